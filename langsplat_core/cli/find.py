@@ -9,30 +9,27 @@ from io import BytesIO
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import tyro
 from PIL import Image, ImageDraw, ImageFont
 
-from langsplat_core.arrays import Array
+from langsplat_core.cli.geometry import read_transform, registered
 from langsplat_core.cli.query import Unit, print_json, unit_of
 from langsplat_core.cli.run import OutFile
 from langsplat_core.cli.teach import searchable
 from langsplat_core.config import CountOrZero, Positive
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.hostile import read_json_file
-from langsplat_core.progress import Progress, TerminalProgress
-from langsplat_core.query.changes import Change, changes, check_similarity
+from langsplat_core.progress import TerminalProgress
+from langsplat_core.query.changes import Change, changes
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.finding import PICTURE, Answered, Hit, find
 from langsplat_core.query.library import Library, update_library
 from langsplat_core.raster import load_lifting_rasterizer
-from langsplat_core.scene import LEVELS, Scene
+from langsplat_core.scene import LEVELS
 from langsplat_core.scene.language import split_phrases
 from langsplat_core.semantics.encoders import load_text_encoder
 
-LIMIT = 100_000  # bytes of a transform
 COLUMNS, CAPTION, GAP = 4, 44, 8  # of a sheet: pictures in a row; pixels below one, and between them
 
 
@@ -214,8 +211,8 @@ class Changes:
     after: tyro.conf.Positional[Path]
     """Another one of the same place."""
     transform: Path | None = None
-    """JSON of 4 x 4 numbers, row by row, from the second scene's frame into the first one's; without it they
-    are taken to be in one frame."""
+    """How the second lies in the axes of the first: .json of `langsplat register`; without it they are taken
+    to be in one frame."""
     register: bool = False
     """Find the transform from the surfaces of both."""
     encoder: str = ""
@@ -228,9 +225,10 @@ class Changes:
     def run(self) -> None:
         if self.register and self.transform is not None:
             raise InputError("--register finds what --transform gives; leave one of them out")
-        placed = None if self.transform is None else _read_transform(self.transform)
+        placed = None if self.transform is None else read_transform(self.transform).matrix
         scenes = searchable(self.before), searchable(self.after)
         unit = unit_of(scenes[0], self.scale)
+        unsure = None in [scene.metres_per_unit for scene in scenes]
         first, second = (QueryEngine(scene, load_text_encoder, encoder_id=self.encoder) for scene in scenes)
         with TerminalProgress() as progress:
             describers = None
@@ -239,32 +237,12 @@ class Changes:
             except EncoderError as error:
                 print(f"langsplat: without names: {error}", file=sys.stderr)
             if self.register:
-                placed = _registered(scenes[1], scenes[0], progress)
+                placed = registered(scenes[1], scenes[0], scaled=unsure, progress=progress).transform
             found = changes(first, second, load_lifting_rasterizer("cpu"), placed, describers, progress)
         if self.json:
             print_json({"metres_per_unit": unit.metres, "changes": [_change_fields(c) for c in found]})
             return
         print("\n".join(_in_words(change, unit) for change in found) or "nothing changed")
-
-
-def _registered(moving: Scene, fixed: Scene, progress: Progress) -> Array:
-    from langsplat_core.geometry.registration import register
-
-    units = moving.metres_per_unit, fixed.metres_per_unit
-    found = register(moving, fixed, scaled=None in units, progress=progress)
-    if not found.trusted:
-        raise InputError(
-            f"the two scenes do not lie on each other ({100 * found.agreement:.0f} % of the depths agree): "
-            "are they of one place? give --transform"
-        )
-    return found.transform
-
-
-def _read_transform(path: Path) -> Array:
-    try:
-        return check_similarity(np.array(read_json_file(path, LIMIT), np.float64))
-    except (ValueError, TypeError, InputError) as error:
-        raise InputError(f"{path}: no transform ({error})") from None
 
 
 def _in_words(change: Change, unit: Unit) -> str:

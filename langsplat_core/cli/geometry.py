@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from langsplat_core.arrays import Array
 from langsplat_core.cli.query import found_answer, unit_of
 from langsplat_core.cli.run import OutFile
 from langsplat_core.cli.teach import searchable
@@ -22,7 +21,7 @@ from langsplat_core.io.shapes import MESH_SUFFIXES, check_suffix, gltf_axes, wri
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import Scene
-from langsplat_core.scene.transform import similarity, transform_scene
+from langsplat_core.scene.transform import Similarity, similarity, transform_scene
 from langsplat_core.semantics.encoders import load_text_encoder
 
 if TYPE_CHECKING:
@@ -100,7 +99,7 @@ class Register:
     @optional_imports()
     def run(self) -> None:
         with TerminalProgress() as progress:
-            found = _registered(load_scene(self.moving), load_scene(self.fixed), self.scaled, progress)
+            found = registered(load_scene(self.moving), load_scene(self.fixed), self.scaled, progress)
         if self.out is not None:
             with atomic_path(self.out) as temporary:
                 temporary.write_text(json.dumps({"matrix": found.transform.tolist()}, indent=1) + "\n")
@@ -139,10 +138,10 @@ class Merge:
         first, second = load_scene(self.first), load_scene(self.second)
         said = "as they were"
         if self.transform is not None:
-            second, said = transform_scene(second, similarity(read_matrix(self.transform))), "as told"
+            second, said = transform_scene(second, read_transform(self.transform)), "as told"
         elif not self.as_is:
             with TerminalProgress() as progress:
-                found = _registered(second, first, self.scaled, progress)
+                found = registered(second, first, self.scaled, progress)
             second = transform_scene(second, similarity(found.transform))
             said = f"registered, {100 * found.agreement:.0f} % of the surfaces agree"
         scene = merge(first, second)
@@ -150,7 +149,7 @@ class Merge:
         print(f"{self.out}: {len(scene.gaussians)} Gaussians, {len(scene.cameras)} cameras; {said}")
 
 
-def _registered(moving: Scene, fixed: Scene, scaled: bool, progress: Progress) -> "Registration":
+def registered(moving: Scene, fixed: Scene, scaled: bool, progress: Progress) -> "Registration":
     """How a scene lies in the axes of another; InputError unless renderings confirm it."""
     from langsplat_core.geometry.registration import TRUSTED, register
 
@@ -165,7 +164,11 @@ def _registered(moving: Scene, fixed: Scene, scaled: bool, progress: Progress) -
     return found
 
 
-def read_matrix(path: Path) -> Array:
-    """(4, 4) float64 of a file of `langsplat register`. Raises InputError and FormatError."""
+def read_transform(path: Path) -> Similarity:
+    """What a file of `langsplat register` holds. Raises InputError and FormatError, with the file's name."""
     entry = read_json_file(path, TRANSFORM_LIMIT)
-    return numbers(entry if isinstance(entry, dict) else {}, "matrix", (4, 4), str(path))
+    matrix = numbers(entry if isinstance(entry, dict) else {}, "matrix", (4, 4), str(path))
+    try:
+        return similarity(matrix)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None

@@ -24,6 +24,7 @@ from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.scene.surface import surface_areas
+from langsplat_core.scene.transform import similarity
 
 Kind = Literal["gone", "appeared", "moved", "recoloured"]
 KINDS: tuple[Kind, ...] = ("gone", "appeared", "moved", "recoloured")
@@ -108,7 +109,7 @@ def changes(
     describers: of both, for names. Raises InputError for a scene without cameras or language field, and for a
     matrix that is no similarity.
     """
-    into = np.eye(4) if placed is None else check_similarity(placed)
+    into = np.eye(4) if placed is None else similarity(placed).matrix
     before, after = _evidence(first.scene, second.scene, into, rasterizer, progress)
     home = (first, before, np.eye(4)), (second, after, into)
     gone, appeared = (_pieces(*each) for each in home)
@@ -129,17 +130,6 @@ def changes(
             other = replace(piece, colour=piece.other, other=piece.colour)
             found.append(_change("recoloured", other, 1, describers))
     return tuple(sorted(found, key=lambda change: (KINDS.index(change.kind), -change.pixels)))
-
-
-def check_similarity(matrix: Array) -> Array:
-    """The matrix as float64; InputError unless it turns, moves and scales alone."""
-    matrix = np.asarray(matrix, np.float64)
-    if matrix.shape == (4, 4) and np.isfinite(matrix).all():
-        scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
-        turn = matrix[:3, :3] / scale if scale > 1e-9 else np.zeros((3, 3))
-        if np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) and np.allclose(matrix[3], (0, 0, 0, 1)):
-            return matrix
-    raise InputError("the transform is not 4 x 4 numbers that turn, move and scale; measure it again")
 
 
 # Evidence: what the pixels of both say about the Gaussians of each.

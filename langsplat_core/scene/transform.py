@@ -129,6 +129,8 @@ def similarity(matrix: Array) -> Similarity:
     """Return the similarity of a (4, 4) or (3, 4) matrix. InputError for one that is mirrored, flat, sheared,
     projective or not finite."""
     matrix = np.asarray(matrix, np.float64)
+    if matrix.shape not in ((4, 4), (3, 4)):
+        raise InputError("a transform is a matrix of 4 x 4 numbers, or 3 x 4")
     linear = matrix[:3, :3]
     if not np.isfinite(matrix).all():
         raise InputError("a matrix whose numbers are not all finite is no transform")

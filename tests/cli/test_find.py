@@ -93,13 +93,15 @@ def test_changes_are_said_in_words_and_in_json(folder, capsys):
     save_scene(folder / "painted.ply", replace(scene, gaussians=replace(scene.gaussians, sh=sh)))
     assert run("changes", pair[0], "painted.ply") == 0
     assert "red to blue" in capsys.readouterr().out
-    (folder / "placed.json").write_text(json.dumps(np.eye(4).tolist()))
+    (folder / "placed.json").write_text(json.dumps({"matrix": np.eye(4).tolist()}))
     assert run("changes", pair[0], "painted.ply", "--transform", "placed.json", "--json") == 0
     (change,) = json.loads(capsys.readouterr().out)["changes"]
     assert (change["kind"], change["colours"]) == ("recoloured", ["red", "blue"])
 
 
-@pytest.mark.parametrize("text", ["[[1]]", "{}", "[[1, 2], [3]]", '"x"', "[" * 50, "[[0,0,0,0]]"])
+@pytest.mark.parametrize(
+    "text", ["[[1]]", "{}", "[[1, 2], [3]]", '"x"', "[" * 50, '{"matrix": [[0,0,0,0]]}', '{"matrix": 3}']
+)
 def test_a_transform_that_is_none_is_refused(folder, capsys, text):
     (folder / "placed.json").write_text(text)
     assert run("changes", "scans/whole.ply", "scans/whole.ply", "--transform", "placed.json") == 2
@@ -107,7 +109,7 @@ def test_a_transform_that_is_none_is_refused(folder, capsys, text):
 
 
 def test_a_transform_is_given_or_found_not_both(folder, capsys):
-    (folder / "placed.json").write_text(json.dumps(np.eye(4).tolist()))
+    (folder / "placed.json").write_text(json.dumps({"matrix": np.eye(4).tolist()}))
     words = "scans/whole.ply", "scans/whole.ply", "--transform", "placed.json", "--register"
     assert run("changes", *words) == 2
     assert "leave one of them out" in capsys.readouterr().err
