@@ -351,7 +351,7 @@ class Window:
         news = (self.viewer.worker.delivered, self.viewer.recorder.delivered)
         asked = (state.selection.leaving, state.selection.may_close)
         seen = (self.unfinished, state.nothing, state.hover)
-        there = (state.view, self.viewer.watch.changed, *news, *seen, *asked)
+        there = (state.view, self.viewer.watch.changed, self.keyboard.given, *news, *seen, *asked)
         changed = len(there) != len(self._last) or any(
             a is not b and a != b for a, b in zip(there, self._last, strict=True)
         )

@@ -233,9 +233,9 @@ def press(window: Window, *keys: str) -> Iterator[None]:
         add(Event(key, True, held))
         if len(name) == 1 and not ctrl:
             add(Event(character=ord(name)))
-        add(Event(key, False, held))
-        if ctrl:
+        if ctrl:  # which people let go of before the key as often as after it
             add(Event(imgui.Key.left_ctrl, False, free))
+        add(Event(key, False, free))
     while window.keyboard.is_waiting:
         yield
     for _ in range(8):

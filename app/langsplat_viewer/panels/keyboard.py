@@ -62,6 +62,7 @@ class Keyboard:
         self._state = state
         self._events: deque[Event] = deque()
         self._waited = 0  # frames, for a box
+        self.given = 0  # events that imgui has got
 
     @property
     def is_waiting(self) -> bool:
@@ -103,10 +104,11 @@ class Keyboard:
             event = self._events[0]
             is_text = bool(event.character) or (typing and event.down and _is_letter(event))
             starts = event.down and not is_text
-            # a frame takes a run of text, or one key
-            if (starts and (is_pressed or (typing and has_text))) or (typing and is_text and is_pressed):
+            # a frame takes a run of text, or one key, whose modifiers stay down until it ends
+            if (is_pressed and (typing or not is_text)) or (starts and typing and has_text):
                 return
             self._events.popleft()
+            self.given += 1
             is_pressed, has_text = is_pressed or starts, has_text or is_text
             if event.character or not is_text:  # the box reads characters: their keys would take a frame each
                 _give(io, event)
