@@ -178,7 +178,7 @@ export class Painter {
   }
 
   // Ask for the draw order of a camera; one sort runs at a time, and only the newest request waits. Resolves
-  // when the order of this camera, or of a later one, is here.
+  // when the order of this camera is here (true), or that of a later one (false).
   sort(camera) {
     const r = camera.rotation, p = camera.position, { near, far } = this.meta.raster;
     const plane = [r[6], r[7], r[8], -(r[6] * p[0] + r[7] * p[1] + r[8] * p[2])];
@@ -202,7 +202,7 @@ export class Painter {
     this.drawn = order.length;
     this.busy = false;
     if (this.next) this.post();
-    this.waiting = this.waiting.filter(([wanted, resolve]) => wanted > ticket || resolve());
+    this.waiting = this.waiting.filter(([wanted, resolve]) => wanted > ticket || resolve(wanted === ticket));
     this.onorder?.();
   }
 

@@ -380,7 +380,7 @@ globalThis.langsplat = (async () => {
   const image = async (camera, display = "rgb", phrase = "") => {
     Object.assign(page, { display, phrase, level: "auto", answer: null });
     if (page.language) page.ask();
-    await page.painter.sort(camera);
+    while (!(await page.painter.sort(camera))); // the page's own camera may have come between
     page.painter.paint(camera, page.look());
     return page.painter.pixels();
   };
