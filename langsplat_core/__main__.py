@@ -1,6 +1,15 @@
-"""``python -m langsplat_core``: the `langsplat` command, for launchers such as torchrun."""
+"""The `langsplat` command, also as ``python -m langsplat_core`` for launchers such as torchrun."""
 
-from langsplat_core.cli.app import entry
+from langsplat_core.signals import end_in_a_line
+
+
+def entry() -> None:
+    """The `langsplat` console script."""
+    end_in_a_line("langsplat")
+    from langsplat_core.cli.app import entry as run
+
+    run()
+
 
 if __name__ == "__main__":
     entry()

@@ -144,6 +144,7 @@ def _word(value: Any) -> str:
 # Every field with numbers names one of these, or a range of its own.
 Count = Annotated[int, Range(1, 1_000_000_000)]
 SeveralCount = Annotated[int, Range(2, 1_000_000_000)]
+FrameCount = Annotated[int, Range(3, 100_000)]
 CountOrZero = Annotated[int, Range(0, 1_000_000_000)]
 Seed = Annotated[int, Range(0, 2**32 - 1)]
 Side = Annotated[int, Range(16, 65_536)]  # pixels of an image's longer side
@@ -180,7 +181,10 @@ class DatasetConfig:
     """Settings for reading photographs and their cameras."""
 
     max_side: Side = 800  # photographs are shrunk until their longer side has at most this many pixels
-    test_every: CountOrZero = 8  # every n-th view, in name order, is held out from training; 0 holds out none
+    test_every: CountOrZero = 8  # one view in so many is held out from training; 0 holds out none
+    # chosen: views that others surround, none of fewer than six; every: each n-th by name, as benchmarks do
+    hold_out: Literal["chosen", "every"] = "chosen"
+    frames: FrameCount = 100  # photographs that a video is made into: the sharpest image of each such part
     metres_per_unit: Positive | None = None
     """Scale of the dataset's world; None: as transforms.json says, or else the photographs' places (GPS)."""
     # go on where fewer than half of the photographs, or fewer than three, have a camera
@@ -340,6 +344,7 @@ class TrainConfig:
 # The method as published (paper sections 3.1 to 3.3 and its public code): 2 x 2 crops beside the whole
 # photograph, an autoencoder of 3 numbers, features trained through the rasterizer from zeros.
 PAPER = TrainConfig(
+    dataset=DatasetConfig(hold_out="every"),
     radiance=RadianceConfig(coarse_fraction=0.0),
     masks=MaskConfig(source="sam", sam="facebook/sam-vit-huge", crop_layers=1),
     codec=AutoencoderConfig(steps=10_000, batch=64, lr=7e-4),
@@ -407,5 +412,8 @@ class PictureConfig:
     own_colours: bool = False  # heat in the colour of each query instead of the colour map
     threshold: Share = 0.5  # of a pixel's light from an answer's Gaussians from which it is segmented
     alpha_gate: Share = 0.3  # pixels with less alpha carry no relevancy
+    heat_scale: tuple[Share, Share] | None = (
+        None  # relevancies that are coldest and hottest; None: each answer's
+    )
     background: tuple[Share, Share, Share] = (0.0, 0.0, 0.0)  # display values in [0, 1]
     transparent: bool = False  # no background: the image has a fourth channel, the scene's alpha

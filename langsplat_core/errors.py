@@ -82,6 +82,8 @@ EXTRAS: Mapping[str, str] = MappingProxyType(  # name as imported -> extra, as i
         "gsplat": "cuda",
         "mcp": "agents",
         "open3d": "geometry",
+        "av": "phones",
+        "pillow_heif": "phones",
     }
 )
 

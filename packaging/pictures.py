@@ -4,14 +4,31 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from imgui_bundle import hello_imgui, imgui  # isort: skip  (before glfw)
 from imgui_bundle.immapp import testing  # isort: skip
 
+import numpy as np
+
+from langsplat_core.bench.query import with_codec
+from langsplat_core.config import AutoencoderConfig, PictureConfig
 from langsplat_core.io.hostile import opened
-from langsplat_viewer.actions import filming, selecting, settings, training, transforming, viewpoint
+from langsplat_core.io.scenes import save_scene
+from langsplat_core.training.language.codec_fit import train_autoencoder
+from langsplat_viewer.actions import (
+    filming,
+    opening,
+    outline,
+    projects,
+    selecting,
+    settings,
+    training,
+    transforming,
+    viewpoint,
+)
 from langsplat_viewer.options import scene_path, services
 from langsplat_viewer.rendering.renderer import GlRenderer
 from langsplat_viewer.state import TrainingForm
@@ -59,6 +76,58 @@ def _selected(ctx: Any, window: Window) -> None:
     settings.open_panel(viewer, "Select")
     selecting.select_query(viewer)
     settings.set_display(viewer, "rgb")
+
+
+def _outlined(ctx: Any, window: Window) -> None:
+    viewer = window.viewer
+    settings.open_panel(viewer, "Outline")
+    while viewer.state.outline is None or not viewer.state.outline.roots:
+        ctx.yield_()
+    named = {outline.name_of(viewer, row): row.node for row in viewer.state.outline.roots}
+    things = [
+        node for name, node in named.items() if name.split(" or ")[0] in ("hamburger", "laptop", "present")
+    ]
+    outline.group(viewer, things[1], things[0])
+    outline.group(viewer, things[2], viewer.state.things.groups[0])
+    outline.rename_group(viewer, viewer.state.things.groups[0], "on the table")
+    outline.toggle_lock(viewer, things[0])
+    settings.set_display(viewer, "latent", 2)
+    ctx.yield_(10)
+
+
+def _clipped(ctx: Any, window: Window) -> None:
+    viewer = window.viewer
+    selecting.select_query(viewer)
+    settings.open_panel(viewer, "Transform")
+    transforming.fill_box(viewer)
+    selecting.select_none(viewer)
+    settings.set_display(viewer, "rgb")
+    transforming.fill_form(viewer, replace(viewer.state.edit_form, gizmo="box"))
+    transforming.clip(viewer, True)
+
+
+def _noted(ctx: Any, window: Window) -> None:
+    viewer = window.viewer
+    settings.open_panel(viewer, "Notes")
+    for place, text in (((0.28, 0.45), "a gift of 1987"), ((0.62, 0.55), "eaten by the children")):
+        projects.pin_at(viewer, *place)
+        projects.write_note(viewer, viewer.state.notes[-1], text)
+
+
+def _beside(ctx: Any, window: Window) -> None:
+    """The scene with an autoencoder of three numbers, as the paper has it, in place of its codebook."""
+    viewer, folder = window.viewer, Path(tempfile.mkdtemp())
+    scene, path = viewer.state.scene, folder / "autoencoder.ply"
+    assert scene is not None
+    assert scene.language is not None
+    field = scene.language
+    codewords = field.codec.decode(np.arange(field.codec.size, dtype=np.uint16)[:, None])
+    codec = train_autoencoder(codewords, AutoencoderConfig(steps=2_000))
+    language = replace(with_codec(field, codec), tree=None)
+    save_scene(path, replace(scene, language=language, path=path))
+    opening.open_beside(viewer, path)
+    while viewer.beside is None or not any(query.result for query in viewer.beside.state.queries):
+        ctx.yield_()
 
 
 def _transformed(ctx: Any, window: Window) -> None:
@@ -174,6 +243,10 @@ WINDOWS: dict[str, tuple[tuple[str, ...], Act]] = {
     "cursor.jpg": (("teddy bear",), _under_the_cursor),
     "select.jpg": (("teddy bear",), _selected),
     "transform.jpg": (("teddy bear",), _transformed),
+    "outline.jpg": (("teddy bear",), _outlined),
+    "clip.jpg": (("teddy bear",), _clipped),
+    "notes.jpg": (("teddy bear",), _noted),
+    "beside.jpg": (("teddy bear", "toy"), _beside),
     "side_by_side.jpg": (("teddy bear",), _side_by_side),
     "palette.jpg": (QUERIES, _palette),
     "structure.jpg": (("toy, not teddy bear", "keyboard of the laptop"), _with_structure),
@@ -191,7 +264,11 @@ WINDOWS: dict[str, tuple[tuple[str, ...], Act]] = {
 def window_picture(path: Path, queries: tuple[str, ...], act: Act) -> None:
     """A screenshot of the window with the demo scene and answered queries."""
     request = WindowRequest(
-        scene_path(None), queries=queries, display="relevancy", size=(1280, 800), camera=CAMERA
+        scene_path(None),
+        queries=queries,
+        picture=PictureConfig(display="relevancy"),
+        size=(1280, 800),
+        camera=CAMERA,
     )
     window = Window(request, services(""), GlRenderer)
     window.idles = False

@@ -5,7 +5,8 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -302,3 +303,56 @@ def test_other_faults_of_a_writer_stay_what_they_are(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="ours"), files_of_at_most(0), atomic_path(tmp_path / "a"):
         raise InputError("ours")
     assert not list(tmp_path.iterdir())
+
+
+PAGE = 4096  # bytes that such a file system gives out at a time
+LARGER = Scene(random_gaussians(6_000, 3, sh_degree=3), random_field(6_000, seed=4), SCENE.cameras)
+LARGE: dict[str, Write] = {
+    "scene": lambda folder: save_scene(folder / "s.ply", LARGER),
+    "sidecar": lambda folder: write_language(
+        folder / "s.safetensors", random_field(40_000, seed=5), random_gaussians(40_000).means
+    ),
+    "checkpoint": checkpoint,
+}
+
+
+@pytest.mark.parametrize("name", LARGE)
+def test_a_small_disk_that_fills_up_is_one_line(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A file system of its own, filled by another file but for less than what is written, and for the last
+    page of it. What is left may be more than a probe takes."""
+    LARGE[name](tmp_path / "whole")
+    needed = sum(-(-len(content) // PAGE) for content in contents(tmp_path / "whole").values())
+    with small_disk(tmp_path / "disk", (needed + 64) * PAGE) as disk:
+        for share in (0.1, 0.5, 0.9, 1.0):
+            free = int(share * needed) - (share == 1.0)
+            filler = disk / "filler"
+            with filler.open("wb") as file:
+                room = os.statvfs(disk).f_bavail - free
+                file.write(bytes(room * PAGE))
+            code = main("langsplat", lambda: Writing(LARGE[name], disk / "out"))
+            (line,) = capsys.readouterr().err.splitlines()
+            assert code == 2
+            assert "No space left" in line
+            left = contents(disk / "out")
+            assert all(
+                len(content) == len((tmp_path / "whole" / path).read_bytes())
+                for path, content in left.items()
+            )
+            filler.unlink()
+            shutil.rmtree(disk / "out", ignore_errors=True)
+        assert main("langsplat", lambda: Writing(LARGE[name], disk / "out")) == 0
+
+
+@contextmanager
+def small_disk(folder: Path, size: int) -> Iterator[Path]:
+    """A file system in memory of so many bytes; skips where one may not be mounted."""
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
+    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("mounting a file system needs root")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", str(folder)], check=True, capture_output=True)

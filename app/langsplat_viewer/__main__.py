@@ -1,91 +1,14 @@
-"""`langsplat-viewer`: arguments -> window, or an image or film without a window."""
+"""The `langsplat-viewer` command, also as ``python -m langsplat_viewer``."""
 
-import sys
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
-from pathlib import Path
-
-from langsplat_core.cli.run import main, parsed
-from langsplat_core.errors import InputError
-from langsplat_core.progress import Progress, TerminalProgress, silent
-from langsplat_viewer.files.preferences import preferences_folder
-from langsplat_viewer.options import ViewerOptions, camera_file, scene_path, services
-
-
-@dataclass(frozen=True)
-class ViewerCommand(ViewerOptions):
-    """Open a 3D Gaussian scene, look around in it and search it with words."""
-
-    def run(self) -> None:
-        self.wanted_size  # noqa: B018  what cannot be read is said before anything slow is done
-        path = scene_path(self.scene)
-        camera_file(self.camera)
-        if self.headless:
-            self._without_window(path)
-        else:
-            self._window(path)
-
-    def _without_window(self, path: Path) -> None:
-        from langsplat_viewer.output.headless import check_options, draw_film, draw_image
-
-        check_options(self)
-        bars: AbstractContextManager[Progress] = nullcontext(silent)
-        if sys.stderr.isatty():
-            bars = TerminalProgress()
-        with bars as progress:
-            draw = draw_film if self.is_film else draw_image
-            lines = draw(self, path, services(self.encoder), progress)
-        print("\n".join(lines))
-
-    def _window(self, path: Path) -> None:
-        if self.out is not None:
-            raise InputError("--out is for pictures without a window; add --headless")
-        for option, given, panel in (
-            ("--colour-map", self.colour_map, "Display"),
-            ("--transparent", self.transparent, "Display"),
-            ("--cut", self.cut, "Search"),
-            ("--canonical", self.canonical, "Search"),
-            ("--near-cut", self.near_cut, "Camera"),
-            ("--far-cut", self.far_cut, "Camera"),
-        ):
-            if given:
-                raise InputError(
-                    f"{option} is for pictures without a window; choose it in the panel {panel}, "
-                    "or add --headless"
-                )
-        if self.turntable is not None:
-            raise InputError("--turntable is a film without a window; add --headless --out film.mp4")
-        from langsplat_viewer.window import WindowRequest, open_window
-
-        open_window(
-            WindowRequest(
-                path=path,
-                queries=self.query,
-                level=self.level,
-                display=self.shown_display,
-                size=self.wanted_size,
-                camera=self.camera,
-                orthographic=self.orthographic,
-                backend=self.backend,
-                path_file=self.path,
-                heat_opacity=self.heat_opacity,
-                dim=self.dim,
-                settings=None if self.fresh else preferences_folder(),
-            ),
-            services(self.encoder),
-        )
-
-
-def parse(args: Sequence[str]) -> ViewerCommand:
-    """The command that the words of a command line make; SystemExit as tyro raises it."""
-    found: ViewerCommand = parsed("langsplat-viewer", ViewerCommand, args)
-    return found
+from langsplat_core.signals import end_in_a_line
 
 
 def entry() -> None:
     """The `langsplat-viewer` console script."""
-    sys.exit(main("langsplat-viewer", lambda: parse(sys.argv[1:])))
+    end_in_a_line("langsplat-viewer")
+    from langsplat_viewer.program import entry as run
+
+    run()
 
 
 if __name__ == "__main__":

@@ -234,10 +234,25 @@ class Canvas:
         self._targets[key] = self._targets.pop(key)
         return self._targets[key]
 
+    @property
+    def backend(self) -> str:
+        """The name of what draws."""
+        return self._fine.backend
+
     def close(self) -> None:
         """Stop the workers."""
         self._background.worker.close()
         self._merger.worker.close()
+
+    def release(self) -> None:
+        """Give device memory back; the canvas cannot be used afterwards."""
+        for target in self._targets.values():
+            target.release()
+        for texture in self._textures.values():
+            texture.release()
+        for renderer in (self._fine, self._quick):
+            if renderer is not None:
+                renderer.release()
 
     def point_at(self, u: float, v: float) -> Array | None:
         if self._shown is None:

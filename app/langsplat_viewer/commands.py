@@ -11,6 +11,7 @@ from langsplat_core.scene import LEVELS
 from langsplat_viewer.actions import (
     filming,
     opening,
+    projects,
     queries,
     selecting,
     settings,
@@ -62,6 +63,8 @@ class Command:
     repeats: bool = False  # while held
     is_edit: bool = False  # belongs to the box while one types, as it does everywhere
     is_on: Callable[[Viewer], bool] | None = None  # for a check mark in the menu
+    apart: bool = False  # a line is above it in the menu
+    icon: str = ""  # on the toolbar, a name of Font Awesome 6 without its "ICON_FA_"
 
 
 def _show(button: Button) -> Callable[[Viewer], None]:
@@ -130,7 +133,13 @@ OVERLAY_TITLES: dict[Overlay, str] = {
 
 
 def _tool(tool: Tool) -> Command:
-    return Command(f"select: {tool}", lambda viewer: selecting.use_tool(viewer, tool), menu="Select")
+    return Command(
+        f"select: {tool}",
+        lambda viewer: selecting.use_tool(viewer, tool),
+        menu="Select",
+        is_on=lambda viewer: viewer.state.selection.tool == tool,
+        icon=TOOL_ICONS[tool],
+    )
 
 
 def _export(does: str, part: Part, as_points: bool = False) -> Command:
@@ -153,28 +162,57 @@ SIDE_KEYS: tuple[tuple[Side, str], ...] = (
     ("bottom", "Ctrl+Keypad7"),
 )
 PANEL_TITLES = (
-    *("Search", "Display", "Camera", "Scene", "Select", "Transform"),
-    *("Library", "Train", "Record", "Bookmarks", "Messages", "Overlays", "Timing"),
+    *("Search", "Display", "Camera", "Scene", "Outline", "Select", "Transform"),
+    *("Library", "Train", "Record", "Bookmarks", "Messages", "Overlays", "Notes", "Timing"),
 )
 LETTERS_MENU = "Size of letters"  # in the menu Window
+TOOL_ICONS: dict[Tool, str] = {
+    "thing": "HAND_POINTER",
+    "rectangle": "VECTOR_SQUARE",
+    "lasso": "DRAW_POLYGON",
+    "brush": "BRUSH",
+    "sphere": "CIRCLE",
+    "box": "CUBE",
+}
+DISPLAY_ICONS: dict[Display, str] = {
+    "rgb": "IMAGE",
+    "relevancy": "FIRE",
+    "segmentation": "HIGHLIGHTER",
+    "latent": "PALETTE",
+    "tree": "SITEMAP",
+    "depth": "MOUNTAIN",
+}
 UI_SCALES = (0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0)
 MENUS = ("File", "Edit", "Select", "View", "Camera", "Window", "Help")
 
 COMMANDS: tuple[Command, ...] = (
     Command("open a scene", opening.ask_for_file, ("Ctrl+O",), "File"),
-    Command("search all scenes of a folder", opening.ask_for_library, menu="File"),
-    Command("reload the scene", opening.reload, ("F5",), "File"),
+    Command(
+        "search all scenes of a folder", lambda viewer: opening.ask_for_folder(viewer, "library"), menu="File"
+    ),
+    Command("reload the scene", opening.reload, ("F5",), "File", apart=True),
     Command(
         "next scene of the list", lambda viewer: opening.step_scene(viewer, 1), ("Ctrl+PageDown",), "File"
     ),
     Command(
         "previous scene of the list", lambda viewer: opening.step_scene(viewer, -1), ("Ctrl+PageUp",), "File"
     ),
-    Command("train a scene", lambda viewer: settings.open_panel(viewer, "Train"), menu="File"),
+    Command("train a scene", lambda viewer: settings.open_panel(viewer, "Train"), menu="File", apart=True),
     Command(
-        "save a picture", lambda viewer: saving.save_picture(viewer, Path.cwd()), ("Ctrl+S", "P"), "File"
+        "save a picture",
+        lambda viewer: saving.save_picture(viewer, Path.cwd()),
+        ("Ctrl+S", "P"),
+        "File",
+        icon="CAMERA",
+        apart=True,
     ),
     Command("save the view", lambda viewer: saving.save_view(viewer, Path.cwd()), menu="File"),
+    Command(
+        "save the project",
+        lambda viewer: projects.save_project(viewer, Path.cwd()),
+        ("Ctrl+Shift+S",),
+        "File",
+    ),
     Command("save the queries", lambda viewer: queries.save_queries(viewer, Path.cwd()), menu="File"),
     Command(
         "copy the command of this picture",
@@ -189,21 +227,37 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command("save a film of the path", lambda viewer: filming.save_film(viewer, Path.cwd()), menu="File"),
     Command("save the camera path", lambda viewer: filming.save_path(viewer, Path.cwd()), menu="File"),
-    Command("quit", selecting.quit_viewer, ("Ctrl+Q",), "File"),
+    Command("quit", selecting.quit_viewer, ("Ctrl+Q",), "File", apart=True),
     Command("search", queries.focus_search, ("Ctrl+F", "/"), "Edit"),
     Command("remove all queries", queries.remove_all, menu="Edit"),
-    Command("undo", undoing.undo, ("Ctrl+Z",), "Edit", repeats=True, is_edit=True),
+    Command("undo", undoing.undo, ("Ctrl+Z",), "Edit", repeats=True, is_edit=True, apart=True),
     Command("redo", undoing.redo, ("Ctrl+Shift+Z", "Ctrl+Y"), "Edit", repeats=True, is_edit=True),
-    Command("gizmo: move, rotate, scale, off", transforming.next_gizmo, ("G",), "Edit"),
+    Command(
+        "gizmo: move, rotate, scale, off",
+        transforming.next_gizmo,
+        ("G",),
+        "Edit",
+        is_on=lambda viewer: viewer.state.edit_form.gizmo != "off",
+        icon="UP_DOWN_LEFT_RIGHT",
+        apart=True,
+    ),
     Command("select everything", selecting.select_all, ("Ctrl+A",), "Select", is_edit=True),
     Command("select nothing", selecting.select_none, ("Ctrl+D", "Ctrl+Shift+A"), "Select", is_edit=True),
     Command("invert the selection", selecting.invert_selection, ("Ctrl+I",), "Select", is_edit=True),
-    Command("select what the search found", selecting.select_query, menu="Select"),
+    Command("select what the search found", selecting.select_query, menu="Select", apart=True),
     Command("select everything like the selection", selecting.select_alike, menu="Select"),
     Command("grow the selection", selecting.grow_selection, menu="Select"),
     Command("shrink the selection", selecting.shrink_selection, menu="Select"),
+    Command(
+        "select with no tool: the left button turns the view",
+        selecting.leave_tool,
+        menu="Select",
+        is_on=lambda viewer: viewer.state.selection.tool is None,
+        icon="HAND",
+        apart=True,
+    ),
     *(_tool(tool) for tool in TOOLS),
-    Command("hide the selection", selecting.hide_selected, ("H",), "Select"),
+    Command("hide the selection", selecting.hide_selected, ("H",), "Select", apart=True),
     Command("isolate the selection", selecting.isolate_selected, ("Shift+H",), "Select"),
     Command("show all that is hidden", selecting.show_hidden, ("U", "Alt+H"), "Select"),
     Command("delete the selection", selecting.delete_selected, ("Delete",), "Select"),
@@ -213,7 +267,12 @@ COMMANDS: tuple[Command, ...] = (
     _export("save the scene without what was deleted", "edited"),
     *(
         Command(
-            _name(button), _show(button), (str(key),) if key < 10 else (), "View", is_on=_is_shown(button)
+            _name(button),
+            _show(button),
+            (str(key),) if key < 10 else (),
+            "View",
+            is_on=_is_shown(button),
+            icon="" if button.latent_level in (0, 1) else DISPLAY_ICONS.get(button.display, ""),
         )
         for key, button in enumerate(BUTTONS, 1)
     ),
@@ -223,47 +282,81 @@ COMMANDS: tuple[Command, ...] = (
         ("I",),
         "View",
         is_on=lambda viewer: viewer.state.pointing,
+        icon="COMMENT_DOTS",
+        apart=True,
     ),
-    Command("compare two displays", settings.toggle_wipe, ("V",), "View"),
-    Command("three levels side by side", settings.toggle_levels, menu="View"),
+    Command(
+        "compare two displays",
+        settings.toggle_wipe,
+        ("V",),
+        "View",
+        is_on=lambda viewer: viewer.state.settings.split.mode == "wipe",
+        icon="TABLE_COLUMNS",
+    ),
+    Command(
+        "three levels side by side",
+        settings.toggle_levels,
+        menu="View",
+        is_on=lambda viewer: viewer.state.settings.split.mode == "levels",
+        icon="LAYER_GROUP",
+    ),
+    Command("compare with another scene", opening.ask_for_beside, menu="View"),
     *(_overlay(name, title) for name, title in OVERLAY_TITLES.items()),
-    Command("compare the picture with the reference", viewpoint.compare_with_reference, menu="View"),
+    Command(
+        "compare the picture with the reference", viewpoint.compare_with_reference, menu="View", apart=True
+    ),
     Command(
         "measure a distance",
         settings.toggle_measuring,
         ("M",),
         "View",
         is_on=lambda viewer: viewer.state.ruler.measures,
+        icon="RULER",
     ),
-    Command("return to the opening view", viewpoint.reset_view, ("R", "Home"), "Camera"),
-    Command("frame everything", viewpoint.frame_scene, ("Shift+F",), "Camera"),
-    Command("focus on the latest result found", viewpoint.focus_result, ("F",), "Camera"),
     Command(
-        "previous training camera", lambda viewer: viewpoint.step_camera(viewer, -1), (",",), "Camera", True
+        "pin a note to what is clicked",
+        projects.toggle_pinning,
+        ("N",),
+        "View",
+        is_on=lambda viewer: viewer.state.pins_notes,
+        icon="NOTE_STICKY",
+    ),
+    Command("return to the opening view", viewpoint.reset_view, ("R", "Home"), "Camera", icon="HOUSE"),
+    Command("frame everything", viewpoint.frame_scene, ("Shift+F",), "Camera", icon="EXPAND"),
+    Command("focus on the latest result found", viewpoint.focus_result, ("F",), "Camera", icon="CROSSHAIRS"),
+    Command(
+        "previous training camera",
+        lambda viewer: viewpoint.step_camera(viewer, -1),
+        (",",),
+        "Camera",
+        True,
+        apart=True,
     ),
     Command("next training camera", lambda viewer: viewpoint.step_camera(viewer, 1), (".",), "Camera", True),
-    Command("level the horizon", lambda viewer: viewpoint.move(viewer, level), menu="Camera"),
+    Command("level the horizon", lambda viewer: viewpoint.move(viewer, level), menu="Camera", apart=True),
     Command(
         "take the picture's up as the world's", lambda viewer: viewpoint.move(viewer, adopt_up), menu="Camera"
     ),
     *(_side(side, key) for side, key in SIDE_KEYS),
-    Command("orthographic view, and back", viewpoint.toggle_orthographic, ("O", "Keypad5"), "Camera"),
+    Command(
+        "orthographic view, and back", viewpoint.toggle_orthographic, ("O", "Keypad5"), "Camera", apart=True
+    ),
     Command(
         "walk in place of flying, and back",
         viewpoint.toggle_walking,
         menu="Camera",
         is_on=lambda viewer: viewer.state.walks,
     ),
-    Command("bookmark this view", viewpoint.add_bookmark, ("Ctrl+B",), "Camera"),
+    Command("bookmark this view", viewpoint.add_bookmark, ("Ctrl+B",), "Camera", apart=True),
     Command("add a keyframe here", filming.add_keyframe, ("K",), "Camera"),
     Command("play the camera path, or stop", viewpoint.toggle_playing, ("Shift+K",), "Camera"),
     Command("hide or show the panels", settings.toggle_panel, ("F11",), "Window"),
-    Command("panels as at first", settings.reset_panels, menu="Window"),
+    Command("panels as at first", settings.reset_panels, menu="Window", apart=True),
     *(_theme(theme) for theme in THEMES),
     *(_letters(scale) for scale in UI_SCALES),
     *(_panel(title) for title in PANEL_TITLES),
     Command("find a command", lambda viewer: settings.show_palette(viewer, True), ("Ctrl+Shift+P",), "Help"),
-    Command("list of keys", settings.toggle_help, ("F1", "?"), "Help"),
+    Command("first steps, and list of keys", settings.toggle_help, ("F1", "?"), "Help"),
     Command("close what lies over the scene", settings.escape, ("Esc",)),
 )
 

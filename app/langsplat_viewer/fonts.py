@@ -24,7 +24,10 @@ WIDE = (
     ),
     *("Arial Unicode.ttf", "PingFang.ttc", "Hiragino Sans GB.ttc", "msyh.ttc", "YuGothM.ttc", "malgun.ttf"),
 )
-PLAIN = "DejaVuSans.ttf"  # Latin, Greek, Cyrillic, Armenian, Georgian, Hebrew, Arabic letters, symbols
+BUNDLED = {  # package -> its file; pictographs, and letters: Latin, Greek, Cyrillic, Hebrew, Arabic, more
+    "matplotlib": "mpl-data/fonts/ttf/DejaVuSans.ttf",
+    "imgui_bundle": "demos_assets/fonts/NotoEmoji-Regular.ttf",
+}
 
 
 def load() -> None:
@@ -39,15 +42,15 @@ def load() -> None:
 
 def fallbacks() -> list[Path]:
     """Font files to look letters up in, in this order."""
-    found = (_bundled(), _installed())
+    found = (*(_bundled(package, file) for package, file in BUNDLED.items()), _installed())
     return [path for path in found if path is not None]
 
 
-def _bundled() -> Path | None:
-    spec = find_spec("matplotlib")
+def _bundled(package: str, file: str) -> Path | None:
+    spec = find_spec(package)
     if spec is None or spec.origin is None:
         return None
-    path = Path(spec.origin).parent / "mpl-data" / "fonts" / "ttf" / PLAIN
+    path = Path(spec.origin).parent / file
     return path if path.is_file() else None
 
 

@@ -22,6 +22,59 @@ from langsplat_core.query.selection import (
 from langsplat_core.scene import Camera, Scene
 from langsplat_core.scene.transform import Similarity, transform_scene
 
+# Numbers of Gaussians that a range of selects.
+
+Measure = Literal["opacity", "size", "distance", "relevancy"]
+MEASURES: tuple[Measure, ...] = get_args(Measure)
+LOGARITHMIC: tuple[Measure, ...] = ("size", "distance")
+BINS = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Histogram:
+    """How many Gaussians have which value, in `BINS` equal steps between two values."""
+
+    values: Array  # (N,) float64, logarithms to base 10 of those of LOGARITHMIC; NaN where there is none
+    low: float
+    high: float
+    counts: Array  # (BINS,) float32, log(1 + n)
+
+    def between(self, start: float, stop: float) -> Array:
+        """(N,) bool: values between two fractions of the range, in either order."""
+        low, high = (self.low + part * (self.high - self.low) for part in sorted((start, stop)))
+        with np.errstate(invalid="ignore"):
+            found: Array = (self.values >= low) & (self.values <= high)
+            return found
+
+
+def measured(scene: Scene, measure: Measure, eye: Array, relevancy: Array | None = None) -> Array | None:
+    """(N,) float64 values of a scene's Gaussians as `Histogram` has them: opacity 0 to 1, size (the longest
+    axis's standard deviation) and distance from `eye` (3,) in world units, and the relevancy of an answer.
+    None for relevancy without one."""
+    gaussians = scene.gaussians
+    with np.errstate(all="ignore"):
+        match measure:
+            case "opacity":
+                return np.asarray(1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64))))
+            case "size":
+                return np.asarray(gaussians.log_scales.max(1).astype(np.float64) / math.log(10))
+            case "distance":
+                away = np.linalg.norm(gaussians.means.astype(np.float64) - eye, axis=1)
+                return np.asarray(np.log10(np.maximum(away, 1e-12)))
+            case _:
+                return None if relevancy is None else relevancy.astype(np.float64)
+
+
+def histogram(values: Array, shown: Array) -> Histogram:
+    """Of the `shown` (N,) ones among (N,) values that are finite."""
+    values = np.where(shown & np.isfinite(values), values, np.nan)
+    finite = values[np.isfinite(values)]
+    low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
+    high = max(high, low + 1e-6)
+    counts, _ = np.histogram(finite, BINS, (low, high))
+    return Histogram(values, low, high, np.log1p(counts).astype(np.float32))
+
+
 # The scene itself is never changed: deleting marks, and what is marked is left out of images and of what is
 # saved. So everything can be undone, and an answer's numbers per Gaussian keep their places.
 
@@ -88,9 +141,9 @@ def hiding(marks: Marks) -> Marks:
     return Marks(np.zeros_like(marks.selected), marks.hidden | marks.selected, marks.deleted)
 
 
-def isolating(marks: Marks) -> Marks:
-    """With everything else hidden."""
-    return replace(marks, hidden=~marks.selected & marks.kept)
+def isolating(marks: Marks, locked: Array) -> Marks:
+    """With everything else hidden but what is `locked` (N,) bool."""
+    return replace(marks, hidden=~marks.selected & marks.kept & ~locked)
 
 
 def showing_all(marks: Marks) -> Marks:
@@ -150,6 +203,7 @@ class Selection:
 
     marks: Marks = field(default_factory=lambda: unmarked(0))
     saved: Array | None = None  # (N,) what was deleted when the scene was last saved; None: not yet
+    locked: Array = field(default_factory=lambda: np.zeros(0, bool))  # (N,) what tools leave alone
     moves: tuple[Move, ...] = ()  # transforms so far, since the scene was opened
     saved_moves: tuple[Move, ...] = ()  # the same when it was last saved
     tool: Tool | None = None  # what a drag in the scene does; None: it turns the camera
@@ -158,6 +212,8 @@ class Selection:
     reach: float = 0.05  # how far growing goes, and how large a sphere of one click is; of the scene's radius
     only_visible: bool = True  # rectangle, lasso and brush leave out what lies behind something
     name: str = ""  # that is being typed for what is selected
+    measure: Measure = "opacity"  # whose histogram is shown
+    brushed: tuple[float, float] | None = None  # of it, where the mouse went down and is, fractions
     stroke: Stroke | None = None
     leaving: Leaving | None = None
     writing: Future[Any] | None = None  # what was last written, or is being written
@@ -177,6 +233,7 @@ def of_scene(selection: Selection, count: int) -> Selection:
     return replace(
         selection,
         marks=unmarked(count),
+        locked=np.zeros(count, bool),
         saved=None,
         moves=(),
         saved_moves=(),

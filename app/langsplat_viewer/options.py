@@ -7,6 +7,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
 import tyro
 
 from langsplat_core.config import (
@@ -33,6 +34,7 @@ from langsplat_viewer.rendering.renderer import Backend
 from langsplat_viewer.viewer import Services
 
 DisplayChoice = Literal["auto", Display]
+WARMING = 64  # Gaussians of the image that has the kernels compiled
 MAX_SIDE = 16_384  # pixels; beyond it drivers refuse textures
 Seconds = Annotated[float, Range(0.1, 36_000.0)]
 PicturesPerSecond = Annotated[float, Range(0.1, 240.0)]
@@ -68,6 +70,8 @@ class ViewerOptions:
     """How much of the heat map covers the colours where relevancy is high."""
     dim: Share = PictureConfig.dim
     """Brightness of what a query does not find."""
+    heat_scale: Annotated[tuple[Share, Share] | None, tyro.conf.arg(metavar="LOW HIGH")] = None
+    """Relevancies at the ends of the heat map, the same in every image (default: each answer's own)."""
     size: Annotated[str, tyro.conf.arg(metavar="WxH")] = ""
     """Size of the window or image in pixels."""
     camera: Annotated[str, tyro.conf.arg(metavar="FILE|INDEX")] = ""
@@ -90,6 +94,8 @@ class ViewerOptions:
     """With --headless: a film of so many seconds, once around what the camera sees in its middle."""
     around: Literal["view", "answer"] = "view"
     """What --turntable goes around; answer: the last query found, from near."""
+    beside: Annotated[Path | None, tyro.conf.arg(metavar="SCENE")] = None
+    """In the window: a second scene right of a line, by another encoder or method, seen and asked alike."""
     fps: PicturesPerSecond = 30.0
     """Images per second of a film."""
     colour_map: ColourMap | None = None
@@ -108,6 +114,21 @@ class ViewerOptions:
         if self.display == "auto":
             return "relevancy" if self.query else "rgb"
         return self.display
+
+    @property
+    def picture(self) -> PictureConfig:
+        """What is shown and how. InputError for a scale that ends before it begins."""
+        scale = self.heat_scale
+        if scale is not None and scale[0] >= scale[1]:
+            raise InputError(f"--heat-scale {scale[0]:g} {scale[1]:g}: the second must be the larger")
+        return PictureConfig(
+            display=self.shown_display,
+            heat_opacity=self.heat_opacity,
+            dim=self.dim,
+            heat_scale=scale,
+            colour_map=self.colour_map or PictureConfig.colour_map,
+            transparent=self.transparent,
+        )
 
     @property
     def is_film(self) -> bool:
@@ -199,10 +220,9 @@ def warm_up(scene: Scene, backend: str, progress: Progress = silent) -> None:
         from langsplat_viewer.rendering.renderer import ArrayChannels
         from langsplat_viewer.rendering.request import RenderKey
 
-        channels, key = (
-            ArrayChannels(load_rasterizer("cpu")),
-            RenderKey(scene, scene.framing_camera((16, 16))),
-        )
+        few = Scene(scene.gaussians.take(np.arange(min(len(scene.gaussians), WARMING))))
+        channels = ArrayChannels(load_rasterizer("cpu"))
+        key = RenderKey(few, few.framing_camera((16, 16)))
         channels.render(key)
         channels.depth_at(key, 8, 8)
 

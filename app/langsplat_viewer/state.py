@@ -3,7 +3,7 @@
 import math
 from collections import deque
 from dataclasses import dataclass, field, fields, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from statistics import median
 from typing import Literal, get_args
@@ -14,18 +14,20 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice, PictureConfig, TrainPreset
 from langsplat_core.display.displays import MAX_QUERIES
 from langsplat_core.query.answers import QueryResult
-from langsplat_core.query.describe import Pointed, Suggestions
+from langsplat_core.query.describe import Outline, Pointed, Suggestions
 from langsplat_core.query.engine import LoadEncoder
 from langsplat_core.query.finding import Hit
 from langsplat_core.query.instances import Instance
 from langsplat_core.query.library import Library
 from langsplat_core.scene import Camera, Scene
+from langsplat_core.scene.tree import Tree
 from langsplat_viewer.camera.controls import Extent, OrbitCamera
 from langsplat_viewer.camera.flight import Flight, Keyframe
 from langsplat_viewer.files.browsing import Listing
 from langsplat_viewer.files.flights import Bookmark
 from langsplat_viewer.files.photographs import Photograph
 from langsplat_viewer.files.preferences import Preferences
+from langsplat_viewer.files.projects import Note, Things
 from langsplat_viewer.marks import Move, Selection
 from langsplat_viewer.rendering.depth import UNCLIPPED, Clip
 from langsplat_viewer.rendering.request import (
@@ -220,6 +222,30 @@ class LibraryView:
     thumbnails: Array | None = None  # (H, W, 3) uint8 of the hits listed, one below the other
 
 
+@dataclass(frozen=True, eq=False)
+class OutlineView:
+    """The scene's tree in words, as the panel "Outline" lists it."""
+
+    roots: tuple[Outline, ...] = ()
+    tree: Tree | None = None
+    sizes: Array = field(default_factory=lambda: np.zeros(0, np.int64))  # (K,) Gaussians of every node
+    problem: str = ""  # why there is none, or none yet
+    colours: dict[tuple[str, int, int], Point] = field(default_factory=dict)  # by display, level and node
+
+    @cached_property
+    def _rows(self) -> dict[int, Outline]:
+        found, waiting = {}, list(self.roots)
+        while waiting:
+            row = waiting.pop()
+            found[row.node] = row
+            waiting += row.parts
+        return found
+
+    def row(self, node: int) -> Outline | None:
+        """The row of a node; None where it has none."""
+        return self._rows.get(node)
+
+
 @dataclass(frozen=True)
 class Message:
     """One line of the messages area."""
@@ -270,7 +296,7 @@ class TrainingForm:
     encoder: str = "demo"
 
 
-Gizmo = Literal["off", "move", "rotate", "scale"]
+Gizmo = Literal["off", "move", "rotate", "scale", "box"]
 
 
 @dataclass(frozen=True)
@@ -283,6 +309,8 @@ class EditForm:
     scale: float = 1.0
     low: Point = (-1.0, -1.0, -1.0)  # two opposite corners of the box that is cropped to
     high: Point = (1.0, 1.0, 1.0)
+    clips: bool = False  # what lies outside it is hidden
+    clipped: tuple[Point, Point] | None = None  # the box that it was last done for
 
 
 @dataclass(eq=False)
@@ -307,8 +335,12 @@ class SceneState:
     record: Recording = field(default_factory=Recording)
     hover: Hover | None = None
     ruler: Ruler = field(default_factory=Ruler)
+    notes: tuple[Note, ...] = ()
+    project: Path | None = None  # the file that all this is saved to again
     selection: Selection = field(default_factory=Selection)
 
+    outline: OutlineView | None = None  # once it was wanted
+    things: Things = field(default_factory=Things)
     queries: list[Query] = field(default_factory=list)
     selected: Query | None = None  # whose details are shown
     evidence: EvidenceSheet | None = None  # in a window of its own, while that is open
@@ -330,6 +362,7 @@ class ViewerState(SceneState):
     latent_level: int = 2  # index into scene.LEVELS
     settings: ViewSettings = field(default_factory=ViewSettings)
     level: LevelChoice = "auto"
+    pins_notes: bool = False  # a click on the scene pins one
     pointing: bool = False  # it is said what lies under the cursor
     fly_speed: float = 0.5  # scene radii per second
     walks: bool = False  # the keys fly level, as one walks
@@ -344,6 +377,7 @@ class ViewerState(SceneState):
     training_form: TrainingForm = field(default_factory=TrainingForm)
     edit_form: EditForm = field(default_factory=EditForm)
     path_typed: str = ""
+    outline_typed: str = ""  # what its rows are filtered by
     messages: list[Message] = field(default_factory=list)
     timing: Timing = field(default_factory=Timing)
     stats: FrameStats = field(default_factory=FrameStats)
@@ -354,9 +388,13 @@ class ViewerState(SceneState):
     show_help: bool = False
     show_palette: bool = False
     resets_panels: bool = False  # at the next frame
+    shows_panels: tuple[
+        str, ...
+    ] = ()  # titles of those that alone are open from the next frame on; (): as they are
     palette_typed: str = ""
     browser: Listing | None = None  # the folder that the file browser shows, while it is open
-    picks_folder: Literal["", "photographs", "library"] = ""  # what it is there to choose a folder for
+    picks_folder: Literal["", "photographs", "library", "dataset"] = ""  # what it chooses a folder for
+    picks_beside: bool = False  # it chooses a scene to be shown beside this one
     library: LibraryView | None = None  # scenes of a folder, and what was looked for in them
     library_typed: str = ""
     preferences: Preferences = field(default_factory=Preferences)

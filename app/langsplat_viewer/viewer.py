@@ -20,12 +20,13 @@ from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.camera.flight import Keyframe
 from langsplat_viewer.files.flights import Shelf
+from langsplat_viewer.files.projects import Things
 from langsplat_viewer.files.watching import Stamps, Watch
 from langsplat_viewer.jobs import Job, Worker
-from langsplat_viewer.marks import Pair
+from langsplat_viewer.marks import Histogram, Marks, Pair
 from langsplat_viewer.rendering.depth import Clip
 from langsplat_viewer.rendering.request import RenderRequest
-from langsplat_viewer.state import Query, Ruler, ViewerState
+from langsplat_viewer.state import OutlineView, Query, Ruler, ViewerState
 
 PREVIEW_EVERY = 100  # steps between the checkpoints that can be looked at
 KEPT = 20  # lines of what it says that are kept
@@ -152,6 +153,7 @@ class Visit:
     keyframes: tuple[Keyframe, ...]
     ruler: Ruler
     clip: Clip
+    things: Things
 
 
 def visit_of(state: ViewerState) -> Visit:
@@ -169,6 +171,7 @@ def visit_of(state: ViewerState) -> Visit:
         keyframes=state.record.keyframes,
         ruler=state.ruler,
         clip=state.settings.clip,
+        things=state.things,
     )
 
 
@@ -236,6 +239,11 @@ class Viewer:
     shelf: Shelf = field(default_factory=Shelf)
     engine: QueryEngine | None = None  # of the scene shown; asked on the worker only
     describer: Describer | None = None  # of the same scene, once it was needed
+    histogram: tuple[tuple[object, ...], Histogram | None] | None = None  # the last one, and what it is of
+    pivot: tuple[Scene, Array, Array] | None = None  # of what is selected in which scene, a point (3,)
+    out_of_sight: tuple[OutlineView, Marks, Array] | None = None  # nodes with nothing shown, of which
+    beside: "Viewer | None" = None  # of a second scene, seen and asked as this one is
+    linked: tuple[OrbitCamera | None, tuple[str, ...]] = (None, ())  # view and canonical phrases given to it
     surface: Surface | None = None
     training: Training | None = None  # under way
     history: History = field(default_factory=History)

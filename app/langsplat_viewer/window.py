@@ -9,13 +9,15 @@ from imgui_bundle import glfw_utils  # noqa: F401  isort: skip  (before glfw: it
 import glfw  # isort: skip
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from imgui_bundle import hello_imgui
 
 from langsplat_core.errors import BackendError, InputError
+from langsplat_viewer.files import PROJECTS
 from langsplat_viewer.files.preferences import (
+    FILE_NAME,
     LAYOUT_NAME,
     Preferences,
     fitting_scale,
@@ -30,15 +32,24 @@ from imgui_bundle import ImVec4, imgui, immapp  # isort: skip
 from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
 import moderngl
 
-from langsplat_core.config import Display, LevelChoice, PictureConfig
+from langsplat_core.config import LevelChoice, PictureConfig
 from langsplat_core.errors import LangSplatError
 from langsplat_viewer import fonts
-from langsplat_viewer.actions import filming, opening, queries, selecting, settings, training, viewpoint
+from langsplat_viewer.actions import (
+    beside,
+    filming,
+    opening,
+    queries,
+    selecting,
+    settings,
+    training,
+    viewpoint,
+)
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.files.flights import Shelf
 from langsplat_viewer.jobs import give_memory_back, on_signals, share_one_heap
 from langsplat_viewer.options import chosen_camera, latent_level
-from langsplat_viewer.panels import layout, navigation, overlays
+from langsplat_viewer.panels import layout, navigation, outline, overlays
 from langsplat_viewer.panels.keyboard import Keyboard
 from langsplat_viewer.panels.style import scene_area
 from langsplat_viewer.rendering.renderer import Backend, GlRenderer
@@ -110,6 +121,7 @@ class Remembered:
         except (OSError, InputError) as error:
             self._state.say(f"settings are not remembered: {one_line(error)}", is_error=True)
             return
+        self._state.show_help = not (self._folder / FILE_NAME).exists()  # at the first start
         self._kept = self._state.preferences
         self._state.picture = replace(self._state.picture, colour_map=self._kept.colour_map)
         params.ini_disable = False
@@ -171,14 +183,13 @@ class WindowRequest:
     path: Path
     queries: tuple[str, ...] = ()
     level: LevelChoice = "auto"
-    display: Display = "rgb"
+    picture: PictureConfig = field(default_factory=PictureConfig)
     size: tuple[int, int] | None = None  # of the window, pixels
     camera: str = ""
     orthographic: float | None = None  # world units across the image's shorter side; None: in perspective
     backend: Backend = "auto"
     path_file: Path | None = None  # a camera path
-    heat_opacity: float = PictureConfig.heat_opacity
-    dim: float = PictureConfig.dim
+    beside: Path | None = None  # a second scene
     settings: Path | None = None  # folder of what is remembered between windows; None: nothing is
 
 
@@ -208,9 +219,11 @@ class Window:
         self._hiding, self._column = layout.Hiding(), layout.Column()
         self._remembered = Remembered(request.settings, self.viewer.state)
         self._canvas: Canvas | None = None
+        self._menu = outline.ThingsMenu()
         self._photograph: overlays.PhotographOverlay | None = None
         self._evidence: overlays.EvidenceWindow | None = None
         self._screen: moderngl.Framebuffer | None = None
+        self._second: Canvas | None = None  # of the scene beside it
         self.unfinished = False  # a finer image is due
         self.signals: list[int] = []  # that the process got
         self._obeyed = 0  # of them
@@ -246,6 +259,7 @@ class Window:
         gl.anti_aliasing_samples = 0  # splats gain nothing from it
         params.fps_idling.fps_idle = IDLE_FPS
         params.fps_idling.time_active_after_last_event = AWAKE_SECONDS
+        params.callbacks.default_icon_font = hello_imgui.DefaultIconFont.font_awesome6
         params.callbacks.load_additional_fonts = fonts.load
         params.callbacks.setup_imgui_style = self._remembered.style
         params.callbacks.show_menus = lambda: layout.draw_menus(self.viewer)
@@ -261,17 +275,13 @@ class Window:
         """The GL context is there."""
         try:
             ctx = moderngl.get_context()
-            renderer = self._make_renderer(ctx)
-            # A graphics device draws large scenes as they are.
-            quick = self._make_renderer(ctx) if renderer.backend == "cpu" else None
-            self._canvas = Canvas(ctx, renderer, quick=quick)
+            self._canvas = self._new_canvas(ctx)
             self._photograph = overlays.PhotographOverlay(ctx)
             self._evidence = overlays.EvidenceWindow(ctx)
-            self.viewer.state.backend = renderer.backend
+            self.viewer.state.backend = self._canvas.backend
         except DRAW_ERRORS as error:
             self.failure = BackendError(one_line(error))
             return
-        self._canvas.wake_with(glfw.post_empty_event)
         self._screen = ctx.detect_framebuffer()
         self.viewer.surface = self._canvas
         self.viewer.worker.wake = self.viewer.recorder.wake = glfw.post_empty_event
@@ -282,7 +292,38 @@ class Window:
         glfw.set_drop_callback(glfw_window_hello_imgui(), self._dropped)  # type: ignore[arg-type]
         self.keyboard.listen(glfw_window_hello_imgui())
         settings.open_panel(self.viewer, "Search")  # before what was left over it the last time
-        opening.open_scene(self.viewer, self._request.path, self._first_view)
+        if self._request.path.name.endswith(PROJECTS):  # which says itself how it is looked at
+            opening.open_project(self.viewer, self._request.path, self._ask)
+        else:
+            opening.open_scene(self.viewer, self._request.path, self._first_view)
+
+    def _new_canvas(self, ctx: moderngl.Context) -> Canvas:
+        renderer = self._make_renderer(ctx)
+        # A graphics device draws large scenes as they are.
+        quick = self._make_renderer(ctx) if renderer.backend == "cpu" else None
+        canvas = Canvas(ctx, renderer, quick=quick)
+        canvas.wake_with(glfw.post_empty_event)
+        return canvas
+
+    def _draw_beside(self) -> tuple[moderngl.Texture, ...]:
+        """Bring the image of the second scene up to date."""
+        other = self.viewer.beside
+        if other is None:
+            if self._second is not None:
+                self._second.close()
+                self._second.release()
+                self._second = None
+            return ()
+        if self._second is None:
+            self._second = self._new_canvas(moderngl.get_context())
+        other.surface = self._second
+        self.unfinished |= self._second.update(other.state, imgui.get_time())
+        return self._second.textures[:1]
+
+    def _ask(self, viewer: Viewer) -> None:
+        """Ask what the command line asks."""
+        for phrase in self._request.queries:
+            queries.ask(viewer, phrase)
 
     def _first_view(self, viewer: Viewer) -> None:
         """The scene of the command line is open: do what else the command line asks for."""
@@ -296,14 +337,16 @@ class Window:
             state.say(str(error), is_error=True)
         if request.orthographic is not None:
             viewpoint.open_orthographic(viewer, request.orthographic)
-        looks = replace(state.picture, heat_opacity=request.heat_opacity, dim=request.dim)
-        settings.set_picture(viewer, looks)
+        wanted = request.picture
+        looks = replace(state.picture, heat_opacity=wanted.heat_opacity, dim=wanted.dim)
+        settings.set_picture(viewer, replace(looks, heat_scale=wanted.heat_scale))
         if request.path_file is not None:
             filming.load_path(viewer, request.path_file)
         queries.set_level(viewer, request.level)
-        for phrase in request.queries:
-            queries.ask(viewer, phrase)
-        settings.set_display(viewer, request.display, latent_level(request.level))
+        self._ask(viewer)
+        if request.beside is not None:
+            opening.open_beside(viewer, request.beside)
+        settings.set_display(viewer, wanted.display, latent_level(request.level))
 
     def drop(self, paths: list[str]) -> None:
         """Files were dropped onto the window."""
@@ -324,6 +367,7 @@ class Window:
         self._began = time.perf_counter()
         viewer.take_results()
         viewpoint.tick(viewer, imgui.get_time())
+        beside.follow(viewer)
         training.watch_training(viewer)
         opening.fetch_photograph(viewer)
         navigation.muted_until_clicked(viewer)  # hello_imgui draws the panels after this
@@ -357,7 +401,7 @@ class Window:
         )
         self._last = there
         self._frames = AWAKE_FRAMES if changed else max(self._frames - 1, 0)
-        awaits = self._canvas is not None and self._canvas.waits  # and is woken
+        awaits = any(canvas is not None and canvas.waits for canvas in self._canvases)  # and is woken
         busy = (
             (self.unfinished and not awaits)
             or state.glide is not None
@@ -373,10 +417,15 @@ class Window:
         idling.time_active_after_last_event = 0.0 if awaits else AWAKE_SECONDS
 
     @property
+    def _canvases(self) -> tuple[Canvas | None, ...]:
+        return self._canvas, self._second
+
+    @property
     def is_running(self) -> bool:
         """True while threads are at work that would keep the process."""
-        workers = (self.viewer.worker, self.viewer.recorder)
-        draws = self._canvas is not None and self._canvas.is_running
+        workers = [self.viewer.worker, self.viewer.recorder]
+        workers += [] if self.viewer.beside is None else [self.viewer.beside.worker]
+        draws = any(canvas is not None and canvas.is_running for canvas in self._canvases)
         return draws or any(worker.is_running for worker in workers)
 
     def is_minimised(self) -> bool:
@@ -396,6 +445,7 @@ class Window:
             return
         viewer, area = self.viewer, scene_area()
         layout.draw_over(viewer)
+        self._menu.draw(viewer, area)
         if self._evidence is not None:
             self._evidence.draw(viewer)
         navigation.handle(viewer, area)
@@ -409,13 +459,14 @@ class Window:
             return
         try:
             self.unfinished = canvas.update(state, imgui.get_time())
+            textures = (*canvas.textures, *self._draw_beside())
         except DRAW_ERRORS as error:
-            self.unfinished = False
+            self.unfinished, textures = False, canvas.textures
             state.say(one_line(error), is_error=True)
         self._pace()
         self._screen.use()
         self._screen.color_mask = True, True, True, True  # a mask left set would colour the panels
-        overlays.draw_pictures(viewer, area, canvas.textures)
+        overlays.draw_pictures(viewer, area, textures)
         if self._photograph is not None:
             self._photograph.draw(viewer, area)
         overlays.draw_lines(viewer, area)
@@ -429,8 +480,11 @@ class Window:
         selecting.finish_writing(self.viewer)
         self._remembered.update()
         self.viewer.watch.close()
-        if self._canvas is not None:
-            self._canvas.close()
+        for canvas in self._canvases:
+            if canvas is not None:
+                canvas.close()
+        if self.viewer.beside is not None:
+            self.viewer.beside.worker.close()
         self.viewer.recorder.close(RECORDER_PATIENCE)
         self.viewer.worker.close()
         if self.viewer.training is not None:

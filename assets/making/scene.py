@@ -28,7 +28,7 @@ MAX_LOSS = 0.25  # dB that compaction may cost
 
 # A low SH degree and a cap on the count keep the file small.
 CONFIG = TrainConfig(
-    dataset=DatasetConfig(max_side=max(SIZE), test_every=9),
+    dataset=DatasetConfig(max_side=max(SIZE), test_every=9, hold_out="every"),
     radiance=RadianceConfig(steps=6_000, sh_degree=1, max_gaussians=110_000),
     masks=MaskConfig(source="graph"),
     clip=ClipConfig(model="demo"),

@@ -19,6 +19,7 @@ FLAGS = ("-q", "--quiet", "-v", "--verbose")  # may precede a command
 COMMANDS: Mapping[str, str] = MappingProxyType(
     {
         "train": "train.Train",
+        "frames": "train.Frames",
         "query": "query.QueryScene",
         "find": "find.Find",
         "changes": "find.Changes",

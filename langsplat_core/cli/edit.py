@@ -13,6 +13,7 @@ from langsplat_core.cli.run import OutputConsole
 from langsplat_core.compaction.clean import CleanReport, clean_scene
 from langsplat_core.config import CleanConfig, Positive, Range
 from langsplat_core.errors import InputError
+from langsplat_core.io.files import check_keeps
 from langsplat_core.io.scenes import check_writable, load_scene, save_scene
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.selection import above_plane, in_box, in_sphere
@@ -166,8 +167,7 @@ def _lines(report: CleanReport) -> list[str]:
 def _check(scene: Path, out: Path) -> None:
     """InputError for what needs no scene to be known: it should not cost the loading of one."""
     check_writable(out)
-    if out.resolve() == scene.resolve():
-        raise InputError(f"{out}: would replace the original scene; choose another name")
+    check_keeps(out, scene)
 
 
 def _extent(scene: Scene) -> str:

@@ -14,7 +14,7 @@ from langsplat_core.config import Count, LevelChoice, Positive
 from langsplat_core.errors import InputError, optional_imports
 from langsplat_core.geometry.merge import merge
 from langsplat_core.io.cameras import numbers
-from langsplat_core.io.files import atomic_path
+from langsplat_core.io.files import atomic_path, check_keeps
 from langsplat_core.io.hostile import read_json_file
 from langsplat_core.io.scenes import check_writable, load_scene, save_scene
 from langsplat_core.io.shapes import MESH_SUFFIXES, check_suffix, gltf_axes, write_meshes
@@ -58,8 +58,7 @@ class Mesh:
         from langsplat_core.geometry.mesh import close_holes, fuse
 
         check_suffix(self.out, MESH_SUFFIXES)
-        if self.out.resolve() == self.scene.resolve():
-            raise InputError(f"{self.out}: would replace the original scene; choose another name")
+        check_keeps(self.out, self.scene)
         scene = searchable(self.scene) if self.phrase else load_scene(self.scene)
         unit = unit_of(scene)
         if self.phrase:
@@ -131,8 +130,7 @@ class Merge:
     @optional_imports()
     def run(self) -> None:
         check_writable(self.out)
-        if self.out.resolve() in (self.first.resolve(), self.second.resolve()):
-            raise InputError(f"{self.out}: would replace an original scene; choose another --out")
+        check_keeps(self.out, self.first, self.second)
         if self.as_is and self.transform is not None:
             raise InputError("--as-is moves nothing, --transform does; give one of them")
         first, second = load_scene(self.first), load_scene(self.second)

@@ -16,7 +16,7 @@ from langsplat_core.cli.run import OutFile
 from langsplat_core.cli.teach import camera_of, pointed, searchable
 from langsplat_core.config import Count, CountOrZero, LevelChoice, NotNegative, PictureConfig, Positive
 from langsplat_core.errors import EncoderError, InputError, LangSplatError
-from langsplat_core.io.files import atomic_path
+from langsplat_core.io.files import atomic_path, check_keeps
 from langsplat_core.io.language import read_words
 from langsplat_core.io.scenes import check_writable, save_scene
 from langsplat_core.io.shapes import (
@@ -355,8 +355,7 @@ class Select:
             raise InputError(
                 "--as hull is the shape of things; what is left after --remove is written as points"
             )
-        if self.out.resolve() == self.scene.resolve():
-            raise InputError(f"{self.out}: would replace the original scene; choose another --out")
+        check_keeps(self.out, self.scene)
         folder = self.out.parent
         if not folder.is_dir():
             raise InputError(f"{folder}: no such folder for {self.out.name}; make it first")

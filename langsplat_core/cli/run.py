@@ -171,7 +171,7 @@ def _run(program: str, parser: Callable[[], Command]) -> None:
     logging.basicConfig(handlers=[handler])
     warnings.filterwarnings("ignore", module=r"(torch|transformers|huggingface_hub|numba)(\.|$)")
     began = time.perf_counter()
-    with _sigterm_raises():
+    with _signals_raise():
         check_arguments(command)
         command.run()
     log.debug("%s %s: %.1f s", program, __version__, time.perf_counter() - began)
@@ -194,7 +194,7 @@ def _ended(program: str, error: BaseException) -> int:
 
 
 @contextlib.contextmanager
-def _sigterm_raises() -> Iterator[None]:
+def _signals_raise() -> Iterator[None]:
     """Have SIGTERM end a command as Ctrl-C does: with what is finished kept, and a line."""
 
     def terminate(number: int, frame: FrameType | None) -> None:
@@ -203,11 +203,15 @@ def _sigterm_raises() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGTERM, terminate)
+    own = {signal.SIGTERM: terminate, signal.SIGINT: signal.default_int_handler}
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # started in a shell's background
+        del own[signal.SIGINT]
+    before = {number: signal.signal(number, handler) for number, handler in own.items()}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before if before is not None else signal.SIG_DFL)
+        for number, handler in before.items():
+            signal.signal(number, handler if handler is not None else signal.SIG_DFL)
 
 
 class _StandardError(io.FileIO):

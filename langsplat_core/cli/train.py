@@ -13,7 +13,16 @@ from typing import Annotated, Any, Literal, get_args
 import tyro
 
 from langsplat_core.cli.run import OutFile, OutFolder, codec_settings, named, one_line
-from langsplat_core.config import PAPER, TrainConfig, TrainPreset, TrainProfile, check_settings, with_preset
+from langsplat_core.config import (
+    PAPER,
+    DatasetConfig,
+    FrameCount,
+    TrainConfig,
+    TrainPreset,
+    TrainProfile,
+    check_settings,
+    with_preset,
+)
 from langsplat_core.errors import InputError
 from langsplat_core.progress import LineProgress, Progress, TerminalProgress, silent
 
@@ -26,7 +35,7 @@ class Train:
     plain folder of photographs. An interrupted run continues where it stopped."""
 
     dataset: tyro.conf.Positional[Path]
-    """Folder of photographs, COLMAP project folder, or transforms.json."""
+    """Folder of photographs, video, COLMAP project folder, or transforms.json."""
     out: OutFile
     """The scene to write, *.ply; its language field and cameras are written beside it."""
     work: OutFolder | None = None
@@ -47,6 +56,7 @@ class Train:
 
     def run(self) -> None:
         # They import torch: seconds that --help need not pay.
+        from langsplat_core.datasets.capture import shortened
         from langsplat_core.pipeline.forecast import Forecast, count_photographs, forecast_in_words, plan
         from langsplat_core.pipeline.stages import join_processes
         from langsplat_core.pipeline.train import train_scene
@@ -71,7 +81,11 @@ class Train:
             )
         if not processes.is_main:
             return
-        psnr = "no held-out views" if report.psnr is None else f"held-out PSNR {report.psnr:.2f} dB"
+        psnr = (
+            "none held out, so that nothing was measured"
+            if report.psnr is None
+            else f"held-out PSNR {report.psnr:.2f} dB ({shortened(v.name for v in report.held_out_views)})"
+        )
         print(
             f"{self.out}: {report.gaussians} Gaussians from {report.views} photographs, {psnr}; "
             f"{report.mask_count} masks by {report.masks}, encoder {report.encoder}; "
@@ -81,6 +95,26 @@ class Train:
         )
         for warning in report.warnings:
             print(f"warning: {warning}")
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Take photographs out of a video: the sharpest image of each of COUNT equal parts. `langsplat train`
+    does it by itself for a video; this is to look at them, and to sort out."""
+
+    video: tyro.conf.Positional[Path]
+    """The video: mp4, mov, m4v, mkv, webm or avi."""
+    out: OutFolder
+    """Folder for frame_0001.jpg ...; a new one."""
+    count: FrameCount = DatasetConfig.frames
+    """At most, of the whole video: two or three a second of a slow walk around something."""
+
+    def run(self) -> None:
+        from langsplat_core.datasets.video import extract_frames
+
+        with TerminalProgress() as progress:
+            written = extract_frames(self.video, self.out, self.count, progress)
+        print(f"{self.out}: {len(written)} photographs; next: langsplat train {self.out} --out scene.ply")
 
 
 def train_command(args: Sequence[str]) -> type[Train]:

@@ -35,6 +35,7 @@ from langsplat_core.compaction.compact import (
 )
 from langsplat_core.config import CleanConfig, check_settings
 from langsplat_core.errors import InputError
+from langsplat_core.io.files import check_keeps
 from langsplat_core.io.scenes import check_writable, load_scene, save_scene
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster import load_rasterizer
@@ -280,8 +281,7 @@ def clean_scene(
 ) -> CleanReport:
     """Write the scene `source` without its floaters to `out`, with all that belongs to it; see `clean`."""
     check_writable(out)
-    if out.resolve() == source.resolve():
-        raise InputError(f"{out}: would replace the original scene; choose another name")
+    check_keeps(out, source)
     check_settings(config)
     scene = load_scene(source)
     views = choose_views(scene, photos, config, progress)

@@ -7,7 +7,9 @@ from pathlib import Path
 from langsplat_core.config import DatasetConfig, check_settings
 from langsplat_core.datasets.capture import Capture, metres_of
 from langsplat_core.datasets.colmap import find_model, load_colmap
+from langsplat_core.datasets.holdout import split
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
+from langsplat_core.datasets.video import is_video, kept_frames
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import shown
 from langsplat_core.progress import Progress, silent
@@ -16,7 +18,7 @@ __all__ = ["Capture", "load_capture", "load_photographs"]
 
 ACCEPTED = (
     "a folder with transforms.json (nerfstudio) or that file, a folder with sparse/0 and images (COLMAP), "
-    "or a folder of at least three photographs (jpg, png, webp, tif, bmp, avif)"
+    "a folder of at least three photographs (jpg, png, webp, tif, bmp, avif, heic), or a video"
 )
 
 
@@ -38,7 +40,7 @@ def load_capture(path: Path, config: DatasetConfig, work: Path, progress: Progre
     # pycolmap is imported where something is computed: a dataset with cameras and points does without.
     from langsplat_core.datasets.known_poses import add_points
 
-    return add_points(capture, capture.split(config.test_every)[0], work, progress)
+    return add_points(capture, split(capture, config)[0], work, progress)
 
 
 def load_photographs(path: Path, config: DatasetConfig, work: Path, progress: Progress = silent) -> Capture:
@@ -64,6 +66,8 @@ def _load(path: Path, config: DatasetConfig, work: Path, progress: Progress) -> 
         return load_colmap(path, model, max_side, progress)
     from langsplat_core.datasets.sfm import load_photos, photo_folder
 
+    if is_video(path):
+        path = kept_frames(path, config.frames, work, progress)
     photos = photo_folder(path)
     if photos is None:
         raise InputError(f"{path} is no dataset; expected {ACCEPTED}")

@@ -52,6 +52,7 @@ class Album:
 
 log = logging.getLogger("langsplat")
 
+HALF = 128  # grey of a mask's pixels, from which they count
 ASPECT_TOLERANCE = 0.02  # shrunk copies round their sizes
 WORKERS = 2  # decoding and resampling release the interpreter; more would only hold more pixels
 
@@ -65,6 +66,7 @@ class Photo:
     intrinsics: PhotoIntrinsics
     world_to_camera: Array  # (4, 4) float64, rigid
     upright: bool = False  # the lens describes the photograph turned as its EXIF data ask
+    mask: Path | None = None  # an image of the same shape, black where the photograph does not count
 
 
 def find_photos(folder: Path) -> list[Path]:
@@ -73,6 +75,15 @@ def find_photos(folder: Path) -> list[Path]:
         return []
     found = (p for p in folder.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES and p.name[0] != ".")
     return sorted(p for p in found if p.is_file())
+
+
+def mask_beside(photo: Path) -> Path | None:
+    """The mask of a photograph where COLMAP and nerfstudio keep it: masks/NAME.jpg.png or masks/NAME.png, in
+    its folder or beside that."""
+    folders = (photo.parent / "masks", photo.parent.parent / "masks")
+    names = (f"{photo.name}.png", f"{photo.stem}.png")
+    candidates = (folder / name for folder in folders for name in names)
+    return next((path for path in candidates if path != photo and path.is_file()), None)
 
 
 def shortened(names: Iterable[str], limit: int = 5, width: int = 200) -> str:
@@ -143,6 +154,17 @@ def _read_for(photo: Photo) -> tuple[Image.Image, PhotoIntrinsics]:
         raise InputError(f"{photo.path}: {error}; export the cameras again") from None
 
 
+def _read_mask(path: Path, size: tuple[int, int]) -> Image.Image:
+    """The mask of a photograph of `size` pixels, as large. InputError for one of another shape."""
+    mask = read_photo(path, upright=False)
+    if abs(mask.width * size[1] / (mask.height * size[0]) - 1) > ASPECT_TOLERANCE:
+        raise InputError(
+            f"{path}: is {mask.width}x{mask.height} pixels, its photograph {size[0]}x{size[1]}; a mask has "
+            "the shape of the photograph as it is shown"
+        )
+    return mask.resize(size, Image.Resampling.NEAREST)
+
+
 def _fits(size: tuple[int, int], intrinsics: PhotoIntrinsics) -> bool:
     ratio = (size[0] * intrinsics.height) / (size[1] * intrinsics.width)
     return (
@@ -151,9 +173,10 @@ def _fits(size: tuple[int, int], intrinsics: PhotoIntrinsics) -> bool:
     )
 
 
-def developer(max_side: int) -> Callable[[Photo], tuple[Camera, Array]]:
-    """Return the function that makes a pinhole camera, yet without a name, and a (H, W, 3) uint8 image of
-    at most `max_side` pixels of a photograph. It raises PictureError for a file that cannot be read."""
+def developer(max_side: int) -> Callable[[Photo], tuple[Camera, Array, Array | None]]:
+    """Return the function that makes a pinhole camera, yet without a name, a (H, W, 3) uint8 image of at most
+    `max_side` pixels of a photograph, and its (H, W) bool mask, if it has one. It raises PictureError for a
+    file that cannot be read."""
 
     # Photographs of one lens share its pinhole and its map; a few maps are kept, not one per photograph.
     @lru_cache(maxsize=4)
@@ -161,19 +184,24 @@ def developer(max_side: int) -> Callable[[Photo], tuple[Camera, Array]]:
         camera = pinhole_for(intrinsics, max_side)
         return camera, None if intrinsics.distortion is None else source_positions(intrinsics, camera)
 
-    def one(photo: Photo) -> tuple[Camera, Array]:
+    def one(photo: Photo) -> tuple[Camera, Array, Array | None]:
         picture, intrinsics = _read_for(photo)
         camera, positions = plan(intrinsics)
         pose = replace(camera, world_to_camera=photo.world_to_camera)
-        return pose, resample(picture, intrinsics, camera, positions)
+        image = resample(picture, intrinsics, camera, positions)
+        if photo.mask is None:
+            return pose, image, None
+        mask = resample(_read_mask(photo.mask, picture.size), intrinsics, camera, positions)
+        return pose, image, np.asarray(mask[..., 0] >= HALF)
 
     return one
 
 
 def develop(
     photos: Sequence[Photo], max_side: int, progress: Progress
-) -> tuple[tuple[Camera, ...], tuple[Array, ...], tuple[Photo, ...]]:
-    """Pinhole cameras and (H, W, 3) uint8 images of `photos`, sorted by name, and what each is made from.
+) -> tuple[tuple[Camera, ...], tuple[Array, ...], tuple[Photo, ...], tuple[Array | None, ...]]:
+    """Pinhole cameras and (H, W, 3) uint8 images of `photos`, sorted by name, what each is made from, and
+    (H, W) bool masks; none at all where no photograph has one.
 
     Files that cannot be read are reported once and left out; InputError when none is left.
     """
@@ -183,31 +211,31 @@ def develop(
     order = sorted(range(len(photos)), key=names.__getitem__)
     read = developer(max_side)
 
-    def one(index: int) -> tuple[Camera, Array, Photo] | str:
+    def one(index: int) -> tuple[Camera, Array, Photo, Array | None] | str:
         photo = photos[index]
         try:
-            camera, picture = read(photo)
+            camera, picture, mask = read(photo)
         except PictureError as error:
             return f"{photo.label} ({error.reason})"
-        return replace(camera, name=names[index]), picture, photo
+        return replace(camera, name=names[index]), picture, photo, mask
 
     album = Album()
-    done: list[tuple[Camera, Array, Photo]] = []
+    done: list[tuple[Camera, Array, Photo, Array | None]] = []
     broken: list[str] = []
     with ThreadPoolExecutor(WORKERS) as pool:
         for count, result in enumerate(pool.map(one, order), 1):
             if isinstance(result, str):
                 broken.append(result)
             else:
-                camera, picture, photo = result
-                done.append((camera, album.keep(picture), photo))
+                camera, picture, photo, mask = result
+                done.append((camera, album.keep(picture), photo, mask))
             progress("reading photographs", count / len(order))
     if not done:
         raise InputError(f"no photograph can be read: {shortened(broken)}")
     if broken:
         log.warning("%d photographs cannot be read and are left out: %s", len(broken), shortened(broken))
-    cameras, images, files = zip(*done, strict=True)
-    return cameras, images, files
+    cameras, images, files, masks = zip(*done, strict=True)
+    return cameras, images, files, masks if any(mask is not None for mask in masks) else ()
 
 
 # A capture: photographs with known cameras, as every loader returns them.
@@ -238,6 +266,7 @@ class Capture:
     metres_per_unit: float | None = None  # > 0, how long a unit of its world is; None: unknown
     photos: tuple[Photo, ...] = ()  # the files, in the same order; none for images made otherwise
     drawn: bool = False  # by `assets.making`, where encoders are calibrated, see `scene.Reading.elsewhere`
+    masks: tuple[Array | None, ...] = ()  # (H, W) bool each, pixels that count; None: all; (): no masks
 
     def __post_init__(self) -> None:
         if len(self.cameras) != len(self.images):
@@ -248,9 +277,18 @@ class Capture:
         check_array("colours", self.colours, ("M", 3), dims)
         if self.photos and len(self.photos) != len(self.images):
             raise ValueError(f"{len(self.photos)} files for {len(self.images)} photographs")
+        if self.masks and len(self.masks) != len(self.images):
+            raise ValueError(f"{len(self.masks)} masks for {len(self.images)} photographs")
+        for camera, mask in zip(self.cameras, self.masks, strict=False):
+            if mask is not None:
+                check_array(f"mask of {camera.name}", mask, (camera.height, camera.width), dtype=np.bool_)
 
     def __len__(self) -> int:
         return len(self.cameras)
+
+    def mask(self, index: int) -> Array | None:
+        """(H, W) bool, pixels of photograph `index` that count; None: all of them."""
+        return self.masks[index] if self.masks else None
 
     def split(self, test_every: int) -> tuple[list[int], list[int]]:
         """Indices of (training, held-out) views; every `test_every`-th is held out, 0 holds out none.
@@ -271,6 +309,8 @@ class Capture:
             digest.update(repr((camera.name, camera.intrinsics)).encode())
             digest.update(_rounded(camera.world_to_camera).tobytes())
             digest.update(np.ascontiguousarray(image).data)
+        for mask in (self.mask(i) for i in indices):
+            digest.update(b"" if mask is None else np.packbits(mask).tobytes())
         digest.update(_rounded(self.points).tobytes())
         digest.update(self.colours.tobytes())
         return digest.hexdigest()

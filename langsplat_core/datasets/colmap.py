@@ -21,6 +21,7 @@ from langsplat_core.datasets.capture import (
     Photo,
     develop,
     find_photos,
+    mask_beside,
     shortened,
     tell_of_lost_points,
 )
@@ -355,8 +356,8 @@ def load_colmap(folder: Path, model_folder: Path, max_side: int, progress: Progr
             len(there),
             present,
         )
-    cameras, images, files = develop(there, max_side, progress)
-    return Capture(cameras, images, *good_points(model), photos=files)
+    cameras, images, files, masks = develop(there, max_side, progress)
+    return Capture(cameras, images, *good_points(model), photos=files, masks=masks)
 
 
 def _photo_folder(folder: Path, model: SparseModel) -> Path:
@@ -374,7 +375,13 @@ def located_photos(model: SparseModel, photo_folder: Path, source: Path) -> list
             raise FormatError(f"{source}: camera {camera_id}: {error}; export the model again") from None
     by_name = {image.name: image for image in model.images}
     return [
-        Photo(photo_folder / name, name, by_id[image.camera_id], image.world_to_camera)
+        Photo(
+            photo_folder / name,
+            name,
+            by_id[image.camera_id],
+            image.world_to_camera,
+            mask=mask_beside(photo_folder / name),
+        )
         for name, image in by_name.items()
     ]
 

@@ -132,7 +132,7 @@ def _write_pictures(
         progress("preparing photographs", count / len(views))
         camera, image = capture.cameras[index], capture.images[index]
         if capture.photos:
-            camera, image = enlarge(capture.photos[index])
+            camera, image, _ = enlarge(capture.photos[index])
         Image.fromarray(image).save(folder / name, compress_level=1)
         cameras.append(camera)
     progress("preparing photographs", 1.0)

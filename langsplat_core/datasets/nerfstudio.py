@@ -15,7 +15,14 @@ from typing import Any
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.capture import Capture, Photo, develop, shortened, tell_of_lost_points
+from langsplat_core.datasets.capture import (
+    Capture,
+    Photo,
+    develop,
+    mask_beside,
+    shortened,
+    tell_of_lost_points,
+)
 from langsplat_core.datasets.intrinsics import BrownDistortion, Distortion, FisheyeDistortion, PhotoIntrinsics
 from langsplat_core.errors import FormatError, InputError, printable_line, quoted
 from langsplat_core.io.hostile import PHOTO_SUFFIXES, PictureError, picture_size, read_json_file
@@ -52,14 +59,15 @@ def load_nerfstudio(file: Path, max_side: int, progress: Progress) -> Capture:
             missing.append(label)
             continue
         try:
-            photos[label] = Photo(path, label, _lens({**top, **frame}, size), _pose(frame))
+            mask = _mask_file(file.parent, frame) or mask_beside(path)
+            photos[label] = Photo(path, label, _lens({**top, **frame}, size), _pose(frame), mask=mask)
         except ValueError as error:
             raise FormatError(f"{where} ({printable_line(label, 60)}): {error}") from None
     _report_missing(file, missing, len(frames))
-    cameras, images, files = develop(list(photos.values()), max_side, progress)
+    cameras, images, files, masks = develop(list(photos.values()), max_side, progress)
     points, colours = _points(file, top.get("ply_file_path"))
     drawn = top.get("drawn") is True  # ours, of `python -m assets.making dataset`
-    return Capture(cameras, images, points, colours, _metres_per_unit(file, top), files, drawn)
+    return Capture(cameras, images, points, colours, _metres_per_unit(file, top), files, drawn, masks)
 
 
 def _metres_per_unit(file: Path, top: Json) -> float | None:
@@ -97,6 +105,16 @@ def _photo_file(folder: Path, label: str) -> Path | None:
     candidates = (f"{folder / label}{suffix}" for suffix in ("", *PHOTO_SUFFIXES))
     # os.path.isfile, unlike Path.is_file, also says no to names that no file system could hold.
     return next((Path(candidate) for candidate in candidates if os.path.isfile(candidate)), None)
+
+
+def _mask_file(folder: Path, frame: Json) -> Path | None:
+    """What "mask_path" names; ValueError where that is no file."""
+    label = frame.get("mask_path")
+    if label is None:
+        return None
+    if not isinstance(label, str) or not os.path.isfile(folder / label):
+        raise ValueError(f'"mask_path" names no file: {reprlib.repr(label)}')
+    return folder / label
 
 
 def _number(values: Json, key: str, default: float | None = None) -> float:

@@ -16,7 +16,15 @@ from typing import Any, TypeAlias
 import numpy as np
 from PIL import Image
 
-from langsplat_core.datasets.capture import Capture, Photo, develop, find_photos, read_photo, shortened
+from langsplat_core.datasets.capture import (
+    Capture,
+    Photo,
+    develop,
+    find_photos,
+    mask_beside,
+    read_photo,
+    shortened,
+)
 from langsplat_core.datasets.colmap import SparseModel, good_points, has_model, located_photos, read_model
 from langsplat_core.datasets.intrinsics import pycolmap
 from langsplat_core.errors import FormatError, InputError
@@ -82,6 +90,7 @@ def _on_film(inner: dict[int, Any], size: tuple[int, int]) -> dict[int, int]:
 EXHAUSTIVE_LIMIT = 80  # photographs; beyond, matching every pair costs too much
 SEQUENTIAL_OVERLAP = 10  # neighbours in name order that each photograph is matched with
 FEATURES = 8192  # per photograph
+MASKS = "masks"  # in the workspace: black where no features are wanted
 SMALL_SIDE = 1000  # px; smaller photographs are doubled before features are sought, as SIFT proposes
 EXTRACT_BATCH = 8  # photographs per step: a step is the unit of progress and of resuming
 MATCH_BATCH = 64  # pairs per step
@@ -149,16 +158,18 @@ def _register(database: Path, images: Path, group: Group) -> None:
             image_path=images,
             camera_mode=pycolmap.CameraMode.SINGLE,
             image_names=lacking,
-            options=_reader(group, known.get(group.names[0], -1)),
+            options=_reader(group, known.get(group.names[0], -1), images.with_name(MASKS)),
         )
 
 
-def _reader(group: Group, camera_id: int) -> "pycolmap.ImageReaderOptions":
+def _reader(group: Group, camera_id: int, masks: Path) -> "pycolmap.ImageReaderOptions":
     """Options to take in photographs of a group; with -1 COLMAP makes a new camera for them."""
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = group.model
     reader.camera_params = group.params
     reader.existing_camera_id = camera_id
+    if masks.is_dir():
+        reader.mask_path = masks
     return reader
 
 
@@ -176,7 +187,7 @@ def _extract(database: Path, images: Path, group: Group, names: Sequence[str]) -
         image_path=images,
         image_names=lacking,
         camera_mode=pycolmap.CameraMode.SINGLE,
-        reader_options=_reader(group, known[group.names[0]].camera_id),
+        reader_options=_reader(group, known[group.names[0]].camera_id, images.with_name(MASKS)),
         extraction_options=options,
         device=pycolmap.Device.cpu,
     )
@@ -267,7 +278,7 @@ def store_model(model: "pycolmap.Reconstruction", folder: Path) -> None:
     unfinished.rename(folder / "sparse")
     for name in ("database.db", "pairs.txt"):
         (folder / name).unlink(missing_ok=True)
-    for name in ("images", "attempts"):
+    for name in ("images", MASKS, "attempts"):
         shutil.rmtree(folder / name, ignore_errors=True)
 
 
@@ -284,6 +295,13 @@ FEWEST_FEATURES = 50  # fewer rarely give `FEWEST_MATCHES`
 LEFT_OUT = "left_out.json"  # in the workspace: which photographs have no camera, and why
 # For first pairs of a walk straight ahead: degrees between rays, share of motion that is forward, matches.
 _CLOSE_PAIRS = {"init_min_tri_angle": 4.0, "init_max_forward_motion": 1.0, "init_min_num_inliers": 50}
+# For long walks: each photograph shares little with those before it, and what it shares lies far ahead.
+_FEW_SHARED = _CLOSE_PAIRS | {
+    "init_min_tri_angle": 2.0,
+    "abs_pose_min_num_inliers": FEWEST_MATCHES,
+    "abs_pose_min_inlier_ratio": 0.1,
+    "filter_min_tri_angle": 0.5,
+}
 
 Model: TypeAlias = pycolmap.Reconstruction
 
@@ -351,16 +369,24 @@ def _take_out_the_badly_held(model: Model) -> None:
 
 
 def _incremental(
-    folder: Path, attempts: Path, advance: Callable[[], None], first_pairs: dict[str, float]
+    folder: Path,
+    attempts: Path,
+    advance: Callable[[], None],
+    limits: dict[str, float],
+    trust_exif: bool = False,
 ) -> Collection[Model]:
-    """One photograph after the other, onto a first pair."""
+    """One photograph after the other, onto a first pair. `limits`: of COLMAP's mapper. With `trust_exif`
+    focal lengths stay what EXIF data say, if they say it for all: what lies far ahead looks much the same
+    from any distance through another lens."""
     options = pycolmap.IncrementalPipelineOptions()
     options.min_model_size = 3
     options.max_num_models = 5
     options.random_seed = 0
     options.triangulation.random_seed = 0
     options.num_threads = 1  # sums of several threads differ from run to run
-    options.mapper.mergedict(first_pairs)
+    options.mapper.mergedict(limits)
+    if trust_exif and _all_focal_lengths_known(folder):
+        options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = False
     models: dict[int, Model] = pycolmap.incremental_mapping(
         database_path=folder / "database.db",
         image_path=folder / "images",
@@ -369,6 +395,11 @@ def _incremental(
         next_image_callback=advance,
     )
     return models.values()
+
+
+def _all_focal_lengths_known(folder: Path) -> bool:
+    with pycolmap.Database.open(folder / "database.db") as database:
+        return all(camera.has_prior_focal_length for camera in database.read_all_cameras())
 
 
 def _all_at_once(folder: Path, attempts: Path, advance: Callable[[], None]) -> Collection[Model]:
@@ -394,9 +425,10 @@ def _all_at_once(folder: Path, attempts: Path, advance: Callable[[], None]) -> C
 
 
 WAYS: tuple[Callable[[Path, Path, Callable[[], None]], Collection[Model]], ...] = (
-    partial(_incremental, first_pairs={}),
-    partial(_incremental, first_pairs=_CLOSE_PAIRS),
+    partial(_incremental, limits={}),
+    partial(_incremental, limits=_CLOSE_PAIRS),
     _all_at_once,
+    partial(_incremental, limits=_FEW_SHARED, trust_exif=True),
 )
 
 
@@ -473,7 +505,8 @@ def load_photos(
             f"{folder} has {len(paths)} photographs; at least {MIN_PHOTOS} are needed: {_ADVICE}"
         )
     contents = [(path.name, _content(path)) for path in paths]
-    workspace = open_workspace(work, ["photographs", 3, SFM_SIDE, contents])
+    masked = [(path.name, _content(mask)) for path in paths if (mask := mask_beside(path))]
+    workspace = open_workspace(work, ["photographs", 3, SFM_SIDE, contents, *([masked] if masked else [])])
     numbered = {f"{index:05d}.jpg": path for index, path in enumerate(paths)}
     if not has_model(workspace / "sparse"):
         _reconstruct(workspace, numbered, progress)
@@ -495,11 +528,11 @@ def load_photos(
         )
     located = located_photos(model, workspace / "images", workspace / "sparse")
     photos = [
-        Photo(numbered[p.label], numbered[p.label].name, p.intrinsics, p.world_to_camera, upright=True)
-        for p in located
+        Photo(path, path.name, p.intrinsics, p.world_to_camera, upright=True, mask=mask_beside(path))
+        for p, path in ((p, numbered[p.label]) for p in located)
     ]
-    cameras, images, files = develop(photos, max_side, progress)
-    return Capture(cameras, images, *good_points(model), photos=files)
+    cameras, images, files, masks = develop(photos, max_side, progress)
+    return Capture(cameras, images, *good_points(model), photos=files, masks=masks)
 
 
 def _content(path: Path) -> str:
@@ -562,6 +595,9 @@ def _small_copies(folder: Path, numbered: dict[str, Path], progress: Progress) -
         try:
             if not (folder / name).is_file():
                 _write_copy(path, folder / name)
+            mask = mask_beside(path)
+            if mask and not (folder.with_name(MASKS) / f"{name}.png").is_file():
+                _write_mask(mask, folder / name, folder.with_name(MASKS) / f"{name}.png")
             with opened(folder / name) as copy:
                 exif = copy.getexif()
                 lens = str(dict(exif) | dict(exif.get_ifd(_EXIF_IFD)))
@@ -581,6 +617,15 @@ def _write_copy(path: Path, copy: Path) -> None:
     picture.thumbnail((SFM_SIDE, SFM_SIDE), Image.Resampling.LANCZOS)
     with atomic_path(copy) as temporary:
         picture.save(temporary, quality=95, exif=optics(path))
+
+
+def _write_mask(mask: Path, copy: Path, out: Path) -> None:
+    """A mask as COLMAP reads it, as large as the copy of its photograph."""
+    with opened(copy) as picture:
+        size = picture.size
+    out.parent.mkdir(exist_ok=True)
+    with atomic_path(out) as temporary:
+        read_photo(mask, upright=False).convert("L").resize(size, Image.Resampling.NEAREST).save(temporary)
 
 
 def _groups(copies: list[_Copy]) -> list[Group]:

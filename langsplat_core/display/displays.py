@@ -132,12 +132,13 @@ def _by_slot(subject: Subject, values_of: Callable[[Answer], Array]) -> Array | 
     return values
 
 
-def heat_ranges(answers: Answers) -> Ranges:
-    """Relevancies at which the heat of each slot is 0 and 1; a weak match gets no hotter than a half."""
-    return _weakened(answers, lambda answer: answer.heat_range)
+def heat_ranges(answers: Answers, scale: tuple[float, float] | None = None) -> Ranges:
+    """Relevancies at which the heat of each slot is 0 and 1, by one `scale` or by each answer's own; a weak
+    match gets no hotter than a half."""
+    return _weakened(answers, lambda answer: scale or answer.heat_range)
 
 
-def member_ranges(answers: Answers) -> Ranges:
+def member_ranges(answers: Answers, scale: tuple[float, float] | None = None) -> Ranges:
     """Range of members for each slot, which are 0 or 1; a weak match is half as opaque."""
     return _weakened(answers, lambda answer: (0.0, 1.0))
 
@@ -335,7 +336,8 @@ class DisplayRow:
     draw: Callable[[_Sheet], Array]  # (H, W, 3 or 4) in [0, 1]
     glsl: str
     channel: Callable[[Subject], Array | None] | Literal["depth"] | None = None  # (N, 1 to 3), or camera z
-    ranges: Callable[[Answers], Ranges] = lambda answers: ()
+    # of the answers, by `PictureConfig.heat_scale`
+    ranges: Callable[[Answers, tuple[float, float] | None], Ranges] = lambda answers, scale: ()
     is_colour: bool = False  # its channel is colours, tinted where Gaussians are selected
     legend: bool = False  # a colour bar of the answers lies over the image
     uses_map: bool = False  # it shows numbers by the colour map

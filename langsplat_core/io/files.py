@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -58,6 +59,9 @@ def _no_room(error: Exception, temporary: Path) -> OSError | None:
         return None
     if isinstance(error, OSError) and error.errno is not None:
         return error if error.errno in NO_ROOM else None
+    said = re.search(r"\(os error (\d+)\)", str(error))  # a library in Rust, such as safetensors
+    if said is not None and int(said[1]) in NO_ROOM:
+        return OSError(int(said[1]), os.strerror(int(said[1])))
     try:
         with temporary.open("ab") as file:
             file.write(bytes(PROBE))
@@ -87,6 +91,12 @@ def check_output_file(path: Path | str) -> None:
     if os.path.exists(target) and not os.path.isfile(target):
         raise InputError(f"{shown(path)}: is no ordinary file; choose another name")
     _try_writing(target, folder)
+
+
+def check_keeps(out: Path, *sources: Path) -> None:
+    """InputError where writing `out` would replace one of the files that are read."""
+    if any(out.resolve() == source.resolve() for source in sources):
+        raise InputError(f"{shown(out)}: would replace the original scene; choose another name")
 
 
 def check_output_folder(path: Path | str) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 from PIL import Image, _imaging, features
 
 from langsplat_core.arrays import Array
-from langsplat_core.errors import FormatError, InputError, LangSplatError, printable_line, quoted
+from langsplat_core.errors import FormatError, InputError, LangSplatError, printable_line, quoted, remedy
 from langsplat_core.io.files import atomic_path
 
 # ---- .npy and .npz: plain numbers or texts, read without pickles and without belief in their headers ----
@@ -212,9 +212,10 @@ def opened_archive(path: Path, kind: str) -> Iterator[Archive]:
 # unreadable image, and its warnings about damaged metadata are silenced: an image is either read or
 # refused.
 
-KINDS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")  # always; AVIF and HEIF where Pillow has a codec
+KINDS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")  # always; AVIF where Pillow has a codec, HEIF with pillow_heif
 # HEIF is named where it cannot be read, too: the message then says why such photographs are left out
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".avif", ".heic", ".heif")
+HEIF_BRANDS = (b"heic", b"heix", b"mif1", b"hevc", b"heim", b"heis")
 MOST_PIXELS = 178_000_000  # of any image: 0.7 GB once decoded. The largest cameras make 151 million
 # Declared pixels beyond these need a file of a fitting size: photographs keep 2 to 100 pixels a byte, what is
 # made to exhaust memory a million. The decoders of WebP and AVIF hold two more copies of the image.
@@ -246,6 +247,7 @@ def opened(
         raise PictureError(name, str(error).removeprefix(f"{name}: ")) from None
     with file, _quiet:
         try:
+            lacking = _lacks_heif(file)
             # Image.open looks at the first bytes only to choose the kind; the name's ending plays no part
             with Image.open(file, formats=kinds or readable_kinds()) as picture:
                 _check_size(name, picture, size)
@@ -254,6 +256,8 @@ def opened(
             raise
         except Image.UnidentifiedImageError:
             read = ", ".join(kinds or readable_kinds())
+            if lacking and not kinds:
+                raise PictureError(name, f"HEIC needs pillow-heif: {remedy('pillow_heif')}") from None
             raise PictureError(name, f"the content is none of {read}, or damaged") from None
         except Exception as error:  # noqa: BLE001  any at all, see the top of this file
             raise PictureError(name, _reason(error)) from None
@@ -261,8 +265,21 @@ def opened(
 
 def readable_kinds() -> tuple[str, ...]:
     """Pillow's names of the kinds that are read on this machine."""
-    # pillow_heif, where somebody has registered it, adds HEIF
     return KINDS + ("AVIF",) * bool(features.check("avif")) + ("HEIF",) * ("HEIF" in Image.OPEN)
+
+
+def _lacks_heif(file: BinaryIO) -> bool:
+    """Register the codec of HEIF for a file of that kind; True where there is none."""
+    head = file.read(12)
+    file.seek(0)
+    if head[4:8] != b"ftyp" or head[8:] not in HEIF_BRANDS or "HEIF" in Image.OPEN:
+        return False
+    try:
+        from pillow_heif import register_heif_opener
+    except ImportError:
+        return True
+    register_heif_opener(thumbnails=False)
+    return False
 
 
 def picture_size(path: Path) -> tuple[int, int]:

@@ -31,6 +31,7 @@ from langsplat_core.semantics.store import (
     StoredFeatures,
     embed_regions,
     fingerprint,
+    within,
 )
 from langsplat_core.training.language.tree import MergeTree, draw_patches, find_tree, nested_maps
 
@@ -49,10 +50,11 @@ def agreed_features(
     work: Path,
     progress: Progress,
     processes: ProcessGroup | None = None,
+    counted: Sequence[Array | None] = (),
 ) -> StoredFeatures:
     """Masks and CLIP vectors of every view by the consensus of all views' masks, whose vectors are not read.
 
-    photographs: (H, W, 3) uint8 of each view. What is finished is kept in `work`.
+    photographs: (H, W, 3) uint8 of each view; counted: as of `describe_capture`. What is finished is kept in `work`.
     """
     processes = processes or ProcessGroup()
     inputs = gaussians_digest(gaussians), [features_digest(features) for _, features in views]
@@ -73,7 +75,7 @@ def agreed_features(
         camera, _ = views[index]
         if not store.has(camera.name, made_by):
             drawn = draw_patches(rasterizer.view(gaussians, camera), gaussians, tree.patches)
-            maps = nested_maps(drawn, cuts, LEAST)
+            maps = within(nested_maps(drawn, cuts, LEAST), counted[index] if counted else None)
             vectors = embed_regions(photographs[index], maps, encoder)
             store.save(camera.name, ImageFeatures(maps, vectors), made_by)
         progress(STAGE, (index + 1) / len(views))

@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from langsplat_core.config import MaskConfig, TrainConfig
+from langsplat_core.config import DatasetConfig, MaskConfig, TrainConfig
+from langsplat_core.datasets.video import is_video
 from langsplat_core.io.hostile import PHOTO_SUFFIXES
 from langsplat_core.progress import ALL_STAGES, Progress, Report, coarse, duration
 
@@ -120,6 +121,8 @@ def _millions(model: str) -> float:
 def count_photographs(dataset: Path) -> tuple[int, Given]:
     """Count the photographs in a dataset, and name what comes with them. Does not raise."""
     try:
+        if is_video(dataset):
+            return DatasetConfig.frames, "nothing"
         folder = dataset if dataset.is_dir() else dataset.parent
         images = folder / "images" if (folder / "images").is_dir() else folder
         return sum(path.suffix.lower() in PHOTO_SUFFIXES for path in images.iterdir()), _given(folder)

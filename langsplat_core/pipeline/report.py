@@ -4,18 +4,15 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from langsplat_core.arrays import Array
+from langsplat_core.datasets.holdout import ViewScore
 from langsplat_core.errors import FormatError, InputError, printable_line
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import read_json_file
 from langsplat_core.scene import Camera
-
-if TYPE_CHECKING:
-    from langsplat_core.training.radiance.train import ViewScore
 
 REPORT = "report.json"
 LIMIT = 1_000_000  # bytes; a report has about a thousand
@@ -45,6 +42,7 @@ class TrainReport:
     warnings: tuple[str, ...]  # what speaks against the scene, with the remedy
     seconds: dict[str, float]  # per stage, of this run: a stage that was already done takes almost none
     dataset: str = ""  # absolute path of the photographs; "" in reports of earlier versions
+    held_out_views: tuple[ViewScore, ...] = ()  # one by one
 
 
 def work_folder(out: Path) -> Path:
@@ -61,7 +59,8 @@ def write_report(work: Path, report: TrainReport) -> None:
 def read_report(work: Path) -> TrainReport:
     """Read the report of the run which has just ended, in this process or another."""
     stated = json.loads((work / REPORT).read_text())
-    return TrainReport(**stated | {"warnings": tuple(stated["warnings"])})
+    scores = tuple(ViewScore(**score) for score in stated.get("held_out_views", ()))
+    return TrainReport(**stated | {"warnings": tuple(stated["warnings"]), "held_out_views": scores})
 
 
 def stated_warnings(scene: Path, gaussians: int) -> tuple[str, ...]:
@@ -78,7 +77,7 @@ def stated_warnings(scene: Path, gaussians: int) -> tuple[str, ...]:
     return tuple(printable_line(line, 300) for line in lines if isinstance(line, str))
 
 
-def quality_warnings(scores: Sequence["ViewScore"], cameras: Sequence[Camera]) -> tuple[str, ...]:
+def quality_warnings(scores: Sequence[ViewScore], cameras: Sequence[Camera]) -> tuple[str, ...]:
     """Return what speaks against a scene that was trained without an error, one sentence each, with a remedy.
 
     scores: of held-out views, or none; cameras: all that were trained on.

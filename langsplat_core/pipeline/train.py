@@ -17,6 +17,7 @@ import numpy as np
 from langsplat_core.config import RadianceConfig, TrainConfig, check_settings
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture
+from langsplat_core.datasets.holdout import split
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import check_output_folder, shown
 from langsplat_core.io.ply import read_ply, write_ply
@@ -102,7 +103,7 @@ def _train(
     log.info("masks: %s, encoder: %s", mask_source.name, encoder.id)
     if encoder.id == DEMO and not capture.drawn:
         log.warning("%s", DEMO_ELSEWHERE)
-    train, held_out = capture.split(config.dataset.test_every)
+    train, held_out = split(capture, config.dataset)
     clock.lap("photographs")
 
     # Keyed by mask settings, encoder and image. Masks that do not agree yet are described when they do.
@@ -110,7 +111,8 @@ def _train(
     mine = processes.share(train)
     names = [capture.cameras[i].name for i in mine]
     seen_by = encoder if mask_source.agrees else None
-    describe_capture([capture.images[i] for i in mine], names, mask_source, seen_by, store, progress)
+    images, counted = [capture.images[i] for i in mine], [capture.mask(i) for i in mine]
+    describe_capture(images, names, mask_source, seen_by, store, progress, counted)
     processes.barrier()
     cameras = tuple(capture.cameras[i] for i in train)
     features = StoredFeatures(store, [camera.name for camera in cameras])
@@ -129,7 +131,8 @@ def _train(
     if not mask_source.agrees:
         shared = load_lifting_rasterizer(config.lift.backend), work, progress, processes
         photographs = [capture.images[i] for i in train]
-        features = agreed_features(gaussians, views, photographs, encoder, *shared)
+        counted = [capture.mask(i) for i in train]
+        features = agreed_features(gaussians, views, photographs, encoder, *shared, counted)
         views = StoredViews(cameras, features)
         clock.lap("masks that agree")
     language, loss = language_field(gaussians, views, encoder, config, work, progress, processes)
@@ -158,6 +161,7 @@ def _train(
             warnings=quality_warnings(scores, cameras),
             seconds=clock.laps,
             dataset=str(dataset.resolve()),
+            held_out_views=tuple(scores),
         )
         write_report(work, report)
     processes.barrier()

@@ -78,21 +78,21 @@ class Scene:
         side = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
         side /= np.linalg.norm(side)
         ahead = np.cross(up, side)
-        means = self.gaussians.means[self.gaussians.valid()]
-        offsets = (means[:: len(means) // SAMPLES + 1] - centre) / radius
+        some = self.gaussians.take(np.arange(0, len(self.gaussians), len(self.gaussians) // SAMPLES + 1))
+        offsets = (some.means[some.valid()] - centre) / radius
         heights, covered, directions = offsets @ up, [], []
         for angle in np.arange(TURNS) * np.pi / TURNS:
             directions.append(np.cos(angle) * side + np.sin(angle) * ahead)
             places = np.stack([offsets @ np.cross(up, directions[-1]), heights], 1)
             cells = np.floor(places[(np.abs(places) < REACH).all(1)] / CELL)
-            covered.append(len(np.unique(cells, axis=0)))
+            covered.append(len(np.unique(cells @ (1.0, 4 * REACH / CELL))))  # a number for each cell
         broadest = int(np.argmax(covered))
         return np.asarray(directions[broadest if covered[broadest] > MORE * covered[0] else 0])
 
-    def framing_camera(self, size: tuple[int, int]) -> Camera:
-        """A camera of `size` (width, height) that frames the bounds, a little from above, and from where they
-        are broadest."""
-        centre, radius = self.bounds()
+    def framing_camera(self, size: tuple[int, int], bounds: tuple[Array, float] | None = None) -> Camera:
+        """A camera of `size` (width, height) that frames the `bounds` (by default the scene's), a little from
+        above, and from where they are broadest."""
+        centre, radius = bounds or self.bounds()
         up = self.up()
         direction = self._across(centre, radius, up) + 0.35 * up
         return look_at(centre + 2.6 * radius * direction / np.linalg.norm(direction), centre, up, size)

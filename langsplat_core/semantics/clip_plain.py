@@ -25,6 +25,7 @@ from langsplat_core.semantics.weights import CONFIG, SAFE, Weights
 # Of the text half. NumPy was the quicker one at 63 million too; but checkpoints that large
 # come from elsewhere, and their tokenizers have not been compared with transformers' reading of them.
 MOST_WEIGHTS = 20_000_000
+MOST_LAYERS = 64  # of a model that is small: beyond, its shapes alone could fill the memory
 TEMPERATURE = 10.0  # of LERF and LangSplat, whatever scale a checkpoint ended its training with
 READABLE = ("F16", "F32", "F64")  # types of safetensors that NumPy has too
 LEGACY_END = 2  # of configurations whose end token is the one with the highest number
@@ -115,6 +116,7 @@ def plain_text_tower(weights: Weights) -> PlainClipText | None:
     if (
         config is None
         or config.hidden_act not in _ACTIVATIONS
+        or config.num_hidden_layers > MOST_LAYERS
         or config.hidden_size % config.num_attention_heads
     ):
         return None

@@ -221,6 +221,15 @@ class StoredFeatures(Sequence[ImageFeatures]):
 MASKS_STAGE = "masks and vectors"
 
 
+def within(labels: Array, mask: Array | None) -> Array:
+    """(L, H, W) label maps without what lies outside of the (H, W) mask; numbers stay without gaps."""
+    if mask is None:
+        return labels
+    kept = np.where(mask, labels, -1)
+    numbers = np.unique(kept[kept >= 0])
+    return np.where(kept >= 0, np.searchsorted(numbers, kept), -1).astype(labels.dtype)
+
+
 def describe_capture(
     images: Sequence[Array],
     names: Sequence[str],
@@ -228,18 +237,21 @@ def describe_capture(
     encoder: ImageEncoder | None,
     store: FeatureStore,
     progress: Progress = silent,
+    counted: Sequence[Array | None] = (),
 ) -> StoredFeatures:
     """Masks and CLIP vectors of every photograph, in order; those that `store` has already are not redone.
     Without an encoder the vectors have no numbers.
 
-    images: (H, W, 3) uint8 each; names: unique, one per image. What is finished is in the store even when
+    images: (H, W, 3) uint8 each; names: unique, one per image; counted: (H, W) bool each, outside of which
+    no mask is kept (None: everywhere). What is finished is in the store even when
     `progress` interrupts the work. Each photograph's regions are encoded by themselves: its file does not
     depend on which others were made beside it.
     """
     made_by = "none" if encoder is None else fingerprint(encoder)
 
-    def keep(finish: Callable[[], LevelMasks], image: Array, name: str, key: str) -> None:
-        labels = label_maps(finish())
+    def keep(finish: Callable[[], LevelMasks], index: int, key: str) -> None:
+        image, name = images[index], names[index]
+        labels = within(label_maps(finish()), counted[index] if counted else None)
         if encoder is None:
             vectors = np.zeros((int(labels.max()) + 1, 0), np.float32)
         else:
@@ -249,14 +261,17 @@ def describe_capture(
     with ThreadPoolExecutor(1) as worker:  # filters, crops and files of one while masks of the next are found
         before: Future[None] | None = None
         for index, (image, name) in enumerate(zip(images, names, strict=True)):
+            mask = counted[index] if counted else None
             part = progress.part(index, len(images), MASKS_STAGE, name)
             part(MASKS_STAGE, 0.0)
             key = feature_key(image, mask_source, made_by)
+            if mask is not None:
+                key += hashlib.sha256(np.packbits(mask).tobytes()).hexdigest()[:12]
             if not store.has(name, key):
                 finish = mask_source.begin(image, part)
                 if before is not None:  # one photograph's full-size masks at a time
                     before.result()
-                before = worker.submit(keep, finish, image, name, key)
+                before = worker.submit(keep, finish, index, key)
         if before is not None:
             before.result()
     progress(MASKS_STAGE, 1.0)

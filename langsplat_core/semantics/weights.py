@@ -3,6 +3,7 @@
 import json
 import math
 import pickle
+import re
 import warnings
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -133,7 +134,68 @@ def load_config(kind: Any, weights: Weights, name: str) -> Any:
     with loading_errors(weights.id, name):
         if weights.converted:
             return kind.from_dict(deepcopy(weights.converted.config))
+        _check_sizes(weights)
         return kind.from_pretrained(weights.folder, local_files_only=True)
+
+
+# Of config.json: sizes that are a side of some tensor, or fewer; and others.
+SIDES = (
+    *("hidden_size", "intermediate_size", "vocab_size", "max_position_embeddings"),
+    *("num_attention_heads", "patch_size", "num_channels"),
+)
+LARGEST_IMAGE = 1 << 16  # pixels
+
+
+def _check_sizes(weights: Weights) -> None:
+    """EncoderError where config.json states sizes that its tensors cannot have: a model of those would be
+    built, with random numbers, before anybody compares."""
+    settings, shapes = json.loads((weights.folder / CONFIG).read_text(encoding="utf-8")), _shapes(weights)
+    parts = [("", settings)] if isinstance(settings, dict) else []
+    for part in ("text", "vision"):
+        stated = settings.get(f"{part}_config") if parts else None
+        names = [name for name in shapes if name.startswith(f"{part}_")]
+        if isinstance(stated, dict) and names:
+            parts.append((f"{part}_config.", stated))
+            layers = {int(found[1]) for name in names if (found := re.search(r"\.layers\.(\d+)\.", name))}
+            if layers:
+                _check_size(
+                    weights, f"{part}_config.num_hidden_layers", stated, max(layers) + 1, max(layers) + 1
+                )
+    largest = max((side for shape in shapes.values() for side in shape), default=0)
+    for prefix, stated in parts:
+        for name in (*SIDES, "image_size", *(() if prefix else ("projection_dim",))):
+            most = LARGEST_IMAGE if name == "image_size" else largest
+            _check_size(weights, prefix + name, stated, 1, most)
+
+
+def _check_size(weights: Weights, name: str, stated: dict[str, Any], least: int, most: int) -> None:
+    value = stated.get(name.rpartition(".")[2], least)
+    values = value if isinstance(value, list) and value else [value]  # image_size may have two
+    if not all(isinstance(v, int) and not isinstance(v, bool) and least <= v <= most for v in values):
+        expected = f"{least}" if least == most else f"a whole number from {least} to {most}"
+        raise EncoderError(
+            f"{weights.id}: {CONFIG}: {name} is {json.dumps(value)[:40]}, its weights have {expected}; take "
+            "the file that belongs to them"
+        )
+
+
+def _shapes(weights: Weights) -> dict[str, tuple[int, ...]]:
+    """The shapes of all tensors of a folder, by name; of pickles without reading their numbers."""
+    from safetensors import safe_open
+
+    found: dict[str, tuple[int, ...]] = {}
+    for path in sorted(path for pattern in SAFE for path in weights.folder.glob(pattern)):
+        with safe_open(path, framework="np") as file:
+            found |= {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118
+    if found:
+        return found
+    import torch
+
+    for path in sorted(path for pattern in PICKLED for path in weights.folder.glob(pattern)):
+        mapped = zipfile.is_zipfile(path)
+        tensors = torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
+        found |= {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+    return found
 
 
 def load_model(kind: Any, weights: Weights, config: Any) -> Any:

@@ -195,7 +195,7 @@ class Room:
         self.encoder, self.weights = encoder
         self.folder = work / f"{tier}-{seed}-{config.views}x{width}x{height}"
         self.settings = TrainConfig(
-            dataset=DatasetConfig(max_side=max(config.size), test_every=HOLD_OUT),
+            dataset=DatasetConfig(max_side=max(config.size), test_every=HOLD_OUT, hold_out="every"),
             radiance=RadianceConfig(steps=config.steps, sh_degree=1, max_gaussians=config.max_gaussians),
             clip=ClipConfig(model=config.encoder),
         )

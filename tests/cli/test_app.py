@@ -15,9 +15,9 @@ from langsplat_core.cli.app import COMMANDS, GROUPS, entry, load_command, parse
 from langsplat_core.cli.run import main
 from langsplat_core.cli.scenes import Doctor
 from langsplat_core.errors import InputError
-from langsplat_viewer.__main__ import ViewerCommand
-from langsplat_viewer.__main__ import entry as viewer_entry
-from langsplat_viewer.__main__ import parse as viewer_parse
+from langsplat_viewer.program import ViewerCommand
+from langsplat_viewer.program import entry as viewer_entry
+from langsplat_viewer.program import parse as viewer_parse
 
 EVERY = {
     "viewer": ViewerCommand,
@@ -44,7 +44,7 @@ def test_every_option_is_described(name):
     [
         (["qurey", "a.ply"], "no command 'qurey'; did you mean 'query'?"),
         (["bench", "quary"], "no command 'bench quary'; did you mean 'query'?"),
-        (["xyz"], "no command 'xyz'; there are train, query"),
+        (["xyz"], "no command 'xyz'; there are train, frames, query"),
     ],
 )
 def test_a_command_that_does_not_exist_is_named(words, said):

@@ -153,6 +153,7 @@ def test_masks_and_vectors_both_ways(tmp_path):
         (["{0}", "{1}", "out.ply"], "of which levels|latents of LangSplat's autoencoder"),
         (["{0}", "out.txt"], "scenes are written as"),
         (["{0}", "out.ply", "--rematch", "x.safetensors"], "--rematch is for one scene"),
+        (["scene.ply", "scene.ply"], "scene.ply: would replace the original scene"),
         (["out.ply"], "name what to read"),
         (["{0}", "{1}", "--levels", "whole"], "scenes are written as"),
         (["missing.pth", "out.ply"], "no such file"),

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from importlib.resources import files
 from pathlib import Path
 
@@ -166,6 +167,31 @@ def test_a_signal_ends_a_command_in_a_line(number: int, said: str, tmp_path: Pat
     assert process.returncode == 128 + number
     (line,) = errors.splitlines()
     assert line == f"langsplat: {said}; the same command continues where it stopped"
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("program", ["langsplat_core", "langsplat_viewer"])
+@pytest.mark.parametrize("seconds", [0.0, 0.1, 0.3])
+def test_a_signal_while_modules_are_imported_is_a_line(program: str, number: int, seconds: float) -> None:
+    code = (
+        "import signal, sys\nfrom langsplat_core.signals import end_in_a_line\n"
+        f"from {program}.__main__ import entry\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "end_in_a_line('begins')\nprint('ready', flush=True)\nsys.argv = ['x', '--help']\nentry()\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        time.sleep(seconds)
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=60)
+    if process.returncode == 0:  # it was done before
+        assert seconds > 0
+        return
+    assert process.returncode == 128 + number
+    assert len(errors.splitlines()) == 1, errors
 
 
 CLOSED = (".", "images", "sparse/0/cameras.bin", "transforms.json")

@@ -172,7 +172,7 @@ def test_a_scene_without_cameras_is_seen_from_a_ring(scene, tmp_path):
         ({"max_psnr_loss": float("nan")}, "out.ply", "max-psnr-loss"),
         ({"assumed_psnr": 0.0}, "out.ply", "assumed-psnr"),
         ({"views": 1}, "out.ply", "--views 1: must be 2 to"),
-        ({}, "scene.ply", "choose another --out"),
+        ({}, "scene.ply", "choose another name"),
         ({}, "out.xyz", "choose such a name"),
         ({"max_psnr_loss": 1e-6}, "out.splat", "format alone"),  # eight bits per colour and opacity
     ],

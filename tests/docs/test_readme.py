@@ -15,7 +15,7 @@ from assets.making.__main__ import parse as parse_making
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import Command, main
 from langsplat_core.io.scenes import load_scene
-from langsplat_viewer.__main__ import parse as parse_viewer
+from langsplat_viewer.program import parse as parse_viewer
 from tests.benchmarks.__main__ import parse as parse_benchmarks
 from tests.support.file_samples import compressed_ply
 from tests.support.scenes import random_gaussians

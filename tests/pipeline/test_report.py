@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from langsplat_core.config import PAPER, MaskConfig, TrainConfig, with_preset
+from langsplat_core.datasets.holdout import ViewScore
 from langsplat_core.pipeline.forecast import (
     Forecast,
     Stage,
@@ -25,7 +26,6 @@ from langsplat_core.pipeline.report import (
 )
 from langsplat_core.progress import ALL_STAGES, Progress, Report
 from langsplat_core.scene import Camera, look_at
-from langsplat_core.training.radiance.train import ViewScore
 
 UP = np.array([0.0, 0.0, 1.0])
 

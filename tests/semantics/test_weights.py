@@ -276,6 +276,27 @@ def test_a_configuration_that_contradicts_itself_is_one_line(tmp_path: Path) -> 
 # Weights in the layouts of open_clip, OpenAI, segment_anything and sam2, against open_clip's arithmetic and
 # against the same weights in Hugging Face layout.
 
+SIZES = ("hidden_size", "vocab_size", "max_position_embeddings", "num_hidden_layers", "intermediate_size")
+
+
+@pytest.mark.parametrize("part", ["text_config", "vision_config"])
+@pytest.mark.parametrize("name", SIZES)
+@pytest.mark.parametrize("value", [-1, 0, "x", 10**9, True, 2.5])
+def test_sizes_that_the_weights_do_not_have_are_one_line(
+    part: str, name: str, value: object, tmp_path: Path
+) -> None:
+    if part == "vision_config" and name in ("vocab_size", "max_position_embeddings"):
+        name = {"vocab_size": "patch_size", "max_position_embeddings": "image_size"}[name]
+    tiny_clip(tmp_path)
+    path = tmp_path / "config.json"
+    config = json.loads(path.read_text(encoding="utf-8"))
+    config[part][name] = value
+    path.write_text(json.dumps(config), encoding="utf-8")
+    with pytest.raises(EncoderError, match=f"{part}.{name}") as caught:
+        load_encoder(str(tmp_path))
+    assert "\n" not in str(caught.value)
+
+
 PHRASES = ["red mug", "a", "handle"]
 CONFIG = "open_clip_config.json"
 Case = tuple[Path, int, int, bool, Any]  # what to load, heads of pictures and of text, quick GELU, config

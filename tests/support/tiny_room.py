@@ -51,7 +51,7 @@ def tiny_room(folder: Path) -> Path:
 
 def tiny_settings(room: Path) -> TrainConfig:
     return TrainConfig(
-        dataset=DatasetConfig(max_side=64, test_every=4),
+        dataset=DatasetConfig(max_side=64, test_every=4, hold_out="every"),
         radiance=RadianceConfig(steps=20, sh_degree=0, checkpoint_every=5),
         masks=MaskConfig(source="graph"),
         clip=ClipConfig(model=str(room / "encoder"), device="cpu"),

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from langsplat_viewer import __main__ as program
-from langsplat_viewer import options
+from langsplat_viewer import options, program
 from langsplat_viewer.actions import opening
 from langsplat_viewer.viewer import Services, Viewer
 from tests.support.fakes import FakeEncoder

@@ -269,7 +269,7 @@ def large_letters(s: Any) -> None:
         assert cut_off(s, panel.title) == [], panel.title
     settings.show_help(s.window.viewer, True)
     s.settle()
-    keys = s.ctx.window_info("//Keys").window
+    keys = s.ctx.window_info("//Help").window
     assert 0 <= keys.pos.x <= keys.pos.x + keys.size.x <= 1280
     assert 0 <= keys.pos.y <= keys.pos.y + keys.size.y <= 720
     s.shot("large letters")
@@ -292,7 +292,53 @@ def cut_off(s: Any, title: str) -> list[tuple[float, float]]:
     return [(right, end) for right, end in ends if right > end + 1]
 
 
+def use_the_outline(s: Any) -> None:
+    """Rows are clicked, hidden, locked and dragged onto each other; the menu of a thing names it."""
+    viewer = s.window.viewer
+    s.search("mug")
+    settings.open_panel(viewer, "Outline")
+    s.wait(lambda: s.state.outline is not None and len(s.state.outline.roots) > 0)
+    s.settle()
+    first, second = s.state.outline.roots[:2]
+    rows = "//**/node "
+    s.ctx.item_click(f"{rows}{first.node}/###row")
+    s.settle()
+    chosen = s.state.selection.marks.selected
+    assert (chosen == s.state.outline.tree.members(first.node)).all()
+    s.ctx.item_click(f"{rows}{first.node}/###eye")
+    s.settle()
+    assert (s.state.selection.marks.hidden == chosen).all()
+    s.ctx.item_click(f"{rows}{first.node}/###eye")
+    s.settle()
+    s.ctx.item_click(f"{rows}{first.node}/###lock")
+    s.ctx.yield_(2)
+    assert s.state.things.locked == {first.node}
+    s.shot("outline")
+    s.ctx.item_drag_and_drop(f"{rows}{first.node}/###row", f"{rows}{second.node}/###row")
+    s.ctx.yield_(2)
+    (group,) = s.state.things.groups
+    assert group.nodes == (second.node, first.node)
+    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.z, 2)
+    s.settle()
+    assert (s.state.things.locked, s.state.things.groups) == (set(), ())
+
+    s.ctx.key_press(imgui.Key.r)
+    s.settle()
+    area, (width, height) = scene_area(), s.state.size
+    (x, y), _ = (part[0] for part in s.state.view.camera(width, height).project(CENTRES[1][None]))
+    s.ctx.mouse_move_to_pos((x + area.left, y + area.top))
+    s.ctx.yield_(2)
+    s.ctx.mouse_click(1)
+    s.ctx.yield_(3)
+    s.ctx.item_click("//**/##name this")
+    s.ctx.key_chars_append_enter("the atlas")
+    s.settle()
+    assert s.state.queries[-1].phrase == "the atlas"
+    assert s.state.queries[-1].result.members.reshape(3, -1).all(1).tolist() == [False, True, False]
+
+
 LAYOUT: dict[str, tuple[Callable[[Any], None], str, dict[str, Any]]] = {
+    "use_the_outline": (use_the_outline, "blobs.ply", {}),
     "large_letters": (large_letters, "blobs.ply", {"size": (1280, 720)}),
 }
 
@@ -318,17 +364,20 @@ def record_and_play(s) -> None:
     s.ctx.yield_(2)
     assert len(record.keyframes) == 3
 
-    filming.set_path_seconds(s.window.viewer, 1.0)
+    filming.set_path_seconds(s.window.viewer, 60.0)  # longer than a frame may take
     start = s.shot("start")
     s.ctx.item_click("//Record/Play##path")
-    s.wait(lambda: 0.2 < record.at < 1.0)
+    s.wait(lambda: 0.2 < record.at < 60.0)
     moving = s.state.view
+    filming.set_path_seconds(s.window.viewer, 1.0)
+    s.ctx.item_click("//Record/Play##path")
     s.wait(lambda: record.began is None)
     assert record.at == 1.0
     np.testing.assert_allclose(s.state.view.eye, last.eye, atol=1e-6)
     assert np.abs(moving.eye - last.eye).max() > 1e-3
+    filming.set_path_seconds(s.window.viewer, 60.0)
     s.ctx.key_press(imgui.Key.mod_shift | imgui.Key.k)  # from the start again
-    s.wait(lambda: 0 < record.at < 0.9)
+    s.wait(lambda: 0 < record.at < 59.0)
     s.drag((600, 300), (620, 310))  # the hand is stronger
     s.settle()
     assert record.began is None
@@ -337,6 +386,7 @@ def record_and_play(s) -> None:
     s.ctx.item_click("//Record/Save path")
     s.ctx.yield_(2)
     assert len(read_flight(s.folder / "blobs-001.path.json").keyframes) == 3
+    filming.set_path_seconds(s.window.viewer, 1.0)
     filming.set_film_size(s.window.viewer, 32, 24)
     filming.set_film_fps(s.window.viewer, 4.0)
     filming.type_film(s.window.viewer, "film")

@@ -12,9 +12,9 @@ from PIL import Image
 from imgui_bundle import hello_imgui, imgui  # isort: skip
 from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
 import glfw  # isort: skip
-from langsplat_core.io.scenes import load_scene
+from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_viewer import canvas
-from langsplat_viewer.actions import queries, selecting, settings, transforming, viewpoint
+from langsplat_viewer.actions import opening, queries, selecting, settings, transforming, viewpoint
 from langsplat_viewer.camera.overlays import Label, visible_faces
 from langsplat_viewer.panels import overlays
 from langsplat_viewer.panels.overlays import EDGE
@@ -22,7 +22,7 @@ from langsplat_viewer.panels.style import Area, scene_area
 from langsplat_viewer.rendering.renderer import ArrayChannels
 from langsplat_viewer.rendering.request import TINT
 from langsplat_viewer.state import EditForm
-from tests.support.fakes import CENTRES
+from tests.support.fakes import CENTRES, blob_scene
 from tests.support.marks_and_flights import marked
 
 MUG, BOOK, PLANT = CENTRES
@@ -115,6 +115,12 @@ def draw_over_the_scene(s: Any) -> None:
     assert s.state.view is turned
     assert abs(s.state.ruler.length - np.linalg.norm(MUG - BOOK)) < 0.2
     s.shot("ruler")
+    before = s.state.view
+    s.ctx.mouse_double_click(0)  # two points in quick succession; elsewhere it would move the view
+    s.settle()
+    assert s.state.view is before
+    assert s.state.ruler.length is not None
+    assert s.state.ruler.length < 0.05
     drawn = s.renderer.count
     s.ctx.yield_(20)
     assert s.renderer.count == drawn
@@ -520,7 +526,7 @@ def drag_the_gizmo(s: Any) -> None:
     went = on_screen(s, transforming.pivot(viewer))
     np.testing.assert_allclose(went, (x + 60, y - 120), atol=3)
     selecting.select_none(viewer)
-    s.ctx.key_press(imgui.Key.g, 3)  # off again
+    s.ctx.key_press(imgui.Key.g, 4)  # off again
     shot = s.shot("moved")
     assert s.at(shot, MUG + moved[chosen][0]).argmax() == s.at(rgb, MUG).argmax()
     assert np.abs(s.at(shot, MUG) - s.at(rgb, MUG)).max() > 40
@@ -541,10 +547,109 @@ def drag_the_gizmo(s: Any) -> None:
     assert not s.state.selection.is_unsaved
 
 
+def clip_and_brush(s: Any) -> None:
+    """A corner of the clipping box is dragged, and what it then leaves out is hidden; a drag over the
+    histogram of distances selects those between."""
+    viewer = s.window.viewer
+    settings.open_panel(viewer, "Transform")
+    transforming.fill_box(viewer)
+    s.ctx.yield_(2)
+    s.ctx.item_click("//Transform/Box##gizmo")
+    s.ctx.item_click("//Transform/Clip")
+    s.settle()
+    assert s.state.selection.marks.shown.all()
+    form = s.state.edit_form
+    corners = np.array([form.low, form.high])
+    along = corners.mean(0)
+    handles = [
+        np.array([corners[i, 0], corners[j, 1], corners[k, 2]])
+        for i in (0, 1)
+        for j in (0, 1)
+        for k in (0, 1)
+    ]
+    middle = on_screen(s, along)
+    for corner in handles:
+        start = on_screen(s, corner)
+        s.ctx.mouse_teleport_to_pos(start)
+        s.ctx.yield_(2)
+        s.ctx.mouse_down(0)
+        s.ctx.yield_(2)
+        for part in (0.2, 0.4, 0.6, 0.8):
+            s.ctx.mouse_teleport_to_pos(tuple(a + part * (b - a) for a, b in zip(start, middle, strict=True)))
+            s.ctx.yield_(2)
+        s.ctx.mouse_up(0)
+        s.settle()
+        if s.state.edit_form.low != form.low or s.state.edit_form.high != form.high:
+            break
+    inside = np.array([s.state.edit_form.low, s.state.edit_form.high])
+    means = s.state.scene.gaussians.means
+    np.testing.assert_array_equal(
+        s.state.selection.marks.shown, ((means >= inside[0]) & (means <= inside[1])).all(1)
+    )
+    assert 0 < s.state.selection.marks.hidden.sum() < len(means)
+    s.shot("clipped")
+    s.ctx.item_click("//Transform/Clip")
+    s.ctx.item_click("//Transform/No gizmo##gizmo")
+    assert s.state.selection.marks.shown.all()
+    settings.open_panel(viewer, "Select")
+    s.settle()
+    s.ctx.item_click("//Select/By numbers")
+    s.ctx.item_click("//Select/Distance")
+    s.ctx.yield_(2)
+    place = s.ctx.item_info("//Select/brush values").rect_full
+    y = place.min.y + 5
+    s.drag((place.min.x + 1, y), ((place.min.x + place.max.x) / 2, y))
+    s.settle()
+    away = np.linalg.norm(means - s.state.view.eye, axis=1)
+    chosen = s.state.selection.marks.selected
+    assert 0 < chosen.sum() < len(away)
+    between = (away >= away[chosen].min()) & (away <= away[chosen].max())
+    np.testing.assert_array_equal(chosen, between)
+
+
+def compare_two_scenes(s: Any) -> None:
+    """Right of the line another scene is drawn by the same camera and answers the same phrase; a saved
+    picture has both; without the line it is gone."""
+    viewer = s.window.viewer
+    s.search("mug")
+    alone = s.shot("alone")
+    moved = replace(blob_scene(), path=None)
+    save_scene(
+        s.folder / "other.ply", replace(moved, gaussians=replace(moved.gaussians, sh=-moved.gaussians.sh))
+    )
+    settings.set_display(viewer, "rgb")
+    s.settle()
+    rgb = s.shot("rgb one")
+    opening.open_beside(viewer, s.folder / "other.ply")
+    s.wait(lambda: viewer.beside.state.scene is not None and len(viewer.beside.state.queries) == 1)
+    s.wait(lambda: viewer.beside.worker.current is None)
+    settings.move_line(viewer, 0.5)
+    both = s.shot("rgb two")
+    area = scene_area()
+    middle = int(area.left + area.width / 2)
+    assert (both[100:450, 450 : middle - 8] == rgb[100:450, 450 : middle - 8]).all()
+    assert np.abs(both[100:450, middle + 8 :] - rgb[100:450, middle + 8 :]).max() > 60
+    settings.set_display(viewer, "relevancy")
+    assert np.abs(s.shot("asked") - alone)[100:450, 450 : middle - 8].max() == 0
+    s.ctx.key_press(imgui.Key.p)
+    s.wait((s.folder / "blobs-001.png").exists)
+    saved = np.asarray(Image.open(s.folder / "blobs-001.png")).astype(int)
+    half = saved.shape[1] // 2
+    shown = s.shot("shown")[int(area.top) :, int(area.left) :]
+    np.testing.assert_allclose(saved[120:400, 100 : half - 8], shown[120:400, 100 : half - 8], atol=3)
+    np.testing.assert_allclose(saved[120:400, half + 8 :], shown[120:400, half + 8 : saved.shape[1]], atol=3)
+    settings.show_one(viewer)
+    s.settle()
+    assert viewer.beside is None
+    assert np.abs(s.shot("alone again") - alone)[100:450, 450:].max() == 0
+
+
 SELECTING: dict[str, tuple[Any, str, dict[str, Any]]] = {
     "select_with_the_mouse": (select_with_the_mouse, "blobs.ply", {}),
     "outline_and_rest": (outline_and_rest, "blobs.ply", {}),
     "name_what_is_clicked": (name_what_is_clicked, "blobs.ply", {}),
     "ask_before_leaving": (ask_before_leaving, "blobs.ply", {}),
     "drag_the_gizmo": (drag_the_gizmo, "blobs.ply", {}),
+    "compare_two_scenes": (compare_two_scenes, "blobs.ply", {}),
+    "clip_and_brush": (clip_and_brush, "blobs.ply", {}),
 }

@@ -1,4 +1,4 @@
-"""A long day at the window: 50 scenes opened and closed and 1000 actions; run by test_soak.py.
+"""A long day at the window: 100 scenes opened and closed and 2000 actions; run by test_process.py.
 
     python -m tests.viewer.soak_driver BACKEND FOLDER
 
@@ -33,9 +33,9 @@ from langsplat_viewer.state import memory_bytes
 from tests.viewer.window_driver import Session
 
 SCENES = ("blobs.ply", "plain.ply", "many.ply", "bare.ply", "few.ply")
-OPENED = 50
-ACTIONS_EACH = 20  # of one scene: 1000 in all
-MARKS = (10, 20, 30, 40, 50)  # after so many scenes it is said what is held
+OPENED = 100
+ACTIONS_EACH = 20  # of one scene: 2000 in all
+MARKS = (10, *range(20, 101, 20))  # after so many scenes it is said what is held
 PHRASES = ("mug", "book", "plant", "mug or plant", "book, plant", "sofa", "mug left of plant")
 # These wait for a person, or draw for minutes.
 LEFT_OUT = ("save a film of the path", "compare the picture with the reference")

@@ -16,7 +16,7 @@ from langsplat_core.io import language
 from langsplat_core.io.cameras import write_cameras
 from langsplat_core.io.scenes import companion_path, save_scene
 from langsplat_core.scene import Camera, Scene
-from langsplat_viewer import __main__ as program
+from langsplat_viewer import program
 from langsplat_viewer.options import DisplayChoice, latent_level, parse_size
 from tests.support.fakes import CENTRES, blob_scene
 from tests.support.scenes import with_tree
@@ -299,7 +299,7 @@ def test_no_display_suggests_a_picture_without_a_window(folder, display):
 def test_without_a_window_no_windowing_library_is_loaded(folder):
     code = (
         "import sys\n"
-        "from langsplat_viewer.__main__ import entry\n"
+        "from langsplat_viewer.program import entry\n"
         "sys.argv = 'langsplat-viewer blobs.ply --query book --headless --out a.png'.split()\n"
         "try:\n"
         "    entry()\n"

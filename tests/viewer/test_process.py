@@ -173,15 +173,17 @@ def folder(tmp_path: Path) -> Path:
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="reads /proc and libGL.so")
 @pytest.mark.parametrize("backend", ["opengl", "cpu"])
-def test_fifty_scenes_and_a_thousand_actions(backend: str, display: str, folder: Path, measured: Measure):
+def test_a_hundred_scenes_and_two_thousand_actions(
+    backend: str, display: str, folder: Path, measured: Measure
+):
     arguments = ["-m", "tests.viewer.soak_driver", backend, str(folder)]
-    said = play(display, arguments, folder, timeout=3000).splitlines()
+    said = play(display, arguments, folder, timeout=3500).splitlines()
     assert said[-1].endswith("PASSED"), "\n".join(said)[-4000:]
     first, *later = [json.loads(line[line.index("{") :]) for line in said if '"scenes"' in line]
-    assert (later[-1]["scenes"], later[-1]["actions"]) == (50, 1000)
+    assert (later[-1]["scenes"], later[-1]["actions"]) == (100, 2000)
     measured(f"soak, {backend}", "MB after 10 scenes and 200 actions", first["MB"])
-    measured(f"soak, {backend}", "MB after 50 scenes and 1000 actions", later[-1]["MB"])
-    # Forty scenes lie between, each with its answers megabytes.
+    measured(f"soak, {backend}", "MB after 100 scenes and 2000 actions", later[-1]["MB"])
+    # Ninety scenes lie between, each with its answers megabytes.
     assert later[-1]["MB"] - first["MB"] < MOST_GROWTH
     for held in (first, *later):
         for kind, most in MOST_HELD.items():

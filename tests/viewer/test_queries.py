@@ -144,6 +144,29 @@ def test_hiding_keeps_the_colours_of_the_others(opened):
     assert opened.state.shown_results() == ()
 
 
+def test_queries_are_combined_as_the_grammar_reads_them(opened):
+    for word in ("mug", "book"):
+        queries.ask(opened, word)
+    settle(opened)
+    mug, book = opened.state.queries
+    for join in queries.JOINS:
+        queries.ask_combined(opened, mug, join, book)
+    settle(opened)
+    both, either, only = opened.state.queries[2:]
+    assert [query.result.found for query in (both, either, only)] == [True] * 3
+    assert either.result.members.sum() == 240 > only.result.members.sum() == 120
+    assert (only.result.members == mug.result.members).all()
+
+
+def test_one_heat_scale_for_all_answers(opened):
+    for word in ("mug", "book"):
+        queries.ask(opened, word)
+    settle(opened)
+    settings.set_picture(opened, replace(opened.state.picture, heat_scale=(0.4, 0.7)))
+    (pane,) = opened.state.panes()
+    assert pane.ranges == ((0.4, 0.7), (0.4, 0.7))
+
+
 def test_level_applies_to_every_query(opened):
     queries.ask(opened, "plant")
     settle(opened)

@@ -1,6 +1,7 @@
 """Camera paths, films, saved images and commands, as actions of the window."""
 
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -222,7 +223,7 @@ def cut_by_hand(viewer) -> None:
     queries.set_cut(viewer, query, float(np.median(query.automatic.even[query.automatic.members])))
 
 
-QUERIES = ("queries", "colours", "sliders", "cuts", "canonical")
+QUERIES = ("queries", "colours", "sliders", "scale", "cuts", "canonical")
 SLIDERS = PictureConfig(display="relevancy", heat_opacity=0.3, dim=0.9)
 
 
@@ -238,6 +239,7 @@ LOOKS = {
     "orthographic": look_flat,
     "colours": lambda viewer: queries.hide(viewer, viewer.state.queries[0]),
     "sliders": lambda viewer: settings.set_picture(viewer, SLIDERS),
+    "scale": lambda viewer: settings.set_picture(viewer, replace(SLIDERS, heat_scale=(0.4, 0.9))),
     "cuts": cut_by_hand,
     "depth": see_depth,
     "clip": lambda viewer: settings.set_clip(viewer, Clip(4.4, 5.1)),

@@ -70,7 +70,12 @@ def edit_everything(viewer: Viewer, mode: str) -> None:
     settings.set_splats(viewer, Splats(0.8, 0))
     settings.set_clip(viewer, Clip(0.5, 6.5))
     picture = PictureConfig(
-        heat_opacity=0.6, dim=0.7, threshold=0.3, alpha_gate=0.2, background=(0.1, 0.6, 0.3)
+        heat_opacity=0.6,
+        dim=0.7,
+        threshold=0.3,
+        alpha_gate=0.2,
+        heat_scale=(0.1, 0.8),
+        background=(0.1, 0.6, 0.3),
     )
     settings.set_picture(viewer, picture)
     settings.set_colour_map(viewer, "viridis")

@@ -10,6 +10,7 @@ from plyfile import PlyData
 
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.scene import look_at
+from langsplat_viewer import marks
 from langsplat_viewer.actions import opening, queries, selecting, settings, undoing, viewpoint
 from langsplat_viewer.actions.selecting import take
 from langsplat_viewer.camera.controls import from_camera
@@ -540,3 +541,53 @@ def test_everything_like_the_selection(opened):
     selecting.select_alike(opened)
     settle(opened)
     assert marked(opened)[0] == "mug"
+
+
+# By numbers.
+
+
+def test_values_in_a_range_are_selected_and_nothing_that_is_hidden(searched):
+    means = searched.state.scene.gaussians.means.astype(np.float64)
+    away = np.linalg.norm(means - searched.state.view.eye, axis=1)
+    take(searched, away < np.median(away))
+    selecting.hide_selected(searched)
+    selecting.set_measure(searched, "distance")
+    found = selecting.values_shown(searched)
+    assert found is selecting.values_shown(searched)
+    assert found.counts.sum() > 0
+    np.testing.assert_allclose(
+        10 ** np.array([found.low, found.high]), [np.median(away), away.max()], rtol=0.2
+    )
+    selecting.brush_values(searched, 0.5)
+    selecting.brush_values(searched, -3.0)  # the mouse is outside
+    selecting.end_brush(searched)
+    cut = 10 ** ((found.low + found.high) / 2)
+    chosen = searched.state.selection.marks.selected
+    np.testing.assert_array_equal(chosen, (away >= np.median(away)) & (away <= cut))
+    viewpoint.frame_scene(searched)
+    selecting.set_measure(searched, "relevancy")
+    assert selecting.values_shown(searched).high == pytest.approx(searched.state.queries[0].result.even.max())
+
+
+@pytest.mark.parametrize("measure", marks.MEASURES)
+def test_a_histogram_leaves_out_what_is_no_number(measure):
+    scene = SCENES["blobs.ply"]
+    broken = scene.gaussians.means.copy()
+    broken[0], broken[1] = np.nan, np.inf
+    logits = np.full(len(broken), np.inf, np.float32)
+    odd = replace(scene, gaussians=replace(scene.gaussians, means=broken, opacity_logits=logits))
+    values = marks.measured(odd, measure, np.zeros(3), np.full(len(broken), np.nan))
+    found = marks.histogram(values, np.ones(len(broken), bool))
+    assert np.isfinite([found.low, found.high]).all()
+    assert found.low < found.high
+    counted = np.expm1(found.counts.astype(np.float64)).sum()
+    assert counted == pytest.approx(np.isfinite(values).sum(), abs=0.01)
+    assert found.between(1.0, 0.0).sum() == np.isfinite(values).sum()
+
+
+def test_relevancy_needs_an_answer(opened):
+    selecting.set_measure(opened, "relevancy")
+    assert selecting.values_shown(opened) is None
+    selecting.brush_values(opened, 0.5)
+    selecting.end_brush(opened)
+    assert marked(opened) == ("", "", "")

@@ -10,7 +10,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.scene.transform import AXES, IDENTITY, moving, rotating, scaling
 from langsplat_viewer.actions import opening, queries, selecting, transforming, undoing
-from langsplat_viewer.panels.transform import dragged, gl_matrices
+from langsplat_viewer.panels.transform import box_of, dragged, gl_matrices
 from langsplat_viewer.state import EditForm
 from tests.support.fakes import CENTRES
 from tests.support.scenes import random_camera, without_perspective
@@ -167,6 +167,30 @@ def test_cropped_to_a_box_and_undone(opened):
     transforming.crop(opened)
     assert "holds nothing" in errors(opened)[-1]
     assert opened.state.selection.marks.kept.all()
+
+
+def test_a_clip_follows_its_box_and_is_undone(opened):
+    chosen = selected_mug(opened)
+    transforming.fill_box(opened)
+    transforming.clip(opened, True)
+    marks = opened.state.selection.marks
+    assert marks.shown[chosen].all()
+    assert 0 < marks.hidden.sum() < len(chosen)
+    assert not marks.deleted.any()
+    transforming.set_box(opened, (-9.0, -9.0, -9.0), (9.0, 9.0, 9.0))
+    transforming.follow_box(opened)
+    assert opened.state.selection.marks.shown.all()
+    undoing.undo(opened)
+    transforming.follow_box(opened)  # the box has not moved since: nothing is hidden or shown again
+    assert opened.state.selection.marks.hidden.any()
+    transforming.clip(opened, False)
+    assert opened.state.selection.marks.shown.all()
+
+
+def test_the_corners_of_a_dragged_box():
+    matrix = np.diag([2.0, -4.0, 6.0, 1.0])  # a handle was dragged beyond the opposite one
+    matrix[:3, 3] = 1.0, 2.0, 3.0
+    assert box_of(matrix) == ((0.0, 0.0, 0.0), (2.0, 4.0, 6.0))
 
 
 def test_without_a_scene_nothing_happens(viewer):

@@ -71,6 +71,10 @@ def folder(tmp_path: Path) -> Path:
         "fade_in_a_photograph",
         "see_the_evidence",
         "large_letters",
+        "use_the_toolbar",
+        "clip_and_brush",
+        "use_the_outline",
+        "compare_two_scenes",
     ],
 )
 def test_window(scenario: str, cast: Cast, folder: Path):

@@ -328,6 +328,8 @@ def _display_words(state: ViewerState) -> list[str]:
     ):
         if value != usual:
             words += [option, repr(value)]
+    if picture.heat_scale is not None:
+        words += ["--heat-scale", *map(repr, picture.heat_scale)]
     if any(query.cut is not None for _, query in shown):
         words += [word for _, query in shown for word in ("--cut", repr(float(query.cut or 0.0)))]
     if state.canonical:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from langsplat_core.config import LevelChoice, PictureConfig
 from langsplat_viewer.camera.flight import Keyframe
+from langsplat_viewer.files.projects import Things
 from langsplat_viewer.marks import Move, PackedMarks, pack
 from langsplat_viewer.state import Query, ViewSettings
 from langsplat_viewer.viewer import Viewer
@@ -26,6 +27,7 @@ class Moment:
     marks: PackedMarks
     moves: tuple[Move, ...]
     keyframes: tuple[Keyframe, ...]
+    things: Things
 
 
 def now(viewer: Viewer) -> Moment:
@@ -43,6 +45,7 @@ def now(viewer: Viewer) -> Moment:
         marks=viewer.history.marks.packed,
         moves=state.selection.moves,
         keyframes=state.record.keyframes,
+        things=state.things,
     )
 
 

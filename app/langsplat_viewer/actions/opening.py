@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -22,20 +23,24 @@ from langsplat_core.query.finding import Answered, Hit, find
 from langsplat_core.query.library import Library, update_library
 from langsplat_core.scene import Camera, Scene, surface
 from langsplat_core.semantics.encoders import DEMO
+from langsplat_viewer.actions import projects
 from langsplat_viewer.actions.filming import load_path
 from langsplat_viewer.actions.history import forget, remember
+from langsplat_viewer.actions.outline import apply_locks
 from langsplat_viewer.actions.queries import ask, ask_again, load_queries, set_canonical
 from langsplat_viewer.actions.selecting import leave
-from langsplat_viewer.actions.settings import open_panel
+from langsplat_viewer.actions.settings import open_panel, show_scenes
 from langsplat_viewer.actions.viewpoint import opening_view, read_bookmarks
 from langsplat_viewer.camera.controls import Extent, extent_of
-from langsplat_viewer.files import photographs
+from langsplat_viewer.files import PROJECTS, photographs
 from langsplat_viewer.files.browsing import SUFFIX as QUERIES
 from langsplat_viewer.files.browsing import Entry, list_folder
 from langsplat_viewer.files.flights import SUFFIX as PATHS
 from langsplat_viewer.files.photographs import Photograph
 from langsplat_viewer.files.preferences import with_photographs, with_recent
+from langsplat_viewer.files.projects import read_project, scene_of
 from langsplat_viewer.files.watching import Stamps, stamps
+from langsplat_viewer.jobs import one_line
 from langsplat_viewer.marks import of_scene
 from langsplat_viewer.rendering.depth import UNCLIPPED, why_undrawable
 from langsplat_viewer.state import LibraryView, Recording, SceneState, ViewerState
@@ -184,7 +189,9 @@ def return_to(viewer: Viewer, visit: Visit) -> None:
     if visit.camera_index is not None and visit.camera_index < count:
         state.camera_index = visit.camera_index
     state.settings, state.ruler = replace(state.settings, clip=visit.clip), visit.ruler
-    state.record.keyframes = visit.keyframes
+    state.record.keyframes, state.things = visit.keyframes, visit.things
+    if visit.things.locked:
+        apply_locks(viewer)
     if state.scene.language is None and DISPLAYS[visit.display].needs_field:
         return
     state.picture = replace(state.picture, display=visit.display)
@@ -363,16 +370,19 @@ def choose_photograph_folder(viewer: Viewer, folder: Path) -> None:
 MOST_HITS = 200  # scenes that the panel lists
 
 
-def ask_for_library(viewer: Viewer) -> None:
-    """Open the browser to choose a folder of scenes."""
+def ask_for_folder(viewer: Viewer, purpose: Literal["library", "dataset"]) -> None:
+    """Open the browser to choose a folder of scenes, or one to train on."""
     ask_for_file(viewer)
-    viewer.state.picks_folder = "library"
+    viewer.state.picks_folder = purpose
 
 
 def choose_folder(viewer: Viewer, folder: Path) -> None:
     """Take the folder that the browser was opened for."""
-    if viewer.state.picks_folder == "library":
+    state = viewer.state
+    if state.picks_folder == "library":
         open_library(viewer, folder)
+    elif state.picks_folder == "dataset":
+        state.browser, state.training_form = None, replace(state.training_form, dataset=str(folder))
     else:
         choose_photograph_folder(viewer, folder)
 
@@ -443,7 +453,25 @@ def ask_for_file(viewer: Viewer) -> None:
     """Open the browser in the folder of the scene that is shown."""
     state = viewer.state
     folder = state.path.parent if state.path is not None else Path.cwd()
-    state.path_typed, state.browser, state.picks_folder = "", list_folder(folder.absolute()), ""
+    state.path_typed, state.browser = "", list_folder(folder.absolute())
+    state.picks_folder, state.picks_beside = "", False
+
+
+def ask_for_beside(viewer: Viewer) -> None:
+    """Open the browser to choose a scene to show beside this one."""
+    ask_for_file(viewer)
+    viewer.state.picks_beside = True
+
+
+def open_beside(viewer: Viewer, path: Path) -> None:
+    """Show another scene right of a line, seen and asked as this one is."""
+    beside = Viewer(viewer.services)
+    beside.worker.wake, beside.state.backend = viewer.worker.wake, viewer.state.backend
+    if viewer.beside is not None:
+        viewer.beside.worker.close()
+    viewer.beside = beside
+    show_scenes(viewer)
+    open_scene(beside, path)
 
 
 def close_browser(viewer: Viewer) -> None:
@@ -460,19 +488,37 @@ def choose(viewer: Viewer, entry: Entry) -> None:
     """Go into a folder, or open a scene."""
     if entry.is_file:
         close_browser(viewer)
-        open_file(viewer, entry.path)
+        (open_beside if viewer.state.picks_beside else open_file)(viewer, entry.path)
     else:
         browse(viewer, entry.path)
 
 
 def open_file(viewer: Viewer, path: Path) -> None:
-    """Open a scene, ask a set of queries, or take a camera path."""
-    if path.name.endswith(QUERIES):
+    """Open a scene or a project, ask a set of queries, or take a camera path."""
+    if path.name.endswith(PROJECTS):
+        open_project(viewer, path)
+    elif path.name.endswith(QUERIES):
         load_queries(viewer, path)
     elif path.name.endswith(PATHS):
         load_path(viewer, path)
     else:
         open_scene(viewer, path)
+
+
+def open_project(viewer: Viewer, path: Path, then: Callable[[Viewer], None] = lambda viewer: None) -> None:
+    """Open the scene of a project, and have in it what the project holds; `then` runs once it is there."""
+    try:
+        project = read_project(path)
+        scene = scene_of(project)
+    except InputError as error:
+        viewer.state.say(one_line(error), is_error=True)
+        return
+
+    def restore(viewer: Viewer) -> None:
+        return_to(viewer, projects.restore(viewer, project, path.absolute()))
+        then(viewer)
+
+    open_scene(viewer, scene, restore)
 
 
 def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
@@ -483,7 +529,7 @@ def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
         choose_photographs(viewer, paths[0])
         open_panel(viewer, "Train")
         return
-    sets = [path for path in paths if path.name.endswith((QUERIES, PATHS))]
+    sets = [path for path in paths if path.name.endswith((QUERIES, PATHS, PROJECTS))]
     files = [path for path in paths if path not in sets]
     scenes = [path for path in files if not path.name.endswith(COMPANIONS)] or files
     if not scenes:

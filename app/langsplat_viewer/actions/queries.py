@@ -1,5 +1,6 @@
 """Searching: the box, the list of queries, their colours and their level."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -26,7 +27,7 @@ from langsplat_viewer.actions.settings import mute_letters, open_panel
 from langsplat_viewer.files.browsing import SUFFIX, QuerySet, SavedQuery, read_queries, write_queries
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.output.saving import free_name
-from langsplat_viewer.state import SLOTS, EvidenceSheet, Query
+from langsplat_viewer.state import SLOTS, EvidenceSheet, Query, ViewerState
 from langsplat_viewer.viewer import Viewer
 
 MOST_THINGS = 20  # of one answer that are told apart
@@ -60,6 +61,14 @@ def ask_one(viewer: Viewer, phrase: str, *, cut: float | None = None, then_show:
     query.cut = cut
     select(viewer, query)
     _answer(viewer, query, then_show)
+
+
+JOINS = {"and": "{} and {}", "or": "{} or {}", "without": "{}, not {}"}  # as the grammar reads them
+
+
+def ask_combined(viewer: Viewer, first: Query, join: str, second: Query) -> None:
+    """Search for two queries at once, joined by one of `JOINS`."""
+    ask_one(viewer, JOINS[join].format(first.phrase, second.phrase), then_show=True)
 
 
 def ask_again(viewer: Viewer) -> None:
@@ -96,20 +105,31 @@ def type_name(viewer: Viewer, name: str) -> None:
 
 def name_selection(viewer: Viewer) -> None:
     """Teach the typed name by what is selected, and search for it. What is saved from now on keeps it."""
-    engine, scene, selection = viewer.engine, viewer.state.scene, viewer.state.selection
-    if not has_selection(viewer) or engine is None:
-        return
-
-    def work(progress: Progress) -> TaughtWord:
-        return engine.teach(selection.name, selection.marks.selected)
 
     def done(word: TaughtWord) -> None:
-        if viewer.state.scene is scene:
-            type_name(viewer, "")
-            viewer.state.say(f"taught '{word.name}'; to keep it, save the scene")
-            ask_one(viewer, word.name)
+        type_name(viewer, "")
+        taught(viewer, word)
 
-    viewer.run("naming the selection", work, done)
+    if has_selection(viewer):
+        selection = viewer.state.selection
+        teach(viewer, selection.name, selection.marks.selected, done)
+
+
+def teach(viewer: Viewer, name: str, members: Array, done: Callable[[TaughtWord], None]) -> None:
+    """Have the worker teach a name by what (N,) bool mean; then `done`, if the scene is still there."""
+    engine, scene = viewer.engine, viewer.state.scene
+    if engine is not None:
+        viewer.run(
+            f"teaching '{name}'",
+            lambda progress: engine.teach(name, members),
+            lambda word: done(word) if viewer.state.scene is scene else None,
+        )
+
+
+def taught(viewer: Viewer, word: TaughtWord) -> None:
+    """Say that a word was taught, and search for it."""
+    viewer.state.say(f"taught '{word.name}'; to keep it, save the scene")
+    ask_one(viewer, word.name)
 
 
 def focus_search(viewer: Viewer) -> None:
@@ -334,6 +354,12 @@ def set_canonical(viewer: Viewer, text: str) -> None:
     viewer.run("encoding canonical phrases", work, done)
 
 
+def listed_queries(state: ViewerState) -> QuerySet:
+    """The list as it is saved."""
+    saved = tuple(SavedQuery(query.phrase, query.cut, query.slot is not None) for query in state.queries)
+    return QuerySet(saved, state.level, state.canonical)
+
+
 def save_queries(viewer: Viewer, folder: Path) -> Path | None:
     """Save the list to a new file in `folder`; returns its path, None if there is none or that failed."""
     state = viewer.state
@@ -341,9 +367,8 @@ def save_queries(viewer: Viewer, folder: Path) -> Path | None:
         state.say("search for something first, then save the queries", is_error=True)
         return None
     path = free_name(folder, state.path.stem if state.path else "scene", SUFFIX)
-    saved = tuple(SavedQuery(query.phrase, query.cut, query.slot is not None) for query in state.queries)
     try:
-        write_queries(path, QuerySet(saved, state.level, state.canonical))
+        write_queries(path, listed_queries(state))
     except OSError as error:
         state.say(f"{path}: not saved ({one_line(error)})", is_error=True)
         return None

@@ -23,7 +23,7 @@ from langsplat_core.query.selection import at_point, grow, of_rows, shrink
 from langsplat_core.scene import LEVELS, Scene
 from langsplat_viewer import marks
 from langsplat_viewer.actions.history import remember
-from langsplat_viewer.marks import Drawn, Leaving, Marks, Mode, Stroke, Tool
+from langsplat_viewer.marks import Drawn, Leaving, Marks, Measure, Mode, Stroke, Tool
 from langsplat_viewer.output.saving import free_name
 from langsplat_viewer.rendering.depth import UNCLIPPED
 from langsplat_viewer.state import Query
@@ -43,7 +43,7 @@ def mark(viewer: Viewer, marks: Marks) -> None:
 def take(viewer: Viewer, found: Array, mode: Mode | None = None) -> None:
     """Combine the selection with `found` (N,) bool; `mode` in place of the one that is set."""
     selection = viewer.state.selection
-    mark(viewer, marks.combined(selection.marks, found, mode or selection.mode))
+    mark(viewer, marks.combined(selection.marks, found & ~selection.locked, mode or selection.mode))
 
 
 def has_scene(viewer: Viewer) -> bool:
@@ -90,7 +90,7 @@ def hide_selected(viewer: Viewer) -> None:
 def isolate_selected(viewer: Viewer) -> None:
     """Hide everything that is not selected."""
     if has_selection(viewer):
-        mark(viewer, marks.isolating(viewer.state.selection.marks))
+        mark(viewer, marks.isolating(viewer.state.selection.marks, viewer.state.selection.locked))
 
 
 def show_hidden(viewer: Viewer) -> None:
@@ -194,6 +194,46 @@ def set_reach(viewer: Viewer, share: float) -> None:
 def set_only_visible(viewer: Viewer, only: bool) -> None:
     """Set whether rectangle, lasso and brush leave out what lies behind something."""
     viewer.state.selection = replace(viewer.state.selection, only_visible=only)
+
+
+# Brushing over a histogram of the Gaussians' numbers.
+
+
+def set_measure(viewer: Viewer, measure: Measure) -> None:
+    """Choose the numbers whose histogram is shown."""
+    viewer.state.selection = replace(viewer.state.selection, measure=measure, brushed=None)
+
+
+def values_shown(viewer: Viewer) -> marks.Histogram | None:
+    """The histogram of the chosen numbers, of what is shown; None where there are none of them."""
+    state, query = viewer.state, chosen_query(viewer)
+    if state.scene is None or state.view is None:
+        return None
+    measure, marked = state.selection.measure, state.selection.marks
+    relevancy = None if query is None or query.result is None else query.result.even
+    view = state.view if measure == "distance" else None
+    of = (state.scene, measure, relevancy, view, marked.hidden, marked.deleted)
+    kept = viewer.histogram
+    if kept is None or any(part is not before for part, before in zip(of, kept[0], strict=True)):
+        values = marks.measured(state.scene, measure, state.view.eye, relevancy)
+        viewer.histogram = of, None if values is None else marks.histogram(values, marked.shown)
+    return None if viewer.histogram is None else viewer.histogram[1]
+
+
+def brush_values(viewer: Viewer, at: float) -> None:
+    """The mouse is held at a fraction `at` of the histogram's range."""
+    selection = viewer.state.selection
+    at = min(max(at, 0.0), 1.0)
+    start = at if selection.brushed is None else selection.brushed[0]
+    viewer.state.selection = replace(selection, brushed=(start, at))
+
+
+def end_brush(viewer: Viewer, mode: Mode | None = None) -> None:
+    """The button goes up: select what has values in the range that was brushed."""
+    brushed, found = viewer.state.selection.brushed, values_shown(viewer)
+    viewer.state.selection = replace(viewer.state.selection, brushed=None)
+    if brushed is not None and found is not None:
+        take(viewer, found.between(*brushed), mode)
 
 
 # Writing what is selected, the rest, or the scene without what was deleted: to new files, never over old.

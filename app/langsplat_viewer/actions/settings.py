@@ -42,6 +42,11 @@ def toggle_levels(viewer: Viewer) -> None:
         _set_split(viewer, replace(split, mode="levels"))
 
 
+def show_scenes(viewer: Viewer) -> None:
+    """Show the second scene right of the line."""
+    _set_split(viewer, replace(viewer.state.settings.split, mode="scenes"))
+
+
 def show_one(viewer: Viewer) -> None:
     """Have one image fill the scene's area."""
     _set_split(viewer, replace(viewer.state.settings.split, mode="off"))
@@ -212,6 +217,11 @@ def reset_panels(viewer: Viewer) -> None:
     viewer.state.resets_panels = True
 
 
+def have_panels(viewer: Viewer, titles: tuple[str, ...]) -> None:
+    """Have these panels open from the next frame on, and no others; none: those that are."""
+    viewer.state.shows_panels = titles
+
+
 def take_panel_reset(viewer: Viewer) -> bool:
     """Whether the panels go back to their first places now; said once."""
     reset, viewer.state.resets_panels = viewer.state.resets_panels, False
@@ -264,6 +274,7 @@ def escape(viewer: Viewer) -> None:
     show_help(viewer, False)
     show_palette(viewer, False)
     measure(viewer, False)
+    state.pins_notes = False
     state.browser = None
     stay(viewer)
     mute_letters(viewer, False)

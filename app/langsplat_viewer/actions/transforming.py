@@ -15,10 +15,10 @@ from langsplat_core.query.selection import in_box
 from langsplat_core.scene.transform import AXES, Similarity, moving, rotating, scaling
 from langsplat_viewer.actions.history import remember
 from langsplat_viewer.actions.queries import ask_again, set_canonical
-from langsplat_viewer.actions.selecting import has_scene, mark
+from langsplat_viewer.actions.selecting import has_scene, mark, show_hidden
 from langsplat_viewer.camera.controls import extent_of
 from langsplat_viewer.marks import Move
-from langsplat_viewer.state import EditForm, Gizmo
+from langsplat_viewer.state import EditForm, Gizmo, Point
 from langsplat_viewer.viewer import Viewer
 
 
@@ -28,7 +28,7 @@ def fill_form(viewer: Viewer, form: EditForm) -> None:
 
 
 def next_gizmo(viewer: Viewer) -> None:
-    """Show the gizmo that moves, the one that rotates, the one that scales, none."""
+    """Show the gizmo that moves, the one that rotates, the one that scales, the handles of the box, none."""
     kinds: tuple[Gizmo, ...] = get_args(Gizmo)
     here = kinds.index(viewer.state.edit_form.gizmo)
     fill_form(viewer, replace(viewer.state.edit_form, gizmo=kinds[(here + 1) % len(kinds)]))
@@ -40,10 +40,14 @@ def pivot(viewer: Viewer) -> Array | None:
     state = viewer.state
     if state.scene is None or state.extent is None:
         return None
-    chosen = state.selection.marks.selected & state.scene.gaussians.valid()
-    if not chosen.any():
-        return state.extent.centre
-    return np.asarray(np.median(state.scene.gaussians.means[chosen].astype(np.float64), axis=0))
+    selected, kept = state.selection.marks.selected, viewer.pivot
+    if kept is None or kept[0] is not state.scene or kept[1] is not selected:  # asked in every frame
+        chosen = selected & state.scene.gaussians.valid()
+        middle = state.extent.centre
+        if chosen.any():
+            middle = np.median(state.scene.gaussians.means[chosen].astype(np.float64), axis=0)
+        kept = viewer.pivot = state.scene, selected, np.asarray(middle)
+    return kept[2]
 
 
 def _move_of(viewer: Viewer, to: Similarity) -> Move:
@@ -129,17 +133,49 @@ def fill_box(viewer: Viewer) -> None:
         means = state.scene.gaussians.means[chosen].astype(np.float64)
         low, high = (tuple(corner.tolist()) for corner in (means.min(0), means.max(0)))
         fill_form(viewer, replace(state.edit_form, low=low, high=high))
+        follow_box(viewer)
+
+
+def set_box(viewer: Viewer, low: Point, high: Point) -> None:
+    """Set two opposite corners of the box of the panel, world units."""
+    fill_form(viewer, replace(viewer.state.edit_form, low=low, high=high))
+
+
+def _inside(viewer: Viewer) -> Array | None:
+    """(N,) what lies inside the box, or is locked; None, and said why, where that is nothing."""
+    state, form = viewer.state, viewer.state.edit_form
+    if not has_scene(viewer) or state.scene is None:
+        return None
+    corners = np.array([form.low, form.high])
+    inside = in_box(state.scene.gaussians.means, corners.min(0), corners.max(0)) | state.selection.locked
+    if not (inside & state.selection.marks.kept).any():
+        state.say("the box holds nothing: set its corners around something, or press Fit", is_error=True)
+        return None
+    return inside
 
 
 def crop(viewer: Viewer) -> None:
     """Delete what lies outside the box of the panel; refused where nothing lies inside."""
-    state, form = viewer.state, viewer.state.edit_form
-    if not has_scene(viewer) or state.scene is None:
+    inside, marks = _inside(viewer), viewer.state.selection.marks
+    if inside is not None:
+        mark(viewer, replace(marks, selected=marks.selected & inside, deleted=marks.deleted | ~inside))
+
+
+def clip(viewer: Viewer, on: bool) -> None:
+    """Hide what lies outside the box from now on, or show again all that is hidden."""
+    fill_form(viewer, replace(viewer.state.edit_form, clips=on, clipped=None))
+    if on:
+        follow_box(viewer)
+    else:
+        show_hidden(viewer)
+
+
+def follow_box(viewer: Viewer) -> None:
+    """Hide what lies outside the box where it clips and has changed."""
+    form, marks = viewer.state.edit_form, viewer.state.selection.marks
+    if not form.clips or viewer.state.scene is None or form.clipped == (form.low, form.high):
         return
-    corners = np.array([form.low, form.high])
-    inside = in_box(state.scene.gaussians.means, corners.min(0), corners.max(0))
-    marks = state.selection.marks
-    if not (inside & marks.kept).any():
-        state.say("the box holds nothing: set its corners around something, or press Fit", is_error=True)
-        return
-    mark(viewer, replace(marks, selected=marks.selected & inside, deleted=marks.deleted | ~inside))
+    fill_form(viewer, replace(form, clipped=(form.low, form.high)))
+    inside = _inside(viewer)
+    if inside is not None:
+        mark(viewer, replace(marks, selected=marks.selected & inside, hidden=marks.kept & ~inside))

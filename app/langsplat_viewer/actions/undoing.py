@@ -4,6 +4,7 @@ The camera is not undone: its reset leads back."""
 from dataclasses import replace
 
 from langsplat_viewer.actions.history import Moment, let_go, now
+from langsplat_viewer.actions.outline import apply_locks
 from langsplat_viewer.actions.queries import ask_unanswered, set_cut, set_level
 from langsplat_viewer.actions.transforming import place
 from langsplat_viewer.marks import pack, unpack
@@ -43,6 +44,9 @@ def _restore(viewer: Viewer, moment: Moment) -> None:
     marks = unpack(moment.marks, pack(state.selection.marks, history.marks))
     state.selection = replace(state.selection, marks=marks, stroke=None)
     state.record.keyframes, state.record.chosen = moment.keyframes, None
+    if moment.things != state.things:
+        state.things = moment.things
+        apply_locks(viewer)
     state.picture, state.latent_level = moment.picture, moment.latent_level
     state.settings = moment.settings
     looks = replace(state.preferences, colour_map=moment.picture.colour_map, overlays=moment.overlays)

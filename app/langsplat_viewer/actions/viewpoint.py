@@ -15,6 +15,7 @@ from langsplat_core.query.engine import no_field
 from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer
 from langsplat_core.scene import Camera
 from langsplat_viewer.camera.controls import (
+    Extent,
     OrbitCamera,
     Side,
     between,
@@ -279,6 +280,12 @@ def focus_result(viewer: Viewer, query: Query | None = None) -> None:
     glide_to(viewer, focus(state.view, place, _distance_for(viewer, place, query.result.box)))
 
 
+def focus_on(viewer: Viewer, place: Array, box: Array) -> None:
+    """Bring a thing at `place` (3,) in `box` (2, 3) to the centre, as near as it is small."""
+    if viewer.state.view is not None and viewer.state.extent is not None:
+        glide_to(viewer, focus(viewer.state.view, place, _distance_for(viewer, place, box)))
+
+
 def _distance_for(viewer: Viewer, place: Array, box: Array | None) -> float:
     """From where a thing at `place` (3,) in `box` (2, 3) is seen, world units: no farther back than the
     eye or the opening view are now, which in a room would be behind its wall."""
@@ -398,9 +405,14 @@ def type_bookmark(viewer: Viewer, text: str) -> None:
 def go_to_bookmark(viewer: Viewer, bookmark: Bookmark) -> None:
     """Stand where it was made, turning around the same point."""
     if viewer.state.extent is not None:
-        view = view_of(bookmark.pose, viewer.state.extent)
-        target = view.eye + bookmark.distance * view.rotation[2]
-        glide_to(viewer, replace(view, target=target, distance=bookmark.distance))
+        glide_to(viewer, bookmarked_view(bookmark, viewer.state.extent))
+
+
+def bookmarked_view(bookmark: Bookmark, extent: Extent) -> OrbitCamera:
+    """The view that was kept."""
+    view = view_of(bookmark.pose, extent)
+    target = view.eye + bookmark.distance * view.rotation[2]
+    return replace(view, target=target, distance=bookmark.distance)
 
 
 def delete_bookmark(viewer: Viewer, bookmark: Bookmark) -> None:

@@ -327,7 +327,7 @@ class Extent:
 def extent_of(scene: Scene) -> Extent:
     """Return the extent of a scene."""
     centre, radius = scene.bounds()
-    rotation = scene.framing_camera((1000, 1000)).rotation
+    rotation = scene.framing_camera((1000, 1000), (centre, radius)).rotation
     sample = sample_of(scene.gaussians)
     farthest = FARTHEST * max(reach(sample, centre), radius)
     return Extent(centre, radius, scene.up(), rotation, sample, farthest)

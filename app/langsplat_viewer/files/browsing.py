@@ -10,6 +10,7 @@ from langsplat_core.config import LevelChoice
 from langsplat_core.errors import InputError, printable_line
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.scenes import format_of
+from langsplat_viewer.files import PROJECTS
 from langsplat_viewer.files.flights import SUFFIX as PATHS
 
 SUFFIX = ".queries.json"
@@ -41,8 +42,12 @@ class QuerySet:
 def write_queries(path: Path, queries: QuerySet) -> None:
     """Write a set, whole or not at all."""
     with atomic_path(path) as temporary:
-        content = {"format": FORMAT, "version": 1, **asdict(queries)}
-        temporary.write_text(json.dumps(content, indent=1, ensure_ascii=False), encoding="utf-8")
+        temporary.write_text(json.dumps(query_entries(queries), indent=1, ensure_ascii=False), "utf-8")
+
+
+def query_entries(queries: QuerySet) -> dict[str, Any]:
+    """A set as JSON has it."""
+    return {"format": FORMAT, "version": 1, **asdict(queries)}
 
 
 def read_queries(path: Path) -> QuerySet:
@@ -50,14 +55,14 @@ def read_queries(path: Path) -> QuerySet:
     try:
         with open(path, "rb") as file:
             top = json.loads(file.read(LARGEST))
-        return _checked(top)
+        return checked_queries(top)
     except (OSError, ValueError, RecursionError) as error:
         reason = printable_line(getattr(error, "strerror", None) or error, 100)
         raise InputError(f"{path}: no set of queries ({reason}); save one anew") from None
 
 
-def _checked(top: Any) -> QuerySet:
-    """ValueError for what breaks a rule of the layout."""
+def checked_queries(top: Any) -> QuerySet:
+    """The set that `query_entries` wrote. ValueError for what breaks a rule of the layout."""
     if not isinstance(top, dict) or top.get("format") != FORMAT or not isinstance(top.get("queries"), list):
         raise ValueError(f'"format" is not "{FORMAT}"')
     canonical, level = top.get("canonical", []), top.get("level", "auto")
@@ -125,7 +130,7 @@ def _entry(path: Path) -> Entry | None:
     try:
         if path.is_dir():
             return Entry(path, is_file=format_of(path) is not None)
-        if format_of(path) is not None or path.name.endswith((SUFFIX, PATHS)):
+        if format_of(path) is not None or path.name.endswith((SUFFIX, PATHS, PROJECTS)):
             return Entry(path, True, path.stat().st_size)
     except OSError:  # it may not be looked at
         pass

@@ -10,6 +10,7 @@
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,7 +46,11 @@ def read_flight(path: Path | str) -> Flight:
         raise FormatError(f'{path}: no camera path; expected an object with "{MARK}": {VERSION}')
     if top[MARK] != VERSION or isinstance(top[MARK], bool):
         raise FormatError(f"{path}: a camera path of version {quoted(top[MARK], 20)}; this program reads 1")
-    entries = top.get("keyframes")
+    return Flight(keyframes_from(top.get("keyframes"), str(path)))
+
+
+def keyframes_from(entries: Any, path: str) -> tuple[Keyframe, ...]:
+    """The keyframes that `keyframe_entries` wrote; FormatError, that begins with `path`, for none."""
     if not isinstance(entries, list) or not 1 <= len(entries) <= MOST:
         raise FormatError(
             f"{path}: 'keyframes' is not a list of 1 to {MOST} keyframes; record the path again"
@@ -60,16 +65,20 @@ def read_flight(path: Path | str) -> Flight:
         if keyframes and seconds - keyframes[-1].seconds < SAME_TIME:
             raise FormatError(f"{what}: 'seconds' is not later than that of the keyframe before; sort them")
         keyframes.append(Keyframe(seconds, pose))
-    return Flight(tuple(keyframes))
+    return tuple(keyframes)
 
 
 def write_flight(path: Path | str, flight: Flight) -> None:
     """Write `flight`, whole or not at all."""
-    entries = [{"seconds": key.seconds, **pose_entry(key.pose)} for key in flight.keyframes]
-    lines = ",\n".join(json.dumps(entry) for entry in entries)
+    lines = ",\n".join(json.dumps(entry) for entry in keyframe_entries(flight.keyframes))
     with atomic_path(path) as temporary:
         text = f'{{"{MARK}": {VERSION}, "keyframes": [\n{lines}\n]}}\n'
         temporary.write_text(text, encoding="utf-8")
+
+
+def keyframe_entries(keyframes: Sequence[Keyframe]) -> list[dict[str, Any]]:
+    """Keyframes as JSON has them."""
+    return [{"seconds": key.seconds, **pose_entry(key.pose)} for key in keyframes]
 
 
 def pose_entry(pose: Pose) -> dict[str, Any]:
@@ -132,7 +141,7 @@ class Shelf:
         what = f"{self._path}: bookmark"
         if not isinstance(entries, list):
             raise FormatError(f"{what}s of {scene}: no list; mend or delete the file")
-        return tuple(_bookmark(entry, what) for entry in entries[:MOST_VIEWS])
+        return tuple(bookmark_from(entry, what) for entry in entries[:MOST_VIEWS])
 
     def write(self, scene: Path, bookmarks: tuple[Bookmark, ...]) -> None:
         """Keep those of a scene beside those of others. InputError where the file that is there makes no
@@ -142,7 +151,7 @@ class Shelf:
         scenes = self._all()
         scenes.pop(str(scene.absolute()), None)
         if bookmarks:
-            scenes[str(scene.absolute())] = [_entry(bookmark) for bookmark in bookmarks]
+            scenes[str(scene.absolute())] = [bookmark_entry(bookmark) for bookmark in bookmarks]
         kept = dict(list(scenes.items())[-MOST_SCENES:])
         with atomic_path(self._path) as temporary:
             text = json.dumps({"version": 1, "scenes": kept}, indent=1, ensure_ascii=False)
@@ -169,11 +178,13 @@ def named(name: str) -> str:
     return name
 
 
-def _entry(bookmark: Bookmark) -> dict[str, Any]:
+def bookmark_entry(bookmark: Bookmark) -> dict[str, Any]:
+    """A named view as JSON has it."""
     return {"name": bookmark.name, **pose_entry(bookmark.pose), "distance": float(bookmark.distance)}
 
 
-def _bookmark(entry: Any, what: str) -> Bookmark:
+def bookmark_from(entry: Any, what: str) -> Bookmark:
+    """The view that `bookmark_entry` wrote; FormatError, beginning with `what`, where there is none."""
     pose = pose_from(entry, what)
     name, distance = entry.get("name"), float(numbers(entry, "distance", (), what))
     if not isinstance(name, str) or not (distance > 0 and math.isfinite(distance)):

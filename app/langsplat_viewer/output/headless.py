@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import PictureConfig
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import check_output_file
 from langsplat_core.io.language import SUFFIX
@@ -185,17 +184,10 @@ def prepare(options: ViewerOptions, path: Path, services: Services, progress: Pr
         camera = without_perspective(scene, camera, options.orthographic)
     engine = services.engine(scene)
     results = answers(engine, options, camera, progress)
-    picture = PictureConfig(
-        display=options.shown_display,
-        heat_opacity=options.heat_opacity,
-        dim=options.dim,
-        colour_map=options.colour_map or PictureConfig.colour_map,
-        transparent=options.transparent,
-    )
     request = plain_request(
         scene,
         camera,
-        picture,
+        options.picture,
         level=latent_level(options.level),
         answers=by_colour(results, options.colour),
         clip=options.clip,

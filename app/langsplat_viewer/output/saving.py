@@ -38,8 +38,12 @@ def save_picture(viewer: Viewer, folder: Path) -> Path | None:
         state.say("open a scene first, then save a picture of it", is_error=True)
         return None
     path = free_name(folder, state.path.stem if state.path else "picture", ".png")
+    transparent, beside = state.settings.transparent, viewer.beside
     try:
-        save_png(path, viewer.surface.capture(state.request(transparent=state.settings.transparent)))
+        images = [viewer.surface.capture(state.request(transparent=transparent))]
+        if beside is not None and beside.surface is not None and beside.state.scene is not None:
+            images.append(beside.surface.capture(beside.state.request(transparent=transparent)))
+        save_png(path, state.settings.split.joined(images, images[0].shape[1]))
     except (OSError, LangSplatError) as error:
         state.say(f"{path}: not saved ({one_line(error)})", is_error=True)
         return None

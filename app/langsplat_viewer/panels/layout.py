@@ -1,6 +1,6 @@
 """The layout of the window: menus, command palette, list of keys, docked panels, messages and timing."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,11 +11,13 @@ from langsplat_viewer.actions import filming, opening, settings, viewpoint
 from langsplat_viewer.commands import COMMANDS, HELD, LETTERS_MENU, MENUS, Command, in_menu, matching
 from langsplat_viewer.panels import (
     library,
+    outline,
     overlays,
     record,
     scene,
     search,
     select,
+    toolbar,
     transform,
     view,
 )
@@ -42,6 +44,8 @@ def draw_menus(viewer: Viewer) -> None:
 
 def _items(viewer: Viewer, menu: str) -> None:
     for command in in_menu(menu):
+        if command.apart:
+            imgui.separator()
         title = command.does[0].upper() + command.does[1:]
         is_on = command.is_on is not None and command.is_on(viewer)
         if imgui.menu_item(title, ", ".join(command.keys[:1]), is_on)[0]:
@@ -119,9 +123,27 @@ def _clicked(found: list[Command]) -> Command | None:
     return chosen
 
 
-# The list of keys.
+# Help: first steps, and the list of keys.
 
-KEYS_EM, DOES_EM = 14.0, 20.0  # widths of the columns
+KEYS_EM, DOES_EM = 13.0, 26.0  # widths of the columns
+FIRST_STEPS = (
+    ("Look", "Drag turns the view, the right button moves it, the wheel goes nearer; double click what to "
+     "turn around. R leads back."),
+    ("Search", "Type into the box and press Enter: 'red mug', 'handle of the mug', 'book on the table', "
+     "'three books', 'toy, not teddy bear'. Tab completes, arrow up recalls."),
+    ("Found, weak match, not here", "What the scene says of a phrase. Only what may be there is painted, "
+     "and a weak match no hotter than half."),
+    ("Relevancy", "From 0 to 1: how much nearer a place is to the phrase than to the everyday words under "
+     "'Compared with'; 0.5 is neither. The answer 'ends at' a relevancy: what has less is no part of it. The "
+     "slider moves that end, Auto gives the answer's own back."),
+    ("Subpart, part, whole", "How finely things are divided: the handle, the cup, the cup with its saucer. "
+     "'auto' takes the level that answers best."),
+    ("Displays", "The strip at the left edge: colours, depth, heat map, segmentation, the latent language "
+     "field as colours, the tree of parts; two side by side."),
+    ("Select", "Click a thing with the pointing hand, draw around it, or take what the search found; then "
+     "hide, name, measure, move or save it."),
+    ("Everything else", "Ctrl + Shift + P finds every command by its words."),
+)  # fmt: skip
 HELP_SHARE = 0.94  # of the window's height
 
 
@@ -136,28 +158,32 @@ def draw_help(viewer: Viewer) -> None:
     if not viewer.state.show_help:
         return
     flags = imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_collapse
-    centre = imgui.get_main_viewport().get_center()
-    room = imgui.get_main_viewport().work_size
+    centre, room = imgui.get_main_viewport().get_center(), imgui.get_main_viewport().work_size
     imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(room.x, HELP_SHARE * room.y))
-    imgui.set_next_window_pos(centre, imgui.Cond_.appearing, ImVec2(0.5, 0.5))
+    imgui.set_next_window_pos(centre, imgui.Cond_.always, ImVec2(0.5, 0.5))
     imgui.set_next_window_bg_alpha(1.0)
-    _, still_open = imgui.begin("Keys", True, flags)
+    _, still_open = imgui.begin("Help", True, flags)
     settings.show_help(viewer, bool(still_open))
     imgui.text_disabled(f"LangSplat viewer {__version__}; documentation: docs/README.md of its source")
-    _table()
+    if imgui.begin_tab_bar("pages"):
+        for title, rows in (("First steps", FIRST_STEPS), ("Keys", key_rows())):
+            if imgui.begin_tab_item(title)[0]:
+                _table(rows)
+                imgui.end_tab_item()
+        imgui.end_tab_bar()
     imgui.end()
 
 
-def _table() -> None:
-    if imgui.begin_table("keys", 2):
-        imgui.table_setup_column("key", imgui.TableColumnFlags_.width_fixed, hello_imgui.em_size(KEYS_EM))
+def _table(rows: Sequence[tuple[str, str]]) -> None:
+    if imgui.begin_table("rows", 2):
+        imgui.table_setup_column("what", imgui.TableColumnFlags_.width_fixed, hello_imgui.em_size(KEYS_EM))
         imgui.table_setup_column("does", imgui.TableColumnFlags_.width_fixed, hello_imgui.em_size(DOES_EM))
-        for key, what in key_rows():
+        for what, does in rows:
             imgui.table_next_row()
             imgui.table_next_column()
-            imgui.text_unformatted(key)
+            imgui.text_unformatted(what)
             imgui.table_next_column()
-            imgui.text_disabled(what)
+            small_wrapped(does, muted())
         imgui.end_table()
 
 
@@ -257,6 +283,7 @@ PANELS: tuple[Panel, ...] = (
     Panel("Display", MIDDLE, view.draw_display),
     Panel("Camera", MIDDLE, view.draw_camera),
     Panel("Scene", MIDDLE, scene.draw),
+    Panel("Outline", MIDDLE, outline.draw, is_open=False),
     Panel("Select", MIDDLE, select.draw, is_open=False),
     Panel("Transform", MIDDLE, transform.draw, is_open=False),
     Panel("Library", MIDDLE, library.draw, is_open=False),
@@ -265,6 +292,7 @@ PANELS: tuple[Panel, ...] = (
     Panel("Bookmarks", MIDDLE, record.draw_bookmarks, is_open=False),
     Panel("Messages", FOOT, draw_messages),
     Panel("Overlays", MIDDLE, view.draw_overlays, is_open=False),
+    Panel("Notes", MIDDLE, view.draw_notes, is_open=False),
     Panel("Timing", MIDDLE, draw_timing, is_open=False),
 )
 
@@ -298,6 +326,9 @@ def _window(viewer: Viewer, panel: Panel) -> hello_imgui.DockableWindow:
 def show_wanted(viewer: Viewer) -> None:
     """Open the panel that an action wants seen, in front of those it shares its place with."""
     title, docking = settings.take_wanted_panel(viewer), hello_imgui.get_runner_params().docking_params
+    for window in docking.dockable_windows if viewer.state.shows_panels else ():
+        window.is_visible = window.label in viewer.state.shows_panels
+    settings.have_panels(viewer, ())
     docking.layout_reset |= settings.take_panel_reset(viewer)
     if title:
         docking.dockable_window_of_name(title).is_visible = True
@@ -364,12 +395,14 @@ def draw_over(viewer: Viewer) -> None:
     if said:
         overlays.say(said, area)
     else:
-        overlays.draw_legend(viewer, area)
+        overlays.draw_legends(viewer, area)
+        outline.draw_legend(viewer, area)
         overlays.draw_pointing(viewer)
         select.draw_stroke(viewer, area)
         transform.draw_gizmo(viewer, area)
     overlays.draw_grip(viewer, area)
     overlays.draw_cube(viewer, area)
+    toolbar.draw(viewer, area)
     scene.draw_changed(viewer, area)
     scene.draw_unsaved(viewer)
     copied = filming.take_clipboard(viewer)

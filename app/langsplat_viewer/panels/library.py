@@ -40,7 +40,7 @@ def draw(viewer: Viewer) -> None:
     """Draw the folder, the box for a phrase and the list."""
     view = viewer.state.library
     if imgui.button("Folder ..."):
-        opening.ask_for_library(viewer)
+        opening.ask_for_folder(viewer, "library")
     tip("Search all scenes of a folder and the folders in it. An index of them is kept there")
     if view is None:
         return

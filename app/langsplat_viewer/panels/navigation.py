@@ -114,7 +114,7 @@ def _mouse(viewer: Viewer, area: Area) -> None:
     io = imgui.get_io()
     free = viewer.state.selection.tool is None
     turns = 0 if free else 2
-    if free and imgui.is_mouse_double_clicked(0):
+    if free and imgui.is_mouse_double_clicked(0) and not viewer.state.ruler.measures:
         viewpoint.focus_pixel(viewer, *area.fraction(io.mouse_pos.x, io.mouse_pos.y))
         return
     dx, dy = io.mouse_delta.x, io.mouse_delta.y

@@ -1,6 +1,6 @@
 """The images of the scene behind the panels, and the overlays on them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import moderngl
@@ -10,10 +10,9 @@ from imgui_bundle import ImVec2, hello_imgui, imgui
 from langsplat_core.arrays import Array
 from langsplat_core.config import ColourMap
 from langsplat_core.display.displays import QUERY_COLOURS, STRENGTH, mapped, painted
-from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.describe import Words
 from langsplat_core.scene import LEVELS, Camera
-from langsplat_viewer.actions import opening, queries, settings, viewpoint
+from langsplat_viewer.actions import opening, projects, queries, settings, viewpoint
 from langsplat_viewer.camera import overlays
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.camera.overlays import Face, Label, face_at, placed, visible_faces, world_axes
@@ -39,7 +38,7 @@ UNMOVED = (
 def draw_pictures(viewer: Viewer, area: Area, textures: tuple[moderngl.Texture, ...]) -> None:
     """The textures of `Canvas.textures` where they belong, each with its name if there are several."""
     split = viewer.state.settings.split
-    if split.mode == "wipe" and len(textures) > 1:
+    if split.mode in ("wipe", "scenes") and len(textures) > 1:
         _image(area, textures[0], 0.0, split.at)
         _image(area, textures[1], split.at, 1.0)
         _divider(area, split.at)
@@ -76,7 +75,10 @@ def _titles(viewer: Viewer, area: Area) -> None:
     """Write what each image shows at its upper edge: left and right of the line of a wipe."""
     split, names = viewer.state.settings.split, tuple(pane.label for pane in viewer.state.panes())
     gap, top = hello_imgui.em_size(0.6), area.top + hello_imgui.em_size(0.5)
-    if split.mode == "wipe":
+    if split.mode == "scenes":
+        there = None if viewer.beside is None else viewer.beside.state.path
+        names = tuple("" if path is None else path.name for path in (viewer.state.path, there))
+    if split.mode in ("wipe", "scenes"):
         x = area.left + split.at * area.width
         text_on_shade(names[0], x - gap - imgui.calc_text_size(names[0]).x, top, area)
         text_on_shade(names[1], x + gap, top, area)
@@ -104,7 +106,7 @@ def text_on_shade(text: str, x: float, y: float, area: Area) -> None:
 def draw_grip(viewer: Viewer, area: Area) -> None:
     """Draw the grip of the line of a wipe; a double click puts it into the middle."""
     split = viewer.state.settings.split
-    if split.mode != "wipe" or viewer.state.scene is None:
+    if split.mode not in ("wipe", "scenes") or viewer.state.scene is None:
         return
     x = area.left + split.at * area.width
     imgui.push_style_var(imgui.StyleVar_.window_padding, ImVec2(0, 0))
@@ -211,7 +213,8 @@ class PhotographOverlay(_Uploaded):
 
 REACH = 7.0  # window units from a line at which a click means it
 STILL = 4.0  # a click that moves farther is a drag
-CAMERA, CHOSEN, HOVERED = (0.75, 0.82, 0.95, 0.75), (0.98, 0.62, 0.15, 1.0), (1.0, 1.0, 1.0, 1.0)
+CAMERA, CHOSEN, HOVERED = (0.75, 0.82, 0.95, 0.3), (0.98, 0.62, 0.15, 1.0), (1.0, 1.0, 1.0, 1.0)
+NOTE = (0.55, 0.85, 1.0, 1.0)
 GRID, RULER = (0.85, 0.85, 0.85, 0.4), (1.0, 0.9, 0.2, 1.0)
 
 
@@ -244,6 +247,7 @@ def draw_lines(viewer: Viewer, area: Area) -> None:
         if "things" in state.preferences.overlays:  # after the lines, so that its words are readable
             _things(viewer, part, camera)
         _ruler(viewer, part, camera)
+        _notes(viewer, part, camera)
         paint.pop_clip_rect()
     _orthographic(viewer, area)
     if state.ruler.measures and not imgui.get_io().want_capture_mouse:
@@ -251,6 +255,11 @@ def draw_lines(viewer: Viewer, area: Area) -> None:
         if clicked(area):
             mouse = imgui.get_io().mouse_pos
             settings.measure_at(viewer, *area.fraction(mouse.x, mouse.y))
+    elif state.pins_notes and not imgui.get_io().want_capture_mouse:
+        imgui.set_mouse_cursor(imgui.MouseCursor_.hand)
+        if clicked(area):
+            mouse = imgui.get_io().mouse_pos
+            projects.pin_at(viewer, *area.fraction(mouse.x, mouse.y))
 
 
 def _orthographic(viewer: Viewer, area: Area) -> None:
@@ -396,6 +405,18 @@ def _ruler(viewer: Viewer, area: Area, camera: Camera) -> None:
         text_on_shade(text, area.left + float(x) + 8, area.top + float(y) + 8, area)
 
 
+def _notes(viewer: Viewer, area: Area, camera: Camera) -> None:
+    """The notes, at the places that they are pinned to."""
+    named, paint = [], imgui.get_background_draw_list()
+    for note in viewer.state.notes:
+        place = _place(camera, np.array(note.at), _least_depth(viewer))
+        if place is not None:
+            middle = ImVec2(area.left + place[0], area.top + place[1])
+            paint.add_circle_filled(middle, 4.0, imgui.get_color_u32(NOTE))
+            named.append(Named(note.text, place, NOTE))
+    _names(named, area)
+
+
 def _place(camera: Camera, point: Array, least_depth: float) -> tuple[float, float] | None:
     """Project a world point (3,) to pixels; None outside the image."""
     pixels, depths = camera.project(point[None].astype(np.float64))
@@ -418,7 +439,17 @@ QUIET = (
 )
 
 
-def draw_legend(viewer: Viewer, area: Area) -> None:
+def draw_legends(viewer: Viewer, area: Area) -> None:
+    """That of the scene, and of the one beside it, each on its side of the line."""
+    if viewer.beside is None:
+        draw_legend(viewer, area)
+        return
+    at = viewer.state.settings.split.at
+    draw_legend(viewer, replace(area, width=at * area.width))
+    draw_legend(viewer.beside, area, "relevancy beside")
+
+
+def draw_legend(viewer: Viewer, area: Area, name: str = "relevancy") -> None:
     """A colour bar with numbers for every query that is painted."""
     state = viewer.state
     shown = state.shown_results()
@@ -430,12 +461,13 @@ def draw_legend(viewer: Viewer, area: Area) -> None:
     )
     imgui.set_next_window_pos(corner, imgui.Cond_.always, ImVec2(1, 1))
     imgui.set_next_window_bg_alpha(0.75)
-    imgui.begin("relevancy", None, QUIET)
+    imgui.begin(name, None, QUIET)
     for slot in slots:
         result = shown[slot]
         if result is not None:
             strength = STRENGTH[result.verdict]
-            _bar(result, bar_colours(slot, strength, len(slots) == 1, state.picture.colour_map))
+            colours = bar_colours(slot, strength, len(slots) == 1, state.picture.colour_map)
+            _bar(result.phrase, colours, state.picture.heat_scale or result.heat_range)
     imgui.end()
 
 
@@ -461,22 +493,27 @@ def bar_colours(slot: int, strength: float, alone: bool, colour_map: ColourMap =
     return (heat * heat * (3 - 2 * heat))[:, None] * QUERY_COLOURS[slot]
 
 
-def _bar(result: QueryResult, colours: Array) -> None:
+def _bar(phrase: str, colours: Array, ends: tuple[float, float]) -> None:
     """Phrase, bar, and the relevancies at its ends and in its middle."""
     width, height = hello_imgui.em_size(BAR_EM), hello_imgui.em_size(BAR_HEIGHT_EM)
-    imgui.text_unformatted(elided(result.phrase, width, width_of))
-    start, paint = imgui.get_cursor_screen_pos(), imgui.get_window_draw_list()
-    for step, colour in enumerate(colours):
-        left, right = (round(start.x + width * edge / STEPS) for edge in (step, step + 1))  # no seams
-        paint.add_rect_filled(ImVec2(left, start.y), ImVec2(right, start.y + height), _opaque(colour))
+    imgui.text_unformatted(elided(phrase, width, width_of))
+    draw_bar(imgui.get_cursor_screen_pos(), width, height, colours)
     imgui.dummy(ImVec2(width, height))
-    low, high = result.heat_range
+    low, high = ends
     x = imgui.get_cursor_pos_x()
     for place, value in ((0.0, low), (0.5, (low + high) / 2), (1.0, high)):
         text = f"{value:.2f}"
         if place:
             imgui.same_line(x + place * (width - imgui.calc_text_size(text).x))
         imgui.text_unformatted(text)
+
+
+def draw_bar(start: Any, width: float, height: float, colours: Array) -> None:
+    """(STEPS, 3) colours from left to right, with the upper left corner at `start`."""
+    paint = imgui.get_window_draw_list()
+    for step, colour in enumerate(colours):
+        left, right = (round(start.x + width * edge / STEPS) for edge in (step, step + 1))  # no seams
+        paint.add_rect_filled(ImVec2(left, start.y), ImVec2(right, start.y + height), _opaque(colour))
 
 
 def _opaque(colour: Array) -> Any:

@@ -101,8 +101,9 @@ def _keyframes(viewer: Viewer) -> None:
             _line(viewer, number, key)
             imgui.pop_id()
     imgui.end_child()
-    if record.chosen is not None:
-        _chosen(viewer, record.chosen)
+    imgui.begin_disabled(record.chosen is None)
+    _chosen(viewer, record.chosen)
+    imgui.end_disabled()
     _file(viewer)
 
 
@@ -121,12 +122,12 @@ def _line(viewer: Viewer, number: int, key: Keyframe) -> None:
     tip("Take it off the path")
 
 
-def _chosen(viewer: Viewer, key: Keyframe) -> None:
-    seconds = _number("##time of the keyframe", key.seconds, 0.5)
-    if seconds is not None:
+def _chosen(viewer: Viewer, key: Keyframe | None) -> None:
+    seconds = _number("##time of the keyframe", 0.0 if key is None else key.seconds, 0.5)
+    if seconds is not None and key is not None:
         filming.move_keyframe(viewer, key, seconds)
     beside("Set to this view")
-    if imgui.button("Set to this view"):
+    if imgui.button("Set to this view") and key is not None:
         filming.replace_keyframe(viewer, key)
     tip("Put the current view in its place")
 

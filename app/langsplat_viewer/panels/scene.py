@@ -48,8 +48,8 @@ def draw(viewer: Viewer) -> None:
     beside("Save view")
     if imgui.button("Save view"):
         saving.save_view(viewer, Path.cwd())
-    beside("Keys")
-    if imgui.button("Keys"):
+    beside("Help")
+    if imgui.button("Help"):
         settings.toggle_help(viewer)
     if len(state.scenes) > 1:
         _list(viewer)
@@ -92,7 +92,13 @@ def _figures(viewer: Viewer) -> str:
 
 # The file browser.
 
-TITLES = {"": "Open a scene", "photographs": "Folder of the photographs", "library": "Folder of scenes"}
+BESIDE = "Scene to compare with"
+TITLES = {
+    "": "Open a scene",
+    "photographs": "Folder of the photographs",
+    "library": "Folder of scenes",
+    "dataset": "Photographs to train on",
+}
 WIDTH_EM, HEIGHT_EM = 40.0, 30.0
 UNITS = ("bytes", "kB", "MB", "GB", "TB")
 
@@ -100,7 +106,7 @@ UNITS = ("bytes", "kB", "MB", "GB", "TB")
 def draw_browser(viewer: Viewer) -> None:
     """A box for a path, the folders above, what is in this one, and what was open before."""
     listing = viewer.state.browser
-    title = TITLES[viewer.state.picks_folder]
+    title = BESIDE if viewer.state.picks_beside else TITLES[viewer.state.picks_folder]
     if listing is not None and not imgui.is_popup_open(title):
         imgui.open_popup(title)
     centre = imgui.get_main_viewport().get_center()
@@ -314,6 +320,8 @@ def _form(viewer: Viewer) -> None:
     form = replace(
         form, dataset=_text_box("Photographs", "a folder, a COLMAP project, transforms.json", form.dataset)
     )
+    if imgui.button("Browse ..."):
+        opening.ask_for_folder(viewer, "dataset")
     form = replace(form, out=_text_box("Scene", "scene.ply", form.out))
     form = replace(form, encoder=_text_box("Encoder", '"demo", or a folder or hub id of CLIP', form.encoder))
     for number, preset in enumerate(PRESETS):

@@ -9,11 +9,12 @@ from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
-from langsplat_core.display.displays import QUERY_COLOURS
+from langsplat_core.display.displays import QUERY_COLOURS, STRENGTH, painted
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import no_field
 from langsplat_core.scene import CANONICAL_PHRASES, LEVELS
 from langsplat_viewer.actions import queries, settings, viewpoint
+from langsplat_viewer.panels.overlays import bar_colours, draw_bar
 from langsplat_viewer.panels.style import bad, beside_boxed, elided, good, muted, small_wrapped, tip, width_of
 from langsplat_viewer.state import Query
 from langsplat_viewer.viewer import Viewer
@@ -105,6 +106,7 @@ def _cut(viewer: Viewer, query: Query, result: QueryResult) -> None:
     button = imgui.calc_text_size("Auto").x + 2 * imgui.get_style().frame_padding.x
     imgui.set_next_item_width(-(button + imgui.get_style().item_spacing.x) if own else -1)
     changed, value = imgui.slider_float("##cut", result.cut, low, high, "ends at %.3f")
+    tip("What is less relevant than this is no part of the answer; one set by hand stays, whatever the level")
     if changed:
         queries.set_cut(viewer, query, value, is_new=not own)
     if own:
@@ -188,8 +190,12 @@ def _swatch(viewer: Viewer, query: Query, side: float) -> None:
             queries.hide(viewer, query)
         else:
             queries.show(viewer, query)
-    if imgui.is_item_hovered():
-        imgui.set_tooltip("Click to hide" if shown else "Click to show")
+    tip("Click to hide" if shown else "Click to show")
+    state = viewer.state
+    alone = state.picture.display == "relevancy" and len(painted(state.shown_results())) == 1
+    if shown and alone and query.result is not None:  # painted by the colour map
+        colours = bar_colours(0, STRENGTH[query.result.verdict], True, state.picture.colour_map)
+        draw_bar(imgui.get_item_rect_min(), side, side, colours)
 
 
 def _verdict(query: Query) -> None:
@@ -222,10 +228,11 @@ def _details(viewer: Viewer, query: Query) -> None:
     if _enabled("Why?", result is not None):
         queries.explain(viewer, query)
     tip("The photographs and masks that the answer stands on, the best and the worst")
+    imgui.same_line()
+    _combine(viewer, query)
     if place is not None:
-        imgui.same_line()
-        imgui.align_text_to_frame_padding()
         imgui.text_colored(muted(), "at " + "  ".join(f"{v:.2f}" for v in place))
+        tip("Where it is relevant most; world units")
     if query.problem:
         small_wrapped(query.problem, bad())
     if result is not None:
@@ -237,9 +244,27 @@ def _details(viewer: Viewer, query: Query) -> None:
                 imgui.text(text)
             else:
                 imgui.text_colored(muted(), text)
+            tip(f"The best relevancy at the level '{name}'; the brighter one answers")
         _cut(viewer, query, result)
     if query.reading:
         small_wrapped(f"read as: {query.reading}", muted())
+
+
+def _combine(viewer: Viewer, query: Query) -> None:
+    """A menu of the other queries, to search for what both, either or only this one finds."""
+    others = [other for other in viewer.state.queries if other is not query]
+    if _enabled("Combine", bool(others)):
+        imgui.open_popup("combine")
+    tip("Search for this and, or, without another query of the list")
+    if not imgui.begin_popup("combine"):
+        return
+    for join in queries.JOINS:
+        if imgui.begin_menu(join):
+            for other in others:
+                if imgui.menu_item(f"{other.phrase}##other", "", False)[0]:
+                    queries.ask_combined(viewer, query, join, other)
+            imgui.end_menu()
+    imgui.end_popup()
 
 
 # The panel.
@@ -272,7 +297,9 @@ def draw(viewer: Viewer) -> None:
 
 def _canonical(viewer: Viewer) -> None:
     """Draw the canonical phrases."""
-    if not imgui.collapsing_header("Compared with"):
+    opened = imgui.collapsing_header("Compared with")
+    tip("Everyday phrases: relevancy is how much nearer a place is to yours than to these")
+    if not opened:
         return
     state = viewer.state
     small_wrapped("a place is relevant where it is nearer to the phrase than to all of these", muted())
@@ -294,5 +321,4 @@ def _level(viewer: Viewer) -> None:
         beside_boxed(choice)
         if imgui.radio_button(choice, viewer.state.level == choice):
             queries.set_level(viewer, choice)
-    if imgui.is_item_hovered():
-        imgui.set_tooltip("auto: the level that answers best")
+        tip("The level that answers best" if choice == "auto" else "How finely things are divided")

@@ -84,6 +84,7 @@ def draw(viewer: Viewer) -> None:
     selecting.set_reach(viewer, _slider("Reach", viewer.state.selection.reach, REACHES, "%.3f of the scene"))
     _name(viewer)
     imgui.separator()
+    _values(viewer)
     _buttons(viewer, FATES)
     imgui.separator()
     imgui.align_text_to_frame_padding()
@@ -151,6 +152,49 @@ def _name(viewer: Viewer) -> None:
     if imgui.button("Name it") or entered:
         queries.name_selection(viewer)
     tip("Searching for the name finds this, and what is like it")
+
+
+HISTOGRAM_EM = 3.0
+
+
+def _values(viewer: Viewer) -> None:
+    """A histogram of a number that every Gaussian has; a drag over it selects those in its range."""
+    if not imgui.collapsing_header("By numbers"):
+        return
+    selection = viewer.state.selection
+    for place, measure in enumerate(marks.MEASURES):
+        if place:
+            beside_boxed(measure)
+        if imgui.radio_button(measure.capitalize(), selection.measure == measure):
+            selecting.set_measure(viewer, measure)
+    found = selecting.values_shown(viewer)
+    if found is None:
+        small_wrapped("search for something first", muted())
+        return
+    size = ImVec2(imgui.get_content_region_avail().x, hello_imgui.em_size(HISTOGRAM_EM))
+    corner = imgui.get_cursor_screen_pos()
+    imgui.set_next_item_allow_overlap()
+    imgui.plot_histogram("##values", found.counts, graph_size=size)
+    imgui.set_cursor_screen_pos(corner)
+    imgui.invisible_button("brush values", size)
+    at = (imgui.get_io().mouse_pos.x - corner.x) / size.x
+    if imgui.is_item_active():
+        selecting.brush_values(viewer, at)
+    elif selection.brushed is not None:
+        selecting.end_brush(viewer, held_mode())
+    brushed = viewer.state.selection.brushed
+    if brushed is not None:
+        left, right = (corner.x + part * size.x for part in sorted(brushed))
+        paint = imgui.get_window_draw_list()
+        paint.add_rect_filled(ImVec2(left, corner.y), ImVec2(right, corner.y + size.y), _colour(PAINT))
+    start, stop = sorted(brushed) if brushed else (0.0, 1.0)
+    small_wrapped(f"{_value(viewer, found, start)} to {_value(viewer, found, stop)}", muted())
+    tip("Drag over the histogram; Shift adds, Ctrl removes, both intersect")
+
+
+def _value(viewer: Viewer, found: marks.Histogram, part: float) -> str:
+    value = found.low + part * (found.high - found.low)
+    return f"{10**value if viewer.state.selection.measure in marks.LOGARITHMIC else value:.3g}"
 
 
 def _buttons(viewer: Viewer, verbs: Sequence[Verb]) -> None:

@@ -2,7 +2,7 @@
 
 from contextlib import suppress
 from dataclasses import replace
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 from imgui_bundle import imgui, imguizmo
@@ -37,7 +37,7 @@ def draw(viewer: Viewer) -> None:
         transforming.apply_form(viewer)
     tip("Scale and rotate about the middle of what is transformed, then move")
     imgui.separator()
-    transforming.fill_form(viewer, _box(state.edit_form))
+    _box(viewer)
     if imgui.button("Fit"):
         transforming.fill_box(viewer)
     tip("The box around the selection, or around everything")
@@ -45,6 +45,11 @@ def draw(viewer: Viewer) -> None:
     if imgui.button("Crop"):
         transforming.crop(viewer)
     tip("Delete what lies outside the box; the file stays as it is")
+    beside_boxed("Clip")
+    changed, clips = imgui.checkbox("Clip", state.edit_form.clips)
+    if changed:
+        transforming.clip(viewer, clips)
+    tip("Hide what lies outside the box, and follow its handles")
     imgui.end_disabled()
 
 
@@ -67,10 +72,13 @@ def _numbers(form: EditForm) -> EditForm:
     return replace(form, move=move, rotate=rotate, scale=scale)
 
 
-def _box(form: EditForm) -> EditForm:
+def _box(viewer: Viewer) -> None:
+    form = viewer.state.edit_form
     low = _three("From", form.low, "A corner of the box, world units")
     high = _three("To", form.high, "The opposite corner")
-    return replace(form, low=low, high=high)
+    if (low, high) != (form.low, form.high):
+        transforming.set_box(viewer, low, high)
+        transforming.follow_box(viewer)
 
 
 def _three(label: str, values: Point, what: str) -> Point:
@@ -92,18 +100,24 @@ def holds_mouse(viewer: Viewer) -> bool:
 def draw_gizmo(viewer: Viewer, area: Area) -> None:
     """The gizmo that is chosen, where it was dragged to; what it moves follows, and stays on release."""
     state = viewer.state
-    kind, centre = state.edit_form.gizmo, transforming.pivot(viewer)
-    if kind == "off" or centre is None or state.view is None or state.settings.split.columns > 1:
+    kind = state.edit_form.gizmo
+    if kind == "off" or state.view is None or state.settings.split.columns > 1:
+        return
+    centre = transforming.pivot(viewer)
+    if centre is None:
         return
     camera = state.view.camera(max(round(area.width), 1), max(round(area.height), 1))
     view, projection = gl_matrices(camera, state.view.distance)
-    start, held = moving(centre).matrix, state.moving
-    edited = gizmo.Matrix16(_columns(start if held is None else held[0].to.matrix @ start))
     gizmo.begin_frame()
     gizmo.set_drawlist(imgui.get_foreground_draw_list())
     gizmo.set_rect(area.left, area.top, area.width, area.height)
     gizmo.set_orthographic(camera.orthographic)
     seen = gizmo.Matrix16(_columns(view)), gizmo.Matrix16(_columns(projection))
+    if kind == "box":
+        _box_handles(viewer, seen)
+        return
+    start, held = moving(centre).matrix, state.moving
+    edited = gizmo.Matrix16(_columns(start if held is None else held[0].to.matrix @ start))
     changed = gizmo.manipulate(*seen, OPERATIONS[kind], gizmo.MODE.world, edited)
     if gizmo.is_using():
         if changed:
@@ -111,6 +125,28 @@ def draw_gizmo(viewer: Viewer, area: Area) -> None:
                 transforming.preview(viewer, dragged(start, np.array(edited.values).reshape(4, 4).T))
     elif held is not None:
         transforming.transform(viewer, held[0].to)
+
+
+def _box_handles(viewer: Viewer, seen: tuple[Any, Any]) -> None:
+    """The box of the panel with handles on its corners and edges; on release the clip follows."""
+    form, unit = viewer.state.edit_form, gizmo.Matrix6([-0.5, -0.5, -0.5, 0.5, 0.5, 0.5])
+    corners = np.array([form.low, form.high])
+    matrix = np.diag([*np.maximum(np.ptp(corners, axis=0), 1e-6), 1.0])
+    matrix[:3, 3] = corners.mean(0)
+    edited = gizmo.Matrix16(_columns(matrix))
+    operation, mode = gizmo.OPERATION.bounds, gizmo.MODE.local
+    if gizmo.manipulate(*seen, operation, mode, edited, local_bounds=unit):
+        low, high = box_of(np.array(edited.values).reshape(4, 4).T)
+        transforming.set_box(viewer, low, high)
+    elif not gizmo.is_using():
+        transforming.follow_box(viewer)
+
+
+def box_of(matrix: Array) -> tuple[Point, Point]:
+    """Lowest and highest corner of the unit cube about the origin after a (4, 4) matrix without rotation."""
+    half = np.abs(np.diag(matrix)[:3]) / 2
+    low, high = (tuple(map(float, matrix[:3, 3] + sign * half)) for sign in (-1, 1))
+    return (low[0], low[1], low[2]), (high[0], high[1], high[2])
 
 
 def dragged(start: Array, now: Array) -> Similarity:

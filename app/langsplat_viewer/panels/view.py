@@ -3,12 +3,14 @@
 import math
 from dataclasses import replace
 from itertools import groupby
+from pathlib import Path
 
-from imgui_bundle import imgui
+from imgui_bundle import ImVec2, imgui
 
 from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, DisplayRow
+from langsplat_core.query.answers import FLOOR
 from langsplat_core.scene import LEVELS
-from langsplat_viewer.actions import opening, settings, viewpoint
+from langsplat_viewer.actions import opening, projects, settings, viewpoint
 from langsplat_viewer.camera.controls import FOV_RANGE, OrbitCamera, adopt_up, level, with_fov
 from langsplat_viewer.camera.overlays import length_text
 from langsplat_viewer.commands import BUTTONS, OVERLAY_TITLES, Button, buttons_of, with_key
@@ -19,6 +21,7 @@ from langsplat_viewer.viewer import Viewer
 
 CUT_RANGE = (0.01, 20.0)  # of the scene's radius, the least and most that a cut can be chosen
 WIDTH_EM = 11.0  # of sliders and lists, where there is room
+LEAST_SPAN = 1e-3  # of a heat scale
 BACKDROPS = {"Black": 0.0, "Grey": 0.5, "White": 1.0}
 
 
@@ -33,6 +36,7 @@ def draw_display(viewer: Viewer) -> None:
         small_wrapped("search for something to see where it is", muted())
     if picture.display == "relevancy":
         picture = replace(picture, heat_opacity=_slider("Heat opacity", picture.heat_opacity, 0.0, 1.0))
+        picture = replace(picture, heat_scale=_heat_scale(viewer))
     if needs_query:
         picture = replace(picture, dim=_slider("Rest dimmed to", picture.dim, 0.0, 1.0))
     _colour_map(viewer)
@@ -60,6 +64,23 @@ def _splats(viewer: Viewer) -> None:
         degree = (MOST_DEGREE if chosen == most else chosen) if changed else degree
         tip("Up to which degree colours change with the direction that they are seen from")
     settings.set_splats(viewer, Splats(size, degree))
+
+
+def _heat_scale(viewer: Viewer) -> tuple[float, float] | None:
+    """Relevancies at the ends of the colour bar: each answer's own, or the same for all."""
+    scale = viewer.state.picture.heat_scale
+    changed, fixed = imgui.checkbox("Fixed heat scale", scale is not None)
+    tip("The same colour means the same relevancy in every answer, image and scene")
+    if changed:
+        own = [result.heat_range for result in viewer.state.shown_results() if result is not None]
+        lows, highs = zip(*own, strict=True) if own else ((FLOOR,), (1.0,))
+        return (min(lows), max(highs)) if fixed else None
+    if scale is None:
+        return None
+    leave_room("From, to", WIDTH_EM)
+    flags = imgui.SliderFlags_.always_clamp
+    changed, low, high = imgui.drag_float_range2("From, to", *scale, 0.002, 0.0, 1.0, "%.3f", "%.3f", flags)
+    return (low, high) if changed and high - low > LEAST_SPAN else scale
 
 
 def _backdrop(background: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -114,7 +135,9 @@ def _compared(viewer: Viewer) -> None:
     """Draw the choice of what is shown beside it."""
     state, split = viewer.state, viewer.state.settings.split
     second = Button("", split.second, split.second_level if DISPLAYS[split.second].by_level else None)
-    shown = {"off": "nothing", "levels": "three levels", "wipe": compared_name(second)}[split.mode]
+    shown = {"off": "nothing", "levels": "three levels", "wipe": compared_name(second)}.get(split.mode, "")
+    if viewer.beside is not None and viewer.beside.state.path is not None:
+        shown = viewer.beside.state.path.name
     leave_room("Beside it", WIDTH_EM)
     if not imgui.begin_combo("Beside it", shown):
         return
@@ -130,6 +153,8 @@ def _compared(viewer: Viewer) -> None:
     if imgui.selectable("three levels", split.mode == "levels")[0] and split.mode != "levels":
         settings.toggle_levels(viewer)
     imgui.end_disabled()
+    if imgui.selectable("another scene ...", split.mode == "scenes")[0]:
+        opening.ask_for_beside(viewer)
     imgui.end_combo()
 
 
@@ -163,6 +188,34 @@ def draw_overlays(viewer: Viewer) -> None:
         small_wrapped(text, muted())
         if scene is not None and scene.metres_per_unit is None:
             small_wrapped("the scene has no scale in metres; langsplat scale gives it one", muted())
+
+
+def draw_notes(viewer: Viewer) -> None:
+    """Draw the panel "Notes": texts pinned to places, kept in the project."""
+    state, side = viewer.state, imgui.get_frame_height()
+    imgui.begin_disabled(state.scene is None)
+    changed, pins = imgui.checkbox(
+        with_key("Pin one to what is clicked", projects.toggle_pinning), state.pins_notes
+    )
+    if changed:
+        projects.pin_notes(viewer, pins)
+    beside("Save project")
+    if imgui.button("Save project"):
+        projects.save_project(viewer, Path.cwd())
+    tip("Notes, queries, selection, edits, views: one file, to be opened again")
+    imgui.end_disabled()
+    if not state.notes:
+        small_wrapped("notes are listed here", muted())
+    for number, note in enumerate(state.notes):
+        imgui.push_id(number)
+        imgui.set_next_item_width(-side - imgui.get_style().item_spacing.x)
+        changed, text = imgui.input_text("##note", note.text)
+        if changed:
+            projects.write_note(viewer, note, text)
+        imgui.same_line()
+        if imgui.button("x", ImVec2(side, 0)):
+            projects.remove_note(viewer, note)
+        imgui.pop_id()
 
 
 def draw_camera(viewer: Viewer) -> None:

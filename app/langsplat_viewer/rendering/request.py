@@ -21,7 +21,7 @@ from langsplat_viewer.rendering.depth import UNCLIPPED, Clip, image_formation
 
 # Parts of a request.
 
-SplitMode = Literal["off", "wipe", "levels"]
+SplitMode = Literal["off", "wipe", "levels", "scenes"]
 AT_RANGE = (0.02, 0.98)  # of the area's width, where the line can be: it stays within reach
 SIZE_RANGE = (0.1, 1.0)
 MOST_DEGREE = 3
@@ -33,7 +33,8 @@ class Split:
 
     "wipe": the display that is chosen left of a line, `second` right of it. "levels": three columns, from
     subpart to whole, with the relevancy of the shown queries at each level where a display of answers is
-    chosen, else with the latents.
+    chosen, else with the latents. "scenes": one pane, and another scene right of the line, whose image is
+    not this request's.
     """
 
     mode: SplitMode = "off"
@@ -57,10 +58,10 @@ class Split:
     def joined(self, images: Sequence[Array], width: int) -> Array:
         """(H, W, C) images of all panes -> one of `width` pixels; pixels that columns leave over repeat the
         last one."""
-        if self.mode == "wipe":
+        if self.mode in ("wipe", "scenes") and len(images) > 1:
             line = round(self.at * width)
             return np.concatenate([images[0][:, :line], images[1][:, line:]], 1)
-        if self.mode == "off":
+        if len(images) == 1:
             return images[0]
         whole = np.concatenate(list(images), 1)
         return np.pad(whole, ((0, 0), (0, max(width - whole.shape[1], 0)), (0, 0)), "edge")
@@ -179,7 +180,7 @@ class Pane:
     @property
     def ranges(self) -> Ranges:
         """Values of its channel that are drawn as 0 and as 1, as far as they follow from the answers."""
-        return self.row.ranges(self.answers)
+        return self.row.ranges(self.answers, self.picture.heat_scale)
 
     @property
     def label(self) -> str:

@@ -37,6 +37,10 @@ _MOST = 2**31 - 1  # intersections of Gaussians and tiles in one view
 _DIGIT = 11  # bits per pass of the radix sort
 
 
+# Of a footprint: centre, half width, abscissa of its lowest point, slope and bulge of `_rows_in_column`; px.
+Ellipse = tuple[float, float, float, float, float, float]
+
+
 class Grid(NamedTuple):
     """An image cut into tiles."""
 
@@ -117,22 +121,27 @@ def _span(centre: float, low: float, high: float, size: float) -> tuple[int, int
 
 
 @helper
-def _rows_in_column(g: Array, column: int, height: float) -> tuple[int, int]:
-    """Pixel rows [first, last) in which the footprint `g` meets a column of tiles.
+def _ellipse(g: Array) -> Ellipse:
+    a, c, k = g[cp.FACTOR_A], g[cp.FACTOR_C], g[cp.FACTOR_K]
+    across = a * a * k * k + c * c
+    wide = g[cp.HALF_WIDTH]
+    return g[cp.MEAN_X], g[cp.MEAN_Y], wide, k * g[cp.HALF_HEIGHT], a * a * k / across, a * c / across
+
+
+@helper
+def _rows_in_column(ellipse: Ellipse, column: int, height: float) -> tuple[int, int]:
+    """Pixel rows [first, last) in which a footprint meets a column of tiles.
 
     At abscissa dx the ellipse spans dy = slope dx +- bulge sqrt(half_width^2 - dx^2); its lowest point over
     a strip of columns is the ellipse's own, or else on the strip's border nearest to that.
     """
-    a2, c2, k = g[cp.FACTOR_A] * g[cp.FACTOR_A], g[cp.FACTOR_C] * g[cp.FACTOR_C], g[cp.FACTOR_K]
-    across = a2 * k * k + c2
-    slope, bulge = a2 * k / across, g[cp.FACTOR_A] * g[cp.FACTOR_C] / across
-    wide, peak = g[cp.HALF_WIDTH], k * g[cp.HALF_HEIGHT]
-    left = max(column * TILE + 0.5 - _SLACK - g[cp.MEAN_X], -wide)
-    right = min(column * TILE + TILE - 0.5 + _SLACK - g[cp.MEAN_X], wide)
+    x, y, wide, peak, slope, bulge = ellipse
+    left = max(column * TILE + 0.5 - _SLACK - x, -wide)
+    right = min(column * TILE + TILE - 0.5 + _SLACK - x, wide)
     bottom, top = min(max(peak, left), right), min(max(-peak, left), right)
     high = slope * bottom + bulge * np.sqrt(max(wide * wide - bottom * bottom, 0.0))
     low = slope * top - bulge * np.sqrt(max(wide * wide - top * top, 0.0))
-    return _span(g[cp.MEAN_Y], low, high, height)
+    return _span(y, low, high, height)
 
 
 @helper
@@ -149,9 +158,10 @@ def _count(first: int, last: int, geometry: Array, grid: Grid, counts: Array, fi
         for rank in range(block * share, min(geometry.shape[0], (block + 1) * share)):
             g = geometry[rank]
             left, right = _columns_touched(g, grid)
+            ellipse = _ellipse(g)
             touched = 0
             for column in range(left, right):
-                low, high = _rows_in_column(g, column, grid.height)
+                low, high = _rows_in_column(ellipse, column, grid.height)
                 if low < high:
                     for row in range(low // TILE, (high - 1) // TILE + 1):
                         counts[block, row * grid.columns + column] += 1
@@ -181,8 +191,9 @@ def _place(first: int, last: int, geometry: Array, grid: Grid, places: Array, ti
             g = geometry[rank]
             mine = tiles.firsts[rank]
             left, right = _columns_touched(g, grid)
+            ellipse = _ellipse(g)
             for column in range(left, right):
-                low, high = _rows_in_column(g, column, grid.height)
+                low, high = _rows_in_column(ellipse, column, grid.height)
                 if low >= high:
                     continue
                 for row in range(low // TILE, (high - 1) // TILE + 1):

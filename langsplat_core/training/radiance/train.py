@@ -26,6 +26,7 @@ from torch import Tensor
 from langsplat_core.arrays import Array, psnr, sigmoid
 from langsplat_core.config import INRIA, RadianceConfig, check_settings
 from langsplat_core.datasets.capture import Capture
+from langsplat_core.datasets.holdout import ViewScore
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Cancelled, Progress, Terminated, silent
 from langsplat_core.scene import Camera, Gaussians
@@ -138,16 +139,6 @@ COARSE_MIN_SIDE = 64  # px: smaller images are never halved
 SMALLEST_EXTENT = 0.05  # of the distance to the scene: one camera, or cameras in one place, have no extent
 
 
-@dataclass(frozen=True)
-class ViewScore:
-    """Scores of one photograph's reproduction."""
-
-    name: str
-    psnr: float  # dB
-    ssim: float
-    covered: float  # share of its pixels that the Gaussians cover by half and more
-
-
 class _Pictures:
     """Photographs and cameras of the training views, whole and at half size. On a GPU they are copied to it;
     else they stay as they are, which for many is in files (`capture.Album`)."""
@@ -156,26 +147,34 @@ class _Pictures:
         def kept(image: Array) -> Array | Tensor:
             return image if device.type == "cpu" else torch.tensor(image, device=device)
 
-        views = [(capture.cameras[index], capture.images[index]) for index in indices]
-        self._fine = [(camera, kept(image)) for camera, image in views]
-        self._coarse = [(camera, kept(image)) for camera, image in (_halved(*view) for view in views)]
+        views = [(capture.cameras[i], capture.images[i], capture.mask(i)) for i in indices]
+        self._fine, self._coarse = (
+            [(camera, kept(image), None if mask is None else kept(mask)) for camera, image, mask in sizes]
+            for sizes in (views, [_halved(*view) for view in views])
+        )
 
     def __len__(self) -> int:
         return len(self._fine)
 
-    def at(self, index: int, coarse: bool) -> tuple[Camera, Tensor]:
-        """The camera and its (H, W, 3) float image in [0, 1]."""
-        camera, picture = (self._coarse if coarse else self._fine)[index]
+    def at(self, index: int, coarse: bool) -> tuple[Camera, Tensor, Tensor | None]:
+        """The camera, its (H, W, 3) float image in [0, 1], and the (H, W) bool mask of pixels that count."""
+        camera, picture, mask = (self._coarse if coarse else self._fine)[index]
         copy = picture if isinstance(picture, Tensor) else torch.tensor(picture)
-        return camera, copy.float().div_(255)
+        return camera, copy.float().div_(255), None if mask is None else torch.as_tensor(mask)
 
 
-def _halved(camera: Camera, image: Array) -> tuple[Camera, Array]:
-    """The view at half its size, by area averages; a small one as it is."""
+def _halved(camera: Camera, image: Array, mask: Array | None) -> tuple[Camera, Array, Array | None]:
+    """The view at half its size, by area averages; a small one as it is. A pixel counts where all do that it
+    is made of."""
     if min(camera.width, camera.height) < COARSE_MIN_SIDE:
-        return camera, image
+        return camera, image, mask
     size = (camera.width // 2, camera.height // 2)
-    return camera.resized(*size), np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BOX))
+
+    def shrunk(picture: Array) -> Array:
+        return np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BOX))
+
+    halved = None if mask is None else shrunk(np.where(mask, np.uint8(255), np.uint8(0))) == 255
+    return camera.resized(*size), shrunk(image), halved
 
 
 @dataclass(frozen=True)
@@ -266,11 +265,16 @@ def evaluate_views(
     scores = []
     with torch.no_grad():
         for index in range(len(pictures)):
-            camera, target = pictures.at(index, coarse=False)
+            camera, target, mask = pictures.at(index, coarse=False)
             drawn = renderer.render(state.values, camera, gaussians.sh_degree)
-            image, covered = drawn.image.clamp(0, 1), float((drawn.alpha >= 0.5).float().mean())
-            decibels = psnr(image.cpu().numpy(), target.cpu().numpy())
-            scores.append(ViewScore(camera.name, decibels, float(ssim(image, target)), covered))
+            image, covered = drawn.image.clamp(0, 1), drawn.alpha >= 0.5
+            if mask is not None:
+                target, covered = torch.where(mask[..., None], target, image), covered[mask]
+            counted = slice(None) if mask is None else mask
+            decibels = psnr(image[counted].cpu().numpy(), target[counted].cpu().numpy())
+            share = 1.0 if mask is None else float(mask.float().mean())
+            similarity = 1 - (1 - float(ssim(image, target))) / max(share, 1e-9)
+            scores.append(ViewScore(camera.name, decibels, similarity, float(covered.float().mean())))
     return scores
 
 
@@ -286,9 +290,13 @@ def _step(run: _Run, state: TrainingState) -> float:
     schedule, step = run.schedule, state.step + 1
     if not state.queue:
         state.queue = [int(index) for index in state.rng.permutation(len(run.pictures))]
-    camera, target = run.pictures.at(state.queue.pop(), coarse=step <= schedule.coarse_until)
+    camera, target, mask = run.pictures.at(state.queue.pop(), coarse=step <= schedule.coarse_until)
     rendered = run.renderer.render(state.values, camera, schedule.active_sh_degree(step))
-    loss = radiance_loss(rendered.image, target, run.config.lambda_dssim)
+    image = rendered.image
+    if mask is not None:  # what is masked differs from nothing, and nothing flows back from it
+        image = torch.where(mask[..., None], image, image.detach())
+        target = torch.where(mask[..., None], target, image.detach())
+    loss = radiance_loss(image, target, run.config.lambda_dssim)
     loss.backward()
     if run.config.opacity_decay > 0:
         add_opacity_decay(state, run.config.opacity_decay)

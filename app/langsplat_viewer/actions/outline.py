@@ -1,0 +1,311 @@
+"""The outline: the scene's tree in words, with names, groups and locks of one's own; and what can be done
+with a thing, a row of it or what is clicked in the scene."""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from langsplat_core.arrays import Array
+from langsplat_core.display.displays import Subject, latent_colours, nodes
+from langsplat_core.progress import Progress
+from langsplat_core.query.describe import Describer, Outline
+from langsplat_core.query.instances import axis_aligned_box
+from langsplat_core.query.selection import at_point
+from langsplat_core.scene import LEVELS, NO_NODE
+from langsplat_core.scene.language import TaughtWord, tidy
+from langsplat_core.semantics.encoders import DEMO
+from langsplat_viewer.actions.history import remember
+from langsplat_viewer.actions.queries import taught, teach
+from langsplat_viewer.actions.selecting import mark, select_alike, take
+from langsplat_viewer.actions.viewpoint import focus_on
+from langsplat_viewer.files.projects import Group
+from langsplat_viewer.state import OutlineView
+from langsplat_viewer.viewer import Viewer
+
+Target = int | Array  # a node of the tree, or a (3,) point on the surface, world units
+
+
+def wanted(viewer: Viewer) -> OutlineView | None:
+    """The outline of the scene, as far as it is known; the worker finds it once it has nothing else to do."""
+    state, engine = viewer.state, viewer.engine
+    if engine is None or state.scene is None or state.scene.language is None:
+        return None
+    view = state.outline
+    if view is None and viewer.worker.current is None:
+        encoder = viewer.services.encoder_id or state.scene.language.encoder_id
+        if encoder != DEMO and not Path(encoder).expanduser().is_dir() and not state.queries:
+            return OutlineView(problem=f"names come from the encoder '{encoder}': search for something first")
+        state.outline = OutlineView(problem="looking for what is here ...")
+        _find(viewer)
+    return state.outline
+
+
+def _find(viewer: Viewer) -> None:
+    engine, scene = viewer.engine, viewer.state.scene
+    assert engine is not None
+
+    def work(progress: Progress) -> tuple[Describer, OutlineView]:
+        describer = viewer.describer
+        if describer is None or describer.engine is not engine:
+            describer = Describer(engine, progress=progress)
+        progress("looking for what is here", 0.5)
+        roots = describer.outline()
+        tree = engine.tree
+        sizes = _totals(np.bincount(tree.leaves[tree.leaves != NO_NODE], minlength=tree.count), tree.parents)
+        return describer, OutlineView(roots, tree, sizes)
+
+    def done(found: tuple[Describer, OutlineView]) -> None:
+        if viewer.state.scene is scene:
+            viewer.describer, viewer.state.outline = found
+
+    def failed(reason: str) -> None:
+        if viewer.state.scene is scene:
+            viewer.state.outline = OutlineView(problem=reason)
+
+    viewer.run("looking for what is here", work, done, failed)
+
+
+def _totals(own: Array, parents: Array) -> Array:
+    """(K,) numbers of nodes -> with those of their descendants. Children come before their parents."""
+    totals = own.astype(np.int64)
+    for node, parent in enumerate(parents):
+        if parent != NO_NODE:
+            totals[parent] += totals[node]
+    return totals
+
+
+def name_of(viewer: Viewer, row: Outline) -> str:
+    """The name that was given to a row, else what it is likely to be."""
+    given = viewer.state.things.names.get(row.node)
+    return given or ("unknown" if row.word is None else row.word.phrase)
+
+
+def filtered(viewer: Viewer, rows: Iterable[Outline], text: str) -> Iterator[Outline]:
+    """Rows whose name, or that of something in them, holds every word of `text`; with those parts alone."""
+    words = text.lower().split()
+    for row in rows:
+        parts = tuple(filtered(viewer, row.parts, text))
+        name = name_of(viewer, row).lower()
+        if all(word in name for word in words):
+            yield row
+        elif parts:
+            yield replace(row, parts=parts)
+
+
+def hidden_nodes(viewer: Viewer) -> Array:
+    """(K,) bool: nodes of which nothing is shown."""
+    view, marks = viewer.state.outline, viewer.state.selection.marks
+    if view is None or view.tree is None:
+        return np.zeros(0, bool)
+    if viewer.out_of_sight is None or viewer.out_of_sight[:2] != (view, marks):
+        gone = view.tree.leaves[~marks.shown & (view.tree.leaves != NO_NODE)]
+        counts = _totals(np.bincount(gone, minlength=view.tree.count), view.tree.parents)
+        viewer.out_of_sight = view, marks, counts >= np.maximum(view.sizes, 1)
+    return viewer.out_of_sight[2]
+
+
+def colour_of(viewer: Viewer, node: int) -> tuple[float, float, float] | None:
+    """Mean colour of a node's Gaussians where what is shown has one for each: the latents, or the tree."""
+    state = viewer.state
+    display, view = state.picture.display, state.outline
+    if display not in ("latent", "tree") or view is None or view.tree is None or state.scene is None:
+        return None
+    key = (display, state.latent_level, node)
+    field = state.scene.language
+    if key not in view.colours and field is not None:
+        subject = Subject(len(state.scene.gaussians), field, level=state.latent_level)
+        values = latent_colours(field)[state.latent_level] if display == "latent" else nodes(subject)
+        inside = view.tree.members(node)
+        mean = np.zeros(3) if values is None else np.median(values[inside], axis=0)
+        view.colours[key] = (float(mean[0]), float(mean[1]), float(mean[2]))
+    return view.colours.get(key)
+
+
+def in_view(viewer: Viewer) -> list[Outline]:
+    """Rows of named wholes whose middle is in the image, those that look largest first."""
+    state = viewer.state
+    if state.outline is None or state.view is None:
+        return []
+    rows = [row for row in state.outline.roots if row.word is not None or row.node in state.things.names]
+    if not rows:
+        return []
+    camera = state.view.camera(*state.size)
+    pixels, depths = camera.project(np.array([row.centre for row in rows]))
+    inside = (depths > 0) & (pixels >= 0).all(1) & (pixels < [camera.width, camera.height]).all(1)
+    order = sorted(np.flatnonzero(inside), key=lambda place: -rows[place].share / depths[place] ** 2)
+    return [rows[place] for place in order]
+
+
+# What can be done with a thing.
+
+
+def with_thing(viewer: Viewer, target: Target, act: Callable[[Array], None]) -> None:
+    """Have the worker find (N,) bool of a thing, and then `act` with it."""
+    engine, scene, level = viewer.engine, viewer.state.scene, viewer.state.level
+    if engine is None or scene is None or scene.language is None:
+        viewer.state.say("things are known where there is a language field", is_error=True)
+        return
+
+    def work(progress: Progress) -> Array:
+        if isinstance(target, int):
+            return engine.tree.members(target)
+        index = LEVELS.index("whole" if level == "auto" else level)
+        return at_point(engine.surface, engine.regions, index, target)
+
+    def done(members: Array) -> None:
+        if viewer.state.scene is scene and members.any():
+            act(members)
+
+    viewer.run("finding the thing", work, done)
+
+
+def select(viewer: Viewer, target: Target) -> None:
+    """Select a thing."""
+    with_thing(viewer, target, lambda members: take(viewer, members, "replace"))
+
+
+def visit(viewer: Viewer, target: Target) -> None:
+    """Select a thing, and look at it from as near as it is small."""
+
+    def act(members: Array) -> None:
+        take(viewer, members, "replace")
+        scene = viewer.state.scene
+        if scene is not None:
+            box = axis_aligned_box(scene.gaussians.means[members].astype(np.float64))
+            focus_on(viewer, box.mean(0), box)
+
+    with_thing(viewer, target, act)
+
+
+def find_alike(viewer: Viewer, target: Target) -> None:
+    """Select everything that is like a thing."""
+
+    def act(members: Array) -> None:
+        take(viewer, members, "replace")
+        select_alike(viewer)
+
+    with_thing(viewer, target, act)
+
+
+def hide(viewer: Viewer, target: Target) -> None:
+    """Hide a thing; what is selected stays so."""
+
+    def act(members: Array) -> None:
+        marks = viewer.state.selection.marks
+        hidden = marks.hidden | (members & ~locked(viewer))
+        mark(viewer, replace(marks, selected=marks.selected & ~hidden, hidden=hidden))
+
+    with_thing(viewer, target, act)
+
+
+def show(viewer: Viewer, target: Target) -> None:
+    """Show a thing that is hidden."""
+
+    def act(members: Array) -> None:
+        marks = viewer.state.selection.marks
+        mark(viewer, replace(marks, hidden=marks.hidden & ~members))
+
+    with_thing(viewer, target, act)
+
+
+def give_name(viewer: Viewer, target: Target, name: str) -> None:
+    """Name a thing, and teach the name, so that it is found by it."""
+    name = tidy(name)
+    if not name:
+        return
+
+    def done(word: TaughtWord) -> None:
+        taught(viewer, word)
+        if isinstance(target, int):
+            things = viewer.state.things
+            remember(viewer)
+            viewer.state.things = replace(things, names={**things.names, target: name})
+
+    with_thing(viewer, target, lambda members: teach(viewer, name, members, done))
+
+
+def write_filter(viewer: Viewer, text: str) -> None:
+    """Take the text of the box over the outline."""
+    viewer.state.outline_typed = text
+
+
+# Locks and groups.
+
+
+def locked(viewer: Viewer) -> Array:
+    """(N,) bool: what tools leave alone."""
+    return viewer.state.selection.locked
+
+
+def toggle_lock(viewer: Viewer, node: int) -> None:
+    """Lock a thing: nothing selects, hides or deletes it; or unlock it."""
+    state = viewer.state
+    if state.outline is None or state.outline.tree is None:
+        return
+    remember(viewer)
+    state.things = replace(state.things, locked=state.things.locked ^ {node})
+    apply_locks(viewer)
+
+
+def apply_locks(viewer: Viewer) -> None:
+    """Have the selection know what is locked."""
+    state, engine = viewer.state, viewer.engine
+    if engine is None or state.scene is None:
+        return
+    locked = np.zeros(len(state.scene.gaussians), bool)
+    for node in state.things.locked:
+        locked |= engine.tree.members(node)
+    marks = state.selection.marks
+    kept = replace(marks, selected=marks.selected & ~locked) if marks.selected.any() else marks
+    state.selection = replace(state.selection, locked=locked, marks=kept)
+
+
+def group(viewer: Viewer, node: int, onto: int | Group) -> None:
+    """Put a thing into a group, or make one of two."""
+    things = viewer.state.things
+    others = tuple(g for g in (_without(g, node) for g in things.groups) if g is not None)
+    if isinstance(onto, Group):
+        new = tuple(replace(g, nodes=(*g.nodes, node)) if g.name == onto.name else g for g in others)
+    elif onto == node:
+        return
+    else:
+        taken = {g.name for g in things.groups}
+        name = next(f"group {k}" for k in range(1, len(taken) + 2) if f"group {k}" not in taken)
+        new = (*others, Group(name, (onto, node)))
+    remember(viewer)
+    viewer.state.things = replace(things, groups=new)
+
+
+def _without(group: Group, node: int) -> Group | None:
+    left = tuple(other for other in group.nodes if other != node)
+    return replace(group, nodes=left) if left else None
+
+
+def ungroup(viewer: Viewer, node: int) -> None:
+    """Take a thing out of its group."""
+    things = viewer.state.things
+    remember(viewer)
+    left = (_without(g, node) for g in things.groups)
+    viewer.state.things = replace(things, groups=tuple(g for g in left if g is not None))
+
+
+def rename_group(viewer: Viewer, old: Group, name: str) -> None:
+    """Give a group another name."""
+    things, name = viewer.state.things, tidy(name)
+    if name in {g.name for g in things.groups if g is not old}:
+        viewer.state.say(f"there is a group '{name}' already", is_error=True)
+    elif name:
+        remember(viewer)
+        groups = tuple(replace(g, name=name) if g is old else g for g in things.groups)
+        viewer.state.things = replace(things, groups=groups)
+
+
+def select_group(viewer: Viewer, group: Group) -> None:
+    """Select all of a group."""
+    engine = viewer.engine
+    if engine is None:
+        return
+    members = np.any([engine.tree.members(node) for node in group.nodes], axis=0)
+    take(viewer, members, "replace")

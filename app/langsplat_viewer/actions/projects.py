@@ -1,0 +1,183 @@
+"""Notes that are pinned to places, and projects: all that was asked, seen, noted and edited in a scene."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from langsplat_core.errors import LangSplatError
+from langsplat_viewer.actions.history import now
+from langsplat_viewer.actions.outline import apply_locks
+from langsplat_viewer.actions.queries import listed_queries
+from langsplat_viewer.actions.settings import have_panels, open_panel
+from langsplat_viewer.actions.transforming import place
+from langsplat_viewer.actions.viewpoint import bookmarked_view
+from langsplat_viewer.camera.flight import pose_of
+from langsplat_viewer.files import PROJECTS
+from langsplat_viewer.files.flights import Bookmark
+from langsplat_viewer.files.projects import (
+    LONGEST_NOTE,
+    MOST_NOTES,
+    Note,
+    Project,
+    Things,
+    write_project,
+)
+from langsplat_viewer.jobs import one_line
+from langsplat_viewer.marks import Pair, unpack
+from langsplat_viewer.output.saving import free_name
+from langsplat_viewer.state import SLOTS, Query, Ruler, ViewerState
+from langsplat_viewer.viewer import Viewer, Visit, visit_of
+
+# Notes.
+
+
+def pin_notes(viewer: Viewer, on: bool) -> None:
+    """Set whether a click on the scene pins a note there."""
+    viewer.state.pins_notes, viewer.state.ruler = on, Ruler()
+    if on:
+        open_panel(viewer, "Notes")
+
+
+def toggle_pinning(viewer: Viewer) -> None:
+    """Begin to pin notes, or end it."""
+    pin_notes(viewer, not viewer.state.pins_notes)
+
+
+def pin_at(viewer: Viewer, u: float, v: float) -> None:
+    """Pin a note to the surface; (u, v) are fractions of the scene's area."""
+    state = viewer.state
+    point = None if viewer.surface is None else viewer.surface.point_at(u, v)
+    if point is None or len(state.notes) >= MOST_NOTES:
+        state.say("nothing under the cursor to pin a note to" if point is None else "no room for more notes")
+        return
+    x, y, z = (float(part) for part in point)
+    state.notes, state.pins_notes = (*state.notes, Note(f"note {len(state.notes) + 1}", (x, y, z))), False
+
+
+def write_note(viewer: Viewer, note: Note, text: str) -> None:
+    """Change the text of a note."""
+    changed = replace(note, text=text[:LONGEST_NOTE])
+    viewer.state.notes = tuple(changed if other is note else other for other in viewer.state.notes)
+
+
+def remove_note(viewer: Viewer, note: Note) -> None:
+    """Take a note off."""
+    viewer.state.notes = tuple(other for other in viewer.state.notes if other is not note)
+
+
+# Projects.
+
+
+def save_project(viewer: Viewer, folder: Path) -> Path | None:
+    """Save the project to the file that it came from, or to a new one in `folder`; None where that failed."""
+    state = viewer.state
+    if state.scene is None or state.path is None or state.view is None:
+        state.say("open a scene first, then save the project", is_error=True)
+        return None
+    path = state.project or free_name(folder.absolute(), state.path.stem, PROJECTS)
+    moment = now(viewer)
+    project = Project(
+        scene=state.path.absolute(),
+        count=len(state.scene.gaussians),
+        view=Bookmark("view", pose_of(state.view), state.view.distance),
+        picture=state.picture,
+        latent_level=state.latent_level,
+        clip=state.settings.clip,
+        queries=listed_queries(state),
+        keyframes=state.record.keyframes,
+        bookmarks=state.bookmarks,
+        notes=state.notes,
+        ruler=state.ruler.points,
+        marks=moment.marks,
+        moves=state.selection.moves,
+        panels=state.preferences.panels or (),
+        things=state.things,
+    )
+    try:
+        write_project(path, project, [_answer(state, query) for query in state.queries])
+    except OSError as error:
+        state.say(f"{path}: not saved ({one_line(error)})", is_error=True)
+        return None
+    state.project = path
+    marks, moves = state.selection.marks, state.selection.moves
+    state.selection = replace(state.selection, saved=marks.deleted, saved_moves=moves)
+    state.say(f"saved {path}")
+    return path
+
+
+def _answer(state: ViewerState, query: Query) -> dict[str, Any]:
+    """What other programs want to know of an answer."""
+    result = query.result
+    if result is None:
+        return {"phrase": query.phrase, "problem": query.problem}
+    return {
+        "phrase": query.phrase,
+        "verdict": result.verdict,
+        "probability": result.probability,
+        "place": None if result.place is None else [float(part) for part in result.place],
+        "gaussians": int(result.members.sum()),
+        "boxes": [thing.box.tolist() for thing in query.things],
+        "notes": [note.text for note in state.notes if result.members[_nearest(state, note)]],
+    }
+
+
+def _nearest(state: ViewerState, note: Note) -> int:
+    """The Gaussian whose centre is nearest to a note."""
+    assert state.scene is not None
+    means = state.scene.gaussians.means.astype(np.float64)
+    with np.errstate(all="ignore"):
+        away = ((means - np.array(note.at)) ** 2).sum(1)
+    return int(np.nanargmin(np.where(np.isfinite(away), away, np.inf)))
+
+
+def restore(viewer: Viewer, project: Project, path: Path) -> Visit:
+    """Have in the scene, which was just opened, what the project in the file `path` holds; the rest is in the
+    visit that is returned, to be taken by `opening.return_to`."""
+    state = viewer.state
+    assert state.scene is not None
+    if len(state.scene.gaussians) == project.count:
+        state.things = project.things
+        apply_locks(viewer)
+        pair = Pair(state.selection.marks, now(viewer).marks)
+        state.selection = replace(state.selection, marks=unpack(project.marks, pair))
+        try:
+            place(viewer, project.moves)
+        except LangSplatError as error:
+            state.say(f"{path}: its transforms are left out: {one_line(error)}", is_error=True)
+        marks, moves = state.selection.marks, state.selection.moves
+        state.selection = replace(state.selection, saved=marks.deleted, saved_moves=moves)
+    elif project.moves or project.things != Things() or any(m is not None for m in project.marks.masks):
+        what = "what was selected, hidden, moved and named is left out"
+        state.say(f"the scene has changed since: {what}", is_error=True)
+    state.picture = project.picture
+    state.notes, state.project = project.notes, path
+    state.bookmarks = project.bookmarks or state.bookmarks
+    if project.panels:
+        state.preferences = replace(state.preferences, panels=project.panels)
+        have_panels(viewer, project.panels)
+    return _visit(viewer, project)
+
+
+def _visit(viewer: Viewer, project: Project) -> Visit:
+    state, asked = viewer.state, project.queries
+    assert state.extent is not None
+    state.level = asked.level
+    shown = iter([*range(SLOTS), *[None] * len(asked.queries)])
+    queries = tuple(
+        Query(query.phrase, next(shown) if query.shown else None, number, cut=query.cut)
+        for number, query in enumerate(asked.queries)
+    )
+    return replace(
+        visit_of(state),
+        view=bookmarked_view(project.view, state.extent),
+        display=project.picture.display,
+        latent_level=project.latent_level,
+        queries=queries,
+        selected=len(queries) - 1 if queries else None,
+        canonical=asked.canonical,
+        keyframes=project.keyframes,
+        ruler=Ruler(points=project.ruler),
+        clip=project.clip,
+    )

@@ -1,0 +1,229 @@
+"""The panel "Outline", the menu of a thing that is clicked with the right button, and the legend of displays
+that have a colour for each thing."""
+
+from typing import Any
+
+from imgui_bundle import ImVec2, ImVec4, hello_imgui, icons_fontawesome_6, imgui
+
+from langsplat_core.query.describe import OR, Outline
+from langsplat_viewer.actions import outline
+from langsplat_viewer.actions.outline import Target
+from langsplat_viewer.files.projects import Group
+from langsplat_viewer.panels.overlays import QUIET, STILL
+from langsplat_viewer.panels.style import Area, elided, muted, small_wrapped, tip, width_of
+from langsplat_viewer.state import OutlineView
+from langsplat_viewer.viewer import Viewer
+
+DRAGGED = "node of the outline"
+LEGEND_ROWS, LEGEND_EM = 8, 9.0
+MENU = "menu of a thing"
+
+
+def draw(viewer: Viewer) -> None:
+    """A box that filters, groups, and the tree."""
+    view = outline.wanted(viewer)
+    if view is None or view.problem:
+        small_wrapped(view.problem if view else "open a scene with a language field", muted())
+        return
+    imgui.set_next_item_width(-1)
+    _, typed = imgui.input_text_with_hint("##filter", "filter", viewer.state.outline_typed)
+    outline.write_filter(viewer, typed)
+    if imgui.begin_child("rows"):
+        for group in viewer.state.things.groups:
+            _group(viewer, view, group)
+        inside = {node for group in viewer.state.things.groups for node in group.nodes}
+        for row in outline.filtered(viewer, view.roots, typed):
+            if row.node not in inside or typed:
+                _row(viewer, row)
+    imgui.end_child()
+
+
+def _group(viewer: Viewer, view: OutlineView, group: Group) -> None:
+    imgui.push_id(group.name)
+    imgui.set_next_item_open(True, imgui.Cond_.once)
+    flags = imgui.TreeNodeFlags_.open_on_arrow | imgui.TreeNodeFlags_.span_avail_width
+    opened = imgui.tree_node_ex(f"{group.name}##group", flags)
+    if imgui.is_item_clicked() and not imgui.is_item_toggled_open():
+        outline.select_group(viewer, group)
+    _drop(viewer, group)
+    if imgui.begin_popup_context_item("group"):
+        name = _named("##rename", "another name", group.name)
+        if name:
+            outline.rename_group(viewer, group, name)
+        imgui.end_popup()
+    if opened:
+        for row in [row for node in group.nodes if (row := view.row(node)) is not None]:
+            _row(viewer, row, in_group=True)
+        imgui.tree_pop()
+    imgui.pop_id()
+
+
+def _row(viewer: Viewer, row: Outline, *, in_group: bool = False) -> None:
+    imgui.push_id(f"node {row.node}")
+    side, spacing = imgui.get_frame_height(), imgui.get_style().item_spacing.x
+    right = imgui.get_cursor_pos_x() + imgui.get_content_region_avail().x
+    flags = imgui.TreeNodeFlags_.open_on_arrow | imgui.TreeNodeFlags_.allow_overlap
+    flags |= imgui.TreeNodeFlags_.span_avail_width | imgui.TreeNodeFlags_.no_tree_push_on_open
+    flags |= imgui.TreeNodeFlags_.leaf if not row.parts else 0
+    colour = outline.colour_of(viewer, row.node)
+    name = outline.name_of(viewer, row)
+    sure = (
+        f" {100 * row.word.probability:.0f} %"
+        if row.word and row.node not in viewer.state.things.names
+        else ""
+    )
+    room = (
+        imgui.get_content_region_avail().x - 2 * side - 2 * spacing - imgui.get_tree_node_to_label_spacing()
+    )
+    imgui.align_text_to_frame_padding()
+    opened = imgui.tree_node_ex(f"{elided(name + sure, room, width_of)}###row", flags)
+    if imgui.is_item_clicked() and not imgui.is_item_toggled_open():
+        outline.visit(viewer, row.node)
+    _about(row, name)
+    if imgui.begin_drag_drop_source():
+        imgui.set_drag_drop_payload_py_id(DRAGGED, row.node)
+        imgui.text(name)
+        imgui.end_drag_drop_source()
+    _drop(viewer, row.node)
+    if imgui.begin_popup_context_item("thing"):
+        _things_menu(viewer, row.node)
+        if in_group and imgui.menu_item("Out of the group", "", False)[0]:
+            outline.ungroup(viewer, row.node)
+        imgui.end_popup()
+    if colour is not None:
+        imgui.same_line(right - 3 * side - 2 * spacing)
+        _swatch(colour, side)
+    imgui.same_line(right - 2 * side - spacing)
+    _eye(viewer, row.node, side)
+    imgui.same_line(right - side)
+    _lock(viewer, row.node, side)
+    imgui.pop_id()
+    if opened:
+        imgui.indent()
+        for part in row.parts:
+            _row(viewer, part)
+        imgui.unindent()
+
+
+def _about(row: Outline, name: str) -> None:
+    sides = " x ".join(f"{side:.3g}" for side in row.size)
+    outlined = f"outlined in {row.votes[0]} of {sum(row.votes)} photographs"
+    tip(f"{name}: {row.count:,} Gaussians, {sides} world units, {outlined}")
+
+
+def _eye(viewer: Viewer, node: int, side: float) -> None:
+    hidden = bool(outline.hidden_nodes(viewer)[node])
+    icon = icons_fontawesome_6.ICON_FA_EYE_SLASH if hidden else icons_fontawesome_6.ICON_FA_EYE
+    if _icon(f"{icon}###eye", side, lit=not hidden):
+        (outline.show if hidden else outline.hide)(viewer, node)
+    tip("Show it again" if hidden else "Hide it")
+
+
+def _lock(viewer: Viewer, node: int, side: float) -> None:
+    is_locked = node in viewer.state.things.locked
+    icon = icons_fontawesome_6.ICON_FA_LOCK if is_locked else icons_fontawesome_6.ICON_FA_LOCK_OPEN
+    if _icon(f"{icon}###lock", side, lit=is_locked):
+        outline.toggle_lock(viewer, node)
+    tip("Locked: no tool selects, hides or deletes it" if is_locked else "Lock it")
+
+
+def _icon(label: str, side: float, *, lit: bool) -> bool:
+    imgui.push_style_color(imgui.Col_.button, ImVec4(0, 0, 0, 0))
+    text = imgui.get_style_color_vec4(imgui.Col_.text) if lit else muted()
+    imgui.push_style_color(imgui.Col_.text, ImVec4(text.x, text.y, text.z, 1.0 if lit else 0.45))
+    clicked = bool(imgui.button(label, ImVec2(side, side)))
+    imgui.pop_style_color(2)
+    return clicked
+
+
+def _swatch(colour: tuple[float, float, float], side: float) -> None:
+    flags = imgui.ColorEditFlags_.no_tooltip | imgui.ColorEditFlags_.no_picker
+    imgui.color_button("##colour", ImVec4(*colour, 1.0), flags, ImVec2(side, side))
+
+
+def _drop(viewer: Viewer, onto: int | Group) -> None:
+    """A row that is dropped here is grouped with this."""
+    if imgui.begin_drag_drop_target():
+        payload = imgui.accept_drag_drop_payload_py_id(DRAGGED)
+        if payload is not None:
+            outline.group(viewer, int(payload.data_id), onto)
+        imgui.end_drag_drop_target()
+
+
+# The menu of a thing.
+
+
+class ThingsMenu:
+    """Opens where the right button is clicked on the scene, without a drag."""
+
+    def __init__(self) -> None:
+        self._at: Any = None  # (3,) on the surface
+
+    def draw(self, viewer: Viewer, area: Area) -> None:
+        """Once per frame, after the panels."""
+        io = imgui.get_io()
+        moved = imgui.get_mouse_drag_delta(1, 0.0)
+        u, v = area.fraction(io.mouse_pos.x, io.mouse_pos.y)
+        still = abs(moved.x) + abs(moved.y) < STILL
+        if imgui.is_mouse_released(1) and still and not io.want_capture_mouse and 0 <= u <= 1 and 0 <= v <= 1:
+            self._at = None if viewer.surface is None else viewer.surface.point_at(u, v)
+            if self._at is not None and viewer.engine is not None:
+                imgui.open_popup(MENU)
+        if imgui.begin_popup(MENU):
+            _things_menu(viewer, self._at)
+            imgui.end_popup()
+
+
+def _things_menu(viewer: Viewer, target: Target) -> None:
+    for label, act in (
+        ("Select", outline.select),
+        ("Focus", outline.visit),
+        ("Find more like this", outline.find_alike),
+        ("Hide", outline.hide),
+    ):
+        if imgui.menu_item(label, "", False)[0]:
+            act(viewer, target)
+    imgui.separator()
+    name = _named("##name this", "name this", "")
+    if name:
+        outline.give_name(viewer, target, name)
+        imgui.close_current_popup()
+
+
+def _named(label: str, hint: str, text: str) -> str:
+    """A box for a name; the name once it is entered, else ""."""
+    imgui.set_next_item_width(hello_imgui.em_size(11))
+    entered, typed = imgui.input_text_with_hint(label, hint, text, imgui.InputTextFlags_.enter_returns_true)
+    return str(typed).strip() if entered else ""
+
+
+# The legend of displays that have a colour for each thing.
+
+
+def draw_legend(viewer: Viewer, area: Area) -> None:
+    """Colours and names of the things that are largest in the image, where latents or the tree are shown."""
+    state = viewer.state
+    if state.picture.display not in ("latent", "tree") or state.settings.split.columns > 1:
+        return
+    view = outline.wanted(viewer)
+    if view is None or view.problem:
+        return
+    seen: dict[str, tuple[float, float, float]] = {}
+    for row in outline.in_view(viewer):
+        colour = outline.colour_of(viewer, row.node)
+        if colour is not None:
+            seen.setdefault(outline.name_of(viewer, row).split(OR)[0], colour)
+        if len(seen) == LEGEND_ROWS:
+            break
+    if not seen:
+        return
+    margin = hello_imgui.em_size(0.7)
+    corner = ImVec2(area.left + area.width - margin, area.top + area.height - margin)
+    imgui.set_next_window_pos(corner, imgui.Cond_.always, ImVec2(1, 1))
+    imgui.set_next_window_bg_alpha(0.75)
+    imgui.begin("things in colours", None, QUIET)
+    for name, colour in seen.items():
+        _swatch(colour, imgui.get_text_line_height())
+        imgui.same_line()
+        imgui.text_unformatted(elided(name, hello_imgui.em_size(LEGEND_EM), width_of))
+    imgui.end()

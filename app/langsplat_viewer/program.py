@@ -1,0 +1,94 @@
+"""`langsplat-viewer`: arguments -> window, or an image or film without a window."""
+
+import sys
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+
+from langsplat_core.cli.run import main, parsed
+from langsplat_core.errors import InputError
+from langsplat_core.progress import Progress, TerminalProgress, silent
+from langsplat_viewer.files import PROJECTS
+from langsplat_viewer.files.preferences import preferences_folder
+from langsplat_viewer.options import ViewerOptions, camera_file, scene_path, services
+
+
+@dataclass(frozen=True)
+class ViewerCommand(ViewerOptions):
+    """Open a 3D Gaussian scene, look around in it and search it with words."""
+
+    def run(self) -> None:
+        self.wanted_size, self.picture  # noqa: B018  what cannot be read is said before anything slow is done
+        path = scene_path(self.scene)
+        camera_file(self.camera)
+        if self.headless and self.beside is not None:
+            raise InputError("--beside is for the window; draw the two scenes one after the other")
+        if self.headless and path.name.endswith(PROJECTS):
+            raise InputError(
+                f"{path}: a project is opened in a window; name its scene, or leave out --headless"
+            )
+        if self.headless:
+            self._without_window(path)
+        else:
+            self._window(path)
+
+    def _without_window(self, path: Path) -> None:
+        from langsplat_viewer.output.headless import check_options, draw_film, draw_image
+
+        check_options(self)
+        bars: AbstractContextManager[Progress] = nullcontext(silent)
+        if sys.stderr.isatty():
+            bars = TerminalProgress()
+        with bars as progress:
+            draw = draw_film if self.is_film else draw_image
+            lines = draw(self, path, services(self.encoder), progress)
+        print("\n".join(lines))
+
+    def _window(self, path: Path) -> None:
+        if self.out is not None:
+            raise InputError("--out is for pictures without a window; add --headless")
+        for option, given, panel in (
+            ("--colour-map", self.colour_map, "Display"),
+            ("--transparent", self.transparent, "Display"),
+            ("--cut", self.cut, "Search"),
+            ("--canonical", self.canonical, "Search"),
+            ("--near-cut", self.near_cut, "Camera"),
+            ("--far-cut", self.far_cut, "Camera"),
+        ):
+            if given:
+                raise InputError(
+                    f"{option} is for pictures without a window; choose it in the panel {panel}, "
+                    "or add --headless"
+                )
+        if self.turntable is not None:
+            raise InputError("--turntable is a film without a window; add --headless --out film.mp4")
+        from langsplat_viewer.window import WindowRequest, open_window
+
+        open_window(
+            WindowRequest(
+                path=path,
+                queries=self.query,
+                level=self.level,
+                picture=self.picture,
+                size=self.wanted_size,
+                camera=self.camera,
+                orthographic=self.orthographic,
+                backend=self.backend,
+                path_file=self.path,
+                beside=None if self.beside is None else scene_path(self.beside),
+                settings=None if self.fresh else preferences_folder(),
+            ),
+            services(self.encoder),
+        )
+
+
+def parse(args: Sequence[str]) -> ViewerCommand:
+    """The command that the words of a command line make; SystemExit as tyro raises it."""
+    found: ViewerCommand = parsed("langsplat-viewer", ViewerCommand, args)
+    return found
+
+
+def entry() -> None:
+    """The `langsplat-viewer` console script."""
+    sys.exit(main("langsplat-viewer", lambda: parse(sys.argv[1:])))

@@ -1,0 +1,133 @@
+"""Photographs from a video: the sharpest image of every interval."""
+
+import errno
+import hashlib
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from PIL import Image
+
+from langsplat_core.arrays import Array
+from langsplat_core.errors import FormatError, InputError, optional_imports
+from langsplat_core.io.files import shown
+from langsplat_core.io.hostile import MOST_PIXELS, open_for_reading
+from langsplat_core.progress import Progress, silent
+
+if TYPE_CHECKING:
+    import av.container
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
+SHARPNESS_WIDTH = 640  # px, at which images are compared: below noise, above motion blur
+QUALITY = 95  # of the JPEG files
+FEWEST = 3  # images, of which cameras can be found
+
+
+def is_video(path: Path) -> bool:
+    """True for a file whose name ends as a video's."""
+    return path.suffix.lower() in VIDEO_SUFFIXES and not path.is_dir()
+
+
+def kept_frames(video: Path, count: int, work: Path, progress: Progress = silent) -> Path:
+    """The folder in `work` with the images of `video`, made there unless it is whole already."""
+    file, _ = open_for_reading(video)
+    with file:
+        content = hashlib.file_digest(file, "sha256").hexdigest()[:12]  # type: ignore[arg-type]
+    folder = work / f"frames-{content}-{count}"
+    if not folder.is_dir():
+        extract_frames(video, folder, count, progress)
+    return folder
+
+
+@optional_imports()
+def extract_frames(video: Path, out: Path, count: int, progress: Progress = silent) -> list[Path]:
+    """Write the sharpest image of each of `count` equal spans of time as out/frame_0001.jpg ..., turned as
+    the video is shown. `out` appears when it is whole. Spans without an image are left out.
+
+    Raises InputError where `out` has something in it already or too little is left, and FormatError for a
+    file that cannot be read as a video.
+    """
+    import av
+
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{shown(out)}: holds something already; name a new folder")
+    unfinished = out.with_name(f"{out.name}.part")
+    shutil.rmtree(unfinished, ignore_errors=True)
+    unfinished.mkdir(parents=True)
+    try:
+        with open_for_reading(video)[0] as file, av.open(file, "r") as container:
+            written = _write(container, unfinished, count, progress)
+        if written < FEWEST:
+            raise InputError(f"{shown(video)}: has {written} images; at least {FEWEST} are needed")
+        if out.is_dir():
+            out.rmdir()
+        unfinished.rename(out)
+    except (av.FFmpegError, OSError) as error:
+        sought_too_far = error.errno == errno.EINVAL
+        if not isinstance(error, av.FFmpegError) and not sought_too_far:
+            raise
+        raise FormatError(f"{shown(video)}: not a readable video ({error.strerror or error})") from None
+    except (IndexError, ValueError, MemoryError) as error:  # no stream of images, or sizes that cannot be
+        raise FormatError(f"{shown(video)}: not a readable video ({str(error)[:80]})") from None
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
+    return sorted(out.iterdir())
+
+
+def _write(container: "av.container.InputContainer", folder: Path, count: int, progress: Progress) -> int:
+    """Write the sharpest images of an opened video; their number."""
+    stream = container.streams.video[0]
+    stream.thread_type = "AUTO"
+    if stream.codec_context.width * stream.codec_context.height > MOST_PIXELS:
+        raise ValueError(f"{stream.codec_context.width}x{stream.codec_context.height} pixels")
+    packets = container.demux(stream)
+    times = [float(packet.pts * packet.time_base) for packet in packets if packet.pts is not None]
+    if not times:
+        raise ValueError("it has no images")
+    first, last = min(times), max(times)
+    container.seek(0)
+    best: dict[int, tuple[float, Any]] = {}  # span -> sharpness and image, of the span under way
+    written = 0
+    for frame in _decoded(container, stream):
+        share = (float(frame.time or first) - first) / max(last - first, 1e-9)
+        span = min(int(share * count), count - 1)
+        for done in [number for number in best if number < span]:
+            written += _save(best.pop(done)[1], folder)
+        progress("taking photographs out of the video", min(share, 1.0))
+        sharp = sharpness(frame)
+        if span not in best or sharp > best[span][0]:
+            best[span] = (sharp, frame)
+    return written + sum(_save(frame, folder) for _, frame in best.values())
+
+
+def _decoded(container: "av.container.InputContainer", stream: Any) -> Iterator[Any]:
+    """Every image that can be decoded: a recording that broke off has a last one that cannot."""
+    import av
+
+    for packet in container.demux(stream):
+        try:
+            yield from packet.decode()
+        except av.InvalidDataError:
+            continue
+
+
+def sharpness(frame: Any) -> float:
+    """Variance of the Laplacian of the grey image, at `SHARPNESS_WIDTH`."""
+    width = min(SHARPNESS_WIDTH, frame.width)
+    height = max(1, round(frame.height * width / frame.width))
+    grey: Array = frame.reformat(width=width, height=height, format="gray").to_ndarray().astype(np.float32)
+    if min(grey.shape) < 3:
+        return 0.0
+    inner = grey[1:-1, 1:-1]
+    around = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:]
+    return float((around - 4 * inner).var())
+
+
+def _save(frame: Any, folder: Path) -> int:
+    """Write an image, turned as it is shown; 1."""
+    upright = np.rot90(frame.to_ndarray(format="rgb24"), round(frame.rotation / 90))
+    name = f"frame_{len(list(folder.iterdir())) + 1:04d}.jpg"
+    Image.fromarray(np.ascontiguousarray(upright)).save(folder / name, quality=QUALITY)
+    return 1

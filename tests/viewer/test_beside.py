@@ -1,0 +1,107 @@
+"""A second scene beside the first: seen and asked alike, and gone when it is not shown any more."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from langsplat_viewer.actions import beside, opening, queries, settings, undoing, viewpoint
+from langsplat_viewer.camera.controls import default_view, extent_of, orbit
+from langsplat_viewer.rendering.request import Split
+from tests.support.windowless import SCENES, errors, settle
+
+
+@pytest.fixture
+def two(opened):
+    """The blobs, and beside them the same with a phrasebook."""
+    queries.ask(opened, "mug")
+    settle(opened)
+    opening.open_beside(opened, Path("book.ply"))
+    meet(opened)
+    yield opened
+    if opened.beside is not None:
+        opened.beside.worker.close()
+
+
+def meet(viewer) -> None:
+    """Frames until both have done what there is to do."""
+    for _ in range(3):
+        beside.follow(viewer)
+        settle(viewer)
+        if viewer.beside is not None:
+            settle(viewer.beside)
+    beside.follow(viewer)
+
+
+def test_both_are_seen_and_asked_alike(two):
+    other = two.beside.state
+    assert other.path == Path("book.ply")
+    assert [(query.phrase, query.slot) for query in other.queries] == [("mug", 0)]
+    assert other.queries[0].result.found
+    assert other.view is two.state.view
+    for phrase in ("book", "nothing like this"):
+        queries.ask(two, phrase)
+    queries.set_level(two, "whole")
+    settings.set_display(two, "segmentation")
+    settings.resize(two, 77, 55)
+    viewpoint.move(two, lambda view: orbit(view, 0.2, 0.1))
+    settle(two)
+    meet(two)
+    assert {query.phrase: query.slot for query in other.queries} == {"mug": 0, "book": 1}
+    assert (other.level, other.picture.display, other.size) == ("whole", "segmentation", (77, 55))
+    assert other.view is two.state.view
+    queries.hide(two, two.state.queries[0])
+    queries.remove(two, two.state.queries[1])
+    meet(two)
+    assert [(query.phrase, query.slot) for query in other.queries] == [("mug", None)]
+
+
+def test_it_goes_with_the_line_and_does_not_come_back_by_itself(two):
+    settings.show_one(two)
+    beside.follow(two)
+    assert two.beside is None
+    undoing.undo(two)
+    beside.follow(two)
+    assert two.state.settings.split.mode == "off"
+
+
+def test_what_cannot_be_opened_is_said_here(two):
+    opening.open_beside(two, Path("broken.ply"))
+    meet(two)
+    assert "broken.ply" in errors(two)[-1]
+    assert two.state.scene is not None
+
+
+def test_a_scene_without_a_field_shows_its_colours(two):
+    opening.open_beside(two, Path("plain.ply"))
+    meet(two)
+    assert two.beside.state.picture.display == "rgb"
+    assert two.beside.state.queries == []
+    assert errors(two) == []
+
+
+def test_other_phrases_to_compare_with_are_those_of_both(two):
+    queries.set_canonical(two, "book, plant")
+    settle(two)
+    meet(two)
+    assert two.beside.state.canonical == ("book", "plant")
+
+
+def test_a_scene_with_other_coordinates_is_seen_from_the_same_side():
+    scene = SCENES["blobs.ply"]
+    moved = replace(scene.gaussians, means=3 * scene.gaussians.means + 50)
+    here, there = extent_of(scene), extent_of(replace(scene, gaussians=moved))
+    view = default_view(scene, here, (80, 60))
+    other = beside.linked(view, here, there)
+    assert beside.linked(view, here, here) is view
+    np.testing.assert_array_equal(other.rotation, view.rotation)
+    np.testing.assert_allclose(
+        (other.eye - there.centre) / there.radius, (view.eye - here.centre) / here.radius
+    )
+
+
+def test_two_images_are_joined_at_the_line():
+    dark, light = np.zeros((2, 10, 3), np.uint8), np.full((2, 10, 3), 9, np.uint8)
+    assert Split("scenes", at=0.3).joined([dark, light], 10)[0, :, 0].tolist() == [0] * 3 + [9] * 7
+    assert Split("scenes", at=0.3).joined([dark], 10) is dark

@@ -1,0 +1,209 @@
+"""The outline: the tree in words, what is done with its rows, and what stays locked."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from langsplat_viewer.actions import (
+    opening,
+    outline,
+    projects,
+    queries,
+    selecting,
+    settings,
+    transforming,
+    undoing,
+)
+from langsplat_viewer.actions.selecting import take
+from tests.support.fakes import CENTRES, blob_scene
+from tests.support.marks_and_flights import blob, marked
+from tests.support.scenes import with_tree
+from tests.support.windowless import SCENES, errors, settle
+
+
+@pytest.fixture
+def outlined(viewer, monkeypatch):
+    """The blobs with a tree, its outline found."""
+    monkeypatch.setitem(SCENES, "tree.ply", with_tree(blob_scene(phrasebook=True)))
+    opening.open_scene(viewer, Path("tree.ply"))
+    settle(viewer)
+    queries.ask(viewer, "mug")  # so that the encoder is known to be there
+    settle(viewer)
+    assert outline.wanted(viewer).problem
+    settle(viewer)
+    assert outline.wanted(viewer).problem == ""
+    return viewer
+
+
+def row_of(viewer, word: str):
+    """The row of most of a blob."""
+    tree = viewer.state.outline.tree
+    return max(viewer.state.outline.roots, key=lambda row: (tree.members(row.node) & blob(word)).sum())
+
+
+def test_every_thing_has_a_row_with_its_word(outlined):
+    for word in ("mug", "book", "plant"):
+        row = row_of(outlined, word)
+        assert word in outline.name_of(outlined, row)
+        assert (outlined.engine.tree.members(row.node) == blob(word)).all()
+        assert outlined.state.outline.row(row.node) is row
+    assert sum(row.count for row in outlined.state.outline.roots) == 360
+
+
+def test_a_row_is_selected_and_looked_at(outlined):
+    row, before = row_of(outlined, "book"), outlined.state.view
+    outline.visit(outlined, row.node)
+    settle(outlined)
+    assert marked(outlined)[0] == "book"
+    assert outlined.state.glide.end.distance < before.distance
+    np.testing.assert_allclose(outlined.state.glide.end.target, CENTRES[1], atol=0.2)
+
+
+def test_what_is_clicked_in_the_scene_is_the_thing_there(outlined):
+    outline.select(outlined, CENTRES[2])
+    settle(outlined)
+    assert marked(outlined)[0] == "plant"
+    outline.find_alike(outlined, CENTRES[0])
+    settle(outlined)
+    assert marked(outlined)[0] == "mug"
+
+
+def test_rows_are_hidden_and_shown_and_the_selection_stays(outlined):
+    mug, book = row_of(outlined, "mug").node, row_of(outlined, "book").node
+    take(outlined, blob("plant"))
+    outline.hide(outlined, mug)
+    settle(outlined)
+    assert marked(outlined) == ("plant", "mug", "")
+    hidden = outline.hidden_nodes(outlined)
+    assert hidden[mug]
+    assert not hidden[book]
+    assert outline.hidden_nodes(outlined) is hidden
+    outline.show(outlined, mug)
+    settle(outlined)
+    assert marked(outlined) == ("plant", "", "")
+    undoing.undo(outlined)
+    assert outline.hidden_nodes(outlined)[mug]
+
+
+def test_what_is_locked_is_left_alone(outlined):
+    mug = row_of(outlined, "mug").node
+    take(outlined, blob("mug") | blob("book"))
+    outline.toggle_lock(outlined, mug)
+    assert marked(outlined)[0] == "book"
+    selecting.select_all(outlined)
+    assert marked(outlined)[0] == "book plant"
+    take(outlined, blob("book"))
+    selecting.isolate_selected(outlined)
+    assert marked(outlined)[1] == "plant"
+    selecting.show_hidden(outlined)
+    outline.hide(outlined, mug)
+    settle(outlined)
+    assert marked(outlined)[1] == ""
+    transforming.fill_box(outlined)
+    transforming.crop(outlined)
+    assert "mug" not in marked(outlined)[2]
+    undoing.undo(outlined)
+    outline.toggle_lock(outlined, mug)
+    selecting.select_all(outlined)
+    assert marked(outlined)[0] == "mug book plant"
+
+
+def test_a_name_is_taught_shown_filtered_and_undone(outlined):
+    mug = row_of(outlined, "mug")
+    outline.give_name(outlined, mug.node, "  grandma's cup ")
+    settle(outlined)
+    assert outline.name_of(outlined, mug) == "grandma's cup"
+    assert outlined.state.queries[-1].phrase == "grandma's cup"
+    assert outlined.state.queries[-1].result.found
+    rows = list(outline.filtered(outlined, outlined.state.outline.roots, "CUP grand"))
+    assert [row.node for row in rows] == [mug.node]
+    assert list(outline.filtered(outlined, outlined.state.outline.roots, "zebra")) == []
+    book = row_of(outlined, "book").node
+    outline.toggle_lock(outlined, book)
+    outline.give_name(outlined, book, "the atlas")  # also of what no tool takes
+    settle(outlined)
+    assert outlined.engine.taught.keys() == {"grandma's cup", "the atlas"}
+    outline.give_name(outlined, book, "of")  # which names nothing
+    settle(outlined)
+    assert outlined.state.things.names[book] == "the atlas"
+    outlined.state.messages.clear()
+    outline.give_name(outlined, mug.node, " ")
+    assert errors(outlined) == []
+
+
+def test_groups_are_made_named_and_left(outlined):
+    mug, book, plant = (row_of(outlined, word).node for word in ("mug", "book", "plant"))
+    outline.group(outlined, mug, book)
+    (group,) = outlined.state.things.groups
+    assert group.nodes == (book, mug)
+    outline.group(outlined, plant, group)
+    outline.rename_group(outlined, outlined.state.things.groups[0], "on the table")
+    (group,) = outlined.state.things.groups
+    assert (group.name, group.nodes) == ("on the table", (book, mug, plant))
+    other = replace(group, name="other", nodes=(plant,))
+    outlined.state.things = replace(outlined.state.things, groups=(group, other))
+    outline.rename_group(outlined, other, "on the table")
+    assert "already" in errors(outlined)[-1]
+    outlined.state.things = replace(outlined.state.things, groups=(group,))
+    outline.select_group(outlined, group)
+    assert marked(outlined)[0] == "mug book plant"
+    outline.ungroup(outlined, mug)
+    assert outlined.state.things.groups[0].nodes == (book, plant)
+    undoing.undo(outlined)
+    assert outlined.state.things.groups[0].nodes == (book, mug, plant)
+    for node in (mug, book, plant):
+        outline.ungroup(outlined, node)
+    assert outlined.state.things.groups == ()
+    outline.group(outlined, mug, mug)
+    assert outlined.state.things.groups == ()
+
+
+def test_a_project_keeps_names_groups_and_locks(outlined, viewer, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("tree.ply").touch()
+    mug, book = row_of(outlined, "mug").node, row_of(outlined, "book").node
+    outline.group(outlined, mug, book)
+    outline.toggle_lock(outlined, mug)
+    outline.give_name(outlined, book, "the atlas")
+    settle(outlined)
+    things, path = outlined.state.things, projects.save_project(outlined, tmp_path)
+    opening.open_scene(viewer, Path("plain.ply"))
+    settle(viewer)
+    assert viewer.state.things != things
+    opening.open_project(viewer, path)
+    settle(viewer)
+    assert viewer.state.things == things
+    selecting.select_all(viewer)
+    assert marked(viewer)[0] == "book plant"
+
+
+def test_things_have_the_colour_that_the_image_has(outlined):
+    settings.set_display(outlined, "rgb")
+    mug, book = row_of(outlined, "mug").node, row_of(outlined, "book").node
+    assert outline.colour_of(outlined, mug) is None
+    for display in ("latent", "tree"):
+        settings.set_display(outlined, display, 2)
+        one, other = outline.colour_of(outlined, mug), outline.colour_of(outlined, book)
+        assert np.abs(np.subtract(one, other)).max() > 0.05
+    named = [outline.name_of(outlined, row) for row in outline.in_view(outlined)]
+    assert {"mug", "book", "plant"} <= {word for name in named for word in name.split()}
+
+
+def test_a_scene_without_a_field_has_none(viewer):
+    opening.open_scene(viewer, Path("plain.ply"))
+    settle(viewer)
+    assert outline.wanted(viewer) is None
+    outline.select(viewer, np.zeros(3))
+    assert "language field" in errors(viewer)[-1]
+
+
+def test_an_encoder_that_may_be_a_download_is_not_loaded_for_it(viewer, monkeypatch):
+    scene = SCENES["blobs.ply"]
+    far = replace(scene, language=replace(scene.language, encoder_id="hub/of-someone"))
+    monkeypatch.setitem(SCENES, "blobs.ply", far)
+    opening.open_scene(viewer, Path("blobs.ply"))
+    settle(viewer)
+    assert "hub/of-someone" in outline.wanted(viewer).problem
+    assert viewer.worker.current is None

@@ -1,0 +1,208 @@
+"""Projects: all that was asked, seen, noted and edited comes back; a broken file is one line."""
+
+import copy
+import json
+import zlib
+from base64 import b64encode
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from langsplat_core.errors import LangSplatError
+from langsplat_core.scene.transform import moving
+from langsplat_viewer.actions import (
+    filming,
+    opening,
+    projects,
+    queries,
+    selecting,
+    settings,
+    transforming,
+    viewpoint,
+)
+from langsplat_viewer.camera.controls import orbit
+from langsplat_viewer.files.projects import read_project
+from langsplat_viewer.rendering.depth import Clip
+from langsplat_viewer.viewer import Services, Viewer
+from tests.support.fakes import CENTRES, FakeEncoder
+from tests.support.marks_and_flights import blob, marked
+from tests.support.windowless import SCENES, FakeSurface, errors, load, settle
+
+
+@pytest.fixture
+def saved(opened, tmp_path, monkeypatch) -> Path:
+    """The file of a project with something of everything in it."""
+    monkeypatch.chdir(tmp_path)
+    Path("blobs.ply").touch()  # what is in it comes from `windowless.load`
+    for phrase in ("mug", "book", "plant", "mug or book"):
+        queries.ask(opened, phrase)
+    settle(opened)
+    queries.set_cut(opened, opened.state.queries[1], 0.6)
+    queries.hide(opened, opened.state.queries[2])
+    selecting.take(opened, blob("plant"))
+    transforming.transform(opened, moving(np.array([0.0, 1.0, 0.0])))
+    settle(opened)
+    selecting.hide_selected(opened)
+    selecting.take(opened, blob("book"))
+    looks = replace(opened.state.picture, dim=0.7, heat_scale=(0.4, 0.9), colour_map="magma")
+    settings.set_picture(opened, looks)
+    settings.set_clip(opened, Clip(0.5, 40.0))
+    viewpoint.move(opened, lambda view: orbit(view, 0.3, 0.1))
+    filming.add_keyframe(opened)
+    projects.pin_notes(opened, True)
+    projects.pin_at(opened, 0.5, 0.5)
+    projects.write_note(opened, opened.state.notes[0], 'a "note" <b>of</b> 1987')
+    opened.state.preferences = replace(opened.state.preferences, panels=("Search", "Notes"))
+    path = projects.save_project(opened, tmp_path)
+    assert path is not None
+    assert path.name == "blobs-001.langsplat"
+    return path
+
+
+@pytest.fixture
+def again(saved):
+    """Another viewer with the project open."""
+    made = Viewer(Services(load, lambda encoder_id: FakeEncoder()), surface=FakeSurface())
+    opening.open_file(made, saved)
+    settle(made)
+    yield made
+    made.worker.close()
+
+
+def test_everything_comes_back(opened, saved, again):
+    before, after = opened.state, again.state
+    assert errors(again) == []
+    asked = [(query.phrase, query.cut, query.slot is None) for query in after.queries]
+    assert asked == [(query.phrase, query.cut, query.slot is None) for query in before.queries]
+    for one, other in zip(before.queries, after.queries, strict=True):
+        np.testing.assert_array_equal(one.result.members, other.result.members)
+    assert marked(again) == marked(opened) == ("book", "plant", "")
+    np.testing.assert_allclose(after.scene.gaussians.means, before.scene.gaussians.means, atol=1e-6)
+    assert (after.picture, after.settings.clip, after.notes) == (
+        before.picture,
+        before.settings.clip,
+        before.notes,
+    )
+    np.testing.assert_allclose(after.view.eye, before.view.eye, atol=1e-9)
+    np.testing.assert_allclose(after.view.target, before.view.target, atol=1e-6)
+    assert len(after.record.keyframes) == 1
+    assert settings.take_wanted_panel(again) == ""
+    assert after.shows_panels == ("Search", "Notes")
+    assert not after.selection.is_unsaved
+    assert projects.save_project(again, Path("/nowhere")) == saved  # where it came from
+
+
+def test_other_programs_find_the_answers_in_it(opened, saved):
+    answers = {answer["phrase"]: answer for answer in json.loads(saved.read_text())["answers"]}
+    assert answers["mug"]["verdict"] == "found"
+    np.testing.assert_allclose(answers["mug"]["place"], CENTRES[0], atol=0.25)
+    assert answers["mug"]["gaussians"] == 120
+    nearest = ((opened.state.scene.gaussians.means - np.array(opened.state.notes[0].at)) ** 2).sum(1).argmin()
+    for query in opened.state.queries:
+        inside = bool(query.result.members[nearest])
+        assert bool(answers[query.phrase]["notes"]) == inside
+
+
+def test_a_scene_that_has_changed_keeps_its_questions_alone(saved, viewer, monkeypatch):
+    smaller = SCENES["blobs.ply"].take(np.arange(240))
+    monkeypatch.setitem(SCENES, "blobs.ply", smaller)
+    opening.open_project(viewer, saved)
+    settle(viewer)
+    assert len(viewer.state.queries) == 4
+    assert not viewer.state.selection.marks.selected.any()
+    assert any("has changed" in text for text in errors(viewer))
+
+
+def test_a_scene_that_is_gone(saved, opened):
+    Path("blobs.ply").unlink()
+    opening.open_dropped(opened, [saved])
+    assert "not there" in errors(opened)[-1]
+    assert opened.state.scene is not None
+
+
+def test_projects_without_a_window_are_refused(saved, run_viewer):
+    code, _, problems = run_viewer(str(saved), "--headless", "--out", "a.png")
+    assert code == 2
+    assert "project" in problems[0]
+
+
+BITS = {
+    "not base64": "&&&",
+    "not zlib": b64encode(b"abc").decode(),
+    "too few": b64encode(zlib.compress(b"abc")).decode(),
+    "a bomb": b64encode(zlib.compress(bytes(50_000_000))).decode(),
+    "a number": 7,
+}
+
+
+@pytest.mark.parametrize("bits", BITS)
+def test_marks_that_are_none(saved, bits):
+    top = json.loads(saved.read_text())
+    top["marks"]["hidden"] = BITS[bits]
+    refuse(saved, top)
+
+
+def test_whatever_is_broken_is_one_line(saved):
+    top = json.loads(saved.read_text())
+    refused: list[str] = []
+    tried = 0
+    for way in list(places(top)):
+        if way[0] in ("answers", "format"):
+            continue
+        for odd in (None, "x", -1, True, [], {}, 1e308, [[["x"]]], "\0"):
+            broken = copy.deepcopy(top)
+            inner = broken
+            for step in way[:-1]:
+                inner = inner[step]
+            inner[way[-1]] = odd
+            saved.write_text(json.dumps(broken))
+            tried += 1
+            try:
+                read_project(saved)  # some of it is a project still
+            except LangSplatError as error:
+                refused.append(str(error))
+    assert tried > len(refused) > 400
+    assert not [text for text in refused if "\n" in text]
+    refuse(saved, {"format": "other"})
+    refuse(saved, {**top, "version": 2})
+    refuse(saved, [])
+
+
+def places(value, way=()):
+    """Every place of a JSON value."""
+    if way:
+        yield way
+    entries = (
+        value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    )
+    for key, inner in entries:
+        yield from places(inner, (*way, key))
+
+
+def refuse(path: Path, top) -> None:
+    path.write_text(json.dumps(top))
+    with pytest.raises(LangSplatError) as raised:
+        read_project(path)
+    assert "\n" not in str(raised.value)
+
+
+def test_without_a_scene_there_is_nothing_to_save(viewer, tmp_path):
+    assert projects.save_project(viewer, tmp_path) is None
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_notes_are_pinned_written_and_taken_off(opened):
+    projects.pin_notes(opened, True)
+    projects.pin_at(opened, 0.95, 0.5)  # nothing is there
+    assert opened.state.notes == ()
+    assert opened.state.pins_notes
+    projects.pin_at(opened, 0.5, 0.5)
+    assert not opened.state.pins_notes
+    (note,) = opened.state.notes
+    projects.write_note(opened, note, "x" * 9000)
+    assert len(opened.state.notes[0].text) == 500
+    settings.escape(opened)
+    projects.remove_note(opened, opened.state.notes[0])
+    assert opened.state.notes == ()
