@@ -37,6 +37,7 @@ from langsplat_core.io.foreign_language import (
     read_part,
 )
 from langsplat_core.io.hostile import exists
+from langsplat_core.io.scenes import warn_of_undrawable
 from langsplat_core.scene import LEVELS, AutoencoderCodec, Scene
 
 WIDEST_LATENT = 16  # numbers per Gaussian up to which they are an autoencoder's; 1, 2, 3 and 8 were published
@@ -243,6 +244,7 @@ def _notes(numbers: list[int], featured: list[Carrier], how: str, pruned: int) -
 
 def _scene(carrier: Carrier) -> Scene:
     """The carrier's Gaussians, and the cameras that 3D Gaussian Splatting puts into the model's folder."""
+    warn_of_undrawable(carrier.path, carrier.gaussians)
     folder = carrier.path.resolve().parent
     model = folder.parent.parent if carrier.path.name == "point_cloud.ply" else folder
     cameras = [path for path in (carrier.path.with_suffix(CAMERAS), model / "cameras.json") if exists(path)]

@@ -157,15 +157,20 @@ def load_without_language(path: Path | str) -> Scene:
 def _read_scene(path: Path) -> Scene:
     """Read the scene's own file; warn where most of it cannot be drawn."""
     scene = _read_by_kind(path)
-    count = len(scene.gaussians)
-    log.debug("%s: %d Gaussians", path, count)
-    looked_at = scene.gaussians.take(np.arange(0, count, max(1, count // LOOKED_AT)))
+    log.debug("%s: %d Gaussians", path, len(scene.gaussians))
+    warn_of_undrawable(path, scene.gaussians)
+    return scene
+
+
+def warn_of_undrawable(path: Path, gaussians: Gaussians) -> None:
+    """Log a warning where most of the Gaussians that were read from `path` cannot be drawn."""
+    count = len(gaussians)
+    looked_at = gaussians.take(np.arange(0, count, max(1, count // LOOKED_AT)))
     if 2 * looked_at.valid().sum() < len(looked_at):
         reasons = looked_at.invalid_rows()
         share = sum(reasons.values()) / len(looked_at)
         told = f"{share:.0%} of the {count} Gaussians cannot be drawn ({', '.join(reasons)})"
         log.warning("%s: %s; is the file damaged?", path, told)
-    return scene
 
 
 def _read_by_kind(path: Path) -> Scene:
