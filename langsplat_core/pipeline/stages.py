@@ -8,6 +8,7 @@ import json
 import logging
 import os
 import socket
+import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence

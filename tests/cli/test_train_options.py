@@ -86,7 +86,9 @@ def test_a_file_that_cannot_be_used_is_named_with_its_key(
     assert said in line
 
 
-@pytest.mark.parametrize("option", ["--radiance.steps", "--codec.max-relevancy-error", "--dataset.test-every"])
+@pytest.mark.parametrize(
+    "option", ["--radiance.steps", "--codec.max-relevancy-error", "--dataset.test-every"]
+)
 def test_numbers_in_other_digits_are_refused(option: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main("langsplat", lambda: parse([*WORDS, option, "١"])) == 2
     (line,) = capsys.readouterr().err.splitlines()
