@@ -93,12 +93,6 @@ def check_output_file(path: Path | str) -> None:
     _try_writing(target, folder)
 
 
-def check_keeps(out: Path, *sources: Path) -> None:
-    """InputError where writing `out` would replace one of the files that are read."""
-    if any(out.resolve() == source.resolve() for source in sources):
-        raise InputError(f"{shown(out)}: would replace the original scene; choose another name")
-
-
 def check_output_folder(path: Path | str) -> None:
     """InputError, in one line, where files cannot be written into a folder `path`, which may be missing yet;
     see `check_output_file`."""

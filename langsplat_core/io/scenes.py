@@ -20,7 +20,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.io import cameras as camera_files
 from langsplat_core.io import language, ply
 from langsplat_core.io.cameras import read_cameras, write_cameras
-from langsplat_core.io.files import atomic_path, check_output_file
+from langsplat_core.io.files import atomic_path, check_output_file, shown
 from langsplat_core.io.gltf import read_gltf_scene, write_gltf
 from langsplat_core.io.hostile import exists
 from langsplat_core.io.language import read_language, write_language
@@ -192,6 +192,17 @@ def check_writable(path: Path | str) -> None:
     check_output_file(path)
     for suffix in (language.SUFFIX, camera_files.SUFFIX):
         check_output_file(companion_path(path, suffix))
+
+
+def check_keeps(out: Path, *sources: Path) -> None:
+    """InputError where a scene, or a file without companions, that is written as `out` would replace one of
+    the scenes `sources`, or what lies beside it."""
+    read = {file.resolve() for source in sources for file in (source, *scene_files(source))}
+    companions = [companion_path(out, suffix) for suffix in (language.SUFFIX, camera_files.SUFFIX)]
+    scene = any(row.write is not None and out.suffix.lower() == row.suffix for row in FORMATS)
+    for path in (out, *(companions if scene else ())):
+        if path.resolve() in read:
+            raise InputError(f"{shown(path)}: would replace the original scene; choose another name")
 
 
 def _writable(path: Path) -> SceneFormat:
