@@ -5,8 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -36,7 +35,7 @@ from langsplat_viewer.output.film import Film, write_film
 from langsplat_viewer.output.saving import save_png
 from tests.support.file_samples import random_codec, random_field
 from tests.support.marks_and_flights import flight as some_flight
-from tests.support.processes import bound_by_permissions, files_of_at_most
+from tests.support.processes import bound_by_permissions, files_of_at_most, small_disk
 from tests.support.scenes import random_camera, random_gaussians
 
 CHECKS = [check_output_file, check_output_folder]
@@ -343,16 +342,3 @@ def test_a_small_disk_that_fills_up_is_one_line(
             filler.unlink()
             shutil.rmtree(disk / "out", ignore_errors=True)
         assert main("langsplat", lambda: Writing(LARGE[name], disk / "out")) == 0
-
-
-@contextmanager
-def small_disk(folder: Path, size: int) -> Iterator[Path]:
-    """A file system in memory of so many bytes; skips where one may not be mounted."""
-    folder.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
-    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode:
-        pytest.skip("mounting a file system needs root")
-    try:
-        yield folder
-    finally:
-        subprocess.run(["umount", str(folder)], check=True, capture_output=True)
