@@ -6,9 +6,11 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from threading import Barrier
 
 import numpy as np
 import pytest
@@ -22,7 +24,7 @@ from langsplat_core.io.files import atomic_path, check_output_file, check_output
 from langsplat_core.io.langsplat_files import write_autoencoder, write_checkpoint, write_features
 from langsplat_core.io.language import write_language
 from langsplat_core.io.ply import write_ply
-from langsplat_core.io.scenes import WRITABLE, save_scene
+from langsplat_core.io.scenes import WRITABLE, load_scene, save_scene
 from langsplat_core.io.shapes import write_points
 from langsplat_core.pipeline.stages import kept, kept_array
 from langsplat_core.scene import Scene
@@ -294,6 +296,30 @@ def test_a_scene_is_kept_whole_when_its_sidecar_finds_no_room(tmp_path: Path) ->
             save_scene(tmp_path / "s.ply", other)
         assert Path(caught.value.filename).name in before
         assert contents(tmp_path) == before
+
+
+def test_two_who_write_one_scene_at_once(tmp_path: Path) -> None:
+    """Scenes of the same positions, so that no checksum would notice a sidecar of the other one."""
+    scenes = {
+        phrase: replace(SCENE, language=random_field(40, phrases=(phrase,))) for phrase in ("red", "old")
+    }
+    scenes = {
+        phrase: replace(scene, extras={f"extra_{phrase}": np.zeros(40, np.float32)})
+        for phrase, scene in scenes.items()
+    }
+    together = Barrier(2)
+
+    def write(scene: Scene) -> None:
+        together.wait()
+        save_scene(tmp_path / "s.ply", scene)
+
+    with ThreadPoolExecutor(2) as pool:
+        for _ in range(60):
+            list(pool.map(write, scenes.values()))
+            last = load_scene(tmp_path / "s.ply")
+            assert last.language is not None
+            assert [f"extra_{phrase}" for phrase in last.language.phrasebook] == list(last.extras)
+    assert len(list(tmp_path.iterdir())) == 3
 
 
 def test_other_faults_of_a_writer_stay_what_they_are(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.io import cameras as camera_files
 from langsplat_core.io import language, ply
 from langsplat_core.io.cameras import read_cameras, write_cameras
-from langsplat_core.io.files import atomic_path, check_output_file, shown
+from langsplat_core.io.files import atomic_path, check_output_file, shown, turns
 from langsplat_core.io.gltf import read_gltf_scene, write_gltf
 from langsplat_core.io.hostile import exists
 from langsplat_core.io.language import read_language, write_language
@@ -230,7 +230,11 @@ def save_scene(path: Path | str, scene: Scene) -> None:
     row = _writable(path)
     assert row.write is not None
     sidecar, cameras = companion_path(path, language.SUFFIX), companion_path(path, camera_files.SUFFIX)
-    with ExitStack() as renames:  # which it makes in the reverse order of the following lines
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with (
+        turns(path.parent) as wait,
+        ExitStack() as renames,
+    ):  # made in the reverse order of these lines
         if scene.cameras:
             write_cameras(renames.enter_context(atomic_path(cameras)), scene.cameras)
         new_sidecar = None if scene.language is None else renames.enter_context(atomic_path(sidecar))
@@ -241,6 +245,7 @@ def save_scene(path: Path | str, scene: Scene) -> None:
             rounded = "precision" in row.loses
             means = load_gaussians(new_file).means if rounded else scene.gaussians.means
             write_language(new_sidecar, scene.language, means)
+        wait()  # else the files of two who write one scene at once could end up side by side
         for companion in (sidecar, cameras):
             companion.unlink(missing_ok=True)
 
