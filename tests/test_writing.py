@@ -314,7 +314,7 @@ def test_two_who_write_one_scene_at_once(tmp_path: Path) -> None:
         save_scene(tmp_path / "s.ply", scene)
 
     with ThreadPoolExecutor(2) as pool:
-        for _ in range(60):
+        for _ in range(30):
             list(pool.map(write, scenes.values()))
             last = load_scene(tmp_path / "s.ply")
             assert last.language is not None
