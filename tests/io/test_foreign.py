@@ -312,7 +312,8 @@ def wrong(index: int, value: object) -> tuple[object, ...]:
         (7, torch.zeros(N, D, dtype=torch.int32), "features of the type int32"),
         (7, torch.zeros(1).expand(10**9, 24), "more numbers than the file has"),
         (7, torch.zeros(N, D, dtype=torch.complex64), "needs 'torch.ComplexFloatStorage'"),
-        (7, torch.full((N, D), torch.nan), "features are not finite, as those of Gaussian 0"),
+        (7, torch.full((N, D), torch.nan), "features are not finite, or huge, as those of Gaussian 0"),
+        (7, torch.full((N, D), 3e38), "features are not finite, or huge, as those of Gaussian 0"),
     ],
 )
 def test_wrong_elements(tmp_path, index, value, message):
