@@ -78,8 +78,8 @@ class ForeignScene:
         faulty = np.flatnonzero(~(np.abs(rows) <= LARGEST).all(1))
         if len(faulty):
             raise FormatError(
-                f"{self.paths[level]}: features are not finite, or huge, as those of Gaussian {indices[faulty[0]]}; "
-                "the training has diverged, take an earlier checkpoint"
+                f"{self.paths[level]}: features are not finite, or huge, as those of Gaussian "
+                f"{indices[faulty[0]]}; the training has diverged, take an earlier checkpoint"
             )
         return rows
 
