@@ -220,9 +220,14 @@ class RadianceConfig:
     densify_every: Count = 100  # steps between two of them
     densify_grad: NotNegative = 2e-4  # mean norm of the gradient by the 2D mean, in NDC
     percent_dense: Share = 0.01  # of the extent: larger Gaussians split, smaller ones are cloned
-    opacity_reset_every: Count = 3_000  # steps between two resets of all opacities to at most 0.01
+    opacity_reset_every: CountOrZero = 3_000  # steps between two resets of opacities to at most 0.01; 0: none
     prune_opacity: Share = 5e-3  # fainter Gaussians are removed
     coarse_fraction: Share = 1 / 3  # of the steps, at the start, on images of half the size; INRIA: 0
+    # up to so many training views: Gaussians begin at depths by stereo and leave the space before surfaces,
+    # opacities decay and are not reset; 0 (as published): never
+    few_views: CountOrZero = 50
+    # each photograph has an exposure and white balance of its own; auto: where that explains enough
+    exposure: Literal["auto", "on", "off"] = "auto"
     checkpoint_every: Count = 2_000  # steps of this run
     seed: Seed = 0  # of random numbers
 
@@ -345,7 +350,7 @@ class TrainConfig:
 # photograph, an autoencoder of 3 numbers, features trained through the rasterizer from zeros.
 PAPER = TrainConfig(
     dataset=DatasetConfig(hold_out="every"),
-    radiance=RadianceConfig(coarse_fraction=0.0),
+    radiance=RadianceConfig(coarse_fraction=0.0, few_views=0, exposure="off"),
     masks=MaskConfig(source="sam", sam="facebook/sam-vit-huge", crop_layers=1),
     codec=AutoencoderConfig(steps=10_000, batch=64, lr=7e-4),
     lift=LiftConfig(mode="gradient", start="zeros-as-published"),

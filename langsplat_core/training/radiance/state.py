@@ -114,6 +114,7 @@ class TrainingState:
     grad_sum: Tensor  # (N,) norms of the gradients by the projected means, NDC, summed over `seen` views
     seen: Tensor  # (N,) float32: in how many steps since the last round the Gaussian was visible
     rng: np.random.Generator
+    exposures: Tensor  # (V, 4, 3) affine changes of colours, of the training views
     step: int = 0  # steps done
     queue: list[int] = field(default_factory=list)  # views still to come in this pass over the photographs
     non_finite: int = 0  # gradient entries that were not finite and were taken as zero
@@ -152,7 +153,13 @@ def start(gaussians: Gaussians, seed: int, device: torch.device) -> TrainingStat
         grad_sum=torch.zeros(count, device=device),
         seen=torch.zeros(count, device=device),
         rng=np.random.default_rng(seed),
+        exposures=no_exposures(0, device),
     )
+
+
+def no_exposures(views: int, device: torch.device) -> Tensor:
+    """(views, 4, 3) affine changes of colours, (r, g, b, 1) @ change, that change nothing."""
+    return torch.eye(4, 3, device=device).repeat(views, 1, 1)
 
 
 def rearrange(state: TrainingState, keep: Tensor, added: dict[str, Tensor] | None = None) -> None:
@@ -168,6 +175,12 @@ def rearrange(state: TrainingState, keep: Tensor, added: dict[str, Tensor] | Non
             moments[name] = torch.cat([moments[name][keep], torch.zeros_like(new)])
     state.grad_sum = torch.zeros(len(state), device=state.device)
     state.seen = torch.zeros(len(state), device=state.device)
+
+
+def remove(state: TrainingState, rows: Array) -> None:
+    """Remove the Gaussians where the (N,) bool `rows` are True, unless hardly any would be left."""
+    if len(state) - np.count_nonzero(rows) >= FEWEST_GAUSSIANS:
+        rearrange(state, torch.from_numpy(np.flatnonzero(~rows)).to(state.device))
 
 
 def clean_gradients(state: TrainingState) -> None:
@@ -219,10 +232,11 @@ def adam_step(state: TrainingState, learning_rates: dict[str, float]) -> None:
 
 # Checkpoints of radiance training: one safetensors file, written atomically, resumed exactly.
 #
-# Tensors: ``values.*``, ``first.*``, ``second.*`` for every parameter, ``grad_sum`` and ``seen``; everything
-# else is JSON in the header. No pickle is involved, so a checkpoint from elsewhere cannot run code.
+# Tensors: ``values.*``, ``first.*``, ``second.*`` for every parameter, ``grad_sum``, ``seen`` and
+# ``exposures``; everything else is JSON in the header. No pickle is involved, so a checkpoint from elsewhere
+# cannot run code.
 
-KIND = "langsplat-radiance-checkpoint-1"
+KIND = "langsplat-radiance-checkpoint-2"
 
 
 def fingerprint(capture: Capture, config: RadianceConfig, train_indices: Sequence[int]) -> str:
@@ -240,7 +254,7 @@ def fingerprint(capture: Capture, config: RadianceConfig, train_indices: Sequenc
 
 def save_checkpoint(path: Path, state: TrainingState, made_from: str) -> None:
     """Write `state`; `made_from` is the run's `fingerprint`."""
-    tensors = {"grad_sum": state.grad_sum, "seen": state.seen}
+    tensors = {"grad_sum": state.grad_sum, "seen": state.seen, "exposures": state.exposures}
     for name in PARAMETERS:
         tensors[f"values.{name}"] = state.values[name].detach()
         tensors[f"first.{name}"] = state.first[name]
@@ -296,6 +310,7 @@ def _rebuild(tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> Traini
         grad_sum=tensors["grad_sum"],
         seen=tensors["seen"],
         rng=rng,
+        exposures=tensors["exposures"],
         step=int(header["step"]),
         queue=[int(index) for index in header["queue"]],
         non_finite=int(header["non_finite"]),

@@ -23,7 +23,15 @@ from langsplat_core.raster.reference import ReferenceRasterizer, colours
 from langsplat_core.scene import Camera, Gaussians, look_at
 from langsplat_core.scene.transform import C0
 from langsplat_core.training.radiance.differentiable import CpuRenderer, renderer_for
-from langsplat_core.training.radiance.losses import blur, radiance_loss, raw_moments, ssim, ssim_terms
+from langsplat_core.training.radiance.losses import (
+    blur,
+    fit_exposure,
+    radiance_loss,
+    raw_moments,
+    ssim,
+    ssim_terms,
+    with_exposure,
+)
 from langsplat_core.training.radiance.state import (
     PARAMETERS,
     TrainingState,
@@ -39,7 +47,13 @@ from langsplat_core.training.radiance.state import (
     save_checkpoint,
     start,
 )
-from langsplat_core.training.radiance.train import evaluate_views, schedule_for, train_radiance
+from langsplat_core.training.radiance.stereo import STAGE
+from langsplat_core.training.radiance.train import (
+    evaluate_views,
+    for_few_views,
+    schedule_for,
+    train_radiance,
+)
 from tests.support.processes import stop_at
 
 
@@ -447,7 +461,12 @@ def capture() -> Capture:
 
 def steps_into(steps: list[int]) -> Progress:
     """Progress of `SHORT` that notes the number of every step."""
-    return Progress(lambda at: steps.append(round(at.fraction * SHORT.steps)))
+
+    def note(at: Report) -> None:
+        if at.stage != STAGE:
+            steps.append(round(at.fraction * SHORT.steps))
+
+    return Progress(note)
 
 
 def as_arrays(gaussians: Gaussians) -> list[Array]:
@@ -520,7 +539,7 @@ def reported(times: int, monkeypatch: pytest.MonkeyPatch) -> list[Mapping[str, f
     reports: list[Report] = []
     config = replace(SHORT, steps=6, reference_steps=6)
     train_radiance(capture(), config, [0, 1], progress=Progress(reports.append))
-    return [report.metrics for report in reports]
+    return [report.metrics for report in reports if report.stage != STAGE]
 
 
 @pytest.mark.long
@@ -559,7 +578,7 @@ def test_ctrl_c_ends_between_two_steps_with_a_checkpoint(tmp_path: Path) -> None
 
     def interrupt(at: Report) -> None:
         steps_into(seen).show(at)
-        if seen[-1] == 7:
+        if seen and seen[-1] == 7:
             os.kill(os.getpid(), signal.SIGINT)
 
     handler = signal.getsignal(signal.SIGINT)
@@ -623,3 +642,63 @@ def test_too_few_points_are_topped_up_inside_the_view_volume(known: int) -> None
     assert (seen >= 1).all()
     assert (seen >= 3).mean() > 0.5
     assert np.linalg.norm(np.median(new, axis=0)) < 1.5  # the cameras look at the origin from 4 away
+
+
+# Exposures of photographs.
+
+
+def test_an_exposure_is_found_and_held_at_none_by_a_ridge() -> None:
+    rng = np.random.default_rng(4)
+    image = torch.tensor(rng.random((30, 40, 3)), dtype=torch.float32)
+    change = torch.tensor([[1.2, 0.0, 0.1], [0.0, 0.8, 0.0], [0.0, 0.1, 1.0], [0.05, -0.02, 0.0]])
+    target = with_exposure(image, change)
+    found = fit_exposure([(image[:10], target[:10]), (image[10:], target[10:])], ridge=0.0)
+    torch.testing.assert_close(found, change, rtol=1e-4, atol=1e-5)
+    x = np.pad(image.reshape(-1, 3).numpy().astype(np.float64), ((0, 0), (0, 1)), constant_values=1.0)
+    y, none = target.reshape(-1, 3).numpy().astype(np.float64), np.eye(4, 3)
+    hold = 0.5 * (x[:, :3] ** 2).mean() * np.eye(4)
+    held = none + np.linalg.solve(x.T @ x / len(x) + hold, x.T @ (y - x @ none) / len(x))
+    np.testing.assert_allclose(fit_exposure([(image, target)], ridge=0.5), held, atol=1e-5)
+    nothing = torch.zeros((0, 3))
+    torch.testing.assert_close(fit_exposure([(nothing, nothing)]), torch.eye(4, 3))
+
+
+@pytest.mark.long
+def test_photographs_of_other_exposures_teach_the_colours_between_them() -> None:
+    """Every other photograph is brighter by a third, the others darker: the scene's colours are neither's."""
+    gains = [1.3, 0.7, 1.3, 0.7, 1.0, 1.0]  # a half is taken of all, so that nothing is clipped
+    images = [
+        (0.5 * gain * image.astype(np.float64)).clip(0, 255).astype(np.uint8)
+        for image, gain in zip(capture().images, gains, strict=True)
+    ]
+    uneven = replace(capture(), images=tuple(images))
+    even = replace(capture(), images=tuple((0.5 * image).astype(np.uint8) for image in capture().images))
+    config = RadianceConfig(steps=200, backend="cpu", sh_degree=1, max_gaussians=2_000)
+    scores = {}
+    for exposure in ("off", "auto", "on"):
+        trained = train_radiance(uneven, replace(config, exposure=exposure), [0, 1, 2, 3])  # type: ignore[arg-type]
+        scores[exposure] = evaluate_views(trained, even, [0, 1, 2, 3], "cpu")
+    means = {exposure: np.mean([score.psnr for score in found]) for exposure, found in scores.items()}
+    assert means["on"] > means["off"] + 2
+    assert means["auto"] == means["on"]
+    same = {
+        exposure: train_radiance(even, replace(config, exposure=exposure), [0, 1, 2, 3])  # type: ignore[arg-type]
+        for exposure in ("off", "auto")
+    }
+    np.testing.assert_array_equal(same["off"].sh, same["auto"].sh)  # nothing to explain
+
+
+@pytest.mark.long
+def test_few_views_have_no_resets_and_many_have() -> None:
+    few, many = for_few_views(SHORT), SHORT
+    assert schedule_for(many, 1.0).resets_opacity(25)
+    schedule = schedule_for(few, 1.0)
+    assert not any(schedule.resets_opacity(step) or schedule.prunes_large(step) for step in range(1, 41))
+    assert few.opacity_decay > 0
+    stages: list[str] = []
+    told = Progress(lambda at: stages.append(at.stage))
+    train_radiance(capture(), replace(SHORT, steps=2), [0, 1, 2], progress=told)
+    assert STAGE in stages
+    stages.clear()
+    train_radiance(capture(), replace(SHORT, steps=2, few_views=2), [0, 1, 2], progress=told)
+    assert STAGE not in stages

@@ -1,0 +1,285 @@
+"""Depths by plane sweeping (Collins 1996) between photographs with known cameras.
+
+Structure from motion finds some hundred points in nine photographs. What lies between them is then learnt by
+heart: each photograph gets Gaussians of its own, anywhere along its rays. Depths are the remedy: Gaussians
+begin at the surfaces, and none stay before one.
+
+A view is compared with each neighbour as that would look if the scene were a plane parallel to the view. Of
+all planes, uniform in inverse depth, a pixel takes the one at which windows correlate best. A depth is kept
+where another view's agrees.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from PIL import Image
+
+from langsplat_core.arrays import Array
+from langsplat_core.compiled import helper, kernel, shared_workers
+from langsplat_core.datasets.capture import Capture
+from langsplat_core.datasets.known_poses import TELLING_POINTS, inside, look_distance
+from langsplat_core.progress import Progress, silent
+from langsplat_core.scene import Camera
+
+STAGE = "finding depths"
+LONGER_SIDE = 320  # px at most, of the images that are compared
+PLANES = 96
+RADIUS = 3  # px, of the windows that are compared
+NEIGHBOURS = 4  # views that each is compared with ...
+BEST = 2  # ... of which so many count: others may see something before it
+ANGLES = (2.0, 35.0)  # degrees between two views' rays to what they see
+ANGLE = 12.0  # degrees, the best: wider ones tell depth better and look less alike
+MARGIN = (0.75, 1.5)  # of the nearest and farthest depth of known points: where planes begin and end
+FLAT = np.float32(1e-5)  # added to variances, grey values in [0, 1]: what is flat correlates with nothing
+LEAST_SCORE = 0.6  # of a pixel whose depth is kept ...
+LEAST_CONFIRMING = 0.5  # ... and of the one in another view that confirms it
+AGREEMENT = 0.015  # of the depth, by which two views' may differ
+BEFORE = 0.05  # of the depth, from which on something lies before a surface ...
+AT = 0.025  # ... and up to which it belongs to it
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """Depths of a view's pixels."""
+
+    camera: Camera
+    depth: Array  # (H, W) world units along the camera's z axis; NaN where none is known
+    score: Array  # (H, W) mean of the best `BEST` correlations, at most 1
+    colours: Array  # (H, W, 3) uint8
+
+    def points(self) -> tuple[Array, Array]:
+        """(N, 3) points of the pixels whose depth is known, and their (N, 3) colours."""
+        rows, columns = np.nonzero(np.isfinite(self.depth))
+        camera, z = self.camera, self.depth[rows, columns]
+        x, y = (columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy
+        points = np.stack([x * z, y * z, z], -1) @ camera.rotation + camera.position
+        return points, self.colours[rows, columns]
+
+    def compare(self, points: Array) -> tuple[Array, Array, Array]:
+        """Which of the (N, 3) points lie at pixels of the image, as (M,) indices, their depth over that of
+        the surface there, NaN where it is not known, and its score."""
+        pixels, depths = self.camera.project(points)
+        there = np.flatnonzero(inside(self.camera, points))
+        columns, rows = pixels[there].astype(int).T
+        return there, depths[there] / self.depth[rows, columns], self.score[rows, columns]
+
+
+def find_depths(capture: Capture, indices: Sequence[int], progress: Progress = silent) -> list[DepthMap]:
+    """Depths of the photographs at `indices` that another one confirms; photographs without neighbours have
+    no map. Masked pixels have no depth."""
+    views = [_shrunk(capture, index) for index in indices]
+    cameras = [camera for camera, _, _ in views]
+    greys = [np.ascontiguousarray(image.mean(2, dtype=np.float32) / 255) for _, image, _ in views]
+    maps: list[DepthMap] = []
+    for index, others in enumerate(neighbouring_views(cameras, capture.points)):
+        if others:
+            depth, score = sweep(index, others, cameras, greys, capture.points)
+            _, image, mask = views[index]
+            maps.append(DepthMap(cameras[index], np.where(mask, depth, np.nan), score, image))
+        progress(STAGE, (index + 1) / len(cameras))
+    return [_confirmed(one, [other for other in maps if other is not one]) for one in maps]
+
+
+def in_free_space(points: Array, maps: Sequence[DepthMap]) -> Array:
+    """(N,) True for points that lie before the surfaces of more views than at them."""
+    balance = np.zeros(len(points), int)
+    for one in maps:
+        there, depths, _ = one.compare(points)
+        balance[there] += depths < 1 - BEFORE
+        balance[there] -= np.abs(depths - 1) < AT
+    return balance > 0
+
+
+def _shrunk(capture: Capture, index: int) -> tuple[Camera, Array, Array]:
+    """Camera, image, and mask of the pixels that count, at most `LONGER_SIDE` long."""
+    camera, image, mask = capture.cameras[index], capture.images[index], capture.mask(index)
+    mask = np.ones(image.shape[:2], bool) if mask is None else mask
+    share = LONGER_SIDE / max(camera.width, camera.height)
+    if share >= 1:
+        return camera, np.asarray(image), mask
+    size = max(round(camera.width * share), 1), max(round(camera.height * share), 1)
+    small = np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BOX))
+    return camera.resized(*size), small, np.asarray(Image.fromarray(mask).resize(size))
+
+
+def neighbouring_views(cameras: Sequence[Camera], known: Array) -> list[list[int]]:
+    """For each view the views that it is best compared with, at most `NEIGHBOURS`: those that see the middle
+    of what it sees from about `ANGLE` aside."""
+    distance = look_distance(cameras)
+    found = []
+    for index, camera in enumerate(cameras):
+        seen = known[inside(camera, known)] if len(known) else known
+        ahead = camera.position + distance * camera.rotation[2]
+        middle = np.median(seen, axis=0) if len(seen) >= TELLING_POINTS else ahead
+        ray = _direction(camera, middle)
+        angles = {
+            other: float(np.degrees(np.arccos(np.clip(ray @ _direction(at, middle), -1, 1))))
+            for other, at in enumerate(cameras)
+            if other != index and inside(at, middle[None])[0]
+        }
+        usable = [other for other, angle in angles.items() if ANGLES[0] < angle < ANGLES[1]]
+        found.append(sorted(usable, key=lambda other: abs(angles[other] - ANGLE))[:NEIGHBOURS])
+    return found
+
+
+def _direction(camera: Camera, point: Array) -> Array:
+    ray = point - camera.position
+    return ray / max(float(np.linalg.norm(ray)), 1e-12)
+
+
+def inverse_depths(camera: Camera, cameras: Sequence[Camera], known: Array) -> Array:
+    """(PLANES,) ascending inverse depths at which a view looks for surfaces."""
+    depths = camera.project(known)[1][inside(camera, known)] if len(known) else np.zeros(0)
+    if len(depths) >= TELLING_POINTS // 2:
+        near, far = np.quantile(depths, (0.02, 0.98)) * MARGIN
+    else:
+        near, far = look_distance(cameras) * np.array((0.3, 3.0))
+    return np.linspace(1 / far, 1 / near, PLANES)
+
+
+def warp(camera: Camera, other: Camera) -> tuple[Array, Array]:
+    """(3, 3) `turn` and (3,) `shift` by which a pixel (x, y) at depth 1/w lies in the `other` view at
+    (p[0] / p[2], p[1] / p[2]), p = turn @ (x, y, 1) + w shift."""
+    rotation = other.rotation @ camera.rotation.T
+    matrix = np.array([[other.fx, 0, other.cx], [0, other.fy, other.cy], [0, 0, 1]])
+    back = np.array(
+        [[1 / camera.fx, 0, -camera.cx / camera.fx], [0, 1 / camera.fy, -camera.cy / camera.fy], [0, 0, 1]]
+    )
+    return matrix @ rotation @ back, matrix @ (other.rotation @ (camera.position - other.position))
+
+
+def sweep(
+    index: int, others: Sequence[int], cameras: Sequence[Camera], greys: Sequence[Array], known: Array
+) -> tuple[Array, Array]:
+    """(H, W) depths of view `index` by its neighbours `others`, and their scores; greys: (H, W) float32 in
+    [0, 1]."""
+    camera, grey = cameras[index], greys[index]
+    planes = inverse_depths(camera, cameras, known)
+    best = np.full((BEST, PLANES, *grey.shape), -1, np.float32)
+    for other in others:
+        turn, shift = warp(camera, cameras[other])
+        shared_workers().run(_score, PLANES, grey, greys[other], turn, shift, planes, best)
+    at, score = np.empty(grey.shape, np.float32), np.empty(grey.shape, np.float32)
+    shared_workers().run(_choose, len(grey), best, min(BEST, len(others)), at, score)
+    return 1 / (planes[0] + at.astype(np.float64) * (planes[1] - planes[0])), score
+
+
+@kernel
+def _score(
+    first: int, last: int, grey: Array, other: Array, turn: Array, shift: Array, planes: Array, best: Array
+) -> None:
+    """Correlate windows of `grey` with those of `other` at planes [first, last); `best` (BEST, P, H, W) has
+    the highest scores of all neighbours so far, in descending order."""
+    height, width = grey.shape
+    seen = np.empty((height, width), np.float32)
+    moments = np.empty((5, height, width), np.float32)  # horizontal sums of x, y, x^2, y^2, x y
+    sums = np.empty((5, width), np.float32)
+    for plane in range(first, last):
+        _look(other, turn, shift, planes[plane], seen)
+        for row in range(height):
+            _sum_along(grey[row], seen[row], moments, row)
+        for row in range(height):
+            count = _sum_across(moments, row, sums)
+            for x in range(width):
+                across = min(x + RADIUS + 1, width) - max(x - RADIUS, 0)
+                score = _correlation(sums, x, np.float32(1) / np.float32(count * across))
+                _rank(best[:, plane, row, x], score if seen[row, x] >= 0 else np.float32(-1))
+
+
+@helper
+def _sum_across(moments: Array, row: int, sums: Array) -> int:
+    """Sums over the rows of windows around `row`, and how many rows these are."""
+    first, last = max(row - RADIUS, 0), min(row + RADIUS + 1, moments.shape[1])
+    sums[:] = 0
+    for r in range(first, last):
+        for m in range(moments.shape[0]):
+            for x in range(sums.shape[1]):
+                sums[m, x] += moments[m, r, x]
+    return last - first
+
+
+@helper
+def _rank(best: Array, score: float) -> None:
+    """Put a score into its place among the highest."""
+    for k in range(best.shape[0]):
+        if score > best[k]:
+            score, best[k] = best[k], score
+
+
+@helper
+def _look(other: Array, turn: Array, shift: Array, inverse_depth: float, seen: Array) -> None:
+    """`seen`: the other image through the plane, bilinear; -1 outside of it."""
+    height, width = other.shape
+    for row in range(seen.shape[0]):
+        for column in range(seen.shape[1]):
+            x, y = column + 0.5, row + 0.5
+            z = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] + inverse_depth * shift[2]
+            u = (turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] + inverse_depth * shift[0]) / z - 0.5
+            v = (turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] + inverse_depth * shift[1]) / z - 0.5
+            if z > 0 and 0 <= u < width - 1 and 0 <= v < height - 1:
+                i, j = int(u), int(v)
+                a, b = np.float32(u - i), np.float32(v - j)
+                above = other[j, i] + a * (other[j, i + 1] - other[j, i])
+                below = other[j + 1, i] + a * (other[j + 1, i + 1] - other[j + 1, i])
+                seen[row, column] = above + b * (below - above)
+            else:
+                seen[row, column] = -1
+
+
+@helper
+def _sum_along(grey: Array, seen: Array, moments: Array, row: int) -> None:
+    """Sums over a row's windows; beside the image there is nothing."""
+    width = grey.shape[0]
+    for m in range(5):
+        moments[m, row] = 0
+    for offset in range(-RADIUS, RADIUS + 1):
+        for x in range(max(-offset, 0), min(width - offset, width)):
+            a, b = grey[x + offset], seen[x + offset]
+            moments[0, row, x] += a
+            moments[1, row, x] += b
+            moments[2, row, x] += a * a
+            moments[3, row, x] += b * b
+            moments[4, row, x] += a * b
+
+
+@helper
+def _correlation(sums: Array, x: int, share: float) -> float:
+    """Zero-mean normalised cross-correlation of a window."""
+    mean_a, mean_b = sums[0, x] * share, sums[1, x] * share
+    spread_a = max(sums[2, x] * share - mean_a * mean_a, np.float32(0)) + FLAT
+    spread_b = max(sums[3, x] * share - mean_b * mean_b, np.float32(0)) + FLAT
+    return (sums[4, x] * share - mean_a * mean_b) / np.sqrt(spread_a * spread_b)
+
+
+@kernel
+def _choose(first: int, last: int, best: Array, count: int, at: Array, score: Array) -> None:
+    """The plane of every pixel of rows [first, last), between planes by a parabola, and its score."""
+    planes, width = best.shape[1], best.shape[3]
+    mean = np.empty(planes, np.float32)
+    for row in range(first, last):
+        for x in range(width):
+            for plane in range(planes):
+                total = np.float32(0)
+                for k in range(count):
+                    total += best[k, plane, row, x]
+                mean[plane] = total / np.float32(count)
+            top = int(np.argmax(mean))
+            inner = min(max(top, 1), planes - 2)
+            bend = mean[inner - 1] - 2 * mean[inner] + mean[inner + 1]
+            offset = 0.5 * (mean[inner - 1] - mean[inner + 1]) / bend if bend < 0 else 0.0
+            at[row, x] = inner + min(max(offset, -0.5), 0.5) if inner == top else top
+            score[row, x] = mean[top]
+
+
+def _confirmed(one: DepthMap, others: Sequence[DepthMap]) -> DepthMap:
+    """The map without depths that no other map confirms."""
+    good = replace(one, depth=np.where(one.score > LEAST_SCORE, one.depth, np.nan))
+    points, _ = good.points()
+    kept = np.zeros(len(points), bool)
+    for other in others:
+        there, depths, scores = other.compare(points)
+        kept[there] |= (np.abs(depths - 1) < AGREEMENT) & (scores > LEAST_CONFIRMING)
+    depth = good.depth.copy()
+    depth[np.isfinite(depth)] = np.where(kept, depth[np.isfinite(depth)], np.nan)
+    return replace(good, depth=depth)
