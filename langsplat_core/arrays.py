@@ -91,6 +91,7 @@ class ViewScore:
     psnr: float  # dB
     ssim: float
     covered: float  # share of its pixels that the Gaussians cover by half and more
+    psnr_exposed: float | None = None  # dB, with the exposure of each half fitted on the other
 
 
 def rotation_matrices(quats_wxyz: Array) -> Array:

@@ -338,8 +338,29 @@ def evaluate_views(
             decibels = psnr(image[counted].cpu().numpy(), target[counted].cpu().numpy())
             share = 1.0 if mask is None else float(mask.float().mean())
             similarity = 1 - (1 - float(ssim(image, target))) / max(share, 1e-9)
-            scores.append(ViewScore(camera.name, decibels, similarity, float(covered.float().mean())))
+            exposed = _psnr_exposed(image, target, mask)
+            scores.append(
+                ViewScore(camera.name, decibels, similarity, float(covered.float().mean()), exposed)
+            )
     return scores
+
+
+def _psnr_exposed(image: Tensor, target: Tensor, mask: Tensor | None) -> float | None:
+    """PSNR of an image whose halves, left and right, each have the exposure that fits the other best; None
+    where a half has no pixel that counts."""
+    counted = image.new_ones(image.shape[:2], dtype=torch.bool) if mask is None else mask
+    left = torch.zeros_like(counted)
+    left[:, : image.shape[1] // 2] = True
+    halves = counted & left, counted & ~left
+    if not all(bool(half.any()) for half in halves):
+        return None
+    drawn = torch.cat(
+        [
+            with_exposure(image[one], fit_exposure([(image[other], target[other])])).clamp(0, 1)
+            for one, other in (halves, halves[::-1])
+        ]
+    )
+    return psnr(drawn.cpu().numpy(), torch.cat([target[half] for half in halves]).cpu().numpy())
 
 
 def _extent(capture: Capture, gaussians: Gaussians) -> float:

@@ -680,6 +680,8 @@ def test_photographs_of_other_exposures_teach_the_colours_between_them() -> None
         scores[exposure] = evaluate_views(trained, even, [0, 1, 2, 3], "cpu")
     means = {exposure: np.mean([score.psnr for score in found]) for exposure, found in scores.items()}
     assert means["on"] > means["off"] + 2
+    apart = evaluate_views(trained, uneven, [0, 1, 2], "cpu")  # in its own exposure each is further away
+    assert all(score.psnr_exposed is not None and score.psnr_exposed > score.psnr + 2 for score in apart)
     assert means["auto"] == means["on"]
     same = {
         exposure: train_radiance(even, replace(config, exposure=exposure), [0, 1, 2, 3])  # type: ignore[arg-type]
