@@ -13,6 +13,7 @@ from scipy import sparse
 from langsplat_core.arrays import Array, logit
 from langsplat_core.config import GSPLAT, INRIA
 from langsplat_core.raster import reference
+from langsplat_core.raster.cpu.memory import Memory
 from langsplat_core.raster.cpu.projection import colours, colours_backward
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.cpu.tiles import depth_order
@@ -145,11 +146,14 @@ def test_depth_order_is_a_stable_sort():
         rng.lognormal(0, 9, 500),
         np.full(3, 2.0),
         np.ones(0),
+        np.append(1 + 1e-14 * rng.random(5000), 1e300),  # a plane, nearly, and a floater
     ):
         status = rng.integers(0, 3, len(depths)).astype(np.uint8)
         drawn = np.flatnonzero(status == 2)
         want = drawn[np.argsort(depths[drawn], kind="stable")]
-        assert np.array_equal(depth_order(status, depths.view(np.uint64)), want)
+        order, sorted_depths = depth_order(status, depths, Memory())
+        assert np.array_equal(order, want)
+        assert np.array_equal(sorted_depths, depths[want])
 
 
 @pytest.mark.parametrize("degree", range(4))

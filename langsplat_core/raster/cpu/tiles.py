@@ -1,6 +1,7 @@
 """Tiles of 16x16 pixels and the Gaussians that touch each, front to back: binning for the CPU backend."""
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,12 +30,14 @@ from langsplat_core.raster.cpu.lanes import (
     where_at_least,
     where_greater,
 )
+from langsplat_core.raster.cpu.memory import Memory
 
 TILE = 16
-_BLOCKS = 16  # pieces of the depth order that are binned side by side; the result does not depend on it
 _SLACK = 1e-3  # px by which footprints are widened here; the blending kernels test alpha itself
 _MOST = 2**31 - 1  # intersections of Gaussians and tiles in one view
-_DIGIT = 11  # bits per pass of the radix sort
+_DIGIT, _PASSES = 11, 3  # bits per pass of the radix sort, of 32
+_FEW = 32  # tiles, too few to count more closely
+_PIECES = 16  # of the depth order that are binned side by side; the result does not depend on it
 
 
 # Of a footprint: centre, half width, abscissa of its lowest point, slope and bulge of `_rows_in_column`; px.
@@ -47,6 +50,7 @@ class Grid(NamedTuple):
     width: float  # px; a float, as it is compared with floats
     height: float
     columns: int  # tiles per row of tiles
+    lines: int  # rows of tiles
 
 
 class Tiles(NamedTuple):
@@ -72,44 +76,74 @@ def unpack_span(packed: int) -> tuple[int, int]:
     return packed & 255, packed >> 8
 
 
-@kernel
-def depth_order(status: Array, depth_bits: Array) -> Array:
-    """(N,) status and depths reinterpreted as uint64 -> (M,) int32 drawn rows, by depth, ties by index.
+class Sorting(NamedTuple):
+    """Memory for what is sorted."""
 
-    Positive floats order as their bits do. Least significant digit first, each pass stable.
+    keys: Array  # (2, M) uint32
+    order: Array  # (2, M) int32 rows; the second one is the result
+    depth_bits: Array  # (M,) uint64
+
+
+@kernel
+def _depth_order(status: Array, depth_bits: Array, out: Sorting) -> bool:
+    """(N,) status and depths reinterpreted as uint64 -> fills `out`, of the length of what is drawn, by depth,
+    ties by index. False where it gave up, as very many depths are nearly equal.
+
+    Positive floats order as their bits do. Sorted by their 32 leading bits that differ (radix, least
+    significant digit first, each pass stable); then neighbours that are still in the wrong order change
+    places.
     """
-    count = 0
+    count = out.depth_bits.shape[0]
     low, high = np.uint64(2**64 - 1), np.uint64(0)
     for i in range(status.shape[0]):
         if status[i] == cp.DRAWN:
-            count += 1
             low, high = min(low, depth_bits[i]), max(high, depth_bits[i])
-    keys, order = np.empty(count, np.uint64), np.empty(count, np.int32)
-    count = 0
+    shift = np.uint64(0)
+    while count > 1 and (high - low) >> shift >= np.uint64(1 << 32):
+        shift += np.uint64(1)
+    mask = np.uint32((1 << _DIGIT) - 1)
+    ends = np.zeros((_PASSES, 1 << _DIGIT), np.int64)
+    n = 0
     for i in range(status.shape[0]):
         if status[i] == cp.DRAWN:
-            keys[count], order[count] = depth_bits[i] - low, i
-            count += 1
-    other_keys, other_order = np.empty_like(keys), np.empty_like(order)
-    shift = np.uint64(0)
-    while count > 1 and (high - low) >> shift > 0:
-        ends = np.zeros(1 << _DIGIT, np.int64)
-        for i in range(count):
-            ends[(keys[i] >> shift) & np.uint64((1 << _DIGIT) - 1)] += 1
+            key = np.uint32((depth_bits[i] - low) >> shift)
+            out.keys[0, n], out.order[0, n] = key, i
+            for digit in range(_PASSES):
+                ends[digit, (key >> np.uint32(_DIGIT * digit)) & mask] += 1
+            n += 1
+    for digit in range(_PASSES):
+        here = digit % 2
         total = 0
-        for digit in range(1 << _DIGIT):
-            total, ends[digit] = total + ends[digit], total
+        for value in range(1 << _DIGIT):
+            total, ends[digit, value] = total + ends[digit, value], total
         for i in range(count):
-            digit = (keys[i] >> shift) & np.uint64((1 << _DIGIT) - 1)
-            place = ends[digit]
-            ends[digit] = place + 1
-            other_keys[place], other_order[place] = keys[i], order[i]
-        keys, other_keys = other_keys, keys
-        order, other_order = other_order, order
-        shift += np.uint64(_DIGIT)
-        if shift >= np.uint64(64):
-            break
-    return order
+            key = out.keys[here, i]
+            value = (key >> np.uint32(_DIGIT * digit)) & mask
+            place = ends[digit, value]
+            ends[digit, value] = place + 1
+            out.keys[1 - here, place], out.order[1 - here, place] = key, out.order[here, i]
+    order, sorted_bits = out.order[_PASSES % 2], out.depth_bits
+    moves = 0
+    for i in range(count):
+        row, bits, place = order[i], depth_bits[order[i]], i
+        while place > 0 and sorted_bits[place - 1] > bits and moves <= 4 * count:
+            order[place], sorted_bits[place] = order[place - 1], sorted_bits[place - 1]
+            place -= 1
+            moves += 1
+        order[place], sorted_bits[place] = row, bits
+    return moves <= 4 * count
+
+
+def depth_order(status: Array, depths: Array, memory: Memory) -> tuple[Array, Array]:
+    """(N,) status and positive depths -> (M,) int32 drawn rows, by depth, ties by index, and their depths."""
+    count = int(np.count_nonzero(status == cp.DRAWN))
+    keys, orders = memory.empty((2, count), np.uint32), memory.empty((2, count), np.int32)
+    bits = memory.empty((count,), np.uint64)
+    if _depth_order(status, depths.view(np.uint64), Sorting(keys, orders, bits)):
+        return orders[_PASSES % 2], bits.view(np.float64)
+    drawn = np.flatnonzero(status == cp.DRAWN)
+    order = drawn[np.argsort(depths[drawn], kind="stable")].astype(np.int32)
+    return order, depths[order]
 
 
 @helper
@@ -150,81 +184,105 @@ def _columns_touched(g: Array, grid: Grid) -> tuple[int, int]:
     return first // TILE, (last + TILE - 1) // TILE if last > first else first // TILE
 
 
-@kernel
-def _count(first: int, last: int, geometry: Array, grid: Grid, counts: Array, firsts: Array) -> None:
-    """For blocks [first, last): counts[block, tile] and firsts[rank + 1] <- how many intersections."""
-    share = (geometry.shape[0] + _BLOCKS - 1) // _BLOCKS
-    for block in range(first, last):
-        for rank in range(block * share, min(geometry.shape[0], (block + 1) * share)):
-            g = geometry[rank]
-            left, right = _columns_touched(g, grid)
-            ellipse = _ellipse(g)
-            touched = 0
-            for column in range(left, right):
-                low, high = _rows_in_column(ellipse, column, grid.height)
-                if low < high:
-                    for row in range(low // TILE, (high - 1) // TILE + 1):
-                        counts[block, row * grid.columns + column] += 1
-                        touched += 1
-            firsts[rank + 1] = touched
+@helper
+def _at_most(g: Array, grid: Grid) -> int:
+    """No fewer tiles than a footprint touches: those of its box; or, for a needle, of the area within a tile's
+    side of it (Steiner)."""
+    left, right = _columns_touched(g, grid)
+    low, high = _span(g[cp.MEAN_Y], -g[cp.HALF_HEIGHT], g[cp.HALF_HEIGHT], grid.height)
+    box = (right - left) * (max(high - 1, low) // TILE - low // TILE + 1)
+    if box <= _FEW:
+        return box
+    _, _, wide, _, _, bulge = _ellipse(g)
+    around = np.pi * bulge * wide * wide / TILE**2 + 4 * (wide + g[cp.HALF_HEIGHT]) / TILE + 5
+    return box if box < around else int(around)
 
 
 @kernel
-def _accumulate(counts: Array, starts: Array, firsts: Array) -> None:
-    """Running sums: starts, firsts, and counts[block, tile] <- where the block writes in the tile."""
-    total = 0
-    for tile in range(counts.shape[1]):
-        starts[tile] = total
-        for block in range(_BLOCKS):
-            total, counts[block, tile] = total + counts[block, tile], total
-    starts[counts.shape[1]] = total
-    for rank in range(1, firsts.shape[0]):
-        firsts[rank] += firsts[rank - 1]
+def _touch(
+    first: int, last: int, order: Array, footprints: Array, grid: Grid, geometry: Array, firsts: Array
+) -> tuple[Array, Array, Array]:
+    """For ranks [first, last): geometry[rank] <- footprints[order[rank]], firsts[rank + 1] <- how many tiles
+    it touches; returns these tiles, the spans of rows in them, and how often each tile of the image was
+    touched."""
+    room = 0
+    for rank in range(first, last):
+        prefetch(footprints, np.int64(order[min(rank + 2 * AHEAD, last - 1)]) * cp.COLUMNS)
+        for n in range(cp.COLUMNS):
+            geometry[rank, n] = footprints[order[rank], n]
+        room += _at_most(geometry[rank], grid)
+    where, spans = np.empty(room, np.int32), np.empty(room, np.uint16)
+    counts = np.zeros(grid.columns * grid.lines, np.int64)
+    used = 0
+    for rank in range(first, last):
+        g, before = geometry[rank], used
+        left, right = _columns_touched(g, grid)
+        ellipse = _ellipse(g)
+        for column in range(left, right):
+            low, high = _rows_in_column(ellipse, column, grid.height)
+            if low >= high:
+                continue
+            for row in range(low // TILE, (high - 1) // TILE + 1):
+                tile = row * grid.columns + column
+                where[used] = tile
+                spans[used] = pack_span(max(low - row * TILE, 0), min(high - row * TILE, TILE))
+                counts[tile] += 1
+                used += 1
+        firsts[rank + 1] = used - before
+    return where, spans, counts
 
 
 @kernel
-def _place(first: int, last: int, geometry: Array, grid: Grid, places: Array, tiles: Tiles) -> None:
-    """The loop of `_count` again, now writing; within a tile ranks ascend, whoever runs which block."""
-    share = (geometry.shape[0] + _BLOCKS - 1) // _BLOCKS
-    for block in range(first, last):
-        for rank in range(block * share, min(geometry.shape[0], (block + 1) * share)):
-            g = geometry[rank]
-            mine = tiles.firsts[rank]
-            left, right = _columns_touched(g, grid)
-            ellipse = _ellipse(g)
-            for column in range(left, right):
-                low, high = _rows_in_column(ellipse, column, grid.height)
-                if low >= high:
-                    continue
-                for row in range(low // TILE, (high - 1) // TILE + 1):
-                    tile = row * grid.columns + column
-                    place = places[block, tile]
-                    places[block, tile] = place + 1
-                    tiles.ranks[place] = rank
-                    tiles.rows[place] = pack_span(max(low - row * TILE, 0), min(high - row * TILE, TILE))
-                    tiles.slots[mine] = place
-                    mine += 1
+def _place(first: int, last: int, touched: tuple[Array, Array], places: Array, tiles: Tiles) -> None:
+    """Write what `_touch` found for ranks [first, last), the ones of a tile from places[tile] on: within a
+    tile ranks ascend, whoever runs which piece."""
+    where, spans = touched
+    start = tiles.firsts[first]
+    for rank in range(first, last):
+        for n in range(tiles.firsts[rank], tiles.firsts[rank + 1]):
+            tile = where[n - start]
+            place = places[tile]
+            places[tile] = place + 1
+            tiles.ranks[place], tiles.rows[place] = rank, spans[n - start]
+            tiles.slots[n] = place
 
 
-def bin_tiles(geometry: Array, width: int, height: int, workers: Workers) -> Tiles:
-    """(M, 8) geometry in depth order -> the intersections with the tiles of a width x height image."""
-    columns, lines = -(-width // TILE), -(-height // TILE)
-    grid = Grid(float(width), float(height), columns)
-    counts = np.zeros((_BLOCKS, columns * lines), np.int64)
-    starts = np.empty(columns * lines + 1, np.int64)
-    firsts = np.zeros(len(geometry) + 1, np.int64)
-    workers.run(_count, _BLOCKS, geometry, grid, counts, firsts)
-    _accumulate(counts, starts, firsts)
-    total = int(starts[-1])
+def bin_tiles(
+    footprints: Array, order: Array, size: tuple[int, int], workers: Workers, memory: Memory
+) -> tuple[Array, Tiles]:
+    """(N, 8) footprints, (M,) the drawn ones in depth order -> (M, 8) geometry in that order, and the
+    intersections with the tiles of an image of `size`, width and height."""
+    geometry = memory.empty((len(order), cp.COLUMNS), np.float64)
+    width, height = size
+    grid = Grid(float(width), float(height), -(-width // TILE), -(-height // TILE))
+    firsts = memory.empty((len(order) + 1,), np.int64)
+    firsts[0] = 0
+    edges = [len(order) * i // _PIECES for i in range(_PIECES + 1)]
+    pieces = [piece for piece in pairwise(edges) if piece[0] < piece[1]]
+    shared = order, footprints, grid, geometry, firsts
+    found = workers.each(_touch, [(*piece, *shared) for piece in pieces])
+    np.cumsum(firsts, out=firsts)
+    total = int(firsts[-1])
     if total > _MOST:
         raise BackendError(
             f"{total} overlaps of Gaussians and tiles are too many for the CPU rasterizer: "
             "render a smaller image"
         )
-    ranks, rows, slots = np.empty(total, np.int32), np.empty(total, np.uint16), np.empty(total, np.int32)
-    tiles = Tiles(starts, ranks, rows, firsts, slots, columns)
-    workers.run(_place, _BLOCKS, geometry, grid, counts, tiles)
-    return tiles
+    # Where each piece writes in each tile: tile by tile, and in a tile piece by piece.
+    counts = np.stack([np.zeros(grid.columns * grid.lines, np.int64), *(counts for _, _, counts in found)], 1)
+    ends = np.cumsum(counts).reshape(counts.shape)
+    starts = np.append(ends[:, 0], total)
+    ranks, rows, slots = (memory.empty((total,), kind) for kind in (np.int32, np.uint16, np.int32))
+    tiles = Tiles(starts, ranks, rows, firsts, slots, grid.columns)
+    places = np.ascontiguousarray(ends.T)  # of piece n those at n - 1: its counts are the n-th
+    workers.each(
+        _place,
+        [
+            (*piece, (where, spans), places[n], tiles)
+            for n, (piece, (where, spans, _)) in enumerate(zip(pieces, found, strict=True))
+        ],
+    )
+    return geometry, tiles
 
 
 @helper
@@ -250,7 +308,7 @@ def spread(index: int, count: int) -> int:
 
 
 def padded(channels: int) -> int:
-    """Channels are blended in fours; three take a fourth along, which is zero."""
+    """Lines of a tile's planes for so many channels, which go in fours: three have room for a fourth."""
     return channels + (channels % 4 == 3)
 
 
@@ -260,14 +318,13 @@ padded_inside = helper(padded)
 @helper
 def add_weighted(sums: Array, at: int, channels: int, weight: Lanes, x: Array) -> None:
     """sums[at + 16 channel : + 16] += weight x[channel]"""
-    fours = channels & ~3
-    for channel in range(0, fours, 4):
+    for channel in range(0, channels & ~3, 4):
         store(sums, at, load(sums, at) + weight * x[channel])
         store(sums, at + TILE, load(sums, at + TILE) + weight * x[channel + 1])
         store(sums, at + 2 * TILE, load(sums, at + 2 * TILE) + weight * x[channel + 2])
         store(sums, at + 3 * TILE, load(sums, at + 3 * TILE) + weight * x[channel + 3])
         at += 4 * TILE
-    for channel in range(fours, channels):
+    for channel in range(channels & ~3, channels):
         store(sums, at, load(sums, at) + weight * x[channel])
         at += TILE
 
