@@ -435,13 +435,3 @@ class TileOperator(LiftingView):
             self.workers.run(sum_partials, len(self.order), self.tiles, self.order, partial, out)
             values[:, start : start + _CHANNELS_AT_ONCE] = out
         return values
-
-
-def in_fours(values: Array) -> Array:
-    """(M, C) values as float32 (M, padded(C)), the last column zero where it was added."""
-    count, channels = values.shape
-    if padded(channels) == channels:
-        return plain(values)
-    wide = np.zeros((count, padded(channels)), np.float32)
-    wide[:, :channels] = values
-    return wide

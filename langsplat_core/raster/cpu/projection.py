@@ -281,7 +281,7 @@ def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Projec
 
 _C20, _C21, _C22 = C2
 _C30, _C31, _C32, _C33, _C34 = C3
-_AHEAD = 8  # rows between asking for a Gaussian and using it
+_AHEAD = 20  # rows between asking for a Gaussian and using it
 _NEAREST = 1e-12  # world units; a Gaussian closer to the camera than this has no direction
 
 

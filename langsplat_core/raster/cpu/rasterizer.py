@@ -17,10 +17,10 @@ from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.progress import lap
 from langsplat_core.raster.cpu import backward, blend, projection
 from langsplat_core.raster.cpu.backward import GaussianGradients
-from langsplat_core.raster.cpu.blend import TileOperator, gather_labels, in_fours
+from langsplat_core.raster.cpu.blend import TileOperator, gather_labels
 from langsplat_core.raster.cpu.frozen import FrozenView
 from langsplat_core.raster.cpu.memory import Memory
-from langsplat_core.raster.cpu.tiles import bin_tiles, depth_order, make_cutoffs
+from langsplat_core.raster.cpu.tiles import bin_tiles, depth_order, make_cutoffs, padded
 from langsplat_core.raster.protocol import check_picture, mean_depth
 from langsplat_core.scene import Camera, Gaussians
 
@@ -111,25 +111,21 @@ class CpuView(TileOperator):
         if alpha_grad is None:
             alpha_grad = np.zeros((height, width), np.float32)
         check_array("alpha_grad", alpha_grad, (height, width))
-        ordered = in_fours(values[self.order])
+        ordered = plain(values[self.order])
         grads = (plain(image_grad), plain(alpha_grad)[..., None])
-        columns = backward.MOMENTS + ordered.shape[1]
-        partial = np.empty((len(self.tiles.ranks), columns), np.float32)
-        self._over_tiles(backward.backward, ordered, grads, self._cutoffs, partial)
+        met, columns = len(self.tiles.ranks), backward.MOMENTS + padded(channels)
+        partial, reached = self._memory.empty((met, columns), np.float32), np.empty(met, bool)
+        self._over_tiles(backward.backward, ordered, grads, self._cutoffs, partial, reached)
         out = GaussianGradients(
-            *(np.zeros((n, *shape), np.float32) for shape in ((3,), (3,), (4,), (), (channels,), (2,)))
+            *(
+                self._memory.empty((n, *shape), np.float32)
+                for shape in ((3,), (3,), (4,), (), (channels,), (2,))
+            )
         )
-        self.workers.run(
-            backward.to_parameters,
-            len(self.order),
-            self.tiles,
-            self.order,
-            self._geometry,
-            partial,
-            self._rows,
-            self._kernel_camera,
-            out,
-        )
+        rank_of = np.full(n, -1, np.int32)
+        rank_of[self.order] = np.arange(len(self.order), dtype=np.int32)
+        sums = backward.Sums(rank_of, self._geometry, partial, reached)
+        self.workers.run(backward.to_parameters, n, self.tiles, sums, self._rows, self._kernel_camera, out)
         return out
 
     def _over_tiles(self, kernel: Callable[..., None], *arguments: Any) -> None:

@@ -201,18 +201,20 @@ def _at_most(g: Array, grid: Grid) -> int:
 @kernel
 def _touch(
     first: int, last: int, order: Array, footprints: Array, grid: Grid, geometry: Array, firsts: Array
-) -> tuple[Array, Array, Array]:
+) -> tuple[tuple[Array, Array, Array], int, Array]:
     """For ranks [first, last): geometry[rank] <- footprints[order[rank]], firsts[rank + 1] <- how many tiles
-    it touches; returns these tiles, the spans of rows in them, and how often each tile of the image was
-    touched."""
+    it touches; returns the ranks, tiles and spans of rows of these intersections, their number, and how often
+    each tile of the image was touched."""
     room = 0
     for rank in range(first, last):
         prefetch(footprints, np.int64(order[min(rank + 2 * AHEAD, last - 1)]) * cp.COLUMNS)
         for n in range(cp.COLUMNS):
             geometry[rank, n] = footprints[order[rank], n]
         room += _at_most(geometry[rank], grid)
-    where, spans = np.empty(room, np.int32), np.empty(room, np.uint16)
-    counts = np.zeros(grid.columns * grid.lines, np.int64)
+    room += 1  # as two places are written at a time
+    touched = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(room, np.uint16)
+    ranks, where, spans = touched
+    counts = np.zeros((grid.lines + 1) * grid.columns, np.int64)
     used = 0
     for rank in range(first, last):
         g, before = geometry[rank], used
@@ -220,31 +222,38 @@ def _touch(
         ellipse = _ellipse(g)
         for column in range(left, right):
             low, high = _rows_in_column(ellipse, column, grid.height)
-            if low >= high:
-                continue
-            for row in range(low // TILE, (high - 1) // TILE + 1):
-                tile = row * grid.columns + column
-                where[used] = tile
-                spans[used] = pack_span(max(low - row * TILE, 0), min(high - row * TILE, TILE))
-                counts[tile] += 1
-                used += 1
+            line = low // TILE
+            lines = (high + TILE - 1) // TILE - line if low < high else 0
+            tile, top = line * grid.columns + column, line * TILE
+            # Most columns have one tile or two: writing two always, without a branch to foretell, is faster.
+            ranks[used], ranks[used + 1] = rank, rank
+            where[used], where[used + 1] = tile, tile + grid.columns
+            spans[used] = pack_span(low - top, min(high - top, TILE))
+            spans[used + 1] = pack_span(0, min(high - top - TILE, TILE))
+            counts[tile] += lines >= 1
+            counts[tile + grid.columns] += lines >= 2
+            for n in range(2, lines):
+                ranks[used + n], where[used + n] = rank, tile + n * grid.columns
+                spans[used + n] = pack_span(0, min(high - top - n * TILE, TILE))
+                counts[tile + n * grid.columns] += 1
+            used += lines
         firsts[rank + 1] = used - before
-    return where, spans, counts
+    return touched, used, counts
 
 
 @kernel
-def _place(first: int, last: int, touched: tuple[Array, Array], places: Array, tiles: Tiles) -> None:
-    """Write what `_touch` found for ranks [first, last), the ones of a tile from places[tile] on: within a
-    tile ranks ascend, whoever runs which piece."""
-    where, spans = touched
-    start = tiles.firsts[first]
-    for rank in range(first, last):
-        for n in range(tiles.firsts[rank], tiles.firsts[rank + 1]):
-            tile = where[n - start]
-            place = places[tile]
-            places[tile] = place + 1
-            tiles.ranks[place], tiles.rows[place] = rank, spans[n - start]
-            tiles.slots[n] = place
+def _place(
+    first: int, last: int, touched: tuple[Array, Array, Array], places: Array, start: int, tiles: Tiles
+) -> None:
+    """Write intersections [first, last) that `_touch` found into their tiles, those of a tile from places[tile]
+    on: within a tile ranks ascend, whoever runs which piece. They are the view's from `start` on."""
+    ranks, where, spans = touched
+    for n in range(first, last):
+        tile = where[n]
+        place = places[tile]
+        places[tile] = place + 1
+        tiles.ranks[place], tiles.rows[place] = ranks[n], spans[n]
+        tiles.slots[start + n] = place
 
 
 def bin_tiles(
@@ -258,7 +267,7 @@ def bin_tiles(
     firsts = memory.empty((len(order) + 1,), np.int64)
     firsts[0] = 0
     edges = [len(order) * i // _PIECES for i in range(_PIECES + 1)]
-    pieces = [piece for piece in pairwise(edges) if piece[0] < piece[1]]
+    pieces = list(pairwise(edges))
     shared = order, footprints, grid, geometry, firsts
     found = workers.each(_touch, [(*piece, *shared) for piece in pieces])
     np.cumsum(firsts, out=firsts)
@@ -269,19 +278,16 @@ def bin_tiles(
             "render a smaller image"
         )
     # Where each piece writes in each tile: tile by tile, and in a tile piece by piece.
-    counts = np.stack([np.zeros(grid.columns * grid.lines, np.int64), *(counts for _, _, counts in found)], 1)
+    counts = np.stack([counts[: grid.columns * grid.lines] for _, _, counts in found], 1)
     ends = np.cumsum(counts).reshape(counts.shape)
-    starts = np.append(ends[:, 0], total)
+    places = np.ascontiguousarray((ends - counts).T)
+    starts = np.append(places[0], total)
     ranks, rows, slots = (memory.empty((total,), kind) for kind in (np.int32, np.uint16, np.int32))
     tiles = Tiles(starts, ranks, rows, firsts, slots, grid.columns)
-    places = np.ascontiguousarray(ends.T)  # of piece n those at n - 1: its counts are the n-th
-    workers.each(
-        _place,
-        [
-            (*piece, (where, spans), places[n], tiles)
-            for n, (piece, (where, spans, _)) in enumerate(zip(pieces, found, strict=True))
-        ],
-    )
+    calls = []
+    for (first, _), (touched, used, _), places_of_it in zip(pieces, found, places, strict=True):
+        calls.append((0, used, touched, places_of_it, int(firsts[first]), tiles))
+    workers.each(_place, calls)
     return geometry, tiles
 
 
