@@ -18,6 +18,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import INRIA, RasterSettings
+from langsplat_core.progress import lap
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.protocol import LiftingRasterizer, View, farthest
 from langsplat_core.scene import Camera, Gaussians, Scene
@@ -114,9 +115,10 @@ def render(
 def splat_colours(view: View, gaussians: Gaussians, camera: Camera, values: Array | None = None) -> Rendering:
     """The image of a view that is projected already, in one pass; values as in `render`."""
     rows = view.rows
-    seen = colours_seen(gaussians, camera, rows)
-    if values is not None:
-        seen = np.concatenate([seen, np.asarray(values, np.float32)[rows]], 1)
+    with lap("colours"):
+        seen = colours_seen(gaussians, camera, rows)
+        if values is not None:
+            seen = np.concatenate([seen, np.asarray(values, np.float32)[rows]], 1)
     image, alpha = view.splat_rows(seen)
     return Rendering(image[..., :3], alpha, image[..., 3:])
 

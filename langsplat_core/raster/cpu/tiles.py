@@ -211,10 +211,10 @@ def _touch(
         for n in range(cp.COLUMNS):
             geometry[rank, n] = footprints[order[rank], n]
         room += _at_most(geometry[rank], grid)
-    room += 1  # as two places are written at a time
+    room += 2  # as two places are always written
     touched = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(room, np.uint16)
     ranks, where, spans = touched
-    counts = np.zeros((grid.lines + 1) * grid.columns, np.int64)
+    counts = np.zeros((grid.lines + 2) * grid.columns, np.int64)  # the last two lines: the same
     used = 0
     for rank in range(first, last):
         g, before = geometry[rank], used
