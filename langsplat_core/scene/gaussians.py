@@ -3,6 +3,7 @@ that look much the same."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -19,8 +20,8 @@ LARGEST_COEFFICIENT = 1e20  # of the spherical harmonics: sums of sixteen and th
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """N anisotropic Gaussians as a structure of float32 arrays. Rows may be invalid (NaN, zero
-    quaternion): backends drop and count them, nothing here repairs them silently."""
+    """N anisotropic Gaussians as a structure of float32 arrays, which are not changed any more. Rows may be
+    invalid (NaN, zero quaternion): backends drop and count them, nothing here repairs them silently."""
 
     means: Array  # (N, 3) world units
     log_scales: Array  # (N, 3) natural logarithm of world units; -inf is a flat axis
@@ -55,6 +56,10 @@ class Gaussians:
     def valid(self) -> Array:
         """(N,) True where a row can be drawn: finite mean, a non-zero finite quaternion, scales and colours
         that are not NaN or so large that they overflow, an opacity that is not NaN."""
+        return self._valid.copy()
+
+    @cached_property
+    def _valid(self) -> Array:
         usable = np.ones(len(self), bool)
         for _, sound in self._requirements():
             usable &= sound
@@ -65,7 +70,9 @@ class Gaussians:
 
         A row counts once, under its first reason, so that the counts add up to the rows dropped.
         """
-        counts = {}
+        counts: dict[str, int] = {}
+        if self._valid.all():
+            return counts
         unexplained = np.ones(len(self), bool)
         for reason, sound in self._requirements():
             faulty = unexplained & ~sound
