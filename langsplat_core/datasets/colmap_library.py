@@ -1,8 +1,8 @@
 """The library pycolmap, imported so that it leaves signals alone and its libraries keep to one thread.
 
 Its logging library installs a handler of its own for SIGTERM, which prints a stack trace and kills the
-process: what was there before is put back. Its wheel brings OpenMP (and a package of other make may bring OpenBLAS) of
-its own, which ask the environment how many threads to use when they are loaded, and never again.
+process: what was there before is put back. Its wheel brings OpenMP (and a package of other make may bring
+OpenBLAS) of its own, which ask the environment how many threads to use when they are loaded, and never again.
 """
 
 import ctypes

@@ -3,8 +3,8 @@ that look much the same."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
-from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -56,14 +56,13 @@ class Gaussians:
     def valid(self) -> Array:
         """(N,) True where a row can be drawn: finite mean, a non-zero finite quaternion, scales and colours
         that are not NaN or so large that they overflow, an opacity that is not NaN."""
-        return self._valid.copy()
-
-    @cached_property
-    def _valid(self) -> Array:
-        usable = np.ones(len(self), bool)
-        for _, sound in self._requirements():
-            usable &= sound
-        return usable
+        usable = _VALID.get(self)
+        if usable is None:
+            usable = np.ones(len(self), bool)
+            for _, sound in self._requirements():
+                usable &= sound
+            _VALID[self] = usable
+        return usable.copy()
 
     def invalid_rows(self) -> dict[str, int]:
         """Why rows are not valid: reason -> count, for those reasons that occur.
@@ -71,7 +70,7 @@ class Gaussians:
         A row counts once, under its first reason, so that the counts add up to the rows dropped.
         """
         counts: dict[str, int] = {}
-        if self._valid.all():
+        if self.valid().all():
             return counts
         unexplained = np.ones(len(self), bool)
         for reason, sound in self._requirements():
@@ -94,6 +93,9 @@ class Gaussians:
             ("opacity not a number", ~np.isnan(self.opacity_logits)),
             ("colour not finite or above 1e20", sound_colour),
         )
+
+
+_VALID: WeakKeyDictionary[Gaussians, Array] = WeakKeyDictionary()  # what was found, as it is asked for often
 
 
 def joined(parts: Sequence[Gaussians]) -> Gaussians:

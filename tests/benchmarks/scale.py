@@ -44,8 +44,8 @@ from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_core.scene.gaussians import merged
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.semantics.vocabulary import ADJECTIVES, NOUNS
-from tests.benchmarks.fresh import in_fresh_interpreter
 from langsplat_viewer.state import STEPS
+from tests.benchmarks.fresh import in_fresh_interpreter
 from tests.benchmarks.room import publish
 
 PROPERTIES = (  # 62, as INRIA writes them

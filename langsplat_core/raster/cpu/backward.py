@@ -178,7 +178,7 @@ def backward(
     reached: Array,
 ) -> None:
     """(M, C) values in depth order; gradients (H, W, C) and (H, W, 1) by image and alpha; fills (I,) bool
-    `reached`, and (I, 8 + padded(C)) partial sums where that is True. All float32, for tiles [first, last)."""
+    `reached`, and (I, 8 + padded(C)) partial sums where that is True. float32, for tiles [first, last)."""
     count = tiles.starts.shape[0] - 1
     tape = np.empty(_TAPE, np.float32)
     for i in range(first, last):

@@ -1,5 +1,5 @@
-"""Memory that frames use again: pages that the system hands out are filled with zeros first, which took a tenth
-of a frame."""
+"""Memory that frames use again: the system fills the pages that it hands out with zeros, a tenth of a frame's
+time."""
 
 import math
 import sys

@@ -87,7 +87,8 @@ class KernelCamera(NamedTuple):
 
 def kernel_camera(camera: Camera, settings: RasterSettings) -> KernelCamera:
     left, top, right, bottom = tangent_limits(camera, settings)
-    # Half width = reach sqrt((A A^T)_xx + dilation) with A = J R S, so at most reach (|J_x| |R| size + sqrt(dilation)).
+    # Half width = reach sqrt((A A^T)_xx + dilation), A = J R S: so at most
+    # reach (|J_x| |R| size + sqrt(dilation)).
     reach = np.sqrt(-2 * np.log(min(settings.alpha_min, 1.0)))
     wide, high = (0.0, 0.0) if camera.orthographic else (max(left, right), max(top, bottom))
     most = 1.001 * reach * np.linalg.norm(camera.rotation, 2)  # 1.001: room for rounding
@@ -390,8 +391,8 @@ def _backward(
 
 
 def colours(sh: Array, means: Array, camera_position: Array, rows: Array | None = None) -> Array:
-    """(N, K, 3) float32 coefficients, (N, 3) float32 means -> (N, 3) float32 display colours >= 0; with `rows`,
-    (M,) int32, those of these Gaussians.
+    """(N, K, 3) float32 coefficients, (N, 3) float32 means -> (N, 3) float32 display colours >= 0; with
+    `rows`, (M,) int32, those of these Gaussians.
 
     Invalid rows give 0; see `spherical_harmonics.colours`.
     """

@@ -45,7 +45,7 @@ class CpuView(TileOperator):
             plain(gaussians.quats_wxyz),
             plain(gaussians.opacity_logits),
             plain(gaussians.sh).reshape(n, gaussians.sh.shape[1] * 3).view(np.uint32),
-            _SIZES.setdefault(gaussians, np.full(n, projection.UNKNOWN, np.float32)),
+            _sizes_of(gaussians),
         )
         self._memory = memory
         found = projection.Projected(
@@ -154,8 +154,15 @@ class CpuView(TileOperator):
         return mean_depth(sums, weights)
 
 
-# Made once for each scene. Gaussians are not changed once a view of them was made.
 _SIZES: WeakKeyDictionary[Gaussians, Array] = WeakKeyDictionary()
+
+
+def _sizes_of(gaussians: Gaussians) -> Array:
+    """`projection.Rows.sizes`, which views fill; kept, as Gaussians are not changed."""
+    sizes = _SIZES.get(gaussians)
+    if sizes is None:
+        sizes = _SIZES[gaussians] = np.full(len(gaussians), projection.UNKNOWN, np.float32)
+    return sizes
 
 
 class CpuRasterizer:

@@ -36,6 +36,7 @@ TILE = 16
 _SLACK = 1e-3  # px by which footprints are widened here; the blending kernels test alpha itself
 _MOST = 2**31 - 1  # intersections of Gaussians and tiles in one view
 _DIGIT, _PASSES = 11, 3  # bits per pass of the radix sort, of 32
+_MOVES = 4  # for each depth, after which sorting by neighbours is given up
 _FEW = 32  # tiles, too few to count more closely
 _PIECES = 16  # of the depth order that are binned side by side; the result does not depend on it
 
@@ -84,54 +85,62 @@ class Sorting(NamedTuple):
     depth_bits: Array  # (M,) uint64
 
 
-@kernel
-def _depth_order(status: Array, depth_bits: Array, out: Sorting) -> bool:
-    """(N,) status and depths reinterpreted as uint64 -> fills `out`, of the length of what is drawn, by depth,
-    ties by index. False where it gave up, as very many depths are nearly equal.
-
-    Positive floats order as their bits do. Sorted by their 32 leading bits that differ (radix, least
-    significant digit first, each pass stable); then neighbours that are still in the wrong order change
-    places.
-    """
-    count = out.depth_bits.shape[0]
+@helper
+def _fill_keys(status: Array, depth_bits: Array, out: Sorting, counts: Array) -> None:
+    """keys[0], order[0] <- the 32 leading bits in which drawn depths differ, and their rows; counts[digit,
+    value] <- how often."""
     low, high = np.uint64(2**64 - 1), np.uint64(0)
     for i in range(status.shape[0]):
         if status[i] == cp.DRAWN:
             low, high = min(low, depth_bits[i]), max(high, depth_bits[i])
     shift = np.uint64(0)
-    while count > 1 and (high - low) >> shift >= np.uint64(1 << 32):
+    while low < high and (high - low) >> shift >= np.uint64(1 << 32):
         shift += np.uint64(1)
-    mask = np.uint32((1 << _DIGIT) - 1)
-    ends = np.zeros((_PASSES, 1 << _DIGIT), np.int64)
     n = 0
     for i in range(status.shape[0]):
         if status[i] == cp.DRAWN:
             key = np.uint32((depth_bits[i] - low) >> shift)
             out.keys[0, n], out.order[0, n] = key, i
-            for digit in range(_PASSES):
-                ends[digit, (key >> np.uint32(_DIGIT * digit)) & mask] += 1
             n += 1
+            for digit in range(_PASSES):
+                counts[digit, _digit_of(key, digit)] += 1
+
+
+@helper
+def _digit_of(key: int, digit: int) -> int:
+    return (key >> np.uint32(_DIGIT * digit)) & np.uint32((1 << _DIGIT) - 1)
+
+
+@kernel
+def _depth_order(status: Array, depth_bits: Array, out: Sorting) -> bool:
+    """(N,) status and depths reinterpreted as uint64 -> fills `out`, of the length of what is drawn, by
+    depth, ties by index. False where it gave up, as very many depths are nearly equal.
+
+    Positive floats order as their bits do. Sorted by their 32 leading bits that differ (radix, least
+    significant digit first, each pass stable); then neighbours that are still in the wrong order change
+    places.
+    """
+    ends = np.zeros((_PASSES, 1 << _DIGIT), np.int64)
+    _fill_keys(status, depth_bits, out, ends)
     for digit in range(_PASSES):
-        here = digit % 2
-        total = 0
+        here, total = digit % 2, 0
         for value in range(1 << _DIGIT):
             total, ends[digit, value] = total + ends[digit, value], total
-        for i in range(count):
+        for i in range(out.depth_bits.shape[0]):
             key = out.keys[here, i]
-            value = (key >> np.uint32(_DIGIT * digit)) & mask
+            value = _digit_of(key, digit)
             place = ends[digit, value]
             ends[digit, value] = place + 1
             out.keys[1 - here, place], out.order[1 - here, place] = key, out.order[here, i]
-    order, sorted_bits = out.order[_PASSES % 2], out.depth_bits
-    moves = 0
-    for i in range(count):
+    order, ordered_bits, moves = out.order[_PASSES % 2], out.depth_bits, 0
+    for i in range(order.shape[0]):
         row, bits, place = order[i], depth_bits[order[i]], i
-        while place > 0 and sorted_bits[place - 1] > bits and moves <= 4 * count:
-            order[place], sorted_bits[place] = order[place - 1], sorted_bits[place - 1]
+        while place > 0 and ordered_bits[place - 1] > bits and moves <= _MOVES * order.shape[0]:
+            order[place], ordered_bits[place] = order[place - 1], ordered_bits[place - 1]
             place -= 1
             moves += 1
-        order[place], sorted_bits[place] = row, bits
-    return moves <= 4 * count
+        order[place], ordered_bits[place] = row, bits
+    return moves <= _MOVES * order.shape[0]
 
 
 def depth_order(status: Array, depths: Array, memory: Memory) -> tuple[Array, Array]:
@@ -186,8 +195,8 @@ def _columns_touched(g: Array, grid: Grid) -> tuple[int, int]:
 
 @helper
 def _at_most(g: Array, grid: Grid) -> int:
-    """No fewer tiles than a footprint touches: those of its box; or, for a needle, of the area within a tile's
-    side of it (Steiner)."""
+    """No fewer tiles than a footprint touches: those of its box; or, for a needle, of the area within a
+    tile's side of it (Steiner)."""
     left, right = _columns_touched(g, grid)
     low, high = _span(g[cp.MEAN_Y], -g[cp.HALF_HEIGHT], g[cp.HALF_HEIGHT], grid.height)
     box = (right - left) * (max(high - 1, low) // TILE - low // TILE + 1)
@@ -245,8 +254,9 @@ def _touch(
 def _place(
     first: int, last: int, touched: tuple[Array, Array, Array], places: Array, start: int, tiles: Tiles
 ) -> None:
-    """Write intersections [first, last) that `_touch` found into their tiles, those of a tile from places[tile]
-    on: within a tile ranks ascend, whoever runs which piece. They are the view's from `start` on."""
+    """Write intersections [first, last) that `_touch` found into their tiles, those of a tile from
+    places[tile] on: within a tile ranks ascend, whoever runs which piece. They are the view's from `start`
+    on."""
     ranks, where, spans = touched
     for n in range(first, last):
         tile = where[n]
