@@ -194,17 +194,16 @@ def _columns_touched(g: Array, grid: Grid) -> tuple[int, int]:
 
 
 @helper
-def _at_most(g: Array, grid: Grid) -> int:
+def _at_most(g: Array, grid: Grid) -> float:
     """No fewer tiles than a footprint touches: those of its box; or, for a needle, of the area within a
     tile's side of it (Steiner)."""
-    left, right = _columns_touched(g, grid)
-    low, high = _span(g[cp.MEAN_Y], -g[cp.HALF_HEIGHT], g[cp.HALF_HEIGHT], grid.height)
-    box = (right - left) * (max(high - 1, low) // TILE - low // TILE + 1)
+    wide, high = 2 * g[cp.HALF_WIDTH] / TILE, 2 * g[cp.HALF_HEIGHT] / TILE
+    box = min(float(grid.columns), wide + 2) * min(float(grid.lines), high + 2)  # in this order also of a NaN
     if box <= _FEW:
         return box
-    _, _, wide, _, _, bulge = _ellipse(g)
-    around = np.pi * bulge * wide * wide / TILE**2 + 4 * (wide + g[cp.HALF_HEIGHT]) / TILE + 5
-    return box if box < around else int(around)
+    a, c, k = g[cp.FACTOR_A], g[cp.FACTOR_C], g[cp.FACTOR_K]
+    area = 0.25 * np.pi * wide * wide * a * c / (a * a * k * k + c * c)
+    return min(box, area + 2 * (wide + high) + 5)
 
 
 @kernel
@@ -214,13 +213,13 @@ def _touch(
     """For ranks [first, last): geometry[rank] <- footprints[order[rank]], firsts[rank + 1] <- how many tiles
     it touches; returns the ranks, tiles and spans of rows of these intersections, their number, and how often
     each tile of the image was touched."""
-    room = 0
+    most = 0.0
     for rank in range(first, last):
         prefetch(footprints, np.int64(order[min(rank + 2 * AHEAD, last - 1)]) * cp.COLUMNS)
         for n in range(cp.COLUMNS):
             geometry[rank, n] = footprints[order[rank], n]
-        room += _at_most(geometry[rank], grid)
-    room += 2  # as two places are always written
+        most += _at_most(geometry[rank], grid)
+    room = int(most) + 3  # two places are always written
     touched = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(room, np.uint16)
     ranks, where, spans = touched
     counts = np.zeros((grid.lines + 2) * grid.columns, np.int64)  # the last two lines: the same
