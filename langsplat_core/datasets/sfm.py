@@ -26,7 +26,7 @@ from langsplat_core.datasets.capture import (
     shortened,
 )
 from langsplat_core.datasets.colmap import SparseModel, good_points, has_model, located_photos, read_model
-from langsplat_core.datasets.colmap_library import pycolmap
+from langsplat_core.datasets.intrinsics import pycolmap
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import PictureError, opened

@@ -441,7 +441,7 @@ def test_of_models_about_as_good_the_first_is_kept() -> None:
 def test_libraries_inside_of_pycolmap_keep_to_one_thread_and_others_do_not() -> None:
     code = """
 import ctypes, os
-from langsplat_core.datasets.colmap_library import pycolmap
+from langsplat_core.datasets.intrinsics import pycolmap
 libraries = {line.split()[-1] for line in open("/proc/self/maps") if "pycolmap.libs/libgomp" in line}
 print([ctypes.CDLL(path).omp_get_max_threads() for path in libraries], os.environ["OMP_NUM_THREADS"])
 """
