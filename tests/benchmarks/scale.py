@@ -290,8 +290,8 @@ def moving_table(costs: Sequence[MovingCost]) -> str:
         for cost in costs
     )
     head = ("resolution", "Gaussians", "image, ms", "a second", "processor, ms", "PSNR, dB", "mean error")
-    head += tuple(STEPS[step].lower() for step in costs[0].steps)
-    return markdown(head, lines)
+    steps = [STEPS[step].lower() for step in costs[0].steps]
+    return markdown([*head, *steps], lines)
 
 
 @dataclass(frozen=True)

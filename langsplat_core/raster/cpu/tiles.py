@@ -107,7 +107,7 @@ def _fill_keys(status: Array, depth_bits: Array, out: Sorting, counts: Array) ->
 
 
 @helper
-def _digit_of(key: int, digit: int) -> int:
+def _digit_of(key: Any, digit: int) -> Any:
     return (key >> np.uint32(_DIGIT * digit)) & np.uint32((1 << _DIGIT) - 1)
 
 
