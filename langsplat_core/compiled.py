@@ -17,10 +17,11 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from functools import cache, partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -214,18 +215,21 @@ class Workers:
     def _begin(self) -> None:
         self._pool, self._process = ThreadPoolExecutor(self.threads, "kernels"), os.getpid()
 
-    def run(self, compiled: Callable[..., None], count: int, *arguments: Any) -> None:
-        """compiled(first, last, *arguments) for pieces [first, last) that cover range(count)."""
+    def run(self, compiled: Callable[..., Any], count: int, *arguments: Any) -> list[Any]:
+        """compiled(first, last, *arguments) for pieces [first, last) that cover range(count), in order; what
+        they return."""
         pieces = min(count, self.threads * _PIECES_PER_THREAD if self.threads > 1 else 1)
-        if pieces <= 1:
-            compiled(0, count, *arguments)
-            return
+        edges = [count * i // max(pieces, 1) for i in range(max(pieces, 1) + 1)]
+        return self.each(compiled, [(*edge, *arguments) for edge in pairwise(edges)])
+
+    def each(self, compiled: Callable[..., Any], calls: Sequence[tuple[Any, ...]]) -> list[Any]:
+        """compiled(*call) for every call; what they return."""
+        if len(calls) <= 1 or self.threads <= 1:
+            return [compiled(*call) for call in calls]
         if self._process != os.getpid():  # after a fork, which takes no threads along
             self._begin()
-        edges = [count * i // pieces for i in range(pieces + 1)]
-        jobs = [self._pool.submit(compiled, edges[i], edges[i + 1], *arguments) for i in range(pieces)]
-        for job in jobs:
-            job.result()
+        jobs = [self._pool.submit(compiled, *call) for call in calls]
+        return [job.result() for job in jobs]
 
 
 @cache

@@ -31,7 +31,7 @@ from langsplat_viewer.rendering.renderer import GlRenderer, Rasterized, Rasteriz
 from langsplat_viewer.rendering.request import FULL, Detail, RenderRequest
 from langsplat_viewer.state import FrameStats, ViewerState
 
-REST_SECONDS = 0.1  # without a move, after which the camera rests
+REST_SECONDS = 0.07  # without a move, after which the camera rests
 KEPT_SIZES = 3  # of images: the full one and two coarse ones
 NOTHING_LEFT = "all of the scene is hidden or deleted"
 NOTHING_BETWEEN = "nothing of the scene in this picture lies between the cuts: move them in the panel Camera"
@@ -284,8 +284,8 @@ def _why_nothing(request: RenderRequest) -> str:
 
 # Level of detail while the camera moves, learned from the times of earlier images.
 
-MOVING_BUDGET = 50.0  # milliseconds: with the panels, some fifteen images a second
-GUESS = 5e-4  # milliseconds of a full image for each Gaussian, before one was drawn
+MOVING_BUDGET = 25.0  # milliseconds: with the panels, some thirty images a second
+GUESS = 4e-4  # milliseconds of a full image for each Gaussian, before one was drawn
 MERGED_SHARE = 0.25  # of an image's time, guessed, when four Gaussians are drawn as one
 FORGET = 0.8  # what was learned is lowered by this with every full image, so that better is tried again
 

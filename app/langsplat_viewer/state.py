@@ -82,6 +82,8 @@ KEPT = 31  # measurements of which the median is told
 STEPS = {  # names of laps, and what they are called; in the order of the panel
     "projection": "Projection",
     "sort": "Sort",
+    "tiles": "Tiles",
+    "colours": "Colours",
     "blend": "Blend",
     "upload": "Upload",
     "compose": "Compose",

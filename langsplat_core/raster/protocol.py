@@ -37,6 +37,16 @@ class View(ABC):
     def splat(self, values: Array) -> tuple[Array, Array]:
         """(N, C) values -> (H, W, C) image ``W x`` without background, and (H, W) alpha = row sums of W."""
 
+    @property
+    def rows(self) -> Array:
+        """(M,) int32 rows of which `splat_rows` takes values: the ones that are drawn, where the backend
+        knows them."""
+        return np.arange(self.count, dtype=np.int32)
+
+    def splat_rows(self, values: Array) -> tuple[Array, Array]:
+        """`splat` of values at `rows` alone, (M, C)."""
+        return self.splat(values)
+
     @abstractmethod
     def depth(self) -> Array:
         """(H, W) alpha-weighted mean depth along camera z, world units; 0 where nothing is drawn."""

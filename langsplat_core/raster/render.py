@@ -18,6 +18,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import INRIA, RasterSettings
+from langsplat_core.progress import lap
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.protocol import LiftingRasterizer, View, farthest
 from langsplat_core.scene import Camera, Gaussians, Scene
@@ -113,18 +114,21 @@ def render(
 
 def splat_colours(view: View, gaussians: Gaussians, camera: Camera, values: Array | None = None) -> Rendering:
     """The image of a view that is projected already, in one pass; values as in `render`."""
-    columns = [colours_seen(gaussians, camera)]
-    if values is not None:
-        columns.append(np.asarray(values, np.float32))
-    image, alpha = view.splat(np.concatenate(columns, 1) if values is not None else columns[0])
+    rows = view.rows
+    with lap("colours"):
+        seen = colours_seen(gaussians, camera, rows)
+        if values is not None:
+            seen = np.concatenate([seen, np.asarray(values, np.float32)[rows]], 1)
+    image, alpha = view.splat_rows(seen)
     return Rendering(image[..., :3], alpha, image[..., 3:])
 
 
-def colours_seen(gaussians: Gaussians, camera: Camera) -> Array:
-    """(N, 3) float32 display colours >= 0 of the Gaussians as seen from the camera; invalid rows are 0."""
+def colours_seen(gaussians: Gaussians, camera: Camera, rows: Array | None = None) -> Array:
+    """(N, 3) float32 display colours >= 0 of the Gaussians as seen from the camera, of those at `rows` where
+    they are given; invalid rows are 0."""
     from langsplat_core.raster.cpu.projection import colours  # numba: a second that OpenGL need not wait for
 
     if camera.orthographic:
         sights = np.broadcast_to(camera.rotation[2].astype(np.float32), gaussians.means.shape)
-        return colours(gaussians.sh, sights, np.zeros(3))
-    return colours(gaussians.sh, gaussians.means, camera.position)
+        return colours(gaussians.sh, sights, np.zeros(3), rows)
+    return colours(gaussians.sh, gaussians.means, camera.position, rows)

@@ -4,6 +4,7 @@ that look much the same."""
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -19,8 +20,8 @@ LARGEST_COEFFICIENT = 1e20  # of the spherical harmonics: sums of sixteen and th
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """N anisotropic Gaussians as a structure of float32 arrays. Rows may be invalid (NaN, zero
-    quaternion): backends drop and count them, nothing here repairs them silently."""
+    """N anisotropic Gaussians as a structure of float32 arrays, which are not changed any more. Rows may be
+    invalid (NaN, zero quaternion): backends drop and count them, nothing here repairs them silently."""
 
     means: Array  # (N, 3) world units
     log_scales: Array  # (N, 3) natural logarithm of world units; -inf is a flat axis
@@ -55,17 +56,22 @@ class Gaussians:
     def valid(self) -> Array:
         """(N,) True where a row can be drawn: finite mean, a non-zero finite quaternion, scales and colours
         that are not NaN or so large that they overflow, an opacity that is not NaN."""
-        usable = np.ones(len(self), bool)
-        for _, sound in self._requirements():
-            usable &= sound
-        return usable
+        usable = _VALID.get(self)
+        if usable is None:
+            usable = np.ones(len(self), bool)
+            for _, sound in self._requirements():
+                usable &= sound
+            _VALID[self] = usable
+        return usable.copy()
 
     def invalid_rows(self) -> dict[str, int]:
         """Why rows are not valid: reason -> count, for those reasons that occur.
 
         A row counts once, under its first reason, so that the counts add up to the rows dropped.
         """
-        counts = {}
+        counts: dict[str, int] = {}
+        if self.valid().all():
+            return counts
         unexplained = np.ones(len(self), bool)
         for reason, sound in self._requirements():
             faulty = unexplained & ~sound
@@ -87,6 +93,9 @@ class Gaussians:
             ("opacity not a number", ~np.isnan(self.opacity_logits)),
             ("colour not finite or above 1e20", sound_colour),
         )
+
+
+_VALID: WeakKeyDictionary[Gaussians, Array] = WeakKeyDictionary()  # what was found, as it is asked for often
 
 
 def joined(parts: Sequence[Gaussians]) -> Gaussians:

@@ -3,8 +3,8 @@
 * load: a large PLY, read by this program and by plyfile, into the same five arrays. The file has just been
   written, so it is in the system's cache.
 * lift: random masks lifted onto random Gaussians, at several sizes.
-* moving: the coarse images that the viewer draws while the camera moves, beside their distance from the full
-  one.
+* moving: the coarse images that the viewer draws while the camera moves, step by step as its panel Timing
+  has them, beside their distance from the full one.
 * endurance: one process, a scene made large, large images and many phrases.
 
 Loading and lifting run in fresh interpreters (`fresh`), whose peak memory is that of everything in them.
@@ -31,10 +31,12 @@ from langsplat_core.bench.measure import markdown
 from langsplat_core.bench.memory import peak_memory, resident_memory, restart_peak
 from langsplat_core.bench.query import repeated
 from langsplat_core.cli.run import OutFolder
-from langsplat_core.config import Count, CountOrZero, Range, RasterSettings
+from langsplat_core.config import Count, CountOrZero, PictureConfig, Range, RasterSettings
+from langsplat_core.display.composing import composed
+from langsplat_core.display.displays import Channels
 from langsplat_core.errors import InputError
 from langsplat_core.io.scenes import load_scene
-from langsplat_core.progress import Progress, TerminalProgress, silent
+from langsplat_core.progress import Progress, TerminalProgress, lap, silent, watched
 from langsplat_core.query.engine import QueryEngine, TextEncoder, no_field
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.render import render, splat_colours
@@ -42,6 +44,7 @@ from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_core.scene.gaussians import merged
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.semantics.vocabulary import ADJECTIVES, NOUNS
+from langsplat_viewer.state import STEPS
 from tests.benchmarks.fresh import in_fresh_interpreter
 from tests.benchmarks.room import publish
 
@@ -212,6 +215,7 @@ class MovingCost:
     processor: float  # milliseconds, all threads together
     psnr: float  # dB, to the full image; 100 for itself
     error: float  # mean absolute difference, values in [0, 1]
+    steps: Mapping[str, float]  # milliseconds, as the panel Timing has them
 
 
 def measure_moving(command: Scale, progress: Progress = silent) -> list[MovingCost]:
@@ -224,7 +228,7 @@ def measure_moving(command: Scale, progress: Progress = silent) -> list[MovingCo
     cameras = [scene.cameras[index].resized(*command.moving_size) for index in chosen]
     fewer = merged(scene.gaussians).gaussians
     rasterizer, settings = CpuRasterizer(), scene.raster_settings()
-    full = [_image(rasterizer, scene.gaussians, camera, settings) for camera in cameras]
+    full = [_channels(rasterizer, scene.gaussians, camera, settings).rgb.clip(0, 1) for camera in cameras]
     costs = []
     for done, (scale, is_merged) in enumerate(COARSE):
         progress("drawing", done / len(COARSE))
@@ -242,25 +246,30 @@ def _cost(
     full: Sequence[Array],
 ) -> MovingCost:
     scale, is_merged = coarse
-    seconds, processor, decibels, errors = [], [], [], []
+    seconds, processor, decibels, errors, steps = [], [], [], [], []
     for camera, wanted in zip(cameras, full, strict=True):
         small = camera.resized(max(round(camera.width * scale), 1), max(round(camera.height * scale), 1))
         wall, cpu = time.perf_counter(), time.process_time()
-        image = _image(rasterizer, gaussians, small, settings)
+        with watched() as laps:
+            drawn = _channels(rasterizer, gaussians, small, settings)
+            with lap("compose"):
+                composed(drawn, PictureConfig())
         seconds.append(time.perf_counter() - wall)
         processor.append(time.process_time() - cpu)
-        shown = _enlarged(image, wanted.shape[1::-1])
+        steps.append(laps)
+        shown = _enlarged(drawn.rgb.clip(0, 1), wanted.shape[1::-1])
         decibels.append(psnr(shown, wanted))
         errors.append(float(np.abs(shown - wanted).mean()))
     times = 1e3 * median(seconds), 1e3 * median(processor)
-    return MovingCost(scale, is_merged, len(gaussians), *times, mean(decibels), mean(errors))
+    each = {name: median(laps[name] for laps in steps) for name in steps[0]}
+    return MovingCost(scale, is_merged, len(gaussians), *times, mean(decibels), mean(errors), each)
 
 
-def _image(
+def _channels(
     rasterizer: CpuRasterizer, gaussians: Gaussians, camera: Camera, settings: RasterSettings
-) -> Array:
-    """(H, W, 3) colours before black, in [0, 1]."""
-    return splat_colours(rasterizer.view(gaussians, camera, settings), gaussians, camera).colours.clip(0, 1)
+) -> Channels:
+    drawn = splat_colours(rasterizer.view(gaussians, camera, settings), gaussians, camera)
+    return Channels(drawn.colours, drawn.alpha)
 
 
 def _enlarged(image: Array, size: tuple[int, ...]) -> Array:
@@ -277,10 +286,12 @@ def moving_table(costs: Sequence[MovingCost]) -> str:
         (f"{cost.scale:g}", f"{cost.gaussians}{' (merged)' if cost.merged else ''}")
         + (f"{cost.milliseconds:.0f}", f"{1e3 / cost.milliseconds:.1f}", f"{cost.processor:.0f}")
         + (f"{cost.psnr:.1f}", f"{cost.error:.1e}")
+        + tuple(f"{taken:.1f}" for taken in cost.steps.values())
         for cost in costs
     )
     head = ("resolution", "Gaussians", "image, ms", "a second", "processor, ms", "PSNR, dB", "mean error")
-    return markdown(head, lines)
+    steps = [STEPS[step].lower() for step in costs[0].steps]
+    return markdown([*head, *steps], lines)
 
 
 @dataclass(frozen=True)

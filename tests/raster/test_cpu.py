@@ -13,9 +13,10 @@ from scipy import sparse
 from langsplat_core.arrays import Array, logit
 from langsplat_core.config import GSPLAT, INRIA
 from langsplat_core.raster import reference
+from langsplat_core.raster.cpu.memory import Memory
 from langsplat_core.raster.cpu.projection import colours, colours_backward
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
-from langsplat_core.raster.cpu.tiles import depth_order
+from langsplat_core.raster.cpu.tiles import Grid, _at_most, depth_order
 from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera, Gaussians
@@ -138,6 +139,44 @@ def test_tiles_hold_little_more_than_what_touches_them():
     assert touched <= kept <= 1.15 * touched
 
 
+@pytest.mark.parametrize("needles", [0.0, 6.0])
+def test_no_footprint_touches_more_tiles_than_there_is_room_for(needles):
+    gaussians = random_gaussians(400, 30, radius=2.0)
+    stretched = gaussians.log_scales + needles * np.eye(3, dtype=np.float32)[np.arange(400) % 3]
+    camera = random_camera(30, 640, 480)
+    view = CPU.view(replace(gaussians, log_scales=stretched), camera)
+    grid = Grid(640.0, 480.0, 40, 30)
+    touched = np.diff(view.tiles.firsts)
+    assert touched.max() > (100 if needles else 4)
+    most = [_at_most(footprint, grid) for footprint in view._geometry]  # noqa: SLF001
+    assert (touched <= most).all()
+
+
+def test_memory_is_used_again_once_nothing_lies_in_it():
+    memory = Memory()
+    first = memory.empty((50_000, 4), np.float64)
+    part, place = first[3:9].view(np.uint64), first.ctypes.data
+    assert place % 64 == 0
+    del first
+    second = memory.empty((50_000, 4), np.float64)
+    assert not np.shares_memory(second, part)
+    del part
+    assert memory.empty((40_000, 4), np.float64).ctypes.data == place
+
+
+def test_rows_are_sieved_by_their_sizes_without_a_trace():
+    """A second view knows the rows' sizes and leaves out what cannot be seen before it is projected."""
+    gaussians, camera = random_gaussians(500, 31, radius=3.0), random_camera(31)
+    turned = random_camera(32)
+    for without in (camera, without_perspective(camera)):
+        for settings in (INRIA, replace(GSPLAT, antialiased=True)):
+            known = CPU.view(gaussians, turned, settings), CPU.view(gaussians, without, settings)
+            fresh = CPU.view(replace(gaussians), without, settings)
+            assert 0 < len(fresh.order) < 500
+            np.testing.assert_array_equal(known[1].order, fresh.order)
+            np.testing.assert_array_equal(known[1].tiles.rows, fresh.tiles.rows)
+
+
 def test_depth_order_is_a_stable_sort():
     rng = np.random.default_rng(21)
     for depths in (
@@ -145,11 +184,14 @@ def test_depth_order_is_a_stable_sort():
         rng.lognormal(0, 9, 500),
         np.full(3, 2.0),
         np.ones(0),
+        np.append(1 + 1e-14 * rng.random(5000), 1e300),  # a plane, nearly, and a floater
     ):
         status = rng.integers(0, 3, len(depths)).astype(np.uint8)
         drawn = np.flatnonzero(status == 2)
         want = drawn[np.argsort(depths[drawn], kind="stable")]
-        assert np.array_equal(depth_order(status, depths.view(np.uint64)), want)
+        order, sorted_depths = depth_order(status, depths, Memory())
+        assert np.array_equal(order, want)
+        assert np.array_equal(sorted_depths, depths[want])
 
 
 @pytest.mark.parametrize("degree", range(4))

@@ -83,8 +83,6 @@ def _open(viewer: Viewer, path: Path, then: Callable[[Viewer], None], check: Cal
         progress(f"preparing {path.name}", 0.6)
         viewer.services.warm_up(scene, backend, progress)
         progress(f"preparing {path.name}", 0.9)
-        if scene.language is not None:
-            latent_colours(scene.language)  # kept for the window's thread
         unusable = scene.gaussians.invalid_rows()
         doubts = stated_warnings(path, len(scene.gaussians))
         return _Opened(scene, unusable, extent_of(scene), read, doubts)
@@ -142,6 +140,10 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     forget(viewer)
     _say_opened(viewer, path, opened)
     if scene.language is not None:
+        field = scene.language
+        viewer.run(
+            "preparing latent colours", lambda progress: latent_colours(field)
+        )  # the window needs none yet
         _compile_search(viewer)
         _warm_up_encoder(viewer, viewer.services.encoder_id or scene.language.encoder_id)
 

@@ -18,9 +18,9 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.compiled import helper, kernel
 from langsplat_core.raster.cpu import projection as cp
-from langsplat_core.raster.cpu.blend import sum_over_tiles
 from langsplat_core.raster.cpu.lanes import (
     lanes,
+    largest,
     load,
     prefetch,
     reciprocal,
@@ -40,6 +40,7 @@ from langsplat_core.raster.cpu.tiles import (
     correlate,
     enter,
     load_tile,
+    padded_inside,
     rows_to_blend,
     running_rows,
     spread,
@@ -71,7 +72,8 @@ def _record(
     """`walk`, but with a tape that may have to grow on the way; returns it (a longer one where it was full),
     its length and the end of the intersections visited.
 
-    spans[s - first] <- rows [low, high) of each intersection that were blended.
+    spans[s - first] <- rows [low, high) of each intersection that were blended; none where no pixel got any
+    weight, and nothing on the tape.
     """
     x, y = tile % tiles.columns * TILE + 0.5, tile // tiles.columns * TILE + 0.5
     first, last = tiles.starts[tile], tiles.starts[tile + 1]
@@ -84,15 +86,20 @@ def _record(
                 return tape, used, s
         tape = _grown(tape, used)
         low, high = rows_to_blend(tiles.rows[s], top, bottom)
-        spans[s - first, 0], spans[s - first, 1] = low, high
         g = enter(geometry, tiles, s, min(s + AHEAD, last - 1))
         step, peak, w, v, w_step, v_step = begin_rows(g, x, y + low)
+        start, most = used, lanes(np.float32(0))
         for row in range(low, high):
             added, before = blend_row(state, row * TILE, step + w, peak - v * v, cutoffs)
             w, v = w + w_step, v + v_step
             store(tape, used, added)
             store(tape, used + TILE, before)
+            most = where_greater(added, most, added, most)
             used += _ENTRY
+        if largest(most) > 0:
+            spans[s - first, 0], spans[s - first, 1] = low, high
+        else:
+            used = start
     return tape, used, last
 
 
@@ -105,18 +112,20 @@ def _backward_tile(
     grads: tuple[Array, Array],
     cutoffs: Cutoffs,
     partial: Array,
+    reached: Array,
     tape: Array,
 ) -> Array:
     """One tile; returns the tape, for the next tile to write over."""
     image_grad, alpha_grad = grads
     height, width, _ = image_grad.shape
-    lines, columns = values.shape[1], partial.shape[1]
+    channels, columns = values.shape[1], partial.shape[1]
+    lines = padded_inside(channels)
     left, top = tile % tiles.columns * TILE + 0.5, tile // tiles.columns * TILE + 0.5
     first, last = tiles.starts[tile], tiles.starts[tile + 1]
     state = start_tile(tile, tiles, width, height)
     spans = np.zeros((last - first, 2), np.int64)
     tape, used, end = _record(tile, tiles, geometry, cutoffs, state, spans, tape)
-    partial[end:last] = 0
+    reached[end:last] = False
     planes, plane = np.empty(PIXELS * lines, np.float32), np.empty(PIXELS, np.float32)
     load_tile(planes, image_grad, tile, tiles.columns)
     load_tile(plane, alpha_grad, tile, tiles.columns)
@@ -124,8 +133,11 @@ def _backward_tile(
     behind = state
     behind[:] = 0
     for s in range(end - 1, first - 1, -1):
-        low, high = max(spans[s - first, 0], 0), spans[s - first, 1]
-        used -= max(high - low, 0) * _ENTRY
+        low, high = spans[s - first, 0], spans[s - first, 1]
+        reached[s] = low < high
+        if low >= high:
+            continue
+        used -= (high - low) * _ENTRY
         g = enter(geometry, tiles, s, max(s - AHEAD, first))
         x = values[tiles.ranks[s]]
         step, _, offset, v, w_step, v_step = begin_rows(g, left, top + low)
@@ -137,7 +149,7 @@ def _backward_tile(
             weight = alpha * before
             store(weights, (row - low) * TILE, weight)
             slope = load(plane, row * TILE)
-            for line in range(lines):
+            for line in range(channels):
                 slope = slope + load(planes, (row * lines + line) * TILE) * x[line]
             hidden = load(behind, row * TILE)
             store(behind, row * TILE, hidden + weight * slope)
@@ -163,13 +175,16 @@ def backward(
     grads: tuple[Array, Array],
     cutoffs: Cutoffs,
     partial: Array,
+    reached: Array,
 ) -> None:
-    """(M, padded(C)) values in depth order; gradients (H, W, C) and (H, W, 1) by image and alpha; fills
-    (I, 8 + padded(C)) partial sums. All float32, for tiles [first, last)."""
+    """(M, C) values in depth order; gradients (H, W, C) and (H, W, 1) by image and alpha; fills (I,) bool
+    `reached`, and (I, 8 + padded(C)) partial sums where that is True. float32, for tiles [first, last)."""
     count = tiles.starts.shape[0] - 1
     tape = np.empty(_TAPE, np.float32)
     for i in range(first, last):
-        tape = _backward_tile(spread(i, count), tiles, geometry, values, grads, cutoffs, partial, tape)
+        tape = _backward_tile(
+            spread(i, count), tiles, geometry, values, grads, cutoffs, partial, reached, tape
+        )
 
 
 # Gradients of the CPU backend, second half: from a footprint back to the Gaussian's parameters.
@@ -186,18 +201,55 @@ class GaussianGradients(NamedTuple):
     means_px: Array  # (N, 2) per pixel, by the 2D mean alone (densification watches its length)
 
 
+class Sums(NamedTuple):
+    """What `backward` left of the M Gaussians that are drawn."""
+
+    rank_of: Array  # (N,) int32 place in depth order of every row, -1 where it is not drawn
+    geometry: Array  # (M, 8)
+    partial: Array  # (I, 8 + padded(C))
+    reached: Array  # (I,) bool
+
+
 @helper
-def _fetch(i: int, rows: cp.Rows, out: GaussianGradients) -> None:
-    """Ask for the rows of Gaussian `i`: depth order is a random order in memory."""
-    row = np.int64(i)
-    prefetch(rows.means, 3 * row)
-    prefetch(rows.log_scales, 3 * row)
-    prefetch(rows.quats_wxyz, 4 * row)
-    prefetch(rows.opacity_logits, row)
-    prefetch(out.means, 3 * row)
-    prefetch(out.log_scales, 3 * row)
-    prefetch(out.quats_wxyz, 4 * row)
-    prefetch(out.values, out.values.shape[1] * row)
+def _fetch(i: int, last: int, tiles: Tiles, sums: Sums) -> None:
+    """Ask for what belongs to the rows after `i`, step by step, as each step needs what the one before
+    brought."""
+    rank = sums.rank_of[min(i + 3 * AHEAD, last - 1)]
+    if rank >= 0:
+        prefetch(tiles.firsts, np.int64(rank))
+        prefetch(sums.geometry, np.int64(rank) * cp.COLUMNS)
+    rank = sums.rank_of[min(i + 2 * AHEAD, last - 1)]
+    if rank >= 0:
+        prefetch(tiles.slots, tiles.firsts[rank])
+    rank = sums.rank_of[min(i + AHEAD, last - 1)]
+    if rank >= 0:
+        for n in range(tiles.firsts[rank], min(tiles.firsts[rank + 1], tiles.firsts[rank] + 4)):
+            if sums.reached[tiles.slots[n]]:
+                prefetch(sums.partial, np.int64(tiles.slots[n]) * sums.partial.shape[1])
+
+
+@helper
+def _add_up(rank: int, tiles: Tiles, sums: Sums, out: Array) -> bool:
+    """out <- the rank's partial sums, added up in the order of its tiles; False where there are none."""
+    some = False
+    for n in range(tiles.firsts[rank], tiles.firsts[rank + 1]):
+        slot = tiles.slots[n]
+        if sums.reached[slot]:
+            for k in range(out.shape[0]):
+                out[k] = sums.partial[slot, k] + (out[k] if some else 0.0)
+            some = True
+    return some
+
+
+@helper
+def _clear(i: int, out: GaussianGradients) -> None:
+    for n in range(3):
+        out.means[i, n] = out.log_scales[i, n] = 0
+    for n in range(4):
+        out.quats_wxyz[i, n] = 0
+    for n in range(out.values.shape[1]):
+        out.values[i, n] = 0
+    out.opacity_logits[i] = out.means_px[i, 0] = out.means_px[i, 1] = 0
 
 
 @helper
@@ -319,26 +371,26 @@ def to_parameters(
     first: int,
     last: int,
     tiles: Tiles,
-    order: Array,
-    geometry: Array,
-    partial: Array,
+    sums: Sums,
     rows: cp.Rows,
     camera: cp.KernelCamera,
     out: GaussianGradients,
 ) -> None:
-    """For drawn Gaussians [first, last) in depth order: sum what `backward` left, in the order of the tiles,
-    and pull the moments back through the projection."""
-    sums = np.empty(partial.shape[1])
-    moments = sums[:MOMENTS]
+    """For rows [first, last): sum what `backward` left, in the order of the tiles, and pull the moments back
+    through the projection."""
+    added = np.empty(sums.partial.shape[1])
+    moments = added[:MOMENTS]
     work, by_b, by_turn = np.empty((3, 3, 3)), np.empty((2, 3)), np.empty((3, 3))
     r = camera.rotation
-    for rank in range(first, last):
-        _fetch(order[min(rank + AHEAD, last - 1)], rows, out)
-        i = order[rank]
-        sum_over_tiles(rank, tiles, partial, sums)
+    for i in range(first, last):
+        _fetch(i, last, tiles, sums)
+        rank = sums.rank_of[i]
+        if rank < 0 or not _add_up(rank, tiles, sums, added):
+            _clear(i, out)
+            continue
         for channel in range(out.values.shape[1]):
-            out.values[i, channel] = sums[MOMENTS + channel]
-        du, dv, by_covariance = _footprint_gradient(geometry[rank], moments)
+            out.values[i, channel] = added[MOMENTS + channel]
+        du, dv, by_covariance = _footprint_gradient(sums.geometry[rank], moments)
         out.means_px[i, 0], out.means_px[i, 1] = du, dv
         out.opacity_logits[i] = moments[Q] * (1 - cp.opacity_of(rows.opacity_logits[i]))
         point = cp.camera_point(rows.means[i], camera)

@@ -22,6 +22,7 @@ from langsplat_core.raster.cpu.tiles import (
     nothing_to_close,
     nothing_to_open,
     padded,
+    padded_inside,
     spread,
     start_tile,
     walk,
@@ -51,8 +52,8 @@ def _fetch_values(work: Any, s: int, later: int) -> Array:
 @helper
 def _add_values(work: Any, x: Array, s: int, row: int, low: int, added: Lanes, before: Lanes) -> None:
     sums = work[2]
-    lines = x.shape[0]
-    add_weighted(sums, row * lines * TILE, lines, added * before, x)
+    channels = x.shape[0]
+    add_weighted(sums, row * padded_inside(channels) * TILE, channels, added * before, x)
 
 
 @kernel
@@ -66,10 +67,10 @@ def splat(
     image: Array,
     alpha: Array,
 ) -> None:
-    """(M, padded(C)) values in depth order -> fills (H, W, C) image and (H, W, 1) alpha, all float32."""
+    """(M, C) values in depth order -> fills (H, W, C) image and (H, W, 1) alpha, all float32."""
     count = tiles.starts.shape[0] - 1
-    height, width, _ = image.shape
-    sums = np.empty(PIXELS * values.shape[1], np.float32)
+    height, width, channels = image.shape
+    sums = np.empty(PIXELS * padded_inside(channels), np.float32)
     for i in range(first, last):
         tile = spread(i, count)
         transmittance = start_tile(tile, tiles, width, height)
@@ -394,7 +395,7 @@ class TileOperator(LiftingView):
 
     @abstractmethod
     def _splat_part(self, values: Array, image: Array, alpha: Array) -> None:
-        """(M, padded(C)) values in depth order -> fill (H, W, C) image and (H, W, 1) alpha."""
+        """(M, C) values in depth order -> fill (H, W, C) image and (H, W, 1) alpha."""
 
     @abstractmethod
     def _gather_part(self, image: Array, partial: Array) -> None:
@@ -403,14 +404,21 @@ class TileOperator(LiftingView):
     def splat(self, values: Array) -> tuple[Array, Array]:
         """Blend (N, C) finite values into (H, W, C) and alpha (H, W), float32."""
         check_array("values", values, (self.count, "C"))
-        ordered = values[self.order]
+        return self.splat_rows(values[self.order])
+
+    @property
+    def rows(self) -> Array:
+        return self.order
+
+    def splat_rows(self, ordered: Array) -> tuple[Array, Array]:
+        check_array("values", ordered, (len(self.order), "C"))
         height, width, channels = self.camera.height, self.camera.width, ordered.shape[1]
         alpha = np.empty((height, width, 1), np.float32)
         parts = []
         for start in range(0, max(channels, 1), _CHANNELS_AT_ONCE):
             part = ordered[:, start : start + _CHANNELS_AT_ONCE]
             image = np.empty((height, width, part.shape[1]), np.float32)
-            self._splat_part(in_fours(part), image, alpha)
+            self._splat_part(plain(part), image, alpha)
             parts.append(image)
         return parts[0] if len(parts) == 1 else np.concatenate(parts, -1), alpha[..., 0]
 
@@ -427,13 +435,3 @@ class TileOperator(LiftingView):
             self.workers.run(sum_partials, len(self.order), self.tiles, self.order, partial, out)
             values[:, start : start + _CHANNELS_AT_ONCE] = out
         return values
-
-
-def in_fours(values: Array) -> Array:
-    """(M, C) values as float32 (M, padded(C)), the last column zero where it was added."""
-    count, channels = values.shape
-    if padded(channels) == channels:
-        return plain(values)
-    wide = np.zeros((count, padded(channels)), np.float32)
-    wide[:, :channels] = values
-    return wide

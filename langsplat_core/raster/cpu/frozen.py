@@ -25,6 +25,7 @@ from langsplat_core.raster.cpu.tiles import (
     load_tile,
     nothing_to_close,
     pack_span,
+    padded_inside,
     spread,
     start_tile,
     unpack_span,
@@ -114,9 +115,9 @@ def keep_weights(
 def splat(
     first: int, last: int, tiles: Tiles, firsts: Array, weights: Array, values: Array, image: Array
 ) -> None:
-    """(M, padded(C)) values in depth order -> fills (H, W, C) image; `tiles.rows` are the spans of
-    `find_spans`."""
-    count, lines = tiles.starts.shape[0] - 1, values.shape[1]
+    """(M, C) values in depth order -> fills (H, W, C) image; `tiles.rows` are the spans of `find_spans`."""
+    count, channels = tiles.starts.shape[0] - 1, values.shape[1]
+    lines = padded_inside(channels)
     sums = np.empty(PIXELS * lines, np.float32)
     for i in range(first, last):
         tile = spread(i, count)
@@ -124,11 +125,11 @@ def splat(
         end = tiles.starts[tile + 1]
         for s in range(tiles.starts[tile], end):
             low, high = unpack_span(tiles.rows[s])
-            prefetch(values, np.int64(tiles.ranks[min(s + AHEAD, end - 1)]) * lines)
+            prefetch(values, np.int64(tiles.ranks[min(s + AHEAD, end - 1)]) * channels)
             x = values[tiles.ranks[s]]
             at = firsts[s] * TILE
             for row in range(low, high):
-                add_weighted(sums, row * lines * TILE, lines, load_units(weights, at), x)
+                add_weighted(sums, row * lines * TILE, channels, load_units(weights, at), x)
                 at += TILE
         write_tile(sums, image, tile, tiles.columns)
 

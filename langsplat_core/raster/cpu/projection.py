@@ -19,6 +19,7 @@ import numpy as np
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.compiled import helper, kernel, plain, shared_workers
 from langsplat_core.config import RasterSettings
+from langsplat_core.raster.cpu.lanes import prefetch
 from langsplat_core.raster.protocol import farthest, tangent_limits
 from langsplat_core.scene import Camera
 from langsplat_core.scene.gaussians import LARGEST_COEFFICIENT
@@ -26,11 +27,13 @@ from langsplat_core.scene.transform import C0, C1, C2, C3
 
 COLUMNS = 8  # of the geometry: one cache line a row
 INVALID, UNDRAWN, DRAWN = 0, 1, 2  # what `project` says of a row
+UNKNOWN, UNUSABLE = 0.0, -1.0  # sizes of rows that no view has come to yet, and of those that are not valid
 MEAN_X, MEAN_Y, FACTOR_A, FACTOR_K, FACTOR_C, LOG2_OPACITY, HALF_WIDTH, HALF_HEIGHT = range(8)  # columns
 HALF_LOG2_E = 0.5 / np.log(2.0)
 LN2 = np.log(2.0)
 COMPENSATION_MIN = 0.005**2  # floor of det before / det after dilation, as gsplat has it
 _MAX_LOG_SCALE, _MIN_QUAT_SQUARED = 80.0, 1e-24  # see Gaussians.valid
+_TINY = 1e-30
 _LARGEST_BITS = int(np.float32(LARGEST_COEFFICIENT).view(np.uint32))  # positive floats order as their bits
 
 
@@ -45,6 +48,7 @@ class Rows(NamedTuple):
     quats_wxyz: Array  # (N, 4) float32
     opacity_logits: Array  # (N,) float32
     sh_bits: Array  # (N, 3 K) uint32: the SH coefficients' bits, only to see whether they are usable
+    sizes: Array  # (N,) float32 the largest of a row's scales or a little more; see `UNKNOWN`, `UNUSABLE`
 
 
 class Projected(NamedTuple):
@@ -76,10 +80,18 @@ class KernelCamera(NamedTuple):
     alpha_min: float
     antialiased: bool
     orthographic: bool
+    reach_x: float  # bounds of a footprint's half width and height: px for each unit of size over depth
+    reach_y: float
+    margin: float  # px that are to be added
 
 
 def kernel_camera(camera: Camera, settings: RasterSettings) -> KernelCamera:
     left, top, right, bottom = tangent_limits(camera, settings)
+    # Half width = reach sqrt((A A^T)_xx + dilation), A = J R S: so at most
+    # reach (|J_x| |R| size + sqrt(dilation)).
+    reach = np.sqrt(-2 * np.log(min(settings.alpha_min, 1.0)))
+    wide, high = (0.0, 0.0) if camera.orthographic else (max(left, right), max(top, bottom))
+    most = 1.001 * reach * np.linalg.norm(camera.rotation, 2)  # 1.001: room for rounding
     return KernelCamera(
         rotation=np.ascontiguousarray(camera.rotation),
         translation=np.ascontiguousarray(camera.world_to_camera[:3, 3]),
@@ -99,6 +111,9 @@ def kernel_camera(camera: Camera, settings: RasterSettings) -> KernelCamera:
         alpha_min=float(settings.alpha_min),
         antialiased=bool(settings.antialiased),
         orthographic=camera.orthographic,
+        reach_x=float(most * camera.fx * np.hypot(1, wide)),
+        reach_y=float(most * camera.fy * np.hypot(1, high)),
+        margin=float(1.001 * reach * np.sqrt(settings.dilation) + 1e-3),
     )
 
 
@@ -203,32 +218,52 @@ def _is_valid(rows: Rows, i: int) -> bool:
     return ok & np.isfinite(squared) & (squared > _MIN_QUAT_SQUARED) & (highest <= np.uint32(_LARGEST_BITS))
 
 
+@helper
+def _is_outside(x: float, y: float, over: float, size: float, camera: KernelCamera) -> bool:
+    """True only for footprints that cannot meet a pixel centre, whatever their shape: most of those that do
+    not. `over`: depth, or 1 without perspective."""
+    u, v = camera.fx * x / over + camera.cx, camera.fy * y / over + camera.cy
+    wide = camera.reach_x * size / over + camera.margin
+    high = camera.reach_y * size / over + camera.margin
+    return (u + wide < 0) | (u - wide > camera.width) | (v + high < 0) | (v - high > camera.height)
+
+
 @kernel
 def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Projected) -> None:
-    """Fill `out` for rows [first, last).
+    """Fill `out` for rows [first, last), and sizes that are not known yet.
 
     A Gaussian whose alpha = alpha_min contour meets no pixel centre is UNDRAWN.
     """
     work = np.empty((3, 3, 3))
+    log2_least = np.log2(camera.alpha_min)
     for i in range(first, last):
-        if not _is_valid(rows, i):
+        size = rows.sizes[i]
+        if size == UNUSABLE or (size == UNKNOWN and not _is_valid(rows, i)):
+            rows.sizes[i] = UNUSABLE
             out.status[i] = INVALID
             continue
         out.status[i] = UNDRAWN
         x, y, z = camera_point(rows.means[i], camera)
-        opacity = opacity_of(rows.opacity_logits[i])
-        if not (camera.near < z <= camera.far and opacity >= camera.alpha_min):
+        if not (camera.near < z <= camera.far):
             continue
-        fill_axes((x, y, z), rows.log_scales[i], rows.quats_wxyz[i], camera, work)
+        over = 1.0 if camera.orthographic else z
+        if size != UNKNOWN and _is_outside(x, y, over, size, camera):
+            continue
+        opacity = opacity_of(rows.opacity_logits[i])
+        if not opacity >= camera.alpha_min:
+            continue
+        scales, _ = fill_axes((x, y, z), rows.log_scales[i], rows.quats_wxyz[i], camera, work)
+        if size == UNKNOWN:
+            rows.sizes[i] = 1.000001 * max(scales[0], scales[1], scales[2]) + _TINY
         xx, xy, yy, det, sharp = covariance(work[2], camera.dilation)
         if camera.antialiased:
             opacity *= np.sqrt(max(sharp / det, COMPENSATION_MIN))
             if opacity < camera.alpha_min:
                 continue
-        reach = np.sqrt(2 * np.log(max(opacity / camera.alpha_min, 1.0)))
-        over = 1.0 if camera.orthographic else z
+        log2_opacity = np.log2(opacity)
+        reach = 2 * LN2 * max(log2_opacity - log2_least, 0.0)  # squared
         u, v = camera.fx * x / over + camera.cx, camera.fy * y / over + camera.cy
-        wide, high = reach * np.sqrt(xx), reach * np.sqrt(yy)
+        wide, high = np.sqrt(reach * xx), np.sqrt(reach * yy)
         right, bottom = camera.width - 0.5, camera.height - 0.5  # the last pixel's centre
         if u + wide < 0.5 or u - wide > right or v + high < 0.5 or v - high > bottom:
             continue
@@ -239,7 +274,7 @@ def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Projec
         g[FACTOR_A] = np.sqrt(HALF_LOG2_E * yy / det)
         g[FACTOR_K] = xy / yy
         g[FACTOR_C] = np.sqrt(HALF_LOG2_E / yy)
-        g[LOG2_OPACITY] = np.log2(opacity)
+        g[LOG2_OPACITY] = log2_opacity
         g[HALF_WIDTH], g[HALF_HEIGHT] = wide, high
 
 
@@ -247,6 +282,7 @@ def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Projec
 
 _C20, _C21, _C22 = C2
 _C30, _C31, _C32, _C33, _C34 = C3
+_AHEAD = 20  # rows between asking for a Gaussian and using it
 _NEAREST = 1e-12  # world units; a Gaussian closer to the camera than this has no direction
 
 
@@ -306,14 +342,22 @@ def _channel(sh: Array, b: Array, channel: int) -> float:
 
 
 @kernel
-def _forward(first: int, last: int, sh: Array, means: Array, position: Array, out: Array) -> None:
+def _forward(
+    first: int, last: int, rows: Array, sh: Array, means: Array, position: Array, out: Array
+) -> None:
+    """out[place] <- colour of the Gaussian rows[place]; columns of `out` beyond the third are left."""
     b = np.empty(sh.shape[1])
-    for n in range(first, last):
+    for place in range(first, last):
+        later = np.int64(rows[min(place + _AHEAD, last - 1)])
+        prefetch(means, 3 * later)
+        for start in range(0, 3 * sh.shape[1], 16):  # cache lines
+            prefetch(sh, 3 * sh.shape[1] * later + start)
+        n = rows[place]
         x, y, z, _ = _direction(means[n], position)
         _basis(x, y, z, b)
         for channel in range(3):
             value = _channel(sh[n], b, channel)
-            out[n, channel] = max(value, 0.0) if np.isfinite(value) else 0.0
+            out[place, channel] = max(value, 0.0) if np.isfinite(value) else 0.0
 
 
 @kernel
@@ -346,16 +390,18 @@ def _backward(
             means_grad[n, 2] = (dz - along * z) * inverse
 
 
-def colours(sh: Array, means: Array, camera_position: Array) -> Array:
-    """(N, K, 3) float32 coefficients, (N, 3) float32 means -> (N, 3) float32 display colours >= 0.
+def colours(sh: Array, means: Array, camera_position: Array, rows: Array | None = None) -> Array:
+    """(N, K, 3) float32 coefficients, (N, 3) float32 means -> (N, 3) float32 display colours >= 0; with
+    `rows`, (M,) int32, those of these Gaussians.
 
     Invalid rows give 0; see `spherical_harmonics.colours`.
     """
     n = check_array("sh", sh, ("N", "K", 3), dtype=np.float32)
     check_array("means", means, ("N", 3), n, dtype=np.float32)
-    out = np.empty(means.shape, np.float32)
+    rows = np.arange(len(sh), dtype=np.int32) if rows is None else rows
+    out = np.empty((len(rows), 3), np.float32)
     position = np.array(camera_position, np.float64)
-    shared_workers().run(_forward, len(sh), plain(sh), plain(means), position, out)
+    shared_workers().run(_forward, len(rows), rows, plain(sh), plain(means), position, out)
     return out
 
 

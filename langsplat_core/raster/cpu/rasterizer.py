@@ -6,6 +6,7 @@ per Gaussian in a fixed order.
 
 from collections.abc import Callable
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy import sparse
@@ -16,9 +17,10 @@ from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.progress import lap
 from langsplat_core.raster.cpu import backward, blend, projection
 from langsplat_core.raster.cpu.backward import GaussianGradients
-from langsplat_core.raster.cpu.blend import TileOperator, gather_labels, in_fours
+from langsplat_core.raster.cpu.blend import TileOperator, gather_labels
 from langsplat_core.raster.cpu.frozen import FrozenView
-from langsplat_core.raster.cpu.tiles import bin_tiles, depth_order, make_cutoffs
+from langsplat_core.raster.cpu.memory import Memory
+from langsplat_core.raster.cpu.tiles import bin_tiles, depth_order, make_cutoffs, padded
 from langsplat_core.raster.protocol import check_picture, mean_depth
 from langsplat_core.scene import Camera, Gaussians
 
@@ -27,7 +29,12 @@ class CpuView(TileOperator):
     """M drawn of N Gaussians, in depth order, with their tiles."""
 
     def __init__(
-        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, workers: Workers
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        settings: RasterSettings,
+        workers: Workers,
+        memory: Memory,
     ) -> None:
         n = len(gaussians)
         self._kernel_camera = projection.kernel_camera(camera, settings)
@@ -38,16 +45,21 @@ class CpuView(TileOperator):
             plain(gaussians.quats_wxyz),
             plain(gaussians.opacity_logits),
             plain(gaussians.sh).reshape(n, gaussians.sh.shape[1] * 3).view(np.uint32),
+            _sizes_of(gaussians),
         )
-        found = projection.Projected(np.empty((n, projection.COLUMNS)), np.empty(n), np.empty(n, np.uint8))
+        self._memory = memory
+        found = projection.Projected(
+            memory.empty((n, projection.COLUMNS), np.float64),
+            memory.empty((n,), np.float64),
+            memory.empty((n,), np.uint8),
+        )
         with lap("projection"):
             workers.run(projection.project, n, self._rows, self._kernel_camera, found)
         with lap("sort"):
-            order = depth_order(found.status, found.depths.view(np.uint64))
-            self._geometry = _aligned((len(order), projection.COLUMNS))
-            np.take(found.geometry, order, axis=0, out=self._geometry, mode="clip")
-            self._depths = found.depths[order]
-            tiles = bin_tiles(self._geometry, camera.width, camera.height, workers)
+            order, self._depths = depth_order(found.status, found.depths, memory)
+        with lap("tiles"):
+            size = camera.width, camera.height
+            self._geometry, tiles = bin_tiles(found.geometry, order, size, workers, memory)
         super().__init__(camera, n, order, tiles, workers)
         self.dropped = int(np.count_nonzero(found.status == projection.INVALID))
 
@@ -99,25 +111,21 @@ class CpuView(TileOperator):
         if alpha_grad is None:
             alpha_grad = np.zeros((height, width), np.float32)
         check_array("alpha_grad", alpha_grad, (height, width))
-        ordered = in_fours(values[self.order])
+        ordered = plain(values[self.order])
         grads = (plain(image_grad), plain(alpha_grad)[..., None])
-        columns = backward.MOMENTS + ordered.shape[1]
-        partial = np.empty((len(self.tiles.ranks), columns), np.float32)
-        self._over_tiles(backward.backward, ordered, grads, self._cutoffs, partial)
+        met, columns = len(self.tiles.ranks), backward.MOMENTS + padded(channels)
+        partial, reached = self._memory.empty((met, columns), np.float32), np.empty(met, bool)
+        self._over_tiles(backward.backward, ordered, grads, self._cutoffs, partial, reached)
         out = GaussianGradients(
-            *(np.zeros((n, *shape), np.float32) for shape in ((3,), (3,), (4,), (), (channels,), (2,)))
+            *(
+                self._memory.empty((n, *shape), np.float32)
+                for shape in ((3,), (3,), (4,), (), (channels,), (2,))
+            )
         )
-        self.workers.run(
-            backward.to_parameters,
-            len(self.order),
-            self.tiles,
-            self.order,
-            self._geometry,
-            partial,
-            self._rows,
-            self._kernel_camera,
-            out,
-        )
+        rank_of = np.full(n, -1, np.int32)
+        rank_of[self.order] = np.arange(len(self.order), dtype=np.int32)
+        sums = backward.Sums(rank_of, self._geometry, partial, reached)
+        self.workers.run(backward.to_parameters, n, self.tiles, sums, self._rows, self._kernel_camera, out)
         return out
 
     def _over_tiles(self, kernel: Callable[..., None], *arguments: Any) -> None:
@@ -146,11 +154,15 @@ class CpuView(TileOperator):
         return mean_depth(sums, weights)
 
 
-def _aligned(shape: tuple[int, int]) -> Array:
-    """An empty float64 array whose rows of eight begin at cache lines of 64 bytes."""
-    memory = np.empty(shape[0] * shape[1] + 7)
-    start = (-memory.ctypes.data // 8) % 8
-    return memory[start : start + shape[0] * shape[1]].reshape(shape)
+_SIZES: WeakKeyDictionary[Gaussians, Array] = WeakKeyDictionary()
+
+
+def _sizes_of(gaussians: Gaussians) -> Array:
+    """`projection.Rows.sizes`, which views fill; kept, as Gaussians are not changed."""
+    sizes = _SIZES.get(gaussians)
+    if sizes is None:
+        sizes = _SIZES[gaussians] = np.full(len(gaussians), projection.UNKNOWN, np.float32)
+    return sizes
 
 
 class CpuRasterizer:
@@ -162,8 +174,9 @@ class CpuRasterizer:
     def __init__(self, threads: int | None = None) -> None:
         """`threads` defaults to all cores this process may use; results do not depend on it."""
         self.workers = shared_workers(threads)
+        self._memory = Memory()
 
     def view(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA) -> CpuView:
         """Project on the CPU; InputError for an image that this machine's memory cannot hold."""
         check_picture(camera)
-        return CpuView(gaussians, camera, settings, self.workers)
+        return CpuView(gaussians, camera, settings, self.workers, self._memory)

@@ -1,6 +1,7 @@
 """Tiles of 16x16 pixels and the Gaussians that touch each, front to back: binning for the CPU backend."""
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,12 +30,15 @@ from langsplat_core.raster.cpu.lanes import (
     where_at_least,
     where_greater,
 )
+from langsplat_core.raster.cpu.memory import Memory
 
 TILE = 16
-_BLOCKS = 16  # pieces of the depth order that are binned side by side; the result does not depend on it
 _SLACK = 1e-3  # px by which footprints are widened here; the blending kernels test alpha itself
 _MOST = 2**31 - 1  # intersections of Gaussians and tiles in one view
-_DIGIT = 11  # bits per pass of the radix sort
+_DIGIT, _PASSES = 11, 3  # bits per pass of the radix sort, of 32
+_MOVES = 4  # for each depth, after which sorting by neighbours is given up
+_FEW = 32  # tiles, too few to count more closely
+_PIECES = 16  # of the depth order that are binned side by side; the result does not depend on it
 
 
 # Of a footprint: centre, half width, abscissa of its lowest point, slope and bulge of `_rows_in_column`; px.
@@ -47,6 +51,7 @@ class Grid(NamedTuple):
     width: float  # px; a float, as it is compared with floats
     height: float
     columns: int  # tiles per row of tiles
+    lines: int  # rows of tiles
 
 
 class Tiles(NamedTuple):
@@ -72,44 +77,82 @@ def unpack_span(packed: int) -> tuple[int, int]:
     return packed & 255, packed >> 8
 
 
-@kernel
-def depth_order(status: Array, depth_bits: Array) -> Array:
-    """(N,) status and depths reinterpreted as uint64 -> (M,) int32 drawn rows, by depth, ties by index.
+class Sorting(NamedTuple):
+    """Memory for what is sorted."""
 
-    Positive floats order as their bits do. Least significant digit first, each pass stable.
-    """
-    count = 0
+    keys: Array  # (2, M) uint32
+    order: Array  # (2, M) int32 rows; the second one is the result
+    depth_bits: Array  # (M,) uint64
+
+
+@helper
+def _fill_keys(status: Array, depth_bits: Array, out: Sorting, counts: Array) -> None:
+    """keys[0], order[0] <- the 32 leading bits in which drawn depths differ, and their rows; counts[digit,
+    value] <- how often."""
     low, high = np.uint64(2**64 - 1), np.uint64(0)
     for i in range(status.shape[0]):
         if status[i] == cp.DRAWN:
-            count += 1
             low, high = min(low, depth_bits[i]), max(high, depth_bits[i])
-    keys, order = np.empty(count, np.uint64), np.empty(count, np.int32)
-    count = 0
+    shift = np.uint64(0)
+    while low < high and (high - low) >> shift >= np.uint64(1 << 32):
+        shift += np.uint64(1)
+    n = 0
     for i in range(status.shape[0]):
         if status[i] == cp.DRAWN:
-            keys[count], order[count] = depth_bits[i] - low, i
-            count += 1
-    other_keys, other_order = np.empty_like(keys), np.empty_like(order)
-    shift = np.uint64(0)
-    while count > 1 and (high - low) >> shift > 0:
-        ends = np.zeros(1 << _DIGIT, np.int64)
-        for i in range(count):
-            ends[(keys[i] >> shift) & np.uint64((1 << _DIGIT) - 1)] += 1
-        total = 0
-        for digit in range(1 << _DIGIT):
-            total, ends[digit] = total + ends[digit], total
-        for i in range(count):
-            digit = (keys[i] >> shift) & np.uint64((1 << _DIGIT) - 1)
-            place = ends[digit]
-            ends[digit] = place + 1
-            other_keys[place], other_order[place] = keys[i], order[i]
-        keys, other_keys = other_keys, keys
-        order, other_order = other_order, order
-        shift += np.uint64(_DIGIT)
-        if shift >= np.uint64(64):
-            break
-    return order
+            key = np.uint32((depth_bits[i] - low) >> shift)
+            out.keys[0, n], out.order[0, n] = key, i
+            n += 1
+            for digit in range(_PASSES):
+                counts[digit, _digit_of(key, digit)] += 1
+
+
+@helper
+def _digit_of(key: Any, digit: int) -> Any:
+    return (key >> np.uint32(_DIGIT * digit)) & np.uint32((1 << _DIGIT) - 1)
+
+
+@kernel
+def _depth_order(status: Array, depth_bits: Array, out: Sorting) -> bool:
+    """(N,) status and depths reinterpreted as uint64 -> fills `out`, of the length of what is drawn, by
+    depth, ties by index. False where it gave up, as very many depths are nearly equal.
+
+    Positive floats order as their bits do. Sorted by their 32 leading bits that differ (radix, least
+    significant digit first, each pass stable); then neighbours that are still in the wrong order change
+    places.
+    """
+    ends = np.zeros((_PASSES, 1 << _DIGIT), np.int64)
+    _fill_keys(status, depth_bits, out, ends)
+    for digit in range(_PASSES):
+        here, total = digit % 2, 0
+        for value in range(1 << _DIGIT):
+            total, ends[digit, value] = total + ends[digit, value], total
+        for i in range(out.depth_bits.shape[0]):
+            key = out.keys[here, i]
+            value = _digit_of(key, digit)
+            place = ends[digit, value]
+            ends[digit, value] = place + 1
+            out.keys[1 - here, place], out.order[1 - here, place] = key, out.order[here, i]
+    order, ordered_bits, moves = out.order[_PASSES % 2], out.depth_bits, 0
+    for i in range(order.shape[0]):
+        row, bits, place = order[i], depth_bits[order[i]], i
+        while place > 0 and ordered_bits[place - 1] > bits and moves <= _MOVES * order.shape[0]:
+            order[place], ordered_bits[place] = order[place - 1], ordered_bits[place - 1]
+            place -= 1
+            moves += 1
+        order[place], ordered_bits[place] = row, bits
+    return moves <= _MOVES * order.shape[0]
+
+
+def depth_order(status: Array, depths: Array, memory: Memory) -> tuple[Array, Array]:
+    """(N,) status and positive depths -> (M,) int32 drawn rows, by depth, ties by index, and their depths."""
+    count = int(np.count_nonzero(status == cp.DRAWN))
+    keys, orders = memory.empty((2, count), np.uint32), memory.empty((2, count), np.int32)
+    bits = memory.empty((count,), np.uint64)
+    if _depth_order(status, depths.view(np.uint64), Sorting(keys, orders, bits)):
+        return orders[_PASSES % 2], bits.view(np.float64)
+    drawn = np.flatnonzero(status == cp.DRAWN)
+    order = drawn[np.argsort(depths[drawn], kind="stable")].astype(np.int32)
+    return order, depths[order]
 
 
 @helper
@@ -150,81 +193,111 @@ def _columns_touched(g: Array, grid: Grid) -> tuple[int, int]:
     return first // TILE, (last + TILE - 1) // TILE if last > first else first // TILE
 
 
-@kernel
-def _count(first: int, last: int, geometry: Array, grid: Grid, counts: Array, firsts: Array) -> None:
-    """For blocks [first, last): counts[block, tile] and firsts[rank + 1] <- how many intersections."""
-    share = (geometry.shape[0] + _BLOCKS - 1) // _BLOCKS
-    for block in range(first, last):
-        for rank in range(block * share, min(geometry.shape[0], (block + 1) * share)):
-            g = geometry[rank]
-            left, right = _columns_touched(g, grid)
-            ellipse = _ellipse(g)
-            touched = 0
-            for column in range(left, right):
-                low, high = _rows_in_column(ellipse, column, grid.height)
-                if low < high:
-                    for row in range(low // TILE, (high - 1) // TILE + 1):
-                        counts[block, row * grid.columns + column] += 1
-                        touched += 1
-            firsts[rank + 1] = touched
+@helper
+def _at_most(g: Array, grid: Grid) -> float:
+    """No fewer tiles than a footprint touches: those of its box; or, for a needle, of the area within a
+    tile's side of it (Steiner)."""
+    wide, high = 2 * g[cp.HALF_WIDTH] / TILE, 2 * g[cp.HALF_HEIGHT] / TILE
+    box = min(float(grid.columns), wide + 2) * min(float(grid.lines), high + 2)  # in this order also of a NaN
+    if box <= _FEW:
+        return box
+    a, c, k = g[cp.FACTOR_A], g[cp.FACTOR_C], g[cp.FACTOR_K]
+    area = 0.25 * np.pi * wide * wide * a * c / (a * a * k * k + c * c)
+    return min(box, area + 2 * (wide + high) + 5)
 
 
 @kernel
-def _accumulate(counts: Array, starts: Array, firsts: Array) -> None:
-    """Running sums: starts, firsts, and counts[block, tile] <- where the block writes in the tile."""
-    total = 0
-    for tile in range(counts.shape[1]):
-        starts[tile] = total
-        for block in range(_BLOCKS):
-            total, counts[block, tile] = total + counts[block, tile], total
-    starts[counts.shape[1]] = total
-    for rank in range(1, firsts.shape[0]):
-        firsts[rank] += firsts[rank - 1]
+def _touch(
+    first: int, last: int, order: Array, footprints: Array, grid: Grid, geometry: Array, firsts: Array
+) -> tuple[tuple[Array, Array, Array], int, Array]:
+    """For ranks [first, last): geometry[rank] <- footprints[order[rank]], firsts[rank + 1] <- how many tiles
+    it touches; returns the ranks, tiles and spans of rows of these intersections, their number, and how often
+    each tile of the image was touched."""
+    most = 0.0
+    for rank in range(first, last):
+        prefetch(footprints, np.int64(order[min(rank + 2 * AHEAD, last - 1)]) * cp.COLUMNS)
+        for n in range(cp.COLUMNS):
+            geometry[rank, n] = footprints[order[rank], n]
+        most += _at_most(geometry[rank], grid)
+    room = int(most) + 3  # two places are always written
+    touched = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(room, np.uint16)
+    ranks, where, spans = touched
+    counts = np.zeros((grid.lines + 2) * grid.columns, np.int64)  # the last two lines: the same
+    used = 0
+    for rank in range(first, last):
+        g, before = geometry[rank], used
+        left, right = _columns_touched(g, grid)
+        ellipse = _ellipse(g)
+        for column in range(left, right):
+            low, high = _rows_in_column(ellipse, column, grid.height)
+            line = low // TILE
+            lines = (high + TILE - 1) // TILE - line if low < high else 0
+            tile, top = line * grid.columns + column, line * TILE
+            # Most columns have one tile or two: writing two always, without a branch to foretell, is faster.
+            ranks[used], ranks[used + 1] = rank, rank
+            where[used], where[used + 1] = tile, tile + grid.columns
+            spans[used] = pack_span(low - top, min(high - top, TILE))
+            spans[used + 1] = pack_span(0, min(high - top - TILE, TILE))
+            counts[tile] += lines >= 1
+            counts[tile + grid.columns] += lines >= 2
+            for n in range(2, lines):
+                ranks[used + n], where[used + n] = rank, tile + n * grid.columns
+                spans[used + n] = pack_span(0, min(high - top - n * TILE, TILE))
+                counts[tile + n * grid.columns] += 1
+            used += lines
+        firsts[rank + 1] = used - before
+    return touched, used, counts
 
 
 @kernel
-def _place(first: int, last: int, geometry: Array, grid: Grid, places: Array, tiles: Tiles) -> None:
-    """The loop of `_count` again, now writing; within a tile ranks ascend, whoever runs which block."""
-    share = (geometry.shape[0] + _BLOCKS - 1) // _BLOCKS
-    for block in range(first, last):
-        for rank in range(block * share, min(geometry.shape[0], (block + 1) * share)):
-            g = geometry[rank]
-            mine = tiles.firsts[rank]
-            left, right = _columns_touched(g, grid)
-            ellipse = _ellipse(g)
-            for column in range(left, right):
-                low, high = _rows_in_column(ellipse, column, grid.height)
-                if low >= high:
-                    continue
-                for row in range(low // TILE, (high - 1) // TILE + 1):
-                    tile = row * grid.columns + column
-                    place = places[block, tile]
-                    places[block, tile] = place + 1
-                    tiles.ranks[place] = rank
-                    tiles.rows[place] = pack_span(max(low - row * TILE, 0), min(high - row * TILE, TILE))
-                    tiles.slots[mine] = place
-                    mine += 1
+def _place(
+    first: int, last: int, touched: tuple[Array, Array, Array], places: Array, start: int, tiles: Tiles
+) -> None:
+    """Write intersections [first, last) that `_touch` found into their tiles, those of a tile from
+    places[tile] on: within a tile ranks ascend, whoever runs which piece. They are the view's from `start`
+    on."""
+    ranks, where, spans = touched
+    for n in range(first, last):
+        tile = where[n]
+        place = places[tile]
+        places[tile] = place + 1
+        tiles.ranks[place], tiles.rows[place] = ranks[n], spans[n]
+        tiles.slots[start + n] = place
 
 
-def bin_tiles(geometry: Array, width: int, height: int, workers: Workers) -> Tiles:
-    """(M, 8) geometry in depth order -> the intersections with the tiles of a width x height image."""
-    columns, lines = -(-width // TILE), -(-height // TILE)
-    grid = Grid(float(width), float(height), columns)
-    counts = np.zeros((_BLOCKS, columns * lines), np.int64)
-    starts = np.empty(columns * lines + 1, np.int64)
-    firsts = np.zeros(len(geometry) + 1, np.int64)
-    workers.run(_count, _BLOCKS, geometry, grid, counts, firsts)
-    _accumulate(counts, starts, firsts)
-    total = int(starts[-1])
+def bin_tiles(
+    footprints: Array, order: Array, size: tuple[int, int], workers: Workers, memory: Memory
+) -> tuple[Array, Tiles]:
+    """(N, 8) footprints, (M,) the drawn ones in depth order -> (M, 8) geometry in that order, and the
+    intersections with the tiles of an image of `size`, width and height."""
+    geometry = memory.empty((len(order), cp.COLUMNS), np.float64)
+    width, height = size
+    grid = Grid(float(width), float(height), -(-width // TILE), -(-height // TILE))
+    firsts = memory.empty((len(order) + 1,), np.int64)
+    firsts[0] = 0
+    edges = [len(order) * i // _PIECES for i in range(_PIECES + 1)]
+    pieces = list(pairwise(edges))
+    shared = order, footprints, grid, geometry, firsts
+    found = workers.each(_touch, [(*piece, *shared) for piece in pieces])
+    np.cumsum(firsts, out=firsts)
+    total = int(firsts[-1])
     if total > _MOST:
         raise BackendError(
             f"{total} overlaps of Gaussians and tiles are too many for the CPU rasterizer: "
             "render a smaller image"
         )
-    ranks, rows, slots = np.empty(total, np.int32), np.empty(total, np.uint16), np.empty(total, np.int32)
-    tiles = Tiles(starts, ranks, rows, firsts, slots, columns)
-    workers.run(_place, _BLOCKS, geometry, grid, counts, tiles)
-    return tiles
+    # Where each piece writes in each tile: tile by tile, and in a tile piece by piece.
+    counts = np.stack([counts[: grid.columns * grid.lines] for _, _, counts in found], 1)
+    ends = np.cumsum(counts).reshape(counts.shape)
+    places = np.ascontiguousarray((ends - counts).T)
+    starts = np.append(places[0], total)
+    ranks, rows, slots = (memory.empty((total,), kind) for kind in (np.int32, np.uint16, np.int32))
+    tiles = Tiles(starts, ranks, rows, firsts, slots, grid.columns)
+    calls = []
+    for (first, _), (touched, used, _), places_of_it in zip(pieces, found, places, strict=True):
+        calls.append((0, used, touched, places_of_it, int(firsts[first]), tiles))
+    workers.each(_place, calls)
+    return geometry, tiles
 
 
 @helper
@@ -250,7 +323,7 @@ def spread(index: int, count: int) -> int:
 
 
 def padded(channels: int) -> int:
-    """Channels are blended in fours; three take a fourth along, which is zero."""
+    """Lines of a tile's planes for so many channels, which go in fours: three have room for a fourth."""
     return channels + (channels % 4 == 3)
 
 
@@ -260,14 +333,13 @@ padded_inside = helper(padded)
 @helper
 def add_weighted(sums: Array, at: int, channels: int, weight: Lanes, x: Array) -> None:
     """sums[at + 16 channel : + 16] += weight x[channel]"""
-    fours = channels & ~3
-    for channel in range(0, fours, 4):
+    for channel in range(0, channels & ~3, 4):
         store(sums, at, load(sums, at) + weight * x[channel])
         store(sums, at + TILE, load(sums, at + TILE) + weight * x[channel + 1])
         store(sums, at + 2 * TILE, load(sums, at + 2 * TILE) + weight * x[channel + 2])
         store(sums, at + 3 * TILE, load(sums, at + 3 * TILE) + weight * x[channel + 3])
         at += 4 * TILE
-    for channel in range(fours, channels):
+    for channel in range(channels & ~3, channels):
         store(sums, at, load(sums, at) + weight * x[channel])
         at += TILE
 
