@@ -262,8 +262,8 @@ def apply_locks(viewer: Viewer) -> None:
     state.selection = replace(state.selection, locked=locked, marks=kept)
 
 
-def group(viewer: Viewer, node: int, onto: int | Group) -> None:
-    """Put a thing into a group, or make one of two."""
+def group(viewer: Viewer, node: int, onto: int | Group | None) -> None:
+    """Put a thing into a group, or into a new one, with the node `onto` where that is given."""
     things = viewer.state.things
     others = tuple(g for g in (_without(g, node) for g in things.groups) if g is not None)
     if isinstance(onto, Group):
@@ -273,7 +273,7 @@ def group(viewer: Viewer, node: int, onto: int | Group) -> None:
     else:
         taken = {g.name for g in things.groups}
         name = next(f"group {k}" for k in range(1, len(taken) + 2) if f"group {k}" not in taken)
-        new = (*others, Group(name, (onto, node)))
+        new = (*others, Group(name, (node,) if onto is None else (onto, node)))
     remember(viewer)
     viewer.state.things = replace(things, groups=new)
 

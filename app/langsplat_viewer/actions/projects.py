@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from langsplat_core.arrays import Array
 from langsplat_core.errors import LangSplatError
-from langsplat_viewer.actions.history import now
+from langsplat_viewer.actions.history import now, remember
 from langsplat_viewer.actions.outline import apply_locks
 from langsplat_viewer.actions.queries import listed_queries
 from langsplat_viewer.actions.settings import have_panels, open_panel
@@ -22,6 +23,7 @@ from langsplat_viewer.files.projects import (
     Note,
     Project,
     Things,
+    known_things,
     write_project,
 )
 from langsplat_viewer.jobs import one_line
@@ -49,21 +51,43 @@ def pin_at(viewer: Viewer, u: float, v: float) -> None:
     """Pin a note to the surface; (u, v) are fractions of the scene's area."""
     state = viewer.state
     point = None if viewer.surface is None else viewer.surface.point_at(u, v)
-    if point is None or len(state.notes) >= MOST_NOTES:
-        state.say("nothing under the cursor to pin a note to" if point is None else "no room for more notes")
+    if point is None:
+        state.say("nothing under the cursor to pin a note to")
+    else:
+        _pin(viewer, point)
+
+
+def pin_to_selection(viewer: Viewer) -> None:
+    """Pin a note to the middle of what is selected."""
+    state, chosen = viewer.state, viewer.state.selection.marks.selected
+    if state.scene is None or not chosen.any():
+        state.say("select something first, then pin a note to it", is_error=True)
         return
+    means = state.scene.gaussians.means[chosen].astype(np.float64)
+    _pin(viewer, means[np.argmin(((means - np.median(means, axis=0)) ** 2).sum(1))])
+    open_panel(viewer, "Notes")
+
+
+def _pin(viewer: Viewer, point: Array) -> None:
+    state = viewer.state
+    if len(state.notes) >= MOST_NOTES:
+        state.say("no room for more notes", is_error=True)
+        return
+    remember(viewer)
     x, y, z = (float(part) for part in point)
     state.notes, state.pins_notes = (*state.notes, Note(f"note {len(state.notes) + 1}", (x, y, z))), False
 
 
 def write_note(viewer: Viewer, note: Note, text: str) -> None:
     """Change the text of a note."""
+    remember(viewer, f"note at {note.at}")
     changed = replace(note, text=text[:LONGEST_NOTE])
     viewer.state.notes = tuple(changed if other is note else other for other in viewer.state.notes)
 
 
 def remove_note(viewer: Viewer, note: Note) -> None:
     """Take a note off."""
+    remember(viewer)
     viewer.state.notes = tuple(other for other in viewer.state.notes if other is not note)
 
 
@@ -138,7 +162,8 @@ def restore(viewer: Viewer, project: Project, path: Path) -> Visit:
     state = viewer.state
     assert state.scene is not None
     if len(state.scene.gaussians) == project.count:
-        state.things = project.things
+        nodes = 0 if viewer.engine is None else viewer.engine.tree.count
+        state.things = known_things(project.things, nodes)
         apply_locks(viewer)
         pair = Pair(state.selection.marks, now(viewer).marks)
         state.selection = replace(state.selection, marks=unpack(project.marks, pair))

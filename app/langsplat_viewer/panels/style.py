@@ -104,6 +104,9 @@ def stoppable(label: str, fraction: float, tag: str = "") -> bool:
     from others of its name."""
     cancel = imgui.calc_text_size("Cancel").x + 2 * imgui.get_style().frame_padding.x
     width = -cancel - imgui.get_style().item_spacing.x
+    if width_of(label) > imgui.get_content_region_avail().x + width:  # no room for it in the bar
+        imgui.text_wrapped(label)
+        label = ""
     imgui.push_style_color(imgui.Col_.plot_histogram, imgui.get_style_color_vec4(imgui.Col_.button_active))
     imgui.progress_bar(fraction, ImVec2(width, 0), label)
     imgui.pop_style_color()

@@ -199,6 +199,10 @@ def draw_notes(viewer: Viewer) -> None:
     )
     if changed:
         projects.pin_notes(viewer, pins)
+    imgui.begin_disabled(not state.selection.marks.selected.any())
+    if imgui.button("Pin one to the selection"):
+        projects.pin_to_selection(viewer)
+    imgui.end_disabled()
     beside("Save project")
     if imgui.button("Save project"):
         projects.save_project(viewer, Path.cwd())
