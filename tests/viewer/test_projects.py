@@ -20,6 +20,7 @@ from langsplat_viewer.actions import (
     selecting,
     settings,
     transforming,
+    undoing,
     viewpoint,
 )
 from langsplat_viewer.camera.controls import orbit
@@ -206,3 +207,19 @@ def test_notes_are_pinned_written_and_taken_off(opened):
     settings.escape(opened)
     projects.remove_note(opened, opened.state.notes[0])
     assert opened.state.notes == ()
+    undoing.undo(opened)
+    assert [len(note.text) for note in opened.state.notes] == [500]
+    undoing.undo(opened)
+    assert opened.state.notes == (note,)
+    undoing.redo(opened)
+    undoing.redo(opened)
+    assert opened.state.notes == ()
+
+
+def test_a_note_is_pinned_to_what_is_selected(opened):
+    projects.pin_to_selection(opened)
+    assert "select something" in errors(opened)[-1]
+    selecting.take(opened, blob("book"))
+    projects.pin_to_selection(opened)
+    np.testing.assert_allclose(opened.state.notes[0].at, CENTRES[1], atol=0.1)
+    assert settings.take_wanted_panel(opened) == "Notes"

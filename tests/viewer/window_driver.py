@@ -358,11 +358,11 @@ def close_while_opening(s: Session) -> None:
 
 
 def use_the_palette(s: Session) -> None:
-    """Its keys keep away from the scrollbar; Enter does the first command that matches."""
+    """Its keys keep away from the scrollbar; Enter does the first command that matches, which is lit."""
     s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.p)
     s.ctx.yield_(3)
     box, bar = s.ctx.item_info("//Commands/##command").rect_full, imgui.get_style().scrollbar_size
-    right, rows = int(box.max.x - bar), slice(int(box.max.y) + 10, int(box.max.y) + 150)
+    right, rows = int(box.max.x - bar), slice(int(box.max.y) + 30, int(box.max.y) + 150)
     seen = s.shot("palette")[rows]
     assert np.ptp(seen[:, right - 100 : right], axis=0).max() > 60  # keys
     assert np.ptp(seen[:, right - 5 : right - 1], axis=0).max() < 10
@@ -598,6 +598,16 @@ def travel_by_keys(s: Session) -> None:
         s.ctx.key_chars_append_enter(words)
         s.wait(done)
         s.settle()
+    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.p)
+    s.ctx.yield_(3)
+    s.ctx.key_chars("show")  # arrows choose another command than the first
+    s.ctx.yield_(2)
+    for _ in range(3):
+        s.ctx.key_press(imgui.Key.down_arrow)
+        s.ctx.yield_(2)
+    s.ctx.key_press(imgui.Key.enter)
+    s.ctx.yield_(3)
+    assert s.state.picture.display == "depth"
     s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.p)
     s.ctx.yield_(3)
     s.ctx.key_chars_append_enter("teleport")

@@ -162,8 +162,9 @@ def restore(viewer: Viewer, project: Project, path: Path) -> Visit:
     state = viewer.state
     assert state.scene is not None
     if len(state.scene.gaussians) == project.count:
-        nodes = 0 if viewer.engine is None else viewer.engine.tree.count
-        state.things = known_things(project.things, nodes)
+        state.things = Things()
+        if project.things != Things() and viewer.engine is not None and state.scene.language is not None:
+            state.things = known_things(project.things, viewer.engine.tree.count)
         apply_locks(viewer)
         pair = Pair(state.selection.marks, now(viewer).marks)
         state.selection = replace(state.selection, marks=unpack(project.marks, pair))

@@ -72,11 +72,11 @@ def _row(viewer: Viewer, row: Outline, *, in_group: bool = False) -> None:
         if row.word and row.node not in viewer.state.things.names
         else ""
     )
-    room = (
-        imgui.get_content_region_avail().x - 2 * side - 2 * spacing - imgui.get_tree_node_to_label_spacing()
-    )
+    icons = (2 if colour is None else 3) * (side + spacing)
+    room = imgui.get_content_region_avail().x - icons - imgui.get_tree_node_to_label_spacing()
+    label = elided(name + sure, room, width_of)
     imgui.align_text_to_frame_padding()
-    opened = imgui.tree_node_ex(f"{elided(name + sure, room, width_of)}###row", flags)
+    opened = imgui.tree_node_ex(f"{label}###row", flags)
     if _chosen("thing"):
         outline.visit(viewer, row.node)
     _about(row, name)
@@ -89,6 +89,13 @@ def _row(viewer: Viewer, row: Outline, *, in_group: bool = False) -> None:
         _things_menu(viewer, row.node)
         _group_menu(viewer, row.node, in_group)
         imgui.end_popup()
+    left = room - width_of(label) - 2 * spacing
+    said = next(
+        (text for text in (f"{row.count:,}   {_sides(row)}", f"{row.count:,}") if width_of(text) < left), ""
+    )
+    if said:
+        imgui.same_line(right - icons - width_of(said))
+        imgui.text_colored(muted(), said)
     if colour is not None:
         imgui.same_line(right - 3 * side - 2 * spacing)
         _swatch(colour, side)
@@ -129,9 +136,12 @@ def _group_menu(viewer: Viewer, node: int, in_group: bool) -> None:
 
 
 def _about(row: Outline, name: str) -> None:
-    sides = " x ".join(f"{side:.3g}" for side in row.size)
     outlined = f"outlined in {row.votes[0]} of {sum(row.votes)} photographs"
-    tip(f"{name}: {row.count:,} Gaussians, {sides} world units, {outlined}")
+    tip(f"{name}: {row.count:,} Gaussians, {_sides(row)} world units, {outlined}")
+
+
+def _sides(row: Outline) -> str:
+    return " x ".join(f"{side:.2g}" for side in row.size)
 
 
 def _eye(viewer: Viewer, node: int, side: float) -> None:
