@@ -13,6 +13,8 @@ import numpy as np
 from PIL import Image
 
 from imgui_bundle import ImVec2, hello_imgui, imgui  # isort: skip
+from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
+import glfw  # isort: skip
 from imgui_bundle.immapp import testing  # isort: skip
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.displays import QUERY_COLOURS
@@ -371,6 +373,26 @@ def use_the_palette(s: Session) -> None:
     assert s.state.picture.display == "depth"
     assert not s.state.show_palette
 
+    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.p)
+    s.ctx.yield_(3)
+    glfw.set_window_size(glfw_window_hello_imgui(), 1100, 600)
+    s.wait(lambda: imgui.get_main_viewport().size.x == 1100)
+    s.ctx.yield_(3)
+    palette = s.ctx.window_info("//Commands").window
+    assert abs(palette.pos.x + palette.size.x / 2 - 550) < 2
+    s.ctx.key_press(imgui.Key.escape)
+    glfw.set_window_size(glfw_window_hello_imgui(), 860, 620)
+    s.settle()
+
+
+def look_from_the_broad_side(s: Session) -> None:
+    """Without cameras, and upright: the blobs lie beside each other, none behind another."""
+    assert s.state.scene.cameras == ()
+    assert abs(s.state.view.rotation[2] @ [1, 0, 0]) < 0.5  # along which the blobs lie
+    assert abs(s.state.view.rotation[0] @ s.state.view.up) < 1e-6
+    rgb = s.shot("bare")
+    assert [s.at(rgb, thing).argmax() for thing in CENTRES] == [0, 1, 2]
+
 
 def use_shortcuts(s: Session) -> None:
     """Chords work everywhere, letters only by themselves and never while typing."""
@@ -531,6 +553,8 @@ def leave_settings(s: Session) -> None:
     assert s.state.show_help  # at the first start
     s.ctx.key_press(imgui.Key.escape)
     s.menu("Window", "Light theme")
+    for title in ("Select", "Train", "Record"):  # which do not lie over the search the next time
+        s.menu("Window", title)
     s.menu("Window", "Display")
     s.ctx.yield_(3)
     s.ctx.key_press(imgui.Key.f11)  # hidden at the end, there again the next time
@@ -680,6 +704,7 @@ SCENARIOS = {
     "type_while_opening": (type_while_opening, "blobs.ply", {"load": slow_load}),
     "travel_by_keys": (travel_by_keys, "blobs.ply", {}),
     "end_by_signals": (end_by_signals, "blobs.ply", {}),
+    "look_from_the_broad_side": (look_from_the_broad_side, "bare.ply", {}),
     "look_at_nothing": (look_at_nothing, "nothing.ply", {}),
     **scenarios_scene.SELECTING,
     **scenarios_panels.RECORD,
