@@ -92,6 +92,11 @@ def test_everything_comes_back(opened, saved, again):
     assert settings.take_wanted_panel(again) == ""
     assert after.shows_panels == ("Search", "Notes")
     assert not after.selection.is_unsaved
+    assert (before.preferences.recent[0], after.preferences.recent[0]) == (str(saved), str(saved))
+    queries.remove_all(again)
+    opening.open_recent(again, str(saved))
+    settle(again)
+    assert len(after.queries) == 4
     assert projects.save_project(again, Path("/nowhere")) == saved  # where it came from
 
 

@@ -26,7 +26,7 @@ def folder(tmp_path: Path) -> Path:
     """Scenes with and without a language field, one cut short, and one of which nothing can be drawn."""
     for name, field in (("blobs", True), ("plain", False)):
         save_scene(tmp_path / f"{name}.ply", replace(blob_scene(field=field), path=None))
-    save_scene(tmp_path / "bare.ply", replace(blob_scene(with_cameras=False), path=None))
+    save_scene(tmp_path / "wide.ply", replace(blob_scene(with_cameras=False), path=None))
     gaussians = replace(blob_scene().gaussians, opacity_logits=np.full(360, np.nan))
     save_scene(tmp_path / "nothing.ply", Scene(gaussians))
     whole = (tmp_path / "plain.ply").read_bytes()

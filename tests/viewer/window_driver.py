@@ -704,7 +704,7 @@ SCENARIOS = {
     "type_while_opening": (type_while_opening, "blobs.ply", {"load": slow_load}),
     "travel_by_keys": (travel_by_keys, "blobs.ply", {}),
     "end_by_signals": (end_by_signals, "blobs.ply", {}),
-    "look_from_the_broad_side": (look_from_the_broad_side, "bare.ply", {}),
+    "look_from_the_broad_side": (look_from_the_broad_side, "wide.ply", {}),
     "look_at_nothing": (look_at_nothing, "nothing.ply", {}),
     **scenarios_scene.SELECTING,
     **scenarios_panels.RECORD,

@@ -571,9 +571,9 @@ def _ask_sets(viewer: Viewer, sets: Sequence[Path]) -> None:
 
 
 def open_recent(viewer: Viewer, path: str) -> None:
-    """Open a scene again that was open before."""
+    """Open a scene or a project again that was open before."""
     close_browser(viewer)
-    open_scene(viewer, Path(path))
+    open_file(viewer, Path(path))
 
 
 def type_path(viewer: Viewer, text: str) -> None:

@@ -17,6 +17,7 @@ from langsplat_viewer.actions.viewpoint import bookmarked_view
 from langsplat_viewer.camera.flight import pose_of
 from langsplat_viewer.files import PROJECTS
 from langsplat_viewer.files.flights import Bookmark
+from langsplat_viewer.files.preferences import with_recent
 from langsplat_viewer.files.projects import (
     LONGEST_NOTE,
     MOST_NOTES,
@@ -124,7 +125,7 @@ def save_project(viewer: Viewer, folder: Path) -> Path | None:
     except OSError as error:
         state.say(f"{path}: not saved ({one_line(error)})", is_error=True)
         return None
-    state.project = path
+    state.project, state.preferences = path, with_recent(state.preferences, path)
     marks, moves = state.selection.marks, state.selection.moves
     state.selection = replace(state.selection, saved=marks.deleted, saved_moves=moves)
     state.say(f"saved {path}")
@@ -179,6 +180,7 @@ def restore(viewer: Viewer, project: Project, path: Path) -> Visit:
         state.say(f"the scene has changed since: {what}", is_error=True)
     state.picture = project.picture
     state.notes, state.project = project.notes, path
+    state.preferences = with_recent(state.preferences, path)
     state.bookmarks = project.bookmarks or state.bookmarks
     if project.panels:
         state.preferences = replace(state.preferences, panels=project.panels)

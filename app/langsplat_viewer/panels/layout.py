@@ -165,7 +165,8 @@ def draw_help(viewer: Viewer) -> None:
         return
     flags = imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_collapse
     area, room = scene_area(), imgui.get_main_viewport().work_size
-    centre = ImVec2(area.left + area.width / 2, area.top + area.height / 2)
+    half = hello_imgui.em_size(KEYS_EM + DOES_EM + 4) / 2
+    centre = ImVec2(min(area.left + area.width / 2, room.x - half), area.top + area.height / 2)
     imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(room.x, HELP_SHARE * room.y))
     imgui.set_next_window_pos(centre, imgui.Cond_.always, ImVec2(0.5, 0.5))
     imgui.set_next_window_bg_alpha(1.0)
