@@ -37,8 +37,8 @@ OPENED = 100
 ACTIONS_EACH = 20  # of one scene: 2000 in all
 MARKS = (10, *range(20, 101, 20))  # after so many scenes it is said what is held
 PHRASES = ("mug", "book", "plant", "mug or plant", "book, plant", "sofa", "mug left of plant")
-# These wait for a person, or draw for minutes.
-LEFT_OUT = ("save a film of the path", "compare the picture with the reference")
+# These wait for a person, draw for minutes, or end it.
+LEFT_OUT = ("save a film of the path", "compare the picture with the reference", "quit")
 MOST_NAMES = 20_000  # of OpenGL objects that are looked at; drivers give the lowest that is free
 
 
