@@ -424,5 +424,5 @@ def _said(viewer: Viewer) -> str:
     """Return the words in place of an image; empty while there is one."""
     state = viewer.state
     if state.scene is None:
-        return f"opening {state.opening.name} ..." if state.opening else "Drop a scene here, or open one: Ctrl + O"
+        return f"opening {state.opening.name} ..." if state.opening else "Drop a scene here, or press Ctrl+O"
     return state.nothing
