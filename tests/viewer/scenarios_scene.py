@@ -591,7 +591,12 @@ def clip_and_brush(s: Any) -> None:
     s.ctx.item_click("//Transform/Clip")
     s.ctx.item_click("//Transform/No gizmo##gizmo")
     assert s.state.selection.marks.shown.all()
-    settings.open_panel(viewer, "Select")
+    brush_numbers(s)
+
+
+def brush_numbers(s: Any) -> None:
+    """By a drag, and by two numbers that are typed."""
+    settings.open_panel(s.window.viewer, "Select")
     s.settle()
     s.ctx.item_click("//Select/By numbers")
     s.ctx.item_click("//Select/Distance")
@@ -600,11 +605,16 @@ def clip_and_brush(s: Any) -> None:
     y = place.min.y + 5
     s.drag((place.min.x + 1, y), ((place.min.x + place.max.x) / 2, y))
     s.settle()
-    away = np.linalg.norm(means - s.state.view.eye, axis=1)
+    away = np.linalg.norm(s.state.scene.gaussians.means - s.state.view.eye, axis=1)
     chosen = s.state.selection.marks.selected
     assert 0 < chosen.sum() < len(away)
     between = (away >= away[chosen].min()) & (away <= away[chosen].max())
     np.testing.assert_array_equal(chosen, between)
+    s.ctx.item_click("//Select/Opacity")
+    s.ctx.item_click("//Select/##range")
+    s.ctx.key_chars_append_enter("0 1")
+    s.ctx.yield_(2)
+    assert s.state.selection.marks.selected.all()
 
 
 def compare_two_scenes(s: Any) -> None:

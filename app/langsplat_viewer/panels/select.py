@@ -145,8 +145,8 @@ def _name(viewer: Viewer) -> None:
     """Draw the box for a name by which what is selected is found from now on."""
     button = imgui.calc_text_size("Name it").x + 2 * imgui.get_style().frame_padding.x
     imgui.set_next_item_width(-button - imgui.get_style().item_spacing.x)
-    flags, hint = imgui.InputTextFlags_.enter_returns_true, "a name for what is selected"
-    entered, typed = imgui.input_text_with_hint("##name", hint, viewer.state.selection.name, flags)
+    hint = "a name for what is selected"
+    entered, typed = imgui.input_text_with_hint("##name", hint, viewer.state.selection.name, _ENTERED)
     queries.type_name(viewer, typed)
     imgui.same_line()
     if imgui.button("Name it") or entered:
@@ -155,6 +155,7 @@ def _name(viewer: Viewer) -> None:
 
 
 HISTOGRAM_EM = 3.0
+_ENTERED = imgui.InputTextFlags_.enter_returns_true
 
 
 def _values(viewer: Viewer) -> None:
@@ -188,8 +189,12 @@ def _values(viewer: Viewer) -> None:
         paint = imgui.get_window_draw_list()
         paint.add_rect_filled(ImVec2(left, corner.y), ImVec2(right, corner.y + size.y), _colour(PAINT))
     start, stop = sorted(brushed) if brushed else (0.0, 1.0)
-    small_wrapped(f"{_value(viewer, found, start)} to {_value(viewer, found, stop)}", muted())
-    tip("Drag over the histogram; Shift adds, Ctrl removes, both intersect")
+    imgui.set_next_item_width(-1)
+    hint = f"{_value(viewer, found, start)} to {_value(viewer, found, stop)}"
+    entered, typed = imgui.input_text_with_hint("##range", hint, "", _ENTERED)
+    if entered:
+        selecting.select_range(viewer, typed)
+    tip("Drag over the histogram, or type two numbers; Shift adds, Ctrl removes, both intersect")
 
 
 def _value(viewer: Viewer, found: marks.Histogram, part: float) -> str:
