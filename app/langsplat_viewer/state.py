@@ -336,6 +336,7 @@ class SceneState:
     hover: Hover | None = None
     ruler: Ruler = field(default_factory=Ruler)
     notes: tuple[Note, ...] = ()
+    fresh_note: Note | None = None  # just pinned, to be written now
     project: Path | None = None  # the file that all this is saved to again
     selection: Selection = field(default_factory=Selection)
 

@@ -654,6 +654,30 @@ def compare_two_scenes(s: Any) -> None:
     assert np.abs(s.shot("alone again") - alone)[100:450, 450:].max() == 0
 
 
+def pin_a_note(s: Any) -> None:
+    """What is typed after the click is its text; it is kept in the project, and undone."""
+    s.ctx.key_press(imgui.Key.n)
+    s.ctx.yield_(2)
+    click(s, on_screen(s, BOOK))
+    s.wait(lambda: imgui.get_io().want_text_input)
+    s.ctx.key_chars("lent by Ada")
+    s.ctx.key_press(imgui.Key.enter)
+    s.ctx.yield_(2)
+    (note,) = s.state.notes
+    assert (note.text, s.state.pins_notes) == ("lent by Ada", False)
+    assert np.linalg.norm(note.at - BOOK) < 1.0
+    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.s)
+    s.wait((s.folder / "blobs-001.langsplat").exists)
+    s.shot("note")
+    for left in (1, 0):
+        s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.z)
+        s.settle()
+        assert len(s.state.notes) == left
+    opening.open_file(s.window.viewer, s.folder / "blobs-001.langsplat")
+    s.wait(lambda: s.state.notes == (note,))
+    s.settle()
+
+
 SELECTING: dict[str, tuple[Any, str, dict[str, Any]]] = {
     "select_with_the_mouse": (select_with_the_mouse, "blobs.ply", {}),
     "outline_and_rest": (outline_and_rest, "blobs.ply", {}),
@@ -661,5 +685,6 @@ SELECTING: dict[str, tuple[Any, str, dict[str, Any]]] = {
     "ask_before_leaving": (ask_before_leaving, "blobs.ply", {}),
     "drag_the_gizmo": (drag_the_gizmo, "blobs.ply", {}),
     "compare_two_scenes": (compare_two_scenes, "blobs.ply", {}),
+    "pin_a_note": (pin_a_note, "blobs.ply", {}),
     "clip_and_brush": (clip_and_brush, "blobs.ply", {}),
 }

@@ -228,3 +228,4 @@ def test_a_note_is_pinned_to_what_is_selected(opened):
     projects.pin_to_selection(opened)
     np.testing.assert_allclose(opened.state.notes[0].at, CENTRES[1], atol=0.1)
     assert settings.take_wanted_panel(opened) == "Notes"
+    assert [projects.take_fresh_note(opened, opened.state.notes[0]) for _ in range(2)] == [True, False]

@@ -75,6 +75,7 @@ def folder(tmp_path: Path) -> Path:
         "large_letters",
         "use_the_toolbar",
         "clip_and_brush",
+        "pin_a_note",
         "use_the_outline",
         "compare_two_scenes",
     ],

@@ -66,7 +66,6 @@ def pin_to_selection(viewer: Viewer) -> None:
         return
     means = state.scene.gaussians.means[chosen].astype(np.float64)
     _pin(viewer, means[np.argmin(((means - np.median(means, axis=0)) ** 2).sum(1))])
-    open_panel(viewer, "Notes")
 
 
 def _pin(viewer: Viewer, point: Array) -> None:
@@ -76,7 +75,17 @@ def _pin(viewer: Viewer, point: Array) -> None:
         return
     remember(viewer)
     x, y, z = (float(part) for part in point)
-    state.notes, state.pins_notes = (*state.notes, Note(f"note {len(state.notes) + 1}", (x, y, z))), False
+    state.fresh_note = Note(f"note {len(state.notes) + 1}", (x, y, z))
+    state.notes, state.pins_notes = (*state.notes, state.fresh_note), False
+    state.awaits_keyboard = True
+    open_panel(viewer, "Notes")
+
+
+def take_fresh_note(viewer: Viewer, note: Note) -> bool:
+    """Whether a note was just pinned, and is to be written now; said once."""
+    is_fresh = viewer.state.fresh_note is note
+    viewer.state.fresh_note = None if is_fresh else viewer.state.fresh_note
+    return is_fresh
 
 
 def write_note(viewer: Viewer, note: Note, text: str) -> None:

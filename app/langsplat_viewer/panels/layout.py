@@ -406,6 +406,7 @@ def draw_over(viewer: Viewer) -> None:
         outline.draw_legend(viewer, area)
         overlays.draw_pointing(viewer)
         select.draw_stroke(viewer, area)
+        select.draw_hint(viewer, area)
         transform.draw_gizmo(viewer, area)
     overlays.draw_grip(viewer, area)
     overlays.draw_cube(viewer, area)
