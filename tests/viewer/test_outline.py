@@ -215,6 +215,20 @@ def test_a_project_of_another_tree_keeps_what_is_known(outlined, tmp_path, monke
         assert marked(outlined)[0] == "mug book plant"
 
 
+def test_a_scene_that_was_trained_anew_is_read_again(outlined, monkeypatch):
+    """Its tree is another: what was locked by the number of a node is not."""
+    outline.toggle_lock(outlined, row_of(outlined, "mug").node)
+    outlined.state.things = replace(outlined.state.things, locked=frozenset({10**6}))
+    opening.reload(outlined)
+    settle(outlined)
+    assert outlined.state.things.locked == frozenset()
+    outline.toggle_lock(outlined, 0)  # of another number of Gaussians
+    monkeypatch.setitem(SCENES, "tree.ply", with_tree(SCENES["tree.ply"].take(np.arange(300))))
+    opening.reload(outlined)
+    settle(outlined)
+    assert outlined.state.things == Things()
+
+
 def test_things_have_the_colour_that_the_image_has(outlined):
     settings.set_display(outlined, "rgb")
     mug, book = row_of(outlined, "mug").node, row_of(outlined, "book").node

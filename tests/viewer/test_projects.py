@@ -221,6 +221,42 @@ def test_notes_are_pinned_written_and_taken_off(opened):
     assert opened.state.notes == ()
 
 
+def test_notes_are_asked_about_before_the_window_closes(opened, tmp_path):
+    projects.pin_at(opened, 0.5, 0.5)
+    assert not selecting.may_close(opened)
+    selecting.stay(opened)
+    undoing.undo(opened)
+    assert selecting.may_close(opened)
+    opened.state.selection = replace(opened.state.selection, may_close=False)
+    undoing.redo(opened)
+    assert not selecting.may_close(opened)
+    projects.save_and_leave(opened, tmp_path)
+    assert opened.state.selection.may_close
+    assert len(read_project(tmp_path / "blobs-001.langsplat").notes) == 1
+    assert selecting.may_close(opened)
+
+
+def test_a_process_that_has_to_end_saves_notes(opened, tmp_path):
+    projects.pin_at(opened, 0.5, 0.5)
+    projects.end(opened, tmp_path)
+    assert opened.state.selection.may_close
+    assert (tmp_path / "blobs-001.langsplat").exists()
+
+
+def test_notes_are_there_again_after_another_scene(opened):
+    projects.pin_at(opened, 0.5, 0.5)
+    notes = opened.state.notes
+    opening.add_scenes(opened, [Path("blobs.ply"), Path("plain.ply")])
+    for step, there in ((1, ()), (-1, notes)):
+        opening.step_scene(opened, step)
+        settle(opened)
+        assert opened.state.notes == there
+    opening.reload(opened)
+    settle(opened)
+    assert opened.state.notes == notes
+    assert opened.state.has_unsaved_notes
+
+
 def test_a_note_is_pinned_to_what_is_selected(opened):
     projects.pin_to_selection(opened)
     assert "select something" in errors(opened)[-1]

@@ -20,7 +20,7 @@ from langsplat_viewer.actions.history import remember
 from langsplat_viewer.actions.queries import taught, teach
 from langsplat_viewer.actions.selecting import mark, select_alike, take
 from langsplat_viewer.actions.viewpoint import focus_on
-from langsplat_viewer.files.projects import Group
+from langsplat_viewer.files.projects import Group, Things, known_things
 from langsplat_viewer.state import OutlineView
 from langsplat_viewer.viewer import Viewer
 
@@ -246,6 +246,16 @@ def toggle_lock(viewer: Viewer, node: int) -> None:
         return
     remember(viewer)
     state.things = replace(state.things, locked=state.things.locked ^ {node})
+    apply_locks(viewer)
+
+
+def have_things(viewer: Viewer, things: Things) -> None:
+    """Take names, groups and locks, as far as the scene's tree has their nodes."""
+    state, engine = viewer.state, viewer.engine
+    state.things = Things()
+    has_tree = engine is not None and state.scene is not None and state.scene.language is not None
+    if engine is not None and has_tree and things != Things():
+        state.things = known_things(things, engine.tree.count)
     apply_locks(viewer)
 
 

@@ -9,8 +9,10 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.errors import LangSplatError
 from langsplat_viewer.actions.history import now, remember
-from langsplat_viewer.actions.outline import apply_locks
+from langsplat_viewer.actions.outline import have_things
 from langsplat_viewer.actions.queries import listed_queries
+from langsplat_viewer.actions.selecting import discard_and_leave
+from langsplat_viewer.actions.selecting import end as end_editing
 from langsplat_viewer.actions.settings import have_panels, open_panel
 from langsplat_viewer.actions.transforming import place
 from langsplat_viewer.actions.viewpoint import bookmarked_view
@@ -24,7 +26,6 @@ from langsplat_viewer.files.projects import (
     Note,
     Project,
     Things,
-    known_things,
     write_project,
 )
 from langsplat_viewer.jobs import one_line
@@ -135,10 +136,24 @@ def save_project(viewer: Viewer, folder: Path) -> Path | None:
         state.say(f"{path}: not saved ({one_line(error)})", is_error=True)
         return None
     state.project, state.preferences = path, with_recent(state.preferences, path)
+    state.kept = state.things, state.notes
     marks, moves = state.selection.marks, state.selection.moves
     state.selection = replace(state.selection, saved=marks.deleted, saved_moves=moves)
     state.say(f"saved {path}")
     return path
+
+
+def save_and_leave(viewer: Viewer, folder: Path) -> None:
+    """Save the project and go on; where it cannot be saved one stays."""
+    if save_project(viewer, folder) is not None:
+        discard_and_leave(viewer)
+
+
+def end(viewer: Viewer, folder: Path) -> None:
+    """Close without a question: what would be lost is first written to new files in `folder`."""
+    if viewer.state.has_unsaved_notes:
+        save_project(viewer, folder)
+    end_editing(viewer, folder)
 
 
 def _answer(state: ViewerState, query: Query) -> dict[str, Any]:
@@ -172,10 +187,7 @@ def restore(viewer: Viewer, project: Project, path: Path) -> Visit:
     state = viewer.state
     assert state.scene is not None
     if len(state.scene.gaussians) == project.count:
-        state.things = Things()
-        if project.things != Things() and viewer.engine is not None and state.scene.language is not None:
-            state.things = known_things(project.things, viewer.engine.tree.count)
-        apply_locks(viewer)
+        have_things(viewer, project.things)
         pair = Pair(state.selection.marks, now(viewer).marks)
         state.selection = replace(state.selection, marks=unpack(project.marks, pair))
         try:
@@ -189,6 +201,7 @@ def restore(viewer: Viewer, project: Project, path: Path) -> Visit:
         state.say(f"the scene has changed since: {what}", is_error=True)
     state.picture = project.picture
     state.notes, state.project = project.notes, path
+    state.kept = state.things, state.notes
     state.preferences = with_recent(state.preferences, path)
     state.bookmarks = project.bookmarks or state.bookmarks
     if project.panels:

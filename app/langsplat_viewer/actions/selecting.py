@@ -336,10 +336,10 @@ def finish_writing(viewer: Viewer) -> None:
 # Another scene, or none: what was deleted and not saved is asked about first.
 
 
-def leave(viewer: Viewer, then: Callable[[Viewer], None], to: str) -> None:
+def leave(viewer: Viewer, then: Callable[[Viewer], None], to: str, loses_more: bool = False) -> None:
     """Do `then`: at once if nothing is lost by it, else when that was answered; `to` says what it is."""
     selection = viewer.state.selection
-    if selection.is_unsaved:
+    if selection.is_unsaved or loses_more:
         viewer.state.selection = replace(selection, leaving=Leaving(then, to))
     else:
         then(viewer)
@@ -354,7 +354,7 @@ def may_close(viewer: Viewer) -> bool:
 
 def quit_viewer(viewer: Viewer) -> None:
     """Have the window close at the next frame."""
-    leave(viewer, _close, "the window closes")
+    leave(viewer, _close, "the window closes", viewer.state.has_unsaved_notes)
 
 
 def end(viewer: Viewer, folder: Path) -> None:
