@@ -16,7 +16,7 @@ from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_viewer import canvas
 from langsplat_viewer.actions import opening, queries, selecting, settings, transforming, viewpoint
 from langsplat_viewer.camera.overlays import Label, visible_faces
-from langsplat_viewer.panels import overlays
+from langsplat_viewer.panels import overlays, transform
 from langsplat_viewer.panels.overlays import EDGE
 from langsplat_viewer.panels.style import Area, scene_area
 from langsplat_viewer.rendering.renderer import ArrayChannels
@@ -509,7 +509,10 @@ def drag_the_gizmo(s: Any) -> None:
     view, chosen = s.state.view, s.state.selection.marks.selected
     x, y = on_screen(s, transforming.pivot(viewer))
     s.ctx.mouse_teleport_to_pos((x, y))
-    s.ctx.yield_(2)
+    for covered in (True, False):  # by a window over the scene, whose mouse it leaves alone
+        settings.show_help(viewer, covered)
+        s.ctx.yield_(3)
+        assert transform.holds_mouse(viewer) != covered
     s.ctx.mouse_down(0)
     s.ctx.yield_(2)
     for step in range(1, 7):

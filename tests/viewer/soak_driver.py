@@ -136,8 +136,8 @@ class Soak:
         way = self.rng.choice((self.command, self.search, self.of_queries, self.look, self.with_mouse))
         way()
         self.s.ctx.yield_(2)
-        if self.state.browser is not None:
-            self.s.do(lambda: opening.close_browser(self.viewer))
+        if self.state.browser is not None or self.state.show_help:  # which lies over the search
+            self.s.do(lambda: settings.escape(self.viewer))
         if self.rng.random() < 0.2:
             self.settle()
 
