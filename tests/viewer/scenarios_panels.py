@@ -274,6 +274,16 @@ def large_letters(s: Any) -> None:
     assert 0 <= keys.pos.y <= keys.pos.y + keys.size.y <= 720
     s.shot("large letters")
     settings.escape(s.window.viewer)
+    settings.set_ui_scale(s.window.viewer, 3.0)
+    for show, name in ((settings.toggle_palette, "Commands"), (opening.ask_for_file, "Open a scene")):
+        show(s.window.viewer)
+        s.ctx.yield_(4)
+        over = s.ctx.window_info(f"//{name}").window
+        assert (over.pos.x, over.pos.y) >= (0, 0)
+        assert over.pos.x + over.size.x <= 1280
+        assert over.pos.y + over.size.y <= 720
+        settings.escape(s.window.viewer)
+        s.ctx.yield_(2)
     settings.set_ui_scale(s.window.viewer, 1.0)
     s.settle()
     assert abs(scene_area().left - narrow) < 0.15 * narrow

@@ -25,6 +25,7 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions import opening, queries, settings, undoing
 from langsplat_viewer.commands import COMMANDS
+from langsplat_viewer.jobs import give_memory_back
 from langsplat_viewer.panels.layout import PANELS
 from langsplat_viewer.rendering.depth import Clip
 from langsplat_viewer.rendering.renderer import Backend, GlRenderer
@@ -39,6 +40,7 @@ MARKS = (10, *range(20, 101, 20))  # after so many scenes it is said what is hel
 PHRASES = ("mug", "book", "plant", "mug or plant", "book, plant", "sofa", "mug left of plant")
 # These wait for a person, draw for minutes, or end it.
 LEFT_OUT = ("save a film of the path", "compare the picture with the reference", "quit")
+TOO_LARGE = ("letters of 250 %", "letters of 300 %")  # for the window
 MOST_NAMES = 20_000  # of OpenGL objects that are looked at; drivers give the lowest that is free
 
 
@@ -136,7 +138,8 @@ class Soak:
         way = self.rng.choice((self.command, self.search, self.of_queries, self.look, self.with_mouse))
         way()
         self.s.ctx.yield_(2)
-        if self.state.browser is not None or self.state.show_help:  # which lies over the search
+        state = self.state
+        if state.browser is not None or state.show_help or state.show_palette:  # over the search
             self.s.do(lambda: settings.escape(self.viewer))
         if self.rng.random() < 0.2:
             self.settle()
@@ -146,7 +149,7 @@ class Soak:
         self.s.ctx.yield_(2)
 
     def command(self) -> None:
-        row = self.rng.choice([row for row in COMMANDS if row.does not in LEFT_OUT])
+        row = self.rng.choice([row for row in COMMANDS if row.does not in LEFT_OUT + TOO_LARGE])
         self.s.do(lambda: row.act(self.viewer))
 
     def search(self) -> None:
@@ -190,6 +193,7 @@ class Soak:
         """What there is, once nothing is under way."""
         self.settle()
         gc.collect()
+        give_memory_back()  # as a window that rests does
         kinds = (Scene, QueryEngine, QueryResult)
         alive = {kind.__name__: sum(type(thing) is kind for thing in gc.get_objects()) for kind in kinds}
         found: dict[str, object] = {}

@@ -22,7 +22,17 @@ from langsplat_viewer.panels import (
     view,
 )
 from langsplat_viewer.panels.scene import in_words
-from langsplat_viewer.panels.style import MAIN_DOCK, bad, muted, scene_area, small_wrapped, stoppable, tip
+from langsplat_viewer.panels.style import (
+    MAIN_DOCK,
+    MOST_OVER,
+    bad,
+    fitting,
+    muted,
+    scene_area,
+    small_wrapped,
+    stoppable,
+    tip,
+)
 from langsplat_viewer.state import Comparison, memory_bytes
 from langsplat_viewer.viewer import Viewer
 
@@ -86,7 +96,7 @@ def draw_palette(viewer: Viewer) -> None:
         return
     top = imgui.get_main_viewport().get_center()
     imgui.set_next_window_pos(ImVec2(top.x, 0.15 * top.y), imgui.Cond_.always, ImVec2(0.5, 0))
-    imgui.set_next_window_size(hello_imgui.em_to_vec2(WIDTH_EM, HEIGHT_EM))
+    imgui.set_next_window_size(fitting(WIDTH_EM, HEIGHT_EM))
     imgui.set_next_window_bg_alpha(1.0)
     flags = imgui.WindowFlags_.no_title_bar | imgui.WindowFlags_.no_resize | imgui.WindowFlags_.no_collapse
     imgui.begin("Commands", None, flags)
@@ -150,7 +160,6 @@ FIRST_STEPS = (
     ("Everything else", "Ctrl + Shift + P finds every command by its words. Without a mouse: Ctrl + Tab goes "
      "to the next panel, Tab and arrows travel in it."),
 )  # fmt: skip
-HELP_SHARE = 0.94  # of the window's height
 
 
 def key_rows() -> tuple[tuple[str, str], ...]:
@@ -167,7 +176,7 @@ def draw_help(viewer: Viewer) -> None:
     area, room = scene_area(), imgui.get_main_viewport().work_size
     half = hello_imgui.em_size(KEYS_EM + DOES_EM + 4) / 2
     centre = ImVec2(min(area.left + area.width / 2, room.x - half), area.top + area.height / 2)
-    imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(room.x, HELP_SHARE * room.y))
+    imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(room.x, MOST_OVER * room.y))
     imgui.set_next_window_pos(centre, imgui.Cond_.always, ImVec2(0.5, 0.5))
     imgui.set_next_window_bg_alpha(1.0)
     _, still_open = imgui.begin("Help", True, flags)

@@ -19,6 +19,7 @@ from langsplat_viewer.panels.style import (
     beside,
     beside_boxed,
     elided,
+    fitting,
     muted,
     small_wrapped,
     tip,
@@ -111,7 +112,7 @@ def draw_browser(viewer: Viewer) -> None:
         imgui.open_popup(title)
     centre = imgui.get_main_viewport().get_center()
     imgui.set_next_window_pos(centre, imgui.Cond_.appearing, ImVec2(0.5, 0.5))
-    imgui.set_next_window_size(hello_imgui.em_to_vec2(WIDTH_EM, HEIGHT_EM), imgui.Cond_.appearing)
+    imgui.set_next_window_size(fitting(WIDTH_EM, HEIGHT_EM), imgui.Cond_.appearing)
     shown, stays = imgui.begin_popup_modal(title, True, imgui.WindowFlags_.no_saved_settings)
     if not shown:
         return
