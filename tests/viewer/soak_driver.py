@@ -1,9 +1,9 @@
-"""A long day at the window: 100 scenes opened and closed and 2000 actions; run by test_process.py.
+"""A long day at the window: 100 scenes opened and closed, and actions in each; run by test_process.py.
 
-    python -m tests.viewer.soak_driver BACKEND FOLDER
+    python -m tests.viewer.soak_driver BACKEND FOLDER ACTIONS
 
-FOLDER holds SCENES; what is saved goes to a new folder in it. Prints one line of JSON for each of `MARKS`:
-what the process holds when so many scenes have been opened.
+ACTIONS are done in each scene. FOLDER holds SCENES; what is saved goes to a new folder in it. Prints one line
+of JSON for each of `MARKS`: what the process holds when so many scenes have been opened.
 """
 
 import ctypes
@@ -35,7 +35,6 @@ from tests.viewer.window_driver import Session
 
 SCENES = ("blobs.ply", "plain.ply", "many.ply", "bare.ply", "few.ply")
 OPENED = 100
-ACTIONS_EACH = 20  # of one scene: 2000 in all
 MARKS = (10, *range(20, 101, 20))  # after so many scenes it is said what is held
 PHRASES = ("mug", "book", "plant", "mug or plant", "book, plant", "sofa", "mug left of plant")
 # These wait for a person, draw for minutes, or end it.
@@ -97,7 +96,8 @@ class SoakSession(Session):
 class Soak:
     """What is done to one window."""
 
-    def __init__(self, session: SoakSession, seed: int = 0) -> None:
+    def __init__(self, session: SoakSession, actions: int, seed: int = 0) -> None:
+        self.actions = actions  # in each scene
         self.s, self.viewer, self.state = session, session.window.viewer, session.state
         self.rng = random.Random(seed)
         self.count_gl = GlCount()
@@ -108,7 +108,7 @@ class Soak:
         done = 0
         for opened in range(1, OPENED + 1):
             self.open(SCENES[opened % len(SCENES)])
-            for _ in range(ACTIONS_EACH):
+            for _ in range(self.actions):
                 self.act()
                 done += 1
             if opened in MARKS:
@@ -207,6 +207,6 @@ if __name__ == "__main__":
     saved = Path(sys.argv[2]) / "saved"  # the list of scenes stays short enough to be seen whole
     saved.mkdir()
     os.chdir(saved)
-    soak = Soak(session)
+    soak = Soak(session, int(sys.argv[3]))
     session.run(soak.run)
     print("PASSED")
