@@ -109,7 +109,7 @@ def _clipped(ctx: Any, window: Window) -> None:
 def _noted(ctx: Any, window: Window) -> None:
     viewer = window.viewer
     settings.open_panel(viewer, "Notes")
-    for place, text in (((0.28, 0.45), "a gift of 1987"), ((0.62, 0.55), "eaten by the children")):
+    for place, text in (((0.37, 0.36), "a gift of 1987"), ((0.62, 0.55), "eaten by the children")):
         projects.pin_at(viewer, *place)
         projects.write_note(viewer, viewer.state.notes[-1], text)
 

@@ -321,6 +321,7 @@ COMMANDS: tuple[Command, ...] = (
         is_on=lambda viewer: viewer.state.pins_notes,
         icon="NOTE_STICKY",
     ),
+    Command("pin a note to the selection", projects.pin_to_selection, menu="View"),
     Command("return to the opening view", viewpoint.reset_view, ("R", "Home"), "Camera", icon="HOUSE"),
     Command("frame everything", viewpoint.frame_scene, ("Shift+F",), "Camera", icon="EXPAND"),
     Command("focus on the latest result found", viewpoint.focus_result, ("F",), "Camera", icon="CROSSHAIRS"),
@@ -355,7 +356,7 @@ COMMANDS: tuple[Command, ...] = (
     *(_theme(theme) for theme in THEMES),
     *(_letters(scale) for scale in UI_SCALES),
     *(_panel(title) for title in PANEL_TITLES),
-    Command("find a command", lambda viewer: settings.show_palette(viewer, True), ("Ctrl+Shift+P",), "Help"),
+    Command("find a command", settings.toggle_palette, ("Ctrl+Shift+P",), "Help"),
     Command("first steps, and list of keys", settings.toggle_help, ("F1", "?"), "Help"),
     Command("close what lies over the scene", settings.escape, ("Esc",)),
 )
@@ -371,6 +372,9 @@ HELD: tuple[tuple[str, str], ...] = (
     ("W A S D, Q E", "fly ahead, left, back, right, down, up"),
     ("Shift, Alt", "fly faster, slower"),
     ("[ ]", "roll"),
+    ("Tab, arrows, Enter", "travel in a panel; the box of the search completes by Tab, recalls by arrow up"),
+    ("Ctrl + Tab", "to the next panel, the strip of icons, or the menus"),
+    ("Menu, Shift + F10", "what can be done with a row of the outline"),
 )
 
 

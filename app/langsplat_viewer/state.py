@@ -338,6 +338,8 @@ class SceneState:
     hover: Hover | None = None
     ruler: Ruler = field(default_factory=Ruler)
     notes: tuple[Note, ...] = ()
+    fresh_note: Note | None = None  # just pinned, to be written now
+    kept: tuple[Things, tuple[Note, ...]] = Things(), ()  # things and notes as a project has them
     project: Path | None = None  # the file that all this is saved to again
     selection: Selection = field(default_factory=Selection)
 
@@ -406,6 +408,11 @@ class ViewerState(SceneState):
         """Show another scene: all that belongs to the one before is gone."""
         for part in fields(SceneState):
             setattr(self, part.name, getattr(fresh, part.name))
+
+    @property
+    def has_unsaved_notes(self) -> bool:
+        """True where no project has the notes, names, groups and locks that there are."""
+        return (self.things, self.notes) != self.kept
 
     def say(self, text: str, is_error: bool = False) -> None:
         """Add one line to the messages area."""

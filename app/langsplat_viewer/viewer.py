@@ -20,7 +20,7 @@ from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.camera.flight import Keyframe
 from langsplat_viewer.files.flights import Shelf
-from langsplat_viewer.files.projects import Things
+from langsplat_viewer.files.projects import Note, Things
 from langsplat_viewer.files.watching import Stamps, Watch
 from langsplat_viewer.jobs import Job, Worker
 from langsplat_viewer.marks import Histogram, Marks, Pair
@@ -154,6 +154,10 @@ class Visit:
     ruler: Ruler
     clip: Clip
     things: Things
+    notes: tuple[Note, ...]
+    kept: tuple[Things, tuple[Note, ...]]
+    project: Path | None
+    count: int  # Gaussians
 
 
 def visit_of(state: ViewerState) -> Visit:
@@ -172,6 +176,10 @@ def visit_of(state: ViewerState) -> Visit:
         ruler=state.ruler,
         clip=state.settings.clip,
         things=state.things,
+        notes=state.notes,
+        kept=state.kept,
+        project=state.project,
+        count=0 if state.scene is None else len(state.scene.gaussians),
     )
 
 

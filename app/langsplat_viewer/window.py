@@ -39,6 +39,7 @@ from langsplat_viewer.actions import (
     beside,
     filming,
     opening,
+    projects,
     queries,
     selecting,
     settings,
@@ -383,7 +384,7 @@ class Window:
         if self._obeyed > 1:
             selecting.end_at_once(self.viewer)
         elif number == signal.SIGTERM:
-            selecting.end(self.viewer, Path.cwd())
+            projects.end(self.viewer, Path.cwd())
         else:
             selecting.quit_viewer(self.viewer)
             if not self.viewer.state.selection.may_close:

@@ -14,7 +14,7 @@ from langsplat_core.io.scenes import save_scene
 from langsplat_core.pipeline.report import REPORT
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_viewer import viewer as training
-from langsplat_viewer.actions import filming, opening, settings, viewpoint
+from langsplat_viewer.actions import filming, opening, selecting, settings, viewpoint
 from langsplat_viewer.files.flights import read_flight
 from langsplat_viewer.panels.layout import PANELS
 from langsplat_viewer.panels.style import scene_area
@@ -274,6 +274,16 @@ def large_letters(s: Any) -> None:
     assert 0 <= keys.pos.y <= keys.pos.y + keys.size.y <= 720
     s.shot("large letters")
     settings.escape(s.window.viewer)
+    settings.set_ui_scale(s.window.viewer, 3.0)
+    for show, name in ((settings.toggle_palette, "Commands"), (opening.ask_for_file, "Open a scene")):
+        show(s.window.viewer)
+        s.ctx.yield_(4)
+        over = s.ctx.window_info(f"//{name}").window
+        assert (over.pos.x, over.pos.y) >= (0, 0)
+        assert over.pos.x + over.size.x <= 1280
+        assert over.pos.y + over.size.y <= 720
+        settings.escape(s.window.viewer)
+        s.ctx.yield_(2)
     settings.set_ui_scale(s.window.viewer, 1.0)
     s.settle()
     assert abs(scene_area().left - narrow) < 0.15 * narrow
@@ -322,6 +332,7 @@ def use_the_outline(s: Any) -> None:
     s.settle()
     assert (s.state.things.locked, s.state.things.groups) == (set(), ())
 
+    use_the_outline_by_keys(s, first.node)
     s.ctx.key_press(imgui.Key.r)
     s.settle()
     area, (width, height) = scene_area(), s.state.size
@@ -335,6 +346,27 @@ def use_the_outline(s: Any) -> None:
     s.settle()
     assert s.state.queries[-1].phrase == "the atlas"
     assert s.state.queries[-1].result.members.reshape(3, -1).all(1).tolist() == [False, True, False]
+
+
+def use_the_outline_by_keys(s: Any, node: int) -> None:
+    """From the filter down to a row: Enter looks at the thing, the menu key groups it."""
+    settings.open_panel(s.window.viewer, "Outline")
+    selecting.select_none(s.window.viewer)
+    s.ctx.item_click("//**/##filter")
+    s.ctx.key_press(imgui.Key.down_arrow)
+    s.ctx.yield_(2)
+    s.ctx.key_press(imgui.Key.enter)
+    s.settle()
+    assert (s.state.selection.marks.selected == s.state.outline.tree.members(node)).all()
+    s.ctx.key_press(imgui.Key.menu)
+    s.ctx.yield_(3)
+    s.ctx.key_press(imgui.Key.up_arrow)  # to the last
+    s.ctx.yield_(2)
+    s.ctx.key_press(imgui.Key.enter)
+    s.ctx.yield_(3)
+    assert [group.nodes for group in s.state.things.groups] == [(node,)]
+    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.z)
+    s.settle()
 
 
 LAYOUT: dict[str, tuple[Callable[[Any], None], str, dict[str, Any]]] = {

@@ -16,7 +16,7 @@ from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_viewer import canvas
 from langsplat_viewer.actions import opening, queries, selecting, settings, transforming, viewpoint
 from langsplat_viewer.camera.overlays import Label, visible_faces
-from langsplat_viewer.panels import overlays
+from langsplat_viewer.panels import overlays, transform
 from langsplat_viewer.panels.overlays import EDGE
 from langsplat_viewer.panels.style import Area, scene_area
 from langsplat_viewer.rendering.renderer import ArrayChannels
@@ -509,7 +509,10 @@ def drag_the_gizmo(s: Any) -> None:
     view, chosen = s.state.view, s.state.selection.marks.selected
     x, y = on_screen(s, transforming.pivot(viewer))
     s.ctx.mouse_teleport_to_pos((x, y))
-    s.ctx.yield_(2)
+    for covered in (True, False):  # by a window over the scene, whose mouse it leaves alone
+        settings.show_help(viewer, covered)
+        s.ctx.yield_(3)
+        assert transform.holds_mouse(viewer) != covered
     s.ctx.mouse_down(0)
     s.ctx.yield_(2)
     for step in range(1, 7):
@@ -591,7 +594,12 @@ def clip_and_brush(s: Any) -> None:
     s.ctx.item_click("//Transform/Clip")
     s.ctx.item_click("//Transform/No gizmo##gizmo")
     assert s.state.selection.marks.shown.all()
-    settings.open_panel(viewer, "Select")
+    brush_numbers(s)
+
+
+def brush_numbers(s: Any) -> None:
+    """By a drag, and by two numbers that are typed."""
+    settings.open_panel(s.window.viewer, "Select")
     s.settle()
     s.ctx.item_click("//Select/By numbers")
     s.ctx.item_click("//Select/Distance")
@@ -600,11 +608,16 @@ def clip_and_brush(s: Any) -> None:
     y = place.min.y + 5
     s.drag((place.min.x + 1, y), ((place.min.x + place.max.x) / 2, y))
     s.settle()
-    away = np.linalg.norm(means - s.state.view.eye, axis=1)
+    away = np.linalg.norm(s.state.scene.gaussians.means - s.state.view.eye, axis=1)
     chosen = s.state.selection.marks.selected
     assert 0 < chosen.sum() < len(away)
     between = (away >= away[chosen].min()) & (away <= away[chosen].max())
     np.testing.assert_array_equal(chosen, between)
+    s.ctx.item_click("//Select/Opacity")
+    s.ctx.item_click("//Select/##range")
+    s.ctx.key_chars_append_enter("0 1")
+    s.ctx.yield_(2)
+    assert s.state.selection.marks.selected.all()
 
 
 def compare_two_scenes(s: Any) -> None:
@@ -644,6 +657,30 @@ def compare_two_scenes(s: Any) -> None:
     assert np.abs(s.shot("alone again") - alone)[100:450, 450:].max() == 0
 
 
+def pin_a_note(s: Any) -> None:
+    """What is typed after the click is its text; it is kept in the project, and undone."""
+    s.ctx.key_press(imgui.Key.n)
+    s.ctx.yield_(2)
+    click(s, on_screen(s, BOOK))
+    s.wait(lambda: imgui.get_io().want_text_input)
+    s.ctx.key_chars("lent by Ada")
+    s.ctx.key_press(imgui.Key.enter)
+    s.ctx.yield_(2)
+    (note,) = s.state.notes
+    assert (note.text, s.state.pins_notes) == ("lent by Ada", False)
+    assert np.linalg.norm(note.at - BOOK) < 1.0
+    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.s)
+    s.wait((s.folder / "blobs-001.langsplat").exists)
+    s.shot("note")
+    for left in (1, 0):
+        s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.z)
+        s.settle()
+        assert len(s.state.notes) == left
+    opening.open_file(s.window.viewer, s.folder / "blobs-001.langsplat")
+    s.wait(lambda: s.state.notes == (note,))
+    s.settle()
+
+
 SELECTING: dict[str, tuple[Any, str, dict[str, Any]]] = {
     "select_with_the_mouse": (select_with_the_mouse, "blobs.ply", {}),
     "outline_and_rest": (outline_and_rest, "blobs.ply", {}),
@@ -651,5 +688,6 @@ SELECTING: dict[str, tuple[Any, str, dict[str, Any]]] = {
     "ask_before_leaving": (ask_before_leaving, "blobs.ply", {}),
     "drag_the_gizmo": (drag_the_gizmo, "blobs.ply", {}),
     "compare_two_scenes": (compare_two_scenes, "blobs.ply", {}),
+    "pin_a_note": (pin_a_note, "blobs.ply", {}),
     "clip_and_brush": (clip_and_brush, "blobs.ply", {}),
 }

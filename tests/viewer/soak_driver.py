@@ -1,9 +1,9 @@
-"""A long day at the window: 100 scenes opened and closed and 2000 actions; run by test_process.py.
+"""A long day at the window: 100 scenes opened and closed, and actions in each; run by test_process.py.
 
-    python -m tests.viewer.soak_driver BACKEND FOLDER
+    python -m tests.viewer.soak_driver BACKEND FOLDER ACTIONS
 
-FOLDER holds SCENES; what is saved goes to a new folder in it. Prints one line of JSON for each of `MARKS`:
-what the process holds when so many scenes have been opened.
+ACTIONS are done in each scene. FOLDER holds SCENES; what is saved goes to a new folder in it. Prints one line
+of JSON for each of `MARKS`: what the process holds when so many scenes have been opened.
 """
 
 import ctypes
@@ -25,6 +25,7 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions import opening, queries, settings, undoing
 from langsplat_viewer.commands import COMMANDS
+from langsplat_viewer.jobs import give_memory_back
 from langsplat_viewer.panels.layout import PANELS
 from langsplat_viewer.rendering.depth import Clip
 from langsplat_viewer.rendering.renderer import Backend, GlRenderer
@@ -34,11 +35,11 @@ from tests.viewer.window_driver import Session
 
 SCENES = ("blobs.ply", "plain.ply", "many.ply", "bare.ply", "few.ply")
 OPENED = 100
-ACTIONS_EACH = 20  # of one scene: 2000 in all
 MARKS = (10, *range(20, 101, 20))  # after so many scenes it is said what is held
 PHRASES = ("mug", "book", "plant", "mug or plant", "book, plant", "sofa", "mug left of plant")
-# These wait for a person, or draw for minutes.
-LEFT_OUT = ("save a film of the path", "compare the picture with the reference")
+# These wait for a person, draw for minutes, or end it.
+LEFT_OUT = ("save a film of the path", "compare the picture with the reference", "quit")
+TOO_LARGE = ("letters of 250 %", "letters of 300 %")  # for the window
 MOST_NAMES = 20_000  # of OpenGL objects that are looked at; drivers give the lowest that is free
 
 
@@ -95,7 +96,8 @@ class SoakSession(Session):
 class Soak:
     """What is done to one window."""
 
-    def __init__(self, session: SoakSession, seed: int = 0) -> None:
+    def __init__(self, session: SoakSession, actions: int, seed: int = 0) -> None:
+        self.actions = actions  # in each scene
         self.s, self.viewer, self.state = session, session.window.viewer, session.state
         self.rng = random.Random(seed)
         self.count_gl = GlCount()
@@ -106,7 +108,7 @@ class Soak:
         done = 0
         for opened in range(1, OPENED + 1):
             self.open(SCENES[opened % len(SCENES)])
-            for _ in range(ACTIONS_EACH):
+            for _ in range(self.actions):
                 self.act()
                 done += 1
             if opened in MARKS:
@@ -136,8 +138,9 @@ class Soak:
         way = self.rng.choice((self.command, self.search, self.of_queries, self.look, self.with_mouse))
         way()
         self.s.ctx.yield_(2)
-        if self.state.browser is not None:
-            self.s.do(lambda: opening.close_browser(self.viewer))
+        state = self.state
+        if state.browser is not None or state.show_help or state.show_palette:  # over the search
+            self.s.do(lambda: settings.escape(self.viewer))
         if self.rng.random() < 0.2:
             self.settle()
 
@@ -146,7 +149,7 @@ class Soak:
         self.s.ctx.yield_(2)
 
     def command(self) -> None:
-        row = self.rng.choice([row for row in COMMANDS if row.does not in LEFT_OUT])
+        row = self.rng.choice([row for row in COMMANDS if row.does not in LEFT_OUT + TOO_LARGE])
         self.s.do(lambda: row.act(self.viewer))
 
     def search(self) -> None:
@@ -190,6 +193,7 @@ class Soak:
         """What there is, once nothing is under way."""
         self.settle()
         gc.collect()
+        give_memory_back()  # as a window that rests does
         kinds = (Scene, QueryEngine, QueryResult)
         alive = {kind.__name__: sum(type(thing) is kind for thing in gc.get_objects()) for kind in kinds}
         found: dict[str, object] = {}
@@ -203,6 +207,6 @@ if __name__ == "__main__":
     saved = Path(sys.argv[2]) / "saved"  # the list of scenes stays short enough to be seen whole
     saved.mkdir()
     os.chdir(saved)
-    soak = Soak(session)
+    soak = Soak(session, int(sys.argv[3]))
     session.run(soak.run)
     print("PASSED")

@@ -1,5 +1,6 @@
 """The outline: the tree in words, what is done with its rows, and what stays locked."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from langsplat_viewer.actions import (
     undoing,
 )
 from langsplat_viewer.actions.selecting import take
+from langsplat_viewer.files.projects import Things
 from tests.support.fakes import CENTRES, blob_scene
 from tests.support.marks_and_flights import blob, marked
 from tests.support.scenes import with_tree
@@ -156,6 +158,10 @@ def test_groups_are_made_named_and_left(outlined):
     for node in (mug, book, plant):
         outline.ungroup(outlined, node)
     assert outlined.state.things.groups == ()
+    outline.group(outlined, mug, None)
+    outline.group(outlined, mug, None)  # out of the first, which is then empty
+    assert [group.nodes for group in outlined.state.things.groups] == [(mug,)]
+    outline.ungroup(outlined, mug)
     outline.group(outlined, mug, mug)
     assert outlined.state.things.groups == ()
 
@@ -177,6 +183,50 @@ def test_a_project_keeps_names_groups_and_locks(outlined, viewer, tmp_path, monk
     assert viewer.state.things == things
     selecting.select_all(viewer)
     assert marked(viewer)[0] == "book plant"
+
+
+@pytest.mark.parametrize("field", [True, False])
+def test_a_project_of_another_tree_keeps_what_is_known(outlined, tmp_path, monkeypatch, field):
+    """As after training anew, or for a scene whose field is gone."""
+    monkeypatch.chdir(tmp_path)
+    Path("tree.ply").touch()
+    mug = row_of(outlined, "mug").node
+    path = projects.save_project(outlined, tmp_path)
+    top = json.loads(path.read_text())
+    nodes = [mug, 10**9, 10**9, mug]
+    top["things"] = {
+        "names": [[10**9, "ghost"], [mug, "cup"]],
+        "groups": [{"name": "a", "nodes": nodes}, {"name": "b", "nodes": [10**9]}],
+        "locked": nodes,
+    }
+    path.write_text(json.dumps(top))
+    if not field:
+        monkeypatch.setitem(SCENES, "tree.ply", replace(SCENES["tree.ply"], language=None))
+    opening.open_project(outlined, path)
+    settle(outlined)
+    things = outlined.state.things
+    selecting.select_all(outlined)
+    if field:
+        assert (things.names, things.locked, things.groups[0].nodes) == ({mug: "cup"}, {mug}, (mug,))
+        assert marked(outlined)[0] == "book plant"
+        outline.select_group(outlined, things.groups[0])
+    else:
+        assert things == Things()
+        assert marked(outlined)[0] == "mug book plant"
+
+
+def test_a_scene_that_was_trained_anew_is_read_again(outlined, monkeypatch):
+    """Its tree is another: what was locked by the number of a node is not."""
+    outline.toggle_lock(outlined, row_of(outlined, "mug").node)
+    outlined.state.things = replace(outlined.state.things, locked=frozenset({10**6}))
+    opening.reload(outlined)
+    settle(outlined)
+    assert outlined.state.things.locked == frozenset()
+    outline.toggle_lock(outlined, 0)  # of another number of Gaussians
+    monkeypatch.setitem(SCENES, "tree.ply", with_tree(SCENES["tree.ply"].take(np.arange(300))))
+    opening.reload(outlined)
+    settle(outlined)
+    assert outlined.state.things == Things()
 
 
 def test_things_have_the_colour_that_the_image_has(outlined):

@@ -18,6 +18,7 @@ from langsplat_viewer.files.preferences import (
     MOST_RECENT,
     SCALES,
     Preferences,
+    fitting_scale,
     load_preferences,
     preferences_folder,
     save_preferences,
@@ -237,6 +238,11 @@ def test_looks_are_chosen_within_limits(viewer):
     settings.set_theme(viewer, "light")
     settings.set_ui_scale(viewer, 99.0)
     assert viewer.state.preferences == replace(Preferences(), theme="light", ui_scale=SCALES[1])
+
+
+@pytest.mark.parametrize(("height", "scale"), [(0, 1.0), (720, 1.0), (1080, 1.0), (1440, 1.25), (2160, 2.0)])
+def test_letters_fit_the_screen(height, scale):
+    assert fitting_scale(height) == scale
 
 
 # Letters beyond Latin.

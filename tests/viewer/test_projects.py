@@ -20,6 +20,7 @@ from langsplat_viewer.actions import (
     selecting,
     settings,
     transforming,
+    undoing,
     viewpoint,
 )
 from langsplat_viewer.camera.controls import orbit
@@ -91,6 +92,11 @@ def test_everything_comes_back(opened, saved, again):
     assert settings.take_wanted_panel(again) == ""
     assert after.shows_panels == ("Search", "Notes")
     assert not after.selection.is_unsaved
+    assert (before.preferences.recent[0], after.preferences.recent[0]) == (str(saved), str(saved))
+    queries.remove_all(again)
+    opening.open_recent(again, str(saved))
+    settle(again)
+    assert len(after.queries) == 4
     assert projects.save_project(again, Path("/nowhere")) == saved  # where it came from
 
 
@@ -206,3 +212,56 @@ def test_notes_are_pinned_written_and_taken_off(opened):
     settings.escape(opened)
     projects.remove_note(opened, opened.state.notes[0])
     assert opened.state.notes == ()
+    undoing.undo(opened)
+    assert [len(note.text) for note in opened.state.notes] == [500]
+    undoing.undo(opened)
+    assert opened.state.notes == (note,)
+    undoing.redo(opened)
+    undoing.redo(opened)
+    assert opened.state.notes == ()
+
+
+def test_notes_are_asked_about_before_the_window_closes(opened, tmp_path):
+    projects.pin_at(opened, 0.5, 0.5)
+    assert not selecting.may_close(opened)
+    selecting.stay(opened)
+    undoing.undo(opened)
+    assert selecting.may_close(opened)
+    opened.state.selection = replace(opened.state.selection, may_close=False)
+    undoing.redo(opened)
+    assert not selecting.may_close(opened)
+    projects.save_and_leave(opened, tmp_path)
+    assert opened.state.selection.may_close
+    assert len(read_project(tmp_path / "blobs-001.langsplat").notes) == 1
+    assert selecting.may_close(opened)
+
+
+def test_a_process_that_has_to_end_saves_notes(opened, tmp_path):
+    projects.pin_at(opened, 0.5, 0.5)
+    projects.end(opened, tmp_path)
+    assert opened.state.selection.may_close
+    assert (tmp_path / "blobs-001.langsplat").exists()
+
+
+def test_notes_are_there_again_after_another_scene(opened):
+    projects.pin_at(opened, 0.5, 0.5)
+    notes = opened.state.notes
+    opening.add_scenes(opened, [Path("blobs.ply"), Path("plain.ply")])
+    for step, there in ((1, ()), (-1, notes)):
+        opening.step_scene(opened, step)
+        settle(opened)
+        assert opened.state.notes == there
+    opening.reload(opened)
+    settle(opened)
+    assert opened.state.notes == notes
+    assert opened.state.has_unsaved_notes
+
+
+def test_a_note_is_pinned_to_what_is_selected(opened):
+    projects.pin_to_selection(opened)
+    assert "select something" in errors(opened)[-1]
+    selecting.take(opened, blob("book"))
+    projects.pin_to_selection(opened)
+    np.testing.assert_allclose(opened.state.notes[0].at, CENTRES[1], atol=0.1)
+    assert settings.take_wanted_panel(opened) == "Notes"
+    assert [projects.take_fresh_note(opened, opened.state.notes[0]) for _ in range(2)] == [True, False]

@@ -564,6 +564,12 @@ def test_values_in_a_range_are_selected_and_nothing_that_is_hidden(searched):
     cut = 10 ** ((found.low + found.high) / 2)
     chosen = searched.state.selection.marks.selected
     np.testing.assert_array_equal(chosen, (away >= np.median(away)) & (away <= cut))
+    selecting.select_none(searched)
+    selecting.select_range(searched, f"{10**found.low:.9g} to {cut:.9g}")
+    assert (searched.state.selection.marks.selected != chosen).sum() <= 2  # at the ends
+    for text in ("0.5", "near to far", ""):
+        selecting.select_range(searched, text)
+        assert "two numbers" in errors(searched)[-1]
     viewpoint.frame_scene(searched)
     selecting.set_measure(searched, "relevancy")
     assert selecting.values_shown(searched).high == pytest.approx(searched.state.queries[0].result.even.max())

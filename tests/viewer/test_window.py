@@ -26,6 +26,7 @@ def folder(tmp_path: Path) -> Path:
     """Scenes with and without a language field, one cut short, and one of which nothing can be drawn."""
     for name, field in (("blobs", True), ("plain", False)):
         save_scene(tmp_path / f"{name}.ply", replace(blob_scene(field=field), path=None))
+    save_scene(tmp_path / "wide.ply", replace(blob_scene(with_cameras=False), path=None))
     gaussians = replace(blob_scene().gaussians, opacity_logits=np.full(360, np.nan))
     save_scene(tmp_path / "nothing.ply", Scene(gaussians))
     whole = (tmp_path / "plain.ply").read_bytes()
@@ -53,6 +54,7 @@ def folder(tmp_path: Path) -> Path:
         "travel_by_keys",
         "end_by_signals",
         "look_at_nothing",
+        "look_from_the_broad_side",
         "record_and_play",
         "mark_and_return",
         "close_while_opening",
@@ -73,6 +75,7 @@ def folder(tmp_path: Path) -> Path:
         "large_letters",
         "use_the_toolbar",
         "clip_and_brush",
+        "pin_a_note",
         "use_the_outline",
         "compare_two_scenes",
     ],

@@ -13,6 +13,8 @@ import numpy as np
 from PIL import Image
 
 from imgui_bundle import ImVec2, hello_imgui, imgui  # isort: skip
+from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
+import glfw  # isort: skip
 from imgui_bundle.immapp import testing  # isort: skip
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.displays import QUERY_COLOURS
@@ -358,11 +360,11 @@ def close_while_opening(s: Session) -> None:
 
 
 def use_the_palette(s: Session) -> None:
-    """Its keys keep away from the scrollbar; Enter does the first command that matches."""
+    """Its keys keep away from the scrollbar; Enter does the first command that matches, which is lit."""
     s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.p)
     s.ctx.yield_(3)
     box, bar = s.ctx.item_info("//Commands/##command").rect_full, imgui.get_style().scrollbar_size
-    right, rows = int(box.max.x - bar), slice(int(box.max.y) + 10, int(box.max.y) + 150)
+    right, rows = int(box.max.x - bar), slice(int(box.max.y) + 30, int(box.max.y) + 150)
     seen = s.shot("palette")[rows]
     assert np.ptp(seen[:, right - 100 : right], axis=0).max() > 60  # keys
     assert np.ptp(seen[:, right - 5 : right - 1], axis=0).max() < 10
@@ -370,6 +372,26 @@ def use_the_palette(s: Session) -> None:
     s.ctx.yield_(3)
     assert s.state.picture.display == "depth"
     assert not s.state.show_palette
+
+    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.p)
+    s.ctx.yield_(3)
+    glfw.set_window_size(glfw_window_hello_imgui(), 1100, 600)
+    s.wait(lambda: imgui.get_main_viewport().size.x == 1100)
+    s.ctx.yield_(3)
+    palette = s.ctx.window_info("//Commands").window
+    assert abs(palette.pos.x + palette.size.x / 2 - 550) < 2
+    s.ctx.key_press(imgui.Key.escape)
+    glfw.set_window_size(glfw_window_hello_imgui(), 860, 620)
+    s.settle()
+
+
+def look_from_the_broad_side(s: Session) -> None:
+    """Without cameras, and upright: the blobs lie beside each other, none behind another."""
+    assert s.state.scene.cameras == ()
+    assert abs(s.state.view.rotation[2] @ [1, 0, 0]) < 0.5  # along which the blobs lie
+    assert abs(s.state.view.rotation[0] @ s.state.view.up) < 1e-6
+    rgb = s.shot("bare")
+    assert [s.at(rgb, thing).argmax() for thing in CENTRES] == [0, 1, 2]
 
 
 def use_shortcuts(s: Session) -> None:
@@ -531,6 +553,8 @@ def leave_settings(s: Session) -> None:
     assert s.state.show_help  # at the first start
     s.ctx.key_press(imgui.Key.escape)
     s.menu("Window", "Light theme")
+    for title in ("Select", "Train", "Record"):  # which do not lie over the search the next time
+        s.menu("Window", title)
     s.menu("Window", "Display")
     s.ctx.yield_(3)
     s.ctx.key_press(imgui.Key.f11)  # hidden at the end, there again the next time
@@ -598,6 +622,16 @@ def travel_by_keys(s: Session) -> None:
         s.ctx.key_chars_append_enter(words)
         s.wait(done)
         s.settle()
+    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.p)
+    s.ctx.yield_(3)
+    s.ctx.key_chars("show")  # arrows choose another command than the first
+    s.ctx.yield_(2)
+    for _ in range(3):
+        s.ctx.key_press(imgui.Key.down_arrow)
+        s.ctx.yield_(2)
+    s.ctx.key_press(imgui.Key.enter)
+    s.ctx.yield_(3)
+    assert s.state.picture.display == "depth"
     s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.p)
     s.ctx.yield_(3)
     s.ctx.key_chars_append_enter("teleport")
@@ -670,6 +704,7 @@ SCENARIOS = {
     "type_while_opening": (type_while_opening, "blobs.ply", {"load": slow_load}),
     "travel_by_keys": (travel_by_keys, "blobs.ply", {}),
     "end_by_signals": (end_by_signals, "blobs.ply", {}),
+    "look_from_the_broad_side": (look_from_the_broad_side, "wide.ply", {}),
     "look_at_nothing": (look_at_nothing, "nothing.ply", {}),
     **scenarios_scene.SELECTING,
     **scenarios_panels.RECORD,

@@ -1,10 +1,10 @@
-"""History: queries, view settings and marks as they were before each change, to be undone."""
+"""History: queries, view settings, notes and marks as they were before each change, to be undone."""
 
 from dataclasses import dataclass
 
 from langsplat_core.config import LevelChoice, PictureConfig
 from langsplat_viewer.camera.flight import Keyframe
-from langsplat_viewer.files.projects import Things
+from langsplat_viewer.files.projects import Note, Things
 from langsplat_viewer.marks import Move, PackedMarks, pack
 from langsplat_viewer.state import Query, ViewSettings
 from langsplat_viewer.viewer import Viewer
@@ -28,6 +28,7 @@ class Moment:
     moves: tuple[Move, ...]
     keyframes: tuple[Keyframe, ...]
     things: Things
+    notes: tuple[Note, ...]
 
 
 def now(viewer: Viewer) -> Moment:
@@ -46,6 +47,7 @@ def now(viewer: Viewer) -> Moment:
         moves=state.selection.moves,
         keyframes=state.record.keyframes,
         things=state.things,
+        notes=state.notes,
     )
 
 

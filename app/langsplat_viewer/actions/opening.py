@@ -26,7 +26,7 @@ from langsplat_core.semantics.encoders import DEMO
 from langsplat_viewer.actions import projects
 from langsplat_viewer.actions.filming import load_path
 from langsplat_viewer.actions.history import forget, remember
-from langsplat_viewer.actions.outline import apply_locks
+from langsplat_viewer.actions.outline import have_things
 from langsplat_viewer.actions.queries import ask, ask_again, load_queries, set_canonical
 from langsplat_viewer.actions.selecting import leave
 from langsplat_viewer.actions.settings import open_panel, show_scenes
@@ -38,7 +38,7 @@ from langsplat_viewer.files.browsing import Entry, list_folder
 from langsplat_viewer.files.flights import SUFFIX as PATHS
 from langsplat_viewer.files.photographs import Photograph
 from langsplat_viewer.files.preferences import with_photographs, with_recent
-from langsplat_viewer.files.projects import read_project, scene_of
+from langsplat_viewer.files.projects import Things, read_project, scene_of
 from langsplat_viewer.files.watching import Stamps, stamps
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.marks import of_scene
@@ -191,9 +191,9 @@ def return_to(viewer: Viewer, visit: Visit) -> None:
     if visit.camera_index is not None and visit.camera_index < count:
         state.camera_index = visit.camera_index
     state.settings, state.ruler = replace(state.settings, clip=visit.clip), visit.ruler
-    state.record.keyframes, state.things = visit.keyframes, visit.things
-    if visit.things.locked:
-        apply_locks(viewer)
+    state.record.keyframes, state.notes = visit.keyframes, visit.notes
+    state.kept, state.project = visit.kept, visit.project
+    have_things(viewer, visit.things if visit.count == len(state.scene.gaussians) else Things())
     if state.scene.language is None and DISPLAYS[visit.display].needs_field:
         return
     state.picture = replace(state.picture, display=visit.display)
@@ -573,9 +573,9 @@ def _ask_sets(viewer: Viewer, sets: Sequence[Path]) -> None:
 
 
 def open_recent(viewer: Viewer, path: str) -> None:
-    """Open a scene again that was open before."""
+    """Open a scene or a project again that was open before."""
     close_browser(viewer)
-    open_scene(viewer, Path(path))
+    open_file(viewer, Path(path))
 
 
 def type_path(viewer: Viewer, text: str) -> None:

@@ -20,7 +20,7 @@ from langsplat_viewer.actions.history import remember
 from langsplat_viewer.actions.queries import taught, teach
 from langsplat_viewer.actions.selecting import mark, select_alike, take
 from langsplat_viewer.actions.viewpoint import focus_on
-from langsplat_viewer.files.projects import Group
+from langsplat_viewer.files.projects import Group, Things, known_things
 from langsplat_viewer.state import OutlineView
 from langsplat_viewer.viewer import Viewer
 
@@ -249,6 +249,16 @@ def toggle_lock(viewer: Viewer, node: int) -> None:
     apply_locks(viewer)
 
 
+def have_things(viewer: Viewer, things: Things) -> None:
+    """Take names, groups and locks, as far as the scene's tree has their nodes."""
+    state, engine = viewer.state, viewer.engine
+    state.things = Things()
+    has_tree = engine is not None and state.scene is not None and state.scene.language is not None
+    if engine is not None and has_tree and things != Things():
+        state.things = known_things(things, engine.tree.count)
+    apply_locks(viewer)
+
+
 def apply_locks(viewer: Viewer) -> None:
     """Have the selection know what is locked."""
     state, engine = viewer.state, viewer.engine
@@ -262,8 +272,8 @@ def apply_locks(viewer: Viewer) -> None:
     state.selection = replace(state.selection, locked=locked, marks=kept)
 
 
-def group(viewer: Viewer, node: int, onto: int | Group) -> None:
-    """Put a thing into a group, or make one of two."""
+def group(viewer: Viewer, node: int, onto: int | Group | None) -> None:
+    """Put a thing into a group, or into a new one, with the node `onto` where that is given."""
     things = viewer.state.things
     others = tuple(g for g in (_without(g, node) for g in things.groups) if g is not None)
     if isinstance(onto, Group):
@@ -273,7 +283,7 @@ def group(viewer: Viewer, node: int, onto: int | Group) -> None:
     else:
         taken = {g.name for g in things.groups}
         name = next(f"group {k}" for k in range(1, len(taken) + 2) if f"group {k}" not in taken)
-        new = (*others, Group(name, (onto, node)))
+        new = (*others, Group(name, (node,) if onto is None else (onto, node)))
     remember(viewer)
     viewer.state.things = replace(things, groups=new)
 

@@ -6,16 +6,20 @@ from typing import Any
 
 import numpy as np
 
+from langsplat_core.arrays import Array
 from langsplat_core.errors import LangSplatError
-from langsplat_viewer.actions.history import now
-from langsplat_viewer.actions.outline import apply_locks
+from langsplat_viewer.actions.history import now, remember
+from langsplat_viewer.actions.outline import have_things
 from langsplat_viewer.actions.queries import listed_queries
+from langsplat_viewer.actions.selecting import discard_and_leave
+from langsplat_viewer.actions.selecting import end as end_editing
 from langsplat_viewer.actions.settings import have_panels, open_panel
 from langsplat_viewer.actions.transforming import place
 from langsplat_viewer.actions.viewpoint import bookmarked_view
 from langsplat_viewer.camera.flight import pose_of
 from langsplat_viewer.files import PROJECTS
 from langsplat_viewer.files.flights import Bookmark
+from langsplat_viewer.files.preferences import with_recent
 from langsplat_viewer.files.projects import (
     LONGEST_NOTE,
     MOST_NOTES,
@@ -49,21 +53,52 @@ def pin_at(viewer: Viewer, u: float, v: float) -> None:
     """Pin a note to the surface; (u, v) are fractions of the scene's area."""
     state = viewer.state
     point = None if viewer.surface is None else viewer.surface.point_at(u, v)
-    if point is None or len(state.notes) >= MOST_NOTES:
-        state.say("nothing under the cursor to pin a note to" if point is None else "no room for more notes")
+    if point is None:
+        state.say("nothing under the cursor to pin a note to")
+    else:
+        _pin(viewer, point)
+
+
+def pin_to_selection(viewer: Viewer) -> None:
+    """Pin a note to the middle of what is selected."""
+    state, chosen = viewer.state, viewer.state.selection.marks.selected
+    if state.scene is None or not chosen.any():
+        state.say("select something first, then pin a note to it", is_error=True)
         return
+    means = state.scene.gaussians.means[chosen].astype(np.float64)
+    _pin(viewer, means[np.argmin(((means - np.median(means, axis=0)) ** 2).sum(1))])
+
+
+def _pin(viewer: Viewer, point: Array) -> None:
+    state = viewer.state
+    if len(state.notes) >= MOST_NOTES:
+        state.say("no room for more notes", is_error=True)
+        return
+    remember(viewer)
     x, y, z = (float(part) for part in point)
-    state.notes, state.pins_notes = (*state.notes, Note(f"note {len(state.notes) + 1}", (x, y, z))), False
+    state.fresh_note = Note(f"note {len(state.notes) + 1}", (x, y, z))
+    state.notes, state.pins_notes = (*state.notes, state.fresh_note), False
+    state.awaits_keyboard = True
+    open_panel(viewer, "Notes")
+
+
+def take_fresh_note(viewer: Viewer, note: Note) -> bool:
+    """Whether a note was just pinned, and is to be written now; said once."""
+    is_fresh = viewer.state.fresh_note is note
+    viewer.state.fresh_note = None if is_fresh else viewer.state.fresh_note
+    return is_fresh
 
 
 def write_note(viewer: Viewer, note: Note, text: str) -> None:
     """Change the text of a note."""
+    remember(viewer, f"note at {note.at}")
     changed = replace(note, text=text[:LONGEST_NOTE])
     viewer.state.notes = tuple(changed if other is note else other for other in viewer.state.notes)
 
 
 def remove_note(viewer: Viewer, note: Note) -> None:
     """Take a note off."""
+    remember(viewer)
     viewer.state.notes = tuple(other for other in viewer.state.notes if other is not note)
 
 
@@ -100,11 +135,25 @@ def save_project(viewer: Viewer, folder: Path) -> Path | None:
     except OSError as error:
         state.say(f"{path}: not saved ({one_line(error)})", is_error=True)
         return None
-    state.project = path
+    state.project, state.preferences = path, with_recent(state.preferences, path)
+    state.kept = state.things, state.notes
     marks, moves = state.selection.marks, state.selection.moves
     state.selection = replace(state.selection, saved=marks.deleted, saved_moves=moves)
     state.say(f"saved {path}")
     return path
+
+
+def save_and_leave(viewer: Viewer, folder: Path) -> None:
+    """Save the project and go on; where it cannot be saved one stays."""
+    if save_project(viewer, folder) is not None:
+        discard_and_leave(viewer)
+
+
+def end(viewer: Viewer, folder: Path) -> None:
+    """Close without a question: what would be lost is first written to new files in `folder`."""
+    if viewer.state.has_unsaved_notes:
+        save_project(viewer, folder)
+    end_editing(viewer, folder)
 
 
 def _answer(state: ViewerState, query: Query) -> dict[str, Any]:
@@ -138,8 +187,7 @@ def restore(viewer: Viewer, project: Project, path: Path) -> Visit:
     state = viewer.state
     assert state.scene is not None
     if len(state.scene.gaussians) == project.count:
-        state.things = project.things
-        apply_locks(viewer)
+        have_things(viewer, project.things)
         pair = Pair(state.selection.marks, now(viewer).marks)
         state.selection = replace(state.selection, marks=unpack(project.marks, pair))
         try:
@@ -153,6 +201,8 @@ def restore(viewer: Viewer, project: Project, path: Path) -> Visit:
         state.say(f"the scene has changed since: {what}", is_error=True)
     state.picture = project.picture
     state.notes, state.project = project.notes, path
+    state.kept = state.things, state.notes
+    state.preferences = with_recent(state.preferences, path)
     state.bookmarks = project.bookmarks or state.bookmarks
     if project.panels:
         state.preferences = replace(state.preferences, panels=project.panels)

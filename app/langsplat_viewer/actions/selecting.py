@@ -236,6 +236,22 @@ def end_brush(viewer: Viewer, mode: Mode | None = None) -> None:
         take(viewer, found.between(*brushed), mode)
 
 
+def select_range(viewer: Viewer, text: str) -> None:
+    """Select what has values between two numbers that were typed, "0.5 to 0.9"."""
+    found = values_shown(viewer)
+    try:
+        ends = np.array([float(word) for word in text.split() if word != "to"])
+    except ValueError:
+        ends = np.zeros(0)
+    if found is None or len(ends) != 2:
+        viewer.state.say(f"'{text}' is not two numbers, such as 0.5 to 0.9", is_error=True)
+        return
+    if viewer.state.selection.measure in marks.LOGARITHMIC:
+        ends = np.log10(np.maximum(ends, 1e-30))
+    start, stop = (ends - found.low) / (found.high - found.low)
+    take(viewer, found.between(start, stop))
+
+
 # Writing what is selected, the rest, or the scene without what was deleted: to new files, never over old.
 
 Part = Literal["selection", "rest", "edited"]
@@ -320,10 +336,10 @@ def finish_writing(viewer: Viewer) -> None:
 # Another scene, or none: what was deleted and not saved is asked about first.
 
 
-def leave(viewer: Viewer, then: Callable[[Viewer], None], to: str) -> None:
+def leave(viewer: Viewer, then: Callable[[Viewer], None], to: str, loses_more: bool = False) -> None:
     """Do `then`: at once if nothing is lost by it, else when that was answered; `to` says what it is."""
     selection = viewer.state.selection
-    if selection.is_unsaved:
+    if selection.is_unsaved or loses_more:
         viewer.state.selection = replace(selection, leaving=Leaving(then, to))
     else:
         then(viewer)
@@ -338,7 +354,7 @@ def may_close(viewer: Viewer) -> bool:
 
 def quit_viewer(viewer: Viewer) -> None:
     """Have the window close at the next frame."""
-    leave(viewer, _close, "the window closes")
+    leave(viewer, _close, "the window closes", viewer.state.has_unsaved_notes)
 
 
 def end(viewer: Viewer, folder: Path) -> None:

@@ -257,6 +257,11 @@ def show_palette(viewer: Viewer, shown: bool) -> None:
     viewer.state.awaits_keyboard |= shown
 
 
+def toggle_palette(viewer: Viewer) -> None:
+    """Show that list, or take it away."""
+    show_palette(viewer, not viewer.state.show_palette)
+
+
 def type_command(viewer: Viewer, text: str) -> None:
     """Set the text of the box of that list."""
     viewer.state.palette_typed = text

@@ -12,8 +12,8 @@ from langsplat_viewer.viewer import Viewer
 
 
 def undo(viewer: Viewer) -> None:
-    """Go back to before the last query, removal, colour, level, keyframe, selection, hiding, deletion or
-    transform, or the last change of display, colours, sliders, split, cuts or overlays."""
+    """Go back to before the last query, removal, colour, level, keyframe, note, selection, hiding, deletion
+    or transform, or the last change of display, colours, sliders, split, cuts or overlays."""
     _step(viewer, viewer.history.past, viewer.history.future, "nothing to undo")
 
 
@@ -47,6 +47,7 @@ def _restore(viewer: Viewer, moment: Moment) -> None:
     if moment.things != state.things:
         state.things = moment.things
         apply_locks(viewer)
+    state.notes = moment.notes
     state.picture, state.latent_level = moment.picture, moment.latent_level
     state.settings = moment.settings
     looks = replace(state.preferences, colour_map=moment.picture.colour_map, overlays=moment.overlays)

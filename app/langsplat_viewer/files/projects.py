@@ -202,6 +202,16 @@ def _things(entry: Any) -> Things:
     return Things(dict(names), tuple(groups), frozenset(map(_node, _list(entry["locked"], MOST_THINGS))))
 
 
+def known_things(things: Things, count: int) -> Things:
+    """Without what speaks of other nodes than the first `count`."""
+    groups = (replace(g, nodes=tuple(n for n in dict.fromkeys(g.nodes) if n < count)) for g in things.groups)
+    return Things(
+        {node: name for node, name in things.names.items() if node < count},
+        tuple(group for group in groups if group.nodes),
+        frozenset(node for node in things.locked if node < count),
+    )
+
+
 def _node(value: Any) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 2**31:
         raise ValueError("no node of a tree")

@@ -22,7 +22,17 @@ from langsplat_viewer.panels import (
     view,
 )
 from langsplat_viewer.panels.scene import in_words
-from langsplat_viewer.panels.style import MAIN_DOCK, bad, muted, scene_area, small_wrapped, stoppable, tip
+from langsplat_viewer.panels.style import (
+    MAIN_DOCK,
+    MOST_OVER,
+    bad,
+    fitting,
+    muted,
+    scene_area,
+    small_wrapped,
+    stoppable,
+    tip,
+)
 from langsplat_viewer.state import Comparison, memory_bytes
 from langsplat_viewer.viewer import Viewer
 
@@ -31,19 +41,21 @@ def draw_menus(viewer: Viewer) -> None:
     """Inside the menu bar."""
     for menu in MENUS:
         if imgui.begin_menu(menu):
-            _items(viewer, menu)
+            first, *others = in_menu(menu)
+            _items(viewer, [first])
             if menu == "File":
                 _recent(viewer)
+            _items(viewer, others)
             if menu == "Window":
                 _panels()
                 if imgui.begin_menu(LETTERS_MENU):
-                    _items(viewer, LETTERS_MENU)
+                    _items(viewer, in_menu(LETTERS_MENU))
                     imgui.end_menu()
             imgui.end_menu()
 
 
-def _items(viewer: Viewer, menu: str) -> None:
-    for command in in_menu(menu):
+def _items(viewer: Viewer, commands: list[Command]) -> None:
+    for command in commands:
         if command.apart:
             imgui.separator()
         title = command.does[0].upper() + command.does[1:]
@@ -84,7 +96,7 @@ def draw_palette(viewer: Viewer) -> None:
         return
     top = imgui.get_main_viewport().get_center()
     imgui.set_next_window_pos(ImVec2(top.x, 0.15 * top.y), imgui.Cond_.always, ImVec2(0.5, 0))
-    imgui.set_next_window_size(hello_imgui.em_to_vec2(WIDTH_EM, HEIGHT_EM))
+    imgui.set_next_window_size(fitting(WIDTH_EM, HEIGHT_EM))
     imgui.set_next_window_bg_alpha(1.0)
     flags = imgui.WindowFlags_.no_title_bar | imgui.WindowFlags_.no_resize | imgui.WindowFlags_.no_collapse
     imgui.begin("Commands", None, flags)
@@ -94,9 +106,10 @@ def draw_palette(viewer: Viewer) -> None:
     entered, typed = imgui.input_text_with_hint(
         "##command", "what to do", viewer.state.palette_typed, imgui.InputTextFlags_.enter_returns_true
     )
+    typing = imgui.is_item_active()
     settings.type_command(viewer, typed)
     found = matching(typed, viewer.state.preferences.recent)
-    chosen = found[0] if entered and found else _clicked(found)
+    chosen = found[0] if entered and found else _clicked(found, typing)
     left = not imgui.is_window_focused(imgui.FocusedFlags_.root_and_child_windows)
     escaped = imgui.is_key_pressed(imgui.Key.escape)
     imgui.end()
@@ -106,15 +119,15 @@ def draw_palette(viewer: Viewer) -> None:
         chosen.act(viewer)
 
 
-def _clicked(found: list[Command]) -> Command | None:
-    """The list; the command that was clicked."""
+def _clicked(found: list[Command], typing: bool) -> Command | None:
+    """The list; the command that was clicked, or chosen by the arrows and Enter."""
     chosen = None
-    if imgui.begin_child("found"):
+    if imgui.begin_child("found", child_flags=imgui.ChildFlags_.nav_flattened):
         if not found:
             imgui.text_colored(muted(), "no command has these words")
         right = imgui.get_content_region_avail().x - hello_imgui.em_size(GAP_EM)
-        for command in found:
-            if imgui.selectable(command.does, False)[0]:
+        for place, command in enumerate(found):  # Enter does the one that is lit
+            if imgui.selectable(command.does, place == 0 and typing)[0]:
                 chosen = command
             keys = ", ".join(command.keys)
             imgui.same_line(right - imgui.calc_text_size(keys).x)
@@ -131,6 +144,8 @@ FIRST_STEPS = (
      "turn around. R leads back."),
     ("Search", "Type into the box and press Enter: 'red mug', 'handle of the mug', 'book on the table', "
      "'three books', 'toy, not teddy bear'. Tab completes, arrow up recalls."),
+    ("What is here", "The panel Outline, in the menu Window, lists what the scene holds; a right click on a "
+     "thing names it, hides it, or finds more like it."),
     ("Found, weak match, not here", "What the scene says of a phrase. Only what may be there is painted, "
      "and a weak match no hotter than half."),
     ("Relevancy", "From 0 to 1: how much nearer a place is to the phrase than to the everyday words under "
@@ -142,9 +157,9 @@ FIRST_STEPS = (
      "field as colours, the tree of parts; two side by side."),
     ("Select", "Click a thing with the pointing hand, draw around it, or take what the search found; then "
      "hide, name, measure, move or save it."),
-    ("Everything else", "Ctrl + Shift + P finds every command by its words."),
+    ("Everything else", "Ctrl + Shift + P finds every command by its words. Without a mouse: Ctrl + Tab goes "
+     "to the next panel, Tab and arrows travel in it."),
 )  # fmt: skip
-HELP_SHARE = 0.94  # of the window's height
 
 
 def key_rows() -> tuple[tuple[str, str], ...]:
@@ -158,8 +173,10 @@ def draw_help(viewer: Viewer) -> None:
     if not viewer.state.show_help:
         return
     flags = imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_collapse
-    centre, room = imgui.get_main_viewport().get_center(), imgui.get_main_viewport().work_size
-    imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(room.x, HELP_SHARE * room.y))
+    area, room = scene_area(), imgui.get_main_viewport().work_size
+    half = hello_imgui.em_size(KEYS_EM + DOES_EM + 4) / 2
+    centre = ImVec2(min(area.left + area.width / 2, room.x - half), area.top + area.height / 2)
+    imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(room.x, MOST_OVER * room.y))
     imgui.set_next_window_pos(centre, imgui.Cond_.always, ImVec2(0.5, 0.5))
     imgui.set_next_window_bg_alpha(1.0)
     _, still_open = imgui.begin("Help", True, flags)
@@ -202,18 +219,16 @@ def draw_messages(viewer: Viewer) -> None:
         for message in reversed(viewer.state.messages):
             small_wrapped(message.text, bad() if message.is_error else muted())
     imgui.end_child()
-    idling = hello_imgui.get_runner_params().fps_idling.is_idling
-    imgui.text_colored(muted(), figures(viewer, None if idling else imgui.get_io().framerate))
+    imgui.text_colored(muted(), figures(viewer))
 
 
-def figures(viewer: Viewer, frames_per_second: float | None) -> str:
-    """One line: frames per second (None: the window sleeps until something happens), backend, time and
-    size of the last image."""
-    stats = viewer.state.stats
-    speed = "idle" if frames_per_second is None else f"{frames_per_second:.0f} fps"
-    parts = [speed, viewer.state.backend]
+def figures(viewer: Viewer) -> str:
+    """One line: backend, time and size of the last image, and how many Gaussians are selected."""
+    stats, selected = viewer.state.stats, int(viewer.state.selection.marks.selected.sum())
+    parts = [viewer.state.backend]
     if stats.width:
         parts += [f"{stats.milliseconds:.0f} ms", f"{stats.width} x {stats.height}"]
+    parts += [f"{selected:,} selected"] if selected else []
     return "   ".join(part for part in parts if part)
 
 
@@ -326,8 +341,9 @@ def _window(viewer: Viewer, panel: Panel) -> hello_imgui.DockableWindow:
 def show_wanted(viewer: Viewer) -> None:
     """Open the panel that an action wants seen, in front of those it shares its place with."""
     title, docking = settings.take_wanted_panel(viewer), hello_imgui.get_runner_params().docking_params
-    for window in docking.dockable_windows if viewer.state.shows_panels else ():
-        window.is_visible = window.label in viewer.state.shows_panels
+    titles = viewer.state.shows_panels
+    for window in docking.dockable_windows if any(panel.title in titles for panel in PANELS) else ():
+        window.is_visible = window.label in titles
     settings.have_panels(viewer, ())
     docking.layout_reset |= settings.take_panel_reset(viewer)
     if title:
@@ -399,6 +415,7 @@ def draw_over(viewer: Viewer) -> None:
         outline.draw_legend(viewer, area)
         overlays.draw_pointing(viewer)
         select.draw_stroke(viewer, area)
+        select.draw_hint(viewer, area)
         transform.draw_gizmo(viewer, area)
     overlays.draw_grip(viewer, area)
     overlays.draw_cube(viewer, area)
@@ -417,5 +434,5 @@ def _said(viewer: Viewer) -> str:
     """Return the words in place of an image; empty while there is one."""
     state = viewer.state
     if state.scene is None:
-        return f"opening {state.opening.name} ..." if state.opening else "Drop a scene here, or use Open ..."
+        return f"opening {state.opening.name} ..." if state.opening else "Drop a scene here, or press Ctrl+O"
     return state.nothing

@@ -28,7 +28,7 @@ def draw(viewer: Viewer) -> None:
     imgui.set_next_item_width(-1)
     _, typed = imgui.input_text_with_hint("##filter", "filter", viewer.state.outline_typed)
     outline.write_filter(viewer, typed)
-    if imgui.begin_child("rows"):
+    if imgui.begin_child("rows", child_flags=imgui.ChildFlags_.nav_flattened):
         for group in viewer.state.things.groups:
             _group(viewer, view, group)
         inside = {node for group in viewer.state.things.groups for node in group.nodes}
@@ -43,7 +43,7 @@ def _group(viewer: Viewer, view: OutlineView, group: Group) -> None:
     imgui.set_next_item_open(True, imgui.Cond_.once)
     flags = imgui.TreeNodeFlags_.open_on_arrow | imgui.TreeNodeFlags_.span_avail_width
     opened = imgui.tree_node_ex(f"{group.name}##group", flags)
-    if imgui.is_item_clicked() and not imgui.is_item_toggled_open():
+    if _chosen("group"):
         outline.select_group(viewer, group)
     _drop(viewer, group)
     if imgui.begin_popup_context_item("group"):
@@ -72,12 +72,12 @@ def _row(viewer: Viewer, row: Outline, *, in_group: bool = False) -> None:
         if row.word and row.node not in viewer.state.things.names
         else ""
     )
-    room = (
-        imgui.get_content_region_avail().x - 2 * side - 2 * spacing - imgui.get_tree_node_to_label_spacing()
-    )
+    icons = (2 if colour is None else 3) * (side + spacing)
+    room = imgui.get_content_region_avail().x - icons - imgui.get_tree_node_to_label_spacing()
+    label = elided(name + sure, room, width_of)
     imgui.align_text_to_frame_padding()
-    opened = imgui.tree_node_ex(f"{elided(name + sure, room, width_of)}###row", flags)
-    if imgui.is_item_clicked() and not imgui.is_item_toggled_open():
+    opened = imgui.tree_node_ex(f"{label}###row", flags)
+    if _chosen("thing"):
         outline.visit(viewer, row.node)
     _about(row, name)
     if imgui.begin_drag_drop_source():
@@ -87,9 +87,15 @@ def _row(viewer: Viewer, row: Outline, *, in_group: bool = False) -> None:
     _drop(viewer, row.node)
     if imgui.begin_popup_context_item("thing"):
         _things_menu(viewer, row.node)
-        if in_group and imgui.menu_item("Out of the group", "", False)[0]:
-            outline.ungroup(viewer, row.node)
+        _group_menu(viewer, row.node, in_group)
         imgui.end_popup()
+    left = room - width_of(label) - 2 * spacing
+    said = next(
+        (text for text in (f"{row.count:,}   {_sides(row)}", f"{row.count:,}") if width_of(text) < left), ""
+    )
+    if said:
+        imgui.same_line(right - icons - width_of(said))
+        imgui.text_colored(muted(), said)
     if colour is not None:
         imgui.same_line(right - 3 * side - 2 * spacing)
         _swatch(colour, side)
@@ -105,10 +111,37 @@ def _row(viewer: Viewer, row: Outline, *, in_group: bool = False) -> None:
         imgui.unindent()
 
 
+def _chosen(menu: str) -> bool:
+    """Whether the last row was clicked, or Enter or Space pressed on it; the menu key opens its menu."""
+    if imgui.is_item_focused():
+        keys, shift = imgui.Key, imgui.get_io().key_shift
+        if imgui.is_key_pressed(keys.menu) or (shift and imgui.is_key_pressed(keys.f10)):
+            imgui.open_popup(menu)
+        if any(imgui.is_key_pressed(key, False) for key in (keys.enter, keys.keypad_enter, keys.space)):
+            if imgui.is_item_toggled_open():  # arrows open and close
+                place, rows = imgui.get_item_id(), imgui.get_state_storage()
+                rows.set_int(place, 1 - rows.get_int(place))
+            return True
+    return imgui.is_item_clicked() and not imgui.is_item_toggled_open()
+
+
+def _group_menu(viewer: Viewer, node: int, in_group: bool) -> None:
+    if imgui.menu_item("Into a new group", "", False)[0]:
+        outline.group(viewer, node, None)
+    for group in viewer.state.things.groups:
+        if node not in group.nodes and imgui.menu_item(f"Into '{group.name}'", "", False)[0]:
+            outline.group(viewer, node, group)
+    if in_group and imgui.menu_item("Out of the group", "", False)[0]:
+        outline.ungroup(viewer, node)
+
+
 def _about(row: Outline, name: str) -> None:
-    sides = " x ".join(f"{side:.3g}" for side in row.size)
     outlined = f"outlined in {row.votes[0]} of {sum(row.votes)} photographs"
-    tip(f"{name}: {row.count:,} Gaussians, {sides} world units, {outlined}")
+    tip(f"{name}: {row.count:,} Gaussians, {_sides(row)} world units, {outlined}")
+
+
+def _sides(row: Outline) -> str:
+    return " x ".join(f"{side:.2g}" for side in row.size)
 
 
 def _eye(viewer: Viewer, node: int, side: float) -> None:
@@ -131,7 +164,9 @@ def _icon(label: str, side: float, *, lit: bool) -> bool:
     imgui.push_style_color(imgui.Col_.button, ImVec4(0, 0, 0, 0))
     text = imgui.get_style_color_vec4(imgui.Col_.text) if lit else muted()
     imgui.push_style_color(imgui.Col_.text, ImVec4(text.x, text.y, text.z, 1.0 if lit else 0.45))
+    imgui.push_style_var(imgui.StyleVar_.frame_padding, ImVec2(0, 0))  # open locks are wide
     clicked = bool(imgui.button(label, ImVec2(side, side)))
+    imgui.pop_style_var()
     imgui.pop_style_color(2)
     return clicked
 

@@ -17,7 +17,7 @@ from langsplat_viewer.camera import overlays
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.camera.overlays import Face, Label, face_at, placed, visible_faces, world_axes
 from langsplat_viewer.files.photographs import corners
-from langsplat_viewer.panels.style import Area, elided, muted, scene_area, width_of
+from langsplat_viewer.panels.style import Area, elided, fitting, muted, scene_area, width_of
 from langsplat_viewer.state import Hover
 from langsplat_viewer.viewer import Viewer
 
@@ -173,7 +173,7 @@ class EvidenceWindow(_Uploaded):
         texture = self._upload(sheet.image)
         area = scene_area()
         imgui.set_next_window_pos(ImVec2(area.left, area.top), imgui.Cond_.appearing)
-        imgui.set_next_window_size(hello_imgui.em_to_vec2(*EVIDENCE_EM), imgui.Cond_.appearing)
+        imgui.set_next_window_size(fitting(*EVIDENCE_EM), imgui.Cond_.appearing)
         imgui.set_next_window_bg_alpha(1.0)
         _, still_open = imgui.begin(f"Evidence: {sheet.phrase}###evidence", True)
         width = imgui.get_content_region_avail().x

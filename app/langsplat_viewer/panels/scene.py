@@ -10,7 +10,7 @@ from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_core.config import TrainPreset
 from langsplat_core.io.scenes import format_of
-from langsplat_viewer.actions import opening, selecting, settings, training
+from langsplat_viewer.actions import opening, projects, selecting, settings, training
 from langsplat_viewer.files.browsing import Entry, Listing
 from langsplat_viewer.output import saving
 from langsplat_viewer.panels.style import (
@@ -19,6 +19,7 @@ from langsplat_viewer.panels.style import (
     beside,
     beside_boxed,
     elided,
+    fitting,
     muted,
     small_wrapped,
     tip,
@@ -111,7 +112,7 @@ def draw_browser(viewer: Viewer) -> None:
         imgui.open_popup(title)
     centre = imgui.get_main_viewport().get_center()
     imgui.set_next_window_pos(centre, imgui.Cond_.appearing, ImVec2(0.5, 0.5))
-    imgui.set_next_window_size(hello_imgui.em_to_vec2(WIDTH_EM, HEIGHT_EM), imgui.Cond_.appearing)
+    imgui.set_next_window_size(fitting(WIDTH_EM, HEIGHT_EM), imgui.Cond_.appearing)
     shown, stays = imgui.begin_popup_modal(title, True, imgui.WindowFlags_.no_saved_settings)
     if not shown:
         return
@@ -264,21 +265,35 @@ def draw_unsaved(viewer: Viewer) -> None:
     if leaving is not None and leaving.film:
         _wait_for_film(viewer)
     elif leaving is not None:
-        count = int(viewer.state.selection.marks.deleted.sum())
-        moved = " and some transformed" if viewer.state.selection.moves else ""
-        imgui.text_unformatted(f"{count:,} Gaussians were deleted{moved}, and the scene is not saved so.")
-        imgui.text_unformatted(f"Save it as a new file before {leaving.to}?")
-        if imgui.button("Save"):
-            selecting.save_and_leave(viewer, Path.cwd())
-        imgui.same_line()
-        if imgui.button("Discard"):
-            selecting.discard_and_leave(viewer)
-        imgui.same_line()
-        if imgui.button("Cancel"):
-            selecting.stay(viewer)
+        _ask(viewer, leaving.to)
     if viewer.state.selection.leaving is None:
         imgui.close_current_popup()
     imgui.end_popup()
+
+
+def _ask(viewer: Viewer, to: str) -> None:
+    selection = viewer.state.selection
+    if selection.is_unsaved:
+        moved = " and some transformed" if selection.moves else ""
+        count = f"{int(selection.marks.deleted.sum()):,} Gaussians"
+        imgui.text_unformatted(f"{count} were deleted{moved}, and the scene is not saved so.")
+    if viewer.state.has_unsaved_notes:
+        imgui.text_unformatted("Notes, names, groups or locks are in no project.")
+    imgui.text_unformatted(f"Save before {to}?")
+    if selection.is_unsaved:
+        if imgui.button("Save"):
+            selecting.save_and_leave(viewer, Path.cwd())
+        tip("The scene as a new file, without what was deleted")
+        imgui.same_line()
+    if imgui.button("Save the project"):
+        projects.save_and_leave(viewer, Path.cwd())
+    tip("Everything in one small file; the scene stays as it is")
+    imgui.same_line()
+    if imgui.button("Discard"):
+        selecting.discard_and_leave(viewer)
+    imgui.same_line()
+    if imgui.button("Cancel"):
+        selecting.stay(viewer)
 
 
 def _wait_for_film(viewer: Viewer) -> None:

@@ -66,7 +66,7 @@ def _offers(viewer: Viewer) -> None:
     if not phrases:
         return
     height = OFFER_LINES * imgui.get_text_line_height_with_spacing()
-    if imgui.begin_child("offers", ImVec2(0, height), imgui.ChildFlags_.none):
+    if imgui.begin_child("offers", ImVec2(0, height), imgui.ChildFlags_.nav_flattened):
         _offer_buttons(viewer, title, phrases)
     imgui.end_child()
 
@@ -139,7 +139,7 @@ def _answers(viewer: Viewer) -> None:
     it the chosen query."""
     row = imgui.get_frame_height_with_spacing()
     rows = rows_shown(len(viewer.state.queries), imgui.get_content_region_avail().y / row)
-    if imgui.begin_child("queries", ImVec2(0, rows * row), imgui.ChildFlags_.none):
+    if imgui.begin_child("queries", ImVec2(0, rows * row), imgui.ChildFlags_.nav_flattened):
         if not viewer.state.queries:
             imgui.text_colored(muted(), "what you search is listed here")
         for query in reversed(viewer.state.queries):
@@ -235,6 +235,8 @@ def _details(viewer: Viewer, query: Query) -> None:
         tip("Where it is relevant most; world units")
     if query.problem:
         small_wrapped(query.problem, bad())
+    if query.reading:
+        small_wrapped(f"read as: {query.reading}", muted())
     if result is not None:
         for index, (name, score) in enumerate(zip(LEVELS, result.scores, strict=True)):
             if index:
@@ -246,8 +248,6 @@ def _details(viewer: Viewer, query: Query) -> None:
                 imgui.text_colored(muted(), text)
             tip(f"The best relevancy at the level '{name}'; the brighter one answers")
         _cut(viewer, query, result)
-    if query.reading:
-        small_wrapped(f"read as: {query.reading}", muted())
 
 
 def _combine(viewer: Viewer, query: Query) -> None:

@@ -145,8 +145,8 @@ def _name(viewer: Viewer) -> None:
     """Draw the box for a name by which what is selected is found from now on."""
     button = imgui.calc_text_size("Name it").x + 2 * imgui.get_style().frame_padding.x
     imgui.set_next_item_width(-button - imgui.get_style().item_spacing.x)
-    flags, hint = imgui.InputTextFlags_.enter_returns_true, "a name for what is selected"
-    entered, typed = imgui.input_text_with_hint("##name", hint, viewer.state.selection.name, flags)
+    hint = "a name for what is selected"
+    entered, typed = imgui.input_text_with_hint("##name", hint, viewer.state.selection.name, _ENTERED)
     queries.type_name(viewer, typed)
     imgui.same_line()
     if imgui.button("Name it") or entered:
@@ -155,6 +155,7 @@ def _name(viewer: Viewer) -> None:
 
 
 HISTOGRAM_EM = 3.0
+_ENTERED = imgui.InputTextFlags_.enter_returns_true
 
 
 def _values(viewer: Viewer) -> None:
@@ -188,8 +189,12 @@ def _values(viewer: Viewer) -> None:
         paint = imgui.get_window_draw_list()
         paint.add_rect_filled(ImVec2(left, corner.y), ImVec2(right, corner.y + size.y), _colour(PAINT))
     start, stop = sorted(brushed) if brushed else (0.0, 1.0)
-    small_wrapped(f"{_value(viewer, found, start)} to {_value(viewer, found, stop)}", muted())
-    tip("Drag over the histogram; Shift adds, Ctrl removes, both intersect")
+    imgui.set_next_item_width(-1)
+    hint = f"{_value(viewer, found, start)} to {_value(viewer, found, stop)}"
+    entered, typed = imgui.input_text_with_hint("##range", hint, "", _ENTERED)
+    if entered:
+        selecting.select_range(viewer, typed)
+    tip("Drag over the histogram, or type two numbers; Shift adds, Ctrl removes, both intersect")
 
 
 def _value(viewer: Viewer, found: marks.Histogram, part: float) -> str:
@@ -256,7 +261,7 @@ def held_mode() -> Mode | None:
 
 
 def draw_stroke(viewer: Viewer, area: Area) -> None:
-    """The outline of what is being enclosed, the brush, and how the tool works."""
+    """The outline of what is being enclosed, and the brush."""
     selection = viewer.state.selection
     if selection.tool is None or viewer.state.scene is None:
         return
@@ -274,7 +279,6 @@ def draw_stroke(viewer: Viewer, area: Area) -> None:
         paint.add_circle(io.mouse_pos, radius, _colour(DARK), 0, 3.0)
         paint.add_circle(io.mouse_pos, radius, _colour(LIGHT), 0, 1.0)
     paint.pop_clip_rect()
-    _hint(selection.tool, area)
 
 
 def _on_screen(line: Array, area: Area) -> list[Any]:
@@ -295,14 +299,24 @@ def _stripe(paint: Any, points: list[Any], radius: float) -> None:
         paint.add_polyline(points, _colour(PAINT), 2 * radius, 0)
 
 
-def _hint(tool: Tool, area: Area) -> None:
+def draw_hint(viewer: Viewer, area: Area) -> None:
+    """What a click on the scene does, while it does not turn the view."""
+    state, tool = viewer.state, viewer.state.selection.tool
+    if state.ruler.measures:
+        text = "Ruler: click two points on the surface; Esc ends it"
+    elif state.pins_notes:
+        text = "Note: click what it is about; Esc leaves"
+    elif tool is not None:
+        text = f"{tool.capitalize()}: {HINTS[tool]}. {TOOL_KEYS}"
+    else:
+        return
     top = ImVec2(area.left + area.width / 2, area.top + hello_imgui.em_size(0.7))
     imgui.set_next_window_pos(top, imgui.Cond_.always, ImVec2(0.5, 0))
     imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(0.95 * area.width, area.height))
     imgui.set_next_window_bg_alpha(0.75)
     imgui.begin("tool", None, QUIET)
     imgui.push_text_wrap_pos(0.9 * area.width)
-    imgui.text_unformatted(f"{tool.capitalize()}: {HINTS[tool]}. {TOOL_KEYS}")
+    imgui.text_unformatted(text)
     imgui.pop_text_wrap_pos()
     imgui.end()
 

@@ -36,6 +36,7 @@ def scene_area() -> Area:
 
 
 TIP_LETTERS = 72  # of a line
+MOST_OVER = 0.94  # of the window that something which lies over it may take
 # Window units at a scale of 1.
 SPACES = {
     "window_padding": (10.0, 8.0),
@@ -104,6 +105,9 @@ def stoppable(label: str, fraction: float, tag: str = "") -> bool:
     from others of its name."""
     cancel = imgui.calc_text_size("Cancel").x + 2 * imgui.get_style().frame_padding.x
     width = -cancel - imgui.get_style().item_spacing.x
+    if width_of(label) > imgui.get_content_region_avail().x + width:  # no room for it in the bar
+        imgui.text_wrapped(label)
+        label = ""
     imgui.push_style_color(imgui.Col_.plot_histogram, imgui.get_style_color_vec4(imgui.Col_.button_active))
     imgui.progress_bar(fraction, ImVec2(width, 0), label)
     imgui.pop_style_color()
@@ -135,6 +139,12 @@ def leave_room(label: str, ems: float) -> None:
     label_width = width_of(label) + imgui.get_style().item_inner_spacing.x
     room = imgui.get_content_region_avail().x - label_width
     imgui.set_next_item_width(max(min(hello_imgui.em_size(ems), room), hello_imgui.em_size(2)))
+
+
+def fitting(width_em: float, height_em: float) -> ImVec2:
+    """A size for what lies over the scene, in widths of an m, as far as the window has room for it."""
+    size, room = hello_imgui.em_to_vec2(width_em, height_em), imgui.get_main_viewport().work_size
+    return ImVec2(min(size.x, MOST_OVER * room.x), min(size.y, MOST_OVER * room.y))
 
 
 def elided(text: str, room: float, width_of: Callable[[str], float]) -> str:

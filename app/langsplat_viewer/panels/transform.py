@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Any, get_args
 
 import numpy as np
-from imgui_bundle import imgui, imguizmo
+from imgui_bundle import ImVec2, imgui, imguizmo
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import LangSplatError
@@ -91,32 +91,46 @@ def _three(label: str, values: Point, what: str) -> Point:
 # The gizmo over the scene. ImGuizmo edits a matrix that lies in the middle of what is transformed.
 
 
+def _is_shown(viewer: Viewer) -> bool:
+    """Whether there is a gizmo: none under what lies over the scene."""
+    state = viewer.state
+    covered = state.show_help or state.show_palette or imgui.is_popup_open("", imgui.PopupFlags_.any_popup)
+    return state.edit_form.gizmo != "off" and state.scene is not None and not covered
+
+
 def holds_mouse(viewer: Viewer) -> bool:
     """Return whether the mouse is on a gizmo, or drags it."""
-    shown = viewer.state.edit_form.gizmo != "off" and viewer.state.scene is not None
-    return shown and bool(gizmo.is_using() or gizmo.is_over())
+    return _is_shown(viewer) and bool(gizmo.is_using() or gizmo.is_over())
 
 
 def draw_gizmo(viewer: Viewer, area: Area) -> None:
     """The gizmo that is chosen, where it was dragged to; what it moves follows, and stays on release."""
     state = viewer.state
     kind = state.edit_form.gizmo
-    if kind == "off" or state.view is None or state.settings.split.columns > 1:
+    if not _is_shown(viewer) or state.view is None or state.settings.split.columns > 1:
         return
     centre = transforming.pivot(viewer)
     if centre is None:
         return
     camera = state.view.camera(max(round(area.width), 1), max(round(area.height), 1))
     view, projection = gl_matrices(camera, state.view.distance)
+    paint = imgui.get_foreground_draw_list()
+    paint.push_clip_rect(ImVec2(area.left, area.top), ImVec2(area.left + area.width, area.top + area.height))
     gizmo.begin_frame()
-    gizmo.set_drawlist(imgui.get_foreground_draw_list())
+    gizmo.set_drawlist(paint)
     gizmo.set_rect(area.left, area.top, area.width, area.height)
     gizmo.set_orthographic(camera.orthographic)
     seen = gizmo.Matrix16(_columns(view)), gizmo.Matrix16(_columns(projection))
     if kind == "box":
         _box_handles(viewer, seen)
-        return
-    start, held = moving(centre).matrix, state.moving
+    else:
+        _handles(viewer, seen, kind, centre)
+    paint.pop_clip_rect()
+
+
+def _handles(viewer: Viewer, seen: tuple[Any, Any], kind: str, centre: Array) -> None:
+    """Arrows, rings or knobs: what is dragged is previewed, on release it is done."""
+    start, held = moving(centre).matrix, viewer.state.moving
     edited = gizmo.Matrix16(_columns(start if held is None else held[0].to.matrix @ start))
     changed = gizmo.manipulate(*seen, OPERATIONS[kind], gizmo.MODE.world, edited)
     if gizmo.is_using():

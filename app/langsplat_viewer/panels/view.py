@@ -199,6 +199,10 @@ def draw_notes(viewer: Viewer) -> None:
     )
     if changed:
         projects.pin_notes(viewer, pins)
+    imgui.begin_disabled(not state.selection.marks.selected.any())
+    if imgui.button("Pin one to the selection"):
+        projects.pin_to_selection(viewer)
+    imgui.end_disabled()
     beside("Save project")
     if imgui.button("Save project"):
         projects.save_project(viewer, Path.cwd())
@@ -209,6 +213,8 @@ def draw_notes(viewer: Viewer) -> None:
     for number, note in enumerate(state.notes):
         imgui.push_id(number)
         imgui.set_next_item_width(-side - imgui.get_style().item_spacing.x)
+        if projects.take_fresh_note(viewer, note):
+            imgui.set_keyboard_focus_here()
         changed, text = imgui.input_text("##note", note.text)
         if changed:
             projects.write_note(viewer, note, text)
