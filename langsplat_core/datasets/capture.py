@@ -4,6 +4,7 @@ unit."""
 import hashlib
 import logging
 import math
+import os
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -83,7 +84,7 @@ def mask_beside(photo: Path) -> Path | None:
     folders = (photo.parent / "masks", photo.parent.parent / "masks")
     names = (f"{photo.name}.png", f"{photo.stem}.png")
     candidates = (folder / name for folder in folders for name in names)
-    return next((path for path in candidates if path != photo and path.is_file()), None)
+    return next((path for path in candidates if path != photo and os.path.isfile(path)), None)
 
 
 def shortened(names: Iterable[str], limit: int = 5, width: int = 200) -> str:

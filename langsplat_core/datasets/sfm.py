@@ -507,32 +507,37 @@ def load_photos(
     contents = [(path.name, _content(path)) for path in paths]
     masked = [(path.name, _content(mask)) for path in paths if (mask := mask_beside(path))]
     workspace = open_workspace(work, ["photographs", 3, SFM_SIDE, contents, *([masked] if masked else [])])
-    numbered = {f"{index:05d}.jpg": path for index, path in enumerate(paths)}
+    files = numbered(paths)
     if not has_model(workspace / "sparse"):
-        _reconstruct(workspace, numbered, progress)
+        _reconstruct(workspace, files, progress)
     model = read_model(workspace / "sparse") if has_model(workspace / "sparse") else None
-    lost = _left_out(workspace, model, numbered, _twins(numbered, dict(contents)))
-    found = len(numbered) - sum(map(len, lost.values()))
-    if model is None or (found < max(MIN_PHOTOS, FEWEST * len(numbered)) and not allow_few_cameras):
+    lost = _left_out(workspace, model, files, _twins(files, dict(contents)))
+    found = len(files) - sum(map(len, lost.values()))
+    if model is None or (found < max(MIN_PHOTOS, FEWEST * len(files)) and not allow_few_cameras):
         anyway = "" if model is None else ", or go on without these with --dataset.allow-few-cameras"
         raise InputError(
-            f"only {found} of {len(numbered)} photographs could be located together "
+            f"only {found} of {len(files)} photographs could be located together "
             f"({_listed(lost, 50, 500)}); {_ADVICE}{anyway}"
         )
     if lost:
         log.warning(
             "%d of %d photographs could not be located and are left out (%s)",
-            len(numbered) - found,
-            len(numbered),
+            len(files) - found,
+            len(files),
             _listed(lost),
         )
     located = located_photos(model, workspace / "images", workspace / "sparse")
     photos = [
         Photo(path, path.name, p.intrinsics, p.world_to_camera, upright=True, mask=mask_beside(path))
-        for p, path in ((p, numbered[p.label]) for p in located)
+        for p, path in ((p, files[p.label]) for p in located)
     ]
-    cameras, images, files, masks = develop(photos, max_side, progress)
-    return Capture(cameras, images, *good_points(model), photos=files, masks=masks)
+    cameras, images, kept, masks = develop(photos, max_side, progress)
+    return Capture(cameras, images, *good_points(model), photos=kept, masks=masks)
+
+
+def numbered(paths: Sequence[Path]) -> dict[str, Path]:
+    """Photographs by their names in the workspace."""
+    return {f"{index:05d}.jpg": path for index, path in enumerate(paths)}
 
 
 def _content(path: Path) -> str:
@@ -575,16 +580,21 @@ def _listed(lost: dict[str, list[str]], limit: int = 5, width: int = 200) -> str
 
 
 def _reconstruct(workspace: Path, numbered: dict[str, Path], progress: Progress) -> None:
-    copies = _small_copies(workspace / "images", numbered, progress)
     try:
-        extract_features(workspace, _groups(copies), progress)
-        match_features(workspace, pairs_by_name([copy.name for copy in copies]), progress)
-        map_cameras(workspace, len(copies), progress)
+        map_cameras(workspace, match_photos(workspace, numbered, progress), progress)
     except FAILURES as error:
         reason = str(error).partition("\n")[0]
         raise InputError(
             f"structure from motion failed ({reason}); remove {workspace} and try again"
         ) from None
+
+
+def match_photos(workspace: Path, numbered: dict[str, Path], progress: Progress) -> int:
+    """Features and matches of photographs into the workspace's database; how many could be read."""
+    copies = _small_copies(workspace / "images", numbered, progress)
+    extract_features(workspace, _groups(copies), progress)
+    match_features(workspace, pairs_by_name([copy.name for copy in copies]), progress)
+    return len(copies)
 
 
 def _small_copies(folder: Path, numbered: dict[str, Path], progress: Progress) -> list[_Copy]:
