@@ -17,12 +17,9 @@ from assets.making.objects import FURNITURE, TABLE_TOP, furniture
 from assets.making.render import Renderer
 from assets.making.shapes import rotation_about
 from assets.making.world import ENLARGED, Placed, assemble, bounds
-from langsplat_core.arrays import Array
 from langsplat_core.bench.measure import markdown
 from langsplat_core.datasets import sfm
 from langsplat_core.datasets.capture import find_photos
-from langsplat_core.datasets.colmap import read_model
-from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, TerminalProgress, silent
 from langsplat_core.scene import Camera, look_at
 
@@ -34,7 +31,7 @@ WAYS = ("usual", "close pairs", "all at once", "few shared")  # as in `sfm.WAYS`
 
 @dataclass(frozen=True)
 class Walks:
-    """Located photographs of walks: of folders, or of one drawn along a row of rooms without walls between."""
+    """Photographs located per way: of the walks in folders, or of one drawn along a furnished street."""
 
     folders: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Folders of photographs; none: draw a walk, with focal lengths in the EXIF data and without."""
@@ -42,6 +39,8 @@ class Walks:
     """Photographs of the drawn walk."""
     step: float = 1.0
     """Metres from one photograph to the next."""
+    sway: float = 1.0
+    """Times 5 cm and 2 degrees, how the walker sways; 0: as on rails."""
     width: int = 800
     """Pixels; the height is three quarters."""
     seed: int = 0
@@ -49,15 +48,16 @@ class Walks:
     """Folder to draw into; a walk that lies there is taken as it is."""
 
     def run(self) -> None:
-        rows = []
+        rows: list[tuple[str, ...]] = []
         with tempfile.TemporaryDirectory() as scratch, TerminalProgress() as progress:
+            truth = () if self.folders else walk_cameras(self)
             folders = self.folders or draw(self.keep or Path(scratch), self, progress)
             for number, folder in enumerate(folders):
-                rows += located(folder, Path(scratch) / str(number), progress)
-        print(markdown(("photographs", "way", "located", "CPU-s", "off the line"), rows))
+                rows += located(folder, Path(scratch) / str(number), truth, progress)
+        print(markdown(("photographs", "way", "located", "places off", "CPU-s"), rows))
 
 
-def draw(folder: Path, walk: Walks, progress: Progress = silent) -> list[Path]:
+def draw(folder: Path, walk: Walks, progress: Progress = silent) -> Sequence[Path]:
     """Write the photographs of a walk, with the focal length in their EXIF data and without; both folders."""
     folders = [folder / "exif", folder / "plain"]
     if all(map(find_photos, folders)):
@@ -82,8 +82,8 @@ FILM_DIAGONAL = float(np.hypot(36, 24))  # mm
 
 
 def street(seed: int, length: float) -> list[Placed]:
-    """Floor and walls along x from 0 to `length` metres, furniture and pictures along the walls, things on the
-    floor beside the way."""
+    """Floor and walls along x from 0 to `length` metres, furniture and pictures along these, and things on
+    the floor beside the way."""
     kit = Kit(np.random.default_rng((seed, 29)))
     placed: list[Placed] = []
     for at in np.arange(furniture.ROOM / 2, length + furniture.ROOM / 2, furniture.ROOM):
@@ -112,17 +112,18 @@ def walk_cameras(walk: Walks) -> list[Camera]:
     size = (walk.width, walk.width * 3 // 4)
     found = []
     for number in range(walk.views):
-        eye = np.array([number * walk.step, 0.0, 1.5]) + rng.normal(0, (0.05, 0.06, 0.03))
-        target = eye + np.array([AHEAD, 0, -0.8]) + rng.normal(0, (0, 0.25, 0.15))
+        eye = np.array([number * walk.step, 0.0, 1.5]) + walk.sway * rng.normal(0, (0.05, 0.06, 0.03))
+        target = eye + np.array([AHEAD, 0, -0.8]) + walk.sway * rng.normal(0, (0, 0.25, 0.15))
         found.append(look_at(eye, target, np.array([0.0, 0, 1]), size, FIELD))
     return found
 
 
-def located(folder: Path, work: Path, progress: Progress = silent) -> list[tuple[str, ...]]:
-    """A row per way: photographs located of those in `folder`, and CPU seconds, from the same matches."""
-    paths = find_photos(folder)
+def located(
+    folder: Path, work: Path, truth: Sequence[Camera], progress: Progress = silent
+) -> list[tuple[str, ...]]:
+    """A row per way, from the same matches; `truth`: the cameras of the photographs, or none."""
     workspace = sfm.open_workspace(work, str(folder))
-    count = sfm.match_photos(workspace, sfm.numbered(paths), progress)
+    count = sfm.match_photos(workspace, sfm.numbered(find_photos(folder)), progress)
     rows = []
     for name, way in zip(WAYS, sfm.WAYS, strict=True):
         attempts = work / "attempts"
@@ -131,17 +132,22 @@ def located(folder: Path, work: Path, progress: Progress = silent) -> list[tuple
         start = time.process_time()
         model = sfm.best_model(None, way(workspace, attempts, lambda: None))
         seconds = time.process_time() - start
-        off, found = "", 0
-        if model is not None:
-            found = len(sfm.located_names(model))
-            eyes = np.array([i.projection_center() for i in model.images.values() if i.has_pose])
-            off = f"{off_the_line(eyes):.3f}"
-        rows.append((folder.name, name, f"{found} of {count}", f"{seconds:.1f}", off))
+        found = 0 if model is None else len(sfm.located_names(model))
+        off = f"{100 * astray(model, truth):.2f} %" if model and truth else ""
+        rows.append((folder.name, name, f"{found} of {count}", off, f"{seconds:.1f}"))
     return rows
 
 
-def off_the_line(eyes: Array) -> float:
-    """Root mean square distance of places from their line, over its length: of a straight walk, an error."""
-    spread = np.linalg.svd(eyes - eyes.mean(0), compute_uv=False)
-    along = np.linalg.svd(eyes - eyes.mean(0))[2][0] @ (eyes - eyes.mean(0)).T
-    return float(np.hypot(*spread[1:]) / np.sqrt(len(eyes)) / max(np.ptp(along), 1e-9))
+def astray(model: sfm.Model, truth: Sequence[Camera]) -> float:
+    """Median error of the located places, over the length of the way between them. The worlds are laid onto
+    each other by what the cameras look at, since places on a line leave a turn about it open."""
+    images = [image for image in model.images.values() if image.has_pose]
+    cameras = [truth[int(Path(image.name).stem)] for image in images]
+    turns = [image.cam_from_world().rotation.matrix() for image in images]
+    left, _, right = np.linalg.svd(np.sum([c.rotation.T @ t for c, t in zip(cameras, turns, strict=True)], 0))
+    turn = left @ np.diag((1, 1, np.linalg.det(left @ right))) @ right
+    found = np.array([image.projection_center() for image in images]) @ turn.T
+    there = np.array([camera.position for camera in cameras])
+    found, there = found - found.mean(0), there - there.mean(0)
+    errors = np.linalg.norm(there - found * (found * there).sum() / (found * found).sum(), axis=1)
+    return float(np.median(errors) / np.ptp(there[:, 0]))
