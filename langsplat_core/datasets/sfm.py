@@ -23,11 +23,11 @@ from langsplat_core.datasets.capture import (
     find_photos,
     mask_beside,
     read_photo,
-    shortened,
 )
-from langsplat_core.datasets.colmap import SparseModel, good_points, has_model, located_photos, read_model
+from langsplat_core.datasets.colmap import good_points, has_model, located_photos, read_model
 from langsplat_core.datasets.intrinsics import pycolmap
-from langsplat_core.errors import FormatError, InputError
+from langsplat_core.datasets.matches import FEWEST_MATCHES, Matches, NotLocatedError
+from langsplat_core.errors import FormatError, InputError, shortened
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import PictureError, opened
 from langsplat_core.progress import Progress
@@ -289,10 +289,8 @@ def store_model(model: "pycolmap.Reconstruction", folder: Path) -> None:
 
 ENOUGH = 0.9  # share of the photographs; with fewer located the next way is tried
 TIE = 0.05  # of the reprojection error: ways that end at the same cameras differ by 1 to 2 %
-FEWEST_MATCHES = 15  # that COLMAP's mapper works with
 FEWEST_POINTS = 30  # that hold a camera; the incremental mapper demands as many, the global one none
-FEWEST_FEATURES = 50  # fewer rarely give `FEWEST_MATCHES`
-LEFT_OUT = "left_out.json"  # in the workspace: which photographs have no camera, and why
+MATCHES = "matches.json"  # in the workspace: names, features and pairs of `Matches`
 # For first pairs of a walk straight ahead: degrees between rays, share of motion that is forward, matches.
 _CLOSE_PAIRS = {"init_min_tri_angle": 4.0, "init_max_forward_motion": 1.0, "init_min_num_inliers": 50}
 # For long walks: each photograph shares little with those before it, and what it shares lies far ahead.
@@ -320,7 +318,7 @@ def map_cameras(folder: Path, count: int, progress: Progress) -> None:
         best = best_model(best, way(folder, attempts, _counted(count, progress)))
         if best is not None and len(located_names(best)) >= ENOUGH * count:
             break
-    write_left_out(folder, set() if best is None else located_names(best))
+    keep_matches(folder)
     if best is not None:
         store_model(best, folder)
     progress("locating cameras", 1.0)
@@ -432,41 +430,29 @@ WAYS: tuple[Callable[[Path, Path, Callable[[], None]], Collection[Model]], ...] 
 )
 
 
-def left_out(folder: Path) -> dict[str, str]:
-    """Why photographs have no camera, by their names in the workspace, after `map_cameras`."""
-    why: dict[str, str] = json.loads((folder / LEFT_OUT).read_text())
-    return why
-
-
-def write_left_out(folder: Path, located: Collection[str]) -> None:
-    """Keep why photographs are not among the `located`; see `left_out`."""
+def keep_matches(folder: Path) -> None:
+    """Write what `read_matches` reads: the database does not outlive the model."""
     with pycolmap.Database.open(folder / "database.db") as database:
         names = {image.image_id: image.name for image in database.read_all_images()}
-        features = {number: database.num_keypoints_for_image(number) for number in names}
+        features = {name: database.num_keypoints_for_image(number) for number, name in names.items()}
         pairs, inliers = database.read_two_view_geometry_num_inliers()
-    matched: dict[int, int] = dict.fromkeys(names, 0)
-    for pair, count in zip(pairs, inliers, strict=True):
-        if count >= FEWEST_MATCHES:
-            for number in pycolmap.pair_id_to_image_pair(pair):
-                matched[number] += 1
-    why = {
-        name: _reason(features[number], matched[number])
-        for number, name in names.items()
-        if name not in located
-    }
-    with atomic_path(folder / LEFT_OUT) as temporary:
-        temporary.write_text(json.dumps(why, sort_keys=True))
+    ends = [[names[number] for number in pycolmap.pair_id_to_image_pair(pair)] for pair in pairs]
+    kept = [[*end, int(count)] for end, count in zip(ends, inliers, strict=True) if count]
+    with atomic_path(folder / MATCHES) as temporary:
+        temporary.write_text(json.dumps({"features": features, "pairs": sorted(kept)}))
 
 
-def _reason(features: int, matched: int) -> str:
-    """Reason in words, from the number of features and of photographs that share enough of them."""
-    if features == 0:
-        return "no features (nothing but plain areas, or blurred)"
-    if features < FEWEST_FEATURES:
-        return "too few features (plain, dark, blurred or tiny)"
-    if matched == 0:
-        return "no matches with any other"
-    return "matched, but from one and the same place, or without enough overlap"
+def read_matches(folder: Path, files: dict[str, Path], located: Collection[str]) -> Matches:
+    """The graph of matches of a workspace. `files`: photographs by their names there, see `numbered`;
+    `located`: names of those that have a camera."""
+    kept = json.loads((folder / MATCHES).read_text())
+    row = {name: index for index, name in enumerate(files)}
+    return Matches(
+        names=tuple(path.name for path in files.values()),
+        features=tuple(kept["features"].get(name, -1) for name in files),
+        pairs=tuple((row[a], row[b], count) for a, b, count in kept["pairs"]),
+        located=frozenset(row[name] for name in located),
+    )
 
 
 # A plain folder of photographs: cameras by structure from motion.
@@ -476,8 +462,6 @@ log = logging.getLogger("langsplat")
 SFM_SIDE = 1600  # px, longer side of the copies that features are sought in
 MIN_PHOTOS = 3
 FEWEST = 0.5  # share of the photographs: a scene of fewer is not of what was photographed
-UNREAD = "cannot be read"
-_ADVICE = "take more photographs, each sharing at least two thirds of its view with the next"
 
 
 @dataclass(frozen=True)
@@ -502,29 +486,33 @@ def load_photos(
     paths = find_photos(folder)
     if len(paths) < MIN_PHOTOS:
         raise InputError(
-            f"{folder} has {len(paths)} photographs; at least {MIN_PHOTOS} are needed: {_ADVICE}"
+            f"{folder} has {len(paths)} photographs; at least {MIN_PHOTOS} are needed, each sharing "
+            "at least two thirds of its view with the next"
         )
     contents = [(path.name, _content(path)) for path in paths]
     masked = [(path.name, _content(mask)) for path in paths if (mask := mask_beside(path))]
-    workspace = open_workspace(work, ["photographs", 3, SFM_SIDE, contents, *([masked] if masked else [])])
+    workspace = open_workspace(work, ["photographs", 4, SFM_SIDE, contents, *([masked] if masked else [])])
     files = numbered(paths)
     if not has_model(workspace / "sparse"):
         _reconstruct(workspace, files, progress)
     model = read_model(workspace / "sparse") if has_model(workspace / "sparse") else None
-    lost = _left_out(workspace, model, files, _twins(files, dict(contents)))
-    found = len(files) - sum(map(len, lost.values()))
+    matches = read_matches(workspace, files, {image.name for image in model.images} if model else ())
+    lost = _left_out(matches, contents)
+    found = len(matches.located)
     if model is None or (found < max(MIN_PHOTOS, FEWEST * len(files)) and not allow_few_cameras):
         anyway = "" if model is None else ", or go on without these with --dataset.allow-few-cameras"
-        raise InputError(
+        raise NotLocatedError(
             f"only {found} of {len(files)} photographs could be located together "
-            f"({_listed(lost, 50, 500)}); {_ADVICE}{anyway}"
+            f"({_listed(lost, 10)}); {matches.in_words()}{anyway}",
+            matches,
         )
     if lost:
         log.warning(
-            "%d of %d photographs could not be located and are left out (%s)",
+            "%d of %d photographs could not be located and are left out (%s); %s",
             len(files) - found,
             len(files),
             _listed(lost),
+            matches.in_words(),
         )
     located = located_photos(model, workspace / "images", workspace / "sparse")
     photos = [
@@ -532,7 +520,7 @@ def load_photos(
         for p, path in ((p, files[p.label]) for p in located)
     ]
     cameras, images, kept, masks = develop(photos, max_side, progress)
-    return Capture(cameras, images, *good_points(model), photos=kept, masks=masks)
+    return Capture(cameras, images, *good_points(model), photos=kept, masks=masks, matches=matches)
 
 
 def numbered(paths: Sequence[Path]) -> dict[str, Path]:
@@ -550,27 +538,16 @@ def _content(path: Path) -> str:
         return ""
 
 
-def _twins(numbered: dict[str, Path], contents: dict[str, str]) -> dict[str, str]:
-    """Photographs that are the same as an earlier one: names in the workspace -> file names."""
+def _left_out(matches: Matches, contents: Sequence[tuple[str, str]]) -> dict[str, list[str]]:
+    """Photographs without a camera by the reason: ``{"no features": ["a.jpg", "b.jpg"]}``; `contents`: names
+    and digests of all."""
     first: dict[str, str] = {}
-    return {
-        name: earlier
-        for name, path in numbered.items()
-        if (earlier := first.setdefault(contents[path.name], path.name)) != path.name
-    }
-
-
-def _left_out(
-    workspace: Path, model: SparseModel | None, numbered: dict[str, Path], twins: dict[str, str]
-) -> dict[str, list[str]]:
-    """Photographs without a camera by the reason: ``{"no features": ["a.jpg", "b.jpg"]}``."""
-    located = {image.name for image in model.images} if model else set()
-    reasons = left_out(workspace)
-    reasons |= {name: f"the same picture as {twin}" for name, twin in twins.items()}
     groups: dict[str, list[str]] = {}
-    for name, path in numbered.items():
-        if name not in located:
-            groups.setdefault(reasons.get(name, UNREAD), []).append(path.name)
+    for row, (name, content) in enumerate(contents):
+        twin = first.setdefault(content, name)
+        if row not in matches.located:
+            why = matches.why(row) if twin == name else f"the same picture as {twin}"
+            groups.setdefault(why, []).append(name)
     return groups
 
 

@@ -41,7 +41,7 @@ STAGE = "describing what masks agree on"
 VERSION = 1
 
 
-def agreed_features(
+def agreed_features(  # noqa: PLR0913  what a stage is made from
     gaussians: Gaussians,
     views: Views,
     photographs: Sequence[Array],
@@ -54,7 +54,8 @@ def agreed_features(
 ) -> StoredFeatures:
     """Masks and CLIP vectors of every view by the consensus of all views' masks, whose vectors are not read.
 
-    photographs: (H, W, 3) uint8 of each view; counted: as of `describe_capture`. What is finished is kept in `work`.
+    photographs: (H, W, 3) uint8 of each view; counted: as of `describe_capture`. What is finished is kept in
+    `work`.
     """
     processes = processes or ProcessGroup()
     inputs = gaussians_digest(gaussians), [features_digest(features) for _, features in views]

@@ -124,7 +124,7 @@ def located(
     """A row per way, from the same matches; `truth`: the cameras of the photographs, or none."""
     workspace = sfm.open_workspace(work, str(folder))
     count = sfm.match_photos(workspace, sfm.numbered(find_photos(folder)), progress)
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for name, way in zip(WAYS, sfm.WAYS, strict=True):
         attempts = work / "attempts"
         shutil.rmtree(attempts, ignore_errors=True)

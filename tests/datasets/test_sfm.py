@@ -177,7 +177,7 @@ def test_a_second_run_computes_nothing(
     np.testing.assert_array_equal(again.points, capture.points)
     np.testing.assert_array_equal(again.cameras[3].world_to_camera, capture.cameras[3].world_to_camera)
     (stage,) = work.glob("sfm-*")
-    assert sorted(path.name for path in stage.iterdir()) == ["left_out.json", "sparse"]
+    assert sorted(path.name for path in stage.iterdir()) == ["matches.json", "sparse"]
 
 
 def test_cameras_are_the_same_byte_for_byte(
@@ -473,7 +473,8 @@ def test_below_half_is_refused_each_time_unless_told_otherwise(mostly_noise: Pat
     told = DatasetConfig(max_side=64, allow_few_cameras=True)
     assert len(load_capture(mostly_noise, told, tmp_path)) == 4
     (stage,) = tmp_path.glob("sfm-*")
-    assert len(json.loads((stage / sfm.LEFT_OUT).read_text())) == 5
+    matches = sfm.read_matches(stage, sfm.numbered(find_photos(mostly_noise)), ())
+    assert [len(group) for group in matches.groups] == [4, 1, 1, 1, 1, 1]
 
 
 def test_two_views_are_refused_although_they_are_half(
@@ -487,7 +488,7 @@ def test_two_views_are_refused_although_they_are_half(
         model = synthetic(2, 100)
         for number, image in sorted(model.images.items()):
             image.name = f"{number - 1:05d}.jpg"
-        sfm.write_left_out(folder, sfm.located_names(model))
+        sfm.keep_matches(folder)
         sfm.store_model(model, folder)
 
     monkeypatch.setattr(sfm, "map_cameras", gives_up)
