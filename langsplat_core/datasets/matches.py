@@ -9,6 +9,7 @@ from langsplat_core.errors import InputError, printable_line, shortened
 FEWEST_MATCHES = 15  # that COLMAP's mapper works with
 FEWEST_FEATURES = 50  # fewer rarely give `FEWEST_MATCHES`
 MOST_TOLD = 3  # groups and gaps in a message
+LONGEST_NAME = 30  # characters of a file's name there
 _STEP_ASIDE = (
     "they all match each other, but nothing tells how far away things are: step aside between photographs "
     "instead of turning on the spot"
@@ -58,45 +59,54 @@ class Matches:
             return "no features (nothing but plain areas, or blurred)"
         if self.features[row] < FEWEST_FEATURES:
             return "too few features (plain, dark, blurred or tiny)"
-        if not any(row in pair and count >= FEWEST_MATCHES for pair, count in self.shared.items()):
+        friends = {a + b - row for (a, b), n in self.shared.items() if row in (a, b) and n >= FEWEST_MATCHES}
+        if not friends:
             return "no matches with any other"
+        if self.located and not friends & self.located:
+            return "matches only others that have no camera"
         return "matched, but from one and the same place, or without enough overlap"
 
     def gaps(self) -> list[tuple[int, int]]:
-        """Rows of neighbours in name order between which a photograph would join one more group each to those
-        before, at most `MOST_TOLD`. Photographs without features, and copies, are no part of it."""
+        """Rows of two photographs each, between which more would join one more group to those before: of two
+        groups the pair that shares most, or the neighbours in name order where none shares enough. At most
+        `MOST_TOLD`; photographs without features are no part of it."""
         useful = [[row for row in group if self.features[row] >= FEWEST_FEATURES] for group in self.groups]
         joined, *apart = [group for group in useful if group] or [[]]
         found: list[tuple[int, int]] = []
         while joined and apart and len(found) < MOST_TOLD:
-            near = ((a, b) for a in joined for group in apart for b in group)
-            a, b = min(near, key=lambda pair: abs(pair[0] - pair[1]))
-            found.append((min(a, b), max(a, b)))
-            (new,) = (group for group in apart if b in group)
+            across = ((min(a, b), max(a, b)) for a in joined for group in apart for b in group)
+            gap = min(across, key=self._width)
+            found.append(gap)
+            new = next(group for group in apart if set(gap) & set(group))
             joined, apart = joined + new, [group for group in apart if group is not new]
         return found
 
-    def in_words(self) -> str:
-        """What matches join, and where to photograph more, in one sentence without its full stop."""
+    def _width(self, pair: tuple[int, int]) -> tuple[int, int]:
+        shared = self.shared.get(pair, 0)
+        return (-shared if shared >= FEWEST_MATCHES else 0), pair[1] - pair[0]
+
+    def joined(self) -> str:
+        """What matches join, in words; empty where they join nothing."""
         large = [self._told(group) for group in self.groups if len(group) > 1][:MOST_TOLD]
+        return f"matches join {', '.join(large)}; " if large else ""
+
+    def advice(self) -> str:
+        """Where to photograph more, in words."""
         gaps = self.gaps()
         if not gaps:
-            return _STEP_ASIDE if large and not self.located else _ADVICE
-        where = ", ".join(
+            return _STEP_ASIDE if self.joined() and not self.located else _ADVICE
+        return "take more photographs " + ", ".join(
             f"between {self._name(a)} and {self._name(b)} ({self.shared.get((a, b), 0) or 'no'} matches)"
             for a, b in gaps
         )
-        joined = f"matches join {' and '.join(large)}; " if large else ""
-        return f"{joined}take more photographs {where}"
 
     def _told(self, group: list[int]) -> str:
-        names = [self.names[row] for row in group]
         if group == list(range(group[0], group[-1] + 1)) and len(group) > 2:
-            return f"{self._name(group[0])} to {self._name(group[-1])}"
-        return shortened(names, 3, 100)
+            return f"{self._name(group[0])} to {self._name(group[-1])} ({len(group)})"
+        return shortened((self._name(row) for row in group), 3, 100)
 
     def _name(self, row: int) -> str:
-        return printable_line(self.names[row], 60)
+        return printable_line(self.names[row], LONGEST_NAME)
 
 
 class NotLocatedError(InputError):

@@ -503,7 +503,7 @@ def load_photos(
         anyway = "" if model is None else ", or go on without these with --dataset.allow-few-cameras"
         raise NotLocatedError(
             f"only {found} of {len(files)} photographs could be located together "
-            f"({_listed(lost, 10)}); {matches.in_words()}{anyway}",
+            f"({_listed(lost, 10)}); {matches.joined()}{matches.advice()}{anyway}",
             matches,
         )
     if lost:
@@ -512,7 +512,7 @@ def load_photos(
             len(files) - found,
             len(files),
             _listed(lost),
-            matches.in_words(),
+            matches.advice(),
         )
     located = located_photos(model, workspace / "images", workspace / "sparse")
     photos = [

@@ -251,8 +251,8 @@ def _group_rings(eyes: Array, places: Array) -> Iterator[str]:
 def _matches(matches: Matches) -> str:
     located = len(matches.located)
     said = f"<p>{located} of {len(matches.names)} photographs are located.</p>"
-    if located < len(matches.names):
-        said += f"<p>{_text(matches.in_words(), 600)}</p>"
+    if matches.gaps():
+        said += f"<p>To join the others (dashed), {_text(matches.advice(), 600)}.</p>"
     key = _key(_BLUE, "located") + _key(_RED, "not located")
     return _section("Which photographs match", _graph(matches), key, said)
 
