@@ -577,14 +577,14 @@ def match_photos(workspace: Path, numbered: dict[str, Path], progress: Progress)
 def _small_copies(folder: Path, numbered: dict[str, Path], progress: Progress) -> list[_Copy]:
     """Copies that COLMAP can read and finds the same way up as we do; unreadable files are left out."""
     copies, broken = [], []
+    any_masks = any(map(mask_beside, numbered.values()))
     for index, (name, path) in enumerate(numbered.items()):
         progress("preparing photographs", index / len(numbered))
         try:
             if not (folder / name).is_file():
                 _write_copy(path, folder / name)
-            mask = mask_beside(path)
-            if mask and not (folder.with_name(MASKS) / f"{name}.png").is_file():
-                _write_mask(mask, folder / name, folder.with_name(MASKS) / f"{name}.png")
+            if any_masks and not (folder.with_name(MASKS) / f"{name}.png").is_file():
+                _write_mask(mask_beside(path), folder / name, folder.with_name(MASKS) / f"{name}.png")
             with opened(folder / name) as copy:
                 exif = copy.getexif()
                 lens = str(dict(exif) | dict(exif.get_ifd(_EXIF_IFD)))
@@ -606,13 +606,15 @@ def _write_copy(path: Path, copy: Path) -> None:
         picture.save(temporary, quality=95, exif=optics(path))
 
 
-def _write_mask(mask: Path, copy: Path, out: Path) -> None:
-    """A mask as COLMAP reads it, as large as the copy of its photograph."""
+def _write_mask(mask: Path | None, copy: Path, out: Path) -> None:
+    """A mask as COLMAP reads it, as large as the copy of its photograph; white for one without: where some
+    have a mask, COLMAP finds nothing in those that have none."""
     with opened(copy) as picture:
-        size = picture.size
+        white = Image.new("L", picture.size, 255)
+    seen = white if mask is None else read_photo(mask, upright=False).convert("L")
     out.parent.mkdir(exist_ok=True)
     with atomic_path(out) as temporary:
-        read_photo(mask, upright=False).convert("L").resize(size, Image.Resampling.NEAREST).save(temporary)
+        seen.resize(white.size, Image.Resampling.NEAREST).save(temporary)
 
 
 def _groups(copies: list[_Copy]) -> list[Group]:

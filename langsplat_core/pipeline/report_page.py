@@ -119,10 +119,8 @@ def _tiles(report: TrainReport) -> str:
         "masks": f"{report.mask_count:,}",
         "in all": f"{sum(report.seconds.values()):.0f} s",
     }
-    cards = (
-        f"<div class=card><b>{value}</b><span class=soft>{name}</span></div>" for name, value in tiles.items()
-    )
-    return f"<p class=soft>{_text(report.dataset, 400)}</p><div class=tiles>{''.join(cards)}</div>"
+    cards = "".join(f"<div class=card><b>{value}</b>{name}</div>" for name, value in tiles.items())
+    return f"<p class=soft>{_text(report.dataset, 400)}</p><div class='tiles soft'>{cards}</div>"
 
 
 def _figures(report: TrainReport) -> Iterator[str]:
@@ -183,10 +181,7 @@ def _from_above(scene: Scene, held_out: Container[str]) -> str:
     margin = max(float((high - low).max()), 1e-6)
     if len(points):
         near, far = np.quantile(points, (0.05, 0.95), axis=0)
-        low, high = (
-            np.maximum(np.minimum(low, near), low - margin),
-            np.minimum(np.maximum(high, far), high + margin),
-        )
+        low, high = np.clip(near, low - margin, low), np.clip(far, high, high + margin)
     low, high = low - 0.06 * margin, high + 0.06 * margin
     scale = PLOT / float((high - low).max())
     width, height = (high - low) * scale
@@ -195,22 +190,21 @@ def _from_above(scene: Scene, held_out: Container[str]) -> str:
         return np.asarray((place - low) * scale * (1, -1) + (0, height))
 
     drawn = [_map(at(points), scene.gaussians.take(np.flatnonzero(valid)), width, height)]
-    for ring in _group_rings(eyes, at(places)):
-        drawn.append(ring)
-    for camera, (x, y) in zip(scene.cameras, at(places), strict=True):
-        colour = _ORANGE if camera.name in held_out else _BLUE
-        drawn.append(_wedge(camera, axes, x, y, colour))
+    drawn += _group_rings(eyes, at(places))
+    for camera, place in zip(scene.cameras, at(places), strict=True):
+        drawn.append(_wedge(camera, axes, place, _ORANGE if camera.name in held_out else _BLUE))
     return f"<svg viewBox='0 0 {width:.0f} {height:.0f}' role=img>{''.join(drawn)}</svg>"
 
 
-def _wedge(camera: Camera, axes: Array, x: float, y: float, colour: str) -> str:
+def _wedge(camera: Camera, axes: Array, place: Array, colour: str) -> str:
     """A camera's place and what it looks towards; one that looks straight down is its dot alone."""
     ahead = axes @ camera.rotation[2] * (1, -1)
     across = np.array([-ahead[1], ahead[0]]) * min(0.5 * camera.width / camera.fx, 1.0)
-    tips = " ".join(f"{x + 17 * a:.1f},{y + 17 * b:.1f}" for a, b in (ahead + across, ahead - across))
+    corners = (place, place + 17 * (ahead + across), place + 17 * (ahead - across))
     return (
-        f"<g fill='{colour}'><title>{_text(camera.name)}</title><circle cx='{x:.1f}' cy='{y:.1f}' r='3.4'/>"
-        f"<polygon points='{x:.1f},{y:.1f} {tips}' fill-opacity='.45'/></g>"
+        f"<g fill='{colour}'><title>{_text(camera.name)}</title><circle cx='{place[0]:.1f}' "
+        f"cy='{place[1]:.1f}' r='3.4'/><polygon fill-opacity='.45' "
+        f"points='{' '.join(f'{x:.1f},{y:.1f}' for x, y in corners)}'/></g>"
     )
 
 
@@ -222,9 +216,8 @@ def _map(places: Array, gaussians: Gaussians, width: float, height: float) -> st
     inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
     flat, weight = (row * columns + column)[inside], sigmoid(gaussians.opacity_logits[inside])
     colours = (0.5 + _SH_C0 * gaussians.sh[inside, 0]).clip(0, 1)
-    sums = np.stack(
-        [np.bincount(flat, weight * c, rows * columns) for c in (*colours.T, np.ones(len(flat)))], 1
-    )
+    channels = (*colours.T, np.ones(len(flat)))
+    sums = np.stack([np.bincount(flat, weight * c, rows * columns) for c in channels], 1)
     full = float(np.quantile(sums[sums[:, 3] > 0, 3], 0.7)) if len(flat) else 1.0
     solid = 0.75 * np.minimum(1, sums[:, 3:] / full)
     mean = sums[:, :3] / np.maximum(sums[:, 3:], 1e-9)

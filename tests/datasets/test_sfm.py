@@ -1,6 +1,5 @@
 """Structure from motion and triangulation, in a textured room and in a street, and EXIF focal lengths."""
 
-import json
 import logging
 import os
 import shutil
