@@ -76,7 +76,8 @@ def report(held_out: Sequence[str], **fields: object) -> TrainReport:
     scores = tuple(ViewScore(name, 21.4, 0.7123, 0.9) for name in held_out)
     stated = {
         "views": 6, "held_out": len(scores), "gaussians": 50, "psnr": 21.4 if scores else None,
-        "masks": "graph", "encoder": HOSTILE, "mask_count": 7, "codec": "codebook", "codec_size": 8, "codec_cosine": 0.9,
+        "masks": "graph", "encoder": HOSTILE, "mask_count": 7, "codec": "codebook", "codec_size": 8,
+        "codec_cosine": 0.9,
         "relevancy_error": 0.01, "relevancy_error_p99": 0.02, "observed": 0.5, "warnings": (),
         "seconds": {"radiance": 3.0}, "dataset": f"/a/{HOSTILE.replace('/', '')}", "held_out_views": scores,
     }  # fmt: skip
