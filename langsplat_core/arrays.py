@@ -1,5 +1,6 @@
 """Small numerical helpers shared by every layer. NumPy only."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -63,6 +64,16 @@ def mean_squared_error(a: Array, b: Array) -> float:
 def psnr(a: Array, b: Array) -> float:
     """Peak signal-to-noise ratio of two images with values in [0, 1], dB; at most 100, for equal ones."""
     return float(-10 * np.log10(max(mean_squared_error(a, b), 1e-10)))
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """Scores of one photograph's reproduction."""
+
+    name: str
+    psnr: float  # dB
+    ssim: float
+    covered: float  # share of its pixels that the Gaussians cover by half and more
 
 
 def rotation_matrices(quats_wxyz: Array) -> Array:

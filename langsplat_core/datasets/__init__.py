@@ -9,9 +9,10 @@ from langsplat_core.datasets.capture import Capture, metres_of
 from langsplat_core.datasets.colmap import find_model, load_colmap
 from langsplat_core.datasets.holdout import split
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
-from langsplat_core.datasets.video import is_video, kept_frames
+from langsplat_core.datasets.video import kept_frames
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import shown
+from langsplat_core.io.hostile import is_video
 from langsplat_core.progress import Progress, silent
 
 __all__ = ["Capture", "load_capture", "load_photographs"]

@@ -1,7 +1,6 @@
-"""Photographs that are held out from training, to measure it on, and their scores."""
+"""Photographs that are held out from training, to measure it on."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,16 +12,6 @@ from langsplat_core.scene import Camera
 FEWEST_VIEWS = 6  # below, every photograph is needed for training, and nothing is measured
 NEIGHBOURS = 4  # a view is surrounded where it lies in the middle of so many nearest training views
 RADIAN = 2.0  # typical steps between cameras that a turn by a radian counts for
-
-
-@dataclass(frozen=True)
-class ViewScore:
-    """Scores of one photograph's reproduction."""
-
-    name: str
-    psnr: float  # dB
-    ssim: float
-    covered: float  # share of its pixels that the Gaussians cover by half and more
 
 
 def split(capture: Capture, config: DatasetConfig) -> tuple[list[int], list[int]]:

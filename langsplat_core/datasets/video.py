@@ -19,15 +19,9 @@ from langsplat_core.progress import Progress, silent
 if TYPE_CHECKING:
     import av.container
 
-VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 SHARPNESS_WIDTH = 640  # px, at which images are compared: below noise, above motion blur
 QUALITY = 95  # of the JPEG files
 FEWEST = 3  # images, of which cameras can be found
-
-
-def is_video(path: Path) -> bool:
-    """True for a file whose name ends as a video's."""
-    return path.suffix.lower() in VIDEO_SUFFIXES and not path.is_dir()
 
 
 def kept_frames(video: Path, count: int, work: Path, progress: Progress = silent) -> Path:

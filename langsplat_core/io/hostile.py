@@ -215,6 +215,7 @@ def opened_archive(path: Path, kind: str) -> Iterator[Archive]:
 KINDS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")  # always; AVIF where Pillow has a codec, HEIF with pillow_heif
 # HEIF is named where it cannot be read, too: the message then says why such photographs are left out
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".avif", ".heic", ".heif")
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 HEIF_BRANDS = (b"heic", b"heix", b"mif1", b"hevc", b"heim", b"heis")
 MOST_PIXELS = 178_000_000  # of any image: 0.7 GB once decoded. The largest cameras make 151 million
 # Declared pixels beyond these need a file of a fitting size: photographs keep 2 to 100 pixels a byte, what is
@@ -261,6 +262,11 @@ def opened(
             raise PictureError(name, f"the content is none of {read}, or damaged") from None
         except Exception as error:  # noqa: BLE001  any at all, see the top of this file
             raise PictureError(name, _reason(error)) from None
+
+
+def is_video(path: Path) -> bool:
+    """True for a file whose name ends as a video's."""
+    return path.suffix.lower() in VIDEO_SUFFIXES and not path.is_dir()
 
 
 def readable_kinds() -> tuple[str, ...]:

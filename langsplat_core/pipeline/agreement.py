@@ -41,21 +41,20 @@ STAGE = "describing what masks agree on"
 VERSION = 1
 
 
-def agreed_features(  # noqa: PLR0913  what a stage is made from
+def agreed_features(
     gaussians: Gaussians,
     views: Views,
-    photographs: Sequence[Array],
+    photographs: Sequence[tuple[Array, Array | None]],
     encoder: ImageEncoder,
     rasterizer: LiftingRasterizer,
     work: Path,
     progress: Progress,
     processes: ProcessGroup | None = None,
-    counted: Sequence[Array | None] = (),
 ) -> StoredFeatures:
     """Masks and CLIP vectors of every view by the consensus of all views' masks, whose vectors are not read.
 
-    photographs: (H, W, 3) uint8 of each view; counted: as of `describe_capture`. What is finished is kept in
-    `work`.
+    photographs: (H, W, 3) uint8 of each view, and its (H, W) bool mask of pixels that count (None: all do).
+    What is finished is kept in `work`.
     """
     processes = processes or ProcessGroup()
     inputs = gaussians_digest(gaussians), [features_digest(features) for _, features in views]
@@ -76,8 +75,9 @@ def agreed_features(  # noqa: PLR0913  what a stage is made from
         camera, _ = views[index]
         if not store.has(camera.name, made_by):
             drawn = draw_patches(rasterizer.view(gaussians, camera), gaussians, tree.patches)
-            maps = within(nested_maps(drawn, cuts, LEAST), counted[index] if counted else None)
-            vectors = embed_regions(photographs[index], maps, encoder)
+            image, mask = photographs[index]
+            maps = within(nested_maps(drawn, cuts, LEAST), mask)
+            vectors = embed_regions(image, maps, encoder)
             store.save(camera.name, ImageFeatures(maps, vectors), made_by)
         progress(STAGE, (index + 1) / len(views))
     processes.barrier()

@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Literal
 
 from langsplat_core.config import DatasetConfig, MaskConfig, TrainConfig
-from langsplat_core.datasets.video import is_video
-from langsplat_core.io.hostile import PHOTO_SUFFIXES
+from langsplat_core.io.hostile import PHOTO_SUFFIXES, is_video
 from langsplat_core.progress import ALL_STAGES, Progress, Report, coarse, duration
 
 ASPECT = 0.75  # height by width of an ordinary photograph

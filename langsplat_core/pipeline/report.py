@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from langsplat_core.arrays import Array
-from langsplat_core.datasets.holdout import ViewScore
+from langsplat_core.arrays import Array, ViewScore
 from langsplat_core.errors import FormatError, InputError, printable_line
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import read_json_file

@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from langsplat_core.arrays import Array, sigmoid
+from langsplat_core.arrays import Array, ViewScore, sigmoid
 from langsplat_core.datasets.capture import Capture
-from langsplat_core.datasets.holdout import ViewScore
 from langsplat_core.datasets.matches import FEWEST_MATCHES, Matches, NotLocatedError
 from langsplat_core.errors import printable_line
 from langsplat_core.io.files import atomic_path

@@ -131,9 +131,8 @@ def _train(
     views = StoredViews(cameras, features)
     if not mask_source.agrees:
         shared = load_lifting_rasterizer(config.lift.backend), work, progress, processes
-        photographs = [capture.images[i] for i in train]
-        counted = [capture.mask(i) for i in train]
-        features = agreed_features(gaussians, views, photographs, encoder, *shared, counted)
+        photographs = [(capture.images[i], capture.mask(i)) for i in train]
+        features = agreed_features(gaussians, views, photographs, encoder, *shared)
         views = StoredViews(cameras, features)
         clock.lap("masks that agree")
     language, loss = language_field(gaussians, views, encoder, config, work, progress, processes)

@@ -266,7 +266,9 @@ class Room:
         if not source.agrees:
             rough, work = list(zip(cameras, features, strict=True)), self.folder / f"agreed-{self.weights}"
             shared = CpuRasterizer(), work, self.progress
-            features = agreed_features(self.gaussians, rough, photographs, encoder, *shared)
+            features = agreed_features(
+                self.gaussians, rough, [(image, None) for image in photographs], encoder, *shared
+            )
         self._lap(f"masks ({variant.masks}) and vectors", start)
         if isinstance(self.encoder, ClipGeometry):
             features = [

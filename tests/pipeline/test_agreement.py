@@ -38,7 +38,7 @@ def room():
             maps.append(np.where(labels >= 0, split + 2 * count * level, -1))
         maps = np.stack(maps).astype(np.int32)
         views.append((camera, ImageFeatures(maps, np.zeros((6 * count, 0), np.float32))))
-        photographs.append(np.round(255 * render(scene, camera).colours.clip(0, 1)).astype(np.uint8))
+        photographs.append((np.round(255 * render(scene, camera).colours.clip(0, 1)).astype(np.uint8), None))
     return scene.gaussians, blob, views, photographs
 
 

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, ViewScore
 from langsplat_core.config import PAPER, MaskConfig, TrainConfig, with_preset
-from langsplat_core.datasets.holdout import ViewScore
 from langsplat_core.pipeline.forecast import (
     Forecast,
     Stage,

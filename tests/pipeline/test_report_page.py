@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from langsplat_core.arrays import ViewScore
 from langsplat_core.config import TrainConfig
 from langsplat_core.datasets.capture import Capture
-from langsplat_core.datasets.holdout import ViewScore
 from langsplat_core.datasets.matches import Matches, NotLocatedError
 from langsplat_core.errors import InputError
 from langsplat_core.pipeline.report import PAGE, TrainReport, read_report

@@ -122,7 +122,7 @@ def test_two_processes_make_the_scene_of_one(tmp_path: Path) -> None:
     train(room, tmp_path / "one.ply", tmp_path / "one.txt", {})
     codes, texts = train_by_two(room, tmp_path / "two.ply")
     assert codes == [0, 0], texts
-    assert [text.count("Gaussians from 3 photographs") for text in texts] == [1, 0]
+    assert [text.count("Gaussians from 5 photographs") for text in texts] == [1, 0]
     for suffix in (".ply", ".langsplat.safetensors"):
         assert (tmp_path / f"two{suffix}").read_bytes() == (tmp_path / f"one{suffix}").read_bytes()
 

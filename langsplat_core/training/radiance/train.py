@@ -23,10 +23,9 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from langsplat_core.arrays import Array, psnr, sigmoid
+from langsplat_core.arrays import Array, ViewScore, psnr, sigmoid
 from langsplat_core.config import INRIA, RadianceConfig, check_settings
 from langsplat_core.datasets.capture import Capture
-from langsplat_core.datasets.holdout import ViewScore
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Cancelled, Progress, Terminated, silent
 from langsplat_core.scene import Camera, Gaussians
