@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from PIL import Image
@@ -288,6 +288,7 @@ def store_model(model: "pycolmap.Reconstruction", folder: Path) -> None:
 # ahead does not have; the others begin with less, or place all photographs at once.
 
 ENOUGH = 0.9  # share of the photographs; with fewer located the next way is tried
+ASTRAY, ASTRAY_GUESS = 2.0, 4.0  # times the focal length of EXIF data, and a normal lens's without them
 TIE = 0.05  # of the reprojection error: ways that end at the same cameras differ by 1 to 2 %
 FEWEST_POINTS = 30  # that hold a camera; the incremental mapper demands as many, the global one none
 MATCHES = "matches.json"  # in the workspace: names, features and pairs of `Matches`
@@ -311,17 +312,35 @@ def map_cameras(folder: Path, count: int, progress: Progress) -> None:
     two could be located there is none.
     """
     best: Model | None = None
+    astray: Model | None = None
     for number, way in enumerate(WAYS):
         check_room(folder)
         attempts = folder / "attempts" / str(number)
         attempts.mkdir(parents=True, exist_ok=True)
-        best = best_model(best, way(folder, attempts, _counted(count, progress)))
+        models = list(way(folder, attempts, _counted(count, progress)))
+        lost = [model for model in models if is_astray(model, folder)]
+        best = best_model(best, (model for model in models if model not in lost))
+        astray = best_model(astray, lost)
         if best is not None and len(located_names(best)) >= ENOUGH * count:
             break
+    if astray and (best is None or 2 * len(located_names(best)) < len(located_names(astray))):
+        best = astray
     keep_matches(folder)
     if best is not None:
         store_model(best, folder)
     progress("locating cameras", 1.0)
+
+
+def is_astray(model: Model, folder: Path) -> bool:
+    """True where a focal length ended far from what EXIF data say, or without them from any lens: on a walk
+    as on rails another one explains the photographs as well, in a world of another depth."""
+    with pycolmap.Database.open(folder / "database.db") as database:
+        before = {camera.camera_id: camera for camera in database.read_all_cameras()}
+    return any(
+        abs(math.log(camera.mean_focal_length() / before[number].mean_focal_length()))
+        > math.log(ASTRAY if before[number].has_prior_focal_length else ASTRAY_GUESS)
+        for number, camera in model.cameras.items()
+    )
 
 
 def _counted(count: int, progress: Progress) -> Callable[[], None]:
@@ -371,11 +390,14 @@ def _incremental(
     attempts: Path,
     advance: Callable[[], None],
     limits: dict[str, float],
-    trust_exif: bool = False,
+    focal: Literal["refined", "of EXIF", "guessed"] = "refined",
 ) -> Collection[Model]:
-    """One photograph after the other, onto a first pair. `limits`: of COLMAP's mapper. With `trust_exif`
-    focal lengths stay what EXIF data say, if they say it for all: what lies far ahead looks much the same
-    from any distance through another lens."""
+    """One photograph after the other, onto a first pair. `limits`: of COLMAP's mapper. `focal`: lengths that
+    EXIF data say of all photographs stay as they are, or those which no EXIF data say stay a normal lens's:
+    what lies far ahead looks much the same from any distance through another lens."""
+    known = focal != "refined" and _all_focal_lengths_known(folder)
+    if focal == "guessed" and known:  # as before
+        return []
     options = pycolmap.IncrementalPipelineOptions()
     options.min_model_size = 3
     options.max_num_models = 5
@@ -383,7 +405,7 @@ def _incremental(
     options.triangulation.random_seed = 0
     options.num_threads = 1  # sums of several threads differ from run to run
     options.mapper.mergedict(limits)
-    if trust_exif and _all_focal_lengths_known(folder):
+    if known or focal == "guessed":
         options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = False
     models: dict[int, Model] = pycolmap.incremental_mapping(
         database_path=folder / "database.db",
@@ -426,7 +448,8 @@ WAYS: tuple[Callable[[Path, Path, Callable[[], None]], Collection[Model]], ...] 
     partial(_incremental, limits={}),
     partial(_incremental, limits=_CLOSE_PAIRS),
     _all_at_once,
-    partial(_incremental, limits=_FEW_SHARED, trust_exif=True),
+    partial(_incremental, limits=_FEW_SHARED, focal="of EXIF"),
+    partial(_incremental, limits=_FEW_SHARED, focal="guessed"),
 )
 
 

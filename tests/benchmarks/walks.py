@@ -26,7 +26,7 @@ from langsplat_core.scene import Camera, look_at
 FIELD = 50.0  # degrees, vertical
 FILM = 36.0  # mm, width of film
 AHEAD = 8.0  # metres, what the walker looks at
-WAYS = ("usual", "close pairs", "all at once", "few shared")  # as in `sfm.WAYS`
+WAYS = ("usual", "close pairs", "all at once", "few shared", "focal length guessed")  # as in `sfm.WAYS`
 
 
 @dataclass(frozen=True)
@@ -132,10 +132,23 @@ def located(
         start = time.process_time()
         model = sfm.best_model(None, way(workspace, attempts, lambda: None))
         seconds = time.process_time() - start
-        found = 0 if model is None else len(sfm.located_names(model))
-        off = f"{100 * astray(model, truth):.2f} %" if model and truth else ""
-        rows.append((folder.name, name, f"{found} of {count}", off, f"{seconds:.1f}"))
-    return rows
+        rows.append(_row(folder, name, count, model, truth, seconds))
+    sfm.map_cameras(workspace, count, silent)
+    kept = sfm.Model(str(workspace / "sparse")) if (workspace / "sparse").is_dir() else None
+    return [*rows, _row(folder, "what is kept", count, kept, truth, None)]
+
+
+def _row(
+    folder: Path,
+    name: str,
+    count: int,
+    model: sfm.Model | None,
+    truth: Sequence[Camera],
+    seconds: float | None,
+) -> tuple[str, ...]:
+    found = 0 if model is None else len(sfm.located_names(model))
+    off = f"{100 * astray(model, truth):.2f} %" if model and truth else ""
+    return (folder.name, name, f"{found} of {count}", off, "" if seconds is None else f"{seconds:.1f}")
 
 
 def astray(model: sfm.Model, truth: Sequence[Camera]) -> float:

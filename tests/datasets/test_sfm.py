@@ -451,6 +451,23 @@ print([ctypes.CDLL(path).omp_get_max_threads() for path in libraries], os.enviro
     assert told.stdout.split() == ["[1]", "3"]
 
 
+@pytest.mark.parametrize(("prior", "focal", "lost"), [
+    (True, 700, False), (True, 210, True), (True, 2000, True),
+    (False, 210, False), (False, 60, True), (False, 2000, False), (False, 5000, True),
+])  # fmt: skip
+def test_a_focal_length_that_is_of_no_such_lens_tells_a_wrong_world(
+    prior: bool, focal: float, lost: bool, tmp_path: Path
+) -> None:
+    model = synthetic(4, 100)
+    ((number, camera),) = model.cameras.items()
+    before = pycolmap.Camera.create_from_model_id(number, pycolmap.CameraModelId.SIMPLE_RADIAL, 600.0, 800, 600)
+    before.has_prior_focal_length = prior
+    with pycolmap.Database.open(tmp_path / "database.db") as database:
+        database.write_camera(before, use_camera_id=True)
+    camera.focal_length = focal
+    assert sfm.is_astray(model, tmp_path) == lost
+
+
 @pytest.fixture(scope="module")
 def mostly_noise(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four photographs of a room and five of nothing."""
