@@ -1,5 +1,7 @@
-"""What ends a command before it has begun. Imports nothing that takes time."""
+"""What ends a command before it has begun, and after it is over. Imports nothing that takes time."""
 
+import atexit
+import contextlib
 import os
 import signal
 from types import FrameType
@@ -13,9 +15,13 @@ def end_in_a_line(program: str) -> None:
     imported and arguments are read there is nothing to keep. A command that runs has handlers of its own."""
 
     def end(number: int, frame: FrameType | None) -> NoReturn:
-        os.write(2, f"{program}: {SAID[signal.Signals(number)]}\n".encode())
+        with contextlib.suppress(OSError):  # a standard error that is closed or full
+            os.write(2, f"{program}: {SAID[signal.Signals(number)]}\n".encode())
         os._exit(128 + number)
 
     for number in SAID:
         if signal.getsignal(number) != signal.SIG_IGN:  # as a shell's background jobs have SIGINT
             signal.signal(number, end)
+    # Python takes back its handlers before its last steps, in which a signal would end a finished command as
+    # one that was killed. What is registered first is called last.
+    atexit.register(lambda: [signal.signal(number, signal.SIG_IGN) for number in SAID])

@@ -145,7 +145,7 @@ def parse_size(text: str) -> tuple[int, int] | None:
     """ "1280x720" -> (1280, 720); "" -> None. Raises InputError."""
     if not text:
         return None
-    match = re.fullmatch(r"(\d{1,6})[xX×](\d{1,6})", text.strip())
+    match = re.fullmatch(r"([0-9]{1,6})[xX×]([0-9]{1,6})", text.strip())
     size = (int(match[1]), int(match[2])) if match else (0, 0)
     if not all(1 <= side <= MAX_SIDE for side in size):
         raise InputError(f"--size {text}: give width x height in pixels, 1 to {MAX_SIDE}, such as 1280x720")
@@ -171,7 +171,7 @@ def scene_path(scene: Path | None) -> Path:
 
 def camera_file(choice: str) -> Camera | None:
     """The camera of a `--camera FILE`; None where `choice` is empty or an index. Raises InputError."""
-    if not choice or re.fullmatch(r"-?\d+", choice):
+    if not choice or re.fullmatch(r"-?[0-9]+", choice):
         return None
     cameras = read_cameras(Path(choice))
     if not cameras:

@@ -13,8 +13,7 @@ from langsplat_core.cli.run import OutputConsole
 from langsplat_core.compaction.clean import CleanReport, clean_scene
 from langsplat_core.config import CleanConfig, Positive, Range
 from langsplat_core.errors import InputError
-from langsplat_core.io.files import check_keeps
-from langsplat_core.io.scenes import check_writable, load_scene, save_scene
+from langsplat_core.io.scenes import check_keeps, check_writable, load_scene, save_scene
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.selection import above_plane, in_box, in_sphere
 from langsplat_core.scene import Scene

@@ -14,9 +14,9 @@ from langsplat_core.config import Count, LevelChoice, Positive
 from langsplat_core.errors import InputError, optional_imports
 from langsplat_core.geometry.merge import merge
 from langsplat_core.io.cameras import numbers
-from langsplat_core.io.files import atomic_path, check_keeps
+from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import read_json_file
-from langsplat_core.io.scenes import check_writable, load_scene, save_scene
+from langsplat_core.io.scenes import check_keeps, check_writable, load_scene, save_scene
 from langsplat_core.io.shapes import MESH_SUFFIXES, check_suffix, gltf_axes, write_meshes
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.engine import QueryEngine

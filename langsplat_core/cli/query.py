@@ -16,9 +16,9 @@ from langsplat_core.cli.run import OutFile
 from langsplat_core.cli.teach import camera_of, pointed, searchable
 from langsplat_core.config import Count, CountOrZero, LevelChoice, NotNegative, PictureConfig, Positive
 from langsplat_core.errors import EncoderError, InputError, LangSplatError
-from langsplat_core.io.files import atomic_path, check_keeps
+from langsplat_core.io.files import atomic_path
 from langsplat_core.io.language import read_words
-from langsplat_core.io.scenes import check_writable, save_scene
+from langsplat_core.io.scenes import check_keeps, check_writable, save_scene
 from langsplat_core.io.shapes import (
     MESH_SUFFIXES,
     POINT_SUFFIXES,

@@ -25,8 +25,10 @@ from typing import Annotated, Any, Literal, Protocol
 
 import tyro
 from rich.console import Console
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from langsplat_core import __version__
+from langsplat_core.arrays import number, whole_number
 from langsplat_core.config import CODEC_CONFIGS, CodecConfig, annotations, check_settings, named_values
 from langsplat_core.errors import InputError, LangSplatError, optional_imports, printable_line
 from langsplat_core.io.files import NO_ROOM, check_output_file, check_output_folder, shown
@@ -135,10 +137,33 @@ def parsed(program: str, kind: Any, args: Sequence[str], description: str | None
         namespace={"__doc__": getattr(kind, "__doc__", None)},
     )
     found: Any = tyro.cli(
-        line, prog=program, description=description, args=args, config=(tyro.conf.CascadeSubcommandArgs,)
+        line,
+        prog=program,
+        description=description,
+        args=args,
+        config=(tyro.conf.CascadeSubcommandArgs,),
+        registry=_NUMBERS,
     )
     log.setLevel(found.verbosity.level)
     return found.command
+
+
+_NUMBERS = ConstructorRegistry()
+
+
+@_NUMBERS.primitive_rule
+def _read_number(option: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """How tyro reads numbers, but for the digits of other scripts."""
+    kind, read = option.type, {int: whole_number, float: number}.get(option.type)
+    if read is None:
+        return None
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=kind.__name__.upper(),
+        instance_from_str=lambda words: read(words[0]),
+        is_instance=lambda value: isinstance(value, kind) or ("~" if isinstance(value, int) else False),
+        str_from_instance=lambda value: [str(value)],
+    )
 
 
 def main(program: str, parser: Callable[[], Command]) -> int:

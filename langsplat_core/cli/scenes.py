@@ -19,10 +19,16 @@ from langsplat_core import __version__
 from langsplat_core.cli.run import OutFile, OutputConsole
 from langsplat_core.config import CodebookConfig, CodecConfig, CompactConfig, Positive, Range
 from langsplat_core.errors import EXTRAS, BackendError, InputError, LangSplatError, remedy
-from langsplat_core.io.files import check_keeps, check_output_folder
+from langsplat_core.io.files import check_output_folder
 from langsplat_core.io.language import rematch_language
 from langsplat_core.io.ply import write_metres
-from langsplat_core.io.scenes import check_writable, load_scene, load_without_language, save_scene
+from langsplat_core.io.scenes import (
+    check_keeps,
+    check_writable,
+    load_scene,
+    load_without_language,
+    save_scene,
+)
 from langsplat_core.io.summary import NEEDLE, OPACITY_EDGES, SceneSummary, disk_bytes, summarise
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.engine import QueryEngine
@@ -218,7 +224,7 @@ class Convert:
 
     def _write_scene(self) -> None:
         check_writable(self.out)  # before minutes are spent on reading
-        check_keeps(self.out, *self.sources)
+        check_keeps(self.out, *self.sources, *([] if self.rematch is None else [self.rematch]))
         scene = self._read()
         save_scene(self.out, replace(scene, path=self.out))
         described = "with a language field" if scene.language else "without a language field"

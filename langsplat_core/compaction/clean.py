@@ -35,8 +35,7 @@ from langsplat_core.compaction.compact import (
 )
 from langsplat_core.config import CleanConfig, check_settings
 from langsplat_core.errors import InputError
-from langsplat_core.io.files import check_keeps
-from langsplat_core.io.scenes import check_writable, load_scene, save_scene
+from langsplat_core.io.scenes import check_keeps, check_writable, load_scene, save_scene
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import Camera, Gaussians, Scene

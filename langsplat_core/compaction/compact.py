@@ -23,8 +23,7 @@ from langsplat_core.arrays import Array, mean_squared_error, psnr
 from langsplat_core.config import BudgetConfig, CompactConfig, DatasetConfig, check_settings
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import InputError
-from langsplat_core.io.files import check_keeps
-from langsplat_core.io.scenes import check_writable, load_scene, save_scene
+from langsplat_core.io.scenes import check_keeps, check_writable, load_scene, save_scene
 from langsplat_core.io.summary import disk_bytes, memory_bytes
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.compose import upright

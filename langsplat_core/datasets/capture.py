@@ -85,6 +85,7 @@ def mask_beside(photo: Path) -> Path | None:
     folders = (photo.parent / "masks", photo.parent.parent / "masks")
     names = (f"{photo.name}.png", f"{photo.stem}.png")
     candidates = (folder / name for folder in folders for name in names)
+    # os.path.isfile, unlike Path.is_file, also says no to names that no file system could hold.
     return next((path for path in candidates if path != photo and os.path.isfile(path)), None)
 
 

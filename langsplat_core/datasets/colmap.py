@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from langsplat_core.arrays import Array, rotation_matrices
+from langsplat_core.arrays import Array, number, rotation_matrices, whole_number
 from langsplat_core.datasets.capture import (
     Capture,
     Photo,
@@ -229,7 +229,7 @@ def _whole(text: str) -> int:
     """Python's own numbers have no limit, and no place in a message then."""
     if len(text) > MOST_DIGITS:
         raise ValueError(f"a whole number of {len(text)} digits")
-    return int(text)
+    return whole_number(text)
 
 
 def _text_cameras(data: bytes) -> dict[int, ModelCamera]:
@@ -239,7 +239,7 @@ def _text_cameras(data: bytes) -> dict[int, ModelCamera]:
         camera_id, model, width, height, *params = line.split()
         if len(params) != sizes.get(model):
             raise ValueError(f"camera {camera_id}: {len(params)} parameters do not make a {model}")
-        cameras[_whole(camera_id)] = _camera(model, _whole(width), _whole(height), tuple(map(float, params)))
+        cameras[_whole(camera_id)] = _camera(model, _whole(width), _whole(height), tuple(map(number, params)))
     return cameras
 
 
@@ -250,7 +250,7 @@ def _text_images(data: bytes) -> list[ModelImage]:
     images = []
     for line in lines[::2]:  # every second line lists 2D points, and may be empty
         _, *pose, camera_id, name = line.split(maxsplit=9)
-        numbers = np.array(pose, np.float64)
+        numbers = np.array(list(map(number, pose)))
         images.append(_image(name, _whole(camera_id), numbers[:4], numbers[4:]))
     return images
 
@@ -259,8 +259,8 @@ def _text_points(data: bytes) -> Points:
     rows: list[PointRow] = []
     for line in filter(None, _lines(data)):
         fields = line.split()
-        numbers = [float(field) for field in fields[1:4]]
-        rows.append((numbers, [_whole(c) for c in fields[4:7]], float(fields[7]), len(fields[8:]) // 2))
+        numbers = [number(field) for field in fields[1:4]]
+        rows.append((numbers, [_whole(c) for c in fields[4:7]], number(fields[7]), len(fields[8:]) // 2))
     return _points(rows)
 
 

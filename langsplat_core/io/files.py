@@ -5,11 +5,17 @@ import os
 import re
 import sys
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from threading import Lock
 
 from langsplat_core.errors import InputError, LangSplatError
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 NAME_MAX, PATH_MAX = 255, 4_096  # bytes, where the system does not say
 RANDOM = 8  # characters that `tempfile` puts into a name
@@ -18,6 +24,9 @@ NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # where a disk i
 PROBE = 1 << 16  # bytes that are written to find out
 # Where files are none: what is written there is read by the system or by nobody, and is gone afterwards.
 _SYSTEM, _MEMORY = ("/proc", "/sys", "/dev"), "/dev/shm"
+
+
+_asking_umask = Lock()
 
 
 @contextmanager
@@ -37,8 +46,9 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     temporary = Path(name)
     try:
         yield temporary
-        umask = os.umask(0)
-        os.umask(umask)
+        with _asking_umask:  # the only way is to change it
+            umask = os.umask(0)
+            os.umask(umask)
         temporary.chmod(0o666 & ~umask)  # mkstemp makes private files; ours are ordinary ones
         temporary.replace(target)
     except Exception as error:
@@ -48,6 +58,29 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         raise OSError(cause.errno, cause.strerror, str(target)) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def turns(folder: Path) -> Iterator[Callable[[], None]]:
+    """Yield a function that waits for a turn at the files of `folder`, which lasts to the end of the block.
+
+    Of all who wait, in this process or others, one at a time has it; where there are no locks, all have it.
+    """
+    handle = -1
+    if fcntl is not None:
+        with suppress(OSError):  # a folder that may not be read
+            handle = os.open(folder, os.O_RDONLY)
+
+    def wait() -> None:
+        if handle >= 0:
+            with suppress(OSError):  # a file system that knows no locks
+                fcntl.flock(handle, fcntl.LOCK_EX)
+
+    try:
+        yield wait
+    finally:
+        if handle >= 0:
+            os.close(handle)
 
 
 def _no_room(error: Exception, temporary: Path) -> OSError | None:
@@ -91,12 +124,6 @@ def check_output_file(path: Path | str) -> None:
     if os.path.exists(target) and not os.path.isfile(target):
         raise InputError(f"{shown(path)}: is no ordinary file; choose another name")
     _try_writing(target, folder)
-
-
-def check_keeps(out: Path, *sources: Path) -> None:
-    """InputError where writing `out` would replace one of the files that are read."""
-    if any(out.resolve() == source.resolve() for source in sources):
-        raise InputError(f"{shown(out)}: would replace the original scene; choose another name")
 
 
 def check_output_folder(path: Path | str) -> None:

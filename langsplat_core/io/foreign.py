@@ -37,11 +37,13 @@ from langsplat_core.io.foreign_language import (
     read_part,
 )
 from langsplat_core.io.hostile import exists
+from langsplat_core.io.scenes import warn_of_undrawable
 from langsplat_core.scene import LEVELS, AutoencoderCodec, Scene
 
 WIDEST_LATENT = 16  # numbers per Gaussian up to which they are an autoencoder's; 1, 2, 3 and 8 were published
 PRUNED = (OCCAM,)  # methods that remove what no view saw, so that levels keep different Gaussians
 ONE_LEVEL = (OPEN_GAUSSIAN, FEATURE_3DGS)  # methods that know no levels
+LARGEST = 1e15  # feature; its square still fits float32
 P = TypeVar("P", bound=Part)
 
 
@@ -66,18 +68,18 @@ class ForeignScene:
     def rows(self, level: int, indices: Array) -> Array:
         """(n, D or d) float32 vectors or latents of any length at `level`; zero for no features.
 
-        Raises FormatError where one is not finite.
+        Raises FormatError where one is not finite, or its square would not be.
         """
         features = self.levels[level]
         if features is None:
             raise ValueError(f"no features of level {LEVELS[level]}")
         with np.errstate(invalid="ignore", over="ignore"):
             rows = features.rows(indices)
-        faulty = np.flatnonzero(~np.isfinite(rows).all(1))
+        faulty = np.flatnonzero(~(np.abs(rows) <= LARGEST).all(1))
         if len(faulty):
             raise FormatError(
-                f"{self.paths[level]}: features are not finite, as those of Gaussian {indices[faulty[0]]}; "
-                "the training has diverged, take an earlier checkpoint"
+                f"{self.paths[level]}: features are not finite, or huge, as those of Gaussian "
+                f"{indices[faulty[0]]}; the training has diverged, take an earlier checkpoint"
             )
         return rows
 
@@ -243,6 +245,7 @@ def _notes(numbers: list[int], featured: list[Carrier], how: str, pruned: int) -
 
 def _scene(carrier: Carrier) -> Scene:
     """The carrier's Gaussians, and the cameras that 3D Gaussian Splatting puts into the model's folder."""
+    warn_of_undrawable(carrier.path, carrier.gaussians)
     folder = carrier.path.resolve().parent
     model = folder.parent.parent if carrier.path.name == "point_cloud.ply" else folder
     cameras = [path for path in (carrier.path.with_suffix(CAMERAS), model / "cameras.json") if exists(path)]

@@ -81,7 +81,7 @@ def _paths(folder: Path | str, stem: str) -> tuple[Path, Path]:
 # is.
 
 EPSILON = 1e-5  # that batch normalisation adds to the variance
-_NAME = re.compile(r"(encoder|decoder)\.(\d{1,3})\.(\w+)")
+_NAME = re.compile(r"(encoder|decoder)\.([0-9]{1,3})\.(\w+)")
 Layer = dict[str, Array]
 
 

@@ -58,6 +58,7 @@ float32, with `means` (N, 3) in place of positions and corners, no temperature a
 
 import hashlib
 import json
+import math
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass, fields, replace
@@ -69,7 +70,7 @@ from numpy.typing import DTypeLike
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from langsplat_core.arrays import Array, check_array
+from langsplat_core.arrays import Array, check_array, number
 from langsplat_core.errors import FormatError, printable_line, quoted
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import open_for_reading, parse_json
@@ -100,6 +101,8 @@ _KEYS = {
     ),
 }
 _KEYS["3"] = _KEYS["2"]
+UNIT = 10.0  # more than any number of a vector whose length is about 1
+_MOST = {"confidence": 1e12, "latents": 1e3}  # and of tensors that are not made of such vectors
 _WHOLE = {  # types of tensors that hold no floating-point numbers
     "codes": ("U16",),
     "things": ("U16",),
@@ -150,9 +153,21 @@ def _read_tensors(
     except SafetensorError as error:
         raise FormatError(f"{path}: not a whole safetensors file ({printable_line(error, 80)})") from None
     for name, tensor in tensors.items():
-        if name != "means" and not np.isfinite(tensor).all():
-            raise FormatError(f"{path}: tensor {quoted(name)} holds numbers that are not finite")
+        _check_numbers(name, tensor, path)
     return tensors, metadata
+
+
+def _check_numbers(name: str, tensor: Array, path: Path) -> None:
+    """FormatError for numbers that the layout above has no room for, and that overflow when they are used."""
+    if name == "means" or tensor.dtype != np.float32:
+        return
+    if not np.isfinite(tensor).all():
+        raise FormatError(f"{path}: tensor {quoted(name)} holds numbers that are not finite")
+    layers = name.startswith((f"{CODEC}encoder.", f"{CODEC}decoder."))  # which the codec bounds itself
+    most = math.inf if layers or name == "corners" else _MOST.get(name, UNIT)
+    largest = float(np.abs(tensor).max(initial=0))
+    if largest > most:
+        raise FormatError(f"{path}: tensor {quoted(name)} holds {largest:g}; expected numbers up to {most:g}")
 
 
 def _check_metadata(metadata: dict[str, str], path: Path) -> None:
@@ -200,7 +215,7 @@ def _field(tensors: dict[str, Array], metadata: dict[str, str], path: Path) -> L
     reading = Reading()
     if metadata["version"] != "1":
         calibration = _calibration(metadata, path)
-        reading = Reading(float(metadata["temperature"]), float(metadata["found"]), calibration)
+        reading = Reading(number(metadata["temperature"]), number(metadata["found"]), calibration)
     return LanguageField(
         codec.from_file(tensors),
         tensors["confidence"],

@@ -25,7 +25,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from langsplat_core.arrays import Array, logit
+from langsplat_core.arrays import Array, logit, number
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import open_for_reading
@@ -257,7 +257,7 @@ def _is_ours(line: bytes) -> bool:
 
 def _positive(text: str) -> float | None:
     try:
-        value = float(text)
+        value = number(text)
     except ValueError:
         return None
     return value if 0 < value < math.inf else None

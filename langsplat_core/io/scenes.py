@@ -20,7 +20,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.io import cameras as camera_files
 from langsplat_core.io import language, ply
 from langsplat_core.io.cameras import read_cameras, write_cameras
-from langsplat_core.io.files import atomic_path, check_output_file
+from langsplat_core.io.files import atomic_path, check_output_file, shown, turns
 from langsplat_core.io.gltf import read_gltf_scene, write_gltf
 from langsplat_core.io.hostile import exists
 from langsplat_core.io.language import read_language, write_language
@@ -157,15 +157,20 @@ def load_without_language(path: Path | str) -> Scene:
 def _read_scene(path: Path) -> Scene:
     """Read the scene's own file; warn where most of it cannot be drawn."""
     scene = _read_by_kind(path)
-    count = len(scene.gaussians)
-    log.debug("%s: %d Gaussians", path, count)
-    looked_at = scene.gaussians.take(np.arange(0, count, max(1, count // LOOKED_AT)))
+    log.debug("%s: %d Gaussians", path, len(scene.gaussians))
+    warn_of_undrawable(path, scene.gaussians)
+    return scene
+
+
+def warn_of_undrawable(path: Path, gaussians: Gaussians) -> None:
+    """Log a warning where most of the Gaussians that were read from `path` cannot be drawn."""
+    count = len(gaussians)
+    looked_at = gaussians.take(np.arange(0, count, max(1, count // LOOKED_AT)))
     if 2 * looked_at.valid().sum() < len(looked_at):
         reasons = looked_at.invalid_rows()
         share = sum(reasons.values()) / len(looked_at)
         told = f"{share:.0%} of the {count} Gaussians cannot be drawn ({', '.join(reasons)})"
         log.warning("%s: %s; is the file damaged?", path, told)
-    return scene
 
 
 def _read_by_kind(path: Path) -> Scene:
@@ -187,6 +192,17 @@ def check_writable(path: Path | str) -> None:
     check_output_file(path)
     for suffix in (language.SUFFIX, camera_files.SUFFIX):
         check_output_file(companion_path(path, suffix))
+
+
+def check_keeps(out: Path, *sources: Path) -> None:
+    """InputError where a scene, or a file without companions, that is written as `out` would replace one of
+    the scenes `sources`, or what lies beside it."""
+    read = {file.resolve() for source in sources for file in (source, *scene_files(source))}
+    companions = [companion_path(out, suffix) for suffix in (language.SUFFIX, camera_files.SUFFIX)]
+    scene = any(row.write is not None and out.suffix.lower() == row.suffix for row in FORMATS)
+    for path in (out, *(companions if scene else ())):
+        if path.resolve() in read:
+            raise InputError(f"{shown(path)}: would replace the original scene; choose another name")
 
 
 def _writable(path: Path) -> SceneFormat:
@@ -214,7 +230,11 @@ def save_scene(path: Path | str, scene: Scene) -> None:
     row = _writable(path)
     assert row.write is not None
     sidecar, cameras = companion_path(path, language.SUFFIX), companion_path(path, camera_files.SUFFIX)
-    with ExitStack() as renames:  # which it makes in the reverse order of the following lines
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with (
+        turns(path.parent) as wait,
+        ExitStack() as renames,
+    ):  # made in the reverse order of these lines
         if scene.cameras:
             write_cameras(renames.enter_context(atomic_path(cameras)), scene.cameras)
         new_sidecar = None if scene.language is None else renames.enter_context(atomic_path(sidecar))
@@ -225,6 +245,7 @@ def save_scene(path: Path | str, scene: Scene) -> None:
             rounded = "precision" in row.loses
             means = load_gaussians(new_file).means if rounded else scene.gaussians.means
             write_language(new_sidecar, scene.language, means)
+        wait()  # else the files of two who write one scene at once could end up side by side
         for companion in (sidecar, cameras):
             companion.unlink(missing_ok=True)
 

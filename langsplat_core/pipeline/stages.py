@@ -8,6 +8,7 @@ import json
 import logging
 import os
 import socket
+import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -78,12 +79,16 @@ def open_array(path: Path) -> Array:
         raise FormatError(f"{path}: damaged ({error}); delete it and run again") from None
 
 
+# What zipfile and NumPy raise; RuntimeError where an archive claims to be encrypted or of a later version.
+_DAMAGED = OSError, ValueError, LookupError, EOFError, RuntimeError
+
+
 def read_arrays(path: Path) -> dict[str, Array]:
     """The arrays of an .npz file; FormatError for a damaged one."""
     try:
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+    except (*_DAMAGED, zipfile.BadZipFile, zlib.error, struct.error) as error:
         raise FormatError(f"{path}: damaged ({error}); delete it and run again") from None
 
 

@@ -5,6 +5,7 @@ be opened and searched without torch; codecs are fitted in `training.language.co
 for what they need (`cosines`, `distances`, `unique`) and never which kind it is.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from langsplat_core.errors import quoted
 SHORTEST = 1e-6  # a latent of numbers shorter than this has no meaning
 LARGEST = 65_535  # codewords: indices are 16 bits, and one number stays free for "no meaning"
 ROWS = 16_384  # vectors compared with all codewords at a time
+LARGEST_SUM = 1e15  # in a network: its square still fits float32
 PAIRS = 65_536  # pairs of latents compared at a time
 
 Layers = tuple[tuple[Array, Array], ...]  # ((out, in) weight, (out,) bias) from input to output
@@ -200,6 +202,9 @@ class AutoencoderCodec(Codec):
                 width = weight.shape[0]
         if self.encoder[-1][0].shape[0] != self.latent_dim or self.decoder[-1][0].shape[0] != self.vector_dim:
             raise ValueError("codec: the decoder does not mirror the encoder's widths")
+        largest = max(_largest(self.encoder), _largest(self.decoder))
+        if LARGEST_SUM < largest < math.inf:  # what is not finite is named by whoever read it
+            raise ValueError(f"codec: the weights add up to {largest:.0e}; at most {LARGEST_SUM:.0e} is used")
 
     @property
     def latent_dim(self) -> int:
@@ -238,6 +243,15 @@ class AutoencoderCodec(Codec):
     @classmethod
     def from_tensors(cls, tensors: dict[str, Array]) -> "AutoencoderCodec":
         return cls(_layers(tensors, "encoder"), _layers(tensors, "decoder"))
+
+
+def _largest(layers: Layers) -> float:
+    """A bound of all numbers that the layers make of a vector of length 1."""
+    bound = 1.0
+    for weight, bias in layers:
+        sums = np.abs(weight).sum(1, dtype=np.float64) * bound + np.abs(bias)
+        bound = float(sums.max(initial=0))
+    return bound
 
 
 def _run(layers: Layers, x: Array) -> Array:

@@ -69,6 +69,7 @@ def _bare(word: str) -> str:
 
 # How the cosines of one text encoder are read, and what they say about whether a thing is there at all.
 
+LARGEST = 1e6  # number of a calibration: cosines are rounded to 1e-7
 Fits = tuple[float, float, float]  # of each level, the best, see `query.chance.Scale.fit`
 
 
@@ -85,8 +86,11 @@ class Odds:
 
     def __post_init__(self) -> None:
         slopes = (self.whole, self.finer)
-        if not (np.isfinite([self.constant, *slopes]).all() and sum(slopes) > 0 and 0.5 <= self.found <= 1):
-            raise ValueError(f"{self}: expected finite numbers, rising with fits, and found in [0.5, 1]")
+        bounded = (np.abs([self.constant, *slopes]) <= LARGEST).all()
+        if not (bounded and sum(slopes) > 0 and 0.5 <= self.found <= 1):
+            raise ValueError(
+                f"{self}: expected numbers up to {LARGEST:g}, rising with fits, and found in [0.5, 1]"
+            )
 
     def probability(self, fits: Fits) -> float:
         """Return the probability, in (0, 1), that what is asked for is there."""
@@ -118,10 +122,10 @@ class Reading:
         return replace(self, calibration=None)
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.temperature) and self.temperature > 0 and 0 <= self.found <= 1):
+        if not (0 < self.temperature <= LARGEST and 0 <= self.found <= 1):
             raise ValueError(
                 f"reading: temperature {self.temperature} and found {self.found}; expected a positive number "
-                "and one in [0, 1]"
+                f"up to {LARGEST:g} and one in [0, 1]"
             )
 
 

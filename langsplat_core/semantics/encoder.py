@@ -17,7 +17,7 @@ import numpy as np
 from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import EncoderError, InputError, UnknownWordError
 from langsplat_core.scene import Calibration, Odds, Reading
-from langsplat_core.semantics.weights import OPEN_CLIP_CONFIG, Weights
+from langsplat_core.semantics.weights import OPEN_CLIP_CONFIG, Weights, asking_errors
 
 # Phrases as rows of token numbers of one length, by the tokenizer.json that lies beside the weights. The file
 # is read as it is, by the `tokenizers` library: what transformers' own classes add around it (which side is
@@ -284,6 +284,7 @@ class Encoder(PhraseEncoder):
         return unit(inferred(lambda: self._images.encode(inputs)))
 
 
+@asking_errors("the encoder")
 def inferred(forward: Callable[[], Any]) -> Array:
     """The float32 array of a torch tensor that `forward` computes, without gradients."""
     import torch

@@ -20,6 +20,7 @@ from langsplat_core.semantics.layouts import open_weights
 from langsplat_core.semantics.masks import GraphMasks, LevelMasks, MaskSource
 from langsplat_core.semantics.weights import (
     Weights,
+    asking_errors,
     load_config,
     load_model,
     model_type,
@@ -43,6 +44,7 @@ class Look:
     shape: tuple[int, int]  # (height, width) of the image itself, px
     ordered: bool  # whether the three answers to a point are subpart, part, whole, in this order
 
+    @asking_errors("the segmenter")
     def ask(self, points: Array) -> tuple[Any, Any]:
         """(P, 2) float32 points x, y, px of the image -> (P, 3) predicted IoU and (P, 3, h, w) logits, low
         resolution, of the masks subpart, part, whole at each point."""
@@ -132,6 +134,7 @@ class Sam:
         settings.mask_decoder_config.layer_norm_eps = EPSILON
         self._model: Any = load_model(SamModel, weights, settings)
 
+    @asking_errors("the segmenter")
     def look(self, image: Array) -> Look:
         import torch
 
@@ -156,6 +159,7 @@ class Sam2:
         # The hub's files state the video model's configuration.
         self._model: Any = load_model(Sam2Model, weights, load_config(Sam2Config, weights, self.name))
 
+    @asking_errors("the segmenter")
     def look(self, image: Array) -> Look:
         import torch
 

@@ -138,40 +138,66 @@ def load_config(kind: Any, weights: Weights, name: str) -> Any:
         return kind.from_pretrained(weights.folder, local_files_only=True)
 
 
-# Of config.json: sizes that are a side of some tensor, or fewer; and others.
+# In config.json: sizes that are a side of some tensor, or fewer; numbers of what has a tensor each.
 SIDES = (
-    *("hidden_size", "intermediate_size", "vocab_size", "max_position_embeddings"),
-    *("num_attention_heads", "patch_size", "num_channels"),
+    *("hidden_size", "intermediate_size", "vocab_size", "max_position_embeddings", "num_attention_heads"),
+    *("patch_size", "num_channels", "projection_size", "mlp_dim", "output_channels", "mask_input_channels"),
+    *("iou_head_hidden_dim", "fpn_hidden_size", "embed_dim_per_stage", "backbone_channel_list"),
 )
-LARGEST_IMAGE = 1 << 16  # pixels
+COUNTS = (
+    *("num_hidden_layers", "iou_head_depth", "num_multimask_outputs", "num_point_embeddings"),
+    "blocks_per_stage",
+)
+LARGEST_IMAGE = 1 << 16  # pixels; no other number is larger either
+_LAYER = re.compile(r"(?:encoder|transformer)\.layers\.(\d+)\.|backbone\.blocks\.(\d+)\.", re.ASCII)
 
 
 def _check_sizes(weights: Weights) -> None:
     """EncoderError where config.json states sizes that its tensors cannot have: a model of those would be
     built, with random numbers, before anybody compares."""
     settings, shapes = json.loads((weights.folder / CONFIG).read_text(encoding="utf-8")), _shapes(weights)
-    parts = [("", settings)] if isinstance(settings, dict) else []
-    for part in ("text", "vision"):
-        stated = settings.get(f"{part}_config") if parts else None
-        names = [name for name in shapes if name.startswith(f"{part}_")]
-        if isinstance(stated, dict) and names:
-            parts.append((f"{part}_config.", stated))
-            layers = {int(found[1]) for name in names if (found := re.search(r"\.layers\.(\d+)\.", name))}
-            if layers:
-                _check_size(
-                    weights, f"{part}_config.num_hidden_layers", stated, max(layers) + 1, max(layers) + 1
-                )
     largest = max((side for shape in shapes.values() for side in shape), default=0)
-    for prefix, stated in parts:
-        for name in (*SIDES, "image_size", *(() if prefix else ("projection_dim",))):
-            most = LARGEST_IMAGE if name == "image_size" else largest
-            _check_size(weights, prefix + name, stated, 1, most)
+    for prefix, name, value in _numbers_in(settings):
+        half = prefix.partition("_")[0]  # text_config.: tensors text_model.
+        layers = {int(n) for key in shapes if half and key.startswith(half) for n in _layer_of(key)}
+        if name in ("num_hidden_layers", "blocks_per_stage") and layers:
+            total = sum(value) if name == "blocks_per_stage" and _whole(value) else value
+            _check_size(weights, prefix + name, total, len(layers), len(layers))
+        if name in SIDES or (name == "projection_dim" and not prefix):
+            _check_size(weights, prefix + name, value, 1, largest)
+        elif name in COUNTS:
+            _check_size(weights, prefix + name, value, 1, len(shapes))
+        elif name == "image_size":
+            _check_size(weights, prefix + name, value, 1, LARGEST_IMAGE)
+        elif _whole(value):
+            most = max(largest, LARGEST_IMAGE)
+            _check_size(weights, prefix + name, value, -most, most)
 
 
-def _check_size(weights: Weights, name: str, stated: dict[str, Any], least: int, most: int) -> None:
-    value = stated.get(name.rpartition(".")[2], least)
-    values = value if isinstance(value, list) and value else [value]  # image_size may have two
-    if not all(isinstance(v, int) and not isinstance(v, bool) and least <= v <= most for v in values):
+def _numbers_in(settings: Any, prefix: str = "") -> Iterator[tuple[str, str, Any]]:
+    """(names of the parts that it is in, its own, value) of every value of a configuration, part by part."""
+    for name, value in settings.items() if isinstance(settings, dict) else ():
+        if isinstance(value, dict):
+            yield from _numbers_in(value, f"{prefix}{name}.")
+        elif value is not None:  # which leaves it to the family
+            yield prefix, name, value
+
+
+def _layer_of(tensor: str) -> Iterator[str]:
+    """The number of the layer that a tensor belongs to, if it is in one of the many."""
+    found = _LAYER.search(tensor)
+    return filter(None, found.groups()) if found else iter(())
+
+
+def _whole(value: Any) -> bool:
+    """Return whether a value is a whole number, or a list of such."""
+    values = value if isinstance(value, list) else [value]
+    return all(isinstance(v, int) and not isinstance(v, bool) for v in values)
+
+
+def _check_size(weights: Weights, name: str, value: Any, least: int, most: int) -> None:
+    values = value if isinstance(value, list) else [value]  # image_size may have two
+    if not (_whole(value) and all(least <= v <= most for v in values)):
         expected = f"{least}" if least == most else f"a whole number from {least} to {most}"
         raise EncoderError(
             f"{weights.id}: {CONFIG}: {name} is {json.dumps(value)[:40]}, its weights have {expected}; take "
@@ -279,6 +305,21 @@ def loading_errors(id: str, kind: str) -> Iterator[None]:
         logging.set_verbosity(level)
         if bars:
             logging.enable_progress_bar()
+
+
+@contextmanager
+def asking_errors(what: str) -> Iterator[None]:
+    """While a loaded model is asked: EncoderError where its configuration, of which loading compares no more
+    than sizes, turns out not to fit its weights."""
+    import torch
+
+    try:
+        yield
+    except torch.OutOfMemoryError:
+        raise
+    except (TypeError, AttributeError, LookupError, ArithmeticError, ValueError, RuntimeError) as error:
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
+        raise EncoderError(f"{what}: cannot be asked; does {CONFIG} belong to it? ({reason})") from error
 
 
 def torch_device(device: str) -> str:

@@ -321,11 +321,12 @@ def measure_endurance(command: Scale, progress: Progress = silent) -> list[Stret
     for part in parts([partial(_draw, large, camera)] * command.images):
         measure("further images", part)
     engine = QueryEngine(large, lambda _: encoder)
-    measure("surface and regions, once", [lambda: engine.regions])
+    measure("regions, once", [lambda: engine.regions])
     asked = [partial(engine.run, text) for text in _two_words(encoder, command.phrases)]
     measure("the first phrase", asked[:1])
     for part in parts(asked[1:]):
         measure("further phrases", part)
+    measure("the surface, once, for instances", [lambda: engine.surface])
     return stretches
 
 

@@ -1,5 +1,6 @@
 """`langsplat convert` to every format that is written: what of a scene arrives, what the image loses."""
 
+import os
 import re
 from dataclasses import replace
 from importlib.resources import files
@@ -14,13 +15,14 @@ from langsplat_core.cli.run import main
 from langsplat_core.cli.scenes import Convert
 from langsplat_core.errors import InputError
 from langsplat_core.io import language
+from langsplat_core.io.language import write_language
 from langsplat_core.io.scenes import companion_path, load_scene, save_scene
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures
 from tests.support.comparing import assert_same_extras
-from tests.support.file_samples import random_field
+from tests.support.file_samples import random_field, sog_files, write_folder
 from tests.support.fixtures import Measure
 from tests.support.foreign_files import save_model, tensor
 from tests.support.scenes import random_camera, random_extras, random_gaussians
@@ -168,6 +170,29 @@ def test_what_cannot_be_imported_is_one_line(tmp_path, capsys, monkeypatch, word
     error = capsys.readouterr().err
     assert re.search(message, error)
     assert error.count("\n") == 1
+
+
+def test_no_scene_that_is_read_is_replaced_by_any_other_name(tmp_path, capsys, monkeypatch):
+    """Nor what lies beside it: a folder of SOG and a PLY of its name have one sidecar."""
+    monkeypatch.chdir(tmp_path)
+    write_folder(Path("a"), sog_files(random_gaussians(20)))
+    write_language("a.langsplat.safetensors", random_field(20), load_scene("a").gaussians.means)
+    save_scene("b.ply", full_scene())
+    Path("link.ply").symlink_to("b.ply")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    for words in (
+        ("a", "a.ply"),
+        ("a/meta.json", "a.ply"),
+        ("link.ply", "b.ply"),
+        ("b.ply", "link.ply"),
+        ("a", "b.ply", "--rematch", "b.langsplat.safetensors"),
+    ):
+        assert run(*words) == 2, words
+        assert "would replace the original scene" in capsys.readouterr().err
+    assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    os.link("b.ply", "other name.ply")  # which is another file as soon as it is written
+    assert run("b.ply", "other name.ply") == 0
+    assert Path("b.ply").read_bytes() == before[tmp_path / "b.ply"]
 
 
 # ---- the demo scene: image and size ----

@@ -312,12 +312,20 @@ def wrong(index: int, value: object) -> tuple[object, ...]:
         (7, torch.zeros(N, D, dtype=torch.int32), "features of the type int32"),
         (7, torch.zeros(1).expand(10**9, 24), "more numbers than the file has"),
         (7, torch.zeros(N, D, dtype=torch.complex64), "needs 'torch.ComplexFloatStorage'"),
-        (7, torch.full((N, D), torch.nan), "features are not finite, as those of Gaussian 0"),
+        (7, torch.full((N, D), torch.nan), "features are not finite, or huge, as those of Gaussian 0"),
+        (7, torch.full((N, D), 3e38), "features are not finite, or huge, as those of Gaussian 0"),
     ],
 )
 def test_wrong_elements(tmp_path, index, value, message):
     torch.save((wrong(index, value), 1), tmp_path / "c.pth")
     refused([tmp_path / "c.pth"], message)
+
+
+def test_checkpoints_that_can_hardly_be_drawn_are_warned_of(tmp_path, caplog):
+    path = save_model(tmp_path / "c.pth", replace(G, log_scales=np.full_like(G.log_scales, np.nan)))
+    with caplog.at_level("WARNING", "langsplat"):
+        read_foreign([path])
+    assert "100% of the 20 Gaussians cannot be drawn" in caplog.text
 
 
 def test_files_that_do_not_go_together(tmp_path):

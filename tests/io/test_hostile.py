@@ -19,6 +19,7 @@ from PIL import EpsImagePlugin, Image
 from langsplat_core.datasets.capture import find_photos, read_photo
 from langsplat_core.errors import FormatError
 from langsplat_core.io.cameras import read_cameras
+from langsplat_core.io.foreign_language import read_part
 from langsplat_core.io.hostile import (
     MOST_PIXELS,
     PictureError,
@@ -33,6 +34,7 @@ from langsplat_core.io.ply import read_ply
 from langsplat_core.io.ply_table import GREY, read_cloud
 from langsplat_core.io.scenes import load_gaussians
 from langsplat_core.io.spz import read_spz_scene
+from langsplat_core.pipeline.stages import read_arrays
 from tests.support.file_samples import plain_ply, random_field, sog_files, spz_bytes, write_folder
 from tests.support.scenes import random_gaussians
 
@@ -54,6 +56,21 @@ def read(folder: Path, data: bytes, name: str = "a", limit: int = 10_000) -> byt
 def test_other_methods_are_refused_before_they_run(tmp_path: Path, method: int) -> None:
     with pytest.raises(FormatError, match=f"packed by method {method}; pack the archive again with deflate"):
         read(tmp_path, packed(method))
+
+
+def test_archives_of_a_version_that_nobody_has(tmp_path: Path) -> None:
+    """ZIP says which version it takes to be unpacked: 12.7, or an encrypted member."""
+    np.savez(tmp_path / "a.npz", key=np.ones(3))
+    good = (tmp_path / "a.npz").read_bytes()
+    entry = good.rindex(b"PK\x01\x02")
+    for place, value in ((6, 127), (8, 1)):
+        data = bytearray(good)
+        data[entry + place] = value
+        (tmp_path / "a.npz").write_bytes(data)
+        for reading in (read_npz, read_part, read_arrays):
+            with pytest.raises(FormatError) as caught:
+                reading(tmp_path / "a.npz")
+            assert "\n" not in str(caught.value)
 
 
 def test_what_unfolds_beyond_the_limit_is_refused(tmp_path: Path) -> None:

@@ -214,7 +214,7 @@ def test_refusals(tmp_path, clip, caplog):
         import_scene(read_foreign(occam(tmp_path / "zero", VECTORS * 0)), clip)
     spoiled = VECTORS.copy()
     spoiled[1, 4, 2] = np.inf
-    with pytest.raises(FormatError, match=r"_2\.pth: features are not finite, as those of Gaussian 4"):
+    with pytest.raises(FormatError, match=r"_2\.pth: features are not finite, .* of Gaussian 4"):
         import_scene(read_foreign(occam(tmp_path / "inf", spoiled)), clip)
 
 

@@ -1,13 +1,14 @@
-"""Trainings that are killed in every stage end as if nothing had been."""
+"""Trainings that are stopped in every stage, by a signal or a full disk, end as if nothing had been."""
 
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -15,11 +16,13 @@ import pytest
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics
 from langsplat_core.progress import ALL_STAGES, Report
 from tests.support.photographs import colmap_reconstruction, poses, write_photos
+from tests.support.processes import resize, small_disk
 from tests.support.tiny_clip import tiny_clip
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name == "nt", reason="no signal 9")]
 LENS = PhotoIntrinsics(320, 240, 300.0, 300.0, 160.0, 120.0)
 VIEWS = 6
+STEPS = 5  # in which a disk is made as large as a training needs
 START = "starting"  # before the first report
 SCENE = ("scene.ply", "scene.langsplat.safetensors", "scene.cameras.json")
 SETTINGS = (
@@ -36,6 +39,7 @@ class Moment:
     stage: str
     fraction: float
     seconds: float
+    signal: int = signal.SIGKILL
 
 
 @dataclass(frozen=True)
@@ -49,7 +53,7 @@ class Ended:
 
 
 def train(data: Path, encoder: Path, folder: Path, kill: Moment | None = None) -> Ended:
-    """Train ``folder/scene.ply``, and kill it with signal 9 at a moment."""
+    """Train ``folder/scene.ply``, and send it a signal at a moment."""
     words = ["train", str(data), "--out", str(folder / SCENE[0]), "--clip.model", str(encoder), *SETTINGS]
     start = time.monotonic()
     began, said = {START: 0.0}, []
@@ -59,7 +63,8 @@ def train(data: Path, encoder: Path, folder: Path, kill: Moment | None = None) -
         stderr=subprocess.PIPE,
         text=True,
     ) as process:
-        killer = threading.Timer(kill.seconds if kill else 0, process.send_signal, (signal.SIGKILL,))
+        number = kill.signal if kill else 0
+        killer = threading.Timer(kill.seconds if kill else 0, process.send_signal, (number,))
         if kill is not None and kill.stage == START:
             killer.start()
         assert process.stderr is not None
@@ -69,6 +74,8 @@ def train(data: Path, encoder: Path, folder: Path, kill: Moment | None = None) -
                 said.append(line)
                 continue
             stage, fraction = report
+            if stage == ALL_STAGES:
+                continue
             began.setdefault(stage, time.monotonic() - start)
             passed = kill is not None and kill.stage in began
             passed = passed and (stage != kill.stage or fraction >= kill.fraction)
@@ -80,12 +87,12 @@ def train(data: Path, encoder: Path, folder: Path, kill: Moment | None = None) -
 
 
 def _report(line: str) -> tuple[str, float] | None:
-    """Stage and fraction of a line of progress; None for other lines and for the progress of the whole."""
+    """Stage and fraction of a line of progress; None for other lines."""
     try:
         report = Report.from_json(line)
     except ValueError:
         return None
-    return None if report.stage == ALL_STAGES else (report.stage, report.fraction)
+    return report.stage, report.fraction
 
 
 def moments(whole: Ended, seed: int) -> list[Moment]:
@@ -113,23 +120,74 @@ def photographs(folder: Path, kind: str) -> Path:
     return folder
 
 
+def assert_same(folder: Path, whole: Path) -> None:
+    for name in SCENE:
+        assert (folder / name).read_bytes() == (whole / name).read_bytes(), name
+
+
 @pytest.mark.parametrize("kind", ["photographs", "COLMAP"])
-def test_killed_in_every_stage_it_ends_with_the_same_bytes(
-    kind: str, tmp_path: Path, request: pytest.FixtureRequest
+@pytest.mark.parametrize("how", ["killed", "signals"])
+def test_stopped_in_every_stage_it_ends_with_the_same_bytes(
+    how: str, kind: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
-    """One run, killed once in each stage at a random moment and begun again, against one that was not."""
+    """One run, stopped once in each stage at a random moment and begun again, against one that was not."""
     data, encoder = photographs(tmp_path / "data", kind), tmp_path / "encoder"
     tiny_clip(encoder)
     whole = train(data, encoder, tmp_path / "whole")
     assert whole.code == 0, whole.said
     seed = request.config.getoption("--seed") or 0
-    killed = []
+    choose, stopped = random.Random(seed), []
     for moment in moments(whole, seed):
-        ended = train(data, encoder, tmp_path / "killed", moment)
-        assert ended.code in (0, -signal.SIGKILL), ended.said  # 0: it was faster than before
-        killed.append(ended.code != 0)
-    assert sum(killed) > len(killed) / 2
-    last = train(data, encoder, tmp_path / "killed")
+        number = choose.choice((signal.SIGINT, signal.SIGTERM)) if how == "signals" else signal.SIGKILL
+        ended = train(data, encoder, tmp_path / "stopped", replace(moment, signal=number))
+        expected = -number if how == "killed" else 128 + number
+        assert ended.code in (0, expected), ended.said  # 0: it was faster than before
+        assert "Traceback" not in ended.said
+        if ended.code > 0:
+            assert ended.said.splitlines()[-1].endswith("the same command continues where it stopped")
+        stopped.append(ended.code != 0)
+    print(f"{kind}: {sum(stopped)} of {len(stopped)} {how}")
+    assert sum(stopped) > len(stopped) / 2
+    last = train(data, encoder, tmp_path / "stopped")
     assert last.code == 0, last.said
-    for name in SCENE:
-        assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
+    assert_same(tmp_path / "stopped", tmp_path / "whole")
+
+
+def test_a_disk_that_is_full_again_and_again(tmp_path: Path) -> None:
+    """Of a training with given cameras, from its masks on: before that, pycolmap wants 64 MB. Each time the
+    disk fills up it is made a little larger."""
+    data, encoder = photographs(tmp_path / "data", "COLMAP"), tmp_path / "encoder"
+    tiny_clip(encoder)
+    whole = train(data, encoder, tmp_path / "whole")
+    assert whole.code == 0, whole.said
+    needed = sum(path.stat().st_size for path in (tmp_path / "whole").rglob("*") if path.is_file())
+    filled = 0
+    with small_disk(tmp_path / "disk", needed + (80 << 20)) as disk:
+        train(data, encoder, disk / "out", Moment("masks and vectors", 0, 0, signal.SIGTERM))
+        size = shutil.disk_usage(disk).used
+        resize(disk, size)
+        while (ended := train(data, encoder, disk / "out")).code != 0:
+            assert ended.code == 2, ended.said
+            assert "No space left" in ended.said.splitlines()[-1]
+            assert "Traceback" not in ended.said
+            size, filled = size + needed // STEPS, filled + 1
+            assert filled < 3 * STEPS  # what is written for a moment needs room too
+            resize(disk, size)
+        print(f"full {filled} times")
+        assert filled > STEPS / 2
+        assert_same(disk / "out", tmp_path / "whole")
+
+
+def test_photographs_that_change_while_it_is_stopped(tmp_path: Path) -> None:
+    """One is replaced between a stop in the last stages and the next run, which then ends as a
+    training of what is there now."""
+    data, encoder = photographs(tmp_path / "data", "COLMAP"), tmp_path / "encoder"
+    tiny_clip(encoder)
+    stop = Moment("lifting masks onto the Gaussians", 0, 0, signal.SIGTERM)
+    assert train(data, encoder, tmp_path / "stopped", stop).code in (0, 128 + signal.SIGTERM)
+    first, second, *_ = sorted((data / "images").iterdir())
+    first.write_bytes(second.read_bytes())
+    again = train(data, encoder, tmp_path / "stopped")
+    assert again.code == 0, again.said
+    assert train(data, encoder, tmp_path / "whole").code == 0
+    assert_same(tmp_path / "stopped", tmp_path / "whole")

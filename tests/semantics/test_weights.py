@@ -25,9 +25,11 @@ from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.semantics import layouts
 from langsplat_core.semantics.encoders import CLIP_MEAN, CLIP_STD, load_encoder, load_text_encoder
 from langsplat_core.semantics.sam import load_segmenter
+from langsplat_core.semantics.weights import COUNTS, SIDES
 from tests.support.tiny_clip import tiny_clip
 from tests.support.tiny_sam import SIDE as SAM_SIDE
 from tests.support.tiny_sam import tiny_sam, tiny_sam2
+from tests.support.tiny_siglip import tiny_siglip
 
 SIDE, PATCH, CONTEXT, SIZE = 32, 8, 20, 24
 MARKS = "'&"
@@ -273,29 +275,59 @@ def test_a_configuration_that_contradicts_itself_is_one_line(tmp_path: Path) -> 
     assert "\n" not in str(caught.value)
 
 
-# Weights in the layouts of open_clip, OpenAI, segment_anything and sam2, against open_clip's arithmetic and
-# against the same weights in Hugging Face layout.
+FOLDERS: dict[str, tuple[Callable[[Path], object], Callable[[str], Any]]] = {
+    "CLIP": (tiny_clip, load_encoder),
+    "SigLIP": (tiny_siglip, load_encoder),
+    "SAM": (tiny_sam, load_segmenter),
+    "SAM 2": (tiny_sam2, load_segmenter),
+}
 
-SIZES = ("hidden_size", "vocab_size", "max_position_embeddings", "num_hidden_layers", "intermediate_size")
+
+def places(config: dict[str, Any]) -> list[tuple[dict[str, Any], str]]:
+    """(part of a configuration, name) of every size in it."""
+    own = [(config, name) for name in config if name in (*SIDES, *COUNTS, "image_size")]
+    return own + [place for part in config.values() if isinstance(part, dict) for place in places(part)]
 
 
-@pytest.mark.parametrize("part", ["text_config", "vision_config"])
-@pytest.mark.parametrize("name", SIZES)
-@pytest.mark.parametrize("value", [-1, 0, "x", 10**9, True, 2.5])
-def test_sizes_that_the_weights_do_not_have_are_one_line(
-    part: str, name: str, value: object, tmp_path: Path
-) -> None:
-    if part == "vision_config" and name in ("vocab_size", "max_position_embeddings"):
-        name = {"vocab_size": "patch_size", "max_position_embeddings": "image_size"}[name]
-    tiny_clip(tmp_path)
+@pytest.mark.parametrize("kind", FOLDERS)
+def test_sizes_that_the_weights_do_not_have_are_one_line(kind: str, tmp_path: Path) -> None:
+    make, load = FOLDERS[kind]
+    make(tmp_path)
     path = tmp_path / "config.json"
     config = json.loads(path.read_text(encoding="utf-8"))
-    config[part][name] = value
-    path.write_text(json.dumps(config), encoding="utf-8")
-    with pytest.raises(EncoderError, match=f"{part}.{name}") as caught:
-        load_encoder(str(tmp_path))
-    assert "\n" not in str(caught.value)
+    every = places(config)
+    assert len(every) > 8
+    for part, name in every:
+        true = part[name]
+        fewer = [true - 1] if name == "num_hidden_layers" else []
+        for value in (-1, 0, "x", 10**9, True, 2.5, [1, -1], *fewer):
+            part[name] = value
+            path.write_text(json.dumps(config), encoding="utf-8")
+            with pytest.raises(EncoderError, match=rf"json: \S*{name} is |not SAM 2") as caught:
+                load(str(tmp_path))
+            assert "\n" not in str(caught.value)
+        part[name] = true
 
+
+def test_a_configuration_that_only_asking_shows_to_be_wrong_is_one_line(tmp_path: Path) -> None:
+    def change(folder: Path, part: str, name: str, value: object) -> str:
+        config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+        config[part][name] = value
+        (folder / "config.json").write_text(json.dumps(config), encoding="utf-8")
+        return str(folder)
+
+    tiny_clip(tmp_path / "clip")
+    encoder = load_encoder(change(tmp_path / "clip", "text_config", "eos_token_id", None))
+    with pytest.raises(EncoderError, match=r"the encoder: cannot be asked; does config\.json belong to it"):
+        encoder.encode_texts(["red mug"])
+    tiny_sam2(tmp_path / "sam")
+    segmenter = load_segmenter(change(tmp_path / "sam", "vision_config", "fpn_padding", -1))
+    with pytest.raises(EncoderError, match="the segmenter: cannot be asked"):
+        segmenter.look(np.zeros((SAM_SIDE, SAM_SIDE, 3), np.uint8))
+
+
+# Weights in the layouts of open_clip, OpenAI, segment_anything and sam2, against open_clip's arithmetic and
+# against the same weights in Hugging Face layout.
 
 PHRASES = ["red mug", "a", "handle"]
 CONFIG = "open_clip_config.json"

@@ -14,6 +14,7 @@ from langsplat_core.arrays import unit
 from langsplat_core.datasets.capture import Capture, read_photo
 from langsplat_core.datasets.colmap import load_colmap
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
+from langsplat_core.display.displays import latent_colours
 from langsplat_core.io.cameras import read_cameras, write_cameras
 from langsplat_core.io.foreign import read_foreign
 from langsplat_core.io.gltf import write_gltf
@@ -21,7 +22,9 @@ from langsplat_core.io.hostile import picture_size
 from langsplat_core.io.language import read_language, write_language
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import silent
-from langsplat_core.scene import Gaussians
+from langsplat_core.query.engine import QueryEngine
+from langsplat_core.raster.render import render
+from langsplat_core.scene import Gaussians, Scene
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures
 from tests.support.file_samples import (
     ascii_ply,
@@ -61,22 +64,18 @@ def gltf_bytes(gaussians: Gaussians, suffix: str = ".glb") -> bytes:
 
 
 def scene_share(path: Path) -> float:
-    """Also makes what a viewer makes first: the camera that frames the scene."""
+    """Also makes what a viewer makes first: the camera that frames the scene, and what it sees."""
     scene = load_scene(path)
-    scene.framing_camera((64, 48))
+    drawn = render(scene, scene.framing_camera((32, 24)))
+    assert np.isfinite(drawn.colours).all()
+    assert np.isfinite(drawn.alpha).all()
     gaussians = scene.gaussians
     assert sum(gaussians.invalid_rows().values()) == len(gaussians) - gaussians.valid().sum()
+    return drawable_share(gaussians)
+
+
+def drawable_share(gaussians: Gaussians) -> float:
     return float(gaussians.valid().mean()) if len(gaussians) else 1.0
-
-
-def _whole(read: Callable[[Path], object]) -> Callable[[Path], float]:
-    """Of a format in which nothing may be unsound."""
-
-    def share(path: Path) -> float:
-        read(path)
-        return 1.0
-
-    return share
 
 
 # -- samples -------------------------------------------------------------------------------------------------
@@ -89,6 +88,22 @@ def sidecars(folder: Path) -> list[bytes]:
         write_language(folder / "made", random_field(len(SCENE), kind), SCENE.means)
         made.append((folder / "made").read_bytes())
     return made
+
+
+def searched(path: Path) -> float:
+    """Asks a field and draws the answer and what its latents look like: numbers that can be read may still be
+    none to reckon with."""
+    field = read_language(path, SCENE.means)
+    scene = Scene(SCENE, field)
+    engine = QueryEngine(scene)
+    vector = unit(np.random.default_rng(0).normal(size=field.codec.vector_dim)).astype(np.float32)
+    answer = engine.run("cup", vector=vector)
+    engine.instances(answer)
+    values = np.concatenate([answer.relevancy.T, *latent_colours(field)], axis=1)
+    drawn = render(scene, scene.framing_camera((32, 24)), values)
+    assert np.isfinite(values).all()
+    assert np.isfinite(drawn.values).all()
+    return 1.0
 
 
 def camera_files(folder: Path) -> list[bytes]:
@@ -271,7 +286,7 @@ def imported(path: Path) -> float:
     scene = read_foreign([path, *[beside] * beside.exists()])
     for level in (level for level in range(3) if scene.levels[level] is not None):
         scene.rows(level, np.arange(len(scene.scene.gaussians)))
-    return 1.0
+    return drawable_share(scene.scene.gaussians)
 
 
 KINDS = {
@@ -293,9 +308,7 @@ KINDS = {
     ".ksplat": _scenes(
         "a.ksplat", *(ksplat_bytes([SCENE, PLAIN][: 1 + level % 2], level) for level in range(3))
     ),
-    "sidecar": FileKind(
-        "a.langsplat.safetensors", sidecars, _whole(lambda path: read_language(path, SCENE.means))
-    ),
+    "sidecar": FileKind("a.langsplat.safetensors", sidecars, searched),
     "cameras.json": FileKind("a.cameras.json", camera_files, camera_list),
     "transforms.json": FileKind("transforms.json", transforms, beside_transforms),
     "point-cloud PLY": FileKind("cloud.ply", cloud_folder, beside_transforms, in_ply_header),

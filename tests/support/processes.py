@@ -3,8 +3,13 @@
 import ctypes
 import os
 import resource
+import shutil
+import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
 
 from langsplat_core.progress import Cancelled, Progress, Report
 
@@ -46,3 +51,21 @@ def stop_at(stage: str, fraction: float = 0.0) -> Progress:
             raise Cancelled
 
     return Progress(show)
+
+
+@contextmanager
+def small_disk(folder: Path, size: int) -> Iterator[Path]:
+    """A file system in memory of so many bytes, see `resize`; skips where one may not be mounted."""
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
+    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("mounting a file system needs root")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "--lazy", str(folder)], check=True, capture_output=True)
+
+
+def resize(disk: Path, size: int) -> None:
+    """Make a `small_disk` larger."""
+    subprocess.run(["mount", "-o", f"remount,size={size}", str(disk)], check=True, capture_output=True)
