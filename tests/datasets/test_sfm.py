@@ -460,7 +460,9 @@ def test_a_focal_length_that_is_of_no_such_lens_tells_a_wrong_world(
 ) -> None:
     model = synthetic(4, 100)
     ((number, camera),) = model.cameras.items()
-    before = pycolmap.Camera.create_from_model_id(number, pycolmap.CameraModelId.SIMPLE_RADIAL, 600.0, 800, 600)
+    before = pycolmap.Camera.create_from_model_id(
+        number, pycolmap.CameraModelId.SIMPLE_RADIAL, 600.0, 800, 600
+    )
     before.has_prior_focal_length = prior
     with pycolmap.Database.open(tmp_path / "database.db") as database:
         database.write_camera(before, use_camera_id=True)
