@@ -1,6 +1,6 @@
 """Errors a user can cause. Each message is one line: what is wrong, and how to mend it."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import MappingProxyType
 
@@ -20,6 +20,14 @@ def printable_line(text: object, limit: int = LINE_LIMIT) -> str:
         return line
     tail = limit // 2
     return f"{line[: limit - tail - 3]}...{line[-tail:]}"
+
+
+def shortened(names: Iterable[str], limit: int = 5, width: int = 200) -> str:
+    """``a, b, c and 4 more``, about `width` characters at most; long names lose their middle."""
+    listed = sorted(names)
+    rest = len(listed) - limit
+    shown = printable_line(", ".join(printable_line(name, 80) for name in listed[:limit]), width)
+    return shown + (f" and {rest} more" if rest > 0 else "")
 
 
 def quoted(content: object, limit: int = 60) -> str:

@@ -56,8 +56,9 @@ class Train:
 
     def run(self) -> None:
         # They import torch: seconds that --help need not pay.
-        from langsplat_core.datasets.capture import shortened
+        from langsplat_core.errors import shortened
         from langsplat_core.pipeline.forecast import Forecast, count_photographs, forecast_in_words, plan
+        from langsplat_core.pipeline.report import PAGE, work_folder
         from langsplat_core.pipeline.stages import join_processes
         from langsplat_core.pipeline.train import train_scene
         from langsplat_core.semantics.weights import torch_device
@@ -95,6 +96,7 @@ class Train:
         )
         for warning in report.warnings:
             print(f"warning: {warning}")
+        print(f"photographs beside what the scene shows: {(self.work or work_folder(self.out)) / PAGE}")
 
 
 @dataclass(frozen=True)

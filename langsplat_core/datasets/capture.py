@@ -6,7 +6,7 @@ import logging
 import math
 import os
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -19,7 +19,8 @@ from scipy.spatial.distance import pdist
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics, pinhole_for, resample, source_positions
-from langsplat_core.errors import InputError, printable_line
+from langsplat_core.datasets.matches import Matches
+from langsplat_core.errors import InputError, shortened
 from langsplat_core.io.hostile import PHOTO_SUFFIXES, PictureError, opened
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera
@@ -86,14 +87,6 @@ def mask_beside(photo: Path) -> Path | None:
     candidates = (folder / name for folder in folders for name in names)
     # os.path.isfile, unlike Path.is_file, also says no to names that no file system could hold.
     return next((path for path in candidates if path != photo and os.path.isfile(path)), None)
-
-
-def shortened(names: Iterable[str], limit: int = 5, width: int = 200) -> str:
-    """``a, b, c and 4 more``, about `width` characters at most; long names lose their middle."""
-    listed = sorted(names)
-    rest = len(listed) - limit
-    shown = printable_line(", ".join(printable_line(name, 80) for name in listed[:limit]), width)
-    return shown + (f" and {rest} more" if rest > 0 else "")
 
 
 def unique_names(labels: Sequence[str]) -> list[str]:
@@ -219,6 +212,8 @@ def develop(
             camera, picture, mask = read(photo)
         except PictureError as error:
             return f"{photo.label} ({error.reason})"
+        if mask is not None and not mask.any():
+            return f"{photo.label} (its mask leaves nothing of it)"
         return replace(camera, name=names[index]), picture, photo, mask
 
     album = Album()
@@ -235,7 +230,7 @@ def develop(
     if not done:
         raise InputError(f"no photograph can be read: {shortened(broken)}")
     if broken:
-        log.warning("%d photographs cannot be read and are left out: %s", len(broken), shortened(broken))
+        log.warning("%d photographs cannot be used and are left out: %s", len(broken), shortened(broken))
     cameras, images, files, masks = zip(*done, strict=True)
     return cameras, images, files, masks if any(mask is not None for mask in masks) else ()
 
@@ -269,6 +264,7 @@ class Capture:
     photos: tuple[Photo, ...] = ()  # the files, in the same order; none for images made otherwise
     drawn: bool = False  # by `assets.making`, where encoders are calibrated, see `scene.Reading.elsewhere`
     masks: tuple[Array | None, ...] = ()  # (H, W) bool each, pixels that count; None: all; (): no masks
+    matches: Matches | None = None  # of all photographs, where cameras came from structure from motion
 
     def __post_init__(self) -> None:
         if len(self.cameras) != len(self.images):

@@ -22,7 +22,6 @@ from langsplat_core.datasets.capture import (
     develop,
     find_photos,
     mask_beside,
-    shortened,
     tell_of_lost_points,
 )
 from langsplat_core.datasets.intrinsics import (
@@ -32,7 +31,7 @@ from langsplat_core.datasets.intrinsics import (
     FisheyeDistortion,
     PhotoIntrinsics,
 )
-from langsplat_core.errors import FormatError, InputError, printable_line
+from langsplat_core.errors import FormatError, InputError, printable_line, shortened
 from langsplat_core.io.files import shown
 from langsplat_core.progress import Progress
 from langsplat_core.scene import FARTHEST

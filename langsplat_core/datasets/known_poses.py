@@ -46,14 +46,20 @@ def look_distance(cameras: Sequence[Camera]) -> float:
 
 
 def random_points(
-    count: int, known: Array, cameras: Sequence[Camera], images: Sequence[Array], rng: np.random.Generator
+    count: int,
+    known: Array,
+    cameras: Sequence[Camera],
+    images: Sequence[Array],
+    rng: np.random.Generator,
+    masks: Sequence[Array | None] = (),
 ) -> tuple[Array, Array]:
     """`count` points in the cameras' view volume, (count, 3), with the (count, 3) uint8 colours of the pixels
     that they fall on.
 
-    images: (H, W, 3) uint8, one per camera; known: (M, 3) points whose depths tell where the scene is, M may
-    be 0. Depths are uniform in 1/z, so that near and far are equally dense in the images. Twice as many
-    are drawn and those in sight of at least half the cameras preferred: one view alone teaches no depth.
+    images: (H, W, 3) uint8, one per camera; masks: (H, W) bool each, pixels that count; known: (M, 3) points
+    whose depths tell where the scene is, M may be 0. Depths are uniform in 1/z, so that near and far are
+    equally dense in the images. Twice as many are drawn and those in sight of at least half the cameras
+    preferred: one view alone teaches no depth.
     """
     distance = look_distance(cameras)
     near, far = NEAREST * distance, FARTHEST * distance
@@ -67,6 +73,10 @@ def random_points(
         rows = np.flatnonzero(owner == index)
         x = rng.uniform(0, camera.width, len(rows))
         y = rng.uniform(0, camera.height, len(rows))
+        mask = masks[index] if masks else None
+        if mask is not None and mask.any():
+            at = np.divmod(rng.choice(np.flatnonzero(mask), len(rows)), camera.width)
+            y, x = (whole + part % 1 for whole, part in zip(at, (y, x), strict=True))
         z = 1 / rng.uniform(1 / far, 1 / near, len(rows))
         local = np.stack([(x - camera.cx) / camera.fx * z, (y - camera.cy) / camera.fy * z, z], -1)
         drawn[rows] = local @ camera.rotation + camera.position
@@ -97,7 +107,8 @@ def add_points(capture: Capture, views: Sequence[int], work: Path, progress: Pro
         )
         generator = np.random.default_rng(0)
         cameras, images = [capture.cameras[i] for i in views], [capture.images[i] for i in views]
-        points, colours = random_points(RANDOM_POINTS, points, cameras, images, generator)
+        masks = [capture.mask(i) for i in views]
+        points, colours = random_points(RANDOM_POINTS, points, cameras, images, generator, masks)
     return replace(capture, points=points, colours=colours)
 
 
@@ -130,10 +141,14 @@ def _write_pictures(
     cameras = []
     for count, (name, index) in enumerate(zip(names, views, strict=True)):
         progress("preparing photographs", count / len(views))
-        camera, image = capture.cameras[index], capture.images[index]
+        camera, image, mask = capture.cameras[index], capture.images[index], capture.mask(index)
         if capture.photos:
-            camera, image, _ = enlarge(capture.photos[index])
+            camera, image, mask = enlarge(capture.photos[index])
         Image.fromarray(image).save(folder / name, compress_level=1)
+        if capture.masks:  # one each: COLMAP finds nothing in a photograph that lacks its own
+            seen = np.ones(image.shape[:2], bool) if mask is None else mask
+            folder.with_name(sfm.MASKS).mkdir(exist_ok=True)
+            Image.fromarray(seen).save(folder.with_name(sfm.MASKS) / f"{name}.png")
         cameras.append(camera)
     progress("preparing photographs", 1.0)
     return tuple(cameras)

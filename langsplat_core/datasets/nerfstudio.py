@@ -20,11 +20,10 @@ from langsplat_core.datasets.capture import (
     Photo,
     develop,
     mask_beside,
-    shortened,
     tell_of_lost_points,
 )
 from langsplat_core.datasets.intrinsics import BrownDistortion, Distortion, FisheyeDistortion, PhotoIntrinsics
-from langsplat_core.errors import FormatError, InputError, printable_line, quoted
+from langsplat_core.errors import FormatError, InputError, printable_line, quoted, shortened
 from langsplat_core.io.hostile import PHOTO_SUFFIXES, PictureError, picture_size, read_json_file
 from langsplat_core.io.ply_table import read_cloud
 from langsplat_core.progress import Progress

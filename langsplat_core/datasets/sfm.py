@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from PIL import Image
@@ -23,11 +23,11 @@ from langsplat_core.datasets.capture import (
     find_photos,
     mask_beside,
     read_photo,
-    shortened,
 )
-from langsplat_core.datasets.colmap import SparseModel, good_points, has_model, located_photos, read_model
+from langsplat_core.datasets.colmap import good_points, has_model, located_photos, read_model
 from langsplat_core.datasets.intrinsics import pycolmap
-from langsplat_core.errors import FormatError, InputError
+from langsplat_core.datasets.matches import FEWEST_MATCHES, Matches, NotLocatedError
+from langsplat_core.errors import FormatError, InputError, shortened
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import PictureError, opened
 from langsplat_core.progress import Progress
@@ -288,11 +288,10 @@ def store_model(model: "pycolmap.Reconstruction", folder: Path) -> None:
 # ahead does not have; the others begin with less, or place all photographs at once.
 
 ENOUGH = 0.9  # share of the photographs; with fewer located the next way is tried
+ASTRAY, ASTRAY_GUESS = 2.0, 4.0  # times the focal length of EXIF data, and a normal lens's without them
 TIE = 0.05  # of the reprojection error: ways that end at the same cameras differ by 1 to 2 %
-FEWEST_MATCHES = 15  # that COLMAP's mapper works with
 FEWEST_POINTS = 30  # that hold a camera; the incremental mapper demands as many, the global one none
-FEWEST_FEATURES = 50  # fewer rarely give `FEWEST_MATCHES`
-LEFT_OUT = "left_out.json"  # in the workspace: which photographs have no camera, and why
+MATCHES = "matches.json"  # in the workspace: names, features and pairs of `Matches`
 # For first pairs of a walk straight ahead: degrees between rays, share of motion that is forward, matches.
 _CLOSE_PAIRS = {"init_min_tri_angle": 4.0, "init_max_forward_motion": 1.0, "init_min_num_inliers": 50}
 # For long walks: each photograph shares little with those before it, and what it shares lies far ahead.
@@ -313,17 +312,35 @@ def map_cameras(folder: Path, count: int, progress: Progress) -> None:
     two could be located there is none.
     """
     best: Model | None = None
+    astray: Model | None = None
     for number, way in enumerate(WAYS):
         check_room(folder)
         attempts = folder / "attempts" / str(number)
         attempts.mkdir(parents=True, exist_ok=True)
-        best = best_model(best, way(folder, attempts, _counted(count, progress)))
+        models = list(way(folder, attempts, _counted(count, progress)))
+        lost = [model for model in models if is_astray(model, folder)]
+        best = best_model(best, (model for model in models if model not in lost))
+        astray = best_model(astray, lost)
         if best is not None and len(located_names(best)) >= ENOUGH * count:
             break
-    write_left_out(folder, set() if best is None else located_names(best))
+    if astray and (best is None or 2 * len(located_names(best)) < len(located_names(astray))):
+        best = astray
+    keep_matches(folder)
     if best is not None:
         store_model(best, folder)
     progress("locating cameras", 1.0)
+
+
+def is_astray(model: Model, folder: Path) -> bool:
+    """True where a focal length ended far from what EXIF data say, or without them from any lens: on a walk
+    as on rails another one explains the photographs as well, in a world of another depth."""
+    with pycolmap.Database.open(folder / "database.db") as database:
+        before = {camera.camera_id: camera for camera in database.read_all_cameras()}
+    return any(
+        abs(math.log(camera.mean_focal_length() / before[number].mean_focal_length()))
+        > math.log(ASTRAY if before[number].has_prior_focal_length else ASTRAY_GUESS)
+        for number, camera in model.cameras.items()
+    )
 
 
 def _counted(count: int, progress: Progress) -> Callable[[], None]:
@@ -373,11 +390,14 @@ def _incremental(
     attempts: Path,
     advance: Callable[[], None],
     limits: dict[str, float],
-    trust_exif: bool = False,
+    focal: Literal["refined", "of EXIF", "guessed"] = "refined",
 ) -> Collection[Model]:
-    """One photograph after the other, onto a first pair. `limits`: of COLMAP's mapper. With `trust_exif`
-    focal lengths stay what EXIF data say, if they say it for all: what lies far ahead looks much the same
-    from any distance through another lens."""
+    """One photograph after the other, onto a first pair. `limits`: of COLMAP's mapper. `focal`: lengths that
+    EXIF data say of all photographs stay as they are, or those which no EXIF data say stay a normal lens's:
+    what lies far ahead looks much the same from any distance through another lens."""
+    known = focal != "refined" and _all_focal_lengths_known(folder)
+    if focal == "guessed" and known:  # as before
+        return []
     options = pycolmap.IncrementalPipelineOptions()
     options.min_model_size = 3
     options.max_num_models = 5
@@ -385,7 +405,7 @@ def _incremental(
     options.triangulation.random_seed = 0
     options.num_threads = 1  # sums of several threads differ from run to run
     options.mapper.mergedict(limits)
-    if trust_exif and _all_focal_lengths_known(folder):
+    if known or focal == "guessed":
         options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = False
     models: dict[int, Model] = pycolmap.incremental_mapping(
         database_path=folder / "database.db",
@@ -428,45 +448,34 @@ WAYS: tuple[Callable[[Path, Path, Callable[[], None]], Collection[Model]], ...] 
     partial(_incremental, limits={}),
     partial(_incremental, limits=_CLOSE_PAIRS),
     _all_at_once,
-    partial(_incremental, limits=_FEW_SHARED, trust_exif=True),
+    partial(_incremental, limits=_FEW_SHARED, focal="of EXIF"),
+    partial(_incremental, limits=_FEW_SHARED, focal="guessed"),
 )
 
 
-def left_out(folder: Path) -> dict[str, str]:
-    """Why photographs have no camera, by their names in the workspace, after `map_cameras`."""
-    why: dict[str, str] = json.loads((folder / LEFT_OUT).read_text())
-    return why
-
-
-def write_left_out(folder: Path, located: Collection[str]) -> None:
-    """Keep why photographs are not among the `located`; see `left_out`."""
+def keep_matches(folder: Path) -> None:
+    """Write what `read_matches` reads: the database does not outlive the model."""
     with pycolmap.Database.open(folder / "database.db") as database:
         names = {image.image_id: image.name for image in database.read_all_images()}
-        features = {number: database.num_keypoints_for_image(number) for number in names}
+        features = {name: database.num_keypoints_for_image(number) for number, name in names.items()}
         pairs, inliers = database.read_two_view_geometry_num_inliers()
-    matched: dict[int, int] = dict.fromkeys(names, 0)
-    for pair, count in zip(pairs, inliers, strict=True):
-        if count >= FEWEST_MATCHES:
-            for number in pycolmap.pair_id_to_image_pair(pair):
-                matched[number] += 1
-    why = {
-        name: _reason(features[number], matched[number])
-        for number, name in names.items()
-        if name not in located
-    }
-    with atomic_path(folder / LEFT_OUT) as temporary:
-        temporary.write_text(json.dumps(why, sort_keys=True))
+    ends = [[names[number] for number in pycolmap.pair_id_to_image_pair(pair)] for pair in pairs]
+    kept = [[*end, int(count)] for end, count in zip(ends, inliers, strict=True) if count]
+    with atomic_path(folder / MATCHES) as temporary:
+        temporary.write_text(json.dumps({"features": features, "pairs": sorted(kept)}))
 
 
-def _reason(features: int, matched: int) -> str:
-    """Reason in words, from the number of features and of photographs that share enough of them."""
-    if features == 0:
-        return "no features (nothing but plain areas, or blurred)"
-    if features < FEWEST_FEATURES:
-        return "too few features (plain, dark, blurred or tiny)"
-    if matched == 0:
-        return "no matches with any other"
-    return "matched, but from one and the same place, or without enough overlap"
+def read_matches(folder: Path, files: dict[str, Path], located: Collection[str]) -> Matches:
+    """The graph of matches of a workspace. `files`: photographs by their names there, see `numbered`;
+    `located`: names of those that have a camera."""
+    kept = json.loads((folder / MATCHES).read_text())
+    row = {name: index for index, name in enumerate(files)}
+    return Matches(
+        names=tuple(path.name for path in files.values()),
+        features=tuple(kept["features"].get(name, -1) for name in files),
+        pairs=tuple((row[a], row[b], count) for a, b, count in kept["pairs"]),
+        located=frozenset(row[name] for name in located),
+    )
 
 
 # A plain folder of photographs: cameras by structure from motion.
@@ -476,8 +485,6 @@ log = logging.getLogger("langsplat")
 SFM_SIDE = 1600  # px, longer side of the copies that features are sought in
 MIN_PHOTOS = 3
 FEWEST = 0.5  # share of the photographs: a scene of fewer is not of what was photographed
-UNREAD = "cannot be read"
-_ADVICE = "take more photographs, each sharing at least two thirds of its view with the next"
 
 
 @dataclass(frozen=True)
@@ -502,37 +509,46 @@ def load_photos(
     paths = find_photos(folder)
     if len(paths) < MIN_PHOTOS:
         raise InputError(
-            f"{folder} has {len(paths)} photographs; at least {MIN_PHOTOS} are needed: {_ADVICE}"
+            f"{folder} has {len(paths)} photographs; at least {MIN_PHOTOS} are needed, each sharing "
+            "at least two thirds of its view with the next"
         )
     contents = [(path.name, _content(path)) for path in paths]
     masked = [(path.name, _content(mask)) for path in paths if (mask := mask_beside(path))]
-    workspace = open_workspace(work, ["photographs", 3, SFM_SIDE, contents, *([masked] if masked else [])])
-    numbered = {f"{index:05d}.jpg": path for index, path in enumerate(paths)}
+    workspace = open_workspace(work, ["photographs", 4, SFM_SIDE, contents, *([masked] if masked else [])])
+    files = numbered(paths)
     if not has_model(workspace / "sparse"):
-        _reconstruct(workspace, numbered, progress)
+        _reconstruct(workspace, files, progress)
     model = read_model(workspace / "sparse") if has_model(workspace / "sparse") else None
-    lost = _left_out(workspace, model, numbered, _twins(numbered, dict(contents)))
-    found = len(numbered) - sum(map(len, lost.values()))
-    if model is None or (found < max(MIN_PHOTOS, FEWEST * len(numbered)) and not allow_few_cameras):
+    matches = read_matches(workspace, files, {image.name for image in model.images} if model else ())
+    lost = _left_out(matches, contents)
+    found = len(matches.located)
+    if model is None or (found < max(MIN_PHOTOS, FEWEST * len(files)) and not allow_few_cameras):
         anyway = "" if model is None else ", or go on without these with --dataset.allow-few-cameras"
-        raise InputError(
-            f"only {found} of {len(numbered)} photographs could be located together "
-            f"({_listed(lost, 50, 500)}); {_ADVICE}{anyway}"
+        raise NotLocatedError(
+            f"only {found} of {len(files)} photographs could be located together "
+            f"({_listed(lost, 10)}); {matches.joined()}{matches.advice()}{anyway}",
+            matches,
         )
     if lost:
         log.warning(
-            "%d of %d photographs could not be located and are left out (%s)",
-            len(numbered) - found,
-            len(numbered),
+            "%d of %d photographs could not be located and are left out (%s); %s",
+            len(files) - found,
+            len(files),
             _listed(lost),
+            matches.advice(),
         )
     located = located_photos(model, workspace / "images", workspace / "sparse")
     photos = [
         Photo(path, path.name, p.intrinsics, p.world_to_camera, upright=True, mask=mask_beside(path))
-        for p, path in ((p, numbered[p.label]) for p in located)
+        for p, path in ((p, files[p.label]) for p in located)
     ]
-    cameras, images, files, masks = develop(photos, max_side, progress)
-    return Capture(cameras, images, *good_points(model), photos=files, masks=masks)
+    cameras, images, kept, masks = develop(photos, max_side, progress)
+    return Capture(cameras, images, *good_points(model), photos=kept, masks=masks, matches=matches)
+
+
+def numbered(paths: Sequence[Path]) -> dict[str, Path]:
+    """Photographs by their names in the workspace."""
+    return {f"{index:05d}.jpg": path for index, path in enumerate(paths)}
 
 
 def _content(path: Path) -> str:
@@ -545,27 +561,16 @@ def _content(path: Path) -> str:
         return ""
 
 
-def _twins(numbered: dict[str, Path], contents: dict[str, str]) -> dict[str, str]:
-    """Photographs that are the same as an earlier one: names in the workspace -> file names."""
+def _left_out(matches: Matches, contents: Sequence[tuple[str, str]]) -> dict[str, list[str]]:
+    """Photographs without a camera by the reason: ``{"no features": ["a.jpg", "b.jpg"]}``; `contents`: names
+    and digests of all."""
     first: dict[str, str] = {}
-    return {
-        name: earlier
-        for name, path in numbered.items()
-        if (earlier := first.setdefault(contents[path.name], path.name)) != path.name
-    }
-
-
-def _left_out(
-    workspace: Path, model: SparseModel | None, numbered: dict[str, Path], twins: dict[str, str]
-) -> dict[str, list[str]]:
-    """Photographs without a camera by the reason: ``{"no features": ["a.jpg", "b.jpg"]}``."""
-    located = {image.name for image in model.images} if model else set()
-    reasons = left_out(workspace)
-    reasons |= {name: f"the same picture as {twin}" for name, twin in twins.items()}
     groups: dict[str, list[str]] = {}
-    for name, path in numbered.items():
-        if name not in located:
-            groups.setdefault(reasons.get(name, UNREAD), []).append(path.name)
+    for row, (name, content) in enumerate(contents):
+        twin = first.setdefault(content, name)
+        if row not in matches.located:
+            why = matches.why(row) if twin == name else f"the same picture as {twin}"
+            groups.setdefault(why, []).append(name)
     return groups
 
 
@@ -575,11 +580,8 @@ def _listed(lost: dict[str, list[str]], limit: int = 5, width: int = 200) -> str
 
 
 def _reconstruct(workspace: Path, numbered: dict[str, Path], progress: Progress) -> None:
-    copies = _small_copies(workspace / "images", numbered, progress)
     try:
-        extract_features(workspace, _groups(copies), progress)
-        match_features(workspace, pairs_by_name([copy.name for copy in copies]), progress)
-        map_cameras(workspace, len(copies), progress)
+        map_cameras(workspace, match_photos(workspace, numbered, progress), progress)
     except FAILURES as error:
         reason = str(error).partition("\n")[0]
         raise InputError(
@@ -587,17 +589,25 @@ def _reconstruct(workspace: Path, numbered: dict[str, Path], progress: Progress)
         ) from None
 
 
+def match_photos(workspace: Path, numbered: dict[str, Path], progress: Progress) -> int:
+    """Features and matches of photographs into the workspace's database; how many could be read."""
+    copies = _small_copies(workspace / "images", numbered, progress)
+    extract_features(workspace, _groups(copies), progress)
+    match_features(workspace, pairs_by_name([copy.name for copy in copies]), progress)
+    return len(copies)
+
+
 def _small_copies(folder: Path, numbered: dict[str, Path], progress: Progress) -> list[_Copy]:
     """Copies that COLMAP can read and finds the same way up as we do; unreadable files are left out."""
     copies, broken = [], []
+    any_masks = any(map(mask_beside, numbered.values()))
     for index, (name, path) in enumerate(numbered.items()):
         progress("preparing photographs", index / len(numbered))
         try:
             if not (folder / name).is_file():
                 _write_copy(path, folder / name)
-            mask = mask_beside(path)
-            if mask and not (folder.with_name(MASKS) / f"{name}.png").is_file():
-                _write_mask(mask, folder / name, folder.with_name(MASKS) / f"{name}.png")
+            if any_masks and not (folder.with_name(MASKS) / f"{name}.png").is_file():
+                _write_mask(mask_beside(path), folder / name, folder.with_name(MASKS) / f"{name}.png")
             with opened(folder / name) as copy:
                 exif = copy.getexif()
                 lens = str(dict(exif) | dict(exif.get_ifd(_EXIF_IFD)))
@@ -619,13 +629,15 @@ def _write_copy(path: Path, copy: Path) -> None:
         picture.save(temporary, quality=95, exif=optics(path))
 
 
-def _write_mask(mask: Path, copy: Path, out: Path) -> None:
-    """A mask as COLMAP reads it, as large as the copy of its photograph."""
+def _write_mask(mask: Path | None, copy: Path, out: Path) -> None:
+    """A mask as COLMAP reads it, as large as the copy of its photograph; white for one without: where some
+    have a mask, COLMAP finds nothing in those that have none."""
     with opened(copy) as picture:
-        size = picture.size
+        white = Image.new("L", picture.size, 255)
+    seen = white if mask is None else read_photo(mask, upright=False).convert("L")
     out.parent.mkdir(exist_ok=True)
     with atomic_path(out) as temporary:
-        read_photo(mask, upright=False).convert("L").resize(size, Image.Resampling.NEAREST).save(temporary)
+        seen.resize(white.size, Image.Resampling.NEAREST).save(temporary)
 
 
 def _groups(copies: list[_Copy]) -> list[Group]:

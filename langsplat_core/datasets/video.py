@@ -62,7 +62,9 @@ def extract_frames(video: Path, out: Path, count: int, progress: Progress = sile
         sought_too_far = error.errno == errno.EINVAL
         if not isinstance(error, av.FFmpegError) and not sought_too_far:
             raise
-        raise FormatError(f"{shown(video)}: not a readable video ({error.strerror or error})") from None
+        raise FormatError(
+            f"{shown(video)}: not a readable video ({error.strerror or error}); copy it again"
+        ) from None
     except (IndexError, ValueError, MemoryError) as error:  # no stream of images, or sizes that cannot be
         raise FormatError(f"{shown(video)}: not a readable video ({str(error)[:80]})") from None
     finally:

@@ -8,7 +8,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from langsplat_core.datasets.capture import shortened
+from langsplat_core.errors import shortened
 from langsplat_core.evaluation.profiles import Profile
 from langsplat_core.evaluation.scoring import QueryScore, SceneScores
 from langsplat_core.io.files import atomic_path

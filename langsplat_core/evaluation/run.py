@@ -5,10 +5,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from langsplat_core.datasets.capture import shortened
 from langsplat_core.datasets.colmap import find_model, load_colmap
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
-from langsplat_core.errors import InputError
+from langsplat_core.errors import InputError, shortened
 from langsplat_core.evaluation.labels import Benchmark, LabelledScene, without_suffix
 from langsplat_core.evaluation.profiles import MapRule, OwnRule, Profile
 from langsplat_core.evaluation.report import BenchmarkReport

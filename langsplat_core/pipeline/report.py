@@ -13,7 +13,7 @@ from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import read_json_file
 from langsplat_core.scene import Camera
 
-REPORT = "report.json"
+REPORT, PAGE = "report.json", "report.html"
 LIMIT = 1_000_000  # bytes; a report has about a thousand
 MOST_WARNINGS = 5  # that are taken from a file
 LEAST_PSNR = 16.0  # dB: below, held-out photographs are hardly recognised
@@ -97,7 +97,7 @@ def quality_warnings(scores: Sequence[ViewScore], cameras: Sequence[Camera]) -> 
             )
     groups = camera_groups(np.array([camera.position for camera in cameras]).reshape(-1, 3))
     if len(groups) > 1:
-        sizes = " and ".join(str(size) for size in groups)
+        sizes = " and ".join(str(len(group)) for group in groups)
         found.append(
             f"the cameras stand in {len(groups)} groups far apart ({sizes} photographs): they may not belong "
             "together; add photographs between them, or train each group alone"
@@ -105,19 +105,20 @@ def quality_warnings(scores: Sequence[ViewScore], cameras: Sequence[Camera]) -> 
     return tuple(found)
 
 
-def camera_groups(positions: Array) -> tuple[int, ...]:
-    """Sizes of the groups of (M, 3) positions that lie `APART`, largest first; one where they are together.
+def camera_groups(positions: Array) -> list[Array]:
+    """Rows of (M, 3) positions in groups that lie `APART`, the largest first; one where they are together.
     A single camera on its own is no group."""
     from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
     from scipy.spatial.distance import pdist, squareform
 
+    whole = [np.arange(len(positions))]
     if len(positions) < 4:
-        return (len(positions),)
+        return whole
     tree = minimum_spanning_tree(squareform(pdist(positions))).toarray()
     steps = tree[tree > 0]
     if len(steps) == 0:
-        return (len(positions),)
+        return whole
     tree[tree > APART * np.median(steps)] = 0
-    _, labels = connected_components(tree, directed=False)
-    sizes = np.sort(np.bincount(labels))[::-1]
-    return tuple(int(size) for size in sizes if size > 1) or (len(positions),)
+    count, labels = connected_components(tree, directed=False)
+    groups = [np.flatnonzero(labels == label) for label in range(count)]
+    return sorted((group for group in groups if len(group) > 1), key=len, reverse=True) or whole

@@ -18,6 +18,7 @@ from langsplat_core.config import RadianceConfig, TrainConfig, check_settings
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.holdout import split
+from langsplat_core.datasets.matches import NotLocatedError
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import check_output_folder, shown
 from langsplat_core.io.ply import read_ply, write_ply
@@ -29,8 +30,8 @@ from langsplat_core.pipeline.report import (
     quality_warnings,
     read_report,
     work_folder,
-    write_report,
 )
+from langsplat_core.pipeline.report_page import write_refusal, write_reports
 from langsplat_core.pipeline.stages import ProcessGroup, sole_use, stage_key
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster import load_lifting_rasterizer
@@ -93,7 +94,7 @@ def _train(
     encoder = load_encoder(config.clip.model, config.clip.device, config.clip.batch)
     named = None if masks_of else load_mask_source(config.masks, config.clip.device)
     # One process solves for cameras, the others find them in the work folder.
-    capture = processes.once(lambda: load_capture(dataset, config.dataset, work, progress))
+    capture = processes.once(lambda: _photographs(dataset, config, work, progress))
     if len(capture) < FEWEST_VIEWS and not config.dataset.allow_few_cameras:
         raise InputError(
             f"{shown(dataset)}: only {len(capture)} photographs have cameras, and a scene needs "
@@ -162,9 +163,17 @@ def _train(
             dataset=str(dataset.resolve()),
             held_out_views=tuple(scores),
         )
-        write_report(work, report)
+        write_reports(work, report, capture, gaussians)
     processes.barrier()
     return read_report(work)
+
+
+def _photographs(dataset: Path, config: TrainConfig, work: Path, progress: Progress) -> Capture:
+    try:
+        return load_capture(dataset, config.dataset, work, progress)
+    except NotLocatedError as error:
+        page = write_refusal(work, error)
+        raise InputError(f"{error}; see {shown(page)}") from None
 
 
 def trained_gaussians(

@@ -18,6 +18,7 @@ from tests.benchmarks.scale import Scale
 from tests.benchmarks.taught import Taught
 from tests.benchmarks.verdicts import Verdicts
 from tests.benchmarks.votes import Votes
+from tests.benchmarks.walks import Walks
 
 PROGRAM = "python -m tests.benchmarks"
 
@@ -27,7 +28,7 @@ def parse(args: list[str]) -> Command:
     about = "Measure this project where the truth is known, and at large sizes."
     known = (
         *(Rooms, Verdicts, Taught, Phrases, Votes, Clean, Maps, Meshes),
-        *(Lifting, Scale, Found, Changed, Formats, Colours),
+        *(Lifting, Scale, Found, Changed, Formats, Colours, Walks),
     )
     reports = tuple(with_codec(report, args) for report in known)
     command: Command = parsed(PROGRAM, Union[(*reports,)], args, about)

@@ -1,6 +1,5 @@
 """Structure from motion and triangulation, in a textured room and in a street, and EXIF focal lengths."""
 
-import json
 import logging
 import os
 import shutil
@@ -177,7 +176,7 @@ def test_a_second_run_computes_nothing(
     np.testing.assert_array_equal(again.points, capture.points)
     np.testing.assert_array_equal(again.cameras[3].world_to_camera, capture.cameras[3].world_to_camera)
     (stage,) = work.glob("sfm-*")
-    assert sorted(path.name for path in stage.iterdir()) == ["left_out.json", "sparse"]
+    assert sorted(path.name for path in stage.iterdir()) == ["matches.json", "sparse"]
 
 
 def test_cameras_are_the_same_byte_for_byte(
@@ -452,6 +451,25 @@ print([ctypes.CDLL(path).omp_get_max_threads() for path in libraries], os.enviro
     assert told.stdout.split() == ["[1]", "3"]
 
 
+@pytest.mark.parametrize(("prior", "focal", "lost"), [
+    (True, 700, False), (True, 210, True), (True, 2000, True),
+    (False, 210, False), (False, 60, True), (False, 2000, False), (False, 5000, True),
+])  # fmt: skip
+def test_a_focal_length_that_is_of_no_such_lens_tells_a_wrong_world(
+    prior: bool, focal: float, lost: bool, tmp_path: Path
+) -> None:
+    model = synthetic(4, 100)
+    ((number, camera),) = model.cameras.items()
+    before = pycolmap.Camera.create_from_model_id(
+        number, pycolmap.CameraModelId.SIMPLE_RADIAL, 600.0, 800, 600
+    )
+    before.has_prior_focal_length = prior
+    with pycolmap.Database.open(tmp_path / "database.db") as database:
+        database.write_camera(before, use_camera_id=True)
+    camera.focal_length = focal
+    assert sfm.is_astray(model, tmp_path) == lost
+
+
 @pytest.fixture(scope="module")
 def mostly_noise(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four photographs of a room and five of nothing."""
@@ -473,7 +491,8 @@ def test_below_half_is_refused_each_time_unless_told_otherwise(mostly_noise: Pat
     told = DatasetConfig(max_side=64, allow_few_cameras=True)
     assert len(load_capture(mostly_noise, told, tmp_path)) == 4
     (stage,) = tmp_path.glob("sfm-*")
-    assert len(json.loads((stage / sfm.LEFT_OUT).read_text())) == 5
+    matches = sfm.read_matches(stage, sfm.numbered(find_photos(mostly_noise)), ())
+    assert [len(group) for group in matches.groups] == [4, 1, 1, 1, 1, 1]
 
 
 def test_two_views_are_refused_although_they_are_half(
@@ -487,7 +506,7 @@ def test_two_views_are_refused_although_they_are_half(
         model = synthetic(2, 100)
         for number, image in sorted(model.images.items()):
             image.name = f"{number - 1:05d}.jpg"
-        sfm.write_left_out(folder, sfm.located_names(model))
+        sfm.keep_matches(folder)
         sfm.store_model(model, folder)
 
     monkeypatch.setattr(sfm, "map_cameras", gives_up)

@@ -53,7 +53,8 @@ def initial_gaussians(
     missing = min(wanted, max_gaussians) - len(points)
     if missing > 0:
         images = [capture.images[i] for i in train_indices]
-        more, colours = random_points(missing, points, cameras, images, rng)
+        masks = [capture.mask(i) for i in train_indices]
+        more, colours = random_points(missing, points, cameras, images, rng, masks)
         points, rgb = np.concatenate([points, more]), np.concatenate([rgb, colours / 255.0])
 
     count = len(points)

@@ -1,0 +1,117 @@
+"""Which photographs share verified matches, as structure from motion found: groups, and gaps between them."""
+
+from collections import defaultdict
+from dataclasses import dataclass
+from functools import cached_property
+
+from langsplat_core.errors import InputError, printable_line, shortened
+
+FEWEST_MATCHES = 15  # that COLMAP's mapper works with
+FEWEST_FEATURES = 50  # fewer rarely give `FEWEST_MATCHES`
+MOST_TOLD = 3  # groups and gaps in a message
+LONGEST_NAME = 30  # characters of a file's name there
+_STEP_ASIDE = (
+    "they all match each other, but nothing tells how far away things are: step aside between photographs "
+    "instead of turning on the spot"
+)
+_ADVICE = "take more photographs, each sharing at least two thirds of its view with the next"
+
+
+@dataclass(frozen=True)
+class Matches:
+    """The graph of matches of all photographs of a dataset, located or not, in name order."""
+
+    names: tuple[str, ...]  # file names
+    features: tuple[int, ...]  # of each; -1 where the file could not be read
+    pairs: tuple[tuple[int, int, int], ...]  # rows of two photographs, and their verified matches
+    located: frozenset[int]  # rows of those that have a camera
+
+    @cached_property
+    def shared(self) -> dict[tuple[int, int], int]:
+        """Verified matches by rows, the smaller first."""
+        return {(min(a, b), max(a, b)): count for a, b, count in self.pairs}
+
+    @cached_property
+    def groups(self) -> list[list[int]]:
+        """Rows in groups: the located ones, then what matches join among the others, larger ones first."""
+        joined = defaultdict[int, set[int]](set)
+        for a, b, count in self.pairs:
+            if count >= FEWEST_MATCHES and not self.located & {a, b}:
+                joined[a].add(b)
+                joined[b].add(a)
+        found: list[list[int]] = []
+        waiting = set(range(len(self.names))) - self.located
+        while waiting:
+            group, edge = set[int](), {min(waiting)}
+            while edge:
+                group |= edge
+                edge = set.union(*(joined[row] for row in edge)) - group
+            waiting -= group
+            found.append(sorted(group))
+        found.sort(key=len, reverse=True)
+        return [sorted(self.located), *found] if self.located else found
+
+    def why(self, row: int) -> str:
+        """Why a photograph has no camera."""
+        if self.features[row] < 0:
+            return "cannot be read"
+        if self.features[row] == 0:
+            return "no features (nothing but plain areas, or blurred)"
+        if self.features[row] < FEWEST_FEATURES:
+            return "too few features (plain, dark, blurred or tiny)"
+        friends = {a + b - row for (a, b), n in self.shared.items() if row in (a, b) and n >= FEWEST_MATCHES}
+        if not friends:
+            return "no matches with any other"
+        if self.located and not friends & self.located:
+            return "matches only others that have no camera"
+        return "matched, but from one and the same place, or without enough overlap"
+
+    def gaps(self) -> list[tuple[int, int]]:
+        """Rows of two photographs each, between which more would join one more group to those before: of two
+        groups the pair that shares most, or the neighbours in name order where none shares enough. At most
+        `MOST_TOLD`; photographs without features are no part of it."""
+        useful = [[row for row in group if self.features[row] >= FEWEST_FEATURES] for group in self.groups]
+        joined, *apart = [group for group in useful if group] or [[]]
+        found: list[tuple[int, int]] = []
+        while joined and apart and len(found) < MOST_TOLD:
+            across = ((min(a, b), max(a, b)) for a in joined for group in apart for b in group)
+            gap = min(across, key=self._width)
+            found.append(gap)
+            new = next(group for group in apart if set(gap) & set(group))
+            joined, apart = joined + new, [group for group in apart if group is not new]
+        return found
+
+    def _width(self, pair: tuple[int, int]) -> tuple[int, int]:
+        shared = self.shared.get(pair, 0)
+        return (-shared if shared >= FEWEST_MATCHES else 0), pair[1] - pair[0]
+
+    def joined(self) -> str:
+        """What matches join, in words; empty where they join nothing."""
+        large = [self._told(group) for group in self.groups if len(group) > 1][:MOST_TOLD]
+        return f"matches join {', '.join(large)}; " if large else ""
+
+    def advice(self) -> str:
+        """Where to photograph more, in words."""
+        gaps = self.gaps()
+        if not gaps:
+            return _STEP_ASIDE if self.joined() and not self.located else _ADVICE
+        return "take more photographs " + ", ".join(
+            f"between {self._name(a)} and {self._name(b)} ({self.shared.get((a, b), 0) or 'no'} matches)"
+            for a, b in gaps
+        )
+
+    def _told(self, group: list[int]) -> str:
+        if group == list(range(group[0], group[-1] + 1)) and len(group) > 2:
+            return f"{self._name(group[0])} to {self._name(group[-1])} ({len(group)})"
+        return shortened((self._name(row) for row in group), 3, 100)
+
+    def _name(self, row: int) -> str:
+        return printable_line(self.names[row], LONGEST_NAME)
+
+
+class NotLocatedError(InputError):
+    """Too few photographs could be located; `matches` says why."""
+
+    def __init__(self, message: str, matches: Matches) -> None:
+        self.matches = matches
+        super().__init__(message)

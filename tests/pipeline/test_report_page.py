@@ -1,0 +1,147 @@
+"""The page of a training: what it shows, that it stands alone, and that names of files stay text."""
+
+from collections.abc import Sequence
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from langsplat_core.arrays import ViewScore
+from langsplat_core.config import TrainConfig
+from langsplat_core.datasets.capture import Capture
+from langsplat_core.datasets.matches import Matches, NotLocatedError
+from langsplat_core.errors import InputError
+from langsplat_core.pipeline.report import PAGE, TrainReport, read_report
+from langsplat_core.pipeline.report_page import MOST_VIEWS, from_all_over, write_refusal, write_reports
+from langsplat_core.pipeline.train import train_scene
+from langsplat_core.scene import Camera, Gaussians, look_at
+
+HOSTILE = "<script>alert(1)</script>\"'&\n"
+ENCODER = TrainConfig().clip
+
+
+class Read(HTMLParser):
+    """Tags with their attributes, and the text between them."""
+
+    def __init__(self, page: Path) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ""
+        self.feed(page.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+    def of(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.tags if name == tag]
+
+
+def cameras(names: Sequence[str], far: int = 0) -> tuple[Camera, ...]:
+    """On a ring; the last `far` of them stand a long way off."""
+    found = []
+    for number, name in enumerate(names):
+        angle = 2 * np.pi * number / len(names)
+        eye = np.array([3 * np.cos(angle), 3 * np.sin(angle), 1.0])
+        shift = np.array([300.0, 0, 0]) if number >= len(names) - far else np.zeros(3)
+        camera = look_at(eye + shift, shift, np.array([0, 0, 1.0]), (40, 30))
+        found.append(Camera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,
+                            camera.world_to_camera, name=name))  # fmt: skip
+    return tuple(found)
+
+
+def capture(names: Sequence[str], far: int = 0, matches: Matches | None = None) -> Capture:
+    images = tuple(np.full((30, 40, 3), 9 * k % 256, np.uint8) for k in range(len(names)))
+    masks = (np.eye(30, 40, dtype=bool), *[None] * (len(names) - 1))
+    none = np.zeros((0, 3))
+    return Capture(cameras(names, far), images, none, none.astype(np.uint8), masks=masks, matches=matches)
+
+
+def gaussians(count: int = 50) -> Gaussians:
+    rng = np.random.default_rng(1)
+    return Gaussians(
+        means=rng.uniform(-1, 1, (count, 3)),
+        log_scales=np.full((count, 3), -2.0),
+        quats_wxyz=np.tile([1.0, 0, 0, 0], (count, 1)),
+        opacity_logits=np.full(count, 2.0),
+        sh=rng.normal(size=(count, 1, 3)),
+    )
+
+
+def report(held_out: Sequence[str], **fields: object) -> TrainReport:
+    scores = tuple(ViewScore(name, 21.4, 0.7123, 0.9) for name in held_out)
+    stated = {
+        "views": 6, "held_out": len(scores), "gaussians": 50, "psnr": 21.4 if scores else None,
+        "masks": "graph", "encoder": HOSTILE, "mask_count": 7, "codec": "codebook", "codec_size": 8,
+        "codec_cosine": 0.9,
+        "relevancy_error": 0.01, "relevancy_error_p99": 0.02, "observed": 0.5, "warnings": (),
+        "seconds": {"radiance": 3.0}, "dataset": f"/a/{HOSTILE.replace('/', '')}", "held_out_views": scores,
+    }  # fmt: skip
+    return TrainReport(**stated | fields)  # type: ignore[arg-type]
+
+
+def test_a_page_shows_every_view_held_out_ones_first_and_stands_alone(tmp_path: Path) -> None:
+    names = [f"{number}{HOSTILE}" for number in range(8)]
+    matches = Matches(tuple(names), (900,) * 8, ((0, 1, 80), (1, 2, 20), (5, 6, 3)), frozenset(range(7)))
+    warned = report(names[2:4], warnings=("it is dim: add <light>",))
+    write_reports(tmp_path, warned, capture(names, matches=matches), gaussians())
+    assert read_report(tmp_path) == warned
+    page = Read(tmp_path / PAGE)
+    assert not {"script", "link", "iframe", "light"} & {tag for tag, _ in page.tags}
+    sources = [image["src"] or "" for image in page.of("img")] + [i["href"] or "" for i in page.of("image")]
+    assert len(page.of("img")) == 16
+    assert all(source.startswith("data:image/jpeg;base64,") for source in sources)
+    views = page.text.partition("what the scene shows there")[2]
+    assert views.index("2<script>") < views.index("3<script>") < views.index("0<script>")
+    assert views.count("held out") == 2
+    for words in ("it is dim: add <light>", "21.4 dB, SSIM 0.712", "7 of 8 photographs are located"):
+        assert words in page.text
+    assert len(page.of("path")) == 2
+    assert len(page.of("line")) == 1
+
+
+def test_groups_of_cameras_are_ringed(tmp_path: Path) -> None:
+    names = [str(number) for number in range(12)]
+    write_reports(tmp_path, report([]), capture(names, far=5), gaussians())
+    text = Read(tmp_path / PAGE).text
+    assert "group 1: 7" in text
+    assert "group 2: 5" in text
+    assert "none" in text  # nothing was held out
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_few_cameras_and_no_gaussians(count: int, tmp_path: Path) -> None:
+    write_reports(tmp_path, report([]), capture([str(k) for k in range(count)]), gaussians(0))
+    assert len(Read(tmp_path / PAGE).of("img")) == 2 * count
+
+
+def test_of_many_views_some_from_all_over_are_shown():
+    chosen = from_all_over(range(1000), MOST_VIEWS)
+    assert (len(chosen), chosen[0], chosen[-1]) == (MOST_VIEWS, 0, 999)
+    assert from_all_over(range(3), 10) == [0, 1, 2]
+    assert from_all_over(range(3), 0) == from_all_over([], 5) == []
+
+
+def test_a_refusal_shows_its_groups(tmp_path: Path) -> None:
+    names = (f"a{HOSTILE}", "b", "c", "d")
+    matches = Matches(names, (900, 900, 900, 0), ((0, 1, 80), (1, 2, 4)), frozenset())
+    page = Read(write_refusal(tmp_path, NotLocatedError("too few", matches)))
+    assert not page.of("script")
+    for words in ("too few", "a<script>", "no features", "no matches with any other", "0 of 4 photographs"):
+        assert words in page.text
+
+
+def test_photographs_that_do_not_match_end_in_a_line_that_names_the_page(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for index in range(3):
+        noise = rng.integers(0, 256, (120, 160, 3), dtype=np.uint8)
+        Image.fromarray(noise).save(tmp_path / f"{index}.png")
+    demo = TrainConfig(clip=type(ENCODER)(model="demo"))
+    with pytest.raises(InputError, match=r"see .*work/report\.html") as caught:
+        train_scene(tmp_path, tmp_path / "a.ply", demo, tmp_path / "work")
+    assert "between 0.png and 1.png" in str(caught.value)
+    assert "2.png" in Read(tmp_path / "work" / PAGE).text
