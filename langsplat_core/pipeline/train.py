@@ -183,7 +183,7 @@ def trained_gaussians(
     # The backend changes who computes, not what, so that a run may move between machines; nor do checkpoints.
     every = RadianceConfig.checkpoint_every
     settings = replace(config.radiance, backend="auto", checkpoint_every=every)
-    done = work / f"{stage_key('radiance', 2, settings, capture.digest(train))}.ply"
+    done = work / f"{stage_key('radiance', 3, settings, capture.digest(train))}.ply"
     if done.exists():
         log.debug("%s: kept from an earlier run", done.name)
         return read_ply(done)

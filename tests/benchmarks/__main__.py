@@ -7,6 +7,7 @@ from langsplat_core.cli.run import Command, main, parsed, with_codec
 from tests.benchmarks.changed import Changed
 from tests.benchmarks.clean import Clean
 from tests.benchmarks.colours import Colours
+from tests.benchmarks.few import Few
 from tests.benchmarks.formats import Formats
 from tests.benchmarks.library import Found
 from tests.benchmarks.lifting import Lifting
@@ -28,7 +29,7 @@ def parse(args: list[str]) -> Command:
     about = "Measure this project where the truth is known, and at large sizes."
     known = (
         *(Rooms, Verdicts, Taught, Phrases, Votes, Clean, Maps, Meshes),
-        *(Lifting, Scale, Found, Changed, Formats, Colours, Walks),
+        *(Lifting, Scale, Found, Changed, Formats, Colours, Walks, Few),
     )
     reports = tuple(with_codec(report, args) for report in known)
     command: Command = parsed(PROGRAM, Union[(*reports,)], args, about)

@@ -70,7 +70,8 @@ def find_depths(capture: Capture, indices: Sequence[int], progress: Progress = s
     no map. Masked pixels have no depth."""
     views = [_shrunk(capture, index) for index in indices]
     cameras = [camera for camera, _, _ in views]
-    greys = [np.ascontiguousarray(image.mean(2, dtype=np.float32) / 255) for _, image, _ in views]
+    # Windows reach into what is masked: it is the same in all photographs.
+    greys = [np.where(mask, image.mean(2, dtype=np.float32) / 255, np.float32(0)) for _, image, mask in views]
     maps: list[DepthMap] = []
     for index, others in enumerate(neighbouring_views(cameras, capture.points)):
         if others:
@@ -99,8 +100,11 @@ def _shrunk(capture: Capture, index: int) -> tuple[Camera, Array, Array]:
     if share >= 1:
         return camera, np.asarray(image), mask
     size = max(round(camera.width * share), 1), max(round(camera.height * share), 1)
-    small = np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BOX))
-    return camera.resized(*size), small, np.asarray(Image.fromarray(mask).resize(size))
+    small, counted = (
+        np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BOX))
+        for picture in (image, np.where(mask, np.uint8(255), np.uint8(0)))
+    )
+    return camera.resized(*size), small, counted == 255
 
 
 def neighbouring_views(cameras: Sequence[Camera], known: Array) -> list[list[int]]:

@@ -81,6 +81,10 @@ class Schedule:
         """True where a round of densification and pruning ends the step."""
         return self.densify_from < step < self.densify_until and step % self.densify_every == 0
 
+    def clears(self, step: int) -> bool:
+        """True where Gaussians that stand before known surfaces are removed after the step."""
+        return self.densify_from < step <= CLEARED_UNTIL * self.steps and step % self.densify_every == 0
+
     def prunes_large(self, step: int) -> bool:
         """True where a round also removes Gaussians larger than a tenth of the extent."""
         return 0 < self.reset_every < step
@@ -143,6 +147,7 @@ LOSSES_SAID = 200  # mean losses reported in a run
 COARSE_MIN_SIDE = 64  # px: smaller images are never halved
 DENSE_POINTS = 20_000  # of depths at most, that Gaussians begin at: the rest is for splitting
 FEW_VIEWS_OPACITY_DECAY = 0.01
+CLEARED_UNTIL = 0.9  # of the steps: the last ones mend what a removal leaves
 EXPOSING = (1 / 3, 2 / 3)  # of the steps, after which exposures of photographs are found
 EVERY = 7  # pixels, of which one tells the exposure
 LEAST_EXPOSURE_GAIN = 0.35  # dB over all training views that exposures of their own must explain
@@ -396,8 +401,8 @@ def _step(run: _Run, state: TrainingState) -> float:
     adam_step(state, schedule.learning_rates(step))
     if schedule.densifies(step):
         densify(state, run.config, run.extent, prune_large=schedule.prunes_large(step))
-        if run.depths:
-            remove(state, in_free_space(state.values["means"].detach().cpu().numpy(), run.depths))
+    if run.depths and schedule.clears(step):
+        remove(state, in_free_space(state.values["means"].detach().cpu().numpy(), run.depths))
     if schedule.resets_opacity(step):
         reset_opacities(state)
     state.step = step

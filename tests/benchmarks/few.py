@@ -1,0 +1,124 @@
+"""Few photographs: what depths, free space and exposures gain, held out."""
+
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+from langsplat_core.bench.measure import markdown
+from langsplat_core.config import DatasetConfig, RadianceConfig, TrainConfig, TrainPreset, with_preset
+from langsplat_core.datasets import Capture, load_capture
+from langsplat_core.datasets.holdout import split
+from langsplat_core.progress import Progress, TerminalProgress
+from langsplat_core.training.radiance.train import evaluate_views, train_radiance
+
+SIDE = 320  # px at which presets are compared with each other
+# What a training has, beside its preset.
+VARIANTS: dict[str, dict[str, object]] = {
+    "before": {"few_views": 0, "exposure": "off"},
+    "depths": {"exposure": "off"},
+    "depths, exposures": {},
+}
+
+
+@dataclass(frozen=True)
+class Few:
+    """Held-out PSNR of captures: without what few photographs get, with depths, and with exposures too."""
+
+    folders: tyro.conf.Positional[tuple[Path, ...]]
+    """Captures, as of `langsplat train`."""
+    presets: tuple[TrainPreset, ...] = ("quick",)
+    variants: tuple[str, ...] = tuple(VARIANTS)
+    views: int = 0
+    """Photographs, evenly spread over the capture; 0: all."""
+    test_every: int = 4
+    uneven: float = 0.0
+    """Deviation of the logarithm of the exposure that each training photograph is given."""
+    seeds: tuple[int, ...] = (0,)
+    work: Path | None = None
+    """Folder where cameras are kept from run to run."""
+
+    def run(self) -> None:
+        rows: list[tuple[str, ...]] = []
+        with tempfile.TemporaryDirectory() as scratch, TerminalProgress() as progress:
+            for folder in self.folders:
+                rows += self._rows(folder, (self.work or Path(scratch)) / folder.name, progress)
+        titles = (
+            *("capture", "training / held out", "preset", "with", "seed", "held out, dB"),
+            *("exposure fitted, dB", f"at {SIDE} px, dB", "SSIM", "training, dB", "Gaussians", "CPU-s"),
+        )
+        print(markdown(titles, rows))
+
+    def _rows(self, folder: Path, work: Path, progress: Progress) -> Iterator[tuple[str, ...]]:
+        small, _, _ = self._capture(folder, work, SIDE, progress)
+        for preset in self.presets:
+            config = with_preset(TrainConfig(), preset)
+            capture, train, held_out = self._capture(folder, work, config.dataset.max_side, progress)
+            for variant in self.variants:
+                for seed in self.seeds:
+                    settings = replace(config.radiance, seed=seed, **VARIANTS[variant])  # type: ignore[arg-type]
+                    found = _measured(capture, small, settings, train, held_out, progress)
+                    counts = f"{len(train)} / {len(held_out)}"
+                    yield (folder.name, counts, preset, variant, str(seed), *found)
+
+    def _capture(
+        self, folder: Path, work: Path, side: int, progress: Progress
+    ) -> tuple[Capture, list[int], list[int]]:
+        """The capture and its training and held-out views."""
+        config = DatasetConfig(max_side=side, test_every=self.test_every, allow_few_cameras=True)
+        capture = load_capture(folder, config, work, progress)
+        if self.views:
+            rows = np.unique(np.linspace(0, len(capture) - 1, self.views).round().astype(int))
+            capture = _subset(capture, [int(row) for row in rows])
+        train, held_out = split(capture, config)
+        if not held_out:
+            held_out = [len(capture) // 2]
+            train = [row for row in train if row not in held_out]
+        if self.uneven:
+            gains = np.exp(np.random.default_rng(0).normal(0, self.uneven, len(capture)))
+            gains[held_out] = 1.0
+            images = [
+                (image * gain).clip(0, 255).astype(np.uint8)
+                for image, gain in zip(capture.images, gains, strict=True)
+            ]
+            capture = replace(capture, images=tuple(images))
+        return capture, train, held_out
+
+
+def _subset(capture: Capture, rows: Sequence[int]) -> Capture:
+    kept = {
+        name: tuple(getattr(capture, name)[row] for row in rows) if getattr(capture, name) else ()
+        for name in ("cameras", "images", "photos", "masks")
+    }
+    return replace(capture, **kept)  # type: ignore[arg-type]
+
+
+def _measured(
+    capture: Capture,
+    small: Capture,
+    config: RadianceConfig,
+    train: Sequence[int],
+    held_out: Sequence[int],
+    progress: Progress,
+) -> tuple[str, ...]:
+    began = time.process_time()
+    gaussians = train_radiance(capture, config, train, progress=progress)
+    seconds = time.process_time() - began
+    scores, again = (evaluate_views(gaussians, one, held_out) for one in (capture, small))
+    learnt = evaluate_views(gaussians, capture, train)
+    exposed = [score.psnr_exposed for score in scores if score.psnr_exposed is not None]
+    means = [
+        np.mean([score.psnr for score in scores]),
+        np.mean(exposed) if exposed else np.nan,
+        np.mean([score.psnr for score in again]),
+    ]
+    ssim = np.mean([score.ssim for score in scores])
+    return (
+        *(f"{mean:.2f}" for mean in means),
+        *(f"{ssim:.3f}", f"{np.mean([score.psnr for score in learnt]):.2f}"),
+        *(str(len(gaussians)), f"{seconds:.0f}"),
+    )
