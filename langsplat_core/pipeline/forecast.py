@@ -21,7 +21,7 @@ SURE = 0.05  # share of a stage from which its own speed is trusted
 GPU = 1 / 30  # of the seconds of two CPU cores; not measured
 POINT = 0.17  # seconds of a point that a segmenter is asked at
 REGIONS = 300  # of an ordinary photograph
-DEPTHS = 0.6  # seconds of a photograph whose depths are found
+DEPTHS = 0.3  # seconds of a photograph whose depths are found
 AGREEING = 1.7  # seconds of a megapixel that masks are drawn into, once they agree
 # Millions of weights by what a hub id contains, the first that fits.
 MILLIONS = {
