@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -70,6 +71,22 @@ def test_a_window_at_rest_ends_by_a_signal(display, tmp_path, blobs, number):
     time.sleep(2)  # and it rests
     process.send_signal(number)
     assert process.wait(100) == 0, process.communicate()[1]
+
+
+@pytest.mark.long
+@pytest.mark.skipif(shutil.which("nvidia-smi") is not None, reason="needs a machine without CUDA")
+def test_a_backend_that_is_not_there_ends_before_a_window(display, tmp_path, blobs):
+    done = subprocess.run(
+        [sys.executable, "-m", "langsplat_viewer", blobs, "--fresh", "--backend", "cuda"],
+        env=surroundings(display),
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert "cuda" in done.stderr.lower()
 
 
 @pytest.mark.long

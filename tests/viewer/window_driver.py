@@ -380,8 +380,15 @@ def use_the_palette(s: Session) -> None:
     s.ctx.yield_(3)
     palette = s.ctx.window_info("//Commands").window
     assert abs(palette.pos.x + palette.size.x / 2 - 550) < 2
+    glfw.set_window_size(glfw_window_hello_imgui(), 200, 150)
+    s.wait(lambda: imgui.get_main_viewport().size.x == 200)
+    s.ctx.yield_(3)
+    palette = s.ctx.window_info("//Commands").window
+    assert palette.pos.x >= 0
+    assert palette.pos.x + palette.size.x <= 200
     s.ctx.key_press(imgui.Key.escape)
     glfw.set_window_size(glfw_window_hello_imgui(), 860, 620)
+    s.wait(lambda: imgui.get_main_viewport().size.x == 860)
     s.settle()
 
 
