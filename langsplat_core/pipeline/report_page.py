@@ -19,6 +19,7 @@ from langsplat_core.io.files import atomic_path
 from langsplat_core.pipeline.report import PAGE, TrainReport, camera_groups, write_report
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Gaussians, Scene
+from langsplat_core.scene.transform import C0
 from langsplat_core.training.radiance.train import evaluate_views
 
 MOST_VIEWS = 48  # on the page, held-out ones first
@@ -28,7 +29,6 @@ MAP_SIDE = 220  # cells of the map, along its longer side
 PLOT = 640  # units of a drawing's side
 STRONGEST = 8  # lines that a photograph adds to the graph of matches
 NAMED = 64  # photographs up to which each is named in the graph
-_SH_C0 = 0.28209479177387814
 _BLUE, _ORANGE, _RED = "#3b6fb6", "#e07b00", "#c62f3c"
 
 
@@ -214,7 +214,7 @@ def _map(places: Array, gaussians: Gaussians, width: float, height: float) -> st
     column, row = np.floor(places / cell).astype(int).T
     inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
     flat, weight = (row * columns + column)[inside], sigmoid(gaussians.opacity_logits[inside])
-    colours = (0.5 + _SH_C0 * gaussians.sh[inside, 0]).clip(0, 1)
+    colours = (0.5 + C0 * gaussians.sh[inside, 0]).clip(0, 1)
     channels = (*colours.T, np.ones(len(flat)))
     sums = np.stack([np.bincount(flat, weight * c, rows * columns) for c in channels], 1)
     full = float(np.quantile(sums[sums[:, 3] > 0, 3], 0.7)) if len(flat) else 1.0

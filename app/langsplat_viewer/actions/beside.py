@@ -16,7 +16,7 @@ ALIKE = 0.5, 1.5  # of two scenes in the same coordinates: distance of their mid
 
 
 def follow(viewer: Viewer) -> None:
-    """Once per frame: have the second scene seen and asked as the first is; or let it go."""
+    """Give the second scene the first one's view and queries, once per frame, or close it."""
     state, beside = viewer.state, viewer.beside
     is_wanted = state.settings.split.mode == "scenes"
     if beside is None:

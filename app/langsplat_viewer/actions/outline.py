@@ -162,7 +162,7 @@ def with_thing(viewer: Viewer, target: Target, act: Callable[[Array], None]) -> 
 
 
 def select(viewer: Viewer, target: Target) -> None:
-    """Select a thing."""
+    """Select the Gaussians of a thing in place of what is selected."""
     with_thing(viewer, target, lambda members: take(viewer, members, "replace"))
 
 

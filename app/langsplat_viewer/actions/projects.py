@@ -83,7 +83,7 @@ def _pin(viewer: Viewer, point: Array) -> None:
 
 
 def take_fresh_note(viewer: Viewer, note: Note) -> bool:
-    """Whether a note was just pinned, and is to be written now; said once."""
+    """Return True once for a note that was just pinned, whose text is to be typed now."""
     is_fresh = viewer.state.fresh_note is note
     viewer.state.fresh_note = None if is_fresh else viewer.state.fresh_note
     return is_fresh

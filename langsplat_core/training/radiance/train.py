@@ -386,11 +386,11 @@ def _step(run: _Run, state: TrainingState) -> float:
     camera, target, mask = run.pictures.at(index, coarse=step <= schedule.coarse_until)
     rendered = run.renderer.render(state.values, camera, schedule.active_sh_degree(step))
     image = rendered.image
+    if min(run.exposing, default=step + 1) <= step:
+        image = with_exposure(image, state.exposures[index])
     if mask is not None:  # what is masked differs from nothing, and nothing flows back from it
         image = torch.where(mask[..., None], image, image.detach())
         target = torch.where(mask[..., None], target, image.detach())
-    if min(run.exposing, default=step + 1) <= step:
-        image = with_exposure(image, state.exposures[index])
     loss = radiance_loss(image, target, run.config.lambda_dssim)
     loss.backward()
     if run.config.opacity_decay > 0:
