@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from PIL import Image
+from scipy.ndimage import minimum_filter
 
 from langsplat_core.arrays import Array
 from langsplat_core.compiled import helper, kernel, shared_workers
@@ -30,6 +31,7 @@ NEIGHBOURS = 4  # views that each is compared with ...
 BEST = 2  # ... of which so many count: others may see something before it
 ANGLES = (2.0, 35.0)  # degrees between two views' rays to what they see
 ANGLE = 12.0  # degrees, the best: wider ones tell depth better and look less alike
+NEAR_QUANTILE = 0.02  # of depths, which passes for the nearest
 MARGIN = (0.75, 1.5)  # of the nearest and farthest depth of known points: where planes begin and end
 FLAT = np.float32(1e-5)  # added to variances, grey values in [0, 1]: what is flat correlates with nothing
 LEAST_SCORE = 0.6  # of a pixel whose depth is kept ...
@@ -37,6 +39,9 @@ LEAST_CONFIRMING = 0.5  # ... and of the one in another view that confirms it
 AGREEMENT = 0.015  # of the depth, by which two views' may differ
 BEFORE = 0.05  # of the depth, from which on something lies before a surface ...
 AT = 0.025  # ... and up to which it belongs to it
+AROUND = 1 / 16  # of the image's longer side: how far from a pixel a depth tells of its surface ...
+NEARER = 0.15  # ... which is nearer than all those by this share of them at most
+NEARER_THAN_ALL = 0.5  # the same where there are none around, against the nearest of the image
 
 
 @dataclass(frozen=True)
@@ -45,6 +50,7 @@ class DepthMap:
 
     camera: Camera
     depth: Array  # (H, W) world units along the camera's z axis; NaN where none is known
+    nearest: Array  # (H, W) depth from which on there may be something: before, space is free
     score: Array  # (H, W) mean of the best `BEST` correlations, at most 1
     colours: Array  # (H, W, 3) uint8
 
@@ -56,13 +62,14 @@ class DepthMap:
         points = np.stack([x * z, y * z, z], -1) @ camera.rotation + camera.position
         return points, self.colours[rows, columns]
 
-    def compare(self, points: Array) -> tuple[Array, Array, Array]:
-        """Which of the (N, 3) points lie at pixels of the image, as (M,) indices, their depth over that of
-        the surface there, NaN where it is not known, and its score."""
-        pixels, depths = self.camera.project(points)
-        there = np.flatnonzero(inside(self.camera, points))
-        columns, rows = pixels[there].astype(int).T
-        return there, depths[there] / self.depth[rows, columns], self.score[rows, columns]
+
+def _pixels(camera: Camera, points: Array) -> tuple[Array, tuple[Array, Array], Array]:
+    """Which of the (N, 3) points lie at pixels of the image, as (M,) indices, rows and columns of these, and
+    the depths of the points."""
+    pixels, depths = camera.project(points)
+    there = np.flatnonzero(inside(camera, points))
+    columns, rows = pixels[there].astype(int).T
+    return there, (rows, columns), depths[there]
 
 
 def find_depths(capture: Capture, indices: Sequence[int], progress: Progress = silent) -> list[DepthMap]:
@@ -77,19 +84,43 @@ def find_depths(capture: Capture, indices: Sequence[int], progress: Progress = s
         if others:
             depth, score = sweep(index, others, cameras, greys, capture.points)
             _, image, mask = views[index]
-            maps.append(DepthMap(cameras[index], np.where(mask, depth, np.nan), score, image))
+            depth[~mask] = np.nan
+            maps.append(DepthMap(cameras[index], depth, np.zeros_like(depth), score, image))
         progress(STAGE, (index + 1) / len(cameras))
-    return [_confirmed(one, [other for other in maps if other is not one]) for one in maps]
+    depths = [confirmed(one, [other for other in maps if other is not one]) for one in maps]
+    return [
+        replace(one, depth=depth, nearest=nearest(one.camera, depth, capture.points))
+        for one, depth in zip(maps, depths, strict=True)
+    ]
 
 
 def in_free_space(points: Array, maps: Sequence[DepthMap]) -> Array:
-    """(N,) True for points that lie before the surfaces of more views than at them."""
+    """(N,) True for points that lie in the free space of more views than at their surfaces."""
     balance = np.zeros(len(points), int)
     for one in maps:
-        there, depths, _ = one.compare(points)
-        balance[there] += depths < 1 - BEFORE
-        balance[there] -= np.abs(depths - 1) < AT
+        there, pixels, depths = _pixels(one.camera, points)
+        balance[there] += depths < one.nearest[pixels]
+        balance[there] -= np.abs(depths / one.depth[pixels] - 1) < AT
     return balance > 0
+
+
+def nearest(camera: Camera, depth: Array, known: Array) -> Array:
+    """(H, W) depths from which on there may be something, by the surfaces of the (H, W) `depth`, NaN where
+    it is not known, and by the (N, 3) `known` points.
+
+    What no other photograph confirms is mostly flat, or seen by this one alone: there nothing else tells haze
+    from a surface. It is not much nearer than the surfaces around it.
+    """
+    told = np.where(np.isfinite(depth), depth, np.inf)
+    _, pixels, depths = _pixels(camera, known)
+    np.minimum.at(told, pixels, depths)
+    if not np.isfinite(told).any():
+        return np.zeros_like(told)
+    reach = max(round(AROUND * max(told.shape)), 1)
+    around = (1 - NEARER) * minimum_filter(told, 2 * reach + 1, mode="nearest")
+    anywhere = (1 - NEARER_THAN_ALL) * np.quantile(told[np.isfinite(told)], NEAR_QUANTILE)
+    free = np.where(np.isfinite(around), around, anywhere)
+    return np.where(np.isfinite(depth), (1 - BEFORE) * depth, free)
 
 
 def _shrunk(capture: Capture, index: int) -> tuple[Camera, Array, Array]:
@@ -136,7 +167,7 @@ def inverse_depths(camera: Camera, cameras: Sequence[Camera], known: Array) -> A
     """(PLANES,) ascending inverse depths at which a view looks for surfaces."""
     depths = camera.project(known)[1][inside(camera, known)] if len(known) else np.zeros(0)
     if len(depths) >= TELLING_POINTS // 2:
-        near, far = np.quantile(depths, (0.02, 0.98)) * MARGIN
+        near, far = np.quantile(depths, (NEAR_QUANTILE, 1 - NEAR_QUANTILE)) * MARGIN
     else:
         near, far = look_distance(cameras) * np.array((0.3, 3.0))
     return np.linspace(1 / far, 1 / near, PLANES)
@@ -276,14 +307,14 @@ def _choose(first: int, last: int, best: Array, count: int, at: Array, score: Ar
             score[row, x] = mean[top]
 
 
-def _confirmed(one: DepthMap, others: Sequence[DepthMap]) -> DepthMap:
-    """The map without depths that no other map confirms."""
-    good = replace(one, depth=np.where(one.score > LEAST_SCORE, one.depth, np.nan))
-    points, _ = good.points()
+def confirmed(one: DepthMap, others: Sequence[DepthMap]) -> Array:
+    """(H, W) depths of the map, NaN where their score is low or no other map confirms them."""
+    depth = np.where(one.score > LEAST_SCORE, one.depth, np.nan)
+    points, _ = replace(one, depth=depth).points()
     kept = np.zeros(len(points), bool)
     for other in others:
-        there, depths, scores = other.compare(points)
-        kept[there] |= (np.abs(depths - 1) < AGREEMENT) & (scores > LEAST_CONFIRMING)
-    depth = good.depth.copy()
+        there, pixels, depths = _pixels(other.camera, points)
+        agree = np.abs(depths / other.depth[pixels] - 1) < AGREEMENT
+        kept[there] |= agree & (other.score[pixels] > LEAST_CONFIRMING)
     depth[np.isfinite(depth)] = np.where(kept, depth[np.isfinite(depth)], np.nan)
-    return replace(good, depth=depth)
+    return depth

@@ -126,6 +126,45 @@ def test_space_before_a_surface_is_free() -> None:
     assert not in_free_space(surface, []).any()
 
 
+def test_what_is_nearest_is_told_by_depths_and_points_around() -> None:
+    rng = np.random.default_rng(4)
+    camera = cameras()[1]
+    depth = np.where(rng.random(SIZE[::-1]) < 0.01, rng.uniform(2, 9, SIZE[::-1]), np.nan)
+    points = camera.unproject((10.5, 40.5), 1.5)[None]
+    told = depth.copy()
+    told[40, 10] = 1.5
+    reach = round(stereo.AROUND * SIZE[0])
+    anywhere = (1 - stereo.NEARER_THAN_ALL) * np.quantile(told[np.isfinite(told)], stereo.NEAR_QUANTILE)
+    alone = 0
+    for (row, column), found in np.ndenumerate(stereo.nearest(camera, depth, points)):
+        window = told[
+            max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1
+        ]  # fmt: skip
+        expected = anywhere
+        if np.isfinite(depth[row, column]):
+            expected = (1 - stereo.BEFORE) * depth[row, column]
+        elif np.isfinite(window).any():
+            expected = (1 - stereo.NEARER) * np.nanmin(window)
+        else:
+            alone += 1
+        assert found == pytest.approx(expected, rel=1e-6)
+    assert 0 < alone < depth.size / 2
+
+
+def test_nothing_stands_close_before_what_no_photograph_confirms() -> None:
+    images = list(capture().images)
+    images[0] = images[0].copy()
+    images[0][20:34, 20:30] = 120  # flat in this view alone
+    maps = find_depths(replace(capture(), images=tuple(images)), range(4))
+    camera = cameras()[0]
+    assert not np.isfinite(maps[0].depth[24:30, 24:26]).any()
+    close, at = (
+        camera.unproject((25.0, 27.0), share * true_depth(camera)[27, 25])[None] for share in (0.6, 1)
+    )
+    assert in_free_space(close, maps[:1]).all()
+    assert not in_free_space(at, maps[:1]).any()
+
+
 def test_masked_pixels_have_no_depth() -> None:
     mask = np.ones(SIZE[::-1], bool)
     mask[:, :30] = False
