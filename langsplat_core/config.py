@@ -191,6 +191,10 @@ class DatasetConfig:
     allow_few_cameras: bool = False
 
 
+FEWEST_REHEARSED = 500  # steps of a rehearsal: fewer are too few for any capture
+REHEARSAL_FACTOR = 3  # between one rehearsal's steps and the next one's
+
+
 @dataclass(frozen=True)
 class RadianceConfig:
     """3D Gaussian Splatting training (Kerbl et al. 2023); defaults are those of the INRIA code.
@@ -226,10 +230,20 @@ class RadianceConfig:
     # up to so many training views: Gaussians begin at depths by stereo and leave the space before surfaces,
     # opacities decay and are not reset; 0 (as published): never
     few_views: CountOrZero = 50
+    # up to so many training views, short trainings on some of them decide whether fewer `steps` are trained,
+    # see `training.radiance.rehearsal`; 0: never
+    rehearsed_views: CountOrZero = 24
     # each photograph has an exposure and white balance of its own; auto: where that explains enough
     exposure: Literal["auto", "on", "off"] = "auto"
     checkpoint_every: Count = 2_000  # steps of this run
     seed: Seed = 0  # of random numbers
+
+    def rehearsals(self, views: int) -> list[int]:
+        """Ascending numbers of steps that are tried with so many training views; the last is `steps`."""
+        tried = [self.steps]
+        while views <= self.rehearsed_views and tried[0] >= REHEARSAL_FACTOR * FEWEST_REHEARSED:
+            tried.insert(0, round(tried[0] / REHEARSAL_FACTOR))
+        return tried
 
 
 @dataclass(frozen=True)
@@ -350,7 +364,7 @@ class TrainConfig:
 # photograph, an autoencoder of 3 numbers, features trained through the rasterizer from zeros.
 PAPER = TrainConfig(
     dataset=DatasetConfig(hold_out="every"),
-    radiance=RadianceConfig(coarse_fraction=0.0, few_views=0, exposure="off"),
+    radiance=RadianceConfig(coarse_fraction=0.0, few_views=0, rehearsed_views=0, exposure="off"),
     masks=MaskConfig(source="sam", sam="facebook/sam-vit-huge", crop_layers=1),
     codec=AutoencoderConfig(steps=10_000, batch=64, lr=7e-4),
     lift=LiftConfig(mode="gradient", start="zeros-as-published"),

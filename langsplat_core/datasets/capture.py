@@ -313,11 +313,34 @@ class Capture:
         digest.update(self.colours.tobytes())
         return digest.hexdigest()
 
+    def shrunk(self, indices: Sequence[int], longer_side: int) -> "Capture":
+        """The photographs at `indices`, at most `longer_side` pixels long, with the points of all."""
+        views = []
+        for index in indices:
+            camera, share = self.cameras[index], longer_side / max(self.images[index].shape)
+            size = max(round(camera.width * share), 1), max(round(camera.height * share), 1)
+            view = camera, self.images[index], self.mask(index)
+            views.append(view if share >= 1 else shrunk_view(*view, size))
+        cameras, images, masks = zip(*views, strict=True) if views else ((), (), ())
+        return replace(self, cameras=cameras, images=images, masks=masks, photos=(), matches=None)
+
     def extent(self) -> float:
         """1.1 times the largest distance of a camera from the cameras' mean: the scene scale that the
         INRIA code multiplies position learning rates with. World units, > 0."""
         centres = np.array([camera.position for camera in self.cameras])
         return max(1.1 * float(np.linalg.norm(centres - centres.mean(0), axis=1).max()), 1e-6)
+
+
+def shrunk_view(
+    camera: Camera, image: Array, mask: Array | None, size: tuple[int, int]
+) -> tuple[Camera, Array, Array | None]:
+    """A view at a smaller (width, height), by area averages; a pixel counts where all it is made of count."""
+
+    def averaged(picture: Array) -> Array:
+        return np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BOX))
+
+    counted = None if mask is None else averaged(np.where(mask, np.uint8(255), np.uint8(0))) == 255
+    return camera.resized(*size), averaged(image), counted
 
 
 def _rounded(values: Array) -> Array:

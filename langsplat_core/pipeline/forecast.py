@@ -21,6 +21,7 @@ SURE = 0.05  # share of a stage from which its own speed is trusted
 GPU = 1 / 30  # of the seconds of two CPU cores; not measured
 POINT = 0.17  # seconds of a point that a segmenter is asked at
 REGIONS = 300  # of an ordinary photograph
+REHEARSED = 320  # px, longer side of photographs that a training is rehearsed with
 DEPTHS = 0.3  # seconds of a photograph whose depths are found
 AGREEING = 1.7  # seconds of a megapixel that masks are drawn into, once they agree
 # Millions of weights by what a hub id contains, the first that fits.
@@ -63,6 +64,10 @@ def plan(
     # A step costs what it draws, and what it keeps: 0.02 s at 0.1 megapixels, 0.1 s at 100 000 Gaussians.
     step = 0.2 * megapixels + 1e-6 * min(gaussians, 300_000)
     depths = DEPTHS * photographs if photographs <= config.radiance.few_views else 0.0
+    *tried, last = config.radiance.rehearsals(photographs)
+    if tried:  # the last is tried, too
+        small = min(config.dataset.max_side, REHEARSED) / config.dataset.max_side
+        depths += (sum(tried) + last) * step * small**2
     codec = config.codec.seconds
     lifting = photographs * (0.2 + 0.5 * megapixels) + 1e-4 * gaussians * min(photographs, 100) / 50
     if config.lift.mode == "gradient":
@@ -83,8 +88,8 @@ def plan(
         ),
         Stage(
             "Gaussians",
-            ("finding depths", "training Gaussians"),
-            0.0 if has_gaussians else config.radiance.steps * step + depths,
+            ("rehearsing", "finding depths", "training Gaussians"),
+            0.0 if has_gaussians else last * step + depths,
         ),
         Stage(
             "language field",

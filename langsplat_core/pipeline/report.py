@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +42,8 @@ class TrainReport:
     seconds: dict[str, float]  # per stage, of this run: a stage that was already done takes almost none
     dataset: str = ""  # absolute path of the photographs; "" in reports of earlier versions
     held_out_views: tuple[ViewScore, ...] = ()  # one by one
+    # steps -> mean PSNR (dB) of views held out of the training views, by short trainings that decided on them
+    rehearsed: dict[str, float] = field(default_factory=dict)
 
 
 def work_folder(out: Path) -> Path:

@@ -8,20 +8,26 @@ from pathlib import Path
 
 import numpy as np
 import tyro
+from PIL import Image
 
+from langsplat_core.arrays import Array, psnr
 from langsplat_core.bench.measure import markdown
 from langsplat_core.config import DatasetConfig, RadianceConfig, TrainConfig, TrainPreset, with_preset
 from langsplat_core.datasets import Capture, load_capture
 from langsplat_core.datasets.holdout import split
 from langsplat_core.progress import Progress, TerminalProgress
+from langsplat_core.raster.render import render
+from langsplat_core.scene import Camera, Gaussians, Scene
+from langsplat_core.training.radiance.rehearsal import rehearse, supported
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
 
 SIDE = 320  # px at which presets are compared with each other
 # What a training has, beside its preset.
 VARIANTS: dict[str, dict[str, object]] = {
-    "before": {"few_views": 0, "exposure": "off"},
-    "depths": {"exposure": "off"},
-    "depths, exposures": {},
+    "before": {"few_views": 0, "rehearsed_views": 0, "exposure": "off"},
+    "depths": {"rehearsed_views": 0, "exposure": "off"},
+    "depths, exposures": {"rehearsed_views": 0},
+    "all": {},
 }
 
 
@@ -49,7 +55,15 @@ class Few:
                 rows += self._rows(folder, (self.work or Path(scratch)) / folder.name, progress)
         titles = (
             *("capture", "training / held out", "preset", "with", "seed", "held out, dB"),
-            *("exposure fitted, dB", f"at {SIDE} px, dB", "SSIM", "training, dB", "Gaussians", "CPU-s"),
+            *(
+                "exposure fitted, dB",
+                f"at {SIDE} px, dB",
+                "SSIM",
+                "training, dB",
+                "steps",
+                "Gaussians",
+                "CPU-s",
+            ),
         )
         print(markdown(titles, rows))
 
@@ -106,19 +120,28 @@ def _measured(
     progress: Progress,
 ) -> tuple[str, ...]:
     began = time.process_time()
+    config = supported(rehearse(capture, config, train, progress=progress), config)
     gaussians = train_radiance(capture, config, train, progress=progress)
     seconds = time.process_time() - began
-    scores, again = (evaluate_views(gaussians, one, held_out) for one in (capture, small))
+    scores = evaluate_views(gaussians, capture, held_out)
     learnt = evaluate_views(gaussians, capture, train)
     exposed = [score.psnr_exposed for score in scores if score.psnr_exposed is not None]
     means = [
         np.mean([score.psnr for score in scores]),
         np.mean(exposed) if exposed else np.nan,
-        np.mean([score.psnr for score in again]),
+        np.mean([_psnr_at(small.images[i], capture.cameras[i], gaussians) for i in held_out]),
     ]
     ssim = np.mean([score.ssim for score in scores])
     return (
         *(f"{mean:.2f}" for mean in means),
         *(f"{ssim:.3f}", f"{np.mean([score.psnr for score in learnt]):.2f}"),
-        *(str(len(gaussians)), f"{seconds:.0f}"),
+        *(str(config.steps), str(len(gaussians)), f"{seconds:.0f}"),
     )
+
+
+def _psnr_at(photograph: Array, camera: Camera, gaussians: Gaussians) -> float:
+    """PSNR of the camera's image, shrunk to the size of the photograph: what presets are compared by."""
+    image = (255 * render(Scene(gaussians), camera).colours.clip(0, 1)).round().astype(np.uint8)
+    size = photograph.shape[1::-1]
+    shrunk = Image.fromarray(image).resize(size, Image.Resampling.BOX)
+    return psnr(np.asarray(shrunk) / 255, photograph / 255)

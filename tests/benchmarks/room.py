@@ -228,7 +228,7 @@ class Room:
         """Gaussians that were trained without the held-out views."""
         train, _ = self.capture.split(HOLD_OUT)
         start = time.perf_counter()
-        gaussians = trained_gaussians(self.capture, train, self.settings, self.folder, self.progress)
+        gaussians = trained_gaussians(self.capture, train, self.settings.radiance, self.folder, self.progress)
         self._lap("radiance", start)
         return gaussians
 

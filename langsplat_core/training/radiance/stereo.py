@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from PIL import Image
 from scipy.ndimage import minimum_filter
 
 from langsplat_core.arrays import Array
@@ -75,18 +74,22 @@ def _pixels(camera: Camera, points: Array) -> tuple[Array, tuple[Array, Array], 
 def find_depths(capture: Capture, indices: Sequence[int], progress: Progress = silent) -> list[DepthMap]:
     """Depths of the photographs at `indices` that another one confirms; photographs without neighbours have
     no map. Masked pixels have no depth."""
-    views = [_shrunk(capture, index) for index in indices]
-    cameras = [camera for camera, _, _ in views]
+    small = capture.shrunk(indices, LONGER_SIDE)
+    masks = [np.True_ if (mask := small.mask(index)) is None else mask for index in range(len(small))]
     # Windows reach into what is masked: it is the same in all photographs.
-    greys = [np.where(mask, image.mean(2, dtype=np.float32) / 255, np.float32(0)) for _, image, mask in views]
+    greys = [
+        np.where(mask, image.mean(2, dtype=np.float32) / 255, np.float32(0))
+        for image, mask in zip(small.images, masks, strict=True)
+    ]
     maps: list[DepthMap] = []
-    for index, others in enumerate(neighbouring_views(cameras, capture.points)):
+    for index, others in enumerate(neighbouring_views(small.cameras, capture.points)):
         if others:
-            depth, score = sweep(index, others, cameras, greys, capture.points)
-            _, image, mask = views[index]
-            depth[~mask] = np.nan
-            maps.append(DepthMap(cameras[index], depth, np.zeros_like(depth), score, image))
-        progress(STAGE, (index + 1) / len(cameras))
+            depth, score = sweep(index, others, small.cameras, greys, capture.points)
+            depth = np.where(masks[index], depth, np.nan)
+            maps.append(
+                DepthMap(small.cameras[index], depth, np.zeros_like(depth), score, small.images[index])
+            )
+        progress(STAGE, (index + 1) / len(small))
     depths = [confirmed(one, [other for other in maps if other is not one]) for one in maps]
     return [
         replace(one, depth=depth, nearest=nearest(one.camera, depth, capture.points))
@@ -121,21 +124,6 @@ def nearest(camera: Camera, depth: Array, known: Array) -> Array:
     anywhere = (1 - NEARER_THAN_ALL) * np.quantile(told[np.isfinite(told)], NEAR_QUANTILE)
     free = np.where(np.isfinite(around), around, anywhere)
     return np.where(np.isfinite(depth), (1 - BEFORE) * depth, free)
-
-
-def _shrunk(capture: Capture, index: int) -> tuple[Camera, Array, Array]:
-    """Camera, image, and mask of the pixels that count, at most `LONGER_SIDE` long."""
-    camera, image, mask = capture.cameras[index], capture.images[index], capture.mask(index)
-    mask = np.ones(image.shape[:2], bool) if mask is None else mask
-    share = LONGER_SIDE / max(camera.width, camera.height)
-    if share >= 1:
-        return camera, np.asarray(image), mask
-    size = max(round(camera.width * share), 1), max(round(camera.height * share), 1)
-    small, counted = (
-        np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BOX))
-        for picture in (image, np.where(mask, np.uint8(255), np.uint8(0)))
-    )
-    return camera.resized(*size), small, counted == 255
 
 
 def neighbouring_views(cameras: Sequence[Camera], known: Array) -> list[list[int]]:

@@ -21,12 +21,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 
 from langsplat_core.arrays import Array, ViewScore, psnr, sigmoid
 from langsplat_core.config import INRIA, RadianceConfig, check_settings
-from langsplat_core.datasets.capture import Capture
+from langsplat_core.datasets.capture import Capture, shrunk_view
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Cancelled, Progress, Terminated, silent
 from langsplat_core.scene import Camera, Gaussians
@@ -143,6 +142,7 @@ def schedule_for(config: RadianceConfig, extent: float) -> Schedule:
 # pruning and opacity resets follow the `Schedule`. On the CPU a run is deterministic given its seed and
 # resumes from a checkpoint exactly where it stopped.
 
+STAGE = "training Gaussians"
 LOSSES_SAID = 200  # mean losses reported in a run
 COARSE_MIN_SIDE = 64  # px: smaller images are never halved
 DENSE_POINTS = 20_000  # of depths at most, that Gaussians begin at: the rest is for splitting
@@ -179,17 +179,10 @@ class _Pictures:
 
 
 def _halved(camera: Camera, image: Array, mask: Array | None) -> tuple[Camera, Array, Array | None]:
-    """The view at half its size, by area averages; a small one as it is. A pixel counts where all do that it
-    is made of."""
+    """The view at half its size; a small one as it is."""
     if min(camera.width, camera.height) < COARSE_MIN_SIDE:
         return camera, image, mask
-    size = (camera.width // 2, camera.height // 2)
-
-    def shrunk(picture: Array) -> Array:
-        return np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BOX))
-
-    halved = None if mask is None else shrunk(np.where(mask, np.uint8(255), np.uint8(0))) == 255
-    return camera.resized(*size), shrunk(image), halved
+    return shrunk_view(camera, image, mask, (camera.width // 2, camera.height // 2))
 
 
 @dataclass(frozen=True)
@@ -267,9 +260,7 @@ def train_radiance(
                 loss = _step(run, state)
                 losses.add(state.step, loss)
                 metrics = {} if losses.mean is None else {"loss": losses.mean}
-                progress(
-                    "training Gaussians", state.step / config.steps, f"{len(state)} Gaussians", **metrics
-                )
+                progress(STAGE, state.step / config.steps, f"{len(state)} Gaussians", **metrics)
                 raise_if_interrupted()
                 if state.step % config.checkpoint_every == 0 or state.step == config.steps:
                     save()
