@@ -15,6 +15,7 @@ from langsplat_core.bench.measure import markdown
 from langsplat_core.config import DatasetConfig, RadianceConfig, TrainConfig, TrainPreset, with_preset
 from langsplat_core.datasets import Capture, load_capture
 from langsplat_core.datasets.holdout import split
+from langsplat_core.datasets.known_poses import look_distance
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Gaussians, Scene
@@ -22,6 +23,8 @@ from langsplat_core.training.radiance.rehearsal import rehearse, supported
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
 
 SIDE = 320  # px at which presets are compared with each other
+SHEET_VIEWS = 4
+NEARER = 0.2  # of the distance to what cameras look at
 # What a training has, beside its preset.
 VARIANTS: dict[str, dict[str, object]] = {
     "before": {"few_views": 0, "rehearsed_views": 0, "exposure": "off"},
@@ -47,6 +50,8 @@ class Few:
     seeds: tuple[int, ...] = (0,)
     work: Path | None = None
     """Folder where cameras are kept from run to run."""
+    sheets: Path | None = None
+    """Folder for a sheet of each capture: a row a training, of views between the photographs and nearer."""
 
     def run(self) -> None:
         rows: list[tuple[str, ...]] = []
@@ -75,7 +80,8 @@ class Few:
             for variant in self.variants:
                 for seed in self.seeds:
                     settings = replace(config.radiance, seed=seed, **VARIANTS[variant])  # type: ignore[arg-type]
-                    found = _measured(capture, small, settings, train, held_out, progress)
+                    sheet = self.sheets and self.sheets / f"{folder.name}.png"
+                    found = _measured(capture, small, settings, train, held_out, progress, sheet)
                     counts = f"{len(train)} / {len(held_out)}"
                     yield (folder.name, counts, preset, variant, str(seed), *found)
 
@@ -118,11 +124,14 @@ def _measured(
     train: Sequence[int],
     held_out: Sequence[int],
     progress: Progress,
+    sheet: Path | None,
 ) -> tuple[str, ...]:
     began = time.process_time()
     config = supported(rehearse(capture, config, train, progress=progress), config)
     gaussians = train_radiance(capture, config, train, progress=progress)
     seconds = time.process_time() - began
+    if sheet:
+        add_row(sheet, gaussians, between(capture.shrunk(train, SIDE).cameras))
     scores = evaluate_views(gaussians, capture, held_out)
     learnt = evaluate_views(gaussians, capture, train)
     exposed = [score.psnr_exposed for score in scores if score.psnr_exposed is not None]
@@ -139,9 +148,39 @@ def _measured(
     )
 
 
+def between(cameras: Sequence[Camera]) -> list[Camera]:
+    """Cameras halfway from one to its nearest neighbour and a fifth nearer to what it looks at, spread over
+    the capture."""
+    places = np.array([camera.position for camera in cameras])
+    distance = look_distance(cameras)
+    found = []
+    for index in np.linspace(0, len(cameras) - 1, SHEET_VIEWS).round().astype(int):
+        apart = np.linalg.norm(places - places[index], axis=1)
+        apart[index] = np.inf
+        camera, other = cameras[index], cameras[int(apart.argmin())]
+        eye = (camera.position + other.position) / 2 + NEARER * distance * camera.rotation[2]
+        moved = camera.world_to_camera.copy()
+        moved[:3, 3] = -camera.rotation @ eye
+        found.append(replace(camera, world_to_camera=moved))
+    return found
+
+
+def add_row(sheet: Path, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
+    """Draw the Gaussians by the cameras, side by side, below what the sheet shows so far."""
+    height = max(camera.height for camera in cameras)
+    images = [np.pad(_image(gaussians, one), ((0, height - one.height), (0, 4), (0, 0))) for one in cameras]
+    row = np.concatenate(images, 1)
+    rows = [np.asarray(Image.open(sheet)), np.zeros_like(row[:4]), row] if sheet.exists() else [row]
+    sheet.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.concatenate(rows)).save(sheet)
+
+
+def _image(gaussians: Gaussians, camera: Camera) -> Array:
+    return (255 * render(Scene(gaussians), camera).colours.clip(0, 1)).round().astype(np.uint8)
+
+
 def _psnr_at(photograph: Array, camera: Camera, gaussians: Gaussians) -> float:
     """PSNR of the camera's image, shrunk to the size of the photograph: what presets are compared by."""
-    image = (255 * render(Scene(gaussians), camera).colours.clip(0, 1)).round().astype(np.uint8)
     size = photograph.shape[1::-1]
-    shrunk = Image.fromarray(image).resize(size, Image.Resampling.BOX)
+    shrunk = Image.fromarray(_image(gaussians, camera)).resize(size, Image.Resampling.BOX)
     return psnr(np.asarray(shrunk) / 255, photograph / 255)
