@@ -174,16 +174,6 @@ def test_a_scene_that_was_left_is_let_go_by_both_renderers(gl, state):
     canvas.close()
 
 
-def test_it_stays_fine_if_told_so(gl, state):
-    renderer = FakeRenderer(seconds=5.0)
-    canvas = Canvas(gl, renderer, renderer.clock)
-    state.coarse_while_moving = False
-    canvas.update(state, 0.0)
-    state.view = orbit(state.view, 0.1, 0)
-    canvas.update(state, 10.0)
-    assert sizes(renderer) == [(200, 120), (200, 120)]
-
-
 def test_it_keeps_few_textures(gl, state):
     canvas, seen = Canvas(gl, FakeRenderer()), []
     for width in range(20, 40):

@@ -19,10 +19,7 @@ from langsplat_viewer.camera.flight import (
     frame_times,
     pose_at,
     pose_of,
-    stretched,
     turntable,
-    view_of,
-    with_keyframe,
 )
 from langsplat_viewer.files.flights import MOST, read_flight, write_flight
 from tests.support.fakes import blob_scene
@@ -156,15 +153,6 @@ def test_times_must_rise():
             Flight(keys)
 
 
-def test_keyframes_are_added_in_order_and_stretched():
-    keys = with_keyframe(with_keyframe((key(2),), key(0.5)), key(2, (1, 1, 1)))
-    assert [k.seconds for k in keys] == [0.5, 2]
-    assert_allclose(keys[1].pose.position, 1)
-    assert [k.seconds for k in stretched(keys, 6)] == [1.5, 6]
-    assert stretched((), 3) == ()
-    assert [k.seconds for k in stretched((key(0),), 3)] == [0]
-
-
 def test_a_turntable_goes_once_around_as_a_drag_does():
     extent = extent_of(blob_scene())
     view = from_camera(blob_scene().cameras[0], extent)
@@ -183,16 +171,6 @@ def test_times_of_pictures():
     assert_allclose(frame_times(turntable(view, 1), 4), [0, 0.25, 0.5, 0.75])  # the last is the first again
     assert len(frame_times(turntable(view, 0.1), 1)) == 1
     assert len(frame_times(Flight((key(0), key(0.1 * 3))), 10)) == 4  # 0.3 is a little less than 3 tenths
-
-
-def test_a_pose_is_the_view_it_was_taken_from():
-    extent = extent_of(blob_scene())
-    view = orbit(from_camera(blob_scene().cameras[1], extent), 0.3, 0.1)
-    again = view_of(pose_of(view), extent)
-    for size in ((160, 120), (64, 64)):
-        a, b = view.camera(*size), again.camera(*size)
-        assert_allclose(b.world_to_camera, a.world_to_camera, atol=1e-9)
-    assert again.camera(160, 120).fx == pytest.approx(view.camera(160, 120).fx)
 
 
 # Camera paths to files and back; files that are none.

@@ -8,28 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions import filming, opening, queries, settings, viewpoint
 from langsplat_viewer.files.browsing import MOST_LISTED, Entry, list_folder
 from langsplat_viewer.files.watching import Watch, stamps
-from langsplat_viewer.options import say_compiling
 from langsplat_viewer.panels.scene import has_several
 from langsplat_viewer.rendering.depth import UNCLIPPED, Clip
 from tests.support.fakes import blob_scene
 from tests.support.windowless import SCENES, arrive, errors, settle
-
-
-def test_open_shows_the_scene_from_its_first_camera(opened):
-    state = opened.state
-    assert state.scene is SCENES["blobs.ply"]
-    assert state.opening is None
-    assert state.camera_index == 0
-    assert_allclose(
-        state.view.camera(160, 120).world_to_camera, state.scene.cameras[0].world_to_camera, atol=1e-9
-    )
 
 
 def test_unusable_gaussians_are_counted(viewer):
@@ -112,27 +100,6 @@ def test_of_dropped_files_the_scene_is_opened_and_what_is_none_is_said(viewer, n
     assert viewer.state.path.name == opened_name
     assert [path.name for path in viewer.state.scenes] == [opened_name]
     assert errors(viewer) == ([said] if said else [])
-
-
-def test_the_first_run_says_that_it_compiles(viewer, monkeypatch):
-    seen = []
-
-    def warm_up(scene, backend, progress):
-        say_compiling(progress)
-        seen.append(viewer.worker.current)
-
-    monkeypatch.setattr("langsplat_core.compiled.is_compiled", lambda source: False)
-    monkeypatch.setattr("langsplat_viewer.actions.opening.is_compiled", lambda source: False)
-    viewer.services = replace(viewer.services, warm_up=warm_up)
-    labels, submit = [], viewer.worker.submit
-    monkeypatch.setattr(
-        viewer.worker, "submit", lambda label, *rest: labels.append(label) or submit(label, *rest)
-    )
-    opening.open_scene(viewer, Path("blobs.ply"))
-    settle(viewer)
-    assert seen == [("compiling the drawing kernels, once per installation (half a minute)", 0.7)]
-    assert "compiling the search kernels, once per installation (half a minute)" in labels
-    assert errors(viewer) == []
 
 
 # Several scenes to switch between, without a window.

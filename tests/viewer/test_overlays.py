@@ -96,15 +96,6 @@ def test_the_nearest_segment():
     assert overlays.nearest_segment(segments[:0], (0.0, 0.0)) == (-1, math.inf)
 
 
-@pytest.mark.parametrize("up", [(0, -1, 0), (0, 0, 1), (0.1, -0.9, 0.4)])
-def test_the_frame_is_a_right_handed_one_with_up_as_up(up):
-    up = np.array(up, float) / np.linalg.norm(up)
-    frame = frame_of(up)
-    np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(frame[1], up)
-    assert np.linalg.det(frame) == pytest.approx(1)
-
-
 @pytest.mark.parametrize(
     ("length", "rounded"), [(1, 1), (1.3, 1), (1.5, 2), (0.031, 0.02), (4, 5), (88, 100), (7e-9, 5e-9)]
 )

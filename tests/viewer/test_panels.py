@@ -18,13 +18,10 @@ from langsplat_viewer.files.preferences import (
     MOST_RECENT,
     SCALES,
     Preferences,
-    fitting_scale,
     load_preferences,
-    preferences_folder,
     save_preferences,
     with_recent,
 )
-from langsplat_viewer.panels import toolbar
 from langsplat_viewer.panels.layout import PANELS
 from langsplat_viewer.panels.navigation import chord
 from langsplat_viewer.panels.style import elided
@@ -229,20 +226,10 @@ def test_recent_scenes_are_not_listed_twice_nor_without_end():
     assert preferences.recent[:2] == ("/5.ply", f"/{MOST_RECENT + 2}.ply")
 
 
-def test_they_lie_in_the_platforms_folder(monkeypatch, tmp_path):
-    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
-    assert preferences_folder().name == "langsplat-viewer"
-
-
 def test_looks_are_chosen_within_limits(viewer):
     settings.set_theme(viewer, "light")
     settings.set_ui_scale(viewer, 99.0)
     assert viewer.state.preferences == replace(Preferences(), theme="light", ui_scale=SCALES[1])
-
-
-@pytest.mark.parametrize(("height", "scale"), [(0, 1.0), (720, 1.0), (1080, 1.0), (1440, 1.25), (2160, 2.0)])
-def test_letters_fit_the_screen(height, scale):
-    assert fitting_scale(height) == scale
 
 
 # Letters beyond Latin.
@@ -259,11 +246,3 @@ def test_a_system_without_fonts_is_no_error(monkeypatch, platform):
     monkeypatch.setattr(fonts.sys, "platform", platform)
     monkeypatch.setattr(fonts, "FOLDERS", {})
     assert [path.name for path in fonts.fallbacks()] == ["DejaVuSans.ttf", "NotoEmoji-Regular.ttf"]
-
-
-@pytest.mark.parametrize(("room", "columns"), [(1000.0, 1), (125.0, 2), (60.0, 3), (10.0, 6)])
-def test_buttons_of_the_toolbar_stay_apart_and_inside(room, columns):
-    places = toolbar.layout([1, 3, 2], room, 20.0, 5.0)
-    assert len(set(places)) == 6
-    assert len({x for x, _ in places}) == columns
-    assert all(y + 20 <= max(room, 20) for _, y in places)

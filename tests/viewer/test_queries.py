@@ -15,7 +15,7 @@ from langsplat_core.semantics.store import ImageFeatures
 from langsplat_viewer.actions import opening, queries, settings, undoing
 from langsplat_viewer.files.browsing import QuerySet, SavedQuery, read_queries, write_queries
 from langsplat_viewer.output.headless import describe
-from langsplat_viewer.panels.search import BINS, hint, histogram
+from langsplat_viewer.panels.search import hint
 from langsplat_viewer.viewer import Services
 from tests.support.fakes import CENTRES, FakeEncoder, as_trained, axis, blob_scene, calibrated_for, language
 from tests.support.windowless import SCENES, errors, load, settle
@@ -156,26 +156,6 @@ def test_queries_are_combined_as_the_grammar_reads_them(opened):
     assert [query.result.found for query in (both, either, only)] == [True] * 3
     assert either.result.members.sum() == 240 > only.result.members.sum() == 120
     assert (only.result.members == mug.result.members).all()
-
-
-def test_one_heat_scale_for_all_answers(opened):
-    for word in ("mug", "book"):
-        queries.ask(opened, word)
-    settle(opened)
-    settings.set_picture(opened, replace(opened.state.picture, heat_scale=(0.4, 0.7)))
-    (pane,) = opened.state.panes()
-    assert pane.ranges == ((0.4, 0.7), (0.4, 0.7))
-
-
-def test_level_applies_to_every_query(opened):
-    queries.ask(opened, "plant")
-    settle(opened)
-    assert opened.state.queries[0].result.level == 2
-    key = opened.state.panes()
-    queries.set_level(opened, "part")
-    settle(opened)
-    assert opened.state.queries[0].result.level == 1
-    assert opened.state.panes() != key
 
 
 def test_the_box_is_emptied_by_a_search_and_by_nothing_else(opened):
@@ -392,14 +372,6 @@ def test_a_broken_set_is_one_line(tmp_path, change):
     with pytest.raises(InputError, match="no set of queries") as caught:
         read_queries(path)
     assert str(caught.value).isprintable()
-
-
-def test_the_histogram_counts_every_gaussian(asked):
-    low, high, counts = histogram(asked.state.queries[0].result)
-    even = asked.state.queries[0].result.even
-    assert (low, high) == (even.min(), max(even.max(), low + 1e-3))
-    assert len(counts) == BINS
-    assert np.expm1(counts.astype(np.float64)).sum() == pytest.approx(360, rel=1e-5)
 
 
 # When the viewer loads the text encoder, and what it says if that fails.

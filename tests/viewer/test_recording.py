@@ -317,9 +317,3 @@ def test_an_unwritable_folder_is_one_line(opened, tmp_path):
     assert saving.save_view(opened, blocked) is None
     assert len(errors(opened)) == 2
     assert all("not saved" in text for text in errors(opened))
-
-
-def test_nothing_to_save_before_a_scene_is_open(viewer, tmp_path):
-    assert saving.save_picture(viewer, tmp_path) is None
-    assert saving.save_view(viewer, tmp_path) is None
-    assert len(errors(viewer)) == 2

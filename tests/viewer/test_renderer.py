@@ -24,7 +24,6 @@ from langsplat_viewer.rendering.renderer import (
     ArraySource,
     GlRenderer,
     GlSource,
-    LastView,
     render_image,
     suits_opengl,
 )
@@ -189,26 +188,6 @@ def test_panes_of_one_camera_share_one_pass(renderer, passes):
         assert len(passes) == 1
     renderer.read(request_for("latent", split=Split("levels")).seen_by(random_camera(9)))
     assert len(passes) == 2
-
-
-class CountingRasterizer:
-    name = "counting"
-
-    def __init__(self) -> None:
-        self.views = 0
-
-    def view(self, gaussians, camera, settings=None):
-        self.views += 1
-        return self.views
-
-
-def test_a_view_is_kept_while_the_render_key_is_the_same():
-    scene = blob_scene()
-    views = LastView(CountingRasterizer())
-    keys = [RenderKey(scene, scene.cameras[place]) for place in (0, 0, 1, 1, 0)]
-    assert [views.of(key) for key in keys] == [1, 1, 2, 2, 3]
-    views.forget()
-    assert views.of(keys[0]) == 4
 
 
 def test_the_same_gaussians_with_another_mark_of_antialiasing_are_projected_anew(tmp_path):
