@@ -199,15 +199,6 @@ def test_a_calibrated_scene_gives_verdicts_with_probability(viewer, monkeypatch,
     assert describe(result).startswith(said)
 
 
-def test_what_was_found_is_told_apart(opened):
-    for phrase in ("mug", "mug or plant"):
-        queries.ask(opened, phrase)
-    settle(opened)
-    one, both = opened.state.queries
-    assert (len(one.things), len(both.things)) == (1, 2)
-    assert np.linalg.norm(one.things[0].centre - CENTRES[0]) < 0.3
-
-
 # Evidence.
 
 

@@ -430,15 +430,6 @@ def test_a_broken_scene_after_discarding_loses_nothing(opened):
     assert opened.state.selection.is_unsaved
 
 
-def test_the_window_closes_at_once_or_asks(opened):
-    without_plant(opened)
-    assert not selecting.may_close(opened)
-    assert opened.state.selection.leaving.to == "the window closes"
-    selecting.stay(opened)
-    undoing.undo(opened)
-    assert selecting.may_close(opened)
-
-
 def test_a_process_that_has_to_end_saves_what_is_not(opened, tmp_path):
     without_plant(opened)
     selecting.end(opened, tmp_path)
