@@ -74,7 +74,7 @@ def check_depths(
 
 
 DEPTHS = {
-    "one": [1.0],
+    **{f"{n} points": RNG.uniform(size=n) for n in (0, 1, 255, 256, 257, TILE - 1, TILE, TILE + 1)},
     "two": [1.0, 2.0],
     "two the other way": [2.0, 1.0],
     "all equal": np.full(TILE + 3, 0.7),
@@ -94,11 +94,6 @@ DEPTHS = {
 @pytest.mark.parametrize("name", DEPTHS)
 def test_order_is_that_of_a_stable_sort(gl, sorter, name):
     check_depths(gl, sorter, np.asarray(DEPTHS[name]))
-
-
-@pytest.mark.parametrize("count", [0, 1, 255, 256, 257, TILE - 1, TILE, TILE + 1])
-def test_any_number_of_points(gl, sorter, count):
-    check_depths(gl, sorter, np.random.default_rng(count).uniform(size=count))
 
 
 @pytest.mark.parametrize(

@@ -498,32 +498,19 @@ def test_first_guess(fine_ms, plain, with_merged):
     assert pace.is_slow == (fine_ms > MOVING_BUDGET)
 
 
-def test_a_level_that_was_too_slow_is_left():
-    pace = after((FINE, 75))
-    assert pace.level(True) == HALF
-    pace.drew(HALF, 60)  # hardly faster: projecting takes as long for few pixels
-    assert pace.level(True) == MERGED
-
-
-def test_one_slow_picture_among_fast_ones_is_forgiven():
-    pace = after((FINE, 75), (HALF, 10), (HALF, 10), (HALF, 30))
-    assert pace.level(True) == HALF
-
-
-def test_what_was_learned_follows_the_fine_picture():
-    """The same scene on a machine that became free: everything takes a quarter."""
-    pace = after((FINE, 75), (HALF, 60))
-    assert pace.level(True) != HALF
-    pace.drew(FINE, 19)
-    assert pace.level(True) == FINE
-
-
-def test_better_is_tried_again_after_some_rests():
-    pace = after((FINE, 75), (HALF, 35))
-    assert pace.level(True) == MERGED
-    for _ in range(3):
-        pace.drew(FINE, 75)
-    assert pace.level(True) == HALF
+@pytest.mark.parametrize(
+    ("pictures", "level"),
+    [
+        ([(FINE, 75)], HALF),
+        ([(FINE, 75), (HALF, 60)], MERGED),  # hardly faster: projecting takes as long for few pixels
+        ([(FINE, 75), (HALF, 10), (HALF, 10), (HALF, 30)], HALF),  # one slow picture is forgiven
+        ([(FINE, 75), (HALF, 60), (FINE, 19)], FINE),  # on a machine that became free
+        ([(FINE, 75), (HALF, 35)], MERGED),
+        ([(FINE, 75), (HALF, 35), *3 * [(FINE, 75)]], HALF),  # better is tried again after some rests
+    ],
+)
+def test_what_was_measured_chooses_the_level(pictures, level):
+    assert after(*pictures).level(True) == level
 
 
 def test_other_scenes_take_as_long_as_they_are_large():

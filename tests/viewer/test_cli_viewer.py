@@ -37,6 +37,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     save_scene(tmp_path / "edited.ply", Scene(gaussians))
     sidecar = companion_path(tmp_path / "blobs.ply", language.SUFFIX)
     companion_path(tmp_path / "edited.ply", language.SUFFIX).write_bytes(sidecar.read_bytes())
+    save_scene(tmp_path / "nothing.ply", Scene(gaussians.take(np.zeros(len(gaussians), bool))))
     (tmp_path / "broken.json").write_text('[{"width": 12')
     (tmp_path / "empty.json").write_text("[]")
     monkeypatch.chdir(tmp_path)
@@ -182,6 +183,7 @@ def test_a_scene_without_cameras_is_framed(run_viewer, folder):
         (["."], "is a folder"),
         (["x" * 5000 + ".ply"], "cannot be opened"),
         (["truncated.ply"], "truncated.ply: truncated"),
+        (["nothing.ply"], "the scene holds no Gaussians"),
         (["edited.ply", "--query", "mug"], "edited.langsplat.safetensors"),
         (["blobs.ply", "--query", "sofa"], "'sofa'"),
         (["blobs.ply", "--query", " "], "empty"),

@@ -14,6 +14,7 @@ from langsplat_core.scene import Scene
 from langsplat_viewer.actions import filming, opening, queries, settings, viewpoint
 from langsplat_viewer.files.browsing import MOST_LISTED, Entry, list_folder
 from langsplat_viewer.files.watching import Watch, stamps
+from langsplat_viewer.options import say_compiling
 from langsplat_viewer.panels.scene import has_several
 from langsplat_viewer.rendering.depth import UNCLIPPED, Clip
 from tests.support.fakes import blob_scene
@@ -107,6 +108,27 @@ def test_of_dropped_files_the_scene_is_opened_and_what_is_none_is_said(viewer, n
 BLOBS, PLAIN, BARE = (Path(f"{name}.ply").absolute() for name in ("blobs", "plain", "bare"))
 
 
+def test_the_first_run_says_that_it_compiles(viewer, monkeypatch):
+    seen = []
+
+    def warm_up(scene, backend, progress):
+        say_compiling(progress)
+        seen.append(viewer.worker.current)
+
+    monkeypatch.setattr("langsplat_core.compiled.is_compiled", lambda source: False)
+    monkeypatch.setattr("langsplat_viewer.actions.opening.is_compiled", lambda source: False)
+    viewer.services = replace(viewer.services, warm_up=warm_up)
+    labels, submit = [], viewer.worker.submit
+    monkeypatch.setattr(
+        viewer.worker, "submit", lambda label, *rest: labels.append(label) or submit(label, *rest)
+    )
+    opening.open_scene(viewer, Path("blobs.ply"))
+    settle(viewer)
+    assert seen == [("compiling the drawing kernels, once per installation (half a minute)", 0.7)]
+    assert "compiling the search kernels, once per installation (half a minute)" in labels
+    assert errors(viewer) == []
+
+
 @pytest.fixture
 def three(viewer):
     """Three scenes were dropped; the first is shown."""
@@ -182,15 +204,6 @@ def test_nothing_of_a_scene_that_was_left_is_kept_in_memory(three):
     (visit,) = three.visits.values()
     assert [query.result for query in visit.queries] == [None]
     assert not any(isinstance(value, np.ndarray) and value.size > 16 for value in vars(visit).values())
-
-
-def test_steps_go_round(three):
-    seen = []
-    for by in (1, 1, 1, -1):
-        opening.step_scene(three, by)
-        settle(three)
-        seen.append(three.state.path.absolute())
-    assert seen == [PLAIN, BARE, BLOBS, BARE]
 
 
 def test_a_scene_is_taken_off_the_list(three):

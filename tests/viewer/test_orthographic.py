@@ -1,13 +1,15 @@
 """The orthographic view through the actions: what keeps it, what leaves it, what it changes elsewhere."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from langsplat_core.scene import LEVELS
-from langsplat_viewer.actions import filming, queries, settings, viewpoint
+from langsplat_viewer.actions import filming, opening, queries, settings, viewpoint
 from langsplat_viewer.actions.opening import standing_at
-from langsplat_viewer.camera.controls import from_side
+from langsplat_viewer.camera.controls import from_side, zoom
 from langsplat_viewer.files.flights import Shelf
 from langsplat_viewer.panels.overlays import pointed_figures
 from langsplat_viewer.state import GLIDE_SECONDS
@@ -50,6 +52,21 @@ def test_moving_keeps_it(flat, go):
     arrive(flat)
     assert flat.state.view is not before
     assert flat.state.view.orthographic
+
+
+def test_the_opening_view_of_a_scene_without_cameras_holds_all_of_it(viewer):
+    opening.open_scene(viewer, Path("bare.ply"))
+    settle(viewer)
+    settings.resize(viewer, *SIZE)
+    viewpoint.toggle_orthographic(viewer)
+    viewpoint.move(viewer, lambda view: zoom(view, 0.1, 0.0))
+    viewpoint.reset_view(viewer)
+    arrive(viewer)
+    sample = viewer.state.extent.sample
+    places = pixels(viewer, sample.points)
+    inside = (places >= 0).all(1) & (places <= SIZE).all(1)
+    assert viewer.state.view.orthographic
+    assert sample.weights[inside].sum() > 0.98 * sample.weights.sum()
 
 
 def test_a_training_camera_is_seen_with_perspective(flat):

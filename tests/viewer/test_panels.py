@@ -22,6 +22,7 @@ from langsplat_viewer.files.preferences import (
     save_preferences,
     with_recent,
 )
+from langsplat_viewer.panels import toolbar
 from langsplat_viewer.panels.layout import PANELS
 from langsplat_viewer.panels.navigation import chord
 from langsplat_viewer.panels.style import elided
@@ -246,3 +247,11 @@ def test_a_system_without_fonts_is_no_error(monkeypatch, platform):
     monkeypatch.setattr(fonts.sys, "platform", platform)
     monkeypatch.setattr(fonts, "FOLDERS", {})
     assert [path.name for path in fonts.fallbacks()] == ["DejaVuSans.ttf", "NotoEmoji-Regular.ttf"]
+
+
+@pytest.mark.parametrize(("room", "columns"), [(1000.0, 1), (125.0, 2), (60.0, 3), (10.0, 6)])
+def test_buttons_of_the_toolbar_stay_apart_and_inside(room, columns):
+    places = toolbar.layout([1, 3, 2], room, 20.0, 5.0)
+    assert len(set(places)) == 6
+    assert len({x for x, _ in places}) == columns
+    assert all(y + 20 <= max(room, 20) for _, y in places)

@@ -15,7 +15,7 @@ from langsplat_core.semantics.store import ImageFeatures
 from langsplat_viewer.actions import opening, queries, settings, undoing
 from langsplat_viewer.files.browsing import QuerySet, SavedQuery, read_queries, write_queries
 from langsplat_viewer.output.headless import describe
-from langsplat_viewer.panels.search import hint
+from langsplat_viewer.panels.search import BINS, hint, histogram
 from langsplat_viewer.viewer import Services
 from tests.support.fakes import CENTRES, FakeEncoder, as_trained, axis, blob_scene, calibrated_for, language
 from tests.support.windowless import SCENES, errors, load, settle
@@ -366,6 +366,14 @@ def test_a_broken_set_is_one_line(tmp_path, change):
 
 
 # When the viewer loads the text encoder, and what it says if that fails.
+
+
+def test_the_histogram_counts_every_gaussian(asked):
+    low, high, counts = histogram(asked.state.queries[0].result)
+    even = asked.state.queries[0].result.even
+    assert (low, high) == (even.min(), max(even.max(), low + 1e-3))
+    assert len(counts) == BINS
+    assert np.expm1(counts.astype(np.float64)).sum() == pytest.approx(360, rel=1e-5)
 
 
 def test_an_unexpected_error_of_the_encoder_is_one_line_too(viewer):

@@ -13,6 +13,7 @@ from langsplat_viewer import marks
 from langsplat_viewer.actions import opening, queries, selecting, settings, undoing, viewpoint
 from langsplat_viewer.actions.selecting import take
 from langsplat_viewer.camera.controls import from_camera
+from langsplat_viewer.marks import Drawn, Stroke, outlines
 from tests.support.fakes import CENTRES, COLOURS, PER_BLOB
 from tests.support.marks_and_flights import blob, marked, marks_of
 from tests.support.windowless import SCENES, FakeSurface, errors, settle
@@ -296,6 +297,31 @@ def test_escape_gives_up_the_stroke_then_the_tool_and_help_before_both(front):
 
 
 # Saving what is selected, the rest and the scene; and what is asked before deletions are lost.
+
+
+def drawn(tool, path, centre=None) -> Drawn:
+    camera = look_at(np.array([0, 0, -5.0]), np.zeros(3), np.array([0, -1.0, 0]), SIZE)
+    return Drawn(tool, Stroke(tuple(path), centre), camera, 0.03, 0.5)
+
+
+def test_outlines_are_what_is_enclosed():
+    (rectangle,) = outlines(drawn("rectangle", [(0.2, 0.3), (0.6, 0.5)]))
+    assert rectangle.tolist() == [[0.2, 0.3], [0.6, 0.3], [0.6, 0.5], [0.2, 0.5], [0.2, 0.3]]
+    (lasso,) = outlines(drawn("lasso", [(0.2, 0.3), (0.6, 0.5), (0.1, 0.9)]))
+    assert lasso[0].tolist() == lasso[-1].tolist()
+    (brush,) = outlines(drawn("brush", [(0.2, 0.3), (0.6, 0.5)]))
+    assert len(brush) == 2
+    assert outlines(drawn("thing", [(0.2, 0.3)])) == []
+
+
+def test_the_circle_of_a_sphere_goes_through_the_mouse():
+    end = (0.6, 0.5)
+    (circle,) = outlines(drawn("sphere", [(0.5, 0.5), end], (0.0, 0.0, 0.0)))
+    np.testing.assert_allclose(np.abs(circle - end).max(1).min(), 0, atol=1e-9)
+    edges = outlines(drawn("box", [(0.5, 0.5), end], (0.0, 0.0, 0.0)))
+    assert len(edges) == 12
+    behind = drawn("box", [(0.5, 0.5)], (0.0, 0.0, -5.0))  # the eye is inside
+    assert len(outlines(behind)) < 12
 
 
 def names_in(folder: Path) -> list[str]:
