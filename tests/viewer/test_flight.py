@@ -19,7 +19,9 @@ from langsplat_viewer.camera.flight import (
     frame_times,
     pose_at,
     pose_of,
+    stretched,
     turntable,
+    with_keyframe,
 )
 from langsplat_viewer.files.flights import MOST, read_flight, write_flight
 from tests.support.fakes import blob_scene
@@ -151,6 +153,15 @@ def test_times_must_rise():
     for keys in ((), (key(1), key(1)), (key(2), key(1))):
         with pytest.raises(ValueError, match="keyframe"):
             Flight(keys)
+
+
+def test_keyframes_are_added_in_order_and_stretched():
+    keys = with_keyframe(with_keyframe((key(2),), key(0.5)), key(2, (1, 1, 1)))
+    assert [k.seconds for k in keys] == [0.5, 2]
+    assert_allclose(keys[1].pose.position, 1)
+    assert [k.seconds for k in stretched(keys, 6)] == [1.5, 6]
+    assert stretched((), 3) == ()
+    assert [k.seconds for k in stretched((key(0),), 3)] == [0]
 
 
 def test_a_turntable_goes_once_around_as_a_drag_does():

@@ -19,6 +19,7 @@ from langsplat_viewer.commands import BUTTONS, COMMANDS, OVERLAY_TITLES, matchin
 from langsplat_viewer.files.preferences import FILE_NAME, load_preferences, save_preferences
 from langsplat_viewer.marks import Marks
 from langsplat_viewer.output import film, saving
+from langsplat_viewer.panels.overlays import STEPS, bar_colours
 from langsplat_viewer.panels.view import compared_name
 from langsplat_viewer.rendering.depth import Clip
 from langsplat_viewer.rendering.renderer import ArrayRenderer, GlRenderer
@@ -299,6 +300,14 @@ def test_panes_are_joined_as_they_are_shown():
 
 
 # The edited scene.
+
+
+def test_colour_bars_end_where_the_image_does():
+    alone, own, weak = bar_colours(1, 1.0, True), bar_colours(1, 1.0, False), bar_colours(1, 0.5, False)
+    assert alone.shape == own.shape == (STEPS, 3)
+    assert not own[0].any()
+    np.testing.assert_allclose(weak[-1], 0.5 * own[-1])
+    assert alone[-1, 0] > alone[-1, 2]  # red is hot
 
 
 def test_hidden_and_deleted_ones_are_left_out_with_their_rows_of_the_layers():
