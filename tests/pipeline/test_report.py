@@ -13,6 +13,7 @@ from langsplat_core.pipeline.forecast import (
     Forecast,
     Stage,
     count_photographs,
+    forecast_in_words,
     plan,
 )
 from langsplat_core.pipeline.report import (
@@ -165,6 +166,29 @@ def test_costs_grow_with_what_is_asked_for():
     named = {stage.name: stage.seconds for stage in plan(full, 20, "points", True)}
     assert named["Gaussians"] == 0
     assert named["photographs"] < 5
+
+
+def test_masks_cost_what_points_crops_and_weights_do(tmp_path: Path):
+    def cost(sam: str, *, on_gpu: bool = False, clip: str = "demo", **settings: int) -> float:
+        masks = MaskConfig(sam=sam, **settings)
+        config = replace(TrainConfig(), masks=masks, clip=replace(TrainConfig().clip, model=clip))
+        stages = plan(config, 1, "points", True, on_gpu)
+        return {stage.name: stage.seconds for stage in stages}["masks and vectors"]
+
+    huge, base = "facebook/sam-vit-huge", "facebook/sam-vit-base"
+    few, many = (cost(base, points_per_side=side) for side in (8, 32))
+    assert many > 4 * few
+    assert cost(huge, points_per_side=8) > 3 * few
+    assert cost(base, points_per_side=8, crop_layers=1) == pytest.approx(5 * few, rel=0.15)
+    tiny, large = (cost(f"facebook/sam2.1-hiera-{size}", points_per_side=8) for size in ("tiny", "large"))
+    assert tiny < large < few * 2
+    assert cost(huge, on_gpu=True) < cost(huge) / 10
+    assert cost(base, clip="openai/clip-vit-large-patch14") > cost(base, clip="any/other") + 100
+    file = tmp_path / "mine.pth"
+    with file.open("wb") as weights:
+        weights.truncate(4 * 94_000_000)  # a hole: no byte is written
+    assert cost(str(file), points_per_side=8) == pytest.approx(few)
+    assert forecast_in_words(STAGES, on_gpu=True).startswith("about 2 min on two CPU cores and a GPU (")
 
 
 def test_photographs_are_counted_where_they_lie(tmp_path: Path):
