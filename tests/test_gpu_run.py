@@ -1,7 +1,6 @@
 """`make gpu`: its sections over the twin of gsplat's kernels, and its runner where there is no GPU."""
 
 import importlib
-import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -155,21 +154,6 @@ def test_every_section_has_a_function_and_a_row_in_the_docs(runner: ModuleType, 
     for name, limit in runner.SECTIONS.items():
         assert callable(getattr(sections, f"measure_{name}"))
         assert f"| {name} | {limit} |" in page
-
-
-@pytest.mark.parametrize(
-    ("words", "wanted", "unwanted"),
-    [
-        ([], "gpu/requirements.txt", "--no-index"),
-        (["WHEELS=wheels"], "--no-index --find-links wheels", "--system-site-packages"),
-        (["SITE=1", "ONLY=raster"], "gpu/beside_torch.txt", "gpu/requirements.txt"),
-    ],
-)
-def test_make_gpu(words: list[str], wanted: str, unwanted: str) -> None:
-    done = subprocess.run(["make", "-n", "gpu", *words], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert wanted in done.stdout
-    assert unwanted not in done.stdout
-    assert "packaging/gpu/run.py" in done.stdout
 
 
 def test_the_wheels_are_those_of_the_constraints() -> None:

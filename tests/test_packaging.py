@@ -7,9 +7,7 @@ from configparser import ConfigParser
 from pathlib import Path
 from xml.etree import ElementTree
 
-import numpy as np
 import pytest
-from PIL import Image
 
 from langsplat_core.io.scenes import FORMATS
 from langsplat_viewer.viewer import TrainingRequest, command
@@ -51,13 +49,6 @@ def test_every_type_of_the_entry_is_described_and_every_kind_of_scene_has_one():
     patterns = {pattern for some in globs.values() for pattern in some}
     assert {f"*{row.suffix}" for row in FORMATS} <= patterns
     assert {row.mime for row in FORMATS} == set(globs)
-
-
-def test_the_icon_is_a_square_with_a_transparent_corner_and_a_full_middle():
-    icon = np.asarray(Image.open(DESKTOP / f"{desktop_entry()['Icon']}.png"))
-    assert icon.shape == (256, 256, 4)
-    assert icon[0, 0, 3] == 0
-    assert icon[128, 128, 3] > 128
 
 
 def test_a_one_folder_build_trains_by_the_program_beside_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):

@@ -14,9 +14,7 @@ from tests.benchmarks.phrases import (
     CONSTRUCTIONS,
     Case,
     InventoryScore,
-    PhraseScore,
     cases,
-    phrase_table,
     score_inventory,
     things_in,
 )
@@ -62,28 +60,6 @@ def test_every_case_has_structure_and_a_truth_that_says_so(room, found):
         assert set(case.ids) | set(case.without) <= known
         # "picture of a cat" is a picture, and a part that is in no list is asked whole
         assert "part" in case.construction or not isinstance(parse(case.text), Atom)
-
-
-def test_what_is_taken_away_is_no_longer_true():
-    case = Case("thing without part", "mug without its handle", "mug", (2,), (5,))
-    labels = np.array([[[0, 5, 9]], [[1, 5, 9]], [[2, 2, 3]]])
-    np.testing.assert_array_equal(case.mask(labels), [[True, False, False]])
-
-
-def test_the_table_pairs_whole_and_composed():
-    row = PhraseScore(
-        "A and B", "mug and book", "whole", 1, True, False, (0.25, 0.75), (True, False), 0.5, 0.1
-    )
-    absent = PhraseScore("A and B", "mug and oak", "whole", 1, False, False, (), (), float("nan"), 0.1)
-    rows = [
-        row,
-        absent,
-        PhraseScore("A and B", "mug and book", "composed", 1, True, True, (1.0, 1.0), (True, True), 1.0, 0.1),
-    ]
-    assert (
-        "| A and B | 1 | 2 | 50.0 / 100.0 | 50.0 / 100.0 | 50.0 / 100.0 | 0.0 / 100.0 | 100.0 / - |"
-        in phrase_table(rows)
-    )
 
 
 TRUTH = {

@@ -12,9 +12,8 @@ from langsplat_core.errors import InputError
 from langsplat_core.progress import silent
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
-from langsplat_core.scene import LanguageField, Scene
 from langsplat_core.semantics.masks import label_maps
-from langsplat_core.semantics.relevancy import latent_relevancy, relevancy
+from langsplat_core.semantics.relevancy import relevancy
 from langsplat_core.semantics.store import ImageFeatures
 from tests.benchmarks.clip_geometry import OTHER, PROMPTS, ClipGeometry, read_geometry
 from tests.benchmarks.lifting import (
@@ -39,7 +38,6 @@ from tests.benchmarks.scoring import (
     found_rate,
 )
 from tests.support.fakes import PER_BLOB, FakeEncoder, blob_scene, blobs, cameras
-from tests.support.file_samples import random_codec
 from tests.support.scenes import random_camera, random_gaussians
 
 THINGS = [3 * letter for letter in "abcdefghijklmnopqrtuvwxyz"]
@@ -102,26 +100,6 @@ def test_unknown_phrases_are_named_not_asked():
     asked = ask(QueryEngine(blob_scene(), lambda _: FakeEncoder()), ["mug", "red cactus", "mug"])
     assert asked.unknown == ("red cactus",)
     assert found_rate(asked, ["mug", "red cactus"]) == (1.0, 1)
-
-
-@pytest.fixture(scope="module")
-def random_scene() -> Scene:
-    """400 Gaussians with random latents of a random autoencoder."""
-    rng = np.random.default_rng(3)
-    gaussians = random_gaussians(400, 3)
-    latents = unit(rng.normal(size=(3, 400, 3))).astype(np.float32)
-    canonical = unit(rng.normal(size=(4, 16))).astype(np.float32)
-    field = LanguageField(latents, np.ones((3, 400), np.float32), random_codec("autoencoder"), canonical, "x")
-    return Scene(gaussians, field)
-
-
-def test_an_exact_engine_decodes_every_gaussian(random_scene):
-    vector = unit(np.random.default_rng(5).normal(size=16)).astype(np.float32)
-    field = random_scene.language
-    want = latent_relevancy(field.codec, field.latents.reshape(-1, 3), vector[None], field.canonical)
-    exact = QueryEngine(random_scene, exact=True).relevancy(vector)
-    np.testing.assert_allclose(exact, want.reshape(3, 400), atol=1e-6)
-    assert np.abs(QueryEngine(random_scene).relevancy(vector) - exact).max() > 1e-6
 
 
 class Speller:

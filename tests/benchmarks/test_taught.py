@@ -2,8 +2,7 @@
 
 from dataclasses import replace
 
-from tests.benchmarks.__main__ import parse
-from tests.benchmarks.taught import Taught, TaughtRow, taught_table
+from tests.benchmarks.taught import TaughtRow, taught_table
 
 ROW = TaughtRow("clutter", 1, "mug", 1, True, False, True, 0.5, True, 0.8)
 ROWS = [
@@ -29,9 +28,3 @@ def test_shares_are_means_over_rooms_and_only_answers_that_are_accepted_can_be_w
     assert [cell.split()[0] for cell in kind[4:]] == ["83.3", "75.0", "66.7", "56.7", "75.0"]
     assert [cell.split()[0] for cell in colour[3:]] == ["1", "100.0", "0.0", "0.0", "20.0", "75.0"]
     assert taught_table([ROW]).splitlines()[2].endswith(" - |")
-
-
-def test_the_report_is_a_command():
-    command = parse(["taught", "--seeds", "7", "8", "--examples", "2"])
-    assert isinstance(command, Taught)
-    assert command.examples == (2,)

@@ -120,29 +120,6 @@ def test_doctor_says_what_draws_and_what_encodes(capsys):
     assert "demo: works" in said["text"]
 
 
-QUERY = """
-import sys
-from langsplat_core.cli.app import entry
-sys.argv = ["langsplat", "query", {scene!r}, "teddy", "red mug"]
-try:
-    entry()
-except SystemExit as stop:
-    assert not stop.code, stop.code
-print([name for name in ("torch", "transformers", "open3d") if name in sys.modules])
-"""
-
-
-@pytest.mark.long
-def test_asking_the_bundled_scene_imports_no_torch():
-    from importlib.resources import files
-
-    scene = str(files("langsplat_assets") / "demo" / "scene.ply")
-    code = QUERY.format(scene=scene)
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.startswith("teddy: found")
-    assert done.stdout.splitlines()[-1] == "[]"
-
-
 @pytest.mark.long
 def test_demo_renders_the_bundled_scene(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(demo, "PICTURES", {"gift.png": ("--query", "blue gift")})

@@ -13,7 +13,6 @@ from langsplat_core.arrays import unit
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
 from langsplat_core.cli.scenes import Convert
-from langsplat_core.errors import InputError
 from langsplat_core.io import language
 from langsplat_core.io.language import write_language
 from langsplat_core.io.scenes import companion_path, load_scene, save_scene
@@ -53,21 +52,6 @@ def test_scenes_of_one_name_keep_their_own_sidecars(tmp_path):
     save_scene(tmp_path / "a.spz", replace(full_scene(), language=None))
     assert load_scene(tmp_path / "a.spz").language is None
     assert load_scene(tmp_path / "a.ply").language is not None
-
-
-def test_a_sidecar_of_other_gaussians_is_refused_and_can_be_rematched(tmp_path):
-    save_scene(tmp_path / "a.ply", full_scene())
-    convert(tmp_path / "a.ply", tmp_path / "a.spz")
-    sidecar = companion_path(tmp_path / "a.spz", language.SUFFIX)
-    sidecar.write_bytes(companion_path(tmp_path / "a.ply", language.SUFFIX).read_bytes())
-    opened = load_scene(tmp_path / "a.spz")
-    assert opened.language is None
-    assert "other positions" in opened.unread[0]
-    with pytest.raises(InputError, match="mend or remove it first"):
-        convert(tmp_path / "a.spz", tmp_path / "c.spz")
-    got = convert(tmp_path / "a.spz", tmp_path / "b.spz", sidecar)
-    assert got.language is not None
-    np.testing.assert_array_equal(got.language.latents, full_scene().language.latents)
 
 
 def test_rematch_keeps_cameras_mark_and_extras(tmp_path):

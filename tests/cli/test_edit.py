@@ -7,19 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from langsplat_core.cli.app import parse
-from langsplat_core.cli.run import main
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.scene import Scene, TaughtWord
 from langsplat_core.scene.tree import tree_of_wholes
+from tests.support.commands import run
 from tests.support.file_samples import random_field
 from tests.support.scenes import random_camera, random_gaussians
 
 N = 60
-
-
-def run(*words: object) -> int:
-    return main("langsplat", lambda: parse([str(word) for word in words]))
 
 
 @pytest.fixture

@@ -12,8 +12,6 @@ import pytest
 from plyfile import PlyData
 
 from langsplat_core.cli import describe, query
-from langsplat_core.cli.app import parse
-from langsplat_core.cli.run import main
 from langsplat_core.cli.scenes import Scale
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.scenes import load_scene, save_scene
@@ -21,6 +19,7 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import Reading, Scene
 from langsplat_core.semantics.encoder import OPEN_MODEL
+from tests.support.commands import refusal, run
 from tests.support.fakes import (
     CENTRES,
     NAMES,
@@ -51,10 +50,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for module in (query, describe):
         monkeypatch.setattr(module, "load_text_encoder", lambda name: FakeEncoder())
     return tmp_path
-
-
-def run(*words: str) -> int:
-    return main("langsplat", lambda: parse(list(words)))
 
 
 def lines(capsys, *words: str) -> list[str]:
@@ -433,9 +428,5 @@ def test_words_for_a_gaussian_a_thing_and_a_pixel(described, capsys):
 def test_bad_input_is_one_line_and_nothing_is_written(described, capsys, words, message):
     before = sorted(path.name for path in described.iterdir())
     out = ("--out", "b.ply") if words.startswith("select") and "--out" not in words else ()
-    assert run(*words.split(), *out) == 2
-    said = capsys.readouterr()
-    assert said.out == ""
-    (line,) = (line for line in said.err.splitlines() if line.startswith("langsplat:"))
-    assert message in line
+    assert message in refusal(capsys, *words.split(), *out)
     assert sorted(path.name for path in described.iterdir()) == before

@@ -14,12 +14,11 @@ import pytest
 from PIL import Image
 
 from langsplat_core.arrays import Array
-from langsplat_core.cli.app import parse
-from langsplat_core.cli.run import main
 from langsplat_core.cli.serve import MOST_SIDE, Door, scene_files
 from langsplat_core.errors import InputError
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.scene import Scene
+from tests.support.commands import refusal
 from tests.support.fakes import PER_BLOB, named_scene
 
 SCENE = named_scene()
@@ -98,5 +97,4 @@ def test_a_client_asks_over_standard_input_and_output(folder):
 
 
 def test_it_is_said_how_to_speak(folder, capsys):
-    assert main("langsplat", lambda: parse(["serve", str(folder / "a.ply")])) == 2
-    assert "--mcp" in capsys.readouterr().err
+    assert "--mcp" in refusal(capsys, "serve", folder / "a.ply")

@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 
 from langsplat_core.cli import query
-from langsplat_core.cli.app import parse
-from langsplat_core.cli.run import main
 from langsplat_core.io.language import read_words
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.scene import Scene
-from langsplat_core.scene.language import MOST_SHOWN
+from tests.support.commands import refusal, run
 from tests.support.comparing import assert_same_field
 from tests.support.fakes import PER_BLOB, axis, blob_scene, named_scene
 
@@ -45,10 +43,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "junk.safetensors").write_bytes(b"junk")
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-def run(*words: str) -> int:
-    return main("langsplat", lambda: parse(list(words)))
 
 
 def asked(capsys, *words: str):
@@ -137,19 +131,8 @@ def test_bad_input_is_one_line_and_nothing_is_written(folder, capsys, monkeypatc
     assert run("teach", "a.ply", "--name", "vase", "--at", MUG, "--into", "own.safetensors") == 0
     capsys.readouterr()
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    assert run(*words.split()) == 2
-    said = capsys.readouterr()
-    assert said.out == ""
-    (line,) = (line for line in said.err.splitlines() if line.startswith("langsplat"))
-    assert message in line
+    assert message in refusal(capsys, *words.split())
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
-
-
-def test_a_word_has_only_so_many_examples(folder, capsys):
-    for _ in range(MOST_SHOWN):
-        assert run("teach", "a.ply", "--name", "vase", "--at", MUG) == 0
-    assert run("teach", "a.ply", "--name", "vase", "--at", MUG) == 2
-    assert f"was shown {MOST_SHOWN} times" in capsys.readouterr().err
 
 
 def test_a_taught_word_may_be_a_part(folder, capsys):

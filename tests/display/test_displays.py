@@ -98,23 +98,6 @@ def test_a_weak_segment_is_half_as_opaque():
     assert_allclose(got, SEGMENT_OPACITY * QUERY_COLOURS[:2] * [[1.0], [0.5]], atol=0.003)
 
 
-def test_turbo_runs_from_dark_blue_over_green_to_dark_red():
-    assert TURBO.shape == (256, 3)
-    low, middle, high = TURBO[0].astype(int), TURBO[128].astype(int), TURBO[255].astype(int)
-    assert low.sum() < 150
-    assert middle.argmax() == 1
-    assert high.argmax() == 0
-    np.testing.assert_allclose(mapped(np.array([0.0, 1.0])), TURBO[[0, 255]] / 255)
-
-
-@pytest.mark.parametrize("display", DISPLAYS)
-def test_every_display_is_a_picture(display):
-    picture = compose(channels(display), replace(PICTURE, display=display), RANGES)
-    assert picture.shape == (4, 5, 3)
-    assert picture.dtype == np.uint8
-    assert (picture == picture[0, 0]).all()
-
-
 def test_colours_lie_over_the_background():
     half = compose(channels(alpha=0.5), replace(PICTURE, background=(1.0, 1.0, 1.0)))
     assert half[0, 0].tolist() == [191, 191, 191]  # 0.25 + 0.5

@@ -10,8 +10,6 @@ from PIL import Image
 from scipy import ndimage
 
 from langsplat_core.arrays import Array
-from langsplat_core.cli.app import parse
-from langsplat_core.cli.run import main
 from langsplat_core.errors import InputError
 from langsplat_core.geometry.occupancy import (
     FloorMap,
@@ -28,8 +26,10 @@ from langsplat_core.geometry.planes import Room
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.scene import Scene
 from tests.support.box_rooms import FLOOR, WALL, box_room
+from tests.support.commands import refusal, run
 from tests.support.fakes import named_scene
 
+COARSE = "--resolution", 0.1, "--step", 0.15
 ROOM = Room(np.array([0.0, 0.0, 1.0]), FLOOR, None, ())
 
 
@@ -183,16 +183,7 @@ def nav2_map(folder: Path) -> tuple[Array, Array, dict[str, str]]:
 def test_the_command_writes_what_nav2_reads(tmp_path, capsys):
     pytest.importorskip("open3d")
     save_scene(tmp_path / "room.ply", replace(box_room(), metres_per_unit=1.0))
-    words = [
-        "map",
-        str(tmp_path / "room.ply"),
-        str(tmp_path / "map"),
-        "--resolution",
-        "0.1",
-        "--step",
-        "0.15",
-    ]
-    assert main("langsplat", lambda: parse(words)) == 0
+    assert run("map", tmp_path / "room.ply", tmp_path / "map", *COARSE) == 0
     occupied, free, settings = nav2_map(tmp_path / "map")
     assert not (occupied & free).any()
     assert (~occupied & ~free).any()  # what nobody saw
@@ -211,8 +202,7 @@ def test_the_command_writes_what_nav2_reads(tmp_path, capsys):
 def test_a_map_without_a_scale_is_refused(tmp_path, capsys):
     pytest.importorskip("open3d")
     save_scene(tmp_path / "room.ply", Scene(box_room().gaussians, cameras=box_room().cameras))
-    assert main("langsplat", lambda: parse(["map", str(tmp_path / "room.ply"), str(tmp_path / "map")])) == 2
-    assert "nobody said how long a unit" in capsys.readouterr().err
+    assert "nobody said how long a unit" in refusal(capsys, "map", tmp_path / "room.ply", tmp_path / "map")
     assert not (tmp_path / "map" / "map.pgm").exists()
 
 
@@ -232,16 +222,8 @@ def test_goals_by_phrase_and_what_has_none(tmp_path, capsys):
         codec=named_scene(False).language.codec,
     )
     save_scene(tmp_path / "room.ply", replace(scene, language=field, metres_per_unit=1.0))
-    words = [
-        "map",
-        str(tmp_path / "room.ply"),
-        str(tmp_path / "map"),
-        "--resolution",
-        "0.1",
-        "--step",
-        "0.15",
-    ]
-    assert main("langsplat", lambda: parse([*words, "--goal", "mug", "wall"])) == 2
+    words = "map", tmp_path / "room.ply", tmp_path / "map", *COARSE, "--goal", "mug", "wall"
+    assert run(*words) == 2
     assert "no goal for 'wall': not here" in capsys.readouterr().err
     (goal,) = json.loads((tmp_path / "map" / "goals.json").read_text())
     assert goal["phrase"] == "mug"

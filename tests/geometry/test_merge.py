@@ -6,8 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from langsplat_core.cli.app import parse
-from langsplat_core.cli.run import main
 from langsplat_core.config import INRIA
 from langsplat_core.errors import InputError
 from langsplat_core.geometry.merge import merge
@@ -18,15 +16,12 @@ from langsplat_core.scene import NO_NODE, Scene, TaughtWord
 from langsplat_core.scene.transform import moving, transform_scene
 from langsplat_core.scene.tree import tree_of_wholes
 from tests.support.box_rooms import box_room
+from tests.support.commands import refusal, run
 from tests.support.fakes import FakeEncoder, blob_scene
 from tests.support.file_samples import random_field
 from tests.support.scenes import random_camera, random_gaussians
 
 N = 40
-
-
-def run(*words: object) -> int:
-    return main("langsplat", lambda: parse([str(word) for word in words]))
 
 
 def scene(seed: int, name: str, degree: int = 1) -> Scene:
@@ -143,7 +138,5 @@ def test_bad_input_is_one_line_and_nothing_is_written(tmp_path, monkeypatch, cap
         save_scene(tmp_path / f"{name}.ply", replace(box_room(1), path=None))
     (tmp_path / "bad.json").write_text('{"matrix": [[1, 2], [3, 4]]}')
     before = sorted(path.name for path in tmp_path.iterdir())
-    assert run(*words.split()) == 2
-    said = capsys.readouterr().err.strip()
-    assert message in said
+    assert message in refusal(capsys, *words.split())
     assert sorted(path.name for path in tmp_path.iterdir()) == before

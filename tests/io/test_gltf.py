@@ -17,7 +17,7 @@ from langsplat_core.io.scenes import load_gaussians
 from langsplat_core.io.spz import write_spz
 from langsplat_core.scene import Gaussians
 from langsplat_core.scene.transform import moving, rotating, scaling, transform_gaussians
-from tests.support.scenes import random_gaussians
+from tests.support.scenes import covariances, random_gaussians
 
 HALF_TURN = rotating(np.array([0, 0, 1]), 180)  # between the axes of glTF and those of the PLY
 
@@ -90,14 +90,6 @@ def test_axes_are_those_of_the_standard(tmp_path):
     # the shapes, of which quaternions are one way to say them
     made = replace(want, quats_wxyz=column(f"{EXTENSION}:ROTATION")[:, [3, 0, 1, 2]])
     np.testing.assert_allclose(covariances(made), covariances(want), atol=1e-5 * covariances(want).max())
-
-
-def covariances(gaussians: Gaussians) -> np.ndarray:
-    from langsplat_core.arrays import rotation_matrices
-
-    axes = rotation_matrices(unit(gaussians.quats_wxyz.astype(np.float64)))
-    axes = axes * np.exp(gaussians.log_scales)[:, None]
-    return axes @ axes.transpose(0, 2, 1)
 
 
 def test_hard_rows_are_written(tmp_path):

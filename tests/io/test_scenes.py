@@ -28,7 +28,7 @@ from langsplat_core.io.scenes import (
 )
 from langsplat_core.io.shapes import base_colours, write_meshes, write_points
 from langsplat_core.io.summary import disk_bytes, duplicates, summarise
-from langsplat_core.query.engine import NO_FIELD, QueryEngine
+from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import NO_NODE, Calibration, Gaussians, Odds, Reading, Scene
 from langsplat_core.scene.tree import tree_of_wholes
 from tests.support.comparing import assert_same_extras, assert_same_field
@@ -271,15 +271,6 @@ def test_a_field_that_cannot_be_read_or_is_of_another_scene(path, capsys, other)
     assert json.loads(capsys.readouterr().out)["unread"] == [reason]
     Inspect(path).run()
     assert "not read" in capsys.readouterr().out
-
-
-def test_a_scene_without_a_field_says_how_to_make_one(tmp_path):
-    save_scene(tmp_path / "a.ply", blob_scene(field=False))
-    scene = load_scene(tmp_path / "a.ply")
-    assert scene.unread == ()
-    with pytest.raises(InputError) as refused:
-        QueryEngine(scene).run("book")
-    assert str(refused.value) == NO_FIELD
 
 
 @pytest.mark.parametrize("name", [CAMERAS, FIELD])

@@ -119,15 +119,3 @@ def test_no_phrase_names_a_whole_and_a_part(things):
                 wholes.update(whole.names)
                 parts.update(subpart.names, part.names)
     assert {phrase for phrase in wholes & parts if phrase.split()[-1] != "hat"} == set()
-
-
-def test_materials_are_said():
-    thing = build("chair", 0)
-    leg = next(piece for piece in thing.pieces if piece.part == "leg")
-    label = label_region(1, thing, leg)
-    assert label.material == "wood"
-    assert {"wooden leg", "wooden chair leg", "chair leg", "leg of the chair", "wood"} <= set(label.words)
-    bottle = build("bottle", 0)
-    assert "glass bottle" in label_region(2, bottle, bottle.pieces[0]).words
-    apple = build("apple", 0)
-    assert label_region(2, apple, apple.pieces[0]).material == ""

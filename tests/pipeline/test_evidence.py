@@ -9,8 +9,6 @@ from PIL import Image
 
 from langsplat_core.arrays import unit
 from langsplat_core.cli import query
-from langsplat_core.cli.app import parse
-from langsplat_core.cli.run import main
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.pipeline.evidence import (
@@ -26,6 +24,7 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.store import ImageFeatures
+from tests.support.commands import run
 from tests.support.fakes import DIM, PER_BLOB, FakeEncoder, as_trained, axis, blob_scene, cameras
 from tests.support.tiny_room import tiny_room, tiny_settings
 
@@ -166,10 +165,6 @@ def test_the_sheet_outlines_masks_in_their_photographs(evidence, engine, scene, 
 
 
 # On the command line, with what a training keeps.
-
-
-def run(*words: str) -> int:
-    return main("langsplat", lambda: parse(list(words)))
 
 
 @pytest.fixture

@@ -118,19 +118,6 @@ def langsplat(folder: Path) -> tuple[list[Path], Array, torch.nn.Module]:
     return [*paths, folder / "best_ckpt.pth"], latents, network
 
 
-def test_langsplat_keeps_its_autoencoder(tmp_path, clip):
-    paths, latents, network = langsplat(tmp_path)
-    scene, report = import_scene(read_foreign(paths), clip)
-    field = scene.language
-    assert field is not None
-    assert (report.codec, report.loss) == ("autoencoder", None)
-    assert report.meaningful[0] == pytest.approx(SEEN.mean())
-    with torch.no_grad():
-        want = network.decode(torch.from_numpy(latents[1][SEEN] / 0.4)).numpy()
-    np.testing.assert_allclose(decoded(field, 1)[SEEN], want, atol=1e-5)
-    np.testing.assert_array_equal(field.known, np.tile(SEEN, (3, 1)))
-
-
 def test_langsplat_there_and_back(tmp_path, clip):
     scene, _ = import_scene(read_foreign(langsplat(tmp_path / "a")[0]), clip)
     written = export_langsplat(scene, tmp_path / "b", "case")

@@ -14,7 +14,6 @@ from PIL import Image
 from safetensors.numpy import load_file
 
 from langsplat_core.cli.app import parse
-from langsplat_core.cli.run import main
 from langsplat_core.config import (
     PAPER,
     AutoencoderConfig,
@@ -23,7 +22,6 @@ from langsplat_core.config import (
     LiftConfig,
     LinearConfig,
     TrainConfig,
-    with_preset,
 )
 from langsplat_core.errors import EncoderError, FormatError, InputError
 from langsplat_core.io.ply import write_metres
@@ -35,6 +33,7 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.semantics import store
 from langsplat_core.semantics.masks import LevelMasks, MaskSource
 from langsplat_core.training.language.mask_weights import find_things
+from tests.support.commands import run
 from tests.support.comparing import assert_same_tree
 from tests.support.fakes import blob_scene
 from tests.support.processes import bound_by_permissions, stop_at
@@ -257,24 +256,6 @@ def test_two_views_are_no_scene_unless_told_otherwise(room, tmp_path):
     assert train_scene(pair, tmp_path / "scene.ply", told).views == 1
 
 
-def run(*args: object) -> int:
-    words = [str(arg) for arg in args]
-    return main("langsplat", lambda: parse(words))
-
-
-def test_query_and_inspect_commands(room, tmp_path, capsys):
-    out = tmp_path / "scene.ply"
-    train_scene(room, out, tiny_settings(room))
-    assert run("query", out, "red mug", "--json") == 0
-    answer = json.loads(capsys.readouterr().out)[0]
-    assert answer["phrase"] == "red mug"
-    assert (len(answer["pixel"]), len(answer["place"])) == (2, 3)
-    assert run("query", out, "red mug", "--mode", "paper") == 2
-    assert "--codec.kind autoencoder" in capsys.readouterr().err
-    assert run("inspect", out) == 0
-    assert "codebook" in capsys.readouterr().out
-
-
 def test_a_trained_scene_is_given_a_meaning(room, tmp_path):
     first = tmp_path / "trained.ply"
     train_scene(room, first, tiny_settings(room))
@@ -316,16 +297,6 @@ def test_the_papers_profile_runs_whole(room, tmp_path, capsys):
     field = load_scene(out).language
     assert field is not None
     assert field.latents.shape[2] == 3
-
-
-def test_presets_are_defaults_that_options_override():
-    words = ["train", "photos", "--out", "s.ply"]
-    assert parse([*words, "--preset", "full"]).config == TrainConfig()
-    quick = parse([*words, "--preset=quick", "--radiance.steps", "7"]).config
-    expected = with_preset(TrainConfig(), "quick")
-    assert quick == replace(expected, radiance=replace(expected.radiance, steps=7))
-    both = parse([*words, "--profile", "paper", "--preset", "good"]).config
-    assert both == with_preset(PAPER, "good")
 
 
 # What changes around a training between its interruption and its end, and around a program that reads.

@@ -233,20 +233,6 @@ def test_a_hundred_phrases_are_answered_as_python_answers_them(
     assert verdicts == {"found", "weak match", "not here"}
 
 
-def test_a_phrase_is_shown_at_once(tab: Tab, measured: Measure) -> None:
-    """Times are measured and not judged."""
-    for phrase in ("teddy bear", "blue gift", "keyboard"):
-        spent = tab.run(
-            """async (phrase) => {
-              const { page } = await langsplat, begun = performance.now();
-              page.search(phrase);
-              return performance.now() - begun;
-            }""",
-            phrase,
-        )
-        measured("page", "ms from a phrase to its heat in the textures", spent)
-
-
 def no_encoder(name: str) -> Any:
     raise EncoderError("none here")
 

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -77,12 +76,6 @@ def test_a_frozen_view_differs_by_its_rounding_only(channels, size):
     assert 0 < frozen.nbytes < 40 * len(view.tiles.ranks) * 16 + 16 * size[0] * size[1] + 64
 
 
-def test_a_frozen_view_of_nothing():
-    empty = CPU.view(random_gaussians(0), PLAIN).frozen()
-    assert not empty.splat(np.zeros((0, 3), np.float32))[0].any()
-    assert empty.gather(np.zeros((30, 40, 2), np.float32)).shape == (0, 2)
-
-
 def test_radii_are_positive_exactly_where_something_is_drawn():
     gaussians, camera = random_gaussians(300, 18, radius=2.0), random_camera(18)
     view = CPU.view(gaussians, camera)
@@ -92,18 +85,6 @@ def test_radii_are_positive_exactly_where_something_is_drawn():
     assert (view.radii[drawn] > 0).all()
     assert ((view.radii > 0) & ~drawn).mean() < 0.05  # hidden ones only
     np.testing.assert_allclose(view.radii[view.radii > 0], extents[view.radii > 0], rtol=1e-5)
-
-
-def test_two_threads_may_render_at_once():
-    gaussians, camera = random_gaussians(300, 25), random_camera(25, 120, 90)
-    x = random_values(300, 3)
-    want = CPU.view(gaussians, camera).splat(x)[0]
-
-    def render(_: int) -> bool:
-        return all(np.array_equal(CPU.view(gaussians, camera).splat(x)[0], want) for _ in range(5))
-
-    with ThreadPoolExecutor(4) as pool:
-        assert all(pool.map(render, range(4)))
 
 
 def test_arrays_of_any_make():

@@ -27,7 +27,7 @@ from langsplat_core.scene.transform import (
     turning,
 )
 from tests.support.file_samples import random_field
-from tests.support.scenes import covariances, random_camera, random_gaussians, without_perspective
+from tests.support.scenes import random_camera, random_gaussians, without_perspective
 
 TO = rotating(np.array([1.0, -2.0, 0.5]), 77).then(scaling(1.7)).then(moving(np.array([3.0, -1.0, 2.0])))
 TURNS = [rotating(axis, degrees) for axis in AXES.values() for degrees in (90, 180)] + [TO]
@@ -59,14 +59,6 @@ def test_harmonics_turn_with_the_world(to: Similarity) -> None:
         before = sh_basis(directions, 16)[:, span] @ values[span]
         after = sh_basis(directions @ to.rotation.T, 16)[:, span] @ (matrix @ values[span])
         np.testing.assert_allclose(after, before, atol=1e-12)
-
-
-def test_shapes_follow():
-    gaussians = random_gaussians(30, seed=1)
-    linear = TO.scale * TO.rotation
-    np.testing.assert_allclose(
-        covariances(transform_gaussians(gaussians, TO)), linear @ covariances(gaussians) @ linear.T, rtol=2e-4
-    )
 
 
 def test_transforms_compose_and_lead_back():
@@ -147,14 +139,6 @@ def test_rows_that_cannot_be_drawn_stay_so():
     np.testing.assert_array_equal(moved.valid(), gaussians.valid())
     assert moved.log_scales[1, 2] == -np.inf
     assert (moved.quats_wxyz[0] == 0).all()
-
-
-def test_far_from_the_origin_and_back():
-    """At a million units float32 steps are 0.06: that is all that is lost."""
-    gaussians = random_gaussians(20)
-    far = transform_gaussians(gaussians, moving(np.array([1e6, 0, 0])))
-    back = transform_gaussians(far, moving(np.array([-1e6, 0, 0])))
-    assert np.abs(back.means - gaussians.means).max() <= 0.04
 
 
 def test_companions_go_along():

@@ -1,6 +1,5 @@
 """Scenarios of `window_driver` in the panels: files, training, layout, recording, bookmarks."""
 
-import json
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,7 +10,6 @@ from PIL import Image
 
 from imgui_bundle import imgui  # isort: skip
 from langsplat_core.io.scenes import save_scene
-from langsplat_core.pipeline.report import REPORT
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_viewer import viewer as training
 from langsplat_viewer.actions import filming, opening, selecting, settings, viewpoint
@@ -191,51 +189,6 @@ def watch_a_training(s: Any) -> None:
     assert "training stopped" in s.state.messages[-1].text
 
 
-DOUBTS = [
-    "held-out photographs are reproduced at 11.3 dB, below 16: cameras may be wrong, or photographs too few; "
-    "take more that overlap, or give COLMAP's cameras",
-    "only 31 % of the held-out pictures' pixels show anything: photograph what is there from more sides, or "
-    "train for more steps",
-]
-
-
-def read_what_speaks_against(s: Any) -> None:
-    """A training that ends with doubts: the panels Train and Scene have them, for that scene alone."""
-    viewer, photographs = s.window.viewer, s.folder / "photos"
-    photographs.mkdir()
-    (photographs / "0.jpg").write_bytes(b"")
-    save_scene(s.folder / "photos.ply", replace(blob_scene(), path=None))
-    report = s.folder / "photos.work" / REPORT
-    report.parent.mkdir()
-    report.write_text(json.dumps({"gaussians": len(s.state.scene.gaussians), "doubts": DOUBTS}))
-    training.command = lambda request: [sys.executable, "-c", "print('photos.ply: 360 Gaussians')"]
-    opening.choose_photographs(viewer, photographs)
-    settings.open_panel(viewer, "Train")
-    s.ctx.yield_(3)
-    before = s.shot("before")
-    s.ctx.item_click("//Train/Train")
-    s.wait(lambda: s.state.path.name == "photos.ply")
-    s.settle()
-    s.ctx.yield_(3)
-    after = s.shot("doubts")
-    assert s.state.doubts == tuple(DOUBTS)
-    below = s.ctx.item_info("//Train/Train").rect_full
-    here = (
-        slice(int(below.max.y) + 30, int(below.max.y) + 200),
-        slice(int(below.min.x), int(below.min.x) + 200),
-    )
-    reddish = (after[here].astype(int)[..., 0] - after[here][..., 2] > 40).sum()
-    assert reddish > 200 > (before[here].astype(int)[..., 0] - before[here][..., 2] > 40).sum()
-    opening.switch_scene(viewer, s.folder / "blobs.ply")
-    s.wait(lambda: s.state.path.name == "blobs.ply")
-    s.settle()
-    assert s.state.doubts == ()
-
-
-def digit_key(digit: int) -> imgui.Key:
-    return imgui.Key[f"_{digit}"]
-
-
 Scenario = tuple[Callable[[Any], None], str, dict[str, Any]]
 FILES: dict[str, Scenario] = {
     "reload_what_changed": (reload_what_changed, "blobs.ply", {}),
@@ -244,7 +197,6 @@ FILES: dict[str, Scenario] = {
     "switch_between_scenes": (switch_between_scenes, "blobs.ply", {}),
     "search_a_library": (search_a_library, "blobs.ply", {}),
     "watch_a_training": (watch_a_training, "blobs.ply", {}),
-    "read_what_speaks_against": (read_what_speaks_against, "blobs.ply", {}),
 }
 
 

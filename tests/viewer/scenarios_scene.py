@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations
-from threading import Event, current_thread
 from typing import Any
 
 import numpy as np
@@ -13,13 +12,11 @@ from imgui_bundle import hello_imgui, imgui  # isort: skip
 from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
 import glfw  # isort: skip
 from langsplat_core.io.scenes import load_scene, save_scene
-from langsplat_viewer import canvas
 from langsplat_viewer.actions import opening, queries, selecting, settings, transforming, viewpoint
 from langsplat_viewer.camera.overlays import Label, visible_faces
 from langsplat_viewer.panels import overlays, transform
 from langsplat_viewer.panels.overlays import EDGE
 from langsplat_viewer.panels.style import Area, scene_area
-from langsplat_viewer.rendering.renderer import ArrayChannels
 from langsplat_viewer.rendering.request import TINT
 from langsplat_viewer.state import EditForm
 from tests.support.fakes import CENTRES, blob_scene
@@ -129,25 +126,6 @@ def draw_over_the_scene(s: Any) -> None:
     assert not s.state.ruler.measures
 
 
-def cut_by_depth(s: Any) -> None:
-    """The sliders of the panel leave out what is nearer or farther; undone at their ends."""
-    settings.open_panel(s.window.viewer, "Camera")
-    s.ctx.yield_(3)
-    viewpoint.look_from(s.window.viewer, "left")
-    s.settle()
-    before = s.shot("whole")
-    depths = [float((thing - s.state.view.eye) @ s.state.view.rotation[2]) for thing in CENTRES]
-    s.ctx.item_input_value("//Camera/Near cut", max(min(depths), 0.1) + 0.6)
-    s.settle()
-    assert s.state.settings.clip.near > 0.5
-    cut = s.shot("cut")
-    assert np.abs(cut - before)[100:, 400:].max() > 60
-    s.ctx.item_input_value("//Camera/Near cut", 0.0)
-    s.settle()
-    assert s.state.settings.clip.near == 0
-    assert np.abs(s.shot("whole again") - before)[100:400, 400:].max() < 3
-
-
 def time_and_compare(s: Any) -> None:
     """The panel tells medians while it is seen, and the error of what is shown."""
     settings.open_panel(s.window.viewer, "Timing")
@@ -185,83 +163,12 @@ def faces_on_screen(s: Any, side: Any) -> list[tuple[str, tuple[float, float]]]:
     ]
 
 
-def rasterize_elsewhere(s: Any) -> None:
-    """While a thread rasterizes the fine picture the window shows a coarse one and works; what goes wrong
-    there is said once."""
-    gate, problems, rasterize = Event(), [], ArrayChannels.render
-
-    def gated(self: ArrayChannels, *arguments: Any) -> Any:
-        if current_thread().name == "langsplat-worker":
-            assert gate.wait(60)
-            if problems:
-                raise problems[0]
-        return rasterize(self, *arguments)
-
-    ArrayChannels.render = gated
-    canvas.MOVING_BUDGET = 0.0  # everything is slow
-    s.drag((600, 300), (656, 279))
-    s.wait(lambda: s.window.viewer.surface.waits)
-    assert s.state.stats.scale < 1
-    s.ctx.key_press(imgui.Key.f1)
-    s.ctx.yield_(3)
-    assert s.state.show_help
-    s.ctx.key_press(imgui.Key.f1)
-    s.ctx.yield_(3)
-    s.capture(s.folder / "coarse.png")
-    gate.set()
-    fine = s.shot("fine")
-    assert s.state.stats.scale == 1
-    coarse = np.asarray(Image.open(s.folder / "coarse.png").convert("RGB")).astype(int)
-    for thing in CENTRES:
-        np.testing.assert_allclose(s.at(coarse, thing), s.at(fine, thing), atol=25)
-
-    problems.append(FloatingPointError("out of range"))
-    s.drag((656, 279), (600, 300))
-    s.settle()
-    s.ctx.yield_(20)
-    said = [message.text for message in s.state.messages if message.is_error]
-    assert said == ["internal error: FloatingPointError: out of range"], said
-    problems.clear()
-    s.drag((600, 300), (656, 279))
-    s.settle()
-    assert s.state.stats.scale == 1
-
-
 Scenario = tuple[Callable[[Any], None], str, dict[str, Any]]
 
 
-def measure_and_select(s: Any) -> None:
-    """From the mug to the book, then the book by a lasso."""
-    s.ctx.key_press(imgui.Key.m)
-    s.ctx.yield_(2)
-    for thing in (MUG, BOOK):
-        click(s, on_screen(s, thing))
-    assert abs(s.state.ruler.length - np.linalg.norm(MUG - BOOK)) < 0.2
-    s.ctx.key_press(imgui.Key.escape)
-    s.ctx.yield_(2)
-
-    selecting.use_tool(s.window.viewer, "lasso")
-    middle = np.array(on_screen(s, BOOK))
-    reach = 0.45 * (on_screen(s, PLANT)[0] - middle[0])
-    turns = np.linspace(0, 2 * np.pi, 16)
-    places = middle + reach * np.stack([np.cos(turns), np.sin(turns)], 1)
-    s.ctx.mouse_teleport_to_pos(tuple(places[0]))
-    s.ctx.mouse_down(0)
-    for x, y in places:
-        s.ctx.mouse_teleport_to_pos((x, y))
-        s.ctx.yield_()
-    s.ctx.mouse_up(0)
-    s.ctx.yield_(2)
-    selected = s.state.selection.marks.selected.reshape(3, -1).sum(1)
-    assert selected[0] == selected[2] == 0
-    assert selected[1] > 40
-    s.shot("selected")
-    selecting.use_tool(s.window.viewer, None)
-
-
 def look_without_perspective(s: Any) -> None:
-    """A key takes perspective away until it is pressed again; axes, wheel, tools and the click on a camera
-    work as ever, and the picture says what it is."""
+    """A key takes perspective away until it is pressed again; axes, wheel and the click on a camera work
+    as ever, and the picture says what it is."""
     deep, view = s.shot("deep"), s.state.view
     s.ctx.key_press(imgui.Key.o)
     s.settle()
@@ -282,7 +189,6 @@ def look_without_perspective(s: Any) -> None:
     s.settle()
     assert abs((on_screen(s, PLANT)[0] - on_screen(s, MUG)[0]) / before - 0.88) < 1e-3
 
-    measure_and_select(s)
     s.menu("View", "Show or hide the training cameras")
     s.ctx.key_press(imgui.Key.home)
     s.settle()
@@ -333,9 +239,7 @@ SEEING: dict[str, Scenario] = {
     "name_what_is_close": (name_what_is_close, "blobs.ply", {}),
     "look_without_perspective": (look_without_perspective, "blobs.ply", {}),
     "split_the_view": (split_the_view, "blobs.ply", {}),
-    "cut_by_depth": (cut_by_depth, "blobs.ply", {}),
     "time_and_compare": (time_and_compare, "blobs.ply", {}),
-    "rasterize_elsewhere": (rasterize_elsewhere, "blobs.ply", {"backend": "cpu"}),
     "draw_over_the_scene": (draw_over_the_scene, "blobs.ply", {}),
 }
 
@@ -362,7 +266,7 @@ def press(s: Any, item: str) -> None:
 
 
 def select_with_the_mouse(s: Any) -> None:
-    """A rectangle, keys and buttons; everything is undone; what is left is saved."""
+    """A rectangle, keys and buttons; what they did is undone."""
     s.ctx.key_press(imgui.Key.period)  # the camera in front: no blob hides another
     s.settle()
     plain = s.shot("plain")
@@ -390,36 +294,18 @@ def select_with_the_mouse(s: Any) -> None:
     s.settle()
     assert marked(s.window.viewer)[0] == "book plant"
 
-    hide_and_undo(s, plain)
-    save_the_rest(s)
+    s.ctx.key_press(imgui.Key.h)
+    s.settle()
+    assert marked(s.window.viewer) == ("", "book plant", "")
+    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.z)
+    s.settle()
+    assert marked(s.window.viewer) == ("book plant", "", "")
     s.ctx.key_press(imgui.Key.escape)
     s.ctx.yield_(3)
     assert s.state.selection.tool is None
     s.drag((600, 300), (656, 279))
     s.settle()
     assert not np.array_equal(before.rotation, s.state.view.rotation)  # the drag turns again
-
-
-def hide_and_undo(s: Any, plain: np.ndarray) -> None:
-    s.ctx.key_press(imgui.Key.h)
-    s.settle()
-    assert marked(s.window.viewer) == ("", "book plant", "")
-    hidden = s.shot("hidden")
-    assert s.at(hidden, PLANT).max() < 30
-    assert s.at(plain, PLANT).max() > 90
-    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.z)
-    s.settle()
-    assert marked(s.window.viewer) == ("book plant", "", "")
-
-
-def save_the_rest(s: Any) -> None:
-    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.i)
-    s.settle()
-    assert marked(s.window.viewer)[0] == "mug"
-    s.menu("Select", "Save the selection")
-    s.settle()
-    written = load_scene(s.folder / "blobs-selection-001.ply")
-    assert len(written.gaussians) == len(written.language) == s.state.selection.marks.selected.sum()
 
 
 def outline_and_rest(s: Any) -> None:

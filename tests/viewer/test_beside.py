@@ -8,7 +8,6 @@ import pytest
 
 from langsplat_viewer.actions import beside, opening, queries, settings, undoing, viewpoint
 from langsplat_viewer.camera.controls import default_view, extent_of, orbit
-from langsplat_viewer.rendering.request import Split
 from tests.support.windowless import SCENES, errors, settle
 
 
@@ -99,9 +98,3 @@ def test_a_scene_with_other_coordinates_is_seen_from_the_same_side():
     np.testing.assert_allclose(
         (other.eye - there.centre) / there.radius, (view.eye - here.centre) / here.radius
     )
-
-
-def test_two_images_are_joined_at_the_line():
-    dark, light = np.zeros((2, 10, 3), np.uint8), np.full((2, 10, 3), 9, np.uint8)
-    assert Split("scenes", at=0.3).joined([dark, light], 10)[0, :, 0].tolist() == [0] * 3 + [9] * 7
-    assert Split("scenes", at=0.3).joined([dark], 10) is dark

@@ -235,15 +235,6 @@ def test_focus_brings_the_latest_result_found_to_the_centre(opened):
     assert 0 < depth[0] < 5
 
 
-def test_focus_on_one_of_several_results(opened):
-    for word in ("mug", "plant"):
-        queries.ask(opened, word)
-    settle(opened)
-    viewpoint.focus_result(opened, opened.state.queries[0])
-    arrive(opened)
-    assert_allclose(opened.state.view.target, opened.state.queries[0].result.place)
-
-
 def test_focus_without_a_result_is_the_whole_scene(opened):
     settings.resize(opened, 160, 120)
     viewpoint.focus_result(opened)

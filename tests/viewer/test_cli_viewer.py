@@ -17,7 +17,7 @@ from langsplat_core.io.cameras import write_cameras
 from langsplat_core.io.scenes import companion_path, save_scene
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer import program
-from langsplat_viewer.options import DisplayChoice, latent_level, parse_size
+from langsplat_viewer.options import parse_size
 from tests.support.fakes import CENTRES, blob_scene
 from tests.support.scenes import with_tree
 
@@ -37,6 +37,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     save_scene(tmp_path / "edited.ply", Scene(gaussians))
     sidecar = companion_path(tmp_path / "blobs.ply", language.SUFFIX)
     companion_path(tmp_path / "edited.ply", language.SUFFIX).write_bytes(sidecar.read_bytes())
+    save_scene(tmp_path / "nothing.ply", Scene(gaussians.take(np.zeros(len(gaussians), bool))))
     (tmp_path / "broken.json").write_text('[{"width": 12')
     (tmp_path / "empty.json").write_text("[]")
     monkeypatch.chdir(tmp_path)
@@ -127,27 +128,6 @@ def test_options_of_pictures_say_where_the_window_has_them(run_viewer, folder, o
     assert f"panel {panel}" in errors[0]
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (("--query", "mug", "--query", "book", "--cut", "0.6"), "--cut 0.6: give each --query a cut"),
-        (("--query", "mug", "--cut", "1.5"), "--cut 1.5: must be 0 to 1"),
-        (("--query", "mug", "--canonical", ", "), "--canonical"),
-        (("--query", "mug", "--canonical", "sofa"), "sofa"),
-        (("--near-cut", "-1"), "--near-cut -1: must be 0"),
-        (("--far-cut", "0"), "--far-cut 0: must be above 0"),
-        (("--near-cut", "30"), "nothing of the scene"),
-        (("--orthographic", "0"), "--orthographic 0: must be 1e-09 to 1e+09"),
-        (("--orthographic", "4", "--near-cut", "30"), "nothing of the scene"),
-    ],
-)
-def test_cuts_and_canonical_phrases_that_cannot_be_are_one_line(run_viewer, folder, options, said):
-    code, _, errors = run_viewer("blobs.ply", "--headless", "--out", "a.png", *options)
-    assert (code, len(errors)) == (2, 1)
-    assert said in errors[0]
-    assert not (folder / "a.png").exists()
-
-
 def test_without_perspective_the_picture_has_the_scale_that_was_asked_for(run_viewer, folder):
     """Three units across 120 pixels; each blob is as large as the others, however far away."""
     code, out, err = run_viewer("blobs.ply", "--headless", "--orthographic", "3", "--out", "a.png")
@@ -203,6 +183,7 @@ def test_a_scene_without_cameras_is_framed(run_viewer, folder):
         (["."], "is a folder"),
         (["x" * 5000 + ".ply"], "cannot be opened"),
         (["truncated.ply"], "truncated.ply: truncated"),
+        (["nothing.ply"], "the scene holds no Gaussians"),
         (["edited.ply", "--query", "mug"], "edited.langsplat.safetensors"),
         (["blobs.ply", "--query", "sofa"], "'sofa'"),
         (["blobs.ply", "--query", " "], "empty"),
@@ -224,6 +205,18 @@ def test_a_scene_without_cameras_is_framed(run_viewer, folder):
         (["blobs.ply", "--backend", "magic"], "magic"),
         (["blobs.ply", "--headles"], "--headles"),
         (["blobs.ply", "plain.ply"], "plain.ply"),
+        (
+            ["blobs.ply", "--query", "mug", "--query", "book", "--cut", "0.6"],
+            "--cut 0.6: give each --query a cut",
+        ),
+        (["blobs.ply", "--query", "mug", "--cut", "1.5"], "--cut 1.5: must be 0 to 1"),
+        (["blobs.ply", "--query", "mug", "--canonical", ", "], "--canonical"),
+        (["blobs.ply", "--query", "mug", "--canonical", "sofa"], "sofa"),
+        (["blobs.ply", "--near-cut", "-1"], "--near-cut -1: must be 0"),
+        (["blobs.ply", "--far-cut", "0"], "--far-cut 0: must be above 0"),
+        (["blobs.ply", "--near-cut", "30"], "nothing of the scene"),
+        (["blobs.ply", "--orthographic", "0"], "--orthographic 0: must be 1e-09 to 1e+09"),
+        (["blobs.ply", "--orthographic", "4", "--near-cut", "30"], "nothing of the scene"),
     ],
 )
 def test_what_cannot_work_is_one_line(run_viewer, folder, arguments, reason):
@@ -320,40 +313,3 @@ def test_without_a_window_no_windowing_library_is_loaded(folder):
 )
 def test_sizes(text, size):
     assert parse_size(text) == size
-
-
-def test_the_choices_are_the_displays_and_auto():
-    assert get_args(DisplayChoice) == ("auto", *get_args(Display))
-
-
-def test_latents_are_those_of_the_level_asked_for():
-    assert [latent_level(level) for level in ("subpart", "part", "whole", "auto")] == [0, 1, 2, 2]
-
-
-BLOBS = blob_scene().gaussians
-NOTHING = {
-    "empty": (BLOBS.take(np.zeros(360, bool)), "the scene holds no Gaussians"),
-    "nan": (replace(BLOBS, means=np.full((360, 3), np.nan)), "none of the 360 Gaussians can be drawn"),
-    "clear": (replace(BLOBS, opacity_logits=np.full(360, -20.0)), "all 360 Gaussians are transparent"),
-}
-
-
-def looking_away() -> Camera:
-    camera = blob_scene().cameras[1]
-    matrix = camera.world_to_camera.copy()
-    matrix[[0, 2]] *= -1
-    return replace(camera, world_to_camera=matrix)
-
-
-@pytest.mark.parametrize("case", [*NOTHING, "away"])
-def test_without_a_window_nothing_is_one_line_and_no_file(case, tmp_path: Path, run_viewer):
-    gaussians, reason = NOTHING.get(case, (BLOBS, "behind the camera"))
-    save_scene(tmp_path / "scene.ply", Scene(gaussians))
-    write_cameras(tmp_path / "view.json", (looking_away(),))
-    options = ["--camera", str(tmp_path / "view.json")] if case == "away" else []
-    out = tmp_path / "a.png"
-    arguments = [str(tmp_path / "scene.ply"), "--headless", "--backend", "cpu", "--out", str(out), *options]
-    code, _, lines = run_viewer(*arguments)
-    assert (code, len(lines)) == (2, 1)
-    assert reason in lines[0]
-    assert not out.exists()

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ import pytest
 from langsplat_core.config import PictureConfig
 from langsplat_core.raster.protocol import farthest
 from langsplat_core.scene import look_at
-from langsplat_viewer.actions import opening, selecting, settings, viewpoint
+from langsplat_viewer.actions import selecting, settings, viewpoint
 from langsplat_viewer.camera.controls import from_camera
 from langsplat_viewer.canvas import NOTHING_BETWEEN, Canvas
 from langsplat_viewer.rendering.depth import UNCLIPPED, Clip, depth_range, image_formation
@@ -18,7 +17,7 @@ from langsplat_viewer.rendering.renderer import GlRenderer
 from langsplat_viewer.rendering.request import plain_request
 from tests.support.fakes import CENTRES, blob_scene
 from tests.support.marks_and_flights import marked
-from tests.support.windowless import rest, settle
+from tests.support.windowless import rest
 
 SIZE = (160, 120)
 # From the side: the blobs lie behind each other, mug, book, plant, at depths of about 3.8, 5 and 6.2.
@@ -99,10 +98,3 @@ def test_an_outline_does_not_select_what_is_cut_away(beside):
     selecting.extend_stroke(beside, 1.0, 1.0)
     selecting.end_stroke(beside)
     assert marked(beside)[0] == "book"
-
-
-def test_another_scene_is_whole(beside):
-    settings.set_clip(beside, BOOK_ALONE)
-    opening.open_scene(beside, Path("bare.ply"))
-    settle(beside)
-    assert beside.state.settings.clip == UNCLIPPED

@@ -21,7 +21,6 @@ from langsplat_viewer.camera.flight import (
     pose_of,
     stretched,
     turntable,
-    view_of,
     with_keyframe,
 )
 from langsplat_viewer.files.flights import MOST, read_flight, write_flight
@@ -183,16 +182,6 @@ def test_times_of_pictures():
     assert_allclose(frame_times(turntable(view, 1), 4), [0, 0.25, 0.5, 0.75])  # the last is the first again
     assert len(frame_times(turntable(view, 0.1), 1)) == 1
     assert len(frame_times(Flight((key(0), key(0.1 * 3))), 10)) == 4  # 0.3 is a little less than 3 tenths
-
-
-def test_a_pose_is_the_view_it_was_taken_from():
-    extent = extent_of(blob_scene())
-    view = orbit(from_camera(blob_scene().cameras[1], extent), 0.3, 0.1)
-    again = view_of(pose_of(view), extent)
-    for size in ((160, 120), (64, 64)):
-        a, b = view.camera(*size), again.camera(*size)
-        assert_allclose(b.world_to_camera, a.world_to_camera, atol=1e-9)
-    assert again.camera(160, 120).fx == pytest.approx(view.camera(160, 120).fx)
 
 
 # Camera paths to files and back; files that are none.

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.scene import Scene
@@ -20,16 +19,6 @@ from langsplat_viewer.panels.scene import has_several
 from langsplat_viewer.rendering.depth import UNCLIPPED, Clip
 from tests.support.fakes import blob_scene
 from tests.support.windowless import SCENES, arrive, errors, settle
-
-
-def test_open_shows_the_scene_from_its_first_camera(opened):
-    state = opened.state
-    assert state.scene is SCENES["blobs.ply"]
-    assert state.opening is None
-    assert state.camera_index == 0
-    assert_allclose(
-        state.view.camera(160, 120).world_to_camera, state.scene.cameras[0].world_to_camera, atol=1e-9
-    )
 
 
 def test_unusable_gaussians_are_counted(viewer):
@@ -114,6 +103,11 @@ def test_of_dropped_files_the_scene_is_opened_and_what_is_none_is_said(viewer, n
     assert errors(viewer) == ([said] if said else [])
 
 
+# Several scenes to switch between, without a window.
+
+BLOBS, PLAIN, BARE = (Path(f"{name}.ply").absolute() for name in ("blobs", "plain", "bare"))
+
+
 def test_the_first_run_says_that_it_compiles(viewer, monkeypatch):
     seen = []
 
@@ -133,11 +127,6 @@ def test_the_first_run_says_that_it_compiles(viewer, monkeypatch):
     assert seen == [("compiling the drawing kernels, once per installation (half a minute)", 0.7)]
     assert "compiling the search kernels, once per installation (half a minute)" in labels
     assert errors(viewer) == []
-
-
-# Several scenes to switch between, without a window.
-
-BLOBS, PLAIN, BARE = (Path(f"{name}.ply").absolute() for name in ("blobs", "plain", "bare"))
 
 
 @pytest.fixture
@@ -215,15 +204,6 @@ def test_nothing_of_a_scene_that_was_left_is_kept_in_memory(three):
     (visit,) = three.visits.values()
     assert [query.result for query in visit.queries] == [None]
     assert not any(isinstance(value, np.ndarray) and value.size > 16 for value in vars(visit).values())
-
-
-def test_steps_go_round(three):
-    seen = []
-    for by in (1, 1, 1, -1):
-        opening.step_scene(three, by)
-        settle(three)
-        seen.append(three.state.path.absolute())
-    assert seen == [PLAIN, BARE, BLOBS, BARE]
 
 
 def test_a_scene_is_taken_off_the_list(three):

@@ -10,13 +10,12 @@ from langsplat_core.scene import LEVELS
 from langsplat_viewer.actions import filming, opening, queries, settings, viewpoint
 from langsplat_viewer.actions.opening import standing_at
 from langsplat_viewer.camera.controls import from_side, zoom
-from langsplat_viewer.commands import COMMANDS
 from langsplat_viewer.files.flights import Shelf
 from langsplat_viewer.panels.overlays import pointed_figures
 from langsplat_viewer.state import GLIDE_SECONDS
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import CENTRES
-from tests.support.windowless import arrive, errors, settle
+from tests.support.windowless import arrive, settle
 
 SIZE = (160, 120)
 
@@ -31,24 +30,6 @@ def flat(opened: Viewer) -> Viewer:
 
 def pixels(viewer: Viewer, points: np.ndarray) -> np.ndarray:
     return viewer.state.view.camera(*SIZE).project(points)[0]
-
-
-def test_there_and_back_is_the_same_view(opened):
-    before = opened.state.view
-    (command,) = (command for command in COMMANDS if command.act is viewpoint.toggle_orthographic)
-    assert command.keys == ("O", "Keypad5")
-    command.act(opened)
-    assert opened.state.view.orthographic
-    command.act(opened)
-    assert_allclose(
-        opened.state.view.camera(*SIZE).world_to_camera, before.camera(*SIZE).world_to_camera, atol=0
-    )
-
-
-def test_before_a_scene_is_open_it_does_nothing(viewer):
-    viewpoint.toggle_orthographic(viewer)
-    viewpoint.open_orthographic(viewer, 2.0)
-    assert viewer.state.view is None
 
 
 @pytest.mark.parametrize(
@@ -95,12 +76,6 @@ def test_a_training_camera_is_seen_with_perspective(flat):
     assert standing_at(flat.state) is not None
     viewpoint.toggle_orthographic(flat)
     assert standing_at(flat.state) is None  # its photograph would not fit
-
-
-def test_the_wheel_changes_the_scale(flat):
-    before = np.ptp(pixels(flat, CENTRES), axis=0)
-    viewpoint.zoom_by(flat, 0.5)
-    assert_allclose(np.ptp(pixels(flat, CENTRES), axis=0), 2 * before, rtol=1e-5)
 
 
 def test_a_double_click_keeps_the_scale(flat):
@@ -161,9 +136,3 @@ def test_what_is_under_the_cursor_is_said_to_be_as_far_as_from_the_eye(flat):
     eye = flat.state.view.eye
     assert away == pytest.approx(float((found.position - eye) @ flat.state.view.rotation[2]), abs=0.006)
     assert np.linalg.norm(found.position - CENTRES[1]) < 0.6
-
-
-def test_opening_with_a_span_shows_as_much(opened):
-    viewpoint.open_orthographic(opened, 3.0)
-    assert opened.state.view.span_in(*SIZE) == pytest.approx(3.0)
-    assert errors(opened) == []

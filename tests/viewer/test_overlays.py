@@ -18,7 +18,7 @@ from langsplat_core.scene import look_at
 from langsplat_viewer.actions import opening, queries, settings, viewpoint
 from langsplat_viewer.camera import overlays
 from langsplat_viewer.camera.controls import default_view, extent_of, frame_of, from_side, orbit
-from langsplat_viewer.camera.overlays import FACES, Label, face_at, facing, placed, visible_faces, world_axes
+from langsplat_viewer.camera.overlays import FACES, Label, face_at, facing, placed, visible_faces
 from langsplat_viewer.files.photographs import LONGEST_SIDE, corners, find, read
 from langsplat_viewer.files.preferences import (
     load_preferences,
@@ -94,15 +94,6 @@ def test_the_nearest_segment():
     assert overlays.nearest_segment(segments, (6.0, 4.5)) == (1, 0.5)
     assert overlays.nearest_segment(segments, (3.0, 2.9))[0] == 2
     assert overlays.nearest_segment(segments[:0], (0.0, 0.0)) == (-1, math.inf)
-
-
-@pytest.mark.parametrize("up", [(0, -1, 0), (0, 0, 1), (0.1, -0.9, 0.4)])
-def test_the_frame_is_a_right_handed_one_with_up_as_up(up):
-    up = np.array(up, float) / np.linalg.norm(up)
-    frame = frame_of(up)
-    np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(frame[1], up)
-    assert np.linalg.det(frame) == pytest.approx(1)
 
 
 @pytest.mark.parametrize(
@@ -216,13 +207,6 @@ def test_from_any_side_the_face_in_front_is_under_its_centre(name):
     for face in faces:
         assert face_at(faces, tuple(face.centre)) == face.name
     assert face_at(faces, (3.0, 0.0)) == ""
-
-
-def test_the_worlds_axes_on_screen():
-    axes = world_axes(facing(VIEW, "front"))
-    np.testing.assert_allclose(np.abs(axes), np.eye(3), atol=1e-9)
-    assert axes[0, 0] > 0.9  # x to the right
-    assert axes[1, 1] > 0.9  # y down, as up is -y
 
 
 @pytest.mark.parametrize("side", ["front", "back", "left", "right", "top", "bottom"])

@@ -18,9 +18,7 @@ from langsplat_viewer.files.preferences import (
     MOST_RECENT,
     SCALES,
     Preferences,
-    fitting_scale,
     load_preferences,
-    preferences_folder,
     save_preferences,
     with_recent,
 )
@@ -229,20 +227,10 @@ def test_recent_scenes_are_not_listed_twice_nor_without_end():
     assert preferences.recent[:2] == ("/5.ply", f"/{MOST_RECENT + 2}.ply")
 
 
-def test_they_lie_in_the_platforms_folder(monkeypatch, tmp_path):
-    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
-    assert preferences_folder().name == "langsplat-viewer"
-
-
 def test_looks_are_chosen_within_limits(viewer):
     settings.set_theme(viewer, "light")
     settings.set_ui_scale(viewer, 99.0)
     assert viewer.state.preferences == replace(Preferences(), theme="light", ui_scale=SCALES[1])
-
-
-@pytest.mark.parametrize(("height", "scale"), [(0, 1.0), (720, 1.0), (1080, 1.0), (1440, 1.25), (2160, 2.0)])
-def test_letters_fit_the_screen(height, scale):
-    assert fitting_scale(height) == scale
 
 
 # Letters beyond Latin.

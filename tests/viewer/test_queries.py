@@ -158,26 +158,6 @@ def test_queries_are_combined_as_the_grammar_reads_them(opened):
     assert (only.result.members == mug.result.members).all()
 
 
-def test_one_heat_scale_for_all_answers(opened):
-    for word in ("mug", "book"):
-        queries.ask(opened, word)
-    settle(opened)
-    settings.set_picture(opened, replace(opened.state.picture, heat_scale=(0.4, 0.7)))
-    (pane,) = opened.state.panes()
-    assert pane.ranges == ((0.4, 0.7), (0.4, 0.7))
-
-
-def test_level_applies_to_every_query(opened):
-    queries.ask(opened, "plant")
-    settle(opened)
-    assert opened.state.queries[0].result.level == 2
-    key = opened.state.panes()
-    queries.set_level(opened, "part")
-    settle(opened)
-    assert opened.state.queries[0].result.level == 1
-    assert opened.state.panes() != key
-
-
 def test_the_box_is_emptied_by_a_search_and_by_nothing_else(opened):
     queries.type_phrase(opened, "  ")
     queries.ask_typed(opened)
@@ -217,15 +197,6 @@ def test_a_calibrated_scene_gives_verdicts_with_probability(viewer, monkeypatch,
     assert (viewer.state.queries[0].slot is None) == (verdict == "not here")
     said = f"'mug': {verdict} ({100 * result.probability:.0f} %), score "
     assert describe(result).startswith(said)
-
-
-def test_what_was_found_is_told_apart(opened):
-    for phrase in ("mug", "mug or plant"):
-        queries.ask(opened, phrase)
-    settle(opened)
-    one, both = opened.state.queries
-    assert (len(one.things), len(both.things)) == (1, 2)
-    assert np.linalg.norm(one.things[0].centre - CENTRES[0]) < 0.3
 
 
 # Evidence.
@@ -394,15 +365,15 @@ def test_a_broken_set_is_one_line(tmp_path, change):
     assert str(caught.value).isprintable()
 
 
+# When the viewer loads the text encoder, and what it says if that fails.
+
+
 def test_the_histogram_counts_every_gaussian(asked):
     low, high, counts = histogram(asked.state.queries[0].result)
     even = asked.state.queries[0].result.even
     assert (low, high) == (even.min(), max(even.max(), low + 1e-3))
     assert len(counts) == BINS
     assert np.expm1(counts.astype(np.float64)).sum() == pytest.approx(360, rel=1e-5)
-
-
-# When the viewer loads the text encoder, and what it says if that fails.
 
 
 def test_an_unexpected_error_of_the_encoder_is_one_line_too(viewer):

@@ -21,7 +21,7 @@ from langsplat_viewer.rendering.renderer import render_image
 from langsplat_viewer.rendering.request import Splats
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
-from tests.support.windowless import arrive, errors, recorded, settle
+from tests.support.windowless import errors, recorded, settle
 
 
 def turn(viewer: Viewer, yaw: float) -> None:
@@ -132,14 +132,6 @@ def test_keyframes_are_changed_and_changes_undone(opened):
     assert times(opened) == [0, 4, 8]
 
 
-def test_choosing_a_keyframe_goes_there(opened):
-    views = record_three(opened)
-    filming.choose_keyframe(opened, opened.state.record.keyframes[1])
-    arrive(opened)
-    assert_allclose(opened.state.view.eye, views[1].eye, atol=1e-9)
-    assert opened.state.record.at == 2
-
-
 def test_a_path_is_saved_loaded_and_dropped(opened, folder):
     record_three(opened)
     path = filming.save_path(opened, folder)
@@ -203,13 +195,6 @@ def test_a_film_can_be_stopped(opened, folder):
     opened.recorder.close(10.0)
     assert len(list(folder.glob("blobs-film-001/*.png"))) < 121
     assert not list(folder.glob("**/.*"))
-
-
-def test_a_picture_of_any_size(opened, folder):
-    filming.set_film_size(opened, 97, 41)
-    filming.save_sized_picture(opened, folder)
-    recorded(opened)
-    assert Image.open(folder / "blobs-97x41-001.png").size == (97, 41)
 
 
 def see_depth(viewer) -> None:
@@ -317,9 +302,3 @@ def test_an_unwritable_folder_is_one_line(opened, tmp_path):
     assert saving.save_view(opened, blocked) is None
     assert len(errors(opened)) == 2
     assert all("not saved" in text for text in errors(opened))
-
-
-def test_nothing_to_save_before_a_scene_is_open(viewer, tmp_path):
-    assert saving.save_picture(viewer, tmp_path) is None
-    assert saving.save_view(viewer, tmp_path) is None
-    assert len(errors(viewer)) == 2

@@ -17,7 +17,7 @@ from langsplat_viewer.actions import filming, opening, queries, selecting, setti
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.commands import BUTTONS, COMMANDS, OVERLAY_TITLES, matching
 from langsplat_viewer.files.preferences import FILE_NAME, load_preferences, save_preferences
-from langsplat_viewer.marks import Marks, unmarked
+from langsplat_viewer.marks import Marks
 from langsplat_viewer.output import film, saving
 from langsplat_viewer.panels.overlays import STEPS, bar_colours
 from langsplat_viewer.panels.view import compared_name
@@ -29,7 +29,6 @@ from langsplat_viewer.rendering.request import (
     TINT_STRENGTH,
     Detail,
     Inputs,
-    RenderKey,
     RenderRequest,
     Splats,
     Split,
@@ -214,19 +213,6 @@ def test_equal_requests_have_equal_keys_and_the_same_channels(asked):
     assert inputs.channels(coarse)[0] is inputs.channels(first)[0]
 
 
-def test_render_keys_are_equal_where_the_projection_is():
-    first, second, _ = SCENE.cameras
-    key = RenderKey(SCENE, first)
-    assert key == RenderKey(SCENE, replace(first, name="again"))
-    others = (
-        RenderKey(SCENE, second),
-        RenderKey(SCENE, first, Clip(1.0)),
-        RenderKey(replace(SCENE), first),
-        RenderKey(SCENE, replace(first, width=80)),
-    )
-    assert all(key != other for other in others)
-
-
 @pytest.mark.parametrize("backend", ["opengl", "cpu"])
 @pytest.mark.parametrize("name", CHANGES)
 def test_what_is_kept_gives_the_image_that_a_new_renderer_gives(gl, asked, name, backend):
@@ -313,24 +299,15 @@ def test_panes_are_joined_as_they_are_shown():
     assert wide[0, :, 0].tolist() == [0] * 20 + [9] * 12
 
 
+# The edited scene.
+
+
 def test_colour_bars_end_where_the_image_does():
     alone, own, weak = bar_colours(1, 1.0, True), bar_colours(1, 1.0, False), bar_colours(1, 0.5, False)
     assert alone.shape == own.shape == (STEPS, 3)
     assert not own[0].any()
     np.testing.assert_allclose(weak[-1], 0.5 * own[-1])
     assert alone[-1, 0] > alone[-1, 2]  # red is hot
-
-
-# The edited scene.
-
-
-def test_without_marks_it_is_the_scene_itself():
-    marks = unmarked(360)
-    edited = edited_scene(SCENE, marks)
-    assert edited.scene is SCENE
-    assert edited.rows is None
-    values = np.ones((360, 2))
-    assert edited.values(values) is values
 
 
 def test_hidden_and_deleted_ones_are_left_out_with_their_rows_of_the_layers():
