@@ -22,16 +22,16 @@ def split(capture: Capture, config: DatasetConfig) -> tuple[list[int], list[int]
     return [index for index in range(len(capture)) if index not in held_out], held_out
 
 
-def chosen(cameras: Sequence[Camera], every: int, fewest: int = FEWEST_VIEWS) -> list[int]:
+def chosen(cameras: Sequence[Camera], every: int) -> list[int]:
     """Indices of one view in `every`, in ascending order, of which each lies among training views: those at
     the ends of a walk show what no other photograph does, and tell nothing of the training.
 
     One after the other that view is taken which lies best in the middle of its nearest training views, by
     place and direction, measured by how far those are away. Its own nearest ones are then left to training,
-    so that the views come from all over the capture. None of fewer than `fewest`.
+    so that the views come from all over the capture. None of fewer than `FEWEST_VIEWS`.
     """
     count = len(cameras)
-    if every < 2 or count < fewest:
+    if every < 2 or count < FEWEST_VIEWS:
         return []
     stands = _stands(cameras)
     apart = np.linalg.norm(stands[:, None] - stands[None], axis=2)

@@ -201,7 +201,7 @@ def _gaussians(run: _Run, capture: Capture, train: list[int]) -> tuple[Gaussians
     """The trained Gaussians, and what rehearsals found."""
     config, once, shared = run.config.radiance, run.processes.once, (run.work, run.progress)
     rehearsed = once(lambda: rehearsals(capture, train, config, *shared))
-    supporting = supported(rehearsed, config)
+    supporting = supported(rehearsed, config, len(train))
     return once(lambda: trained_gaussians(capture, train, supporting, *shared)), rehearsed
 
 
@@ -239,12 +239,13 @@ def rehearsals(
         for left in checkpoints_of(checkpoint):
             left.unlink(missing_ok=True)
     found = {int(steps): float(decibels) for steps, decibels in json.loads(done.read_text()).items()}
-    steps = supported(found, config).steps
+    steps = supported(found, config, len(train)).steps
     if steps < config.steps:
-        log.warning(
-            "%d steps are trained, not %d: with so few photographs more end worse (held-out PSNR %s); "
+        decibels = ", ".join(f"{psnr:.1f} dB after {n}" for n, psnr in found.items()) or "none could be"
+        log.info(
+            "%d steps are trained, not %d: with so few photographs more end worse (held out: %s); "
             "--radiance.rehearsed-views 0 trains them all",
-            *(steps, config.steps, ", ".join(f"{n}: {decibels:.1f} dB" for n, decibels in found.items())),
+            *(steps, config.steps, decibels),
         )
     return found
 

@@ -127,7 +127,7 @@ def _measured(
     sheet: Path | None,
 ) -> tuple[str, ...]:
     began = time.process_time()
-    config = supported(rehearse(capture, config, train, progress=progress), config)
+    config = supported(rehearse(capture, config, train, progress=progress), config, len(train))
     gaussians = train_radiance(capture, config, train, progress=progress)
     seconds = time.process_time() - began
     if sheet:

@@ -25,7 +25,6 @@ log = logging.getLogger("langsplat")
 STAGE = "rehearsing"
 LONGER_SIDE = 320  # px at most
 HELD_OUT = 4  # one view in so many
-FEWEST_VIEWS = 3  # of which one can be spared
 TOLERANCE = 0.1  # dB, by which more steps may end worse
 
 
@@ -43,7 +42,7 @@ def rehearse(
     `checkpoints_of` it, and stay.
     """
     every = config.rehearsals(len(train_indices))
-    held_out = chosen([capture.cameras[i] for i in train_indices], HELD_OUT, FEWEST_VIEWS)
+    held_out = chosen([capture.cameras[i] for i in train_indices], HELD_OUT)
     if len(every) < 2 or not held_out:
         return {}
     small = capture.shrunk(train_indices, LONGER_SIDE)
@@ -76,9 +75,10 @@ def checkpoints_of(checkpoint: Path) -> list[Path]:
     return list(checkpoint.parent.glob(f"*-{checkpoint.name}"))
 
 
-def supported(found: dict[int, float], config: RadianceConfig) -> RadianceConfig:
-    """Return `config` with the most steps that the rehearsals `found` no worse than fewer."""
+def supported(found: dict[int, float], config: RadianceConfig, views: int) -> RadianceConfig:
+    """Return `config` with the most steps that the rehearsals `found` no worse than fewer; with so few training
+    views that none could be held out, with the fewest."""
     if not found:
-        return config
+        return replace(config, steps=config.rehearsals(views)[0])
     enough = max(found.values()) - TOLERANCE
     return replace(config, steps=max(steps for steps, psnr in found.items() if psnr >= enough))
