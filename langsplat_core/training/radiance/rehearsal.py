@@ -76,8 +76,8 @@ def checkpoints_of(checkpoint: Path) -> list[Path]:
 
 
 def supported(found: dict[int, float], config: RadianceConfig, views: int) -> RadianceConfig:
-    """Return `config` with the most steps that the rehearsals `found` no worse than fewer. Where there are too
-    few training views to hold one out, the fewest."""
+    """Return `config` with the most steps that the rehearsals `found` no worse than fewer. Where too few
+    training views leave none to hold out, the fewest."""
     if not found:
         return replace(config, steps=config.rehearsals(views)[0])
     enough = max(found.values()) - TOLERANCE
