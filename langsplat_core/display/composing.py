@@ -1,7 +1,7 @@
 """`displays.compose` compiled, for machines whose OpenGL is software: there the shader takes longer than the
 rasterizer. One pass over the pixels, float32, on all cores."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,31 +32,59 @@ WAYS = {
     "relevancy": HEAT,
     "segmentation": SEGMENTS,
 }
-# Places in the numbers that a kernel is given.
-THRESHOLD, GATE, DIM, HEAT_OPACITY, BACKDROP = range(5)
-LIMITS = BACKDROP + 3
-TINTS = LIMITS + 2 * MAX_QUERIES
 _TABLES = {name: np.ascontiguousarray(table / np.float32(255)) for name, table in COLOUR_MAPS.items()}
+
+
+class Look(NamedTuple):
+    """How pixels are drawn: a picture's settings as a kernel takes them, all numbers float32."""
+
+    way: int  # one of `WAYS`
+    transparent: bool
+    own_colours: bool
+    threshold: Any
+    gate: Any
+    dim: Any
+    heat_opacity: Any
+    backdrop: Array  # (3,)
+    limits: Array  # (MAX_QUERIES, 2) values drawn as 0 and as 1
+    tints: Array  # (MAX_QUERIES, 3)
+    table: Array  # (NODES, 3) the colour map
+
+
+class Planes(NamedTuple):
+    """The channels of an image, float32."""
+
+    rgb: Array  # (H, W, 3)
+    alpha: Array  # (H, W)
+    extra: Array  # (H, W, C)
 
 
 def composed(channels: Channels, picture: PictureConfig, ranges: Ranges = ()) -> Array:
     """(H, W, 4) uint8, row 0 at the bottom as OpenGL has it: what `compose` draws, within one step; opaque
     unless the picture is transparent."""
-    way = WAYS[picture.display]
-    if channels.extra is None and DISPLAYS[picture.display].channel is not None:
-        way = PLAIN
     extra = channels.rgb if channels.extra is None else channels.extra
+    planes = Planes(*(np.asarray(plane, np.float32) for plane in (channels.rgb, channels.alpha, extra)))
     height, width = channels.alpha.shape
     image = np.empty((height, width, 4), np.uint8)
-    backdrop = np.zeros(3) if picture.transparent else np.asarray(picture.background)
-    gates = np.array([picture.threshold, picture.alpha_gate, picture.dim, picture.heat_opacity])
-    limits = np.array(full_ranges(ranges, MAX_QUERIES))
-    looks = np.concatenate([gates, backdrop, limits.ravel(), QUERY_COLOURS.ravel()]).astype(np.float32)
-    table = _TABLES[picture.colour_map]
-    flags = way, picture.transparent, picture.own_colours
-    arrays = (np.asarray(a, np.float32) for a in (channels.rgb, channels.alpha, extra))
-    shared_workers().run(_rows, height, image, *arrays, *flags, looks, table)
+    shared_workers().run(_rows, height, image, planes, _look(channels, picture, ranges))
     return image
+
+
+def _look(channels: Channels, picture: PictureConfig, ranges: Ranges) -> Look:
+    is_plain = channels.extra is None and DISPLAYS[picture.display].channel is not None
+    return Look(
+        way=PLAIN if is_plain else WAYS[picture.display],
+        transparent=picture.transparent,
+        own_colours=picture.own_colours,
+        threshold=np.float32(picture.threshold),
+        gate=np.float32(picture.alpha_gate),
+        dim=np.float32(picture.dim),
+        heat_opacity=np.float32(picture.heat_opacity),
+        backdrop=np.asarray((0, 0, 0) if picture.transparent else picture.background, np.float32),
+        limits=np.array(full_ranges(ranges, MAX_QUERIES), np.float32).reshape(MAX_QUERIES, 2),
+        tints=np.asarray(QUERY_COLOURS, np.float32),
+        table=_TABLES[picture.colour_map],
+    )
 
 
 @helper
@@ -74,82 +102,73 @@ def _map(shown: Array, t: Any, table: Array) -> None:
 
 
 @helper
-def _heat(shown: Array, base: Array, mean: Array, own_colours: bool, looks: Array, table: Array) -> None:
+def _heat(shown: Array, base: Array, mean: Array, look: Look) -> None:
     heat = total = red = green = blue = np.float32(0)
     for j in range(len(mean)):
-        low, high, tint = looks[LIMITS + 2 * j], looks[LIMITS + 2 * j + 1], TINTS + 3 * j
+        low, high, tint = look.limits[j, 0], look.limits[j, 1], look.tints[j]
         own = _clip((mean[j] - low) / (high - low))
         heat, total = max(heat, own), total + own
-        red, green, blue = (
-            red + own * looks[tint],
-            green + own * looks[tint + 1],
-            blue + own * looks[tint + 2],
-        )
-    if own_colours:
+        red, green, blue = red + own * tint[0], green + own * tint[1], blue + own * tint[2]
+    if look.own_colours:
         share = 1 / max(total, np.float32(1e-9))
         shown[0], shown[1], shown[2] = red * share, green * share, blue * share
     else:
-        _map(shown, heat, table)
-    fade = heat if own_colours else _clip(heat / np.float32(HEAT_FADE))
-    mix = looks[HEAT_OPACITY] * fade * fade * (3 - 2 * fade)  # smoothstep
+        _map(shown, heat, look.table)
+    fade = heat if look.own_colours else _clip(heat / np.float32(HEAT_FADE))
+    mix = look.heat_opacity * fade * fade * (3 - 2 * fade)  # smoothstep
     for k in range(3):
-        shown[k] = base[k] * looks[DIM] * (1 - mix) + shown[k] * mix
+        shown[k] = base[k] * look.dim * (1 - mix) + shown[k] * mix
 
 
 @helper
-def _segment(shown: Array, base: Array, mean: Array, looks: Array) -> None:
+def _segment(shown: Array, base: Array, mean: Array, look: Look) -> None:
     winner = 0
     for j in range(1, len(mean)):
         if mean[j] > mean[winner]:
             winner = j
-    low, high = looks[LIMITS + 2 * winner], looks[LIMITS + 2 * winner + 1]
+    low, high = look.limits[winner, 0], look.limits[winner, 1]
     opacity = np.float32(SEGMENT_OPACITY) * _clip((1 - low) / (high - low))
-    inside = mean[winner] > looks[THRESHOLD]
+    inside = mean[winner] > look.threshold
     for k in range(3):
-        mixed = base[k] * (1 - opacity) + looks[TINTS + 3 * winner + k] * opacity
-        shown[k] = mixed if inside else base[k] * looks[DIM]
+        mixed = base[k] * (1 - opacity) + look.tints[winner, k] * opacity
+        shown[k] = mixed if inside else base[k] * look.dim
+
+
+@helper
+def _depth(shown: Array, depth: Any, is_open: bool, look: Look) -> None:
+    near, far = look.limits[0, 0], look.limits[0, 1]
+    _map(shown, 1 - _clip((depth - near) / max(far - near, np.float32(1e-9))), look.table)
+    for k in range(3):
+        shown[k] = shown[k] if is_open else look.backdrop[k]
 
 
 @kernel
-def _rows(
-    first: int,
-    last: int,
-    image: Array,
-    rgb: Array,
-    alphas: Array,
-    extra: Array,
-    way: int,
-    transparent: bool,
-    own_colours: bool,
-    looks: Array,
-    table: Array,
-) -> None:
-    height, width = alphas.shape
+def _rows(first: int, last: int, image: Array, planes: Planes, look: Look) -> None:
+    """Rows [first, last) of the planes, row 0 on top, into `image`."""
+    height, width = planes.alpha.shape
     shown, base = np.empty(3, np.float32), np.empty(3, np.float32)
-    values = np.empty(extra.shape[2], np.float32)
+    values = np.empty(planes.extra.shape[2], np.float32)
     for y in range(first, last):
         for x in range(width):
-            alpha = alphas[y, x]
-            is_open = alpha > looks[GATE]
+            alpha = planes.alpha[y, x]
+            is_open = alpha > look.gate
             scale = 1 / alpha if is_open else np.float32(0)
-            share = 1 / max(alpha, np.float32(LEAST_ALPHA)) if transparent else np.float32(1)
+            share = 1 / max(alpha, np.float32(LEAST_ALPHA)) if look.transparent else np.float32(1)
             for k in range(3):
-                own = extra[y, x, k] if way == SUMS else rgb[y, x, k]
-                base[k] = alpha if way == ALPHA else _clip(own * share + (1 - alpha) * looks[BACKDROP + k])
+                own = planes.extra[y, x, k] if look.way == SUMS else planes.rgb[y, x, k]
+                mixed = _clip(own * share + (1 - alpha) * look.backdrop[k])
+                base[k] = alpha if look.way == ALPHA else mixed
                 shown[k] = base[k]
             for k in range(len(values)):
-                values[k] = extra[y, x, k] * scale
-            opacity = np.float32(1) if way == ALPHA or not transparent else alpha
-            if way == HEAT:
-                _heat(shown, base, values, own_colours, looks, table)
-            elif way == SEGMENTS:
-                _segment(shown, base, values, looks)
-            elif way == DEPTH:
-                near, far = looks[LIMITS], looks[LIMITS + 1]
-                _map(shown, 1 - _clip((values[0] - near) / max(far - near, np.float32(1e-9))), table)
-                opacity = np.float32(is_open or not transparent)
-                for k in range(3):
-                    shown[k] = shown[k] if is_open else looks[BACKDROP + k]
+                values[k] = planes.extra[y, x, k] * scale
+            opacity = np.float32(1) if look.way == ALPHA or not look.transparent else alpha
+            if look.way == HEAT:
+                _heat(shown, base, values, look)
+            elif look.way == SEGMENTS:
+                _segment(shown, base, values, look)
+            elif look.way == DEPTH:
+                _depth(shown, values[0], is_open, look)
+                opacity = np.float32(is_open or not look.transparent)
             for k in range(3):
                 image[height - 1 - y, x, k] = np.uint8(np.float32(255) * _clip(shown[k]) + np.float32(0.5))
             image[height - 1 - y, x, 3] = np.uint8(np.float32(255) * opacity + np.float32(0.5))

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -58,17 +58,25 @@ LONGEST_HEADER = 2**30  # bytes
 THUMBNAIL = (96, 72)  # width and height, pixels, of the picture that the index keeps of a scene
 # Name, type, and what has a row: k, d codewords, m entries of mixtures, r regions, those of subparts first.
 COLUMNS: tuple[tuple[str, str, str], ...] = (
-    ("steps", "<f4", "k"),  # (K,) of the 8 bits: a codeword is step times codewords
-    ("zeros", "<f4", "k"),  # (K,) see `Scale.of`
-    ("rates", "<f4", "k"),  # (K,)
-    ("shares", "<f4", "m"),  # (M,) of a codeword in the mean of a region
-    ("words", "<u4", "m"),  # (M,) codeword, from 0 in each scene
-    ("regions", "<u4", "m"),  # (M,) region, from 0 in each scene
-    ("parents", "<i4", "r"),  # (R,) region of the level above, from 0 in each scene; -1 for none
-    ("solid", "<u4", "r"),  # (R,) whether it is no crumb
-    ("codewords", "<i1", "d"),  # (K, D)
+    *(("steps", "<f4", "k"), ("zeros", "<f4", "k"), ("rates", "<f4", "k")),
+    *(("shares", "<f4", "m"), ("words", "<u4", "m"), ("regions", "<u4", "m")),
+    *(("parents", "<i4", "r"), ("solid", "<u4", "r"), ("codewords", "<i1", "d")),
 )
 FLOATS = 8 + 4 * len(LEVELS)  # of a scene: median and spread of four bars; odds, or NaN
+
+
+class Columns(NamedTuple):
+    """The arrays of scenes, one scene after the other, in the order of `COLUMNS`."""
+
+    steps: Array  # (K,) of the 8 bits: a codeword is step times codewords
+    zeros: Array  # (K,) see `Scale.of`
+    rates: Array  # (K,)
+    shares: Array  # (M,) of a codeword in the mean of a region
+    words: Array  # (M,) codeword, from 0 in each scene
+    regions: Array  # (M,) region, from 0 in each scene
+    parents: Array  # (R,) region of the level above, from 0 in each scene; -1 for none
+    solid: Array  # (R,) whether it is no crumb
+    codewords: Array  # (K, D)
 
 
 @dataclass(frozen=True, eq=False)
@@ -416,9 +424,8 @@ def fits_in(group: Group, vector: Array) -> Array:
     those that are not indexed. FormatError for an index whose numbers do not fit each other."""
     found, columns = np.full((len(group.scenes), len(LEVELS)), -np.inf), group.columns
     levels = np.array([scene.counts[1:4] for scene in group.scenes], np.int64).reshape(-1, 3)
-    arrays = (columns[name] for name, _, _ in COLUMNS)
-    workers = shared_workers()
-    workers.run(_fits, len(found), np.require(vector, np.float32, "C"), *arrays, group.starts, levels, found)
+    arrays, phrase = Columns(**columns), np.require(vector, np.float32, "C")
+    shared_workers().run(_fits, len(found), phrase, arrays, group.starts, levels, found)
     if np.isnan(found).any():
         raise FormatError("the index of scenes is damaged; remove it, and it is made again")
     return found
@@ -433,22 +440,8 @@ def _dot(row: Array, vector: Array) -> np.float32:
 
 
 @kernel
-def _fits(  # noqa: PLR0913  the columns
-    first: int,
-    last: int,
-    vector: Array,
-    steps: Array,
-    zeros: Array,
-    rates: Array,
-    shares: Array,
-    words: Array,
-    regions: Array,
-    parents: Array,
-    solid: Array,
-    codewords: Array,
-    starts: Array,
-    levels: Array,
-    found: Array,
+def _fits(
+    first: int, last: int, vector: Array, columns: Columns, starts: Array, levels: Array, found: Array
 ) -> None:
     """Rows [first, last) of `found` (S, 3): as `answers.by_regions` says; NaN for numbers out of place."""
     for scene in range(first, last):
@@ -458,11 +451,12 @@ def _fits(  # noqa: PLR0913  the columns
             continue
         relevancy = np.empty(last_k - k, np.float64)
         for i in range(k, last_k):
-            cosine = _dot(codewords[i], vector) * steps[i]
-            relevancy[i - k] = 1 / (1 + np.exp(-rates[i] * (cosine - zeros[i])))
-        fits = np.zeros(last_r - r)
-        if _mix(fits, relevancy, shares[m:last_m], words[m:last_m], regions[m:last_m], parents[r:last_r]):
-            _best_fits(fits, parents[r:last_r], solid[r:last_r], levels[scene], found[scene])
+            cosine = _dot(columns.codewords[i], vector) * columns.steps[i]
+            relevancy[i - k] = 1 / (1 + np.exp(-columns.rates[i] * (cosine - columns.zeros[i])))
+        fits, parents = np.zeros(last_r - r), columns.parents[r:last_r]
+        shares, words = columns.shares[m:last_m], columns.words[m:last_m]
+        if _mix(fits, relevancy, shares, words, columns.regions[m:last_m], parents):
+            _best_fits(fits, parents, columns.solid[r:last_r], levels[scene], found[scene])
         else:
             found[scene] = np.nan
 
