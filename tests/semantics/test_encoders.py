@@ -280,6 +280,12 @@ def remove_logit_scale(folder: Path) -> None:
     torch.save(state, folder / "pytorch_model.bin")
 
 
+def add_long_token(folder: Path) -> None:
+    path = folder / "tokenizer.json"
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text.replace('"▁mug"', '"' + "y" * 300_000 + '"'), encoding="utf-8")
+
+
 def holding(name: str, text: str) -> Callable[[Path], object]:
     return lambda folder: (folder / name).write_text(text, encoding="utf-8")
 
@@ -296,6 +302,7 @@ def change_config(folder: Path, change: Callable[[dict[str, Any]], None]) -> Non
     [
         (lambda folder: (folder / "tokenizer.json").unlink(), r"no tokenizer\.json in this folder"),
         (holding("tokenizer.json", '{"version": "1.0"}'), r"tokenizer\.json is no tokenizer"),
+        (add_long_token, "a token of more than"),
         (remove_special_tokens, "no eos_token"),
         (remove_logit_scale, "logit_scale is not in them"),
         (
@@ -303,12 +310,23 @@ def change_config(folder: Path, change: Callable[[dict[str, Any]], None]) -> Non
             "'bert' model is no image-text encoder known here; known are clip, siglip",
         ),
         (holding("config.json", "{"), r"config\.json cannot be read"),
+        (holding("config.json", "[" * 100_000), r"config\.json cannot be read"),
     ],
 )
 def test_a_broken_folder_is_one_line(tmp_path: Path, damage: Callable[[Path], object], message: str) -> None:
     tiny_siglip(tmp_path)
     damage(tmp_path)
     with pytest.raises(EncoderError, match=message) as error:
+        load_text_encoder(str(tmp_path))
+    assert "\n" not in str(error.value)
+
+
+def test_a_tokenizer_of_no_known_rules_is_one_line(tmp_path: Path) -> None:
+    tiny_clip(tmp_path)
+    path = tmp_path / "tokenizer.json"
+    stated = json.loads(path.read_text(encoding="utf-8"))
+    path.write_text(json.dumps(stated | {"normalizer": 0}), encoding="utf-8")
+    with pytest.raises(EncoderError, match="not CLIP weights that can be loaded") as error:
         load_text_encoder(str(tmp_path))
     assert "\n" not in str(error.value)
 
