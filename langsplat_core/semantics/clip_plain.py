@@ -129,9 +129,9 @@ def plain_text_tower(weights: Weights) -> PlainClipText | None:
     tensors = _tensors(weights.folder, shapes) if tokenizer else None
     if tokenizer is None or tensors is None:
         return None
-    highest = max(tokenizer.numbers.values())
-    end = config.eos_token_id if config.eos_token_id != LEGACY_END else highest
-    if tokenizer.end != end or highest >= config.vocab_size:
+    numbers = set(tokenizer.numbers.values())
+    end = config.eos_token_id if config.eos_token_id != LEGACY_END else max(numbers, default=-1)
+    if tokenizer.end != end or not {tokenizer.begin, end} <= numbers <= set(range(config.vocab_size)):
         return None
     return PlainClipText(weights.id, config, tensors, tokenizer)
 

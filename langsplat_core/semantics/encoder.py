@@ -27,6 +27,7 @@ FILE = "tokenizer.json"
 STATED_IN = ("tokenizer_config.json", "special_tokens_map.json")  # which token pads, which one ends
 # The library ends the process over a token of 300 000 bytes; the table of a normaliser may be as long.
 _LONG = re.compile(rb'(?<!"precompiled_charsmap":)(?<!"precompiled_charsmap": )"[^"]{10000}')
+UNUSUAL = "\u3042"  # where the token for what is not known is lacking, this cannot be read
 USUAL = {"eos_token": ("</s>", "<eos>"), "pad_token": ("<pad>", "</s>")}
 
 
@@ -107,6 +108,7 @@ def read_tokenizer(weights: Weights) -> Any:
         tokenizer = Tokenizer.from_file(str(weights.folder / FILE))
         tokenizer.no_truncation()
         tokenizer.no_padding()
+        tokenizer.encode(UNUSUAL)
         return tokenizer
     except Exception as error:  # the library raises no narrower class for a damaged file
         reason = (str(error).splitlines() or ["unreadable"])[0][:200]

@@ -290,11 +290,17 @@ def holding(name: str, text: str) -> Callable[[Path], object]:
     return lambda folder: (folder / name).write_text(text, encoding="utf-8")
 
 
-def change_config(folder: Path, change: Callable[[dict[str, Any]], None]) -> None:
-    path = folder / "config.json"
+def change_config(
+    folder: Path, change: Callable[[dict[str, Any]], object], name: str = "config.json"
+) -> None:
+    path = folder / name
     config = json.loads(path.read_text(encoding="utf-8"))
     change(config)
     path.write_text(json.dumps(config), encoding="utf-8")
+
+
+def change_tokenizer(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    change_config(folder, change, "tokenizer.json")
 
 
 @pytest.mark.parametrize(
@@ -321,11 +327,15 @@ def test_a_broken_folder_is_one_line(tmp_path: Path, damage: Callable[[Path], ob
     assert "\n" not in str(error.value)
 
 
-def test_a_tokenizer_of_no_known_rules_is_one_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "change",
+    [lambda stated: stated.update(normalizer=0), lambda stated: stated["model"].update(vocab={})],
+)
+def test_a_tokenizer_of_no_known_rules_is_one_line(
+    tmp_path: Path, change: Callable[[dict[str, Any]], object]
+) -> None:
     tiny_clip(tmp_path)
-    path = tmp_path / "tokenizer.json"
-    stated = json.loads(path.read_text(encoding="utf-8"))
-    path.write_text(json.dumps(stated | {"normalizer": 0}), encoding="utf-8")
+    change_tokenizer(tmp_path, change)
     with pytest.raises(EncoderError, match="not CLIP weights that can be loaded") as error:
         load_text_encoder(str(tmp_path))
     assert "\n" not in str(error.value)
@@ -397,6 +407,10 @@ def text_setting(**settings: object) -> Callable[[Path], None]:
 
 NOT_PLAIN: dict[str, Callable[[Path], object]] = {
     "no tokenizer": lambda folder: (folder / "tokenizer.json").unlink(),
+    "no tokens": lambda folder: change_tokenizer(folder, lambda stated: stated["model"].update(vocab={})),
+    "a beginning that is no token": lambda folder: change_tokenizer(
+        folder, lambda stated: stated["post_processor"].update(cls=["<|startoftext|>", 97])
+    ),
     "another activation": text_setting(hidden_act="relu"),
     "more layers": text_setting(num_hidden_layers=3),
     "narrower": text_setting(intermediate_size=40),
