@@ -33,10 +33,12 @@ from langsplat_core.config import CODEC_CONFIGS, CodecConfig, annotations, check
 from langsplat_core.errors import InputError, LangSplatError, optional_imports, printable_line
 from langsplat_core.io.files import NO_ROOM, check_output_file, check_output_folder, shown
 from langsplat_core.progress import Terminated
+from langsplat_core.signals import end, is_import
 
 log = logging.getLogger("langsplat")
 COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
 SHELLS = ("bash", "zsh", "fish", "tcsh")
+_CONTINUES = "; the same command continues where it stopped"
 _LOG_LIMIT = 2000  # characters of a warning
 # What writing to an open file or standard output ends in where there is no room or no file.
 _UNWRITTEN = (*NO_ROOM, errno.EBADF)
@@ -196,7 +198,7 @@ def _run(program: str, parser: Callable[[], Command]) -> None:
     logging.basicConfig(handlers=[handler])
     warnings.filterwarnings("ignore", module=r"(torch|transformers|huggingface_hub|numba)(\.|$)")
     began = time.perf_counter()
-    with _signals_raise():
+    with _signals_raise(program):
         check_arguments(command)
         command.run()
     log.debug("%s %s: %.1f s", program, __version__, time.perf_counter() - began)
@@ -209,7 +211,7 @@ def _ended(program: str, error: BaseException) -> int:
         return 0
     if isinstance(error, KeyboardInterrupt):
         how, code = ("terminated", 143) if isinstance(error, Terminated) else ("interrupted", 130)
-        print(f"{program}: {how}; the same command continues where it stopped", file=sys.stderr)
+        print(f"{program}: {how}{_CONTINUES}", file=sys.stderr)
         return code
     if isinstance(error, OSError):
         return _fail(program, _system_complaint(error))
@@ -219,16 +221,18 @@ def _ended(program: str, error: BaseException) -> int:
 
 
 @contextlib.contextmanager
-def _signals_raise() -> Iterator[None]:
+def _signals_raise(program: str) -> Iterator[None]:
     """Have SIGTERM end a command as Ctrl-C does: with what is finished kept, and a line."""
 
-    def terminate(number: int, frame: FrameType | None) -> None:
-        raise Terminated
+    def stop(number: int, frame: FrameType | None) -> None:
+        if is_import(frame):
+            end(program, number, _CONTINUES)
+        raise Terminated if number == signal.SIGTERM else KeyboardInterrupt
 
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    own = {signal.SIGTERM: terminate, signal.SIGINT: signal.default_int_handler}
+    own = dict.fromkeys((signal.SIGTERM, signal.SIGINT), stop)
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # started in a shell's background
         del own[signal.SIGINT]
     before = {number: signal.signal(number, handler) for number, handler in own.items()}

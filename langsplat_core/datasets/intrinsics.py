@@ -1,9 +1,11 @@
 """Lenses of photographs: their formulas, their inverses, and resampling to a pinhole; and pycolmap.
 
 Import `pycolmap` from here, where it leaves signals alone and its libraries keep to one thread. Its logging
-library installs a handler of its own for SIGTERM, which prints a stack trace and kills the process: what was
-there before is put back. Its wheel brings OpenMP (and a package of other make may bring OpenBLAS) of its own,
-which ask the environment how many threads to use when they are loaded, and never again.
+library installs a handler of its own for SIGTERM and SIGABRT, which prints a stack trace and kills the
+process: what was there before is put back, and in the 30 ms until then the trace is printed nowhere. Where it
+aborts, as on a full disk, its reason is so the last thing it says. Its wheel brings OpenMP (and a package of
+other make may bring OpenBLAS) of its own, which ask the environment how many threads to use when they are
+loaded, and never again.
 """
 
 import ctypes
@@ -51,16 +53,36 @@ def _handler(number: int, handler: int | None) -> int | None:
     return before
 
 
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Have what is written to standard error meanwhile, by whichever library, lead nowhere."""
+    try:
+        kept = os.dup(2)
+    except OSError:  # it is closed
+        yield
+        return
+    with open(os.devnull, "wb") as nowhere:
+        os.dup2(nowhere.fileno(), 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+
+
 if sys.platform == "win32":  # no such handler there
     with _one_thread():
         import pycolmap
 else:
-    _before = _handler(signal.SIGTERM, None)
+    _before = {number: _handler(number, None) for number in (signal.SIGTERM, signal.SIGABRT)}
+    for _number in _before:
+        _handler(_number, _before[_number])
     try:
-        with _one_thread():
+        with _one_thread(), _silent():
             import pycolmap
     finally:
-        _handler(signal.SIGTERM, _before)
+        for _number in _before:
+            _handler(_number, _before[_number])
         signal.siginterrupt(signal.SIGTERM, True)  # as Python has it: a call that waits shall return
 
 

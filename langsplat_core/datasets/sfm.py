@@ -583,6 +583,7 @@ def _reconstruct(workspace: Path, numbered: dict[str, Path], progress: Progress)
     try:
         map_cameras(workspace, match_photos(workspace, numbered, progress), progress)
     except FAILURES as error:
+        check_room(workspace)
         reason = str(error).partition("\n")[0]
         raise InputError(
             f"structure from motion failed ({reason}); remove {workspace} and try again"

@@ -16,6 +16,7 @@ from langsplat_core.scene.tree import LEVEL_COUNT, NO_NODE, Tree
 
 NEIGHBOURS = 16
 FAINTEST = 1e-3  # weight of a Gaussian whose opacity is less, so that no mean divides by nothing
+SOME = 1 << 18  # Gaussians whose distances are held at a time: all of five million take gigabytes
 REACH = 4.0  # times the median distance of a Gaussian's neighbours: what is farther is another surface
 
 _OUTSIDE, _WAITING = -1, -2  # labels that are no part
@@ -102,17 +103,21 @@ def build_surface(gaussians: Gaussians, min_opacity: float = 0.1) -> Surface:
     rows = rows[cKDTree(gaussians.means[rows].astype(np.float64)).indices]  # leaf by leaf: near ones meet
     positions = gaussians.means[rows].astype(np.float64)
     tree = cKDTree(positions)
-    distances, neighbours = tree.query(positions, k=k, workers=-1)
-    shape = (len(rows), k)
-    distances, neighbours = distances.reshape(shape), neighbours.reshape(shape).astype(np.int32)
+    neighbours, near = np.empty((len(rows), k), np.int32), np.empty((len(rows), k), bool)
+    reach, middle = np.empty(len(rows)), slice((k - 1) // 2, k // 2 + 1)
+    for start in range(0, len(rows), SOME):
+        part = slice(start, start + SOME)
+        distances, found = (of.reshape(-1, k) for of in tree.query(positions[part], k=k, workers=-1))
+        neighbours[part] = found
+        reach[part] = REACH * distances[:, middle].mean(1) + 1e-12  # the median: they ascend
+        near[part] = distances <= reach[part, None]
     weights = every[rows]
-    reach = REACH * np.median(distances, axis=1) + 1e-12
     anchors = np.full(len(gaussians), -1, np.int32)
     anchors[rows] = np.arange(len(rows))
     faint = np.flatnonzero(valid & (anchors < 0))
     gap, nearest = tree.query(gaussians.means[faint].astype(np.float64), workers=-1)
     anchors[faint] = np.where(gap <= reach[nearest], nearest, -1)
-    return Surface(rows, positions, neighbours, weights, _links(neighbours, distances, reach), anchors)
+    return Surface(rows, positions, neighbours, weights, _links(neighbours, near), anchors)
 
 
 def surface_areas(gaussians: Gaussians) -> Array:
@@ -126,11 +131,12 @@ def surface_areas(gaussians: Gaussians) -> Array:
     return np.minimum(areas, np.quantile(areas, 0.99)) if len(areas) else areas
 
 
-def _links(neighbours: Array, distances: Array, reach: Array) -> csr_matrix:
-    near = distances <= reach[:, None]
-    count = len(neighbours)
-    source = np.repeat(np.arange(count, dtype=np.int32), near.sum(1))
-    one_way = csr_matrix((np.ones(len(source), bool), (source, neighbours[near])), shape=(count, count))
+def _links(neighbours: Array, near: Array) -> csr_matrix:
+    starts = np.zeros(len(neighbours) + 1, np.int32)
+    np.cumsum(near.sum(1), out=starts[1:])
+    ends = neighbours[near]
+    one_way = csr_matrix((np.ones(len(ends), bool), ends, starts), shape=2 * (len(neighbours),))
+    one_way.sort_indices()
     return (one_way + one_way.T).tocsr()
 
 

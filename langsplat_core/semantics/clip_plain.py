@@ -27,6 +27,8 @@ from langsplat_core.semantics.weights import CONFIG, SAFE, Weights
 MOST_WEIGHTS = 20_000_000
 MOST_LAYERS = 64  # of a model that is small: beyond, its shapes alone could fill the memory
 TEMPERATURE = 10.0  # of LERF and LangSplat, whatever scale a checkpoint ended its training with
+# What reading a file raises that states something else.
+UNCLEAR = (OSError, ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError)
 READABLE = ("F16", "F32", "F64")  # types of safetensors that NumPy has too
 LEGACY_END = 2  # of configurations whose end token is the one with the highest number
 PREFIX = "text_model."
@@ -127,9 +129,9 @@ def plain_text_tower(weights: Weights) -> PlainClipText | None:
     tensors = _tensors(weights.folder, shapes) if tokenizer else None
     if tokenizer is None or tensors is None:
         return None
-    highest = max(tokenizer.numbers.values())
-    end = config.eos_token_id if config.eos_token_id != LEGACY_END else highest
-    if tokenizer.end != end or highest >= config.vocab_size:
+    numbers = set(tokenizer.numbers.values())
+    end = config.eos_token_id if config.eos_token_id != LEGACY_END else max(numbers, default=-1)
+    if tokenizer.end != end or not {tokenizer.begin, end} <= numbers <= set(range(config.vocab_size)):
         return None
     return PlainClipText(weights.id, config, tensors, tokenizer)
 
@@ -206,7 +208,7 @@ def _text_config(weights: Weights) -> TextConfig | None:
         stated["projection_dim"] = whole.get("projection_dim", TextConfig.projection_dim)
         kinds = {name: type(getattr(TextConfig, name)) for name in TextConfig.__dataclass_fields__}
         config = TextConfig(**{name: kind(stated[name]) for name, kind in kinds.items() if name in stated})
-    except (OSError, ValueError, TypeError, AttributeError):
+    except UNCLEAR:
         return None
     return (
         config if min(config.num_attention_heads, config.num_hidden_layers, config.hidden_size) > 0 else None
@@ -285,7 +287,7 @@ def read_pair_tokenizer(path: Path) -> PairTokenizer | None:
         merges = [pair.split() if isinstance(pair, str) else pair for pair in model["merges"]]
         ranks = {(first, second): rank for rank, (first, second) in enumerate(merges)}
         return PairTokenizer({str(k): int(v) for k, v in model["vocab"].items()}, ranks, int(begin), int(end))
-    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+    except UNCLEAR:
         return None
 
 

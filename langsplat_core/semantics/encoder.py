@@ -25,6 +25,9 @@ from langsplat_core.semantics.weights import OPEN_CLIP_CONFIG, Weights, asking_e
 
 FILE = "tokenizer.json"
 STATED_IN = ("tokenizer_config.json", "special_tokens_map.json")  # which token pads, which one ends
+# The library ends the process over a token of 300 000 bytes; the table of a normaliser may be as long.
+_LONG = re.compile(rb'(?<!"precompiled_charsmap":)(?<!"precompiled_charsmap": )"[^"]{10000}')
+UNUSUAL = "\u3042"  # where the token for what is not known is lacking, this cannot be read
 USUAL = {"eos_token": ("</s>", "<eos>"), "pad_token": ("<pad>", "</s>")}
 
 
@@ -100,12 +103,15 @@ def read_tokenizer(weights: Weights) -> Any:
     from tokenizers import Tokenizer
 
     try:
+        if _LONG.search((weights.folder / FILE).read_bytes()):
+            raise ValueError("a token of more than 10000 bytes")
         tokenizer = Tokenizer.from_file(str(weights.folder / FILE))
         tokenizer.no_truncation()
         tokenizer.no_padding()
+        tokenizer.encode(UNUSUAL)
         return tokenizer
     except Exception as error:  # the library raises no narrower class for a damaged file
-        reason = (str(error).splitlines() or ["unreadable"])[0]
+        reason = (str(error).splitlines() or ["unreadable"])[0][:200]
         raise EncoderError(f"{weights.id}: {FILE} is no tokenizer ({reason})") from error
 
 
@@ -123,7 +129,7 @@ def _stated(weights: Weights, name: str, role: str) -> str | None:
     path = weights.folder / name
     try:
         token = json.loads(path.read_text(encoding="utf-8")).get(role)
-    except (OSError, ValueError, AttributeError):
+    except (OSError, ValueError, AttributeError, RecursionError):
         return None
     content = token.get("content") if isinstance(token, dict) else token
     return content if isinstance(content, str) else None
@@ -305,7 +311,7 @@ def _reading(weights: Weights, temperature: float) -> Reading:
         odds = {name: Odds(**numbers) for name, numbers in stated.get("calibration", {}).items()}
         calibration = Calibration(**odds) if "calibration" in stated else None
         return Reading(temperature, float(stated.get("found", Reading.found)), calibration)
-    except (OSError, ValueError, TypeError, AttributeError, OverflowError) as error:
+    except (OSError, ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise EncoderError(
             f'{weights.id}: {READING} is not {{"found": 0 to 1, "calibration": {{"thing": ODDS, '
             '"part": ODDS, "inside": ODDS}} with ODDS as {"constant": number, "whole": number, '
@@ -328,7 +334,7 @@ def pixel_statistics(weights: Weights, mean: Triple, std: Triple) -> tuple[Array
             settings = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
         stated = settings.get("image_mean") or mean, settings.get("image_std") or std
         found = np.array(stated, np.float32)
-    except (OSError, ValueError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
         raise EncoderError(f"{weights.id}: {name} cannot be read ({error})") from error
     if found.shape != (2, 3) or not (found[1] > 0).all():
         raise EncoderError(f"{weights.id}: {name} states no mean and deviation of three colours")

@@ -15,6 +15,7 @@ from langsplat_core.semantics.clip_plain import TEMPERATURE, plain_text_tower
 from langsplat_core.semantics.encoder import (
     OPEN_MODEL,
     SHARE_OF_SCALE,
+    UNUSUAL,
     Encoder,
     Family,
     PhraseEncoder,
@@ -112,7 +113,9 @@ def _load_tokenizer(kind: Any, weights: Weights, vocabulary: int) -> Any:
         )
     with loading_errors(weights.id, "CLIP"):
         tokenizer = kind.from_pretrained(folder, local_files_only=True)
-    if max(tokenizer.get_vocab().values()) >= vocabulary:
+        tokenizer(UNUSUAL)
+        highest = max(tokenizer.get_vocab().values())
+    if highest >= vocabulary:
         raise EncoderError(
             f"{weights.id}: the tokenizer in {folder} has more tokens than the model's {vocabulary}"
         )

@@ -263,7 +263,7 @@ def _stated(path: Path) -> Settings:
         parts = [stated["model_cfg"], stated["model_cfg"]["vision_cfg"], stated["model_cfg"]["text_cfg"]]
         if all(isinstance(part, dict) for part in parts):
             return stated
-    except (ValueError, LookupError, TypeError):
+    except (ValueError, LookupError, TypeError, RecursionError):
         pass
     raise ValueError(f"{path.name} states no model_cfg with vision_cfg and text_cfg")
 

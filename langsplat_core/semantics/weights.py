@@ -121,9 +121,9 @@ def model_type(weights: Weights) -> str:
         return str(weights.converted.config["model_type"])
     try:
         settings = json.loads((weights.folder / CONFIG).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise EncoderError(f"{weights.id}: {CONFIG} cannot be read ({error})") from error
-    return str(settings.get("model_type", "")) if isinstance(settings, dict) else ""
+    return str(settings.get("model_type", ""))[:40] if isinstance(settings, dict) else ""
 
 
 def load_config(kind: Any, weights: Weights, name: str) -> Any:
@@ -283,7 +283,6 @@ def _pickled_tensor(path: Path, name: str) -> Any:
 def loading_errors(id: str, kind: str) -> Iterator[None]:
     """While transformers reads a folder: nothing on the terminal, and one line in place of its tracebacks."""
     from huggingface_hub.errors import StrictDataclassError
-    from safetensors import SafetensorError
     from transformers.utils import logging
 
     level, bars = logging.get_verbosity(), logging.is_progress_bar_enabled()
@@ -293,7 +292,9 @@ def loading_errors(id: str, kind: str) -> Iterator[None]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
-    except (*UNREADABLE, SafetensorError, StrictDataclassError) as error:
+    except (EncoderError, MemoryError):
+        raise
+    except Exception as error:  # tokenizers raises no narrower class for a damaged file
         # Its own text names the class that complains; why it does stands in its cause.
         told = (error.__cause__ or error) if isinstance(error, StrictDataclassError) else error
         lines = str(told).strip().splitlines() or [type(error).__name__]

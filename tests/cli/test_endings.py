@@ -191,6 +191,26 @@ def test_a_signal_while_modules_are_imported_is_a_line(program: str, number: int
     assert len(lines) == 1 or ended == 0, lines
 
 
+@pytest.mark.parametrize(("number", "said"), [(signal.SIGTERM, "terminated"), (signal.SIGINT, "interrupted")])
+def test_a_signal_while_a_command_imports_is_not_for_the_module(
+    number: int, said: str, tmp_path: Path
+) -> None:
+    """As pycolmap, which makes another error of any, and torch, which swallows some."""
+    module = f"import os\ntry:\n    os.kill(os.getpid(), {int(number)})\nexcept BaseException:\n    pass\n"
+    (tmp_path / "heavy.py").write_text(module)
+    code = (
+        "import signal, sys\nfrom langsplat_core.cli.run import main\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from dataclasses import dataclass\n@dataclass\nclass Imports:\n"
+        "    def run(self):\n        import heavy\n"
+        f"sys.path.append({str(tmp_path)!r})\nsys.exit(main('langsplat', Imports))\n"
+    )
+    words = [sys.executable, "-c", code]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 128 + number
+    assert done.stderr == f"langsplat: {said}; the same command continues where it stopped\n"
+
+
 CLOSED = (".", "images", "sparse/0/cameras.bin", "transforms.json")
 TRAIN_ALL = """
 import json, sys

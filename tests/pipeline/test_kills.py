@@ -144,7 +144,8 @@ def test_stopped_in_every_stage_it_ends_with_the_same_bytes(
         assert ended.code in (0, expected), ended.said  # 0: it was faster than before
         assert "Traceback" not in ended.said
         if ended.code > 0:
-            assert ended.said.splitlines()[-1].endswith("the same command continues where it stopped")
+            said = ended.said.splitlines()[-1]  # before its arguments are read there is nothing to continue
+            assert said.endswith("the same command continues where it stopped") or moment.stage == START
         stopped.append(ended.code != 0)
     print(f"{kind}: {sum(stopped)} of {len(stopped)} {how}")
     assert sum(stopped) > len(stopped) / 2

@@ -280,15 +280,27 @@ def remove_logit_scale(folder: Path) -> None:
     torch.save(state, folder / "pytorch_model.bin")
 
 
+def add_long_token(folder: Path) -> None:
+    path = folder / "tokenizer.json"
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text.replace('"▁mug"', '"' + "y" * 300_000 + '"'), encoding="utf-8")
+
+
 def holding(name: str, text: str) -> Callable[[Path], object]:
     return lambda folder: (folder / name).write_text(text, encoding="utf-8")
 
 
-def change_config(folder: Path, change: Callable[[dict[str, Any]], None]) -> None:
-    path = folder / "config.json"
+def change_config(
+    folder: Path, change: Callable[[dict[str, Any]], object], name: str = "config.json"
+) -> None:
+    path = folder / name
     config = json.loads(path.read_text(encoding="utf-8"))
     change(config)
     path.write_text(json.dumps(config), encoding="utf-8")
+
+
+def change_tokenizer(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    change_config(folder, change, "tokenizer.json")
 
 
 @pytest.mark.parametrize(
@@ -296,6 +308,7 @@ def change_config(folder: Path, change: Callable[[dict[str, Any]], None]) -> Non
     [
         (lambda folder: (folder / "tokenizer.json").unlink(), r"no tokenizer\.json in this folder"),
         (holding("tokenizer.json", '{"version": "1.0"}'), r"tokenizer\.json is no tokenizer"),
+        (add_long_token, "a token of more than"),
         (remove_special_tokens, "no eos_token"),
         (remove_logit_scale, "logit_scale is not in them"),
         (
@@ -303,12 +316,27 @@ def change_config(folder: Path, change: Callable[[dict[str, Any]], None]) -> Non
             "'bert' model is no image-text encoder known here; known are clip, siglip",
         ),
         (holding("config.json", "{"), r"config\.json cannot be read"),
+        (holding("config.json", "[" * 100_000), r"config\.json cannot be read"),
     ],
 )
 def test_a_broken_folder_is_one_line(tmp_path: Path, damage: Callable[[Path], object], message: str) -> None:
     tiny_siglip(tmp_path)
     damage(tmp_path)
     with pytest.raises(EncoderError, match=message) as error:
+        load_text_encoder(str(tmp_path))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [lambda stated: stated.update(normalizer=0), lambda stated: stated["model"].update(vocab={})],
+)
+def test_a_tokenizer_of_no_known_rules_is_one_line(
+    tmp_path: Path, change: Callable[[dict[str, Any]], object]
+) -> None:
+    tiny_clip(tmp_path)
+    change_tokenizer(tmp_path, change)
+    with pytest.raises(EncoderError, match="not CLIP weights that can be loaded") as error:
         load_text_encoder(str(tmp_path))
     assert "\n" not in str(error.value)
 
@@ -379,6 +407,10 @@ def text_setting(**settings: object) -> Callable[[Path], None]:
 
 NOT_PLAIN: dict[str, Callable[[Path], object]] = {
     "no tokenizer": lambda folder: (folder / "tokenizer.json").unlink(),
+    "no tokens": lambda folder: change_tokenizer(folder, lambda stated: stated["model"].update(vocab={})),
+    "a beginning that is no token": lambda folder: change_tokenizer(
+        folder, lambda stated: stated["post_processor"].update(cls=["<|startoftext|>", 97])
+    ),
     "another activation": text_setting(hidden_act="relu"),
     "more layers": text_setting(num_hidden_layers=3),
     "narrower": text_setting(intermediate_size=40),
