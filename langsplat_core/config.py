@@ -228,6 +228,8 @@ class RadianceConfig:
     few_views: CountOrZero = 50
     # each photograph has an exposure and white balance of its own; auto: where that explains enough
     exposure: Literal["auto", "on", "off"] = "auto"
+    # what moves in a photograph, such as people, does not count; auto: where it explains enough of the error
+    transients: Literal["auto", "on", "off"] = "auto"
     checkpoint_every: Count = 2_000  # steps of this run
     seed: Seed = 0  # of random numbers
 

@@ -20,15 +20,17 @@ from tests.benchmarks.captures import Kind, draw_capture
 SIDE = 320  # px at which presets are compared with each other
 # What a training has, beside its preset.
 VARIANTS: dict[str, dict[str, object]] = {
-    "before": {"few_views": 0, "exposure": "off"},
-    "depths": {"exposure": "off"},
-    "depths, exposures": {},
+    "before": {"few_views": 0, "exposure": "off", "transients": "off"},
+    "depths": {"exposure": "off", "transients": "off"},
+    "depths, exposures": {"transients": "off"},
+    "all": {},
 }
 
 
 @dataclass(frozen=True)
 class Few:
-    """Held-out PSNR of captures: without what few photographs get, with depths, and with exposures too."""
+    """Held-out PSNR of captures: without what few photographs get, with depths, with exposures too, and
+    without what moves."""
 
     folders: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Captures, as of `langsplat train`."""
