@@ -235,6 +235,8 @@ class RadianceConfig:
     rehearsed_views: CountOrZero = 24
     # each photograph has an exposure and white balance of its own; auto: where that explains enough
     exposure: Literal["auto", "on", "off"] = "auto"
+    # what moves in a photograph, such as people, does not count; auto: where it explains enough of the error
+    transients: Literal["auto", "on", "off"] = "auto"
     checkpoint_every: Count = 2_000  # steps of this run
     seed: Seed = 0  # of random numbers
 
@@ -364,7 +366,9 @@ class TrainConfig:
 # photograph, an autoencoder of 3 numbers, features trained through the rasterizer from zeros.
 PAPER = TrainConfig(
     dataset=DatasetConfig(hold_out="every"),
-    radiance=RadianceConfig(coarse_fraction=0.0, few_views=0, rehearsed_views=0, exposure="off"),
+    radiance=RadianceConfig(
+        coarse_fraction=0.0, few_views=0, rehearsed_views=0, exposure="off", transients="off"
+    ),
     masks=MaskConfig(source="sam", sam="facebook/sam-vit-huge", crop_layers=1),
     codec=AutoencoderConfig(steps=10_000, batch=64, lr=7e-4),
     lift=LiftConfig(mode="gradient", start="zeros-as-published"),

@@ -84,7 +84,7 @@ def write_dataset(
         progress("rendering photographs", (done + 1) / views)
     write_labels(world, truth / "labels.json")
     _write_points(world, renderer, seed, out / "points.ply")
-    _write_transforms(cameras, naming.suffix, out / "transforms.json")
+    write_transforms(cameras, naming.suffix, out / "transforms.json")
 
 
 def photographed_room(seed: int, tier: Tier = "clutter") -> World:
@@ -168,7 +168,8 @@ def camera_to_world_gl(camera: Camera) -> Array:
     return np.linalg.inv(camera.world_to_camera) @ np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def _write_transforms(cameras: list[Camera], suffix: str, path: Path) -> None:
+def write_transforms(cameras: list[Camera], suffix: str, path: Path, points: str = "points.ply") -> None:
+    """Write transforms.json, as `write_dataset` says; points: the file of points beside it, "" for none."""
     first = cameras[0]
     content = {
         "camera_model": "PINHOLE",
@@ -178,7 +179,7 @@ def _write_transforms(cameras: list[Camera], suffix: str, path: Path) -> None:
         "fl_y": first.fy,
         "cx": first.cx,
         "cy": first.cy,
-        "ply_file_path": "points.ply",
+        "ply_file_path": points,
         "metres_per_unit": 1.0,
         "drawn": True,
         "frames": [

@@ -48,7 +48,7 @@ from langsplat_core.training.radiance.rehearsal import checkpoints_of, rehearse,
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
 
 FEWEST_VIEWS = 3
-RADIANCE_VERSION = 4  # of what training and rehearsal make
+RADIANCE_VERSION = 5  # of what training and rehearsal make
 
 log = logging.getLogger("langsplat")
 
@@ -243,7 +243,7 @@ def rehearsals(
     if steps < config.steps:
         decibels = ", ".join(f"{psnr:.1f} dB after {n}" for n, psnr in found.items()) or "none could be"
         log.info(
-            "%d steps are trained, not %d: with so few photographs more end worse (held out: %s); "
+            "%d steps are trained, not %d: with so few photographs more do not pay (held out: %s); "
             "--radiance.rehearsed-views 0 trains them all",
             *(steps, config.steps, decibels),
         )

@@ -1,4 +1,4 @@
-"""Few photographs: what depths, free space and exposures gain, held out."""
+"""Few photographs: what depths, free space, exposures and masks of what moves gain, held out."""
 
 import tempfile
 import time
@@ -12,7 +12,7 @@ from PIL import Image
 
 from langsplat_core.arrays import Array, psnr
 from langsplat_core.bench.measure import markdown
-from langsplat_core.config import DatasetConfig, RadianceConfig, TrainConfig, TrainPreset, with_preset
+from langsplat_core.config import DatasetConfig, RadianceConfig, Seed, TrainConfig, TrainPreset, with_preset
 from langsplat_core.datasets import Capture, load_capture
 from langsplat_core.datasets.holdout import split
 from langsplat_core.datasets.known_poses import look_distance
@@ -21,43 +21,60 @@ from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_core.training.radiance.rehearsal import rehearse, supported
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
+from tests.benchmarks.captures import Kind, draw_capture
 
 SIDE = 320  # px at which presets are compared with each other
 SHEET_VIEWS = 4
 NEARER = 0.2  # of the distance to what cameras look at
 # What a training has, beside its preset.
 VARIANTS: dict[str, dict[str, object]] = {
-    "before": {"few_views": 0, "rehearsed_views": 0, "exposure": "off"},
-    "depths": {"rehearsed_views": 0, "exposure": "off"},
-    "depths, exposures": {"rehearsed_views": 0},
+    "before": {"few_views": 0, "rehearsed_views": 0, "exposure": "off", "transients": "off"},
+    "depths": {"rehearsed_views": 0, "exposure": "off", "transients": "off"},
+    "depths, exposures": {"rehearsed_views": 0, "transients": "off"},
     "all": {},
 }
 
 
 @dataclass(frozen=True)
 class Few:
-    """Held-out PSNR of captures: without what few photographs get, with depths, and with exposures too."""
+    """Held-out PSNR of captures: without what few photographs get, with depths, with exposures too, and
+    without what moves and steps that do not pay."""
 
-    folders: tyro.conf.Positional[tuple[Path, ...]]
+    folders: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Captures, as of `langsplat train`."""
+    rooms: tuple[Seed, ...] = ()
+    """Seeds of drawn captures, beside the folders."""
+    kind: Kind = "few"
+    """Of drawn captures: on an arc around a table, or straight ahead along a street."""
+    people: bool = False
+    """Into the training photographs of drawn captures go people, each time elsewhere."""
     presets: tuple[TrainPreset, ...] = ("quick",)
     variants: tuple[str, ...] = tuple(VARIANTS)
     views: int = 0
     """Photographs, evenly spread over the capture; 0: all."""
     test_every: int = 4
     uneven: float = 0.0
-    """Deviation of the logarithm of the exposure that each training photograph is given."""
+    """Deviation of the logarithm of the exposure that each training photograph is given; of that of each
+    channel's gain, a third."""
     seeds: tuple[int, ...] = (0,)
     work: Path | None = None
-    """Folder where cameras are kept from run to run."""
+    """Folder where drawn captures and cameras are kept from run to run."""
     sheets: Path | None = None
     """Folder for a sheet of each capture: a row a training, of views between the photographs and nearer."""
 
     def run(self) -> None:
         rows: list[tuple[str, ...]] = []
         with tempfile.TemporaryDirectory() as scratch, TerminalProgress() as progress:
-            for folder in self.folders:
-                rows += self._rows(folder, (self.work or Path(scratch)) / folder.name, progress)
+            work = self.work or Path(scratch)
+            drawn = [
+                work / f"{self.kind}-{seed}{'-people' if self.people else ''}" / "photographs"
+                for seed in self.rooms
+            ]
+            for seed, folder in zip(self.rooms, drawn, strict=True):
+                draw_capture(folder, self.kind, seed, self.people, self.test_every, progress)
+            for folder in (*self.folders, *drawn):
+                name = folder.parent.name if folder in drawn else folder.name
+                rows += self._rows(folder, name, work / name, progress)
         titles = (
             *("capture", "training / held out", "preset", "with", "seed", "held out, dB"),
             *(
@@ -72,7 +89,7 @@ class Few:
         )
         print(markdown(titles, rows))
 
-    def _rows(self, folder: Path, work: Path, progress: Progress) -> Iterator[tuple[str, ...]]:
+    def _rows(self, folder: Path, name: str, work: Path, progress: Progress) -> Iterator[tuple[str, ...]]:
         small, _, _ = self._capture(folder, work, SIDE, progress)
         for preset in self.presets:
             config = with_preset(TrainConfig(), preset)
@@ -80,10 +97,10 @@ class Few:
             for variant in self.variants:
                 for seed in self.seeds:
                     settings = replace(config.radiance, seed=seed, **VARIANTS[variant])  # type: ignore[arg-type]
-                    sheet = self.sheets and self.sheets / f"{folder.name}.png"
+                    sheet = self.sheets and self.sheets / f"{name}.png"
                     found = _measured(capture, small, settings, train, held_out, progress, sheet)
                     counts = f"{len(train)} / {len(held_out)}"
-                    yield (folder.name, counts, preset, variant, str(seed), *found)
+                    yield (name, counts, preset, variant, str(seed), *found)
 
     def _capture(
         self, folder: Path, work: Path, side: int, progress: Progress
@@ -99,7 +116,9 @@ class Few:
             held_out = [len(capture) // 2]
             train = [row for row in train if row not in held_out]
         if self.uneven:
-            gains = np.exp(np.random.default_rng(0).normal(0, self.uneven, len(capture)))
+            rng = np.random.default_rng(0)
+            gains = np.exp(rng.normal(0, self.uneven, (len(capture), 1)))
+            gains = gains * np.exp(rng.normal(0, self.uneven / 3, (len(capture), 3)))
             gains[held_out] = 1.0
             images = [
                 (image * gain).clip(0, 255).astype(np.uint8)

@@ -2,7 +2,7 @@
 
 Few photographs can be learnt by heart, and from some step on they are: views that were held out get worse.
 Which step that is depends on the capture (docs/photographs.md). So some of the training views are held out,
-and the others trained on at a small size: shortly, three times as long, and so on, until more ends worse. The
+and the others trained on at a small size: shortly, three times as long, and so on, as long as that pays. The
 training itself then takes all views.
 """
 
@@ -24,8 +24,8 @@ log = logging.getLogger("langsplat")
 
 STAGE = "rehearsing"
 LONGER_SIDE = 320  # px at most
-HELD_OUT = 4  # one view in so many
-TOLERANCE = 0.1  # dB, by which more steps may end worse
+HELD_OUT = 8  # one view in so many: the more are left, the more it is like the training itself
+LEAST_GAIN = 0.25  # dB, for which more steps are trained: less may be chance
 
 
 def rehearse(
@@ -55,7 +55,7 @@ def rehearse(
         scores = evaluate_views(gaussians, small, held_out, config.backend)
         found[steps] = float(np.mean([score.psnr_exposed or score.psnr for score in scores]))
         log.debug("rehearsal of %d steps: %.2f dB held out", steps, found[steps])
-        if found[steps] < max(found.values()) - TOLERANCE:
+        if index and found[steps] < found[every[index - 1]] + LEAST_GAIN:
             break
     return found
 
@@ -76,9 +76,10 @@ def checkpoints_of(checkpoint: Path) -> list[Path]:
 
 
 def supported(found: dict[int, float], config: RadianceConfig, views: int) -> RadianceConfig:
-    """Return `config` with the most steps that the rehearsals `found` no worse than fewer. Where too few
-    training views leave none to hold out, the fewest."""
-    if not found:
-        return replace(config, steps=config.rehearsals(views)[0])
-    enough = max(found.values()) - TOLERANCE
-    return replace(config, steps=max(steps for steps, psnr in found.items() if psnr >= enough))
+    """Return `config` with the steps that the rehearsals `found` best, more only where they gain; with the
+    fewest where no view could be held out."""
+    steps = config.rehearsals(views)[0]
+    for more, psnr in found.items():
+        if psnr >= found[steps] + LEAST_GAIN:
+            steps = more
+    return replace(config, steps=steps)

@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians
 from langsplat_core.scene.transform import C0
+from langsplat_core.training.radiance.transients import Watched, nothing_watched
 
 INITIAL_OPACITY = 0.1
 NEIGHBOURS = 3
@@ -116,6 +117,7 @@ class TrainingState:
     seen: Tensor  # (N,) float32: in how many steps since the last round the Gaussian was visible
     rng: np.random.Generator
     exposures: Tensor  # (V, 4, 3) affine changes of colours, of the training views
+    watched: Watched  # of the training views; of none where nothing may move
     step: int = 0  # steps done
     queue: list[int] = field(default_factory=list)  # views still to come in this pass over the photographs
     non_finite: int = 0  # gradient entries that were not finite and were taken as zero
@@ -155,6 +157,7 @@ def start(gaussians: Gaussians, seed: int, device: torch.device) -> TrainingStat
         seen=torch.zeros(count, device=device),
         rng=np.random.default_rng(seed),
         exposures=no_exposures(0, device),
+        watched=nothing_watched(0),
     )
 
 
@@ -233,11 +236,11 @@ def adam_step(state: TrainingState, learning_rates: dict[str, float]) -> None:
 
 # Checkpoints of radiance training: one safetensors file, written atomically, resumed exactly.
 #
-# Tensors: ``values.*``, ``first.*``, ``second.*`` for every parameter, ``grad_sum``, ``seen`` and
-# ``exposures``; everything else is JSON in the header. No pickle is involved, so a checkpoint from elsewhere
-# cannot run code.
+# Tensors: ``values.*``, ``first.*``, ``second.*`` for every parameter, ``grad_sum``, ``seen``, ``exposures``
+# and ``watched.*``; everything else is JSON in the header. No pickle is involved, so a checkpoint from
+# elsewhere cannot run code.
 
-KIND = "langsplat-radiance-checkpoint-2"
+KIND = "langsplat-radiance-checkpoint-3"
 
 
 def fingerprint(capture: Capture, config: RadianceConfig, train_indices: Sequence[int]) -> str:
@@ -256,6 +259,7 @@ def fingerprint(capture: Capture, config: RadianceConfig, train_indices: Sequenc
 def save_checkpoint(path: Path, state: TrainingState, made_from: str) -> None:
     """Write `state`; `made_from` is the run's `fingerprint`."""
     tensors = {"grad_sum": state.grad_sum, "seen": state.seen, "exposures": state.exposures}
+    tensors |= {f"watched.{name}": torch.from_numpy(array) for name, array in vars(state.watched).items()}
     for name in PARAMETERS:
         tensors[f"values.{name}"] = state.values[name].detach()
         tensors[f"first.{name}"] = state.first[name]
@@ -312,6 +316,7 @@ def _rebuild(tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> Traini
         seen=tensors["seen"],
         rng=rng,
         exposures=tensors["exposures"],
+        watched=Watched(*(tensors[f"watched.{part.name}"].cpu().numpy() for part in fields(Watched))),
         step=int(header["step"]),
         queue=[int(index) for index in header["queue"]],
         non_finite=int(header["non_finite"]),

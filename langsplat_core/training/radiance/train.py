@@ -48,6 +48,15 @@ from langsplat_core.training.radiance.state import (
     start,
 )
 from langsplat_core.training.radiance.stereo import DepthMap, find_depths, in_free_space
+from langsplat_core.training.radiance.transients import (
+    EXPLAINS,
+    FROM,
+    drawn_depths,
+    look,
+    nothing_watched,
+    patches,
+    pixels_of,
+)
 
 log = logging.getLogger("langsplat")
 
@@ -162,6 +171,7 @@ class _Pictures:
         def kept(image: Array) -> Array | Tensor:
             return image if device.type == "cpu" else torch.tensor(image, device=device)
 
+        self.cameras = [capture.cameras[i] for i in indices]
         views = [(capture.cameras[i], capture.images[i], capture.mask(i)) for i in indices]
         self._fine, self._coarse = (
             [(camera, kept(image), None if mask is None else kept(mask)) for camera, image, mask in sizes]
@@ -248,6 +258,7 @@ def train_radiance(
     else:
         state = start(seed, config.seed, renderer.device)
         state.exposures = no_exposures(len(pictures), renderer.device)
+        state.watched = nothing_watched(0 if config.transients == "off" else len(pictures))
 
     def save() -> None:
         if checkpoint:
@@ -277,6 +288,7 @@ def _exposures(run: _Run, state: TrainingState) -> Tensor:
     with torch.no_grad():
         for index in range(len(run.pictures)):
             camera, target, mask = run.pictures.at(index, coarse=True)
+            mask = _still(run, state, index, target, mask)
             image = run.renderer.render(state.values, camera, run.schedule.active_sh_degree(state.step)).image
             seen = (slice(None), slice(None)) if mask is None else mask
             pairs.append((image[seen].reshape(-1, 3)[::EVERY], target[seen].reshape(-1, 3)[::EVERY]))
@@ -292,6 +304,38 @@ def _exposures(run: _Run, state: TrainingState) -> Tensor:
     log.debug("exposures of the photographs explain %.2f dB", gain)
     explains = len(pairs) == len(run.pictures) and gain >= LEAST_EXPOSURE_GAIN
     return found if explains or run.config.exposure == "on" else no_exposures(len(run.pictures), found.device)
+
+
+def _judged(config: RadianceConfig) -> int:
+    """The steps after which what moves no longer counts, if it is to be left out."""
+    return max(round(FROM * config.steps), 1)
+
+
+def _counted(
+    run: _Run, state: TrainingState, index: int, image: Tensor, target: Tensor, mask: Tensor | None
+) -> Tensor | None:
+    """The (H, W) pixels of view `index` that count in this step, which draws `image`."""
+    judged = state.step == _judged(run.config) and run.config.transients == "auto"
+    if judged and state.watched.explained() < EXPLAINS:
+        state.watched = nothing_watched(0)
+    if not len(state.watched.moving):
+        return mask
+    drawn = patches(image)
+    if mask is not None:
+        drawn[patches(mask[..., None].float())[..., 0] < 0.5] = np.nan
+    cameras = run.pictures.cameras
+    depths = drawn_depths(run.renderer, state.values, cameras[index])
+    look(state.watched, index, cameras, drawn, patches(target), depths)
+    return _still(run, state, index, target, mask)
+
+
+def _still(run: _Run, state: TrainingState, index: int, target: Tensor, mask: Tensor | None) -> Tensor | None:
+    """The mask of view `index`, (H, W) bool as the (H, W, 3) `target`, without what moves."""
+    moving = state.watched.moving
+    if not len(moving) or state.step < _judged(run.config) or not moving[index].any():
+        return mask
+    still = ~pixels_of(moving[index], (target.shape[0], target.shape[1]), target.device)
+    return still if mask is None else mask & still
 
 
 def for_few_views(config: RadianceConfig) -> RadianceConfig:
@@ -379,6 +423,7 @@ def _step(run: _Run, state: TrainingState) -> float:
     image = rendered.image
     if min(run.exposing, default=step + 1) <= step:
         image = with_exposure(image, state.exposures[index])
+    mask = _counted(run, state, index, image, target, mask)
     if mask is not None:  # what is masked differs from nothing, and nothing flows back from it
         image = torch.where(mask[..., None], image, image.detach())
         target = torch.where(mask[..., None], target, image.detach())

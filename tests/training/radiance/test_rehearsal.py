@@ -36,7 +36,7 @@ def test_presets_are_rehearsed_with_few_views_only() -> None:
     assert RadianceConfig(rehearsed_views=0).rehearsals(9) == [30_000]
 
 
-def test_it_ends_where_more_steps_end_worse(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_ends_where_more_steps_do_not_pay(monkeypatch: pytest.MonkeyPatch) -> None:
     trained: list[tuple[int, int, int]] = []
     scores = {1_111: 20.0, 3_333: 21.0, 10_000: 20.5, 30_000: 25.0}
 
@@ -53,9 +53,9 @@ def test_it_ends_where_more_steps_end_worse(monkeypatch: pytest.MonkeyPatch) -> 
     config = RadianceConfig()
     found = rehearse(capture(640), config, range(VIEWS))
     assert found == {1_111: 20.0, 3_333: 21.0, 10_000: 20.5}
-    assert trained == [(steps, VIEWS - 2, 320) for steps in found]
+    assert trained == [(steps, VIEWS - 1, 320) for steps in found]
     assert supported(found, config, VIEWS) == replace(config, steps=3_333)
-    assert supported({1_111: 20.0, 3_333: 19.95}, config, VIEWS).steps == 3_333  # no worse
+    assert supported({1_111: 20.0, 3_333: 20.1}, config, VIEWS).steps == 1_111  # it may be chance
     assert supported({}, config, 100) == config
     trained.clear()
     assert rehearse(capture(), config, [0, 4, 7]) == {}  # none can be spared
