@@ -108,7 +108,7 @@ def read_tokenizer(weights: Weights) -> Any:
         tokenizer = Tokenizer.from_file(str(weights.folder / FILE))
         tokenizer.no_truncation()
         tokenizer.no_padding()
-        tokenizer.encode(UNUSUAL)
+        tokenizer.encode(UNUSUAL, add_special_tokens=False)
         return tokenizer
     except Exception as error:  # the library raises no narrower class for a damaged file
         reason = (str(error).splitlines() or ["unreadable"])[0][:200]
