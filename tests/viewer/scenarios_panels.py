@@ -91,6 +91,7 @@ def see_the_evidence(s: Any) -> None:
     plain, area = s.shot("plain"), scene_area()
     s.ctx.item_click("//Search/Why?")
     s.wait(lambda: s.state.evidence is not None)
+    s.ctx.mouse_move_to_pos((area.left + area.width / 2, area.top + area.height - 20))  # its tooltip goes
     s.ctx.yield_(3)
     inside = np.s_[int(area.top) + 60 : int(area.top) + 200, int(area.left) + 40 : int(area.left) + 400]
     assert (s.shot("evidence")[inside] == 255).all(-1).mean() > 0.2 > (plain[inside] == 255).all(-1).mean()
