@@ -9,7 +9,7 @@ import dataclasses
 import types
 import typing
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
 from numbers import Integral, Real
 from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin
@@ -191,8 +191,23 @@ class DatasetConfig:
     allow_few_cameras: bool = False
 
 
-FEWEST_REHEARSED = 500  # steps of a rehearsal: fewer are too few for any capture
-REHEARSAL_FACTOR = 3  # between one rehearsal's steps and the next one's
+@dataclass(frozen=True)
+class RadianceBudget:
+    """What a training of Gaussians may spend."""
+
+    longer_side: int  # px, of the photographs
+    steps: int
+    max_gaussians: int
+    sh_degree: int
+
+    def at_most(self, limit: "RadianceBudget") -> "RadianceBudget":
+        """No more of anything than `limit`."""
+        return RadianceBudget(*map(min, astuple(self), astuple(limit)))
+
+
+QUICK = RadianceBudget(320, 500, 30_000, 1)  # with fewer steps no capture is learnt
+GOOD = RadianceBudget(480, 1_500, 60_000, 1)
+REHEARSAL_FACTOR = 3  # between the steps of one rehearsal and the next one
 
 
 @dataclass(frozen=True)
@@ -231,7 +246,7 @@ class RadianceConfig:
     # opacities decay and are not reset; 0 (as published): never
     few_views: CountOrZero = 50
     # up to so many training views, short trainings on some of them decide whether fewer `steps` are trained,
-    # see `training.radiance.rehearsal`; 0: never
+    # with fewer Gaussians and smaller photographs, see `training.radiance.rehearsal`; 0: never
     rehearsed_views: CountOrZero = 24
     # each photograph has an exposure and white balance of its own; auto: where that explains enough
     exposure: Literal["auto", "on", "off"] = "auto"
@@ -240,12 +255,23 @@ class RadianceConfig:
     checkpoint_every: Count = 2_000  # steps of this run
     seed: Seed = 0  # of random numbers
 
-    def rehearsals(self, views: int) -> list[int]:
-        """Ascending numbers of steps that are tried with so many training views; the last is `steps`."""
-        tried = [self.steps]
-        while views <= self.rehearsed_views and tried[0] >= REHEARSAL_FACTOR * FEWEST_REHEARSED:
-            tried.insert(0, round(tried[0] / REHEARSAL_FACTOR))
-        return tried
+    def budgets(self, views: int, longer_side: int) -> list[RadianceBudget]:
+        """Ascending budgets that are tried with so many training views of so many pixels; the last is all
+        that is asked for, and the only one with many views or few steps."""
+        whole = RadianceBudget(longer_side, self.steps, self.max_gaussians, self.sh_degree)
+        steps = [self.steps]
+        while steps[0] >= REHEARSAL_FACTOR * QUICK.steps:
+            steps.insert(0, round(steps[0] / REHEARSAL_FACTOR))
+        if views > self.rehearsed_views or len(steps) < 2:
+            return [whole]
+        sizes = [replace(GOOD if count <= GOOD.steps else whole, steps=count) for count in steps]
+        return list(dict.fromkeys(budget.at_most(whole) for budget in (QUICK, *sizes)))
+
+    def spending(self, budget: RadianceBudget) -> "RadianceConfig":
+        """These settings with the budget's steps, Gaussians and degree."""
+        return replace(
+            self, steps=budget.steps, max_gaussians=budget.max_gaussians, sh_degree=budget.sh_degree
+        )
 
 
 @dataclass(frozen=True)
@@ -382,14 +408,12 @@ def with_preset(config: TrainConfig, preset: TrainPreset) -> TrainConfig:
     """Return `config` with a preset's budget: "quick" takes minutes on a CPU, "full" is the published one."""
     if preset == "full":
         return config
-    side, steps, most, size = (320, 500, 30_000, 512) if preset == "quick" else (480, 1_500, 60_000, 0)
+    budget, codewords = (QUICK, 512) if preset == "quick" else (GOOD, 0)
     return replace(
         config,
-        dataset=replace(config.dataset, max_side=side),
-        radiance=replace(
-            config.radiance, steps=steps, max_gaussians=most, sh_degree=1, opacity_decay=OPACITY_DECAY
-        ),
-        codec=replace(config.codec, size=size) if config.codec.kind == "codebook" else config.codec,
+        dataset=replace(config.dataset, max_side=budget.longer_side),
+        radiance=replace(config.radiance.spending(budget), opacity_decay=OPACITY_DECAY),
+        codec=replace(config.codec, size=codewords) if config.codec.kind == "codebook" else config.codec,
     )
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from langsplat_core.config import DatasetConfig, MaskConfig, TrainConfig
+from langsplat_core.config import DatasetConfig, MaskConfig, RadianceBudget, TrainConfig
 from langsplat_core.io.hostile import PHOTO_SUFFIXES, is_video
 from langsplat_core.progress import ALL_STAGES, Progress, Report, coarse, duration
 
@@ -21,7 +21,6 @@ SURE = 0.05  # share of a stage from which its own speed is trusted
 GPU = 1 / 30  # of the seconds of two CPU cores; not measured
 POINT = 0.17  # seconds of a point that a segmenter is asked at
 REGIONS = 300  # of an ordinary photograph
-REHEARSED = 320  # px, longer side of photographs that a training is rehearsed with
 DEPTHS = 0.3  # seconds of a photograph whose depths are found
 AGREEING = 1.7  # seconds of a megapixel that masks are drawn into, once they agree
 # Millions of weights by what a hub id contains, the first that fits.
@@ -61,13 +60,9 @@ def plan(
     vectors = _encoder_seconds(config.clip.model, config.masks) * speed
     agreeing = 0.0 if _has_segmenter(config.masks) else AGREEING * megapixels  # and then the vectors
     gaussians = config.radiance.max_gaussians
-    # A step costs what it draws, and what it keeps: 0.02 s at 0.1 megapixels, 0.1 s at 100 000 Gaussians.
-    step = 0.2 * megapixels + 1e-6 * min(gaussians, 300_000)
     depths = DEPTHS * photographs if photographs <= config.radiance.few_views else 0.0
-    *tried, last = config.radiance.rehearsals(photographs)
-    if tried:  # the last is tried, too
-        small = min(config.dataset.max_side, REHEARSED) / config.dataset.max_side
-        depths += (sum(tried) + last) * step * small**2
+    *smaller, whole = config.radiance.budgets(photographs, config.dataset.max_side)
+    training = sum(map(_training_seconds, [*smaller, whole, *([whole] if smaller else [])]))
     codec = config.codec.seconds
     lifting = photographs * (0.2 + 0.5 * megapixels) + 1e-4 * gaussians * min(photographs, 100) / 50
     if config.lift.mode == "gradient":
@@ -89,7 +84,7 @@ def plan(
         Stage(
             "Gaussians",
             ("rehearsing", "finding depths", "training Gaussians"),
-            0.0 if has_gaussians else last * step + depths,
+            0.0 if has_gaussians else training + depths,
         ),
         Stage(
             "language field",
@@ -97,6 +92,12 @@ def plan(
             lifting + codec + photographs * (agreeing + vectors if agreeing else 0.0),
         ),
     )
+
+
+def _training_seconds(budget: RadianceBudget) -> float:
+    """A step costs what it draws, and what it keeps: 0.02 s at 0.1 megapixels, 0.1 s at 100 000 Gaussians."""
+    megapixels = ASPECT * budget.longer_side**2 / 1e6
+    return budget.steps * (0.2 * megapixels + 1e-6 * min(budget.max_gaussians, 300_000))
 
 
 def _has_segmenter(masks: MaskConfig) -> bool:

@@ -130,8 +130,7 @@ def _figures(report: TrainReport) -> Iterator[str]:
         for name, seconds in report.seconds.items()
     )
     figures = {
-        "rehearsed": ", ".join(f"{steps} steps {dB:.1f} dB" for steps, dB in report.rehearsed.items())
-        or "no",
+        "rehearsed": ", ".join(f"{budget}: {dB:.1f} dB" for budget, dB in report.rehearsed.items()) or "no",
         "masks": report.masks,
         "encoder": report.encoder,
         "codec": f"{report.codec} of {report.codec_size}, mean cosine {report.codec_cosine:.4f}",

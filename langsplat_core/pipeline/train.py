@@ -44,11 +44,18 @@ from langsplat_core.semantics.masks import MaskSource
 from langsplat_core.semantics.sam import load_mask_source
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures, StoredFeatures, describe_capture
 from langsplat_core.training.language.codec_fit import CodecReport
-from langsplat_core.training.radiance.rehearsal import checkpoints_of, rehearse, supported
+from langsplat_core.training.radiance.rehearsal import (
+    budgets_for,
+    checkpoints_of,
+    in_words,
+    rehearse,
+    supported,
+    within,
+)
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
 
 FEWEST_VIEWS = 3
-RADIANCE_VERSION = 5  # of what training and rehearsal make
+RADIANCE_VERSION = 6  # of what training and rehearsal make
 
 log = logging.getLogger("langsplat")
 
@@ -159,7 +166,7 @@ def _train(run: _Run, masks_of: Callable[[Capture], MaskSource] | None, given: S
             mask_count=sum(len(item.vectors) for item in views.features),
             seconds=clock.laps,
             dataset=str(run.dataset.resolve()),
-            rehearsed={str(steps): round(decibels, 2) for steps, decibels in rehearsed.items()},
+            rehearsed={name: round(decibels, 2) for name, decibels in rehearsed.items()},
         )
         write_reports(run.work, report, capture, gaussians)
     processes.barrier()
@@ -197,12 +204,22 @@ def _described(
     return StoredViews(cameras, StoredFeatures(store, [camera.name for camera in cameras]))
 
 
-def _gaussians(run: _Run, capture: Capture, train: list[int]) -> tuple[Gaussians, dict[int, float]]:
+def _gaussians(run: _Run, capture: Capture, train: list[int]) -> tuple[Gaussians, dict[str, float]]:
     """The trained Gaussians, and what rehearsals found."""
     config, once, shared = run.config.radiance, run.processes.once, (run.work, run.progress)
-    rehearsed = once(lambda: rehearsals(capture, train, config, *shared))
-    supporting = supported(rehearsed, config, len(train))
-    return once(lambda: trained_gaussians(capture, train, supporting, *shared)), rehearsed
+    budgets = budgets_for(capture, config, len(train))
+    found = once(lambda: rehearsals(capture, train, config, *shared))
+    budget = supported(found, budgets)
+    rehearsed = dict(zip(map(in_words, budgets), found, strict=False))
+    if budget != budgets[-1]:
+        decibels = ", ".join(f"{psnr:.1f} dB after {name}" for name, psnr in rehearsed.items())
+        log.info(
+            "training takes %s, not %s: with so few photographs more does not pay (held out: %s); "
+            "--radiance.rehearsed-views 0 spends all",
+            *(in_words(budget), in_words(budgets[-1]), decibels or "none could be"),
+        )
+    small, supporting = within(capture, budget), config.spending(budget)
+    return once(lambda: trained_gaussians(small, train, supporting, *shared)), rehearsed
 
 
 def _report(
@@ -228,7 +245,7 @@ def _report(
 
 def rehearsals(
     capture: Capture, train: list[int], config: RadianceConfig, work: Path, progress: Progress
-) -> dict[int, float]:
+) -> list[float]:
     """`rehearse` for the photographs at `train`, from `work` where that was done before."""
     done = work / f"{_radiance_key('rehearsal', capture, train, config)}.json"
     if not done.exists():
@@ -238,16 +255,7 @@ def rehearsals(
             temporary.write_text(json.dumps(found))
         for left in checkpoints_of(checkpoint):
             left.unlink(missing_ok=True)
-    found = {int(steps): float(decibels) for steps, decibels in json.loads(done.read_text()).items()}
-    steps = supported(found, config, len(train)).steps
-    if steps < config.steps:
-        decibels = ", ".join(f"{psnr:.1f} dB after {n}" for n, psnr in found.items()) or "none could be"
-        log.info(
-            "%d steps are trained, not %d: with so few photographs more do not pay (held out: %s); "
-            "--radiance.rehearsed-views 0 trains them all",
-            *(steps, config.steps, decibels),
-        )
-    return found
+    return [float(decibels) for decibels in json.loads(done.read_text())]
 
 
 def trained_gaussians(

@@ -19,7 +19,7 @@ from langsplat_core.datasets.known_poses import look_distance
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Gaussians, Scene
-from langsplat_core.training.radiance.rehearsal import rehearse, supported
+from langsplat_core.training.radiance.rehearsal import budgets_for, rehearse, supported, within
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
 from tests.benchmarks.captures import Kind, draw_capture
 
@@ -146,8 +146,10 @@ def _measured(
     sheet: Path | None,
 ) -> tuple[str, ...]:
     began = time.process_time()
-    config = supported(rehearse(capture, config, train, progress=progress), config, len(train))
-    gaussians = train_radiance(capture, config, train, progress=progress)
+    found = rehearse(capture, config, train, progress=progress)
+    budget = supported(found, budgets_for(capture, config, len(train)))
+    config = config.spending(budget)
+    gaussians = train_radiance(within(capture, budget), config, train, progress=progress)
     seconds = time.process_time() - began
     if sheet:
         add_row(sheet, gaussians, between(capture.shrunk(train, SIDE).cameras))
@@ -163,7 +165,7 @@ def _measured(
     return (
         *(f"{mean:.2f}" for mean in means),
         *(f"{ssim:.3f}", f"{np.mean([score.psnr for score in learnt]):.2f}"),
-        *(str(config.steps), str(len(gaussians)), f"{seconds:.0f}"),
+        *(f"{budget.steps} at {budget.longer_side} px", str(len(gaussians)), f"{seconds:.0f}"),
     )
 
 

@@ -1,19 +1,18 @@
-"""Rehearsal of a training: how many steps a few photographs support.
+"""Rehearsal of a training: how much a few photographs support.
 
-Few photographs can be learnt by heart, and from some step on they are: views that were held out get worse.
-Which step that is depends on the capture (docs/photographs.md). So some of the training views are held out,
-and the others trained on at a small size: shortly, three times as long, and so on, as long as that pays. The
+Few photographs can be learnt by heart, and from some budget on they are: views that were held out get worse.
+Which one that is depends on the capture (docs/photographs.md). So some of the training views are held out,
+and the others trained on with the smallest budget, then with larger ones, unless one clearly loses. The
 training itself then takes all views.
 """
 
 import logging
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from langsplat_core.config import RadianceConfig
+from langsplat_core.config import RadianceBudget, RadianceConfig
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.holdout import chosen
 from langsplat_core.progress import Progress, Report, silent
@@ -23,9 +22,13 @@ from langsplat_core.training.radiance.train import evaluate_views, train_radianc
 log = logging.getLogger("langsplat")
 
 STAGE = "rehearsing"
-LONGER_SIDE = 320  # px at most
 HELD_OUT = 8  # one view in so many: the more are left, the more it is like the training itself
-LEAST_GAIN = 0.25  # dB, for which more steps are trained: less may be chance
+LEAST_GAIN = 0.25  # dB, for which more is spent: less may be chance
+
+
+def budgets_for(capture: Capture, config: RadianceConfig, views: int) -> list[RadianceBudget]:
+    """Ascending budgets that `views` of the capture's photographs may be trained with."""
+    return config.budgets(views, max(max(camera.width, camera.height) for camera in capture.cameras))
 
 
 def rehearse(
@@ -34,30 +37,36 @@ def rehearse(
     train_indices: Sequence[int],
     checkpoint: Path | None = None,
     progress: Progress = silent,
-) -> dict[int, float]:
-    """Steps -> mean PSNR (dB, exposures fitted) of views held out of those at `train_indices`. Empty where
-    there is nothing to decide: many views, so few that none can be held out, or few steps.
+) -> list[float]:
+    """Mean PSNR (dB, exposures fitted) of views held out of those at `train_indices`, for each budget from
+    the smallest on, up to one that clearly loses. Empty where there is nothing to decide: many views, so few
+    that none can be held out, or few steps.
 
     With a `checkpoint` path an interrupted rehearsal goes on where it stopped; the files are those of
     `checkpoints_of` it, and stay.
     """
-    every = config.rehearsals(len(train_indices))
+    budgets = budgets_for(capture, config, len(train_indices))
     held_out = chosen([capture.cameras[i] for i in train_indices], HELD_OUT)
-    if len(every) < 2 or not held_out:
-        return {}
-    small = capture.shrunk(train_indices, LONGER_SIDE)
-    train = [index for index in range(len(small)) if index not in held_out]
-    found: dict[int, float] = {}
-    for index, steps in enumerate(every):
-        at = checkpoint and checkpoint.with_name(f"{steps}-{checkpoint.name}")
-        reports = _of_steps(progress.part(index, len(every), STAGE, f"{steps} steps"))
-        gaussians = train_radiance(small, replace(config, steps=steps), train, at, reports)
+    if len(budgets) < 2 or not held_out:
+        return []
+    found: list[float] = []
+    for index, budget in enumerate(budgets):
+        small = capture.shrunk(train_indices, budget.longer_side)
+        train = [index for index in range(len(small)) if index not in held_out]
+        at = checkpoint and checkpoint.with_name(f"{index}-{checkpoint.name}")
+        reports = _of_steps(progress.part(index, len(budgets), STAGE, in_words(budget)))
+        gaussians = train_radiance(small, config.spending(budget), train, at, reports)
         scores = evaluate_views(gaussians, small, held_out, config.backend)
-        found[steps] = float(np.mean([score.psnr_exposed or score.psnr for score in scores]))
-        log.debug("rehearsal of %d steps: %.2f dB held out", steps, found[steps])
-        if index and found[steps] < found[every[index - 1]] + LEAST_GAIN:
+        found.append(float(np.mean([score.psnr_exposed or score.psnr for score in scores])))
+        log.debug("rehearsal of %s: %.2f dB held out", in_words(budget), found[-1])
+        if found[-1] < max(found) - LEAST_GAIN:
             break
     return found
+
+
+def in_words(budget: RadianceBudget) -> str:
+    """The budget as messages and reports name it."""
+    return f"{budget.steps} steps at {budget.longer_side} px"
 
 
 def _of_steps(progress: Progress) -> Progress:
@@ -75,11 +84,18 @@ def checkpoints_of(checkpoint: Path) -> list[Path]:
     return list(checkpoint.parent.glob(f"*-{checkpoint.name}"))
 
 
-def supported(found: dict[int, float], config: RadianceConfig, views: int) -> RadianceConfig:
-    """Return `config` with the steps that the rehearsals `found` best, more only where they gain; with the
-    fewest where no view could be held out."""
-    steps = config.rehearsals(views)[0]
-    for more, psnr in found.items():
-        if psnr >= found[steps] + LEAST_GAIN:
-            steps = more
-    return replace(config, steps=steps)
+def supported(found: Sequence[float], budgets: Sequence[RadianceBudget]) -> RadianceBudget:
+    """The budget that rehearsals `found` best, a larger one only where it gains; the smallest where no view
+    could be held out."""
+    best = 0
+    for index, decibels in enumerate(found):
+        if decibels >= found[best] + LEAST_GAIN:
+            best = index
+    return budgets[best]
+
+
+def within(capture: Capture, budget: RadianceBudget) -> Capture:
+    """The capture with photographs as large as the budget allows."""
+    if all(max(camera.width, camera.height) <= budget.longer_side for camera in capture.cameras):
+        return capture
+    return capture.shrunk(range(len(capture)), budget.longer_side)

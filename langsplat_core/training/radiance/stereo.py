@@ -38,6 +38,8 @@ LEAST_CONFIRMING = 0.5  # ... and of the one in another view that confirms it
 AGREEMENT = 0.015  # of the depth, by which two views' may differ
 BEFORE = 0.05  # of the depth, from which on something lies before a surface ...
 AT = 0.025  # ... and up to which it belongs to it
+LEAST_ALIKE = 0.4  # of the pixels around, as far as windows reach, that share a depth which frees space ...
+ALIKE = 0.03  # ... up to this part of it
 AROUND = 1 / 16  # of the image's longer side: how far from a pixel a depth tells of its surface ...
 NEARER = 0.15  # ... which is nearer than all those by this share of them at most
 NEARER_THAN_ALL = 0.5  # the same where there are none around, against the nearest of the image
@@ -92,7 +94,7 @@ def find_depths(capture: Capture, indices: Sequence[int], progress: Progress = s
         progress(STAGE, (index + 1) / len(small))
     depths = [confirmed(one, [other for other in maps if other is not one]) for one in maps]
     return [
-        replace(one, depth=depth, nearest=nearest(one.camera, depth, capture.points))
+        replace(one, depth=depth, nearest=nearest(one.camera, shared(depth), capture.points))
         for one, depth in zip(maps, depths, strict=True)
     ]
 
@@ -105,6 +107,20 @@ def in_free_space(points: Array, maps: Sequence[DepthMap]) -> Array:
         balance[there] += depths < one.nearest[pixels]
         balance[there] -= np.abs(depths / one.depth[pixels] - 1) < AT
     return balance > 0
+
+
+def shared(depth: Array) -> Array:
+    """The (H, W) depths without those that few pixels around share: NaN.
+
+    What two views agree on by chance is alone. Where views lie one behind another, as on a walk, that is one
+    depth in ten, and each would free a window of space behind the surface.
+    """
+    height, width = depth.shape
+    padded = np.pad(depth, RADIUS, constant_values=np.nan)
+    alike = np.zeros(depth.shape, int)
+    for row, column in np.ndindex(2 * RADIUS + 1, 2 * RADIUS + 1):
+        alike += np.abs(padded[row : row + height, column : column + width] / depth - 1) < ALIKE
+    return np.where(alike >= LEAST_ALIKE * (2 * RADIUS + 1) ** 2, depth, np.nan)
 
 
 def nearest(camera: Camera, depth: Array, known: Array) -> Array:

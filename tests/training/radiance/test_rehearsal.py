@@ -1,4 +1,4 @@
-"""Rehearsals: steps that few photographs support, decided by views held out of the training views."""
+"""Rehearsals: budgets that few photographs support, decided by views held out of the training views."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,12 +8,18 @@ import pytest
 
 from langsplat_core import config as settings
 from langsplat_core.arrays import ViewScore
-from langsplat_core.config import RadianceConfig, TrainConfig, with_preset
+from langsplat_core.config import GOOD, QUICK, RadianceBudget, RadianceConfig, TrainConfig, with_preset
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.progress import Cancelled, Progress, Report
 from langsplat_core.scene import look_at
 from langsplat_core.training.radiance import rehearsal
-from langsplat_core.training.radiance.rehearsal import checkpoints_of, rehearse, supported
+from langsplat_core.training.radiance.rehearsal import (
+    budgets_for,
+    checkpoints_of,
+    rehearse,
+    supported,
+    within,
+)
 
 VIEWS = 8
 SHORT = RadianceConfig(steps=36, reference_steps=36, backend="cpu", sh_degree=0, max_gaussians=200)
@@ -30,15 +36,23 @@ def capture(side: int = 24) -> Capture:
 
 
 def test_presets_are_rehearsed_with_few_views_only() -> None:
-    steps = [with_preset(TrainConfig(), name).radiance.rehearsals(9) for name in ("quick", "good", "full")]
-    assert steps == [[500], [500, 1500], [1111, 3333, 10000, 30000]]
-    assert RadianceConfig().rehearsals(RadianceConfig.rehearsed_views + 1) == [30_000]
-    assert RadianceConfig(rehearsed_views=0).rehearsals(9) == [30_000]
+    quick, good, full = (with_preset(TrainConfig(), name) for name in ("quick", "good", "full"))
+    tried = [one.radiance.budgets(9, one.dataset.max_side) for one in (quick, good, full)]
+    assert tried[0] == [QUICK]
+    assert tried[1] == [QUICK, RadianceBudget(480, 500, 60_000, 1), GOOD]
+    assert [budget.steps for budget in tried[2]] == [500, 1111, 3333, 10000, 30000]
+    assert [budget.longer_side for budget in tried[2]] == [320, 480, 800, 800, 800]
+    assert [budget.sh_degree for budget in tried[2]] == [1, 1, 3, 3, 3]
+    whole = RadianceBudget(800, 30_000, 1_000_000, 3)
+    assert RadianceConfig().budgets(RadianceConfig.rehearsed_views + 1, 800) == [whole]
+    assert RadianceConfig(rehearsed_views=0).budgets(9, 800) == [whole]
+    small = RadianceConfig(steps=1_500, max_gaussians=5_000, sh_degree=0).budgets(9, 200)
+    assert small == [RadianceBudget(200, steps, 5_000, 0) for steps in (500, 1500)]
 
 
-def test_it_ends_where_more_steps_do_not_pay(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_ends_where_more_loses(monkeypatch: pytest.MonkeyPatch) -> None:
     trained: list[tuple[int, int, int]] = []
-    scores = {1_111: 20.0, 3_333: 21.0, 10_000: 20.5, 30_000: 25.0}
+    scores = {500: 20.0, 1_111: 20.2, 3_333: 21.0, 10_000: 20.5, 30_000: 25.0}
 
     def train(small: Capture, config: RadianceConfig, indices: list[int], *_: object) -> int:
         trained.append((config.steps, len(indices), small.cameras[0].width))
@@ -50,24 +64,33 @@ def test_it_ends_where_more_steps_do_not_pay(monkeypatch: pytest.MonkeyPatch) ->
 
     monkeypatch.setattr(rehearsal, "train_radiance", train)
     monkeypatch.setattr(rehearsal, "evaluate_views", scored)
-    config = RadianceConfig()
-    found = rehearse(capture(640), config, range(VIEWS))
-    assert found == {1_111: 20.0, 3_333: 21.0, 10_000: 20.5}
-    assert trained == [(steps, VIEWS - 1, 320) for steps in found]
-    assert supported(found, config, VIEWS) == replace(config, steps=3_333)
-    assert supported({1_111: 20.0, 3_333: 20.1}, config, VIEWS).steps == 1_111  # it may be chance
-    assert supported({}, config, 100) == config
+    config, photographs = RadianceConfig(), capture(800)
+    budgets = budgets_for(photographs, config, VIEWS)
+    found = rehearse(photographs, config, range(VIEWS))
+    assert found == [20.0, 20.2, 21.0, 20.5]
+    sizes = zip((500, 1_111, 3_333, 10_000), (320, 480, 800, 800), strict=True)
+    assert trained == [(steps, VIEWS - 1, side) for steps, side in sizes]
+    assert supported(found, budgets) == budgets[2]
+    assert supported([20.0, 20.1], budgets) == budgets[0]  # it may be chance
     trained.clear()
-    assert rehearse(capture(), config, [0, 4, 7]) == {}  # none can be spared
+    assert rehearse(photographs, config, [0, 4, 7]) == []  # none can be spared
     assert not trained
-    assert supported({}, config, 3).steps == 1_111
+    assert supported([], budgets) == budgets[0] == QUICK
+
+
+def test_photographs_are_no_larger_than_the_budget_allows() -> None:
+    photographs = capture(40)
+    assert within(photographs, RadianceBudget(40, 1, 1, 0)) is photographs
+    small = within(photographs, RadianceBudget(20, 1, 1, 0))
+    assert [camera.name for camera in small.cameras] == [camera.name for camera in photographs.cameras]
+    assert {image.shape for image in small.images} == {(20, 20, 3)}
 
 
 @pytest.mark.long
 def test_an_interrupted_rehearsal_ends_as_an_uninterrupted_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(settings, "FEWEST_REHEARSED", 12)
+    monkeypatch.setattr(settings, "QUICK", RadianceBudget(320, 12, 30_000, 1))
     reports: list[Report] = []
 
     def stop(at: Report) -> None:
@@ -77,7 +100,7 @@ def test_an_interrupted_rehearsal_ends_as_an_uninterrupted_one(
 
     path = tmp_path / "rehearsal.safetensors"
     straight = rehearse(capture(), SHORT, range(VIEWS))
-    assert list(straight) in ([12, 36], [12])
+    assert len(straight) == 2
     with pytest.raises(Cancelled):
         rehearse(capture(), replace(SHORT, rehearsed_views=50), range(VIEWS), path, Progress(stop))
     assert len(checkpoints_of(path)) == 2

@@ -126,6 +126,22 @@ def test_space_before_a_surface_is_free() -> None:
     assert not in_free_space(surface, []).any()
 
 
+def test_depths_that_are_alone_tell_nothing() -> None:
+    rng = np.random.default_rng(5)
+    depth = np.where(rng.random(SIZE[::-1]) < 0.6, rng.normal(5, 0.1, SIZE[::-1]), np.nan)
+    depth[10, 10] = 9.0
+    kept = stereo.shared(depth)
+    for (row, column), found in np.ndenumerate(kept):
+        window = depth[
+            max(row - RADIUS, 0) : row + RADIUS + 1, max(column - RADIUS, 0) : column + RADIUS + 1
+        ]  # fmt: skip
+        alike = np.abs(window / depth[row, column] - 1) < stereo.ALIKE
+        enough = alike.sum() >= stereo.LEAST_ALIKE * (2 * RADIUS + 1) ** 2
+        assert found == depth[row, column] if enough else np.isnan(found)
+    assert np.isnan(kept[10, 10])
+    assert 0.2 < np.isfinite(kept).mean() < 0.6
+
+
 def test_what_is_nearest_is_told_by_depths_and_points_around() -> None:
     rng = np.random.default_rng(4)
     camera = cameras()[1]
