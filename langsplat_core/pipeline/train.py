@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from langsplat_core.arrays import ViewScore
-from langsplat_core.config import RadianceConfig, TrainConfig, check_settings
+from langsplat_core.config import RadianceBudget, RadianceConfig, TrainConfig, check_settings
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.holdout import split
@@ -50,9 +50,9 @@ from langsplat_core.training.radiance.rehearsal import (
     in_words,
     rehearse,
     supported,
-    within,
+    train_within,
 )
-from langsplat_core.training.radiance.train import evaluate_views, train_radiance
+from langsplat_core.training.radiance.train import evaluate_views
 
 FEWEST_VIEWS = 3
 RADIANCE_VERSION = 6  # of what training and rehearsal make
@@ -218,8 +218,7 @@ def _gaussians(run: _Run, capture: Capture, train: list[int]) -> tuple[Gaussians
             "--radiance.rehearsed-views 0 spends all",
             *(in_words(budget), in_words(budgets[-1]), decibels or "none could be"),
         )
-    small, supporting = within(capture, budget), config.spending(budget)
-    return once(lambda: trained_gaussians(small, train, supporting, *shared)), rehearsed
+    return once(lambda: trained_gaussians(capture, train, config, budget, *shared)), rehearsed
 
 
 def _report(
@@ -259,24 +258,32 @@ def rehearsals(
 
 
 def trained_gaussians(
-    capture: Capture, train: list[int], config: RadianceConfig, work: Path, progress: Progress
+    capture: Capture,
+    train: list[int],
+    config: RadianceConfig,
+    budget: RadianceBudget,
+    work: Path,
+    progress: Progress,
 ) -> Gaussians:
     """The Gaussians of the photographs at `train`, from `work` where they were trained before."""
-    done = work / f"{_radiance_key('radiance', capture, train, config)}.ply"
+    done = work / f"{_radiance_key('radiance', capture, train, config, budget)}.ply"
     if done.exists():
         log.debug("%s: kept from an earlier run", done.name)
         return read_ply(done)
-    gaussians = train_radiance(capture, config, train, done.with_suffix(".checkpoint.safetensors"), progress)
+    checkpoint = done.with_suffix(".checkpoint.safetensors")
+    gaussians = train_within(capture, budget, config, train, checkpoint, progress)
     write_ply(done, gaussians)
-    done.with_suffix(".checkpoint.safetensors").unlink(missing_ok=True)
+    checkpoint.unlink(missing_ok=True)
     return gaussians
 
 
-def _radiance_key(name: str, capture: Capture, train: list[int], config: RadianceConfig) -> str:
+def _radiance_key(
+    name: str, capture: Capture, train: list[int], config: RadianceConfig, *more: RadianceBudget
+) -> str:
     # The backend changes who computes, not what, so that a run may move between machines; nor do checkpoints.
     every = RadianceConfig.checkpoint_every
     settings = replace(config, backend="auto", checkpoint_every=every)
-    return stage_key(name, RADIANCE_VERSION, settings, capture.digest(train))
+    return stage_key(name, RADIANCE_VERSION, settings, capture.digest(train), *more)
 
 
 class StoredViews(Sequence[tuple[Camera, ImageFeatures]]):

@@ -18,7 +18,7 @@ from torch import Tensor
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.errors import BackendError
-from langsplat_core.raster.protocol import LiftingView, farthest, mean_depth
+from langsplat_core.raster.protocol import LiftingView, dilation, farthest, mean_depth
 from langsplat_core.scene import Camera, Gaussians, look_at
 
 DEVICE = "cuda"
@@ -104,7 +104,7 @@ def draw(
         height=camera.height,
         near_plane=settings.near,
         far_plane=min(farthest(settings), FARTHEST),
-        eps2d=settings.dilation,
+        eps2d=dilation(camera, settings),
         sh_degree=sh_degree,
         packed=False,
         rasterize_mode="antialiased" if settings.antialiased else "classic",

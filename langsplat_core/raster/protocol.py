@@ -141,6 +141,19 @@ def tangent_limits(camera: Camera, settings: RasterSettings) -> tuple[float, flo
     )
 
 
+def dilation(camera: Camera, settings: RasterSettings) -> float:
+    """What is added to both variances of a footprint, px^2.
+
+    Gaussians are fitted with the dilation around them. In an image of more pixels than the photographs had,
+    the same number of pixels is less of the world: what was closed there opens, and edges fray into needles
+    (Yu et al. 2024, Mip-Splatting, figure 1). So it grows as the image does. It never shrinks: it also
+    guards against aliasing.
+    """
+    if settings.focal is None or camera.orthographic:
+        return settings.dilation
+    return settings.dilation * max(1.0, camera.fx * camera.fy / settings.focal**2)
+
+
 def check_picture(camera: Camera) -> None:
     """InputError where an image of the camera's size needs more than all of this machine's memory."""
     needed = camera.width * camera.height * BYTES_PER_PIXEL

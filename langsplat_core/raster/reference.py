@@ -7,7 +7,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array, check_array, rotation_matrices, sigmoid, unit
 from langsplat_core.config import INRIA, RasterSettings
-from langsplat_core.raster.protocol import LiftingView, farthest, mean_depth, tangent_limits
+from langsplat_core.raster.protocol import LiftingView, dilation, farthest, mean_depth, tangent_limits
 from langsplat_core.scene import Camera, Gaussians
 from langsplat_core.scene.transform import sh_basis
 
@@ -86,8 +86,9 @@ def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings = INR
     yy = (a[:, 1] ** 2).sum(1)
     xy = (a[:, 0] * a[:, 1]).sum(1)
     det_sharp = (np.cross(a[:, 0], a[:, 1]) ** 2).sum(1)
-    det = det_sharp + settings.dilation * (xx + yy) + settings.dilation**2
-    xx, yy = xx + settings.dilation, yy + settings.dilation
+    added = dilation(camera, settings)
+    det = det_sharp + added * (xx + yy) + added**2
+    xx, yy = xx + added, yy + added
 
     opacities = sigmoid(np.where(drawn, gaussians.opacity_logits, -np.inf).astype(np.float64))
     if settings.antialiased:

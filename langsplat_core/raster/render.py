@@ -20,7 +20,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.progress import lap
 from langsplat_core.raster import load_rasterizer
-from langsplat_core.raster.protocol import LiftingRasterizer, View, farthest
+from langsplat_core.raster.protocol import LiftingRasterizer, View, dilation, farthest
 from langsplat_core.scene import Camera, Gaussians, Scene
 
 
@@ -66,7 +66,7 @@ def _may_reach(
         if not camera.orthographic:
             x, y = x / z, y / z
             largest *= np.sqrt(1 + x * x + y * y) / z
-        variance = largest**2 + np.float32(settings.dilation)
+        variance = largest**2 + np.float32(dilation(camera, settings))
         reach = np.sqrt(np.float32(2 * np.log(1 / settings.alpha_min)) * variance) + 1
         away = np.maximum(
             np.abs(camera.fx * x + np.float32(camera.cx - pixel[0] - 0.5)),

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -52,8 +53,14 @@ class Scene:
         )
 
     def raster_settings(self, profile: RasterSettings = INRIA) -> RasterSettings:
-        """`profile` with the antialiasing that this scene was trained with."""
-        return replace(profile, antialiased=self.antialiased)
+        """`profile` with the antialiasing and the focal length that this scene was trained with."""
+        return replace(profile, antialiased=self.antialiased, focal=self._focal)
+
+    @cached_property
+    def _focal(self) -> float | None:
+        """Median focal length of the cameras, px; None without cameras."""
+        lengths = [camera.fx * camera.fy for camera in self.cameras if not camera.orthographic]
+        return float(np.sqrt(np.median(lengths))) if lengths else None
 
     def up(self) -> Array:
         """(3,) the world's up direction: the mean of the cameras' up axes, else -y as COLMAP has it."""

@@ -180,6 +180,8 @@ export class Painter {
   // Ask for the draw order of a camera; one sort runs at a time, and only the newest request waits. Resolves
   // when the order of this camera is here (true), or that of a later one (false).
   sort(camera) {
+    // As raster.protocol.dilation.
+    const finer = raster.focal ? Math.max(1, (camera.fx * camera.fy) / raster.focal ** 2) : 1;
     const r = camera.rotation, p = camera.position, { near, far } = this.meta.raster;
     const plane = [r[6], r[7], r[8], -(r[6] * p[0] + r[7] * p[1] + r[8] * p[2])];
     if (this.plane && plane.every((v, i) => v === this.plane[i])) return this.last;
@@ -218,12 +220,14 @@ export class Painter {
       }
       this.image = this.target(width, height, Array(2).fill(gl.RGBA16F));
     }
+    // As raster.protocol.dilation.
+    const finer = raster.focal ? Math.max(1, (camera.fx * camera.fy) / raster.focal ** 2) : 1;
     const r = camera.rotation, high = camera.position.map(Math.fround);
     const mx = (0.5 * (raster.fov_clamp - 1) * width) / camera.fx,
       my = (0.5 * (raster.fov_clamp - 1) * height) / camera.fy;
     this.use("project", {
       gaussians: 0, sh: 1, orthographic: 0, sh_count: meta.sh_count, antialiased: +raster.antialiased,
-      dilation: raster.dilation, alpha_min: raster.alpha_min, colour_max: 65504,
+      dilation: raster.dilation * finer, alpha_min: raster.alpha_min, colour_max: 65504,
       focal: [camera.fx, camera.fy], principal: [camera.cx, camera.cy],
       world_to_camera: [r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]], camera_high: high,
       camera_low: camera.position.map((v, i) => v - high[i]),

@@ -19,8 +19,8 @@ from langsplat_core.datasets.known_poses import look_distance
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Gaussians, Scene
-from langsplat_core.training.radiance.rehearsal import budgets_for, rehearse, supported, within
-from langsplat_core.training.radiance.train import evaluate_views, train_radiance
+from langsplat_core.training.radiance.rehearsal import budgets_for, rehearse, supported, train_within
+from langsplat_core.training.radiance.train import evaluate_views
 from tests.benchmarks.captures import Kind, draw_capture
 
 SIDE = 320  # px at which presets are compared with each other
@@ -148,8 +148,7 @@ def _measured(
     began = time.process_time()
     found = rehearse(capture, config, train, progress=progress)
     budget = supported(found, budgets_for(capture, config, len(train)))
-    config = config.spending(budget)
-    gaussians = train_radiance(within(capture, budget), config, train, progress=progress)
+    gaussians = train_within(capture, budget, config, train, progress=progress)
     seconds = time.process_time() - began
     if sheet:
         add_row(sheet, gaussians, between(capture.shrunk(train, SIDE).cameras))

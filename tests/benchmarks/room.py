@@ -63,6 +63,7 @@ from langsplat_core.semantics.masks import MaskSource
 from langsplat_core.semantics.sam import load_mask_source
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures, describe_capture
 from langsplat_core.training.language.codec_fit import CodecReport
+from langsplat_core.training.radiance.rehearsal import budgets_for
 from tests.benchmarks.clip_geometry import ClipGeometry, read_geometry
 from tests.benchmarks.oracles import (
     TileMasks,
@@ -228,7 +229,9 @@ class Room:
         """Gaussians that were trained without the held-out views."""
         train, _ = self.capture.split(HOLD_OUT)
         start = time.perf_counter()
-        gaussians = trained_gaussians(self.capture, train, self.settings.radiance, self.folder, self.progress)
+        config = self.settings.radiance
+        budget = budgets_for(self.capture, config, len(train))[-1]
+        gaussians = trained_gaussians(self.capture, train, config, budget, self.folder, self.progress)
         self._lap("radiance", start)
         return gaussians
 

@@ -51,7 +51,8 @@ def cases(draw: st.DrawFn) -> Drawn:
     if draw(st.booleans()):
         camera = without_perspective(camera, draw(st.floats(0.05, 6)))
     profile = draw(st.sampled_from([INRIA, GSPLAT]))
-    return gaussians, camera, replace(profile, antialiased=draw(st.booleans()))
+    focal = draw(st.sampled_from([None, None, 0.3 * camera.fx]))
+    return gaussians, camera, replace(profile, antialiased=draw(st.booleans()), focal=focal)
 
 
 def over_random_cases(law: Callable[[Drawn], None], slow: bool, largest: int = 1000) -> None:

@@ -51,6 +51,27 @@ def test_the_scenes_antialiasing_and_the_profile_apply():
     assert not np.array_equal(got.colours, render(Scene(G), CAMERA).colours)
 
 
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_an_image_of_more_pixels_than_the_photographs_shows_what_they_showed(backend: str) -> None:
+    """Gaussians thinner than a pixel are all dilation: an image four times as large has as much of it."""
+    thin = replace(
+        G, log_scales=np.full_like(G.log_scales, -9.0), sh=G.sh[:, :1], opacity_logits=G.opacity_logits + 9
+    )
+    large = CAMERA.resized(4 * CAMERA.width, 4 * CAMERA.height)
+    fitted = Scene(thin, cameras=(CAMERA, CAMERA, CAMERA.resized(20, 15)))
+    assert fitted.raster_settings().focal == pytest.approx(np.sqrt(CAMERA.fx * CAMERA.fy))
+    small = render(fitted, CAMERA, backend=backend)
+    np.testing.assert_array_equal(small.alpha, render(Scene(thin), CAMERA, backend=backend).alpha)
+    alike = render(fitted, large, backend=backend).alpha.mean()
+    assert alike == pytest.approx(small.alpha.mean(), rel=0.05)
+    assert render(Scene(thin), large, backend=backend).alpha.mean() < 0.2 * small.alpha.mean()
+    flat = without_perspective(large)  # its pixels have no focal length
+    without = render(Scene(thin), flat, backend=backend).alpha
+    np.testing.assert_array_equal(render(fitted, flat, backend=backend).alpha, without)
+    less = CAMERA.resized(CAMERA.width // 2, CAMERA.height // 2)
+    assert protocol.dilation(less, fitted.raster_settings()) == INRIA.dilation  # it guards against aliasing
+
+
 def test_what_cannot_draw_is_said():
     with pytest.raises(InputError, match="choose one of reference, cpu, opengl, cuda"):
         render(Scene(G), CAMERA, backend="vulkan")

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from langsplat_core.config import INRIA, RasterSettings
-from langsplat_core.raster.protocol import farthest
+from langsplat_core.raster.protocol import dilation, farthest
 from langsplat_core.scene import Camera, Gaussians
 
 
@@ -52,7 +52,7 @@ def project(
     ).reshape(-1, 3, 3)  # fmt: skip
     a = jacobian @ rotation @ (turn * torch.exp(leaves["log_scales"])[:, None, :])
     sharp = a @ a.mT
-    covariance = sharp + settings.dilation * torch.eye(2, dtype=torch.float64)
+    covariance = sharp + dilation(camera, settings) * torch.eye(2, dtype=torch.float64)
     opacity = torch.sigmoid(leaves["opacity_logits"])
     if settings.antialiased:
         ratio = torch.linalg.det(sharp) / torch.linalg.det(covariance)

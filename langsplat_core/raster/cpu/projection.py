@@ -20,7 +20,7 @@ from langsplat_core.arrays import Array, check_array
 from langsplat_core.compiled import helper, kernel, plain, shared_workers
 from langsplat_core.config import RasterSettings
 from langsplat_core.raster.cpu.lanes import prefetch
-from langsplat_core.raster.protocol import farthest, tangent_limits
+from langsplat_core.raster.protocol import dilation, farthest, tangent_limits
 from langsplat_core.scene import Camera
 from langsplat_core.scene.gaussians import LARGEST_COEFFICIENT
 from langsplat_core.scene.transform import C0, C1, C2, C3
@@ -87,6 +87,7 @@ class KernelCamera(NamedTuple):
 
 def kernel_camera(camera: Camera, settings: RasterSettings) -> KernelCamera:
     left, top, right, bottom = tangent_limits(camera, settings)
+    added = dilation(camera, settings)
     # Half width = reach sqrt((A A^T)_xx + dilation), A = J R S: so at most
     # reach (|J_x| |R| size + sqrt(dilation)).
     reach = np.sqrt(-2 * np.log(min(settings.alpha_min, 1.0)))
@@ -107,13 +108,13 @@ def kernel_camera(camera: Camera, settings: RasterSettings) -> KernelCamera:
         bottom=float(bottom),
         near=float(settings.near),
         far=float(farthest(settings)),
-        dilation=float(settings.dilation),
+        dilation=float(added),
         alpha_min=float(settings.alpha_min),
         antialiased=bool(settings.antialiased),
         orthographic=camera.orthographic,
         reach_x=float(most * camera.fx * np.hypot(1, wide)),
         reach_y=float(most * camera.fy * np.hypot(1, high)),
-        margin=float(1.001 * reach * np.sqrt(settings.dilation) + 1e-3),
+        margin=float(1.001 * reach * np.sqrt(added) + 1e-3),
     )
 
 

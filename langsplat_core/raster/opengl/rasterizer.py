@@ -28,7 +28,7 @@ from langsplat_core.raster.opengl.scene_textures import (
     set_uniforms,
 )
 from langsplat_core.raster.opengl.shaders import shader, splat_shaders
-from langsplat_core.raster.protocol import View, farthest, mean_depth, tangent_limits
+from langsplat_core.raster.protocol import View, dilation, farthest, mean_depth, tangent_limits
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians
 
 MAX_TARGETS = 4  # colour attachments of one pass, three values each
@@ -176,7 +176,7 @@ class GlRasterizer:
                 "focal": (camera.fx, camera.fy),
                 "principal": (camera.cx, camera.cy),
                 "tangents": tangent_limits(camera, settings),
-                "dilation": settings.dilation,
+                "dilation": dilation(camera, settings),
                 "alpha_min": settings.alpha_min,
                 "antialiased": settings.antialiased,
                 "colour_max": HALF_MAX if self.precision == "half" else np.finfo(np.float32).max,

@@ -8,14 +8,17 @@ training itself then takes all views.
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from langsplat_core.config import RadianceBudget, RadianceConfig
+from langsplat_core.config import INRIA, RadianceBudget, RadianceConfig
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.holdout import chosen
+from langsplat_core.datasets.known_poses import inside
 from langsplat_core.progress import Progress, Report, silent
+from langsplat_core.scene import Camera, Gaussians
 from langsplat_core.training.radiance.train import STAGE as STEPS
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
 
@@ -94,8 +97,32 @@ def supported(found: Sequence[float], budgets: Sequence[RadianceBudget]) -> Radi
     return budgets[best]
 
 
-def within(capture: Capture, budget: RadianceBudget) -> Capture:
-    """The capture with photographs as large as the budget allows."""
-    if all(max(camera.width, camera.height) <= budget.longer_side for camera in capture.cameras):
-        return capture
-    return capture.shrunk(range(len(capture)), budget.longer_side)
+def train_within(
+    capture: Capture,
+    budget: RadianceBudget,
+    config: RadianceConfig,
+    train_indices: Sequence[int],
+    checkpoint: Path | None = None,
+    progress: Progress = silent,
+) -> Gaussians:
+    """`train_radiance` with the budget's share of `config`, for images as large as the photographs."""
+    spent, cameras = config.spending(budget), capture.cameras
+    if all(max(camera.width, camera.height) <= budget.longer_side for camera in cameras):
+        return train_radiance(capture, spent, train_indices, checkpoint, progress)
+    small = capture.shrunk(range(len(capture)), budget.longer_side)
+    gaussians = train_radiance(small, spent, train_indices, checkpoint, progress)
+    return widened(gaussians, [(small.cameras[index], cameras[index]) for index in train_indices])
+
+
+def widened(gaussians: Gaussians, views: Sequence[tuple[Camera, Camera]]) -> Gaussians:
+    """Gaussians fitted to the first camera of each view, as large as the second, which has the same place and
+    more pixels, has to see them: what the dilation (`raster.protocol.dilation`) adds there is less."""
+    added = np.full(len(gaussians), np.inf)
+    for camera, finer in views:
+        seen = inside(camera, gaussians.means)
+        depth = camera.project(gaussians.means)[1]
+        less = 1 / (camera.fx * camera.fy) - 1 / (finer.fx * finer.fy)
+        added[seen] = np.minimum(added, INRIA.dilation * depth**2 * less)[seen]
+    added = np.where(np.isfinite(added), added, 0)[:, None]
+    variances = np.exp(2 * gaussians.log_scales.astype(np.float64)) + added
+    return replace(gaussians, log_scales=(np.log(variances) / 2).astype(np.float32))

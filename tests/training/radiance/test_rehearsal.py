@@ -11,14 +11,15 @@ from langsplat_core.arrays import ViewScore
 from langsplat_core.config import GOOD, QUICK, RadianceBudget, RadianceConfig, TrainConfig, with_preset
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.progress import Cancelled, Progress, Report
-from langsplat_core.scene import look_at
+from langsplat_core.raster.render import render
+from langsplat_core.scene import Gaussians, Scene, look_at
 from langsplat_core.training.radiance import rehearsal
 from langsplat_core.training.radiance.rehearsal import (
     budgets_for,
     checkpoints_of,
     rehearse,
     supported,
-    within,
+    train_within,
 )
 
 VIEWS = 8
@@ -78,12 +79,35 @@ def test_it_ends_where_more_loses(monkeypatch: pytest.MonkeyPatch) -> None:
     assert supported([], budgets) == budgets[0] == QUICK
 
 
-def test_photographs_are_no_larger_than_the_budget_allows() -> None:
-    photographs = capture(40)
-    assert within(photographs, RadianceBudget(40, 1, 1, 0)) is photographs
-    small = within(photographs, RadianceBudget(20, 1, 1, 0))
-    assert [camera.name for camera in small.cameras] == [camera.name for camera in photographs.cameras]
-    assert {image.shape for image in small.images} == {(20, 20, 3)}
+def test_fewer_pixels_show_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    photographs, sizes = capture(160), []
+    rng = np.random.default_rng(1)
+    fitted = Gaussians(
+        means=rng.normal(0, 0.4, (60, 3)),
+        log_scales=rng.normal(-5.5, 0.5, (60, 3)),
+        quats_wxyz=rng.normal(size=(60, 4)),
+        opacity_logits=np.full(60, 2.0),
+        sh=rng.normal(0, 0.5, (60, 1, 3)),
+    )
+
+    def train(small: Capture, config: RadianceConfig, indices: list[int], *_: object) -> Gaussians:
+        sizes.append((small.cameras[0].width, len(small), config.steps, list(indices)))
+        return fitted
+
+    monkeypatch.setattr(rehearsal, "train_radiance", train)
+    budget = RadianceBudget(160, 7, 60, 0)
+    assert train_within(photographs, budget, RadianceConfig(), [1, 2]) is fitted
+    wide = train_within(photographs, replace(budget, longer_side=40), RadianceConfig(), [1, 2])
+    assert sizes == [(160, VIEWS, 7, [1, 2]), (40, VIEWS, 7, [1, 2])]
+    camera = photographs.cameras[1]
+    small = render(Scene(fitted), camera.resized(40, 40)).colours.repeat(4, 0).repeat(4, 1)
+    thin, seen = (render(Scene(gaussians), camera).colours for gaussians in (fitted, wide))
+    assert np.abs(small - seen).mean() < 0.6 * np.abs(small - thin).mean()
+    # A Gaussian in the middle, seen by both cameras: its variance grows by what the dilation lost.
+    depth = min(photographs.cameras[i].project(fitted.means)[1][0] for i in (1, 2))
+    focal = photographs.cameras[1].fx
+    grown = np.exp(2 * fitted.log_scales[0].astype(float)) + 0.3 * depth**2 * (16 - 1) / focal**2
+    np.testing.assert_allclose(np.exp(2 * wide.log_scales[0].astype(float)), grown, rtol=1e-4)
 
 
 @pytest.mark.long
