@@ -9,10 +9,10 @@ import dataclasses
 import types
 import typing
 from collections.abc import Iterator, Mapping
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from numbers import Integral, Real
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args, get_origin
 
 import tyro
 
@@ -194,8 +194,7 @@ class DatasetConfig:
     allow_few_cameras: bool = False
 
 
-@dataclass(frozen=True)
-class RadianceBudget:
+class RadianceBudget(NamedTuple):
     """What a training of Gaussians may spend."""
 
     longer_side: int  # px, of the photographs
@@ -205,7 +204,7 @@ class RadianceBudget:
 
     def at_most(self, limit: "RadianceBudget") -> "RadianceBudget":
         """No more of anything than `limit`."""
-        return RadianceBudget(*map(min, astuple(self), astuple(limit)))
+        return RadianceBudget(*map(min, self, limit))
 
 
 QUICK = RadianceBudget(320, 500, 30_000, 1)  # with fewer steps no capture is learnt
@@ -267,7 +266,7 @@ class RadianceConfig:
             steps.insert(0, round(steps[0] / REHEARSAL_FACTOR))
         if views > self.rehearsed_views or len(steps) < 2:
             return [whole]
-        sizes = [replace(GOOD if count <= GOOD.steps else whole, steps=count) for count in steps]
+        sizes = [(GOOD if count <= GOOD.steps else whole)._replace(steps=count) for count in steps]
         return list(dict.fromkeys(budget.at_most(whole) for budget in (QUICK, *sizes)))
 
     def spending(self, budget: RadianceBudget) -> "RadianceConfig":

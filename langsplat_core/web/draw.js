@@ -180,8 +180,6 @@ export class Painter {
   // Ask for the draw order of a camera; one sort runs at a time, and only the newest request waits. Resolves
   // when the order of this camera is here (true), or that of a later one (false).
   sort(camera) {
-    // As raster.protocol.dilation.
-    const finer = raster.focal ? Math.max(1, (camera.fx * camera.fy) / raster.focal ** 2) : 1;
     const r = camera.rotation, p = camera.position, { near, far } = this.meta.raster;
     const plane = [r[6], r[7], r[8], -(r[6] * p[0] + r[7] * p[1] + r[8] * p[2])];
     if (this.plane && plane.every((v, i) => v === this.plane[i])) return this.last;

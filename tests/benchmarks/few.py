@@ -200,7 +200,8 @@ def _image(gaussians: Gaussians, camera: Camera) -> Array:
 
 
 def _psnr_at(photograph: Array, camera: Camera, gaussians: Gaussians) -> float:
-    """PSNR of the camera's image, shrunk to the size of the photograph: what presets are compared by."""
+    """PSNR of the camera's image, shrunk to the size of the photograph as that was: what presets are compared
+    by. Area averages alone would be 30 to 40 dB from it."""
     size = photograph.shape[1::-1]
-    shrunk = Image.fromarray(_image(gaussians, camera)).resize(size, Image.Resampling.BOX)
+    shrunk = Image.fromarray(_image(gaussians, camera)).resize(size, Image.Resampling.LANCZOS)
     return psnr(np.asarray(shrunk) / 255, photograph / 255)

@@ -117,7 +117,7 @@ def test_the_same_command_again_changes_nothing_and_repeats_no_stage(room, tmp_p
         raise AssertionError("a stage that was done is done again")
 
     for module, name in (
-        (train, "train_radiance"),
+        (train, "train_within"),
         (language, "view_pairs"),
         (language, "group_masks"),
         (language, "lift_sample"),

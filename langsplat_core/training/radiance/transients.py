@@ -39,7 +39,7 @@ KEPT = 0.5  # of the difference that was found before, in the mean
 FITTING = 0.7  # of the patches, those that fit best, tell the exposure
 RIDGE = 0.01  # of that exposure, as `losses.RIDGE`
 AGAINST = 3  # times as many other views agree with what is drawn as do not
-EXPLAINS = 0.27  # of the squared differences, that must lie in what moves
+EXPLAINS = 0.24  # of the squared differences, that must lie in what moves
 DEPTH_SIDE = 64  # px, width of the drawn depths
 
 

@@ -97,7 +97,7 @@ def test_fewer_pixels_show_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rehearsal, "train_radiance", train)
     budget = RadianceBudget(160, 7, 60, 0)
     assert train_within(photographs, budget, RadianceConfig(), [1, 2]) is fitted
-    wide = train_within(photographs, replace(budget, longer_side=40), RadianceConfig(), [1, 2])
+    wide = train_within(photographs, budget._replace(longer_side=40), RadianceConfig(), [1, 2])
     assert sizes == [(160, VIEWS, 7, [1, 2]), (40, VIEWS, 7, [1, 2])]
     camera = photographs.cameras[1]
     small = render(Scene(fitted), camera.resized(40, 40)).colours.repeat(4, 0).repeat(4, 1)
