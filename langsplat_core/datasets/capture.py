@@ -334,13 +334,15 @@ class Capture:
 def shrunk_view(
     camera: Camera, image: Array, mask: Array | None, size: tuple[int, int]
 ) -> tuple[Camera, Array, Array | None]:
-    """A view at a smaller (width, height), by area averages; a pixel counts where all it is made of count."""
+    """A view at a smaller (width, height), shrunk as photographs are when they are read (`intrinsics`): area
+    averages differ by 30 to 40 dB. A pixel counts where all it is made of count."""
 
-    def averaged(picture: Array) -> Array:
-        return np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BOX))
+    def resized(picture: Array, by: Image.Resampling) -> Array:
+        return np.asarray(Image.fromarray(picture).resize(size, by))
 
-    counted = None if mask is None else averaged(np.where(mask, np.uint8(255), np.uint8(0))) == 255
-    return camera.resized(*size), averaged(image), counted
+    counts = None if mask is None else np.where(mask, np.uint8(255), np.uint8(0))
+    counted = None if counts is None else resized(counts, Image.Resampling.BOX) == 255
+    return camera.resized(*size), resized(image, Image.Resampling.LANCZOS), counted
 
 
 def _rounded(values: Array) -> Array:

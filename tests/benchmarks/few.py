@@ -19,11 +19,18 @@ from langsplat_core.datasets.known_poses import look_distance
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Gaussians, Scene
-from langsplat_core.training.radiance.rehearsal import budgets_for, rehearse, supported, train_within
+from langsplat_core.training.radiance.rehearsal import (
+    budgets_for,
+    in_words,
+    rehearse,
+    supported,
+    train_within,
+)
 from langsplat_core.training.radiance.train import evaluate_views
 from tests.benchmarks.captures import Kind, draw_capture
 
 SIDE = 320  # px at which presets are compared with each other
+LARGE = 800  # px, of a window beside them: with dilation as at the photographs' size, and growing
 SHEET_VIEWS = 4
 NEARER = 0.2  # of the distance to what cameras look at
 # What a training has, beside its preset.
@@ -80,9 +87,11 @@ class Few:
             *(
                 "exposure fitted, dB",
                 f"at {SIDE} px, dB",
+                f"at {LARGE} px: dilation as it was, growing",
                 "SSIM",
                 "training, dB",
-                "steps",
+                "budget",
+                "rehearsed, dB",
                 "Gaussians",
                 "CPU-s",
             ),
@@ -90,7 +99,7 @@ class Few:
         print(markdown(titles, rows))
 
     def _rows(self, folder: Path, name: str, work: Path, progress: Progress) -> Iterator[tuple[str, ...]]:
-        small, _, _ = self._capture(folder, work, SIDE, progress)
+        others = [self._capture(folder, work, side, progress)[0] for side in (SIDE, LARGE)]
         for preset in self.presets:
             config = with_preset(TrainConfig(), preset)
             capture, train, held_out = self._capture(folder, work, config.dataset.max_side, progress)
@@ -98,7 +107,7 @@ class Few:
                 for seed in self.seeds:
                     settings = replace(config.radiance, seed=seed, **VARIANTS[variant])  # type: ignore[arg-type]
                     sheet = self.sheets and self.sheets / f"{name}.png"
-                    found = _measured(capture, small, settings, train, held_out, progress, sheet)
+                    found = _measured(capture, others, settings, train, held_out, progress, sheet)
                     counts = f"{len(train)} / {len(held_out)}"
                     yield (name, counts, preset, variant, str(seed), *found)
 
@@ -138,7 +147,7 @@ def _subset(capture: Capture, rows: Sequence[int]) -> Capture:
 
 def _measured(
     capture: Capture,
-    small: Capture,
+    others: Sequence[Capture],
     config: RadianceConfig,
     train: Sequence[int],
     held_out: Sequence[int],
@@ -154,17 +163,25 @@ def _measured(
         add_row(sheet, gaussians, between(capture.shrunk(train, SIDE).cameras))
     scores = evaluate_views(gaussians, capture, held_out)
     learnt = evaluate_views(gaussians, capture, train)
+    small, large = others
+    scene = Scene(gaussians, cameras=tuple(capture.cameras[i] for i in train))
     exposed = [score.psnr_exposed for score in scores if score.psnr_exposed is not None]
     means = [
         np.mean([score.psnr for score in scores]),
         np.mean(exposed) if exposed else np.nan,
-        np.mean([_psnr_at(small.images[i], capture.cameras[i], gaussians) for i in held_out]),
+        np.mean([_psnr_at(small.images[i], capture.cameras[i], scene) for i in held_out]),
+    ]
+    larger = [
+        np.mean([_psnr_at(large.images[i], large.cameras[i], drawn) for i in held_out])
+        for drawn in (Scene(gaussians), scene)
     ]
     ssim = np.mean([score.ssim for score in scores])
     return (
         *(f"{mean:.2f}" for mean in means),
+        ", ".join(f"{mean:.2f}" for mean in larger),
         *(f"{ssim:.3f}", f"{np.mean([score.psnr for score in learnt]):.2f}"),
-        *(f"{budget.steps} at {budget.longer_side} px", str(len(gaussians)), f"{seconds:.0f}"),
+        *(in_words(budget), ", ".join(f"{decibels:.2f}" for decibels in found)),
+        *(str(len(gaussians)), f"{seconds:.0f}"),
     )
 
 
@@ -188,20 +205,22 @@ def between(cameras: Sequence[Camera]) -> list[Camera]:
 def add_row(sheet: Path, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
     """Draw the Gaussians by the cameras, side by side, below what the sheet shows so far."""
     height = max(camera.height for camera in cameras)
-    images = [np.pad(_image(gaussians, one), ((0, height - one.height), (0, 4), (0, 0))) for one in cameras]
+    images = [
+        np.pad(_image(Scene(gaussians), one), ((0, height - one.height), (0, 4), (0, 0))) for one in cameras
+    ]
     row = np.concatenate(images, 1)
     rows = [np.asarray(Image.open(sheet)), np.zeros_like(row[:4]), row] if sheet.exists() else [row]
     sheet.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(np.concatenate(rows)).save(sheet)
 
 
-def _image(gaussians: Gaussians, camera: Camera) -> Array:
-    return (255 * render(Scene(gaussians), camera).colours.clip(0, 1)).round().astype(np.uint8)
+def _image(scene: Scene, camera: Camera) -> Array:
+    return (255 * render(scene, camera).colours.clip(0, 1)).round().astype(np.uint8)
 
 
-def _psnr_at(photograph: Array, camera: Camera, gaussians: Gaussians) -> float:
+def _psnr_at(photograph: Array, camera: Camera, scene: Scene) -> float:
     """PSNR of the camera's image, shrunk to the size of the photograph as that was: what presets are compared
     by. Area averages alone would be 30 to 40 dB from it."""
     size = photograph.shape[1::-1]
-    shrunk = Image.fromarray(_image(gaussians, camera)).resize(size, Image.Resampling.LANCZOS)
+    shrunk = Image.fromarray(_image(scene, camera)).resize(size, Image.Resampling.LANCZOS)
     return psnr(np.asarray(shrunk) / 255, photograph / 255)
