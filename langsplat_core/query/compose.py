@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, across
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.progress import Progress, silent
@@ -101,7 +101,7 @@ class Viewpoint:
 
 def upright(up: Array) -> Array:
     """(3,) unit -> (3, 3) rotation of world points into axes of which the last is up."""
-    first = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    first = across(up)
     first /= np.linalg.norm(first)
     return np.stack([first, np.cross(up, first), up])
 

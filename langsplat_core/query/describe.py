@@ -65,7 +65,7 @@ class WordScores:
     scale: float  # of the softmax
 
     def vector(self, phrase: str) -> Array:
-        """(D,) of one of the phrases."""
+        """(D,) unit vector of one of the phrases."""
         found: Array = self.vectors[self.phrases.index(phrase)]
         return found
 
@@ -113,15 +113,24 @@ class WordScores:
         return [slice(start, start + rows) for start in range(0, count, rows)]
 
 
+def likely_name(words: Sequence[Word]) -> Word | None:
+    """The best word, or as many as are `LIKELY` together: "mug or cup"; None where all together are not."""
+    for count in range(1, len(words) + 1):
+        probability = sum(word.probability for word in words[:count])
+        if probability >= LIKELY:
+            return Word(OR.join(word.phrase for word in words[:count]), probability)
+    return None
+
+
 def build_words(field: LanguageField, phrases: tuple[str, ...], vectors: Array) -> WordScores:
-    """Names of things: V phrases and their (V, D) unit vectors."""
+    """Scores of names of things, from V phrases and their (V, D) unit vectors."""
     every, bank = np.concatenate([vectors, field.canonical]).astype(np.float32), meanings(field)
     return WordScores(phrases, every, hubs(every, bank), WORD_SCALE / _spread(field, vectors, bank))
 
 
 def build_attributes(field: LanguageField, phrases: tuple[str, ...], vectors: Array) -> WordScores:
-    """Words of which a thing has one, such as colours: V phrases and their (V, D) unit vectors. Few and all
-    of one kind, they are no hubs."""
+    """Scores of words of which a thing has one, such as colours, from V phrases and their (V, D) unit
+    vectors. Few and all of one kind, they are no hubs."""
     scale = ATTRIBUTE_SCALE / _spread(field, vectors, meanings(field))
     return WordScores(phrases, vectors.astype(np.float32), np.zeros(len(vectors), np.float32), scale)
 
@@ -280,7 +289,7 @@ def same_things(names: Array, surface: Array) -> list[list[int]]:
 
 @dataclass(frozen=True)
 class Words:
-    """The words for a place, at one level."""
+    """The most probable words for a place at one level."""
 
     level: int  # index into LEVELS
     words: tuple[Word, ...]  # the most probable first; none where nothing is known
@@ -390,14 +399,8 @@ class Describer:
         return tuple(shown(node, self._name(node, members[node])) for node in parts.get(NO_NODE, []))
 
     def _name(self, node: int, rows: Array) -> Word | None:
-        """The best word for a node, or as many as are likely together: "mug or cup"; None where none are."""
         level, weights = int(self.engine.tree.levels[node]), np.maximum(self.areas[rows], 1e-300)
-        words = self._at_level(level, rows, weights, NAMES).words
-        for count in range(1, len(words) + 1):
-            probability = sum(word.probability for word in words[:count])
-            if probability >= LIKELY:
-                return Word(OR.join(word.phrase for word in words[:count]), probability)
-        return None
+        return likely_name(self._at_level(level, rows, weights, NAMES).words)
 
     def _outlined(
         self, node: int, word: Word | None, rows: Array, share: float, parts: tuple[Outline, ...]
@@ -486,7 +489,7 @@ class Describer:
 
 @dataclass(frozen=True, eq=False)
 class Pointed:
-    """The surface in one pixel."""
+    """The surface that one pixel shows, in words."""
 
     position: Array  # (3,) world units
     depth: float  # camera z, world units
