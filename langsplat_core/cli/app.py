@@ -110,7 +110,7 @@ def _group(name: str, words: Sequence[str]) -> Any:
 
 
 def _union(commands: Sequence[Any]) -> Any:
-    """tyro asks for two subcommands at least."""
+    """The union of commands; tyro asks for two subcommands at least."""
     return Union[(*commands, Annotated[None, tyro.conf.Suppress])]
 
 
@@ -132,6 +132,6 @@ def check_commands(args: Sequence[str]) -> None:
 
 
 def entry() -> None:
-    """The `langsplat` console script."""
+    """Run the `langsplat` console script."""
     args = sys.argv[1:] or ["--help"]
     sys.exit(main("langsplat", lambda: parse(args)))

@@ -101,7 +101,7 @@ class Describe:
 
     @property
     def _asked_of(self) -> list[str]:
-        """The options that name a place."""
+        """The options given that name a place."""
         given = {"--pixel": self.pixel, "--gaussian": self.gaussian, "--phrase": self.phrase}
         return [option for option, value in given.items() if value is not None]
 

@@ -163,7 +163,7 @@ def registered(moving: Scene, fixed: Scene, scaled: bool, progress: Progress) ->
 
 
 def read_transform(path: Path) -> Similarity:
-    """What a file of `langsplat register` holds. Raises InputError and FormatError, with the file's name."""
+    """The similarity in a file of `langsplat register`; InputError and FormatError name the file."""
     entry = read_json_file(path, TRANSFORM_LIMIT)
     matrix = numbers(entry if isinstance(entry, dict) else {}, "matrix", (4, 4), str(path))
     try:

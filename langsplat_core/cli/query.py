@@ -372,7 +372,7 @@ class Select:
         return selected
 
     def _write(self, engine: QueryEngine, answer: QueryResult) -> int:
-        """Number of Gaussians, points or meshes that were written."""
+        """Write the file; return the number of Gaussians, points or meshes in it."""
         scene, rows = engine.scene, np.flatnonzero(~answer.members if self.remove else answer.members)
         if self.shape == "points":
             relevancy = answer.relevancy[answer.level][rows]
@@ -421,16 +421,16 @@ class Unit:
 
     @property
     def metres(self) -> float | None:
-        """Metres per world unit, where they are known."""
+        """Metres per world unit; None where nobody said."""
         return self.length if self.name == "m" else None
 
     def format(self, values: Array, between: str = " ") -> str:
-        """World units as text, in this unit, without it."""
+        """Lengths in world units as numbers of this unit, joined by `between`."""
         return between.join(f"{self.length * value:.3f}" for value in values)
 
 
 def unit_of(scene: Scene, metres_per_unit: float | None = None) -> Unit:
-    """Metres by `metres_per_unit`, else by the scene's own, else world units."""
+    """The unit of lengths in a scene: metres by `metres_per_unit` or the scene's own, else world units."""
     metres = metres_per_unit or scene.metres_per_unit
     return Unit("units", 1.0) if metres is None else Unit("m", metres)
 
