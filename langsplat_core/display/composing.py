@@ -52,7 +52,7 @@ class Look(NamedTuple):
 
 
 class Planes(NamedTuple):
-    """The channels of an image, float32."""
+    """The channels of an image as a kernel takes them, float32."""
 
     rgb: Array  # (H, W, 3)
     alpha: Array  # (H, W)
