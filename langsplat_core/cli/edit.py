@@ -166,7 +166,7 @@ def _lines(report: CleanReport) -> list[str]:
 
 
 def _extent(scene: Scene) -> str:
-    """Where the Gaussians of a scene are, in words."""
+    """The extent of a scene's Gaussians, in words."""
     means = scene.gaussians.means[np.isfinite(scene.gaussians.means).all(1)]
     if not len(means):
         return "the scene holds none that lies anywhere"

@@ -55,7 +55,7 @@ RESOLUTION = 96  # groups are halved down to this fraction of the floaters
 
 @dataclass(frozen=True, eq=False)
 class Floaters:
-    """The floaters that are suspected among N Gaussians."""
+    """Suspected floaters among N Gaussians."""
 
     suspicion: Array  # (N,) int8 0: none, up to 3
     region: Array  # (N,) bool: of a small region; the other suspects hang in free space

@@ -262,7 +262,7 @@ UNLIKE = 10.0  # dB: a scene that is this far from the photographs does not show
 
 @dataclass(frozen=True)
 class Weight:
-    """What a scene costs, in bytes, and what it is worth, in decibels."""
+    """Size of a scene in bytes, and its quality in decibels."""
 
     gaussians: int
     sh_degree: int

@@ -215,7 +215,7 @@ class Channels:
 
 @dataclass(frozen=True, eq=False)
 class _Sheet:
-    """What a display is drawn from: rasterized channels and settings."""
+    """The rasterized channels and settings that a display is drawn from."""
 
     channels: Channels
     extra: Array  # (H, W, C) the display's further channel; alpha for displays without one

@@ -156,7 +156,7 @@ def map_classes(folder: Path, points: LabelledPoints) -> list[Array]:
 def score_points(
     points: LabelledPoints, found: list[Array], unknown: tuple[str, ...] = ()
 ) -> list[PointScore]:
-    """One score per set of classes."""
+    """Score the points, once for each set of classes."""
     scores = []
     for names, ids in zip(CLASS_SETS, found, strict=True):
         counted = np.isin(points.labels, [NYU40[name] for name in names])

@@ -44,7 +44,7 @@ class Mesh:
     name: str = "scene"
 
     def holes(self) -> int:
-        """How many loops of edges have a triangle on one side alone."""
+        """Number of holes: loops of edges with a triangle on one side alone."""
         edges = np.sort(self.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
         edges, sides = np.unique(edges, axis=0, return_counts=True)
         rim = edges[sides == 1]
@@ -53,7 +53,7 @@ class Mesh:
         return int(connected_components(links, directed=False)[0]) if len(rim) else 0
 
     def areas(self) -> Array:
-        """(T,) areas of the triangles, world units squared."""
+        """(T,) areas of the triangles, square world units."""
         a, b, c = (self.vertices[self.triangles[:, corner]] for corner in range(3))
         return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
 

@@ -27,7 +27,7 @@ STAGE = "registering"
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """How a scene lies in another one's axes."""
+    """The pose and size of a scene in the axes of another."""
 
     transform: Array  # (4, 4) float64 similarity, from the moving scene to the fixed one
     rmse: float  # of points that lie on each other, units of the fixed scene
@@ -40,7 +40,7 @@ class Registration:
 
     @property
     def trusted(self) -> bool:
-        """Whether the two scenes show one place, as far as renderings tell."""
+        """True if the two scenes show one place, as far as renderings tell."""
         return self.agreement >= TRUSTED
 
 

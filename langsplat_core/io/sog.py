@@ -141,7 +141,7 @@ def _folder_reader(folder: Path) -> Fetch:
 
 
 def _decode(fetch: Fetch, meta_path: Path) -> Scene:
-    """`meta_path` is for messages; the name of the meta file is its last part."""
+    """Decode the scene whose meta file `fetch` finds by the last part of `meta_path`."""
     meta = _Meta(parse_json(fetch(meta_path.name, META_LIMIT), meta_path), meta_path)
     return Scene(_gaussians(fetch, meta), antialiased=meta.antialiased())
 

@@ -109,7 +109,7 @@ def to_bytes(values: Array) -> Array:
 
 
 def _layout(size: int, fields: dict[str, tuple[int, str]]) -> np.dtype[Any]:
-    """A record of `size` bytes; field name -> (offset, type)."""
+    """The type of a record of `size` bytes; field name -> (offset, type)."""
     offsets, kinds = zip(*fields.values(), strict=True)
     return np.dtype({"names": [*fields], "formats": kinds, "offsets": offsets, "itemsize": size})
 

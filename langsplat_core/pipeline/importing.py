@@ -35,7 +35,7 @@ BLOCK = 16_384  # Gaussians read at a time: 32 MB at 512 float32 numbers
 
 @dataclass(frozen=True)
 class ImportReport:
-    """What became of a scene of another method."""
+    """Report on the import of a scene of another method."""
 
     method: str
     codec: str  # its kind; empty without a language field

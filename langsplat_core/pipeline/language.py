@@ -101,7 +101,7 @@ def language_field(
 
 
 def _coloured(field: LanguageField, tree: Tree, gaussians: Gaussians) -> Codec:
-    """The codec; a codebook with colours that tell neighbours apart."""
+    """The codec of a field; a codebook gets colours that differ between neighbours."""
     if not isinstance(field.codec, CodebookCodec):
         return field.codec
     colours = contrasting_colours(field, tree, build_surface(gaussians))
@@ -289,7 +289,7 @@ def _what_matters(config: LiftConfig) -> LiftConfig:
 
 
 def _encoded(codec: Codec, lifted: Lifted) -> Latents:
-    """(3, n, d) latents, zero where unobserved, and (3, n) confidence."""
+    """Encode lifted vectors: (3, n, d) latents, zero where unobserved, and (3, n) confidence."""
     levels, count, dim = lifted.vectors.shape
     latents = codec.encode(lifted.vectors.reshape(-1, dim)).reshape(levels, count, -1)
     return np.where(lifted.confidence[..., None] > 0, latents, 0).astype(latents.dtype), lifted.confidence

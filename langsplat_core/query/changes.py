@@ -81,12 +81,12 @@ class _Piece:
 
     @property
     def share(self) -> float:
-        """Of its pixels, in [0, 1]: those that changed."""
+        """Share of its pixels that changed, in [0, 1]."""
         return (self.gone + self.coloured) / max(self.gone + self.kept, 1e-9)
 
     @property
     def is_absent(self) -> bool:
-        """Whether it is gone, not only of another colour."""
+        """True if it is gone, and has not just another colour."""
         return self.gone >= ABSENT * (self.gone + self.kept)
 
     @property
@@ -296,7 +296,7 @@ def _together(
 
 
 def _meet(one: Array, other: Array) -> bool:
-    """Whether boxes (2, 3) overlap, or nearly."""
+    """True if two boxes (2, 3) overlap, or nearly."""
     room = TOUCHING * max(np.linalg.norm(one[1] - one[0]), np.linalg.norm(other[1] - other[0]))
     return bool(((one[0] - room <= other[1]) & (other[0] - room <= one[1])).all())
 
@@ -327,6 +327,6 @@ def _change(kind: Kind, piece: _Piece, scene: int, describers: tuple[Describer, 
 
 
 def _name(describer: Describer, rows: Array) -> str | None:
-    """The name of Gaussians taken as a whole thing."""
+    """The likeliest name of the Gaussians `rows` as one whole."""
     name = likely_name(describer.at_gaussians(rows, top=NAMES)[-1].words)
     return None if name is None else name.phrase

@@ -540,7 +540,7 @@ TRIES = 4  # candidates that are asked for each example wanted
 
 @dataclass(frozen=True)
 class Suggestions:
-    """Help for someone who does not know a scene."""
+    """Examples and phrases for someone who does not know a scene."""
 
     examples: tuple[str, ...] = ()  # each is found in the scene
     phrases: tuple[str, ...] = ()  # that its encoder or its phrasebook knows, what is in the scene first

@@ -120,7 +120,7 @@ SAM2_SIDE = 1024  # px, of the square that SAM 2 sees, which no shape tells
 
 @dataclass(frozen=True)
 class Hiera:
-    """Settings of a SAM 2's encoder that shapes do not tell."""
+    """Settings of a SAM 2's encoder that do not follow from shapes of tensors."""
 
     heads: int  # of the first stage; they double with the width
     windows: tuple[int, int, int, int]  # side by stage, in positions of its grid

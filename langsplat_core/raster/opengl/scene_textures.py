@@ -300,7 +300,7 @@ class SceneTextures:
 
     @staticmethod
     def _geometry(kept: Gaussians) -> Array:
-        """(n, 12): mean and opacity, scales and a free place, unit quaternion."""
+        """(n, 12) numbers of each Gaussian: mean, opacity, scales, a free place, unit quaternion."""
         scales = np.minimum(np.exp(kept.log_scales.astype(np.float64)), LARGEST_SCALE)
         quats = unit(kept.quats_wxyz.astype(np.float64), 1e-30)
         opacities = sigmoid(kept.opacity_logits.astype(np.float64))
@@ -308,7 +308,7 @@ class SceneTextures:
         return np.concatenate([kept.means, opacities[:, None], scales, free, quats], 1).astype(np.float32)
 
     def _layers(self, values: Array, dtype: str | np.dtype) -> moderngl.TextureArray:
-        """(n, C) -> texture array of ceil(C / 4) RGBA layers."""
+        """Upload (n, C) values as a texture array of ceil(C / 4) RGBA layers."""
         kind = np.dtype(dtype)
         layers = math.ceil(values.shape[1] / 4)
         padded = np.zeros((layers, self.size[0] * self.size[1], 4), kind)
@@ -359,13 +359,13 @@ class DrawOrder(Protocol):
     """Order in which the Gaussians ahead of one camera are drawn."""
 
     def write(self, scene: SceneTextures) -> None:
-        """Make `scene.order` this order."""
+        """Write this order into `scene.order`."""
 
     def rows(self, scene: SceneTextures) -> Array:
         """(m,) int32 texels, back to front; this order must be the one written last."""
 
     def draw(self, scene: SceneTextures, quads: moderngl.VertexArray) -> None:
-        """A quad for each of them; this order must be the one written last."""
+        """Draw a quad for each of them; this order must be the one written last."""
 
 
 @dataclass(frozen=True, eq=False)
