@@ -82,7 +82,7 @@ class Describe:
             print_json(answer | basis_fields(engine))
             return
         if self.outline:
-            print(*outline_lines(answer["outline"], unit_of(scene, None)), sep="\n")
+            print(*outline_lines(answer["outline"], unit_of(scene)), sep="\n")
         elif self._everything:
             _print_inventory(answer["inventory"])
         else:

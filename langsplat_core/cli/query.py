@@ -38,6 +38,7 @@ from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.answers import QueryResult, peak_pixel
 from langsplat_core.query.compose import Number, check_phrase, count_things, joined, run_phrase
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder
+from langsplat_core.query.finding import Hit
 from langsplat_core.query.grammar import Atom, Counted, Phrase, heads, unparse
 from langsplat_core.query.instances import Instance, hull
 from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
@@ -429,7 +430,7 @@ class Unit:
         return between.join(f"{self.length * value:.3f}" for value in values)
 
 
-def unit_of(scene: Scene, metres_per_unit: float | None = None) -> Unit:
+def unit_of(scene: Scene | Hit, metres_per_unit: float | None = None) -> Unit:
     """The unit of lengths in a scene: metres by `metres_per_unit` or the scene's own, else world units."""
     metres = metres_per_unit or scene.metres_per_unit
     return Unit("units", 1.0) if metres is None else Unit("m", metres)

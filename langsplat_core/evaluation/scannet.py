@@ -16,8 +16,9 @@ from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.evaluation.report import FIXED, write_json
+from langsplat_core.evaluation.report import FIXED
 from langsplat_core.evaluation.run import Subject, chosen_scenes, open_scene
+from langsplat_core.io.files import write_json
 from langsplat_core.io.hostile import open_for_reading, read_npy
 from langsplat_core.io.ply_table import fill_columns, iterate_rows, read_ply_header
 from langsplat_core.progress import Progress, silent
