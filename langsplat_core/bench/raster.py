@@ -241,11 +241,7 @@ def _cell(value: float | None, form: str) -> str:
 
 
 _COLOURS = {"cpu": "#0072b2", "opengl half": "#d55e00", "opengl single": "#e69f00"}
-_COMPARED = {
-    "splat": "splat: pixels",
-    "gather": "gather: values",
-    "frozen": "frozen (triangles: gathered)",
-}
+_COMPARED = {"splat": "splat: pixels", "gather": "gather: values", "frozen": "frozen (triangles: gathered)"}
 _ORDER = ("project", "frame", "splat", "gather", "backward", "freeze", "frozen splat", "frozen gather")
 
 

@@ -56,10 +56,7 @@ GROUPS: Mapping[str, tuple[str, Mapping[str, str]]] = MappingProxyType(
         ),
         "bench": (
             "Speed against error, measured in one run.",
-            {
-                "raster": "bench.BenchRaster",
-                "query": "bench.BenchQuery",
-            },
+            {"raster": "bench.BenchRaster", "query": "bench.BenchQuery"},
         ),
     }
 )

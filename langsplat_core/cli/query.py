@@ -28,12 +28,7 @@ from langsplat_core.io.shapes import (
     write_meshes,
     write_points,
 )
-from langsplat_core.pipeline.evidence import (
-    draw_evidence,
-    find_evidence,
-    kept_features,
-    kept_photographs,
-)
+from langsplat_core.pipeline.evidence import draw_evidence, find_evidence, kept_features, kept_photographs
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.answers import QueryResult, peak_pixel
 from langsplat_core.query.compose import Number, check_phrase, count_things, joined, run_phrase

@@ -48,8 +48,7 @@ _RULE = re.compile(r"[\s│╰╯├┤]*(─{2,}|-{5,})[\s│╰╯├┤]*")
 
 
 _Flag = Annotated[
-    tyro.conf.FlagCreatePairsOff[bool],
-    tyro.conf.create_mutex_group(required=False, title="how much is said"),
+    tyro.conf.FlagCreatePairsOff[bool], tyro.conf.create_mutex_group(required=False, title="how much is said")
 ]
 
 

@@ -15,13 +15,7 @@ from typing import Any
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.capture import (
-    Capture,
-    Photo,
-    develop,
-    mask_beside,
-    tell_of_lost_points,
-)
+from langsplat_core.datasets.capture import Capture, Photo, develop, mask_beside, tell_of_lost_points
 from langsplat_core.datasets.intrinsics import BrownDistortion, Distortion, FisheyeDistortion, PhotoIntrinsics
 from langsplat_core.errors import FormatError, InputError, printable_line, quoted, shortened
 from langsplat_core.io.hostile import PHOTO_SUFFIXES, PictureError, picture_size, read_json_file

@@ -12,13 +12,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.pipeline.language import Views, kept_mask_weights
-from langsplat_core.pipeline.stages import (
-    ProcessGroup,
-    features_digest,
-    gaussians_digest,
-    kept,
-    stage_key,
-)
+from langsplat_core.pipeline.stages import ProcessGroup, features_digest, gaussians_digest, kept, stage_key
 from langsplat_core.progress import Progress
 from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.scene import Gaussians

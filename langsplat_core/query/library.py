@@ -36,14 +36,7 @@ from langsplat_core.io.hostile import exists, open_for_reading, parse_json
 from langsplat_core.io.language import SUFFIX
 from langsplat_core.io.scenes import companion_path, format_of, load_scene, scene_files
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.answers import (
-    NOTHING,
-    PARTS,
-    Bar,
-    Bars,
-    QueryResult,
-    bars,
-)
+from langsplat_core.query.answers import NOTHING, PARTS, Bar, Bars, QueryResult, bars
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, same_vectors
 from langsplat_core.query.grammar import Named
 from langsplat_core.raster import load_rasterizer

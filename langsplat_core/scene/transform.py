@@ -52,9 +52,7 @@ class Similarity:
     def then(self, other: "Similarity") -> "Similarity":
         """Return this map followed by `other`."""
         return Similarity(
-            other.rotation @ self.rotation,
-            other.points(self.translation[None])[0],
-            self.scale * other.scale,
+            other.rotation @ self.rotation, other.points(self.translation[None])[0], self.scale * other.scale
         )
 
     def inverse(self) -> "Similarity":

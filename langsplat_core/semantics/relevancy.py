@@ -43,11 +43,7 @@ def relevancy(
 
 
 def latent_relevancy(
-    codec: Codec,
-    latents: Array,
-    phrases: Array,
-    canonical: Array,
-    temperature: float = Reading.temperature,
+    codec: Codec, latents: Array, phrases: Array, canonical: Array, temperature: float = Reading.temperature
 ) -> Array:
     """(M, d) latents of any length, (Q, D), (C, D) -> (M, Q) relevancy of what they stand for, exact, in
     bounded memory. A latent without meaning gets relevancy 0."""

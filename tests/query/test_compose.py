@@ -7,16 +7,7 @@ from hypothesis import strategies as st
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import EncoderError, InputError
-from langsplat_core.query.compose import (
-    Body,
-    body,
-    most,
-    run_phrase,
-    separate,
-    stands,
-    upright,
-    viewpoint,
-)
+from langsplat_core.query.compose import Body, body, most, run_phrase, separate, stands, upright, viewpoint
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import (
     MAX_ATOMS,

@@ -54,10 +54,7 @@ class GlRasterizer:
     name = "opengl"
 
     def __init__(
-        self,
-        ctx: moderngl.Context,
-        precision: Literal["half", "single"] = "half",
-        sort: Sort = "auto",
+        self, ctx: moderngl.Context, precision: Literal["half", "single"] = "half", sort: Sort = "auto"
     ) -> None:
         if ctx.version_code < 410:
             raise BackendError(

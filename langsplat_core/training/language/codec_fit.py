@@ -11,13 +11,7 @@ import torch
 from torch import nn
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import (
-    AutoencoderConfig,
-    CodebookConfig,
-    CodecConfig,
-    LinearConfig,
-    check_settings,
-)
+from langsplat_core.config import AutoencoderConfig, CodebookConfig, CodecConfig, LinearConfig, check_settings
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import CANONICAL_PHRASES, AutoencoderCodec, CodebookCodec, Codec, LinearCodec
 from langsplat_core.scene.codec import KINDS, principal_colours

@@ -156,10 +156,7 @@ def lift_latents(
         progress("lifting latents onto the Gaussians", (done + 1) / len(views))
     confidence = total[..., d]
     means = unit(total[..., :d] / np.maximum(confidence, 1e-9)[..., None])
-    return (
-        np.moveaxis(means, 1, 0).astype(np.float32).copy(),
-        confidence.T.astype(np.float32).copy(),
-    )
+    return np.moveaxis(means, 1, 0).astype(np.float32).copy(), confidence.T.astype(np.float32).copy()
 
 
 # Lifting by gradient descent: latents trained through the rasterizer, as the paper does it.
