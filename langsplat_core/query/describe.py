@@ -15,6 +15,7 @@ word of the vocabulary fits.
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import islice
 from typing import get_args
 
 import numpy as np
@@ -393,31 +394,26 @@ class Describer:
                     yield shown(part, own)
 
         def shown(node: int, word: Word | None) -> Outline:
-            within = sorted(below(node, word), key=lambda part: -part.share)
-            return self._outlined(node, word, members[node], float(totals[node]), tuple(within))
+            rows = members[node]
+            weights = np.maximum(self.areas[rows], 1e-300)
+            positions = self.engine.scene.gaussians.means[rows].astype(np.float64)
+            return Outline(
+                node=node,
+                level=int(tree.levels[node]),
+                word=word,
+                count=len(rows),
+                share=float(totals[node]),
+                centre=weights @ positions / weights.sum(),
+                size=2 * oriented_box(positions).half_extents,
+                votes=(int(tree.votes[node, 0]), int(tree.votes[node, 1])),
+                parts=tuple(sorted(below(node, word), key=lambda part: -part.share)),
+            )
 
         return tuple(shown(node, self._name(node, members[node])) for node in parts.get(NO_NODE, []))
 
     def _name(self, node: int, rows: Array) -> Word | None:
         level, weights = int(self.engine.tree.levels[node]), np.maximum(self.areas[rows], 1e-300)
         return likely_name(self._at_level(level, rows, weights, NAMES).words)
-
-    def _outlined(
-        self, node: int, word: Word | None, rows: Array, share: float, parts: tuple[Outline, ...]
-    ) -> Outline:
-        tree, weights = self.engine.tree, np.maximum(self.areas[rows], 1e-300)
-        positions = self.engine.scene.gaussians.means[rows].astype(np.float64)
-        return Outline(
-            node=node,
-            level=int(tree.levels[node]),
-            word=word,
-            count=len(rows),
-            share=share,
-            centre=weights @ positions / weights.sum(),
-            size=2 * oriented_box(positions).half_extents,
-            votes=(int(tree.votes[node, 0]), int(tree.votes[node, 1])),
-            parts=parts,
-        )
 
     def _verified(self, claim: _Claim) -> Entry | None:
         """The claim as an entry under the first of its words that a query finds there, if any."""
@@ -560,13 +556,8 @@ def suggest(engine: QueryEngine, at_most: int = EXAMPLES, progress: Progress = s
     except LangSplatError:  # no encoder here, or one that knows none of the words: the phrasebook is left
         pass
     candidates = tuple(dict.fromkeys((*here, *book)))
-    examples: list[str] = []
-    for phrase in candidates[: TRIES * at_most]:
-        if len(examples) == at_most:
-            break
-        if _is_found(engine, phrase):
-            examples.append(phrase)
-    return Suggestions(tuple(examples), tuple(dict.fromkeys((*candidates, *taught))))
+    found = (phrase for phrase in candidates[: TRIES * at_most] if _is_found(engine, phrase))
+    return Suggestions(tuple(islice(found, at_most)), tuple(dict.fromkeys((*candidates, *taught))))
 
 
 def _is_found(engine: QueryEngine, phrase: str) -> bool:
