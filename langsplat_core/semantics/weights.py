@@ -215,7 +215,7 @@ def _shapes(weights: Weights) -> dict[str, tuple[int, ...]]:
             with safe_open(path, framework="np") as file:
                 found |= {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118
         else:
-            found |= {name: tuple(tensor.shape) for name, tensor in _unpickled(path).items()}
+            found |= {name: tuple(tensor.shape) for name, tensor in unpickled(path).items()}
     return found
 
 
@@ -227,7 +227,7 @@ def _weight_files(folder: Path) -> list[Path]:
     return []
 
 
-def _unpickled(path: Path) -> dict[str, Any]:
+def unpickled(path: Path) -> dict[str, Any]:
     """The tensors of a file of torch, by name, read when they are used where the file allows."""
     import torch
 
@@ -277,7 +277,7 @@ def read_scalar(weights: Weights, name: str) -> float:
                 with safe_open(path, framework="pt") as file:
                     tensor = file.get_tensor(name) if name in file.keys() else None  # noqa: SIM118
             else:
-                tensor = _unpickled(path).get(name)
+                tensor = unpickled(path).get(name)
             value = value if tensor is None else float(tensor)
     return value
 

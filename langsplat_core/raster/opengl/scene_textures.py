@@ -128,10 +128,8 @@ class SortBuffers:
         self.means = ctx.buffer(points)
         self.keys, self.other_keys = (ctx.buffer(reserve=8 * max(n, 1)) for _ in range(2))
         self.other_rows = ctx.buffer(reserve=4 * max(n, 1))
-        self.counts, self.totals = (
-            ctx.buffer(reserve=4 * DIGITS * self.groups),
-            ctx.buffer(reserve=4 * DIGITS),
-        )
+        self.counts = ctx.buffer(reserve=4 * DIGITS * self.groups)
+        self.totals = ctx.buffer(reserve=4 * DIGITS)
         self.command = ctx.buffer(reserve=20)  # moderngl's stride; the last four bytes are not read
 
     def order(self) -> Array:
@@ -141,15 +139,7 @@ class SortBuffers:
 
     def release(self) -> None:
         """Give the device memory back, all but `rows`."""
-        own = (
-            self.means,
-            self.keys,
-            self.other_keys,
-            self.other_rows,
-            self.counts,
-            self.totals,
-            self.command,
-        )
+        own = self.means, self.keys, self.other_keys, self.other_rows, self.counts, self.totals, self.command
         for buffer in own:
             buffer.release()
 
@@ -180,13 +170,8 @@ class DepthSorter:
         for binding, buffer in ((0, b.means), (5, b.counts), (6, b.totals), (7, b.command)):
             buffer.bind_to_storage_buffer(binding)
         self._bind(b.keys, b.rows, b.other_keys, b.other_rows)
-        values: dict[str, object] = {
-            "plane": tuple(plane),
-            "near": near,
-            "far": far,
-            "items": b.count,
-            "groups": b.groups,
-        }
+        values: dict[str, object] = {"plane": tuple(plane), "near": near, "far": far}
+        values |= {"items": b.count, "groups": b.groups}
         self._run("keys", max(-(-b.count // GROUP), 1), values)
         here, there = (b.keys, b.rows), (b.other_keys, b.other_rows)
         for shift in range(0, KEY_BITS, DIGIT_BITS):  # an even number of passes: they end in `rows`
