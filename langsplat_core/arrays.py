@@ -73,6 +73,11 @@ def unit(vectors: Array, epsilon: float = 1e-6) -> Array:
     return vectors / np.maximum(length, epsilon)
 
 
+def across(direction: Array) -> Array:
+    """(3,) -> (3,) a direction at a right angle to it, of any length but zero."""
+    return np.cross(direction, np.eye(3)[int(np.argmin(np.abs(direction)))])
+
+
 def mean_squared_error(a: Array, b: Array) -> float:
     """Return the mean squared difference of two arrays of one shape."""
     return float(np.mean((a.astype(np.float64) - b) ** 2))

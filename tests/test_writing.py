@@ -19,9 +19,15 @@ import pytest
 from langsplat_core.cli.bench import write_report
 from langsplat_core.cli.run import main
 from langsplat_core.errors import InputError
-from langsplat_core.evaluation.report import write_json
 from langsplat_core.io.cameras import write_cameras
-from langsplat_core.io.files import atomic_path, check_output_file, check_output_folder, name_max, shown
+from langsplat_core.io.files import (
+    atomic_path,
+    check_output_file,
+    check_output_folder,
+    name_max,
+    shown,
+    write_json,
+)
 from langsplat_core.io.langsplat_files import write_autoencoder, write_checkpoint, write_features
 from langsplat_core.io.language import write_language
 from langsplat_core.io.ply import write_ply

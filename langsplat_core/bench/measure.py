@@ -105,7 +105,7 @@ class Error:
 
 @dataclass(frozen=True)
 class Operation:
-    """Something a backend can do with a view."""
+    """An operation of a backend on a view, to be timed."""
 
     name: str
     call: Callable[[], Any]
@@ -120,7 +120,7 @@ class Foresight:
         self._rates: dict[tuple[str, str, int], float] = {}  # seconds per overlap
 
     def expected(self, key: tuple[str, str, int], overlaps: int) -> float:
-        """Seconds; 0 where nothing like it ran before."""
+        """Expected seconds; 0 where nothing like it ran before."""
         return self._rates.get(key, 0.0) * overlaps
 
     def learn(self, key: tuple[str, str, int], overlaps: int, seconds: float) -> None:
@@ -144,7 +144,7 @@ def warm_up(backends: Sequence[Rasterizer], channels: Sequence[int]) -> None:
 def measure(
     backend: Rasterizer, case: Case, channels: int, exact: "ReferenceWindows", foresight: Foresight
 ) -> Iterator[Measurement]:
-    """Every operation of `backend` on one case."""
+    """Time every operation of `backend` on one case."""
     drawn = exact.footprints.opacities > 0
     overlaps = int(np.prod(2 * exact.footprints.extents_px / 16 + 1, axis=1)[drawn].sum())
     camera, backend_name = case.camera, label(backend)
@@ -171,7 +171,7 @@ def measure(
 def operations(
     backend: Rasterizer, case: Case, channels: int, exact: "ReferenceWindows | None"
 ) -> Iterator[Operation]:
-    """Everything that `backend` can do; nothing is compared without `exact`."""
+    """The operations that `backend` has; without `exact` their errors are not measured."""
     values, image = _inputs(case, channels)
     cameras = _two_cameras(case.camera)
     turn = iter(range(sys.maxsize))
@@ -198,7 +198,7 @@ def operations(
 def _linear(
     view: Any, values: Array, image: Array, exact: "ReferenceWindows | None", prefix: str
 ) -> Iterator[Operation]:
-    """`splat` and, where there is one, `gather`."""
+    """The operation `splat` and, where the view has it, `gather`."""
     splat_error = None if exact is None else lambda: exact.splat_error(view.splat(values)[0], values)
     yield Operation(f"{prefix}splat", lambda: view.splat(values), splat_error)
     if hasattr(view, "gather"):
@@ -214,7 +214,7 @@ def _linear(
 
 
 def _labels(view: LiftingView, camera: Camera, exact: "ReferenceWindows | None") -> Operation:
-    """Label maps of three levels (`GRIDS`), as many regions as a segmenter finds."""
+    """Gathering of label maps of three levels (`GRIDS`), with as many regions as a segmenter finds."""
     maps, count = label_maps(camera)
 
     def error() -> Error:

@@ -71,7 +71,7 @@ class QueryReport:
 
 @dataclass(frozen=True, eq=False)
 class _Asked:
-    """Phrases, and the codewords that they should find."""
+    """Phrases, and the codewords of the scene that they are compared with."""
 
     texts: Sequence[str]
     vectors: Array  # (Q, D)
@@ -131,7 +131,7 @@ def with_codec(field: LanguageField, codec: Codec) -> LanguageField:
 
 
 def _batched(engine: QueryEngine, texts: Sequence[str], progress: Progress) -> tuple[float, float]:
-    """Seconds per phrase, asked one by one and all at once, each encoded anew."""
+    """Seconds per phrase, encoding included, when asked one by one and all at once."""
     engine.run_many(texts[:2])
     progress("asking one by one and all at once", 0.1)
     alone = _seconds(lambda: [engine.run(text) for text in texts])
@@ -139,7 +139,7 @@ def _batched(engine: QueryEngine, texts: Sequence[str], progress: Progress) -> t
 
 
 def _paper(scene: Scene, field: LanguageField, camera: Camera, asked: _Asked) -> QueryCost:
-    """Decoding is measured once: it takes a minute and more."""
+    """Costs of the paper's order of work. Decoding is measured once: it takes a minute and more."""
     rasterizer = CpuRasterizer()
     rasterizer.view(scene.gaussians, camera, scene.raster_settings()).splat(field.latents[0])
     views: list[View] = []

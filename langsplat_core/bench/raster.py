@@ -54,7 +54,7 @@ _NOTES = """- The size with most scenes and the most channels; every other measu
 
 
 def quick_plan(plan: RasterBenchConfig) -> RasterBenchConfig:
-    """About a minute on two cores."""
+    """A smaller plan, which takes about a minute on two cores."""
     return replace(
         plan,
         counts=(3_000, 10_000, 31_000),
@@ -66,7 +66,7 @@ def quick_plan(plan: RasterBenchConfig) -> RasterBenchConfig:
 
 @dataclass(frozen=True)
 class Ratio:
-    """A ratio that the project promises, and what was measured."""
+    """A ratio that the project promises, and its measured value."""
 
     text: str
     ratio: float | None  # None: not measured in this run
@@ -76,7 +76,7 @@ class Ratio:
 
 @dataclass(frozen=True)
 class Report:
-    """Everything one run found."""
+    """Results of one run of the benchmark."""
 
     machine: dict[str, object]
     rows: list[Measurement]
@@ -210,7 +210,7 @@ def ratios(rows: Sequence[Measurement]) -> list[Ratio]:
 
 
 def table(rows: Sequence[Measurement]) -> str:
-    """The measurements as Markdown."""
+    """The measurements as a Markdown table."""
     head = ("scene", "Gaussians", "size", "channels", "operation", "backend", "ms", "MiB")
     return markdown(
         (*head, "error off cut-offs", "largest error", "flips"),
@@ -224,13 +224,13 @@ def table(rows: Sequence[Measurement]) -> str:
 
 
 def _selection(rows: Sequence[Measurement]) -> list[Measurement]:
-    """The rows of the size with most scenes and the most channels."""
+    """The rows of the most measured image size, with the most channels."""
     size, channels = _busiest(rows), max((r.channels for r in rows), default=0)
     return [r for r in rows if (r.width, r.height) == size and r.channels == channels]
 
 
 def ratio_table(found: Sequence[Ratio]) -> str:
-    """Promised ratios as Markdown."""
+    """The promised ratios as a Markdown table."""
     words = {None: "not measured", True: "yes", False: "NO"}
     rows = ((r.text, _cell(r.ratio, ".2f"), r.target, words[r.met]) for r in found)
     return markdown(("ratio", "measured", "target", "met"), rows)
@@ -241,11 +241,7 @@ def _cell(value: float | None, form: str) -> str:
 
 
 _COLOURS = {"cpu": "#0072b2", "opengl half": "#d55e00", "opengl single": "#e69f00"}
-_COMPARED = {
-    "splat": "splat: pixels",
-    "gather": "gather: values",
-    "frozen": "frozen (triangles: gathered)",
-}
+_COMPARED = {"splat": "splat: pixels", "gather": "gather: values", "frozen": "frozen (triangles: gathered)"}
 _ORDER = ("project", "frame", "splat", "gather", "backward", "freeze", "frozen splat", "frozen gather")
 
 
@@ -297,7 +293,7 @@ def _times(panel: Any, rows: Sequence[Measurement], colours: dict[str, str], sty
 
 
 def _errors(panel: Any, kind: str, rows: Sequence[Measurement], colours: dict[str, str]) -> None:
-    """Error away from cut-offs over the time it took; triangles are gathers."""
+    """Plot the error away from cut-offs over time; triangles are gathers."""
     chosen = [r for r in rows if r.operation.startswith(kind) and r.error_off_cuts is not None]
     errors = [max(r.error_off_cuts or 0, 1e-9) for r in chosen]
     times = [r.milliseconds or 1 for r in chosen]
@@ -309,7 +305,7 @@ def _errors(panel: Any, kind: str, rows: Sequence[Measurement], colours: dict[st
 
 
 def _log_axes(panel: Any, x: Sequence[float], y: Sequence[float]) -> None:
-    """Logarithmic from one power of ten to another, labelled at powers of ten alone."""
+    """Make both axes logarithmic, between powers of ten that alone are labelled."""
     from matplotlib.ticker import NullFormatter
 
     panel.set(xscale="log", yscale="log")
@@ -322,7 +318,7 @@ def _log_axes(panel: Any, x: Sequence[float], y: Sequence[float]) -> None:
 
 
 def _busiest(rows: Sequence[Measurement]) -> tuple[int, int] | None:
-    """The size that was measured with most numbers of Gaussians."""
+    """The image size that was measured with the most numbers of Gaussians."""
     counts: dict[tuple[int, int], set[int]] = {}
     for r in rows:
         counts.setdefault((r.width, r.height), set()).add(r.gaussians)

@@ -56,10 +56,7 @@ GROUPS: Mapping[str, tuple[str, Mapping[str, str]]] = MappingProxyType(
         ),
         "bench": (
             "Speed against error, measured in one run.",
-            {
-                "raster": "bench.BenchRaster",
-                "query": "bench.BenchQuery",
-            },
+            {"raster": "bench.BenchRaster", "query": "bench.BenchQuery"},
         ),
     }
 )
@@ -110,7 +107,7 @@ def _group(name: str, words: Sequence[str]) -> Any:
 
 
 def _union(commands: Sequence[Any]) -> Any:
-    """tyro asks for two subcommands at least."""
+    """The union of commands; tyro asks for two subcommands at least."""
     return Union[(*commands, Annotated[None, tyro.conf.Suppress])]
 
 
@@ -132,6 +129,6 @@ def check_commands(args: Sequence[str]) -> None:
 
 
 def entry() -> None:
-    """The `langsplat` console script."""
+    """Run the `langsplat` console script."""
     args = sys.argv[1:] or ["--help"]
     sys.exit(main("langsplat", lambda: parse(args)))

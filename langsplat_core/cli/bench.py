@@ -11,11 +11,9 @@ import tyro
 
 from langsplat_core.bench import QueryBenchConfig, RasterBenchConfig
 from langsplat_core.cli.run import OutFolder
-from langsplat_core.errors import InputError
+from langsplat_core.cli.teach import searchable
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import TerminalProgress
-from langsplat_core.query.engine import no_field
 from langsplat_core.semantics.encoders import load_text_encoder
 
 
@@ -54,9 +52,8 @@ class BenchQuery:
     """Folder for query.md and query.json."""
 
     def run(self) -> None:
-        scene = load_scene(self.scene)
-        if scene.language is None:
-            raise InputError(f"{self.scene}: {no_field(scene)}")
+        scene = searchable(self.scene)
+        assert scene.language is not None
         from langsplat_core.bench.query import measure_queries, query_table
 
         encoder = load_text_encoder(scene.language.encoder_id)

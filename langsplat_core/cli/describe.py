@@ -82,7 +82,7 @@ class Describe:
             print_json(answer | basis_fields(engine))
             return
         if self.outline:
-            print(*outline_lines(answer["outline"], unit_of(scene, None)), sep="\n")
+            print(*outline_lines(answer["outline"], unit_of(scene)), sep="\n")
         elif self._everything:
             _print_inventory(answer["inventory"])
         else:
@@ -101,7 +101,7 @@ class Describe:
 
     @property
     def _asked_of(self) -> list[str]:
-        """The options that name a place."""
+        """The options given that name a place."""
         given = {"--pixel": self.pixel, "--gaussian": self.gaussian, "--phrase": self.phrase}
         return [option for option, value in given.items() if value is not None]
 

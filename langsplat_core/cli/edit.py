@@ -59,7 +59,8 @@ class Transform:
     """World units."""
 
     def run(self) -> None:
-        _check(self.scene, self.out)
+        check_writable(self.out)
+        check_keeps(self.out, self.scene)
         scene = load_scene(self.scene)
         to = self._similarity(scene)
         save_scene(self.out, replace(transform_scene(scene, to), path=self.out))
@@ -94,7 +95,8 @@ class Crop:
     """Keep what lies outside of them together instead."""
 
     def run(self) -> None:
-        _check(self.scene, self.out)
+        check_writable(self.out)
+        check_keeps(self.out, self.scene)
         if not (self.box or self.sphere or self.plane):
             raise InputError("nothing to crop to: give --box, --sphere or --plane")
         scene = load_scene(self.scene)
@@ -105,7 +107,7 @@ class Crop:
         print(f"{self.out}: {keep.sum()} of {len(keep)} Gaussians")
 
     def inside(self, means: Array) -> Array:
-        """(N, 3) -> (N,) bool: in all of the shapes."""
+        """(N, 3) positions -> (N,) bool, whether each is in all of the shapes."""
         inside = np.ones(len(means), bool)
         for numbers in self.box:
             corners = np.array(numbers).reshape(2, 3)
@@ -163,14 +165,8 @@ def _lines(report: CleanReport) -> list[str]:
     return lines
 
 
-def _check(scene: Path, out: Path) -> None:
-    """InputError for what needs no scene to be known: it should not cost the loading of one."""
-    check_writable(out)
-    check_keeps(out, scene)
-
-
 def _extent(scene: Scene) -> str:
-    """Where the Gaussians of a scene are, in words."""
+    """The extent of a scene's Gaussians, in words."""
     means = scene.gaussians.means[np.isfinite(scene.gaussians.means).all(1)]
     if not len(means):
         return "the scene holds none that lies anywhere"

@@ -70,15 +70,16 @@ class _EvalLabels(_Eval):
         return self.out, self.paths[0]
 
     def evaluate(self, benchmark: "Benchmark", profile: Profile) -> None:
-        """Train where that is asked for, score, print the tables, write what was asked for."""
+        """Train the scenes with --train, score them, print the tables and write the files asked for."""
         from langsplat_core.evaluation.report import beside_published, save_json, table
         from langsplat_core.evaluation.run import Subject, run_benchmark
         from langsplat_core.semantics.encoders import load_text_encoder
 
         failed = self._train(benchmark) if self.train else {}
         left = [name for name in self.only or benchmark.scenes if name not in failed]
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in failed.items())
         if failed and not left:
-            raise InputError("; ".join(f"{name}: {reason}" for name, reason in failed.items()))
+            raise InputError(reasons)
         only = tuple(left) if failed else self.only
         subject = Subject(self.scene_and_data()[0], self.maps, self.encoder, self.paper_order)
         with TerminalProgress() as progress:
@@ -92,11 +93,10 @@ class _EvalLabels(_Eval):
         if self.json is not None:
             save_json(self.json, report)
         if failed:
-            reasons = "; ".join(f"{name}: {reason}" for name, reason in failed.items())
             raise InputError(f"not trained, and not in the table: {reasons}")
 
     def _train(self, benchmark: "Benchmark") -> dict[str, str]:
-        """Train the scenes that --out lacks; which could not be, and why."""
+        """Train the scenes that --out lacks; names of those that could not be trained -> the reason."""
         from langsplat_core.pipeline.train import train_scene
 
         config = with_preset(TrainConfig(clip=self.clip, masks=self.masks), self.preset)

@@ -97,12 +97,8 @@ def _said(hit: Hit) -> str:
 def _place(hit: Hit) -> str:
     if hit.answer is None or hit.answer.place is None:
         return "place not looked for" if hit.answer is None else "place -"
-    unit = _unit(hit)
+    unit = unit_of(hit)
     return f"place {unit.format(hit.answer.place)} {unit.name}"
-
-
-def _unit(hit: Hit) -> Unit:
-    return Unit("units", 1.0) if hit.metres_per_unit is None else Unit("m", hit.metres_per_unit)
 
 
 def _name(hit: Hit, library: Library) -> str:

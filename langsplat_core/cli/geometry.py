@@ -1,6 +1,5 @@
 """`langsplat mesh`, `register` and `merge`: surfaces as triangles, and two scenes of one place."""
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,7 +13,7 @@ from langsplat_core.config import Count, LevelChoice, Positive
 from langsplat_core.errors import InputError, optional_imports
 from langsplat_core.geometry.merge import merge
 from langsplat_core.io.cameras import numbers
-from langsplat_core.io.files import atomic_path
+from langsplat_core.io.files import write_json
 from langsplat_core.io.hostile import read_json_file
 from langsplat_core.io.scenes import check_keeps, check_writable, load_scene, save_scene
 from langsplat_core.io.shapes import MESH_SUFFIXES, check_suffix, gltf_axes, write_meshes
@@ -100,8 +99,7 @@ class Register:
         with TerminalProgress() as progress:
             found = registered(load_scene(self.moving), load_scene(self.fixed), self.scaled, progress)
         if self.out is not None:
-            with atomic_path(self.out) as temporary:
-                temporary.write_text(json.dumps({"matrix": found.transform.tolist()}, indent=1) + "\n")
+            write_json(self.out, {"matrix": found.transform.tolist()})
         rows = "; ".join(" ".join(f"{number:.9g}" for number in row) for row in found.transform)
         print(
             f"{100 * found.agreement:.0f} % of the surfaces agree, {found.rmse:.3g} units apart; scale "
@@ -163,7 +161,7 @@ def registered(moving: Scene, fixed: Scene, scaled: bool, progress: Progress) ->
 
 
 def read_transform(path: Path) -> Similarity:
-    """What a file of `langsplat register` holds. Raises InputError and FormatError, with the file's name."""
+    """The similarity in a file of `langsplat register`; InputError and FormatError name the file."""
     entry = read_json_file(path, TRANSFORM_LIMIT)
     matrix = numbers(entry if isinstance(entry, dict) else {}, "matrix", (4, 4), str(path))
     try:

@@ -28,16 +28,12 @@ from langsplat_core.io.shapes import (
     write_meshes,
     write_points,
 )
-from langsplat_core.pipeline.evidence import (
-    draw_evidence,
-    find_evidence,
-    kept_features,
-    kept_photographs,
-)
+from langsplat_core.pipeline.evidence import draw_evidence, find_evidence, kept_features, kept_photographs
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.answers import QueryResult, peak_pixel
 from langsplat_core.query.compose import Number, check_phrase, count_things, joined, run_phrase
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder
+from langsplat_core.query.finding import Hit
 from langsplat_core.query.grammar import Atom, Counted, Phrase, heads, unparse
 from langsplat_core.query.instances import Instance, hull
 from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
@@ -372,7 +368,7 @@ class Select:
         return selected
 
     def _write(self, engine: QueryEngine, answer: QueryResult) -> int:
-        """Number of Gaussians, points or meshes that were written."""
+        """Write the file; return the number of Gaussians, points or meshes in it."""
         scene, rows = engine.scene, np.flatnonzero(~answer.members if self.remove else answer.members)
         if self.shape == "points":
             relevancy = answer.relevancy[answer.level][rows]
@@ -421,16 +417,16 @@ class Unit:
 
     @property
     def metres(self) -> float | None:
-        """Metres per world unit, where they are known."""
+        """Metres per world unit; None where nobody said."""
         return self.length if self.name == "m" else None
 
     def format(self, values: Array, between: str = " ") -> str:
-        """World units as text, in this unit, without it."""
+        """Lengths in world units as numbers of this unit, joined by `between`."""
         return between.join(f"{self.length * value:.3f}" for value in values)
 
 
-def unit_of(scene: Scene, metres_per_unit: float | None = None) -> Unit:
-    """Metres by `metres_per_unit`, else by the scene's own, else world units."""
+def unit_of(scene: Scene | Hit, metres_per_unit: float | None = None) -> Unit:
+    """The unit of lengths in a scene: metres by `metres_per_unit` or the scene's own, else world units."""
     metres = metres_per_unit or scene.metres_per_unit
     return Unit("units", 1.0) if metres is None else Unit("m", metres)
 

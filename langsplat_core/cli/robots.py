@@ -3,7 +3,7 @@
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import tyro
@@ -26,6 +26,7 @@ from langsplat_core.geometry.occupancy import (
 )
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.scenes import load_scene
+from langsplat_core.io.shapes import RGB
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.describe import Describer
@@ -125,13 +126,14 @@ class Map:
             pose = f"x {goal.x:.2f} y {goal.y:.2f} m, yaw {goal.yaw:.2f}"
             print(f"{phrase}: {pose}, {goal.distance:.2f} m from it")
         if self.goal:
-            _write_json(self.out / "goals.json", answers)
+            with atomic_path(self.out / "goals.json") as path:
+                path.write_text(json.dumps(answers, indent=2) + "\n", encoding="utf-8")
         if missing:
             raise InputError(f"no goal for {'; '.join(missing)}")
 
 
 def write_grid(folder: Path, plan: FloorMap) -> None:
-    """`map.pgm`, whose first row has the largest y, and `map.yaml`."""
+    """Write `map.pgm`, whose first row has the largest y, and `map.yaml`."""
     grey = np.where(plan.occupied, OCCUPIED, np.where(plan.free, FREE, UNKNOWN)).astype(np.uint8)
     with atomic_path(folder / "map.pgm") as path:
         Image.fromarray(np.ascontiguousarray(grey.T[::-1])).save(path, "PPM")
@@ -144,7 +146,7 @@ def write_grid(folder: Path, plan: FloorMap) -> None:
 
 
 def write_collider(path: Path, occupancy: Occupancy) -> None:
-    """Everything that is occupied as squares, Wavefront OBJ, metres."""
+    """Write everything that is occupied as squares, a Wavefront OBJ in metres."""
     corners, squares = collider(occupancy)
     with atomic_path(path) as temporary, temporary.open("w", encoding="ascii") as file:
         np.savetxt(file, corners, "v %.4f %.4f %.4f")
@@ -154,7 +156,8 @@ def write_collider(path: Path, occupancy: Occupancy) -> None:
 def write_voxels(
     folder: Path, occupancy: Occupancy, scene: Scene, engine: QueryEngine | None, progress: Progress
 ) -> None:
-    """The occupied voxels with their whole of the scene's tree and its word: `voxels.npz`, `voxels.ply`."""
+    """Write the occupied voxels with the whole of the scene's tree that each is in, and its word, as
+    `voxels.npz` and `voxels.ply`."""
     cells = np.argwhere(occupancy.occupied)
     nodes, words = np.full(len(cells), NO_NODE), {}
     if engine is not None:
@@ -176,19 +179,15 @@ def write_voxels(
 
     centres = occupancy.origin + (cells + 0.5) * occupancy.resolution
     colours = np.random.default_rng(0).integers(40, 256, (int(nodes.max(initial=0)) + 2, 3))
-    table = np.zeros(
-        len(cells), [(axis, "f4") for axis in "xyz"] + [("node", "i4")] + [(c, "u1") for c in COLOURS]
-    )
+    columns = [(axis, "f4") for axis in "xyz"] + [("node", "i4")] + [(name, "u1") for name in RGB]
+    table = np.zeros(len(cells), columns)
     for axis, values in zip("xyz", centres.T, strict=True):
         table[axis] = values
     table["node"] = nodes
-    for name, values in zip(COLOURS, colours[nodes].T, strict=True):
+    for name, values in zip(RGB, colours[nodes].T, strict=True):
         table[name] = values
     with atomic_path(folder / "voxels.ply") as path:
         PlyData([PlyElement.describe(table, "vertex")]).write(path)
-
-
-COLOURS = ("red", "green", "blue")
 
 
 def _nodes(occupancy: Occupancy, scene: Scene, engine: QueryEngine, cells: Array) -> Array:
@@ -203,8 +202,3 @@ def _nodes(occupancy: Occupancy, scene: Scene, engine: QueryEngine, cells: Array
     centres = occupancy.origin + (cells + 0.5) * occupancy.resolution
     gaps, nearest = cKDTree(means).query(centres, distance_upper_bound=4 * occupancy.resolution, workers=-1)
     return np.append(whole[rows], NO_NODE)[np.where(np.isfinite(gaps), nearest, len(rows))]
-
-
-def _write_json(path: Path, answers: list[dict[str, Any]]) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(answers, indent=2) + "\n", encoding="utf-8")

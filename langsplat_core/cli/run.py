@@ -48,8 +48,7 @@ _RULE = re.compile(r"[\s│╰╯├┤]*(─{2,}|-{5,})[\s│╰╯├┤]*")
 
 
 _Flag = Annotated[
-    tyro.conf.FlagCreatePairsOff[bool],
-    tyro.conf.create_mutex_group(required=False, title="how much is said"),
+    tyro.conf.FlagCreatePairsOff[bool], tyro.conf.create_mutex_group(required=False, title="how much is said")
 ]
 
 
@@ -76,10 +75,10 @@ class _OneLine(logging.Formatter):
 
 
 class Command(Protocol):
-    """Parsed arguments that know what to do."""
+    """Parsed arguments of a command, with the work that they ask for."""
 
     def run(self) -> None:
-        """Do it; raise LangSplatError for what a user can mend."""
+        """Do the work; raise LangSplatError for what a user can mend."""
 
 
 def named(args: Sequence[str], option: str) -> str:
@@ -247,7 +246,7 @@ class _StandardError(io.FileIO):
     """Standard error. What it does not take is lost, and the work goes on."""
 
     def write(self, data: Any) -> int:
-        """Number of bytes written, or lost."""
+        """Write `data`, or lose it; return its number of bytes."""
         try:
             return super().write(data)
         except OSError:
@@ -271,7 +270,7 @@ def _prepare_standard_streams() -> None:
 
 
 def _occupy(descriptor: int, flags: int) -> None:
-    """Have a closed standard stream lead nowhere."""
+    """Open the null device as a standard stream that is closed."""
     nowhere = os.open(os.devnull, flags)
     if nowhere != descriptor:
         os.dup2(nowhere, descriptor)
@@ -279,7 +278,7 @@ def _occupy(descriptor: int, flags: int) -> None:
 
 
 def _drop_standard_output() -> None:
-    """Nothing more is written, also not what is buffered when the process ends."""
+    """Send all further output to the null device, also what is buffered when the process ends."""
     with contextlib.suppress(OSError):  # a standard output that is no file
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 

@@ -17,6 +17,7 @@ from rich.text import Text
 
 from langsplat_core import __version__
 from langsplat_core.cli.run import OutFile, OutputConsole
+from langsplat_core.cli.teach import Level
 from langsplat_core.config import CodebookConfig, CodecConfig, CompactConfig, Positive, Range
 from langsplat_core.errors import EXTRAS, BackendError, InputError, LangSplatError, remedy
 from langsplat_core.io.files import check_output_folder
@@ -169,7 +170,6 @@ def _version(package: str) -> str:
 
 CHECKPOINTS = (".pth", ".pt", ".ckpt", ".npz", ".npy", ".faiss")  # no scene has such a name
 Target = Literal["scene", "langsplat", "occam", "features"]
-LevelName = Literal["subpart", "part", "whole"]
 
 
 @dataclass(frozen=True)
@@ -195,7 +195,7 @@ class Convert:
     encoder: str | None = None
     """Text encoder of the checkpoints' vectors: hub id, folder or "demo" (default: LangSplat's OpenCLIP,
     laion/CLIP-ViT-B-16-laion2B-s34B-b88K). With a single .ply: its semantic_* are read."""
-    levels: tuple[LevelName, ...] = ()
+    levels: tuple[Level, ...] = ()
     """Levels of the checkpoints with features, in their order, where files and folders do not tell."""
     phrases: tuple[str, ...] = ()
     """Stored encoded in a scene made of checkpoints: they can be asked without any encoder."""
@@ -204,12 +204,12 @@ class Convert:
 
     @property
     def sources(self) -> tuple[Path, ...]:
-        """Files that are read."""
+        """The files that are read."""
         return (self.source, *self.rest[:-1])
 
     @property
     def out(self) -> Path:
-        """File or folder that is written."""
+        """The file or folder that is written."""
         return self.rest[-1]
 
     def run(self) -> None:

@@ -143,9 +143,7 @@ class Door:
             view = towards(scene_of, self._found(engine, phrase))
         else:
             view = camera_of(scene_of, camera) if scene_of.cameras else scene_of.framing_camera(SIZE)
-        scale = min(MOST_SIDE / max(view.width, view.height), 1.0)
-        view = view.resized(max(round(scale * view.width), 1), max(round(scale * view.height), 1))
-        colours = render(scene_of, view).colours
+        colours = render(scene_of, view.within(MOST_SIDE)).colours
         return np.round(255 * np.clip(colours, 0, 1)).astype(np.uint8)
 
     def _engine(self, name: str) -> QueryEngine:

@@ -55,7 +55,7 @@ RESOLUTION = 96  # groups are halved down to this fraction of the floaters
 
 @dataclass(frozen=True, eq=False)
 class Floaters:
-    """What is suspected in a scene of N Gaussians."""
+    """Suspected floaters among N Gaussians."""
 
     suspicion: Array  # (N,) int8 0: none, up to 3
     region: Array  # (N,) bool: of a small region; the other suspects hang in free space
@@ -154,7 +154,7 @@ class CleanReport:
 
     @property
     def removed(self) -> int:
-        """Gaussians that went."""
+        """Number of Gaussians that were removed."""
         return self.invalid + self.regions + self.free_space
 
 
@@ -210,7 +210,7 @@ class _Trial:
         self.keep = np.ones(len(self.scene.gaussians), bool)
 
     def losses(self) -> Array:
-        """(V,) dB, as it is now."""
+        """(V,) dB that the measuring views lose with what is removed so far."""
         return psnr_losses(self.scene.take(self.keep), self.measured, self.config.assumed_psnr)
 
 

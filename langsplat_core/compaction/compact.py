@@ -72,7 +72,7 @@ def choose_views(scene: Scene, photos: Path | None, config: BudgetConfig, progre
     else:
         cameras = ring_cameras(scene, min(config.views, 48))
         origin = "a ring around the scene (it has no cameras): what lies inside may be judged invisible"
-    cameras = [_limited(camera, config.max_side) for camera in cameras]
+    cameras = [camera.within(config.max_side) for camera in cameras]
     held = _every(len(cameras))
     return Views(
         tuple(camera for i, camera in enumerate(cameras) if i not in held),
@@ -156,13 +156,6 @@ def _every(count: int) -> set[int]:
     return set(range(step // 2, count, step))
 
 
-def _limited(camera: Camera, max_side: int) -> Camera:
-    factor = max_side / max(camera.width, camera.height)
-    if factor >= 1:
-        return camera
-    return camera.resized(max(round(camera.width * factor), 1), max(round(camera.height * factor), 1))
-
-
 # What each Gaussian contributes to the images of a scene, and what images lose without some of them.
 #
 # **Contribution.** In a view with blending weights w (a row of W per pixel p), taking Gaussian i of colour
@@ -194,7 +187,7 @@ ALONE = 0.055  # display values, RGB distance; see above
 
 @dataclass(frozen=True, eq=False)
 class MeasuringView:
-    """One view on which the loss is measured."""
+    """A view on which the loss is measured, with its images."""
 
     camera: Camera
     original: Array  # (H, W, 3) float32 in [0, 1], the image of the original scene
@@ -244,8 +237,7 @@ def psnr_losses(scene: Scene, views: Sequence[MeasuringView], assumed_psnr: floa
     for view in views:
         image = draw(scene, view.camera)
         if view.photograph is None:
-            change = mean_squared_error(image, view.original)
-            losses.append(estimated_loss(change, assumed_psnr))
+            losses.append(estimated_loss(mean_squared_error(image, view.original), assumed_psnr))
         else:
             losses.append(psnr(view.original, view.photograph) - psnr(image, view.photograph))
     return np.array(losses)
@@ -270,7 +262,7 @@ UNLIKE = 10.0  # dB: a scene that is this far from the photographs does not show
 
 @dataclass(frozen=True)
 class Weight:
-    """Costs and worth of a scene."""
+    """Size of a scene in bytes, and its quality in decibels."""
 
     gaussians: int
     sh_degree: int
@@ -326,7 +318,7 @@ class Choice:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """Part of a scene of N Gaussians that stays."""
+    """The part of a scene of N Gaussians that stays."""
 
     keep: Array  # (N,) bool
     sh_degree: int
@@ -402,7 +394,7 @@ PHRASES = 8  # at most, of the phrasebook, asked before and after
 
 @dataclass(frozen=True)
 class AnswerChange:
-    """One phrase, asked before and after."""
+    """How the answer to one phrase changed."""
 
     phrase: str
     same: bool  # found or not, and the level, as before

@@ -120,7 +120,7 @@ def read_photo(path: Path, upright: bool) -> Image.Image:
 
 
 def upright_copy(picture: Image.Image) -> Image.Image:
-    """Turned as the EXIF data ask; unreadable EXIF data count as none."""
+    """A copy of an image, turned as its EXIF data ask; unreadable EXIF data count as none."""
     picture.load()  # so that nothing but the EXIF data can fail below
     try:
         return ImageOps.exif_transpose(picture)
@@ -129,7 +129,7 @@ def upright_copy(picture: Image.Image) -> Image.Image:
 
 
 def _read_for(photo: Photo) -> tuple[Image.Image, PhotoIntrinsics]:
-    """The image, and the photo's lens on its pixel grid.
+    """Read a photograph, and return its intrinsics on the pixel grid of the file.
 
     COLMAP reads pixels as stored, other tools turn them first; when the stored shape does not fit the
     lens but the turned one does, the latter is meant.
@@ -346,7 +346,7 @@ def shrunk_view(
 
 
 def _rounded(values: Array) -> Array:
-    """To `DECIMALS`, float64, without a negative zero."""
+    """Values rounded to `DECIMALS`, float64, without a negative zero."""
     rounded: Array = np.round(values.astype(np.float64), DECIMALS) + 0.0
     return rounded
 
@@ -429,6 +429,6 @@ def _place(exif: Exif) -> tuple[float, float]:
 
 
 def _degrees(parts: tuple[float, float, float]) -> float:
-    """Degrees of degrees, minutes and seconds."""
+    """Degrees, minutes and seconds as degrees."""
     degrees, minutes, seconds = map(float, parts)
     return degrees + minutes / 60 + seconds / 3600

@@ -226,7 +226,7 @@ def _lines(data: bytes) -> list[str]:
 
 
 def _whole(text: str) -> int:
-    """Python's own numbers have no limit, and no place in a message then."""
+    """Parse a whole number of at most `MOST_DIGITS` digits; longer ones have no place in a message."""
     if len(text) > MOST_DIGITS:
         raise ValueError(f"a whole number of {len(text)} digits")
     return whole_number(text)
@@ -306,7 +306,7 @@ def find_model(folder: Path) -> Path | None:
 
 
 def _photographs_of(model_folder: Path) -> int:
-    """Count the photographs that a model has cameras for; 0 if it is damaged."""
+    """Number of photographs with a camera in a model; 0 if it is damaged."""
     try:
         return len({image.name for image in read_images(model_folder)})
     except FormatError:
@@ -314,7 +314,7 @@ def _photographs_of(model_folder: Path) -> int:
 
 
 def intrinsics_of(camera: ModelCamera) -> PhotoIntrinsics:
-    """The lens of a COLMAP camera; ValueError if its focal length is impossible."""
+    """Intrinsics of a COLMAP camera; ValueError if its focal length is impossible."""
     named = camera.named()
     fx, fy, cx, cy = (named[key] for key in _INTRINSICS)
     rest = {key: value for key, value in named.items() if key not in _INTRINSICS}

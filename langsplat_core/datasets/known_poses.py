@@ -154,15 +154,11 @@ def _write_pictures(
     return tuple(cameras)
 
 
-def _params(camera: Camera) -> str:
-    """Intrinsics as COLMAP's PINHOLE takes them."""
-    return ",".join(repr(float(value)) for value in (camera.fx, camera.fy, camera.cx, camera.cy))
-
-
 def _groups(names: list[str], cameras: tuple[Camera, ...]) -> list[sfm.Group]:
     members: dict[tuple[str, int], list[str]] = {}
     for name, camera in zip(names, cameras, strict=True):
-        members.setdefault((_params(camera), max(camera.width, camera.height)), []).append(name)
+        params = ",".join(repr(float(value)) for value in (camera.fx, camera.fy, camera.cx, camera.cy))
+        members.setdefault((params, max(camera.width, camera.height)), []).append(name)
     return [sfm.Group(tuple(group), "PINHOLE", params, side) for (params, side), group in members.items()]
 
 

@@ -28,7 +28,7 @@ class Matches:
 
     @cached_property
     def shared(self) -> dict[tuple[int, int], int]:
-        """Verified matches by rows, the smaller first."""
+        """Number of verified matches of each pair of rows, the smaller row first."""
         return {(min(a, b), max(a, b)): count for a, b, count in self.pairs}
 
     @cached_property
@@ -52,7 +52,7 @@ class Matches:
         return [sorted(self.located), *found] if self.located else found
 
     def why(self, row: int) -> str:
-        """Why a photograph has no camera."""
+        """The reason why a photograph has no camera."""
         if self.features[row] < 0:
             return "cannot be read"
         if self.features[row] == 0:
@@ -86,12 +86,12 @@ class Matches:
         return (-shared if shared >= FEWEST_MATCHES else 0), pair[1] - pair[0]
 
     def joined(self) -> str:
-        """What matches join, in words; empty where they join nothing."""
+        """The groups that matches join, in words; empty where there are none."""
         large = [self._told(group) for group in self.groups if len(group) > 1][:MOST_TOLD]
         return f"matches join {', '.join(large)}; " if large else ""
 
     def advice(self) -> str:
-        """Where to photograph more, in words."""
+        """Advice in words where to take more photographs."""
         gaps = self.gaps()
         if not gaps:
             return _STEP_ASIDE if self.joined() and not self.located else _ADVICE

@@ -15,13 +15,7 @@ from typing import Any
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.capture import (
-    Capture,
-    Photo,
-    develop,
-    mask_beside,
-    tell_of_lost_points,
-)
+from langsplat_core.datasets.capture import Capture, Photo, develop, mask_beside, tell_of_lost_points
 from langsplat_core.datasets.intrinsics import BrownDistortion, Distortion, FisheyeDistortion, PhotoIntrinsics
 from langsplat_core.errors import FormatError, InputError, printable_line, quoted, shortened
 from langsplat_core.io.hostile import PHOTO_SUFFIXES, PictureError, picture_size, read_json_file
@@ -70,7 +64,7 @@ def load_nerfstudio(file: Path, max_side: int, progress: Progress) -> Capture:
 
 
 def _metres_per_unit(file: Path, top: Json) -> float | None:
-    """The key is ours: nerfstudio's own files do not say how long a unit is."""
+    """The length of a unit, a key of our own: nerfstudio's files do not state it."""
     if top.get("metres_per_unit") is None:
         return None
     try:
@@ -107,7 +101,7 @@ def _photo_file(folder: Path, label: str) -> Path | None:
 
 
 def _mask_file(folder: Path, frame: Json) -> Path | None:
-    """What "mask_path" names; ValueError where that is no file."""
+    """The file of a frame's "mask_path"; ValueError where there is none."""
     label = frame.get("mask_path")
     if label is None:
         return None
@@ -117,7 +111,7 @@ def _mask_file(folder: Path, frame: Json) -> Path | None:
 
 
 def _number(values: Json, key: str, default: float | None = None) -> float:
-    """A finite number; ValueError names the key."""
+    """Read a finite number; the ValueError names its key."""
     value = values.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e15:
         raise ValueError(f'"{key}" must be a finite number, got {reprlib.repr(value)}')
@@ -148,7 +142,7 @@ def _lens(values: Json, size: tuple[int, int]) -> PhotoIntrinsics:
 
 
 def _focal(values: Json, axis: str, side: int, default: float | None) -> float:
-    """Pixels, from ``fl_*`` or the field of view ``camera_angle_*`` in radians."""
+    """Focal length in pixels, from ``fl_*`` or the field of view ``camera_angle_*``, radians."""
     if f"fl_{axis}" in values:
         return _number(values, f"fl_{axis}")
     if f"camera_angle_{axis}" in values:

@@ -73,7 +73,7 @@ def extract_frames(video: Path, out: Path, count: int, progress: Progress = sile
 
 
 def _write(container: "av.container.InputContainer", folder: Path, count: int, progress: Progress) -> int:
-    """Write the sharpest images of an opened video; their number."""
+    """Write the sharpest images of an opened video; return their number."""
     stream = container.streams.video[0]
     stream.thread_type = "AUTO"
     if stream.codec_context.width * stream.codec_context.height > MOST_PIXELS:
@@ -85,17 +85,18 @@ def _write(container: "av.container.InputContainer", folder: Path, count: int, p
     first, last = min(times), max(times)
     container.seek(0)
     best: dict[int, tuple[float, Any]] = {}  # span -> sharpness and image, of the span under way
-    written = 0
     for frame in _decoded(container, stream):
         share = (float(frame.time or first) - first) / max(last - first, 1e-9)
         span = min(int(share * count), count - 1)
         for done in [number for number in best if number < span]:
-            written += _save(best.pop(done)[1], folder)
+            _save(best.pop(done)[1], folder)
         progress("taking photographs out of the video", min(share, 1.0))
         sharp = sharpness(frame)
         if span not in best or sharp > best[span][0]:
             best[span] = (sharp, frame)
-    return written + sum(_save(frame, folder) for _, frame in best.values())
+    for _, frame in best.values():
+        _save(frame, folder)
+    return len(list(folder.iterdir()))
 
 
 def _decoded(container: "av.container.InputContainer", stream: Any) -> Iterator[Any]:
@@ -121,9 +122,8 @@ def sharpness(frame: Any) -> float:
     return float((around - 4 * inner).var())
 
 
-def _save(frame: Any, folder: Path) -> int:
-    """Write an image, turned as it is shown; 1."""
+def _save(frame: Any, folder: Path) -> None:
+    """Write an image, turned as it is shown, under the next number."""
     upright = np.rot90(frame.to_ndarray(format="rgb24"), round(frame.rotation / 90))
     name = f"frame_{len(list(folder.iterdir())) + 1:04d}.jpg"
     Image.fromarray(np.ascontiguousarray(upright)).save(folder / name, quality=QUALITY)
-    return 1

@@ -52,7 +52,7 @@ class Look(NamedTuple):
 
 
 class Planes(NamedTuple):
-    """The channels of an image, float32."""
+    """The channels of an image as a kernel takes them, float32."""
 
     rgb: Array  # (H, W, 3)
     alpha: Array  # (H, W)
@@ -144,7 +144,7 @@ def _depth(shown: Array, depth: Any, is_open: bool, look: Look) -> None:
 
 @kernel
 def _rows(first: int, last: int, image: Array, planes: Planes, look: Look) -> None:
-    """Rows [first, last) of the planes, row 0 on top, into `image`."""
+    """Compose rows [first, last) of the planes, row 0 on top, into `image`."""
     height, width = planes.alpha.shape
     shown, base = np.empty(3, np.float32), np.empty(3, np.float32)
     values = np.empty(planes.extra.shape[2], np.float32)

@@ -49,7 +49,6 @@ def _published() -> dict[ColourMap, Array]:
 COLOUR_MAPS: Mapping[ColourMap, Array] = MappingProxyType(
     {"turbo": _turbo(), **_published(), "grey": np.repeat(np.arange(NODES, dtype=np.uint8)[:, None], 3, 1)}
 )
-TURBO = COLOUR_MAPS["turbo"]
 
 QUERY_COLOURS = np.array([[0.98, 0.45, 0.09], [0.13, 0.59, 0.95], [0.30, 0.80, 0.35]])  # per shown query
 MAX_QUERIES = len(QUERY_COLOURS)  # shown at a time: one colour each, one channel of a texture each
@@ -91,7 +90,7 @@ Answers = Sequence[Answer | None]  # by colour slot; None: the slot has no answe
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """Input of a display's channel function."""
+    """What a display's channel is made of: a scene's Gaussians, language field and answers."""
 
     count: int  # Gaussians
     language: LanguageField | None = None
@@ -120,7 +119,7 @@ def members(subject: Subject) -> Array | None:
 
 
 def _by_slot(subject: Subject, values_of: Callable[[Answer], Array]) -> Array | None:
-    """None where no slot paints anything."""
+    """(N, Q) float32 values of each slot's answer; None where no slot paints anything."""
     slots = painted(subject.answers)
     if not slots:
         return None
@@ -156,7 +155,7 @@ _LATENT: WeakKeyDictionary[LanguageField, Array] = WeakKeyDictionary()
 
 
 def latents(subject: Subject) -> Array | None:
-    """(N, 3) latent colours of a level."""
+    """(N, 3) colours of the latents at a level; None without a language field or level."""
     if subject.language is None or subject.level is None:
         return None
     colours: Array = latent_colours(subject.language)[subject.level]
@@ -216,7 +215,7 @@ class Channels:
 
 @dataclass(frozen=True, eq=False)
 class _Sheet:
-    """Input of a display's drawing."""
+    """The rasterized channels and settings that a display is drawn from."""
 
     channels: Channels
     extra: Array  # (H, W, C) the display's further channel; alpha for displays without one
@@ -224,7 +223,7 @@ class _Sheet:
     ranges: Ranges
 
     def uncovered(self) -> Array:
-        """(H, W, 3) what shows of the background."""
+        """(H, W, 3) the background as far as the scene leaves it uncovered."""
         if self.picture.transparent:
             return np.zeros_like(self.channels.rgb)
         return (1 - self.channels.alpha)[..., None] * np.asarray(self.picture.background)
@@ -308,7 +307,7 @@ def _segments(sheet: _Sheet) -> Array:
 
 
 def _depth(sheet: _Sheet) -> Array:
-    """Opaque, or nothing at all."""
+    """Depth by the colour map; a pixel of a transparent image is opaque, or nothing at all."""
     covered = (sheet.channels.alpha > sheet.picture.alpha_gate)[..., None]
     ((near, far),) = full_ranges(sheet.ranges, 1)
     t = np.clip((sheet.mean()[..., 0] - near) / max(far - near, 1e-9), 0, 1)

@@ -35,7 +35,7 @@ class Outlines:
 
 @dataclass(frozen=True)
 class MaskFile:
-    """An image that is bright inside."""
+    """An image file of a mask, bright inside."""
 
     path: Path
 
@@ -51,7 +51,7 @@ Truth = Outlines | MaskFile  # true mask of a phrase in a frame
 
 @dataclass(frozen=True, eq=False)
 class Label:
-    """One phrase that is asked in one frame."""
+    """A phrase that is asked in a frame, with the true mask and boxes."""
 
     phrase: str
     truth: Truth
@@ -61,7 +61,7 @@ class Label:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One labelled view of a scene."""
+    """A labelled view of a scene."""
 
     name: str  # of its photograph, without extension; dots inside belong to it
     size: Size  # of the label's grid
@@ -81,7 +81,7 @@ class LabelledScene:
 
 @dataclass(frozen=True, eq=False)
 class Benchmark:
-    """All scenes that a folder holds."""
+    """A benchmark's scenes, as a folder holds them."""
 
     name: str
     scenes: Mapping[str, LabelledScene]
@@ -94,7 +94,7 @@ def read_grey(path: Path) -> Array:
 
 
 def resized(mask: Array, size: Size) -> Array:
-    """(H, W) bool on a grid of `size`, each pixel the nearest one's."""
+    """(H, W) bool mask on a grid of `size`, by the nearest pixel."""
     if mask.shape == (size[1], size[0]):
         return mask
     image = Image.fromarray(mask.astype(np.uint8))
@@ -221,7 +221,7 @@ def _is_side(value: Any) -> TypeGuard[int]:
 
 
 def _object(item: Any, where: str) -> tuple[str, Array]:
-    """Category, and (K, 2) corners."""
+    """Category of a labelled object, and (K, 2) corners of its polygon."""
     if (
         not isinstance(item, dict)
         or not isinstance(item.get("category"), str)

@@ -30,7 +30,7 @@ OvsProtocol = Literal["langsplat-paper", "direct-3d", "ours"]
 
 @dataclass(frozen=True)
 class MapRule:
-    """From relevancy maps, one per level, to a mask and a peak."""
+    """A rule that turns relevancy maps, one per level, into a mask and a peak."""
 
     window: int  # px, mean filter of the map that is cut; 1: none
     raw_share: float  # of the unfiltered map in what is cut
@@ -54,7 +54,7 @@ class SilhouetteRule:
 
 @dataclass(frozen=True)
 class OwnRule:
-    """From the engine's own answer to a mask and a peak (see `own_prediction`)."""
+    """The rule that turns the engine's own answer into a mask and a peak (see `own_prediction`)."""
 
     share: float = 0.5  # of a pixel's light that comes from members, strictly above
     peak_window: int = 20  # px of an image of `rows` rows, as the paper's; in proportion for others

@@ -1,6 +1,5 @@
 """Scores of labelled queries as means, as a table for people and as JSON for programs."""
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ import numpy as np
 from langsplat_core.errors import shortened
 from langsplat_core.evaluation.profiles import Profile
 from langsplat_core.evaluation.scoring import QueryScore, SceneScores
-from langsplat_core.io.files import atomic_path
+from langsplat_core.io.files import write_json
 
 ACCURACY_AT = (0.25, 0.5)  # IoU strictly above
 FIXED = (
@@ -142,12 +141,6 @@ def save_json(path: Path, report: BenchmarkReport) -> None:
         "left_out": {name: list(scores.left_out) for name, scores in report.scenes.items()},
     }
     write_json(path, content)
-
-
-def write_json(path: Path, content: object) -> None:
-    """Write a value as a JSON file, whole or not at all."""
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 # Published figures on the benchmarks, beside the own: mIoU and localisation, percent.

@@ -16,8 +16,9 @@ from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.evaluation.report import FIXED, write_json
+from langsplat_core.evaluation.report import FIXED
 from langsplat_core.evaluation.run import Subject, chosen_scenes, open_scene
+from langsplat_core.io.files import write_json
 from langsplat_core.io.hostile import open_for_reading, read_npy
 from langsplat_core.io.ply_table import fill_columns, iterate_rows, read_ply_header
 from langsplat_core.progress import Progress, silent
@@ -156,7 +157,7 @@ def map_classes(folder: Path, points: LabelledPoints) -> list[Array]:
 def score_points(
     points: LabelledPoints, found: list[Array], unknown: tuple[str, ...] = ()
 ) -> list[PointScore]:
-    """One score per set of classes."""
+    """Score the points, once for each set of classes."""
     scores = []
     for names, ids in zip(CLASS_SETS, found, strict=True):
         counted = np.isin(points.labels, [NYU40[name] for name in names])

@@ -72,7 +72,7 @@ class QueryScore:
 
 @dataclass(frozen=True)
 class SceneScores:
-    """All queries of a scene."""
+    """The scores of all queries of a scene."""
 
     queries: tuple[QueryScore, ...]
     left_out: tuple[str, ...]  # labels that cannot be asked, each "frame: phrase (why)"

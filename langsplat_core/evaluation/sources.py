@@ -39,7 +39,7 @@ from langsplat_core.scene import LEVELS, Camera
 
 
 def file_name(phrase: str) -> str:
-    """The stem of a phrase's files."""
+    """Return the stem of the names of a phrase's files."""
     return phrase.replace("/", "_")
 
 
@@ -82,7 +82,7 @@ def _read(path: Path) -> Array:
 
 
 def _image(path: Path) -> Array:
-    """(H, W) in [0, 1]."""
+    """(H, W) relevancy in [0, 1] of an image file."""
     with opened(path) as image:
         if image.mode.startswith("I"):
             return np.asarray(image, np.float64) / 65535
@@ -143,7 +143,7 @@ class SceneSource:
         return [read_maps(maps[row : row + len(LEVELS)], rule) for row in range(0, len(maps), len(LEVELS))]
 
     def _decoded(self, view: View, phrases: Sequence[str]) -> Array:
-        """(Q, 3, H, W) in the paper's order."""
+        """(Q, 3, H, W) relevancy in the paper's order: latents blended, every pixel decoded."""
         vectors = np.stack([self.engine.text_vector(phrase) for phrase in phrases])
         gate = PictureConfig().alpha_gate
         levels = [decoded_relevancy(view, self.engine.field, k, vectors, gate) for k in range(len(LEVELS))]
@@ -162,7 +162,7 @@ class SceneSource:
 
 @dataclass(frozen=True, eq=False)
 class MapSource:
-    """Another system's maps of one scene, scored on their own grid (see `map_files`)."""
+    """Another system's maps of one scene, scored on their own grid; see the top of this file."""
 
     folder: Path  # <view>/<phrase>...
     rule: MapRule | SilhouetteRule

@@ -6,7 +6,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
-from langsplat_core.scene import Gaussians, LanguageField, Scene, Tree
+from langsplat_core.scene import LanguageField, Scene, Tree
 from langsplat_core.scene.codec import LARGEST, CodebookCodec, Codec, principal_colours
 from langsplat_core.scene.gaussians import join_gaussians
 from langsplat_core.scene.tree import NO_NODE
@@ -28,9 +28,8 @@ def merge(first: Scene, second: Scene) -> Scene:
         name for name, values in first.extras.items()
         if name in second.extras and second.extras[name].dtype == values.dtype
     ]  # fmt: skip
-    degree = max(first.gaussians.sh.shape[1], second.gaussians.sh.shape[1])
     return Scene(
-        join_gaussians([_padded(scene.gaussians, degree) for scene in (first, second)]),
+        join_gaussians([first.gaussians, second.gaussians]),
         _language(first, second),
         first.cameras + second.cameras,
         antialiased=first.antialiased,
@@ -40,18 +39,12 @@ def merge(first: Scene, second: Scene) -> Scene:
     )
 
 
-def _padded(gaussians: Gaussians, count: int) -> Gaussians:
-    """With `count` coefficients of each colour."""
-    missing = count - gaussians.sh.shape[1]
-    return replace(gaussians, sh=np.pad(gaussians.sh, ((0, 0), (0, missing), (0, 0))))
-
-
 def _language(first: Scene, second: Scene) -> LanguageField | None:
-    one, other = first.language, second.language
-    if one is None and other is None:
+    known = first.language if first.language is not None else second.language
+    if known is None:
         return None
-    a = one if one is not None else _meaningless(_chosen(other), len(first.gaussians))
-    b = other if other is not None else _meaningless(_chosen(one), len(second.gaussians))
+    a = _meaningless(known, len(first.gaussians)) if first.language is None else first.language
+    b = _meaningless(known, len(second.gaussians)) if second.language is None else second.language
     if a.encoder_id != b.encoder_id or a.codec.vector_dim != b.codec.vector_dim:
         raise InputError(
             f"their language fields are of two text encoders, {a.encoder_id} and {b.encoder_id}, and no "
@@ -59,7 +52,7 @@ def _language(first: Scene, second: Scene) -> LanguageField | None:
         )
     codec, latents = _one_codec(a, b)
     everyday = a.everyday if a.everyday is not None else b.everyday
-    known = {word.key for word in a.taught}
+    words = {word.key for word in a.taught}
     return replace(
         a,
         latents=latents,
@@ -68,13 +61,8 @@ def _language(first: Scene, second: Scene) -> LanguageField | None:
         phrasebook={**b.phrasebook, **a.phrasebook},
         tree=None if a.tree is None or b.tree is None else _one_tree(a.tree, b.tree),
         everyday=everyday,
-        taught=a.taught + tuple(word for word in b.taught if word.key not in known),
+        taught=a.taught + tuple(word for word in b.taught if word.key not in words),
     )
-
-
-def _chosen(field: LanguageField | None) -> LanguageField:
-    assert field is not None
-    return field
 
 
 def _meaningless(field: LanguageField, count: int) -> LanguageField:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from langsplat_core.arrays import Array, rotation_matrices, unit
+from langsplat_core.arrays import Array, across, rotation_matrices, unit
 from langsplat_core.errors import InputError
 from langsplat_core.geometry.points import cloud
 from langsplat_core.progress import Progress, silent
@@ -44,7 +44,7 @@ class Mesh:
     name: str = "scene"
 
     def holes(self) -> int:
-        """How many loops of edges have a triangle on one side alone."""
+        """Number of holes: loops of edges with a triangle on one side alone."""
         edges = np.sort(self.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
         edges, sides = np.unique(edges, axis=0, return_counts=True)
         rim = edges[sides == 1]
@@ -53,7 +53,7 @@ class Mesh:
         return int(connected_components(links, directed=False)[0]) if len(rim) else 0
 
     def areas(self) -> Array:
-        """(T,) world units squared."""
+        """(T,) areas of the triangles, square world units."""
         a, b, c = (self.vertices[self.triangles[:, corner]] for corner in range(3))
         return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
 
@@ -116,8 +116,7 @@ def fuse(
 
 
 def _rendered(scene: Scene, camera: Camera) -> Depth:
-    shrink = min(SIDE / max(camera.width, camera.height), 1.0)
-    small = camera.resized(max(round(shrink * camera.width), 1), max(round(shrink * camera.height), 1))
+    small = camera.within(SIDE)
     view = CpuRasterizer().view(scene.gaussians, small, scene.raster_settings())
     image = splat_colours(view, scene.gaussians, small)
     colours = np.clip(image.colours / np.maximum(image.alpha, 0.5)[..., None], 0, 1)
@@ -150,7 +149,7 @@ def _fused(images: list[Depth], resolution: float, views: int, progress: Progres
 
 
 def _taken(mesh: "object") -> Mesh:
-    """A legacy mesh of Open3D as arrays."""
+    """Convert a legacy mesh of Open3D to arrays."""
     vertices, triangles, colours = (
         np.asarray(getattr(mesh, name)) for name in ("vertices", "triangles", "vertex_colors")
     )
@@ -197,7 +196,7 @@ def generated_cameras(scene: Scene) -> tuple[Camera, ...]:
     """Views of a scene without cameras, from outside around it."""
     centre, radius = scene.bounds()
     up = scene.up()
-    side = unit(np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))]), 1e-12)
+    side = unit(across(up), 1e-12)
     angles = np.arange(TURNS)[:, None] * np.pi * (3 - np.sqrt(5))
     flat = np.cos(angles) * side + np.sin(angles) * np.cross(up, side)
     rise = np.linspace(*RISES, TURNS)[:, None]

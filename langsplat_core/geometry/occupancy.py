@@ -21,9 +21,7 @@ from langsplat_core.scene import Scene
 MOST_CELLS = 60_000_000  # of a grid
 SIDE = 240  # pixels of the longer side of the depth images
 HIT = 0.1  # of the rays that reach a voxel, how many end there from which it is occupied
-OUTSIDE = (
-    0.02  # of the seen surface on each side of each axis that a grid leaves out: floaters, the view outside
-)
+OUTSIDE = 0.02  # of the seen surface, at each end of each axis, that a grid leaves out: floaters, what is far
 MARGIN = 5  # voxels around what is seen
 MOST_LOOKS = 20_000  # places from which it is tried whether a thing is seen
 MOST_PAIRS = 4_000_000  # of a place and a cell of a thing, whose distance is measured
@@ -42,23 +40,22 @@ class Occupancy:
 
     @property
     def occupied(self) -> Array:
-        """(X, Y, Z) bool."""
+        """(X, Y, Z) bool, the voxels in which enough of the rays end."""
         return np.asarray((self.hits > 0) & (self.hits >= HIT * (self.hits + self.passes.astype(np.float64))))
 
     @property
     def seen(self) -> Array:
-        """(X, Y, Z) bool: some ray came there."""
+        """(X, Y, Z) bool, the voxels that some ray reaches."""
         return np.asarray((self.hits > 0) | (self.passes > 0))
 
     def voxels(self, points: Array) -> Array:
         """(P, 3) world points -> (P, 3) int64 voxels, perhaps outside of the grid."""
-        on_map = points @ self.to_map[:3, :3].T + self.to_map[:3, 3]
-        return np.floor((on_map - self.origin) / self.resolution).astype(np.int64)
+        return np.floor((_moved(points, self.to_map) - self.origin) / self.resolution).astype(np.int64)
 
 
 @dataclass(frozen=True, eq=False)
 class FloorMap:
-    """X x Y cells of the floor."""
+    """The map of the floor, X x Y cells."""
 
     origin: Array  # (2,) lower left corner of the first cell, metres
     resolution: float
@@ -66,7 +63,7 @@ class FloorMap:
     free: Array  # (X, Y) bool: seen there, and nothing stands
 
     def centres(self, cells: Array) -> Array:
-        """(P, 2) cells -> (P, 2) metres."""
+        """(P, 2) cells -> (P, 2) their middles, metres."""
         return np.asarray(self.origin + (cells + 0.5) * self.resolution)
 
 
@@ -102,8 +99,7 @@ def find_occupancy(scene: Scene, to_map: Array, resolution: float, progress: Pro
     rays = []
     for number, camera in enumerate(scene.cameras):
         progress(STAGE, number / (2 * len(scene.cameras)))
-        shrink = min(SIDE / max(camera.width, camera.height), 1.0)
-        small = camera.resized(max(round(shrink * camera.width), 1), max(round(shrink * camera.height), 1))
+        small = camera.within(SIDE)
         depth = CpuRasterizer().view(scene.gaussians, small, scene.raster_settings()).median_depth()
         rows, columns = np.nonzero(depth > 0)
         z = depth[rows, columns].astype(np.float64)

@@ -6,21 +6,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.errors import InputError
 from langsplat_core.geometry.points import cloud, sample_surface
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.scene import Camera, Scene
+from langsplat_core.scene.transform import moved_camera
 
 SAMPLES = 40_000  # points of each surface
 ROUGH, FINE = 0.06, 0.03  # of the fixed scene's radius: spacing of points for features, and for ICP
 TRIES = 50_000  # of RANSAC
 AGAIN = 2  # times RANSAC is begun
-SIZES = (
-    1.0,
-    0.8,
-    1.25,
-)  # times the ratio of the scenes' radii, from which it is begun where the scale is open
+SIZES = (1.0, 0.8, 1.25)  # times the ratio of the scenes' radii: where it begins if the scale is open
 VIEWS, SIDE = 8, 120  # cameras of either scene that check it, and pixels of their longer side
 ALIKE = 0.05  # of the depth: surfaces that are no farther apart are the same
 TRUSTED = 0.7  # of the pixels that both scenes fill, from which two scenes are one place
@@ -31,7 +27,7 @@ STAGE = "registering"
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """How a scene lies in another one's axes."""
+    """The pose and size of a scene in the axes of another."""
 
     transform: Array  # (4, 4) float64 similarity, from the moving scene to the fixed one
     rmse: float  # of points that lie on each other, units of the fixed scene
@@ -44,7 +40,7 @@ class Registration:
 
     @property
     def trusted(self) -> bool:
-        """Whether the two scenes show one place, as far as renderings tell."""
+        """True if the two scenes show one place, as far as renderings tell."""
         return self.agreement >= TRUSTED
 
 
@@ -134,17 +130,6 @@ def _aligned(
         found.append((float(result.inlier_rmse) / max(float(result.fitness), 1e-9), result))
     best = min(found, key=lambda one: one[0])[1]
     return np.asarray(best.transformation, np.float64), float(best.inlier_rmse)
-
-
-def moved_camera(camera: Camera, transform: Array) -> tuple[Camera, float]:
-    """A camera of a fixed scene as it sees a moving one before that is moved by a (4, 4) similarity, and the
-    factor from its depths to those of the fixed scene."""
-    scale = float(np.cbrt(np.linalg.det(transform[:3, :3])))
-    if not (np.isfinite(transform).all() and scale > 0):
-        raise InputError("a transform must be a similarity: turned, scaled by a positive factor, and moved")
-    matrix = camera.world_to_camera @ transform
-    matrix[:3] /= scale
-    return replace(camera, world_to_camera=matrix), scale
 
 
 def agreement(moving: Scene, fixed: Scene, transform: Array) -> float:

@@ -1,6 +1,7 @@
 """Writing files so that a reader never sees half of one, and saying beforehand where none can be written."""
 
 import errno
+import json
 import os
 import re
 import sys
@@ -58,6 +59,12 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         raise OSError(cause.errno, cause.strerror, str(target)) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_json(path: Path, content: object) -> None:
+    """Write a value as a JSON file, whole or not at all."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 @contextmanager

@@ -49,7 +49,7 @@ P = TypeVar("P", bound=Part)
 
 @dataclass(frozen=True, eq=False)
 class ForeignScene:
-    """Gaussians, and what they mean in the method's own numbers."""
+    """Gaussians of another method, with its own language features."""
 
     method: str
     scene: Scene  # without a language field
@@ -60,7 +60,7 @@ class ForeignScene:
 
     @property
     def dim(self) -> int:
-        """D, of the vectors; 0 where there are no features."""
+        """Length D of the vectors; 0 where there are no features."""
         if self.codec is not None:
             return self.codec.vector_dim
         return next((features.dim for features in self.levels if features is not None), 0)
@@ -142,7 +142,7 @@ def _without_language(plain: Carrier | None, others: list[Part]) -> ForeignScene
 
 
 def _of_clusters(carrier: Carrier | None, clusters: Clusters) -> ForeignScene:
-    """OpenGaussian: one level, which is taken for the whole."""
+    """OpenGaussian's scene, whose one level is taken for the whole."""
     leaves = clusters.leaves
     if carrier is None:
         raise InputError(f"{clusters.path}: has no Gaussians; name the scene's checkpoint or PLY too")

@@ -79,17 +79,16 @@ class SparseCodes:
         logits = np.asarray(self.logits[indices], np.float32)
         mixed = np.zeros((len(logits), dim), np.float32)
         for layer in range(layers):
-            weights = _largest_of_softmax(logits[:, layer * size : (layer + 1) * size], TOPK)
+            weights = _largest_of_softmax(logits[:, layer * size : (layer + 1) * size])
             mixed += weights @ self.codewords[layer]
         return np.where(np.ptp(logits, axis=1, keepdims=True) != 0, mixed, np.float32(0))
 
 
-def _largest_of_softmax(logits: Array, count: int) -> Array:
-    """(n, K) logits -> (n, K) weights: the `count` largest of their softmax over their sum, else 0."""
+def _largest_of_softmax(logits: Array) -> Array:
+    """(n, K) logits -> (n, K) weights: the `TOPK` largest of their softmax over their sum, else 0."""
     powers = np.exp(logits - logits.max(1, keepdims=True))
     shares = powers / powers.sum(1, keepdims=True)
-    count = min(count, shares.shape[1])
-    largest = np.argsort(-shares, axis=1, kind="stable")[:, :count]
+    largest = np.argsort(-shares, axis=1, kind="stable")[:, :TOPK]
     kept = np.take_along_axis(shares, largest, 1)
     weights = np.zeros_like(shares)
     np.put_along_axis(weights, largest, kept / (kept.sum(1, keepdims=True) + 1e-10), 1)
@@ -332,7 +331,9 @@ def _clusters(arrays: dict[str, Array], path: Path) -> Clusters:
 def _from_torch(content: Any, path: Path) -> Part:
     elements = model_tuple(content)
     if elements is not None:
-        return _from_tuple(elements, path)
+        gaussians = gaussians_of(elements, path)
+        method, features, codes = _language(elements, len(gaussians), path)
+        return Carrier(path, method, gaussians, features, codes)
     mapping = plain_mapping(content)
     named = {"": content} if mapping is None else mapping
     if is_autoencoder(named):
@@ -345,12 +346,6 @@ def _from_torch(content: Any, path: Path) -> Part:
             "not Gaussians, so that such features cannot be imported; train without the speed-up"
         )
     raise FormatError(f"{path}: a torch file, but not a checkpoint or autoencoder of a known method")
-
-
-def _from_tuple(elements: tuple[Any, ...], path: Path) -> Carrier:
-    gaussians = gaussians_of(elements, path)
-    method, features, codes = _language(elements, len(gaussians), path)
-    return Carrier(path, method, gaussians, features, codes)
 
 
 def _language(
@@ -490,9 +485,7 @@ def _require_shared(row: Array, count: int, carrier: Carrier) -> None:
 def _row_of(means: Array, theirs: Array) -> Array:
     """(N,) row of `theirs` at the same position; the k-th of several at one place goes with the k-th."""
     keys = np.concatenate([_keys(means), _keys(theirs)])
-    order = np.lexsort(
-        keys.T
-    )  # stable: of two equal keys, which are one of each side, that of `means` is first
+    order = np.lexsort(keys.T)  # stable: of two equal keys, one of each side, that of `means` is first
     ordered = keys[order]
     same = (ordered[1:] == ordered[:-1]).all(1)
     row = np.full(len(means), -1, np.int64)

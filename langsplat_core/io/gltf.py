@@ -22,19 +22,22 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from langsplat_core.arrays import Array, logit, sigmoid, unit
+from langsplat_core.arrays import Array, logit, rotation_matrices, sigmoid, unit
 from langsplat_core.errors import FormatError, InputError, quoted
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import open_for_reading, parse_json
 from langsplat_core.io.splat import to_bytes
 from langsplat_core.io.spz import coefficient_signs, decode_spz, quaternion_signs
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
-from langsplat_core.scene.gaussians import joined
+from langsplat_core.scene.gaussians import join_gaussians
 from langsplat_core.scene.transform import C0, Similarity, similarity, transform_gaussians
 
 EXTENSION = "KHR_gaussian_splatting"
 PACKED = (f"{EXTENSION}_compression_spz_2", f"{EXTENSION}_compression_spz")
 KNOWN = {EXTENSION, *PACKED, "KHR_mesh_quantization"}  # others that a file requires are refused
+COEFFICIENTS = [
+    f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{n}" for degree in range(4) for n in range(2 * degree + 1)
+]
 POINTS = 0  # mode of a primitive
 FLOAT, UNSIGNED_BYTE = 5126, 5121
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", FLOAT: "<f4"}
@@ -62,7 +65,7 @@ def read_gltf_scene(path: Path | str) -> Scene:
         raise FormatError(f"{path}: not a sound glTF file ({str(error)[:80]}); export it again") from None
     if not parts and EXTENSION not in file.content.get("extensionsUsed", ()):
         raise FormatError(f"{path}: holds no Gaussians ({EXTENSION}); meshes are not read")
-    return Scene(_turned(joined(parts)))
+    return Scene(_turned(join_gaussians(parts)))
 
 
 def _turned(gaussians: Gaussians) -> Gaussians:
@@ -137,17 +140,11 @@ def _placed(file: "_File") -> Iterator[tuple[Similarity, Any]]:
 
 
 def _matrix(node: Any) -> Array:
-    """(4, 4) place of a node in its parent."""
+    """Return the (4, 4) matrix from the axes of a node to those of its parent."""
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T  # stored by columns
     x, y, z, w = unit(np.array(node.get("rotation", [0, 0, 0, 1]), np.float64), 1e-300)
-    turn = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    turn = rotation_matrices(np.array([w, x, y, z]))
     matrix = np.eye(4)
     matrix[:3, :3] = turn * np.array(node.get("scale", [1, 1, 1]), np.float64).reshape(3)
     matrix[:3, 3] = np.array(node.get("translation", [0, 0, 0]), np.float64).reshape(3)
@@ -160,20 +157,15 @@ def _gaussians(file: "_File", attributes: Any, count: int) -> Gaussians:
     def column(name: str, width: int) -> Array:
         return file.accessor(attributes[name], width, count, name)
 
-    names = [
-        f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{number}"
-        for degree in range(4)
-        for number in range(2 * degree + 1)
-    ]
-    have = sum(name in attributes for name in names)
-    if have not in SH_COUNTS.values() or names[have - 1] not in attributes:
+    have = sum(name in attributes for name in COEFFICIENTS)
+    if have not in SH_COUNTS.values() or COEFFICIENTS[have - 1] not in attributes:
         raise FormatError(f"{file.path}: {have} of the coefficients of its colours; expected 1, 4, 9 or 16")
     quats = column(f"{EXTENSION}:ROTATION", 4)
     scales = column(f"{EXTENSION}:SCALE", 3)
     log_scales = scales if (scales < 0).any() else np.log(scales)
     logits = logit(column(f"{EXTENSION}:OPACITY", 1)[:, 0].astype(np.float64))
     sh = np.empty((count, have, 3), np.float32)
-    for number, name in enumerate(names[:have]):
+    for number, name in enumerate(COEFFICIENTS[:have]):
         sh[:, number] = column(name, 3)
     return Gaussians(column("POSITION", 3), log_scales, quats[:, [3, 0, 1, 2]], logits, sh)
 
@@ -351,16 +343,21 @@ def write_gltf(path: Path | str, gaussians: Gaussians) -> None:
                 content["buffers"][0]["uri"] = f"data:application/octet-stream;base64,{data}"
             file.write(json.dumps(content).encode())
             return
-        text = json.dumps(content).encode()
-        text += b" " * (-len(text) % 4)
-        whole = 12 + 8 + len(text) + (8 + size if blocks else 0)
-        if whole >= 2**32:
-            raise InputError(f"{path}: {whole} bytes are more than a .glb can hold; write .spz or .sog")
-        file.write(MAGIC + struct.pack("<III", 2, whole, len(text)) + JSON_CHUNK + text)
-        if blocks:
-            file.write(struct.pack("<I", size) + BINARY_CHUNK)
+        file.write(glb_head(content, size, path))
         for block in blocks:
             file.write(block.data)
+
+
+def glb_head(content: dict[str, Any], size: int, path: Path) -> bytes:
+    """Everything of a .glb that is in front of its `size` bytes of binary data, a multiple of four.
+    InputError, naming `path`, for more than a .glb can hold."""
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    binary = struct.pack("<I", size) + BINARY_CHUNK if size else b""
+    whole = 20 + len(text) + len(binary) + size
+    if whole >= 2**32:
+        raise InputError(f"{path}: {whole} bytes are more than a .glb can hold; write .spz or .sog")
+    return MAGIC + struct.pack("<III", 2, whole, len(text)) + JSON_CHUNK + text + binary
 
 
 def _columns(gaussians: Gaussians) -> dict[str, Array]:
@@ -379,7 +376,4 @@ def _columns(gaussians: Gaussians) -> dict[str, Array]:
         f"{EXTENSION}:SCALE": np.exp(np.where(keep, turned.log_scales, 0).astype(np.float64)).astype("<f4"),
         f"{EXTENSION}:OPACITY": opacity.astype("<f4"),
     }
-    for degree in range(gaussians.sh_degree + 1):
-        for number in range(2 * degree + 1):
-            columns[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{number}"] = sh[:, degree**2 + number].astype("<f4")
-    return columns
+    return columns | {name: sh[:, k].astype("<f4") for k, name in enumerate(COEFFICIENTS[: sh.shape[1]])}

@@ -321,7 +321,7 @@ def _reason(error: Exception) -> str:
 
 
 class _Quiet:
-    """No Python warnings while any thread is inside.
+    """A context without Python warnings while any thread is inside.
 
     `warnings.catch_warnings` alone is not safe where threads overlap: the one that leaves last would restore
     what another had set.

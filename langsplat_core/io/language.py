@@ -93,14 +93,9 @@ FORMAT, VERSION = "langsplat", "3"
 WORDS_FORMAT, WORDS_VERSION = "langsplat words", "1"
 CODEC = "codec."
 WAYS = len(fields(Calibration))  # to look for something, each with odds of its own
-_KEYS = {
-    "1": ("encoder", "levels", "codec", "d", "gaussians", "means_blake2b", "phrases"),
-    "2": (
-        *("encoder", "levels", "codec", "d", "gaussians", "means_blake2b", "phrases"),
-        *("temperature", "found"),
-    ),
-}
-_KEYS["3"] = _KEYS["2"]
+_KEYS_1 = ("encoder", "levels", "codec", "d", "gaussians", "means_blake2b", "phrases")
+_KEYS_2 = (*_KEYS_1, "temperature", "found")
+_KEYS = {"1": _KEYS_1, "2": _KEYS_2, "3": _KEYS_2}
 UNIT = 10.0  # more than any number of a vector whose length is about 1
 _MOST = {"confidence": 1e12, "latents": 1e3}  # and of tensors that are not made of such vectors
 _WHOLE = {  # types of tensors that hold no floating-point numbers

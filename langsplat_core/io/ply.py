@@ -41,13 +41,13 @@ from langsplat_core.io.ply_table import (
     read_ply_header,
 )
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
+from langsplat_core.scene.transform import C0
 
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")  # zeros that nobody reads
 BASE_COLOUR = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALE = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
-SH_C0 = 0.5 / np.sqrt(np.pi)  # the constant spherical harmonic: colour = 0.5 + SH_C0 * f_dc
 REST_COUNTS = {3 * (count - 1): degree for degree, count in SH_COUNTS.items()}  # f_rest_* -> SH degree
 LAYOUT = "the layout"  # NumPy field of all its columns together; no PLY property has a name with a blank
 METRES = "metres_per_unit"
@@ -215,7 +215,7 @@ def antialiased_by_comments(comments: tuple[str, ...]) -> bool:
 
 
 def metres_comment(metres_per_unit: float) -> str:
-    """The comment that says so."""
+    """The comment that states the length of the world's unit."""
     return f"{METRES} {float(metres_per_unit)!r}"
 
 
@@ -326,7 +326,7 @@ def read_compressed(file: BinaryIO, file_size: int, header: PlyHeader, path: Pat
             log_scales=_between(bounds[:, 6:12], of_chunk, _fractions_11_10_11(scale)),
             quats_wxyz=_quaternions(rotation),
             opacity_logits=logit(rgba[:, 3]),
-            sh=sh_from_channel_major((rgb - 0.5) / SH_C0, _read_rest(file, file_size, header, vertex, path)),
+            sh=sh_from_channel_major((rgb - 0.5) / C0, _read_rest(file, file_size, header, vertex, path)),
         )
 
 
@@ -354,7 +354,7 @@ def _between(bounds: Array, of_chunk: Array, fractions: Array) -> Array:
 
 
 def _fractions_11_10_11(packed: Array) -> Array:
-    """(N,) uint32 -> (N, 3) in [0, 1]."""
+    """(N,) uint32 of 11, 10 and 11 bits -> (N, 3) fractions in [0, 1]."""
     return np.stack([(packed >> 21) / 2047, (packed >> 11 & 1023) / 1023, (packed & 2047) / 2047], axis=1)
 
 
@@ -364,11 +364,13 @@ def _quaternions(packed: Array) -> Array:
     return smallest_three((three - 0.5) * np.sqrt(2), packed >> 30)
 
 
+OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # components beside the largest, by its index
+
+
 def smallest_three(three: Array, largest: Array) -> Array:
     """(N, 3) components other than the largest, (N,) index of the largest -> (N, 4) unit quaternions."""
     out = np.empty((len(three), 4))
     rows = np.arange(len(three))[:, None]
-    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-    out[rows, others[largest]] = three
+    out[rows, OTHERS[largest]] = three
     out[rows[:, 0], largest] = np.sqrt(np.maximum(0, 1 - (three**2).sum(1)))
     return out

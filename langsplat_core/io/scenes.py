@@ -231,10 +231,7 @@ def save_scene(path: Path | str, scene: Scene) -> None:
     assert row.write is not None
     sidecar, cameras = companion_path(path, language.SUFFIX), companion_path(path, camera_files.SUFFIX)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with (
-        turns(path.parent) as wait,
-        ExitStack() as renames,
-    ):  # made in the reverse order of these lines
+    with turns(path.parent) as wait, ExitStack() as renames:  # made in the reverse order of these lines
         if scene.cameras:
             write_cameras(renames.enter_context(atomic_path(cameras)), scene.cameras)
         new_sidecar = None if scene.language is None else renames.enter_context(atomic_path(sidecar))

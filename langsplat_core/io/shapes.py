@@ -1,7 +1,5 @@
 """Coloured points and meshes, which other programs open without knowing Gaussians."""
 
-import json
-import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
@@ -11,9 +9,10 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.ply import SH_C0
+from langsplat_core.io.gltf import glb_head
+from langsplat_core.io.splat import to_bytes
 from langsplat_core.scene import Gaussians, Scene
-from langsplat_core.scene.transform import AXES, scaling, turning
+from langsplat_core.scene.transform import AXES, C0, scaling, turning
 
 POINT_SUFFIXES = (".ply",)
 MESH_SUFFIXES = (".ply", ".obj", ".glb")
@@ -27,7 +26,7 @@ class Mesh(Protocol):
     def name(self) -> str: ...
     @property
     def vertices(self) -> Array:
-        """(V, 3) world units."""
+        """(V, 3) positions, world units."""
 
     @property
     def triangles(self) -> Array:
@@ -40,13 +39,14 @@ class Mesh(Protocol):
 
 def base_colours(gaussians: Gaussians) -> Array:
     """(N, 3) float64 display values in [0, 1]: of every Gaussian, the same from all sides."""
-    colours = 0.5 + SH_C0 * gaussians.sh[:, 0].astype(np.float64)
+    colours = 0.5 + C0 * gaussians.sh[:, 0].astype(np.float64)
     return np.clip(np.nan_to_num(colours), 0, 1)
 
 
 def write_points(path: Path | str, gaussians: Gaussians, extras: Mapping[str, Array] | None = None) -> int:
-    """The means of the Gaussians that can be drawn as a PLY point cloud: red, green and blue as bytes, each
-    of `extras`, name -> (N,), as a float. How many points. Atomic; InputError for another suffix."""
+    """Write the means of the Gaussians that can be drawn as a PLY point cloud, atomically: red, green and
+    blue as bytes, each of `extras`, name -> (N,), as a float. Return the number of points. InputError for
+    another suffix."""
     from plyfile import PlyData, PlyElement
 
     path = check_suffix(path, POINT_SUFFIXES)
@@ -56,7 +56,7 @@ def write_points(path: Path | str, gaussians: Gaussians, extras: Mapping[str, Ar
     table = np.empty(int(valid.sum()), [*columns, *((name, "<f4") for name in extras)])
     for k, axis in enumerate("xyz"):
         table[axis] = gaussians.means[valid, k]
-    for name, values in zip(RGB, _bytes(base_colours(gaussians)[valid]).T, strict=True):
+    for name, values in zip(RGB, to_bytes(255 * base_colours(gaussians)[valid]).T, strict=True):
         table[name] = values
     for name, values in extras.items():
         table[name] = values[valid]
@@ -66,14 +66,15 @@ def write_points(path: Path | str, gaussians: Gaussians, extras: Mapping[str, Ar
 
 
 def write_meshes(path: Path | str, meshes: Sequence[Mesh], to_gltf: Array | None = None) -> None:
-    """All of them in one .ply, or in one .obj or .glb with an object each. Atomic; InputError for another
-    suffix. to_gltf: (4, 4) from world units to metres with y up, as glTF has them; nothing else is moved."""
+    """Write all meshes in one .ply, or in one .obj or .glb with an object each, atomically. InputError for
+    another suffix. to_gltf: (4, 4) from world units to metres with y up, as glTF has them; nothing else is
+    moved."""
     path = check_suffix(path, MESH_SUFFIXES)
     with atomic_path(path) as temporary:
         if path.suffix.lower() == ".obj":
             temporary.write_text(_obj(meshes), encoding="utf-8")
         elif path.suffix.lower() == ".glb":
-            temporary.write_bytes(_glb(meshes, np.eye(4) if to_gltf is None else to_gltf))
+            temporary.write_bytes(_glb(path, meshes, np.eye(4) if to_gltf is None else to_gltf))
         else:
             _write_mesh_ply(temporary, meshes)
 
@@ -110,8 +111,8 @@ def _write_mesh_ply(path: Path, meshes: Sequence[Mesh]) -> None:
     firsts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     vertex = np.empty(firsts[-1], [(axis, "<f4") for axis in "xyz"] + [(name, "u1") for name in RGB])
     places = np.concatenate([mesh.vertices for mesh in meshes])
-    colours = np.concatenate([np.broadcast_to(_bytes(mesh.colour), mesh.vertices.shape) for mesh in meshes])
-    for names, values in (("xyz", places), (RGB, colours)):
+    colours = np.concatenate([np.broadcast_to(mesh.colour, mesh.vertices.shape) for mesh in meshes])
+    for names, values in (("xyz", places), (RGB, to_bytes(255 * colours))):
         for k, name in enumerate(names):
             vertex[name] = values[:, k]
     triangles = [mesh.triangles + first for mesh, first in zip(meshes, firsts, strict=False)]
@@ -121,7 +122,7 @@ def _write_mesh_ply(path: Path, meshes: Sequence[Mesh]) -> None:
     PlyData(elements).write(str(path))
 
 
-def _glb(meshes: Sequence[Mesh], to_gltf: Array) -> bytes:
+def _glb(path: Path, meshes: Sequence[Mesh], to_gltf: Array) -> bytes:
     """Binary glTF 2.0. Colours are light as it was photographed, so the material is unlit, and linear."""
     chunks: list[bytes] = []
     views, accessors, shapes, nodes = [], [], [], []
@@ -160,20 +161,5 @@ def _glb(meshes: Sequence[Mesh], to_gltf: Array) -> bytes:
         "bufferViews": views,
         "buffers": [{"byteLength": sum(map(len, chunks))}],
     }
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
     data = b"".join(chunks)  # of numbers of 4 and 8 bytes
-    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(data))
-    return (
-        head
-        + struct.pack("<I4s", len(text), b"JSON")
-        + text
-        + struct.pack("<I4s", len(data), b"BIN\0")
-        + data
-    )
-
-
-def _bytes(colours: Array) -> Array:
-    """Display values in [0, 1] -> uint8."""
-    rounded: Array = np.rint(255 * colours).astype(np.uint8)
-    return rounded
+    return glb_head(document, len(data), path) + data

@@ -35,7 +35,6 @@ from langsplat_core.arrays import Array, logit, sigmoid, unit, whole_number
 from langsplat_core.errors import FormatError, quoted
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import (
-    Archive,
     exists,
     open_for_reading,
     opened,
@@ -43,9 +42,9 @@ from langsplat_core.io.hostile import (
     parse_json,
     read_json_file,
 )
-from langsplat_core.io.ply import smallest_three
+from langsplat_core.io.ply import OTHERS, smallest_three
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
-from langsplat_core.scene.gaussians import joined
+from langsplat_core.scene.gaussians import join_gaussians
 
 META_NAME, LOD_NAME = "meta.json", "lod-meta.json"
 LOD_LIMIT = 16 << 20  # bytes of lod-meta.json; a leaf, of some thousand Gaussians, has 300
@@ -74,7 +73,9 @@ def read_sog_scene(path: Path | str) -> Scene:
     if path.suffix.lower() == ".json":
         return _decode(_folder_reader(path.parent), path)
     with opened_archive(path, "SOG archive") as archive:
-        return _decode(_archive_reader(archive), path / META_NAME)
+        # The images are compressed already, so a member far larger than its archive is a trap.
+        most = 16 * archive.size + META_LIMIT
+        return _decode(lambda name, limit: archive.read(name, min(limit, most)), path / META_NAME)
 
 
 def _read_streamed(path: Path) -> Scene:
@@ -97,7 +98,8 @@ def _read_streamed(path: Path) -> Scene:
             raise FormatError(f"{path}: asks for more than the {count} Gaussians of {file}")
         parts += [scene.gaussians.take(np.arange(at, at + length)) for at, length in rows]
         antialiased |= scene.antialiased
-    return Scene(joined(parts + [read_sog_scene(file).gaussians for file in around]), antialiased=antialiased)
+    parts += [read_sog_scene(file).gaussians for file in around]
+    return Scene(join_gaussians(parts), antialiased=antialiased)
 
 
 def _finest_ranges(tree: Any) -> dict[int, list[tuple[int, int]]]:
@@ -138,13 +140,8 @@ def _folder_reader(folder: Path) -> Fetch:
     return fetch
 
 
-def _archive_reader(archive: Archive) -> Fetch:
-    # The images are compressed already, so a member far larger than its archive is a trap.
-    return lambda name, limit: archive.read(name, min(limit, 16 * archive.size + META_LIMIT))
-
-
 def _decode(fetch: Fetch, meta_path: Path) -> Scene:
-    """`meta_path` is for messages; the name of the meta file is its last part."""
+    """Decode the scene whose meta file `fetch` finds by the last part of `meta_path`."""
     meta = _Meta(parse_json(fetch(meta_path.name, META_LIMIT), meta_path), meta_path)
     return Scene(_gaussians(fetch, meta), antialiased=meta.antialiased())
 
@@ -363,8 +360,7 @@ def _quaternion_codes(quats: Array, valid: Array) -> Array:
     turns = unit(np.where(valid[:, None], quats, [1, 0, 0, 0]).astype(np.float64))
     largest = np.abs(turns).argmax(1)
     turns *= np.where(turns[np.arange(len(turns)), largest] < 0, -1, 1)[:, None]
-    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
-    three = np.take_along_axis(turns, others, axis=1)
+    three = np.take_along_axis(turns, OTHERS[largest], axis=1)
     codes = np.rint((three / np.sqrt(2) + 0.5) * 255).clip(0, 255)
     return np.concatenate([codes, 252 + largest[:, None]], axis=1).astype(np.uint8)
 

@@ -12,7 +12,6 @@ by size times opacity, so that a viewer can show the first part; here the order 
 language field goes by rows. Source of the layout: antimatter15/splat; the code here is our own.
 """
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -22,9 +21,9 @@ from langsplat_core.arrays import Array, logit, sigmoid, unit
 from langsplat_core.errors import FormatError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import open_for_reading
-from langsplat_core.io.ply import SH_C0
 from langsplat_core.scene import SH_COUNTS, Gaussians
 from langsplat_core.scene.gaussians import join_gaussians
+from langsplat_core.scene.transform import C0
 
 HUGE = 1e12  # world units that no Gaussian of a real scene has
 _RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("rotation", "u1", 4)])
@@ -71,7 +70,7 @@ def write_splat(path: Path | str, gaussians: Gaussians) -> None:
     rows = np.zeros(len(gaussians), _RECORD)
     rows["position"][valid] = drawn.means
     rows["scale"][valid] = np.exp(drawn.log_scales)
-    rows["colour"][valid, :3] = to_bytes((0.5 + SH_C0 * drawn.sh[:, 0]) * 255)
+    rows["colour"][valid, :3] = to_bytes((0.5 + C0 * drawn.sh[:, 0].astype(np.float64)) * 255)
     rows["colour"][valid, 3] = to_bytes(sigmoid(drawn.opacity_logits) * 255)
     rows["rotation"][valid] = to_bytes(unit(drawn.quats_wxyz.astype(np.float64)) * 128 + 128)
     with atomic_path(path) as temporary:
@@ -79,18 +78,18 @@ def write_splat(path: Path | str, gaussians: Gaussians) -> None:
 
 
 def base_of_colours(rgba: Array) -> Array:
-    """(N, 4) uint8 -> (N, 3) coefficients f_dc."""
-    return (rgba[:, :3] / 255 - 0.5) / SH_C0
+    """(N, 4) uint8 colours and opacities -> (N, 3) coefficients f_dc."""
+    return (rgba[:, :3] / 255 - 0.5) / C0
 
 
 def log_of_scales(scales: Array) -> Array:
-    """0 becomes -infinity, a flat axis; a negative scale NaN, a row that is dropped later."""
+    """Logarithms of scales: -infinity of 0, a flat axis, and NaN of a negative one, a row dropped later."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.log(scales)
 
 
 def to_bytes(values: Array) -> Array:
-    """Rounded and clipped to uint8."""
+    """Round numbers and clip them to uint8."""
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
@@ -110,7 +109,7 @@ def to_bytes(values: Array) -> Array:
 
 
 def _layout(size: int, fields: dict[str, tuple[int, str]]) -> np.dtype[Any]:
-    """A record of `size` bytes; field name -> (offset, type)."""
+    """The type of a record of `size` bytes; field name -> (offset, type)."""
     offsets, kinds = zip(*fields.values(), strict=True)
     return np.dtype({"names": [*fields], "formats": kinds, "offsets": offsets, "itemsize": size})
 
@@ -171,17 +170,17 @@ def read_ksplat(path: Path | str) -> Gaussians:
             )
         _check_sizes(sections, main["level"], size - file.tell(), path)
         parts = [_read_section(file, section, main, path) for section in sections]
-    return _joined(parts)
+    return join_gaussians(parts)
 
 
 def _record(file: BinaryIO, layout: np.dtype[Any]) -> dict[str, Any]:
-    """Field name -> Python number."""
+    """Read one record: field name -> Python number."""
     record = np.frombuffer(file.read(layout.itemsize), layout)[0]
     return {name: record[name].item() for name in layout.names or ()}
 
 
 def _check_sizes(sections: list[dict[str, Any]], level: int, left: int, path: Path) -> None:
-    """Before anything is allocated; `left` is the number of bytes behind the headers."""
+    """FormatError for sections that the `left` bytes behind the headers cannot hold; nothing is allocated."""
     for section in sections:
         if section["degree"] not in SH_COUNTS or section["gaussians"] > section["places"]:
             raise FormatError(
@@ -251,12 +250,3 @@ def _by_degree(rest: Array) -> list[Array]:
         out.append(rest[:, start : start + 3 * width].reshape(-1, 3, width).transpose(0, 2, 1))
         start += 3 * width
     return out
-
-
-def _joined(parts: list[Gaussians]) -> Gaussians:
-    columns = max((part.sh.shape[1] for part in parts), default=1)
-    none = Gaussians(
-        np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0), np.zeros((0, columns, 3))
-    )
-    padded = [np.pad(part.sh, ((0, 0), (0, columns - part.sh.shape[1]), (0, 0))) for part in parts]
-    return join_gaussians([none, *(replace(part, sh=sh) for part, sh in zip(parts, padded, strict=True))])

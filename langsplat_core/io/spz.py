@@ -65,14 +65,7 @@ def widths(version: int, sh_degree: int) -> dict[str, int]:
     }
 
 
-def read_packed(path: Path) -> Packed:
-    """Raises InputError when the file cannot be opened and FormatError when it breaks a rule."""
-    file, size = open_for_reading(path)
-    with file:
-        return _read_opened(file, size, path)
-
-
-def _read_opened(file: BinaryIO, size: int, path: Path) -> Packed:
+def _read_packed(file: BinaryIO, size: int, path: Path) -> Packed:
     start = file.read(8)
     file.seek(0)
     if start.startswith(GZIP_MAGIC):
@@ -238,12 +231,15 @@ def read_spz_scene(path: Path | str) -> Scene:
 
     Raises InputError when the file cannot be opened and FormatError when it breaks a rule of the format.
     """
-    return _scene(read_packed(Path(path)))
+    path = Path(path)
+    file, size = open_for_reading(path)
+    with file:
+        return _scene(_read_packed(file, size, path))
 
 
 def decode_spz(data: bytes, path: Path) -> Scene:
     """The scene of an .spz file in memory, along the axes of the PLY; `path` is for messages. FormatError."""
-    return _scene(_read_opened(io.BytesIO(data), len(data), path))
+    return _scene(_read_packed(io.BytesIO(data), len(data), path))
 
 
 def _scene(packed: Packed) -> Scene:
@@ -318,7 +314,7 @@ def _fractional_bits(drawn: Gaussians, path: Path) -> int:
 
 
 def _positions(packed: Packed) -> Array:
-    """(N, 3) along the axes of the file."""
+    """(N, 3) positions along the axes of the file."""
     data = packed.blocks["positions"]
     if packed.version == 1:
         return np.ascontiguousarray(data).view("<f2").astype(np.float32)
@@ -372,5 +368,5 @@ def quaternion_signs(signs: Array) -> Array:
 
 
 def coefficient_signs(signs: Array, count: int) -> Array:
-    """(count,) of the coefficients from degree 1 on."""
+    """(count,) signs of the coefficients from degree 1 on."""
     return np.where(_ODD, signs, 1).prod(axis=1)[:count]

@@ -12,14 +12,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.pipeline.language import Views, kept_mask_weights
-from langsplat_core.pipeline.stages import (
-    Arrays,
-    ProcessGroup,
-    features_digest,
-    gaussians_digest,
-    kept,
-    stage_key,
-)
+from langsplat_core.pipeline.stages import ProcessGroup, features_digest, gaussians_digest, kept, stage_key
 from langsplat_core.progress import Progress
 from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.scene import Gaussians
@@ -67,7 +60,7 @@ def agreed_features(
         return find_tree(gaussians, build_surface(gaussians), mask_weights, counts, eyes, progress)
 
     key = stage_key("tree", VERSION, *inputs)
-    tree = processes.once(lambda: kept(work / f"{key}.npz", make, _pack, _unpack))
+    tree = processes.once(lambda: kept(work / f"{key}.npz", make, vars, lambda arrays: MergeTree(**arrays)))
     cuts = [tree.cut(cost) for cost in CUTS]
     store = FeatureStore(work / "features")
     made_by = stage_key(key, VERSION, CUTS, LEAST, fingerprint(encoder))
@@ -82,11 +75,3 @@ def agreed_features(
         progress(STAGE, (index + 1) / len(views))
     processes.barrier()
     return StoredFeatures(store, [camera.name for camera, _ in views])
-
-
-def _pack(tree: MergeTree) -> Arrays:
-    return {"patches": tree.patches, "children": tree.children, "costs": tree.costs}
-
-
-def _unpack(arrays: Arrays) -> MergeTree:
-    return MergeTree(arrays["patches"], arrays["children"], arrays["costs"])

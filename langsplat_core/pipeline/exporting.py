@@ -120,7 +120,7 @@ def _language(scene: Scene) -> LanguageField:
 
 
 def _vectors(language: LanguageField, level: int) -> Array:
-    """(N, D) float32 of one level."""
+    """(N, D) float32 unit vectors of one level, zero for no meaning."""
     vectors = np.zeros((len(language), language.codec.vector_dim), np.float32)
     known = np.flatnonzero(language.known[level])
     for start in range(0, len(known), BLOCK):
@@ -172,7 +172,7 @@ def langsplat_stems(folder: Path) -> list[str]:
 
 
 def _of_levels(vectors: Array, labels: Array) -> ImageFeatures:
-    """With the vectors that (3, H, W) labels name, and without those of the default masks."""
+    """The features of (3, H, W) labels, without the vectors that none of them names, as default masks'."""
     used, compact = np.unique(labels, return_inverse=True)
     empty = int(used[0] == -1) if len(used) else 0
     rows = compact.reshape(labels.shape).astype(np.int32) - empty

@@ -14,13 +14,12 @@ from langsplat_core.config import CodebookConfig, CodecConfig, check_settings
 from langsplat_core.errors import InputError
 from langsplat_core.io.foreign import ForeignScene
 from langsplat_core.io.foreign_language import Leaves
-from langsplat_core.pipeline.language import encoded_phrases
+from langsplat_core.pipeline.language import field_of
 from langsplat_core.progress import Progress, silent
-from langsplat_core.scene import CANONICAL_PHRASES, LEVELS, Codec, LanguageField, Scene
+from langsplat_core.scene import LEVELS, Codec, Scene
 from langsplat_core.scene.codec import LARGEST, SHORTEST
 from langsplat_core.semantics.encoder import OPEN_MODEL
 from langsplat_core.semantics.encoders import load_text_encoder
-from langsplat_core.semantics.vocabulary import everyday_vectors
 from langsplat_core.training.language.codec_fit import (
     CodecReport,
     Vocabulary,
@@ -36,7 +35,7 @@ BLOCK = 16_384  # Gaussians read at a time: 32 MB at 512 float32 numbers
 
 @dataclass(frozen=True)
 class ImportReport:
-    """Report on the import of a foreign scene."""
+    """Report on the import of a scene of another method."""
 
     method: str
     codec: str  # its kind; empty without a language field
@@ -73,20 +72,11 @@ def import_scene(
     vocabulary = everyday_vocabulary(encoder, phrases)
     codec, loss = _codec(foreign, config, vocabulary, progress)
     latents, confidence = _latents(foreign, codec, progress)
-    field = LanguageField(
-        latents=latents,
-        confidence=confidence,
-        codec=codec,
-        canonical=encoder.encode_texts(list(CANONICAL_PHRASES)),
-        encoder_id=encoder.id,
-        phrasebook=encoded_phrases(encoder, phrases),
-        reading=encoder.reading.elsewhere,
-        everyday=everyday_vectors(encoder),
-    )
+    field = field_of((latents, confidence), codec, encoder, phrases)
     subpart, part, whole = confidence.mean(1).tolist() if confidence.size else (0.0, 0.0, 0.0)
     shares = (subpart, part, whole)
     report = ImportReport(foreign.method, codec.kind, codec.size, shares, loss, foreign.notes)
-    return replace(foreign.scene, language=field), report
+    return replace(foreign.scene, language=replace(field, reading=encoder.reading.elsewhere)), report
 
 
 def _first_path(foreign: ForeignScene) -> object:

@@ -95,22 +95,13 @@ def language_field(
     codec, report = stages.codec()
     latents, confidence = stages.latents(codec)
     confidence = confidence.clip(max=MOST_CONFIDENCE).astype(np.float16).astype(np.float32)
-    field = LanguageField(
-        latents=latents,
-        confidence=confidence,
-        codec=codec,
-        canonical=encoder.encode_texts(list(CANONICAL_PHRASES)),
-        encoder_id=encoder.id,
-        phrasebook=encoded_phrases(encoder, config.phrases),
-        reading=encoder.reading,
-        everyday=everyday_vectors(encoder),
-    )
+    field = field_of((latents, confidence), codec, encoder, config.phrases)
     tree = stages.tree(field)
     return replace(field, tree=tree, codec=_coloured(field, tree, gaussians)), report
 
 
 def _coloured(field: LanguageField, tree: Tree, gaussians: Gaussians) -> Codec:
-    """The codec; a codebook with colours that tell neighbours apart."""
+    """The codec of a field; a codebook gets colours that differ between neighbours."""
     if not isinstance(field.codec, CodebookCodec):
         return field.codec
     colours = contrasting_colours(field, tree, build_surface(gaussians))
@@ -200,7 +191,7 @@ class _Stages:
             tree = build_tree(surface(), field.codec, field.latents, field.known, things)
             return replace(tree, votes=count_votes(tree, mask_weights, counts))
 
-        return self._processes.once(lambda: kept(path, make, _pack_tree, _unpack_tree))
+        return self._processes.once(lambda: kept(path, make, vars, lambda arrays: Tree(**arrays)))
 
     def _fit(self) -> tuple[Codec, CodecReport]:
         config, vocabulary = self._config.codec, everyday_vocabulary(self._encoder, self._config.phrases)
@@ -298,7 +289,7 @@ def _what_matters(config: LiftConfig) -> LiftConfig:
 
 
 def _encoded(codec: Codec, lifted: Lifted) -> Latents:
-    """(3, n, d) latents, zero where unobserved, and (3, n) confidence."""
+    """Encode lifted vectors: (3, n, d) latents, zero where unobserved, and (3, n) confidence."""
     levels, count, dim = lifted.vectors.shape
     latents = codec.encode(lifted.vectors.reshape(-1, dim)).reshape(levels, count, -1)
     return np.where(lifted.confidence[..., None] > 0, latents, 0).astype(latents.dtype), lifted.confidence
@@ -310,14 +301,6 @@ def _pack(latents: Latents) -> Arrays:
 
 def _unpack(arrays: Arrays) -> Latents:
     return arrays["latents"], arrays["confidence"]
-
-
-def _pack_tree(tree: Tree) -> Arrays:
-    return {"leaves": tree.leaves, "parents": tree.parents, "levels": tree.levels, "votes": tree.votes}
-
-
-def _unpack_tree(arrays: Arrays) -> Tree:
-    return Tree(arrays["leaves"], arrays["parents"], arrays["levels"], arrays["votes"])
 
 
 def _pack_groups(groups: MaskGroups) -> Arrays:
@@ -338,7 +321,18 @@ def _unpack_codec(arrays: Arrays) -> tuple[Codec, CodecReport]:
     return codec_from_tensors(str(arrays["kind"]), tensors), CodecReport(*arrays["report"].tolist())
 
 
-def encoded_phrases(encoder: Encoder | PhraseEncoder, phrases: tuple[str, ...]) -> dict[str, Array]:
-    """A scene's phrasebook: `phrase_key` -> (D,) float32 unit vector, each phrase once."""
+def field_of(
+    latents: Latents, codec: Codec, encoder: PhraseEncoder, phrases: tuple[str, ...]
+) -> LanguageField:
+    """The field of latents and confidences, without a tree, with all that a query needs of the encoder; its
+    phrasebook has each of `phrases` once."""
     names = list(dict.fromkeys(phrase_key(phrase) for phrase in phrases))
-    return dict(zip(names, encoder.encode_texts(names), strict=True))
+    return LanguageField(
+        *latents,
+        codec=codec,
+        canonical=encoder.encode_texts(list(CANONICAL_PHRASES)),
+        encoder_id=encoder.id,
+        phrasebook=dict(zip(names, encoder.encode_texts(names), strict=True)),
+        reading=encoder.reading,
+        everyday=everyday_vectors(encoder),
+    )

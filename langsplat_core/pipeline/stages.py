@@ -174,7 +174,7 @@ class ProcessGroup:
         return self.rank == 0
 
     def share(self, items: Sequence[T]) -> list[T]:
-        """The items that are this process's."""
+        """The part of `items` that is this process's work."""
         return list(items[self.rank :: self.size])
 
     def barrier(self) -> None:

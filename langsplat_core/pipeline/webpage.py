@@ -54,7 +54,7 @@ NO_TABLES = "a page answers by everyday phrases, and neither the scene nor an en
 
 @dataclass(frozen=True)
 class PageReport:
-    """What a page holds."""
+    """The content of a page that was written."""
 
     gaussians: int
     phrases: int  # that can be completed

@@ -40,13 +40,13 @@ class QueryResult:
     relevancy: Array  # (3, N) float32 in [0, 1] per level and Gaussian
     even: Array  # (N,) float32 relevancy at the level, the same all over a region
     peak: float  # score of the chosen level
-    fits: Fits  # of the best region, or neighbourhood, of each level, see `chance.Scale.fit`
+    fits: Fits  # of the best region, or neighbourhood, of each level, see `Scale.fit`
     probability: float | None  # that the thing is there at all; None where the encoder is not calibrated
     found: bool
     members: Array  # (N,) bool: the Gaussians that answer, wherever they are
     place: Array | None  # (3,) world units
     box: Array | None  # (2, 3) corners, world units
-    excess: float | None = None  # where there is none: spreads above chance, see `chance.excess`
+    excess: float | None = None  # where there is none: spreads above chance, see `Bar.excess`
     own_cut: float | None = None  # relevancy from which on everything is a member, where it was set by hand
 
     @property
@@ -83,7 +83,7 @@ def recut(result: QueryResult, cut: float) -> QueryResult:
 
 
 def triple(values: Iterable[float]) -> Triple:
-    """Three values as plain numbers."""
+    """Three values as Python numbers."""
     subpart, part, whole = values
     return float(subpart), float(part), float(whole)
 
@@ -215,7 +215,7 @@ def with_parts(regions: Regions, own: tuple[Array, ...]) -> tuple[Array, ...]:
 
 
 def _relevancy(fits: Array) -> Array:
-    """Relevancy that fits stand for, 0 of what means nothing."""
+    """The relevancy of fits, 0 for what has no meaning."""
     return np.where(fits > NOTHING, sigmoid(fits), 0)
 
 
@@ -234,7 +234,7 @@ def _best(values: Array, sizes: Array) -> float:
 
 
 def _level(best: Array, named: Named) -> int:
-    """The best after its advantage; of equal ones the coarsest."""
+    """The level with the best fit, advantage included; the coarsest of equal ones."""
     given = best + ADVANTAGE[named]
     return int(np.flatnonzero(given == given.max())[-1])
 

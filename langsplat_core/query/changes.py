@@ -17,14 +17,14 @@ import numpy as np
 from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.describe import LIKELY, NAMES, OR, Describer
+from langsplat_core.query.describe import NAMES, Describer, likely_name
 from langsplat_core.query.engine import QueryEngine, same_vectors
 from langsplat_core.query.instances import axis_aligned_box
 from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.scene.surface import surface_areas
-from langsplat_core.scene.transform import similarity
+from langsplat_core.scene.transform import moved_camera, similarity
 
 Kind = Literal["gone", "appeared", "moved", "recoloured"]
 KINDS: tuple[Kind, ...] = ("gone", "appeared", "moved", "recoloured")
@@ -81,12 +81,12 @@ class _Piece:
 
     @property
     def share(self) -> float:
-        """Of its pixels, in [0, 1]: those that changed."""
+        """Share of its pixels that changed, in [0, 1]."""
         return (self.gone + self.coloured) / max(self.gone + self.kept, 1e-9)
 
     @property
     def is_absent(self) -> bool:
-        """Whether it is gone, and not only of another colour."""
+        """True if it is gone, and has not just another colour."""
         return self.gone >= ABSENT * (self.gone + self.kept)
 
     @property
@@ -116,7 +116,8 @@ def changes(
     lost = [piece for piece in gone if piece.is_absent]
     new = [piece for piece in appeared if piece.is_absent]
     found: list[Change] = []
-    for old, now in _matched(lost, new, _same_words(first, second)):
+    one_encoder = same_vectors(first.field.canonical, second.field.canonical)
+    for old, now in _matched(lost, new, one_encoder):
         lost, new = [p for p in lost if p is not old], [p for p in new if p is not now]
         moved = now.points.mean(0) - old.points.mean(0)
         found.append(replace(_change("moved", now, 1, describers), moved=moved))
@@ -143,14 +144,14 @@ def _evidence(
 ) -> tuple[Array, Array]:
     """(N, `_CHANNELS`) float64 of the Gaussians of both scenes."""
     back = np.linalg.inv(into)
-    own, others = _some(first.cameras), [_seen_from(camera, back) for camera in _some(second.cameras)]
+    own, others = _some(first.cameras), [moved_camera(camera, back)[0] for camera in _some(second.cameras)]
     if not own + others:
         raise InputError("neither scene has cameras to look from; keep .cameras.json beside one of them")
     scale = float(np.cbrt(np.linalg.det(into[:3, :3])))
     sums = np.zeros((len(first.gaussians), _CHANNELS)), np.zeros((len(second.gaussians), _CHANNELS))
     for done, camera in enumerate(own + others):
         progress("comparing the scenes", done / len(own + others))
-        pair = ((first, camera), (second, _seen_from(camera, into)))
+        pair = ((first, camera), (second, moved_camera(camera, into)[0]))
         views = [rasterizer.view(s.gaussians, c, s.raster_settings()) for s, c in pair]
         drawn = [splat_colours(view, s.gaussians, c) for view, (s, c) in zip(views, pair, strict=True)]
         looks = [to_lab(np.clip(image.colours, 0, 1)) for image in drawn]
@@ -182,24 +183,9 @@ def _evidence(
 
 
 def _some(cameras: Sequence[Camera]) -> list[Camera]:
-    """At most `VIEWS` of them, evenly, small."""
+    """At most `VIEWS` of the cameras, evenly chosen, with images of at most `SIDE`."""
     chosen = np.unique(np.linspace(0, len(cameras) - 1, min(VIEWS, len(cameras))).astype(int))
-    small = []
-    for camera in (cameras[row] for row in chosen):
-        share = min(SIDE / max(camera.width, camera.height), 1.0)
-        small.append(
-            camera.resized(max(round(share * camera.width), 1), max(round(share * camera.height), 1))
-        )
-    return small
-
-
-def _seen_from(camera: Camera, into: Array) -> Camera:
-    """`camera`, of the frame that `into` leads to, in the frame that it comes from: what it sees is the same,
-    but for the scale of depths."""
-    scale = np.cbrt(np.linalg.det(into[:3, :3]))
-    matrix = camera.world_to_camera @ into
-    matrix[:3] /= scale
-    return replace(camera, world_to_camera=matrix)
+    return [cameras[row].within(SIDE) for row in chosen]
 
 
 def to_lab(colours: Array) -> Array:
@@ -310,14 +296,9 @@ def _together(
 
 
 def _meet(one: Array, other: Array) -> bool:
-    """Whether boxes (2, 3) overlap, or nearly."""
+    """True if two boxes (2, 3) overlap, or nearly."""
     room = TOUCHING * max(np.linalg.norm(one[1] - one[0]), np.linalg.norm(other[1] - other[0]))
     return bool(((one[0] - room <= other[1]) & (other[0] - room <= one[1])).all())
-
-
-def _same_words(first: QueryEngine, second: QueryEngine) -> bool:
-    """Whether meanings of both scenes are of one encoder."""
-    return same_vectors(first.field.canonical, second.field.canonical)
 
 
 def _matched(lost: list[_Piece], new: list[_Piece], comparable: bool) -> list[tuple[_Piece, _Piece]]:
@@ -346,9 +327,6 @@ def _change(kind: Kind, piece: _Piece, scene: int, describers: tuple[Describer, 
 
 
 def _name(describer: Describer, rows: Array) -> str | None:
-    """The best words for Gaussians as a whole, as many as are likely together."""
-    words = describer.at_gaussians(rows, top=NAMES)[-1].words
-    for count in range(1, len(words) + 1):
-        if sum(word.probability for word in words[:count]) >= LIKELY:
-            return OR.join(word.phrase for word in words[:count])
-    return None
+    """The likeliest name of the Gaussians `rows` as one whole."""
+    name = likely_name(describer.at_gaussians(rows, top=NAMES)[-1].words)
+    return None if name is None else name.phrase

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, across
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.progress import Progress, silent
@@ -63,17 +63,17 @@ class Body:
 
     @property
     def centre(self) -> Array:
-        """(3,) of its box."""
+        """(3,) centre of its bounding box."""
         return (self.low + self.high) / 2
 
     @property
     def size(self) -> float:
-        """Diagonal of its box, world units."""
+        """Diagonal of its bounding box, world units."""
         return float(np.linalg.norm(self.high - self.low))
 
     @cached_property
     def tree(self) -> cKDTree:
-        """Search tree of its points."""
+        """A k-d tree of its points."""
         return cKDTree(self.points)
 
     @cached_property
@@ -89,7 +89,7 @@ class Viewpoint:
     matrix: Array  # (4, 4) from the axes of bodies to the camera's
 
     def centre(self, body: Body) -> Array:
-        """(3,) of a body, in the camera's axes."""
+        """(3,) centre of a body, in the camera's axes."""
         seen: Array = self.matrix[:3, :3] @ body.centre + self.matrix[:3, 3]
         return seen
 
@@ -101,7 +101,7 @@ class Viewpoint:
 
 def upright(up: Array) -> Array:
     """(3,) unit -> (3, 3) rotation of world points into axes of which the last is up."""
-    first = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    first = across(up)
     first /= np.linalg.norm(first)
     return np.stack([first, np.cross(up, first), up])
 
@@ -323,7 +323,7 @@ def joined(answers: Sequence[QueryResult], all_needed: bool) -> QueryResult:
 
 
 def without(what: QueryResult, unwanted: QueryResult) -> QueryResult:
-    """`what` but for `unwanted`, if that is there."""
+    """`what` without the members of `unwanted`, if that was found."""
     return restricted(what, ~unwanted.members, what) if unwanted.found else what
 
 
@@ -336,18 +336,18 @@ def surest(engine: QueryEngine, answer: QueryResult) -> QueryResult:
 
 
 def _combined(values: Sequence[float | None], score: Callable[[Iterable[float]], float]) -> float | None:
-    """The weakest or the best, as `score` says; None where one is not known."""
+    """The smallest or largest value, by `score`; None where a value is not known."""
     known = [value for value in values if value is not None]
     return score(known) if len(known) == len(values) else None
 
 
 def _of_any(members: Array, probability: float | None) -> float | None:
-    """0 where there are no members, in a scene that has probabilities."""
+    """`probability`, but 0 where there are no members; None without calibration."""
     return probability if probability is None or members.any() else 0.0
 
 
 def restricted(answer: QueryResult, keep: Array, needed: QueryResult) -> QueryResult:
-    """`answer` where `keep` (N,) holds; nothing is found without `needed`."""
+    """`answer` limited to `keep` (N,); nothing is found where `needed` is not."""
     members = answer.members & keep
     return replace(
         answer,

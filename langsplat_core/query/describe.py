@@ -15,6 +15,7 @@ word of the vocabulary fits.
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import islice
 from typing import get_args
 
 import numpy as np
@@ -65,7 +66,7 @@ class WordScores:
     scale: float  # of the softmax
 
     def vector(self, phrase: str) -> Array:
-        """(D,) of one of the phrases."""
+        """(D,) unit vector of one of the phrases."""
         found: Array = self.vectors[self.phrases.index(phrase)]
         return found
 
@@ -113,15 +114,24 @@ class WordScores:
         return [slice(start, start + rows) for start in range(0, count, rows)]
 
 
+def likely_name(words: Sequence[Word]) -> Word | None:
+    """The best word, or as many as are `LIKELY` together: "mug or cup"; None where all together are not."""
+    for count in range(1, len(words) + 1):
+        probability = sum(word.probability for word in words[:count])
+        if probability >= LIKELY:
+            return Word(OR.join(word.phrase for word in words[:count]), probability)
+    return None
+
+
 def build_words(field: LanguageField, phrases: tuple[str, ...], vectors: Array) -> WordScores:
-    """Names of things: V phrases and their (V, D) unit vectors."""
+    """Scores of names of things, from V phrases and their (V, D) unit vectors."""
     every, bank = np.concatenate([vectors, field.canonical]).astype(np.float32), meanings(field)
     return WordScores(phrases, every, hubs(every, bank), WORD_SCALE / _spread(field, vectors, bank))
 
 
 def build_attributes(field: LanguageField, phrases: tuple[str, ...], vectors: Array) -> WordScores:
-    """Words of which a thing has one, such as colours: V phrases and their (V, D) unit vectors. Few and all
-    of one kind, they are no hubs."""
+    """Scores of words of which a thing has one, such as colours, from V phrases and their (V, D) unit
+    vectors. Few and all of one kind, they are no hubs."""
     scale = ATTRIBUTE_SCALE / _spread(field, vectors, meanings(field))
     return WordScores(phrases, vectors.astype(np.float32), np.zeros(len(vectors), np.float32), scale)
 
@@ -280,7 +290,7 @@ def same_things(names: Array, surface: Array) -> list[list[int]]:
 
 @dataclass(frozen=True)
 class Words:
-    """The words for a place, at one level."""
+    """The most probable words for a place at one level."""
 
     level: int  # index into LEVELS
     words: tuple[Word, ...]  # the most probable first; none where nothing is known
@@ -384,37 +394,26 @@ class Describer:
                     yield shown(part, own)
 
         def shown(node: int, word: Word | None) -> Outline:
-            within = sorted(below(node, word), key=lambda part: -part.share)
-            return self._outlined(node, word, members[node], float(totals[node]), tuple(within))
+            rows = members[node]
+            weights = np.maximum(self.areas[rows], 1e-300)
+            positions = self.engine.scene.gaussians.means[rows].astype(np.float64)
+            return Outline(
+                node=node,
+                level=int(tree.levels[node]),
+                word=word,
+                count=len(rows),
+                share=float(totals[node]),
+                centre=weights @ positions / weights.sum(),
+                size=2 * oriented_box(positions).half_extents,
+                votes=(int(tree.votes[node, 0]), int(tree.votes[node, 1])),
+                parts=tuple(sorted(below(node, word), key=lambda part: -part.share)),
+            )
 
         return tuple(shown(node, self._name(node, members[node])) for node in parts.get(NO_NODE, []))
 
     def _name(self, node: int, rows: Array) -> Word | None:
-        """The best word for a node, or as many as are likely together: "mug or cup"; None where none are."""
         level, weights = int(self.engine.tree.levels[node]), np.maximum(self.areas[rows], 1e-300)
-        words = self._at_level(level, rows, weights, NAMES).words
-        for count in range(1, len(words) + 1):
-            probability = sum(word.probability for word in words[:count])
-            if probability >= LIKELY:
-                return Word(OR.join(word.phrase for word in words[:count]), probability)
-        return None
-
-    def _outlined(
-        self, node: int, word: Word | None, rows: Array, share: float, parts: tuple[Outline, ...]
-    ) -> Outline:
-        tree, weights = self.engine.tree, np.maximum(self.areas[rows], 1e-300)
-        positions = self.engine.scene.gaussians.means[rows].astype(np.float64)
-        return Outline(
-            node=node,
-            level=int(tree.levels[node]),
-            word=word,
-            count=len(rows),
-            share=share,
-            centre=weights @ positions / weights.sum(),
-            size=2 * oriented_box(positions).half_extents,
-            votes=(int(tree.votes[node, 0]), int(tree.votes[node, 1])),
-            parts=parts,
-        )
+        return likely_name(self._at_level(level, rows, weights, NAMES).words)
 
     def _verified(self, claim: _Claim) -> Entry | None:
         """The claim as an entry under the first of its words that a query finds there, if any."""
@@ -486,7 +485,7 @@ class Describer:
 
 @dataclass(frozen=True, eq=False)
 class Pointed:
-    """The surface in one pixel."""
+    """The surface that one pixel shows, in words."""
 
     position: Array  # (3,) world units
     depth: float  # camera z, world units
@@ -537,7 +536,7 @@ TRIES = 4  # candidates that are asked for each example wanted
 
 @dataclass(frozen=True)
 class Suggestions:
-    """Help for someone who does not know a scene."""
+    """Examples and phrases for someone who does not know a scene."""
 
     examples: tuple[str, ...] = ()  # each is found in the scene
     phrases: tuple[str, ...] = ()  # that its encoder or its phrasebook knows, what is in the scene first
@@ -557,13 +556,8 @@ def suggest(engine: QueryEngine, at_most: int = EXAMPLES, progress: Progress = s
     except LangSplatError:  # no encoder here, or one that knows none of the words: the phrasebook is left
         pass
     candidates = tuple(dict.fromkeys((*here, *book)))
-    examples: list[str] = []
-    for phrase in candidates[: TRIES * at_most]:
-        if len(examples) == at_most:
-            break
-        if _is_found(engine, phrase):
-            examples.append(phrase)
-    return Suggestions(tuple(examples), tuple(dict.fromkeys((*candidates, *taught))))
+    found = (phrase for phrase in candidates[: TRIES * at_most] if _is_found(engine, phrase))
+    return Suggestions(tuple(islice(found, at_most)), tuple(dict.fromkeys((*candidates, *taught))))
 
 
 def _is_found(engine: QueryEngine, phrase: str) -> bool:

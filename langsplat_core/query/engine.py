@@ -300,7 +300,7 @@ class QueryEngine:
         return [key for key in dict.fromkeys(keys) if key not in book and key not in self._encoded]
 
     def _vectors(self, keys: Sequence[str]) -> Array:
-        """(Q, D) of phrases of which none is fresh."""
+        """(Q, D) vectors of phrases that are all known already."""
         book = self.field.phrasebook
         vectors = [book[key] if key in book else self._encoded[key] for key in keys]
         return np.stack(vectors) if vectors else np.zeros((0, self.field.codec.vector_dim), np.float32)
@@ -466,7 +466,7 @@ def check_words(field: LanguageField, words: Words) -> None:
 
 
 def same_vectors(canonical: Array, own: Array) -> bool:
-    """Whether canonical vectors are of one encoder."""
+    """True if two sets of canonical vectors are of the same encoder."""
     return canonical.shape == own.shape and bool(
         ((canonical.astype(np.float64) * own).sum(1) >= SAME_ENCODER).all()
     )

@@ -12,19 +12,14 @@ from langsplat_core.errors import EncoderError, LangSplatError
 from langsplat_core.io.language import SUFFIX, read_stored
 from langsplat_core.io.scenes import companion_path, load_scene
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.answers import (
-    NEARLY,
-    WEAK,
-    QueryResult,
-    Verdict,
-    excess,
-)
+from langsplat_core.query.answers import NEARLY, WEAK, QueryResult, Verdict, excess
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import LoadEncoder, QueryEngine
 from langsplat_core.query.grammar import Atom, Named, heads, named, parse
 from langsplat_core.query.library import Group, Library, Listed, draw, fits_in
-from langsplat_core.scene import LEVELS, Gaussians, LanguageField, Scene
+from langsplat_core.scene import LEVELS, LanguageField, Scene
 from langsplat_core.scene.codec import LinearCodec
+from langsplat_core.scene.gaussians import join_gaussians
 from langsplat_core.scene.language import phrase_key
 from langsplat_core.semantics.relevancy import NARROWEST
 
@@ -33,7 +28,7 @@ PICTURE = (320, 240)  # width and height, pixels, of the picture of an answer
 
 @dataclass(frozen=True, eq=False)
 class Hit:
-    """One scene that answers a phrase, or might."""
+    """The answer of one scene to a phrase."""
 
     path: Path
     verdict: Verdict
@@ -46,7 +41,7 @@ class Hit:
 
 @dataclass(frozen=True, eq=False)
 class Answered:
-    """A phrase in all scenes of one encoder."""
+    """The answers of all scenes of one encoder to a phrase."""
 
     phrase: str
     encoder_id: str
@@ -55,7 +50,7 @@ class Answered:
     unread: tuple[tuple[str, str], ...] = ()  # scenes that could not be opened, and why
 
     def count(self, verdict: Verdict) -> int:
-        """Number of scenes with a verdict."""
+        """Number of scenes with this verdict."""
         return sum(hit.verdict == verdict for hit in self.hits)
 
 
@@ -151,10 +146,9 @@ def _vector(library: Library, group: Group, text: str, load_encoder: LoadEncoder
     dim = group.canonical.shape[1]
     codec = LinearCodec(np.eye(1, dim, dtype=np.float32))
     none = np.zeros((len(LEVELS), 0, 1), np.float32), np.zeros((len(LEVELS), 0), np.float32)
-    empty = Gaussians(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0), np.zeros((0, 1, 3)))
     field = LanguageField(*none, codec, group.canonical, group.encoder_id)
     try:
-        return QueryEngine(Scene(empty, field), load_encoder).text_vector(text)
+        return QueryEngine(Scene(join_gaussians([]), field), load_encoder).text_vector(text)
     except EncoderError:
         for scene in group.scenes:
             if scene.phrases:

@@ -16,14 +16,14 @@ EXTREMES: tuple[Extreme, ...] = get_args(Extreme)
 
 @dataclass(frozen=True)
 class Atom:
-    """A phrase that is asked whole."""
+    """A phrase that is asked as it is."""
 
     text: str
 
 
 @dataclass(frozen=True)
 class Inside:
-    """A part, looked for on the whole alone."""
+    """A part of a thing, searched within that thing alone."""
 
     part: "Phrase"
     whole: "Phrase"
@@ -31,7 +31,7 @@ class Inside:
 
 @dataclass(frozen=True)
 class Relation:
-    """The ones of `what` that stand so to one of `anchor`."""
+    """Those of `what` that are in the relation `kind` to one of `anchor`."""
 
     kind: Side
     what: "Phrase"
@@ -40,14 +40,14 @@ class Relation:
 
 @dataclass(frozen=True)
 class Both:
-    """All of them, each to be there."""
+    """All of several things, each of which must be found."""
 
     items: tuple["Phrase", ...]
 
 
 @dataclass(frozen=True)
 class Union:
-    """Whichever of them is there."""
+    """Those of several things that are found."""
 
     items: tuple["Phrase", ...]
 
@@ -62,7 +62,7 @@ class Without:
 
 @dataclass(frozen=True)
 class Superlative:
-    """The one of `what` that is most so; "nearest" and "farthest" are seen from `anchor`, else the viewer."""
+    """The one of `what` that is the most `kind`; "nearest" and "farthest" from `anchor`, else the camera."""
 
     kind: Extreme
     what: "Phrase"
@@ -71,7 +71,7 @@ class Superlative:
 
 @dataclass(frozen=True)
 class Counted:
-    """All of `what`, of which there are to be so many or more."""
+    """All of `what`, of which there must be `count` or more."""
 
     count: int
     what: "Phrase"
@@ -367,14 +367,14 @@ def _query(tokens: list[str]) -> Phrase:
 
 
 def _of_it(unwanted: Phrase, wanted: Phrase) -> Phrase:
-    """ "mug without handle": the mug's own handle is meant."""
+    """In "mug without handle" the mug's own handle is meant: `unwanted`, as a part of `wanted`."""
     part, whole = (atoms(tree)[0].text.split()[-1] for tree in (unwanted, wanted))
     own = isinstance(unwanted, Atom) and is_part(part) and isinstance(wanted, Atom) and not is_part(whole)
     return Inside(unwanted, wanted) if own else unwanted
 
 
 def _exclusion_at(tokens: list[str], at: int) -> int:
-    """Number of tokens of the exclusion that begins there; 0 for none."""
+    """Number of tokens of the exclusion that begins at token `at`; 0 for none."""
     for words in _EXCLUSIONS:
         if tuple(token.lower() for token in tokens[at : at + len(words)]) == words:
             return len(words)
@@ -397,7 +397,7 @@ def _all(tokens: list[str]) -> Phrase:
 
 
 def _split(tokens: list[str], marks: tuple[str, ...]) -> list[list[str]]:
-    """Between `marks`, unless a side would name nothing."""
+    """Split tokens at `marks`, unless a side would name nothing."""
     parts: list[list[str]] = [[]]
     for token in tokens:
         if token.lower() in marks:
@@ -408,7 +408,7 @@ def _split(tokens: list[str], marks: tuple[str, ...]) -> list[list[str]]:
 
 
 def _names(tokens: list[str]) -> bool:
-    """True of words that name a thing: more than stop words and descriptions."""
+    """True for words that name a thing: more than stop words and descriptions."""
     words = [token for token in tokens if token != ","]
     return not only(_EMPTY, words) or (bool(words) and words[-1].lower() in ALSO_NOUNS)
 

@@ -30,13 +30,13 @@ class OrientedBox:
 
     @property
     def corners(self) -> Array:
-        """(8, 3) world units."""
+        """(8, 3) corners of the box, world units."""
         signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
         corners: Array = self.centre + (signs * self.half_extents) @ self.axes.T
         return corners
 
     def contains(self, points: Array) -> Array:
-        """(N, 3) -> (N,) bool; a point on a face is inside."""
+        """(N, 3) points -> (N,) bool, True inside the box or on a face."""
         inside: Array = (np.abs((points - self.centre) @ self.axes) <= self.half_extents * (1 + 1e-9)).all(1)
         return inside
 
@@ -151,7 +151,7 @@ class Instance:
 
 
 def told_apart(surface: Surface, numbers: Array, wholes: Array | None, join: bool) -> list[Array]:
-    """Of the Gaussians `numbers` (K,) of a surface those of each single thing.
+    """Divide the Gaussians `numbers` (K,) of a surface into single things.
 
     wholes: (N,) voted wholes, see `Tree.voted`, which tell apart things that touch; join: what is of one
     whole is one, connected or not.
@@ -206,7 +206,7 @@ def find_instances(
 
 
 def _ranked(scores: Array, extents: Array, counts: Array) -> Array:
-    """Numbers of the parts that are no crumbs, best first."""
+    """Indices of the parts that are not crumbs, best first."""
     kept = np.flatnonzero((counts >= CRUMB_COUNT) & (extents >= CRUMB_SHARE * extents.max()))
     if len(kept) == 0:
         return np.array([int(extents.argmax())])
@@ -217,7 +217,7 @@ def _ranked(scores: Array, extents: Array, counts: Array) -> Array:
 def _instance(
     surface: Surface, own: Array, members: Array, relevancy: Array, score: float, share: float
 ) -> Instance:
-    """own: its numbers on the surface; members: its rows, these and faint ones."""
+    """The thing with the Gaussians `own` on the surface; members: rows of these and of faint ones."""
     points, weights = surface.positions[own], surface.weights[own].astype(np.float64)
     weights /= weights.sum()
     return Instance(

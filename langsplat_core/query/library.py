@@ -36,14 +36,7 @@ from langsplat_core.io.hostile import exists, open_for_reading, parse_json
 from langsplat_core.io.language import SUFFIX
 from langsplat_core.io.scenes import companion_path, format_of, load_scene, scene_files
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.answers import (
-    NOTHING,
-    PARTS,
-    Bar,
-    Bars,
-    QueryResult,
-    bars,
-)
+from langsplat_core.query.answers import NOTHING, PARTS, Bar, Bars, QueryResult, bars
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, same_vectors
 from langsplat_core.query.grammar import Named
 from langsplat_core.raster import load_rasterizer
@@ -81,7 +74,7 @@ class Columns(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Listed:
-    """One scene of the folder, as the index knows it."""
+    """A scene of the folder, as the index describes it."""
 
     path: str  # below the folder, "/" between names
     stamp: tuple[int, ...]  # size and time of change, ns, of each of its files
@@ -136,7 +129,7 @@ class Library:
 
     @property
     def scenes(self) -> tuple[Listed, ...]:
-        """All scenes that can be searched."""
+        """Scenes that can be searched."""
         return tuple(scene for group in self.groups for scene in group.scenes)
 
 
@@ -179,7 +172,7 @@ def stamp_of(scene: Path) -> tuple[int, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Digest:
-    """What the index keeps of one scene."""
+    """The entry of one scene in the index."""
 
     listed: Listed
     encoder_id: str = ""
@@ -189,7 +182,7 @@ class Digest:
 
 
 def digest(path: Path, name: str, load_encoder: LoadEncoder | None) -> Digest:
-    """Read a scene; one that cannot be read, or has no field, says why."""
+    """Read a scene for the index; one that cannot be read, or has no field, is listed with the reason."""
     listed = Listed(name, stamp_of(path))
     try:
         scene = load_scene(path)
@@ -282,7 +275,7 @@ def update_library(
 
 
 def _digests(library: Library) -> Iterator[Digest]:
-    """Every scene of a library, as views of its arrays."""
+    """Yield the entry of every scene of a library, as views of its arrays."""
     pictures = library.thumbnails or {}
     for group in library.groups:
         starts = group.starts

@@ -71,12 +71,12 @@ def sphere_to_octahedral(vectors: Array) -> Array:
 
 
 def _folded(xy: Array, z: Array) -> Array:
-    """The square's corners turned out where z < 0, or back in."""
+    """Fold the lower half (z < 0) of the octahedron out into the square's corners, or back in."""
     return np.where((z < 0)[..., None], (1 - np.abs(xy[..., ::-1])) * np.where(xy >= 0, 1, -1), xy)
 
 
 class ExactLookup:
-    """Every distinct latent compared, and a fetch per Gaussian: exact, in bounded memory."""
+    """Compares every distinct latent, then fetches per Gaussian: exact, in bounded memory."""
 
     def __init__(self, field: LanguageField, scale: Scale) -> None:
         self._codec = field.codec
@@ -121,7 +121,7 @@ def build_lookup(field: LanguageField, scale: Scale, exact: bool = False) -> Loo
 
 @kernel
 def _fetch(first: int, last: int, values: Array, codes: Array, found: Array) -> None:
-    """Rows [first, last) of `found` (3 N,)."""
+    """Fill rows [first, last) of `found` (3 N,)."""
     for i in range(first, last):
         found[i] = values[codes[i]]
 
@@ -130,7 +130,7 @@ def _fetch(first: int, last: int, values: Array, codes: Array, found: Array) -> 
 def _interpolate(
     first: int, last: int, nodes: Array, corner: Array, fraction: Array, resolution: int, found: Array
 ) -> None:
-    """Rows [first, last) of `found` (M,), bilinear."""
+    """Fill rows [first, last) of `found` (M,), bilinear."""
     one = np.float32(1)
     for i in range(first, last):
         node, u, v = corner[i], fraction[i, 0], fraction[i, 1]

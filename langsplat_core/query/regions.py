@@ -100,7 +100,7 @@ def _sum_pieces(first: int, last: int, values: Array, everywhere: Array, weights
 
 @kernel
 def _spread(first: int, last: int, of: Array, values: Array, others: Array, spread: Array) -> None:
-    """Rows [first, last) of `spread` (N,)."""
+    """Fill rows [first, last) of `spread` (N,)."""
     for i in range(first, last):
         region = of[i]
         spread[i] = values[region] if region >= 0 else others[i]

@@ -94,7 +94,7 @@ def _spread(surface: Surface, selected: Array, reached: Array) -> Array:
 
 
 def _lengths(surface: Surface) -> csr_matrix:
-    """The links with their lengths, world units."""
+    """The links of the surface, weighted by their lengths, world units."""
     links = surface.links
     source = np.repeat(np.arange(len(surface.rows)), np.diff(links.indptr))
     gaps = np.linalg.norm(surface.positions[source] - surface.positions[links.indices], axis=1)

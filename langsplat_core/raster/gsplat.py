@@ -37,7 +37,7 @@ class DeviceGaussians:
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """One image, differentiable by everything that it was made of."""
+    """An image that can be differentiated by the Gaussians and their values."""
 
     image: Tensor  # (H, W, C)
     alpha: Tensor  # (H, W)
@@ -118,7 +118,7 @@ def draw(
 
 
 def to_device(array: Array) -> Tensor:
-    """As a float32 tensor on the device."""
+    """Copy an array to the device as a float32 tensor."""
     return torch.tensor(np.asarray(array), dtype=torch.float32, device=DEVICE)
 
 

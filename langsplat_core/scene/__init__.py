@@ -1,13 +1,7 @@
 """The nouns of the project: plain typed data, no behaviour that needs a device or a file."""
 
 from langsplat_core.scene.camera import FARTHEST, Camera, Intrinsics, look_at
-from langsplat_core.scene.codec import (
-    AutoencoderCodec,
-    CodebookCodec,
-    Codec,
-    LinearCodec,
-    codec_from_tensors,
-)
+from langsplat_core.scene.codec import AutoencoderCodec, CodebookCodec, Codec, LinearCodec, codec_from_tensors
 from langsplat_core.scene.gaussians import SH_COUNTS, Gaussians
 from langsplat_core.scene.language import (
     CANONICAL_PHRASES,

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from langsplat_core.arrays import Array, check_array
+from langsplat_core.arrays import Array, across, check_array
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class Camera:
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """The camera without its pose."""
+        """Focal lengths and principal point on the camera's own pixel grid."""
         return Intrinsics(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
 
     def with_intrinsics(self, intrinsics: Intrinsics) -> "Camera":
@@ -101,6 +101,11 @@ class Camera:
     def resized(self, width: int, height: int) -> "Camera":
         """The same view on another pixel grid."""
         return self.with_intrinsics(self.intrinsics.resized(width, height))
+
+    def within(self, side: int) -> "Camera":
+        """The same view, no side of whose image is longer than `side` pixels."""
+        share = min(side / max(self.width, self.height), 1.0)
+        return self.resized(max(round(share * self.width), 1), max(round(share * self.height), 1))
 
     def project(self, points_world: Array) -> tuple[Array, Array]:
         """(N, 3) world points -> (N, 2) pixel positions and (N,) depths along z (may be <= 0)."""
@@ -129,7 +134,7 @@ def look_at(
     forward = forward / max(float(np.linalg.norm(forward)), 1e-12)
     right = np.cross(forward, np.asarray(up, dtype=np.float64))
     if np.linalg.norm(right) < 1e-9:
-        right = np.cross(forward, np.eye(3)[int(np.argmin(np.abs(forward)))])
+        right = across(forward)
     right = right / np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
     matrix = np.eye(4)

@@ -126,10 +126,6 @@ class Codec(ABC):
         mean = np.bincount(of, minlength=len(distinct)) @ self.directions(distinct) / len(latents)
         return max(1 - float(mean @ mean), 0.0)
 
-    def blendable(self, latents: Array) -> Array:
-        """(M, d) latents -> (M, c) float32 numbers of which a blend lies between what was blended."""
-        return latents.astype(np.float32)
-
     def colours(self, latents: Array, weights: Array) -> Array:
         """(M, d) latents -> (M, 3) float32 colours in [0, 1]; near meanings have near ones.
 
@@ -346,9 +342,6 @@ class CodebookCodec(Codec):
 
     def directions(self, latents: Array) -> Array:
         return self.decode(latents)
-
-    def blendable(self, latents: Array) -> Array:
-        return self.palette[latents[:, 0]]
 
     def colours(self, latents: Array, weights: Array) -> Array:
         return self.palette[latents[:, 0]]

@@ -98,7 +98,7 @@ class Gaussians:
 _VALID: WeakKeyDictionary[Gaussians, Array] = WeakKeyDictionary()  # what was found, as it is asked for often
 
 
-def joined(parts: Sequence[Gaussians]) -> Gaussians:
+def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
     """Return the Gaussians of all `parts`, in order; harmonics of lower degrees are filled up with zeros."""
     if not parts:
         return Gaussians(*(np.zeros(shape) for shape in ((0, 3), (0, 3), (0, 4), 0, (0, 1, 3))))
@@ -106,7 +106,10 @@ def joined(parts: Sequence[Gaussians]) -> Gaussians:
         return parts[0]
     count = max(part.sh.shape[1] for part in parts)
     columns = {field.name: [getattr(part, field.name) for part in parts] for field in fields(Gaussians)}
-    columns["sh"] = [np.pad(sh, ((0, 0), (0, count - sh.shape[1]), (0, 0))) for sh in columns["sh"]]
+    columns["sh"] = [
+        np.pad(sh, ((0, 0), (0, count - sh.shape[1]), (0, 0))) if sh.shape[1] < count else sh
+        for sh in columns["sh"]
+    ]
     return Gaussians(**{name: np.concatenate(column) for name, column in columns.items()})
 
 
@@ -128,7 +131,7 @@ _SPACED = (*_CURVE, (2, 0x1249249249249249))  # shifts and masks that put two fr
 
 @dataclass(frozen=True, eq=False)
 class Merged:
-    """M Gaussians in place of N."""
+    """M Gaussians that stand for N, and the weights of the N in each."""
 
     gaussians: Gaussians
     weights: "sparse.csr_matrix"  # (M, N) float32: what each is made of; rows sum to 1
@@ -155,8 +158,6 @@ def merged(gaussians: Gaussians, progress: Progress = silent) -> Merged:
     for start in range(0, len(grouped), BLOCK):
         progress("merging", start / len(grouped))
         parts += _merge(gaussians, grouped[start : start + BLOCK])
-    names = [field.name for field in fields(Gaussians)]
-    joined = (np.concatenate([getattr(part.gaussians, name) for part in parts]) for name in names)
     weights = np.concatenate([part.weights for part in parts])
     sources = np.concatenate([part.sources for part in parts])
     starts = np.arange(0, weights.size + 1, GROUP)
@@ -164,7 +165,7 @@ def merged(gaussians: Gaussians, progress: Progress = silent) -> Merged:
     from scipy import sparse  # here, since every program that opens a scene imports this module
 
     matrix = sparse.csr_matrix((weights.astype(np.float32).ravel(), sources.ravel(), starts), shape=shape)
-    return Merged(Gaussians(*joined), matrix)
+    return Merged(join_gaussians([part.gaussians for part in parts]), matrix)
 
 
 def along_curve(points: Array) -> Array:
@@ -228,9 +229,3 @@ def _ellipsoids(covariances: Array) -> tuple[Array, Array, Array]:
     quats = np.roll(Rotation.from_matrix(axes).as_quat(), 1, axis=1) if len(axes) else np.zeros((0, 4))
     scales = np.sqrt(np.maximum(variances, _TINY))
     return np.minimum(np.log(scales), 80.0), quats, _area(scales)
-
-
-def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
-    """Return the rows of at least one part, of the same SH degree, one after the other."""
-    names = [field.name for field in fields(Gaussians)]
-    return Gaussians(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))

@@ -70,7 +70,7 @@ def _bare(word: str) -> str:
 # How the cosines of one text encoder are read, and what they say about whether a thing is there at all.
 
 LARGEST = 1e6  # number of a calibration: cosines are rounded to 1e-7
-Fits = tuple[float, float, float]  # of each level, the best, see `query.chance.Scale.fit`
+Fits = tuple[float, float, float]  # of each level, the best, see `semantics.relevancy.Scale.fit`
 
 
 @dataclass(frozen=True)

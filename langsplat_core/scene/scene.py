@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, across
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.scene.camera import Camera, look_at
 from langsplat_core.scene.gaussians import Gaussians
@@ -82,7 +82,7 @@ class Scene:
 
     def _across(self, centre: Array, radius: float, up: Array) -> Array:
         """(3,) the level direction along which the scene covers the most of an image."""
-        side = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+        side = across(up)
         side /= np.linalg.norm(side)
         ahead = np.cross(up, side)
         some = self.gaussians.take(np.arange(0, len(self.gaussians), len(self.gaussians) // SAMPLES + 1))

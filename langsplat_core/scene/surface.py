@@ -151,7 +151,7 @@ def _smooth(
     values: Array,
     smoothed: Array,
 ) -> None:
-    """Elements [first, last) of `smoothed` (K,)."""
+    """Fill elements [first, last) of `smoothed` (K,)."""
     for i in range(first, last):
         value = total = np.float32(0)
         for k in range(neighbours.shape[1]):

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from langsplat_core.arrays import Array, unit
+from langsplat_core.arrays import Array, across, unit
 from langsplat_core.errors import InputError
 from langsplat_core.scene.camera import FARTHEST, Camera
 from langsplat_core.scene.gaussians import SH_COUNTS, Gaussians
@@ -33,18 +33,18 @@ class Similarity:
 
     @property
     def matrix(self) -> Array:
-        """(4, 4) float64 homogeneous matrix."""
+        """(4, 4) float64 homogeneous matrix of the map."""
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = self.scale * self.rotation, self.translation
         return matrix
 
     @cached_property
     def is_identity(self) -> bool:
-        """True where nothing moves at all."""
+        """Whether the map leaves every point where it is."""
         return bool((self.matrix == np.eye(4)).all())
 
     def points(self, points: Array) -> Array:
-        """(N, 3) -> (N, 3) float64."""
+        """(N, 3) points -> (N, 3) float64 images of them."""
         with np.errstate(invalid="ignore", over="ignore"):
             moved: Array = np.asarray(points, np.float64) @ (self.scale * self.rotation.T) + self.translation
         return moved
@@ -52,13 +52,11 @@ class Similarity:
     def then(self, other: "Similarity") -> "Similarity":
         """Return this map followed by `other`."""
         return Similarity(
-            other.rotation @ self.rotation,
-            other.points(self.translation[None])[0],
-            self.scale * other.scale,
+            other.rotation @ self.rotation, other.points(self.translation[None])[0], self.scale * other.scale
         )
 
     def inverse(self) -> "Similarity":
-        """Return the map that leads back."""
+        """Return the inverse map."""
         return Similarity(self.rotation.T, -self.rotation.T @ self.translation / self.scale, 1 / self.scale)
 
     def about(self, centre: Array) -> "Similarity":
@@ -95,7 +93,7 @@ def moving(offset: Array) -> Similarity:
 
 
 def scaling(factor: float) -> Similarity:
-    """Return the scaling about the origin."""
+    """Return the scaling by `factor` about the origin."""
     return Similarity(np.eye(3), np.zeros(3), float(factor))
 
 
@@ -120,8 +118,7 @@ def turning(direction: Array, onto: Array) -> Similarity:
     a, b = unit(np.asarray(direction, np.float64), 1e-300), unit(np.asarray(onto, np.float64), 1e-300)
     axis, cosine = np.cross(a, b), float(a @ b)
     if np.linalg.norm(axis) < 1e-9:  # the same, or opposite: any axis across
-        axis = np.cross(a, np.eye(3)[int(np.argmin(np.abs(a)))])
-        return IDENTITY if cosine > 0 else rotating(axis, 180)
+        return IDENTITY if cosine > 0 else rotating(across(a), 180)
     return rotating(axis, math.degrees(math.atan2(float(np.linalg.norm(axis)), cosine)))
 
 
@@ -147,6 +144,17 @@ def similarity(matrix: Array) -> Similarity:
     if np.abs(linear / scale - rotation).max() > SHEAR:
         raise InputError("the matrix shears the scene or scales its axes unlike; give one scale for all axes")
     return Similarity(rotation, matrix[:3, 3].copy(), scale)
+
+
+def moved_camera(camera: Camera, transform: Array) -> tuple[Camera, float]:
+    """A camera of a fixed scene as it sees a moving one before that is moved by a (4, 4) similarity, and the
+    factor from its depths to those of the fixed scene."""
+    scale = float(np.cbrt(np.linalg.det(transform[:3, :3])))
+    if not (np.isfinite(transform).all() and scale > 0):
+        raise InputError("a transform must be a similarity: turned, scaled by a positive factor, and moved")
+    matrix = camera.world_to_camera @ transform
+    matrix[:3] /= scale
+    return replace(camera, world_to_camera=matrix), scale
 
 
 def rotation_quaternion(rotation: Array) -> Array:

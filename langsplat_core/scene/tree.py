@@ -42,7 +42,7 @@ class Tree:
 
     @property
     def complete(self) -> bool:
-        """False where there are wholes alone."""
+        """False for a tree of wholes without parts."""
         return bool((self.levels < LEVEL_COUNT - 1).any()) or self.count == 0
 
     @property
@@ -89,7 +89,7 @@ class Tree:
         return np.asarray(inside[self.leaves])
 
     def gaussians(self) -> list[Array]:
-        """Of every node its Gaussians, rising."""
+        """The Gaussians of each node, ascending."""
         order = np.argsort(self.leaves, kind="stable")
         firsts = np.searchsorted(self.leaves[order], np.arange(self.count + 1))
         found = [order[a:b] for a, b in pairwise(firsts)]

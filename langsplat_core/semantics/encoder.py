@@ -164,7 +164,7 @@ class TextTower(Protocol):
 
     def encode(self, texts: list[str]) -> Array:
         """(B, D) float32 vectors, of any length, of B > 0 phrases. Raises InputError and EncoderError as
-        `tokens.check_whole`: no part of a phrase is left out in silence."""
+        `check_whole`: no part of a phrase is left out in silence."""
 
 
 class ImageTower(Protocol):

@@ -43,7 +43,7 @@ CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
 
 
 class ClipText:
-    """A `TextTower`, by torch."""
+    """A `TextTower` computed by torch."""
 
     def __init__(self, weights: Weights) -> None:
         from transformers import CLIPTextModelWithProjection, CLIPTokenizerFast
@@ -70,7 +70,7 @@ class ClipText:
 
 
 class ClipImages:
-    """A `ImageTower` by torch."""
+    """An `ImageTower` computed by torch."""
 
     def __init__(self, weights: Weights) -> None:
         from transformers import CLIPVisionModelWithProjection
@@ -91,11 +91,8 @@ def clip_text(weights: Weights) -> TextTower:
     return plain_text_tower(weights) or ClipText(weights)
 
 
-CLIP = Family(clip_text, ClipImages)
-
-
 def _load(kind: Any, tower: str, weights: Weights) -> Any:
-    """One tower ("text" or "vision") with its projection."""
+    """Load one tower, "text" or "vision", with its projection."""
     from transformers import CLIPConfig
 
     config = load_config(CLIPConfig, weights, "CLIP")
@@ -138,7 +135,7 @@ NO_PUNCTUATION = str.maketrans("", "", string.punctuation)
 
 
 class SiglipText:
-    """A `TextTower` by torch."""
+    """A `TextTower` computed by torch."""
 
     def __init__(self, weights: Weights) -> None:
         from transformers import SiglipTextModel
@@ -169,7 +166,7 @@ class SiglipText:
 
 
 class SiglipImages:
-    """A `ImageTower` by torch."""
+    """An `ImageTower` computed by torch."""
 
     def __init__(self, weights: Weights) -> None:
         from transformers import SiglipVisionModel
@@ -192,9 +189,6 @@ def _siglip_config(weights: Weights) -> Any:
     return load_config(SiglipConfig, weights, "SigLIP")
 
 
-SIGLIP = Family(SiglipText, SiglipImages)
-
-
 # Image-text encoders by hub id, folder or file: a new family is two towers above and one row here.
 
 DEMO = "demo"
@@ -204,7 +198,7 @@ DEMO_ELSEWHERE = (
     f"langsplat train DATASET --out scene.ply --clip.model {OPEN_MODEL}"
 )
 FAMILIES: Mapping[str, Family] = MappingProxyType(  # by `model_type` of config.json
-    {"clip": CLIP, "siglip": SIGLIP}
+    {"clip": Family(clip_text, ClipImages), "siglip": Family(SiglipText, SiglipImages)}
 )
 
 

@@ -27,6 +27,7 @@ from langsplat_core.semantics.weights import (
     Weights,
     is_hugging_face,
     loading_errors,
+    unpickled,
 )
 
 Tensors = Mapping[str, Any]  # name -> torch.Tensor
@@ -120,7 +121,7 @@ SAM2_SIDE = 1024  # px, of the square that SAM 2 sees, which no shape tells
 
 @dataclass(frozen=True)
 class Hiera:
-    """Settings of a SAM 2's encoder that shapes do not tell."""
+    """Settings of a SAM 2's encoder that do not follow from shapes of tensors."""
 
     heads: int  # of the first stage; they double with the width
     windows: tuple[int, int, int, int]  # side by stage, in positions of its grid
@@ -167,8 +168,9 @@ def _read(id: str, file: Path) -> Tensors:
 
     if file.suffix == ".safetensors":
         return load_file(file)
-    zipped = zipfile.is_zipfile(file)  # files of PyTorch before 1.6 are none, and cannot be mapped
-    if zipped and any(name.endswith("/constants.pkl") for name in zipfile.ZipFile(file).namelist()):
+    if zipfile.is_zipfile(file) and any(
+        name.endswith("/constants.pkl") for name in zipfile.ZipFile(file).namelist()
+    ):
         try:
             found: Any = _script_tensors(file)
         except UNREADABLE as error:
@@ -177,7 +179,7 @@ def _read(id: str, file: Path) -> Tensors:
                 "same weights in another layout, such as the hub id openai/clip-vit-base-patch16"
             ) from error
     else:
-        found = torch.load(file, map_location="cpu", weights_only=True, mmap=zipped)
+        found = unpickled(file)
     found = found.get("state_dict", found.get("model", found)) if isinstance(found, dict) else {}
     if not isinstance(found, dict):
         raise ValueError("it holds no named tensors")

@@ -262,7 +262,7 @@ def _paint(lab: Array) -> Array:
 
 
 def _superpixels(lab: Array) -> Array:
-    """(H, W) int labels 0..N-1."""
+    """(H, W) int superpixels, numbered 0..N-1."""
     from skimage.segmentation import slic
 
     labels = slic(

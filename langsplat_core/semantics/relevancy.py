@@ -29,25 +29,21 @@ NARROWEST = 1e-6  # distance of a relevancy from 0 and 1, so that its fit is fin
 CHUNK = 16_384  # decoded vectors held at a time: 32 MB at 512 float32 numbers
 
 
-def from_cosines(phrases: Array, nearest_canonical: Array, temperature: float) -> Array:
-    """Cosines with phrases and the largest one with a canonical phrase, of shapes that go together ->
-    relevancy in (0, 1)."""
-    return sigmoid(temperature * (phrases - nearest_canonical))
+def relevancy_of(cosines: Array, zero: Array, rate: Array | float) -> Array:
+    """Relevancy in (0, 1) of cosines, zeros and rates whose shapes go together. As published: zero is the
+    largest cosine with a canonical phrase, the rate the temperature."""
+    return sigmoid(rate * (cosines - zero))
 
 
 def relevancy(
     vectors: Array, phrases: Array, canonical: Array, temperature: float = Reading.temperature
 ) -> Array:
     """(M, D) unit vectors, (Q, D) unit phrase vectors, (C, D) unit canonical vectors -> (M, Q) in (0, 1)."""
-    return from_cosines(vectors @ phrases.T, (vectors @ canonical.T).max(1, keepdims=True), temperature)
+    return relevancy_of(vectors @ phrases.T, (vectors @ canonical.T).max(1, keepdims=True), temperature)
 
 
 def latent_relevancy(
-    codec: Codec,
-    latents: Array,
-    phrases: Array,
-    canonical: Array,
-    temperature: float = Reading.temperature,
+    codec: Codec, latents: Array, phrases: Array, canonical: Array, temperature: float = Reading.temperature
 ) -> Array:
     """(M, d) latents of any length, (Q, D), (C, D) -> (M, Q) relevancy of what they stand for, exact, in
     bounded memory. A latent without meaning gets relevancy 0."""
@@ -58,7 +54,7 @@ def latent_relevancy(
         rows = known[start : start + CHUNK]
         cosines = codec.cosines(latents[rows], texts)
         nearest = cosines[:, len(phrases) :].max(1, keepdims=True)
-        out[rows] = from_cosines(cosines[:, : len(phrases)], nearest, temperature)
+        out[rows] = relevancy_of(cosines[:, : len(phrases)], nearest, temperature)
     return out
 
 
@@ -72,7 +68,7 @@ class Scale:
 
     @property
     def texts(self) -> Array:
-        """(T, D) everything that `of` compares with."""
+        """(T, D) unit vectors of all phrases that `of` compares with."""
         return self.canonical if self.everyday is None else np.concatenate([self.canonical, self.everyday])
 
     def of(self, cosines: Array) -> tuple[Array, Array]:
@@ -93,8 +89,3 @@ class Scale:
         clipped = np.clip(np.asarray(relevancy, np.float64), NARROWEST, 1 - NARROWEST)
         rate = 1.0 if self.everyday is not None else self.temperature
         return np.asarray(np.log(clipped / (1 - clipped)) / rate)
-
-
-def relevancy_of(cosines: Array, zero: Array, rate: Array) -> Array:
-    """Relevancy in (0, 1) of cosines, zeros and rates whose shapes go together."""
-    return sigmoid(rate * (cosines - zero))

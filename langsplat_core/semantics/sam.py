@@ -35,7 +35,7 @@ LEVELS = 3  # masks per point
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """An image as a model has seen it."""
+    """An image after the model's encoder, which can be asked for masks at points."""
 
     model: Any  # a transformers model
     seen: Mapping[str, Any]  # arguments of the model that stand for the image
@@ -405,7 +405,7 @@ class SamMasks(MaskSource):
 
     @property
     def key(self) -> str:
-        """Settings that change the masks; the size of batches does not."""
+        """The settings that change the masks, as JSON; the size of batches does not."""
         settings = asdict(self._config) | {"source": "sam", "points_per_batch": 0}
         return json.dumps(["sam", VERSION, settings, *["float16"] * self._half], sort_keys=True)
 
@@ -414,7 +414,7 @@ class SamMasks(MaskSource):
         return self.begin(image, progress)()
 
     def begin(self, image: Array, progress: Progress) -> Callable[[], LevelMasks]:
-        """Ask the model; what is returned compares pixels."""
+        """Ask the model; the function that is returned compares pixels and gives the masks."""
         crops = crop_boxes(image.shape[:2], self._config.crop_layers)
         levels: list[list[Proposal]] = [[] for _ in range(LEVELS)]
         for index, crop in enumerate(crops):

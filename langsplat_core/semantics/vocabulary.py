@@ -66,7 +66,7 @@ def _phrase(line: bytes, where: str) -> str:
 
 
 # Everyday phrases: what a codec's errors are judged on, beside a scene's own vectors, and what answers are
-# compared with (`query.chance`).
+# compared with (`query.answers`).
 
 
 def _words(text: str) -> tuple[str, ...]:
@@ -100,14 +100,14 @@ class _TextEncoder(Protocol):
     def unknown_words(self, text: str) -> tuple[str, ...]: ...
 
 
-def everyday_phrases(unknown_words: Callable[[str], Sequence[str]], seed: int = 0) -> list[str]:
-    """Nouns, and as many as `MIXED` random pairs of an adjective and a noun; without words that the encoder
-    was never taught."""
+def everyday_phrases(unknown_words: Callable[[str], Sequence[str]]) -> list[str]:
+    """Nouns, and as many as `MIXED` random pairs of an adjective and a noun, the same each time; without
+    words that the encoder was never taught."""
     nouns = [word for word in NOUNS if not unknown_words(word)]
     adjectives = [word for word in ADJECTIVES if not unknown_words(word)]
     if not nouns or not adjectives:
         return nouns
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(0)
     pairs = zip(generator.choice(adjectives, MIXED), generator.choice(nouns, MIXED), strict=True)
     return [*nouns, *sorted({f"{adjective} {noun}" for adjective, noun in pairs})]
 

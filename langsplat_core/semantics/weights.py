@@ -210,18 +210,30 @@ def _shapes(weights: Weights) -> dict[str, tuple[int, ...]]:
     from safetensors import safe_open
 
     found: dict[str, tuple[int, ...]] = {}
-    for path in sorted(path for pattern in SAFE for path in weights.folder.glob(pattern)):
-        with safe_open(path, framework="np") as file:
-            found |= {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118
-    if found:
-        return found
+    for path in _weight_files(weights.folder):
+        if path.suffix == ".safetensors":
+            with safe_open(path, framework="np") as file:
+                found |= {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118
+        else:
+            found |= {name: tuple(tensor.shape) for name, tensor in unpickled(path).items()}
+    return found
+
+
+def _weight_files(folder: Path) -> list[Path]:
+    """The files with a folder's weights: of both kinds the first, which transformers prefers, too."""
+    for patterns in (SAFE, PICKLED):
+        if paths := sorted(path for pattern in patterns for path in folder.glob(pattern)):
+            return paths
+    return []
+
+
+def unpickled(path: Path) -> dict[str, Any]:
+    """The tensors of a file of torch, by name, read when they are used where the file allows."""
     import torch
 
-    for path in sorted(path for pattern in PICKLED for path in weights.folder.glob(pattern)):
-        mapped = zipfile.is_zipfile(path)
-        tensors = torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
-        found |= {name: tuple(tensor.shape) for name, tensor in tensors.items()}
-    return found
+    mapped = zipfile.is_zipfile(path)  # files of PyTorch before 1.6 are none, and are read whole
+    tensors: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
+    return tensors
 
 
 def load_model(kind: Any, weights: Weights, config: Any) -> Any:
@@ -256,27 +268,18 @@ def read_scalar(weights: Weights, name: str) -> float:
 
     Half a model (a text tower) has no place for what belongs to the pair, such as a logit scale.
     """
-    with loading_errors(weights.id, "readable"):
-        for patterns, read in ((SAFE, _safe_tensor), (PICKLED, _pickled_tensor)):
-            paths = sorted(path for pattern in patterns for path in weights.folder.glob(pattern))
-            if paths:  # transformers, too, prefers the first kind where both are there
-                found = [tensor for path in paths if (tensor := read(path, name)) is not None]
-                return float(found[-1]) if found else math.nan
-    return math.nan
-
-
-def _safe_tensor(path: Path, name: str) -> Any:
     from safetensors import safe_open
 
-    with safe_open(path, framework="pt") as file:
-        return file.get_tensor(name) if name in file.keys() else None  # noqa: SIM118
-
-
-def _pickled_tensor(path: Path, name: str) -> Any:
-    import torch
-
-    mapped = zipfile.is_zipfile(path)  # files of PyTorch before 1.6 are none, and are read whole
-    return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped).get(name)
+    value = math.nan
+    with loading_errors(weights.id, "readable"):
+        for path in _weight_files(weights.folder):
+            if path.suffix == ".safetensors":
+                with safe_open(path, framework="pt") as file:
+                    tensor = file.get_tensor(name) if name in file.keys() else None  # noqa: SIM118
+            else:
+                tensor = unpickled(path).get(name)
+            value = value if tensor is None else float(tensor)
+    return value
 
 
 @contextmanager

@@ -134,11 +134,7 @@ def test_budget_companions_and_order_survive_the_file(scene, source, tmp_path):
     np.testing.assert_array_equal(small.language.tree.leaves, scene.language.tree.leaves[rows])
     assert len(small.cameras) == len(scene.cameras)
     held = choose_views(scene, None, CONFIG, silent).measuring
-    losses = psnr_losses(
-        small,
-        measuring_views(scene, held, [None] * len(held)),
-        CONFIG.assumed_psnr,
-    )
+    losses = psnr_losses(small, measuring_views(scene, held, [None] * len(held)), CONFIG.assumed_psnr)
     assert losses.mean() == pytest.approx(report.loss)
     assert report.loss <= CONFIG.max_psnr_loss
     assert [answer.phrase for answer in report.answers] == ["red mug", "door"]

@@ -26,13 +26,7 @@ from langsplat_core.datasets.sfm import optics, pairs_by_name
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Cancelled, Progress, Report, silent
 from langsplat_core.scene import Camera, look_at
-from tests.support.photographs import (
-    colmap_reconstruction,
-    distance_to_room,
-    photograph,
-    poses,
-    write_photos,
-)
+from tests.support.photographs import colmap_reconstruction, distance_to_room, photograph, poses, write_photos
 from tests.support.processes import files_of_at_most, stop_at
 
 # A walk straight ahead between two walls: what structure from motion finds hardest to begin with.

@@ -15,7 +15,6 @@ from langsplat_core.display.displays import (
     NODES,
     QUERY_COLOURS,
     SEGMENT_OPACITY,
-    TURBO,
     Channels,
     Subject,
     compose,
@@ -111,7 +110,9 @@ def test_uncovered_pixels_are_never_relevant():
 def test_heat_starts_at_the_lower_end_of_its_range_and_saturates_at_the_upper():
     below = compose(channels("relevancy", 0.49), HEAT, RANGES)
     assert below[0, 0].tolist() == [round(255 * 0.5 * PICTURE.dim)] * 3
-    assert_allclose(compose(channels("relevancy", 0.9), HEAT, RANGES)[0, 0], TURBO[255], atol=1)
+    assert_allclose(
+        compose(channels("relevancy", 0.9), HEAT, RANGES)[0, 0], COLOUR_MAPS["turbo"][255], atol=1
+    )
     for value in (0.0, 0.3, 1.0):  # without a range it is hot over all of 0 to 1
         shown = channels("relevancy", value)
         assert (compose(shown, HEAT) == compose(shown, HEAT, ((0.0, 1.0),))).all()

@@ -9,8 +9,9 @@ from langsplat_core.errors import InputError
 from langsplat_core.geometry import registration
 from langsplat_core.geometry.planes import find_room
 from langsplat_core.geometry.points import FEWEST, sample_surface
-from langsplat_core.geometry.registration import agreement, moved_camera, quarter_turns, register
+from langsplat_core.geometry.registration import agreement, quarter_turns, register
 from langsplat_core.scene import Scene
+from langsplat_core.scene.transform import moved_camera
 from tests.support.box_rooms import FLOOR, WALL, box_room, moved
 from tests.support.scenes import random_gaussians
 

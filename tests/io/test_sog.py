@@ -17,7 +17,7 @@ from langsplat_core.io.ply import write_ply
 from langsplat_core.io.scenes import load_gaussians, scene_files
 from langsplat_core.io.sog import write_sog
 from langsplat_core.scene import Gaussians
-from langsplat_core.scene.gaussians import joined
+from langsplat_core.scene.gaussians import join_gaussians
 from tests.support.scenes import random_gaussians
 
 
@@ -106,7 +106,7 @@ def test_splat_transform_reads_it_alike(tmp_path):
 def streamed(folder, parts: list[Gaussians], change=lambda content: None):
     """A streamed scene: each of `parts` a leaf of the finest level, in two files; a coarse row."""
     for name, some in {"0_0": parts[:-1], "0_1": parts[-1:], "1_0": [parts[0].take(np.arange(1))]}.items():
-        write_sog(folder / "packed.sog", joined(some))
+        write_sog(folder / "packed.sog", join_gaussians(some))
         with zipfile.ZipFile(folder / "packed.sog") as archive:
             archive.extractall(folder / name)
     (folder / "packed.sog").unlink()
@@ -133,7 +133,7 @@ def test_a_streamed_scene_is_read_at_its_finest_level(tmp_path):
     for path in (folder, folder / "lod-meta.json"):
         got = load_gaussians(path)
         assert len(got) == 120
-        assert np.abs(got.means - joined(parts).means).max() < 1e-3  # in the order of the tree
+        assert np.abs(got.means - join_gaussians(parts).means).max() < 1e-3  # in the order of the tree
     files = scene_files(folder)
     assert files[0] == folder / "lod-meta.json"
     assert {path.parent.name for path in files if path.suffix == ".webp"} == {"0_0", "0_1", "1_0"}

@@ -9,13 +9,7 @@ import pytest
 
 from langsplat_core.arrays import Array, ViewScore
 from langsplat_core.config import PAPER, MaskConfig, TrainConfig, with_preset
-from langsplat_core.pipeline.forecast import (
-    Forecast,
-    Stage,
-    count_photographs,
-    forecast_in_words,
-    plan,
-)
+from langsplat_core.pipeline.forecast import Forecast, Stage, count_photographs, forecast_in_words, plan
 from langsplat_core.pipeline.report import (
     APART,
     REPORT,

@@ -328,8 +328,7 @@ def test_a_broken_folder_is_one_line(tmp_path: Path, damage: Callable[[Path], ob
 
 
 @pytest.mark.parametrize(
-    "change",
-    [lambda stated: stated.update(normalizer=0), lambda stated: stated["model"].update(vocab={})],
+    "change", [lambda stated: stated.update(normalizer=0), lambda stated: stated["model"].update(vocab={})]
 )
 def test_a_tokenizer_of_no_known_rules_is_one_line(
     tmp_path: Path, change: Callable[[dict[str, Any]], object]

@@ -92,10 +92,7 @@ def cameras(count: int = 3) -> tuple[Camera, ...]:
 
 def blob_scene(*, field: bool = True, with_cameras: bool = True, phrasebook: bool = False) -> Scene:
     return Scene(
-        blobs(),
-        language(phrasebook) if field else None,
-        cameras() if with_cameras else (),
-        Path("blobs.ply"),
+        blobs(), language(phrasebook) if field else None, cameras() if with_cameras else (), Path("blobs.ply")
     )
 
 

@@ -42,12 +42,7 @@ def random_gaussians(
 
 
 def random_camera(
-    seed: int = 0,
-    width: int = 70,
-    height: int = 45,
-    *,
-    distance: float = 3.0,
-    off_centre: bool = True,
+    seed: int = 0, width: int = 70, height: int = 45, *, distance: float = 3.0, off_centre: bool = True
 ) -> Camera:
     """A camera `distance` world units from the origin that looks roughly at it.
 

@@ -23,9 +23,7 @@ def tiny_clip(folder: Path, half: bool = False) -> CLIPModel:
     torch.manual_seed(0)
     model = CLIPModel(
         CLIPConfig(
-            text_config=text,
-            vision_config=tower | {"image_size": SIDE, "patch_size": 8},
-            projection_dim=24,
+            text_config=text, vision_config=tower | {"image_size": SIDE, "patch_size": 8}, projection_dim=24
         )
     ).eval()
     (model.half() if half else model).save_pretrained(folder)

@@ -62,10 +62,7 @@ def project(
 
 
 def render(
-    leaves: dict[str, torch.Tensor],
-    values: torch.Tensor,
-    camera: Camera,
-    settings: RasterSettings = INRIA,
+    leaves: dict[str, torch.Tensor], values: torch.Tensor, camera: Camera, settings: RasterSettings = INRIA
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """(N, C) values -> image (H, W, C), alpha (H, W), and the pixel means for their gradient."""
     means_px, covariance, opacity, depth = project(leaves, camera, settings)

@@ -13,9 +13,9 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.config import Display, PictureConfig, RasterSettings
 from langsplat_core.display.displays import DISPLAYS, Answers, DisplayRow, Ranges, Subject, painted
-from langsplat_core.io.ply import SH_C0
 from langsplat_core.scene import LEVELS, SH_COUNTS, Camera, Scene
 from langsplat_core.scene.gaussians import Merged
+from langsplat_core.scene.transform import C0
 from langsplat_viewer.marks import Marks
 from langsplat_viewer.rendering.depth import UNCLIPPED, Clip, image_formation
 
@@ -134,7 +134,7 @@ def _tinted(scene: Scene, selected: Array) -> Scene:
     its coefficients, so that mixing these mixes it, but for what is clamped at black."""
     sh = scene.gaussians.sh.copy()
     sh[selected] *= 1 - TINT_STRENGTH
-    sh[selected, 0] += TINT_STRENGTH * (TINT - 0.5) / SH_C0
+    sh[selected, 0] += TINT_STRENGTH * (TINT - 0.5) / C0
     return replace(scene, gaussians=replace(scene.gaussians, sh=sh))
 
 

@@ -45,7 +45,7 @@ class GlRasterizer:
     suits measurements: but for the cut-offs within 2e-5 in images of 400 pixels a side, 1e-4 in those of
     1920 and for needles across the image, as pixel positions are float32.
 
-    `sort`: who finds the draw order, the same either way; see `depth_sort.chosen_sorter`.
+    `sort`: who finds the draw order, the same either way; see `chosen_sorter`.
 
     Blending goes back to front and cannot stop: behind layers that would end a pixel more is drawn, with the
     weight that was left, at most 1e-2 and mostly below 1e-3.
@@ -54,10 +54,7 @@ class GlRasterizer:
     name = "opengl"
 
     def __init__(
-        self,
-        ctx: moderngl.Context,
-        precision: Literal["half", "single"] = "half",
-        sort: Sort = "auto",
+        self, ctx: moderngl.Context, precision: Literal["half", "single"] = "half", sort: Sort = "auto"
     ) -> None:
         if ctx.version_code < 410:
             raise BackendError(
@@ -115,7 +112,7 @@ class GlRasterizer:
         return self._scene
 
     def forget(self) -> None:
-        """Project and sort anew the next time."""
+        """Have the next view projected and sorted anew."""
         self._current = None
 
     def draw(

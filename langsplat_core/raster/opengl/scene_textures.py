@@ -128,10 +128,8 @@ class SortBuffers:
         self.means = ctx.buffer(points)
         self.keys, self.other_keys = (ctx.buffer(reserve=8 * max(n, 1)) for _ in range(2))
         self.other_rows = ctx.buffer(reserve=4 * max(n, 1))
-        self.counts, self.totals = (
-            ctx.buffer(reserve=4 * DIGITS * self.groups),
-            ctx.buffer(reserve=4 * DIGITS),
-        )
+        self.counts = ctx.buffer(reserve=4 * DIGITS * self.groups)
+        self.totals = ctx.buffer(reserve=4 * DIGITS)
         self.command = ctx.buffer(reserve=20)  # moderngl's stride; the last four bytes are not read
 
     def order(self) -> Array:
@@ -141,15 +139,7 @@ class SortBuffers:
 
     def release(self) -> None:
         """Give the device memory back, all but `rows`."""
-        own = (
-            self.means,
-            self.keys,
-            self.other_keys,
-            self.other_rows,
-            self.counts,
-            self.totals,
-            self.command,
-        )
+        own = self.means, self.keys, self.other_keys, self.other_rows, self.counts, self.totals, self.command
         for buffer in own:
             buffer.release()
 
@@ -180,13 +170,8 @@ class DepthSorter:
         for binding, buffer in ((0, b.means), (5, b.counts), (6, b.totals), (7, b.command)):
             buffer.bind_to_storage_buffer(binding)
         self._bind(b.keys, b.rows, b.other_keys, b.other_rows)
-        values: dict[str, object] = {
-            "plane": tuple(plane),
-            "near": near,
-            "far": far,
-            "items": b.count,
-            "groups": b.groups,
-        }
+        values: dict[str, object] = {"plane": tuple(plane), "near": near, "far": far}
+        values |= {"items": b.count, "groups": b.groups}
         self._run("keys", max(-(-b.count // GROUP), 1), values)
         here, there = (b.keys, b.rows), (b.other_keys, b.other_rows)
         for shift in range(0, KEY_BITS, DIGIT_BITS):  # an even number of passes: they end in `rows`
@@ -300,7 +285,7 @@ class SceneTextures:
 
     @staticmethod
     def _geometry(kept: Gaussians) -> Array:
-        """(n, 12): mean and opacity, scales and a free place, unit quaternion."""
+        """(n, 12) numbers of each Gaussian: mean, opacity, scales, a free place, unit quaternion."""
         scales = np.minimum(np.exp(kept.log_scales.astype(np.float64)), LARGEST_SCALE)
         quats = unit(kept.quats_wxyz.astype(np.float64), 1e-30)
         opacities = sigmoid(kept.opacity_logits.astype(np.float64))
@@ -308,7 +293,7 @@ class SceneTextures:
         return np.concatenate([kept.means, opacities[:, None], scales, free, quats], 1).astype(np.float32)
 
     def _layers(self, values: Array, dtype: str | np.dtype) -> moderngl.TextureArray:
-        """(n, C) -> texture array of ceil(C / 4) RGBA layers."""
+        """Upload (n, C) values as a texture array of ceil(C / 4) RGBA layers."""
         kind = np.dtype(dtype)
         layers = math.ceil(values.shape[1] / 4)
         padded = np.zeros((layers, self.size[0] * self.size[1], 4), kind)
@@ -359,13 +344,13 @@ class DrawOrder(Protocol):
     """Order in which the Gaussians ahead of one camera are drawn."""
 
     def write(self, scene: SceneTextures) -> None:
-        """Make `scene.order` this order."""
+        """Write this order into `scene.order`."""
 
     def rows(self, scene: SceneTextures) -> Array:
         """(m,) int32 texels, back to front; this order must be the one written last."""
 
     def draw(self, scene: SceneTextures, quads: moderngl.VertexArray) -> None:
-        """A quad for each of them; this order must be the one written last."""
+        """Draw a quad for each of them; this order must be the one written last."""
 
 
 @dataclass(frozen=True, eq=False)

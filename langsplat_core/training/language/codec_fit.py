@@ -11,13 +11,7 @@ import torch
 from torch import nn
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import (
-    AutoencoderConfig,
-    CodebookConfig,
-    CodecConfig,
-    LinearConfig,
-    check_settings,
-)
+from langsplat_core.config import AutoencoderConfig, CodebookConfig, CodecConfig, LinearConfig, check_settings
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import CANONICAL_PHRASES, AutoencoderCodec, CodebookCodec, Codec, LinearCodec
 from langsplat_core.scene.codec import KINDS, principal_colours
@@ -43,7 +37,7 @@ class Vocabulary:
 
 
 def everyday_vocabulary(encoder: PhraseEncoder, phrases: tuple[str, ...] = ()) -> Vocabulary:
-    """`phrases` and everyday ones, as `encoder` writes them."""
+    """The vocabulary of `phrases` and everyday ones in the vectors of `encoder`."""
     texts = list(dict.fromkeys([*phrases, *everyday_phrases(encoder.unknown_words)]))
     canonical = encoder.encode_texts(list(CANONICAL_PHRASES))
     scale = Scale(canonical, everyday_vectors(encoder), encoder.temperature)
@@ -225,7 +219,7 @@ def _smallest(
     budget: float,
     vocabulary: Vocabulary,
 ) -> Array:
-    """Doubled until good enough, then halved between the last two sizes."""
+    """The smallest codebook within `budget`: sizes are doubled, then the last interval is halved."""
     most = max(min(available // LARGEST_SHARE, 65_535), 1)
     size, smaller, codewords = min(SMALLEST, most), None, np.zeros((0, 0), np.float32)
     while True:
@@ -250,13 +244,13 @@ def _smallest(
 
 
 def codebook_error(codewords: Array, vectors: Array, vocabulary: Vocabulary) -> float:
-    """Mean error of relevancy with every vector's nearest codeword in its place."""
+    """Mean error of relevancy when every vector is replaced by its nearest codeword."""
     nearest, _ = nearest_centres(vectors, codewords)
     return relevancy_error(codewords[nearest], vectors, vocabulary)[0]
 
 
 def rounded(numbers: Array) -> Array:
-    """float32 numbers, each moved to the nearest float16 one."""
+    """Numbers rounded to float16, as float32."""
     return numbers.astype(np.float16).astype(np.float32)
 
 

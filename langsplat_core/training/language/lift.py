@@ -41,7 +41,7 @@ def lift_block(mask_weights: MaskWeights, groups: MaskGroups, number: int, robus
 def lift_sample(
     mask_weights: MaskWeights, groups: MaskGroups, rows: Array, robust: bool, progress: Progress = silent
 ) -> Lifted:
-    """Lift onto the Gaussians at `rows`, in rising order."""
+    """Lift onto the Gaussians at `rows`, which ascend."""
     parts = []
     for number, (first, last) in enumerate(mask_weights.blocks):
         inside = rows[(rows >= first) & (rows < last)] - first
@@ -156,10 +156,7 @@ def lift_latents(
         progress("lifting latents onto the Gaussians", (done + 1) / len(views))
     confidence = total[..., d]
     means = unit(total[..., :d] / np.maximum(confidence, 1e-9)[..., None])
-    return (
-        np.moveaxis(means, 1, 0).astype(np.float32).copy(),
-        confidence.T.astype(np.float32).copy(),
-    )
+    return np.moveaxis(means, 1, 0).astype(np.float32).copy(), confidence.T.astype(np.float32).copy()
 
 
 # Lifting by gradient descent: latents trained through the rasterizer, as the paper does it.
@@ -225,7 +222,7 @@ def lift_by_gradient(
 
 
 def blended(x: Array, published: bool) -> Array:
-    """(3, N, d) features -> what is blended."""
+    """(3, N, d) features -> the values that are blended: unit vectors where `published`."""
     if not published:
         return x
     return x / (np.linalg.norm(x, axis=-1, keepdims=True) + PUBLISHED_EPSILON)
@@ -305,7 +302,7 @@ class _Weights:
         self._bytes = 0.0
 
     def of(self, index: int) -> LiftingView:
-        """The view of camera `index`."""
+        """The view of camera `index`, kept where memory allows."""
         if index in self._kept:
             return self._kept[index]
         view = self._rasterizer.view(self._gaussians, self._cameras[index], self._settings)

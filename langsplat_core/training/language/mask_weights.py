@@ -133,7 +133,7 @@ SAMPLE = 16_384  # masks that the groups are found with
 
 @dataclass(frozen=True, eq=False)
 class MaskGroups:
-    """To which of G groups every mask of every view belongs."""
+    """The group, of G, of every mask of every view."""
 
     of_mask: tuple[Array, ...]  # of each view, (M,) int32
     vectors: Array  # (G, D) float32 unit vectors
@@ -208,7 +208,7 @@ def find_mask_weights(
     settings: RasterSettings = INRIA,
     progress: Progress = silent,
 ) -> MaskWeights:
-    """Mask weights of all views, in memory."""
+    """Gather the mask weights of all views, in memory."""
     pairs = []
     for camera, features in views:
         pairs.append(view_pairs(rasterizer, gaussians, camera, features, settings))
@@ -223,7 +223,7 @@ def view_pairs(
     features: ImageFeatures,
     settings: RasterSettings = INRIA,
 ) -> Array:
-    """The pairs of one view, of type PAIR, by rising row."""
+    """The (Gaussian, mask) pairs of a view, of type PAIR, by ascending row."""
     if len(features.vectors) == 0:
         return np.zeros(0, PAIR)
     if len(features.vectors) > np.iinfo(PAIR["mask"]).max:

@@ -84,7 +84,7 @@ class Borders:
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """Everything about P patches that merging reads."""
+    """The masks, colours, areas and borders of P patches, from which they are merged."""
 
     masses: sparse.csr_matrix  # (P, masks of all views) float32 pixels, columns sorted
     labelling: Array  # (masks of all views,) int32 view and level of each mask, counted through
@@ -274,7 +274,7 @@ def count_votes(tree: Tree, mask_weights: MaskWeights, counts: Sequence[int]) ->
 
 
 def _descendants(tree: Tree) -> sparse.csr_matrix:
-    """(K, K) float32 ones where the column's node is the row's or within it."""
+    """(K, K) float32, 1 where the column's node is the row's or a descendant of it."""
     rows, columns = [np.arange(tree.count)], [np.arange(tree.count)]
     while len(rows[-1]):
         above = tree.parents[rows[-1]]
@@ -285,7 +285,7 @@ def _descendants(tree: Tree) -> sparse.csr_matrix:
 
 
 class _Merger:
-    """Nodes that are alive, with their sums and neighbours."""
+    """The nodes that are not merged yet, with their sums and neighbours."""
 
     def __init__(self, patches: Patches) -> None:
         count, masses = len(patches.areas), patches.masses
@@ -320,7 +320,7 @@ class _Merger:
         return float(between * (min(self._areas[a], self._areas[b]) / self._plain) ** SMALL)
 
     def join(self, a: int, b: int, new: int) -> None:
-        """Make node `new` of a and b."""
+        """Merge the nodes a and b into node `new`."""
         columns = np.concatenate([self._columns[a], self._columns[b]])
         self._columns[new], place = np.unique(columns, return_inverse=True)
         values = np.concatenate([self._values[a], self._values[b]])

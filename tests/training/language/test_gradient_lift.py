@@ -12,12 +12,7 @@ from langsplat_core.progress import Cancelled
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Camera, LinearCodec
 from langsplat_core.semantics.store import ImageFeatures
-from langsplat_core.training.language.lift import (
-    blended,
-    by_features,
-    lift_by_gradient,
-    lift_latents,
-)
+from langsplat_core.training.language.lift import blended, by_features, lift_by_gradient, lift_latents
 from tests.support.processes import stop_at
 from tests.support.scenes import random_camera, random_gaussians
 
