@@ -26,6 +26,7 @@ from langsplat_viewer.panels.style import (
     MAIN_DOCK,
     MOST_OVER,
     bad,
+    button_if,
     fitting,
     muted,
     scene_area,
@@ -257,10 +258,8 @@ def draw_timing(viewer: Viewer) -> None:
         if stoppable(*work, tag="comparison"):
             viewpoint.stop_comparing(viewer)
     else:
-        imgui.begin_disabled(viewer.state.scene is None)
-        if imgui.button("Compare with the reference"):
+        if button_if("Compare with the reference", viewer.state.scene is not None):
             viewpoint.compare_with_reference(viewer)
-        imgui.end_disabled()
         tip("Draws this view small in float64, in the background: about 15 s for 100,000 Gaussians")
     if viewer.state.timing.comparison is not None:
         small_wrapped(in_numbers(viewer.state.timing.comparison), muted())

@@ -456,12 +456,7 @@ def draw_legend(viewer: Viewer, area: Area, name: str = "relevancy") -> None:
     slots = painted(shown)
     if state.scene is None or not slots or not any(pane.row.legend for pane in state.panes()):
         return
-    corner = ImVec2(
-        area.left + area.width - hello_imgui.em_size(0.7), area.top + area.height - hello_imgui.em_size(0.7)
-    )
-    imgui.set_next_window_pos(corner, imgui.Cond_.always, ImVec2(1, 1))
-    imgui.set_next_window_bg_alpha(0.75)
-    imgui.begin(name, None, QUIET)
+    begin_legend(name, area)
     for slot in slots:
         result = shown[slot]
         if result is not None:
@@ -471,14 +466,24 @@ def draw_legend(viewer: Viewer, area: Area, name: str = "relevancy") -> None:
     imgui.end()
 
 
-def say(text: str, area: Area) -> None:
-    """A line in the middle of the scene's area."""
-    centre = ImVec2(area.left + area.width / 2, area.top + area.height / 2)
-    imgui.set_next_window_pos(centre, imgui.Cond_.always, ImVec2(0.5, 0.5))
-    imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(0.9 * area.width, area.height))
+def begin_legend(name: str, area: Area) -> None:
+    """Begin a window in the lower right corner of the scene's area."""
+    margin = hello_imgui.em_size(0.7)
+    corner = ImVec2(area.left + area.width - margin, area.top + area.height - margin)
+    imgui.set_next_window_pos(corner, imgui.Cond_.always, ImVec2(1, 1))
     imgui.set_next_window_bg_alpha(0.75)
-    imgui.begin("said over the scene", None, QUIET)
-    imgui.push_text_wrap_pos(0.85 * area.width)
+    imgui.begin(name, None, QUIET)
+
+
+def say(text: str, area: Area, name: str = "said over the scene", top: float | None = None) -> None:
+    """Write a line over the scene, in the middle of its area or `top` window units below its upper edge."""
+    x, y = area.left + area.width / 2, area.top + (area.height / 2 if top is None else top)
+    imgui.set_next_window_pos(ImVec2(x, y), imgui.Cond_.always, ImVec2(0.5, 0.5 if top is None else 0))
+    widest = 0.9 if top is None else 0.95  # of the area's width
+    imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(widest * area.width, area.height))
+    imgui.set_next_window_bg_alpha(0.75)
+    imgui.begin(name, None, QUIET)
+    imgui.push_text_wrap_pos((widest - 0.05) * area.width)
     imgui.text_unformatted(text)
     imgui.pop_text_wrap_pos()
     imgui.end()

@@ -103,8 +103,7 @@ def tip(text: str) -> None:
 def stoppable(label: str, fraction: float, tag: str = "") -> bool:
     """A bar in the accent's colour, with a button beside it; whether that was clicked. `tag` tells the button
     from others of its name."""
-    cancel = imgui.calc_text_size("Cancel").x + 2 * imgui.get_style().frame_padding.x
-    width = -cancel - imgui.get_style().item_spacing.x
+    width = beside_button("Cancel")
     if width_of(label) > imgui.get_content_region_avail().x + width:  # no room for it in the bar
         imgui.text_wrapped(label)
         label = ""
@@ -120,13 +119,46 @@ def width_of(text: str) -> float:
     return float(imgui.calc_text_size(text).x)
 
 
+def button_width(label: str) -> float:
+    """Return the width of a button, window units."""
+    return width_of(label.partition("##")[0]) + 2 * imgui.get_style().frame_padding.x
+
+
+def beside_button(label: str) -> float:
+    """Return the width, as imgui takes it, of an item that leaves room for a button at the end of its row."""
+    return -button_width(label) - imgui.get_style().item_spacing.x
+
+
 def beside(label: str, more: float = 0.0) -> None:
     """Go on in the row of the last widget, unless the next one, with this label and `more` window units, does
     not fit there."""
     imgui.same_line()
-    wide = width_of(label.partition("##")[0]) + 2 * imgui.get_style().frame_padding.x + more
-    if imgui.get_content_region_avail().x < wide:
+    if imgui.get_content_region_avail().x < button_width(label) + more:
         imgui.new_line()
+
+
+def button_if(label: str, enabled: bool) -> bool:
+    """Draw a button that can be clicked where it is `enabled`, and return whether it was."""
+    imgui.begin_disabled(not enabled)
+    clicked = bool(imgui.button(label))
+    imgui.end_disabled()
+    return clicked
+
+
+def next_button(label: str, enabled: bool = True) -> bool:
+    """Draw a button `beside` the last widget, and return whether it was clicked."""
+    beside(label)
+    return button_if(label, enabled)
+
+
+def box_with_button(box: str, hint: str, text: str, label: str) -> tuple[bool, str]:
+    """Draw a text box and a button beside it, and return whether Enter or the button was pressed, and the
+    text."""
+    imgui.set_next_item_width(beside_button(label))
+    flags = imgui.InputTextFlags_.enter_returns_true
+    entered, typed = imgui.input_text_with_hint(box, hint, text, flags)
+    imgui.same_line()
+    return bool(imgui.button(label)) or entered, typed
 
 
 def beside_boxed(label: str) -> None:

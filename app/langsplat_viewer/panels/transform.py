@@ -12,7 +12,15 @@ from langsplat_core.errors import LangSplatError
 from langsplat_core.scene import Camera
 from langsplat_core.scene.transform import Similarity, moving, scaling, similarity
 from langsplat_viewer.actions import transforming
-from langsplat_viewer.panels.style import Area, beside, beside_boxed, leave_room, muted, small_wrapped, tip
+from langsplat_viewer.panels.style import (
+    Area,
+    beside_boxed,
+    leave_room,
+    muted,
+    next_button,
+    small_wrapped,
+    tip,
+)
 from langsplat_viewer.state import EditForm, Gizmo, Point
 from langsplat_viewer.viewer import Viewer
 
@@ -41,8 +49,7 @@ def draw(viewer: Viewer) -> None:
     if imgui.button("Fit"):
         transforming.fill_box(viewer)
     tip("The box around the selection, or around everything")
-    beside("Crop")
-    if imgui.button("Crop"):
+    if next_button("Crop"):
         transforming.crop(viewer)
     tip("Delete what lies outside the box; the file stays as it is")
     beside_boxed("Clip")
