@@ -16,14 +16,13 @@ from langsplat_viewer.camera.controls import from_camera
 from langsplat_viewer.marks import Drawn, Stroke, outlines
 from tests.support.fakes import CENTRES, COLOURS, PER_BLOB
 from tests.support.marks_and_flights import blob, marked, marks_of
-from tests.support.windowless import SCENES, FakeSurface, errors, settle
+from tests.support.windowless import SCENES, FakeSurface, ask, errors, open_scene, settle
 
 
 @pytest.fixture
 def searched(opened):
     """One answer: the book."""
-    queries.ask(opened, "book")
-    settle(opened)
+    ask(opened, "book")
     return opened
 
 
@@ -108,8 +107,7 @@ def test_what_changes_nothing_is_no_step(opened):
 def test_what_the_search_found(searched):
     selecting.select_query(searched)
     assert marked(searched)[0] == "book"
-    queries.ask(searched, "mug")
-    settle(searched)
+    ask(searched, "mug")
     selecting.select_query(searched, mode="add")
     assert marked(searched)[0] == "mug book"
 
@@ -162,8 +160,7 @@ def test_another_scene_has_no_marks_but_the_tool_stays(opened):
     selecting.hide_selected(opened)
     selecting.use_tool(opened, "lasso")
     selecting.set_mode(opened, "add")
-    opening.open_scene(opened, Path("plain.ply"))
-    settle(opened)
+    open_scene(opened, "plain.ply")
     assert marked(opened) == ("", "", "")
     assert (opened.state.selection.tool, opened.state.selection.mode) == ("lasso", "add")
 
