@@ -20,7 +20,7 @@ MENU = "menu of a thing"
 
 
 def draw(viewer: Viewer) -> None:
-    """A box that filters, groups, and the tree."""
+    """Draw the panel "Outline": a box that filters, groups, and the tree."""
     view = outline.wanted(viewer)
     if view is None or view.problem:
         small_wrapped(view.problem if view else "open a scene with a language field", muted())
@@ -108,7 +108,7 @@ def _row(viewer: Viewer, row: Outline, *, in_group: bool = False) -> None:
 
 
 def _chosen(menu: str) -> bool:
-    """Whether the last row was clicked, or Enter or Space pressed on it; the menu key opens its menu."""
+    """Return whether the last row was clicked, or Enter or Space pressed on it; the menu key opens `menu`."""
     if imgui.is_item_focused():
         keys, shift = imgui.Key, imgui.get_io().key_shift
         if imgui.is_key_pressed(keys.menu) or (shift and imgui.is_key_pressed(keys.f10)):
@@ -191,7 +191,7 @@ class ThingsMenu:
         self._at: Any = None  # (3,) on the surface
 
     def draw(self, viewer: Viewer, area: Area) -> None:
-        """Once per frame, after the panels."""
+        """Draw the menu while it is open; once per frame, after the panels."""
         io = imgui.get_io()
         moved = imgui.get_mouse_drag_delta(1, 0.0)
         u, v = area.fraction(io.mouse_pos.x, io.mouse_pos.y)
@@ -232,7 +232,7 @@ def _named(label: str, hint: str, text: str) -> str:
 
 
 def draw_legend(viewer: Viewer, area: Area) -> None:
-    """Colours and names of the things that are largest in the image, where latents or the tree are shown."""
+    """Draw colours and names of the largest things in the image, where latents or the tree are shown."""
     state = viewer.state
     if state.picture.display not in ("latent", "tree") or state.settings.split.columns > 1:
         return

@@ -28,7 +28,7 @@ NUMBER_EM, FPS_EM = 7.5, 4.5
 
 
 def draw(viewer: Viewer) -> None:
-    """From top to bottom: what the path is, playing it, saving it, films."""
+    """Draw the panel "Record": what the path is, playing it, saving it, films."""
     record = viewer.state.record
     if imgui.radio_button("Keyframes", not record.turns):
         filming.set_turning(viewer, False)
@@ -178,7 +178,7 @@ def _film(viewer: Viewer) -> None:
 
 
 def draw_bookmarks(viewer: Viewer) -> None:
-    """A box for a name, and the list."""
+    """Draw the panel "Bookmarks": a box for a name, and the list."""
     state = viewer.state
     imgui.begin_disabled(state.view is None)
     hint = "name of this view"

@@ -31,7 +31,7 @@ from langsplat_viewer.viewer import Training, Viewer
 
 
 def draw(viewer: Viewer) -> None:
-    """Name and figures of the scene, then the buttons."""
+    """Draw the panel "Scene": name and figures of the scene, then the buttons."""
     state = viewer.state
     if state.scene is None:
         imgui.text("Opening ..." if state.opening else "No scene is open")
@@ -102,7 +102,7 @@ UNITS = ("bytes", "kB", "MB", "GB", "TB")
 
 
 def draw_browser(viewer: Viewer) -> None:
-    """A box for a path, the folders above, what is in this one, and what was open before."""
+    """Draw the browser: a box for a path, the folders above, what is in this one, and recent scenes."""
     listing = viewer.state.browser
     title = BESIDE if viewer.state.picks_beside else TITLES[viewer.state.picks_folder]
     _ask_for_popup(title, listing is not None)
@@ -249,7 +249,7 @@ UNSAVED = "Not saved"
 
 
 def draw_unsaved(viewer: Viewer) -> None:
-    """Save, discard, cancel; over everything else, while something waits for the answer."""
+    """Ask whether to save, discard or stay; over everything else, while something waits for the answer."""
     leaving = viewer.state.selection.leaving
     _ask_for_popup(UNSAVED, leaving is not None)
     flags = imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_saved_settings
@@ -315,7 +315,7 @@ MEANS = {
 
 
 def draw_training(viewer: Viewer) -> None:
-    """The form, or what a running training says."""
+    """Draw the panel "Train": the form, or what a running training says."""
     process = viewer.training
     if process is None:
         _form(viewer)

@@ -66,7 +66,7 @@ FILES: tuple[Verb, ...] = (
 
 
 def draw(viewer: Viewer) -> None:
-    """Counts, tools, the search, verbs, files."""
+    """Draw the panel "Select": counts, tools, the search, verbs, files."""
     imgui.begin_disabled(viewer.state.scene is None)
     small_wrapped(counts(viewer.state.selection.marks), muted())
     _tools(viewer)
@@ -223,7 +223,7 @@ PAINT = (float(TINT[0]), float(TINT[1]), float(TINT[2]), 0.35)
 
 
 def handle_stroke(viewer: Viewer, area: Area) -> None:
-    """Once per frame: begin, go on with, or end a stroke."""
+    """Begin a stroke, go on with it, or end it; once per frame."""
     io, selection = imgui.get_io(), viewer.state.selection
     if selection.tool is None:
         return
@@ -247,19 +247,20 @@ def held_mode() -> Mode | None:
 
 
 def draw_stroke(viewer: Viewer, area: Area) -> None:
-    """The outline of what is being enclosed, and the brush."""
+    """Draw the outline of what is being enclosed, and the brush."""
     selection = viewer.state.selection
     if selection.tool is None or viewer.state.scene is None:
         return
     paint = imgui.get_foreground_draw_list()
-    paint.push_clip_rect(ImVec2(area.left, area.top), ImVec2(area.left + area.width, area.top + area.height))
+    paint.push_clip_rect(*area.corners)
     drawn, radius = selecting.drawn_stroke(viewer), selection.brush * area.height
     for line in marks.outlines(drawn) if drawn is not None else []:
         points = _on_screen(line, area)
         if selection.tool == "brush":
             _stripe(paint, points, radius)
         else:
-            _outline(paint, points)
+            paint.add_polyline(points, _colour(DARK), 3.0, 0)
+            paint.add_polyline(points, _colour(LIGHT), 1.5, 0)
     io = imgui.get_io()
     if selection.tool == "brush" and (drawn is not None or not io.want_capture_mouse):
         paint.add_circle(io.mouse_pos, radius, _colour(DARK), 0, 3.0)
@@ -272,11 +273,6 @@ def _on_screen(line: Array, area: Area) -> list[Any]:
     return [ImVec2(area.left + u * area.width, area.top + v * area.height) for u, v in line.tolist()]
 
 
-def _outline(paint: Any, points: list[Any]) -> None:
-    paint.add_polyline(points, _colour(DARK), 3.0, 0)
-    paint.add_polyline(points, _colour(LIGHT), 1.5, 0)
-
-
 def _stripe(paint: Any, points: list[Any], radius: float) -> None:
     """The way of the brush, as wide as it is; of a click a disk."""
     if len(points) == 1:
@@ -286,7 +282,7 @@ def _stripe(paint: Any, points: list[Any], radius: float) -> None:
 
 
 def draw_hint(viewer: Viewer, area: Area) -> None:
-    """What a click on the scene does, while it does not turn the view."""
+    """Say what a click on the scene does, while it does not turn the view."""
     state, tool = viewer.state, viewer.state.selection.tool
     if state.ruler.measures:
         text = "Ruler: click two points on the surface; Esc ends it"

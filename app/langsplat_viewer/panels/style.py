@@ -24,6 +24,21 @@ class Area:
         """A window position as fractions of the area; outside [0, 1] beyond its edges."""
         return (x - self.left) / self.width, (y - self.top) / self.height
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in whole window units, at least 1."""
+        return max(round(self.width), 1), max(round(self.height), 1)
+
+    @property
+    def corners(self) -> tuple[ImVec2, ImVec2]:
+        """The upper left and the lower right corner."""
+        return ImVec2(self.left, self.top), ImVec2(self.left + self.width, self.top + self.height)
+
+    def columns(self, count: int) -> list["Area"]:
+        """The area cut into columns of one width."""
+        width = self.width / count
+        return [Area(self.left + place * width, self.top, width, self.height) for place in range(count)]
+
 
 def scene_area() -> Area:
     """Return what menus and docked panels leave free, at least one unit wide and high."""
@@ -49,7 +64,7 @@ SIZES = {"frame_rounding": 4.0, "indent_spacing": 21.0, "scrollbar_size": 14.0, 
 
 
 def apply(preferences: Preferences) -> None:
-    """Calm: one accent, little contrast between the widgets. To be called once for every change."""
+    """Apply the theme, with one accent and little contrast between the widgets; once for every change."""
     dark = preferences.theme == "dark"
     themes = hello_imgui.ImGuiTheme_
     hello_imgui.apply_theme(themes.darcula_darker if dark else themes.imgui_colors_light)
