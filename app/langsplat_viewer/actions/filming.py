@@ -1,4 +1,4 @@
-"""The camera path and its keyframes; what is undone of them."""
+"""The camera path and its keyframes; films, images of any size, and images as commands."""
 
 import math
 import os
@@ -43,7 +43,7 @@ from langsplat_viewer.viewer import Viewer
 
 
 def add_keyframe(viewer: Viewer) -> None:
-    """The current view, some seconds after the last keyframe."""
+    """Add the current view as a keyframe, some seconds after the last one."""
     state, record = viewer.state, viewer.state.record
     if state.view is None:
         state.say("open a scene first, then record a path in it", is_error=True)
@@ -67,12 +67,12 @@ def choose_keyframe(viewer: Viewer, key: Keyframe) -> None:
 
 
 def delete_keyframe(viewer: Viewer, key: Keyframe) -> None:
-    """Take it off the path; the others keep their times."""
+    """Take a keyframe off the path; the others keep their times."""
     _set(viewer, tuple(other for other in viewer.state.record.keyframes if other is not key), None)
 
 
 def move_keyframe(viewer: Viewer, key: Keyframe, seconds: float) -> None:
-    """Move it to another time, or beside a keyframe that has that time."""
+    """Move a keyframe to another time, or beside a keyframe that has that time."""
     others = tuple(other for other in viewer.state.record.keyframes if other is not key)
     seconds = min(max(seconds, 0.0), LONGEST)
     while any(abs(other.seconds - seconds) < SAME_TIME for other in others):
@@ -82,14 +82,14 @@ def move_keyframe(viewer: Viewer, key: Keyframe, seconds: float) -> None:
 
 
 def replace_keyframe(viewer: Viewer, key: Keyframe) -> None:
-    """Put the current view in its place."""
+    """Put the current view in the place of a keyframe."""
     if viewer.state.view is not None:
         new = replace(key, pose=pose_of(viewer.state.view))
         _set(viewer, with_keyframe(viewer.state.record.keyframes, new), new)
 
 
 def set_path_seconds(viewer: Viewer, seconds: float) -> None:
-    """Play the whole path in that time."""
+    """Set the duration of the whole path."""
     record = viewer.state.record
     seconds = min(max(seconds, 0.1), LONGEST)
     if record.turns:
@@ -184,7 +184,7 @@ def set_film_size(viewer: Viewer, width: int, height: int) -> None:
 
 
 def set_film_fps(viewer: Viewer, fps: float) -> None:
-    """Images per second of a film."""
+    """Set the images per second of a film."""
     viewer.state.record.fps = fps
 
 
@@ -260,8 +260,7 @@ def cancel_film(viewer: Viewer) -> None:
 
 
 def _submit(viewer: Viewer, label: str, work: Callable[[Progress], str]) -> None:
-    state = viewer.state
-    viewer.recorder.submit(label, work, state.say, lambda reason: state.say(reason, is_error=True))
+    viewer.recorder.submit(label, work, viewer.state.say, viewer.say_error)
 
 
 def copy_command(viewer: Viewer, folder: Path) -> str:

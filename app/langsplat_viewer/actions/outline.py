@@ -194,7 +194,7 @@ def hide(viewer: Viewer, target: Target) -> None:
 
     def act(members: Array) -> None:
         marks = viewer.state.selection.marks
-        hidden = marks.hidden | (members & ~locked(viewer))
+        hidden = marks.hidden | (members & ~viewer.state.selection.locked)
         mark(viewer, replace(marks, selected=marks.selected & ~hidden, hidden=hidden))
 
     with_thing(viewer, target, act)
@@ -232,11 +232,6 @@ def write_filter(viewer: Viewer, text: str) -> None:
 
 
 # Locks and groups.
-
-
-def locked(viewer: Viewer) -> Array:
-    """(N,) bool: what tools leave alone."""
-    return viewer.state.selection.locked
 
 
 def toggle_lock(viewer: Viewer, node: int) -> None:

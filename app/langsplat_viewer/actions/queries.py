@@ -68,7 +68,7 @@ JOINS = {"and": "{} and {}", "or": "{} or {}", "without": "{}, not {}"}  # as th
 
 def ask_combined(viewer: Viewer, first: Query, join: str, second: Query) -> None:
     """Search for two queries at once, joined by one of `JOINS`."""
-    ask_one(viewer, JOINS[join].format(first.phrase, second.phrase), then_show=True)
+    ask_one(viewer, JOINS[join].format(first.phrase, second.phrase))
 
 
 def ask_again(viewer: Viewer) -> None:

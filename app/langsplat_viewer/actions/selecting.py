@@ -90,19 +90,22 @@ def hide_selected(viewer: Viewer) -> None:
 def isolate_selected(viewer: Viewer) -> None:
     """Hide everything that is not selected."""
     if has_selection(viewer):
-        mark(viewer, marks.isolating(viewer.state.selection.marks, viewer.state.selection.locked))
+        marks, locked = viewer.state.selection.marks, viewer.state.selection.locked
+        mark(viewer, replace(marks, hidden=marks.kept & ~(marks.selected | locked)))
 
 
 def show_hidden(viewer: Viewer) -> None:
     """Show everything that was hidden."""
     if has_scene(viewer):
-        mark(viewer, marks.showing_all(viewer.state.selection.marks))
+        marks = viewer.state.selection.marks
+        mark(viewer, replace(marks, hidden=np.zeros_like(marks.hidden)))
 
 
 def delete_selected(viewer: Viewer) -> None:
     """Take the selection out of the image and of what is saved; the file that was opened stays as it is."""
     if has_selection(viewer):
-        mark(viewer, marks.deleting(viewer.state.selection.marks))
+        marks = viewer.state.selection.marks
+        mark(viewer, Marks(np.zeros_like(marks.selected), marks.hidden, marks.deleted | marks.selected))
 
 
 def reach(viewer: Viewer) -> float:
@@ -126,7 +129,7 @@ def shrink_selection(viewer: Viewer) -> None:
 
 
 def select_alike(viewer: Viewer) -> None:
-    """Select everything that is like what is selected, wherever it is; see `QueryEngine.like`."""
+    """Select everything that is like what is selected, wherever it is, by `QueryEngine.like`."""
     if has_selection(viewer):
         selected = viewer.state.selection.marks.selected
         find(viewer, "looking for more like", lambda engine: engine.like(selected).members, "replace")
@@ -399,7 +402,7 @@ def discard_and_leave(viewer: Viewer) -> None:
 
 
 def stay(viewer: Viewer) -> None:
-    """Do not go on."""
+    """Stay in the scene: forget the action that waited for the answer."""
     _answered(viewer)
 
 
@@ -426,7 +429,7 @@ def begin_stroke(viewer: Viewer, u: float, v: float) -> None:
 
 
 def extend_stroke(viewer: Viewer, u: float, v: float) -> None:
-    """The mouse is there now."""
+    """Add a place (u, v) to the stroke under way."""
     selection = viewer.state.selection
     stroke = selection.stroke
     if stroke is None:
@@ -465,7 +468,7 @@ def drawn_stroke(viewer: Viewer) -> Drawn | None:
 
 
 def cancel_stroke(viewer: Viewer) -> None:
-    """Select nothing by it."""
+    """Drop the stroke under way; nothing is selected by it."""
     viewer.state.selection = replace(viewer.state.selection, stroke=None)
 
 

@@ -139,12 +139,8 @@ def open_at(viewer: Viewer, camera: Camera) -> None:
     """Take a camera's view at once; it is the opening view from now on."""
     extent, scene = viewer.state.extent, viewer.state.scene
     if extent is not None and scene is not None:
-        same = (
-            i
-            for i, own in enumerate(scene.cameras)
-            if np.array_equal(own.world_to_camera, camera.world_to_camera)
-        )
-        viewer.state.camera_index = next(same, None)
+        same = [np.array_equal(own.world_to_camera, camera.world_to_camera) for own in scene.cameras]
+        viewer.state.camera_index = same.index(True) if any(same) else None
         viewer.state.opening_camera = camera
         move(viewer, lambda view: from_camera(camera, extent))
 
@@ -277,18 +273,18 @@ def focus_result(viewer: Viewer, query: Query | None = None) -> None:
     if query is None or query.result is None or place is None:
         frame_scene(viewer)
         return
-    glide_to(viewer, focus(state.view, place, _distance_for(viewer, place, query.result.box)))
+    focus_on(viewer, place, query.result.box)
 
 
-def focus_on(viewer: Viewer, place: Array, box: Array) -> None:
+def focus_on(viewer: Viewer, place: Array, box: Array | None) -> None:
     """Bring a thing at `place` (3,) in `box` (2, 3) to the centre, as near as it is small."""
     if viewer.state.view is not None and viewer.state.extent is not None:
         glide_to(viewer, focus(viewer.state.view, place, _distance_for(viewer, place, box)))
 
 
 def _distance_for(viewer: Viewer, place: Array, box: Array | None) -> float:
-    """From where a thing at `place` (3,) in `box` (2, 3) is seen, world units: no farther back than the
-    eye or the opening view are now, which in a room would be behind its wall."""
+    """Distance from which a thing at `place` (3,) in `box` (2, 3) is seen, world units: no farther back than
+    the eye or the opening view are now, which in a room would be behind its wall."""
     view, extent, home = viewer.state.view, viewer.state.extent, opening_view(viewer)
     assert view is not None
     assert extent is not None
@@ -403,20 +399,20 @@ def type_bookmark(viewer: Viewer, text: str) -> None:
 
 
 def go_to_bookmark(viewer: Viewer, bookmark: Bookmark) -> None:
-    """Stand where it was made, turning around the same point."""
+    """Stand where a bookmark was made, turning around the same point."""
     if viewer.state.extent is not None:
         glide_to(viewer, bookmarked_view(bookmark, viewer.state.extent))
 
 
 def bookmarked_view(bookmark: Bookmark, extent: Extent) -> OrbitCamera:
-    """The view that was kept."""
+    """Return the view that a bookmark keeps."""
     view = view_of(bookmark.pose, extent)
     target = view.eye + bookmark.distance * view.rotation[2]
     return replace(view, target=target, distance=bookmark.distance)
 
 
 def delete_bookmark(viewer: Viewer, bookmark: Bookmark) -> None:
-    """Take it off the list."""
+    """Take a bookmark off the list."""
     viewer.state.bookmarks = tuple(other for other in viewer.state.bookmarks if other is not bookmark)
     _keep(viewer)
 
@@ -467,11 +463,9 @@ def compare_with_reference(viewer: Viewer) -> None:
     def done(reference: Array) -> None:
         state.timing.comparison = compared(shown, reference, backend)
 
-    viewer.recorder.submit(
-        "comparing with the reference", work, done, lambda reason: state.say(reason, is_error=True)
-    )
+    viewer.recorder.submit("comparing with the reference", work, done, viewer.say_error)
 
 
 def stop_comparing(viewer: Viewer) -> None:
-    """Do not wait for it."""
+    """Cancel the comparison with the reference."""
     viewer.recorder.cancel()
