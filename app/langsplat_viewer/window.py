@@ -321,7 +321,7 @@ class Window:
             if camera is not None:
                 viewpoint.open_at(viewer, camera)
         except InputError as error:
-            state.say(str(error), is_error=True)
+            viewer.say_error(str(error))
         if request.orthographic is not None:
             viewpoint.open_orthographic(viewer, request.orthographic)
         wanted = request.picture
@@ -447,7 +447,7 @@ class Window:
             textures = (*canvas.textures, *self._draw_beside())
         except DRAW_ERRORS as error:
             self.unfinished, textures = False, canvas.textures
-            state.say(one_line(error), is_error=True)
+            viewer.say_error(one_line(error))
         self._pace()
         self._screen.use()
         self._screen.color_mask = True, True, True, True  # a mask left set would colour the panels

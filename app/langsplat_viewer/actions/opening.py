@@ -93,7 +93,7 @@ def _open(viewer: Viewer, path: Path, then: Callable[[Viewer], None], check: Cal
 
     def failed(reason: str) -> None:
         viewer.state.opening = None
-        viewer.state.say(reason, is_error=True)
+        viewer.say_error(reason)
 
     viewer.run(f"opening {path.name}", work, done, failed)
 
@@ -212,7 +212,7 @@ def reload(viewer: Viewer) -> None:
     state = viewer.state
     path, shown = state.path, state.scene
     if path is None or shown is None:
-        state.say("open a scene first; it can be read again when its file has changed", is_error=True)
+        viewer.say_error("open a scene first; it can be read again when its file has changed")
         return
     if state.opening is not None:
         return
@@ -261,7 +261,7 @@ def step_scene(viewer: Viewer, by: int) -> None:
     state = viewer.state
     others = [path for path in state.scenes if state.path is None or path != state.path.absolute()]
     if not others:
-        state.say("no other scene is listed: drop several, or open another", is_error=True)
+        viewer.say_error("no other scene is listed: drop several, or open another")
         return
     here = state.scenes.index(state.path.absolute()) if state.path and len(others) < len(state.scenes) else -1
     switch_scene(viewer, state.scenes[(here + by) % len(state.scenes)])
@@ -502,7 +502,7 @@ def open_project(viewer: Viewer, path: Path, then: Callable[[Viewer], None] = la
         project = read_project(path)
         scene = scene_of(project)
     except InputError as error:
-        viewer.state.say(one_line(error), is_error=True)
+        viewer.say_error(one_line(error))
         return
 
     def restore(viewer: Viewer) -> None:
@@ -530,7 +530,7 @@ def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
     others = [path.name for path in scenes if path not in known]
     if others:
         more = f" and {len(others) - NAMED} more" if len(others) > NAMED else ""
-        viewer.state.say(f"not opened: {', '.join(others[:NAMED])}{more}", is_error=True)
+        viewer.say_error(f"not opened: {', '.join(others[:NAMED])}{more}")
     add_scenes(viewer, known)
     if len(known) > 1:
         viewer.state.say(f"{len(known)} scenes: the panel Scene lists them")

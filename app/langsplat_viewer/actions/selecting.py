@@ -49,7 +49,7 @@ def take(viewer: Viewer, found: Array, mode: Mode | None = None) -> None:
 def has_scene(viewer: Viewer) -> bool:
     """Return whether a scene is open; say so where none is."""
     if viewer.state.scene is None:
-        viewer.state.say("open a scene first, then select in it", is_error=True)
+        viewer.say_error("open a scene first, then select in it")
     return viewer.state.scene is not None
 
 
@@ -247,7 +247,7 @@ def select_range(viewer: Viewer, text: str) -> None:
     except ValueError:
         ends = np.zeros(0)
     if found is None or len(ends) != 2:
-        viewer.state.say(f"'{text}' is not two numbers, such as 0.5 to 0.9", is_error=True)
+        viewer.say_error(f"'{text}' is not two numbers, such as 0.5 to 0.9")
         return
     if viewer.state.selection.measure in marks.LOGARITHMIC:
         ends = np.log10(np.maximum(ends, 1e-30))
@@ -300,7 +300,7 @@ def export(
         field = replace(field, taught=tuple(engine.taught.values()))
     rows = np.flatnonzero(rows_of(marks, part))
     if len(rows) == 0:
-        state.say(f"the {part} holds no Gaussians: nothing to write", is_error=True)
+        viewer.say_error(f"the {part} holds no Gaussians: nothing to write")
         return
     stem = f"{state.path.stem if state.path else 'scene'}-{part}{'-points' if as_points else ''}"
 
@@ -315,7 +315,7 @@ def export(
         then(viewer)
 
     def failed(reason: str) -> None:
-        state.say(f"not saved: {reason}", is_error=True)
+        viewer.say_error(f"not saved: {reason}")
 
     job = viewer.run(f"saving the {part}", work, done, failed)
     state.selection = replace(state.selection, writing=job.future)
@@ -486,7 +486,7 @@ def _select_under(viewer: Viewer, stroke: Stroke, mode: Mode | None) -> None:
     if state.scene is None or stroke.centre is None:
         return
     if state.scene.language is None:
-        state.say("without a language field no things are known: use a brush, sphere or box", is_error=True)
+        viewer.say_error("without a language field no things are known: use a brush, sphere or box")
         return
     level = LEVELS.index("whole" if state.level == "auto" else state.level)
     centre = np.array(stroke.centre)

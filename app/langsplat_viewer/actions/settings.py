@@ -134,7 +134,7 @@ def _can_show(viewer: Viewer, needs_field: bool) -> bool:
     """Return whether the scene has a language field where one is needed; says so where it has none."""
     scene = viewer.state.scene
     if needs_field and scene is not None and scene.language is None:
-        viewer.state.say(no_field(scene), is_error=True)
+        viewer.say_error(no_field(scene))
         return False
     return True
 

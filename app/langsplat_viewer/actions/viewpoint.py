@@ -53,9 +53,9 @@ def toggle_playing(viewer: Viewer) -> None:
     if record.began is not None:
         record.began = None
     elif viewer.state.view is None:
-        viewer.state.say("open a scene first, then play a path in it", is_error=True)
+        viewer.say_error("open a scene first, then play a path in it")
     elif path_seconds(viewer) <= 0:
-        viewer.state.say("a path needs two keyframes: add one at the current view", is_error=True)
+        viewer.say_error("a path needs two keyframes: add one at the current view")
     else:
         start = 0.0 if record.at >= path_seconds(viewer) else record.at
         scrub(viewer, start)
@@ -249,7 +249,7 @@ def go_to_camera(viewer: Viewer, index: int) -> None:
     if scene is None or extent is None:
         return
     if not scene.cameras:
-        viewer.state.say("this scene has no training cameras (no .cameras.json beside it)", is_error=True)
+        viewer.say_error("this scene has no training cameras (no .cameras.json beside it)")
         return
     viewer.state.camera_index = index % len(scene.cameras)
     glide_to(viewer, from_camera(scene.cameras[viewer.state.camera_index], extent))
@@ -318,7 +318,7 @@ def toggle_pointing(viewer: Viewer) -> None:
     """Say what is under the cursor from now on, or no longer."""
     state = viewer.state
     if not state.pointing and (state.scene is None or state.scene.language is None):
-        state.say("open a scene first" if state.scene is None else no_field(state.scene), is_error=True)
+        viewer.say_error("open a scene first" if state.scene is None else no_field(state.scene))
         return
     state.pointing, state.hover = not state.pointing, None
 
@@ -375,7 +375,7 @@ def add_bookmark(viewer: Viewer, name: str = "") -> None:
     """Keep the current view; in place of one of the same name. Without a name it gets a number."""
     state = viewer.state
     if state.view is None:
-        state.say("open a scene first, then bookmark a view of it", is_error=True)
+        viewer.say_error("open a scene first, then bookmark a view of it")
         return
     kept = state.bookmarks
     if not name.strip():
@@ -386,7 +386,7 @@ def add_bookmark(viewer: Viewer, name: str = "") -> None:
     added = Bookmark(named(name), pose_of(state.view), state.view.distance)
     others = tuple(bookmark for bookmark in kept if bookmark.name != added.name)
     if len(others) >= MOST_VIEWS:
-        state.say(f"a scene has at most {MOST_VIEWS} bookmarks: delete one", is_error=True)
+        viewer.say_error(f"a scene has at most {MOST_VIEWS} bookmarks: delete one")
         return
     state.bookmarks, state.bookmark_typed = (*others, added), ""
     _keep(viewer)
@@ -433,7 +433,7 @@ def _keep(viewer: Viewer) -> None:
     try:
         viewer.shelf.write(state.path, state.bookmarks)
     except (OSError, InputError) as error:
-        state.say(f"bookmarks not kept: {one_line(error)}", is_error=True)
+        viewer.say_error(f"bookmarks not kept: {one_line(error)}")
 
 
 # Timing and the comparison with the reference.
@@ -449,10 +449,10 @@ def compare_with_reference(viewer: Viewer) -> None:
     tell the difference."""
     state = viewer.state
     if state.scene is None or state.view is None or viewer.surface is None:
-        state.say("open a scene first, then compare its picture", is_error=True)
+        viewer.say_error("open a scene first, then compare its picture")
         return
     if viewer.recorder.current is not None:
-        state.say("a film or a comparison is being drawn; wait for it or cancel it", is_error=True)
+        viewer.say_error("a film or a comparison is being drawn; wait for it or cancel it")
         return
     request, backend = state.request(compared_size(state.size)), state.backend
     shown = viewer.surface.capture(request)

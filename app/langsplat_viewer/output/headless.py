@@ -48,7 +48,7 @@ log = logging.getLogger("langsplat")
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """All that is done once, however many images are drawn."""
+    """Request, answers and lines that are made once, however many images are drawn."""
 
     request: RenderRequest
     results: tuple[QueryResult, ...]
@@ -127,8 +127,8 @@ def even(camera: Camera) -> Camera:
 
 
 def turn(prepared: Prepared, options: ViewerOptions) -> Motion:
-    """Once around what the camera sees in its middle, or around the place of the last answer, from as far
-    as it fills half of the image. InputError where nothing was found."""
+    """Return the turn around what the camera sees in its middle, or around the place of the last answer, from
+    where it fills half of the image. InputError where nothing was found."""
     extent = extent_of(prepared.request.scene.source)
     view = from_camera(prepared.request.camera, extent)
     if options.around == "answer":

@@ -608,4 +608,5 @@ def _on_cube(place: Array, middle: tuple[float, float], scale: float) -> ImVec2:
 
 
 def _faded(colour: Iterable[float], alpha: float) -> int:
-    return int(imgui.get_color_u32((*map(float, colour), alpha)))
+    red, green, blue = map(float, colour)
+    return int(imgui.get_color_u32((red, green, blue, alpha)))
