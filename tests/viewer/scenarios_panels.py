@@ -269,8 +269,7 @@ def use_the_outline(s: Any) -> None:
     s.ctx.mouse_click(1)
     s.ctx.yield_(3)
     s.ctx.item_click("//**/##name this")
-    s.ctx.key_chars_append_enter("the atlas")
-    s.settle()
+    s.enter("the atlas")
     assert s.state.queries[-1].phrase == "the atlas"
     assert s.state.queries[-1].result.members.reshape(3, -1).all(1).tolist() == [False, True, False]
 
@@ -350,8 +349,7 @@ def mark_and_return(s) -> None:
     s.click("//**/view 1##bookmark")
     np.testing.assert_allclose(s.state.view.rotation, start.rotation, atol=1e-6)
     s.ctx.item_click("//**/##bookmark")
-    s.ctx.key_chars_append_enter("by the key of k")
-    s.ctx.yield_(2)
+    s.enter("by the key of k", frames=2)
     assert [mark.name for mark in s.state.bookmarks] == ["view 1", "by the key of k"]
     assert s.state.record.keyframes == ()
     s.key(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.c, frames=3)

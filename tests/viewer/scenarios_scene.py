@@ -337,8 +337,7 @@ def name_what_is_clicked(s: Any) -> None:
     s.settle()
     assert marked(s.window.viewer)[0] == "plant"
     s.ctx.item_click("//Select/##name")
-    s.ctx.key_chars_append_enter("grandma's mug")
-    s.settle()
+    s.enter("grandma's mug")
     query = s.state.queries[-1]
     assert (query.phrase, query.result.found) == ("grandma's mug", True)
     np.testing.assert_array_equal(query.result.members, s.state.selection.marks.selected)
@@ -461,8 +460,7 @@ def brush_numbers(s: Any) -> None:
     np.testing.assert_array_equal(chosen, between)
     s.ctx.item_click("//Select/Opacity")
     s.ctx.item_click("//Select/##range")
-    s.ctx.key_chars_append_enter("0 1")
-    s.ctx.yield_(2)
+    s.enter("0 1", frames=2)
     assert s.state.selection.marks.selected.all()
 
 

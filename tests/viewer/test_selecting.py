@@ -168,14 +168,14 @@ def test_another_scene_has_no_marks_but_the_tool_stays(opened):
 # Selecting with the mouse: what a stroke encloses, and what becomes of it. No window.
 
 SIZE = (400, 300)
+FRONT = look_at(np.array([0, 0, -5.0]), np.zeros(3), np.array([0, -1.0, 0]), SIZE)
 
 
 @pytest.fixture
 def front(opened):
     """From straight ahead, so that the blobs lie in a row: mug, book, plant from left to right."""
-    camera = look_at(np.array([0, 0, -5.0]), np.zeros(3), np.array([0, -1.0, 0]), SIZE)
     settings.resize(opened, *SIZE)
-    viewpoint.move(opened, lambda view: from_camera(camera, opened.state.extent))
+    viewpoint.move(opened, lambda view: from_camera(FRONT, opened.state.extent))
     return opened
 
 
@@ -297,8 +297,7 @@ def test_escape_gives_up_the_stroke_then_the_tool_and_help_before_both(front):
 
 
 def drawn(tool, path, centre=None) -> Drawn:
-    camera = look_at(np.array([0, 0, -5.0]), np.zeros(3), np.array([0, -1.0, 0]), SIZE)
-    return Drawn(tool, Stroke(tuple(path), centre), camera, 0.03, 0.5)
+    return Drawn(tool, Stroke(tuple(path), centre), FRONT, 0.03, 0.5)
 
 
 def test_outlines_are_what_is_enclosed():

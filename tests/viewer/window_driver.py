@@ -147,6 +147,16 @@ class Session:
         self.ctx.item_click(item)
         self.rest(frames)
 
+    def type(self, text: str, frames: int) -> None:
+        """Type characters, then let so many frames pass."""
+        self.ctx.key_chars(text)
+        self.ctx.yield_(frames)
+
+    def enter(self, text: str, frames: int = 0) -> None:
+        """Type characters and Enter, then `rest`."""
+        self.ctx.key_chars_append_enter(text)
+        self.rest(frames)
+
     def open_panel(self, title: str, frames: int = 0) -> None:
         """Open a panel, then `rest`."""
         settings.open_panel(self.window.viewer, title)
@@ -223,8 +233,7 @@ def find_the_plant(s: Session, rgb: np.ndarray) -> None:
     assert s.state.queries[0].result.found
     # The box keeps the keyboard, until Esc leaves it: then the next letter is a key again.
     assert imgui.get_io().want_text_input
-    s.ctx.key_chars("ff")
-    s.ctx.yield_(2)
+    s.type("ff", frames=2)
     assert s.state.typed == "ff"
     assert s.state.view is before
     for _ in range(2):
@@ -376,8 +385,7 @@ def use_the_palette(s: Session) -> None:
     seen = s.shot("palette")[rows]
     assert np.ptp(seen[:, right - 100 : right], axis=0).max() > 60  # keys
     assert np.ptp(seen[:, right - 5 : right - 1], axis=0).max() < 10
-    s.ctx.key_chars_append_enter("show depth")
-    s.ctx.yield_(3)
+    s.enter("show depth", frames=3)
     assert s.state.picture.display == "depth"
     assert not s.state.show_palette
 
@@ -419,8 +427,7 @@ def use_shortcuts(s: Session) -> None:
     assert not list(s.folder.glob("blobs-*.png"))
 
     s.key(ctrl | key.f, frames=3)
-    s.ctx.key_chars("far")
-    s.ctx.yield_(3)
+    s.type("far", frames=3)
     assert (s.state.typed, s.state.view is before) == ("far", True)
     s.ctx.key_press(key.f1)  # also while typing
     s.ctx.yield_(2)
@@ -439,8 +446,7 @@ def use_shortcuts(s: Session) -> None:
 
     s.ctx.key_press(ctrl | key.s)
     s.wait((s.folder / "blobs-001.png").exists)
-    s.ctx.key_chars("?")
-    s.ctx.yield_(2)
+    s.type("?", frames=2)
     assert s.state.show_help
     s.ctx.key_press(key.escape)
     use_the_palette(s)
@@ -523,8 +529,7 @@ def arrange_panels(s: Session) -> None:
     s.settle()
     assert s.state.size[0] == 860 > whole[0]  # the scene has taken their place
     s.key(imgui.Key.mod_ctrl | imgui.Key.f, frames=4)
-    s.ctx.key_chars("mug")
-    s.ctx.yield_(3)
+    s.type("mug", frames=3)
     assert s.state.typed == "mug"  # the panel is open again, and its box has the keyboard
     s.ctx.key_press(imgui.Key.escape)
     s.menu("Window", "Panels as at first")
@@ -623,8 +628,7 @@ def travel_by_keys(s: Session) -> None:
     s.key(imgui.Key.enter, frames=3)
     assert s.state.picture.display == "depth"
     s.key(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.p, frames=3)
-    s.ctx.key_chars_append_enter("teleport")
-    s.ctx.yield_(3)
+    s.enter("teleport", frames=3)
     assert s.state.show_palette
 
 
