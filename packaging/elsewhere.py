@@ -54,7 +54,7 @@ class Row:
 
     @property
     def difference(self) -> str:
-        """What it is, for the table."""
+        """The cell of the table that says what is different."""
         other = "" if self.python == sys.executable else Path(self.python).resolve().name
         typed = (self.environment, self.before, self.arguments, other)
         beside = [f"{self.loops} busy loops beside"] if self.loops else []
@@ -62,7 +62,7 @@ class Row:
 
 
 def rows(seed: int, newest: str) -> list[Row]:
-    """All of them. Of its own accord the suite runs with one thread of OpenMP and in the files' order."""
+    """Return all rows. The suite itself runs with one thread of OpenMP and in the files' order."""
     steps = subprocess.run([sys.executable, "-c", STEPS], capture_output=True, text=True, check=True).stdout
     every = steps.split()
     avx512 = [name for name in every if "512" in name or name == "X86_V4"]
@@ -85,7 +85,7 @@ def rows(seed: int, newest: str) -> list[Row]:
 
 
 def environment_of(row: Row, folder: str) -> dict[str, str]:
-    """The variables of its process."""
+    """Return the environment variables of a row's process."""
     paths = os.pathsep.join(str(ROOT / part) for part in (".", "app", "packaging/wheel"))
     given = dict(pair.split("=", 1) for pair in row.environment.replace("{tmp}", folder).split())
     if "LOCPATH" in given:  # few systems have more than their own locale
@@ -96,7 +96,7 @@ def environment_of(row: Row, folder: str) -> dict[str, str]:
 
 
 def run(row: Row) -> tuple[tuple[object, ...], bool]:
-    """How many tests passed, failed and were skipped, CPU minutes, and whether all went well."""
+    """Run a row; return the tests passed, failed and skipped, the CPU minutes, and whether all went well."""
     command = f"{row.before} {row.python} -m pytest -n 2 --dist loadfile {row.arguments}".split()
     command += [f"tests/{name}" for name in row.folders.split()]
     log = OUT / f"{row.name}.txt"

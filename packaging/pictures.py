@@ -51,8 +51,6 @@ STILLS = {
         *("--display", "segmentation"),
     ],
 }
-
-
 PAGE, PAGE_VIEW, PAGE_PHRASE = "page.jpg", 20, "blue gift"
 QUERIES = ("teddy bear", "blue gift", "hamburger")
 
@@ -147,10 +145,6 @@ def _side_by_side(ctx: Any, window: Window) -> None:
 def _palette(ctx: Any, window: Window) -> None:
     settings.show_palette(window.viewer, True)
     settings.type_command(window.viewer, "sel")
-
-
-def _with_structure(ctx: Any, window: Window) -> None:
-    settings.toggle_overlay(window.viewer, "things")
 
 
 def _light(ctx: Any, window: Window) -> None:
@@ -249,7 +243,7 @@ WINDOWS: dict[str, tuple[tuple[str, ...], Act]] = {
     "beside.jpg": (("teddy bear", "toy"), _beside),
     "side_by_side.jpg": (("teddy bear",), _side_by_side),
     "palette.jpg": (QUERIES, _palette),
-    "structure.jpg": (("toy, not teddy bear", "keyboard of the laptop"), _with_structure),
+    "structure.jpg": (("toy, not teddy bear", "keyboard of the laptop"), _found),
     "three_levels.jpg": (("teddy bear",), _three_levels),
     "tree.jpg": (("teddy bear",), _tree),
     "light.jpg": (("teddy bear",), _light),

@@ -318,7 +318,7 @@ class Pace:
         self._shares: dict[Level, float] = {}  # of the full image's time, measured
 
     def expect(self, count: int) -> None:
-        """Images are of so many Gaussians from now on."""
+        """Expect images of `count` Gaussians from now on."""
         self._count = max(count, 1)
 
     @property
@@ -327,7 +327,7 @@ class Pace:
         return not self._is_within(FINE)
 
     def drew(self, level: Level, milliseconds: float) -> None:
-        """An image took so long."""
+        """Learn the time of an image that was drawn."""
         if level == FINE:
             self._each = milliseconds / self._count
             self._shares = {other: FORGET * share for other, share in self._shares.items()}
@@ -376,7 +376,7 @@ class Latest(Generic[W, M]):
         return self._wanted is not None
 
     def want(self, wanted: W) -> None:
-        """Begin with it, unless that was done."""
+        """Begin to make the result for `wanted`, unless it is under way or there."""
         if wanted != self._wanted:
             self.drop()
             self._wanted = wanted
@@ -392,7 +392,7 @@ class Latest(Generic[W, M]):
         return self._made if wanted == self._wanted else None
 
     def drop(self) -> None:
-        """Nothing is wanted any more."""
+        """Cancel the work under way, and drop its result."""
         self.worker.cancel()
         self.worker.poll()  # so that nothing of a job that was left is held
         self._wanted, self._made, self._problem = None, None, ""

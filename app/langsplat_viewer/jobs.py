@@ -95,7 +95,7 @@ class Job:
             self.wake()
 
     def run(self) -> None:
-        """On the worker's thread."""
+        """Do the work, on the worker's thread."""
         if not self.future.set_running_or_notify_cancel():
             return
         try:

@@ -66,7 +66,7 @@ def measured(scene: Scene, measure: Measure, eye: Array, relevancy: Array | None
 
 
 def histogram(values: Array, shown: Array) -> Histogram:
-    """Of the `shown` (N,) ones among (N,) values that are finite."""
+    """Return the histogram of (N,) values that are finite and `shown` (N,) bool."""
     values = np.where(shown & np.isfinite(values), values, np.nan)
     finite = values[np.isfinite(values)]
     low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
@@ -106,14 +106,11 @@ class Marks:
 
     def same(self, other: "Marks") -> bool:
         """Return whether the same are marked in both."""
-        return all(
-            a is b or np.array_equal(a, b)
-            for a, b in (
-                (self.selected, other.selected),
-                (self.hidden, other.hidden),
-                (self.deleted, other.deleted),
-            )
-        )
+        pairs = ((getattr(self, name), getattr(other, name)) for name in NAMES)
+        return all(a is b or np.array_equal(a, b) for a, b in pairs)
+
+
+NAMES = tuple(field.name for field in fields(Marks))
 
 
 def unmarked(count: int) -> Marks:
@@ -137,23 +134,8 @@ def combined(marks: Marks, found: Array, mode: Mode) -> Marks:
 
 
 def hiding(marks: Marks) -> Marks:
-    """With the selection hidden, and nothing selected."""
+    """Return the marks with the selection hidden, and nothing selected."""
     return Marks(np.zeros_like(marks.selected), marks.hidden | marks.selected, marks.deleted)
-
-
-def isolating(marks: Marks, locked: Array) -> Marks:
-    """With everything else hidden but what is `locked` (N,) bool."""
-    return replace(marks, hidden=~marks.selected & marks.kept & ~locked)
-
-
-def showing_all(marks: Marks) -> Marks:
-    """Return the marks with nothing hidden."""
-    return replace(marks, hidden=np.zeros_like(marks.hidden))
-
-
-def deleting(marks: Marks) -> Marks:
-    """With the selection deleted, and nothing selected."""
-    return Marks(np.zeros_like(marks.selected), marks.hidden, marks.deleted | marks.selected)
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,7 +211,7 @@ class Selection:
 
 
 def of_scene(selection: Selection, count: int) -> Selection:
-    """For another scene, of `count` Gaussians: the tool and its settings stay."""
+    """Return the selection for another scene, of `count` Gaussians: the tool and its settings stay."""
     return replace(
         selection,
         marks=unmarked(count),
@@ -243,8 +225,6 @@ def of_scene(selection: Selection, count: int) -> Selection:
 
 
 # Marks as history keeps them: one bit each, and none for what is not marked at all.
-
-NAMES = tuple(field.name for field in fields(Marks))
 
 
 @dataclass(frozen=True, eq=False)

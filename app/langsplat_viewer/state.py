@@ -1,6 +1,7 @@
 """The viewer's state: plain data that actions change, and that panels and the canvas read."""
 
 import math
+import os
 from collections import deque
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache
@@ -140,11 +141,10 @@ class Timing:
 def memory_bytes() -> int | None:
     """Bytes that this process holds in memory; None where the system does not tell."""
     try:
-        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+        resident = Path("/proc/self/statm").read_text(encoding="ascii").split()[1]
     except OSError:
         return None
-    resident = [line for line in lines if line.startswith("VmRSS:")]
-    return 1024 * int(resident[0].split()[1]) if resident else None
+    return int(resident) * os.sysconf("SC_PAGE_SIZE")
 
 
 # Camera path and film: the panel "Record".
@@ -392,9 +392,7 @@ class ViewerState(SceneState):
     show_help: bool = False
     show_palette: bool = False
     resets_panels: bool = False  # at the next frame
-    shows_panels: tuple[
-        str, ...
-    ] = ()  # titles of those that alone are open from the next frame on; (): as they are
+    shows_panels: tuple[str, ...] = ()  # titles of those that alone are open from now on; (): as they are
     palette_typed: str = ""
     browser: Listing | None = None  # the folder that the file browser shows, while it is open
     picks_folder: Literal["", "photographs", "library", "dataset"] = ""  # what it chooses a folder for

@@ -117,17 +117,17 @@ class Training:
 
     @property
     def exit_code(self) -> int | None:
-        """None while it runs, or while what it wrote is still being read."""
+        """The exit code; None while the process runs, or while what it wrote is still being read."""
         return None if self._listener.is_alive() else self.process.poll()
 
     def interrupt(self) -> None:
-        """Have it stop soon; what is finished is kept."""
+        """Ask the process to stop soon; what is finished is kept."""
         self.interrupted = True
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
 
     def end(self, patience: float = 5.0) -> None:
-        """Stop it for good: the window closes."""
+        """End the process, killed after `patience` seconds: the window closes."""
         self.interrupt()
         try:
             self.process.wait(patience)
@@ -275,4 +275,5 @@ class Viewer:
         self.recorder.poll()
 
     def say_error(self, reason: str) -> None:
+        """Add one line to the messages area, as an error."""
         self.state.say(reason, is_error=True)

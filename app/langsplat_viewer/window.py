@@ -3,37 +3,19 @@
 import os
 import signal
 import sys
-import warnings
-
-from imgui_bundle import glfw_utils  # noqa: F401  isort: skip  (before glfw: it brings a library of its own)
-import glfw  # isort: skip
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from imgui_bundle import hello_imgui
-
-from langsplat_core.errors import BackendError, InputError
-from langsplat_viewer.files import PROJECTS
-from langsplat_viewer.files.preferences import (
-    FILE_NAME,
-    LAYOUT_NAME,
-    Preferences,
-    fitting_scale,
-    load_preferences,
-    save_preferences,
-)
-from langsplat_viewer.jobs import one_line
-from langsplat_viewer.panels import style
-from langsplat_viewer.state import ViewerState
-
-from imgui_bundle import ImVec4, imgui, immapp  # isort: skip
-from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
+from imgui_bundle import ImVec4, hello_imgui, imgui, immapp  # isort: skip
+from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip  (before glfw, else there are two)
+import glfw  # isort: skip
 import moderngl
 
 from langsplat_core.config import LevelChoice, PictureConfig
-from langsplat_core.errors import LangSplatError
+from langsplat_core.errors import BackendError, InputError, LangSplatError
 from langsplat_viewer import fonts
 from langsplat_viewer.actions import (
     beside,
@@ -47,13 +29,23 @@ from langsplat_viewer.actions import (
     viewpoint,
 )
 from langsplat_viewer.canvas import Canvas
+from langsplat_viewer.files import PROJECTS
 from langsplat_viewer.files.flights import Shelf
-from langsplat_viewer.jobs import give_memory_back, on_signals, share_one_heap
+from langsplat_viewer.files.preferences import (
+    FILE_NAME,
+    LAYOUT_NAME,
+    Preferences,
+    fitting_scale,
+    load_preferences,
+    save_preferences,
+)
+from langsplat_viewer.jobs import give_memory_back, on_signals, one_line, share_one_heap
 from langsplat_viewer.options import chosen_camera, latent_level
-from langsplat_viewer.panels import layout, navigation, outline, overlays
+from langsplat_viewer.panels import layout, navigation, outline, overlays, style
 from langsplat_viewer.panels.keyboard import Keyboard
 from langsplat_viewer.panels.style import scene_area
 from langsplat_viewer.rendering.renderer import Backend, GlRenderer
+from langsplat_viewer.state import ViewerState
 from langsplat_viewer.viewer import Services, Viewer
 
 # 4.3 sorts splats, 4.1 draws them on every system; 3.3 still shows the CPU's images.
@@ -82,7 +74,7 @@ def probe_gl() -> tuple[int, int]:
 
 
 def _screen_height() -> float:
-    """Of the first screen, window units of the size that the system gives them; 0 where that is not known."""
+    """Height of the first screen, window units in the size that the system gives them; 0 if unknown."""
     monitor = glfw.get_primary_monitor()
     mode = glfw.get_video_mode(monitor) if monitor else None
     return mode.size.height / max(glfw.get_monitor_content_scale(monitor)[1], 1.0) if mode else 0.0
@@ -136,7 +128,7 @@ class Remembered:
         style.apply(self._styled)
 
     def update(self) -> None:
-        """Once per frame: apply and keep what has changed."""
+        """Apply and keep the preferences that have changed; once per frame."""
         preferences = self._state.preferences
         if self._styled is not None and preferences != self._styled:
             self.style()
@@ -147,9 +139,6 @@ class Remembered:
             save_preferences(self._folder, preferences)
         except OSError as error:
             self._state.say(f"settings not written: {one_line(error)}", is_error=True)
-
-
-# imgui_bundle brings its own GLFW library and must be imported first, else the process holds two.
 
 
 TITLE = "LangSplat viewer"
@@ -221,8 +210,7 @@ class Window:
         self._remembered = Remembered(request.settings, self.viewer.state)
         self._canvas: Canvas | None = None
         self._menu = outline.ThingsMenu()
-        self._photograph: overlays.PhotographOverlay | None = None
-        self._evidence: overlays.EvidenceWindow | None = None
+        self._photograph, self._evidence = overlays.PhotographOverlay(), overlays.EvidenceWindow()
         self._screen: moderngl.Framebuffer | None = None
         self._second: Canvas | None = None  # of the scene beside it
         self.unfinished = False  # a finer image is due
@@ -273,12 +261,10 @@ class Window:
         return params
 
     def _start(self) -> None:
-        """The GL context is there."""
+        """Set up what needs the GL context, which is there now, and open the scene."""
         try:
             ctx = moderngl.get_context()
             self._canvas = self._new_canvas(ctx)
-            self._photograph = overlays.PhotographOverlay(ctx)
-            self._evidence = overlays.EvidenceWindow(ctx)
             self.viewer.state.backend = self._canvas.backend
         except DRAW_ERRORS as error:
             self.failure = BackendError(one_line(error))
@@ -335,7 +321,7 @@ class Window:
             if camera is not None:
                 viewpoint.open_at(viewer, camera)
         except InputError as error:
-            state.say(str(error), is_error=True)
+            viewer.say_error(str(error))
         if request.orthographic is not None:
             viewpoint.open_orthographic(viewer, request.orthographic)
         wanted = request.picture
@@ -350,7 +336,7 @@ class Window:
         settings.set_display(viewer, wanted.display, latent_level(request.level))
 
     def drop(self, paths: list[str]) -> None:
-        """Files were dropped onto the window."""
+        """Open files that were dropped onto the window."""
         opening.open_dropped(self.viewer, [Path(path) for path in paths])
 
     def _dropped(self, window: object, paths: list[str]) -> None:
@@ -379,7 +365,7 @@ class Window:
         self._remembered.update()
 
     def _obey(self) -> None:
-        """A signal came: Ctrl + C asks what is to be saved, SIGTERM saves it; a second one ends at once."""
+        """Obey the last signal: Ctrl + C asks what to save, SIGTERM saves it, a second one ends at once."""
         self._obeyed, number = len(self.signals), self.signals[-1]
         if self._obeyed > 1:
             selecting.end_at_once(self.viewer)
@@ -440,15 +426,13 @@ class Window:
             self._titled = path
 
     def _picture(self) -> None:
-        """After the panels: take what they left of mouse and keys, bring the image up to date and put it
-        behind them."""
+        """Take what the panels left of mouse and keys, bring the image up to date and draw it behind them."""
         if self.failure is not None:
             return
         viewer, area = self.viewer, scene_area()
         layout.draw_over(viewer)
         self._menu.draw(viewer, area)
-        if self._evidence is not None:
-            self._evidence.draw(viewer)
+        self._evidence.draw(viewer)
         navigation.handle(viewer, area)
         scale = imgui.get_io().display_framebuffer_scale
         settings.resize(viewer, round(area.width * scale.x), round(area.height * scale.y))
@@ -463,13 +447,12 @@ class Window:
             textures = (*canvas.textures, *self._draw_beside())
         except DRAW_ERRORS as error:
             self.unfinished, textures = False, canvas.textures
-            state.say(one_line(error), is_error=True)
+            viewer.say_error(one_line(error))
         self._pace()
         self._screen.use()
         self._screen.color_mask = True, True, True, True  # a mask left set would colour the panels
         overlays.draw_pictures(viewer, area, textures)
-        if self._photograph is not None:
-            self._photograph.draw(viewer, area)
+        self._photograph.draw(viewer, area)
         overlays.draw_lines(viewer, area)
         state.timing.wanted = False  # the panel says so again, if it is still seen
 

@@ -1,10 +1,8 @@
 """Folders of photographs of a procedural room, with cameras, points and ground truth in three layouts."""
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 from PIL import Image
@@ -155,10 +153,8 @@ def _write_points(world: World, renderer: Renderer, seed: int, path: Path) -> No
     colours = renderer.colours_at(chosen, uv, np.array([0.0, 0.0, 3.0]))
     row = np.dtype([(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")])
     table = np.empty(POINTS, row)
-    for axis, name in enumerate("xyz"):
-        table[name] = points[:, axis]
-    for channel, name in enumerate(("red", "green", "blue")):
-        table[name] = colours[:, channel]
+    for name, column in zip(row.names or (), (*points.T, *colours.T), strict=True):
+        table[name] = column
     with atomic_path(path) as temporary:
         PlyData([PlyElement.describe(table, "vertex")]).write(str(temporary))
 
@@ -196,9 +192,11 @@ def write_transforms(cameras: list[Camera], suffix: str, path: Path, points: str
 
 SCENE = "room"  # the benchmark's name for it
 LABELLED_EVERY = 8  # views; those that training holds out unless told otherwise
-NAMES: Mapping[LabelLayout, Naming] = MappingProxyType(
-    {"plain": PLAIN, "lerf-ovs": Naming("frame_{:05d}", ".jpg", 1), "3d-ovs": Naming("{:02d}", ".jpg")}
-)
+NAMES: dict[LabelLayout, Naming] = {
+    "plain": PLAIN,
+    "lerf-ovs": Naming("frame_{:05d}", ".jpg", 1),
+    "3d-ovs": Naming("{:02d}", ".jpg"),
+}
 ASKED = ("object", "colour+object", "part")  # kinds of phrases that LERF-OVS's labels are like
 MIN_PIXELS = 150  # a thing with fewer visible pixels in a view is not asked for there
 PIECES = np.ones((3, 3), int)  # pixels that touch at a corner are of one piece
@@ -237,8 +235,8 @@ def _visible(truth: Truth, name: str, kinds: tuple[str, ...]) -> dict[Phrase, Ar
 
 
 def write_lerf_ovs(dataset: Path, labels: Path, truth: Truth, names: list[str]) -> None:
-    """label/<scene>/<frame>.json and .jpg. A mask of several pieces, or with holes, becomes several objects
-    of one category, whose polygons joined are the mask."""
+    """Write label/<scene>/<frame>.json and .jpg. A mask of several pieces, or with holes, becomes several
+    objects of one category, whose polygons joined are the mask."""
     for name in names:
         photograph = (dataset / "images" / f"{name}.jpg").read_bytes()
         with atomic_path(labels / f"{name}.jpg") as path:
@@ -265,7 +263,7 @@ def _objects(mask: Array) -> list[tuple[list[list[int]], list[int]]]:
 
 
 def write_3d_ovs(dataset: Path, truth: Truth, names: list[str]) -> None:
-    """segmentations/<view>/<class>.png and, last, classes.txt; a class is what one calls a whole thing."""
+    """Write segmentations/<view>/<class>.png and, last, classes.txt; a class is the word of a whole thing."""
     folder = dataset / "segmentations"
     classes: dict[str, None] = {}
     for name in names:

@@ -125,8 +125,8 @@ def normalised(crops: Array) -> Tensor:
 
 
 def begin_from(model: Any, vocabulary: dict[str, int], folder: Path) -> None:
-    """Give `model` the weights of the encoder in `folder`, and its vector of every
-    token of `vocabulary` (token -> row) that it knows."""
+    """Give `model` the weights of the encoder in `folder`, and its vectors of the tokens of `vocabulary`
+    (token -> row) that it knows."""
     from transformers import CLIPModel, CLIPTokenizerFast
 
     old = CLIPModel.from_pretrained(folder).state_dict()
@@ -293,7 +293,7 @@ def _flipped(images: Array, rng: np.random.Generator) -> Array:
 
 
 def _jitter(pixels: Tensor, rng: np.random.Generator) -> Tensor:
-    """Pictures turned, stretched, shifted, its exposure changed, and now and then partly covered."""
+    """Turn, stretch and shift pictures, change their exposure, and now and then cover a part."""
     count, size = len(pixels), pixels.shape[-1]
     black = -torch.tensor(MEAN).view(3, 1, 1) / torch.tensor(STD).view(3, 1, 1)
     angle, shear = rng.normal(0, 0.2, count), rng.normal(0, 0.08, count)
@@ -312,7 +312,7 @@ def _jitter(pixels: Tensor, rng: np.random.Generator) -> Tensor:
 
 
 def loss_of(cosines: Tensor, fits: Tensor, nameable: Tensor) -> Tensor:
-    """Scalar loss of (B, P) cosines; the first four phrases are the canonical ones. See the module text."""
+    """Scalar loss of (B, P) cosines, described above; the first four phrases are the canonical ones."""
     canonical = len(CANONICAL_PHRASES)
     right, wrong = (fits == 1).float(), (fits == 0).float()
     held = torch.zeros_like(wrong)

@@ -115,7 +115,7 @@ PLANS = {"full": FULL, "tiny": TINY}
 
 
 def table(head: tuple[str, ...], rows: list[tuple[object, ...]]) -> str:
-    """In Markdown; floats with four digits, None as a dash."""
+    """Return a table in Markdown: floats with four digits, None as a dash."""
     lines = [head, ("---",) * len(head), *rows]
     return "\n".join("| " + " | ".join(_cell(cell) for cell in line) + " |" for line in lines) + "\n"
 
@@ -127,7 +127,7 @@ def _cell(value: object) -> str:
 
 
 def need_cuda() -> None:
-    """Raises Missing unless gsplat has its device."""
+    """Raise Missing unless gsplat has its device."""
     if not gsplat.has_device():
         raise Missing("no CUDA device")
 
@@ -146,13 +146,13 @@ def milliseconds(call: Callable[[], object], times: int = 10) -> float:
 
 
 def wait() -> None:
-    """Until the device has done what it was told."""
+    """Wait until the device has finished its work."""
     if torch.cuda.is_available():
         torch.cuda.synchronize()
 
 
 def forget_peak() -> None:
-    """Count the device's memory from here."""
+    """Begin to measure the peak of the device's memory anew."""
     if torch.cuda.is_available():
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
@@ -184,7 +184,7 @@ def measure_environment(plan: Plan) -> Iterator[str]:
 
 
 def machine() -> dict[str, object]:
-    """Said at the top of every report."""
+    """Return the properties of the machine, for the top of every report."""
     query = "--query-gpu=name,driver_version,memory.total,power.limit"
     found = describe_machine()
     found.pop("libraries")
@@ -202,7 +202,7 @@ def machine() -> dict[str, object]:
 
 
 def renderer() -> str:
-    """Of the driver that EGL finds."""
+    """Return the OpenGL renderer and version of the driver that EGL finds."""
     try:
         context = create_egl_context()
     except BackendError as error:
@@ -239,7 +239,7 @@ NOTES = """- Through the interface, arrays in and out of NumPy: every `frame` co
 
 
 def measure_raster(plan: Plan) -> Iterator[str]:
-    """Every scene: its table of both backends, then what stays on the device."""
+    """Time both backends on every scene, then what stays on the device."""
     need_cuda()
     backends = [load_rasterizer("cpu"), load_rasterizer("cuda")]
     settings = {"cpu": INRIA, "cuda": gsplat.drawn_settings(INRIA)}
@@ -259,7 +259,7 @@ def measure_raster(plan: Plan) -> Iterator[str]:
 
 
 def _on_device(case: Case, channels: tuple[int, ...]) -> str:
-    """Projection and blending, without and with gradients by everything."""
+    """Return the table of projection and blending, without and with gradients by everything."""
     rows: list[tuple[object, ...]] = []
     kept = device_gaussians(case.gaussians)
     for count in channels:
@@ -282,7 +282,7 @@ def _on_device(case: Case, channels: tuple[int, ...]) -> str:
 
 
 def device_gaussians(gaussians: object) -> gsplat.DeviceGaussians:
-    """On the device, each part a leaf that wants its gradient."""
+    """Return Gaussians on the device, each part a leaf that requires its gradient."""
     names = ("means", "log_scales", "quats_wxyz", "opacity_logits")
     return gsplat.DeviceGaussians(
         **{name: gsplat.to_device(getattr(gaussians, name)).requires_grad_() for name in names}
@@ -296,7 +296,7 @@ NAMES = ("means", "log_scales", "quats_wxyz", "opacity_logits", "values", "means
 
 
 def measure_gradients(plan: Plan) -> Iterator[str]:
-    """Two tables."""
+    """Compare the gradients of both backends with float64 autograd, and test W^T as the adjoint of W."""
     need_cuda()
     count, size = plan.gradients
     case = Case("random", random_scene(count), default_camera(*size))
@@ -320,7 +320,7 @@ def measure_gradients(plan: Plan) -> Iterator[str]:
 
 
 def gradients(case: Case, values: Array, image: Array) -> dict[str, Array]:
-    """Of <picture, image> by every parameter and by the projected means, through gsplat."""
+    """Return the gradients of <picture, image> by every parameter and by the projected means, by gsplat."""
     kept = device_gaussians(case.gaussians)
     x = gsplat.to_device(values).requires_grad_()
     drawn = gsplat.draw(kept, x, case.camera, INRIA)
@@ -367,13 +367,13 @@ def bundled_scene(plan: Plan) -> Scene:
 
 
 def cameras(scene: Scene, plan: Plan) -> list[Camera]:
-    """Of the scene, evenly chosen, of the plan's size."""
+    """Return evenly chosen cameras of the scene, in the plan's size."""
     chosen = np.linspace(0, len(scene.cameras) - 1, plan.pictures).round().astype(int)
     return [replace(scene.cameras[index].resized(*plan.size), name=f"{index:03}") for index in chosen]
 
 
 def capture(scene: Scene, plan: Plan) -> Capture:
-    """What a photographer would have brought home."""
+    """Return renders of the scene, with cameras and noisy points, as a capture to train on."""
     views = cameras(scene, plan)
     images = [
         np.round(255 * np.clip(render(scene, view, backend="cpu").colours, 0, 1)).astype(np.uint8)
@@ -387,7 +387,7 @@ def capture(scene: Scene, plan: Plan) -> Capture:
 
 
 def masked_views(scene: Scene, plan: Plan) -> list[tuple[Camera, ImageFeatures]]:
-    """Grids of cells at three levels, 252 in each picture."""
+    """Return cameras with masks: grids of cells at three levels, 252 in each picture."""
     rng = np.random.default_rng(0)
     views = []
     for camera in cameras(scene, plan):
@@ -400,7 +400,7 @@ def masked_views(scene: Scene, plan: Plan) -> list[tuple[Camera, ImageFeatures]]
 
 
 def measure_lifting(plan: Plan) -> Iterator[str]:
-    """Seconds of both, and how far apart they are."""
+    """Time the lifting of masks on both backends, and compare the weights."""
     need_cuda()
     scene = bundled_scene(plan)
     views = masked_views(scene, plan)
@@ -420,7 +420,7 @@ def measure_lifting(plan: Plan) -> Iterator[str]:
 
 
 def _difference(one: np.ndarray, two: np.ndarray, count: int) -> float:
-    """Of the weights of one view; a pair that only one has counts with its whole weight."""
+    """Return the largest difference of two tables of weights, where a missing pair has weight 0."""
     from scipy import sparse
 
     width = 1 + max(int(pairs["mask"].max(initial=0)) for pairs in (one, two))
@@ -440,7 +440,7 @@ BACKENDS: tuple[Literal["cuda", "cpu"], ...] = ("cuda", "cpu")
 
 
 def measure_training(plan: Plan) -> Iterator[str]:
-    """One row a backend."""
+    """Train on each backend, and measure PSNR, seconds and memory."""
     need_cuda()
     photographs = capture(bundled_scene(plan), plan)
     seen, held_out = photographs.split(8)
@@ -467,7 +467,7 @@ ENDLESS = replace(INRIA, transmittance_min=0.0)  # OpenGL cannot stop where a pi
 
 
 def measure_opengl(plan: Plan) -> Iterator[str]:
-    """The bundled scene and a large random one, in both precisions."""
+    """Time the bundled scene and a large random one, in both precisions."""
     try:
         context = create_egl_context()
     except BackendError as error:
@@ -479,7 +479,7 @@ def measure_opengl(plan: Plan) -> Iterator[str]:
 
 
 def tables(plan: Plan, context: moderngl.Context) -> Iterator[str]:
-    """On any driver."""
+    """Yield the report for a context on any driver."""
     yield f"# OpenGL through EGL: {context.info['GL_RENDERER']}\n"
     yield "Errors against the float64 reference without its early stop, which OpenGL has not.\n"
     scene = bundled_scene(plan)
@@ -501,8 +501,6 @@ def tables(plan: Plan, context: moderngl.Context) -> Iterator[str]:
 
 REPEATS = 5  # of a batch of crops: 320, about as many regions as a photograph has
 ENLARGED = 16  # masks at once
-
-
 PHOTOGRAPH = (1080, 1440)  # height, width, px: what LangSplat shrinks photographs to
 
 
@@ -550,7 +548,7 @@ MODELS = {
 
 
 def measure_encoders(plan: Plan) -> Iterator[str]:
-    """One table a model."""
+    """Time each model of the plan, and compare it with the CPU."""
     need_cuda()
     yield "# Encoders and segmenters in their real sizes, random weights\n"
     for name in plan.models:
@@ -563,7 +561,7 @@ def measure_encoders(plan: Plan) -> Iterator[str]:
 
 
 def _encoder(folder: str, plan: Plan) -> str:
-    """The crops of a photograph on the device; vectors of some beside the CPU's."""
+    """Time the crops of a photograph on the device; compare the vectors of some with the CPU's."""
     forget_peak()
     start = time.perf_counter()
     encoder = load_encoder(folder, gsplat.DEVICE)
@@ -580,18 +578,13 @@ def _encoder(folder: str, plan: Plan) -> str:
     start = time.perf_counter()
     wanted = there.encode_images(crops)
     slow = (time.perf_counter() - start) * REPEATS
-    head = (
-        "loading, s",
-        f"{REPEATS * plan.crops} crops, s",
-        "on the CPU, s",
-        "largest error of a vector",
-        "device MiB",
-    )
+    times = ("loading, s", f"{REPEATS * plan.crops} crops, s", "on the CPU, s")
+    head = (*times, "largest error of a vector", "device MiB")
     return table(head, [(loaded, seconds, slow, _largest_difference(vectors, wanted), memory)])
 
 
 def _segmenter(folder: str, plan: Plan) -> str:
-    """A photograph, asked at its points, all masks enlarged; one batch of points beside the CPU's."""
+    """Time a photograph, asked at its points, all masks enlarged; compare one batch with the CPU's."""
     forget_peak()
     start = time.perf_counter()
     segmenter = load_segmenter(folder, gsplat.DEVICE)
@@ -643,7 +636,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def measure_tests(plan: Plan) -> Iterator[str]:
-    """What pytest says at its end."""
+    """Run the plan's tests, and yield the end of pytest's output."""
     need_cuda()
     if find_spec("pytest") is None or find_spec("hypothesis") is None:
         raise Missing("no pytest or no hypothesis")
@@ -663,7 +656,7 @@ ABSENT = 3
 
 
 def main(name: str, plan: str, report: Path) -> int:
-    """See the module."""
+    """Run section `name` and write its report after every piece; return the exit code."""
     pieces: list[str] = []
     try:
         for piece in globals()[f"measure_{name}"](PLANS[plan]):

@@ -28,19 +28,14 @@ SECTIONS = {  # in this order, with the most seconds each may take
     "encoders": 150,
     "tests": 120,
 }
-ON_GSPLAT = {
-    "raster",
-    "gradients",
-    "lifting",
-    "training",
-}  # not begun where "environment" could not make it work
+ON_GSPLAT = ("raster", "gradients", "lifting", "training")  # skipped where "environment" failed
 ABSENT = 3  # exit code of a section that lacks what it is about
 SAID = 25  # last lines of a section that failed
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a section."""
+    """The outcome of a section."""
 
     name: str
     seconds: float
@@ -53,7 +48,7 @@ class Outcome:
 
 
 def run_section(name: str, plan: str, report: Path, limit: float) -> Outcome:
-    """One section in its own process."""
+    """Run one section in its own process, for at most `limit` seconds."""
     paths = (HERE, ROOT, ROOT / "packaging" / "wheel", ROOT / "app")
     inherited = os.environ.get("PYTHONPATH")
     search = [str(path) for path in paths] + ([inherited] if inherited else [])
@@ -99,7 +94,7 @@ def summary(outcomes: list[Outcome], head: str) -> str:
 
 
 def arguments() -> argparse.Namespace:
-    """The command line's."""
+    """Parse and check the command line."""
     parser = argparse.ArgumentParser(description="Run on a GPU what never ran without one; write its tables.")
     parser.add_argument(
         "--out", type=Path, default=ROOT / "docs" / "benchmarks" / "gpu", help="folder of the tables"
@@ -121,7 +116,7 @@ def arguments() -> argparse.Namespace:
 
 
 def main() -> int:
-    """See the module."""
+    """Run the sections that were asked for and write their tables; return the exit code."""
     asked = arguments()
     chosen = [name for name in SECTIONS if name in (asked.only.split(",") if asked.only else SECTIONS)]
     end = time.monotonic() + 60 * asked.minutes

@@ -7,7 +7,7 @@ import numpy as np
 
 from langsplat_core.errors import FormatError
 from langsplat_core.scene import Scene
-from langsplat_viewer.actions import viewpoint
+from langsplat_viewer.actions import opening, queries, viewpoint
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.rendering.request import RenderRequest
 from langsplat_viewer.state import GLIDE_SECONDS, ViewerState
@@ -86,6 +86,19 @@ def settle(viewer: Viewer, seconds: float = 120.0) -> None:
         time.sleep(0.002)
     viewer.take_results()
     viewpoint.tick(viewer, 0.0)
+
+
+def open_scene(viewer: Viewer, path: Path | str) -> None:
+    """Open a scene, and wait until it is shown."""
+    opening.open_scene(viewer, Path(path))
+    settle(viewer)
+
+
+def ask(viewer: Viewer, *phrases: str) -> None:
+    """Search for phrases, and wait for the answers."""
+    for phrase in phrases:
+        queries.ask(viewer, phrase)
+    settle(viewer)
 
 
 def recorded(viewer: Viewer, seconds: float = 60.0) -> None:

@@ -5,15 +5,13 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 
 from langsplat_viewer import options, program
-from langsplat_viewer.actions import opening
 from langsplat_viewer.viewer import Services, Viewer
 from tests.support.fakes import FakeEncoder
-from tests.support.windowless import FakeSurface, load, settle
+from tests.support.windowless import FakeSurface, load, open_scene
 
 
 @pytest.fixture
@@ -27,8 +25,7 @@ def viewer() -> Iterator[Viewer]:
 @pytest.fixture
 def opened(viewer: Viewer) -> Viewer:
     """Shows the scene of three blobs."""
-    opening.open_scene(viewer, Path("blobs.ply"))
-    settle(viewer)
+    open_scene(viewer, "blobs.ply")
     return viewer
 
 

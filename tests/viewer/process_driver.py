@@ -185,9 +185,13 @@ def close() -> None:
     glfw.post_empty_event()
 
 
-def idle(path: Path) -> None:
+def window_of(path: Path) -> Window:
     services = Services(load_scene, lambda encoder_id: FakeEncoder())
-    window = Window(WindowRequest(path, size=(860, 620)), services, lambda ctx: GlRenderer(ctx, "opengl"))
+    return Window(WindowRequest(path, size=(860, 620)), services, lambda ctx: GlRenderer(ctx, "opengl"))
+
+
+def idle(path: Path) -> None:
+    window = window_of(path)
     params = window.params()
     frames, gui = [], params.callbacks.show_gui
 
@@ -264,19 +268,16 @@ def typing(window: Window) -> Iterator[None]:
     yield from press(window, "up_arrow")
     assert state.typed == "plant"
     handle = glfw_window_hello_imgui()
-    for action in (glfw.PRESS, glfw.RELEASE):
-        window.keyboard.pressed(handle, glfw.KEY_ESCAPE, 0, action, 0)
-    yield from press(window)
-    for action in (glfw.PRESS, glfw.RELEASE):
-        window.keyboard.pressed(handle, glfw.KEY_F1, 0, action, 0)
-    yield from press(window)
+    for key in (glfw.KEY_ESCAPE, glfw.KEY_F1):
+        for action in (glfw.PRESS, glfw.RELEASE):
+            window.keyboard.pressed(handle, key, 0, action, 0)
+        yield from press(window)
     assert state.show_help
     print("PASSED", flush=True)
 
 
 def drive(path: Path) -> None:
-    services = Services(load_scene, lambda encoder_id: FakeEncoder())
-    window = Window(WindowRequest(path, size=(860, 620)), services, lambda ctx: GlRenderer(ctx, "opengl"))
+    window = window_of(path)
     params = window.params()
     gui, steps = params.callbacks.show_gui, typing(window)
     window.idles = False

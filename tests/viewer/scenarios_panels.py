@@ -1,7 +1,6 @@
 """Scenarios of `window_driver` in the panels: files, training, layout, recording, bookmarks."""
 
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -48,7 +47,7 @@ def fade_in_a_photograph(s: Any) -> None:
     colours = np.full((240, 320, 3), (250, 120, 10), np.uint8)
     colours[:, 160:] = (20, 60, 240)
     Image.fromarray(colours).save(folder / "photo_1.png")
-    settings.open_panel(viewer, "Camera")
+    settings.open_panel(s.window.viewer, "Camera")
     viewpoint.go_to_camera(viewer, 1)
     s.settle()
     plain = s.shot("plain")
@@ -57,10 +56,8 @@ def fade_in_a_photograph(s: Any) -> None:
     s.ctx.yield_(3)
     assert "no photograph 'photo_1'" in s.state.photograph.reason
     assert (s.shot("none")[100:500, 400:] == plain[100:500, 400:]).all()
-    s.ctx.item_click("//Camera/Folder of photographs ...")
-    s.ctx.yield_(4)
-    s.ctx.item_click("//**/elsewhere\\/")
-    s.ctx.yield_(4)
+    s.click("//Camera/Folder of photographs ...", frames=4)
+    s.click("//**/elsewhere\\/", frames=4)
     s.shot("browser")
     s.ctx.item_click("//**/Take this folder")
     s.wait(lambda: s.state.photograph.image is not None)
@@ -118,11 +115,9 @@ def switch_between_scenes(s: Any) -> None:
     s.wait(lambda: s.state.path.name == "blobs.ply")
     s.settle()
     assert s.state.view is view
-    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.o)
-    s.ctx.yield_(4)
+    s.key(imgui.Key.mod_ctrl | imgui.Key.o, frames=4)
     s.shot("all of them")
-    s.ctx.item_click("//**/Open all scenes here")
-    s.ctx.yield_(3)
+    s.click("//**/Open all scenes here", frames=3)
     s.settle()
     assert s.state.path.name == "blobs.ply"
 
@@ -133,10 +128,8 @@ def search_a_library(s: Any) -> None:
     save_scene(s.folder / "deep" / "named.ply", replace(named_scene(), path=None))
     fewer = named_scene().take(np.arange(3 * PER_BLOB) < PER_BLOB)
     save_scene(s.folder / "deep" / "mug.ply", replace(fewer, cameras=cameras()))
-    settings.open_panel(viewer, "Library")
-    s.ctx.yield_(3)
-    s.ctx.item_click("//Library/Folder ...")
-    s.ctx.yield_(4)
+    s.open_panel("Library", frames=3)
+    s.click("//Library/Folder ...", frames=4)
     opening.type_path(viewer, "deep")
     opening.open_typed(viewer)
     s.ctx.yield_(3)
@@ -176,8 +169,7 @@ def watch_a_training(s: Any) -> None:
         (photographs / f"{number}.jpg").write_bytes(b"")
     training.command = lambda request: [sys.executable, "-c", TRAINS]
     opening.choose_photographs(viewer, photographs)
-    settings.open_panel(viewer, "Train")
-    s.ctx.yield_(3)
+    s.open_panel("Train", frames=3)
     s.ctx.item_click("//Train/Train")
     s.wait(lambda: viewer.training is not None and len(viewer.training.progress.losses) > 50)
     s.ctx.yield_(3)
@@ -188,17 +180,6 @@ def watch_a_training(s: Any) -> None:
     s.ctx.item_click("//Train/Stop")
     s.wait(lambda: viewer.training is None)
     assert "training stopped" in s.state.messages[-1].text
-
-
-Scenario = tuple[Callable[[Any], None], str, dict[str, Any]]
-FILES: dict[str, Scenario] = {
-    "reload_what_changed": (reload_what_changed, "blobs.ply", {}),
-    "fade_in_a_photograph": (fade_in_a_photograph, "blobs.ply", {}),
-    "see_the_evidence": (see_the_evidence, "blobs.ply", {}),
-    "switch_between_scenes": (switch_between_scenes, "blobs.ply", {}),
-    "search_a_library": (search_a_library, "blobs.ply", {}),
-    "watch_a_training": (watch_a_training, "blobs.ply", {}),
-}
 
 
 # Scenarios of `window_driver` about where things lie: large letters, long words.
@@ -216,8 +197,7 @@ def large_letters(s: Any) -> None:
     s.settle()
     assert 1.3 * narrow < scene_area().left <= 0.41 * 1280
     for panel in PANELS:
-        settings.open_panel(s.window.viewer, panel.title)
-        s.settle()
+        s.open_panel(panel.title)
         assert seen_items(s, panel.title), panel.title
         assert cut_off(s, panel.title) == [], panel.title
     settings.show_help(s.window.viewer, True)
@@ -257,24 +237,19 @@ def cut_off(s: Any, title: str) -> list[tuple[float, float]]:
 
 def use_the_outline(s: Any) -> None:
     """Rows are clicked, hidden, locked and dragged onto each other; the menu of a thing names it."""
-    viewer = s.window.viewer
     s.search("mug")
-    settings.open_panel(viewer, "Outline")
+    settings.open_panel(s.window.viewer, "Outline")
     s.wait(lambda: s.state.outline is not None and len(s.state.outline.roots) > 0)
     s.settle()
     first, second = s.state.outline.roots[:2]
     rows = "//**/node "
-    s.ctx.item_click(f"{rows}{first.node}/###row")
-    s.settle()
+    s.click(f"{rows}{first.node}/###row")
     chosen = s.state.selection.marks.selected
     assert (chosen == s.state.outline.tree.members(first.node)).all()
-    s.ctx.item_click(f"{rows}{first.node}/###eye")
-    s.settle()
+    s.click(f"{rows}{first.node}/###eye")
     assert (s.state.selection.marks.hidden == chosen).all()
-    s.ctx.item_click(f"{rows}{first.node}/###eye")
-    s.settle()
-    s.ctx.item_click(f"{rows}{first.node}/###lock")
-    s.ctx.yield_(2)
+    s.click(f"{rows}{first.node}/###eye")
+    s.click(f"{rows}{first.node}/###lock", frames=2)
     assert s.state.things.locked == {first.node}
     s.shot("outline")
     s.ctx.item_drag_and_drop(f"{rows}{first.node}/###row", f"{rows}{second.node}/###row")
@@ -286,8 +261,7 @@ def use_the_outline(s: Any) -> None:
     assert (s.state.things.locked, s.state.things.groups) == (set(), ())
 
     use_the_outline_by_keys(s, first.node)
-    s.ctx.key_press(imgui.Key.r)
-    s.settle()
+    s.key(imgui.Key.r)
     area, (width, height) = scene_area(), s.state.size
     (x, y), _ = (part[0] for part in s.state.view.camera(width, height).project(CENTRES[1][None]))
     s.ctx.mouse_move_to_pos((x + area.left, y + area.top))
@@ -295,8 +269,7 @@ def use_the_outline(s: Any) -> None:
     s.ctx.mouse_click(1)
     s.ctx.yield_(3)
     s.ctx.item_click("//**/##name this")
-    s.ctx.key_chars_append_enter("the atlas")
-    s.settle()
+    s.enter("the atlas")
     assert s.state.queries[-1].phrase == "the atlas"
     assert s.state.queries[-1].result.members.reshape(3, -1).all(1).tolist() == [False, True, False]
 
@@ -306,26 +279,15 @@ def use_the_outline_by_keys(s: Any, node: int) -> None:
     settings.open_panel(s.window.viewer, "Outline")
     selecting.select_none(s.window.viewer)
     s.ctx.item_click("//**/##filter")
-    s.ctx.key_press(imgui.Key.down_arrow)
-    s.ctx.yield_(2)
-    s.ctx.key_press(imgui.Key.enter)
-    s.settle()
+    s.key(imgui.Key.down_arrow, frames=2)
+    s.key(imgui.Key.enter)
     assert (s.state.selection.marks.selected == s.state.outline.tree.members(node)).all()
-    s.ctx.key_press(imgui.Key.menu)
-    s.ctx.yield_(3)
+    s.key(imgui.Key.menu, frames=3)
     s.ctx.key_press(imgui.Key.up_arrow)  # to the last
     s.ctx.yield_(2)
-    s.ctx.key_press(imgui.Key.enter)
-    s.ctx.yield_(3)
+    s.key(imgui.Key.enter, frames=3)
     assert [group.nodes for group in s.state.things.groups] == [(node,)]
-    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.z)
-    s.settle()
-
-
-LAYOUT: dict[str, tuple[Callable[[Any], None], str, dict[str, Any]]] = {
-    "use_the_outline": (use_the_outline, "blobs.ply", {}),
-    "large_letters": (large_letters, "blobs.ply", {"size": (1280, 720)}),
-}
+    s.key(imgui.Key.mod_ctrl | imgui.Key.z)
 
 
 # Scenarios of `window_driver`: the panel "Record", bookmarks, sides.
@@ -334,19 +296,16 @@ LAYOUT: dict[str, tuple[Callable[[Any], None], str, dict[str, Any]]] = {
 def record_and_play(s) -> None:
     """Keyframes by a key, played in the window, saved as a path and as a film."""
     record = s.state.record
-    settings.open_panel(s.window.viewer, "Record")
-    s.ctx.yield_(4)
+    s.open_panel("Record", frames=4)
     for end in ((656, 300), (700, 320)):
         s.ctx.key_press(imgui.Key.k)
         s.drag((600, 300), end)
         s.settle()
-    s.ctx.item_click("//Record/Add keyframe")
-    s.ctx.yield_(2)
+    s.click("//Record/Add keyframe", frames=2)
     assert [key.seconds for key in record.keyframes] == [0, 2, 4]
     last = s.state.view
     s.ctx.item_click("//Record/Clear")
-    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.z)
-    s.ctx.yield_(2)
+    s.key(imgui.Key.mod_ctrl | imgui.Key.z, frames=2)
     assert len(record.keyframes) == 3
 
     filming.set_path_seconds(s.window.viewer, 60.0)  # longer than a frame may take
@@ -368,8 +327,7 @@ def record_and_play(s) -> None:
     assert record.began is None
     assert np.abs(s.shot("elsewhere") - start)[100:500, 400:].max() > 30
 
-    s.ctx.item_click("//Record/Save path")
-    s.ctx.yield_(2)
+    s.click("//Record/Save path", frames=2)
     assert len(read_flight(s.folder / "blobs-001.path.json").keyframes) == 3
     filming.set_path_seconds(s.window.viewer, 1.0)
     filming.set_film_size(s.window.viewer, 32, 24)
@@ -383,28 +341,16 @@ def record_and_play(s) -> None:
 
 def mark_and_return(s) -> None:
     """A bookmark by its key, the sides by theirs, the command on the clipboard."""
-    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.b)
-    s.ctx.yield_(2)
+    s.key(imgui.Key.mod_ctrl | imgui.Key.b, frames=2)
     start = s.state.view
-    s.ctx.key_press(imgui.Key.keypad7)
-    s.settle()
+    s.key(imgui.Key.keypad7)
     np.testing.assert_allclose(s.state.view.rotation[2], -start.up, atol=1e-6)
-    settings.open_panel(s.window.viewer, "Bookmarks")
-    s.ctx.yield_(4)
-    s.ctx.item_click("//**/view 1##bookmark")
-    s.settle()
+    s.open_panel("Bookmarks", frames=4)
+    s.click("//**/view 1##bookmark")
     np.testing.assert_allclose(s.state.view.rotation, start.rotation, atol=1e-6)
     s.ctx.item_click("//**/##bookmark")
-    s.ctx.key_chars_append_enter("by the key of k")
-    s.ctx.yield_(2)
+    s.enter("by the key of k", frames=2)
     assert [mark.name for mark in s.state.bookmarks] == ["view 1", "by the key of k"]
     assert s.state.record.keyframes == ()
-    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.c)
-    s.ctx.yield_(3)
+    s.key(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.c, frames=3)
     assert imgui.get_clipboard_text().startswith("langsplat-viewer ")
-
-
-RECORD = {
-    "record_and_play": (record_and_play, "blobs.ply", {}),
-    "mark_and_return": (mark_and_return, "blobs.ply", {}),
-}

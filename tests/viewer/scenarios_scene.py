@@ -1,6 +1,5 @@
 """Scenarios of `window_driver` over the scene: several panes, overlays, measuring, selecting."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations
 from typing import Any
@@ -28,8 +27,7 @@ MUG, BOOK, PLANT = CENTRES
 def split_the_view(s: Any) -> None:
     """The line is dragged without the camera; nothing is drawn for it, and nothing at rest."""
     rgb = s.shot("rgb")
-    s.ctx.key_press(imgui.Key.v)
-    s.settle()
+    s.key(imgui.Key.v)
     assert s.state.settings.split.mode == "wipe"
     both, area, before = s.shot("both"), scene_area(), s.state.view
     np.testing.assert_allclose(s.at(both, MUG), s.at(rgb, MUG), atol=2)
@@ -104,8 +102,7 @@ def draw_over_the_scene(s: Any) -> None:
     got = s.state.view.camera(160, 120).world_to_camera
     np.testing.assert_allclose(got, camera.world_to_camera, atol=1e-9)
 
-    s.ctx.key_press(imgui.Key.m)
-    s.ctx.yield_(2)
+    s.key(imgui.Key.m, frames=2)
     turned = s.state.view
     for thing in (MUG, BOOK):
         click(s, on_screen(s, thing))
@@ -121,18 +118,15 @@ def draw_over_the_scene(s: Any) -> None:
     drawn = s.renderer.count
     s.ctx.yield_(20)
     assert s.renderer.count == drawn
-    s.ctx.key_press(imgui.Key.escape)
-    s.ctx.yield_(2)
+    s.key(imgui.Key.escape, frames=2)
     assert not s.state.ruler.measures
 
 
 def time_and_compare(s: Any) -> None:
     """The panel tells medians while it is seen, and the error of what is shown."""
-    settings.open_panel(s.window.viewer, "Timing")
-    s.ctx.yield_(3)
+    s.open_panel("Timing", frames=3)
     for key in (imgui.Key["_2"], imgui.Key["_1"]):
-        s.ctx.key_press(key)
-        s.settle()
+        s.key(key)
     queries.ask(s.window.viewer, "mug")
     s.settle()
     told = dict(s.state.timing.medians())
@@ -146,8 +140,7 @@ def time_and_compare(s: Any) -> None:
     s.menu("Window", "Timing")
     s.ctx.yield_(3)
     drawn = len(s.state.timing.laps["blend"])
-    s.ctx.key_press(imgui.Key["_2"])
-    s.settle()
+    s.key(imgui.Key["_2"])
     assert len(s.state.timing.laps["blend"]) == drawn
 
 
@@ -163,15 +156,11 @@ def faces_on_screen(s: Any, side: Any) -> list[tuple[str, tuple[float, float]]]:
     ]
 
 
-Scenario = tuple[Callable[[Any], None], str, dict[str, Any]]
-
-
 def look_without_perspective(s: Any) -> None:
     """A key takes perspective away until it is pressed again; axes, wheel and the click on a camera work
     as ever, and the picture says what it is."""
     deep, view = s.shot("deep"), s.state.view
-    s.ctx.key_press(imgui.Key.o)
-    s.settle()
+    s.key(imgui.Key.o)
     assert s.state.view.orthographic
     flat, area = s.shot("flat"), scene_area()
     for thing in CENTRES:
@@ -180,8 +169,7 @@ def look_without_perspective(s: Any) -> None:
     assert (flat[corner].min(-1) > 200).sum() > 100  # words
     assert (deep[corner].min(-1) > 200).sum() == 0
 
-    s.ctx.key_press(imgui.Key.keypad1)
-    s.settle()
+    s.key(imgui.Key.keypad1)
     before = on_screen(s, PLANT)[0] - on_screen(s, MUG)[0]
     s.ctx.mouse_teleport_to_pos((area.left + area.width / 2, area.top + area.height / 2))
     s.ctx.mouse_wheel_y(-1)
@@ -190,18 +178,14 @@ def look_without_perspective(s: Any) -> None:
     assert abs((on_screen(s, PLANT)[0] - on_screen(s, MUG)[0]) / before - 0.88) < 1e-3
 
     s.menu("View", "Show or hide the training cameras")
-    s.ctx.key_press(imgui.Key.home)
-    s.settle()
+    s.key(imgui.Key.home)
     assert s.state.view.orthographic
-    settings.open_panel(s.window.viewer, "Camera")
-    s.ctx.yield_(4)
-    s.ctx.item_click("//Camera/###orthographic")
-    s.settle()
+    s.open_panel("Camera", frames=4)
+    s.click("//Camera/###orthographic")
     np.testing.assert_allclose(
         s.state.view.camera(160, 120).world_to_camera, view.camera(160, 120).world_to_camera, atol=1e-9
     )
-    s.ctx.key_press(imgui.Key.keypad5)
-    s.ctx.yield_(2)
+    s.key(imgui.Key.keypad5, frames=2)
     assert s.state.view.orthographic
     viewpoint.zoom_by(s.window.viewer, 4.0)  # until all cameras are in the picture
     s.settle()
@@ -235,15 +219,6 @@ def name_what_is_close(s: Any) -> None:
     s.shot("names")
 
 
-SEEING: dict[str, Scenario] = {
-    "name_what_is_close": (name_what_is_close, "blobs.ply", {}),
-    "look_without_perspective": (look_without_perspective, "blobs.ply", {}),
-    "split_the_view": (split_the_view, "blobs.ply", {}),
-    "time_and_compare": (time_and_compare, "blobs.ply", {}),
-    "draw_over_the_scene": (draw_over_the_scene, "blobs.ply", {}),
-}
-
-
 # Selecting in the real window; played by `window_driver`.
 
 
@@ -260,11 +235,6 @@ def looks_selected(colour: np.ndarray) -> bool:
     return bool(np.abs(colour - 255 * TINT).max() < 0.55 * 255 and colour[2] > colour[1] + 60)
 
 
-def press(s: Any, item: str) -> None:
-    s.ctx.item_click(item)
-    s.settle()
-
-
 def select_with_the_mouse(s: Any) -> None:
     """A rectangle, keys and buttons; what they did is undone."""
     s.ctx.key_press(imgui.Key.period)  # the camera in front: no blob hides another
@@ -272,12 +242,12 @@ def select_with_the_mouse(s: Any) -> None:
     plain = s.shot("plain")
     s.menu("Window", "Select")
     s.settle()
-    press(s, "//**/Rectangle##tool")
+    s.click("//**/Rectangle##tool")
     s.drag(*around(s, PLANT))
     s.settle()
     seen = s.state.selection.marks.selected
     assert 10 < seen.sum() < 110  # the front of it
-    press(s, "//**/Only what is visible")
+    s.click("//**/Only what is visible")
     before = s.state.view
     s.drag(*around(s, PLANT))
     s.settle()
@@ -294,14 +264,11 @@ def select_with_the_mouse(s: Any) -> None:
     s.settle()
     assert marked(s.window.viewer)[0] == "book plant"
 
-    s.ctx.key_press(imgui.Key.h)
-    s.settle()
+    s.key(imgui.Key.h)
     assert marked(s.window.viewer) == ("", "book plant", "")
-    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.z)
-    s.settle()
+    s.key(imgui.Key.mod_ctrl | imgui.Key.z)
     assert marked(s.window.viewer) == ("book plant", "", "")
-    s.ctx.key_press(imgui.Key.escape)
-    s.ctx.yield_(3)
+    s.key(imgui.Key.escape, frames=3)
     assert s.state.selection.tool is None
     s.drag((600, 300), (656, 279))
     s.settle()
@@ -334,27 +301,26 @@ def ask_before_leaving(s: Any) -> None:
     """What was deleted and not saved is asked about before another scene opens or the window closes."""
     s.search("mug")
     s.menu("Select", "Select what the search found")
-    s.ctx.key_press(imgui.Key.delete)
-    s.settle()
+    s.key(imgui.Key.delete)
     assert marked(s.window.viewer) == ("", "", "mug")
     s.window.drop([str(s.folder / "plain.ply")])
     s.ctx.yield_(4)
     s.shot("question")
-    press(s, "//**/Cancel")
+    s.click("//**/Cancel")
     assert s.state.path.name == "blobs.ply"
 
     s.menu("File", "Quit")
     assert not hello_imgui.get_runner_params().app_shall_exit
-    press(s, "//**/Cancel")
+    s.click("//**/Cancel")
     assert not s.state.selection.may_close
     glfw.set_window_should_close(glfw_window_hello_imgui(), True)  # its cross was clicked
     s.wait(lambda: s.state.selection.leaving is not None)
-    press(s, "//**/Cancel")
+    s.click("//**/Cancel")
     assert marked(s.window.viewer) == ("", "", "mug")
 
     s.window.drop([str(s.folder / "plain.ply")])
     s.ctx.yield_(4)
-    press(s, "//**/Not saved/Save")
+    s.click("//**/Not saved/Save")
     s.wait(lambda: s.state.path.name == "plain.ply")
     s.settle()
     assert len(load_scene(s.folder / "blobs-edited-001.ply").gaussians) < 360
@@ -365,19 +331,18 @@ def name_what_is_clicked(s: Any) -> None:
     """A thing is clicked, named in the panel, and found by its name; what is like it is selected."""
     s.menu("Window", "Select")
     s.settle()
-    press(s, "//**/Thing##tool")
+    s.click("//**/Thing##tool")
     s.ctx.mouse_teleport_to_pos(on_screen(s, PLANT))
     s.ctx.mouse_click(0)
     s.settle()
     assert marked(s.window.viewer)[0] == "plant"
     s.ctx.item_click("//Select/##name")
-    s.ctx.key_chars_append_enter("grandma's mug")
-    s.settle()
+    s.enter("grandma's mug")
     query = s.state.queries[-1]
     assert (query.phrase, query.result.found) == ("grandma's mug", True)
     np.testing.assert_array_equal(query.result.members, s.state.selection.marks.selected)
     s.shot("named")
-    press(s, "//**/More like it##verb")
+    s.click("//**/More like it##verb")
     assert marked(s.window.viewer)[0] == "plant"
 
 
@@ -389,9 +354,8 @@ def drag_the_gizmo(s: Any) -> None:
     s.search("mug")
     selecting.select_query(viewer)
     settings.set_display(viewer, "rgb")
-    settings.open_panel(viewer, "Transform")
-    s.ctx.key_press(imgui.Key.g)
-    s.settle()
+    settings.open_panel(s.window.viewer, "Transform")
+    s.key(imgui.Key.g)
     view, chosen = s.state.view, s.state.selection.marks.selected
     x, y = on_screen(s, transforming.pivot(viewer))
     s.ctx.mouse_teleport_to_pos((x, y))
@@ -422,16 +386,14 @@ def drag_the_gizmo(s: Any) -> None:
 
     transforming.fill_form(viewer, EditForm(rotate=(0.0, 0.0, 90.0)))
     s.ctx.item_click("//Transform/Apply")
-    s.ctx.item_click("//Transform/Fit")
-    s.settle()
+    s.click("//Transform/Fit")
     form = s.state.edit_form
     transforming.fill_form(viewer, replace(form, high=(*form.high[:2], (form.low[2] + form.high[2]) / 2)))
     s.ctx.item_click("//Transform/Crop")
     s.shot("cropped")
     assert 0 < s.state.selection.marks.deleted.sum() < len(chosen)
     for _ in range(5):
-        s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.z)
-        s.settle()
+        s.key(imgui.Key.mod_ctrl | imgui.Key.z)
     np.testing.assert_array_equal(s.state.scene.gaussians.means, before)
     assert not s.state.selection.is_unsaved
 
@@ -440,12 +402,11 @@ def clip_and_brush(s: Any) -> None:
     """A corner of the clipping box is dragged, and what it then leaves out is hidden; a drag over the
     histogram of distances selects those between."""
     viewer = s.window.viewer
-    settings.open_panel(viewer, "Transform")
+    settings.open_panel(s.window.viewer, "Transform")
     transforming.fill_box(viewer)
     s.ctx.yield_(2)
     s.ctx.item_click("//Transform/Box##gizmo")
-    s.ctx.item_click("//Transform/Clip")
-    s.settle()
+    s.click("//Transform/Clip")
     assert s.state.selection.marks.shown.all()
     form = s.state.edit_form
     corners = np.array([form.low, form.high])
@@ -485,11 +446,9 @@ def clip_and_brush(s: Any) -> None:
 
 def brush_numbers(s: Any) -> None:
     """By a drag, and by two numbers that are typed."""
-    settings.open_panel(s.window.viewer, "Select")
-    s.settle()
+    s.open_panel("Select")
     s.ctx.item_click("//Select/By numbers")
-    s.ctx.item_click("//Select/Distance")
-    s.ctx.yield_(2)
+    s.click("//Select/Distance", frames=2)
     place = s.ctx.item_info("//Select/brush values").rect_full
     y = place.min.y + 5
     s.drag((place.min.x + 1, y), ((place.min.x + place.max.x) / 2, y))
@@ -501,8 +460,7 @@ def brush_numbers(s: Any) -> None:
     np.testing.assert_array_equal(chosen, between)
     s.ctx.item_click("//Select/Opacity")
     s.ctx.item_click("//Select/##range")
-    s.ctx.key_chars_append_enter("0 1")
-    s.ctx.yield_(2)
+    s.enter("0 1", frames=2)
     assert s.state.selection.marks.selected.all()
 
 
@@ -545,13 +503,11 @@ def compare_two_scenes(s: Any) -> None:
 
 def pin_a_note(s: Any) -> None:
     """What is typed after the click is its text; it is kept in the project, and undone."""
-    s.ctx.key_press(imgui.Key.n)
-    s.ctx.yield_(2)
+    s.key(imgui.Key.n, frames=2)
     click(s, on_screen(s, BOOK))
     s.wait(lambda: imgui.get_io().want_text_input)
     s.ctx.key_chars("lent by Ada")
-    s.ctx.key_press(imgui.Key.enter)
-    s.ctx.yield_(2)
+    s.key(imgui.Key.enter, frames=2)
     (note,) = s.state.notes
     assert (note.text, s.state.pins_notes) == ("lent by Ada", False)
     assert np.linalg.norm(note.at - BOOK) < 1.0
@@ -559,21 +515,8 @@ def pin_a_note(s: Any) -> None:
     s.wait((s.folder / "blobs-001.langsplat").exists)
     s.shot("note")
     for left in (1, 0):
-        s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.z)
-        s.settle()
+        s.key(imgui.Key.mod_ctrl | imgui.Key.z)
         assert len(s.state.notes) == left
     opening.open_file(s.window.viewer, s.folder / "blobs-001.langsplat")
     s.wait(lambda: s.state.notes == (note,))
     s.settle()
-
-
-SELECTING: dict[str, tuple[Any, str, dict[str, Any]]] = {
-    "select_with_the_mouse": (select_with_the_mouse, "blobs.ply", {}),
-    "outline_and_rest": (outline_and_rest, "blobs.ply", {}),
-    "name_what_is_clicked": (name_what_is_clicked, "blobs.ply", {}),
-    "ask_before_leaving": (ask_before_leaving, "blobs.ply", {}),
-    "drag_the_gizmo": (drag_the_gizmo, "blobs.ply", {}),
-    "compare_two_scenes": (compare_two_scenes, "blobs.ply", {}),
-    "pin_a_note": (pin_a_note, "blobs.ply", {}),
-    "clip_and_brush": (clip_and_brush, "blobs.ply", {}),
-}

@@ -8,14 +8,13 @@ import pytest
 
 from langsplat_viewer.actions import beside, opening, queries, settings, undoing, viewpoint
 from langsplat_viewer.camera.controls import default_view, extent_of, orbit
-from tests.support.windowless import SCENES, errors, settle
+from tests.support.windowless import SCENES, ask, errors, settle
 
 
 @pytest.fixture
 def two(opened):
     """The blobs, and beside them the same with a phrasebook."""
-    queries.ask(opened, "mug")
-    settle(opened)
+    ask(opened, "mug")
     opening.open_beside(opened, Path("book.ply"))
     meet(opened)
     yield opened

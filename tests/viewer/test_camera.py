@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 from langsplat_core.arrays import Array
 from langsplat_core.scene import Camera, Gaussians, Intrinsics, Scene
-from langsplat_viewer.actions import opening, queries, settings, viewpoint
+from langsplat_viewer.actions import settings, viewpoint
 from langsplat_viewer.camera.controls import (
     MAX_ELEVATION,
     SHARE,
@@ -43,7 +43,7 @@ from langsplat_viewer.state import GLIDE_SECONDS
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
 from tests.support.scenes import random_camera, random_gaussians
-from tests.support.windowless import arrive, errors, settle
+from tests.support.windowless import arrive, ask, errors, open_scene
 
 SIZE = (320, 200)
 
@@ -224,9 +224,7 @@ def share_in_picture(viewer: Viewer, size: tuple[int, int]) -> float:
 
 
 def test_focus_brings_the_latest_result_found_to_the_centre(opened):
-    for word in ("mug", "plant", "sofa"):
-        queries.ask(opened, word)
-    settle(opened)
+    ask(opened, "mug", "plant", "sofa")
     viewpoint.focus_result(opened)
     arrive(opened)
     place = opened.state.queries[1].result.place
@@ -286,8 +284,7 @@ def test_everything_is_framed_in_a_window_of_any_shape(opened, size):
 @pytest.mark.parametrize("size", [(160, 120), (90, 300)])
 def test_a_scene_without_cameras_opens_and_returns_to_a_view_of_everything(viewer, size):
     settings.resize(viewer, *size)
-    opening.open_scene(viewer, Path("bare.ply"))
-    settle(viewer)
+    open_scene(viewer, "bare.ply")
     assert share_in_picture(viewer, size) >= 0.99
     settings.resize(viewer, size[1], size[0])  # R knows the window's new shape
     viewpoint.zoom_by(viewer, 0.1)
@@ -320,8 +317,7 @@ def test_zooming_out_ends_while_the_scene_is_still_seen(opened):
 
 
 def test_focus_goes_as_near_as_the_thing_is_small(opened):
-    queries.ask(opened, "mug")
-    settle(opened)
+    ask(opened, "mug")
     query, distances = opened.state.queries[0], []
     place, box = query.result.place, query.result.box
     for size in (1.0, 0.1, 0.01):
@@ -335,8 +331,7 @@ def test_focus_goes_as_near_as_the_thing_is_small(opened):
 
 
 def test_focus_on_something_huge_stays_in_the_room(opened):
-    queries.ask(opened, "mug")
-    settle(opened)
+    ask(opened, "mug")
     query = opened.state.queries[0]
     query.result = replace(query.result, box=1e3 * np.array([[-1.0] * 3, [1.0] * 3]))
     before = np.linalg.norm(opened.state.view.eye - query.result.place)
@@ -419,11 +414,6 @@ def test_nothing_has_no_view():
 # Views with names, the six sides, walking.
 
 
-def reopen(viewer, name: str = "blobs.ply") -> None:
-    opening.open_scene(viewer, Path(name))
-    settle(viewer)
-
-
 def names(viewer) -> list[str]:
     return [bookmark.name for bookmark in viewer.state.bookmarks]
 
@@ -433,10 +423,10 @@ def test_a_bookmark_leads_back_and_is_there_the_next_time(opened, tmp_path):
     viewpoint.move(opened, lambda view: orbit(view, 0.4, 0.1))
     marked = opened.state.view
     viewpoint.add_bookmark(opened, "  the  mug ")
-    reopen(opened, "plain.ply")
+    open_scene(opened, "plain.ply")
     assert names(opened) == []
     viewpoint.add_bookmark(opened)
-    reopen(opened)
+    open_scene(opened, "blobs.ply")
     assert names(opened) == ["the mug"]
     viewpoint.go_to_bookmark(opened, opened.state.bookmarks[0])
     arrive(opened)
@@ -444,9 +434,9 @@ def test_a_bookmark_leads_back_and_is_there_the_next_time(opened, tmp_path):
     assert_allclose(opened.state.view.rotation, marked.rotation, atol=1e-9)
     assert_allclose(opened.state.view.target, marked.target, atol=1e-9)
     viewpoint.delete_bookmark(opened, opened.state.bookmarks[0])
-    reopen(opened)
+    open_scene(opened, "blobs.ply")
     assert names(opened) == []
-    reopen(opened, "plain.ply")
+    open_scene(opened, "plain.ply")
     assert names(opened) == ["view 1"]
 
 
@@ -479,7 +469,7 @@ def test_a_file_that_makes_no_sense_is_said_and_kept(opened, tmp_path, text):
         text = json.dumps({"version": 1, "scenes": {str(Path("blobs.ply").absolute()): entries}})
     (tmp_path / FILE_NAME).write_text(text)
     opened.shelf = Shelf(tmp_path)
-    reopen(opened)
+    open_scene(opened, "blobs.ply")
     assert names(opened) == []
     assert FILE_NAME in errors(opened)[0]
     if '"scenes": {"' not in text:

@@ -36,7 +36,7 @@ from langsplat_viewer.state import (
 )
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
-from tests.support.windowless import FakeRenderer, errors, recorded, rest, settle
+from tests.support.windowless import FakeRenderer, ask, errors, recorded, rest
 
 SIZE = (120, 90)
 
@@ -266,8 +266,7 @@ def gated(monkeypatch: pytest.MonkeyPatch) -> Gated:
 
 @pytest.fixture
 def asked(opened: Viewer) -> Viewer:
-    queries.ask(opened, "mug")
-    settle(opened)
+    ask(opened, "mug")
     settings.resize(opened, *SIZE)
     return opened
 
@@ -600,8 +599,7 @@ def test_the_panel_has_a_picture_measured_when_it_opens(drawn):
 def test_what_is_shown_is_that_of_the_reference(drawn, look):
     """Whatever is chosen in the window: queries, split, marks, cuts, splats."""
     if look != "plain":
-        queries.ask(drawn, "mug")
-        settle(drawn)
+        ask(drawn, "mug")
     if look == "wipe":
         settings.toggle_wipe(drawn)
     if look == "levels":

@@ -18,23 +18,21 @@ from langsplat_viewer.options import say_compiling
 from langsplat_viewer.panels.scene import has_several
 from langsplat_viewer.rendering.depth import UNCLIPPED, Clip
 from tests.support.fakes import blob_scene
-from tests.support.windowless import SCENES, arrive, errors, settle
+from tests.support.windowless import SCENES, arrive, ask, errors, open_scene, settle
 
 
 def test_unusable_gaussians_are_counted(viewer):
     scene = blob_scene(field=False)
     scene.gaussians.means[[3, 7]] = np.nan
     viewer.services = replace(viewer.services, load_scene=lambda path: scene)
-    opening.open_scene(viewer, Path("holes.ply"))
-    settle(viewer)
+    open_scene(viewer, "holes.ply")
     assert viewer.state.messages[0].text == "holes.ply: 360 Gaussians; not drawn: 2 with position not finite"
     assert np.isfinite(viewer.state.view.camera(160, 120).world_to_camera).all()
 
 
 def test_a_broken_file_leaves_the_open_scene_alone(opened):
     before = opened.state.view
-    opening.open_scene(opened, Path("broken.ply"))
-    settle(opened)
+    open_scene(opened, "broken.ply")
     assert opened.state.scene is SCENES["blobs.ply"]
     assert opened.state.view is before
     assert opened.state.opening is None
@@ -43,8 +41,7 @@ def test_a_broken_file_leaves_the_open_scene_alone(opened):
 
 def test_a_scene_without_language_field_says_what_makes_one(viewer):
     settings.set_display(viewer, "relevancy")
-    opening.open_scene(viewer, Path("plain.ply"))
-    settle(viewer)
+    open_scene(viewer, "plain.ply")
     assert viewer.state.picture.display == "rgb"
     assert "langsplat train" in viewer.state.messages[-1].text
     queries.ask(viewer, "mug")
@@ -79,8 +76,7 @@ def test_a_scene_with_broken_companions_opens_and_says_why(tmp_path, viewer):
     for name in names:
         (tmp_path / name).write_bytes(b"{")
     viewer.services = replace(viewer.services, load_scene=load_scene)
-    opening.open_scene(viewer, path)
-    settle(viewer)
+    open_scene(viewer, path)
     assert viewer.state.scene.language is None
     said = errors(viewer)
     assert len(said) == 2
@@ -122,8 +118,7 @@ def test_the_first_run_says_that_it_compiles(viewer, monkeypatch):
     monkeypatch.setattr(
         viewer.worker, "submit", lambda label, *rest: labels.append(label) or submit(label, *rest)
     )
-    opening.open_scene(viewer, Path("blobs.ply"))
-    settle(viewer)
+    open_scene(viewer, "blobs.ply")
     assert seen == [("compiling the drawing kernels, once per installation (half a minute)", 0.7)]
     assert "compiling the search kernels, once per installation (half a minute)" in labels
     assert errors(viewer) == []
@@ -150,9 +145,7 @@ def test_of_several_the_first_is_opened_and_all_are_listed(three):
 
 
 def test_camera_and_queries_of_each_are_found_again(three):
-    for word in ("mug", "book"):
-        queries.ask(three, word)
-    settle(three)
+    ask(three, "mug", "book")
     queries.set_canonical(three, "plant")
     settle(three)
     mug, book = three.state.queries
@@ -168,8 +161,7 @@ def test_camera_and_queries_of_each_are_found_again(three):
     assert three.state.queries == []
     assert three.state.canonical == ()
     assert three.state.settings.clip == UNCLIPPED
-    queries.ask(three, "plant")
-    settle(three)
+    ask(three, "plant")
     viewpoint.zoom_by(three, 2.0)
     bare = three.state.view
 
@@ -189,8 +181,7 @@ def test_camera_and_queries_of_each_are_found_again(three):
 
 
 def test_a_display_of_answers_comes_back_after_a_scene_without(three):
-    queries.ask(three, "mug")
-    settle(three)
+    ask(three, "mug")
     switch(three, PLAIN)
     assert three.state.picture.display == "rgb"
     switch(three, BLOBS)
@@ -198,8 +189,7 @@ def test_a_display_of_answers_comes_back_after_a_scene_without(three):
 
 
 def test_nothing_of_a_scene_that_was_left_is_kept_in_memory(three):
-    queries.ask(three, "mug")
-    settle(three)
+    ask(three, "mug")
     switch(three, BARE)
     (visit,) = three.visits.values()
     assert [query.result for query in visit.queries] == [None]
@@ -325,8 +315,7 @@ def test_a_path_that_leads_nowhere_is_an_error_line(viewer, folder, monkeypatch,
 
 def test_scenes_that_were_open_are_remembered_the_latest_first(viewer):
     for name in ("blobs.ply", "plain.ply", "blobs.ply"):
-        opening.open_scene(viewer, Path(name))
-        settle(viewer)
+        open_scene(viewer, name)
     recent = viewer.state.preferences.recent
     assert [Path(path).name for path in recent] == ["blobs.ply", "plain.ply"]
     assert all(Path(path).is_absolute() for path in recent)
@@ -344,8 +333,7 @@ def shown(viewer, tmp_path):
     path = tmp_path / "blobs.ply"
     save_scene(path, replace(blob_scene(), path=None))
     viewer.services = replace(viewer.services, load_scene=load_scene)
-    opening.open_scene(viewer, path)
-    settle(viewer)
+    open_scene(viewer, path)
     return viewer
 
 
@@ -392,9 +380,7 @@ def test_a_scene_whose_file_is_gone_is_not_offered(shown):
 
 
 def test_reload_keeps_camera_queries_and_settings(shown):
-    for word in ("mug", "book"):
-        queries.ask(shown, word)
-    settle(shown)
+    ask(shown, "mug", "book")
     mug, book = shown.state.queries
     queries.set_cut(shown, mug, 0.6)
     queries.hide(shown, book)
@@ -424,8 +410,7 @@ def test_reload_keeps_camera_queries_and_settings(shown):
 
 
 def test_a_reload_with_other_gaussians_asks_anew(shown):
-    queries.ask(shown, "plant")
-    settle(shown)
+    ask(shown, "plant")
     half = np.arange(0, 360, 2)
     save_scene(shown.state.path, replace(blob_scene().take(half), path=None))
     opening.reload(shown)
@@ -437,8 +422,7 @@ def test_a_reload_with_other_gaussians_asks_anew(shown):
 
 @pytest.mark.parametrize("name", ["blobs.ply", "blobs.langsplat.safetensors", "blobs.cameras.json"])
 def test_a_half_written_file_leaves_the_scene_as_it_was(shown, name):
-    queries.ask(shown, "mug")
-    settle(shown)
+    ask(shown, "mug")
     query, before, view = shown.state.queries[0], shown.state.scene, shown.state.view
     answer = query.result
     file = shown.state.path.with_name(name)
@@ -468,8 +452,7 @@ def test_what_is_not_wanted_is_not_offered_again_until_it_changes_again(shown):
 
 
 def test_a_field_that_went_away_takes_its_display_along(shown):
-    queries.ask(shown, "mug")
-    settle(shown)
+    ask(shown, "mug")
     save_scene(shown.state.path, replace(blob_scene(field=False), path=None))
     opening.reload(shown)
     settle(shown)

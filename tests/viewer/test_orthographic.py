@@ -1,13 +1,11 @@
 """The orthographic view through the actions: what keeps it, what leaves it, what it changes elsewhere."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from langsplat_core.scene import LEVELS
-from langsplat_viewer.actions import filming, opening, queries, settings, viewpoint
+from langsplat_viewer.actions import filming, settings, viewpoint
 from langsplat_viewer.actions.opening import standing_at
 from langsplat_viewer.camera.controls import from_side, zoom
 from langsplat_viewer.files.flights import Shelf
@@ -15,7 +13,7 @@ from langsplat_viewer.panels.overlays import pointed_figures
 from langsplat_viewer.state import GLIDE_SECONDS
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import CENTRES
-from tests.support.windowless import arrive, settle
+from tests.support.windowless import arrive, ask, open_scene, settle
 
 SIZE = (160, 120)
 
@@ -45,8 +43,7 @@ def pixels(viewer: Viewer, points: np.ndarray) -> np.ndarray:
     ],
 )
 def test_moving_keeps_it(flat, go):
-    queries.ask(flat, "plant")
-    settle(flat)
+    ask(flat, "plant")
     before = flat.state.view
     go(flat)
     arrive(flat)
@@ -55,8 +52,7 @@ def test_moving_keeps_it(flat, go):
 
 
 def test_the_opening_view_of_a_scene_without_cameras_holds_all_of_it(viewer):
-    opening.open_scene(viewer, Path("bare.ply"))
-    settle(viewer)
+    open_scene(viewer, "bare.ply")
     settings.resize(viewer, *SIZE)
     viewpoint.toggle_orthographic(viewer)
     viewpoint.move(viewer, lambda view: zoom(view, 0.1, 0.0))

@@ -11,7 +11,6 @@ from langsplat_viewer.actions import (
     opening,
     outline,
     projects,
-    queries,
     selecting,
     settings,
     transforming,
@@ -22,17 +21,15 @@ from langsplat_viewer.files.projects import Things
 from tests.support.fakes import CENTRES, blob_scene
 from tests.support.marks_and_flights import blob, marked
 from tests.support.scenes import with_tree
-from tests.support.windowless import SCENES, errors, settle
+from tests.support.windowless import SCENES, ask, errors, open_scene, settle
 
 
 @pytest.fixture
 def outlined(viewer, monkeypatch):
     """The blobs with a tree, its outline found."""
     monkeypatch.setitem(SCENES, "tree.ply", with_tree(blob_scene(phrasebook=True)))
-    opening.open_scene(viewer, Path("tree.ply"))
-    settle(viewer)
-    queries.ask(viewer, "mug")  # so that the encoder is known to be there
-    settle(viewer)
+    open_scene(viewer, "tree.ply")
+    ask(viewer, "mug")  # so that the encoder is known to be there
     assert outline.wanted(viewer).problem
     settle(viewer)
     assert outline.wanted(viewer).problem == ""
@@ -175,8 +172,7 @@ def test_a_project_keeps_names_groups_and_locks(outlined, viewer, tmp_path, monk
     outline.give_name(outlined, book, "the atlas")
     settle(outlined)
     things, path = outlined.state.things, projects.save_project(outlined, tmp_path)
-    opening.open_scene(viewer, Path("plain.ply"))
-    settle(viewer)
+    open_scene(viewer, "plain.ply")
     assert viewer.state.things != things
     opening.open_project(viewer, path)
     settle(viewer)
@@ -242,8 +238,7 @@ def test_things_have_the_colour_that_the_image_has(outlined):
 
 
 def test_a_scene_without_a_field_has_none(viewer):
-    opening.open_scene(viewer, Path("plain.ply"))
-    settle(viewer)
+    open_scene(viewer, "plain.ply")
     assert outline.wanted(viewer) is None
     outline.select(viewer, np.zeros(3))
     assert "language field" in errors(viewer)[-1]
@@ -253,7 +248,6 @@ def test_an_encoder_that_may_be_a_download_is_not_loaded_for_it(viewer, monkeypa
     scene = SCENES["blobs.ply"]
     far = replace(scene, language=replace(scene.language, encoder_id="hub/of-someone"))
     monkeypatch.setitem(SCENES, "blobs.ply", far)
-    opening.open_scene(viewer, Path("blobs.ply"))
-    settle(viewer)
+    open_scene(viewer, "blobs.ply")
     assert "hub/of-someone" in outline.wanted(viewer).problem
     assert viewer.worker.current is None

@@ -15,7 +15,7 @@ from langsplat_core.query.describe import Describer, look_at_pixel
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import look_at
-from langsplat_viewer.actions import opening, queries, settings, viewpoint
+from langsplat_viewer.actions import opening, settings, viewpoint
 from langsplat_viewer.camera import overlays
 from langsplat_viewer.camera.controls import default_view, extent_of, frame_of, from_side, orbit
 from langsplat_viewer.camera.overlays import FACES, Label, face_at, facing, placed, visible_faces
@@ -26,7 +26,7 @@ from langsplat_viewer.files.preferences import (
 )
 from langsplat_viewer.panels.overlays import pointed_figures, said
 from tests.support.fakes import CENTRES, FakeEncoder, blob_scene, cameras
-from tests.support.windowless import arrive, errors, settle
+from tests.support.windowless import arrive, ask, errors, open_scene, settle
 
 SIZE = (120, 80)
 NEAR = 0.05
@@ -232,8 +232,7 @@ def compiled() -> None:
 def pointing(compiled, opened):
     """The mug asked for, and the mouse asked about."""
     settings.resize(opened, 160, 120)
-    queries.ask(opened, "mug")
-    settle(opened)
+    ask(opened, "mug")
     viewpoint.toggle_pointing(opened)
     return opened
 
@@ -283,8 +282,7 @@ def test_it_is_forgotten_when_the_mouse_or_the_camera_moves(pointing):
 
 
 def test_a_scene_that_means_nothing_says_so(pointing):
-    opening.open_scene(pointing, Path("plain.ply"))
-    settle(pointing)
+    open_scene(pointing, "plain.ply")
     assert not pointing.state.pointing
     viewpoint.toggle_pointing(pointing)
     assert not pointing.state.pointing

@@ -29,7 +29,7 @@ from langsplat_viewer.rendering.depth import Clip
 from langsplat_viewer.viewer import Services, Viewer
 from tests.support.fakes import CENTRES, FakeEncoder
 from tests.support.marks_and_flights import blob, marked
-from tests.support.windowless import SCENES, FakeSurface, errors, load, settle
+from tests.support.windowless import SCENES, FakeSurface, ask, errors, load, settle
 
 
 @pytest.fixture
@@ -37,9 +37,7 @@ def saved(opened, tmp_path, monkeypatch) -> Path:
     """The file of a project with something of everything in it."""
     monkeypatch.chdir(tmp_path)
     Path("blobs.ply").touch()  # what is in it comes from `windowless.load`
-    for phrase in ("mug", "book", "plant", "mug or book"):
-        queries.ask(opened, phrase)
-    settle(opened)
+    ask(opened, "mug", "book", "plant", "mug or book")
     queries.set_cut(opened, opened.state.queries[1], 0.6)
     queries.hide(opened, opened.state.queries[2])
     selecting.take(opened, blob("plant"))

@@ -18,7 +18,7 @@ from langsplat_viewer.output.headless import describe
 from langsplat_viewer.panels.search import BINS, hint, histogram
 from langsplat_viewer.viewer import Services
 from tests.support.fakes import CENTRES, FakeEncoder, as_trained, axis, blob_scene, calibrated_for, language
-from tests.support.windowless import SCENES, errors, load, settle
+from tests.support.windowless import SCENES, ask, errors, load, open_scene, settle
 
 
 def test_a_query_is_answered_and_shown(opened):
@@ -39,9 +39,7 @@ def test_a_query_is_answered_and_shown(opened):
 
 
 def test_an_unknown_word_takes_no_colour_and_says_what_may_be_meant(opened):
-    for text in ("mug", "book", "plant", "plamt pot", "plamt"):
-        queries.ask(opened, text)
-    settle(opened)
+    ask(opened, "mug", "book", "plant", "plamt pot", "plamt")
     assert [query.slot for query in opened.state.queries] == [0, 1, 2, None, None]
     typo = opened.state.queries[4]
     assert (typo.phrase, typo.meant) == ("plamt", "plant")
@@ -50,11 +48,9 @@ def test_an_unknown_word_takes_no_colour_and_says_what_may_be_meant(opened):
 
 
 def test_a_correction_is_offered_and_takes_the_place_of_the_typo(opened):
-    queries.ask(opened, "red plamt")
-    settle(opened)
+    ask(opened, "red plamt")
     assert queries.offers(opened) == ("did you mean", ())  # "red" is like no word either
-    queries.ask(opened, "plamt")
-    settle(opened)
+    ask(opened, "plamt")
     assert queries.offers(opened) == ("did you mean", ("plant",))
     queries.ask_offered(opened, "plant")
     settle(opened)
@@ -64,13 +60,11 @@ def test_a_correction_is_offered_and_takes_the_place_of_the_typo(opened):
 
 
 def test_commas_separate_searches_and_quotes_are_no_part_of_them(opened):
-    queries.ask(opened, '"mug", plant; book, not mug')
-    settle(opened)
+    ask(opened, '"mug", plant; book, not mug')
     assert [query.phrase for query in opened.state.queries] == ["mug", "plant", "book, not mug"]
     queries.ask(opened, "?!")
     assert "no word to look for" in errors(opened)[-1]
-    queries.ask(opened, "the")
-    settle(opened)
+    ask(opened, "the")
     assert "names nothing" in opened.state.queries[-1].problem or "names nothing" in errors(opened)[-1]
 
 
@@ -82,8 +76,7 @@ def test_earlier_phrases_come_back_by_the_arrows(opened):
 
 
 def test_examples_are_offered_until_the_first_search_and_each_is_found(viewer):
-    opening.open_scene(viewer, Path("book.ply"))
-    settle(viewer)
+    open_scene(viewer, "book.ply")
     assert queries.offers(viewer) == ("try", ())
     queries.prepare_suggestions(viewer)
     assert viewer.worker.current == ("finding examples", 0.0) or viewer.state.suggestions.examples
@@ -98,8 +91,7 @@ def test_examples_are_offered_until_the_first_search_and_each_is_found(viewer):
     queries.ask_offered(viewer, "book")
     settle(viewer)
     assert viewer.state.queries[0].result.found
-    opening.open_scene(viewer, Path("plain.ply"))
-    settle(viewer)
+    open_scene(viewer, "plain.ply")
     queries.prepare_suggestions(viewer)
     assert queries.offers(viewer) == ("try", ())
 
@@ -107,27 +99,20 @@ def test_examples_are_offered_until_the_first_search_and_each_is_found(viewer):
 def test_empty_and_repeated_phrases(opened):
     queries.ask(opened, "   ")
     assert opened.state.queries == []
-    queries.ask(opened, "mug")
-    queries.ask(opened, " Mug ")
-    settle(opened)
+    ask(opened, "mug", " Mug ")
     assert [query.phrase for query in opened.state.queries] == ["mug"]
 
 
 def test_a_fourth_query_takes_the_oldest_ones_colour(opened):
-    for word in ("mug", "book", "plant"):
-        queries.ask(opened, word)
-    settle(opened)
+    ask(opened, "mug", "book", "plant")
     assert [query.slot for query in opened.state.queries] == [0, 1, 2]
-    queries.ask(opened, "mug or book")
-    settle(opened)
+    ask(opened, "mug or book")
     slots = {query.phrase: query.slot for query in opened.state.queries}
     assert slots == {"mug": None, "book": 1, "plant": 2, "mug or book": 0}
 
 
 def test_hiding_keeps_the_colours_of_the_others(opened):
-    for word in ("mug", "book"):
-        queries.ask(opened, word)
-    settle(opened)
+    ask(opened, "mug", "book")
     mug, book = opened.state.queries
     queries.hide(opened, mug)
     (pane,) = opened.state.panes()
@@ -145,9 +130,7 @@ def test_hiding_keeps_the_colours_of_the_others(opened):
 
 
 def test_queries_are_combined_as_the_grammar_reads_them(opened):
-    for word in ("mug", "book"):
-        queries.ask(opened, word)
-    settle(opened)
+    ask(opened, "mug", "book")
     mug, book = opened.state.queries
     for join in queries.JOINS:
         queries.ask_combined(opened, mug, join, book)
@@ -175,8 +158,7 @@ def test_the_box_is_emptied_by_a_search_and_by_nothing_else(opened):
 
 def test_all_queries_go_at_once_and_come_back(opened):
     for phrase in ("mug", "plant"):
-        queries.ask(opened, phrase)
-        settle(opened)
+        ask(opened, phrase)
     queries.remove_all(opened)
     assert (opened.state.queries, opened.state.selected) == ([], None)
     undoing.undo(opened)
@@ -188,10 +170,8 @@ def test_a_calibrated_scene_gives_verdicts_with_probability(viewer, monkeypatch,
     reading = Reading(calibration=calibrated_for("mug", logit))
     scene = replace(blob_scene(), language=replace(language(), reading=reading))
     monkeypatch.setitem(SCENES, "sure.ply", scene)
-    opening.open_scene(viewer, Path("sure.ply"))
-    settle(viewer)
-    queries.ask(viewer, "mug")
-    settle(viewer)
+    open_scene(viewer, "sure.ply")
+    ask(viewer, "mug")
     result = viewer.state.queries[0].result
     assert (result.verdict, result.found) == (verdict, verdict == "found")
     assert (viewer.state.queries[0].slot is None) == (verdict == "not here")
@@ -204,8 +184,7 @@ def test_a_calibrated_scene_gives_verdicts_with_probability(viewer, monkeypatch,
 
 def test_an_answer_is_explained_by_what_training_kept(opened, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    queries.ask(opened, "book")
-    settle(opened)
+    ask(opened, "book")
     (query,) = opened.state.queries
     queries.explain(opened, query)
     settle(opened)
@@ -227,8 +206,7 @@ def test_an_answer_is_explained_by_what_training_kept(opened, tmp_path, monkeypa
 @pytest.fixture
 def asked(opened):
     """Three blobs, and "mug" asked."""
-    queries.ask(opened, "mug")
-    settle(opened)
+    ask(opened, "mug")
     return opened
 
 
@@ -290,16 +268,14 @@ def test_everything_can_be_compared_with_other_phrases(asked):
 
 def test_a_set_of_queries_is_asked_again(asked, tmp_path):
     queries.set_cut(asked, asked.state.queries[0], 0.7)
-    queries.ask(asked, "plant")
-    settle(asked)
+    ask(asked, "plant")
     queries.hide(asked, asked.state.queries[1])
     queries.set_level(asked, "whole")
     queries.set_canonical(asked, "book")
     settle(asked)
     path = queries.save_queries(asked, tmp_path)
     assert path.name == "blobs-001.queries.json"
-    opening.open_scene(asked, Path("blobs.ply"))
-    settle(asked)
+    open_scene(asked, "blobs.ply")
     assert (asked.state.queries, asked.state.canonical) == ([], ())
     opening.open_dropped(asked, [path])
     settle(asked)
@@ -322,8 +298,7 @@ def test_nothing_to_save_and_nothing_to_ask_of(viewer, opened, tmp_path):
     assert queries.save_queries(opened, tmp_path) is None
     queries.load_queries(opened, tmp_path / "gone.queries.json")
     assert "gone.queries.json" in errors(opened)[-1]
-    opening.open_scene(opened, Path("plain.ply"))
-    settle(opened)
+    open_scene(opened, "plain.ply")
     write_queries(tmp_path / "a.queries.json", QuerySet((SavedQuery("mug"),)))
     queries.load_queries(opened, tmp_path / "a.queries.json")
     assert "searched" in errors(opened)[-1]
@@ -381,10 +356,8 @@ def test_an_unexpected_error_of_the_encoder_is_one_line_too(viewer):
         raise ZeroDivisionError("deep\ninside")
 
     viewer.services = replace(viewer.services, load_encoder=broken)
-    opening.open_scene(viewer, Path("blobs.ply"))
-    settle(viewer)
-    queries.ask(viewer, "mug")
-    settle(viewer)
+    open_scene(viewer, "blobs.ply")
+    ask(viewer, "mug")
     assert viewer.state.queries[0].problem == "internal error: ZeroDivisionError: deep inside"
     settings.set_display(viewer, "depth")  # and life goes on
     assert viewer.state.picture.display == "depth"
@@ -395,8 +368,7 @@ def test_a_local_encoder_is_loaded_while_the_user_looks_round(viewer, encoder_id
     """A hub id may mean a download: it waits for a phrase."""
     asked = []
     viewer.services = Services(load, lambda name: asked.append(name) or FakeEncoder(), encoder_id)
-    opening.open_scene(viewer, Path("blobs.ply"))
-    settle(viewer)
+    open_scene(viewer, "blobs.ply")
     assert asked == ([] if "/" in encoder_id else [encoder_id])
     queries.ask(viewer, "mug")
     assert viewer.worker.current == ("searching 'mug'", 0.0) or asked
@@ -410,11 +382,8 @@ def test_phrasebook_needs_no_encoder(viewer):
         raise EncoderError("no weights; download them")
 
     viewer.services = replace(viewer.services, load_encoder=absent)
-    opening.open_scene(viewer, Path("book.ply"))
-    settle(viewer)
-    queries.ask(viewer, "Book")
-    queries.ask(viewer, "mug")
-    settle(viewer)
+    open_scene(viewer, "book.ply")
+    ask(viewer, "Book", "mug")
     book, mug = viewer.state.queries
     assert book.result.found
     assert mug.problem == "no weights; download them"

@@ -21,7 +21,7 @@ from langsplat_viewer.rendering.renderer import render_image
 from langsplat_viewer.rendering.request import Splats
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
-from tests.support.windowless import errors, recorded, settle
+from tests.support.windowless import ask, errors, open_scene, recorded
 
 
 def turn(viewer: Viewer, yaw: float) -> None:
@@ -151,8 +151,7 @@ def test_a_path_is_saved_loaded_and_dropped(opened, folder):
 def test_another_scene_has_no_path_of_this_one(opened):
     record_three(opened)
     filming.set_film_size(opened, 640, 0)
-    opening.open_scene(opened, Path("plain.ply"))
-    settle(opened)
+    open_scene(opened, "plain.ply")
     assert times(opened) == []
     assert opened.state.record.size == (640, 1)
 
@@ -246,9 +245,7 @@ def test_the_command_on_the_clipboard_draws_the_same_picture(opened, folder, run
     if case == "canonical":
         queries.set_canonical(opened, "book, plant")
     if case in QUERIES:
-        for word in ("mug", "plant", "book"):
-            queries.ask(opened, word)
-        settle(opened)
+        ask(opened, "mug", "plant", "book")
     LOOKS.get(case, lambda viewer: None)(opened)
     command = filming.copy_command(opened, folder)
     assert filming.take_clipboard(opened) == command

@@ -41,16 +41,10 @@ from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene, cameras
 from tests.support.marks_and_flights import blob
 from tests.support.scenes import random_gaussians
-from tests.support.windowless import errors, recorded, rest, settle
+from tests.support.windowless import arrive, ask, errors, recorded, rest, settle
 
 SCENE = blob_scene()
 NOTHING = np.zeros(360, bool)
-
-
-def ask(viewer: Viewer, *phrases: str) -> None:
-    for phrase in phrases:
-        queries.ask(viewer, phrase)
-    settle(viewer)
 
 
 # Every image is of the same request.
@@ -61,8 +55,7 @@ def edit_everything(viewer: Viewer, mode: str) -> None:
     state, odd = viewer.state, np.arange(360) % 2 == 1
     settings.resize(viewer, 160, 120)
     viewpoint.look_from(viewer, "left")
-    viewpoint.tick(viewer, viewer.clock + 10)
-    viewpoint.tick(viewer, viewer.clock + 10)
+    arrive(viewer)
     ask(viewer, "mug", "plant")
     marks = Marks(blob("book") & odd, blob("mug") & odd, blob("plant") & odd)
     state.selection = replace(state.selection, marks=marks)
@@ -190,8 +183,7 @@ def test_what_is_seen_is_in_it(asked, name):
     before = asked.state.request()
     assert asked.state.request() == before
     CHANGES[name](asked)
-    viewpoint.tick(asked, asked.clock + 10)
-    viewpoint.tick(asked, asked.clock + 10)
+    arrive(asked)
     assert asked.state.request() != before
 
 
@@ -220,8 +212,7 @@ def test_what_is_kept_gives_the_image_that_a_new_renderer_gives(gl, asked, name,
     canvas = Canvas(gl, kept)
     canvas.update(asked.state, 0.0)
     CHANGES[name](asked)
-    viewpoint.tick(asked, asked.clock + 10)
-    viewpoint.tick(asked, asked.clock + 10)
+    arrive(asked)
     canvas.update(asked.state, 20.0)
     canvas.update(asked.state, 30.0)
     expected = fresh.read(asked.state.request())

@@ -16,14 +16,13 @@ from langsplat_viewer.camera.controls import from_camera
 from langsplat_viewer.marks import Drawn, Stroke, outlines
 from tests.support.fakes import CENTRES, COLOURS, PER_BLOB
 from tests.support.marks_and_flights import blob, marked, marks_of
-from tests.support.windowless import SCENES, FakeSurface, errors, settle
+from tests.support.windowless import SCENES, FakeSurface, ask, errors, open_scene, settle
 
 
 @pytest.fixture
 def searched(opened):
     """One answer: the book."""
-    queries.ask(opened, "book")
-    settle(opened)
+    ask(opened, "book")
     return opened
 
 
@@ -108,8 +107,7 @@ def test_what_changes_nothing_is_no_step(opened):
 def test_what_the_search_found(searched):
     selecting.select_query(searched)
     assert marked(searched)[0] == "book"
-    queries.ask(searched, "mug")
-    settle(searched)
+    ask(searched, "mug")
     selecting.select_query(searched, mode="add")
     assert marked(searched)[0] == "mug book"
 
@@ -162,8 +160,7 @@ def test_another_scene_has_no_marks_but_the_tool_stays(opened):
     selecting.hide_selected(opened)
     selecting.use_tool(opened, "lasso")
     selecting.set_mode(opened, "add")
-    opening.open_scene(opened, Path("plain.ply"))
-    settle(opened)
+    open_scene(opened, "plain.ply")
     assert marked(opened) == ("", "", "")
     assert (opened.state.selection.tool, opened.state.selection.mode) == ("lasso", "add")
 
@@ -171,14 +168,14 @@ def test_another_scene_has_no_marks_but_the_tool_stays(opened):
 # Selecting with the mouse: what a stroke encloses, and what becomes of it. No window.
 
 SIZE = (400, 300)
+FRONT = look_at(np.array([0, 0, -5.0]), np.zeros(3), np.array([0, -1.0, 0]), SIZE)
 
 
 @pytest.fixture
 def front(opened):
     """From straight ahead, so that the blobs lie in a row: mug, book, plant from left to right."""
-    camera = look_at(np.array([0, 0, -5.0]), np.zeros(3), np.array([0, -1.0, 0]), SIZE)
     settings.resize(opened, *SIZE)
-    viewpoint.move(opened, lambda view: from_camera(camera, opened.state.extent))
+    viewpoint.move(opened, lambda view: from_camera(FRONT, opened.state.extent))
     return opened
 
 
@@ -300,8 +297,7 @@ def test_escape_gives_up_the_stroke_then_the_tool_and_help_before_both(front):
 
 
 def drawn(tool, path, centre=None) -> Drawn:
-    camera = look_at(np.array([0, 0, -5.0]), np.zeros(3), np.array([0, -1.0, 0]), SIZE)
-    return Drawn(tool, Stroke(tuple(path), centre), camera, 0.03, 0.5)
+    return Drawn(tool, Stroke(tuple(path), centre), FRONT, 0.03, 0.5)
 
 
 def test_outlines_are_what_is_enclosed():

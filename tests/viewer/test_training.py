@@ -21,7 +21,7 @@ from langsplat_viewer.files.watching import IN_TRAINING, NAME, write_preview
 from langsplat_viewer.viewer import PREVIEW_EVERY, TrainingProgress, TrainingRequest, command
 from tests.support.fakes import blob_scene
 from tests.support.scenes import random_gaussians
-from tests.support.windowless import SCENES, errors, settle
+from tests.support.windowless import SCENES, errors, open_scene, settle
 
 SAYS = """
 import json, sys
@@ -92,8 +92,7 @@ def test_what_speaks_against_the_scene_is_said(viewer, folder, monkeypatch):
     said = [message.text for message in viewer.state.messages]
     assert "done: 3 Gaussians" in said  # not pushed out by the warnings, which are not said twice
     assert not any(text.startswith("warning") for text in said)
-    opening.open_scene(viewer, folder.with_name("plain.ply"))
-    settle(viewer)
+    open_scene(viewer, folder.with_name("plain.ply"))
     assert viewer.state.doubts == ()
 
 

@@ -14,15 +14,14 @@ from langsplat_viewer.panels.transform import box_of, dragged, gl_matrices
 from langsplat_viewer.state import EditForm
 from tests.support.fakes import CENTRES
 from tests.support.scenes import random_camera, without_perspective
-from tests.support.windowless import errors, settle
+from tests.support.windowless import ask, errors, open_scene, settle
 
 MUG = CENTRES[0]
 STEP = np.array([0.0, 2.0, -1.0])
 
 
 def selected_mug(viewer) -> np.ndarray:
-    queries.ask(viewer, "mug")
-    settle(viewer)
+    ask(viewer, "mug")
     selecting.select_query(viewer)
     chosen: np.ndarray = viewer.state.selection.marks.selected
     assert 0 < chosen.sum() < len(chosen)
@@ -201,8 +200,7 @@ def test_without_a_scene_nothing_happens(viewer):
 
 
 def test_without_a_language_field(viewer):
-    opening.open_scene(viewer, Path("plain.ply"))
-    settle(viewer)
+    open_scene(viewer, "plain.ply")
     before = means(viewer)
     transforming.transform(viewer, moving(STEP))
     settle(viewer)
@@ -241,7 +239,6 @@ def test_what_a_drag_means():
 def test_another_scene_begins_without_transforms(opened):
     transforming.transform(opened, moving(STEP))
     opened.state.selection = replace(opened.state.selection, saved_moves=opened.state.selection.moves)
-    opening.open_scene(opened, Path("book.ply"))
-    settle(opened)
+    open_scene(opened, "book.ply")
     assert opened.state.selection.moves == ()
     assert opened.state.opened is None

@@ -4,7 +4,6 @@ import gc
 import tracemalloc
 import weakref
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from langsplat_viewer.actions.selecting import mark
 from langsplat_viewer.marks import Marks, hiding, unmarked
 from langsplat_viewer.rendering.depth import Clip
 from langsplat_viewer.rendering.request import Splats
-from tests.support.windowless import settle
+from tests.support.windowless import ask, open_scene, settle
 
 
 def phrases(viewer) -> list[str]:
@@ -23,9 +22,7 @@ def phrases(viewer) -> list[str]:
 
 
 def test_a_query_is_undone_and_done_again(opened):
-    for word in ("mug", "book"):
-        queries.ask(opened, word)
-    settle(opened)
+    ask(opened, "mug", "book")
     undoing.undo(opened)
     assert phrases(opened) == ["mug"]
     undoing.undo(opened)
@@ -45,9 +42,7 @@ def test_a_query_is_undone_and_done_again(opened):
 
 
 def test_a_removed_query_comes_back_with_its_answer_and_colour(opened):
-    for word in ("mug", "book"):
-        queries.ask(opened, word)
-    settle(opened)
+    ask(opened, "mug", "book")
     mug = opened.state.queries[0]
     queries.set_cut(opened, mug, 0.6)
     count = mug.result.members.sum()
@@ -69,12 +64,10 @@ def leave_by_removing(viewer) -> None:
 @pytest.mark.parametrize("leave", [leave_by_removing, undoing.undo])
 def test_history_keeps_no_answers_of_queries_that_are_gone(opened, leave):
     """Each has a number for every Gaussian and level."""
-    queries.ask(opened, "mug")
-    settle(opened)
+    ask(opened, "mug")
     stays, gone = opened.state.queries[0].result, []
     for word in ("book", "plant"):
-        queries.ask(opened, word)
-        settle(opened)
+        ask(opened, word)
         gone.append(weakref.ref(opened.state.queries[-1].result))
         opened.state.panes()
         leave(opened)
@@ -100,8 +93,7 @@ def test_an_answer_that_comes_after_its_query_was_taken_off_is_dropped(opened):
 
 
 def test_colour_level_and_display_are_undone(opened):
-    queries.ask(opened, "mug")
-    settle(opened)
+    ask(opened, "mug")
     query = opened.state.queries[0]
     queries.hide(opened, query)
     queries.set_level(opened, "part")
@@ -121,8 +113,7 @@ def test_another_scene_and_a_long_day(opened):
         settings.set_display(opened, "depth")
         settings.set_display(opened, "rgb")
     assert len(opened.history.past) == LONGEST
-    opening.open_scene(opened, Path("bare.ply"))
-    settle(opened)
+    open_scene(opened, "bare.ply")
     assert opened.history.past == []
 
 

@@ -12,6 +12,17 @@ from langsplat_core.scene import Scene
 from tests.support.fakes import blob_scene
 from tests.support.on_display import Cast
 
+SCENARIOS = [
+    "look_and_search", "without_field", "from_the_command_line", "broken_renderer", "use_shortcuts",
+    "arrange_panels", "many_queries", "select_with_the_mouse", "outline_and_rest", "name_what_is_clicked",
+    "ask_before_leaving", "drag_the_gizmo", "type_while_opening", "travel_by_keys", "end_by_signals",
+    "look_at_nothing", "look_from_the_broad_side", "record_and_play", "mark_and_return",
+    "close_while_opening", "split_the_view", "draw_over_the_scene", "look_without_perspective",
+    "name_what_is_close", "reload_what_changed", "watch_a_training", "switch_between_scenes",
+    "search_a_library", "time_and_compare", "fade_in_a_photograph", "see_the_evidence", "large_letters",
+    "use_the_toolbar", "clip_and_brush", "pin_a_note", "use_the_outline", "compare_two_scenes",
+]  # fmt: skip
+
 
 @pytest.fixture(scope="module")
 def cast(display: str) -> Iterator[Cast]:
@@ -35,48 +46,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "scenario",
-    [
-        "look_and_search",
-        "without_field",
-        "from_the_command_line",
-        "broken_renderer",
-        "use_shortcuts",
-        "arrange_panels",
-        "many_queries",
-        "select_with_the_mouse",
-        "outline_and_rest",
-        "name_what_is_clicked",
-        "ask_before_leaving",
-        "drag_the_gizmo",
-        "type_while_opening",
-        "travel_by_keys",
-        "end_by_signals",
-        "look_at_nothing",
-        "look_from_the_broad_side",
-        "record_and_play",
-        "mark_and_return",
-        "close_while_opening",
-        "split_the_view",
-        "draw_over_the_scene",
-        "look_without_perspective",
-        "name_what_is_close",
-        "reload_what_changed",
-        "watch_a_training",
-        "switch_between_scenes",
-        "search_a_library",
-        "time_and_compare",
-        "fade_in_a_photograph",
-        "see_the_evidence",
-        "large_letters",
-        "use_the_toolbar",
-        "clip_and_brush",
-        "pin_a_note",
-        "use_the_outline",
-        "compare_two_scenes",
-    ],
-)
+@pytest.mark.parametrize("scenario", SCENARIOS)
 def test_window(scenario: str, cast: Cast, folder: Path):
     drive(scenario, cast, folder)
 

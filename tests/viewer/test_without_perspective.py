@@ -30,6 +30,7 @@ SIDES = ("front", "back", "left", "right", "top", "bottom")
 BLOBS = blob_scene()
 EXTENT = extent_of(BLOBS)
 VIEW = default_view(BLOBS, EXTENT, SIZE)
+FLAT = with_projection(VIEW, orthographic=True)
 
 
 def exact(view: OrbitCamera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -41,9 +42,8 @@ def exact(view: OrbitCamera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def test_the_camera_is_orthographic():
-    view = with_projection(VIEW, orthographic=True)
-    wanted, depths = exact(view, BLOBS.gaussians.means)
-    found, z = view.camera(*SIZE).project(BLOBS.gaussians.means.astype(np.float64))
+    wanted, depths = exact(FLAT, BLOBS.gaussians.means)
+    found, z = FLAT.camera(*SIZE).project(BLOBS.gaussians.means.astype(np.float64))
     assert_allclose(found, wanted, atol=1e-9)
     assert_allclose(z, depths, atol=1e-12)
 
@@ -51,8 +51,7 @@ def test_the_camera_is_orthographic():
 @pytest.mark.parametrize("backend", ["opengl", "cpu"])
 def test_what_is_clicked_is_where_it_is(gl, backend):
     """By the depth of one pixel, and by that of all of them."""
-    view = with_projection(VIEW, orthographic=True)
-    camera = view.camera(320, 240)
+    camera = FLAT.camera(320, 240)
     renderer, request = GlRenderer(gl, backend, "half"), plain_request(BLOBS, camera, PictureConfig())
     for centre in CENTRES:
         (pixel,), _ = camera.project(centre[None])
@@ -60,19 +59,18 @@ def test_what_is_clicked_is_where_it_is(gl, backend):
         one, every = renderer.depth_at(request, x, y), renderer.depth_map(request)[int(y), int(x)]
         for depth in (one, every):
             found = camera.unproject((x, y), float(depth)) - centre
-            assert -0.5 < found @ view.rotation[2] < 0.1  # the front of the blob
+            assert -0.5 < found @ FLAT.rotation[2] < 0.1  # the front of the blob
             assert np.linalg.norm(found[:2]) < 0.3
     assert renderer.depth_at(request, 2.5, 2.5) is None
     renderer.release()
 
 
 def test_the_plane_through_the_target_keeps_its_scale():
-    view = with_projection(VIEW, orthographic=True)
     across = VIEW.target + 0.3 * VIEW.rotation[0] - 0.7 * VIEW.rotation[1]
     points = np.stack([VIEW.target, across])
-    assert_allclose(view.camera(*SIZE).project(points)[0], VIEW.camera(*SIZE).project(points)[0], atol=1e-9)
-    assert with_projection(view, orthographic=False).camera(*SIZE).intrinsics == VIEW.camera(*SIZE).intrinsics
-    assert view.span == pytest.approx(2 * np.tan(np.radians(VIEW.intrinsics.fov_degrees / 2)) * VIEW.distance)
+    assert_allclose(FLAT.camera(*SIZE).project(points)[0], VIEW.camera(*SIZE).project(points)[0], atol=1e-9)
+    assert with_projection(FLAT, orthographic=False).camera(*SIZE).intrinsics == VIEW.camera(*SIZE).intrinsics
+    assert FLAT.span == pytest.approx(2 * np.tan(np.radians(VIEW.intrinsics.fov_degrees / 2)) * VIEW.distance)
 
 
 def test_a_span_is_what_the_shorter_side_shows():
@@ -98,9 +96,8 @@ def test_an_orthographic_camera_gives_its_view_back_at_any_size():
 
 
 def test_what_lies_behind_the_eye_is_left_out_and_cuts_count_from_the_eye():
-    view = with_projection(VIEW, orthographic=True)
     inside = replace(
-        view, target=view.target - 0.2 * view.rotation[2], distance=0.2
+        FLAT, target=FLAT.target - 0.2 * FLAT.rotation[2], distance=0.2
     )  # the eye among the blobs
     camera = inside.camera(*SIZE)
     _, z = exact(inside, BLOBS.gaussians.means)
@@ -119,7 +116,7 @@ def test_what_lies_behind_the_eye_is_left_out_and_cuts_count_from_the_eye():
 
 @pytest.mark.parametrize("side", SIDES)
 def test_framing_holds_the_scene_and_nothing_of_it_is_behind_the_eye(side):
-    view = frame_all(from_side(with_projection(VIEW, orthographic=True), side), EXTENT, SIZE)
+    view = frame_all(from_side(FLAT, side), EXTENT, SIZE)
     pixels, z = exact(view, EXTENT.sample.points)
     inside = (pixels >= 0).all(1) & (pixels <= SIZE).all(1) & (z > 0)
     assert EXTENT.sample.weights[inside].sum() > 0.979 * EXTENT.sample.weights.sum()
@@ -128,17 +125,15 @@ def test_framing_holds_the_scene_and_nothing_of_it_is_behind_the_eye(side):
 
 
 def test_zooming_in_ends_where_nothing_gets_larger():
-    view = with_projection(VIEW, orthographic=True)
-    assert zoom(view, 0.5, 0.1).span == pytest.approx(0.5 * view.span)
-    nearest = zoom(replace(view, distance=0.1), 0.5, 0.1)
+    assert zoom(FLAT, 0.5, 0.1).span == pytest.approx(0.5 * FLAT.span)
+    nearest = zoom(replace(FLAT, distance=0.1), 0.5, 0.1)
     assert nearest.distance == 0.1
-    assert_allclose(nearest.target, view.target)
+    assert_allclose(nearest.target, FLAT.target)
 
 
 def test_a_glide_has_the_projection_of_its_end():
-    flat = with_projection(VIEW, orthographic=True)
-    assert between(VIEW, flat, 0.3).orthographic
-    assert not between(flat, VIEW, 0.3).orthographic
+    assert between(VIEW, FLAT, 0.3).orthographic
+    assert not between(FLAT, VIEW, 0.3).orthographic
 
 
 def flight_of(*views: OrbitCamera) -> Flight:

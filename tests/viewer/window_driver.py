@@ -130,6 +130,38 @@ class Session:
         self.wait(lambda: not self.window.unfinished)
         self.ctx.yield_(2)
 
+    def rest(self, frames: int) -> None:
+        """Let so many frames pass, or, for 0, wait until it is settled."""
+        if frames:
+            self.ctx.yield_(frames)
+        else:
+            self.settle()
+
+    def key(self, key: imgui.Key, frames: int = 0) -> None:
+        """Press a key, then `rest`."""
+        self.ctx.key_press(key)
+        self.rest(frames)
+
+    def click(self, item: str, frames: int = 0) -> None:
+        """Click an item, then `rest`."""
+        self.ctx.item_click(item)
+        self.rest(frames)
+
+    def type(self, text: str, frames: int) -> None:
+        """Type characters, then let so many frames pass."""
+        self.ctx.key_chars(text)
+        self.ctx.yield_(frames)
+
+    def enter(self, text: str, frames: int = 0) -> None:
+        """Type characters and Enter, then `rest`."""
+        self.ctx.key_chars_append_enter(text)
+        self.rest(frames)
+
+    def open_panel(self, title: str, frames: int = 0) -> None:
+        """Open a panel, then `rest`."""
+        settings.open_panel(self.window.viewer, title)
+        self.rest(frames)
+
     def shot(self, name: str) -> np.ndarray:
         """(H, W, 3) the whole window."""
         self.settle()
@@ -201,19 +233,15 @@ def find_the_plant(s: Session, rgb: np.ndarray) -> None:
     assert s.state.queries[0].result.found
     # The box keeps the keyboard, until Esc leaves it: then the next letter is a key again.
     assert imgui.get_io().want_text_input
-    s.ctx.key_chars("ff")
-    s.ctx.yield_(2)
+    s.type("ff", frames=2)
     assert s.state.typed == "ff"
     assert s.state.view is before
     for _ in range(2):
-        s.ctx.key_press(imgui.Key.escape)
-        s.ctx.yield_(2)
-    s.ctx.key_press(imgui.Key.f)
-    s.settle()
+        s.key(imgui.Key.escape, frames=2)
+    s.key(imgui.Key.f)
     assert s.state.typed == ""
     np.testing.assert_allclose(s.state.view.target, s.state.queries[0].result.place)
-    s.ctx.key_press(imgui.Key.r)
-    s.settle()
+    s.key(imgui.Key.r)
     heat = s.shot("heat")
     hot = s.at(heat, PLANT)
     assert hot[0] > hot[2] + 60  # blue turned hot
@@ -262,31 +290,24 @@ def use_keys(s: Session) -> None:
     for digit, display in enumerate(
         ("rgb", "depth", "alpha", "relevancy", "segmentation", "latent"), start=1
     ):
-        s.ctx.key_press(digit_key(digit))
-        s.ctx.yield_(2)
+        s.key(digit_key(digit), frames=2)
         assert s.state.picture.display == display
-    s.ctx.key_press(digit_key(7))
-    s.ctx.yield_(2)
+    s.key(digit_key(7), frames=2)
     assert (s.state.picture.display, s.state.latent_level) == ("latent", 1)
     s.ctx.key_press(digit_key(1))
-    s.ctx.key_press(imgui.Key.r)
-    s.settle()
+    s.key(imgui.Key.r)
     assert s.state.picture.display == "rgb"
     width = s.state.size[0]
-    s.ctx.key_press(imgui.Key.f11)
-    s.settle()
+    s.key(imgui.Key.f11)
     assert s.state.size[0] == 860
     assert width < 600
-    s.ctx.key_press(imgui.Key.f11)
-    s.settle()
-    s.ctx.key_press(imgui.Key.f)
-    s.settle()
+    s.key(imgui.Key.f11)
+    s.key(imgui.Key.f)
     np.testing.assert_allclose(s.state.view.target, s.state.queries[-1].result.place)
 
 
 def save_with_a_key(s: Session) -> None:
-    s.ctx.key_press(imgui.Key.p)
-    s.ctx.yield_(2)
+    s.key(imgui.Key.p, frames=2)
     saved = np.asarray(Image.open(s.folder / "blobs-001.png")).astype(int)
     assert saved.shape == (s.state.size[1], s.state.size[0], 3)
     shown = s.shot("saved")
@@ -313,11 +334,9 @@ def without_field(s: Session) -> None:
     s.wait(lambda: s.state.path.name == "blobs.ply")
     s.settle()
     assert s.ctx.item_exists("//**/##phrase")
-    settings.open_panel(s.window.viewer, "Scene")
-    s.ctx.yield_(3)
+    s.open_panel("Scene", frames=3)
     s.ctx.item_click("//**/Help")
-    settings.open_panel(s.window.viewer, "Camera")
-    s.ctx.yield_(3)
+    s.open_panel("Camera", frames=3)
     s.ctx.item_click("//**/##next")
     s.wait(lambda: s.state.camera_index == 1)
     s.shot("help")
@@ -342,8 +361,7 @@ def broken_renderer(s: Session) -> None:
         raise BackendError("the driver gave up; use --backend cpu")
 
     s.renderer.draw = fail
-    s.ctx.key_press(digit_key(2))
-    s.settle()
+    s.key(digit_key(2))
     s.ctx.yield_(20)
     assert s.state.messages[-1].text == "the driver gave up; use --backend cpu"
     del s.renderer.draw
@@ -361,20 +379,17 @@ def close_while_opening(s: Session) -> None:
 
 def use_the_palette(s: Session) -> None:
     """Its keys keep away from the scrollbar; Enter does the first command that matches, which is lit."""
-    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.p)
-    s.ctx.yield_(3)
+    s.key(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.p, frames=3)
     box, bar = s.ctx.item_info("//Commands/##command").rect_full, imgui.get_style().scrollbar_size
     right, rows = int(box.max.x - bar), slice(int(box.max.y) + 30, int(box.max.y) + 150)
     seen = s.shot("palette")[rows]
     assert np.ptp(seen[:, right - 100 : right], axis=0).max() > 60  # keys
     assert np.ptp(seen[:, right - 5 : right - 1], axis=0).max() < 10
-    s.ctx.key_chars_append_enter("show depth")
-    s.ctx.yield_(3)
+    s.enter("show depth", frames=3)
     assert s.state.picture.display == "depth"
     assert not s.state.show_palette
 
-    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.p)
-    s.ctx.yield_(3)
+    s.key(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.p, frames=3)
     glfw.set_window_size(glfw_window_hello_imgui(), 1100, 600)
     s.wait(lambda: imgui.get_main_viewport().size.x == 1100)
     s.ctx.yield_(3)
@@ -406,47 +421,38 @@ def use_shortcuts(s: Session) -> None:
     key, ctrl, shift = imgui.Key, imgui.Key.mod_ctrl, imgui.Key.mod_shift
     before = s.state.view
     for chord in (ctrl | key.r, ctrl | key.p, ctrl | key.d, ctrl | digit_key(2), ctrl | key.e):
-        s.ctx.key_press(chord)
-        s.ctx.yield_(3)
+        s.key(chord, frames=3)
     assert s.state.view is before
     assert s.state.picture.display == "rgb"
     assert not list(s.folder.glob("blobs-*.png"))
 
-    s.ctx.key_press(ctrl | key.f)
-    s.ctx.yield_(3)
-    s.ctx.key_chars("far")
-    s.ctx.yield_(3)
+    s.key(ctrl | key.f, frames=3)
+    s.type("far", frames=3)
     assert (s.state.typed, s.state.view is before) == ("far", True)
     s.ctx.key_press(key.f1)  # also while typing
     s.ctx.yield_(2)
     assert s.state.show_help
     s.ctx.key_press(key.f1)
-    s.ctx.key_press(key.escape)
-    s.ctx.yield_(3)
+    s.key(key.escape, frames=3)
     assert not imgui.get_io().want_text_input
     assert not s.state.show_help
-    s.ctx.key_press(shift | key.f)
-    s.settle()
+    s.key(shift | key.f)
     assert s.state.view is not before
     for back, start in ((key.home, (600, 300)), (key.r, (560, 340))):  # apart: never a double click
         s.drag(start, (656, 279))
-        s.ctx.key_press(back)
-        s.settle()
+        s.key(back)
         first = s.state.scene.cameras[0].world_to_camera
         np.testing.assert_allclose(s.state.view.camera(160, 120).world_to_camera, first, atol=1e-9)
 
     s.ctx.key_press(ctrl | key.s)
     s.wait((s.folder / "blobs-001.png").exists)
-    s.ctx.key_chars("?")
-    s.ctx.yield_(2)
+    s.type("?", frames=2)
     assert s.state.show_help
     s.ctx.key_press(key.escape)
     use_the_palette(s)
-    s.ctx.key_press(ctrl | key.z)
-    s.ctx.yield_(2)
+    s.key(ctrl | key.z, frames=2)
     assert s.state.picture.display == "rgb"
-    s.ctx.key_press(ctrl | key.o)
-    s.ctx.yield_(3)
+    s.key(ctrl | key.o, frames=3)
     assert s.ctx.item_exists("//**/##path")
 
 
@@ -456,22 +462,17 @@ def use_the_toolbar(s: Session) -> None:
     for does, icon in icons.items():
         assert s.ctx.item_exists(icon), does
     s.ctx.item_click(icons["show depth"])
-    s.ctx.item_click(icons["select: lasso"])
-    s.ctx.yield_(2)
+    s.click(icons["select: lasso"], frames=2)
     assert (s.state.picture.display, s.state.selection.tool) == ("depth", "lasso")
     s.ctx.item_click(icons["select with no tool: the left button turns the view"])
     for phrase in ("mug", "book"):
         s.search(phrase)
     s.ctx.item_click("//**/mug##phrase of list")
-    s.ctx.item_click("//Search/Combine")
-    s.ctx.yield_(2)
-    s.ctx.item_click("//$FOCUSED/or")
-    s.ctx.yield_(2)
-    s.ctx.item_click("//**/book##other")
-    s.settle()
+    s.click("//Search/Combine", frames=2)
+    s.click("//$FOCUSED/or", frames=2)
+    s.click("//**/book##other")
     assert [query.phrase for query in s.state.queries] == ["mug", "book", "mug or book"]
-    s.ctx.item_click("//**/Fixed heat scale")
-    s.ctx.yield_(2)
+    s.click("//**/Fixed heat scale", frames=2)
     lows, highs = zip(*(query.result.heat_range for query in s.state.shown()), strict=True)
     assert s.state.picture.heat_scale == (min(lows), max(highs))
     s.shot("toolbar")
@@ -501,8 +502,7 @@ def many_queries(s: Session) -> None:
     assert all(rect.max.x <= panel + 1 for rect in closes)
     phrase = s.state.queries[-1].phrase
     s.shot("many")
-    s.ctx.item_click(f"//**/{phrase}/x")
-    s.ctx.yield_(2)
+    s.click(f"//**/{phrase}/x", frames=2)
     assert phrase not in [query.phrase for query in s.state.queries]
     assert s.ctx.item_info("//**/Colours").rect_full.min.y == display
 
@@ -528,10 +528,8 @@ def arrange_panels(s: Session) -> None:
         s.ctx.yield_(3)
     s.settle()
     assert s.state.size[0] == 860 > whole[0]  # the scene has taken their place
-    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.f)
-    s.ctx.yield_(4)
-    s.ctx.key_chars("mug")
-    s.ctx.yield_(3)
+    s.key(imgui.Key.mod_ctrl | imgui.Key.f, frames=4)
+    s.type("mug", frames=3)
     assert s.state.typed == "mug"  # the panel is open again, and its box has the keyboard
     s.ctx.key_press(imgui.Key.escape)
     s.menu("Window", "Panels as at first")
@@ -540,18 +538,15 @@ def arrange_panels(s: Session) -> None:
         if not s.ctx.item_exists(f"//{title}"):
             s.menu("Window", f"{title}")
     s.settle()
-    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.o)
-    s.ctx.yield_(4)
+    s.key(imgui.Key.mod_ctrl | imgui.Key.o, frames=4)
     assert s.state.browser.folder == s.folder.absolute()
     s.shot("browser")
     s.ctx.item_click("//**/plain.ply")
     s.wait(lambda: s.state.path.name == "plain.ply")
     s.settle()
     assert s.state.browser is None
-    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.o)
-    s.ctx.yield_(4)
-    s.ctx.key_press(imgui.Key.escape)
-    s.ctx.yield_(3)
+    s.key(imgui.Key.mod_ctrl | imgui.Key.o, frames=4)
+    s.key(imgui.Key.escape, frames=3)
     assert s.state.browser is None
 
 
@@ -605,15 +600,12 @@ def travel_by_keys(s: Session) -> None:
     """Esc closes a menu; Tab goes from field to field, and the panels stay; the palette knows everything."""
     s.ctx.item_click("//**/##MenuBar/View")
     assert imgui.is_popup_open("", imgui.PopupFlags_.any_popup)
-    s.ctx.key_press(imgui.Key.escape)
-    s.ctx.yield_(2)
+    s.key(imgui.Key.escape, frames=2)
     assert not imgui.is_popup_open("", imgui.PopupFlags_.any_popup)
-    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.f)
-    s.ctx.yield_(4)
+    s.key(imgui.Key.mod_ctrl | imgui.Key.f, frames=4)
     seen = set()
     for _ in range(12):
-        s.ctx.key_press(imgui.Key.tab)
-        s.ctx.yield_(2)
+        s.key(imgui.Key.tab, frames=2)
         seen.add(imgui.internal.get_focus_id())
     assert len(seen) > 5
     assert s.state.show_panel
@@ -624,25 +616,19 @@ def travel_by_keys(s: Session) -> None:
     ):
         if words == "open plain":
             s.state.preferences = with_recent(s.state.preferences, s.folder / "plain.ply")
-        s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.p)
-        s.ctx.yield_(3)
+        s.key(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.p, frames=3)
         s.ctx.key_chars_append_enter(words)
         s.wait(done)
         s.settle()
-    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.p)
-    s.ctx.yield_(3)
+    s.key(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.p, frames=3)
     s.ctx.key_chars("show")  # arrows choose another command than the first
     s.ctx.yield_(2)
     for _ in range(3):
-        s.ctx.key_press(imgui.Key.down_arrow)
-        s.ctx.yield_(2)
-    s.ctx.key_press(imgui.Key.enter)
-    s.ctx.yield_(3)
+        s.key(imgui.Key.down_arrow, frames=2)
+    s.key(imgui.Key.enter, frames=3)
     assert s.state.picture.display == "depth"
-    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.p)
-    s.ctx.yield_(3)
-    s.ctx.key_chars_append_enter("teleport")
-    s.ctx.yield_(3)
+    s.key(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.p, frames=3)
+    s.enter("teleport", frames=3)
     assert s.state.show_palette
 
 
@@ -653,20 +639,17 @@ def end_by_signals(s: Session) -> None:
     selecting.quit_viewer(viewer)
     s.wait(lambda: s.state.selection.leaving is not None)
     s.shot("film")
-    s.ctx.item_click("//**/Stay")
-    s.ctx.yield_(2)
+    s.click("//**/Stay", frames=2)
     assert not s.state.selection.may_close
     viewer.recorder.cancel()
     s.search("mug")
     s.menu("Select", "Select what the search found")
-    s.ctx.key_press(imgui.Key.delete)
-    s.settle()
+    s.key(imgui.Key.delete)
     s.window.signals.append(signal.SIGINT)
     s.wait(lambda: s.state.selection.leaving is not None)
     assert not s.state.selection.may_close
     s.shot("asked")
-    s.ctx.item_click("//**/Cancel")
-    s.ctx.yield_(2)
+    s.click("//**/Cancel", frames=2)
 
 
 def slow_film(progress) -> None:
@@ -687,11 +670,9 @@ def slow_load(path: Path) -> Scene:
     return load_scene(path)
 
 
-SCENARIOS = {
-    "look_and_search": (look_and_search, "blobs.ply", {}),
-    "without_field": (without_field, "plain.ply", {}),
+OPENED = {  # scene and request of the scenarios that do not just open "blobs.ply"
+    "without_field": ("plain.ply", {}),
     "from_the_command_line": (
-        from_the_command_line,
         "blobs.ply",
         {
             "queries": ("mug", "sofa", "plant"),
@@ -701,31 +682,22 @@ SCENARIOS = {
             "orthographic": 4.0,
         },
     ),
-    "broken_renderer": (broken_renderer, "blobs.ply", {}),
-    "use_shortcuts": (use_shortcuts, "blobs.ply", {}),
-    "arrange_panels": (arrange_panels, "blobs.ply", {}),
-    "leave_settings": (leave_settings, "blobs.ply", {"settings": Path("settings")}),
-    "find_settings": (find_settings, "blobs.ply", {"settings": Path("settings")}),
-    "use_the_toolbar": (use_the_toolbar, "blobs.ply", {}),
-    "many_queries": (many_queries, "blobs.ply", {}),
-    "type_while_opening": (type_while_opening, "blobs.ply", {"load": slow_load}),
-    "travel_by_keys": (travel_by_keys, "blobs.ply", {}),
-    "end_by_signals": (end_by_signals, "blobs.ply", {}),
-    "look_from_the_broad_side": (look_from_the_broad_side, "wide.ply", {}),
-    "look_at_nothing": (look_at_nothing, "nothing.ply", {}),
-    **scenarios_scene.SELECTING,
-    **scenarios_panels.RECORD,
-    "close_while_opening": (close_while_opening, "blobs.ply", {"load": slow_load}),
-    **scenarios_scene.SEEING,
-    **scenarios_panels.FILES,
-    **scenarios_panels.LAYOUT,
+    "leave_settings": ("blobs.ply", {"settings": Path("settings")}),
+    "find_settings": ("blobs.ply", {"settings": Path("settings")}),
+    "type_while_opening": ("blobs.ply", {"load": slow_load}),
+    "close_while_opening": ("blobs.ply", {"load": slow_load}),
+    "look_from_the_broad_side": ("wide.ply", {}),
+    "look_at_nothing": ("nothing.ply", {}),
+    "large_letters": ("blobs.ply", {"size": (1280, 720)}),
 }
 
 
 def play_one(arguments: list[str]) -> None:
+    """Play the scenario that is the function of that name, here or in one of the modules of scenarios."""
     name, folder = arguments
-    scenario, scene_name, settings = SCENARIOS[name]
-    Session(Path(folder), scene_name, **settings).run(scenario)
+    known = {**vars(scenarios_scene), **vars(scenarios_panels), **globals()}
+    scene, request = OPENED.get(name, ("blobs.ply", {}))
+    Session(Path(folder), scene, **request).run(known[name])
     print("PASSED")
 
 

@@ -1,4 +1,4 @@
-"""The camera path and its keyframes; what is undone of them."""
+"""The camera path and its keyframes; films, images of any size, and images as commands."""
 
 import math
 import os
@@ -43,14 +43,14 @@ from langsplat_viewer.viewer import Viewer
 
 
 def add_keyframe(viewer: Viewer) -> None:
-    """The current view, some seconds after the last keyframe."""
+    """Add the current view as a keyframe, some seconds after the last one."""
     state, record = viewer.state, viewer.state.record
     if state.view is None:
-        state.say("open a scene first, then record a path in it", is_error=True)
+        viewer.say_error("open a scene first, then record a path in it")
         return
     last = record.keyframes[-1].seconds + SPACING if record.keyframes else 0.0
     if last > LONGEST or len(record.keyframes) >= MOST:
-        state.say(f"a path has at most {MOST} keyframes and {LONGEST:.0f} seconds", is_error=True)
+        viewer.say_error(f"a path has at most {MOST} keyframes and {LONGEST:.0f} seconds")
         return
     added = Keyframe(last, pose_of(state.view))
     record.turns = False
@@ -67,12 +67,12 @@ def choose_keyframe(viewer: Viewer, key: Keyframe) -> None:
 
 
 def delete_keyframe(viewer: Viewer, key: Keyframe) -> None:
-    """Take it off the path; the others keep their times."""
+    """Take a keyframe off the path; the others keep their times."""
     _set(viewer, tuple(other for other in viewer.state.record.keyframes if other is not key), None)
 
 
 def move_keyframe(viewer: Viewer, key: Keyframe, seconds: float) -> None:
-    """Move it to another time, or beside a keyframe that has that time."""
+    """Move a keyframe to another time, or beside a keyframe that has that time."""
     others = tuple(other for other in viewer.state.record.keyframes if other is not key)
     seconds = min(max(seconds, 0.0), LONGEST)
     while any(abs(other.seconds - seconds) < SAME_TIME for other in others):
@@ -82,14 +82,14 @@ def move_keyframe(viewer: Viewer, key: Keyframe, seconds: float) -> None:
 
 
 def replace_keyframe(viewer: Viewer, key: Keyframe) -> None:
-    """Put the current view in its place."""
+    """Put the current view in the place of a keyframe."""
     if viewer.state.view is not None:
         new = replace(key, pose=pose_of(viewer.state.view))
         _set(viewer, with_keyframe(viewer.state.record.keyframes, new), new)
 
 
 def set_path_seconds(viewer: Viewer, seconds: float) -> None:
-    """Play the whole path in that time."""
+    """Set the duration of the whole path."""
     record = viewer.state.record
     seconds = min(max(seconds, 0.1), LONGEST)
     if record.turns:
@@ -134,7 +134,7 @@ def save_path(viewer: Viewer, folder: Path) -> Path | None:
     """Save the path to the typed file, or to a new one in `folder`; None where that failed."""
     state, record = viewer.state, viewer.state.record
     if not record.keyframes:
-        state.say("a path to save needs a keyframe: add one at the current view", is_error=True)
+        viewer.say_error("a path to save needs a keyframe: add one at the current view")
         return None
     stem = state.path.stem if state.path else "camera"
     path = (
@@ -143,7 +143,7 @@ def save_path(viewer: Viewer, folder: Path) -> Path | None:
     try:
         write_flight(path, flight_of(record.keyframes))
     except (OSError, ValueError) as error:
-        state.say(f"{path}: not saved ({one_line(error)})", is_error=True)
+        viewer.say_error(f"{path}: not saved ({one_line(error)})")
         return None
     record.path_typed = str(path)
     state.say(f"saved {path}; langsplat-viewer --headless --path makes a film of it")
@@ -155,7 +155,7 @@ def load_path(viewer: Viewer, path: Path) -> None:
     try:
         flight = read_flight(path)
     except LangSplatError as error:
-        viewer.state.say(str(error), is_error=True)
+        viewer.say_error(str(error))
         return
     record = viewer.state.record
     record.turns = False
@@ -171,7 +171,7 @@ def load_typed_path(viewer: Viewer, folder: Path) -> None:
     if typed:
         load_path(viewer, folder / typed)
     else:
-        viewer.state.say("type the name of a file with a path first", is_error=True)
+        viewer.say_error("type the name of a file with a path first")
 
 
 # Films and images of any size, drawn by the CPU on a thread of their own; images as commands.
@@ -184,7 +184,7 @@ def set_film_size(viewer: Viewer, width: int, height: int) -> None:
 
 
 def set_film_fps(viewer: Viewer, fps: float) -> None:
-    """Images per second of a film."""
+    """Set the images per second of a film."""
     viewer.state.record.fps = fps
 
 
@@ -207,14 +207,14 @@ def save_film(viewer: Viewer, folder: Path) -> None:
     """Have a film made along the path, to the typed place or to a new name in `folder`."""
     state, record, motion = viewer.state, viewer.state.record, film_motion(viewer)
     if motion is None or state.extent is None:
-        state.say("a film needs a path: add a keyframe, or choose a turntable", is_error=True)
+        viewer.say_error("a film needs a path: add a keyframe, or choose a turntable")
         return
     request = state.request(record.size)
     try:
         out = check_film(_film_out(viewer, folder), record.size)
         cameras = cameras_of(motion, state.extent, record.fps, record.size)
     except (InputError, OSError) as error:
-        state.say(f"no film: {error}", is_error=True)
+        viewer.say_error(f"no film: {error}")
         return
     shot = Shot(request, cameras, record.fps, "cpu")
 
@@ -237,7 +237,7 @@ def save_sized_picture(viewer: Viewer, folder: Path) -> None:
     """Have the scene as shown drawn in the size of a film and saved under a new name in `folder`."""
     state = viewer.state
     if state.view is None:
-        state.say("open a scene first, then save a picture of it", is_error=True)
+        viewer.say_error("open a scene first, then save a picture of it")
         return
     width, height = state.record.size
     request = state.request((width, height), state.settings.transparent)
@@ -260,8 +260,7 @@ def cancel_film(viewer: Viewer) -> None:
 
 
 def _submit(viewer: Viewer, label: str, work: Callable[[Progress], str]) -> None:
-    state = viewer.state
-    viewer.recorder.submit(label, work, state.say, lambda reason: state.say(reason, is_error=True))
+    viewer.recorder.submit(label, work, viewer.state.say, viewer.say_error)
 
 
 def copy_command(viewer: Viewer, folder: Path) -> str:
@@ -269,7 +268,7 @@ def copy_command(viewer: Viewer, folder: Path) -> str:
     failed. A view that is no training camera's is saved to a file in `folder` first."""
     state = viewer.state
     if state.view is None or state.path is None:
-        state.say("open a scene first, then copy the command of its picture", is_error=True)
+        viewer.say_error("open a scene first, then copy the command of its picture")
         return ""
     camera = _training_camera(state)
     if camera is None:

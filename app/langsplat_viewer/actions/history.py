@@ -74,6 +74,6 @@ def let_go(viewer: Viewer) -> None:
 
 
 def forget(viewer: Viewer) -> None:
-    """Another scene: nothing of before can be undone."""
+    """Empty the history: nothing that was done in another scene can be undone."""
     history = viewer.history
     history.past, history.future, history.marks, history.setting = [], [], None, ""

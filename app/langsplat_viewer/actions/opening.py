@@ -93,7 +93,7 @@ def _open(viewer: Viewer, path: Path, then: Callable[[Viewer], None], check: Cal
 
     def failed(reason: str) -> None:
         viewer.state.opening = None
-        viewer.state.say(reason, is_error=True)
+        viewer.say_error(reason)
 
     viewer.run(f"opening {path.name}", work, done, failed)
 
@@ -141,9 +141,7 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     _say_opened(viewer, path, opened)
     if scene.language is not None:
         field = scene.language
-        viewer.run(
-            "preparing latent colours", lambda progress: latent_colours(field)
-        )  # the window needs none yet
+        viewer.run("preparing latent colours", lambda progress: latent_colours(field))  # none is needed yet
         _compile_search(viewer)
         _warm_up_encoder(viewer, viewer.services.encoder_id or scene.language.encoder_id)
 
@@ -182,7 +180,7 @@ def _warm_up_encoder(viewer: Viewer, encoder_id: str) -> None:
 
 
 def return_to(viewer: Viewer, visit: Visit) -> None:
-    """Have it again in the scene that was just opened; what was asked is asked anew."""
+    """Restore a visit in the scene that was just opened; what was asked is asked anew."""
     state = viewer.state
     if state.scene is None:
         return
@@ -214,7 +212,7 @@ def reload(viewer: Viewer) -> None:
     state = viewer.state
     path, shown = state.path, state.scene
     if path is None or shown is None:
-        state.say("open a scene first; it can be read again when its file has changed", is_error=True)
+        viewer.say_error("open a scene first; it can be read again when its file has changed")
         return
     if state.opening is not None:
         return
@@ -229,7 +227,7 @@ def reload(viewer: Viewer) -> None:
 
 
 def keep_old(viewer: Viewer) -> None:
-    """Do not read what has changed."""
+    """Keep the scene as it was read, though its files have changed."""
     viewer.watch.dismiss()
 
 
@@ -243,14 +241,6 @@ def add_scenes(viewer: Viewer, paths: Sequence[Path]) -> None:
     listed = viewer.state.scenes
     new = dict.fromkeys(path.absolute() for path in paths)
     viewer.state.scenes = (*listed, *(path for path in new if path not in listed))[:MOST]
-
-
-def open_scenes(viewer: Viewer, paths: Sequence[Path]) -> None:
-    """Open the first of some and list them all."""
-    if paths:
-        add_scenes(viewer, paths)
-        viewer.state.browser = None
-        open_scene(viewer, paths[0])
 
 
 def switch_scene(viewer: Viewer, path: Path) -> None:
@@ -271,14 +261,14 @@ def step_scene(viewer: Viewer, by: int) -> None:
     state = viewer.state
     others = [path for path in state.scenes if state.path is None or path != state.path.absolute()]
     if not others:
-        state.say("no other scene is listed: drop several, or open another", is_error=True)
+        viewer.say_error("no other scene is listed: drop several, or open another")
         return
     here = state.scenes.index(state.path.absolute()) if state.path and len(others) < len(state.scenes) else -1
     switch_scene(viewer, state.scenes[(here + by) % len(state.scenes)])
 
 
 def unlist_scene(viewer: Viewer, path: Path) -> None:
-    """Take one off the list, and forget where one stood in it; the one that is shown stays."""
+    """Take a scene off the list, and forget its visit; the scene that is shown stays."""
     viewer.state.scenes = tuple(other for other in viewer.state.scenes if other != path)
     viewer.visits.pop(path, None)
 
@@ -355,8 +345,8 @@ def ask_for_photographs(viewer: Viewer) -> None:
     """Open the browser to choose the folder that has the photographs of the scene."""
     state = viewer.state
     if state.path is not None:
-        start = Path(_folder(viewer) or state.path.parent)
-        state.path_typed, state.browser, state.picks_folder = "", list_folder(start.absolute()), "photographs"
+        browse(viewer, Path(_folder(viewer) or state.path.parent).absolute())
+        state.picks_folder = "photographs"
 
 
 def choose_photograph_folder(viewer: Viewer, folder: Path) -> None:
@@ -454,8 +444,7 @@ NAMED = 3  # files that a message names
 def ask_for_file(viewer: Viewer) -> None:
     """Open the browser in the folder of the scene that is shown."""
     state = viewer.state
-    folder = state.path.parent if state.path is not None else Path.cwd()
-    state.path_typed, state.browser = "", list_folder(folder.absolute())
+    browse(viewer, (Path.cwd() if state.path is None else state.path.parent).absolute())
     state.picks_folder, state.picks_beside = "", False
 
 
@@ -513,7 +502,7 @@ def open_project(viewer: Viewer, path: Path, then: Callable[[Viewer], None] = la
         project = read_project(path)
         scene = scene_of(project)
     except InputError as error:
-        viewer.state.say(one_line(error), is_error=True)
+        viewer.say_error(one_line(error))
         return
 
     def restore(viewer: Viewer) -> None:
@@ -541,7 +530,7 @@ def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
     others = [path.name for path in scenes if path not in known]
     if others:
         more = f" and {len(others) - NAMED} more" if len(others) > NAMED else ""
-        viewer.state.say(f"not opened: {', '.join(others[:NAMED])}{more}", is_error=True)
+        viewer.say_error(f"not opened: {', '.join(others[:NAMED])}{more}")
     add_scenes(viewer, known)
     if len(known) > 1:
         viewer.state.say(f"{len(known)} scenes: the panel Scene lists them")
@@ -561,9 +550,11 @@ def open_all(viewer: Viewer) -> None:
     """List the scenes of the folder that the browser shows, and open the first."""
     listing = viewer.state.browser
     if listing is not None:
-        open_scenes(
-            viewer, [entry.path for entry in listing.entries if entry.is_file and format_of(entry.path)]
-        )
+        paths = [entry.path for entry in listing.entries if entry.is_file and format_of(entry.path)]
+        if paths:
+            add_scenes(viewer, paths)
+            close_browser(viewer)
+            open_scene(viewer, paths[0])
         open_panel(viewer, "Scene")
 
 

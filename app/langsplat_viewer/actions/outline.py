@@ -145,7 +145,7 @@ def with_thing(viewer: Viewer, target: Target, act: Callable[[Array], None]) -> 
     """Have the worker find (N,) bool of a thing, and then `act` with it."""
     engine, scene, level = viewer.engine, viewer.state.scene, viewer.state.level
     if engine is None or scene is None or scene.language is None:
-        viewer.state.say("things are known where there is a language field", is_error=True)
+        viewer.say_error("things are known where there is a language field")
         return
 
     def work(progress: Progress) -> Array:
@@ -194,7 +194,7 @@ def hide(viewer: Viewer, target: Target) -> None:
 
     def act(members: Array) -> None:
         marks = viewer.state.selection.marks
-        hidden = marks.hidden | (members & ~locked(viewer))
+        hidden = marks.hidden | (members & ~viewer.state.selection.locked)
         mark(viewer, replace(marks, selected=marks.selected & ~hidden, hidden=hidden))
 
     with_thing(viewer, target, act)
@@ -232,11 +232,6 @@ def write_filter(viewer: Viewer, text: str) -> None:
 
 
 # Locks and groups.
-
-
-def locked(viewer: Viewer) -> Array:
-    """(N,) bool: what tools leave alone."""
-    return viewer.state.selection.locked
 
 
 def toggle_lock(viewer: Viewer, node: int) -> None:
@@ -305,7 +300,7 @@ def rename_group(viewer: Viewer, old: Group, name: str) -> None:
     """Give a group another name."""
     things, name = viewer.state.things, tidy(name)
     if name in {g.name for g in things.groups if g is not old}:
-        viewer.state.say(f"there is a group '{name}' already", is_error=True)
+        viewer.say_error(f"there is a group '{name}' already")
     elif name:
         remember(viewer)
         groups = tuple(replace(g, name=name) if g is old else g for g in things.groups)

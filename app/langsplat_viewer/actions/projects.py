@@ -63,7 +63,7 @@ def pin_to_selection(viewer: Viewer) -> None:
     """Pin a note to the middle of what is selected."""
     state, chosen = viewer.state, viewer.state.selection.marks.selected
     if state.scene is None or not chosen.any():
-        state.say("select something first, then pin a note to it", is_error=True)
+        viewer.say_error("select something first, then pin a note to it")
         return
     means = state.scene.gaussians.means[chosen].astype(np.float64)
     _pin(viewer, means[np.argmin(((means - np.median(means, axis=0)) ** 2).sum(1))])
@@ -72,7 +72,7 @@ def pin_to_selection(viewer: Viewer) -> None:
 def _pin(viewer: Viewer, point: Array) -> None:
     state = viewer.state
     if len(state.notes) >= MOST_NOTES:
-        state.say("no room for more notes", is_error=True)
+        viewer.say_error("no room for more notes")
         return
     remember(viewer)
     x, y, z = (float(part) for part in point)
@@ -109,7 +109,7 @@ def save_project(viewer: Viewer, folder: Path) -> Path | None:
     """Save the project to the file that it came from, or to a new one in `folder`; None where that failed."""
     state = viewer.state
     if state.scene is None or state.path is None or state.view is None:
-        state.say("open a scene first, then save the project", is_error=True)
+        viewer.say_error("open a scene first, then save the project")
         return None
     path = state.project or free_name(folder.absolute(), state.path.stem, PROJECTS)
     moment = now(viewer)
@@ -133,7 +133,7 @@ def save_project(viewer: Viewer, folder: Path) -> Path | None:
     try:
         write_project(path, project, [_answer(state, query) for query in state.queries])
     except OSError as error:
-        state.say(f"{path}: not saved ({one_line(error)})", is_error=True)
+        viewer.say_error(f"{path}: not saved ({one_line(error)})")
         return None
     state.project, state.preferences = path, with_recent(state.preferences, path)
     state.kept = state.things, state.notes
@@ -193,12 +193,12 @@ def restore(viewer: Viewer, project: Project, path: Path) -> Visit:
         try:
             place(viewer, project.moves)
         except LangSplatError as error:
-            state.say(f"{path}: its transforms are left out: {one_line(error)}", is_error=True)
+            viewer.say_error(f"{path}: its transforms are left out: {one_line(error)}")
         marks, moves = state.selection.marks, state.selection.moves
         state.selection = replace(state.selection, saved=marks.deleted, saved_moves=moves)
     elif project.moves or project.things != Things() or any(m is not None for m in project.marks.masks):
         what = "what was selected, hidden, moved and named is left out"
-        state.say(f"the scene has changed since: {what}", is_error=True)
+        viewer.say_error(f"the scene has changed since: {what}")
     state.picture = project.picture
     state.notes, state.project = project.notes, path
     state.kept = state.things, state.notes

@@ -39,7 +39,7 @@ def ask(viewer: Viewer, text: str) -> None:
     for phrase in phrases:
         ask_one(viewer, phrase)
     if text.strip() and not phrases:
-        viewer.state.say(f"'{text.strip()[:40]}' has no word to look for", is_error=True)
+        viewer.say_error(f"'{text.strip()[:40]}' has no word to look for")
 
 
 def ask_one(viewer: Viewer, phrase: str, *, cut: float | None = None, then_show: bool = True) -> None:
@@ -47,10 +47,10 @@ def ask_one(viewer: Viewer, phrase: str, *, cut: float | None = None, then_show:
     give it a colour if it may be there."""
     state = viewer.state
     if state.scene is None or viewer.engine is None:
-        state.say("open a scene first, then search it", is_error=True)
+        viewer.say_error("open a scene first, then search it")
         return
     if state.scene.language is None:
-        state.say(no_field(state.scene), is_error=True)
+        viewer.say_error(no_field(state.scene))
         return
     key = phrase_key(phrase)
     query = next((q for q in state.queries if phrase_key(q.phrase) == key), None) or Query(phrase)
@@ -68,7 +68,7 @@ JOINS = {"and": "{} and {}", "or": "{} or {}", "without": "{}, not {}"}  # as th
 
 def ask_combined(viewer: Viewer, first: Query, join: str, second: Query) -> None:
     """Search for two queries at once, joined by one of `JOINS`."""
-    ask_one(viewer, JOINS[join].format(first.phrase, second.phrase), then_show=True)
+    ask_one(viewer, JOINS[join].format(first.phrase, second.phrase))
 
 
 def ask_again(viewer: Viewer) -> None:
@@ -137,9 +137,7 @@ def focus_search(viewer: Viewer) -> None:
     open_panel(viewer, "Search")
     scene = viewer.state.scene
     if scene is None or scene.language is None:
-        viewer.state.say(
-            "open a scene first, then search it" if scene is None else no_field(scene), is_error=True
-        )
+        viewer.say_error("open a scene first, then search it" if scene is None else no_field(scene))
         mute_letters(viewer, True)
     else:
         viewer.state.focus_input = viewer.state.awaits_keyboard = True
@@ -188,7 +186,7 @@ def _answer(viewer: Viewer, query: Query, then_show: bool = False) -> None:
 
     def failed(reason: str) -> None:
         query.problem, query.pending = reason, False
-        viewer.state.say(reason, is_error=True)
+        viewer.say_error(reason)
 
     query.pending = True
     viewer.run(f"searching '{query.phrase}'", work, done, failed)
@@ -339,7 +337,7 @@ def set_canonical(viewer: Viewer, text: str) -> None:
     phrases = tuple(split_phrases(text))
     engine, state = viewer.engine, viewer.state
     if engine is None or state.scene is None or state.scene.language is None:
-        state.say("open a scene with a language field first", is_error=True)
+        viewer.say_error("open a scene with a language field first")
         return
 
     def work(progress: Progress) -> tuple[str, ...]:
@@ -364,13 +362,13 @@ def save_queries(viewer: Viewer, folder: Path) -> Path | None:
     """Save the list to a new file in `folder`; returns its path, None if there is none or that failed."""
     state = viewer.state
     if not state.queries:
-        state.say("search for something first, then save the queries", is_error=True)
+        viewer.say_error("search for something first, then save the queries")
         return None
     path = free_name(folder, state.path.stem if state.path else "scene", SUFFIX)
     try:
         write_queries(path, listed_queries(state))
     except OSError as error:
-        state.say(f"{path}: not saved ({one_line(error)})", is_error=True)
+        viewer.say_error(f"{path}: not saved ({one_line(error)})")
         return None
     state.say(f"saved {path}; open it, or drop it onto the window, to ask them again")
     return path
@@ -382,10 +380,10 @@ def load_queries(viewer: Viewer, path: Path) -> None:
     try:
         wanted = read_queries(path)
     except InputError as error:
-        state.say(one_line(error), is_error=True)
+        viewer.say_error(one_line(error))
         return
     if state.scene is None or state.scene.language is None:
-        state.say(f"{path.name}: open a scene that can be searched first", is_error=True)
+        viewer.say_error(f"{path.name}: open a scene that can be searched first")
         return
     if wanted.canonical != state.canonical:
         set_canonical(viewer, ", ".join(wanted.canonical))

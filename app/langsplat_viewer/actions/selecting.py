@@ -49,7 +49,7 @@ def take(viewer: Viewer, found: Array, mode: Mode | None = None) -> None:
 def has_scene(viewer: Viewer) -> bool:
     """Return whether a scene is open; say so where none is."""
     if viewer.state.scene is None:
-        viewer.state.say("open a scene first, then select in it", is_error=True)
+        viewer.say_error("open a scene first, then select in it")
     return viewer.state.scene is not None
 
 
@@ -90,19 +90,22 @@ def hide_selected(viewer: Viewer) -> None:
 def isolate_selected(viewer: Viewer) -> None:
     """Hide everything that is not selected."""
     if has_selection(viewer):
-        mark(viewer, marks.isolating(viewer.state.selection.marks, viewer.state.selection.locked))
+        marks, locked = viewer.state.selection.marks, viewer.state.selection.locked
+        mark(viewer, replace(marks, hidden=marks.kept & ~(marks.selected | locked)))
 
 
 def show_hidden(viewer: Viewer) -> None:
     """Show everything that was hidden."""
     if has_scene(viewer):
-        mark(viewer, marks.showing_all(viewer.state.selection.marks))
+        marks = viewer.state.selection.marks
+        mark(viewer, replace(marks, hidden=np.zeros_like(marks.hidden)))
 
 
 def delete_selected(viewer: Viewer) -> None:
     """Take the selection out of the image and of what is saved; the file that was opened stays as it is."""
     if has_selection(viewer):
-        mark(viewer, marks.deleting(viewer.state.selection.marks))
+        marks = viewer.state.selection.marks
+        mark(viewer, Marks(np.zeros_like(marks.selected), marks.hidden, marks.deleted | marks.selected))
 
 
 def reach(viewer: Viewer) -> float:
@@ -126,7 +129,7 @@ def shrink_selection(viewer: Viewer) -> None:
 
 
 def select_alike(viewer: Viewer) -> None:
-    """Select everything that is like what is selected, wherever it is; see `QueryEngine.like`."""
+    """Select everything that is like what is selected, wherever it is, by `QueryEngine.like`."""
     if has_selection(viewer):
         selected = viewer.state.selection.marks.selected
         find(viewer, "looking for more like", lambda engine: engine.like(selected).members, "replace")
@@ -244,7 +247,7 @@ def select_range(viewer: Viewer, text: str) -> None:
     except ValueError:
         ends = np.zeros(0)
     if found is None or len(ends) != 2:
-        viewer.state.say(f"'{text}' is not two numbers, such as 0.5 to 0.9", is_error=True)
+        viewer.say_error(f"'{text}' is not two numbers, such as 0.5 to 0.9")
         return
     if viewer.state.selection.measure in marks.LOGARITHMIC:
         ends = np.log10(np.maximum(ends, 1e-30))
@@ -297,7 +300,7 @@ def export(
         field = replace(field, taught=tuple(engine.taught.values()))
     rows = np.flatnonzero(rows_of(marks, part))
     if len(rows) == 0:
-        state.say(f"the {part} holds no Gaussians: nothing to write", is_error=True)
+        viewer.say_error(f"the {part} holds no Gaussians: nothing to write")
         return
     stem = f"{state.path.stem if state.path else 'scene'}-{part}{'-points' if as_points else ''}"
 
@@ -312,7 +315,7 @@ def export(
         then(viewer)
 
     def failed(reason: str) -> None:
-        state.say(f"not saved: {reason}", is_error=True)
+        viewer.say_error(f"not saved: {reason}")
 
     job = viewer.run(f"saving the {part}", work, done, failed)
     state.selection = replace(state.selection, writing=job.future)
@@ -399,7 +402,7 @@ def discard_and_leave(viewer: Viewer) -> None:
 
 
 def stay(viewer: Viewer) -> None:
-    """Do not go on."""
+    """Stay in the scene: forget the action that waited for the answer."""
     _answered(viewer)
 
 
@@ -426,7 +429,7 @@ def begin_stroke(viewer: Viewer, u: float, v: float) -> None:
 
 
 def extend_stroke(viewer: Viewer, u: float, v: float) -> None:
-    """The mouse is there now."""
+    """Add a place (u, v) to the stroke under way."""
     selection = viewer.state.selection
     stroke = selection.stroke
     if stroke is None:
@@ -465,7 +468,7 @@ def drawn_stroke(viewer: Viewer) -> Drawn | None:
 
 
 def cancel_stroke(viewer: Viewer) -> None:
-    """Select nothing by it."""
+    """Drop the stroke under way; nothing is selected by it."""
     viewer.state.selection = replace(viewer.state.selection, stroke=None)
 
 
@@ -483,7 +486,7 @@ def _select_under(viewer: Viewer, stroke: Stroke, mode: Mode | None) -> None:
     if state.scene is None or stroke.centre is None:
         return
     if state.scene.language is None:
-        state.say("without a language field no things are known: use a brush, sphere or box", is_error=True)
+        viewer.say_error("without a language field no things are known: use a brush, sphere or box")
         return
     level = LEVELS.index("whole" if state.level == "auto" else state.level)
     centre = np.array(stroke.centre)

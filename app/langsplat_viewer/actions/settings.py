@@ -1,4 +1,4 @@
-"""Several images side by side, and what lies over them."""
+"""Settings of what is shown and how: several images side by side, overlays, display, panels, help."""
 
 from dataclasses import fields, replace
 
@@ -98,12 +98,12 @@ def show_overlay(viewer: Viewer, overlay: Overlay, shown: bool) -> None:
 
 
 def toggle_overlay(viewer: Viewer, overlay: Overlay) -> None:
-    """Show it, or take it away."""
+    """Show an overlay, or take it away."""
     show_overlay(viewer, overlay, overlay not in viewer.state.preferences.overlays)
 
 
 def turn_to_face(viewer: Viewer, face: str) -> None:
-    """Look straight at one face of the view cube, by its name in `view_cube.FACES`."""
+    """Look straight at one face of the view cube, by its name in `camera.overlays.FACES`."""
     if viewer.state.view is not None:
         glide_to(viewer, facing(viewer.state.view, face))
 
@@ -134,7 +134,7 @@ def _can_show(viewer: Viewer, needs_field: bool) -> bool:
     """Return whether the scene has a language field where one is needed; says so where it has none."""
     scene = viewer.state.scene
     if needs_field and scene is not None and scene.language is None:
-        viewer.state.say(no_field(scene), is_error=True)
+        viewer.say_error(no_field(scene))
         return False
     return True
 
@@ -156,8 +156,7 @@ def _set(viewer: Viewer, settings: ViewSettings, setting: str = "") -> None:
 def set_display(viewer: Viewer, display: Display, latent_level: int | None = None) -> None:
     """Choose what is shown; `latent_level` is an index into `scene.LEVELS`."""
     state = viewer.state
-    if DISPLAYS[display].needs_field and state.scene is not None and state.scene.language is None:
-        state.say(no_field(state.scene), is_error=True)
+    if not _can_show(viewer, DISPLAYS[display].needs_field):
         return
     latent_level = state.latent_level if latent_level is None else latent_level
     if (display, latent_level) != (state.picture.display, state.latent_level):
@@ -223,13 +222,13 @@ def have_panels(viewer: Viewer, titles: tuple[str, ...]) -> None:
 
 
 def take_panel_reset(viewer: Viewer) -> bool:
-    """Whether the panels go back to their first places now; said once."""
+    """Return whether the panels go back to their first places now; True once."""
     reset, viewer.state.resets_panels = viewer.state.resets_panels, False
     return reset
 
 
 def take_wanted_panel(viewer: Viewer) -> str:
-    """The panel that is opened now, "" for none; said once."""
+    """Return the title of the panel that is opened now, "" for none; once."""
     title, viewer.state.wanted_panel = viewer.state.wanted_panel, ""
     return title
 
@@ -258,7 +257,7 @@ def show_palette(viewer: Viewer, shown: bool) -> None:
 
 
 def toggle_palette(viewer: Viewer) -> None:
-    """Show that list, or take it away."""
+    """Show the list of everything that can be done, or take it away."""
     show_palette(viewer, not viewer.state.show_palette)
 
 

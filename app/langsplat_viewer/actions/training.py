@@ -23,25 +23,25 @@ def start_training(viewer: Viewer) -> None:
     """Train, or go on with what was interrupted: the same photographs and name continue."""
     state, form = viewer.state, viewer.state.training_form
     if viewer.training is not None and viewer.training.exit_code is None:
-        state.say("a training is under way; stop it first", is_error=True)
+        viewer.say_error("a training is under way; stop it first")
         return
     dataset = Path(form.dataset.strip()).expanduser()
     out = Path(form.out.strip() or f"{dataset}.ply").expanduser()
     photographs, _ = count_photographs(dataset)
     if not form.dataset.strip() or photographs == 0:
-        state.say(f"no photographs in '{form.dataset.strip()}'; name a folder that has some", is_error=True)
+        viewer.say_error(f"no photographs in '{form.dataset.strip()}'; name a folder that has some")
         return
     request = TrainingRequest(dataset, out, form.preset, form.encoder.strip() or "demo")
     try:
         viewer.training = Training(request, viewer.worker.wake)
     except OSError as error:
-        state.say(f"training cannot be started ({one_line(error)})", is_error=True)
+        viewer.say_error(f"training cannot be started ({one_line(error)})")
         return
     state.say(f"training {out.name} from {photographs} photographs")
 
 
 def stop_training(viewer: Viewer) -> None:
-    """Interrupt; `start_training` goes on from there."""
+    """Interrupt the training; `start_training` goes on from there."""
     if viewer.training is not None:
         viewer.training.interrupt()
 
@@ -62,7 +62,7 @@ def look_at_training(viewer: Viewer) -> None:
 
 
 def _show_checkpoint(viewer: Viewer, training: Training, checkpoint: Stamps) -> None:
-    """Open it as a scene, or in place of the one before, where that is still shown."""
+    """Open a checkpoint as a scene, or in place of the one before, where that is still shown."""
     training.previewed = checkpoint
     ((path, _),) = checkpoint
 
@@ -85,7 +85,7 @@ def _follow(viewer: Viewer, training: Training) -> None:
 
 
 def watch_training(viewer: Viewer) -> None:
-    """Once per frame: open the scene when it is finished, or say why there is none."""
+    """Open the scene when its training is finished, or say why there is none; once per frame."""
     training, state = viewer.training, viewer.state
     if training is None:
         return
@@ -102,4 +102,4 @@ def watch_training(viewer: Viewer) -> None:
     elif training.interrupted:
         state.say("training stopped; Train goes on where it was")
     else:
-        state.say(last, is_error=True)
+        viewer.say_error(last)

@@ -75,7 +75,7 @@ def transform(viewer: Viewer, to: Similarity) -> None:
         place(viewer, joined)
     except LangSplatError as error:
         viewer.history.past.pop()
-        viewer.state.say(str(error), is_error=True)
+        viewer.say_error(str(error))
         return
     what = "the scene" if move.packed is None else "the selection"
     viewer.state.say(f"transformed {what}; save the scene to keep it")
@@ -116,7 +116,7 @@ def apply_form(viewer: Viewer) -> None:
             to = to.then(rotating(AXES[axis], degrees))
         to = (to if to.is_identity else to.about(centre)).then(moving(np.array(form.move)))
     except LangSplatError as error:
-        viewer.state.say(str(error), is_error=True)
+        viewer.say_error(str(error))
         return
     transform(viewer, to)
     fill_form(viewer, replace(form, move=EditForm.move, rotate=EditForm.rotate, scale=EditForm.scale))
@@ -149,7 +149,7 @@ def _inside(viewer: Viewer) -> Array | None:
     corners = np.array([form.low, form.high])
     inside = in_box(state.scene.gaussians.means, corners.min(0), corners.max(0)) | state.selection.locked
     if not (inside & state.selection.marks.kept).any():
-        state.say("the box holds nothing: set its corners around something, or press Fit", is_error=True)
+        viewer.say_error("the box holds nothing: set its corners around something, or press Fit")
         return None
     return inside
 

@@ -53,9 +53,9 @@ def toggle_playing(viewer: Viewer) -> None:
     if record.began is not None:
         record.began = None
     elif viewer.state.view is None:
-        viewer.state.say("open a scene first, then play a path in it", is_error=True)
+        viewer.say_error("open a scene first, then play a path in it")
     elif path_seconds(viewer) <= 0:
-        viewer.state.say("a path needs two keyframes: add one at the current view", is_error=True)
+        viewer.say_error("a path needs two keyframes: add one at the current view")
     else:
         start = 0.0 if record.at >= path_seconds(viewer) else record.at
         scrub(viewer, start)
@@ -139,12 +139,8 @@ def open_at(viewer: Viewer, camera: Camera) -> None:
     """Take a camera's view at once; it is the opening view from now on."""
     extent, scene = viewer.state.extent, viewer.state.scene
     if extent is not None and scene is not None:
-        same = (
-            i
-            for i, own in enumerate(scene.cameras)
-            if np.array_equal(own.world_to_camera, camera.world_to_camera)
-        )
-        viewer.state.camera_index = next(same, None)
+        same = [np.array_equal(own.world_to_camera, camera.world_to_camera) for own in scene.cameras]
+        viewer.state.camera_index = same.index(True) if any(same) else None
         viewer.state.opening_camera = camera
         move(viewer, lambda view: from_camera(camera, extent))
 
@@ -253,7 +249,7 @@ def go_to_camera(viewer: Viewer, index: int) -> None:
     if scene is None or extent is None:
         return
     if not scene.cameras:
-        viewer.state.say("this scene has no training cameras (no .cameras.json beside it)", is_error=True)
+        viewer.say_error("this scene has no training cameras (no .cameras.json beside it)")
         return
     viewer.state.camera_index = index % len(scene.cameras)
     glide_to(viewer, from_camera(scene.cameras[viewer.state.camera_index], extent))
@@ -277,18 +273,18 @@ def focus_result(viewer: Viewer, query: Query | None = None) -> None:
     if query is None or query.result is None or place is None:
         frame_scene(viewer)
         return
-    glide_to(viewer, focus(state.view, place, _distance_for(viewer, place, query.result.box)))
+    focus_on(viewer, place, query.result.box)
 
 
-def focus_on(viewer: Viewer, place: Array, box: Array) -> None:
+def focus_on(viewer: Viewer, place: Array, box: Array | None) -> None:
     """Bring a thing at `place` (3,) in `box` (2, 3) to the centre, as near as it is small."""
     if viewer.state.view is not None and viewer.state.extent is not None:
         glide_to(viewer, focus(viewer.state.view, place, _distance_for(viewer, place, box)))
 
 
 def _distance_for(viewer: Viewer, place: Array, box: Array | None) -> float:
-    """From where a thing at `place` (3,) in `box` (2, 3) is seen, world units: no farther back than the
-    eye or the opening view are now, which in a room would be behind its wall."""
+    """Distance from which a thing at `place` (3,) in `box` (2, 3) is seen, world units: no farther back than
+    the eye or the opening view are now, which in a room would be behind its wall."""
     view, extent, home = viewer.state.view, viewer.state.extent, opening_view(viewer)
     assert view is not None
     assert extent is not None
@@ -322,7 +318,7 @@ def toggle_pointing(viewer: Viewer) -> None:
     """Say what is under the cursor from now on, or no longer."""
     state = viewer.state
     if not state.pointing and (state.scene is None or state.scene.language is None):
-        state.say("open a scene first" if state.scene is None else no_field(state.scene), is_error=True)
+        viewer.say_error("open a scene first" if state.scene is None else no_field(state.scene))
         return
     state.pointing, state.hover = not state.pointing, None
 
@@ -379,7 +375,7 @@ def add_bookmark(viewer: Viewer, name: str = "") -> None:
     """Keep the current view; in place of one of the same name. Without a name it gets a number."""
     state = viewer.state
     if state.view is None:
-        state.say("open a scene first, then bookmark a view of it", is_error=True)
+        viewer.say_error("open a scene first, then bookmark a view of it")
         return
     kept = state.bookmarks
     if not name.strip():
@@ -390,7 +386,7 @@ def add_bookmark(viewer: Viewer, name: str = "") -> None:
     added = Bookmark(named(name), pose_of(state.view), state.view.distance)
     others = tuple(bookmark for bookmark in kept if bookmark.name != added.name)
     if len(others) >= MOST_VIEWS:
-        state.say(f"a scene has at most {MOST_VIEWS} bookmarks: delete one", is_error=True)
+        viewer.say_error(f"a scene has at most {MOST_VIEWS} bookmarks: delete one")
         return
     state.bookmarks, state.bookmark_typed = (*others, added), ""
     _keep(viewer)
@@ -403,20 +399,20 @@ def type_bookmark(viewer: Viewer, text: str) -> None:
 
 
 def go_to_bookmark(viewer: Viewer, bookmark: Bookmark) -> None:
-    """Stand where it was made, turning around the same point."""
+    """Stand where a bookmark was made, turning around the same point."""
     if viewer.state.extent is not None:
         glide_to(viewer, bookmarked_view(bookmark, viewer.state.extent))
 
 
 def bookmarked_view(bookmark: Bookmark, extent: Extent) -> OrbitCamera:
-    """The view that was kept."""
+    """Return the view that a bookmark keeps."""
     view = view_of(bookmark.pose, extent)
     target = view.eye + bookmark.distance * view.rotation[2]
     return replace(view, target=target, distance=bookmark.distance)
 
 
 def delete_bookmark(viewer: Viewer, bookmark: Bookmark) -> None:
-    """Take it off the list."""
+    """Take a bookmark off the list."""
     viewer.state.bookmarks = tuple(other for other in viewer.state.bookmarks if other is not bookmark)
     _keep(viewer)
 
@@ -437,7 +433,7 @@ def _keep(viewer: Viewer) -> None:
     try:
         viewer.shelf.write(state.path, state.bookmarks)
     except (OSError, InputError) as error:
-        state.say(f"bookmarks not kept: {one_line(error)}", is_error=True)
+        viewer.say_error(f"bookmarks not kept: {one_line(error)}")
 
 
 # Timing and the comparison with the reference.
@@ -453,10 +449,10 @@ def compare_with_reference(viewer: Viewer) -> None:
     tell the difference."""
     state = viewer.state
     if state.scene is None or state.view is None or viewer.surface is None:
-        state.say("open a scene first, then compare its picture", is_error=True)
+        viewer.say_error("open a scene first, then compare its picture")
         return
     if viewer.recorder.current is not None:
-        state.say("a film or a comparison is being drawn; wait for it or cancel it", is_error=True)
+        viewer.say_error("a film or a comparison is being drawn; wait for it or cancel it")
         return
     request, backend = state.request(compared_size(state.size)), state.backend
     shown = viewer.surface.capture(request)
@@ -467,11 +463,9 @@ def compare_with_reference(viewer: Viewer) -> None:
     def done(reference: Array) -> None:
         state.timing.comparison = compared(shown, reference, backend)
 
-    viewer.recorder.submit(
-        "comparing with the reference", work, done, lambda reason: state.say(reason, is_error=True)
-    )
+    viewer.recorder.submit("comparing with the reference", work, done, viewer.say_error)
 
 
 def stop_comparing(viewer: Viewer) -> None:
-    """Do not wait for it."""
+    """Cancel the comparison with the reference."""
     viewer.recorder.cancel()

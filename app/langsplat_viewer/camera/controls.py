@@ -45,7 +45,7 @@ def sample_of(gaussians: Gaussians) -> Sample:
 
 def reach(sample: Sample, centre: Array) -> float:
     """Distance from `centre` (3,) within which `SHARE` of the weight lies, world units; 0 without any."""
-    return _quantile(np.linalg.norm(sample.points - centre, axis=1), sample.weights, SHARE)
+    return weighted_quantile(np.linalg.norm(sample.points - centre, axis=1), sample.weights, SHARE)
 
 
 def framing_eye(sample: Sample, rotation: Array, inner: Intrinsics, share: float = SHARE) -> Array | None:
@@ -87,13 +87,13 @@ def framing_eye(sample: Sample, rotation: Array, inner: Intrinsics, share: float
 
 def median_depth(sample: Sample, eye: Array, forward: Array) -> float:
     """Return the depth from `eye` (3,) along the unit `forward` (3,) of half of the weight, world units."""
-    return _quantile((sample.points - eye) @ forward, sample.weights, 0.5)
+    return weighted_quantile((sample.points - eye) @ forward, sample.weights, 0.5)
 
 
 def nearest_depth(sample: Sample, eye: Array, forward: Array) -> float:
     """Return the depth from `eye` (3,) along the unit `forward` (3,) before which only `1 - SHARE` of the
     weight lies, world units; negative behind it."""
-    return _quantile((sample.points - eye) @ forward, sample.weights, 1 - SHARE)
+    return weighted_quantile((sample.points - eye) @ forward, sample.weights, 1 - SHARE)
 
 
 def _ordered(values: Array, weights: Array) -> tuple[Array, Array]:
@@ -108,7 +108,8 @@ def _pick(ordered: tuple[Array, Array], share: float) -> float:
     return float(values[min(int(np.searchsorted(shares, share - 1e-12)), len(values) - 1)])
 
 
-def _quantile(values: Array, weights: Array, share: float) -> float:
+def weighted_quantile(values: Array, weights: Array, share: float) -> float:
+    """Return the least of (M,) values up to which a `share` of the weight lies; 0 without any."""
     return _pick(_ordered(values, weights), share) if len(values) else 0.0
 
 
@@ -238,8 +239,8 @@ def fly(view: OrbitCamera, right: float, up: float, forward: float) -> OrbitCame
 
 
 def walk(view: OrbitCamera, right: float, up: float, forward: float) -> OrbitCamera:
-    """As `fly`, but ahead is level; one who looks straight up or down goes where the image's top or foot
-    points."""
+    """Move as `fly` does, but ahead is level; who looks straight up or down goes where the image's top or
+    foot points."""
     ahead = view.rotation[2] - (view.rotation[2] @ view.up) * view.up
     if np.linalg.norm(ahead) < 1e-3:
         ahead = -view.rotation[1] if view.elevation < 0 else view.rotation[1]

@@ -100,7 +100,7 @@ class Flight:
 
 @dataclass(frozen=True, eq=False)
 class Turntable:
-    """Once around a vertical axis, at an even pace; ends where it began."""
+    """A motion once around a vertical axis, at an even pace; it ends where it began."""
 
     start: Pose
     centre: Array  # (3,) world units, on the axis
@@ -119,7 +119,7 @@ class Turntable:
 
 
 def turntable(view: OrbitCamera, seconds: float) -> Turntable:
-    """Around what `view` turns around, as a sideways drag does."""
+    """Return the turn around what `view` turns around, as a sideways drag does."""
     return Turntable(pose_of(view), view.target, view.up, seconds)
 
 
@@ -157,7 +157,7 @@ def frame_times(motion: Motion, fps: float) -> Array:
 
 
 def with_keyframe(keyframes: tuple[Keyframe, ...], added: Keyframe) -> tuple[Keyframe, ...]:
-    """In the order of time, `added` in place of one at the same time."""
+    """Return the keyframes in the order of time, with `added` in place of one at the same time."""
     others = [key for key in keyframes if abs(key.seconds - added.seconds) >= SAME_TIME]
     return tuple(sorted((*others, added), key=lambda key: key.seconds))
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.scene import Camera, look_at
-from langsplat_viewer.camera.controls import Extent, OrbitCamera, Sample, frame_of
+from langsplat_viewer.camera.controls import Extent, OrbitCamera, frame_of, weighted_quantile
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def frusta(cameras: Sequence[Camera], depth: float) -> Array:
 
 
 def box_edges(corners: Array) -> Array:
-    """(8, 3) corners, in the order of `query.boxes.OrientedBox` -> (12, 2, 3) edges."""
+    """(8, 3) corners, in the order of `query.instances.OrientedBox` -> (12, 2, 3) edges."""
     pairs = [(a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a & bit]
     edges: Array = corners[np.array(pairs)]
     return edges
@@ -159,7 +159,9 @@ def ground_grid(extent: Extent, up: Array, metres_per_unit: float | None) -> Gri
     frame = frame_of(up)
     spacing = round_length(2 * GRID_REACH * extent.radius / GRID_LINES * scale) / scale
     right, height, front = frame @ extent.centre
-    height = _lowest(extent.sample, up, height - extent.radius)
+    height -= extent.radius
+    if len(extent.sample.points):
+        height = weighted_quantile(extent.sample.points @ up, extent.sample.weights, GROUND_SHARE)
     reach = GRID_REACH * extent.radius
     across, ahead = (_multiples(middle - reach, middle + reach, spacing) for middle in (right, front))
 
@@ -175,15 +177,6 @@ def ground_grid(extent: Extent, up: Array, metres_per_unit: float | None) -> Gri
 
 def _multiples(low: float, high: float, spacing: float) -> Array:
     return spacing * np.arange(math.floor(low / spacing), math.ceil(high / spacing) + 1)
-
-
-def _lowest(sample: Sample, up: Array, otherwise: float) -> float:
-    if not len(sample.points):
-        return otherwise
-    heights = sample.points @ up
-    order = np.argsort(heights)
-    shares = np.cumsum(sample.weights[order])
-    return float(heights[order][np.searchsorted(shares, GROUND_SHARE * shares[-1])])
 
 
 # The view cube.

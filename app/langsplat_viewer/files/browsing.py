@@ -23,7 +23,7 @@ LEVEL_CHOICES: tuple[LevelChoice, ...] = get_args(LevelChoice)
 
 @dataclass(frozen=True)
 class SavedQuery:
-    """One line of the list."""
+    """A query of a set."""
 
     phrase: str
     cut: float | None = None  # relevancy, where it was set by hand
@@ -32,7 +32,7 @@ class SavedQuery:
 
 @dataclass(frozen=True)
 class QuerySet:
-    """The list, and how it was asked."""
+    """The content of a query set: its queries, and how they were asked."""
 
     queries: tuple[SavedQuery, ...]
     level: LevelChoice = "auto"
@@ -96,7 +96,7 @@ MOST_LISTED = 2000  # entries of a folder that are listed
 
 @dataclass(frozen=True)
 class Entry:
-    """One line of the list."""
+    """A file or folder as the browser lists it."""
 
     path: Path
     is_file: bool  # to be opened; else a folder to go into

@@ -144,8 +144,8 @@ class Shelf:
         return tuple(bookmark_from(entry, what) for entry in entries[:MOST_VIEWS])
 
     def write(self, scene: Path, bookmarks: tuple[Bookmark, ...]) -> None:
-        """Keep those of a scene beside those of others. InputError where the file that is there makes no
-        sense: it stays as it is. OSError where it cannot be written."""
+        """Keep the bookmarks of a scene beside those of others. InputError where the file that is there
+        makes no sense: it stays as it is. OSError where it cannot be written."""
         if self.folder is None:
             return
         scenes = self._all()

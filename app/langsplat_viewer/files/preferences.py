@@ -94,21 +94,21 @@ def _from_json(top: Any) -> Preferences:
 
 
 def save_preferences(folder: Path, preferences: Preferences) -> None:
-    """Keep them, whole or not at all. OSError where the folder cannot be written."""
+    """Write the preferences, whole or not at all. OSError where the folder cannot be written."""
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_path(folder / FILE_NAME) as temporary:
         temporary.write_text(json.dumps(asdict(preferences), indent=1), encoding="utf-8")
 
 
 def with_recent(preferences: Preferences, path: Path) -> Preferences:
-    """With `path` as the scene that was opened last."""
+    """Return the preferences with `path` as the scene that was opened last."""
     name = str(path)
     others = tuple(other for other in preferences.recent if other != name)
     return replace(preferences, recent=(name, *others)[:MOST_RECENT])
 
 
 def with_photographs(preferences: Preferences, scene: Path, folder: Path) -> Preferences:
-    """With `folder` as the one that has the photographs of `scene`."""
+    """Return the preferences with `folder` as the one that has the photographs of `scene`."""
     others = {path: kept for path, kept in preferences.photographs.items() if path != str(scene)}
     latest = list(others.items())[1 - MOST_FOLDERS :]
     return replace(preferences, photographs={**dict(latest), str(scene): str(folder)})

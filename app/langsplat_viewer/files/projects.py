@@ -78,7 +78,7 @@ class Group:
 
 @dataclass(frozen=True)
 class Things:
-    """What was made of the nodes of the scene's tree."""
+    """Names, groups and locks that a user gave to nodes of the scene's tree."""
 
     names: Mapping[int, str] = field(default_factory=dict)
     groups: tuple[Group, ...] = ()
@@ -203,7 +203,7 @@ def _things(entry: Any) -> Things:
 
 
 def known_things(things: Things, count: int) -> Things:
-    """Without what speaks of other nodes than the first `count`."""
+    """Return things without what speaks of other nodes than the first `count`."""
     groups = (replace(g, nodes=tuple(n for n in dict.fromkeys(g.nodes) if n < count)) for g in things.groups)
     return Things(
         {node: name for node, name in things.names.items() if node < count},
@@ -285,7 +285,7 @@ def _bits(text: Any, count: int) -> Array | None:
 
 
 def scene_of(project: Project) -> Path:
-    """Its scene. InputError where that is not there any more."""
+    """Return the path of a project's scene. InputError where no file is there any more."""
     if not project.scene.exists():
         raise InputError(f"{project.scene}: the project's scene is not there; move it back, or mend its path")
     return project.scene

@@ -62,7 +62,7 @@ class Watch:
             self.look()
 
     def look(self) -> None:
-        """One look. What still changes is not spoken of, nor a scene whose own file is gone."""
+        """Look once. What still changes is not spoken of, nor a scene whose own file is gone."""
         with self._lock:
             watched, last = self._read, self._last
         now = stamps(tuple(file for file, _ in watched))
@@ -77,7 +77,7 @@ class Watch:
             self.wake()
 
     def dismiss(self) -> None:
-        """Take the files as they are now for read."""
+        """Count the files as read in their present state."""
         with self._lock:
             self._read = self._last
             self.changed = False

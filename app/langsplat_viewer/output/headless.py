@@ -48,7 +48,7 @@ log = logging.getLogger("langsplat")
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """All that is done once, however many images are drawn."""
+    """Request, answers and lines that are made once, however many images are drawn."""
 
     request: RenderRequest
     results: tuple[QueryResult, ...]
@@ -127,8 +127,8 @@ def even(camera: Camera) -> Camera:
 
 
 def turn(prepared: Prepared, options: ViewerOptions) -> Motion:
-    """Once around what the camera sees in its middle, or around the place of the last answer, from as far
-    as it fills half of the image. InputError where nothing was found."""
+    """Return the turn around what the camera sees in its middle, or around the place of the last answer, from
+    where it fills half of the image. InputError where nothing was found."""
     extent = extent_of(prepared.request.scene.source)
     view = from_camera(prepared.request.camera, extent)
     if options.around == "answer":
@@ -205,7 +205,11 @@ def answers(
     if options.cut and len(options.cut) != len(phrases):
         raise InputError(f"--cut {options.cut[0]:g}: give each --query a cut, 0 for its own, or none any")
     if options.canonical:
-        _compare_with(engine, options.canonical, progress)
+        canonical = split_phrases(options.canonical)
+        if engine.scene.language is None or not canonical:
+            needed = "needs a phrase, and a scene with a language field"
+            raise InputError(f"--canonical {options.canonical}: {needed}")
+        engine.compare_with(canonical, progress)
     for phrase in phrases:  # before anything slow is done
         check_phrase(engine, phrase, camera, progress)
     results = tuple(run_phrase(engine, phrase, options.level, camera, progress).answer for phrase in phrases)
@@ -213,14 +217,6 @@ def answers(
         return results
     pairs = zip(results, options.cut, strict=True)
     return tuple(recut(result, cut) if cut > 0 else result for result, cut in pairs)
-
-
-def _compare_with(engine: QueryEngine, text: str, progress: Progress) -> None:
-    """Take other canonical phrases."""
-    phrases = split_phrases(text)
-    if engine.scene.language is None or not phrases:
-        raise InputError(f"--canonical {text}: needs a phrase, and a scene with a language field")
-    engine.compare_with(phrases, progress)
 
 
 def check_colours(colours: tuple[int, ...], count: int) -> None:

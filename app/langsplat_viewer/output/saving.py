@@ -35,7 +35,7 @@ def save_picture(viewer: Viewer, folder: Path) -> Path | None:
     returns its path, None if that failed."""
     state = viewer.state
     if viewer.surface is None or state.scene is None or state.view is None:
-        state.say("open a scene first, then save a picture of it", is_error=True)
+        viewer.say_error("open a scene first, then save a picture of it")
         return None
     path = free_name(folder, state.path.stem if state.path else "picture", ".png")
     transparent, beside = state.settings.transparent, viewer.beside
@@ -45,7 +45,7 @@ def save_picture(viewer: Viewer, folder: Path) -> Path | None:
             images.append(beside.surface.capture(beside.state.request(transparent=transparent)))
         save_png(path, state.settings.split.joined(images, images[0].shape[1]))
     except (OSError, LangSplatError) as error:
-        state.say(f"{path}: not saved ({one_line(error)})", is_error=True)
+        viewer.say_error(f"{path}: not saved ({one_line(error)})")
         return None
     state.say(f"saved {path}")
     return path
@@ -56,13 +56,13 @@ def save_view(viewer: Viewer, folder: Path) -> Path | None:
     if that failed."""
     state = viewer.state
     if state.view is None:
-        state.say("open a scene first, then save a view of it", is_error=True)
+        viewer.say_error("open a scene first, then save a view of it")
         return None
     path = free_name(folder, f"{state.path.stem if state.path else 'view'}-view", ".json")
     try:
         write_cameras(path, (with_projection(state.view, orthographic=False).camera(*state.size),))
     except OSError as error:
-        state.say(f"{path}: not saved ({one_line(error)})", is_error=True)
+        viewer.say_error(f"{path}: not saved ({one_line(error)})")
         return None
     span = f" --orthographic {state.view.span_in(*state.size):.6g}" if state.view.orthographic else ""
     state.say(f"saved {path}; show it again with --camera {path.name}{span}")

@@ -70,27 +70,27 @@ class Keyboard:
         return bool(self._events)
 
     def listen(self, window: Any) -> None:
-        """Stand in for imgui's own callbacks."""
+        """Take the place of imgui's own callbacks."""
         glfw.set_key_callback(window, self.pressed)
         glfw.set_char_callback(window, self.typed)
 
     def pressed(self, window: Any, key: int, scancode: int, action: int, mods: int) -> None:
-        """A key went down or up; GLFW's repeats are left to imgui."""
+        """Take a key that went down or up; GLFW's repeats are left to imgui."""
         if action not in (glfw.PRESS, glfw.RELEASE):
             return
         held = tuple(any(glfw.get_key(window, one) == glfw.PRESS for one in keys) for _, keys in HELD)
         self.add(Event(_as_printed(key, scancode), action == glfw.PRESS, held))
 
     def typed(self, window: Any, character: int) -> None:
-        """A character was typed."""
+        """Take a character that was typed."""
         self.add(Event(character=character))
 
     def add(self, event: Event) -> None:
-        """The latest event."""
+        """Append the latest event."""
         self._events.append(event)
 
     def feed(self) -> None:
-        """Before a frame begins: give imgui what belongs to it."""
+        """Give imgui the events that belong to the next frame; before it begins."""
         io = imgui.get_io()
         least, most = FOCUS_FRAMES
         if self._state.awaits_keyboard and self._waited < (least if io.want_text_input else most):

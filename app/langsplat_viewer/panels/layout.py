@@ -26,6 +26,7 @@ from langsplat_viewer.panels.style import (
     MAIN_DOCK,
     MOST_OVER,
     bad,
+    button_if,
     fitting,
     muted,
     scene_area,
@@ -38,7 +39,7 @@ from langsplat_viewer.viewer import Viewer
 
 
 def draw_menus(viewer: Viewer) -> None:
-    """Inside the menu bar."""
+    """Draw the menus inside the menu bar."""
     for menu in MENUS:
         if imgui.begin_menu(menu):
             first, *others = in_menu(menu)
@@ -91,7 +92,7 @@ GAP_EM = 0.6  # from the keys to the scrollbar
 
 
 def draw_palette(viewer: Viewer) -> None:
-    """A box and the commands that match; Enter does the first, Esc closes."""
+    """Draw the palette: a box and the commands that match; Enter does the first, Esc closes."""
     if not viewer.state.show_palette:
         return
     top = imgui.get_main_viewport().get_center()
@@ -162,14 +163,8 @@ FIRST_STEPS = (
 )  # fmt: skip
 
 
-def key_rows() -> tuple[tuple[str, str], ...]:
-    """(keys, what they do)."""
-    commands = ((", ".join(command.keys), command.does) for command in COMMANDS)
-    return (*HELD, *(row for row in commands if row[0]))
-
-
 def draw_help(viewer: Viewer) -> None:
-    """A small window that can be closed."""
+    """Draw the window with the first steps and the list of keys."""
     if not viewer.state.show_help:
         return
     flags = imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_collapse
@@ -183,7 +178,8 @@ def draw_help(viewer: Viewer) -> None:
     settings.show_help(viewer, bool(still_open))
     imgui.text_disabled(f"LangSplat viewer {__version__}; documentation: docs/README.md of its source")
     if imgui.begin_tab_bar("pages"):
-        for title, rows in (("First steps", FIRST_STEPS), ("Keys", key_rows())):
+        keys = [(", ".join(command.keys), command.does) for command in COMMANDS if command.keys]
+        for title, rows in (("First steps", FIRST_STEPS), ("Keys", (*HELD, *keys))):
             if imgui.begin_tab_item(title)[0]:
                 _table(rows)
                 imgui.end_tab_item()
@@ -223,7 +219,7 @@ def draw_messages(viewer: Viewer) -> None:
 
 
 def figures(viewer: Viewer) -> str:
-    """One line: backend, time and size of the last image, and how many Gaussians are selected."""
+    """Return backend, time and size of the last image, and the count of the selection, as one line."""
     stats, selected = viewer.state.stats, int(viewer.state.selection.marks.selected.sum())
     parts = [viewer.state.backend]
     if stats.width:
@@ -236,7 +232,7 @@ def figures(viewer: Viewer) -> str:
 
 
 def draw_timing(viewer: Viewer) -> None:
-    """Medians of the last images, memory, and a comparison."""
+    """Draw the panel "Timing": medians of the last images, memory, and a comparison."""
     viewpoint.measure_frame(viewer)
     rows = [(title, f"{milliseconds:.1f} ms") for title, milliseconds in viewer.state.timing.medians()]
     memory = memory_bytes()
@@ -257,10 +253,8 @@ def draw_timing(viewer: Viewer) -> None:
         if stoppable(*work, tag="comparison"):
             viewpoint.stop_comparing(viewer)
     else:
-        imgui.begin_disabled(viewer.state.scene is None)
-        if imgui.button("Compare with the reference"):
+        if button_if("Compare with the reference", viewer.state.scene is not None):
             viewpoint.compare_with_reference(viewer)
-        imgui.end_disabled()
         tip("Draws this view small in float64, in the background: about 15 s for 100,000 Gaussians")
     if viewer.state.timing.comparison is not None:
         small_wrapped(in_numbers(viewer.state.timing.comparison), muted())
@@ -389,7 +383,7 @@ class Hiding:
         self._hidden: list[str] = []
 
     def apply(self, viewer: Viewer) -> None:
-        """Once per frame: hide them or bring them back where that has changed, and note which are open."""
+        """Hide the panels or bring them back where that changed, and note which are open; once per frame."""
         docking, shown = hello_imgui.get_runner_params().docking_params, viewer.state.show_panel
         if not shown and not self._hidden:
             self._hidden = [window.label for window in docking.dockable_windows if window.is_visible]

@@ -21,7 +21,7 @@ class _Atlas:
         self._texture: moderngl.Texture | None = None
 
     def texture(self, view: LibraryView) -> moderngl.Texture | None:
-        """None for a list without scenes."""
+        """Return the texture of the list's thumbnails; None for a list without scenes."""
         if self._of is not view:
             if self._texture is not None:
                 self._texture.release()

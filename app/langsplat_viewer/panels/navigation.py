@@ -40,13 +40,9 @@ def chord(text: str) -> Chord:
     *held, name = text.split("+")
     if not name.isalnum():
         return Chord(character=name)
-    key = _key(name)
+    key = imgui.Key[f"_{name}" if name.isdigit() else NAMED.get(name, name.lower())]
     ctrl, shift, alt = (name in held for name in ("Ctrl", "Shift", "Alt"))
     return Chord(key, "", ctrl, shift, alt, is_plain=not ctrl and name not in WHILE_TYPING)
-
-
-def _key(name: str) -> imgui.Key:
-    return imgui.Key[f"_{name}" if name.isdigit() else NAMED.get(name, name.lower())]
 
 
 def handle_keys(viewer: Viewer) -> None:
@@ -84,7 +80,7 @@ WHEEL_STEP = 0.88  # factor of the distance per notch
 
 
 def handle(viewer: Viewer, area: Area) -> None:
-    """Once per frame, after the panels: they take what is theirs first."""
+    """Handle mouse and keys; once per frame, after the panels have taken what is theirs."""
     io = imgui.get_io()
     held = transform.holds_mouse(viewer)
     if not held:
@@ -121,8 +117,7 @@ def _mouse(viewer: Viewer, area: Area) -> None:
     if dx or dy:
         turn = math.pi / area.height  # a drag over the whole height is half a turn
         if _held(1) or (free and (_held(2) or (_held(0) and io.key_shift))):
-            size = (max(round(area.width), 1), max(round(area.height), 1))
-            viewpoint.move(viewer, lambda view: controls.pan(view, dx, dy, size))
+            viewpoint.move(viewer, lambda view: controls.pan(view, dx, dy, area.size))
         elif _held(turns) and io.key_ctrl:
             viewpoint.move(viewer, lambda view: controls.look(view, dx * turn, dy * turn))
         elif _held(turns):

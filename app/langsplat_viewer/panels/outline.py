@@ -9,7 +9,7 @@ from langsplat_core.query.describe import OR, Outline
 from langsplat_viewer.actions import outline
 from langsplat_viewer.actions.outline import Target
 from langsplat_viewer.files.projects import Group
-from langsplat_viewer.panels.overlays import QUIET, STILL
+from langsplat_viewer.panels.overlays import STILL, begin_legend
 from langsplat_viewer.panels.style import Area, elided, muted, small_wrapped, tip, width_of
 from langsplat_viewer.state import OutlineView
 from langsplat_viewer.viewer import Viewer
@@ -20,7 +20,7 @@ MENU = "menu of a thing"
 
 
 def draw(viewer: Viewer) -> None:
-    """A box that filters, groups, and the tree."""
+    """Draw the panel "Outline": a box that filters, groups, and the tree."""
     view = outline.wanted(viewer)
     if view is None or view.problem:
         small_wrapped(view.problem if view else "open a scene with a language field", muted())
@@ -66,12 +66,9 @@ def _row(viewer: Viewer, row: Outline, *, in_group: bool = False) -> None:
     flags |= imgui.TreeNodeFlags_.span_avail_width | imgui.TreeNodeFlags_.no_tree_push_on_open
     flags |= imgui.TreeNodeFlags_.leaf if not row.parts else 0
     colour = outline.colour_of(viewer, row.node)
-    name = outline.name_of(viewer, row)
-    sure = (
-        f" {100 * row.word.probability:.0f} %"
-        if row.word and row.node not in viewer.state.things.names
-        else ""
-    )
+    name, sure = outline.name_of(viewer, row), ""
+    if row.word and row.node not in viewer.state.things.names:
+        sure = f" {100 * row.word.probability:.0f} %"
     icons = (2 if colour is None else 3) * (side + spacing)
     room = imgui.get_content_region_avail().x - icons - imgui.get_tree_node_to_label_spacing()
     label = elided(name + sure, room, width_of)
@@ -90,9 +87,8 @@ def _row(viewer: Viewer, row: Outline, *, in_group: bool = False) -> None:
         _group_menu(viewer, row.node, in_group)
         imgui.end_popup()
     left = room - width_of(label) - 2 * spacing
-    said = next(
-        (text for text in (f"{row.count:,}   {_sides(row)}", f"{row.count:,}") if width_of(text) < left), ""
-    )
+    texts = (f"{row.count:,}   {_sides(row)}", f"{row.count:,}")
+    said = next((text for text in texts if width_of(text) < left), "")
     if said:
         imgui.same_line(right - icons - width_of(said))
         imgui.text_colored(muted(), said)
@@ -112,7 +108,7 @@ def _row(viewer: Viewer, row: Outline, *, in_group: bool = False) -> None:
 
 
 def _chosen(menu: str) -> bool:
-    """Whether the last row was clicked, or Enter or Space pressed on it; the menu key opens its menu."""
+    """Return whether the last row was clicked, or Enter or Space pressed on it; the menu key opens `menu`."""
     if imgui.is_item_focused():
         keys, shift = imgui.Key, imgui.get_io().key_shift
         if imgui.is_key_pressed(keys.menu) or (shift and imgui.is_key_pressed(keys.f10)):
@@ -195,7 +191,7 @@ class ThingsMenu:
         self._at: Any = None  # (3,) on the surface
 
     def draw(self, viewer: Viewer, area: Area) -> None:
-        """Once per frame, after the panels."""
+        """Draw the menu while it is open; once per frame, after the panels."""
         io = imgui.get_io()
         moved = imgui.get_mouse_drag_delta(1, 0.0)
         u, v = area.fraction(io.mouse_pos.x, io.mouse_pos.y)
@@ -236,7 +232,7 @@ def _named(label: str, hint: str, text: str) -> str:
 
 
 def draw_legend(viewer: Viewer, area: Area) -> None:
-    """Colours and names of the things that are largest in the image, where latents or the tree are shown."""
+    """Draw colours and names of the largest things in the image, where latents or the tree are shown."""
     state = viewer.state
     if state.picture.display not in ("latent", "tree") or state.settings.split.columns > 1:
         return
@@ -252,11 +248,7 @@ def draw_legend(viewer: Viewer, area: Area) -> None:
             break
     if not seen:
         return
-    margin = hello_imgui.em_size(0.7)
-    corner = ImVec2(area.left + area.width - margin, area.top + area.height - margin)
-    imgui.set_next_window_pos(corner, imgui.Cond_.always, ImVec2(1, 1))
-    imgui.set_next_window_bg_alpha(0.75)
-    imgui.begin("things in colours", None, QUIET)
+    begin_legend("things in colours", area)
     for name, colour in seen.items():
         _swatch(colour, imgui.get_text_line_height())
         imgui.same_line()

@@ -1,5 +1,6 @@
 """The images of the scene behind the panels, and the overlays on them."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -43,9 +44,8 @@ def draw_pictures(viewer: Viewer, area: Area, textures: tuple[moderngl.Texture, 
         _image(area, textures[1], split.at, 1.0)
         _divider(area, split.at)
     elif split.mode == "levels" and len(textures) > 1:
-        width = area.width / len(textures)
-        for place, texture in enumerate(textures):
-            _image(Area(area.left + place * width, area.top, width, area.height), texture, 0.0, 1.0)
+        for column, texture in zip(area.columns(len(textures)), textures, strict=True):
+            _image(column, texture, 0.0, 1.0)
         for place in range(1, len(textures)):
             _divider(area, place / len(textures))
     elif textures:
@@ -83,8 +83,8 @@ def _titles(viewer: Viewer, area: Area) -> None:
         text_on_shade(names[0], x - gap - imgui.calc_text_size(names[0]).x, top, area)
         text_on_shade(names[1], x + gap, top, area)
     elif split.mode == "levels":
-        for place, name in enumerate(names):
-            text_on_shade(name, area.left + place * area.width / len(names) + gap, top, area)
+        for column, name in zip(area.columns(len(names)), names, strict=True):
+            text_on_shade(name, column.left + gap, top, area)
 
 
 def shade_edge() -> float:
@@ -93,9 +93,9 @@ def shade_edge() -> float:
 
 
 def text_on_shade(text: str, x: float, y: float, area: Area) -> None:
-    """On a shade, nowhere outside the area."""
+    """Write text on a shade, nowhere outside the area."""
     paint, size, edge = imgui.get_background_draw_list(), imgui.calc_text_size(text), shade_edge()
-    paint.push_clip_rect(ImVec2(area.left, area.top), ImVec2(area.left + area.width, area.top + area.height))
+    paint.push_clip_rect(*area.corners)
     paint.add_rect_filled(
         ImVec2(x - edge, y - edge), ImVec2(x + size.x + edge, y + size.y + edge), SHADE, 3.0
     )
@@ -127,13 +127,9 @@ def draw_grip(viewer: Viewer, area: Area) -> None:
 
 
 def _knob(x: float, area: Area) -> None:
-    middle, paint = ImVec2(x, area.top + area.height / 2), _foreground()
+    middle, paint = ImVec2(x, area.top + area.height / 2), imgui.get_foreground_draw_list()
     paint.add_circle_filled(middle, 0.5 * GRIP, WHITE)
     paint.add_circle(middle, 0.5 * GRIP, SHADE, 0, 2.0)
-
-
-def _foreground() -> Any:
-    return imgui.get_foreground_draw_list()
 
 
 # The photograph of a training camera.
@@ -142,8 +138,7 @@ def _foreground() -> Any:
 class _Uploaded:
     """Holds an image as a texture."""
 
-    def __init__(self, ctx: moderngl.Context) -> None:
-        self._ctx = ctx
+    def __init__(self) -> None:
         self._image: Array | None = None  # what the texture has
         self._texture: moderngl.Texture | None = None
 
@@ -152,7 +147,7 @@ class _Uploaded:
             if self._texture is not None:
                 self._texture.release()
             height, width = image.shape[:2]
-            texture = self._ctx.texture((width, height), 3, image.tobytes(), alignment=1)
+            texture = moderngl.get_context().texture((width, height), 3, image.tobytes(), alignment=1)
             texture.build_mipmaps()
             texture.filter = moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR
             texture.repeat_x = texture.repeat_y = False
@@ -188,23 +183,18 @@ class PhotographOverlay(_Uploaded):
     """The photograph of the camera at which one stands, over the image."""
 
     def draw(self, viewer: Viewer, area: Area) -> None:
-        """Over every image in the area, where one stands at its camera."""
+        """Draw the photograph over every image in the area, where one stands at its camera."""
         state = viewer.state
         photograph = opening.photograph_here(state)
         if state.settings.fade == 0 or photograph is None or photograph.image is None or state.view is None:
             return
-        texture = self._upload(photograph.image)
-        count = state.settings.split.columns
-        width, paint = area.width / count, imgui.get_background_draw_list()
-        shown = state.view.camera(max(round(width), 1), max(round(area.height), 1))
-        left, top, right, bottom = corners(photograph.camera, shown)
+        reference = imgui.ImTextureRef(self._upload(photograph.image).glo)
+        paint = imgui.get_background_draw_list()
         tint = imgui.get_color_u32((1.0, 1.0, 1.0, state.settings.fade))
-        for column in range(count):
-            x = area.left + column * width
-            end = ImVec2(x + width, area.top + area.height)
-            paint.push_clip_rect(ImVec2(x, area.top), end, True)
-            low, high = ImVec2(x + left, area.top + top), ImVec2(x + right, area.top + bottom)
-            reference = imgui.ImTextureRef(texture.glo)
+        for part in area.columns(state.settings.split.columns):
+            left, top, right, bottom = corners(photograph.camera, state.view.camera(*part.size))
+            low, high = ImVec2(part.left + left, part.top + top), ImVec2(part.left + right, part.top + bottom)
+            paint.push_clip_rect(*part.corners, True)
             paint.add_image(reference, low, high, ImVec2(0, 0), ImVec2(1, 1), tint)
             paint.pop_clip_rect()
 
@@ -228,18 +218,14 @@ class Named:
 
 
 def draw_lines(viewer: Viewer, area: Area) -> None:
-    """Over every image in the area, after they are drawn."""
+    """Draw grid, cameras, boxes, ruler and notes over every image in the area, after they are drawn."""
     state = viewer.state
     if state.scene is None or state.view is None or state.extent is None:
         return
-    count = state.settings.split.columns
-    width = area.width / count
     paint = imgui.get_background_draw_list()
-    for column in range(count):
-        part = Area(area.left + column * width, area.top, width, area.height)
-        camera = state.view.camera(max(round(part.width), 1), max(round(part.height), 1))
-        low = ImVec2(part.left, part.top)
-        paint.push_clip_rect(low, ImVec2(part.left + part.width, part.top + part.height), True)
+    for column, part in enumerate(area.columns(state.settings.split.columns)):
+        camera = state.view.camera(*part.size)
+        paint.push_clip_rect(*part.corners, True)
         if "grid" in state.preferences.overlays:
             _grid(viewer, part, camera, is_named=column == 0)
         if "cameras" in state.preferences.overlays:
@@ -250,16 +236,12 @@ def draw_lines(viewer: Viewer, area: Area) -> None:
         _notes(viewer, part, camera)
         paint.pop_clip_rect()
     _orthographic(viewer, area)
-    if state.ruler.measures and not imgui.get_io().want_capture_mouse:
-        imgui.set_mouse_cursor(imgui.MouseCursor_.resize_all)
+    if (state.ruler.measures or state.pins_notes) and not imgui.get_io().want_capture_mouse:
+        cursors, measures = imgui.MouseCursor_, state.ruler.measures
+        imgui.set_mouse_cursor(cursors.resize_all if measures else cursors.hand)
         if clicked(area):
-            mouse = imgui.get_io().mouse_pos
-            settings.measure_at(viewer, *area.fraction(mouse.x, mouse.y))
-    elif state.pins_notes and not imgui.get_io().want_capture_mouse:
-        imgui.set_mouse_cursor(imgui.MouseCursor_.hand)
-        if clicked(area):
-            mouse = imgui.get_io().mouse_pos
-            projects.pin_at(viewer, *area.fraction(mouse.x, mouse.y))
+            mouse, act = imgui.get_io().mouse_pos, settings.measure_at if measures else projects.pin_at
+            act(viewer, *area.fraction(mouse.x, mouse.y))
 
 
 def _orthographic(viewer: Viewer, area: Area) -> None:
@@ -362,7 +344,7 @@ def _names(named: list[Named], area: Area) -> None:
 
 
 def _grid(viewer: Viewer, area: Area, camera: Camera, is_named: bool) -> None:
-    """On the ground, with the distance of its lines from the world's origin; named in the corner, or not."""
+    """Draw the grid on the ground, each line with its distance from the world's origin; name its spacing."""
     state = viewer.state
     assert state.scene is not None
     assert state.extent is not None
@@ -440,7 +422,7 @@ QUIET = (
 
 
 def draw_legends(viewer: Viewer, area: Area) -> None:
-    """That of the scene, and of the one beside it, each on its side of the line."""
+    """Draw the legend of the scene, and of the one beside it, each on its side of the line."""
     if viewer.beside is None:
         draw_legend(viewer, area)
         return
@@ -450,18 +432,13 @@ def draw_legends(viewer: Viewer, area: Area) -> None:
 
 
 def draw_legend(viewer: Viewer, area: Area, name: str = "relevancy") -> None:
-    """A colour bar with numbers for every query that is painted."""
+    """Draw a colour bar with numbers for every query that is painted."""
     state = viewer.state
     shown = state.shown_results()
     slots = painted(shown)
     if state.scene is None or not slots or not any(pane.row.legend for pane in state.panes()):
         return
-    corner = ImVec2(
-        area.left + area.width - hello_imgui.em_size(0.7), area.top + area.height - hello_imgui.em_size(0.7)
-    )
-    imgui.set_next_window_pos(corner, imgui.Cond_.always, ImVec2(1, 1))
-    imgui.set_next_window_bg_alpha(0.75)
-    imgui.begin(name, None, QUIET)
+    begin_legend(name, area)
     for slot in slots:
         result = shown[slot]
         if result is not None:
@@ -471,14 +448,24 @@ def draw_legend(viewer: Viewer, area: Area, name: str = "relevancy") -> None:
     imgui.end()
 
 
-def say(text: str, area: Area) -> None:
-    """A line in the middle of the scene's area."""
-    centre = ImVec2(area.left + area.width / 2, area.top + area.height / 2)
-    imgui.set_next_window_pos(centre, imgui.Cond_.always, ImVec2(0.5, 0.5))
-    imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(0.9 * area.width, area.height))
+def begin_legend(name: str, area: Area) -> None:
+    """Begin a window in the lower right corner of the scene's area."""
+    margin = hello_imgui.em_size(0.7)
+    corner = ImVec2(area.left + area.width - margin, area.top + area.height - margin)
+    imgui.set_next_window_pos(corner, imgui.Cond_.always, ImVec2(1, 1))
     imgui.set_next_window_bg_alpha(0.75)
-    imgui.begin("said over the scene", None, QUIET)
-    imgui.push_text_wrap_pos(0.85 * area.width)
+    imgui.begin(name, None, QUIET)
+
+
+def say(text: str, area: Area, name: str = "said over the scene", top: float | None = None) -> None:
+    """Write a line over the scene, in the middle of its area or `top` window units below its upper edge."""
+    x, y = area.left + area.width / 2, area.top + (area.height / 2 if top is None else top)
+    imgui.set_next_window_pos(ImVec2(x, y), imgui.Cond_.always, ImVec2(0.5, 0.5 if top is None else 0))
+    widest = 0.9 if top is None else 0.95  # of the area's width
+    imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(widest * area.width, area.height))
+    imgui.set_next_window_bg_alpha(0.75)
+    imgui.begin(name, None, QUIET)
+    imgui.push_text_wrap_pos((widest - 0.05) * area.width)
     imgui.text_unformatted(text)
     imgui.pop_text_wrap_pos()
     imgui.end()
@@ -509,15 +496,11 @@ def _bar(phrase: str, colours: Array, ends: tuple[float, float]) -> None:
 
 
 def draw_bar(start: Any, width: float, height: float, colours: Array) -> None:
-    """(STEPS, 3) colours from left to right, with the upper left corner at `start`."""
+    """Draw (STEPS, 3) colours from left to right, with the upper left corner at `start`."""
     paint = imgui.get_window_draw_list()
     for step, colour in enumerate(colours):
         left, right = (round(start.x + width * edge / STEPS) for edge in (step, step + 1))  # no seams
-        paint.add_rect_filled(ImVec2(left, start.y), ImVec2(right, start.y + height), _opaque(colour))
-
-
-def _opaque(colour: Array) -> Any:
-    return imgui.get_color_u32((float(colour[0]), float(colour[1]), float(colour[2]), 1.0))
+        paint.add_rect_filled(ImVec2(left, start.y), ImVec2(right, start.y + height), _faded(colour, 1.0))
 
 
 # The tooltip: what lies under the cursor.
@@ -526,7 +509,7 @@ UNSURE = 0.02  # a word less probable than this is not said
 
 
 def draw_pointing(viewer: Viewer) -> None:
-    """A tooltip, where something was found under the mouse."""
+    """Draw the tooltip, where something was found under the mouse."""
     hover = viewer.state.hover
     if hover is None or hover.found is None or not imgui.begin_tooltip():
         return
@@ -552,7 +535,7 @@ def said(words: Words, sure: bool) -> str:
 
 
 def pointed_figures(hover: Hover) -> list[str]:
-    """Relevancies of what is shown, and the place."""
+    """Return the relevancies of what is shown and the place, a line each."""
     assert hover.found is not None
     lines = [
         f"{phrase}: {value:.2f}" for phrase, value in zip(hover.phrases, hover.found.relevancy, strict=True)
@@ -572,7 +555,7 @@ INK = (0.08, 0.08, 0.10)
 
 
 def draw_cube(viewer: Viewer, area: Area) -> None:
-    """Over everything in the image."""
+    """Draw the view cube over the image's corner; a click on a face turns the view there."""
     view = viewer.state.view
     if view is None or "cube" not in viewer.state.preferences.overlays:
         return
@@ -624,5 +607,6 @@ def _on_cube(place: Array, middle: tuple[float, float], scale: float) -> ImVec2:
     return ImVec2(middle[0] + scale * float(place[0]), middle[1] + scale * float(place[1]))
 
 
-def _faded(colour: tuple[float, float, float], alpha: float) -> int:
-    return int(imgui.get_color_u32((*colour, alpha)))
+def _faded(colour: Iterable[float], alpha: float) -> int:
+    red, green, blue = map(float, colour)
+    return int(imgui.get_color_u32((red, green, blue, alpha)))

@@ -10,9 +10,11 @@ from langsplat_viewer.commands import with_key
 from langsplat_viewer.panels.style import (
     beside,
     beside_boxed,
+    box_with_button,
     elided,
     leave_room,
     muted,
+    next_button,
     small_wrapped,
     stoppable,
     tip,
@@ -26,7 +28,7 @@ NUMBER_EM, FPS_EM = 7.5, 4.5
 
 
 def draw(viewer: Viewer) -> None:
-    """From top to bottom: what the path is, playing it, saving it, films."""
+    """Draw the panel "Record": what the path is, playing it, saving it, films."""
     record = viewer.state.record
     if imgui.radio_button("Keyframes", not record.turns):
         filming.set_turning(viewer, False)
@@ -85,11 +87,8 @@ def _keyframes(viewer: Viewer) -> None:
     if imgui.button("Add keyframe"):
         filming.add_keyframe(viewer)
     tip(with_key("The current view", filming.add_keyframe))
-    beside("Clear")
-    imgui.begin_disabled(not record.keyframes)
-    if imgui.button("Clear"):
+    if next_button("Clear", bool(record.keyframes)):
         filming.clear_path(viewer)
-    imgui.end_disabled()
     beside("Duration", hello_imgui.em_size(NUMBER_EM))
     _duration(viewer)
     height = ROWS * imgui.get_frame_height_with_spacing()
@@ -126,8 +125,7 @@ def _chosen(viewer: Viewer, key: Keyframe | None) -> None:
     seconds = _number("##time of the keyframe", 0.0 if key is None else key.seconds, 0.5)
     if seconds is not None and key is not None:
         filming.move_keyframe(viewer, key, seconds)
-    beside("Set to this view")
-    if imgui.button("Set to this view") and key is not None:
+    if next_button("Set to this view") and key is not None:
         filming.replace_keyframe(viewer, key)
     tip("Put the current view in its place")
 
@@ -137,11 +135,9 @@ def _file(viewer: Viewer) -> None:
     hint = "file.path.json"
     _, typed = imgui.input_text_with_hint("##path file", hint, viewer.state.record.path_typed)
     filming.type_path_file(viewer, typed)
-    beside("Save path")
-    if imgui.button("Save path"):
+    if next_button("Save path"):
         filming.save_path(viewer, Path.cwd())
-    beside("Load")
-    if imgui.button("Load"):
+    if next_button("Load"):
         filming.load_typed_path(viewer, Path.cwd())
 
 
@@ -170,12 +166,10 @@ def _film(viewer: Viewer) -> None:
         return
     if imgui.button("Save film"):
         filming.save_film(viewer, Path.cwd())
-    beside("Save picture")
-    if imgui.button("Save picture##sized"):
+    if next_button("Save picture##sized"):
         filming.save_sized_picture(viewer, Path.cwd())
     tip("What is shown now, in this size")
-    beside("Copy as command")
-    if imgui.button("Copy as command"):
+    if next_button("Copy as command"):
         filming.copy_command(viewer, Path.cwd())
     tip("The command that draws this picture without a window")
 
@@ -184,16 +178,13 @@ def _film(viewer: Viewer) -> None:
 
 
 def draw_bookmarks(viewer: Viewer) -> None:
-    """A box for a name, and the list."""
+    """Draw the panel "Bookmarks": a box for a name, and the list."""
     state = viewer.state
     imgui.begin_disabled(state.view is None)
-    button = imgui.calc_text_size("Keep").x + 2 * imgui.get_style().frame_padding.x
-    imgui.set_next_item_width(-button - imgui.get_style().item_spacing.x)
-    flags, hint = imgui.InputTextFlags_.enter_returns_true, "name of this view"
-    entered, typed = imgui.input_text_with_hint("##bookmark", hint, state.bookmark_typed, flags)
+    hint = "name of this view"
+    entered, typed = box_with_button("##bookmark", hint, state.bookmark_typed, "Keep")
     viewpoint.type_bookmark(viewer, typed)
-    imgui.same_line()
-    if imgui.button("Keep") or entered:
+    if entered:
         viewpoint.add_bookmark(viewer, state.bookmark_typed)
     imgui.end_disabled()
     if imgui.begin_child("bookmarks"):

@@ -16,22 +16,22 @@ from langsplat_viewer.output import saving
 from langsplat_viewer.panels.style import (
     Area,
     bad,
-    beside,
     beside_boxed,
+    box_with_button,
+    button_width,
     elided,
     fitting,
     muted,
+    next_button,
     small_wrapped,
     tip,
     width_of,
 )
 from langsplat_viewer.viewer import Training, Viewer
 
-DIALOG_PROGRAMS = ("zenity", "kdialog", "matedialog", "qarma")  # one of them draws the dialog on Linux
-
 
 def draw(viewer: Viewer) -> None:
-    """Name and figures of the scene, then the buttons."""
+    """Draw the panel "Scene": name and figures of the scene, then the buttons."""
     state = viewer.state
     if state.scene is None:
         imgui.text("Opening ..." if state.opening else "No scene is open")
@@ -43,14 +43,11 @@ def draw(viewer: Viewer) -> None:
             tip(doubt)
     if imgui.button("Open ..."):
         opening.ask_for_file(viewer)
-    beside("Save picture")
-    if imgui.button("Save picture"):
+    if next_button("Save picture"):
         saving.save_picture(viewer, Path.cwd())
-    beside("Save view")
-    if imgui.button("Save view"):
+    if next_button("Save view"):
         saving.save_view(viewer, Path.cwd())
-    beside("Help")
-    if imgui.button("Help"):
+    if next_button("Help"):
         settings.toggle_help(viewer)
     if len(state.scenes) > 1:
         _list(viewer)
@@ -105,13 +102,10 @@ UNITS = ("bytes", "kB", "MB", "GB", "TB")
 
 
 def draw_browser(viewer: Viewer) -> None:
-    """A box for a path, the folders above, what is in this one, and what was open before."""
+    """Draw the browser: a box for a path, the folders above, what is in this one, and recent scenes."""
     listing = viewer.state.browser
     title = BESIDE if viewer.state.picks_beside else TITLES[viewer.state.picks_folder]
-    if listing is not None and not imgui.is_popup_open(title):
-        imgui.open_popup(title)
-    centre = imgui.get_main_viewport().get_center()
-    imgui.set_next_window_pos(centre, imgui.Cond_.appearing, ImVec2(0.5, 0.5))
+    _ask_for_popup(title, listing is not None)
     imgui.set_next_window_size(fitting(WIDTH_EM, HEIGHT_EM), imgui.Cond_.appearing)
     shown, stays = imgui.begin_popup_modal(title, True, imgui.WindowFlags_.no_saved_settings)
     if not shown:
@@ -128,6 +122,14 @@ def draw_browser(viewer: Viewer) -> None:
     imgui.end_popup()
 
 
+def _ask_for_popup(title: str, is_wanted: bool) -> None:
+    """Have the popup `title` opened in the middle of the window, if it `is_wanted` and not open."""
+    if is_wanted and not imgui.is_popup_open(title):
+        imgui.open_popup(title)
+    centre = imgui.get_main_viewport().get_center()
+    imgui.set_next_window_pos(centre, imgui.Cond_.appearing, ImVec2(0.5, 0.5))
+
+
 def _foot(viewer: Viewer, listing: Listing) -> None:
     if viewer.state.picks_folder:
         if imgui.button("Take this folder"):
@@ -142,17 +144,13 @@ def has_several(listing: Listing) -> bool:
 
 
 def _path_box(viewer: Viewer) -> None:
-    button = imgui.calc_text_size("Open").x + 2 * imgui.get_style().frame_padding.x
-    imgui.set_next_item_width(-button - imgui.get_style().item_spacing.x)
     if imgui.is_window_appearing():
         imgui.set_keyboard_focus_here()
-    flags = imgui.InputTextFlags_.enter_returns_true
     picks = viewer.state.picks_folder
     hint = "path of a folder" if picks else "path of a scene or folder, or drop files onto the window"
-    entered, typed = imgui.input_text_with_hint("##path", hint, viewer.state.path_typed, flags)
+    entered, typed = box_with_button("##path", hint, viewer.state.path_typed, "Open")
     opening.type_path(viewer, typed)
-    imgui.same_line()
-    if imgui.button("Open") or entered:
+    if entered:
         opening.open_typed(viewer)
 
 
@@ -161,9 +159,7 @@ def _above(viewer: Viewer, folder: Path) -> None:
     for number, parent in enumerate((*reversed(folder.parents), folder)):
         if number:
             imgui.same_line(0, 2)
-            name = parent.name or str(parent)
-            width = imgui.calc_text_size(name).x + 2 * imgui.get_style().frame_padding.x
-            if imgui.get_content_region_avail().x < width:
+            if imgui.get_content_region_avail().x < button_width(parent.name):
                 imgui.new_line()
         if imgui.small_button(f"{parent.name or parent}##above {number}"):
             opening.browse(viewer, parent)
@@ -253,12 +249,9 @@ UNSAVED = "Not saved"
 
 
 def draw_unsaved(viewer: Viewer) -> None:
-    """Save, discard, cancel; over everything else, while something waits for the answer."""
+    """Ask whether to save, discard or stay; over everything else, while something waits for the answer."""
     leaving = viewer.state.selection.leaving
-    if leaving is not None and not imgui.is_popup_open(UNSAVED):
-        imgui.open_popup(UNSAVED)
-    centre = imgui.get_main_viewport().get_center()
-    imgui.set_next_window_pos(centre, imgui.Cond_.appearing, ImVec2(0.5, 0.5))
+    _ask_for_popup(UNSAVED, leaving is not None)
     flags = imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_saved_settings
     if not imgui.begin_popup_modal(UNSAVED, None, flags)[0]:
         return
@@ -322,7 +315,7 @@ MEANS = {
 
 
 def draw_training(viewer: Viewer) -> None:
-    """The form, or what a running training says."""
+    """Draw the panel "Train": the form, or what a running training says."""
     process = viewer.training
     if process is None:
         _form(viewer)
@@ -384,8 +377,7 @@ def _running(viewer: Viewer, process: Training) -> None:
     imgui.progress_bar(progress.overall, ImVec2(-1, 0), progress.left or "starting")
     if imgui.button("Stop"):
         training.stop_training(viewer)
-    beside("Look at it so far")
-    if imgui.button("Look at it so far"):
+    if next_button("Look at it so far"):
         training.look_at_training(viewer)
     for line in progress.said[-3:]:
         small_wrapped(line, muted())

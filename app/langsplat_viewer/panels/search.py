@@ -15,7 +15,19 @@ from langsplat_core.query.engine import no_field
 from langsplat_core.scene import CANONICAL_PHRASES, LEVELS
 from langsplat_viewer.actions import queries, settings, viewpoint
 from langsplat_viewer.panels.overlays import bar_colours, draw_bar
-from langsplat_viewer.panels.style import bad, beside_boxed, elided, good, muted, small_wrapped, tip, width_of
+from langsplat_viewer.panels.style import (
+    bad,
+    beside_boxed,
+    beside_button,
+    button_if,
+    button_width,
+    elided,
+    good,
+    muted,
+    small_wrapped,
+    tip,
+    width_of,
+)
 from langsplat_viewer.state import Query
 from langsplat_viewer.viewer import Viewer
 
@@ -27,8 +39,7 @@ OFFER_LINES = 2  # more are scrolled to
 def _box(viewer: Viewer) -> None:
     """Draw the search box, its button and the suggestions."""
     queries.prepare_suggestions(viewer)
-    button = imgui.calc_text_size("Search").x + 2 * imgui.get_style().frame_padding.x
-    imgui.set_next_item_width(-button - imgui.get_style().item_spacing.x)
+    imgui.set_next_item_width(beside_button("Search"))
     if queries.take_search_focus(viewer):
         imgui.set_keyboard_focus_here()
     flags = imgui.InputTextFlags_.enter_returns_true | imgui.InputTextFlags_.callback_history
@@ -48,8 +59,7 @@ def _box(viewer: Viewer) -> None:
     entered, typed = imgui.input_text_with_hint("##phrase", hint(viewer), typed, flags, recalled)
     queries.type_phrase(viewer, typed)
     imgui.same_line()
-    clicked = imgui.button("Search")
-    if entered or clicked:
+    if imgui.button("Search") or entered:
         queries.ask_typed(viewer)
     _offers(viewer)
 
@@ -73,12 +83,11 @@ def _offers(viewer: Viewer) -> None:
 
 def _offer_buttons(viewer: Viewer, title: str, phrases: tuple[str, ...]) -> None:
     imgui.text_colored(muted(), title)
-    margins = 2 * imgui.get_style().frame_padding.x
     for number, phrase in enumerate(phrases):
         imgui.same_line()
-        if imgui.get_content_region_avail().x < width_of(phrase) + margins:
+        if imgui.get_content_region_avail().x < button_width(phrase):
             imgui.new_line()
-        shown = elided(phrase, imgui.get_content_region_avail().x - margins, width_of)
+        shown = elided(phrase, imgui.get_content_region_avail().x - button_width(""), width_of)
         if imgui.small_button(f"{shown}###offer {number}"):
             queries.ask_offered(viewer, phrase)
         if shown != phrase:
@@ -103,8 +112,7 @@ def _cut(viewer: Viewer, query: Query, result: QueryResult) -> None:
     colour = imgui.get_color_u32(imgui.Col_.text)
     imgui.get_window_draw_list().add_line(ImVec2(x, corner.y), ImVec2(x, corner.y + size.y), colour, 2.0)
     own = result.own_cut is not None
-    button = imgui.calc_text_size("Auto").x + 2 * imgui.get_style().frame_padding.x
-    imgui.set_next_item_width(-(button + imgui.get_style().item_spacing.x) if own else -1)
+    imgui.set_next_item_width(beside_button("Auto") if own else -1)
     changed, value = imgui.slider_float("##cut", result.cut, low, high, "ends at %.3f")
     tip("What is less relevant than this is no part of the answer; one set by hand stays, whatever the level")
     if changed:
@@ -210,22 +218,14 @@ def _verdict(query: Query) -> None:
             imgui.set_tooltip(f"{100 * probability:.0f} % likely to be there")
 
 
-def _enabled(label: str, is_enabled: bool) -> bool:
-    """Draw a button; True where it is clicked."""
-    imgui.begin_disabled(not is_enabled)
-    clicked = imgui.button(label)
-    imgui.end_disabled()
-    return clicked
-
-
 def _details(viewer: Viewer, query: Query) -> None:
     """Place and a button to go there, scores per level, how it was read or why it was not answered."""
     result = query.result
     place = None if result is None or result.verdict == "not here" else result.place
-    if _enabled("Focus", place is not None):
+    if button_if("Focus", place is not None):
         viewpoint.focus_result(viewer, query)
     imgui.same_line()
-    if _enabled("Why?", result is not None):
+    if button_if("Why?", result is not None):
         queries.explain(viewer, query)
     tip("The photographs and masks that the answer stands on, the best and the worst")
     imgui.same_line()
@@ -253,7 +253,7 @@ def _details(viewer: Viewer, query: Query) -> None:
 def _combine(viewer: Viewer, query: Query) -> None:
     """A menu of the other queries, to search for what both, either or only this one finds."""
     others = [other for other in viewer.state.queries if other is not query]
-    if _enabled("Combine", bool(others)):
+    if button_if("Combine", bool(others)):
         imgui.open_popup("combine")
     tip("Search for this and, or, without another query of the list")
     if not imgui.begin_popup("combine"):

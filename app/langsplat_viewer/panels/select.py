@@ -11,14 +11,17 @@ from langsplat_viewer import marks
 from langsplat_viewer.actions import queries, selecting
 from langsplat_viewer.commands import with_key
 from langsplat_viewer.marks import BRUSHES, MODES, REACHES, TOOLS, Marks, Mode, Tool
-from langsplat_viewer.panels.overlays import QUIET
+from langsplat_viewer.panels.overlays import say
 from langsplat_viewer.panels.style import (
     Area,
     beside,
     beside_boxed,
+    box_with_button,
+    button_if,
     elided,
     leave_room,
     muted,
+    next_button,
     small_wrapped,
     tip,
     width_of,
@@ -39,23 +42,12 @@ FATES: tuple[Verb, ...] = (
     ("Hide", selecting.hide_selected, "Out of the picture"),
     ("Isolate", selecting.isolate_selected, "Everything else out of the picture"),
     ("Show all", selecting.show_hidden, "Everything that was hidden"),
-    (
-        "Delete",
-        selecting.delete_selected,
-        "Out of the scene; its file stays as it is",
-    ),
+    ("Delete", selecting.delete_selected, "Out of the scene; its file stays as it is"),
 )
 OF_SELECTED = {
-    "None",
-    "Grow",
-    "Shrink",
-    "More like it",
-    "Hide",
-    "Isolate",
-    "Delete",
-    "Selection",
-    "Rest",
-    "Points",
+    *("None", "Grow", "Shrink", "More like it"),
+    *("Hide", "Isolate", "Delete"),
+    *("Selection", "Rest", "Points"),
 }
 FILES: tuple[Verb, ...] = (
     ("Selection", lambda viewer: selecting.export(viewer, Path.cwd(), "selection"), "A PLY with its field"),
@@ -74,7 +66,7 @@ FILES: tuple[Verb, ...] = (
 
 
 def draw(viewer: Viewer) -> None:
-    """Counts, tools, the search, verbs, files."""
+    """Draw the panel "Select": counts, tools, the search, verbs, files."""
     imgui.begin_disabled(viewer.state.scene is None)
     small_wrapped(counts(viewer.state.selection.marks), muted())
     _tools(viewer)
@@ -135,27 +127,22 @@ def _found(viewer: Viewer) -> None:
     if query.result.verdict == "not here" or len(query.things) < 2:
         return
     for number, thing in enumerate(query.things, 1):
-        beside(str(number))
-        if imgui.button(f"{number}##thing"):
+        if next_button(f"{number}##thing"):
             selecting.select_thing(viewer, thing)
         tip(f"{thing.count:,} Gaussians, {100 * thing.share:.0f} % of the answer, score {thing.score:.2f}")
 
 
 def _name(viewer: Viewer) -> None:
     """Draw the box for a name by which what is selected is found from now on."""
-    button = imgui.calc_text_size("Name it").x + 2 * imgui.get_style().frame_padding.x
-    imgui.set_next_item_width(-button - imgui.get_style().item_spacing.x)
-    hint = "a name for what is selected"
-    entered, typed = imgui.input_text_with_hint("##name", hint, viewer.state.selection.name, _ENTERED)
+    hint, name = "a name for what is selected", viewer.state.selection.name
+    entered, typed = box_with_button("##name", hint, name, "Name it")
     queries.type_name(viewer, typed)
-    imgui.same_line()
-    if imgui.button("Name it") or entered:
+    if entered:
         queries.name_selection(viewer)
     tip("Searching for the name finds this, and what is like it")
 
 
 HISTOGRAM_EM = 3.0
-_ENTERED = imgui.InputTextFlags_.enter_returns_true
 
 
 def _values(viewer: Viewer) -> None:
@@ -191,7 +178,8 @@ def _values(viewer: Viewer) -> None:
     start, stop = sorted(brushed) if brushed else (0.0, 1.0)
     imgui.set_next_item_width(-1)
     hint = f"{_value(viewer, found, start)} to {_value(viewer, found, stop)}"
-    entered, typed = imgui.input_text_with_hint("##range", hint, "", _ENTERED)
+    flags = imgui.InputTextFlags_.enter_returns_true
+    entered, typed = imgui.input_text_with_hint("##range", hint, "", flags)
     if entered:
         selecting.select_range(viewer, typed)
     tip("Drag over the histogram, or type two numbers; Shift adds, Ctrl removes, both intersect")
@@ -207,10 +195,8 @@ def _buttons(viewer: Viewer, verbs: Sequence[Verb]) -> None:
     for place, (name, act, what) in enumerate(verbs):
         if place:
             beside(name)
-        imgui.begin_disabled(nothing and name in OF_SELECTED)
-        if imgui.button(f"{name}##verb"):
+        if button_if(f"{name}##verb", not (nothing and name in OF_SELECTED)):
             act(viewer)
-        imgui.end_disabled()
         tip(with_key(what, act))
 
 
@@ -237,7 +223,7 @@ PAINT = (float(TINT[0]), float(TINT[1]), float(TINT[2]), 0.35)
 
 
 def handle_stroke(viewer: Viewer, area: Area) -> None:
-    """Once per frame: begin, go on with, or end a stroke."""
+    """Begin a stroke, go on with it, or end it; once per frame."""
     io, selection = imgui.get_io(), viewer.state.selection
     if selection.tool is None:
         return
@@ -261,19 +247,20 @@ def held_mode() -> Mode | None:
 
 
 def draw_stroke(viewer: Viewer, area: Area) -> None:
-    """The outline of what is being enclosed, and the brush."""
+    """Draw the outline of what is being enclosed, and the brush."""
     selection = viewer.state.selection
     if selection.tool is None or viewer.state.scene is None:
         return
     paint = imgui.get_foreground_draw_list()
-    paint.push_clip_rect(ImVec2(area.left, area.top), ImVec2(area.left + area.width, area.top + area.height))
+    paint.push_clip_rect(*area.corners)
     drawn, radius = selecting.drawn_stroke(viewer), selection.brush * area.height
     for line in marks.outlines(drawn) if drawn is not None else []:
         points = _on_screen(line, area)
         if selection.tool == "brush":
             _stripe(paint, points, radius)
         else:
-            _outline(paint, points)
+            paint.add_polyline(points, _colour(DARK), 3.0, 0)
+            paint.add_polyline(points, _colour(LIGHT), 1.5, 0)
     io = imgui.get_io()
     if selection.tool == "brush" and (drawn is not None or not io.want_capture_mouse):
         paint.add_circle(io.mouse_pos, radius, _colour(DARK), 0, 3.0)
@@ -286,11 +273,6 @@ def _on_screen(line: Array, area: Area) -> list[Any]:
     return [ImVec2(area.left + u * area.width, area.top + v * area.height) for u, v in line.tolist()]
 
 
-def _outline(paint: Any, points: list[Any]) -> None:
-    paint.add_polyline(points, _colour(DARK), 3.0, 0)
-    paint.add_polyline(points, _colour(LIGHT), 1.5, 0)
-
-
 def _stripe(paint: Any, points: list[Any], radius: float) -> None:
     """The way of the brush, as wide as it is; of a click a disk."""
     if len(points) == 1:
@@ -300,7 +282,7 @@ def _stripe(paint: Any, points: list[Any], radius: float) -> None:
 
 
 def draw_hint(viewer: Viewer, area: Area) -> None:
-    """What a click on the scene does, while it does not turn the view."""
+    """Say what a click on the scene does, while it does not turn the view."""
     state, tool = viewer.state, viewer.state.selection.tool
     if state.ruler.measures:
         text = "Ruler: click two points on the surface; Esc ends it"
@@ -310,15 +292,7 @@ def draw_hint(viewer: Viewer, area: Area) -> None:
         text = f"{tool.capitalize()}: {HINTS[tool]}. {TOOL_KEYS}"
     else:
         return
-    top = ImVec2(area.left + area.width / 2, area.top + hello_imgui.em_size(0.7))
-    imgui.set_next_window_pos(top, imgui.Cond_.always, ImVec2(0.5, 0))
-    imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(0.95 * area.width, area.height))
-    imgui.set_next_window_bg_alpha(0.75)
-    imgui.begin("tool", None, QUIET)
-    imgui.push_text_wrap_pos(0.9 * area.width)
-    imgui.text_unformatted(text)
-    imgui.pop_text_wrap_pos()
-    imgui.end()
+    say(text, area, "tool", hello_imgui.em_size(0.7))
 
 
 def _colour(colour: tuple[float, float, float, float]) -> Any:

@@ -24,6 +24,21 @@ class Area:
         """A window position as fractions of the area; outside [0, 1] beyond its edges."""
         return (x - self.left) / self.width, (y - self.top) / self.height
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in whole window units, at least 1."""
+        return max(round(self.width), 1), max(round(self.height), 1)
+
+    @property
+    def corners(self) -> tuple[ImVec2, ImVec2]:
+        """The upper left and the lower right corner."""
+        return ImVec2(self.left, self.top), ImVec2(self.left + self.width, self.top + self.height)
+
+    def columns(self, count: int) -> list["Area"]:
+        """The area cut into columns of one width."""
+        width = self.width / count
+        return [Area(self.left + place * width, self.top, width, self.height) for place in range(count)]
+
 
 def scene_area() -> Area:
     """Return what menus and docked panels leave free, at least one unit wide and high."""
@@ -49,7 +64,7 @@ SIZES = {"frame_rounding": 4.0, "indent_spacing": 21.0, "scrollbar_size": 14.0, 
 
 
 def apply(preferences: Preferences) -> None:
-    """Calm: one accent, little contrast between the widgets. To be called once for every change."""
+    """Apply the theme, with one accent and little contrast between the widgets; once for every change."""
     dark = preferences.theme == "dark"
     themes = hello_imgui.ImGuiTheme_
     hello_imgui.apply_theme(themes.darcula_darker if dark else themes.imgui_colors_light)
@@ -103,8 +118,7 @@ def tip(text: str) -> None:
 def stoppable(label: str, fraction: float, tag: str = "") -> bool:
     """A bar in the accent's colour, with a button beside it; whether that was clicked. `tag` tells the button
     from others of its name."""
-    cancel = imgui.calc_text_size("Cancel").x + 2 * imgui.get_style().frame_padding.x
-    width = -cancel - imgui.get_style().item_spacing.x
+    width = beside_button("Cancel")
     if width_of(label) > imgui.get_content_region_avail().x + width:  # no room for it in the bar
         imgui.text_wrapped(label)
         label = ""
@@ -120,13 +134,46 @@ def width_of(text: str) -> float:
     return float(imgui.calc_text_size(text).x)
 
 
+def button_width(label: str) -> float:
+    """Return the width of a button, window units."""
+    return width_of(label.partition("##")[0]) + 2 * imgui.get_style().frame_padding.x
+
+
+def beside_button(label: str) -> float:
+    """Return the width, as imgui takes it, of an item that leaves room for a button at the end of its row."""
+    return -button_width(label) - imgui.get_style().item_spacing.x
+
+
 def beside(label: str, more: float = 0.0) -> None:
     """Go on in the row of the last widget, unless the next one, with this label and `more` window units, does
     not fit there."""
     imgui.same_line()
-    wide = width_of(label.partition("##")[0]) + 2 * imgui.get_style().frame_padding.x + more
-    if imgui.get_content_region_avail().x < wide:
+    if imgui.get_content_region_avail().x < button_width(label) + more:
         imgui.new_line()
+
+
+def button_if(label: str, enabled: bool) -> bool:
+    """Draw a button that can be clicked where it is `enabled`, and return whether it was."""
+    imgui.begin_disabled(not enabled)
+    clicked = bool(imgui.button(label))
+    imgui.end_disabled()
+    return clicked
+
+
+def next_button(label: str, enabled: bool = True) -> bool:
+    """Draw a button `beside` the last widget, and return whether it was clicked."""
+    beside(label)
+    return button_if(label, enabled)
+
+
+def box_with_button(box: str, hint: str, text: str, label: str) -> tuple[bool, str]:
+    """Draw a text box and a button beside it, and return whether Enter or the button was pressed, and the
+    text."""
+    imgui.set_next_item_width(beside_button(label))
+    flags = imgui.InputTextFlags_.enter_returns_true
+    entered, typed = imgui.input_text_with_hint(box, hint, text, flags)
+    imgui.same_line()
+    return bool(imgui.button(label)) or entered, typed
 
 
 def beside_boxed(label: str) -> None:

@@ -74,5 +74,5 @@ def _button(viewer: Viewer, command: Command, side: float) -> None:
 
 
 def button_label(command: Command) -> str:
-    """Its icon, which may be another's too, and what tells it from that."""
+    """Return the label of a command's button: its icon, and an id that no other command has."""
     return f"{getattr(icons_fontawesome_6, f'ICON_FA_{command.icon}')}##{command.does}"

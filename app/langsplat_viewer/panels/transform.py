@@ -5,14 +5,22 @@ from dataclasses import replace
 from typing import Any, get_args
 
 import numpy as np
-from imgui_bundle import ImVec2, imgui, imguizmo
+from imgui_bundle import imgui, imguizmo
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import LangSplatError
 from langsplat_core.scene import Camera
 from langsplat_core.scene.transform import Similarity, moving, scaling, similarity
 from langsplat_viewer.actions import transforming
-from langsplat_viewer.panels.style import Area, beside, beside_boxed, leave_room, muted, small_wrapped, tip
+from langsplat_viewer.panels.style import (
+    Area,
+    beside_boxed,
+    leave_room,
+    muted,
+    next_button,
+    small_wrapped,
+    tip,
+)
 from langsplat_viewer.state import EditForm, Gizmo, Point
 from langsplat_viewer.viewer import Viewer
 
@@ -26,7 +34,7 @@ NEAR, FAR = 1e-3, 1e3  # depths that the gizmo's camera sees, of the distance to
 
 
 def draw(viewer: Viewer) -> None:
-    """What is transformed, gizmo, numbers, box."""
+    """Draw the panel "Transform": what is transformed, gizmo, numbers, box."""
     state = viewer.state
     imgui.begin_disabled(state.scene is None)
     chosen = int(state.selection.marks.selected.sum())
@@ -41,8 +49,7 @@ def draw(viewer: Viewer) -> None:
     if imgui.button("Fit"):
         transforming.fill_box(viewer)
     tip("The box around the selection, or around everything")
-    beside("Crop")
-    if imgui.button("Crop"):
+    if next_button("Crop"):
         transforming.crop(viewer)
     tip("Delete what lies outside the box; the file stays as it is")
     beside_boxed("Clip")
@@ -104,7 +111,7 @@ def holds_mouse(viewer: Viewer) -> bool:
 
 
 def draw_gizmo(viewer: Viewer, area: Area) -> None:
-    """The gizmo that is chosen, where it was dragged to; what it moves follows, and stays on release."""
+    """Draw the chosen gizmo where it was dragged to; what it moves follows, and stays on release."""
     state = viewer.state
     kind = state.edit_form.gizmo
     if not _is_shown(viewer) or state.view is None or state.settings.split.columns > 1:
@@ -112,10 +119,10 @@ def draw_gizmo(viewer: Viewer, area: Area) -> None:
     centre = transforming.pivot(viewer)
     if centre is None:
         return
-    camera = state.view.camera(max(round(area.width), 1), max(round(area.height), 1))
+    camera = state.view.camera(*area.size)
     view, projection = gl_matrices(camera, state.view.distance)
     paint = imgui.get_foreground_draw_list()
-    paint.push_clip_rect(ImVec2(area.left, area.top), ImVec2(area.left + area.width, area.top + area.height))
+    paint.push_clip_rect(*area.corners)
     gizmo.begin_frame()
     gizmo.set_drawlist(paint)
     gizmo.set_rect(area.left, area.top, area.width, area.height)

@@ -14,7 +14,15 @@ from langsplat_viewer.actions import opening, projects, settings, viewpoint
 from langsplat_viewer.camera.controls import FOV_RANGE, OrbitCamera, adopt_up, level, with_fov
 from langsplat_viewer.camera.overlays import length_text
 from langsplat_viewer.commands import BUTTONS, OVERLAY_TITLES, Button, buttons_of, with_key
-from langsplat_viewer.panels.style import beside, beside_boxed, leave_room, muted, small_wrapped, tip
+from langsplat_viewer.panels.style import (
+    beside_boxed,
+    button_if,
+    leave_room,
+    muted,
+    next_button,
+    small_wrapped,
+    tip,
+)
 from langsplat_viewer.rendering.depth import Clip
 from langsplat_viewer.rendering.request import MOST_DEGREE, SIZE_RANGE, Splats
 from langsplat_viewer.viewer import Viewer
@@ -199,12 +207,9 @@ def draw_notes(viewer: Viewer) -> None:
     )
     if changed:
         projects.pin_notes(viewer, pins)
-    imgui.begin_disabled(not state.selection.marks.selected.any())
-    if imgui.button("Pin one to the selection"):
+    if button_if("Pin one to the selection", bool(state.selection.marks.selected.any())):
         projects.pin_to_selection(viewer)
-    imgui.end_disabled()
-    beside("Save project")
-    if imgui.button("Save project"):
+    if next_button("Save project"):
         projects.save_project(viewer, Path.cwd())
     tip("Notes, queries, selection, edits, views: one file, to be opened again")
     imgui.end_disabled()
@@ -233,19 +238,15 @@ def draw_camera(viewer: Viewer) -> None:
     if imgui.button(with_key("Reset", viewpoint.reset_view)):
         viewpoint.reset_view(viewer)
     tip("Return to the opening view")
-    focus = with_key("Focus", viewpoint.focus_result)
-    beside(focus)
-    if imgui.button(focus):
+    if next_button(with_key("Focus", viewpoint.focus_result)):
         viewpoint.focus_result(viewer)
-    beside("Frame all")
-    if imgui.button("Frame all"):
+    if next_button("Frame all"):
         viewpoint.frame_scene(viewer)
     tip(with_key("Show the whole scene from this side", viewpoint.frame_scene))
     if imgui.button("Horizon"):
         viewpoint.move(viewer, level)
     tip("Turn the picture until the horizon is level")
-    beside("Up is up")
-    if imgui.button("Up is up"):
+    if next_button("Up is up"):
         viewpoint.move(viewer, adopt_up)
     tip("Take what is up in the picture as the world's up")
     if state.view is not None:

@@ -36,17 +36,24 @@ VISIBLE_ALPHA = 1 / 255
 _SAMPLE = 20_000  # Gaussians looked at; quantiles need no more
 
 
+def _in_image(gaussians: Gaussians, camera: Camera) -> tuple[slice, Array, Array]:
+    """A sample of the Gaussians: their rows, the (M,) camera z of their centres, world units, and (M,) bool,
+    those whose centres are in the image."""
+    rows = slice(None, None, max(len(gaussians) // _SAMPLE, 1))
+    with np.errstate(invalid="ignore", over="ignore"):
+        pixels, depths = camera.project(gaussians.means[rows].astype(np.float64))
+        inside = (depths > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
+    return rows, depths, inside
+
+
 def near_plane(gaussians: Gaussians, camera: Camera, most: float = INRIA.near) -> float:
     """World units from the camera to the near plane: a share of the depth of what is nearest in the
     image, so that one can go as near to a thing as it is small; at most `most`, the constant of training,
     so that the view of a photograph is the one that was trained. Without perspective, that of the eye."""
     if camera.orthographic:
         return 0.0
-    rows = slice(None, None, max(len(gaussians) // _SAMPLE, 1))
-    means = gaussians.means[rows].astype(np.float64)
-    with np.errstate(invalid="ignore", over="ignore"):
-        pixels, depths = camera.project(means)
-        inside = (depths > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
+    rows, depths, inside = _in_image(gaussians, camera)
+    with np.errstate(invalid="ignore"):
         inside &= gaussians.opacity_logits[rows] > logit(np.array(VISIBLE_ALPHA))
     if not inside.any():
         return most
@@ -61,16 +68,11 @@ def image_formation(scene: Scene, camera: Camera, clip: Clip = UNCLIPPED) -> Ras
     return replace(settings, near=max(near, clip.near), far=None if math.isinf(clip.far) else clip.far)
 
 
-_DEPTH_SAMPLE = 20_000  # Gaussians looked at for the depth range; quantiles need no more
-
-
 def depth_range(gaussians: Gaussians, camera: Camera, clip: Clip = UNCLIPPED) -> tuple[float, float]:
     """Near and far end of the depth display: the 2 % and 98 % quantiles of the camera z of those
     Gaussians whose centres are in the image and not cut away. World units; (0, 1) where there are none."""
-    means = gaussians.means[:: max(len(gaussians) // _DEPTH_SAMPLE, 1)].astype(np.float64)
-    with np.errstate(invalid="ignore", over="ignore"):
-        pixels, depths = camera.project(means)
-        inside = (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1) & (depths > 0)
+    _, depths, inside = _in_image(gaussians, camera)
+    with np.errstate(invalid="ignore"):
         inside &= clip.keeps(depths)
     if not inside.any():
         return 0.0, 1.0

@@ -138,8 +138,8 @@ class ArrayChannels:
         return made
 
     def render(self, key: RenderKey, wanted: Sequence[Channel] = ()) -> list[Channels]:
-        """For each of `wanted` the colours, alpha and that channel; of none wanted colours and alpha. All of
-        them in one pass."""
+        """Rasterize, in one pass, for each of `wanted` the colours, alpha and that channel; colours and alpha
+        where none is wanted."""
         gaussians, camera = key.scene.gaussians, key.camera
         wanted = wanted or [Channel()]
         columns = [camera_depths(gaussians, camera) if c.is_depth else c.values for c in wanted]
@@ -454,13 +454,13 @@ class GlRenderer:
         return None if missing is None or work is None else Rasterizing(key, tuple(missing), work)
 
     def take(self, made: Rasterized) -> None:
-        """Have the result, as if it had been rasterized here."""
+        """Take over what another thread rasterized, as if it had been rasterized here."""
         self._drop()
         self._layers = made.finish()
         self._held, self._channels = made.of.key, made.of.channels
 
     def _rasterized(self, request: RenderRequest) -> tuple[RenderKey, list[Channel]]:
-        """Have the channels of all panes among those that are held."""
+        """Rasterize what is missing of the channels of all panes; return the key and the channels."""
         key, wanted = self._inputs.key(request), self._inputs.channels(request)
         missing = self._missing(key, wanted)
         if missing is not None:

@@ -130,8 +130,8 @@ def _shown(source: Scene, marks: Marks, before: EditedScene | None) -> tuple[Arr
 
 
 def _tinted(scene: Scene, selected: Array) -> Scene:
-    """With the colours of the `selected` (N,) bool mixed with `TINT`, from every side: a colour is linear in
-    its coefficients, so that mixing these mixes it, but for what is clamped at black."""
+    """Return the scene with the colours of the `selected` (N,) bool mixed with `TINT`, from every side: a
+    colour is linear in its coefficients, so that mixing these mixes it, but for what is clamped at black."""
     sh = scene.gaussians.sh.copy()
     sh[selected] *= 1 - TINT_STRENGTH
     sh[selected, 0] += TINT_STRENGTH * (TINT - 0.5) / C0
@@ -234,14 +234,14 @@ class RenderRequest:
         return self.camera.resized(width, height)
 
     def seen_by(self, camera: Camera) -> "RenderRequest":
-        """The same by another camera, which has the size of the image and is fitted into each pane."""
+        """Return the request by another camera of the image's size, which is fitted into each pane."""
         pane = self.split.pane_size(self.size)
         if pane != (camera.width, camera.height):
             camera = camera.with_intrinsics(camera.intrinsics.fitted(*pane))
         return replace(self, camera=camera)
 
     def without_line(self) -> "RenderRequest":
-        """The part that panes depend on; the window joins them itself."""
+        """Return the part that panes depend on, without the line: the window joins them itself."""
         return replace(self, split=replace(self.split, at=0.5))
 
 
