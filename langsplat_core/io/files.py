@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import re
+import stat
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -126,9 +127,13 @@ def check_output_file(path: Path | str) -> None:
     """
     target = Path(path)
     folder = _existing_folder(target)
-    if os.path.isdir(target):
+    try:
+        mode = os.stat(target).st_mode  # once: another process may replace the file meanwhile
+    except (OSError, ValueError):
+        mode = stat.S_IFREG  # none there, or no name for one, which writing will say
+    if stat.S_ISDIR(mode):
         raise InputError(f"{shown(path)}: is a folder; name a file in it")
-    if os.path.exists(target) and not os.path.isfile(target):
+    if not stat.S_ISREG(mode):
         raise InputError(f"{shown(path)}: is no ordinary file; choose another name")
     _try_writing(target, folder)
 
