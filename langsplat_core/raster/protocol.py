@@ -22,6 +22,9 @@ from langsplat_core.scene import Camera, Gaussians
 
 # Of an image of colours with alpha while it is drawn and turned into display values, float32 and uint8.
 BYTES_PER_PIXEL = 40
+# Of the dilation, for images 16 times as large as the photographs: with more of it, wrong cameras beside a
+# scene would spread every Gaussian over the whole image.
+MOST_GROWTH = 256.0
 LABELS_AT_ONCE = 32  # that a plain gather lifts
 _LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
 
@@ -146,12 +149,15 @@ def dilation(camera: Camera, settings: RasterSettings) -> float:
 
     Gaussians are fitted with the dilation around them. In an image of more pixels than the photographs had,
     the same number of pixels is less of the world: what was closed there opens, and edges fray into needles
-    (Yu et al. 2024, Mip-Splatting, figure 1). So it grows as the image does. It never shrinks: it also
-    guards against aliasing.
+    (Yu et al. 2024, Mip-Splatting, figure 1). So it grows as the image does, up to `MOST_GROWTH`. It never
+    shrinks: it also guards against aliasing.
     """
     if settings.focal is None or camera.orthographic:
         return settings.dilation
-    return settings.dilation * max(1.0, camera.fx * camera.fy / settings.focal**2)
+    growth = camera.fx * camera.fy / settings.focal / settings.focal
+    if growth < 1 + 1e-6:  # at the photographs' own size it is rounding that differs
+        return settings.dilation
+    return settings.dilation * min(growth, MOST_GROWTH)
 
 
 def check_picture(camera: Camera) -> None:

@@ -15,6 +15,7 @@ from langsplat_core.scene.language import LanguageField
 
 # The opening view of a scene without cameras is from where it covers the most of a grid; lengths in radii.
 SAMPLES, TURNS, REACH, CELL = 20_000, 12, 3.0, 0.06
+WIDEST = 0.2  # of an image's width: shorter focal lengths, 136 degrees, are of no lens
 MORE = 1.25  # how many times as much another side has to cover, to be better
 
 
@@ -58,9 +59,15 @@ class Scene:
 
     @cached_property
     def _focal(self) -> float | None:
-        """Median focal length of the cameras, px; None without cameras."""
-        lengths = [camera.fx * camera.fy for camera in self.cameras if not camera.orthographic]
-        return float(np.sqrt(np.median(lengths))) if lengths else None
+        """Median focal length of the cameras, px; None without cameras, and where it is one of no lens, as in
+        files that state it in other units."""
+        lengths = [
+            (np.sqrt(camera.fx * camera.fy), camera.width)
+            for camera in self.cameras
+            if not camera.orthographic
+        ]
+        focal, width = np.median(lengths, axis=0) if lengths else (0.0, 1.0)
+        return float(focal) if focal > WIDEST * width else None
 
     def up(self) -> Array:
         """(3,) the world's up direction: the mean of the cameras' up axes, else -y as COLMAP has it."""

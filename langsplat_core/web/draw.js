@@ -219,13 +219,13 @@ export class Painter {
       this.image = this.target(width, height, Array(2).fill(gl.RGBA16F));
     }
     // As raster.protocol.dilation.
-    const finer = raster.focal ? Math.max(1, (camera.fx * camera.fy) / raster.focal ** 2) : 1;
+    const finer = raster.focal ? (camera.fx * camera.fy) / raster.focal ** 2 : 1;
     const r = camera.rotation, high = camera.position.map(Math.fround);
     const mx = (0.5 * (raster.fov_clamp - 1) * width) / camera.fx,
       my = (0.5 * (raster.fov_clamp - 1) * height) / camera.fy;
     this.use("project", {
       gaussians: 0, sh: 1, orthographic: 0, sh_count: meta.sh_count, antialiased: +raster.antialiased,
-      dilation: raster.dilation * finer, alpha_min: raster.alpha_min, colour_max: 65504,
+      dilation: raster.dilation * Math.min(Math.max(finer, 1), 256), alpha_min: raster.alpha_min, colour_max: 65504,
       focal: [camera.fx, camera.fy], principal: [camera.cx, camera.cy],
       world_to_camera: [r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]], camera_high: high,
       camera_low: camera.position.map((v, i) => v - high[i]),

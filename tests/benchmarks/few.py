@@ -14,6 +14,7 @@ from langsplat_core.arrays import Array, psnr
 from langsplat_core.bench.measure import markdown
 from langsplat_core.config import DatasetConfig, RadianceConfig, Seed, TrainConfig, TrainPreset, with_preset
 from langsplat_core.datasets import Capture, load_capture
+from langsplat_core.datasets.capture import shrunk_view
 from langsplat_core.datasets.holdout import split
 from langsplat_core.datasets.known_poses import look_distance
 from langsplat_core.progress import Progress, TerminalProgress
@@ -220,7 +221,6 @@ def _image(scene: Scene, camera: Camera) -> Array:
 
 def _psnr_at(photograph: Array, camera: Camera, scene: Scene) -> float:
     """PSNR of the camera's image, shrunk to the size of the photograph as that was: what presets are compared
-    by. Area averages alone would be 30 to 40 dB from it."""
-    size = photograph.shape[1::-1]
-    shrunk = Image.fromarray(_image(scene, camera)).resize(size, Image.Resampling.LANCZOS)
-    return psnr(np.asarray(shrunk) / 255, photograph / 255)
+    by."""
+    _, shrunk, _ = shrunk_view(camera, _image(scene, camera), None, photograph.shape[1::-1])
+    return psnr(shrunk / 255, photograph / 255)

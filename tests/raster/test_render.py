@@ -63,13 +63,21 @@ def test_an_image_of_more_pixels_than_the_photographs_shows_what_they_showed(bac
     small = render(fitted, CAMERA, backend=backend)
     np.testing.assert_array_equal(small.alpha, render(Scene(thin), CAMERA, backend=backend).alpha)
     alike = render(fitted, large, backend=backend).alpha.mean()
-    assert alike == pytest.approx(small.alpha.mean(), rel=0.05)
-    assert render(Scene(thin), large, backend=backend).alpha.mean() < 0.2 * small.alpha.mean()
+    assert alike == pytest.approx(small.alpha.mean(), rel=0.01)
+    assert render(Scene(thin), large, backend=backend).alpha.mean() < 0.1 * small.alpha.mean()
     flat = without_perspective(large)  # its pixels have no focal length
     without = render(Scene(thin), flat, backend=backend).alpha
     np.testing.assert_array_equal(render(fitted, flat, backend=backend).alpha, without)
     less = CAMERA.resized(CAMERA.width // 2, CAMERA.height // 2)
     assert protocol.dilation(less, fitted.raster_settings()) == INRIA.dilation  # it guards against aliasing
+
+
+@pytest.mark.parametrize("factor", [1e-30, 1e-3, 0.1])
+def test_cameras_of_no_lens_do_not_spread_gaussians_over_the_image(factor: float) -> None:
+    wrong = replace(CAMERA, fx=CAMERA.fx * factor, fy=CAMERA.fy * factor)
+    assert Scene(G, cameras=(wrong,)).raster_settings().focal is None
+    settings = replace(INRIA, focal=wrong.fx)
+    assert protocol.dilation(CAMERA, settings) <= protocol.MOST_GROWTH * INRIA.dilation
 
 
 def test_what_cannot_draw_is_said():

@@ -157,7 +157,7 @@ def end(viewer: Viewer, folder: Path) -> None:
 
 
 def _answer(state: ViewerState, query: Query) -> dict[str, Any]:
-    """What other programs want to know of an answer."""
+    """The answer to a query as a project keeps it, for other programs."""
     result = query.result
     if result is None:
         return {"phrase": query.phrase, "problem": query.problem}

@@ -55,7 +55,7 @@ def rehearse(
     found: list[float] = []
     for index, budget in enumerate(budgets):
         small = capture.shrunk(train_indices, budget.longer_side)
-        train = [index for index in range(len(small)) if index not in held_out]
+        train = [row for row in range(len(small)) if row not in held_out]
         at = checkpoint and checkpoint.with_name(f"{index}-{checkpoint.name}")
         reports = _of_steps(progress.part(index, len(budgets), STAGE, in_words(budget)))
         gaussians = train_radiance(small, config.spending(budget), train, at, reports)

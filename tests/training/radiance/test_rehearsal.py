@@ -102,7 +102,7 @@ def test_fewer_pixels_show_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     camera = photographs.cameras[1]
     small = render(Scene(fitted), camera.resized(40, 40)).colours.repeat(4, 0).repeat(4, 1)
     thin, seen = (render(Scene(gaussians), camera).colours for gaussians in (fitted, wide))
-    assert np.abs(small - seen).mean() < 0.6 * np.abs(small - thin).mean()
+    assert np.abs(small - seen).mean() < 0.5 * np.abs(small - thin).mean()
     # A Gaussian in the middle, seen by both cameras: its variance grows by what the dilation lost.
     depth = min(photographs.cameras[i].project(fitted.means)[1][0] for i in (1, 2))
     focal = photographs.cameras[1].fx
