@@ -324,6 +324,26 @@ class Capture:
         cameras, images, masks = zip(*views, strict=True) if views else ((), (), ())
         return replace(self, cameras=cameras, images=images, masks=masks, photos=(), matches=None)
 
+    def read_at(self, indices: Sequence[int], longer_side: int) -> "Capture":
+        """The photographs at `indices` as they are when a dataset is read at that size, bit for bit, with the
+        points of all; `shrunk` where there are no files. InputError for a file that can no longer be read."""
+        if not self.photos or longer_side >= max(max(self.images[index].shape) for index in indices):
+            return self.shrunk(indices, longer_side)
+        read = developer(longer_side)
+
+        def view(index: int) -> tuple[Camera, Array, Array | None]:
+            try:
+                lens, image, mask = read(self.photos[index])
+            except PictureError as error:
+                raise InputError(f"{error}; it was there when this run began") from None
+            camera = self.cameras[index]
+            return replace(lens, world_to_camera=camera.world_to_camera, name=camera.name), image, mask
+
+        with ThreadPoolExecutor(WORKERS) as pool:
+            cameras, images, masks = zip(*pool.map(view, indices), strict=True)
+        masks = masks if self.masks else ()
+        return replace(self, cameras=cameras, images=images, masks=masks, photos=(), matches=None)
+
     def extent(self) -> float:
         """1.1 times the largest distance of a camera from the cameras' mean: the scene scale that the
         INRIA code multiplies position learning rates with. World units, > 0."""

@@ -134,7 +134,7 @@ class Few:
                 (image * gain).clip(0, 255).astype(np.uint8)
                 for image, gain in zip(capture.images, gains, strict=True)
             ]
-            capture = replace(capture, images=tuple(images))
+            capture = replace(capture, images=tuple(images), photos=())  # not as the files are
         return capture, train, held_out
 
 

@@ -54,7 +54,7 @@ def rehearse(
         return []
     found: list[float] = []
     for index, budget in enumerate(budgets):
-        small = capture.shrunk(train_indices, budget.longer_side)
+        small = capture.read_at(train_indices, budget.longer_side)
         train = [row for row in range(len(small)) if row not in held_out]
         at = checkpoint and checkpoint.with_name(f"{index}-{checkpoint.name}")
         reports = _of_steps(progress.part(index, len(budgets), STAGE, in_words(budget)))
@@ -109,7 +109,7 @@ def train_within(
     spent, cameras = config.spending(budget), capture.cameras
     if all(max(camera.width, camera.height) <= budget.longer_side for camera in cameras):
         return train_radiance(capture, spent, train_indices, checkpoint, progress)
-    small = capture.shrunk(range(len(capture)), budget.longer_side)
+    small = capture.read_at(range(len(capture)), budget.longer_side)
     gaussians = train_radiance(small, spent, train_indices, checkpoint, progress)
     return widened(gaussians, [(small.cameras[index], cameras[index]) for index in train_indices])
 

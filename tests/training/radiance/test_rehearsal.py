@@ -41,10 +41,8 @@ def test_presets_are_rehearsed_with_few_views_only() -> None:
     tried = [one.radiance.budgets(9, one.dataset.max_side) for one in (quick, good, full)]
     assert tried[0] == [QUICK]
     assert tried[1] == [QUICK, RadianceBudget(480, 500, 60_000, 1), GOOD]
-    assert [budget.steps for budget in tried[2]] == [500, 1111, 3333, 10000, 30000]
-    assert [budget.longer_side for budget in tried[2]] == [320, 480, 800, 800, 800]
-    assert [budget.sh_degree for budget in tried[2]] == [1, 1, 3, 3, 3]
     whole = RadianceBudget(800, 30_000, 1_000_000, 3)
+    assert tried[2] == [*tried[1], whole._replace(steps=4_500), whole]
     assert RadianceConfig().budgets(RadianceConfig.rehearsed_views + 1, 800) == [whole]
     assert RadianceConfig(rehearsed_views=0).budgets(9, 800) == [whole]
     small = RadianceConfig(steps=1_500, max_gaussians=5_000, sh_degree=0).budgets(9, 200)
@@ -53,7 +51,7 @@ def test_presets_are_rehearsed_with_few_views_only() -> None:
 
 def test_it_ends_where_more_loses(monkeypatch: pytest.MonkeyPatch) -> None:
     trained: list[tuple[int, int, int]] = []
-    scores = {500: 20.0, 1_111: 20.2, 3_333: 21.0, 10_000: 20.5, 30_000: 25.0}
+    scores = {320: 20.0, 500: 20.2, 1_500: 21.0, 4_500: 20.5, 30_000: 25.0}
 
     def train(small: Capture, config: RadianceConfig, indices: list[int], *_: object) -> int:
         trained.append((config.steps, len(indices), small.cameras[0].width))
@@ -61,7 +59,8 @@ def test_it_ends_where_more_loses(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def scored(steps: int, small: Capture, held_out: list[int], *_: object) -> list[ViewScore]:
         assert all(index < len(small) for index in held_out)
-        return [ViewScore("", 0.0, 0.0, 1.0, scores[steps] + way) for way in (-1, 1)]
+        found = scores[small.cameras[0].width if small.cameras[0].width == QUICK.longer_side else steps]
+        return [ViewScore("", 0.0, 0.0, 1.0, found + way) for way in (-1, 1)]
 
     monkeypatch.setattr(rehearsal, "train_radiance", train)
     monkeypatch.setattr(rehearsal, "evaluate_views", scored)
@@ -69,7 +68,7 @@ def test_it_ends_where_more_loses(monkeypatch: pytest.MonkeyPatch) -> None:
     budgets = budgets_for(photographs, config, VIEWS)
     found = rehearse(photographs, config, range(VIEWS))
     assert found == [20.0, 20.2, 21.0, 20.5]
-    sizes = zip((500, 1_111, 3_333, 10_000), (320, 480, 800, 800), strict=True)
+    sizes = zip((500, 500, 1_500, 4_500), (320, 480, 480, 800), strict=True)
     assert trained == [(steps, VIEWS - 1, side) for steps, side in sizes]
     assert supported(found, budgets) == budgets[2]
     assert supported([20.0, 20.1], budgets) == budgets[0]  # it may be chance
