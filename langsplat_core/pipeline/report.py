@@ -42,6 +42,7 @@ class TrainReport:
     seconds: dict[str, float]  # per stage, of this run: a stage that was already done takes almost none
     dataset: str = ""  # absolute path of the photographs; "" in reports of earlier versions
     held_out_views: tuple[ViewScore, ...] = ()  # one by one
+    psnr_small: float | None = None  # as `psnr`, of images shrunk to 320 px, by which presets compare
     # budget -> mean PSNR (dB) of views held out of the training views, by trainings that decided on it
     rehearsed: dict[str, float] = field(default_factory=dict)
 

@@ -7,7 +7,7 @@ continues where it stopped and a changed setting recomputes only what depends on
 import json
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -229,7 +229,8 @@ def _report(
         views=len(scene.cameras),
         held_out=len(scores),
         gaussians=len(scene.gaussians),
-        psnr=float(np.mean([score.psnr for score in scores])) if scores else None,
+        psnr=_mean(score.psnr for score in scores),
+        psnr_small=_mean(score.psnr_small for score in scores),
         codec=language.codec.kind,
         codec_size=language.codec.size,
         codec_cosine=loss.cosine,
@@ -240,6 +241,12 @@ def _report(
         held_out_views=tuple(scores),
         **training,
     )
+
+
+def _mean(scores: Iterable[float | None]) -> float | None:
+    """The mean of those that could be measured; None where none could."""
+    measured = [score for score in scores if score is not None]
+    return float(np.mean(measured)) if measured else None
 
 
 def rehearsals(

@@ -5,9 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from langsplat_core import config as settings
-from langsplat_core.arrays import ViewScore
+from langsplat_core.arrays import ViewScore, psnr
 from langsplat_core.config import GOOD, QUICK, RadianceBudget, RadianceConfig, TrainConfig, with_preset
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.progress import Cancelled, Progress, Report
@@ -21,6 +22,7 @@ from langsplat_core.training.radiance.rehearsal import (
     supported,
     train_within,
 )
+from langsplat_core.training.radiance.train import evaluate_views
 
 VIEWS = 8
 SHORT = RadianceConfig(steps=36, reference_steps=36, backend="cpu", sh_degree=0, max_gaussians=200)
@@ -107,6 +109,32 @@ def test_fewer_pixels_show_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     focal = photographs.cameras[1].fx
     grown = np.exp(2 * fitted.log_scales[0].astype(float)) + 0.3 * depth**2 * (16 - 1) / focal**2
     np.testing.assert_allclose(np.exp(2 * wide.log_scales[0].astype(float)), grown, rtol=1e-4)
+
+
+def test_scores_compare_between_sizes() -> None:
+    """As if both had been shrunk beforehand; what a mask leaves out of a small pixel leaves out the pixel."""
+    rng = np.random.default_rng(2)
+    photographs = capture(640)
+    scene = Gaussians(
+        means=rng.normal(0, 0.4, (60, 3)),
+        log_scales=np.full((60, 3), -2.0),
+        quats_wxyz=rng.normal(size=(60, 4)),
+        opacity_logits=np.full(60, 2.0),
+        sh=rng.normal(0, 0.5, (60, 1, 3)),
+    )
+    mask = np.ones((640, 640), bool)
+    mask[:, 301:] = False
+    photographs = replace(photographs, masks=(None, mask, *[None] * 6))
+    scores = evaluate_views(scene, photographs, [0, 1], "cpu")
+    for index, (score, columns) in enumerate(zip(scores, (320, 150), strict=True)):
+        drawn = render(Scene(scene), photographs.cameras[index]).colours.clip(0, 1)
+        pair = np.round(255 * drawn).astype(np.uint8), photographs.images[index]
+        small = [
+            np.asarray(Image.fromarray(one).resize((320, 320), Image.Resampling.LANCZOS)) for one in pair
+        ]
+        expected = psnr(*(one[:, :columns] / 255 for one in small))
+        assert score.psnr_small == pytest.approx(expected, abs=0.01)
+        assert expected > score.psnr + 1  # of noise
 
 
 @pytest.mark.long
