@@ -28,6 +28,7 @@ from langsplat_core.datasets.colmap import good_points, has_model, located_photo
 from langsplat_core.datasets.intrinsics import pycolmap
 from langsplat_core.datasets.matches import FEWEST_MATCHES, Matches, NotLocatedError
 from langsplat_core.errors import FormatError, InputError, shortened
+from langsplat_core.io import apart
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import PictureError, opened
 from langsplat_core.progress import Progress
@@ -116,12 +117,21 @@ def open_workspace(work: Path, inputs: object) -> Path:
     folder = work / f"sfm-{digest}"
     if not (folder / "sparse").is_dir():
         (folder / "images").mkdir(parents=True, exist_ok=True)
-    pycolmap.logging.minloglevel = 3  # its log lines would tear the progress bars apart
     return folder
 
 
+def run_apart(function: Callable[..., Any], *arguments: Any, workspace: Path, progress: Progress) -> Any:
+    """``function(*arguments, progress)`` in a process of its own, which pycolmap may end: RuntimeError then,
+    and OSError for whatever fails where the disk is about full."""
+    try:
+        return apart.run(function, *arguments, progress=progress)
+    except (apart.AbortedError, *FAILURES) as error:
+        check_room(workspace)
+        raise error if isinstance(error, FAILURES) else RuntimeError(f"it {error}") from None
+
+
 def check_room(folder: Path) -> None:
-    """OSError where the disk is about full: pycolmap would end the whole process there."""
+    """OSError where the disk is about full: pycolmap would end its process there."""
     if shutil.disk_usage(folder).free < ROOM:
         raise _disk_full(folder)
 
@@ -581,13 +591,16 @@ def _listed(lost: dict[str, list[str]], limit: int = 5, width: int = 200) -> str
 
 def _reconstruct(workspace: Path, numbered: dict[str, Path], progress: Progress) -> None:
     try:
-        map_cameras(workspace, match_photos(workspace, numbered, progress), progress)
+        run_apart(_locate, workspace, numbered, workspace=workspace, progress=progress)
     except FAILURES as error:
-        check_room(workspace)
         reason = str(error).partition("\n")[0]
         raise InputError(
             f"structure from motion failed ({reason}); remove {workspace} and try again"
         ) from None
+
+
+def _locate(workspace: Path, numbered: dict[str, Path], progress: Progress) -> None:
+    map_cameras(workspace, match_photos(workspace, numbered, progress), progress)
 
 
 def match_photos(workspace: Path, numbered: dict[str, Path], progress: Progress) -> int:
