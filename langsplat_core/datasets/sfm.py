@@ -96,7 +96,7 @@ SMALL_SIDE = 1000  # px; smaller photographs are doubled before features are sou
 EXTRACT_BATCH = 8  # photographs per step: a step is the unit of progress and of resuming
 MATCH_BATCH = 64  # pairs per step
 FAILURES = (RuntimeError, ValueError, IndexError)  # what pycolmap raises
-ROOM = 64_000_000  # bytes that a step may write: 8 photographs of 8192 features take 20 MB, with the journal
+ROOM = 64_000_000  # bytes that a step may want: 8 photographs of 8192 features take 20 MB, with the journal
 
 Pair = tuple[str, str]
 
@@ -126,14 +126,9 @@ def run_apart(function: Callable[..., Any], *arguments: Any, workspace: Path, pr
     try:
         return apart.run(function, *arguments, progress=progress)
     except (apart.AbortedError, *FAILURES) as error:
-        check_room(workspace)
+        if shutil.disk_usage(workspace).free < ROOM:
+            raise _disk_full(workspace) from None
         raise error if isinstance(error, FAILURES) else RuntimeError(f"it {error}") from None
-
-
-def check_room(folder: Path) -> None:
-    """OSError where the disk is about full: pycolmap would end its process there."""
-    if shutil.disk_usage(folder).free < ROOM:
-        raise _disk_full(folder)
 
 
 def _disk_full(folder: Path) -> OSError:
@@ -149,7 +144,6 @@ def extract_features(folder: Path, groups: Sequence[Group], progress: Progress) 
     for group in groups:
         for start in range(0, len(group.names), EXTRACT_BATCH):
             progress("finding features", done / total)
-            check_room(folder)
             names = group.names[start : start + EXTRACT_BATCH]
             _extract(database, folder / "images", group, names)
             done += len(names)
@@ -219,7 +213,6 @@ def match_features(folder: Path, pairs: Sequence[Pair], progress: Progress) -> N
     done = len(pairs) - len(lacking)
     for start in range(0, len(lacking), MATCH_BATCH):
         progress("matching photographs", (done + start) / len(pairs))
-        check_room(folder)
         batch = lacking[start : start + MATCH_BATCH]
         listing = folder / "pairs.txt"
         listing.write_text("".join(f"{first} {second}\n" for first, second in batch))
@@ -324,7 +317,6 @@ def map_cameras(folder: Path, count: int, progress: Progress) -> None:
     best: Model | None = None
     astray: Model | None = None
     for number, way in enumerate(WAYS):
-        check_room(folder)
         attempts = folder / "attempts" / str(number)
         attempts.mkdir(parents=True, exist_ok=True)
         models = list(way(folder, attempts, _counted(count, progress)))

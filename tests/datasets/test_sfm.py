@@ -9,7 +9,6 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -513,23 +512,6 @@ def test_two_views_are_refused_although_they_are_half(
     for _ in range(2):
         with pytest.raises(InputError, match="only 2 of 4 photographs"):
             load_capture(tmp_path, SMALL, tmp_path / "work")
-
-
-@pytest.mark.parametrize("label", ["finding features", "matching photographs", "locating cameras"])
-def test_a_full_disk_is_said_before_pycolmap_ends_the_process(
-    label: str, mostly_noise: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fill(at: Report) -> None:
-        if at.stage == label:
-            monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1000))
-
-    in_this_process(monkeypatch)
-    told = DatasetConfig(max_side=64, allow_few_cameras=True)
-    with pytest.raises(OSError, match="No space left") as caught:
-        load_capture(mostly_noise, told, tmp_path, Progress(fill))
-    assert Path(caught.value.filename).parent == tmp_path
-    monkeypatch.undo()
-    assert len(load_capture(mostly_noise, told, tmp_path)) == 4
 
 
 @pytest.mark.parametrize("label", ["finding features", "matching photographs", "locating cameras"])
