@@ -19,10 +19,11 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets import load_capture, sfm
-from langsplat_core.datasets.capture import Capture, find_photos
+from langsplat_core.datasets.capture import Capture, find_photos, optics
 from langsplat_core.datasets.intrinsics import BrownDistortion, PhotoIntrinsics
 from langsplat_core.datasets.known_poses import add_points, neighbouring_views
-from langsplat_core.datasets.sfm import optics, pairs_by_name
+from langsplat_core.datasets.matches import read_matches
+from langsplat_core.datasets.sfm import pairs_by_name
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Cancelled, Progress, Report, silent
 from langsplat_core.scene import Camera, look_at
@@ -489,7 +490,7 @@ def test_below_half_is_refused_each_time_unless_told_otherwise(mostly_noise: Pat
     told = DatasetConfig(max_side=64, allow_few_cameras=True)
     assert len(load_capture(mostly_noise, told, tmp_path)) == 4
     (stage,) = tmp_path.glob("sfm-*")
-    matches = sfm.read_matches(stage, sfm.numbered(find_photos(mostly_noise)), ())
+    matches = read_matches(stage, sfm.numbered(find_photos(mostly_noise)), ())
     assert [len(group) for group in matches.groups] == [4, 1, 1, 1, 1, 1]
 
 
