@@ -186,7 +186,7 @@ def _measured(
         *(f"{mean:.2f}" for mean in means),
         ", ".join(f"{mean:.2f}" for mean in larger),
         *(f"{ssim:.3f}", f"{np.mean([score.psnr for score in learnt]):.2f}"),
-        *(in_words(budget), ", ".join(f"{decibels:.2f}" for decibels in found)),
+        *(in_words(budget), "; ".join(", ".join(f"{decibels:.2f}" for decibels in each) for each in found)),
         *(str(len(gaussians)), f"{seconds:.0f}"),
     )
 

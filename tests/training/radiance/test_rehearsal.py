@@ -1,5 +1,6 @@
 """Rehearsals: budgets that few photographs support, decided by views held out of the training views."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -51,33 +52,65 @@ def test_presets_are_rehearsed_with_few_views_only() -> None:
     assert small == [RadianceBudget(200, steps, 5_000, 0) for steps in (500, 1500)]
 
 
-def test_it_ends_where_more_loses(monkeypatch: pytest.MonkeyPatch) -> None:
-    trained: list[tuple[int, int, int]] = []
-    scores = {320: 20.0, 500: 20.2, 1_500: 21.0, 4_500: 20.5, 30_000: 25.0}
+@pytest.fixture
+def pretended(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
+    """Set what the rehearsals find, budget by budget as (steps, longer side), and return what was tried."""
 
-    def train(small: Capture, config: RadianceConfig, indices: list[int], *_: object) -> int:
-        trained.append((config.steps, len(indices), small.cameras[0].width))
-        return config.steps
+    def pretend(scores: dict[tuple[int, int], list[float]]) -> list[str]:
+        tried: list[str] = []
+        left_out: list[int] = []
 
-    def scored(steps: int, small: Capture, held_out: list[int], *_: object) -> list[ViewScore]:
-        assert all(index < len(small) for index in held_out)
-        found = scores[small.cameras[0].width if small.cameras[0].width == QUICK.longer_side else steps]
-        return [ViewScore("", 0.0, 0.0, 1.0, found + way) for way in (-1, 1)]
+        def train(small: Capture, config: RadianceConfig, indices: list[int], *_: object) -> int:
+            (missing,) = set(range(VIEWS)) - set(indices)
+            if missing not in left_out:
+                left_out.append(missing)
+            tried.append(f"{config.steps} at {small.cameras[0].width} without {left_out.index(missing)}")
+            return config.steps
 
-    monkeypatch.setattr(rehearsal, "train_radiance", train)
-    monkeypatch.setattr(rehearsal, "evaluate_views", scored)
-    config, photographs = RadianceConfig(), capture(800)
+        def scored(steps: int, small: Capture, held_out: list[int], *_: object) -> list[ViewScore]:
+            found = scores[steps, small.cameras[0].width][left_out.index(held_out[0])]
+            return [ViewScore("", 0.0, 0.0, 1.0, found)]
+
+        monkeypatch.setattr(rehearsal, "train_radiance", train)
+        monkeypatch.setattr(rehearsal, "evaluate_views", scored)
+        return tried
+
+    return pretend
+
+
+def test_it_ends_where_more_loses(pretended: Callable[..., list[str]]) -> None:
+    photographs, config = capture(800), RadianceConfig()
     budgets = budgets_for(photographs, config, VIEWS)
+    scores = {
+        (500, 320): [20.0, 18.0, 15.0],
+        (500, 480): [20.2, 18.2, 15.2],  # more each time, but it may be chance
+        (1_500, 480): [21.0, 18.1, 15.4],
+        (4_500, 800): [20.5],
+    }
+    tried = pretended(scores)
     found = rehearse(photographs, config, range(VIEWS))
-    assert found == [20.0, 20.2, 21.0, 20.5]
-    sizes = zip((500, 500, 1_500, 4_500), (320, 480, 480, 800), strict=True)
-    assert trained == [(steps, VIEWS - 1, side) for steps, side in sizes]
+    assert found == list(scores.values())
+    small, *larger = (f"{steps} at {side} without" for steps, side in scores)
+    first = [f"{name} {number}" for number in range(3) for name in (small, larger[0])]
+    assert tried == [*first, *(f"{larger[1]} {number}" for number in range(3)), f"{larger[2]} 0"]
     assert supported(found, budgets) == budgets[2]
-    assert supported([20.0, 20.1], budgets) == budgets[0]  # it may be chance
-    trained.clear()
-    assert rehearse(photographs, config, [0, 4, 7]) == []  # none can be spared
-    assert not trained
-    assert supported([], budgets) == budgets[0] == QUICK
+
+
+def test_one_view_that_loses_is_enough(pretended: Callable[..., list[str]]) -> None:
+    photographs, config = capture(480), RadianceConfig(steps=1_500, max_gaussians=60_000, sh_degree=1)
+    scores = {(500, 320): [20.0, 18.0], (500, 480): [19.9], (1_500, 480): [22.0, 17.9]}
+    pretended(scores)
+    found = rehearse(photographs, config, range(VIEWS))
+    assert found == list(scores.values())
+    assert supported(found, budgets_for(photographs, config, VIEWS)) == QUICK
+
+
+def test_where_no_view_can_be_spared_it_is_the_smallest(pretended: Callable[..., list[str]]) -> None:
+    tried = pretended({})
+    budgets = budgets_for(capture(), RadianceConfig(), 3)
+    assert rehearse(capture(), RadianceConfig(), [0, 4, 7]) == []
+    assert not tried
+    assert supported([], budgets) == budgets[0]
 
 
 def test_fewer_pixels_show_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -146,15 +179,16 @@ def test_an_interrupted_rehearsal_ends_as_an_uninterrupted_one(
 
     def stop(at: Report) -> None:
         reports.append(at)
-        if at.stage == rehearsal.STAGE and at.fraction > 0.75:
+        if at.stage == rehearsal.STAGE and at.fraction > 0.25:
             raise Cancelled
 
     path = tmp_path / "rehearsal.safetensors"
     straight = rehearse(capture(), SHORT, range(VIEWS))
     assert len(straight) == 2
+    assert 1 <= len(straight[0]) == len(straight[1]) <= 3
     with pytest.raises(Cancelled):
         rehearse(capture(), replace(SHORT, rehearsed_views=50), range(VIEWS), path, Progress(stop))
-    assert len(checkpoints_of(path)) == 2
+    assert len(checkpoints_of(path)) > 1
     assert {report.stage for report in reports} == {rehearsal.STAGE}
     assert reports[0].fraction < 0.1
     again: list[Report] = []
@@ -162,4 +196,4 @@ def test_an_interrupted_rehearsal_ends_as_an_uninterrupted_one(
         capture(), replace(SHORT, rehearsed_views=50), range(VIEWS), path, Progress(again.append)
     )
     assert found == straight
-    assert len(again) < len(reports)
+    assert again[0].fraction >= 0.25
