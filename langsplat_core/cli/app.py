@@ -82,15 +82,13 @@ def parse(args: list[str]) -> Command:
         commands += [_group(name, ()) for name in GROUPS]
     about = "Train, query, convert and measure 3D Gaussian scenes with a language field."
     found = parsed("langsplat", _union(commands), [*before, *args], about)
-    command: Command = getattr(found, "command", found)  # of a group
-    return command
+    return getattr(found, "command", found)  # of a group
 
 
 def load_command(where: str) -> type[Command]:
     """The class at a place of `COMMANDS` or `GROUPS`."""
     module, _, name = where.partition(".")
-    found: type[Command] = getattr(import_module(f"langsplat_core.cli.{module}"), name)
-    return found
+    return getattr(import_module(f"langsplat_core.cli.{module}"), name)
 
 
 def _subcommand(name: str, command: type[Command]) -> Any:

@@ -179,8 +179,7 @@ def mean_filtered(values: Array, window: int, border: Border) -> Array:
     if window <= 1:
         return values
     if border == "mirror":
-        found: Array = uniform_filter(values, window, mode="mirror")
-        return found
+        return uniform_filter(values, window, mode="mirror")
     total = uniform_filter(values, window, mode="constant")
     return total / uniform_filter(np.ones_like(values), window, mode="constant")
 

@@ -90,8 +90,7 @@ class Viewpoint:
 
     def centre(self, body: Body) -> Array:
         """(3,) centre of a body, in the camera's axes."""
-        seen: Array = self.matrix[:3, :3] @ body.centre + self.matrix[:3, 3]
-        return seen
+        return self.matrix[:3, :3] @ body.centre + self.matrix[:3, 3]
 
     def seen(self, body: Body) -> tuple[float, float]:
         """Tangent of the angle to the right of the viewing direction, and depth; NaN for what is behind."""

@@ -67,8 +67,7 @@ class WordScores:
 
     def vector(self, phrase: str) -> Array:
         """(D,) unit vector of one of the phrases."""
-        found: Array = self.vectors[self.phrases.index(phrase)]
-        return found
+        return self.vectors[self.phrases.index(phrase)]
 
     def take(self, chosen: Array) -> "WordScores":
         """The phrases for which `chosen` (V,) bool is True; the canonical ones stay."""
@@ -80,8 +79,7 @@ class WordScores:
         """(M, d) latents with a meaning -> (M, V + C) float32, each row adding up to 1."""
         logits = np.float32(self.scale) * (codec.cosines(latents, self.vectors) - self.hubs / 2)
         shares = np.exp(logits - logits.max(1, keepdims=True))
-        result: Array = shares / shares.sum(1, keepdims=True)
-        return result
+        return shares / shares.sum(1, keepdims=True)
 
     def mixture(self, codec: Codec, latents: Array, weights: Array) -> Array:
         """(M, d) latents with a meaning and (M,) weights >= 0, not all zero -> (V + C,) float64: the mean of
@@ -158,8 +156,7 @@ def hubs(vectors: Array, bank: Array) -> Array:
     if count == 0:
         return np.zeros(len(vectors), np.float32)
     near = np.partition(vectors @ bank.T, len(bank) - count, axis=1)[:, -count:]
-    found: Array = near.mean(1, dtype=np.float64).astype(np.float32)
-    return found
+    return near.mean(1, dtype=np.float64).astype(np.float32)
 
 
 # The inventory of a scene: every word that is true in it, where, how sure.

@@ -259,8 +259,7 @@ class QueryEngine:
         Raises InputError for an empty phrase and one of stop words alone, UnknownWordError for words that the
         encoder was never taught, and EncoderError for one that is not the scene's or cannot be loaded.
         """
-        found: Array = self.text_vectors([phrase], progress)[0]
-        return found
+        return self.text_vectors([phrase], progress)[0]
 
     def text_vectors(self, phrases: Sequence[str], progress: Progress = silent) -> Array:
         """(Q, D) unit vectors of phrases, encoded together. Raises as `text_vector`."""

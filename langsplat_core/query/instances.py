@@ -32,13 +32,11 @@ class OrientedBox:
     def corners(self) -> Array:
         """(8, 3) corners of the box, world units."""
         signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
-        corners: Array = self.centre + (signs * self.half_extents) @ self.axes.T
-        return corners
+        return self.centre + (signs * self.half_extents) @ self.axes.T
 
     def contains(self, points: Array) -> Array:
         """(N, 3) points -> (N,) bool, True inside the box or on a face."""
-        inside: Array = (np.abs((points - self.centre) @ self.axes) <= self.half_extents * (1 + 1e-9)).all(1)
-        return inside
+        return (np.abs((points - self.centre) @ self.axes) <= self.half_extents * (1 + 1e-9)).all(1)
 
 
 def axis_aligned_box(points: Array) -> Array:
@@ -71,8 +69,7 @@ def oriented_box(points: Array) -> OrientedBox:
 
 def _inner(columns: Array) -> Array:
     """(3, M) -> (2, 3) the `INNER` quantiles of each row."""
-    inner: Array = np.quantile(columns, INNER, axis=1)
-    return inner
+    return np.quantile(columns, INNER, axis=1)
 
 
 def _turned(columns: Array, axes: Array) -> Array:
@@ -95,8 +92,7 @@ def _widths(rows: Array) -> Array:
     """(A, M) -> (A,) between the `INNER` quantiles of each row, to the nearest point."""
     low, high = (round(q * (rows.shape[1] - 1)) for q in INNER)
     rows.partition((low, high), axis=1)
-    widths: Array = rows[:, high] - rows[:, low]
-    return widths
+    return rows[:, high] - rows[:, low]
 
 
 def _right_handed(axes: Array) -> Array:
@@ -146,8 +142,7 @@ class Instance:
     @property
     def size(self) -> Array:
         """(3,) sides of the oriented box, longest first, world units."""
-        size: Array = 2 * self.oriented.half_extents
-        return size
+        return 2 * self.oriented.half_extents
 
 
 def told_apart(surface: Surface, numbers: Array, wholes: Array | None, join: bool) -> list[Array]:
@@ -289,5 +284,4 @@ def _outward(vertices: Array, triangles: Array, normals: Array) -> Array:
     """The triangles, turned where they run against their outward `normals` (T, 3)."""
     a, b, c = vertices[triangles].transpose(1, 0, 2)
     inward = (np.cross(b - a, c - a) * normals).sum(1) < 0
-    turned: Array = np.where(inward[:, None], triangles[:, [0, 2, 1]], triangles)
-    return turned
+    return np.where(inward[:, None], triangles[:, [0, 2, 1]], triangles)

@@ -36,8 +36,7 @@ def in_sphere(means: Array, centre: Array, radius: float) -> Array:
 
 def in_box(means: Array, low: Array, high: Array) -> Array:
     """(N, 3) -> (N,) bool: between two corners (3,) along the world's axes, faces included."""
-    inside: Array = np.all((means >= np.asarray(low)) & (means <= np.asarray(high)), axis=1)
-    return inside
+    return np.all((means >= np.asarray(low)) & (means <= np.asarray(high)), axis=1)
 
 
 def above_plane(means: Array, normal: Array, offset: float) -> Array:
@@ -54,8 +53,7 @@ def at_point(surface: Surface, regions: Regions, level: int, point: Array) -> Ar
     if len(surface.rows) == 0:
         return np.zeros(len(surface.anchors), bool)
     nearest = int(((surface.positions - point) ** 2).sum(1).argmin())
-    same: Array = regions.everywhere[level] == regions.everywhere[level, surface.rows[nearest]]
-    return same
+    return regions.everywhere[level] == regions.everywhere[level, surface.rows[nearest]]
 
 
 def in_pixel(regions: Regions, level: int, rows: Array, weights: Array) -> Array:
@@ -89,8 +87,7 @@ def _spread(surface: Surface, selected: Array, reached: Array) -> Array:
     """`selected` and every Gaussian at a `reached` (M,) point of the surface."""
     if len(reached) == 0:
         return selected.copy()
-    at_reached: Array = selected | (reached[surface.anchors] & (surface.anchors >= 0))
-    return at_reached
+    return selected | (reached[surface.anchors] & (surface.anchors >= 0))
 
 
 def _lengths(surface: Surface) -> csr_matrix:
@@ -135,8 +132,7 @@ def in_rectangle(seen: Projected, corner: Array, opposite: Array) -> Array:
     """(N,) bool: between two opposite corners (2,), pixels, borders included."""
     corners = np.stack([corner, opposite]).astype(np.float64)
     low, high = corners.min(0), corners.max(0)
-    inside: Array = seen.ahead & ((seen.pixels >= low) & (seen.pixels <= high)).all(1)
-    return inside
+    return seen.ahead & ((seen.pixels >= low) & (seen.pixels <= high)).all(1)
 
 
 def in_polygon(seen: Projected, outline: Array) -> Array:

@@ -227,8 +227,7 @@ def cut_by_crop(boxes: Array, crop: Array, shape: tuple[int, int]) -> Array:
     """
     picture = np.array([0, 0, shape[1], shape[0]])
     at_crop, at_picture = np.abs(boxes - crop) <= EDGE, np.abs(boxes - picture) <= EDGE
-    cut: Array = (at_crop & ~at_picture).any(axis=-1)
-    return cut
+    return (at_crop & ~at_picture).any(axis=-1)
 
 
 # Which of many proposed masks are kept: suppression by box and by pixels, and the removal of crumbs.

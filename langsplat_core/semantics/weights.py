@@ -232,8 +232,7 @@ def unpickled(path: Path) -> dict[str, Any]:
     import torch
 
     mapped = zipfile.is_zipfile(path)  # files of PyTorch before 1.6 are none, and are read whole
-    tensors: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
-    return tensors
+    return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
 
 
 def load_model(kind: Any, weights: Weights, config: Any) -> Any:
