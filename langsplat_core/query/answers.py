@@ -18,7 +18,7 @@ from langsplat_core.compiled import plain
 from langsplat_core.config import LevelChoice
 from langsplat_core.query.grammar import Named, named
 from langsplat_core.query.instances import axis_aligned_box
-from langsplat_core.query.regions import Regions
+from langsplat_core.query.selection import Regions
 from langsplat_core.scene import LEVELS, Calibration, Fits, LanguageField
 from langsplat_core.scene.surface import SMALLEST, Surface
 from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, NARROWEST, Scale, relevancy_of

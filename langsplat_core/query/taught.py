@@ -17,7 +17,7 @@ from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import InputError
 from langsplat_core.query.answers import QueryResult, place_of, triple
-from langsplat_core.query.regions import Regions
+from langsplat_core.query.selection import Regions
 from langsplat_core.scene import LEVELS, LanguageField, TaughtWord
 from langsplat_core.scene.surface import SMALLEST
 

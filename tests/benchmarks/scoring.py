@@ -22,7 +22,7 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import SPAN, QueryResult, peak_pixel
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
-from langsplat_core.query.regions import Regions
+from langsplat_core.query.selection import Regions
 from langsplat_core.raster.protocol import Rasterizer, View
 from langsplat_core.scene import Camera
 from langsplat_core.semantics.relevancy import FLOOR
