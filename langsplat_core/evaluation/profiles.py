@@ -15,8 +15,7 @@ from scipy.ndimage import uniform_filter
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import PictureConfig
-from langsplat_core.query.answers import QueryResult, peak_pixel
-from langsplat_core.query.lookup import splatted_relevancy
+from langsplat_core.query.answers import QueryResult, peak_pixel, splatted_relevancy
 from langsplat_core.raster.protocol import View
 
 Border = Literal["mirror", "inside"]  # cv2's reflect101; the mean of what lies inside the image

@@ -29,9 +29,8 @@ from langsplat_core.evaluation.profiles import (
     read_silhouette,
 )
 from langsplat_core.io.hostile import opened, read_npy
-from langsplat_core.query.answers import QueryResult
+from langsplat_core.query.answers import QueryResult, decoded_relevancy, splatted_relevancy
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.protocol import View
 from langsplat_core.raster.render import splat_colours

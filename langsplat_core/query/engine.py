@@ -17,15 +17,16 @@ from langsplat_core.query.answers import (
     AnswerRule,
     Bars,
     Chance,
+    Lookup,
     QueryResult,
     bars,
+    build_lookup,
     by_peak,
     by_regions,
     chance_in,
 )
 from langsplat_core.query.grammar import STOP_WORDS, check_names, only
 from langsplat_core.query.instances import Instance, find_instances
-from langsplat_core.query.lookup import Lookup, build_lookup
 from langsplat_core.query.selection import Regions, build_regions
 from langsplat_core.query.taught import WordSpace, build_word_space, by_showing, compared, shown
 from langsplat_core.scene import CANONICAL_PHRASES, LEVELS, Calibration, LanguageField, Scene, TaughtWord
