@@ -71,8 +71,13 @@ class _EvalLabels(_Eval):
 
     def evaluate(self, benchmark: "Benchmark", profile: Profile) -> None:
         """Train the scenes with --train, score them, print the tables and write the files asked for."""
-        from langsplat_core.evaluation.report import beside_published, save_json, table
-        from langsplat_core.evaluation.run import Subject, run_benchmark
+        from langsplat_core.evaluation.report import (
+            Subject,
+            beside_published,
+            run_benchmark,
+            save_json,
+            table,
+        )
         from langsplat_core.semantics.encoders import load_text_encoder
 
         failed = self._train(benchmark) if self.train else {}
@@ -151,7 +156,7 @@ class EvalScanNet(_Eval):
     DATA is a folder of NAME/NAME_vh_clean_2.labels.ply; maps are NAME.npy, one class id per vertex."""
 
     def run(self) -> None:
-        from langsplat_core.evaluation.run import Subject
+        from langsplat_core.evaluation.report import Subject
         from langsplat_core.evaluation.scannet import point_table, read_scannet, run_scannet, save_point_json
         from langsplat_core.semantics.encoders import load_text_encoder
 

@@ -30,10 +30,9 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 from langsplat_core import __version__
 from langsplat_core.arrays import number, whole_number
 from langsplat_core.config import CODEC_CONFIGS, CodecConfig, annotations, check_settings, named_values
-from langsplat_core.errors import InputError, LangSplatError, optional_imports, printable_line
+from langsplat_core.errors import InputError, LangSplatError, end, is_import, optional_imports, printable_line
 from langsplat_core.io.files import NO_ROOM, check_output_file, check_output_folder, shown
 from langsplat_core.progress import Terminated
-from langsplat_core.signals import end, is_import
 
 log = logging.getLogger("langsplat")
 COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")

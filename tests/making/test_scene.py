@@ -16,7 +16,7 @@ from assets.making.render import Renderer
 from assets.making.scene import SEED, SIZE, VIEWS
 from langsplat_core.config import PictureConfig
 from langsplat_core.errors import EncoderError
-from langsplat_core.evaluation.scoring import intersection_over_union
+from langsplat_core.evaluation.report import intersection_over_union
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.query.answers import peak_pixel, splatted_relevancy
 from langsplat_core.query.engine import QueryEngine
