@@ -25,10 +25,10 @@ COMMANDS: Mapping[str, str] = MappingProxyType(
         "changes": "find.Changes",
         "describe": "describe.Describe",
         "select": "query.Select",
-        "teach": "teach.Teach",
+        "teach": "describe.Teach",
         "serve": "serve.Serve",
-        "map": "robots.Map",
-        "scale": "scenes.Scale",
+        "map": "geometry.Map",
+        "scale": "edit.Scale",
         "mesh": "geometry.Mesh",
         "register": "geometry.Register",
         "merge": "geometry.Merge",
@@ -36,11 +36,11 @@ COMMANDS: Mapping[str, str] = MappingProxyType(
         "crop": "edit.Crop",
         "clean": "edit.Clean",
         "export": "export.Export",
-        "convert": "scenes.Convert",
-        "compact": "scenes.Compact",
+        "convert": "export.Convert",
+        "compact": "edit.Compact",
         "inspect": "scenes.Inspect",
         "doctor": "scenes.Doctor",
-        "demo": "demo.Demo",
+        "demo": "scenes.Demo",
     }
 )
 # Name -> what it is about, and its commands.
@@ -56,7 +56,7 @@ GROUPS: Mapping[str, tuple[str, Mapping[str, str]]] = MappingProxyType(
         ),
         "bench": (
             "Speed against error, measured in one run.",
-            {"raster": "bench.BenchRaster", "query": "bench.BenchQuery"},
+            {"raster": "evaluate.BenchRaster", "query": "evaluate.BenchQuery"},
         ),
     }
 )

@@ -13,9 +13,8 @@ import tyro
 from PIL import Image, ImageDraw, ImageFont
 
 from langsplat_core.cli.geometry import read_transform, registered
-from langsplat_core.cli.query import Unit, print_json, unit_of
-from langsplat_core.cli.run import OutFile
-from langsplat_core.cli.teach import searchable
+from langsplat_core.cli.query import Unit, searchable, unit_of
+from langsplat_core.cli.run import EncoderOption, JsonOption, OutFile, TrainedScene, print_json
 from langsplat_core.config import CountOrZero, Positive
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.files import atomic_path
@@ -50,10 +49,8 @@ class Find:
     """File of the index (default: .langsplat-library in the folder)."""
     rebuild: bool = False
     """Read every scene again, whatever the index says."""
-    encoder: str = ""
-    """Text encoder folder or hub id, in place of the one the scenes name."""
-    json: bool = False
-    """Print JSON, lengths in world units."""
+    encoder: EncoderOption = ""
+    json: JsonOption = False
 
     def run(self) -> None:
         if len(self.words) < 2:
@@ -202,8 +199,7 @@ class Changes:
     """Say what changed between two scenes of one place: what appeared, is gone, moved, or has another colour.
     Places are in the first scene's frame."""
 
-    before: tyro.conf.Positional[Path]
-    """A trained scene, *.ply with its language field beside it."""
+    before: TrainedScene
     after: tyro.conf.Positional[Path]
     """Another one of the same place."""
     transform: Path | None = None
@@ -211,12 +207,10 @@ class Changes:
     to be in one frame."""
     register: bool = False
     """Find the transform from the surfaces of both."""
-    encoder: str = ""
-    """Text encoder folder or hub id, in place of the one the scenes name."""
+    encoder: EncoderOption = ""
     scale: Positive | None = None
     """Metres per world unit of the first scene, in place of what it says."""
-    json: bool = False
-    """Print JSON, lengths in world units."""
+    json: JsonOption = False
 
     def run(self) -> None:
         if self.register and self.transform is not None:

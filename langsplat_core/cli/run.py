@@ -8,6 +8,7 @@ done, and whose `run` does the work. The viewer's program ends the same way and 
 import contextlib
 import errno
 import io
+import json
 import logging
 import os
 import re
@@ -29,7 +30,14 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 
 from langsplat_core import __version__
 from langsplat_core.arrays import number, whole_number
-from langsplat_core.config import CODEC_CONFIGS, CodecConfig, annotations, check_settings, named_values
+from langsplat_core.config import (
+    CODEC_CONFIGS,
+    CodecConfig,
+    Positive,
+    annotations,
+    check_settings,
+    named_values,
+)
 from langsplat_core.errors import InputError, LangSplatError, end, is_import, optional_imports, printable_line
 from langsplat_core.io.files import NO_ROOM, check_output_file, check_output_folder, shown
 from langsplat_core.progress import Terminated
@@ -299,6 +307,11 @@ def _fail(program: str, message: str) -> int:
     return 2
 
 
+def print_json(content: Any) -> None:
+    """Print what a command found, for programs."""
+    print(json.dumps(content, indent=1))
+
+
 class OutputConsole(Console):
     """A console that leaves to `main` what happens when nobody reads any more; rich's own ends with 1."""
 
@@ -316,6 +329,22 @@ class Written:
 
 OutFile = Annotated[Path, Written("file")]
 OutFolder = Annotated[Path, Written("folder")]
+
+# Arguments that several commands have.
+_trained = tyro.conf.arg(help="A trained scene, *.ply with its language field beside it.")
+_taught = "Your own words, as `langsplat teach --into FILE` writes them, beside those of the scene."
+_encoder = tyro.conf.arg(help="Text encoder folder or hub id, in place of the one the scene names.")
+AnyScene = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="Any readable scene.")]
+TrainedScene = Annotated[tyro.conf.Positional[Path], _trained]
+WrittenScene = Annotated[
+    tyro.conf.Positional[Path], tyro.conf.arg(help="Scene to write: .ply, .spz or .splat.")
+]
+EncoderOption = Annotated[str, _encoder]
+JsonOption = Annotated[bool, tyro.conf.arg(help="Print JSON, lengths in world units.")]
+ScaleOption = Annotated[
+    Positive | None, tyro.conf.arg(help="Metres per world unit, in place of what the scene says.")
+]
+WordsOption = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help=_taught)]
 
 
 def check_arguments(command: object) -> None:

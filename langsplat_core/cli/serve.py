@@ -14,8 +14,8 @@ from PIL import Image
 
 from langsplat_core.arrays import Array
 from langsplat_core.cli.describe import outline_lines, outline_of
-from langsplat_core.cli.query import unit_of
-from langsplat_core.cli.teach import camera_of, searchable
+from langsplat_core.cli.query import camera_of, searchable, unit_of
+from langsplat_core.cli.run import EncoderOption
 from langsplat_core.errors import InputError, LangSplatError
 from langsplat_core.io.language import SUFFIX
 from langsplat_core.progress import silent
@@ -51,8 +51,7 @@ class Serve:
     """A trained scene, *.ply with its language field beside it, or a folder of such."""
     mcp: bool = False
     """Speak the Model Context Protocol on standard input and output; started by the agent's program."""
-    encoder: str = ""
-    """Text encoder folder or hub id, in place of the one a scene names."""
+    encoder: EncoderOption = ""
 
     def run(self) -> None:
         if not self.mcp:

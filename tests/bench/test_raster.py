@@ -16,7 +16,7 @@ from langsplat_core.bench.measure import (
     restart_peak,
 )
 from langsplat_core.bench.raster import plot, run_plan, sweep
-from langsplat_core.cli.bench import write_report
+from langsplat_core.cli.evaluate import write_report
 from langsplat_core.raster.reference import ReferenceRasterizer
 from tests.support.scenes import random_camera, random_gaussians, random_values
 

@@ -22,7 +22,7 @@ from assets.making.objects import EVERYTHING
 from assets.making.scene import SEED
 from assets.making.truth import Truth, TruthMasks, read_truth
 from langsplat_core.arrays import Array
-from langsplat_core.cli.bench import write_report
+from langsplat_core.cli.evaluate import write_report
 from langsplat_core.cli.run import OutFolder
 from langsplat_core.config import (
     AutoencoderConfig,
