@@ -16,48 +16,25 @@ from langsplat_core.errors import InputError
 
 FLAGS = ("-q", "--quiet", "-v", "--verbose")  # may precede a command
 # Name -> class, in a module beside this one that is imported when the command line needs it.
-COMMANDS: Mapping[str, str] = MappingProxyType(
-    {
-        "train": "train.Train",
-        "frames": "train.Frames",
-        "query": "query.QueryScene",
-        "find": "find.Find",
-        "changes": "find.Changes",
-        "describe": "describe.Describe",
-        "select": "query.Select",
-        "teach": "describe.Teach",
-        "serve": "serve.Serve",
-        "map": "geometry.Map",
-        "scale": "edit.Scale",
-        "mesh": "geometry.Mesh",
-        "register": "geometry.Register",
-        "merge": "geometry.Merge",
-        "transform": "edit.Transform",
-        "crop": "edit.Crop",
-        "clean": "edit.Clean",
-        "export": "export.Export",
-        "convert": "export.Convert",
-        "compact": "edit.Compact",
-        "inspect": "scenes.Inspect",
-        "doctor": "scenes.Doctor",
-        "demo": "scenes.Demo",
-    }
-)
+COMMANDS: Mapping[str, str] = MappingProxyType({
+    "train": "train.Train", "frames": "train.Frames", "query": "query.QueryScene", "find": "find.Find",
+    "changes": "find.Changes", "describe": "describe.Describe", "select": "query.Select",
+    "teach": "describe.Teach", "serve": "serve.Serve", "map": "geometry.Map", "scale": "edit.Scale",
+    "mesh": "geometry.Mesh", "register": "geometry.Register", "merge": "geometry.Merge",
+    "transform": "edit.Transform", "crop": "edit.Crop", "clean": "edit.Clean", "export": "export.Export",
+    "convert": "export.Convert", "compact": "edit.Compact", "inspect": "scenes.Inspect",
+    "doctor": "scenes.Doctor", "demo": "scenes.Demo",
+})  # fmt: skip
+_EVALUATIONS = {"lerf-ovs": "EvalLerfOvs", "3d-ovs": "EvalOvs3d", "scannet": "EvalScanNet"}
+_BENCHES = {"raster": "BenchRaster", "query": "BenchQuery"}
 # Name -> what it is about, and its commands.
 GROUPS: Mapping[str, tuple[str, Mapping[str, str]]] = MappingProxyType(
     {
-        "eval": (
-            "Measure a scene against ground truth.",
-            {
-                "lerf-ovs": "evaluate.EvalLerfOvs",
-                "3d-ovs": "evaluate.EvalOvs3d",
-                "scannet": "evaluate.EvalScanNet",
-            },
-        ),
-        "bench": (
-            "Speed against error, measured in one run.",
-            {"raster": "evaluate.BenchRaster", "query": "evaluate.BenchQuery"},
-        ),
+        name: (about, {word: f"evaluate.{command}" for word, command in members.items()})
+        for name, about, members in (
+            ("eval", "Measure a scene against ground truth.", _EVALUATIONS),
+            ("bench", "Speed against error, measured in one run.", _BENCHES),
+        )
     }
 )
 

@@ -20,7 +20,6 @@ from langsplat_core.cli.query import (
     instance_fields,
     pixel_in,
     pointed,
-    searchable,
     unit_of,
 )
 from langsplat_core.cli.run import EncoderOption, OutputConsole, TrainedScene, print_json
@@ -32,7 +31,7 @@ from langsplat_core.io.scenes import check_writable, companion_path
 from langsplat_core.pipeline.exporting import export_labels
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.describe import Describer, Entry, Words, look_at_pixel
-from langsplat_core.query.engine import QueryEngine, check_words
+from langsplat_core.query.engine import QueryEngine, check_words, searchable
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import LEVELS, LanguageField, Scene, TaughtWord
 from langsplat_core.scene.language import phrase_key

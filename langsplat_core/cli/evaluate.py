@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from langsplat_core.bench import QueryBenchConfig, RasterBenchConfig
-from langsplat_core.cli.query import searchable
 from langsplat_core.cli.run import EncoderOption, OutFile, OutFolder
 from langsplat_core.config import ClipConfig, MaskConfig, TrainConfig, TrainPreset, with_preset
 from langsplat_core.errors import InputError
@@ -18,6 +17,7 @@ from langsplat_core.evaluation.profiles import LERF_PROFILES, OVS_PROFILES, Lerf
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.language import SUFFIX
 from langsplat_core.progress import TerminalProgress
+from langsplat_core.query.engine import searchable
 from langsplat_core.semantics.encoders import load_text_encoder
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ import tyro
 from PIL import Image, ImageDraw, ImageFont
 
 from langsplat_core.cli.geometry import read_transform, registered
-from langsplat_core.cli.query import Unit, searchable, unit_of
+from langsplat_core.cli.query import Unit, unit_of
 from langsplat_core.cli.run import EncoderOption, JsonOption, OutFile, TrainedScene, print_json
 from langsplat_core.config import CountOrZero, Positive
 from langsplat_core.errors import EncoderError, InputError
@@ -21,7 +21,7 @@ from langsplat_core.io.files import atomic_path
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.changes import Change, changes
 from langsplat_core.query.describe import Describer
-from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.engine import QueryEngine, searchable
 from langsplat_core.query.finding import PICTURE, Answered, Hit, find
 from langsplat_core.query.library import Library, update_library
 from langsplat_core.raster import load_lifting_rasterizer

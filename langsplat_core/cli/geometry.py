@@ -10,7 +10,7 @@ import tyro
 from PIL import Image
 
 from langsplat_core.arrays import Array
-from langsplat_core.cli.query import found_answer, searchable, unit_of
+from langsplat_core.cli.query import found_answer, unit_of
 from langsplat_core.cli.run import AnyScene, EncoderOption, OutFile, OutFolder
 from langsplat_core.config import Count, LevelChoice, Positive
 from langsplat_core.errors import EncoderError, InputError, optional_imports
@@ -33,7 +33,7 @@ from langsplat_core.io.shapes import MESH_SUFFIXES, RGB, check_suffix, gltf_axes
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.describe import Describer
-from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.engine import QueryEngine, searchable
 from langsplat_core.scene import LEVELS, NO_NODE, Scene
 from langsplat_core.scene.surface import surface_weights
 from langsplat_core.scene.transform import Similarity, similarity, transform_scene

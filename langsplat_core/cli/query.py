@@ -25,7 +25,7 @@ from langsplat_core.config import Count, CountOrZero, LevelChoice, NotNegative, 
 from langsplat_core.errors import EncoderError, InputError, LangSplatError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.language import read_words
-from langsplat_core.io.scenes import check_keeps, check_writable, load_scene, save_scene
+from langsplat_core.io.scenes import check_keeps, check_writable, save_scene
 from langsplat_core.io.shapes import (
     MESH_SUFFIXES,
     POINT_SUFFIXES,
@@ -39,7 +39,7 @@ from langsplat_core.pipeline.evidence import draw_evidence, find_evidence, kept_
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.answers import QueryResult, decoded_relevancy, peak_pixel, splatted_relevancy
 from langsplat_core.query.compose import Number, check_phrase, count_things, joined, run_phrase
-from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder, no_field
+from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder, searchable
 from langsplat_core.query.finding import Hit
 from langsplat_core.query.grammar import Atom, Counted, Phrase, heads, unparse
 from langsplat_core.query.instances import Instance, hull
@@ -539,11 +539,3 @@ def camera_of(scene: Scene, index: int) -> Camera:
     if not 0 <= index < len(scene.cameras):
         raise InputError(f"--camera {index}: the scene has cameras 0 to {len(scene.cameras) - 1}")
     return scene.cameras[index]
-
-
-def searchable(path: Path) -> Scene:
-    """The scene of a file; InputError where it has no language field."""
-    scene = load_scene(path)
-    if scene.language is None:
-        raise InputError(f"{path}: {no_field(scene)}")
-    return scene

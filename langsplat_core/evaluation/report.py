@@ -37,10 +37,9 @@ from langsplat_core.evaluation.profiles import (
     file_name,
 )
 from langsplat_core.io.files import atomic_path, write_json
-from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import AnswerRule
-from langsplat_core.query.engine import LoadEncoder, QueryEngine, no_field
+from langsplat_core.query.engine import LoadEncoder, QueryEngine, searchable
 from langsplat_core.scene import LEVELS, Camera
 
 
@@ -465,10 +464,7 @@ def open_scene(
     path = subject.scene / f"{name}.ply" if subject.scene.is_dir() else subject.scene
     if not path.exists():
         raise InputError(f"{path}: no such scene; leave {name} out with --only, or name the right folder")
-    scene = load_scene(path)
-    if scene.language is None:
-        raise InputError(f"{path}: {no_field(scene)}")
-    return QueryEngine(scene, load_encoder, encoder_id=subject.encoder, rule=rule)
+    return QueryEngine(searchable(path), load_encoder, encoder_id=subject.encoder, rule=rule)
 
 
 def _scene_source(

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from threading import RLock
 from typing import Protocol
 
@@ -12,6 +13,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError, UnknownWordError
 from langsplat_core.io.language import SUFFIX, Words
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import (
     AnswerRule,
@@ -46,6 +48,14 @@ def no_field(scene: Scene) -> str:
     """The reason why a scene has no language field."""
     unread = [reason for reason in scene.unread if SUFFIX in reason]
     return f"it can be looked at, not searched: {unread[0]}" if unread else NO_FIELD
+
+
+def searchable(path: Path) -> Scene:
+    """The scene of a file; InputError where it has no language field."""
+    scene = load_scene(path)
+    if scene.language is None:
+        raise InputError(f"{path}: {no_field(scene)}")
+    return scene
 
 
 class TextEncoder(Protocol):

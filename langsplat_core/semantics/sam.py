@@ -359,14 +359,6 @@ def load_mask_source(config: MaskConfig, device: str = "auto") -> MaskSource:
         raise InputError(
             "masks.source sam: name the weights too, such as `--masks.sam facebook/sam-vit-huge`"
         )
-    return load_sam(config, device)
-
-
-def load_sam(config: MaskConfig, device: str = "auto") -> "SamMasks":
-    """Load the weights that `config.sam` names: a folder in Hugging Face layout or a hub id.
-
-    Raises EncoderError where they are absent or are not those of a SAM.
-    """
     return SamMasks(load_segmenter(config.sam, device), config, torch_device(device).startswith(HALF_ON))
 
 
