@@ -169,8 +169,6 @@ class Describe:
 def _plain(value: Any, sure: bool) -> Any:
     """Words, spots and entries, ready for JSON. A share of the softmax over a vocabulary is a probability too
     where that is `sure`."""
-    if isinstance(value, np.ndarray):
-        return value.tolist()
     if isinstance(value, tuple):
         return [_plain(item, sure) for item in value]
     if not is_dataclass(value):
@@ -242,7 +240,7 @@ def _outline_lines(nodes: list[dict[str, Any]], unit: Unit, depth: int) -> Itera
         word = "?" if node["word"] is None else f"{node['word']['phrase']}{_percent(node['word'])}"
         what = [
             node["level"],
-            f"{unit.format(np.array(node['size']), ' x ')} {unit.name}",
+            f"{unit.format(node['size'], ' x ')} {unit.name}",
             f"{node['count']} Gaussians",
         ]
         if any(node["votes"]):

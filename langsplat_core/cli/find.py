@@ -140,8 +140,8 @@ def _hit_fields(hit: Hit, library: Library) -> dict[str, Any]:
         "margin": hit.margin,
         "exact": answer is not None,
         "level": None if answer is None else LEVELS[answer.level],
-        "place": None if answer is None or answer.place is None else answer.place.tolist(),
-        "box": None if answer is None or answer.box is None else answer.box.tolist(),
+        "place": None if answer is None else answer.place,
+        "box": None if answer is None else answer.box,
         "metres_per_unit": hit.metres_per_unit,
     }
 
@@ -250,13 +250,5 @@ def _in_words(change: Change, unit: Unit) -> str:
 
 
 def _change_fields(change: Change) -> dict[str, Any]:
-    return {
-        "kind": change.kind,
-        "name": change.name,
-        "centre": change.centre.tolist(),
-        "box": change.box.tolist(),
-        "moved": None if change.moved is None else change.moved.tolist(),
-        "distance": change.distance,
-        "colours": None if change.colours is None else list(change.colours),
-        "share": change.share,
-    }
+    names = ("kind", "name", "centre", "box", "moved", "distance", "colours", "share")
+    return {name: getattr(change, name) for name in names}

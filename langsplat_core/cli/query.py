@@ -267,8 +267,8 @@ def _answer(
         "score": result.peak,
         "level": LEVELS[result.level],
         "scores": dict(zip(LEVELS, result.scores, strict=True)),
-        "place": None if result.place is None else result.place.tolist(),
-        "box": None if result.box is None else result.box.tolist(),
+        "place": result.place,
+        "box": result.box,
         "pixel": None,
         "pixel_score": None,
         "view": None if camera is None else camera.name,
@@ -464,14 +464,10 @@ def instance_fields(instance: Instance, number: int) -> dict[str, Any]:
         "mean": instance.mean,
         "share": instance.share,
         "gaussians": instance.count,
-        "centre": instance.centre.tolist(),
-        "size": instance.size.tolist(),
-        "box": instance.box.tolist(),
-        "oriented_box": {
-            "centre": box.centre.tolist(),
-            "rotation": box.axes.tolist(),
-            "half_extents": box.half_extents.tolist(),
-        },
+        "centre": instance.centre,
+        "size": instance.size,
+        "box": instance.box,
+        "oriented_box": {"centre": box.centre, "rotation": box.axes, "half_extents": box.half_extents},
     }
 
 

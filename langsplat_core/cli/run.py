@@ -24,6 +24,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any, Literal, Protocol
 
+import numpy as np
 import tyro
 from rich.console import Console
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
@@ -308,8 +309,8 @@ def _fail(program: str, message: str) -> int:
 
 
 def print_json(content: Any) -> None:
-    """Print what a command found, for programs."""
-    print(json.dumps(content, indent=1))
+    """Print what a command found, arrays too, for programs."""
+    print(json.dumps(content, indent=1, default=np.ndarray.tolist))
 
 
 class OutputConsole(Console):

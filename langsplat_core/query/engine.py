@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from threading import RLock
-from typing import Protocol
 
 import numpy as np
 
@@ -37,7 +36,7 @@ from langsplat_core.scene.surface import Surface, build_surface, build_tree, sur
 from langsplat_core.scene.tree import Tree
 from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE
 from langsplat_core.semantics.relevancy import Scale, relevancy_of
-from langsplat_core.semantics.vocabulary import FEWEST, everyday_vectors
+from langsplat_core.semantics.vocabulary import FEWEST, TextEncoder, everyday_vectors
 
 BATCH = 256  # phrases that are encoded, and compared with codewords, at a time
 SAME_ENCODER = 0.99  # least cosine of canonical vectors of one encoder, whatever rounds them
@@ -56,19 +55,6 @@ def searchable(path: Path) -> Scene:
     if scene.language is None:
         raise InputError(f"{path}: {no_field(scene)}")
     return scene
-
-
-class TextEncoder(Protocol):
-    """The text half of a CLIP model."""
-
-    def encode_texts(self, texts: list[str]) -> Array:
-        """(M, D) float32 unit vectors."""
-
-    def unknown_words(self, text: str) -> tuple[str, ...]:
-        """Words of `text` that the encoder was never taught; empty if it cannot tell."""
-
-    def near_words(self, word: str) -> tuple[str, ...]:
-        """Words it was taught that are written like an unknown one, the nearest first."""
 
 
 @dataclass(frozen=True)

@@ -191,7 +191,7 @@ class Family:
 
 
 class PhraseEncoder:
-    """The text half of a model, in float32; it satisfies `query.engine.TextEncoder`."""
+    """The text half of a model, in float32; it satisfies `vocabulary.TextEncoder`."""
 
     def __init__(self, weights: Weights, tower: TextTower) -> None:
         self.id = weights.id  # hub id or folder as it was asked for; "demo" for the bundled encoder

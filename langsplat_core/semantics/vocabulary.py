@@ -94,10 +94,17 @@ MIXED = 96  # phrases of two words
 FEWEST = 48  # phrases from which they tell what fits by chance
 
 
-class _TextEncoder(Protocol):
-    def encode_texts(self, texts: list[str]) -> Array: ...
+class TextEncoder(Protocol):
+    """The text half of a CLIP model."""
 
-    def unknown_words(self, text: str) -> tuple[str, ...]: ...
+    def encode_texts(self, texts: list[str]) -> Array:
+        """(M, D) float32 unit vectors."""
+
+    def unknown_words(self, text: str) -> tuple[str, ...]:
+        """Words of `text` that the encoder was never taught; empty if it cannot tell."""
+
+    def near_words(self, word: str) -> tuple[str, ...]:
+        """Words it was taught that are written like an unknown one, the nearest first."""
 
 
 def everyday_phrases(unknown_words: Callable[[str], Sequence[str]]) -> list[str]:
@@ -112,7 +119,7 @@ def everyday_phrases(unknown_words: Callable[[str], Sequence[str]]) -> list[str]
     return [*nouns, *sorted({f"{adjective} {noun}" for adjective, noun in pairs})]
 
 
-def everyday_vectors(encoder: _TextEncoder) -> Array | None:
+def everyday_vectors(encoder: TextEncoder) -> Array | None:
     """(V, D) float32 unit vectors of the everyday phrases, of float16 precision, as a scene keeps them; None
     for an encoder that was taught too few of them."""
     phrases = everyday_phrases(encoder.unknown_words)
