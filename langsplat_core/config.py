@@ -461,8 +461,7 @@ class PictureConfig:
     own_colours: bool = False  # heat in the colour of each query instead of the colour map
     threshold: Share = 0.5  # of a pixel's light from an answer's Gaussians from which it is segmented
     alpha_gate: Share = 0.3  # pixels with less alpha carry no relevancy
-    heat_scale: tuple[Share, Share] | None = (
-        None  # relevancies that are coldest and hottest; None: each answer's
-    )
+    # relevancies that are coldest and hottest; None: each answer's
+    heat_scale: tuple[Share, Share] | None = None
     background: tuple[Share, Share, Share] = (0.0, 0.0, 0.0)  # display values in [0, 1]
     transparent: bool = False  # no background: the image has a fourth channel, the scene's alpha

@@ -1,6 +1,5 @@
 """`langsplat mesh`, `register` and `merge`: surfaces as triangles, and two scenes of one place."""
 
-import json
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -276,8 +275,7 @@ class Map:
             pose = f"x {goal.x:.2f} y {goal.y:.2f} m, yaw {goal.yaw:.2f}"
             print(f"{phrase}: {pose}, {goal.distance:.2f} m from it")
         if self.goal:
-            with atomic_path(self.out / "goals.json") as path:
-                path.write_text(json.dumps(answers, indent=2) + "\n", encoding="utf-8")
+            write_json(self.out / "goals.json", answers)
         if missing:
             raise InputError(f"no goal for {'; '.join(missing)}")
 

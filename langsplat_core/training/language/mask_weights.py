@@ -139,14 +139,14 @@ class MaskGroups:
     vectors: Array  # (G, D) float32 unit vectors
 
 
-def group_masks(vectors: Sequence[Array], groups: int = GROUPS, seed: int = 0) -> MaskGroups:
+def group_masks(vectors: Sequence[Array], groups: int = GROUPS) -> MaskGroups:
     """vectors: of each view, (M, D) float32 unit CLIP vectors. At most `groups` groups; where there are not
     more masks than that, each is its own."""
     counts = [len(view) for view in vectors]
     joined = np.concatenate(vectors)
     if len(joined) <= groups:
         return MaskGroups(_per_view(np.arange(len(joined)), counts), joined)
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(0)
     sample = joined[np.sort(generator.permutation(len(joined))[:SAMPLE])]
     centres = spherical_kmeans(sample, groups, ROUNDS, generator=generator)
     return MaskGroups(_per_view(nearest_centres(joined, centres)[0], counts), centres)
@@ -255,9 +255,8 @@ def _row_levels(features: ImageFeatures) -> Array:
 # in 3D is known from MaskClustering, Yan et al. 2024; this is its plainest form.)
 
 SAME = 0.6  # overlap over union of what two masks claim from which they are one thing
-THING_SAMPLE = (
-    50_000  # Gaussians that decide which masks go together: what is compared grows with views squared
-)
+# Gaussians that decide which masks go together: what is compared grows with views squared
+THING_SAMPLE = 50_000
 
 
 def find_things(mask_weights: MaskWeights, counts: Sequence[int], level: int = len(LEVELS) - 1) -> Array:
