@@ -39,27 +39,10 @@ _HOMES = {
 }
 
 __all__ = [
-    "Camera",
-    "Gaussians",
-    "Intrinsics",
-    "LanguageField",
-    "QueryEngine",
-    "QueryResult",
-    "Rendering",
-    "Scene",
-    "TrainConfig",
-    "Words",
-    "load_lifting_rasterizer",
-    "load_rasterizer",
-    "load_scene",
-    "load_text_encoder",
-    "look_at",
-    "read_words",
-    "render",
-    "save_scene",
-    "train_scene",
-    "write_words",
-]
+    "Camera", "Gaussians", "Intrinsics", "LanguageField", "QueryEngine", "QueryResult", "Rendering",
+    "Scene", "TrainConfig", "Words", "load_lifting_rasterizer", "load_rasterizer", "load_scene",
+    "load_text_encoder", "look_at", "read_words", "render", "save_scene", "train_scene", "write_words",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -83,23 +83,11 @@ class UnknownWordError(EncoderError):
 
 # Optional packages: the extra of the distribution that brings each, and one line where one is missing.
 
-EXTRAS: Mapping[str, str] = MappingProxyType(  # name as imported -> extra, as in pyproject.toml
-    {
-        "torch": "train",
-        "pycolmap": "train",
-        "skimage": "train",
-        "transformers": "encoders",
-        "tokenizers": "encoders",
-        "huggingface_hub": "encoders",
-        "ftfy": "encoders",
-        "matplotlib": "plots",
-        "gsplat": "cuda",
-        "mcp": "agents",
-        "open3d": "geometry",
-        "av": "phones",
-        "pillow_heif": "phones",
-    }
-)
+EXTRAS: Mapping[str, str] = MappingProxyType({  # name as imported -> extra, as in pyproject.toml
+    "torch": "train", "pycolmap": "train", "skimage": "train", "transformers": "encoders",
+    "tokenizers": "encoders", "huggingface_hub": "encoders", "ftfy": "encoders", "matplotlib": "plots",
+    "gsplat": "cuda", "mcp": "agents", "open3d": "geometry", "av": "phones", "pillow_heif": "phones",
+})  # fmt: skip
 
 
 def remedy(package: str) -> str:

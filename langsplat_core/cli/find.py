@@ -13,7 +13,7 @@ import tyro
 from PIL import Image, ImageDraw, ImageFont
 
 from langsplat_core.cli.geometry import read_transform, registered
-from langsplat_core.cli.query import Unit, unit_of
+from langsplat_core.cli.query import Unit, once, unit_of
 from langsplat_core.cli.run import EncoderOption, JsonOption, OutFile, TrainedScene, print_json
 from langsplat_core.config import CountOrZero, Positive
 from langsplat_core.errors import EncoderError, InputError
@@ -58,14 +58,7 @@ class Find:
         if self.sheet is not None and self.sheet.suffix.lower() not in (".html", ".png"):
             raise InputError(f"--sheet {self.sheet}: name an .html or a .png file")
         phrases = [phrase for text in self.words[:-1] for phrase in split_phrases(text) or [text]]
-        loaded: dict[str, Any] = {}
-
-        def load(model: str) -> Any:
-            name = self.encoder or model
-            if name not in loaded:
-                loaded[name] = load_text_encoder(name)
-            return loaded[name]
-
+        load = once(load_text_encoder, self.encoder)
         with TerminalProgress() as progress:
             library = update_library(Path(self.words[-1]), self.index, load, progress, self.rebuild)
             answers = [each for phrase in phrases for each in find(library, phrase, load, self.top, progress)]

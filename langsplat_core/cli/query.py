@@ -93,7 +93,7 @@ class QueryScene:
         self._check()
         explain = _Explainer(self, scene) if self.why is not None else None
         camera = camera_of(scene, self.camera) if scene.cameras else None
-        engine = _engine(scene, _once(load_text_encoder), self.encoder, self.taught)
+        engine = _engine(scene, once(load_text_encoder), self.encoder, self.taught)
         unit = unit_of(scene, self.scale)
         found = [self._ask(engine, text, camera) for text in self._askable(engine, camera)]
         if self.like:
@@ -231,18 +231,22 @@ def _reasons(evidence: dict[str, Any] | None = None) -> list[str]:
     return [f"  why: {'; '.join([evidence['summary'], *said])}"]
 
 
-def _once(load: LoadEncoder) -> LoadEncoder:
-    """`load`, but a hub out of reach is not asked again by every phrase: it fails as it first did."""
-    failed: list[EncoderError] = []
+def once(load: LoadEncoder, instead: str = "") -> LoadEncoder:
+    """`load`, or `instead` of what it is asked for, but once: a hub out of reach is not asked again
+    either."""
+    known: dict[str, TextEncoder | EncoderError] = {}
 
     def load_once(model: str) -> TextEncoder:
-        if failed:
-            raise failed[0]
-        try:
-            return load(model)
-        except EncoderError as error:
-            failed.append(error)
-            raise
+        name = instead or model
+        if name not in known:
+            try:
+                known[name] = load(name)
+            except EncoderError as error:
+                known[name] = error
+        found = known[name]
+        if isinstance(found, EncoderError):
+            raise found
+        return found
 
     return load_once
 

@@ -27,12 +27,8 @@ from langsplat_core.semantics.encoder import OPEN_MODEL
 from langsplat_core.semantics.encoders import load_text_encoder
 
 OPTIONAL = ("torch", "transformers", "pycolmap", "matplotlib", "gsplat")
-LIBRARIES = {
-    "EGL": "libegl1",
-    "GL": "libgl1",
-    "X11": "libx11-6",
-    "usb-1.0": "libusb-1.0-0",
-}  # Debian's packages
+# Debian's packages
+LIBRARIES = {"EGL": "libegl1", "GL": "libgl1", "X11": "libx11-6", "usb-1.0": "libusb-1.0-0"}
 
 
 @dataclass(frozen=True)

@@ -358,21 +358,17 @@ class QueryEngine:
         progress(f"searching '{tidy(phrase)}'", 0.5)
         return self._answer(tidy(phrase), self.relevancy(vector), level)
 
-    def run_many(
-        self, phrases: Sequence[str], level: LevelChoice = "auto", progress: Progress = silent
-    ) -> list[QueryResult]:
+    def run_many(self, phrases: Sequence[str], level: LevelChoice = "auto") -> list[QueryResult]:
         """The answers of `run` to each of `phrases`, which are encoded and compared with the scene's meanings
         together. An answer keeps 17 bytes per Gaussian. Raises as `text_vector` does, before any is asked."""
-        results: list[QueryResult] = []
         plain = [phrase for phrase in phrases if not self.is_taught(phrase)]
-        relevancies = self._relevancies(self.text_vectors(plain, progress))
-        for phrase in phrases:
-            progress(f"searching '{tidy(phrase)}'", len(results) / len(phrases))
-            if self.is_taught(phrase):
-                results.append(self._by_showing(self.taught[phrase_key(phrase)], level))
-            else:
-                results.append(self._answer(tidy(phrase), next(relevancies), level))
-        return results
+        relevancies = self._relevancies(self.text_vectors(plain))
+        return [
+            self._by_showing(self.taught[phrase_key(phrase)], level)
+            if self.is_taught(phrase)
+            else self._answer(tidy(phrase), next(relevancies), level)
+            for phrase in phrases
+        ]
 
     def _answer(self, phrase: str, relevancy: Array, level: LevelChoice) -> QueryResult:
         if self._bars is None:
