@@ -14,11 +14,9 @@ LINE_LIMIT = 1000  # characters of a message: room for two long paths, not for a
 
 
 def printable_line(text: object, limit: int = LINE_LIMIT) -> str:
-    """`text` as one line that a terminal may show, at most `limit` characters long.
-
-    Runs of blanks and line ends become one blank, what cannot be printed (control characters, lone
-    surrogates) is escaped, and what is too long loses its middle.
-    """
+    """`text` as one line that a terminal may show, at most `limit` characters long. Runs of blanks and line
+    ends become one blank, what cannot be printed (control characters, lone surrogates) is escaped, and what
+    is too long loses its middle."""
     line = " ".join(
         "".join(c if c.isprintable() or c.isspace() else repr(c)[1:-1] for c in str(text)).split()
     )
@@ -42,11 +40,9 @@ def quoted(content: object, limit: int = 60) -> str:
 
 
 class LangSplatError(Exception):
-    """Base of every error that the command line turns into one line and exit code 2.
-
-    Whatever a file brought into the message, `str()` of it is a `printable_line`. Who quotes a file or
-    another program's error shortens it, with `printable_line` too.
-    """
+    """Base of every error that the command line turns into one line and exit code 2. Whatever a file brought
+    into the message, `str()` of it is a `printable_line`. Who quotes a file or another program's error
+    shortens it, with `printable_line` too."""
 
     def __str__(self) -> str:
         return printable_line(super().__str__())

@@ -130,11 +130,9 @@ def one_line(box: str) -> str:
 
 
 def parsed(program: str, kind: Any, args: Sequence[str], description: str | None = None) -> Any:
-    """The command of type `kind`, a dataclass or a union of subcommands, that the words `args` name.
-
-    Sets how much is said; -v and -q may stand anywhere. SystemExit as tyro raises it, with help and
-    completion scripts on stdout and complaints on stderr. InputError for completion of an unknown shell.
-    """
+    """The command of type `kind`, a dataclass or a union of subcommands, that the words `args` name. Sets how
+    much is said; -v and -q may stand anywhere. SystemExit as tyro raises it, with help and completion scripts
+    on stdout and complaints on stderr. InputError for completion of an unknown shell."""
     if args and args[0] in COMPLETION and args[1:2] and args[1] not in SHELLS:
         raise InputError(f"{args[0]} {args[1]}: there is {', '.join(SHELLS)}")
     line = make_dataclass(

@@ -111,11 +111,9 @@ def score_scene(
     pictures: Path | None = None,
     progress: Progress = silent,
 ) -> SceneScores:
-    """Score every query of a scene; `pictures`: a folder for one image per answer.
-
-    A frame's answers are complete, cut and all, before any mask of it is drawn. Raises InputError where a map
-    has another shape than the labelled image.
-    """
+    """Score every query of a scene; `pictures`: a folder for one image per answer. A frame's answers are
+    complete, cut and all, before any mask of it is drawn. Raises InputError where a map has another shape
+    than the labelled image."""
     scores: list[QueryScore] = []
     left_out = list(labelled.left_out)
     for done, frame in enumerate(labelled.frames):
@@ -418,11 +416,8 @@ def run_benchmark(
     pictures: Path | None = None,
     progress: Progress = silent,
 ) -> BenchmarkReport:
-    """Score `subject` on the scenes of `benchmark`, or those named by `only`.
-
-    Raises InputError for a scene or maps that do not belong to the labels, EncoderError where the text
-    encoder cannot be loaded.
-    """
+    """Score `subject` on the scenes of `benchmark`, or those named by `only`. Raises InputError for a scene
+    or maps that do not belong to the labels, EncoderError where the text encoder cannot be loaded."""
     if subject.paper_order and (subject.maps is not None or not isinstance(profile.rule, MapRule)):
         raise InputError(
             "--paper-order is for a scene under a protocol that reads relevancy maps; leave it out"

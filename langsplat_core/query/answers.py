@@ -178,10 +178,8 @@ def splatted_relevancy(view: View, relevancy: Array, alpha_gate: float) -> Array
 def decoded_relevancy(
     view: View, field: LanguageField, level: int, phrases: Array, alpha_gate: float
 ) -> Array:
-    """The paper's order: (Q, D) phrase vectors -> (H, W, Q) relevancy of the decoded pixel latents.
-
-    Raises InputError for a codebook, whose numbers cannot be blended.
-    """
+    """The paper's order: (Q, D) phrase vectors -> (H, W, Q) relevancy of the decoded pixel latents. Raises
+    InputError for a codebook, whose numbers cannot be blended."""
     if not field.codec.blends:
         raise InputError(
             f"the paper's order blends latents, and this scene has a {field.codec.kind}; train one with "
@@ -532,10 +530,8 @@ def locate(surface: Surface, smoothed: Array, threshold: float) -> tuple[Array, 
 
 
 def peak_pixel(relevancy: Array, window: int) -> tuple[int, int, float]:
-    """Peak (column, row, value) of a relevancy map (H, W) after a mean filter of `window` px (paper: 20).
-
-    The window never exceeds the image; borders repeat the edge pixels.
-    """
+    """Peak (column, row, value) of a relevancy map (H, W) after a mean filter of `window` px (paper: 20). The
+    window never exceeds the image; borders repeat the edge pixels."""
     window = max(1, min(window, *relevancy.shape))
     smooth = uniform_filter(np.asarray(relevancy, np.float64), size=window, mode="nearest")
     row, column = np.unravel_index(int(smooth.argmax()), smooth.shape)

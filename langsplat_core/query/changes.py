@@ -108,12 +108,10 @@ def changes(
     describers: tuple[Describer, Describer] | None = None,
     progress: Progress = silent,
 ) -> tuple[Change, ...]:
-    """What changed from the first scene to the second, the largest first of each of `KINDS`.
-
-    placed: (4, 4) similarity from the second scene's frame into the first one's; None: they are one.
-    describers: of both, for names. Raises InputError for a scene without cameras or language field, and for a
-    matrix that is no similarity.
-    """
+    """What changed from the first scene to the second, the largest first of each of `KINDS`. placed: (4, 4)
+    similarity from the second scene's frame into the first one's; None: they are one. describers: of both,
+    for names. Raises InputError for a scene without cameras or language field, and for a matrix that is no
+    similarity."""
     into = np.eye(4) if placed is None else similarity(placed).matrix
     before, after = _evidence(first.scene, second.scene, into, rasterizer, progress)
     home = (first, before, np.eye(4)), (second, after, into)

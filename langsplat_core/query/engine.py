@@ -177,9 +177,7 @@ class QueryEngine:
     def compare_with(self, phrases: Sequence[str] = (), progress: Progress = silent) -> None:
         """Take other canonical phrases (LERF, section 3.3: what everything is compared with) from now on;
         none: the scene's own again. With others no probability is said, since it was calibrated on those.
-
-        Raises as `text_vectors` does, and leaves everything as it was then.
-        """
+        Raises as `text_vectors` does, and leaves everything as it was then."""
         canonical = self.text_vectors(phrases, progress) if phrases else None
         self._canonical = canonical
         self.canonical_phrases = tuple(map(phrase_key, phrases)) or CANONICAL_PHRASES
@@ -187,10 +185,8 @@ class QueryEngine:
             self.__dict__.pop(made, None)
 
     def load_encoder(self, progress: Progress = silent) -> TextEncoder:
-        """The text encoder, loaded at the first call, which imports torch: seconds.
-
-        Raises EncoderError where it cannot be loaded, or where the engine was given no way to.
-        """
+        """The text encoder, loaded at the first call, which imports torch: seconds. Raises EncoderError where
+        it cannot be loaded, or where the engine was given no way to."""
         with self._turn:
             if self._encoder is None:
                 if self._load_encoder is None:
@@ -251,11 +247,9 @@ class QueryEngine:
         return self.load_encoder().unknown_words(phrase_key(phrase))
 
     def text_vector(self, phrase: str, progress: Progress = silent) -> Array:
-        """(D,) unit vector of a phrase: from the scene's phrasebook, else from the encoder.
-
-        Raises InputError for an empty phrase and one of stop words alone, UnknownWordError for words that the
-        encoder was never taught, and EncoderError for one that is not the scene's or cannot be loaded.
-        """
+        """(D,) unit vector of a phrase: from the scene's phrasebook, else from the encoder. Raises InputError
+        for an empty phrase and one of stop words alone, UnknownWordError for words that the encoder was never
+        taught, and EncoderError for one that is not the scene's or cannot be loaded."""
         return self.text_vectors([phrase], progress)[0]
 
     def text_vectors(self, phrases: Sequence[str], progress: Progress = silent) -> Array:

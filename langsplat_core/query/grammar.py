@@ -299,11 +299,9 @@ _EXCLUSIONS = tuple(
 
 
 def parse(text: str, names: Collection[str] = ()) -> Phrase:
-    """The tree of one query. names: keys of phrases that are one name, whatever words they have.
-
-    Raises InputError where nothing is named, where something is only excluded ("not the cup"), and for a text
-    beyond `MAX_CHARACTERS` or `MAX_ATOMS`.
-    """
+    """The tree of one query. names: keys of phrases that are one name, whatever words they have. Raises
+    InputError where nothing is named, where something is only excluded ("not the cup"), and for a text beyond
+    `MAX_CHARACTERS` or `MAX_ATOMS`."""
     if len(text) > MAX_CHARACTERS:
         raise InputError(f"a query of {len(text)} characters; use at most {MAX_CHARACTERS}")
     tokens = _with_names(tokens_of(text), names)

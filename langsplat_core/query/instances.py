@@ -45,13 +45,11 @@ def axis_aligned_box(points: Array) -> Array:
 
 
 def oriented_box(points: Array) -> OrientedBox:
-    """Box around (M, 3) points, M >= 1, between the `INNER` quantiles along each of its axes.
-
-    The axes begin as the principal ones of the points that are no strays, and are then turned about one
-    another to the least area of the box's faces: principal axes alone say nothing about how a square, a cube
-    or a round table top with something on it lies. Where the points leave axes open (a single point, a line)
-    they are some that fit.
-    """
+    """Box around (M, 3) points, M >= 1, between the `INNER` quantiles along each of its axes. The axes begin
+    as the principal ones of the points that are no strays, and are then turned about one another to the least
+    area of the box's faces: principal axes alone say nothing about how a square, a cube or a round table top
+    with something on it lies. Where the points leave axes open (a single point, a line) they are some that
+    fit."""
     columns = np.ascontiguousarray(points.T, np.float64)
     low, high = axis_aligned_box(points)[..., None]
     core = columns[:, ((columns >= low) & (columns <= high)).all(0)]
@@ -146,11 +144,8 @@ class Instance:
 
 
 def told_apart(surface: Surface, numbers: Array, wholes: Array | None, join: bool) -> list[Array]:
-    """Divide the Gaussians `numbers` (K,) of a surface into single things.
-
-    wholes: (N,) voted wholes, see `Tree.voted`, which tell apart things that touch; join: what is of one
-    whole is one, connected or not.
-    """
+    """Divide the Gaussians `numbers` (K,) of a surface into single things. wholes: (N,) voted wholes, see
+    `Tree.voted`, which tell apart things that touch; join: what is of one whole is one, connected or not."""
     if wholes is None:
         return surface.parts(numbers).each()
     owner = wholes[surface.rows[numbers]]
@@ -171,11 +166,9 @@ def find_instances(
     join: bool = False,
 ) -> tuple[Instance, ...]:
     """The instances among `members` (N,) bool, best first by score, of equal ones the larger first.
-
     relevancy: (N,) in [0, 1], at the level of the answer. wholes, join: see `told_apart`. at_most: only so
     many of the best. Crumbs are left out: parts of fewer than `CRUMB_COUNT` Gaussians on the surface, or of
-    less than `CRUMB_SHARE` of the largest part's extent. Where all are crumbs, the largest alone is kept.
-    """
+    less than `CRUMB_SHARE` of the largest part's extent. Where all are crumbs, the largest alone is kept."""
     every = np.flatnonzero(members)
     numbers = surface.anchors[every]
     near = numbers >= 0
@@ -250,11 +243,9 @@ class Mesh:
 
 
 def hull(instance: Instance, gaussians: Gaussians, colours: Array, name: str) -> Mesh:
-    """Hull around the instance's Gaussians that lie in its oriented box: strays would stretch it.
-
-    colours: (N, 3) of the scene's Gaussians, in [0, 1]; the mesh has the mean of its own. Raises InputError
-    where all lie at one point.
-    """
+    """Hull around the instance's Gaussians that lie in its oriented box: strays would stretch it. colours:
+    (N, 3) of the scene's Gaussians, in [0, 1]; the mesh has the mean of its own. Raises InputError where all
+    lie at one point."""
     box, rows = instance.oriented, instance.members
     means = gaussians.means[rows].astype(np.float64)
     inside = box.contains(means)

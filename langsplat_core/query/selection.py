@@ -34,10 +34,8 @@ class Regions:
     totals: tuple[Array, ...]  # (R,) float64 sums of their weights
 
     def means(self, values: Array) -> tuple[Array, ...]:
-        """(3, N) values of all Gaussians -> of every level the (R,) float64 opacity-weighted means.
-
-        In the order of the Gaussians and not of the surface: memory is read from front to back.
-        """
+        """(3, N) values of all Gaussians -> of every level the (R,) float64 opacity-weighted means. In the
+        order of the Gaussians and not of the surface: memory is read from front to back."""
         longest = max(len(total) for total in self.totals)
         sums = np.zeros((len(LEVELS) * PIECES, longest))
         workers = shared_workers()
@@ -54,9 +52,7 @@ class Regions:
 
     def best_parts(self, level: int, values: tuple[Array, ...]) -> Array:
         """(R, ...) the largest value among each region's parts at the level below; its own where it has none.
-
-        values: of each level, the (R, ...) values of its regions.
-        """
+        values: of each level, the (R, ...) values of its regions."""
         own = values[level]
         if level == 0:
             return own
@@ -238,11 +234,9 @@ def in_rectangle(seen: Projected, corner: Array, opposite: Array) -> Array:
 
 def in_polygon(seen: Projected, outline: Array) -> Array:
     """(N,) bool: inside the closed `outline` (K, 2), pixels, by the even-odd rule; nothing for fewer than
-    three corners. What lies exactly on an edge may count either way.
-
-    A ray from the centre to the right crosses an odd number of edges (Shimrat 1962, Algorithm 112). Centres
-    are sorted by height once, so that an edge meets only those that are level with it.
-    """
+    three corners. What lies exactly on an edge may count either way. A ray from the centre to the right
+    crosses an odd number of edges (Shimrat 1962, Algorithm 112). Centres are sorted by height once, so that
+    an edge meets only those that are level with it."""
     outline = np.asarray(outline, np.float64)
     check_array("outline", outline, ("K", 2))
     inside = np.zeros(len(seen.depths), bool)
@@ -287,12 +281,10 @@ def in_stroke(seen: Projected, path: Array, radius: float) -> Array:
 
 
 def on_surface(seen: Projected, depths: Array, size: tuple[int, int], behind: float = BEHIND) -> Array:
-    """(N,) bool: in the image and not hidden there: the depth of the centre is at most that of the surface
-    in its pixel and `behind` of it more. Where nothing is drawn, nothing hides.
-
-    depths: (H, W) camera z of the surface, world units, 0 where nothing is drawn; it may be coarser or finer
-    than the `size` (width, height) of the image that the centres were projected into.
-    """
+    """(N,) bool: in the image and not hidden there: the depth of the centre is at most that of the surface in
+    its pixel and `behind` of it more. Where nothing is drawn, nothing hides. depths: (H, W) camera z of the
+    surface, world units, 0 where nothing is drawn; it may be coarser or finer than the `size` (width, height)
+    of the image that the centres were projected into."""
     check_array("depths", depths, ("H", "W"))
     height, width = depths.shape
     columns, rows = np.floor(seen.pixels * (width / size[0], height / size[1])).T

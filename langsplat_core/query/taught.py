@@ -44,11 +44,9 @@ class WordSpace:
 
 
 def build_word_space(field: LanguageField, regions: Regions, votes: Array) -> WordSpace:
-    """The word space of a scene; that of all images where the scene keeps no everyday phrases.
-
-    votes: (K,) of the tree's nodes. Where masks voted, mean and rival are of those regions that have a vote:
-    the others are mostly fragments of walls and floors, many of one thing.
-    """
+    """The word space of a scene; that of all images where the scene keeps no everyday phrases. votes: (K,) of
+    the tree's nodes. Where masks voted, mean and rival are of those regions that have a vote: the others are
+    mostly fragments of walls and floors, many of one thing."""
     basis = np.eye(field.codec.vector_dim, dtype=np.float32)
     if field.everyday is not None and len(field.everyday) > 1:
         _, spreads, axes = np.linalg.svd(field.everyday - field.everyday.mean(0), full_matrices=False)

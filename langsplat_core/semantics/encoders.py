@@ -199,22 +199,18 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(  # by `model_type` of config.
 
 @optional_imports(EncoderError)
 def load_text_encoder(model: str, device: str = "cpu") -> PhraseEncoder:
-    """Load the text half of `model`: a folder, a file, a hub id, or "demo" for the bundled encoder.
-
-    The device is the CPU unless told otherwise, because a phrase takes it a few milliseconds.
-    Raises EncoderError where the weights are absent or are those of no family here.
-    """
+    """Load the text half of `model`: a folder, a file, a hub id, or "demo" for the bundled encoder. The
+    device is the CPU unless told otherwise, because a phrase takes it a few milliseconds. Raises EncoderError
+    where the weights are absent or are those of no family here."""
     weights = open_weights(model, model_path(model, "--encoder"), torch_device(device))
     return PhraseEncoder(weights, _family(weights).text(weights))
 
 
 @optional_imports(EncoderError)
 def load_encoder(model: str, device: str = "auto", batch: int = 32) -> Encoder:
-    """Load both halves of `model`: a folder, a file, a hub id, or "demo" for the bundled encoder.
-
-    batch: images per forward pass.
-    Raises EncoderError where the weights are absent or are those of no family here.
-    """
+    """Load both halves of `model`: a folder, a file, a hub id, or "demo" for the bundled encoder. batch:
+    images per forward pass. Raises EncoderError where the weights are absent or are those of no family
+    here."""
     weights = open_weights(model, model_path(model, "--clip.model"), torch_device(device))
     family = _family(weights)
     return Encoder(weights, family.text(weights), family.images(weights), batch)

@@ -139,10 +139,8 @@ SAM2_SIZES: Mapping[tuple[int, int], Hiera] = MappingProxyType(  # by width of t
 
 
 def open_weights(id: str, path: Path, device: str) -> Weights:
-    """The weights at `path`, a folder or a file that `weights.weights_path` found.
-
-    Raises EncoderError for a file that is damaged, or holds no tensors of a layout known here.
-    """
+    """The weights at `path`, a folder or a file that `weights.weights_path` found. Raises EncoderError for a
+    file that is damaged, or holds no tensors of a layout known here."""
     if path.is_dir() and is_hugging_face(path):
         return Weights(id, path, device)
     file = path if path.is_file() else next(path / name for name in OPEN_CLIP if (path / name).is_file())
@@ -203,10 +201,8 @@ class _Module:
 
 
 def _script_tensors(file: Path) -> dict[str, Any]:
-    """Tensors of a TorchScript archive, as OpenAI publishes CLIP, by their modules' names.
-
-    torch reads such an archive only by running it, so what holds the tensors is put into one of its own.
-    """
+    """Tensors of a TorchScript archive, as OpenAI publishes CLIP, by their modules' names. torch reads such
+    an archive only by running it, so what holds the tensors is put into one of its own."""
     import torch
 
     copy = io.BytesIO()
@@ -415,10 +411,8 @@ def _decoder_config(tensors: Tensors, first: str) -> Settings:
 
 
 def _sam2(tensors: dict[str, Any]) -> Converted:
-    """The half of a SAM 2 or 2.1 that sees single images; its memory of films is left out.
-
-    tensors: without "sam_" before the names of prompt encoder and mask decoder.
-    """
+    """The half of a SAM 2 or 2.1 that sees single images; its memory of films is left out. tensors: without
+    "sam_" before the names of prompt encoder and mask decoder."""
     import torch
 
     points = [tensors.pop(name) for name in SAM2_POINTS if _shape(tensors, name, 2)]

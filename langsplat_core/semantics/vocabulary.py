@@ -18,19 +18,15 @@ LONGEST = 80  # characters of a phrase: CLIP reads 77 tokens, and a whole paragr
 
 
 def bundled_vocabulary(name: Bundled) -> tuple[str, ...]:
-    """The phrases of a bundled list: everyday things, parts of things, colours, materials.
-
-    Raises InputError where it is missing from the installation.
-    """
+    """The phrases of a bundled list: everyday things, parts of things, colours, materials. Raises InputError
+    where it is missing from the installation."""
     return read_vocabulary(Path(str(files("langsplat_assets") / "vocabulary" / f"{name}.txt")))
 
 
 def read_vocabulary(path: Path) -> tuple[str, ...]:
-    """The phrases of a UTF-8 text file, one a line, in lower case, each once, in the file's order.
-
-    Empty lines and lines that begin with # do not count. Raises InputError for a file that cannot be read,
-    that has no phrase, or with a line that is none (no letter or digit, too long, no text), which is named.
-    """
+    """The phrases of a UTF-8 text file, one a line, in lower case, each once, in the file's order. Empty
+    lines and lines that begin with # do not count. Raises InputError for a file that cannot be read, that has
+    no phrase, or with a line that is none (no letter or digit, too long, no text), which is named."""
     try:
         lines = path.read_bytes().removeprefix(b"\xef\xbb\xbf").splitlines()
     except OSError as error:

@@ -263,9 +263,7 @@ def fit_codec(
 ) -> Codec:
     """(M, D) float32 unit CLIP vectors -> a codec for them; what phrases of the `vocabulary` find is what it
     may not change. Deterministic for a given seed on one machine. InputError for settings out of range.
-
-    further: (M', D) vectors that are not kept, but help a kind that interpolates between what it has seen.
-    """
+    further: (M', D) vectors that are not kept, but help a kind that interpolates between what it has seen."""
     check_settings(config, "--codec.")
     if further is not None and (KINDS[config.kind].blends or len(vectors) == 0):
         vectors = np.concatenate([further, vectors])

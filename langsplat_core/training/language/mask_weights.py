@@ -40,13 +40,11 @@ def spherical_kmeans(
     start: Array | None = None,
     generator: np.random.Generator | None = None,
 ) -> Array:
-    """At most `count` unit centres (K, D) float32 of (M, D) float32 unit vectors.
-
-    Begins at `start` (K' <= count centres) and adds vectors that these fit badly, drawn by their distance: a
-    quarter more than asked for, of which those are given up again, round by round, that would be missed
-    least. That finds the gaps which plain k-means leaves where two clusters share a centre. Fewer than
-    `count` come back where fewer different vectors are there.
-    """
+    """At most `count` unit centres (K, D) float32 of (M, D) float32 unit vectors. Begins at `start` (K' <=
+    count centres) and adds vectors that these fit badly, drawn by their distance: a quarter more than asked
+    for, of which those are given up again, round by round, that would be missed least. That finds the gaps
+    which plain k-means leaves where two clusters share a centre. Fewer than `count` come back where fewer
+    different vectors are there."""
     generator = generator or np.random.default_rng(0)
     centres = np.zeros((0, vectors.shape[1]), np.float32) if start is None else start
     extra = (count - len(centres)) * EXTRA
@@ -261,10 +259,8 @@ THING_SAMPLE = 50_000
 
 def find_things(mask_weights: MaskWeights, counts: Sequence[int], level: int = len(LEVELS) - 1) -> Array:
     """(N,) int32 number of the thing that each Gaussian belongs to, at a level, by default the coarsest;
-    NO_NODE where no mask of that level shows it.
-
-    counts: number of masks of each view. Things are numbered from the largest, by number of Gaussians.
-    """
+    NO_NODE where no mask of that level shows it. counts: number of masks of each view. Things are numbered
+    from the largest, by number of Gaussians."""
     numbers = masks_of_things(mask_weights, counts, level)
     size = int(numbers.max(initial=-1)) + 1
     of_mask = np.split(np.where(numbers >= 0, numbers, size).astype(np.int32), np.cumsum(counts)[:-1])
