@@ -72,7 +72,9 @@ def named_values(settings: object, option: str = "--") -> Iterator[tuple[str, An
         value, hint = getattr(settings, entry.name), hints[entry.name]
         name = option + entry.name.replace("_", "-")
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
-            yield from named_values(value, option if _is_flat(hint) else f"{name}.")
+            # of `tyro.conf.arg(name="")`, whose fields are options without its own name
+            is_flat = any(getattr(part, "name", None) == "" for part in annotations(hint))
+            yield from named_values(value, option if is_flat else f"{name}.")
         else:
             yield name, value, hint
 
@@ -97,11 +99,6 @@ def _kinds(hint: Any) -> Iterator[type]:
             yield from _kinds(part)
     elif isinstance(hint, type) and hint is not types.NoneType:
         yield hint
-
-
-def _is_flat(hint: Any) -> bool:
-    """True where a dataclass's fields are options without its own name: ``tyro.conf.arg(name="")``."""
-    return any(getattr(part, "name", None) == "" for part in annotations(hint))
 
 
 def _problem(setting: Setting) -> str | None:

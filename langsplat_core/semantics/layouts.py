@@ -166,9 +166,8 @@ def _read(id: str, file: Path) -> Tensors:
 
     if file.suffix == ".safetensors":
         return load_file(file)
-    if zipfile.is_zipfile(file) and any(
-        name.endswith("/constants.pkl") for name in zipfile.ZipFile(file).namelist()
-    ):
+    names = zipfile.ZipFile(file).namelist() if zipfile.is_zipfile(file) else []
+    if any(name.endswith("/constants.pkl") for name in names):
         try:
             found: Any = _script_tensors(file)
         except UNREADABLE as error:
@@ -181,14 +180,10 @@ def _read(id: str, file: Path) -> Tensors:
     found = found.get("state_dict", found.get("model", found)) if isinstance(found, dict) else {}
     if not isinstance(found, dict):
         raise ValueError("it holds no named tensors")
-    if any(
-        tensor.nbytes > file.stat().st_size for tensor in found.values() if isinstance(tensor, torch.Tensor)
-    ):
+    tensors = {name: tensor for name, tensor in found.items() if isinstance(tensor, torch.Tensor)}
+    if any(tensor.nbytes > file.stat().st_size for tensor in tensors.values()):
         raise ValueError("a tensor claims more numbers than the file holds")
-    names = {
-        name: name.removeprefix("module.").removeprefix("text.") for name in found if isinstance(name, str)
-    }
-    return {names[name]: found[name] for name in names if isinstance(found[name], torch.Tensor)}
+    return {str(name).removeprefix("module.").removeprefix("text."): tensors[name] for name in tensors}
 
 
 class _Module:

@@ -202,7 +202,10 @@ def lift_by_gradient(
     x = np.zeros_like(start) if published else start.copy()
     features = torch.from_numpy(x)  # the same memory
     adam = torch.optim.Adam([features], config.lr, BETAS, EPSILON, fused=True)
-    targets = [_target(camera, features, codec) for camera, features in views]
+    targets = [
+        _Target(camera, np.asarray(seen.labels, np.int32), plain(codec.encode(seen.vectors)))
+        for camera, seen in views
+    ]
     weights = _Weights(rasterizer, gaussians, [camera for camera, _ in views], settings)
     for step, index in enumerate(_shuffled(len(views), config.steps, config.seed), 1):
         loss, by_y = loss_and_gradient(weights.of(index), targets[index], blended(x, published))
@@ -265,10 +268,6 @@ def _compare(
                 total += abs(difference)
                 signs[row, column, channel] = share * np.sign(difference)
         losses[row] = total
-
-
-def _target(camera: Camera, features: ImageFeatures, codec: Codec) -> _Target:
-    return _Target(camera, np.asarray(features.labels, np.int32), plain(codec.encode(features.vectors)))
 
 
 def _shuffled(views: int, steps: int, seed: int) -> Iterator[int]:
