@@ -8,61 +8,21 @@
   software OpenGL driver holds. Linux only; elsewhere unknown.
 """
 
-import ctypes
-import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import scipy.sparse
 
 from langsplat_core.arrays import Array
+from langsplat_core.bench import peak_memory, restart_peak
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.raster.protocol import LiftingView, Rasterizer
 from langsplat_core.raster.reference import Footprints, ReferenceView, project, rim
 from langsplat_core.scene import Camera, Gaussians, look_at
-
-_STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-
-
-def resident_memory() -> int | None:
-    """Bytes of this process now; None where the system does not tell."""
-    return _status("VmRSS")
-
-
-def peak_memory() -> int | None:
-    """Most bytes of this process since it began or since `restart_peak`. Not getrusage: its maximum is
-    inherited from the parent process on Linux."""
-    return _status("VmHWM")
-
-
-def restart_peak() -> int | None:
-    """Give free pages back and forget the peak; returns the bytes now, None where that cannot be done."""
-    if not (sys.platform.startswith("linux") and _CLEAR.exists()):
-        return None
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc has it
-    try:
-        if trim is not None:
-            trim(0)
-        _CLEAR.write_text("5")
-    except OSError:
-        return None
-    return resident_memory()
-
-
-def _status(key: str) -> int | None:
-    try:
-        found = re.search(rf"{key}:\s*(\d+) kB", _STATUS.read_text())
-    except OSError:
-        return None
-    return int(found[1]) * 1024 if found else None
-
-
-# The measurements.
 
 GRIDS = ((16, 12), (8, 6), (4, 3))  # cells of subparts, parts and wholes: 252 labels in all
 MIB = 2**20
