@@ -198,12 +198,8 @@ def _percent(described: dict[str, Any]) -> str:
 def _print_inventory(entries: list[dict[str, Any]]) -> None:
     table = Table("what", "also", "level", "p %", "surface %", "looks", "centre", box=None)
     for entry in entries:
-        names = (
-            entry["phrase"],
-            ", ".join(entry["also"]),
-            entry["level"],
-            _percent(entry).strip(" %") or "-",
-        )
+        sure = _percent(entry).strip(" %") or "-"
+        names = (entry["phrase"], ", ".join(entry["also"]), entry["level"], sure)
         for number, spot in enumerate(entry["spots"]):
             centre = " ".join(f"{value:.2f}" for value in spot["centre"])
             start = names if number == 0 else ("", "", "", "")

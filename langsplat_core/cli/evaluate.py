@@ -168,13 +168,8 @@ class EvalScanNet(_Eval):
 
         scene, data = self.scene_and_data()
         with TerminalProgress() as progress:
-            report = run_scannet(
-                read_scannet(data),
-                Subject(scene, self.maps, self.encoder),
-                load_text_encoder,
-                self.only,
-                progress,
-            )
+            subject = Subject(scene, self.maps, self.encoder)
+            report = run_scannet(read_scannet(data), subject, load_text_encoder, self.only, progress)
         print(point_table(report))
         if self.json is not None:
             save_point_json(self.json, report)

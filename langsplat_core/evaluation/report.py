@@ -359,13 +359,8 @@ def beside_published(report: BenchmarkReport) -> str:
     if not scenes:
         return ""
     means = summary(report)
-    ours = {
-        name: (
-            100 * means[name].iou,
-            None if means[name].localisation is None else 100 * (means[name].localisation or 0),
-        )
-        for name in scenes
-    }
+    own = {name: (means[name].iou, means[name].localisation) for name in scenes}
+    ours = {name: (100 * iou, None if place is None else 100 * place) for name, (iou, place) in own.items()}
     lines = [
         f"| mIoU % / localisation % | {' | '.join(scenes)} | mean |",
         "|---|" + "---|" * (len(scenes) + 1),

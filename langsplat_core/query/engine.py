@@ -368,16 +368,8 @@ class QueryEngine:
         if self._bars is None:
             found = self.field.reading.found
             return by_peak(phrase, relevancy, self.surface, self.scale, found, level)
-        return by_regions(
-            phrase,
-            relevancy,
-            self.scene.gaussians.means,
-            self.regions,
-            self.scale,
-            self._bars,
-            self.calibration,
-            level,
-        )
+        means, judged = self.scene.gaussians.means, (self.scale, self._bars, self.calibration)
+        return by_regions(phrase, relevancy, means, self.regions, *judged, level)
 
     @cached_property
     def word_space(self) -> WordSpace:
