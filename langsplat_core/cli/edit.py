@@ -4,7 +4,7 @@ them goes along."""
 import math
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import tyro
@@ -12,8 +12,6 @@ from rich.table import Table
 
 from langsplat_core.arrays import Array
 from langsplat_core.cli.run import AnyScene, OutFile, OutputConsole, WrittenScene, print_json
-from langsplat_core.compaction.clean import CleanReport, clean_scene
-from langsplat_core.compaction.compact import CompactReport, compact_scene
 from langsplat_core.config import CleanConfig, CompactConfig, Positive, Range
 from langsplat_core.errors import InputError
 from langsplat_core.io.ply import write_metres
@@ -38,6 +36,10 @@ from langsplat_core.scene.transform import (
     transform_scene,
     turning,
 )
+
+if TYPE_CHECKING:
+    from langsplat_core.compaction.clean import CleanReport
+    from langsplat_core.compaction.compact import CompactReport
 
 Coordinate = Annotated[float, Range(-1e12, 1e12)]
 Point = tuple[Coordinate, Coordinate, Coordinate]
@@ -144,6 +146,8 @@ class Clean:
     config: Annotated[CleanConfig, tyro.conf.arg(name="")] = field(default_factory=CleanConfig)
 
     def run(self) -> None:
+        from langsplat_core.compaction.clean import clean_scene  # pycolmap: not every install has it
+
         with TerminalProgress() as progress:
             report = clean_scene(self.scene, self.out, self.config, self.photos, progress)
         if self.json:
@@ -152,7 +156,7 @@ class Clean:
         print(*_lines(report), f"written: {self.out}", sep="\n")
 
 
-def _lines(report: CleanReport) -> list[str]:
+def _lines(report: "CleanReport") -> list[str]:
     how = "on photographs" if report.assumed_psnr is None else f"if the scene has {report.assumed_psnr:g} dB"
     lines = [
         f"removed: {report.removed} of {report.gaussians} Gaussians: {report.regions} in small regions, "
@@ -191,6 +195,8 @@ class Compact:
     config: Annotated[CompactConfig, tyro.conf.arg(name="")] = field(default_factory=CompactConfig)
 
     def run(self) -> None:
+        from langsplat_core.compaction.compact import compact_scene
+
         out = self.out or self.scene.with_name(self.scene.name.split(".")[0] + ".compact.ply")
         with TerminalProgress() as progress:
             report = compact_scene(self.scene, out, self.config, self.photos, progress)
@@ -201,7 +207,7 @@ class Compact:
         print(*_notes(report), f"written: {out}", sep="\n")
 
 
-def _table(report: CompactReport) -> Table:
+def _table(report: "CompactReport") -> Table:
     table = Table("", "before", "after", "after / before")
     for column in table.columns[1:]:
         column.justify = "right"
@@ -220,7 +226,7 @@ def _table(report: CompactReport) -> Table:
     return table
 
 
-def _notes(report: CompactReport) -> list[str]:
+def _notes(report: "CompactReport") -> list[str]:
     how = (
         "measured on photographs"
         if report.assumed_psnr is None
