@@ -16,7 +16,7 @@ from threading import Barrier
 import numpy as np
 import pytest
 
-from langsplat_core.cli.bench import write_report
+from langsplat_core.cli.evaluate import write_report
 from langsplat_core.cli.run import main
 from langsplat_core.errors import InputError
 from langsplat_core.io.cameras import write_cameras

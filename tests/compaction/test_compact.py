@@ -7,7 +7,7 @@ import pytest
 
 from langsplat_core.arrays import psnr
 from langsplat_core.cli import run as command_line
-from langsplat_core.cli.scenes import Compact
+from langsplat_core.cli.edit import Compact
 from langsplat_core.compaction import compact
 from langsplat_core.compaction.compact import (
     ALONE,
