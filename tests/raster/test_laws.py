@@ -5,7 +5,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -68,23 +67,19 @@ def slow(request: pytest.FixtureRequest) -> bool:
     return bool(request.config.getoption("--slow"))
 
 
-def view_of(backend: Backend, case: Drawn) -> Any:
-    return backend.raster.view(*case)
-
-
 @pytest.mark.long
 def test_finite_and_between_0_and_1(backend: Backend, slow: bool) -> None:
     """Values in [0, 1] give an image in [0, alpha], and the weights of a pixel add up to alpha."""
 
     def law(case: Drawn) -> None:
-        n, view = len(case[0]), view_of(backend, case)
+        n, view = len(case[0]), backend.raster.view(*case)
         image, alpha = view.splat(np.column_stack([random_values(n, 2), np.ones(n, np.float32)]))
         assert np.isfinite(image).all()
         assert alpha.min() >= 0
-        assert alpha.max() <= 1
+        assert alpha.max() <= (1 - 0.99e-4 if backend.stops_early else 1)
         assert image.min() >= 0
         assert (image.max(-1) <= alpha + 1e-6).all()
-        np.testing.assert_allclose(image[..., 2], alpha, atol=2e-6)
+        np.testing.assert_allclose(image[..., 2], alpha, atol=1e-12 if backend.name == "reference" else 2e-6)
         assert np.isfinite(view.depth()).all()
 
     over_random_cases(law, slow)
@@ -95,7 +90,7 @@ def test_linear(backend: Backend, slow: bool) -> None:
     atol = {"reference": 1e-12, "opengl-half": 2.5e-2}.get(backend.name, 1e-5)
 
     def law(case: Drawn) -> None:
-        n, view = len(case[0]), view_of(backend, case)
+        n, view = len(case[0]), backend.raster.view(*case)
         x, y = (random_values(n, 2, seed).astype(np.float64) for seed in (1, 2))
         mixed = view.splat(2 * x - 3 * y)[0]
         np.testing.assert_allclose(mixed, 2 * view.splat(x)[0] - 3 * view.splat(y)[0], atol=atol)
@@ -109,10 +104,11 @@ def test_adjoint(backend: Backend, slow: bool) -> None:
         pytest.skip("it has no adjoint")
 
     def law(case: Drawn) -> None:
-        view, camera = view_of(backend, case), case[1]
+        view, camera = backend.raster.view(*case), case[1]
         x = random_values(len(case[0]), 3)
         y = np.random.default_rng(0).normal(size=(camera.height, camera.width, 3)).astype(np.float32)
-        assert_adjoint(lambda v: view.splat(v)[0], view.gather, x, y)
+        rtol = 1e-12 if backend.name == "reference" else 1e-5
+        assert_adjoint(lambda v: view.splat(v)[0], view.gather, x, y, rtol)
 
     over_random_cases(law, slow)
 
@@ -131,7 +127,7 @@ def test_equal_to_the_reference(fast_backend: Backend, slow: bool) -> None:
         reference = ReferenceRasterizer().view(gaussians, camera, expected)
         band = reference.cut_off_band(fast_backend.band)
         want, want_alpha = reference.splat(x)
-        image, alpha = view_of(fast_backend, case).splat(x)
+        image, alpha = fast_backend.raster.view(*case).splat(x)
         error = np.maximum(np.abs(image - want).max(-1), np.abs(alpha - want_alpha))
         flipped += int((error[band] > fast_backend.tolerance).sum())
         pixels += error.size
@@ -220,10 +216,9 @@ def run_case(case: Case, drawing: Drawing, backend: Backend, measured: Measure) 
         compare(seen, measured)
     if isinstance(seen.view, LiftingView):
         check_adjoint(seen)
+        check_frozen(seen)
     if hasattr(seen.view, "backward"):
         check_gradients(seen)
-    if isinstance(seen.view, LiftingView):
-        check_frozen(seen)
     return seen
 
 
