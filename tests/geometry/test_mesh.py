@@ -1,7 +1,5 @@
 """Meshes of rooms whose surfaces are known, holes and their closing, files; and two scenes as one."""
 
-import json
-import struct
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +9,6 @@ from scipy.spatial.transform import Rotation
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.geometry.mesh import Mesh, close_holes, fuse, generated_cameras, surface_depth
-from langsplat_core.io.shapes import gltf_axes, write_meshes
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.scene import Gaussians, Scene, look_at
 from tests.support.box_rooms import FLOOR, WALL, box_room
@@ -145,38 +142,3 @@ def test_nothing_to_see_is_refused():
         fuse(ball(), views=1000)
     with pytest.raises(InputError, match="see no surface"):
         fuse(Scene(random_gaussians(0)))
-
-
-def triangle() -> Mesh:
-    return Mesh(np.eye(3), np.array([[0, 1, 2]]), np.array([[1.0, 0, 0], [0, 0.5, 0], [0, 0, 0]]), "a b")
-
-
-def test_glb_holds_places_colours_and_axes(tmp_path):
-    scene = replace(box_room(), metres_per_unit=2.0)
-    write_meshes(tmp_path / "a.glb", [triangle(), triangle()], gltf_axes(scene))
-    data = (tmp_path / "a.glb").read_bytes()
-    magic, version, size, length, kind = struct.unpack("<4sIII4s", data[:20])
-    assert (magic, version, size, kind) == (b"glTF", 2, len(data), b"JSON")
-    document, binary = json.loads(data[20 : 20 + length]), data[28 + length :]
-    assert document["buffers"][0]["byteLength"] == len(binary)
-    assert len(document["meshes"]) == 2
-    np.testing.assert_array_equal(np.frombuffer(binary[:36], "<f4").reshape(3, 3), np.eye(3))
-    colours = np.frombuffer(binary[36:60], "<u2").reshape(3, 4) / 65_535
-    np.testing.assert_allclose(colours[:, :3].sum(1), [1, 0.2140, 0], atol=1e-4)  # linear
-    matrix = np.array(document["nodes"][0]["matrix"]).reshape(4, 4).T
-    np.testing.assert_allclose(matrix @ [0, 0, 1, 1], [0, 2, 0, 1], atol=1e-6)  # up, metres
-    import open3d
-
-    write_meshes(tmp_path / "one.glb", [triangle()])
-    read = open3d.io.read_triangle_mesh(str(tmp_path / "one.glb"))
-    np.testing.assert_allclose(np.asarray(read.vertices), np.eye(3))
-
-
-@pytest.mark.parametrize("suffix", [".ply", ".obj"])
-def test_other_programs_read_colours_of_vertices(tmp_path, suffix):
-    import open3d
-
-    write_meshes(tmp_path / f"a{suffix}", [triangle()])
-    read = open3d.io.read_triangle_mesh(str(tmp_path / f"a{suffix}"))
-    np.testing.assert_allclose(np.asarray(read.vertices), np.eye(3))
-    np.testing.assert_allclose(np.asarray(read.vertex_colors), triangle().colour, atol=0.003)
