@@ -83,7 +83,7 @@ def test_splat_extremes(tmp_path):
 WANT = random_gaussians(30, sh_degree=1)
 SPLAT, KSPLAT = splat_bytes(WANT), ksplat_bytes([WANT], 2)
 PARTS = "not a whole number of Gaussians of 32"
-MALFORMED_SPLAT = {
+BROKEN_SPLAT = {
     "nothing": (b"", PARTS),
     "a byte less": (SPLAT[:-1], PARTS),
     "a byte more": (SPLAT + b"\0", PARTS),
@@ -133,7 +133,7 @@ def patched(content: bytes, at: int, code: str, value: int) -> bytes:
 
 
 MISSING = "truncated: .* bytes are missing"
-MALFORMED_KSPLAT = {
+BROKEN_KSPLAT = {
     case: (patched(KSPLAT, *change), message)
     for case, (change, message) in {
         "another version": ((0, "B", 1), "version 1.1"),
@@ -295,7 +295,7 @@ def with_first_frame(frame: bytes) -> bytes:
     return patched(SPZ_4[:start], 32, "<Q", len(frame)) + frame + SPZ_4[start + old :]
 
 
-MALFORMED_SPZ = {
+BROKEN_SPZ = {
     "words": (b"words of no meaning, none", "not an .spz file"),
     "zipped words": (gzip.compress(b"words of no meaning"), "not an .spz file"),
     "version 0": (patched(SPZ, 4, "<I", 0), "version 0"),
@@ -410,7 +410,7 @@ def meta_with(**entries: object) -> dict[str, bytes]:
     return SOG | {"meta.json": json.dumps(meta).encode()}
 
 
-MALFORMED_SOG = {
+BROKEN_SOG = {
     "version 1": (meta_with(version=None), "SOG version 1; only 2 is read"),
     "version 3": (meta_with(version=3), "SOG version 3"),
     "no count": (meta_with(count=None), "count is missing"),
@@ -436,10 +436,10 @@ MALFORMED_SOG = {
     "a list": (SOG | {"meta.json": b"[]"}, "expected a JSON object"),
 }
 TABLES = {
-    ".splat": MALFORMED_SPLAT,
-    ".ksplat": MALFORMED_KSPLAT,
-    ".spz": MALFORMED_SPZ,
-    ".sog": MALFORMED_SOG,
+    ".splat": BROKEN_SPLAT,
+    ".ksplat": BROKEN_KSPLAT,
+    ".spz": BROKEN_SPZ,
+    ".sog": BROKEN_SOG,
 }
 
 

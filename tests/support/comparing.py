@@ -99,8 +99,8 @@ def assert_same_field(got: LanguageField, want: LanguageField) -> None:
         np.testing.assert_array_equal(got.phrasebook[phrase], vector)
 
 
-def assert_refused(read: Callable[[Path], object], path: Path, message: str = "") -> None:
-    """A FormatError of one short printable line that begins with the path and matches `message`."""
+def assert_refused(read: Callable[[Path], object], path: Path, message: str | None = None) -> None:
+    """A FormatError of one short printable line that begins with the path and matches `message`, if given."""
     with pytest.raises(FormatError, match=message) as caught:
         read(path)
     said = str(caught.value)
