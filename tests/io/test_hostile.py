@@ -1,4 +1,4 @@
-"""Archives, arrays, pictures and clouds of points that are malformed, and files made to exhaust memory."""
+"""Files that are malformed, made to exhaust memory, or damaged at random."""
 
 import gzip
 import io
@@ -8,7 +8,7 @@ import struct
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -31,12 +31,14 @@ from langsplat_core.io.hostile import (
 from langsplat_core.io.language import read_language, write_language
 from langsplat_core.io.ply import read_ply
 from langsplat_core.io.ply_table import GREY, read_cloud
-from langsplat_core.io.scenes import load_gaussians
+from langsplat_core.io.scenes import FORMATS, load_gaussians
 from langsplat_core.io.spz import read_spz_scene
 from langsplat_core.pipeline.stages import read_arrays
 from langsplat_core.scene import LanguageField
 from tests.support.comparing import assert_refused
+from tests.support.file_kinds import KINDS
 from tests.support.file_samples import plain_ply, random_field, sog_files, spz_bytes, write_folder
+from tests.support.mutation import FuzzRun, Outcome
 from tests.support.scenes import random_gaussians
 
 
@@ -402,3 +404,74 @@ def test_a_sidecar_with_weights_that_do_not_fit_each_other(tmp_path, bounded):
                 changed = json.dumps(header | {name: header[name] | {"shape": shape}}).encode()
                 path.write_bytes(struct.pack("<Q", len(changed)) + changed + raw[8 + size :])
                 assert_refused(sidecar, path)
+
+
+# Every input format, among them every row of the table of scene formats, against thousands of damaged files:
+# read, or refused in one line, and nothing else.
+
+SEEDS, MUTANTS = (1, 2), 3000  # of the slow tier; of a kind and seed
+# In which a byte that is missing cannot go unseen, nor can another format's file be taken for one.
+STRICT = ["INRIA PLY", "compressed PLY", "SOG", "SPZ 3", "SPZ 4", ".splat", ".ksplat"]
+STRICT += ["sidecar", "cameras.json"]
+
+
+def tried(name: str, folder: Path, contents: Iterable[bytes]) -> Outcome:
+    """What became of each, as the contents of a file of the kind."""
+    outcome = FuzzRun(folder / KINDS[name].file, KINDS[name].read).run(iter(contents))
+    assert not outcome.faults, outcome.summary()
+    return outcome
+
+
+def fuzz(name: str, folder: Path, count: int, seed: int) -> Outcome:
+    """What became of `count` mutants, after the good samples were read without a word."""
+    kind, rng = KINDS[name], np.random.default_rng(seed)
+    samples = kind.samples(folder)
+    good = tried(name, folder, samples)
+    assert (good.loaded, good.warned) == (len(samples), 0), good.summary()
+    mutants = (kind.damage(samples[number % len(samples)], samples, rng) for number in range(count))
+    outcome = tried(name, folder, mutants)
+    assert outcome.refused + outcome.loaded == outcome.tried
+    assert outcome.refused + outcome.warned > outcome.tried / 50  # the mutations do hurt
+    return outcome
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", KINDS)
+def test_mutants(tmp_path: Path, name: str, request: pytest.FixtureRequest) -> None:
+    seed = request.config.getoption("--seed")
+    for used in SEEDS if seed is None else (seed,):
+        folder = tmp_path / str(used)
+        folder.mkdir()
+        print(f"{name}, seed {used}: {fuzz(name, folder, MUTANTS, used).summary()}")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", KINDS)
+def test_a_few_mutants(tmp_path: Path, name: str) -> None:
+    fuzz(name, tmp_path, 60, seed=0)
+
+
+def test_every_scene_format_is_among_the_kinds() -> None:
+    assert {row.suffix for row in FORMATS} <= {Path(kind.file).suffix for kind in KINDS.values()}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", STRICT)
+def test_truncated_at_many_places(tmp_path: Path, name: str) -> None:
+    sample = KINDS[name].samples(tmp_path)[0]
+    size = len(sample) - (name == "cameras.json")  # the line feed behind JSON means nothing
+    places = sorted({*range(0, size, max(1, size // 150)), *range(size - 12, size)})
+    if name == ".splat":  # nothing in it tells how many Gaussians follow
+        places = [place for place in places if place % 32 or place == 0]
+    assert tried(name, tmp_path, (sample[:place] for place in places)).refused == len(places)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", STRICT)
+def test_random_bytes_and_other_formats_are_refused(tmp_path: Path, name: str) -> None:
+    rng, kind = np.random.default_rng(2), KINDS[name]
+    magic = kind.samples(tmp_path)[0][:8]
+    noise = [magic[: 8 * (number % 2)] + rng.bytes(int(rng.integers(1, 3000)) | 1) for number in range(60)]
+    others = [KINDS[other] for other in STRICT if KINDS[other].file != kind.file]
+    noise += [other.samples(tmp_path)[0] for other in others]
+    assert tried(name, tmp_path, noise).refused == len(noise)
