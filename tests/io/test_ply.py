@@ -26,7 +26,6 @@ from tests.support.comparing import assert_refused, assert_same, assert_same_ext
 from tests.support.fakes import blob_scene
 from tests.support.file_samples import (
     C0,
-    SHARED_DATA,
     ascii_ply,
     columns,
     compressed_ply,
@@ -263,8 +262,6 @@ def test_loading_holds_little_beside_the_arrays_it_keeps(tmp_path, extra):
 
 # ---- SuperSplat's compressed PLY ----
 
-GUITAR = SHARED_DATA / "gaussians" / "guitar.compressed.ply"
-
 
 @pytest.mark.parametrize("degree", range(4))
 @pytest.mark.parametrize("colours", [True, False])
@@ -315,9 +312,8 @@ def test_the_first_and_last_bits_of_every_field(put):
     np.testing.assert_allclose(sigmoid(got.opacity_logits[3]), 128 / 255, rtol=1e-6)
 
 
-@pytest.mark.skipif(not GUITAR.exists(), reason="the shared data are not here")
-def test_a_real_file():
-    got = read_ply(GUITAR)
+def test_a_real_file(real_data):
+    got = read_ply(real_data / "gaussians" / "guitar.compressed.ply")
     assert len(got) == 90854
     assert got.valid().all()
     assert np.isposinf(got.opacity_logits).sum() == 667

@@ -1,25 +1,31 @@
-"""Formats that round: .splat, .ksplat, .spz and SOG, each against an encoder of the tests' own."""
+"""Formats that round: .splat, .ksplat, .spz and SOG, each against an encoder of the tests' own; what is
+written, and what another program reads."""
 
 import gzip
 import json
 import struct
+import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import zstandard
 from scipy.spatial import cKDTree
 
-from langsplat_core.arrays import rotation_matrices, sigmoid
+from langsplat_core.arrays import rotation_matrices, sigmoid, unit
 from langsplat_core.errors import InputError
-from langsplat_core.io.scenes import load_gaussians, load_scene
+from langsplat_core.io import sog
+from langsplat_core.io.ply import write_ply
+from langsplat_core.io.scenes import load_gaussians, load_scene, scene_files
+from langsplat_core.io.sog import write_sog
 from langsplat_core.io.splat import read_ksplat, read_splat, write_splat
 from langsplat_core.io.spz import read_spz_scene, write_spz
 from langsplat_core.raster.reference import colours
 from langsplat_core.scene import Gaussians
+from langsplat_core.scene.gaussians import join_gaussians
 from tests.support.comparing import assert_refused
 from tests.support.file_samples import (
     C0,
-    SHARED_DATA,
     ksplat_bytes,
     sog_files,
     splat_bytes,
@@ -44,22 +50,18 @@ def check_bytes(got: Gaussians, want: Gaussians) -> None:
     assert np.abs(sigmoid(got.opacity_logits) - sigmoid(want.opacity_logits)).max() <= 0.5 / 255 + 1e-6
 
 
-def test_a_splat_of_another_encoder(put):
-    want = random_gaussians(200)
-    got = read_splat(put(splat_bytes(want), "a.splat"))
+def test_splat_written_and_read(tmp_path):
+    want = random_gaussians(200, sh_degree=2)
+    write_splat(tmp_path / "a.splat", want)
+    assert (tmp_path / "a.splat").read_bytes() == splat_bytes(want)  # as of another encoder
+    got = read_splat(tmp_path / "a.splat")
     assert got.sh_degree == 0
     np.testing.assert_array_equal(got.means, want.means)
     np.testing.assert_allclose(got.log_scales, want.log_scales, atol=1e-6)
     check_bytes(got, want)
     # Half a step of 1/128 a component (a whole one where 128 is cut to 127), at most 3 times in the matrix
     assert rotation_error(got, want) <= 3 / 128
-
-
-def test_splat_written_and_read(put, tmp_path):
-    want = random_gaussians(200, sh_degree=2)
-    write_splat(tmp_path / "a.splat", want)
-    assert (tmp_path / "a.splat").read_bytes() == splat_bytes(want)
-    write_splat(tmp_path / "b.splat", read_splat(tmp_path / "a.splat"))
+    write_splat(tmp_path / "b.splat", got)
     check_bytes(read_splat(tmp_path / "b.splat"), want)  # a second turn loses nothing more
 
 
@@ -82,11 +84,11 @@ def test_splat_extremes(tmp_path):
 
 WANT = random_gaussians(30, sh_degree=1)
 SPLAT, KSPLAT = splat_bytes(WANT), ksplat_bytes([WANT], 2)
-PARTS = "not a whole number of Gaussians of 32"
+ROWS = "not a whole number of Gaussians of 32"
 BROKEN_SPLAT = {
-    "nothing": (b"", PARTS),
-    "a byte less": (SPLAT[:-1], PARTS),
-    "a byte more": (SPLAT + b"\0", PARTS),
+    "nothing": (b"", ROWS),
+    "a byte less": (SPLAT[:-1], ROWS),
+    "a byte more": (SPLAT + b"\0", ROWS),
     "noise": (np.random.default_rng(0).bytes(3200), r"\d+ of 100 rows are no Gaussians"),
 }
 
@@ -110,11 +112,9 @@ def test_ksplat(put, level, degree):
 def test_ksplat_of_sections_of_different_degrees(put):
     parts = [random_gaussians(30, sh_degree=1), random_gaussians(19, 1, sh_degree=2)]
     got = read_ksplat(put(ksplat_bytes(parts, 0), "a.ksplat"))
-    assert got.sh_degree == 2
-    np.testing.assert_array_equal(got.means, np.concatenate([part.means for part in parts]))
-    np.testing.assert_array_equal(got.sh[:30, 1:4], parts[0].sh[:, 1:])
-    assert not got.sh[:30, 4:].any()
-    np.testing.assert_array_equal(got.sh[30:, 1:], parts[1].sh[:, 1:])
+    want = join_gaussians(parts)  # the lower degree filled up by zeros
+    np.testing.assert_array_equal(got.means, want.means)
+    np.testing.assert_array_equal(got.sh[:, 1:], want.sh[:, 1:])
 
 
 def test_ksplat_defaults_of_nought(put):
@@ -203,18 +203,16 @@ def test_spz_is_exact_up_to_the_quantisation(put, version, degree):
 
 @pytest.mark.parametrize("degree", range(4))
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_spz_written_and_read(tmp_path, degree, antialiased):
+def test_spz_written(tmp_path, degree, antialiased):
     want = random_gaussians(150, sh_degree=degree)
     write_spz(tmp_path / "a.spz", want, antialiased)
-    scene = read_spz_scene(tmp_path / "a.spz")
-    check_spz(scene.gaussians, want, 3)
-    assert scene.antialiased == antialiased
     content = gzip.decompress((tmp_path / "a.spz").read_bytes())
-    assert content == gzip.decompress(spz_bytes(want, 3, flags=int(antialiased)))
-    write_spz(tmp_path / "b.spz", scene.gaussians, antialiased)  # a second turn loses nothing more
+    assert content == gzip.decompress(spz_bytes(want, 3, flags=int(antialiased)))  # as of another encoder
+    once = read_spz_scene(tmp_path / "a.spz").gaussians
+    write_spz(tmp_path / "b.spz", once, antialiased)  # a second turn loses nothing more
     again = read_spz_scene(tmp_path / "b.spz").gaussians
-    np.testing.assert_array_equal(again.means, scene.gaussians.means)
-    np.testing.assert_allclose(again.sh, scene.gaussians.sh, atol=1e-6)
+    np.testing.assert_array_equal(again.means, once.means)
+    np.testing.assert_allclose(again.sh, once.sh, atol=1e-6)
 
 
 AXES = ("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF")
@@ -289,8 +287,9 @@ SPZ, SPZ_4 = gzip.decompress(spz_bytes(WANT, 3)), spz_bytes(WANT, 4)
 AXES_9 = spz_bytes(WANT, 4, flags=2, records=struct.pack("<III", 0xADBE0003, 4, 9))
 
 
-def with_first_frame(frame: bytes) -> bytes:
-    """`SPZ_4` with another stream of positions, of which the table says 270 bytes."""
+def with_positions_of(size: int) -> bytes:
+    """`SPZ_4` with a first stream of `size` bytes, of which the table says 270."""
+    frame = zstandard.ZstdCompressor().compress(bytes(size))
     old, start = struct.unpack_from("<Q", SPZ_4, 32)[0], 32 + 6 * 16
     return patched(SPZ_4[:start], 32, "<Q", len(frame)) + frame + SPZ_4[start + old :]
 
@@ -316,13 +315,8 @@ BROKEN_SPZ = {
     "4: a stream of others": (patched(SPZ_4, 40, "<Q", 271), "not those of 30 Gaussians"),
     "4: no Zstandard": (patched(SPZ_4, 32 + 6 * 16, "<I", 0), "a stream cannot be unpacked"),
     "4: axes of a kind": (AXES_9, "its axes are of kind 9"),
-    **{
-        f"4: a frame of {size} bytes": (
-            with_first_frame(zstandard.ZstdCompressor().compress(bytes(size))),
-            "fewer or more than the 270 bytes",
-        )
-        for size in (269, 271)
-    },
+    "4: fewer positions": (with_positions_of(269), "fewer or more than the 270 bytes"),
+    "4: more positions": (with_positions_of(271), "fewer or more than the 270 bytes"),
 }
 
 
@@ -348,8 +342,6 @@ def test_real_spz_agree(real_data, name):
 
 # ---- SOG ----
 
-PLAYBOT = SHARED_DATA / "gaussians"
-
 
 @pytest.mark.parametrize("degree", range(4))
 def test_sog_is_exact_up_to_the_quantisation(tmp_path, degree):
@@ -371,20 +363,12 @@ def test_sog_is_exact_up_to_the_quantisation(tmp_path, degree):
 
 
 def test_folder_meta_and_archive_say_the_same(tmp_path):
-    files = sog_files(random_gaussians(40, sh_degree=1))
-    folder = write_folder(tmp_path / "scene", files)
-    (tmp_path / "scene.sog").write_bytes(zipped(files))
+    folder = write_folder(tmp_path / "scene", SOG)
+    (tmp_path / "scene.sog").write_bytes(zipped(SOG))
     want = load_gaussians(folder)
     for path in (folder / "meta.json", tmp_path / "scene.sog"):
         np.testing.assert_array_equal(load_gaussians(path).means, want.means)
         np.testing.assert_array_equal(load_scene(path).gaussians.sh, want.sh)
-
-
-def test_opacities_of_nought_and_one_are_infinite_logits(tmp_path):
-    scene = random_gaussians(30)
-    scene.opacity_logits[:2] = np.inf, -np.inf
-    got = load_gaussians(write_folder(tmp_path / "a", sog_files(scene)))
-    assert got.opacity_logits[:2].tolist() == [np.inf, -np.inf]
 
 
 SOG = sog_files(random_gaussians(40, sh_degree=1))
@@ -460,10 +444,8 @@ def test_missing_files_of_a_sog(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "count"), [("playbot_8k_sog", 8406), ("playbot_31k_sog", 31000)])
-def test_real_sogs(name, count):
-    if not (PLAYBOT / name).exists():
-        pytest.skip("the shared data are not here")
-    got = load_gaussians(PLAYBOT / name)
+def test_real_sogs(real_data, name, count):
+    got = load_gaussians(real_data / "gaussians" / name)
     assert len(got) == count
     assert got.sh_degree == 2
     assert got.valid().all()
@@ -474,3 +456,145 @@ def test_real_sogs(name, count):
     shortest = got.log_scales[::10].argmin(1)[:, None, None]
     normals = np.take_along_axis(rotation_matrices(got.quats_wxyz[::10].astype(float)), shortest, 2)[..., 0]
     assert np.median(np.abs((normals * axes[:, 2]).sum(1))[flat]) > 0.95
+
+
+# ---- SOG, written; streamed scenes, read ----
+
+
+def written(tmp_path, gaussians: Gaussians) -> Gaussians:
+    write_sog(tmp_path / "a.sog", gaussians)
+    return load_gaussians(tmp_path / "a.sog")
+
+
+def angles(one: Gaussians, other: Gaussians) -> np.ndarray:
+    """Degrees between the rotations of two scenes."""
+    cosines = np.abs((unit(one.quats_wxyz.astype(float)) * unit(other.quats_wxyz.astype(float))).sum(1))
+    return 2 * np.degrees(np.arccos(np.clip(cosines, 0, 1)))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_rows_come_back_in_their_order_within_the_format_s_rounding(tmp_path, degree):
+    scene = random_gaussians(3000, sh_degree=degree)
+    got = written(tmp_path, scene)
+    assert got.sh.shape == scene.sh.shape
+    logs = np.log1p(np.abs(scene.means.astype(np.float64)))
+    step = (logs.max() * 2) / 65535 * np.exp(logs)
+    assert (np.abs(got.means - scene.means) <= step).all()
+    assert np.abs(sigmoid(got.opacity_logits) - sigmoid(scene.opacity_logits)).max() <= 0.5 / 255 + 1e-6
+    assert angles(scene, got).max() < 1.0
+    for name in ("log_scales", "sh"):
+        have, want = getattr(got, name), getattr(scene, name)
+        assert np.abs(have - want).mean() < 0.01 * want.std()
+        assert np.abs(have - want).max() < 0.05 * np.ptp(want)
+
+
+def test_a_palette_shares_entries_where_there_are_too_many(tmp_path, monkeypatch):
+    monkeypatch.setattr(sog, "MOST_ENTRIES", 256)
+    rng = np.random.default_rng(0)
+    scene = random_gaussians(5000, sh_degree=1)
+    kinds = rng.normal(size=(40, 3, 3)).astype(np.float32)
+    rest = kinds[rng.integers(0, 40, 5000)] + 0.01 * rng.normal(size=(5000, 3, 3)).astype(np.float32)
+    scene = replace(scene, sh=np.concatenate([scene.sh[:, :1], rest], axis=1))
+    got = written(tmp_path, scene)
+    assert np.sqrt(((got.sh[:, 1:] - rest) ** 2).mean()) < 0.1 * rest.std()
+    meta = zipfile.ZipFile(tmp_path / "a.sog").read("meta.json")
+    assert json.loads(meta)["shN"]["count"] <= 256
+
+
+def test_hard_rows_of_a_sog(tmp_path):
+    hard = random_gaussians(8, sh_degree=1)
+    hard.means[:2] = [[np.nan], [1e8]]
+    hard.log_scales[2] = [-np.inf, 0, 1]
+    hard.quats_wxyz[3:5] *= [[0], [-1]]
+    hard.opacity_logits[5:7] = np.inf, -np.inf
+    got = written(tmp_path, hard)
+    assert got.opacity_logits[[0, 3, 5, 6]].tolist() == [-np.inf, -np.inf, np.inf, -np.inf]
+    assert got.means[1] == pytest.approx(hard.means[1], rel=1e-2)
+    assert np.isfinite(got.log_scales).all()
+    assert angles(hard.take([4]), got.take([4])).max() < 1
+    for count in (0, 1):
+        assert len(written(tmp_path, random_gaussians(count, sh_degree=2))) == count
+
+
+def test_the_same_scene_makes_the_same_sog(tmp_path):
+    scene = random_gaussians(500, sh_degree=1)
+    write_sog(tmp_path / "a.sog", scene)
+    write_sog(tmp_path / "b.sog", scene)
+    assert (tmp_path / "a.sog").read_bytes() == (tmp_path / "b.sog").read_bytes()
+
+
+def test_splat_transform_reads_it_alike(tmp_path, splat_transform):
+    mine = written(tmp_path, random_gaussians(2000, sh_degree=2))
+    splat_transform(tmp_path / "a.sog", tmp_path / "b.ply")
+    theirs = load_gaussians(tmp_path / "b.ply")
+    for name in ("means", "log_scales", "sh"):
+        np.testing.assert_allclose(getattr(theirs, name), getattr(mine, name), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(sigmoid(theirs.opacity_logits), sigmoid(mine.opacity_logits), atol=1e-6)
+    assert angles(mine, theirs).max() < 0.05
+
+
+PARTS = [random_gaussians(count, seed=count, sh_degree=1) for count in (30, 40, 50)]
+
+
+def streamed(folder, change=lambda content: None):
+    """A streamed scene: each of `PARTS` a leaf of the finest level, in two files; a coarse row."""
+    for name, some in {"0_0": PARTS[:2], "0_1": PARTS[2:], "1_0": [PARTS[0].take([0])]}.items():
+        write_sog(folder / "packed.sog", join_gaussians(some))
+        zipfile.ZipFile(folder / "packed.sog").extractall(folder / name)
+    (folder / "packed.sog").unlink()
+    places = ((0, 0, 30), (0, 30, 40), (2, 0, 50), (1, 0, 1))
+    first, *others, coarse = (dict(zip(("file", "offset", "count"), at, strict=True)) for at in places)
+    finest = {"children": [{"lods": {"0": place}} for place in others]}
+    content = {"version": 1, "lodLevels": 2, "filenames": ["0_0/meta.json", "1_0/meta.json", "0_1/meta.json"]}
+    content["tree"] = {"children": [{"lods": {"0": first, "1": coarse}}, finest]}
+    change(content)
+    (folder / "lod-meta.json").write_text(json.dumps(content))
+    return folder
+
+
+def test_a_streamed_scene_is_read_at_its_finest_level(tmp_path):
+    folder = streamed(tmp_path)
+    for path in (folder, folder / "lod-meta.json"):
+        got = load_gaussians(path)
+        assert len(got) == 120
+        assert np.abs(got.means - join_gaussians(PARTS).means).max() < 1e-3  # in the order of the tree
+    files = scene_files(folder)
+    assert files[0] == folder / "lod-meta.json"
+    assert {path.parent.name for path in files if path.suffix == ".webp"} == {"0_0", "0_1", "1_0"}
+
+    def surroundings(content: dict) -> None:
+        content["filenames"][1] = "none/meta.json"  # of the coarse level, which is not asked for
+        content["environment"] = "1_0/meta.json"
+
+    assert len(load_gaussians(streamed(tmp_path, surroundings))) == 121
+
+
+STREAMED_LIES = {
+    "a path": lambda c: c["filenames"].__setitem__(0, "../x/meta.json"),
+    "a missing file": lambda c: c["filenames"].__setitem__(0, "3_0/meta.json"),
+    "itself": lambda c: c["filenames"].__setitem__(0, "lod-meta.json"),
+    "a file twice": lambda c: c["filenames"].__setitem__(2, "0_0/meta.json"),
+    "rows beyond the end": lambda c: c["tree"]["children"][0]["lods"]["0"].update(count=71),
+    "rows again and again": lambda c: c["tree"]["children"].extend([c["tree"]["children"][0]] * 99),
+    "negative rows": lambda c: c["tree"]["children"][0]["lods"]["0"].update(offset=-1),
+    "no tree": lambda c: c.pop("tree"),
+    "a tree of numbers": lambda c: c["tree"].update(children=[1]),
+}
+
+
+@pytest.mark.parametrize("name", STREAMED_LIES)
+def test_a_streamed_scene_that_lies_is_refused(tmp_path, name):
+    with pytest.raises(InputError):
+        load_gaussians(streamed(tmp_path, STREAMED_LIES[name]))
+
+
+@pytest.mark.slow
+def test_what_splat_transform_streams_is_read(tmp_path, splat_transform):
+    scene, path = random_gaussians(30_000, sh_degree=1), tmp_path / "a.ply"
+    write_ply(path, scene)
+    lod = tmp_path / "lod" / "lod-meta.json"
+    splat_transform("-g", "cpu", "-C", "8", path, "-l", "0", path, "-F", "20%", "-l", "1", lod)
+    got = load_gaussians(tmp_path / "lod")
+    assert len(got) == len(scene)
+    near, _ = cKDTree(got.means).query(scene.means)
+    assert near.max() < 1e-3

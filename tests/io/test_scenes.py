@@ -366,18 +366,13 @@ def entry(**changes):
     return {key: value for key, value in (plain | changes).items() if value is not None}
 
 
-@pytest.fixture
-def put(tmp_path):
-    def write(value):
-        path = tmp_path / "scene.cameras.json"
-        path.write_text(value if isinstance(value, str) else json.dumps(value))
-        return path
-
-    return write
+def text_of(value: Any) -> bytes:
+    """As JSON, what is no text yet."""
+    return (value if isinstance(value, str) else json.dumps(value)).encode()
 
 
 def test_the_inria_convention(put):
-    camera = read_cameras(put([entry()]))[0]
+    camera = read_cameras(put(text_of([entry()])))[0]
     np.testing.assert_allclose(camera.position, [1, 2, 3])
     np.testing.assert_allclose(camera.rotation[2], [1, 0, 0])  # forward, in the world
     pixel, depth = camera.project(np.array([[6.0, 2.0, 3.0], [6.0, 3.0, 3.0], [6.0, 2.0, 2.0]]))
@@ -385,9 +380,9 @@ def test_the_inria_convention(put):
     # the middle; below it, since y points down; to the right of it, which is world -z
     np.testing.assert_allclose(pixel, [[32, 24], [32, 24 + 55 / 5], [32 + 50 / 5, 24]])
     assert camera.name == "frame_01"
-    moved = read_cameras(put([entry(cx=30, cy=20.5)]))[0]
+    moved = read_cameras(put(text_of([entry(cx=30, cy=20.5)])))[0]
     assert (moved.cx, moved.cy) == (30, 20.5)
-    write_cameras(put([]), (replace(camera, fx=np.float32(50.5), width=np.int64(64)),))  # NumPy's numbers
+    write_cameras(put(b""), (replace(camera, fx=np.float32(50.5), width=np.int64(64)),))  # NumPy's numbers
 
 
 @pytest.mark.parametrize(
@@ -395,7 +390,7 @@ def test_the_inria_convention(put):
     [("a.jpg", "a"), ("a.JPEG", "a"), ("frame.01", "frame.01"), ("x/y.png", "x/y"), ("", "")],
 )
 def test_names_lose_the_suffix_of_an_image(put, stored, name):
-    assert read_cameras(put([entry(img_name=stored)]))[0].name == name
+    assert read_cameras(put(text_of([entry(img_name=stored)])))[0].name == name
 
 
 TURNED = np.array(entry()["rotation"])
@@ -427,4 +422,4 @@ BROKEN = {
 @pytest.mark.parametrize("case", BROKEN)
 def test_every_broken_rule_has_its_message(put, case):
     value, message = BROKEN[case]
-    assert_refused(read_cameras, put(value), message)
+    assert_refused(read_cameras, put(text_of(value)), message)
