@@ -347,9 +347,8 @@ def test_a_field_of_other_gaussians_is_refused_with_the_way_to_mend_it(sidecar, 
     mend = r"langsplat convert EDITED\.ply NEW\.ply --rematch .*scene\.langsplat\.safetensors"
     nudged = means.copy()
     nudged[3, 1] = np.nextafter(nudged[3, 1], np.float32(9))
-    elsewhere = "other positions than the scene's"
-    for other, reason in ((means[1:], "made for 60 Gaussians, the scene has 59"), (nudged, elsewhere),
-                          (means[::-1], elsewhere)):  # fmt: skip
+    fewer, elsewhere = "made for 60 Gaussians, the scene has 59", "other positions than the scene's"
+    for other, reason in ((means[1:], fewer), (nudged, elsewhere), (means[::-1], elsewhere)):
         with pytest.raises(FormatError, match=f"{reason}; .*{mend}"):
             read_language(sidecar, other)
     for path, reason in ((tmp_path / "a.safetensors", "no such file"), (tmp_path, "is a folder")):

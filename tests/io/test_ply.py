@@ -234,7 +234,9 @@ def test_numbers_that_an_integer_column_cannot_hold_are_read_without_a_word(tmp_
     ("name", "dtype", "says"),
     [
         *((name, "f4", "rename") for name in ("x", "nx", "f_rest_3", "two words", "a\nend_header", "")),
-        *(("long", "i8", "type int64"), ("flag", "?", "type bool"), ("half", "f2", "type float16")),
+        ("long", "i8", "type int64"),
+        ("flag", "?", "type bool"),
+        ("half", "f2", "type float16"),
     ],
 )
 def test_extras_and_comments_that_no_ply_can_hold(tmp_path, name, dtype, says):

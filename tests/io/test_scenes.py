@@ -192,8 +192,11 @@ def test_what_is_not_a_scene(tmp_path):
     assert load_scene(tmp_path / ("n" * 240 + ".ply")).language is None
     write_ply(tmp_path / "model" / "iteration_7" / "point_cloud.ply", random_gaussians(1))
     (tmp_path / "empty").mkdir()
-    for name, message in (("model", r"perhaps .*model/iteration_7/point_cloud\.ply"),
-                          ("empty", r"a folder without meta\.json is not a scene$")):  # fmt: skip
+    said = {
+        "model": r"perhaps .*model/iteration_7/point_cloud\.ply",
+        "empty": r"without meta\.json is not a scene$",
+    }
+    for name, message in said.items():
         with pytest.raises(InputError, match=message):
             load_scene(tmp_path / name)
 
