@@ -19,6 +19,7 @@ from langsplat_core.io.hostile import opened
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.training.language.codec_fit import train_autoencoder
 from langsplat_viewer.actions import (
+    editing,
     filming,
     opening,
     outline,
@@ -26,7 +27,6 @@ from langsplat_viewer.actions import (
     selecting,
     settings,
     training,
-    transforming,
     viewpoint,
 )
 from langsplat_viewer.options import scene_path, services
@@ -97,11 +97,11 @@ def _clipped(ctx: Any, window: Window) -> None:
     viewer = window.viewer
     selecting.select_query(viewer)
     settings.open_panel(viewer, "Transform")
-    transforming.fill_box(viewer)
+    editing.fill_box(viewer)
     selecting.select_none(viewer)
     settings.set_display(viewer, "rgb")
-    transforming.fill_form(viewer, replace(viewer.state.edit_form, gizmo="box"))
-    transforming.clip(viewer, True)
+    editing.fill_form(viewer, replace(viewer.state.edit_form, gizmo="box"))
+    editing.clip(viewer, True)
 
 
 def _noted(ctx: Any, window: Window) -> None:
@@ -131,7 +131,7 @@ def _beside(ctx: Any, window: Window) -> None:
 def _transformed(ctx: Any, window: Window) -> None:
     _selected(ctx, window)
     settings.open_panel(window.viewer, "Transform")
-    transforming.next_gizmo(window.viewer)
+    editing.next_gizmo(window.viewer)
 
 
 def _side_by_side(ctx: Any, window: Window) -> None:

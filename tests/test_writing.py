@@ -37,9 +37,8 @@ from langsplat_core.pipeline.stages import kept, kept_array
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures
 from langsplat_core.training.radiance.state import save_checkpoint
-from langsplat_viewer.files.browsing import QuerySet, SavedQuery, write_queries
-from langsplat_viewer.files.flights import Bookmark, Shelf, write_flight
 from langsplat_viewer.files.preferences import Preferences, save_preferences
+from langsplat_viewer.files.projects import Bookmark, QuerySet, SavedQuery, Shelf, write_flight, write_queries
 from langsplat_viewer.output.film import Film, write_film
 from langsplat_viewer.output.saving import save_png
 from tests.support.file_samples import random_codec, random_field

@@ -22,13 +22,19 @@ from langsplat_core.errors import BackendError
 from langsplat_core.progress import Progress, watched
 from langsplat_core.scene import Gaussians
 from langsplat_core.scene.gaussians import Merged, merged
-from langsplat_viewer.actions import selecting, undoing, viewpoint
+from langsplat_viewer.actions import editing, selecting, viewpoint
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.commands import with_key
 from langsplat_viewer.jobs import Worker
-from langsplat_viewer.rendering.depth import UNCLIPPED, why_nothing, why_undrawable
 from langsplat_viewer.rendering.renderer import GlRenderer, Rasterized, Rasterizing
-from langsplat_viewer.rendering.request import FULL, Detail, RenderRequest
+from langsplat_viewer.rendering.request import (
+    FULL,
+    UNCLIPPED,
+    Detail,
+    RenderRequest,
+    why_nothing,
+    why_undrawable,
+)
 from langsplat_viewer.state import FrameStats, ViewerState
 
 REST_SECONDS = 0.07  # without a move, after which the camera rests
@@ -273,7 +279,7 @@ def _why_nothing(request: RenderRequest) -> str:
     gaussians = request.scene.scene.gaussians
     if len(request.scene.source.gaussians) and not len(gaussians):
         shown = with_key("show what is hidden", selecting.show_hidden)
-        return f"{NOTHING_LEFT}: {shown}, or {with_key('undo', undoing.undo)}"
+        return f"{NOTHING_LEFT}: {shown}, or {with_key('undo', editing.undo)}"
     if request.clip != UNCLIPPED and gaussians.valid().any():
         return NOTHING_BETWEEN
     reason = why_nothing(gaussians, request.camera)

@@ -9,14 +9,13 @@ from langsplat_core.config import Display
 from langsplat_core.display.displays import DISPLAYS, DisplayRow
 from langsplat_core.scene import LEVELS
 from langsplat_viewer.actions import (
+    editing,
     filming,
     opening,
     projects,
     queries,
     selecting,
     settings,
-    transforming,
-    undoing,
     viewpoint,
 )
 from langsplat_viewer.actions.selecting import Part
@@ -230,11 +229,11 @@ COMMANDS: tuple[Command, ...] = (
     Command("quit", selecting.quit_viewer, ("Ctrl+Q",), "File", apart=True),
     Command("search", queries.focus_search, ("Ctrl+F", "/"), "Edit"),
     Command("remove all queries", queries.remove_all, menu="Edit"),
-    Command("undo", undoing.undo, ("Ctrl+Z",), "Edit", repeats=True, is_edit=True, apart=True),
-    Command("redo", undoing.redo, ("Ctrl+Shift+Z", "Ctrl+Y"), "Edit", repeats=True, is_edit=True),
+    Command("undo", editing.undo, ("Ctrl+Z",), "Edit", repeats=True, is_edit=True, apart=True),
+    Command("redo", editing.redo, ("Ctrl+Shift+Z", "Ctrl+Y"), "Edit", repeats=True, is_edit=True),
     Command(
         "gizmo: move, rotate, scale, off",
-        transforming.next_gizmo,
+        editing.next_gizmo,
         ("G",),
         "Edit",
         is_on=lambda viewer: viewer.state.edit_form.gizmo != "off",

@@ -29,8 +29,8 @@ from langsplat_core.query.engine import no_field
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_viewer.camera.flight import SPAN_LIMITS
-from langsplat_viewer.rendering.depth import Clip
 from langsplat_viewer.rendering.renderer import Backend
+from langsplat_viewer.rendering.request import Clip
 from langsplat_viewer.viewer import Services
 
 DisplayChoice = Literal["auto", Display]

@@ -24,14 +24,13 @@ from langsplat_core.scene import Camera, Scene
 from langsplat_core.scene.tree import Tree
 from langsplat_viewer.camera.controls import Extent, OrbitCamera
 from langsplat_viewer.camera.flight import Flight, Keyframe
-from langsplat_viewer.files.browsing import Listing
-from langsplat_viewer.files.flights import Bookmark
-from langsplat_viewer.files.photographs import Photograph
+from langsplat_viewer.files.disk import Listing, Photograph
 from langsplat_viewer.files.preferences import Preferences
-from langsplat_viewer.files.projects import Note, Things
+from langsplat_viewer.files.projects import Bookmark, Note, Things
 from langsplat_viewer.marks import Move, Selection
-from langsplat_viewer.rendering.depth import UNCLIPPED, Clip
 from langsplat_viewer.rendering.request import (
+    UNCLIPPED,
+    Clip,
     EditedScene,
     Pane,
     RenderRequest,

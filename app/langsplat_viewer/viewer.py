@@ -19,13 +19,11 @@ from langsplat_core.query.engine import LoadEncoder, QueryEngine
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.camera.flight import Keyframe
-from langsplat_viewer.files.flights import Shelf
-from langsplat_viewer.files.projects import Note, Things
-from langsplat_viewer.files.watching import Stamps, Watch
+from langsplat_viewer.files.disk import Stamps, Watch
+from langsplat_viewer.files.projects import Note, Shelf, Things
 from langsplat_viewer.jobs import Job, Worker
 from langsplat_viewer.marks import Histogram, Marks, Pair
-from langsplat_viewer.rendering.depth import Clip
-from langsplat_viewer.rendering.request import RenderRequest
+from langsplat_viewer.rendering.request import Clip, RenderRequest
 from langsplat_viewer.state import OutlineView, Query, Ruler, ViewerState
 
 PREVIEW_EVERY = 100  # steps between the checkpoints that can be looked at

@@ -16,7 +16,6 @@ import moderngl
 
 from langsplat_core.config import LevelChoice, PictureConfig
 from langsplat_core.errors import BackendError, InputError, LangSplatError
-from langsplat_viewer import fonts
 from langsplat_viewer.actions import (
     beside,
     filming,
@@ -29,8 +28,6 @@ from langsplat_viewer.actions import (
     viewpoint,
 )
 from langsplat_viewer.canvas import Canvas
-from langsplat_viewer.files import PROJECTS
-from langsplat_viewer.files.flights import Shelf
 from langsplat_viewer.files.preferences import (
     FILE_NAME,
     LAYOUT_NAME,
@@ -39,10 +36,11 @@ from langsplat_viewer.files.preferences import (
     load_preferences,
     save_preferences,
 )
+from langsplat_viewer.files.projects import PROJECTS, Shelf
 from langsplat_viewer.jobs import give_memory_back, on_signals, one_line, share_one_heap
 from langsplat_viewer.options import chosen_camera, latent_level
 from langsplat_viewer.panels import layout, navigation, outline, overlays, style
-from langsplat_viewer.panels.keyboard import Keyboard
+from langsplat_viewer.panels.navigation import Keyboard
 from langsplat_viewer.panels.style import scene_area
 from langsplat_viewer.rendering.renderer import Backend, GlRenderer
 from langsplat_viewer.state import ViewerState
@@ -249,7 +247,7 @@ class Window:
         params.fps_idling.fps_idle = IDLE_FPS
         params.fps_idling.time_active_after_last_event = AWAKE_SECONDS
         params.callbacks.default_icon_font = hello_imgui.DefaultIconFont.font_awesome6
-        params.callbacks.load_additional_fonts = fonts.load
+        params.callbacks.load_additional_fonts = style.load_fonts
         params.callbacks.setup_imgui_style = self._remembered.style
         params.callbacks.show_menus = lambda: layout.draw_menus(self.viewer)
         params.callbacks.post_init = self._start

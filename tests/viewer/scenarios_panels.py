@@ -12,7 +12,7 @@ from langsplat_core.io.scenes import save_scene
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_viewer import viewer as training
 from langsplat_viewer.actions import filming, opening, selecting, settings, viewpoint
-from langsplat_viewer.files.flights import read_flight
+from langsplat_viewer.files.projects import read_flight
 from langsplat_viewer.panels.layout import PANELS
 from langsplat_viewer.panels.style import scene_area
 from tests.support.fakes import CENTRES, PER_BLOB, as_trained, blob_scene, cameras, named_scene

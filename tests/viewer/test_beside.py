@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from langsplat_viewer.actions import beside, opening, queries, settings, undoing, viewpoint
+from langsplat_viewer.actions import beside, editing, opening, queries, settings, viewpoint
 from langsplat_viewer.camera.controls import default_view, extent_of, orbit
 from tests.support.windowless import SCENES, ask, errors, settle
 
@@ -59,7 +59,7 @@ def test_it_goes_with_the_line_and_does_not_come_back_by_itself(two):
     settings.show_one(two)
     beside.follow(two)
     assert two.beside is None
-    undoing.undo(two)
+    editing.undo(two)
     beside.follow(two)
     assert two.state.settings.split.mode == "off"
 

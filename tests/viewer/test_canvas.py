@@ -17,15 +17,14 @@ from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.errors import BackendError
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.opengl.scene_textures import is_software
-from langsplat_viewer.actions import queries, selecting, settings, undoing, viewpoint
+from langsplat_viewer.actions import editing, queries, selecting, settings, viewpoint
 from langsplat_viewer.camera.controls import default_view, extent_of, orbit
 from langsplat_viewer.canvas import FINE, MOVING_BUDGET, NOTHING_LEFT, REST_SECONDS, Canvas, Level, Pace
 from langsplat_viewer.marks import unmarked
 from langsplat_viewer.panels.layout import in_numbers
 from langsplat_viewer.rendering import renderer as renderers
-from langsplat_viewer.rendering.depth import Clip
 from langsplat_viewer.rendering.renderer import ArrayRenderer, GlRenderer
-from langsplat_viewer.rendering.request import Splats
+from langsplat_viewer.rendering.request import Clip, Splats
 from langsplat_viewer.state import (
     KEPT,
     LONGEST_SIDE,
@@ -330,7 +329,7 @@ CHANGES = {
     "undone camera": lambda v: (viewpoint.look_from(v, "left"), viewpoint.reset_view(v)),
     "marks": selecting.select_all,
     "deleted": lambda v: (selecting.select_all(v), selecting.delete_selected(v)),
-    "undone": lambda v: (selecting.select_all(v), selecting.delete_selected(v), undoing.undo(v)),
+    "undone": lambda v: (selecting.select_all(v), selecting.delete_selected(v), editing.undo(v)),
     "splats": lambda v: settings.set_splats(v, Splats(0.5)),
     "cut": lambda v: settings.set_clip(v, Clip(1.0)),
     "display": lambda v: settings.set_display(v, "depth"),

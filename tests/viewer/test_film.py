@@ -17,7 +17,7 @@ from langsplat_core.io.scenes import save_scene
 from langsplat_core.progress import Cancelled, Progress, Report
 from langsplat_viewer.camera.controls import extent_of
 from langsplat_viewer.camera.flight import Flight, Keyframe
-from langsplat_viewer.files.flights import write_flight
+from langsplat_viewer.files.projects import write_flight
 from langsplat_viewer.output import film
 from langsplat_viewer.output.film import Shot, cameras_of, find_ffmpeg, fingerprint, make_film
 from langsplat_viewer.rendering.renderer import render_image

@@ -12,11 +12,10 @@ import pytest
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions import filming, opening, queries, settings, viewpoint
-from langsplat_viewer.files.browsing import MOST_LISTED, Entry, list_folder
-from langsplat_viewer.files.watching import Watch, stamps
+from langsplat_viewer.files.disk import MOST_LISTED, Entry, Watch, list_folder, stamps
 from langsplat_viewer.options import say_compiling
 from langsplat_viewer.panels.scene import has_several
-from langsplat_viewer.rendering.depth import UNCLIPPED, Clip
+from langsplat_viewer.rendering.request import UNCLIPPED, Clip
 from tests.support.fakes import blob_scene
 from tests.support.windowless import SCENES, arrive, ask, errors, open_scene, settle
 
@@ -259,7 +258,7 @@ def _file(folder: Path) -> Path:
 
 
 def test_a_crowded_folder_is_cut(tmp_path, monkeypatch):
-    monkeypatch.setattr("langsplat_viewer.files.browsing.MOST_LISTED", 3)
+    monkeypatch.setattr("langsplat_viewer.files.disk.MOST_LISTED", 3)
     for number in range(5):
         (tmp_path / f"{number}.ply").write_bytes(b"")
     listing = list_folder(tmp_path)
@@ -461,7 +460,7 @@ def test_a_field_that_went_away_takes_its_display_along(shown):
 
 
 def test_a_watch_looks_by_itself_and_stops(tmp_path, monkeypatch):
-    monkeypatch.setattr("langsplat_viewer.files.watching.EVERY", 0.005)
+    monkeypatch.setattr("langsplat_viewer.files.disk.EVERY", 0.005)
     file: Path = tmp_path / "a.ply"
     file.write_bytes(b"a")
     woken = threading.Event()

@@ -13,19 +13,18 @@ import pytest
 from langsplat_core.errors import LangSplatError
 from langsplat_core.scene.transform import moving
 from langsplat_viewer.actions import (
+    editing,
     filming,
     opening,
     projects,
     queries,
     selecting,
     settings,
-    transforming,
-    undoing,
     viewpoint,
 )
 from langsplat_viewer.camera.controls import orbit
 from langsplat_viewer.files.projects import read_project
-from langsplat_viewer.rendering.depth import Clip
+from langsplat_viewer.rendering.request import Clip
 from langsplat_viewer.viewer import Services, Viewer
 from tests.support.fakes import CENTRES, FakeEncoder
 from tests.support.marks_and_flights import blob, marked
@@ -41,7 +40,7 @@ def saved(opened, tmp_path, monkeypatch) -> Path:
     queries.set_cut(opened, opened.state.queries[1], 0.6)
     queries.hide(opened, opened.state.queries[2])
     selecting.take(opened, blob("plant"))
-    transforming.transform(opened, moving(np.array([0.0, 1.0, 0.0])))
+    editing.transform(opened, moving(np.array([0.0, 1.0, 0.0])))
     settle(opened)
     selecting.hide_selected(opened)
     selecting.take(opened, blob("book"))
@@ -210,12 +209,12 @@ def test_notes_are_pinned_written_and_taken_off(opened):
     settings.escape(opened)
     projects.remove_note(opened, opened.state.notes[0])
     assert opened.state.notes == ()
-    undoing.undo(opened)
+    editing.undo(opened)
     assert [len(note.text) for note in opened.state.notes] == [500]
-    undoing.undo(opened)
+    editing.undo(opened)
     assert opened.state.notes == (note,)
-    undoing.redo(opened)
-    undoing.redo(opened)
+    editing.redo(opened)
+    editing.redo(opened)
     assert opened.state.notes == ()
 
 
@@ -223,10 +222,10 @@ def test_notes_are_asked_about_before_the_window_closes(opened, tmp_path):
     projects.pin_at(opened, 0.5, 0.5)
     assert not selecting.may_close(opened)
     selecting.stay(opened)
-    undoing.undo(opened)
+    editing.undo(opened)
     assert selecting.may_close(opened)
     opened.state.selection = replace(opened.state.selection, may_close=False)
-    undoing.redo(opened)
+    editing.redo(opened)
     assert not selecting.may_close(opened)
     projects.save_and_leave(opened, tmp_path)
     assert opened.state.selection.may_close

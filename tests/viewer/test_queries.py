@@ -12,8 +12,8 @@ from langsplat_core.display.displays import NO_HEAT, Subject, relevancies
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.scene import CANONICAL_PHRASES, Reading
 from langsplat_core.semantics.store import ImageFeatures
-from langsplat_viewer.actions import opening, queries, settings, undoing
-from langsplat_viewer.files.browsing import QuerySet, SavedQuery, read_queries, write_queries
+from langsplat_viewer.actions import editing, opening, queries, settings
+from langsplat_viewer.files.projects import QuerySet, SavedQuery, read_queries, write_queries
 from langsplat_viewer.output.headless import describe
 from langsplat_viewer.panels.search import BINS, hint, histogram
 from langsplat_viewer.viewer import Services
@@ -161,7 +161,7 @@ def test_all_queries_go_at_once_and_come_back(opened):
         ask(opened, phrase)
     queries.remove_all(opened)
     assert (opened.state.queries, opened.state.selected) == ([], None)
-    undoing.undo(opened)
+    editing.undo(opened)
     assert [query.phrase for query in opened.state.queries] == ["mug", "plant"]
 
 
@@ -235,14 +235,14 @@ def test_a_cut_is_undone_in_one_step_and_outlives_another_level(asked):
     queries.set_level(asked, "part")
     settle(asked)
     assert (query.result.level, query.result.own_cut) == (1, 0.62)
-    undoing.undo(asked)
+    editing.undo(asked)
     settle(asked)
     assert query.result.own_cut == 0.62
-    undoing.undo(asked)
+    editing.undo(asked)
     settle(asked)
     assert query.result.own_cut is None
     np.testing.assert_array_equal(query.result.members, automatic.members)
-    undoing.redo(asked)
+    editing.redo(asked)
     assert query.result.own_cut == 0.62
 
 

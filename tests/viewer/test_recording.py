@@ -12,13 +12,12 @@ from PIL import Image
 from langsplat_core.config import PictureConfig
 from langsplat_core.io.cameras import read_cameras
 from langsplat_core.io.scenes import save_scene
-from langsplat_viewer.actions import filming, opening, queries, settings, undoing, viewpoint
+from langsplat_viewer.actions import editing, filming, opening, queries, settings, viewpoint
 from langsplat_viewer.camera.controls import orbit, zoom
-from langsplat_viewer.files.flights import read_flight
+from langsplat_viewer.files.projects import read_flight
 from langsplat_viewer.output import film, saving
-from langsplat_viewer.rendering.depth import Clip
 from langsplat_viewer.rendering.renderer import render_image
-from langsplat_viewer.rendering.request import Splats
+from langsplat_viewer.rendering.request import Clip, Splats
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
 from tests.support.windowless import ask, errors, open_scene, recorded
@@ -117,10 +116,10 @@ def test_keyframes_are_changed_and_changes_undone(opened):
     filming.delete_keyframe(opened, first)
     assert times(opened) == [4, 4.01]
     for expected in ([0, 4, 4.01], [0, 4, 5], [0, 2, 4], [0, 2]):
-        undoing.undo(opened)
+        editing.undo(opened)
         assert times(opened) == expected
     assert opened.state.record.keyframes == (first, second)
-    undoing.redo(opened)
+    editing.redo(opened)
     assert opened.state.record.keyframes == (first, second, third)
     filming.replace_keyframe(opened, first)
     assert_allclose(opened.state.record.keyframes[0].pose.position, opened.state.view.eye)
@@ -128,7 +127,7 @@ def test_keyframes_are_changed_and_changes_undone(opened):
     assert times(opened) == [0, 4, 8]
     filming.clear_path(opened)
     assert times(opened) == []
-    undoing.undo(opened)
+    editing.undo(opened)
     assert times(opened) == [0, 4, 8]
 
 

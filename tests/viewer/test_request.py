@@ -21,12 +21,12 @@ from langsplat_viewer.marks import Marks
 from langsplat_viewer.output import film, saving
 from langsplat_viewer.panels.overlays import STEPS, bar_colours
 from langsplat_viewer.panels.view import compared_name
-from langsplat_viewer.rendering.depth import Clip
 from langsplat_viewer.rendering.renderer import ArrayRenderer, GlRenderer
 from langsplat_viewer.rendering.request import (
     AT_RANGE,
     TINT,
     TINT_STRENGTH,
+    Clip,
     Detail,
     Inputs,
     RenderRequest,

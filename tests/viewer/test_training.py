@@ -17,7 +17,7 @@ from langsplat_core.pipeline.report import REPORT
 from langsplat_core.scene import Scene
 from langsplat_viewer import viewer
 from langsplat_viewer.actions import opening, settings, training, viewpoint
-from langsplat_viewer.files.watching import IN_TRAINING, NAME, write_preview
+from langsplat_viewer.files.disk import IN_TRAINING, PREVIEW, write_preview
 from langsplat_viewer.viewer import PREVIEW_EVERY, TrainingProgress, TrainingRequest, command
 from tests.support.fakes import blob_scene
 from tests.support.scenes import random_gaussians
@@ -220,7 +220,7 @@ def test_gaussians_in_training_are_looked_at_and_followed(training_now, folder):
     checkpoint(folder.parent, whole.take(np.arange(0, 360, 2)))
     training.look_at_training(viewer)
     settle(viewer)
-    assert viewer.state.path == folder.parent / "photos.work" / NAME
+    assert viewer.state.path == folder.parent / "photos.work" / PREVIEW
     seen = viewer.state.scene.gaussians
     assert (len(seen), seen.sh_degree) == (180, 1)
     np.testing.assert_array_equal(seen.means, whole.gaussians.means[::2])

@@ -30,7 +30,7 @@ from langsplat_viewer.camera.flight import (
     view_of,
     with_keyframe,
 )
-from langsplat_viewer.files.flights import MOST, SUFFIX, read_flight, write_flight
+from langsplat_viewer.files.projects import MOST_KEYFRAMES, PATHS, read_flight, write_flight
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.options import MAX_SIDE, say_compiling
 from langsplat_viewer.output.film import VIDEO, Shot, cameras_of, check_film, find_ffmpeg, make_film
@@ -49,8 +49,8 @@ def add_keyframe(viewer: Viewer) -> None:
         viewer.say_error("open a scene first, then record a path in it")
         return
     last = record.keyframes[-1].seconds + SPACING if record.keyframes else 0.0
-    if last > LONGEST or len(record.keyframes) >= MOST:
-        viewer.say_error(f"a path has at most {MOST} keyframes and {LONGEST:.0f} seconds")
+    if last > LONGEST or len(record.keyframes) >= MOST_KEYFRAMES:
+        viewer.say_error(f"a path has at most {MOST_KEYFRAMES} keyframes and {LONGEST:.0f} seconds")
         return
     added = Keyframe(last, pose_of(state.view))
     record.turns = False
@@ -137,9 +137,7 @@ def save_path(viewer: Viewer, folder: Path) -> Path | None:
         viewer.say_error("a path to save needs a keyframe: add one at the current view")
         return None
     stem = state.path.stem if state.path else "camera"
-    path = (
-        folder / record.path_typed.strip() if record.path_typed.strip() else free_name(folder, stem, SUFFIX)
-    )
+    path = folder / record.path_typed.strip() if record.path_typed.strip() else free_name(folder, stem, PATHS)
     try:
         write_flight(path, flight_of(record.keyframes))
     except (OSError, ValueError) as error:

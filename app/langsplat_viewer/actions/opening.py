@@ -32,17 +32,13 @@ from langsplat_viewer.actions.selecting import leave
 from langsplat_viewer.actions.settings import open_panel, show_scenes
 from langsplat_viewer.actions.viewpoint import opening_view, read_bookmarks
 from langsplat_viewer.camera.controls import Extent, extent_of
-from langsplat_viewer.files import PROJECTS, photographs
-from langsplat_viewer.files.browsing import SUFFIX as QUERIES
-from langsplat_viewer.files.browsing import Entry, list_folder
-from langsplat_viewer.files.flights import SUFFIX as PATHS
-from langsplat_viewer.files.photographs import Photograph
+from langsplat_viewer.files import disk
+from langsplat_viewer.files.disk import Entry, Photograph, Stamps, list_folder, stamps
 from langsplat_viewer.files.preferences import with_photographs, with_recent
-from langsplat_viewer.files.projects import Things, read_project, scene_of
-from langsplat_viewer.files.watching import Stamps, stamps
+from langsplat_viewer.files.projects import PATHS, PROJECTS, QUERIES, Things, read_project, scene_of
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.marks import of_scene
-from langsplat_viewer.rendering.depth import UNCLIPPED, why_undrawable
+from langsplat_viewer.rendering.request import UNCLIPPED, why_undrawable
 from langsplat_viewer.state import LibraryView, Recording, SceneState, ViewerState
 from langsplat_viewer.viewer import Viewer, Visit, unanswered, visit_of
 
@@ -323,7 +319,7 @@ def fetch_photograph(viewer: Viewer) -> None:
     wanted = state.photograph = Photograph(camera, folder)
 
     def work(progress: Progress) -> Array:
-        return photographs.read(photographs.find(camera.name, path, folder), camera)
+        return disk.read_photograph(disk.find_photograph(camera.name, path, folder), camera)
 
     def done(image: Array) -> None:
         if state.photograph is wanted:

@@ -8,21 +8,21 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import LangSplatError
+from langsplat_viewer.actions.editing import place
 from langsplat_viewer.actions.history import now, remember
 from langsplat_viewer.actions.outline import have_things
 from langsplat_viewer.actions.queries import listed_queries
 from langsplat_viewer.actions.selecting import discard_and_leave
 from langsplat_viewer.actions.selecting import end as end_editing
 from langsplat_viewer.actions.settings import have_panels, open_panel
-from langsplat_viewer.actions.transforming import place
 from langsplat_viewer.actions.viewpoint import bookmarked_view
 from langsplat_viewer.camera.flight import pose_of
-from langsplat_viewer.files import PROJECTS
-from langsplat_viewer.files.flights import Bookmark
 from langsplat_viewer.files.preferences import with_recent
 from langsplat_viewer.files.projects import (
     LONGEST_NOTE,
     MOST_NOTES,
+    PROJECTS,
+    Bookmark,
     Note,
     Project,
     Things,

@@ -24,7 +24,7 @@ from langsplat_core.semantics.encoders import DEMO
 from langsplat_viewer.actions.history import let_go, remember
 from langsplat_viewer.actions.selecting import has_selection
 from langsplat_viewer.actions.settings import mute_letters, open_panel
-from langsplat_viewer.files.browsing import SUFFIX, QuerySet, SavedQuery, read_queries, write_queries
+from langsplat_viewer.files.projects import QUERIES, QuerySet, SavedQuery, read_queries, write_queries
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.output.saving import free_name
 from langsplat_viewer.state import SLOTS, EvidenceSheet, Query, ViewerState
@@ -364,7 +364,7 @@ def save_queries(viewer: Viewer, folder: Path) -> Path | None:
     if not state.queries:
         viewer.say_error("search for something first, then save the queries")
         return None
-    path = free_name(folder, state.path.stem if state.path else "scene", SUFFIX)
+    path = free_name(folder, state.path.stem if state.path else "scene", QUERIES)
     try:
         write_queries(path, listed_queries(state))
     except OSError as error:

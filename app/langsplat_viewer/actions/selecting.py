@@ -25,7 +25,7 @@ from langsplat_viewer import marks
 from langsplat_viewer.actions.history import remember
 from langsplat_viewer.marks import Drawn, Leaving, Marks, Measure, Mode, Stroke, Tool
 from langsplat_viewer.output.saving import free_name
-from langsplat_viewer.rendering.depth import UNCLIPPED
+from langsplat_viewer.rendering.request import UNCLIPPED
 from langsplat_viewer.state import Query
 from langsplat_viewer.viewer import Viewer
 

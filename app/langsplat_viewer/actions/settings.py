@@ -10,8 +10,7 @@ from langsplat_viewer.actions.selecting import leave_tool, stay
 from langsplat_viewer.actions.viewpoint import glide_to
 from langsplat_viewer.camera.overlays import facing
 from langsplat_viewer.files.preferences import SCALES, Theme
-from langsplat_viewer.rendering.depth import Clip
-from langsplat_viewer.rendering.request import AT_RANGE, MOST_DEGREE, SIZE_RANGE, Splats, Split
+from langsplat_viewer.rendering.request import AT_RANGE, MOST_DEGREE, SIZE_RANGE, Clip, Splats, Split
 from langsplat_viewer.state import OVERLAYS, Overlay, Ruler, ViewSettings
 from langsplat_viewer.viewer import Viewer
 

@@ -5,8 +5,8 @@ from pathlib import Path
 from langsplat_core.pipeline.forecast import count_photographs
 from langsplat_core.pipeline.report import work_folder
 from langsplat_viewer.actions.opening import open_scene, reload
-from langsplat_viewer.files import watching
-from langsplat_viewer.files.watching import Stamps
+from langsplat_viewer.files import disk
+from langsplat_viewer.files.disk import Stamps
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.state import TrainingForm
 from langsplat_viewer.viewer import Training, TrainingRequest, Viewer
@@ -52,10 +52,10 @@ def look_at_training(viewer: Viewer) -> None:
     training = viewer.training
     if training is None:
         return
-    written = watching.newest(training.request.out)
+    written = disk.newest(training.request.out)
     if not written:
         viewer.state.say("there are no Gaussians to look at yet")
-    elif written[0][0].name.endswith(watching.IN_TRAINING):
+    elif written[0][0].name.endswith(disk.IN_TRAINING):
         _show_checkpoint(viewer, training, written)
     else:
         open_scene(viewer, written[0][0])
@@ -72,15 +72,15 @@ def _show_checkpoint(viewer: Viewer, training: Training, checkpoint: Stamps) -> 
         else:
             open_scene(viewer, written)
 
-    viewer.run("reading the Gaussians so far", lambda progress: watching.write_preview(path), done)
+    viewer.run("reading the Gaussians so far", lambda progress: disk.write_preview(path), done)
 
 
 def _follow(viewer: Viewer, training: Training) -> None:
     folder = work_folder(training.request.out)
-    if viewer.state.path != folder / watching.NAME or viewer.worker.current is not None:
+    if viewer.state.path != folder / disk.PREVIEW or viewer.worker.current is not None:
         return
-    written = watching.newest(training.request.out)
-    if written != training.previewed and written and written[0][0].name.endswith(watching.IN_TRAINING):
+    written = disk.newest(training.request.out)
+    if written != training.previewed and written and written[0][0].name.endswith(disk.IN_TRAINING):
         _show_checkpoint(viewer, training, written)
 
 

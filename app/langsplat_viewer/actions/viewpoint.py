@@ -31,10 +31,10 @@ from langsplat_viewer.camera.controls import (
     zoom,
 )
 from langsplat_viewer.camera.flight import pose_at, pose_of, view_of
-from langsplat_viewer.files.flights import MOST_VIEWS, Bookmark, named
+from langsplat_viewer.files.projects import MOST_VIEWS, Bookmark, named
 from langsplat_viewer.jobs import one_line
-from langsplat_viewer.rendering.depth import image_formation
 from langsplat_viewer.rendering.renderer import ArrayRenderer
+from langsplat_viewer.rendering.request import image_formation
 from langsplat_viewer.state import GLIDE_SECONDS, Glide, Hover, Query, compared, compared_size, flight_of
 from langsplat_viewer.viewer import Viewer
 

@@ -27,9 +27,8 @@ from langsplat_core.scene import Camera
 from langsplat_viewer.camera.controls import Extent
 from langsplat_viewer.camera.flight import Motion, camera_of, frame_times
 from langsplat_viewer.output.saving import save_png
-from langsplat_viewer.rendering.depth import why_nothing
 from langsplat_viewer.rendering.renderer import ArrayRenderer, Backend, GlRenderer, open_renderer
-from langsplat_viewer.rendering.request import Inputs, RenderRequest
+from langsplat_viewer.rendering.request import Inputs, RenderRequest, why_nothing
 
 VIDEO, ANIMATIONS = ".mp4", (".webp", ".gif")
 SETTINGS = "film.json"  # in a folder of images: what they are images of

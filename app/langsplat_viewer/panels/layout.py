@@ -1,30 +1,21 @@
-"""The layout of the window: menus, command palette, list of keys, docked panels, messages and timing."""
+"""The layout of the window: menus, toolbar, command palette, help, docked panels, messages and timing."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 
-from imgui_bundle import ImVec2, hello_imgui, imgui
+from imgui_bundle import ImVec2, ImVec4, hello_imgui, icons_fontawesome_6, imgui
 
 from langsplat_core import __version__
 from langsplat_viewer.actions import filming, opening, settings, viewpoint
 from langsplat_viewer.commands import COMMANDS, HELD, LETTERS_MENU, MENUS, Command, in_menu, matching
-from langsplat_viewer.panels import (
-    library,
-    outline,
-    overlays,
-    record,
-    scene,
-    search,
-    select,
-    toolbar,
-    transform,
-    view,
-)
+from langsplat_viewer.panels import layout, outline, overlays, scene, search, select, view
 from langsplat_viewer.panels.scene import in_words
 from langsplat_viewer.panels.style import (
     MAIN_DOCK,
     MOST_OVER,
+    Area,
     bad,
     button_if,
     fitting,
@@ -294,11 +285,11 @@ PANELS: tuple[Panel, ...] = (
     Panel("Scene", MIDDLE, scene.draw),
     Panel("Outline", MIDDLE, outline.draw, is_open=False),
     Panel("Select", MIDDLE, select.draw, is_open=False),
-    Panel("Transform", MIDDLE, transform.draw, is_open=False),
-    Panel("Library", MIDDLE, library.draw, is_open=False),
+    Panel("Transform", MIDDLE, select.draw_transform, is_open=False),
+    Panel("Library", MIDDLE, scene.draw_library, is_open=False),
     Panel("Train", MIDDLE, scene.draw_training, is_open=False),
-    Panel("Record", MIDDLE, record.draw, is_open=False),
-    Panel("Bookmarks", MIDDLE, record.draw_bookmarks, is_open=False),
+    Panel("Record", MIDDLE, view.draw_record, is_open=False),
+    Panel("Bookmarks", MIDDLE, view.draw_bookmarks, is_open=False),
     Panel("Messages", FOOT, draw_messages),
     Panel("Overlays", MIDDLE, view.draw_overlays, is_open=False),
     Panel("Notes", MIDDLE, view.draw_notes, is_open=False),
@@ -410,10 +401,10 @@ def draw_over(viewer: Viewer) -> None:
         overlays.draw_pointing(viewer)
         select.draw_stroke(viewer, area)
         select.draw_hint(viewer, area)
-        transform.draw_gizmo(viewer, area)
+        select.draw_gizmo(viewer, area)
     overlays.draw_grip(viewer, area)
     overlays.draw_cube(viewer, area)
-    toolbar.draw(viewer, area)
+    layout.draw_toolbar(viewer, area)
     scene.draw_changed(viewer, area)
     scene.draw_unsaved(viewer)
     copied = filming.take_clipboard(viewer)
@@ -430,3 +421,75 @@ def _said(viewer: Viewer) -> str:
     if state.scene is None:
         return f"opening {state.opening.name} ..." if state.opening else "Drop a scene here, or press Ctrl+O"
     return state.nothing
+
+
+# The toolbar: commands that have an icon, in a strip at the left edge of the scene.
+
+GROUPS = [list(group) for _, group in groupby((c for c in COMMANDS if c.icon), lambda c: c.menu)]
+SIDE_EM, GROUP_GAP_EM, MARGIN_EM = 1.75, 0.3, 0.3  # of a button, between groups, around them
+OPACITY = 0.95  # of a button
+MOST_OF_SCENE = 0.4  # of the scene's width
+FLAGS = (
+    imgui.WindowFlags_.no_decoration
+    | imgui.WindowFlags_.no_move
+    | imgui.WindowFlags_.no_docking
+    | imgui.WindowFlags_.no_saved_settings
+    | imgui.WindowFlags_.no_focus_on_appearing
+    | imgui.WindowFlags_.no_bring_to_front_on_focus
+)
+
+
+def draw_toolbar(viewer: Viewer, area: Area) -> None:
+    """A column of buttons between the titles of images and what is written at their foot, further ones where
+    the scene is low; none where it is too narrow for them."""
+    if viewer.state.scene is None or not viewer.state.show_panel:
+        return
+    side, gap, margin = (float(hello_imgui.em_size(size)) for size in (SIDE_EM, GROUP_GAP_EM, MARGIN_EM))
+    top = area.top + side
+    places = toolbar_places([len(group) for group in GROUPS], area.height - 2 * side - 2 * margin, side, gap)
+    width, height = (max(place[axis] for place in places) + side + 2 * margin for axis in (0, 1))
+    if width > MOST_OF_SCENE * area.width:
+        return
+    imgui.set_next_window_pos(ImVec2(area.left, top))
+    imgui.set_next_window_size(ImVec2(width, height))
+    imgui.set_next_window_bg_alpha(0.0)
+    imgui.push_style_var(imgui.StyleVar_.window_padding, ImVec2(margin, margin))
+    imgui.begin("toolbar", None, FLAGS)
+    for command, (x, y) in zip((c for group in GROUPS for c in group), places, strict=True):
+        imgui.set_cursor_pos(ImVec2(margin + x, margin + y))
+        _tool_button(viewer, command, side)
+    imgui.end()
+    imgui.pop_style_var()
+
+
+def toolbar_places(sizes: list[int], room: float, side: float, gap: float) -> list[tuple[float, float]]:
+    """Places (x, y) of the buttons of groups of `sizes`, in columns not higher than `room`; a group begins a
+    new column where it does not fit into the rest of the last one."""
+    places: list[tuple[float, float]] = []
+    x = y = 0.0
+    for size in sizes:
+        if places and y + size * side > room:
+            x, y = x + side, 0.0
+        for _ in range(size):
+            if y and y + side > room:
+                x, y = x + side, 0.0
+            places.append((x, y))
+            y += side
+        y += gap
+    return places
+
+
+def _tool_button(viewer: Viewer, command: Command, side: float) -> None:
+    lit = command.is_on is not None and command.is_on(viewer)
+    colour = imgui.get_style_color_vec4(imgui.Col_.button_active if lit else imgui.Col_.window_bg)
+    imgui.push_style_color(imgui.Col_.button, ImVec4(colour.x, colour.y, colour.z, OPACITY))
+    if imgui.button(button_label(command), ImVec2(side, side)):
+        command.act(viewer)
+    imgui.pop_style_color()
+    keys = f" ({command.keys[0]})" if command.keys else ""
+    tip(command.does[0].upper() + command.does[1:] + keys)
+
+
+def button_label(command: Command) -> str:
+    """Return the label of a command's button: its icon, and an id that no other command has."""
+    return f"{getattr(icons_fontawesome_6, f'ICON_FA_{command.icon}')}##{command.does}"

@@ -17,7 +17,7 @@ from langsplat_viewer.actions import opening, projects, queries, settings, viewp
 from langsplat_viewer.camera import overlays
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.camera.overlays import Face, Label, face_at, placed, visible_faces, world_axes
-from langsplat_viewer.files.photographs import corners
+from langsplat_viewer.files.disk import corners
 from langsplat_viewer.panels.style import Area, elided, fitting, muted, scene_area, width_of
 from langsplat_viewer.state import Hover
 from langsplat_viewer.viewer import Viewer

@@ -41,8 +41,16 @@ from langsplat_core.raster.opengl.scene_textures import (
 from langsplat_core.raster.opengl.shaders import shader
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Gaussians, Scene
-from langsplat_viewer.rendering.depth import VISIBLE_ALPHA, camera_depths, depth_range
-from langsplat_viewer.rendering.request import Channel, Inputs, Pane, RenderKey, RenderRequest
+from langsplat_viewer.rendering.request import (
+    VISIBLE_ALPHA,
+    Channel,
+    Inputs,
+    Pane,
+    RenderKey,
+    RenderRequest,
+    camera_depths,
+    depth_range,
+)
 
 Backend = Literal["auto", "opengl", "cpu", "cuda"]
 Layer = moderngl.Texture | Channels  # what a pane is composed of, by the shader or by `composed`

@@ -1,4 +1,4 @@
-"""Transforms of the scene or of the selection, and cropping to a box; undone as every other edit is.
+"""Transforms of the scene or of the selection, cropping to a box; undo and redo of every edit.
 
 The scene that is shown is made anew from the one that was opened, by all transforms so far, so that undoing
 them all gives exactly what was there.
@@ -13,11 +13,12 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import LangSplatError
 from langsplat_core.query.selection import in_box
 from langsplat_core.scene.transform import AXES, Similarity, moving, rotating, scaling
-from langsplat_viewer.actions.history import remember
-from langsplat_viewer.actions.queries import ask_again, set_canonical
+from langsplat_viewer.actions.history import Moment, let_go, now, remember
+from langsplat_viewer.actions.outline import apply_locks
+from langsplat_viewer.actions.queries import ask_again, ask_unanswered, set_canonical, set_cut, set_level
 from langsplat_viewer.actions.selecting import has_scene, mark, show_hidden
 from langsplat_viewer.camera.controls import extent_of
-from langsplat_viewer.marks import Move
+from langsplat_viewer.marks import Move, pack, unpack
 from langsplat_viewer.state import EditForm, Gizmo, Point
 from langsplat_viewer.viewer import Viewer
 
@@ -179,3 +180,58 @@ def follow_box(viewer: Viewer) -> None:
     inside = _inside(viewer)
     if inside is not None:
         mark(viewer, replace(marks, selected=marks.selected & inside, hidden=marks.kept & ~inside))
+
+
+# Undo and redo of what was asked, shown, selected, hidden and deleted, and of the settings of what is seen.
+# The camera is not undone: its reset leads back.
+
+
+def undo(viewer: Viewer) -> None:
+    """Go back to before the last query, removal, colour, level, keyframe, note, selection, hiding, deletion
+    or transform, or the last change of display, colours, sliders, split, cuts or overlays."""
+    _step(viewer, viewer.history.past, viewer.history.future, "nothing to undo")
+
+
+def redo(viewer: Viewer) -> None:
+    """Do again what was undone last."""
+    _step(viewer, viewer.history.future, viewer.history.past, "nothing to redo")
+
+
+def _step(viewer: Viewer, there: list[Moment], back: list[Moment], otherwise: str) -> None:
+    if not there:
+        viewer.state.say(otherwise)
+        return
+    viewer.history.setting = ""
+    back.append(now(viewer))
+    _restore(viewer, there.pop())
+
+
+def _restore(viewer: Viewer, moment: Moment) -> None:
+    state, history = viewer.state, viewer.history
+    for query in state.queries:
+        query.slot = None
+    for query, slot, since, cut in moment.queries:
+        query.slot, query.shown_since = slot, since
+        if query.automatic is None:  # it is asked anew
+            query.cut = cut
+        set_cut(viewer, query, cut, is_new=False)
+    state.queries, state.selected = [query for query, *_ in moment.queries], moment.selected
+    marks = unpack(moment.marks, pack(state.selection.marks, history.marks))
+    state.selection = replace(state.selection, marks=marks, stroke=None)
+    state.record.keyframes, state.record.chosen = moment.keyframes, None
+    if moment.things != state.things:
+        state.things = moment.things
+        apply_locks(viewer)
+    state.notes = moment.notes
+    state.picture, state.latent_level = moment.picture, moment.latent_level
+    state.settings = moment.settings
+    looks = replace(state.preferences, colour_map=moment.picture.colour_map, overlays=moment.overlays)
+    state.preferences = looks
+    past, future = history.past, history.future
+    set_level(viewer, moment.level)
+    history.past, history.future = past, future  # what that has remembered is no step of its own
+    let_go(viewer)
+    if moment.moves != state.selection.moves:
+        place(viewer, moment.moves)
+    else:
+        ask_unanswered(viewer)
