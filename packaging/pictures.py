@@ -19,6 +19,7 @@ from langsplat_core.io.hostile import opened
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.training.language.codec_fit import train_autoencoder
 from langsplat_viewer.actions import (
+    browsing,
     editing,
     filming,
     opening,
@@ -26,7 +27,6 @@ from langsplat_viewer.actions import (
     projects,
     selecting,
     settings,
-    training,
     viewpoint,
 )
 from langsplat_viewer.options import scene_path, services
@@ -216,8 +216,8 @@ def _trained(ctx: Any, window: Window) -> None:
     room = ["dataset", "--seed", "3", "--views", "12", "--out", str(folder / "room")]
     subprocess.run([sys.executable, "-m", "assets.making", *room], check=True)
     settings.open_panel(viewer, "Train")
-    training.fill_in(viewer, TrainingForm(str(folder / "room"), str(folder / "room.ply"), "quick"))
-    training.start_training(viewer)
+    browsing.fill_in(viewer, TrainingForm(str(folder / "room"), str(folder / "room.ply"), "quick"))
+    browsing.start_training(viewer)
     process = viewer.training
     assert process is not None
     while process.exit_code is None and len(process.progress.losses) < 120:
@@ -251,7 +251,7 @@ WINDOWS: dict[str, tuple[tuple[str, ...], Act]] = {
     "orthographic.jpg": (("teddy bear",), _orthographic),
     "film.jpg": (("teddy bear",), _film),
     "timing.jpg": (("teddy bear",), _timed),
-    "training.jpg": (("teddy bear",), _trained),
+    "browsing.jpg": (("teddy bear",), _trained),
 }
 
 

@@ -9,6 +9,7 @@ from langsplat_core.config import Display
 from langsplat_core.display.displays import DISPLAYS, DisplayRow
 from langsplat_core.scene import LEVELS
 from langsplat_viewer.actions import (
+    browsing,
     editing,
     filming,
     opening,
@@ -22,7 +23,6 @@ from langsplat_viewer.actions.selecting import Part
 from langsplat_viewer.camera.controls import Side, adopt_up, level
 from langsplat_viewer.files.preferences import THEMES, Theme
 from langsplat_viewer.marks import TOOLS, Tool
-from langsplat_viewer.output import saving
 from langsplat_viewer.state import Overlay
 from langsplat_viewer.viewer import Viewer
 
@@ -105,7 +105,7 @@ def _letters(scale: float) -> Command:
 
 def _recent(path: str) -> Command:
     name = Path(path)
-    return Command(f"open {name.parent.name}/{name.name}", lambda viewer: opening.open_recent(viewer, path))
+    return Command(f"open {name.parent.name}/{name.name}", lambda viewer: browsing.open_recent(viewer, path))
 
 
 def _panel(title: str) -> Command:
@@ -185,9 +185,11 @@ UI_SCALES = (0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0)
 MENUS = ("File", "Edit", "Select", "View", "Camera", "Window", "Help")
 
 COMMANDS: tuple[Command, ...] = (
-    Command("open a scene", opening.ask_for_file, ("Ctrl+O",), "File"),
+    Command("open a scene", browsing.ask_for_file, ("Ctrl+O",), "File"),
     Command(
-        "search all scenes of a folder", lambda viewer: opening.ask_for_folder(viewer, "library"), menu="File"
+        "search all scenes of a folder",
+        lambda viewer: browsing.ask_for_folder(viewer, "library"),
+        menu="File",
     ),
     Command("reload the scene", opening.reload, ("F5",), "File", apart=True),
     Command(
@@ -199,13 +201,13 @@ COMMANDS: tuple[Command, ...] = (
     Command("train a scene", lambda viewer: settings.open_panel(viewer, "Train"), menu="File", apart=True),
     Command(
         "save a picture",
-        lambda viewer: saving.save_picture(viewer, Path.cwd()),
+        lambda viewer: filming.save_picture(viewer, Path.cwd()),
         ("Ctrl+S", "P"),
         "File",
         icon="CAMERA",
         apart=True,
     ),
-    Command("save the view", lambda viewer: saving.save_view(viewer, Path.cwd()), menu="File"),
+    Command("save the view", lambda viewer: filming.save_view(viewer, Path.cwd()), menu="File"),
     Command(
         "save the project",
         lambda viewer: projects.save_project(viewer, Path.cwd()),
@@ -299,7 +301,7 @@ COMMANDS: tuple[Command, ...] = (
         is_on=lambda viewer: viewer.state.settings.split.mode == "levels",
         icon="LAYER_GROUP",
     ),
-    Command("compare with another scene", opening.ask_for_beside, menu="View"),
+    Command("compare with another scene", browsing.ask_for_beside, menu="View"),
     *(_overlay(name, title) for name, title in OVERLAY_TITLES.items()),
     Command(
         "compare the picture with the reference", viewpoint.compare_with_reference, menu="View", apart=True

@@ -17,14 +17,13 @@ import moderngl
 from langsplat_core.config import LevelChoice, PictureConfig
 from langsplat_core.errors import BackendError, InputError, LangSplatError
 from langsplat_viewer.actions import (
-    beside,
+    browsing,
     filming,
     opening,
     projects,
     queries,
     selecting,
     settings,
-    training,
     viewpoint,
 )
 from langsplat_viewer.canvas import Canvas
@@ -278,7 +277,7 @@ class Window:
         self.keyboard.listen(glfw_window_hello_imgui())
         settings.open_panel(self.viewer, "Search")  # before what was left over it the last time
         if self._request.path.name.endswith(PROJECTS):  # which says itself how it is looked at
-            opening.open_project(self.viewer, self._request.path, self._ask)
+            browsing.open_project(self.viewer, self._request.path, self._ask)
         else:
             opening.open_scene(self.viewer, self._request.path, self._first_view)
 
@@ -335,7 +334,7 @@ class Window:
 
     def drop(self, paths: list[str]) -> None:
         """Open files that were dropped onto the window."""
-        opening.open_dropped(self.viewer, [Path(path) for path in paths])
+        browsing.open_dropped(self.viewer, [Path(path) for path in paths])
 
     def _dropped(self, window: object, paths: list[str]) -> None:
         self.drop(paths)
@@ -352,8 +351,8 @@ class Window:
         self._began = time.perf_counter()
         viewer.take_results()
         viewpoint.tick(viewer, imgui.get_time())
-        beside.follow(viewer)
-        training.watch_training(viewer)
+        opening.follow_beside(viewer)
+        browsing.watch_training(viewer)
         opening.fetch_photograph(viewer)
         navigation.muted_until_clicked(viewer)  # hello_imgui draws the panels after this
         self._hiding.apply(viewer)

@@ -11,7 +11,7 @@ from imgui_bundle import hello_imgui, imgui  # isort: skip
 from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
 import glfw  # isort: skip
 from langsplat_core.io.scenes import load_scene, save_scene
-from langsplat_viewer.actions import editing, opening, queries, selecting, settings, viewpoint
+from langsplat_viewer.actions import browsing, editing, opening, queries, selecting, settings, viewpoint
 from langsplat_viewer.camera.overlays import Label, visible_faces
 from langsplat_viewer.panels import overlays, select
 from langsplat_viewer.panels.overlays import EDGE
@@ -517,6 +517,6 @@ def pin_a_note(s: Any) -> None:
     for left in (1, 0):
         s.key(imgui.Key.mod_ctrl | imgui.Key.z)
         assert len(s.state.notes) == left
-    opening.open_file(s.window.viewer, s.folder / "blobs-001.langsplat")
+    browsing.open_file(s.window.viewer, s.folder / "blobs-001.langsplat")
     s.wait(lambda: s.state.notes == (note,))
     s.settle()

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from langsplat_viewer.actions import editing, opening, outline, projects, selecting, settings
+from langsplat_viewer.actions import browsing, editing, opening, outline, projects, selecting, settings
 from langsplat_viewer.actions.selecting import take
 from langsplat_viewer.files.projects import Things
 from tests.support.fakes import CENTRES, blob_scene
@@ -166,7 +166,7 @@ def test_a_project_keeps_names_groups_and_locks(outlined, viewer, tmp_path, monk
     things, path = outlined.state.things, projects.save_project(outlined, tmp_path)
     open_scene(viewer, "plain.ply")
     assert viewer.state.things != things
-    opening.open_project(viewer, path)
+    browsing.open_project(viewer, path)
     settle(viewer)
     assert viewer.state.things == things
     selecting.select_all(viewer)
@@ -190,7 +190,7 @@ def test_a_project_of_another_tree_keeps_what_is_known(outlined, tmp_path, monke
     path.write_text(json.dumps(top))
     if not field:
         monkeypatch.setitem(SCENES, "tree.ply", replace(SCENES["tree.ply"], language=None))
-    opening.open_project(outlined, path)
+    browsing.open_project(outlined, path)
     settle(outlined)
     things = outlined.state.things
     selecting.select_all(outlined)

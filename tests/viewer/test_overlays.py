@@ -15,7 +15,7 @@ from langsplat_core.query.describe import Describer, look_at_pixel
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import look_at
-from langsplat_viewer.actions import opening, settings, viewpoint
+from langsplat_viewer.actions import browsing, opening, settings, viewpoint
 from langsplat_viewer.camera import overlays
 from langsplat_viewer.camera.controls import default_view, extent_of, frame_of, from_side, orbit
 from langsplat_viewer.camera.overlays import FACES, Label, face_at, facing, placed, visible_faces
@@ -417,9 +417,9 @@ def test_a_chosen_folder_is_looked_into_and_remembered(beside_photograph, tmp_pa
     photograph(tmp_path / "away" / "deep" / "photo_2.jpg")
     opening.fade_photograph(beside_photograph, 1.0)
     stand(beside_photograph, 2)
-    opening.ask_for_photographs(beside_photograph)
+    browsing.ask_for_photographs(beside_photograph)
     assert beside_photograph.state.picks_folder
-    opening.choose_photograph_folder(beside_photograph, tmp_path / "away")
+    browsing.choose_photograph_folder(beside_photograph, tmp_path / "away")
     assert beside_photograph.state.browser is None
     stand(beside_photograph, 2)
     assert opening.photograph_here(beside_photograph.state).image.shape == (120, 160, 3)
@@ -427,5 +427,5 @@ def test_a_chosen_folder_is_looked_into_and_remembered(beside_photograph, tmp_pa
     assert load_preferences(tmp_path / "settings").photographs == {
         str(tmp_path / "blobs.ply"): str(tmp_path / "away")
     }
-    opening.ask_for_file(beside_photograph)
+    browsing.ask_for_file(beside_photograph)
     assert not beside_photograph.state.picks_folder

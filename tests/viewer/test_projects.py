@@ -13,6 +13,7 @@ import pytest
 from langsplat_core.errors import LangSplatError
 from langsplat_core.scene.transform import moving
 from langsplat_viewer.actions import (
+    browsing,
     editing,
     filming,
     opening,
@@ -63,7 +64,7 @@ def saved(opened, tmp_path, monkeypatch) -> Path:
 def again(saved):
     """Another viewer with the project open."""
     made = Viewer(Services(load, lambda encoder_id: FakeEncoder()), surface=FakeSurface())
-    opening.open_file(made, saved)
+    browsing.open_file(made, saved)
     settle(made)
     yield made
     made.worker.close()
@@ -91,7 +92,7 @@ def test_everything_comes_back(opened, saved, again):
     assert not after.selection.is_unsaved
     assert (before.preferences.recent[0], after.preferences.recent[0]) == (str(saved), str(saved))
     queries.remove_all(again)
-    opening.open_recent(again, str(saved))
+    browsing.open_recent(again, str(saved))
     settle(again)
     assert len(after.queries) == 4
     assert projects.save_project(again, Path("/nowhere")) == saved  # where it came from
@@ -111,7 +112,7 @@ def test_other_programs_find_the_answers_in_it(opened, saved):
 def test_a_scene_that_has_changed_keeps_its_questions_alone(saved, viewer, monkeypatch):
     smaller = SCENES["blobs.ply"].take(np.arange(240))
     monkeypatch.setitem(SCENES, "blobs.ply", smaller)
-    opening.open_project(viewer, saved)
+    browsing.open_project(viewer, saved)
     settle(viewer)
     assert len(viewer.state.queries) == 4
     assert not viewer.state.selection.marks.selected.any()
@@ -120,7 +121,7 @@ def test_a_scene_that_has_changed_keeps_its_questions_alone(saved, viewer, monke
 
 def test_a_scene_that_is_gone(saved, opened):
     Path("blobs.ply").unlink()
-    opening.open_dropped(opened, [saved])
+    browsing.open_dropped(opened, [saved])
     assert "not there" in errors(opened)[-1]
     assert opened.state.scene is not None
 

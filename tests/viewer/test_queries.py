@@ -12,7 +12,7 @@ from langsplat_core.display.displays import NO_HEAT, Subject, relevancies
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.scene import CANONICAL_PHRASES, Reading
 from langsplat_core.semantics.store import ImageFeatures
-from langsplat_viewer.actions import editing, opening, queries, settings
+from langsplat_viewer.actions import browsing, editing, queries, settings
 from langsplat_viewer.files.projects import QuerySet, SavedQuery, read_queries, write_queries
 from langsplat_viewer.output.headless import describe
 from langsplat_viewer.panels.search import BINS, hint, histogram
@@ -277,7 +277,7 @@ def test_a_set_of_queries_is_asked_again(asked, tmp_path):
     assert path.name == "blobs-001.queries.json"
     open_scene(asked, "blobs.ply")
     assert (asked.state.queries, asked.state.canonical) == ([], ())
-    opening.open_dropped(asked, [path])
+    browsing.open_dropped(asked, [path])
     settle(asked)
     found = [(query.phrase, query.cut, query.slot is None) for query in asked.state.queries]
     assert found == [("mug", 0.7, False), ("plant", None, True)]
@@ -289,7 +289,7 @@ def test_a_set_of_queries_is_asked_again(asked, tmp_path):
 def test_queries_dropped_with_a_scene_are_asked_of_it(viewer, tmp_path):
     path = tmp_path / "a.queries.json"
     write_queries(path, QuerySet((SavedQuery("mug"),)))
-    opening.open_dropped(viewer, [path, Path("blobs.ply")])
+    browsing.open_dropped(viewer, [path, Path("blobs.ply")])
     settle(viewer)
     assert [query.phrase for query in viewer.state.queries] == ["mug"]
 

@@ -12,10 +12,10 @@ from PIL import Image
 from langsplat_core.config import PictureConfig
 from langsplat_core.io.cameras import read_cameras
 from langsplat_core.io.scenes import save_scene
-from langsplat_viewer.actions import editing, filming, opening, queries, settings, viewpoint
+from langsplat_viewer.actions import browsing, editing, filming, queries, settings, viewpoint
 from langsplat_viewer.camera.controls import orbit, zoom
 from langsplat_viewer.files.projects import read_flight
-from langsplat_viewer.output import film, saving
+from langsplat_viewer.output import film
 from langsplat_viewer.rendering.renderer import render_image
 from langsplat_viewer.rendering.request import Clip, Splats
 from langsplat_viewer.viewer import Viewer
@@ -137,7 +137,7 @@ def test_a_path_is_saved_loaded_and_dropped(opened, folder):
     assert path.name == "blobs-001.path.json"
     assert len(read_flight(path).keyframes) == 3
     filming.clear_path(opened)
-    opening.open_dropped(opened, [path])
+    browsing.open_dropped(opened, [path])
     assert times(opened) == [0, 2, 4]
     assert opened.state.wanted_panel == "Record"
     (folder / "bad.path.json").write_text("{}")
@@ -276,7 +276,7 @@ def test_what_the_command_cannot_say_is_said(opened, folder):
 
 
 def test_pictures_are_saved_under_new_names(opened, tmp_path):
-    first, second = saving.save_picture(opened, tmp_path), saving.save_picture(opened, tmp_path)
+    first, second = filming.save_picture(opened, tmp_path), filming.save_picture(opened, tmp_path)
     assert [first.name, second.name] == ["blobs-001.png", "blobs-002.png"]
     assert np.asarray(Image.open(second)).tolist() == np.full((6, 8, 3), 77).tolist()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["blobs-001.png", "blobs-002.png"]
@@ -284,7 +284,7 @@ def test_pictures_are_saved_under_new_names(opened, tmp_path):
 
 def test_a_saved_view_can_be_read_again(opened, tmp_path):
     opened.state.size = (321, 123)
-    camera = read_cameras(saving.save_view(opened, tmp_path))[0]
+    camera = read_cameras(filming.save_view(opened, tmp_path))[0]
     expected = opened.state.view.camera(321, 123)
     assert (camera.width, camera.height) == (321, 123)
     assert_allclose(camera.world_to_camera, expected.world_to_camera, atol=1e-9)
@@ -294,7 +294,7 @@ def test_a_saved_view_can_be_read_again(opened, tmp_path):
 def test_an_unwritable_folder_is_one_line(opened, tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("not a folder")
-    assert saving.save_picture(opened, blocked) is None
-    assert saving.save_view(opened, blocked) is None
+    assert filming.save_picture(opened, blocked) is None
+    assert filming.save_view(opened, blocked) is None
     assert len(errors(opened)) == 2
     assert all("not saved" in text for text in errors(opened))

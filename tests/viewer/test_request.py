@@ -18,7 +18,7 @@ from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.commands import BUTTONS, COMMANDS, OVERLAY_TITLES, matching
 from langsplat_viewer.files.preferences import FILE_NAME, load_preferences, save_preferences
 from langsplat_viewer.marks import Marks
-from langsplat_viewer.output import film, saving
+from langsplat_viewer.output import film
 from langsplat_viewer.panels.overlays import STEPS, bar_colours
 from langsplat_viewer.panels.view import compared_name
 from langsplat_viewer.rendering.renderer import ArrayRenderer, GlRenderer
@@ -108,7 +108,7 @@ def test_screen_file_sized_image_film_and_reference_agree(gl, opened, tmp_path, 
             assert getattr(request.picture, field.name) != field.default, field.name
 
     rest(canvas, state, 1.0)
-    images = {"screen": on_screen(canvas, state), "saved": image(saving.save_picture(opened, tmp_path))}
+    images = {"screen": on_screen(canvas, state), "saved": image(filming.save_picture(opened, tmp_path))}
     filming.set_film_size(opened, *state.size)
     filming.save_sized_picture(opened, tmp_path)
     recorded(opened)
@@ -136,9 +136,9 @@ def test_images_are_saved_without_background_if_so_chosen(gl, opened, tmp_path):
     opened.surface = Canvas(gl, GlRenderer(gl, "cpu"))
     settings.resize(opened, 40, 30)
     filming.set_film_size(opened, 40, 30)
-    assert image(saving.save_picture(opened, tmp_path)).shape == (30, 40, 3)
+    assert image(filming.save_picture(opened, tmp_path)).shape == (30, 40, 3)
     settings.save_transparent(opened, True)
-    saved = image(saving.save_picture(opened, tmp_path))
+    saved = image(filming.save_picture(opened, tmp_path))
     filming.save_sized_picture(opened, tmp_path)
     recorded(opened)
     assert saved.shape == (30, 40, 4)

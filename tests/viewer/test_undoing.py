@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from langsplat_viewer.actions import editing, opening, queries, selecting, settings
-from langsplat_viewer.actions.history import GESTURE, LONGEST
 from langsplat_viewer.actions.selecting import mark
 from langsplat_viewer.marks import Marks, hiding, unmarked
 from langsplat_viewer.rendering.request import Clip, Splats
+from langsplat_viewer.viewer import GESTURE, MOST_STEPS
 from tests.support.windowless import ask, open_scene, settle
 
 
@@ -108,10 +108,10 @@ def test_colour_level_and_display_are_undone(opened):
 
 
 def test_another_scene_and_a_long_day(opened):
-    for _ in range(LONGEST):
+    for _ in range(MOST_STEPS):
         settings.set_display(opened, "depth")
         settings.set_display(opened, "rgb")
-    assert len(opened.history.past) == LONGEST
+    assert len(opened.history.past) == MOST_STEPS
     open_scene(opened, "bare.ply")
     assert opened.history.past == []
 
@@ -221,12 +221,12 @@ def test_a_hundred_changes_of_a_million_gaussians_take_little_memory(viewer):
     viewer.state.selection = replace(viewer.state.selection, marks=unmarked(count))
     tracemalloc.start()
     try:
-        for step in range(LONGEST):
+        for step in range(MOST_STEPS):
             mark(viewer, changed(viewer.state.selection.marks, rng, step))
         held, _ = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert len(viewer.history.past) == LONGEST
+    assert len(viewer.history.past) == MOST_STEPS
     now = viewer.state.selection.marks
     own = sum(mask.nbytes for mask in (now.selected, now.hidden))
     assert held - own < 15e6

@@ -13,14 +13,13 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import LangSplatError
 from langsplat_core.query.selection import in_box
 from langsplat_core.scene.transform import AXES, Similarity, moving, rotating, scaling
-from langsplat_viewer.actions.history import Moment, let_go, now, remember
 from langsplat_viewer.actions.outline import apply_locks
 from langsplat_viewer.actions.queries import ask_again, ask_unanswered, set_canonical, set_cut, set_level
 from langsplat_viewer.actions.selecting import has_scene, mark, show_hidden
 from langsplat_viewer.camera.controls import extent_of
 from langsplat_viewer.marks import Move, pack, unpack
 from langsplat_viewer.state import EditForm, Gizmo, Point
-from langsplat_viewer.viewer import Viewer
+from langsplat_viewer.viewer import Moment, Viewer, let_go, now, remember
 
 
 def fill_form(viewer: Viewer, form: EditForm) -> None:

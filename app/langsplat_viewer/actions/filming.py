@@ -13,9 +13,9 @@ import numpy as np
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.errors import InputError, LangSplatError
+from langsplat_core.io.cameras import write_cameras
 from langsplat_core.progress import Progress
 from langsplat_core.scene import LEVELS
-from langsplat_viewer.actions.history import remember
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.actions.viewpoint import glide_to, leave_path, path_seconds
 from langsplat_viewer.camera.controls import from_camera, with_projection
@@ -33,13 +33,60 @@ from langsplat_viewer.camera.flight import (
 from langsplat_viewer.files.projects import MOST_KEYFRAMES, PATHS, read_flight, write_flight
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.options import MAX_SIDE, say_compiling
-from langsplat_viewer.output.film import VIDEO, Shot, cameras_of, check_film, find_ffmpeg, make_film
+from langsplat_viewer.output.film import (
+    VIDEO,
+    Shot,
+    cameras_of,
+    check_film,
+    find_ffmpeg,
+    free_name,
+    make_film,
+    save_png,
+)
 from langsplat_viewer.output.headless import draw_something
-from langsplat_viewer.output.saving import free_name, save_png, save_view
 from langsplat_viewer.rendering.renderer import open_renderer
 from langsplat_viewer.rendering.request import Splats
 from langsplat_viewer.state import SPACING, ViewerState, flight_of
-from langsplat_viewer.viewer import Viewer
+from langsplat_viewer.viewer import Viewer, remember
+
+
+def save_picture(viewer: Viewer, folder: Path) -> Path | None:
+    """Save the scene as shown, without its background if that was chosen, to a new PNG in `folder`;
+    returns its path, None if that failed."""
+    state = viewer.state
+    if viewer.surface is None or state.scene is None or state.view is None:
+        viewer.say_error("open a scene first, then save a picture of it")
+        return None
+    path = free_name(folder, state.path.stem if state.path else "picture", ".png")
+    transparent, beside = state.settings.transparent, viewer.beside
+    try:
+        images = [viewer.surface.capture(state.request(transparent=transparent))]
+        if beside is not None and beside.surface is not None and beside.state.scene is not None:
+            images.append(beside.surface.capture(beside.state.request(transparent=transparent)))
+        save_png(path, state.settings.split.joined(images, images[0].shape[1]))
+    except (OSError, LangSplatError) as error:
+        viewer.say_error(f"{path}: not saved ({one_line(error)})")
+        return None
+    state.say(f"saved {path}")
+    return path
+
+
+def save_view(viewer: Viewer, folder: Path) -> Path | None:
+    """Save the current camera, with perspective, to a new file that `--camera` reads; returns its path, None
+    if that failed."""
+    state = viewer.state
+    if state.view is None:
+        viewer.say_error("open a scene first, then save a view of it")
+        return None
+    path = free_name(folder, f"{state.path.stem if state.path else 'view'}-view", ".json")
+    try:
+        write_cameras(path, (with_projection(state.view, orthographic=False).camera(*state.size),))
+    except OSError as error:
+        viewer.say_error(f"{path}: not saved ({one_line(error)})")
+        return None
+    span = f" --orthographic {state.view.span_in(*state.size):.6g}" if state.view.orthographic else ""
+    state.say(f"saved {path}; show it again with --camera {path.name}{span}")
+    return path
 
 
 def add_keyframe(viewer: Viewer) -> None:

@@ -16,13 +16,12 @@ from langsplat_core.query.selection import at_point
 from langsplat_core.scene import LEVELS, NO_NODE
 from langsplat_core.scene.language import TaughtWord, tidy
 from langsplat_core.semantics.encoders import DEMO
-from langsplat_viewer.actions.history import remember
 from langsplat_viewer.actions.queries import taught, teach
 from langsplat_viewer.actions.selecting import mark, select_alike, take
 from langsplat_viewer.actions.viewpoint import focus_on
 from langsplat_viewer.files.projects import Group, Things, known_things
 from langsplat_viewer.state import OutlineView
-from langsplat_viewer.viewer import Viewer
+from langsplat_viewer.viewer import Viewer, remember
 
 Target = int | Array  # a node of the tree, or a (3,) point on the surface, world units
 

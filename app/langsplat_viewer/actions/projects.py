@@ -9,7 +9,6 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.errors import LangSplatError
 from langsplat_viewer.actions.editing import place
-from langsplat_viewer.actions.history import now, remember
 from langsplat_viewer.actions.outline import have_things
 from langsplat_viewer.actions.queries import listed_queries
 from langsplat_viewer.actions.selecting import discard_and_leave
@@ -30,9 +29,9 @@ from langsplat_viewer.files.projects import (
 )
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.marks import Pair, unpack
-from langsplat_viewer.output.saving import free_name
+from langsplat_viewer.output.film import free_name
 from langsplat_viewer.state import SLOTS, Query, Ruler, ViewerState
-from langsplat_viewer.viewer import Viewer, Visit, visit_of
+from langsplat_viewer.viewer import Viewer, Visit, now, remember, visit_of
 
 # Notes.
 

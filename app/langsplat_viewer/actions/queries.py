@@ -21,14 +21,13 @@ from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import TaughtWord
 from langsplat_core.scene.language import phrase_key, split_phrases
 from langsplat_core.semantics.encoders import DEMO
-from langsplat_viewer.actions.history import let_go, remember
 from langsplat_viewer.actions.selecting import has_selection
 from langsplat_viewer.actions.settings import mute_letters, open_panel
 from langsplat_viewer.files.projects import QUERIES, QuerySet, SavedQuery, read_queries, write_queries
 from langsplat_viewer.jobs import one_line
-from langsplat_viewer.output.saving import free_name
+from langsplat_viewer.output.film import free_name
 from langsplat_viewer.state import SLOTS, EvidenceSheet, Query, ViewerState
-from langsplat_viewer.viewer import Viewer
+from langsplat_viewer.viewer import Viewer, let_go, remember
 
 MOST_THINGS = 20  # of one answer that are told apart
 

@@ -5,14 +5,13 @@ from dataclasses import fields, replace
 from langsplat_core.config import ColourMap, Display, PictureConfig
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.query.engine import no_field
-from langsplat_viewer.actions.history import remember
 from langsplat_viewer.actions.selecting import leave_tool, stay
 from langsplat_viewer.actions.viewpoint import glide_to
 from langsplat_viewer.camera.overlays import facing
 from langsplat_viewer.files.preferences import SCALES, Theme
 from langsplat_viewer.rendering.request import AT_RANGE, MOST_DEGREE, SIZE_RANGE, Clip, Splats, Split
 from langsplat_viewer.state import OVERLAYS, Overlay, Ruler, ViewSettings
-from langsplat_viewer.viewer import Viewer
+from langsplat_viewer.viewer import Viewer, remember
 
 
 def compare_with(viewer: Viewer, display: Display, latent_level: int | None = None) -> None:

@@ -22,15 +22,7 @@ from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import read_json_file
 from langsplat_core.scene import FARTHEST, LEVELS
 from langsplat_core.scene.transform import similarity
-from langsplat_viewer.camera.flight import (
-    FOV_LIMITS,
-    LONGEST,
-    SAME_TIME,
-    SPAN_LIMITS,
-    Flight,
-    Keyframe,
-    Pose,
-)
+from langsplat_viewer.camera.flight import FOV_LIMITS, LONGEST, SAME_TIME, SPAN_LIMITS, Flight, Keyframe, Pose
 from langsplat_viewer.marks import Move, PackedMarks
 from langsplat_viewer.rendering.request import Clip
 

@@ -1,4 +1,4 @@
-"""Films as files: MP4 by the system's ffmpeg, animated WebP and GIF, or a folder of images.
+"""Images and films as files: PNG, MP4 by the system's ffmpeg, animated WebP and GIF, or a folder of images.
 
 A file is written whole or not at all. A folder is filled image by image; where the same film was begun in
 it before, the images that are there are kept.
@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields, is_dataclass
+from itertools import count
 from pathlib import Path
 
 import moderngl
@@ -26,9 +27,25 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import Camera
 from langsplat_viewer.camera.controls import Extent
 from langsplat_viewer.camera.flight import Motion, camera_of, frame_times
-from langsplat_viewer.output.saving import save_png
 from langsplat_viewer.rendering.renderer import ArrayRenderer, Backend, GlRenderer, open_renderer
 from langsplat_viewer.rendering.request import Inputs, RenderRequest, why_nothing
+
+
+def free_name(folder: Path, stem: str, suffix: str, companions: tuple[str, ...] = ()) -> Path:
+    """The first of stem-001, stem-002, ... that does not exist in `folder`, nor with the suffixes of files
+    that are written beside it."""
+    for number in count(1):
+        name = f"{stem}-{number:03d}"
+        if not any((folder / f"{name}{ending}").exists() for ending in (suffix, *companions)):
+            break
+    return folder / f"{name}{suffix}"
+
+
+def save_png(path: Path, image: Array) -> None:
+    """Write an (H, W, 3) or (H, W, 4) uint8 image, whole or not at all."""
+    with atomic_path(path) as temporary:
+        Image.fromarray(image).save(temporary, format="PNG")
+
 
 VIDEO, ANIMATIONS = ".mp4", (".webp", ".gif")
 SETTINGS = "film.json"  # in a folder of images: what they are images of

@@ -27,15 +27,8 @@ from langsplat_viewer.camera.controls import (
 )
 from langsplat_viewer.camera.flight import Motion, turntable
 from langsplat_viewer.files.projects import read_flight
-from langsplat_viewer.options import (
-    ViewerOptions,
-    check_display,
-    chosen_camera,
-    latent_level,
-    say_compiling,
-)
-from langsplat_viewer.output.film import VIDEO, Shot, cameras_of, check_film, in_one_line, make_film
-from langsplat_viewer.output.saving import save_png
+from langsplat_viewer.options import ViewerOptions, check_display, chosen_camera, latent_level, say_compiling
+from langsplat_viewer.output.film import VIDEO, Shot, cameras_of, check_film, in_one_line, make_film, save_png
 from langsplat_viewer.rendering.renderer import ArrayRenderer, Backend, GlRenderer, open_renderer
 from langsplat_viewer.rendering.request import RenderRequest, plain_request, why_nothing, why_undrawable
 from langsplat_viewer.state import SLOTS

@@ -8,7 +8,7 @@ from pathlib import Path
 from imgui_bundle import ImVec2, ImVec4, hello_imgui, icons_fontawesome_6, imgui
 
 from langsplat_core import __version__
-from langsplat_viewer.actions import filming, opening, settings, viewpoint
+from langsplat_viewer.actions import browsing, filming, opening, settings, viewpoint
 from langsplat_viewer.commands import COMMANDS, HELD, LETTERS_MENU, MENUS, Command, in_menu, matching
 from langsplat_viewer.panels import layout, outline, overlays, scene, search, select, view
 from langsplat_viewer.panels.scene import in_words
@@ -62,7 +62,7 @@ def _recent(viewer: Viewer) -> None:
         for number, path in enumerate(recent):
             name = Path(path)
             if imgui.menu_item(f"{name.parent.name}/{name.name}##{number}", "", False)[0]:
-                opening.open_recent(viewer, path)
+                browsing.open_recent(viewer, path)
             if imgui.is_item_hovered():
                 imgui.set_tooltip(path)
         imgui.end_menu()

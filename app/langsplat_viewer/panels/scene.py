@@ -12,9 +12,8 @@ from langsplat_core.config import TrainPreset
 from langsplat_core.io.scenes import format_of
 from langsplat_core.query.finding import Hit
 from langsplat_core.query.library import THUMBNAIL
-from langsplat_viewer.actions import opening, projects, selecting, settings, training
+from langsplat_viewer.actions import browsing, filming, opening, projects, selecting, settings
 from langsplat_viewer.files.disk import Entry, Listing
-from langsplat_viewer.output import saving
 from langsplat_viewer.panels.style import (
     Area,
     bad,
@@ -46,11 +45,11 @@ def draw(viewer: Viewer) -> None:
             small_wrapped(doubt.partition(":")[0], bad())
             tip(doubt)
     if imgui.button("Open ..."):
-        opening.ask_for_file(viewer)
+        browsing.ask_for_file(viewer)
     if next_button("Save picture"):
-        saving.save_picture(viewer, Path.cwd())
+        filming.save_picture(viewer, Path.cwd())
     if next_button("Save view"):
-        saving.save_view(viewer, Path.cwd())
+        filming.save_view(viewer, Path.cwd())
     if next_button("Help"):
         settings.toggle_help(viewer)
     if len(state.scenes) > 1:
@@ -120,7 +119,7 @@ def draw_browser(viewer: Viewer) -> None:
         _entries(viewer, listing)
         _foot(viewer, listing)
     if not stays or imgui.is_key_pressed(imgui.Key.escape):
-        opening.close_browser(viewer)
+        browsing.close_browser(viewer)
     if viewer.state.browser is None:
         imgui.close_current_popup()
     imgui.end_popup()
@@ -137,9 +136,9 @@ def _ask_for_popup(title: str, is_wanted: bool) -> None:
 def _foot(viewer: Viewer, listing: Listing) -> None:
     if viewer.state.picks_folder:
         if imgui.button("Take this folder"):
-            opening.choose_folder(viewer, listing.folder)
+            browsing.choose_folder(viewer, listing.folder)
     elif has_several(listing) and imgui.button("Open all scenes here"):
-        opening.open_all(viewer)
+        browsing.open_all(viewer)
 
 
 def has_several(listing: Listing) -> bool:
@@ -153,9 +152,9 @@ def _path_box(viewer: Viewer) -> None:
     picks = viewer.state.picks_folder
     hint = "path of a folder" if picks else "path of a scene or folder, or drop files onto the window"
     entered, typed = box_with_button("##path", hint, viewer.state.path_typed, "Open")
-    opening.type_path(viewer, typed)
+    browsing.type_path(viewer, typed)
     if entered:
-        opening.open_typed(viewer)
+        browsing.open_typed(viewer)
 
 
 def _above(viewer: Viewer, folder: Path) -> None:
@@ -166,7 +165,7 @@ def _above(viewer: Viewer, folder: Path) -> None:
             if imgui.get_content_region_avail().x < button_width(parent.name):
                 imgui.new_line()
         if imgui.small_button(f"{parent.name or parent}##above {number}"):
-            opening.browse(viewer, parent)
+            browsing.browse(viewer, parent)
 
 
 def _entries(viewer: Viewer, listing: Listing) -> None:
@@ -191,7 +190,7 @@ def _entries(viewer: Viewer, listing: Listing) -> None:
         if imgui.begin_child("recent", ImVec2(0, -foot)):
             for path in recent:
                 if imgui.selectable(f"{path}##recent", False)[0]:
-                    opening.open_recent(viewer, path)
+                    browsing.open_recent(viewer, path)
         imgui.end_child()
 
 
@@ -199,7 +198,7 @@ def _entry(viewer: Viewer, entry: Entry) -> None:
     right = imgui.get_content_region_avail().x
     name = entry.path.name if entry.is_file else f"{entry.path.name}/"
     if imgui.selectable(name, False)[0]:
-        opening.choose(viewer, entry)
+        browsing.choose(viewer, entry)
     if entry.size:
         text = in_words(entry.size)
         imgui.same_line(right - imgui.calc_text_size(text).x)
@@ -333,7 +332,7 @@ def _form(viewer: Viewer) -> None:
         form, dataset=_text_box("Photographs", "a folder, a COLMAP project, transforms.json", form.dataset)
     )
     if imgui.button("Browse ..."):
-        opening.ask_for_folder(viewer, "dataset")
+        browsing.ask_for_folder(viewer, "dataset")
     form = replace(form, out=_text_box("Scene", "scene.ply", form.out))
     form = replace(form, encoder=_text_box("Encoder", '"demo", or a folder or hub id of CLIP', form.encoder))
     for number, preset in enumerate(PRESETS):
@@ -343,9 +342,9 @@ def _form(viewer: Viewer) -> None:
             form = replace(form, preset=preset)
         if imgui.is_item_hovered():
             imgui.set_tooltip(MEANS[preset])
-    training.fill_in(viewer, form)
+    browsing.fill_in(viewer, form)
     if imgui.button("Train"):
-        training.start_training(viewer)
+        browsing.start_training(viewer)
     small_wrapped("An interrupted training continues where it stopped.", muted())
     _doubts(viewer)
 
@@ -380,9 +379,9 @@ def _running(viewer: Viewer, process: Training) -> None:
     imgui.separator()
     imgui.progress_bar(progress.overall, ImVec2(-1, 0), progress.left or "starting")
     if imgui.button("Stop"):
-        training.stop_training(viewer)
+        browsing.stop_training(viewer)
     if next_button("Look at it so far"):
-        training.look_at_training(viewer)
+        browsing.look_at_training(viewer)
     for line in progress.said[-3:]:
         small_wrapped(line, muted())
 
@@ -419,7 +418,7 @@ def draw_library(viewer: Viewer) -> None:
     """Draw the folder, the box for a phrase and the list."""
     view = viewer.state.library
     if imgui.button("Folder ..."):
-        opening.ask_for_folder(viewer, "library")
+        browsing.ask_for_folder(viewer, "library")
     tip("Search all scenes of a folder and the folders in it. An index of them is kept there")
     if view is None:
         return
@@ -432,9 +431,9 @@ def draw_library(viewer: Viewer) -> None:
     flags = imgui.InputTextFlags_.enter_returns_true
     hint = "what to look for in all of them"
     entered, typed = imgui.input_text_with_hint("##library", hint, viewer.state.library_typed, flags)
-    opening.type_library(viewer, typed)
+    browsing.type_library(viewer, typed)
     if entered:
-        opening.ask_library(viewer, typed)
+        browsing.ask_library(viewer, typed)
     small_wrapped(view.said, muted())
     if imgui.begin_child("library"):
         for row, hit in enumerate(view.hits):
@@ -450,7 +449,7 @@ def _hit(viewer: Viewer, view: LibraryView, row: int, hit: Hit) -> None:
     width, count = height * THUMBNAIL[0] / THUMBNAIL[1], len(view.hits)
     start = imgui.get_cursor_pos()
     if imgui.selectable("##scene", hit.path == viewer.state.path, size=ImVec2(0, height))[0]:
-        opening.open_hit(viewer, hit)
+        browsing.open_hit(viewer, hit)
     tip(str(hit.path))
     imgui.set_cursor_pos(start)
     if texture is not None:

@@ -10,7 +10,7 @@ from imgui_bundle import ImVec2, hello_imgui, imgui
 from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, DisplayRow
 from langsplat_core.query.answers import FLOOR
 from langsplat_core.scene import LEVELS
-from langsplat_viewer.actions import filming, opening, projects, settings, viewpoint
+from langsplat_viewer.actions import browsing, filming, opening, projects, settings, viewpoint
 from langsplat_viewer.camera.controls import FOV_RANGE, OrbitCamera, adopt_up, level, with_fov
 from langsplat_viewer.camera.flight import Keyframe
 from langsplat_viewer.camera.overlays import length_text
@@ -168,7 +168,7 @@ def _compared(viewer: Viewer) -> None:
         settings.toggle_levels(viewer)
     imgui.end_disabled()
     if imgui.selectable("another scene ...", split.mode == "scenes")[0]:
-        opening.ask_for_beside(viewer)
+        browsing.ask_for_beside(viewer)
     imgui.end_combo()
 
 
@@ -341,7 +341,7 @@ def _photograph(viewer: Viewer) -> None:
     elif photograph.reason:
         small_wrapped(photograph.reason, muted())
         if imgui.button("Folder of photographs ..."):
-            opening.ask_for_photographs(viewer)
+            browsing.ask_for_photographs(viewer)
 
 
 def _slider(

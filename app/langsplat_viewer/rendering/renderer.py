@@ -32,12 +32,7 @@ from langsplat_core.errors import BackendError
 from langsplat_core.progress import Progress, lap
 from langsplat_core.raster import Rasterizer, View, load_rasterizer
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer, GlView, Source
-from langsplat_core.raster.opengl.scene_textures import (
-    create_egl_context,
-    drawing,
-    is_software,
-    set_uniforms,
-)
+from langsplat_core.raster.opengl.scene_textures import create_egl_context, drawing, is_software, set_uniforms
 from langsplat_core.raster.opengl.shaders import shader
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Gaussians, Scene
