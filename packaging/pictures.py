@@ -100,7 +100,7 @@ def _clipped(ctx: Any, window: Window) -> None:
     editing.fill_box(viewer)
     selecting.select_none(viewer)
     settings.set_display(viewer, "rgb")
-    editing.fill_form(viewer, replace(viewer.state.edit_form, gizmo="box"))
+    viewer.state.edit_form = replace(viewer.state.edit_form, gizmo="box")
     editing.clip(viewer, True)
 
 
@@ -144,7 +144,7 @@ def _side_by_side(ctx: Any, window: Window) -> None:
 
 def _palette(ctx: Any, window: Window) -> None:
     settings.show_palette(window.viewer, True)
-    settings.type_command(window.viewer, "sel")
+    window.viewer.state.palette_typed = "sel"
 
 
 def _light(ctx: Any, window: Window) -> None:
@@ -216,7 +216,7 @@ def _trained(ctx: Any, window: Window) -> None:
     room = ["dataset", "--seed", "3", "--views", "12", "--out", str(folder / "room")]
     subprocess.run([sys.executable, "-m", "assets.making", *room], check=True)
     settings.open_panel(viewer, "Train")
-    browsing.fill_in(viewer, TrainingForm(str(folder / "room"), str(folder / "room.ply"), "quick"))
+    viewer.state.training_form = TrainingForm(str(folder / "room"), str(folder / "room.ply"), "quick")
     browsing.start_training(viewer)
     process = viewer.training
     assert process is not None

@@ -367,7 +367,7 @@ class Window:
         if self._obeyed > 1:
             selecting.end_at_once(self.viewer)
         elif number == signal.SIGTERM:
-            projects.end(self.viewer, Path.cwd())
+            projects.end(self.viewer)
         else:
             selecting.quit_viewer(self.viewer)
             if not self.viewer.state.selection.may_close:

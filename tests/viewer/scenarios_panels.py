@@ -130,7 +130,7 @@ def search_a_library(s: Any) -> None:
     save_scene(s.folder / "deep" / "mug.ply", replace(fewer, cameras=cameras()))
     s.open_panel("Library", frames=3)
     s.click("//Library/Folder ...", frames=4)
-    browsing.type_path(viewer, "deep")
+    viewer.state.path_typed = "deep"
     browsing.open_typed(viewer)
     s.ctx.yield_(3)
     s.ctx.item_click("//**/Take this folder")
@@ -331,8 +331,8 @@ def record_and_play(s) -> None:
     assert len(read_flight(s.folder / "blobs-001.path.json").keyframes) == 3
     filming.set_path_seconds(s.window.viewer, 1.0)
     filming.set_film_size(s.window.viewer, 32, 24)
-    filming.set_film_fps(s.window.viewer, 4.0)
-    filming.type_film(s.window.viewer, "film")
+    s.window.viewer.state.record.fps = 4.0
+    s.window.viewer.state.record.film_typed = "film"
     s.ctx.item_click("//Record/Save film")
     s.wait(lambda: s.window.viewer.recorder.current is None)
     s.ctx.yield_(3)

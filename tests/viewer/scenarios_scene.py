@@ -384,11 +384,11 @@ def drag_the_gizmo(s: Any) -> None:
     assert s.at(shot, MUG + moved[chosen][0]).argmax() == s.at(rgb, MUG).argmax()
     assert np.abs(s.at(shot, MUG) - s.at(rgb, MUG)).max() > 40
 
-    editing.fill_form(viewer, EditForm(rotate=(0.0, 0.0, 90.0)))
+    viewer.state.edit_form = EditForm(rotate=(0.0, 0.0, 90.0))
     s.ctx.item_click("//Transform/Apply")
     s.click("//Transform/Fit")
     form = s.state.edit_form
-    editing.fill_form(viewer, replace(form, high=(*form.high[:2], (form.low[2] + form.high[2]) / 2)))
+    viewer.state.edit_form = replace(form, high=(*form.high[:2], (form.low[2] + form.high[2]) / 2))
     s.ctx.item_click("//Transform/Crop")
     s.shot("cropped")
     assert 0 < s.state.selection.marks.deleted.sum() < len(chosen)

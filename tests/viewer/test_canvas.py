@@ -567,7 +567,7 @@ def drawn(gl, opened, request):
 
 def test_the_steps_of_a_picture_are_measured_while_the_panel_is_seen(gl, drawn):
     assert drawn.state.timing.medians() == []
-    viewpoint.measure_frame(drawn)
+    drawn.state.timing.wanted = True
     drawn.state.coarse_while_moving = False
     viewpoint.look_from(drawn, "left")
     viewpoint.tick(drawn, 10.0)
@@ -582,14 +582,14 @@ def test_the_steps_of_a_picture_are_measured_while_the_panel_is_seen(gl, drawn):
 def test_the_panel_has_a_picture_measured_when_it_opens(drawn):
     """All of its steps, though nothing has changed; once."""
     for now in (10.0, 11.0):
-        viewpoint.measure_frame(drawn)
+        drawn.state.timing.wanted = True
         rest(drawn.surface, drawn.state, now)
         counts = {name: len(measured) for name, measured in drawn.state.timing.laps.items()}
         assert counts.keys() >= {"projection", "sort", "blend", "compose", "picture"}
         assert set(counts.values()) == {1}
     drawn.state.timing.wanted = False  # closed, and opened again
     rest(drawn.surface, drawn.state, 12.0)
-    viewpoint.measure_frame(drawn)
+    drawn.state.timing.wanted = True
     rest(drawn.surface, drawn.state, 13.0)
     assert {len(measured) for measured in drawn.state.timing.laps.values()} == {2}
 
@@ -646,6 +646,6 @@ def test_a_comparison_is_one_at_a_time_and_can_be_left(drawn):
     viewpoint.compare_with_reference(drawn)
     viewpoint.compare_with_reference(drawn)
     assert "wait for it or cancel it" in errors(drawn)[-1]
-    viewpoint.stop_comparing(drawn)
+    drawn.recorder.cancel()
     recorded(drawn)
     assert drawn.state.timing.comparison is None

@@ -288,15 +288,15 @@ def test_a_path_can_be_typed(viewer, folder, monkeypatch, typed):
     monkeypatch.chdir(folder)
     browsing.ask_for_file(viewer)
     for nothing in ("", "  "):
-        browsing.type_path(viewer, nothing)
+        viewer.state.path_typed = nothing
         browsing.open_typed(viewer)
         assert viewer.state.browser is not None
-    browsing.type_path(viewer, "B folder")
+    viewer.state.path_typed = "B folder"
     browsing.open_typed(viewer)
     assert viewer.state.browser.folder == folder / "B folder"
     assert viewer.state.path_typed == ""
     browsing.browse(viewer, folder)
-    browsing.type_path(viewer, typed)
+    viewer.state.path_typed = typed
     browsing.open_typed(viewer)
     settle(viewer)
     assert viewer.state.scene is SCENES["blobs.ply"]
@@ -306,7 +306,7 @@ def test_a_path_can_be_typed(viewer, folder, monkeypatch, typed):
 def test_a_path_that_leads_nowhere_is_an_error_line(viewer, folder, monkeypatch, typed):
     monkeypatch.chdir(folder)
     browsing.ask_for_file(viewer)
-    browsing.type_path(viewer, typed)
+    viewer.state.path_typed = typed
     browsing.open_typed(viewer)
     settle(viewer)
     assert len(errors(viewer)) == 1
@@ -444,7 +444,7 @@ def test_a_half_written_file_leaves_the_scene_as_it_was(shown, name):
 def test_what_is_not_wanted_is_not_offered_again_until_it_changes_again(shown):
     os.utime(shown.state.path, ns=(1, 1))
     assert look(shown)
-    opening.keep_old(shown)
+    shown.watch.dismiss()
     assert not look(shown)
     os.utime(shown.state.path, ns=(2, 2))
     assert look(shown)

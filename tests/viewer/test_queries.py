@@ -85,9 +85,9 @@ def test_examples_are_offered_until_the_first_search_and_each_is_found(viewer):
     assert hint(viewer) == "book, ..."
     queries.prepare_suggestions(viewer)
     assert viewer.worker.current is None  # once per scene
-    queries.type_phrase(viewer, "bo")
+    viewer.state.typed = "bo"
     assert queries.offers(viewer) == ("", ("book",))
-    queries.type_phrase(viewer, "")
+    viewer.state.typed = ""
     queries.ask_offered(viewer, "book")
     settle(viewer)
     assert viewer.state.queries[0].result.found
@@ -142,10 +142,10 @@ def test_queries_are_combined_as_the_grammar_reads_them(opened):
 
 
 def test_the_box_is_emptied_by_a_search_and_by_nothing_else(opened):
-    queries.type_phrase(opened, "  ")
+    opened.state.typed = "  "
     queries.ask_typed(opened)
     assert (opened.state.typed, opened.state.queries) == ("  ", [])
-    queries.type_phrase(opened, "mug ")
+    opened.state.typed = "mug "
     queries.ask_typed(opened)
     assert (opened.state.typed, opened.state.queries[0].phrase) == ("", "mug")
     assert queries.take_search_focus(opened)  # for the next phrase
@@ -196,7 +196,7 @@ def test_an_answer_is_explained_by_what_training_kept(opened, tmp_path, monkeypa
     settle(opened)
     assert opened.state.evidence.phrase == "book"
     assert opened.state.evidence.image.ndim == 3
-    queries.close_evidence(opened)
+    opened.state.evidence = None
     assert opened.state.evidence is None
 
 

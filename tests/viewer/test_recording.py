@@ -64,7 +64,7 @@ def test_a_played_path_goes_through_its_keyframes(opened):
 
 def test_a_loop_begins_again_and_a_drag_ends_it(opened):
     views = record_three(opened)
-    filming.set_looping(opened, True)
+    opened.state.record.loops = True
     viewpoint.scrub(opened, 1.0)
     viewpoint.toggle_playing(opened)
     viewpoint.tick(opened, opened.clock + 5.0)  # at 6 of 4 seconds
@@ -141,7 +141,7 @@ def test_a_path_is_saved_loaded_and_dropped(opened, folder):
     assert times(opened) == [0, 2, 4]
     assert opened.state.wanted_panel == "Record"
     (folder / "bad.path.json").write_text("{}")
-    filming.type_path_file(opened, "bad.path.json")
+    opened.state.record.path_typed = "bad.path.json"
     filming.load_typed_path(opened, folder)
     assert "no camera path" in errors(opened)[-1]
     assert times(opened) == [0, 2, 4]
@@ -161,7 +161,7 @@ def test_what_cannot_be_done_is_said(viewer, opened, folder):
     filming.save_path(opened, folder)
     filming.load_typed_path(opened, folder)
     record_three(opened)
-    filming.type_film(opened, "film.avi")
+    opened.state.record.film_typed = "film.avi"
     filming.save_film(opened, folder)
     wanted = ["two keyframes", "needs a path", "needs a keyframe", "type the name", "a film is .mp4"]
     assert [reason in text for reason, text in zip(wanted, errors(opened), strict=True)] == [True] * 5
@@ -171,7 +171,7 @@ def test_what_cannot_be_done_is_said(viewer, opened, folder):
 def test_a_film_is_made_beside_the_window(opened, folder):
     record_three(opened)
     filming.set_film_size(opened, 32, 24)
-    filming.set_film_fps(opened, 1.0)
+    opened.state.record.fps = 1.0
     request = opened.state.request((32, 24))
     filming.save_film(opened, folder)
     queries.ask(opened, "mug")  # the other worker answers meanwhile, and changes what is shown

@@ -115,7 +115,7 @@ def test_screen_file_sized_image_film_and_reference_agree(gl, opened, tmp_path, 
     images["sized"] = image(tmp_path / "blobs-160x120-001.png")
     filming.set_turning(opened, True)
     filming.set_path_seconds(opened, 1.0)
-    filming.set_film_fps(opened, 2.0)
+    opened.state.record.fps = 2.0
     filming.save_film(opened, tmp_path)
     recorded(opened)
     images["film"] = image(tmp_path / "blobs-film-001" / film.frame_name(0))
@@ -164,7 +164,7 @@ UNSEEN = {
     "line": lambda v: settings.move_line(v, 0.3),  # the window draws it
     "ruler": settings.toggle_measuring,
     "tool": lambda v: selecting.use_tool(v, "brush"),
-    "word": lambda v: queries.type_phrase(v, "plant"),
+    "word": lambda v: setattr(v.state, "typed", "plant"),
     "chosen query": lambda v: queries.select(v, None),
     "photograph": lambda v: opening.fade_photograph(v, 0.5),
     "saved without background": lambda v: settings.save_transparent(v, True),

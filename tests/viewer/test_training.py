@@ -63,7 +63,7 @@ def test_a_folder_of_photographs_becomes_a_scene_that_opens(viewer, folder, monk
     form = viewer.state.training_form
     assert (form.dataset, form.out) == (str(folder), str(folder.with_suffix(".ply")))
     assert settings.take_wanted_panel(viewer) == "Train"
-    browsing.fill_in(viewer, replace(form, out=str(folder.with_name("blobs.ply"))))
+    viewer.state.training_form = replace(form, out=str(folder.with_name("blobs.ply")))
     browsing.start_training(viewer)
     progress = viewer.training.progress
     finish(viewer)
@@ -84,7 +84,7 @@ def test_what_speaks_against_the_scene_is_said(viewer, folder, monkeypatch):
     report.write_text(json.dumps({"gaussians": 360, "doubts": doubts}))
     trains(monkeypatch, GOOD + "".join(f"; print('warning: {doubt}')" for doubt in doubts))
     browsing.choose_photographs(viewer, folder)
-    browsing.fill_in(viewer, replace(viewer.state.training_form, out=str(folder.with_name("blobs.ply"))))
+    viewer.state.training_form = replace(viewer.state.training_form, out=str(folder.with_name("blobs.ply")))
     browsing.start_training(viewer)
     finish(viewer)
     assert viewer.state.doubts == tuple(doubts)
@@ -140,7 +140,7 @@ def test_the_gaussians_can_be_looked_at_before_the_end(viewer, folder, monkeypat
 @pytest.mark.parametrize("dataset", ["", "  ", "gone", "."])
 def test_a_folder_without_photographs_is_said(viewer, tmp_path, monkeypatch, dataset):
     monkeypatch.chdir(tmp_path)
-    browsing.fill_in(viewer, replace(viewer.state.training_form, dataset=dataset))
+    viewer.state.training_form = replace(viewer.state.training_form, dataset=dataset)
     browsing.start_training(viewer)
     assert "no photographs" in errors(viewer)[-1]
     assert viewer.training is None

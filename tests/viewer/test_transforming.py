@@ -134,7 +134,7 @@ def test_the_numbers_of_the_panel(opened):
     chosen, before = selected_mug(opened), means(opened)
     centre = editing.pivot(opened)
     form = EditForm(move=(1.0, 0.0, 0.0), rotate=(0.0, 0.0, 90.0), scale=2.0)
-    editing.fill_form(opened, form)
+    opened.state.edit_form = form
     editing.apply_form(opened)
     x, y, z = (before[chosen] - centre).T
     expected = centre + np.stack([1 - 2 * y, 2 * x, 2 * z], 1)
@@ -145,7 +145,7 @@ def test_the_numbers_of_the_panel(opened):
 @pytest.mark.parametrize("form", [EditForm(scale=0), EditForm(scale=-1), EditForm(move=(1e39, 0.0, 0.0))])
 def test_numbers_that_cannot_be_are_refused(form, opened):
     before = opened.state.scene
-    editing.fill_form(opened, form)
+    opened.state.edit_form = form
     editing.apply_form(opened)
     assert len(errors(opened)) == 1
     assert opened.state.scene is before
@@ -162,7 +162,7 @@ def test_cropped_to_a_box_and_undone(opened):
     assert 0 < marks.kept.sum() < len(chosen)
     editing.undo(opened)
     assert opened.state.selection.marks.kept.all()
-    editing.fill_form(opened, EditForm(low=(50.0, 50, 50), high=(51.0, 51, 51)))
+    opened.state.edit_form = EditForm(low=(50.0, 50, 50), high=(51.0, 51, 51))
     editing.crop(opened)
     assert "holds nothing" in errors(opened)[-1]
     assert opened.state.selection.marks.kept.all()

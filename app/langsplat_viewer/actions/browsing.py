@@ -34,7 +34,7 @@ from langsplat_viewer.files.disk import Entry, Stamps, list_folder
 from langsplat_viewer.files.preferences import with_photographs
 from langsplat_viewer.files.projects import PATHS, PROJECTS, QUERIES, read_project, scene_of
 from langsplat_viewer.jobs import one_line
-from langsplat_viewer.state import LibraryView, TrainingForm
+from langsplat_viewer.state import LibraryView
 from langsplat_viewer.viewer import Training, TrainingRequest, Viewer
 
 # The library: all scenes of a folder, searched by their index.
@@ -103,11 +103,6 @@ def _show_hits(viewer: Viewer, view: LibraryView, hits: Sequence[Hit]) -> None:
     viewer.state.library = replace(view, hits=listed, thumbnails=image)
 
 
-def type_library(viewer: Viewer, text: str) -> None:
-    """Take the text of the library's box."""
-    viewer.state.library_typed = text
-
-
 def open_hit(viewer: Viewer, hit: Hit) -> None:
     """Open a scene of the library, and search it for what was looked for in all of them."""
     view = viewer.state.library
@@ -134,11 +129,6 @@ def ask_for_beside(viewer: Viewer) -> None:
     viewer.state.picks_beside = True
 
 
-def close_browser(viewer: Viewer) -> None:
-    """Close the browser without choosing a file."""
-    viewer.state.browser = None
-
-
 def browse(viewer: Viewer, folder: Path) -> None:
     """Show another folder in the browser."""
     viewer.state.path_typed, viewer.state.browser = "", list_folder(folder)
@@ -147,7 +137,7 @@ def browse(viewer: Viewer, folder: Path) -> None:
 def choose(viewer: Viewer, entry: Entry) -> None:
     """Go into a folder, or open a scene."""
     if entry.is_file:
-        close_browser(viewer)
+        viewer.state.browser = None
         (open_beside if viewer.state.picks_beside else open_file)(viewer, entry.path)
     else:
         browse(viewer, entry.path)
@@ -222,7 +212,7 @@ def open_all(viewer: Viewer) -> None:
         paths = [entry.path for entry in listing.entries if entry.is_file and format_of(entry.path)]
         if paths:
             add_scenes(viewer, paths)
-            close_browser(viewer)
+            viewer.state.browser = None
             open_scene(viewer, paths[0])
         open_panel(viewer, "Scene")
 
@@ -234,13 +224,8 @@ def _ask_sets(viewer: Viewer, sets: Sequence[Path]) -> None:
 
 def open_recent(viewer: Viewer, path: str) -> None:
     """Open a scene or a project again that was open before."""
-    close_browser(viewer)
+    viewer.state.browser = None
     open_file(viewer, Path(path))
-
-
-def type_path(viewer: Viewer, text: str) -> None:
-    """Take the text of the box for a path."""
-    viewer.state.path_typed = text
 
 
 def open_typed(viewer: Viewer) -> None:
@@ -278,11 +263,6 @@ def choose_photograph_folder(viewer: Viewer, folder: Path) -> None:
 # Training a scene from photographs, in a process of its own.
 
 WARNING = "warning: "  # before each doubt that `langsplat train` ends with
-
-
-def fill_in(viewer: Viewer, form: TrainingForm) -> None:
-    """Take the texts of the form."""
-    viewer.state.training_form = form
 
 
 def start_training(viewer: Viewer) -> None:

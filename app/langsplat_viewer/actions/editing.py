@@ -22,16 +22,11 @@ from langsplat_viewer.state import EditForm, Gizmo, Point
 from langsplat_viewer.viewer import Moment, Viewer, let_go, now, remember
 
 
-def fill_form(viewer: Viewer, form: EditForm) -> None:
-    """Take what was typed or chosen in the panel."""
-    viewer.state.edit_form = form
-
-
 def next_gizmo(viewer: Viewer) -> None:
     """Show the gizmo that moves, the one that rotates, the one that scales, the handles of the box, none."""
     kinds: tuple[Gizmo, ...] = get_args(Gizmo)
     here = kinds.index(viewer.state.edit_form.gizmo)
-    fill_form(viewer, replace(viewer.state.edit_form, gizmo=kinds[(here + 1) % len(kinds)]))
+    viewer.state.edit_form = replace(viewer.state.edit_form, gizmo=kinds[(here + 1) % len(kinds)])
 
 
 def pivot(viewer: Viewer) -> Array | None:
@@ -119,7 +114,7 @@ def apply_form(viewer: Viewer) -> None:
         viewer.say_error(str(error))
         return
     transform(viewer, to)
-    fill_form(viewer, replace(form, move=EditForm.move, rotate=EditForm.rotate, scale=EditForm.scale))
+    viewer.state.edit_form = replace(form, move=EditForm.move, rotate=EditForm.rotate, scale=EditForm.scale)
 
 
 def fill_box(viewer: Viewer) -> None:
@@ -132,13 +127,13 @@ def fill_box(viewer: Viewer) -> None:
     if chosen.any():
         means = state.scene.gaussians.means[chosen].astype(np.float64)
         low, high = (tuple(corner.tolist()) for corner in (means.min(0), means.max(0)))
-        fill_form(viewer, replace(state.edit_form, low=low, high=high))
+        viewer.state.edit_form = replace(state.edit_form, low=low, high=high)
         follow_box(viewer)
 
 
 def set_box(viewer: Viewer, low: Point, high: Point) -> None:
     """Set two opposite corners of the box of the panel, world units."""
-    fill_form(viewer, replace(viewer.state.edit_form, low=low, high=high))
+    viewer.state.edit_form = replace(viewer.state.edit_form, low=low, high=high)
 
 
 def _inside(viewer: Viewer) -> Array | None:
@@ -163,7 +158,7 @@ def crop(viewer: Viewer) -> None:
 
 def clip(viewer: Viewer, on: bool) -> None:
     """Hide what lies outside the box from now on, or show again all that is hidden."""
-    fill_form(viewer, replace(viewer.state.edit_form, clips=on, clipped=None))
+    viewer.state.edit_form = replace(viewer.state.edit_form, clips=on, clipped=None)
     if on:
         follow_box(viewer)
     else:
@@ -175,7 +170,7 @@ def follow_box(viewer: Viewer) -> None:
     form, marks = viewer.state.edit_form, viewer.state.selection.marks
     if not form.clips or viewer.state.scene is None or form.clipped == (form.low, form.high):
         return
-    fill_form(viewer, replace(form, clipped=(form.low, form.high)))
+    viewer.state.edit_form = replace(form, clipped=(form.low, form.high))
     inside = _inside(viewer)
     if inside is not None:
         mark(viewer, replace(marks, selected=marks.selected & inside, hidden=marks.kept & ~inside))

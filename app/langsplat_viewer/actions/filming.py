@@ -50,7 +50,7 @@ from langsplat_viewer.state import SPACING, ViewerState, flight_of
 from langsplat_viewer.viewer import Viewer, remember
 
 
-def save_picture(viewer: Viewer, folder: Path) -> Path | None:
+def save_picture(viewer: Viewer, folder: Path = Path()) -> Path | None:
     """Save the scene as shown, without its background if that was chosen, to a new PNG in `folder`;
     returns its path, None if that failed."""
     state = viewer.state
@@ -71,7 +71,7 @@ def save_picture(viewer: Viewer, folder: Path) -> Path | None:
     return path
 
 
-def save_view(viewer: Viewer, folder: Path) -> Path | None:
+def save_view(viewer: Viewer, folder: Path = Path()) -> Path | None:
     """Save the current camera, with perspective, to a new file that `--camera` reads; returns its path, None
     if that failed."""
     state = viewer.state
@@ -167,24 +167,15 @@ def set_turning(viewer: Viewer, turns: bool) -> None:
     viewer.state.record.turns, viewer.state.record.at = turns, 0.0
 
 
-def set_looping(viewer: Viewer, loops: bool) -> None:
-    """Have a played path begin again at its end."""
-    viewer.state.record.loops = loops
-
-
-def type_path_file(viewer: Viewer, text: str) -> None:
-    """Set the text of the box for a file with a path."""
-    viewer.state.record.path_typed = text
-
-
-def save_path(viewer: Viewer, folder: Path) -> Path | None:
+def save_path(viewer: Viewer, folder: Path = Path()) -> Path | None:
     """Save the path to the typed file, or to a new one in `folder`; None where that failed."""
     state, record = viewer.state, viewer.state.record
     if not record.keyframes:
         viewer.say_error("a path to save needs a keyframe: add one at the current view")
         return None
     stem = state.path.stem if state.path else "camera"
-    path = folder / record.path_typed.strip() if record.path_typed.strip() else free_name(folder, stem, PATHS)
+    typed = record.path_typed.strip()
+    path = folder.absolute() / typed if typed else free_name(folder, stem, PATHS)
     try:
         write_flight(path, flight_of(record.keyframes))
     except (OSError, ValueError) as error:
@@ -210,11 +201,11 @@ def load_path(viewer: Viewer, path: Path) -> None:
     viewer.state.say(f"{path.name}: {len(flight.keyframes)} keyframes, {flight.seconds:.1f} s")
 
 
-def load_typed_path(viewer: Viewer, folder: Path) -> None:
+def load_typed_path(viewer: Viewer, folder: Path = Path()) -> None:
     """Take the path of the typed file."""
     typed = viewer.state.record.path_typed.strip()
     if typed:
-        load_path(viewer, folder / typed)
+        load_path(viewer, folder.absolute() / typed)
     else:
         viewer.say_error("type the name of a file with a path first")
 
@@ -228,16 +219,6 @@ def set_film_size(viewer: Viewer, width: int, height: int) -> None:
     viewer.state.record.size = (width, height)
 
 
-def set_film_fps(viewer: Viewer, fps: float) -> None:
-    """Set the images per second of a film."""
-    viewer.state.record.fps = fps
-
-
-def type_film(viewer: Viewer, text: str) -> None:
-    """Set the text of the box for where the film goes."""
-    viewer.state.record.film_typed = text
-
-
 def film_motion(viewer: Viewer) -> Motion | None:
     """The path that is filmed; None without one."""
     state, record = viewer.state, viewer.state.record
@@ -248,7 +229,7 @@ def film_motion(viewer: Viewer) -> Motion | None:
     return flight_of(record.keyframes)
 
 
-def save_film(viewer: Viewer, folder: Path) -> None:
+def save_film(viewer: Viewer, folder: Path = Path()) -> None:
     """Have a film made along the path, to the typed place or to a new name in `folder`."""
     state, record, motion = viewer.state, viewer.state.record, film_motion(viewer)
     if motion is None or state.extent is None:
@@ -273,12 +254,12 @@ def save_film(viewer: Viewer, folder: Path) -> None:
 def _film_out(viewer: Viewer, folder: Path) -> Path:
     typed = viewer.state.record.film_typed.strip()
     if typed:
-        return folder / typed
+        return folder.absolute() / typed
     stem = f"{viewer.state.path.stem if viewer.state.path else 'scene'}-film"
     return free_name(folder, stem, "" if find_ffmpeg() is None else VIDEO)
 
 
-def save_sized_picture(viewer: Viewer, folder: Path) -> None:
+def save_sized_picture(viewer: Viewer, folder: Path = Path()) -> None:
     """Have the scene as shown drawn in the size of a film and saved under a new name in `folder`."""
     state = viewer.state
     if state.view is None:
@@ -308,7 +289,7 @@ def _submit(viewer: Viewer, label: str, work: Callable[[Progress], str]) -> None
     viewer.recorder.submit(label, work, viewer.state.say, viewer.say_error)
 
 
-def copy_command(viewer: Viewer, folder: Path) -> str:
+def copy_command(viewer: Viewer, folder: Path = Path()) -> str:
     """Put the command that draws this image without a window on the clipboard, and return it; "" where that
     failed. A view that is no training camera's is saved to a file in `folder` first."""
     state = viewer.state

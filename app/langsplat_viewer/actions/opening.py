@@ -212,11 +212,6 @@ def reload(viewer: Viewer) -> None:
     open_scene(viewer, path, lambda viewer: return_to(viewer, viewer.visits[path.absolute()]), check)
 
 
-def keep_old(viewer: Viewer) -> None:
-    """Keep the scene as it was read, though its files have changed."""
-    viewer.watch.dismiss()
-
-
 # The list of scenes. One is in memory at a time; of the others the visit is kept.
 
 MOST = 100  # scenes that are listed

@@ -225,11 +225,6 @@ def give_name(viewer: Viewer, target: Target, name: str) -> None:
     with_thing(viewer, target, lambda members: teach(viewer, name, members, done))
 
 
-def write_filter(viewer: Viewer, text: str) -> None:
-    """Take the text of the box over the outline."""
-    viewer.state.outline_typed = text
-
-
 # Locks and groups.
 
 

@@ -13,7 +13,7 @@ from langsplat_viewer.actions.outline import have_things
 from langsplat_viewer.actions.queries import listed_queries
 from langsplat_viewer.actions.selecting import discard_and_leave
 from langsplat_viewer.actions.selecting import end as end_editing
-from langsplat_viewer.actions.settings import have_panels, open_panel
+from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.actions.viewpoint import bookmarked_view
 from langsplat_viewer.camera.flight import pose_of
 from langsplat_viewer.files.preferences import with_recent
@@ -104,13 +104,13 @@ def remove_note(viewer: Viewer, note: Note) -> None:
 # Projects.
 
 
-def save_project(viewer: Viewer, folder: Path) -> Path | None:
+def save_project(viewer: Viewer, folder: Path = Path()) -> Path | None:
     """Save the project to the file that it came from, or to a new one in `folder`; None where that failed."""
     state = viewer.state
     if state.scene is None or state.path is None or state.view is None:
         viewer.say_error("open a scene first, then save the project")
         return None
-    path = state.project or free_name(folder.absolute(), state.path.stem, PROJECTS)
+    path = state.project or free_name(folder, state.path.stem, PROJECTS)
     moment = now(viewer)
     project = Project(
         scene=state.path.absolute(),
@@ -142,13 +142,13 @@ def save_project(viewer: Viewer, folder: Path) -> Path | None:
     return path
 
 
-def save_and_leave(viewer: Viewer, folder: Path) -> None:
+def save_and_leave(viewer: Viewer, folder: Path = Path()) -> None:
     """Save the project and go on; where it cannot be saved one stays."""
     if save_project(viewer, folder) is not None:
         discard_and_leave(viewer)
 
 
-def end(viewer: Viewer, folder: Path) -> None:
+def end(viewer: Viewer, folder: Path = Path()) -> None:
     """Close without a question: what would be lost is first written to new files in `folder`."""
     if viewer.state.has_unsaved_notes:
         save_project(viewer, folder)
@@ -205,7 +205,7 @@ def restore(viewer: Viewer, project: Project, path: Path) -> Visit:
     state.bookmarks = project.bookmarks or state.bookmarks
     if project.panels:
         state.preferences = replace(state.preferences, panels=project.panels)
-        have_panels(viewer, project.panels)
+        viewer.state.shows_panels = project.panels
     return _visit(viewer, project)
 
 

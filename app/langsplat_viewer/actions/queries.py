@@ -22,7 +22,7 @@ from langsplat_core.scene import TaughtWord
 from langsplat_core.scene.language import phrase_key, split_phrases
 from langsplat_core.semantics.encoders import DEMO
 from langsplat_viewer.actions.selecting import has_selection
-from langsplat_viewer.actions.settings import mute_letters, open_panel
+from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.files.projects import QUERIES, QuerySet, SavedQuery, read_queries, write_queries
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.output.film import free_name
@@ -83,11 +83,6 @@ def ask_unanswered(viewer: Viewer) -> None:
             _answer(viewer, query)
 
 
-def type_phrase(viewer: Viewer, text: str) -> None:
-    """Take the text of the search box."""
-    viewer.state.typed = text
-
-
 def ask_typed(viewer: Viewer) -> None:
     """Search for what stands in the box and empty it; the box keeps the keyboard for the next phrase."""
     viewer.state.focus_input = viewer.state.awaits_keyboard = True
@@ -137,7 +132,7 @@ def focus_search(viewer: Viewer) -> None:
     scene = viewer.state.scene
     if scene is None or scene.language is None:
         viewer.say_error("open a scene first, then search it" if scene is None else no_field(scene))
-        mute_letters(viewer, True)
+        viewer.state.letters_muted = True
     else:
         viewer.state.focus_input = viewer.state.awaits_keyboard = True
 
@@ -305,11 +300,6 @@ def explain(viewer: Viewer, query: Query) -> None:
     viewer.run(f"looking for the evidence of '{query.phrase}'", work, done)
 
 
-def close_evidence(viewer: Viewer) -> None:
-    """Close the window with the evidence."""
-    viewer.state.evidence = None
-
-
 # How queries are asked and where they end: own cuts, canonical phrases, whole sets of queries.
 
 
@@ -324,11 +314,6 @@ def set_cut(viewer: Viewer, query: Query, cut: float | None, *, is_new: bool = T
         remember(viewer)
     query.cut = cut
     query.result = query.automatic if cut is None else recut(query.automatic, cut)
-
-
-def type_canonical(viewer: Viewer, text: str) -> None:
-    """Take the text of the box of canonical phrases."""
-    viewer.state.canonical_typed = text
 
 
 def set_canonical(viewer: Viewer, text: str) -> None:
@@ -357,7 +342,7 @@ def listed_queries(state: ViewerState) -> QuerySet:
     return QuerySet(saved, state.level, state.canonical)
 
 
-def save_queries(viewer: Viewer, folder: Path) -> Path | None:
+def save_queries(viewer: Viewer, folder: Path = Path()) -> Path | None:
     """Save the list to a new file in `folder`; returns its path, None if there is none or that failed."""
     state = viewer.state
     if not state.queries:

@@ -359,7 +359,7 @@ def quit_viewer(viewer: Viewer) -> None:
     leave(viewer, _close, "the window closes", viewer.state.has_unsaved_notes)
 
 
-def end(viewer: Viewer, folder: Path) -> None:
+def end(viewer: Viewer, folder: Path = Path()) -> None:
     """Close without a question: what is not saved is first written to a new file in `folder`."""
     if viewer.state.selection.is_unsaved:
         export(viewer, folder, "edited", then=end_at_once)
@@ -386,7 +386,7 @@ def _answered(viewer: Viewer) -> Callable[[Viewer], None] | None:
     return None if leaving is None else leaving.then
 
 
-def save_and_leave(viewer: Viewer, folder: Path) -> None:
+def save_and_leave(viewer: Viewer, folder: Path = Path()) -> None:
     """Write the scene without what was deleted to a new file in `folder`, and go on once it is there."""
     then = _answered(viewer)
     if then is not None:

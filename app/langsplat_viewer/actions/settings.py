@@ -171,11 +171,6 @@ def set_picture(viewer: Viewer, picture: PictureConfig) -> None:
         viewer.state.picture = picture
 
 
-def set_coarse_while_moving(viewer: Viewer, coarse: bool) -> None:
-    """Set whether a slow machine draws fewer pixels while the camera moves."""
-    viewer.state.coarse_while_moving = coarse
-
-
 def set_theme(viewer: Viewer, theme: Theme) -> None:
     """Dark or light panels, from now on."""
     viewer.state.preferences = replace(viewer.state.preferences, theme=theme)
@@ -212,11 +207,6 @@ def reset_panels(viewer: Viewer) -> None:
     """Have the panels where they were at first."""
     show_panel(viewer, True)
     viewer.state.resets_panels = True
-
-
-def have_panels(viewer: Viewer, titles: tuple[str, ...]) -> None:
-    """Have these panels open from the next frame on, and no others; none: those that are."""
-    viewer.state.shows_panels = titles
 
 
 def take_panel_reset(viewer: Viewer) -> bool:
@@ -259,16 +249,6 @@ def toggle_palette(viewer: Viewer) -> None:
     show_palette(viewer, not viewer.state.show_palette)
 
 
-def type_command(viewer: Viewer, text: str) -> None:
-    """Set the text of the box of that list."""
-    viewer.state.palette_typed = text
-
-
-def mute_letters(viewer: Viewer, muted: bool) -> None:
-    """Set whether letters do nothing for now: they were meant for a box that cannot be typed in."""
-    viewer.state.letters_muted = muted
-
-
 def escape(viewer: Viewer) -> None:
     """Close what lies over the scene, and let letters be keys again; where nothing did, leave the tool."""
     state = viewer.state
@@ -279,6 +259,6 @@ def escape(viewer: Viewer) -> None:
     state.pins_notes = False
     state.browser = None
     stay(viewer)
-    mute_letters(viewer, False)
+    viewer.state.letters_muted = False
     if not lay_over:
         leave_tool(viewer)

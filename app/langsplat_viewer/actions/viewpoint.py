@@ -160,11 +160,6 @@ def zoom_by(viewer: Viewer, factor: float) -> None:
         move(viewer, lambda view: zoom(view, factor, nearest, farthest))
 
 
-def set_fly_speed(viewer: Viewer, speed: float) -> None:
-    """Set the speed of flying with keys, scene radii per second."""
-    viewer.state.fly_speed = speed
-
-
 def opening_view(viewer: Viewer) -> OrbitCamera | None:
     """Return the first view of a scene: that of the camera that was asked for, else the first training
     camera, else a view of everything in the window as it is now. None without a scene."""
@@ -393,11 +388,6 @@ def add_bookmark(viewer: Viewer, name: str = "") -> None:
     state.say(f"bookmark '{added.name}'")
 
 
-def type_bookmark(viewer: Viewer, text: str) -> None:
-    """Take the text of the box for a name."""
-    viewer.state.bookmark_typed = text
-
-
 def go_to_bookmark(viewer: Viewer, bookmark: Bookmark) -> None:
     """Stand where a bookmark was made, turning around the same point."""
     if viewer.state.extent is not None:
@@ -439,11 +429,6 @@ def _keep(viewer: Viewer) -> None:
 # Timing and the comparison with the reference.
 
 
-def measure_frame(viewer: Viewer) -> None:
-    """Have the steps of this frame measured: the panel is seen."""
-    viewer.state.timing.wanted = True
-
-
 def compare_with_reference(viewer: Viewer) -> None:
     """Draw what is shown at a small size, have the reference rasterizer draw the same in the background, and
     tell the difference."""
@@ -464,8 +449,3 @@ def compare_with_reference(viewer: Viewer) -> None:
         state.timing.comparison = compared(shown, reference, backend)
 
     viewer.recorder.submit("comparing with the reference", work, done, viewer.say_error)
-
-
-def stop_comparing(viewer: Viewer) -> None:
-    """Cancel the comparison with the reference."""
-    viewer.recorder.cancel()

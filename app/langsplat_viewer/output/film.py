@@ -38,7 +38,7 @@ def free_name(folder: Path, stem: str, suffix: str, companions: tuple[str, ...] 
         name = f"{stem}-{number:03d}"
         if not any((folder / f"{name}{ending}").exists() for ending in (suffix, *companions)):
             break
-    return folder / f"{name}{suffix}"
+    return folder.absolute() / f"{name}{suffix}"
 
 
 def save_png(path: Path, image: Array) -> None:

@@ -99,7 +99,7 @@ def draw_palette(viewer: Viewer) -> None:
         "##command", "what to do", viewer.state.palette_typed, imgui.InputTextFlags_.enter_returns_true
     )
     typing = imgui.is_item_active()
-    settings.type_command(viewer, typed)
+    viewer.state.palette_typed = typed
     found = matching(typed, viewer.state.preferences.recent)
     chosen = found[0] if entered and found else _clicked(found, typing)
     left = not imgui.is_window_focused(imgui.FocusedFlags_.root_and_child_windows)
@@ -224,7 +224,7 @@ def figures(viewer: Viewer) -> str:
 
 def draw_timing(viewer: Viewer) -> None:
     """Draw the panel "Timing": medians of the last images, memory, and a comparison."""
-    viewpoint.measure_frame(viewer)
+    viewer.state.timing.wanted = True
     rows = [(title, f"{milliseconds:.1f} ms") for title, milliseconds in viewer.state.timing.medians()]
     memory = memory_bytes()
     if memory is not None:
@@ -242,7 +242,7 @@ def draw_timing(viewer: Viewer) -> None:
     work = viewer.recorder.current
     if work is not None:
         if stoppable(*work, tag="comparison"):
-            viewpoint.stop_comparing(viewer)
+            viewer.recorder.cancel()
     else:
         if button_if("Compare with the reference", viewer.state.scene is not None):
             viewpoint.compare_with_reference(viewer)
@@ -329,7 +329,7 @@ def show_wanted(viewer: Viewer) -> None:
     titles = viewer.state.shows_panels
     for window in docking.dockable_windows if any(panel.title in titles for panel in PANELS) else ():
         window.is_visible = window.label in titles
-    settings.have_panels(viewer, ())
+    viewer.state.shows_panels = ()
     docking.layout_reset |= settings.take_panel_reset(viewer)
     if title:
         docking.dockable_window_of_name(title).is_visible = True

@@ -27,7 +27,7 @@ def draw(viewer: Viewer) -> None:
         return
     imgui.set_next_item_width(-1)
     _, typed = imgui.input_text_with_hint("##filter", "filter", viewer.state.outline_typed)
-    outline.write_filter(viewer, typed)
+    viewer.state.outline_typed = typed
     if imgui.begin_child("rows", child_flags=imgui.ChildFlags_.nav_flattened):
         for group in viewer.state.things.groups:
             _group(viewer, view, group)

@@ -13,7 +13,7 @@ from langsplat_core.config import ColourMap
 from langsplat_core.display.displays import QUERY_COLOURS, STRENGTH, mapped, painted
 from langsplat_core.query.describe import Words
 from langsplat_core.scene import LEVELS, Camera
-from langsplat_viewer.actions import opening, projects, queries, settings, viewpoint
+from langsplat_viewer.actions import opening, projects, settings, viewpoint
 from langsplat_viewer.camera import overlays
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.camera.overlays import Face, Label, face_at, placed, visible_faces, world_axes
@@ -176,7 +176,7 @@ class EvidenceWindow(_Uploaded):
         imgui.image(imgui.ImTextureRef(texture.glo), size)
         imgui.end()
         if not still_open:
-            queries.close_evidence(viewer)
+            viewer.state.evidence = None
 
 
 class PhotographOverlay(_Uploaded):

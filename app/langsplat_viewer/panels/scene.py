@@ -47,9 +47,9 @@ def draw(viewer: Viewer) -> None:
     if imgui.button("Open ..."):
         browsing.ask_for_file(viewer)
     if next_button("Save picture"):
-        filming.save_picture(viewer, Path.cwd())
+        filming.save_picture(viewer)
     if next_button("Save view"):
-        filming.save_view(viewer, Path.cwd())
+        filming.save_view(viewer)
     if next_button("Help"):
         settings.toggle_help(viewer)
     if len(state.scenes) > 1:
@@ -119,7 +119,7 @@ def draw_browser(viewer: Viewer) -> None:
         _entries(viewer, listing)
         _foot(viewer, listing)
     if not stays or imgui.is_key_pressed(imgui.Key.escape):
-        browsing.close_browser(viewer)
+        viewer.state.browser = None
     if viewer.state.browser is None:
         imgui.close_current_popup()
     imgui.end_popup()
@@ -152,7 +152,7 @@ def _path_box(viewer: Viewer) -> None:
     picks = viewer.state.picks_folder
     hint = "path of a folder" if picks else "path of a scene or folder, or drop files onto the window"
     entered, typed = box_with_button("##path", hint, viewer.state.path_typed, "Open")
-    browsing.type_path(viewer, typed)
+    viewer.state.path_typed = typed
     if entered:
         browsing.open_typed(viewer)
 
@@ -242,7 +242,7 @@ def draw_changed(viewer: Viewer, area: Area) -> None:
     tip("Read it again; camera, queries and view settings stay")
     imgui.same_line()
     if imgui.button("Not now"):
-        opening.keep_old(viewer)
+        viewer.watch.dismiss()
     imgui.end()
 
 
@@ -278,11 +278,11 @@ def _ask(viewer: Viewer, to: str) -> None:
     imgui.text_unformatted(f"Save before {to}?")
     if selection.is_unsaved:
         if imgui.button("Save"):
-            selecting.save_and_leave(viewer, Path.cwd())
+            selecting.save_and_leave(viewer)
         tip("The scene as a new file, without what was deleted")
         imgui.same_line()
     if imgui.button("Save the project"):
-        projects.save_and_leave(viewer, Path.cwd())
+        projects.save_and_leave(viewer)
     tip("Everything in one small file; the scene stays as it is")
     imgui.same_line()
     if imgui.button("Discard"):
@@ -342,7 +342,7 @@ def _form(viewer: Viewer) -> None:
             form = replace(form, preset=preset)
         if imgui.is_item_hovered():
             imgui.set_tooltip(MEANS[preset])
-    browsing.fill_in(viewer, form)
+    viewer.state.training_form = form
     if imgui.button("Train"):
         browsing.start_training(viewer)
     small_wrapped("An interrupted training continues where it stopped.", muted())
@@ -431,7 +431,7 @@ def draw_library(viewer: Viewer) -> None:
     flags = imgui.InputTextFlags_.enter_returns_true
     hint = "what to look for in all of them"
     entered, typed = imgui.input_text_with_hint("##library", hint, viewer.state.library_typed, flags)
-    browsing.type_library(viewer, typed)
+    viewer.state.library_typed = typed
     if entered:
         browsing.ask_library(viewer, typed)
     small_wrapped(view.said, muted())

@@ -13,7 +13,7 @@ from langsplat_core.display.displays import QUERY_COLOURS, STRENGTH, painted
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import no_field
 from langsplat_core.scene import CANONICAL_PHRASES, LEVELS
-from langsplat_viewer.actions import queries, settings, viewpoint
+from langsplat_viewer.actions import queries, viewpoint
 from langsplat_viewer.panels.overlays import bar_colours, draw_bar
 from langsplat_viewer.panels.style import (
     bad,
@@ -57,7 +57,7 @@ def _box(viewer: Viewer) -> None:
 
     typed = viewer.state.typed
     entered, typed = imgui.input_text_with_hint("##phrase", hint(viewer), typed, flags, recalled)
-    queries.type_phrase(viewer, typed)
+    viewer.state.typed = typed
     imgui.same_line()
     if imgui.button("Search") or entered:
         queries.ask_typed(viewer)
@@ -284,7 +284,7 @@ def draw(viewer: Viewer) -> None:
     imgui.end_group()
     hovered = imgui.is_item_hovered(imgui.HoveredFlags_.allow_when_disabled)
     if scene is None and hovered and imgui.is_mouse_clicked(imgui.MouseButton_.left):
-        settings.mute_letters(viewer, True)  # what is typed now was meant for the box
+        viewer.state.letters_muted = True  # what is typed now was meant for the box
     _level(viewer)
     imgui.end_disabled()
     if viewer.engine is not None:
@@ -307,7 +307,7 @@ def _canonical(viewer: Viewer) -> None:
     hint = ", ".join(state.canonical or CANONICAL_PHRASES)
     flags = imgui.InputTextFlags_.enter_returns_true
     entered, typed = imgui.input_text_with_hint("##canonical", hint, state.canonical_typed, flags)
-    queries.type_canonical(viewer, typed)
+    viewer.state.canonical_typed = typed
     if entered:
         queries.set_canonical(viewer, typed)
     if state.canonical and imgui.button("The scene's own"):

@@ -324,7 +324,7 @@ def draw_transform(viewer: Viewer) -> None:
     chosen = int(state.selection.marks.selected.sum())
     what = f"{chosen:,} selected Gaussians" if chosen else "The whole scene, with its cameras"
     small_wrapped(what, muted())
-    editing.fill_form(viewer, _numbers(_gizmos(state.edit_form)))
+    viewer.state.edit_form = _numbers(_gizmos(state.edit_form))
     if imgui.button("Apply"):
         editing.apply_form(viewer)
     tip("Scale and rotate about the middle of what is transformed, then move")

@@ -3,7 +3,6 @@
 import math
 from dataclasses import replace
 from itertools import groupby
-from pathlib import Path
 
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
@@ -216,7 +215,7 @@ def draw_notes(viewer: Viewer) -> None:
     if button_if("Pin one to the selection", bool(state.selection.marks.selected.any())):
         projects.pin_to_selection(viewer)
     if next_button("Save project"):
-        projects.save_project(viewer, Path.cwd())
+        projects.save_project(viewer)
     tip("Notes, queries, selection, edits, views: one file, to be opened again")
     imgui.end_disabled()
     if not state.notes:
@@ -259,13 +258,13 @@ def draw_camera(viewer: Viewer) -> None:
         _projection(viewer, state.view)
     _cuts(viewer)
     speed = _slider("Fly speed", state.fly_speed, 0.05, 4.0, "%.2f", logarithmic=True)
-    viewpoint.set_fly_speed(viewer, speed)
+    viewer.state.fly_speed = speed
     _, walks = imgui.checkbox("Walk", state.walks)
     viewpoint.set_walking(viewer, walks)
     tip("W A S D keep the height of the eye")
     beside_boxed("Coarse while moving")
     _, coarse = imgui.checkbox("Coarse while moving", state.coarse_while_moving)
-    settings.set_coarse_while_moving(viewer, coarse)
+    viewer.state.coarse_while_moving = coarse
     tip("Draw fewer pixels and merged Gaussians while the camera moves, where drawing is slow")
     imgui.end_disabled()
 
@@ -396,7 +395,7 @@ def _play(viewer: Viewer) -> None:
     imgui.same_line()
     changed, loops = imgui.checkbox("Loop", record.loops)
     if changed:
-        filming.set_looping(viewer, loops)
+        viewer.state.record.loops = loops
 
 
 def _duration(viewer: Viewer) -> None:
@@ -468,11 +467,11 @@ def _file(viewer: Viewer) -> None:
     leave_room("", NUMBER_EM + 2)
     hint = "file.path.json"
     _, typed = imgui.input_text_with_hint("##path file", hint, viewer.state.record.path_typed)
-    filming.type_path_file(viewer, typed)
+    viewer.state.record.path_typed = typed
     if next_button("Save path"):
-        filming.save_path(viewer, Path.cwd())
+        filming.save_path(viewer)
     if next_button("Load"):
-        filming.load_typed_path(viewer, Path.cwd())
+        filming.load_typed_path(viewer)
 
 
 def _films(viewer: Viewer) -> None:
@@ -487,24 +486,24 @@ def _films(viewer: Viewer) -> None:
     if imgui.begin_combo("fps", f"{record.fps:g}"):
         for fps in FPS_CHOICES:
             if imgui.selectable(f"{fps:g}", fps == record.fps)[0]:
-                filming.set_film_fps(viewer, fps)
+                viewer.state.record.fps = fps
         imgui.end_combo()
     imgui.set_next_item_width(-1)
     hint = "film.mp4, .webp, .gif or a folder; empty: a new name"
     _, typed = imgui.input_text_with_hint("##film", hint, record.film_typed)
-    filming.type_film(viewer, typed)
+    viewer.state.record.film_typed = typed
     work = viewer.recorder.current
     if work is not None:
         if stoppable(*work, tag="film"):
             filming.cancel_film(viewer)
         return
     if imgui.button("Save film"):
-        filming.save_film(viewer, Path.cwd())
+        filming.save_film(viewer)
     if next_button("Save picture##sized"):
-        filming.save_sized_picture(viewer, Path.cwd())
+        filming.save_sized_picture(viewer)
     tip("What is shown now, in this size")
     if next_button("Copy as command"):
-        filming.copy_command(viewer, Path.cwd())
+        filming.copy_command(viewer)
     tip("The command that draws this picture without a window")
 
 
@@ -517,7 +516,7 @@ def draw_bookmarks(viewer: Viewer) -> None:
     imgui.begin_disabled(state.view is None)
     hint = "name of this view"
     entered, typed = box_with_button("##bookmark", hint, state.bookmark_typed, "Keep")
-    viewpoint.type_bookmark(viewer, typed)
+    viewer.state.bookmark_typed = typed
     if entered:
         viewpoint.add_bookmark(viewer, state.bookmark_typed)
     imgui.end_disabled()
