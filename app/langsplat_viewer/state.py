@@ -353,6 +353,16 @@ class SceneState:
     suggestions_of: Scene | None = None  # the scene for which they were looked for
     _edited: EditedScene | None = None  # of the last request
 
+    @property
+    def has_field(self) -> bool:
+        """True where a scene with a language field is open."""
+        return self.scene is not None and self.scene.language is not None
+
+    @property
+    def lacks_field(self) -> bool:
+        """True where a scene without one is open."""
+        return self.scene is not None and self.scene.language is None
+
 
 @dataclass(eq=False)
 class ViewerState(SceneState):

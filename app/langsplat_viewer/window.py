@@ -38,9 +38,8 @@ from langsplat_viewer.files.preferences import (
 from langsplat_viewer.files.projects import PROJECTS, Shelf
 from langsplat_viewer.jobs import give_memory_back, on_signals, one_line, share_one_heap
 from langsplat_viewer.options import chosen_camera, latent_level
-from langsplat_viewer.panels import layout, navigation, outline, overlays, style
+from langsplat_viewer.panels import layout, navigation, outline, overlays, ui
 from langsplat_viewer.panels.navigation import Keyboard
-from langsplat_viewer.panels.style import scene_area
 from langsplat_viewer.rendering.renderer import Backend, GlRenderer
 from langsplat_viewer.state import ViewerState
 from langsplat_viewer.viewer import Services, Viewer
@@ -122,7 +121,7 @@ class Remembered:
     def style(self) -> None:
         """Make the window look as the preferences say."""
         self._styled = self._state.preferences
-        style.apply(self._styled)
+        ui.apply(self._styled)
 
     def update(self) -> None:
         """Apply and keep the preferences that have changed; once per frame."""
@@ -207,7 +206,7 @@ class Window:
         self._remembered = Remembered(request.settings, self.viewer.state)
         self._canvas: Canvas | None = None
         self._menu = outline.ThingsMenu()
-        self._photograph, self._evidence = overlays.PhotographOverlay(), overlays.EvidenceWindow()
+        self._photograph, self._evidence = ui.Picture(), ui.Picture()
         self._screen: moderngl.Framebuffer | None = None
         self._second: Canvas | None = None  # of the scene beside it
         self.unfinished = False  # a finer image is due
@@ -246,7 +245,7 @@ class Window:
         params.fps_idling.fps_idle = IDLE_FPS
         params.fps_idling.time_active_after_last_event = AWAKE_SECONDS
         params.callbacks.default_icon_font = hello_imgui.DefaultIconFont.font_awesome6
-        params.callbacks.load_additional_fonts = style.load_fonts
+        params.callbacks.load_additional_fonts = ui.load_fonts
         params.callbacks.setup_imgui_style = self._remembered.style
         params.callbacks.show_menus = lambda: layout.draw_menus(self.viewer)
         params.callbacks.post_init = self._start
@@ -426,10 +425,10 @@ class Window:
         """Take what the panels left of mouse and keys, bring the image up to date and draw it behind them."""
         if self.failure is not None:
             return
-        viewer, area = self.viewer, scene_area()
+        viewer, area = self.viewer, ui.scene_area()
         layout.draw_over(viewer)
         self._menu.draw(viewer, area)
-        self._evidence.draw(viewer)
+        overlays.draw_evidence(viewer, self._evidence)
         navigation.handle(viewer, area)
         scale = imgui.get_io().display_framebuffer_scale
         settings.resize(viewer, round(area.width * scale.x), round(area.height * scale.y))
@@ -449,7 +448,7 @@ class Window:
         self._screen.use()
         self._screen.color_mask = True, True, True, True  # a mask left set would colour the panels
         overlays.draw_pictures(viewer, area, textures)
-        self._photograph.draw(viewer, area)
+        overlays.draw_photograph(viewer, area, self._photograph)
         overlays.draw_lines(viewer, area)
         state.timing.wanted = False  # the panel says so again, if it is still seen
 

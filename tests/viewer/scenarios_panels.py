@@ -14,7 +14,7 @@ from langsplat_viewer import viewer as training
 from langsplat_viewer.actions import browsing, filming, opening, selecting, settings, viewpoint
 from langsplat_viewer.files.projects import read_flight
 from langsplat_viewer.panels.layout import PANELS
-from langsplat_viewer.panels.style import scene_area
+from langsplat_viewer.panels.ui import scene_area
 from tests.support.fakes import CENTRES, PER_BLOB, as_trained, blob_scene, cameras, named_scene
 
 

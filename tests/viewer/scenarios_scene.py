@@ -15,7 +15,7 @@ from langsplat_viewer.actions import browsing, editing, opening, queries, select
 from langsplat_viewer.camera.overlays import Label, visible_faces
 from langsplat_viewer.panels import overlays, select
 from langsplat_viewer.panels.overlays import EDGE
-from langsplat_viewer.panels.style import Area, scene_area
+from langsplat_viewer.panels.ui import Area, scene_area
 from langsplat_viewer.rendering.request import TINT
 from langsplat_viewer.state import EditForm
 from tests.support.fakes import CENTRES, blob_scene

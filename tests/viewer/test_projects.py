@@ -50,7 +50,7 @@ def saved(opened, tmp_path, monkeypatch) -> Path:
     settings.set_clip(opened, Clip(0.5, 40.0))
     viewpoint.move(opened, lambda view: orbit(view, 0.3, 0.1))
     filming.add_keyframe(opened)
-    projects.pin_notes(opened, True)
+    projects.toggle_pinning(opened)
     projects.pin_at(opened, 0.5, 0.5)
     projects.write_note(opened, opened.state.notes[0], 'a "note" <b>of</b> 1987')
     opened.state.preferences = replace(opened.state.preferences, panels=("Search", "Notes"))
@@ -198,7 +198,7 @@ def test_without_a_scene_there_is_nothing_to_save(viewer, tmp_path):
 
 
 def test_notes_are_pinned_written_and_taken_off(opened):
-    projects.pin_notes(opened, True)
+    projects.toggle_pinning(opened)
     projects.pin_at(opened, 0.95, 0.5)  # nothing is there
     assert opened.state.notes == ()
     assert opened.state.pins_notes

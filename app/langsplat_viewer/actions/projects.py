@@ -36,16 +36,11 @@ from langsplat_viewer.viewer import Viewer, Visit, now, remember, visit_of
 # Notes.
 
 
-def pin_notes(viewer: Viewer, on: bool) -> None:
-    """Set whether a click on the scene pins a note there."""
-    viewer.state.pins_notes, viewer.state.ruler = on, Ruler()
-    if on:
-        open_panel(viewer, "Notes")
-
-
 def toggle_pinning(viewer: Viewer) -> None:
-    """Begin to pin notes, or end it."""
-    pin_notes(viewer, not viewer.state.pins_notes)
+    """Have a click on the scene pin a note there, or no longer."""
+    viewer.state.pins_notes, viewer.state.ruler = not viewer.state.pins_notes, Ruler()
+    if viewer.state.pins_notes:
+        open_panel(viewer, "Notes")
 
 
 def pin_at(viewer: Viewer, u: float, v: float) -> None:

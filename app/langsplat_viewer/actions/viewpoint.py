@@ -227,14 +227,9 @@ def open_orthographic(viewer: Viewer, span: float) -> None:
         move(viewer, lambda view: spanning(view, span))
 
 
-def set_walking(viewer: Viewer, walks: bool) -> None:
-    """Set whether the keys that fly ahead keep the height of the eye."""
-    viewer.state.walks = walks
-
-
 def toggle_walking(viewer: Viewer) -> None:
-    """Walk, or fly again."""
-    set_walking(viewer, not viewer.state.walks)
+    """Have the keys that fly ahead keep the height of the eye, or no longer."""
+    viewer.state.walks = not viewer.state.walks
     viewer.state.say("W A S D walk at one height" if viewer.state.walks else "W A S D fly")
 
 

@@ -10,21 +10,8 @@ from imgui_bundle import ImVec2, ImVec4, hello_imgui, icons_fontawesome_6, imgui
 from langsplat_core import __version__
 from langsplat_viewer.actions import browsing, filming, opening, settings, viewpoint
 from langsplat_viewer.commands import COMMANDS, HELD, LETTERS_MENU, MENUS, Command, in_menu, matching
-from langsplat_viewer.panels import layout, outline, overlays, scene, search, select, view
+from langsplat_viewer.panels import layout, outline, overlays, scene, search, select, ui, view
 from langsplat_viewer.panels.scene import in_words
-from langsplat_viewer.panels.style import (
-    MAIN_DOCK,
-    MOST_OVER,
-    Area,
-    bad,
-    button_if,
-    fitting,
-    muted,
-    scene_area,
-    small_wrapped,
-    stoppable,
-    tip,
-)
 from langsplat_viewer.state import Comparison, memory_bytes
 from langsplat_viewer.viewer import Viewer
 
@@ -88,18 +75,14 @@ def draw_palette(viewer: Viewer) -> None:
         return
     top = imgui.get_main_viewport().get_center()
     imgui.set_next_window_pos(ImVec2(top.x, 0.15 * top.y), imgui.Cond_.always, ImVec2(0.5, 0))
-    imgui.set_next_window_size(fitting(WIDTH_EM, HEIGHT_EM))
+    imgui.set_next_window_size(ui.fitting(WIDTH_EM, HEIGHT_EM))
     imgui.set_next_window_bg_alpha(1.0)
     flags = imgui.WindowFlags_.no_title_bar | imgui.WindowFlags_.no_resize | imgui.WindowFlags_.no_collapse
     imgui.begin("Commands", None, flags)
     if imgui.is_window_appearing():
         imgui.set_keyboard_focus_here()
-    imgui.set_next_item_width(-1)
-    entered, typed = imgui.input_text_with_hint(
-        "##command", "what to do", viewer.state.palette_typed, imgui.InputTextFlags_.enter_returns_true
-    )
-    typing = imgui.is_item_active()
-    viewer.state.palette_typed = typed
+    entered, typed = ui.box("##command", "what to do", viewer.state.palette_typed)
+    typing, viewer.state.palette_typed = imgui.is_item_active(), typed
     found = matching(typed, viewer.state.preferences.recent)
     chosen = found[0] if entered and found else _clicked(found, typing)
     left = not imgui.is_window_focused(imgui.FocusedFlags_.root_and_child_windows)
@@ -116,14 +99,14 @@ def _clicked(found: list[Command], typing: bool) -> Command | None:
     chosen = None
     if imgui.begin_child("found", child_flags=imgui.ChildFlags_.nav_flattened):
         if not found:
-            imgui.text_colored(muted(), "no command has these words")
+            imgui.text_colored(ui.muted(), "no command has these words")
         right = imgui.get_content_region_avail().x - hello_imgui.em_size(GAP_EM)
         for place, command in enumerate(found):  # Enter does the one that is lit
             if imgui.selectable(command.does, place == 0 and typing)[0]:
                 chosen = command
             keys = ", ".join(command.keys)
             imgui.same_line(right - imgui.calc_text_size(keys).x)
-            imgui.text_colored(muted(), keys)
+            imgui.text_colored(ui.muted(), keys)
     imgui.end_child()
     return chosen
 
@@ -159,10 +142,10 @@ def draw_help(viewer: Viewer) -> None:
     if not viewer.state.show_help:
         return
     flags = imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_collapse
-    area, room = scene_area(), imgui.get_main_viewport().work_size
+    area, room = ui.scene_area(), imgui.get_main_viewport().work_size
     half = hello_imgui.em_size(KEYS_EM + DOES_EM + 4) / 2
     centre = ImVec2(min(area.left + area.width / 2, room.x - half), area.top + area.height / 2)
-    imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(room.x, MOST_OVER * room.y))
+    imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(room.x, ui.MOST_OVER * room.y))
     imgui.set_next_window_pos(centre, imgui.Cond_.always, ImVec2(0.5, 0.5))
     imgui.set_next_window_bg_alpha(1.0)
     _, still_open = imgui.begin("Help", True, flags)
@@ -187,7 +170,7 @@ def _table(rows: Sequence[tuple[str, str]]) -> None:
             imgui.table_next_column()
             imgui.text_unformatted(what)
             imgui.table_next_column()
-            small_wrapped(does, muted())
+            ui.small_wrapped(does, ui.muted())
         imgui.end_table()
 
 
@@ -198,15 +181,15 @@ LEAST_LINES = 2  # of messages, however low the panel is
 
 def draw_messages(viewer: Viewer) -> None:
     """Draw progress, messages (the latest first) and the speed of images."""
-    if viewer.worker.current is not None and stoppable(*viewer.worker.current):
+    if viewer.worker.current is not None and ui.stoppable(*viewer.worker.current):
         opening.cancel(viewer)
     line = imgui.get_text_line_height_with_spacing()
     height = max(imgui.get_content_region_avail().y - line, LEAST_LINES * line)
     if imgui.begin_child("messages", ImVec2(0, height)):
         for message in reversed(viewer.state.messages):
-            small_wrapped(message.text, bad() if message.is_error else muted())
+            ui.small_wrapped(message.text, ui.bad() if message.is_error else ui.muted())
     imgui.end_child()
-    imgui.text_colored(muted(), figures(viewer))
+    imgui.text_colored(ui.muted(), figures(viewer))
 
 
 def figures(viewer: Viewer) -> str:
@@ -237,18 +220,21 @@ def draw_timing(viewer: Viewer) -> None:
             imgui.table_next_column()
             imgui.text(title)
             imgui.table_next_column()
-            imgui.text_colored(muted(), text)
+            imgui.text_colored(ui.muted(), text)
         imgui.end_table()
     work = viewer.recorder.current
     if work is not None:
-        if stoppable(*work, tag="comparison"):
+        if ui.stoppable(*work, tag="comparison"):
             viewer.recorder.cancel()
     else:
-        if button_if("Compare with the reference", viewer.state.scene is not None):
+        if ui.button(
+            "Compare with the reference",
+            "Draws this view small in float64, in the background: about 15 s for 100,000 Gaussians",
+            enabled=viewer.state.scene is not None,
+        ):
             viewpoint.compare_with_reference(viewer)
-        tip("Draws this view small in float64, in the background: about 15 s for 100,000 Gaussians")
     if viewer.state.timing.comparison is not None:
-        small_wrapped(in_numbers(viewer.state.timing.comparison), muted())
+        ui.small_wrapped(in_numbers(viewer.state.timing.comparison), ui.muted())
 
 
 def in_numbers(comparison: Comparison) -> str:
@@ -302,7 +288,7 @@ def params(viewer: Viewer, width: float) -> hello_imgui.DockingParams:
     docking = hello_imgui.DockingParams()
     share = min(COLUMN * viewer.state.preferences.ui_scale / width, MOST_SHARE)
     docking.docking_splits = [
-        hello_imgui.DockingSplit(MAIN_DOCK, LEFT, imgui.Dir.left, share),
+        hello_imgui.DockingSplit(ui.MAIN_DOCK, LEFT, imgui.Dir.left, share),
         hello_imgui.DockingSplit(LEFT, FOOT, imgui.Dir.down, FOOT_SHARE),
         hello_imgui.DockingSplit(LEFT, MIDDLE, imgui.Dir.down, MIDDLE_SHARE),
     ]
@@ -359,7 +345,7 @@ class Column:
 def _column() -> imgui.internal.DockNode | None:
     """The node of the docks beside the scene, as long as it lies there."""
     docking = hello_imgui.get_runner_params().docking_params
-    root = docking.dock_space_id_from_name(MAIN_DOCK)
+    root = docking.dock_space_id_from_name(ui.MAIN_DOCK)
     node = imgui.internal.dock_builder_get_node(docking.dock_space_id_from_name(LEFT) or 0)
     while node is not None and node.parent_node is not None and node.parent_node.id_ != root:
         node = node.parent_node
@@ -391,7 +377,7 @@ class Hiding:
 
 def draw_over(viewer: Viewer) -> None:
     """Draw what lies over the scene, after the panels."""
-    area = scene_area()
+    area = ui.scene_area()
     said = _said(viewer)
     if said:
         overlays.say(said, area)
@@ -429,17 +415,9 @@ GROUPS = [list(group) for _, group in groupby((c for c in COMMANDS if c.icon), l
 SIDE_EM, GROUP_GAP_EM, MARGIN_EM = 1.75, 0.3, 0.3  # of a button, between groups, around them
 OPACITY = 0.95  # of a button
 MOST_OF_SCENE = 0.4  # of the scene's width
-FLAGS = (
-    imgui.WindowFlags_.no_decoration
-    | imgui.WindowFlags_.no_move
-    | imgui.WindowFlags_.no_docking
-    | imgui.WindowFlags_.no_saved_settings
-    | imgui.WindowFlags_.no_focus_on_appearing
-    | imgui.WindowFlags_.no_bring_to_front_on_focus
-)
 
 
-def draw_toolbar(viewer: Viewer, area: Area) -> None:
+def draw_toolbar(viewer: Viewer, area: ui.Area) -> None:
     """A column of buttons between the titles of images and what is written at their foot, further ones where
     the scene is low; none where it is too narrow for them."""
     if viewer.state.scene is None or not viewer.state.show_panel:
@@ -454,7 +432,7 @@ def draw_toolbar(viewer: Viewer, area: Area) -> None:
     imgui.set_next_window_size(ImVec2(width, height))
     imgui.set_next_window_bg_alpha(0.0)
     imgui.push_style_var(imgui.StyleVar_.window_padding, ImVec2(margin, margin))
-    imgui.begin("toolbar", None, FLAGS)
+    imgui.begin("toolbar", None, ui.OVER | ui.FIXED)
     for command, (x, y) in zip((c for group in GROUPS for c in group), places, strict=True):
         imgui.set_cursor_pos(ImVec2(margin + x, margin + y))
         _tool_button(viewer, command, side)
@@ -487,7 +465,7 @@ def _tool_button(viewer: Viewer, command: Command, side: float) -> None:
         command.act(viewer)
     imgui.pop_style_color()
     keys = f" ({command.keys[0]})" if command.keys else ""
-    tip(command.does[0].upper() + command.does[1:] + keys)
+    ui.tip(command.does[0].upper() + command.does[1:] + keys)
 
 
 def button_label(command: Command) -> str:

@@ -14,8 +14,7 @@ from imgui_bundle import imgui
 from langsplat_viewer.actions import viewpoint
 from langsplat_viewer.camera import controls
 from langsplat_viewer.commands import COMMANDS, Command
-from langsplat_viewer.panels import select
-from langsplat_viewer.panels.style import Area
+from langsplat_viewer.panels import select, ui
 from langsplat_viewer.state import ViewerState
 from langsplat_viewer.viewer import Viewer
 
@@ -218,7 +217,7 @@ LONGEST_FRAME = 0.1  # seconds; a stalled frame must not throw a flying camera a
 WHEEL_STEP = 0.88  # factor of the distance per notch
 
 
-def handle(viewer: Viewer, area: Area) -> None:
+def handle(viewer: Viewer, area: ui.Area) -> None:
     """Handle mouse and keys; once per frame, after the panels have taken what is theirs."""
     io = imgui.get_io()
     held = select.holds_mouse(viewer)
@@ -233,7 +232,7 @@ def handle(viewer: Viewer, area: Area) -> None:
         _fly(viewer)
 
 
-def _pixel(area: Area) -> tuple[int, int] | None:
+def _pixel(area: ui.Area) -> tuple[int, int] | None:
     """Return the mouse's place in the scene's area, pixels; None where a panel has it, or a button is
     held."""
     io = imgui.get_io()
@@ -244,7 +243,7 @@ def _pixel(area: Area) -> tuple[int, int] | None:
     return math.floor(x), math.floor(y)
 
 
-def _mouse(viewer: Viewer, area: Area) -> None:
+def _mouse(viewer: Viewer, area: ui.Area) -> None:
     """The left button turns; while a tool has it, the middle one does."""
     io = imgui.get_io()
     free = viewer.state.selection.tool is None

@@ -1,17 +1,29 @@
-"""Style: the scene's area of the window, colours, letters, and small widgets that the panels share."""
+"""What panels share: the scene's area of the window, colours, letters, and small widgets."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from textwrap import fill
+from typing import TypeVar
 
+import moderngl
 from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
 
+from langsplat_core.arrays import Array
 from langsplat_viewer.files.preferences import Preferences
 
+T = TypeVar("T")
+
 MAIN_DOCK = "MainDockSpace"  # hello_imgui's name for the whole window below the menus
+OVER = (  # a window over the scene: it looks like a part of the image, and does not come to the front
+    imgui.WindowFlags_.no_decoration
+    | imgui.WindowFlags_.no_saved_settings
+    | imgui.WindowFlags_.no_focus_on_appearing
+    | imgui.WindowFlags_.no_bring_to_front_on_focus
+)
+FIXED = imgui.WindowFlags_.no_move | imgui.WindowFlags_.no_docking
 
 
 @dataclass(frozen=True)
@@ -85,24 +97,24 @@ def apply(preferences: Preferences) -> None:
     style.set_color_(imgui.Col_.popup_bg, ImVec4(popup.x, popup.y, popup.z, 1))
 
 
+def _readable(on_dark: tuple[float, float, float], on_light: tuple[float, float, float]) -> ImVec4:
+    background = imgui.get_style().color_(imgui.Col_.window_bg)
+    return ImVec4(*(on_dark if background.x + background.y + background.z < 1.5 else on_light), 1.0)
+
+
 def good() -> ImVec4:
-    """Colour of what was found, readable on the theme's background."""
-    return ImVec4(0.47, 0.80, 0.52, 1.0) if _is_dark() else ImVec4(0.05, 0.45, 0.15, 1.0)
+    """Colour of what was found."""
+    return _readable((0.47, 0.80, 0.52), (0.05, 0.45, 0.15))
 
 
 def bad() -> ImVec4:
-    """Return the colour of errors."""
-    return ImVec4(0.95, 0.58, 0.45, 1.0) if _is_dark() else ImVec4(0.70, 0.15, 0.05, 1.0)
+    """Colour of errors."""
+    return _readable((0.95, 0.58, 0.45), (0.70, 0.15, 0.05))
 
 
 def muted() -> ImVec4:
-    """Return the colour of explanations."""
-    return ImVec4(0.62, 0.64, 0.67, 1.0) if _is_dark() else ImVec4(0.35, 0.36, 0.40, 1.0)
-
-
-def _is_dark() -> bool:
-    background = imgui.get_style().color_(imgui.Col_.window_bg)
-    return background.x + background.y + background.z < 1.5
+    """Colour of explanations."""
+    return _readable((0.62, 0.64, 0.67), (0.35, 0.36, 0.40))
 
 
 def small_wrapped(text: str, colour: ImVec4) -> None:
@@ -155,28 +167,104 @@ def beside(label: str, more: float = 0.0) -> None:
         imgui.new_line()
 
 
-def button_if(label: str, enabled: bool) -> bool:
-    """Draw a button that can be clicked where it is `enabled`, and return whether it was."""
+def button(label: str, about: str = "", *, enabled: bool = True) -> bool:
+    """Draw a button with a tip, that can be clicked where it is `enabled`; whether it was."""
     imgui.begin_disabled(not enabled)
     clicked = bool(imgui.button(label))
     imgui.end_disabled()
+    if about:
+        tip(about)
     return clicked
 
 
-def next_button(label: str, enabled: bool = True) -> bool:
-    """Draw a button `beside` the last widget, and return whether it was clicked."""
+def next_button(label: str, about: str = "", *, enabled: bool = True) -> bool:
+    """Draw a `button` beside the last widget."""
     beside(label)
-    return button_if(label, enabled)
+    return button(label, about, enabled=enabled)
 
 
-def box_with_button(box: str, hint: str, text: str, label: str) -> tuple[bool, str]:
-    """Draw a text box and a button beside it, and return whether Enter or the button was pressed, and the
-    text."""
-    imgui.set_next_item_width(beside_button(label))
+def box(label: str, hint: str, text: str, width: float = -1.0) -> tuple[bool, str]:
+    """A text box, as wide as the row unless a `width` is given; whether Enter was pressed, and the text."""
+    imgui.set_next_item_width(width)
     flags = imgui.InputTextFlags_.enter_returns_true
-    entered, typed = imgui.input_text_with_hint(box, hint, text, flags)
+    entered, typed = imgui.input_text_with_hint(label, hint, text, flags)
+    return bool(entered), str(typed)
+
+
+def box_with_button(label: str, hint: str, text: str, button: str) -> tuple[bool, str]:
+    """A `box`, and a button beside it that does what Enter does."""
+    entered, typed = box(label, hint, text, beside_button(button))
     imgui.same_line()
-    return bool(imgui.button(label)) or entered, typed
+    return bool(imgui.button(button)) or entered, typed
+
+
+def radio(choices: Mapping[T, str], chosen: T, tips: Mapping[T, str] | None = None) -> T:
+    """Draw a radio button with its label for each of the `choices`; the one that is chosen now."""
+    for place, (value, label) in enumerate(choices.items()):
+        if place:
+            beside_boxed(label)
+        if imgui.radio_button(label, value == chosen):
+            chosen = value
+        if tips:
+            tip(tips[value])
+    return chosen
+
+
+def slider(
+    label: str,
+    value: float,
+    limits: tuple[float, float],
+    text: str = "%.2f",
+    *,
+    logarithmic: bool = False,
+    ems: float = 11.0,
+) -> float:
+    """Draw a slider, `ems` wide where there is room; the value that it has now."""
+    leave_room(label, ems)
+    flags = imgui.SliderFlags_.always_clamp
+    if logarithmic:
+        flags |= imgui.SliderFlags_.logarithmic
+    changed, new = imgui.slider_float(label, value, *limits, text, flags)
+    return new if changed else value  # what comes back unchanged has been rounded
+
+
+def row(text: str, tag: str, chosen: bool, *, can_go: bool = True, about: str = "") -> tuple[bool, bool]:
+    """Draw a row of a list and a button that takes it off; whether each was clicked. about: its tip."""
+    side, right = imgui.get_frame_height(), imgui.get_content_region_avail().x
+    room = right - side - imgui.get_style().item_spacing.x
+    imgui.align_text_to_frame_padding()
+    clicked = imgui.selectable(f"{elided(text, room)}##{tag}", chosen, size=ImVec2(room, 0))[0]
+    if about:
+        tip(about)
+    imgui.same_line(imgui.get_cursor_start_pos().x + right - side)
+    imgui.begin_disabled(not can_go)
+    gone = imgui.button("x", ImVec2(side, 0))
+    imgui.end_disabled()
+    return bool(clicked), bool(gone)
+
+
+class Picture:
+    """An image of an action's result as a texture, uploaded where it is another than in the last frame."""
+
+    def __init__(self, *, shrinks: bool = True) -> None:
+        """shrinks: it is drawn smaller than it is."""
+        self._shrinks = shrinks
+        self._image: Array | None = None  # what the texture has
+        self._texture: moderngl.Texture | None = None
+
+    def texture(self, image: Array) -> moderngl.Texture:
+        """The texture of an (H, W, 3) uint8 image, row 0 on top."""
+        if self._texture is None or self._image is not image:
+            if self._texture is not None:
+                self._texture.release()
+            size = (image.shape[1], image.shape[0])
+            texture = moderngl.get_context().texture(size, 3, image.tobytes(), alignment=1)
+            if self._shrinks:
+                texture.build_mipmaps()
+                texture.filter = moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR
+            texture.repeat_x = texture.repeat_y = False
+            self._texture, self._image = texture, image
+        return self._texture
 
 
 def beside_boxed(label: str) -> None:
@@ -197,9 +285,9 @@ def fitting(width_em: float, height_em: float) -> ImVec2:
     return ImVec2(min(size.x, MOST_OVER * room.x), min(size.y, MOST_OVER * room.y))
 
 
-def elided(text: str, room: float, width_of: Callable[[str], float]) -> str:
+def elided(text: str, room: float, width_of: Callable[[str], float] = width_of) -> str:
     """`text` in one line, cut with "..." where it is wider than `room`."""
-    text = " ".join(text.split())
+    text = " ".join(text.splitlines())
     if width_of(text) <= room:
         return text
     low, high = 0, len(text)  # as many letters as fit
