@@ -128,7 +128,6 @@ class Canvas:
         self._background.worker.wake = wake
 
     def _follow(self, state: ViewerState, request: RenderRequest) -> None:
-        """Moving: draw as finely as is fast enough."""
         if not state.coarse_while_moving:
             if request != self._tried:
                 self._draw(state, request)
@@ -164,7 +163,6 @@ class Canvas:
         return self._tried is None or replace(self._tried, detail=FULL) != request
 
     def _merged(self, request: RenderRequest) -> Merged | None:
-        """Gaussians that the quick renderer can draw, if they are there."""
         if self._quick is not None:
             with suppress(BackendError):  # for want of memory: images stay as they are
                 return self._merger.made(request.scene.scene.gaussians)
@@ -242,11 +240,9 @@ class Canvas:
 
     @property
     def backend(self) -> str:
-        """The name of what draws."""
         return self._fine.backend
 
     def close(self) -> None:
-        """Stop the workers."""
         self._background.worker.close()
         self._merger.worker.close()
 
@@ -324,7 +320,6 @@ class Pace:
         self._shares: dict[Level, float] = {}  # of the full image's time, measured
 
     def expect(self, count: int) -> None:
-        """Expect images of `count` Gaussians from now on."""
         self._count = max(count, 1)
 
     @property
@@ -333,7 +328,6 @@ class Pace:
         return not self._is_within(FINE)
 
     def drew(self, level: Level, milliseconds: float) -> None:
-        """Learn the time of an image that was drawn."""
         if level == FINE:
             self._each = milliseconds / self._count
             self._shares = {other: FORGET * share for other, share in self._shares.items()}

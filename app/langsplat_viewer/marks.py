@@ -101,7 +101,6 @@ class Marks:
 
     @property
     def kept(self) -> Array:
-        """(N,) bool: not deleted."""
         return ~self.deleted
 
     def same(self, other: "Marks") -> bool:
@@ -114,7 +113,6 @@ NAMES = tuple(field.name for field in fields(Marks))
 
 
 def unmarked(count: int) -> Marks:
-    """Return the marks of a scene that was just opened: none."""
     nothing = np.zeros(count, bool)
     return Marks(nothing, nothing, nothing)
 
@@ -312,7 +310,6 @@ class Drawn:
 
     @property
     def centre(self) -> Array:
-        """(3,) of a sphere or box."""
         return np.array(self.stroke.centre, np.float64)
 
 

@@ -132,12 +132,10 @@ class ViewerOptions:
 
     @property
     def is_film(self) -> bool:
-        """True where `--headless` makes a film."""
         return self.path is not None or self.turntable is not None
 
     @property
     def clip(self) -> Clip:
-        """Depths that are drawn."""
         return Clip(self.near_cut, math.inf if self.far_cut is None else self.far_cut)
 
 
@@ -237,5 +235,4 @@ def say_compiling(progress: Progress) -> None:
 
 
 def services(encoder_id: str) -> Services:
-    """The real layers below."""
     return Services(load_scene, load_text_encoder, encoder_id, warm_up)

@@ -90,5 +90,4 @@ def parse(args: Sequence[str]) -> ViewerCommand:
 
 
 def entry() -> None:
-    """The `langsplat-viewer` console script."""
     sys.exit(main("langsplat-viewer", lambda: parse(sys.argv[1:])))

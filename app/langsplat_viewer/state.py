@@ -129,7 +129,6 @@ class Timing:
     comparison: Comparison | None = None  # the last one
 
     def add(self, name: str, milliseconds: float) -> None:
-        """Add one measurement of the step `name`."""
         self.laps.setdefault(name, deque(maxlen=KEPT)).append(milliseconds)
 
     def medians(self) -> list[tuple[str, float]]:
@@ -243,7 +242,6 @@ class OutlineView:
         return found
 
     def row(self, node: int) -> Outline | None:
-        """The row of a node; None where it has none."""
         return self._rows.get(node)
 
 
@@ -437,7 +435,6 @@ class ViewerState(SceneState):
         return [by_slot.get(slot) for slot in range(max(by_slot, default=-1) + 1)]
 
     def shown_results(self) -> tuple[QueryResult | None, ...]:
-        """Answers of the queries that are shown."""
         return tuple(None if query is None else query.result for query in self.shown())
 
     def panes(self) -> tuple[Pane, ...]:

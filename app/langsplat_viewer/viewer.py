@@ -13,16 +13,17 @@ from typing import IO, Protocol, TypeVar
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import Display, LevelChoice, PictureConfig, TrainPreset
-from langsplat_core.errors import printable_line
+from langsplat_core.errors import LangSplatError, printable_line
 from langsplat_core.progress import ALL_STAGES, Progress, Report
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import LoadEncoder, QueryEngine
 from langsplat_core.scene import Camera, Scene
+from langsplat_core.semantics.encoders import DEMO
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.camera.flight import Keyframe
 from langsplat_viewer.files.disk import Stamps, Watch
 from langsplat_viewer.files.projects import Note, Shelf, Things
-from langsplat_viewer.jobs import Job, Worker
+from langsplat_viewer.jobs import Job, Worker, one_line
 from langsplat_viewer.marks import Histogram, Marks, Move, PackedMarks, Pair, pack
 from langsplat_viewer.rendering.request import Clip, RenderRequest
 from langsplat_viewer.state import OutlineView, Query, Ruler, ViewerState, ViewSettings
@@ -160,7 +161,6 @@ class Visit:
 
 
 def visit_of(state: ViewerState) -> Visit:
-    """Return the state to be found again."""
     chosen = [place for place, query in enumerate(state.queries) if query is state.selected]
     return Visit(
         view=state.view,
@@ -215,7 +215,6 @@ class Services:
     warm_up: Callable[[Scene, str, Progress], None] = lambda scene, backend, progress: None
 
     def engine(self, scene: Scene) -> QueryEngine:
-        """Engine that answers queries on `scene`."""
         return QueryEngine(scene, self.load_encoder, encoder_id=self.encoder_id)
 
 
@@ -282,6 +281,28 @@ class Viewer:
         reason, which by default is said."""
         return self.worker.submit(label, work, done, failed or self.say_error)
 
+    @property
+    def encoder_id(self) -> str:
+        """The text encoder of the scene shown, "" without one."""
+        field = None if self.state.scene is None else self.state.scene.language
+        return "" if field is None else self.services.encoder_id or field.encoder_id
+
+    @property
+    def has_encoder_here(self) -> bool:
+        """True where the text encoder lies on this machine: a hub id may mean a download."""
+        encoder = self.encoder_id
+        return encoder == DEMO or (encoder != "" and Path(encoder).expanduser().is_dir())
+
+    def save(self, path: Path, write: Callable[[], object], more: str = "") -> Path | None:
+        """Have `write` write the file `path`, and say so, or why it is not saved and return None."""
+        try:
+            write()
+        except (OSError, ValueError, LangSplatError) as error:
+            self.say_error(f"{path}: not saved ({one_line(error)})")
+            return None
+        self.state.say(f"saved {path}{more}")
+        return path
+
     def take_results(self) -> None:
         """Hand over what the worker and the recorder have finished; the one place where results of other
         threads arrive. Call once per frame."""
@@ -300,7 +321,6 @@ GESTURE = 1.0  # seconds: changes of one setting that follow each other sooner a
 
 
 def now(viewer: Viewer) -> Moment:
-    """Return the present moment."""
     state = viewer.state
     viewer.history.marks = pack(state.selection.marks, viewer.history.marks)
     return Moment(

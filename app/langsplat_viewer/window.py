@@ -289,7 +289,6 @@ class Window:
         return canvas
 
     def _draw_beside(self) -> tuple[moderngl.Texture, ...]:
-        """Bring the image of the second scene up to date."""
         other = self.viewer.beside
         if other is None:
             if self._second is not None:
@@ -304,7 +303,6 @@ class Window:
         return self._second.textures[:1]
 
     def _ask(self, viewer: Viewer) -> None:
-        """Ask what the command line asks."""
         for phrase in self._request.queries:
             queries.ask(viewer, phrase)
 
@@ -332,7 +330,6 @@ class Window:
         settings.set_display(viewer, wanted.display, latent_level(request.level))
 
     def drop(self, paths: list[str]) -> None:
-        """Open files that were dropped onto the window."""
         browsing.open_dropped(self.viewer, [Path(path) for path in paths])
 
     def _dropped(self, window: object, paths: list[str]) -> None:
@@ -412,7 +409,6 @@ class Window:
         return draws or any(worker.is_running for worker in workers)
 
     def is_minimised(self) -> bool:
-        """Return whether nobody can see the window."""
         return bool(glfw.get_window_attrib(glfw_window_hello_imgui(), glfw.ICONIFIED))
 
     def _title(self) -> None:

@@ -200,7 +200,7 @@ def large_letters(s: Any) -> None:
         s.open_panel(panel.title)
         assert seen_items(s, panel.title), panel.title
         assert cut_off(s, panel.title) == [], panel.title
-    settings.show_help(s.window.viewer, True)
+    s.window.viewer.state.show_help = True
     s.settle()
     keys = s.ctx.window_info("//Help").window
     assert 0 <= keys.pos.x <= keys.pos.x + keys.size.x <= 1280

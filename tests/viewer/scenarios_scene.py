@@ -360,7 +360,7 @@ def drag_the_gizmo(s: Any) -> None:
     x, y = on_screen(s, editing.pivot(viewer))
     s.ctx.mouse_teleport_to_pos((x, y))
     for covered in (True, False):  # by a window over the scene, whose mouse it leaves alone
-        settings.show_help(viewer, covered)
+        viewer.state.show_help = covered
         s.ctx.yield_(3)
         assert select.holds_mouse(viewer) != covered
     s.ctx.mouse_down(0)

@@ -149,7 +149,7 @@ def test_the_box_is_emptied_by_a_search_and_by_nothing_else(opened):
     queries.ask_typed(opened)
     assert (opened.state.typed, opened.state.queries[0].phrase) == ("", "mug")
     assert queries.take_search_focus(opened)  # for the next phrase
-    settings.show_panel(opened, False)
+    opened.state.show_panel = False
     queries.focus_search(opened)
     assert opened.state.show_panel
     assert queries.take_search_focus(opened)

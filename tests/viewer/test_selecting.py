@@ -282,7 +282,7 @@ def test_a_click_on_nothing_and_without_a_field(front, monkeypatch):
 def test_escape_gives_up_the_stroke_then_the_tool_and_help_before_both(front):
     selecting.use_tool(front, "lasso")
     selecting.begin_stroke(front, 0.1, 0.1)
-    settings.show_help(front, True)
+    front.state.show_help = True
     settings.escape(front)
     assert front.state.selection.stroke is not None
     settings.escape(front)

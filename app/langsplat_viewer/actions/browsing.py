@@ -49,7 +49,6 @@ def ask_for_folder(viewer: Viewer, purpose: Literal["library", "dataset"]) -> No
 
 
 def choose_folder(viewer: Viewer, folder: Path) -> None:
-    """Take the folder that the browser was opened for."""
     state = viewer.state
     if state.picks_folder == "library":
         open_library(viewer, folder)
@@ -130,7 +129,6 @@ def ask_for_beside(viewer: Viewer) -> None:
 
 
 def browse(viewer: Viewer, folder: Path) -> None:
-    """Show another folder in the browser."""
     viewer.state.path_typed, viewer.state.browser = "", list_folder(folder)
 
 
@@ -223,7 +221,6 @@ def _ask_sets(viewer: Viewer, sets: Sequence[Path]) -> None:
 
 
 def open_recent(viewer: Viewer, path: str) -> None:
-    """Open a scene or a project again that was open before."""
     viewer.state.browser = None
     open_file(viewer, Path(path))
 
@@ -287,7 +284,6 @@ def start_training(viewer: Viewer) -> None:
 
 
 def stop_training(viewer: Viewer) -> None:
-    """Interrupt the training; `start_training` goes on from there."""
     if viewer.training is not None:
         viewer.training.interrupt()
 

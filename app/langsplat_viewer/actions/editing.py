@@ -132,7 +132,6 @@ def fill_box(viewer: Viewer) -> None:
 
 
 def set_box(viewer: Viewer, low: Point, high: Point) -> None:
-    """Set two opposite corners of the box of the panel, world units."""
     viewer.state.edit_form = replace(viewer.state.edit_form, low=low, high=high)
 
 
@@ -187,7 +186,6 @@ def undo(viewer: Viewer) -> None:
 
 
 def redo(viewer: Viewer) -> None:
-    """Do again what was undone last."""
     _step(viewer, viewer.history.future, viewer.history.past, "nothing to redo")
 
 

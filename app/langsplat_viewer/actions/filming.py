@@ -31,7 +31,6 @@ from langsplat_viewer.camera.flight import (
     with_keyframe,
 )
 from langsplat_viewer.files.projects import MOST_KEYFRAMES, PATHS, read_flight, write_flight
-from langsplat_viewer.jobs import one_line
 from langsplat_viewer.options import MAX_SIDE, say_compiling
 from langsplat_viewer.output.film import (
     VIDEO,
@@ -58,17 +57,15 @@ def save_picture(viewer: Viewer, folder: Path = Path()) -> Path | None:
         viewer.say_error("open a scene first, then save a picture of it")
         return None
     path = free_name(folder, state.path.stem if state.path else "picture", ".png")
-    transparent, beside = state.settings.transparent, viewer.beside
-    try:
-        images = [viewer.surface.capture(state.request(transparent=transparent))]
-        if beside is not None and beside.surface is not None and beside.state.scene is not None:
-            images.append(beside.surface.capture(beside.state.request(transparent=transparent)))
+    surface, other, transparent = viewer.surface, viewer.beside, state.settings.transparent
+
+    def write() -> None:
+        images = [surface.capture(state.request(transparent=transparent))]
+        if other is not None and other.surface is not None and other.state.scene is not None:
+            images.append(other.surface.capture(other.state.request(transparent=transparent)))
         save_png(path, state.settings.split.joined(images, images[0].shape[1]))
-    except (OSError, LangSplatError) as error:
-        viewer.say_error(f"{path}: not saved ({one_line(error)})")
-        return None
-    state.say(f"saved {path}")
-    return path
+
+    return viewer.save(path, write)
 
 
 def save_view(viewer: Viewer, folder: Path = Path()) -> Path | None:
@@ -79,14 +76,10 @@ def save_view(viewer: Viewer, folder: Path = Path()) -> Path | None:
         viewer.say_error("open a scene first, then save a view of it")
         return None
     path = free_name(folder, f"{state.path.stem if state.path else 'view'}-view", ".json")
-    try:
-        write_cameras(path, (with_projection(state.view, orthographic=False).camera(*state.size),))
-    except OSError as error:
-        viewer.say_error(f"{path}: not saved ({one_line(error)})")
-        return None
+    camera = with_projection(state.view, orthographic=False).camera(*state.size)
     span = f" --orthographic {state.view.span_in(*state.size):.6g}" if state.view.orthographic else ""
-    state.say(f"saved {path}; show it again with --camera {path.name}{span}")
-    return path
+    more = f"; show it again with --camera {path.name}{span}"
+    return viewer.save(path, lambda: write_cameras(path, (camera,)), more)
 
 
 def add_keyframe(viewer: Viewer) -> None:
@@ -106,7 +99,6 @@ def add_keyframe(viewer: Viewer) -> None:
 
 
 def choose_keyframe(viewer: Viewer, key: Keyframe) -> None:
-    """Stand where a keyframe is."""
     state, record = viewer.state, viewer.state.record
     if state.extent is not None:
         glide_to(viewer, view_of(key.pose, state.extent))
@@ -129,14 +121,12 @@ def move_keyframe(viewer: Viewer, key: Keyframe, seconds: float) -> None:
 
 
 def replace_keyframe(viewer: Viewer, key: Keyframe) -> None:
-    """Put the current view in the place of a keyframe."""
     if viewer.state.view is not None:
         new = replace(key, pose=pose_of(viewer.state.view))
         _set(viewer, with_keyframe(viewer.state.record.keyframes, new), new)
 
 
 def set_path_seconds(viewer: Viewer, seconds: float) -> None:
-    """Set the duration of the whole path."""
     record = viewer.state.record
     seconds = min(max(seconds, 0.1), LONGEST)
     if record.turns:
@@ -148,7 +138,6 @@ def set_path_seconds(viewer: Viewer, seconds: float) -> None:
 
 
 def clear_path(viewer: Viewer) -> None:
-    """Take all keyframes off."""
     if viewer.state.record.keyframes:
         _set(viewer, (), None)
 
@@ -176,14 +165,10 @@ def save_path(viewer: Viewer, folder: Path = Path()) -> Path | None:
     stem = state.path.stem if state.path else "camera"
     typed = record.path_typed.strip()
     path = folder.absolute() / typed if typed else free_name(folder, stem, PATHS)
-    try:
-        write_flight(path, flight_of(record.keyframes))
-    except (OSError, ValueError) as error:
-        viewer.say_error(f"{path}: not saved ({one_line(error)})")
-        return None
-    record.path_typed = str(path)
-    state.say(f"saved {path}; langsplat-viewer --headless --path makes a film of it")
-    return path
+    more = "; langsplat-viewer --headless --path makes a film of it"
+    saved = viewer.save(path, lambda: write_flight(path, flight_of(record.keyframes)), more)
+    record.path_typed = record.path_typed if saved is None else str(path)
+    return saved
 
 
 def load_path(viewer: Viewer, path: Path) -> None:
@@ -202,7 +187,6 @@ def load_path(viewer: Viewer, path: Path) -> None:
 
 
 def load_typed_path(viewer: Viewer, folder: Path = Path()) -> None:
-    """Take the path of the typed file."""
     typed = viewer.state.record.path_typed.strip()
     if typed:
         load_path(viewer, folder.absolute() / typed)

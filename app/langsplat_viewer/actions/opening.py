@@ -15,7 +15,6 @@ from langsplat_core.pipeline.report import stated_warnings
 from langsplat_core.progress import Progress
 from langsplat_core.query.engine import no_field
 from langsplat_core.scene import Camera, Scene, surface
-from langsplat_core.semantics.encoders import DEMO
 from langsplat_viewer.actions import viewpoint
 from langsplat_viewer.actions.outline import have_things
 from langsplat_viewer.actions.queries import ask_again, ask_one, set_canonical, set_level
@@ -85,7 +84,6 @@ def _open(viewer: Viewer, path: Path, then: Callable[[Viewer], None], check: Cal
 
 
 def cancel(viewer: Viewer) -> None:
-    """Drop the work under way."""
     viewer.worker.cancel()
     viewer.state.opening = None
     photograph = viewer.state.photograph
@@ -129,7 +127,8 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
         field = scene.language
         viewer.run("preparing latent colours", lambda progress: latent_colours(field))  # none is needed yet
         _compile_search(viewer)
-        _warm_up_encoder(viewer, viewer.services.encoder_id or scene.language.encoder_id)
+        if viewer.has_encoder_here:  # while the user looks round
+            viewer.run("loading the text encoder", viewer.engine.load_encoder)
 
 
 def _say_opened(viewer: Viewer, path: Path, opened: _Opened) -> None:
@@ -152,14 +151,6 @@ def _compile_search(viewer: Viewer) -> None:
     viewer.run(
         "compiling the search kernels, once per installation (half a minute)", lambda progress: engine.regions
     )
-
-
-def _warm_up_encoder(viewer: Viewer, encoder_id: str) -> None:
-    """Load a local encoder while the user looks round; a hub id may mean a download and waits for the
-    first query that needs it."""
-    if viewer.engine is None or not (encoder_id == DEMO or Path(encoder_id).expanduser().is_dir()):
-        return
-    viewer.run("loading the text encoder", viewer.engine.load_encoder)
 
 
 # Visits: a scene that was shown before is found again as it was left.
@@ -368,8 +359,7 @@ def _look(viewer: Viewer, beside: Viewer) -> None:
     assert other.extent is not None
     if state.view is not None and view is not state.view:
         other.view, beside.linked = linked(state.view, state.extent, other.extent), (state.view, canonical)
-    has_field = other.scene is not None and other.scene.language is not None
-    other.picture = state.picture if has_field else replace(state.picture, display="rgb")
+    other.picture = state.picture if other.has_field else replace(state.picture, display="rgb")
     other.latent_level, other.size = state.latent_level, state.size
     other.settings = replace(state.settings, split=Split())
 
@@ -390,7 +380,7 @@ def linked(view: OrbitCamera, here: Extent, there: Extent) -> OrbitCamera:
 def _ask(viewer: Viewer, beside: Viewer) -> None:
     """Ask what the first is asked; each answer has the colour of the first one's."""
     state, other = viewer.state, beside.state
-    if other.scene is None or other.scene.language is None:
+    if not other.has_field:
         return
     if other.level != state.level:
         set_level(beside, state.level)

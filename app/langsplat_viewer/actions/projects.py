@@ -54,7 +54,6 @@ def pin_at(viewer: Viewer, u: float, v: float) -> None:
 
 
 def pin_to_selection(viewer: Viewer) -> None:
-    """Pin a note to the middle of what is selected."""
     state, chosen = viewer.state, viewer.state.selection.marks.selected
     if state.scene is None or not chosen.any():
         viewer.say_error("select something first, then pin a note to it")
@@ -84,14 +83,12 @@ def take_fresh_note(viewer: Viewer, note: Note) -> bool:
 
 
 def write_note(viewer: Viewer, note: Note, text: str) -> None:
-    """Change the text of a note."""
     remember(viewer, f"note at {note.at}")
     changed = replace(note, text=text[:LONGEST_NOTE])
     viewer.state.notes = tuple(changed if other is note else other for other in viewer.state.notes)
 
 
 def remove_note(viewer: Viewer, note: Note) -> None:
-    """Take a note off."""
     remember(viewer)
     viewer.state.notes = tuple(other for other in viewer.state.notes if other is not note)
 
@@ -124,16 +121,13 @@ def save_project(viewer: Viewer, folder: Path = Path()) -> Path | None:
         panels=state.preferences.panels or (),
         things=state.things,
     )
-    try:
-        write_project(path, project, [_answer(state, query) for query in state.queries])
-    except OSError as error:
-        viewer.say_error(f"{path}: not saved ({one_line(error)})")
+    answers = [_answer(state, query) for query in state.queries]
+    if viewer.save(path, lambda: write_project(path, project, answers)) is None:
         return None
     state.project, state.preferences = path, with_recent(state.preferences, path)
     state.kept = state.things, state.notes
     marks, moves = state.selection.marks, state.selection.moves
     state.selection = replace(state.selection, saved=marks.deleted, saved_moves=moves)
-    state.say(f"saved {path}")
     return path
 
 

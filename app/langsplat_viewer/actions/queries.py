@@ -20,7 +20,6 @@ from langsplat_core.query.instances import Instance
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import TaughtWord
 from langsplat_core.scene.language import phrase_key, split_phrases
-from langsplat_core.semantics.encoders import DEMO
 from langsplat_viewer.actions.selecting import has_selection
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.files.projects import QUERIES, QuerySet, SavedQuery, read_queries, write_queries
@@ -93,7 +92,6 @@ def ask_typed(viewer: Viewer) -> None:
 
 
 def type_name(viewer: Viewer, name: str) -> None:
-    """Take the text of the box for a name of what is selected."""
     viewer.state.selection = replace(viewer.state.selection, name=name)
 
 
@@ -245,7 +243,6 @@ def hide(viewer: Viewer, query: Query) -> None:
 
 
 def remove(viewer: Viewer, query: Query) -> None:
-    """Take a query off the list."""
     state = viewer.state
     if query in state.queries:
         remember(viewer)
@@ -320,7 +317,7 @@ def set_canonical(viewer: Viewer, text: str) -> None:
     """Compare everything with other canonical phrases, between commas; "" for the scene's own again."""
     phrases = tuple(split_phrases(text))
     engine, state = viewer.engine, viewer.state
-    if engine is None or state.scene is None or state.scene.language is None:
+    if engine is None or not state.has_field:
         viewer.say_error("open a scene with a language field first")
         return
 
@@ -349,13 +346,8 @@ def save_queries(viewer: Viewer, folder: Path = Path()) -> Path | None:
         viewer.say_error("search for something first, then save the queries")
         return None
     path = free_name(folder, state.path.stem if state.path else "scene", QUERIES)
-    try:
-        write_queries(path, listed_queries(state))
-    except OSError as error:
-        viewer.say_error(f"{path}: not saved ({one_line(error)})")
-        return None
-    state.say(f"saved {path}; open it, or drop it onto the window, to ask them again")
-    return path
+    more = "; open it, or drop it onto the window, to ask them again"
+    return viewer.save(path, lambda: write_queries(path, listed_queries(state)), more)
 
 
 def load_queries(viewer: Viewer, path: Path) -> None:
@@ -366,7 +358,7 @@ def load_queries(viewer: Viewer, path: Path) -> None:
     except InputError as error:
         viewer.say_error(one_line(error))
         return
-    if state.scene is None or state.scene.language is None:
+    if not state.has_field:
         viewer.say_error(f"{path.name}: open a scene that can be searched first")
         return
     if wanted.canonical != state.canonical:
@@ -385,12 +377,10 @@ def prepare_suggestions(viewer: Viewer) -> None:
     if state.scene is state.suggestions_of or viewer.worker.current is not None:
         return
     state.suggestions, state.suggestions_of = Suggestions(), state.scene
-    if engine is None or state.scene is None or state.scene.language is None:
-        return
     scene = state.scene
-    encoder_id = viewer.services.encoder_id or state.scene.language.encoder_id
-    local = encoder_id == DEMO or Path(encoder_id).expanduser().is_dir()
-    asked = engine if local else QueryEngine(scene)  # a hub id may mean a download: the phrasebook alone
+    if engine is None or scene is None or not state.has_field:
+        return
+    asked = engine if viewer.has_encoder_here else QueryEngine(scene)  # the phrasebook alone
 
     def work(progress: Progress) -> Suggestions:
         return suggest(asked, progress=progress)

@@ -63,13 +63,11 @@ def has_selection(viewer: Viewer) -> bool:
 
 
 def select_all(viewer: Viewer) -> None:
-    """Select everything that is shown."""
     if has_scene(viewer):
         take(viewer, viewer.state.selection.marks.shown, "replace")
 
 
 def select_none(viewer: Viewer) -> None:
-    """Clear the selection."""
     if has_scene(viewer):
         take(viewer, np.zeros_like(viewer.state.selection.marks.selected), "replace")
 
@@ -94,7 +92,6 @@ def isolate_selected(viewer: Viewer) -> None:
 
 
 def show_hidden(viewer: Viewer) -> None:
-    """Show everything that was hidden."""
     if has_scene(viewer):
         marks = viewer.state.selection.marks
         mark(viewer, replace(marks, hidden=np.zeros_like(marks.hidden)))
@@ -166,7 +163,6 @@ def select_query(viewer: Viewer, query: Query | None = None, mode: Mode | None =
 
 
 def select_thing(viewer: Viewer, thing: Instance, mode: Mode | None = None) -> None:
-    """Select one of the things that an answer found."""
     if has_scene(viewer):
         take(viewer, of_rows(thing.members, len(viewer.state.selection.marks.selected)), mode)
 
@@ -182,7 +178,6 @@ def set_mode(viewer: Viewer, mode: Mode) -> None:
 
 
 def set_brush(viewer: Viewer, radius: float) -> None:
-    """Set the brush's radius, of the image's height."""
     low, high = marks.BRUSHES
     viewer.state.selection = replace(viewer.state.selection, brush=min(max(radius, low), high))
 
@@ -355,7 +350,6 @@ def may_close(viewer: Viewer) -> bool:
 
 
 def quit_viewer(viewer: Viewer) -> None:
-    """Have the window close at the next frame."""
     leave(viewer, _close, "the window closes", viewer.state.has_unsaved_notes)
 
 

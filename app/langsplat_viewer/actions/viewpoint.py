@@ -146,7 +146,6 @@ def open_at(viewer: Viewer, camera: Camera) -> None:
 
 
 def glide_to(viewer: Viewer, end: OrbitCamera) -> None:
-    """Move smoothly to a view."""
     if viewer.state.view is not None:
         leave_path(viewer)
         viewer.state.glide = Glide(viewer.state.view, end, viewer.clock)
@@ -216,7 +215,6 @@ def set_orthographic(viewer: Viewer, orthographic: bool) -> None:
 
 
 def toggle_orthographic(viewer: Viewer) -> None:
-    """Look without perspective, or with it again."""
     set_orthographic(viewer, viewer.state.view is not None and not viewer.state.view.orthographic)
 
 
@@ -390,14 +388,12 @@ def go_to_bookmark(viewer: Viewer, bookmark: Bookmark) -> None:
 
 
 def bookmarked_view(bookmark: Bookmark, extent: Extent) -> OrbitCamera:
-    """Return the view that a bookmark keeps."""
     view = view_of(bookmark.pose, extent)
     target = view.eye + bookmark.distance * view.rotation[2]
     return replace(view, target=target, distance=bookmark.distance)
 
 
 def delete_bookmark(viewer: Viewer, bookmark: Bookmark) -> None:
-    """Take a bookmark off the list."""
     viewer.state.bookmarks = tuple(other for other in viewer.state.bookmarks if other is not bookmark)
     _keep(viewer)
 

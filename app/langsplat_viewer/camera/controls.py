@@ -284,7 +284,6 @@ def focus(view: OrbitCamera, point: Array, distance: float | None = None) -> Orb
 
 
 def level(view: OrbitCamera) -> OrbitCamera:
-    """The same view with a level horizon."""
     upright = look_at(view.eye, view.target, view.up, (1, 1))
     return replace(view, rotation=upright.rotation)
 
@@ -326,7 +325,6 @@ class Extent:
 
 
 def extent_of(scene: Scene) -> Extent:
-    """Return the extent of a scene."""
     centre, radius = scene.bounds()
     rotation = scene.framing_camera((1000, 1000), (centre, radius)).rotation
     sample = sample_of(scene.gaussians)

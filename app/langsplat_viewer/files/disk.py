@@ -163,7 +163,6 @@ Stamps = tuple[tuple[Path, Stamp], ...]
 
 
 def stamps(files: tuple[Path, ...]) -> Stamps:
-    """Return the present stamp of each file."""
     return tuple((file, _stamp(file)) for file in files)
 
 
@@ -194,7 +193,6 @@ class Watch:
             self.changed = False
 
     def start(self) -> None:
-        """Look every second from now on."""
         threading.Thread(target=self._run, name="langsplat-watch", daemon=True).start()
 
     def _run(self) -> None:
@@ -223,7 +221,6 @@ class Watch:
             self.changed = False
 
     def close(self) -> None:
-        """End the watching thread."""
         self._closed.set()
 
 

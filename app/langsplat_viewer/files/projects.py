@@ -82,12 +82,10 @@ def write_flight(path: Path | str, flight: Flight) -> None:
 
 
 def keyframe_entries(keyframes: Sequence[Keyframe]) -> list[dict[str, Any]]:
-    """Keyframes as JSON has them."""
     return [{"seconds": key.seconds, **pose_entry(key.pose)} for key in keyframes]
 
 
 def pose_entry(pose: Pose) -> dict[str, Any]:
-    """A pose as JSON has it."""
     entry = {
         "position": np.asarray(pose.position, float).tolist(),
         "rotation": np.asarray(pose.rotation, float).T.tolist(),
@@ -184,7 +182,6 @@ def named(name: str) -> str:
 
 
 def bookmark_entry(bookmark: Bookmark) -> dict[str, Any]:
-    """A named view as JSON has it."""
     return {"name": bookmark.name, **pose_entry(bookmark.pose), "distance": float(bookmark.distance)}
 
 
@@ -232,7 +229,6 @@ def write_queries(path: Path, queries: QuerySet) -> None:
 
 
 def query_entries(queries: QuerySet) -> dict[str, Any]:
-    """A set as JSON has it."""
     return {"format": QUERY_FORMAT, "version": 1, **asdict(queries)}
 
 
@@ -515,7 +511,6 @@ def _place(entry: Any, what: str) -> Place:
 
 
 def _text(bits: Array | None) -> str | None:
-    """Packed bits as text."""
     return None if bits is None else base64.b64encode(zlib.compress(bits.tobytes())).decode()
 
 

@@ -27,7 +27,7 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import Camera
 from langsplat_viewer.camera.controls import Extent
 from langsplat_viewer.camera.flight import Motion, camera_of, frame_times
-from langsplat_viewer.rendering.renderer import ArrayRenderer, Backend, GlRenderer, open_renderer
+from langsplat_viewer.rendering.renderer import Backend, open_renderer
 from langsplat_viewer.rendering.request import Inputs, RenderRequest, why_nothing
 
 
@@ -88,12 +88,10 @@ def check_film(out: Path | None, size: tuple[int, int] | None) -> Path:
 
 
 def is_folder(out: Path) -> bool:
-    """True where a film to `out` is a folder of images."""
     return out.is_dir() or not out.suffix
 
 
 def find_ffmpeg() -> str | None:
-    """The system's ffmpeg, where there is one."""
     return shutil.which("ffmpeg")
 
 
@@ -111,7 +109,6 @@ def write_film(film: Film, draw: Draw) -> int:
 
 
 def frame_name(number: int) -> str:
-    """Name of an image in a folder."""
     return f"frame-{number:05d}.png"
 
 
@@ -124,7 +121,6 @@ def _check_own(folder: Path) -> None:
 
 
 def _write_pictures(film: Film, draw: Draw) -> int:
-    """Write the images that are missing."""
     folder = film.out
     folder.mkdir(parents=True, exist_ok=True)
     _check_own(folder)
@@ -208,7 +204,6 @@ def _ffmpeg(film: Film, target: Path) -> list[str]:
 
 
 def _end(process: "subprocess.Popen[bytes]") -> None:
-    """End the process and close what is left of it."""
     if process.poll() is None:
         process.kill()
     process.wait()
@@ -240,38 +235,29 @@ def cameras_of(motion: Motion, extent: Extent, fps: float, size: tuple[int, int]
 def make_film(shot: Shot, out: Path, progress: Progress = silent) -> list[str]:
     """Draw and write a film; returns the lines to print. Raises InputError, among others where no image
     shows anything of the scene, and BackendError; `progress` may raise to stop it."""
-    width, height = shot.request.size
-    film = Film(out, len(shot.cameras), (width, height), shot.fps, fingerprint(shot))
+    (width, height), cameras, empty = shot.request.size, shot.cameras, 0
+    film = Film(out, len(cameras), (width, height), shot.fps, fingerprint(shot))
     with in_one_line(out, f"{width}x{height}"), open_renderer(shot.backend) as renderer:
-        roll = _Roll(shot, renderer, progress)
-        drawn = write_film(film, roll.draw)
+
+        def draw(number: int) -> Array:
+            nonlocal empty
+            progress("drawing", number / len(cameras), f"{number + 1} of {len(cameras)} pictures")
+            image = renderer.read(shot.request.seen_by(cameras[number]))
+            empty += renderer.shows_nothing()
+            if empty == len(cameras):
+                scene = shot.request.scene.scene
+                raise InputError(
+                    f"{scene.path}: no picture of the film shows anything of the scene: "
+                    f"{why_nothing(scene.gaussians, cameras[number])}; mend the path"
+                )
+            return image
+
+        drawn = write_film(film, draw)
     kept = f", {film.count - drawn} of them kept" if drawn < film.count else ""
     name = f"{out}/" if is_folder(out) else str(out)
     pictures = "picture" if film.count == 1 else "pictures"
-    empty = [f"{roll.empty} of {film.count} pictures show nothing of the scene"] if roll.empty else []
-    return [f"{name}: {width}x{height}, {film.count} {pictures}{kept}, {film.fps:g} a second", *empty]
-
-
-class _Roll:
-    """Draws image after image and says how far it is."""
-
-    def __init__(self, shot: Shot, renderer: ArrayRenderer | GlRenderer, progress: Progress) -> None:
-        self._shot, self._renderer, self._progress = shot, renderer, progress
-        self.empty = 0  # images that show nothing of the scene
-
-    def draw(self, number: int) -> Array:
-        """(H, W, 3) uint8. InputError at the last image where none showed anything."""
-        cameras, request = self._shot.cameras, self._shot.request
-        self._progress("drawing", number / len(cameras), f"{number + 1} of {len(cameras)} pictures")
-        image = self._renderer.read(request.seen_by(cameras[number]))
-        self.empty += self._renderer.shows_nothing()
-        if self.empty == len(cameras):
-            scene = request.scene.scene
-            raise InputError(
-                f"{scene.path}: no picture of the film shows anything of the scene: "
-                f"{why_nothing(scene.gaussians, cameras[number])}; mend the path"
-            )
-        return image
+    nothing = [f"{empty} of {film.count} pictures show nothing of the scene"] if empty else []
+    return [f"{name}: {width}x{height}, {film.count} {pictures}{kept}, {film.fps:g} a second", *nothing]
 
 
 @contextmanager
@@ -300,7 +286,6 @@ def fingerprint(shot: Shot) -> str:
 
 
 def _add(update: Callable[[bytes], object], value: object) -> None:
-    """A dataclass, array, list or plain value."""
     if is_dataclass(value) and not isinstance(value, type):
         for field in fields(value):
             _add(update, getattr(value, field.name))

@@ -17,7 +17,6 @@ from langsplat_viewer.viewer import Viewer
 
 
 def draw_menus(viewer: Viewer) -> None:
-    """Draw the menus inside the menu bar."""
     for menu in MENUS:
         if imgui.begin_menu(menu):
             first, *others = in_menu(menu)
@@ -138,7 +137,6 @@ FIRST_STEPS = (
 
 
 def draw_help(viewer: Viewer) -> None:
-    """Draw the window with the first steps and the list of keys."""
     if not viewer.state.show_help:
         return
     flags = imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_collapse
@@ -149,7 +147,7 @@ def draw_help(viewer: Viewer) -> None:
     imgui.set_next_window_pos(centre, imgui.Cond_.always, ImVec2(0.5, 0.5))
     imgui.set_next_window_bg_alpha(1.0)
     _, still_open = imgui.begin("Help", True, flags)
-    settings.show_help(viewer, bool(still_open))
+    viewer.state.show_help = bool(still_open)
     imgui.text_disabled(f"LangSplat viewer {__version__}; documentation: docs/README.md of its source")
     if imgui.begin_tab_bar("pages"):
         keys = [(", ".join(command.keys), command.does) for command in COMMANDS if command.keys]
@@ -376,7 +374,6 @@ class Hiding:
 
 
 def draw_over(viewer: Viewer) -> None:
-    """Draw what lies over the scene, after the panels."""
     area = ui.scene_area()
     said = _said(viewer)
     if said:

@@ -89,11 +89,9 @@ class Keyboard:
         self.add(Event(_as_printed(key, scancode), action == glfw.PRESS, held))
 
     def typed(self, window: Any, character: int) -> None:
-        """Take a character that was typed."""
         self.add(Event(character=character))
 
     def add(self, event: Event) -> None:
-        """Append the latest event."""
         self._events.append(event)
 
     def feed(self) -> None:

@@ -139,7 +139,6 @@ def _sides(row: Outline) -> str:
 
 
 def _switches(viewer: Viewer, node: int, right: float, side: float) -> None:
-    """Eye and lock, at the right end of a row."""
     hidden, locked = bool(outline.hidden_nodes(viewer)[node]), node in viewer.state.things.locked
     imgui.same_line(right - 2 * side - imgui.get_style().item_spacing.x)
     if _icon(f"{icons.ICON_FA_EYE_SLASH if hidden else icons.ICON_FA_EYE}###eye", side, lit=not hidden):

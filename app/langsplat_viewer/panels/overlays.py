@@ -45,7 +45,6 @@ def draw_pictures(viewer: Viewer, area: ui.Area, textures: tuple[moderngl.Textur
 
 
 def _image(area: ui.Area, texture: moderngl.Texture, start: float, stop: float) -> None:
-    """The part of a texture between two fractions of its width, at its place."""
     imgui.get_background_draw_list().add_image(
         imgui.ImTextureRef(texture.glo),
         ImVec2(area.left + start * area.width, area.top),
@@ -126,7 +125,6 @@ EVIDENCE_EM = 50.0, 34.0  # size of the window at first
 
 
 def draw_evidence(viewer: Viewer, picture: ui.Picture) -> None:
-    """Draw the evidence of an answer, in a window that can be closed."""
     sheet, area = viewer.state.evidence, ui.scene_area()
     if sheet is None:
         return
@@ -204,7 +202,6 @@ def draw_lines(viewer: Viewer, area: ui.Area) -> None:
 
 
 def _orthographic(viewer: Viewer, area: ui.Area) -> None:
-    """Write that the camera is orthographic, and its scale."""
     view, scene = viewer.state.view, viewer.state.scene
     if view is None or scene is None or not view.orthographic:
         return
@@ -232,7 +229,6 @@ def _least_depth(viewer: Viewer) -> float:
 
 
 def _lines(area: ui.Area, segments: Array, colour: tuple[float, float, float, float], thick: float) -> None:
-    """(K, 2, 2) segments in units of the image in `area`."""
     paint, packed = imgui.get_background_draw_list(), imgui.get_color_u32(colour)
     for (x0, y0), (x1, y1) in (segments + (area.left, area.top)).tolist():
         paint.add_line(ImVec2(x0, y0), ImVec2(x1, y1), packed, thick)
@@ -325,7 +321,6 @@ def _grid(viewer: Viewer, area: ui.Area, camera: Camera, is_named: bool) -> None
 
 
 def _ruler(viewer: Viewer, area: ui.Area, camera: Camera) -> None:
-    """The points that were clicked, and what lies between them."""
     ruler, scene = viewer.state.ruler, viewer.state.scene
     assert scene is not None
     paint, least = imgui.get_background_draw_list(), _least_depth(viewer)

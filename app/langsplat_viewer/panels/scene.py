@@ -116,7 +116,6 @@ def _ask_for_popup(title: str, is_wanted: bool) -> None:
 
 
 def has_several(listing: Listing) -> bool:
-    """Return whether there is more than one scene to open."""
     return sum(entry.is_file and format_of(entry.path) is not None for entry in listing.entries) > 1
 
 
@@ -131,7 +130,6 @@ def _path_box(viewer: Viewer) -> None:
 
 
 def _above(viewer: Viewer, folder: Path) -> None:
-    """The folders above, each to be gone to."""
     for number, parent in enumerate((*reversed(folder.parents), folder)):
         if number:
             imgui.same_line(0, 2)
@@ -199,7 +197,6 @@ BAR = (
 
 
 def draw_changed(viewer: Viewer, area: ui.Area) -> None:
-    """Draw the file that has changed, and buttons to read it or not."""
     state = viewer.state
     if not viewer.watch.changed or state.path is None or state.opening is not None:
         return
@@ -286,7 +283,6 @@ PRESETS: dict[TrainPreset, str] = {
 
 
 def draw_training(viewer: Viewer) -> None:
-    """Draw the panel "Train": the form, or what a running training says."""
     process = viewer.training
     if process is None:
         _form(viewer)

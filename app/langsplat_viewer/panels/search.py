@@ -25,7 +25,6 @@ OFFER_LINES = 2  # more are scrolled to
 
 
 def _box(viewer: Viewer) -> None:
-    """Draw the search box, its button and the suggestions."""
     queries.prepare_suggestions(viewer)
     imgui.set_next_item_width(ui.beside_button("Search"))
     if queries.take_search_focus(viewer):
@@ -288,7 +287,6 @@ def draw(viewer: Viewer) -> None:
 
 
 def _canonical(viewer: Viewer) -> None:
-    """Draw the canonical phrases."""
     opened = imgui.collapsing_header("Compared with")
     ui.tip("Everyday phrases: relevancy is how much nearer a place is to yours than to these")
     if not opened:

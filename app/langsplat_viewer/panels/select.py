@@ -110,7 +110,6 @@ def _tools(viewer: Viewer) -> None:
 
 
 def _found(viewer: Viewer) -> None:
-    """Draw buttons that select an answer, whole or thing by thing."""
     query = selecting.chosen_query(viewer)
     if query is None or query.result is None:
         return

@@ -46,7 +46,6 @@ class Area:
 
     @property
     def corners(self) -> tuple[ImVec2, ImVec2]:
-        """The upper left and the lower right corner."""
         return ImVec2(self.left, self.top), ImVec2(self.left + self.width, self.top + self.height)
 
     def columns(self, count: int) -> list["Area"]:
@@ -103,17 +102,14 @@ def _readable(on_dark: tuple[float, float, float], on_light: tuple[float, float,
 
 
 def good() -> ImVec4:
-    """Colour of what was found."""
     return _readable((0.47, 0.80, 0.52), (0.05, 0.45, 0.15))
 
 
 def bad() -> ImVec4:
-    """Colour of errors."""
     return _readable((0.95, 0.58, 0.45), (0.70, 0.15, 0.05))
 
 
 def muted() -> ImVec4:
-    """Colour of explanations."""
     return _readable((0.62, 0.64, 0.67), (0.35, 0.36, 0.40))
 
 
@@ -145,12 +141,10 @@ def stoppable(label: str, fraction: float, tag: str = "") -> bool:
 
 
 def width_of(text: str) -> float:
-    """Return the width of one line, window units."""
     return float(imgui.calc_text_size(text).x)
 
 
 def button_width(label: str) -> float:
-    """Return the width of a button, window units."""
     return width_of(label.partition("##")[0]) + 2 * imgui.get_style().frame_padding.x
 
 
@@ -178,7 +172,6 @@ def button(label: str, about: str = "", *, enabled: bool = True) -> bool:
 
 
 def next_button(label: str, about: str = "", *, enabled: bool = True) -> bool:
-    """Draw a `button` beside the last widget."""
     beside(label)
     return button(label, about, enabled=enabled)
 

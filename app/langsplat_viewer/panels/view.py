@@ -26,7 +26,6 @@ BACKDROPS = {(grey, grey, grey): name for name, grey in (("Black", 0.0), ("Grey"
 
 
 def draw_display(viewer: Viewer) -> None:
-    """Draw the panel "Display"."""
     for _, group in groupby(DISPLAYS.values(), lambda row: row.name if row.by_level else row.needs_query):
         _display_line(viewer, tuple(group))
     _compared(viewer)
@@ -56,7 +55,6 @@ def draw_display(viewer: Viewer) -> None:
 
 
 def _splats(viewer: Viewer) -> None:
-    """Draw the settings of the Gaussians' appearance."""
     scene, splats = viewer.state.scene, viewer.state.settings.splats
     size = ui.slider("Splat size", splats.size, SIZE_RANGE)
     ui.tip("Smaller, every Gaussian can be seen; answers and files do not change")
@@ -88,7 +86,6 @@ def _heat_scale(viewer: Viewer) -> tuple[float, float] | None:
 
 
 def _backdrop(background: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Three to choose from, and one's own."""
     background = ui.radio(BACKDROPS, background)
     ui.beside_boxed("Backdrop")
     flags = imgui.ColorEditFlags_.no_inputs | imgui.ColorEditFlags_.uint8
@@ -147,7 +144,6 @@ def compared_name(button: Button) -> str:
 
 
 def draw_overlays(viewer: Viewer) -> None:
-    """Draw the panel "Overlays"."""
     state = viewer.state
     for name, title in OVERLAY_TITLES.items():
         changed, shown = imgui.checkbox(title.capitalize(), name in state.preferences.overlays)
@@ -201,7 +197,6 @@ def draw_notes(viewer: Viewer) -> None:
 
 
 def draw_camera(viewer: Viewer) -> None:
-    """Draw the panel "Camera"."""
     state = viewer.state
     imgui.begin_disabled(state.view is None)
     if state.scene is not None and state.scene.cameras:

@@ -31,7 +31,6 @@ class Clip:
     far: float = math.inf
 
     def keeps(self, depths: Array) -> Array:
-        """(N,) bool, of (N,) camera z."""
         kept: Array = (depths > self.near) & (depths <= self.far)
         return kept
 
@@ -114,7 +113,6 @@ def why_undrawable(gaussians: Gaussians) -> str:
 
 
 def why_nothing(gaussians: Gaussians, camera: Camera) -> str:
-    """Return why an image shows nothing."""
     reason = why_undrawable(gaussians)
     if reason:
         return reason
@@ -281,7 +279,6 @@ class Pane:
 
     @property
     def row(self) -> DisplayRow:
-        """Row of its display."""
         return DISPLAYS[self.picture.display]
 
     @property
@@ -291,7 +288,6 @@ class Pane:
 
     @property
     def label(self) -> str:
-        """Name over the pane."""
         return self.row.label if self.level is None else f"{self.row.label}, {LEVELS[self.level]}"
 
 
@@ -318,7 +314,6 @@ class RenderRequest:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height of the image, pixels."""
         return self.width, self.camera.height
 
     @property
@@ -402,26 +397,20 @@ class Channel:
         return self.is_depth, id(self.values)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class RenderKey:
     """All that a projection of Gaussians depends on. Equal for the same scene, as an object, cut alike, and
     cameras that see the same."""
 
     scene: Scene  # as it is drawn
-    camera: Camera
+    camera: Camera = field(compare=False)  # compared by `pose`
     clip: Clip = UNCLIPPED
+    pose: tuple[object, ...] = field(init=False, repr=False)
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, RenderKey) and self.scene is other.scene and self._place() == other._place()
-
-    def __hash__(self) -> int:
-        return hash((id(self.scene), self._place()))
-
-    def _place(self) -> tuple[object, ...]:
-        return self.clip, _pose(self.camera)
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "pose", _pose(self.camera))
 
     def settings(self) -> RasterSettings:
-        """Image formation for it."""
         return image_formation(self.scene, self.camera, self.clip)
 
 
@@ -445,7 +434,6 @@ class Inputs:
         return RenderKey(self._scene[1], request.drawn_camera, request.clip)
 
     def channels(self, request: RenderRequest) -> list[Channel]:
-        """The further channel of each pane."""
         of = (request.scene, request.answers, request.detail.merged)
         if self._of != of:
             self._of, self._channels = of, {}
@@ -456,7 +444,6 @@ class Inputs:
         return [self._channels[of_pane] for of_pane in wanted]
 
     def forget(self) -> None:
-        """Hold nothing of the last request."""
         self._scene, self._of, self._channels = None, (), {}
 
 
