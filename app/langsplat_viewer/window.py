@@ -26,6 +26,7 @@ from langsplat_viewer.actions import (
     settings,
     viewpoint,
 )
+from langsplat_viewer.camera.controls import spanning
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.files.preferences import (
     FILE_NAME,
@@ -316,8 +317,9 @@ class Window:
                 viewpoint.open_at(viewer, camera)
         except InputError as error:
             viewer.say_error(str(error))
-        if request.orthographic is not None:
-            viewpoint.open_orthographic(viewer, request.orthographic)
+        span = request.orthographic
+        if span is not None:
+            viewpoint.move(viewer, lambda view: spanning(view, span))
         wanted = request.picture
         looks = replace(state.picture, heat_opacity=wanted.heat_opacity, dim=wanted.dim)
         settings.set_picture(viewer, replace(looks, heat_scale=wanted.heat_scale))

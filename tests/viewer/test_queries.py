@@ -14,8 +14,9 @@ from langsplat_core.scene import CANONICAL_PHRASES, Reading
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_viewer.actions import browsing, editing, queries, settings
 from langsplat_viewer.files.projects import QuerySet, SavedQuery, read_queries, write_queries
+from langsplat_viewer.marks import BINS
 from langsplat_viewer.output.headless import describe
-from langsplat_viewer.panels.search import BINS, hint, histogram
+from langsplat_viewer.panels.search import hint, histogram
 from langsplat_viewer.viewer import Services
 from tests.support.fakes import CENTRES, FakeEncoder, as_trained, axis, blob_scene, calibrated_for, language
 from tests.support.windowless import SCENES, ask, errors, load, open_scene, settle

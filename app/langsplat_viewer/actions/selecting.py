@@ -264,17 +264,6 @@ class Written:
     count: int  # Gaussians, or points
 
 
-def rows_of(marks: Marks, part: Part) -> Array:
-    """(N,) bool: what is selected, all else that was not deleted, or all that was not deleted."""
-    match part:
-        case "selection":
-            return marks.selected
-        case "rest":
-            return marks.kept & ~marks.selected
-        case _:
-            return marks.kept
-
-
 def export(
     viewer: Viewer,
     folder: Path,
@@ -292,7 +281,8 @@ def export(
     field = scene.language
     if field is not None and engine is not None:
         field = replace(field, taught=tuple(engine.taught.values()))
-    rows = np.flatnonzero(rows_of(marks, part))
+    parts = {"selection": marks.selected, "rest": marks.kept & ~marks.selected, "edited": marks.kept}
+    rows = np.flatnonzero(parts[part])
     if len(rows) == 0:
         viewer.say_error(f"the {part} holds no Gaussians: nothing to write")
         return

@@ -26,7 +26,6 @@ from langsplat_viewer.camera.controls import (
     from_side,
     holding_distance,
     orbit,
-    spanning,
     with_projection,
     zoom,
 )
@@ -176,15 +175,10 @@ def reset_view(viewer: Viewer) -> None:
     if view is None or extent is None:
         return
     if viewer.state.view is not None and viewer.state.view.orthographic:
-        view = with_projection(view, orthographic=True)
-        if _opens_framed(viewer):
+        view, scene = with_projection(view, orthographic=True), viewer.state.scene
+        if viewer.state.opening_camera is None and scene is not None and not scene.cameras:
             view = frame_all(view, extent, viewer.state.size)
     glide_to(viewer, view)
-
-
-def _opens_framed(viewer: Viewer) -> bool:
-    scene = viewer.state.scene
-    return viewer.state.opening_camera is None and scene is not None and not scene.cameras
 
 
 def frame_scene(viewer: Viewer) -> None:
@@ -216,13 +210,6 @@ def set_orthographic(viewer: Viewer, orthographic: bool) -> None:
 
 def toggle_orthographic(viewer: Viewer) -> None:
     set_orthographic(viewer, viewer.state.view is not None and not viewer.state.view.orthographic)
-
-
-def open_orthographic(viewer: Viewer, span: float) -> None:
-    """Look without perspective, `span` world units across the shorter side of the uncropped image."""
-    extent = viewer.state.extent
-    if extent is not None:
-        move(viewer, lambda view: spanning(view, span))
 
 
 def toggle_walking(viewer: Viewer) -> None:

@@ -4,7 +4,6 @@ import math
 from functools import lru_cache
 from typing import get_args
 
-import numpy as np
 from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
 
 from langsplat_core.arrays import Array
@@ -14,6 +13,7 @@ from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import no_field
 from langsplat_core.scene import CANONICAL_PHRASES, LEVELS
 from langsplat_viewer.actions import queries, viewpoint
+from langsplat_viewer.marks import counted
 from langsplat_viewer.panels import ui
 from langsplat_viewer.panels.overlays import bar_colours, draw_bar
 from langsplat_viewer.state import Query
@@ -78,7 +78,6 @@ def _offer_buttons(viewer: Viewer, title: str, phrases: tuple[str, ...]) -> None
 
 # The threshold of an answer: a histogram of its relevancies, and a slider over it.
 
-BINS = 64
 HISTOGRAM_EM = 3.0
 
 
@@ -110,13 +109,8 @@ def _cut(viewer: Viewer, query: Query, result: QueryResult) -> None:
 
 @lru_cache(maxsize=8)
 def histogram(result: QueryResult) -> tuple[float, float, Array]:
-    """Lowest and highest relevancy of an answer, and (BINS,) float32 log(1 + n) of how many Gaussians have
-    which."""
-    values = result.even[np.isfinite(result.even)]
-    low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
-    high = max(high, low + 1e-3)
-    counts, _ = np.histogram(values, BINS, (low, high))
-    return low, high, np.log1p(counts).astype(np.float32)
+    """The relevancies of an answer, as `marks.counted` has them."""
+    return counted(result.even, 1e-3)
 
 
 # The list of queries.
