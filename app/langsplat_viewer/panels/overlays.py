@@ -179,37 +179,45 @@ def draw_lines(viewer: Viewer, area: ui.Area) -> None:
     state = viewer.state
     if state.scene is None or state.view is None or state.extent is None:
         return
-    paint = imgui.get_background_draw_list()
-    for column, part in enumerate(area.columns(state.settings.split.columns)):
+    paint, metres = imgui.get_background_draw_list(), state.scene.metres_per_unit
+    least = overlays.LEAST_DEPTH * state.extent.radius  # from this camera z on lines are drawn
+    grid = None
+    if "grid" in state.preferences.overlays:
+        grid = overlays.ground_grid(state.extent, state.view.up, metres)
+    for part in area.columns(state.settings.split.columns):
         camera = state.view.camera(*part.size)
         paint.push_clip_rect(*part.corners, True)
-        if "grid" in state.preferences.overlays:
-            _grid(viewer, part, camera, is_named=column == 0)
+        if grid is not None:
+            _grid(grid, part, camera, least)
         if "cameras" in state.preferences.overlays:
-            _cameras(viewer, part, camera)
+            edges = overlays.frusta(state.scene.cameras, overlays.FRUSTUM_DEPTH * state.extent.radius)
+            _cameras(viewer, edges, part, camera, least)
         if "things" in state.preferences.overlays:  # after the lines, so that its words are readable
-            _things(viewer, part, camera)
-        _ruler(viewer, part, camera)
-        _notes(viewer, part, camera)
+            _things(viewer, part, camera, least)
+        _ruler(viewer, part, camera, least, metres)
+        _notes(viewer, part, camera, least)
         paint.pop_clip_rect()
-    _orthographic(viewer, area)
-    if (state.ruler.measures or state.pins_notes) and not imgui.get_io().want_capture_mouse:
-        cursors, measures = imgui.MouseCursor_, state.ruler.measures
-        imgui.set_mouse_cursor(cursors.resize_all if measures else cursors.hand)
-        if clicked(area):
-            mouse, act = imgui.get_io().mouse_pos, settings.measure_at if measures else projects.pin_at
-            act(viewer, *area.fraction(mouse.x, mouse.y))
-
-
-def _orthographic(viewer: Viewer, area: ui.Area) -> None:
-    view, scene = viewer.state.view, viewer.state.scene
-    if view is None or scene is None or not view.orthographic:
-        return
     line = imgui.get_text_line_height()
-    lines_below = 2 if "grid" in viewer.state.preferences.overlays else 1
-    span = overlays.length_text(view.span_in(*viewer.state.size), scene.metres_per_unit)
-    text = f"orthographic, {span} across the shorter side"
-    text_on_shade(text, area.left + 0.6 * line, area.top + area.height - 1.6 * lines_below * line, area)
+    left, foot = area.left + 0.6 * line, area.top + area.height
+    if grid is not None:
+        text_on_shade(f"grid {overlays.length_text(grid.spacing, metres)}", left, foot - 1.6 * line, area)
+    if state.view.orthographic:
+        span = overlays.length_text(state.view.span_in(*state.size), metres)
+        below = 1 if grid is None else 2  # lines
+        text_on_shade(f"orthographic, {span} across the shorter side", left, foot - 1.6 * below * line, area)
+    if not imgui.get_io().want_capture_mouse:
+        _take_click(viewer, area)
+
+
+def _take_click(viewer: Viewer, area: ui.Area) -> None:
+    """Set a point of the ruler, or pin a note, where the scene is clicked for that."""
+    cursors, measures = imgui.MouseCursor_, viewer.state.ruler.measures
+    if not (measures or viewer.state.pins_notes):
+        return
+    imgui.set_mouse_cursor(cursors.resize_all if measures else cursors.hand)
+    if clicked(area):
+        mouse, act = imgui.get_io().mouse_pos, settings.measure_at if measures else projects.pin_at
+        act(viewer, *area.fraction(mouse.x, mouse.y))
 
 
 def clicked(area: ui.Area) -> bool:
@@ -222,27 +230,19 @@ def clicked(area: ui.Area) -> bool:
     return abs(moved.x) + abs(moved.y) < STILL and 0 <= u <= 1 and 0 <= v <= 1
 
 
-def _least_depth(viewer: Viewer) -> float:
-    """Camera z from which on lines are drawn: a little before the eye."""
-    assert viewer.state.extent is not None
-    return overlays.LEAST_DEPTH * viewer.state.extent.radius
-
-
 def _lines(area: ui.Area, segments: Array, colour: tuple[float, float, float, float], thick: float) -> None:
     paint, packed = imgui.get_background_draw_list(), imgui.get_color_u32(colour)
     for (x0, y0), (x1, y1) in (segments + (area.left, area.top)).tolist():
         paint.add_line(ImVec2(x0, y0), ImVec2(x1, y1), packed, thick)
 
 
-def _cameras(viewer: Viewer, area: ui.Area, camera: Camera) -> None:
-    """Draw all but the one that the view looks through; a click on one stands there."""
+def _cameras(viewer: Viewer, edges: Array, area: ui.Area, camera: Camera, least: float) -> None:
+    """(C, 8, 2, 3) edges of all, but for the one that the view looks through; a click on one stands there."""
     state = viewer.state
     assert state.scene is not None
-    assert state.extent is not None
-    edges = overlays.frusta(state.scene.cameras, overlays.FRUSTUM_DEPTH * state.extent.radius)
-    away = np.linalg.norm(edges[:, 0, 0] - camera.position, axis=1) > _least_depth(viewer)
+    away = np.linalg.norm(edges[:, 0, 0] - camera.position, axis=1) > least
     edges = edges * away[:, None, None, None]  # all in one point, which is no line
-    segments, rows = overlays.clip_segments(camera, edges.reshape(-1, 2, 3), _least_depth(viewer))
+    segments, rows = overlays.clip_segments(camera, edges.reshape(-1, 2, 3), least)
     owners = rows // edges.shape[1]
     segments, owners = segments[away[owners]], owners[away[owners]]
     under = -1
@@ -261,7 +261,7 @@ def _cameras(viewer: Viewer, area: ui.Area, camera: Camera) -> None:
             viewpoint.go_to_camera(viewer, under)
 
 
-def _things(viewer: Viewer, area: ui.Area, camera: Camera) -> None:
+def _things(viewer: Viewer, area: ui.Area, camera: Camera, least: float) -> None:
     """A box around each thing that a query shown has found, and the phrase beside it."""
     named: list[Named] = []
     for query in viewer.state.shown():
@@ -270,7 +270,7 @@ def _things(viewer: Viewer, area: ui.Area, camera: Camera) -> None:
         red, green, blue = QUERY_COLOURS[query.slot]
         for number, thing in enumerate(query.things, start=1):
             edges = overlays.box_edges(thing.oriented.corners)
-            segments, _ = overlays.clip_segments(camera, edges, _least_depth(viewer))
+            segments, _ = overlays.clip_segments(camera, edges, least)
             _lines(area, segments, (0.0, 0.0, 0.0, 0.5), 3.0)
             _lines(area, segments, (red, green, blue, 1.0), 1.5)
             if len(segments):
@@ -298,32 +298,19 @@ def _names(named: list[Named], area: ui.Area) -> None:
         text_on_shade(name.text, area.left + label.x + edge, area.top + label.y + edge, area)
 
 
-def _grid(viewer: Viewer, area: ui.Area, camera: Camera, is_named: bool) -> None:
-    """Draw the grid on the ground, each line with its distance from the world's origin; name its spacing."""
-    state = viewer.state
-    assert state.scene is not None
-    assert state.extent is not None
-    assert state.view is not None
-    scale = state.scene.metres_per_unit
-    grid = overlays.ground_grid(state.extent, state.view.up, scale)
-    segments, _ = overlays.clip_segments(camera, grid.segments, _least_depth(viewer))
+def _grid(grid: overlays.Grid, area: ui.Area, camera: Camera, least: float) -> None:
+    """Draw the lines on the ground, each with its distance from the world's origin."""
+    segments, _ = overlays.clip_segments(camera, grid.segments, least)
     _lines(area, segments, GRID, 1.0)
     paint, packed = imgui.get_background_draw_list(), imgui.get_color_u32((*GRID[:3], 1.0))
     for text, point in grid.marks:
-        place = _place(camera, point, _least_depth(viewer))
+        place = _place(camera, point, least)
         if place is not None:
             paint.add_text(ImVec2(area.left + place[0] + 3, area.top + place[1]), packed, text)
-    if not is_named:
-        return
-    spacing = overlays.length_text(grid.spacing, scale)
-    line = imgui.get_text_line_height()
-    text_on_shade(f"grid {spacing}", area.left + 0.6 * line, area.top + area.height - 1.6 * line, area)
 
 
-def _ruler(viewer: Viewer, area: ui.Area, camera: Camera) -> None:
-    ruler, scene = viewer.state.ruler, viewer.state.scene
-    assert scene is not None
-    paint, least = imgui.get_background_draw_list(), _least_depth(viewer)
+def _ruler(viewer: Viewer, area: ui.Area, camera: Camera, least: float, metres: float | None) -> None:
+    ruler, paint = viewer.state.ruler, imgui.get_background_draw_list()
     for point in ruler.points:
         place = _place(camera, np.array(point), least)
         if place is not None:
@@ -337,15 +324,15 @@ def _ruler(viewer: Viewer, area: ui.Area, camera: Camera) -> None:
     _lines(area, segments, RULER, 2.0)
     for start, end in segments:
         x, y = (start + end) / 2
-        text = overlays.length_text(ruler.length, scene.metres_per_unit)
+        text = overlays.length_text(ruler.length, metres)
         text_on_shade(text, area.left + float(x) + 8, area.top + float(y) + 8, area)
 
 
-def _notes(viewer: Viewer, area: ui.Area, camera: Camera) -> None:
+def _notes(viewer: Viewer, area: ui.Area, camera: Camera, least: float) -> None:
     """The notes, at the places that they are pinned to."""
     named, paint = [], imgui.get_background_draw_list()
     for note in viewer.state.notes:
-        place = _place(camera, np.array(note.at), _least_depth(viewer))
+        place = _place(camera, np.array(note.at), least)
         if place is not None:
             middle = ImVec2(area.left + place[0], area.top + place[1])
             paint.add_circle_filled(middle, 4.0, imgui.get_color_u32(NOTE))
