@@ -251,7 +251,7 @@ WINDOWS: dict[str, tuple[tuple[str, ...], Act]] = {
     "orthographic.jpg": (("teddy bear",), _orthographic),
     "film.jpg": (("teddy bear",), _film),
     "timing.jpg": (("teddy bear",), _timed),
-    "browsing.jpg": (("teddy bear",), _trained),
+    "training.jpg": (("teddy bear",), _trained),
 }
 
 

@@ -34,7 +34,7 @@ class ViewerCommand(ViewerOptions):
             self._window(path)
 
     def _without_window(self, path: Path) -> None:
-        from langsplat_viewer.output.headless import check_options, draw_film, draw_image
+        from langsplat_viewer.output import check_options, draw_film, draw_image
 
         check_options(self)
         bars: AbstractContextManager[Progress] = nullcontext(silent)

@@ -12,10 +12,10 @@ from PIL import Image
 from langsplat_core.config import PictureConfig
 from langsplat_core.io.cameras import read_cameras
 from langsplat_core.io.scenes import save_scene
+from langsplat_viewer import output
 from langsplat_viewer.actions import browsing, editing, filming, queries, settings, viewpoint
 from langsplat_viewer.camera.controls import orbit, zoom
 from langsplat_viewer.files.projects import read_flight
-from langsplat_viewer.output import film
 from langsplat_viewer.rendering.renderer import render_image
 from langsplat_viewer.rendering.request import Clip, Splats
 from langsplat_viewer.viewer import Viewer
@@ -43,7 +43,7 @@ def times(viewer: Viewer) -> list[float]:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(film, "find_ffmpeg", lambda: None)
+    monkeypatch.setattr(output, "find_ffmpeg", lambda: None)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -13,12 +13,12 @@ from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Scene
+from langsplat_viewer import output
 from langsplat_viewer.actions import filming, opening, queries, selecting, settings, viewpoint
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.commands import BUTTONS, COMMANDS, OVERLAY_TITLES, matching
 from langsplat_viewer.files.preferences import FILE_NAME, load_preferences, save_preferences
 from langsplat_viewer.marks import Marks
-from langsplat_viewer.output import film
 from langsplat_viewer.panels.overlays import STEPS, bar_colours
 from langsplat_viewer.panels.view import compared_name
 from langsplat_viewer.rendering.renderer import ArrayRenderer, GlRenderer
@@ -92,7 +92,7 @@ def on_screen(canvas: Canvas, state: ViewerState) -> np.ndarray:
 @pytest.mark.parametrize("backend", ["cpu", "opengl"])
 def test_screen_file_sized_image_film_and_reference_agree(gl, opened, tmp_path, monkeypatch, mode, backend):
     """Nothing that is hidden or deleted comes back, in whatever way an image is made."""
-    monkeypatch.setattr(film, "find_ffmpeg", lambda: None)
+    monkeypatch.setattr(output, "find_ffmpeg", lambda: None)
     edit_everything(opened, mode)
     state, renderer = opened.state, GlRenderer(gl, backend, "single")
     opened.surface = canvas = Canvas(gl, renderer)
@@ -118,7 +118,7 @@ def test_screen_file_sized_image_film_and_reference_agree(gl, opened, tmp_path, 
     opened.state.record.fps = 2.0
     filming.save_film(opened, tmp_path)
     recorded(opened)
-    images["film"] = image(tmp_path / "blobs-film-001" / film.frame_name(0))
+    images["film"] = image(tmp_path / "blobs-film-001" / output.frame_name(0))
     expected = ArrayRenderer(ReferenceRasterizer()).read(request).astype(int)
     bare = ArrayRenderer(ReferenceRasterizer()).read(replace(request, scene=edited_scene(state.scene)))
     assert np.abs(bare - expected).max() > 60  # the edits are seen

@@ -32,17 +32,17 @@ from langsplat_viewer.camera.flight import (
 )
 from langsplat_viewer.files.projects import MOST_KEYFRAMES, PATHS, read_flight, write_flight
 from langsplat_viewer.options import MAX_SIDE, say_compiling
-from langsplat_viewer.output.film import (
+from langsplat_viewer.output import (
     VIDEO,
     Shot,
     cameras_of,
     check_film,
+    draw_something,
     find_ffmpeg,
     free_name,
     make_film,
     save_png,
 )
-from langsplat_viewer.output.headless import draw_something
 from langsplat_viewer.rendering.renderer import open_renderer
 from langsplat_viewer.rendering.request import Splats
 from langsplat_viewer.state import SPACING, ViewerState, flight_of

@@ -29,7 +29,7 @@ from langsplat_viewer.files.projects import (
 )
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.marks import Pair, unpack
-from langsplat_viewer.output.film import free_name
+from langsplat_viewer.output import free_name
 from langsplat_viewer.state import SLOTS, Query, Ruler, ViewerState
 from langsplat_viewer.viewer import Viewer, Visit, now, remember, visit_of
 

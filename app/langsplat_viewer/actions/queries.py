@@ -24,7 +24,7 @@ from langsplat_viewer.actions.selecting import has_selection
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.files.projects import QUERIES, QuerySet, SavedQuery, read_queries, write_queries
 from langsplat_viewer.jobs import one_line
-from langsplat_viewer.output.film import free_name
+from langsplat_viewer.output import free_name
 from langsplat_viewer.state import SLOTS, EvidenceSheet, Query, ViewerState
 from langsplat_viewer.viewer import Viewer, let_go, remember
 

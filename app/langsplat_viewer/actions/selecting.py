@@ -23,7 +23,7 @@ from langsplat_core.query.selection import at_point, grow, of_rows, shrink
 from langsplat_core.scene import LEVELS, Scene
 from langsplat_viewer import marks
 from langsplat_viewer.marks import Drawn, Leaving, Marks, Measure, Mode, Stroke, Tool
-from langsplat_viewer.output.film import free_name
+from langsplat_viewer.output import free_name
 from langsplat_viewer.rendering.request import UNCLIPPED
 from langsplat_viewer.state import Query
 from langsplat_viewer.viewer import Viewer, remember
