@@ -305,8 +305,7 @@ class Drawn:
 
     @property
     def radius(self) -> float:
-        """Radius of a sphere, or half the side of a box: how far the drag leads from its centre, world
-        units."""
+        """Radius of a sphere, half the side of a box: how far the drag leads from its centre, world units."""
         first, last = self.pixels[[0, -1]]
         if np.linalg.norm(last - first) < CLICK * self.camera.height:
             return self.reach

@@ -178,8 +178,7 @@ def camera_file(choice: str) -> Camera | None:
 
 
 def chosen_camera(scene: Scene, choice: str) -> Camera | None:
-    """The camera that `--camera` names: of a file, or a training camera by index from 0; None without a
-    choice. Raises InputError."""
+    """The camera that `--camera` names, of a file or by its index; None for no choice. Raises InputError."""
     if not choice:
         return None
     of_file = camera_file(choice)

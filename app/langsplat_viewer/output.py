@@ -57,8 +57,7 @@ from langsplat_viewer.viewer import Services
 
 
 def free_name(folder: Path, stem: str, suffix: str, companions: tuple[str, ...] = ()) -> Path:
-    """The first of stem-001, stem-002, ... that does not exist in `folder`, nor with the suffixes of files
-    that are written beside it."""
+    """The first of stem-001, stem-002, ... that is free in `folder`, with all `companions` as endings."""
     for number in count(1):
         name = f"{stem}-{number:03d}"
         if not any((folder / f"{name}{ending}").exists() for ending in (suffix, *companions)):
@@ -361,8 +360,7 @@ def check_options(options: ViewerOptions) -> Path:
 def draw_image(
     options: ViewerOptions, path: Path, services: Services, progress: Progress = silent
 ) -> list[str]:
-    """Draw the scene of `path` and save the image; returns the lines to print: the image's, then one for each
-    query."""
+    """Draw the scene and save the image; returns the lines to print: the image's, then each query's."""
     out, prepared = check_options(options), prepare(options, path, services, progress)
     progress("drawing", 0.8)
     say_drawing(options.backend, progress)

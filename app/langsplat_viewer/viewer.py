@@ -71,8 +71,7 @@ class TrainingProgress:
 
 
 def command(request: TrainingRequest) -> list[str]:
-    """The command line of a request, for the interpreter that runs this, or the program beside it that a
-    one-folder build has."""
+    """The command line of a request, for this interpreter or the program beside a one-folder build."""
     program = [sys.executable, "-m", "langsplat_core"]
     if getattr(sys, "frozen", False):
         program = [str(Path(sys.executable).with_stem("langsplat"))]
@@ -304,8 +303,7 @@ class Viewer:
         return path
 
     def take_results(self) -> None:
-        """Hand over what the worker and the recorder have finished; the one place where results of other
-        threads arrive. Call once per frame."""
+        """Hand over what other threads have finished, which arrives nowhere else. Call once per frame."""
         self.worker.poll()
         self.recorder.poll()
 

@@ -30,8 +30,7 @@ def next_gizmo(viewer: Viewer) -> None:
 
 
 def pivot(viewer: Viewer) -> Array | None:
-    """(3,) middle of what is transformed, world units: the selection, else the whole scene. None without a
-    scene."""
+    """(3,) middle of what is transformed, world units: the selection, else the scene; None without one."""
     state = viewer.state
     if state.scene is None or state.extent is None:
         return None
@@ -51,8 +50,7 @@ def _move_of(viewer: Viewer, to: Similarity) -> Move:
 
 
 def preview(viewer: Viewer, to: Similarity) -> None:
-    """Show the selection, or without one the scene, transformed, until `transform`. Raises InputError where
-    that leads too far."""
+    """Show what `transform` would do, until it does. Raises InputError where that leads too far."""
     if viewer.state.scene is not None:
         move = _move_of(viewer, to)
         viewer.state.moving = move, move.applied(viewer.state.scene)

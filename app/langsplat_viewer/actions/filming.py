@@ -50,8 +50,7 @@ from langsplat_viewer.viewer import Viewer, remember
 
 
 def save_picture(viewer: Viewer, folder: Path = Path()) -> Path | None:
-    """Save the scene as shown, without its background if that was chosen, to a new PNG in `folder`;
-    returns its path, None if that failed."""
+    """Save the scene as shown to a new PNG in `folder`; returns its path, None if that failed."""
     state = viewer.state
     if viewer.surface is None or state.scene is None or state.view is None:
         viewer.say_error("open a scene first, then save a picture of it")
@@ -69,8 +68,7 @@ def save_picture(viewer: Viewer, folder: Path = Path()) -> Path | None:
 
 
 def save_view(viewer: Viewer, folder: Path = Path()) -> Path | None:
-    """Save the current camera, with perspective, to a new file that `--camera` reads; returns its path, None
-    if that failed."""
+    """Save the camera, in perspective, to a new file that `--camera` reads; its path, None if that failed."""
     state = viewer.state
     if state.view is None:
         viewer.say_error("open a scene first, then save a view of it")

@@ -184,8 +184,7 @@ def return_to(viewer: Viewer, visit: Visit) -> None:
 
 
 def reload(viewer: Viewer) -> None:
-    """Read the scene's files again and stay where one is; if that fails the reason is said and the scene is
-    kept."""
+    """Read the scene's files again and stay where one is; where that fails the scene is kept."""
     state = viewer.state
     path, shown = state.path, state.scene
     if path is None or shown is None:
@@ -251,8 +250,7 @@ SAME = 1e-6  # of the scene's radius, and of a rotation: nearer is the same plac
 
 
 def standing_at(state: ViewerState) -> Camera | None:
-    """The training camera whose pose the view has, whatever its field of view; None elsewhere, and without
-    perspective."""
+    """The training camera whose pose the view has; None elsewhere, and without perspective."""
     scene, view, index = state.scene, state.view, state.camera_index
     if (
         scene is None

@@ -146,8 +146,7 @@ def _fits(size: tuple[int, int], camera: Camera) -> bool:
 
 
 def corners(camera: Camera, shown: Camera) -> tuple[float, float, float, float]:
-    """Left, top, right and bottom of a camera's photograph in the image of another with the same pose, in
-    pixels of the latter."""
+    """Left, top, right, bottom of a photograph in the image of another camera of the same pose, pixels."""
     x, y = shown.fx / camera.fx, shown.fy / camera.fy
     left, top = shown.cx - camera.cx * x, shown.cy - camera.cy * y
     return left, top, left + camera.width * x, top + camera.height * y

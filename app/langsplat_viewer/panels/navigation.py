@@ -231,8 +231,7 @@ def handle(viewer: Viewer, area: ui.Area) -> None:
 
 
 def _pixel(area: ui.Area) -> tuple[int, int] | None:
-    """Return the mouse's place in the scene's area, pixels; None where a panel has it, or a button is
-    held."""
+    """The mouse's place in the scene's area, pixels; None where a panel has it or a button is held."""
     io = imgui.get_io()
     if io.want_capture_mouse or any(imgui.is_mouse_down(button) for button in range(3)):
         return None

@@ -154,8 +154,7 @@ def beside_button(label: str) -> float:
 
 
 def beside(label: str, more: float = 0.0) -> None:
-    """Go on in the row of the last widget, unless the next one, with this label and `more` window units, does
-    not fit there."""
+    """Go on in the last row, unless a widget with this label and `more` window units does not fit there."""
     imgui.same_line()
     if imgui.get_content_region_avail().x < button_width(label) + more:
         imgui.new_line()

@@ -72,8 +72,7 @@ def open_renderer(backend: Backend = "auto") -> Iterator["ArrayRenderer | GlRend
 
 
 def render_image(request: RenderRequest, backend: Backend = "auto") -> Array:
-    """(H, W, 3) uint8 image, row 0 on top, (H, W, 4) of a transparent one. Raises what
-    `open_renderer` does."""
+    """(H, W, 3) uint8 image, row 0 on top, (H, W, 4) of a transparent one. Raises as `open_renderer`."""
     with open_renderer(backend) as renderer:
         return renderer.read(request)
 
@@ -504,8 +503,7 @@ class GlRenderer:
         return depth if alpha > PICK_ALPHA and depth > 0 else None
 
     def depth_map(self, request: RenderRequest) -> Array:
-        """(H, W) camera z of the surface in every pixel of a pane, world units, 0 where nothing stops half
-        the light."""
+        """(H, W) camera z of the surface in a pane, world units, 0 where nothing stops half the light."""
         self._held = None  # the rasterizer draws, and its layers hold until then
         return self._source.depth_map(self._inputs.key(request))
 

@@ -161,8 +161,7 @@ class Split:
         return u * self.columns - min(max(int(u * self.columns), 0), self.columns - 1)
 
     def joined(self, images: Sequence[Array], width: int) -> Array:
-        """(H, W, C) images of all panes -> one of `width` pixels; pixels that columns leave over repeat the
-        last one."""
+        """(H, W, C) images of all panes -> one of `width` pixels; pixels left over repeat the last one."""
         if self.mode in ("wipe", "scenes") and len(images) > 1:
             line = round(self.at * width)
             return np.concatenate([images[0][:, :line], images[1][:, line:]], 1)
