@@ -10,7 +10,7 @@ from langsplat_viewer.actions.viewpoint import glide_to
 from langsplat_viewer.camera.overlays import facing
 from langsplat_viewer.files.preferences import SCALES, Theme
 from langsplat_viewer.rendering.request import AT_RANGE, MOST_DEGREE, SIZE_RANGE, Clip, Splats, Split
-from langsplat_viewer.state import OVERLAYS, Overlay, Ruler, ViewSettings
+from langsplat_viewer.state import OVERLAYS, Overlay, Recording, Ruler, Timing, ViewerState, ViewSettings
 from langsplat_viewer.viewer import Viewer, remember
 
 
@@ -143,6 +143,14 @@ def _set(viewer: Viewer, settings: ViewSettings, setting: str = "") -> None:
 
 
 # What is shown and how; which parts of the window are.
+
+
+def put(part: ViewerState | Recording | Timing, **values: object) -> None:
+    """Take what was typed or switched, where nothing follows from it: fields of the state, or of a part of it,
+    by name. Panels write nothing themselves."""
+    for name, value in values.items():
+        getattr(part, name)  # AttributeError where it has none
+        setattr(part, name, value)
 
 
 def set_display(viewer: Viewer, display: Display, latent_level: int | None = None) -> None:

@@ -81,7 +81,8 @@ def draw_palette(viewer: Viewer) -> None:
     if imgui.is_window_appearing():
         imgui.set_keyboard_focus_here()
     entered, typed = ui.box("##command", "what to do", viewer.state.palette_typed)
-    typing, viewer.state.palette_typed = imgui.is_item_active(), typed
+    typing = imgui.is_item_active()
+    settings.put(viewer.state, palette_typed=typed)
     found = matching(typed, viewer.state.preferences.recent)
     chosen = found[0] if entered and found else _clicked(found, typing)
     left = not imgui.is_window_focused(imgui.FocusedFlags_.root_and_child_windows)
@@ -147,7 +148,7 @@ def draw_help(viewer: Viewer) -> None:
     imgui.set_next_window_pos(centre, imgui.Cond_.always, ImVec2(0.5, 0.5))
     imgui.set_next_window_bg_alpha(1.0)
     _, still_open = imgui.begin("Help", True, flags)
-    viewer.state.show_help = bool(still_open)
+    settings.put(viewer.state, show_help=bool(still_open))
     imgui.text_disabled(f"LangSplat viewer {__version__}; documentation: docs/README.md of its source")
     if imgui.begin_tab_bar("pages"):
         keys = [(", ".join(command.keys), command.does) for command in COMMANDS if command.keys]
@@ -205,7 +206,7 @@ def figures(viewer: Viewer) -> str:
 
 def draw_timing(viewer: Viewer) -> None:
     """Draw the panel "Timing": medians of the last images, memory, and a comparison."""
-    viewer.state.timing.wanted = True
+    settings.put(viewer.state.timing, wanted=True)
     rows = [(title, f"{milliseconds:.1f} ms") for title, milliseconds in viewer.state.timing.medians()]
     memory = memory_bytes()
     if memory is not None:
@@ -313,7 +314,7 @@ def show_wanted(viewer: Viewer) -> None:
     titles = viewer.state.shows_panels
     for window in docking.dockable_windows if any(panel.title in titles for panel in PANELS) else ():
         window.is_visible = window.label in titles
-    viewer.state.shows_panels = ()
+    settings.put(viewer.state, shows_panels=())
     docking.layout_reset |= settings.take_panel_reset(viewer)
     if title:
         docking.dockable_window_of_name(title).is_visible = True

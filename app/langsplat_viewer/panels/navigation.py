@@ -11,7 +11,7 @@ from functools import cache
 
 from imgui_bundle import imgui
 
-from langsplat_viewer.actions import viewpoint
+from langsplat_viewer.actions import settings, viewpoint
 from langsplat_viewer.camera import controls
 from langsplat_viewer.commands import COMMANDS, Command
 from langsplat_viewer.panels import select, ui
@@ -205,7 +205,7 @@ def _pressed(wanted: Chord, command: Command, typing: bool, muted: bool) -> bool
 def muted_until_clicked(viewer: Viewer) -> None:
     """Letters are keys again once something is clicked; to be called before the panels are drawn."""
     if imgui.is_mouse_clicked(imgui.MouseButton_.left):
-        viewer.state.letters_muted = False
+        settings.put(viewer.state, letters_muted=False)
 
 
 # Mouse and held keys over the scene.

@@ -137,7 +137,7 @@ def draw_evidence(viewer: Viewer, picture: ui.Picture) -> None:
     imgui.image(imgui.ImTextureRef(texture.glo), ImVec2(width, width * texture.height / texture.width))
     imgui.end()
     if not still_open:
-        viewer.state.evidence = None
+        settings.put(viewer.state, evidence=None)
 
 
 def draw_photograph(viewer: Viewer, area: ui.Area, picture: ui.Picture) -> None:

@@ -101,7 +101,7 @@ def draw_browser(viewer: Viewer) -> None:
         elif has_several(listing) and imgui.button("Open all scenes here"):
             browsing.open_all(viewer)
     if not stays or imgui.is_key_pressed(imgui.Key.escape):
-        viewer.state.browser = None
+        settings.put(viewer.state, browser=None)
     if viewer.state.browser is None:
         imgui.close_current_popup()
     imgui.end_popup()
@@ -124,7 +124,8 @@ def _path_box(viewer: Viewer) -> None:
         imgui.set_keyboard_focus_here()
     picks = viewer.state.picks_folder
     hint = "path of a folder" if picks else "path of a scene or folder, or drop files onto the window"
-    entered, viewer.state.path_typed = ui.box_with_button("##path", hint, viewer.state.path_typed, "Open")
+    entered, typed = ui.box_with_button("##path", hint, viewer.state.path_typed, "Open")
+    settings.put(viewer.state, path_typed=typed)
     if entered:
         browsing.open_typed(viewer)
 
@@ -300,7 +301,7 @@ def _form(viewer: Viewer) -> None:
     form = replace(form, out=_text_box("Scene", "scene.ply", form.out))
     form = replace(form, encoder=_text_box("Encoder", '"demo", or a folder or hub id of CLIP', form.encoder))
     preset = ui.radio({name: name for name in PRESETS}, form.preset, PRESETS)
-    viewer.state.training_form = replace(form, preset=preset)
+    settings.put(viewer.state, training_form=replace(form, preset=preset))
     if imgui.button("Train"):
         browsing.start_training(viewer)
     ui.small_wrapped("An interrupted training continues where it stopped.", ui.muted())
@@ -364,7 +365,7 @@ def draw_library(viewer: Viewer) -> None:
     ui.tip(name)
     hint = "what to look for in all of them"
     entered, typed = ui.box("##library", hint, viewer.state.library_typed)
-    viewer.state.library_typed = typed
+    settings.put(viewer.state, library_typed=typed)
     if entered:
         browsing.ask_library(viewer, typed)
     ui.small_wrapped(view.said, ui.muted())

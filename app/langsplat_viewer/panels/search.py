@@ -12,7 +12,7 @@ from langsplat_core.display.displays import QUERY_COLOURS, STRENGTH, painted
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import no_field
 from langsplat_core.scene import CANONICAL_PHRASES, LEVELS
-from langsplat_viewer.actions import queries, viewpoint
+from langsplat_viewer.actions import queries, settings, viewpoint
 from langsplat_viewer.marks import counted
 from langsplat_viewer.panels import ui
 from langsplat_viewer.panels.overlays import bar_colours, draw_bar
@@ -42,9 +42,9 @@ def _box(viewer: Viewer) -> None:
         data.insert_chars(0, text)
         return 0
 
-    entered, viewer.state.typed = imgui.input_text_with_hint(
-        "##phrase", hint(viewer), viewer.state.typed, flags, recalled
-    )
+    typed = viewer.state.typed
+    entered, typed = imgui.input_text_with_hint("##phrase", hint(viewer), typed, flags, recalled)
+    settings.put(viewer.state, typed=typed)
     imgui.same_line()
     if imgui.button("Search") or entered:
         queries.ask_typed(viewer)
@@ -269,7 +269,7 @@ def draw(viewer: Viewer) -> None:
     imgui.end_group()
     hovered = imgui.is_item_hovered(imgui.HoveredFlags_.allow_when_disabled)
     if scene is None and hovered and imgui.is_mouse_clicked(imgui.MouseButton_.left):
-        viewer.state.letters_muted = True  # what is typed now was meant for the box
+        settings.put(viewer.state, letters_muted=True)  # what is typed now was meant for the box
     _level(viewer)
     imgui.end_disabled()
     if viewer.engine is not None:
@@ -288,9 +288,10 @@ def _canonical(viewer: Viewer) -> None:
     state = viewer.state
     ui.small_wrapped("a place is relevant where it is nearer to the phrase than to all of these", ui.muted())
     hint = ", ".join(state.canonical or CANONICAL_PHRASES)
-    entered, state.canonical_typed = ui.box("##canonical", hint, state.canonical_typed)
+    entered, typed = ui.box("##canonical", hint, state.canonical_typed)
+    settings.put(state, canonical_typed=typed)
     if entered:
-        queries.set_canonical(viewer, state.canonical_typed)
+        queries.set_canonical(viewer, typed)
     if state.canonical and imgui.button("The scene's own"):
         queries.set_canonical(viewer, "")
 

@@ -14,7 +14,7 @@ from langsplat_core.errors import LangSplatError
 from langsplat_core.scene import Camera
 from langsplat_core.scene.transform import Similarity, moving, scaling, similarity
 from langsplat_viewer import marks
-from langsplat_viewer.actions import editing, queries, selecting
+from langsplat_viewer.actions import editing, queries, selecting, settings
 from langsplat_viewer.commands import with_key
 from langsplat_viewer.marks import BRUSHES, MODES, REACHES, TOOLS, Marks, Mode, Tool
 from langsplat_viewer.panels import ui
@@ -302,7 +302,8 @@ def draw_transform(viewer: Viewer) -> None:
     chosen = int(state.selection.marks.selected.sum())
     what = f"{chosen:,} selected Gaussians" if chosen else "The whole scene, with its cameras"
     ui.small_wrapped(what, ui.muted())
-    viewer.state.edit_form = _numbers(replace(state.edit_form, gizmo=ui.radio(GIZMOS, state.edit_form.gizmo)))
+    form = replace(state.edit_form, gizmo=ui.radio(GIZMOS, state.edit_form.gizmo))
+    settings.put(state, edit_form=_numbers(form))
     if ui.button("Apply", "Scale and rotate about the middle of what is transformed, then move"):
         editing.apply_form(viewer)
     imgui.separator()

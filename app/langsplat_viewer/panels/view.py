@@ -214,11 +214,12 @@ def draw_camera(viewer: Viewer) -> None:
     if state.view is not None:
         _projection(viewer, state.view)
     _cuts(viewer)
-    state.fly_speed = ui.slider("Fly speed", state.fly_speed, (0.05, 4.0), logarithmic=True)
-    _, state.walks = imgui.checkbox("Walk", state.walks)
+    speed = ui.slider("Fly speed", state.fly_speed, (0.05, 4.0), logarithmic=True)
+    _, walks = imgui.checkbox("Walk", state.walks)
     ui.tip("W A S D keep the height of the eye")
     ui.beside_boxed("Coarse while moving")
-    _, state.coarse_while_moving = imgui.checkbox("Coarse while moving", state.coarse_while_moving)
+    _, coarse = imgui.checkbox("Coarse while moving", state.coarse_while_moving)
+    settings.put(state, fly_speed=speed, walks=walks, coarse_while_moving=coarse)
     ui.tip("Draw fewer pixels and merged Gaussians while the camera moves, where drawing is slow")
     imgui.end_disabled()
 
@@ -322,7 +323,7 @@ def _play(viewer: Viewer) -> None:
         viewpoint.scrub(viewer, at)
     imgui.end_disabled()
     imgui.same_line()
-    _, record.loops = imgui.checkbox("Loop", record.loops)
+    settings.put(record, loops=imgui.checkbox("Loop", record.loops)[1])
 
 
 def _duration(viewer: Viewer) -> None:
@@ -367,7 +368,8 @@ def _keyframes(viewer: Viewer) -> None:
     imgui.end_child()
     _chosen(viewer, record.chosen)
     ui.leave_room("", NUMBER_EM + 2)
-    _, record.path_typed = imgui.input_text_with_hint("##path file", "file.path.json", record.path_typed)
+    _, typed = imgui.input_text_with_hint("##path file", "file.path.json", record.path_typed)
+    settings.put(record, path_typed=typed)
     if ui.next_button("Save path"):
         filming.save_path(viewer)
     if ui.next_button("Load"):
@@ -397,11 +399,12 @@ def _films(viewer: Viewer) -> None:
     if imgui.begin_combo("fps", f"{record.fps:g}"):
         for fps in FPS_CHOICES:
             if imgui.selectable(f"{fps:g}", fps == record.fps)[0]:
-                record.fps = fps
+                settings.put(record, fps=fps)
         imgui.end_combo()
     imgui.set_next_item_width(-1)
     hint = "film.mp4, .webp, .gif or a folder; empty: a new name"
-    _, record.film_typed = imgui.input_text_with_hint("##film", hint, record.film_typed)
+    _, typed = imgui.input_text_with_hint("##film", hint, record.film_typed)
+    settings.put(record, film_typed=typed)
     work = viewer.recorder.current
     if work is not None:
         if ui.stoppable(*work, tag="film"):
@@ -423,7 +426,8 @@ def draw_bookmarks(viewer: Viewer) -> None:
     state = viewer.state
     imgui.begin_disabled(state.view is None)
     hint = "name of this view"
-    entered, state.bookmark_typed = ui.box_with_button("##bookmark", hint, state.bookmark_typed, "Keep")
+    entered, typed = ui.box_with_button("##bookmark", hint, state.bookmark_typed, "Keep")
+    settings.put(state, bookmark_typed=typed)
     if entered:
         viewpoint.add_bookmark(viewer, state.bookmark_typed)
     imgui.end_disabled()
