@@ -146,7 +146,7 @@ def _set(viewer: Viewer, settings: ViewSettings, setting: str = "") -> None:
 
 
 def put(part: ViewerState | Recording | Timing, **values: object) -> None:
-    """Take what was typed or switched, where nothing follows from it: fields of the state, or of a part of it,
+    """Take what was typed or switched, where nothing follows from it: fields of the state or a part of it,
     by name. Panels write nothing themselves."""
     for name, value in values.items():
         getattr(part, name)  # AttributeError where it has none
