@@ -27,7 +27,7 @@ LAYERS = [
     ["langsplat_viewer.rendering"],
     ["langsplat_viewer.marks"],
     ["langsplat_viewer.camera"],
-    ["langsplat_viewer.jobs", "langsplat_viewer.fonts"],
+    ["langsplat_viewer.jobs"],
     ["langsplat_core.__main__"],
     ["langsplat_core.cli"],
     ["langsplat_core.bench"],

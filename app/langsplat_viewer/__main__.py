@@ -4,7 +4,6 @@ from langsplat_core.errors import end_in_a_line
 
 
 def entry() -> None:
-    """The `langsplat-viewer` console script."""
     end_in_a_line("langsplat-viewer")
     from langsplat_viewer.program import entry as run
 
