@@ -6,6 +6,7 @@ this process, however that ends, and at once where the work is cancelled.
 """
 
 import contextlib
+import ctypes
 import logging
 import os
 import pickle
@@ -21,6 +22,7 @@ from langsplat_core.errors import printable_line
 from langsplat_core.progress import Progress, Report
 
 SAID = 20  # last lines of standard error that are kept
+_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of prctl(2): where who started this process ends
 _SERVE = "from langsplat_core.io.apart import serve; serve()"
 
 log = logging.getLogger("langsplat")
@@ -115,6 +117,8 @@ def serve() -> None:
     log.setLevel(level)
     log.propagate = False
     threading.Thread(target=_end_with, args=(given,), daemon=True).start()
+    if sys.platform == "linux":  # the thread waits for native code that keeps the interpreter to itself
+        ctypes.CDLL(None).prctl(_DEATH_SIGNAL, signal.SIGKILL)
     progress = Progress(lambda at: send("progress", (at.stage, at.fraction, at.note, dict(at.metrics))))
     try:
         send("result", function(*arguments, progress))

@@ -1,5 +1,6 @@
 """Functions in a process of their own: what comes back of them, and that they never outlive who asked."""
 
+import ctypes
 import logging
 import os
 import signal
@@ -38,6 +39,13 @@ def wait(pid: Path, progress: Progress) -> None:
     pid.write_text(str(os.getpid()))
     progress("waiting", 0.0)
     time.sleep(600)
+
+
+def hold(pid: Path, progress: Progress) -> None:
+    """As native code that keeps the interpreter to itself."""
+    pid.write_text(str(os.getpid()))
+    progress("waiting", 0.0)
+    ctypes.PyDLL(None).sleep(600)
 
 
 def is_alive(pid: int) -> bool:
@@ -96,12 +104,13 @@ def test_what_is_cancelled_ends_at_once(tmp_path: Path) -> None:
     assert not is_alive(int((tmp_path / "pid").read_text()))
 
 
-@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
-def test_it_ends_with_who_asked(tmp_path: Path) -> None:
+@pytest.mark.skipif(sys.platform != "linux", reason="needs /proc, and prctl(2) for native code")
+@pytest.mark.parametrize("busy", ["wait", "hold"])
+def test_it_ends_with_who_asked(busy: str, tmp_path: Path) -> None:
     """Killed without a chance to tell."""
     code = (
-        "import sys, pathlib; from tests.io.test_apart import apart, silent, wait;"
-        "apart.run(wait, pathlib.Path(sys.argv[1]), progress=silent)"
+        f"import sys, pathlib; from tests.io.test_apart import apart, silent, {busy};"
+        f"apart.run({busy}, pathlib.Path(sys.argv[1]), progress=silent)"
     )
     pid = tmp_path / "pid"
     with subprocess.Popen([sys.executable, "-c", code, str(pid)]) as process:
