@@ -1,6 +1,7 @@
 """A viewer without a window: a fake picture, fake files, and frames on demand."""
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -88,10 +89,21 @@ def settle(viewer: Viewer, seconds: float = 120.0) -> None:
     viewpoint.tick(viewer, 0.0)
 
 
+def act(action: Callable[..., object], viewer: Viewer, *arguments: object, **options: object) -> None:
+    """Do something, and wait until the worker has done what that began."""
+    action(viewer, *arguments, **options)
+    settle(viewer)
+
+
+def go(action: Callable[..., object], viewer: Viewer, *arguments: object) -> None:
+    """Do something, and let the camera that it sends gliding arrive."""
+    action(viewer, *arguments)
+    arrive(viewer)
+
+
 def open_scene(viewer: Viewer, path: Path | str) -> None:
     """Open a scene, and wait until it is shown."""
-    opening.open_scene(viewer, Path(path))
-    settle(viewer)
+    act(opening.open_scene, viewer, Path(path))
 
 
 def ask(viewer: Viewer, *phrases: str) -> None:

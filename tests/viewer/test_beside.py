@@ -8,7 +8,7 @@ import pytest
 
 from langsplat_viewer.actions import beside, opening, queries, settings, undoing, viewpoint
 from langsplat_viewer.camera.controls import default_view, extent_of, orbit
-from tests.support.windowless import SCENES, ask, errors, settle
+from tests.support.windowless import SCENES, act, ask, errors, settle
 
 
 @pytest.fixture
@@ -25,8 +25,7 @@ def two(opened):
 def meet(viewer) -> None:
     """Frames until both have done what there is to do."""
     for _ in range(3):
-        beside.follow(viewer)
-        settle(viewer)
+        act(beside.follow, viewer)
         if viewer.beside is not None:
             settle(viewer.beside)
     beside.follow(viewer)
@@ -43,8 +42,7 @@ def test_both_are_seen_and_asked_alike(two):
     queries.set_level(two, "whole")
     settings.set_display(two, "segmentation")
     settings.resize(two, 77, 55)
-    viewpoint.move(two, lambda view: orbit(view, 0.2, 0.1))
-    settle(two)
+    act(viewpoint.move, two, lambda view: orbit(view, 0.2, 0.1))
     meet(two)
     assert {query.phrase: query.slot for query in other.queries} == {"mug": 0, "book": 1}
     assert (other.level, other.picture.display, other.size) == ("whole", "segmentation", (77, 55))
@@ -80,8 +78,7 @@ def test_a_scene_without_a_field_shows_its_colours(two):
 
 
 def test_other_phrases_to_compare_with_are_those_of_both(two):
-    queries.set_canonical(two, "book, plant")
-    settle(two)
+    act(queries.set_canonical, two, "book, plant")
     meet(two)
     assert two.beside.state.canonical == ("book", "plant")
 

@@ -43,7 +43,7 @@ from langsplat_viewer.state import GLIDE_SECONDS
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
 from tests.support.scenes import random_camera, random_gaussians
-from tests.support.windowless import arrive, ask, errors, open_scene
+from tests.support.windowless import ask, errors, go, open_scene
 
 SIZE = (320, 200)
 
@@ -225,8 +225,7 @@ def share_in_picture(viewer: Viewer, size: tuple[int, int]) -> float:
 
 def test_focus_brings_the_latest_result_found_to_the_centre(opened):
     ask(opened, "mug", "plant", "sofa")
-    viewpoint.focus_result(opened)
-    arrive(opened)
+    go(viewpoint.focus_result, opened)
     place = opened.state.queries[1].result.place
     pixels, depth = opened.state.view.camera(160, 120).project(place[None])
     assert_allclose(pixels[0], (80, 60), atol=1e-6)
@@ -235,14 +234,12 @@ def test_focus_brings_the_latest_result_found_to_the_centre(opened):
 
 def test_focus_without_a_result_is_the_whole_scene(opened):
     settings.resize(opened, 160, 120)
-    viewpoint.focus_result(opened)
-    arrive(opened)
+    go(viewpoint.focus_result, opened)
     assert share_in_picture(opened, (160, 120)) >= 0.99
 
 
 def test_training_cameras_wrap_round(opened):
-    viewpoint.step_camera(opened, -1)
-    arrive(opened)
+    go(viewpoint.step_camera, opened, -1)
     last = opened.state.scene.cameras[-1]
     assert opened.state.camera_index == 2
     assert_allclose(opened.state.view.camera(160, 120).world_to_camera, last.world_to_camera, atol=1e-9)
@@ -251,8 +248,7 @@ def test_training_cameras_wrap_round(opened):
 
 
 def test_double_click_turns_around_the_surface(opened):
-    viewpoint.focus_pixel(opened, 0.75, 0.5)
-    arrive(opened)
+    go(viewpoint.focus_pixel, opened, 0.75, 0.5)
     assert_allclose(opened.state.view.target, (0.25, 0.0, 0.0))
     viewpoint.focus_pixel(opened, 0.95, 0.5)
     assert "nothing under the cursor" in opened.state.messages[-1].text
@@ -273,8 +269,7 @@ def test_everything_is_framed_in_a_window_of_any_shape(opened, size):
     settings.resize(opened, *size)
     forward = opened.state.view.rotation[2]
     viewpoint.move(opened, lambda view: focus(view, np.array([4.0, 1.0, 2.0]), 0.3))
-    viewpoint.frame_scene(opened)
-    arrive(opened)
+    go(viewpoint.frame_scene, opened)
     assert_allclose(opened.state.view.rotation[2], forward, atol=1e-9)
     assert share_in_picture(opened, size) >= 0.99
     viewpoint.move(opened, lambda view: focus(view, view.target, 0.8 * view.distance))
@@ -288,8 +283,7 @@ def test_a_scene_without_cameras_opens_and_returns_to_a_view_of_everything(viewe
     assert share_in_picture(viewer, size) >= 0.99
     settings.resize(viewer, size[1], size[0])  # R knows the window's new shape
     viewpoint.zoom_by(viewer, 0.1)
-    viewpoint.reset_view(viewer)
-    arrive(viewer)
+    go(viewpoint.reset_view, viewer)
     assert share_in_picture(viewer, (size[1], size[0])) >= 0.99
 
 
@@ -300,8 +294,7 @@ def test_reset_returns_to_the_opening_view(opened):
             assert opened.state.camera_index == 2
         viewpoint.go_to_camera(opened, 1)
         viewpoint.zoom_by(opened, 0.3)
-        viewpoint.reset_view(opened)
-        arrive(opened)
+        go(viewpoint.reset_view, opened)
         assert_allclose(opened.state.view.camera(160, 120).world_to_camera, camera.world_to_camera, atol=1e-9)
 
 
@@ -322,8 +315,7 @@ def test_focus_goes_as_near_as_the_thing_is_small(opened):
     place, box = query.result.place, query.result.box
     for size in (1.0, 0.1, 0.01):
         query.result = replace(query.result, box=place + size * (box - place))
-        viewpoint.focus_result(opened)
-        arrive(opened)
+        go(viewpoint.focus_result, opened)
         distances.append(opened.state.view.distance)
     assert_allclose(distances, distances[0] * np.array([1, 0.1, 0.01]), rtol=1e-6)
     pixels, _ = opened.state.view.camera(100, 100).project(query.result.box)
@@ -335,8 +327,7 @@ def test_focus_on_something_huge_stays_in_the_room(opened):
     query = opened.state.queries[0]
     query.result = replace(query.result, box=1e3 * np.array([[-1.0] * 3, [1.0] * 3]))
     before = np.linalg.norm(opened.state.view.eye - query.result.place)
-    viewpoint.focus_result(opened)
-    arrive(opened)
+    go(viewpoint.focus_result, opened)
     assert opened.state.view.distance <= max(before, opened.state.extent.radius * 5)
 
 
@@ -428,8 +419,7 @@ def test_a_bookmark_leads_back_and_is_there_the_next_time(opened, tmp_path):
     viewpoint.add_bookmark(opened)
     open_scene(opened, "blobs.ply")
     assert names(opened) == ["the mug"]
-    viewpoint.go_to_bookmark(opened, opened.state.bookmarks[0])
-    arrive(opened)
+    go(viewpoint.go_to_bookmark, opened, opened.state.bookmarks[0])
     assert_allclose(opened.state.view.eye, marked.eye, atol=1e-9)
     assert_allclose(opened.state.view.rotation, marked.rotation, atol=1e-9)
     assert_allclose(opened.state.view.target, marked.target, atol=1e-9)

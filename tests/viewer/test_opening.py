@@ -18,7 +18,7 @@ from langsplat_viewer.options import say_compiling
 from langsplat_viewer.panels.scene import has_several
 from langsplat_viewer.rendering.depth import UNCLIPPED, Clip
 from tests.support.fakes import blob_scene
-from tests.support.windowless import SCENES, arrive, ask, errors, open_scene, settle
+from tests.support.windowless import SCENES, act, ask, errors, go, open_scene, settle
 
 
 def test_unusable_gaussians_are_counted(viewer):
@@ -92,8 +92,7 @@ def test_a_scene_with_broken_companions_opens_and_says_why(tmp_path, viewer):
     ],
 )
 def test_of_dropped_files_the_scene_is_opened_and_what_is_none_is_said(viewer, names, opened_name, said):
-    opening.open_dropped(viewer, [Path(name) for name in names])
-    settle(viewer)
+    act(opening.open_dropped, viewer, [Path(name) for name in names])
     assert viewer.state.path.name == opened_name
     assert [path.name for path in viewer.state.scenes] == [opened_name]
     assert errors(viewer) == ([said] if said else [])
@@ -127,14 +126,12 @@ def test_the_first_run_says_that_it_compiles(viewer, monkeypatch):
 @pytest.fixture
 def three(viewer):
     """Three scenes were dropped; the first is shown."""
-    opening.open_dropped(viewer, [Path("blobs.ply"), Path("plain.ply"), Path("bare.ply")])
-    settle(viewer)
+    act(opening.open_dropped, viewer, [Path("blobs.ply"), Path("plain.ply"), Path("bare.ply")])
     return viewer
 
 
 def switch(viewer, path: Path) -> None:
-    opening.switch_scene(viewer, path)
-    settle(viewer)
+    act(opening.switch_scene, viewer, path)
 
 
 def test_of_several_the_first_is_opened_and_all_are_listed(three):
@@ -146,13 +143,11 @@ def test_of_several_the_first_is_opened_and_all_are_listed(three):
 
 def test_camera_and_queries_of_each_are_found_again(three):
     ask(three, "mug", "book")
-    queries.set_canonical(three, "plant")
-    settle(three)
+    act(queries.set_canonical, three, "plant")
     mug, book = three.state.queries
     queries.hide(three, mug)
     queries.set_cut(three, book, 0.7)
-    viewpoint.go_to_camera(three, 2)
-    arrive(three)
+    go(viewpoint.go_to_camera, three, 2)
     settings.set_clip(three, Clip(1.0, 9.0))
     filming.add_keyframe(three)
     view = three.state.view
@@ -201,8 +196,7 @@ def test_a_scene_is_taken_off_the_list(three):
     opening.unlist_scene(three, BLOBS)
     assert three.state.scenes == (PLAIN, BARE)
     assert three.visits == {}
-    opening.step_scene(three, 1)
-    settle(three)
+    act(opening.step_scene, three, 1)
     assert three.state.path == BARE
 
 
@@ -212,8 +206,7 @@ def test_all_scenes_of_a_folder_are_opened_together(viewer, tmp_path):
     (tmp_path / "folder").mkdir()
     viewer.state.browser = list_folder(tmp_path)
     assert has_several(viewer.state.browser)
-    opening.open_all(viewer)
-    settle(viewer)
+    act(opening.open_all, viewer)
     assert viewer.state.browser is None
     assert viewer.state.scenes == (tmp_path / "blobs.ply", tmp_path / "plain.ply")
     assert viewer.state.path.name == "blobs.ply"
@@ -298,8 +291,7 @@ def test_a_path_can_be_typed(viewer, folder, monkeypatch, typed):
     assert viewer.state.path_typed == ""
     opening.browse(viewer, folder)
     opening.type_path(viewer, typed)
-    opening.open_typed(viewer)
-    settle(viewer)
+    act(opening.open_typed, viewer)
     assert viewer.state.scene is SCENES["blobs.ply"]
 
 
@@ -308,8 +300,7 @@ def test_a_path_that_leads_nowhere_is_an_error_line(viewer, folder, monkeypatch,
     monkeypatch.chdir(folder)
     opening.ask_for_file(viewer)
     opening.type_path(viewer, typed)
-    opening.open_typed(viewer)
-    settle(viewer)
+    act(opening.open_typed, viewer)
     assert len(errors(viewer)) == 1
 
 
@@ -319,8 +310,7 @@ def test_scenes_that_were_open_are_remembered_the_latest_first(viewer):
     recent = viewer.state.preferences.recent
     assert [Path(path).name for path in recent] == ["blobs.ply", "plain.ply"]
     assert all(Path(path).is_absolute() for path in recent)
-    opening.open_recent(viewer, recent[1])
-    settle(viewer)
+    act(opening.open_recent, viewer, recent[1])
     assert viewer.state.scene is SCENES["plain.ply"]
 
 
@@ -393,8 +383,7 @@ def test_reload_keeps_camera_queries_and_settings(shown):
     view, before = shown.state.view, shown.state.scene
     save_scene(shown.state.path, dyed())
     assert look(shown)
-    opening.reload(shown)
-    settle(shown)
+    act(opening.reload, shown)
     state = shown.state
     assert state.scene is not before
     np.testing.assert_array_equal(state.scene.gaussians.sh, dyed().gaussians.sh.astype(np.float32))
@@ -413,8 +402,7 @@ def test_a_reload_with_other_gaussians_asks_anew(shown):
     ask(shown, "plant")
     half = np.arange(0, 360, 2)
     save_scene(shown.state.path, replace(blob_scene().take(half), path=None))
-    opening.reload(shown)
-    settle(shown)
+    act(opening.reload, shown)
     (query,) = shown.state.queries
     assert query.result.members.shape == (180,)
     assert shown.state.selection.marks.selected.shape == (180,)
@@ -429,15 +417,13 @@ def test_a_half_written_file_leaves_the_scene_as_it_was(shown, name):
     whole = file.read_bytes()
     file.write_bytes(whole[: len(whole) // 2])
     assert look(shown)
-    opening.reload(shown)
-    settle(shown)
+    act(opening.reload, shown)
     assert shown.state.scene is before
     assert (shown.state.view, shown.state.queries, query.result) == (view, [query], answer)
     assert name in errors(shown)[-1]
     assert shown.watch.changed  # to be tried again
     file.write_bytes(whole)
-    opening.reload(shown)
-    settle(shown)
+    act(opening.reload, shown)
     assert shown.state.scene is not before
     assert not look(shown)
 
@@ -454,8 +440,7 @@ def test_what_is_not_wanted_is_not_offered_again_until_it_changes_again(shown):
 def test_a_field_that_went_away_takes_its_display_along(shown):
     ask(shown, "mug")
     save_scene(shown.state.path, replace(blob_scene(field=False), path=None))
-    opening.reload(shown)
-    settle(shown)
+    act(opening.reload, shown)
     assert shown.state.picture.display == "rgb"
     assert shown.state.queries == []
 

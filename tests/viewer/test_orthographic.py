@@ -13,7 +13,7 @@ from langsplat_viewer.panels.overlays import pointed_figures
 from langsplat_viewer.state import GLIDE_SECONDS
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import CENTRES
-from tests.support.windowless import arrive, ask, open_scene, settle
+from tests.support.windowless import arrive, ask, go, open_scene, settle
 
 SIZE = (160, 120)
 
@@ -31,7 +31,7 @@ def pixels(viewer: Viewer, points: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    "go",
+    "move",
     [
         viewpoint.reset_view,
         viewpoint.frame_scene,
@@ -42,11 +42,10 @@ def pixels(viewer: Viewer, points: np.ndarray) -> np.ndarray:
         lambda viewer: viewpoint.zoom_by(viewer, 0.5),
     ],
 )
-def test_moving_keeps_it(flat, go):
+def test_moving_keeps_it(flat, move):
     ask(flat, "plant")
     before = flat.state.view
-    go(flat)
-    arrive(flat)
+    go(move, flat)
     assert flat.state.view is not before
     assert flat.state.view.orthographic
 
@@ -56,8 +55,7 @@ def test_the_opening_view_of_a_scene_without_cameras_holds_all_of_it(viewer):
     settings.resize(viewer, *SIZE)
     viewpoint.toggle_orthographic(viewer)
     viewpoint.move(viewer, lambda view: zoom(view, 0.1, 0.0))
-    viewpoint.reset_view(viewer)
-    arrive(viewer)
+    go(viewpoint.reset_view, viewer)
     sample = viewer.state.extent.sample
     places = pixels(viewer, sample.points)
     inside = (places >= 0).all(1) & (places <= SIZE).all(1)
@@ -66,8 +64,7 @@ def test_the_opening_view_of_a_scene_without_cameras_holds_all_of_it(viewer):
 
 
 def test_a_training_camera_is_seen_with_perspective(flat):
-    viewpoint.go_to_camera(flat, 1)
-    arrive(flat)
+    go(viewpoint.go_to_camera, flat, 1)
     assert flat.state.view.orthographic is False
     assert standing_at(flat.state) is not None
     viewpoint.toggle_orthographic(flat)
@@ -76,8 +73,7 @@ def test_a_training_camera_is_seen_with_perspective(flat):
 
 def test_a_double_click_keeps_the_scale(flat):
     span = flat.state.view.span
-    viewpoint.focus_pixel(flat, 0.4, 0.6)
-    arrive(flat)
+    go(viewpoint.focus_pixel, flat, 0.4, 0.6)
     assert_allclose(flat.state.view.target, [-0.1, 0.1, 0.0])
     assert flat.state.view.span == pytest.approx(span)
 
@@ -85,8 +81,7 @@ def test_a_double_click_keeps_the_scale(flat):
 def test_a_glide_under_way_goes_on(opened):
     viewpoint.look_from(opened, "top")
     viewpoint.tick(opened, opened.clock + 0.5 * GLIDE_SECONDS)
-    viewpoint.toggle_orthographic(opened)
-    arrive(opened)
+    go(viewpoint.toggle_orthographic, opened)
     wanted = from_side(opened.state.view, "top")
     assert_allclose(opened.state.view.rotation, wanted.rotation, atol=1e-9)
     assert opened.state.view.orthographic
@@ -103,14 +98,14 @@ def test_keyframes_and_bookmarks_bring_their_own(flat, tmp_path):
     filming.add_keyframe(flat)
     viewpoint.add_bookmark(flat, "deep")
     kept = flat.shelf.read(flat.state.path)
-    for name, orthographic, go in (
+    for name, orthographic, take in (
         ("flat", True, lambda: viewpoint.go_to_bookmark(flat, kept[0])),
         ("deep", False, lambda: viewpoint.go_to_bookmark(flat, kept[1])),
         ("first key", True, lambda: filming.choose_keyframe(flat, flat.state.record.keyframes[0])),
         ("second key", False, lambda: filming.choose_keyframe(flat, flat.state.record.keyframes[1])),
         ("played", True, lambda: viewpoint.scrub(flat, 1.0)),
     ):
-        go()
+        take()
         arrive(flat)
         assert flat.state.view.orthographic == orthographic, name
         if orthographic and name != "played":

@@ -21,7 +21,7 @@ from langsplat_viewer.files.projects import Things
 from tests.support.fakes import CENTRES, blob_scene
 from tests.support.marks_and_flights import blob, marked
 from tests.support.scenes import with_tree
-from tests.support.windowless import SCENES, ask, errors, open_scene, settle
+from tests.support.windowless import SCENES, act, ask, errors, open_scene, settle
 
 
 @pytest.fixture
@@ -53,34 +53,29 @@ def test_every_thing_has_a_row_with_its_word(outlined):
 
 def test_a_row_is_selected_and_looked_at(outlined):
     row, before = row_of(outlined, "book"), outlined.state.view
-    outline.visit(outlined, row.node)
-    settle(outlined)
+    act(outline.visit, outlined, row.node)
     assert marked(outlined)[0] == "book"
     assert outlined.state.glide.end.distance < before.distance
     np.testing.assert_allclose(outlined.state.glide.end.target, CENTRES[1], atol=0.2)
 
 
 def test_what_is_clicked_in_the_scene_is_the_thing_there(outlined):
-    outline.select(outlined, CENTRES[2])
-    settle(outlined)
+    act(outline.select, outlined, CENTRES[2])
     assert marked(outlined)[0] == "plant"
-    outline.find_alike(outlined, CENTRES[0])
-    settle(outlined)
+    act(outline.find_alike, outlined, CENTRES[0])
     assert marked(outlined)[0] == "mug"
 
 
 def test_rows_are_hidden_and_shown_and_the_selection_stays(outlined):
     mug, book = row_of(outlined, "mug").node, row_of(outlined, "book").node
     take(outlined, blob("plant"))
-    outline.hide(outlined, mug)
-    settle(outlined)
+    act(outline.hide, outlined, mug)
     assert marked(outlined) == ("plant", "mug", "")
     hidden = outline.hidden_nodes(outlined)
     assert hidden[mug]
     assert not hidden[book]
     assert outline.hidden_nodes(outlined) is hidden
-    outline.show(outlined, mug)
-    settle(outlined)
+    act(outline.show, outlined, mug)
     assert marked(outlined) == ("plant", "", "")
     undoing.undo(outlined)
     assert outline.hidden_nodes(outlined)[mug]
@@ -97,8 +92,7 @@ def test_what_is_locked_is_left_alone(outlined):
     selecting.isolate_selected(outlined)
     assert marked(outlined)[1] == "plant"
     selecting.show_hidden(outlined)
-    outline.hide(outlined, mug)
-    settle(outlined)
+    act(outline.hide, outlined, mug)
     assert marked(outlined)[1] == ""
     transforming.fill_box(outlined)
     transforming.crop(outlined)
@@ -111,8 +105,7 @@ def test_what_is_locked_is_left_alone(outlined):
 
 def test_a_name_is_taught_shown_filtered_and_undone(outlined):
     mug = row_of(outlined, "mug")
-    outline.give_name(outlined, mug.node, "  grandma's cup ")
-    settle(outlined)
+    act(outline.give_name, outlined, mug.node, "  grandma's cup ")
     assert outline.name_of(outlined, mug) == "grandma's cup"
     assert outlined.state.queries[-1].phrase == "grandma's cup"
     assert outlined.state.queries[-1].result.found
@@ -121,11 +114,9 @@ def test_a_name_is_taught_shown_filtered_and_undone(outlined):
     assert list(outline.filtered(outlined, outlined.state.outline.roots, "zebra")) == []
     book = row_of(outlined, "book").node
     outline.toggle_lock(outlined, book)
-    outline.give_name(outlined, book, "the atlas")  # also of what no tool takes
-    settle(outlined)
+    act(outline.give_name, outlined, book, "the atlas")  # also of what no tool takes
     assert outlined.engine.taught.keys() == {"grandma's cup", "the atlas"}
-    outline.give_name(outlined, book, "of")  # which names nothing
-    settle(outlined)
+    act(outline.give_name, outlined, book, "of")  # which names nothing
     assert outlined.state.things.names[book] == "the atlas"
     outlined.state.messages.clear()
     outline.give_name(outlined, mug.node, " ")
@@ -169,13 +160,11 @@ def test_a_project_keeps_names_groups_and_locks(outlined, viewer, tmp_path, monk
     mug, book = row_of(outlined, "mug").node, row_of(outlined, "book").node
     outline.group(outlined, mug, book)
     outline.toggle_lock(outlined, mug)
-    outline.give_name(outlined, book, "the atlas")
-    settle(outlined)
+    act(outline.give_name, outlined, book, "the atlas")
     things, path = outlined.state.things, projects.save_project(outlined, tmp_path)
     open_scene(viewer, "plain.ply")
     assert viewer.state.things != things
-    opening.open_project(viewer, path)
-    settle(viewer)
+    act(opening.open_project, viewer, path)
     assert viewer.state.things == things
     selecting.select_all(viewer)
     assert marked(viewer)[0] == "book plant"
@@ -198,8 +187,7 @@ def test_a_project_of_another_tree_keeps_what_is_known(outlined, tmp_path, monke
     path.write_text(json.dumps(top))
     if not field:
         monkeypatch.setitem(SCENES, "tree.ply", replace(SCENES["tree.ply"], language=None))
-    opening.open_project(outlined, path)
-    settle(outlined)
+    act(opening.open_project, outlined, path)
     things = outlined.state.things
     selecting.select_all(outlined)
     if field:
@@ -215,13 +203,11 @@ def test_a_scene_that_was_trained_anew_is_read_again(outlined, monkeypatch):
     """Its tree is another: what was locked by the number of a node is not."""
     outline.toggle_lock(outlined, row_of(outlined, "mug").node)
     outlined.state.things = replace(outlined.state.things, locked=frozenset({10**6}))
-    opening.reload(outlined)
-    settle(outlined)
+    act(opening.reload, outlined)
     assert outlined.state.things.locked == frozenset()
     outline.toggle_lock(outlined, 0)  # of another number of Gaussians
     monkeypatch.setitem(SCENES, "tree.ply", with_tree(SCENES["tree.ply"].take(np.arange(300))))
-    opening.reload(outlined)
-    settle(outlined)
+    act(opening.reload, outlined)
     assert outlined.state.things == Things()
 
 

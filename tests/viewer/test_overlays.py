@@ -26,7 +26,7 @@ from langsplat_viewer.files.preferences import (
 )
 from langsplat_viewer.panels.overlays import pointed_figures, said
 from tests.support.fakes import CENTRES, FakeEncoder, blob_scene, cameras
-from tests.support.windowless import arrive, ask, errors, open_scene, settle
+from tests.support.windowless import act, ask, errors, go, open_scene, settle
 
 SIZE = (120, 80)
 NEAR = 0.05
@@ -363,8 +363,7 @@ def test_one_of_another_shape_is_refused(tmp_path):
 
 
 def test_it_lies_where_its_camera_saw_it(opened):
-    viewpoint.go_to_camera(opened, 1)
-    arrive(opened)
+    go(viewpoint.go_to_camera, opened, 1)
     camera = opened.state.scene.cameras[1]
     shown = opened.state.view.camera(500, 300)
     left, top, right, bottom = corners(camera, shown)
@@ -385,10 +384,8 @@ def beside_photograph(opened, tmp_path):
 
 
 def stand(viewer, index: int) -> None:
-    viewpoint.go_to_camera(viewer, index)
-    arrive(viewer)
-    opening.fetch_photograph(viewer)
-    settle(viewer)
+    go(viewpoint.go_to_camera, viewer, index)
+    act(opening.fetch_photograph, viewer)
 
 
 def test_it_is_read_once_it_is_wanted_and_only_at_its_camera(beside_photograph):

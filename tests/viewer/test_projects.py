@@ -29,7 +29,7 @@ from langsplat_viewer.rendering.depth import Clip
 from langsplat_viewer.viewer import Services, Viewer
 from tests.support.fakes import CENTRES, FakeEncoder
 from tests.support.marks_and_flights import blob, marked
-from tests.support.windowless import SCENES, FakeSurface, ask, errors, load, settle
+from tests.support.windowless import SCENES, FakeSurface, act, ask, errors, load
 
 
 @pytest.fixture
@@ -41,8 +41,7 @@ def saved(opened, tmp_path, monkeypatch) -> Path:
     queries.set_cut(opened, opened.state.queries[1], 0.6)
     queries.hide(opened, opened.state.queries[2])
     selecting.take(opened, blob("plant"))
-    transforming.transform(opened, moving(np.array([0.0, 1.0, 0.0])))
-    settle(opened)
+    act(transforming.transform, opened, moving(np.array([0.0, 1.0, 0.0])))
     selecting.hide_selected(opened)
     selecting.take(opened, blob("book"))
     looks = replace(opened.state.picture, dim=0.7, heat_scale=(0.4, 0.9), colour_map="magma")
@@ -64,8 +63,7 @@ def saved(opened, tmp_path, monkeypatch) -> Path:
 def again(saved):
     """Another viewer with the project open."""
     made = Viewer(Services(load, lambda encoder_id: FakeEncoder()), surface=FakeSurface())
-    opening.open_file(made, saved)
-    settle(made)
+    act(opening.open_file, made, saved)
     yield made
     made.worker.close()
 
@@ -92,8 +90,7 @@ def test_everything_comes_back(opened, saved, again):
     assert not after.selection.is_unsaved
     assert (before.preferences.recent[0], after.preferences.recent[0]) == (str(saved), str(saved))
     queries.remove_all(again)
-    opening.open_recent(again, str(saved))
-    settle(again)
+    act(opening.open_recent, again, str(saved))
     assert len(after.queries) == 4
     assert projects.save_project(again, Path("/nowhere")) == saved  # where it came from
 
@@ -112,8 +109,7 @@ def test_other_programs_find_the_answers_in_it(opened, saved):
 def test_a_scene_that_has_changed_keeps_its_questions_alone(saved, viewer, monkeypatch):
     smaller = SCENES["blobs.ply"].take(np.arange(240))
     monkeypatch.setitem(SCENES, "blobs.ply", smaller)
-    opening.open_project(viewer, saved)
-    settle(viewer)
+    act(opening.open_project, viewer, saved)
     assert len(viewer.state.queries) == 4
     assert not viewer.state.selection.marks.selected.any()
     assert any("has changed" in text for text in errors(viewer))
@@ -246,11 +242,9 @@ def test_notes_are_there_again_after_another_scene(opened):
     notes = opened.state.notes
     opening.add_scenes(opened, [Path("blobs.ply"), Path("plain.ply")])
     for step, there in ((1, ()), (-1, notes)):
-        opening.step_scene(opened, step)
-        settle(opened)
+        act(opening.step_scene, opened, step)
         assert opened.state.notes == there
-    opening.reload(opened)
-    settle(opened)
+    act(opening.reload, opened)
     assert opened.state.notes == notes
     assert opened.state.has_unsaved_notes
 

@@ -18,7 +18,7 @@ from langsplat_viewer.output.headless import describe
 from langsplat_viewer.panels.search import BINS, hint, histogram
 from langsplat_viewer.viewer import Services
 from tests.support.fakes import CENTRES, FakeEncoder, as_trained, axis, blob_scene, calibrated_for, language
-from tests.support.windowless import SCENES, ask, errors, load, open_scene, settle
+from tests.support.windowless import SCENES, act, ask, errors, load, open_scene, settle
 
 
 def test_a_query_is_answered_and_shown(opened):
@@ -52,8 +52,7 @@ def test_a_correction_is_offered_and_takes_the_place_of_the_typo(opened):
     assert queries.offers(opened) == ("did you mean", ())  # "red" is like no word either
     ask(opened, "plamt")
     assert queries.offers(opened) == ("did you mean", ("plant",))
-    queries.ask_offered(opened, "plant")
-    settle(opened)
+    act(queries.ask_offered, opened, "plant")
     assert [query.phrase for query in opened.state.queries] == ["red plamt", "plant"]
     assert opened.state.queries[1].result.found
     assert opened.state.queries[1].slot == 0
@@ -88,8 +87,7 @@ def test_examples_are_offered_until_the_first_search_and_each_is_found(viewer):
     queries.type_phrase(viewer, "bo")
     assert queries.offers(viewer) == ("", ("book",))
     queries.type_phrase(viewer, "")
-    queries.ask_offered(viewer, "book")
-    settle(viewer)
+    act(queries.ask_offered, viewer, "book")
     assert viewer.state.queries[0].result.found
     open_scene(viewer, "plain.ply")
     queries.prepare_suggestions(viewer)
@@ -186,14 +184,12 @@ def test_an_answer_is_explained_by_what_training_kept(opened, tmp_path, monkeypa
     monkeypatch.chdir(tmp_path)
     ask(opened, "book")
     (query,) = opened.state.queries
-    queries.explain(opened, query)
-    settle(opened)
+    act(queries.explain, opened, query)
     assert "--work" in errors(opened)[-1]
     scene = opened.state.scene
     seen = ImageFeatures(np.zeros((3, 120, 160), np.int32), axis(1)[None])
     as_trained(tmp_path / "blobs.ply", scene, [seen] * len(scene.cameras))
-    queries.explain(opened, query)
-    settle(opened)
+    act(queries.explain, opened, query)
     assert opened.state.evidence.phrase == "book"
     assert opened.state.evidence.image.ndim == 3
     queries.close_evidence(opened)
@@ -232,14 +228,11 @@ def test_a_cut_is_undone_in_one_step_and_outlives_another_level(asked):
     queries.set_cut(asked, query, 0.6)
     for value in (0.61, 0.62):  # the slider moves on
         queries.set_cut(asked, query, value, is_new=False)
-    queries.set_level(asked, "part")
-    settle(asked)
+    act(queries.set_level, asked, "part")
     assert (query.result.level, query.result.own_cut) == (1, 0.62)
-    undoing.undo(asked)
-    settle(asked)
+    act(undoing.undo, asked)
     assert query.result.own_cut == 0.62
-    undoing.undo(asked)
-    settle(asked)
+    act(undoing.undo, asked)
     assert query.result.own_cut is None
     np.testing.assert_array_equal(query.result.members, automatic.members)
     undoing.redo(asked)
@@ -249,18 +242,15 @@ def test_a_cut_is_undone_in_one_step_and_outlives_another_level(asked):
 def test_everything_can_be_compared_with_other_phrases(asked):
     (query,) = asked.state.queries
     before = query.result
-    queries.set_canonical(asked, "book, plant")
-    settle(asked)
+    act(queries.set_canonical, asked, "book, plant")
     assert asked.state.canonical == ("book", "plant")
     assert asked.engine.canonical_phrases == ("book", "plant")
     assert np.abs(query.result.relevancy - before.relevancy).max() > 0.01
     assert query.result.probability is None
-    queries.set_canonical(asked, "sofa")  # never taught: all stays as it was
-    settle(asked)
+    act(queries.set_canonical, asked, "sofa")  # never taught: all stays as it was
     assert "sofa" in errors(asked)[-1]
     assert asked.state.canonical == ("book", "plant")
-    queries.set_canonical(asked, "")
-    settle(asked)
+    act(queries.set_canonical, asked, "")
     assert asked.state.canonical == ()
     assert asked.engine.canonical_phrases == CANONICAL_PHRASES
     np.testing.assert_array_equal(query.result.relevancy, before.relevancy)
@@ -271,14 +261,12 @@ def test_a_set_of_queries_is_asked_again(asked, tmp_path):
     ask(asked, "plant")
     queries.hide(asked, asked.state.queries[1])
     queries.set_level(asked, "whole")
-    queries.set_canonical(asked, "book")
-    settle(asked)
+    act(queries.set_canonical, asked, "book")
     path = queries.save_queries(asked, tmp_path)
     assert path.name == "blobs-001.queries.json"
     open_scene(asked, "blobs.ply")
     assert (asked.state.queries, asked.state.canonical) == ([], ())
-    opening.open_dropped(asked, [path])
-    settle(asked)
+    act(opening.open_dropped, asked, [path])
     found = [(query.phrase, query.cut, query.slot is None) for query in asked.state.queries]
     assert found == [("mug", 0.7, False), ("plant", None, True)]
     assert asked.state.canonical == ("book",)
@@ -289,8 +277,7 @@ def test_a_set_of_queries_is_asked_again(asked, tmp_path):
 def test_queries_dropped_with_a_scene_are_asked_of_it(viewer, tmp_path):
     path = tmp_path / "a.queries.json"
     write_queries(path, QuerySet((SavedQuery("mug"),)))
-    opening.open_dropped(viewer, [path, Path("blobs.ply")])
-    settle(viewer)
+    act(opening.open_dropped, viewer, [path, Path("blobs.ply")])
     assert [query.phrase for query in viewer.state.queries] == ["mug"]
 
 

@@ -41,7 +41,7 @@ from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene, cameras
 from tests.support.marks_and_flights import blob
 from tests.support.scenes import random_gaussians
-from tests.support.windowless import arrive, ask, errors, recorded, rest, settle
+from tests.support.windowless import arrive, ask, errors, go, recorded, rest, settle
 
 SCENE = blob_scene()
 NOTHING = np.zeros(360, bool)
@@ -54,8 +54,7 @@ def edit_everything(viewer: Viewer, mode: str) -> None:
     """Every setting off its default: one blob hidden in part, one selected, one deleted in part."""
     state, odd = viewer.state, np.arange(360) % 2 == 1
     settings.resize(viewer, 160, 120)
-    viewpoint.look_from(viewer, "left")
-    arrive(viewer)
+    go(viewpoint.look_from, viewer, "left")
     ask(viewer, "mug", "plant")
     marks = Marks(blob("book") & odd, blob("mug") & odd, blob("plant") & odd)
     state.selection = replace(state.selection, marks=marks)

@@ -16,7 +16,7 @@ from langsplat_viewer.camera.controls import from_camera
 from langsplat_viewer.marks import Drawn, Stroke, outlines
 from tests.support.fakes import CENTRES, COLOURS, PER_BLOB
 from tests.support.marks_and_flights import blob, marked, marks_of
-from tests.support.windowless import SCENES, FakeSurface, ask, errors, open_scene, settle
+from tests.support.windowless import SCENES, FakeSurface, act, ask, errors, open_scene, settle
 
 
 @pytest.fixture
@@ -134,14 +134,12 @@ def test_growing_and_shrinking_follow_the_surface(opened):
     core = np.linalg.norm(means, axis=1) < 0.15
     take(opened, core)
     selecting.set_reach(opened, 0.15)
-    selecting.grow_selection(opened)
-    settle(opened)
+    act(selecting.grow_selection, opened)
     grown = marks_of(opened).selected.copy()
     assert core.sum() < grown.sum()
     assert (grown >= core).all()
     assert not (grown & ~blob("book")).any()  # the others are not on its surface
-    selecting.shrink_selection(opened)
-    settle(opened)
+    act(selecting.shrink_selection, opened)
     assert marks_of(opened).selected.sum() < grown.sum()
     undoing.undo(opened)
     assert (marks_of(opened).selected == grown).all()
@@ -333,8 +331,7 @@ def test_the_selection_and_the_rest_are_scenes_with_their_field(opened, tmp_path
     without_plant(opened)
     take(opened, blob("mug"))
     for part, word in (("selection", "mug"), ("rest", "book")):
-        selecting.export(opened, tmp_path, part)
-        settle(opened)
+        act(selecting.export, opened, tmp_path, part)
         assert f"saved {tmp_path / f'blobs-{part}-001.ply'}: 120 Gaussians" == opened.state.messages[-1].text
         written = load_scene(tmp_path / f"blobs-{part}-001.ply")
         np.testing.assert_array_equal(
@@ -347,8 +344,7 @@ def test_the_selection_and_the_rest_are_scenes_with_their_field(opened, tmp_path
 
 def test_points_have_their_colours(opened, tmp_path):
     take(opened, blob("mug"))
-    selecting.export(opened, tmp_path, "selection", as_points=True)
-    settle(opened)
+    act(selecting.export, opened, tmp_path, "selection", as_points=True)
     assert names_in(tmp_path) == ["blobs-selection-points-001.ply"]
     table = PlyData.read(tmp_path / "blobs-selection-points-001.ply")["vertex"]
     assert len(table) == 120
@@ -376,8 +372,7 @@ def test_what_cannot_be_written_is_said(opened, tmp_path):
     selecting.export(opened, tmp_path, "rest")
     assert "the rest holds no Gaussians" in errors(opened)[-1]
     (tmp_path / "file").write_text("")
-    selecting.export(opened, tmp_path / "file", "selection")
-    settle(opened)
+    act(selecting.export, opened, tmp_path / "file", "selection")
     assert errors(opened)[-1].startswith("not saved: ")
     assert names_in(tmp_path) == ["file"]
 
@@ -390,8 +385,7 @@ def test_deleting_is_unsaved_until_the_scene_is_saved(opened, tmp_path):
     undoing.undo(opened)
     assert not selection().is_unsaved
     undoing.redo(opened)
-    selecting.export(opened, tmp_path, "edited")
-    settle(opened)
+    act(selecting.export, opened, tmp_path, "edited")
     assert not selection().is_unsaved
     assert len(load_scene(tmp_path / "blobs-edited-001.ply").gaussians) == 240
     take(opened, blob("mug"))
@@ -404,8 +398,7 @@ def test_another_scene_waits_for_the_answer(opened, tmp_path):
     opening.open_scene(opened, Path("plain.ply"))
     assert opened.state.opening is None
     assert opened.state.selection.leaving.to == "plain.ply is opened"
-    selecting.stay(opened)
-    settle(opened)
+    act(selecting.stay, opened)
     assert (opened.state.path.name, opened.state.selection.leaving) == ("blobs.ply", None)
     assert marked(opened) == ("", "", "plant")
 
@@ -414,8 +407,7 @@ def test_another_scene_waits_for_the_answer(opened, tmp_path):
     assert opened.state.selection.leaving is None
 
     opening.open_scene(opened, Path("plain.ply"))
-    selecting.discard_and_leave(opened)
-    settle(opened)
+    act(selecting.discard_and_leave, opened)
     assert opened.state.path.name == "plain.ply"
     assert names_in(tmp_path) == []
 
@@ -424,8 +416,7 @@ def test_saving_comes_before_what_waited(opened, tmp_path):
     without_plant(opened)
     then = []
     opening.open_scene(opened, Path("plain.ply"), then.append)
-    selecting.save_and_leave(opened, tmp_path)
-    settle(opened)
+    act(selecting.save_and_leave, opened, tmp_path)
     settle(opened)
     assert then == [opened]
     assert opened.state.path.name == "plain.ply"
@@ -436,8 +427,7 @@ def test_where_saving_fails_nothing_is_left(opened, tmp_path):
     without_plant(opened)
     selecting.quit_viewer(opened)
     (tmp_path / "file").write_text("")
-    selecting.save_and_leave(opened, tmp_path / "file")
-    settle(opened)
+    act(selecting.save_and_leave, opened, tmp_path / "file")
     assert "not saved" in errors(opened)[-1]
     assert not opened.state.selection.may_close
     assert opened.state.selection.is_unsaved
@@ -446,8 +436,7 @@ def test_where_saving_fails_nothing_is_left(opened, tmp_path):
 def test_a_broken_scene_after_discarding_loses_nothing(opened):
     without_plant(opened)
     opening.open_scene(opened, Path("broken.ply"))
-    selecting.discard_and_leave(opened)
-    settle(opened)
+    act(selecting.discard_and_leave, opened)
     assert marked(opened) == ("", "", "plant")
     assert opened.state.selection.is_unsaved
 
@@ -472,14 +461,12 @@ def test_what_is_being_written_is_waited_for(opened, tmp_path):
 def test_what_is_named_is_found_by_its_name_and_kept_where_it_is_saved(opened, tmp_path):
     take(opened, blob("plant"))
     queries.type_name(opened, "grandma's mug")
-    queries.name_selection(opened)
-    settle(opened)
+    act(queries.name_selection, opened)
     query = opened.state.queries[-1]
     assert query.phrase == "grandma's mug"
     np.testing.assert_array_equal(query.result.members, blob("plant"))
     assert opened.state.selection.name == ""
-    selecting.export(opened, tmp_path, "edited")
-    settle(opened)
+    act(selecting.export, opened, tmp_path, "edited")
     (saved,) = tmp_path.glob("*.ply")
     assert [word.name for word in load_scene(saved).language.taught] == ["grandma's mug"]
     assert errors(opened) == []
@@ -490,16 +477,14 @@ def test_what_cannot_be_a_name_is_said(opened):
     assert "nothing is selected" in opened.state.messages[-1].text
     take(opened, blob("plant"))
     queries.type_name(opened, "the")
-    queries.name_selection(opened)
-    settle(opened)
+    act(queries.name_selection, opened)
     assert "'the' cannot be a name" in errors(opened)[-1]
     assert (opened.state.queries, opened.state.selection.name) == ([], "the")
 
 
 def test_everything_like_the_selection(opened):
     take(opened, blob("mug"))
-    selecting.select_alike(opened)
-    settle(opened)
+    act(selecting.select_alike, opened)
     assert marked(opened)[0] == "mug"
 
 

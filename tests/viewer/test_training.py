@@ -21,7 +21,7 @@ from langsplat_viewer.files.watching import IN_TRAINING, NAME, write_preview
 from langsplat_viewer.viewer import PREVIEW_EVERY, TrainingProgress, TrainingRequest, command
 from tests.support.fakes import blob_scene
 from tests.support.scenes import random_gaussians
-from tests.support.windowless import SCENES, errors, open_scene, settle
+from tests.support.windowless import SCENES, act, errors, open_scene, settle
 
 SAYS = """
 import json, sys
@@ -129,8 +129,7 @@ def test_the_gaussians_can_be_looked_at_before_the_end(viewer, folder, monkeypat
     (work / "radiance-0.ply").write_bytes(b"")
     SCENES["radiance-0.ply"] = SCENES["plain.ply"]
     try:
-        training.look_at_training(viewer)
-        settle(viewer)
+        act(training.look_at_training, viewer)
     finally:
         del SCENES["radiance-0.ply"]
         viewer.training.end()
@@ -218,8 +217,7 @@ def test_gaussians_in_training_are_looked_at_and_followed(training_now, folder):
     assert "no Gaussians to look at yet" in viewer.state.messages[-1].text
     whole = blob_scene()
     checkpoint(folder.parent, whole.take(np.arange(0, 360, 2)))
-    training.look_at_training(viewer)
-    settle(viewer)
+    act(training.look_at_training, viewer)
     assert viewer.state.path == folder.parent / "photos.work" / NAME
     seen = viewer.state.scene.gaussians
     assert (len(seen), seen.sh_degree) == (180, 1)
@@ -230,8 +228,7 @@ def test_gaussians_in_training_are_looked_at_and_followed(training_now, folder):
     assert viewer.worker.current is None  # nothing new
 
     checkpoint(folder.parent, whole)
-    training.watch_training(viewer)
-    settle(viewer)
+    act(training.watch_training, viewer)
     assert len(viewer.state.scene.gaussians) == 360
     assert viewer.state.view is view
     assert errors(viewer) == []
@@ -254,7 +251,6 @@ def test_a_checkpoint_of_training_itself_is_read(tmp_path):
 def test_a_damaged_checkpoint_is_one_line(training_now, folder):
     path = checkpoint(folder.parent, blob_scene())
     path.write_bytes(path.read_bytes()[:100])
-    training.look_at_training(training_now)
-    settle(training_now)
+    act(training.look_at_training, training_now)
     assert "no Gaussians in training" in errors(training_now)[-1]
     assert training_now.state.scene is None

@@ -14,7 +14,7 @@ from langsplat_viewer.panels.transform import box_of, dragged, gl_matrices
 from langsplat_viewer.state import EditForm
 from tests.support.fakes import CENTRES
 from tests.support.scenes import random_camera, without_perspective
-from tests.support.windowless import ask, errors, open_scene, settle
+from tests.support.windowless import act, ask, errors, open_scene, settle
 
 MUG = CENTRES[0]
 STEP = np.array([0.0, 2.0, -1.0])
@@ -35,8 +35,7 @@ def means(viewer) -> np.ndarray:
 def test_the_selection_moves_alone_and_is_found_where_it_went(opened):
     chosen, before = selected_mug(opened), means(opened)
     place, cameras = opened.state.queries[0].result.place, opened.state.scene.cameras
-    transforming.transform(opened, moving(STEP))
-    settle(opened)
+    act(transforming.transform, opened, moving(STEP))
     np.testing.assert_allclose(means(opened)[chosen], before[chosen] + STEP, atol=1e-5)
     np.testing.assert_array_equal(means(opened)[~chosen], before[~chosen])
     assert opened.state.scene.cameras is cameras
@@ -61,8 +60,7 @@ def test_undone_exactly_and_done_again(opened):
     transforming.transform(opened, rotating(AXES["x"], 33).about(MUG))
     transforming.transform(opened, moving(STEP))
     selecting.select_none(opened)
-    transforming.transform(opened, scaling(0.5))
-    settle(opened)
+    act(transforming.transform, opened, scaling(0.5))
     last = means(opened)
     for _ in range(4):
         undoing.undo(opened)
@@ -106,8 +104,7 @@ def test_a_held_gizmo_shows_what_release_does(opened):
 def test_what_is_saved_is_what_is_seen(opened, tmp_path):
     chosen = selected_mug(opened)
     transforming.transform(opened, moving(STEP))
-    selecting.export(opened, tmp_path, "edited")
-    settle(opened)
+    act(selecting.export, opened, tmp_path, "edited")
     made = load_scene(next(tmp_path.glob("*.ply")))
     np.testing.assert_array_equal(made.gaussians.means, means(opened))
     assert made.language is not None
@@ -121,10 +118,8 @@ def test_what_is_saved_is_what_is_seen(opened, tmp_path):
 def test_names_that_were_taught_go_along(opened):
     selected_mug(opened)
     queries.type_name(opened, "trophy")
-    queries.name_selection(opened)
-    settle(opened)
-    transforming.transform(opened, moving(STEP))
-    settle(opened)
+    act(queries.name_selection, opened)
+    act(transforming.transform, opened, moving(STEP))
     assert opened.engine.is_taught("trophy")
     assert [word.name for word in opened.state.scene.language.taught] == ["trophy"]
 
@@ -193,8 +188,13 @@ def test_the_corners_of_a_dragged_box():
 
 
 def test_without_a_scene_nothing_happens(viewer):
-    for act in (transforming.apply_form, transforming.crop, transforming.fill_box, transforming.next_gizmo):
-        act(viewer)
+    for action in (
+        transforming.apply_form,
+        transforming.crop,
+        transforming.fill_box,
+        transforming.next_gizmo,
+    ):
+        action(viewer)
     transforming.preview(viewer, moving(STEP))
     assert viewer.state.moving is None
 
@@ -202,8 +202,7 @@ def test_without_a_scene_nothing_happens(viewer):
 def test_without_a_language_field(viewer):
     open_scene(viewer, "plain.ply")
     before = means(viewer)
-    transforming.transform(viewer, moving(STEP))
-    settle(viewer)
+    act(transforming.transform, viewer, moving(STEP))
     np.testing.assert_allclose(means(viewer), before + STEP, atol=1e-5)
     assert viewer.state.scene.language is None
 

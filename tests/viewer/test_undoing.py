@@ -14,7 +14,7 @@ from langsplat_viewer.actions.selecting import mark
 from langsplat_viewer.marks import Marks, hiding, unmarked
 from langsplat_viewer.rendering.depth import Clip
 from langsplat_viewer.rendering.request import Splats
-from tests.support.windowless import ask, open_scene, settle
+from tests.support.windowless import act, ask, open_scene, settle
 
 
 def phrases(viewer) -> list[str]:
@@ -31,8 +31,7 @@ def test_a_query_is_undone_and_done_again(opened):
     undoing.undo(opened)
     assert "nothing to undo" in opened.state.messages[-1].text
     undoing.redo(opened)
-    undoing.redo(opened)
-    settle(opened)
+    act(undoing.redo, opened)
     assert phrases(opened) == ["mug", "book"]
     assert [query.slot for query in opened.state.queries] == [0, 1]
     assert opened.state.picture.display == "relevancy"
@@ -47,8 +46,7 @@ def test_a_removed_query_comes_back_with_its_answer_and_colour(opened):
     queries.set_cut(opened, mug, 0.6)
     count = mug.result.members.sum()
     queries.remove(opened, mug)
-    undoing.undo(opened)
-    settle(opened)
+    act(undoing.undo, opened)
     assert opened.state.queries[0] is mug
     assert mug.slot == 0
     assert mug.cut == 0.6
@@ -83,8 +81,7 @@ def test_history_keeps_no_answers_of_queries_that_are_gone(opened, leave):
 def test_an_answer_that_comes_after_its_query_was_taken_off_is_dropped(opened):
     queries.ask(opened, "mug")
     mug = opened.state.queries[0]
-    queries.remove(opened, mug)
-    settle(opened)
+    act(queries.remove, opened, mug)
     assert (mug.result, mug.pending) == (None, False)
     undoing.undo(opened)
     assert mug.pending
@@ -97,12 +94,10 @@ def test_colour_level_and_display_are_undone(opened):
     query = opened.state.queries[0]
     queries.hide(opened, query)
     queries.set_level(opened, "part")
-    settings.set_display(opened, "depth")
-    settle(opened)
+    act(settings.set_display, opened, "depth")
     undoing.undo(opened)
     assert opened.state.picture.display == "relevancy"
-    undoing.undo(opened)
-    settle(opened)
+    act(undoing.undo, opened)
     assert (opened.state.level, query.result.level) == ("auto", 2)
     undoing.undo(opened)
     assert query.slot == 0
