@@ -8,9 +8,10 @@ import numpy as np
 
 from langsplat_core.errors import FormatError
 from langsplat_core.scene import Scene
-from langsplat_viewer.actions import opening, queries, viewpoint
+from langsplat_viewer.actions import opening, queries, selecting, settings, viewpoint
 from langsplat_viewer.canvas import Canvas
-from langsplat_viewer.rendering.request import RenderRequest
+from langsplat_viewer.rendering.depth import Clip
+from langsplat_viewer.rendering.request import RenderRequest, Splats
 from langsplat_viewer.state import GLIDE_SECONDS, ViewerState
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
@@ -130,6 +131,23 @@ def arrive(viewer: Viewer) -> None:
 
 def errors(viewer: Viewer) -> list[str]:
     return [message.text for message in viewer.state.messages if message.is_error]
+
+
+CHANGES = {  # of what is seen, after a search
+    "display": lambda v: settings.set_display(v, "depth"),
+    "hidden query": lambda v: queries.hide(v, v.state.queries[0]),
+    "splats": lambda v: settings.set_splats(v, Splats(0.5)),
+    "near cut": lambda v: settings.set_clip(v, Clip(1.0)),
+    "marks": selecting.select_all,
+    "size": lambda v: settings.resize(v, 100, 80),
+    "view": lambda v: viewpoint.look_from(v, "left"),
+}
+
+
+def on_screen(canvas: Canvas) -> list[np.ndarray]:
+    """(H, W, 3) bytes of each pane."""
+    raw = [(np.frombuffer(texture.read(), np.uint8), texture.size) for texture in canvas.textures]
+    return [pixels.reshape(height, width, 4)[::-1, :, :3] for pixels, (width, height) in raw]
 
 
 def rest(canvas: Canvas, state: ViewerState, now: float) -> None:

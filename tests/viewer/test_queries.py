@@ -199,13 +199,6 @@ def test_an_answer_is_explained_by_what_training_kept(opened, tmp_path, monkeypa
 # Own cuts, canonical phrases and sets of queries, without a window.
 
 
-@pytest.fixture
-def asked(opened):
-    """Three blobs, and "mug" asked."""
-    ask(opened, "mug")
-    return opened
-
-
 def test_an_answer_ends_where_one_says_and_can_end_by_itself_again(asked):
     (query,) = asked.state.queries
     automatic = query.result
