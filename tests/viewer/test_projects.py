@@ -77,11 +77,9 @@ def test_everything_comes_back(opened, saved, again):
         np.testing.assert_array_equal(one.result.members, other.result.members)
     assert marked(again) == marked(opened) == ("book", "plant", "")
     np.testing.assert_allclose(after.scene.gaussians.means, before.scene.gaussians.means, atol=1e-6)
-    assert (after.picture, after.settings.clip, after.notes) == (
-        before.picture,
-        before.settings.clip,
-        before.notes,
-    )
+    for name in ("picture", "notes"):
+        assert getattr(after, name) == getattr(before, name)
+    assert after.settings.clip == before.settings.clip
     np.testing.assert_allclose(after.view.eye, before.view.eye, atol=1e-9)
     np.testing.assert_allclose(after.view.target, before.view.target, atol=1e-6)
     assert len(after.record.keyframes) == 1
@@ -93,6 +91,16 @@ def test_everything_comes_back(opened, saved, again):
     act(opening.open_recent, again, str(saved))
     assert len(after.queries) == 4
     assert projects.save_project(again, Path("/nowhere")) == saved  # where it came from
+
+
+def test_a_project_without_its_scene_or_a_window_is_refused(saved, opened, run_viewer):
+    code, _, problems = run_viewer(str(saved), "--headless", "--out", "a.png")
+    assert code == 2
+    assert "project" in problems[0]
+    Path("blobs.ply").unlink()
+    opening.open_dropped(opened, [saved])
+    assert "not there" in errors(opened)[-1]
+    assert opened.state.scene is not None
 
 
 def test_other_programs_find_the_answers_in_it(opened, saved):
@@ -113,35 +121,6 @@ def test_a_scene_that_has_changed_keeps_its_questions_alone(saved, viewer, monke
     assert len(viewer.state.queries) == 4
     assert not viewer.state.selection.marks.selected.any()
     assert any("has changed" in text for text in errors(viewer))
-
-
-def test_a_scene_that_is_gone(saved, opened):
-    Path("blobs.ply").unlink()
-    opening.open_dropped(opened, [saved])
-    assert "not there" in errors(opened)[-1]
-    assert opened.state.scene is not None
-
-
-def test_projects_without_a_window_are_refused(saved, run_viewer):
-    code, _, problems = run_viewer(str(saved), "--headless", "--out", "a.png")
-    assert code == 2
-    assert "project" in problems[0]
-
-
-BITS = {
-    "not base64": "&&&",
-    "not zlib": b64encode(b"abc").decode(),
-    "too few": b64encode(zlib.compress(b"abc")).decode(),
-    "a bomb": b64encode(zlib.compress(bytes(50_000_000))).decode(),
-    "a number": 7,
-}
-
-
-@pytest.mark.parametrize("bits", BITS)
-def test_marks_that_are_none(saved, bits):
-    top = json.loads(saved.read_text())
-    top["marks"]["hidden"] = BITS[bits]
-    refuse(saved, top)
 
 
 def test_whatever_is_broken_is_one_line(saved):
@@ -165,32 +144,25 @@ def test_whatever_is_broken_is_one_line(saved):
                 refused.append(str(error))
     assert tried > len(refused) > 400
     assert not [text for text in refused if "\n" in text]
-    refuse(saved, {"format": "other"})
-    refuse(saved, {**top, "version": 2})
-    refuse(saved, [])
+    # Marks: not base64, not zlib, too few, a bomb, a number.
+    packed = [
+        b64encode(raw).decode() for raw in (b"abc", zlib.compress(b"abc"), zlib.compress(bytes(50_000_000)))
+    ]
+    marks = [{**top, "marks": {**top["marks"], "hidden": bits}} for bits in ("&&&", *packed, 7)]
+    for broken in ({"format": "other"}, {**top, "version": 2}, [], *marks):
+        saved.write_text(json.dumps(broken))
+        with pytest.raises(LangSplatError) as raised:
+            read_project(saved)
+        assert "\n" not in str(raised.value)
 
 
 def places(value, way=()):
     """Every place of a JSON value."""
     if way:
         yield way
-    entries = (
-        value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    )
-    for key, inner in entries:
-        yield from places(inner, (*way, key))
-
-
-def refuse(path: Path, top) -> None:
-    path.write_text(json.dumps(top))
-    with pytest.raises(LangSplatError) as raised:
-        read_project(path)
-    assert "\n" not in str(raised.value)
-
-
-def test_without_a_scene_there_is_nothing_to_save(viewer, tmp_path):
-    assert projects.save_project(viewer, tmp_path) is None
-    assert list(tmp_path.iterdir()) == []
+    if isinstance(value, dict | list):
+        for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from places(inner, (*way, key))
 
 
 def test_notes_are_pinned_written_and_taken_off(opened):
@@ -215,7 +187,8 @@ def test_notes_are_pinned_written_and_taken_off(opened):
     assert opened.state.notes == ()
 
 
-def test_notes_are_asked_about_before_the_window_closes(opened, tmp_path):
+@pytest.mark.parametrize("leave", [projects.save_and_leave, projects.end])
+def test_notes_are_asked_about_before_the_window_closes(opened, tmp_path, leave):
     projects.pin_at(opened, 0.5, 0.5)
     assert not selecting.may_close(opened)
     selecting.stay(opened)
@@ -224,17 +197,10 @@ def test_notes_are_asked_about_before_the_window_closes(opened, tmp_path):
     opened.state.selection = replace(opened.state.selection, may_close=False)
     undoing.redo(opened)
     assert not selecting.may_close(opened)
-    projects.save_and_leave(opened, tmp_path)
+    leave(opened, tmp_path)
     assert opened.state.selection.may_close
     assert len(read_project(tmp_path / "blobs-001.langsplat").notes) == 1
     assert selecting.may_close(opened)
-
-
-def test_a_process_that_has_to_end_saves_notes(opened, tmp_path):
-    projects.pin_at(opened, 0.5, 0.5)
-    projects.end(opened, tmp_path)
-    assert opened.state.selection.may_close
-    assert (tmp_path / "blobs-001.langsplat").exists()
 
 
 def test_notes_are_there_again_after_another_scene(opened):

@@ -9,7 +9,6 @@ from PIL import Image
 
 from langsplat_core.config import PictureConfig
 from langsplat_core.errors import InputError
-from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Scene
@@ -60,15 +59,8 @@ def edit_everything(viewer: Viewer, mode: str) -> None:
     state.selection = replace(state.selection, marks=marks)
     settings.set_splats(viewer, Splats(0.8, 0))
     settings.set_clip(viewer, Clip(0.5, 6.5))
-    picture = PictureConfig(
-        heat_opacity=0.6,
-        dim=0.7,
-        threshold=0.3,
-        alpha_gate=0.2,
-        heat_scale=(0.1, 0.8),
-        background=(0.1, 0.6, 0.3),
-    )
-    settings.set_picture(viewer, picture)
+    heat = {"heat_opacity": 0.6, "dim": 0.7, "threshold": 0.3, "heat_scale": (0.1, 0.8)}
+    settings.set_picture(viewer, PictureConfig(**heat, alpha_gate=0.2, background=(0.1, 0.6, 0.3)))
     settings.set_colour_map(viewer, "viridis")
     settings.set_display(viewer, "relevancy", 1)
     split = Split(mode, second="segmentation", second_level=0, at=0.4)
@@ -214,11 +206,8 @@ def test_the_second_pane_is_what_the_display_would_show_alone(opened):
 
 def test_three_levels_of_latents_or_of_answers(opened):
     settings.toggle_levels(opened)
-    assert [pane.label for pane in opened.state.panes()] == [
-        "Latent, subpart",
-        "Latent, part",
-        "Latent, whole",
-    ]
+    labels = [pane.label for pane in opened.state.panes()]
+    assert labels == ["Latent, subpart", "Latent, part", "Latent, whole"]
     opened.state.size = (200, 90)
     request = opened.state.request()
     assert (request.camera.width, request.camera.height, request.size) == (66, 90, (200, 90))
@@ -299,10 +288,9 @@ def test_only_the_selection_changes_its_colour_from_every_side():
     np.testing.assert_array_equal(tinted.gaussians.sh[~selected], source.gaussians.sh[~selected])
     assert tinted.antialiased == source.antialiased
     for camera in cameras():
-        ones = [scene.gaussians.take(selected) for scene in (source, tinted)]
-        views = [load_rasterizer("reference").view(gaussians, camera) for gaussians in ones]
         before, after = (
-            splat_colours(view, gaussians, camera) for view, gaussians in zip(views, ones, strict=True)
+            splat_colours(ReferenceRasterizer().view(gaussians, camera), gaussians, camera)
+            for gaussians in (source.gaussians.take(selected), tinted.gaussians.take(selected))
         )
         wanted = (1 - TINT_STRENGTH) * before.colours + TINT_STRENGTH * before.alpha[..., None] * TINT
         np.testing.assert_allclose(after.colours, wanted, atol=2e-5)
@@ -354,29 +342,19 @@ def test_splats_are_drawn_smaller_and_of_one_colour(opened):
 # Over the image: overlays and the ruler.
 
 
-def test_overlays_are_shown_and_remembered(opened, tmp_path):
+def test_overlays_and_colour_map_have_commands_and_are_remembered(opened, tmp_path):
     for name in reversed(OVERLAYS):
-        settings.toggle_overlay(opened, name)
+        (command,) = matching(OVERLAY_TITLES[name])
+        if name not in opened.state.preferences.overlays:
+            command.act(opened)
     assert opened.state.preferences.overlays == OVERLAYS
-    save_preferences(tmp_path, opened.state.preferences)
-    assert load_preferences(tmp_path).overlays == OVERLAYS
-    settings.show_overlay(opened, "cube", False)
-    settings.show_overlay(opened, "cube", False)
-    assert opened.state.preferences.overlays == tuple(name for name in OVERLAYS if name != "cube")
-
-
-def test_every_overlay_has_a_command(opened):
-    for name, title in OVERLAY_TITLES.items():
-        (command,) = matching(title)
-        command.act(opened)
-        assert name in opened.state.preferences.overlays
-
-
-def test_the_colour_map_is_remembered(opened, tmp_path):
     settings.set_colour_map(opened, "cividis")
     assert opened.state.request().picture.colour_map == "cividis"
     save_preferences(tmp_path, opened.state.preferences)
-    assert load_preferences(tmp_path).colour_map == "cividis"
+    assert load_preferences(tmp_path) == opened.state.preferences
+    for _ in range(2):
+        settings.show_overlay(opened, "cube", False)
+    assert opened.state.preferences.overlays == tuple(name for name in OVERLAYS if name != "cube")
     (tmp_path / FILE_NAME).write_text('{"colour_map": "rainbow"}')
     with pytest.raises(InputError, match=r"rainbow.*viridis"):
         load_preferences(tmp_path)
@@ -385,19 +363,15 @@ def test_the_colour_map_is_remembered(opened, tmp_path):
 def test_two_clicks_measure_and_a_third_begins_anew(opened):
     settings.toggle_measuring(opened)
     assert opened.state.ruler.length is None
+    settings.measure_at(opened, 0.95, 0.5)
+    assert opened.state.ruler.points == ()
+    assert "nothing under the cursor" in opened.state.messages[-1].text
     settings.measure_at(opened, 0.5, 0.5)
     settings.measure_at(opened, 0.8, 0.1)  # the fake surface: (u - 0.5, v - 0.5, 0)
     assert opened.state.ruler.length == pytest.approx(0.5)
     settings.measure_at(opened, 0.6, 0.6)
     assert opened.state.ruler.length is None
     assert len(opened.state.ruler.points) == 1
-
-
-def test_a_click_beside_everything_is_said(opened):
-    settings.measure(opened, True)
-    settings.measure_at(opened, 0.95, 0.5)
-    assert opened.state.ruler.points == ()
-    assert "nothing under the cursor" in opened.state.messages[-1].text
 
 
 def test_measuring_ends_with_esc_and_with_another_scene(opened):

@@ -41,6 +41,18 @@ def test_the_selection_moves_alone_and_is_found_where_it_went(opened):
     assert opened.state.scene.cameras is cameras
     np.testing.assert_allclose(opened.state.queries[0].result.place, place + STEP, atol=1e-4)
     np.testing.assert_array_equal(opened.state.selection.marks.selected, chosen)
+    queries.type_name(opened, "trophy")  # what is taught goes along
+    act(queries.name_selection, opened)
+    act(transforming.transform, opened, moving(STEP))
+    assert opened.engine.is_taught("trophy")
+    assert [word.name for word in opened.state.scene.language.taught] == ["trophy"]
+    opened.state.selection = replace(opened.state.selection, saved_moves=opened.state.selection.moves)
+    open_scene(opened, "plain.ply")  # begins without transforms, and has no language field
+    assert (opened.state.selection.moves, opened.state.opened) == ((), None)
+    before = means(opened)
+    act(transforming.transform, opened, moving(STEP))
+    np.testing.assert_allclose(means(opened), before + STEP, atol=1e-5)
+    assert opened.state.scene.language is None
 
 
 def test_the_whole_scene_takes_its_cameras_along(opened):
@@ -102,7 +114,7 @@ def test_a_held_gizmo_shows_what_release_does(opened):
 
 
 def test_what_is_saved_is_what_is_seen(opened, tmp_path):
-    chosen = selected_mug(opened)
+    selected_mug(opened)
     transforming.transform(opened, moving(STEP))
     act(selecting.export, opened, tmp_path, "edited")
     made = load_scene(next(tmp_path.glob("*.ply")))
@@ -112,16 +124,6 @@ def test_what_is_saved_is_what_is_seen(opened, tmp_path):
     transforming.transform(opened, moving(STEP))
     opening.open_scene(opened, Path("plain.ply"))  # is asked about first
     assert opened.state.selection.leaving is not None
-    assert chosen.any()
-
-
-def test_names_that_were_taught_go_along(opened):
-    selected_mug(opened)
-    queries.type_name(opened, "trophy")
-    act(queries.name_selection, opened)
-    act(transforming.transform, opened, moving(STEP))
-    assert opened.engine.is_taught("trophy")
-    assert [word.name for word in opened.state.scene.language.taught] == ["trophy"]
 
 
 def test_the_numbers_of_the_panel(opened):
@@ -181,12 +183,6 @@ def test_a_clip_follows_its_box_and_is_undone(opened):
     assert opened.state.selection.marks.shown.all()
 
 
-def test_the_corners_of_a_dragged_box():
-    matrix = np.diag([2.0, -4.0, 6.0, 1.0])  # a handle was dragged beyond the opposite one
-    matrix[:3, 3] = 1.0, 2.0, 3.0
-    assert box_of(matrix) == ((0.0, 0.0, 0.0), (2.0, 4.0, 6.0))
-
-
 def test_without_a_scene_nothing_happens(viewer):
     for action in (
         transforming.apply_form,
@@ -197,14 +193,6 @@ def test_without_a_scene_nothing_happens(viewer):
         action(viewer)
     transforming.preview(viewer, moving(STEP))
     assert viewer.state.moving is None
-
-
-def test_without_a_language_field(viewer):
-    open_scene(viewer, "plain.ply")
-    before = means(viewer)
-    act(transforming.transform, viewer, moving(STEP))
-    np.testing.assert_allclose(means(viewer), before + STEP, atol=1e-5)
-    assert viewer.state.scene.language is None
 
 
 @pytest.mark.parametrize("perspective", [True, False])
@@ -222,6 +210,9 @@ def test_the_gizmo_lies_where_the_camera_sees_it(perspective):
 
 
 def test_what_a_drag_means():
+    box = np.diag([2.0, -4.0, 6.0, 1.0])  # a handle was dragged beyond the opposite one
+    box[:3, 3] = 1.0, 2.0, 3.0
+    assert box_of(box) == ((0.0, 0.0, 0.0), (2.0, 4.0, 6.0))
     start = moving(np.array([1.0, 2.0, 3.0])).matrix
     turned = rotating(AXES["y"], 20).about(start[:3, 3])
     np.testing.assert_allclose(dragged(start, turned.matrix @ start).matrix, turned.matrix, atol=1e-9)
@@ -233,11 +224,3 @@ def test_what_a_drag_means():
     stretched[:3, :3] = 0
     with pytest.raises(InputError):
         dragged(start, stretched)
-
-
-def test_another_scene_begins_without_transforms(opened):
-    transforming.transform(opened, moving(STEP))
-    opened.state.selection = replace(opened.state.selection, saved_moves=opened.state.selection.moves)
-    open_scene(opened, "book.ply")
-    assert opened.state.selection.moves == ()
-    assert opened.state.opened is None
