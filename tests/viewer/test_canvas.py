@@ -2,7 +2,6 @@
 
 import gc
 import itertools
-import math
 import time
 import weakref
 from collections.abc import Callable, Iterator
@@ -16,20 +15,18 @@ import pytest
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.errors import BackendError
 from langsplat_core.raster import load_rasterizer
-from langsplat_core.raster.opengl.scene_textures import is_software
 from langsplat_viewer.actions import selecting, settings, undoing, viewpoint
 from langsplat_viewer.camera.controls import default_view, extent_of, orbit
 from langsplat_viewer.canvas import FINE, MOVING_BUDGET, NOTHING_LEFT, REST_SECONDS, Canvas, Level, Pace
 from langsplat_viewer.marks import unmarked
-from langsplat_viewer.panels.layout import in_numbers
 from langsplat_viewer.rendering import renderer as renderers
 from langsplat_viewer.rendering.depth import Clip
-from langsplat_viewer.rendering.renderer import ArrayRenderer, GlRenderer
+from langsplat_viewer.rendering.renderer import GlRenderer
 from langsplat_viewer.rendering.request import Splats
-from langsplat_viewer.state import KEPT, LONGEST_SIDE, Timing, ViewerState, compared, compared_size
+from langsplat_viewer.state import ViewerState
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
-from tests.support.windowless import CHANGES, FakeRenderer, ask, errors, go, on_screen, recorded, rest
+from tests.support.windowless import CHANGES, FakeRenderer, go, on_screen, rest
 
 
 @pytest.fixture
@@ -490,126 +487,3 @@ def test_only_merged_gaussians_stand_in():
     assert after((FINE, 150)).stand_in() == MERGED
     assert after((FINE, 1000)).stand_in() == COARSEST
     assert after((FINE, 1e5)).stand_in() is None
-
-
-# Times of the steps, and the comparison with the reference.
-
-
-def test_the_median_of_the_last_measurements_is_told():
-    timing = Timing()
-    for value in (1000.0, *range(KEPT)):
-        timing.add("sort", value)
-    timing.add("blend", 2.0)
-    assert timing.medians() == [("Sort", (KEPT - 1) / 2), ("Blend", 2.0)]
-
-
-def test_errors_are_those_of_the_pictures():
-    shown = np.zeros((2, 5, 3), np.uint8)
-    reference = shown.copy()
-    assert compared(shown, reference, "cpu").psnr == math.inf
-    assert "every pixel is the same" in in_numbers(compared(shown, reference, "cpu"))
-    reference[0, 0] = (255, 0, 0)
-    found = compared(shown, reference, "cpu")
-    assert (found.size, found.largest, found.mean) == ((5, 2), 255, 255 / 30)
-    assert found.psnr == pytest.approx(10 * math.log10(30))
-    assert "5 x 2: error at most 255 of 255, mean 8.5, PSNR 14.8 dB" in in_numbers(found)
-
-
-@pytest.fixture(params=["cpu", "opengl"])
-def drawn(gl, opened, request):
-    """A viewer with a real picture."""
-    renderer = GlRenderer(gl, request.param, "single")
-    opened.surface = canvas = Canvas(gl, renderer)
-    opened.state.backend = renderer.backend
-    settings.resize(opened, 400, 300)
-    rest(canvas, opened.state, 0.0)
-    yield opened
-    renderer.release()
-
-
-def test_the_steps_of_a_picture_are_measured_while_the_panel_is_seen(gl, drawn):
-    assert drawn.state.timing.medians() == []
-    viewpoint.measure_frame(drawn)
-    drawn.state.coarse_while_moving = False
-    go(viewpoint.look_from, drawn, "left")
-    rest(drawn.surface, drawn.state, 10.0)
-    laps, steps = drawn.state.timing.laps, {"projection", "sort", "blend", "compose"}
-    if drawn.state.backend == "cpu":
-        steps |= {"tiles", "colours"} if is_software(gl) else {"tiles", "colours", "upload"}
-    assert laps.keys() == steps | {"picture"}
-    assert sum(laps[name][0] for name in steps) <= laps["picture"][0]
-
-
-def test_the_panel_has_a_picture_measured_when_it_opens(drawn):
-    """All of its steps, though nothing has changed; once."""
-    for now in (10.0, 11.0):
-        viewpoint.measure_frame(drawn)
-        rest(drawn.surface, drawn.state, now)
-        counts = {name: len(measured) for name, measured in drawn.state.timing.laps.items()}
-        assert counts.keys() >= {"projection", "sort", "blend", "compose", "picture"}
-        assert set(counts.values()) == {1}
-    drawn.state.timing.wanted = False  # closed, and opened again
-    rest(drawn.surface, drawn.state, 12.0)
-    viewpoint.measure_frame(drawn)
-    rest(drawn.surface, drawn.state, 13.0)
-    assert {len(measured) for measured in drawn.state.timing.laps.values()} == {2}
-
-
-def change_everything(viewer: Viewer) -> None:
-    selecting.select_all(viewer)
-    settings.set_splats(viewer, Splats(0.5, 0))
-    settings.set_clip(viewer, Clip(1.0, 5.2))
-    settings.set_colour_map(viewer, "viridis")
-
-
-LOOKS = {
-    "heat": ask,
-    "wipe": settings.toggle_wipe,
-    "levels": settings.toggle_levels,
-    "changed": change_everything,
-}
-
-
-@pytest.mark.parametrize("look", ["plain", *LOOKS])
-def test_what_is_shown_is_that_of_the_reference(drawn, look):
-    """Whatever is chosen in the window: queries, split, marks, cuts, splats."""
-    if look != "plain":
-        ask(drawn, "mug")
-        LOOKS[look](drawn)
-    viewpoint.compare_with_reference(drawn)
-    recorded(drawn)
-    found = drawn.state.timing.comparison
-    assert errors(drawn) == []
-    assert LONGEST_SIDE - 3 < max(found.size) <= LONGEST_SIDE
-    assert found.backend == drawn.state.backend
-    assert found.mean < 0.05
-    assert found.psnr > 45
-
-
-def test_what_is_wrong_is_told(drawn, monkeypatch):
-    request = drawn.state.request(compared_size(drawn.state.size))
-    right = ArrayRenderer(load_rasterizer("reference")).read(request).astype(int)
-    capture = drawn.surface.capture
-    monkeypatch.setattr(drawn.surface, "capture", lambda state: 255 - capture(state))
-    viewpoint.compare_with_reference(drawn)
-    recorded(drawn)
-    found = drawn.state.timing.comparison
-    assert found.largest == 255
-    assert found.mean == pytest.approx(np.abs(255 - 2 * right).mean(), abs=1)
-
-
-def test_the_picture_on_screen_is_drawn_again_after_it(drawn):
-    viewpoint.compare_with_reference(drawn)
-    recorded(drawn)
-    rest(drawn.surface, drawn.state, 2.0)
-    assert drawn.surface.textures[0].size == (400, 300)
-    assert drawn.surface.depths().shape == (300, 400)
-
-
-def test_a_comparison_is_one_at_a_time_and_can_be_left(drawn):
-    viewpoint.compare_with_reference(drawn)
-    viewpoint.compare_with_reference(drawn)
-    assert "wait for it or cancel it" in errors(drawn)[-1]
-    viewpoint.stop_comparing(drawn)
-    recorded(drawn)
-    assert drawn.state.timing.comparison is None

@@ -1,5 +1,6 @@
 """Render requests: what they depend on, their panes, the edited scene; and that every image is one."""
 
+import math
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from PIL import Image
 
 from langsplat_core.config import PictureConfig
 from langsplat_core.errors import InputError
+from langsplat_core.raster.opengl.scene_textures import is_software
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Scene
@@ -18,6 +20,7 @@ from langsplat_viewer.commands import BUTTONS, COMMANDS, OVERLAY_TITLES, matchin
 from langsplat_viewer.files.preferences import FILE_NAME, load_preferences, save_preferences
 from langsplat_viewer.marks import Marks
 from langsplat_viewer.output import film, saving
+from langsplat_viewer.panels.layout import in_numbers
 from langsplat_viewer.panels.overlays import STEPS, bar_colours
 from langsplat_viewer.panels.view import compared_name
 from langsplat_viewer.rendering.depth import Clip
@@ -35,7 +38,7 @@ from langsplat_viewer.rendering.request import (
     plain_request,
     with_splats,
 )
-from langsplat_viewer.state import OVERLAYS, Ruler
+from langsplat_viewer.state import KEPT, LONGEST_SIDE, OVERLAYS, Ruler, Timing, compared, compared_size
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene, cameras
 from tests.support.marks_and_flights import blob
@@ -380,3 +383,111 @@ def test_measuring_ends_with_esc_and_with_another_scene(opened):
         settings.measure_at(opened, 0.5, 0.5)
         end(opened)
         assert opened.state.ruler == Ruler()
+
+
+# Times of the steps, and the comparison with the reference.
+
+
+def test_the_median_of_the_last_measurements_is_told():
+    timing = Timing()
+    for value in (1000.0, *range(KEPT)):
+        timing.add("sort", value)
+    timing.add("blend", 2.0)
+    assert timing.medians() == [("Sort", (KEPT - 1) / 2), ("Blend", 2.0)]
+
+
+def test_errors_are_those_of_the_pictures():
+    shown = np.zeros((2, 5, 3), np.uint8)
+    reference = shown.copy()
+    assert compared(shown, reference, "cpu").psnr == math.inf
+    assert "every pixel is the same" in in_numbers(compared(shown, reference, "cpu"))
+    reference[0, 0] = (255, 0, 0)
+    found = compared(shown, reference, "cpu")
+    assert (found.size, found.largest, found.mean) == ((5, 2), 255, 255 / 30)
+    assert found.psnr == pytest.approx(10 * math.log10(30))
+    assert "5 x 2: error at most 255 of 255, mean 8.5, PSNR 14.8 dB" in in_numbers(found)
+
+
+@pytest.fixture(params=["cpu", "opengl"])
+def drawn(gl, opened, request):
+    """A viewer with a real picture."""
+    renderer = GlRenderer(gl, request.param, "single")
+    opened.surface = canvas = Canvas(gl, renderer)
+    opened.state.backend = renderer.backend
+    settings.resize(opened, 400, 300)
+    rest(canvas, opened.state, 0.0)
+    yield opened
+    renderer.release()
+
+
+def test_the_steps_of_a_picture_are_measured_while_the_panel_is_seen(gl, drawn):
+    assert drawn.state.timing.medians() == []
+    viewpoint.measure_frame(drawn)
+    drawn.state.coarse_while_moving = False
+    go(viewpoint.look_from, drawn, "left")
+    rest(drawn.surface, drawn.state, 10.0)
+    laps, steps = drawn.state.timing.laps, {"projection", "sort", "blend", "compose"}
+    if drawn.state.backend == "cpu":
+        steps |= {"tiles", "colours"} if is_software(gl) else {"tiles", "colours", "upload"}
+    assert laps.keys() == steps | {"picture"}
+    assert sum(laps[name][0] for name in steps) <= laps["picture"][0]
+
+
+def test_the_panel_has_a_picture_measured_when_it_opens(drawn):
+    """All of its steps, though nothing has changed; once."""
+    for now in (10.0, 11.0):
+        viewpoint.measure_frame(drawn)
+        rest(drawn.surface, drawn.state, now)
+        counts = {name: len(measured) for name, measured in drawn.state.timing.laps.items()}
+        assert counts.keys() >= {"projection", "sort", "blend", "compose", "picture"}
+        assert set(counts.values()) == {1}
+    drawn.state.timing.wanted = False  # closed, and opened again
+    rest(drawn.surface, drawn.state, 12.0)
+    viewpoint.measure_frame(drawn)
+    rest(drawn.surface, drawn.state, 13.0)
+    assert {len(measured) for measured in drawn.state.timing.laps.values()} == {2}
+
+
+@pytest.mark.parametrize("mode", ["off", "wipe", "levels"])
+def test_what_is_shown_is_that_of_the_reference(drawn, mode):
+    """Whatever is chosen in the window: queries, split, marks, cuts, splats."""
+    if mode != "off":
+        edit_everything(drawn, mode)
+        settings.resize(drawn, 400, 300)
+    viewpoint.compare_with_reference(drawn)
+    recorded(drawn)
+    found = drawn.state.timing.comparison
+    assert errors(drawn) == []
+    assert LONGEST_SIDE - 3 < max(found.size) <= LONGEST_SIDE
+    assert found.backend == drawn.state.backend
+    assert found.mean < 0.05
+    assert found.psnr > 45
+
+
+def test_what_is_wrong_is_told(drawn, monkeypatch):
+    request = drawn.state.request(compared_size(drawn.state.size))
+    right = ArrayRenderer(ReferenceRasterizer()).read(request).astype(int)
+    capture = drawn.surface.capture
+    monkeypatch.setattr(drawn.surface, "capture", lambda state: 255 - capture(state))
+    viewpoint.compare_with_reference(drawn)
+    recorded(drawn)
+    found = drawn.state.timing.comparison
+    assert found.largest == 255
+    assert found.mean == pytest.approx(np.abs(255 - 2 * right).mean(), abs=1)
+
+
+def test_the_picture_on_screen_is_drawn_again_after_it(drawn):
+    viewpoint.compare_with_reference(drawn)
+    recorded(drawn)
+    rest(drawn.surface, drawn.state, 2.0)
+    assert drawn.surface.textures[0].size == (400, 300)
+    assert drawn.surface.depths().shape == (300, 400)
+
+
+def test_a_comparison_is_one_at_a_time_and_can_be_left(drawn):
+    viewpoint.compare_with_reference(drawn)
+    viewpoint.compare_with_reference(drawn)
+    assert "wait for it or cancel it" in errors(drawn)[-1]
+    viewpoint.stop_comparing(drawn)
+    recorded(drawn)
+    assert drawn.state.timing.comparison is None
