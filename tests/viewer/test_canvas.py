@@ -338,26 +338,18 @@ def test_what_changes_no_projection_does_not_begin_anew(gl, asked, begun, gated)
     assert_rests_as_drawn_anew(gl, begun, asked, 2.0)
 
 
-def test_a_camera_that_moves_on_is_followed_coarsely(asked, begun, gated):
+@pytest.mark.parametrize("coarse", [True, False])
+def test_a_camera_that_moves_on_is_followed_in_the_windows_thread(asked, begun, gated, coarse):
+    asked.state.coarse_while_moving = coarse
     go(viewpoint.look_from, asked, "left")
     begun.update(asked.state, 10.0)
     assert gated.threads[1:] == [main_thread()]
     assert not begun.waits
-    assert asked.state.stats.scale < 1
+    assert (asked.state.stats.scale < 1) == coarse
     gated.gate.set()
     until(lambda: not begun.is_running)
     begun.update(asked.state, 10.01)
-    assert asked.state.stats.scale < 1  # of the old view nothing is shown
-
-
-def test_told_to_stay_fine_it_draws_while_the_camera_moves(asked, canvas, gated):
-    asked.state.coarse_while_moving = False
-    gated.gate.set()
-    rest(canvas, asked.state, 0.0)
-    go(viewpoint.look_from, asked, "left")
-    canvas.update(asked.state, 10.0)
-    assert gated.threads[1:] == [main_thread()]
-    assert asked.state.stats.scale == 1
+    assert (asked.state.stats.scale < 1) == coarse  # of the old view nothing is shown
 
 
 def test_an_error_is_said_once_and_another_picture_is_tried(gl, asked, canvas, gated):
@@ -398,8 +390,7 @@ def test_closing_does_not_wait_for_it(begun, gated):
     begun.close()
     assert begun.is_running
     gated.gate.set()
-    until(lambda: not begun.is_running)
-    until(lambda: not gated.threads[0].is_alive())
+    until(lambda: not begun.is_running and not gated.threads[0].is_alive())
 
 
 def test_it_wakes_the_window(asked, begun, gated):
@@ -440,18 +431,19 @@ def after(*pictures: tuple[Level, float]) -> Pace:
 
 
 @pytest.mark.parametrize(
-    ("fine_ms", "plain", "with_merged"),
+    ("fine_ms", "plain", "with_merged", "stand_in"),
     [
-        (0, FINE, FINE),
-        (MOVING_BUDGET, FINE, FINE),
-        (3 * MOVING_BUDGET, HALF, HALF),
-        (12 * MOVING_BUDGET, QUARTER, MERGED),
-        (1e5, QUARTER, COARSEST),
+        (0, FINE, FINE, MERGED),
+        (MOVING_BUDGET, FINE, FINE, MERGED),
+        (3 * MOVING_BUDGET, HALF, HALF, MERGED),
+        (12 * MOVING_BUDGET, QUARTER, MERGED, MERGED),
+        (1000, QUARTER, COARSEST, COARSEST),
+        (1e5, QUARTER, COARSEST, None),
     ],
 )
-def test_first_guess(fine_ms, plain, with_merged):
+def test_first_guess(fine_ms, plain, with_merged, stand_in):
     pace = after((FINE, fine_ms))
-    assert (pace.level(False), pace.level(True)) == (plain, with_merged)
+    assert (pace.level(False), pace.level(True), pace.stand_in()) == (plain, with_merged, stand_in)
     assert pace.is_slow == (fine_ms > MOVING_BUDGET)
 
 
@@ -481,9 +473,3 @@ def test_other_scenes_take_as_long_as_they_are_large():
     assert pace.level(False) == HALF
     pace.expect(50_000)
     assert pace.level(False) == FINE
-
-
-def test_only_merged_gaussians_stand_in():
-    assert after((FINE, 150)).stand_in() == MERGED
-    assert after((FINE, 1000)).stand_in() == COARSEST
-    assert after((FINE, 1e5)).stand_in() is None

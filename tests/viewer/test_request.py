@@ -152,14 +152,6 @@ UNSEEN = {
 }
 
 
-@pytest.mark.parametrize("name", SEEN)
-def test_what_is_seen_is_in_it(asked, name):
-    before = asked.state.request()
-    assert asked.state.request() == before
-    go(SEEN[name], asked)
-    assert asked.state.request() != before
-
-
 @pytest.mark.parametrize("name", UNSEEN)
 def test_what_is_not_seen_is_not_in_it(asked, name):
     before = asked.state.request().without_line()
@@ -182,9 +174,11 @@ def test_equal_requests_have_equal_keys_and_the_same_channels(asked):
 @pytest.mark.parametrize("name", SEEN)
 def test_what_is_kept_gives_the_image_that_a_new_renderer_gives(gl, asked, name, backend):
     kept, fresh = GlRenderer(gl, backend), GlRenderer(gl, backend)
-    canvas = Canvas(gl, kept)
+    canvas, before = Canvas(gl, kept), asked.state.request()
+    assert asked.state.request() == before
     canvas.update(asked.state, 0.0)
     go(SEEN[name], asked)
+    assert asked.state.request() != before
     canvas.update(asked.state, 20.0)
     canvas.update(asked.state, 30.0)
     expected = fresh.read(asked.state.request())
@@ -226,12 +220,6 @@ def test_three_levels_of_latents_or_of_answers(opened):
     assert [pane.label for pane in opened.state.panes()] == ["Segmentation"]
 
 
-def test_the_line_stays_within_reach(opened):
-    for at, kept in ((-3.0, AT_RANGE[0]), (0.3, 0.3), (2.0, AT_RANGE[1])):
-        settings.move_line(opened, at)
-        assert opened.state.settings.split.at == kept
-
-
 def test_without_a_field_levels_and_latents_are_refused(viewer):
     viewer.state.scene = Scene(random_gaussians(5))
     settings.toggle_levels(viewer)
@@ -245,21 +233,18 @@ def test_without_a_field_levels_and_latents_are_refused(viewer):
     assert len({compared_name(button) for button in BUTTONS}) == len(BUTTONS)
 
 
-@pytest.mark.parametrize(("u", "inside"), [(0.0, 0.0), (0.2, 0.6), (0.5, 0.5), (1.0, 1.0)])
-def test_a_place_in_a_column(u, inside):
-    assert Split("levels").within_pane(u) == pytest.approx(inside)
-    assert Split("wipe").within_pane(u) == u
-
-
-def test_panes_are_joined_as_they_are_shown():
+def test_panes_are_joined_as_they_are_shown_and_the_line_stays_within_reach(opened):
+    for at, kept in ((-3.0, AT_RANGE[0]), (0.3, 0.3), (2.0, AT_RANGE[1])):
+        settings.move_line(opened, at)
+        assert opened.state.settings.split.at == kept
+    for u, inside in ((0.0, 0.0), (0.2, 0.6), (0.5, 0.5), (1.0, 1.0)):
+        assert Split("levels").within_pane(u) == pytest.approx(inside)
+        assert Split("wipe").within_pane(u) == u
     dark, light = np.zeros((2, 10, 3), np.uint8), np.full((2, 10, 3), 9, np.uint8)
     wiped = Split("wipe", at=0.3).joined([dark, light], 10)
     assert wiped[0, :, 0].tolist() == [0] * 3 + [9] * 7
     wide = Split("levels").joined([dark, dark, light], 32)  # two pixels are left over
     assert wide[0, :, 0].tolist() == [0] * 20 + [9] * 12
-
-
-# The edited scene.
 
 
 def test_colour_bars_end_where_the_image_does():
@@ -270,6 +255,9 @@ def test_colour_bars_end_where_the_image_does():
     assert alone[-1, 0] > alone[-1, 2]  # red is hot
 
 
+# The edited scene.
+
+
 def test_hidden_and_deleted_ones_are_left_out_with_their_rows_of_the_layers():
     edited = edited_scene(SCENE, Marks(NOTHING, blob("mug"), blob("plant")))
     np.testing.assert_array_equal(edited.rows, np.flatnonzero(blob("book")))
@@ -278,6 +266,8 @@ def test_hidden_and_deleted_ones_are_left_out_with_their_rows_of_the_layers():
     np.testing.assert_array_equal(edited.values(values), values[blob("book")])
     everything = np.ones(360, bool)
     assert len(edited_scene(SCENE, Marks(NOTHING, everything, NOTHING)).scene.gaussians) == 0
+    for other in (everything[:0], everything[:-1]):  # marks of another scene count as none
+        assert edited_scene(SCENE, Marks(other, other, other)).scene is SCENE
 
 
 def test_only_the_selection_changes_its_colour_from_every_side():
@@ -322,12 +312,6 @@ def test_nothing_is_made_twice():
     other = edited_scene(blob_scene(), marks, first)
     assert other.source is not SCENE
     assert other.scene is not first.scene
-
-
-@pytest.mark.parametrize("count", [0, 359])
-def test_marks_of_another_scene_count_as_none(count):
-    everything = np.ones(count, bool)
-    assert edited_scene(SCENE, Marks(everything, everything, everything)).scene is SCENE
 
 
 def test_splats_are_drawn_smaller_and_of_one_colour(opened):
@@ -375,9 +359,6 @@ def test_two_clicks_measure_and_a_third_begins_anew(opened):
     settings.measure_at(opened, 0.6, 0.6)
     assert opened.state.ruler.length is None
     assert len(opened.state.ruler.points) == 1
-
-
-def test_measuring_ends_with_esc_and_with_another_scene(opened):
     for end in (settings.escape, lambda viewer: open_scene(viewer, "plain.ply")):
         settings.measure(opened, True)
         settings.measure_at(opened, 0.5, 0.5)
