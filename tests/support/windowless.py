@@ -129,6 +129,11 @@ def arrive(viewer: Viewer) -> None:
     viewpoint.tick(viewer, viewer.clock + 2 * GLIDE_SECONDS)
 
 
+def phrases(viewer: Viewer) -> list[str]:
+    """Of the queries, in their order."""
+    return [query.phrase for query in viewer.state.queries]
+
+
 def errors(viewer: Viewer) -> list[str]:
     return [message.text for message in viewer.state.messages if message.is_error]
 

@@ -18,11 +18,7 @@ from langsplat_viewer.output.headless import describe
 from langsplat_viewer.panels.search import BINS, hint, histogram
 from langsplat_viewer.viewer import Services
 from tests.support.fakes import CENTRES, FakeEncoder, as_trained, axis, blob_scene, calibrated_for, language
-from tests.support.windowless import SCENES, act, ask, errors, load, open_scene, settle
-
-
-def phrases(viewer) -> list[str]:
-    return [query.phrase for query in viewer.state.queries]
+from tests.support.windowless import SCENES, act, ask, errors, load, open_scene, phrases, settle
 
 
 def test_a_query_is_answered_and_shown(opened):

@@ -14,11 +14,7 @@ from langsplat_viewer.actions.selecting import mark
 from langsplat_viewer.marks import Marks, hiding, unmarked
 from langsplat_viewer.rendering.depth import Clip
 from langsplat_viewer.rendering.request import Splats
-from tests.support.windowless import act, ask, open_scene, settle
-
-
-def phrases(viewer) -> list[str]:
-    return [query.phrase for query in viewer.state.queries]
+from tests.support.windowless import act, ask, open_scene, phrases, settle
 
 
 def test_a_query_is_undone_and_done_again(opened):
