@@ -11,13 +11,12 @@ from contextlib import contextmanager
 from functools import reduce
 from operator import or_
 from pathlib import Path
+from threading import Event, Timer
 
 import numpy as np
 from PIL import Image
 
 from imgui_bundle import ImVec2, hello_imgui, imgui  # isort: skip
-from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
-import glfw  # isort: skip
 from imgui_bundle.immapp import testing  # isort: skip
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.displays import QUERY_COLOURS
@@ -25,10 +24,7 @@ from langsplat_core.errors import BackendError
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions import selecting, settings
-from langsplat_viewer.commands import COMMANDS
-from langsplat_viewer.files.preferences import with_recent
 from langsplat_viewer.panels.style import scene_area
-from langsplat_viewer.panels.toolbar import button_label
 from langsplat_viewer.rendering.renderer import Backend, GlRenderer
 from langsplat_viewer.viewer import Services, Viewer
 from langsplat_viewer.window import Window, WindowRequest
@@ -402,176 +398,22 @@ def broken_renderer(s: Session) -> None:
     assert s.shot("mended")[:, 400:].max() > 100
 
 
+READ_ON = Event()
+
+
+def slow_load(path: Path) -> Scene:
+    """As long as the scenario wants it to."""
+    assert READ_ON.wait(PATIENCE)
+    return load_scene(path)
+
+
 def close_while_opening(s: Session) -> None:
     """The window may be closed at any time; the process ends when the reading does."""
     assert s.state.scene is None
     assert s.viewer.worker.current is not None
     s.ctx.item_click("//**/Cancel")
     assert s.viewer.worker.current is None
-
-
-def use_the_palette(s: Session) -> None:
-    """Its keys keep away from the scrollbar; Enter does the first command that matches, which is lit."""
-    s.key("Ctrl+Shift+P", frames=3)
-    box, bar = s.ctx.item_info("//Commands/##command").rect_full, imgui.get_style().scrollbar_size
-    right, rows = int(box.max.x - bar), slice(int(box.max.y) + 30, int(box.max.y) + 150)
-    seen = s.shot("palette")[rows]
-    assert np.ptp(seen[:, right - 100 : right], axis=0).max() > 60  # keys
-    assert np.ptp(seen[:, right - 5 : right - 1], axis=0).max() < 10
-    s.enter("show depth", frames=3)
-    assert s.state.picture.display == "depth"
-    assert not s.state.show_palette
-
-    s.key("Ctrl+Shift+P", frames=3)
-    for width, height in ((1100, 600), (200, 150)):
-        resize(s, width, height)
-        palette = s.ctx.window_info("//Commands").window
-        assert abs(palette.pos.x + palette.size.x / 2 - width / 2) < 2 or width == 200
-        assert 0 <= palette.pos.x <= palette.pos.x + palette.size.x <= width
-    s.key("escape", frames=1)
-    resize(s, 860, 620)
-
-
-def resize(s: Session, width: int, height: int) -> None:
-    glfw.set_window_size(glfw_window_hello_imgui(), width, height)
-    s.until(lambda: imgui.get_main_viewport().size.x == width)
-
-
-def look_from_the_broad_side(s: Session) -> None:
-    """Without cameras, and upright: the blobs lie beside each other, none behind another."""
-    assert s.state.scene.cameras == ()
-    assert abs(s.state.view.rotation[2] @ [1, 0, 0]) < 0.5  # along which the blobs lie
-    assert abs(s.state.view.rotation[0] @ s.state.view.up) < 1e-6
-    rgb = s.shot("bare")
-    assert [s.at(rgb, thing).argmax() for thing in CENTRES] == [0, 1, 2]
-
-
-def use_shortcuts(s: Session) -> None:
-    """Chords work everywhere, letters only by themselves and never while typing."""
-    before = s.state.view
-    for key in "RPD2E":
-        s.key(f"Ctrl+{key}", frames=3)
-    assert s.state.view is before
-    assert s.state.picture.display == "rgb"
-    assert not list(s.folder.glob("blobs-*.png"))
-
-    s.key("Ctrl+F", frames=3)
-    s.type("far", frames=3)
-    assert (s.state.typed, s.state.view is before) == ("far", True)
-    s.key("f1", frames=2)  # also while typing
-    assert s.state.show_help
-    s.key("f1", frames=1)
-    s.key("escape", frames=3)
-    assert not imgui.get_io().want_text_input
-    assert not s.state.show_help
-    s.key("Shift+F")
-    assert s.state.view is not before
-    for back, start in (("home", (600, 300)), ("R", (560, 340))):  # apart: never a double click
-        s.drag(start, (656, 279))
-        s.key(back)
-        first = s.state.scene.cameras[0].world_to_camera
-        np.testing.assert_allclose(s.state.view.camera(160, 120).world_to_camera, first, atol=1e-9)
-
-    s.key("Ctrl+S", frames=1)
-    s.wait((s.folder / "blobs-001.png").exists)
-    s.type("?")
-    assert s.state.show_help
-    s.key("escape", frames=1)
-    use_the_palette(s)
-    s.key("Ctrl+Z", frames=2)
-    assert s.state.picture.display == "rgb"
-    s.key("Ctrl+O", frames=3)
-    assert s.ctx.item_exists("//**/##path")
-
-
-def use_the_toolbar(s: Session) -> None:
-    """Every icon does what its command does, and is lit where that is on; queries are combined by a menu."""
-    labels = {row.does: button_label(row).replace("/", "\\/") for row in COMMANDS if row.icon}
-    icons = {does: f"//toolbar/{label}" for does, label in labels.items()}
-    for does, icon in icons.items():
-        assert s.ctx.item_exists(icon), does
-    s.ctx.item_click(icons["show depth"])
-    s.click(icons["select: lasso"], frames=2)
-    assert (s.state.picture.display, s.state.selection.tool) == ("depth", "lasso")
-    s.ctx.item_click(icons["select with no tool: the left button turns the view"])
-    for phrase in ("mug", "book"):
-        s.search(phrase)
-    s.ctx.item_click("//**/mug##phrase of list")
-    s.click("//Search/Combine", frames=2)
-    s.click("//$FOCUSED/or", frames=2)
-    s.click("//**/book##other")
-    assert [query.phrase for query in s.state.queries] == ["mug", "book", "mug or book"]
-    s.click("//**/Fixed heat scale", frames=2)
-    lows, highs = zip(*(query.result.heat_range for query in s.state.shown()), strict=True)
-    assert s.state.picture.heat_scale == (min(lows), max(highs))
-
-
-def many_queries(s: Session) -> None:
-    """However many there are and however long: the list keeps its place, the newest is on top."""
-    display = s.ctx.item_info("//**/Colours").rect_full.min.y
-    long = "a mug or a book or a plant or another mug or plant"
-    for phrase in ("mug", "plant", "book or plant", long, "pot"):
-        s.search(phrase)
-        assert s.ctx.item_info("//**/Colours").rect_full.min.y == display
-    names = [f"//**/{query.phrase}/x" for query in s.state.queries]
-    closes = [s.ctx.item_info(name).rect_full for name in names if s.ctx.item_exists(name)]
-    ((_, right),) = {(rect.min.x, rect.max.x) for rect in closes}
-    assert right <= s.ctx.item_info("//Search/Search").rect_full.max.x + 1
-    phrase = s.state.queries[-1].phrase
-    s.click(f"//**/{phrase}/x", frames=2)
-    assert phrase not in [query.phrase for query in s.state.queries]
-    assert s.ctx.item_info("//**/Colours").rect_full.min.y == display
-
-
-def arrange_panels(s: Session) -> None:
-    """Menus do what keys do; panels are closed, opened and moved; the browser opens a scene."""
-    s.menu("View", "Show depth")
-    assert s.state.picture.display == "depth"
-    s.menu("Window", "Light theme")
-    light = s.shot("light")
-    assert light[300:500, 5].min() > 150
-    whole = s.state.size
-    for title in ("Search", "Scene", "Display", "Camera", "Messages"):
-        s.menu("Window", title)
-    assert s.state.size[0] == 860 > whole[0]  # the scene has taken their place
-    s.key("Ctrl+F", frames=4)
-    s.type("mug", frames=3)
-    assert s.state.typed == "mug"  # the panel is open again, and its box has the keyboard
-    s.key("escape", frames=1)
-    s.menu("Window", "Panels as at first")
-    for title in ("Scene", "Display", "Camera", "Messages"):
-        if not s.ctx.item_exists(f"//{title}"):
-            s.menu("Window", title)
-    s.key("Ctrl+O")
-    assert s.state.browser.folder == s.folder.absolute()
-    s.ctx.item_click("//**/plain.ply")
-    s.shows("plain.ply")
-    assert s.state.browser is None
-    s.key("Ctrl+O", frames=4)
-    s.key("escape", frames=3)
-    assert s.state.browser is None
-
-
-def leave_settings(s: Session) -> None:
-    """The next window finds them; see `find_settings`."""
-    assert s.state.show_help  # at the first start
-    s.key("escape", frames=1)
-    s.menu("Window", "Light theme")
-    for title in ("Select", "Train", "Record"):  # which do not lie over the search the next time
-        s.menu("Window", title)
-    s.menu("Window", "Display")
-    s.key("f11")  # hidden at the end, there again the next time
-    assert s.state.size[0] == 860
-
-
-def find_settings(s: Session) -> None:
-    """What `leave_settings` has left."""
-    assert not s.state.show_help
-    assert s.state.preferences.theme == "light"
-    assert [Path(path).name for path in s.state.preferences.recent] == ["blobs.ply"]
-    assert s.state.size[0] < 700
-    assert s.ctx.item_exists("//**/##phrase")
-    assert not s.ctx.item_exists("//**/Colours")
+    Timer(1.0, READ_ON.set).start()  # when the window is closed
 
 
 def type_while_opening(s: Session) -> None:
@@ -586,41 +428,17 @@ def type_while_opening(s: Session) -> None:
     assert not any("picture" in message.text for message in s.state.messages)
     s.click_at((600, 400), frames=2)
     assert not s.state.letters_muted
+    READ_ON.set()
     s.wait(lambda: s.state.scene is not None)
 
 
-def travel_by_keys(s: Session) -> None:
-    """Esc closes a menu; Tab goes from field to field, and the panels stay; the palette knows everything."""
-    s.ctx.item_click("//**/##MenuBar/View")
-    assert imgui.is_popup_open("", imgui.PopupFlags_.any_popup)
-    s.key("escape", frames=2)
-    assert not imgui.is_popup_open("", imgui.PopupFlags_.any_popup)
-    s.key("Ctrl+F", frames=4)
-    seen = set()
-    for _ in range(12):
-        s.key("tab", frames=2)
-        seen.add(imgui.internal.get_focus_id())
-    assert len(seen) > 5
-    assert s.state.show_panel
-    for words, done in (
-        ("light theme", lambda: s.state.preferences.theme == "light"),
-        ("letters of 125", lambda: s.state.preferences.ui_scale == 1.25),
-        ("open plain", lambda: s.state.path.name == "plain.ply"),
-    ):
-        if words == "open plain":
-            s.state.preferences = with_recent(s.state.preferences, s.folder / "plain.ply")
-        s.key("Ctrl+Shift+P", frames=3)
-        s.ctx.key_chars_append_enter(words)
-        s.until(done)
-    s.key("Ctrl+Shift+P", frames=3)
-    s.type("show")  # arrows choose another command than the first
-    for _ in range(3):
-        s.key("down_arrow", frames=2)
-    s.key("enter", frames=3)
-    assert s.state.picture.display == "depth"
-    s.key("Ctrl+Shift+P", frames=3)
-    s.enter("teleport", frames=3)
-    assert s.state.show_palette
+def look_from_the_broad_side(s: Session) -> None:
+    """Without cameras, and upright: the blobs lie beside each other, none behind another."""
+    assert s.state.scene.cameras == ()
+    assert abs(s.state.view.rotation[2] @ [1, 0, 0]) < 0.5  # along which the blobs lie
+    assert abs(s.state.view.rotation[0] @ s.state.view.up) < 1e-6
+    rgb = s.shot("bare")
+    assert [s.at(rgb, thing).argmax() for thing in CENTRES] == [0, 1, 2]
 
 
 def end_by_signals(s: Session) -> None:
@@ -650,11 +468,6 @@ def look_at_nothing(s: Session) -> None:
     """A scene of which nothing can be drawn says so over the picture."""
     assert "none of the 360 Gaussians can be drawn" in s.state.nothing
     assert s.shot("nothing")[250:370, 400:].max() > 150
-
-
-def slow_load(path: Path) -> Scene:
-    time.sleep(1.0)
-    return load_scene(path)
 
 
 ASKED = {
