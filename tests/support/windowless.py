@@ -10,8 +10,7 @@ from langsplat_core.errors import FormatError
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions import opening, queries, selecting, settings, viewpoint
 from langsplat_viewer.canvas import Canvas
-from langsplat_viewer.rendering.depth import Clip
-from langsplat_viewer.rendering.request import RenderRequest, Splats
+from langsplat_viewer.rendering.request import Clip, RenderRequest, Splats
 from langsplat_viewer.state import GLIDE_SECONDS, ViewerState
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene

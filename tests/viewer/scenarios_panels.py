@@ -14,13 +14,12 @@ import glfw  # isort: skip
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_viewer import viewer as training
-from langsplat_viewer.actions import filming, opening, selecting, settings, viewpoint
+from langsplat_viewer.actions import browsing, filming, opening, selecting, settings, viewpoint
 from langsplat_viewer.commands import COMMANDS
-from langsplat_viewer.files.flights import read_flight
 from langsplat_viewer.files.preferences import with_recent
-from langsplat_viewer.panels.layout import PANELS
-from langsplat_viewer.panels.style import scene_area
-from langsplat_viewer.panels.toolbar import button_label
+from langsplat_viewer.files.projects import read_flight
+from langsplat_viewer.panels.layout import PANELS, button_label
+from langsplat_viewer.panels.ui import scene_area
 from tests.support.fakes import CENTRES, PER_BLOB, as_trained, blob_scene, cameras, named_scene
 
 
@@ -115,13 +114,13 @@ def search_a_library(s: Any) -> None:
     save_scene(s.folder / "deep" / "mug.ply", replace(fewer, cameras=cameras()))
     s.open_panel("Library", frames=3)
     s.click("//Library/Folder ...", frames=4)
-    opening.type_path(viewer, "deep")
-    opening.open_typed(viewer)
+    viewer.state.path_typed = "deep"
+    browsing.open_typed(viewer)
     s.ctx.yield_(3)
     s.ctx.item_click("//**/Take this folder")
     s.until(lambda: s.state.library is not None)
     assert len(s.state.library.hits) == 2
-    opening.ask_library(viewer, "plant")
+    browsing.ask_library(viewer, "plant")
     s.until(lambda: s.state.library.phrase == "plant")
     hits = [(hit.path.name, hit.verdict) for hit in s.state.library.hits]
     assert hits == [("named.ply", "found"), ("mug.ply", "not here")]
@@ -148,7 +147,7 @@ def watch_a_training(s: Any) -> None:
     for number in range(3):
         (photographs / f"{number}.jpg").write_bytes(b"")
     training.command = lambda request: [sys.executable, "-c", TRAINS]
-    opening.choose_photographs(viewer, photographs)
+    browsing.choose_photographs(viewer, photographs)
     s.open_panel("Train", frames=3)
     s.ctx.item_click("//Train/Train")
     s.wait(lambda: viewer.training is not None and len(viewer.training.progress.losses) > 50)
@@ -184,7 +183,7 @@ def large_letters(s: Any) -> None:
     for scale, show, name in (
         (2.0, settings.toggle_help, "Help"),
         (3.0, settings.toggle_palette, "Commands"),
-        (3.0, opening.ask_for_file, "Open a scene"),
+        (3.0, browsing.ask_for_file, "Open a scene"),
     ):
         settings.set_ui_scale(s.viewer, scale)
         show(s.viewer)
@@ -287,8 +286,8 @@ def record_and_play(s: Any) -> None:
     assert len(read_flight(s.folder / "blobs-001.path.json").keyframes) == 3
     filming.set_path_seconds(s.viewer, 1.0)
     filming.set_film_size(s.viewer, 32, 24)
-    filming.set_film_fps(s.viewer, 4.0)
-    filming.type_film(s.viewer, "film")
+    s.viewer.state.record.fps = 4.0
+    s.viewer.state.record.film_typed = "film"
     s.ctx.item_click("//Record/Save film")
     s.until(lambda: s.viewer.recorder.current is None)
     assert len(list((s.folder / "film").glob("frame-*.png"))) == 5

@@ -15,14 +15,13 @@ import pytest
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.errors import BackendError
 from langsplat_core.raster import load_rasterizer
-from langsplat_viewer.actions import selecting, settings, undoing, viewpoint
+from langsplat_viewer.actions import editing, selecting, settings, viewpoint
 from langsplat_viewer.camera.controls import default_view, extent_of, orbit
 from langsplat_viewer.canvas import FINE, MOVING_BUDGET, NOTHING_LEFT, REST_SECONDS, Canvas, Level, Pace
 from langsplat_viewer.marks import unmarked
 from langsplat_viewer.rendering import renderer as renderers
-from langsplat_viewer.rendering.depth import Clip
 from langsplat_viewer.rendering.renderer import GlRenderer
-from langsplat_viewer.rendering.request import Splats
+from langsplat_viewer.rendering.request import Clip, Splats
 from langsplat_viewer.state import ViewerState
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
@@ -311,7 +310,7 @@ STALE = {
     **CHANGES,
     "undone camera": lambda v: (viewpoint.look_from(v, "left"), viewpoint.reset_view(v)),
     "deleted": lambda v: (selecting.select_all(v), selecting.delete_selected(v)),
-    "undone": lambda v: (selecting.select_all(v), selecting.delete_selected(v), undoing.undo(v)),
+    "undone": lambda v: (selecting.select_all(v), selecting.delete_selected(v), editing.undo(v)),
     "scene": lambda v: setattr(v.state, "scene", replace(v.state.scene)),
 }
 

@@ -10,13 +10,12 @@ import pytest
 
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.scene import Scene
-from langsplat_viewer.actions import beside, filming, opening, queries, settings, undoing, viewpoint
+from langsplat_viewer.actions import browsing, editing, filming, opening, queries, settings, viewpoint
 from langsplat_viewer.camera.controls import default_view, extent_of, orbit
-from langsplat_viewer.files.browsing import MOST_LISTED, Entry, list_folder
-from langsplat_viewer.files.watching import Watch, stamps
+from langsplat_viewer.files.disk import MOST_LISTED, Entry, Watch, list_folder, stamps
 from langsplat_viewer.options import say_compiling
 from langsplat_viewer.panels.scene import has_several
-from langsplat_viewer.rendering.depth import UNCLIPPED, Clip
+from langsplat_viewer.rendering.request import UNCLIPPED, Clip
 from tests.support.fakes import blob_scene
 from tests.support.windowless import SCENES, act, ask, errors, go, open_scene, settle
 
@@ -90,7 +89,7 @@ def test_a_scene_with_broken_companions_opens_and_says_why(tmp_path, viewer):
     ],
 )
 def test_of_dropped_files_the_scene_is_opened_and_what_is_none_is_said(viewer, names, opened_name, said):
-    act(opening.open_dropped, viewer, [Path(name) for name in names])
+    act(browsing.open_dropped, viewer, [Path(name) for name in names])
     assert viewer.state.path.name == opened_name
     assert [path.name for path in viewer.state.scenes] == [opened_name]
     assert errors(viewer) == ([said] if said else [])
@@ -122,7 +121,7 @@ def test_the_first_run_says_that_it_compiles(viewer, monkeypatch):
 @pytest.fixture
 def three(viewer):
     """Three scenes were dropped; the first is shown."""
-    act(opening.open_dropped, viewer, [Path("blobs.ply"), Path("plain.ply"), Path("bare.ply")])
+    act(browsing.open_dropped, viewer, [Path("blobs.ply"), Path("plain.ply"), Path("bare.ply")])
     return viewer
 
 
@@ -188,7 +187,7 @@ def test_all_scenes_of_a_folder_are_opened_together(viewer, tmp_path):
     (tmp_path / "folder").mkdir()
     viewer.state.browser = list_folder(tmp_path)
     assert has_several(viewer.state.browser)
-    act(opening.open_all, viewer)
+    act(browsing.open_all, viewer)
     assert viewer.state.browser is None
     assert viewer.state.scenes == (tmp_path / "blobs.ply", tmp_path / "plain.ply")
     assert viewer.state.path.name == "blobs.ply"
@@ -222,7 +221,7 @@ def test_folders_come_first_and_what_is_no_scene_is_left_out(folder):
 
 
 def test_a_crowded_folder_is_cut(tmp_path, monkeypatch):
-    monkeypatch.setattr("langsplat_viewer.files.browsing.MOST_LISTED", 3)
+    monkeypatch.setattr("langsplat_viewer.files.disk.MOST_LISTED", 3)
     for number in range(5):
         (tmp_path / f"{number}.ply").write_bytes(b"")
     listing = list_folder(tmp_path)
@@ -231,15 +230,15 @@ def test_a_crowded_folder_is_cut(tmp_path, monkeypatch):
 
 
 def test_one_goes_into_folders_and_opens_scenes(viewer, folder):
-    opening.ask_for_file(viewer)
+    browsing.ask_for_file(viewer)
     assert viewer.state.browser.folder == folder
-    opening.choose(viewer, Entry(folder / "B folder", is_file=False))
+    browsing.choose(viewer, Entry(folder / "B folder", is_file=False))
     assert viewer.state.browser.folder == folder / "B folder"
-    opening.browse(viewer, folder)
-    act(opening.choose, viewer, Entry(folder / "blobs.ply", is_file=True))
+    browsing.browse(viewer, folder)
+    act(browsing.choose, viewer, Entry(folder / "blobs.ply", is_file=True))
     assert viewer.state.browser is None
     assert viewer.state.scene is SCENES["blobs.ply"]
-    opening.ask_for_file(viewer)
+    browsing.ask_for_file(viewer)
     assert viewer.state.browser.folder == folder  # that of the scene
     settings.escape(viewer)
     assert viewer.state.browser is None
@@ -247,27 +246,27 @@ def test_one_goes_into_folders_and_opens_scenes(viewer, folder):
 
 def enter(viewer, typed: str) -> None:
     """Type a path in the browser, and open it."""
-    opening.type_path(viewer, typed)
-    act(opening.open_typed, viewer)
+    viewer.state.path_typed = typed
+    act(browsing.open_typed, viewer)
 
 
 @pytest.mark.parametrize("typed", [" blobs.ply ", "B folder/../blobs.ply"])
 def test_a_path_can_be_typed(viewer, folder, typed):
-    opening.ask_for_file(viewer)
+    browsing.ask_for_file(viewer)
     for nothing in ("", "  "):
         enter(viewer, nothing)
         assert viewer.state.browser is not None
     enter(viewer, "B folder")
     assert viewer.state.browser.folder == folder / "B folder"
     assert viewer.state.path_typed == ""
-    opening.browse(viewer, folder)
+    browsing.browse(viewer, folder)
     enter(viewer, typed)
     assert viewer.state.scene is SCENES["blobs.ply"]
 
 
 @pytest.mark.parametrize("typed", ["gone.ply", "x" * 5000, "~nobody-of-this-name/a.ply"])
 def test_a_path_that_leads_nowhere_is_an_error_line(viewer, folder, typed):
-    opening.ask_for_file(viewer)
+    browsing.ask_for_file(viewer)
     enter(viewer, typed)
     assert len(errors(viewer)) == 1
 
@@ -278,7 +277,7 @@ def test_scenes_that_were_open_are_remembered_the_latest_first(viewer):
     recent = viewer.state.preferences.recent
     assert [Path(path).name for path in recent] == ["blobs.ply", "plain.ply"]
     assert all(Path(path).is_absolute() for path in recent)
-    act(opening.open_recent, viewer, recent[1])
+    act(browsing.open_recent, viewer, recent[1])
     assert viewer.state.scene is SCENES["plain.ply"]
 
 
@@ -315,7 +314,7 @@ def test_a_change_of_any_file_is_noticed_once_it_is_over(shown, name):
         assert not shown.watch.changed
     assert look(shown)
     assert woken == [name]
-    opening.keep_old(shown)
+    shown.watch.dismiss()
     assert not look(shown)
     os.utime(file, ns=(9, 9))  # it changes again
     assert look(shown)
@@ -400,7 +399,7 @@ def test_a_field_that_went_away_takes_its_display_along(shown):
 
 
 def test_a_watch_looks_by_itself_and_stops(tmp_path, monkeypatch):
-    monkeypatch.setattr("langsplat_viewer.files.watching.EVERY", 0.005)
+    monkeypatch.setattr("langsplat_viewer.files.disk.EVERY", 0.005)
     file: Path = tmp_path / "a.ply"
     file.write_bytes(b"a")
     woken = threading.Event()
@@ -430,10 +429,10 @@ def two(opened):
 def meet(viewer) -> None:
     """Frames until both have done what there is to do."""
     for _ in range(3):
-        act(beside.follow, viewer)
+        act(opening.follow_beside, viewer)
         if viewer.beside is not None:
             settle(viewer.beside)
-    beside.follow(viewer)
+    opening.follow_beside(viewer)
 
 
 def test_both_are_seen_and_asked_alike(two):
@@ -473,10 +472,10 @@ def test_a_scene_without_a_field_shows_its_colours_and_what_cannot_be_opened_is_
 
 def test_it_goes_with_the_line_and_does_not_come_back_by_itself(two):
     settings.show_one(two)
-    beside.follow(two)
+    opening.follow_beside(two)
     assert two.beside is None
-    undoing.undo(two)
-    beside.follow(two)
+    editing.undo(two)
+    opening.follow_beside(two)
     assert two.state.settings.split.mode == "off"
 
 
@@ -485,8 +484,8 @@ def test_a_scene_with_other_coordinates_is_seen_from_the_same_side():
     moved = replace(scene.gaussians, means=3 * scene.gaussians.means + 50)
     here, there = extent_of(scene), extent_of(replace(scene, gaussians=moved))
     view = default_view(scene, here, (80, 60))
-    other = beside.linked(view, here, there)
-    assert beside.linked(view, here, here) is view
+    other = opening.linked(view, here, there)
+    assert opening.linked(view, here, here) is view
     np.testing.assert_array_equal(other.rotation, view.rotation)
     eyes = [(one.eye - extent.centre) / extent.radius for one, extent in ((other, there), (view, here))]
     np.testing.assert_allclose(*eyes)

@@ -13,11 +13,10 @@ from langsplat_viewer.actions.opening import standing_at
 from langsplat_viewer.camera import controls
 from langsplat_viewer.camera.controls import OrbitCamera, from_side, spanning, with_projection
 from langsplat_viewer.camera.flight import Flight, Keyframe, camera_of, pose_at, pose_of
-from langsplat_viewer.files.flights import Shelf
+from langsplat_viewer.files.projects import Shelf
 from langsplat_viewer.panels.overlays import pointed_figures
-from langsplat_viewer.rendering.depth import Clip, depth_range, image_formation, why_nothing
 from langsplat_viewer.rendering.renderer import GlRenderer
-from langsplat_viewer.rendering.request import plain_request
+from langsplat_viewer.rendering.request import Clip, depth_range, image_formation, plain_request, why_nothing
 from langsplat_viewer.state import GLIDE_SECONDS
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import CENTRES, blob_scene

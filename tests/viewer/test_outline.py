@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from langsplat_viewer.actions import opening, outline, projects, selecting, settings, transforming, undoing
+from langsplat_viewer.actions import browsing, editing, opening, outline, projects, selecting, settings
 from langsplat_viewer.actions.selecting import take
 from langsplat_viewer.files.projects import Things
 from tests.support.fakes import CENTRES, blob_scene
@@ -73,7 +73,7 @@ def test_rows_are_hidden_and_shown_and_the_selection_stays(outlined, nodes):
     assert outline.hidden_nodes(outlined) is hidden
     act(outline.show, outlined, mug)
     assert marked(outlined) == ("plant", "", "")
-    undoing.undo(outlined)
+    editing.undo(outlined)
     assert outline.hidden_nodes(outlined)[mug]
 
 
@@ -90,10 +90,10 @@ def test_what_is_locked_is_left_alone(outlined, nodes):
     selecting.show_hidden(outlined)
     act(outline.hide, outlined, mug)
     assert marked(outlined)[1] == ""
-    transforming.fill_box(outlined)
-    transforming.crop(outlined)
+    editing.fill_box(outlined)
+    editing.crop(outlined)
     assert "mug" not in marked(outlined)[2]
-    undoing.undo(outlined)
+    editing.undo(outlined)
     outline.toggle_lock(outlined, mug)
     selecting.select_all(outlined)
     assert marked(outlined)[0] == "mug book plant"
@@ -137,7 +137,7 @@ def test_groups_are_made_named_and_left(outlined, nodes):
     assert marked(outlined)[0] == "mug book plant"
     outline.ungroup(outlined, mug)
     assert outlined.state.things.groups[0].nodes == (book, plant)
-    undoing.undo(outlined)
+    editing.undo(outlined)
     assert outlined.state.things.groups[0].nodes == (book, mug, plant)
     for node in (mug, book, plant):
         outline.ungroup(outlined, node)
@@ -164,7 +164,7 @@ def test_a_project_keeps_names_groups_and_locks_and_of_another_tree_what_is_know
     things, path = outlined.state.things, projects.save_project(outlined, tmp_path)
     open_scene(outlined, "plain.ply")
     assert outlined.state.things != things
-    act(opening.open_project, outlined, path)
+    act(browsing.open_project, outlined, path)
     assert outlined.state.things == things
     selecting.select_all(outlined)
     assert marked(outlined)[0] == "book plant"
@@ -175,7 +175,7 @@ def test_a_project_keeps_names_groups_and_locks_and_of_another_tree_what_is_know
     path.write_text(json.dumps(top))
     if not field:
         monkeypatch.setitem(SCENES, "tree.ply", replace(SCENES["tree.ply"], language=None))
-    act(opening.open_project, outlined, path)
+    act(browsing.open_project, outlined, path)
     things = outlined.state.things
     selecting.select_all(outlined)
     if field:

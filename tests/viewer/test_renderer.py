@@ -20,11 +20,21 @@ from langsplat_core.scene import Camera, Gaussians, Scene, look_at
 from langsplat_viewer.actions import selecting, settings, viewpoint
 from langsplat_viewer.camera.controls import default_view, extent_of, from_camera
 from langsplat_viewer.canvas import NOTHING_BETWEEN, Canvas
-from langsplat_viewer.rendering import depth
 from langsplat_viewer.rendering import renderer as renderers
-from langsplat_viewer.rendering.depth import UNCLIPPED, Clip, depth_range, near_plane, why_nothing
 from langsplat_viewer.rendering.renderer import ArrayChannels, ArrayRenderer, GlRenderer, render_image
-from langsplat_viewer.rendering.request import RenderKey, RenderRequest, Split, plain_request
+from langsplat_viewer.rendering.request import (
+    UNCLIPPED,
+    Clip,
+    RenderKey,
+    RenderRequest,
+    Split,
+    depth_range,
+    image_formation,
+    near_plane,
+    plain_request,
+    why_nothing,
+    why_undrawable,
+)
 from tests.support.fakes import CENTRES, blob_scene
 from tests.support.fixtures import gl_state
 from tests.support.marks_and_flights import marked
@@ -334,14 +344,14 @@ BLOBS = blob_scene().gaussians
     ],
 )
 def test_why_no_camera_would_see_anything(gaussians, reason):
-    assert depth.why_undrawable(gaussians).startswith(reason)
+    assert why_undrawable(gaussians).startswith(reason)
     assert why_nothing(gaussians, blob_scene().cameras[0]).startswith(reason)
     assert np.isfinite(opening(Scene(gaussians)).world_to_camera).all()
 
 
 def test_why_this_camera_sees_nothing():
     gaussians, camera = blob_scene().gaussians, blob_scene().cameras[1]
-    assert depth.why_undrawable(gaussians) == ""
+    assert why_undrawable(gaussians) == ""
     assert "behind the camera" in why_nothing(gaussians, looking_away())
     aside = camera.world_to_camera.copy()
     aside[0, 3] += 1e3
@@ -381,9 +391,9 @@ def test_what_is_cut_away_is_as_if_it_were_not_there(renderer, display, clip):
 
 def test_the_near_cut_never_comes_nearer_than_the_near_plane_and_the_far_one_is_none_by_itself():
     scene = blob_scene()
-    plain = depth.image_formation(scene, SIDE)
-    assert depth.image_formation(scene, SIDE, Clip(0.01, 7.0)) == replace(plain, far=7.0)
-    assert depth.image_formation(scene, SIDE, Clip(3.0)) == replace(plain, near=3.0)
+    plain = image_formation(scene, SIDE)
+    assert image_formation(scene, SIDE, Clip(0.01, 7.0)) == replace(plain, far=7.0)
+    assert image_formation(scene, SIDE, Clip(3.0)) == replace(plain, near=3.0)
     assert (plain.far, farthest(plain)) == (None, np.inf)
     near, far = depth_range(scene.gaussians, SIDE, BOOK_ALONE)  # of what is left
     assert 4.4 < near < far < 5.6

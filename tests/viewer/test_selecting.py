@@ -11,7 +11,7 @@ from plyfile import PlyData
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.scene import look_at
 from langsplat_viewer import marks
-from langsplat_viewer.actions import opening, queries, selecting, settings, undoing, viewpoint
+from langsplat_viewer.actions import editing, opening, queries, selecting, settings, viewpoint
 from langsplat_viewer.actions.selecting import take
 from langsplat_viewer.camera.controls import from_camera
 from langsplat_viewer.marks import Drawn, Stroke, outlines
@@ -70,10 +70,10 @@ def test_every_change_is_one_step_back_and_forth(opened):
     states.append(("", "", ""))
     assert marked(opened) == states[0]
     for state in states[1:]:
-        undoing.undo(opened)
+        editing.undo(opened)
         assert marked(opened) == state
     for state in states[-2::-1]:
-        undoing.redo(opened)
+        editing.redo(opened)
         assert marked(opened) == state
 
 
@@ -121,7 +121,7 @@ def test_growing_and_shrinking_follow_the_surface(opened):
     assert not (grown & ~blob("book")).any()  # the others are not on its surface
     act(selecting.shrink_selection, opened)
     assert marks_of(opened).selected.sum() < grown.sum()
-    undoing.undo(opened)
+    editing.undo(opened)
     assert (marks_of(opened).selected == grown).all()
 
 
@@ -186,7 +186,7 @@ def corners(viewer, centre, half: float = 0.58) -> list[tuple[float, float]]:
 def test_a_stroke_selects_what_it_encloses_or_sweeps_over_and_is_undone(front):
     assert draw(front, "rectangle", corners(front, CENTRES[0])) == "mug"
     assert draw(front, "rectangle", corners(front, CENTRES[2])[::-1], "add") == "mug plant"
-    undoing.undo(front)
+    editing.undo(front)
     assert marked(front)[0] == "mug"
     assert draw(front, "lasso", around(front, CENTRES[1])) == "book"
     selecting.set_brush(front, 0.12)
@@ -225,7 +225,7 @@ def test_what_lies_behind_something_is_left_out_unless_all_is_wanted(front, monk
 def test_a_click_selects_the_thing_at_the_level_of_the_queries(front, monkeypatch):
     monkeypatch.setattr(FakeSurface, "point_at", lambda self, u, v: CENTRES[1])
     assert draw(front, "thing", [(0.5, 0.5)]) == "book"
-    undoing.undo(front)
+    editing.undo(front)
     assert marked(front)[0] == ""
 
 
@@ -241,7 +241,7 @@ def test_a_click_on_nothing_and_without_a_field(front, monkeypatch):
 def test_escape_gives_up_the_stroke_then_the_tool_and_help_before_both(front):
     selecting.use_tool(front, "lasso")
     selecting.begin_stroke(front, 0.1, 0.1)
-    settings.show_help(front, True)
+    front.state.show_help = True
     settings.escape(front)
     assert front.state.selection.stroke is not None
     settings.escape(front)
@@ -344,8 +344,8 @@ def test_what_cannot_be_written_is_said(opened, tmp_path):
 
 def test_deleting_is_unsaved_until_the_scene_is_saved(pruned, tmp_path):
     for action, unsaved in (
-        (undoing.undo, False),
-        (undoing.redo, True),
+        (editing.undo, False),
+        (editing.redo, True),
         (partial(selecting.export, folder=tmp_path, part="edited"), False),
         (partial(take, found=blob("mug")), False),
         (selecting.delete_selected, True),

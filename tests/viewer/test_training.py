@@ -17,8 +17,8 @@ from langsplat_core.io.scenes import load_scene
 from langsplat_core.pipeline.report import REPORT
 from langsplat_core.scene import Scene
 from langsplat_viewer import viewer as training_process
-from langsplat_viewer.actions import opening, settings, training, viewpoint
-from langsplat_viewer.files.watching import IN_TRAINING, NAME, write_preview
+from langsplat_viewer.actions import browsing, settings, viewpoint
+from langsplat_viewer.files.disk import IN_TRAINING, PREVIEW, write_preview
 from langsplat_viewer.viewer import PREVIEW_EVERY, TrainingProgress, TrainingRequest, command
 from tests.support.fakes import blob_scene
 from tests.support.scenes import random_gaussians
@@ -51,9 +51,9 @@ def begin(viewer, folder, monkeypatch) -> Callable[..., None]:
 
     def start(script: str, out: str = "photos.ply") -> None:
         monkeypatch.setattr(training_process, "command", lambda request: [sys.executable, "-c", script])
-        opening.choose_photographs(viewer, folder)
-        training.fill_in(viewer, replace(viewer.state.training_form, out=str(folder.with_name(out))))
-        training.start_training(viewer)
+        browsing.choose_photographs(viewer, folder)
+        viewer.state.training_form = replace(viewer.state.training_form, out=str(folder.with_name(out)))
+        browsing.start_training(viewer)
 
     return start
 
@@ -61,14 +61,14 @@ def begin(viewer, folder, monkeypatch) -> Callable[..., None]:
 def finish(viewer, seconds: float = 20.0) -> None:
     end = time.monotonic() + seconds
     while viewer.training is not None and time.monotonic() < end:
-        training.watch_training(viewer)
+        browsing.watch_training(viewer)
         time.sleep(0.02)
     assert viewer.training is None
     settle(viewer)
 
 
 def test_a_folder_of_photographs_becomes_a_scene_that_opens(viewer, folder, begin):
-    opening.open_dropped(viewer, [folder])
+    browsing.open_dropped(viewer, [folder])
     form = viewer.state.training_form
     assert (form.dataset, form.out) == (str(folder), str(folder.with_suffix(".ply")))
     assert settings.take_wanted_panel(viewer) == "Train"
@@ -110,12 +110,12 @@ def test_what_goes_wrong_is_said(viewer, begin):
 
 def test_it_can_be_stopped_and_one_is_enough(viewer, begin):
     begin(SLOW)
-    training.start_training(viewer)
+    browsing.start_training(viewer)
     assert "under way" in errors(viewer)[-1]
-    training.look_at_training(viewer)
+    browsing.look_at_training(viewer)
     assert "no Gaussians to look at yet" in viewer.state.messages[-1].text
     process = viewer.training.process
-    training.stop_training(viewer)
+    browsing.stop_training(viewer)
     finish(viewer)
     assert process.returncode == -signal.SIGTERM
     assert "goes on" in viewer.state.messages[-1].text
@@ -127,7 +127,7 @@ def test_the_gaussians_can_be_looked_at_before_the_end(viewer, folder, begin, mo
     work.mkdir()
     (work / "radiance-0.ply").write_bytes(b"")
     monkeypatch.setitem(SCENES, "radiance-0.ply", SCENES["plain.ply"])
-    act(training.look_at_training, viewer)
+    act(browsing.look_at_training, viewer)
     viewer.training.end()
     assert viewer.state.scene is SCENES["plain.ply"]
 
@@ -135,8 +135,8 @@ def test_the_gaussians_can_be_looked_at_before_the_end(viewer, folder, begin, mo
 @pytest.mark.parametrize("dataset", ["", "  ", "gone", "."])
 def test_a_folder_without_photographs_is_said(viewer, tmp_path, monkeypatch, dataset):
     monkeypatch.chdir(tmp_path)
-    training.fill_in(viewer, replace(viewer.state.training_form, dataset=dataset))
-    training.start_training(viewer)
+    viewer.state.training_form = replace(viewer.state.training_form, dataset=dataset)
+    browsing.start_training(viewer)
     assert "no photographs" in errors(viewer)[-1]
     assert viewer.training is None
 
@@ -189,24 +189,24 @@ def test_gaussians_in_training_are_looked_at_and_followed(viewer, folder, begin)
     whole = blob_scene()
     path = checkpoint(folder.parent, whole)
     path.write_bytes(path.read_bytes()[:100])  # damaged
-    act(training.look_at_training, viewer)
+    act(browsing.look_at_training, viewer)
     assert "no Gaussians in training" in errors(viewer)[-1]
     assert viewer.state.scene is None
     viewer.state.messages.clear()
 
     checkpoint(folder.parent, whole.take(np.arange(0, 360, 2)))
-    act(training.look_at_training, viewer)
-    assert viewer.state.path == folder.parent / "photos.work" / NAME
+    act(browsing.look_at_training, viewer)
+    assert viewer.state.path == folder.parent / "photos.work" / PREVIEW
     seen = viewer.state.scene.gaussians
     assert (len(seen), seen.sh_degree) == (180, 1)
     np.testing.assert_array_equal(seen.means, whole.gaussians.means[::2])
     viewpoint.zoom_by(viewer, 1.5)
     view = viewer.state.view
-    training.watch_training(viewer)
+    browsing.watch_training(viewer)
     assert viewer.worker.current is None  # nothing new
 
     checkpoint(folder.parent, whole)
-    act(training.watch_training, viewer)
+    act(browsing.watch_training, viewer)
     assert len(viewer.state.scene.gaussians) == 360
     assert viewer.state.view is view
     assert errors(viewer) == []

@@ -24,7 +24,7 @@ from langsplat_core.errors import BackendError
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions import selecting, settings
-from langsplat_viewer.panels.style import scene_area
+from langsplat_viewer.panels.ui import scene_area
 from langsplat_viewer.rendering.renderer import Backend, GlRenderer
 from langsplat_viewer.viewer import Services, Viewer
 from langsplat_viewer.window import Window, WindowRequest
