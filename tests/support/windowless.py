@@ -1,15 +1,16 @@
 """A viewer without a window: a fake picture, fake files, and frames on demand."""
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from langsplat_core.errors import FormatError
 from langsplat_core.scene import Scene
-from langsplat_viewer.actions import opening, queries, viewpoint
+from langsplat_viewer.actions import opening, queries, selecting, settings, viewpoint
 from langsplat_viewer.canvas import Canvas
-from langsplat_viewer.rendering.request import RenderRequest
+from langsplat_viewer.rendering.request import Clip, RenderRequest, Splats
 from langsplat_viewer.state import GLIDE_SECONDS, ViewerState
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
@@ -88,10 +89,21 @@ def settle(viewer: Viewer, seconds: float = 120.0) -> None:
     viewpoint.tick(viewer, 0.0)
 
 
+def act(action: Callable[..., object], viewer: Viewer, *arguments: object, **options: object) -> None:
+    """Do something, and wait until the worker has done what that began."""
+    action(viewer, *arguments, **options)
+    settle(viewer)
+
+
+def go(action: Callable[..., object], viewer: Viewer, *arguments: object) -> None:
+    """Do something, and let the camera that it sends gliding arrive."""
+    action(viewer, *arguments)
+    arrive(viewer)
+
+
 def open_scene(viewer: Viewer, path: Path | str) -> None:
     """Open a scene, and wait until it is shown."""
-    opening.open_scene(viewer, Path(path))
-    settle(viewer)
+    act(opening.open_scene, viewer, Path(path))
 
 
 def ask(viewer: Viewer, *phrases: str) -> None:
@@ -116,8 +128,30 @@ def arrive(viewer: Viewer) -> None:
     viewpoint.tick(viewer, viewer.clock + 2 * GLIDE_SECONDS)
 
 
+def phrases(viewer: Viewer) -> list[str]:
+    """Of the queries, in their order."""
+    return [query.phrase for query in viewer.state.queries]
+
+
 def errors(viewer: Viewer) -> list[str]:
     return [message.text for message in viewer.state.messages if message.is_error]
+
+
+CHANGES = {  # of what is seen, after a search
+    "display": lambda v: settings.set_display(v, "depth"),
+    "hidden query": lambda v: queries.hide(v, v.state.queries[0]),
+    "splats": lambda v: settings.set_splats(v, Splats(0.5)),
+    "near cut": lambda v: settings.set_clip(v, Clip(1.0)),
+    "marks": selecting.select_all,
+    "size": lambda v: settings.resize(v, 100, 80),
+    "view": lambda v: viewpoint.look_from(v, "left"),
+}
+
+
+def on_screen(canvas: Canvas) -> list[np.ndarray]:
+    """(H, W, 3) bytes of each pane."""
+    raw = [(np.frombuffer(texture.read(), np.uint8), texture.size) for texture in canvas.textures]
+    return [pixels.reshape(height, width, 4)[::-1, :, :3] for pixels, (width, height) in raw]
 
 
 def rest(canvas: Canvas, state: ViewerState, now: float) -> None:

@@ -9,9 +9,10 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from langsplat_viewer import options, program
+from langsplat_viewer.actions import settings
 from langsplat_viewer.viewer import Services, Viewer
 from tests.support.fakes import FakeEncoder
-from tests.support.windowless import FakeSurface, load, open_scene
+from tests.support.windowless import FakeSurface, ask, load, open_scene
 
 
 @pytest.fixture
@@ -27,6 +28,14 @@ def opened(viewer: Viewer) -> Viewer:
     """Shows the scene of three blobs."""
     open_scene(viewer, "blobs.ply")
     return viewer
+
+
+@pytest.fixture
+def asked(opened: Viewer) -> Viewer:
+    """Answers "mug", in 120 x 90 pixels."""
+    ask(opened, "mug")
+    settings.resize(opened, 120, 90)
+    return opened
 
 
 @pytest.fixture(scope="module")

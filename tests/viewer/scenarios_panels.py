@@ -1,19 +1,24 @@
-"""Scenarios of `window_driver` in the panels: files, training, layout, recording, bookmarks."""
+"""Scenarios of `window_driver` in the panels: files, training, layout, recording, bookmarks, keys."""
 
 import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from imgui_bundle import imgui  # isort: skip
+from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
+import glfw  # isort: skip
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_viewer import viewer as training
 from langsplat_viewer.actions import browsing, filming, opening, selecting, settings, viewpoint
+from langsplat_viewer.commands import COMMANDS
+from langsplat_viewer.files.preferences import with_recent
 from langsplat_viewer.files.projects import read_flight
-from langsplat_viewer.panels.layout import PANELS
+from langsplat_viewer.panels.layout import PANELS, button_label
 from langsplat_viewer.panels.ui import scene_area
 from tests.support.fakes import CENTRES, PER_BLOB, as_trained, blob_scene, cameras, named_scene
 
@@ -22,17 +27,13 @@ def reload_what_changed(s: Any) -> None:
     """A bar appears by itself, its button reads the file again, camera and queries stay."""
     s.search("mug")
     s.drag((600, 300), (656, 279))
-    s.settle()
     view, before = s.state.view, s.state.scene
     assert not s.ctx.item_exists("//changed/Reload")
     scene = replace(blob_scene(), path=None)
     save_scene(s.state.path, replace(scene, gaussians=replace(scene.gaussians, sh=-scene.gaussians.sh)))
-    s.wait(lambda: s.window.viewer.watch.changed)
-    s.ctx.yield_(3)
-    s.shot("changed")
+    s.until(lambda: s.viewer.watch.changed)
     s.ctx.item_click("//changed/Reload")
-    s.wait(lambda: s.state.scene is not before)
-    s.settle()
+    s.until(lambda: s.state.scene is not before)
     assert s.state.view is view
     assert s.state.queries[0].result.found
     assert not s.ctx.item_exists("//changed/Reload")
@@ -42,40 +43,31 @@ def reload_what_changed(s: Any) -> None:
 
 def fade_in_a_photograph(s: Any) -> None:
     """The slider lays it over the picture where the camera saw it; elsewhere there is none."""
-    viewer, folder = s.window.viewer, s.folder / "elsewhere"
+    viewer, folder = s.viewer, s.folder / "elsewhere"
     folder.mkdir()
     colours = np.full((240, 320, 3), (250, 120, 10), np.uint8)
     colours[:, 160:] = (20, 60, 240)
     Image.fromarray(colours).save(folder / "photo_1.png")
-    settings.open_panel(s.window.viewer, "Camera")
+    s.open_panel("Camera", frames=1)
     viewpoint.go_to_camera(viewer, 1)
-    s.settle()
     plain = s.shot("plain")
     opening.fade_photograph(viewer, 1.0)
     s.settle()
-    s.ctx.yield_(3)
     assert "no photograph 'photo_1'" in s.state.photograph.reason
     assert (s.shot("none")[100:500, 400:] == plain[100:500, 400:]).all()
     s.click("//Camera/Folder of photographs ...", frames=4)
-    s.click("//**/elsewhere\\/", frames=4)
-    s.shot("browser")
+    s.click("//**/elsewhere\\/")
     s.ctx.item_click("//**/Take this folder")
-    s.wait(lambda: s.state.photograph.image is not None)
-    s.settle()
+    s.until(lambda: s.state.photograph.image is not None)
     assert list(s.state.preferences.photographs.values()) == [str(folder.absolute())]
     area, shot = scene_area(), s.shot("photograph")
-    middle, left = int(area.top + area.height / 2), int(area.left)
-    quarter = int(area.width / 4)
-    np.testing.assert_allclose(shot[middle, left + quarter], (250, 120, 10), atol=3)
-    np.testing.assert_allclose(shot[middle, left + 3 * quarter], (20, 60, 240), atol=3)
-    assert (shot[int(area.top) + 30, left + quarter] == plain[int(area.top) + 30, left + quarter]).all()
+    middle, quarter = int(area.top + area.height / 2), int(area.width / 4)
+    left, right = (middle, int(area.left) + quarter), (middle, int(area.left) + 3 * quarter)
+    np.testing.assert_allclose([shot[left], shot[right]], [(250, 120, 10), (20, 60, 240)], atol=3)
+    assert (shot == plain)[int(area.top) + 30, left[1]].all()
     opening.fade_photograph(viewer, 0.5)
-    s.ctx.yield_(3)
-    half = s.shot("half")
-    place = middle, left + quarter
-    np.testing.assert_allclose(half[place], (shot[place] + plain[place]) / 2, atol=4)
+    np.testing.assert_allclose(s.shot("half")[left], (shot[left] + plain[left]) / 2, atol=4)
     s.drag((600, 300), (656, 279))
-    s.settle()
     assert opening.photograph_here(s.state) is None
 
 
@@ -99,32 +91,24 @@ def see_the_evidence(s: Any) -> None:
 
 def switch_between_scenes(s: Any) -> None:
     """Dropped together; the list in the panel shows one after the other, as it was left."""
-    s.window.drop([str(s.folder / name) for name in ("blobs.ply", "plain.ply")])
-    s.ctx.yield_(2)
-    s.settle()
+    s.drop("blobs.ply", "plain.ply")
     assert [path.name for path in s.state.scenes] == ["blobs.ply", "plain.ply"]
     s.drag((600, 300), (656, 279))
-    s.settle()
     view = s.state.view
-    s.shot("listed")
     s.ctx.item_click("//**/plain.ply##scene")
-    s.wait(lambda: s.state.path.name == "plain.ply")
-    s.settle()
+    s.shows("plain.ply")
     assert s.state.view is not view
-    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.page_up)
-    s.wait(lambda: s.state.path.name == "blobs.ply")
-    s.settle()
+    s.key("Ctrl+page_up", frames=1)
+    s.shows("blobs.ply")
     assert s.state.view is view
-    s.key(imgui.Key.mod_ctrl | imgui.Key.o, frames=4)
-    s.shot("all of them")
-    s.click("//**/Open all scenes here", frames=3)
-    s.settle()
+    s.key("Ctrl+O")
+    s.click("//**/Open all scenes here")
     assert s.state.path.name == "blobs.ply"
 
 
 def search_a_library(s: Any) -> None:
     """The panel lists the scenes of a folder; a phrase ranks them, a click opens one and asks it there."""
-    viewer = s.window.viewer
+    viewer = s.viewer
     save_scene(s.folder / "deep" / "named.ply", replace(named_scene(), path=None))
     fewer = named_scene().take(np.arange(3 * PER_BLOB) < PER_BLOB)
     save_scene(s.folder / "deep" / "mug.ply", replace(fewer, cameras=cameras()))
@@ -134,19 +118,14 @@ def search_a_library(s: Any) -> None:
     browsing.open_typed(viewer)
     s.ctx.yield_(3)
     s.ctx.item_click("//**/Take this folder")
-    s.wait(lambda: s.state.library is not None)
-    s.settle()
+    s.until(lambda: s.state.library is not None)
     assert len(s.state.library.hits) == 2
-    s.shot("library")
     browsing.ask_library(viewer, "plant")
-    s.wait(lambda: s.state.library.phrase == "plant")
-    s.settle()
-    assert [hit.path.name for hit in s.state.library.hits] == ["named.ply", "mug.ply"]
-    assert [hit.verdict for hit in s.state.library.hits] == ["found", "not here"]
-    s.shot("ranked")
+    s.until(lambda: s.state.library.phrase == "plant")
+    hits = [(hit.path.name, hit.verdict) for hit in s.state.library.hits]
+    assert hits == [("named.ply", "found"), ("mug.ply", "not here")]
     s.ctx.item_click("//**/$$0/##scene")
-    s.wait(lambda: s.state.path.name == "named.ply")
-    s.settle()
+    s.shows("named.ply")
     assert s.state.queries[0].phrase == "plant"
     assert s.state.queries[0].result.found
 
@@ -163,7 +142,7 @@ time.sleep(60)
 
 def watch_a_training(s: Any) -> None:
     """The panel plots what the process says of its loss."""
-    viewer, photographs = s.window.viewer, s.folder / "photos"
+    viewer, photographs = s.viewer, s.folder / "photos"
     photographs.mkdir()
     for number in range(3):
         (photographs / f"{number}.jpg").write_bytes(b"")
@@ -172,17 +151,15 @@ def watch_a_training(s: Any) -> None:
     s.open_panel("Train", frames=3)
     s.ctx.item_click("//Train/Train")
     s.wait(lambda: viewer.training is not None and len(viewer.training.progress.losses) > 50)
-    s.ctx.yield_(3)
-    before = s.shot("loss")
-    plot = s.ctx.item_info("//Train/##loss").rect_full
-    inside = before[int(plot.min.y) : int(plot.max.y), int(plot.min.x) : int(plot.max.x)]
-    assert inside.max() - inside.min() > 60
+    shot, plot = s.shot("loss"), s.ctx.item_info("//Train/##loss").rect_full
+    inside = shot[int(plot.min.y) : int(plot.max.y), int(plot.min.x) : int(plot.max.x)]
+    assert np.ptp(inside) > 60
     s.ctx.item_click("//Train/Stop")
     s.wait(lambda: viewer.training is None)
     assert "training stopped" in s.state.messages[-1].text
 
 
-# Scenarios of `window_driver` about where things lie: large letters, long words.
+# Where things lie: large letters, long words.
 
 LONG = "mugg or boook or plent or mugg or boook or plent or mugg or boook or plent or mugg"
 
@@ -193,78 +170,59 @@ def large_letters(s: Any) -> None:
         s.search(phrase)
     assert s.state.queries[-1].meant  # a long one, and so is the button for it
     narrow = scene_area().left
-    settings.set_ui_scale(s.window.viewer, 2.0)
+    settings.set_ui_scale(s.viewer, 2.0)
     s.settle()
     assert 1.3 * narrow < scene_area().left <= 0.41 * 1280
     for panel in PANELS:
         s.open_panel(panel.title)
-        assert seen_items(s, panel.title), panel.title
-        assert cut_off(s, panel.title) == [], panel.title
-    s.window.viewer.state.show_help = True
-    s.settle()
-    keys = s.ctx.window_info("//Help").window
-    assert 0 <= keys.pos.x <= keys.pos.x + keys.size.x <= 1280
-    assert 0 <= keys.pos.y <= keys.pos.y + keys.size.y <= 720
-    s.shot("large letters")
-    settings.escape(s.window.viewer)
-    settings.set_ui_scale(s.window.viewer, 3.0)
-    for show, name in ((settings.toggle_palette, "Commands"), (browsing.ask_for_file, "Open a scene")):
-        show(s.window.viewer)
-        s.ctx.yield_(4)
+        items = imgui.test_engine.TestItemList()
+        s.ctx.gather_items(items, f"//{panel.title}")
+        assert items.get_size() > 0, panel.title
+        for item in map(items.get_by_index, range(items.get_size())):
+            assert item.rect_full.max.x <= item.window.inner_rect.max.x + 1, panel.title
+    for scale, show, name in (
+        (2.0, settings.toggle_help, "Help"),
+        (3.0, settings.toggle_palette, "Commands"),
+        (3.0, browsing.ask_for_file, "Open a scene"),
+    ):
+        settings.set_ui_scale(s.viewer, scale)
+        show(s.viewer)
+        s.settle()
         over = s.ctx.window_info(f"//{name}").window
-        assert (over.pos.x, over.pos.y) >= (0, 0)
-        assert over.pos.x + over.size.x <= 1280
-        assert over.pos.y + over.size.y <= 720
-        settings.escape(s.window.viewer)
-        s.ctx.yield_(2)
-    settings.set_ui_scale(s.window.viewer, 1.0)
+        assert 0 <= over.pos.x <= over.pos.x + over.size.x <= 1280, name
+        assert 0 <= over.pos.y <= over.pos.y + over.size.y <= 720, name
+        settings.escape(s.viewer)
+    settings.set_ui_scale(s.viewer, 1.0)
     s.settle()
     assert abs(scene_area().left - narrow) < 0.15 * narrow
-
-
-def seen_items(s: Any, title: str) -> list[Any]:
-    """The widgets of a panel."""
-    found = imgui.test_engine.TestItemList()
-    s.ctx.gather_items(found, f"//{title}")
-    return [found.get_by_index(place) for place in range(found.get_size())]
-
-
-def cut_off(s: Any, title: str) -> list[tuple[float, float]]:
-    """Right ends of the widgets that reach beyond their window, and where that ends."""
-    ends = [(item.rect_full.max.x, item.window.inner_rect.max.x) for item in seen_items(s, title)]
-    return [(right, end) for right, end in ends if right > end + 1]
 
 
 def use_the_outline(s: Any) -> None:
     """Rows are clicked, hidden, locked and dragged onto each other; the menu of a thing names it."""
     s.search("mug")
-    settings.open_panel(s.window.viewer, "Outline")
-    s.wait(lambda: s.state.outline is not None and len(s.state.outline.roots) > 0)
-    s.settle()
-    first, second = s.state.outline.roots[:2]
-    rows = "//**/node "
-    s.click(f"{rows}{first.node}/###row")
+    s.open_panel("Outline", frames=1)
+    s.until(lambda: s.state.outline is not None and len(s.state.outline.roots) > 0)
+    first, second = (row.node for row in s.state.outline.roots[:2])
+    row = f"//**/node {first}/###"
+    s.click(f"{row}row")
     chosen = s.state.selection.marks.selected
-    assert (chosen == s.state.outline.tree.members(first.node)).all()
-    s.click(f"{rows}{first.node}/###eye")
+    assert (chosen == s.state.outline.tree.members(first)).all()
+    s.click(f"{row}eye")
     assert (s.state.selection.marks.hidden == chosen).all()
-    s.click(f"{rows}{first.node}/###eye")
-    s.click(f"{rows}{first.node}/###lock", frames=2)
-    assert s.state.things.locked == {first.node}
-    s.shot("outline")
-    s.ctx.item_drag_and_drop(f"{rows}{first.node}/###row", f"{rows}{second.node}/###row")
-    s.ctx.yield_(2)
-    (group,) = s.state.things.groups
-    assert group.nodes == (second.node, first.node)
-    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.z, 2)
+    s.click(f"{row}eye")
+    s.click(f"{row}lock")
+    assert s.state.things.locked == {first}
+    s.ctx.item_drag_and_drop(f"{row}row", f"//**/node {second}/###row")
     s.settle()
+    (group,) = s.state.things.groups
+    assert group.nodes == (second, first)
+    for _ in range(2):
+        s.key("Ctrl+Z")
     assert (s.state.things.locked, s.state.things.groups) == (set(), ())
 
-    use_the_outline_by_keys(s, first.node)
-    s.key(imgui.Key.r)
-    area, (width, height) = scene_area(), s.state.size
-    (x, y), _ = (part[0] for part in s.state.view.camera(width, height).project(CENTRES[1][None]))
-    s.ctx.mouse_move_to_pos((x + area.left, y + area.top))
+    use_the_outline_by_keys(s, first)
+    s.key("R")
+    s.ctx.mouse_move_to_pos(s.on_screen(CENTRES[1]))
     s.ctx.yield_(2)
     s.ctx.mouse_click(1)
     s.ctx.yield_(3)
@@ -276,74 +234,70 @@ def use_the_outline(s: Any) -> None:
 
 def use_the_outline_by_keys(s: Any, node: int) -> None:
     """From the filter down to a row: Enter looks at the thing, the menu key groups it."""
-    settings.open_panel(s.window.viewer, "Outline")
-    selecting.select_none(s.window.viewer)
+    s.open_panel("Outline", frames=1)
+    selecting.select_none(s.viewer)
     s.ctx.item_click("//**/##filter")
-    s.key(imgui.Key.down_arrow, frames=2)
-    s.key(imgui.Key.enter)
+    s.key("down_arrow", frames=2)
+    s.key("enter")
     assert (s.state.selection.marks.selected == s.state.outline.tree.members(node)).all()
-    s.key(imgui.Key.menu, frames=3)
-    s.ctx.key_press(imgui.Key.up_arrow)  # to the last
-    s.ctx.yield_(2)
-    s.key(imgui.Key.enter, frames=3)
+    s.key("menu", frames=3)
+    s.key("up_arrow", frames=2)  # to the last
+    s.key("enter", frames=3)
     assert [group.nodes for group in s.state.things.groups] == [(node,)]
-    s.key(imgui.Key.mod_ctrl | imgui.Key.z)
+    s.key("Ctrl+Z")
 
 
-# Scenarios of `window_driver`: the panel "Record", bookmarks, sides.
+# The panel "Record", bookmarks, sides.
 
 
-def record_and_play(s) -> None:
+def record_and_play(s: Any) -> None:
     """Keyframes by a key, played in the window, saved as a path and as a film."""
     record = s.state.record
     s.open_panel("Record", frames=4)
     for end in ((656, 300), (700, 320)):
-        s.ctx.key_press(imgui.Key.k)
+        s.key("K", frames=1)
         s.drag((600, 300), end)
-        s.settle()
     s.click("//Record/Add keyframe", frames=2)
     assert [key.seconds for key in record.keyframes] == [0, 2, 4]
     last = s.state.view
     s.ctx.item_click("//Record/Clear")
-    s.key(imgui.Key.mod_ctrl | imgui.Key.z, frames=2)
+    s.key("Ctrl+Z", frames=2)
     assert len(record.keyframes) == 3
 
-    filming.set_path_seconds(s.window.viewer, 60.0)  # longer than a frame may take
+    filming.set_path_seconds(s.viewer, 60.0)  # longer than a frame may take
     start = s.shot("start")
     s.ctx.item_click("//Record/Play##path")
     s.wait(lambda: 0.2 < record.at < 60.0)
     moving = s.state.view
-    filming.set_path_seconds(s.window.viewer, 1.0)
+    filming.set_path_seconds(s.viewer, 1.0)
     s.ctx.item_click("//Record/Play##path")
     s.wait(lambda: record.began is None)
     assert record.at == 1.0
     np.testing.assert_allclose(s.state.view.eye, last.eye, atol=1e-6)
     assert np.abs(moving.eye - last.eye).max() > 1e-3
-    filming.set_path_seconds(s.window.viewer, 60.0)
-    s.ctx.key_press(imgui.Key.mod_shift | imgui.Key.k)  # from the start again
+    filming.set_path_seconds(s.viewer, 60.0)
+    s.key("Shift+K", frames=1)  # from the start again
     s.wait(lambda: 0 < record.at < 59.0)
     s.drag((600, 300), (620, 310))  # the hand is stronger
-    s.settle()
     assert record.began is None
     assert np.abs(s.shot("elsewhere") - start)[100:500, 400:].max() > 30
 
     s.click("//Record/Save path", frames=2)
     assert len(read_flight(s.folder / "blobs-001.path.json").keyframes) == 3
-    filming.set_path_seconds(s.window.viewer, 1.0)
-    filming.set_film_size(s.window.viewer, 32, 24)
-    s.window.viewer.state.record.fps = 4.0
-    s.window.viewer.state.record.film_typed = "film"
+    filming.set_path_seconds(s.viewer, 1.0)
+    filming.set_film_size(s.viewer, 32, 24)
+    s.viewer.state.record.fps = 4.0
+    s.viewer.state.record.film_typed = "film"
     s.ctx.item_click("//Record/Save film")
-    s.wait(lambda: s.window.viewer.recorder.current is None)
-    s.ctx.yield_(3)
+    s.until(lambda: s.viewer.recorder.current is None)
     assert len(list((s.folder / "film").glob("frame-*.png"))) == 5
 
 
-def mark_and_return(s) -> None:
+def mark_and_return(s: Any) -> None:
     """A bookmark by its key, the sides by theirs, the command on the clipboard."""
-    s.key(imgui.Key.mod_ctrl | imgui.Key.b, frames=2)
+    s.key("Ctrl+B", frames=2)
     start = s.state.view
-    s.key(imgui.Key.keypad7)
+    s.key("keypad7")
     np.testing.assert_allclose(s.state.view.rotation[2], -start.up, atol=1e-6)
     s.open_panel("Bookmarks", frames=4)
     s.click("//**/view 1##bookmark")
@@ -352,5 +306,197 @@ def mark_and_return(s) -> None:
     s.enter("by the key of k", frames=2)
     assert [mark.name for mark in s.state.bookmarks] == ["view 1", "by the key of k"]
     assert s.state.record.keyframes == ()
-    s.key(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.c, frames=3)
+    s.key("Ctrl+Shift+C", frames=3)
     assert imgui.get_clipboard_text().startswith("langsplat-viewer ")
+
+
+# Keys, palette, toolbar, and where panels lie.
+
+
+def use_the_palette(s: Any) -> None:
+    """Its keys keep away from the scrollbar; Enter does the first command that matches, which is lit."""
+    s.key("Ctrl+Shift+P", frames=3)
+    box, bar = s.ctx.item_info("//Commands/##command").rect_full, imgui.get_style().scrollbar_size
+    right, rows = int(box.max.x - bar), slice(int(box.max.y) + 30, int(box.max.y) + 150)
+    seen = s.shot("palette")[rows]
+    assert np.ptp(seen[:, right - 100 : right], axis=0).max() > 60  # keys
+    assert np.ptp(seen[:, right - 5 : right - 1], axis=0).max() < 10
+    s.enter("show depth", frames=3)
+    assert s.state.picture.display == "depth"
+    assert not s.state.show_palette
+
+    s.key("Ctrl+Shift+P", frames=3)
+    for width, height in ((1100, 600), (200, 150)):
+        resize(s, width, height)
+        palette = s.ctx.window_info("//Commands").window
+        assert abs(palette.pos.x + palette.size.x / 2 - width / 2) < 2 or width == 200
+        assert 0 <= palette.pos.x <= palette.pos.x + palette.size.x <= width
+    s.key("escape", frames=1)
+    resize(s, 860, 620)
+
+
+def resize(s: Any, width: int, height: int) -> None:
+    glfw.set_window_size(glfw_window_hello_imgui(), width, height)
+    s.until(lambda: imgui.get_main_viewport().size.x == width)
+
+
+def use_shortcuts(s: Any) -> None:
+    """Chords work everywhere, letters only by themselves and never while typing."""
+    before = s.state.view
+    for key in "RPD2E":
+        s.key(f"Ctrl+{key}", frames=3)
+    assert s.state.view is before
+    assert s.state.picture.display == "rgb"
+    assert not list(s.folder.glob("blobs-*.png"))
+
+    s.key("Ctrl+F", frames=3)
+    s.type("far", frames=3)
+    assert (s.state.typed, s.state.view is before) == ("far", True)
+    s.key("f1", frames=2)  # also while typing
+    assert s.state.show_help
+    s.key("f1", frames=1)
+    s.key("escape", frames=3)
+    assert not imgui.get_io().want_text_input
+    assert not s.state.show_help
+    s.key("Shift+F")
+    assert s.state.view is not before
+    for back, start in (("home", (600, 300)), ("R", (560, 340))):  # apart: never a double click
+        s.drag(start, (656, 279))
+        s.key(back)
+        first = s.state.scene.cameras[0].world_to_camera
+        np.testing.assert_allclose(s.state.view.camera(160, 120).world_to_camera, first, atol=1e-9)
+
+    s.key("Ctrl+S", frames=1)
+    s.wait((s.folder / "blobs-001.png").exists)
+    s.type("?")
+    assert s.state.show_help
+    s.key("escape", frames=1)
+    use_the_palette(s)
+    s.key("Ctrl+Z", frames=2)
+    assert s.state.picture.display == "rgb"
+    s.key("Ctrl+O", frames=3)
+    assert s.ctx.item_exists("//**/##path")
+
+
+def use_the_toolbar(s: Any) -> None:
+    """Every icon does what its command does, and is lit where that is on; queries are combined by a menu."""
+    labels = {row.does: button_label(row).replace("/", "\\/") for row in COMMANDS if row.icon}
+    icons = {does: f"//toolbar/{label}" for does, label in labels.items()}
+    for does, icon in icons.items():
+        assert s.ctx.item_exists(icon), does
+    s.ctx.item_click(icons["show depth"])
+    s.click(icons["select: lasso"], frames=2)
+    assert (s.state.picture.display, s.state.selection.tool) == ("depth", "lasso")
+    s.ctx.item_click(icons["select with no tool: the left button turns the view"])
+    for phrase in ("mug", "book"):
+        s.search(phrase)
+    s.ctx.item_click("//**/mug##phrase of list")
+    s.click("//Search/Combine", frames=2)
+    s.click("//$FOCUSED/or", frames=2)
+    s.click("//**/book##other")
+    assert [query.phrase for query in s.state.queries] == ["mug", "book", "mug or book"]
+    s.click("//**/Fixed heat scale", frames=2)
+    lows, highs = zip(*(query.result.heat_range for query in s.state.shown()), strict=True)
+    assert s.state.picture.heat_scale == (min(lows), max(highs))
+
+
+def many_queries(s: Any) -> None:
+    """However many there are and however long: the list keeps its place, the newest is on top."""
+    display = s.ctx.item_info("//**/Colours").rect_full.min.y
+    long = "a mug or a book or a plant or another mug or plant"
+    for phrase in ("mug", "plant", "book or plant", long, "pot"):
+        s.search(phrase)
+        assert s.ctx.item_info("//**/Colours").rect_full.min.y == display
+    names = [f"//**/{query.phrase}/x" for query in s.state.queries]
+    closes = [s.ctx.item_info(name).rect_full for name in names if s.ctx.item_exists(name)]
+    ((_, right),) = {(rect.min.x, rect.max.x) for rect in closes}
+    assert right <= s.ctx.item_info("//Search/Search").rect_full.max.x + 1
+    phrase = s.state.queries[-1].phrase
+    s.click(f"//**/{phrase}/x", frames=2)
+    assert phrase not in [query.phrase for query in s.state.queries]
+    assert s.ctx.item_info("//**/Colours").rect_full.min.y == display
+
+
+def arrange_panels(s: Any) -> None:
+    """Menus do what keys do; panels are closed, opened and moved; the browser opens a scene."""
+    s.menu("View", "Show depth")
+    assert s.state.picture.display == "depth"
+    s.menu("Window", "Light theme")
+    light = s.shot("light")
+    assert light[300:500, 5].min() > 150
+    whole = s.state.size
+    for title in ("Search", "Scene", "Display", "Camera", "Messages"):
+        s.menu("Window", title)
+    assert s.state.size[0] == 860 > whole[0]  # the scene has taken their place
+    s.key("Ctrl+F", frames=4)
+    s.type("mug", frames=3)
+    assert s.state.typed == "mug"  # the panel is open again, and its box has the keyboard
+    s.key("escape", frames=1)
+    s.menu("Window", "Panels as at first")
+    for title in ("Scene", "Display", "Camera", "Messages"):
+        if not s.ctx.item_exists(f"//{title}"):
+            s.menu("Window", title)
+    s.key("Ctrl+O")
+    assert s.state.browser.folder == s.folder.absolute()
+    s.ctx.item_click("//**/plain.ply")
+    s.shows("plain.ply")
+    assert s.state.browser is None
+    s.key("Ctrl+O", frames=4)
+    s.key("escape", frames=3)
+    assert s.state.browser is None
+
+
+def leave_settings(s: Any) -> None:
+    """The next window finds them; see `find_settings`."""
+    assert s.state.show_help  # at the first start
+    s.key("escape", frames=1)
+    s.menu("Window", "Light theme")
+    for title in ("Select", "Train", "Record"):  # which do not lie over the search the next time
+        s.menu("Window", title)
+    s.menu("Window", "Display")
+    s.key("f11")  # hidden at the end, there again the next time
+    assert s.state.size[0] == 860
+
+
+def find_settings(s: Any) -> None:
+    """What `leave_settings` has left."""
+    assert not s.state.show_help
+    assert s.state.preferences.theme == "light"
+    assert [Path(path).name for path in s.state.preferences.recent] == ["blobs.ply"]
+    assert s.state.size[0] < 700
+    assert s.ctx.item_exists("//**/##phrase")
+    assert not s.ctx.item_exists("//**/Colours")
+
+
+def travel_by_keys(s: Any) -> None:
+    """Esc closes a menu; Tab goes from field to field, and the panels stay; the palette knows everything."""
+    s.ctx.item_click("//**/##MenuBar/View")
+    assert imgui.is_popup_open("", imgui.PopupFlags_.any_popup)
+    s.key("escape", frames=2)
+    assert not imgui.is_popup_open("", imgui.PopupFlags_.any_popup)
+    s.key("Ctrl+F", frames=4)
+    seen = set()
+    for _ in range(12):
+        s.key("tab", frames=2)
+        seen.add(imgui.internal.get_focus_id())
+    assert len(seen) > 5
+    assert s.state.show_panel
+    for words, done in (
+        ("light theme", lambda: s.state.preferences.theme == "light"),
+        ("letters of 125", lambda: s.state.preferences.ui_scale == 1.25),
+        ("open plain", lambda: s.state.path.name == "plain.ply"),
+    ):
+        if words == "open plain":
+            s.state.preferences = with_recent(s.state.preferences, s.folder / "plain.ply")
+        s.key("Ctrl+Shift+P", frames=3)
+        s.ctx.key_chars_append_enter(words)
+        s.until(done)
+    s.key("Ctrl+Shift+P", frames=3)
+    s.type("show")  # arrows choose another command than the first
+    for _ in range(3):
+        s.key("down_arrow", frames=2)
+    s.key("enter", frames=3)
+    assert s.state.picture.display == "depth"
+    s.key("Ctrl+Shift+P", frames=3)
+    s.enter("teleport", frames=3)
+    assert s.state.show_palette

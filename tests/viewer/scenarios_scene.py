@@ -1,7 +1,7 @@
 """Scenarios of `window_driver` over the scene: several panes, overlays, measuring, selecting."""
 
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from imgui_bundle import hello_imgui, imgui  # isort: skip
 from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
 import glfw  # isort: skip
 from langsplat_core.io.scenes import load_scene, save_scene
-from langsplat_viewer.actions import browsing, editing, opening, queries, selecting, settings, viewpoint
+from langsplat_viewer.actions import browsing, editing, opening, selecting, settings, viewpoint
 from langsplat_viewer.camera.overlays import Label, visible_faces
 from langsplat_viewer.panels import overlays, select
 from langsplat_viewer.panels.overlays import EDGE
@@ -27,7 +27,7 @@ MUG, BOOK, PLANT = CENTRES
 def split_the_view(s: Any) -> None:
     """The line is dragged without the camera; nothing is drawn for it, and nothing at rest."""
     rgb = s.shot("rgb")
-    s.key(imgui.Key.v)
+    s.key("V")
     assert s.state.settings.split.mode == "wipe"
     both, area, before = s.shot("both"), scene_area(), s.state.view
     np.testing.assert_allclose(s.at(both, MUG), s.at(rgb, MUG), atol=2)
@@ -36,131 +36,103 @@ def split_the_view(s: Any) -> None:
     middle, y = area.left + area.width / 2, area.top + 0.8 * area.height
     drawn = s.renderer.count
     s.drag((middle, y), (area.left + 0.9 * area.width, y))
-    s.settle()
     assert abs(s.state.settings.split.at - 0.9) < 0.02
     assert s.state.view is before
     assert s.renderer.count == drawn
     np.testing.assert_allclose(s.at(s.shot("wiped"), PLANT), s.at(rgb, PLANT), atol=2)
 
     s.drag((middle, y), (middle + 40, y))  # beside the line the camera turns as ever
-    s.settle()
     assert s.state.view is not before
     s.menu("View", "Three levels side by side")
-    s.settle()
     levels = s.shot("levels")
     assert s.renderer.count > drawn
     thirds = [levels[250:400, int(area.left + (i + 0.5) * area.width / 3)] for i in range(3)]
     assert np.abs(thirds[0] - thirds[2]).max() > 30
-    drawn = s.renderer.count
-    s.ctx.yield_(20)
-    assert s.renderer.count == drawn
-
-
-def on_screen(s: Any, point: np.ndarray) -> tuple[float, float]:
-    """Where a world point is in the window."""
-    area = scene_area()
-    pixels, _ = s.state.view.camera(*s.state.size).project(point[None])
-    return float(pixels[0, 0] + area.left), float(pixels[0, 1] + area.top)
-
-
-def click(s: Any, place: tuple[float, float]) -> None:
-    s.ctx.mouse_teleport_to_pos(place)
-    s.ctx.yield_(2)
-    s.ctx.mouse_click(0)
-    s.ctx.yield_(2)
+    s.draws_nothing()
 
 
 def draw_over_the_scene(s: Any) -> None:
     """The cube turns the view, a click on a camera stands there, two clicks measure."""
     s.menu("View", "Show or hide the view cube")
     s.menu("View", "Show or hide the training cameras")
-    s.settle()
-    area = scene_area()
-    before = s.state.view
+    area, before = scene_area(), s.state.view
     side = s.ctx.item_info("//view cube/cube").rect_full
     assert side.max.x <= area.left + area.width + 1
     name, place = next(face for face in faces_on_screen(s, side) if face[0] == "front")
-    click(s, place)
-    s.settle()
+    s.click_at(place)
     assert s.state.view is not before
     assert [face[0] for face in faces_on_screen(s, side)] == [name]
 
-    for _ in range(8):  # until all cameras are in the picture
-        s.ctx.mouse_teleport_to_pos((area.left + area.width / 2, area.top + area.height / 2))
-        s.ctx.mouse_wheel_y(-1)
-        s.ctx.yield_(2)
-    s.settle()
+    turn_the_wheel(s, 8)  # until all cameras are in the picture
     camera = s.state.scene.cameras[2]
     seen = s.shot("cameras")
     s.menu("View", "Show or hide the training cameras")
-    s.settle()
     assert np.abs(seen - s.shot("none"))[:, int(area.left) :].max() > 60
     s.menu("View", "Show or hide the training cameras")
-    click(s, on_screen(s, camera.position))
-    s.settle()
+    s.click_at(s.on_screen(camera.position))
     assert s.state.camera_index == 2
     got = s.state.view.camera(160, 120).world_to_camera
     np.testing.assert_allclose(got, camera.world_to_camera, atol=1e-9)
 
-    s.key(imgui.Key.m, frames=2)
+    s.key("M", frames=2)
     turned = s.state.view
     for thing in (MUG, BOOK):
-        click(s, on_screen(s, thing))
+        s.click_at(s.on_screen(thing))
     assert s.state.view is turned
     assert abs(s.state.ruler.length - np.linalg.norm(MUG - BOOK)) < 0.2
-    s.shot("ruler")
-    before = s.state.view
     s.ctx.mouse_double_click(0)  # two points in quick succession; elsewhere it would move the view
     s.settle()
-    assert s.state.view is before
+    assert s.state.view is turned
     assert s.state.ruler.length is not None
     assert s.state.ruler.length < 0.05
-    drawn = s.renderer.count
-    s.ctx.yield_(20)
-    assert s.renderer.count == drawn
-    s.key(imgui.Key.escape, frames=2)
+    s.draws_nothing()
+    s.key("escape", frames=2)
     assert not s.state.ruler.measures
 
 
 def time_and_compare(s: Any) -> None:
     """The panel tells medians while it is seen, and the error of what is shown."""
     s.open_panel("Timing", frames=3)
-    for key in (imgui.Key["_2"], imgui.Key["_1"]):
+    for key in "21":
         s.key(key)
-    queries.ask(s.window.viewer, "mug")
-    s.settle()
+    s.search("mug")
     told = dict(s.state.timing.medians())
     assert {"Blend", "Picture, all of it", "Panels", "Search"} <= set(told)
     s.ctx.item_click("//Timing/Compare with the reference")
-    s.wait(lambda: s.state.timing.comparison is not None)
+    s.until(lambda: s.state.timing.comparison is not None)
     assert s.state.timing.comparison.psnr > 40
-    s.shot("timing")
-    count = len(s.state.timing.laps["panels"])
-    assert count > 2
+    assert len(s.state.timing.laps["panels"]) > 2
     s.menu("Window", "Timing")
-    s.ctx.yield_(3)
     drawn = len(s.state.timing.laps["blend"])
-    s.key(imgui.Key["_2"])
+    s.key("2")
     assert len(s.state.timing.laps["blend"]) == drawn
 
 
 def faces_on_screen(s: Any, side: Any) -> list[tuple[str, tuple[float, float]]]:
     """Name and middle of each face of the cube that is seen, in the window."""
-    middle, scale = (
-        ((side.min.x + side.max.x) / 2, (side.min.y + side.max.y) / 2),
-        EDGE * (side.max.x - side.min.x),
-    )
-    return [
-        (face.name, (middle[0] + scale * face.centre[0], middle[1] + scale * face.centre[1]))
+    middle = np.array([side.min.x + side.max.x, side.min.y + side.max.y]) / 2
+    places = {
+        face.name: middle + EDGE * (side.max.x - side.min.x) * np.array(face.centre)
         for face in visible_faces(s.state.view)
-    ]
+    }
+    return [(name, tuple(map(float, place))) for name, place in places.items()]
+
+
+def turn_the_wheel(s: Any, times: int) -> None:
+    """Away from the scene, over its middle."""
+    area = scene_area()
+    for _ in range(times):
+        s.ctx.mouse_teleport_to_pos((area.left + area.width / 2, area.top + area.height / 2))
+        s.ctx.mouse_wheel_y(-1)
+        s.ctx.yield_(2)
+    s.settle()
 
 
 def look_without_perspective(s: Any) -> None:
     """A key takes perspective away until it is pressed again; axes, wheel and the click on a camera work
     as ever, and the picture says what it is."""
     deep, view = s.shot("deep"), s.state.view
-    s.key(imgui.Key.o)
+    s.key("O")
     assert s.state.view.orthographic
     flat, area = s.shot("flat"), scene_area()
     for thing in CENTRES:
@@ -169,38 +141,32 @@ def look_without_perspective(s: Any) -> None:
     assert (flat[corner].min(-1) > 200).sum() > 100  # words
     assert (deep[corner].min(-1) > 200).sum() == 0
 
-    s.key(imgui.Key.keypad1)
-    before = on_screen(s, PLANT)[0] - on_screen(s, MUG)[0]
-    s.ctx.mouse_teleport_to_pos((area.left + area.width / 2, area.top + area.height / 2))
-    s.ctx.mouse_wheel_y(-1)
-    s.ctx.yield_(2)
-    s.settle()
-    assert abs((on_screen(s, PLANT)[0] - on_screen(s, MUG)[0]) / before - 0.88) < 1e-3
+    s.key("keypad1")
+    before = s.on_screen(PLANT)[0] - s.on_screen(MUG)[0]
+    turn_the_wheel(s, 1)
+    assert abs((s.on_screen(PLANT)[0] - s.on_screen(MUG)[0]) / before - 0.88) < 1e-3
 
     s.menu("View", "Show or hide the training cameras")
-    s.key(imgui.Key.home)
+    s.key("home")
     assert s.state.view.orthographic
     s.open_panel("Camera", frames=4)
     s.click("//Camera/###orthographic")
-    np.testing.assert_allclose(
-        s.state.view.camera(160, 120).world_to_camera, view.camera(160, 120).world_to_camera, atol=1e-9
-    )
-    s.key(imgui.Key.keypad5, frames=2)
+    poses = [one.camera(160, 120).world_to_camera for one in (s.state.view, view)]
+    np.testing.assert_allclose(*poses, atol=1e-9)
+    s.key("keypad5", frames=2)
     assert s.state.view.orthographic
-    viewpoint.zoom_by(s.window.viewer, 4.0)  # until all cameras are in the picture
+    viewpoint.zoom_by(s.viewer, 4.0)  # until all cameras are in the picture
     s.settle()
-    s.shot("cameras")
-    click(s, on_screen(s, s.state.scene.cameras[2].position))
-    s.settle()
+    s.click_at(s.on_screen(s.state.scene.cameras[2].position))
     assert (s.state.camera_index, s.state.view.orthographic) == (2, False)
 
 
 def name_what_is_close(s: Any) -> None:
     """Things in one line of sight have their names one above the other."""
-    settings.show_overlay(s.window.viewer, "things", True)
+    settings.show_overlay(s.viewer, "things", True)
     for word in ("mug", "book", "plant"):
         s.search(word)
-    viewpoint.look_from(s.window.viewer, "left")
+    viewpoint.look_from(s.viewer, "left")
     s.settle()
     written, write = [], overlays.text_on_shade
 
@@ -216,16 +182,15 @@ def name_what_is_close(s: Any) -> None:
     assert set(frame) == {"mug", "book", "plant"}
     assert not any(a.covers(b) for a, b in combinations(frame.values(), 2))
     assert written[:3] == written[3:6]  # from frame to frame the same
-    s.shot("names")
 
 
-# Selecting in the real window; played by `window_driver`.
+# Selecting.
 
 
 def around(s: Any, centre: np.ndarray) -> tuple[tuple[float, float], tuple[float, float]]:
     """Two corners around a blob, as it is seen now."""
-    x, y = on_screen(s, centre)
-    right, _ = on_screen(s, centre + 0.6 * s.state.view.rotation[0])
+    x, y = s.on_screen(centre)
+    right, _ = s.on_screen(centre + 0.6 * s.state.view.rotation[0])
     half = right - x
     return (x - half, y - half), (x + half, y + half)
 
@@ -237,48 +202,40 @@ def looks_selected(colour: np.ndarray) -> bool:
 
 def select_with_the_mouse(s: Any) -> None:
     """A rectangle, keys and buttons; what they did is undone."""
-    s.ctx.key_press(imgui.Key.period)  # the camera in front: no blob hides another
-    s.settle()
+    s.key("period")  # the camera in front: no blob hides another
     plain = s.shot("plain")
     s.menu("Window", "Select")
-    s.settle()
     s.click("//**/Rectangle##tool")
     s.drag(*around(s, PLANT))
-    s.settle()
     seen = s.state.selection.marks.selected
     assert 10 < seen.sum() < 110  # the front of it
     s.click("//**/Only what is visible")
     before = s.state.view
     s.drag(*around(s, PLANT))
-    s.settle()
     assert s.state.view is before  # the drag turned nothing
-    assert marked(s.window.viewer) == ("plant", "", "")
+    assert marked(s.viewer) == ("plant", "", "")
     chosen = s.shot("chosen")
     assert looks_selected(s.at(chosen, PLANT))
     np.testing.assert_allclose(s.at(chosen, BOOK), s.at(plain, BOOK), atol=6)
 
     s.ctx.key_down(imgui.Key.mod_shift)
     s.drag(*around(s, BOOK))
-    s.ctx.yield_(2)
     s.ctx.key_up(imgui.Key.mod_shift)
-    s.settle()
-    assert marked(s.window.viewer)[0] == "book plant"
+    assert marked(s.viewer)[0] == "book plant"
 
-    s.key(imgui.Key.h)
-    assert marked(s.window.viewer) == ("", "book plant", "")
-    s.key(imgui.Key.mod_ctrl | imgui.Key.z)
-    assert marked(s.window.viewer) == ("book plant", "", "")
-    s.key(imgui.Key.escape, frames=3)
+    s.key("H")
+    assert marked(s.viewer) == ("", "book plant", "")
+    s.key("Ctrl+Z")
+    assert marked(s.viewer) == ("book plant", "", "")
+    s.key("escape", frames=3)
     assert s.state.selection.tool is None
     s.drag((600, 300), (656, 279))
-    s.settle()
     assert not np.array_equal(before.rotation, s.state.view.rotation)  # the drag turns again
 
 
 def outline_and_rest(s: Any) -> None:
     """An outline is drawn while the button is held, Esc gives it up, and nothing is drawn again at rest."""
     s.menu("Select", "Select: lasso")
-    s.settle()
     s.ctx.mouse_teleport_to_pos((500, 200))
     s.ctx.mouse_down(0)
     for place in ((700, 200), (700, 400), (520, 390)):
@@ -287,25 +244,21 @@ def outline_and_rest(s: Any) -> None:
     assert len(s.state.selection.stroke.path) == 4
     line = s.shot("lasso")[196:205, 600]
     assert line.min(1).max() > 100  # a light line on black
-    s.ctx.key_press(imgui.Key.escape)
+    s.key("escape", frames=1)
     s.ctx.mouse_up(0)
     s.settle()
     assert (s.state.selection.stroke, s.state.selection.tool) == (None, "lasso")
-    assert marked(s.window.viewer)[0] == ""
-    drawn = s.renderer.count
-    s.ctx.yield_(20)
-    assert s.renderer.count == drawn
+    assert marked(s.viewer)[0] == ""
+    s.draws_nothing()
 
 
 def ask_before_leaving(s: Any) -> None:
     """What was deleted and not saved is asked about before another scene opens or the window closes."""
     s.search("mug")
     s.menu("Select", "Select what the search found")
-    s.key(imgui.Key.delete)
-    assert marked(s.window.viewer) == ("", "", "mug")
-    s.window.drop([str(s.folder / "plain.ply")])
-    s.ctx.yield_(4)
-    s.shot("question")
+    s.key("delete")
+    assert marked(s.viewer) == ("", "", "mug")
+    s.drop("plain.ply")
     s.click("//**/Cancel")
     assert s.state.path.name == "blobs.ply"
 
@@ -316,13 +269,11 @@ def ask_before_leaving(s: Any) -> None:
     glfw.set_window_should_close(glfw_window_hello_imgui(), True)  # its cross was clicked
     s.wait(lambda: s.state.selection.leaving is not None)
     s.click("//**/Cancel")
-    assert marked(s.window.viewer) == ("", "", "mug")
+    assert marked(s.viewer) == ("", "", "mug")
 
-    s.window.drop([str(s.folder / "plain.ply")])
-    s.ctx.yield_(4)
+    s.drop("plain.ply")
     s.click("//**/Not saved/Save")
-    s.wait(lambda: s.state.path.name == "plain.ply")
-    s.settle()
+    s.shows("plain.ply")
     assert len(load_scene(s.folder / "blobs-edited-001.ply").gaussians) < 360
     assert len(load_scene(s.folder / "blobs.ply").gaussians) == 360  # as it was
 
@@ -330,56 +281,48 @@ def ask_before_leaving(s: Any) -> None:
 def name_what_is_clicked(s: Any) -> None:
     """A thing is clicked, named in the panel, and found by its name; what is like it is selected."""
     s.menu("Window", "Select")
-    s.settle()
     s.click("//**/Thing##tool")
-    s.ctx.mouse_teleport_to_pos(on_screen(s, PLANT))
-    s.ctx.mouse_click(0)
-    s.settle()
-    assert marked(s.window.viewer)[0] == "plant"
+    s.click_at(s.on_screen(PLANT))
+    assert marked(s.viewer)[0] == "plant"
     s.ctx.item_click("//Select/##name")
     s.enter("grandma's mug")
     query = s.state.queries[-1]
     assert (query.phrase, query.result.found) == ("grandma's mug", True)
     np.testing.assert_array_equal(query.result.members, s.state.selection.marks.selected)
-    s.shot("named")
     s.click("//**/More like it##verb")
-    assert marked(s.window.viewer)[0] == "plant"
+    assert marked(s.viewer)[0] == "plant"
 
 
 def drag_the_gizmo(s: Any) -> None:
     """What was found is moved by the gizmo's middle, and seen there; the camera stays. Numbers and the crop
     box do the rest, and all is undone."""
-    viewer, before = s.window.viewer, s.state.scene.gaussians.means.copy()
+    viewer, before = s.viewer, s.state.scene.gaussians.means.copy()
     rgb = s.shot("rgb")
     s.search("mug")
     selecting.select_query(viewer)
     settings.set_display(viewer, "rgb")
-    settings.open_panel(s.window.viewer, "Transform")
-    s.key(imgui.Key.g)
+    s.open_panel("Transform", frames=1)
+    s.key("G")
     view, chosen = s.state.view, s.state.selection.marks.selected
-    x, y = on_screen(s, editing.pivot(viewer))
+    x, y = s.on_screen(editing.pivot(viewer))
     s.ctx.mouse_teleport_to_pos((x, y))
     for covered in (True, False):  # by a window over the scene, whose mouse it leaves alone
         viewer.state.show_help = covered
         s.ctx.yield_(3)
         assert select.holds_mouse(viewer) != covered
-    s.ctx.mouse_down(0)
-    s.ctx.yield_(2)
-    for step in range(1, 7):
-        s.ctx.mouse_teleport_to_pos((x + 10 * step, y - 20 * step))
-        s.ctx.yield_(2)
-    assert s.state.moving is not None
-    s.capture(s.folder / "dragging.png")
-    s.ctx.mouse_up(0)
+    with s.dragging((x, y), (x + 60, y - 120)):
+        assert s.state.moving is not None
+        s.capture(s.folder / "dragging.png")
     s.settle()
     assert s.state.view is view
     moved = s.state.scene.gaussians.means - before
     assert (moved[~chosen] == 0).all()
     assert np.ptp(moved[chosen], axis=0).max() < 1e-5
-    went = on_screen(s, editing.pivot(viewer))
+    went = s.on_screen(editing.pivot(viewer))
     np.testing.assert_allclose(went, (x + 60, y - 120), atol=3)
     selecting.select_none(viewer)
-    s.ctx.key_press(imgui.Key.g, 4)  # off again
+    for _ in range(4):  # off again
+        s.key("G", frames=1)
     shot = s.shot("moved")
     assert s.at(shot, MUG + moved[chosen][0]).argmax() == s.at(rgb, MUG).argmax()
     assert np.abs(s.at(shot, MUG) - s.at(rgb, MUG)).max() > 40
@@ -389,11 +332,10 @@ def drag_the_gizmo(s: Any) -> None:
     s.click("//Transform/Fit")
     form = s.state.edit_form
     viewer.state.edit_form = replace(form, high=(*form.high[:2], (form.low[2] + form.high[2]) / 2))
-    s.ctx.item_click("//Transform/Crop")
-    s.shot("cropped")
+    s.click("//Transform/Crop")
     assert 0 < s.state.selection.marks.deleted.sum() < len(chosen)
     for _ in range(5):
-        s.key(imgui.Key.mod_ctrl | imgui.Key.z)
+        s.key("Ctrl+Z")
     np.testing.assert_array_equal(s.state.scene.gaussians.means, before)
     assert not s.state.selection.is_unsaved
 
@@ -401,43 +343,24 @@ def drag_the_gizmo(s: Any) -> None:
 def clip_and_brush(s: Any) -> None:
     """A corner of the clipping box is dragged, and what it then leaves out is hidden; a drag over the
     histogram of distances selects those between."""
-    viewer = s.window.viewer
-    settings.open_panel(s.window.viewer, "Transform")
+    viewer = s.viewer
+    s.open_panel("Transform", frames=1)
     editing.fill_box(viewer)
     s.ctx.yield_(2)
     s.ctx.item_click("//Transform/Box##gizmo")
     s.click("//Transform/Clip")
     assert s.state.selection.marks.shown.all()
-    form = s.state.edit_form
-    corners = np.array([form.low, form.high])
-    along = corners.mean(0)
-    handles = [
-        np.array([corners[i, 0], corners[j, 1], corners[k, 2]])
-        for i in (0, 1)
-        for j in (0, 1)
-        for k in (0, 1)
-    ]
-    middle = on_screen(s, along)
-    for corner in handles:
-        start = on_screen(s, corner)
-        s.ctx.mouse_teleport_to_pos(start)
-        s.ctx.yield_(2)
-        s.ctx.mouse_down(0)
-        s.ctx.yield_(2)
-        for part in (0.2, 0.4, 0.6, 0.8):
-            s.ctx.mouse_teleport_to_pos(tuple(a + part * (b - a) for a, b in zip(start, middle, strict=True)))
-            s.ctx.yield_(2)
-        s.ctx.mouse_up(0)
-        s.settle()
-        if s.state.edit_form.low != form.low or s.state.edit_form.high != form.high:
+    form, means = s.state.edit_form, s.state.scene.gaussians.means
+    middle = np.array(s.on_screen(np.mean([form.low, form.high], 0)))
+    for corner in product(*zip(form.low, form.high, strict=True)):
+        start = np.array(s.on_screen(np.array(corner)))
+        s.drag(tuple(start), tuple(start + 0.8 * (middle - start)))
+        if s.state.edit_form != form:
             break
-    inside = np.array([s.state.edit_form.low, s.state.edit_form.high])
-    means = s.state.scene.gaussians.means
-    np.testing.assert_array_equal(
-        s.state.selection.marks.shown, ((means >= inside[0]) & (means <= inside[1])).all(1)
-    )
-    assert 0 < s.state.selection.marks.hidden.sum() < len(means)
-    s.shot("clipped")
+    low, high = s.state.edit_form.low, s.state.edit_form.high
+    inside = ((means >= low) & (means <= high)).all(1)
+    np.testing.assert_array_equal(s.state.selection.marks.shown, inside)
+    assert 0 < inside.sum() < len(means)
     s.ctx.item_click("//Transform/Clip")
     s.ctx.item_click("//Transform/No gizmo##gizmo")
     assert s.state.selection.marks.shown.all()
@@ -452,7 +375,6 @@ def brush_numbers(s: Any) -> None:
     place = s.ctx.item_info("//Select/brush values").rect_full
     y = place.min.y + 5
     s.drag((place.min.x + 1, y), ((place.min.x + place.max.x) / 2, y))
-    s.settle()
     away = np.linalg.norm(s.state.scene.gaussians.means - s.state.view.eye, axis=1)
     chosen = s.state.selection.marks.selected
     assert 0 < chosen.sum() < len(away)
@@ -467,28 +389,24 @@ def brush_numbers(s: Any) -> None:
 def compare_two_scenes(s: Any) -> None:
     """Right of the line another scene is drawn by the same camera and answers the same phrase; a saved
     picture has both; without the line it is gone."""
-    viewer = s.window.viewer
+    viewer = s.viewer
     s.search("mug")
-    alone = s.shot("alone")
-    moved = replace(blob_scene(), path=None)
-    save_scene(
-        s.folder / "other.ply", replace(moved, gaussians=replace(moved.gaussians, sh=-moved.gaussians.sh))
-    )
+    alone, area = s.shot("alone"), scene_area()
+    gaussians = blob_scene().gaussians
+    dyed = replace(blob_scene(), path=None, gaussians=replace(gaussians, sh=-gaussians.sh))
+    save_scene(s.folder / "other.ply", dyed)
     settings.set_display(viewer, "rgb")
-    s.settle()
     rgb = s.shot("rgb one")
     opening.open_beside(viewer, s.folder / "other.ply")
-    s.wait(lambda: viewer.beside.state.scene is not None and len(viewer.beside.state.queries) == 1)
-    s.wait(lambda: viewer.beside.worker.current is None)
+    s.wait(lambda: len(viewer.beside.state.queries) == 1 and viewer.beside.worker.current is None)
     settings.move_line(viewer, 0.5)
     both = s.shot("rgb two")
-    area = scene_area()
     middle = int(area.left + area.width / 2)
-    assert (both[100:450, 450 : middle - 8] == rgb[100:450, 450 : middle - 8]).all()
-    assert np.abs(both[100:450, middle + 8 :] - rgb[100:450, middle + 8 :]).max() > 60
+    assert (both == rgb)[100:450, 450 : middle - 8].all()
+    assert np.abs(both - rgb)[100:450, middle + 8 :].max() > 60
     settings.set_display(viewer, "relevancy")
-    assert np.abs(s.shot("asked") - alone)[100:450, 450 : middle - 8].max() == 0
-    s.ctx.key_press(imgui.Key.p)
+    assert (s.shot("asked") == alone)[100:450, 450 : middle - 8].all()
+    s.key("P", frames=1)
     s.wait((s.folder / "blobs-001.png").exists)
     saved = np.asarray(Image.open(s.folder / "blobs-001.png")).astype(int)
     half = saved.shape[1] // 2
@@ -496,27 +414,24 @@ def compare_two_scenes(s: Any) -> None:
     np.testing.assert_allclose(saved[120:400, 100 : half - 8], shown[120:400, 100 : half - 8], atol=3)
     np.testing.assert_allclose(saved[120:400, half + 8 :], shown[120:400, half + 8 : saved.shape[1]], atol=3)
     settings.show_one(viewer)
-    s.settle()
+    assert (s.shot("alone again") == alone)[100:450, 450:].all()
     assert viewer.beside is None
-    assert np.abs(s.shot("alone again") - alone)[100:450, 450:].max() == 0
 
 
 def pin_a_note(s: Any) -> None:
     """What is typed after the click is its text; it is kept in the project, and undone."""
-    s.key(imgui.Key.n, frames=2)
-    click(s, on_screen(s, BOOK))
+    s.key("N", frames=2)
+    s.click_at(s.on_screen(BOOK))
     s.wait(lambda: imgui.get_io().want_text_input)
     s.ctx.key_chars("lent by Ada")
-    s.key(imgui.Key.enter, frames=2)
+    s.key("enter", frames=2)
     (note,) = s.state.notes
     assert (note.text, s.state.pins_notes) == ("lent by Ada", False)
     assert np.linalg.norm(note.at - BOOK) < 1.0
-    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.s)
-    s.wait((s.folder / "blobs-001.langsplat").exists)
-    s.shot("note")
+    s.key("Ctrl+Shift+S", frames=1)
+    s.until((s.folder / "blobs-001.langsplat").exists)
     for left in (1, 0):
-        s.key(imgui.Key.mod_ctrl | imgui.Key.z)
+        s.key("Ctrl+Z")
         assert len(s.state.notes) == left
-    browsing.open_file(s.window.viewer, s.folder / "blobs-001.langsplat")
-    s.wait(lambda: s.state.notes == (note,))
-    s.settle()
+    browsing.open_file(s.viewer, s.folder / "blobs-001.langsplat")
+    s.until(lambda: s.state.notes == (note,))

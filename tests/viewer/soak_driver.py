@@ -185,7 +185,7 @@ class Soak:
     def with_mouse(self) -> None:
         """A drag in the scene, with whichever tool there is, and the wheel."""
         start, end = ((self.rng.randint(450, 800), self.rng.randint(150, 500)) for _ in range(2))
-        self.s.drag(start, end, steps=3)
+        self.s.drag(start, end, frames=1, steps=3)
         self.s.ctx.mouse_wheel_y(self.rng.choice((-1, 1)))
 
     def held(self) -> dict[str, object]:

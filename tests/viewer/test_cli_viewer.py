@@ -16,8 +16,8 @@ from langsplat_core.io import language
 from langsplat_core.io.cameras import write_cameras
 from langsplat_core.io.scenes import companion_path, save_scene
 from langsplat_core.scene import Camera, Scene
-from langsplat_viewer import program
-from langsplat_viewer.options import parse_size
+from langsplat_viewer import options
+from langsplat_viewer.options import load_text_encoder, parse_size
 from tests.support.fakes import CENTRES, blob_scene
 from tests.support.scenes import with_tree
 
@@ -48,6 +48,13 @@ def picture(path: Path) -> np.ndarray:
     return np.asarray(Image.open(path)).astype(int)
 
 
+def draw(run_viewer, out: str, *arguments: str) -> list[str]:
+    """What is said of a picture of the blobs that is drawn without a window."""
+    code, said, errors = run_viewer("blobs.ply", "--headless", "--out", out, *arguments)
+    assert (code, errors) == (0, [])
+    return said
+
+
 def colour_at(image: np.ndarray, camera: Camera, point: np.ndarray) -> np.ndarray:
     pixels, _ = camera.project(point[None])
     column, row = pixels[0].astype(int)
@@ -55,18 +62,23 @@ def colour_at(image: np.ndarray, camera: Camera, point: np.ndarray) -> np.ndarra
 
 
 def test_a_picture_from_the_first_training_camera(run_viewer, folder):
-    code, out, err = run_viewer("blobs.ply", "--headless", "--out", "a.png")
-    assert (code, out, err) == (0, ["a.png: 160x120, rgb"], [])
+    assert draw(run_viewer, "a.png") == ["a.png: 160x120, rgb"]
     image, camera = picture(folder / "a.png"), blob_scene().cameras[0]
     assert image.shape == (120, 160, 3)
     assert [colour_at(image, camera, p).argmax() for p in (MUG, BOOK, PLANT)] == [0, 1, 2]
+    draw(run_viewer, "b.png", "--size", "400x120")  # holds the whole photograph
+    wide = picture(folder / "b.png")
+    assert wide.shape == (120, 400, 3)
+    np.testing.assert_allclose(wide[:, 120:280], image, atol=1)
+    write_cameras(folder / "view.json", (blob_scene().cameras[2],))
+    draw(run_viewer, "c.png", "--camera", "2")
+    draw(run_viewer, "d.png", "--camera", "view.json")
+    np.testing.assert_array_equal(picture(folder / "c.png"), picture(folder / "d.png"))
 
 
 def test_a_query_answers_in_words_and_as_heat(run_viewer, folder):
-    run_viewer("blobs.ply", "--headless", "--out", "rgb.png", "--camera", "1")
-    arguments = ["--query", "plant", "--query", "Book", "--camera", "1"]
-    code, out, err = run_viewer("blobs.ply", "--headless", "--out", "a.png", *arguments)
-    assert (code, err) == (0, [])
+    draw(run_viewer, "rgb.png", "--camera", "1")
+    out = draw(run_viewer, "a.png", "--query", "plant", "--query", "Book", "--camera", "1")
     assert out[0] == "a.png: 160x120, relevancy"
     assert out[1].startswith("'plant': found, score ")
     assert "level whole" in out[1]
@@ -76,13 +88,9 @@ def test_a_query_answers_in_words_and_as_heat(run_viewer, folder):
     camera = blob_scene().cameras[1]
     before, heat = picture(folder / "rgb.png"), picture(folder / "a.png")
     assert colour_at(heat, camera, PLANT)[2] < 60 < colour_at(before, camera, PLANT)[2]
-    np.testing.assert_allclose(
-        colour_at(heat, camera, MUG), 0.45 * colour_at(before, camera, MUG), atol=4
-    )  # what is not asked for is dimmed
-
-
-def test_a_fixed_level_is_used_and_named(run_viewer, folder):
-    _, out, _ = run_viewer("blobs.ply", "--headless", "--out", "a.png", "--query", "mug", "--level", "part")
+    dimmed = 0.45 * colour_at(before, camera, MUG)  # what is not asked for
+    np.testing.assert_allclose(colour_at(heat, camera, MUG), dimmed, atol=4)
+    out = draw(run_viewer, "a.png", "--query", "mug", "--level", "part")
     assert "not here" in out[1]
     assert "level part" in out[1]
 
@@ -90,19 +98,16 @@ def test_a_fixed_level_is_used_and_named(run_viewer, folder):
 def test_every_display_is_another_picture(run_viewer, folder):
     seen = []
     for display in get_args(Display):
-        code, out, _ = run_viewer(
-            "blobs.ply", "--headless", "--out", f"{display}.png", "--query", "mug", "--display", display
-        )
-        assert (code, out[0]) == (0, f"{display}.png: 160x120, {display}")
+        out = draw(run_viewer, f"{display}.png", "--query", "mug", "--display", display)
+        assert out[0] == f"{display}.png: 160x120, {display}"
         image = picture(folder / f"{display}.png")
         assert all(np.abs(image - other).max() > 30 for other in seen), display
         seen.append(image)
 
 
 def test_a_transparent_picture_in_another_colour_map(run_viewer, folder):
-    for out, more in (("a.png", ()), ("b.png", ("--colour-map", "cividis", "--transparent"))):
-        code, _, errors = run_viewer("blobs.ply", "--display", "depth", "--headless", "--out", out, *more)
-        assert (code, errors) == (0, [])
+    draw(run_viewer, "a.png", "--display", "depth")
+    draw(run_viewer, "b.png", "--display", "depth", "--colour-map", "cividis", "--transparent")
     plain, clear = picture(folder / "a.png"), picture(folder / "b.png")
     assert (plain.shape[2], clear.shape[2]) == (3, 4)
     inside = clear[..., 3] == 255
@@ -111,33 +116,14 @@ def test_a_transparent_picture_in_another_colour_map(run_viewer, folder):
     assert np.abs(clear[..., :3][inside] - plain[inside]).max() > 60
 
 
-@pytest.mark.parametrize(
-    ("option", "panel"),
-    [
-        (("--transparent",), "Display"),
-        (("--colour-map", "grey"), "Display"),
-        (("--cut", "0.6"), "Search"),
-        (("--canonical", "book"), "Search"),
-        (("--near-cut", "1"), "Camera"),
-        (("--far-cut", "1"), "Camera"),
-    ],
-)
-def test_options_of_pictures_say_where_the_window_has_them(run_viewer, folder, option, panel):
-    code, _, errors = run_viewer("blobs.ply", *option)
-    assert code == 2
-    assert f"panel {panel}" in errors[0]
-
-
 def test_without_perspective_the_picture_has_the_scale_that_was_asked_for(run_viewer, folder):
     """Three units across 120 pixels; each blob is as large as the others, however far away."""
-    code, out, err = run_viewer("blobs.ply", "--headless", "--orthographic", "3", "--out", "a.png")
-    assert (code, out, err) == (0, ["a.png: 160x120, rgb"], [])
-    image, camera = picture(folder / "a.png").astype(int), blob_scene().cameras[0]
+    assert draw(run_viewer, "a.png", "--orthographic", "3") == ["a.png: 160x120, rgb"]
+    image, camera = picture(folder / "a.png"), blob_scene().cameras[0]
     sizes, middles = [], []
     for colour in range(3):
-        others = [part for part in range(3) if part != colour]
-        rows, columns = np.nonzero(image[..., colour] - image[..., others].max(-1) > 40)
-        sizes.append(len(rows))
+        columns = np.nonzero(image[..., colour] - np.delete(image, colour, -1).max(-1) > 40)[1]
+        sizes.append(len(columns))
         middles.append(columns.mean())
     assert max(sizes) < 1.3 * min(sizes)
     along = float((PLANT - MUG) @ camera.rotation[0])
@@ -145,28 +131,12 @@ def test_without_perspective_the_picture_has_the_scale_that_was_asked_for(run_vi
 
 
 def test_a_cut_of_zero_is_the_answers_own(run_viewer, folder):
-    asked = ("blobs.ply", "--headless", "--display", "segmentation", "--query", "mug", "--query", "plant")
+    asked = ("--display", "segmentation", "--query", "mug", "--query", "plant")
     for out, cuts in (("a.png", ()), ("b.png", ("0", "0")), ("c.png", ("0", "0.01"))):
-        words = [word for cut in cuts for word in ("--cut", cut)]
-        assert run_viewer(*asked, "--out", out, *words)[0] == 0
+        draw(run_viewer, out, *asked, *[word for cut in cuts for word in ("--cut", cut)])
     own, zero, cut = (picture(folder / name) for name in ("a.png", "b.png", "c.png"))
     assert (own == zero).all()
     assert np.abs(own - cut).max() > 30
-
-
-def test_a_size_holds_the_whole_photograph(run_viewer, folder):
-    run_viewer("blobs.ply", "--headless", "--out", "a.png")
-    run_viewer("blobs.ply", "--headless", "--out", "b.png", "--size", "400x120")
-    wide = picture(folder / "b.png")
-    assert wide.shape == (120, 400, 3)
-    np.testing.assert_allclose(wide[:, 120:280], picture(folder / "a.png"), atol=1)
-
-
-def test_a_camera_file_gives_that_view(run_viewer, folder):
-    write_cameras(folder / "view.json", (blob_scene().cameras[2],))
-    run_viewer("blobs.ply", "--headless", "--out", "a.png", "--camera", "2")
-    run_viewer("blobs.ply", "--headless", "--out", "b.png", "--camera", "view.json")
-    np.testing.assert_array_equal(picture(folder / "a.png"), picture(folder / "b.png"))
 
 
 def test_a_scene_without_cameras_is_framed(run_viewer, folder):
@@ -221,9 +191,7 @@ def test_a_scene_without_cameras_is_framed(run_viewer, folder):
 )
 def test_what_cannot_work_is_one_line(run_viewer, folder, arguments, reason):
     code, out, err = run_viewer(*arguments, "--headless", "--out", "a.png")
-    assert code == 2
-    assert out == []
-    assert len(err) == 1
+    assert (code, out, len(err)) == (2, [], 1)
     assert reason in err[0]
     assert err[0].startswith("langsplat-viewer: ")
     assert not (folder / "a.png").exists()
@@ -238,25 +206,27 @@ def test_what_cannot_work_is_one_line(run_viewer, folder, arguments, reason):
         (["--headless", "--out", "blobs.ply/a.png"], "is a file, not a folder"),
         (["--headless", "--out", "x" * 5000 + ".png"], "choose a shorter one"),
         (["--out", "a.png"], "add --headless"),
+        # Where the window has what is for pictures.
+        (["--transparent"], "panel Display"),
+        (["--colour-map", "grey"], "panel Display"),
+        (["--cut", "0.6"], "panel Search"),
+        (["--canonical", "book"], "panel Search"),
+        (["--near-cut", "1"], "panel Camera"),
+        (["--far-cut", "1"], "panel Camera"),
     ],
 )
-def test_an_impossible_out_is_one_line(run_viewer, folder, arguments, reason):
+def test_what_needs_another_option_is_one_line(run_viewer, folder, arguments, reason):
     (folder / "folder.png").mkdir()
     code, out, err = run_viewer("blobs.ply", *arguments)
     assert (code, out, len(err)) == (2, [], 1)
     assert reason in err[0]
 
 
-def test_an_encoder_that_is_absent_is_one_line(monkeypatch, folder, capsys):
-    monkeypatch.setattr(
-        sys, "argv", ["langsplat-viewer", "blobs.ply", "--headless", "--out", "a.png", "--query", "mug"]
-    )
-    with pytest.raises(SystemExit) as stop:
-        program.entry()
-    assert stop.value.code == 2
-    error = capsys.readouterr().err.splitlines()
-    assert len(error) == 1
-    assert "fake" in error[0]
+def test_an_encoder_that_is_absent_is_one_line(run_viewer, monkeypatch, folder):
+    monkeypatch.setattr(options, "load_text_encoder", load_text_encoder)
+    code, _, errors = run_viewer("blobs.ply", "--headless", "--out", "a.png", "--query", "mug")
+    assert (code, len(errors)) == (2, 1)
+    assert "fake" in errors[0]
     assert not (folder / "a.png").exists()
 
 
@@ -269,40 +239,38 @@ def test_a_failed_picture_leaves_the_old_one(run_viewer, folder):
     assert not [path for path in folder.iterdir() if path.name.startswith(".a")]
 
 
+def run_python(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Of a process without a display, but for one that is given."""
+    inherited = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    return subprocess.run(
+        [sys.executable, *arguments], env=inherited | environment, capture_output=True, text=True, timeout=120
+    )
+
+
 @pytest.mark.long
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the message is about X11")
-@pytest.mark.parametrize("display", [None, ":987"])
+@pytest.mark.parametrize("display", [{}, {"DISPLAY": ":987"}])
 def test_no_display_suggests_a_picture_without_a_window(folder, display):
-    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
-    if display is not None:
-        environment["DISPLAY"] = display
-    run = subprocess.run(
-        [sys.executable, "-m", "langsplat_viewer", "blobs.ply"],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert run.returncode == 2
-    assert len(run.stderr.splitlines()) == 1, run.stderr
+    run = run_python("-m", "langsplat_viewer", "blobs.ply", **display)
+    assert (run.returncode, len(run.stderr.splitlines())) == (2, 1), run.stderr
     assert "--headless" in run.stderr
+
+
+WINDOWLESS = """
+import sys
+from langsplat_viewer.program import entry
+sys.argv = "langsplat-viewer blobs.ply --query book --headless --out a.png".split()
+try:
+    entry()
+except SystemExit as stop:
+    assert not stop.code, stop.code
+print([name for name in ("glfw", "imgui_bundle", "torch", "transformers", "open3d") if name in sys.modules])
+"""
 
 
 @pytest.mark.long
 def test_without_a_window_no_windowing_library_is_loaded(folder):
-    code = (
-        "import sys\n"
-        "from langsplat_viewer.program import entry\n"
-        "sys.argv = 'langsplat-viewer blobs.ply --query book --headless --out a.png'.split()\n"
-        "try:\n"
-        "    entry()\n"
-        "except SystemExit as stop:\n"
-        "    assert not stop.code, stop.code\n"
-        "heavy = ('glfw', 'imgui_bundle', 'torch', 'transformers', 'open3d')\n"
-        "print([name for name in heavy if name in sys.modules])\n"
-    )
-    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
-    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    run = run_python("-c", WINDOWLESS)
     assert run.returncode == 0, run.stderr
     assert run.stdout.splitlines()[-1] == "[]"
     assert (folder / "a.png").exists()

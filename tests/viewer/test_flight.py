@@ -7,22 +7,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from langsplat_core.errors import InputError
+from langsplat_viewer.camera import flight
 from langsplat_viewer.camera.controls import extent_of, from_camera, orbit
-from langsplat_viewer.camera.flight import (
-    Flight,
-    Keyframe,
-    Pose,
-    frame_times,
-    pose_at,
-    pose_of,
-    stretched,
-    turntable,
-    with_keyframe,
-)
+from langsplat_viewer.camera.flight import Flight, Keyframe, Pose, pose_at
 from langsplat_viewer.files.projects import MOST_KEYFRAMES, read_flight, write_flight
 from tests.support.fakes import blob_scene
 
@@ -56,14 +47,22 @@ def speeds(flight: Flight, at: float) -> np.ndarray:
     return np.array(found)
 
 
+def assert_same(got: Pose, wanted: Pose) -> None:
+    assert_allclose(got.position, wanted.position, atol=1e-12)
+    assert_allclose(got.rotation, wanted.rotation, atol=1e-12)
+    assert got.fov_degrees == pytest.approx(wanted.fov_degrees, abs=1e-9)
+
+
 @pytest.mark.parametrize("count", [1, 2, 3, 8])
-def test_it_passes_through_its_keyframes(count):
-    flight = random_flight(count, count)
-    times = np.array([k.seconds for k in flight.keyframes])
-    for got, wanted in zip(flight.poses(times), flight.keyframes, strict=True):
-        assert_allclose(got.position, wanted.pose.position, atol=1e-12)
-        assert_allclose(got.rotation, wanted.pose.rotation, atol=1e-12)
-        assert got.fov_degrees == pytest.approx(wanted.pose.fov_degrees, abs=1e-9)
+def test_it_passes_through_its_keyframes_and_stands_still_before_and_after(count):
+    keys = random_flight(count, count).keyframes
+    times = [keys[0].seconds - 5, *[k.seconds for k in keys], keys[-1].seconds + 9]
+    found = Flight(keys).poses(np.array(times))
+    for got, wanted in zip(found, (keys[0], *keys, keys[-1]), strict=True):
+        assert_same(got, wanted.pose)
+    for wrong in ((), (key(1), key(1)), (key(2), key(1))):  # times must rise
+        with pytest.raises(ValueError, match="keyframe"):
+            Flight(wrong)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -83,13 +82,6 @@ def test_two_keyframes_are_an_even_straight_way():
         assert_allclose(pose.rotation, turned(0, (t - 1) / 2, 0), atol=1e-12)
 
 
-def test_before_the_first_and_after_the_last_it_stands_still():
-    flight = random_flight(1, 4)
-    first, last = flight.keyframes[0], flight.keyframes[-1]
-    for t, wanted in ((0, first), (-5, first), (last.seconds + 9, last)):
-        assert_allclose(pose_at(flight, t).position, wanted.pose.position, atol=1e-12)
-
-
 def test_an_even_turn_stays_even_and_agrees_with_scipys_spline():
     axis = np.array([1.0, 2, -1]) / math.sqrt(6)
     times = np.array([0.0, 1, 2.5, 3, 5])
@@ -106,11 +98,11 @@ def test_it_rests_between_equal_keyframes():
     flight = Flight((key(0), key(1, *there), key(4, *there), key(5, (2, 2, 2), (0.3, 0, 0))))
     wanted = flight.keyframes[1].pose
     for pose in flight.poses(np.linspace(1, 4, 31)):
-        assert_allclose(pose.position, wanted.position, atol=1e-12)
-        assert_allclose(pose.rotation, wanted.rotation, atol=1e-12)
-        assert pose.fov_degrees == pytest.approx(40, abs=1e-12)
-    before, after = speeds(flight, 4.0)
-    assert_allclose(before, after, atol=5e-3)
+        assert_same(pose, wanted)
+    assert_allclose(*speeds(flight, 4.0), atol=5e-3)
+    zooms = Flight((key(0, fov=60), key(1, fov=61), key(1.1, fov=20), key(4, fov=20)))
+    found = [pose.fov_degrees for pose in zooms.poses(np.linspace(0, 4, 400))]
+    assert 20 - 1e-9 <= min(found) <= max(found) <= 61 + 1e-9
 
 
 @pytest.mark.parametrize("angle", [math.pi, math.pi - 1e-9, math.pi + 1e-9, 3.0])
@@ -121,14 +113,7 @@ def test_half_turns(angle):
         assert_allclose(pose.rotation @ pose.rotation.T, np.eye(3), atol=1e-12)
     steps = [np.abs(b.rotation - a.rotation).max() for a, b in pairwise(poses)]
     assert max(steps) < 0.15  # no jump
-    before, after = speeds(flight, 1.0)
-    assert_allclose(before, after, atol=2e-2)
-
-
-def test_the_field_of_view_never_leaves_that_of_the_keyframes():
-    flight = Flight((key(0, fov=60), key(1, fov=61), key(1.1, fov=20), key(4, fov=20)))
-    found = [pose.fov_degrees for pose in flight.poses(np.linspace(0, 4, 400))]
-    assert 20 - 1e-9 <= min(found) <= max(found) <= 61 + 1e-9
+    assert_allclose(*speeds(flight, 1.0), atol=2e-2)
 
 
 def test_a_far_keyframe_does_not_move_what_is_near():
@@ -136,8 +121,7 @@ def test_a_far_keyframe_does_not_move_what_is_near():
     other = (*keys[:-1], key(keys[-1].seconds, (9, 9, 9), (1, 1, 1)))
     early = keys[4].seconds
     for a, b in zip(*(Flight(k).poses(np.linspace(0, early, 50)) for k in (keys, other)), strict=True):
-        assert_allclose(a.position, b.position, atol=1e-12)
-        assert_allclose(a.rotation, b.rotation, atol=1e-12)
+        assert_same(a, b)
 
 
 @pytest.mark.parametrize("scale", [1e-9, 1e9])
@@ -149,39 +133,37 @@ def test_extreme_paths_stay_finite(scale):
         assert np.isfinite(pose.rotation).all()
 
 
-def test_times_must_rise():
-    for keys in ((), (key(1), key(1)), (key(2), key(1))):
-        with pytest.raises(ValueError, match="keyframe"):
-            Flight(keys)
-
-
 def test_keyframes_are_added_in_order_and_stretched():
-    keys = with_keyframe(with_keyframe((key(2),), key(0.5)), key(2, (1, 1, 1)))
+    keys = flight.with_keyframe(flight.with_keyframe((key(2),), key(0.5)), key(2, (1, 1, 1)))
     assert [k.seconds for k in keys] == [0.5, 2]
     assert_allclose(keys[1].pose.position, 1)
-    assert [k.seconds for k in stretched(keys, 6)] == [1.5, 6]
-    assert stretched((), 3) == ()
-    assert [k.seconds for k in stretched((key(0),), 3)] == [0]
+    assert [k.seconds for k in flight.stretched(keys, 6)] == [1.5, 6]
+    assert flight.stretched((), 3) == ()
+    assert [k.seconds for k in flight.stretched((key(0),), 3)] == [0]
 
 
 def test_a_turntable_goes_once_around_as_a_drag_does():
     extent = extent_of(blob_scene())
     view = from_camera(blob_scene().cameras[0], extent)
-    turn = turntable(view, 8.0)
+    turn = flight.turntable(view, 8.0)
     for t in (0.0, 1.0, 5.5):
-        expected = pose_of(orbit(view, 2 * math.pi * t / 8, 0))
+        expected = flight.pose_of(orbit(view, 2 * math.pi * t / 8, 0))
         assert_allclose(pose_at(turn, t).position, expected.position, atol=1e-9)
         assert_allclose(pose_at(turn, t).rotation, expected.rotation, atol=1e-9)
     assert_allclose(pose_at(turn, 8.0).position, view.eye, atol=1e-9)
 
 
 def test_times_of_pictures():
-    assert_allclose(frame_times(Flight((key(0), key(1))), 4), [0, 0.25, 0.5, 0.75, 1])
-    assert_allclose(frame_times(Flight((key(0),)), 30), [0])
+    assert_allclose(flight.frame_times(Flight((key(0), key(1))), 4), [0, 0.25, 0.5, 0.75, 1])
+    assert_allclose(flight.frame_times(Flight((key(0),)), 30), [0])
     view = from_camera(blob_scene().cameras[0], extent_of(blob_scene()))
-    assert_allclose(frame_times(turntable(view, 1), 4), [0, 0.25, 0.5, 0.75])  # the last is the first again
-    assert len(frame_times(turntable(view, 0.1), 1)) == 1
-    assert len(frame_times(Flight((key(0), key(0.1 * 3))), 10)) == 4  # 0.3 is a little less than 3 tenths
+    assert_allclose(
+        flight.frame_times(flight.turntable(view, 1), 4), [0, 0.25, 0.5, 0.75]
+    )  # the last is the first again
+    assert len(flight.frame_times(flight.turntable(view, 0.1), 1)) == 1
+    assert (
+        len(flight.frame_times(Flight((key(0), key(0.1 * 3))), 10)) == 4
+    )  # 0.3 is a little less than 3 tenths
 
 
 # Camera paths to files and back; files that are none.
@@ -206,11 +188,10 @@ def test_a_path_is_read_as_it_was_written(tmp_path):
     write_flight(tmp_path / "path.json", Flight(keys))
     assert [path.name for path in tmp_path.iterdir()] == ["path.json"]
     for got, wanted in zip(read_flight(tmp_path / "path.json").keyframes, keys, strict=True):
-        assert got.seconds == wanted.seconds
-        assert got.pose.fov_degrees == wanted.pose.fov_degrees
+        assert (got.seconds, got.pose.fov_degrees) == (wanted.seconds, wanted.pose.fov_degrees)
         assert got.pose.span == wanted.pose.span
-        assert_allclose(got.pose.position, wanted.pose.position, rtol=0, atol=0)
-        assert_allclose(got.pose.rotation, wanted.pose.rotation, rtol=0, atol=0)
+        assert_array_equal(got.pose.position, wanted.pose.position)
+        assert_array_equal(got.pose.rotation, wanted.pose.rotation)
 
 
 @pytest.mark.parametrize(

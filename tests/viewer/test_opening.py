@@ -1,7 +1,6 @@
 """Opening scenes, without a window."""
 
 import os
-import shutil
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -11,13 +10,14 @@ import pytest
 
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.scene import Scene
-from langsplat_viewer.actions import browsing, filming, opening, queries, settings, viewpoint
+from langsplat_viewer.actions import browsing, editing, filming, opening, queries, settings, viewpoint
+from langsplat_viewer.camera.controls import default_view, extent_of, orbit
 from langsplat_viewer.files.disk import MOST_LISTED, Entry, Watch, list_folder, stamps
 from langsplat_viewer.options import say_compiling
 from langsplat_viewer.panels.scene import has_several
 from langsplat_viewer.rendering.request import UNCLIPPED, Clip
 from tests.support.fakes import blob_scene
-from tests.support.windowless import SCENES, arrive, ask, errors, open_scene, settle
+from tests.support.windowless import SCENES, act, ask, errors, go, open_scene, settle
 
 
 def test_unusable_gaussians_are_counted(viewer):
@@ -77,9 +77,7 @@ def test_a_scene_with_broken_companions_opens_and_says_why(tmp_path, viewer):
     viewer.services = replace(viewer.services, load_scene=load_scene)
     open_scene(viewer, path)
     assert viewer.state.scene.language is None
-    said = errors(viewer)
-    assert len(said) == 2
-    assert all(name in reason for name, reason in zip(names, said, strict=True))
+    assert all(name in reason for name, reason in zip(names, errors(viewer), strict=True))
 
 
 @pytest.mark.parametrize(
@@ -91,8 +89,7 @@ def test_a_scene_with_broken_companions_opens_and_says_why(tmp_path, viewer):
     ],
 )
 def test_of_dropped_files_the_scene_is_opened_and_what_is_none_is_said(viewer, names, opened_name, said):
-    browsing.open_dropped(viewer, [Path(name) for name in names])
-    settle(viewer)
+    act(browsing.open_dropped, viewer, [Path(name) for name in names])
     assert viewer.state.path.name == opened_name
     assert [path.name for path in viewer.state.scenes] == [opened_name]
     assert errors(viewer) == ([said] if said else [])
@@ -110,13 +107,11 @@ def test_the_first_run_says_that_it_compiles(viewer, monkeypatch):
         say_compiling(progress)
         seen.append(viewer.worker.current)
 
-    monkeypatch.setattr("langsplat_core.compiled.is_compiled", lambda source: False)
-    monkeypatch.setattr("langsplat_viewer.actions.opening.is_compiled", lambda source: False)
+    for module in ("langsplat_core.compiled", "langsplat_viewer.actions.opening"):
+        monkeypatch.setattr(f"{module}.is_compiled", lambda source: False)
     viewer.services = replace(viewer.services, warm_up=warm_up)
     labels, submit = [], viewer.worker.submit
-    monkeypatch.setattr(
-        viewer.worker, "submit", lambda label, *rest: labels.append(label) or submit(label, *rest)
-    )
+    viewer.worker.submit = lambda label, *rest: labels.append(label) or submit(label, *rest)
     open_scene(viewer, "blobs.ply")
     assert seen == [("compiling the drawing kernels, once per installation (half a minute)", 0.7)]
     assert "compiling the search kernels, once per installation (half a minute)" in labels
@@ -126,45 +121,42 @@ def test_the_first_run_says_that_it_compiles(viewer, monkeypatch):
 @pytest.fixture
 def three(viewer):
     """Three scenes were dropped; the first is shown."""
-    browsing.open_dropped(viewer, [Path("blobs.ply"), Path("plain.ply"), Path("bare.ply")])
-    settle(viewer)
+    act(browsing.open_dropped, viewer, [Path("blobs.ply"), Path("plain.ply"), Path("bare.ply")])
     return viewer
 
 
-def switch(viewer, path: Path) -> None:
-    opening.switch_scene(viewer, path)
-    settle(viewer)
-
-
-def test_of_several_the_first_is_opened_and_all_are_listed(three):
-    assert three.state.scene is SCENES["blobs.ply"]
-    assert three.state.scenes == (BLOBS, PLAIN, BARE)
-    assert errors(three) == []
-    assert settings.take_wanted_panel(three) == "Scene"
+def test_a_display_of_answers_comes_back_after_a_scene_without_and_no_arrays_are_kept(three):
+    ask(three, "mug")
+    act(opening.switch_scene, three, PLAIN)
+    assert three.state.picture.display == "rgb"
+    (visit,) = three.visits.values()
+    assert [query.result for query in visit.queries] == [None]
+    assert not any(isinstance(value, np.ndarray) and value.size > 16 for value in vars(visit).values())
+    act(opening.switch_scene, three, BLOBS)
+    assert three.state.picture.display == "relevancy"
 
 
 def test_camera_and_queries_of_each_are_found_again(three):
+    assert (three.state.scene, three.state.scenes) == (SCENES["blobs.ply"], (BLOBS, PLAIN, BARE))
+    assert settings.take_wanted_panel(three) == "Scene"
     ask(three, "mug", "book")
-    queries.set_canonical(three, "plant")
-    settle(three)
+    act(queries.set_canonical, three, "plant")
     mug, book = three.state.queries
     queries.hide(three, mug)
     queries.set_cut(three, book, 0.7)
-    viewpoint.go_to_camera(three, 2)
-    arrive(three)
+    go(viewpoint.go_to_camera, three, 2)
     settings.set_clip(three, Clip(1.0, 9.0))
     filming.add_keyframe(three)
     view = three.state.view
-    switch(three, BARE)
+    act(opening.switch_scene, three, BARE)
     assert three.state.scene is SCENES["bare.ply"]
-    assert three.state.queries == []
-    assert three.state.canonical == ()
+    assert (three.state.queries, three.state.canonical) == ([], ())
     assert three.state.settings.clip == UNCLIPPED
     ask(three, "plant")
     viewpoint.zoom_by(three, 2.0)
     bare = three.state.view
 
-    switch(three, BLOBS)
+    act(opening.switch_scene, three, BLOBS)
     state = three.state
     assert state.view is view
     assert [(q.phrase, q.slot, q.cut) for q in state.queries] == [("mug", None, None), ("book", 1, 0.7)]
@@ -172,36 +164,20 @@ def test_camera_and_queries_of_each_are_found_again(three):
     assert state.canonical == three.engine.canonical_phrases == ("plant",)
     assert (state.camera_index, len(state.record.keyframes)) == (2, 1)
     assert state.settings.clip == Clip(1.0, 9.0)
-    switch(three, BARE)
+    act(opening.switch_scene, three, BARE)
     assert three.state.view is bare
+    assert errors(three) == []
     assert [query.phrase for query in three.state.queries] == ["plant"]
     assert three.state.shown_results()[0].found
     assert three.engine.canonical_phrases != ("plant",)
 
 
-def test_a_display_of_answers_comes_back_after_a_scene_without(three):
-    ask(three, "mug")
-    switch(three, PLAIN)
-    assert three.state.picture.display == "rgb"
-    switch(three, BLOBS)
-    assert three.state.picture.display == "relevancy"
-
-
-def test_nothing_of_a_scene_that_was_left_is_kept_in_memory(three):
-    ask(three, "mug")
-    switch(three, BARE)
-    (visit,) = three.visits.values()
-    assert [query.result for query in visit.queries] == [None]
-    assert not any(isinstance(value, np.ndarray) and value.size > 16 for value in vars(visit).values())
-
-
 def test_a_scene_is_taken_off_the_list(three):
-    switch(three, PLAIN)
+    act(opening.switch_scene, three, PLAIN)
     opening.unlist_scene(three, BLOBS)
     assert three.state.scenes == (PLAIN, BARE)
     assert three.visits == {}
-    opening.step_scene(three, 1)
-    settle(three)
+    act(opening.step_scene, three, 1)
     assert three.state.path == BARE
 
 
@@ -211,8 +187,7 @@ def test_all_scenes_of_a_folder_are_opened_together(viewer, tmp_path):
     (tmp_path / "folder").mkdir()
     viewer.state.browser = list_folder(tmp_path)
     assert has_several(viewer.state.browser)
-    browsing.open_all(viewer)
-    settle(viewer)
+    act(browsing.open_all, viewer)
     assert viewer.state.browser is None
     assert viewer.state.scenes == (tmp_path / "blobs.ply", tmp_path / "plain.ply")
     assert viewer.state.path.name == "blobs.ply"
@@ -224,8 +199,9 @@ def test_all_scenes_of_a_folder_are_opened_together(viewer, tmp_path):
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """Scenes, folders, and what is neither."""
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working folder: scenes, folders, and what is neither."""
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "B folder").mkdir()
     (tmp_path / "sog folder").mkdir()
     (tmp_path / "sog folder" / "meta.json").write_text("{}")
@@ -237,24 +213,11 @@ def folder(tmp_path: Path) -> Path:
 def test_folders_come_first_and_what_is_no_scene_is_left_out(folder):
     listing = list_folder(folder)
     listed = [(entry.path.name, entry.is_file, entry.size) for entry in listing.entries]
-    assert listed == [
-        ("B folder", False, 0),
-        ("a.ply", True, 5),
-        ("sog folder", True, 0),
-        ("Z.SPZ", True, 5),
-    ]
+    files = [("a.ply", True, 5), ("sog folder", True, 0), ("Z.SPZ", True, 5)]
+    assert listed == [("B folder", False, 0), *files]
     assert not listing.problem
-
-
-def test_a_folder_that_cannot_be_listed_says_why(tmp_path):
-    assert "No such file" in list_folder(tmp_path / "gone").problem
-    assert "Not a directory" in list_folder(_file(tmp_path)).problem
-
-
-def _file(folder: Path) -> Path:
-    path = folder / "file"
-    path.write_bytes(b"")
-    return path
+    assert "No such file" in list_folder(folder / "gone").problem
+    assert "Not a directory" in list_folder(folder / "notes.txt").problem
 
 
 def test_a_crowded_folder_is_cut(tmp_path, monkeypatch):
@@ -266,16 +229,14 @@ def test_a_crowded_folder_is_cut(tmp_path, monkeypatch):
     assert MOST_LISTED > 100
 
 
-def test_one_goes_into_folders_and_opens_scenes(viewer, folder, monkeypatch):
-    monkeypatch.chdir(folder)
+def test_one_goes_into_folders_and_opens_scenes(viewer, folder):
     browsing.ask_for_file(viewer)
     assert viewer.state.browser.folder == folder
     browsing.choose(viewer, Entry(folder / "B folder", is_file=False))
     assert viewer.state.browser.folder == folder / "B folder"
     browsing.browse(viewer, folder)
-    browsing.choose(viewer, Entry(folder / "blobs.ply", is_file=True))
+    act(browsing.choose, viewer, Entry(folder / "blobs.ply", is_file=True))
     assert viewer.state.browser is None
-    settle(viewer)
     assert viewer.state.scene is SCENES["blobs.ply"]
     browsing.ask_for_file(viewer)
     assert viewer.state.browser.folder == folder  # that of the scene
@@ -283,32 +244,30 @@ def test_one_goes_into_folders_and_opens_scenes(viewer, folder, monkeypatch):
     assert viewer.state.browser is None
 
 
+def enter(viewer, typed: str) -> None:
+    """Type a path in the browser, and open it."""
+    viewer.state.path_typed = typed
+    act(browsing.open_typed, viewer)
+
+
 @pytest.mark.parametrize("typed", [" blobs.ply ", "B folder/../blobs.ply"])
-def test_a_path_can_be_typed(viewer, folder, monkeypatch, typed):
-    monkeypatch.chdir(folder)
+def test_a_path_can_be_typed(viewer, folder, typed):
     browsing.ask_for_file(viewer)
     for nothing in ("", "  "):
-        viewer.state.path_typed = nothing
-        browsing.open_typed(viewer)
+        enter(viewer, nothing)
         assert viewer.state.browser is not None
-    viewer.state.path_typed = "B folder"
-    browsing.open_typed(viewer)
+    enter(viewer, "B folder")
     assert viewer.state.browser.folder == folder / "B folder"
     assert viewer.state.path_typed == ""
     browsing.browse(viewer, folder)
-    viewer.state.path_typed = typed
-    browsing.open_typed(viewer)
-    settle(viewer)
+    enter(viewer, typed)
     assert viewer.state.scene is SCENES["blobs.ply"]
 
 
 @pytest.mark.parametrize("typed", ["gone.ply", "x" * 5000, "~nobody-of-this-name/a.ply"])
-def test_a_path_that_leads_nowhere_is_an_error_line(viewer, folder, monkeypatch, typed):
-    monkeypatch.chdir(folder)
+def test_a_path_that_leads_nowhere_is_an_error_line(viewer, folder, typed):
     browsing.ask_for_file(viewer)
-    viewer.state.path_typed = typed
-    browsing.open_typed(viewer)
-    settle(viewer)
+    enter(viewer, typed)
     assert len(errors(viewer)) == 1
 
 
@@ -318,8 +277,7 @@ def test_scenes_that_were_open_are_remembered_the_latest_first(viewer):
     recent = viewer.state.preferences.recent
     assert [Path(path).name for path in recent] == ["blobs.ply", "plain.ply"]
     assert all(Path(path).is_absolute() for path in recent)
-    browsing.open_recent(viewer, recent[1])
-    settle(viewer)
+    act(browsing.open_recent, viewer, recent[1])
     assert viewer.state.scene is SCENES["plain.ply"]
 
 
@@ -343,14 +301,10 @@ def look(viewer) -> bool:
     return viewer.watch.changed
 
 
-def dyed() -> object:
-    """The same scene in other colours and with fewer cameras."""
-    scene = replace(blob_scene(), path=None)
-    gaussians = replace(scene.gaussians, sh=-scene.gaussians.sh)
-    return replace(scene, gaussians=gaussians, cameras=scene.cameras[:2])
+FILES = ["blobs.ply", "blobs.langsplat.safetensors", "blobs.cameras.json"]
 
 
-@pytest.mark.parametrize("name", ["blobs.ply", "blobs.langsplat.safetensors", "blobs.cameras.json"])
+@pytest.mark.parametrize("name", FILES)
 def test_a_change_of_any_file_is_noticed_once_it_is_over(shown, name):
     file, woken = shown.state.path.with_name(name), []
     shown.watch.wake = lambda: woken.append(name)
@@ -358,22 +312,20 @@ def test_a_change_of_any_file_is_noticed_once_it_is_over(shown, name):
         os.utime(file, ns=(second, second))
         shown.watch.look()
         assert not shown.watch.changed
-    shown.watch.look()
-    assert shown.watch.changed
-    shown.watch.look()
-    assert woken == [name]
-
-
-def test_a_companion_that_was_added_or_taken_away_is_a_change(shown):
-    sidecar = shown.state.path.with_name("blobs.langsplat.safetensors")
-    kept = sidecar.with_name("kept")
-    shutil.move(sidecar, kept)
     assert look(shown)
-    shutil.move(kept, sidecar)
+    assert woken == [name]
+    shown.watch.dismiss()
+    assert not look(shown)
+    os.utime(file, ns=(9, 9))  # it changes again
+    assert look(shown)
+
+
+def test_a_companion_that_comes_or_goes_is_a_change_and_a_scene_that_is_gone_is_not_offered(shown):
+    sidecar = shown.state.path.with_name(FILES[1])
+    kept = sidecar.rename(sidecar.with_name("kept"))
+    assert look(shown)
+    kept.rename(sidecar)
     assert not look(shown)  # as it was read
-
-
-def test_a_scene_whose_file_is_gone_is_not_offered(shown):
     shown.state.path.unlink()
     assert not look(shown)
 
@@ -390,13 +342,13 @@ def test_reload_keeps_camera_queries_and_settings(shown):
     settings.set_splats(shown, replace(shown.state.settings.splats, size=0.5))
     settings.set_picture(shown, replace(shown.state.picture, dim=0.1))
     view, before = shown.state.view, shown.state.scene
-    save_scene(shown.state.path, dyed())
+    dyed = replace(before.gaussians, sh=-before.gaussians.sh)
+    save_scene(shown.state.path, replace(before, gaussians=dyed, cameras=before.cameras[:2], path=None))
     assert look(shown)
-    opening.reload(shown)
-    settle(shown)
+    act(opening.reload, shown)
     state = shown.state
     assert state.scene is not before
-    np.testing.assert_array_equal(state.scene.gaussians.sh, dyed().gaussians.sh.astype(np.float32))
+    np.testing.assert_array_equal(state.scene.gaussians.sh, dyed.sh)
     assert state.view is view
     assert [(q.phrase, q.slot, q.cut) for q in state.queries] == [("mug", 0, 0.6), ("book", None, None)]
     assert state.queries[0].result.own_cut == 0.6
@@ -412,14 +364,13 @@ def test_a_reload_with_other_gaussians_asks_anew(shown):
     ask(shown, "plant")
     half = np.arange(0, 360, 2)
     save_scene(shown.state.path, replace(blob_scene().take(half), path=None))
-    opening.reload(shown)
-    settle(shown)
+    act(opening.reload, shown)
     (query,) = shown.state.queries
     assert query.result.members.shape == (180,)
     assert shown.state.selection.marks.selected.shape == (180,)
 
 
-@pytest.mark.parametrize("name", ["blobs.ply", "blobs.langsplat.safetensors", "blobs.cameras.json"])
+@pytest.mark.parametrize("name", FILES)
 def test_a_half_written_file_leaves_the_scene_as_it_was(shown, name):
     ask(shown, "mug")
     query, before, view = shown.state.queries[0], shown.state.scene, shown.state.view
@@ -428,33 +379,21 @@ def test_a_half_written_file_leaves_the_scene_as_it_was(shown, name):
     whole = file.read_bytes()
     file.write_bytes(whole[: len(whole) // 2])
     assert look(shown)
-    opening.reload(shown)
-    settle(shown)
+    act(opening.reload, shown)
     assert shown.state.scene is before
     assert (shown.state.view, shown.state.queries, query.result) == (view, [query], answer)
     assert name in errors(shown)[-1]
     assert shown.watch.changed  # to be tried again
     file.write_bytes(whole)
-    opening.reload(shown)
-    settle(shown)
+    act(opening.reload, shown)
     assert shown.state.scene is not before
     assert not look(shown)
-
-
-def test_what_is_not_wanted_is_not_offered_again_until_it_changes_again(shown):
-    os.utime(shown.state.path, ns=(1, 1))
-    assert look(shown)
-    shown.watch.dismiss()
-    assert not look(shown)
-    os.utime(shown.state.path, ns=(2, 2))
-    assert look(shown)
 
 
 def test_a_field_that_went_away_takes_its_display_along(shown):
     ask(shown, "mug")
     save_scene(shown.state.path, replace(blob_scene(field=False), path=None))
-    opening.reload(shown)
-    settle(shown)
+    act(opening.reload, shown)
     assert shown.state.picture.display == "rgb"
     assert shown.state.queries == []
 
@@ -471,3 +410,82 @@ def test_a_watch_looks_by_itself_and_stops(tmp_path, monkeypatch):
     assert woken.wait(5)
     assert watch.changed
     watch.close()
+
+
+# A second scene beside the first: seen and asked alike, and gone when it is not shown any more.
+
+
+@pytest.fixture
+def two(opened):
+    """The blobs, and beside them the same with a phrasebook."""
+    ask(opened, "mug")
+    opening.open_beside(opened, Path("book.ply"))
+    meet(opened)
+    yield opened
+    if opened.beside is not None:
+        opened.beside.worker.close()
+
+
+def meet(viewer) -> None:
+    """Frames until both have done what there is to do."""
+    for _ in range(3):
+        act(opening.follow_beside, viewer)
+        if viewer.beside is not None:
+            settle(viewer.beside)
+    opening.follow_beside(viewer)
+
+
+def test_both_are_seen_and_asked_alike(two):
+    other = two.beside.state
+    assert other.path == Path("book.ply")
+    assert [(query.phrase, query.slot) for query in other.queries] == [("mug", 0)]
+    assert other.queries[0].result.found
+    assert other.view is two.state.view
+    for phrase in ("book", "nothing like this"):
+        queries.ask(two, phrase)
+    queries.set_level(two, "whole")
+    queries.set_canonical(two, "book, plant")
+    settings.set_display(two, "segmentation")
+    settings.resize(two, 77, 55)
+    act(viewpoint.move, two, lambda view: orbit(view, 0.2, 0.1))
+    meet(two)
+    assert {query.phrase: query.slot for query in other.queries} == {"mug": 0, "book": 1}
+    assert (other.level, other.picture.display, other.size) == ("whole", "segmentation", (77, 55))
+    assert other.canonical == ("book", "plant")
+    assert other.view is two.state.view
+    queries.hide(two, two.state.queries[0])
+    queries.remove(two, two.state.queries[1])
+    meet(two)
+    assert [(query.phrase, query.slot) for query in other.queries] == [("mug", None)]
+
+
+def test_a_scene_without_a_field_shows_its_colours_and_what_cannot_be_opened_is_said_here(two):
+    for name in ("plain.ply", "broken.ply"):
+        assert errors(two) == []
+        opening.open_beside(two, Path(name))
+        meet(two)
+        if name == "plain.ply":
+            assert (two.beside.state.picture.display, two.beside.state.queries) == ("rgb", [])
+    assert "broken.ply" in errors(two)[-1]
+    assert two.state.scene is not None
+
+
+def test_it_goes_with_the_line_and_does_not_come_back_by_itself(two):
+    settings.show_one(two)
+    opening.follow_beside(two)
+    assert two.beside is None
+    editing.undo(two)
+    opening.follow_beside(two)
+    assert two.state.settings.split.mode == "off"
+
+
+def test_a_scene_with_other_coordinates_is_seen_from_the_same_side():
+    scene = SCENES["blobs.ply"]
+    moved = replace(scene.gaussians, means=3 * scene.gaussians.means + 50)
+    here, there = extent_of(scene), extent_of(replace(scene, gaussians=moved))
+    view = default_view(scene, here, (80, 60))
+    other = opening.linked(view, here, there)
+    assert opening.linked(view, here, here) is view
+    np.testing.assert_array_equal(other.rotation, view.rotation)
+    eyes = [(one.eye - extent.centre) / extent.radius for one, extent in ((other, there), (view, here))]
+    np.testing.assert_allclose(*eyes)

@@ -13,7 +13,7 @@ from langsplat_viewer.files.projects import Things
 from tests.support.fakes import CENTRES, blob_scene
 from tests.support.marks_and_flights import blob, marked
 from tests.support.scenes import with_tree
-from tests.support.windowless import SCENES, ask, errors, open_scene, settle
+from tests.support.windowless import SCENES, act, ask, errors, open_scene, settle
 
 
 @pytest.fixture
@@ -34,52 +34,51 @@ def row_of(viewer, word: str):
     return max(viewer.state.outline.roots, key=lambda row: (tree.members(row.node) & blob(word)).sum())
 
 
-def test_every_thing_has_a_row_with_its_word(outlined):
-    for word in ("mug", "book", "plant"):
+@pytest.fixture
+def nodes(outlined) -> list[int]:
+    """Of mug, book and plant."""
+    return [row_of(outlined, word).node for word in ("mug", "book", "plant")]
+
+
+def test_every_thing_has_a_row_with_its_word_that_is_selected_and_looked_at(outlined):
+    before = outlined.state.view
+    for word, centre in zip(("mug", "book", "plant"), CENTRES, strict=True):
         row = row_of(outlined, word)
         assert word in outline.name_of(outlined, row)
         assert (outlined.engine.tree.members(row.node) == blob(word)).all()
         assert outlined.state.outline.row(row.node) is row
+        act(outline.visit, outlined, row.node)
+        assert marked(outlined)[0] == word
+        assert outlined.state.glide.end.distance < before.distance
+        np.testing.assert_allclose(outlined.state.glide.end.target, centre, atol=0.2)
     assert sum(row.count for row in outlined.state.outline.roots) == 360
 
 
-def test_a_row_is_selected_and_looked_at(outlined):
-    row, before = row_of(outlined, "book"), outlined.state.view
-    outline.visit(outlined, row.node)
-    settle(outlined)
-    assert marked(outlined)[0] == "book"
-    assert outlined.state.glide.end.distance < before.distance
-    np.testing.assert_allclose(outlined.state.glide.end.target, CENTRES[1], atol=0.2)
-
-
 def test_what_is_clicked_in_the_scene_is_the_thing_there(outlined):
-    outline.select(outlined, CENTRES[2])
-    settle(outlined)
-    assert marked(outlined)[0] == "plant"
-    outline.find_alike(outlined, CENTRES[0])
-    settle(outlined)
-    assert marked(outlined)[0] == "mug"
+    for choose, centre, word in (
+        (outline.select, CENTRES[2], "plant"),
+        (outline.find_alike, CENTRES[0], "mug"),
+    ):
+        act(choose, outlined, centre)
+        assert marked(outlined)[0] == word
 
 
-def test_rows_are_hidden_and_shown_and_the_selection_stays(outlined):
-    mug, book = row_of(outlined, "mug").node, row_of(outlined, "book").node
+def test_rows_are_hidden_and_shown_and_the_selection_stays(outlined, nodes):
+    mug, book, _ = nodes
     take(outlined, blob("plant"))
-    outline.hide(outlined, mug)
-    settle(outlined)
+    act(outline.hide, outlined, mug)
     assert marked(outlined) == ("plant", "mug", "")
     hidden = outline.hidden_nodes(outlined)
-    assert hidden[mug]
-    assert not hidden[book]
+    assert (hidden[mug], hidden[book]) == (True, False)
     assert outline.hidden_nodes(outlined) is hidden
-    outline.show(outlined, mug)
-    settle(outlined)
+    act(outline.show, outlined, mug)
     assert marked(outlined) == ("plant", "", "")
     editing.undo(outlined)
     assert outline.hidden_nodes(outlined)[mug]
 
 
-def test_what_is_locked_is_left_alone(outlined):
-    mug = row_of(outlined, "mug").node
+def test_what_is_locked_is_left_alone(outlined, nodes):
+    mug = nodes[0]
     take(outlined, blob("mug") | blob("book"))
     outline.toggle_lock(outlined, mug)
     assert marked(outlined)[0] == "book"
@@ -89,8 +88,7 @@ def test_what_is_locked_is_left_alone(outlined):
     selecting.isolate_selected(outlined)
     assert marked(outlined)[1] == "plant"
     selecting.show_hidden(outlined)
-    outline.hide(outlined, mug)
-    settle(outlined)
+    act(outline.hide, outlined, mug)
     assert marked(outlined)[1] == ""
     editing.fill_box(outlined)
     editing.crop(outlined)
@@ -103,8 +101,7 @@ def test_what_is_locked_is_left_alone(outlined):
 
 def test_a_name_is_taught_shown_filtered_and_undone(outlined):
     mug = row_of(outlined, "mug")
-    outline.give_name(outlined, mug.node, "  grandma's cup ")
-    settle(outlined)
+    act(outline.give_name, outlined, mug.node, "  grandma's cup ")
     assert outline.name_of(outlined, mug) == "grandma's cup"
     assert outlined.state.queries[-1].phrase == "grandma's cup"
     assert outlined.state.queries[-1].result.found
@@ -113,19 +110,17 @@ def test_a_name_is_taught_shown_filtered_and_undone(outlined):
     assert list(outline.filtered(outlined, outlined.state.outline.roots, "zebra")) == []
     book = row_of(outlined, "book").node
     outline.toggle_lock(outlined, book)
-    outline.give_name(outlined, book, "the atlas")  # also of what no tool takes
-    settle(outlined)
+    act(outline.give_name, outlined, book, "the atlas")  # also of what no tool takes
     assert outlined.engine.taught.keys() == {"grandma's cup", "the atlas"}
-    outline.give_name(outlined, book, "of")  # which names nothing
-    settle(outlined)
+    act(outline.give_name, outlined, book, "of")  # which names nothing
     assert outlined.state.things.names[book] == "the atlas"
     outlined.state.messages.clear()
     outline.give_name(outlined, mug.node, " ")
     assert errors(outlined) == []
 
 
-def test_groups_are_made_named_and_left(outlined):
-    mug, book, plant = (row_of(outlined, word).node for word in ("mug", "book", "plant"))
+def test_groups_are_made_named_and_left(outlined, nodes):
+    mug, book, plant = nodes
     outline.group(outlined, mug, book)
     (group,) = outlined.state.things.groups
     assert group.nodes == (book, mug)
@@ -155,43 +150,32 @@ def test_groups_are_made_named_and_left(outlined):
     assert outlined.state.things.groups == ()
 
 
-def test_a_project_keeps_names_groups_and_locks(outlined, viewer, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    Path("tree.ply").touch()
-    mug, book = row_of(outlined, "mug").node, row_of(outlined, "book").node
-    outline.group(outlined, mug, book)
-    outline.toggle_lock(outlined, mug)
-    outline.give_name(outlined, book, "the atlas")
-    settle(outlined)
-    things, path = outlined.state.things, projects.save_project(outlined, tmp_path)
-    open_scene(viewer, "plain.ply")
-    assert viewer.state.things != things
-    browsing.open_project(viewer, path)
-    settle(viewer)
-    assert viewer.state.things == things
-    selecting.select_all(viewer)
-    assert marked(viewer)[0] == "book plant"
-
-
 @pytest.mark.parametrize("field", [True, False])
-def test_a_project_of_another_tree_keeps_what_is_known(outlined, tmp_path, monkeypatch, field):
+def test_a_project_keeps_names_groups_and_locks_and_of_another_tree_what_is_known(
+    outlined, nodes, tmp_path, monkeypatch, field
+):
     """As after training anew, or for a scene whose field is gone."""
     monkeypatch.chdir(tmp_path)
     Path("tree.ply").touch()
-    mug = row_of(outlined, "mug").node
-    path = projects.save_project(outlined, tmp_path)
+    mug, book, _ = nodes
+    outline.group(outlined, mug, book)
+    outline.toggle_lock(outlined, mug)
+    act(outline.give_name, outlined, book, "the atlas")
+    things, path = outlined.state.things, projects.save_project(outlined, tmp_path)
+    open_scene(outlined, "plain.ply")
+    assert outlined.state.things != things
+    act(browsing.open_project, outlined, path)
+    assert outlined.state.things == things
+    selecting.select_all(outlined)
+    assert marked(outlined)[0] == "book plant"
     top = json.loads(path.read_text())
-    nodes = [mug, 10**9, 10**9, mug]
-    top["things"] = {
-        "names": [[10**9, "ghost"], [mug, "cup"]],
-        "groups": [{"name": "a", "nodes": nodes}, {"name": "b", "nodes": [10**9]}],
-        "locked": nodes,
-    }
+    odd = [mug, 10**9, 10**9, mug]
+    groups = [{"name": "a", "nodes": odd}, {"name": "b", "nodes": [10**9]}]
+    top["things"] = {"names": [[10**9, "ghost"], [mug, "cup"]], "groups": groups, "locked": odd}
     path.write_text(json.dumps(top))
     if not field:
         monkeypatch.setitem(SCENES, "tree.ply", replace(SCENES["tree.ply"], language=None))
-    browsing.open_project(outlined, path)
-    settle(outlined)
+    act(browsing.open_project, outlined, path)
     things = outlined.state.things
     selecting.select_all(outlined)
     if field:
@@ -207,19 +191,17 @@ def test_a_scene_that_was_trained_anew_is_read_again(outlined, monkeypatch):
     """Its tree is another: what was locked by the number of a node is not."""
     outline.toggle_lock(outlined, row_of(outlined, "mug").node)
     outlined.state.things = replace(outlined.state.things, locked=frozenset({10**6}))
-    opening.reload(outlined)
-    settle(outlined)
+    act(opening.reload, outlined)
     assert outlined.state.things.locked == frozenset()
     outline.toggle_lock(outlined, 0)  # of another number of Gaussians
     monkeypatch.setitem(SCENES, "tree.ply", with_tree(SCENES["tree.ply"].take(np.arange(300))))
-    opening.reload(outlined)
-    settle(outlined)
+    act(opening.reload, outlined)
     assert outlined.state.things == Things()
 
 
-def test_things_have_the_colour_that_the_image_has(outlined):
+def test_things_have_the_colour_that_the_image_has(outlined, nodes):
     settings.set_display(outlined, "rgb")
-    mug, book = row_of(outlined, "mug").node, row_of(outlined, "book").node
+    mug, book, _ = nodes
     assert outline.colour_of(outlined, mug) is None
     for display in ("latent", "tree"):
         settings.set_display(outlined, display, 2)
@@ -229,17 +211,14 @@ def test_things_have_the_colour_that_the_image_has(outlined):
     assert {"mug", "book", "plant"} <= {word for name in named for word in name.split()}
 
 
-def test_a_scene_without_a_field_has_none(viewer):
-    open_scene(viewer, "plain.ply")
-    assert outline.wanted(viewer) is None
-    outline.select(viewer, np.zeros(3))
-    assert "language field" in errors(viewer)[-1]
-
-
-def test_an_encoder_that_may_be_a_download_is_not_loaded_for_it(viewer, monkeypatch):
+def test_a_scene_without_a_field_has_none_and_for_it_no_encoder_is_downloaded(viewer, monkeypatch):
     scene = SCENES["blobs.ply"]
     far = replace(scene, language=replace(scene.language, encoder_id="hub/of-someone"))
     monkeypatch.setitem(SCENES, "blobs.ply", far)
     open_scene(viewer, "blobs.ply")
     assert "hub/of-someone" in outline.wanted(viewer).problem
     assert viewer.worker.current is None
+    open_scene(viewer, "plain.ply")
+    assert outline.wanted(viewer) is None
+    outline.select(viewer, np.zeros(3))
+    assert "language field" in errors(viewer)[-1]

@@ -2,7 +2,6 @@
 
 import ast
 import threading
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,15 +12,7 @@ from langsplat_core.errors import InputError
 from langsplat_viewer import panels
 from langsplat_viewer.actions import queries, settings, viewpoint
 from langsplat_viewer.commands import COMMANDS, PANEL_TITLES, matching
-from langsplat_viewer.files.preferences import (
-    FILE_NAME,
-    MOST_RECENT,
-    SCALES,
-    Preferences,
-    load_preferences,
-    save_preferences,
-    with_recent,
-)
+from langsplat_viewer.files import preferences
 from langsplat_viewer.panels import layout, ui
 from langsplat_viewer.panels.layout import PANELS
 from langsplat_viewer.panels.navigation import chord
@@ -75,15 +66,11 @@ def test_panels_write_no_state():
 
 # The table of commands: keys, help and palette are made from it.
 
-KEYS = {key: command for command in COMMANDS for key in command.keys}
 
-
-def test_no_key_does_two_things():
-    assert [key for key, count in Counter(k for c in COMMANDS for k in c.keys).items() if count > 1] == []
-
-
-def test_every_key_is_understood_and_letters_are_plain():
-    for key in KEYS:
+def test_every_key_does_one_thing_and_is_understood_and_letters_are_plain():
+    keys = [key for command in COMMANDS for key in command.keys]
+    assert len(set(keys)) == len(keys)
+    for key in keys:
         understood = chord(key)
         assert (understood.key is None) == bool(understood.character)
         assert understood.is_plain == (not key.startswith("Ctrl") and key not in ("F1", "Esc")), key
@@ -100,12 +87,8 @@ def test_every_panel_can_be_opened_by_a_command(viewer):
         command.act(viewer)
         assert settings.take_wanted_panel(viewer) == title
     assert settings.take_wanted_panel(viewer) == ""
-
-
-def test_commands_are_found_by_their_words(opened):
     assert matching("") == list(COMMANDS)
-    (found,) = matching("OPENING view")
-    assert found.act is viewpoint.reset_view
+    assert [command.act for command in matching("OPENING view")] == [viewpoint.reset_view]
     assert matching("make coffee") == []
 
 
@@ -119,17 +102,16 @@ def test_every_command_does_something_sensible_before_a_scene_is_open(viewer, tm
 # What is shown and how; messages; the worker.
 
 
-def test_messages_do_not_grow_without_end(viewer):
-    for number in range(3 * MAX_MESSAGES):
+def test_messages_do_not_grow_without_end_and_repeated_ones_are_said_once(viewer):
+    for number in [*range(3 * MAX_MESSAGES), 3 * MAX_MESSAGES - 1]:
         viewer.state.say(f"message {number}")
-    viewer.state.say(f"message {3 * MAX_MESSAGES - 1}")  # repeated: once is enough
-    assert len(viewer.state.messages) == MAX_MESSAGES
-    assert viewer.state.messages[-1].text == f"message {3 * MAX_MESSAGES - 1}"
-    assert viewer.state.messages[-2].text != viewer.state.messages[-1].text
+    numbers = [int(message.text.split()[1]) for message in viewer.state.messages]
+    assert numbers == list(range(2 * MAX_MESSAGES, 3 * MAX_MESSAGES))
 
 
-def test_worker_delivers_in_order_and_names_user_errors_plainly(viewer):
-    seen = []
+def test_worker_delivers_in_order_wakes_the_window_and_names_user_errors_plainly(viewer):
+    seen, woken = [], []
+    viewer.worker.wake = lambda: woken.append(viewer.worker.is_running)
 
     def fail(progress):
         raise InputError("two\n lines")
@@ -139,16 +121,8 @@ def test_worker_delivers_in_order_and_names_user_errors_plainly(viewer):
     viewer.worker.submit("c", lambda progress: progress("half", 0.5) or 3, seen.append, seen.append)
     settle(viewer)
     assert seen == [1, "two lines", 3]
-
-
-def test_the_worker_wakes_the_window_when_there_is_news(viewer):
-    woken = []
-    viewer.worker.wake = lambda: woken.append(viewer.worker.is_running)
-    viewer.worker.submit("a", lambda progress: progress("half", 0.5), lambda nothing: None, print)
-    settle(viewer)
-    assert len(woken) == 2  # the report, and the end
-    assert viewer.worker.delivered == 1
-    assert not viewer.worker.is_running
+    assert len(woken) == 4  # a report, and three ends
+    assert (viewer.worker.delivered, viewer.worker.is_running) == (3, False)
 
 
 def test_a_job_that_hangs_does_not_keep_the_process(viewer):
@@ -166,14 +140,6 @@ def test_a_job_that_hangs_does_not_keep_the_process(viewer):
     release.set()
 
 
-def test_letters_meant_for_a_box_that_is_not_there_are_no_keys(viewer):
-    queries.focus_search(viewer)
-    assert viewer.state.letters_muted
-    assert "open a scene" in viewer.state.messages[-1].text
-    settings.escape(viewer)
-    assert not viewer.state.letters_muted
-
-
 def test_long_lines_are_cut_where_they_fit():
     assert elided("red mug", 7, len) == "red mug"
     assert elided("a red mug on the table", 10, len) == "a red m..."
@@ -185,10 +151,10 @@ def test_long_lines_are_cut_where_they_fit():
 
 
 def test_they_come_back_as_they_were(tmp_path):
-    assert load_preferences(tmp_path / "none") == Preferences()
-    kept = Preferences("light", 1.5, ("/a/b.ply", "/ü.ply"), ("Search",))
-    save_preferences(tmp_path / "new" / "folder", kept)
-    assert load_preferences(tmp_path / "new" / "folder") == kept
+    assert preferences.load_preferences(tmp_path / "none") == preferences.Preferences()
+    kept = preferences.Preferences("light", 1.5, ("/a/b.ply", "/ü.ply"), ("Search",))
+    preferences.save_preferences(tmp_path / "new" / "folder", kept)
+    assert preferences.load_preferences(tmp_path / "new" / "folder") == kept
 
 
 @pytest.mark.parametrize(
@@ -212,25 +178,28 @@ def test_they_come_back_as_they_were(tmp_path):
     ],
 )
 def test_a_file_that_makes_no_sense_is_one_line(tmp_path, text):
-    (tmp_path / FILE_NAME).write_bytes(text.encode("latin-1"))
-    with pytest.raises(InputError, match=FILE_NAME) as caught:
-        load_preferences(tmp_path)
+    (tmp_path / preferences.FILE_NAME).write_bytes(text.encode("latin-1"))
+    with pytest.raises(InputError, match=preferences.FILE_NAME) as caught:
+        preferences.load_preferences(tmp_path)
     assert str(caught.value).isprintable()
     assert len(str(caught.value)) < 300
 
 
-def test_recent_scenes_are_not_listed_twice_nor_without_end():
-    preferences = Preferences()
-    for number in (*range(MOST_RECENT + 3), 5):
-        preferences = with_recent(preferences, Path(f"/{number}.ply"))
-    assert len(preferences.recent) == MOST_RECENT
-    assert preferences.recent[:2] == ("/5.ply", f"/{MOST_RECENT + 2}.ply")
-
-
-def test_looks_are_chosen_within_limits(viewer):
+def test_letters_recent_scenes_and_looks_stay_within_limits(viewer):
+    queries.focus_search(viewer)  # a box that is not there: letters meant for it are no keys
+    assert viewer.state.letters_muted
+    assert "open a scene" in viewer.state.messages[-1].text
+    settings.escape(viewer)
+    assert not viewer.state.letters_muted
     settings.set_theme(viewer, "light")
     settings.set_ui_scale(viewer, 99.0)
-    assert viewer.state.preferences == replace(Preferences(), theme="light", ui_scale=SCALES[1])
+    wanted = replace(preferences.Preferences(), theme="light", ui_scale=preferences.SCALES[1])
+    assert viewer.state.preferences == wanted
+    most = preferences.MOST_RECENT
+    for number in (*range(most + 3), 5):
+        wanted = preferences.with_recent(wanted, Path(f"/{number}.ply"))
+    assert len(wanted.recent) == most
+    assert wanted.recent[:2] == ("/5.ply", f"/{most + 2}.ply")
 
 
 # Letters beyond Latin.

@@ -29,7 +29,7 @@ from langsplat_viewer.rendering.request import Clip
 from langsplat_viewer.viewer import Services, Viewer
 from tests.support.fakes import CENTRES, FakeEncoder
 from tests.support.marks_and_flights import blob, marked
-from tests.support.windowless import SCENES, FakeSurface, ask, errors, load, settle
+from tests.support.windowless import SCENES, FakeSurface, act, ask, errors, load
 
 
 @pytest.fixture
@@ -41,8 +41,7 @@ def saved(opened, tmp_path, monkeypatch) -> Path:
     queries.set_cut(opened, opened.state.queries[1], 0.6)
     queries.hide(opened, opened.state.queries[2])
     selecting.take(opened, blob("plant"))
-    editing.transform(opened, moving(np.array([0.0, 1.0, 0.0])))
-    settle(opened)
+    act(editing.transform, opened, moving(np.array([0.0, 1.0, 0.0])))
     selecting.hide_selected(opened)
     selecting.take(opened, blob("book"))
     looks = replace(opened.state.picture, dim=0.7, heat_scale=(0.4, 0.9), colour_map="magma")
@@ -64,8 +63,7 @@ def saved(opened, tmp_path, monkeypatch) -> Path:
 def again(saved):
     """Another viewer with the project open."""
     made = Viewer(Services(load, lambda encoder_id: FakeEncoder()), surface=FakeSurface())
-    browsing.open_file(made, saved)
-    settle(made)
+    act(browsing.open_file, made, saved)
     yield made
     made.worker.close()
 
@@ -79,11 +77,9 @@ def test_everything_comes_back(opened, saved, again):
         np.testing.assert_array_equal(one.result.members, other.result.members)
     assert marked(again) == marked(opened) == ("book", "plant", "")
     np.testing.assert_allclose(after.scene.gaussians.means, before.scene.gaussians.means, atol=1e-6)
-    assert (after.picture, after.settings.clip, after.notes) == (
-        before.picture,
-        before.settings.clip,
-        before.notes,
-    )
+    for name in ("picture", "notes"):
+        assert getattr(after, name) == getattr(before, name)
+    assert after.settings.clip == before.settings.clip
     np.testing.assert_allclose(after.view.eye, before.view.eye, atol=1e-9)
     np.testing.assert_allclose(after.view.target, before.view.target, atol=1e-6)
     assert len(after.record.keyframes) == 1
@@ -92,10 +88,19 @@ def test_everything_comes_back(opened, saved, again):
     assert not after.selection.is_unsaved
     assert (before.preferences.recent[0], after.preferences.recent[0]) == (str(saved), str(saved))
     queries.remove_all(again)
-    browsing.open_recent(again, str(saved))
-    settle(again)
+    act(browsing.open_recent, again, str(saved))
     assert len(after.queries) == 4
     assert projects.save_project(again, Path("/nowhere")) == saved  # where it came from
+
+
+def test_a_project_without_its_scene_or_a_window_is_refused(saved, opened, run_viewer):
+    code, _, problems = run_viewer(str(saved), "--headless", "--out", "a.png")
+    assert code == 2
+    assert "project" in problems[0]
+    Path("blobs.ply").unlink()
+    browsing.open_dropped(opened, [saved])
+    assert "not there" in errors(opened)[-1]
+    assert opened.state.scene is not None
 
 
 def test_other_programs_find_the_answers_in_it(opened, saved):
@@ -112,40 +117,10 @@ def test_other_programs_find_the_answers_in_it(opened, saved):
 def test_a_scene_that_has_changed_keeps_its_questions_alone(saved, viewer, monkeypatch):
     smaller = SCENES["blobs.ply"].take(np.arange(240))
     monkeypatch.setitem(SCENES, "blobs.ply", smaller)
-    browsing.open_project(viewer, saved)
-    settle(viewer)
+    act(browsing.open_project, viewer, saved)
     assert len(viewer.state.queries) == 4
     assert not viewer.state.selection.marks.selected.any()
     assert any("has changed" in text for text in errors(viewer))
-
-
-def test_a_scene_that_is_gone(saved, opened):
-    Path("blobs.ply").unlink()
-    browsing.open_dropped(opened, [saved])
-    assert "not there" in errors(opened)[-1]
-    assert opened.state.scene is not None
-
-
-def test_projects_without_a_window_are_refused(saved, run_viewer):
-    code, _, problems = run_viewer(str(saved), "--headless", "--out", "a.png")
-    assert code == 2
-    assert "project" in problems[0]
-
-
-BITS = {
-    "not base64": "&&&",
-    "not zlib": b64encode(b"abc").decode(),
-    "too few": b64encode(zlib.compress(b"abc")).decode(),
-    "a bomb": b64encode(zlib.compress(bytes(50_000_000))).decode(),
-    "a number": 7,
-}
-
-
-@pytest.mark.parametrize("bits", BITS)
-def test_marks_that_are_none(saved, bits):
-    top = json.loads(saved.read_text())
-    top["marks"]["hidden"] = BITS[bits]
-    refuse(saved, top)
 
 
 def test_whatever_is_broken_is_one_line(saved):
@@ -169,32 +144,25 @@ def test_whatever_is_broken_is_one_line(saved):
                 refused.append(str(error))
     assert tried > len(refused) > 400
     assert not [text for text in refused if "\n" in text]
-    refuse(saved, {"format": "other"})
-    refuse(saved, {**top, "version": 2})
-    refuse(saved, [])
+    # Marks: not base64, not zlib, too few, a bomb, a number.
+    packed = [
+        b64encode(raw).decode() for raw in (b"abc", zlib.compress(b"abc"), zlib.compress(bytes(50_000_000)))
+    ]
+    marks = [{**top, "marks": {**top["marks"], "hidden": bits}} for bits in ("&&&", *packed, 7)]
+    for broken in ({"format": "other"}, {**top, "version": 2}, [], *marks):
+        saved.write_text(json.dumps(broken))
+        with pytest.raises(LangSplatError) as raised:
+            read_project(saved)
+        assert "\n" not in str(raised.value)
 
 
 def places(value, way=()):
     """Every place of a JSON value."""
     if way:
         yield way
-    entries = (
-        value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    )
-    for key, inner in entries:
-        yield from places(inner, (*way, key))
-
-
-def refuse(path: Path, top) -> None:
-    path.write_text(json.dumps(top))
-    with pytest.raises(LangSplatError) as raised:
-        read_project(path)
-    assert "\n" not in str(raised.value)
-
-
-def test_without_a_scene_there_is_nothing_to_save(viewer, tmp_path):
-    assert projects.save_project(viewer, tmp_path) is None
-    assert list(tmp_path.iterdir()) == []
+    if isinstance(value, dict | list):
+        for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from places(inner, (*way, key))
 
 
 def test_notes_are_pinned_written_and_taken_off(opened):
@@ -219,7 +187,8 @@ def test_notes_are_pinned_written_and_taken_off(opened):
     assert opened.state.notes == ()
 
 
-def test_notes_are_asked_about_before_the_window_closes(opened, tmp_path):
+@pytest.mark.parametrize("leave", [projects.save_and_leave, projects.end])
+def test_notes_are_asked_about_before_the_window_closes(opened, tmp_path, leave):
     projects.pin_at(opened, 0.5, 0.5)
     assert not selecting.may_close(opened)
     selecting.stay(opened)
@@ -228,17 +197,10 @@ def test_notes_are_asked_about_before_the_window_closes(opened, tmp_path):
     opened.state.selection = replace(opened.state.selection, may_close=False)
     editing.redo(opened)
     assert not selecting.may_close(opened)
-    projects.save_and_leave(opened, tmp_path)
+    leave(opened, tmp_path)
     assert opened.state.selection.may_close
     assert len(read_project(tmp_path / "blobs-001.langsplat").notes) == 1
     assert selecting.may_close(opened)
-
-
-def test_a_process_that_has_to_end_saves_notes(opened, tmp_path):
-    projects.pin_at(opened, 0.5, 0.5)
-    projects.end(opened, tmp_path)
-    assert opened.state.selection.may_close
-    assert (tmp_path / "blobs-001.langsplat").exists()
 
 
 def test_notes_are_there_again_after_another_scene(opened):
@@ -246,11 +208,9 @@ def test_notes_are_there_again_after_another_scene(opened):
     notes = opened.state.notes
     opening.add_scenes(opened, [Path("blobs.ply"), Path("plain.ply")])
     for step, there in ((1, ()), (-1, notes)):
-        opening.step_scene(opened, step)
-        settle(opened)
+        act(opening.step_scene, opened, step)
         assert opened.state.notes == there
-    opening.reload(opened)
-    settle(opened)
+    act(opening.reload, opened)
     assert opened.state.notes == notes
     assert opened.state.has_unsaved_notes
 

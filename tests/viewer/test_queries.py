@@ -12,14 +12,14 @@ from langsplat_core.display.displays import NO_HEAT, Subject, relevancies
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.scene import CANONICAL_PHRASES, Reading
 from langsplat_core.semantics.store import ImageFeatures
-from langsplat_viewer.actions import browsing, editing, queries, settings
+from langsplat_viewer.actions import browsing, editing, queries
 from langsplat_viewer.files.projects import QuerySet, SavedQuery, read_queries, write_queries
 from langsplat_viewer.marks import BINS
 from langsplat_viewer.output import describe
 from langsplat_viewer.panels.search import hint, histogram
 from langsplat_viewer.viewer import Services
 from tests.support.fakes import CENTRES, FakeEncoder, as_trained, axis, blob_scene, calibrated_for, language
-from tests.support.windowless import SCENES, ask, errors, load, open_scene, settle
+from tests.support.windowless import SCENES, act, ask, errors, load, open_scene, phrases, settle
 
 
 def test_a_query_is_answered_and_shown(opened):
@@ -39,30 +39,25 @@ def test_a_query_is_answered_and_shown(opened):
     assert pane.ranges == (query.result.heat_range,)
 
 
-def test_an_unknown_word_takes_no_colour_and_says_what_may_be_meant(opened):
-    ask(opened, "mug", "book", "plant", "plamt pot", "plamt")
-    assert [query.slot for query in opened.state.queries] == [0, 1, 2, None, None]
-    typo = opened.state.queries[4]
-    assert (typo.phrase, typo.meant) == ("plamt", "plant")
-    assert "did you mean 'plant'?" in typo.problem
-    assert opened.state.queries[3].meant == ""  # "pot" is like no word
-
-
 def test_a_correction_is_offered_and_takes_the_place_of_the_typo(opened):
     ask(opened, "red plamt")
-    assert queries.offers(opened) == ("did you mean", ())  # "red" is like no word either
+    assert queries.offers(opened) == ("did you mean", ())  # "red" is like no word
     ask(opened, "plamt")
+    unknown, typo = opened.state.queries
+    assert [(query.meant, query.slot) for query in (unknown, typo)] == [("", None), ("plant", None)]
+    assert "did you mean 'plant'?" in typo.problem
     assert queries.offers(opened) == ("did you mean", ("plant",))
-    queries.ask_offered(opened, "plant")
-    settle(opened)
-    assert [query.phrase for query in opened.state.queries] == ["red plamt", "plant"]
+    act(queries.ask_offered, opened, "plant")
+    assert phrases(opened) == ["red plamt", "plant"]
     assert opened.state.queries[1].result.found
     assert opened.state.queries[1].slot == 0
 
 
 def test_commas_separate_searches_and_quotes_are_no_part_of_them(opened):
-    ask(opened, '"mug", plant; book, not mug')
-    assert [query.phrase for query in opened.state.queries] == ["mug", "plant", "book, not mug"]
+    ask(opened, "   ", '"mug", plant; book, not mug')
+    assert phrases(opened) == ["mug", "plant", "book, not mug"]
+    ask(opened, " Mug ")  # again
+    assert phrases(opened) == ["plant", "book, not mug", "mug"]
     queries.ask(opened, "?!")
     assert "no word to look for" in errors(opened)[-1]
     ask(opened, "the")
@@ -89,30 +84,14 @@ def test_examples_are_offered_until_the_first_search_and_each_is_found(viewer):
     viewer.state.typed = "bo"
     assert queries.offers(viewer) == ("", ("book",))
     viewer.state.typed = ""
-    queries.ask_offered(viewer, "book")
-    settle(viewer)
+    act(queries.ask_offered, viewer, "book")
     assert viewer.state.queries[0].result.found
     open_scene(viewer, "plain.ply")
     queries.prepare_suggestions(viewer)
     assert queries.offers(viewer) == ("try", ())
 
 
-def test_empty_and_repeated_phrases(opened):
-    queries.ask(opened, "   ")
-    assert opened.state.queries == []
-    ask(opened, "mug", " Mug ")
-    assert [query.phrase for query in opened.state.queries] == ["mug"]
-
-
-def test_a_fourth_query_takes_the_oldest_ones_colour(opened):
-    ask(opened, "mug", "book", "plant")
-    assert [query.slot for query in opened.state.queries] == [0, 1, 2]
-    ask(opened, "mug or book")
-    slots = {query.phrase: query.slot for query in opened.state.queries}
-    assert slots == {"mug": None, "book": 1, "plant": 2, "mug or book": 0}
-
-
-def test_hiding_keeps_the_colours_of_the_others(opened):
+def test_hiding_keeps_the_colours_of_the_others_and_a_fourth_takes_that_of_the_longest_shown(opened):
     ask(opened, "mug", "book")
     mug, book = opened.state.queries
     queries.hide(opened, mug)
@@ -124,10 +103,14 @@ def test_hiding_keeps_the_colours_of_the_others(opened):
     assert columns[120:240, 1].mean() > 0.9
     queries.show(opened, mug)
     assert (mug.slot, book.slot) == (0, 1)
-    queries.remove(opened, book)
-    assert len(opened.state.shown_results()) == 1
+    ask(opened, "plant", "mug or book")
+    assert [query.slot for query in opened.state.queries] == [0, None, 2, 1]
     queries.remove(opened, mug)
-    assert opened.state.shown_results() == ()
+    assert [result is not None for result in opened.state.shown_results()] == [False, True, True]
+    queries.remove_all(opened)
+    assert (opened.state.queries, opened.state.selected, opened.state.shown_results()) == ([], None, ())
+    editing.undo(opened)
+    assert phrases(opened) == ["book", "plant", "mug or book"]
 
 
 def test_queries_are_combined_as_the_grammar_reads_them(opened):
@@ -157,20 +140,10 @@ def test_the_box_is_emptied_by_a_search_and_by_nothing_else(opened):
     assert not queries.take_search_focus(opened)  # said once
 
 
-def test_all_queries_go_at_once_and_come_back(opened):
-    for phrase in ("mug", "plant"):
-        ask(opened, phrase)
-    queries.remove_all(opened)
-    assert (opened.state.queries, opened.state.selected) == ([], None)
-    editing.undo(opened)
-    assert [query.phrase for query in opened.state.queries] == ["mug", "plant"]
-
-
 @pytest.mark.parametrize(("logit", "verdict"), [(9.0, "found"), (1.0, "weak match"), (-3.0, "not here")])
 def test_a_calibrated_scene_gives_verdicts_with_probability(viewer, monkeypatch, logit, verdict):
-    reading = Reading(calibration=calibrated_for("mug", logit))
-    scene = replace(blob_scene(), language=replace(language(), reading=reading))
-    monkeypatch.setitem(SCENES, "sure.ply", scene)
+    sure = replace(language(), reading=Reading(calibration=calibrated_for("mug", logit)))
+    monkeypatch.setitem(SCENES, "sure.ply", replace(blob_scene(), language=sure))
     open_scene(viewer, "sure.ply")
     ask(viewer, "mug")
     result = viewer.state.queries[0].result
@@ -187,14 +160,12 @@ def test_an_answer_is_explained_by_what_training_kept(opened, tmp_path, monkeypa
     monkeypatch.chdir(tmp_path)
     ask(opened, "book")
     (query,) = opened.state.queries
-    queries.explain(opened, query)
-    settle(opened)
+    act(queries.explain, opened, query)
     assert "--work" in errors(opened)[-1]
     scene = opened.state.scene
     seen = ImageFeatures(np.zeros((3, 120, 160), np.int32), axis(1)[None])
     as_trained(tmp_path / "blobs.ply", scene, [seen] * len(scene.cameras))
-    queries.explain(opened, query)
-    settle(opened)
+    act(queries.explain, opened, query)
     assert opened.state.evidence.phrase == "book"
     assert opened.state.evidence.image.ndim == 3
     opened.state.evidence = None
@@ -202,13 +173,6 @@ def test_an_answer_is_explained_by_what_training_kept(opened, tmp_path, monkeypa
 
 
 # Own cuts, canonical phrases and sets of queries, without a window.
-
-
-@pytest.fixture
-def asked(opened):
-    """Three blobs, and "mug" asked."""
-    ask(opened, "mug")
-    return opened
 
 
 def test_an_answer_ends_where_one_says_and_can_end_by_itself_again(asked):
@@ -233,14 +197,11 @@ def test_a_cut_is_undone_in_one_step_and_outlives_another_level(asked):
     queries.set_cut(asked, query, 0.6)
     for value in (0.61, 0.62):  # the slider moves on
         queries.set_cut(asked, query, value, is_new=False)
-    queries.set_level(asked, "part")
-    settle(asked)
+    act(queries.set_level, asked, "part")
     assert (query.result.level, query.result.own_cut) == (1, 0.62)
-    editing.undo(asked)
-    settle(asked)
+    act(editing.undo, asked)
     assert query.result.own_cut == 0.62
-    editing.undo(asked)
-    settle(asked)
+    act(editing.undo, asked)
     assert query.result.own_cut is None
     np.testing.assert_array_equal(query.result.members, automatic.members)
     editing.redo(asked)
@@ -250,49 +211,37 @@ def test_a_cut_is_undone_in_one_step_and_outlives_another_level(asked):
 def test_everything_can_be_compared_with_other_phrases(asked):
     (query,) = asked.state.queries
     before = query.result
-    queries.set_canonical(asked, "book, plant")
-    settle(asked)
+    act(queries.set_canonical, asked, "book, plant")
     assert asked.state.canonical == ("book", "plant")
     assert asked.engine.canonical_phrases == ("book", "plant")
     assert np.abs(query.result.relevancy - before.relevancy).max() > 0.01
     assert query.result.probability is None
-    queries.set_canonical(asked, "sofa")  # never taught: all stays as it was
-    settle(asked)
+    act(queries.set_canonical, asked, "sofa")  # never taught: all stays as it was
     assert "sofa" in errors(asked)[-1]
     assert asked.state.canonical == ("book", "plant")
-    queries.set_canonical(asked, "")
-    settle(asked)
+    act(queries.set_canonical, asked, "")
     assert asked.state.canonical == ()
     assert asked.engine.canonical_phrases == CANONICAL_PHRASES
     np.testing.assert_array_equal(query.result.relevancy, before.relevancy)
 
 
-def test_a_set_of_queries_is_asked_again(asked, tmp_path):
+@pytest.mark.parametrize("dropped", [lambda path: [path], lambda path: [path, Path("blobs.ply")]])
+def test_a_set_of_queries_is_asked_again_alone_or_with_its_scene(asked, tmp_path, dropped):
     queries.set_cut(asked, asked.state.queries[0], 0.7)
     ask(asked, "plant")
     queries.hide(asked, asked.state.queries[1])
     queries.set_level(asked, "whole")
-    queries.set_canonical(asked, "book")
-    settle(asked)
+    act(queries.set_canonical, asked, "book")
     path = queries.save_queries(asked, tmp_path)
     assert path.name == "blobs-001.queries.json"
     open_scene(asked, "blobs.ply")
     assert (asked.state.queries, asked.state.canonical) == ([], ())
-    browsing.open_dropped(asked, [path])
-    settle(asked)
+    act(browsing.open_dropped, asked, dropped(path))
     found = [(query.phrase, query.cut, query.slot is None) for query in asked.state.queries]
     assert found == [("mug", 0.7, False), ("plant", None, True)]
     assert asked.state.canonical == ("book",)
     assert asked.state.level == "whole"
     assert asked.state.queries[0].result.own_cut == 0.7
-
-
-def test_queries_dropped_with_a_scene_are_asked_of_it(viewer, tmp_path):
-    path = tmp_path / "a.queries.json"
-    write_queries(path, QuerySet((SavedQuery("mug"),)))
-    browsing.open_dropped(viewer, [path, Path("blobs.ply")])
-    settle(viewer)
-    assert [query.phrase for query in viewer.state.queries] == ["mug"]
 
 
 def test_nothing_to_save_and_nothing_to_ask_of(viewer, opened, tmp_path):
@@ -341,9 +290,6 @@ def test_a_broken_set_is_one_line(tmp_path, change):
     assert str(caught.value).isprintable()
 
 
-# When the viewer loads the text encoder, and what it says if that fails.
-
-
 def test_the_histogram_counts_every_gaussian(asked):
     low, high, counts = histogram(asked.state.queries[0].result)
     even = asked.state.queries[0].result.even
@@ -352,16 +298,26 @@ def test_the_histogram_counts_every_gaussian(asked):
     assert np.expm1(counts.astype(np.float64)).sum() == pytest.approx(360, rel=1e-5)
 
 
-def test_an_unexpected_error_of_the_encoder_is_one_line_too(viewer):
+# When the viewer loads the text encoder, and what it says if that fails.
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (EncoderError("no weights; download them"), "no weights; download them"),
+        (ZeroDivisionError("deep\ninside"), "internal error: ZeroDivisionError: deep inside"),
+    ],
+)
+def test_an_encoder_that_fails_is_one_line_and_a_phrasebook_needs_none(viewer, error, said):
     def broken(encoder_id: str):
-        raise ZeroDivisionError("deep\ninside")
+        raise error
 
     viewer.services = replace(viewer.services, load_encoder=broken)
-    open_scene(viewer, "blobs.ply")
-    ask(viewer, "mug")
-    assert viewer.state.queries[0].problem == "internal error: ZeroDivisionError: deep inside"
-    settings.set_display(viewer, "depth")  # and life goes on
-    assert viewer.state.picture.display == "depth"
+    open_scene(viewer, "book.ply")
+    ask(viewer, "Book", "mug")
+    book, mug = viewer.state.queries
+    assert book.result.found
+    assert mug.problem == said
 
 
 @pytest.mark.parametrize("encoder_id", ["demo", "~", "somebody/some-model"])
@@ -376,15 +332,3 @@ def test_a_local_encoder_is_loaded_while_the_user_looks_round(viewer, encoder_id
     settle(viewer)
     assert asked == [encoder_id]
     assert viewer.state.queries[0].result.found
-
-
-def test_phrasebook_needs_no_encoder(viewer):
-    def absent(encoder_id: str):
-        raise EncoderError("no weights; download them")
-
-    viewer.services = replace(viewer.services, load_encoder=absent)
-    open_scene(viewer, "book.ply")
-    ask(viewer, "Book", "mug")
-    book, mug = viewer.state.queries
-    assert book.result.found
-    assert mug.problem == "no weights; download them"

@@ -20,7 +20,7 @@ from langsplat_viewer.rendering.renderer import render_image
 from langsplat_viewer.rendering.request import Clip, Splats
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
-from tests.support.windowless import ask, errors, open_scene, recorded
+from tests.support.windowless import act, ask, errors, open_scene, recorded
 
 
 def turn(viewer: Viewer, yaw: float) -> None:
@@ -62,31 +62,20 @@ def test_a_played_path_goes_through_its_keyframes(opened):
     assert opened.state.record.at == 4
 
 
-def test_a_loop_begins_again_and_a_drag_ends_it(opened):
+def test_playing_goes_on_where_it_was_stopped_a_loop_begins_again_and_a_drag_ends_it(opened):
     views = record_three(opened)
     opened.state.record.loops = True
     viewpoint.scrub(opened, 1.0)
-    viewpoint.toggle_playing(opened)
-    viewpoint.tick(opened, opened.clock + 5.0)  # at 6 of 4 seconds
-    assert opened.state.record.at == pytest.approx(2.0)
+    for playing, seconds, at in ((True, 5.0, 2.0), (False, 9.0, 2.0), (True, 0.25, 2.25), (True, 3.75, 2.0)):
+        if playing != (opened.state.record.began is not None):
+            viewpoint.toggle_playing(opened)
+        viewpoint.tick(opened, opened.clock + seconds)  # around, of 4 seconds
+        assert opened.state.record.at == pytest.approx(at)
     assert_allclose(opened.state.view.eye, views[1].eye, atol=1e-9)
     turn(opened, 0.1)
     view = opened.state.view
     viewpoint.tick(opened, opened.clock + 1.0)
     assert opened.state.view is view
-
-
-def test_stopping_stays_and_playing_goes_on_from_there(opened):
-    record_three(opened)
-    viewpoint.scrub(opened, 0)
-    viewpoint.toggle_playing(opened)
-    viewpoint.tick(opened, opened.clock + 1.5)
-    viewpoint.toggle_playing(opened)
-    viewpoint.tick(opened, opened.clock + 9)
-    assert opened.state.record.at == pytest.approx(1.5)
-    viewpoint.toggle_playing(opened)
-    viewpoint.tick(opened, opened.clock + 0.25)
-    assert opened.state.record.at == pytest.approx(1.75)
 
 
 def test_a_turntable_comes_back_and_begins_anew_after_a_drag(opened):
@@ -145,12 +134,8 @@ def test_a_path_is_saved_loaded_and_dropped(opened, folder):
     filming.load_typed_path(opened, folder)
     assert "no camera path" in errors(opened)[-1]
     assert times(opened) == [0, 2, 4]
-
-
-def test_another_scene_has_no_path_of_this_one(opened):
-    record_three(opened)
     filming.set_film_size(opened, 640, 0)
-    open_scene(opened, "plain.ply")
+    open_scene(opened, "plain.ply")  # has no path of this one
     assert times(opened) == []
     assert opened.state.record.size == (640, 1)
 
@@ -206,10 +191,6 @@ def cut_by_hand(viewer) -> None:
     queries.set_cut(viewer, query, float(np.median(query.automatic.even[query.automatic.members])))
 
 
-QUERIES = ("queries", "colours", "sliders", "scale", "cuts", "canonical")
-SLIDERS = PictureConfig(display="relevancy", heat_opacity=0.3, dim=0.9)
-
-
 def look_flat(viewer) -> None:
     """In a tall window, and with a cut, which counts from the eye."""
     settings.resize(viewer, 130, 200)
@@ -218,40 +199,39 @@ def look_flat(viewer) -> None:
     settings.set_clip(viewer, Clip(3.9, 4.3))
 
 
-LOOKS = {
-    "orthographic": look_flat,
-    "colours": lambda viewer: queries.hide(viewer, viewer.state.queries[0]),
-    "sliders": lambda viewer: settings.set_picture(viewer, SLIDERS),
-    "scale": lambda viewer: settings.set_picture(viewer, replace(SLIDERS, heat_scale=(0.4, 0.9))),
-    "cuts": cut_by_hand,
-    "depth": see_depth,
-    "clip": lambda viewer: settings.set_clip(viewer, Clip(4.4, 5.1)),
-    "latent": lambda viewer: settings.set_display(viewer, "latent", 1),
+SLIDERS = PictureConfig(display="relevancy", heat_opacity=0.3, dim=0.9)
+LOOKS = {  # whether after a search, and what is set then
+    "training camera": (False, lambda viewer: None),
+    "elsewhere": (False, lambda viewer: turn(viewer, 0.2)),
+    "orthographic": (False, look_flat),
+    "depth": (False, see_depth),
+    "clip": (False, lambda viewer: settings.set_clip(viewer, Clip(4.4, 5.1))),
+    "latent": (False, lambda viewer: settings.set_display(viewer, "latent", 1)),
+    "queries": (True, lambda viewer: None),
+    "colours": (True, lambda viewer: queries.hide(viewer, viewer.state.queries[0])),
+    "sliders": (True, lambda viewer: settings.set_picture(viewer, SLIDERS)),
+    "scale": (True, lambda viewer: settings.set_picture(viewer, replace(SLIDERS, heat_scale=(0.4, 0.9)))),
+    "cuts": (True, cut_by_hand),
+    "canonical": (True, lambda viewer: act(queries.set_canonical, viewer, "book, plant")),
 }
 
 
-@pytest.mark.parametrize(
-    "case", ["training camera", "elsewhere", *QUERIES, "latent", "depth", "clip", "orthographic"]
-)
+@pytest.mark.parametrize("case", LOOKS)
 def test_the_command_on_the_clipboard_draws_the_same_picture(opened, folder, run_viewer, case):
-    where = folder / "with a space"
-    where.mkdir()
-    save_scene(where / "blobs.ply", blob_scene(phrasebook=True))
-    opened.state.path = where / "blobs.ply"
+    path = folder / "with a space" / "blobs.ply"
+    save_scene(path, blob_scene(phrasebook=True))
+    opened.state.path = path
     settings.resize(opened, 200, 130)
+    searched, set_it = LOOKS[case]
     if case != "training camera":
         turn(opened, 0.2)
-    if case == "canonical":
-        queries.set_canonical(opened, "book, plant")
-    if case in QUERIES:
+    if searched:
         ask(opened, "mug", "plant", "book")
-    LOOKS.get(case, lambda viewer: None)(opened)
+    set_it(opened)
     command = filming.copy_command(opened, folder)
-    assert filming.take_clipboard(opened) == command
-    assert filming.take_clipboard(opened) == ""
-    assert [path.suffix for path in folder.iterdir() if path.is_file()] == (
-        [] if case == "training camera" else [".json"]
-    )
+    assert [filming.take_clipboard(opened), filming.take_clipboard(opened)] == [command, ""]
+    written = [path.suffix for path in folder.iterdir() if path.is_file()]
+    assert written == ([] if case == "training camera" else [".json"])
     expected = render_image(opened.state.request(), "cpu")
     words = shlex.split(command)
     code, _, problems = run_viewer(*words[1:], "--backend", "cpu")
@@ -289,12 +269,7 @@ def test_a_saved_view_can_be_read_again(opened, tmp_path):
     assert (camera.width, camera.height) == (321, 123)
     assert_allclose(camera.world_to_camera, expected.world_to_camera, atol=1e-9)
     assert camera.fx == pytest.approx(expected.fx)
-
-
-def test_an_unwritable_folder_is_one_line(opened, tmp_path):
-    blocked = tmp_path / "file"
-    blocked.write_text("not a folder")
-    assert filming.save_picture(opened, blocked) is None
-    assert filming.save_view(opened, blocked) is None
-    assert len(errors(opened)) == 2
-    assert all("not saved" in text for text in errors(opened))
+    (tmp_path / "file").write_text("not a folder")
+    for save in (filming.save_picture, filming.save_view):
+        assert save(opened, tmp_path / "file") is None
+    assert ["not saved" in text for text in errors(opened)] == [True, True]

@@ -3,7 +3,7 @@
 import os
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -14,31 +14,32 @@ from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, Channels, com
 from langsplat_core.io.ply import write_ply
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.raster import load_rasterizer
-from langsplat_core.raster.reference import ReferenceRasterizer
-from langsplat_core.scene import Camera, Gaussians, Scene
-from langsplat_viewer.camera.controls import default_view, extent_of
-from langsplat_viewer.rendering.renderer import (
-    ArrayChannels,
-    ArrayRenderer,
-    ArraySource,
-    GlRenderer,
-    GlSource,
-    render_image,
-    suits_opengl,
-)
+from langsplat_core.raster.protocol import farthest
+from langsplat_core.raster.reference import ReferenceRasterizer, colours
+from langsplat_core.scene import Camera, Gaussians, Scene, look_at
+from langsplat_viewer.actions import selecting, settings, viewpoint
+from langsplat_viewer.camera.controls import default_view, extent_of, from_camera
+from langsplat_viewer.canvas import NOTHING_BETWEEN, Canvas
+from langsplat_viewer.rendering import renderer as renderers
+from langsplat_viewer.rendering.renderer import ArrayChannels, ArrayRenderer, GlRenderer, render_image
 from langsplat_viewer.rendering.request import (
+    UNCLIPPED,
+    Clip,
     RenderKey,
     RenderRequest,
     Split,
     depth_range,
+    image_formation,
     near_plane,
     plain_request,
     why_nothing,
     why_undrawable,
 )
-from tests.support.fakes import blob_scene
+from tests.support.fakes import CENTRES, blob_scene
 from tests.support.fixtures import gl_state
+from tests.support.marks_and_flights import marked
 from tests.support.scenes import random_answer, random_camera, random_gaussians, random_scene, with_tree
+from tests.support.windowless import on_screen, rest
 
 COUNT = 150
 SCENE = with_tree(random_scene(COUNT))
@@ -115,9 +116,7 @@ def test_the_image_is_that_of_the_reference(renderer, display):
 
 def test_the_reference_image_is_composed_of_float64_channels():
     """Apart from the renderers: colours, depths and relevancies splatted one by one."""
-    from langsplat_core.raster.reference import colours
-
-    gaussians, request = SCENE.gaussians, request_for("relevancy")
+    gaussians = SCENE.gaussians
     view = ReferenceRasterizer().view(gaussians, CAMERA)
     values = np.stack([answer.relevancy[2] for answer in ANSWERS[:2]], 1)
     rgb = colours(gaussians.sh, gaussians.means, CAMERA.position)
@@ -126,8 +125,7 @@ def test_the_reference_image_is_composed_of_float64_channels():
     for display, extra in (("relevancy", image[..., 3:5]), ("depth", image[..., 5:])):
         picture = replace(PICTURE, display=display, own_colours=True)
         expected = compose(Channels(image[..., :3], alpha, extra), picture, ranges[display])
-        request = replace(request, picture=replace(PICTURE, display=display))
-        got = ArrayRenderer(ReferenceRasterizer()).read(request)
+        got = ArrayRenderer(ReferenceRasterizer()).read(request_for(display))
         assert (np.abs(got.astype(int) - expected).max(-1) > 1).mean() <= 2e-3
 
 
@@ -141,11 +139,10 @@ def test_images_with_and_without_a_graphics_device_agree(gl, display):
 
 
 def test_a_missing_channel_shows_the_plain_colours(renderer):
-    plain = renderer.read(plain_request(replace(SCENE, language=None), CAMERA, PICTURE))
+    plain = plain_request(replace(SCENE, language=None), CAMERA, PICTURE)
     for display in (row.name for row in DISPLAYS.values() if row.needs_field):
-        picture = replace(PICTURE, display=display)
-        request = plain_request(replace(SCENE, language=None), CAMERA, picture)
-        assert largest_difference(renderer.read(request), plain) == 0
+        request = replace(plain, picture=replace(PICTURE, display=display))
+        assert largest_difference(renderer.read(request), renderer.read(plain)) == 0
 
 
 # What is kept between requests.
@@ -155,7 +152,7 @@ def test_a_missing_channel_shows_the_plain_colours(renderer):
 def passes(monkeypatch):
     """Notes each pass of a rasterizer."""
     made = []
-    for source in (GlSource, ArraySource):
+    for source in (renderers.GlSource, renderers.ArraySource):
 
         def noting(*arguments, method=source.render):
             made.append(arguments)
@@ -198,14 +195,6 @@ def test_panes_of_one_camera_share_one_pass(renderer, passes):
     assert len(passes) == 2
 
 
-def test_the_same_gaussians_with_another_mark_of_antialiasing_are_projected_anew(tmp_path):
-    scene, camera = small_scene(tmp_path, True), random_camera(1)
-    channels = ArrayChannels(load_rasterizer("cpu"))
-    keys = (RenderKey(scene, camera), RenderKey(replace(scene, antialiased=False), camera))
-    first, second = (channels.render(key)[0].alpha for key in keys)
-    assert np.abs(first - second).max() > 0.05
-
-
 # Pixels: where they are, and the surface in them.
 
 
@@ -240,9 +229,8 @@ def test_picking_finds_the_surface(renderer):
     """An opaque disc at z = 4 behind a faint one at z = 2: the surface is the opaque one."""
     solid, veil = wall((1, 1, 1), (0, 0, 4.0), 0.5), wall((0, 0, 1), (0, 0, 2.0), 0.5)
     faint = replace(veil, opacity_logits=np.array([-1.0]))
-    fields = ("means", "log_scales", "quats_wxyz", "opacity_logits", "sh")
-    both = Gaussians(*(np.concatenate([getattr(solid, f), getattr(faint, f)]) for f in fields))
-    request = plain_request(Scene(both), FRONT, PictureConfig())
+    pairs = {f.name: np.concatenate([getattr(solid, f.name), getattr(faint, f.name)]) for f in fields(solid)}
+    request = plain_request(Scene(Gaussians(**pairs)), FRONT, PictureConfig())
     renderer.read(request)
     found = renderer.depth_at(request, 32.0, 24.0)
     assert found == pytest.approx(4.0, rel=1e-5)
@@ -271,16 +259,12 @@ def test_an_empty_scene_is_the_background(renderer):
     assert renderer.depth_at(request, 3, 3) is None
 
 
-def small_scene(tmp_path, antialiased: bool) -> Scene:
-    """Read from a file; its Gaussians are as small as pixels, where the compensation matters."""
-    gaussians = random_gaussians(60, scale_range=(0.002, 0.02))
-    write_ply(tmp_path / "a.ply", gaussians, ("SplatRenderMode: mip",) if antialiased else ())
-    return load_scene(tmp_path / "a.ply")
-
-
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_a_file_marked_as_antialiased_is_drawn_as_the_reference_draws_it(tmp_path, renderer, antialiased):
-    scene, camera = small_scene(tmp_path, antialiased), random_camera(1)
+    """Its Gaussians are as small as pixels, where the compensation matters."""
+    gaussians, camera = random_gaussians(60, scale_range=(0.002, 0.02)), random_camera(1)
+    write_ply(tmp_path / "a.ply", gaussians, ("SplatRenderMode: mip",) if antialiased else ())
+    scene = load_scene(tmp_path / "a.ply")
     want, other = (
         ReferenceRasterizer()
         .view(scene.gaussians, camera, replace(INRIA, antialiased=mark))
@@ -296,6 +280,9 @@ def test_a_file_marked_as_antialiased_is_drawn_as_the_reference_draws_it(tmp_pat
     channels = ArrayChannels(load_rasterizer("cpu"))
     found = channels.depth_at(RenderKey(scene, camera), int(column), int(row))[1]
     np.testing.assert_allclose(found, want.max(), atol=1e-4)
+    keys = (RenderKey(replace(scene, antialiased=mark), camera) for mark in (antialiased, not antialiased))
+    first, second = (channels.render(key)[0].alpha for key in keys)  # projected anew
+    assert np.abs(first - second).max() > 0.05
 
 
 # Depths: the near plane, the range of the depth display, and why nothing is seen.
@@ -306,11 +293,8 @@ SIZE = (160, 120)
 def scaled(factor: float) -> Scene:
     """The three blobs without cameras, `factor` times as large."""
     scene = blob_scene(field=False, with_cameras=False)
-    gaussians = scene.gaussians
-    smaller = replace(
-        gaussians, means=factor * gaussians.means, log_scales=gaussians.log_scales + np.log(factor)
-    )
-    return replace(scene, gaussians=smaller)
+    means, log_scales = factor * scene.gaussians.means, scene.gaussians.log_scales + np.log(factor)
+    return replace(scene, gaussians=replace(scene.gaussians, means=means, log_scales=log_scales))
 
 
 def opening(scene: Scene) -> Camera:
@@ -330,26 +314,15 @@ def test_a_scene_of_any_size_is_the_same_image(factor):
     np.testing.assert_allclose(radii[1], factor * radii[0], rtol=1e-4)
 
 
-def test_a_view_of_a_photograph_is_the_one_that_was_trained():
+def test_the_near_plane_is_that_of_training_and_comes_along_to_a_thing():
     scene = blob_scene()
-    for camera in scene.cameras:
-        assert near_plane(scene.gaussians, camera) == INRIA.near
-
-
-def test_the_near_plane_comes_along_to_a_thing():
-    scene = blob_scene()
-    ahead = scene.cameras[0]
-    seen = []
+    assert [near_plane(scene.gaussians, camera) for camera in scene.cameras] == [INRIA.near] * 3
+    ahead, seen = scene.cameras[0], []
     for left in (1.0, 0.15, 0.1):  # of the way to the middle
         matrix = ahead.world_to_camera.copy()
         matrix[:3, 3] *= left
         seen.append(near_plane(scene.gaussians, replace(ahead, world_to_camera=matrix)))
-    assert seen[0] == INRIA.near
-    assert seen[0] > seen[1] > seen[2] > 0
-
-
-def faulty(**fields: object) -> Gaussians:
-    return replace(blob_scene().gaussians, **fields)
+    assert INRIA.near == seen[0] > seen[1] > seen[2] > 0
 
 
 def looking_away() -> Camera:
@@ -359,16 +332,18 @@ def looking_away() -> Camera:
     return replace(camera, world_to_camera=matrix)
 
 
-NOTHING = {
-    "empty": (blob_scene().gaussians.take(np.zeros(360, bool)), "the scene holds no Gaussians"),
-    "nan": (faulty(means=np.full((360, 3), np.nan)), "none of the 360 Gaussians can be drawn"),
-    "clear": (faulty(opacity_logits=np.full(360, -20.0)), "all 360 Gaussians are transparent"),
-}
+BLOBS = blob_scene().gaussians
 
 
-@pytest.mark.parametrize("case", NOTHING)
-def test_why_no_camera_would_see_anything(case):
-    gaussians, reason = NOTHING[case]
+@pytest.mark.parametrize(
+    ("gaussians", "reason"),
+    [
+        (BLOBS.take(np.zeros(360, bool)), "the scene holds no Gaussians"),
+        (replace(BLOBS, means=np.full((360, 3), np.nan)), "none of the 360 Gaussians can be drawn"),
+        (replace(BLOBS, opacity_logits=np.full(360, -20.0)), "all 360 Gaussians are transparent"),
+    ],
+)
+def test_why_no_camera_would_see_anything(gaussians, reason):
     assert why_undrawable(gaussians).startswith(reason)
     assert why_nothing(gaussians, blob_scene().cameras[0]).startswith(reason)
     assert np.isfinite(opening(Scene(gaussians)).world_to_camera).all()
@@ -392,12 +367,80 @@ def test_a_renderer_knows_an_empty_image(renderer):
             assert made.shows_nothing() == nothing
 
 
+# The near and the far cut.
+
+# From the side: the blobs lie behind each other, mug, book, plant, at depths of about 3.8, 5 and 6.2.
+SIDE = look_at(np.array([-5.0, 0, 0]), np.zeros(3), np.array([0, -1.0, 0]), SIZE)
+BOOK_ALONE = Clip(4.4, 5.6)
+
+
+@pytest.mark.parametrize("display", ["rgb", "depth", "alpha"])
+@pytest.mark.parametrize("clip", [BOOK_ALONE, Clip(near=4.4), Clip(far=4.4)])
+def test_what_is_cut_away_is_as_if_it_were_not_there(renderer, display, clip):
+    scene = blob_scene()
+    depths = scene.gaussians.means @ SIDE.rotation[2] + SIDE.world_to_camera[2, 3]
+    kept = scene.take(np.flatnonzero(clip.keeps(depths)))
+    assert 0 < len(kept.gaussians) < 360
+    whole = plain_request(scene, SIDE, PictureConfig(display=display))
+    expected = renderer.read(plain_request(kept, SIDE, whole.picture)).astype(int)
+    seen = [renderer.read(request).astype(int) for request in (whole, replace(whole, clip=clip), whole)]
+    np.testing.assert_allclose(seen[1], expected, atol=1)
+    assert np.abs(seen[1] - seen[0]).max() > 20
+    np.testing.assert_array_equal(seen[2], seen[0])
+
+
+def test_the_near_cut_never_comes_nearer_than_the_near_plane_and_the_far_one_is_none_by_itself():
+    scene = blob_scene()
+    plain = image_formation(scene, SIDE)
+    assert image_formation(scene, SIDE, Clip(0.01, 7.0)) == replace(plain, far=7.0)
+    assert image_formation(scene, SIDE, Clip(3.0)) == replace(plain, near=3.0)
+    assert (plain.far, farthest(plain)) == (None, np.inf)
+    near, far = depth_range(scene.gaussians, SIDE, BOOK_ALONE)  # of what is left
+    assert 4.4 < near < far < 5.6
+
+
+def test_the_far_cut_stays_the_farther(opened):
+    for wanted, kept in ((Clip(3.0, 2.0), Clip(3.0, 3.0)), (Clip(-1.0, 2.0), Clip(0.0, 2.0))):
+        settings.set_clip(opened, wanted)
+        assert opened.state.settings.clip == kept
+
+
+@pytest.fixture
+def beside(opened):
+    """Stands at `SIDE`."""
+    settings.resize(opened, *SIZE)
+    viewpoint.move(opened, lambda view: from_camera(SIDE, opened.state.extent))
+    return opened
+
+
+def test_the_canvas_draws_another_cut_once_and_says_where_nothing_is_left(gl, beside):
+    renderer = GlRenderer(gl, "cpu")
+    canvas, state = Canvas(gl, renderer), beside.state
+    for clip, nothing in ((BOOK_ALONE, ""), (Clip(20.0, 30.0), NOTHING_BETWEEN), (UNCLIPPED, "")):
+        settings.set_clip(beside, clip)
+        rest(canvas, state, 1.0)
+        assert state.nothing == nothing
+        if clip == BOOK_ALONE:
+            assert on_screen(canvas)[0][60, 80].argmax() == 1
+            assert abs(canvas.point_at(0.5, 0.5)[0] - CENTRES[1][0]) < 0.6  # of the surface that is seen
+    renderer.release()
+
+
+def test_an_outline_does_not_select_what_is_cut_away(beside):
+    selecting.use_tool(beside, "rectangle")
+    settings.set_clip(beside, BOOK_ALONE)
+    selecting.begin_stroke(beside, 0.0, 0.0)
+    selecting.extend_stroke(beside, 1.0, 1.0)
+    selecting.end_stroke(beside)
+    assert marked(beside)[0] == "book"
+
+
 # Drivers.
 
 
 def test_auto_takes_the_cpu_where_the_driver_is_software(gl):
     renderer = GlRenderer(gl)
-    assert renderer.backend == ("opengl" if suits_opengl(gl) else "cpu")
+    assert renderer.backend == ("opengl" if renderers.suits_opengl(gl) else "cpu")
     renderer.release()
 
 

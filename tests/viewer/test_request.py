@@ -1,5 +1,6 @@
 """Render requests: what they depend on, their panes, the edited scene; and that every image is one."""
 
+import math
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from PIL import Image
 
 from langsplat_core.config import PictureConfig
 from langsplat_core.errors import InputError
-from langsplat_core.raster import load_rasterizer
+from langsplat_core.raster.opengl.scene_textures import is_software
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Scene
@@ -19,6 +20,7 @@ from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.commands import BUTTONS, COMMANDS, OVERLAY_TITLES, matching
 from langsplat_viewer.files.preferences import FILE_NAME, load_preferences, save_preferences
 from langsplat_viewer.marks import Marks
+from langsplat_viewer.panels.layout import in_numbers
 from langsplat_viewer.panels.overlays import STEPS, bar_colours
 from langsplat_viewer.panels.view import compared_name
 from langsplat_viewer.rendering.renderer import ArrayRenderer, GlRenderer
@@ -36,12 +38,12 @@ from langsplat_viewer.rendering.request import (
     plain_request,
     with_splats,
 )
-from langsplat_viewer.state import OVERLAYS, Ruler, ViewerState
+from langsplat_viewer.state import KEPT, LONGEST_SIDE, OVERLAYS, Ruler, Timing, compared, compared_size
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene, cameras
 from tests.support.marks_and_flights import blob
 from tests.support.scenes import random_gaussians
-from tests.support.windowless import arrive, ask, errors, recorded, rest, settle
+from tests.support.windowless import CHANGES, ask, errors, go, on_screen, open_scene, recorded, rest
 
 SCENE = blob_scene()
 NOTHING = np.zeros(360, bool)
@@ -54,22 +56,14 @@ def edit_everything(viewer: Viewer, mode: str) -> None:
     """Every setting off its default: one blob hidden in part, one selected, one deleted in part."""
     state, odd = viewer.state, np.arange(360) % 2 == 1
     settings.resize(viewer, 160, 120)
-    viewpoint.look_from(viewer, "left")
-    arrive(viewer)
+    go(viewpoint.look_from, viewer, "left")
     ask(viewer, "mug", "plant")
     marks = Marks(blob("book") & odd, blob("mug") & odd, blob("plant") & odd)
     state.selection = replace(state.selection, marks=marks)
     settings.set_splats(viewer, Splats(0.8, 0))
     settings.set_clip(viewer, Clip(0.5, 6.5))
-    picture = PictureConfig(
-        heat_opacity=0.6,
-        dim=0.7,
-        threshold=0.3,
-        alpha_gate=0.2,
-        heat_scale=(0.1, 0.8),
-        background=(0.1, 0.6, 0.3),
-    )
-    settings.set_picture(viewer, picture)
+    heat = {"heat_opacity": 0.6, "dim": 0.7, "threshold": 0.3, "heat_scale": (0.1, 0.8)}
+    settings.set_picture(viewer, PictureConfig(**heat, alpha_gate=0.2, background=(0.1, 0.6, 0.3)))
     settings.set_colour_map(viewer, "viridis")
     settings.set_display(viewer, "relevancy", 1)
     split = Split(mode, second="segmentation", second_level=0, at=0.4)
@@ -78,14 +72,6 @@ def edit_everything(viewer: Viewer, mode: str) -> None:
 
 def image(path: Path) -> np.ndarray:
     return np.asarray(Image.open(path)).astype(int)
-
-
-def on_screen(canvas: Canvas, state: ViewerState) -> np.ndarray:
-    panes = [
-        np.frombuffer(texture.read(), np.uint8).reshape(*texture.size[::-1], 4)[::-1, :, :3]
-        for texture in canvas.textures
-    ]
-    return state.settings.split.joined(panes, state.size[0]).astype(int)
 
 
 @pytest.mark.parametrize("mode", ["wipe", "levels"])
@@ -108,7 +94,8 @@ def test_screen_file_sized_image_film_and_reference_agree(gl, opened, tmp_path, 
             assert getattr(request.picture, field.name) != field.default, field.name
 
     rest(canvas, state, 1.0)
-    images = {"screen": on_screen(canvas, state), "saved": image(filming.save_picture(opened, tmp_path))}
+    screen = state.settings.split.joined(on_screen(canvas), state.size[0]).astype(int)
+    images = {"screen": screen, "saved": image(filming.save_picture(opened, tmp_path))}
     filming.set_film_size(opened, *state.size)
     filming.save_sized_picture(opened, tmp_path)
     recorded(opened)
@@ -148,17 +135,11 @@ def test_images_are_saved_without_background_if_so_chosen(gl, opened, tmp_path):
 
 # Requests are equal where the image is.
 
-CHANGES = {
-    "display": lambda v: settings.set_display(v, "depth"),
+SEEN = {
+    **CHANGES,
     "slider": lambda v: settings.set_picture(v, replace(v.state.picture, dim=0.1)),
-    "hidden query": lambda v: queries.hide(v, v.state.queries[0]),
     "cut": lambda v: queries.set_cut(v, v.state.queries[0], 0.7),
     "split": settings.toggle_wipe,
-    "splats": lambda v: settings.set_splats(v, Splats(0.5)),
-    "near cut": lambda v: settings.set_clip(v, Clip(1.0)),
-    "marks": selecting.select_all,
-    "size": lambda v: settings.resize(v, 300, 200),
-    "view": lambda v: viewpoint.look_from(v, "left"),
 }
 UNSEEN = {
     "line": lambda v: settings.move_line(v, 0.3),  # the window draws it
@@ -169,22 +150,6 @@ UNSEEN = {
     "photograph": lambda v: opening.fade_photograph(v, 0.5),
     "saved without background": lambda v: settings.save_transparent(v, True),
 }
-
-
-@pytest.fixture
-def asked(opened: Viewer) -> Viewer:
-    ask(opened, "mug")
-    settings.resize(opened, 240, 180)
-    return opened
-
-
-@pytest.mark.parametrize("name", CHANGES)
-def test_what_is_seen_is_in_it(asked, name):
-    before = asked.state.request()
-    assert asked.state.request() == before
-    CHANGES[name](asked)
-    arrive(asked)
-    assert asked.state.request() != before
 
 
 @pytest.mark.parametrize("name", UNSEEN)
@@ -201,18 +166,19 @@ def test_equal_requests_have_equal_keys_and_the_same_channels(asked):
     assert hash(inputs.key(first)) == hash(inputs.key(again))
     assert inputs.channels(first)[0] is inputs.channels(again)[0]
     coarse = replace(first, detail=Detail(0.5))
-    assert (inputs.key(coarse).camera.width, inputs.key(coarse).camera.height) == (120, 90)
+    assert (inputs.key(coarse).camera.width, inputs.key(coarse).camera.height) == (60, 45)
     assert inputs.channels(coarse)[0] is inputs.channels(first)[0]
 
 
 @pytest.mark.parametrize("backend", ["opengl", "cpu"])
-@pytest.mark.parametrize("name", CHANGES)
+@pytest.mark.parametrize("name", SEEN)
 def test_what_is_kept_gives_the_image_that_a_new_renderer_gives(gl, asked, name, backend):
     kept, fresh = GlRenderer(gl, backend), GlRenderer(gl, backend)
-    canvas = Canvas(gl, kept)
+    canvas, before = Canvas(gl, kept), asked.state.request()
+    assert asked.state.request() == before
     canvas.update(asked.state, 0.0)
-    CHANGES[name](asked)
-    arrive(asked)
+    go(SEEN[name], asked)
+    assert asked.state.request() != before
     canvas.update(asked.state, 20.0)
     canvas.update(asked.state, 30.0)
     expected = fresh.read(asked.state.request())
@@ -237,11 +203,8 @@ def test_the_second_pane_is_what_the_display_would_show_alone(opened):
 
 def test_three_levels_of_latents_or_of_answers(opened):
     settings.toggle_levels(opened)
-    assert [pane.label for pane in opened.state.panes()] == [
-        "Latent, subpart",
-        "Latent, part",
-        "Latent, whole",
-    ]
+    labels = [pane.label for pane in opened.state.panes()]
+    assert labels == ["Latent, subpart", "Latent, part", "Latent, whole"]
     opened.state.size = (200, 90)
     request = opened.state.request()
     assert (request.camera.width, request.camera.height, request.size) == (66, 90, (200, 90))
@@ -257,12 +220,6 @@ def test_three_levels_of_latents_or_of_answers(opened):
     assert [pane.label for pane in opened.state.panes()] == ["Segmentation"]
 
 
-def test_the_line_stays_within_reach(opened):
-    for at, kept in ((-3.0, AT_RANGE[0]), (0.3, 0.3), (2.0, AT_RANGE[1])):
-        settings.move_line(opened, at)
-        assert opened.state.settings.split.at == kept
-
-
 def test_without_a_field_levels_and_latents_are_refused(viewer):
     viewer.state.scene = Scene(random_gaussians(5))
     settings.toggle_levels(viewer)
@@ -276,21 +233,18 @@ def test_without_a_field_levels_and_latents_are_refused(viewer):
     assert len({compared_name(button) for button in BUTTONS}) == len(BUTTONS)
 
 
-@pytest.mark.parametrize(("u", "inside"), [(0.0, 0.0), (0.2, 0.6), (0.5, 0.5), (1.0, 1.0)])
-def test_a_place_in_a_column(u, inside):
-    assert Split("levels").within_pane(u) == pytest.approx(inside)
-    assert Split("wipe").within_pane(u) == u
-
-
-def test_panes_are_joined_as_they_are_shown():
+def test_panes_are_joined_as_they_are_shown_and_the_line_stays_within_reach(opened):
+    for at, kept in ((-3.0, AT_RANGE[0]), (0.3, 0.3), (2.0, AT_RANGE[1])):
+        settings.move_line(opened, at)
+        assert opened.state.settings.split.at == kept
+    for u, inside in ((0.0, 0.0), (0.2, 0.6), (0.5, 0.5), (1.0, 1.0)):
+        assert Split("levels").within_pane(u) == pytest.approx(inside)
+        assert Split("wipe").within_pane(u) == u
     dark, light = np.zeros((2, 10, 3), np.uint8), np.full((2, 10, 3), 9, np.uint8)
     wiped = Split("wipe", at=0.3).joined([dark, light], 10)
     assert wiped[0, :, 0].tolist() == [0] * 3 + [9] * 7
     wide = Split("levels").joined([dark, dark, light], 32)  # two pixels are left over
     assert wide[0, :, 0].tolist() == [0] * 20 + [9] * 12
-
-
-# The edited scene.
 
 
 def test_colour_bars_end_where_the_image_does():
@@ -301,6 +255,9 @@ def test_colour_bars_end_where_the_image_does():
     assert alone[-1, 0] > alone[-1, 2]  # red is hot
 
 
+# The edited scene.
+
+
 def test_hidden_and_deleted_ones_are_left_out_with_their_rows_of_the_layers():
     edited = edited_scene(SCENE, Marks(NOTHING, blob("mug"), blob("plant")))
     np.testing.assert_array_equal(edited.rows, np.flatnonzero(blob("book")))
@@ -309,6 +266,8 @@ def test_hidden_and_deleted_ones_are_left_out_with_their_rows_of_the_layers():
     np.testing.assert_array_equal(edited.values(values), values[blob("book")])
     everything = np.ones(360, bool)
     assert len(edited_scene(SCENE, Marks(NOTHING, everything, NOTHING)).scene.gaussians) == 0
+    for other in (everything[:0], everything[:-1]):  # marks of another scene count as none
+        assert edited_scene(SCENE, Marks(other, other, other)).scene is SCENE
 
 
 def test_only_the_selection_changes_its_colour_from_every_side():
@@ -322,10 +281,9 @@ def test_only_the_selection_changes_its_colour_from_every_side():
     np.testing.assert_array_equal(tinted.gaussians.sh[~selected], source.gaussians.sh[~selected])
     assert tinted.antialiased == source.antialiased
     for camera in cameras():
-        ones = [scene.gaussians.take(selected) for scene in (source, tinted)]
-        views = [load_rasterizer("reference").view(gaussians, camera) for gaussians in ones]
         before, after = (
-            splat_colours(view, gaussians, camera) for view, gaussians in zip(views, ones, strict=True)
+            splat_colours(ReferenceRasterizer().view(gaussians, camera), gaussians, camera)
+            for gaussians in (source.gaussians.take(selected), tinted.gaussians.take(selected))
         )
         wanted = (1 - TINT_STRENGTH) * before.colours + TINT_STRENGTH * before.alpha[..., None] * TINT
         np.testing.assert_allclose(after.colours, wanted, atol=2e-5)
@@ -356,12 +314,6 @@ def test_nothing_is_made_twice():
     assert other.scene is not first.scene
 
 
-@pytest.mark.parametrize("count", [0, 359])
-def test_marks_of_another_scene_count_as_none(count):
-    everything = np.ones(count, bool)
-    assert edited_scene(SCENE, Marks(everything, everything, everything)).scene is SCENE
-
-
 def test_splats_are_drawn_smaller_and_of_one_colour(opened):
     scene = Scene(random_gaussians(40, sh_degree=3))
     assert with_splats(scene, Splats()) is scene
@@ -377,29 +329,19 @@ def test_splats_are_drawn_smaller_and_of_one_colour(opened):
 # Over the image: overlays and the ruler.
 
 
-def test_overlays_are_shown_and_remembered(opened, tmp_path):
+def test_overlays_and_colour_map_have_commands_and_are_remembered(opened, tmp_path):
     for name in reversed(OVERLAYS):
-        settings.toggle_overlay(opened, name)
+        (command,) = matching(OVERLAY_TITLES[name])
+        if name not in opened.state.preferences.overlays:
+            command.act(opened)
     assert opened.state.preferences.overlays == OVERLAYS
-    save_preferences(tmp_path, opened.state.preferences)
-    assert load_preferences(tmp_path).overlays == OVERLAYS
-    settings.show_overlay(opened, "cube", False)
-    settings.show_overlay(opened, "cube", False)
-    assert opened.state.preferences.overlays == tuple(name for name in OVERLAYS if name != "cube")
-
-
-def test_every_overlay_has_a_command(opened):
-    for name, title in OVERLAY_TITLES.items():
-        (command,) = matching(title)
-        command.act(opened)
-        assert name in opened.state.preferences.overlays
-
-
-def test_the_colour_map_is_remembered(opened, tmp_path):
     settings.set_colour_map(opened, "cividis")
     assert opened.state.request().picture.colour_map == "cividis"
     save_preferences(tmp_path, opened.state.preferences)
-    assert load_preferences(tmp_path).colour_map == "cividis"
+    assert load_preferences(tmp_path) == opened.state.preferences
+    for _ in range(2):
+        settings.show_overlay(opened, "cube", False)
+    assert opened.state.preferences.overlays == tuple(name for name in OVERLAYS if name != "cube")
     (tmp_path / FILE_NAME).write_text('{"colour_map": "rainbow"}')
     with pytest.raises(InputError, match=r"rainbow.*viridis"):
         load_preferences(tmp_path)
@@ -408,25 +350,125 @@ def test_the_colour_map_is_remembered(opened, tmp_path):
 def test_two_clicks_measure_and_a_third_begins_anew(opened):
     settings.toggle_measuring(opened)
     assert opened.state.ruler.length is None
+    settings.measure_at(opened, 0.95, 0.5)
+    assert opened.state.ruler.points == ()
+    assert "nothing under the cursor" in opened.state.messages[-1].text
     settings.measure_at(opened, 0.5, 0.5)
     settings.measure_at(opened, 0.8, 0.1)  # the fake surface: (u - 0.5, v - 0.5, 0)
     assert opened.state.ruler.length == pytest.approx(0.5)
     settings.measure_at(opened, 0.6, 0.6)
     assert opened.state.ruler.length is None
     assert len(opened.state.ruler.points) == 1
-
-
-def test_a_click_beside_everything_is_said(opened):
-    settings.measure(opened, True)
-    settings.measure_at(opened, 0.95, 0.5)
-    assert opened.state.ruler.points == ()
-    assert "nothing under the cursor" in opened.state.messages[-1].text
-
-
-def test_measuring_ends_with_esc_and_with_another_scene(opened):
-    for end in (settings.escape, lambda viewer: opening.open_scene(viewer, Path("plain.ply"))):
+    for end in (settings.escape, lambda viewer: open_scene(viewer, "plain.ply")):
         settings.measure(opened, True)
         settings.measure_at(opened, 0.5, 0.5)
         end(opened)
-        settle(opened)
         assert opened.state.ruler == Ruler()
+
+
+# Times of the steps, and the comparison with the reference.
+
+
+def test_the_median_of_the_last_measurements_is_told():
+    timing = Timing()
+    for value in (1000.0, *range(KEPT)):
+        timing.add("sort", value)
+    timing.add("blend", 2.0)
+    assert timing.medians() == [("Sort", (KEPT - 1) / 2), ("Blend", 2.0)]
+
+
+def test_errors_are_those_of_the_pictures():
+    shown = np.zeros((2, 5, 3), np.uint8)
+    reference = shown.copy()
+    assert compared(shown, reference, "cpu").psnr == math.inf
+    assert "every pixel is the same" in in_numbers(compared(shown, reference, "cpu"))
+    reference[0, 0] = (255, 0, 0)
+    found = compared(shown, reference, "cpu")
+    assert (found.size, found.largest, found.mean) == ((5, 2), 255, 255 / 30)
+    assert found.psnr == pytest.approx(10 * math.log10(30))
+    assert "5 x 2: error at most 255 of 255, mean 8.5, PSNR 14.8 dB" in in_numbers(found)
+
+
+@pytest.fixture(params=["cpu", "opengl"])
+def drawn(gl, opened, request):
+    """A viewer with a real picture."""
+    renderer = GlRenderer(gl, request.param, "single")
+    opened.surface = canvas = Canvas(gl, renderer)
+    opened.state.backend = renderer.backend
+    settings.resize(opened, 400, 300)
+    rest(canvas, opened.state, 0.0)
+    yield opened
+    renderer.release()
+
+
+def test_the_steps_of_a_picture_are_measured_while_the_panel_is_seen(gl, drawn):
+    assert drawn.state.timing.medians() == []
+    drawn.state.timing.wanted = True
+    drawn.state.coarse_while_moving = False
+    go(viewpoint.look_from, drawn, "left")
+    rest(drawn.surface, drawn.state, 10.0)
+    laps, steps = drawn.state.timing.laps, {"projection", "sort", "blend", "compose"}
+    if drawn.state.backend == "cpu":
+        steps |= {"tiles", "colours"} if is_software(gl) else {"tiles", "colours", "upload"}
+    assert laps.keys() == steps | {"picture"}
+    assert sum(laps[name][0] for name in steps) <= laps["picture"][0]
+
+
+def test_the_panel_has_a_picture_measured_when_it_opens(drawn):
+    """All of its steps, though nothing has changed; once."""
+    for now in (10.0, 11.0):
+        drawn.state.timing.wanted = True
+        rest(drawn.surface, drawn.state, now)
+        counts = {name: len(measured) for name, measured in drawn.state.timing.laps.items()}
+        assert counts.keys() >= {"projection", "sort", "blend", "compose", "picture"}
+        assert set(counts.values()) == {1}
+    drawn.state.timing.wanted = False  # closed, and opened again
+    rest(drawn.surface, drawn.state, 12.0)
+    drawn.state.timing.wanted = True
+    rest(drawn.surface, drawn.state, 13.0)
+    assert {len(measured) for measured in drawn.state.timing.laps.values()} == {2}
+
+
+@pytest.mark.parametrize("mode", ["off", "wipe", "levels"])
+def test_what_is_shown_is_that_of_the_reference(drawn, mode):
+    """Whatever is chosen in the window: queries, split, marks, cuts, splats."""
+    if mode != "off":
+        edit_everything(drawn, mode)
+        settings.resize(drawn, 400, 300)
+    viewpoint.compare_with_reference(drawn)
+    recorded(drawn)
+    found = drawn.state.timing.comparison
+    assert errors(drawn) == []
+    assert LONGEST_SIDE - 3 < max(found.size) <= LONGEST_SIDE
+    assert found.backend == drawn.state.backend
+    assert found.mean < 0.05
+    assert found.psnr > 45
+
+
+def test_what_is_wrong_is_told(drawn, monkeypatch):
+    request = drawn.state.request(compared_size(drawn.state.size))
+    right = ArrayRenderer(ReferenceRasterizer()).read(request).astype(int)
+    capture = drawn.surface.capture
+    monkeypatch.setattr(drawn.surface, "capture", lambda state: 255 - capture(state))
+    viewpoint.compare_with_reference(drawn)
+    recorded(drawn)
+    found = drawn.state.timing.comparison
+    assert found.largest == 255
+    assert found.mean == pytest.approx(np.abs(255 - 2 * right).mean(), abs=1)
+
+
+def test_the_picture_on_screen_is_drawn_again_after_it(drawn):
+    viewpoint.compare_with_reference(drawn)
+    recorded(drawn)
+    rest(drawn.surface, drawn.state, 2.0)
+    assert drawn.surface.textures[0].size == (400, 300)
+    assert drawn.surface.depths().shape == (300, 400)
+
+
+def test_a_comparison_is_one_at_a_time_and_can_be_left(drawn):
+    viewpoint.compare_with_reference(drawn)
+    viewpoint.compare_with_reference(drawn)
+    assert "wait for it or cancel it" in errors(drawn)[-1]
+    drawn.recorder.cancel()
+    recorded(drawn)
+    assert drawn.state.timing.comparison is None

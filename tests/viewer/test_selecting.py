@@ -1,6 +1,7 @@
 """Selecting, hiding and deleting without a window: verbs, answers, settings, undo."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from langsplat_viewer.camera.controls import from_camera
 from langsplat_viewer.marks import Drawn, Stroke, outlines
 from tests.support.fakes import CENTRES, COLOURS, PER_BLOB
 from tests.support.marks_and_flights import blob, marked, marks_of
-from tests.support.windowless import SCENES, FakeSurface, ask, errors, open_scene, settle
+from tests.support.windowless import SCENES, FakeSurface, act, ask, errors, open_scene, settle
 
 
 @pytest.fixture
@@ -26,14 +27,26 @@ def searched(opened):
     return opened
 
 
-def test_everything_nothing_and_the_rest(opened):
-    selecting.select_all(opened)
-    assert marked(opened) == ("mug book plant", "", "")
-    selecting.select_none(opened)
-    assert marked(opened) == ("", "", "")
-    take(opened, blob("book"))
-    selecting.invert_selection(opened)
-    assert marked(opened) == ("mug plant", "", "")
+def test_what_is_hidden_or_deleted_is_never_selected(opened):
+    for action, expected in (
+        (selecting.select_all, ("mug book plant", "", "")),
+        (selecting.select_none, ("", "", "")),
+        (partial(take, found=blob("book")), ("book", "", "")),
+        (selecting.invert_selection, ("mug plant", "", "")),
+        (partial(take, found=blob("mug")), ("mug", "", "")),
+        (selecting.select_alike, ("mug", "", "")),
+        (selecting.hide_selected, ("", "mug", "")),
+        (partial(take, found=blob("plant")), ("plant", "mug", "")),
+        (selecting.delete_selected, ("", "mug", "plant")),
+        (selecting.select_all, ("book", "mug", "plant")),
+        (selecting.invert_selection, ("", "mug", "plant")),
+        (selecting.show_hidden, ("", "", "plant")),
+        (selecting.select_all, ("mug book", "", "plant")),
+        (partial(take, found=blob("mug")), ("mug", "", "plant")),
+        (selecting.isolate_selected, ("mug", "book", "plant")),
+    ):
+        act(action, opened)
+        assert marked(opened) == expected, action
 
 
 @pytest.mark.parametrize(
@@ -47,43 +60,14 @@ def test_what_is_found_is_combined_by_the_mode(opened, mode, selected):
     assert marked(opened)[0] == selected
 
 
-def test_hidden_and_deleted_ones_are_never_selected(opened):
-    take(opened, blob("mug"))
-    selecting.hide_selected(opened)
-    take(opened, blob("plant"))
-    selecting.delete_selected(opened)
-    assert marked(opened) == ("", "mug", "plant")
-    selecting.select_all(opened)
-    assert marked(opened) == ("book", "mug", "plant")
-    selecting.invert_selection(opened)
-    assert marked(opened) == ("", "mug", "plant")
-    selecting.show_hidden(opened)
-    selecting.select_all(opened)
-    assert marked(opened) == ("mug book", "", "plant")
-
-
-def test_isolating_hides_all_else_but_what_is_gone(opened):
-    take(opened, blob("plant"))
-    selecting.delete_selected(opened)
-    take(opened, blob("mug"))
-    selecting.isolate_selected(opened)
-    assert marked(opened) == ("mug", "book", "plant")
-
-
 def test_every_change_is_one_step_back_and_forth(opened):
     take(opened, blob("mug"))
     selecting.hide_selected(opened)
     take(opened, blob("book"))
     selecting.delete_selected(opened)
     selecting.show_hidden(opened)
-    states = [
-        ("", "", "book"),
-        ("", "mug", "book"),
-        ("book", "mug", ""),
-        ("", "mug", ""),
-        ("mug", "", ""),
-        ("", "", ""),
-    ]
+    states = [("", "", "book"), ("", "mug", "book"), ("book", "mug", ""), ("", "mug", ""), ("mug", "", "")]
+    states.append(("", "", ""))
     assert marked(opened) == states[0]
     for state in states[1:]:
         editing.undo(opened)
@@ -104,16 +88,18 @@ def test_what_changes_nothing_is_no_step(opened):
     assert len(opened.history.past) == 1
 
 
-def test_what_the_search_found(searched):
+def test_what_the_search_found_or_did_not(searched):
     selecting.select_query(searched)
     assert marked(searched)[0] == "book"
     ask(searched, "mug")
     selecting.select_query(searched, mode="add")
     assert marked(searched)[0] == "mug book"
-
-
-def test_nothing_was_searched_or_found(searched):
-    query = searched.state.queries[0]
+    query, mug = searched.state.queries
+    (thing,) = query.things
+    selecting.select_thing(searched, thing)
+    np.testing.assert_array_equal(np.flatnonzero(marks_of(searched).selected), thing.members)
+    selecting.select_none(searched)
+    queries.remove(searched, mug)
     query.result = replace(query.result, found=False, probability=None, excess=None)
     selecting.select_query(searched)
     assert "'book' is not here" in searched.state.messages[-1].text
@@ -123,25 +109,17 @@ def test_nothing_was_searched_or_found(searched):
     assert marked(searched) == ("", "", "")
 
 
-def test_things_of_an_answer_one_by_one(searched):
-    (thing,) = searched.state.queries[0].things
-    selecting.select_thing(searched, thing)
-    np.testing.assert_array_equal(np.flatnonzero(marks_of(searched).selected), thing.members)
-
-
 def test_growing_and_shrinking_follow_the_surface(opened):
     means = opened.state.scene.gaussians.means
     core = np.linalg.norm(means, axis=1) < 0.15
     take(opened, core)
     selecting.set_reach(opened, 0.15)
-    selecting.grow_selection(opened)
-    settle(opened)
+    act(selecting.grow_selection, opened)
     grown = marks_of(opened).selected.copy()
     assert core.sum() < grown.sum()
     assert (grown >= core).all()
     assert not (grown & ~blob("book")).any()  # the others are not on its surface
-    selecting.shrink_selection(opened)
-    settle(opened)
+    act(selecting.shrink_selection, opened)
     assert marks_of(opened).selected.sum() < grown.sum()
     editing.undo(opened)
     assert (marks_of(opened).selected == grown).all()
@@ -191,50 +169,38 @@ def around(viewer, centre, radius: float = 0.58) -> list[tuple[float, float]]:
     return [place(viewer, centre + radius * np.array([np.cos(t), np.sin(t), 0])) for t in turns]
 
 
-def draw(viewer, places, mode=None) -> None:
+def draw(viewer, tool, places, mode=None) -> str:
+    """A stroke of a tool, when all that it began is done; returns what is selected."""
+    selecting.use_tool(viewer, tool)
     selecting.begin_stroke(viewer, *places[0])
     for u, v in places[1:]:
         selecting.extend_stroke(viewer, u, v)
-    selecting.end_stroke(viewer, mode)
+    act(selecting.end_stroke, viewer, mode)
+    return marked(viewer)[0]
 
 
 def corners(viewer, centre, half: float = 0.58) -> list[tuple[float, float]]:
     return [place(viewer, centre + half * np.array([sign, sign, 0])) for sign in (-1, 1)]
 
 
-def test_a_rectangle_selects_the_blob_inside_it_and_is_undone(front):
-    selecting.use_tool(front, "rectangle")
-    draw(front, corners(front, CENTRES[0]))
-    assert marked(front)[0] == "mug"
-    draw(front, corners(front, CENTRES[2])[::-1], "add")
-    assert marked(front)[0] == "mug plant"
+def test_a_stroke_selects_what_it_encloses_or_sweeps_over_and_is_undone(front):
+    assert draw(front, "rectangle", corners(front, CENTRES[0])) == "mug"
+    assert draw(front, "rectangle", corners(front, CENTRES[2])[::-1], "add") == "mug plant"
     editing.undo(front)
     assert marked(front)[0] == "mug"
-
-
-def test_a_lasso_selects_what_it_goes_around(front):
-    selecting.use_tool(front, "lasso")
-    draw(front, around(front, CENTRES[1]))
-    assert marked(front)[0] == "book"
-
-
-def test_a_brush_selects_what_it_sweeps_over(front):
-    selecting.use_tool(front, "brush")
+    assert draw(front, "lasso", around(front, CENTRES[1])) == "book"
     selecting.set_brush(front, 0.12)
-    draw(front, [place(front, CENTRES[0]), place(front, CENTRES[1])])
-    assert marked(front)[0] == "mug book"
+    assert draw(front, "brush", [place(front, CENTRES[0]), place(front, CENTRES[1])]) == "mug book"
     selecting.set_brush(front, 0.01)
-    draw(front, [place(front, CENTRES[2])])
+    draw(front, "brush", [place(front, CENTRES[2])])
     assert 0 < marks_of(front).selected.sum() < PER_BLOB
 
 
 @pytest.mark.parametrize("tool", ["sphere", "box"])
 def test_a_body_is_as_large_as_the_drag_or_the_reach(front, tool, monkeypatch):
     monkeypatch.setattr(FakeSurface, "point_at", lambda self, u, v: CENTRES[2])
-    selecting.use_tool(front, tool)
-    draw(front, [place(front, CENTRES[2]), place(front, CENTRES[2] + [0.7, 0, 0])])
-    assert marked(front)[0] == "plant"
-    draw(front, [place(front, CENTRES[2])])  # a click
+    assert draw(front, tool, [place(front, CENTRES[2]), place(front, CENTRES[2] + [0.7, 0, 0])]) == "plant"
+    draw(front, tool, [place(front, CENTRES[2])])  # a click
     offsets = np.abs(front.state.scene.gaussians.means - CENTRES[2])
     far = np.linalg.norm(offsets, axis=1) if tool == "sphere" else offsets.max(1)
     np.testing.assert_array_equal(marks_of(front).selected, far <= selecting.reach(front))
@@ -247,34 +213,27 @@ def test_what_lies_behind_something_is_left_out_unless_all_is_wanted(front, monk
     if not perspective:
         viewpoint.toggle_orthographic(front)
     monkeypatch.setattr(FakeSurface, "depths", lambda self: np.full((30, 40), 4.95))
-    selecting.use_tool(front, "rectangle")
-    draw(front, corners(front, CENTRES[1]))
+    draw(front, "rectangle", corners(front, CENTRES[1]))
     z = front.state.scene.gaussians.means[:, 2]
     in_front = marks_of(front).selected
     selecting.set_only_visible(front, False)
-    draw(front, corners(front, CENTRES[1]))
-    assert marked(front)[0] == "book"
+    assert draw(front, "rectangle", corners(front, CENTRES[1])) == "book"
     np.testing.assert_array_equal(in_front, marks_of(front).selected & (z + 5 <= 4.95 * 1.03))
     assert 20 < in_front.sum() < 100
 
 
 def test_a_click_selects_the_thing_at_the_level_of_the_queries(front, monkeypatch):
     monkeypatch.setattr(FakeSurface, "point_at", lambda self, u, v: CENTRES[1])
-    selecting.use_tool(front, "thing")
-    draw(front, [(0.5, 0.5)])
-    settle(front)
-    assert marked(front)[0] == "book"
+    assert draw(front, "thing", [(0.5, 0.5)]) == "book"
     editing.undo(front)
     assert marked(front)[0] == ""
 
 
 def test_a_click_on_nothing_and_without_a_field(front, monkeypatch):
-    selecting.use_tool(front, "sphere")
-    draw(front, [(0.95, 0.5)])  # where the picture is empty
+    draw(front, "sphere", [(0.95, 0.5)])  # where the picture is empty
     assert "nothing under the cursor" in front.state.messages[-1].text
     front.state.scene = type(front.state.scene)(front.state.scene.gaussians)
-    selecting.use_tool(front, "thing")
-    draw(front, [(0.5, 0.5)])
+    draw(front, "thing", [(0.5, 0.5)])
     assert "without a language field" in errors(front)[-1]
     assert marked(front) == ("", "", "")
 
@@ -324,31 +283,34 @@ def names_in(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def without_plant(viewer) -> None:
-    take(viewer, blob("plant"))
-    selecting.delete_selected(viewer)
+@pytest.fixture
+def pruned(opened):
+    """The plant is deleted."""
+    take(opened, blob("plant"))
+    selecting.delete_selected(opened)
+    return opened
 
 
-def test_the_selection_and_the_rest_are_scenes_with_their_field(opened, tmp_path):
-    without_plant(opened)
-    take(opened, blob("mug"))
+def kept_in(folder: Path) -> int:
+    """Gaussians of what was saved as "edited"."""
+    return len(load_scene(folder / "blobs-edited-001.ply").gaussians)
+
+
+def test_the_selection_and_the_rest_are_scenes_with_their_field(pruned, tmp_path):
+    take(pruned, blob("mug"))
     for part, word in (("selection", "mug"), ("rest", "book")):
-        selecting.export(opened, tmp_path, part)
-        settle(opened)
-        assert f"saved {tmp_path / f'blobs-{part}-001.ply'}: 120 Gaussians" == opened.state.messages[-1].text
-        written = load_scene(tmp_path / f"blobs-{part}-001.ply")
-        np.testing.assert_array_equal(
-            written.gaussians.means, SCENES["blobs.ply"].gaussians.means[blob(word)]
-        )
-        assert len(written.language) == 120
-        assert len(written.cameras) == 3
-    assert opened.state.selection.is_unsaved  # neither is the scene
+        act(selecting.export, pruned, tmp_path, part)
+        path = tmp_path / f"blobs-{part}-001.ply"
+        assert f"saved {path}: 120 Gaussians" == pruned.state.messages[-1].text
+        written, means = load_scene(path), SCENES["blobs.ply"].gaussians.means
+        np.testing.assert_array_equal(written.gaussians.means, means[blob(word)])
+        assert (len(written.language), len(written.cameras)) == (120, 3)
+    assert pruned.state.selection.is_unsaved  # neither is the scene
 
 
 def test_points_have_their_colours(opened, tmp_path):
     take(opened, blob("mug"))
-    selecting.export(opened, tmp_path, "selection", as_points=True)
-    settle(opened)
+    act(selecting.export, opened, tmp_path, "selection", as_points=True)
     assert names_in(tmp_path) == ["blobs-selection-points-001.ply"]
     table = PlyData.read(tmp_path / "blobs-selection-points-001.ply")["vertex"]
     assert len(table) == 120
@@ -359,14 +321,13 @@ def test_nothing_is_ever_written_over(opened, tmp_path):
     take(opened, blob("mug"))
     taken = tmp_path / "blobs-selection-001.langsplat.safetensors"  # what would belong to the first name
     taken.write_text("precious")
+    selecting.finish_writing(opened)  # nothing is
     for _ in range(2):  # both are asked for before either is written
         selecting.export(opened, tmp_path, "selection")
-    settle(opened)
+    selecting.finish_writing(opened)  # waits for both
     assert taken.read_text() == "precious"
-    assert [name for name in names_in(tmp_path) if name.endswith(".ply")] == [
-        "blobs-selection-002.ply",
-        "blobs-selection-003.ply",
-    ]
+    written = [name for name in names_in(tmp_path) if name.endswith(".ply")]
+    assert written == ["blobs-selection-002.ply", "blobs-selection-003.ply"]
 
 
 def test_what_cannot_be_written_is_said(opened, tmp_path):
@@ -376,110 +337,80 @@ def test_what_cannot_be_written_is_said(opened, tmp_path):
     selecting.export(opened, tmp_path, "rest")
     assert "the rest holds no Gaussians" in errors(opened)[-1]
     (tmp_path / "file").write_text("")
-    selecting.export(opened, tmp_path / "file", "selection")
-    settle(opened)
+    act(selecting.export, opened, tmp_path / "file", "selection")
     assert errors(opened)[-1].startswith("not saved: ")
     assert names_in(tmp_path) == ["file"]
 
 
-def test_deleting_is_unsaved_until_the_scene_is_saved(opened, tmp_path):
-    selection = lambda: opened.state.selection  # noqa: E731  replaced at every change
-    assert not selection().is_unsaved
-    without_plant(opened)
-    assert selection().is_unsaved
-    editing.undo(opened)
-    assert not selection().is_unsaved
-    editing.redo(opened)
-    selecting.export(opened, tmp_path, "edited")
-    settle(opened)
-    assert not selection().is_unsaved
-    assert len(load_scene(tmp_path / "blobs-edited-001.ply").gaussians) == 240
-    take(opened, blob("mug"))
-    selecting.delete_selected(opened)
-    assert selection().is_unsaved
+def test_deleting_is_unsaved_until_the_scene_is_saved(pruned, tmp_path):
+    for action, unsaved in (
+        (editing.undo, False),
+        (editing.redo, True),
+        (partial(selecting.export, folder=tmp_path, part="edited"), False),
+        (partial(take, found=blob("mug")), False),
+        (selecting.delete_selected, True),
+    ):
+        act(action, pruned)
+        assert pruned.state.selection.is_unsaved == unsaved, action
+    assert kept_in(tmp_path) == 240
 
 
-def test_another_scene_waits_for_the_answer(opened, tmp_path):
-    without_plant(opened)
-    opening.open_scene(opened, Path("plain.ply"))
-    assert opened.state.opening is None
-    assert opened.state.selection.leaving.to == "plain.ply is opened"
-    selecting.stay(opened)
-    settle(opened)
-    assert (opened.state.path.name, opened.state.selection.leaving) == ("blobs.ply", None)
-    assert marked(opened) == ("", "", "plant")
-
-    opening.open_scene(opened, Path("plain.ply"))
-    settings.escape(opened)
-    assert opened.state.selection.leaving is None
-
-    opening.open_scene(opened, Path("plain.ply"))
-    selecting.discard_and_leave(opened)
-    settle(opened)
-    assert opened.state.path.name == "plain.ply"
+def test_another_scene_waits_for_the_answer(pruned, tmp_path):
+    for answer in (selecting.stay, settings.escape, selecting.discard_and_leave):
+        opening.open_scene(pruned, Path("plain.ply"))
+        assert pruned.state.opening is None
+        assert pruned.state.selection.leaving.to == "plain.ply is opened"
+        assert marked(pruned) == ("", "", "plant")
+        act(answer, pruned)
+        left = answer is selecting.discard_and_leave
+        assert pruned.state.selection.leaving is None
+        assert pruned.state.path.name == ("plain.ply" if left else "blobs.ply")
     assert names_in(tmp_path) == []
 
 
-def test_saving_comes_before_what_waited(opened, tmp_path):
-    without_plant(opened)
+def test_a_broken_scene_after_discarding_loses_nothing(pruned):
+    opening.open_scene(pruned, Path("broken.ply"))
+    act(selecting.discard_and_leave, pruned)
+    assert marked(pruned) == ("", "", "plant")
+    assert pruned.state.selection.is_unsaved
+
+
+def test_saving_comes_before_what_waited(pruned, tmp_path):
     then = []
-    opening.open_scene(opened, Path("plain.ply"), then.append)
-    selecting.save_and_leave(opened, tmp_path)
-    settle(opened)
-    settle(opened)
-    assert then == [opened]
-    assert opened.state.path.name == "plain.ply"
-    assert len(load_scene(tmp_path / "blobs-edited-001.ply").gaussians) == 240
+    opening.open_scene(pruned, Path("plain.ply"), then.append)
+    act(selecting.save_and_leave, pruned, tmp_path)
+    settle(pruned)
+    assert then == [pruned]
+    assert pruned.state.path.name == "plain.ply"
+    assert kept_in(tmp_path) == 240
 
 
-def test_where_saving_fails_nothing_is_left(opened, tmp_path):
-    without_plant(opened)
-    selecting.quit_viewer(opened)
+def test_where_saving_fails_nothing_is_left(pruned, tmp_path):
+    selecting.quit_viewer(pruned)
     (tmp_path / "file").write_text("")
-    selecting.save_and_leave(opened, tmp_path / "file")
-    settle(opened)
-    assert "not saved" in errors(opened)[-1]
-    assert not opened.state.selection.may_close
-    assert opened.state.selection.is_unsaved
+    act(selecting.save_and_leave, pruned, tmp_path / "file")
+    assert "not saved" in errors(pruned)[-1]
+    assert not pruned.state.selection.may_close
+    assert pruned.state.selection.is_unsaved
 
 
-def test_a_broken_scene_after_discarding_loses_nothing(opened):
-    without_plant(opened)
-    opening.open_scene(opened, Path("broken.ply"))
-    selecting.discard_and_leave(opened)
-    settle(opened)
-    assert marked(opened) == ("", "", "plant")
-    assert opened.state.selection.is_unsaved
-
-
-def test_a_process_that_has_to_end_saves_what_is_not(opened, tmp_path):
-    without_plant(opened)
-    selecting.end(opened, tmp_path)
-    assert not opened.state.selection.may_close
-    settle(opened)
-    assert opened.state.selection.may_close
-    assert len(load_scene(tmp_path / "blobs-edited-001.ply").gaussians) == 240
-
-
-def test_what_is_being_written_is_waited_for(opened, tmp_path):
-    selecting.finish_writing(opened)  # nothing is
-    take(opened, blob("mug"))
-    selecting.export(opened, tmp_path, "selection")
-    selecting.finish_writing(opened)
-    assert "blobs-selection-001.ply" in names_in(tmp_path)
+def test_a_process_that_has_to_end_saves_what_is_not(pruned, tmp_path):
+    selecting.end(pruned, tmp_path)
+    assert not pruned.state.selection.may_close
+    settle(pruned)
+    assert pruned.state.selection.may_close
+    assert kept_in(tmp_path) == 240
 
 
 def test_what_is_named_is_found_by_its_name_and_kept_where_it_is_saved(opened, tmp_path):
     take(opened, blob("plant"))
     queries.type_name(opened, "grandma's mug")
-    queries.name_selection(opened)
-    settle(opened)
+    act(queries.name_selection, opened)
     query = opened.state.queries[-1]
     assert query.phrase == "grandma's mug"
     np.testing.assert_array_equal(query.result.members, blob("plant"))
     assert opened.state.selection.name == ""
-    selecting.export(opened, tmp_path, "edited")
-    settle(opened)
+    act(selecting.export, opened, tmp_path, "edited")
     (saved,) = tmp_path.glob("*.ply")
     assert [word.name for word in load_scene(saved).language.taught] == ["grandma's mug"]
     assert errors(opened) == []
@@ -490,49 +421,46 @@ def test_what_cannot_be_a_name_is_said(opened):
     assert "nothing is selected" in opened.state.messages[-1].text
     take(opened, blob("plant"))
     queries.type_name(opened, "the")
-    queries.name_selection(opened)
-    settle(opened)
+    act(queries.name_selection, opened)
     assert "'the' cannot be a name" in errors(opened)[-1]
     assert (opened.state.queries, opened.state.selection.name) == ([], "the")
-
-
-def test_everything_like_the_selection(opened):
-    take(opened, blob("mug"))
-    selecting.select_alike(opened)
-    settle(opened)
-    assert marked(opened)[0] == "mug"
 
 
 # By numbers.
 
 
-def test_values_in_a_range_are_selected_and_nothing_that_is_hidden(searched):
-    means = searched.state.scene.gaussians.means.astype(np.float64)
-    away = np.linalg.norm(means - searched.state.view.eye, axis=1)
-    take(searched, away < np.median(away))
-    selecting.hide_selected(searched)
-    selecting.set_measure(searched, "distance")
-    found = selecting.values_shown(searched)
-    assert found is selecting.values_shown(searched)
+def test_values_in_a_range_are_selected_and_nothing_that_is_hidden(opened):
+    selecting.set_measure(opened, "relevancy")  # of an answer: there is none
+    assert selecting.values_shown(opened) is None
+    selecting.brush_values(opened, 0.5)
+    selecting.end_brush(opened)
+    assert marked(opened) == ("", "", "")
+    ask(opened, "book")
+    means = opened.state.scene.gaussians.means.astype(np.float64)
+    away = np.linalg.norm(means - opened.state.view.eye, axis=1)
+    take(opened, away < np.median(away))
+    selecting.hide_selected(opened)
+    selecting.set_measure(opened, "distance")
+    found = selecting.values_shown(opened)
+    assert found is selecting.values_shown(opened)
     assert found.counts.sum() > 0
-    np.testing.assert_allclose(
-        10 ** np.array([found.low, found.high]), [np.median(away), away.max()], rtol=0.2
-    )
-    selecting.brush_values(searched, 0.5)
-    selecting.brush_values(searched, -3.0)  # the mouse is outside
-    selecting.end_brush(searched)
+    ends = 10 ** np.array([found.low, found.high])
+    np.testing.assert_allclose(ends, [np.median(away), away.max()], rtol=0.2)
+    selecting.brush_values(opened, 0.5)
+    selecting.brush_values(opened, -3.0)  # the mouse is outside
+    selecting.end_brush(opened)
     cut = 10 ** ((found.low + found.high) / 2)
-    chosen = searched.state.selection.marks.selected
+    chosen = opened.state.selection.marks.selected
     np.testing.assert_array_equal(chosen, (away >= np.median(away)) & (away <= cut))
-    selecting.select_none(searched)
-    selecting.select_range(searched, f"{10**found.low:.9g} to {cut:.9g}")
-    assert (searched.state.selection.marks.selected != chosen).sum() <= 2  # at the ends
+    selecting.select_none(opened)
+    selecting.select_range(opened, f"{10**found.low:.9g} to {cut:.9g}")
+    assert (opened.state.selection.marks.selected != chosen).sum() <= 2  # at the ends
     for text in ("0.5", "near to far", ""):
-        selecting.select_range(searched, text)
-        assert "two numbers" in errors(searched)[-1]
-    viewpoint.frame_scene(searched)
-    selecting.set_measure(searched, "relevancy")
-    assert selecting.values_shown(searched).high == pytest.approx(searched.state.queries[0].result.even.max())
+        selecting.select_range(opened, text)
+        assert "two numbers" in errors(opened)[-1]
+    viewpoint.frame_scene(opened)
+    selecting.set_measure(opened, "relevancy")
+    assert selecting.values_shown(opened).high == pytest.approx(opened.state.queries[0].result.even.max())
 
 
 @pytest.mark.parametrize("measure", marks.MEASURES)
@@ -549,11 +477,3 @@ def test_a_histogram_leaves_out_what_is_no_number(measure):
     counted = np.expm1(found.counts.astype(np.float64)).sum()
     assert counted == pytest.approx(np.isfinite(values).sum(), abs=0.01)
     assert found.between(1.0, 0.0).sum() == np.isfinite(values).sum()
-
-
-def test_relevancy_needs_an_answer(opened):
-    selecting.set_measure(opened, "relevancy")
-    assert selecting.values_shown(opened) is None
-    selecting.brush_values(opened, 0.5)
-    selecting.end_brush(opened)
-    assert marked(opened) == ("", "", "")

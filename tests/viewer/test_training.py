@@ -4,6 +4,7 @@ import json
 import signal
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -15,13 +16,13 @@ from langsplat_core.cli.app import parse
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.pipeline.report import REPORT
 from langsplat_core.scene import Scene
-from langsplat_viewer import viewer
+from langsplat_viewer import viewer as training_process
 from langsplat_viewer.actions import browsing, settings, viewpoint
 from langsplat_viewer.files.disk import IN_TRAINING, PREVIEW, write_preview
 from langsplat_viewer.viewer import PREVIEW_EVERY, TrainingProgress, TrainingRequest, command
 from tests.support.fakes import blob_scene
 from tests.support.scenes import random_gaussians
-from tests.support.windowless import SCENES, errors, open_scene, settle
+from tests.support.windowless import SCENES, act, errors, open_scene, settle
 
 SAYS = """
 import json, sys
@@ -44,8 +45,17 @@ def folder(tmp_path: Path) -> Path:
     return made
 
 
-def trains(monkeypatch: pytest.MonkeyPatch, script: str) -> None:
-    monkeypatch.setattr(viewer, "command", lambda request: [sys.executable, "-c", script])
+@pytest.fixture
+def begin(viewer, folder, monkeypatch) -> Callable[..., None]:
+    """Begins a training that does what a script says, for a file beside the photographs."""
+
+    def start(script: str, out: str = "photos.ply") -> None:
+        monkeypatch.setattr(training_process, "command", lambda request: [sys.executable, "-c", script])
+        browsing.choose_photographs(viewer, folder)
+        viewer.state.training_form = replace(viewer.state.training_form, out=str(folder.with_name(out)))
+        browsing.start_training(viewer)
+
+    return start
 
 
 def finish(viewer, seconds: float = 20.0) -> None:
@@ -57,14 +67,12 @@ def finish(viewer, seconds: float = 20.0) -> None:
     settle(viewer)
 
 
-def test_a_folder_of_photographs_becomes_a_scene_that_opens(viewer, folder, monkeypatch):
-    trains(monkeypatch, GOOD)
+def test_a_folder_of_photographs_becomes_a_scene_that_opens(viewer, folder, begin):
     browsing.open_dropped(viewer, [folder])
     form = viewer.state.training_form
     assert (form.dataset, form.out) == (str(folder), str(folder.with_suffix(".ply")))
     assert settings.take_wanted_panel(viewer) == "Train"
-    viewer.state.training_form = replace(form, out=str(folder.with_name("blobs.ply")))
-    browsing.start_training(viewer)
+    begin(GOOD, "blobs.ply")
     progress = viewer.training.progress
     finish(viewer)
     assert progress.stages == {"reading photographs": 1.0}
@@ -73,7 +81,7 @@ def test_a_folder_of_photographs_becomes_a_scene_that_opens(viewer, folder, monk
     assert viewer.state.scene is SCENES["blobs.ply"]
 
 
-def test_what_speaks_against_the_scene_is_said(viewer, folder, monkeypatch):
+def test_what_speaks_against_the_scene_is_said(viewer, folder, begin):
     doubts = [
         "held-out photographs are reproduced at 9.1 dB, below 16: take more",
         "two groups",
@@ -82,10 +90,7 @@ def test_what_speaks_against_the_scene_is_said(viewer, folder, monkeypatch):
     report = folder.with_name("blobs.work") / REPORT
     report.parent.mkdir()
     report.write_text(json.dumps({"gaussians": 360, "doubts": doubts}))
-    trains(monkeypatch, GOOD + "".join(f"; print('warning: {doubt}')" for doubt in doubts))
-    browsing.choose_photographs(viewer, folder)
-    viewer.state.training_form = replace(viewer.state.training_form, out=str(folder.with_name("blobs.ply")))
-    browsing.start_training(viewer)
+    begin(GOOD + "".join(f"; print('warning: {doubt}')" for doubt in doubts), "blobs.ply")
     finish(viewer)
     assert viewer.state.doubts == tuple(doubts)
     assert errors(viewer) == doubts
@@ -96,19 +101,15 @@ def test_what_speaks_against_the_scene_is_said(viewer, folder, monkeypatch):
     assert viewer.state.doubts == ()
 
 
-def test_what_goes_wrong_is_said(viewer, folder, monkeypatch):
-    trains(monkeypatch, BAD)
-    browsing.choose_photographs(viewer, folder)
-    browsing.start_training(viewer)
+def test_what_goes_wrong_is_said(viewer, begin):
+    begin(BAD)
     finish(viewer)
     assert errors(viewer) == ["langsplat: photos: none can be located"]
     assert viewer.state.scene is None
 
 
-def test_it_can_be_stopped_and_one_is_enough(viewer, folder, monkeypatch):
-    trains(monkeypatch, SLOW)
-    browsing.choose_photographs(viewer, folder)
-    browsing.start_training(viewer)
+def test_it_can_be_stopped_and_one_is_enough(viewer, begin):
+    begin(SLOW)
     browsing.start_training(viewer)
     assert "under way" in errors(viewer)[-1]
     browsing.look_at_training(viewer)
@@ -120,20 +121,14 @@ def test_it_can_be_stopped_and_one_is_enough(viewer, folder, monkeypatch):
     assert "goes on" in viewer.state.messages[-1].text
 
 
-def test_the_gaussians_can_be_looked_at_before_the_end(viewer, folder, monkeypatch):
-    trains(monkeypatch, SLOW)
-    browsing.choose_photographs(viewer, folder)
-    browsing.start_training(viewer)
+def test_the_gaussians_can_be_looked_at_before_the_end(viewer, folder, begin, monkeypatch):
+    begin(SLOW)
     work = folder.with_name("photos.work")
     work.mkdir()
     (work / "radiance-0.ply").write_bytes(b"")
-    SCENES["radiance-0.ply"] = SCENES["plain.ply"]
-    try:
-        browsing.look_at_training(viewer)
-        settle(viewer)
-    finally:
-        del SCENES["radiance-0.ply"]
-        viewer.training.end()
+    monkeypatch.setitem(SCENES, "radiance-0.ply", SCENES["plain.ply"])
+    act(browsing.look_at_training, viewer)
+    viewer.training.end()
     assert viewer.state.scene is SCENES["plain.ply"]
 
 
@@ -169,14 +164,8 @@ def test_what_is_no_progress_is_kept_as_words():
 
 def test_the_loss_is_heard_once_for_every_time_that_it_is_said():
     progress = TrainingProgress()
-    for fraction, metrics in (
-        (0.0, {}),
-        (0.1, {"loss": 0.25}),
-        (0.11, {"loss": 0.25}),
-        (0.2, {"loss": 0.125}),
-    ):
-        report = {"stage": "training Gaussians", "fraction": fraction, "metrics": metrics}
-        progress.hear(json.dumps(report))
+    for fraction, loss in ((0.0, {}), (0.1, {"loss": 0.25}), (0.11, {"loss": 0.25}), (0.2, {"loss": 0.125})):
+        progress.hear(json.dumps({"stage": "training Gaussians", "fraction": fraction, "metrics": loss}))
     progress.hear('{"stage": "all stages", "fraction": 0.5, "metrics": {"seconds_left": 180}}')
     assert progress.losses == [0.25, 0.125]
     assert progress.stages == {"training Gaussians": 0.2}
@@ -184,16 +173,9 @@ def test_the_loss_is_heard_once_for_every_time_that_it_is_said():
 
 def checkpoint(folder: Path, scene: Scene) -> Path:
     """As training writes it, with what the window does not read."""
-    gaussians = scene.gaussians
-    rest = np.zeros((len(gaussians), 3, 3), np.float32)
-    values = {
-        "means": gaussians.means,
-        "log_scales": gaussians.log_scales,
-        "quats_wxyz": gaussians.quats_wxyz,
-        "opacity_logits": gaussians.opacity_logits,
-        "sh_dc": gaussians.sh[:, :1],
-        "sh_rest": rest,
-    }
+    values = {field.name: getattr(scene.gaussians, field.name) for field in fields(scene.gaussians)}
+    rest = np.zeros((len(scene.gaussians), 3, 3), np.float32)
+    values |= {"sh_dc": values.pop("sh")[:, :1], "sh_rest": rest}
     tensors = {f"values.{name}": np.ascontiguousarray(array) for name, array in values.items()}
     path = folder / "photos.work" / "radiance-1.checkpoint.safetensors"
     path.parent.mkdir(exist_ok=True)
@@ -201,25 +183,19 @@ def checkpoint(folder: Path, scene: Scene) -> Path:
     return path
 
 
-@pytest.fixture
-def training_now(viewer, folder, monkeypatch):
-    """A training is under way."""
+def test_gaussians_in_training_are_looked_at_and_followed(viewer, folder, begin):
     viewer.services = replace(viewer.services, load_scene=load_scene)
-    trains(monkeypatch, SLOW)
-    browsing.choose_photographs(viewer, folder)
-    browsing.start_training(viewer)
-    yield viewer
-    viewer.training.end()
-
-
-def test_gaussians_in_training_are_looked_at_and_followed(training_now, folder):
-    viewer = training_now
-    browsing.look_at_training(viewer)
-    assert "no Gaussians to look at yet" in viewer.state.messages[-1].text
+    begin(SLOW)
     whole = blob_scene()
+    path = checkpoint(folder.parent, whole)
+    path.write_bytes(path.read_bytes()[:100])  # damaged
+    act(browsing.look_at_training, viewer)
+    assert "no Gaussians in training" in errors(viewer)[-1]
+    assert viewer.state.scene is None
+    viewer.state.messages.clear()
+
     checkpoint(folder.parent, whole.take(np.arange(0, 360, 2)))
-    browsing.look_at_training(viewer)
-    settle(viewer)
+    act(browsing.look_at_training, viewer)
     assert viewer.state.path == folder.parent / "photos.work" / PREVIEW
     seen = viewer.state.scene.gaussians
     assert (len(seen), seen.sh_degree) == (180, 1)
@@ -230,11 +206,11 @@ def test_gaussians_in_training_are_looked_at_and_followed(training_now, folder):
     assert viewer.worker.current is None  # nothing new
 
     checkpoint(folder.parent, whole)
-    browsing.watch_training(viewer)
-    settle(viewer)
+    act(browsing.watch_training, viewer)
     assert len(viewer.state.scene.gaussians) == 360
     assert viewer.state.view is view
     assert errors(viewer) == []
+    viewer.training.end()
 
 
 @pytest.mark.long
@@ -249,12 +225,3 @@ def test_a_checkpoint_of_training_itself_is_read(tmp_path):
     seen = load_scene(write_preview(path)).gaussians
     for field in fields(gaussians):
         np.testing.assert_array_equal(getattr(seen, field.name), getattr(gaussians, field.name))
-
-
-def test_a_damaged_checkpoint_is_one_line(training_now, folder):
-    path = checkpoint(folder.parent, blob_scene())
-    path.write_bytes(path.read_bytes()[:100])
-    browsing.look_at_training(training_now)
-    settle(training_now)
-    assert "no Gaussians in training" in errors(training_now)[-1]
-    assert training_now.state.scene is None

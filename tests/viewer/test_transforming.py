@@ -14,7 +14,7 @@ from langsplat_viewer.panels.select import box_of, dragged, gl_matrices
 from langsplat_viewer.state import EditForm
 from tests.support.fakes import CENTRES
 from tests.support.scenes import random_camera, without_perspective
-from tests.support.windowless import ask, errors, open_scene, settle
+from tests.support.windowless import act, ask, errors, open_scene, settle
 
 MUG = CENTRES[0]
 STEP = np.array([0.0, 2.0, -1.0])
@@ -35,13 +35,24 @@ def means(viewer) -> np.ndarray:
 def test_the_selection_moves_alone_and_is_found_where_it_went(opened):
     chosen, before = selected_mug(opened), means(opened)
     place, cameras = opened.state.queries[0].result.place, opened.state.scene.cameras
-    editing.transform(opened, moving(STEP))
-    settle(opened)
+    act(editing.transform, opened, moving(STEP))
     np.testing.assert_allclose(means(opened)[chosen], before[chosen] + STEP, atol=1e-5)
     np.testing.assert_array_equal(means(opened)[~chosen], before[~chosen])
     assert opened.state.scene.cameras is cameras
     np.testing.assert_allclose(opened.state.queries[0].result.place, place + STEP, atol=1e-4)
     np.testing.assert_array_equal(opened.state.selection.marks.selected, chosen)
+    queries.type_name(opened, "trophy")  # what is taught goes along
+    act(queries.name_selection, opened)
+    act(editing.transform, opened, moving(STEP))
+    assert opened.engine.is_taught("trophy")
+    assert [word.name for word in opened.state.scene.language.taught] == ["trophy"]
+    opened.state.selection = replace(opened.state.selection, saved_moves=opened.state.selection.moves)
+    open_scene(opened, "plain.ply")  # begins without transforms, and has no language field
+    assert (opened.state.selection.moves, opened.state.opened) == ((), None)
+    before = means(opened)
+    act(editing.transform, opened, moving(STEP))
+    np.testing.assert_allclose(means(opened), before + STEP, atol=1e-5)
+    assert opened.state.scene.language is None
 
 
 def test_the_whole_scene_takes_its_cameras_along(opened):
@@ -61,8 +72,7 @@ def test_undone_exactly_and_done_again(opened):
     editing.transform(opened, rotating(AXES["x"], 33).about(MUG))
     editing.transform(opened, moving(STEP))
     selecting.select_none(opened)
-    editing.transform(opened, scaling(0.5))
-    settle(opened)
+    act(editing.transform, opened, scaling(0.5))
     last = means(opened)
     for _ in range(4):
         editing.undo(opened)
@@ -76,15 +86,10 @@ def test_undone_exactly_and_done_again(opened):
     settle(opened)
     np.testing.assert_array_equal(means(opened), last)
     assert opened.state.selection.is_unsaved
-
-
-def test_transforms_of_the_same_are_one(opened):
-    """Thirty degrees twelve times: as if nothing had been done, to float32."""
-    before = means(opened)
-    for _ in range(12):
+    for _ in range(12):  # a full turn: of the same part all are one, and nothing to float32
         editing.transform(opened, rotating(AXES["y"], 30))
-    assert len(opened.state.selection.moves) == 1
-    np.testing.assert_allclose(means(opened), before, atol=1e-5)
+    assert len(opened.state.selection.moves) == 2
+    np.testing.assert_allclose(means(opened), last, atol=1e-5)
 
 
 def test_a_held_gizmo_shows_what_release_does(opened):
@@ -104,10 +109,9 @@ def test_a_held_gizmo_shows_what_release_does(opened):
 
 
 def test_what_is_saved_is_what_is_seen(opened, tmp_path):
-    chosen = selected_mug(opened)
+    selected_mug(opened)
     editing.transform(opened, moving(STEP))
-    selecting.export(opened, tmp_path, "edited")
-    settle(opened)
+    act(selecting.export, opened, tmp_path, "edited")
     made = load_scene(next(tmp_path.glob("*.ply")))
     np.testing.assert_array_equal(made.gaussians.means, means(opened))
     assert made.language is not None
@@ -115,42 +119,6 @@ def test_what_is_saved_is_what_is_seen(opened, tmp_path):
     editing.transform(opened, moving(STEP))
     opening.open_scene(opened, Path("plain.ply"))  # is asked about first
     assert opened.state.selection.leaving is not None
-    assert chosen.any()
-
-
-def test_names_that_were_taught_go_along(opened):
-    selected_mug(opened)
-    queries.type_name(opened, "trophy")
-    queries.name_selection(opened)
-    settle(opened)
-    editing.transform(opened, moving(STEP))
-    settle(opened)
-    assert opened.engine.is_taught("trophy")
-    assert [word.name for word in opened.state.scene.language.taught] == ["trophy"]
-
-
-def test_the_numbers_of_the_panel(opened):
-    """Scaled and rotated about the middle of the selection, then moved; then the fields are neutral again."""
-    chosen, before = selected_mug(opened), means(opened)
-    centre = editing.pivot(opened)
-    form = EditForm(move=(1.0, 0.0, 0.0), rotate=(0.0, 0.0, 90.0), scale=2.0)
-    opened.state.edit_form = form
-    editing.apply_form(opened)
-    x, y, z = (before[chosen] - centre).T
-    expected = centre + np.stack([1 - 2 * y, 2 * x, 2 * z], 1)
-    np.testing.assert_allclose(means(opened)[chosen], expected, atol=1e-5)
-    assert opened.state.edit_form == EditForm()
-
-
-@pytest.mark.parametrize("form", [EditForm(scale=0), EditForm(scale=-1), EditForm(move=(1e39, 0.0, 0.0))])
-def test_numbers_that_cannot_be_are_refused(form, opened):
-    before = opened.state.scene
-    opened.state.edit_form = form
-    editing.apply_form(opened)
-    assert len(errors(opened)) == 1
-    assert opened.state.scene is before
-    editing.undo(opened)
-    assert "nothing to undo" in opened.state.messages[-1].text
 
 
 def test_cropped_to_a_box_and_undone(opened):
@@ -186,26 +154,33 @@ def test_a_clip_follows_its_box_and_is_undone(opened):
     assert opened.state.selection.marks.shown.all()
 
 
-def test_the_corners_of_a_dragged_box():
-    matrix = np.diag([2.0, -4.0, 6.0, 1.0])  # a handle was dragged beyond the opposite one
-    matrix[:3, 3] = 1.0, 2.0, 3.0
-    assert box_of(matrix) == ((0.0, 0.0, 0.0), (2.0, 4.0, 6.0))
+def test_the_numbers_of_the_panel(opened):
+    """Scaled and rotated about the middle of the selection, then moved; then the fields are neutral again."""
+    before = opened.state.scene
+    refused = (EditForm(scale=0), EditForm(scale=-1), EditForm(move=(1e39, 0.0, 0.0)))
+    for count, form in enumerate(refused, start=1):
+        opened.state.edit_form = form
+        editing.apply_form(opened)
+        assert len(errors(opened)) == count
+    assert opened.state.scene is before
+    editing.undo(opened)
+    assert "nothing to undo" in opened.state.messages[-1].text
+    chosen, before = selected_mug(opened), means(opened)
+    centre = editing.pivot(opened)
+    form = EditForm(move=(1.0, 0.0, 0.0), rotate=(0.0, 0.0, 90.0), scale=2.0)
+    opened.state.edit_form = form
+    editing.apply_form(opened)
+    x, y, z = (before[chosen] - centre).T
+    expected = centre + np.stack([1 - 2 * y, 2 * x, 2 * z], 1)
+    np.testing.assert_allclose(means(opened)[chosen], expected, atol=1e-5)
+    assert opened.state.edit_form == EditForm()
 
 
 def test_without_a_scene_nothing_happens(viewer):
-    for act in (editing.apply_form, editing.crop, editing.fill_box, editing.next_gizmo):
-        act(viewer)
+    for action in (editing.apply_form, editing.crop, editing.fill_box):
+        action(viewer)
     editing.preview(viewer, moving(STEP))
     assert viewer.state.moving is None
-
-
-def test_without_a_language_field(viewer):
-    open_scene(viewer, "plain.ply")
-    before = means(viewer)
-    editing.transform(viewer, moving(STEP))
-    settle(viewer)
-    np.testing.assert_allclose(means(viewer), before + STEP, atol=1e-5)
-    assert viewer.state.scene.language is None
 
 
 @pytest.mark.parametrize("perspective", [True, False])
@@ -223,6 +198,9 @@ def test_the_gizmo_lies_where_the_camera_sees_it(perspective):
 
 
 def test_what_a_drag_means():
+    box = np.diag([2.0, -4.0, 6.0, 1.0])  # a handle was dragged beyond the opposite one
+    box[:3, 3] = 1.0, 2.0, 3.0
+    assert box_of(box) == ((0.0, 0.0, 0.0), (2.0, 4.0, 6.0))
     start = moving(np.array([1.0, 2.0, 3.0])).matrix
     turned = rotating(AXES["y"], 20).about(start[:3, 3])
     np.testing.assert_allclose(dragged(start, turned.matrix @ start).matrix, turned.matrix, atol=1e-9)
@@ -234,11 +212,3 @@ def test_what_a_drag_means():
     stretched[:3, :3] = 0
     with pytest.raises(InputError):
         dragged(start, stretched)
-
-
-def test_another_scene_begins_without_transforms(opened):
-    editing.transform(opened, moving(STEP))
-    opened.state.selection = replace(opened.state.selection, saved_moves=opened.state.selection.moves)
-    open_scene(opened, "book.ply")
-    assert opened.state.selection.moves == ()
-    assert opened.state.opened is None

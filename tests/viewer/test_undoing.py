@@ -13,11 +13,7 @@ from langsplat_viewer.actions.selecting import mark
 from langsplat_viewer.marks import Marks, hiding, unmarked
 from langsplat_viewer.rendering.request import Clip, Splats
 from langsplat_viewer.viewer import GESTURE, MOST_STEPS
-from tests.support.windowless import ask, open_scene, settle
-
-
-def phrases(viewer) -> list[str]:
-    return [query.phrase for query in viewer.state.queries]
+from tests.support.windowless import act, ask, open_scene, phrases, settle
 
 
 def test_a_query_is_undone_and_done_again(opened):
@@ -30,8 +26,7 @@ def test_a_query_is_undone_and_done_again(opened):
     editing.undo(opened)
     assert "nothing to undo" in opened.state.messages[-1].text
     editing.redo(opened)
-    editing.redo(opened)
-    settle(opened)
+    act(editing.redo, opened)
     assert phrases(opened) == ["mug", "book"]
     assert [query.slot for query in opened.state.queries] == [0, 1]
     assert opened.state.picture.display == "relevancy"
@@ -46,21 +41,13 @@ def test_a_removed_query_comes_back_with_its_answer_and_colour(opened):
     queries.set_cut(opened, mug, 0.6)
     count = mug.result.members.sum()
     queries.remove(opened, mug)
-    editing.undo(opened)
-    settle(opened)
+    act(editing.undo, opened)
     assert opened.state.queries[0] is mug
-    assert mug.slot == 0
-    assert mug.cut == 0.6
-    assert mug.result.found
+    assert (mug.slot, mug.cut, mug.result.found, len(mug.things)) == (0, 0.6, True, 1)
     assert mug.result.members.sum() == count
-    assert len(mug.things) == 1
 
 
-def leave_by_removing(viewer) -> None:
-    queries.remove(viewer, viewer.state.queries[-1])
-
-
-@pytest.mark.parametrize("leave", [leave_by_removing, editing.undo])
+@pytest.mark.parametrize("leave", [lambda v: queries.remove(v, v.state.queries[-1]), editing.undo])
 def test_history_keeps_no_answers_of_queries_that_are_gone(opened, leave):
     """Each has a number for every Gaussian and level."""
     ask(opened, "mug")
@@ -82,8 +69,7 @@ def test_history_keeps_no_answers_of_queries_that_are_gone(opened, leave):
 def test_an_answer_that_comes_after_its_query_was_taken_off_is_dropped(opened):
     queries.ask(opened, "mug")
     mug = opened.state.queries[0]
-    queries.remove(opened, mug)
-    settle(opened)
+    act(queries.remove, opened, mug)
     assert (mug.result, mug.pending) == (None, False)
     editing.undo(opened)
     assert mug.pending
@@ -91,23 +77,15 @@ def test_an_answer_that_comes_after_its_query_was_taken_off_is_dropped(opened):
     assert mug.result.found
 
 
-def test_colour_level_and_display_are_undone(opened):
+def test_answers_come_back_at_their_level_and_another_scene_has_no_history(opened):
     ask(opened, "mug")
     query = opened.state.queries[0]
     queries.hide(opened, query)
-    queries.set_level(opened, "part")
-    settings.set_display(opened, "depth")
-    settle(opened)
-    editing.undo(opened)
-    assert opened.state.picture.display == "relevancy"
-    editing.undo(opened)
-    settle(opened)
+    act(queries.set_level, opened, "part")
+    act(editing.undo, opened)
     assert (opened.state.level, query.result.level) == ("auto", 2)
     editing.undo(opened)
     assert query.slot == 0
-
-
-def test_another_scene_and_a_long_day(opened):
     for _ in range(MOST_STEPS):
         settings.set_display(opened, "depth")
         settings.set_display(opened, "rgb")
@@ -120,6 +98,7 @@ SETTINGS = {
     "picture": lambda v: settings.set_picture(
         v, replace(v.state.picture, dim=0.2, background=(1.0, 1.0, 1.0))
     ),
+    "display": lambda v: settings.set_display(v, "depth"),
     "colour map": lambda v: settings.set_colour_map(v, "viridis"),
     "wipe": settings.toggle_wipe,
     "levels": settings.toggle_levels,
@@ -145,24 +124,18 @@ def test_a_setting_of_what_is_seen_is_undone_in_one_step(opened, name):
     SETTINGS[name](opened)
     after = looks(opened)
     assert after != before
+    if name not in ("wipe", "levels", "overlay"):  # which would go back
+        SETTINGS[name](opened)  # changes nothing, and is no step
+    assert len(opened.history.past) == 1
+    settings.measure(opened, True)  # is never undone
     SETTINGS["wipe" if name == "levels" else "levels"](opened)
     for wanted in (after, before):
         editing.undo(opened)
         assert looks(opened) == wanted
     assert opened.history.past == []
+    assert opened.state.ruler.measures
     editing.redo(opened)
     assert looks(opened) == after
-
-
-@pytest.mark.parametrize("name", SETTINGS)
-def test_what_changes_nothing_is_no_step(opened, name):
-    SETTINGS[name](opened)
-    count = len(opened.history.past)
-    if name in ("wipe", "levels", "overlay"):  # which would go back
-        assert count == 1
-    else:
-        SETTINGS[name](opened)
-        assert len(opened.history.past) == count == 1
 
 
 def slide(viewer, seconds: float, dim: float) -> None:
@@ -183,14 +156,6 @@ def test_a_slider_that_is_moved_is_one_step_and_another_time_another(opened):
     assert opened.state.picture.dim == pytest.approx(0.31)
     editing.undo(opened)
     assert opened.state.picture.dim == 0.45
-
-
-def test_the_ruler_is_not_undone(opened):
-    settings.toggle_wipe(opened)
-    settings.measure(opened, True)
-    editing.undo(opened)
-    assert opened.state.ruler.measures
-    assert opened.state.settings.split.mode == "off"
 
 
 def test_an_undone_setting_leaves_the_marks_the_same_objects(opened):
