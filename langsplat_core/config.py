@@ -49,9 +49,7 @@ class Setting:
 
 def check_settings(settings: object, option: str = "--") -> None:
     """InputError for the first number in `settings`, a dataclass, that is outside the range of its field.
-
-    `option` is what precedes the fields' names on the command line, such as ``--codec.``.
-    """
+    `option` is what precedes the fields' names on the command line, such as ``--codec.``."""
     for setting in numeric_settings(settings, option):
         problem = _problem(setting)
         if problem:
@@ -74,7 +72,9 @@ def named_values(settings: object, option: str = "--") -> Iterator[tuple[str, An
         value, hint = getattr(settings, entry.name), hints[entry.name]
         name = option + entry.name.replace("_", "-")
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
-            yield from named_values(value, option if _is_flat(hint) else f"{name}.")
+            # of `tyro.conf.arg(name="")`, whose fields are options without its own name
+            is_flat = any(getattr(part, "name", None) == "" for part in annotations(hint))
+            yield from named_values(value, option if is_flat else f"{name}.")
         else:
             yield name, value, hint
 
@@ -99,11 +99,6 @@ def _kinds(hint: Any) -> Iterator[type]:
             yield from _kinds(part)
     elif isinstance(hint, type) and hint is not types.NoneType:
         yield hint
-
-
-def _is_flat(hint: Any) -> bool:
-    """True where a dataclass's fields are options without its own name: ``tyro.conf.arg(name="")``."""
-    return any(getattr(part, "name", None) == "" for part in annotations(hint))
 
 
 def _problem(setting: Setting) -> str | None:
@@ -259,15 +254,16 @@ class RadianceConfig:
 
     def budgets(self, views: int, longer_side: int) -> list[RadianceBudget]:
         """Ascending budgets that are tried with so many training views of so many pixels; the last is all
-        that is asked for, and the only one with many views or few steps."""
+        that is asked for, and the only one with many views or few steps. A larger preset's begin with the
+        smaller one's, so that it cannot choose worse."""
         whole = RadianceBudget(longer_side, self.steps, self.max_gaussians, self.sh_degree)
-        steps = [self.steps]
-        while steps[0] >= REHEARSAL_FACTOR * QUICK.steps:
-            steps.insert(0, round(steps[0] / REHEARSAL_FACTOR))
-        if views > self.rehearsed_views or len(steps) < 2:
+        steps = [QUICK.steps]
+        while REHEARSAL_FACTOR**2 * steps[-1] <= self.steps:
+            steps.append(REHEARSAL_FACTOR * steps[-1])
+        if views > self.rehearsed_views or self.steps < REHEARSAL_FACTOR * QUICK.steps:
             return [whole]
         sizes = [(GOOD if count <= GOOD.steps else whole)._replace(steps=count) for count in steps]
-        return list(dict.fromkeys(budget.at_most(whole) for budget in (QUICK, *sizes)))
+        return list(dict.fromkeys(budget.at_most(whole) for budget in (QUICK, *sizes, whole)))
 
     def spending(self, budget: RadianceBudget) -> "RadianceConfig":
         """These settings with the budget's steps, Gaussians and degree."""
@@ -461,8 +457,7 @@ class PictureConfig:
     own_colours: bool = False  # heat in the colour of each query instead of the colour map
     threshold: Share = 0.5  # of a pixel's light from an answer's Gaussians from which it is segmented
     alpha_gate: Share = 0.3  # pixels with less alpha carry no relevancy
-    heat_scale: tuple[Share, Share] | None = (
-        None  # relevancies that are coldest and hottest; None: each answer's
-    )
+    # relevancies that are coldest and hottest; None: each answer's
+    heat_scale: tuple[Share, Share] | None = None
     background: tuple[Share, Share, Share] = (0.0, 0.0, 0.0)  # display values in [0, 1]
     transparent: bool = False  # no background: the image has a fourth channel, the scene's alpha

@@ -16,7 +16,7 @@ import pytest
 from tyro.extras import get_parser
 
 from langsplat_core import __version__
-from langsplat_core.cli import demo
+from langsplat_core.cli import scenes
 from langsplat_core.cli.app import COMMANDS, GROUPS, entry, load_command, parse
 from langsplat_core.cli.scenes import Doctor
 from langsplat_core.errors import InputError
@@ -114,11 +114,11 @@ def test_doctor_says_what_draws_and_what_encodes(capsys):
 
 @pytest.mark.long
 def test_demo_renders_the_bundled_scene(tmp_path, monkeypatch, capfd):
-    monkeypatch.setattr(demo, "PICTURES", {"gift.png": ("--query", "blue gift")})
+    monkeypatch.setattr(scenes, "PICTURES", {"gift.png": ("--query", "blue gift")})
     assert run("demo", "--out", tmp_path) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["gift.png"]
     assert "'blue gift': found" in capfd.readouterr().out
-    monkeypatch.setattr(demo, "PICTURES", {"gift.png": ("--camera", "absent")})
+    monkeypatch.setattr(scenes, "PICTURES", {"gift.png": ("--camera", "absent")})
     assert run("demo", "--out", tmp_path) == 2
 
 
@@ -288,7 +288,7 @@ def test_a_signal_ends_a_command_in_a_line(number: int, said: str, tmp_path: Pat
 @pytest.mark.parametrize("seconds", [0.0, 0.2])
 def test_a_signal_while_modules_are_imported_is_a_line(program: str, number: int, seconds: float) -> None:
     code = (
-        "import signal, sys\nfrom langsplat_core.signals import end_in_a_line\n"
+        "import signal, sys\nfrom langsplat_core.errors import end_in_a_line\n"
         f"from {program}.__main__ import entry\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "end_in_a_line('begins')\nprint('ready', flush=True)\nsys.argv = ['x', '--help']\nentry()\n"

@@ -16,11 +16,10 @@ from assets.making.render import Renderer
 from assets.making.scene import SEED, SIZE, VIEWS
 from langsplat_core.config import PictureConfig
 from langsplat_core.errors import EncoderError
-from langsplat_core.evaluation.scoring import intersection_over_union
+from langsplat_core.evaluation.report import intersection_over_union
 from langsplat_core.io.scenes import load_scene
-from langsplat_core.query.answers import peak_pixel
+from langsplat_core.query.answers import peak_pixel, splatted_relevancy
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.lookup import splatted_relevancy
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import Camera, Scene
 from langsplat_core.semantics.encoders import load_text_encoder

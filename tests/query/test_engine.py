@@ -17,11 +17,17 @@ import pytest
 
 from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.errors import EncoderError, InputError, UnknownWordError
-from langsplat_core.query import lookup
-from langsplat_core.query.answers import peak_pixel
+from langsplat_core.query.answers import (
+    SphereTable,
+    build_lookup,
+    decoded_relevancy,
+    octahedral_to_sphere,
+    peak_pixel,
+    sphere_to_octahedral,
+    splatted_relevancy,
+)
 from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.lookup import build_lookup, decoded_relevancy, splatted_relevancy
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.raster.render import render
@@ -458,8 +464,8 @@ def test_octahedral_map_is_a_bijection_of_the_sphere():
     rng = np.random.default_rng(5)
     vectors = unit(rng.normal(size=(1000, 3)))
     vectors = np.concatenate([vectors, np.eye(3), -np.eye(3)])
-    uv = lookup.sphere_to_octahedral(vectors)
-    np.testing.assert_allclose(lookup.octahedral_to_sphere(uv), vectors, atol=1e-12)
+    uv = sphere_to_octahedral(vectors)
+    np.testing.assert_allclose(octahedral_to_sphere(uv), vectors, atol=1e-12)
     assert 0 <= uv.min() < uv.max() <= 1
 
 
@@ -472,7 +478,7 @@ def test_table_agrees_with_exact_decoding_and_improves_with_resolution():
     exact = latent_relevancy(codec, latents, phrases, canonical)
     errors = {}
     for resolution in (48, 192):
-        table = lookup.SphereTable(codec, latents, Scale(canonical, None, 10.0), resolution=resolution)
+        table = SphereTable(codec, latents, Scale(canonical, None, 10.0), resolution=resolution)
         got = np.stack(list(table.relevancies(phrases)), 1)
         errors[resolution] = np.abs(got - exact)
     assert errors[192].mean() < 3e-4

@@ -29,7 +29,7 @@ from langsplat_core.config import MaskConfig
 from langsplat_core.progress import silent
 from langsplat_core.semantics.encoders import load_encoder
 from langsplat_core.semantics.masks import label_maps
-from langsplat_core.semantics.sam import LEVELS, Look, SamMasks, load_mask_source, load_sam, load_segmenter
+from langsplat_core.semantics.sam import LEVELS, Look, SamMasks, load_mask_source, load_segmenter
 from langsplat_core.semantics.store import masked_crop
 from tests.support.fixtures import Measure
 
@@ -273,7 +273,7 @@ def test_sam_2_of_sam2(field: SimpleNamespace, tmp_path: Path, measured: Measure
         embedding = predictor.get_image_embedding()
         compare("SAM 2.1 tiny", segmenter.look(square), embedding, points, (want[0], want[1]), measured)
     every = MaskConfig(sam=str(file), points_per_side=2, predicted_iou=0, stability=0, **PASSING)
-    levels = load_sam(every, "cpu")(square, silent)
+    levels = load_mask_source(every, "cpu")(square, silent)
     assert [len(masks) > 0 for masks in levels.masks] == [True] * LEVELS
 
 

@@ -1,7 +1,5 @@
 """A room of flat Gaussians whose planes are known: a floor, four walls, a table and blocks on it."""
 
-from dataclasses import replace
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -56,24 +54,3 @@ def box_room(seed: int = 0) -> Scene:
     angles = np.linspace(0, 2 * np.pi, 8, endpoint=False)
     eyes = [np.array([1.4 * np.cos(a), 1.4 * np.sin(a), 0.5]) for a in angles]
     return Scene(gaussians, cameras=tuple(look_at(eye, FLOOR / 2 * z, z, (96, 72), 70) for eye in eyes))
-
-
-def moved(scene: Scene, transform: Array) -> Scene:
-    """The scene in other axes, and its cameras with it. transform: (4, 4) similarity; colours stay."""
-    scale = float(np.cbrt(np.linalg.det(transform[:3, :3])))
-    old = scene.gaussians
-    turned = Rotation.from_matrix(transform[:3, :3] / scale) * Rotation.from_quat(
-        old.quats_wxyz[:, [1, 2, 3, 0]]
-    )
-    gaussians = replace(
-        old,
-        means=old.means @ transform[:3, :3].T + transform[:3, 3],
-        log_scales=old.log_scales + np.log(scale),
-        quats_wxyz=turned.as_quat()[:, [3, 0, 1, 2]],
-    )
-    cameras = []
-    for camera in scene.cameras:
-        matrix = camera.world_to_camera @ np.linalg.inv(transform)
-        matrix[:3] *= scale
-        cameras.append(replace(camera, world_to_camera=matrix))
-    return replace(scene, gaussians=gaussians, cameras=tuple(cameras))

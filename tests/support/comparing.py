@@ -1,14 +1,17 @@
-"""Comparisons: of a fast rasterizer with the reference, of gradients, and bit for bit of scenes.
+"""Comparisons: of a fast rasterizer with the reference, of gradients, bit for bit of scenes; and refusals.
 
 Image formation has steps: an alpha of just 1/255 counts or does not, a transmittance of just 1e-4 stops a
 pixel or does not. Pixels where rounding may decide are the *band*: a counted allowance of them may differ.
 """
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
+import pytest
 
 from langsplat_core.arrays import Array
+from langsplat_core.errors import FormatError
 from langsplat_core.scene import Gaussians, LanguageField, Tree
 
 BAND = 1e-4  # relative distance to a cut-off; float32 kernels are within about 1e-6 of it
@@ -94,3 +97,13 @@ def assert_same_field(got: LanguageField, want: LanguageField) -> None:
     assert list(got.phrasebook) == list(want.phrasebook)
     for phrase, vector in want.phrasebook.items():
         np.testing.assert_array_equal(got.phrasebook[phrase], vector)
+
+
+def assert_refused(read: Callable[[Path], object], path: Path, message: str | None = None) -> None:
+    """A FormatError of one short printable line that begins with the path and matches `message`, if given."""
+    with pytest.raises(FormatError, match=message) as caught:
+        read(path)
+    said = str(caught.value)
+    assert said.startswith(str(path))
+    assert said.isprintable()
+    assert len(said) < len(str(path)) + 300  # whatever a library adds

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from langsplat_core.io import apart
 from langsplat_core.progress import Cancelled, Progress, Report
 
 PR_CAPBSET_DROP, CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH = 24, 1, 2  # linux/prctl.h, linux/capability.h
@@ -29,6 +30,11 @@ def bound_by_permissions() -> Callable[[], None] | None:
                 raise OSError(ctypes.get_errno(), "cannot give up a right")
 
     return give_up
+
+
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What runs in a process of its own runs in this one, where what is patched is so for it too."""
+    monkeypatch.setattr(apart, "run", lambda function, *given, progress: function(*given, progress))
 
 
 @contextmanager

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import langsplat_core.pipeline.importing  # noqa: F401  which imports torch
+from langsplat_core.cli.export import Convert
 from langsplat_core.cli.run import main
-from langsplat_core.cli.scenes import Convert
 
 ROOM, SECONDS = 3 << 30, 20  # bytes of address space beyond the parent's, seconds of the processor
 
