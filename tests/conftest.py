@@ -15,16 +15,7 @@ import pytest
 from tests.support.backends import backend, fast_backend, gl_rasterizers, gsplat_twin
 from tests.support.fixtures import gl, gl_session, measured, print_measured
 
-__all__ = [
-    "backend",
-    "fast_backend",
-    "gl",
-    "gl_rasterizers",
-    "gl_session",
-    "gsplat_twin",
-    "measured",
-    "real_data",
-]
+__all__ = ["backend", "fast_backend", "gl", "gl_rasterizers", "gl_session", "gsplat_twin", "measured"]
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

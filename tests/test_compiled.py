@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -107,11 +108,10 @@ def test_pieces_cover_a_range_once() -> None:
     def mark(first: int, last: int, out: np.ndarray) -> None:
         out[first:last] += 1
 
-    for count in (0, 1, 7, 100):
-        for threads in (1, 3):
-            out = np.zeros(count, int)
-            Workers(threads).run(mark, count, out)
-            assert (out == 1).all()
+    for count, threads in product((0, 1, 7, 100), (1, 3)):
+        out = np.zeros(count, int)
+        Workers(threads).run(mark, count, out)
+        assert (out == 1).all()
 
 
 def test_a_full_disk_keeps_no_machine_code_and_stops_nothing(

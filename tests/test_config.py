@@ -1,4 +1,5 @@
-"""Settings: every number has a range, and what lies outside is refused by name, before any work."""
+"""Settings: every number has a range, and what lies outside is refused by name, before any work; options of
+`langsplat train` come together from a file, profiles, presets and short names."""
 
 import dataclasses
 import math
@@ -10,23 +11,19 @@ import pytest
 
 from langsplat_core import bench, config
 from langsplat_core.cli.app import parse
-from langsplat_core.cli.run import main
-from langsplat_core.config import (
-    AutoencoderConfig,
-    Range,
-    Setting,
-    TrainConfig,
-    check_settings,
-    numeric_settings,
-)
+from langsplat_core.cli.train import Train
+from langsplat_core.config import AutoencoderConfig, TrainConfig, check_settings, numeric_settings
 from langsplat_core.errors import InputError
 from langsplat_core.pipeline.train import train_scene
+from tests.support.commands import refusal
 
 CONFIGS = {
     name: value
     for module in (config, bench)
     for name, value in vars(module).items()
-    if dataclasses.is_dataclass(value) and isinstance(value, type) and value not in (Range, Setting)
+    if dataclasses.is_dataclass(value)
+    and isinstance(value, type)
+    and value not in (config.Range, config.Setting)
 }
 SETTINGS = [
     (name, setting)
@@ -49,7 +46,7 @@ COMMANDS = (
 )
 
 
-def outside(setting: Setting) -> list[Any]:
+def outside(setting: config.Setting) -> list[Any]:
     """Values that its range excludes, in the shape of the setting's own value."""
     bound = setting.range
     assert bound is not None
@@ -67,10 +64,11 @@ def shaped(like: Any, value: Any) -> Any:
 
 
 @pytest.mark.parametrize(("name", "setting"), SETTINGS, ids=lambda part: getattr(part, "option", part))
-def test_every_number_has_a_range_outside_of_which_it_is_refused_by_name(name: str, setting: Setting) -> None:
+def test_every_number_has_a_range_outside_of_which_it_is_refused_by_name(
+    name: str, setting: config.Setting
+) -> None:
     assert setting.range is not None, f"{name}: write Annotated[..., Range(...)] beside {setting.option}"
-    assert math.isfinite(setting.range.low)
-    assert math.isfinite(setting.range.high)
+    assert np.isfinite([setting.range.low, setting.range.high]).all()
     check_settings(CONFIGS[name]())
     field = setting.option.removeprefix("--").replace("-", "_")
     for value in outside(setting):
@@ -79,7 +77,6 @@ def test_every_number_has_a_range_outside_of_which_it_is_refused_by_name(name: s
             check_settings(wrong)
         message = str(caught.value)
         assert message.startswith(f"{setting.option} "), message
-        assert "\n" not in message
         assert len(message) < 200
 
 
@@ -108,11 +105,8 @@ def test_every_number_of_every_command_has_a_range(line: str) -> None:
 def test_the_command_line_names_the_option_as_typed(
     line: str, named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = f"train {tmp_path} --out {tmp_path}/s.ply {line}".split()
-    assert main("langsplat", lambda: parse(words)) == 2
-    error = capsys.readouterr().err
+    error = refusal(capsys, "train", tmp_path, "--out", tmp_path / "s.ply", *line.split())
     assert error.lower().startswith(f"langsplat: {named}")
-    assert error.count("\n") == 1
     assert list(tmp_path.iterdir()) == []  # nothing was begun
 
 
@@ -125,8 +119,8 @@ def test_python_is_refused_alike(tmp_path: Path) -> None:
 @dataclasses.dataclass(frozen=True)
 class Sample:
     plain: int = 3
-    length: Annotated[float, Range(0.0, 1.0, above=True)] | None = None
-    pair: tuple[Annotated[int, Range(1, 9)], Annotated[int, Range(1, 9)]] = (1, 9)
+    length: Annotated[float, config.Range(0.0, 1.0, above=True)] | None = None
+    pair: tuple[Annotated[int, config.Range(1, 9)], Annotated[int, config.Range(1, 9)]] = (1, 9)
     text: str = "no number"
     switch: bool = False
 
@@ -142,3 +136,90 @@ def test_values_inside_pass_whatever_their_kind_and_a_field_without_a_range_is_s
         check_settings(Sample(length=0.0))
     with pytest.raises(InputError, match="whole number"):
         check_settings(Sample(pair=(True, 1)))
+
+
+# How the options of `langsplat train` come together.
+
+WORDS = ("train", "photographs", "--out", "s.ply")
+PAGE = Path(__file__).parents[1] / "docs" / "photographs.md"
+
+
+def trained(*words: str, file: Path | None = None, text: str = "") -> Train:
+    """What is asked for, with a file that holds `text`."""
+    if file is not None:
+        file.write_text(text)
+        words = (*words, "--config", str(file))
+    found = parse([*WORDS, *words])
+    assert isinstance(found, Train)
+    assert str(found.dataset) == "photographs"
+    return found
+
+
+@pytest.mark.parametrize("name", ["--max-relevancy-error", "--codec.max-relevancy-error"])
+def test_every_spelling_of_an_option_takes_its_value_both_ways(name: str) -> None:
+    for spelling in (name, name.replace("-", "_").replace("__", "--", 1)):
+        assert trained(f"{spelling}=0.002").config.codec.max_relevancy_error == 0.002
+        assert trained(spelling, "0.002").config.codec.max_relevancy_error == 0.002
+
+
+def test_the_example_of_the_docs(tmp_path: Path) -> None:
+    (example,) = PAGE.read_text().split("```toml\n")[1:]
+    found = trained(file=tmp_path / "train.toml", text=example.partition("```")[0])
+    config = found.config
+    assert (found.preset, config.radiance.max_gaussians) == ("good", 60_000)  # the preset's
+    assert (config.dataset.max_side, config.radiance.steps, config.clip.model) == (640, 3000, "demo")
+    assert (config.codec.max_relevancy_error, config.phrases) == (0.002, ("red mug", "keyboard"))
+
+
+def test_options_beside_a_file_win(tmp_path: Path) -> None:
+    file, text = tmp_path / "f.toml", 'preset = "quick"\nradiance.steps = 7\nphrases = ["a", "b"]'
+    assert trained(file=file, text=text).config.radiance.steps == 7
+    other = trained("--radiance.steps=8", "--preset", "good", "--phrases", "c", file=file, text=text)
+    assert (other.preset, other.config.radiance.steps, other.config.phrases) == ("good", 8, ("c",))
+    assert other.config.dataset.max_side == 480  # of the preset that was asked for
+    assert trained(f"--config={file}").config.dataset.max_side == 320
+    flags = "[dataset]\nallow_few_cameras = true"
+    assert trained(file=file, text=flags).config.dataset.allow_few_cameras
+    other = trained("--dataset.no-allow-few-cameras", file=file, text=flags)
+    assert not other.config.dataset.allow_few_cameras
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[radiance]\nstepz = 7", "--radiance.stepz"),
+        ("radiance = 5", "--radiance"),
+        ("dataset = 'here'", "--dataset"),
+        ("help = true", "--help"),
+        ("[radiance]\nsteps = 'many'", "--radiance.steps: invalid literal"),
+        ("[radiance]\nsteps = 1.5", "--radiance.steps: invalid literal"),
+        ("[radiance]\nsteps = true", "--radiance.steps"),
+        ("[radiance]\nsteps = 0", "--radiance.steps 0: must be 1 to"),
+        ("[[radiance]]\nsteps = 1", "--radiance"),
+        ("preset = 'fast'", "invalid choice 'fast'"),
+        ("phrases = ['--out', 'x']", "phrases"),
+        ("config = 'other.toml'", "config"),
+        ("steps = ", "Invalid value"),
+        ("\udcff", "utf-8"),
+    ],
+)
+def test_a_file_that_cannot_be_used_is_named_with_its_key(
+    text: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "train.toml"
+    file.write_text(text, errors="surrogateescape")
+    line = refusal(capsys, *WORDS, "--config", file)
+    assert line.startswith(f"langsplat: {file}: ")
+    assert said in line
+
+
+@pytest.mark.parametrize(
+    "option", ["--radiance.steps", "--codec.max-relevancy-error", "--dataset.test-every"]
+)
+def test_numbers_in_other_digits_are_refused(option: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert f"{option}: '١' is not written" in refusal(capsys, *WORDS, option, "١")
+
+
+@pytest.mark.parametrize("name", ["absent.toml", "."])
+def test_a_file_that_cannot_be_read(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert str(tmp_path / name) in refusal(capsys, *WORDS, "--config", tmp_path / name)

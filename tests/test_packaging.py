@@ -1,20 +1,45 @@
-"""What a desktop is told of the viewer, and what the one-folder build is made of."""
+"""The wheel without extras, what a desktop is told of the viewer, the one-folder build, and the scripts in
+`packaging`: rows of other machines; `make gpu`, its sections over the twin of gsplat's kernels and its runner
+where there is no GPU."""
 
 import importlib.util
+import os
+import re
+import shutil
 import subprocess
 import sys
+import venv
 from configparser import ConfigParser
+from importlib.metadata import Distribution, distribution
 from pathlib import Path
+from types import ModuleType
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
+from packaging.requirements import Requirement
+from PIL import Image
 
+from langsplat_core import load_scene
+from langsplat_core.errors import EXTRAS
 from langsplat_core.io.scenes import FORMATS
+from langsplat_core.raster.opengl.scene_textures import create_egl_context
 from langsplat_viewer.viewer import TrainingRequest, command
 
 PACKAGING = Path(__file__).resolve().parents[1] / "packaging"
-DESKTOP = PACKAGING / "desktop"
+DESKTOP, GPU = PACKAGING / "desktop", PACKAGING / "gpu"
 NAMESPACE = "{http://www.freedesktop.org/standards/shared-mime-info}"
+
+
+def script(name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """packaging/NAME.py as a module."""
+    spec = importlib.util.spec_from_file_location(name, PACKAGING / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, name, module)  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
 
 
 def desktop_entry() -> dict[str, str]:
@@ -38,9 +63,7 @@ def test_the_desktop_entry_starts_the_program_with_a_file():
     assert entry["Type"] == "Application"
     assert entry["Exec"].split() == ["langsplat-viewer", "%f"]
     assert entry["TryExec"] == "langsplat-viewer"
-    assert all(
-        entry["MimeType"].endswith(";") and entry[key].endswith(";") for key in ("Categories", "Keywords")
-    )
+    assert all(entry[key].endswith(";") for key in ("MimeType", "Categories", "Keywords"))
 
 
 def test_every_type_of_the_entry_is_described_and_every_kind_of_scene_has_one():
@@ -57,17 +80,11 @@ def test_a_one_folder_build_trains_by_the_program_beside_it(monkeypatch: pytest.
     monkeypatch.setattr("sys.frozen", True, raising=False)
     monkeypatch.setattr("sys.executable", str(tmp_path / "langsplat-viewer"))
     frozen = command(request)
-    assert frozen[0] == str(tmp_path / "langsplat")
-    assert frozen[1:] == plain[3:]
+    assert frozen == [str(tmp_path / "langsplat"), *plain[3:]]
 
 
 def test_a_row_of_another_machine_leaves_the_other_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    spec = importlib.util.spec_from_file_location("elsewhere", PACKAGING / "elsewhere.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "elsewhere", module)  # dataclasses look their module up
-    spec.loader.exec_module(module)
+    module = script("elsewhere", monkeypatch)
     python = tmp_path / "python"
     python.write_text('#!/bin/sh\necho "$*"\necho "$CODE failed, 2 passed, 3 skipped in 1s"\nexit $CODE\n')
     python.chmod(0o755)
@@ -85,3 +102,240 @@ def test_a_row_of_another_machine_leaves_the_other_rows(tmp_path: Path, monkeypa
         ["| row2", "`CODE=2`, `python`", "2", "ended with 2", "3"],
     ]
     assert "-n 2 --dist loadfile tests/a tests/b" in (tmp_path / "out" / "row1.txt").read_text()
+
+
+# `make gpu`.
+
+
+@pytest.fixture
+def sections(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(GPU))
+    return importlib.import_module("gpu_sections")
+
+
+@pytest.fixture
+def runner(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    return script("gpu/run", monkeypatch)
+
+
+@pytest.fixture
+def fake_sections(tmp_path: Path, runner: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Sections that do as they are called, in place of the real ones."""
+    (tmp_path / "gpu_sections.py").write_text(
+        "import sys, time\nfrom pathlib import Path\n_, name, plan, report = sys.argv\n"
+        "if name == 'opengl':\n    sys.exit(print('no driver', file=sys.stderr) or 3)\n"
+        "Path(report).write_text(f'# {name}\\n\\nfound by {plan}\\n')\n"
+        "if name == 'lifting':\n    time.sleep(60)\n"
+        "if name == 'gradients':\n    raise ValueError('three\\nlines\\nof it')\n"
+    )
+    monkeypatch.setattr(runner, "HERE", tmp_path)
+    monkeypatch.setattr(runner, "SECTIONS", {"environment": 60, "gradients": 60, "lifting": 5, "opengl": 60})
+    return tmp_path
+
+
+def pieces(sections: ModuleType, name: str) -> str:
+    return "\n".join(getattr(sections, f"measure_{name}")(sections.TINY))
+
+
+def numbers(text: str, first: str) -> list[float]:
+    """Of the table's row that begins with `first`."""
+    row = next(line for line in text.splitlines() if line.startswith(f"| {first} |"))
+    return [float(cell) for cell in row.strip("| ").split(" | ")[1:] if cell != "-"]
+
+
+@pytest.mark.long
+def test_sections_over_the_twin(sections: ModuleType, gsplat_twin: None) -> None:
+    said = pieces(sections, "gradients")
+    for name in ("means", "log_scales", "quats_wxyz", "opacity_logits", "values", "means_px"):
+        assert max(numbers(said, name)) < 1e-4
+    assert max(numbers(said, "cuda")) < 1e-5
+    said = pieces(sections, "lifting")
+    assert numbers(said, "cpu")[1] == numbers(said, "cuda")[1] > 100
+    assert float(said.split("Largest difference of a weight: ")[1].split()[0]) < 1e-4
+    said = pieces(sections, "environment")
+    assert "- gsplat: 1." in said
+    assert "gsplat's first picture and its gradients" in said
+
+
+@pytest.mark.slow
+def test_longer_sections_over_the_twin(sections: ModuleType, gsplat_twin: None) -> None:
+    said = pieces(sections, "raster")
+    errors = [line.split(" | ")[8] for line in said.splitlines() if "| gather | cuda |" in line]
+    assert errors
+    assert max(map(float, errors)) < 1e-4
+    assert "| 300 | 64x48 | 3 |" in said.split("On the device alone")[1]
+    said = pieces(sections, "training")
+    assert numbers(said, "cuda")[2] == pytest.approx(numbers(said, "cpu")[2], abs=0.5)
+    assert " passed" in pieces(sections, "tests")
+    assert "| loading, s | 5 crops, s |" in pieces(sections, "encoders")
+
+
+@pytest.mark.long
+def test_opengl_tables_on_any_driver(sections: ModuleType, gl_session: object) -> None:
+    with create_egl_context() as context:
+        said = "\n".join(sections.tables(sections.TINY, context))
+    errors = [line.split(" | ")[8] for line in said.splitlines() if "| splat | opengl single |" in line]
+    assert len(errors) == 2
+    assert max(map(float, errors)) < 1e-4
+
+
+@pytest.mark.long
+@pytest.mark.skipif("__import__('torch').cuda.is_available()", reason="needs a machine without CUDA")
+def test_without_a_gpu_it_says_so_in_one_line_and_writes_nothing(
+    tmp_path: Path, runner: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    monkeypatch.setattr(sys, "argv", ["run.py", "--only", "environment,gradients", "--out", str(out)])
+    monkeypatch.setenv("PYTHONPATH", "")
+    assert runner.main() == 2
+    said = capsys.readouterr()
+    assert said.err == "gpu: nothing could be run (no CUDA device); see docs/speed.md\n"
+    assert "gradients: skipped: no CUDA device" in said.out
+    assert not out.exists()
+
+
+def test_a_section_that_fails_or_takes_too_long_does_not_stop_the_others(
+    fake_sections: Path, runner: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = fake_sections / "out"
+    monkeypatch.setattr(sys, "argv", ["run.py", "--out", str(out)])
+    monkeypatch.setattr(runner, "ON_GSPLAT", {"gradients"})
+    assert runner.main() == 1
+    page = (out / "README.md").read_text()
+    said = ("| gradients | ", "failed (exit code 1)", "of it\n```", "stopped after 5 s", "skipped: no driver")
+    assert [text for text in ("# environment\n\nfound by full", *said) if text not in page] == []
+    stopped = (out / "lifting.md").read_text()
+    assert stopped.startswith("# lifting\n\nfound by full\n\n## Machine\n\n# environment")
+    assert not (out / "opengl.md").exists()
+
+
+def test_what_needs_gsplat_is_not_begun_where_it_does_not_work(
+    fake_sections: Path, runner: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    main = fake_sections / "gpu_sections.py"
+    main.write_text(main.read_text().replace("'gradients'", "'environment'"))
+    monkeypatch.setattr(runner, "SECTIONS", {"environment": 60, "gradients": 60, "opengl": 60})
+    monkeypatch.setattr(sys, "argv", ["run.py", "--out", str(fake_sections / "out")])
+    assert runner.main() == 1
+    page = (fake_sections / "out" / "README.md").read_text()
+    assert "skipped: gsplat does not work here" in page
+
+
+@pytest.mark.parametrize("words", [["--minutes", "0"], ["--only", "raster,tables"], ["--plan", "huge"]])
+def test_unusable_arguments(
+    words: list[str], runner: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["run.py", *words])
+    with pytest.raises(SystemExit) as stop:
+        runner.main()
+    assert stop.value.code == 2
+    assert words[0] in capsys.readouterr().err
+
+
+def test_every_section_has_a_function_and_a_row_in_the_docs(runner: ModuleType, sections: ModuleType) -> None:
+    page = (PACKAGING.parent / "docs" / "speed.md").read_text()
+    for name, limit in runner.SECTIONS.items():
+        assert callable(getattr(sections, f"measure_{name}"))
+        assert f"| {name} | {limit} |" in page
+
+
+def test_the_wheels_are_those_of_the_constraints() -> None:
+    constraints = (PACKAGING / "constraints.txt").read_text().split()
+    for line in ("torch==2.13.0", "gsplat==1.5.3"):
+        assert line in constraints
+    assert "\ntorch==2.13.0\n" in (GPU / "requirements.txt").read_text()
+    assert "\ngsplat==1.5.3 " in (GPU / "beside_torch.txt").read_text()
+
+
+# The wheel without extras, in an environment that holds what it declares and nothing else: it opens, draws,
+# searches and selects, and what needs an optional package ends with the line that installs it.
+
+PARTS = ("pyproject.toml", "README.md", "LICENSE", "langsplat_core", "app", "assets", "packaging/wheel")
+# Nothing but the environment's own packages.
+CLEAN = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+
+
+def with_all_it_needs(first: Distribution) -> list[Distribution]:
+    """Every distribution that `first` requires on this machine, directly or not, extras left out."""
+    found: dict[str, Distribution] = {}
+    waiting = [first]
+    while waiting:
+        for needed in map(Requirement, waiting.pop().requires or []):
+            here = needed.marker is None or needed.marker.evaluate({"extra": ""})
+            if here and needed.name.lower() not in found:
+                found[needed.name.lower()] = distribution(needed.name)
+                waiting.append(found[needed.name.lower()])
+    return list(found.values())
+
+
+@pytest.fixture(scope="module")
+def light(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of programs of an environment with the wheel, and links to the packages it requires."""
+    work = tmp_path_factory.mktemp("light")
+    source = work / "source"
+    left_out = shutil.ignore_patterns("__pycache__", "*.egg-info")
+    for part in PARTS:
+        (source / part).parent.mkdir(parents=True, exist_ok=True)
+        if (PACKAGING.parent / part).is_dir():
+            shutil.copytree(PACKAGING.parent / part, source / part, symlinks=True, ignore=left_out)
+        else:
+            shutil.copy(PACKAGING.parent / part, source / part)
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
+    build = ["wheel", "--no-deps", "--no-index", "--no-build-isolation", "--wheel-dir", work, source]
+    subprocess.run([*pip, *build], check=True, env=CLEAN)
+    (wheel,) = work.glob("*.whl")
+    venv.create(work / "env")
+    programs = work / "env" / "bin"
+    install = ["--python", programs / "python", "install", "--no-deps", "--no-index", "--no-compile", wheel]
+    subprocess.run([*pip, *install], check=True, env=CLEAN)
+    (packages,) = (work / "env").glob("lib/python*/site-packages")
+    (ours,) = packages.glob("langsplat_viewer-*.dist-info")
+    for package in with_all_it_needs(Distribution.at(ours)):
+        for top in {Path(file).parts[0] for file in package.files or []} - {"..", "__pycache__"}:
+            if not (packages / top).exists():
+                (packages / top).symlink_to(package.locate_file(top))
+    return programs
+
+
+def run(light: Path, program: str, *options: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [light / program, *options]
+    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=light.parent, env=CLEAN)
+
+
+@pytest.mark.long
+def test_it_holds_none_of_the_optional_packages(light: Path) -> None:
+    look = "import importlib.util as i, sys; print(*[n for n in sys.argv[1:] if i.find_spec(n)])"
+    found = run(light, "python", "-c", look, "numpy", "langsplat_assets", *EXTRAS)
+    assert found.stdout.split() == ["numpy", "langsplat_assets"]
+
+
+@pytest.mark.long
+def test_a_scene_is_drawn_and_searched(light: Path, tmp_path: Path) -> None:
+    out = tmp_path / "heat.png"
+    # OpenGL: the CPU's kernels would be compiled for this environment alone.
+    asked = ("--query", "keyboard", "--backend", "opengl", "--size", "320x240")
+    done = run(light, "langsplat-viewer", "--headless", "--out", out, *asked)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "'keyboard': found" in done.stdout
+    assert np.asarray(Image.open(out)).std() > 10
+
+
+@pytest.mark.long
+def test_what_is_found_is_selected(light: Path, tmp_path: Path) -> None:
+    scene = next(light.parent.glob("lib/python*/site-packages/langsplat_assets/demo/scene.ply"))
+    done = run(light, "langsplat", "select", scene, "keyboard", "--out", tmp_path / "keyboard.ply")
+    assert done.returncode == 0, done.stderr
+    assert 300 < len(load_scene(tmp_path / "keyboard.ply").gaussians.means) < 3000
+
+
+@pytest.mark.long
+def test_a_missing_package_ends_in_the_line_that_installs_it(light: Path, tmp_path: Path) -> None:
+    for number in range(3):
+        Image.new("RGB", (32, 24), (number, 0, 0)).save(tmp_path / f"{number}.png")
+    done = run(light, "langsplat", "train", tmp_path, "--out", tmp_path / "scene.ply")
+    assert done.returncode == 2
+    found = re.fullmatch(
+        r'langsplat: this needs (\w+): pip install "langsplat-viewer\[(\w+)\]"', done.stderr.strip()
+    )
+    assert found is not None, done.stderr
+    assert EXTRAS[found[1]] == found[2]

@@ -1,4 +1,4 @@
-"""`langsplat query`, `select`, `describe` and `scale`."""
+"""`langsplat query`, `select`, `describe`, `scale`, `find` and `changes`."""
 
 import json
 import os
@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from plyfile import PlyData
 
-from langsplat_core.cli import describe, query
+from langsplat_core.cli import describe, find, query
 from langsplat_core.cli.edit import Scale
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.scenes import load_scene, save_scene
@@ -39,13 +40,11 @@ from tests.support.fakes import (
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The working folder, with a scene of a mug, a book and a plant. In its phrasebook are also "pair", both
     mug and plant, and "void", which is nothing."""
-    scene = blob_scene(phrasebook=True)
-    assert scene.language is not None
     pair = ((axis(0) + axis(2)) / np.sqrt(2)).astype(np.float32)
-    known = dict(scene.language.phrasebook) | {"pair": pair, "void": axis(6)}
-    extras = {"label": np.arange(len(scene.gaussians), dtype=np.int32)}
-    field = replace(scene.language, phrasebook=known)
-    save_scene(tmp_path / "a.ply", replace(scene, language=field, extras=extras, metres_per_unit=0.5))
+    field = replace(language(), phrasebook={"book": axis(1), "pair": pair, "void": axis(6)})
+    extras = {"label": np.arange(3 * PER_BLOB, dtype=np.int32)}
+    scene = replace(blob_scene(), language=field, extras=extras, metres_per_unit=0.5)
+    save_scene(tmp_path / "a.ply", scene)
     monkeypatch.chdir(tmp_path)
     for module in (query, describe):
         monkeypatch.setattr(module, "load_text_encoder", lambda name: FakeEncoder())
@@ -84,10 +83,8 @@ print([name for name in ("torch", "transformers") if name in sys.modules])
 @pytest.mark.long
 def test_phrases_of_the_phrasebook_need_no_encoder(tmp_path):
     """However they are written: loading one imports torch, which takes seconds."""
-    save_scene(
-        tmp_path / "a.ply",
-        Scene(blobs(), replace(language(), phrasebook={"book": axis(1), "plant pot": axis(2)}), cameras(1)),
-    )
+    field = replace(language(), phrasebook={"book": axis(1), "plant pot": axis(2)})
+    save_scene(tmp_path / "a.ply", Scene(blobs(), field, cameras(1)))
     done = subprocess.run(
         [sys.executable, "-c", ASK], cwd=tmp_path, env=os.environ, capture_output=True, text=True
     )
@@ -218,10 +215,8 @@ def test_structure_is_read_unless_the_phrase_is_asked_whole(folder, capsys):
     assert said[0].startswith("mug or plant: found")
     assert said[1] == f"  read as: {answer['reading']}" == "  read as: mug  or  plant"
     assert len(answer["instances"]) == 2
-    whole, plain = (
-        answers(capsys, "query", "b.ply", *words)[0]
-        for words in (("mug near the plant", "--whole"), ("plant",))
-    )
+    (whole,) = answers(capsys, "query", "b.ply", "mug near the plant", "--whole")
+    (plain,) = answers(capsys, "query", "b.ply", "plant")
     assert (whole["reading"], plain["reading"]) == (None, None)
     assert whole["place"][0] == pytest.approx(0, abs=0.2)  # what the phrasebook says of the whole phrase
 
@@ -290,10 +285,8 @@ def test_points_and_hulls(folder, capsys):
     assert vertex["red"].mean() > 190 > 60 > vertex["green"].mean() > 40
     assert run("select", "a.ply", "pair", "--out", "h.obj", "--as", "hull") == 0
     assert "h.obj: 2 closed hulls" in capsys.readouterr().out
-    assert [line for line in Path("h.obj").read_text().splitlines() if line[0] == "o"] == [
-        "o pair_1",
-        "o pair_2",
-    ]
+    named = [line for line in Path("h.obj").read_text().splitlines() if line[0] == "o"]
+    assert named == ["o pair_1", "o pair_2"]
     assert run("select", "a.ply", "mug", "--out", "rest.ply", "--as", "points", "--remove") == 0
     assert len(PlyData.read("rest.ply")["vertex"]["x"]) >= 2 * PER_BLOB
 
@@ -335,10 +328,9 @@ def described(folder: Path) -> Path:
     save_scene("named.ply", scene)
     save_scene("plain.ply", Scene(scene.gaussians))
     save_scene("blind.ply", replace(scene, cameras=()))
-    Path("list.txt").write_text("\n".join([*NAMES, "sofa"]))
-    Path("empty.txt").write_text("# nothing\n")
-    Path("bad.txt").write_text("mug\n???\n")
-    Path("sofas.txt").write_text("sofa\n")
+    lists = {"empty": "# nothing", "bad": "mug\n???", "sofas": "sofa", "list": "\n".join([*NAMES, "sofa"])}
+    for name, text in lists.items():
+        Path(f"{name}.txt").write_text(text)
     return folder
 
 
@@ -430,3 +422,86 @@ def test_bad_input_is_one_line_and_nothing_is_written(described, capsys, words, 
     out = ("--out", "b.ply") if words.startswith("select") and "--out" not in words else ()
     assert message in refusal(capsys, *words.split(), *out)
     assert sorted(path.name for path in described.iterdir()) == before
+
+
+# `langsplat find` and `langsplat changes`.
+
+
+@pytest.fixture
+def scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working folder; in "scans" a scene with mug, book and plant, and one without the mug."""
+    (tmp_path / "scans" / "<b>&").mkdir(parents=True)
+    save_scene(tmp_path / "scans" / "whole.ply", named_scene())
+    fewer = named_scene().take(np.arange(PER_BLOB, 3 * PER_BLOB))
+    save_scene(tmp_path / "scans" / "<b>&" / "fewer.ply", fewer)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(find, "load_text_encoder", lambda name: FakeEncoder())
+    return tmp_path
+
+
+def test_find_lists_the_scenes_that_have_it(scans, capsys):
+    assert run("find", "mug", "book", "scans", "--json") == 0
+    mug, book = json.loads(capsys.readouterr().out)
+    assert (mug["phrase"], mug["found"], mug["not_here"]) == ("mug", 1, 1)
+    assert [scene["scene"] for scene in mug["scenes"]] == ["whole.ply"]
+    np.testing.assert_allclose(mug["scenes"][0]["place"], (-1.2, 0, 0), atol=0.2)
+    assert book["found"] == 2
+    assert run("find", "mug", "scans", "--all") == 0
+    text = capsys.readouterr().out
+    assert "found in 1 of 2 scenes" in text
+    assert "fewer.ply: not here" in text
+
+
+def test_sheets_show_every_answer_and_escape_names(scans):
+    assert run("find", "book", "scans", "--sheet", "sheet.html") == 0
+    text = (scans / "sheet.html").read_text()
+    assert text.count("<img") == 2
+    assert "&lt;b&gt;&amp;/fewer.ply" in text
+    assert "<b>" not in text
+    assert run("find", "book", "scans", "--sheet", "sheet.png") == 0
+    picture = np.asarray(Image.open(scans / "sheet.png"))
+    assert picture.shape[1] > 4 * 320
+    assert np.ptp(picture[60:200, 20:600].astype(int)) > 100
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["mug"], "phrases and a folder"),
+        (["mug", "elsewhere"], "no such folder"),
+        (["mug", "scans", "--sheet", "sheet.txt"], ".html"),
+        (["the", "scans"], "the"),
+    ],
+)
+def test_find_says_what_is_wrong_in_a_line(scans, capsys, words, said):
+    assert said in refusal(capsys, "find", *words)
+    assert not (scans / "sheet.txt").exists()
+
+
+def test_changes_are_said_in_words_and_in_json(scans, capsys):
+    pair = "scans/whole.ply", "scans/<b>&/fewer.ply"
+    assert run("changes", *pair) == 0
+    assert capsys.readouterr().out.startswith("gone: ")
+    assert run("changes", pair[0], pair[0]) == 0
+    assert capsys.readouterr().out.strip() == "nothing changed"
+    scene = named_scene()
+    sh = scene.gaussians.sh.copy()
+    sh[:PER_BLOB] = sh[2 * PER_BLOB :]
+    save_scene(scans / "painted.ply", replace(scene, gaussians=replace(scene.gaussians, sh=sh)))
+    assert run("changes", pair[0], "painted.ply") == 0
+    assert "red to blue" in capsys.readouterr().out
+    (scans / "placed.json").write_text(json.dumps({"matrix": np.eye(4).tolist()}))
+    assert run("changes", pair[0], "painted.ply", "--transform", "placed.json", "--json") == 0
+    (change,) = json.loads(capsys.readouterr().out)["changes"]
+    assert (change["kind"], change["colours"]) == ("recoloured", ["red", "blue"])
+    both = "--transform", "placed.json", "--register"
+    assert "leave one of them out" in refusal(capsys, "changes", pair[0], "painted.ply", *both)
+
+
+@pytest.mark.parametrize(
+    "text", ["[[1]]", "{}", "[[1, 2], [3]]", '"x"', "[" * 50, '{"matrix": [[0,0,0,0]]}', '{"matrix": 3}']
+)
+def test_a_transform_that_is_none_is_refused(scans, capsys, text):
+    (scans / "placed.json").write_text(text)
+    words = "scans/whole.ply", "scans/whole.ply", "--transform", "placed.json"
+    assert "placed.json" in refusal(capsys, "changes", *words)

@@ -48,8 +48,7 @@ def test_scenes_of_a_folder_are_those_that_can_be_searched(folder, tmp_path):
 def test_what_is_there_is_found_in_metres_and_what_is_not_is_said_so(folder):
     door = Door(scene_files(folder))
     answer = door.find("mug", "a.ply")
-    assert answer["verdict"] == "found"
-    assert answer["unit"] == "m"
+    assert (answer["verdict"], answer["unit"]) == ("found", "m")
     np.testing.assert_allclose(answer["place"], 2 * middle(0), atol=0.3)
     assert door.count("mug", "a.ply")["least"] >= 1
     apart = door.distance("mug", "book", "a.ply")

@@ -13,7 +13,7 @@ from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.scene import Scene
 from tests.support.commands import refusal, run
 from tests.support.comparing import assert_same_field
-from tests.support.fakes import PER_BLOB, axis, blob_scene, named_scene
+from tests.support.fakes import PER_BLOB, axis, language, named_scene
 
 SCENE = named_scene()
 
@@ -35,7 +35,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     is no encoder."""
     for name in ("a.ply", "b.ply"):
         save_scene(tmp_path / name, SCENE)
-    assert SCENE.language is not None
     other = replace(SCENE.language, encoder_id="other", canonical=np.tile(axis(5), (4, 1)))
     save_scene(tmp_path / "other.ply", replace(SCENE, language=other))
     save_scene(tmp_path / "blind.ply", replace(SCENE, cameras=()))
@@ -136,11 +135,9 @@ def test_bad_input_is_one_line_and_nothing_is_written(folder, capsys, monkeypatc
 
 
 def test_a_taught_word_may_be_a_part(folder, capsys):
-    field = blob_scene().language
-    assert field is not None
-    latents = field.latents.copy()
-    latents[1] = latents[2]
-    save_scene("parts.ply", Scene(SCENE.gaussians, replace(field, latents=latents), SCENE.cameras))
+    field = language()
+    field.latents[1] = field.latents[2]
+    save_scene("parts.ply", Scene(SCENE.gaussians, field, SCENE.cameras))
     assert run("teach", "parts.ply", "--name", "knob", "--at", MUG, "--level", "part") == 0
     (answer,) = asked(capsys, "parts.ply", "knob")
     assert (answer["level"], answer["found"]) == ("part", True)

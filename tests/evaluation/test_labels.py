@@ -9,18 +9,10 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 
 from langsplat_core.errors import FormatError, InputError
+from langsplat_core.evaluation import scannet
 from langsplat_core.evaluation.labels import read_3d_ovs, read_lerf_ovs, without_suffix
 from langsplat_core.evaluation.report import Subject
-from langsplat_core.evaluation.scannet import (
-    CLASS_SETS,
-    NYU40,
-    point_table,
-    read_points,
-    read_scannet,
-    run_scannet,
-    save_point_json,
-    scene_classes,
-)
+from langsplat_core.evaluation.scannet import NYU40, read_points, read_scannet, run_scannet
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import Scene
@@ -100,10 +92,8 @@ def test_3d_ovs(tmp_path):
     ovs_view(scene, "00", {"red cup": block(1, 1, 8, 8), "wall": block(0, 20, 39, 29)})
     ovs_view(scene, "1.5", {"wall": block(0, 0, 3, 3)})
     found = only_scene(read_3d_ovs(tmp_path))
-    assert [(f.name, f.size, [x.phrase for x in f.labels]) for f in found.frames] == [
-        ("00", SIZE, ["red cup", "wall"]),
-        ("1.5", SIZE, ["wall"]),
-    ]
+    frames = [(f.name, f.size, [x.phrase for x in f.labels]) for f in found.frames]
+    assert frames == [("00", SIZE, ["red cup", "wall"]), ("1.5", SIZE, ["wall"])]
     assert found.frames[1].photograph.name == "1.5.jpg"
     np.testing.assert_array_equal(found.frames[0].labels[0].truth.draw(SIZE), block(1, 1, 8, 8))
     assert only_scene(read_3d_ovs(scene)).name == found.name == "bench"
@@ -157,15 +147,18 @@ def test_no_layout_at_all(read, tmp_path):
 NAME = "scene0000_00"
 
 
-def write_labels(folder, positions, labels):
+def write_vertices(folder, table):
     folder.mkdir(parents=True, exist_ok=True)
-    table = np.empty(len(labels), [("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("label", "u2")])
-    for column, name in enumerate("xyz"):
-        table[name] = np.asarray(positions)[:, column]
-    table["label"], table["red"] = labels, 0
     path = folder / f"{NAME}_vh_clean_2.labels.ply"
     PlyData([PlyElement.describe(table, "vertex")]).write(str(path))
     return path
+
+
+def write_labels(folder, positions, labels):
+    table = np.zeros(len(labels), [("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("label", "u2")])
+    table["x"], table["y"], table["z"] = np.transpose(positions)
+    table["label"] = labels
+    return write_vertices(folder, table)
 
 
 @pytest.fixture
@@ -188,21 +181,20 @@ def test_means_over_the_classes_that_are_there(labelled):
     report = run(labelled, [wall, wall, wall, bed, bed, bed, bed, picture, 0, wall])
     nineteen, fifteen, ten = report.scores
     assert (nineteen.classes, nineteen.present, nineteen.points) == (19, 3, 9)
-    assert nineteen.iou == pytest.approx((3 / 4 + 3 / 4 + 1 / 2) / 3)
-    assert nineteen.accuracy == pytest.approx((3 / 4 + 1 + 1 / 2) / 3)
+    iou, accuracy = (3 / 4 + 3 / 4 + 1 / 2) / 3, (3 / 4 + 1 + 1 / 2) / 3
+    assert (nineteen.iou, nineteen.accuracy) == pytest.approx((iou, accuracy))
     for score, classes in ((fifteen, 15), (ten, 10)):  # without pictures
         assert (score.classes, score.present, score.points) == (classes, 2, 7)
-        assert score.iou == pytest.approx(3 / 4)
-        assert score.accuracy == pytest.approx(7 / 8)
-    assert "| macro, mean of scenes | 19 |" in point_table(report)
-    assert "fixed before a label was read" in point_table(report)
+        assert (score.iou, score.accuracy) == pytest.approx((3 / 4, 7 / 8))
+    assert "| macro, mean of scenes | 19 |" in scannet.point_table(report)
+    assert "fixed before a label was read" in scannet.point_table(report)
 
 
 def test_json_and_nested_class_sets(labelled, tmp_path):
-    save_point_json(tmp_path / "out.json", run(labelled, np.full(10, 1)))
+    scannet.save_point_json(tmp_path / "out.json", run(labelled, np.full(10, 1)))
     said = json.loads((tmp_path / "out.json").read_text())
     assert said["scores"][0]["accuracy"] == pytest.approx(1 / 3)
-    nineteen, fifteen, ten = (set(names) for names in CLASS_SETS)
+    nineteen, fifteen, ten = (set(names) for names in scannet.CLASS_SETS)
     assert [len(nineteen), len(fifteen), len(ten)] == [19, 15, 10]
     assert ten < fifteen < nineteen
 
@@ -210,17 +202,15 @@ def test_json_and_nested_class_sets(labelled, tmp_path):
 def test_vertices_take_the_nearest_meaning(tmp_path):
     """The blobs are called wall, floor and bed; vertices stand near their middles."""
     known = {name: axis(3) for name in NYU40} | {"wall": axis(0), "floor": axis(1), "bed": axis(2)}
-    field = language()
-    confidence = field.confidence.copy()
-    confidence[1] = 0  # at part level all blobs are alike
-    field = replace(field, phrasebook=known, confidence=confidence)
+    field = replace(language(), phrasebook=known)
+    field.confidence[1] = 0  # at part level all blobs are alike
     save_scene(tmp_path / f"{NAME}.ply", Scene(blobs(), field))
     positions = np.repeat(CENTRES, 2, 0) + 0.01
     names = ["wall", "wall", "floor", "floor", "bed", "sofa"]  # the last is called bed
     write_labels(tmp_path / "data", positions, [NYU40[name] for name in names])
     report = run_scannet(read_scannet(tmp_path / "data"), Subject(scene=tmp_path), None)
-    assert report.scores[0].iou == pytest.approx((1 + 1 + 1 / 2 + 0) / 4)
-    assert report.scores[0].accuracy == pytest.approx(3 / 4)
+    score = report.scores[0]
+    assert (score.iou, score.accuracy) == pytest.approx(((1 + 1 + 1 / 2 + 0) / 4, 3 / 4))
 
 
 def test_words_that_the_encoder_lacks_are_wrong_everywhere(tmp_path):
@@ -233,7 +223,7 @@ def test_words_that_the_encoder_lacks_are_wrong_everywhere(tmp_path):
 
     engine = QueryEngine(Scene(blobs(), language()), lambda _: Half())
     path = write_labels(tmp_path, CENTRES, [NYU40["bathtub"]] * 3)
-    found, unknown = scene_classes(engine, read_points(path, NAME))
+    found, unknown = scannet.scene_classes(engine, read_points(path, NAME))
     assert unknown == ("bathtub",)
     assert not any((ids == NYU40["bathtub"]).any() for ids in found)
 
@@ -247,9 +237,7 @@ def test_maps_of_another_length(labelled, ids):
 def test_other_layouts(labelled, tmp_path):
     with pytest.raises(InputError, match="not in the layout of ScanNet"):
         read_scannet(tmp_path / "absent")
-    path = tmp_path / f"{NAME}_vh_clean_2.labels.ply"
-    table = np.zeros(3, [("x", "f4"), ("y", "f4"), ("z", "f4")])
-    PlyData([PlyElement.describe(table, "vertex")]).write(str(path))
+    path = write_vertices(tmp_path, np.zeros(3, [("x", "f4"), ("y", "f4"), ("z", "f4")]))
     with pytest.raises(FormatError, match="lack x, y, z or label"):
         read_points(path, NAME)
     with pytest.raises(InputError, match="--only other"):

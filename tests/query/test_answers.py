@@ -8,22 +8,7 @@ import pytest
 
 from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.query import answers
-from langsplat_core.query.answers import (
-    ADVANTAGE,
-    FARTHEST,
-    FOUND,
-    NEAREST,
-    PARTS,
-    REACH,
-    Bar,
-    QueryResult,
-    bars,
-    by_peak,
-    by_regions,
-    chance_in,
-    excess,
-    with_parts,
-)
+from langsplat_core.query.answers import Bar, QueryResult, bars, by_peak, by_regions
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import Named
 from langsplat_core.query.selection import Regions, build_regions
@@ -52,7 +37,7 @@ def asked(
     if rule == "peak":
         return by_peak(phrase, relevancy, surface, scale, field.reading.found, level)
     regions, calibration = regions_of(Scene(gaussians, field), surface), field.reading.calibration
-    by_chance = bars(chance_in(field, regions, replace(scale, everyday=field.everyday[:9])))
+    by_chance = bars(answers.chance_in(field, regions, replace(scale, everyday=field.everyday[:9])))
     return by_regions(phrase, relevancy, gaussians.means, regions, scale, by_chance, calibration, level)
 
 
@@ -78,18 +63,6 @@ def test_whatever_is_asked_the_answer_is_sound(kind, rule, level):
     np.testing.assert_allclose(sigmoid(rate * np.array(result.fits)), result.scores, atol=1e-5)
 
 
-def test_an_answer_by_regions_has_their_borders():
-    engine = QueryEngine(Scene(random_gaussians(400), random_field(400, "linear")))
-    result = engine.run("red mug")
-    rows = engine.surface.rows
-    of = engine.regions.everywhere[result.level, rows]
-    members, even = result.members[rows], result.even[rows]
-    for number in range(of.max() + 1):
-        assert len(set(zip(members[of == number], even[of == number], strict=True))) == 1
-    assert even[members].min() > even[~members].max()
-    assert even.max() == pytest.approx(result.peak, abs=1e-6)
-
-
 @pytest.mark.parametrize("rule", RULES)
 def test_the_answer_is_the_thing(rule):
     engine = QueryEngine(blob_scene(), lambda _: FakeEncoder(), rule=rule)
@@ -97,8 +70,7 @@ def test_the_answer_is_the_thing(rule):
     assert (result.level, result.found, result.verdict) == (2, True, "found")
     np.testing.assert_array_equal(np.flatnonzero(result.members), np.arange(PER_BLOB, 2 * PER_BLOB))
     np.testing.assert_allclose(result.place, CENTRES[1], atol=0.2)
-    low, high = result.box
-    assert ((low > CENTRES[1] - 0.7) & (high < CENTRES[1] + 0.7)).all()
+    assert (np.abs(result.box - CENTRES[1]) < 0.7).all()
 
     # As a whole a mug is there; among the parts nothing is more of a mug than of an object.
     assert engine.run("mug", "whole").found
@@ -159,10 +131,8 @@ def test_probability_is_of_being_there_at_all():
 
 
 def test_of_the_peak_the_best_relevancy_decides():
-    scene = blob_scene()
     for found, says in ((0.6, True), (0.9999, True), (1.0, False)):
-        field = replace(language(), reading=Reading(found=found))
-        scene = replace(scene, language=field)
+        scene = replace(blob_scene(), language=replace(language(), reading=Reading(found=found)))
         result = QueryEngine(scene, lambda _: FakeEncoder(), rule="peak").run("mug")
         assert (result.found, result.verdict) == (says, "found" if says else "not here")
 
@@ -185,8 +155,7 @@ def test_negative_fits_everywhere(rule):
 def test_almost_no_gaussians_and_no_meaning_anywhere(rule, calibration, count):
     field = replace(random_field(count), reading=Reading(calibration=calibration))
     if count > 1:
-        nothing = np.zeros_like(field.latents), np.zeros_like(field.confidence)
-        field = replace(field, latents=nothing[0], confidence=nothing[1])
+        field = replace(field, latents=0 * field.latents, confidence=0 * field.confidence)
     result = QueryEngine(Scene(random_gaussians(count), field), rule=rule).run("red mug")
     assert not result.found
     assert result.members.shape == (count,)
@@ -208,7 +177,7 @@ def test_fits_by_chance_are_those_of_looking_everyday_phrases_up(kind, monkeypat
     fits = engine.chance
     for number, vector in enumerate(engine.field.everyday):
         means = engine.regions.means(engine.relevancy(vector))
-        every = with_parts(engine.regions, tuple(map(engine.scale.fit, means)))
+        every = answers.with_parts(engine.regions, tuple(map(engine.scale.fit, means)))
         for level, want in enumerate(every):
             solid = engine.regions.sizes[level] >= SMALLEST
             np.testing.assert_allclose(fits[level][solid, number], want[solid], atol=TOLERANCE[kind])
@@ -229,11 +198,11 @@ def test_bars_are_quantiles_of_the_best_and_those_of_some_regions_are_lower():
     assert not np.isfinite(some[2].median)  # nothing is found where there is nothing
 
 
-@pytest.mark.parametrize("named", FOUND)
+@pytest.mark.parametrize("named", answers.FOUND)
 @pytest.mark.parametrize("level", ["auto", *LEVELS])
 def test_excess_is_counted_from_the_bars(named, level):
     rng = np.random.default_rng(1)
-    whole, finer = FOUND[named]
+    whole, finer = answers.FOUND[named]
     for fits in rng.normal(scale=4, size=(50, 3)).tolist():
         if level == "auto":
             by_whole = (fits[2] - BARS[2].median) / BARS[2].spread - whole
@@ -241,7 +210,7 @@ def test_excess_is_counted_from_the_bars(named, level):
         else:
             bar, fit = BARS[LEVELS.index(level)], fits[LEVELS.index(level)]
             want = (fit - bar.median) / bar.spread - min(whole, finer)
-        assert excess(tuple(fits), BARS, named, level) == pytest.approx(want)
+        assert answers.excess(tuple(fits), BARS, named, level) == pytest.approx(want)
     assert np.isfinite(Bar(0.3, 0.0).excess(0.3, 1.0))  # without width
 
 
@@ -297,27 +266,29 @@ def plain_extent(fits, sizes, level: str, named: Named) -> tuple[int, list[bool]
     """The level and the regions that answer."""
     solid = [n for n, size in enumerate(sizes) if size >= SMALLEST] or list(range(len(sizes)))
     best = [max(row[n] for n in solid) for row in fits]
-    given = [value + more for value, more in zip(best, ADVANTAGE[named], strict=True)]
+    given = [value + more for value, more in zip(best, answers.ADVANTAGE[named], strict=True)]
     chosen = given.index(max(given)) if level == "auto" else LEVELS.index(level)
-    limit = best[chosen] - min(max(REACH * best[chosen], NEAREST), FARTHEST)
+    limit = best[chosen] - min(max(answers.REACH * best[chosen], answers.NEAREST), answers.FARTHEST)
     return chosen, [value >= limit for value in fits[chosen]]
 
 
-@pytest.mark.parametrize(("level", "named"), [*product(["auto"], ADVANTAGE), *product(LEVELS, ["part"])])
+@pytest.mark.parametrize(
+    ("level", "named"), [*product(["auto"], answers.ADVANTAGE), *product(LEVELS, ["part"])]
+)
 @pytest.mark.parametrize("middle", [-2.0, 0.0, 1.0])
 def test_the_extent_is_that_of_the_plain_rule(surface, level, named, middle):
     rng = np.random.default_rng(0)
     count = len(surface.rows)
     for _ in range(30):
-        sizes = (*rng.integers(3, 30, 9).tolist(),)
+        sizes = rng.integers(3, 30, 9).tolist()
         sizes = (*sizes, count - sum(sizes))
         fits = middle + rng.normal(size=(3, len(sizes)))
         regions = regions_by(surface, sizes)
         got = answer_of(surface, spread_out(surface, regions, fits), regions, level, named)
         solid = np.array(sizes) >= SMALLEST  # every region has one part, all of it; of crumbs it says nothing
-        fits[1:, solid] = (1 - PARTS) * fits[1:, solid] + PARTS * fits[:-1, solid]
+        fits[1:, solid] = (1 - answers.PARTS) * fits[1:, solid] + answers.PARTS * fits[:-1, solid]
         chosen, answering = plain_extent(fits, sizes, level, named)
-        of, solid = regions.everywhere[chosen, surface.rows], np.array(sizes) >= SMALLEST
+        of = regions.everywhere[chosen, surface.rows]
         assert got.level == chosen
         np.testing.assert_array_equal(got.members[surface.rows], np.array(answering)[of])
         np.testing.assert_allclose(got.fits, fits[:, solid].max(1), atol=1e-5)

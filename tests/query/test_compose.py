@@ -7,26 +7,10 @@ from hypothesis import strategies as st
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.query import grammar
 from langsplat_core.query.compose import Body, body, most, run_phrase, separate, stands, upright, viewpoint
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.grammar import (
-    MAX_ATOMS,
-    MAX_CHARACTERS,
-    Atom,
-    Both,
-    Counted,
-    Inside,
-    Relation,
-    Superlative,
-    Union,
-    Without,
-    atoms,
-    heads,
-    named,
-    parse,
-    singular,
-    unparse,
-)
+from langsplat_core.query.grammar import Atom, Both, Counted, Inside, Relation, Superlative, Union, Without
 from langsplat_core.scene import NO_NODE, look_at
 from langsplat_core.scene.language import split_phrases
 from langsplat_core.scene.surface import build_surface
@@ -82,27 +66,26 @@ READ |= {text: Atom(text) for text in ASKED_WHOLE}
 
 @pytest.mark.parametrize("text", READ)
 def test_what_is_read(text):
-    assert parse(text) == READ[text]
+    assert grammar.parse(text) == READ[text]
 
 
 @pytest.mark.parametrize("text", ["", " \n\t", "'?!'", "the", "of the", "and", "\u200b", "\x00"])
-def test_what_names_nothing_is_refused_in_one_line(text):
-    with pytest.raises(InputError) as refused:
-        parse(text)
-    assert "\n" not in str(refused.value)
+def test_what_names_nothing_is_refused(text):
+    with pytest.raises(InputError):
+        grammar.parse(text)
 
 
 @pytest.mark.parametrize("text", ["not cup", "not", "without the mug", ", not red", "except the mug"])
 def test_a_negative_phrase_needs_a_positive(text):
     with pytest.raises(InputError, match="what not to look for"):
-        parse(text)
+        grammar.parse(text)
 
 
 def test_a_text_without_end_is_refused():
-    with pytest.raises(InputError, match=f"10000 characters; use at most {MAX_CHARACTERS}"):
-        parse("mug " * 2500)
-    with pytest.raises(InputError, match=f"at most {MAX_ATOMS}"):
-        parse(" and ".join(["mug"] * (MAX_ATOMS + 1)))
+    with pytest.raises(InputError, match=f"10000 characters; use at most {grammar.MAX_CHARACTERS}"):
+        grammar.parse("mug " * 2500)
+    with pytest.raises(InputError, match=f"at most {grammar.MAX_ATOMS}"):
+        grammar.parse(" and ".join(["mug"] * (grammar.MAX_ATOMS + 1)))
 
 
 @pytest.mark.parametrize(
@@ -111,14 +94,14 @@ def test_a_text_without_end_is_refused():
     + [("Chairs", "Chair"), ("scissors", "scissors"), ("cactus", "cactus"), ("benches", "bench")],
 )
 def test_things_are_counted_in_the_singular(plural, one):
-    assert singular(plural) == one
+    assert grammar.singular(plural) == one
 
 
 def test_readings_show_the_structure():
-    assert unparse(parse("red mug handle")) == "handle  inside  red mug"
-    assert unparse(parse("biggest mug on the table")) == "biggest  (mug  on  table)"
-    assert unparse(parse("mug nearest to the book")) == "nearest  mug  from  book"
-    assert unparse(parse("mug or cup, not red cup")) == "(mug  or  cup)  without  red cup"
+    assert grammar.unparse(grammar.parse("red mug handle")) == "handle  inside  red mug"
+    assert grammar.unparse(grammar.parse("biggest mug on the table")) == "biggest  (mug  on  table)"
+    assert grammar.unparse(grammar.parse("mug nearest to the book")) == "nearest  mug  from  book"
+    assert grammar.unparse(grammar.parse("mug or cup, not red cup")) == "(mug  or  cup)  without  red cup"
 
 
 WORDS = st.sampled_from(
@@ -134,16 +117,16 @@ def test_every_text_is_read_or_refused(text):
     """Nothing but InputError is raised, every phrase of a tree says something, and a reading shows it."""
     for query in [text, *split_phrases(text)]:
         try:
-            tree = parse(query)
+            tree = grammar.parse(query)
         except InputError:
             continue
-        assert all(atom.text.strip() and atom.text in unparse(tree) for atom in atoms(tree))
+        assert all(atom.text.strip() and atom.text in grammar.unparse(tree) for atom in grammar.atoms(tree))
 
 
 def test_what_is_asked_for_is_told_from_what_it_is_related_to():
-    assert heads(parse("biggest red mug on the table")) == ("red mug",)
-    assert heads(parse("mug, not red mug")) == ("mug",)
-    assert heads(parse("mug or handle of the cup")) == ("mug", "handle")
+    assert grammar.heads(grammar.parse("biggest red mug on the table")) == ("red mug",)
+    assert grammar.heads(grammar.parse("mug, not red mug")) == ("mug",)
+    assert grammar.heads(grammar.parse("mug or handle of the cup")) == ("mug", "handle")
 
 
 NAMED = {
@@ -155,7 +138,7 @@ NAMED = {
 
 @pytest.mark.parametrize("what", NAMED)
 def test_a_part_word_at_the_end_names_a_part_and_a_thing_before_it_whose(what):
-    assert {named(phrase) for phrase in NAMED[what]} == {what}
+    assert {grammar.named(phrase) for phrase in NAMED[what]} == {what}
 
 
 # Phrases with structure on a laid table, where every Gaussian's meaning is known.
@@ -218,16 +201,10 @@ def test_what_a_viewer_says_needs_one(table, text):
         run_phrase(table[0], text)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "handle of the book",
-        "book on the red mug",
-        "mug in the book",
-        "biggest handle on the book",
-        "nine mugs",
-    ],
-)
+NOT_SO = ("handle of the book", "book on the red mug", "mug in the book", "biggest handle on the book")
+
+
+@pytest.mark.parametrize("text", [*NOT_SO, "nine mugs"])
 def test_what_is_not_so_is_not_found(table, text):
     assert not run_phrase(table[0], text).answer.found
 

@@ -7,23 +7,10 @@ import pytest
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.query import describe
-from langsplat_core.query.describe import (
-    NEAREST,
-    Describer,
-    WordScores,
-    build_attributes,
-    build_words,
-    completions,
-    corrected,
-    hubs,
-    look_at_pixel,
-    meanings,
-    same_things,
-    suggest,
-)
+from langsplat_core.query.describe import Describer, build_attributes, build_words, hubs, meanings
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster import load_lifting_rasterizer
-from langsplat_core.scene import Gaussians, LanguageField, LinearCodec, Scene
+from langsplat_core.scene import LanguageField, LinearCodec, Scene
 from langsplat_core.scene.codec import CodebookCodec
 from langsplat_core.scene.surface import surface_areas
 from tests.support.fakes import (
@@ -38,6 +25,7 @@ from tests.support.fakes import (
     named_field,
     named_scene,
 )
+from tests.support.scenes import unturned_gaussians
 
 
 @pytest.fixture(autouse=True)
@@ -57,11 +45,9 @@ def test_every_blob_is_its_word(codebook):
     for number, word in enumerate(WORDS):
         rows = np.arange(number * PER_BLOB, (number + 1) * PER_BLOB)
         subpart, part, whole = asked.at_gaussians(rows)
-        assert subpart.words == ()
-        assert subpart.known == 0
-        assert whole.words[0].phrase == word
+        assert (subpart.words, subpart.known) == ((), 0)
+        assert (whole.words[0].phrase, whole.known) == (word, 1)
         assert whole.words[0].probability > 0.95
-        assert whole.known == 1
         assert sum(found.probability for found in whole.words) + whole.other == pytest.approx(1)
         if not codebook:  # at "part" all mean 0.8 of a canonical phrase and 0.6 of "plant"
             assert part.words[0].phrase == "plant"
@@ -110,7 +96,7 @@ def test_a_pixel_is_what_the_rows_of_w_say(codebook, backend):
         if weights.sum() <= 0.3:
             continue
         rasterizer = load_lifting_rasterizer(backend)
-        found = look_at_pixel(rasterizer, asked, camera, (column, row), results, top=4)
+        found = describe.look_at_pixel(rasterizer, asked, camera, (column, row), results, top=4)
         want = weights @ own / weights.sum()
         for word in found.words[2].words:
             assert word.probability == pytest.approx(want[names.phrases.index(word.phrase)], abs=1e-4)
@@ -125,7 +111,7 @@ def test_a_pixel_is_what_the_rows_of_w_say(codebook, backend):
             in_front = weights[depths < found.depth - 1e-9].sum()
             there = weights[np.abs(depths - found.depth) < 1e-6].sum()
             assert in_front < weights.sum() / 2 <= in_front + there
-    assert look_at_pixel(load_lifting_rasterizer(backend), asked, camera, (0, 0)) is None
+    assert describe.look_at_pixel(load_lifting_rasterizer(backend), asked, camera, (0, 0)) is None
 
 
 @pytest.mark.parametrize("codebook", [True, False])
@@ -134,13 +120,11 @@ def test_the_inventory_lists_what_is_there_where_it_is(codebook):
     assert set(entries) == set(WORDS)
     for centre, word in zip(CENTRES, WORDS, strict=True):
         entry = entries[word]
-        assert entry.level == 2
+        assert (entry.level, entry.share) == (2, pytest.approx(1 / 3, abs=0.02))
         assert entry.probability > 0.95
-        assert entry.share == pytest.approx(1 / 3, abs=0.02)
         (spot,) = entry.spots
         np.testing.assert_allclose(spot.centre, centre, atol=0.1)
-        assert (spot.box[0] < spot.centre).all()
-        assert (spot.centre < spot.box[1]).all()
+        assert ((spot.box[0] < spot.centre) & (spot.centre < spot.box[1])).all()
         assert len(spot.rows) > 0.95 * PER_BLOB
 
 
@@ -172,22 +156,18 @@ def test_groups_of_words_that_claim_the_same():
     cup = np.array([0.45, 0.4, 0.1, 0])
     vague = np.array([0.05, 0.1, 0.9, 0.4])  # everywhere a little: a name for neither
     names = np.stack([vague, mug, cup], 1)
-    assert same_things(names, surface) == [[0], [1, 2]]
-    assert same_things(np.zeros((0, 0)), np.zeros(0)) == []
+    assert describe.same_things(names, surface) == [[0], [1, 2]]
+    assert describe.same_things(np.zeros((0, 0)), np.zeros(0)) == []
 
 
 def test_surface_of_gaussians():
-    shape = named_scene().gaussians
-    scales = np.log(np.tile([0.3, 0.02, 0.1], (len(shape), 1)))
-    logits = np.zeros(len(shape))
-    means = shape.means.copy()
-    means[0] = np.nan
-    scales[1] = np.log(50.0)  # a veil
-    areas = surface_areas(Gaussians(means, scales, shape.quats_wxyz, logits, shape.sh))
-    np.testing.assert_allclose(areas[2:], 0.5 * 0.3 * 0.1, rtol=1e-5)
+    gaussians = unturned_gaussians(named_scene().gaussians.means, np.log([0.3, 0.02, 0.1]), 0.0)
+    gaussians.means[0] = np.nan
+    gaussians.log_scales[1] = np.log(50.0)  # a veil
+    areas = surface_areas(gaussians)
+    np.testing.assert_allclose(areas[1:], 0.5 * 0.3 * 0.1, rtol=1e-5)
     assert areas[0] == 0
-    assert areas[1] == pytest.approx(0.015)
-    assert len(surface_areas(shape.take(np.zeros(0, int)))) == 0
+    assert len(surface_areas(gaussians.take(np.zeros(0, int)))) == 0
 
 
 # Words of meanings, against a plain float64 reference.
@@ -221,7 +201,7 @@ def plain_probabilities(made: LanguageField, vectors: Array, latents: Array, ban
     hub = []
     for word in every:
         cosines = sorted((float(word @ meaning) for meaning in bank.astype(np.float64)), reverse=True)
-        hub.append(np.mean(cosines[:NEAREST]))
+        hub.append(np.mean(cosines[: describe.NEAREST]))
     spreads = [np.std([float(word @ meaning) for word in every[: len(vectors)]]) for meaning in bank]
     rows, scale = [], describe.WORD_SCALE / np.median(spreads)
     for vector in made.codec.decode(latents).astype(np.float64):
@@ -270,17 +250,17 @@ def test_a_word_that_is_near_everything_is_not_the_answer_everywhere():
     made = LanguageField(codes, np.ones((3, 40), np.float32), codec, far, "none")
     vectors = np.concatenate([names, centre[None].astype(np.float32)])
     labels = (*(f"thing {number}" for number in range(40)), "hub")
-    latents = codes[0]
-    right = (build_words(made, labels, vectors).best(codec, latents, 1)[0][:, 0] == np.arange(40)).mean()
-    plain = (build_attributes(made, labels, vectors).best(codec, latents, 1)[0][:, 0] == np.arange(40)).mean()
-    assert plain < 0.2
-    assert right > 0.8
+    plain, right = (
+        (build(made, labels, vectors).best(codec, codes[0], 1)[0][:, 0] == np.arange(40)).mean()
+        for build in (build_attributes, build_words)
+    )
+    assert plain < 0.2 < 0.8 < right
 
 
 def test_very_different_cosines_do_not_overflow():
     made = field("codebook")
     names, vectors = phrases()
-    words = WordScores(names, vectors, np.zeros(V, np.float32), 1e6)
+    words = describe.WordScores(names, vectors, np.zeros(V, np.float32), 1e6)
     found = words.probabilities(made.codec, made.latents[0])
     assert np.isfinite(found).all()
     np.testing.assert_allclose(found.sum(1), 1, atol=1e-5)
@@ -311,21 +291,19 @@ PHRASES = ("teddy bear", "tea pot", "red mug", "teapot", "mug")
 
 def test_every_example_is_found_in_the_scene():
     engine = QueryEngine(blob_scene(), lambda _: FakeEncoder())
-    found = suggest(engine)
-    assert {"mug", "book", "plant"} >= set(found.examples)
-    assert found.examples
+    found = describe.suggest(engine)
+    assert {"mug", "book", "plant"} >= set(found.examples) > set()
     assert all(engine.run(phrase).found for phrase in found.examples)
     assert set(found.examples) <= set(found.phrases)
-    assert len(suggest(engine, at_most=1).examples) == 1
+    assert len(describe.suggest(engine, at_most=1).examples) == 1
 
 
 def test_without_an_encoder_the_phrasebook_is_asked():
     nothing = (-axis(0) - axis(1) - axis(2)) / np.float32(np.sqrt(3))
     book = {"mug": axis(0), "unicorn": nothing, "of": axis(1)}
     scene = replace(blob_scene(), language=replace(language(), phrasebook=book))
-    found = suggest(QueryEngine(scene))
-    assert found.examples == ("mug",)
-    assert found.phrases == ("mug", "unicorn", "of")
+    found = describe.suggest(QueryEngine(scene))
+    assert (found.examples, found.phrases) == (("mug",), ("mug", "unicorn", "of"))
 
 
 @pytest.mark.parametrize(
@@ -342,10 +320,10 @@ def test_without_an_encoder_the_phrasebook_is_asked():
     ],
 )
 def test_what_is_typed_is_completed(typed, offered):
-    assert completions(typed, PHRASES) == offered
-    assert completions(typed, PHRASES, at_most=1) == offered[:1]
+    assert describe.completions(typed, PHRASES) == offered
+    assert describe.completions(typed, PHRASES, at_most=1) == offered[:1]
 
 
 def test_a_correction_replaces_the_unknown_words_alone():
-    assert corrected("the Red mugg", {"mugg": ("mug", "muff")}) == "the red mug"
-    assert corrected("red mugg", {"mugg": ()}) is None
+    assert describe.corrected("the Red mugg", {"mugg": ("mug", "muff")}) == "the red mug"
+    assert describe.corrected("red mugg", {"mugg": ()}) is None

@@ -21,20 +21,12 @@ from langsplat_core.query.selection import (
     project,
 )
 from langsplat_core.scene import NO_NODE, Gaussians, LanguageField, Scene, look_at
-from langsplat_core.scene.surface import (
-    BORDER,
-    NEIGHBOURS,
-    SCALE,
-    SMALLEST,
-    STEPS,
-    UNKNOWN,
-    Surface,
-    build_surface,
-)
+from langsplat_core.scene import surface as surfaces
+from langsplat_core.scene.surface import Surface, build_surface
 from langsplat_core.scene.tree import tree_of_wholes
 from tests.support.fakes import CENTRES, PER_BLOB, blob_scene
 from tests.support.file_samples import random_field
-from tests.support.scenes import random_gaussians, regions_of
+from tests.support.scenes import random_gaussians, regions_of, unturned_gaussians
 
 
 def test_smoothing_is_the_weighted_mean_of_the_nearest():
@@ -49,7 +41,7 @@ def test_smoothing_is_the_weighted_mean_of_the_nearest():
     assert sorted(surface.rows) == counted.tolist()
     for number, row in enumerate(surface.rows):
         distances = np.linalg.norm(gaussians.means[counted] - gaussians.means[row], axis=1)
-        near = counted[np.argsort(distances)[:NEIGHBOURS]]
+        near = counted[np.argsort(distances)[: surfaces.NEIGHBOURS]]
         want = (values[near] * opacity[near]).sum() / opacity[near].sum()
         np.testing.assert_allclose(smoothed[number], want, rtol=1e-5)
 
@@ -112,13 +104,7 @@ def patched(kind: str, seed: int = 0, things: bool = False) -> tuple[Gaussians, 
 def line(count: int, gaps: tuple[int, ...] = ()) -> Gaussians:
     """Opaque Gaussians in a row, a step apart; before those numbered in `gaps`, a thousand steps."""
     x = np.arange(count) + 1000.0 * np.isin(np.arange(count), gaps).cumsum()
-    return Gaussians(
-        means=np.stack([x, np.zeros(count), np.zeros(count)], 1),
-        log_scales=np.zeros((count, 3)),
-        quats_wxyz=np.tile([1.0, 0, 0, 0], (count, 1)),
-        opacity_logits=np.full(count, 3.0),
-        sh=np.zeros((count, 1, 3)),
-    )
+    return unturned_gaussians(np.stack([x, np.zeros(count), np.zeros(count)], 1), 0.0, 3.0)
 
 
 def links_of(surface: Surface) -> list[tuple[int, int]]:
@@ -130,7 +116,7 @@ def plain_step(field: LanguageField, level: int, a: int, b: int) -> float:
     """Between the meanings of two Gaussians of the scene."""
     known = field.known[level]
     if not (known[a] and known[b]):
-        return UNKNOWN if known[a] or known[b] else 0.0
+        return surfaces.UNKNOWN if known[a] or known[b] else 0.0
     one, other = field.codec.directions(field.latents[level][[a, b]]).astype(np.float64)
     return float(1 - one @ other / (np.linalg.norm(one) * np.linalg.norm(other)))
 
@@ -138,9 +124,7 @@ def plain_step(field: LanguageField, level: int, a: int, b: int) -> float:
 def plain_typical_step(surface: Surface, field: LanguageField, level: int) -> float:
     """Mean over all pairs of Gaussians with a meaning, each with itself included."""
     rows = [row for row in surface.rows if field.known[level][row]]
-    latents = field.latents[level][rows]
-    vectors = field.codec.directions(latents)
-    vectors = vectors.astype(np.float64)
+    vectors = field.codec.directions(field.latents[level][rows]).astype(np.float64)
     return float(np.mean(1 - vectors @ vectors.T))
 
 
@@ -154,10 +138,10 @@ def plain_regions(surface: Surface, field: LanguageField, level: int) -> list[in
         if above is not None and above[a] != above[b]:
             continue
         one, other = surface.rows[a], surface.rows[b]
-        step = min(max(plain_step(field, level, one, other), 0.0), UNKNOWN)
+        step = min(max(plain_step(field, level, one, other), 0.0), surfaces.UNKNOWN)
         if things is not None and NO_NODE not in things[[one, other]]:
-            step = 0.0 if things[one] == things[other] else step + BORDER * typical
-        steps.append((round(step * STEPS), step, a, b))
+            step = 0.0 if things[one] == things[other] else step + surfaces.BORDER * typical
+        steps.append((round(step * surfaces.STEPS), step, a, b))
     steps.sort(key=lambda link: link[0])
     region = {number: frozenset([number]) for number in range(len(surface.rows))}
     within = dict.fromkeys(region.values(), 0.0)  # largest step inside
@@ -167,11 +151,10 @@ def plain_regions(surface: Surface, field: LanguageField, level: int) -> list[in
             if mine == other:
                 continue
             if gathering:
-                join = min(len(mine), len(other)) < SMALLEST
+                join = min(len(mine), len(other)) < surfaces.SMALLEST
             else:
-                join = step <= min(
-                    within[mine] + SCALE * typical / len(mine), within[other] + SCALE * typical / len(other)
-                )
+                limits = (within[one] + surfaces.SCALE * typical / len(one) for one in (mine, other))
+                join = step <= min(limits)
             if join:
                 both = mine | other
                 within[both] = max(step, within[mine], within[other])
@@ -202,7 +185,7 @@ def assert_sound(regions: Regions, surface: Surface) -> None:
             assert len(np.unique(every[level : level + 2], axis=1).T) == len(sizes)
         assert len(np.unique(np.stack([of, parts]), axis=1).T) == len(sizes)
         around = parts if level == 2 else parts * len(of) + every[level + 1]
-        for number in np.flatnonzero(sizes < SMALLEST):
+        for number in np.flatnonzero(sizes < surfaces.SMALLEST):
             assert (around == around[of.tolist().index(number)]).sum() == sizes[number]  # nobody to join
 
 
@@ -225,13 +208,11 @@ def test_the_order_of_the_gaussians_moves_no_border(kind):
     field = replace(field, confidence=np.ones_like(field.confidence))
     order = np.random.default_rng(0).permutation(N)
     found = []
-    for scene, meaning, rows in (
-        (gaussians, field, np.arange(N)),
-        (gaussians.take(order), field.take(order), order),
-    ):
-        surface = build_surface(scene)
+    for rows in (np.arange(N), order):
+        scene = Scene(gaussians, field).take(rows)
+        surface = build_surface(scene.gaussians)
         numbers = np.full((3, N), -1)
-        regions = regions_of(Scene(scene, meaning), surface)
+        regions = regions_of(scene, surface)
         numbers[:, rows[surface.rows]] = on_surface_of(regions, surface)
         found.append(numbers)
     for got, want in zip(*found, strict=True):
@@ -335,6 +316,8 @@ def test_means_of_regions_and_what_is_spread_from_them(scattered):
 def test_almost_no_gaussians(kind, count):
     surface = build_surface(random_gaussians(count), min_opacity=0.0)
     assert surface.smooth(np.full(count, 0.25, np.float32)).tolist() == [0.25] * len(surface.rows)
+    for selected in (np.zeros(count, bool), np.ones(count, bool)):
+        assert selection.grow(surface, selected, 1.0).tolist() == selected.tolist()
     field = replace(random_field(count, kind), tree=tree_of_wholes(np.zeros(count, np.int32)))
     regions = regions_of(Scene(line(count), field))
     assert regions.everywhere.tolist() == [[0] * count] * 3
@@ -355,14 +338,8 @@ def sheet(side: int = 20, spacing: float = 0.1) -> Gaussians:
     """A square of opaque Gaussians in the plane z = 0, and one faint one above each."""
     x, y = np.meshgrid(np.arange(side) * spacing, np.arange(side) * spacing)
     flat = np.stack([x.ravel(), y.ravel(), np.zeros(side * side)], -1)
-    n = 2 * len(flat)
-    return Gaussians(
-        means=np.concatenate([flat, flat + [0, 0, 0.3 * spacing]]),
-        log_scales=np.full((n, 3), np.log(spacing / 2)),
-        quats_wxyz=np.tile([1.0, 0, 0, 0], (n, 1)),
-        opacity_logits=np.repeat([3.0, -4.0], n // 2),
-        sh=np.zeros((n, 1, 3)),
-    )
+    means = np.concatenate([flat, flat + [0, 0, 0.3 * spacing]])
+    return unturned_gaussians(means, np.log(spacing / 2), np.repeat([3.0, -4.0], len(flat)))
 
 
 def walked(surface: Surface, seeds: np.ndarray) -> np.ndarray:
@@ -432,20 +409,9 @@ def test_what_lies_nearest_to_a_point_is_selected_as_a_region():
 
 @pytest.mark.parametrize("wrong", [-1, inf, nan])
 def test_a_distance_that_cannot_be_walked(wrong):
-    surface = build_surface(sheet(5))
-    nothing = np.zeros(50, bool)
     with pytest.raises(InputError, match="give 0 or more"):
-        selection.grow(surface, nothing, wrong)
+        selection.grow(build_surface(sheet(5)), np.zeros(50, bool), wrong)
 
-
-@pytest.mark.parametrize("count", [0, 1, 2])
-def test_scenes_of_almost_nothing(count):
-    surface = build_surface(random_gaussians(count), min_opacity=0.0)
-    for selected in (np.zeros(count, bool), np.ones(count, bool)):
-        assert selection.grow(surface, selected, 1.0).tolist() == selected.tolist()
-
-
-# Selections drawn on a picture, against plain loops.
 
 SIZE = (80, 60)
 
@@ -533,9 +499,7 @@ def test_what_lies_behind_the_surface_is_hidden(seen, coarser):
     depths = np.full((60 // coarser, 80 // coarser), 4.0)
     depths[:, : 40 // coarser] = 0  # nothing is drawn there, and nothing hides
     found = on_surface(seen, depths, SIZE, behind=0.05)
-    wanted = []
-    for (x, y), z in zip(seen.pixels, seen.depths, strict=True):
-        in_picture = z > 0 and 0 <= x < 80 and 0 <= y < 60
-        wanted.append(bool(in_picture and (x < 40 or z <= 4.2)))
-    assert found.tolist() == wanted
+    (x, y), z = seen.pixels.T, seen.depths
+    in_picture = (z > 0) & (x >= 0) & (x < 80) & (y >= 0) & (y < 60)
+    assert found.tolist() == (in_picture & ((x < 40) | (z <= 4.2))).tolist()
     assert 0 < found.sum() < in_rectangle(seen, np.zeros(2), np.array(SIZE)).sum()

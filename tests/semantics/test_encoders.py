@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -14,36 +15,18 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from safetensors.torch import load_file, save_file
 from tokenizers import Tokenizer
-from transformers import (
-    CLIPModel,
-    CLIPTokenizer,
-    CLIPTokenizerFast,
-    PreTrainedTokenizerFast,
-    Siglip2Tokenizer,
-    SiglipModel,
-)
+from transformers import CLIPModel, CLIPTokenizerFast, PreTrainedTokenizerFast, Siglip2Tokenizer
 
+from langsplat_core.arrays import unit
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.scene import Calibration, Odds, Reading
-from langsplat_core.semantics import clip_plain
-from langsplat_core.semantics.clip_plain import (
-    BYTES,
-    PlainClipText,
-    TextConfig,
-    plain_text_tower,
-    read_pair_tokenizer,
-)
-from langsplat_core.semantics.encoders import (
-    CLIP_MEAN,
-    CLIP_STD,
-    ClipText,
-    clip_text,
-    load_encoder,
-    load_text_encoder,
-)
+from langsplat_core.semantics import clip_plain, encoders
+from langsplat_core.semantics.clip_plain import PlainClipText, plain_text_tower, read_pair_tokenizer
+from langsplat_core.semantics.encoders import ClipText, clip_text, load_encoder, load_text_encoder
 from langsplat_core.semantics.weights import Weights
-from tests.support.tiny_clip import SIDE, WORDS, tiny_clip
+from tests.support.tiny_clip import SIDE, WORDS, change_json, tiny_clip
 from tests.support.tiny_siglip import LENGTH, SCALE, tiny_siglip
 
 pytestmark = pytest.mark.long
@@ -66,26 +49,12 @@ def test_images_agree_with_the_whole_model(folder: Path) -> None:
     got = encoder.encode_images(pictures)
     assert (encoder.dim, encoder.image_size, encoder.id) == (24, SIDE, str(folder))
     model = CLIPModel.from_pretrained(folder).eval()
-    pixels = (pictures / 255 - np.array(CLIP_MEAN)) / np.array(CLIP_STD)
+    pixels = (pictures / 255 - np.array(encoders.CLIP_MEAN)) / np.array(encoders.CLIP_STD)
     inputs = torch.from_numpy(pixels.transpose(0, 3, 1, 2).astype(np.float32))
     with torch.no_grad():
-        want = model.visual_projection(model.vision_model(inputs).pooler_output).numpy()
-    want /= np.linalg.norm(want, axis=1, keepdims=True)
+        want = model.visual_projection(model.vision_model(inputs).pooler_output)
     assert got.dtype == np.float32
-    np.testing.assert_allclose(got, want, atol=2e-6)  # float32, batches of another size
-
-
-def test_texts_agree_with_the_whole_model_one_at_a_time(folder: Path) -> None:
-    phrases = ["red mug", "handle", "green mug"]
-    got = load_text_encoder(str(folder)).encode_texts(phrases)
-    np.testing.assert_array_equal(got, load_encoder(str(folder), "cpu").encode_texts(phrases))
-    model = CLIPModel.from_pretrained(folder).eval()
-    tokenizer = CLIPTokenizer.from_pretrained(folder)
-    for phrase, vector in zip(phrases, got, strict=True):  # alone, so without any padding
-        tokens = tokenizer([phrase], truncation=True, max_length=12, return_tensors="pt").input_ids
-        with torch.no_grad():
-            want = model.text_projection(model.text_model(input_ids=tokens).pooler_output).numpy()[0]
-        np.testing.assert_allclose(vector, want / np.linalg.norm(want), atol=2e-6)
+    np.testing.assert_allclose(got, unit_tensor(want), atol=2e-6)  # float32, batches of another size
 
 
 def test_the_folder_may_state_its_own_normalisation(tmp_path: Path) -> None:
@@ -94,15 +63,6 @@ def test_the_folder_may_state_its_own_normalisation(tmp_path: Path) -> None:
     settings = '{"image_mean": [0.5, 0.5, 0.5], "image_std": [0.5, 0.5, 0.5]}'
     (tmp_path / "preprocessor_config.json").write_text(settings, encoding="utf-8")
     assert abs(load_encoder(str(tmp_path), "cpu").encode_images(crops(1)) - before).max() > 1e-4
-
-
-@pytest.mark.parametrize("text", ["{", "[]", '{"image_mean": [0.5]}', '{"image_std": [0, 0, 0]}'])
-def test_a_broken_normalisation_is_one_line(tmp_path: Path, text: str) -> None:
-    tiny_clip(tmp_path)
-    (tmp_path / "preprocessor_config.json").write_text(text, encoding="utf-8")
-    with pytest.raises(EncoderError, match=r"preprocessor_config\.json") as error:
-        load_encoder(str(tmp_path), "cpu")
-    assert "\n" not in str(error.value)
 
 
 def test_pickled_weights_give_the_same_vectors(tmp_path: Path) -> None:
@@ -131,9 +91,8 @@ def test_a_vocabulary_makes_words_unknown(tmp_path: Path) -> None:
     with pytest.raises(
         EncoderError,
         match=r"'handl' \(did you mean 'handle'\?\); .* 7 words, such as apple, .*--clip\.model laion/",
-    ) as error:
+    ):
         encoder.encode_texts(["handl"])
-    assert "\n" not in str(error.value)
 
 
 def test_absent_weights_say_what_to_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,11 +101,8 @@ def test_absent_weights_say_what_to_pass(tmp_path: Path, monkeypatch: pytest.Mon
         load_encoder("./nowhere")
     with pytest.raises(EncoderError, match=r"no config\.json with model\.safetensors"):
         load_encoder(str(tmp_path))
-    with pytest.raises(
-        EncoderError, match=r"HF_HUB_OFFLINE is set.*`hf download nobody/nothing-here`"
-    ) as error:
+    with pytest.raises(EncoderError, match=r"HF_HUB_OFFLINE is set.*`hf download nobody/nothing-here`"):
         load_encoder("nobody/nothing-here")
-    assert "\n" not in str(error.value)
 
 
 def test_weights_of_another_model_are_refused(tmp_path: Path) -> None:
@@ -198,21 +154,28 @@ BROKEN_READINGS = (
 )
 
 
-@pytest.mark.parametrize("broken", BROKEN_READINGS)
-def test_a_broken_reading_is_one_line(tmp_path, broken):
+BROKEN_NORMALISATIONS = ("{", "[]", '{"image_mean": [0.5]}', '{"image_std": [0, 0, 0]}')
+
+
+@pytest.mark.parametrize(
+    ("name", "said", "text"),
+    [
+        *(("reading.json", "reading.json is not", text) for text in BROKEN_READINGS),
+        *(("preprocessor_config.json", "preprocessor_config.json", text) for text in BROKEN_NORMALISATIONS),
+    ],
+)
+def test_a_broken_file_beside_the_weights_is_named(tmp_path, name, said, text):
     tiny_clip(tmp_path)
-    (tmp_path / "reading.json").write_text(broken)
-    with pytest.raises(EncoderError, match=r"reading\.json is not") as caught:
-        load_text_encoder(str(tmp_path))
-    assert "\n" not in str(caught.value)
+    (tmp_path / name).write_text(text, encoding="utf-8")
+    with pytest.raises(EncoderError, match=re.escape(said)):
+        load_encoder(str(tmp_path), "cpu")
 
 
 # SigLIP and SigLIP 2 through the real loading path, with tiny models made here.
 
 
 def unit_tensor(tensor: torch.Tensor) -> np.ndarray:
-    rows = tensor.detach().numpy()
-    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    return unit(tensor.detach().numpy())
 
 
 def padded_ids(tokenizer: Any, phrases: list[str]) -> torch.Tensor:
@@ -224,9 +187,8 @@ def padded_ids(tokenizer: Any, phrases: list[str]) -> torch.Tensor:
 def test_texts_agree_with_the_whole_model(tmp_path: Path) -> None:
     model = tiny_siglip(tmp_path)
     phrases = ["red mug", "red", "a red mug with a very long handle"]
-    tokenizer = PreTrainedTokenizerFast(
-        tokenizer_file=str(tmp_path / "tokenizer.json"), pad_token="</s>", eos_token="</s>"
-    )
+    written = str(tmp_path / "tokenizer.json")
+    tokenizer = PreTrainedTokenizerFast(tokenizer_file=written, pad_token="</s>", eos_token="</s>")
     ids = padded_ids(tokenizer, phrases)
     assert ids.shape == (3, LENGTH)
     assert ids[0].tolist() == [4, 5] + [1] * (LENGTH - 2)  # end and padding are one token
@@ -268,76 +230,55 @@ def test_images_agree_with_the_whole_siglip(tmp_path: Path) -> None:
     np.testing.assert_allclose(encoder.encode_images(pictures), want, atol=2e-6)
 
 
-def remove_special_tokens(folder: Path) -> None:
-    path = folder / "tokenizer.json"
-    path.write_text(path.read_text(encoding="utf-8").replace("</s>", "<o>"), encoding="utf-8")
+def with_tokenizer(old: str, new: str) -> Callable[[Path], object]:
+    """The folder's tokenizer.json with other words in it."""
+
+    def write(folder: Path) -> None:
+        path = folder / "tokenizer.json"
+        path.write_text(path.read_text(encoding="utf-8").replace(old, new), encoding="utf-8")
+
+    return write
 
 
 def remove_logit_scale(folder: Path) -> None:
-    model = SiglipModel.from_pretrained(folder)
-    state = {name: value for name, value in model.state_dict().items() if name != "logit_scale"}
-    (folder / "model.safetensors").unlink()
-    torch.save(state, folder / "pytorch_model.bin")
-
-
-def add_long_token(folder: Path) -> None:
-    path = folder / "tokenizer.json"
-    text = path.read_text(encoding="utf-8")
-    path.write_text(text.replace('"▁mug"', '"' + "y" * 300_000 + '"'), encoding="utf-8")
+    state = load_file(folder / "model.safetensors")
+    del state["logit_scale"]
+    save_file(state, folder / "model.safetensors", {"format": "pt"})
 
 
 def holding(name: str, text: str) -> Callable[[Path], object]:
     return lambda folder: (folder / name).write_text(text, encoding="utf-8")
 
 
-def change_config(
-    folder: Path, change: Callable[[dict[str, Any]], object], name: str = "config.json"
-) -> None:
-    path = folder / name
-    config = json.loads(path.read_text(encoding="utf-8"))
-    change(config)
-    path.write_text(json.dumps(config), encoding="utf-8")
+NO_RULES = "not CLIP weights that can be loaded"
 
 
-def change_tokenizer(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    change_config(folder, change, "tokenizer.json")
+def tokenizer_of(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
+    return lambda folder: change_json(folder / "tokenizer.json", change)
 
 
 @pytest.mark.parametrize(
-    ("damage", "message"),
+    ("make", "damage", "message"),
     [
-        (lambda folder: (folder / "tokenizer.json").unlink(), r"no tokenizer\.json in this folder"),
-        (holding("tokenizer.json", '{"version": "1.0"}'), r"tokenizer\.json is no tokenizer"),
-        (add_long_token, "a token of more than"),
-        (remove_special_tokens, "no eos_token"),
-        (remove_logit_scale, "logit_scale is not in them"),
-        (
-            holding("config.json", '{"model_type": "bert"}'),
-            "'bert' model is no image-text encoder known here; known are clip, siglip",
-        ),
-        (holding("config.json", "{"), r"config\.json cannot be read"),
-        (holding("config.json", "[" * 100_000), r"config\.json cannot be read"),
+        (tiny_clip, tokenizer_of(lambda stated: stated.update(normalizer=0)), NO_RULES),
+        (tiny_clip, tokenizer_of(lambda stated: stated["model"].update(vocab={})), NO_RULES),
+        (tiny_siglip, lambda folder: (folder / "tokenizer.json").unlink(), r"no tokenizer\.json in this"),
+        (tiny_siglip, holding("tokenizer.json", '{"version": "1.0"}'), r"tokenizer\.json is no tokenizer"),
+        (tiny_siglip, with_tokenizer('"▁mug"', f'"{"y" * 300_000}"'), "a token of more than"),
+        (tiny_siglip, with_tokenizer("</s>", "<o>"), "no eos_token"),
+        (tiny_siglip, remove_logit_scale, "logit_scale is not in them"),
+        (tiny_siglip, holding("config.json", '{"model_type": "bert"}'), "'bert' model .* are clip, siglip"),
+        (tiny_siglip, holding("config.json", "{"), r"config\.json cannot be read"),
+        (tiny_siglip, holding("config.json", "[" * 100_000), r"config\.json cannot be read"),
     ],
 )
-def test_a_broken_folder_is_one_line(tmp_path: Path, damage: Callable[[Path], object], message: str) -> None:
-    tiny_siglip(tmp_path)
-    damage(tmp_path)
-    with pytest.raises(EncoderError, match=message) as error:
-        load_text_encoder(str(tmp_path))
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    "change", [lambda stated: stated.update(normalizer=0), lambda stated: stated["model"].update(vocab={})]
-)
-def test_a_tokenizer_of_no_known_rules_is_one_line(
-    tmp_path: Path, change: Callable[[dict[str, Any]], object]
+def test_a_broken_folder_is_named(
+    tmp_path: Path, make: Callable[[Path], object], damage: Callable[[Path], object], message: str
 ) -> None:
-    tiny_clip(tmp_path)
-    change_tokenizer(tmp_path, change)
-    with pytest.raises(EncoderError, match="not CLIP weights that can be loaded") as error:
+    make(tmp_path)
+    damage(tmp_path)
+    with pytest.raises(EncoderError, match=message):
         load_text_encoder(str(tmp_path))
-    assert "\n" not in str(error.value)
 
 
 # The text half of a small CLIP in NumPy, against transformers' in float64.
@@ -347,10 +288,6 @@ PHRASES = ["red mug", "handle", "a", "the handle of a red mug things"]
 CLOSE = 1e-5  # of unit vectors
 
 
-def unit_rows(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-
-
 def by_transformers(folder: Path, phrases: list[str]) -> np.ndarray:
     """(M, D) float64 unit vectors, one phrase at a time and so without padding."""
     model = CLIPModel.from_pretrained(folder, dtype=torch.float64).eval()
@@ -358,7 +295,13 @@ def by_transformers(folder: Path, phrases: list[str]) -> np.ndarray:
     with torch.inference_mode():
         ids = [torch.tensor([tokenizer(phrase).input_ids]) for phrase in phrases]
         rows = [model.text_projection(model.text_model(input_ids=row).pooler_output)[0] for row in ids]
-    return unit_rows(torch.stack(rows).numpy())
+    return unit(torch.stack(rows).numpy())
+
+
+def text_setting(**settings: object) -> Callable[[Path], None]:
+    return lambda folder: change_json(
+        folder / "config.json", lambda stated: stated["text_config"].update(settings)
+    )
 
 
 def taught(folder: Path) -> list[str]:
@@ -370,7 +313,7 @@ def test_the_bundled_encoder_says_the_same_of_every_word_it_knows(measured) -> N
     phrases = [*words, *(f"{a} {b}" for a, b in zip(words, words[7:], strict=False)), "handle of the red mug"]
     tower = clip_text(Weights("demo", DEMO, "cpu"))
     assert isinstance(tower, PlainClipText)
-    got, want = unit_rows(tower.encode(phrases)), by_transformers(DEMO, phrases)
+    got, want = unit(tower.encode(phrases)), by_transformers(DEMO, phrases)
     assert got.dtype == np.float32
     error = np.abs(got - want).max()
     measured("demo text vectors", "largest error", float(error))
@@ -381,13 +324,14 @@ def test_the_bundled_encoder_says_the_same_of_every_word_it_knows(measured) -> N
 @pytest.mark.parametrize("half", [False, True])
 def test_a_random_one_agrees_with_float64(tmp_path: Path, activation: str, half: bool) -> None:
     tiny_clip(tmp_path, half)
-    change_config(tmp_path, lambda config: config["text_config"].update(hidden_act=activation))
+    text_setting(hidden_act=activation)(tmp_path)
     tower = clip_text(Weights("tiny", tmp_path, "cpu"))
     assert isinstance(tower, PlainClipText)
     phrases = ["red mug", "a", "handle"]
-    np.testing.assert_allclose(
-        unit_rows(tower.encode(phrases)), by_transformers(tmp_path, phrases), atol=CLOSE
-    )
+    want = by_transformers(tmp_path, phrases)
+    np.testing.assert_allclose(unit(tower.encode(phrases)), want, atol=CLOSE)
+    for encoder in (load_text_encoder(str(tmp_path)), load_encoder(str(tmp_path), "cpu")):
+        np.testing.assert_allclose(encoder.encode_texts(phrases), want, atol=CLOSE)
     by_torch = ClipText(Weights("tiny", tmp_path, "cpu"))
     np.testing.assert_allclose(tower.encode(phrases), by_torch.encode(phrases), rtol=1e-4, atol=CLOSE)
     assert tower.dim == by_torch.dim == 24
@@ -396,19 +340,15 @@ def test_a_random_one_agrees_with_float64(tmp_path: Path, activation: str, half:
 def test_an_end_token_numbered_as_of_old(tmp_path: Path) -> None:
     """OpenAI's and OpenCLIP's configurations say 2, and mean the token with the highest number."""
     tiny_clip(tmp_path)
-    change_config(tmp_path, lambda config: config["text_config"].update(eos_token_id=2))
+    text_setting(eos_token_id=2)(tmp_path)
     assert plain_text_tower(Weights("tiny", tmp_path, "cpu")) is None  # whose end token is the second
-
-
-def text_setting(**settings: object) -> Callable[[Path], None]:
-    return lambda folder: change_config(folder, lambda config: config["text_config"].update(settings))
 
 
 NOT_PLAIN: dict[str, Callable[[Path], object]] = {
     "no tokenizer": lambda folder: (folder / "tokenizer.json").unlink(),
-    "no tokens": lambda folder: change_tokenizer(folder, lambda stated: stated["model"].update(vocab={})),
-    "a beginning that is no token": lambda folder: change_tokenizer(
-        folder, lambda stated: stated["post_processor"].update(cls=["<|startoftext|>", 97])
+    "no tokens": tokenizer_of(lambda stated: stated["model"].update(vocab={})),
+    "a beginning that is no token": tokenizer_of(
+        lambda stated: stated["post_processor"].update(cls=["<|startoftext|>", 97])
     ),
     "another activation": text_setting(hidden_act="relu"),
     "more layers": text_setting(num_hidden_layers=3),
@@ -432,7 +372,7 @@ def test_large_models_and_other_devices_are_left_to_torch(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tiny_clip(tmp_path)
-    count = sum(int(np.prod(shape)) for shape in TextConfig().shapes().values())
+    count = sum(int(np.prod(shape)) for shape in clip_plain.TextConfig().shapes().values())
     assert count == 63_428_096  # the text half of ViT-B/16
     assert plain_text_tower(Weights("tiny", tmp_path, "cuda")) is None
     monkeypatch.setattr(clip_plain, "MOST_WEIGHTS", 1_000)
@@ -476,7 +416,8 @@ def spelled_bytes(path: Path) -> Tokenizer:
     """The bundled tokenizer with a vocabulary that has every byte, within a word and at its end, and a few
     merges; written to `path`."""
     stated = json.loads((DEMO / "tokenizer.json").read_text(encoding="utf-8"))
-    tokens = ["<|startoftext|>", "<|endoftext|>", *(byte + end for end in ("", "</w>") for byte in BYTES)]
+    spelled = (byte + end for end in ("", "</w>") for byte in clip_plain.BYTES)
+    tokens = ["<|startoftext|>", "<|endoftext|>", *spelled]
     merges = [["a", "b"], ["ab", "ab"], ["a", "a"], ["'", "'"], ["Ã", "Ł"], ["0", "1</w>"], ["b", "a</w>"]]
     tokens += ["".join(pair) for pair in merges]
     stated["model"] |= {"vocab": {token: i for i, token in enumerate(tokens)}, "merges": merges}
@@ -503,8 +444,7 @@ def test_phrases_are_read_as_tokenizers_reads_them(tmp_path: Path) -> None:
 def test_a_tokenizer_of_other_rules_is_not_read(tmp_path: Path, place: str) -> None:
     path = tmp_path / "tokenizer.json"
     spelled_bytes(path)
-    stated = json.loads(path.read_text(encoding="utf-8"))
-    path.write_text(json.dumps(stated | {place: {"type": "Sequence"}}), encoding="utf-8")
+    change_json(path, lambda stated: stated.update({place: {"type": "Sequence"}}))
     assert read_pair_tokenizer(path) is None
 
 

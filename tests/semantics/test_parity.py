@@ -33,6 +33,7 @@ from langsplat_core.semantics.sam import LEVELS, Look, SamMasks, load_mask_sourc
 from langsplat_core.semantics.store import masked_crop
 from tests.support.fixtures import Measure
 
+PARTS = ("segment_anything.automatic_mask_generator", "sam2.build_sam", "sam2.sam2_image_predictor")
 NAMES = ("torchvision", "open_clip", "segment_anything", "sam2", "cv2")
 ENDS = {"<start_of_text>": "<|startoftext|>", "<end_of_text>": "<|endoftext|>"}  # as the hub names them
 SCALES = {"pos": 0.3, "rel_": 0.3, "token": 0.3, "no_mem": 0.3, "latent": 0.3, "class_embedding": 0.3}
@@ -72,11 +73,7 @@ def upstream() -> SimpleNamespace:
                 torch.library.define(f"torchvision::{name}", "(Tensor a, Tensor b, float iou) -> Tensor")
             boxes = importlib.import_module("torchvision.ops.boxes")
             boxes.nms = plain_nms  # type: ignore[attr-defined]
-        for part in (
-            "segment_anything.automatic_mask_generator",
-            "sam2.build_sam",
-            "sam2.sam2_image_predictor",
-        ):
+        for part in PARTS:
             importlib.import_module(part)
         return SimpleNamespace(**{name: importlib.import_module(name) for name in NAMES})
 
@@ -143,18 +140,9 @@ def siglip_tensors(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tenso
 pytestmark = pytest.mark.slow
 PLAIN = ["red mug", "a photo of a chair", "the handle of a green mug", "object", "things", "naïve café"]
 PLAIN += ["crème brûlée", "ein Fenster", "日本", "3 yellow bananas", "UPPER Case WORDS", "x y z", "texture"]
-MARKED = ["it's", "it’s", "“quoted” mug", "salt &amp; pepper", "of\ufb01ce chair", "mug, not red", "mug 🍵"]
-MARKED += [
-    "3.5 mm jack",
-    "what is this?",
-    "a&b",
-    "co₂",
-    "½ apple",
-    "  two  spaces ",
-    "don`t",
-    "a/b (c)",
-    "a-b",
-]
+MARKED = ["it's", "it’s", "“quoted” mug", "salt &amp; pepper", "of\ufb01ce chair", "mug, not red"]
+MARKED += ["mug 🍵", "3.5 mm jack", "what is this?", "a&b", "co₂", "½ apple", "  two  spaces "]
+MARKED += ["don`t", "a/b (c)", "a-b"]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -223,6 +211,7 @@ def test_siglip_2_of_open_clip(field: SimpleNamespace, tmp_path: Path, measured:
     measured("SigLIP 2, pictures", "as open_clip leaves them", (exact - seen).abs().max().item())
 
 
+PASSING = {"nms_iou": 2.0, "nms_score": -1.0, "nms_inner": 2.0}
 POINTS = np.array([[100, 200], [700, 500], [1300, 1000]], np.float32) / (1440, 1080)  # shares of a picture
 
 
@@ -235,9 +224,8 @@ def compare(
     scores, full = want
     seen = look.seen["image_embeddings"]
     mine, alike = (seen[-1], [*seen[:-1], embedding]) if isinstance(seen, list) else (seen, embedding)
-    close(
-        f"{name}, embedding / sd", *(some[0] / embedding.std() for some in (mine, embedding)), 5e-5, measured
-    )
+    scaled = (some[0] / embedding.std() for some in (mine, embedding))
+    close(f"{name}, embedding / sd", *scaled, 5e-5, measured)
     for what, given in (("alone", alike), ("and picture", seen)):
         ious, logits = replace(look, seen={"image_embeddings": given}, ordered=True).ask(points)
         enlarged = torch.stack([look.enlarge(masks) for masks in logits])
@@ -279,17 +267,13 @@ def test_sam_2_of_sam2(field: SimpleNamespace, tmp_path: Path, measured: Measure
     points = (POINTS * 1024).astype(np.float32)
     with torch.inference_mode():
         predictor.set_image(square)
-        answers = [
-            predictor.predict(point[None], np.ones(1), multimask_output=True, return_logits=True)
-            for point in points
-        ]
+        asked = {"multimask_output": True, "return_logits": True}
+        answers = [predictor.predict(point[None], np.ones(1), **asked) for point in points]
         want = tuple(torch.from_numpy(np.stack([answer[part] for answer in answers])) for part in (1, 0))
         embedding = predictor.get_image_embedding()
         compare("SAM 2.1 tiny", segmenter.look(square), embedding, points, (want[0], want[1]), measured)
-    loose = MaskConfig(
-        sam=str(file), points_per_side=2, predicted_iou=0, stability=0, nms_score=-1, nms_inner=2, nms_iou=2
-    )
-    levels = load_mask_source(loose, "cpu")(square, silent)
+    every = MaskConfig(sam=str(file), points_per_side=2, predicted_iou=0, stability=0, **PASSING)
+    levels = load_mask_source(every, "cpu")(square, silent)
     assert [len(masks) > 0 for masks in levels.masks] == [True] * LEVELS
 
 
@@ -349,8 +333,7 @@ def test_the_filters_of_segment_anything_but_for_its_boxes(
 ) -> None:
     """Its boxes end at the last pixel, ours behind it: with ours in their place every mask is the same, bit
     by bit. What LangSplat adds, `mask_nms`, lets all pass here: test_mask_filters.py has it."""
-    passing = {"nms_iou": 2.0, "nms_score": -1.0, "nms_inner": 2.0}
-    config = MaskConfig(points_per_side=16, crop_layers=1, min_region=30, **passing)
+    config = MaskConfig(points_per_side=16, crop_layers=1, min_region=30, **PASSING)
     module = field.segment_anything.automatic_mask_generator
     theirs = module.batched_mask_to_box
 

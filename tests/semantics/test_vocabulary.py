@@ -1,5 +1,6 @@
 """Vocabularies: the bundled lists, and other people's files with everything that can be wrong in them."""
 
+import re
 from importlib.resources import files
 from pathlib import Path
 
@@ -52,11 +53,8 @@ def test_a_file_is_read_as_people_write_it(tmp_path):
 def test_what_is_wrong_is_said_with_file_and_line(tmp_path, content, problem):
     path = tmp_path / "mine.txt"
     path.write_bytes(content)
-    with pytest.raises(InputError) as error:
+    with pytest.raises(InputError, match=re.escape(str(path)) + ".*" + re.escape(problem)):
         read_vocabulary(path)
-    assert str(path) in str(error.value)
-    assert problem in str(error.value)
-    assert "\n" not in str(error.value)
 
 
 def test_a_missing_file_and_a_folder_cannot_be_read(tmp_path):

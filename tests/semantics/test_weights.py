@@ -26,7 +26,7 @@ from langsplat_core.semantics import layouts
 from langsplat_core.semantics.encoders import CLIP_MEAN, CLIP_STD, load_encoder, load_text_encoder
 from langsplat_core.semantics.sam import load_segmenter
 from langsplat_core.semantics.weights import COUNTS, SIDES
-from tests.support.tiny_clip import tiny_clip
+from tests.support.tiny_clip import change_json, tiny_clip
 from tests.support.tiny_sam import SIDE as SAM_SIDE
 from tests.support.tiny_sam import tiny_sam, tiny_sam2
 from tests.support.tiny_siglip import tiny_siglip
@@ -36,6 +36,7 @@ MARKS = "'&"
 LETTERS = ascii_lowercase + MARKS
 TOKENS = [*LETTERS, *(f"{letter}</w>" for letter in LETTERS), "<|startoftext|>", "<|endoftext|>"]
 BEGIN, END = len(TOKENS) - 2, len(TOKENS) - 1
+PROJECTIONS = ("in_proj_weight", "in_proj_bias", "out_proj.weight", "out_proj.bias")
 Tensors = dict[str, Tensor]
 
 
@@ -57,11 +58,8 @@ def open_clip_tensors(vision: int = 128, layers: int = 2, inner: int = 48) -> Te
             found |= norm(f"{block}ln_1", wide) | norm(f"{block}ln_2", wide)
             found[f"{block}attn.in_proj_weight"] = random(3 * wide, wide)
             found[f"{block}attn.in_proj_bias"] = random(3 * wide)
-            for name, rows, columns in (
-                ("attn.out_proj", wide, wide),
-                ("mlp.c_fc", inner, wide),
-                ("mlp.c_proj", wide, inner),
-            ):
+            shapes = {"attn.out_proj": (wide, wide), "mlp.c_fc": (inner, wide), "mlp.c_proj": (wide, inner)}
+            for name, (rows, columns) in shapes.items():
                 found |= {f"{block}{name}.weight": random(rows, columns), f"{block}{name}.bias": random(rows)}
         return found
 
@@ -109,13 +107,11 @@ def _blocks(tensors: Tensors, prefix: str, x: Tensor, heads: int, quick: bool, m
     number = 0
     while (block := f"{prefix}transformer.resblocks.{number}.") + "ln_1.weight" in tensors:
         y = _norm(tensors, f"{block}ln_1", x)
+        projections = [tensors[f"{block}attn.{name}"] for name in PROJECTIONS]
         x = (
             x
             + functional.multi_head_attention_forward(
-                *(y, y, y, y.shape[-1], heads),
-                *(tensors[f"{block}attn.in_proj_weight"], tensors[f"{block}attn.in_proj_bias"]),
-                *(None, None, False, 0.0),
-                *(tensors[f"{block}attn.out_proj.weight"], tensors[f"{block}attn.out_proj.bias"]),
+                *(y, y, y, y.shape[-1], heads, *projections[:2], None, None, False, 0.0, *projections[2:]),
                 training=False,
                 need_weights=False,
                 attn_mask=mask,
@@ -173,34 +169,29 @@ def renamed(state: Tensors, words: tuple[tuple[str, str], ...]) -> Tensors:
     return found
 
 
+def words(pattern: str, by: str, names: dict[str, int]) -> tuple[tuple[str, str], ...]:
+    """A pattern and what stands for it, for each name and its number."""
+    return tuple((pattern.format(re.escape(name)), by.format(number)) for name, number in names.items())
+
+
+SAM_NECK = {"conv1": 0, "layer_norm1": 1, "conv2": 2, "layer_norm2": 3}
 SAM_WORDS = (
     (r"^vision_encoder\.layers\.", "image_encoder.blocks."),
-    *(
-        (rf"\.neck\.{a}\.", f".neck.{n}.")
-        for n, a in enumerate(("conv1", "layer_norm1", "conv2", "layer_norm2"))
-    ),
+    *words(r"\.neck\.{}\.", ".neck.{}.", SAM_NECK),
     (r"^vision_encoder\.", "image_encoder."),
     (r"\.point_embed\.", ".point_embeddings."),
 )
+DOWN = {"conv1": 0, "conv2": 3, "conv3": 6, "layer_norm1": 1, "layer_norm2": 4}
 DECODER_WORDS = (
-    *(
-        (rf"(_head|_mlps\.\d)\.{a}\.", rf"\1.layers.{n}.")
-        for a, n in (("layers.0", 1), ("proj_in", 0), ("proj_out", 2))
-    ),
-    *(
-        (rf"\.mask_embed\.{a}\.", f".mask_downscaling.{n}.")
-        for a, n in (("conv1", 0), ("conv2", 3), ("conv3", 6), ("layer_norm1", 1), ("layer_norm2", 4))
-    ),
-    *(
-        (rf"\.upscale_{a}\.", f".output_upscaling.{n}.")
-        for a, n in (("conv1", 0), ("layer_norm", 1), ("conv2", 3))
-    ),
+    *words(r"(_head|_mlps\.\d)\.{}\.", r"\1.layers.{}.", {"layers.0": 1, "proj_in": 0, "proj_out": 2}),
+    *words(r"\.mask_embed\.{}\.", ".mask_downscaling.{}.", DOWN),
+    *words(r"\.upscale_{}\.", ".output_upscaling.{}.", {"conv1": 0, "layer_norm": 1, "conv2": 3}),
     (r"\.layer_norm(\d|_final_attn)\.", r".norm\1."),
     (r"\.shared_embedding\.positional_embedding", ".pe_layer.positional_encoding_gaussian_matrix"),
     (r"\.patch_embed\.projection\.", ".patch_embed.proj."),
 )
 SAM2_WORDS = (
-    *((rf"\.mlp\.{a}\.", f".mlp.layers.{n}.") for a, n in (("proj_in", 0), ("proj_out", 1))),
+    *words(r"\.mlp\.{}\.", ".mlp.layers.{}.", {"proj_in": 0, "proj_out": 1}),
     (r"\.o_proj\.", ".out_proj."),
     (r"^vision_encoder\.neck\.convs\.(\d)\.", r"image_encoder.neck.convs.\1.conv."),
     (r"^vision_encoder\.backbone\.", "image_encoder.trunk."),
@@ -225,15 +216,7 @@ class Runs:
         return os.mkdir, (str(self.mark),)
 
 
-def as_pickle(path: Path, content: object) -> None:
-    path.write_bytes(pickle.dumps(content))
-
-
-def as_torch_file(path: Path, content: object) -> None:
-    torch.save(content, path)
-
-
-@pytest.mark.parametrize("write", [as_pickle, as_torch_file])
+@pytest.mark.parametrize("write", [lambda content, path: path.write_bytes(pickle.dumps(content)), torch.save])
 @pytest.mark.parametrize(
     ("make", "load"), [(tiny_clip, load_encoder), (tiny_clip, load_text_encoder), (tiny_sam, load_segmenter)]
 )
@@ -242,10 +225,9 @@ def test_a_pickle_is_refused_in_a_line_and_not_run(write, make, load, tmp_path: 
     folder.mkdir()
     make(folder)
     (folder / WEIGHTS).unlink()
-    write(folder / PLAIN, {"text_model.embeddings": Runs(tmp_path / "ran")})
+    write({"text_model.embeddings": Runs(tmp_path / "ran")}, folder / PLAIN)
     with pytest.raises(EncoderError, match="a pickle that holds more than tensors") as caught:
         load(str(folder))
-    assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 300
     assert not (tmp_path / "ran").exists()
     assert not recwarn.list
@@ -259,20 +241,21 @@ def test_bytes_that_are_no_weights(content: bytes, name: str, tmp_path: Path) ->
     tiny_clip(tmp_path)
     (tmp_path / WEIGHTS).unlink()
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(EncoderError, match=r"not .* weights") as caught:
+    with pytest.raises(EncoderError, match=r"not .* weights"):
         load_text_encoder(str(tmp_path))
-    assert "\n" not in str(caught.value)
 
 
-def test_a_configuration_that_contradicts_itself_is_one_line(tmp_path: Path) -> None:
+def setting(folder: Path, part: str, name: str, value: object) -> str:
+    """The folder, with a number of a part of its configuration changed."""
+    change_json(folder / "config.json", lambda stated: stated[part].update({name: value}))
+    return str(folder)
+
+
+def test_a_configuration_that_contradicts_itself_is_named(tmp_path: Path) -> None:
     tiny_clip(tmp_path)
-    path = tmp_path / "config.json"
-    config = json.loads(path.read_text(encoding="utf-8"))
-    config["vision_config"]["num_attention_heads"] = 7  # of a width of 32
-    path.write_text(json.dumps(config), encoding="utf-8")
-    with pytest.raises(EncoderError, match="multiple of the number of attention heads") as caught:
+    setting(tmp_path, "vision_config", "num_attention_heads", 7)  # of a width of 32
+    with pytest.raises(EncoderError, match="multiple of the number of attention heads"):
         load_encoder(str(tmp_path))
-    assert "\n" not in str(caught.value)
 
 
 FOLDERS: dict[str, tuple[Callable[[Path], object], Callable[[str], Any]]] = {
@@ -290,7 +273,7 @@ def places(config: dict[str, Any]) -> list[tuple[dict[str, Any], str]]:
 
 
 @pytest.mark.parametrize("kind", FOLDERS)
-def test_sizes_that_the_weights_do_not_have_are_one_line(kind: str, tmp_path: Path) -> None:
+def test_sizes_that_the_weights_do_not_have_are_named(kind: str, tmp_path: Path) -> None:
     make, load = FOLDERS[kind]
     make(tmp_path)
     path = tmp_path / "config.json"
@@ -303,25 +286,18 @@ def test_sizes_that_the_weights_do_not_have_are_one_line(kind: str, tmp_path: Pa
         for value in (-1, 0, "x", 10**9, True, 2.5, [1, -1], *fewer):
             part[name] = value
             path.write_text(json.dumps(config), encoding="utf-8")
-            with pytest.raises(EncoderError, match=rf"json: \S*{name} is |not SAM 2") as caught:
+            with pytest.raises(EncoderError, match=rf"json: \S*{name} is |not SAM 2"):
                 load(str(tmp_path))
-            assert "\n" not in str(caught.value)
         part[name] = true
 
 
-def test_a_configuration_that_only_asking_shows_to_be_wrong_is_one_line(tmp_path: Path) -> None:
-    def change(folder: Path, part: str, name: str, value: object) -> str:
-        config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
-        config[part][name] = value
-        (folder / "config.json").write_text(json.dumps(config), encoding="utf-8")
-        return str(folder)
-
+def test_a_configuration_that_only_asking_shows_to_be_wrong_is_named(tmp_path: Path) -> None:
     tiny_clip(tmp_path / "clip")
-    encoder = load_encoder(change(tmp_path / "clip", "text_config", "eos_token_id", None))
+    encoder = load_encoder(setting(tmp_path / "clip", "text_config", "eos_token_id", None))
     with pytest.raises(EncoderError, match=r"the encoder: cannot be asked; does config\.json belong to it"):
         encoder.encode_texts(["red mug"])
     tiny_sam2(tmp_path / "sam")
-    segmenter = load_segmenter(change(tmp_path / "sam", "vision_config", "fpn_padding", -1))
+    segmenter = load_segmenter(setting(tmp_path / "sam", "vision_config", "fpn_padding", -1))
     with pytest.raises(EncoderError, match="the segmenter: cannot be asked"):
         segmenter.look(np.zeros((SAM_SIDE, SAM_SIDE, 3), np.uint8))
 
@@ -460,11 +436,8 @@ def test_what_lies_beside_does_not_stand_in_for_a_file(tmp_path: Path) -> None:
 
 def test_without_its_tokenizer_a_clip_says_which_file_to_put_beside(tmp_path: Path) -> None:
     path = training_checkpoint(tmp_path, open_clip_tensors())[0]
-    with pytest.raises(
-        EncoderError, match=r"put tokenizer\.json there.*openai/clip-vit-base-patch32"
-    ) as error:
+    with pytest.raises(EncoderError, match=r"put tokenizer\.json there.*openai/clip-vit-base-patch32"):
         load_text_encoder(str(path))
-    assert "\n" not in str(error.value)
     tokens = {f"x{number}": number for number in range(60)} | {"<|startoftext|>": 60, "<|endoftext|>": 61}
     CLIPTokenizer(vocab=tokens, merges=[]).save_pretrained(tmp_path)
     with pytest.raises(EncoderError, match="has more tokens than the model's 58"):
@@ -533,7 +506,6 @@ def refusal(load: Callable[[str], object], path: Path) -> str:
     with pytest.raises(EncoderError) as error:
         load(str(path))
     said = str(error.value)
-    assert "\n" not in said
     assert len(said) < 420
     assert said.startswith(str(path))
     return said
@@ -578,7 +550,7 @@ def sam_checkpoint(folder: Path) -> Tensors:
     ],
     ids=[*HOSTILE_CLIP, *(f"SAM: {case}" for case in HOSTILE_SAM), *(f"SAM 2: {c}" for c in HOSTILE_SAM2)],
 )
-def test_tensors_of_no_model_known_are_one_line(make, change, load, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_tensors_of_no_model_known_are_named(make, change, load, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     letter_tokenizer(tmp_path)
     changed = change(make(tmp_path))
     torch.save({"model": changed} if make is sam2_checkpoint else changed, tmp_path / "model.pt")
@@ -594,7 +566,7 @@ def test_a_mobile_sam_is_told_what_to_take_in_its_place(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("load", [load_encoder, load_segmenter])
-def test_damaged_files_are_one_line_and_run_nothing(load: Callable[[str], object], tmp_path: Path) -> None:
+def test_damaged_files_are_named_and_run_nothing(load: Callable[[str], object], tmp_path: Path) -> None:
     whole = tmp_path / "whole.pt"
     torch.save(open_clip_tensors(), whole)
     for name, content in (("a.pt", whole.read_bytes()[:-900]), ("b.pth", b""), ("c.safetensors", b"\x08{}")):
@@ -632,7 +604,7 @@ HOSTILE_CONFIGS = {
 
 
 @pytest.mark.parametrize("case", HOSTILE_CONFIGS)
-def test_a_configuration_of_another_model_is_one_line(case: str, tmp_path: Path) -> None:
+def test_a_configuration_of_another_model_is_named(case: str, tmp_path: Path) -> None:
     letter_tokenizer(tmp_path)
     config = hub_folder(tmp_path, open_clip_tensors())[-1]
     (tmp_path / CONFIG).write_text(json.dumps(HOSTILE_CONFIGS[case](config)), encoding="utf-8")

@@ -26,6 +26,7 @@ from langsplat_core.scene import (
 )
 from langsplat_core.scene.codec import CodebookCodec
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures
+from tests.support.scenes import unturned_gaussians
 
 COUNT = 64
 
@@ -50,14 +51,8 @@ def axis(index: int) -> Array:
 def blobs(seed: int = 0) -> Gaussians:
     rng = np.random.default_rng(seed)
     means = np.repeat(CENTRES, PER_BLOB, 0) + rng.normal(scale=0.18, size=(3 * PER_BLOB, 3))
-    n = len(means)
-    return Gaussians(
-        means=means,
-        log_scales=np.full((n, 3), np.log(0.08)),
-        quats_wxyz=np.tile([1.0, 0, 0, 0], (n, 1)),
-        opacity_logits=np.full(n, logit(np.array(0.85))),
-        sh=((np.repeat(COLOURS, PER_BLOB, 0) - 0.5) / 0.2820948)[:, None],
-    )
+    colours = (np.repeat(COLOURS, PER_BLOB, 0) - 0.5) / 0.2820948
+    return unturned_gaussians(means, np.log(0.08), logit(np.array(0.85)), colours[:, None])
 
 
 def language(phrasebook: bool = False) -> LanguageField:

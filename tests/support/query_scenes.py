@@ -9,7 +9,6 @@ from langsplat_core.arrays import Array, logit, unit
 from langsplat_core.scene import (
     CANONICAL_PHRASES,
     Camera,
-    Gaussians,
     LanguageField,
     LinearCodec,
     Reading,
@@ -17,6 +16,7 @@ from langsplat_core.scene import (
     look_at,
 )
 from tests.support.fakes import everyday_about
+from tests.support.scenes import unturned_gaussians
 
 DIM = 8
 AXES = ("mug", "handle", "book", "table", "red", "blue", "anything", "white")  # the seventh is canonical
@@ -80,13 +80,7 @@ def laid_table(phrasebook: dict[str, Array] | None = None) -> tuple[Scene, dict[
         owner += [number] * len(grid)
     means, owners = np.concatenate(points), np.array(owner)
     count = len(means)
-    gaussians = Gaussians(
-        means=means,
-        log_scales=np.full((count, 3), np.log(0.04)),
-        quats_wxyz=np.tile([1.0, 0, 0, 0], (count, 1)),
-        opacity_logits=np.full(count, logit(np.array(0.9))),
-        sh=np.zeros((count, 1, 3)),
-    )
+    gaussians = unturned_gaussians(means, np.log(0.04), logit(np.array(0.9)))
     wholes = np.stack([meaning(block.thing) for block in BLOCKS])[owners]
     parts = np.stack([meaning(block.part or block.thing) for block in BLOCKS])[owners]
     latents = np.stack([np.zeros_like(wholes), parts, wholes])

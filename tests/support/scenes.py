@@ -41,6 +41,18 @@ def random_gaussians(
     )
 
 
+def unturned_gaussians(
+    means: Array, log_scales: Array | float, opacity_logits: Array | float, sh: Array | float = 0.0
+) -> Gaussians:
+    """Gaussians along the world's axes, of SH degree 0; a number is the same for all of them."""
+    n = len(means)
+    scales, opacities, colours = (
+        np.broadcast_to(values, shape).copy()
+        for values, shape in ((log_scales, (n, 3)), (opacity_logits, n), (sh, (n, 1, 3)))
+    )
+    return Gaussians(means, scales, np.tile([1.0, 0, 0, 0], (n, 1)), opacities, colours)
+
+
 def random_camera(
     seed: int = 0, width: int = 70, height: int = 45, *, distance: float = 3.0, off_centre: bool = True
 ) -> Camera:

@@ -1,13 +1,23 @@
 """A CLIP small enough to be made while a test runs, in the layout of Hugging Face."""
 
+import json
+from collections.abc import Callable
 from pathlib import Path
 from string import ascii_lowercase, digits
+from typing import Any
 
 import torch
 from transformers import CLIPConfig, CLIPModel, CLIPTokenizer
 
 WORDS = ["red", "green", "mug", "apple", "handle", "object", "things"]
 SIDE = 32
+
+
+def change_json(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Write a JSON file anew with what `change` has done to its content."""
+    content = json.loads(path.read_text(encoding="utf-8"))
+    change(content)
+    path.write_text(json.dumps(content), encoding="utf-8")
 
 
 def tiny_clip(folder: Path, half: bool = False) -> CLIPModel:

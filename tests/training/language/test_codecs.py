@@ -1,6 +1,7 @@
-"""Codecs of every kind: what they answer, fitting, storage; k-means, which finds codewords."""
+"""Codecs of every kind: what they answer, fitting, storage; k-means, which finds codewords; their colours."""
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,31 +9,33 @@ import torch
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.config import CODEC_CONFIGS, AutoencoderConfig, CodebookConfig, LinearConfig
-from langsplat_core.scene import AutoencoderCodec, Codec, LinearCodec, codec_from_tensors
-from langsplat_core.scene.codec import KINDS
-from langsplat_core.semantics.relevancy import Scale
-from langsplat_core.training.language.codec_fit import (
-    FITTERS,
-    Vocabulary,
-    codebook_error,
-    codec_report,
-    exact_codec,
-    fit_codebook,
-    fit_codec,
-    folded_layers,
-    networks,
-    relevancy_error,
-    rounded,
+from langsplat_core.scene import (
+    NO_NODE,
+    AutoencoderCodec,
+    Codec,
+    Gaussians,
+    LanguageField,
+    LinearCodec,
+    codec_from_tensors,
 )
+from langsplat_core.scene.codec import KINDS, CodebookCodec, principal_colours
+from langsplat_core.scene.surface import build_surface
+from langsplat_core.scene.tree import tree_of_wholes
+from langsplat_core.semantics.relevancy import Scale
+from langsplat_core.training.language import codec_fit
+from langsplat_core.training.language.codec_fit import codec_report, fit_codebook, fit_codec, rounded
 from langsplat_core.training.language.mask_weights import nearest_centres, spherical_kmeans
+from langsplat_core.training.language.palette import contrasting_colours
+from tests.support.file_samples import random_field
+from tests.support.scenes import unturned_gaussians
 
 pytestmark = pytest.mark.long
 
 
-def random_vocabulary(dim: int, phrases: int = 20, seed: int = 9) -> Vocabulary:
+def random_vocabulary(dim: int, phrases: int = 20, seed: int = 9) -> codec_fit.Vocabulary:
     rng = np.random.default_rng(seed)
     made = unit(rng.normal(size=(phrases + 4, dim))).astype(np.float32)
-    return Vocabulary(made[4:], Scale(made[:4], made[4:], 10.0))
+    return codec_fit.Vocabulary(made[4:], Scale(made[:4], made[4:], 10.0))
 
 
 D = 48
@@ -61,7 +64,7 @@ def codec(request: pytest.FixtureRequest) -> Codec:
 
 
 def test_a_codec_is_a_kind_its_settings_and_its_fit() -> None:
-    assert set(KINDS) == set(CODEC_CONFIGS) == set(FITTERS)
+    assert set(KINDS) == set(CODEC_CONFIGS) == set(codec_fit.FITTERS)
     assert all(CODEC_CONFIGS[kind]().kind == KINDS[kind].kind == kind for kind in KINDS)
 
 
@@ -110,20 +113,14 @@ def test_distinct_latents_distances_and_colours(codec: Codec) -> None:
     assert codec.spread(latents) == pytest.approx(every.mean(), abs=1e-6)
     colours = codec.colours(latents, np.ones(120))
     assert (colours.dtype, colours.shape) == (np.float32, (120, 3))
-    assert colours.min() >= 0
-    assert colours.max() <= 1
+    assert 0 <= colours.min() <= colours.max() <= 1
 
 
 def test_broken_tensors_are_named() -> None:
-    for kind, missing in (
-        ("linear", "basis"),
-        ("autoencoder", "encoder"),
-        ("codebook", "colours and vectors"),
-    ):
+    told = {"linear": "basis", "autoencoder": "encoder", "codebook": "colours and vectors"}
+    for kind, missing in (*told.items(), ("vq", "unknown codec kind")):
         with pytest.raises(ValueError, match=missing):
             codec_from_tensors(kind, {})
-    with pytest.raises(ValueError, match="unknown codec kind"):
-        codec_from_tensors("vq", {})
     w, b = np.zeros((3, 8), np.float32), np.zeros(3, np.float32)
     with pytest.raises(ValueError, match="mirror"):
         AutoencoderCodec(((w, b),), ((np.zeros((9, 3), np.float32), np.zeros(9, np.float32)),))
@@ -157,7 +154,7 @@ def test_linear_codec_is_the_best_subspace() -> None:
 
 def test_folding_batch_normalisation_changes_nothing() -> None:
     torch.manual_seed(0)
-    encoder, _ = networks(32, 3)
+    encoder, _ = codec_fit.networks(32, 3)
     data = torch.randn(200, 32)
     for _ in range(5):
         encoder(data)
@@ -165,7 +162,7 @@ def test_folding_batch_normalisation_changes_nothing() -> None:
     with torch.no_grad():
         want = encoder(data).numpy()
     x = data.numpy()
-    layers = folded_layers(encoder)
+    layers = codec_fit.folded_layers(encoder)
     for index, (weight, bias) in enumerate(layers):
         x = x @ weight.T + bias
         if index + 1 < len(layers):
@@ -185,10 +182,10 @@ def test_further_vectors_help_kinds_that_interpolate_only() -> None:
 
 def test_given_vectors_are_kept_by_a_codebook_alone() -> None:
     vectors = rounded(clusters(20, 1)[0])
-    made = exact_codec(vectors, np.ones(20), CodebookConfig())
+    made = codec_fit.exact_codec(vectors, np.ones(20), CodebookConfig())
     assert made is not None
     np.testing.assert_array_equal(made.decode(np.arange(20)[:, None]), vectors)
-    assert exact_codec(vectors, np.ones(20), LinearConfig()) is None
+    assert codec_fit.exact_codec(vectors, np.ones(20), LinearConfig()) is None
 
 
 def test_the_size_of_a_codebook_is_the_smallest_that_keeps_the_budget() -> None:
@@ -238,14 +235,13 @@ def test_codewords_and_colours_are_float16_and_near_ones_have_near_colours() -> 
 
 def test_errors_are_differences_of_relevancy() -> None:
     vectors, _ = clusters(5, 4)
-    exact = relevancy_error(vectors, vectors, WORDS)
-    assert exact == (0, 0)
+    assert codec_fit.relevancy_error(vectors, vectors, WORDS) == (0, 0)
     swapped = vectors[::-1]
     difference = np.abs(WORDS.relevancy(swapped) - WORDS.relevancy(vectors))
-    mean, p99 = relevancy_error(swapped, vectors, WORDS)
+    mean, p99 = codec_fit.relevancy_error(swapped, vectors, WORDS)
     assert mean == pytest.approx(difference.mean(), rel=1e-5)
     assert p99 == pytest.approx(np.quantile(difference, 0.99), rel=1e-4)
-    assert codebook_error(vectors, vectors, WORDS) < 1e-6
+    assert codec_fit.codebook_error(vectors, vectors, WORDS) < 1e-6
 
 
 # Spherical k-means.
@@ -291,3 +287,64 @@ def test_fewer_different_vectors_than_centres(different: int) -> None:
     centres = spherical_kmeans(vectors, 10)
     assert sorted(centres.argmax(1)) == list(range(different))
     assert apart(vectors, centres) < 1e-6
+
+
+# Colours of codewords: neighbours are told apart, whatever else is large.
+
+SIDE, THINGS = 40, 8
+
+
+def sheet() -> Gaussians:
+    """SIDE x SIDE small discs in a plane."""
+    x, y = np.divmod(np.arange(SIDE * SIDE), SIDE)
+    return unturned_gaussians(np.stack([x, y, 0 * x], 1) * 0.1, np.log(0.07), 4.0)
+
+
+def field_of(things: Array, vectors: Array) -> LanguageField:
+    """Of things (N,), each with its own codeword; NO_NODE means nothing."""
+    usage = np.bincount(things[things != NO_NODE], minlength=len(vectors)).astype(float)
+    codec = CodebookCodec(vectors, principal_colours(vectors, usage))
+    codes = np.where(things == NO_NODE, 0, things).astype(np.uint16)
+    return replace(
+        random_field(len(things), "codebook"),
+        codec=codec,
+        canonical=vectors[:4],
+        everyday=None,
+        phrasebook={},
+        latents=np.tile(codes[None, :, None], (3, 1, 1)),
+        confidence=np.tile((things != NO_NODE).astype(np.float32), (3, 1)),
+        tree=tree_of_wholes(things),
+    )
+
+
+def rooms(seed: int) -> tuple[Gaussians, LanguageField]:
+    """Small things in a row on a large wall; things are nearly alike, the wall and the floor are not."""
+    rng = np.random.default_rng(seed)
+    x, y = np.divmod(np.arange(SIDE * SIDE), SIDE)
+    things = np.where(y < 12, 8, 9)
+    on = (y > 8) & (y < 16)
+    things[on] = x[on] * THINGS // SIDE
+    alike = unit(rng.normal(size=32))
+    small = unit(alike + 0.06 * rng.normal(size=(THINGS, 32)))
+    large = unit(rng.normal(size=(2, 32)))
+    return sheet(), field_of(things, np.concatenate([small, large]).astype(np.float32))
+
+
+def least_between_neighbours(colours: Array) -> float:
+    return float(np.linalg.norm(np.diff(colours[:THINGS], axis=0), axis=1).min())
+
+
+def test_neighbours_differ_more_than_by_the_axes_of_everything():
+    for seed in range(5):
+        gaussians, field = rooms(seed)
+        found = contrasting_colours(field, field.tree, build_surface(gaussians))
+        assert found.shape == (THINGS + 2, 3)
+        assert 0 <= found.min() < found.max() <= 1
+        assert least_between_neighbours(found) > 1.5 * least_between_neighbours(field.codec.palette)
+
+
+def test_nothing_beside_anything_has_no_colours():
+    vectors = unit(np.random.default_rng(0).normal(size=(3, 32))).astype(np.float32)
+    for thing in (NO_NODE, 0):
+        field = field_of(np.full(SIDE * SIDE, thing), vectors)
+        assert contrasting_colours(field, field.tree, build_surface(sheet())) is None

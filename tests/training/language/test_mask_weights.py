@@ -11,16 +11,7 @@ from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import LEVELS, NO_NODE
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language import mask_weights as module
-from langsplat_core.training.language.mask_weights import (
-    PAIR,
-    SAME,
-    MaskWeights,
-    find_mask_weights,
-    find_things,
-    group_masks,
-    masks_of_things,
-    view_pairs,
-)
+from langsplat_core.training.language.mask_weights import PAIR, MaskWeights, find_mask_weights, group_masks
 from tests.support.scenes import LIFTED_DIM, dense_weights, make_views, random_camera, random_gaussians
 
 
@@ -88,17 +79,11 @@ def test_groups_hold_what_says_the_same():
     np.testing.assert_allclose((groups.vectors[found] * centres[labels]).sum(1), 1, atol=0.01)
 
 
-def test_a_view_without_masks_has_no_pairs(gaussians):
-    empty = ImageFeatures(np.full((3, 6, 8), -1, np.int32), np.zeros((0, LIFTED_DIM), np.float32))
-    pairs = view_pairs(ReferenceRasterizer(), gaussians, random_camera(0, 8, 6), empty)
-    assert (len(pairs), pairs.dtype) == (0, PAIR)
-
-
 def test_more_masks_than_can_be_numbered_are_refused(gaussians):
     labels = np.full((3, 6, 8), -1, np.int32)
     many = ImageFeatures(labels, np.zeros((70_000, 1), np.float32))
     with pytest.raises(ValueError, match="70000 masks; at most 65 535"):
-        view_pairs(ReferenceRasterizer(), gaussians, random_camera(0, 8, 6), many)
+        module.view_pairs(ReferenceRasterizer(), gaussians, random_camera(0, 8, 6), many)
 
 
 # Things from masks, against the rule written out with sets.
@@ -128,7 +113,7 @@ def counts_of(views: Sequence[Array]) -> list[int]:
 
 
 def found(views: Sequence[Array], count: int) -> Array:
-    return find_things(MaskWeights(list(views), count), counts_of(views))
+    return module.find_things(MaskWeights(list(views), count), counts_of(views))
 
 
 def random_views(seed: int, count: int = 240, views: int = 8) -> list[Array]:
@@ -173,7 +158,7 @@ def plain_masks_of_things(views: Sequence[Array], level: int) -> list[int]:
         for b, other in enumerate(claims):
             both = len(mine & other)
             union = len(mine & seen[of_view[b]]) + len(other & seen[of_view[a]]) - both
-            if of_view[a] != of_view[b] and both > SAME * union:
+            if of_view[a] != of_view[b] and both > module.SAME * union:
                 old, new = names[a], names[b]
                 names = [new if name == old else name for name in names]
     kept = sorted({name for name, claim in zip(names, claims, strict=True) if claim})
@@ -184,7 +169,7 @@ def plain_masks_of_things(views: Sequence[Array], level: int) -> list[int]:
 @pytest.mark.parametrize("seed", range(4))
 def test_masks_go_together_by_the_plain_rule(seed, level):
     views = random_views(seed)
-    got = masks_of_things(MaskWeights(views, 240), counts_of(views), level)
+    got = module.masks_of_things(MaskWeights(views, 240), counts_of(views), level)
     want = np.array(plain_masks_of_things(views, level))
     assert ((got == -1) == (want == -1)).all()
     pairs = len({*zip(got.tolist(), want.tolist(), strict=True)})
@@ -263,16 +248,16 @@ def test_masks_of_other_levels_show_no_thing():
     rows = np.arange(20)
     views = [joined(view(np.where(rows < 10, 0, UNSEEN)), view(np.full(20, 1), level=1))] * 2
     for level, want in ((WHOLE, [0, -1, 0, -1]), (1, [-1, 0, -1, 0]), (0, [-1] * 4)):
-        assert masks_of_things(MaskWeights(views, 20), [2, 2], level).tolist() == want
+        assert module.masks_of_things(MaskWeights(views, 20), [2, 2], level).tolist() == want
     assert found(views, 20).tolist() == [0] * 10 + [NO_NODE] * 10
-    hidden = find_things(MaskWeights([np.zeros(0, PAIR)], 5), [3])  # masks behind everything
+    hidden = module.find_things(MaskWeights([np.zeros(0, PAIR)], 5), [3])  # masks behind everything
     assert hidden.tolist() == [NO_NODE] * 5
 
 
 def test_a_gaussian_that_two_masks_share_evenly_is_claimed_by_neither():
     even = joined(view([0, 0, 0]), view([1, UNSEEN, UNSEEN]))
     assert plain_masks_of_things([even], WHOLE) == [0, -1]
-    assert masks_of_things(MaskWeights([even], 3), [2], WHOLE).tolist() == [0, -1]
+    assert module.masks_of_things(MaskWeights([even], 3), [2], WHOLE).tolist() == [0, -1]
     assert found([even], 3).tolist() == [0, 0, 0]
 
 

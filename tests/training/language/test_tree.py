@@ -1,6 +1,7 @@
 """The tree of things against plain loops in float64, and on scenes whose things are known."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -14,25 +15,7 @@ from langsplat_core.scene.surface import build_surface
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language import tree as module
 from langsplat_core.training.language.mask_weights import PAIR, MaskWeights, find_mask_weights
-from langsplat_core.training.language.tree import (
-    BENT,
-    COLOUR,
-    ENOUGH,
-    PLAIN,
-    SEEN,
-    SMALL,
-    UNSEEN,
-    MergeTree,
-    Patches,
-    count_votes,
-    draw_patches,
-    find_borders,
-    find_tree,
-    link_concavity,
-    link_disagreement,
-    merge,
-    nested_maps,
-)
+from langsplat_core.training.language.tree import MergeTree, Patches, draw_patches, find_tree, merge
 from tests.support.fakes import PER_BLOB, blob_scene, cameras
 from tests.support.scenes import make_views, random_camera, random_gaussians
 
@@ -45,7 +28,7 @@ def random_patches(seed: int, count: int = 24, views: int = 4) -> Patches:
     masses[rng.integers(0, count, 2)] = 0
     first = np.concatenate([np.arange(count), rng.integers(0, count, count)])
     second = np.concatenate([np.roll(np.arange(count), 1), rng.integers(0, count, count)])
-    borders = find_borders(
+    borders = module.find_borders(
         np.arange(count), (first, second), rng.uniform(size=2 * count), rng.uniform(size=2 * count)
     )
     labelling = np.arange(masks, dtype=np.int32) // 5
@@ -74,14 +57,14 @@ def merged_plainly(patches: Patches) -> tuple[list[tuple[int, int]], list[float]
             seen += least
             if least > 0:
                 agreed += least * (mine / mine.sum()) @ (theirs / theirs.sum())
-        agreement = agreed / seen if seen > 0 else 1 - UNSEEN
+        agreement = agreed / seen if seen > 0 else 1 - module.UNSEEN
         links = borders.links[across].sum()
         means = [np.average(patches.colours[nodes], axis=0, weights=patches.areas[nodes]) for nodes in (a, b)]
-        between = SEEN * (1 - agreement) + SEEN * borders.disagreement[across].sum() / links
-        between += BENT * borders.concavity[across].sum() / links
-        between += COLOUR * np.linalg.norm(means[0] - means[1])
+        between = module.SEEN * (1 - agreement) + module.SEEN * borders.disagreement[across].sum() / links
+        between += module.BENT * borders.concavity[across].sum() / links
+        between += module.COLOUR * np.linalg.norm(means[0] - means[1])
         smaller = min(patches.areas[a].sum(), patches.areas[b].sum()) / patches.areas.sum()
-        return between * (smaller / PLAIN) ** SMALL
+        return between * (smaller / module.PLAIN) ** module.SMALL
 
     while True:
         pairs = [(cost(nodes[a], nodes[b]), a, b) for a in nodes for b in nodes if a < b]
@@ -107,7 +90,7 @@ def test_disagreement_of_links():
     gaussians = random_gaussians(120, seed=3, scale_range=(0.1, 0.3))
     mask_weights = find_mask_weights(CpuRasterizer(), gaussians, make_views(4))
     surface = build_surface(gaussians)
-    found = link_disagreement(surface, mask_weights)
+    found = module.link_disagreement(surface, mask_weights)
     assert 0 < found.mean() < 1
     for link in range(0, len(found), 7):
         ends = [surface.rows[numbers[link]] for numbers in surface.ends]
@@ -117,10 +100,10 @@ def test_disagreement_of_links():
                 own = [pairs[(pairs["row"] == row) & (pairs["level"] == level)] for row in ends]
                 if all(map(len, own)):
                     best = [one[one["weight"].argmax()] for one in own]
-                    weight = min(*(one["weight"] for one in best), ENOUGH)
+                    weight = min(*(one["weight"] for one in best), module.ENOUGH)
                     seen += weight
                     apart += weight * (best[0]["mask"] != best[1]["mask"])
-        assert found[link] == pytest.approx(apart / seen if seen else UNSEEN, abs=1e-5)
+        assert found[link] == pytest.approx(apart / seen if seen else module.UNSEEN, abs=1e-5)
 
 
 def test_a_surface_bends_towards_itself_in_a_corner_and_away_on_a_ridge():
@@ -133,8 +116,8 @@ def test_a_surface_bends_towards_itself_in_a_corner_and_away_on_a_ridge():
     surface = build_surface(gaussians)
     middles = surface.positions[surface.ends[0]]
     crease = (middles[:, 0] < 0.05) & (middles[:, 2] < 0.05)
-    inside = link_concavity(surface, np.array([[2.0, 0.5, 2.0]]))
-    outside = link_concavity(surface, np.array([[-2.0, 0.5, -2.0]]))
+    inside = module.link_concavity(surface, np.array([[2.0, 0.5, 2.0]]))
+    outside = module.link_concavity(surface, np.array([[-2.0, 0.5, -2.0]]))
     assert inside[crease].mean() > 5 * inside[~crease].mean()
     assert inside[crease].mean() > 5 * outside[crease].mean()
     assert ((inside >= 0) & (inside <= 1)).all()
@@ -178,23 +161,17 @@ def test_cuts_are_nested_and_end_at_their_cost():
     assert tree.cut(-1.0).tolist() == list(range(24))
     coarser = tree.cut(np.inf)
     assert coarser.max() + 1 == 24 - len(children)
-    for low, high in zip(
-        np.quantile(costs, [0.1, 0.4, 0.7]), np.quantile(costs, [0.4, 0.7, 0.9]), strict=True
-    ):
+    for low, high in pairwise(np.quantile(costs, [0.1, 0.4, 0.7, 0.9])):
         fine, coarse = tree.cut(low), tree.cut(high)
-        for node in np.unique(fine):
-            assert len(np.unique(coarse[fine == node])) == 1
+        assert len(np.unique(np.stack([fine, coarse]), axis=1).T) == len(np.unique(fine))
 
 
 def test_a_pixel_has_the_patch_it_shows_most_of():
     gaussians, camera = random_gaussians(60, scale_range=(0.1, 0.4)), random_camera(1, 24, 18)
     patches = np.random.default_rng(0).integers(-1, 5, 60).astype(np.int32)
     drawn = draw_patches(CpuRasterizer().view(gaussians, camera), gaussians, patches)
-    image, alpha = (
-        ReferenceRasterizer()
-        .view(gaussians, camera)
-        .splat((patches[:, None] == np.arange(5)).astype(np.float64))
-    )
+    each = (patches[:, None] == np.arange(5)).astype(np.float64)
+    image, alpha = ReferenceRasterizer().view(gaussians, camera).splat(each)
     two = np.sort(image, axis=-1)[..., -2:]
     clear = (two[..., 1] - two[..., 0] > 1e-3) & (np.abs(alpha - module.SOLID) > 1e-3)
     want = np.where((alpha > module.SOLID) & (image.max(-1) > 0), image.argmax(-1), -1)
@@ -204,7 +181,9 @@ def test_a_pixel_has_the_patch_it_shows_most_of():
 
 def test_maps_number_what_is_seen_of_three_cuts():
     drawn = np.array([[0, 0, 1, 1], [2, 2, 3, -1]])
-    maps = nested_maps(drawn, [np.arange(4), np.array([0, 0, 1, 1]), np.zeros(4, np.int64)], 2 / drawn.size)
+    maps = module.nested_maps(
+        drawn, [np.arange(4), np.array([0, 0, 1, 1]), np.zeros(4, np.int64)], 2 / drawn.size
+    )
     assert maps.tolist() == [
         [[0, 0, 1, 1], [2, 2, -1, -1]],
         [[3, 3, 3, 3], [4, 4, 4, -1]],
@@ -217,16 +196,14 @@ def test_almost_nothing():
     eyes = np.zeros((1, 3))
     for count in (0, 1, 3):
         gaussians = random_gaussians(count)
-        mask_weights = MaskWeights(
-            [find_mask_weights(CpuRasterizer(), random_gaussians(0), make_views(1)).pairs[0][:0]], count
-        )
-        tree = find_tree(gaussians, build_surface(gaussians), mask_weights, [7], eyes)
+        nothing = MaskWeights([np.zeros(0, PAIR)], count)
+        tree = find_tree(gaussians, build_surface(gaussians), nothing, [7], eyes)
         assert tree.patches.shape == (count,)
         assert (tree.cut(0.5) >= 0).all()
     gaussians = random_gaussians(3)
     view = CpuRasterizer().view(gaussians, random_camera(0, 8, 6))
     assert (draw_patches(view, gaussians, np.full(3, -1, np.int32)) == -1).all()
-    assert (nested_maps(np.full((6, 8), -1, np.int32), [np.zeros(0, np.int32)] * 3, 0.1) == -1).all()
+    assert (module.nested_maps(np.full((6, 8), -1, np.int32), [np.zeros(0, np.int32)] * 3, 0.1) == -1).all()
 
 
 # Votes: masks of just one node, in photograph after photograph.
@@ -257,5 +234,5 @@ def test_votes_are_masks_of_just_that_node():
         photograph(np.zeros(40, int), 2, rows < 9),  # the part that is seen is all that counts
         np.zeros(0, PAIR),
     ]
-    votes = count_votes(tree, MaskWeights(views, 40), [1, 2, 2, 1, 1, 0])
+    votes = module.count_votes(tree, MaskWeights(views, 40), [1, 2, 2, 1, 1, 0])
     assert votes.tolist() == [[3, 1], [2, 1], [3, 1]]

@@ -1,13 +1,18 @@
-"""What the pages say can be done: commands parse, the quick ones run, links lead somewhere, Python runs."""
+"""What the pages say can be done: commands parse, the quick ones run, links lead somewhere, Python runs;
+every script in `docs/examples` runs without arguments of its own, and says and draws what it promises."""
 
 import json
 import re
+import runpy
 import shlex
 import shutil
 from collections.abc import Callable
+from contextlib import redirect_stdout
 from importlib.resources import files
+from io import StringIO
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -20,14 +25,10 @@ from tests.benchmarks.__main__ import parse as parse_benchmarks
 from tests.support.file_samples import compressed_ply
 from tests.support.scenes import random_gaussians
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
-PAGES = [
-    README,
-    ROOT / "CONTRIBUTING.md",
-    *sorted((ROOT / "docs").rglob("*.md")),
-    *(ROOT / "assets").rglob("*.md"),
-]
+PAGES = [README, ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES += (ROOT / "assets").rglob("*.md")
 TOML = re.compile(r"^```toml\n(.*?)^```", re.MULTILINE | re.DOTALL)
 PYTHON = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
@@ -111,11 +112,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def run(start: list[str], more: tuple[str, ...] = ()) -> None:
     """The README's command that starts so."""
-    (words,) = [
-        found
-        for found in commands(README.read_text())
-        if found[: len(start)] == start and found[-1] != start[-1]
-    ]
+    every = [words for words in commands(README.read_text()) if words[: len(start)] == start]
+    (words,) = [words for words in every if words[-1] != start[-1]]
     assert main(words[0], lambda: PARSERS[words[0]]([*words[1:], *more])) == 0
 
 
@@ -158,3 +156,66 @@ def test_python_runs(block: str, capsys: pytest.CaptureFixture[str]) -> None:
     shapes, answer = capsys.readouterr().out.splitlines()
     assert shapes == "(240, 320, 3) (240, 320)"
     assert answer.startswith("True [")
+
+
+# Examples.
+
+EXAMPLES = ROOT / "docs" / "examples"
+
+
+def run_example(name: str, out: Path) -> str:
+    """What the example prints; its files are written to `out`."""
+    path = str(EXAMPLES / f"{name}.py")
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(StringIO()) as said:
+        patch.setattr("sys.argv", [path, str(out)])
+        runpy.run_path(path, run_name="__main__")
+    return said.getvalue()
+
+
+def pixels(path: Path) -> np.ndarray:
+    return np.asarray(Image.open(path)).astype(int)
+
+
+@pytest.mark.long
+def test_render_a_picture(tmp_path: Path) -> None:
+    shares = re.findall(r"(\d+)% covered", run_example("01_render_a_picture", tmp_path))
+    assert len(shares) == 2
+    for share, name in zip(shares, ("photograph.png", "own_place.png"), strict=True):
+        assert int(share) > 90
+        picture = pixels(tmp_path / name)
+        assert picture.shape == (240, 320, 3)
+        assert picture.std() > 30
+
+
+@pytest.mark.long
+def test_ask_a_phrase(tmp_path: Path) -> None:
+    there, place, absent = run_example("02_ask_a_phrase", tmp_path).splitlines()
+    assert there.startswith("blue gift: found, score 0.")
+    assert len(re.findall(r"-?\d+\.\d+", place)) == 3
+    assert absent.startswith("yellow banana: not here")
+    heat = pixels(tmp_path / "relevancy.png")
+    assert heat.shape == (240, 320)
+    assert 0.005 < (heat > 200).mean() < 0.1  # the gift is a small part of the picture
+    assert (heat < 150).mean() > 0.9
+
+
+@pytest.mark.long
+def test_lift_your_own_features(tmp_path: Path) -> None:
+    observed, agree = map(
+        int, re.findall(r"(\d+)(?: Gaussians|%)", run_example("03_lift_your_own_features", tmp_path))
+    )
+    assert observed > 50_000
+    assert agree > 90
+    assert pixels(tmp_path / "lifted.png").shape == (180, 240, 3)
+
+
+@pytest.mark.long
+def test_write_a_backend(tmp_path: Path) -> None:
+    errors = re.findall(
+        r"(\w+): mean error (\S+), largest (\S+)", run_example("04_write_a_backend", tmp_path)
+    )
+    (discs, coarse, _), (cpu, fine, largest) = errors
+    assert (discs, cpu) == ("discs", "cpu")
+    assert 1e-3 < float(coarse) < 0.2
+    assert float(fine) < 1e-6
+    assert float(largest) < 1e-4

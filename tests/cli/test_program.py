@@ -1,6 +1,9 @@
-"""Whatever happens to a command, it ends with one line."""
+"""The command line as a whole: its commands, their options, what it says of those that do not exist; and
+whatever happens to a command, it ends with one line."""
 
+import dataclasses
 import json
+import logging
 import os
 import signal
 import subprocess
@@ -10,10 +13,116 @@ from importlib.resources import files
 from pathlib import Path
 
 import pytest
+from tyro.extras import get_parser
 
-from langsplat_core.cli.app import parse
-from langsplat_core.cli.run import main
+from langsplat_core import __version__
+from langsplat_core.cli import scenes
+from langsplat_core.cli.app import COMMANDS, GROUPS, entry, load_command, parse
+from langsplat_core.cli.scenes import Doctor
+from langsplat_core.errors import InputError
+from langsplat_viewer.program import ViewerCommand
+from langsplat_viewer.program import entry as viewer_entry
+from langsplat_viewer.program import parse as viewer_parse
+from tests.support.commands import refusal, run
 from tests.support.processes import bound_by_permissions
+
+EVERY = {
+    "viewer": ViewerCommand,
+    **{name: load_command(where) for name, where in COMMANDS.items()},
+    **{f"{group} {name}": load_command(at) for group in GROUPS for name, at in GROUPS[group][1].items()},
+}
+
+
+@pytest.mark.parametrize("name", EVERY)
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_every_option_is_described(name):
+    actions = get_parser(EVERY[name])._actions  # noqa: SLF001  argparse has no public list of them
+    assert len(actions) > len(dataclasses.fields(EVERY[name])) // 2
+    said = {one.dest: (one.help or "").partition("(default")[0].replace("(required)", "") for one in actions}
+    assert [option for option, text in said.items() if len(text.strip()) < 3] == []
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["qurey", "a.ply"], "no command 'qurey'; did you mean 'query'?"),
+        (["bench", "quary"], "no command 'bench quary'; did you mean 'query'?"),
+        (["xyz"], "no command 'xyz'; there are train, frames, query"),
+        (["--tyro-print-completion", "ksh"], "--tyro-print-completion ksh: there is bash, zsh"),
+    ],
+)
+def test_a_command_or_a_shell_that_does_not_exist_is_named(words, said):
+    with pytest.raises(InputError) as error:
+        parse(words)
+    assert str(error.value).startswith(said)
+
+
+@pytest.mark.parametrize(("program", "begin"), [("langsplat", entry), ("langsplat-viewer", viewer_entry)])
+def test_versions(program, begin, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [program, "--version"])
+    with pytest.raises(SystemExit) as stop:
+        begin()
+    assert not stop.value.code
+    assert capsys.readouterr().out == f"{program} {__version__}\n"
+
+
+@pytest.mark.parametrize(("flag", "level"), [("-q", "ERROR"), ("--verbose", "DEBUG")])
+def test_how_much_is_said_stands_anywhere(flag, level):
+    log = logging.getLogger("langsplat")
+    for words in ([flag, "doctor"], ["doctor", flag], ["bench", flag, "raster"], ["bench", "raster", flag]):
+        log.setLevel(logging.INFO)
+        parse(words)
+        assert logging.getLevelName(log.level) == level
+    log.setLevel(logging.INFO)
+    viewer_parse([flag, "scene.ply"])
+    assert logging.getLevelName(log.level) == level
+    parse(["doctor"])
+    assert log.level == logging.INFO
+
+
+COMPLETE = """
+source /dev/stdin
+try() {
+  COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1))
+  _tyro_langsplat langsplat "${@: -1}"
+  echo "${COMPREPLY[@]}"
+}
+try langsplat q
+try langsplat bench r
+try langsplat train --max
+try langsplat train --preset g
+"""
+
+
+def test_bash_completes_commands_options_and_choices(capsys):
+    with pytest.raises(SystemExit) as stop:
+        parse(["--tyro-print-completion", "bash"])
+    assert not stop.value.code
+    script = capsys.readouterr().out
+    terminal = {**os.environ, "LC_ALL": "C.UTF-8", "PYTHONUTF8": "1"}  # of others tyro's scripts know nothing
+    said = subprocess.check_output(["bash", "-c", COMPLETE], input=script, encoding="utf-8", env=terminal)
+    assert said.splitlines() == ["query", "raster", "--max-relevancy-error", "good"]
+
+
+def test_doctor_says_what_draws_and_what_encodes(capsys):
+    Doctor().run()
+    said = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
+    assert said["langsplat"] == __version__
+    assert said["OpenGL"]
+    assert "demo: works" in said["text"]
+
+
+@pytest.mark.long
+def test_demo_renders_the_bundled_scene(tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(scenes, "PICTURES", {"gift.png": ("--query", "blue gift")})
+    assert run("demo", "--out", tmp_path) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["gift.png"]
+    assert "'blue gift': found" in capfd.readouterr().out
+    monkeypatch.setattr(scenes, "PICTURES", {"gift.png": ("--camera", "absent")})
+    assert run("demo", "--out", tmp_path) == 2
+
+
+# Endings.
 
 DEMO = str(files("langsplat_assets") / "demo" / "scene.ply")
 RUN = [sys.executable, "-m", "langsplat_core"]
@@ -41,9 +150,7 @@ def test_every_command_that_writes_tries_the_place_first(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("")
     (tmp_path / "s.ply").symlink_to(DEMO)
-    words = line.format(place.format(here=tmp_path)).split()
-    assert main("langsplat", lambda: parse(words)) == 2
-    (message,) = capsys.readouterr().err.splitlines()
+    message = refusal(capsys, *line.format(place.format(here=tmp_path)).split())
     assert any(word in message for word in ("system's own", "is a file", "file system takes")), message
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "s.ply"]
 
@@ -52,9 +159,7 @@ def test_every_command_that_writes_tries_the_place_first(
     "words", [["query", DEMO, "caf\udce9"], ["query", DEMO, "cup", "--encoder", "\udcff"]]
 )
 def test_texts_that_are_not_utf_8(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main("langsplat", lambda: parse(words)) == 2
-    (message,) = capsys.readouterr().err.splitlines()
-    assert "is not UTF-8" in message
+    assert "is not UTF-8" in refusal(capsys, *words)
 
 
 def test_a_name_that_is_not_utf_8_can_be_read_and_is_printed_with_escapes(tmp_path: Path) -> None:
@@ -71,9 +176,8 @@ def test_names_that_cannot_be_read(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("")
-    for words in (["inspect", name], ["train", name, "--out", "s.ply", "--clip.model", "demo"]):
-        assert main("langsplat", lambda words=words: parse(words)) == 2  # type: ignore[misc]
-        assert len(capsys.readouterr().err.splitlines()) == 1
+    refusal(capsys, "inspect", name)
+    refusal(capsys, "train", name, "--out", "s.ply", "--clip.model", "demo")
 
 
 REPORTS = """
@@ -158,7 +262,13 @@ def signalled(code: str, number: int, seconds: float = 0.0) -> tuple[int, list[s
     return process.returncode, errors.splitlines()
 
 
-@pytest.mark.parametrize(("number", "said"), [(signal.SIGTERM, "terminated"), (signal.SIGINT, "interrupted")])
+ENDED = pytest.mark.parametrize(
+    ("number", "said"), [(signal.SIGTERM, "terminated"), (signal.SIGINT, "interrupted")]
+)
+CONTINUES = "langsplat: {}; the same command continues where it stopped"
+
+
+@ENDED
 def test_a_signal_ends_a_command_in_a_line(number: int, said: str, tmp_path: Path) -> None:
     """With pycolmap imported, whose library would print a stack trace."""
     code = (
@@ -170,10 +280,7 @@ def test_a_signal_ends_a_command_in_a_line(number: int, said: str, tmp_path: Pat
         "        print('ready', flush=True)\n        time.sleep(60)\n"
         "sys.exit(main('langsplat', Waits))\n"
     )
-    ended, lines = signalled(code, number)
-    assert ended == 128 + number
-    (line,) = lines
-    assert line == f"langsplat: {said}; the same command continues where it stopped"
+    assert signalled(code, number) == (128 + number, [CONTINUES.format(said)])
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -191,7 +298,7 @@ def test_a_signal_while_modules_are_imported_is_a_line(program: str, number: int
     assert len(lines) == 1 or ended == 0, lines
 
 
-@pytest.mark.parametrize(("number", "said"), [(signal.SIGTERM, "terminated"), (signal.SIGINT, "interrupted")])
+@ENDED
 def test_a_signal_while_a_command_imports_is_not_for_the_module(
     number: int, said: str, tmp_path: Path
 ) -> None:
@@ -207,8 +314,7 @@ def test_a_signal_while_a_command_imports_is_not_for_the_module(
     )
     words = [sys.executable, "-c", code]
     done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=60)
-    assert done.returncode == 128 + number
-    assert done.stderr == f"langsplat: {said}; the same command continues where it stopped\n"
+    assert (done.returncode, done.stderr) == (128 + number, CONTINUES.format(said) + "\n")
 
 
 CLOSED = (".", "images", "sparse/0/cameras.bin", "transforms.json")

@@ -1,5 +1,7 @@
-"""`langsplat convert` to every format that is written: what of a scene arrives, what the image loses."""
+"""`langsplat convert` to every format that is written: what of a scene arrives, what the image loses; and
+`transform`, `crop` and `clean`: what belongs to a scene goes along, or nothing is written."""
 
+import json
 import os
 import re
 from dataclasses import replace
@@ -10,16 +12,16 @@ import numpy as np
 import pytest
 
 from langsplat_core.arrays import unit
-from langsplat_core.cli.app import parse
 from langsplat_core.cli.export import Convert
-from langsplat_core.cli.run import main
 from langsplat_core.io import language
 from langsplat_core.io.language import write_language
 from langsplat_core.io.scenes import companion_path, load_scene, save_scene
 from langsplat_core.raster.render import render
-from langsplat_core.scene import Camera, Gaussians, Scene
+from langsplat_core.scene import Camera, Gaussians, Scene, TaughtWord
+from langsplat_core.scene.tree import tree_of_wholes
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures
+from tests.support.commands import refusal, run
 from tests.support.comparing import assert_same_extras
 from tests.support.file_samples import random_field, sog_files, write_folder
 from tests.support.fixtures import Measure
@@ -74,10 +76,6 @@ def test_rematch_keeps_cameras_mark_and_extras(tmp_path):
 # ---- checkpoints of other methods ----
 
 
-def run(*words: object) -> int:
-    return main("langsplat", lambda: parse(["convert", *map(str, words)]))
-
-
 @pytest.fixture
 def checkpoints(tmp_path: Path) -> list[Path]:
     """Of Occam's LGS, three levels of vectors as long as the demo encoder's."""
@@ -91,7 +89,8 @@ def checkpoints(tmp_path: Path) -> list[Path]:
 
 @pytest.mark.long
 def test_checkpoints_become_a_scene_and_a_scene_checkpoints(tmp_path, checkpoints, capsys):
-    assert run(*checkpoints, tmp_path / "a.ply", "--encoder", "demo", "--phrases", "apple", "red mug") == 0
+    read = ("--encoder", "demo", "--phrases", "apple", "red mug")
+    assert run("convert", *checkpoints, tmp_path / "a.ply", *read) == 0
     printed = capsys.readouterr().out
     assert "Occam's LGS: levels (by the names of files and folders): subpart from" in printed
     assert "codec codebook of 5, encoder demo" in printed
@@ -100,25 +99,25 @@ def test_checkpoints_become_a_scene_and_a_scene_checkpoints(tmp_path, checkpoint
     assert scene.language is not None
     assert set(scene.language.phrasebook) == {"apple", "red mug"}
     assert (scene.language.confidence == 1).all()
-    assert run(tmp_path / "a.ply", tmp_path / "out", "--to", "occam") == 0
+    assert run("convert", tmp_path / "a.ply", tmp_path / "out", "--to", "occam") == 0
     assert len(list((tmp_path / "out").glob("chkpnt30000_langfeat_[123].pth"))) == 3
-    assert run(tmp_path / "a.ply", tmp_path / "out", "--to", "langsplat") == 2
-    assert "--to occam" in capsys.readouterr().err
+    words = ("convert", tmp_path / "a.ply", tmp_path / "out", "--to", "langsplat")
+    assert "--to occam" in refusal(capsys, *words)
 
 
 def test_a_checkpoint_of_gaussians_alone(tmp_path, capsys):
     g = random_gaussians(20, sh_degree=3)
     path = save_model(tmp_path / "chkpnt30000.pth", g)
-    assert run(path, tmp_path / "a.spz") == 0
+    assert run("convert", path, tmp_path / "a.spz") == 0
     assert "20 Gaussians, without a language field" in capsys.readouterr().out
     assert np.abs(load_scene(tmp_path / "a.spz").gaussians.means - g.means).max() < 1e-3
-    assert run(tmp_path / "a.spz", tmp_path / "out", "--to", "langsplat") == 2
-    assert "has no language field" in capsys.readouterr().err
+    words = ("convert", tmp_path / "a.spz", tmp_path / "out", "--to", "langsplat")
+    assert "has no language field" in refusal(capsys, *words)
 
 
 def test_a_scene_of_an_autoencoder_becomes_langsplats(tmp_path):
     save_scene(tmp_path / "case.ply", full_scene())
-    assert run(tmp_path / "case.ply", tmp_path / "out", "--to", "langsplat") == 0
+    assert run("convert", tmp_path / "case.ply", tmp_path / "out", "--to", "langsplat") == 0
     made = sorted(str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*.pth"))
     assert made == ["best_ckpt.pth", *(f"case_{level}/chkpnt30000.pth" for level in (1, 2, 3))]
 
@@ -127,10 +126,10 @@ def test_masks_and_vectors_both_ways(tmp_path):
     labels = np.arange(12, dtype=np.int32).reshape(3, 2, 2)
     store = FeatureStore(tmp_path / "features")
     store.save("a.jpg", ImageFeatures(labels, np.eye(12, 20, dtype=np.float32)))
-    assert run(tmp_path / "features", tmp_path / "language_features", "--to", "features") == 0
-    assert run(tmp_path / "language_features", tmp_path / "back", "--to", "features") == 0
+    assert run("convert", tmp_path / "features", tmp_path / "language_features", "--to", "features") == 0
+    assert run("convert", tmp_path / "language_features", tmp_path / "back", "--to", "features") == 0
     np.testing.assert_array_equal(FeatureStore(tmp_path / "back").load("a").labels, labels)
-    assert run(tmp_path / "nothing", tmp_path / "back", "--to", "features") == 2
+    assert run("convert", tmp_path / "nothing", tmp_path / "back", "--to", "features") == 2
 
 
 @pytest.mark.parametrize(
@@ -150,10 +149,7 @@ def test_what_cannot_be_imported_is_one_line(tmp_path, capsys, monkeypatch, word
     monkeypatch.chdir(tmp_path)
     g = random_gaussians(20)
     paths = [save_model(tmp_path / f"{name}.pth", g, tensor(np.ones((20, 3), np.float32))) for name in "ab"]
-    assert run(*(word.format(*paths) for word in words)) == 2
-    error = capsys.readouterr().err
-    assert re.search(message, error)
-    assert error.count("\n") == 1
+    assert re.search(message, refusal(capsys, "convert", *(word.format(*paths) for word in words)))
 
 
 def test_no_scene_that_is_read_is_replaced_by_any_other_name(tmp_path, capsys, monkeypatch):
@@ -164,18 +160,12 @@ def test_no_scene_that_is_read_is_replaced_by_any_other_name(tmp_path, capsys, m
     save_scene("b.ply", full_scene())
     Path("link.ply").symlink_to("b.ply")
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    for words in (
-        ("a", "a.ply"),
-        ("a/meta.json", "a.ply"),
-        ("link.ply", "b.ply"),
-        ("b.ply", "link.ply"),
-        ("a", "b.ply", "--rematch", "b.langsplat.safetensors"),
-    ):
-        assert run(*words) == 2, words
-        assert "would replace the original scene" in capsys.readouterr().err
+    pairs = ("a", "a.ply"), ("a/meta.json", "a.ply"), ("link.ply", "b.ply"), ("b.ply", "link.ply")
+    for words in (*pairs, ("a", "b.ply", "--rematch", "b.langsplat.safetensors")):
+        assert "would replace the original scene" in refusal(capsys, "convert", *words)
     assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     os.link("b.ply", "other name.ply")  # which is another file as soon as it is written
-    assert run("b.ply", "other name.ply") == 0
+    assert run("convert", "b.ply", "other name.ply") == 0
     assert Path("b.ply").read_bytes() == before[tmp_path / "b.ply"]
 
 
@@ -183,10 +173,7 @@ def test_no_scene_that_is_read_is_replaced_by_any_other_name(tmp_path, capsys, m
 
 
 def psnr(scene: Gaussians, truth: Gaussians, cameras: list[Camera]) -> float:
-    images = [
-        [render(Scene(gaussians), camera).colours.clip(0, 1) for camera in cameras]
-        for gaussians in (scene, truth)
-    ]
+    images = [[render(Scene(one), camera).colours.clip(0, 1) for camera in cameras] for one in (scene, truth)]
     return float(-10 * np.log10(np.mean(np.square(np.subtract(*images)))))
 
 
@@ -208,3 +195,136 @@ def test_the_demo_scene_in_small_formats(
     assert value > least
     size = (tmp_path / f"demo{suffix}").stat().st_size
     assert size == bytes_each * len(want) if suffix == ".splat" else size < bytes_each * len(want)
+
+
+# `langsplat transform`, `crop` and `clean`.
+
+N = 60
+
+
+@pytest.fixture
+def scene() -> Scene:
+    """With every kind of companion, and none of its Gaussians far from a camera."""
+    field = random_field(N, phrases=("red mug",))
+    vector = np.eye(1, field.codec.vector_dim, dtype=np.float32)
+    taught = (TaughtWord("thing", 2, vector, np.zeros(1, np.float32)),)
+    field = replace(field, tree=tree_of_wholes(np.arange(N) // 9), taught=taught)
+    extras = {"age": np.arange(N, dtype=np.float32)}
+    cameras = tuple(random_camera(seed) for seed in range(3))
+    return Scene(random_gaussians(N, sh_degree=3), field, cameras, extras=extras, metres_per_unit=0.5)
+
+
+@pytest.fixture
+def source(scene, tmp_path):
+    save_scene(tmp_path / "scene.ply", scene)
+    return tmp_path / "scene.ply"
+
+
+def assert_companions(made: Scene, scene: Scene, rows) -> None:
+    """The language field, tree, taught words, cameras and extra properties are those of `rows`."""
+    field, expected = made.language, scene.language.take(rows)
+    np.testing.assert_array_equal(field.latents, expected.latents)
+    np.testing.assert_array_equal(field.tree.leaves, expected.tree.leaves)
+    assert [word.name for word in field.taught] == ["thing"]
+    assert list(field.phrasebook) == ["red mug"]
+    assert len(made.cameras) == len(scene.cameras)
+    np.testing.assert_array_equal(made.extras["age"], scene.extras["age"][rows])
+
+
+def test_transform_moves_everything(scene, source, tmp_path, capsys):
+    """A quarter turn about z, twice the size, and a move, in that order, whatever the order of options."""
+    out = tmp_path / "out.ply"
+    assert run("transform", source, out, "--move", 1, 2, 3, "--scale", 2, "--rotate", "z", 90) == 0
+    made = load_scene(out)
+    x, y, z = scene.gaussians.means.T
+    moved = np.stack([1 - 2 * y, 2 + 2 * x, 3 + 2 * z], 1)
+    np.testing.assert_allclose(made.gaussians.means, moved, atol=1e-5)
+    assert made.metres_per_unit == pytest.approx(0.25)
+    assert_companions(made, scene, np.arange(N))
+    assert f"{N} Gaussians, 3 cameras" in capsys.readouterr().out
+
+
+def test_transform_and_its_inverse_by_matrix(scene, source, tmp_path):
+    there, back = tmp_path / "there.ply", tmp_path / "back.ply"
+    matrix = [0, -2, 0, 5, 2, 0, 0, 6, 0, 0, 2, 7, 0, 0, 0, 1]
+    assert run("transform", source, there, "--matrix", *matrix) == 0
+    assert run("transform", there, back, "--matrix", *np.linalg.inv(np.reshape(matrix, (4, 4))).ravel()) == 0
+    np.testing.assert_allclose(load_scene(back).gaussians.means, scene.gaussians.means, atol=1e-5)
+    np.testing.assert_allclose(load_scene(back).gaussians.sh, scene.gaussians.sh, atol=1e-5)
+
+
+@pytest.mark.parametrize(("axis", "up"), [("z", [0, 0, 1]), ("-y", [0, -1, 0])])
+def test_up_becomes_the_axis(axis, up, source, tmp_path):
+    assert run("transform", source, tmp_path / "out.ply", f"--up={axis}") == 0
+    np.testing.assert_allclose(load_scene(tmp_path / "out.ply").up(), up, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("words", "kept"),
+    [
+        (["--box", 0, 0, 0, -9, -9, -9], lambda x, y, z: (x <= 0) & (y <= 0) & (z <= 0)),
+        (["--sphere", 0, 0, 0, 0.5], lambda x, y, z: x**2 + y**2 + z**2 <= 0.25),
+        (["--plane", 0, 2, 0, 0.2], lambda x, y, z: y >= 0.1),
+        (["--plane", 0, 1, 0, 0, "--plane", -1, 0, 0, 0], lambda x, y, z: (y >= 0) & (x <= 0)),
+        (["--box", 0, 0, 0, 9, 9, 9, "--sphere", 0, 0, 0, 0.9, "--outside"],
+         lambda x, y, z: ~((x >= 0) & (y >= 0) & (z >= 0) & (x**2 + y**2 + z**2 <= 0.81))),
+    ],
+)  # fmt: skip
+def test_crop_keeps_what_lies_in_all_shapes(words, kept, scene, source, tmp_path):
+    out = tmp_path / "out.ply"
+    assert run("crop", source, out, *words) == 0
+    rows = np.flatnonzero(kept(*scene.gaussians.means.astype(np.float64).T))
+    assert 0 < len(rows) < N
+    np.testing.assert_array_equal(load_scene(out).gaussians.means, scene.gaussians.means[rows])
+    assert_companions(load_scene(out), scene, rows)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["transform", "--scale", 0],
+        ["transform", "--rotate", "x", "inf"],
+        ["transform", "--matrix", 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1],
+        ["transform", "--move", 1e11, 0, 0],
+        ["crop"],
+        ["crop", "--sphere", 100, 0, 0, 1],
+        ["crop", "--sphere", 0, 0, 0, -1],
+        ["crop", "--plane", 0, 0, 0, 1],
+        ["crop", "--box", -9, -9, -9, 9, 9, 9, "--outside"],
+    ],
+)
+def test_what_cannot_be_done_writes_nothing(words, source, tmp_path, capsys):
+    before = sorted(tmp_path.iterdir())
+    command, *options = words
+    refusal(capsys, command, source, tmp_path / "out.ply", *options)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize("command", ["transform", "crop", "clean"])
+def test_the_original_is_never_replaced(command, source, capsys):
+    content = source.read_bytes()
+    box = ["--box", -9, -9, -9, 9, 9, 9] if command == "crop" else []
+    assert "would replace" in refusal(capsys, command, source, source, *box)
+    assert source.read_bytes() == content
+
+
+def test_a_scene_without_companions_and_far_away(tmp_path):
+    gaussians = random_gaussians(N)
+    far = replace(gaussians, means=gaussians.means + np.float32(1e6))
+    save_scene(tmp_path / "far.ply", Scene(far))
+    near = tmp_path / "near.ply"
+    assert run("transform", tmp_path / "far.ply", near, "--move", -1e6, -1e6, -1e6) == 0
+    made = load_scene(near)
+    assert made.language is None
+    assert np.abs(made.gaussians.means - gaussians.means).max() < 0.1  # float32's steps at a million
+    assert run("crop", near, tmp_path / "half.ply", "--plane", 1, 0, 0, 0) == 0
+
+
+def test_clean_says_what_went(scene, source, tmp_path, capsys):
+    out = tmp_path / "out.ply"
+    assert run("clean", source, out, "--region", 3, "--max-psnr-loss", 3, "--json") == 0
+    report = json.loads(capsys.readouterr().out)
+    made = load_scene(out)
+    assert len(made.gaussians) == N - report["removed"]
+    assert report["loss"] <= 3
+    assert_companions(made, scene, np.isin(scene.extras["age"], made.extras["age"]))

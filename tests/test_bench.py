@@ -1,28 +1,39 @@
-"""The rasterizer benchmark: its reference windows, promised ratios and files. No test looks at a time."""
+"""The rasterizer benchmark: its reference windows, promised ratios and files; the query benchmark on a tiny
+scene. No test looks at a time."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from langsplat_core.bench import RasterBenchConfig, peak_memory, resident_memory, restart_peak
+from langsplat_core.bench import (
+    QueryBenchConfig,
+    RasterBenchConfig,
+    peak_memory,
+    resident_memory,
+    restart_peak,
+)
 from langsplat_core.bench import raster as bench_report
 from langsplat_core.bench.measure import Measurement, reference_windows
+from langsplat_core.bench.query import measure_queries, query_table, repeated, with_codec
 from langsplat_core.bench.raster import plot, run_plan, sweep
 from langsplat_core.cli.evaluate import write_report
+from langsplat_core.errors import InputError
 from langsplat_core.raster.reference import ReferenceRasterizer
+from langsplat_core.scene import CodebookCodec, LanguageField, Scene
+from tests.support.commands import run
+from tests.support.fakes import DIM, PER_BLOB, FakeEncoder, axis, blob_scene
+from tests.support.file_samples import random_codec
 from tests.support.scenes import random_camera, random_gaussians, random_values
 
-pytestmark = pytest.mark.long
+
+def measurement(gaussians: int, milliseconds: float, operation: str = "splat") -> Measurement:
+    return Measurement("random", gaussians, 320, 240, 3, operation, "cpu", milliseconds)
 
 
-def measurement(
-    gaussians=100, milliseconds=1.0, operation="splat", backend="cpu", size=(320, 240), channels=3
-):
-    return Measurement("random", gaussians, *size, channels, operation, backend, milliseconds)
-
-
+@pytest.mark.long
 class TestReferenceWindows:
     g, camera = random_gaussians(400, 7), random_camera(8, 150, 110)
 
@@ -54,6 +65,7 @@ class TestReferenceWindows:
         assert exact.splat_error(bad, x).off_cuts == pytest.approx(0.125)
 
 
+@pytest.mark.long
 class TestReport:
     def test_ratios_say_met_missed_and_not_measured(self):
         rows = [
@@ -78,6 +90,7 @@ class TestReport:
         ]  # fmt: skip
 
 
+@pytest.mark.long
 def test_a_tiny_run_writes_three_sane_files(tmp_path):
     plan = RasterBenchConfig((60, 120, 200), ((40, 30),), 120, (1, 3))
     unfinished = []
@@ -97,21 +110,22 @@ def test_a_tiny_run_writes_three_sane_files(tmp_path):
     frozen = [r for r in rows if r["operation"].startswith("frozen")]
     assert all(r["error_off_cuts"] < 2e-3 for r in frozen)  # weights in 16 bits
     text = (tmp_path / "raster.md").read_text()
-    for heading in ("# Rasterizers", "## Promised ratios"):
-        assert heading in text
+    assert "# Rasterizers" in text
+    assert "## Promised ratios" in text
     assert Image.open(tmp_path / "raster.png").size[0] > 1000
 
 
+@pytest.mark.long
 def test_what_would_take_too_long_is_named(tmp_path):
     plan = RasterBenchConfig((60, 4000), ((40, 30),), 60, (1,), limit=1e-9)
     report = run_plan(plan)
-    assert all(r.milliseconds is not None for r in report.rows if r.gaussians == 60)
+    assert {r.milliseconds is None for r in report.rows if r.gaussians == 60} == {False}
     left_out = [r for r in report.rows if r.gaussians == 4000]
-    assert left_out
-    assert all(r.milliseconds is None and "expected" in r.note for r in left_out)
+    assert {r.milliseconds is None and "expected" in r.note for r in left_out} == {True}
     assert "not run" in report.text
 
 
+@pytest.mark.long
 def test_a_peak_begins_anew():
     if restart_peak() is None:
         pytest.skip("this system does not tell")
@@ -121,3 +135,71 @@ def test_a_peak_begins_anew():
     assert peak_memory() > resident_memory() + 100_000_000
     restart_peak()
     assert peak_memory() < resident_memory() + 100_000_000
+
+
+# The query benchmark.
+
+SMALL = QueryBenchConfig(size=(40, 30), phrases=2, together=3, repeats=1, codec_steps=40)
+
+
+def codebook_scene() -> Scene:
+    """The three blobs, each with a codeword of its own at all levels."""
+    codec = CodebookCodec(np.eye(3, DIM, dtype=np.float32), np.zeros((3, 3), np.float32))
+    latents = np.tile(np.repeat(np.arange(3, dtype=np.uint16), PER_BLOB)[:, None], (3, 1, 1))
+    confidence = np.ones((3, 3 * PER_BLOB), np.float32)
+    confidence[0, :50] = 0
+    field = LanguageField(latents, confidence, codec, np.tile(axis(3), (4, 1)), "fake")
+    return replace(blob_scene(), language=field)
+
+
+@pytest.mark.long
+def test_every_order_is_measured_against_what_it_should_find():
+    report = measure_queries(codebook_scene(), FakeEncoder(), SMALL)
+    paper, table, codebook = report.costs
+    assert (report.gaussians, report.size, report.phrases) == (3 * PER_BLOB, (40, 30), 3)
+    assert [cost.way for cost in report.costs] == ["paper's order", "table lookup", "codebook"]
+    assert codebook.lookup.p99 < 1e-6
+    assert codebook.codec == codebook.lookup  # its latents stand for the codewords themselves
+    assert 0 < table.lookup.mean < table.codec.mean  # 40 steps fit nothing; the table shows what they did
+    assert table.codec.mean == pytest.approx(paper.codec.mean, rel=0.1)
+    for cost in report.costs:
+        assert min(cost.answer, cost.camera, cost.frame) >= 0  # seconds: how many is not for a test to say
+        assert cost.way in query_table(report)
+
+
+def test_a_scene_without_a_codebook_is_refused():
+    with pytest.raises(InputError, match="codebook"):
+        measure_queries(blob_scene(), FakeEncoder(), SMALL)
+
+
+def test_repeated_gaussians_lie_beside_their_own_with_their_meaning():
+    scene = codebook_scene()
+    larger = repeated(scene, 1000)
+    assert len(larger.gaussians) == 1000
+    rows = np.arange(1000) % (3 * PER_BLOB)
+    np.testing.assert_array_equal(larger.language.latents, scene.language.latents[:, rows])
+    steps = (larger.gaussians.means - scene.gaussians.means[rows]) / np.exp(scene.gaussians.log_scales[rows])
+    assert 0.9 < steps.std() < 1.1
+
+
+def test_another_codec_encodes_the_codewords():
+    field = codebook_scene().language
+    wide = CodebookCodec(np.eye(3, 16, dtype=np.float32), np.zeros((3, 3), np.float32))
+    field = replace(field, codec=wide, canonical=np.eye(16, dtype=np.float32)[[3] * 4])
+    codec = random_codec("autoencoder")
+    encoded = with_codec(field, codec)
+    want = codec.encode(np.eye(3, 16, dtype=np.float32))[field.latents[2, :, 0]]
+    np.testing.assert_array_equal(encoded.latents[2], want)
+    assert (encoded.latents[0, :50] == 0).all()
+
+
+@pytest.mark.long
+def test_the_command_writes_what_it_measured(tmp_path, capsys):
+    small = "--size 64 48 --phrases 2 --together 2 --repeats 1 --codec-steps 30"
+    words = ["bench", "query", "assets/demo/scene.ply", *small.split(), "--out", tmp_path]
+    assert run(*words) == 0
+    report = json.loads((tmp_path / "query.json").read_text())["report"]
+    assert report["size"] == [64, 48]
+    assert report["costs"][2]["lookup"]["p99"] < 1e-6
+    assert (tmp_path / "query.md").read_text() in capsys.readouterr().out
+    assert run(*words, "--repeats", 0) == 2

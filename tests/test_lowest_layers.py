@@ -1,0 +1,132 @@
+"""What every layer shares: numbers, the one printable line of a message, and progress as a value, in lines
+and in words, with laps where somebody watches."""
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from langsplat_core import errors
+from langsplat_core.arrays import number, psnr, whole_number
+from langsplat_core.errors import EncoderError, InputError, printable_line, quoted
+from langsplat_core.progress import LineProgress, Progress, Report, duration, lap, watched
+
+
+def test_psnr() -> None:
+    a = np.zeros((4, 4, 3), np.float32)
+    assert psnr(a + np.float32(0.1), a) == pytest.approx(20, abs=1e-5)
+    assert psnr(a, a) == 100
+    assert psnr(a.astype(np.float16) + 1, a) == pytest.approx(0)
+
+
+@pytest.mark.parametrize("text", ["١", "1٠", "１", "1_0", "²", "", "x"])
+def test_numbers_in_other_digits_are_refused(text: str) -> None:
+    for read in (number, whole_number):
+        with pytest.raises(ValueError, match=r"digits|convert|literal"):
+            read(text)
+    assert (number("-1e3"), whole_number(" 7 ")) == (-1000, 7)
+
+
+# Messages.
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("one\n  two\r\n\tthree", "one two three"),
+        ("a\x1b[2Jb\x00c\x7f", r"a\x1b[2Jb\x00c\x7f"),
+        ("\udcff surrogate", r"\udcff surrogate"),
+        ("right\u202eleft", r"right\u202eleft"),
+        ("Tür \u2028 é 日本", "Tür é 日本"),
+        ("", ""),
+    ],
+)
+def test_one_printable_line(text: str, line: str) -> None:
+    kinds = InputError, errors.FormatError, errors.BackendError, EncoderError
+    assert {printable_line(text), *(str(kind(text)) for kind in kinds)} == {line}
+
+
+def test_a_long_line_keeps_its_ends() -> None:
+    line = printable_line("begin " + "x" * 10_000 + " end", 100)
+    assert len(line) == 100
+    assert line.startswith("begin xxx")
+    assert line.endswith("xxx end")
+    assert len(str(InputError("y" * 10_000))) == errors.LINE_LIMIT
+    assert printable_line("z" * 100, 100) == "z" * 100
+
+
+def test_a_quotation_is_short_with_its_escapes() -> None:
+    assert quoted("red mug", 60) == "'red mug'"
+    assert len(quoted("\x00" * 60, 60)) == 60
+
+
+# Progress.
+
+
+def test_laps_of_one_name_are_summed():
+    with watched() as laps:
+        for _ in range(2):
+            with lap("a"):
+                time.sleep(0.01)
+        with lap("b"):
+            pass
+    assert laps["a"] >= 20
+    assert laps["b"] < laps["a"]
+    with lap("c"):
+        pass
+    assert set(laps) == {"a", "b"}
+
+
+def test_a_device_is_waited_for_only_where_somebody_watches():
+    with lap("a", lambda: pytest.fail("waited")):
+        pass
+    with watched() as laps, lap("a", lambda: time.sleep(0.01)):
+        pass
+    assert laps["a"] >= 10
+
+
+def test_other_threads_are_not_watched():
+    def work() -> None:
+        with lap("elsewhere"):
+            pass
+
+    with watched() as laps, ThreadPoolExecutor(1) as pool:
+        pool.submit(work).result()
+    assert laps == {}
+
+
+def test_an_error_passes_and_the_watch_ends():
+    with pytest.raises(ValueError, match="oh"), watched(), lap("a"):
+        raise ValueError("oh")
+    with watched() as laps:
+        pass
+    assert laps == {}
+
+
+def test_progress_as_lines_for_other_programs(capsys):
+    with LineProgress() as progress:
+        progress("a\n", 0.25, "one", loss=0.25)
+        progress("a\n", 0.2501, "one", loss=0.250001)
+        progress("b", 7.0)
+    reports = [Report.from_json(line) for line in capsys.readouterr().err.splitlines()]
+    assert reports == [Report("a\n", 0.25, "one", {"loss": 0.25}), Report("b", 1.0)]
+    assert reports[0].text == "a\n: one, loss 0.2500"
+    for line in ("words", '{"stage": 3}', '"text"', "[1]", '{"stage": "a", "fraction": 0, "metrics": 1}'):
+        with pytest.raises(ValueError):
+            Report.from_json(line)
+
+
+def test_durations_are_as_exact_as_a_forecast():
+    found = [duration(seconds) for seconds in (0, 44, 89, 100, 3000, 9000)]
+    assert found == ["10 s", "40 s", "90 s", "2 min", "50 min", "2 h"]
+    report = Report("a", 0.5, "b", {"psnr": 20.06, "seconds_left": 100})
+    assert report.text == "a: b, PSNR 20.1 dB, about 2 min left"
+
+
+def test_a_part_reports_within_the_whole():
+    reports: list[Report] = []
+    whole = Progress(reports.append)
+    whole.part(1, 4)("inner", 0.5, "b", loss=1.0)
+    whole.part(3, 4, "outer", "c")("inner", 1.0)
+    assert reports == [Report("inner", 0.375, "b", {"loss": 1.0}), Report("outer", 1.0, "c")]
