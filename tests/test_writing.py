@@ -43,9 +43,9 @@ from langsplat_viewer.files.preferences import Preferences, save_preferences
 from langsplat_viewer.output.film import Film, write_film
 from langsplat_viewer.output.saving import save_png
 from tests.support.file_samples import random_codec, random_field
-from tests.support.marks_and_flights import flight as some_flight
 from tests.support.processes import bound_by_permissions, files_of_at_most, small_disk
 from tests.support.scenes import random_camera, random_gaussians
+from tests.support.windowless import flight as some_flight
 
 CHECKS = [check_output_file, check_output_folder]
 Check = Callable[[Path], None]

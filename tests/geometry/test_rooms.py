@@ -12,8 +12,7 @@ from langsplat_core.geometry.points import FEWEST, sample_surface
 from langsplat_core.geometry.registration import agreement, quarter_turns, register
 from langsplat_core.scene import Scene
 from langsplat_core.scene.transform import moved_camera
-from tests.support.box_rooms import FLOOR, WALL, box_room, moved
-from tests.support.scenes import random_gaussians
+from tests.support.scenes import FLOOR, WALL, box_room, moved, random_gaussians
 
 pytest.importorskip("open3d")
 

@@ -16,7 +16,7 @@ from langsplat_core.io.foreign import ForeignScene, read_foreign
 from langsplat_core.io.ply import write_ply
 from langsplat_core.scene import Gaussians
 from tests.support.comparing import assert_same
-from tests.support.foreign_files import autoencoder, faiss_index, geometry, save_model, tensor, training_state
+from tests.support.file_samples import autoencoder, faiss_index, geometry, save_model, tensor, training_state
 from tests.support.scenes import random_gaussians
 
 N, D = 20, 24

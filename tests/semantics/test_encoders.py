@@ -43,8 +43,7 @@ from langsplat_core.semantics.encoders import (
     load_text_encoder,
 )
 from langsplat_core.semantics.weights import Weights
-from tests.support.tiny_clip import SIDE, WORDS, tiny_clip
-from tests.support.tiny_siglip import LENGTH, SCALE, tiny_siglip
+from tests.support.tiny_models import LENGTH, SCALE, SIDE, WORDS, tiny_clip, tiny_siglip
 
 pytestmark = pytest.mark.long
 

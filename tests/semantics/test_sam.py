@@ -35,7 +35,8 @@ from langsplat_core.semantics.sam import (
     squashed,
     upscale,
 )
-from tests.support.tiny_sam import SIDE, tiny_sam, tiny_sam2, tiny_sam2_video
+from tests.support.tiny_models import SAM_SIDE as SIDE
+from tests.support.tiny_models import tiny_sam, tiny_sam2, tiny_sam2_video
 
 
 def plain_mask_nms(masks: np.ndarray, scores: np.ndarray, config: MaskConfig) -> list[int]:

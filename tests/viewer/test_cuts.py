@@ -16,8 +16,7 @@ from langsplat_viewer.rendering.depth import UNCLIPPED, Clip, depth_range, image
 from langsplat_viewer.rendering.renderer import GlRenderer
 from langsplat_viewer.rendering.request import plain_request
 from tests.support.fakes import CENTRES, blob_scene
-from tests.support.marks_and_flights import marked
-from tests.support.windowless import rest
+from tests.support.windowless import marked, rest
 
 SIZE = (160, 120)
 # From the side: the blobs lie behind each other, mug, book, plant, at depths of about 3.8, 5 and 6.2.

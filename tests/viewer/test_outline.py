@@ -19,9 +19,8 @@ from langsplat_viewer.actions import (
 from langsplat_viewer.actions.selecting import take
 from langsplat_viewer.files.projects import Things
 from tests.support.fakes import CENTRES, blob_scene
-from tests.support.marks_and_flights import blob, marked
 from tests.support.scenes import with_tree
-from tests.support.windowless import SCENES, ask, errors, open_scene, settle
+from tests.support.windowless import SCENES, ask, blob, errors, marked, open_scene, settle
 
 
 @pytest.fixture

@@ -28,8 +28,7 @@ from langsplat_viewer.files.projects import read_project
 from langsplat_viewer.rendering.depth import Clip
 from langsplat_viewer.viewer import Services, Viewer
 from tests.support.fakes import CENTRES, FakeEncoder
-from tests.support.marks_and_flights import blob, marked
-from tests.support.windowless import SCENES, FakeSurface, ask, errors, load, settle
+from tests.support.windowless import SCENES, FakeSurface, ask, blob, errors, load, marked, settle
 
 
 @pytest.fixture

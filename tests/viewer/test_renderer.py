@@ -28,8 +28,8 @@ from langsplat_viewer.rendering.renderer import (
     suits_opengl,
 )
 from langsplat_viewer.rendering.request import RenderKey, RenderRequest, Split, plain_request
+from tests.support.backends import gl_state
 from tests.support.fakes import blob_scene
-from tests.support.fixtures import gl_state
 from tests.support.scenes import random_answer, random_camera, random_gaussians, random_scene, with_tree
 
 COUNT = 150

@@ -39,9 +39,8 @@ from langsplat_viewer.rendering.request import (
 from langsplat_viewer.state import OVERLAYS, Ruler, ViewerState
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene, cameras
-from tests.support.marks_and_flights import blob
 from tests.support.scenes import random_gaussians
-from tests.support.windowless import arrive, ask, errors, recorded, rest, settle
+from tests.support.windowless import arrive, ask, blob, errors, recorded, rest, settle
 
 SCENE = blob_scene()
 NOTHING = np.zeros(360, bool)
