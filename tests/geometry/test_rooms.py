@@ -11,8 +11,9 @@ from langsplat_core.geometry.planes import find_room
 from langsplat_core.geometry.points import FEWEST, sample_surface
 from langsplat_core.geometry.registration import agreement, quarter_turns, register
 from langsplat_core.scene import Scene
+from langsplat_core.scene import transform as transforms
 from langsplat_core.scene.transform import moved_camera
-from tests.support.scenes import FLOOR, WALL, box_room, moved, random_gaussians
+from tests.support.scenes import FLOOR, WALL, box_room, random_gaussians
 
 pytest.importorskip("open3d")
 
@@ -22,6 +23,10 @@ def similarity(turn: tuple[float, float, float], step: tuple[float, float, float
     matrix[:3, :3] = scale * Rotation.from_rotvec(turn).as_matrix()
     matrix[:3, 3] = step
     return matrix
+
+
+def moved(scene: Scene, matrix: Array) -> Scene:
+    return transforms.transform_scene(scene, transforms.similarity(matrix))
 
 
 def degrees_apart(one: Array, other: Array) -> float:

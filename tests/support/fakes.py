@@ -27,6 +27,7 @@ from langsplat_core.scene import (
 )
 from langsplat_core.scene.codec import CodebookCodec
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures
+from tests.support.scenes import transforms
 
 COUNT = 64
 
@@ -146,15 +147,11 @@ def as_trained(path: Path, scene: Scene, features: Sequence[ImageFeatures]) -> N
     save_scene(path, scene)
     work, photographs = work_folder(path), path.parent / "photographs"
     photographs.mkdir()
-    frames = []
     for camera, seen in zip(scene.cameras, features, strict=True):
         FeatureStore(work / "features").save(camera.name, seen)
         Image.new("RGB", (camera.width, camera.height), (90, 90, 90)).save(photographs / f"{camera.name}.png")
-        pose = np.linalg.inv(camera.world_to_camera) @ np.diag([1.0, -1, -1, 1])
-        frames.append({"file_path": f"{camera.name}.png", "transform_matrix": pose.tolist()})
-    one = scene.cameras[0]
-    lens = {"fl_x": one.fx, "fl_y": one.fy, "cx": one.cx, "cy": one.cy, "w": one.width, "h": one.height}
-    (photographs / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+    files = [f"{camera.name}.png" for camera in scene.cameras]
+    (photographs / "transforms.json").write_text(transforms(scene.cameras, files))
     (work / REPORT).write_text(json.dumps({"dataset": str(photographs)}))
 
 

@@ -39,16 +39,9 @@ C0 = 0.28209479177387814
 
 def inria_names(sh_degree: int, normals: bool = True) -> list[str]:
     """Property names in the order of the INRIA code."""
-    rest = 3 * ((sh_degree + 1) ** 2 - 1)
-    return [
-        *"xyz",
-        *(["nx", "ny", "nz"] if normals else []),
-        *(f"f_dc_{i}" for i in range(3)),
-        *(f"f_rest_{i}" for i in range(rest)),
-        "opacity",
-        *(f"scale_{i}" for i in range(3)),
-        *(f"rot_{i}" for i in range(4)),
-    ]
+    numbered = {"f_dc": 3, "f_rest": 3 * ((sh_degree + 1) ** 2 - 1), "scale": 3, "rot": 4}
+    dc, rest, scale, rot = ([f"{name}_{i}" for i in range(n)] for name, n in numbered.items())
+    return [*"xyz", *(["nx", "ny", "nz"] if normals else []), *dc, *rest, "opacity", *scale, *rot]
 
 
 def columns(g: Gaussians) -> dict[str, Array]:
@@ -71,8 +64,7 @@ def ply_bytes(header: list[str], body: bytes, newline: str = "\n") -> bytes:
 
 
 def vertex_table(g: Gaussians, names: list[str], code: str = "<f4") -> Array:
-    values = columns(g)
-    table = np.zeros(len(g), np.dtype([(name, code) for name in names]))
+    values, table = columns(g), np.zeros(len(g), [(name, code) for name in names])
     for name in names:
         table[name] = values.get(name, 7.0)  # 7: a property that is none of ours
     return table
@@ -83,9 +75,8 @@ def plain_ply(
 ) -> bytes:
     """Binary little endian; `front` is the body of a list element `face` of 2 rows before the vertices."""
     names = names or inria_names(g.sh_degree)
-    header = ["format binary_little_endian 1.0"]
-    if front:
-        header += ["element face 2", "property list uchar int vertex_indices"]
+    faces = ["element face 2", "property list uchar int vertex_indices"] if front else []
+    header = ["format binary_little_endian 1.0", *faces]
     header += [f"element vertex {len(g)}", *(f"property float {name}" for name in names)]
     return ply_bytes(header, front + vertex_table(g, names).tobytes(), newline)
 
@@ -122,6 +113,14 @@ def _fields(values: Array, bits: tuple[int, ...]) -> Array:
     return packed
 
 
+def _three(g: Gaussians) -> tuple[Array, Array]:
+    """(N, 3) the components of quaternions whose largest is positive, without that one, and which that is."""
+    quats = unit(g.quats_wxyz.astype(np.float64))
+    largest = np.abs(quats).argmax(1)
+    quats *= np.sign(np.take_along_axis(quats, largest[:, None], 1))
+    return np.array([np.delete(q, i) for q, i in zip(quats, largest, strict=True)]), largest
+
+
 def compressed_ply(g: Gaussians, *, colours: bool = True) -> bytes:
     """SuperSplat's compressed PLY; without `colours` the chunks have the 12 older columns."""
     starts = range(0, len(g), 256)
@@ -137,10 +136,7 @@ def compressed_ply(g: Gaussians, *, colours: bool = True) -> bytes:
             fractions[key][rows] = (block[rows].astype(np.float64) - low) / np.maximum(high - low, 1e-12)
             row += [low, high]
         bounds.append(np.concatenate(row))
-    quats = unit(g.quats_wxyz.astype(np.float64))
-    largest = np.abs(quats).argmax(1)
-    quats *= np.sign(np.take_along_axis(quats, largest[:, None], 1))
-    three = np.array([np.delete(q, i) for q, i in zip(quats, largest, strict=True)])
+    three, largest = _three(g)
     rotation = _fields(three / np.sqrt(2) + 0.5, (10, 10, 10)) | (largest.astype(np.uint32) << 30)
     opacity = sigmoid(g.opacity_logits.astype(np.float64))[:, None]
     packed = [
@@ -167,9 +163,7 @@ def compressed_ply(g: Gaussians, *, colours: bool = True) -> bytes:
 def _webp(pixels: Array) -> bytes:
     buffer = io.BytesIO()
     # exact: else the encoder may change colours under alpha 0
-    Image.fromarray(pixels.astype(np.uint8), "RGBA" if pixels.shape[2] == 4 else "RGB").save(
-        buffer, "WEBP", lossless=True, exact=True
-    )
+    Image.fromarray(pixels.astype(np.uint8)).save(buffer, "WEBP", lossless=True, exact=True)
     return buffer.getvalue()
 
 
@@ -191,10 +185,7 @@ def sog_files(g: Gaussians, palette_entries: int = 70) -> dict[str, bytes]:
     logs = np.sign(g.means) * np.log1p(np.abs(g.means.astype(np.float64)))
     mins, maxs = logs.min(0), logs.max(0)
     code = np.round((logs - mins) / (maxs - mins) * 65535).astype(np.uint32)
-    quats = unit(g.quats_wxyz.astype(np.float64))
-    largest = np.abs(quats).argmax(1)
-    quats *= np.sign(np.take_along_axis(quats, largest[:, None], 1))
-    three = np.array([np.delete(q, i) for q, i in zip(quats, largest, strict=True)])
+    three, largest = _three(g)
     packed = np.concatenate([np.round((three / np.sqrt(2) + 0.5) * 255), 252 + largest[:, None]], 1)
     packed = _plane(packed, width)
     packed[..., 3] = np.maximum(packed[..., 3], 252)  # the padding too
@@ -293,8 +284,7 @@ def random_field(
     )
 
 
-# Encoders of .splat, .ksplat and .spz for tests: one Gaussian at a time, from the published layouts, apart
-# from the readers and writers, so that both would have to be wrong in the same way for a test to miss it.
+# Encoders of .splat, .ksplat and .spz: one Gaussian at a time.
 
 HALF_TURN = np.diag([1.0, -1.0, -1.0])  # right down front <-> right up back
 
@@ -378,8 +368,7 @@ def ksplat_bytes(parts: list[Gaussians], level: int, bucket: int = 8, sh_range: 
 def turned_coefficients(sh: Array, turn: Array) -> Array:
     """(N, K, 3) coefficients of the same colours after the world was multiplied by `turn` (3, 3), found by
     least squares over directions instead of from symmetries."""
-    directions = np.random.default_rng(0).normal(size=(400, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = unit(np.random.default_rng(0).normal(size=(400, 3)))
     count = sh.shape[1]
     matrix = np.linalg.lstsq(sh_basis(directions @ turn.T, count), sh_basis(directions, count), rcond=None)[0]
     return np.einsum("kj,njc->nkc", matrix, sh.astype(float))
@@ -481,22 +470,18 @@ class LangSplatAutoencoder(nn.Module):
         for number, (into, out) in enumerate(zip((dim, *encoder), encoder, strict=False)):
             layers += [nn.BatchNorm1d(into), nn.ReLU()] if number else []
             layers.append(nn.Linear(into, out))
-        self.encoder = nn.ModuleList(layers)
+        self.encoder = nn.Sequential(*layers)
         layers = []
         for number, (into, out) in enumerate(zip((encoder[-1], *decoder), (*decoder, dim), strict=True)):
             layers += [nn.ReLU()] if number else []
             layers.append(nn.Linear(into, out))
-        self.decoder = nn.ModuleList(layers)
+        self.decoder = nn.Sequential(*layers)
 
     def encode(self, x: torch.Tensor) -> torch.Tensor:
-        for layer in self.encoder:
-            x = layer(x)
-        return x / x.norm(dim=-1, keepdim=True)
+        return nn.functional.normalize(self.encoder(x), dim=-1)
 
     def decode(self, x: torch.Tensor) -> torch.Tensor:
-        for layer in self.decoder:
-            x = layer(x)
-        return x / x.norm(dim=-1, keepdim=True)
+        return nn.functional.normalize(self.decoder(x), dim=-1)
 
 
 def autoencoder(
@@ -512,9 +497,7 @@ def autoencoder(
             nn.init.uniform_(module.weight, 0.5, 2)
             nn.init.uniform_(module.bias, -0.3, 0.3)
     for _ in range(20):
-        x = torch.randn(64, dim)
-        for layer in network.encoder:
-            x = layer(x)
+        network.encoder(torch.randn(64, dim))
     return network.eval()
 
 

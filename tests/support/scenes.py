@@ -1,5 +1,7 @@
 """Small seeded scenes, answers and views with masks that many tests share."""
 
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -55,15 +57,18 @@ def random_camera(
     camera = look_at(eye, rng.uniform(-0.2, 0.2, size=3), rng.normal(size=3), (width, height))
     if not off_centre:
         return camera
-    return Camera(
-        width,
-        height,
-        camera.fx * 1.1,
-        camera.fy * 0.95,
-        width * rng.uniform(0.35, 0.65),
-        height * rng.uniform(0.35, 0.65),
-        camera.world_to_camera,
-    )
+    cx, cy = width * rng.uniform(0.35, 0.65), height * rng.uniform(0.35, 0.65)
+    return Camera(width, height, camera.fx * 1.1, camera.fy * 0.95, cx, cy, camera.world_to_camera)
+
+
+def transforms(cameras: Sequence[Camera], files: Sequence[str], **more: object) -> str:
+    """nerfstudio's transforms.json of cameras of one lens and their photographs; more: at its top."""
+    one = cameras[0]
+    lens = {"fl_x": one.fx, "fl_y": one.fy, "cx": one.cx, "cy": one.cy, "w": one.width, "h": one.height}
+    poses = [np.linalg.inv(camera.world_to_camera) @ np.diag([1.0, -1, -1, 1]) for camera in cameras]
+    named = zip(files, poses, strict=True)
+    frames = [{"file_path": file, "transform_matrix": pose.tolist()} for file, pose in named]
+    return json.dumps({**lens, **more, "frames": frames})
 
 
 def without_perspective(camera: Camera, distance: float = 3.0) -> Camera:
@@ -90,16 +95,8 @@ def shifted(gaussians: Gaussians, camera: Camera, offset: Array) -> tuple[Gaussi
     return moved, replace(camera, world_to_camera=matrix)
 
 
-PLY_TYPES = {
-    "i1": "char",
-    "u1": "uchar",
-    "i2": "short",
-    "u2": "ushort",
-    "i4": "int",
-    "u4": "uint",
-    "f4": "float",
-    "f8": "double",
-}
+PLY_TYPES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort"}
+PLY_TYPES |= {"i4": "int", "u4": "uint", "f4": "float", "f8": "double"}
 
 
 def random_extras(count: int = 40) -> dict[str, Array]:
@@ -240,24 +237,3 @@ def box_room(seed: int = 0) -> Scene:
     angles = np.linspace(0, 2 * np.pi, 8, endpoint=False)
     eyes = [np.array([1.4 * np.cos(a), 1.4 * np.sin(a), 0.5]) for a in angles]
     return Scene(gaussians, cameras=tuple(look_at(eye, FLOOR / 2 * z, z, (96, 72), 70) for eye in eyes))
-
-
-def moved(scene: Scene, transform: Array) -> Scene:
-    """The scene in other axes, and its cameras with it. transform: (4, 4) similarity; colours stay."""
-    scale = float(np.cbrt(np.linalg.det(transform[:3, :3])))
-    old = scene.gaussians
-    turned = Rotation.from_matrix(transform[:3, :3] / scale) * Rotation.from_quat(
-        old.quats_wxyz[:, [1, 2, 3, 0]]
-    )
-    gaussians = replace(
-        old,
-        means=old.means @ transform[:3, :3].T + transform[:3, 3],
-        log_scales=old.log_scales + np.log(scale),
-        quats_wxyz=turned.as_quat()[:, [3, 0, 1, 2]],
-    )
-    cameras = []
-    for camera in scene.cameras:
-        matrix = camera.world_to_camera @ np.linalg.inv(transform)
-        matrix[:3] *= scale
-        cameras.append(replace(camera, world_to_camera=matrix))
-    return replace(scene, gaussians=gaussians, cameras=tuple(cameras))

@@ -38,7 +38,7 @@ from langsplat_core.config import (
 )
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Scene, look_at
-from tests.support.scenes import random_gaussians
+from tests.support.scenes import random_gaussians, transforms
 
 TOWER = {"hidden_size": 32, "intermediate_size": 48, "num_hidden_layers": 2, "num_attention_heads": 2}
 
@@ -213,30 +213,18 @@ def tiny_room(folder: Path) -> Path:
     """A nerfstudio folder in the empty `folder`, and a tiny encoder in it."""
     (folder / "images").mkdir(parents=True)
     gaussians = random_gaussians(60, 5, scale_range=(0.15, 0.4))
-    frames = []
-    for index in range(VIEWS):
-        angle = 0.5 * index
-        eye = 3 * np.array([np.sin(angle), -0.2, -np.cos(angle)])
-        camera = look_at(eye, np.zeros(3), np.array([0.0, -1, 0]), SIZE)
+    eyes = [3 * np.array([np.sin(angle), -0.2, -np.cos(angle)]) for angle in 0.5 * np.arange(VIEWS)]
+    cameras = [look_at(eye, np.zeros(3), np.array([0.0, -1, 0]), SIZE) for eye in eyes]
+    files = [f"images/photo_{index}.png" for index in range(VIEWS)]
+    for file, camera in zip(files, cameras, strict=True):
         image = render(Scene(gaussians), camera).colours
-        name = f"images/photo_{index}.png"
-        Image.fromarray((255 * np.clip(image, 0, 1)).astype(np.uint8)).save(folder / name)
-        pose = np.linalg.inv(camera.world_to_camera) @ np.diag([1.0, -1, -1, 1])
-        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+        Image.fromarray((255 * np.clip(image, 0, 1)).astype(np.uint8)).save(folder / file)
     header = f"ply\nformat ascii 1.0\nelement vertex {len(gaussians)}\n"
     header += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
     body = "".join("{} {} {}\n".format(*mean) for mean in gaussians.means)
     (folder / "points.ply").write_text(header + body)
-    lens = {
-        "fl_x": camera.fx,
-        "fl_y": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "w": SIZE[0],
-        "h": SIZE[1],
-    }
-    transforms = {**lens, "ply_file_path": "points.ply", "frames": frames, "metres_per_unit": 0.5}
-    (folder / "transforms.json").write_text(json.dumps(transforms))
+    text = transforms(cameras, files, ply_file_path="points.ply", metres_per_unit=0.5)
+    (folder / "transforms.json").write_text(text)
     tiny_clip(folder / "encoder")
     return folder
 

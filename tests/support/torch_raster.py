@@ -333,17 +333,15 @@ def _harmonics() -> Any:
 
 
 # Image formation once more, dense and differentiable: float64, every Gaussian at every pixel, to check
-# gradients. Cut-offs are decided by detached comparisons, so autograd gives the gradient of what is drawn; keep
+# gradients. Cut-offs are decided by detached comparisons: autograd gives the gradient of what is drawn. Keep
 # scenes to a few dozen Gaussians and a few thousand pixels.
 
 
 def parameters(gaussians: Gaussians) -> dict[str, torch.Tensor]:
     """Leaves in float64 that `render` takes."""
     names = ("means", "log_scales", "quats_wxyz", "opacity_logits")
-    return {
-        name: torch.tensor(getattr(gaussians, name), dtype=torch.float64, requires_grad=True)
-        for name in names
-    }
+    arrays = {name: getattr(gaussians, name) for name in names}
+    return {name: torch.tensor(a, dtype=torch.float64, requires_grad=True) for name, a in arrays.items()}
 
 
 def project(
@@ -353,29 +351,17 @@ def project(
     rotation = torch.tensor(camera.rotation)
     points = leaves["means"] @ rotation.T + torch.tensor(camera.world_to_camera[:3, 3])
     x, y, z = points.T
-    grow_x, grow_y = (
-        (settings.fov_clamp - 1) * 0.5 * size / focal
-        for size, focal in ((camera.width, camera.fx), (camera.height, camera.fy))
-    )
-    tx = torch.clamp(x / z, -camera.cx / camera.fx - grow_x, (camera.width - camera.cx) / camera.fx + grow_x)
-    ty = torch.clamp(y / z, -camera.cy / camera.fy - grow_y, (camera.height - camera.cy) / camera.fy + grow_y)
-    over = torch.ones_like(z) if camera.orthographic else z
-    if camera.orthographic:
-        tx, ty = torch.zeros_like(z), torch.zeros_like(z)
-    nought = torch.zeros_like(z)
+    axes = (x, camera.width, camera.fx, camera.cx), (y, camera.height, camera.fy, camera.cy)
+    nought, over, kept = torch.zeros_like(z), torch.ones_like(z), [torch.zeros_like(z)] * 2
+    if not camera.orthographic:
+        grow = 0.5 * (settings.fov_clamp - 1)  # of the image's size, on every side
+        kept = [(p / z).clamp((-c - grow * size) / f, (size - c + grow * size) / f) for p, size, f, c in axes]
+        over = z
+    tx, ty = kept
     jacobian = torch.stack(
         [camera.fx / over, nought, -camera.fx * tx / z, nought, camera.fy / over, -camera.fy * ty / z], -1
     ).reshape(-1, 2, 3)
-    w, i, j, k = torch.nn.functional.normalize(leaves["quats_wxyz"], dim=1).T
-    turn = torch.stack(
-        [
-            1 - 2 * (j * j + k * k), 2 * (i * j - w * k), 2 * (i * k + w * j),
-            2 * (i * j + w * k), 1 - 2 * (i * i + k * k), 2 * (j * k - w * i),
-            2 * (i * k - w * j), 2 * (j * k + w * i), 1 - 2 * (i * i + j * j),
-        ],
-        -1,
-    ).reshape(-1, 3, 3)  # fmt: skip
-    a = jacobian @ rotation @ (turn * torch.exp(leaves["log_scales"])[:, None, :])
+    a = jacobian @ rotation @ (_rotations(leaves["quats_wxyz"]) * torch.exp(leaves["log_scales"])[:, None, :])
     sharp = a @ a.mT
     covariance = sharp + dilation(camera, settings) * torch.eye(2, dtype=torch.float64)
     opacity = torch.sigmoid(leaves["opacity_logits"])

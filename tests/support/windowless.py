@@ -1,6 +1,8 @@
 """A viewer without a window: a fake picture, fake files, and frames on demand."""
 
 import time
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -81,14 +83,22 @@ def load(path: Path) -> Scene:
 
 def settle(viewer: Viewer, seconds: float = 120.0) -> None:
     """Frames until the worker has nothing left to do."""
-    end = time.monotonic() + seconds
-    while viewer.worker.current is not None:
-        assert time.monotonic() < end, "the worker never finished"
+
+    def frame() -> None:
         viewer.take_results()
         viewpoint.tick(viewer, 0.0)
+
+    _repeat(frame, lambda: viewer.worker.current is not None, seconds)
+    frame()
+
+
+def _repeat(step: Callable[[], object], goes_on: Callable[[], object], seconds: float) -> None:
+    """Steps, one after another, as long as something goes on."""
+    end = time.monotonic() + seconds
+    while goes_on():
+        assert time.monotonic() < end, "it never finished"
+        step()
         time.sleep(0.002)
-    viewer.take_results()
-    viewpoint.tick(viewer, 0.0)
 
 
 def open_scene(viewer: Viewer, path: Path | str) -> None:
@@ -106,11 +116,7 @@ def ask(viewer: Viewer, *phrases: str) -> None:
 
 def recorded(viewer: Viewer, seconds: float = 60.0) -> None:
     """Until the recorder has nothing left to do."""
-    end = time.monotonic() + seconds
-    while viewer.recorder.current is not None:
-        assert time.monotonic() < end, "never finished"
-        viewer.take_results()
-        time.sleep(0.002)
+    _repeat(viewer.take_results, lambda: viewer.recorder.current is not None, seconds)
     viewer.take_results()
 
 
@@ -125,10 +131,7 @@ def errors(viewer: Viewer) -> list[str]:
 
 def rest(canvas: Canvas, state: ViewerState, now: float) -> None:
     """Update until the fine picture is there, whoever rasterizes it."""
-    end = time.monotonic() + 60
-    while canvas.update(state, now) and canvas.waits:
-        assert time.monotonic() < end, "the picture never came"
-        time.sleep(0.002)
+    _repeat(lambda: None, lambda: canvas.update(state, now) and canvas.waits, 60)
 
 
 # The scene of three blobs: what is selected, hidden and deleted in it, and a flight around it.
@@ -166,7 +169,6 @@ def flight(away: float = 0.0) -> Flight:
     for seconds, yaw in ((0.0, 0.0), (0.5, 0.2), (1.0, 0.5)):
         pose = pose_of(orbit(view, yaw, 0))
         if away:
-            turned = pose.rotation * np.array([[-1.0], [1.0], [-1.0]])
-            pose = type(pose)(pose.position, turned, pose.fov_degrees)
+            pose = replace(pose, rotation=pose.rotation * np.array([[-1.0], [1.0], [-1.0]]))
         keys.append(Keyframe(seconds, pose))
     return Flight(tuple(keys))
