@@ -186,13 +186,12 @@ def room_table(reports: Sequence[RoomReport]) -> str:
         ours = [room.measured[0] for room in rooms]
         objects, absent = sum(m.objects for m in ours), sum(m.absent for m in ours)
         accepted = sum(m.accepted * m.objects for m in ours) / max(objects, 1)
-        rejected = sum(m.rejected * m.absent for m in ours) / max(absent, 1)
         lines.append((
             tier,
             round(np.mean([room.gaussians for room in rooms])),
             f"{np.mean([room.psnr for room in rooms]):.1f}",
             f"{_percent(accepted)} % of {objects}",
-            f"{_percent(rejected)} % of {absent}",
+            f"{_rejected(ours)} % of {absent}",
             _percent(float(np.mean([m.separation for m in ours]))),
             f"{np.median([m.query_ms for m in ours]):.1f}",
             f"{np.median([m.frame_ms for m in ours]):.1f}",
@@ -212,14 +211,17 @@ def budget_table(reports: Sequence[RoomReport]) -> str:
             cells = [tier, f"nothing ({ours[0].masks} masks)" if row == 0 else ours[0].name]
             for mean, of_method in zip(_means(ours), base, strict=True):
                 cells += [_percent(mean), f"{100 * (mean - of_method):+.1f}" if row else ""]
-            rejected = sum(m.rejected * m.absent for m in ours) / max(sum(m.absent for m in ours), 1)
-            lines.append((*cells, _percent(rejected), *loss_cells(ours)))
+            lines.append((*cells, _rejected(ours), *loss_cells(ours)))
     return markdown((*head, "codec", "relevancy error mean / p99", "bytes/Gaussian"), lines)
 
 
 def _means(measured: Iterable[Measured]) -> tuple[float, ...]:
     """Mean IoU, localisation and 3-D IoU over all phrases, mean over the rooms."""
     return tuple(float(x) for x in np.mean([of_kind(m, "all")[1:] for m in measured], axis=0))
+
+
+def _rejected(measured: Sequence[Measured]) -> str:
+    return _percent(sum(m.rejected * m.absent for m in measured) / max(sum(m.absent for m in measured), 1))
 
 
 def _percent(share: float) -> str:

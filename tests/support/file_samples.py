@@ -466,16 +466,16 @@ class LangSplatAutoencoder(nn.Module):
 
     def __init__(self, dim: int, encoder: tuple[int, ...], decoder: tuple[int, ...]) -> None:
         super().__init__()
+        self.encoder = self._chain((dim, *encoder), normalised=True)
+        self.decoder = self._chain((encoder[-1], *decoder, dim), normalised=False)
+
+    @staticmethod
+    def _chain(widths: tuple[int, ...], normalised: bool) -> nn.Sequential:
         layers: list[nn.Module] = []
-        for number, (into, out) in enumerate(zip((dim, *encoder), encoder, strict=False)):
-            layers += [nn.BatchNorm1d(into), nn.ReLU()] if number else []
-            layers.append(nn.Linear(into, out))
-        self.encoder = nn.Sequential(*layers)
-        layers = []
-        for number, (into, out) in enumerate(zip((encoder[-1], *decoder), (*decoder, dim), strict=True)):
-            layers += [nn.ReLU()] if number else []
-            layers.append(nn.Linear(into, out))
-        self.decoder = nn.Sequential(*layers)
+        for into, out in pairwise(widths):
+            between = [nn.BatchNorm1d(into), nn.ReLU()] if normalised else [nn.ReLU()]
+            layers += [*(between if layers else []), nn.Linear(into, out)]
+        return nn.Sequential(*layers)
 
     def encode(self, x: torch.Tensor) -> torch.Tensor:
         return nn.functional.normalize(self.encoder(x), dim=-1)
