@@ -97,6 +97,7 @@ class ViewScore:
     ssim: float
     covered: float  # share of its pixels that the Gaussians cover by half and more
     psnr_exposed: float | None = None  # dB, with the exposure of each half fitted on the other
+    psnr_small: float | None = None  # dB at 320 px, where trainings on photographs of any size compare
 
 
 def rotation_matrices(quats_wxyz: Array) -> Array:

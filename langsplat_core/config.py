@@ -259,15 +259,16 @@ class RadianceConfig:
 
     def budgets(self, views: int, longer_side: int) -> list[RadianceBudget]:
         """Ascending budgets that are tried with so many training views of so many pixels; the last is all
-        that is asked for, and the only one with many views or few steps."""
+        that is asked for, and the only one with many views or few steps. A larger preset's begin with the
+        smaller one's, so that it cannot choose worse."""
         whole = RadianceBudget(longer_side, self.steps, self.max_gaussians, self.sh_degree)
-        steps = [self.steps]
-        while steps[0] >= REHEARSAL_FACTOR * QUICK.steps:
-            steps.insert(0, round(steps[0] / REHEARSAL_FACTOR))
-        if views > self.rehearsed_views or len(steps) < 2:
+        steps = [QUICK.steps]
+        while REHEARSAL_FACTOR**2 * steps[-1] <= self.steps:
+            steps.append(REHEARSAL_FACTOR * steps[-1])
+        if views > self.rehearsed_views or self.steps < REHEARSAL_FACTOR * QUICK.steps:
             return [whole]
         sizes = [(GOOD if count <= GOOD.steps else whole)._replace(steps=count) for count in steps]
-        return list(dict.fromkeys(budget.at_most(whole) for budget in (QUICK, *sizes)))
+        return list(dict.fromkeys(budget.at_most(whole) for budget in (QUICK, *sizes, whole)))
 
     def spending(self, budget: RadianceBudget) -> "RadianceConfig":
         """These settings with the budget's steps, Gaussians and degree."""

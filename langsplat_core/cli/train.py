@@ -82,10 +82,12 @@ class Train:
             )
         if not processes.is_main:
             return
+        names = shortened(view.name for view in report.held_out_views)
+        small = "" if report.psnr_small is None else f", {report.psnr_small:.2f} dB at 320 px"
         psnr = (
             "none held out, so that nothing was measured"
             if report.psnr is None
-            else f"held-out PSNR {report.psnr:.2f} dB ({shortened(v.name for v in report.held_out_views)})"
+            else f"held-out PSNR {report.psnr:.2f} dB{small} ({names})"
         )
         print(
             f"{self.out}: {report.gaussians} Gaussians from {report.views} photographs, {psnr}; "

@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageOps
@@ -57,6 +58,12 @@ log = logging.getLogger("langsplat")
 HALF = 128  # grey of a mask's pixels, from which they count
 ASPECT_TOLERANCE = 0.02  # shrunk copies round their sizes
 WORKERS = 2  # decoding and resampling release the interpreter; more would only hold more pixels
+_MAIN_TAGS, EXIF_IFD = (0x010F, 0x0110), 0x8769  # maker, model
+_FOCAL, _FOCAL_ON_FILM = 0x920A, 0xA405  # mm; mm of a lens with the same view on film of 36 x 24 mm
+_PLANE_X, _PLANE_UNIT, _WIDTH = 0xA20E, 0xA210, 0xA002  # pixels per unit on the sensor; the unit; pixels
+_MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0}  # of the unit
+_FILM = math.hypot(36, 24)  # mm, its diagonal
+_PLAUSIBLE = (1, 5_000)  # mm on film, of any lens that is sold
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,6 +133,42 @@ def upright_copy(picture: Image.Image) -> Image.Image:
         return ImageOps.exif_transpose(picture)
     except Exception:  # noqa: BLE001  Pillow's parser lets through what damaged tags cause
         return picture.copy()
+
+
+def optics(path: Path) -> Image.Exif:
+    """EXIF data that tell the focal length alone: other tags, orientation first of all, would be wrong for a
+    copy.
+
+    Where a camera gives pixels per inch of its sensor instead of the length on film, that is worked out:
+    COLMAP compares those with the size of the image, which is another for a copy.
+    """
+    kept = Image.Exif()
+    try:
+        with opened(path) as picture:
+            source = picture.getexif()
+            kept.update({tag: source[tag] for tag in _MAIN_TAGS if tag in source})
+            inner = source.get_ifd(EXIF_IFD)
+            kept_inner = {tag: inner[tag] for tag in (_FOCAL, _FOCAL_ON_FILM) if tag in inner}
+            if not kept_inner.get(_FOCAL_ON_FILM):
+                kept_inner |= _on_film(inner, picture.size)
+            kept.get_ifd(EXIF_IFD).update(kept_inner)
+            kept.tobytes()
+    except PictureError:
+        return Image.Exif()
+    return kept
+
+
+def _on_film(inner: dict[int, Any], size: tuple[int, int]) -> dict[int, int]:
+    """The focal length on film from the one on a sensor whose pixels are counted by the inch; `size`: of the
+    image, pixels."""
+    try:
+        width = inner.get(_WIDTH, size[0]) * _MILLIMETRES[inner.get(_PLANE_UNIT, 2)] / inner[_PLANE_X]
+        diagonal = width * math.hypot(*size) / size[0]
+        length = float(inner[_FOCAL] / diagonal * _FILM)
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):  # absent, or not what the standard says
+        return {}
+    known = math.isfinite(length) and _PLAUSIBLE[0] <= length <= _PLAUSIBLE[1]
+    return {_FOCAL_ON_FILM: round(length)} if known else {}
 
 
 def _read_for(photo: Photo) -> tuple[Image.Image, PhotoIntrinsics]:
@@ -322,6 +365,26 @@ class Capture:
             view = camera, self.images[index], self.mask(index)
             views.append(view if share >= 1 else shrunk_view(*view, size))
         cameras, images, masks = zip(*views, strict=True) if views else ((), (), ())
+        return replace(self, cameras=cameras, images=images, masks=masks, photos=(), matches=None)
+
+    def read_at(self, indices: Sequence[int], longer_side: int) -> "Capture":
+        """The photographs at `indices` as they are when a dataset is read at that size, bit for bit, with the
+        points of all; `shrunk` where there are no files. InputError for a file that can no longer be read."""
+        if not self.photos or longer_side >= max(max(self.images[index].shape) for index in indices):
+            return self.shrunk(indices, longer_side)
+        read = developer(longer_side)
+
+        def view(index: int) -> tuple[Camera, Array, Array | None]:
+            try:
+                lens, image, mask = read(self.photos[index])
+            except PictureError as error:
+                raise InputError(f"{error}; it was there when this run began") from None
+            camera = self.cameras[index]
+            return replace(lens, world_to_camera=camera.world_to_camera, name=camera.name), image, mask
+
+        with ThreadPoolExecutor(WORKERS) as pool:
+            cameras, images, masks = zip(*pool.map(view, indices), strict=True)
+        masks = masks if self.masks else ()
         return replace(self, cameras=cameras, images=images, masks=masks, photos=(), matches=None)
 
     def extent(self) -> float:

@@ -86,6 +86,9 @@ else:
         signal.siginterrupt(signal.SIGTERM, True)  # as Python has it: a call that waits shall return
 
 
+pycolmap.logging.minloglevel = 3  # its log lines would tear the progress bars apart
+
+
 # Intrinsics of photographs: where a photograph's pixels look, in the conventions of COLMAP and OpenCV.
 #
 # A point in the camera's frame has *normalised* coordinates (x/z, y/z). A distortion maps normalised to

@@ -120,16 +120,21 @@ def _triangulated(
         if not has_model(workspace / "sparse"):
             names = [f"{index:05d}.png" for index in range(len(views))]
             cameras = _write_pictures(workspace / "images", names, capture, views, progress)
-            sfm.extract_features(workspace, _groups(names, cameras), progress)
-            pairs = [(names[i], names[j]) for i, j in neighbouring_views(cameras)]
-            sfm.match_features(workspace, pairs, progress)
-            progress("triangulating points", 0.0)
-            sfm.triangulate(workspace, names, cameras)
-            progress("triangulating points", 1.0)
+            sfm.run_apart(_found, workspace, names, cameras, workspace=workspace, progress=progress)
         return good_points(read_model(workspace / "sparse"))
     except (*sfm.FAILURES, InputError) as error:
         log.warning("points could not be triangulated: %s", str(error).splitlines()[0])
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+
+
+def _found(workspace: Path, names: Sequence[str], cameras: Sequence[Camera], progress: Progress) -> None:
+    """Points from the pictures of a workspace, written there."""
+    sfm.extract_features(workspace, _groups(names, cameras), progress)
+    pairs = [(names[i], names[j]) for i, j in neighbouring_views(cameras)]
+    sfm.match_features(workspace, pairs, progress)
+    progress("triangulating points", 0.0)
+    sfm.triangulate(workspace, names, cameras)
+    progress("triangulating points", 1.0)
 
 
 def _write_pictures(
@@ -154,7 +159,7 @@ def _write_pictures(
     return tuple(cameras)
 
 
-def _groups(names: list[str], cameras: tuple[Camera, ...]) -> list[sfm.Group]:
+def _groups(names: Sequence[str], cameras: Sequence[Camera]) -> list[sfm.Group]:
     members: dict[tuple[str, int], list[str]] = {}
     for name, camera in zip(names, cameras, strict=True):
         params = ",".join(repr(float(value)) for value in (camera.fx, camera.fy, camera.cx, camera.cy))
@@ -162,7 +167,7 @@ def _groups(names: list[str], cameras: tuple[Camera, ...]) -> list[sfm.Group]:
     return [sfm.Group(tuple(group), "PINHOLE", params, side) for (params, side), group in members.items()]
 
 
-def neighbouring_views(cameras: tuple[Camera, ...]) -> list[tuple[int, int]]:
+def neighbouring_views(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
     """Pairs (i < j) worth matching: for every view the nearest `NEIGHBOURS` that look a similar way."""
     centres = np.array([camera.position for camera in cameras])
     axes = np.array([camera.rotation[2] for camera in cameras])

@@ -1,11 +1,15 @@
 """Which photographs share verified matches, as structure from motion found: groups, and gaps between them."""
 
+import json
 from collections import defaultdict
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 from langsplat_core.errors import InputError, printable_line, shortened
 
+MATCHES = "matches.json"  # in a workspace: features and pairs
 FEWEST_MATCHES = 15  # that COLMAP's mapper works with
 FEWEST_FEATURES = 50  # fewer rarely give `FEWEST_MATCHES`
 MOST_TOLD = 3  # groups and gaps in a message
@@ -115,3 +119,16 @@ class NotLocatedError(InputError):
     def __init__(self, message: str, matches: Matches) -> None:
         self.matches = matches
         super().__init__(message)
+
+
+def read_matches(folder: Path, files: dict[str, Path], located: Collection[str]) -> Matches:
+    """The graph of matches of a workspace. `files`: photographs by their names there, see `numbered`;
+    `located`: names of those that have a camera."""
+    kept = json.loads((folder / MATCHES).read_text())
+    row = {name: index for index, name in enumerate(files)}
+    return Matches(
+        names=tuple(path.name for path in files.values()),
+        features=tuple(kept["features"].get(name, -1) for name in files),
+        pairs=tuple((row[a], row[b], count) for a, b, count in kept["pairs"]),
+        located=frozenset(row[name] for name in located),
+    )

@@ -1,4 +1,4 @@
-"""Structure from motion (pycolmap): focal lengths from EXIF data, features and matches, cameras, points."""
+"""Structure from motion (pycolmap): features and matches, cameras, points."""
 
 import errno
 import hashlib
@@ -17,65 +17,24 @@ import numpy as np
 from PIL import Image
 
 from langsplat_core.datasets.capture import (
+    EXIF_IFD,
     Capture,
     Photo,
     develop,
     find_photos,
     mask_beside,
+    optics,
     read_photo,
 )
 from langsplat_core.datasets.colmap import good_points, has_model, located_photos, read_model
 from langsplat_core.datasets.intrinsics import pycolmap
-from langsplat_core.datasets.matches import FEWEST_MATCHES, Matches, NotLocatedError
+from langsplat_core.datasets.matches import FEWEST_MATCHES, MATCHES, Matches, NotLocatedError, read_matches
 from langsplat_core.errors import FormatError, InputError, shortened
+from langsplat_core.io import apart
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import PictureError, opened
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera
-
-_MAIN_TAGS, _EXIF_IFD = (0x010F, 0x0110), 0x8769  # maker, model
-_FOCAL, _FOCAL_ON_FILM = 0x920A, 0xA405  # mm; mm of a lens with the same view on film of 36 x 24 mm
-_PLANE_X, _PLANE_UNIT, _WIDTH = 0xA20E, 0xA210, 0xA002  # pixels per unit on the sensor; the unit; pixels
-_MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0}  # of the unit
-_FILM = math.hypot(36, 24)  # mm, its diagonal
-_PLAUSIBLE = (1, 5_000)  # mm on film, of any lens that is sold
-
-
-def optics(path: Path) -> Image.Exif:
-    """EXIF data that tell the focal length alone: other tags, orientation first of all, would be wrong for a
-    copy.
-
-    Where a camera gives pixels per inch of its sensor instead of the length on film, that is worked out:
-    COLMAP compares those with the size of the image, which is another for a copy.
-    """
-    kept = Image.Exif()
-    try:
-        with opened(path) as picture:
-            source = picture.getexif()
-            kept.update({tag: source[tag] for tag in _MAIN_TAGS if tag in source})
-            inner = source.get_ifd(_EXIF_IFD)
-            kept_inner = {tag: inner[tag] for tag in (_FOCAL, _FOCAL_ON_FILM) if tag in inner}
-            if not kept_inner.get(_FOCAL_ON_FILM):
-                kept_inner |= _on_film(inner, picture.size)
-            kept.get_ifd(_EXIF_IFD).update(kept_inner)
-            kept.tobytes()
-    except PictureError:
-        return Image.Exif()
-    return kept
-
-
-def _on_film(inner: dict[int, Any], size: tuple[int, int]) -> dict[int, int]:
-    """The focal length on film from the one on a sensor whose pixels are counted by the inch; `size`: of the
-    image, pixels."""
-    try:
-        width = inner.get(_WIDTH, size[0]) * _MILLIMETRES[inner.get(_PLANE_UNIT, 2)] / inner[_PLANE_X]
-        diagonal = width * math.hypot(*size) / size[0]
-        length = float(inner[_FOCAL] / diagonal * _FILM)
-    except (KeyError, TypeError, ValueError, ZeroDivisionError):  # absent, or not what the standard says
-        return {}
-    known = math.isfinite(length) and _PLAUSIBLE[0] <= length <= _PLAUSIBLE[1]
-    return {_FOCAL_ON_FILM: round(length)} if known else {}
-
 
 # Features, matches and triangulation by pycolmap, in steps that report and resume.
 #
@@ -95,7 +54,7 @@ SMALL_SIDE = 1000  # px; smaller photographs are doubled before features are sou
 EXTRACT_BATCH = 8  # photographs per step: a step is the unit of progress and of resuming
 MATCH_BATCH = 64  # pairs per step
 FAILURES = (RuntimeError, ValueError, IndexError)  # what pycolmap raises
-ROOM = 64_000_000  # bytes that a step may write: 8 photographs of 8192 features take 20 MB, with the journal
+ROOM = 64_000_000  # bytes that a step may want: 8 photographs of 8192 features take 20 MB, with the journal
 
 Pair = tuple[str, str]
 
@@ -116,14 +75,18 @@ def open_workspace(work: Path, inputs: object) -> Path:
     folder = work / f"sfm-{digest}"
     if not (folder / "sparse").is_dir():
         (folder / "images").mkdir(parents=True, exist_ok=True)
-    pycolmap.logging.minloglevel = 3  # its log lines would tear the progress bars apart
     return folder
 
 
-def check_room(folder: Path) -> None:
-    """OSError where the disk is about full: pycolmap would end the whole process there."""
-    if shutil.disk_usage(folder).free < ROOM:
-        raise _disk_full(folder)
+def run_apart(function: Callable[..., Any], *arguments: Any, workspace: Path, progress: Progress) -> Any:
+    """``function(*arguments, progress)`` in a process of its own, which pycolmap may end: RuntimeError then,
+    and OSError for whatever fails where the disk is about full."""
+    try:
+        return apart.run(function, *arguments, progress=progress)
+    except (apart.AbortedError, *FAILURES) as error:
+        if shutil.disk_usage(workspace).free < ROOM:
+            raise _disk_full(workspace) from None
+        raise error if isinstance(error, FAILURES) else RuntimeError(f"it {error}") from None
 
 
 def _disk_full(folder: Path) -> OSError:
@@ -139,7 +102,6 @@ def extract_features(folder: Path, groups: Sequence[Group], progress: Progress) 
     for group in groups:
         for start in range(0, len(group.names), EXTRACT_BATCH):
             progress("finding features", done / total)
-            check_room(folder)
             names = group.names[start : start + EXTRACT_BATCH]
             _extract(database, folder / "images", group, names)
             done += len(names)
@@ -209,7 +171,6 @@ def match_features(folder: Path, pairs: Sequence[Pair], progress: Progress) -> N
     done = len(pairs) - len(lacking)
     for start in range(0, len(lacking), MATCH_BATCH):
         progress("matching photographs", (done + start) / len(pairs))
-        check_room(folder)
         batch = lacking[start : start + MATCH_BATCH]
         listing = folder / "pairs.txt"
         listing.write_text("".join(f"{first} {second}\n" for first, second in batch))
@@ -291,7 +252,6 @@ ENOUGH = 0.9  # share of the photographs; with fewer located the next way is tri
 ASTRAY, ASTRAY_GUESS = 2.0, 4.0  # times the focal length of EXIF data, and a normal lens's without them
 TIE = 0.05  # of the reprojection error: ways that end at the same cameras differ by 1 to 2 %
 FEWEST_POINTS = 30  # that hold a camera; the incremental mapper demands as many, the global one none
-MATCHES = "matches.json"  # in the workspace: names, features and pairs of `Matches`
 # For first pairs of a walk straight ahead: degrees between rays, share of motion that is forward, matches.
 _CLOSE_PAIRS = {"init_min_tri_angle": 4.0, "init_max_forward_motion": 1.0, "init_min_num_inliers": 50}
 # For long walks: each photograph shares little with those before it, and what it shares lies far ahead.
@@ -314,7 +274,6 @@ def map_cameras(folder: Path, count: int, progress: Progress) -> None:
     best: Model | None = None
     astray: Model | None = None
     for number, way in enumerate(WAYS):
-        check_room(folder)
         attempts = folder / "attempts" / str(number)
         attempts.mkdir(parents=True, exist_ok=True)
         models = list(way(folder, attempts, _counted(count, progress)))
@@ -465,19 +424,6 @@ def keep_matches(folder: Path) -> None:
         temporary.write_text(json.dumps({"features": features, "pairs": sorted(kept)}))
 
 
-def read_matches(folder: Path, files: dict[str, Path], located: Collection[str]) -> Matches:
-    """The graph of matches of a workspace. `files`: photographs by their names there, see `numbered`;
-    `located`: names of those that have a camera."""
-    kept = json.loads((folder / MATCHES).read_text())
-    row = {name: index for index, name in enumerate(files)}
-    return Matches(
-        names=tuple(path.name for path in files.values()),
-        features=tuple(kept["features"].get(name, -1) for name in files),
-        pairs=tuple((row[a], row[b], count) for a, b, count in kept["pairs"]),
-        located=frozenset(row[name] for name in located),
-    )
-
-
 # A plain folder of photographs: cameras by structure from motion.
 
 log = logging.getLogger("langsplat")
@@ -581,13 +527,16 @@ def _listed(lost: dict[str, list[str]], limit: int = 5, width: int = 200) -> str
 
 def _reconstruct(workspace: Path, numbered: dict[str, Path], progress: Progress) -> None:
     try:
-        map_cameras(workspace, match_photos(workspace, numbered, progress), progress)
+        run_apart(_locate, workspace, numbered, workspace=workspace, progress=progress)
     except FAILURES as error:
-        check_room(workspace)
         reason = str(error).partition("\n")[0]
         raise InputError(
             f"structure from motion failed ({reason}); remove {workspace} and try again"
         ) from None
+
+
+def _locate(workspace: Path, numbered: dict[str, Path], progress: Progress) -> None:
+    map_cameras(workspace, match_photos(workspace, numbered, progress), progress)
 
 
 def match_photos(workspace: Path, numbered: dict[str, Path], progress: Progress) -> int:
@@ -611,7 +560,7 @@ def _small_copies(folder: Path, numbered: dict[str, Path], progress: Progress) -
                 _write_mask(mask_beside(path), folder / name, folder.with_name(MASKS) / f"{name}.png")
             with opened(folder / name) as copy:
                 exif = copy.getexif()
-                lens = str(dict(exif) | dict(exif.get_ifd(_EXIF_IFD)))
+                lens = str(dict(exif) | dict(exif.get_ifd(EXIF_IFD)))
                 copies.append(_Copy(name, copy.size, lens))
         except PictureError as error:
             broken.append(f"{path.name} ({error.reason})")

@@ -22,6 +22,7 @@ GPU = 1 / 30  # of the seconds of two CPU cores; not measured
 POINT = 0.17  # seconds of a point that a segmenter is asked at
 REGIONS = 300  # of an ordinary photograph
 DEPTHS = 0.3  # seconds of a photograph whose depths are found
+REHEARSALS = 2  # of a budget: it ends with the first that does not gain
 AGREEING = 1.7  # seconds of a megapixel that masks are drawn into, once they agree
 # Millions of weights by what a hub id contains, the first that fits.
 MILLIONS = {
@@ -62,7 +63,8 @@ def plan(
     gaussians = config.radiance.max_gaussians
     depths = DEPTHS * photographs if photographs <= config.radiance.few_views else 0.0
     *smaller, whole = config.radiance.budgets(photographs, config.dataset.max_side)
-    training = sum(map(_training_seconds, [*smaller, whole, *([whole] if smaller else [])]))
+    rehearsed = REHEARSALS * sum(map(_training_seconds, [*smaller, whole] if smaller else []))
+    training = rehearsed + _training_seconds(whole)
     codec = config.codec.seconds
     lifting = photographs * (0.2 + 0.5 * megapixels) + 1e-4 * gaussians * min(photographs, 100) / 50
     if config.lift.mode == "gradient":

@@ -1,7 +1,7 @@
 """Report of a training, `report.json` in its work folder, and quality warnings; read without torch."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -42,8 +42,17 @@ class TrainReport:
     seconds: dict[str, float]  # per stage, of this run: a stage that was already done takes almost none
     dataset: str = ""  # absolute path of the photographs; "" in reports of earlier versions
     held_out_views: tuple[ViewScore, ...] = ()  # one by one
-    # budget -> mean PSNR (dB) of views held out of the training views, by trainings that decided on it
-    rehearsed: dict[str, float] = field(default_factory=dict)
+    psnr_small: float | None = None  # as `psnr`, of images shrunk to 320 px, by which presets compare
+    # budget -> mean PSNR (dB) of views held out of the training views, by each training that decided on it
+    rehearsed: dict[str, list[float]] = field(default_factory=dict)
+
+
+def said_of(rehearsed: Mapping[str, Sequence[float]]) -> str:
+    """``after 500 steps at 320 px 24.6, 21.1 dB; after 500 steps at 480 px 24.0 dB``."""
+    return "; ".join(
+        f"after {budget} {', '.join(f'{decibels:.1f}' for decibels in found)} dB"
+        for budget, found in rehearsed.items()
+    )
 
 
 def work_folder(out: Path) -> Path:

@@ -16,7 +16,7 @@ from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.matches import FEWEST_MATCHES, Matches, NotLocatedError
 from langsplat_core.errors import printable_line
 from langsplat_core.io.files import atomic_path
-from langsplat_core.pipeline.report import PAGE, TrainReport, camera_groups, write_report
+from langsplat_core.pipeline.report import PAGE, TrainReport, camera_groups, said_of, write_report
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_core.scene.transform import C0
@@ -113,6 +113,7 @@ def _tiles(report: TrainReport) -> str:
         "photographs": report.views + report.held_out,
         "held out": report.held_out,
         "held-out PSNR": "none" if report.psnr is None else f"{report.psnr:.1f} dB",
+        "the same at 320 px": "none" if report.psnr_small is None else f"{report.psnr_small:.1f} dB",
         "held-out SSIM": f"{np.mean([s.ssim for s in scores]):.3f}" if scores else "none",
         "Gaussians": f"{report.gaussians:,}",
         "masks": f"{report.mask_count:,}",
@@ -130,7 +131,7 @@ def _figures(report: TrainReport) -> Iterator[str]:
         for name, seconds in report.seconds.items()
     )
     figures = {
-        "rehearsed": ", ".join(f"{budget}: {dB:.1f} dB" for budget, dB in report.rehearsed.items()) or "no",
+        "rehearsed": said_of(report.rehearsed) or "no",
         "masks": report.masks,
         "encoder": report.encoder,
         "codec": f"{report.codec} of {report.codec_size}, mean cosine {report.codec_cosine:.4f}",

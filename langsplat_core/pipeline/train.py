@@ -7,7 +7,7 @@ continues where it stopped and a changed setting recomputes only what depends on
 import json
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -31,6 +31,7 @@ from langsplat_core.pipeline.report import (
     TrainReport,
     quality_warnings,
     read_report,
+    said_of,
     work_folder,
 )
 from langsplat_core.pipeline.report_page import write_refusal, write_reports
@@ -55,7 +56,7 @@ from langsplat_core.training.radiance.rehearsal import (
 from langsplat_core.training.radiance.train import evaluate_views
 
 FEWEST_VIEWS = 3
-RADIANCE_VERSION = 6  # of what training and rehearsal make
+RADIANCE_VERSION = 7  # of what training and rehearsal make
 
 log = logging.getLogger("langsplat")
 
@@ -166,7 +167,7 @@ def _train(run: _Run, masks_of: Callable[[Capture], MaskSource] | None, given: S
             mask_count=sum(len(item.vectors) for item in views.features),
             seconds=clock.laps,
             dataset=str(run.dataset.resolve()),
-            rehearsed={name: round(decibels, 2) for name, decibels in rehearsed.items()},
+            rehearsed=rehearsed,
         )
         write_reports(run.work, report, capture, gaussians)
     processes.barrier()
@@ -204,19 +205,19 @@ def _described(
     return StoredViews(cameras, StoredFeatures(store, [camera.name for camera in cameras]))
 
 
-def _gaussians(run: _Run, capture: Capture, train: list[int]) -> tuple[Gaussians, dict[str, float]]:
+def _gaussians(run: _Run, capture: Capture, train: list[int]) -> tuple[Gaussians, dict[str, list[float]]]:
     """The trained Gaussians, and what rehearsals found."""
     config, once, shared = run.config.radiance, run.processes.once, (run.work, run.progress)
     budgets = budgets_for(capture, config, len(train))
     found = once(lambda: rehearsals(capture, train, config, *shared))
     budget = supported(found, budgets)
-    rehearsed = dict(zip(map(in_words, budgets), found, strict=False))
+    scores = [[round(decibels, 2) for decibels in each] for each in found]
+    rehearsed = dict(zip(map(in_words, budgets), scores, strict=False))
     if budget != budgets[-1]:
-        decibels = ", ".join(f"{psnr:.1f} dB after {name}" for name, psnr in rehearsed.items())
         log.info(
             "training takes %s, not %s: with so few photographs more does not pay (held out: %s); "
             "--radiance.rehearsed-views 0 spends all",
-            *(in_words(budget), in_words(budgets[-1]), decibels or "none could be"),
+            *(in_words(budget), in_words(budgets[-1]), said_of(rehearsed) or "none could be"),
         )
     return once(lambda: trained_gaussians(capture, train, config, budget, *shared)), rehearsed
 
@@ -229,7 +230,8 @@ def _report(
         views=len(scene.cameras),
         held_out=len(scores),
         gaussians=len(scene.gaussians),
-        psnr=float(np.mean([score.psnr for score in scores])) if scores else None,
+        psnr=_mean(score.psnr for score in scores),
+        psnr_small=_mean(score.psnr_small for score in scores),
         codec=language.codec.kind,
         codec_size=language.codec.size,
         codec_cosine=loss.cosine,
@@ -242,9 +244,15 @@ def _report(
     )
 
 
+def _mean(scores: Iterable[float | None]) -> float | None:
+    """The mean of those that could be measured; None where none could."""
+    measured = [score for score in scores if score is not None]
+    return float(np.mean(measured)) if measured else None
+
+
 def rehearsals(
     capture: Capture, train: list[int], config: RadianceConfig, work: Path, progress: Progress
-) -> list[float]:
+) -> list[list[float]]:
     """`rehearse` for the photographs at `train`, from `work` where that was done before."""
     done = work / f"{_radiance_key('rehearsal', capture, train, config)}.json"
     if not done.exists():
@@ -254,7 +262,7 @@ def rehearsals(
             temporary.write_text(json.dumps(found))
         for left in checkpoints_of(checkpoint):
             left.unlink(missing_ok=True)
-    return [float(decibels) for decibels in json.loads(done.read_text())]
+    return [[float(decibels) for decibels in each] for each in json.loads(done.read_text())]
 
 
 def trained_gaussians(

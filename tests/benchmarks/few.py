@@ -12,9 +12,16 @@ from PIL import Image
 
 from langsplat_core.arrays import Array, psnr
 from langsplat_core.bench.measure import markdown
-from langsplat_core.config import DatasetConfig, RadianceConfig, Seed, TrainConfig, TrainPreset, with_preset
+from langsplat_core.config import (
+    QUICK,
+    DatasetConfig,
+    RadianceConfig,
+    Seed,
+    TrainConfig,
+    TrainPreset,
+    with_preset,
+)
 from langsplat_core.datasets import Capture, load_capture
-from langsplat_core.datasets.capture import shrunk_view
 from langsplat_core.datasets.holdout import split
 from langsplat_core.datasets.known_poses import look_distance
 from langsplat_core.progress import Progress, TerminalProgress
@@ -30,7 +37,6 @@ from langsplat_core.training.radiance.rehearsal import (
 from langsplat_core.training.radiance.train import evaluate_views
 from tests.benchmarks.captures import Kind, draw_capture
 
-SIDE = 320  # px at which presets are compared with each other
 LARGE = 800  # px, of a window beside them: with dilation as at the photographs' size, and growing
 SHEET_VIEWS = 4
 NEARER = 0.2  # of the distance to what cameras look at
@@ -87,7 +93,7 @@ class Few:
             *("capture", "training / held out", "preset", "with", "seed", "held out, dB"),
             *(
                 "exposure fitted, dB",
-                f"at {SIDE} px, dB",
+                f"at {QUICK.longer_side} px, dB",
                 f"at {LARGE} px: dilation as it was, growing",
                 "SSIM",
                 "training, dB",
@@ -100,7 +106,7 @@ class Few:
         print(markdown(titles, rows))
 
     def _rows(self, folder: Path, name: str, work: Path, progress: Progress) -> Iterator[tuple[str, ...]]:
-        others = [self._capture(folder, work, side, progress)[0] for side in (SIDE, LARGE)]
+        large = self._capture(folder, work, LARGE, progress)[0]
         for preset in self.presets:
             config = with_preset(TrainConfig(), preset)
             capture, train, held_out = self._capture(folder, work, config.dataset.max_side, progress)
@@ -108,7 +114,7 @@ class Few:
                 for seed in self.seeds:
                     settings = replace(config.radiance, seed=seed, **VARIANTS[variant])  # type: ignore[arg-type]
                     sheet = self.sheets and self.sheets / f"{name}.png"
-                    found = _measured(capture, others, settings, train, held_out, progress, sheet)
+                    found = _measured(capture, large, settings, train, held_out, progress, sheet)
                     counts = f"{len(train)} / {len(held_out)}"
                     yield (name, counts, preset, variant, str(seed), *found)
 
@@ -134,7 +140,7 @@ class Few:
                 (image * gain).clip(0, 255).astype(np.uint8)
                 for image, gain in zip(capture.images, gains, strict=True)
             ]
-            capture = replace(capture, images=tuple(images))
+            capture = replace(capture, images=tuple(images), photos=())  # not as the files are
         return capture, train, held_out
 
 
@@ -148,7 +154,7 @@ def _subset(capture: Capture, rows: Sequence[int]) -> Capture:
 
 def _measured(
     capture: Capture,
-    others: Sequence[Capture],
+    large: Capture,
     config: RadianceConfig,
     train: Sequence[int],
     held_out: Sequence[int],
@@ -161,19 +167,18 @@ def _measured(
     gaussians = train_within(capture, budget, config, train, progress=progress)
     seconds = time.process_time() - began
     if sheet:
-        add_row(sheet, gaussians, between(capture.shrunk(train, SIDE).cameras))
+        add_row(sheet, gaussians, between(capture.shrunk(train, QUICK.longer_side).cameras))
     scores = evaluate_views(gaussians, capture, held_out)
     learnt = evaluate_views(gaussians, capture, train)
-    small, large = others
     scene = Scene(gaussians, cameras=tuple(capture.cameras[i] for i in train))
     exposed = [score.psnr_exposed for score in scores if score.psnr_exposed is not None]
     means = [
         np.mean([score.psnr for score in scores]),
         np.mean(exposed) if exposed else np.nan,
-        np.mean([_psnr_at(small.images[i], capture.cameras[i], scene) for i in held_out]),
+        np.mean([score.psnr_small for score in scores if score.psnr_small is not None]),
     ]
     larger = [
-        np.mean([_psnr_at(large.images[i], large.cameras[i], drawn) for i in held_out])
+        np.mean([psnr(_image(drawn, large.cameras[i]) / 255, large.images[i] / 255) for i in held_out])
         for drawn in (Scene(gaussians), scene)
     ]
     ssim = np.mean([score.ssim for score in scores])
@@ -181,7 +186,7 @@ def _measured(
         *(f"{mean:.2f}" for mean in means),
         ", ".join(f"{mean:.2f}" for mean in larger),
         *(f"{ssim:.3f}", f"{np.mean([score.psnr for score in learnt]):.2f}"),
-        *(in_words(budget), ", ".join(f"{decibels:.2f}" for decibels in found)),
+        *(in_words(budget), "; ".join(", ".join(f"{decibels:.2f}" for decibels in each) for each in found)),
         *(str(len(gaussians)), f"{seconds:.0f}"),
     )
 
@@ -217,10 +222,3 @@ def add_row(sheet: Path, gaussians: Gaussians, cameras: Sequence[Camera]) -> Non
 
 def _image(scene: Scene, camera: Camera) -> Array:
     return (255 * render(scene, camera).colours.clip(0, 1)).round().astype(np.uint8)
-
-
-def _psnr_at(photograph: Array, camera: Camera, scene: Scene) -> float:
-    """PSNR of the camera's image, shrunk to the size of the photograph as that was: what presets are compared
-    by."""
-    _, shrunk, _ = shrunk_view(camera, _image(scene, camera), None, photograph.shape[1::-1])
-    return psnr(shrunk / 255, photograph / 255)

@@ -25,6 +25,7 @@ from langsplat_core.datasets.capture import (
 )
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics
 from langsplat_core.datasets.known_poses import inside, look_distance, random_points
+from langsplat_core.errors import InputError
 from langsplat_core.scene import Camera, look_at
 from tests.support.photographs import (
     CONFIG,
@@ -32,6 +33,7 @@ from tests.support.photographs import (
     poses,
     refuse,
     write_colmap,
+    write_nerfstudio,
     write_photos,
     write_picture,
 )
@@ -157,6 +159,24 @@ def test_a_broken_photograph_is_left_out_and_named(
 
     spoil(tmp_path / "images/b.png")
     assert "a.png" in refuse(tmp_path, tmp_path / "work")
+
+
+@pytest.mark.parametrize("lens", [{}, {"k1": 0.2, "p2": 0.01}])
+def test_read_again_at_another_size_it_is_as_if_read_at_that(tmp_path: Path, lens: dict[str, float]) -> None:
+    write_nerfstudio(tmp_path, **lens)
+    write_picture(tmp_path / "masks/a.png", seed=1)
+    large, small = (
+        load_capture(tmp_path, DatasetConfig(max_side=side), tmp_path / "work") for side in (40, 24)
+    )
+    large = replace(large, points=small.points, colours=small.colours)  # random ones
+    again = large.read_at([0], 24)
+    assert again.digest([0]) == small.digest([0]) != large.shrunk([0], 24).digest([0])
+    assert large.read_at([0], 40).images[0] is large.images[0]
+    made = replace(large, photos=())
+    assert made.read_at([0], 24).digest([0]) == large.shrunk([0], 24).digest([0])
+    (tmp_path / "a.png").unlink()
+    with pytest.raises(InputError, match=r"a\.png"):
+        large.read_at([0], 24)
 
 
 def test_an_absurd_camera_size_is_refused(tmp_path: Path) -> None:

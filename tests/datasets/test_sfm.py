@@ -5,10 +5,10 @@ import os
 import shutil
 import subprocess
 import sys
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -19,15 +19,16 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets import load_capture, sfm
-from langsplat_core.datasets.capture import Capture, find_photos
+from langsplat_core.datasets.capture import Capture, find_photos, optics
 from langsplat_core.datasets.intrinsics import BrownDistortion, PhotoIntrinsics
 from langsplat_core.datasets.known_poses import add_points, neighbouring_views
-from langsplat_core.datasets.sfm import optics, pairs_by_name
+from langsplat_core.datasets.matches import read_matches
+from langsplat_core.datasets.sfm import pairs_by_name
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Cancelled, Progress, Report, silent
 from langsplat_core.scene import Camera, look_at
 from tests.support.photographs import colmap_reconstruction, distance_to_room, photograph, poses, write_photos
-from tests.support.processes import files_of_at_most, stop_at
+from tests.support.processes import files_of_at_most, in_this_process, small_disk, stop_at
 
 # A walk straight ahead between two walls: what structure from motion finds hardest to begin with.
 
@@ -117,6 +118,7 @@ def located(
     handler.emit = lambda record: messages.append(record.getMessage())  # type: ignore[method-assign]
     logging.getLogger("langsplat").addHandler(handler)
     with pytest.MonkeyPatch.context() as patch:
+        in_this_process(patch)
         patch.setattr(pycolmap, "extract_features", _never)
         capture = load_capture(photos, CONFIG, work, Progress(lambda at: labels.append(at.stage)))
     logging.getLogger("langsplat").removeHandler(handler)
@@ -164,6 +166,7 @@ def test_a_second_run_computes_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     capture, work, _, _ = located
+    in_this_process(monkeypatch)
     for name in ("extract_features", "match_image_pairs", "incremental_mapping"):
         monkeypatch.setattr(pycolmap, name, _never)
     again = load_capture(photos, CONFIG, work)
@@ -200,6 +203,7 @@ def test_changed_photographs_are_computed_again(
     for photo in (photos / "images").glob("*.png"):
         shutil.copy(photo, dataset)
     shutil.copytree(located[1], work)
+    in_this_process(monkeypatch)
     monkeypatch.setattr(pycolmap, "extract_features", _never)
     with pytest.raises(AssertionError, match="computed again"):
         load_capture(dataset, CONFIG, work)
@@ -229,6 +233,7 @@ def test_known_poses_give_points_in_their_own_world(tmp_path: Path, monkeypatch:
     x, y = pixels[seen].astype(int).T
     assert np.median(np.abs(image[y, x].astype(float) - found.colours[seen])) < 12
 
+    in_this_process(monkeypatch)
     monkeypatch.setattr(pycolmap, "extract_features", _never)
     np.testing.assert_array_equal(add_points(capture, range(4), tmp_path, silent).points, found.points)
 
@@ -485,7 +490,7 @@ def test_below_half_is_refused_each_time_unless_told_otherwise(mostly_noise: Pat
     told = DatasetConfig(max_side=64, allow_few_cameras=True)
     assert len(load_capture(mostly_noise, told, tmp_path)) == 4
     (stage,) = tmp_path.glob("sfm-*")
-    matches = sfm.read_matches(stage, sfm.numbered(find_photos(mostly_noise)), ())
+    matches = read_matches(stage, sfm.numbered(find_photos(mostly_noise)), ())
     assert [len(group) for group in matches.groups] == [4, 1, 1, 1, 1, 1]
 
 
@@ -503,6 +508,7 @@ def test_two_views_are_refused_although_they_are_half(
         sfm.keep_matches(folder)
         sfm.store_model(model, folder)
 
+    in_this_process(monkeypatch)
     monkeypatch.setattr(sfm, "map_cameras", gives_up)
     for _ in range(2):
         with pytest.raises(InputError, match="only 2 of 4 photographs"):
@@ -510,19 +516,22 @@ def test_two_views_are_refused_although_they_are_half(
 
 
 @pytest.mark.parametrize("label", ["finding features", "matching photographs", "locating cameras"])
-def test_a_full_disk_is_said_before_pycolmap_ends_the_process(
-    label: str, mostly_noise: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fill(at: Report) -> None:
-        if at.stage == label:
-            monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1000))
-
+def test_a_disk_that_another_program_fills_meanwhile(label: str, mostly_noise: Path, tmp_path: Path) -> None:
+    """pycolmap then aborts, or raises, wherever it is."""
     told = DatasetConfig(max_side=64, allow_few_cameras=True)
-    with pytest.raises(OSError, match="No space left") as caught:
-        load_capture(mostly_noise, told, tmp_path, Progress(fill))
-    assert Path(caught.value.filename).parent == tmp_path
-    monkeypatch.undo()
-    assert len(load_capture(mostly_noise, told, tmp_path)) == 4
+    with small_disk(tmp_path / "disk", sfm.ROOM + (16 << 20)) as disk:
+
+        def fill(at: Report) -> None:
+            if at.stage == label and not (disk / "full").exists():
+                with suppress(OSError), (disk / "full").open("wb", buffering=0) as file:
+                    while file.write(bytes(1 << 16)):
+                        pass
+
+        with pytest.raises(OSError, match="No space left") as caught:
+            load_capture(mostly_noise, told, disk / "work", Progress(fill))
+        assert Path(caught.value.filename).parent == disk / "work"
+        (disk / "full").unlink()
+        assert len(load_capture(mostly_noise, told, disk / "work")) == 4
 
 
 def test_a_model_that_was_cut_off_is_not_kept(tmp_path: Path) -> None:

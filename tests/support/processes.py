@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from langsplat_core.arrays import Array
+from langsplat_core.io import apart
 from langsplat_core.progress import Cancelled, Progress, Report
 from langsplat_core.scene import Camera
 
@@ -37,6 +38,11 @@ def bound_by_permissions() -> Callable[[], None] | None:
                 raise OSError(ctypes.get_errno(), "cannot give up a right")
 
     return give_up
+
+
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What runs in a process of its own runs in this one, where what is patched is so for it too."""
+    monkeypatch.setattr(apart, "run", lambda function, *given, progress: function(*given, progress))
 
 
 @contextmanager

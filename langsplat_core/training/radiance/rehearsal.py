@@ -26,6 +26,7 @@ log = logging.getLogger("langsplat")
 
 STAGE = "rehearsing"
 HELD_OUT = 8  # one view in so many: the more are left, the more it is like the training itself
+FEWEST_HELD_OUT = 3  # views in all, each in one rehearsal: single ones differ by a decibel or two
 LEAST_GAIN = 0.25  # dB, for which more is spent: less may be chance
 
 
@@ -40,30 +41,71 @@ def rehearse(
     train_indices: Sequence[int],
     checkpoint: Path | None = None,
     progress: Progress = silent,
-) -> list[float]:
+) -> list[list[float]]:
     """Mean PSNR (dB, exposures fitted) of views held out of those at `train_indices`, for each budget from
-    the smallest on, up to one that clearly loses. Empty where there is nothing to decide: many views, so few
-    that none can be held out, or few steps.
+    the smallest on up to one that clearly loses, in one rehearsal after the other; one in which a budget
+    does not gain is its last. Empty where there is nothing to decide: many views, so few that none can be
+    held out, or few steps.
 
     With a `checkpoint` path an interrupted rehearsal goes on where it stopped; the files are those of
     `checkpoints_of` it, and stay.
     """
     budgets = budgets_for(capture, config, len(train_indices))
-    held_out = chosen([capture.cameras[i] for i in train_indices], HELD_OUT)
+    held_out = _held_out([capture.cameras[i] for i in train_indices])
     if len(budgets) < 2 or not held_out:
         return []
-    found: list[float] = []
-    for index, budget in enumerate(budgets):
-        small = capture.shrunk(train_indices, budget.longer_side)
-        train = [row for row in range(len(small)) if row not in held_out]
-        at = checkpoint and checkpoint.with_name(f"{index}-{checkpoint.name}")
-        reports = _of_steps(progress.part(index, len(budgets), STAGE, in_words(budget)))
-        gaussians = train_radiance(small, config.spending(budget), train, at, reports)
-        scores = evaluate_views(gaussians, small, held_out, config.backend)
-        found.append(float(np.mean([score.psnr_exposed or score.psnr for score in scores])))
-        log.debug("rehearsal of %s: %.2f dB held out", in_words(budget), found[-1])
-        if found[-1] < max(found) - LEAST_GAIN:
+    found: list[list[float]] = [[] for _ in budgets]
+
+    def score(index: int, number: int) -> float:
+        if len(found[index]) == number:
+            done, most = sum(map(len, found)), len(budgets) * len(held_out)
+            at = checkpoint and checkpoint.with_name(f"{index}-{number}-{checkpoint.name}")
+            reports = _of_steps(progress.part(done, most, STAGE, in_words(budgets[index])))
+            without = held_out[number]
+            found[index].append(_score(capture, config, budgets[index], train_indices, without, at, reports))
+        return found[index][number]
+
+    best = 0
+    for index in range(1, len(budgets)):
+        gains: list[float] = []
+        while len(gains) < len(held_out) and all(gain > 0 for gain in gains):
+            number = len(gains)
+            before = score(best, number)
+            gains.append(score(index, number) - before)
+        if _pays(gains):
+            best = index
+        elif np.mean(gains) < -LEAST_GAIN:
             break
+    return [scores for scores in found if scores]
+
+
+def _held_out(cameras: Sequence[Camera]) -> list[list[int]]:
+    """Views that the rehearsals leave out, one after the other: `FEWEST_HELD_OUT` at least in all."""
+    views: list[list[int]] = []
+    while sum(map(len, views)) < FEWEST_HELD_OUT:
+        more = chosen(cameras, HELD_OUT, [index for taken in views for index in taken])
+        if not more:
+            break
+        views.append(more)
+    return views
+
+
+def _score(
+    capture: Capture,
+    config: RadianceConfig,
+    budget: RadianceBudget,
+    train_indices: Sequence[int],
+    held_out: Sequence[int],
+    checkpoint: Path | None,
+    progress: Progress,
+) -> float:
+    """Mean PSNR of the views `held_out` of a training with the budget on the others."""
+    small = capture.read_at(train_indices, budget.longer_side)
+    train = [row for row in range(len(small)) if row not in held_out]
+    gaussians = train_radiance(small, config.spending(budget), train, checkpoint, progress)
+    scores = evaluate_views(gaussians, small, held_out, config.backend)
+    found = float(np.mean([score.psnr_exposed or score.psnr for score in scores]))
+    log.debug("rehearsal of %s without %s: %.2f dB", in_words(budget), list(held_out), found)
     return found
 
 
@@ -87,14 +129,19 @@ def checkpoints_of(checkpoint: Path) -> list[Path]:
     return list(checkpoint.parent.glob(f"*-{checkpoint.name}"))
 
 
-def supported(found: Sequence[float], budgets: Sequence[RadianceBudget]) -> RadianceBudget:
-    """The budget that rehearsals `found` best, a larger one only where it gains; the smallest where no view
-    could be held out."""
+def supported(found: Sequence[Sequence[float]], budgets: Sequence[RadianceBudget]) -> RadianceBudget:
+    """The budget that rehearsals `found` best, a larger one only where it gains in every one of them; the
+    smallest where no view could be held out."""
     best = 0
-    for index, decibels in enumerate(found):
-        if decibels >= found[best] + LEAST_GAIN:
+    for index in range(1, len(found)):
+        if _pays([more - less for more, less in zip(found[index], found[best], strict=False)]):
             best = index
     return budgets[best]
+
+
+def _pays(gains: Sequence[float]) -> bool:
+    """Whether a larger budget pays that gained so much (dB) in rehearsals: one view alone tells little."""
+    return min(gains) > 0 and float(np.mean(gains)) >= LEAST_GAIN
 
 
 def train_within(
@@ -109,7 +156,7 @@ def train_within(
     spent, cameras = config.spending(budget), capture.cameras
     if all(max(camera.width, camera.height) <= budget.longer_side for camera in cameras):
         return train_radiance(capture, spent, train_indices, checkpoint, progress)
-    small = capture.shrunk(range(len(capture)), budget.longer_side)
+    small = capture.read_at(range(len(capture)), budget.longer_side)
     gaussians = train_radiance(small, spent, train_indices, checkpoint, progress)
     return widened(gaussians, [(small.cameras[index], cameras[index]) for index in train_indices])
 

@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from langsplat_core.arrays import Array, ViewScore, psnr, sigmoid
-from langsplat_core.config import INRIA, RadianceConfig, check_settings
+from langsplat_core.config import INRIA, QUICK, RadianceConfig, check_settings
 from langsplat_core.datasets.capture import Capture, shrunk_view
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Cancelled, Progress, Terminated, silent
@@ -378,11 +378,21 @@ def evaluate_views(
             decibels = psnr(image[counted].cpu().numpy(), target[counted].cpu().numpy())
             share = 1.0 if mask is None else float(mask.float().mean())
             similarity = 1 - (1 - float(ssim(image, target))) / max(share, 1e-9)
-            exposed = _psnr_exposed(image, target, mask)
-            scores.append(
-                ViewScore(camera.name, decibels, similarity, float(covered.float().mean()), exposed)
-            )
+            whole = decibels, similarity, float(covered.float().mean())
+            small = _psnr_small(camera, image, target, mask)
+            scores.append(ViewScore(camera.name, *whole, _psnr_exposed(image, target, mask), small))
     return scores
+
+
+def _psnr_small(camera: Camera, image: Tensor, target: Tensor, mask: Tensor | None) -> float | None:
+    """PSNR of an image and its photograph, both as small as `QUICK`'s; None where nothing counts then."""
+    share = min(QUICK.longer_side / max(camera.width, camera.height), 1.0)
+    size = max(round(share * camera.width), 1), max(round(share * camera.height), 1)
+    counted = None if mask is None else mask.cpu().numpy()
+    values = [(255 * colours).round().byte().cpu().numpy() for colours in (image, target)]
+    (_, drawn, counts), (_, photograph, _) = (shrunk_view(camera, one, counted, size) for one in values)
+    which = np.ones(drawn.shape[:2], bool) if counts is None else counts
+    return psnr(drawn[which] / 255, photograph[which] / 255) if which.any() else None
 
 
 def _psnr_exposed(image: Tensor, target: Tensor, mask: Tensor | None) -> float | None:
