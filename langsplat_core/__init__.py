@@ -23,50 +23,26 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
-    "load_scene": "langsplat_core.io.scenes",
-    "save_scene": "langsplat_core.io.scenes",
-    "Words": "langsplat_core.io.language",
-    "read_words": "langsplat_core.io.language",
-    "write_words": "langsplat_core.io.language",
-    "render": "langsplat_core.raster.render",
-    "Rendering": "langsplat_core.raster.render",
-    "load_rasterizer": "langsplat_core.raster",
-    "load_lifting_rasterizer": "langsplat_core.raster",
-    "load_text_encoder": "langsplat_core.semantics.encoders",
-    "QueryEngine": "langsplat_core.query.engine",
-    "QueryResult": "langsplat_core.query.engine",
-    "train_scene": "langsplat_core.pipeline.train",
-    "TrainConfig": "langsplat_core.config",
-    "Camera": "langsplat_core.scene",
-    "Gaussians": "langsplat_core.scene",
-    "Intrinsics": "langsplat_core.scene",
-    "LanguageField": "langsplat_core.scene",
-    "Scene": "langsplat_core.scene",
-    "look_at": "langsplat_core.scene",
+    name: f"langsplat_core.{module}"
+    for module, names in {
+        "io.scenes": "load_scene save_scene",
+        "io.language": "Words read_words write_words",
+        "raster.render": "render Rendering",
+        "raster": "load_rasterizer load_lifting_rasterizer",
+        "semantics.encoders": "load_text_encoder",
+        "query.engine": "QueryEngine QueryResult",
+        "pipeline.train": "train_scene",
+        "config": "TrainConfig",
+        "scene": "Camera Gaussians Intrinsics LanguageField Scene look_at",
+    }.items()
+    for name in names.split()
 }
 
 __all__ = [
-    "Camera",
-    "Gaussians",
-    "Intrinsics",
-    "LanguageField",
-    "QueryEngine",
-    "QueryResult",
-    "Rendering",
-    "Scene",
-    "TrainConfig",
-    "Words",
-    "load_lifting_rasterizer",
-    "load_rasterizer",
-    "load_scene",
-    "load_text_encoder",
-    "look_at",
-    "read_words",
-    "render",
-    "save_scene",
-    "train_scene",
-    "write_words",
-]
+    "Camera", "Gaussians", "Intrinsics", "LanguageField", "QueryEngine", "QueryResult", "Rendering",
+    "Scene", "TrainConfig", "Words", "load_lifting_rasterizer", "load_rasterizer", "load_scene",
+    "load_text_encoder", "look_at", "read_words", "render", "save_scene", "train_scene", "write_words",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -1,6 +1,6 @@
 """The `langsplat` command, also as ``python -m langsplat_core`` for launchers such as torchrun."""
 
-from langsplat_core.signals import end_in_a_line
+from langsplat_core.errors import end_in_a_line
 
 
 def entry() -> None:

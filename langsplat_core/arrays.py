@@ -15,12 +15,10 @@ def check_array(
     dims: dict[str, int] | None = None,
     dtype: type | None = None,
 ) -> dict[str, int]:
-    """Require `array` to have `shape`; letters in the shape must agree with `dims`, or are bound now.
-
-    Returns the letters bound so far, so that calls can be chained over the fields of one object.
-    Raises TypeError for a wrong dtype and ValueError for a wrong shape, both naming the array:
-    ``scales: expected shape (N, 3) with {'N': 6}, got (5, 3)``.
-    """
+    """Require `array` to have `shape`; letters in the shape must agree with `dims`, or are bound now. Returns
+    the letters bound so far, so that calls can be chained over the fields of one object. Raises TypeError for
+    a wrong dtype and ValueError for a wrong shape, both naming the array: ``scales: expected shape (N, 3)
+    with {'N': 6}, got (5, 3)``."""
     dims = dict(dims or {})
     if not isinstance(array, np.ndarray):
         raise TypeError(f"{name}: expected a NumPy array, got {type(array).__name__}")

@@ -50,10 +50,8 @@ def helper(function: Callable[..., Any], **options: Any) -> Any:
 
 
 def kernel(function: Callable[..., Any], **options: Any) -> Any:
-    """Compile `function` at its first call, or take the machine code of an earlier process.
-
-    options: further ones of `numba.njit`, such as `fastmath`.
-    """
+    """Compile `function` at its first call, or take the machine code of an earlier process. options: further
+    ones of `numba.njit`, such as `fastmath`."""
     folder = kernel_folder(Path(function.__code__.co_filename))
     with _cache_folder(folder) if folder else nullcontext():
         made = numba.njit(cache=folder is not None, nogil=True, error_model="numpy", **options)(function)
@@ -197,10 +195,8 @@ def _cache_folder(folder: Path) -> Iterator[None]:
 
 
 def plain(array: Array) -> Array:
-    """The array as float32, contiguous and writeable: one type for numba, which compiles once per type.
-
-    Only a read-only array is copied for that reason; kernels never write to their inputs.
-    """
+    """The array as float32, contiguous and writeable: one type for numba, which compiles once per type. Only
+    a read-only array is copied for that reason; kernels never write to their inputs."""
     return np.require(array, np.float32, ["C", "W"])
 
 

@@ -49,9 +49,7 @@ class Setting:
 
 def check_settings(settings: object, option: str = "--") -> None:
     """InputError for the first number in `settings`, a dataclass, that is outside the range of its field.
-
-    `option` is what precedes the fields' names on the command line, such as ``--codec.``.
-    """
+    `option` is what precedes the fields' names on the command line, such as ``--codec.``."""
     for setting in numeric_settings(settings, option):
         problem = _problem(setting)
         if problem:
@@ -74,7 +72,9 @@ def named_values(settings: object, option: str = "--") -> Iterator[tuple[str, An
         value, hint = getattr(settings, entry.name), hints[entry.name]
         name = option + entry.name.replace("_", "-")
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
-            yield from named_values(value, option if _is_flat(hint) else f"{name}.")
+            # of `tyro.conf.arg(name="")`, whose fields are options without its own name
+            is_flat = any(getattr(part, "name", None) == "" for part in annotations(hint))
+            yield from named_values(value, option if is_flat else f"{name}.")
         else:
             yield name, value, hint
 
@@ -99,11 +99,6 @@ def _kinds(hint: Any) -> Iterator[type]:
             yield from _kinds(part)
     elif isinstance(hint, type) and hint is not types.NoneType:
         yield hint
-
-
-def _is_flat(hint: Any) -> bool:
-    """True where a dataclass's fields are options without its own name: ``tyro.conf.arg(name="")``."""
-    return any(getattr(part, "name", None) == "" for part in annotations(hint))
 
 
 def _problem(setting: Setting) -> str | None:
@@ -462,8 +457,7 @@ class PictureConfig:
     own_colours: bool = False  # heat in the colour of each query instead of the colour map
     threshold: Share = 0.5  # of a pixel's light from an answer's Gaussians from which it is segmented
     alpha_gate: Share = 0.3  # pixels with less alpha carry no relevancy
-    heat_scale: tuple[Share, Share] | None = (
-        None  # relevancies that are coldest and hottest; None: each answer's
-    )
+    # relevancies that are coldest and hottest; None: each answer's
+    heat_scale: tuple[Share, Share] | None = None
     background: tuple[Share, Share, Share] = (0.0, 0.0, 0.0)  # display values in [0, 1]
     transparent: bool = False  # no background: the image has a fourth channel, the scene's alpha

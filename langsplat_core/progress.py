@@ -132,8 +132,7 @@ class Terminated(KeyboardInterrupt):
 
 class LineProgress:
     """Progress for other programs, a context manager: a line of JSON on stderr for every report that says
-    anything new, ``{"stage": "training", "fraction": 0.2, "note": "step 9", "metrics": {"loss": 0.03}}``.
-    """
+    anything new, ``{"stage": "training", "fraction": 0.2, "note": "step 9", "metrics": {"loss": 0.03}}``."""
 
     def __init__(self) -> None:
         self._last = ""

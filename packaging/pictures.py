@@ -19,14 +19,14 @@ from langsplat_core.io.hostile import opened
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.training.language.codec_fit import train_autoencoder
 from langsplat_viewer.actions import (
+    browsing,
+    editing,
     filming,
     opening,
     outline,
     projects,
     selecting,
     settings,
-    training,
-    transforming,
     viewpoint,
 )
 from langsplat_viewer.options import scene_path, services
@@ -97,11 +97,11 @@ def _clipped(ctx: Any, window: Window) -> None:
     viewer = window.viewer
     selecting.select_query(viewer)
     settings.open_panel(viewer, "Transform")
-    transforming.fill_box(viewer)
+    editing.fill_box(viewer)
     selecting.select_none(viewer)
     settings.set_display(viewer, "rgb")
-    transforming.fill_form(viewer, replace(viewer.state.edit_form, gizmo="box"))
-    transforming.clip(viewer, True)
+    viewer.state.edit_form = replace(viewer.state.edit_form, gizmo="box")
+    editing.clip(viewer, True)
 
 
 def _noted(ctx: Any, window: Window) -> None:
@@ -131,7 +131,7 @@ def _beside(ctx: Any, window: Window) -> None:
 def _transformed(ctx: Any, window: Window) -> None:
     _selected(ctx, window)
     settings.open_panel(window.viewer, "Transform")
-    transforming.next_gizmo(window.viewer)
+    editing.next_gizmo(window.viewer)
 
 
 def _side_by_side(ctx: Any, window: Window) -> None:
@@ -144,7 +144,7 @@ def _side_by_side(ctx: Any, window: Window) -> None:
 
 def _palette(ctx: Any, window: Window) -> None:
     settings.show_palette(window.viewer, True)
-    settings.type_command(window.viewer, "sel")
+    window.viewer.state.palette_typed = "sel"
 
 
 def _light(ctx: Any, window: Window) -> None:
@@ -216,8 +216,8 @@ def _trained(ctx: Any, window: Window) -> None:
     room = ["dataset", "--seed", "3", "--views", "12", "--out", str(folder / "room")]
     subprocess.run([sys.executable, "-m", "assets.making", *room], check=True)
     settings.open_panel(viewer, "Train")
-    training.fill_in(viewer, TrainingForm(str(folder / "room"), str(folder / "room.ply"), "quick"))
-    training.start_training(viewer)
+    viewer.state.training_form = TrainingForm(str(folder / "room"), str(folder / "room.ply"), "quick")
+    browsing.start_training(viewer)
     process = viewer.training
     assert process is not None
     while process.exit_code is None and len(process.progress.losses) < 120:

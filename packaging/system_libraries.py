@@ -10,13 +10,7 @@ import subprocess
 import sys
 
 # library name as the loader knows it -> Debian package that carries it
-NEEDED = {
-    "EGL": "libegl1",
-    "GL": "libgl1",
-    "usb-1.0": "libusb-1.0-0",
-    "gomp": "libgomp1",
-    "X11": "libx11-6",
-}
+NEEDED = {"EGL": "libegl1", "GL": "libgl1", "usb-1.0": "libusb-1.0-0", "gomp": "libgomp1", "X11": "libx11-6"}
 # Mesa's software driver has no library that find_library sees: look for the driver folder's file.
 DRI_PACKAGE = "libgl1-mesa-dri"
 XVFB_PACKAGE = "xvfb"

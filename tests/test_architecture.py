@@ -27,7 +27,7 @@ LAYERS = [
     ["langsplat_viewer.rendering"],
     ["langsplat_viewer.marks"],
     ["langsplat_viewer.camera"],
-    ["langsplat_viewer.jobs", "langsplat_viewer.fonts"],
+    ["langsplat_viewer.jobs"],
     ["langsplat_core.__main__"],
     ["langsplat_core.cli"],
     ["langsplat_core.bench"],
@@ -44,7 +44,7 @@ LAYERS = [
     ["langsplat_core.scene"],
     ["langsplat_core.config", "langsplat_core.compiled"],
     ["langsplat_core.arrays", "langsplat_core.progress"],
-    ["langsplat_core.errors", "langsplat_core.signals", "langsplat_core.web"],
+    ["langsplat_core.errors", "langsplat_core.web"],
 ]
 FACADE = "langsplat_core.__init__"  # the public names; it may reach anything below the command line
 HEAVY = ("torch", "open3d", "transformers", "pycolmap", "moderngl", "glfw", "imgui_bundle", "skimage")

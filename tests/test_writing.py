@@ -16,7 +16,7 @@ from threading import Barrier
 import numpy as np
 import pytest
 
-from langsplat_core.cli.bench import write_report
+from langsplat_core.cli.evaluate import write_report
 from langsplat_core.cli.run import main
 from langsplat_core.errors import InputError
 from langsplat_core.io.cameras import write_cameras
@@ -37,11 +37,9 @@ from langsplat_core.pipeline.stages import kept, kept_array
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures
 from langsplat_core.training.radiance.state import save_checkpoint
-from langsplat_viewer.files.browsing import QuerySet, SavedQuery, write_queries
-from langsplat_viewer.files.flights import Bookmark, Shelf, write_flight
 from langsplat_viewer.files.preferences import Preferences, save_preferences
-from langsplat_viewer.output.film import Film, write_film
-from langsplat_viewer.output.saving import save_png
+from langsplat_viewer.files.projects import Bookmark, QuerySet, SavedQuery, Shelf, write_flight, write_queries
+from langsplat_viewer.output import Film, save_png, write_film
 from tests.support.file_samples import random_codec, random_field
 from tests.support.processes import bound_by_permissions, files_of_at_most, small_disk
 from tests.support.scenes import random_camera, random_gaussians

@@ -1,10 +1,9 @@
 """The `langsplat-viewer` command, also as ``python -m langsplat_viewer``."""
 
-from langsplat_core.signals import end_in_a_line
+from langsplat_core.errors import end_in_a_line
 
 
 def entry() -> None:
-    """The `langsplat-viewer` console script."""
     end_in_a_line("langsplat-viewer")
     from langsplat_viewer.program import entry as run
 

@@ -22,13 +22,19 @@ from langsplat_core.errors import BackendError
 from langsplat_core.progress import Progress, watched
 from langsplat_core.scene import Gaussians
 from langsplat_core.scene.gaussians import Merged, merged
-from langsplat_viewer.actions import selecting, undoing, viewpoint
+from langsplat_viewer.actions import editing, selecting, viewpoint
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.commands import with_key
 from langsplat_viewer.jobs import Worker
-from langsplat_viewer.rendering.depth import UNCLIPPED, why_nothing, why_undrawable
 from langsplat_viewer.rendering.renderer import GlRenderer, Rasterized, Rasterizing
-from langsplat_viewer.rendering.request import FULL, Detail, RenderRequest
+from langsplat_viewer.rendering.request import (
+    FULL,
+    UNCLIPPED,
+    Detail,
+    RenderRequest,
+    why_nothing,
+    why_undrawable,
+)
 from langsplat_viewer.state import FrameStats, ViewerState
 
 REST_SECONDS = 0.07  # without a move, after which the camera rests
@@ -122,7 +128,6 @@ class Canvas:
         self._background.worker.wake = wake
 
     def _follow(self, state: ViewerState, request: RenderRequest) -> None:
-        """Moving: draw as finely as is fast enough."""
         if not state.coarse_while_moving:
             if request != self._tried:
                 self._draw(state, request)
@@ -158,7 +163,6 @@ class Canvas:
         return self._tried is None or replace(self._tried, detail=FULL) != request
 
     def _merged(self, request: RenderRequest) -> Merged | None:
-        """Gaussians that the quick renderer can draw, if they are there."""
         if self._quick is not None:
             with suppress(BackendError):  # for want of memory: images stay as they are
                 return self._merger.made(request.scene.scene.gaussians)
@@ -236,11 +240,9 @@ class Canvas:
 
     @property
     def backend(self) -> str:
-        """The name of what draws."""
         return self._fine.backend
 
     def close(self) -> None:
-        """Stop the workers."""
         self._background.worker.close()
         self._merger.worker.close()
 
@@ -273,7 +275,7 @@ def _why_nothing(request: RenderRequest) -> str:
     gaussians = request.scene.scene.gaussians
     if len(request.scene.source.gaussians) and not len(gaussians):
         shown = with_key("show what is hidden", selecting.show_hidden)
-        return f"{NOTHING_LEFT}: {shown}, or {with_key('undo', undoing.undo)}"
+        return f"{NOTHING_LEFT}: {shown}, or {with_key('undo', editing.undo)}"
     if request.clip != UNCLIPPED and gaussians.valid().any():
         return NOTHING_BETWEEN
     reason = why_nothing(gaussians, request.camera)
@@ -318,7 +320,6 @@ class Pace:
         self._shares: dict[Level, float] = {}  # of the full image's time, measured
 
     def expect(self, count: int) -> None:
-        """Expect images of `count` Gaussians from now on."""
         self._count = max(count, 1)
 
     @property
@@ -327,7 +328,6 @@ class Pace:
         return not self._is_within(FINE)
 
     def drew(self, level: Level, milliseconds: float) -> None:
-        """Learn the time of an image that was drawn."""
         if level == FINE:
             self._each = milliseconds / self._count
             self._shares = {other: FORGET * share for other, share in self._shares.items()}

@@ -2,29 +2,28 @@
 of keys and the list of commands are made."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from langsplat_core.config import Display
 from langsplat_core.display.displays import DISPLAYS, DisplayRow
 from langsplat_core.scene import LEVELS
 from langsplat_viewer.actions import (
+    browsing,
+    editing,
     filming,
     opening,
     projects,
     queries,
     selecting,
     settings,
-    transforming,
-    undoing,
     viewpoint,
 )
 from langsplat_viewer.actions.selecting import Part
 from langsplat_viewer.camera.controls import Side, adopt_up, level
 from langsplat_viewer.files.preferences import THEMES, Theme
 from langsplat_viewer.marks import TOOLS, Tool
-from langsplat_viewer.output import saving
-from langsplat_viewer.state import Overlay
+from langsplat_viewer.state import Overlay, ViewerState
 from langsplat_viewer.viewer import Viewer
 
 
@@ -59,38 +58,34 @@ class Command:
     does: str
     act: Callable[[Viewer], object]
     keys: tuple[str, ...] = ()
-    menu: str = ""  # one of MENUS; without one it is found in the list of commands alone
     repeats: bool = False  # while held
     is_edit: bool = False  # belongs to the box while one types, as it does everywhere
     is_on: Callable[[Viewer], bool] | None = None  # for a check mark in the menu
     apart: bool = False  # a line is above it in the menu
     icon: str = ""  # on the toolbar, a name of Font Awesome 6 without its "ICON_FA_"
+    menu: str = ""  # one of MENUS; without one it is found in the list of commands alone
 
 
-def _show(button: Button) -> Callable[[Viewer], None]:
-    return lambda viewer: settings.set_display(viewer, button.display, button.latent_level)
+def is_shown(state: ViewerState, button: Button) -> bool:
+    """Return whether the scene is looked at in this way."""
+    return state.picture.display == button.display and button.latent_level in (None, state.latent_level)
 
 
-def _name(button: Button) -> str:
-    name = button.label.partition("##")[0]
-    return (
-        f"show {DISPLAYS[button.display].label.lower()}{'' if button.latent_level is None else ', ' + name}"
+def _display(button: Button, number: int) -> Command:
+    name = "" if button.latent_level is None else f", {LEVELS[button.latent_level]}"
+    return Command(
+        f"show {DISPLAYS[button.display].label.lower()}{name}",
+        lambda viewer: settings.set_display(viewer, button.display, button.latent_level),
+        (str(number),) if number < 10 else (),
+        is_on=lambda viewer: is_shown(viewer.state, button),
+        icon="" if button.latent_level in (0, 1) else DISPLAY_ICONS.get(button.display, ""),
     )
-
-
-def _is_shown(button: Button) -> Callable[[Viewer], bool]:
-    def shown(viewer: Viewer) -> bool:
-        state, level = viewer.state, button.latent_level
-        return state.picture.display == button.display and level in (None, state.latent_level)
-
-    return shown
 
 
 def _theme(theme: Theme) -> Command:
     return Command(
         f"{theme} theme",
         lambda viewer: settings.set_theme(viewer, theme),
-        menu="Window",
         is_on=lambda viewer: viewer.state.preferences.theme == theme,
     )
 
@@ -99,14 +94,13 @@ def _letters(scale: float) -> Command:
     return Command(
         f"letters of {100 * scale:.0f} %",
         lambda viewer: settings.set_ui_scale(viewer, scale),
-        menu=LETTERS_MENU,
         is_on=lambda viewer: abs(viewer.state.preferences.ui_scale - scale) < 1e-6,
     )
 
 
 def _recent(path: str) -> Command:
     name = Path(path)
-    return Command(f"open {name.parent.name}/{name.name}", lambda viewer: opening.open_recent(viewer, path))
+    return Command(f"open {name.parent.name}/{name.name}", lambda viewer: browsing.open_recent(viewer, path))
 
 
 def _panel(title: str) -> Command:
@@ -114,14 +108,30 @@ def _panel(title: str) -> Command:
 
 
 def _overlay(name: Overlay, title: str) -> Command:
-    keys = ("B",) if name == "things" else ()
     return Command(
         f"show or hide the {title}",
         lambda viewer: settings.toggle_overlay(viewer, name),
-        keys,
-        "View",
+        ("B",) if name == "things" else (),
         is_on=lambda viewer: name in viewer.state.preferences.overlays,
     )
+
+
+def _tool(tool: Tool) -> Command:
+    return Command(
+        f"select: {tool}",
+        lambda viewer: selecting.use_tool(viewer, tool),
+        is_on=lambda viewer: viewer.state.selection.tool == tool,
+        icon=TOOL_ICONS[tool],
+    )
+
+
+def _export(does: str, part: Part, as_points: bool = False) -> Command:
+    return Command(does, lambda viewer: selecting.export(viewer, Path.cwd(), part, as_points=as_points))
+
+
+def _side(side: Side, key: str) -> Command:
+    where = {"top": "above", "bottom": "below"}.get(side, f"the {side}")
+    return Command(f"look from {where}", lambda viewer: viewpoint.look_from(viewer, side), (key,))
 
 
 OVERLAY_TITLES: dict[Overlay, str] = {
@@ -130,29 +140,6 @@ OVERLAY_TITLES: dict[Overlay, str] = {
     "cube": "view cube",
     "grid": "ground grid",
 }
-
-
-def _tool(tool: Tool) -> Command:
-    return Command(
-        f"select: {tool}",
-        lambda viewer: selecting.use_tool(viewer, tool),
-        menu="Select",
-        is_on=lambda viewer: viewer.state.selection.tool == tool,
-        icon=TOOL_ICONS[tool],
-    )
-
-
-def _export(does: str, part: Part, as_points: bool = False) -> Command:
-    return Command(
-        does, lambda viewer: selecting.export(viewer, Path.cwd(), part, as_points=as_points), menu="Select"
-    )
-
-
-def _side(side: Side, key: str) -> Command:
-    where = {"top": "above", "bottom": "below"}.get(side, f"the {side}")
-    return Command(f"look from {where}", lambda viewer: viewpoint.look_from(viewer, side), (key,), "Camera")
-
-
 SIDE_KEYS: tuple[tuple[Side, str], ...] = (
     ("front", "Keypad1"),
     ("back", "Ctrl+Keypad1"),
@@ -185,179 +172,134 @@ DISPLAY_ICONS: dict[Display, str] = {
 UI_SCALES = (0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0)
 MENUS = ("File", "Edit", "Select", "View", "Camera", "Window", "Help")
 
-COMMANDS: tuple[Command, ...] = (
-    Command("open a scene", opening.ask_for_file, ("Ctrl+O",), "File"),
-    Command(
-        "search all scenes of a folder", lambda viewer: opening.ask_for_folder(viewer, "library"), menu="File"
+BY_MENU: dict[str, tuple[Command, ...]] = {
+    "File": (
+        Command("open a scene", browsing.ask_for_file, ("Ctrl+O",)),
+        Command("search all scenes of a folder", lambda viewer: browsing.ask_for_folder(viewer, "library")),
+        Command("reload the scene", opening.reload, ("F5",), apart=True),
+        Command("next scene of the list", lambda v: opening.step_scene(v, 1), ("Ctrl+PageDown",)),
+        Command("previous scene of the list", lambda v: opening.step_scene(v, -1), ("Ctrl+PageUp",)),
+        Command("train a scene", lambda viewer: settings.open_panel(viewer, "Train"), apart=True),
+        Command("save a picture", filming.save_picture, ("Ctrl+S", "P"), icon="CAMERA", apart=True),
+        Command("save the view", filming.save_view),
+        Command("save the project", projects.save_project, ("Ctrl+Shift+S",)),
+        Command("save the queries", queries.save_queries),
+        Command("copy the command of this picture", filming.copy_command, ("Ctrl+Shift+C",)),
+        Command("save a picture of the size of the film", filming.save_sized_picture),
+        Command("save a film of the path", filming.save_film),
+        Command("save the camera path", filming.save_path),
+        Command("quit", selecting.quit_viewer, ("Ctrl+Q",), apart=True),
     ),
-    Command("reload the scene", opening.reload, ("F5",), "File", apart=True),
-    Command(
-        "next scene of the list", lambda viewer: opening.step_scene(viewer, 1), ("Ctrl+PageDown",), "File"
-    ),
-    Command(
-        "previous scene of the list", lambda viewer: opening.step_scene(viewer, -1), ("Ctrl+PageUp",), "File"
-    ),
-    Command("train a scene", lambda viewer: settings.open_panel(viewer, "Train"), menu="File", apart=True),
-    Command(
-        "save a picture",
-        lambda viewer: saving.save_picture(viewer, Path.cwd()),
-        ("Ctrl+S", "P"),
-        "File",
-        icon="CAMERA",
-        apart=True,
-    ),
-    Command("save the view", lambda viewer: saving.save_view(viewer, Path.cwd()), menu="File"),
-    Command(
-        "save the project",
-        lambda viewer: projects.save_project(viewer, Path.cwd()),
-        ("Ctrl+Shift+S",),
-        "File",
-    ),
-    Command("save the queries", lambda viewer: queries.save_queries(viewer, Path.cwd()), menu="File"),
-    Command(
-        "copy the command of this picture",
-        lambda viewer: filming.copy_command(viewer, Path.cwd()),
-        ("Ctrl+Shift+C",),
-        "File",
-    ),
-    Command(
-        "save a picture of the size of the film",
-        lambda viewer: filming.save_sized_picture(viewer, Path.cwd()),
-        menu="File",
-    ),
-    Command("save a film of the path", lambda viewer: filming.save_film(viewer, Path.cwd()), menu="File"),
-    Command("save the camera path", lambda viewer: filming.save_path(viewer, Path.cwd()), menu="File"),
-    Command("quit", selecting.quit_viewer, ("Ctrl+Q",), "File", apart=True),
-    Command("search", queries.focus_search, ("Ctrl+F", "/"), "Edit"),
-    Command("remove all queries", queries.remove_all, menu="Edit"),
-    Command("undo", undoing.undo, ("Ctrl+Z",), "Edit", repeats=True, is_edit=True, apart=True),
-    Command("redo", undoing.redo, ("Ctrl+Shift+Z", "Ctrl+Y"), "Edit", repeats=True, is_edit=True),
-    Command(
-        "gizmo: move, rotate, scale, off",
-        transforming.next_gizmo,
-        ("G",),
-        "Edit",
-        is_on=lambda viewer: viewer.state.edit_form.gizmo != "off",
-        icon="UP_DOWN_LEFT_RIGHT",
-        apart=True,
-    ),
-    Command("select everything", selecting.select_all, ("Ctrl+A",), "Select", is_edit=True),
-    Command("select nothing", selecting.select_none, ("Ctrl+D", "Ctrl+Shift+A"), "Select", is_edit=True),
-    Command("invert the selection", selecting.invert_selection, ("Ctrl+I",), "Select", is_edit=True),
-    Command("select what the search found", selecting.select_query, menu="Select", apart=True),
-    Command("select everything like the selection", selecting.select_alike, menu="Select"),
-    Command("grow the selection", selecting.grow_selection, menu="Select"),
-    Command("shrink the selection", selecting.shrink_selection, menu="Select"),
-    Command(
-        "select with no tool: the left button turns the view",
-        selecting.leave_tool,
-        menu="Select",
-        is_on=lambda viewer: viewer.state.selection.tool is None,
-        icon="HAND",
-        apart=True,
-    ),
-    *(_tool(tool) for tool in TOOLS),
-    Command("hide the selection", selecting.hide_selected, ("H",), "Select", apart=True),
-    Command("isolate the selection", selecting.isolate_selected, ("Shift+H",), "Select"),
-    Command("show all that is hidden", selecting.show_hidden, ("U", "Alt+H"), "Select"),
-    Command("delete the selection", selecting.delete_selected, ("Delete",), "Select"),
-    _export("save the selection", "selection"),
-    _export("save the selection as points", "selection", as_points=True),
-    _export("save the rest", "rest"),
-    _export("save the scene without what was deleted", "edited"),
-    *(
+    "Edit": (
+        Command("search", queries.focus_search, ("Ctrl+F", "/")),
+        Command("remove all queries", queries.remove_all),
+        Command("undo", editing.undo, ("Ctrl+Z",), repeats=True, is_edit=True, apart=True),
+        Command("redo", editing.redo, ("Ctrl+Shift+Z", "Ctrl+Y"), repeats=True, is_edit=True),
         Command(
-            _name(button),
-            _show(button),
-            (str(key),) if key < 10 else (),
-            "View",
-            is_on=_is_shown(button),
-            icon="" if button.latent_level in (0, 1) else DISPLAY_ICONS.get(button.display, ""),
-        )
-        for key, button in enumerate(BUTTONS, 1)
+            "gizmo: move, rotate, scale, off",
+            editing.next_gizmo,
+            ("G",),
+            is_on=lambda viewer: viewer.state.edit_form.gizmo != "off",
+            icon="UP_DOWN_LEFT_RIGHT",
+            apart=True,
+        ),
     ),
-    Command(
-        "say what is under the cursor",
-        viewpoint.toggle_pointing,
-        ("I",),
-        "View",
-        is_on=lambda viewer: viewer.state.pointing,
-        icon="COMMENT_DOTS",
-        apart=True,
+    "Select": (
+        Command("select everything", selecting.select_all, ("Ctrl+A",), is_edit=True),
+        Command("select nothing", selecting.select_none, ("Ctrl+D", "Ctrl+Shift+A"), is_edit=True),
+        Command("invert the selection", selecting.invert_selection, ("Ctrl+I",), is_edit=True),
+        Command("select what the search found", selecting.select_query, apart=True),
+        Command("select everything like the selection", selecting.select_alike),
+        Command("grow the selection", selecting.grow_selection),
+        Command("shrink the selection", selecting.shrink_selection),
+        Command(
+            "select with no tool: the left button turns the view",
+            selecting.leave_tool,
+            is_on=lambda viewer: viewer.state.selection.tool is None,
+            icon="HAND",
+            apart=True,
+        ),
+        *(_tool(tool) for tool in TOOLS),
+        Command("hide the selection", selecting.hide_selected, ("H",), apart=True),
+        Command("isolate the selection", selecting.isolate_selected, ("Shift+H",)),
+        Command("show all that is hidden", selecting.show_hidden, ("U", "Alt+H")),
+        Command("delete the selection", selecting.delete_selected, ("Delete",)),
+        _export("save the selection", "selection"),
+        _export("save the selection as points", "selection", as_points=True),
+        _export("save the rest", "rest"),
+        _export("save the scene without what was deleted", "edited"),
     ),
-    Command(
-        "compare two displays",
-        settings.toggle_wipe,
-        ("V",),
-        "View",
-        is_on=lambda viewer: viewer.state.settings.split.mode == "wipe",
-        icon="TABLE_COLUMNS",
+    "View": (
+        *(_display(button, number) for number, button in enumerate(BUTTONS, 1)),
+        Command(
+            "say what is under the cursor",
+            viewpoint.toggle_pointing,
+            ("I",),
+            is_on=lambda viewer: viewer.state.pointing,
+            icon="COMMENT_DOTS",
+            apart=True,
+        ),
+        Command(
+            "compare two displays",
+            settings.toggle_wipe,
+            ("V",),
+            is_on=lambda viewer: viewer.state.settings.split.mode == "wipe",
+            icon="TABLE_COLUMNS",
+        ),
+        Command(
+            "three levels side by side",
+            settings.toggle_levels,
+            is_on=lambda viewer: viewer.state.settings.split.mode == "levels",
+            icon="LAYER_GROUP",
+        ),
+        Command("compare with another scene", browsing.ask_for_beside),
+        *(_overlay(name, title) for name, title in OVERLAY_TITLES.items()),
+        Command("compare the picture with the reference", viewpoint.compare_with_reference, apart=True),
+        Command(
+            "measure a distance",
+            settings.toggle_measuring,
+            ("M",),
+            is_on=lambda viewer: viewer.state.ruler.measures,
+            icon="RULER",
+        ),
+        Command(
+            "pin a note to what is clicked",
+            projects.toggle_pinning,
+            ("N",),
+            is_on=lambda viewer: viewer.state.pins_notes,
+            icon="NOTE_STICKY",
+        ),
+        Command("pin a note to the selection", projects.pin_to_selection),
     ),
-    Command(
-        "three levels side by side",
-        settings.toggle_levels,
-        menu="View",
-        is_on=lambda viewer: viewer.state.settings.split.mode == "levels",
-        icon="LAYER_GROUP",
+    "Camera": (
+        Command("return to the opening view", viewpoint.reset_view, ("R", "Home"), icon="HOUSE"),
+        Command("frame everything", viewpoint.frame_scene, ("Shift+F",), icon="EXPAND"),
+        Command("focus on the latest result found", viewpoint.focus_result, ("F",), icon="CROSSHAIRS"),
+        Command("previous training camera", lambda v: viewpoint.step_camera(v, -1), (",",), True, apart=True),
+        Command("next training camera", lambda v: viewpoint.step_camera(v, 1), (".",), True),
+        Command("level the horizon", lambda viewer: viewpoint.move(viewer, level), apart=True),
+        Command("take the picture's up as the world's", lambda viewer: viewpoint.move(viewer, adopt_up)),
+        *(_side(side, key) for side, key in SIDE_KEYS),
+        Command("orthographic view, and back", viewpoint.toggle_orthographic, ("O", "Keypad5"), apart=True),
+        Command("walk in place of flying, and back", viewpoint.toggle_walking, is_on=lambda v: v.state.walks),
+        Command("bookmark this view", viewpoint.add_bookmark, ("Ctrl+B",), apart=True),
+        Command("add a keyframe here", filming.add_keyframe, ("K",)),
+        Command("play the camera path, or stop", viewpoint.toggle_playing, ("Shift+K",)),
     ),
-    Command("compare with another scene", opening.ask_for_beside, menu="View"),
-    *(_overlay(name, title) for name, title in OVERLAY_TITLES.items()),
-    Command(
-        "compare the picture with the reference", viewpoint.compare_with_reference, menu="View", apart=True
+    "Window": (
+        Command("hide or show the panels", settings.toggle_panel, ("F11",)),
+        Command("panels as at first", settings.reset_panels, apart=True),
+        *(_theme(theme) for theme in THEMES),
     ),
-    Command(
-        "measure a distance",
-        settings.toggle_measuring,
-        ("M",),
-        "View",
-        is_on=lambda viewer: viewer.state.ruler.measures,
-        icon="RULER",
+    LETTERS_MENU: tuple(_letters(scale) for scale in UI_SCALES),
+    "": tuple(_panel(title) for title in PANEL_TITLES),
+    "Help": (
+        Command("find a command", settings.toggle_palette, ("Ctrl+Shift+P",)),
+        Command("first steps, and list of keys", settings.toggle_help, ("F1", "?")),
     ),
-    Command(
-        "pin a note to what is clicked",
-        projects.toggle_pinning,
-        ("N",),
-        "View",
-        is_on=lambda viewer: viewer.state.pins_notes,
-        icon="NOTE_STICKY",
-    ),
-    Command("pin a note to the selection", projects.pin_to_selection, menu="View"),
-    Command("return to the opening view", viewpoint.reset_view, ("R", "Home"), "Camera", icon="HOUSE"),
-    Command("frame everything", viewpoint.frame_scene, ("Shift+F",), "Camera", icon="EXPAND"),
-    Command("focus on the latest result found", viewpoint.focus_result, ("F",), "Camera", icon="CROSSHAIRS"),
-    Command(
-        "previous training camera",
-        lambda viewer: viewpoint.step_camera(viewer, -1),
-        (",",),
-        "Camera",
-        True,
-        apart=True,
-    ),
-    Command("next training camera", lambda viewer: viewpoint.step_camera(viewer, 1), (".",), "Camera", True),
-    Command("level the horizon", lambda viewer: viewpoint.move(viewer, level), menu="Camera", apart=True),
-    Command(
-        "take the picture's up as the world's", lambda viewer: viewpoint.move(viewer, adopt_up), menu="Camera"
-    ),
-    *(_side(side, key) for side, key in SIDE_KEYS),
-    Command(
-        "orthographic view, and back", viewpoint.toggle_orthographic, ("O", "Keypad5"), "Camera", apart=True
-    ),
-    Command(
-        "walk in place of flying, and back",
-        viewpoint.toggle_walking,
-        menu="Camera",
-        is_on=lambda viewer: viewer.state.walks,
-    ),
-    Command("bookmark this view", viewpoint.add_bookmark, ("Ctrl+B",), "Camera", apart=True),
-    Command("add a keyframe here", filming.add_keyframe, ("K",), "Camera"),
-    Command("play the camera path, or stop", viewpoint.toggle_playing, ("Shift+K",), "Camera"),
-    Command("hide or show the panels", settings.toggle_panel, ("F11",), "Window"),
-    Command("panels as at first", settings.reset_panels, menu="Window", apart=True),
-    *(_theme(theme) for theme in THEMES),
-    *(_letters(scale) for scale in UI_SCALES),
-    *(_panel(title) for title in PANEL_TITLES),
-    Command("find a command", settings.toggle_palette, ("Ctrl+Shift+P",), "Help"),
-    Command("first steps, and list of keys", settings.toggle_help, ("F1", "?"), "Help"),
+}
+COMMANDS: tuple[Command, ...] = (
+    *(replace(command, menu=menu) for menu, commands in BY_MENU.items() for command in commands),
     Command("close what lies over the scene", settings.escape, ("Esc",)),
 )
 

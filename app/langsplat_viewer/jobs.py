@@ -95,7 +95,6 @@ class Job:
             self.wake()
 
     def run(self) -> None:
-        """Do the work, on the worker's thread."""
         if not self.future.set_running_or_notify_cancel():
             return
         try:

@@ -65,14 +65,20 @@ def measured(scene: Scene, measure: Measure, eye: Array, relevancy: Array | None
                 return None if relevancy is None else relevancy.astype(np.float64)
 
 
+def counted(values: Array, least: float) -> tuple[float, float, Array]:
+    """Lowest and highest of the finite ones of (N,) values, at least `least` apart, and (BINS,) float32
+    log(1 + n) of how many lie in which step between them."""
+    finite = values[np.isfinite(values)]
+    low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
+    high = max(high, low + least)
+    counts, _ = np.histogram(finite, BINS, (low, high))
+    return low, high, np.log1p(counts).astype(np.float32)
+
+
 def histogram(values: Array, shown: Array) -> Histogram:
     """Return the histogram of (N,) values that are finite and `shown` (N,) bool."""
     values = np.where(shown & np.isfinite(values), values, np.nan)
-    finite = values[np.isfinite(values)]
-    low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
-    high = max(high, low + 1e-6)
-    counts, _ = np.histogram(finite, BINS, (low, high))
-    return Histogram(values, low, high, np.log1p(counts).astype(np.float32))
+    return Histogram(values, *counted(values, 1e-6))
 
 
 # The scene itself is never changed: deleting marks, and what is marked is left out of images and of what is
@@ -101,7 +107,6 @@ class Marks:
 
     @property
     def kept(self) -> Array:
-        """(N,) bool: not deleted."""
         return ~self.deleted
 
     def same(self, other: "Marks") -> bool:
@@ -114,7 +119,6 @@ NAMES = tuple(field.name for field in fields(Marks))
 
 
 def unmarked(count: int) -> Marks:
-    """Return the marks of a scene that was just opened: none."""
     nothing = np.zeros(count, bool)
     return Marks(nothing, nothing, nothing)
 
@@ -301,8 +305,7 @@ class Drawn:
 
     @property
     def radius(self) -> float:
-        """Radius of a sphere, or half the side of a box: how far the drag leads from its centre, world
-        units."""
+        """Radius of a sphere, half the side of a box: how far the drag leads from its centre, world units."""
         first, last = self.pixels[[0, -1]]
         if np.linalg.norm(last - first) < CLICK * self.camera.height:
             return self.reach
@@ -312,7 +315,6 @@ class Drawn:
 
     @property
     def centre(self) -> Array:
-        """(3,) of a sphere or box."""
         return np.array(self.stroke.centre, np.float64)
 
 

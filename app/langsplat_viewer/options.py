@@ -29,8 +29,8 @@ from langsplat_core.query.engine import no_field
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_viewer.camera.flight import SPAN_LIMITS
-from langsplat_viewer.rendering.depth import Clip
 from langsplat_viewer.rendering.renderer import Backend
+from langsplat_viewer.rendering.request import Clip
 from langsplat_viewer.viewer import Services
 
 DisplayChoice = Literal["auto", Display]
@@ -132,12 +132,10 @@ class ViewerOptions:
 
     @property
     def is_film(self) -> bool:
-        """True where `--headless` makes a film."""
         return self.path is not None or self.turntable is not None
 
     @property
     def clip(self) -> Clip:
-        """Depths that are drawn."""
         return Clip(self.near_cut, math.inf if self.far_cut is None else self.far_cut)
 
 
@@ -180,8 +178,7 @@ def camera_file(choice: str) -> Camera | None:
 
 
 def chosen_camera(scene: Scene, choice: str) -> Camera | None:
-    """The camera that `--camera` names: of a file, or a training camera by index from 0; None without a
-    choice. Raises InputError."""
+    """The camera that `--camera` names, of a file or by its index; None for no choice. Raises InputError."""
     if not choice:
         return None
     of_file = camera_file(choice)
@@ -237,5 +234,4 @@ def say_compiling(progress: Progress) -> None:
 
 
 def services(encoder_id: str) -> Services:
-    """The real layers below."""
     return Services(load_scene, load_text_encoder, encoder_id, warm_up)

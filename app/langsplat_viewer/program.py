@@ -9,8 +9,8 @@ from pathlib import Path
 from langsplat_core.cli.run import main, parsed
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, TerminalProgress, silent
-from langsplat_viewer.files import PROJECTS
 from langsplat_viewer.files.preferences import preferences_folder
+from langsplat_viewer.files.projects import PROJECTS
 from langsplat_viewer.options import ViewerOptions, camera_file, scene_path, services
 
 
@@ -34,7 +34,7 @@ class ViewerCommand(ViewerOptions):
             self._window(path)
 
     def _without_window(self, path: Path) -> None:
-        from langsplat_viewer.output.headless import check_options, draw_film, draw_image
+        from langsplat_viewer.output import check_options, draw_film, draw_image
 
         check_options(self)
         bars: AbstractContextManager[Progress] = nullcontext(silent)
@@ -90,5 +90,4 @@ def parse(args: Sequence[str]) -> ViewerCommand:
 
 
 def entry() -> None:
-    """The `langsplat-viewer` console script."""
     sys.exit(main("langsplat-viewer", lambda: parse(sys.argv[1:])))

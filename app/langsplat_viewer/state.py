@@ -24,14 +24,13 @@ from langsplat_core.scene import Camera, Scene
 from langsplat_core.scene.tree import Tree
 from langsplat_viewer.camera.controls import Extent, OrbitCamera
 from langsplat_viewer.camera.flight import Flight, Keyframe
-from langsplat_viewer.files.browsing import Listing
-from langsplat_viewer.files.flights import Bookmark
-from langsplat_viewer.files.photographs import Photograph
+from langsplat_viewer.files.disk import Listing, Photograph
 from langsplat_viewer.files.preferences import Preferences
-from langsplat_viewer.files.projects import Note, Things
+from langsplat_viewer.files.projects import Bookmark, Note, Things
 from langsplat_viewer.marks import Move, Selection
-from langsplat_viewer.rendering.depth import UNCLIPPED, Clip
 from langsplat_viewer.rendering.request import (
+    UNCLIPPED,
+    Clip,
     EditedScene,
     Pane,
     RenderRequest,
@@ -130,7 +129,6 @@ class Timing:
     comparison: Comparison | None = None  # the last one
 
     def add(self, name: str, milliseconds: float) -> None:
-        """Add one measurement of the step `name`."""
         self.laps.setdefault(name, deque(maxlen=KEPT)).append(milliseconds)
 
     def medians(self) -> list[tuple[str, float]]:
@@ -244,7 +242,6 @@ class OutlineView:
         return found
 
     def row(self, node: int) -> Outline | None:
-        """The row of a node; None where it has none."""
         return self._rows.get(node)
 
 
@@ -354,6 +351,16 @@ class SceneState:
     suggestions_of: Scene | None = None  # the scene for which they were looked for
     _edited: EditedScene | None = None  # of the last request
 
+    @property
+    def has_field(self) -> bool:
+        """True where a scene with a language field is open."""
+        return self.scene is not None and self.scene.language is not None
+
+    @property
+    def lacks_field(self) -> bool:
+        """True where a scene without one is open."""
+        return self.scene is not None and self.scene.language is None
+
 
 @dataclass(eq=False)
 class ViewerState(SceneState):
@@ -428,7 +435,6 @@ class ViewerState(SceneState):
         return [by_slot.get(slot) for slot in range(max(by_slot, default=-1) + 1)]
 
     def shown_results(self) -> tuple[QueryResult | None, ...]:
-        """Answers of the queries that are shown."""
         return tuple(None if query is None else query.result for query in self.shown())
 
     def panes(self) -> tuple[Pane, ...]:

@@ -1,4 +1,5 @@
-"""`langsplat train` as a process of its own: started, listened to, interrupted."""
+"""The viewer without its window: its state, what it needs from elsewhere, a training in a process of its own,
+and the history of what can be undone."""
 
 import os
 import signal
@@ -8,25 +9,24 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any, Protocol, TypeVar
+from typing import IO, Protocol, TypeVar
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import Display, TrainPreset
-from langsplat_core.errors import printable_line
+from langsplat_core.config import Display, LevelChoice, PictureConfig, TrainPreset
+from langsplat_core.errors import LangSplatError, printable_line
 from langsplat_core.progress import ALL_STAGES, Progress, Report
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import LoadEncoder, QueryEngine
 from langsplat_core.scene import Camera, Scene
+from langsplat_core.semantics.encoders import DEMO
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.camera.flight import Keyframe
-from langsplat_viewer.files.flights import Shelf
-from langsplat_viewer.files.projects import Note, Things
-from langsplat_viewer.files.watching import Stamps, Watch
-from langsplat_viewer.jobs import Job, Worker
-from langsplat_viewer.marks import Histogram, Marks, Pair
-from langsplat_viewer.rendering.depth import Clip
-from langsplat_viewer.rendering.request import RenderRequest
-from langsplat_viewer.state import OutlineView, Query, Ruler, ViewerState
+from langsplat_viewer.files.disk import Stamps, Watch
+from langsplat_viewer.files.projects import Note, Shelf, Things
+from langsplat_viewer.jobs import Job, Worker, one_line
+from langsplat_viewer.marks import Histogram, Marks, Move, PackedMarks, Pair, pack
+from langsplat_viewer.rendering.request import Clip, RenderRequest
+from langsplat_viewer.state import OutlineView, Query, Ruler, ViewerState, ViewSettings
 
 PREVIEW_EVERY = 100  # steps between the checkpoints that can be looked at
 KEPT = 20  # lines of what it says that are kept
@@ -71,8 +71,7 @@ class TrainingProgress:
 
 
 def command(request: TrainingRequest) -> list[str]:
-    """The command line of a request, for the interpreter that runs this, or the program beside it that a
-    one-folder build has."""
+    """The command line of a request, for this interpreter or the program beside a one-folder build."""
     program = [sys.executable, "-m", "langsplat_core"]
     if getattr(sys, "frozen", False):
         program = [str(Path(sys.executable).with_stem("langsplat"))]
@@ -161,7 +160,6 @@ class Visit:
 
 
 def visit_of(state: ViewerState) -> Visit:
-    """Return the state to be found again."""
     chosen = [place for place, query in enumerate(state.queries) if query is state.selected]
     return Visit(
         view=state.view,
@@ -186,9 +184,6 @@ def visit_of(state: ViewerState) -> Visit:
 def unanswered(query: Query) -> Query:
     """Return the same question without its answer, to be asked again."""
     return Query(query.phrase, query.slot, query.shown_since, cut=query.cut)
-
-
-# The viewer without its window: its state, what acts on it, and what it needs from elsewhere.
 
 
 T = TypeVar("T")
@@ -219,16 +214,33 @@ class Services:
     warm_up: Callable[[Scene, str, Progress], None] = lambda scene, backend, progress: None
 
     def engine(self, scene: Scene) -> QueryEngine:
-        """Engine that answers queries on `scene`."""
         return QueryEngine(scene, self.load_encoder, encoder_id=self.encoder_id)
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """The queries and how they were looked at; what is selected, hidden, deleted and moved."""
+
+    queries: tuple[tuple[Query, int | None, int, float | None], ...]  # with slot, shown_since and cut
+    selected: Query | None
+    picture: PictureConfig
+    latent_level: int
+    level: LevelChoice
+    settings: ViewSettings
+    overlays: tuple[str, ...]
+    marks: PackedMarks
+    moves: tuple[Move, ...]
+    keyframes: tuple[Keyframe, ...]
+    things: Things
+    notes: tuple[Note, ...]
 
 
 @dataclass(eq=False)
 class History:
-    """Moments (`actions.history`) to return to, the nearest one last."""
+    """Moments to return to, the nearest one last."""
 
-    past: list[Any] = field(default_factory=list)
-    future: list[Any] = field(default_factory=list)
+    past: list[Moment] = field(default_factory=list)
+    future: list[Moment] = field(default_factory=list)
     marks: Pair | None = None  # as they were packed last
     setting: str = ""  # that was changed by the last step, where others of it may join the step
     set_at: float = 0.0  # when, seconds on the window's clock
@@ -268,12 +280,86 @@ class Viewer:
         reason, which by default is said."""
         return self.worker.submit(label, work, done, failed or self.say_error)
 
+    @property
+    def encoder_id(self) -> str:
+        """The text encoder of the scene shown, "" without one."""
+        field = None if self.state.scene is None else self.state.scene.language
+        return "" if field is None else self.services.encoder_id or field.encoder_id
+
+    @property
+    def has_encoder_here(self) -> bool:
+        """True where the text encoder lies on this machine: a hub id may mean a download."""
+        encoder = self.encoder_id
+        return encoder == DEMO or (encoder != "" and Path(encoder).expanduser().is_dir())
+
+    def save(self, path: Path, write: Callable[[], object], more: str = "") -> Path | None:
+        """Have `write` write the file `path`, and say so, or why it is not saved and return None."""
+        try:
+            write()
+        except (OSError, ValueError, LangSplatError) as error:
+            self.say_error(f"{path}: not saved ({one_line(error)})")
+            return None
+        self.state.say(f"saved {path}{more}")
+        return path
+
     def take_results(self) -> None:
-        """Hand over what the worker and the recorder have finished; the one place where results of other
-        threads arrive. Call once per frame."""
+        """Hand over what other threads have finished, which arrives nowhere else. Call once per frame."""
         self.worker.poll()
         self.recorder.poll()
 
     def say_error(self, reason: str) -> None:
         """Add one line to the messages area, as an error."""
         self.state.say(reason, is_error=True)
+
+
+# History: queries, view settings, notes and marks as they were before each change, to be undone.
+
+MOST_STEPS = 100  # steps that can be undone
+GESTURE = 1.0  # seconds: changes of one setting that follow each other sooner are one step
+
+
+def now(viewer: Viewer) -> Moment:
+    state = viewer.state
+    viewer.history.marks = pack(state.selection.marks, viewer.history.marks)
+    return Moment(
+        queries=tuple((query, query.slot, query.shown_since, query.cut) for query in state.queries),
+        selected=state.selected,
+        picture=state.picture,
+        latent_level=state.latent_level,
+        level=state.level,
+        settings=state.settings,
+        overlays=state.preferences.overlays,
+        marks=viewer.history.marks.packed,
+        moves=state.selection.moves,
+        keyframes=state.record.keyframes,
+        things=state.things,
+        notes=state.notes,
+    )
+
+
+def remember(viewer: Viewer, setting: str = "") -> None:
+    """Make what follows one step that can be undone; call it before a change. `setting` names one that is
+    moved, as sliders are: its changes in quick succession are one step."""
+    history = viewer.history
+    goes_on = setting != "" and setting == history.setting and viewer.clock - history.set_at < GESTURE
+    history.setting, history.set_at = setting, viewer.clock
+    if not goes_on:
+        history.past = [*history.past[1 - MOST_STEPS :], now(viewer)]
+        history.future = []
+
+
+def let_go(viewer: Viewer) -> None:
+    """Drop the answers of queries that are in no list any more but in what can be undone: numbers for every
+    Gaussian. They are asked anew when they come back."""
+    listed = {id(query) for query in viewer.state.queries}
+    for moment in (*viewer.history.past, *viewer.history.future):
+        for query, *_ in moment.queries:
+            if id(query) not in listed:
+                query.result = query.automatic = None
+                query.things, query.pending = (), False
+
+
+def forget(viewer: Viewer) -> None:
+    """Empty the history: nothing that was done in another scene can be undone."""
+    history = viewer.history
+    history.past, history.future, history.marks, history.setting = [], [], None, ""

@@ -16,21 +16,18 @@ import moderngl
 
 from langsplat_core.config import LevelChoice, PictureConfig
 from langsplat_core.errors import BackendError, InputError, LangSplatError
-from langsplat_viewer import fonts
 from langsplat_viewer.actions import (
-    beside,
+    browsing,
     filming,
     opening,
     projects,
     queries,
     selecting,
     settings,
-    training,
     viewpoint,
 )
+from langsplat_viewer.camera.controls import spanning
 from langsplat_viewer.canvas import Canvas
-from langsplat_viewer.files import PROJECTS
-from langsplat_viewer.files.flights import Shelf
 from langsplat_viewer.files.preferences import (
     FILE_NAME,
     LAYOUT_NAME,
@@ -39,11 +36,11 @@ from langsplat_viewer.files.preferences import (
     load_preferences,
     save_preferences,
 )
+from langsplat_viewer.files.projects import PROJECTS, Shelf
 from langsplat_viewer.jobs import give_memory_back, on_signals, one_line, share_one_heap
 from langsplat_viewer.options import chosen_camera, latent_level
-from langsplat_viewer.panels import layout, navigation, outline, overlays, style
-from langsplat_viewer.panels.keyboard import Keyboard
-from langsplat_viewer.panels.style import scene_area
+from langsplat_viewer.panels import layout, navigation, outline, overlays, ui
+from langsplat_viewer.panels.navigation import Keyboard
 from langsplat_viewer.rendering.renderer import Backend, GlRenderer
 from langsplat_viewer.state import ViewerState
 from langsplat_viewer.viewer import Services, Viewer
@@ -125,7 +122,7 @@ class Remembered:
     def style(self) -> None:
         """Make the window look as the preferences say."""
         self._styled = self._state.preferences
-        style.apply(self._styled)
+        ui.apply(self._styled)
 
     def update(self) -> None:
         """Apply and keep the preferences that have changed; once per frame."""
@@ -210,7 +207,7 @@ class Window:
         self._remembered = Remembered(request.settings, self.viewer.state)
         self._canvas: Canvas | None = None
         self._menu = outline.ThingsMenu()
-        self._photograph, self._evidence = overlays.PhotographOverlay(), overlays.EvidenceWindow()
+        self._photograph, self._evidence = ui.Picture(), ui.Picture()
         self._screen: moderngl.Framebuffer | None = None
         self._second: Canvas | None = None  # of the scene beside it
         self.unfinished = False  # a finer image is due
@@ -249,7 +246,7 @@ class Window:
         params.fps_idling.fps_idle = IDLE_FPS
         params.fps_idling.time_active_after_last_event = AWAKE_SECONDS
         params.callbacks.default_icon_font = hello_imgui.DefaultIconFont.font_awesome6
-        params.callbacks.load_additional_fonts = fonts.load
+        params.callbacks.load_additional_fonts = ui.load_fonts
         params.callbacks.setup_imgui_style = self._remembered.style
         params.callbacks.show_menus = lambda: layout.draw_menus(self.viewer)
         params.callbacks.post_init = self._start
@@ -280,7 +277,7 @@ class Window:
         self.keyboard.listen(glfw_window_hello_imgui())
         settings.open_panel(self.viewer, "Search")  # before what was left over it the last time
         if self._request.path.name.endswith(PROJECTS):  # which says itself how it is looked at
-            opening.open_project(self.viewer, self._request.path, self._ask)
+            browsing.open_project(self.viewer, self._request.path, self._ask)
         else:
             opening.open_scene(self.viewer, self._request.path, self._first_view)
 
@@ -293,7 +290,6 @@ class Window:
         return canvas
 
     def _draw_beside(self) -> tuple[moderngl.Texture, ...]:
-        """Bring the image of the second scene up to date."""
         other = self.viewer.beside
         if other is None:
             if self._second is not None:
@@ -308,7 +304,6 @@ class Window:
         return self._second.textures[:1]
 
     def _ask(self, viewer: Viewer) -> None:
-        """Ask what the command line asks."""
         for phrase in self._request.queries:
             queries.ask(viewer, phrase)
 
@@ -322,8 +317,9 @@ class Window:
                 viewpoint.open_at(viewer, camera)
         except InputError as error:
             viewer.say_error(str(error))
-        if request.orthographic is not None:
-            viewpoint.open_orthographic(viewer, request.orthographic)
+        span = request.orthographic
+        if span is not None:
+            viewpoint.move(viewer, lambda view: spanning(view, span))
         wanted = request.picture
         looks = replace(state.picture, heat_opacity=wanted.heat_opacity, dim=wanted.dim)
         settings.set_picture(viewer, replace(looks, heat_scale=wanted.heat_scale))
@@ -336,8 +332,7 @@ class Window:
         settings.set_display(viewer, wanted.display, latent_level(request.level))
 
     def drop(self, paths: list[str]) -> None:
-        """Open files that were dropped onto the window."""
-        opening.open_dropped(self.viewer, [Path(path) for path in paths])
+        browsing.open_dropped(self.viewer, [Path(path) for path in paths])
 
     def _dropped(self, window: object, paths: list[str]) -> None:
         self.drop(paths)
@@ -354,8 +349,8 @@ class Window:
         self._began = time.perf_counter()
         viewer.take_results()
         viewpoint.tick(viewer, imgui.get_time())
-        beside.follow(viewer)
-        training.watch_training(viewer)
+        opening.follow_beside(viewer)
+        browsing.watch_training(viewer)
         opening.fetch_photograph(viewer)
         navigation.muted_until_clicked(viewer)  # hello_imgui draws the panels after this
         self._hiding.apply(viewer)
@@ -370,7 +365,7 @@ class Window:
         if self._obeyed > 1:
             selecting.end_at_once(self.viewer)
         elif number == signal.SIGTERM:
-            projects.end(self.viewer, Path.cwd())
+            projects.end(self.viewer)
         else:
             selecting.quit_viewer(self.viewer)
             if not self.viewer.state.selection.may_close:
@@ -416,7 +411,6 @@ class Window:
         return draws or any(worker.is_running for worker in workers)
 
     def is_minimised(self) -> bool:
-        """Return whether nobody can see the window."""
         return bool(glfw.get_window_attrib(glfw_window_hello_imgui(), glfw.ICONIFIED))
 
     def _title(self) -> None:
@@ -429,10 +423,10 @@ class Window:
         """Take what the panels left of mouse and keys, bring the image up to date and draw it behind them."""
         if self.failure is not None:
             return
-        viewer, area = self.viewer, scene_area()
+        viewer, area = self.viewer, ui.scene_area()
         layout.draw_over(viewer)
         self._menu.draw(viewer, area)
-        self._evidence.draw(viewer)
+        overlays.draw_evidence(viewer, self._evidence)
         navigation.handle(viewer, area)
         scale = imgui.get_io().display_framebuffer_scale
         settings.resize(viewer, round(area.width * scale.x), round(area.height * scale.y))
@@ -452,7 +446,7 @@ class Window:
         self._screen.use()
         self._screen.color_mask = True, True, True, True  # a mask left set would colour the panels
         overlays.draw_pictures(viewer, area, textures)
-        self._photograph.draw(viewer, area)
+        overlays.draw_photograph(viewer, area, self._photograph)
         overlays.draw_lines(viewer, area)
         state.timing.wanted = False  # the panel says so again, if it is still seen
 

@@ -21,8 +21,8 @@ from langsplat_core.bench.measure import markdown
 from langsplat_core.config import AutoencoderConfig, PictureConfig
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, silent
+from langsplat_core.query.answers import decoded_relevancy, splatted_relevancy
 from langsplat_core.query.engine import QueryEngine, TextEncoder
-from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.protocol import View
 from langsplat_core.scene import LEVELS, Camera, Codec, LanguageField, Scene
@@ -114,12 +114,12 @@ def measure_queries(
     return QueryReport(*sizes, surface, regions, tuple(costs), asked_many, alone, together)
 
 
-def repeated(scene: Scene, count: int, seed: int = 0) -> Scene:
+def repeated(scene: Scene, count: int) -> Scene:
     """`count` Gaussians: the scene's over and over, each moved by a random step of its own size."""
     rows = np.resize(np.arange(len(scene.gaussians)), count)
     larger = scene.take(rows)
     gaussians = larger.gaussians
-    steps = np.random.default_rng(seed).normal(size=(count, 3)) * np.exp(gaussians.log_scales)
+    steps = np.random.default_rng(0).normal(size=(count, 3)) * np.exp(gaussians.log_scales)
     return replace(larger, gaussians=replace(gaussians, means=gaussians.means + steps))
 
 
@@ -211,11 +211,9 @@ def _exact(asked: _Asked, vectors: Array, scale: Scale, row: int) -> Array:
 
 def _error(got: Sequence[Array], want: Sequence[Array]) -> RelevancyError:
     apart = np.abs(np.concatenate(got).astype(np.float64) - np.concatenate(want))
-    return (
-        RelevancyError(float(apart.mean()), float(np.quantile(apart, 0.99)))
-        if len(apart)
-        else RelevancyError(0.0, 0.0)
-    )
+    if not len(apart):
+        return RelevancyError(0.0, 0.0)
+    return RelevancyError(float(apart.mean()), float(np.quantile(apart, 0.99)))
 
 
 def _seconds(work: Callable[[], Any]) -> float:
@@ -228,14 +226,8 @@ def query_table(report: QueryReport) -> str:
     """Both tables as Markdown; ratios are to the paper's order."""
     paper, (width, height) = report.costs[0], report.size
     head = (
-        "order",
-        "new phrase",
-        "times faster",
-        "shown",
-        "new camera",
-        "frame",
-        "lookup error",
-        "codec error",
+        *("order", "new phrase", "times faster", "shown", "new camera", "frame"),
+        *("lookup error", "codec error"),
     )
     rows = (
         (cost.way, f"{1e3 * cost.answer:.1f}", f"{paper.answer / max(cost.answer, 1e-9):.0f}")

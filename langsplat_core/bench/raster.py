@@ -55,13 +55,8 @@ _NOTES = """- The size with most scenes and the most channels; every other measu
 
 def quick_plan(plan: RasterBenchConfig) -> RasterBenchConfig:
     """A smaller plan, which takes about a minute on two cores."""
-    return replace(
-        plan,
-        counts=(3_000, 10_000, 31_000),
-        sizes=((160, 120), (320, 240), (640, 480)),
-        pivot=10_000,
-        limit=min(plan.limit, 3.0),
-    )
+    counts, sizes = (3_000, 10_000, 31_000), ((160, 120), (320, 240), (640, 480))
+    return replace(plan, counts=counts, sizes=sizes, pivot=10_000, limit=min(plan.limit, 3.0))
 
 
 @dataclass(frozen=True)
@@ -173,12 +168,8 @@ def describe_machine() -> dict[str, object]:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     load = f"{os.getloadavg()[0]:.2f}" if hasattr(os, "getloadavg") else "unknown"
     libraries = ", ".join(f"{name} {version(name)}" for name in ("numpy", "numba", "torch"))
-    return {
-        "processor": _processor(),
-        "cores": cores,
-        "load when the run began": load,
-        "libraries": libraries,
-    }
+    told: dict[str, object] = {"processor": _processor(), "cores": cores, "load when the run began": load}
+    return told | {"libraries": libraries}
 
 
 def _processor() -> str:

@@ -16,48 +16,25 @@ from langsplat_core.errors import InputError
 
 FLAGS = ("-q", "--quiet", "-v", "--verbose")  # may precede a command
 # Name -> class, in a module beside this one that is imported when the command line needs it.
-COMMANDS: Mapping[str, str] = MappingProxyType(
-    {
-        "train": "train.Train",
-        "frames": "train.Frames",
-        "query": "query.QueryScene",
-        "find": "find.Find",
-        "changes": "find.Changes",
-        "describe": "describe.Describe",
-        "select": "query.Select",
-        "teach": "teach.Teach",
-        "serve": "serve.Serve",
-        "map": "robots.Map",
-        "scale": "scenes.Scale",
-        "mesh": "geometry.Mesh",
-        "register": "geometry.Register",
-        "merge": "geometry.Merge",
-        "transform": "edit.Transform",
-        "crop": "edit.Crop",
-        "clean": "edit.Clean",
-        "export": "export.Export",
-        "convert": "scenes.Convert",
-        "compact": "scenes.Compact",
-        "inspect": "scenes.Inspect",
-        "doctor": "scenes.Doctor",
-        "demo": "demo.Demo",
-    }
-)
+COMMANDS: Mapping[str, str] = MappingProxyType({
+    "train": "train.Train", "frames": "train.Frames", "query": "query.QueryScene", "find": "find.Find",
+    "changes": "find.Changes", "describe": "describe.Describe", "select": "query.Select",
+    "teach": "describe.Teach", "serve": "serve.Serve", "map": "geometry.Map", "scale": "edit.Scale",
+    "mesh": "geometry.Mesh", "register": "geometry.Register", "merge": "geometry.Merge",
+    "transform": "edit.Transform", "crop": "edit.Crop", "clean": "edit.Clean", "export": "export.Export",
+    "convert": "export.Convert", "compact": "edit.Compact", "inspect": "scenes.Inspect",
+    "doctor": "scenes.Doctor", "demo": "scenes.Demo",
+})  # fmt: skip
+_EVALUATIONS = {"lerf-ovs": "EvalLerfOvs", "3d-ovs": "EvalOvs3d", "scannet": "EvalScanNet"}
+_BENCHES = {"raster": "BenchRaster", "query": "BenchQuery"}
 # Name -> what it is about, and its commands.
 GROUPS: Mapping[str, tuple[str, Mapping[str, str]]] = MappingProxyType(
     {
-        "eval": (
-            "Measure a scene against ground truth.",
-            {
-                "lerf-ovs": "evaluate.EvalLerfOvs",
-                "3d-ovs": "evaluate.EvalOvs3d",
-                "scannet": "evaluate.EvalScanNet",
-            },
-        ),
-        "bench": (
-            "Speed against error, measured in one run.",
-            {"raster": "bench.BenchRaster", "query": "bench.BenchQuery"},
-        ),
+        name: (about, {word: f"evaluate.{command}" for word, command in members.items()})
+        for name, about, members in (
+            ("eval", "Measure a scene against ground truth.", _EVALUATIONS),
+            ("bench", "Speed against error, measured in one run.", _BENCHES),
+        )
     }
 )
 
@@ -82,15 +59,13 @@ def parse(args: list[str]) -> Command:
         commands += [_group(name, ()) for name in GROUPS]
     about = "Train, query, convert and measure 3D Gaussian scenes with a language field."
     found = parsed("langsplat", _union(commands), [*before, *args], about)
-    command: Command = getattr(found, "command", found)  # of a group
-    return command
+    return getattr(found, "command", found)  # of a group
 
 
 def load_command(where: str) -> type[Command]:
     """The class at a place of `COMMANDS` or `GROUPS`."""
     module, _, name = where.partition(".")
-    found: type[Command] = getattr(import_module(f"langsplat_core.cli.{module}"), name)
-    return found
+    return getattr(import_module(f"langsplat_core.cli.{module}"), name)
 
 
 def _subcommand(name: str, command: type[Command]) -> Any:

@@ -1,7 +1,8 @@
-"""`langsplat describe`: words for what is in a scene, everywhere, at a place, or as a tree."""
+"""`langsplat describe` and `teach`: words for what is in a scene, everywhere, at a place, or as a tree; and a
+name for something that is pointed at, by which it is then found."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,25 +12,29 @@ from rich.table import Table
 
 from langsplat_core.cli.query import (
     WIDTH,
+    Level,
     Unit,
     basis_fields,
     chosen_instances,
     found_answer,
     instance_fields,
-    print_json,
+    pixel_in,
+    pointed,
     unit_of,
 )
-from langsplat_core.cli.run import OutputConsole
-from langsplat_core.cli.teach import Level, pixel_in, searchable
+from langsplat_core.cli.run import EncoderOption, OutputConsole, TrainedScene, print_json
 from langsplat_core.config import Count, CountOrZero
-from langsplat_core.errors import InputError
-from langsplat_core.io.scenes import check_writable
+from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.io import language as files
+from langsplat_core.io.files import check_output_file
+from langsplat_core.io.scenes import check_writable, companion_path
 from langsplat_core.pipeline.exporting import export_labels
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.describe import Describer, Entry, Words, look_at_pixel
-from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.engine import QueryEngine, check_words, searchable
 from langsplat_core.raster import load_lifting_rasterizer
-from langsplat_core.scene import LEVELS, Scene
+from langsplat_core.scene import LEVELS, LanguageField, Scene, TaughtWord
+from langsplat_core.scene.language import phrase_key
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.semantics.vocabulary import read_vocabulary
 
@@ -39,8 +44,7 @@ class Describe:
     """Name what is here: the best words of a vocabulary for a pixel, a Gaussian or an instance of a phrase,
     or the scene's inventory."""
 
-    scene: tyro.conf.Positional[Path]
-    """A trained scene, *.ply with its language field beside it."""
+    scene: TrainedScene
     camera: Annotated[CountOrZero, tyro.conf.arg(metavar="INDEX")] = 0
     """Training view in which --pixel is meant."""
     pixel: Annotated[tuple[CountOrZero, CountOrZero] | None, tyro.conf.arg(metavar="X Y")] = None
@@ -62,8 +66,7 @@ class Describe:
     """Words per level."""
     vocabulary: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Your own list, one phrase per line, in place of the bundled everyday things and parts."""
-    encoder: str = ""
-    """Text encoder folder or hub id, in place of the one the scene names."""
+    encoder: EncoderOption = ""
     json: bool = False
     """Print JSON."""
 
@@ -166,8 +169,6 @@ class Describe:
 def _plain(value: Any, sure: bool) -> Any:
     """Words, spots and entries, ready for JSON. A share of the softmax over a vocabulary is a probability too
     where that is `sure`."""
-    if isinstance(value, np.ndarray):
-        return value.tolist()
     if isinstance(value, tuple):
         return [_plain(item, sure) for item in value]
     if not is_dataclass(value):
@@ -197,12 +198,8 @@ def _percent(described: dict[str, Any]) -> str:
 def _print_inventory(entries: list[dict[str, Any]]) -> None:
     table = Table("what", "also", "level", "p %", "surface %", "looks", "centre", box=None)
     for entry in entries:
-        names = (
-            entry["phrase"],
-            ", ".join(entry["also"]),
-            entry["level"],
-            _percent(entry).strip(" %") or "-",
-        )
+        sure = _percent(entry).strip(" %") or "-"
+        names = (entry["phrase"], ", ".join(entry["also"]), entry["level"], sure)
         for number, spot in enumerate(entry["spots"]):
             centre = " ".join(f"{value:.2f}" for value in spot["centre"])
             start = names if number == 0 else ("", "", "", "")
@@ -239,7 +236,7 @@ def _outline_lines(nodes: list[dict[str, Any]], unit: Unit, depth: int) -> Itera
         word = "?" if node["word"] is None else f"{node['word']['phrase']}{_percent(node['word'])}"
         what = [
             node["level"],
-            f"{unit.format(np.array(node['size']), ' x ')} {unit.name}",
+            f"{unit.format(node['size'], ' x ')} {unit.name}",
             f"{node['count']} Gaussians",
         ]
         if any(node["votes"]):
@@ -257,3 +254,69 @@ def _print_words(levels: list[dict[str, Any]]) -> None:
         said = ", ".join(word["phrase"] + _percent(word) for word in level["words"])
         looks = _looks(level)
         print(f"{level['level']:<8} {said}" + (f"; looks {looks}" if looks else ""))
+
+
+@dataclass(frozen=True)
+class Teach:
+    """Name what is in a pixel. `langsplat query` then finds the name in this scene or, with --into, in every
+    scene of the same encoder. Teaching a name again adds an example."""
+
+    scene: tyro.conf.Positional[Path]
+    """A trained scene, *.ply with its language field beside it, into which the word is written."""
+    name: str
+    """The word, such as "grandma's vase"; it replaces what the encoder takes it for."""
+    at: Annotated[str, tyro.conf.arg(metavar="X,Y")] = ""
+    """Column and row of a pixel in it, counted from the top left one, 0,0."""
+    camera: Annotated[CountOrZero, tyro.conf.arg(metavar="INDEX")] = 0
+    """Training view in which the pixel is meant."""
+    level: Level = "whole"
+    """Semantic level of what is meant there."""
+    into: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Write into this vocabulary of yours, *.safetensors, instead of the scene."""
+    remove: bool = False
+    """Forget the word, with all its examples."""
+
+    def run(self) -> None:
+        scene = searchable(self.scene)
+        field, target = scene.language, self.into or companion_path(self.scene, files.SUFFIX)
+        assert field is not None
+        if self.remove == bool(self.at):
+            raise InputError("give either --at X,Y, a pixel to teach, or --remove")
+        if self.into is not None and self.into.suffix != ".safetensors":
+            raise InputError(f"{self.into}: taught words are written as .safetensors; choose such a name")
+        check_output_file(target)
+        known = {word.key: word for word in self._known(field)}
+        if self.remove:
+            if known.pop(phrase_key(self.name), None) is None:
+                there = ", ".join(word.name for word in known.values()) or "none"
+                raise InputError(f"{target}: '{self.name}' was not taught here; taught words: {there}")
+            said = f"{self.name}: forgotten"
+        else:
+            engine = QueryEngine(scene)
+            engine.taught = known
+            members = pointed(engine, self.camera, self.at, "--at", self.level)
+            word = engine.teach(self.name, members, self.level)
+            here = len(engine.instances(engine.run(word.name)))
+            times = "once" if len(word.vectors) == 1 else f"{len(word.vectors)} times"
+            said = f"{word.name}: {members.sum()} Gaussians, shown {times}; things like it here: {here}"
+        self._write(scene, field, list(known.values()))
+        print(f"{said}\n{target}: taught words: {len(known)}")
+
+    def _known(self, field: LanguageField) -> Sequence[TaughtWord]:
+        if self.into is None:
+            return field.taught
+        if not self.into.exists():
+            return ()
+        words = files.read_words(self.into)
+        try:
+            check_words(field, words)
+        except EncoderError as error:
+            raise EncoderError(f"{self.into}: {error}") from None
+        return words.words
+
+    def _write(self, scene: Scene, field: LanguageField, taught: Sequence[TaughtWord]) -> None:
+        if self.into is not None:
+            files.write_words(self.into, files.Words(field.encoder_id, field.canonical, tuple(taught)))
+        else:
+            path = companion_path(self.scene, files.SUFFIX)
+            files.write_language(path, replace(field, taught=tuple(taught)), scene.gaussians.means)

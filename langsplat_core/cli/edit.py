@@ -1,19 +1,27 @@
-"""`langsplat transform`, `crop` and `clean`: scenes edited by numbers; what belongs to them goes along."""
+"""`langsplat transform`, `crop`, `clean`, `compact` and `scale`: scenes edited by numbers; what belongs to
+them goes along."""
 
-import json
+import math
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import tyro
+from rich.table import Table
 
 from langsplat_core.arrays import Array
-from langsplat_core.cli.run import OutputConsole
-from langsplat_core.compaction.clean import CleanReport, clean_scene
-from langsplat_core.config import CleanConfig, Positive, Range
+from langsplat_core.cli.run import AnyScene, OutFile, OutputConsole, WrittenScene, print_json
+from langsplat_core.config import CleanConfig, CompactConfig, Positive, Range
 from langsplat_core.errors import InputError
-from langsplat_core.io.scenes import check_keeps, check_writable, load_scene, save_scene
+from langsplat_core.io.ply import write_metres
+from langsplat_core.io.scenes import (
+    check_keeps,
+    check_writable,
+    load_scene,
+    load_without_language,
+    save_scene,
+)
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.selection import above_plane, in_box, in_sphere
 from langsplat_core.scene import Scene
@@ -29,6 +37,10 @@ from langsplat_core.scene.transform import (
     turning,
 )
 
+if TYPE_CHECKING:
+    from langsplat_core.compaction.clean import CleanReport
+    from langsplat_core.compaction.compact import CompactReport
+
 Coordinate = Annotated[float, Range(-1e12, 1e12)]
 Point = tuple[Coordinate, Coordinate, Coordinate]
 Four = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
@@ -42,10 +54,8 @@ class Transform:
     """Move, rotate and scale a whole scene, colours seen from the side, cameras and metres per unit
     included. Steps are taken in this order: --matrix, --up, --rotate, --scale, --move."""
 
-    scene: tyro.conf.Positional[Path]
-    """Any readable scene."""
-    out: tyro.conf.Positional[Path]
-    """Scene to write: .ply, .spz or .splat."""
+    scene: AnyScene
+    out: WrittenScene
     matrix: Annotated[tuple[Four, Four, Four, Four] | None, tyro.conf.arg(metavar="16 NUMBERS")] = None
     """A 4x4 matrix, row by row, as registration gives one: a rotation times a scale, and a move."""
     up: Axis | None = None
@@ -81,10 +91,8 @@ class Crop:
     """Keep the Gaussians whose centres lie in all of the given boxes, spheres and half-spaces, with all that
     belongs to them; or with --outside everything else. World units."""
 
-    scene: tyro.conf.Positional[Path]
-    """Any readable scene."""
-    out: tyro.conf.Positional[Path]
-    """Scene to write: .ply, .spz or .splat."""
+    scene: AnyScene
+    out: WrittenScene
     box: Annotated[tyro.conf.UseAppendAction[tuple[Box, ...]], tyro.conf.arg(metavar="X Y Z X Y Z")] = ()
     """Two opposite corners; may be given several times, as the others."""
     sphere: Annotated[tyro.conf.UseAppendAction[tuple[Four, ...]], tyro.conf.arg(metavar="X Y Z R")] = ()
@@ -129,10 +137,8 @@ class Clean:
     of PSNR lets go, the least visible first. The loss is measured on photographs that the scene was not
     trained on where --photos has some, else derived from how far its images change."""
 
-    scene: tyro.conf.Positional[Path]
-    """Any readable scene."""
-    out: tyro.conf.Positional[Path]
-    """Scene to write: .ply, .spz or .splat."""
+    scene: AnyScene
+    out: WrittenScene
     photos: Path | None = None
     """Dataset the scene was trained on: true floaters then cost nothing, and more of them go."""
     json: bool = False
@@ -140,17 +146,17 @@ class Clean:
     config: Annotated[CleanConfig, tyro.conf.arg(name="")] = field(default_factory=CleanConfig)
 
     def run(self) -> None:
+        from langsplat_core.compaction.clean import clean_scene  # pycolmap: not every install has it
+
         with TerminalProgress() as progress:
             report = clean_scene(self.scene, self.out, self.config, self.photos, progress)
         if self.json:
-            print(json.dumps({"out": str(self.out), "removed": report.removed, **asdict(report)}, indent=1))
+            print_json({"out": str(self.out), "removed": report.removed, **asdict(report)})
             return
-        console = OutputConsole()
-        for line in (*_lines(report), f"written: {self.out}"):
-            console.print(line, soft_wrap=True, highlight=False, markup=False)
+        print(*_lines(report), f"written: {self.out}", sep="\n")
 
 
-def _lines(report: CleanReport) -> list[str]:
+def _lines(report: "CleanReport") -> list[str]:
     how = "on photographs" if report.assumed_psnr is None else f"if the scene has {report.assumed_psnr:g} dB"
     lines = [
         f"removed: {report.removed} of {report.gaussians} Gaussians: {report.regions} in small regions, "
@@ -172,3 +178,108 @@ def _extent(scene: Scene) -> str:
         return "the scene holds none that lies anywhere"
     low, high = (" ".join(f"{number:.4g}" for number in corner) for corner in (means.min(0), means.max(0)))
     return f"they lie between {low} and {high}"
+
+
+@dataclass(frozen=True)
+class Compact:
+    """Drop the Gaussians and colour harmonics that the views do not need, within an error budget. Nothing
+    is retrained; the language field, the cameras and extra properties are taken along."""
+
+    scene: AnyScene
+    out: OutFile | None = None
+    """The scene to write (default: SCENE with .compact.ply for its ending)."""
+    photos: Path | None = None
+    """Dataset the scene was trained on: the loss is then measured against its photographs."""
+    json: bool = False
+    """Print JSON."""
+    config: Annotated[CompactConfig, tyro.conf.arg(name="")] = field(default_factory=CompactConfig)
+
+    def run(self) -> None:
+        from langsplat_core.compaction.compact import compact_scene
+
+        out = self.out or self.scene.with_name(self.scene.name.split(".")[0] + ".compact.ply")
+        with TerminalProgress() as progress:
+            report = compact_scene(self.scene, out, self.config, self.photos, progress)
+        if self.json:
+            print_json({"out": str(out), **asdict(report)})
+            return
+        OutputConsole().print(_table(report))
+        print(*_notes(report), f"written: {out}", sep="\n")
+
+
+def _table(report: "CompactReport") -> Table:
+    table = Table("", "before", "after", "after / before")
+    for column in table.columns[1:]:
+        column.justify = "right"
+    before, after = report.before, report.after
+
+    def row(name: str, old: float, new: float, form: str, factor: float = 1.0) -> None:
+        share = f"{100 * new / old:.1f} %" if old else "-"
+        table.add_row(name, format(old * factor, form), format(new * factor, form), share)
+
+    row("Gaussians", before.gaussians, after.gaussians, ",d", 1)
+    table.add_row("SH degree", str(before.sh_degree), str(after.sh_degree), "")
+    row("on disk, MB", before.disk_bytes, after.disk_bytes, ".2f", 1e-6)
+    row("in memory, MB", before.memory_bytes, after.memory_bytes, ".2f", 1e-6)
+    if before.psnr is not None and after.psnr is not None:
+        table.add_row("PSNR, dB", f"{before.psnr:.2f}", f"{after.psnr:.2f}", "")
+    return table
+
+
+def _notes(report: "CompactReport") -> list[str]:
+    how = (
+        "measured on photographs"
+        if report.assumed_psnr is None
+        else f"derived from the change, if the scene has {report.assumed_psnr:g} dB"
+    )
+    lines = [
+        f"loss: {report.loss:.3f} dB of {report.budget:g} allowed, worst view "
+        f"{report.worst_loss:.2f} dB ({how})",
+        f"views: {report.ranking_views} ranked the Gaussians, {report.measuring_views} others measured; "
+        f"{report.views_from}",
+    ]
+    for answer in report.answers:
+        place = "no place" if answer.moved is None else f"place moved by {answer.moved:.3g}"
+        lines.append(f"{answer.phrase}: {'same answer' if answer.same else 'ANOTHER ANSWER'}, {place}")
+    return lines
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Say how long a scene's unit is, so that answers are in metres: by a known length in it, or by a
+    factor. Without either, print what the scene says. Only the header of the .ply is changed."""
+
+    scene: tyro.conf.Positional[Path]
+    """The scene, *.ply."""
+    metres: Positive | None = None
+    """A known length, between the two points of --between."""
+    between: Box | None = None
+    """Two points that are --metres apart, x y z x y z in world units."""
+    metres_per_unit: Positive | None = None
+    """How long a unit is."""
+
+    def run(self) -> None:
+        if (self.metres is None) != (self.between is None):
+            raise InputError(
+                "--metres and --between belong together: a length, and the points it lies between"
+            )
+        if self.metres is not None and self.metres_per_unit is not None:
+            raise InputError("give either --metres with --between, or --metres-per-unit")
+        factor = self.metres_per_unit
+        if self.metres is not None and self.between is not None:
+            factor = metres_per_unit(self.metres, self.between)
+        if factor is not None:
+            write_metres(self.scene, factor)
+        stored = load_without_language(self.scene).metres_per_unit
+        print(f"{self.scene}: {'no scale' if stored is None else f'{stored:.6g} m per unit'}")
+
+
+def metres_per_unit(metres: float, between: Box) -> float:
+    """Metres per unit of a length in metres between two points. InputError unless both lengths are
+    positive."""
+    units = math.dist(between[:3], between[3:])
+    if not (0 < metres < math.inf and 0 < units < math.inf):
+        raise InputError(
+            f"{metres:g} m between points {units:g} units apart: both must be above 0 and finite"
+        )
+    return metres / units

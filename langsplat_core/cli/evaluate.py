@@ -1,17 +1,24 @@
 """`langsplat eval lerf-ovs | 3d-ovs | scannet`: the field's benchmarks."""
 
-from dataclasses import dataclass, field
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from langsplat_core.cli.run import OutFile, OutFolder
+from langsplat_core.bench import QueryBenchConfig, RasterBenchConfig
+from langsplat_core.cli.run import EncoderOption, OutFile, OutFolder
 from langsplat_core.config import ClipConfig, MaskConfig, TrainConfig, TrainPreset, with_preset
 from langsplat_core.errors import InputError
 from langsplat_core.evaluation.profiles import LERF_PROFILES, OVS_PROFILES, LerfProtocol, OvsProtocol, Profile
+from langsplat_core.io.files import atomic_path
 from langsplat_core.io.language import SUFFIX
 from langsplat_core.progress import TerminalProgress
+from langsplat_core.query.engine import searchable
+from langsplat_core.semantics.encoders import load_text_encoder
 
 if TYPE_CHECKING:
     from langsplat_core.evaluation.labels import Benchmark
@@ -30,8 +37,7 @@ class _Eval:
     """Names of the benchmark's scenes to score; all of them if empty."""
     json: OutFile | None = None
     """Also write all figures to this file."""
-    encoder: str = ""
-    """Text encoder folder or hub id, in place of the one the scene names."""
+    encoder: EncoderOption = ""
 
     def scene_and_data(self) -> tuple[Path | None, Path]:
         """The scene, None for maps, and the benchmark's folder."""
@@ -71,8 +77,13 @@ class _EvalLabels(_Eval):
 
     def evaluate(self, benchmark: "Benchmark", profile: Profile) -> None:
         """Train the scenes with --train, score them, print the tables and write the files asked for."""
-        from langsplat_core.evaluation.report import beside_published, save_json, table
-        from langsplat_core.evaluation.run import Subject, run_benchmark
+        from langsplat_core.evaluation.report import (
+            Subject,
+            beside_published,
+            run_benchmark,
+            save_json,
+            table,
+        )
         from langsplat_core.semantics.encoders import load_text_encoder
 
         failed = self._train(benchmark) if self.train else {}
@@ -151,19 +162,77 @@ class EvalScanNet(_Eval):
     DATA is a folder of NAME/NAME_vh_clean_2.labels.ply; maps are NAME.npy, one class id per vertex."""
 
     def run(self) -> None:
-        from langsplat_core.evaluation.run import Subject
+        from langsplat_core.evaluation.report import Subject
         from langsplat_core.evaluation.scannet import point_table, read_scannet, run_scannet, save_point_json
         from langsplat_core.semantics.encoders import load_text_encoder
 
         scene, data = self.scene_and_data()
         with TerminalProgress() as progress:
-            report = run_scannet(
-                read_scannet(data),
-                Subject(scene, self.maps, self.encoder),
-                load_text_encoder,
-                self.only,
-                progress,
-            )
+            subject = Subject(scene, self.maps, self.encoder)
+            report = run_scannet(read_scannet(data), subject, load_text_encoder, self.only, progress)
         print(point_table(report))
         if self.json is not None:
             save_point_json(self.json, report)
+
+
+# `langsplat bench`.
+
+
+@dataclass(frozen=True)
+class BenchRaster:
+    """Time, error and memory of every rasterizer that loads here, in one run; takes some minutes."""
+
+    quick: bool = False
+    """Fewer and smaller scenes, in about a minute; --counts and --sizes are then not read."""
+    config: Annotated[RasterBenchConfig, tyro.conf.arg(name="")] = field(default_factory=RasterBenchConfig)
+    out: OutFolder = Path("bench_out")
+    """Folder for raster.md, raster.json and raster.png."""
+
+    def run(self) -> None:
+        from langsplat_core.bench.raster import Report, plot, quick_plan, run_plan
+
+        def keep(report: Report) -> None:
+            draw = partial(plot, report.rows)
+            write_report(self.out, "raster", report.text, report.figures, draw)
+
+        with TerminalProgress() as progress:
+            report = run_plan(quick_plan(self.config) if self.quick else self.config, progress, keep)
+        keep(report)
+        print(report.text)
+
+
+@dataclass(frozen=True)
+class BenchQuery:
+    """The paper's order, a table over the sphere and a codebook on one scene: time of a new phrase, a new
+    camera and a frame, beside the error of relevancy. Some minutes, nearly all of them the paper's order."""
+
+    scene: tyro.conf.Positional[Path]
+    """A scene with a codebook, and its cameras beside it."""
+    config: Annotated[QueryBenchConfig, tyro.conf.arg(name="")] = field(default_factory=QueryBenchConfig)
+    out: OutFolder = Path("bench_out")
+    """Folder for query.md and query.json."""
+
+    def run(self) -> None:
+        scene = searchable(self.scene)
+        assert scene.language is not None
+        from langsplat_core.bench.query import measure_queries, query_table
+
+        encoder = load_text_encoder(scene.language.encoder_id)
+        with TerminalProgress() as progress:
+            report = measure_queries(scene, encoder, self.config, progress)
+        table = query_table(report)
+        write_report(self.out, "query", table, {"config": asdict(self.config), "report": asdict(report)})
+        print(table)
+
+
+def write_report(
+    out: Path, name: str, text: str, figures: Any, plot: Callable[[Path], None] | None = None
+) -> None:
+    """Write `name`.md, .json and, with `plot`, .png into the folder `out`, each whole or not at all."""
+    with atomic_path(out / f"{name}.md") as path:
+        path.write_text(text, encoding="utf-8")
+    with atomic_path(out / f"{name}.json") as path:
+        path.write_text(json.dumps(figures, indent=1, default=str), encoding="utf-8")
+    if plot is not None:
+        with atomic_path(out / f"{name}.png") as path:
+            plot(path)

@@ -1,18 +1,28 @@
-"""`langsplat export`: a scene as a page for a browser."""
+"""`langsplat export` and `convert`: a scene as a page for a browser, and in other formats."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
+from langsplat_core.cli.query import Level
+from langsplat_core.cli.run import AnyScene, EncoderOption
+from langsplat_core.config import CodebookConfig, CodecConfig
 from langsplat_core.errors import InputError
-from langsplat_core.io.files import check_output_file
-from langsplat_core.io.language import read_words
-from langsplat_core.io.scenes import load_scene
+from langsplat_core.io.files import check_output_file, check_output_folder
+from langsplat_core.io.language import read_words, rematch_language
+from langsplat_core.io.scenes import (
+    check_keeps,
+    check_writable,
+    load_scene,
+    load_without_language,
+    save_scene,
+)
 from langsplat_core.pipeline.webpage import write_page
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.engine import QueryEngine
+from langsplat_core.scene import Scene
 from langsplat_core.semantics.encoders import load_text_encoder
 
 
@@ -20,16 +30,14 @@ from langsplat_core.semantics.encoders import load_text_encoder
 class Export:
     """Write a scene as one HTML file that any browser shows and searches, without a network or a server."""
 
-    scene: tyro.conf.Positional[Path]
-    """Any readable scene."""
+    scene: AnyScene
     out: tyro.conf.Positional[Path]
     """Page to write, *.html."""
     title: str = ""
     """Heading of the page, by default the scene's name."""
     words: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Your own taught words, *.safetensors, beside those of the scene."""
-    encoder: str = ""
-    """Text encoder folder or hub id, in place of the one the scene names."""
+    encoder: EncoderOption = ""
 
     def run(self) -> None:
         if self.out.suffix.lower() not in (".html", ".htm"):
@@ -51,3 +59,133 @@ class Export:
         else:
             asked = f"{report.phrases:,} phrases can be searched"
         print(f"{self.out}: {report.gaussians:,} Gaussians, {report.bytes / 1e6:.2f} MB; {asked}")
+
+
+CHECKPOINTS = (".pth", ".pt", ".ckpt", ".npz", ".npy", ".faiss")  # no scene has such a name
+Target = Literal["scene", "langsplat", "occam", "features"]
+
+
+@dataclass(frozen=True)
+class Convert:
+    """Write any readable scene as .ply, .spz or .splat, with language field and cameras beside it if it has
+    them. A .ply (INRIA's) keeps everything, .spz is ten times smaller and rounded, .splat is without view
+    dependence. Checkpoints of LangSplat, LangSplatV2, Occam's LGS, Dr. Splat, OpenGaussian, Feature-3DGS and
+    3D Gaussian Splatting become such a scene (see docs/files.md for what to give), and a scene becomes
+    checkpoints."""
+
+    source: tyro.conf.Positional[Path]
+    """Scene to read, of any format; or the first of the files that another method has of one scene."""
+    rest: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[MORE...] OUT")]]
+    """The other method's further files, in any order, and last the scene to write: .ply, .spz or .splat; with
+    --to the folder."""
+    rematch: Path | None = None
+    """A language sidecar (*.langsplat.safetensors) made before the Gaussians were edited: its field is
+    carried over to the Gaussians of SOURCE by nearest position."""
+    to: Target = "scene"
+    """langsplat: a folder with LangSplat's three checkpoints and its autoencoder. occam: with Occam's LGS's
+    three checkpoints of whole vectors. features: a folder of masks and vectors of photographs, `features` of
+    a training's work folder as LangSplat's language_features, or the other way."""
+    encoder: str | None = None
+    """Text encoder of the checkpoints' vectors: hub id, folder or "demo" (default: LangSplat's OpenCLIP,
+    laion/CLIP-ViT-B-16-laion2B-s34B-b88K). With a single .ply: its semantic_* are read."""
+    levels: tuple[Level, ...] = ()
+    """Levels of the checkpoints with features, in their order, where files and folders do not tell."""
+    phrases: tuple[str, ...] = ()
+    """Stored encoded in a scene made of checkpoints: they can be asked without any encoder."""
+    codec: CodecConfig = CodebookConfig()  # noqa: RUF009  (frozen)
+    """How the Gaussians of checkpoints with whole vectors keep them."""
+
+    @property
+    def sources(self) -> tuple[Path, ...]:
+        """The files that are read."""
+        return (self.source, *self.rest[:-1])
+
+    @property
+    def out(self) -> Path:
+        """The file or folder that is written."""
+        return self.rest[-1]
+
+    def run(self) -> None:
+        if not self.rest:
+            raise InputError(f"{self.source}: name what to read, and then what to write")
+        if self.to == "features":
+            self._convert_features()
+        elif self.to == "scene":
+            self._write_scene()
+        else:
+            self._export()
+
+    def _write_scene(self) -> None:
+        check_writable(self.out)  # before minutes are spent on reading
+        check_keeps(self.out, *self.sources, *([] if self.rematch is None else [self.rematch]))
+        scene = self._read()
+        save_scene(self.out, replace(scene, path=self.out))
+        described = "with a language field" if scene.language else "without a language field"
+        print(f"{self.out}: {len(scene.gaussians)} Gaussians, {described}")
+
+    def _read(self) -> Scene:
+        first = self.source
+        foreign = len(self.sources) > 1 or first.suffix.lower() in CHECKPOINTS or self.encoder is not None
+        if foreign and self.rematch is not None:
+            raise InputError(
+                "--rematch is for one scene; import the checkpoints first, then rematch the result"
+            )
+        if foreign:
+            return self._import()
+        if self.rematch is None:
+            return load_scene(first)
+        scene = load_without_language(first)
+        return replace(scene, language=rematch_language(self.rematch, scene.gaussians.means))
+
+    def _import(self) -> Scene:
+        from langsplat_core.io.foreign import read_foreign
+        from langsplat_core.pipeline.importing import import_scene  # imports torch: --help need not wait
+
+        foreign = read_foreign(self.sources, self.levels)
+        with TerminalProgress() as progress:
+            scene, report = import_scene(foreign, self.encoder, self.phrases, self.codec, progress)
+        print(f"{report.method}: {'; '.join(report.notes)}")
+        if scene.language is not None:
+            shares = ", ".join(f"{share:.0%}" for share in report.meaningful)
+            print(
+                f"with a meaning at subpart, part, whole: {shares} of the Gaussians; "
+                f"codec {report.codec} of {report.codec_size}, encoder {scene.language.encoder_id}"
+            )
+        if report.loss is not None:
+            print(
+                f"relevancy error of the codec: mean {report.loss.error_mean:.4f}, "
+                f"99 % below {report.loss.error_p99:.4f}; mean cosine {report.loss.cosine:.4f}"
+            )
+        return scene
+
+    def _export(self) -> None:
+        from langsplat_core.pipeline.exporting import export_langsplat, export_occam
+
+        check_output_folder(self.out)
+        scene = replace(self._read(), path=self.source)
+        with TerminalProgress() as progress:
+            if self.to == "langsplat":
+                written = export_langsplat(scene, self.out, self.source.stem)
+            else:
+                written = export_occam(scene, self.out, progress)
+        for path in written:
+            print(path)
+
+    def _convert_features(self) -> None:
+        from langsplat_core.pipeline.exporting import (
+            features_from_langsplat,
+            features_to_langsplat,
+            langsplat_stems,
+        )
+        from langsplat_core.semantics.store import FeatureStore
+
+        folder = self.source
+        if len(self.sources) > 1 or not folder.is_dir():
+            raise InputError(f"{folder}: --to features reads one folder of masks and vectors of photographs")
+        check_output_folder(self.out)
+        with TerminalProgress() as progress:
+            if langsplat_stems(folder):
+                count = features_from_langsplat(folder, FeatureStore(self.out), progress)
+            else:
+                count = features_to_langsplat(FeatureStore(folder), self.out, progress)
+        print(f"{self.out}: masks and vectors of {count} photographs")

@@ -13,16 +13,15 @@ import tyro
 from PIL import Image, ImageDraw, ImageFont
 
 from langsplat_core.cli.geometry import read_transform, registered
-from langsplat_core.cli.query import Unit, print_json, unit_of
-from langsplat_core.cli.run import OutFile
-from langsplat_core.cli.teach import searchable
+from langsplat_core.cli.query import Unit, once, unit_of
+from langsplat_core.cli.run import EncoderOption, JsonOption, OutFile, TrainedScene, print_json
 from langsplat_core.config import CountOrZero, Positive
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.changes import Change, changes
 from langsplat_core.query.describe import Describer
-from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.engine import QueryEngine, searchable
 from langsplat_core.query.finding import PICTURE, Answered, Hit, find
 from langsplat_core.query.library import Library, update_library
 from langsplat_core.raster import load_lifting_rasterizer
@@ -50,10 +49,8 @@ class Find:
     """File of the index (default: .langsplat-library in the folder)."""
     rebuild: bool = False
     """Read every scene again, whatever the index says."""
-    encoder: str = ""
-    """Text encoder folder or hub id, in place of the one the scenes name."""
-    json: bool = False
-    """Print JSON, lengths in world units."""
+    encoder: EncoderOption = ""
+    json: JsonOption = False
 
     def run(self) -> None:
         if len(self.words) < 2:
@@ -61,14 +58,7 @@ class Find:
         if self.sheet is not None and self.sheet.suffix.lower() not in (".html", ".png"):
             raise InputError(f"--sheet {self.sheet}: name an .html or a .png file")
         phrases = [phrase for text in self.words[:-1] for phrase in split_phrases(text) or [text]]
-        loaded: dict[str, Any] = {}
-
-        def load(model: str) -> Any:
-            name = self.encoder or model
-            if name not in loaded:
-                loaded[name] = load_text_encoder(name)
-            return loaded[name]
-
+        load = once(load_text_encoder, self.encoder)
         with TerminalProgress() as progress:
             library = update_library(Path(self.words[-1]), self.index, load, progress, self.rebuild)
             answers = [each for phrase in phrases for each in find(library, phrase, load, self.top, progress)]
@@ -143,8 +133,8 @@ def _hit_fields(hit: Hit, library: Library) -> dict[str, Any]:
         "margin": hit.margin,
         "exact": answer is not None,
         "level": None if answer is None else LEVELS[answer.level],
-        "place": None if answer is None or answer.place is None else answer.place.tolist(),
-        "box": None if answer is None or answer.box is None else answer.box.tolist(),
+        "place": None if answer is None else answer.place,
+        "box": None if answer is None else answer.box,
         "metres_per_unit": hit.metres_per_unit,
     }
 
@@ -202,8 +192,7 @@ class Changes:
     """Say what changed between two scenes of one place: what appeared, is gone, moved, or has another colour.
     Places are in the first scene's frame."""
 
-    before: tyro.conf.Positional[Path]
-    """A trained scene, *.ply with its language field beside it."""
+    before: TrainedScene
     after: tyro.conf.Positional[Path]
     """Another one of the same place."""
     transform: Path | None = None
@@ -211,12 +200,10 @@ class Changes:
     to be in one frame."""
     register: bool = False
     """Find the transform from the surfaces of both."""
-    encoder: str = ""
-    """Text encoder folder or hub id, in place of the one the scenes name."""
+    encoder: EncoderOption = ""
     scale: Positive | None = None
     """Metres per world unit of the first scene, in place of what it says."""
-    json: bool = False
-    """Print JSON, lengths in world units."""
+    json: JsonOption = False
 
     def run(self) -> None:
         if self.register and self.transform is not None:
@@ -256,13 +243,5 @@ def _in_words(change: Change, unit: Unit) -> str:
 
 
 def _change_fields(change: Change) -> dict[str, Any]:
-    return {
-        "kind": change.kind,
-        "name": change.name,
-        "centre": change.centre.tolist(),
-        "box": change.box.tolist(),
-        "moved": None if change.moved is None else change.moved.tolist(),
-        "distance": change.distance,
-        "colours": None if change.colours is None else list(change.colours),
-        "share": change.share,
-    }
+    names = ("kind", "name", "centre", "box", "moved", "distance", "colours", "share")
+    return {name: getattr(change, name) for name in names}

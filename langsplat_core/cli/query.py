@@ -1,6 +1,6 @@
 """`langsplat query` and `select`: where in a scene a phrase is true, and that alone as a scene of its own."""
 
-import json
+import re
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -12,9 +12,16 @@ import tyro
 from PIL import Image
 
 from langsplat_core.arrays import Array
-from langsplat_core.cli.run import OutFile
-from langsplat_core.cli.teach import camera_of, pointed, searchable
-from langsplat_core.config import Count, CountOrZero, LevelChoice, NotNegative, PictureConfig, Positive
+from langsplat_core.cli.run import (
+    EncoderOption,
+    JsonOption,
+    OutFile,
+    ScaleOption,
+    TrainedScene,
+    WordsOption,
+    print_json,
+)
+from langsplat_core.config import Count, CountOrZero, LevelChoice, NotNegative, PictureConfig
 from langsplat_core.errors import EncoderError, InputError, LangSplatError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.language import read_words
@@ -30,19 +37,20 @@ from langsplat_core.io.shapes import (
 )
 from langsplat_core.pipeline.evidence import draw_evidence, find_evidence, kept_features, kept_photographs
 from langsplat_core.progress import TerminalProgress
-from langsplat_core.query.answers import QueryResult, peak_pixel
+from langsplat_core.query.answers import QueryResult, decoded_relevancy, peak_pixel, splatted_relevancy
 from langsplat_core.query.compose import Number, check_phrase, count_things, joined, run_phrase
-from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder
+from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder, searchable
 from langsplat_core.query.finding import Hit
 from langsplat_core.query.grammar import Atom, Counted, Phrase, heads, unparse
 from langsplat_core.query.instances import Instance, hull
-from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
-from langsplat_core.query.selection import grow, of_rows, shrink
-from langsplat_core.raster import load_rasterizer
+from langsplat_core.query.selection import grow, in_pixel, of_rows, shrink
+from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer
+from langsplat_core.raster.render import pixel_weights
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.scene.language import split_phrases
 from langsplat_core.semantics.encoders import load_text_encoder
 
+Level = Literal["subpart", "part", "whole"]
 PAPER_FILTER = 20  # px, mean filter before the peak is taken (paper, implementation details)
 NOT_DECODED = "--mode paper decodes pixels, and what was shown is compared with regions; leave it out"
 WIDTH = 118  # characters of a table that is not written to a terminal
@@ -52,15 +60,13 @@ WIDTH = 118  # characters of a table that is not written to a terminal
 class QueryScene:
     """Ask a scene for phrases: score, level, pixel, place in world units, box."""
 
-    scene: tyro.conf.Positional[Path]
-    """A trained scene, *.ply with its language field beside it."""
+    scene: TrainedScene
     texts: tyro.conf.Positional[tuple[str, ...]] = ()
     """Phrases, each in quotes if it has several words; "," and ";" separate them too. What cannot be asked
     is named on stderr, and the rest is answered; with nothing left the exit code is 2."""
     like: Annotated[str, tyro.conf.arg(metavar="X,Y")] = ""
     """Find more like what is in this pixel of the --camera, at --level; auto: like the whole thing."""
-    taught: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Your own words, as `langsplat teach --into FILE` writes them, beside those of the scene."""
+    taught: WordsOption = None
     level: LevelChoice = "auto"
     """Semantic level; auto takes the one that answers best, for a thing rather the whole."""
     whole: bool = False
@@ -69,12 +75,10 @@ class QueryScene:
     """splat: relevancy per Gaussian, then blended. paper: latents blended, every pixel decoded."""
     camera: Annotated[CountOrZero, tyro.conf.arg(metavar="INDEX")] = 0
     """Training view in which the pixel is reported."""
-    encoder: str = ""
-    """Text encoder folder or hub id, in place of the one the scene names."""
+    encoder: EncoderOption = ""
     instances: CountOrZero = 5
     """How many of a phrase's things are listed, the best first."""
-    scale: Positive | None = None
-    """Metres per world unit, in place of what the scene says."""
+    scale: ScaleOption = None
     why: OutFile | None = None
     """Draw the evidence here, *.png: the photographs and masks that the best region of each answer stands on,
     best and worst. --json then has it, too."""
@@ -82,15 +86,14 @@ class QueryScene:
     """Folder of the training, with its masks, for --why (default: <scene>.work)."""
     photographs: Path | None = None
     """The dataset of the training, for --why, if it is elsewhere now."""
-    json: bool = False
-    """Print JSON, lengths in world units."""
+    json: JsonOption = False
 
     def run(self) -> None:
         scene = searchable(self.scene)
         self._check()
         explain = _Explainer(self, scene) if self.why is not None else None
         camera = camera_of(scene, self.camera) if scene.cameras else None
-        engine = _engine(scene, _once(load_text_encoder), self.encoder, self.taught)
+        engine = _engine(scene, once(load_text_encoder), self.encoder, self.taught)
         unit = unit_of(scene, self.scale)
         found = [self._ask(engine, text, camera) for text in self._askable(engine, camera)]
         if self.like:
@@ -228,18 +231,22 @@ def _reasons(evidence: dict[str, Any] | None = None) -> list[str]:
     return [f"  why: {'; '.join([evidence['summary'], *said])}"]
 
 
-def _once(load: LoadEncoder) -> LoadEncoder:
-    """`load`, but a hub out of reach is not asked again by every phrase: it fails as it first did."""
-    failed: list[EncoderError] = []
+def once(load: LoadEncoder, instead: str = "") -> LoadEncoder:
+    """`load`, or `instead` of what it is asked for, but once: a hub out of reach is not asked again
+    either."""
+    known: dict[str, TextEncoder | EncoderError] = {}
 
     def load_once(model: str) -> TextEncoder:
-        if failed:
-            raise failed[0]
-        try:
-            return load(model)
-        except EncoderError as error:
-            failed.append(error)
-            raise
+        name = instead or model
+        if name not in known:
+            try:
+                known[name] = load(name)
+            except EncoderError as error:
+                known[name] = error
+        found = known[name]
+        if isinstance(found, EncoderError):
+            raise found
+        return found
 
     return load_once
 
@@ -264,8 +271,8 @@ def _answer(
         "score": result.peak,
         "level": LEVELS[result.level],
         "scores": dict(zip(LEVELS, result.scores, strict=True)),
-        "place": None if result.place is None else result.place.tolist(),
-        "box": None if result.box is None else result.box.tolist(),
+        "place": result.place,
+        "box": result.box,
         "pixel": None,
         "pixel_score": None,
         "view": None if camera is None else camera.name,
@@ -297,8 +304,7 @@ class Select:
     """Write what a phrase names as a scene of its own, with its language field and cameras, as points or as a
     mesh; or, with --remove, the scene without it. Prints the things that were found, best first."""
 
-    scene: tyro.conf.Positional[Path]
-    """A trained scene, *.ply with its language field beside it."""
+    scene: TrainedScene
     texts: tyro.conf.Positional[tuple[str, ...]]
     """Phrases, each in quotes if it has several words; what any of them names is taken."""
     out: OutFile
@@ -315,14 +321,10 @@ class Select:
     """Leave out what is so near to the rest along the surface, in the same unit; after growing."""
     shape: Annotated[Shape, tyro.conf.arg(name="as")] = "scene"
     """scene: Gaussians. points: their centres, with colour and relevancy. hull: a closed mesh around each."""
-    scale: Positive | None = None
-    """Metres per world unit, in place of what the scene says."""
-    encoder: str = ""
-    """Text encoder folder or hub id, in place of the one the scene names."""
-    taught: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Your own words, as `langsplat teach --into FILE` writes them, beside those of the scene."""
-    json: bool = False
-    """Print JSON, lengths in world units."""
+    scale: ScaleOption = None
+    encoder: EncoderOption = ""
+    taught: WordsOption = None
+    json: JsonOption = False
 
     def run(self) -> None:
         self._check()
@@ -466,14 +468,10 @@ def instance_fields(instance: Instance, number: int) -> dict[str, Any]:
         "mean": instance.mean,
         "share": instance.share,
         "gaussians": instance.count,
-        "centre": instance.centre.tolist(),
-        "size": instance.size.tolist(),
-        "box": instance.box.tolist(),
-        "oriented_box": {
-            "centre": box.centre.tolist(),
-            "rotation": box.axes.tolist(),
-            "half_extents": box.half_extents.tolist(),
-        },
+        "centre": instance.centre,
+        "size": instance.size,
+        "box": instance.box,
+        "oriented_box": {"centre": box.centre, "rotation": box.axes, "half_extents": box.half_extents},
     }
 
 
@@ -502,6 +500,42 @@ def basis_fields(engine: QueryEngine) -> dict[str, Any]:
     return {"encoder": engine.basis.encoder, "calibration": engine.basis.calibration}
 
 
-def print_json(content: Any) -> None:
-    json.dump(content, sys.stdout, indent=1)
-    print()
+# What is at a pixel.
+
+
+def pointed(engine: QueryEngine, camera: int, at: str, option: str, level: LevelChoice) -> Array:
+    """(N,) bool: the region in a pixel, "X,Y" as the user gave it with an option. Raises InputError for what
+    is no pixel of the camera, and for one without a region."""
+    scene, place = engine.scene, re.fullmatch(r"([0-9]{1,9}), ?([0-9]{1,9})", at)
+    if not scene.cameras:
+        raise InputError(f"the scene has no cameras, so {option} means nothing")
+    if place is None:
+        raise InputError(
+            f"{option} {at}: give column and row, counted from the top left pixel, as in 412,230"
+        )
+    pixel = int(place[1]), int(place[2])
+    view = pixel_in(scene, camera, pixel, f"{option} {at}")
+    rows, weights = pixel_weights(
+        load_lifting_rasterizer("cpu"), scene.gaussians, view, pixel, scene.raster_settings()
+    )
+    members = in_pixel(engine.regions, LEVELS.index(level), rows, weights)
+    if weights.sum() <= PictureConfig().alpha_gate or not members.any():
+        raise InputError(f"{option} {at}: nothing is there in camera {camera}; point at a thing")
+    return members
+
+
+def pixel_in(scene: Scene, index: int, pixel: tuple[int, int], given: str) -> Camera:
+    """The camera of a number; InputError where there is none, or `pixel` is outside its image."""
+    camera, (column, row) = camera_of(scene, index), pixel
+    if not (0 <= column < camera.width and 0 <= row < camera.height):
+        raise InputError(
+            f"{given}: camera {index} has columns 0 to {camera.width - 1} and rows 0 to {camera.height - 1}"
+        )
+    return camera
+
+
+def camera_of(scene: Scene, index: int) -> Camera:
+    """The camera of a number; InputError where there is none."""
+    if not 0 <= index < len(scene.cameras):
+        raise InputError(f"--camera {index}: the scene has cameras 0 to {len(scene.cameras) - 1}")
+    return scene.cameras[index]

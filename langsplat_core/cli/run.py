@@ -8,6 +8,7 @@ done, and whose `run` does the work. The viewer's program ends the same way and 
 import contextlib
 import errno
 import io
+import json
 import logging
 import os
 import re
@@ -23,17 +24,24 @@ from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any, Literal, Protocol
 
+import numpy as np
 import tyro
 from rich.console import Console
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from langsplat_core import __version__
 from langsplat_core.arrays import number, whole_number
-from langsplat_core.config import CODEC_CONFIGS, CodecConfig, annotations, check_settings, named_values
-from langsplat_core.errors import InputError, LangSplatError, optional_imports, printable_line
+from langsplat_core.config import (
+    CODEC_CONFIGS,
+    CodecConfig,
+    Positive,
+    annotations,
+    check_settings,
+    named_values,
+)
+from langsplat_core.errors import InputError, LangSplatError, end, is_import, optional_imports, printable_line
 from langsplat_core.io.files import NO_ROOM, check_output_file, check_output_folder, shown
 from langsplat_core.progress import Terminated
-from langsplat_core.signals import end, is_import
 
 log = logging.getLogger("langsplat")
 COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
@@ -122,11 +130,9 @@ def one_line(box: str) -> str:
 
 
 def parsed(program: str, kind: Any, args: Sequence[str], description: str | None = None) -> Any:
-    """The command of type `kind`, a dataclass or a union of subcommands, that the words `args` name.
-
-    Sets how much is said; -v and -q may stand anywhere. SystemExit as tyro raises it, with help and
-    completion scripts on stdout and complaints on stderr. InputError for completion of an unknown shell.
-    """
+    """The command of type `kind`, a dataclass or a union of subcommands, that the words `args` name. Sets how
+    much is said; -v and -q may stand anywhere. SystemExit as tyro raises it, with help and completion scripts
+    on stdout and complaints on stderr. InputError for completion of an unknown shell."""
     if args and args[0] in COMPLETION and args[1:2] and args[1] not in SHELLS:
         raise InputError(f"{args[0]} {args[1]}: there is {', '.join(SHELLS)}")
     line = make_dataclass(
@@ -300,6 +306,11 @@ def _fail(program: str, message: str) -> int:
     return 2
 
 
+def print_json(content: Any) -> None:
+    """Print what a command found, arrays too, for programs."""
+    print(json.dumps(content, indent=1, default=np.ndarray.tolist))
+
+
 class OutputConsole(Console):
     """A console that leaves to `main` what happens when nobody reads any more; rich's own ends with 1."""
 
@@ -317,6 +328,22 @@ class Written:
 
 OutFile = Annotated[Path, Written("file")]
 OutFolder = Annotated[Path, Written("folder")]
+
+# Arguments that several commands have.
+_trained = tyro.conf.arg(help="A trained scene, *.ply with its language field beside it.")
+_taught = "Your own words, as `langsplat teach --into FILE` writes them, beside those of the scene."
+_encoder = tyro.conf.arg(help="Text encoder folder or hub id, in place of the one the scene names.")
+AnyScene = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="Any readable scene.")]
+TrainedScene = Annotated[tyro.conf.Positional[Path], _trained]
+WrittenScene = Annotated[
+    tyro.conf.Positional[Path], tyro.conf.arg(help="Scene to write: .ply, .spz or .splat.")
+]
+EncoderOption = Annotated[str, _encoder]
+JsonOption = Annotated[bool, tyro.conf.arg(help="Print JSON, lengths in world units.")]
+ScaleOption = Annotated[
+    Positive | None, tyro.conf.arg(help="Metres per world unit, in place of what the scene says.")
+]
+WordsOption = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help=_taught)]
 
 
 def check_arguments(command: object) -> None:

@@ -14,15 +14,15 @@ from PIL import Image
 
 from langsplat_core.arrays import Array
 from langsplat_core.cli.describe import outline_lines, outline_of
-from langsplat_core.cli.query import unit_of
-from langsplat_core.cli.teach import camera_of, searchable
+from langsplat_core.cli.query import camera_of, unit_of
+from langsplat_core.cli.run import EncoderOption
 from langsplat_core.errors import InputError, LangSplatError
-from langsplat_core.io.language import SUFFIX
 from langsplat_core.progress import silent
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import body, count_things, gap, run_phrase, separate, upright
 from langsplat_core.query.describe import Describer
-from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.engine import QueryEngine, searchable
+from langsplat_core.query.library import scenes_in
 from langsplat_core.raster.render import render
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.scene.camera import look_at
@@ -51,8 +51,7 @@ class Serve:
     """A trained scene, *.ply with its language field beside it, or a folder of such."""
     mcp: bool = False
     """Speak the Model Context Protocol on standard input and output; started by the agent's program."""
-    encoder: str = ""
-    """Text encoder folder or hub id, in place of the one a scene names."""
+    encoder: EncoderOption = ""
 
     def run(self) -> None:
         if not self.mcp:
@@ -64,15 +63,10 @@ def scene_files(place: Path) -> dict[str, Path]:
     """Searchable scenes by name: of a folder all of it, named by their path in it. InputError for none."""
     if not place.is_dir():
         return {place.name: place}
-    sidecars = sorted(place.rglob(f"*{SUFFIX}"))
-    found = {str(p.relative_to(place)): p for s in sidecars if (p := _scene_of(s)).is_file()}
+    found = {str(path.relative_to(place)): path for path in scenes_in(place)}
     if not found:
         raise InputError(f"{place}: no scene with a language field in it; `langsplat train` makes one")
     return found
-
-
-def _scene_of(sidecar: Path) -> Path:
-    return sidecar.with_name(sidecar.name.removesuffix(SUFFIX) + ".ply")
 
 
 class Door:

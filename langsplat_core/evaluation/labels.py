@@ -141,9 +141,7 @@ WANTED = "expected label/<scene>/<frame>.json in it, or one scene's folder of th
 
 def read_lerf_ovs(folder: Path) -> Benchmark:
     """The labels in `folder`: the benchmark's, one scene's of `label`, or one scene's dataset beside `label`.
-
-    Raises InputError for a folder of another layout and FormatError for a file that breaks it.
-    """
+    Raises InputError for a folder of another layout and FormatError for a file that breaks it."""
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; {WANTED}")
     if (folder / "label").is_dir():
@@ -258,11 +256,8 @@ WANTED_PICTURES = "expected segmentations/classes.txt in it, or in folders of it
 
 
 def read_3d_ovs(folder: Path) -> Benchmark:
-    """The labels in `folder`: one scene's, or several scenes' folders.
-
-    What a view has an image of is asked there. Raises InputError for a folder of another layout and
-    FormatError for a scene that breaks it.
-    """
+    """The labels in `folder`: one scene's, or several scenes' folders. What a view has an image of is asked
+    there. Raises InputError for a folder of another layout and FormatError for a scene that breaks it."""
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; {WANTED_PICTURES}")
     scenes = [folder] if _is_scene(folder) else [path for path in sorted(folder.iterdir()) if _is_scene(path)]

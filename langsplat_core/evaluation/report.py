@@ -1,22 +1,186 @@
-"""Scores of labelled queries as means, as a table for people and as JSON for programs."""
+"""Every labelled query against its answer: scores, their means, a table for people, JSON for programs, and
+one image per answer."""
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
+from PIL import Image, ImageDraw
+from scipy.ndimage import binary_erosion
 
-from langsplat_core.errors import shortened
-from langsplat_core.evaluation.profiles import Profile
-from langsplat_core.evaluation.scoring import QueryScore, SceneScores
-from langsplat_core.io.files import write_json
+from langsplat_core.arrays import Array
+from langsplat_core.datasets.capture import read_photo
+from langsplat_core.datasets.colmap import find_model, load_colmap
+from langsplat_core.datasets.nerfstudio import load_nerfstudio
+from langsplat_core.errors import InputError, shortened
+from langsplat_core.evaluation.labels import (
+    Benchmark,
+    Frame,
+    Label,
+    LabelledScene,
+    Size,
+    check_same_image,
+    without_suffix,
+)
+from langsplat_core.evaluation.profiles import (
+    MapRule,
+    MapSource,
+    OwnRule,
+    Prediction,
+    Profile,
+    SceneSource,
+    SilhouetteRule,
+    Source,
+    file_name,
+)
+from langsplat_core.io.files import atomic_path, write_json
+from langsplat_core.progress import Progress, silent
+from langsplat_core.query.answers import AnswerRule
+from langsplat_core.query.engine import LoadEncoder, QueryEngine, searchable
+from langsplat_core.scene import LEVELS, Camera
+
+
+def intersection_over_union(found: Array, truth: Array) -> float:
+    """Return the intersection over union of two (H, W) boolean masks; 1 where both are empty."""
+    union = np.logical_or(found, truth).sum()
+    return float(np.logical_and(found, truth).sum() / union) if union else 1.0
+
+
+# The image: photograph, mask that was found, the label's outline and boxes, the place.
+
+FOUND = np.array([250, 115, 25])  # tint of the mask
+TRUTH = (60, 220, 90)  # the label's outline and boxes
+PLACE = (40, 130, 255)
+OPACITY = 0.55
+MAX_MARKS = 100  # of a flat map every pixel is a peak
+
+
+def write_image(folder: Path, frame: Frame, label: Label, answer: Prediction, truth: Array) -> None:
+    """`folder`/<frame>/<phrase>.png on the scored grid; over black where the photograph is not there."""
+    rows, columns = answer.mask.shape
+    photo = np.zeros((rows, columns, 3))
+    if frame.photograph is not None:
+        photo = np.asarray(read_photo(frame.photograph, upright=False).resize((columns, rows)), np.float64)
+    photo = np.where(answer.mask[..., None], (1 - OPACITY) * photo + OPACITY * FOUND, photo)
+    photo[truth & ~binary_erosion(truth)] = TRUTH
+    canvas = Image.fromarray(photo.astype(np.uint8))
+    brush = ImageDraw.Draw(canvas)
+    scale = np.array([columns / frame.size[0], rows / frame.size[1]] * 2)
+    for box in [] if label.boxes is None else label.boxes * scale:
+        corners = np.concatenate([np.minimum(box[:2], box[2:]), np.maximum(box[:2], box[2:])])
+        brush.rectangle([float(value) for value in corners], outline=TRUTH)
+    for column, row in answer.peaks[:MAX_MARKS]:
+        brush.ellipse([column - 4, row - 4, column + 4, row + 4], outline=PLACE, width=2)
+    with atomic_path(folder / frame.name / f"{file_name(label.phrase)}.png") as path:
+        canvas.save(path, "PNG")
+
+
+# Every labelled query against its answer.
+
+
+@dataclass(frozen=True)
+class QueryScore:
+    """One phrase in one labelled view. What was not answered is wrong: a mean is over all queries."""
+
+    scene: str
+    frame: str
+    phrase: str
+    iou: float
+    hit: bool | None  # whether the place lies in a box of the label; None: not scored
+    level: str = ""  # whose map was cut
+    unanswered: str = ""  # why there is no answer
+    trained_on: bool | None = None  # whether the view is a training view; None: not known
+    grid: Size = (0, 0)  # width and height that were scored
+
+
+@dataclass(frozen=True)
+class SceneScores:
+    """The scores of all queries of a scene."""
+
+    queries: tuple[QueryScore, ...]
+    left_out: tuple[str, ...]  # labels that cannot be asked, each "frame: phrase (why)"
+
+
+def score_scene(
+    labelled: LabelledScene,
+    source: Source,
+    profile: Profile,
+    pictures: Path | None = None,
+    progress: Progress = silent,
+) -> SceneScores:
+    """Score every query of a scene; `pictures`: a folder for one image per answer. A frame's answers are
+    complete, cut and all, before any mask of it is drawn. Raises InputError where a map has another shape
+    than the labelled image."""
+    scores: list[QueryScore] = []
+    left_out = list(labelled.left_out)
+    for done, frame in enumerate(labelled.frames):
+        answers = source.answers(
+            frame.name, scored_size(frame.size, profile.max_rows), [label.phrase for label in frame.labels]
+        )
+        for label in frame.labels:
+            answer = answers[label.phrase]
+            size = _grid(answer, frame)
+            truth = label.truth.draw(size)
+            if not truth.any():
+                left_out.append(f"{frame.name}: {label.phrase} (empty mask)")
+                continue
+            score = _score(labelled.name, frame, label, answer, truth, profile)
+            scores.append(replace(score, trained_on=source.trained_on(frame.name), grid=size))
+            if pictures is not None and not isinstance(answer, str):
+                write_image(pictures / labelled.name, frame, label, answer, truth)
+        progress("asking phrases", (done + 1) / len(labelled.frames), labelled.name)
+    return SceneScores(tuple(scores), tuple(left_out))
+
+
+def scored_size(size: Size, max_rows: int) -> Size:
+    """`size`, shrunk to `max_rows` rows where it has more."""
+    width, height = size
+    return size if height <= max_rows else (max(1, int(width * max_rows / height)), max_rows)
+
+
+def _grid(answer: Prediction | str, frame: Frame) -> Size:
+    if isinstance(answer, str):
+        return frame.size
+    rows, columns = answer.mask.shape
+    check_same_image(frame.name, (columns, rows), frame.size)
+    return columns, rows
+
+
+def _score(
+    scene: str, frame: Frame, label: Label, answer: Prediction | str, truth: Array, profile: Profile
+) -> QueryScore:
+    placed = label.boxes is not None and not isinstance(profile.rule, SilhouetteRule)
+    if isinstance(answer, str):
+        return QueryScore(scene, frame.name, label.phrase, 0.0, False if placed else None, unanswered=answer)
+    hit = inside_any_box(answer.peaks, label.boxes, frame.size, truth.shape) if placed else None
+    level = "" if answer.level is None else LEVELS[answer.level]
+    return QueryScore(
+        scene, frame.name, label.phrase, intersection_over_union(answer.mask, truth), hit, level
+    )
+
+
+def inside_any_box(peaks: Array, boxes: Array | None, size: Size, shape: tuple[int, ...]) -> bool:
+    """Return True where any of the (P, 2) peaks, column and row on a grid of `shape` (rows, columns), lies in
+    any of the (B, 4) boxes on the label's grid of `size`, borders included."""
+    if boxes is None or not len(peaks):
+        return False
+    scale = np.array([shape[1] / size[0], shape[0] / size[1]])
+    low, high = np.minimum(boxes[:, :2], boxes[:, 2:]) * scale, np.maximum(boxes[:, :2], boxes[:, 2:]) * scale
+    inside = (peaks[:, None] >= low) & (peaks[:, None] <= high)
+    return bool(inside.all(-1).any())
+
 
 ACCURACY_AT = (0.25, 0.5)  # IoU strictly above
 FIXED = (
     "every constant of the protocol was fixed before a label was read; none was chosen or tuned by the labels"
 )
 COUNTED = "a query without an answer counts as wrong: IoU 0, no place"
+
+
+# Means of scores, and their report.
 
 
 @dataclass(frozen=True)
@@ -195,13 +359,8 @@ def beside_published(report: BenchmarkReport) -> str:
     if not scenes:
         return ""
     means = summary(report)
-    ours = {
-        name: (
-            100 * means[name].iou,
-            None if means[name].localisation is None else 100 * (means[name].localisation or 0),
-        )
-        for name in scenes
-    }
+    own = {name: (means[name].iou, means[name].localisation) for name in scenes}
+    ours = {name: (100 * iou, None if place is None else 100 * place) for name, (iou, place) in own.items()}
     lines = [
         f"| mIoU % / localisation % | {' | '.join(scenes)} | mean |",
         "|---|" + "---|" * (len(scenes) + 1),
@@ -225,3 +384,131 @@ def _cell(pair: tuple[float | None, float | None] | None) -> str:
     if pair is None or pair[0] is None:
         return "-"
     return f"{pair[0]:.1f}" if pair[1] is None else f"{pair[0]:.1f} / {pair[1]:.1f}"
+
+
+# A benchmark's labels, and whoever answers them, brought together by names.
+
+log = logging.getLogger("langsplat")
+FULL_SIZE = 100_000  # px: photographs are read for their cameras alone and not shrunk
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Subject of a measurement: exactly one of `scene` and `maps` is set."""
+
+    scene: Path | None = None  # a scene file, or a folder of <benchmark's scene>.ply
+    maps: Path | None = None  # <view>/<phrase>..., or <benchmark's scene>/<view>/<phrase>...
+    encoder: str = ""  # in place of the one that the scene names
+    paper_order: bool = False
+
+
+def run_benchmark(
+    benchmark: Benchmark,
+    profile: Profile,
+    subject: Subject,
+    load_encoder: LoadEncoder,
+    only: Sequence[str] = (),
+    pictures: Path | None = None,
+    progress: Progress = silent,
+) -> BenchmarkReport:
+    """Score `subject` on the scenes of `benchmark`, or those named by `only`. Raises InputError for a scene
+    or maps that do not belong to the labels, EncoderError where the text encoder cannot be loaded."""
+    if subject.paper_order and (subject.maps is not None or not isinstance(profile.rule, MapRule)):
+        raise InputError(
+            "--paper-order is for a scene under a protocol that reads relevancy maps; leave it out"
+        )
+    names = chosen_scenes(list(benchmark.scenes), only, subject)
+    scores = {}
+    for name in names:
+        labelled = benchmark.scenes[name]
+        source = (
+            _map_source(labelled, len(names), profile, subject.maps)
+            if subject.maps is not None
+            else _scene_source(labelled, profile, subject, load_encoder, progress)
+        )
+        scores[name] = score_scene(labelled, source, profile, pictures, progress)
+    order = ", latents blended and every pixel decoded (the paper's order)" if subject.paper_order else ""
+    return BenchmarkReport(benchmark.name, profile, f"{subject.scene or subject.maps}{order}", scores)
+
+
+def chosen_scenes(labelled: Sequence[str], only: Sequence[str], subject: Subject) -> list[str]:
+    """Names of the `labelled` scenes to score: `only` these, else the one that a scene file is named after
+    where several could be meant. Raises InputError for a name that is not labelled."""
+    wrong = [name for name in only if name not in labelled]
+    if wrong:
+        raise InputError(f"--only {wrong[0]}: no such labelled scene; there are {', '.join(labelled)}")
+    if only or subject.scene is None or subject.scene.is_dir() or len(labelled) == 1:
+        return list(only or labelled)
+    if subject.scene.stem not in labelled:
+        raise InputError(
+            f"{subject.scene} could be any labelled scene of {', '.join(labelled)}; say which with --only"
+        )
+    return [subject.scene.stem]
+
+
+def open_scene(
+    subject: Subject, name: str, load_encoder: LoadEncoder, rule: AnswerRule = "regions"
+) -> QueryEngine:
+    """The scene of `subject` that belongs to the labelled scene `name`, to be asked."""
+    assert subject.scene is not None
+    path = subject.scene / f"{name}.ply" if subject.scene.is_dir() else subject.scene
+    if not path.exists():
+        raise InputError(f"{path}: no such scene; leave {name} out with --only, or name the right folder")
+    return QueryEngine(searchable(path), load_encoder, encoder_id=subject.encoder, rule=rule)
+
+
+def _scene_source(
+    labelled: LabelledScene, profile: Profile, subject: Subject, load_encoder: LoadEncoder, progress: Progress
+) -> SceneSource:
+    # Published maps are read as published.
+    rule: AnswerRule = "peak" if isinstance(profile.rule, MapRule) else "regions"
+    engine = open_scene(subject, labelled.name, load_encoder, rule)
+    own = {without_suffix(camera.name): camera for camera in engine.scene.cameras}
+    others = _other_cameras(own, labelled, progress)
+    # With no name in common the scene's views are named by another rule: nothing is known of training.
+    related = not own.keys().isdisjoint([*others, *(frame.name for frame in labelled.frames)])
+    trained = frozenset(own) if related else None
+    return SceneSource(engine, {**others, **own}, trained, profile, subject.paper_order)
+
+
+def _map_source(labelled: LabelledScene, count: int, profile: Profile, maps: Path) -> MapSource:
+    if isinstance(profile.rule, OwnRule):
+        raise InputError("--protocol ours reads a scene's own answer; score maps by another protocol")
+    candidates = (maps / labelled.name, maps) if count == 1 else (maps / labelled.name,)
+    names = [frame.name for frame in labelled.frames]
+    for folder in candidates:
+        if any((folder / name).is_dir() for name in names):
+            return MapSource(folder, profile.rule)
+    raise InputError(
+        f"{candidates[0]}: no folder is named after a labelled frame ({shortened(names, 3)}); "
+        "expected <view>/<phrase>.npy or .png in it"
+    )
+
+
+def _other_cameras(
+    own: Mapping[str, Camera], labelled: LabelledScene, progress: Progress
+) -> Mapping[str, Camera]:
+    """The dataset's views by name, read where the scene lacks a labelled one; they share its world.
+    InputError where no labelled frame is among either."""
+    wanted = [frame.name for frame in labelled.frames]
+    if all(name in own for name in wanted):
+        return {}
+    others = {camera.name: camera for camera in _dataset_cameras(labelled.dataset, progress)}
+    missing = [name for name in wanted if name not in own and name not in others]
+    if len(missing) == len(wanted):
+        raise InputError(
+            f"{labelled.name}: none of the scene's views ({shortened(own, 3) or 'it has none'}) is a "
+            f"labelled frame ({shortened(wanted, 3)}); views are matched by name, never by number; put the "
+            f"photographs with their cameras into {labelled.dataset}"
+        )
+    if missing:
+        log.warning("%d labelled frames have no camera: %s", len(missing), shortened(missing))
+    return others
+
+
+def _dataset_cameras(folder: Path, progress: Progress) -> tuple[Camera, ...]:
+    """Return the cameras that came with a dataset; none where it has none."""
+    if (folder / "transforms.json").is_file():
+        return load_nerfstudio(folder / "transforms.json", FULL_SIZE, progress).cameras
+    model = find_model(folder)
+    return () if model is None else load_colmap(folder, model, FULL_SIZE, progress).cameras

@@ -16,8 +16,7 @@ from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.evaluation.report import FIXED
-from langsplat_core.evaluation.run import Subject, chosen_scenes, open_scene
+from langsplat_core.evaluation.report import FIXED, Subject, chosen_scenes, open_scene
 from langsplat_core.io.files import write_json
 from langsplat_core.io.hostile import open_for_reading, read_npy
 from langsplat_core.io.ply_table import fill_columns, iterate_rows, read_ply_header
@@ -26,29 +25,11 @@ from langsplat_core.query.engine import LoadEncoder, QueryEngine
 
 ENDING = "_vh_clean_2.labels.ply"
 WANTED = f"expected <scene>/<scene>{ENDING} in it, one scene's folder, or such a file"
-NYU40: Mapping[str, int] = MappingProxyType(
-    {
-        "wall": 1,
-        "floor": 2,
-        "cabinet": 3,
-        "bed": 4,
-        "chair": 5,
-        "sofa": 6,
-        "table": 7,
-        "door": 8,
-        "window": 9,
-        "bookshelf": 10,
-        "picture": 11,
-        "counter": 12,
-        "desk": 14,
-        "curtain": 16,
-        "refrigerator": 24,
-        "shower curtain": 28,
-        "toilet": 33,
-        "sink": 34,
-        "bathtub": 36,
-    }
-)
+NYU40: Mapping[str, int] = MappingProxyType({
+    "wall": 1, "floor": 2, "cabinet": 3, "bed": 4, "chair": 5, "sofa": 6, "table": 7, "door": 8, "window": 9,
+    "bookshelf": 10, "picture": 11, "counter": 12, "desk": 14, "curtain": 16, "refrigerator": 24,
+    "shower curtain": 28, "toilet": 33, "sink": 34, "bathtub": 36,
+})  # fmt: skip
 _NOT_IN_15 = ("picture", "refrigerator", "shower curtain", "bathtub")
 _NOT_IN_10 = (*_NOT_IN_15, "cabinet", "counter", "desk", "curtain", "sink")
 

@@ -1,11 +1,12 @@
-"""From the relevancies of a phrase to its answer: the regions of the surface that are it, or its peak alone.
+"""The relevancies of a phrase at every Gaussian and pixel, and its answer: the regions of the surface that
+are it, or its peak alone.
 
 Absolute relevancy says little across encoders and phrases (a cosine margin of 0.1 is 0.73). So whether a
 phrase is found is judged by what everyday phrases fit in the same scene, and how far it reaches by its best
 region.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -14,14 +15,184 @@ from scipy.ndimage import uniform_filter
 from scipy.sparse import csr_matrix
 
 from langsplat_core.arrays import Array, logit, sigmoid
-from langsplat_core.compiled import plain
+from langsplat_core.compiled import kernel, plain, shared_workers
 from langsplat_core.config import LevelChoice
+from langsplat_core.display.displays import gated_mean
+from langsplat_core.errors import InputError
 from langsplat_core.query.grammar import Named, named
 from langsplat_core.query.instances import axis_aligned_box
-from langsplat_core.query.regions import Regions
-from langsplat_core.scene import LEVELS, Calibration, Fits, LanguageField
+from langsplat_core.query.selection import Regions
+from langsplat_core.raster.protocol import View
+from langsplat_core.scene import LEVELS, Calibration, Codec, Fits, LanguageField
 from langsplat_core.scene.surface import SMALLEST, Surface
-from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, NARROWEST, Scale, relevancy_of
+from langsplat_core.semantics.relevancy import (
+    FLOOR,
+    MIN_HEAT_SPAN,
+    NARROWEST,
+    Scale,
+    latent_relevancy,
+    relevancy_of,
+)
+
+# Relevancy, by what the scene's codec allows. Each distinct latent is compared, exactly; those of a codebook
+# are few, and every Gaussian costs a fetch. Of unit latents of three numbers, the relevancy of a phrase is a
+# function on the sphere: the decoder is run once per scene at the nodes of an octahedral grid that its
+# latents lie between; after that a phrase costs one matrix-vector product, and every Gaussian a bilinear
+# interpolation at a place computed once.
+
+CHUNK = 16_384  # latents compared with texts at a time
+RESOLUTION = 256  # nodes per side; error against exact decoding falls with its square
+TOGETHER = 16  # phrases compared with every latent at a time: 4 bytes each per latent
+
+
+class SphereTable:
+    """Unit latents of three numbers: decoded once at the nodes of a grid, then interpolated between them."""
+
+    def __init__(self, codec: Codec, latents: Array, scale: Scale, resolution: int = RESOLUTION) -> None:
+        """latents: (M, 3) float; those of no length have no meaning."""
+        known = codec.known(latents)
+        safe = np.where(known[:, None], latents, (0.0, 0.0, 1.0)).astype(np.float64)
+        position = sphere_to_octahedral(safe) * (resolution - 1)
+        cell = np.clip(np.floor(position), 0, resolution - 2).astype(np.int64)
+        corner = cell[:, 1] * resolution + cell[:, 0]  # row-major: first coordinate fastest
+        needed = np.zeros(resolution**2, bool)
+        for step in (0, 1, resolution, resolution + 1):
+            needed[corner[known] + step] = True
+        self._resolution = resolution
+        self._corner = np.where(known, corner, -1).astype(np.int32)  # (M,) lower left node
+        self._fraction = (position - cell).astype(np.float32)  # (M, 2) place inside the cell, in [0, 1]
+        self.used = np.flatnonzero(needed)  # (U,) nodes that some latent lies next to
+        grid = np.stack([self.used % resolution, self.used // resolution], 1) / (resolution - 1)
+        self._vectors = codec.decode(octahedral_to_sphere(grid).astype(np.float32))
+        self._zero, self._rate = scale.of(self._vectors @ scale.texts.T)
+
+    def relevancies(self, phrases: Array) -> Iterator[Array]:
+        """(Q, D) unit phrase vectors -> of each in turn (M,) float32 relevancy; 0 for no meaning."""
+        values = relevancy_of(self._vectors @ phrases.T, self._zero[:, None], self._rate[:, None])
+        grid = np.zeros(self._resolution**2, np.float32)
+        for row in values.T:
+            grid[self.used] = row
+            found = np.empty(len(self._corner), np.float32)
+            arguments = grid, self._corner, self._fraction, self._resolution, found
+            shared_workers().run(_interpolate, len(found), *arguments)
+            yield found
+
+
+def octahedral_to_sphere(uv: Array) -> Array:
+    """(..., 2) in [0, 1]^2 -> (..., 3) unit vectors; the square's border is the lower hemisphere's pole."""
+    xy = 2 * np.asarray(uv, np.float64) - 1
+    z = 1 - np.abs(xy).sum(-1)
+    vectors = np.concatenate([_folded(xy, z), z[..., None]], -1)
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def sphere_to_octahedral(vectors: Array) -> Array:
+    """(..., 3) non-zero vectors -> (..., 2) in [0, 1]^2; inverse of `octahedral_to_sphere`."""
+    scaled = vectors / np.abs(vectors).sum(-1, keepdims=True)
+    return (_folded(scaled[..., :2], scaled[..., 2]) + 1) / 2
+
+
+def _folded(xy: Array, z: Array) -> Array:
+    """Fold the lower half (z < 0) of the octahedron out into the square's corners, or back in."""
+    return np.where((z < 0)[..., None], (1 - np.abs(xy[..., ::-1])) * np.where(xy >= 0, 1, -1), xy)
+
+
+class ExactLookup:
+    """Compares every distinct latent, then fetches per Gaussian: exact, in bounded memory."""
+
+    def __init__(self, field: LanguageField, scale: Scale) -> None:
+        self._codec = field.codec
+        self._latents, of = field.codec.unique(field.latents.reshape(-1, field.latents.shape[-1]))
+        count = len(self._latents)
+        kind = np.uint16 if count <= np.iinfo(np.uint16).max else np.uint32
+        self._of = np.where(field.known.reshape(-1), of, count).astype(kind)
+        self._zero, self._rate = np.empty(count, np.float32), np.empty(count, np.float32)
+        for part in self._parts():
+            cosines = self._codec.cosines(self._latents[part], scale.texts)
+            self._zero[part], self._rate[part] = scale.of(cosines)
+
+    def relevancies(self, phrases: Array) -> Iterator[Array]:
+        """(Q, D) unit phrase vectors -> of each in turn (3 N,) float32 relevancy; 0 for no meaning."""
+        for first in range(0, len(phrases), TOGETHER):
+            some = phrases[first : first + TOGETHER]
+            values = np.zeros((len(some), len(self._latents) + 1), np.float32)  # the last: no meaning
+            for part in self._parts():
+                cosines = self._codec.cosines(self._latents[part], some)
+                zero, rate = self._zero[part, None], self._rate[part, None]
+                values[:, :-1][:, part] = relevancy_of(cosines, zero, rate).T
+            for row in values:
+                found = np.empty(len(self._of), np.float32)
+                shared_workers().run(_fetch, len(found), row, self._of, found)
+                yield found
+
+    def _parts(self) -> Iterator[slice]:
+        for start in range(0, len(self._latents), CHUNK):
+            yield slice(start, min(start + CHUNK, len(self._latents)))
+
+
+Lookup = SphereTable | ExactLookup  # what of a language field does not depend on the phrase
+
+
+def build_lookup(field: LanguageField, scale: Scale, exact: bool = False) -> Lookup:
+    """The fastest lookup for `field`; with `exact` none that interpolates, to measure a table by."""
+    if field.codec.spherical and not exact:
+        latents = np.where(field.known[..., None], field.latents, 0)
+        return SphereTable(field.codec, latents.reshape(-1, 3), scale)
+    return ExactLookup(field, scale)
+
+
+@kernel
+def _fetch(first: int, last: int, values: Array, codes: Array, found: Array) -> None:
+    """Fill rows [first, last) of `found` (3 N,)."""
+    for i in range(first, last):
+        found[i] = values[codes[i]]
+
+
+@kernel
+def _interpolate(
+    first: int, last: int, nodes: Array, corner: Array, fraction: Array, resolution: int, found: Array
+) -> None:
+    """Fill rows [first, last) of `found` (M,), bilinear."""
+    one = np.float32(1)
+    for i in range(first, last):
+        node, u, v = corner[i], fraction[i, 0], fraction[i, 1]
+        if node < 0:
+            found[i] = 0
+            continue
+        low = nodes[node] * (one - u) + nodes[node + 1] * u
+        high = nodes[node + resolution] * (one - u) + nodes[node + resolution + 1] * u
+        found[i] = low * (one - v) + high * v
+
+
+# Relevancy of pixels: per Gaussian and splatted, one linear channel per phrase (ours); or of latents that are
+# splatted and decoded (the paper's order, section 3.4). Both are gated by alpha, because an uncovered pixel's
+# zero latent decodes to a confident something.
+
+
+def splatted_relevancy(view: View, relevancy: Array, alpha_gate: float) -> Array:
+    """(N, Q) per-Gaussian relevancy -> (H, W, Q) per-pixel relevancy in [0, 1]; 0 under the gate."""
+    total, alpha = view.splat(np.asarray(relevancy, np.float32))
+    return gated_mean(total, alpha, alpha_gate)
+
+
+def decoded_relevancy(
+    view: View, field: LanguageField, level: int, phrases: Array, alpha_gate: float
+) -> Array:
+    """The paper's order: (Q, D) phrase vectors -> (H, W, Q) relevancy of the decoded pixel latents. Raises
+    InputError for a codebook, whose numbers cannot be blended."""
+    if not field.codec.blends:
+        raise InputError(
+            f"the paper's order blends latents, and this scene has a {field.codec.kind}; train one with "
+            "`--codec.kind autoencoder`"
+        )
+    blended, alpha = view.splat(field.latents[level])
+    height, width, d = blended.shape
+    flat = np.where(alpha[..., None] > alpha_gate, blended, 0).reshape(-1, d)
+    values = latent_relevancy(field.codec, flat, phrases, field.canonical, field.reading.temperature)
+    return values.reshape(height, width, len(phrases))
+
+
+# The answer, whatever rule made it.
 
 Triple = tuple[float, float, float]  # one number a level
 AnswerRule = Literal["regions", "peak"]
@@ -93,7 +264,6 @@ def triple(values: Iterable[float]) -> Triple:
 # Fits are those of `semantics.relevancy.Scale`. The more places a scene has, the better the best of them
 # fits a phrase by chance; so "found" is said by the best fits of everyday phrases in the scene itself.
 
-CHUNK = 16_384  # latents compared with everyday phrases at a time
 # Spreads above the median best fit of everyday phrases from which a phrase is found, among whole things and
 # at the finer levels, by what it names: where things like it are, and elsewhere, where more is asked for. One
 # absent phrase in twenty exceeds it (rooms 201 to 203, the bundled encoder and CLIP's geometry with six sets
@@ -150,28 +320,34 @@ def excess(fits: Fits, bars: Bars, named: Named | Literal["inside"], level: Leve
 def chance_in(field: LanguageField, regions: Regions, scale: Scale) -> Chance:
     """The fits of everyday phrases in a scene."""
     assert scale.everyday is not None
+
+    def everyday(latents: Array) -> Array:
+        cosines = field.codec.cosines(latents, scale.texts)
+        zero, rate = scale.of(cosines)
+        return relevancy_of(cosines[:, len(scale.canonical) :], zero[:, None], rate[:, None])
+
     fits: list[Array] = []
-    for level, known in enumerate(field.known):
-        rows = np.flatnonzero(known & (regions.weights > 0))
-        latents, of = field.codec.unique(field.latents[level, rows])
-        shape = (len(regions.totals[level]), len(latents))
-        shares = csr_matrix(
-            (regions.weights[rows], (regions.everywhere[level, rows], of)), shape=shape
-        ).tocsc()
-        means = np.zeros((shape[0], len(scale.everyday)))
-        for start in range(0, len(latents), CHUNK):
-            part = slice(start, start + CHUNK)
-            cosines = field.codec.cosines(latents[part], scale.texts)
-            zero, rate = scale.of(cosines)
-            everyday = cosines[:, len(scale.canonical) :]
-            means += shares[:, part] @ relevancy_of(everyday, zero[:, None], rate[:, None])
-        means /= regions.totals[level][:, None]
-        fits.append(scale.fit(means).astype(np.float32))
+    for level, totals in enumerate(regions.totals):
+        of = regions.everywhere[level]
+        sums = sums_of_meanings(field, level, of, regions.weights, len(totals), everyday)
+        fits.append(scale.fit(sums / totals[:, None]).astype(np.float32))
     solid = [sizes >= SMALLEST for sizes in regions.sizes]
     return tuple(
         np.where(rows[:, None], own, -np.inf) if rows.any() else own  # as in `_best`
         for own, rows in zip(with_parts(regions, tuple(fits)), solid, strict=True)
     )
+
+
+def sums_of_meanings(
+    field: LanguageField, level: int, of: Array, weights: Array, count: int, read: Callable[[Array], Array]
+) -> Array:
+    """(count, V) weighted sums, over sets of Gaussians, of what `read`, (M, d) latents -> (M, V), makes of
+    what they mean at a level. of: (N,) set of each, -1 for none; weights: (N,)."""
+    rows = np.flatnonzero(field.known[level] & (of >= 0) & (weights > 0))
+    latents, kinds = field.codec.unique(field.latents[level, rows])
+    shares = csr_matrix((weights[rows], (of[rows], kinds)), shape=(count, len(latents))).tocsc()
+    parts = [slice(start, start + CHUNK) for start in range(0, max(len(latents), 1), CHUNK)]
+    return sum((shares[:, part] @ read(latents[part])).astype(np.float64) for part in parts)
 
 
 # The answer by regions: its level, the regions that are it, and how good the best one is.
@@ -354,10 +530,8 @@ def locate(surface: Surface, smoothed: Array, threshold: float) -> tuple[Array, 
 
 
 def peak_pixel(relevancy: Array, window: int) -> tuple[int, int, float]:
-    """Peak (column, row, value) of a relevancy map (H, W) after a mean filter of `window` px (paper: 20).
-
-    The window never exceeds the image; borders repeat the edge pixels.
-    """
+    """Peak (column, row, value) of a relevancy map (H, W) after a mean filter of `window` px (paper: 20). The
+    window never exceeds the image; borders repeat the edge pixels."""
     window = max(1, min(window, *relevancy.shape))
     smooth = uniform_filter(np.asarray(relevancy, np.float64), size=window, mode="nearest")
     row, column = np.unravel_index(int(smooth.argmax()), smooth.shape)

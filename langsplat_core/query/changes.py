@@ -10,6 +10,7 @@ trees are divided; what one capture did not see, or what stands behind something
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -89,10 +90,14 @@ class _Piece:
         """True if it is gone, and has not just another colour."""
         return self.gone >= ABSENT * (self.gone + self.kept)
 
+    @cached_property
+    def box(self) -> Array:
+        """(2, 3) corners."""
+        return axis_aligned_box(self.points)
+
     @property
     def size(self) -> float:
-        low, high = axis_aligned_box(self.points)
-        return float(np.linalg.norm(high - low))
+        return float(np.linalg.norm(self.box[1] - self.box[0]))
 
 
 def changes(
@@ -103,12 +108,10 @@ def changes(
     describers: tuple[Describer, Describer] | None = None,
     progress: Progress = silent,
 ) -> tuple[Change, ...]:
-    """What changed from the first scene to the second, the largest first of each of `KINDS`.
-
-    placed: (4, 4) similarity from the second scene's frame into the first one's; None: they are one.
-    describers: of both, for names. Raises InputError for a scene without cameras or language field, and for a
-    matrix that is no similarity.
-    """
+    """What changed from the first scene to the second, the largest first of each of `KINDS`. placed: (4, 4)
+    similarity from the second scene's frame into the first one's; None: they are one. describers: of both,
+    for names. Raises InputError for a scene without cameras or language field, and for a matrix that is no
+    similarity."""
     into = np.eye(4) if placed is None else similarity(placed).matrix
     before, after = _evidence(first.scene, second.scene, into, rasterizer, progress)
     home = (first, before, np.eye(4)), (second, after, into)
@@ -126,10 +129,9 @@ def changes(
     painted = [piece for piece in gone if not piece.is_absent]
     found += [_change("recoloured", piece, 0, describers) for piece in painted]
     for piece in appeared:  # what has a node of its own only in the second scene
-        box = axis_aligned_box(piece.points)
-        if not piece.is_absent and not any(_meet(box, axis_aligned_box(p.points)) for p in painted):
-            other = replace(piece, colour=piece.other, other=piece.colour)
-            found.append(_change("recoloured", other, 1, describers))
+        if not piece.is_absent and not any(_meet(piece.box, other.box) for other in painted):
+            turned = replace(piece, colour=piece.other, other=piece.colour)
+            found.append(_change("recoloured", turned, 1, describers))
     return tuple(sorted(found, key=lambda change: (KINDS.index(change.kind), -change.pixels)))
 
 
@@ -286,7 +288,7 @@ def _together(
     for piece in pieces:
         for place, other in enumerate(kept):
             alike = float(piece.meaning @ other.meaning) >= ALIKE and piece.is_absent == other.is_absent
-            if alike and _meet(axis_aligned_box(piece.points), axis_aligned_box(other.points)):
+            if alike and _meet(piece.box, other.box):
                 rows = np.union1d(piece.rows, other.rows)
                 kept[place] = _piece(engine, evidence, into, rows, meanings)
                 break
@@ -320,10 +322,10 @@ def _matched(lost: list[_Piece], new: list[_Piece], comparable: bool) -> list[tu
 
 def _change(kind: Kind, piece: _Piece, scene: int, describers: tuple[Describer, Describer] | None) -> Change:
     name = None if describers is None else _name(describers[scene], piece.rows)
-    centre, box = piece.points.mean(0), axis_aligned_box(piece.points)
+    centre = piece.points.mean(0)
     colours = (colour_term(piece.colour), colour_term(piece.other)) if kind == "recoloured" else None
     pixels = piece.gone + piece.kept
-    return Change(kind, name, centre, box, colours=colours, share=piece.share, pixels=pixels)
+    return Change(kind, name, centre, piece.box, colours=colours, share=piece.share, pixels=pixels)
 
 
 def _name(describer: Describer, rows: Array) -> str | None:

@@ -90,8 +90,7 @@ class Viewpoint:
 
     def centre(self, body: Body) -> Array:
         """(3,) centre of a body, in the camera's axes."""
-        seen: Array = self.matrix[:3, :3] @ body.centre + self.matrix[:3, 3]
-        return seen
+        return self.matrix[:3, :3] @ body.centre + self.matrix[:3, 3]
 
     def seen(self, body: Body) -> tuple[float, float]:
         """Tangent of the angle to the right of the viewing direction, and depth; NaN for what is behind."""
@@ -121,11 +120,9 @@ def body(positions: Array, frame: Array) -> Body:
 
 
 def separate(surface: Surface, inside: Array, tree: Tree | None = None) -> list[Array]:
-    """(M,) bool -> surface numbers of each single thing in it, the largest first, without specks.
-
-    tree: what tells apart things that touch, by its wholes that masks voted for. All other Gaussians are
-    taken apart where the surface is.
-    """
+    """(M,) bool -> surface numbers of each single thing in it, the largest first, without specks. tree: what
+    tells apart things that touch, by its wholes that masks voted for. All other Gaussians are taken apart
+    where the surface is."""
     wholes = None if tree is None else tree.voted(WHOLE)
     parts = told_apart(surface, np.flatnonzero(inside), wholes, join=True)
     parts.sort(key=len, reverse=True)
@@ -396,15 +393,11 @@ def run_phrase(
     progress: Progress = silent,
 ) -> ComposedResult:
     """Answer a phrase as the grammar reads it; whole, as `QueryEngine.run` does, where it finds no structure,
-    or where only the whole phrase can be asked (of a phrasebook).
-
-    level: of what is asked for; the things that it is related to keep their own. viewpoint: from where "left
-    of", "right of", "behind", "in front of", "leftmost" and "rightmost" are said, and "nearest" and
-    "farthest" where they are of nothing else.
-
+    or where only the whole phrase can be asked (of a phrasebook). level: of what is asked for; the things
+    that it is related to keep their own. viewpoint: from where "left of", "right of", "behind", "in front
+    of", "leftmost" and "rightmost" are said, and "nearest" and "farthest" where they are of nothing else.
     Raises InputError as `grammar.parse` does and where a viewpoint is needed, EncoderError as
-    `QueryEngine.run`.
-    """
+    `QueryEngine.run`."""
     tree = parse(text, engine.taught)
     if not isinstance(tree, Atom):
         _check_viewpoint(tree, viewpoint)

@@ -67,8 +67,7 @@ class WordScores:
 
     def vector(self, phrase: str) -> Array:
         """(D,) unit vector of one of the phrases."""
-        found: Array = self.vectors[self.phrases.index(phrase)]
-        return found
+        return self.vectors[self.phrases.index(phrase)]
 
     def take(self, chosen: Array) -> "WordScores":
         """The phrases for which `chosen` (V,) bool is True; the canonical ones stay."""
@@ -80,8 +79,7 @@ class WordScores:
         """(M, d) latents with a meaning -> (M, V + C) float32, each row adding up to 1."""
         logits = np.float32(self.scale) * (codec.cosines(latents, self.vectors) - self.hubs / 2)
         shares = np.exp(logits - logits.max(1, keepdims=True))
-        result: Array = shares / shares.sum(1, keepdims=True)
-        return result
+        return shares / shares.sum(1, keepdims=True)
 
     def mixture(self, codec: Codec, latents: Array, weights: Array) -> Array:
         """(M, d) latents with a meaning and (M,) weights >= 0, not all zero -> (V + C,) float64: the mean of
@@ -158,8 +156,7 @@ def hubs(vectors: Array, bank: Array) -> Array:
     if count == 0:
         return np.zeros(len(vectors), np.float32)
     near = np.partition(vectors @ bank.T, len(bank) - count, axis=1)[:, -count:]
-    found: Array = near.mean(1, dtype=np.float64).astype(np.float32)
-    return found
+    return near.mean(1, dtype=np.float64).astype(np.float32)
 
 
 # The inventory of a scene: every word that is true in it, where, how sure.
@@ -233,10 +230,8 @@ class _Claim:
 def _claims(
     codec: Codec, latents: Array, of: Array, words: WordScores, level: int, areas: Array
 ) -> Iterator[_Claim]:
-    """Groups of words at a level, those that cover most first.
-
-    latents: (M, d) the distinct ones of the field; of: (N,) int64 number of each Gaussian's, -1 for none.
-    """
+    """Groups of words at a level, those that cover most first. latents: (M, d) the distinct ones of the
+    field; of: (N,) int64 number of each Gaussian's, -1 for none."""
     best, shares = words.best(codec, latents, RUNNERS_UP)
     if best.size == 0:  # no words, or nothing that means anything
         return
@@ -264,12 +259,9 @@ def _claims(
 
 def same_things(names: Array, surface: Array) -> list[list[int]]:
     """(M, C) probabilities of C words, the most claimed first, for meanings of (M,) surface -> groups of
-    columns that name the same.
-
-    Two words do where most of what either claims is claimed by the other as well:
+    columns that name the same. Two words do where most of what either claims is claimed by the other as well:
     sum_m s_m min(p_ma, p_mb) >= SAME max(sum_m s_m p_ma, sum_m s_m p_mb). A word joins the first group whose
-    most claimed word it agrees with.
-    """
+    most claimed word it agrees with."""
     weighted = names.astype(np.float64) * surface[:, None]
     totals = weighted.sum(0)
     groups: list[list[int]] = []
@@ -312,10 +304,8 @@ class Describer:
     ) -> None:
         """vocabulary: phrases for all levels, by default the bundled ones: everyday things, and below the
         level "whole" parts of things too. Those with words that the encoder was never taught are left out.
-
         Raises InputError for a scene without a language field and where no phrase is left, EncoderError as
-        `QueryEngine.known_vectors` does.
-        """
+        `QueryEngine.known_vectors` does."""
         things = tuple(vocabulary) if vocabulary is not None else bundled_vocabulary("things")
         parts = () if vocabulary is not None else bundled_vocabulary("parts")
         phrases = (*things, *parts)
@@ -341,9 +331,7 @@ class Describer:
 
     def at_gaussians(self, rows: Array, weights: Array | None = None, top: int = 5) -> Levels:
         """Words for the Gaussians at `rows` (M indices, or a boolean mask of length N) taken together.
-
-        weights: (M,) >= 0, how much each counts; by default its surface.
-        """
+        weights: (M,) >= 0, how much each counts; by default its surface."""
         rows = np.flatnonzero(rows) if rows.dtype == bool else rows
         counted = self.areas[rows] if weights is None else np.asarray(weights, np.float64)
         if weights is None and not counted.any():  # without any surface they still mean something
@@ -503,10 +491,8 @@ def look_at_pixel(
     settings: RasterSettings | None = None,
 ) -> Pointed | None:
     """The surface that `camera` sees at `pixel` (column, row) of its image; None where that is mostly empty.
-
     Every Gaussian counts by its blending weight there; the surface is at the median of their depths, as the
-    rasterizers have it. `settings` of image formation: by default the scene's own.
-    """
+    rasterizers have it. `settings` of image formation: by default the scene's own."""
     scene = describer.engine.scene
     formed = settings or scene.raster_settings()
     rows, weights = pixel_weights(rasterizer, scene.gaussians, camera, pixel, formed)

@@ -3,8 +3,8 @@
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from threading import RLock
-from typing import Protocol
 
 import numpy as np
 
@@ -12,21 +12,23 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError, UnknownWordError
 from langsplat_core.io.language import SUFFIX, Words
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import (
     AnswerRule,
     Bars,
     Chance,
+    Lookup,
     QueryResult,
     bars,
+    build_lookup,
     by_peak,
     by_regions,
     chance_in,
 )
 from langsplat_core.query.grammar import STOP_WORDS, check_names, only
 from langsplat_core.query.instances import Instance, find_instances
-from langsplat_core.query.lookup import Lookup, build_lookup
-from langsplat_core.query.regions import Regions, build_regions
+from langsplat_core.query.selection import Regions, build_regions
 from langsplat_core.query.taught import WordSpace, build_word_space, by_showing, compared, shown
 from langsplat_core.scene import CANONICAL_PHRASES, LEVELS, Calibration, LanguageField, Scene, TaughtWord
 from langsplat_core.scene.language import LONGEST_NAME, MOST_SHOWN, phrase_key, split_phrases, tidy
@@ -34,7 +36,7 @@ from langsplat_core.scene.surface import Surface, build_surface, build_tree, sur
 from langsplat_core.scene.tree import Tree
 from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE
 from langsplat_core.semantics.relevancy import Scale, relevancy_of
-from langsplat_core.semantics.vocabulary import FEWEST, everyday_vectors
+from langsplat_core.semantics.vocabulary import FEWEST, TextEncoder, everyday_vectors
 
 BATCH = 256  # phrases that are encoded, and compared with codewords, at a time
 SAME_ENCODER = 0.99  # least cosine of canonical vectors of one encoder, whatever rounds them
@@ -47,17 +49,12 @@ def no_field(scene: Scene) -> str:
     return f"it can be looked at, not searched: {unread[0]}" if unread else NO_FIELD
 
 
-class TextEncoder(Protocol):
-    """The text half of a CLIP model."""
-
-    def encode_texts(self, texts: list[str]) -> Array:
-        """(M, D) float32 unit vectors."""
-
-    def unknown_words(self, text: str) -> tuple[str, ...]:
-        """Words of `text` that the encoder was never taught; empty if it cannot tell."""
-
-    def near_words(self, word: str) -> tuple[str, ...]:
-        """Words it was taught that are written like an unknown one, the nearest first."""
+def searchable(path: Path) -> Scene:
+    """The scene of a file; InputError where it has no language field."""
+    scene = load_scene(path)
+    if scene.language is None:
+        raise InputError(f"{path}: {no_field(scene)}")
+    return scene
 
 
 @dataclass(frozen=True)
@@ -180,9 +177,7 @@ class QueryEngine:
     def compare_with(self, phrases: Sequence[str] = (), progress: Progress = silent) -> None:
         """Take other canonical phrases (LERF, section 3.3: what everything is compared with) from now on;
         none: the scene's own again. With others no probability is said, since it was calibrated on those.
-
-        Raises as `text_vectors` does, and leaves everything as it was then.
-        """
+        Raises as `text_vectors` does, and leaves everything as it was then."""
         canonical = self.text_vectors(phrases, progress) if phrases else None
         self._canonical = canonical
         self.canonical_phrases = tuple(map(phrase_key, phrases)) or CANONICAL_PHRASES
@@ -190,10 +185,8 @@ class QueryEngine:
             self.__dict__.pop(made, None)
 
     def load_encoder(self, progress: Progress = silent) -> TextEncoder:
-        """The text encoder, loaded at the first call, which imports torch: seconds.
-
-        Raises EncoderError where it cannot be loaded, or where the engine was given no way to.
-        """
+        """The text encoder, loaded at the first call, which imports torch: seconds. Raises EncoderError where
+        it cannot be loaded, or where the engine was given no way to."""
         with self._turn:
             if self._encoder is None:
                 if self._load_encoder is None:
@@ -254,13 +247,10 @@ class QueryEngine:
         return self.load_encoder().unknown_words(phrase_key(phrase))
 
     def text_vector(self, phrase: str, progress: Progress = silent) -> Array:
-        """(D,) unit vector of a phrase: from the scene's phrasebook, else from the encoder.
-
-        Raises InputError for an empty phrase and one of stop words alone, UnknownWordError for words that the
-        encoder was never taught, and EncoderError for one that is not the scene's or cannot be loaded.
-        """
-        found: Array = self.text_vectors([phrase], progress)[0]
-        return found
+        """(D,) unit vector of a phrase: from the scene's phrasebook, else from the encoder. Raises InputError
+        for an empty phrase and one of stop words alone, UnknownWordError for words that the encoder was never
+        taught, and EncoderError for one that is not the scene's or cannot be loaded."""
+        return self.text_vectors([phrase], progress)[0]
 
     def text_vectors(self, phrases: Sequence[str], progress: Progress = silent) -> Array:
         """(Q, D) unit vectors of phrases, encoded together. Raises as `text_vector`."""
@@ -362,36 +352,24 @@ class QueryEngine:
         progress(f"searching '{tidy(phrase)}'", 0.5)
         return self._answer(tidy(phrase), self.relevancy(vector), level)
 
-    def run_many(
-        self, phrases: Sequence[str], level: LevelChoice = "auto", progress: Progress = silent
-    ) -> list[QueryResult]:
+    def run_many(self, phrases: Sequence[str], level: LevelChoice = "auto") -> list[QueryResult]:
         """The answers of `run` to each of `phrases`, which are encoded and compared with the scene's meanings
         together. An answer keeps 17 bytes per Gaussian. Raises as `text_vector` does, before any is asked."""
-        results: list[QueryResult] = []
         plain = [phrase for phrase in phrases if not self.is_taught(phrase)]
-        relevancies = self._relevancies(self.text_vectors(plain, progress))
-        for phrase in phrases:
-            progress(f"searching '{tidy(phrase)}'", len(results) / len(phrases))
-            if self.is_taught(phrase):
-                results.append(self._by_showing(self.taught[phrase_key(phrase)], level))
-            else:
-                results.append(self._answer(tidy(phrase), next(relevancies), level))
-        return results
+        relevancies = self._relevancies(self.text_vectors(plain))
+        return [
+            self._by_showing(self.taught[phrase_key(phrase)], level)
+            if self.is_taught(phrase)
+            else self._answer(tidy(phrase), next(relevancies), level)
+            for phrase in phrases
+        ]
 
     def _answer(self, phrase: str, relevancy: Array, level: LevelChoice) -> QueryResult:
         if self._bars is None:
             found = self.field.reading.found
             return by_peak(phrase, relevancy, self.surface, self.scale, found, level)
-        return by_regions(
-            phrase,
-            relevancy,
-            self.scene.gaussians.means,
-            self.regions,
-            self.scale,
-            self._bars,
-            self.calibration,
-            level,
-        )
+        means, judged = self.scene.gaussians.means, (self.scale, self._bars, self.calibration)
+        return by_regions(phrase, relevancy, means, self.regions, *judged, level)
 
     @cached_property
     def word_space(self) -> WordSpace:

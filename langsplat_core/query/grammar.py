@@ -124,17 +124,8 @@ def _nested(tree: Phrase) -> str:
 
 def children(tree: Phrase) -> tuple[Phrase, ...]:
     """The trees that a tree is made of."""
-    match tree:
-        case Both(items) | Union(items):
-            return items
-        case Inside(one, other) | Without(one, other) | Relation(_, one, other):
-            return (one, other)
-        case Superlative(_, what, anchor):
-            return (what,) if anchor is None else (what, anchor)
-        case Counted(_, what):
-            return (what,)
-        case Atom():
-            return ()
+    values = (value if isinstance(value, tuple) else (value,) for value in vars(tree).values())
+    return tuple(part for several in values for part in several if isinstance(part, Phrase))
 
 
 # The word lists by which a part is told from a thing.
@@ -223,7 +214,7 @@ def singular(word: str) -> str:
 
 def is_part(word: str) -> bool:
     """True of a noun, in either number, that is a part of things."""
-    return any(form in PARTS for form in forms(word))
+    return not PARTS.isdisjoint(forms(word))
 
 
 def named(phrase: str) -> Named:
@@ -233,11 +224,6 @@ def named(phrase: str) -> Named:
     if not is_part(last):
         return "thing"
     return "part" if only(ADJECTIVES | ARTICLES, before) else "part of a thing"
-
-
-def is_measure(word: str) -> bool:
-    """True of a noun, in either number, that holds or counts what follows "of"."""
-    return any(form in MEASURES for form in forms(word))
 
 
 def only(words: frozenset[str], tokens: Sequence[str]) -> bool:
@@ -313,11 +299,9 @@ _EXCLUSIONS = tuple(
 
 
 def parse(text: str, names: Collection[str] = ()) -> Phrase:
-    """The tree of one query. names: keys of phrases that are one name, whatever words they have.
-
-    Raises InputError where nothing is named, where something is only excluded ("not the cup"), and for a text
-    beyond `MAX_CHARACTERS` or `MAX_ATOMS`.
-    """
+    """The tree of one query. names: keys of phrases that are one name, whatever words they have. Raises
+    InputError where nothing is named, where something is only excluded ("not the cup"), and for a text beyond
+    `MAX_CHARACTERS` or `MAX_ATOMS`."""
     if len(text) > MAX_CHARACTERS:
         raise InputError(f"a query of {len(text)} characters; use at most {MAX_CHARACTERS}")
     tokens = _with_names(tokens_of(text), names)
@@ -470,7 +454,9 @@ def _related(tokens: list[str]) -> Phrase:
 
 
 def _holds(tokens: list[str]) -> bool:
-    return is_measure(tokens[-1]) and only(_EMPTY, tokens[:-1])
+    """True of a noun, in either number, that holds or counts what follows "of", with words that describe
+    it."""
+    return not MEASURES.isdisjoint(forms(tokens[-1])) and only(_EMPTY, tokens[:-1])
 
 
 def _thing(tokens: list[str]) -> Phrase:

@@ -32,13 +32,11 @@ class OrientedBox:
     def corners(self) -> Array:
         """(8, 3) corners of the box, world units."""
         signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
-        corners: Array = self.centre + (signs * self.half_extents) @ self.axes.T
-        return corners
+        return self.centre + (signs * self.half_extents) @ self.axes.T
 
     def contains(self, points: Array) -> Array:
         """(N, 3) points -> (N,) bool, True inside the box or on a face."""
-        inside: Array = (np.abs((points - self.centre) @ self.axes) <= self.half_extents * (1 + 1e-9)).all(1)
-        return inside
+        return (np.abs((points - self.centre) @ self.axes) <= self.half_extents * (1 + 1e-9)).all(1)
 
 
 def axis_aligned_box(points: Array) -> Array:
@@ -47,13 +45,11 @@ def axis_aligned_box(points: Array) -> Array:
 
 
 def oriented_box(points: Array) -> OrientedBox:
-    """Box around (M, 3) points, M >= 1, between the `INNER` quantiles along each of its axes.
-
-    The axes begin as the principal ones of the points that are no strays, and are then turned about one
-    another to the least area of the box's faces: principal axes alone say nothing about how a square, a cube
-    or a round table top with something on it lies. Where the points leave axes open (a single point, a line)
-    they are some that fit.
-    """
+    """Box around (M, 3) points, M >= 1, between the `INNER` quantiles along each of its axes. The axes begin
+    as the principal ones of the points that are no strays, and are then turned about one another to the least
+    area of the box's faces: principal axes alone say nothing about how a square, a cube or a round table top
+    with something on it lies. Where the points leave axes open (a single point, a line) they are some that
+    fit."""
     columns = np.ascontiguousarray(points.T, np.float64)
     low, high = axis_aligned_box(points)[..., None]
     core = columns[:, ((columns >= low) & (columns <= high)).all(0)]
@@ -71,8 +67,7 @@ def oriented_box(points: Array) -> OrientedBox:
 
 def _inner(columns: Array) -> Array:
     """(3, M) -> (2, 3) the `INNER` quantiles of each row."""
-    inner: Array = np.quantile(columns, INNER, axis=1)
-    return inner
+    return np.quantile(columns, INNER, axis=1)
 
 
 def _turned(columns: Array, axes: Array) -> Array:
@@ -95,8 +90,7 @@ def _widths(rows: Array) -> Array:
     """(A, M) -> (A,) between the `INNER` quantiles of each row, to the nearest point."""
     low, high = (round(q * (rows.shape[1] - 1)) for q in INNER)
     rows.partition((low, high), axis=1)
-    widths: Array = rows[:, high] - rows[:, low]
-    return widths
+    return rows[:, high] - rows[:, low]
 
 
 def _right_handed(axes: Array) -> Array:
@@ -146,16 +140,12 @@ class Instance:
     @property
     def size(self) -> Array:
         """(3,) sides of the oriented box, longest first, world units."""
-        size: Array = 2 * self.oriented.half_extents
-        return size
+        return 2 * self.oriented.half_extents
 
 
 def told_apart(surface: Surface, numbers: Array, wholes: Array | None, join: bool) -> list[Array]:
-    """Divide the Gaussians `numbers` (K,) of a surface into single things.
-
-    wholes: (N,) voted wholes, see `Tree.voted`, which tell apart things that touch; join: what is of one
-    whole is one, connected or not.
-    """
+    """Divide the Gaussians `numbers` (K,) of a surface into single things. wholes: (N,) voted wholes, see
+    `Tree.voted`, which tell apart things that touch; join: what is of one whole is one, connected or not."""
     if wholes is None:
         return surface.parts(numbers).each()
     owner = wholes[surface.rows[numbers]]
@@ -176,11 +166,9 @@ def find_instances(
     join: bool = False,
 ) -> tuple[Instance, ...]:
     """The instances among `members` (N,) bool, best first by score, of equal ones the larger first.
-
     relevancy: (N,) in [0, 1], at the level of the answer. wholes, join: see `told_apart`. at_most: only so
     many of the best. Crumbs are left out: parts of fewer than `CRUMB_COUNT` Gaussians on the surface, or of
-    less than `CRUMB_SHARE` of the largest part's extent. Where all are crumbs, the largest alone is kept.
-    """
+    less than `CRUMB_SHARE` of the largest part's extent. Where all are crumbs, the largest alone is kept."""
     every = np.flatnonzero(members)
     numbers = surface.anchors[every]
     near = numbers >= 0
@@ -255,11 +243,9 @@ class Mesh:
 
 
 def hull(instance: Instance, gaussians: Gaussians, colours: Array, name: str) -> Mesh:
-    """Hull around the instance's Gaussians that lie in its oriented box: strays would stretch it.
-
-    colours: (N, 3) of the scene's Gaussians, in [0, 1]; the mesh has the mean of its own. Raises InputError
-    where all lie at one point.
-    """
+    """Hull around the instance's Gaussians that lie in its oriented box: strays would stretch it. colours:
+    (N, 3) of the scene's Gaussians, in [0, 1]; the mesh has the mean of its own. Raises InputError where all
+    lie at one point."""
     box, rows = instance.oriented, instance.members
     means = gaussians.means[rows].astype(np.float64)
     inside = box.contains(means)
@@ -289,5 +275,4 @@ def _outward(vertices: Array, triangles: Array, normals: Array) -> Array:
     """The triangles, turned where they run against their outward `normals` (T, 3)."""
     a, b, c = vertices[triangles].transpose(1, 0, 2)
     inward = (np.cross(b - a, c - a) * normals).sum(1) < 0
-    turned: Array = np.where(inward[:, None], triangles[:, [0, 2, 1]], triangles)
-    return turned
+    return np.where(inward[:, None], triangles[:, [0, 2, 1]], triangles)

@@ -1,4 +1,5 @@
-"""Selections of Gaussians, (N,) bool arrays: by place, along the surface, and drawn on an image.
+"""Sets of Gaussians: the regions that a scene's tree makes at each level, with means of values over them; and
+selections, (N,) bool arrays, by place, along the surface, and drawn on an image.
 
 Growing and shrinking walk along the surface and never jump to a thing behind or above. Gaussians too faint to
 be on it go where the one goes that they are nearest to (`Surface.anchors`); those near none never change.
@@ -12,10 +13,106 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import Array, check_array
+from langsplat_core.compiled import kernel, plain, shared_workers
 from langsplat_core.errors import InputError
-from langsplat_core.query.regions import Regions
-from langsplat_core.scene import Camera
+from langsplat_core.scene import LEVELS, Camera
 from langsplat_core.scene.surface import Surface
+from langsplat_core.scene.tree import Tree
+
+PIECES = 4  # that a level is summed in, so that more than three cores have work
+
+
+@dataclass(frozen=True, eq=False)
+class Regions:
+    """Regions of the N Gaussians of a scene; R of them at a level."""
+
+    nodes: tuple[Array, ...]  # (R,) number in the tree of each region of a level, rising
+    everywhere: Array  # (3, N) int32 number of the region at each level, from 0; -1: in none
+    weights: Array  # (N,) float32 opacity of what counts, 0 for all others, see `surface_weights`
+    parents: tuple[Array, Array]  # (R,) region of the level above that each is part of: of two levels
+    sizes: tuple[Array, ...]  # (R,) Gaussians that count
+    totals: tuple[Array, ...]  # (R,) float64 sums of their weights
+
+    def means(self, values: Array) -> tuple[Array, ...]:
+        """(3, N) values of all Gaussians -> of every level the (R,) float64 opacity-weighted means. In the
+        order of the Gaussians and not of the surface: memory is read from front to back."""
+        longest = max(len(total) for total in self.totals)
+        sums = np.zeros((len(LEVELS) * PIECES, longest))
+        workers = shared_workers()
+        workers.run(_sum_pieces, len(sums), plain(values), self.everywhere, self.weights, sums)
+        levels = sums.reshape(len(LEVELS), PIECES, longest).sum(1)
+        return tuple(row[: len(total)] / total for row, total in zip(levels, self.totals, strict=True))
+
+    def spread(self, level: int, values: Array, others: Array) -> Array:
+        """(R,) values of a level's regions -> (N,) of all Gaussians: of a faint one what is next to it, and
+        where nothing is, its own of `others` (N,) of the same type."""
+        spread = np.empty_like(others)
+        shared_workers().run(_spread, len(others), self.everywhere[level], values, others, spread)
+        return spread
+
+    def best_parts(self, level: int, values: tuple[Array, ...]) -> Array:
+        """(R, ...) the largest value among each region's parts at the level below; its own where it has none.
+        values: of each level, the (R, ...) values of its regions."""
+        own = values[level]
+        if level == 0:
+            return own
+        best = np.full_like(own, -np.inf)
+        np.maximum.at(best, self.parents[level - 1], values[level - 1])
+        return np.where(np.isfinite(best), best, own)
+
+    def level_of(self, members: Array) -> int:
+        """The level with the region that overlaps most with `members` (N,) bool; of equal ones the
+        coarsest."""
+        best = []
+        for of, sizes in zip(self.everywhere, self.sizes, strict=True):
+            hits = np.bincount(of[members & (of >= 0) & (self.weights > 0)], minlength=len(sizes))
+            best.append((hits / np.maximum(sizes + hits.sum() - hits, 1)).max(initial=0))
+        return int(np.flatnonzero(np.array(best) == max(best))[-1])
+
+    def counted(self, level: int, region: int) -> Array:
+        """(K,) the Gaussians of one region that count."""
+        return np.flatnonzero((self.everywhere[level] == region) & (self.weights > 0))
+
+
+def build_regions(tree: Tree, weights: Array) -> Regions:
+    """The regions of a scene. weights: (N,) float32, see `surface_weights`."""
+    weights = np.where(tree.leaves >= 0, weights, np.float32(0))
+    counts = np.flatnonzero(weights > 0)
+    nodes, everywhere, parents, sizes, totals = [], [], [], [], []
+    for level in range(len(LEVELS)):
+        at = tree.at(level)
+        there, first, row = np.unique(at[counts], return_index=True, return_inverse=True)
+        number = np.full(tree.count + 1, -1, np.int32)
+        number[there] = np.arange(len(there))
+        nodes.append(there)
+        everywhere.append(number[at])
+        sizes.append(np.bincount(row, minlength=len(there)))
+        totals.append(np.bincount(row, weights[counts], minlength=len(there)))
+        parents.append(counts[first])  # a Gaussian of each region
+    above = everywhere[1][parents[0]], everywhere[2][parents[1]]
+    return Regions(tuple(nodes), np.stack(everywhere), weights, above, tuple(sizes), tuple(totals))
+
+
+@kernel
+def _sum_pieces(first: int, last: int, values: Array, everywhere: Array, weights: Array, sums: Array) -> None:
+    """Rows [first, last) of `sums` (3 P, R): of a level's P pieces the weighted sums over its regions."""
+    count, pieces = len(weights), len(sums) // len(values)
+    for row in range(first, last):
+        level, piece = row // pieces, row % pieces
+        for i in range(count * piece // pieces, count * (piece + 1) // pieces):
+            if weights[i] > 0:
+                sums[row, everywhere[level, i]] += np.float64(weights[i]) * values[level, i]
+
+
+@kernel
+def _spread(first: int, last: int, of: Array, values: Array, others: Array, spread: Array) -> None:
+    """Fill rows [first, last) of `spread` (N,)."""
+    for i in range(first, last):
+        region = of[i]
+        spread[i] = values[region] if region >= 0 else others[i]
+
+
+# Selections.
 
 
 def of_rows(rows: Array, count: int) -> Array:
@@ -36,8 +133,7 @@ def in_sphere(means: Array, centre: Array, radius: float) -> Array:
 
 def in_box(means: Array, low: Array, high: Array) -> Array:
     """(N, 3) -> (N,) bool: between two corners (3,) along the world's axes, faces included."""
-    inside: Array = np.all((means >= np.asarray(low)) & (means <= np.asarray(high)), axis=1)
-    return inside
+    return np.all((means >= np.asarray(low)) & (means <= np.asarray(high)), axis=1)
 
 
 def above_plane(means: Array, normal: Array, offset: float) -> Array:
@@ -54,8 +150,7 @@ def at_point(surface: Surface, regions: Regions, level: int, point: Array) -> Ar
     if len(surface.rows) == 0:
         return np.zeros(len(surface.anchors), bool)
     nearest = int(((surface.positions - point) ** 2).sum(1).argmin())
-    same: Array = regions.everywhere[level] == regions.everywhere[level, surface.rows[nearest]]
-    return same
+    return regions.everywhere[level] == regions.everywhere[level, surface.rows[nearest]]
 
 
 def in_pixel(regions: Regions, level: int, rows: Array, weights: Array) -> Array:
@@ -72,11 +167,11 @@ def grow(surface: Surface, selected: Array, distance: float) -> Array:
         raise InputError(f"a distance of {distance:g} cannot be walked along the surface; give 0 or more")
     reached = selected[surface.rows]
     if not reached.any() or reached.all():
-        return _spread(surface, selected, reached)
+        return _with_reached(surface, selected, reached)
     lengths = dijkstra(
         _lengths(surface), directed=False, indices=np.flatnonzero(reached), limit=distance, min_only=True
     )
-    return _spread(surface, selected, np.isfinite(lengths))
+    return _with_reached(surface, selected, np.isfinite(lengths))
 
 
 def shrink(surface: Surface, selected: Array, distance: float) -> Array:
@@ -85,12 +180,11 @@ def shrink(surface: Surface, selected: Array, distance: float) -> Array:
     return ~grow(surface, ~selected, distance)
 
 
-def _spread(surface: Surface, selected: Array, reached: Array) -> Array:
+def _with_reached(surface: Surface, selected: Array, reached: Array) -> Array:
     """`selected` and every Gaussian at a `reached` (M,) point of the surface."""
     if len(reached) == 0:
         return selected.copy()
-    at_reached: Array = selected | (reached[surface.anchors] & (surface.anchors >= 0))
-    return at_reached
+    return selected | (reached[surface.anchors] & (surface.anchors >= 0))
 
 
 def _lengths(surface: Surface) -> csr_matrix:
@@ -135,17 +229,14 @@ def in_rectangle(seen: Projected, corner: Array, opposite: Array) -> Array:
     """(N,) bool: between two opposite corners (2,), pixels, borders included."""
     corners = np.stack([corner, opposite]).astype(np.float64)
     low, high = corners.min(0), corners.max(0)
-    inside: Array = seen.ahead & ((seen.pixels >= low) & (seen.pixels <= high)).all(1)
-    return inside
+    return seen.ahead & ((seen.pixels >= low) & (seen.pixels <= high)).all(1)
 
 
 def in_polygon(seen: Projected, outline: Array) -> Array:
     """(N,) bool: inside the closed `outline` (K, 2), pixels, by the even-odd rule; nothing for fewer than
-    three corners. What lies exactly on an edge may count either way.
-
-    A ray from the centre to the right crosses an odd number of edges (Shimrat 1962, Algorithm 112). Centres
-    are sorted by height once, so that an edge meets only those that are level with it.
-    """
+    three corners. What lies exactly on an edge may count either way. A ray from the centre to the right
+    crosses an odd number of edges (Shimrat 1962, Algorithm 112). Centres are sorted by height once, so that
+    an edge meets only those that are level with it."""
     outline = np.asarray(outline, np.float64)
     check_array("outline", outline, ("K", 2))
     inside = np.zeros(len(seen.depths), bool)
@@ -190,12 +281,10 @@ def in_stroke(seen: Projected, path: Array, radius: float) -> Array:
 
 
 def on_surface(seen: Projected, depths: Array, size: tuple[int, int], behind: float = BEHIND) -> Array:
-    """(N,) bool: in the image and not hidden there: the depth of the centre is at most that of the surface
-    in its pixel and `behind` of it more. Where nothing is drawn, nothing hides.
-
-    depths: (H, W) camera z of the surface, world units, 0 where nothing is drawn; it may be coarser or finer
-    than the `size` (width, height) of the image that the centres were projected into.
-    """
+    """(N,) bool: in the image and not hidden there: the depth of the centre is at most that of the surface in
+    its pixel and `behind` of it more. Where nothing is drawn, nothing hides. depths: (H, W) camera z of the
+    surface, world units, 0 where nothing is drawn; it may be coarser or finer than the `size` (width, height)
+    of the image that the centres were projected into."""
     check_array("depths", depths, ("H", "W"))
     height, width = depths.shape
     columns, rows = np.floor(seen.pixels * (width / size[0], height / size[1])).T

@@ -9,15 +9,15 @@ region is what was shown if it is more like it than `FOUND` says for the mean ri
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
-from scipy.sparse import csr_matrix
 
 from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import InputError
-from langsplat_core.query.answers import QueryResult, place_of, triple
-from langsplat_core.query.regions import Regions
+from langsplat_core.query.answers import QueryResult, place_of, sums_of_meanings, triple
+from langsplat_core.query.selection import Regions
 from langsplat_core.scene import LEVELS, LanguageField, TaughtWord
 from langsplat_core.scene.surface import SMALLEST
 
@@ -31,7 +31,6 @@ LEAST = 0.08  # rival: a few regions say little about it
 HIGHEST = 0.95  # similarity from which anything is what was shown
 UNIT = 0.3  # of the similarity from which it is found: half of it below, 80 % of what is absent is less
 HEAT = 4.0  # fit of what is exactly as shown: a relevancy of 0.98
-CHUNK = 16_384  # latents compared with the word space at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,11 +44,9 @@ class WordSpace:
 
 
 def build_word_space(field: LanguageField, regions: Regions, votes: Array) -> WordSpace:
-    """The word space of a scene; that of all images where the scene keeps no everyday phrases.
-
-    votes: (K,) of the tree's nodes. Where masks voted, mean and rival are of those regions that have a vote:
-    the others are mostly fragments of walls and floors, many of one thing.
-    """
+    """The word space of a scene; that of all images where the scene keeps no everyday phrases. votes: (K,) of
+    the tree's nodes. Where masks voted, mean and rival are of those regions that have a vote: the others are
+    mostly fragments of walls and floors, many of one thing."""
     basis = np.eye(field.codec.vector_dim, dtype=np.float32)
     if field.everyday is not None and len(field.everyday) > 1:
         _, spreads, axes = np.linalg.svd(field.everyday - field.everyday.mean(0), full_matrices=False)
@@ -74,14 +71,9 @@ def _means(
 ) -> tuple[Array, Array]:
     """(count, W) means in a space of what sets of Gaussians mean, and (count,) bool, False for a set without
     a meaning. of: (N,) number of each Gaussian's set, -1 for none; weights: (N,)."""
-    rows = np.flatnonzero(field.known[level] & (of >= 0) & (weights > 0))
-    latents, kinds = field.codec.unique(field.latents[level, rows])
-    shares = csr_matrix((weights[rows], (of[rows], kinds)), shape=(count, len(latents))).tocsc()
-    sums = np.zeros((count, len(basis)))
-    for start in range(0, len(latents), CHUNK):
-        part = slice(start, start + CHUNK)
-        sums += shares[:, part] @ field.codec.cosines(latents[part], basis)
-    totals = np.bincount(of[rows], weights[rows], count)
+    counted = field.known[level] & (of >= 0)
+    totals = np.bincount(of[counted], weights[counted], count)
+    sums = sums_of_meanings(field, level, of, weights, count, partial(field.codec.cosines, vectors=basis))
     return sums / np.maximum(totals, 1e-12)[:, None], totals > 0
 
 

@@ -149,8 +149,7 @@ def text_vectors(tensors: Tensors, config: TextConfig, ids: Array, ends: Array) 
         inner = _linear(tensors, f"{layer}mlp.fc1", _norm(tensors, f"{layer}layer_norm2", x, eps))
         x = x + _linear(tensors, f"{layer}mlp.fc2", activate(inner))
     last = _norm(tensors, f"{PREFIX}final_layer_norm", x[np.arange(len(ids)), ends], eps)
-    found: Array = last @ tensors[PROJECTION].T
-    return found
+    return last @ tensors[PROJECTION].T
 
 
 def _layer(number: int) -> str:
@@ -167,8 +166,7 @@ def _linear(tensors: Tensors, name: str, x: Array) -> Array:
 def _norm(tensors: Tensors, name: str, x: Array, eps: float) -> Array:
     centred = x - x.mean(-1, keepdims=True)
     spread = np.sqrt((centred**2).mean(-1, keepdims=True) + np.float32(eps))
-    scaled: Array = centred / spread * tensors[f"{name}.weight"] + tensors[f"{name}.bias"]
-    return scaled
+    return centred / spread * tensors[f"{name}.weight"] + tensors[f"{name}.bias"]
 
 
 def _attention(tensors: Tensors, name: str, x: Array, later: Array, heads: int) -> Array:
@@ -193,8 +191,7 @@ def _quick_gelu(x: Array) -> Array:
 def _gelu(x: Array) -> Array:
     from scipy.special import erf
 
-    gelu: Array = np.float32(0.5) * x * (1 + erf(x * np.float32(0.5**0.5)))
-    return gelu
+    return np.float32(0.5) * x * (1 + erf(x * np.float32(0.5**0.5)))
 
 
 _ACTIVATIONS: Mapping[str, Callable[[Array], Array]] = {"quick_gelu": _quick_gelu, "gelu": _gelu}

@@ -68,10 +68,8 @@ def load_tokens(weights: Weights, length: int) -> Tokens:
 
 def text_cleaner() -> Callable[[str], str]:
     """Return the cleaning that open_clip does before its tokenizer reads a text: broken Unicode is mended,
-    curly quotes and ligatures are made plain, names of HTML replaced, spaces made single.
-
-    The function raises InputError where no letter and no digit is left.
-    """
+    curly quotes and ligatures are made plain, names of HTML replaced, spaces made single. The function raises
+    InputError where no letter and no digit is left."""
     import ftfy
 
     def clean(text: str) -> str:
@@ -84,12 +82,10 @@ def text_cleaner() -> Callable[[str], str]:
 
 
 def check_whole(text: str, ids: Sequence[int], room: int, ends: Collection[int]) -> None:
-    """Refuse a phrase of which a model would not see all.
-
-    ids: its tokens without those that begin and end a phrase; room: how many the model reads; ends: tokens
-    that end a phrase, which some tokenizers give for every mark that they cannot read. Raises InputError for
-    a phrase that is too long, EncoderError for one that would end early.
-    """
+    """Refuse a phrase of which a model would not see all. ids: its tokens without those that begin and end a
+    phrase; room: how many the model reads; ends: tokens that end a phrase, which some tokenizers give for
+    every mark that they cannot read. Raises InputError for a phrase that is too long, EncoderError for one
+    that would end early."""
     if len(ids) > room:
         raise InputError(
             f"'{text[:40]} ...' is too long: {len(ids)} tokens; this encoder reads {room}, so use fewer words"
@@ -191,7 +187,7 @@ class Family:
 
 
 class PhraseEncoder:
-    """The text half of a model, in float32; it satisfies `query.engine.TextEncoder`."""
+    """The text half of a model, in float32; it satisfies `vocabulary.TextEncoder`."""
 
     def __init__(self, weights: Weights, tower: TextTower) -> None:
         self.id = weights.id  # hub id or folder as it was asked for; "demo" for the bundled encoder
@@ -226,13 +222,11 @@ class PhraseEncoder:
         return next((form for form in (word, owner) if form in self.words), None)
 
     def encode_texts(self, texts: Sequence[str]) -> Array:
-        """(M, D) float32 unit vectors of M phrases, raw: no prompt template, as in LangSplat.
-
-        An encoder of a closed vocabulary is given its words and nothing else: any mark that its tokenizer
-        lacks might end the phrase. Raises InputError for a phrase without a letter or digit or with more
-        tokens than the model reads, UnknownWordError for words it was not taught, EncoderError for other
-        marks that it cannot read.
-        """
+        """(M, D) float32 unit vectors of M phrases, raw: no prompt template, as in LangSplat. An encoder of a
+        closed vocabulary is given its words and nothing else: any mark that its tokenizer lacks might end the
+        phrase. Raises InputError for a phrase without a letter or digit or with more tokens than the model
+        reads, UnknownWordError for words it was not taught, EncoderError for other marks that it cannot
+        read."""
         for text in texts:
             self._check(text)
         said = [self._said(text) for text in texts]
@@ -320,11 +314,9 @@ def _reading(weights: Weights, temperature: float) -> Reading:
 
 
 def pixel_statistics(weights: Weights, mean: Triple, std: Triple) -> tuple[Array, Array]:
-    """(3,) mean and (3,) standard deviation of the pixels a model was trained with, in [0, 1]: those that
-    the folder's preprocessor_config.json states, else `mean` and `std`.
-
-    Raises EncoderError where that file cannot be read, or states no three numbers.
-    """
+    """(3,) mean and (3,) standard deviation of the pixels a model was trained with, in [0, 1]: those that the
+    folder's preprocessor_config.json states, else `mean` and `std`. Raises EncoderError where that file
+    cannot be read, or states no three numbers."""
     path = weights.folder / "preprocessor_config.json"
     name = OPEN_CLIP_CONFIG if weights.converted else path.name
     try:

@@ -18,6 +18,7 @@ from langsplat_core.semantics.encoder import (
     UNUSUAL,
     Encoder,
     Family,
+    ImageTower,
     PhraseEncoder,
     TextTower,
     check_whole,
@@ -69,21 +70,26 @@ class ClipText:
         return inferred(lambda: self._model(input_ids=tokens).text_embeds)
 
 
-class ClipImages:
+class Images:
     """An `ImageTower` computed by torch."""
 
-    def __init__(self, weights: Weights) -> None:
-        from transformers import CLIPVisionModelWithProjection
-
-        self._model: Any = _load(CLIPVisionModelWithProjection, "vision", weights)
-        self.statistics: tuple[Array, Array] = pixel_statistics(weights, CLIP_MEAN, CLIP_STD)
+    def __init__(self, model: Any, output: str, statistics: tuple[Array, Array]) -> None:
+        """model: of transformers; output: name of the vectors in what it returns."""
+        self._model, self._output, self.statistics = model, output, statistics
 
     @property
     def image_size(self) -> int:
         return int(self._model.config.image_size)
 
     def encode(self, pixels: Any) -> Any:
-        return self._model(pixel_values=pixels).image_embeds
+        return getattr(self._model(pixel_values=pixels), self._output)
+
+
+def clip_images(weights: Weights) -> ImageTower:
+    from transformers import CLIPVisionModelWithProjection
+
+    model = _load(CLIPVisionModelWithProjection, "vision", weights)
+    return Images(model, "image_embeds", pixel_statistics(weights, CLIP_MEAN, CLIP_STD))
 
 
 def clip_text(weights: Weights) -> TextTower:
@@ -165,22 +171,11 @@ class SiglipText:
         return " ".join(lower.translate(NO_PUNCTUATION).split()) if self._tokens.is_unigram else lower
 
 
-class SiglipImages:
-    """An `ImageTower` computed by torch."""
+def siglip_images(weights: Weights) -> ImageTower:
+    from transformers import SiglipVisionModel
 
-    def __init__(self, weights: Weights) -> None:
-        from transformers import SiglipVisionModel
-
-        config = _siglip_config(weights).vision_config
-        self._model: Any = load_model(SiglipVisionModel, weights, config)
-        self.statistics: tuple[Array, Array] = pixel_statistics(weights, HALF, HALF)
-
-    @property
-    def image_size(self) -> int:
-        return int(self._model.config.image_size)
-
-    def encode(self, pixels: Any) -> Any:
-        return self._model(pixel_values=pixels).pooler_output
+    model = load_model(SiglipVisionModel, weights, _siglip_config(weights).vision_config)
+    return Images(model, "pooler_output", pixel_statistics(weights, HALF, HALF))
 
 
 def _siglip_config(weights: Weights) -> Any:
@@ -198,28 +193,24 @@ DEMO_ELSEWHERE = (
     f"langsplat train DATASET --out scene.ply --clip.model {OPEN_MODEL}"
 )
 FAMILIES: Mapping[str, Family] = MappingProxyType(  # by `model_type` of config.json
-    {"clip": Family(clip_text, ClipImages), "siglip": Family(SiglipText, SiglipImages)}
+    {"clip": Family(clip_text, clip_images), "siglip": Family(SiglipText, siglip_images)}
 )
 
 
 @optional_imports(EncoderError)
 def load_text_encoder(model: str, device: str = "cpu") -> PhraseEncoder:
-    """Load the text half of `model`: a folder, a file, a hub id, or "demo" for the bundled encoder.
-
-    The device is the CPU unless told otherwise, because a phrase takes it a few milliseconds.
-    Raises EncoderError where the weights are absent or are those of no family here.
-    """
+    """Load the text half of `model`: a folder, a file, a hub id, or "demo" for the bundled encoder. The
+    device is the CPU unless told otherwise, because a phrase takes it a few milliseconds. Raises EncoderError
+    where the weights are absent or are those of no family here."""
     weights = open_weights(model, model_path(model, "--encoder"), torch_device(device))
     return PhraseEncoder(weights, _family(weights).text(weights))
 
 
 @optional_imports(EncoderError)
 def load_encoder(model: str, device: str = "auto", batch: int = 32) -> Encoder:
-    """Load both halves of `model`: a folder, a file, a hub id, or "demo" for the bundled encoder.
-
-    batch: images per forward pass.
-    Raises EncoderError where the weights are absent or are those of no family here.
-    """
+    """Load both halves of `model`: a folder, a file, a hub id, or "demo" for the bundled encoder. batch:
+    images per forward pass. Raises EncoderError where the weights are absent or are those of no family
+    here."""
     weights = open_weights(model, model_path(model, "--clip.model"), torch_device(device))
     family = _family(weights)
     return Encoder(weights, family.text(weights), family.images(weights), batch)

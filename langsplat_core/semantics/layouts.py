@@ -139,10 +139,8 @@ SAM2_SIZES: Mapping[tuple[int, int], Hiera] = MappingProxyType(  # by width of t
 
 
 def open_weights(id: str, path: Path, device: str) -> Weights:
-    """The weights at `path`, a folder or a file that `weights.weights_path` found.
-
-    Raises EncoderError for a file that is damaged, or holds no tensors of a layout known here.
-    """
+    """The weights at `path`, a folder or a file that `weights.weights_path` found. Raises EncoderError for a
+    file that is damaged, or holds no tensors of a layout known here."""
     if path.is_dir() and is_hugging_face(path):
         return Weights(id, path, device)
     file = path if path.is_file() else next(path / name for name in OPEN_CLIP if (path / name).is_file())
@@ -168,9 +166,8 @@ def _read(id: str, file: Path) -> Tensors:
 
     if file.suffix == ".safetensors":
         return load_file(file)
-    if zipfile.is_zipfile(file) and any(
-        name.endswith("/constants.pkl") for name in zipfile.ZipFile(file).namelist()
-    ):
+    names = zipfile.ZipFile(file).namelist() if zipfile.is_zipfile(file) else []
+    if any(name.endswith("/constants.pkl") for name in names):
         try:
             found: Any = _script_tensors(file)
         except UNREADABLE as error:
@@ -183,14 +180,10 @@ def _read(id: str, file: Path) -> Tensors:
     found = found.get("state_dict", found.get("model", found)) if isinstance(found, dict) else {}
     if not isinstance(found, dict):
         raise ValueError("it holds no named tensors")
-    if any(
-        tensor.nbytes > file.stat().st_size for tensor in found.values() if isinstance(tensor, torch.Tensor)
-    ):
+    tensors = {name: tensor for name, tensor in found.items() if isinstance(tensor, torch.Tensor)}
+    if any(tensor.nbytes > file.stat().st_size for tensor in tensors.values()):
         raise ValueError("a tensor claims more numbers than the file holds")
-    names = {
-        name: name.removeprefix("module.").removeprefix("text.") for name in found if isinstance(name, str)
-    }
-    return {names[name]: found[name] for name in names if isinstance(found[name], torch.Tensor)}
+    return {str(name).removeprefix("module.").removeprefix("text."): tensors[name] for name in tensors}
 
 
 class _Module:
@@ -203,10 +196,8 @@ class _Module:
 
 
 def _script_tensors(file: Path) -> dict[str, Any]:
-    """Tensors of a TorchScript archive, as OpenAI publishes CLIP, by their modules' names.
-
-    torch reads such an archive only by running it, so what holds the tensors is put into one of its own.
-    """
+    """Tensors of a TorchScript archive, as OpenAI publishes CLIP, by their modules' names. torch reads such
+    an archive only by running it, so what holds the tensors is put into one of its own."""
     import torch
 
     copy = io.BytesIO()
@@ -415,10 +406,8 @@ def _decoder_config(tensors: Tensors, first: str) -> Settings:
 
 
 def _sam2(tensors: dict[str, Any]) -> Converted:
-    """The half of a SAM 2 or 2.1 that sees single images; its memory of films is left out.
-
-    tensors: without "sam_" before the names of prompt encoder and mask decoder.
-    """
+    """The half of a SAM 2 or 2.1 that sees single images; its memory of films is left out. tensors: without
+    "sam_" before the names of prompt encoder and mask decoder."""
     import torch
 
     points = [tensors.pop(name) for name in SAM2_POINTS if _shape(tensors, name, 2)]

@@ -84,9 +84,7 @@ def by_area(ious: Any, logits: Any) -> tuple[Any, Any]:
 
 def padded(image: Array, side: int) -> tuple[Array, tuple[int, int]]:
     """Scale the longer side of (H, W, 3) uint8 to `side`, normalise, pad with zeros to the right and below.
-
-    Returns (1, 3, side, side) float32 and the (height, width) of the image in it, px.
-    """
+    Returns (1, 3, side, side) float32 and the (height, width) of the image in it, px."""
     height, width = image.shape[:2]
     scale = side / max(height, width)
     size = max(1, int(height * scale + 0.5)), max(1, int(width * scale + 0.5))
@@ -177,10 +175,8 @@ FAMILIES: Mapping[str, Callable[[Weights], Segmenter]] = MappingProxyType(  # by
 
 
 def load_segmenter(model: str, device: str = "auto") -> Segmenter:
-    """Load `model`: a folder in Hugging Face layout, a file of segment_anything or sam2, or a hub id.
-
-    Raises EncoderError where the weights are absent or are those of no family here.
-    """
+    """Load `model`: a folder in Hugging Face layout, a file of segment_anything or sam2, or a hub id. Raises
+    EncoderError where the weights are absent or are those of no family here."""
     weights = open_weights(model, weights_path(model, "--masks.sam"), torch_device(device))
     named = model_type(weights)
     if named not in FAMILIES:
@@ -199,9 +195,7 @@ EDGE = 20.0  # px: a box that ends this near to an edge touches it
 
 def crop_boxes(shape: tuple[int, int], layers: int) -> Array:
     """(C, 4) int64 left, top, right, bottom, px, of the whole image and its crops; the last two exclusive.
-
-    shape: (height, width); layer k cuts 2^k x 2^k crops that overlap. The whole image comes first.
-    """
+    shape: (height, width); layer k cuts 2^k x 2^k crops that overlap. The whole image comes first."""
     height, width = shape
     boxes = [(0, 0, width, height)]
     for layer in range(1, layers + 1):
@@ -221,14 +215,11 @@ def _spans(length: int, count: int, overlap: int) -> list[tuple[int, int]]:
 
 def cut_by_crop(boxes: Array, crop: Array, shape: tuple[int, int]) -> Array:
     """(...,) bool: whether a mask's box ends at an edge of the crop that is no edge of the image: what it
-    shows goes on outside, and the next crop or the whole image shows it better.
-
-    boxes: (..., 4); crop: (4,) left, top, right, bottom, px of the image; shape: its (height, width).
-    """
+    shows goes on outside, and the next crop or the whole image shows it better. boxes: (..., 4); crop: (4,)
+    left, top, right, bottom, px of the image; shape: its (height, width)."""
     picture = np.array([0, 0, shape[1], shape[0]])
     at_crop, at_picture = np.abs(boxes - crop) <= EDGE, np.abs(boxes - picture) <= EDGE
-    cut: Array = (at_crop & ~at_picture).any(axis=-1)
-    return cut
+    return (at_crop & ~at_picture).any(axis=-1)
 
 
 # Which of many proposed masks are kept: suppression by box and by pixels, and the removal of crumbs.
@@ -249,10 +240,8 @@ def mask_boxes(masks: Array) -> Array:
 
 
 def box_nms(boxes: Array, scores: Array, iou: float) -> Array:
-    """Greedy non-maximum suppression: (K,) indices kept, by falling score; ties by index.
-
-    boxes: (M, 4) left, top, right, bottom, non-empty; a box goes when its IoU with a kept one is > `iou`.
-    """
+    """Greedy non-maximum suppression: (K,) indices kept, by falling score; ties by index. boxes: (M, 4) left,
+    top, right, bottom, non-empty; a box goes when its IoU with a kept one is > `iou`."""
     order = np.argsort(-scores, kind="stable")
     left, top, right, bottom = boxes.astype(float).T
     area = (right - left) * (bottom - top)
@@ -268,11 +257,9 @@ def box_nms(boxes: Array, scores: Array, iou: float) -> Array:
 
 
 def clean_regions(mask: Array, min_region: int) -> tuple[Array, bool]:
-    """Fill holes below `min_region` px, then drop islands below it; the largest island always stays.
-
-    mask: (H, W) bool, not empty. Returns the mask and whether anything changed. As SAM's
-    `remove_small_regions`; only the surroundings of the mask are looked at, which changes nothing else.
-    """
+    """Fill holes below `min_region` px, then drop islands below it; the largest island always stays. mask:
+    (H, W) bool, not empty. Returns the mask and whether anything changed. As SAM's `remove_small_regions`;
+    only the surroundings of the mask are looked at, which changes nothing else."""
     (left, top, right, bottom), (height, width) = mask_boxes(mask[None])[0], mask.shape
     gaps = np.array([top * width, (height - bottom) * width, left * height, (width - right) * height])
     if ((gaps > 0) & (gaps < min_region)).any():  # what lies beyond the box may itself be a small hole
@@ -317,13 +304,11 @@ def common_pixels(masks: Array) -> Array:
 
 
 def mask_nms(masks: Array, scores: Array, config: MaskConfig) -> Array:
-    """(K,) indices of the masks that stay, rising.
-
-    masks: (M, H, W) bool, none empty; scores: (M,) stability times predicted IoU. A mask goes when its IoU
-    with any higher-scored mask, gone or not, is > nms_iou; when its score is <= nms_score; or when it lies
-    inside another mask, whatever the scores, so that 1 - (its share in both areas multiplied) > nms_inner.
-    Source: `mask_nms` of LangSplat's preprocessing, with the thresholds that it passes.
-    """
+    """(K,) indices of the masks that stay, rising. masks: (M, H, W) bool, none empty; scores: (M,) stability
+    times predicted IoU. A mask goes when its IoU with any higher-scored mask, gone or not, is > nms_iou; when
+    its score is <= nms_score; or when it lies inside another mask, whatever the scores, so that 1 - (its
+    share in both areas multiplied) > nms_inner. Source: `mask_nms` of LangSplat's preprocessing, with the
+    thresholds that it passes."""
     common = common_pixels(masks)
     area = np.diag(common)
     order = np.argsort(-scores, kind="stable")
@@ -351,23 +336,13 @@ HALF_ON = "cuda"  # where products are float16's: bfloat16's error is seven time
 
 def load_mask_source(config: MaskConfig, device: str = "auto") -> MaskSource:
     """The source that `config` asks for; "auto" is SAM where `config.sam` names weights, else the graph.
-
-    Raises EncoderError where SAM's weights are absent, InputError where they are not named at all.
-    """
+    Raises EncoderError where SAM's weights are absent, InputError where they are not named at all."""
     if config.source == "graph" or (config.source == "auto" and not config.sam):
         return GraphMasks()
     if not config.sam:
         raise InputError(
             "masks.source sam: name the weights too, such as `--masks.sam facebook/sam-vit-huge`"
         )
-    return load_sam(config, device)
-
-
-def load_sam(config: MaskConfig, device: str = "auto") -> "SamMasks":
-    """Load the weights that `config.sam` names: a folder in Hugging Face layout or a hub id.
-
-    Raises EncoderError where they are absent or are not those of a SAM.
-    """
     return SamMasks(load_segmenter(config.sam, device), config, torch_device(device).startswith(HALF_ON))
 
 
@@ -433,10 +408,8 @@ class SamMasks(MaskSource):
         return LevelMasks((kept[0][0], kept[1][0], kept[2][0]), (kept[0][1], kept[1][1], kept[2][1]))
 
     def _in_crop(self, image: Array, crop: Array, progress: Progress, half: bool) -> list[list[Proposal]]:
-        """The proposals that one crop (4,) of the image gives at each level, in pixels of the image.
-
-        Raises OverflowError for `half` where numbers are larger than float16 holds.
-        """
+        """The proposals that one crop (4,) of the image gives at each level, in pixels of the image. Raises
+        OverflowError for `half` where numbers are larger than float16 holds."""
         import torch
 
         left, top, right, bottom = crop
@@ -499,10 +472,8 @@ class SamMasks(MaskSource):
 
 def measure(logits: Any, offset: float) -> Any:
     """(B, 5) float32 of (B, H, W) full-size logits, on their device: stability, left, top, right, bottom, px;
-    right and bottom exclusive, all 0 of an empty mask.
-
-    At full size, as in segment_anything: at the decoder's own, areas and boxes of small masks differ.
-    """
+    right and bottom exclusive, all 0 of an empty mask. At full size, as in segment_anything: at the decoder's
+    own, areas and boxes of small masks differ."""
     import torch
 
     inside = ((logits > cut).view(torch.uint8).flatten(1) for cut in (offset, -offset))
@@ -517,12 +488,10 @@ def measure(logits: Any, offset: float) -> Any:
 def filter_level(
     proposals: list[Proposal], shape: tuple[int, int], config: MaskConfig
 ) -> tuple[Array, Array]:
-    """Filter one level: (M, H, W) bool masks and (M,) float32 scores, stability times IoU.
-
-    proposals: of each crop those that no better one resembled. Order of the steps as in SAM's mask generator
-    with LangSplat's mask suppression behind it: boxes of different crops, where the smaller crop shows more
-    of a thing, crumbs, boxes again (there an untouched mask beats a cleaned one), pixels.
-    """
+    """Filter one level: (M, H, W) bool masks and (M,) float32 scores, stability times IoU. proposals: of each
+    crop those that no better one resembled. Order of the steps as in SAM's mask generator with LangSplat's
+    mask suppression behind it: boxes of different crops, where the smaller crop shows more of a thing,
+    crumbs, boxes again (there an untouched mask beats a cleaned one), pixels."""
     if not proposals:
         return np.zeros((0, *shape), bool), np.zeros(0, np.float32)
     closeness = np.array([1 / proposal.crop_area for proposal in proposals])

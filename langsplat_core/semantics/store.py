@@ -24,13 +24,11 @@ from langsplat_core.semantics.masks import LevelMasks, MaskSource, label_maps
 
 
 def masked_crop(image: Array, mask: Array, size: int) -> Array:
-    """Cut one region out: black outside the mask, bounding box, centred on a black square, resized.
-
-    image: (H, W, 3) uint8; mask: (H, W) bool with at least one pixel set; size: side of the result, px.
-    Returns (size, size, 3) uint8. Bilinear, with antialiasing when shrinking. This is the crop of the
-    method's public code (LangSplat `preprocess.py`), which the encoder must also be trained with.
-    Raises ValueError for an empty mask, which has no bounding box.
-    """
+    """Cut one region out: black outside the mask, bounding box, centred on a black square, resized. image:
+    (H, W, 3) uint8; mask: (H, W) bool with at least one pixel set; size: side of the result, px. Returns
+    (size, size, 3) uint8. Bilinear, with antialiasing when shrinking. This is the crop of the method's public
+    code (LangSplat `preprocess.py`), which the encoder must also be trained with. Raises ValueError for an
+    empty mask, which has no bounding box."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if rows.size == 0:
         raise ValueError("masked_crop: the mask is empty")
@@ -65,11 +63,9 @@ class ImageEncoder(Protocol):
 
 
 def embed_regions(image: Array, label_maps: Array, encoder: ImageEncoder) -> Array:
-    """(M, D) float32 unit vectors of the M regions that `label_maps` numbers.
-
-    image: (H, W, 3) uint8; label_maps: (3, H, W) int32 as of `masks.label_maps`. A region is shown as it
-    is visible in its map, on black; where masks of one level overlap, LangSplat shows the covered part too.
-    """
+    """(M, D) float32 unit vectors of the M regions that `label_maps` numbers. image: (H, W, 3) uint8;
+    label_maps: (3, H, W) int32 as of `masks.label_maps`. A region is shown as it is visible in its map, on
+    black; where masks of one level overlap, LangSplat shows the covered part too."""
     crops = np.zeros((int(label_maps.max()) + 1, encoder.image_size, encoder.image_size, 3), np.uint8)
     for labels in label_maps:
         for row, box in enumerate(ndimage.find_objects(labels + 1)):
@@ -136,10 +132,8 @@ class FeatureStore:
         return os.fsdecode(stored.tobytes())
 
     def has(self, name: str, key: str | None = None) -> bool:
-        """Return True where a whole file for `name` exists; with `key`, only if it was saved with that key.
-
-        A damaged one counts as absent, and is told of once: what it held is then made again.
-        """
+        """Return True where a whole file for `name` exists; with `key`, only if it was saved with that key. A
+        damaged one counts as absent, and is told of once: what it held is then made again."""
         try:
             if not exists(self.path(name)):
                 return False
@@ -240,13 +234,10 @@ def describe_capture(
     counted: Sequence[Array | None] = (),
 ) -> StoredFeatures:
     """Masks and CLIP vectors of every photograph, in order; those that `store` has already are not redone.
-    Without an encoder the vectors have no numbers.
-
-    images: (H, W, 3) uint8 each; names: unique, one per image; counted: (H, W) bool each, outside of which
-    no mask is kept (None: everywhere). What is finished is in the store even when
-    `progress` interrupts the work. Each photograph's regions are encoded by themselves: its file does not
-    depend on which others were made beside it.
-    """
+    Without an encoder the vectors have no numbers. images: (H, W, 3) uint8 each; names: unique, one per
+    image; counted: (H, W) bool each, outside of which no mask is kept (None: everywhere). What is finished is
+    in the store even when `progress` interrupts the work. Each photograph's regions are encoded by
+    themselves: its file does not depend on which others were made beside it."""
     made_by = "none" if encoder is None else fingerprint(encoder)
 
     def keep(finish: Callable[[], LevelMasks], index: int, key: str) -> None:

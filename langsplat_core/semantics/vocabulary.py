@@ -18,19 +18,15 @@ LONGEST = 80  # characters of a phrase: CLIP reads 77 tokens, and a whole paragr
 
 
 def bundled_vocabulary(name: Bundled) -> tuple[str, ...]:
-    """The phrases of a bundled list: everyday things, parts of things, colours, materials.
-
-    Raises InputError where it is missing from the installation.
-    """
+    """The phrases of a bundled list: everyday things, parts of things, colours, materials. Raises InputError
+    where it is missing from the installation."""
     return read_vocabulary(Path(str(files("langsplat_assets") / "vocabulary" / f"{name}.txt")))
 
 
 def read_vocabulary(path: Path) -> tuple[str, ...]:
-    """The phrases of a UTF-8 text file, one a line, in lower case, each once, in the file's order.
-
-    Empty lines and lines that begin with # do not count. Raises InputError for a file that cannot be read,
-    that has no phrase, or with a line that is none (no letter or digit, too long, no text), which is named.
-    """
+    """The phrases of a UTF-8 text file, one a line, in lower case, each once, in the file's order. Empty
+    lines and lines that begin with # do not count. Raises InputError for a file that cannot be read, that has
+    no phrase, or with a line that is none (no letter or digit, too long, no text), which is named."""
     try:
         lines = path.read_bytes().removeprefix(b"\xef\xbb\xbf").splitlines()
     except OSError as error:
@@ -94,10 +90,17 @@ MIXED = 96  # phrases of two words
 FEWEST = 48  # phrases from which they tell what fits by chance
 
 
-class _TextEncoder(Protocol):
-    def encode_texts(self, texts: list[str]) -> Array: ...
+class TextEncoder(Protocol):
+    """The text half of a CLIP model."""
 
-    def unknown_words(self, text: str) -> tuple[str, ...]: ...
+    def encode_texts(self, texts: list[str]) -> Array:
+        """(M, D) float32 unit vectors."""
+
+    def unknown_words(self, text: str) -> tuple[str, ...]:
+        """Words of `text` that the encoder was never taught; empty if it cannot tell."""
+
+    def near_words(self, word: str) -> tuple[str, ...]:
+        """Words it was taught that are written like an unknown one, the nearest first."""
 
 
 def everyday_phrases(unknown_words: Callable[[str], Sequence[str]]) -> list[str]:
@@ -112,7 +115,7 @@ def everyday_phrases(unknown_words: Callable[[str], Sequence[str]]) -> list[str]
     return [*nouns, *sorted({f"{adjective} {noun}" for adjective, noun in pairs})]
 
 
-def everyday_vectors(encoder: _TextEncoder) -> Array | None:
+def everyday_vectors(encoder: TextEncoder) -> Array | None:
     """(V, D) float32 unit vectors of the everyday phrases, of float16 precision, as a scene keeps them; None
     for an encoder that was taught too few of them."""
     phrases = everyday_phrases(encoder.unknown_words)

@@ -49,12 +49,10 @@ class Weights:
 
 
 def weights_path(model: str, option: str) -> Path:
-    """The folder or file that holds `model`, downloaded when it is a hub id that is not cached yet.
-
-    model: an existing folder or file, or a hub id "owner/name"; option: the setting to name in messages, such
-    as "--clip.model". What exists is never looked up on the hub, and with HF_HUB_OFFLINE set nothing is.
-    Raises EncoderError saying what to pass or to run.
-    """
+    """The folder or file that holds `model`, downloaded when it is a hub id that is not cached yet. model: an
+    existing folder or file, or a hub id "owner/name"; option: the setting to name in messages, such as
+    "--clip.model". What exists is never looked up on the hub, and with HF_HUB_OFFLINE set nothing is. Raises
+    EncoderError saying what to pass or to run."""
     path = Path(model).expanduser()
     if path.is_file():
         plain = any(path.match(pattern) for pattern in SAFE + PICKLED)
@@ -113,10 +111,8 @@ def _from_hub(model: str, option: str) -> Path:
 
 
 def model_type(weights: Weights) -> str:
-    """The architecture that the folder's config.json names, "" where it names none.
-
-    Raises EncoderError for a file that is no JSON.
-    """
+    """The architecture that the folder's config.json names, "" where it names none. Raises EncoderError for a
+    file that is no JSON."""
     if weights.converted:
         return str(weights.converted.config["model_type"])
     try:
@@ -128,9 +124,7 @@ def model_type(weights: Weights) -> str:
 
 def load_config(kind: Any, weights: Weights, name: str) -> Any:
     """The configuration of `weights` as transformers' class `kind`; `name` is the family's in messages.
-
-    Raises EncoderError where it cannot be read.
-    """
+    Raises EncoderError where it cannot be read."""
     with loading_errors(weights.id, name):
         if weights.converted:
             return kind.from_dict(deepcopy(weights.converted.config))
@@ -232,17 +226,14 @@ def unpickled(path: Path) -> dict[str, Any]:
     import torch
 
     mapped = zipfile.is_zipfile(path)  # files of PyTorch before 1.6 are none, and are read whole
-    tensors: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
-    return tensors
+    return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
 
 
 def load_model(kind: Any, weights: Weights, config: Any) -> Any:
-    """A transformers model of class `kind` in float32 on the device of `weights`, ready to be asked.
-
-    Raises EncoderError where the folder lacks some of its weights or has them in another shape:
-    transformers alone would fill those with random numbers. Converted weights may hold no more than the model
-    has, either: what was deduced from them may be wrong.
-    """
+    """A transformers model of class `kind` in float32 on the device of `weights`, ready to be asked. Raises
+    EncoderError where the folder lacks some of its weights or has them in another shape: transformers alone
+    would fill those with random numbers. Converted weights may hold no more than the model has, either: what
+    was deduced from them may be wrong."""
     import torch
 
     options = {"local_files_only": True, "ignore_mismatched_sizes": True, "output_loading_info": True}
@@ -265,9 +256,7 @@ def load_model(kind: Any, weights: Weights, config: Any) -> Any:
 
 def read_scalar(weights: Weights, name: str) -> float:
     """Read a number that is among the weights, without loading the rest of them; NaN where it is not there.
-
-    Half a model (a text tower) has no place for what belongs to the pair, such as a logit scale.
-    """
+    Half a model (a text tower) has no place for what belongs to the pair, such as a logit scale."""
     from safetensors import safe_open
 
     value = math.nan
@@ -328,10 +317,7 @@ def asking_errors(what: str) -> Iterator[None]:
 
 def torch_device(device: str) -> str:
     """Device that "auto" means here: cuda where PyTorch sees one, else cpu. EncoderError for an absent
-    device.
-
-    By its number: which one is current is a matter of each thread.
-    """
+    device. By its number: which one is current is a matter of each thread."""
     if device == "cpu":
         return device  # without importing torch, which a small text encoder does without
     import torch

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_viewer.output.saving import save_png
+from langsplat_viewer.output import save_png
 
 SIDE = 256  # pixels
 EDGE, SOFT = 2.0, 0.08  # standard deviations: where a Gaussian ends, and within what

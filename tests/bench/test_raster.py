@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from langsplat_core.bench import RasterBenchConfig
+from langsplat_core.bench import RasterBenchConfig, peak_memory, resident_memory, restart_peak
 from langsplat_core.bench import raster as bench_report
 from langsplat_core.bench.measure import Measurement, reference_windows
-from langsplat_core.bench.memory import peak_memory, resident_memory, restart_peak
 from langsplat_core.bench.raster import plot, run_plan, sweep
-from langsplat_core.cli.bench import write_report
+from langsplat_core.cli.evaluate import write_report
 from langsplat_core.raster.reference import ReferenceRasterizer
 from tests.support.scenes import random_camera, random_gaussians, random_values
 

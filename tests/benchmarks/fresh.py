@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from langsplat_core.arrays import Array, unit
-from langsplat_core.bench.memory import peak_memory
+from langsplat_core.bench import peak_memory
 from langsplat_core.errors import InputError
 from langsplat_core.scene import Camera, Reading, look_at
 from langsplat_core.semantics.store import ImageFeatures

@@ -24,7 +24,7 @@ from assets.making.objects import EVERYTHING
 from assets.making.scene import SEED
 from assets.making.truth import Truth, TruthMasks, read_truth
 from langsplat_core.arrays import Array
-from langsplat_core.cli.bench import write_report
+from langsplat_core.cli.evaluate import write_report
 from langsplat_core.cli.run import OutFolder
 from langsplat_core.config import (
     ClipConfig,
@@ -52,9 +52,8 @@ from langsplat_core.pipeline.language import Views, language_field
 from langsplat_core.pipeline.stages import stage_key
 from langsplat_core.pipeline.train import trained_gaussians
 from langsplat_core.progress import Progress, TerminalProgress
-from langsplat_core.query.answers import AnswerRule
+from langsplat_core.query.answers import AnswerRule, decoded_relevancy, splatted_relevancy
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.scene import LEVELS, Camera, Gaussians, LanguageField, Scene
 from langsplat_core.semantics.encoder import Encoder

@@ -27,9 +27,8 @@ import tyro
 from PIL import Image
 
 from langsplat_core.arrays import Array, psnr, sigmoid, unit
-from langsplat_core.bench import Size
+from langsplat_core.bench import Size, peak_memory, resident_memory, restart_peak
 from langsplat_core.bench.measure import markdown
-from langsplat_core.bench.memory import peak_memory, resident_memory, restart_peak
 from langsplat_core.bench.query import repeated
 from langsplat_core.cli.run import OutFolder
 from langsplat_core.config import Count, CountOrZero, PictureConfig, Range

@@ -19,12 +19,11 @@ from assets.making.dataset import MIN_PIXELS
 from assets.making.truth import PHRASE_KINDS, Phrase, Truth
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice, PictureConfig
-from langsplat_core.evaluation.scoring import intersection_over_union
+from langsplat_core.evaluation.report import intersection_over_union
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.answers import SPAN, QueryResult, peak_pixel
+from langsplat_core.query.answers import SPAN, QueryResult, decoded_relevancy, peak_pixel, splatted_relevancy
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
-from langsplat_core.query.regions import Regions
+from langsplat_core.query.selection import Regions
 from langsplat_core.raster.protocol import Rasterizer, View
 from langsplat_core.scene import Camera
 from langsplat_core.semantics.relevancy import FLOOR

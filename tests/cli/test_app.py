@@ -10,7 +10,7 @@ import pytest
 from tyro.extras import get_parser
 
 from langsplat_core import __version__
-from langsplat_core.cli import demo
+from langsplat_core.cli import scenes
 from langsplat_core.cli.app import COMMANDS, GROUPS, entry, load_command, parse
 from langsplat_core.cli.run import main
 from langsplat_core.cli.scenes import Doctor
@@ -122,9 +122,9 @@ def test_doctor_says_what_draws_and_what_encodes(capsys):
 
 @pytest.mark.long
 def test_demo_renders_the_bundled_scene(tmp_path, monkeypatch, capfd):
-    monkeypatch.setattr(demo, "PICTURES", {"gift.png": ("--query", "blue gift")})
+    monkeypatch.setattr(scenes, "PICTURES", {"gift.png": ("--query", "blue gift")})
     assert main("langsplat", lambda: parse(["demo", "--out", str(tmp_path)])) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["gift.png"]
     assert "'blue gift': found" in capfd.readouterr().out
-    monkeypatch.setattr(demo, "PICTURES", {"gift.png": ("--camera", "absent")})
+    monkeypatch.setattr(scenes, "PICTURES", {"gift.png": ("--camera", "absent")})
     assert main("langsplat", lambda: parse(["demo", "--out", str(tmp_path)])) == 2

@@ -11,8 +11,8 @@ import pytest
 
 from langsplat_core.arrays import unit
 from langsplat_core.cli.app import parse
+from langsplat_core.cli.export import Convert
 from langsplat_core.cli.run import main
-from langsplat_core.cli.scenes import Convert
 from langsplat_core.io import language
 from langsplat_core.io.language import write_language
 from langsplat_core.io.scenes import companion_path, load_scene, save_scene

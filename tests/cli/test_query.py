@@ -12,7 +12,7 @@ import pytest
 from plyfile import PlyData
 
 from langsplat_core.cli import describe, query
-from langsplat_core.cli.scenes import Scale
+from langsplat_core.cli.edit import Scale
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.query.engine import QueryEngine

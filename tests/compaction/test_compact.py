@@ -1,18 +1,20 @@
-"""A compact scene keeps its error budget, its meaning and its order, or is not written."""
+"""A compact scene keeps its error budget, its meaning and its order, or is not written; floaters go."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from langsplat_core.arrays import psnr
+from langsplat_core.arrays import Array, psnr
 from langsplat_core.cli import run as command_line
-from langsplat_core.cli.scenes import Compact
+from langsplat_core.cli.edit import Compact
 from langsplat_core.compaction import compact
+from langsplat_core.compaction.clean import CleanReport, clean, find_floaters
 from langsplat_core.compaction.compact import (
     ALONE,
     HOLD_OUT,
     Choice,
+    Views,
     choose_views,
     compact_scene,
     contributions,
@@ -24,28 +26,29 @@ from langsplat_core.compaction.compact import (
     select,
     smallest,
 )
-from langsplat_core.config import CompactConfig
+from langsplat_core.config import CleanConfig, CompactConfig
 from langsplat_core.datasets import Capture
 from langsplat_core.errors import InputError
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.progress import Progress, Report, silent
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.reference import ReferenceRasterizer
-from langsplat_core.scene import Camera, Scene, look_at
+from langsplat_core.scene import Camera, Gaussians, Scene, look_at
+from langsplat_core.scene.gaussians import join_gaussians
+from langsplat_core.scene.transform import moving, scaling, transform_scene
 from langsplat_core.scene.tree import tree_of_wholes
 from tests.support.file_samples import random_field
+from tests.support.hard_cases import balls
 from tests.support.scenes import random_gaussians
 
 N = 400
 CONFIG = CompactConfig(max_psnr_loss=0.3, max_side=64)
 
 
-def cameras(count: int = 14) -> tuple[Camera, ...]:
-    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
-    return tuple(
-        look_at(3 * np.array([np.cos(a), 0.3 * np.sin(3 * a), np.sin(a)]), np.zeros(3), [0, -1, 0], (64, 48))
-        for a in angles
-    )
+def cameras() -> tuple[Camera, ...]:
+    angles = np.linspace(0, 2 * np.pi, 14, endpoint=False)
+    eyes = 3 * np.stack([np.cos(angles), 0.3 * np.sin(3 * angles), np.sin(angles)], 1)
+    return tuple(look_at(eye, np.zeros(3), [0, -1, 0], (64, 48)) for eye in eyes)
 
 
 @pytest.fixture
@@ -71,13 +74,11 @@ def test_a_contribution_bounds_what_its_removal_changes():
     """One Gaussian on black, against the float64 reference: the picture is C = w c, and the score is
     sqrt(W (E + ALONE^2 W)) with E = sum w |c - C|^2, never less than sum w |c - C|."""
     gaussians = random_gaussians(12, seed=3, scale_range=(0.1, 0.3))
-    alone = [gaussians.take(np.array([row])) for row in range(12)]
     camera = cameras()[0].resized(32, 24)
-    for one in alone:
-        scene = Scene(one)
-        score = contributions(scene, [camera])[0]
-        view = ReferenceRasterizer().view(one, camera)
-        weight = view.splat(np.ones((1, 1)))[0]
+    for row in range(12):
+        one = gaussians.take([row])
+        score = contributions(Scene(one), [camera])[0]
+        weight = ReferenceRasterizer().view(one, camera).splat(np.ones((1, 1)))[0]
         colour = np.maximum(one.sh[0, 0].astype(float) * 0.28209479177387814 + 0.5, 0)
         distance = np.linalg.norm(colour * (1 - weight), axis=-1)  # |c - C|, with C = w c
         total = (weight[..., 0] * distance).sum()
@@ -89,12 +90,11 @@ def test_a_contribution_bounds_what_its_removal_changes():
 def test_loss_without_photographs_is_that_of_uncorrelated_errors(scene):
     """Photographs made as the picture plus noise of known strength: measured and derived loss agree."""
     view = scene.cameras[0].resized(256, 192)
-    less = scene.take(np.arange(N) % 9 > 0)
-    picture = draw(scene, view)
+    less, picture = scene.take(np.arange(N) % 9 > 0), draw(scene, view)
+    (plain,) = measuring_views(scene, [view], [None])
     noise = np.random.default_rng(0).normal(0, 10 ** (-30 / 20), picture.shape)
-    truth = replace(measuring_views(scene, [view], [None])[0], photograph=picture + noise)
-    measured = psnr_losses(less, [truth], 30.0)[0]
-    derived = psnr_losses(less, measuring_views(scene, [view], [None]), 30.0)[0]
+    measured = psnr_losses(less, [replace(plain, photograph=picture + noise)], 30.0)[0]
+    derived = psnr_losses(less, [plain], 30.0)[0]
     assert measured > 0.5
     assert derived == pytest.approx(measured, abs=0.1)  # the noise is finite: 147 000 numbers
     assert estimated_loss(1e-3, 30.0) == pytest.approx(10 * np.log10(2))
@@ -181,11 +181,11 @@ def test_bad_arguments_are_one_line_and_nothing_is_written(source, tmp_path, cap
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_a_scene_that_no_view_sees_is_refused(scene, tmp_path):
+def test_a_scene_that_no_view_sees_is_refused(scene, source, tmp_path):
     away = tuple(look_at(np.array([9.0, 0, z]), np.array([20.0, 0, 0]), [0, -1, 0], (32, 24)) for z in (0, 1))
-    save_scene(tmp_path / "scene.ply", replace(scene, cameras=away))
+    save_scene(source, replace(scene, cameras=away))
     with pytest.raises(InputError, match="visible"):
-        compact_scene(tmp_path / "scene.ply", tmp_path / "out.ply", CONFIG)
+        compact_scene(source, tmp_path / "out.ply", CONFIG)
 
 
 def test_interruption_leaves_the_old_file(source, tmp_path, monkeypatch):
@@ -219,9 +219,7 @@ def test_bisection_finds_the_edge_and_weighs_degrees():
 def test_photographs_of_another_world_are_refused(scene):
     named = [replace(camera, name=f"v{i}") for i, camera in enumerate(scene.cameras)]
     compact.check_same_world(named, named, "photos")
-    matrix = np.eye(4)
-    matrix[0, 3] = 0.2
-    moved = [replace(camera, world_to_camera=camera.world_to_camera @ matrix) for camera in named]
+    moved = [moving(np.array([0.2, 0, 0])).camera(camera) for camera in named]
     with pytest.raises(InputError, match="lie elsewhere"):
         compact.check_same_world(named, moved, "photos")
 
@@ -245,3 +243,85 @@ def test_photographs_held_out_from_training_measure(scene, source, tmp_path, mon
     monkeypatch.setattr(compact, "load_capture", lambda *_: strangers)
     with pytest.raises(InputError, match="something else"):
         compact_scene(source, tmp_path / "out.ply", CONFIG, photos=tmp_path)
+
+
+# Floaters go, the surface stays, and the budget holds.
+
+CLEAN = CleanConfig(max_side=64)
+WALL, FLOATERS = np.arange(24**2), 24**2 + np.arange(12)  # rows
+
+
+def coloured(means, scale: float, opacity: float) -> Gaussians:
+    sh = np.random.default_rng(0).uniform(-1, 1, (len(means), 1, 3))
+    x, y, z = np.transpose(means)
+    return replace(balls(z, opacity, scale, x, y), sh=sh)
+
+
+@pytest.fixture
+def dirty() -> Scene:
+    """A wall of 576, then a single, a clump of ten and a large veil before it; cameras in front."""
+    x, y = (side.ravel() for side in np.meshgrid(*[np.linspace(-1, 1, 24)] * 2))
+    parts = (
+        coloured(np.stack([x, y, 0 * x], 1), 0.04, 0.95),
+        coloured([[0.0, -0.5, -0.7]], 0.03, 0.8),
+        coloured([0.5, 0.4, -0.8] + 0.01 * np.random.default_rng(1).normal(size=(10, 3)), 0.02, 0.8),
+        coloured([[-0.3, 0.2, -1.0]], 0.8, 0.1),
+    )
+    eyes = [np.array([x, y, -2.5]) for x in (-0.8, -0.3, 0.3, 0.8) for y in (-0.5, 0, 0.5)]
+    seen_by = tuple(look_at(eye, np.zeros(3), [0, -1, 0], (64, 64)) for eye in eyes)
+    return Scene(join_gaussians(list(parts)), cameras=seen_by)
+
+
+def cleaned(scene: Scene, **changes: float) -> tuple[Array, CleanReport]:
+    """Without photographs."""
+    config = replace(CLEAN, **changes)
+    return clean(scene, choose_views(scene, None, config, silent), config)
+
+
+def test_floaters_are_told_from_the_wall(dirty):
+    found = find_floaters(dirty, dirty.cameras, 100)
+    np.testing.assert_array_equal(np.flatnonzero(found.suspicion), FLOATERS)
+    np.testing.assert_array_equal(np.flatnonzero(found.region), FLOATERS[:11])
+    # The size and place of the world are no matter.
+    there = transform_scene(dirty, scaling(40).then(moving(np.array([300.0, 0, 0]))))
+    np.testing.assert_array_equal(find_floaters(there, there.cameras, 100).suspicion, found.suspicion)
+
+
+def test_photographs_let_all_of_them_go(dirty):
+    """Of the wall alone: without floaters its images are these."""
+    wall, held = dirty.take(WALL), dirty.cameras[1::3]
+    photographs = tuple((255 * draw(wall, camera)).round().astype(np.uint8) for camera in held)
+    keep, report = clean(dirty, Views(dirty.cameras[::3], held, photographs, "here"), CLEAN)
+    np.testing.assert_array_equal(np.flatnonzero(~keep), FLOATERS)
+    assert (report.regions, report.free_space, report.kept) == (11, 1, 0)
+    assert report.loss < -1
+    assert report.psnr_after > report.psnr_before
+
+
+@pytest.mark.parametrize("budget", [0.0, 0.2, 50.0])
+def test_without_photographs_the_images_may_change_so_much(dirty, budget):
+    keep, report = cleaned(dirty, max_psnr_loss=budget)
+    assert report.loss <= budget + 1e-9
+    assert report.removed == (~keep).sum()
+    assert report.removed + report.kept == 12
+    assert keep[WALL].all()
+    assert (report.removed == 12) == (budget == 50)
+
+
+def test_rows_that_cannot_be_drawn_go(dirty):
+    dirty.gaussians.means[5] = np.nan
+    keep, report = cleaned(dirty)
+    assert not keep[5]
+    assert report.invalid == 1
+
+
+@pytest.mark.parametrize("count", [1, 2, 40])
+def test_a_scene_that_is_one_small_region_stays(count):
+    keep, report = cleaned(Scene(random_gaussians(count, scale_range=(0.5, 0.8))))
+    assert keep.any()
+    assert report.loss <= CLEAN.max_psnr_loss
+
+
+def test_nothing_cannot_be_cleaned():
+    with pytest.raises(InputError, match="nothing"):
+        clean(Scene(random_gaussians(0)), Views((), (), (), ""), CLEAN)

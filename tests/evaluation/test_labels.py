@@ -10,7 +10,7 @@ from plyfile import PlyData, PlyElement
 
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.evaluation.labels import read_3d_ovs, read_lerf_ovs, without_suffix
-from langsplat_core.evaluation.run import Subject
+from langsplat_core.evaluation.report import Subject
 from langsplat_core.evaluation.scannet import (
     CLASS_SETS,
     NYU40,

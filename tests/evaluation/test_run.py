@@ -25,9 +25,15 @@ from langsplat_core.evaluation.profiles import (
     read_silhouette,
     voted,
 )
-from langsplat_core.evaluation.report import save_json, summary, table
-from langsplat_core.evaluation.run import Subject, run_benchmark
-from langsplat_core.evaluation.scoring import inside_any_box, scored_size
+from langsplat_core.evaluation.report import (
+    Subject,
+    inside_any_box,
+    run_benchmark,
+    save_json,
+    scored_size,
+    summary,
+    table,
+)
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Scene

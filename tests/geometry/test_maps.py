@@ -63,11 +63,12 @@ def test_rays_pass_the_voxels_that_small_steps_pass(eye):
 
 def test_rays_along_an_axis_and_of_no_length_end():
     hits, passes = (np.zeros((4, 4, 4), np.uint16) for _ in range(2))
-    trace(np.array([0.5, 0.5, 0.5]), np.array([[3.5, 0.5, 0.5], [0.5, 0.5, 0.5]]), hits, passes)
+    start = np.full(3, 0.5)
+    trace(start, np.array([[3.5, 0.5, 0.5], start]), hits, passes)
     assert passes[:, 0, 0].tolist() == [1, 1, 1, 0]
     assert hits[3, 0, 0] == hits[0, 0, 0] == 1
     full = np.full((4, 4, 4), np.iinfo(np.uint16).max, np.uint16)
-    trace(np.array([0.5, 0.5, 0.5]), np.array([[3.5, 0.5, 0.5]]), full.copy(), full)
+    trace(start, np.array([[3.5, 0.5, 0.5]]), full.copy(), full)
     assert full[0, 0, 0] == np.iinfo(np.uint16).max
 
 
@@ -95,13 +96,12 @@ def test_a_room_is_free_within_its_walls():
     assert block.sum() > 10
     with pytest.raises(InputError, match="finer --resolution"):
         floor_map(occupancy, 0.6, 0.5)
-
-
-def test_what_cannot_be_a_map_is_refused():
-    with pytest.raises(InputError, match="no cameras"):
-        find_occupancy(replace(box_room(), cameras=()), map_axes(ROOM, 1.0), 0.1)
-    with pytest.raises(InputError, match="coarser --resolution"):
-        find_occupancy(box_room(), map_axes(ROOM, 1.0), 0.001)
+    for scene, side, message in (
+        (replace(box_room(), cameras=()), 0.1, "no cameras"),
+        (box_room(), 0.001, "coarser --resolution"),
+    ):
+        with pytest.raises(InputError, match=message):
+            find_occupancy(scene, map_axes(ROOM, 1.0), side)
 
 
 def plan_of(rows: list[str]) -> FloorMap:
@@ -113,35 +113,21 @@ def plan_of(rows: list[str]) -> FloorMap:
 PLAN = ["#######", "#..#..#", "#..#..#", "#..#.##", "#.....#", "#######"]
 
 
-def steps_to(plan: FloorMap, where: Array, start: Array, end: Array) -> int:
-    """Cells of the shortest way over neighbours in `where`, -1 without one: plain breadth first."""
-    ahead, seen = [(tuple(start), 0)], {tuple(start)}
-    for cell, length in ahead:
-        if cell == tuple(end):
-            return length
-        for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-            other = cell[0] + dx, cell[1] + dy
-            if where[other] and other not in seen:
-                seen.add(other)
-                ahead.append((other, length + 1))
-    return -1
-
-
 def test_goals_are_reachable_and_face_a_thing_with_nothing_between():
-    plan = plan_of(PLAN)
+    plan, thing = plan_of(PLAN), np.array([[4.5, 4.5]])
     where = reachable(plan, 0.4, (1.5, 1.5))
-    goal = find_goal(plan, where, np.array([[4.5, 4.5]]))
+    goal = find_goal(plan, where, thing)
     assert goal is not None
     assert goal.x >= 4  # not through the wall, where it would be as near
-    cell = np.floor([goal.x, goal.y]).astype(int)
-    assert steps_to(plan, where, np.array([1, 1]), cell) > 3
-    far = find_goal(plan, where, np.array([[4.5, 4.5]]), 1.5)
+    islands, _ = ndimage.label(where)  # of cells that share an edge
+    assert islands[int(goal.x), int(goal.y)] == islands[1, 1] > 0
+    far = find_goal(plan, where, thing, 1.5)
     assert far is not None
     assert far.distance >= 1.5
     assert np.hypot(4.5 - far.x, 4.5 - far.y) == pytest.approx(far.distance)
     assert far.yaw == pytest.approx(np.arctan2(4.5 - far.y, 4.5 - far.x))
-    assert find_goal(plan, where, np.array([[4.5, 4.5]]), 30.0) is None
-    assert find_goal(plan, np.zeros(plan.free.shape, bool), np.array([[4.5, 4.5]])) is None
+    assert find_goal(plan, where, thing, 30.0) is None
+    assert find_goal(plan, np.zeros(plan.free.shape, bool), thing) is None
 
 
 def test_a_robot_stays_where_it_fits_and_where_it_is():
@@ -160,10 +146,8 @@ def test_a_collider_is_closed_around_what_is_occupied():
     corners, squares = collider(Occupancy(np.eye(4), np.full(3, -1.0), 0.5, hits, np.zeros_like(hits)))
     assert len(squares) == 10
     np.testing.assert_allclose([corners.min(0), corners.max(0)], [[-0.5, -0.5, -0.5], [0.0, 0.0, 0.5]])
-    edges = [
-        tuple(sorted((a, b))) for square in squares for a, b in zip(square, np.roll(square, -1), strict=True)
-    ]
-    assert set(map(edges.count, edges)) == {2}
+    edges = np.sort(np.stack([squares, np.roll(squares, -1, 1)], -1).reshape(-1, 2), 1)
+    assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
     a, b, c = (corners[squares[:, k]] for k in range(3))
     outward = np.einsum("fi,fi->f", np.cross(b - a, c - b), corners[squares].mean(1) - corners.mean(0))
     assert (outward > 0).all()
@@ -208,19 +192,14 @@ def test_a_map_without_a_scale_is_refused(tmp_path, capsys):
 
 def test_goals_by_phrase_and_what_has_none(tmp_path, capsys):
     pytest.importorskip("open3d")
-    scene, named = box_room(), named_scene()
-    rows = len(scene.gaussians)
+    scene = box_room()
     near_block = (np.abs(scene.gaussians.means - [1.5, 0, FLOOR + 0.3]) < [0.4, 1.5, 0.4]).all(1)
-    assert named.language is not None
-    latents = np.zeros((3, rows, 4), np.float32)
+    latents = np.zeros((3, len(near_block), 4), np.float32)
     latents[..., 3] = 1
     latents[:, near_block] = [1, 0, 0, 0]
-    field = replace(
-        named.language,
-        latents=latents,
-        confidence=np.ones((3, rows), np.float32),
-        codec=named_scene(False).language.codec,
-    )
+    ones = np.ones(latents.shape[:2], np.float32)
+    codec = named_scene(False).language.codec
+    field = replace(named_scene().language, latents=latents, confidence=ones, codec=codec)
     save_scene(tmp_path / "room.ply", replace(scene, language=field, metres_per_unit=1.0))
     words = "map", tmp_path / "room.ply", tmp_path / "map", *COARSE, "--goal", "mug", "wall"
     assert run(*words) == 2

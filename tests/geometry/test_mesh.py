@@ -1,19 +1,16 @@
 """Meshes of rooms whose surfaces are known, holes and their closing, files; and two scenes as one."""
 
-import json
-import struct
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.geometry.mesh import Mesh, close_holes, fuse, generated_cameras, surface_depth
-from langsplat_core.io.shapes import gltf_axes, write_meshes
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.scene import Gaussians, Scene, look_at
+from langsplat_core.scene.transform import AXES, rotation_quaternion, turning
 from tests.support.scenes import FLOOR, WALL, box_room, random_camera, random_gaussians
 
 pytest.importorskip("open3d")
@@ -24,15 +21,10 @@ def ball(radius: float = 1.0, count: int = 3000) -> Scene:
     index = np.arange(count) + 0.5
     z, turn = 1 - 2 * index / count, np.pi * (1 + 5**0.5) * index
     normals = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], 1)
-    turns = [Rotation.align_vectors([normal], [[0, 0, 1]])[0].as_quat() for normal in normals]
-    sh = np.tile(np.array([1.0, -1.0, 0.0]), (count, 1, 1))
-    flat = np.log([0.04 * radius, 0.04 * radius, 0.0004 * radius])
-    return Scene(
-        Gaussians(
-            radius * normals, np.tile(flat, (count, 1)), np.array(turns)[:, [3, 0, 1, 2]],
-            np.full(count, 5.0), sh,
-        )
-    )  # fmt: skip
+    quats = [rotation_quaternion(turning(AXES["z"], normal).rotation) for normal in normals]
+    log_scales = np.tile(np.log(radius * np.array([0.04, 0.04, 0.0004])), (count, 1))
+    sh = np.tile([1.0, -1.0, 0.0], (count, 1, 1))
+    return Scene(Gaussians(radius * normals, log_scales, np.array(quats), np.full(count, 5.0), sh))
 
 
 def test_depth_is_that_of_the_planes_where_gaussians_are_flat():
@@ -41,9 +33,8 @@ def test_depth_is_that_of_the_planes_where_gaussians_are_flat():
     view = CpuRasterizer().view(scene.gaussians, camera)
     depth = surface_depth(scene.gaussians, camera, view.median_rows())
     rows, columns = np.nonzero(depth)
-    rays = np.stack([(columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy], 1)
-    points = np.column_stack([rays, np.ones(len(rays))]) * depth[rows, columns, None]
-    world = (points - camera.world_to_camera[:3, 3]) @ camera.rotation
+    pixels = np.stack([columns, rows], 1) + 0.5
+    world = np.stack([camera.unproject(*seen) for seen in zip(pixels, depth[rows, columns], strict=True)])
     on_wall = np.abs(np.abs(world[:, :2]).max(1) - WALL) < 0.1
     off = np.abs(np.abs(world[on_wall, :2]).max(1) - WALL)
     centres = np.abs(depth - view.median_depth())[rows, columns][on_wall]
@@ -84,22 +75,15 @@ def test_degenerate_gaussians_have_a_finite_depth():
         assert (depth >= 0).all()
 
 
-def sharp_room(seed: int = 1) -> Scene:
-    """With pixels of a centimetre."""
-    room = box_room(seed)
-    return replace(room, cameras=tuple(camera.resized(384, 288) for camera in room.cameras))
-
-
-def distances_to_room(points: Array) -> Array:
-    """To the nearest of floor and walls; what stands on the table is left out by height."""
-    return np.minimum(np.abs(points[:, 2] - FLOOR), np.abs(np.abs(points[:, :2]).max(1) - WALL))
-
-
 def test_the_surface_of_a_room_is_found():
-    mesh, side = fuse(sharp_room())
-    shell = (mesh.vertices[:, 2] < -0.1) & (np.abs(mesh.vertices[:, :2]).max(1) > 1.85)
+    """Photographed with pixels of a centimetre; what stands on the table is left out by height."""
+    room = box_room(1)
+    mesh, side = fuse(room, cameras=tuple(camera.resized(384, 288) for camera in room.cameras))
+    heights, across = mesh.vertices[:, 2], np.abs(mesh.vertices[:, :2]).max(1)
+    shell = (heights < -0.1) & (across > 1.85)
     assert shell.sum() > 1000
-    assert np.median(distances_to_room(mesh.vertices[shell])) < 0.005 < side
+    off = np.minimum(np.abs(heights - FLOOR), np.abs(across - WALL))  # from the nearest of floor and walls
+    assert np.median(off[shell]) < 0.005 < side
     assert mesh.holes() > 0  # no ceiling
     assert mesh.colour.min() >= 0
     assert mesh.colour.std() > 0.05
@@ -136,46 +120,11 @@ def test_generated_cameras_are_outside():
 
 def test_nothing_to_see_is_refused():
     away = look_at(np.array([0, 0, 3.0]), np.array([0, 0, 9.0]), np.array([0, 1.0, 0]), (20, 20))
-    with pytest.raises(InputError, match="see no surface"):
-        fuse(ball(), cameras=(away,))
-    with pytest.raises(InputError, match="finer than the images"):
-        fuse(ball(), 1e-6)
-    with pytest.raises(InputError, match="too few views"):
-        fuse(ball(), views=1000)
-    with pytest.raises(InputError, match="see no surface"):
-        fuse(Scene(random_gaussians(0)))
-
-
-def triangle() -> Mesh:
-    return Mesh(np.eye(3), np.array([[0, 1, 2]]), np.array([[1.0, 0, 0], [0, 0.5, 0], [0, 0, 0]]), "a b")
-
-
-def test_glb_holds_places_colours_and_axes(tmp_path):
-    scene = replace(box_room(), metres_per_unit=2.0)
-    write_meshes(tmp_path / "a.glb", [triangle(), triangle()], gltf_axes(scene))
-    data = (tmp_path / "a.glb").read_bytes()
-    magic, version, size, length, kind = struct.unpack("<4sIII4s", data[:20])
-    assert (magic, version, size, kind) == (b"glTF", 2, len(data), b"JSON")
-    document, binary = json.loads(data[20 : 20 + length]), data[28 + length :]
-    assert document["buffers"][0]["byteLength"] == len(binary)
-    assert len(document["meshes"]) == 2
-    np.testing.assert_array_equal(np.frombuffer(binary[:36], "<f4").reshape(3, 3), np.eye(3))
-    colours = np.frombuffer(binary[36:60], "<u2").reshape(3, 4) / 65_535
-    np.testing.assert_allclose(colours[:, :3].sum(1), [1, 0.2140, 0], atol=1e-4)  # linear
-    matrix = np.array(document["nodes"][0]["matrix"]).reshape(4, 4).T
-    np.testing.assert_allclose(matrix @ [0, 0, 1, 1], [0, 2, 0, 1], atol=1e-6)  # up, metres
-    import open3d
-
-    write_meshes(tmp_path / "one.glb", [triangle()])
-    read = open3d.io.read_triangle_mesh(str(tmp_path / "one.glb"))
-    np.testing.assert_allclose(np.asarray(read.vertices), np.eye(3))
-
-
-@pytest.mark.parametrize("suffix", [".ply", ".obj"])
-def test_other_programs_read_colours_of_vertices(tmp_path, suffix):
-    import open3d
-
-    write_meshes(tmp_path / f"a{suffix}", [triangle()])
-    read = open3d.io.read_triangle_mesh(str(tmp_path / f"a{suffix}"))
-    np.testing.assert_allclose(np.asarray(read.vertices), np.eye(3))
-    np.testing.assert_allclose(np.asarray(read.vertex_colors), triangle().colour, atol=0.003)
+    for message, scene, options in (
+        ("see no surface", ball(), {"cameras": (away,)}),
+        ("finer than the images", ball(), {"resolution": 1e-6}),
+        ("too few views", ball(), {"views": 1000}),
+        ("see no surface", Scene(random_gaussians(0)), {}),
+    ):
+        with pytest.raises(InputError, match=message):
+            fuse(scene, **options)

@@ -1,8 +1,10 @@
-"""Files of other methods, read: what is found in them, and which belong together."""
+"""Files of other methods: what is found in them, which belong together, and what is refused."""
 
+import io
 import json
 import os
 import pickle
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +15,7 @@ import torch
 from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.foreign import ForeignScene, read_foreign
+from langsplat_core.io.langsplat_files import read_features, write_features
 from langsplat_core.io.ply import write_ply
 from langsplat_core.scene import Gaussians
 from tests.support.comparing import assert_same
@@ -28,8 +31,10 @@ CENTROIDS = rng.normal(size=(4, 256, D // 4)).astype(np.float32)
 ALL = np.arange(N)
 
 
-def rows(scene: ForeignScene, level: int) -> Array:
-    return scene.rows(level, np.arange(len(scene.scene.gaussians)))
+def assert_rows(scene: ForeignScene, level: int, want: Array, atol: float = 0.0) -> None:
+    """The vectors of all Gaussians at a level are these."""
+    found = scene.rows(level, np.arange(len(scene.scene.gaussians)))
+    np.testing.assert_allclose(found, want, rtol=0, atol=atol)
 
 
 def langsplat(folder: Path, levels: tuple[int, ...] = (1, 2, 3), g: Gaussians = G) -> list[Path]:
@@ -57,7 +62,7 @@ def test_langsplat_and_its_autoencoder(tmp_path):
     assert got.method == "LangSplat"
     assert_same(got.scene.gaussians, G)
     for level in range(3):
-        np.testing.assert_array_equal(rows(got, level), LATENTS[level])
+        assert_rows(got, level, LATENTS[level])
     assert "by the names of files and folders" in got.notes[0]
 
 
@@ -88,8 +93,8 @@ def test_the_autoencoder_is_the_networks(tmp_path, widths):
 def test_levels_may_be_missing_and_are_told_apart(tmp_path):
     ae = best_ckpt(tmp_path)
     got = read_foreign([*langsplat(tmp_path, (3, 1)), ae])
-    np.testing.assert_array_equal(rows(got, 0), LATENTS[0])
-    np.testing.assert_array_equal(rows(got, 2), LATENTS[2])
+    assert_rows(got, 0, LATENTS[0])
+    assert_rows(got, 2, LATENTS[2])
     assert got.levels[1] is None
     assert "without features: part" in got.notes
     nameless = [save_model(tmp_path / f"{name}.pth", G, tensor(LATENTS[i])) for i, name in enumerate("xyz")]
@@ -98,8 +103,8 @@ def test_levels_may_be_missing_and_are_told_apart(tmp_path):
     with pytest.raises(InputError, match="of which levels"):
         read_foreign([*nameless[:2], ae])
     asked = read_foreign([*nameless[:2], ae], ["whole", "subpart"])
-    np.testing.assert_array_equal(rows(asked, 2), LATENTS[0])
-    np.testing.assert_array_equal(rows(asked, 0), LATENTS[1])
+    assert_rows(asked, 2, LATENTS[0])
+    assert_rows(asked, 0, LATENTS[1])
     for levels in (["whole"], ["part", "part"]):
         with pytest.raises(InputError, match="name a level for each"):
             read_foreign([*nameless[:2], ae], levels)
@@ -126,7 +131,7 @@ def test_langsplat_v2(tmp_path):
     assert (got.method, got.dim) == ("LangSplatV2", D)
     want = mixture(logits, codebooks, 4)
     want[5] = 0
-    np.testing.assert_allclose(rows(got, 1), want, atol=1e-5)
+    assert_rows(got, 1, want, 1e-5)
     assert got.levels[0] is got.levels[2] is None
 
 
@@ -137,28 +142,23 @@ def occam(folder: Path, kept: tuple[Array, ...]) -> list[Path]:
     ]
 
 
-def test_occam(tmp_path):
-    got = read_foreign(occam(tmp_path, (ALL, ALL, ALL)))
-    assert got.method == "Occam's LGS"
-    for level in range(3):
-        np.testing.assert_array_equal(rows(got, level), VECTORS[level])
+LACKING = (ALL[2:], np.r_[0:7, 9:19], ALL[1:15][::-1])
 
 
-@pytest.mark.parametrize("with_all", [False, True])
-def test_occam_where_levels_lack_different_gaussians(tmp_path, with_all):
-    kept = (ALL[2:], np.r_[0:7, 9:19], ALL[1:15][::-1])
+@pytest.mark.parametrize(("kept", "with_all"), [((ALL,) * 3, False), (LACKING, False), (LACKING, True)])
+def test_occam_where_levels_may_lack_different_gaussians(tmp_path, kept, with_all):
     paths = occam(tmp_path, kept)
     if with_all:
         paths.append(save_model(tmp_path / "chkpnt30000.pth", G))
     got = read_foreign(paths)
+    assert got.method == "Occam's LGS"
     means = got.scene.gaussians.means
     assert len(means) == N  # every Gaussian is in one of the three
     order = np.array([np.flatnonzero((G.means == mean).all(1))[0] for mean in means])
     assert_same(got.scene.gaussians, G.take(order))
     for level in range(3):
-        want = np.where(np.isin(order, kept[level])[:, None], VECTORS[level][order], 0)
-        np.testing.assert_array_equal(rows(got, level), want)
-    assert "lack some Gaussians" in got.notes[-1]
+        assert_rows(got, level, np.where(np.isin(order, kept[level])[:, None], VECTORS[level][order], 0))
+    assert any("lack some Gaussians" in note for note in got.notes) == (kept is LACKING)
 
 
 def test_gaussians_at_one_place_are_kept_apart(tmp_path):
@@ -167,7 +167,7 @@ def test_gaussians_at_one_place_are_kept_apart(tmp_path):
     less = save_model(tmp_path / "a_langfeat_2.pth", g.take(ALL[:15]), tensor(VECTORS[1][:15]))
     got = read_foreign([path, less])
     assert len(got.scene.gaussians) == N
-    np.testing.assert_array_equal(rows(got, 1), np.concatenate([VECTORS[1][:15], np.zeros((5, D))]))
+    assert_rows(got, 1, np.concatenate([VECTORS[1][:15], np.zeros((5, D))]))
 
 
 def test_dr_splat(tmp_path):
@@ -178,15 +178,12 @@ def test_dr_splat(tmp_path):
     path = save_model(tmp_path / "figurines_1_pq_openclip" / "chkpnt0.pth", G, tensor(codes))
     for metric in (0, 1, 4):
         (tmp_path / "pq_index.faiss").write_bytes(faiss_index(CENTROIDS, metric=metric))
-        got = read_foreign([path, tmp_path / "pq_index.faiss"])
-        np.testing.assert_array_equal(rows(got, 0), want)
+        assert_rows(read_foreign([path, tmp_path / "pq_index.faiss"]), 0, want)
     np.save(tmp_path / "a.npy", CENTROIDS)
-    np.testing.assert_array_equal(rows(read_foreign([tmp_path / "a.npy", path]), 0), want)
-    with pytest.raises(InputError, match=r"name its pq_index\.faiss"):
-        read_foreign([path])
+    assert_rows(read_foreign([tmp_path / "a.npy", path]), 0, want)
+    refused([path], r"name its pq_index\.faiss")
     np.save(tmp_path / "a.npy", CENTROIDS[:3])
-    with pytest.raises(FormatError, match=r"4 codes per Gaussian, .* 3 parts"):
-        read_foreign([path, tmp_path / "a.npy"])
+    refused([path, tmp_path / "a.npy"], r"4 codes per Gaussian, .* 3 parts")
 
 
 def leaves(path: Path, index: Array, count: int = 6) -> Array:
@@ -208,19 +205,16 @@ def test_open_gaussian(tmp_path, as_ply):
         write_ply(path, G, extras=dict(zip(names, instance.T, strict=True)))
     else:
         path = save_model(tmp_path / "chkpnt90000.pth", G, tensor(instance), tensor(instance))
-        with pytest.raises(InputError, match=r"cluster_lang\.npz, name it too"):
-            read_foreign([path])
-    got = read_foreign([path, tmp_path / "cluster_lang.npz"])
+        refused([path], r"cluster_lang\.npz, name it too")
+    both = [path, tmp_path / "cluster_lang.npz"]
+    got = read_foreign(both)
     assert got.method == "OpenGaussian"
-    want = np.where((index >= 0)[:, None] & (index < 6)[:, None], vectors[index.clip(0, 5)], 0)
-    np.testing.assert_array_equal(rows(got, 2), want)
+    assert_rows(got, 2, np.where(((index >= 0) & (index < 6))[:, None], vectors[index.clip(0, 5)], 0))
     assert got.levels[:2] == (None, None)
     leaves(tmp_path / "cluster_lang.npz", index[1:])
-    with pytest.raises(FormatError, match="clusters of 19 Gaussians"):
-        read_foreign([path, tmp_path / "cluster_lang.npz"])
+    refused(both, "clusters of 19 Gaussians")
     leaves(tmp_path / "cluster_lang.npz", index + 100)
-    with pytest.raises(FormatError, match="names none of the 6 clusters"):
-        read_foreign([path, tmp_path / "cluster_lang.npz"])
+    refused(both, "names none of the 6 clusters")
 
 
 def test_feature_3dgs(tmp_path):
@@ -228,19 +222,17 @@ def test_feature_3dgs(tmp_path):
     extras = {f"semantic_{i}": VECTORS[0][:, i] for i in reversed(range(D))} | {"kept": VECTORS[0][:, 0]}
     write_ply(ply, G, extras=extras)
     got = read_foreign([ply])
-    np.testing.assert_array_equal(rows(got, 2), VECTORS[0])
+    assert_rows(got, 2, VECTORS[0])
     assert list(got.scene.extras) == ["kept"]
     for shape in ((N, 1, D), (N, D, 1), (N, D)):
         path = save_model(tmp_path / "c.pth", G, behind=(tensor(VECTORS[0].reshape(shape)),))
         got = read_foreign([path])
         assert got.method == "Feature-3DGS"
-        np.testing.assert_array_equal(rows(got, 2), VECTORS[0])
+        assert_rows(got, 2, VECTORS[0])
     torch.save({"conv.weight": torch.zeros(D, 8, 1, 1), "conv.bias": torch.zeros(D)}, tmp_path / "dec.pth")
-    with pytest.raises(FormatError, match="decodes pictures, not Gaussians"):
-        read_foreign([path, tmp_path / "dec.pth"])
+    refused([path, tmp_path / "dec.pth"], "decodes pictures, not Gaussians")
     write_ply(ply, G, extras={"semantic_0": VECTORS[0][:, 0], "semantic_2": VECTORS[0][:, 0]})
-    with pytest.raises(FormatError, match="without gaps"):
-        read_foreign([ply])
+    refused([ply], "without gaps")
 
 
 def test_half_precision_and_older_files(tmp_path):
@@ -248,10 +240,10 @@ def test_half_precision_and_older_files(tmp_path):
     for kind in (torch.bfloat16, torch.float16):
         want = torch.from_numpy(VECTORS[0]).to(kind)
         path = save_model(tmp_path / "c.pth", G, want)
-        np.testing.assert_array_equal(rows(read_foreign([path]), 2), want.float().numpy())
+        assert_rows(read_foreign([path]), 2, want.float().numpy())
     content = ((*geometry(G), tensor(VECTORS[0]), *training_state(G)), 7)
     torch.save(content, tmp_path / "old.pth", _use_new_zipfile_serialization=False)
-    np.testing.assert_array_equal(rows(read_foreign([tmp_path / "old.pth"]), 2), VECTORS[0])
+    assert_rows(read_foreign([tmp_path / "old.pth"]), 2, VECTORS[0])
 
 
 def test_cameras_of_the_models_folder(tmp_path):
@@ -380,3 +372,105 @@ def test_damaged_quantisers(tmp_path):
         refused([path, checkpoint], message)
     np.savez(tmp_path / "x.npz", a=np.zeros((3, 4)))
     refused([tmp_path / "x.npz", checkpoint], r"holds arrays \(3, 4\)")
+
+
+# The masks and vectors of one photograph as the original LangSplat stores them.
+
+FEATURES = rng.normal(size=(9, 512)).astype(np.float32)
+MAPS = rng.integers(-1, 9, size=(4, 6, 8)).astype(np.int32)
+
+
+@pytest.fixture
+def save(tmp_path: Path) -> Callable[..., Path]:
+    """Writes both files of "view.01", each from an array or as bytes."""
+
+    def write(vectors: Array | bytes = FEATURES, maps: Array | bytes = MAPS) -> Path:
+        for letter, content in (("f", vectors), ("s", maps)):
+            path = tmp_path / f"view.01_{letter}.npy"
+            path.write_bytes(content) if isinstance(content, bytes) else np.save(path, content)
+        return tmp_path
+
+    return write
+
+
+def test_features_are_read_back(tmp_path):
+    write_features(tmp_path / "new", "view.01", FEATURES, MAPS)
+    assert sorted(p.name for p in (tmp_path / "new").iterdir()) == ["view.01_f.npy", "view.01_s.npy"]
+    vectors, maps = read_features(tmp_path / "new", "view.01")
+    np.testing.assert_array_equal(vectors, FEATURES)
+    np.testing.assert_array_equal(maps, MAPS)
+    assert (vectors.dtype, maps.dtype) == (np.float32, np.int32)
+    np.testing.assert_array_equal(np.load(tmp_path / "new" / "view.01_s.npy"), MAPS)
+    write_features(tmp_path, "empty", FEATURES[:0], np.full_like(MAPS, -1))
+    vectors, maps = read_features(tmp_path, "empty")
+    assert vectors.shape == (0, 512)
+    assert (maps == -1).all()
+
+
+@pytest.mark.parametrize("kind", ["f4", "i8", "i2", ">i4"])
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_maps_of_other_writers(save, kind, order):
+    folder = save(FEATURES[:, :3].astype(np.float16), np.asarray(MAPS, kind, order=order))
+    vectors, maps = read_features(folder, "view.01")
+    np.testing.assert_array_equal(maps, MAPS)
+    assert vectors.shape == (9, 3)
+
+
+def with_value(value: float) -> Array:
+    maps = MAPS.astype("f4")
+    maps[3, 5, 7] = value
+    return maps
+
+
+def npy(shape: tuple[int, ...], data: bytes = b"", kind: str = "<f4") -> bytes:
+    buffer = io.BytesIO()
+    np.lib.format.write_array_header_1_0(buffer, {"descr": kind, "fortran_order": False, "shape": shape})
+    return buffer.getvalue() + data
+
+
+MAP_SHAPE, VECTOR_SHAPE = "expected numbers of shape", r"expected floats of shape \(M, D\)"
+HELD, PLAIN = "truncated or damaged", "not a .npy file of plain numbers"
+BROKEN = {  # vectors, maps, message
+    "an id too high": (FEATURES, with_value(9), r"ids from -1.* to 9.*expected -1 to 8, the rows of view"),
+    "an id below -1": (FEATURES, with_value(-2), "ids from -2"),
+    "an id that is none": (FEATURES, with_value(np.nan), "ids from nan"),
+    "half an id": (FEATURES, with_value(1.5), "ids that are not whole"),
+    "three maps": (FEATURES, MAPS[:3], rf"\(3, 6, 8\); {MAP_SHAPE} \(4, H, W\)"),
+    "one map": (FEATURES, MAPS[0], MAP_SHAPE),
+    "maps without pixels": (FEATURES, MAPS[:, :0], MAP_SHAPE),
+    "maps of text": (FEATURES, MAPS.astype("U2"), MAP_SHAPE),
+    "flat vectors": (FEATURES[0], MAPS, VECTOR_SHAPE),
+    "whole vectors": (FEATURES.astype(np.int32), MAPS, VECTOR_SHAPE),
+    "vectors that are none": (FEATURES * np.float32(np.nan), MAPS, "not finite"),
+    "pickled objects": (np.array([{}], dtype=object), MAPS, PLAIN),
+    "complex vectors": (FEATURES.astype(complex), MAPS, PLAIN),
+    "a trillion rows": (npy((10**12, 512)), MAPS, HELD),
+    "2^80 numbers": (npy((2**40, 2**40)), MAPS, HELD),
+    "truncated": (npy((9, 512), FEATURES.tobytes()[:-1]), MAPS, HELD),
+    "too long": (npy((9, 512), FEATURES.tobytes() + b"x"), MAPS, HELD),
+    **{
+        f"another kind {content[:8]!r}": (FEATURES, content, r"view\.01_s\.npy: not a \.npy file")
+        for content in (b"", b"\x93NUMPY", b"\x93NUMPY\x09\x00aa", pickle.dumps([1]), npy((-9, -8)))
+    },
+    "objects for maps": (FEATURES, npy((9,), kind="|O"), r"view\.01_s\.npy: not a \.npy file"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_every_broken_rule_of_features_has_its_message(save, case):
+    *arrays, message = BROKEN[case]
+    folder = save(*arrays)
+    with pytest.raises(FormatError, match=message) as caught:
+        read_features(folder, "view.01")
+    assert str(caught.value).startswith(str(folder / "view.01_"))
+
+
+def test_features_that_are_missing_or_could_not_be_read_again(tmp_path, save):
+    (save() / "view.01_s.npy").unlink()
+    with pytest.raises(InputError, match=r"view\.01_s\.npy: no such file"):
+        read_features(tmp_path, "view.01")
+    with pytest.raises(ValueError, match="beyond the 8 vectors"):
+        write_features(tmp_path / "none", "a", FEATURES[:8], np.full((4, 1, 1), 8, np.int32))
+    with pytest.raises(TypeError):
+        write_features(tmp_path / "none", "a", FEATURES.astype(np.float64), MAPS)
+    assert not list(tmp_path.glob("none/*"))

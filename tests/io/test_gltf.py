@@ -1,21 +1,25 @@
-"""glTF with KHR_gaussian_splatting: what is written, placed by nodes, packed as .spz; and hostile files."""
+"""For other programs: glTF with KHR_gaussian_splatting, written, placed by nodes, packed as .spz and hostile;
+point clouds and meshes."""
 
 import json
-import shutil
 import struct
-import subprocess
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from plyfile import PlyData
 
 from langsplat_core.arrays import sigmoid, unit
-from langsplat_core.errors import FormatError
+from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.gltf import EXTENSION, PACKED, write_gltf
 from langsplat_core.io.ply import write_ply
 from langsplat_core.io.scenes import load_gaussians
+from langsplat_core.io.shapes import base_colours, gltf_axes, write_meshes, write_points
 from langsplat_core.io.spz import write_spz
-from langsplat_core.scene import Gaussians
+from langsplat_core.scene import Gaussians, Scene
 from langsplat_core.scene.transform import moving, rotating, scaling, transform_gaussians
 from tests.support.scenes import covariances, random_gaussians
 
@@ -36,11 +40,13 @@ def glb(content: dict, binary: bytes) -> bytes:
     return header + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
 
 
-def changed(path, change) -> None:
-    """Rewrite a .glb with its JSON changed in place."""
+def written(path: Path, scene: Gaussians, change: Callable[[dict], object] = lambda content: None) -> Path:
+    """`scene` as a .glb whose JSON is changed in place."""
+    write_gltf(path, scene)
     content, binary = parts(path.read_bytes())
     change(content)
     path.write_bytes(glb(content, binary))
+    return path
 
 
 def assert_alike(got: Gaussians, want: Gaussians, places: float = 1e-5) -> None:
@@ -68,10 +74,9 @@ def test_axes_are_those_of_the_standard(tmp_path):
     scene = random_gaussians(50, sh_degree=3)
     write_gltf(tmp_path / "a.glb", scene)
     content, binary = parts((tmp_path / "a.glb").read_bytes())
-    attributes = content["meshes"][0]["primitives"][0]["attributes"]
 
     def column(name: str) -> np.ndarray:
-        about = content["accessors"][attributes[name]]
+        about = content["accessors"][splats(content)["attributes"][name]]
         view = content["bufferViews"][about["bufferView"]]
         data = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
         return np.frombuffer(data, "<f4").reshape(50, -1)
@@ -79,14 +84,9 @@ def test_axes_are_those_of_the_standard(tmp_path):
     want = transform_gaussians(scene, HALF_TURN)
     np.testing.assert_allclose(column("POSITION"), want.means, atol=1e-6)
     np.testing.assert_allclose(column(f"{EXTENSION}:SCALE"), np.exp(want.log_scales), rtol=1e-5)
-    for number, name in (
-        (0, "0_COEF_0"),
-        (1, "1_COEF_0"),
-        (8, "2_COEF_4"),
-        (9, "3_COEF_0"),
-        (15, "3_COEF_6"),
-    ):
-        np.testing.assert_allclose(column(f"{EXTENSION}:SH_DEGREE_{name}"), want.sh[:, number], atol=1e-5)
+    for number, degree, coefficient in ((0, 0, 0), (1, 1, 0), (8, 2, 4), (9, 3, 0), (15, 3, 6)):
+        found = column(f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{coefficient}")
+        np.testing.assert_allclose(found, want.sh[:, number], atol=1e-5)
     # the shapes, of which quaternions are one way to say them
     made = replace(want, quats_wxyz=column(f"{EXTENSION}:ROTATION")[:, [3, 0, 1, 2]])
     np.testing.assert_allclose(covariances(made), covariances(want), atol=1e-5 * covariances(want).max())
@@ -94,14 +94,10 @@ def test_axes_are_those_of_the_standard(tmp_path):
 
 def test_hard_rows_are_written(tmp_path):
     scene = random_gaussians(8, sh_degree=1)
-    means, scales, quats = scene.means.copy(), scene.log_scales.copy(), scene.quats_wxyz.copy()
-    means[0], means[1], scales[2, 0], quats[3], quats[4] = np.nan, 1e30, -np.inf, 0, quats[4] * -7
-    logits = scene.opacity_logits.copy()
-    logits[5], logits[6] = np.inf, -np.inf
-    write_gltf(
-        tmp_path / "a.glb",
-        replace(scene, means=means, log_scales=scales, quats_wxyz=quats, opacity_logits=logits),
-    )
+    scene.means[0], scene.means[1], scene.log_scales[2, 0] = np.nan, 1e30, -np.inf
+    scene.quats_wxyz[3:5] *= [[0], [-7]]
+    scene.opacity_logits[5:7] = np.inf, -np.inf
+    write_gltf(tmp_path / "a.glb", scene)
     got = load_gaussians(tmp_path / "a.glb")
     assert got.valid().all()
     assert (sigmoid(got.opacity_logits)[[0, 3, 6]] == 0).all()
@@ -115,7 +111,6 @@ def test_hard_rows_are_written(tmp_path):
 
 def test_nodes_place_what_they_hold(tmp_path):
     scene = random_gaussians(40, sh_degree=3)
-    write_gltf(tmp_path / "a.glb", scene)
     turn = rotating(np.array([1.0, 2, 3]), 70)
 
     def place(content: dict) -> None:
@@ -127,10 +122,21 @@ def test_nodes_place_what_they_hold(tmp_path):
         ]
         content["scenes"] = [{"nodes": [1]}]
 
-    changed(tmp_path / "a.glb", place)
     there = scaling(2).then(turn).then(moving(np.array([5.0, 6, 7])))
     want = transform_gaussians(scene, HALF_TURN.then(there).then(HALF_TURN))
-    assert_alike(load_gaussians(tmp_path / "a.glb"), want, 1e-4)
+    assert_alike(load_gaussians(written(tmp_path / "a.glb", scene, place)), want, 1e-4)
+
+
+def one_mesh(attributes: dict[str, int], extension: dict, size: int, **buffer: str) -> dict:
+    """The JSON of a file of one primitive, its numbers in a buffer of `size` bytes; without its columns."""
+    primitive = {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: extension}}
+    return {
+        "asset": {"version": "2.0"},
+        "bufferViews": [{"buffer": 0, "byteLength": size}],
+        "buffers": [{"byteLength": size, **buffer}],
+        "meshes": [{"primitives": [primitive]}],
+        "nodes": [{"mesh": 0}],
+    }
 
 
 @pytest.mark.parametrize("name", PACKED)
@@ -139,15 +145,9 @@ def test_an_spz_inside_is_read(tmp_path, name):
     write_spz(tmp_path / "a.spz", scene)
     data = (tmp_path / "a.spz").read_bytes()
     inside = {"extensions": {name: {"bufferView": 0}}}
-    primitive = {"attributes": {"POSITION": 0}, "mode": 0, "extensions": {EXTENSION: inside}}
-    content = {
-        "asset": {"version": "2.0"},
+    content = one_mesh({"POSITION": 0}, inside, len(data)) | {
         "extensionsRequired": [EXTENSION, name],
         "accessors": [{"count": 60, "type": "VEC3", "componentType": 5126}],
-        "bufferViews": [{"buffer": 0, "byteLength": len(data)}],
-        "buffers": [{"byteLength": len(data)}],
-        "meshes": [{"primitives": [primitive]}],
-        "nodes": [{"mesh": 0}],
     }
     (tmp_path / "a.glb").write_bytes(glb(content, data))
     assert_alike(load_gaussians(tmp_path / "a.glb"), load_gaussians(tmp_path / "a.spz"))
@@ -163,19 +163,13 @@ def test_quantised_and_interleaved_columns(tmp_path):
     offsets = {"POSITION": (0, 5126, "VEC3"), "ROTATION": (12, 5120, "VEC4"), "SCALE": (16, 5120, "VEC3")}
     offsets |= {"OPACITY": (20, 5121, "SCALAR"), "SH_DEGREE_0_COEF_0": (0, 5126, "VEC3")}
     names = [name if name == "POSITION" else f"{EXTENSION}:{name}" for name in offsets]
-    content = {
-        "asset": {"version": "2.0"},
-        "accessors": [
-            {"bufferView": 0, "byteOffset": at, "componentType": kind, "type": shape, "count": 3}
-            | {"normalized": name in ("ROTATION", "OPACITY")}
-            for name, (at, kind, shape) in offsets.items()
-        ],
-        "bufferViews": [{"buffer": 0, "byteLength": 72, "byteStride": 24}],
-        "buffers": [{"byteLength": 72, "uri": "b%20c.bin"}],
-        "meshes": [{"primitives": [{"mode": 0, "attributes": {n: i for i, n in enumerate(names)}}]}],
-        "nodes": [{"mesh": 0}],
-    }
-    content["meshes"][0]["primitives"][0]["extensions"] = {EXTENSION: {}}
+    content = one_mesh({name: i for i, name in enumerate(names)}, {}, 72, uri="b%20c.bin")
+    content["bufferViews"][0]["byteStride"] = 24
+    content["accessors"] = [
+        {"bufferView": 0, "byteOffset": at, "componentType": kind, "type": shape, "count": 3}
+        | {"normalized": name in ("ROTATION", "OPACITY")}
+        for name, (at, kind, shape) in offsets.items()
+    ]
     (tmp_path / "a.gltf").write_text(json.dumps(content))
     (tmp_path / "b c.bin").write_bytes(rows.tobytes())
     got = load_gaussians(tmp_path / "a.gltf")
@@ -185,6 +179,11 @@ def test_quantised_and_interleaved_columns(tmp_path):
     rows["s"][1] = -3  # of a draft of the extension: logarithms
     (tmp_path / "b c.bin").write_bytes(rows.tobytes())
     np.testing.assert_array_equal(load_gaussians(tmp_path / "a.gltf").log_scales[1], [-3, -3, -3])
+
+
+def splats(content: dict) -> dict:
+    """The one primitive of a file."""
+    return content["meshes"][0]["primitives"][0]
 
 
 HOSTILE = {
@@ -201,13 +200,9 @@ HOSTILE = {
     "no numbers": lambda c: c["nodes"][0].update(translation=["a", 1, 1]),
     "huge numbers": lambda c: c["nodes"][0].update(translation=[10**400, 1, 1]),
     "meshopt": lambda c: c.update(extensionsRequired=["EXT_meshopt_compression"]),
-    "triangles": lambda c: c["meshes"][0]["primitives"][0].update(mode=4),
-    "linear colours": lambda c: c["meshes"][0]["primitives"][0]["extensions"][EXTENSION].update(
-        colorSpace="lin_rec709_display"
-    ),
-    "half a degree": lambda c: c["meshes"][0]["primitives"][0]["attributes"].pop(
-        f"{EXTENSION}:SH_DEGREE_1_COEF_1"
-    ),
+    "triangles": lambda c: splats(c).update(mode=4),
+    "linear colours": lambda c: splats(c)["extensions"][EXTENSION].update(colorSpace="lin_rec709_display"),
+    "half a degree": lambda c: splats(c)["attributes"].pop(f"{EXTENSION}:SH_DEGREE_1_COEF_1"),
     "negative index": lambda c: c["nodes"][0].update(mesh=-1),
     "another version": lambda c: c.update(asset={"version": "1.0"}),
     "no Gaussians": lambda c: c.update(nodes=[], scenes=[], extensionsUsed=[]),
@@ -216,10 +211,9 @@ HOSTILE = {
 
 @pytest.mark.parametrize("name", HOSTILE)
 def test_what_breaks_a_rule_is_refused_in_one_line(tmp_path, name):
-    write_gltf(tmp_path / "a.glb", random_gaussians(20, sh_degree=1))
-    changed(tmp_path / "a.glb", HOSTILE[name])
+    path = written(tmp_path / "a.glb", random_gaussians(20, sh_degree=1), HOSTILE[name])
     with pytest.raises(FormatError) as error:
-        load_gaussians(tmp_path / "a.glb")
+        load_gaussians(path)
     assert "\n" not in str(error.value)
 
 
@@ -231,31 +225,111 @@ def test_what_is_written_keeps_the_rules(tmp_path):
     assert struct.unpack_from("<I", data, 8)[0] == len(data)
     assert content["buffers"][0]["byteLength"] == len(binary)
     assert all(view["byteOffset"] % 4 == 0 for view in content["bufferViews"])
-    primitive = content["meshes"][0]["primitives"][0]
-    says = primitive["extensions"][EXTENSION]
+    says, attributes = splats(content)["extensions"][EXTENSION], splats(content)["attributes"]
     assert says["kernel"] == "ellipse"
     assert says["colorSpace"] == "srgb_rec709_display"
-    names = {
-        "ROTATION",
-        "SCALE",
-        "OPACITY",
-        *(f"SH_DEGREE_1_COEF_{n}" for n in range(3)),
-        "SH_DEGREE_0_COEF_0",
-    }
-    assert set(primitive["attributes"]) == {"POSITION", "COLOR_0", *(f"{EXTENSION}:{name}" for name in names)}
-    positions = content["accessors"][primitive["attributes"]["POSITION"]]
+    coefficients = ("0_COEF_0", *(f"1_COEF_{n}" for n in range(3)))
+    names = {"ROTATION", "SCALE", "OPACITY", *(f"SH_DEGREE_{name}" for name in coefficients)}
+    assert set(attributes) == {"POSITION", "COLOR_0", *(f"{EXTENSION}:{name}" for name in names)}
+    positions = content["accessors"][attributes["POSITION"]]
     assert np.less(positions["min"], positions["max"]).all()
 
 
-def test_what_splat_transform_writes_is_read_alike(tmp_path):
-    program = shutil.which("splat-transform")
-    if program is None:
-        pytest.skip("splat-transform of @playcanvas is not installed")
+def test_what_splat_transform_writes_is_read_alike(tmp_path, splat_transform):
     scene = random_gaussians(500, sh_degree=3)
     write_ply(tmp_path / "a.ply", scene)
-    subprocess.run([program, "-w", "-q", tmp_path / "a.ply", tmp_path / "b.glb"], check=True, timeout=120)
+    splat_transform(tmp_path / "a.ply", tmp_path / "b.glb")
     got = load_gaussians(tmp_path / "b.glb")
-    np.testing.assert_allclose(got.means, scene.means, atol=1e-5)
-    np.testing.assert_allclose(got.log_scales, scene.log_scales, atol=1e-5)
-    np.testing.assert_allclose(got.sh, scene.sh, atol=1e-5)
+    for name in ("means", "log_scales", "sh"):
+        np.testing.assert_allclose(getattr(got, name), getattr(scene, name), atol=1e-5)
     np.testing.assert_allclose(covariances(got), covariances(scene), rtol=1e-4, atol=1e-5)
+
+
+# Point clouds and meshes, read back by other programs.
+
+TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float64)
+FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
+SHADES = np.array([[1.0, 0, 0], [0, 0.5, 0], [0, 0, 0], [0, 1, 0]])  # of the vertices of the first
+MESHES = [
+    SimpleNamespace(name="red mug 1", vertices=TETRAHEDRON, triangles=FACES, colour=SHADES),
+    SimpleNamespace(name="two", vertices=TETRAHEDRON + 5, triangles=FACES, colour=np.array([1, 0, 0.5])),
+]
+
+
+def test_points_have_colours_and_what_else_is_given(tmp_path):
+    gaussians = random_gaussians(40, sh_degree=1)
+    gaussians.means[7] = np.nan
+    relevancy = np.linspace(0, 1, 40)
+    assert write_points(tmp_path / "a.ply", gaussians, {"relevancy": relevancy}) == 39
+    vertex = PlyData.read(tmp_path / "a.ply")["vertex"]
+    kept = np.delete(np.arange(40), 7)
+    np.testing.assert_array_equal(np.stack([vertex[k] for k in "xyz"], 1), gaussians.means[kept])
+    colours = np.stack([vertex[name] for name in ("red", "green", "blue")], 1)
+    want = np.clip(0.5 + 0.28209479177 * gaussians.sh[kept, 0].astype(np.float64), 0, 1)
+    assert np.abs(colours / 255 - want).max() <= 0.5 / 255 + 1e-9
+    np.testing.assert_allclose(vertex["relevancy"], relevancy[kept], atol=1e-7)
+
+
+def test_colours_stay_colours():
+    gaussians = random_gaussians(4)
+    gaussians.sh[:, 0] = [[np.nan, np.inf, -np.inf], [9, -9, 0], [0, 0, 0], [1, 1, 1]]
+    colours = base_colours(gaussians)
+    assert ((colours >= 0) & (colours <= 1)).all()
+    assert colours[1].tolist() == [1, 0, 0.5]
+
+
+def test_a_ply_mesh_holds_all_of_them(tmp_path):
+    write_meshes(tmp_path / "a.ply", MESHES)
+    data = PlyData.read(tmp_path / "a.ply")
+    places = np.stack([data["vertex"][k] for k in "xyz"], 1)
+    np.testing.assert_array_equal(places, np.concatenate([TETRAHEDRON, TETRAHEDRON + 5]))
+    faces = np.stack(data["face"]["vertex_indices"])
+    np.testing.assert_array_equal(faces, np.concatenate([FACES, FACES + 4]))
+    assert data["vertex"]["red"].tolist() == [255, 0, 0, 0] + [255] * 4
+
+
+def test_an_obj_names_its_objects(tmp_path):
+    write_meshes(tmp_path / "a.OBJ", MESHES)
+    lines = (tmp_path / "a.OBJ").read_text().splitlines()
+    assert [line for line in lines if line.startswith("o ")] == ["o red_mug_1", "o two"]
+    assert lines[2] == "v 1 0 0 0.0000 0.5000 0.0000"
+    faces = np.array([line.split()[1:] for line in lines if line.startswith("f ")], int)
+    np.testing.assert_array_equal(faces, np.concatenate([FACES, FACES + 4]) + 1)
+
+
+def test_a_glb_mesh_has_linear_colours_and_the_axes_of_the_standard(tmp_path):
+    scene = Scene(random_gaussians(3), metres_per_unit=2.0)
+    write_meshes(tmp_path / "a.glb", MESHES, gltf_axes(scene))
+    content, binary = parts((tmp_path / "a.glb").read_bytes())
+    assert content["buffers"][0]["byteLength"] == len(binary)
+    assert len(content["meshes"]) == 2
+    np.testing.assert_array_equal(np.frombuffer(binary[:48], "<f4").reshape(4, 3), TETRAHEDRON)
+    colours = np.frombuffer(binary[48:80], "<u2").reshape(4, 4) / 65_535
+    np.testing.assert_allclose(colours[:, :3].sum(1), [1, 0.2140, 0, 1], atol=1e-4)
+    matrix = np.array(content["nodes"][0]["matrix"]).reshape(4, 4).T
+    np.testing.assert_allclose(matrix @ [*scene.up(), 1], [0, 2, 0, 1], atol=1e-6)  # up, metres
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb"])
+def test_open3d_reads_them(tmp_path, suffix):
+    open3d = pytest.importorskip("open3d")
+    write_meshes(tmp_path / f"a{suffix}", MESHES)
+    mesh = open3d.io.read_triangle_mesh(str(tmp_path / f"a{suffix}"))
+    assert len(mesh.triangles) == 8
+    assert mesh.is_watertight()
+    assert mesh.get_volume() == pytest.approx(1 / 3)
+    shades = dict(zip(map(tuple, np.asarray(mesh.vertices)), np.asarray(mesh.vertex_colors), strict=True))
+    found = [shades[tuple(place)] for place in TETRAHEDRON]
+    if suffix != ".glb":  # whose colours are linear
+        np.testing.assert_allclose(found, SHADES, atol=0.003)
+    write_points(tmp_path / "p.ply", random_gaussians(10))
+    assert len(open3d.io.read_point_cloud(str(tmp_path / "p.ply")).points) == 10
+
+
+def test_another_suffix_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"\.ply; choose"):
+        write_points(tmp_path / "a.obj", random_gaussians(3))
+    with pytest.raises(InputError, match=r"\.ply or \.obj"):
+        write_meshes(tmp_path / "a.stl", MESHES)
+    assert list(tmp_path.iterdir()) == []

@@ -35,7 +35,7 @@ from langsplat_core.scene import (
     TaughtWord,
     Tree,
 )
-from tests.support.comparing import assert_same_field
+from tests.support.comparing import assert_refused, assert_same_field
 from tests.support.file_samples import random_field
 from tests.support.scenes import random_gaussians
 
@@ -74,6 +74,11 @@ def sidecar(tmp_path: Path, means: Array) -> Path:
 def header_of(path: Path) -> dict[str, Any]:
     raw = path.read_bytes()
     return json.loads(raw[8 : 8 + struct.unpack("<Q", raw[:8])[0]])
+
+
+def layout(header: dict[str, Any]) -> dict[str, tuple[str, list[int]]]:
+    """Type and shape of every tensor."""
+    return {name: (of["dtype"], of["shape"]) for name, of in header.items() if name != "__metadata__"}
 
 
 def change_header(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
@@ -137,31 +142,20 @@ def test_what_is_written_is_read_back(tmp_path, means, kind, phrases, full):
     write_language(path, want, means)
     assert_same_field(read_language(path, means), want)
     assert list(tmp_path.iterdir()) == [path]
-    write_language(path, want.take(np.zeros(0, int)), means[:0])
+    write_language(path, want.take(slice(0)), means[:0])
     assert len(read_language(path, means[:0])) == 0
 
 
 def test_the_layout_is_the_documented_one(sidecar, means):
     header = header_of(sidecar)
-    metadata = header.pop("__metadata__")
-    layout = {name: (entry["dtype"], entry["shape"]) for name, entry in header.items()}
-    for name, kind, shape in (
-        ("latents", "F32", [3, N, 3]),
-        ("confidence", "F32", [3, N]),
-        ("tree.leaves", "U16", [N]),
-        ("tree.parents", "U32", [11]),
-        ("tree.levels", "U8", [11]),
-        ("tree.votes", "U16", [11, 2]),
-        ("positions", "U64", [N]),
-        ("corners", "F32", [2, 3]),
-        ("canonical", "F32", [4, 16]),
-        ("everyday", "F16", [60, 16]),
-        ("phrasebook", "F32", [2, 16]),
-        ("taught", "F16", [3, 16]),
-        ("taught.rivals", "F16", [3]),
-        ("codec.encoder.0.weight", "F32", [8, 16]),
-    ):
-        assert layout[name] == (kind, shape)
+    metadata = header["__metadata__"]
+    assert layout(header).items() >= {
+        "latents": ("F32", [3, N, 3]), "confidence": ("F32", [3, N]), "positions": ("U64", [N]),
+        "tree.leaves": ("U16", [N]), "tree.parents": ("U32", [11]), "tree.levels": ("U8", [11]),
+        "tree.votes": ("U16", [11, 2]), "corners": ("F32", [2, 3]), "canonical": ("F32", [4, 16]),
+        "everyday": ("F16", [60, 16]), "phrasebook": ("F32", [2, 16]), "taught": ("F16", [3, 16]),
+        "taught.rivals": ("F16", [3]), "codec.encoder.0.weight": ("F32", [8, 16]),
+    }.items()  # fmt: skip
     numbers = [[-0.25, 18.548, 2.7, 0.62], [0.5, 2.25, 15.5, 0.75], [0.75, -0.5, 9.25, 0.5]]
     assert json.loads(metadata.pop("odds")) == numbers
     assert metadata == {
@@ -185,21 +179,9 @@ EXAMPLES = "not a list of names, levels and counts"
 # Of taught words, in a scene and in a file of their own.
 MISTAUGHT: dict[str, tuple[Spoil, str]] = {
     "taught words that are no JSON": (says(taught="[["), "not readable as JSON"),
-    **{
-        f"taught words {text}": (says(taught=text), EXAMPLES)
-        for text in (
-            '{"a": 1}',
-            "3",
-            '["a"]',
-            '[["a", 2]]',
-            '[["a", 2, 3.0]]',
-            '[["a", true, 3]]',
-            '[["a", 2, 0]]',
-            '[["a", 2, 9]]',
-            '[["a", 2, -1], ["b", 2, 4]]',
-            '[[["a"], 2, 3]]',
-        )
-    },
+    **{f"taught words {text}": (says(taught=text), EXAMPLES) for text in
+       ('{"a": 1}', "3", '["a"]', '[["a", 2]]', '[["a", 2, 3.0]]', '[["a", true, 3]]', '[["a", 2, 0]]',
+        '[["a", 2, 9]]', '[["a", 2, -1], ["b", 2, 4]]', '[[["a"], 2, 3]]')},
     "too few examples": (says(taught='[["a", 2, 4]]'), r"taught: expected shape \(4, D\)"),
     "too many examples": (says(taught='[["a", 2, 2]]'), r"taught: expected shape \(2, D\)"),
     "no examples": (holds(taught=None), "tensor 'taught' is missing"),
@@ -215,7 +197,7 @@ MISTAUGHT: dict[str, tuple[Spoil, str]] = {
     "a rival of more than one": (holds(**{"taught.rivals": np.full(3, 2, np.float16)}), "rivals in"),
     "examples of integers": (declares("taught", dtype="I16"), "'taught' is I16"),
     "examples of another length": (holds(taught=np.eye(3, 15, dtype=np.float16)), "taught"),
-}
+}  # fmt: skip
 MALFORMED: dict[str, tuple[Spoil, str]] = {
     "another program's": (says(format="gguf"), "not a language field"),
     "no format": (says(format=None), "not a language field"),
@@ -284,10 +266,7 @@ def test_every_broken_rule_has_its_message(sidecar, means, case):
     spoil, message = MALFORMED[case]
     spoil(sidecar)
     for read in (read_language, rematch_language):
-        with pytest.raises(FormatError, match=message) as caught:
-            read(sidecar, means)
-        assert str(caught.value).startswith(str(sidecar))
-        assert "\n" not in str(caught.value)
+        assert_refused(lambda path, read=read: read(path, means), sidecar, message)
 
 
 NO_TREE = {f"tree.{name}": None for name in ("leaves", "parents", "levels", "votes")}
@@ -296,16 +275,14 @@ NO_TREE = {f"tree.{name}": None for name in ("leaves", "parents", "levels", "vot
 @pytest.fixture
 def own_words(tmp_path: Path) -> Path:
     """A file of a user's words."""
-    path = tmp_path / "words.safetensors"
-    write_words(path, Words("demo", random_field(N, "linear").canonical, TAUGHT))
-    return path
+    write_words(tmp_path / "words", Words("demo", random_field(N, "linear").canonical, TAUGHT))
+    return tmp_path / "words"
 
 
 def test_words_of_a_user_are_read_back(own_words):
     got, want = read_words(own_words), replace(random_field(N, "linear"), taught=TAUGHT)
-    assert_same_field(replace(want, taught=got.words), want)
-    assert got.encoder_id == "demo"
-    np.testing.assert_array_equal(got.canonical, want.canonical)
+    found = replace(want, taught=got.words, encoder_id=got.encoder_id, canonical=got.canonical)
+    assert_same_field(found, want)
     write_words(own_words, replace(got, words=()))
     assert read_words(own_words).words == ()
 
@@ -325,10 +302,7 @@ MISTOLD = MISTAUGHT | {
 def test_every_broken_rule_of_a_users_words_has_its_message(own_words, case):
     spoil, message = MISTOLD[case]
     spoil(own_words)
-    with pytest.raises(FormatError, match=message) as error:
-        read_words(own_words)
-    assert str(error.value).startswith(f"{own_words}: ")
-    assert len(str(error.value)) < 400
+    assert_refused(read_words, own_words, message)
 
 
 def test_the_things_of_version_2_are_wholes(sidecar, means):
@@ -364,30 +338,22 @@ def test_rematch_after_removing_reordering_and_adding(sidecar, means):
     assert got.tree.leaves.tolist()[N:] == [NO_NODE] * 2
     nobody = rematch_language(sidecar, np.zeros((0, 3), np.float32))
     assert nobody.tree.leaves.shape == (0,)
-
-
-def test_a_field_of_other_gaussians_is_refused_with_the_way_to_mend_it(sidecar, means):
-    mend = r"langsplat convert EDITED\.ply NEW\.ply --rematch .*scene\.langsplat\.safetensors"
-    with pytest.raises(FormatError, match=f"made for 60 Gaussians, the scene has 59; .*{mend}"):
-        read_language(sidecar, means[1:])
-    nudged = means.copy()
-    nudged[3, 1] = np.nextafter(nudged[3, 1], np.float32(9))
-    for other in (nudged, means[::-1]):
-        with pytest.raises(FormatError, match=f"other positions than the scene's; .*{mend}"):
-            read_language(sidecar, other)
-
-
-def test_paths_that_cannot_be_read(tmp_path, means):
-    with pytest.raises(InputError, match="no such file"):
-        read_language(tmp_path / "a.safetensors", means)
-    with pytest.raises(InputError, match="is a folder"):
-        read_language(tmp_path, means)
-
-
-def test_rematch_within_a_given_distance(sidecar, means):
     moved = means + np.float32([0.01, 0, 0])
     assert rematch_language(sidecar, moved, max_distance=0.02).confidence.any()
     assert not rematch_language(sidecar, moved, max_distance=0.005).confidence.any()
+
+
+def test_a_field_of_other_gaussians_is_refused_with_the_way_to_mend_it(sidecar, means, tmp_path):
+    mend = r"langsplat convert EDITED\.ply NEW\.ply --rematch .*scene\.langsplat\.safetensors"
+    nudged = means.copy()
+    nudged[3, 1] = np.nextafter(nudged[3, 1], np.float32(9))
+    fewer, elsewhere = "made for 60 Gaussians, the scene has 59", "other positions than the scene's"
+    for other, reason in ((means[1:], fewer), (nudged, elsewhere), (means[::-1], elsewhere)):
+        with pytest.raises(FormatError, match=f"{reason}; .*{mend}"):
+            read_language(sidecar, other)
+    for path, reason in ((tmp_path / "a.safetensors", "no such file"), (tmp_path, "is a folder")):
+        with pytest.raises(InputError, match=reason):
+            read_language(path, means)
 
 
 @pytest.mark.parametrize(("old", "new"), [(0, 5), (5, 0), (1, 1), (1, 3)])
@@ -402,25 +368,22 @@ def test_a_codebook_is_stored_in_small_numbers_where_that_loses_nothing(tmp_path
     field = random_field(N, "codebook")
     codec = CodebookCodec(*(rounded(tensor) for tensor in field.codec.tensors().values()))
     field = replace(field, codec=codec, confidence=rounded(field.confidence))
-    path = tmp_path / "a.langsplat.safetensors"
-    write_language(path, field, means)
-    header = header_of(path)
-    kinds = {name: (entry.get("dtype"), entry.get("shape")) for name, entry in header.items()}
+    write_language(tmp_path / "a", field, means)
+    kinds = layout(header_of(tmp_path / "a"))
     assert kinds["codes"] == ("U16", [3, N])
     assert kinds["codec.vectors"] == ("F16", [11, 16])
     assert kinds["confidence"] == ("F16", [3, N])
     assert kinds["canonical"] == ("F32", [4, 16])
     assert "latents" not in kinds
-    assert_same_field(read_language(path, means), field)
+    assert_same_field(read_language(tmp_path / "a", means), field)
 
 
 def test_a_code_without_a_codeword_is_refused(tmp_path, means):
-    path = tmp_path / "a.langsplat.safetensors"
-    write_language(path, random_field(N, "codebook"), means)
+    path, field = tmp_path / "a", random_field(N, "codebook")
+    write_language(path, field, means)
     change(path, **{"codec.vectors": None})
     with pytest.raises(FormatError, match="codebook codec without its vectors"):
         read_language(path, means)
-    field = random_field(N, "codebook")
     field.latents[1, 5] = 11
     write_language(path, field, means)
     with pytest.raises(FormatError, match="11 is not the number of one of 11 codewords"):
@@ -430,14 +393,12 @@ def test_a_code_without_a_codeword_is_refused(tmp_path, means):
 def test_version_1_still_opens(tmp_path, means):
     """As the first release wrote it: everything float32, and the means themselves."""
     field = replace(random_field(N), everyday=None)
-    path = tmp_path / "a.langsplat.safetensors"
+    path = tmp_path / "a"
     write_language(path, field, means)
     metadata = header_of(path)["__metadata__"]
-    for name in ("temperature", "found"):
-        metadata.pop(name)
+    del metadata["temperature"], metadata["found"]
     tensors = load_file(path)
-    for name in ("positions", "corners"):
-        tensors.pop(name)
+    del tensors["positions"], tensors["corners"]
     save_file(tensors | {"means": means}, path, metadata | {"version": "1"})
     assert_same_field(read_language(path, means), field)
     assert_same_field(rematch_language(path, means), field)
@@ -464,8 +425,7 @@ def rounded(tensor: np.ndarray) -> np.ndarray:
 
 def test_the_same_field_makes_the_same_bytes(tmp_path, means):
     written = set()
-    for number in range(6):  # the library orders the metadata anew each time
-        path = tmp_path / f"{number}.langsplat.safetensors"
-        write_language(path, random_field(N), means)
-        written.add(path.read_bytes())
+    for _ in range(6):  # the library orders the metadata anew each time
+        write_language(tmp_path / "a", random_field(N), means)
+        written.add((tmp_path / "a").read_bytes())
     assert len(written) == 1

@@ -3,7 +3,7 @@
 import json
 import tracemalloc
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import plyfile
@@ -22,11 +22,10 @@ from langsplat_core.io.ply import (
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.io.sog import read_sog_scene
 from langsplat_core.scene import Gaussians, Scene
-from tests.support.comparing import assert_same, assert_same_extras
+from tests.support.comparing import assert_refused, assert_same, assert_same_extras
 from tests.support.fakes import blob_scene
 from tests.support.file_samples import (
     C0,
-    SHARED_DATA,
     ascii_ply,
     columns,
     compressed_ply,
@@ -44,41 +43,34 @@ from tests.support.scenes import random_extras, random_gaussians
 @pytest.mark.parametrize("degree", range(4))
 @pytest.mark.parametrize("count", [0, 1, 50])
 def test_what_is_written_is_read_back_bit_for_bit(tmp_path, degree, count):
-    want = random_gaussians(count, sh_degree=degree)
-    write_ply(tmp_path / "a.ply", want, comments=("vertical axis: y", "Tür"))
+    """And is what another reader expects."""
+    want, extras = random_gaussians(count, sh_degree=degree), random_extras(50)
+    extras = {name: values[:count] for name, values in extras.items()}
+    write_ply(tmp_path / "a.ply", want, comments=("vertical axis: y",), extras=extras)
     assert_same(read_ply(tmp_path / "a.ply"), want)
+    (element,) = plyfile.PlyData.read(tmp_path / "a.ply").elements
+    assert element.name == "vertex"
+    assert [prop.name for prop in element.properties] == [*inria_names(degree), *extras]
+    for name, values in (columns(want) | extras).items():
+        np.testing.assert_array_equal(element[name], values, name)
 
 
 @pytest.mark.parametrize("encode", [plain_ply, ascii_ply])
-def test_more_rows_than_one_chunk(tmp_path, encode):
+def test_more_rows_than_one_chunk(put, encode):
     want = random_gaussians(2 * 8192 + 3)
-    (tmp_path / "a.ply").write_bytes(encode(want))
-    assert_same(read_ply(tmp_path / "a.ply"), want)
+    assert_same(read_ply(put(encode(want))), want)
 
 
 def test_rows_that_cannot_be_drawn_are_kept_as_they_are(tmp_path):
     want = random_gaussians(8)
-    want.means[0] = np.nan
-    want.log_scales[1] = -np.inf
-    want.quats_wxyz[2] = 0
+    want.means[0], want.log_scales[1], want.quats_wxyz[2] = np.nan, -np.inf, 0
     want.opacity_logits[3:5] = np.inf, -np.inf
     want.sh[5] = -0.0
-    write_ply(tmp_path / "a.ply", want)
+    write_ply(tmp_path / "a.ply", want, comments=("Tür",))
     assert_same(read_ply(tmp_path / "a.ply"), want)
     (tmp_path / "b.ply").write_bytes(ascii_ply(want))
     for name in ("opacity_logits", "log_scales", "means"):
         np.testing.assert_array_equal(getattr(read_ply(tmp_path / "b.ply"), name), getattr(want, name))
-
-
-@pytest.mark.parametrize("degree", range(4))
-def test_the_file_written_is_what_another_reader_expects(tmp_path, degree):
-    scene, extras = random_gaussians(20, sh_degree=degree), random_extras(20)
-    write_ply(tmp_path / "a.ply", scene, extras=extras)
-    other = plyfile.PlyData.read(tmp_path / "a.ply")
-    assert [element.name for element in other.elements] == ["vertex"]
-    assert [prop.name for prop in other["vertex"].properties] == [*inria_names(degree), *extras]
-    for name, values in (columns(scene) | extras).items():
-        np.testing.assert_array_equal(other["vertex"][name], values, name)
 
 
 @pytest.mark.parametrize("byte_order", ["<", ">"])
@@ -89,19 +81,17 @@ def test_files_of_another_writer(tmp_path, byte_order, text, code, degree):
     """Properties in any order, those of no layout among them, between elements of other kinds."""
     want, extras = random_gaussians(30, sh_degree=degree), random_extras(30)
     values = {name: column.astype(code) for name, column in columns(want).items()} | extras
+    values["opacity"] = np.round(values["opacity"]).astype("i2")  # a column of integers
+    want = replace(want, opacity_logits=values["opacity"])
     names = [name for name in values if name not in ("nx", "nz")]
     np.random.default_rng(1).shuffle(names)
     table = np.zeros(30, [(name, values[name].dtype) for name in names])
     for name in names:
         table[name] = values[name]
-    vertices = plyfile.PlyElement.describe(table, "vertex")
     face = np.array([([0, 1, 2],), ([2, 1, 0],)], dtype=[("vertex_indices", "i4", (3,))])
-    extra = np.array([(1.5, 2)], dtype=[("focal", "f4"), ("size", "u2")])
-    elements = [
-        plyfile.PlyElement.describe(face, "face"),
-        vertices,
-        plyfile.PlyElement.describe(extra, "camera"),
-    ]
+    camera = np.array([(1.5, 2)], dtype=[("focal", "f4"), ("size", "u2")])
+    rows = {"face": face, "vertex": table, "camera": camera}
+    elements = [plyfile.PlyElement.describe(data, name) for name, data in rows.items()]
     path = tmp_path / "a.ply"
     plyfile.PlyData(elements, text=text, byte_order=byte_order, comments=["end_header is near"]).write(path)
     got = read_ply_scene(path)
@@ -109,33 +99,8 @@ def test_files_of_another_writer(tmp_path, byte_order, text, code, degree):
     assert_same_extras(got.extras, {name: extras[name] for name in names if name in extras})
 
 
-def test_integer_columns(put):
-    scene = random_gaussians(4)
-    table = vertex_table(scene, inria_names(0), "<f4")
-    kinds = [(name, "<i2" if name == "opacity" else "<f4") for name in table.dtype.names]
-    header = ["format binary_little_endian 1.0", "element vertex 4"]
-    header += [f"property {'short' if kind == '<i2' else 'float32'} {name}" for name, kind in kinds]
-    table = table.astype(kinds)
-    got = read_ply(put(ply_bytes(header, table.tobytes())))
-    np.testing.assert_array_equal(got.opacity_logits, table["opacity"])
-
-
-@pytest.mark.parametrize("newline", ["\n", "\r\n"])
-@pytest.mark.parametrize("normals", [False, True])
-@pytest.mark.parametrize("front", [b"", b"\x02" + bytes(8) + b"\x00"])  # rows: a list of two, an empty one
-def test_line_ends_normals_and_lists_in_front(put, newline, normals, front):
-    want = random_gaussians(9, sh_degree=1)
-    # a body that begins with a line feed must not be taken for a part of the header
-    want.means[0, 0] = np.frombuffer(b"\n\r\n\x3f", "<f4")[0]
-    content = plain_ply(want, inria_names(1, normals), front=front, newline=newline)
-    assert_same(read_ply(put(content)), want)
-    spaced = content.replace(b"property float x", b"\nproperty\tfloat \t x\t\ncomment")
-    assert_same(read_ply(put(spaced)), want)
-
-
 def test_a_double_beyond_float32_becomes_infinite(put):
-    scene = random_gaussians(2)
-    table = vertex_table(scene, inria_names(0), "<f8")
+    table = vertex_table(random_gaussians(2), inria_names(0), "<f8")
     table["scale_0"][1] = 1e300
     header = ["format binary_little_endian 1.0", "element vertex 2"]
     header += [f"property double {name}" for name in table.dtype.names]
@@ -174,22 +139,13 @@ def test_the_marks_of_other_programs(tmp_path, comments, antialiased):
     assert read_ply_scene(path).antialiased is antialiased
 
 
-@pytest.mark.parametrize(
-    ("entry", "antialiased"),
-    [
-        ({}, False),
-        ({"model": "antialiased"}, True),
-        ({"model": "2dgs"}, False),
-        ({"model": ["antialiased"]}, False),
-        ({"antialias": True}, True),
-        ({"antialias": False}, False),
-        ({"antialias": "no"}, False),
-    ],
-)
-def test_the_mark_of_a_sog(tmp_path, entry, antialiased):
+def test_the_mark_of_a_sog(tmp_path):
     files = sog_files(random_gaussians(20))
-    files["meta.json"] = json.dumps(json.loads(files["meta.json"]) | entry).encode()
-    assert read_sog_scene(write_folder(tmp_path / "a", files)).antialiased is antialiased
+    plain = [{}, {"model": "2dgs"}, {"model": ["antialiased"]}, {"antialias": False}, {"antialias": "no"}]
+    for entry in (*plain, {"model": "antialiased"}, {"antialias": True}):
+        meta = json.dumps(json.loads(files["meta.json"]) | entry).encode()
+        scene = read_sog_scene(write_folder(tmp_path / "a", files | {"meta.json": meta}))
+        assert scene.antialiased is (entry not in plain), entry
 
 
 @pytest.mark.parametrize(
@@ -254,13 +210,10 @@ def test_other_plies_stay_what_they_are(tmp_path):
 
 def test_what_cannot_keep_a_scale(tmp_path):
     save_scene(tmp_path / "a.spz", Scene(random_gaussians(3)))
-    with pytest.raises(InputError, match="keeps a scale; make one"):
-        write_metres(tmp_path / "a.spz", 1)
-    with pytest.raises(InputError, match="no such file"):
-        write_metres(tmp_path / "b.ply", 1)
     (tmp_path / "c.ply").write_bytes(b"plx\n")
-    with pytest.raises(FormatError, match="not a PLY"):
-        write_metres(tmp_path / "c.ply", 1)
+    for name, message in (("a.spz", "a scale; make one"), ("b.ply", "no such file"), ("c.ply", "not a PLY")):
+        with pytest.raises(InputError, match=message):
+            write_metres(tmp_path / name, 1)
     assert (tmp_path / "c.ply").read_bytes() == b"plx\n"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.spz", "c.ply"]
 
@@ -280,12 +233,7 @@ def test_numbers_that_an_integer_column_cannot_hold_are_read_without_a_word(tmp_
 @pytest.mark.parametrize(
     ("name", "dtype", "says"),
     [
-        ("x", "f4", "rename"),
-        ("nx", "f4", "rename"),
-        ("f_rest_3", "f4", "rename"),
-        ("two words", "f4", "rename"),
-        ("a\nend_header", "f4", "rename"),
-        ("", "f4", "rename"),
+        *((name, "f4", "rename") for name in ("x", "nx", "f_rest_3", "two words", "a\nend_header", "")),
         ("long", "i8", "type int64"),
         ("flag", "?", "type bool"),
         ("half", "f2", "type float16"),
@@ -316,8 +264,6 @@ def test_loading_holds_little_beside_the_arrays_it_keeps(tmp_path, extra):
 
 # ---- SuperSplat's compressed PLY ----
 
-GUITAR = SHARED_DATA / "gaussians" / "guitar.compressed.ply"
-
 
 @pytest.mark.parametrize("degree", range(4))
 @pytest.mark.parametrize("colours", [True, False])
@@ -327,8 +273,8 @@ def test_decoding_is_exact_up_to_the_quantisation(put, degree, colours):
     assert len(got) == 600
     assert got.sh_degree == degree
     # Half a step of the coarsest field, with bounds over at most the whole scene; 10 % for float32.
-    for name, bits in (("means", 10), ("log_scales", 10)):
-        step = np.ptp(getattr(want, name), axis=0) / (2**bits - 1)
+    for name in ("means", "log_scales"):
+        step = np.ptp(getattr(want, name), axis=0) / (2**10 - 1)
         assert (np.abs(getattr(got, name) - getattr(want, name)) <= 0.55 * step).all()
     step = (np.ptp(want.sh[:, 0], axis=0) if colours else 1 / C0) / 255
     if not colours:  # without bounds the colours are 0..1
@@ -337,22 +283,15 @@ def test_decoding_is_exact_up_to_the_quantisation(put, degree, colours):
     assert np.abs(sigmoid(got.opacity_logits) - sigmoid(want.opacity_logits)).max() <= 0.5 / 255 + 1e-6
     # 10 bits over [-0.71, 0.71]: 7e-4 a component, amplified at most 2.5 times in the matrix and in the
     # component that is reconstructed
-    turned = rotation_matrices(got.quats_wxyz.astype(float)) - rotation_matrices(
-        want.quats_wxyz.astype(float)
-    )
-    assert np.abs(turned).max() <= 6e-3
-    if degree:
-        # 8 bits over [-4, 4]: half a step is 1/64
-        assert np.abs(got.sh[:, 1:] - want.sh[:, 1:]).max() <= 1 / 64 + 1e-6
+    axes, want_axes = (rotation_matrices(g.quats_wxyz.astype(float)) for g in (got, want))
+    assert np.abs(axes - want_axes).max() <= 6e-3
+    # 8 bits over [-4, 4]: half a step is 1/64
+    assert np.abs(got.sh[:, 1:] - want.sh[:, 1:]).max(initial=0) <= 1 / 64 + 1e-6
 
 
 def test_the_first_and_last_bits_of_every_field(put):
     """A file made of literal words, with the numbers worked out by hand."""
-    header = ["ply", "format binary_little_endian 1.0", "element chunk 1"]
-    header += [f"property float {end}_{axis}" for end in ("min", "max") for axis in "xyz"]
-    header += [f"property float {end}_scale_{axis}" for end in ("min", "max") for axis in "xyz"]
-    header += ["element vertex 4"]
-    header += [f"property uint packed_{name}" for name in ("position", "rotation", "scale", "color")]
+    header = compressed_ply(random_gaussians(4), colours=False).split(b"end_header\n")[0]
     bounds = np.array([[0, 10, 20, 1, 20, 40, -9, -8, -7, -1, -2, -3]], "<f4")
     half = 0b1000000000  # 512 of 1023: 0.0005 above the middle
     words = np.array(
@@ -364,32 +303,19 @@ def test_the_first_and_last_bits_of_every_field(put):
         ],
         "<u4",
     )
-    body = bounds.tobytes() + words.tobytes()
-    got = read_ply(put(("\n".join(header) + "\nend_header\n").encode() + body))
+    got = read_ply(put(header + b"end_header\n" + bounds.tobytes() + words.tobytes()))
     np.testing.assert_allclose(got.means, [[0, 10, 20], [1, 10, 20], [0, 20, 20], [0, 10, 40]])
     np.testing.assert_allclose(got.log_scales, [[-9, -8, -7], [-1, -8, -7], [-9, -2, -7], [-9, -8, -3]])
-    np.testing.assert_allclose(got.quats_wxyz[:3], np.eye(4)[:3], atol=1e-3)
-    np.testing.assert_allclose(got.quats_wxyz[3], [0.5**0.5, 0, 0, 0.5**0.5], atol=1e-3)
-    np.testing.assert_allclose(
-        0.5 + C0 * got.sh[:, 0], [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], atol=1e-6
-    )
-    assert got.opacity_logits[0] == got.opacity_logits[1] == -np.inf
-    assert got.opacity_logits[2] == np.inf
+    turned = [*np.eye(4)[:3], [0.5**0.5, 0, 0, 0.5**0.5]]
+    np.testing.assert_allclose(got.quats_wxyz, turned, atol=1e-3)
+    shades = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    np.testing.assert_allclose(0.5 + C0 * got.sh[:, 0], shades, atol=1e-6)
+    assert got.opacity_logits[:3].tolist() == [-np.inf, -np.inf, np.inf]
     np.testing.assert_allclose(sigmoid(got.opacity_logits[3]), 128 / 255, rtol=1e-6)
 
 
-def test_infinite_bounds_make_rows_that_are_dropped(put):
-    content = compressed_ply(random_gaussians(300))
-    start = content.index(b"end_header\n") + len(b"end_header\n")
-    content = content[:start] + np.float32(np.inf).tobytes() + content[start + 4 :]
-    got = read_ply(put(content))
-    assert not got.valid()[:256].any()
-    assert got.valid()[256:].all()
-
-
-@pytest.mark.skipif(not GUITAR.exists(), reason="the shared data are not here")
-def test_a_real_file():
-    got = read_ply(GUITAR)
+def test_a_real_file(real_data):
+    got = read_ply(real_data / "gaussians" / "guitar.compressed.ply")
     assert len(got) == 90854
     assert got.valid().all()
     assert np.isposinf(got.opacity_logits).sum() == 667
@@ -469,29 +395,28 @@ BROKEN = {  # a good file, what of it is replaced by what, and the message
 def test_every_broken_rule_has_its_message(put, case):
     good, old, new, message = BROKEN[case]
     assert old in good
-    path = put(good.replace(old, new, 1))
-    with pytest.raises(FormatError, match=message) as caught:
+    assert_refused(read_ply, put(good.replace(old, new, 1)), message)
+
+
+NO_FILES = {
+    "nowhere.ply": r"nowhere\.ply: no such file",
+    "/": "is a folder",
+    "nul\0.ply": "cannot be opened",
+    "/dev/null": "not an ordinary file",
+}
+
+
+@pytest.mark.parametrize("path", NO_FILES)
+def test_paths_that_cannot_be_read(path):
+    with pytest.raises(InputError, match=NO_FILES[path]):
         read_ply(path)
-    assert str(caught.value).startswith(str(path))
-    assert "\n" not in str(caught.value)
-    assert len(str(caught.value)) < len(str(path)) + 200  # whatever a library adds
-
-
-def test_paths_that_cannot_be_read(tmp_path):
-    with pytest.raises(InputError, match=r"nowhere\.ply: no such file"):
-        read_ply(tmp_path / "nowhere.ply")
-    with pytest.raises(InputError, match="is a folder"):
-        read_ply(tmp_path)
-    with pytest.raises(InputError, match="cannot be opened"):
-        read_ply("nul\0.ply")
-    with pytest.raises(InputError, match="not an ordinary file"):
-        read_ply("/dev/null")
 
 
 # Every encoding of a PLY: headers that say what is not so, and comments anywhere.
 
 KINDS: dict[str, Callable[[Gaussians], bytes]] = {
     "plain": plain_ply,
+    "no normals": lambda g: plain_ply(g, inria_names(g.sh_degree, normals=False)),
     "list in front": lambda g: plain_ply(g, front=b"\x01" + bytes(4) + b"\x00"),
     "mixed": mixed_ply,
     "ascii": ascii_ply,
@@ -517,23 +442,24 @@ def test_headers_that_say_what_is_not_so(put, bounded, kind, case):
     content = KINDS[kind](random_gaussians(3))
     assert VERTICES.encode() in content
     path = put(content.replace(VERTICES.encode(), FALSE[case].encode()))
-    if (kind, case) == ("compressed", "rows in front"):  # it names its elements: their order plays no part
-        return
-    with pytest.raises(FormatError) as caught:
-        read_ply(path)
-    assert str(caught.value).isprintable()
-    assert len(str(caught.value)) < len(str(path)) + 300
+    if (kind, case) != ("compressed", "rows in front"):  # it names its elements: their order plays no part
+        assert_refused(read_ply, path)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("newline", [b"\n", b"\r\n"])
-def test_comments_and_obj_info_anywhere(put, kind, newline):
+def test_comments_blanks_and_line_ends_anywhere(put, kind, newline):
     """Between any two lines, also such as look like other lines, and with bytes that are no text."""
-    content = KINDS[kind](random_gaussians(7, sh_degree=1))
+    scene = random_gaussians(7, sh_degree=1)
+    # a body that begins with a line feed must not be taken for a part of the header
+    scene.means[0, 0] = np.frombuffer(b"\n\r\n\x3f", "<f4")[0]
+    content = KINDS[kind](scene)
     want = read_ply(put(content))
+    if kind != "compressed":
+        assert_same(want, scene)
     header, body = content.split(b"end_header\n", 1)
-    lines = [*header.splitlines(), b"end_header"]
+    lines = [*header.replace(b"property float x", b"property\tfloat \t x\t").splitlines(), b"end_header"]
     remarks = [b"comment element vertex 3", b"obj_info \xff\xfe\x00", b"comment", b"", b"  ", b"obj_info"]
     for place in range(1, len(lines)):
         remark = remarks[place % len(remarks)]
@@ -542,12 +468,15 @@ def test_comments_and_obj_info_anywhere(put, kind, newline):
 
 
 def test_compressed_files_that_fuzzing_found(put):
-    """An element without properties; doubles and signalling NaN in place of packed numbers and bounds."""
+    """An element without properties; doubles in place of packed numbers; bounds that are none: the rows of
+    their chunk are dropped."""
     content = compressed_ply(random_gaussians(3, sh_degree=1))
     bare = content.replace(b"".join(b"property uchar f_rest_%d\n" % i for i in range(9)), b"")
     assert read_ply(put(bare)).sh_degree == 0
     with pytest.raises(FormatError):
         read_ply(put(content.replace(b"uint packed_color", b"float packed_color")))
-    header, body = content.split(b"end_header\n")
-    nan = b"\x01\x00\xa0\x7f"  # little endian; signalling
-    assert not read_ply(put(header + b"end_header\n" + nan + body[4:])).valid().any()
+    header, body = compressed_ply(random_gaussians(300)).split(b"end_header\n", 1)
+    for bound in (np.float32(np.inf).tobytes(), b"\x01\x00\xa0\x7f"):  # little endian NaN; signalling
+        valid = read_ply(put(header + b"end_header\n" + bound + body[4:])).valid()
+        assert not valid[:256].any()
+        assert valid[256:].all()

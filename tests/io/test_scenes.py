@@ -1,17 +1,16 @@
 """Scenes saved and loaded as a whole, with what lies beside them."""
 
 import json
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
-from plyfile import PlyData
 
 from langsplat_core.cli.query import QueryScene
 from langsplat_core.cli.scenes import Inspect
-from langsplat_core.errors import FormatError, InputError
+from langsplat_core.errors import InputError
 from langsplat_core.io import language
 from langsplat_core.io.cameras import read_cameras, write_cameras
 from langsplat_core.io.language import write_language
@@ -26,12 +25,12 @@ from langsplat_core.io.scenes import (
     save_scene,
     scene_files,
 )
-from langsplat_core.io.shapes import base_colours, write_meshes, write_points
 from langsplat_core.io.summary import disk_bytes, duplicates, summarise
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.scene import NO_NODE, Calibration, Gaussians, Odds, Reading, Scene
+from langsplat_core.scene import NO_NODE, Calibration, Odds, Reading, Scene
+from langsplat_core.scene.gaussians import join_gaussians
 from langsplat_core.scene.tree import tree_of_wholes
-from tests.support.comparing import assert_same_extras, assert_same_field
+from tests.support.comparing import assert_refused, assert_same_extras, assert_same_field
 from tests.support.fakes import blob_scene
 from tests.support.file_samples import compressed_ply, random_field, sog_files, write_folder
 from tests.support.scenes import random_camera, random_extras, random_gaussians
@@ -40,7 +39,7 @@ N = 60
 
 
 def full_scene(seed: int = 0) -> Scene:
-    cameras = tuple(replace(random_camera(i), name=f"view.{i}") for i in range(3))
+    cameras = tuple(replace(random_camera(i, width=70 + i), name=f"Tür {i}.a") for i in range(3))
     return Scene(random_gaussians(N, seed, sh_degree=1), random_field(N, seed=seed), cameras)
 
 
@@ -57,9 +56,8 @@ def spoilt(got: Scene, want: Scene) -> set[str]:
     for a, b in zip(got.cameras, want.cameras, strict=True):
         # the centre of projection is stored instead of the translation: a few rounding errors
         np.testing.assert_allclose(a.world_to_camera, b.world_to_camera, atol=1e-14)
-        names = ("width", "height", "fx", "fy", "cx", "cy", "name")
-        assert [getattr(a, name) for name in names] == [getattr(b, name) for name in names]
-    arrays = [[getattr(scene.gaussians, f.name) for f in fields(Gaussians)] for scene in (got, want)]
+        assert {**vars(a), "world_to_camera": 0} == {**vars(b), "world_to_camera": 0}
+    arrays = [vars(scene.gaussians).values() for scene in (got, want)]
     changed = {
         "precision": not all(map(np.array_equal, *arrays)),
         "view dependence": got.gaussians.sh_degree < want.gaussians.sh_degree,
@@ -76,8 +74,7 @@ def spoilt(got: Scene, want: Scene) -> set[str]:
 @pytest.mark.parametrize("degree", range(1, 4))
 @pytest.mark.parametrize("row", [row for row in FORMATS if row.write], ids=lambda row: row.suffix)
 def test_a_scene_comes_back_but_for_what_its_format_loses(tmp_path, row, degree):
-    cameras = tuple(replace(random_camera(i, width=70 + i), name=f"Tür {i}.a") for i in range(3))
-    want = Scene(random_gaussians(N, sh_degree=degree), random_field(N), cameras, None, True)
+    want = replace(full_scene(), gaussians=random_gaussians(N, sh_degree=degree), antialiased=True)
     want = replace(want, extras=random_extras(N), metres_per_unit=1 / 3)
     path = tmp_path / "new folder" / f"scene{row.suffix}"
     save_scene(path, want)
@@ -103,8 +100,7 @@ def test_a_scene_without_companions_removes_those_of_the_one_it_replaces(tmp_pat
     save_scene(tmp_path / "scene.ply", Scene(random_gaussians(5)))
     assert [p.name for p in tmp_path.iterdir()] == ["scene.ply"]
     got = load_scene(tmp_path / "scene.ply")
-    assert got.language is None
-    assert got.cameras == ()
+    assert (got.language, got.cameras) == (None, ())
 
 
 class Interrupted(BaseException):
@@ -136,17 +132,14 @@ def test_an_interruption_never_leaves_a_mixture(tmp_path, monkeypatch, after):
         finished = False
     monkeypatch.undo()
     got = load_scene(path)  # raises if the sidecar is of the other scene
-    is_new = np.array_equal(got.gaussians.means, new.gaussians.means)
-    assert is_new or np.array_equal(got.gaussians.means, old.gaussians.means)
-    source = new if is_new else old
+    (source,) = (one for one in (old, new) if np.array_equal(got.gaussians.means, one.gaussians.means))
     if got.language is not None:
         assert_same_field(got.language, source.language)
     if finished:
-        assert is_new
+        assert source is new
         assert got.language is not None
         assert got.cameras
-    leftovers = [p.name for p in tmp_path.iterdir() if p.name.startswith(".")]
-    assert not leftovers
+    assert not list(tmp_path.glob(".*"))
     assert after < 8 or finished  # the parameters cover every step
 
 
@@ -198,11 +191,14 @@ def test_what_is_not_a_scene(tmp_path):
     write_ply(tmp_path / ("n" * 240 + ".ply"), random_gaussians(1))  # its companions' names would be too long
     assert load_scene(tmp_path / ("n" * 240 + ".ply")).language is None
     write_ply(tmp_path / "model" / "iteration_7" / "point_cloud.ply", random_gaussians(1))
-    with pytest.raises(InputError, match=r"perhaps .*model/iteration_7/point_cloud\.ply"):
-        load_scene(tmp_path / "model")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match=r"a folder without meta\.json is not a scene$"):
-        load_scene(tmp_path / "empty")
+    said = {
+        "model": r"perhaps .*model/iteration_7/point_cloud\.ply",
+        "empty": r"without meta\.json is not a scene$",
+    }
+    for name, message in said.items():
+        with pytest.raises(InputError, match=message):
+            load_scene(tmp_path / name)
 
 
 def test_a_scene_of_which_most_cannot_be_drawn_says_so(
@@ -210,9 +206,8 @@ def test_a_scene_of_which_most_cannot_be_drawn_says_so(
 ) -> None:
     gaussians = random_gaussians(N)
     for broken, told in ((N // 2, False), (N // 2 + 1, True)):
-        means = gaussians.means.copy()
-        means[:broken] = np.nan
-        write_ply(tmp_path / "a.ply", replace(gaussians, means=means))
+        gaussians.means[:broken] = np.nan
+        write_ply(tmp_path / "a.ply", gaussians)
         caplog.clear()
         assert len(load_scene(tmp_path / "a.ply").gaussians) == N
         assert bool(caplog.messages) == told
@@ -285,10 +280,6 @@ def test_what_could_not_be_read_is_not_removed_by_writing(path, name):
 # What `langsplat inspect` says of scenes whose faults are known.
 
 
-def joined(*parts: Gaussians) -> Gaussians:
-    return Gaussians(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Gaussians)))
-
-
 def test_planted_faults_are_counted():
     clean = random_gaussians(40, seed=1, sh_degree=1)
     broken = random_gaussians(4, seed=2, sh_degree=1)
@@ -298,18 +289,11 @@ def test_planted_faults_are_counted():
     broken.sh[3, 0, 0] = np.inf
     needles = random_gaussians(2, seed=3, sh_degree=1)
     needles.log_scales[:] = np.log([1.0, 1e-4, 1e-2])
-    found = summarise(Scene(joined(clean, broken, needles, clean.take(np.arange(5)))))
-    assert found.gaussians == 51
-    assert found.invalid_rows == 4
-    assert sum(found.invalid.values()) == 4
-    assert len(found.invalid) == 4
-    assert found.duplicates == 5
-    assert found.needles == 2
+    found = summarise(Scene(join_gaussians([clean, broken, needles, clean.take(np.arange(5))])))
+    assert (found.gaussians, found.invalid_rows, found.duplicates, found.needles) == (51, 4, 5, 2)
+    assert [*found.invalid.values()] == [1, 1, 1, 1]
     assert found.anisotropy[2] == pytest.approx(1e4, rel=1e-5)
-
-
-def test_rows_that_differ_in_one_number_are_no_duplicates():
-    gaussians = joined(*[random_gaussians(1, seed=1)] * 3)
+    gaussians = random_gaussians(1).take(np.zeros(3, int))
     assert duplicates(gaussians) == 2
     gaussians.sh[1, 0, 2] += 1e-3
     assert duplicates(gaussians) == 1
@@ -336,26 +320,25 @@ def test_flat_and_empty_scenes_have_an_answer():
 
 
 def test_the_command_prints_a_table_and_json(tmp_path, capsys):
-    gaussians = random_gaussians(30, sh_degree=1)
-    path = tmp_path / "scene.ply"
-    field = random_field(30)
-    extras = {"age": np.arange(30, dtype=np.float32)}
-    scene = Scene(gaussians, field, (random_camera(),), antialiased=True, extras=extras)
-    save_scene(path, scene)
+    path, scene = tmp_path / "scene.ply", full_scene()
+    extras = {"age": np.arange(N, dtype=np.float32)}
+    save_scene(path, replace(scene, antialiased=True, extras=extras))
     Inspect(path).run()
-    text = capsys.readouterr().out
-    for words in ("Gaussians         30\n", "yes (Mip-Splatting)", "age", "codec"):
-        assert words in "\n".join(line.rstrip() for line in text.splitlines()) + "\n", words
-    Inspect(path, json=True).run()
-    answer = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
-    assert answer["gaussians"] == 30
-    assert answer["cameras"] == 1
+    text = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
+    for words in ("Gaussians         60\n", "yes (Mip-Splatting)", "age", "codec"):
+        assert words in "\n".join([*text, ""]), words
+
+    def told() -> dict[str, Any]:
+        Inspect(path, json=True).run()
+        return json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+
+    answer = told()
+    assert (answer["gaussians"], answer["cameras"]) == (N, 3)
     assert answer["disk_bytes"] == sum(file.stat().st_size for file in tmp_path.iterdir())
-    assert answer["memory_bytes"] == 4 * 30 * (3 + 3 + 4 + 1 + 12 + 1 + 3 * (field.latents.shape[2] + 1))
-    flat = replace(gaussians, log_scales=np.full((30, 3), [-np.inf, 0, 0]))
+    assert answer["memory_bytes"] == 4 * N * (3 + 3 + 4 + 1 + 12 + 1 + 3 * (3 + 1))
+    flat = replace(scene.gaussians, log_scales=np.full((N, 3), [-np.inf, 0, 0]))
     save_scene(path, Scene(flat))
-    Inspect(path, json=True).run()
-    json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    assert told()["anisotropy"] == [None] * 3
 
 
 def test_size_of_a_folder_counts_its_files(real_data):
@@ -367,93 +350,13 @@ def test_size_of_a_folder_counts_its_files(real_data):
 def test_nodes_are_counted():
     field = random_field(40)
     tree = tree_of_wholes(np.array([1, 1, 0, NO_NODE] * 10))
-    plain, named = (
-        summarise(Scene(random_gaussians(40), made)) for made in (field, replace(field, tree=tree))
-    )
+    sure = Reading(calibration=Calibration(*[Odds(0, 1, 0)] * 3))
+    fields = field, replace(field, tree=tree, reading=sure)
+    plain, named = (summarise(Scene(random_gaussians(40), made)) for made in fields)
     assert (plain.language.nodes, named.language.nodes) == (None, (0, 0, 2))
+    assert (plain.language.calibrated, named.language.calibrated) == (False, True)
     assert named.language.bytes - plain.language.bytes == tree.leaves.nbytes
     assert named.memory_bytes - plain.memory_bytes == tree.leaves.nbytes
-    odds = Odds(0, 1, 0)
-    sure = replace(field, reading=Reading(calibration=Calibration(odds, odds, odds)))
-    assert not plain.language.calibrated
-    assert summarise(Scene(random_gaussians(40), sure)).language.calibrated
-
-
-# Point clouds and meshes, read back by other programs.
-
-TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float64)
-FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
-
-
-def meshes():
-    one = SimpleNamespace(
-        name="red mug 1", vertices=TETRAHEDRON, triangles=FACES, colour=np.array([1, 0, 0.5])
-    )
-    two = SimpleNamespace(name="two", vertices=TETRAHEDRON + 5, triangles=FACES, colour=np.array([0, 1, 0]))
-    return [one, two]
-
-
-def test_points_have_colours_and_what_else_is_given(tmp_path):
-    gaussians = random_gaussians(40, sh_degree=1)
-    gaussians.means[7] = np.nan
-    relevancy = np.linspace(0, 1, 40)
-    assert write_points(tmp_path / "a.ply", gaussians, {"relevancy": relevancy}) == 39
-    vertex = PlyData.read(tmp_path / "a.ply")["vertex"]
-    kept = np.delete(np.arange(40), 7)
-    np.testing.assert_array_equal(np.stack([vertex[k] for k in "xyz"], 1), gaussians.means[kept])
-    colours = np.stack([vertex[name] for name in ("red", "green", "blue")], 1)
-    want = np.clip(0.5 + 0.28209479177 * gaussians.sh[kept, 0].astype(np.float64), 0, 1)
-    assert np.abs(colours / 255 - want).max() <= 0.5 / 255 + 1e-9
-    np.testing.assert_allclose(vertex["relevancy"], relevancy[kept], atol=1e-7)
-
-
-def test_colours_stay_colours():
-    gaussians = random_gaussians(4)
-    gaussians.sh[:, 0] = [[np.nan, np.inf, -np.inf], [9, -9, 0], [0, 0, 0], [1, 1, 1]]
-    colours = base_colours(gaussians)
-    assert ((colours >= 0) & (colours <= 1)).all()
-    assert colours[1].tolist() == [1, 0, 0.5]
-
-
-def test_a_ply_mesh_holds_all_of_them(tmp_path):
-    write_meshes(tmp_path / "a.ply", meshes())
-    data = PlyData.read(tmp_path / "a.ply")
-    places = np.stack([data["vertex"][k] for k in "xyz"], 1)
-    np.testing.assert_array_equal(places, np.concatenate([TETRAHEDRON, TETRAHEDRON + 5]))
-    faces = np.stack(data["face"]["vertex_indices"])
-    np.testing.assert_array_equal(faces, np.concatenate([FACES, FACES + 4]))
-    assert data["vertex"]["red"].tolist() == [255] * 4 + [0] * 4
-
-
-def test_an_obj_names_its_objects(tmp_path):
-    write_meshes(tmp_path / "a.OBJ", meshes())
-    lines = (tmp_path / "a.OBJ").read_text().splitlines()
-    assert [line for line in lines if line.startswith("o ")] == ["o red_mug_1", "o two"]
-    assert lines[1] == "v 0 0 0 1.0000 0.0000 0.5000"
-    faces = np.array([line.split()[1:] for line in lines if line.startswith("f ")], int)
-    np.testing.assert_array_equal(faces, np.concatenate([FACES, FACES + 4]) + 1)
-
-
-@pytest.mark.long
-def test_open3d_reads_them(tmp_path):
-    import open3d
-
-    for name in ("a.ply", "a.obj"):
-        write_meshes(tmp_path / name, meshes())
-        mesh = open3d.io.read_triangle_mesh(str(tmp_path / name))
-        assert len(mesh.triangles) == 8
-        assert mesh.is_watertight()
-        assert mesh.get_volume() == pytest.approx(1 / 3)
-    write_points(tmp_path / "p.ply", random_gaussians(10))
-    assert len(open3d.io.read_point_cloud(str(tmp_path / "p.ply")).points) == 10
-
-
-def test_another_suffix_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"\.ply; choose"):
-        write_points(tmp_path / "a.obj", random_gaussians(3))
-    with pytest.raises(InputError, match=r"\.ply or \.obj"):
-        write_meshes(tmp_path / "a.stl", meshes())
-    assert list(tmp_path.iterdir()) == []
 
 
 # ---- INRIA's cameras.json ----
@@ -461,31 +364,18 @@ def test_another_suffix_is_refused(tmp_path):
 
 def entry(**changes):
     """A camera at (1, 2, 3) that is turned by 90 degrees about its down axis: it looks along world +x."""
-    plain = {
-        "id": 0,
-        "img_name": "frame_01",
-        "width": 64,
-        "height": 48,
-        "position": [1.0, 2.0, 3.0],
-        "rotation": [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]],
-        "fx": 50.0,
-        "fy": 55.0,
-    }
+    plain = {"id": 0, "img_name": "frame_01", "width": 64, "height": 48, "fx": 50.0, "fy": 55.0}
+    plain |= {"position": [1.0, 2.0, 3.0], "rotation": [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]}
     return {key: value for key, value in (plain | changes).items() if value is not None}
 
 
-@pytest.fixture
-def put(tmp_path):
-    def write(value):
-        path = tmp_path / "scene.cameras.json"
-        path.write_text(value if isinstance(value, str) else json.dumps(value))
-        return path
-
-    return write
+def text_of(value: Any) -> bytes:
+    """As JSON, what is no text yet."""
+    return (value if isinstance(value, str) else json.dumps(value)).encode()
 
 
 def test_the_inria_convention(put):
-    camera = read_cameras(put([entry()]))[0]
+    camera = read_cameras(put(text_of([entry()])))[0]
     np.testing.assert_allclose(camera.position, [1, 2, 3])
     np.testing.assert_allclose(camera.rotation[2], [1, 0, 0])  # forward, in the world
     pixel, depth = camera.project(np.array([[6.0, 2.0, 3.0], [6.0, 3.0, 3.0], [6.0, 2.0, 2.0]]))
@@ -493,9 +383,9 @@ def test_the_inria_convention(put):
     # the middle; below it, since y points down; to the right of it, which is world -z
     np.testing.assert_allclose(pixel, [[32, 24], [32, 24 + 55 / 5], [32 + 50 / 5, 24]])
     assert camera.name == "frame_01"
-    moved = read_cameras(put([entry(cx=30, cy=20.5)]))[0]
+    moved = read_cameras(put(text_of([entry(cx=30, cy=20.5)])))[0]
     assert (moved.cx, moved.cy) == (30, 20.5)
-    write_cameras(put([]), (replace(camera, fx=np.float32(50.5), width=np.int64(64)),))  # NumPy's numbers
+    write_cameras(put(b""), (replace(camera, fx=np.float32(50.5), width=np.int64(64)),))  # NumPy's numbers
 
 
 @pytest.mark.parametrize(
@@ -503,10 +393,10 @@ def test_the_inria_convention(put):
     [("a.jpg", "a"), ("a.JPEG", "a"), ("frame.01", "frame.01"), ("x/y.png", "x/y"), ("", "")],
 )
 def test_names_lose_the_suffix_of_an_image(put, stored, name):
-    assert read_cameras(put([entry(img_name=stored)]))[0].name == name
+    assert read_cameras(put(text_of([entry(img_name=stored)])))[0].name == name
 
 
-TURNED = entry()["rotation"]
+TURNED = np.array(entry()["rotation"])
 BROKEN = {
     "not a list": ({"a": 1}, "expected a list of cameras"),
     "not objects": ([1], "camera 0: expected an object"),
@@ -522,11 +412,8 @@ BROKEN = {
     "a place beyond sense": ([entry(position=[0, 2e9, 0])], "more than 1e[+]09 units from the origin"),
     "a rotation that overflows": ([entry(rotation=[[1e200] * 3] * 3)], "'rotation' is not a rotation"),
     "ragged rotation": ([entry(rotation=[[1, 0, 0], [0, 1], [0, 0, 1]])], "'rotation' is not 3 rows"),
-    "a scaled rotation": (
-        [entry(rotation=[[2 * x for x in row] for row in TURNED])],
-        "'rotation' is not a rotation",
-    ),
-    "a mirror": ([entry(rotation=[[-x for x in row] for row in TURNED])], "'rotation' is not a rotation"),
+    "a scaled rotation": ([entry(rotation=(2 * TURNED).tolist())], "'rotation' is not a rotation"),
+    "a mirror": ([entry(rotation=(-TURNED).tolist())], "'rotation' is not a rotation"),
     "no focal length": ([entry(fx=0)], "fx and fy must be positive"),
     "a name of numbers": ([entry(img_name=7)], "'img_name' is not a text"),
     "half a file": (json.dumps([entry()])[:-9], "not readable as JSON"),
@@ -538,8 +425,4 @@ BROKEN = {
 @pytest.mark.parametrize("case", BROKEN)
 def test_every_broken_rule_has_its_message(put, case):
     value, message = BROKEN[case]
-    path = put(value)
-    with pytest.raises(FormatError, match=message) as caught:
-        read_cameras(path)
-    assert str(caught.value).startswith(str(path))
-    assert "\n" not in str(caught.value)
+    assert_refused(read_cameras, put(text_of(value)), message)

@@ -35,12 +35,11 @@ from assets.making.vocabulary import Label, phrase_book
 from assets.making.world import World
 from langsplat_core.config import PictureConfig
 from langsplat_core.errors import EncoderError
-from langsplat_core.evaluation.scoring import intersection_over_union
+from langsplat_core.evaluation.report import intersection_over_union
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import Cancelled, Progress, Report, silent
-from langsplat_core.query.answers import peak_pixel
+from langsplat_core.query.answers import peak_pixel, splatted_relevancy
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.lookup import splatted_relevancy
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import CANONICAL_PHRASES, Camera, Scene
 from langsplat_core.semantics.encoders import load_encoder, load_text_encoder

@@ -26,7 +26,7 @@ from langsplat_core.query.answers import (
 )
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import Named
-from langsplat_core.query.regions import Regions, build_regions
+from langsplat_core.query.selection import Regions, build_regions
 from langsplat_core.scene import LEVELS, NO_NODE, Calibration, Gaussians, LanguageField, Odds, Reading, Scene
 from langsplat_core.scene.surface import SMALLEST, Surface, build_surface
 from langsplat_core.semantics.relevancy import FLOOR, Scale

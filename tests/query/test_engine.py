@@ -10,17 +10,17 @@ import pytest
 
 from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.errors import EncoderError, InputError, UnknownWordError
-from langsplat_core.query.answers import peak_pixel
-from langsplat_core.query.compose import check_phrase, run_phrase
-from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.lookup import (
+from langsplat_core.query.answers import (
     SphereTable,
     build_lookup,
     decoded_relevancy,
     octahedral_to_sphere,
+    peak_pixel,
     sphere_to_octahedral,
     splatted_relevancy,
 )
+from langsplat_core.query.compose import check_phrase, run_phrase
+from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import (
     CANONICAL_PHRASES,

@@ -11,8 +11,15 @@ from scipy.sparse.csgraph import connected_components
 from langsplat_core.arrays import sigmoid, unit
 from langsplat_core.errors import InputError
 from langsplat_core.query import selection
-from langsplat_core.query.regions import Regions
-from langsplat_core.query.selection import Projected, in_polygon, in_rectangle, in_stroke, on_surface, project
+from langsplat_core.query.selection import (
+    Projected,
+    Regions,
+    in_polygon,
+    in_rectangle,
+    in_stroke,
+    on_surface,
+    project,
+)
 from langsplat_core.scene import NO_NODE, Gaussians, LanguageField, Scene, look_at
 from langsplat_core.scene.surface import (
     BORDER,

@@ -93,13 +93,12 @@ def check_gather(view: object, truth: Truth, x: Array) -> None:
     assert np.abs(view.gather(y) - want).max(initial=0) <= 1e-5 * max(np.abs(want).max(initial=0), 1e-3)
 
 
+LABELS = ("error away from cut-offs", "mean error", "relative error of depth", "pixels flipped", "pixels")
+
+
 def record(scored: Scored, backend: Backend, group: str, measured: Measure) -> None:
-    name = f"{backend.name}, {group}"
-    measured(name, "error away from cut-offs", scored.worst)
-    measured(name, "mean error", scored.mean)
-    measured(name, "relative error of depth", scored.depth)
-    measured(name, "pixels flipped", scored.flips)
-    measured(name, "pixels", scored.pixels)
+    for label, value in zip(LABELS, vars(scored).values(), strict=True):
+        measured(f"{backend.name}, {group}", label, value)
 
 
 def part_of(camera: Camera, width: int = 48, height: int = 36) -> Camera:

@@ -5,13 +5,13 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from langsplat_core.arrays import Array
 from langsplat_core.config import GSPLAT, INRIA, RasterSettings
 from langsplat_core.errors import BackendError
 from langsplat_core.raster import LiftingView, load_rasterizer
@@ -67,23 +67,19 @@ def slow(request: pytest.FixtureRequest) -> bool:
     return bool(request.config.getoption("--slow"))
 
 
-def view_of(backend: Backend, case: Drawn) -> Any:
-    return backend.raster.view(*case)
-
-
 @pytest.mark.long
 def test_finite_and_between_0_and_1(backend: Backend, slow: bool) -> None:
     """Values in [0, 1] give an image in [0, alpha], and the weights of a pixel add up to alpha."""
 
     def law(case: Drawn) -> None:
-        n, view = len(case[0]), view_of(backend, case)
+        n, view = len(case[0]), backend.raster.view(*case)
         image, alpha = view.splat(np.column_stack([random_values(n, 2), np.ones(n, np.float32)]))
         assert np.isfinite(image).all()
         assert alpha.min() >= 0
-        assert alpha.max() <= 1
+        assert alpha.max() <= (1 - 0.99e-4 if backend.stops_early else 1)
         assert image.min() >= 0
         assert (image.max(-1) <= alpha + 1e-6).all()
-        np.testing.assert_allclose(image[..., 2], alpha, atol=2e-6)
+        np.testing.assert_allclose(image[..., 2], alpha, atol=1e-12 if backend.name == "reference" else 2e-6)
         assert np.isfinite(view.depth()).all()
 
     over_random_cases(law, slow)
@@ -94,7 +90,7 @@ def test_linear(backend: Backend, slow: bool) -> None:
     atol = {"reference": 1e-12, "opengl-half": 2.5e-2}.get(backend.name, 1e-5)
 
     def law(case: Drawn) -> None:
-        n, view = len(case[0]), view_of(backend, case)
+        n, view = len(case[0]), backend.raster.view(*case)
         x, y = (random_values(n, 2, seed).astype(np.float64) for seed in (1, 2))
         mixed = view.splat(2 * x - 3 * y)[0]
         np.testing.assert_allclose(mixed, 2 * view.splat(x)[0] - 3 * view.splat(y)[0], atol=atol)
@@ -108,12 +104,23 @@ def test_adjoint(backend: Backend, slow: bool) -> None:
         pytest.skip("it has no adjoint")
 
     def law(case: Drawn) -> None:
-        view, camera = view_of(backend, case), case[1]
+        view, camera = backend.raster.view(*case), case[1]
         x = random_values(len(case[0]), 3)
         y = np.random.default_rng(0).normal(size=(camera.height, camera.width, 3)).astype(np.float32)
-        assert_adjoint(lambda v: view.splat(v)[0], view.gather, x, y)
+        rtol = 1e-12 if backend.name == "reference" else 1e-5
+        assert_adjoint(lambda v: view.splat(v)[0], view.gather, x, y, rtol)
 
     over_random_cases(law, slow)
+
+
+def off(seen: Seen) -> tuple[Array, Array]:
+    """(H, W) distance of image or alpha from the reference's, whichever is more, and where cut-offs are."""
+    drawing, backend = seen.drawing, seen.backend
+    settings = backend.expected_settings(drawing.settings)
+    reference = ReferenceRasterizer().view(drawing.gaussians, drawing.camera, settings)
+    want, want_alpha = reference.splat(drawing.features())
+    error = np.abs(np.dstack([seen.image - want, seen.alpha - want_alpha])).max(-1)
+    return error, reference.cut_off_band(backend.band)
 
 
 def test_equal_to_the_reference(fast_backend: Backend, slow: bool) -> None:
@@ -122,16 +129,9 @@ def test_equal_to_the_reference(fast_backend: Backend, slow: bool) -> None:
 
     def law(case: Drawn) -> None:
         nonlocal flipped, pixels
-        gaussians, camera, raster_settings = case
-        if not fast_backend.promises(gaussians, raster_settings):
+        if not fast_backend.promises(case[0], case[2]):
             return
-        x = random_values(len(gaussians), 3)
-        expected = fast_backend.expected_settings(raster_settings)
-        reference = ReferenceRasterizer().view(gaussians, camera, expected)
-        band = reference.cut_off_band(fast_backend.band)
-        want, want_alpha = reference.splat(x)
-        image, alpha = view_of(fast_backend, case).splat(x)
-        error = np.maximum(np.abs(image - want).max(-1), np.abs(alpha - want_alpha))
+        error, band = off(draw(fast_backend, Drawing(*case)))
         flipped += int((error[band] > fast_backend.tolerance).sum())
         pixels += error.size
         assert error[~band].max(initial=0) <= fast_backend.tolerance
@@ -178,19 +178,11 @@ def test_without_perspective_a_step_along_the_view_changes_nothing(backend: Back
 MOST_AT_A_CUT_OFF = 2 / 255 + 0.99 * 1e-4 / (1 - 0.99)
 # Where gsplat draws something else by design: it forms covariances in 3D in float32, which overflow or lose
 # their digits, caps alpha at a value of its own and draws a Gaussian that lies in the near plane itself.
-BEYOND_GSPLAT = frozenset(
-    {
-        "scale e^40",
-        "scale e^80",
-        "needles longer than the world",
-        "all scales e^(79, 79, 79)",
-        "all scales e^(-inf, 79, 79)",
-        "all scales e^(40, 0, -40)",
-        "all scales e^(7, -5, -6)",
-        "one opaque Gaussian",
-        "one ulp about the near plane",
-    }
-)
+BEYOND_GSPLAT = {
+    "scale e^40", "scale e^80", "needles longer than the world", "all scales e^(79, 79, 79)",
+    "all scales e^(-inf, 79, 79)", "all scales e^(40, 0, -40)", "all scales e^(7, -5, -6)",
+    "one opaque Gaussian", "one ulp about the near plane",
+}  # fmt: skip
 NAMED = [pytest.param(case, id=case.name) for case in CASES]
 
 
@@ -219,10 +211,9 @@ def run_case(case: Case, drawing: Drawing, backend: Backend, measured: Measure) 
         compare(seen, measured)
     if isinstance(seen.view, LiftingView):
         check_adjoint(seen)
+        check_frozen(seen)
     if hasattr(seen.view, "backward"):
         check_gradients(seen)
-    if isinstance(seen.view, LiftingView):
-        check_frozen(seen)
     return seen
 
 
@@ -236,17 +227,11 @@ def check_depth(seen: Seen) -> None:
 
 def compare(seen: Seen, measured: Measure) -> None:
     """The picture is the reference's but at cut-offs, where an alpha of 1/255 may flip."""
-    drawing, backend = seen.drawing, seen.backend
-    settings = backend.expected_settings(drawing.settings)
-    reference = ReferenceRasterizer().view(drawing.gaussians, drawing.camera, settings)
-    want, want_alpha = reference.splat(drawing.features())
-    band = reference.cut_off_band(backend.band)
-    both = np.concatenate([seen.image, seen.alpha[..., None]], -1)
-    error = np.abs(both - np.concatenate([want, want_alpha[..., None]], -1)).max(-1)
+    (error, band), tolerance = off(seen), seen.backend.tolerance
     worst = float(error[~band].max(initial=0))
-    measured(f"hard cases, {backend.name}", "error away from cut-offs", worst)
-    measured(f"hard cases, {backend.name}", "pixels flipped", float((error[band] > backend.tolerance).sum()))
-    assert worst <= backend.tolerance
+    measured(f"hard cases, {seen.backend.name}", "error away from cut-offs", worst)
+    measured(f"hard cases, {seen.backend.name}", "pixels flipped", float((error[band] > tolerance).sum()))
+    assert worst <= tolerance
     assert error[band].max(initial=0) <= MOST_AT_A_CUT_OFF
 
 
@@ -275,8 +260,7 @@ def check_frozen(seen: Seen) -> None:
 def check_gradients(seen: Seen) -> None:
     """Finite everywhere, exactly zero for dropped rows."""
     rng = np.random.default_rng(2)
-    by_image = rng.normal(size=seen.image.shape)
-    by_alpha = rng.normal(size=seen.alpha.shape)
+    by_image, by_alpha = rng.normal(size=seen.image.shape), rng.normal(size=seen.alpha.shape)
     gradients = seen.view.backward(seen.drawing.features(), by_image, by_alpha)
     dropped = ~seen.drawing.gaussians.valid()
     assert gradients.values.shape == seen.drawing.features().shape
@@ -327,11 +311,9 @@ def test_colours_that_overflow(backend: Backend, coefficient: float) -> None:
 
 def test_dropped_rows_are_told_by_reason() -> None:
     """One sentence per reason; a row with several faults counts once."""
-    gaussians = altered("means", [0, 1], np.nan).gaussians
-    quats, logits, sh = gaussians.quats_wxyz.copy(), gaussians.opacity_logits.copy(), gaussians.sh.copy()
-    log_scales = gaussians.log_scales.copy()
-    quats[1:5], logits[4:6], sh[6, 0, 1], log_scales[7:9, 2] = 0, np.nan, 1e38, [np.inf, 81]
-    broken = replace(gaussians, quats_wxyz=quats, opacity_logits=logits, sh=sh, log_scales=log_scales)
+    broken = crowd().gaussians
+    broken.means[:2], broken.quats_wxyz[1:5], broken.opacity_logits[4:6] = np.nan, 0, np.nan
+    broken.sh[6, 0, 1], broken.log_scales[7:9, 2] = 1e38, [np.inf, 81]
     assert broken.invalid_rows() == {
         "position not finite": 2,
         "scale not a number or above e^80": 2,
@@ -352,9 +334,8 @@ def test_results_do_not_depend_on_the_number_of_threads(case: Case) -> None:
     x = drawing.features()[:, :1]
     results = []
     for threads in (1, 2, 5):
-        view = load_rasterizer("cpu", threads=threads).view(
-            drawing.gaussians, drawing.camera, drawing.settings
-        )
+        rasterizer = load_rasterizer("cpu", threads=threads)
+        view = rasterizer.view(drawing.gaussians, drawing.camera, drawing.settings)
         gradients = view.backward(x, target, target[..., 0])
         results.append([*view.splat(x), view.gather(target), view.median_depth(), *gradients])
     for other in results[1:]:

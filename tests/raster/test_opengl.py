@@ -29,7 +29,6 @@ from langsplat_core.scene import Camera, Gaussians
 from tests.support.backends import gl_state
 from tests.support.scenes import random_camera, random_gaussians, random_values
 
-FORWARD = np.array([0.0, 0.0, 1.0, 0.0])
 RNG = np.random.default_rng(0)
 TILE = scene_textures.GROUP * scene_textures.ROUNDS
 BIG, TINY = 3.4e38, 1e-45  # near the ends of float32; the latter is denormal
@@ -59,18 +58,18 @@ def sorted_on_device(
     return found
 
 
-def back_to_front(depths: Array, near: float, far: float) -> Array:
+def check_order(found: Array, depths: Array, near: float = -np.inf, far: float = np.inf) -> None:
+    """Back to front, what lies between the planes alone."""
     ahead = np.flatnonzero((depths > near) & (depths <= far))
-    return ahead[np.argsort(depths[ahead], kind="stable")][::-1]
+    np.testing.assert_array_equal(found, ahead[np.argsort(depths[ahead], kind="stable")][::-1])
 
 
 def check_depths(
     gl: moderngl.Context, sorter: DepthSorter, depths: Array, near: float = -np.inf, far: float = np.inf
 ) -> None:
-    means = np.zeros((len(depths), 3))
-    means[:, 2] = depths
-    found = sorted_on_device(gl, sorter, means, FORWARD, near, far)
-    np.testing.assert_array_equal(found, back_to_front(np.asarray(depths, float), near, far))
+    means = np.pad(np.asarray(depths, float)[:, None], ((0, 0), (2, 0)))
+    found = sorted_on_device(gl, sorter, means, np.array([0.0, 0.0, 1.0, 0.0]), near, far)
+    check_order(found, means[:, 2], near, far)
 
 
 DEPTHS = {
@@ -111,8 +110,7 @@ def test_depths_round_as_numpy_rounds_them(gl, sorter):
     for _ in range(3):
         a, b, c, d = plane = rng.normal(size=4)
         depths = means[:, 0] * a + means[:, 1] * b + means[:, 2] * c + d
-        found = sorted_on_device(gl, sorter, means, plane, -np.inf, np.inf)
-        np.testing.assert_array_equal(found, back_to_front(depths, -np.inf, np.inf))
+        check_order(sorted_on_device(gl, sorter, means, plane, -np.inf, np.inf), depths)
 
 
 @pytest.mark.long
@@ -147,11 +145,8 @@ def test_pictures_do_not_depend_on_who_sorts(gl, both):
 def test_a_scene_before_the_near_plane_draws_nothing(gl, both):
     nothing_ahead = replace(INRIA, near=1e6)
     for rasterizer in both:
-        image, alpha = rasterizer.view(random_gaussians(30), random_camera(), nothing_ahead).splat(
-            np.ones((30, 1))
-        )
-        assert not image.any()
-        assert not alpha.any()
+        view = rasterizer.view(random_gaussians(30), random_camera(), nothing_ahead)
+        assert not np.any(view.splat(np.ones((30, 1)))[1])
 
 
 def test_the_order_is_kept_while_the_camera_stands(gl, both):
@@ -164,19 +159,19 @@ def test_the_order_is_kept_while_the_camera_stands(gl, both):
     assert rasterizer.view(gaussians, camera, GSPLAT).order is not view.order
 
 
-def test_a_driver_that_sorts_wrongly_is_not_used(gl, monkeypatch):
-    monkeypatch.setattr(SortBuffers, "order", lambda self: np.arange(self.count, dtype=np.int32))
+def refuse(*_: object) -> None:
+    raise moderngl.Error("GLSL Compiler failed")
+
+
+@pytest.mark.parametrize(
+    ("of", "name", "made"),
+    [(SortBuffers, "order", lambda b: np.arange(b.count, dtype=np.int32)), (DepthSorter, "__init__", refuse)],
+)
+def test_a_driver_that_sorts_wrongly_or_cannot_compile_it_is_not_used(gl, monkeypatch, of, name, made):
+    monkeypatch.setattr(of, name, made)
     assert working_sorter(gl) is None
     with pytest.raises(BackendError, match="cannot sort"):
         GlRasterizer(gl, sort="device")
-
-
-def test_a_driver_that_cannot_compile_it_is_not_used(gl, monkeypatch):
-    def refuse(*_):
-        raise moderngl.Error("GLSL Compiler failed")
-
-    monkeypatch.setattr(DepthSorter, "__init__", refuse)
-    assert working_sorter(gl) is None
 
 
 @pytest.mark.parametrize("software", [True, False])
@@ -202,16 +197,11 @@ def test_scenes_beyond_the_drivers_buffers_are_sorted_by_numpy(gl, both, monkeyp
 # closely. What the cut-offs add is tested apart, because there single pixels may flip.
 SMOOTH = replace(INRIA, transmittance_min=0.0, alpha_min=1e-6)
 SINGLE = 5e-6  # measured 2e-6 at most
-NEEDLES = 1e-4  # measured 3e-5: a pixel centre's distance from a million pixels' axis, in float32
 
 
 @pytest.fixture(scope="module")
-def raster(gl_session):
-    with gl_session:
-        rasterizer = GlRasterizer(gl_session, "single", sort="cpu")
-    yield rasterizer
-    with gl_session:
-        rasterizer.release()
+def raster(gl_rasterizers):
+    return gl_rasterizers["single"]
 
 
 def agree(
@@ -219,134 +209,89 @@ def agree(
     gaussians: Gaussians,
     camera: Camera,
     settings: RasterSettings = SMOOTH,
-    tolerance: float = SINGLE,
+    channels: int = 4,
 ) -> None:
-    """Image, alpha and expected depth within `tolerance` (depth: relative, where anything is seen)."""
-    values = random_values(len(gaussians), 4, seed=5)
+    """Image, alpha and expected depth within `SINGLE` (depth: relative, where anything is seen)."""
+    values = random_values(len(gaussians), channels, seed=5)
     reference = ReferenceRasterizer().view(gaussians, camera, settings)
     view = raster.view(gaussians, camera, settings)
     want, want_alpha = reference.splat(values)
     image, alpha = view.splat(values)
-    np.testing.assert_allclose(image, want, atol=tolerance)
-    np.testing.assert_allclose(alpha, want_alpha, atol=tolerance)
+    assert image.shape == want.shape
+    np.testing.assert_allclose(image, want, atol=SINGLE)
+    np.testing.assert_allclose(alpha, want_alpha, atol=SINGLE)
     seen = want_alpha > 0.01
-    np.testing.assert_allclose(view.depth()[seen], reference.depth()[seen], rtol=tolerance)
+    np.testing.assert_allclose(view.depth()[seen], reference.depth()[seen], rtol=SINGLE)
     assert view.dropped == reference.dropped
 
 
-@pytest.mark.usefixtures("gl")
-class TestAgainstTheReference:
-    @pytest.mark.parametrize("seed", range(4))
-    @pytest.mark.parametrize("distance", [3.0, 1.2])  # 1.2: in the middle of the scene
-    def test_random_scenes(self, raster, seed, distance):
-        agree(raster, random_gaussians(100, seed), random_camera(seed, distance=distance))
-
-    def test_antialiased(self, raster):
-        settings = replace(SMOOTH, antialiased=True)
-        agree(raster, random_gaussians(100, scale_range=(1e-3, 0.05)), random_camera(), settings)
-
-    def test_gsplat_profile_draws_what_is_nearer(self, raster):
-        gaussians = random_gaussians(60, scale_range=(0.01, 0.03))
-        camera = random_camera(distance=0.3)
-        agree(raster, gaussians, camera, replace(GSPLAT, transmittance_min=0.0, alpha_min=1e-6))
-        inria, gsplat = (raster.view(gaussians, camera, s) for s in (INRIA, GSPLAT))
-        assert len(gsplat.order.texels) > len(inria.order.texels)
-
-    @pytest.mark.parametrize("centre", [(0.0, 0.0), (-40.0, 100.0), (70.0, 22.0)])
-    def test_principal_point_anywhere(self, raster, centre):
-        camera = replace(random_camera(distance=2.0), cx=centre[0], cy=centre[1])
-        agree(raster, random_gaussians(80, radius=2.0), camera)
-
-    @pytest.mark.parametrize("channels", [0, 1, 3, 4, 12, 13, 26])
-    def test_any_number_of_channels(self, raster, channels):
-        gaussians, camera = random_gaussians(40), random_camera()
-        values = random_values(40, channels)
-        want, want_alpha = ReferenceRasterizer().view(gaussians, camera, SMOOTH).splat(values)
-        image, alpha = raster.view(gaussians, camera, SMOOTH).splat(values)
-        assert image.shape == want.shape
-        np.testing.assert_allclose(image, want, atol=SINGLE)
-        np.testing.assert_allclose(alpha, want_alpha, atol=SINGLE)
-
-    @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-    def test_view_dependent_colours(self, raster, degree):
-        gaussians, camera = random_gaussians(80, sh_degree=degree), random_camera(2)
-        rgb = colours(gaussians.sh, gaussians.means, camera.position)
-        want, _ = ReferenceRasterizer().view(gaussians, camera, SMOOTH).splat(rgb)
-        (texture,) = raster.draw(raster.view(gaussians, camera, SMOOTH), ["colour"])
-        image = np.frombuffer(texture.read(), "f4").reshape(*want.shape[:2], 4)
-        np.testing.assert_allclose(image[..., :3], want, atol=SINGLE)
-
-    def test_copies_of_a_gaussian_are_drawn_by_index(self, raster):
-        """From any direction: equal rows must get equal depths, wherever in the file they are."""
-        twice = random_gaussians(41).take(np.concatenate([np.arange(41), np.arange(41)[::-1]]))
-        for seed in range(3):
-            agree(raster, twice, random_camera(seed))
+NEAR = random_gaussians(60, scale_range=(0.01, 0.03)), random_camera(distance=0.3)
+AGREEING = [
+    *(
+        (random_gaussians(100, seed), random_camera(seed, distance=distance))
+        for seed in range(4)
+        for distance in (3.0, 1.2)  # 1.2: in the middle of the scene
+    ),
+    (random_gaussians(100, scale_range=(1e-3, 0.05)), random_camera(), replace(SMOOTH, antialiased=True)),
+    (*NEAR, replace(GSPLAT, transmittance_min=0.0, alpha_min=1e-6)),
+    *(
+        (random_gaussians(80, radius=2.0), replace(random_camera(distance=2.0), cx=cx, cy=cy))
+        for cx, cy in ((0.0, 0.0), (-40.0, 100.0), (70.0, 22.0))
+    ),
+]
 
 
-def test_depth_does_not_suffer_from_half_precision(gl):
-    raster = GlRasterizer(gl, "half")
-    gaussians, camera = random_gaussians(100), random_camera(distance=1e5)
-    agree_depth = ReferenceRasterizer().view(gaussians, camera, SMOOTH)
-    _, alpha = agree_depth.splat(np.zeros((100, 0)))
-    depth = raster.view(gaussians, camera, SMOOTH).depth()
-    np.testing.assert_allclose(depth[alpha > 0.01], agree_depth.depth()[alpha > 0.01], rtol=SINGLE)
-    raster.release()
+@pytest.mark.parametrize("case", AGREEING)
+def test_pictures_are_the_references(gl, raster, case):
+    agree(raster, *case)
 
 
-def test_at_the_cut_offs_few_pixels_flip_and_none_by_much(gl, raster):
-    """Blending has no early stop (T <= 1e-4 costs 1e-4 of a value), and an alpha within rounding of 1/255
-    may fall on either side (which costs one alpha of 1/255)."""
-    flipped = total = 0
-    for seed in range(6):
-        gaussians, camera = random_gaussians(150, seed), random_camera(seed, distance=2.0)
-        values = random_values(150, 3, seed)
-        image, _ = raster.view(gaussians, camera).splat(values)
-        want, _ = ReferenceRasterizer().view(gaussians, camera).splat(values)
-        error = np.abs(image - want).max(-1)
-        assert error.max() <= 1 / 255
-        flipped += int((error > 2e-4).sum())
-        total += error.size
-    assert flipped <= 1e-3 * total
+@pytest.mark.parametrize("channels", [0, 1, 3, 4, 12, 13, 26])
+def test_any_number_of_channels(gl, raster, channels):
+    agree(raster, random_gaussians(40), random_camera(), channels=channels)
 
 
-def test_a_footprint_ends_where_alpha_is_one_255th(gl, raster):
-    """A lone Gaussian: exactly the pixels of the reference, so the quad cuts none and adds none."""
-    for seed in range(8):
-        gaussians, camera = random_gaussians(1, seed, scale_range=(0.01, 1.5)), random_camera(seed)
-        _, alpha = raster.view(gaussians, camera).splat(np.zeros((1, 0)))
-        _, want = ReferenceRasterizer().view(gaussians, camera).splat(np.zeros((1, 0)))
-        borderline = np.abs(want * 255 - 1) < 1e-3
-        np.testing.assert_array_equal((alpha > 0)[~borderline], (want > 0)[~borderline])
+def test_gsplats_profile_draws_what_is_nearer(gl, raster):
+    inria, gsplat = (raster.view(*NEAR, settings) for settings in (INRIA, GSPLAT))
+    assert len(gsplat.order.texels) > len(inria.order.texels)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_view_dependent_colours(gl, raster, degree):
+    gaussians, camera = random_gaussians(80, sh_degree=degree), random_camera(2)
+    rgb = colours(gaussians.sh, gaussians.means, camera.position)
+    want, _ = ReferenceRasterizer().view(gaussians, camera, SMOOTH).splat(rgb)
+    (texture,) = raster.draw(raster.view(gaussians, camera, SMOOTH), ["colour"])
+    image = np.frombuffer(texture.read(), "f4").reshape(*want.shape[:2], 4)
+    np.testing.assert_allclose(image[..., :3], want, atol=SINGLE)
+
+
+def test_depth_does_not_suffer_from_half_precision(gl, gl_rasterizers):
+    case = random_gaussians(100), random_camera(distance=1e5), SMOOTH
+    reference = ReferenceRasterizer().view(*case)
+    seen = reference.splat(np.zeros((100, 0)))[1] > 0.01
+    depth = gl_rasterizers["half"].view(*case).depth()
+    np.testing.assert_allclose(depth[seen], reference.depth()[seen], rtol=SINGLE)
 
 
 def test_views_drawn_in_turn_do_not_disturb_each_other(gl, raster):
     """One set of textures serves all views; also scenes of different size, and a zoomed camera."""
     first, second = random_gaussians(70, 1), random_gaussians(40, 2)
     camera = random_camera(1)
-    cases = [
-        (first, camera),
-        (first, random_camera(5)),
-        (first, replace(camera, fx=2 * camera.fx)),
-        (second, camera),
-    ]
-    views = [raster.view(*case) for case in cases]
-    for _ in range(2):
-        for view, (gaussians, cam) in zip(views, cases, strict=True):
-            values = random_values(len(gaussians), 3)
-            want, _ = ReferenceRasterizer().view(gaussians, cam).splat(values)
-            np.testing.assert_allclose(view.splat(values)[0], want, atol=1 / 255)
+    cases = [(first, at) for at in (camera, random_camera(5), replace(camera, fx=2 * camera.fx))]
+    views = [(raster.view(*case), ReferenceRasterizer().view(*case)) for case in [*cases, (second, camera)]]
+    for view, reference in 2 * views:
+        values = random_values(len(view.gaussians), 3)
+        np.testing.assert_allclose(view.splat(values)[0], reference.splat(values)[0], atol=1 / 255)
 
 
 def test_median_depth_of_one_pixel(gl, raster):
-    gaussians, camera = random_gaussians(120), random_camera(1)
-    reference = ReferenceRasterizer().view(gaussians, camera, SMOOTH)
-    view = raster.view(gaussians, camera, SMOOTH)
-    median, mean = reference.median_depth(), reference.depth()
+    case = random_gaussians(120), random_camera(1), SMOOTH
+    reference, view = ReferenceRasterizer().view(*case), raster.view(*case)
     _, alpha = reference.splat(np.zeros((120, 0)))
-    want = np.where(median > 0, median, mean)
-    rows, columns = np.nonzero(np.abs(alpha - 0.5) > 1e-4)
-    for i in np.random.default_rng(0).choice(len(rows), 40, replace=False):
-        row, column = int(rows[i]), int(columns[i])
+    want = np.where(reference.median_depth() > 0, reference.median_depth(), reference.depth())
+    pixels = np.argwhere(np.abs(alpha - 0.5) > 1e-4)
+    for row, column in np.random.default_rng(0).choice(pixels, 40, replace=False).tolist():
         depth, covered = view.depth_at(column, row)
         assert depth == pytest.approx(want[row, column], rel=1e-5)
         assert covered == pytest.approx(alpha[row, column], abs=1e-5)

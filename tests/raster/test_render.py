@@ -1,6 +1,8 @@
 """The front door: one call from a scene and a camera to a picture."""
 
 import doctest
+import subprocess
+import sys
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +22,12 @@ from langsplat_core.scene import look_at
 from tests.support.scenes import random_camera, random_gaussians, random_values, without_perspective
 
 G, CAMERA = random_gaussians(80, 4, sh_degree=2), random_camera(2)
+either = pytest.mark.parametrize("backend", ["cpu", "reference"])
+
+
+def test_backends_are_loaded_lazily():
+    code = "import sys, langsplat_core.raster; print({'numba', 'torch', 'moderngl'} & {*sys.modules})"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "set()\n"
 
 
 def test_the_example_in_the_docstring_runs():
@@ -27,7 +35,7 @@ def test_the_example_in_the_docstring_runs():
     assert (result.attempted, result.failed) == (6, 0)
 
 
-@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@either
 def test_a_picture_is_project_colours_and_splat(backend: str) -> None:
     values = random_values(80, 2)
     picture = render(Scene(G), CAMERA, values, backend=backend)
@@ -51,7 +59,7 @@ def test_the_scenes_antialiasing_and_the_profile_apply():
     assert not np.array_equal(got.colours, render(Scene(G), CAMERA).colours)
 
 
-@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@either
 def test_an_image_of_more_pixels_than_the_photographs_shows_what_they_showed(backend: str) -> None:
     """Gaussians thinner than a pixel are all dilation: an image four times as large has as much of it."""
     thin = replace(
@@ -80,20 +88,15 @@ def test_cameras_of_no_lens_do_not_spread_gaussians_over_the_image(factor: float
     assert protocol.dilation(CAMERA, settings) <= protocol.MOST_GROWTH * INRIA.dilation
 
 
-def test_what_cannot_draw_is_said():
+def test_what_cannot_draw_or_lift_is_said():
     with pytest.raises(InputError, match="choose one of reference, cpu, opengl, cuda"):
         render(Scene(G), CAMERA, backend="vulkan")
     with pytest.raises(BackendError, match="--backend cpu"):
         render(Scene(G), CAMERA, backend="cuda")
-
-
-def test_lifting_takes_what_the_machine_has():
     assert load_lifting_rasterizer("auto").name in ("cpu", "cuda")
-    assert load_lifting_rasterizer("reference").name == "reference"
-    with pytest.raises(InputError, match="cannot lift"):
-        load_lifting_rasterizer("opengl")
-    with pytest.raises(InputError, match="choose one of"):
-        load_lifting_rasterizer("vulkan")
+    for name, message in (("opengl", "cannot lift"), ("vulkan", "choose one of")):
+        with pytest.raises(InputError, match=message):
+            load_lifting_rasterizer(name)
 
 
 def test_every_public_name_is_there():
@@ -121,31 +124,27 @@ def test_a_camera_file_of_65536_x_65536(tmp_path: Path, monkeypatch: pytest.Monk
 
 # The Gaussians of one pixel are those that the whole view blends there.
 
-SIZE = (64, 48)
-PIXELS = [(0, 0), (63, 47), (32, 24), (20, 40), (50, 5)]
-
 
 def view_from(distance: float):
-    return look_at(np.array([0.2, -0.3, -distance]), np.zeros(3), np.array([0.0, -1, 0]), SIZE)
+    return look_at(np.array([0.2, -0.3, -distance]), np.zeros(3), np.array([0.0, -1, 0]), (64, 48))
 
 
 @pytest.mark.parametrize("orthographic", [False, True])
 @pytest.mark.parametrize("distance", [3.0, 0.8])  # outside, and amid them: some behind, some at the edge
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@either
 def test_the_row_of_w(backend, distance, orthographic):
     gaussians = random_gaussians(400, 3, scale_range=(0.005, 0.5))
     camera, rasterizer = view_from(distance), load_lifting_rasterizer(backend)
     camera = without_perspective(camera) if orthographic else camera
     truth = load_lifting_rasterizer("reference").view(gaussians, camera)
-    for column, row in PIXELS:
-        image = np.zeros((SIZE[1], SIZE[0], 1))
+    for column, row in [(0, 0), (63, 47), (32, 24), (20, 40), (50, 5)]:
+        image = np.zeros((48, 64, 1))
         image[row, column] = 1
-        want = truth.gather(image)[:, 0]
         rows, weights = pixel_weights(rasterizer, gaussians, camera, (column, row))
         got = np.zeros(len(gaussians))
         got[rows] = weights
         assert (weights > 0).all()
-        np.testing.assert_allclose(got, want, atol=2e-5)
+        np.testing.assert_allclose(got, truth.gather(image)[:, 0], atol=2e-5)
 
 
 def test_few_are_projected_and_invalid_ones_are_not():
@@ -163,9 +162,5 @@ def test_few_are_projected_and_invalid_ones_are_not():
     rows, _ = pixel_weights(Recorder(), broken, view_from(3.0), (32, 24))
     assert 5 not in rows
     assert seen[0] < 200
-
-
-def test_an_empty_scene():
-    none = random_gaussians(3, 0).take(np.zeros(3, bool))
-    rows, weights = pixel_weights(load_lifting_rasterizer("cpu"), none, view_from(3.0), (1, 1))
+    rows, weights = pixel_weights(Recorder(), gaussians.take(slice(0)), view_from(3.0), (1, 1))
     assert len(rows) == len(weights) == 0

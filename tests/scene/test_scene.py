@@ -1,4 +1,4 @@
-"""Scenes: framing, merged Gaussians, phrases, calibration."""
+"""Scenes: framing, merged Gaussians, phrases, calibration, trees, and similarity transforms."""
 
 from dataclasses import replace
 
@@ -7,15 +7,35 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from langsplat_core.arrays import logit, psnr, sigmoid
+from langsplat_core import render
+from langsplat_core.arrays import logit, psnr, rotation_matrices, sigmoid, unit
 from langsplat_core.bench.query import repeated
+from langsplat_core.errors import InputError
 from langsplat_core.progress import Cancelled
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import NO_NODE, Gaussians, Odds, Scene, Tree
 from langsplat_core.scene.gaussians import GROUP, merged
 from langsplat_core.scene.language import phrase_key, split_phrases, tidy, tokens
+from langsplat_core.scene.transform import (
+    AXES,
+    IDENTITY,
+    Similarity,
+    moving,
+    rotating,
+    rotation_quaternion,
+    scaling,
+    sh_basis,
+    sh_rotations,
+    similarity,
+    transform_gaussians,
+    transform_rows,
+    transform_scene,
+    turning,
+)
+from tests.support.comparing import assert_same
 from tests.support.file_samples import random_field
-from tests.support.scenes import covariances, random_camera, random_gaussians
+from tests.support.hard_cases import balls
+from tests.support.scenes import covariances, random_camera, random_gaussians, without_perspective
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e4, 1e15, 3e38])
@@ -47,9 +67,7 @@ def test_a_thin_scene_is_seen_from_its_broad_side(angle: float) -> None:
 def test_copies_become_one():
     """Exactly: same place, same shape, the opacity of all four one behind the other."""
     one = random_gaussians(1, sh_degree=1, scale_range=(0.1, 0.4))
-    four = one.take(np.zeros(GROUP, int))
-    four = replace(four, opacity_logits=logit(np.full(GROUP, 0.3)))
-    found = merged(four)
+    found = merged(replace(one.take(np.zeros(GROUP, int)), opacity_logits=logit(np.full(GROUP, 0.3))))
     assert len(found.gaussians) == 1
     np.testing.assert_allclose(found.gaussians.means, one.means, rtol=1e-6)
     np.testing.assert_allclose(found.gaussians.sh, one.sh, rtol=1e-6)
@@ -60,16 +78,11 @@ def test_copies_become_one():
 
 def test_a_row_of_neighbours_becomes_a_longer_one():
     """Mean and covariance are those of the mixture."""
-    means = np.zeros((GROUP, 3))
-    means[:, 0] = (-0.12, -0.04, 0.04, 0.12)
-    row = Gaussians(
-        means, np.log(np.full((GROUP, 3), 0.2)), np.tile([1.0, 0, 0, 0], (GROUP, 1)), np.zeros(GROUP),
-        np.zeros((GROUP, 1, 3)),
-    )  # fmt: skip
-    found = merged(row).gaussians
+    x = np.array([-0.12, -0.04, 0.04, 0.12])
+    found = merged(balls(np.zeros(GROUP), 0.5, 0.2, x)).gaussians
     assert len(found) == 1
     np.testing.assert_allclose(found.means, 0, atol=1e-7)
-    expected = np.diag([0.04 + np.mean(means[:, 0] ** 2), 0.04, 0.04])
+    expected = np.diag([0.04 + np.mean(x**2), 0.04, 0.04])
     np.testing.assert_allclose(covariances(found)[0], expected, atol=1e-7)
 
 
@@ -78,8 +91,7 @@ def test_what_lies_apart_is_left_as_it_is():
     found = merged(apart)
     rows = found.weights.indices.reshape(-1, GROUP)[:, 0]
     assert sorted(rows) == list(range(81))
-    for name in ("means", "log_scales", "quats_wxyz", "opacity_logits", "sh"):
-        np.testing.assert_array_equal(getattr(found.gaussians, name), getattr(apart, name)[rows])
+    assert_same(found.gaussians, apart.take(rows))
 
 
 @pytest.fixture(scope="module")
@@ -99,26 +111,18 @@ def test_a_dense_scene_shrinks_and_looks_alike(dense):
     assert psnr(image, want) > 27  # measured 29.1
     assert psnr(alpha, want_alpha) > 23  # measured 24.0: the ball's rim is much of so small a picture
     assert found.values(None) is None
-
-
-def test_every_row_counts_once(dense):
-    weights = merged(dense).weights
-    assert weights.shape[1] == 1600
-    np.testing.assert_allclose(weights.sum(1), 1, rtol=1e-6)
-    entries = weights.tocoo()
-    used = entries.col[entries.data > 0]
-    assert len(used) == len(set(used.tolist())) == 1600
+    np.testing.assert_allclose(found.weights.sum(1), 1, rtol=1e-6)
+    entries = found.weights.tocoo()
+    assert sorted(entries.col[entries.data > 0]) == list(range(1600))  # every row counts once
 
 
 def test_blocks_do_not_show(dense, monkeypatch):
-    whole = merged(dense)
+    whole = merged(dense).gaussians
     monkeypatch.setattr("langsplat_core.scene.gaussians.BLOCK", 37)
-    blocks = merged(dense)
-    order = np.lexsort(whole.gaussians.means.T), np.lexsort(blocks.gaussians.means.T)
+    blocks = merged(dense).gaussians
+    whole, blocks = (one.take(np.lexsort(one.means.T)) for one in (whole, blocks))
     for name in ("means", "log_scales", "sh"):
-        np.testing.assert_array_equal(
-            getattr(whole.gaussians, name)[order[0]], getattr(blocks.gaussians, name)[order[1]]
-        )
+        np.testing.assert_array_equal(getattr(whole, name), getattr(blocks, name))
 
 
 def test_what_cannot_be_drawn_is_left_out():
@@ -134,8 +138,8 @@ def test_what_cannot_be_drawn_is_left_out():
 def test_any_number_of_gaussians(count):
     found = merged(random_gaussians(count))
     assert len(found.gaussians) == found.weights.shape[0] <= count
-    assert found.values(np.ones((count, 2))).shape == (len(found.gaussians), 2)
-    np.testing.assert_allclose(found.values(np.ones((count, 2))), 1, rtol=1e-6)
+    values = found.values(np.ones((count, 2)))
+    np.testing.assert_allclose(values, np.ones((len(found.gaussians), 2)), rtol=1e-6)
 
 
 def test_extremes_stay_drawable():
@@ -184,12 +188,10 @@ def test_quotes_and_punctuation_are_no_part_of_a_phrase(key, text):
         ("mug , not 'red mug'!", ["mug, not red mug"]),
         (" , mug ,", ["mug"]),
         ("duck, penguin", ["duck", "penguin"]),
-        (
-            '"mug", red book; plate, not red plate,, the cup, but not my cup',
-            ["mug", "red book", "plate, not red plate", "the cup, but not my cup"],
-        ),
+        ('"mug", red book; plate, not red plate,, the cup, but not my cup',
+         ["mug", "red book", "plate, not red plate", "the cup, but not my cup"]),
     ],
-)
+)  # fmt: skip
 def test_phrases_in_a_line_are_separated_and_keep_capitals_and_commas(text, shown):
     assert split_phrases(text) == shown
     if len(shown) == 1:
@@ -230,12 +232,8 @@ def test_odds_rise_with_fits(numbers):
 
 
 LEAVES = np.array([0, 0, 1, 2, 2, NO_NODE, 3], np.int32)  # two subparts of a part of a whole; another whole
-TREE = Tree(
-    LEAVES,
-    np.array([4, 4, 5, 5, 6, NO_NODE, NO_NODE], np.int32),
-    np.array([0, 0, 2, 0, 1, 2, 2], np.uint8),
-    np.zeros((7, 2), np.uint16),
-)
+PARENTS = np.array([4, 4, 5, 5, 6, NO_NODE, NO_NODE], np.int32)
+TREE = Tree(LEAVES, PARENTS, np.array([0, 0, 2, 0, 1, 2, 2], np.uint8), np.zeros((7, 2), np.uint16))
 
 
 def test_nodes_are_nested_sets():
@@ -283,10 +281,140 @@ def test_a_field_has_a_leaf_for_every_gaussian_and_taking_rows_takes_them():
 
 def test_things_are_nodes_of_their_level_that_masks_voted_for():
     voted = replace(TREE, votes=np.array([[1, 0], [0, 3], [2, 0], [0, 0], [4, 1], [0, 0], [1, 1]], np.uint16))
-    assert voted.things().tolist() == [
-        [0, 0, NO_NODE, NO_NODE, NO_NODE, NO_NODE, NO_NODE],
-        [4, 4, 4, NO_NODE, NO_NODE, NO_NODE, NO_NODE],
-        [6, 6, 6, NO_NODE, NO_NODE, NO_NODE, NO_NODE],
-    ]
+    none = [NO_NODE] * 4
+    assert voted.things().tolist() == [[0, 0, NO_NODE, *none], [4, 4, 4, *none], [6, 6, 6, *none]]
     again = replace(TREE, votes=np.zeros((7, 2), np.uint16)).voted_by(voted.things())
     assert again.votes[:, 0].tolist() == [1, 0, 0, 0, 1, 0, 1]
+
+
+# A transformed scene seen by the transformed camera is the scene that was there before.
+
+TO = rotating(np.array([1.0, -2.0, 0.5]), 77).then(scaling(1.7)).then(moving(np.array([3.0, -1.0, 2.0])))
+TURNS = [rotating(axis, degrees) for axis in AXES.values() for degrees in (90, 180)] + [TO]
+
+
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("perspective", [True, False])
+def test_the_transformed_scene_looks_the_same(degree: int, perspective: bool) -> None:
+    """To the float64 reference; the Gaussians themselves are rounded to float32."""
+    gaussians, camera = random_gaussians(40, seed=3, sh_degree=degree), random_camera(4)
+    camera = camera if perspective else without_perspective(camera)
+    want = render(Scene(gaussians), camera, backend="reference").colours
+    for to in (*TURNS, scaling(0.5)):
+        moved = Scene(transform_gaussians(gaussians, to))
+        seen = render(moved, to.camera(camera), backend="reference").colours
+        np.testing.assert_allclose(seen, want, atol=2e-5)
+
+
+@pytest.mark.parametrize("to", TURNS)
+def test_harmonics_turn_with_the_world(to: Similarity) -> None:
+    """Orthogonal matrices, and f'(R d) = f(d) at directions that did not make them."""
+    directions = unit(np.random.default_rng(1).normal(size=(50, 3)))
+    values = np.random.default_rng(2).normal(size=16)
+    for order, matrix in enumerate(sh_rotations(to.rotation, 3)):
+        span = slice(order**2, (order + 1) ** 2)
+        np.testing.assert_allclose(matrix @ matrix.T, np.eye(2 * order + 1), atol=1e-12)
+        before = sh_basis(directions, 16)[:, span] @ values[span]
+        after = sh_basis(directions @ to.rotation.T, 16)[:, span] @ (matrix @ values[span])
+        np.testing.assert_allclose(after, before, atol=1e-12)
+
+
+def test_transforms_compose_and_lead_back():
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    other = rotating(AXES["y"], 12).then(scaling(0.25))
+    np.testing.assert_allclose(TO.then(other).points(points), other.points(TO.points(points)), atol=1e-12)
+    np.testing.assert_allclose(TO.then(TO.inverse()).matrix, np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(TO.then(other).matrix, other.matrix @ TO.matrix, atol=1e-12)
+    np.testing.assert_allclose(similarity(TO.matrix).matrix, TO.matrix, atol=1e-12)
+    centre = np.array([1.0, 2.0, 3.0])
+    turned = rotating(AXES["z"], 30).then(scaling(3)).about(centre)
+    np.testing.assert_allclose(turned.points(centre[None])[0], centre, atol=1e-12)
+    half = rotating(AXES["z"], 90).then(rotating(AXES["z"], 90))
+    assert half.then(half).is_identity
+    assert rotating(AXES["x"], -360).is_identity
+
+
+def test_a_quaternion_of_every_rotation():
+    quats = unit(np.random.default_rng(5).normal(size=(300, 4)))
+    for quat, matrix in zip(quats, rotation_matrices(quats), strict=True):
+        np.testing.assert_allclose(rotation_quaternion(matrix), quat * np.sign(quat[0]), atol=1e-12)
+    for turn in TURNS:
+        matrix = rotation_matrices(rotation_quaternion(turn.rotation)[None])[0]
+        np.testing.assert_allclose(matrix, turn.rotation, atol=1e-12)
+
+
+@pytest.mark.parametrize("onto", [*AXES.values(), np.array([1.0, 1.0, 1e-9])])
+def test_a_direction_is_turned_onto_another(onto) -> None:
+    for start in (*AXES.values(), np.array([0.3, -2.0, 0.1])):
+        np.testing.assert_allclose(turning(start, onto).rotation @ unit(start), unit(onto), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "reason"),
+    [
+        (np.diag([1.0, 1, -1, 1]), "mirrors"),
+        (np.diag([1.0, 1, 0, 1]), "flat"),
+        (np.zeros((4, 4)) + np.diag([0, 0, 0, 1.0]), "flat"),
+        (np.diag([1.0, 1, 2, 1]), "unlike"),
+        (np.eye(4) + 0.2 * np.eye(4, k=1) * [[1], [0], [0], [0]], "shears"),
+        (np.eye(4) * [1, 1, 1, 2.0], "last row"),
+        (np.full((4, 4), np.nan), "finite"),
+    ],
+)
+def test_a_matrix_that_is_no_similarity_is_refused(matrix, reason: str) -> None:
+    with pytest.raises(InputError, match=reason):
+        similarity(matrix)
+
+
+def test_numbers_that_leave_nothing_are_refused():
+    for make in (
+        *(lambda factor=factor: scaling(factor) for factor in (0, -1, np.inf)),
+        lambda: moving(np.array([np.nan, 0, 0])),
+        lambda: rotating(np.zeros(3), 90),
+        lambda: rotating(AXES["x"], np.inf),
+        lambda: transform_gaussians(random_gaussians(3), scaling(1e39)),
+        lambda: transform_gaussians(random_gaussians(3), moving(np.array([1e39, 0, 0]))),
+        lambda: transform_scene(Scene(random_gaussians(3), cameras=(random_camera(),)), scaling(1e12)),
+    ):
+        with pytest.raises(InputError):
+            make()
+
+
+def test_rows_that_cannot_be_drawn_stay_so():
+    """Zero quaternions, flat axes, places that are not finite: as they were, and no warning."""
+    gaussians = random_gaussians(6, sh_degree=3)
+    gaussians.quats_wxyz[0] = 0
+    gaussians.log_scales[1, 2] = -np.inf
+    gaussians.means[2] = [np.nan, np.inf, 0]
+    gaussians.sh[3, 5] = np.nan
+    gaussians.opacity_logits[4] = np.inf
+    moved = transform_gaussians(gaussians, TO)
+    np.testing.assert_array_equal(moved.valid(), gaussians.valid())
+    assert moved.log_scales[1, 2] == -np.inf
+    assert (moved.quats_wxyz[0] == 0).all()
+
+
+def test_companions_go_along():
+    """The language field is the same object, cameras move, a metre stays a metre."""
+    scene = Scene(random_gaussians(9), random_field(9), (random_camera(),), metres_per_unit=0.5)
+    moved = transform_scene(replace(scene, extras={"age": np.arange(9.0)}), TO)
+    assert moved.language is scene.language
+    assert moved.extras["age"].tolist() == list(range(9))
+    assert moved.metres_per_unit == pytest.approx(0.5 / TO.scale)
+    np.testing.assert_allclose(moved.cameras[0].position, TO.points(scene.cameras[0].position[None])[0])
+    np.testing.assert_allclose(moved.up(), TO.rotation @ scene.up(), atol=1e-12)
+    assert transform_scene(scene, IDENTITY) is scene
+
+
+@pytest.mark.parametrize("chosen", [[], [4], range(9)])
+def test_a_part_moves_alone(chosen) -> None:
+    gaussians, selected = random_gaussians(9, sh_degree=2), np.isin(np.arange(9), list(chosen))
+    moved, whole = transform_rows(gaussians, selected, TO), transform_gaussians(gaussians, TO)
+    assert_same(moved.take(~selected), gaussians.take(~selected))
+    assert_same(moved.take(selected), whole.take(selected))
+
+
+def test_an_empty_scene_is_transformed():
+    nothing = random_gaussians(0, sh_degree=3)
+    assert len(transform_gaussians(nothing, TO)) == 0
+    assert isinstance(transform_scene(Scene(nothing), replace(TO)).gaussians, Gaussians)

@@ -29,7 +29,7 @@ from langsplat_core.config import MaskConfig
 from langsplat_core.progress import silent
 from langsplat_core.semantics.encoders import load_encoder
 from langsplat_core.semantics.masks import label_maps
-from langsplat_core.semantics.sam import LEVELS, Look, SamMasks, load_mask_source, load_sam, load_segmenter
+from langsplat_core.semantics.sam import LEVELS, Look, SamMasks, load_mask_source, load_segmenter
 from langsplat_core.semantics.store import masked_crop
 from tests.support.backends import Measure
 
@@ -289,7 +289,7 @@ def test_sam_2_of_sam2(field: SimpleNamespace, tmp_path: Path, measured: Measure
     loose = MaskConfig(
         sam=str(file), points_per_side=2, predicted_iou=0, stability=0, nms_score=-1, nms_inner=2, nms_iou=2
     )
-    levels = load_sam(loose, "cpu")(square, silent)
+    levels = load_mask_source(loose, "cpu")(square, silent)
     assert [len(masks) > 0 for masks in levels.masks] == [True] * LEVELS
 
 

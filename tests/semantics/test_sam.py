@@ -27,7 +27,6 @@ from langsplat_core.semantics.sam import (
     cut_by_crop,
     grid_points,
     load_mask_source,
-    load_sam,
     load_segmenter,
     mask_boxes,
     mask_nms,
@@ -380,7 +379,7 @@ def plain_level(
 
 def compare(config: MaskConfig, model: Any, image: np.ndarray, crops: list[tuple[int, ...]]) -> list[int]:
     """The masks of every level against the plain ones; returns how many there are."""
-    levels = load_sam(config, "cpu")(image, silent)
+    levels = load_mask_source(config, "cpu")(image, silent)
     for level in range(3):
         want = plain_level(model, image, crops, config, level)
         assert len(levels.masks[level]) == len(want)
@@ -397,7 +396,7 @@ def test_the_whole_source_agrees_with_one_point_at_a_time(family: str, tmp_path:
     counts = compare(config, kind.from_pretrained(tmp_path).eval(), image, [(0, 0, 80, 48)])
     assert sum(counts) >= 3
     everything = replace(config, predicted_iou=-99.0, stability=0.0)
-    loose = load_sam(everything, "cpu")(image, silent)
+    loose = load_mask_source(everything, "cpu")(image, silent)
     assert sum(map(len, loose.masks)) > sum(counts)  # so both scores did filter something
 
 
@@ -409,7 +408,7 @@ def test_a_layer_of_crops_agrees_with_crops_one_after_another(family: str, tmp_p
     # overlap int(48 * 512 / 1500) = 16; width (80 + 16) / 2 = 48, height (48 + 16) / 2 = 32
     crops = [(0, 0, 48, 32), (0, 16, 48, 48), (32, 0, 80, 32), (32, 16, 80, 48)]
     compare(config, kind.from_pretrained(tmp_path).eval(), image, [(0, 0, 80, 48), *crops])
-    assert load_sam(config, "cpu").key != load_sam(replace(config, crop_layers=0), "cpu").key
+    assert load_mask_source(config, "cpu").key != load_mask_source(replace(config, crop_layers=0), "cpu").key
 
 
 def test_the_decoder_has_its_authors_norms_whatever_the_file_states(tmp_path: Path) -> None:
@@ -445,28 +444,28 @@ def test_weights_that_do_not_fit_are_one_line(family: str, tmp_path: Path) -> No
     config["mask_decoder_config"]["iou_head_hidden_dim"] = 12
     path.write_text(json.dumps(config), encoding="utf-8")
     with pytest.raises(EncoderError, match="do not fit, such as mask_decoder") as error:
-        load_sam(MaskConfig(sam=str(tmp_path)), "cpu")
+        load_mask_source(MaskConfig(sam=str(tmp_path)), "cpu")
     assert "\n" not in str(error.value)
 
 
 def test_batches_do_not_change_the_masks(config: MaskConfig) -> None:
-    one = load_sam(replace(config, points_per_batch=1), "cpu")
-    all_at_once = load_sam(replace(config, points_per_batch=64), "cpu")
+    one = load_mask_source(replace(config, points_per_batch=1), "cpu")
+    all_at_once = load_mask_source(replace(config, points_per_batch=64), "cpu")
     assert one.key == all_at_once.key
-    assert one.key != load_sam(replace(config, box_nms=0.6), "cpu").key
+    assert one.key != load_mask_source(replace(config, box_nms=0.6), "cpu").key
     for a, b in zip(one(photograph(), silent).masks, all_at_once(photograph(), silent).masks, strict=True):
         assert a.shape == b.shape
         assert (a ^ b).sum() <= 2 * len(a)
 
 
 def test_no_mask_at_all_is_an_answer(config: MaskConfig) -> None:
-    levels = load_sam(replace(config, predicted_iou=99.0), "cpu")(photograph(), silent)
+    levels = load_mask_source(replace(config, predicted_iou=99.0), "cpu")(photograph(), silent)
     assert [masks.shape for masks in levels.masks] == [(0, 48, 80)] * 3
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 70), (70, 1)])
 def test_thin_pictures_work(config: MaskConfig, shape: tuple[int, int]) -> None:
-    levels = load_sam(config, "cpu")(np.full((*shape, 3), 80, np.uint8), silent)
+    levels = load_mask_source(config, "cpu")(np.full((*shape, 3), 80, np.uint8), silent)
     assert all(masks.shape[1:] == shape for masks in levels.masks)
 
 

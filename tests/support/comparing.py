@@ -1,4 +1,4 @@
-"""Comparisons: of a fast rasterizer with the reference, of gradients, and bit for bit of scenes.
+"""Comparisons: of a fast rasterizer with the reference, of gradients, bit for bit of scenes; and refusals.
 
 Image formation has steps: an alpha of just 1/255 counts or does not, a transmittance of just 1e-4 stops a
 pixel or does not. Pixels where rounding may decide are the *band*: a counted allowance of them may differ.
@@ -6,10 +6,13 @@ pixel or does not. Pixels where rounding may decide are the *band*: a counted al
 
 from collections.abc import Callable, Mapping, Sequence
 from operator import attrgetter
+from pathlib import Path
 
 import numpy as np
+import pytest
 
 from langsplat_core.arrays import Array
+from langsplat_core.errors import FormatError
 from langsplat_core.scene import Gaussians, LanguageField, Tree
 
 BAND = 1e-4  # relative distance to a cut-off; float32 kernels are within about 1e-6 of it
@@ -91,3 +94,13 @@ def _parts(field: LanguageField) -> dict[str, Array]:
 
 def _arrays(owner: object, names: Sequence[str], prefix: str = "") -> dict[str, Array]:
     return {prefix + name: getattr(owner, name) for name in names}
+
+
+def assert_refused(read: Callable[[Path], object], path: Path, message: str | None = None) -> None:
+    """A FormatError of one short printable line that begins with the path and matches `message`, if given."""
+    with pytest.raises(FormatError, match=message) as caught:
+        read(path)
+    said = str(caught.value)
+    assert said.startswith(str(path))
+    assert said.isprintable()
+    assert len(said) < len(str(path)) + 300  # whatever a library adds

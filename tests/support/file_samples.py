@@ -8,7 +8,6 @@ import gzip
 import io
 import json
 import math
-import os
 import struct
 import zipfile
 from itertools import pairwise
@@ -33,7 +32,6 @@ from langsplat_core.scene import (
 )
 from langsplat_core.scene.transform import sh_basis
 
-SHARED_DATA = Path(os.environ.get("LANGSPLAT_TEST_DATA", Path(__file__).parents[3] / "shared" / "data"))
 C0 = 0.28209479177387814
 
 

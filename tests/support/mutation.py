@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from langsplat_core.bench.memory import peak_memory, restart_peak
+from langsplat_core.bench import peak_memory, restart_peak
 from langsplat_core.errors import InputError, printable_line
 
 HEADER = 600  # bytes at the beginning in which half of the mutations fall

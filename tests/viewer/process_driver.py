@@ -32,7 +32,7 @@ from langsplat_core.scene import Scene
 from langsplat_viewer import canvas
 from langsplat_viewer.actions import viewpoint
 from langsplat_viewer.camera.controls import orbit
-from langsplat_viewer.panels.keyboard import Event
+from langsplat_viewer.panels.navigation import Event
 from langsplat_viewer.rendering.renderer import GlRenderer
 from langsplat_viewer.viewer import Services
 from langsplat_viewer.window import Window, WindowRequest, open_window

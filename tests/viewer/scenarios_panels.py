@@ -11,10 +11,10 @@ from imgui_bundle import imgui  # isort: skip
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_viewer import viewer as training
-from langsplat_viewer.actions import filming, opening, selecting, settings, viewpoint
-from langsplat_viewer.files.flights import read_flight
+from langsplat_viewer.actions import browsing, filming, opening, selecting, settings, viewpoint
+from langsplat_viewer.files.projects import read_flight
 from langsplat_viewer.panels.layout import PANELS
-from langsplat_viewer.panels.style import scene_area
+from langsplat_viewer.panels.ui import scene_area
 from tests.support.fakes import CENTRES, PER_BLOB, as_trained, blob_scene, cameras, named_scene
 
 
@@ -130,15 +130,15 @@ def search_a_library(s: Any) -> None:
     save_scene(s.folder / "deep" / "mug.ply", replace(fewer, cameras=cameras()))
     s.open_panel("Library", frames=3)
     s.click("//Library/Folder ...", frames=4)
-    opening.type_path(viewer, "deep")
-    opening.open_typed(viewer)
+    viewer.state.path_typed = "deep"
+    browsing.open_typed(viewer)
     s.ctx.yield_(3)
     s.ctx.item_click("//**/Take this folder")
     s.wait(lambda: s.state.library is not None)
     s.settle()
     assert len(s.state.library.hits) == 2
     s.shot("library")
-    opening.ask_library(viewer, "plant")
+    browsing.ask_library(viewer, "plant")
     s.wait(lambda: s.state.library.phrase == "plant")
     s.settle()
     assert [hit.path.name for hit in s.state.library.hits] == ["named.ply", "mug.ply"]
@@ -168,7 +168,7 @@ def watch_a_training(s: Any) -> None:
     for number in range(3):
         (photographs / f"{number}.jpg").write_bytes(b"")
     training.command = lambda request: [sys.executable, "-c", TRAINS]
-    opening.choose_photographs(viewer, photographs)
+    browsing.choose_photographs(viewer, photographs)
     s.open_panel("Train", frames=3)
     s.ctx.item_click("//Train/Train")
     s.wait(lambda: viewer.training is not None and len(viewer.training.progress.losses) > 50)
@@ -200,7 +200,7 @@ def large_letters(s: Any) -> None:
         s.open_panel(panel.title)
         assert seen_items(s, panel.title), panel.title
         assert cut_off(s, panel.title) == [], panel.title
-    settings.show_help(s.window.viewer, True)
+    s.window.viewer.state.show_help = True
     s.settle()
     keys = s.ctx.window_info("//Help").window
     assert 0 <= keys.pos.x <= keys.pos.x + keys.size.x <= 1280
@@ -208,7 +208,7 @@ def large_letters(s: Any) -> None:
     s.shot("large letters")
     settings.escape(s.window.viewer)
     settings.set_ui_scale(s.window.viewer, 3.0)
-    for show, name in ((settings.toggle_palette, "Commands"), (opening.ask_for_file, "Open a scene")):
+    for show, name in ((settings.toggle_palette, "Commands"), (browsing.ask_for_file, "Open a scene")):
         show(s.window.viewer)
         s.ctx.yield_(4)
         over = s.ctx.window_info(f"//{name}").window
@@ -331,8 +331,8 @@ def record_and_play(s) -> None:
     assert len(read_flight(s.folder / "blobs-001.path.json").keyframes) == 3
     filming.set_path_seconds(s.window.viewer, 1.0)
     filming.set_film_size(s.window.viewer, 32, 24)
-    filming.set_film_fps(s.window.viewer, 4.0)
-    filming.type_film(s.window.viewer, "film")
+    s.window.viewer.state.record.fps = 4.0
+    s.window.viewer.state.record.film_typed = "film"
     s.ctx.item_click("//Record/Save film")
     s.wait(lambda: s.window.viewer.recorder.current is None)
     s.ctx.yield_(3)

@@ -11,11 +11,11 @@ from imgui_bundle import hello_imgui, imgui  # isort: skip
 from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
 import glfw  # isort: skip
 from langsplat_core.io.scenes import load_scene, save_scene
-from langsplat_viewer.actions import opening, queries, selecting, settings, transforming, viewpoint
+from langsplat_viewer.actions import browsing, editing, opening, queries, selecting, settings, viewpoint
 from langsplat_viewer.camera.overlays import Label, visible_faces
-from langsplat_viewer.panels import overlays, transform
+from langsplat_viewer.panels import overlays, select
 from langsplat_viewer.panels.overlays import EDGE
-from langsplat_viewer.panels.style import Area, scene_area
+from langsplat_viewer.panels.ui import Area, scene_area
 from langsplat_viewer.rendering.request import TINT
 from langsplat_viewer.state import EditForm
 from tests.support.fakes import CENTRES, blob_scene
@@ -357,12 +357,12 @@ def drag_the_gizmo(s: Any) -> None:
     settings.open_panel(s.window.viewer, "Transform")
     s.key(imgui.Key.g)
     view, chosen = s.state.view, s.state.selection.marks.selected
-    x, y = on_screen(s, transforming.pivot(viewer))
+    x, y = on_screen(s, editing.pivot(viewer))
     s.ctx.mouse_teleport_to_pos((x, y))
     for covered in (True, False):  # by a window over the scene, whose mouse it leaves alone
-        settings.show_help(viewer, covered)
+        viewer.state.show_help = covered
         s.ctx.yield_(3)
-        assert transform.holds_mouse(viewer) != covered
+        assert select.holds_mouse(viewer) != covered
     s.ctx.mouse_down(0)
     s.ctx.yield_(2)
     for step in range(1, 7):
@@ -376,7 +376,7 @@ def drag_the_gizmo(s: Any) -> None:
     moved = s.state.scene.gaussians.means - before
     assert (moved[~chosen] == 0).all()
     assert np.ptp(moved[chosen], axis=0).max() < 1e-5
-    went = on_screen(s, transforming.pivot(viewer))
+    went = on_screen(s, editing.pivot(viewer))
     np.testing.assert_allclose(went, (x + 60, y - 120), atol=3)
     selecting.select_none(viewer)
     s.ctx.key_press(imgui.Key.g, 4)  # off again
@@ -384,11 +384,11 @@ def drag_the_gizmo(s: Any) -> None:
     assert s.at(shot, MUG + moved[chosen][0]).argmax() == s.at(rgb, MUG).argmax()
     assert np.abs(s.at(shot, MUG) - s.at(rgb, MUG)).max() > 40
 
-    transforming.fill_form(viewer, EditForm(rotate=(0.0, 0.0, 90.0)))
+    viewer.state.edit_form = EditForm(rotate=(0.0, 0.0, 90.0))
     s.ctx.item_click("//Transform/Apply")
     s.click("//Transform/Fit")
     form = s.state.edit_form
-    transforming.fill_form(viewer, replace(form, high=(*form.high[:2], (form.low[2] + form.high[2]) / 2)))
+    viewer.state.edit_form = replace(form, high=(*form.high[:2], (form.low[2] + form.high[2]) / 2))
     s.ctx.item_click("//Transform/Crop")
     s.shot("cropped")
     assert 0 < s.state.selection.marks.deleted.sum() < len(chosen)
@@ -403,7 +403,7 @@ def clip_and_brush(s: Any) -> None:
     histogram of distances selects those between."""
     viewer = s.window.viewer
     settings.open_panel(s.window.viewer, "Transform")
-    transforming.fill_box(viewer)
+    editing.fill_box(viewer)
     s.ctx.yield_(2)
     s.ctx.item_click("//Transform/Box##gizmo")
     s.click("//Transform/Clip")
@@ -517,6 +517,6 @@ def pin_a_note(s: Any) -> None:
     for left in (1, 0):
         s.key(imgui.Key.mod_ctrl | imgui.Key.z)
         assert len(s.state.notes) == left
-    opening.open_file(s.window.viewer, s.folder / "blobs-001.langsplat")
+    browsing.open_file(s.window.viewer, s.folder / "blobs-001.langsplat")
     s.wait(lambda: s.state.notes == (note,))
     s.settle()

@@ -23,13 +23,12 @@ import moderngl
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import Scene
-from langsplat_viewer.actions import opening, queries, settings, undoing
+from langsplat_viewer.actions import browsing, editing, opening, queries, settings
 from langsplat_viewer.commands import COMMANDS
 from langsplat_viewer.jobs import give_memory_back
 from langsplat_viewer.panels.layout import PANELS
-from langsplat_viewer.rendering.depth import Clip
 from langsplat_viewer.rendering.renderer import Backend, GlRenderer
-from langsplat_viewer.rendering.request import Splats
+from langsplat_viewer.rendering.request import Clip, Splats
 from langsplat_viewer.state import memory_bytes
 from tests.viewer.window_driver import Session
 
@@ -121,7 +120,7 @@ class Soak:
         if way == "dropped":
             self.s.do(lambda: self.s.window.drop([str(path)]))
         elif way == "browsed":
-            self.s.do(lambda: opening.ask_for_file(self.viewer))
+            self.s.do(lambda: browsing.ask_for_file(self.viewer))
             self.s.ctx.yield_(3)
             self.s.ctx.item_click(f"//**/{name}")
         else:
@@ -167,7 +166,7 @@ class Soak:
             act = rng.choice((queries.show, queries.hide, queries.remove, queries.select))
             self.s.do(partial(act, viewer, query))
             self.s.do(partial(queries.set_cut, viewer, query, rng.choice((None, 0.6, 0.7))))
-        self.s.do(partial(rng.choice((undoing.undo, undoing.redo)), viewer))
+        self.s.do(partial(rng.choice((editing.undo, editing.redo)), viewer))
 
     def look(self) -> None:
         """What sliders and boxes of the panels do."""
@@ -179,7 +178,7 @@ class Soak:
             lambda: settings.set_ui_scale(viewer, rng.choice((0.8, 1.0, 1.5))),
             lambda: settings.open_panel(viewer, rng.choice(PANELS).title),
             lambda: queries.set_canonical(viewer, ""),
-            lambda: undoing.undo(viewer),
+            lambda: editing.undo(viewer),
         )
         self.s.do(rng.choice(steps))
 

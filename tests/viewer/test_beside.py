@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from langsplat_viewer.actions import beside, opening, queries, settings, undoing, viewpoint
+from langsplat_viewer.actions import editing, opening, queries, settings, viewpoint
 from langsplat_viewer.camera.controls import default_view, extent_of, orbit
 from tests.support.windowless import SCENES, ask, errors, settle
 
@@ -25,11 +25,11 @@ def two(opened):
 def meet(viewer) -> None:
     """Frames until both have done what there is to do."""
     for _ in range(3):
-        beside.follow(viewer)
+        opening.follow_beside(viewer)
         settle(viewer)
         if viewer.beside is not None:
             settle(viewer.beside)
-    beside.follow(viewer)
+    opening.follow_beside(viewer)
 
 
 def test_both_are_seen_and_asked_alike(two):
@@ -57,10 +57,10 @@ def test_both_are_seen_and_asked_alike(two):
 
 def test_it_goes_with_the_line_and_does_not_come_back_by_itself(two):
     settings.show_one(two)
-    beside.follow(two)
+    opening.follow_beside(two)
     assert two.beside is None
-    undoing.undo(two)
-    beside.follow(two)
+    editing.undo(two)
+    opening.follow_beside(two)
     assert two.state.settings.split.mode == "off"
 
 
@@ -91,8 +91,8 @@ def test_a_scene_with_other_coordinates_is_seen_from_the_same_side():
     moved = replace(scene.gaussians, means=3 * scene.gaussians.means + 50)
     here, there = extent_of(scene), extent_of(replace(scene, gaussians=moved))
     view = default_view(scene, here, (80, 60))
-    other = beside.linked(view, here, there)
-    assert beside.linked(view, here, here) is view
+    other = opening.linked(view, here, there)
+    assert opening.linked(view, here, here) is view
     np.testing.assert_array_equal(other.rotation, view.rotation)
     np.testing.assert_allclose(
         (other.eye - there.centre) / there.radius, (view.eye - here.centre) / here.radius

@@ -38,7 +38,7 @@ from langsplat_viewer.camera.controls import (
     walk,
     zoom,
 )
-from langsplat_viewer.files.flights import FILE_NAME, MOST_VIEWS, Shelf
+from langsplat_viewer.files.projects import BOOKMARKS, MOST_VIEWS, Shelf
 from langsplat_viewer.state import GLIDE_SECONDS
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
@@ -467,15 +467,15 @@ def test_a_file_that_makes_no_sense_is_said_and_kept(opened, tmp_path, text):
     if text.startswith("SCENE "):
         entries = json.loads(text.removeprefix("SCENE "))
         text = json.dumps({"version": 1, "scenes": {str(Path("blobs.ply").absolute()): entries}})
-    (tmp_path / FILE_NAME).write_text(text)
+    (tmp_path / BOOKMARKS).write_text(text)
     opened.shelf = Shelf(tmp_path)
     open_scene(opened, "blobs.ply")
     assert names(opened) == []
-    assert FILE_NAME in errors(opened)[0]
+    assert BOOKMARKS in errors(opened)[0]
     if '"scenes": {"' not in text:
         viewpoint.add_bookmark(opened, "here")
         assert "not kept" in errors(opened)[-1]
-        assert (tmp_path / FILE_NAME).read_text() == text
+        assert (tmp_path / BOOKMARKS).read_text() == text
 
 
 def view_with_up(up) -> OrbitCamera:

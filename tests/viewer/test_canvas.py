@@ -17,15 +17,14 @@ from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.errors import BackendError
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.opengl.scene_textures import is_software
-from langsplat_viewer.actions import queries, selecting, settings, undoing, viewpoint
+from langsplat_viewer.actions import editing, queries, selecting, settings, viewpoint
 from langsplat_viewer.camera.controls import default_view, extent_of, orbit
 from langsplat_viewer.canvas import FINE, MOVING_BUDGET, NOTHING_LEFT, REST_SECONDS, Canvas, Level, Pace
 from langsplat_viewer.marks import unmarked
 from langsplat_viewer.panels.layout import in_numbers
 from langsplat_viewer.rendering import renderer as renderers
-from langsplat_viewer.rendering.depth import Clip
 from langsplat_viewer.rendering.renderer import ArrayRenderer, GlRenderer
-from langsplat_viewer.rendering.request import Splats
+from langsplat_viewer.rendering.request import Clip, Splats
 from langsplat_viewer.state import (
     KEPT,
     LONGEST_SIDE,
@@ -330,7 +329,7 @@ CHANGES = {
     "undone camera": lambda v: (viewpoint.look_from(v, "left"), viewpoint.reset_view(v)),
     "marks": selecting.select_all,
     "deleted": lambda v: (selecting.select_all(v), selecting.delete_selected(v)),
-    "undone": lambda v: (selecting.select_all(v), selecting.delete_selected(v), undoing.undo(v)),
+    "undone": lambda v: (selecting.select_all(v), selecting.delete_selected(v), editing.undo(v)),
     "splats": lambda v: settings.set_splats(v, Splats(0.5)),
     "cut": lambda v: settings.set_clip(v, Clip(1.0)),
     "display": lambda v: settings.set_display(v, "depth"),
@@ -568,7 +567,7 @@ def drawn(gl, opened, request):
 
 def test_the_steps_of_a_picture_are_measured_while_the_panel_is_seen(gl, drawn):
     assert drawn.state.timing.medians() == []
-    viewpoint.measure_frame(drawn)
+    drawn.state.timing.wanted = True
     drawn.state.coarse_while_moving = False
     viewpoint.look_from(drawn, "left")
     viewpoint.tick(drawn, 10.0)
@@ -583,14 +582,14 @@ def test_the_steps_of_a_picture_are_measured_while_the_panel_is_seen(gl, drawn):
 def test_the_panel_has_a_picture_measured_when_it_opens(drawn):
     """All of its steps, though nothing has changed; once."""
     for now in (10.0, 11.0):
-        viewpoint.measure_frame(drawn)
+        drawn.state.timing.wanted = True
         rest(drawn.surface, drawn.state, now)
         counts = {name: len(measured) for name, measured in drawn.state.timing.laps.items()}
         assert counts.keys() >= {"projection", "sort", "blend", "compose", "picture"}
         assert set(counts.values()) == {1}
     drawn.state.timing.wanted = False  # closed, and opened again
     rest(drawn.surface, drawn.state, 12.0)
-    viewpoint.measure_frame(drawn)
+    drawn.state.timing.wanted = True
     rest(drawn.surface, drawn.state, 13.0)
     assert {len(measured) for measured in drawn.state.timing.laps.values()} == {2}
 
@@ -647,6 +646,6 @@ def test_a_comparison_is_one_at_a_time_and_can_be_left(drawn):
     viewpoint.compare_with_reference(drawn)
     viewpoint.compare_with_reference(drawn)
     assert "wait for it or cancel it" in errors(drawn)[-1]
-    viewpoint.stop_comparing(drawn)
+    drawn.recorder.cancel()
     recorded(drawn)
     assert drawn.state.timing.comparison is None

@@ -12,9 +12,8 @@ from langsplat_core.scene import look_at
 from langsplat_viewer.actions import selecting, settings, viewpoint
 from langsplat_viewer.camera.controls import from_camera
 from langsplat_viewer.canvas import NOTHING_BETWEEN, Canvas
-from langsplat_viewer.rendering.depth import UNCLIPPED, Clip, depth_range, image_formation
 from langsplat_viewer.rendering.renderer import GlRenderer
-from langsplat_viewer.rendering.request import plain_request
+from langsplat_viewer.rendering.request import UNCLIPPED, Clip, depth_range, image_formation, plain_request
 from tests.support.fakes import CENTRES, blob_scene
 from tests.support.windowless import marked, rest
 

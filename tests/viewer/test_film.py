@@ -15,11 +15,11 @@ from langsplat_core.config import PictureConfig
 from langsplat_core.errors import InputError
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.progress import Cancelled, Progress, Report
+from langsplat_viewer import output
 from langsplat_viewer.camera.controls import extent_of
 from langsplat_viewer.camera.flight import Flight, Keyframe
-from langsplat_viewer.files.flights import write_flight
-from langsplat_viewer.output import film
-from langsplat_viewer.output.film import Shot, cameras_of, find_ffmpeg, fingerprint, make_film
+from langsplat_viewer.files.projects import write_flight
+from langsplat_viewer.output import Shot, cameras_of, find_ffmpeg, fingerprint, make_film
 from langsplat_viewer.rendering.renderer import render_image
 from langsplat_viewer.rendering.request import RenderRequest, plain_request
 from tests.support.fakes import blob_scene
@@ -63,7 +63,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     write_flight(tmp_path / "away.json", flight(1.0))
     (tmp_path / "broken.json").write_text('{"langsplat_flight": 1}')
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(film, "find_ffmpeg", lambda: None)
+    monkeypatch.setattr(output, "find_ffmpeg", lambda: None)
     return tmp_path
 
 
@@ -77,7 +77,7 @@ def ffmpeg(folder: Path, monkeypatch: pytest.MonkeyPatch):
         path.write_text(source)
         path.chmod(0o755)
         monkeypatch.setenv("PATH", f"{path.parent}{os.pathsep}{os.environ['PATH']}")
-        monkeypatch.setattr(film, "find_ffmpeg", find_ffmpeg)
+        monkeypatch.setattr(output, "find_ffmpeg", find_ffmpeg)
 
     return put
 
@@ -204,7 +204,7 @@ def test_a_stopped_video_leaves_nothing(ffmpeg, folder):
 
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="this system has no ffmpeg")
 def test_the_systems_ffmpeg_makes_a_film(folder, monkeypatch):
-    monkeypatch.setattr(film, "find_ffmpeg", find_ffmpeg)
+    monkeypatch.setattr(output, "find_ffmpeg", find_ffmpeg)
     make_film(shot(), folder / "a.mp4")
     assert (folder / "a.mp4").read_bytes()[4:8] == b"ftyp"
 

@@ -23,7 +23,7 @@ from langsplat_viewer.camera.flight import (
     turntable,
     with_keyframe,
 )
-from langsplat_viewer.files.flights import MOST, read_flight, write_flight
+from langsplat_viewer.files.projects import MOST_KEYFRAMES, read_flight, write_flight
 from tests.support.fakes import blob_scene
 
 STEP = 1e-6  # seconds, of numerical velocities
@@ -222,7 +222,7 @@ def test_a_path_is_read_as_it_was_written(tmp_path):
         (file_of(entry(), version=True), "version True"),
         (file_of(), "1 to 10000 keyframes"),
         ({"langsplat_flight": 1, "keyframes": 7}, "1 to 10000 keyframes"),
-        (file_of(*[entry()] * (MOST + 1)), "1 to 10000 keyframes"),
+        (file_of(*[entry()] * (MOST_KEYFRAMES + 1)), "1 to 10000 keyframes"),
         (file_of(3), "keyframe 0: expected an object"),
         (file_of({}), "'position' is missing"),
         (file_of(POSE), "'seconds' is missing"),

@@ -11,12 +11,11 @@ import pytest
 
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.scene import Scene
-from langsplat_viewer.actions import filming, opening, queries, settings, viewpoint
-from langsplat_viewer.files.browsing import MOST_LISTED, Entry, list_folder
-from langsplat_viewer.files.watching import Watch, stamps
+from langsplat_viewer.actions import browsing, filming, opening, queries, settings, viewpoint
+from langsplat_viewer.files.disk import MOST_LISTED, Entry, Watch, list_folder, stamps
 from langsplat_viewer.options import say_compiling
 from langsplat_viewer.panels.scene import has_several
-from langsplat_viewer.rendering.depth import UNCLIPPED, Clip
+from langsplat_viewer.rendering.request import UNCLIPPED, Clip
 from tests.support.fakes import blob_scene
 from tests.support.windowless import SCENES, arrive, ask, errors, open_scene, settle
 
@@ -92,7 +91,7 @@ def test_a_scene_with_broken_companions_opens_and_says_why(tmp_path, viewer):
     ],
 )
 def test_of_dropped_files_the_scene_is_opened_and_what_is_none_is_said(viewer, names, opened_name, said):
-    opening.open_dropped(viewer, [Path(name) for name in names])
+    browsing.open_dropped(viewer, [Path(name) for name in names])
     settle(viewer)
     assert viewer.state.path.name == opened_name
     assert [path.name for path in viewer.state.scenes] == [opened_name]
@@ -127,7 +126,7 @@ def test_the_first_run_says_that_it_compiles(viewer, monkeypatch):
 @pytest.fixture
 def three(viewer):
     """Three scenes were dropped; the first is shown."""
-    opening.open_dropped(viewer, [Path("blobs.ply"), Path("plain.ply"), Path("bare.ply")])
+    browsing.open_dropped(viewer, [Path("blobs.ply"), Path("plain.ply"), Path("bare.ply")])
     settle(viewer)
     return viewer
 
@@ -212,7 +211,7 @@ def test_all_scenes_of_a_folder_are_opened_together(viewer, tmp_path):
     (tmp_path / "folder").mkdir()
     viewer.state.browser = list_folder(tmp_path)
     assert has_several(viewer.state.browser)
-    opening.open_all(viewer)
+    browsing.open_all(viewer)
     settle(viewer)
     assert viewer.state.browser is None
     assert viewer.state.scenes == (tmp_path / "blobs.ply", tmp_path / "plain.ply")
@@ -259,7 +258,7 @@ def _file(folder: Path) -> Path:
 
 
 def test_a_crowded_folder_is_cut(tmp_path, monkeypatch):
-    monkeypatch.setattr("langsplat_viewer.files.browsing.MOST_LISTED", 3)
+    monkeypatch.setattr("langsplat_viewer.files.disk.MOST_LISTED", 3)
     for number in range(5):
         (tmp_path / f"{number}.ply").write_bytes(b"")
     listing = list_folder(tmp_path)
@@ -269,16 +268,16 @@ def test_a_crowded_folder_is_cut(tmp_path, monkeypatch):
 
 def test_one_goes_into_folders_and_opens_scenes(viewer, folder, monkeypatch):
     monkeypatch.chdir(folder)
-    opening.ask_for_file(viewer)
+    browsing.ask_for_file(viewer)
     assert viewer.state.browser.folder == folder
-    opening.choose(viewer, Entry(folder / "B folder", is_file=False))
+    browsing.choose(viewer, Entry(folder / "B folder", is_file=False))
     assert viewer.state.browser.folder == folder / "B folder"
-    opening.browse(viewer, folder)
-    opening.choose(viewer, Entry(folder / "blobs.ply", is_file=True))
+    browsing.browse(viewer, folder)
+    browsing.choose(viewer, Entry(folder / "blobs.ply", is_file=True))
     assert viewer.state.browser is None
     settle(viewer)
     assert viewer.state.scene is SCENES["blobs.ply"]
-    opening.ask_for_file(viewer)
+    browsing.ask_for_file(viewer)
     assert viewer.state.browser.folder == folder  # that of the scene
     settings.escape(viewer)
     assert viewer.state.browser is None
@@ -287,18 +286,18 @@ def test_one_goes_into_folders_and_opens_scenes(viewer, folder, monkeypatch):
 @pytest.mark.parametrize("typed", [" blobs.ply ", "B folder/../blobs.ply"])
 def test_a_path_can_be_typed(viewer, folder, monkeypatch, typed):
     monkeypatch.chdir(folder)
-    opening.ask_for_file(viewer)
+    browsing.ask_for_file(viewer)
     for nothing in ("", "  "):
-        opening.type_path(viewer, nothing)
-        opening.open_typed(viewer)
+        viewer.state.path_typed = nothing
+        browsing.open_typed(viewer)
         assert viewer.state.browser is not None
-    opening.type_path(viewer, "B folder")
-    opening.open_typed(viewer)
+    viewer.state.path_typed = "B folder"
+    browsing.open_typed(viewer)
     assert viewer.state.browser.folder == folder / "B folder"
     assert viewer.state.path_typed == ""
-    opening.browse(viewer, folder)
-    opening.type_path(viewer, typed)
-    opening.open_typed(viewer)
+    browsing.browse(viewer, folder)
+    viewer.state.path_typed = typed
+    browsing.open_typed(viewer)
     settle(viewer)
     assert viewer.state.scene is SCENES["blobs.ply"]
 
@@ -306,9 +305,9 @@ def test_a_path_can_be_typed(viewer, folder, monkeypatch, typed):
 @pytest.mark.parametrize("typed", ["gone.ply", "x" * 5000, "~nobody-of-this-name/a.ply"])
 def test_a_path_that_leads_nowhere_is_an_error_line(viewer, folder, monkeypatch, typed):
     monkeypatch.chdir(folder)
-    opening.ask_for_file(viewer)
-    opening.type_path(viewer, typed)
-    opening.open_typed(viewer)
+    browsing.ask_for_file(viewer)
+    viewer.state.path_typed = typed
+    browsing.open_typed(viewer)
     settle(viewer)
     assert len(errors(viewer)) == 1
 
@@ -319,7 +318,7 @@ def test_scenes_that_were_open_are_remembered_the_latest_first(viewer):
     recent = viewer.state.preferences.recent
     assert [Path(path).name for path in recent] == ["blobs.ply", "plain.ply"]
     assert all(Path(path).is_absolute() for path in recent)
-    opening.open_recent(viewer, recent[1])
+    browsing.open_recent(viewer, recent[1])
     settle(viewer)
     assert viewer.state.scene is SCENES["plain.ply"]
 
@@ -445,7 +444,7 @@ def test_a_half_written_file_leaves_the_scene_as_it_was(shown, name):
 def test_what_is_not_wanted_is_not_offered_again_until_it_changes_again(shown):
     os.utime(shown.state.path, ns=(1, 1))
     assert look(shown)
-    opening.keep_old(shown)
+    shown.watch.dismiss()
     assert not look(shown)
     os.utime(shown.state.path, ns=(2, 2))
     assert look(shown)
@@ -461,7 +460,7 @@ def test_a_field_that_went_away_takes_its_display_along(shown):
 
 
 def test_a_watch_looks_by_itself_and_stops(tmp_path, monkeypatch):
-    monkeypatch.setattr("langsplat_viewer.files.watching.EVERY", 0.005)
+    monkeypatch.setattr("langsplat_viewer.files.disk.EVERY", 0.005)
     file: Path = tmp_path / "a.ply"
     file.write_bytes(b"a")
     woken = threading.Event()

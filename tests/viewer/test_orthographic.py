@@ -8,7 +8,7 @@ from langsplat_core.scene import LEVELS
 from langsplat_viewer.actions import filming, settings, viewpoint
 from langsplat_viewer.actions.opening import standing_at
 from langsplat_viewer.camera.controls import from_side, zoom
-from langsplat_viewer.files.flights import Shelf
+from langsplat_viewer.files.projects import Shelf
 from langsplat_viewer.panels.overlays import pointed_figures
 from langsplat_viewer.state import GLIDE_SECONDS
 from langsplat_viewer.viewer import Viewer

@@ -7,15 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from langsplat_viewer.actions import (
-    opening,
-    outline,
-    projects,
-    selecting,
-    settings,
-    transforming,
-    undoing,
-)
+from langsplat_viewer.actions import browsing, editing, opening, outline, projects, selecting, settings
 from langsplat_viewer.actions.selecting import take
 from langsplat_viewer.files.projects import Things
 from tests.support.fakes import CENTRES, blob_scene
@@ -81,7 +73,7 @@ def test_rows_are_hidden_and_shown_and_the_selection_stays(outlined):
     outline.show(outlined, mug)
     settle(outlined)
     assert marked(outlined) == ("plant", "", "")
-    undoing.undo(outlined)
+    editing.undo(outlined)
     assert outline.hidden_nodes(outlined)[mug]
 
 
@@ -99,10 +91,10 @@ def test_what_is_locked_is_left_alone(outlined):
     outline.hide(outlined, mug)
     settle(outlined)
     assert marked(outlined)[1] == ""
-    transforming.fill_box(outlined)
-    transforming.crop(outlined)
+    editing.fill_box(outlined)
+    editing.crop(outlined)
     assert "mug" not in marked(outlined)[2]
-    undoing.undo(outlined)
+    editing.undo(outlined)
     outline.toggle_lock(outlined, mug)
     selecting.select_all(outlined)
     assert marked(outlined)[0] == "mug book plant"
@@ -149,7 +141,7 @@ def test_groups_are_made_named_and_left(outlined):
     assert marked(outlined)[0] == "mug book plant"
     outline.ungroup(outlined, mug)
     assert outlined.state.things.groups[0].nodes == (book, plant)
-    undoing.undo(outlined)
+    editing.undo(outlined)
     assert outlined.state.things.groups[0].nodes == (book, mug, plant)
     for node in (mug, book, plant):
         outline.ungroup(outlined, node)
@@ -173,7 +165,7 @@ def test_a_project_keeps_names_groups_and_locks(outlined, viewer, tmp_path, monk
     things, path = outlined.state.things, projects.save_project(outlined, tmp_path)
     open_scene(viewer, "plain.ply")
     assert viewer.state.things != things
-    opening.open_project(viewer, path)
+    browsing.open_project(viewer, path)
     settle(viewer)
     assert viewer.state.things == things
     selecting.select_all(viewer)
@@ -197,7 +189,7 @@ def test_a_project_of_another_tree_keeps_what_is_known(outlined, tmp_path, monke
     path.write_text(json.dumps(top))
     if not field:
         monkeypatch.setitem(SCENES, "tree.ply", replace(SCENES["tree.ply"], language=None))
-    opening.open_project(outlined, path)
+    browsing.open_project(outlined, path)
     settle(outlined)
     things = outlined.state.things
     selecting.select_all(outlined)

@@ -15,11 +15,11 @@ from langsplat_core.query.describe import Describer, look_at_pixel
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import look_at
-from langsplat_viewer.actions import opening, settings, viewpoint
+from langsplat_viewer.actions import browsing, opening, settings, viewpoint
 from langsplat_viewer.camera import overlays
 from langsplat_viewer.camera.controls import default_view, extent_of, frame_of, from_side, orbit
 from langsplat_viewer.camera.overlays import FACES, Label, face_at, facing, placed, visible_faces
-from langsplat_viewer.files.photographs import LONGEST_SIDE, corners, find, read
+from langsplat_viewer.files.disk import LONGEST_SIDE, corners, find_photograph, read_photograph
 from langsplat_viewer.files.preferences import (
     load_preferences,
     save_preferences,
@@ -304,14 +304,14 @@ def photograph(path: Path, size=(160, 120), **options) -> Path:
 def test_it_is_found_where_photographs_usually_lie(tmp_path, place):
     wanted = photograph(tmp_path / place / "photo_0.JPG")
     photograph(tmp_path / place / "photo_01.jpg")
-    assert find("photo_0", tmp_path / "scene.ply", "") == wanted
+    assert find_photograph("photo_0", tmp_path / "scene.ply", "") == wanted
 
 
 @pytest.mark.parametrize("name", ["b", "left/b", "left_b"])
 def test_it_is_found_in_a_chosen_folder_and_those_in_it(tmp_path, name):
     wanted = photograph(tmp_path / "photos" / "left" / "b.png")
     photograph(tmp_path / "b.png")  # where it would be without a choice
-    assert find(name, tmp_path / "scene.ply", str(tmp_path / "photos")) == wanted
+    assert find_photograph(name, tmp_path / "scene.ply", str(tmp_path / "photos")) == wanted
 
 
 @pytest.mark.parametrize("folder", ["", "away", "file.txt"])
@@ -320,14 +320,14 @@ def test_where_there_is_none_the_reason_says_where_it_was_looked_for(tmp_path, f
     (tmp_path / "b.txt").write_text("no photograph")
     chosen = str(tmp_path / folder) if folder else ""
     with pytest.raises(InputError, match="no photograph 'b' in ") as caught:
-        find("b", tmp_path / "scene.ply", chosen)
+        find_photograph("b", tmp_path / "scene.ply", chosen)
     assert str(tmp_path) in str(caught.value)
     with pytest.raises(InputError, match="does not name"):
-        find("", tmp_path / "scene.ply", chosen)
+        find_photograph("", tmp_path / "scene.ply", chosen)
 
 
 def test_a_large_one_is_shrunk(tmp_path):
-    image = read(photograph(tmp_path / "a.jpg", (4000, 3000)), CAMERA)
+    image = read_photograph(photograph(tmp_path / "a.jpg", (4000, 3000)), CAMERA)
     assert image.shape == (LONGEST_SIDE * 3 // 4, LONGEST_SIDE, 3)
     np.testing.assert_allclose(image.mean((0, 1)), (200, 100, 50), atol=2)
 
@@ -335,9 +335,13 @@ def test_a_large_one_is_shrunk(tmp_path):
 def test_one_that_lies_on_its_side_is_turned(tmp_path):
     exif = Image.Exif()
     exif[0x0112] = 6
-    assert read(photograph(tmp_path / "a.jpg", (120, 160), exif=exif), CAMERA).shape == (120, 160, 3)
+    assert read_photograph(photograph(tmp_path / "a.jpg", (120, 160), exif=exif), CAMERA).shape == (
+        120,
+        160,
+        3,
+    )
     kept = replace(CAMERA, width=120, height=160)
-    assert read(tmp_path / "a.jpg", kept).shape == (160, 120, 3)  # it fits as it is
+    assert read_photograph(tmp_path / "a.jpg", kept).shape == (160, 120, 3)  # it fits as it is
 
 
 @pytest.mark.parametrize("mode", ["L", "RGBA", "P", "I;16"])
@@ -349,17 +353,17 @@ def test_every_kind_of_pixel_becomes_three_bytes(tmp_path, mode):
         else Image.fromarray(np.full((120, 160), 200 * 256, np.uint16))
     )
     picture.save(tmp_path / "a.png")
-    image = read(tmp_path / "a.png", CAMERA)
+    image = read_photograph(tmp_path / "a.png", CAMERA)
     assert (image.shape, image.dtype) == ((120, 160, 3), np.uint8)
     np.testing.assert_allclose(image, 200, atol=1)
 
 
 def test_one_of_another_shape_is_refused(tmp_path):
     with pytest.raises(InputError, match="100x100 pixels, its camera 160x120"):
-        read(photograph(tmp_path / "a.png", (100, 100)), CAMERA)
+        read_photograph(photograph(tmp_path / "a.png", (100, 100)), CAMERA)
     (tmp_path / "b.png").write_bytes(b"no picture")
     with pytest.raises(InputError, match=r"b\.png"):
-        read(tmp_path / "b.png", CAMERA)
+        read_photograph(tmp_path / "b.png", CAMERA)
 
 
 def test_it_lies_where_its_camera_saw_it(opened):
@@ -400,7 +404,7 @@ def test_it_is_read_once_it_is_wanted_and_only_at_its_camera(beside_photograph):
     found = opening.photograph_here(beside_photograph.state)
     assert found.image.shape == (120, 160, 3)
     stand(beside_photograph, 1)
-    assert opening.photograph_here(beside_photograph.state) is found  # not read again
+    assert opening.photograph_here(beside_photograph.state) is found  # not read_photograph again
     viewpoint.zoom_by(beside_photograph, 1.1)
     assert opening.photograph_here(beside_photograph.state) is None
     stand(beside_photograph, 2)
@@ -413,9 +417,9 @@ def test_a_chosen_folder_is_looked_into_and_remembered(beside_photograph, tmp_pa
     photograph(tmp_path / "away" / "deep" / "photo_2.jpg")
     opening.fade_photograph(beside_photograph, 1.0)
     stand(beside_photograph, 2)
-    opening.ask_for_photographs(beside_photograph)
+    browsing.ask_for_photographs(beside_photograph)
     assert beside_photograph.state.picks_folder
-    opening.choose_photograph_folder(beside_photograph, tmp_path / "away")
+    browsing.choose_photograph_folder(beside_photograph, tmp_path / "away")
     assert beside_photograph.state.browser is None
     stand(beside_photograph, 2)
     assert opening.photograph_here(beside_photograph.state).image.shape == (120, 160, 3)
@@ -423,5 +427,5 @@ def test_a_chosen_folder_is_looked_into_and_remembered(beside_photograph, tmp_pa
     assert load_preferences(tmp_path / "settings").photographs == {
         str(tmp_path / "blobs.ply"): str(tmp_path / "away")
     }
-    opening.ask_for_file(beside_photograph)
+    browsing.ask_for_file(beside_photograph)
     assert not beside_photograph.state.picks_folder

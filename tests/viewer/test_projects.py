@@ -13,19 +13,19 @@ import pytest
 from langsplat_core.errors import LangSplatError
 from langsplat_core.scene.transform import moving
 from langsplat_viewer.actions import (
+    browsing,
+    editing,
     filming,
     opening,
     projects,
     queries,
     selecting,
     settings,
-    transforming,
-    undoing,
     viewpoint,
 )
 from langsplat_viewer.camera.controls import orbit
 from langsplat_viewer.files.projects import read_project
-from langsplat_viewer.rendering.depth import Clip
+from langsplat_viewer.rendering.request import Clip
 from langsplat_viewer.viewer import Services, Viewer
 from tests.support.fakes import CENTRES, FakeEncoder
 from tests.support.windowless import SCENES, FakeSurface, ask, blob, errors, load, marked, settle
@@ -40,7 +40,7 @@ def saved(opened, tmp_path, monkeypatch) -> Path:
     queries.set_cut(opened, opened.state.queries[1], 0.6)
     queries.hide(opened, opened.state.queries[2])
     selecting.take(opened, blob("plant"))
-    transforming.transform(opened, moving(np.array([0.0, 1.0, 0.0])))
+    editing.transform(opened, moving(np.array([0.0, 1.0, 0.0])))
     settle(opened)
     selecting.hide_selected(opened)
     selecting.take(opened, blob("book"))
@@ -49,7 +49,7 @@ def saved(opened, tmp_path, monkeypatch) -> Path:
     settings.set_clip(opened, Clip(0.5, 40.0))
     viewpoint.move(opened, lambda view: orbit(view, 0.3, 0.1))
     filming.add_keyframe(opened)
-    projects.pin_notes(opened, True)
+    projects.toggle_pinning(opened)
     projects.pin_at(opened, 0.5, 0.5)
     projects.write_note(opened, opened.state.notes[0], 'a "note" <b>of</b> 1987')
     opened.state.preferences = replace(opened.state.preferences, panels=("Search", "Notes"))
@@ -63,7 +63,7 @@ def saved(opened, tmp_path, monkeypatch) -> Path:
 def again(saved):
     """Another viewer with the project open."""
     made = Viewer(Services(load, lambda encoder_id: FakeEncoder()), surface=FakeSurface())
-    opening.open_file(made, saved)
+    browsing.open_file(made, saved)
     settle(made)
     yield made
     made.worker.close()
@@ -91,7 +91,7 @@ def test_everything_comes_back(opened, saved, again):
     assert not after.selection.is_unsaved
     assert (before.preferences.recent[0], after.preferences.recent[0]) == (str(saved), str(saved))
     queries.remove_all(again)
-    opening.open_recent(again, str(saved))
+    browsing.open_recent(again, str(saved))
     settle(again)
     assert len(after.queries) == 4
     assert projects.save_project(again, Path("/nowhere")) == saved  # where it came from
@@ -111,7 +111,7 @@ def test_other_programs_find_the_answers_in_it(opened, saved):
 def test_a_scene_that_has_changed_keeps_its_questions_alone(saved, viewer, monkeypatch):
     smaller = SCENES["blobs.ply"].take(np.arange(240))
     monkeypatch.setitem(SCENES, "blobs.ply", smaller)
-    opening.open_project(viewer, saved)
+    browsing.open_project(viewer, saved)
     settle(viewer)
     assert len(viewer.state.queries) == 4
     assert not viewer.state.selection.marks.selected.any()
@@ -120,7 +120,7 @@ def test_a_scene_that_has_changed_keeps_its_questions_alone(saved, viewer, monke
 
 def test_a_scene_that_is_gone(saved, opened):
     Path("blobs.ply").unlink()
-    opening.open_dropped(opened, [saved])
+    browsing.open_dropped(opened, [saved])
     assert "not there" in errors(opened)[-1]
     assert opened.state.scene is not None
 
@@ -197,7 +197,7 @@ def test_without_a_scene_there_is_nothing_to_save(viewer, tmp_path):
 
 
 def test_notes_are_pinned_written_and_taken_off(opened):
-    projects.pin_notes(opened, True)
+    projects.toggle_pinning(opened)
     projects.pin_at(opened, 0.95, 0.5)  # nothing is there
     assert opened.state.notes == ()
     assert opened.state.pins_notes
@@ -209,12 +209,12 @@ def test_notes_are_pinned_written_and_taken_off(opened):
     settings.escape(opened)
     projects.remove_note(opened, opened.state.notes[0])
     assert opened.state.notes == ()
-    undoing.undo(opened)
+    editing.undo(opened)
     assert [len(note.text) for note in opened.state.notes] == [500]
-    undoing.undo(opened)
+    editing.undo(opened)
     assert opened.state.notes == (note,)
-    undoing.redo(opened)
-    undoing.redo(opened)
+    editing.redo(opened)
+    editing.redo(opened)
     assert opened.state.notes == ()
 
 
@@ -222,10 +222,10 @@ def test_notes_are_asked_about_before_the_window_closes(opened, tmp_path):
     projects.pin_at(opened, 0.5, 0.5)
     assert not selecting.may_close(opened)
     selecting.stay(opened)
-    undoing.undo(opened)
+    editing.undo(opened)
     assert selecting.may_close(opened)
     opened.state.selection = replace(opened.state.selection, may_close=False)
-    undoing.redo(opened)
+    editing.redo(opened)
     assert not selecting.may_close(opened)
     projects.save_and_leave(opened, tmp_path)
     assert opened.state.selection.may_close

@@ -12,10 +12,11 @@ from langsplat_core.display.displays import NO_HEAT, Subject, relevancies
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.scene import CANONICAL_PHRASES, Reading
 from langsplat_core.semantics.store import ImageFeatures
-from langsplat_viewer.actions import opening, queries, settings, undoing
-from langsplat_viewer.files.browsing import QuerySet, SavedQuery, read_queries, write_queries
-from langsplat_viewer.output.headless import describe
-from langsplat_viewer.panels.search import BINS, hint, histogram
+from langsplat_viewer.actions import browsing, editing, queries, settings
+from langsplat_viewer.files.projects import QuerySet, SavedQuery, read_queries, write_queries
+from langsplat_viewer.marks import BINS
+from langsplat_viewer.output import describe
+from langsplat_viewer.panels.search import hint, histogram
 from langsplat_viewer.viewer import Services
 from tests.support.fakes import CENTRES, FakeEncoder, as_trained, axis, blob_scene, calibrated_for, language
 from tests.support.windowless import SCENES, ask, errors, load, open_scene, settle
@@ -85,9 +86,9 @@ def test_examples_are_offered_until_the_first_search_and_each_is_found(viewer):
     assert hint(viewer) == "book, ..."
     queries.prepare_suggestions(viewer)
     assert viewer.worker.current is None  # once per scene
-    queries.type_phrase(viewer, "bo")
+    viewer.state.typed = "bo"
     assert queries.offers(viewer) == ("", ("book",))
-    queries.type_phrase(viewer, "")
+    viewer.state.typed = ""
     queries.ask_offered(viewer, "book")
     settle(viewer)
     assert viewer.state.queries[0].result.found
@@ -142,14 +143,14 @@ def test_queries_are_combined_as_the_grammar_reads_them(opened):
 
 
 def test_the_box_is_emptied_by_a_search_and_by_nothing_else(opened):
-    queries.type_phrase(opened, "  ")
+    opened.state.typed = "  "
     queries.ask_typed(opened)
     assert (opened.state.typed, opened.state.queries) == ("  ", [])
-    queries.type_phrase(opened, "mug ")
+    opened.state.typed = "mug "
     queries.ask_typed(opened)
     assert (opened.state.typed, opened.state.queries[0].phrase) == ("", "mug")
     assert queries.take_search_focus(opened)  # for the next phrase
-    settings.show_panel(opened, False)
+    opened.state.show_panel = False
     queries.focus_search(opened)
     assert opened.state.show_panel
     assert queries.take_search_focus(opened)
@@ -161,7 +162,7 @@ def test_all_queries_go_at_once_and_come_back(opened):
         ask(opened, phrase)
     queries.remove_all(opened)
     assert (opened.state.queries, opened.state.selected) == ([], None)
-    undoing.undo(opened)
+    editing.undo(opened)
     assert [query.phrase for query in opened.state.queries] == ["mug", "plant"]
 
 
@@ -196,7 +197,7 @@ def test_an_answer_is_explained_by_what_training_kept(opened, tmp_path, monkeypa
     settle(opened)
     assert opened.state.evidence.phrase == "book"
     assert opened.state.evidence.image.ndim == 3
-    queries.close_evidence(opened)
+    opened.state.evidence = None
     assert opened.state.evidence is None
 
 
@@ -235,14 +236,14 @@ def test_a_cut_is_undone_in_one_step_and_outlives_another_level(asked):
     queries.set_level(asked, "part")
     settle(asked)
     assert (query.result.level, query.result.own_cut) == (1, 0.62)
-    undoing.undo(asked)
+    editing.undo(asked)
     settle(asked)
     assert query.result.own_cut == 0.62
-    undoing.undo(asked)
+    editing.undo(asked)
     settle(asked)
     assert query.result.own_cut is None
     np.testing.assert_array_equal(query.result.members, automatic.members)
-    undoing.redo(asked)
+    editing.redo(asked)
     assert query.result.own_cut == 0.62
 
 
@@ -277,7 +278,7 @@ def test_a_set_of_queries_is_asked_again(asked, tmp_path):
     assert path.name == "blobs-001.queries.json"
     open_scene(asked, "blobs.ply")
     assert (asked.state.queries, asked.state.canonical) == ([], ())
-    opening.open_dropped(asked, [path])
+    browsing.open_dropped(asked, [path])
     settle(asked)
     found = [(query.phrase, query.cut, query.slot is None) for query in asked.state.queries]
     assert found == [("mug", 0.7, False), ("plant", None, True)]
@@ -289,7 +290,7 @@ def test_a_set_of_queries_is_asked_again(asked, tmp_path):
 def test_queries_dropped_with_a_scene_are_asked_of_it(viewer, tmp_path):
     path = tmp_path / "a.queries.json"
     write_queries(path, QuerySet((SavedQuery("mug"),)))
-    opening.open_dropped(viewer, [path, Path("blobs.ply")])
+    browsing.open_dropped(viewer, [path, Path("blobs.ply")])
     settle(viewer)
     assert [query.phrase for query in viewer.state.queries] == ["mug"]
 

@@ -12,13 +12,12 @@ from PIL import Image
 from langsplat_core.config import PictureConfig
 from langsplat_core.io.cameras import read_cameras
 from langsplat_core.io.scenes import save_scene
-from langsplat_viewer.actions import filming, opening, queries, settings, undoing, viewpoint
+from langsplat_viewer import output
+from langsplat_viewer.actions import browsing, editing, filming, queries, settings, viewpoint
 from langsplat_viewer.camera.controls import orbit, zoom
-from langsplat_viewer.files.flights import read_flight
-from langsplat_viewer.output import film, saving
-from langsplat_viewer.rendering.depth import Clip
+from langsplat_viewer.files.projects import read_flight
 from langsplat_viewer.rendering.renderer import render_image
-from langsplat_viewer.rendering.request import Splats
+from langsplat_viewer.rendering.request import Clip, Splats
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
 from tests.support.windowless import ask, errors, open_scene, recorded
@@ -44,7 +43,7 @@ def times(viewer: Viewer) -> list[float]:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(film, "find_ffmpeg", lambda: None)
+    monkeypatch.setattr(output, "find_ffmpeg", lambda: None)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -65,7 +64,7 @@ def test_a_played_path_goes_through_its_keyframes(opened):
 
 def test_a_loop_begins_again_and_a_drag_ends_it(opened):
     views = record_three(opened)
-    filming.set_looping(opened, True)
+    opened.state.record.loops = True
     viewpoint.scrub(opened, 1.0)
     viewpoint.toggle_playing(opened)
     viewpoint.tick(opened, opened.clock + 5.0)  # at 6 of 4 seconds
@@ -117,10 +116,10 @@ def test_keyframes_are_changed_and_changes_undone(opened):
     filming.delete_keyframe(opened, first)
     assert times(opened) == [4, 4.01]
     for expected in ([0, 4, 4.01], [0, 4, 5], [0, 2, 4], [0, 2]):
-        undoing.undo(opened)
+        editing.undo(opened)
         assert times(opened) == expected
     assert opened.state.record.keyframes == (first, second)
-    undoing.redo(opened)
+    editing.redo(opened)
     assert opened.state.record.keyframes == (first, second, third)
     filming.replace_keyframe(opened, first)
     assert_allclose(opened.state.record.keyframes[0].pose.position, opened.state.view.eye)
@@ -128,7 +127,7 @@ def test_keyframes_are_changed_and_changes_undone(opened):
     assert times(opened) == [0, 4, 8]
     filming.clear_path(opened)
     assert times(opened) == []
-    undoing.undo(opened)
+    editing.undo(opened)
     assert times(opened) == [0, 4, 8]
 
 
@@ -138,11 +137,11 @@ def test_a_path_is_saved_loaded_and_dropped(opened, folder):
     assert path.name == "blobs-001.path.json"
     assert len(read_flight(path).keyframes) == 3
     filming.clear_path(opened)
-    opening.open_dropped(opened, [path])
+    browsing.open_dropped(opened, [path])
     assert times(opened) == [0, 2, 4]
     assert opened.state.wanted_panel == "Record"
     (folder / "bad.path.json").write_text("{}")
-    filming.type_path_file(opened, "bad.path.json")
+    opened.state.record.path_typed = "bad.path.json"
     filming.load_typed_path(opened, folder)
     assert "no camera path" in errors(opened)[-1]
     assert times(opened) == [0, 2, 4]
@@ -162,7 +161,7 @@ def test_what_cannot_be_done_is_said(viewer, opened, folder):
     filming.save_path(opened, folder)
     filming.load_typed_path(opened, folder)
     record_three(opened)
-    filming.type_film(opened, "film.avi")
+    opened.state.record.film_typed = "film.avi"
     filming.save_film(opened, folder)
     wanted = ["two keyframes", "needs a path", "needs a keyframe", "type the name", "a film is .mp4"]
     assert [reason in text for reason, text in zip(wanted, errors(opened), strict=True)] == [True] * 5
@@ -172,7 +171,7 @@ def test_what_cannot_be_done_is_said(viewer, opened, folder):
 def test_a_film_is_made_beside_the_window(opened, folder):
     record_three(opened)
     filming.set_film_size(opened, 32, 24)
-    filming.set_film_fps(opened, 1.0)
+    opened.state.record.fps = 1.0
     request = opened.state.request((32, 24))
     filming.save_film(opened, folder)
     queries.ask(opened, "mug")  # the other worker answers meanwhile, and changes what is shown
@@ -277,7 +276,7 @@ def test_what_the_command_cannot_say_is_said(opened, folder):
 
 
 def test_pictures_are_saved_under_new_names(opened, tmp_path):
-    first, second = saving.save_picture(opened, tmp_path), saving.save_picture(opened, tmp_path)
+    first, second = filming.save_picture(opened, tmp_path), filming.save_picture(opened, tmp_path)
     assert [first.name, second.name] == ["blobs-001.png", "blobs-002.png"]
     assert np.asarray(Image.open(second)).tolist() == np.full((6, 8, 3), 77).tolist()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["blobs-001.png", "blobs-002.png"]
@@ -285,7 +284,7 @@ def test_pictures_are_saved_under_new_names(opened, tmp_path):
 
 def test_a_saved_view_can_be_read_again(opened, tmp_path):
     opened.state.size = (321, 123)
-    camera = read_cameras(saving.save_view(opened, tmp_path))[0]
+    camera = read_cameras(filming.save_view(opened, tmp_path))[0]
     expected = opened.state.view.camera(321, 123)
     assert (camera.width, camera.height) == (321, 123)
     assert_allclose(camera.world_to_camera, expected.world_to_camera, atol=1e-9)
@@ -295,7 +294,7 @@ def test_a_saved_view_can_be_read_again(opened, tmp_path):
 def test_an_unwritable_folder_is_one_line(opened, tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("not a folder")
-    assert saving.save_picture(opened, blocked) is None
-    assert saving.save_view(opened, blocked) is None
+    assert filming.save_picture(opened, blocked) is None
+    assert filming.save_view(opened, blocked) is None
     assert len(errors(opened)) == 2
     assert all("not saved" in text for text in errors(opened))

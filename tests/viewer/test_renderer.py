@@ -17,7 +17,6 @@ from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_viewer.camera.controls import default_view, extent_of
-from langsplat_viewer.rendering.depth import depth_range, near_plane, why_nothing, why_undrawable
 from langsplat_viewer.rendering.renderer import (
     ArrayChannels,
     ArrayRenderer,
@@ -27,7 +26,16 @@ from langsplat_viewer.rendering.renderer import (
     render_image,
     suits_opengl,
 )
-from langsplat_viewer.rendering.request import RenderKey, RenderRequest, Split, plain_request
+from langsplat_viewer.rendering.request import (
+    RenderKey,
+    RenderRequest,
+    Split,
+    depth_range,
+    near_plane,
+    plain_request,
+    why_nothing,
+    why_undrawable,
+)
 from tests.support.backends import gl_state
 from tests.support.fakes import blob_scene
 from tests.support.scenes import random_answer, random_camera, random_gaussians, random_scene, with_tree

@@ -13,20 +13,20 @@ from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Scene
+from langsplat_viewer import output
 from langsplat_viewer.actions import filming, opening, queries, selecting, settings, viewpoint
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.commands import BUTTONS, COMMANDS, OVERLAY_TITLES, matching
 from langsplat_viewer.files.preferences import FILE_NAME, load_preferences, save_preferences
 from langsplat_viewer.marks import Marks
-from langsplat_viewer.output import film, saving
 from langsplat_viewer.panels.overlays import STEPS, bar_colours
 from langsplat_viewer.panels.view import compared_name
-from langsplat_viewer.rendering.depth import Clip
 from langsplat_viewer.rendering.renderer import ArrayRenderer, GlRenderer
 from langsplat_viewer.rendering.request import (
     AT_RANGE,
     TINT,
     TINT_STRENGTH,
+    Clip,
     Detail,
     Inputs,
     RenderRequest,
@@ -91,7 +91,7 @@ def on_screen(canvas: Canvas, state: ViewerState) -> np.ndarray:
 @pytest.mark.parametrize("backend", ["cpu", "opengl"])
 def test_screen_file_sized_image_film_and_reference_agree(gl, opened, tmp_path, monkeypatch, mode, backend):
     """Nothing that is hidden or deleted comes back, in whatever way an image is made."""
-    monkeypatch.setattr(film, "find_ffmpeg", lambda: None)
+    monkeypatch.setattr(output, "find_ffmpeg", lambda: None)
     edit_everything(opened, mode)
     state, renderer = opened.state, GlRenderer(gl, backend, "single")
     opened.surface = canvas = Canvas(gl, renderer)
@@ -107,17 +107,17 @@ def test_screen_file_sized_image_film_and_reference_agree(gl, opened, tmp_path, 
             assert getattr(request.picture, field.name) != field.default, field.name
 
     rest(canvas, state, 1.0)
-    images = {"screen": on_screen(canvas, state), "saved": image(saving.save_picture(opened, tmp_path))}
+    images = {"screen": on_screen(canvas, state), "saved": image(filming.save_picture(opened, tmp_path))}
     filming.set_film_size(opened, *state.size)
     filming.save_sized_picture(opened, tmp_path)
     recorded(opened)
     images["sized"] = image(tmp_path / "blobs-160x120-001.png")
     filming.set_turning(opened, True)
     filming.set_path_seconds(opened, 1.0)
-    filming.set_film_fps(opened, 2.0)
+    opened.state.record.fps = 2.0
     filming.save_film(opened, tmp_path)
     recorded(opened)
-    images["film"] = image(tmp_path / "blobs-film-001" / film.frame_name(0))
+    images["film"] = image(tmp_path / "blobs-film-001" / output.frame_name(0))
     expected = ArrayRenderer(ReferenceRasterizer()).read(request).astype(int)
     bare = ArrayRenderer(ReferenceRasterizer()).read(replace(request, scene=edited_scene(state.scene)))
     assert np.abs(bare - expected).max() > 60  # the edits are seen
@@ -135,9 +135,9 @@ def test_images_are_saved_without_background_if_so_chosen(gl, opened, tmp_path):
     opened.surface = Canvas(gl, GlRenderer(gl, "cpu"))
     settings.resize(opened, 40, 30)
     filming.set_film_size(opened, 40, 30)
-    assert image(saving.save_picture(opened, tmp_path)).shape == (30, 40, 3)
+    assert image(filming.save_picture(opened, tmp_path)).shape == (30, 40, 3)
     settings.save_transparent(opened, True)
-    saved = image(saving.save_picture(opened, tmp_path))
+    saved = image(filming.save_picture(opened, tmp_path))
     filming.save_sized_picture(opened, tmp_path)
     recorded(opened)
     assert saved.shape == (30, 40, 4)
@@ -163,7 +163,7 @@ UNSEEN = {
     "line": lambda v: settings.move_line(v, 0.3),  # the window draws it
     "ruler": settings.toggle_measuring,
     "tool": lambda v: selecting.use_tool(v, "brush"),
-    "word": lambda v: queries.type_phrase(v, "plant"),
+    "word": lambda v: setattr(v.state, "typed", "plant"),
     "chosen query": lambda v: queries.select(v, None),
     "photograph": lambda v: opening.fade_photograph(v, 0.5),
     "saved without background": lambda v: settings.save_transparent(v, True),

@@ -10,7 +10,7 @@ from plyfile import PlyData
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.scene import look_at
 from langsplat_viewer import marks
-from langsplat_viewer.actions import opening, queries, selecting, settings, undoing, viewpoint
+from langsplat_viewer.actions import editing, opening, queries, selecting, settings, viewpoint
 from langsplat_viewer.actions.selecting import take
 from langsplat_viewer.camera.controls import from_camera
 from langsplat_viewer.marks import Drawn, Stroke, outlines
@@ -95,10 +95,10 @@ def test_every_change_is_one_step_back_and_forth(opened):
     ]
     assert marked(opened) == states[0]
     for state in states[1:]:
-        undoing.undo(opened)
+        editing.undo(opened)
         assert marked(opened) == state
     for state in states[-2::-1]:
-        undoing.redo(opened)
+        editing.redo(opened)
         assert marked(opened) == state
 
 
@@ -152,7 +152,7 @@ def test_growing_and_shrinking_follow_the_surface(opened):
     selecting.shrink_selection(opened)
     settle(opened)
     assert marks_of(opened).selected.sum() < grown.sum()
-    undoing.undo(opened)
+    editing.undo(opened)
     assert (marks_of(opened).selected == grown).all()
 
 
@@ -217,7 +217,7 @@ def test_a_rectangle_selects_the_blob_inside_it_and_is_undone(front):
     assert marked(front)[0] == "mug"
     draw(front, corners(front, CENTRES[2])[::-1], "add")
     assert marked(front)[0] == "mug plant"
-    undoing.undo(front)
+    editing.undo(front)
     assert marked(front)[0] == "mug"
 
 
@@ -273,7 +273,7 @@ def test_a_click_selects_the_thing_at_the_level_of_the_queries(front, monkeypatc
     draw(front, [(0.5, 0.5)])
     settle(front)
     assert marked(front)[0] == "book"
-    undoing.undo(front)
+    editing.undo(front)
     assert marked(front)[0] == ""
 
 
@@ -291,7 +291,7 @@ def test_a_click_on_nothing_and_without_a_field(front, monkeypatch):
 def test_escape_gives_up_the_stroke_then_the_tool_and_help_before_both(front):
     selecting.use_tool(front, "lasso")
     selecting.begin_stroke(front, 0.1, 0.1)
-    settings.show_help(front, True)
+    front.state.show_help = True
     settings.escape(front)
     assert front.state.selection.stroke is not None
     settings.escape(front)
@@ -396,9 +396,9 @@ def test_deleting_is_unsaved_until_the_scene_is_saved(opened, tmp_path):
     assert not selection().is_unsaved
     without_plant(opened)
     assert selection().is_unsaved
-    undoing.undo(opened)
+    editing.undo(opened)
     assert not selection().is_unsaved
-    undoing.redo(opened)
+    editing.redo(opened)
     selecting.export(opened, tmp_path, "edited")
     settle(opened)
     assert not selection().is_unsaved

@@ -16,8 +16,8 @@ from langsplat_core.io.scenes import load_scene
 from langsplat_core.pipeline.report import REPORT
 from langsplat_core.scene import Scene
 from langsplat_viewer import viewer
-from langsplat_viewer.actions import opening, settings, training, viewpoint
-from langsplat_viewer.files.watching import IN_TRAINING, NAME, write_preview
+from langsplat_viewer.actions import browsing, settings, viewpoint
+from langsplat_viewer.files.disk import IN_TRAINING, PREVIEW, write_preview
 from langsplat_viewer.viewer import PREVIEW_EVERY, TrainingProgress, TrainingRequest, command
 from tests.support.fakes import blob_scene
 from tests.support.scenes import random_gaussians
@@ -51,7 +51,7 @@ def trains(monkeypatch: pytest.MonkeyPatch, script: str) -> None:
 def finish(viewer, seconds: float = 20.0) -> None:
     end = time.monotonic() + seconds
     while viewer.training is not None and time.monotonic() < end:
-        training.watch_training(viewer)
+        browsing.watch_training(viewer)
         time.sleep(0.02)
     assert viewer.training is None
     settle(viewer)
@@ -59,12 +59,12 @@ def finish(viewer, seconds: float = 20.0) -> None:
 
 def test_a_folder_of_photographs_becomes_a_scene_that_opens(viewer, folder, monkeypatch):
     trains(monkeypatch, GOOD)
-    opening.open_dropped(viewer, [folder])
+    browsing.open_dropped(viewer, [folder])
     form = viewer.state.training_form
     assert (form.dataset, form.out) == (str(folder), str(folder.with_suffix(".ply")))
     assert settings.take_wanted_panel(viewer) == "Train"
-    training.fill_in(viewer, replace(form, out=str(folder.with_name("blobs.ply"))))
-    training.start_training(viewer)
+    viewer.state.training_form = replace(form, out=str(folder.with_name("blobs.ply")))
+    browsing.start_training(viewer)
     progress = viewer.training.progress
     finish(viewer)
     assert progress.stages == {"reading photographs": 1.0}
@@ -83,9 +83,9 @@ def test_what_speaks_against_the_scene_is_said(viewer, folder, monkeypatch):
     report.parent.mkdir()
     report.write_text(json.dumps({"gaussians": 360, "doubts": doubts}))
     trains(monkeypatch, GOOD + "".join(f"; print('warning: {doubt}')" for doubt in doubts))
-    opening.choose_photographs(viewer, folder)
-    training.fill_in(viewer, replace(viewer.state.training_form, out=str(folder.with_name("blobs.ply"))))
-    training.start_training(viewer)
+    browsing.choose_photographs(viewer, folder)
+    viewer.state.training_form = replace(viewer.state.training_form, out=str(folder.with_name("blobs.ply")))
+    browsing.start_training(viewer)
     finish(viewer)
     assert viewer.state.doubts == tuple(doubts)
     assert errors(viewer) == doubts
@@ -98,8 +98,8 @@ def test_what_speaks_against_the_scene_is_said(viewer, folder, monkeypatch):
 
 def test_what_goes_wrong_is_said(viewer, folder, monkeypatch):
     trains(monkeypatch, BAD)
-    opening.choose_photographs(viewer, folder)
-    training.start_training(viewer)
+    browsing.choose_photographs(viewer, folder)
+    browsing.start_training(viewer)
     finish(viewer)
     assert errors(viewer) == ["langsplat: photos: none can be located"]
     assert viewer.state.scene is None
@@ -107,14 +107,14 @@ def test_what_goes_wrong_is_said(viewer, folder, monkeypatch):
 
 def test_it_can_be_stopped_and_one_is_enough(viewer, folder, monkeypatch):
     trains(monkeypatch, SLOW)
-    opening.choose_photographs(viewer, folder)
-    training.start_training(viewer)
-    training.start_training(viewer)
+    browsing.choose_photographs(viewer, folder)
+    browsing.start_training(viewer)
+    browsing.start_training(viewer)
     assert "under way" in errors(viewer)[-1]
-    training.look_at_training(viewer)
+    browsing.look_at_training(viewer)
     assert "no Gaussians to look at yet" in viewer.state.messages[-1].text
     process = viewer.training.process
-    training.stop_training(viewer)
+    browsing.stop_training(viewer)
     finish(viewer)
     assert process.returncode == -signal.SIGTERM
     assert "goes on" in viewer.state.messages[-1].text
@@ -122,14 +122,14 @@ def test_it_can_be_stopped_and_one_is_enough(viewer, folder, monkeypatch):
 
 def test_the_gaussians_can_be_looked_at_before_the_end(viewer, folder, monkeypatch):
     trains(monkeypatch, SLOW)
-    opening.choose_photographs(viewer, folder)
-    training.start_training(viewer)
+    browsing.choose_photographs(viewer, folder)
+    browsing.start_training(viewer)
     work = folder.with_name("photos.work")
     work.mkdir()
     (work / "radiance-0.ply").write_bytes(b"")
     SCENES["radiance-0.ply"] = SCENES["plain.ply"]
     try:
-        training.look_at_training(viewer)
+        browsing.look_at_training(viewer)
         settle(viewer)
     finally:
         del SCENES["radiance-0.ply"]
@@ -140,8 +140,8 @@ def test_the_gaussians_can_be_looked_at_before_the_end(viewer, folder, monkeypat
 @pytest.mark.parametrize("dataset", ["", "  ", "gone", "."])
 def test_a_folder_without_photographs_is_said(viewer, tmp_path, monkeypatch, dataset):
     monkeypatch.chdir(tmp_path)
-    training.fill_in(viewer, replace(viewer.state.training_form, dataset=dataset))
-    training.start_training(viewer)
+    viewer.state.training_form = replace(viewer.state.training_form, dataset=dataset)
+    browsing.start_training(viewer)
     assert "no photographs" in errors(viewer)[-1]
     assert viewer.training is None
 
@@ -206,31 +206,31 @@ def training_now(viewer, folder, monkeypatch):
     """A training is under way."""
     viewer.services = replace(viewer.services, load_scene=load_scene)
     trains(monkeypatch, SLOW)
-    opening.choose_photographs(viewer, folder)
-    training.start_training(viewer)
+    browsing.choose_photographs(viewer, folder)
+    browsing.start_training(viewer)
     yield viewer
     viewer.training.end()
 
 
 def test_gaussians_in_training_are_looked_at_and_followed(training_now, folder):
     viewer = training_now
-    training.look_at_training(viewer)
+    browsing.look_at_training(viewer)
     assert "no Gaussians to look at yet" in viewer.state.messages[-1].text
     whole = blob_scene()
     checkpoint(folder.parent, whole.take(np.arange(0, 360, 2)))
-    training.look_at_training(viewer)
+    browsing.look_at_training(viewer)
     settle(viewer)
-    assert viewer.state.path == folder.parent / "photos.work" / NAME
+    assert viewer.state.path == folder.parent / "photos.work" / PREVIEW
     seen = viewer.state.scene.gaussians
     assert (len(seen), seen.sh_degree) == (180, 1)
     np.testing.assert_array_equal(seen.means, whole.gaussians.means[::2])
     viewpoint.zoom_by(viewer, 1.5)
     view = viewer.state.view
-    training.watch_training(viewer)
+    browsing.watch_training(viewer)
     assert viewer.worker.current is None  # nothing new
 
     checkpoint(folder.parent, whole)
-    training.watch_training(viewer)
+    browsing.watch_training(viewer)
     settle(viewer)
     assert len(viewer.state.scene.gaussians) == 360
     assert viewer.state.view is view
@@ -254,7 +254,7 @@ def test_a_checkpoint_of_training_itself_is_read(tmp_path):
 def test_a_damaged_checkpoint_is_one_line(training_now, folder):
     path = checkpoint(folder.parent, blob_scene())
     path.write_bytes(path.read_bytes()[:100])
-    training.look_at_training(training_now)
+    browsing.look_at_training(training_now)
     settle(training_now)
     assert "no Gaussians in training" in errors(training_now)[-1]
     assert training_now.state.scene is None

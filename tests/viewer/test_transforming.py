@@ -9,8 +9,8 @@ import pytest
 from langsplat_core.errors import InputError
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.scene.transform import AXES, IDENTITY, moving, rotating, scaling
-from langsplat_viewer.actions import opening, queries, selecting, transforming, undoing
-from langsplat_viewer.panels.transform import box_of, dragged, gl_matrices
+from langsplat_viewer.actions import editing, opening, queries, selecting
+from langsplat_viewer.panels.select import box_of, dragged, gl_matrices
 from langsplat_viewer.state import EditForm
 from tests.support.fakes import CENTRES
 from tests.support.scenes import random_camera, without_perspective
@@ -35,7 +35,7 @@ def means(viewer) -> np.ndarray:
 def test_the_selection_moves_alone_and_is_found_where_it_went(opened):
     chosen, before = selected_mug(opened), means(opened)
     place, cameras = opened.state.queries[0].result.place, opened.state.scene.cameras
-    transforming.transform(opened, moving(STEP))
+    editing.transform(opened, moving(STEP))
     settle(opened)
     np.testing.assert_allclose(means(opened)[chosen], before[chosen] + STEP, atol=1e-5)
     np.testing.assert_array_equal(means(opened)[~chosen], before[~chosen])
@@ -48,7 +48,7 @@ def test_the_whole_scene_takes_its_cameras_along(opened):
     up, before = opened.state.extent.up, means(opened)
     eyes = [camera.position for camera in opened.state.scene.cameras]
     to = rotating(AXES["z"], 90).then(scaling(3)).then(moving(STEP))
-    transforming.transform(opened, to)
+    editing.transform(opened, to)
     np.testing.assert_allclose(means(opened), to.points(before), atol=1e-4)
     moved = [camera.position for camera in opened.state.scene.cameras]
     np.testing.assert_allclose(moved, to.points(np.array(eyes)), atol=1e-9)
@@ -58,21 +58,21 @@ def test_the_whole_scene_takes_its_cameras_along(opened):
 def test_undone_exactly_and_done_again(opened):
     chosen, first = selected_mug(opened), means(opened)
     place = opened.state.queries[0].result.place
-    transforming.transform(opened, rotating(AXES["x"], 33).about(MUG))
-    transforming.transform(opened, moving(STEP))
+    editing.transform(opened, rotating(AXES["x"], 33).about(MUG))
+    editing.transform(opened, moving(STEP))
     selecting.select_none(opened)
-    transforming.transform(opened, scaling(0.5))
+    editing.transform(opened, scaling(0.5))
     settle(opened)
     last = means(opened)
     for _ in range(4):
-        undoing.undo(opened)
+        editing.undo(opened)
     settle(opened)
     np.testing.assert_array_equal(means(opened), first)
     np.testing.assert_array_equal(opened.state.selection.marks.selected, chosen)
     np.testing.assert_allclose(opened.state.queries[0].result.place, place, atol=1e-6)
     assert not opened.state.selection.is_unsaved
     for _ in range(4):
-        undoing.redo(opened)
+        editing.redo(opened)
     settle(opened)
     np.testing.assert_array_equal(means(opened), last)
     assert opened.state.selection.is_unsaved
@@ -82,7 +82,7 @@ def test_transforms_of_the_same_are_one(opened):
     """Thirty degrees twelve times: as if nothing had been done, to float32."""
     before = means(opened)
     for _ in range(12):
-        transforming.transform(opened, rotating(AXES["y"], 30))
+        editing.transform(opened, rotating(AXES["y"], 30))
     assert len(opened.state.selection.moves) == 1
     np.testing.assert_allclose(means(opened), before, atol=1e-5)
 
@@ -90,29 +90,29 @@ def test_transforms_of_the_same_are_one(opened):
 def test_a_held_gizmo_shows_what_release_does(opened):
     chosen = selected_mug(opened)
     before, shown = means(opened), opened.state.request((32, 24))
-    transforming.preview(opened, moving(STEP))
+    editing.preview(opened, moving(STEP))
     seen = opened.state.request((32, 24))
     assert seen != shown
     np.testing.assert_allclose(seen.scene.scene.gaussians.means[chosen], before[chosen] + STEP, atol=1e-5)
     assert means(opened) is before
     assert opened.state.request((32, 24)) == seen  # nothing is drawn anew while it rests
     with pytest.raises(InputError):
-        transforming.preview(opened, moving(np.array([1e39, 0, 0])))
+        editing.preview(opened, moving(np.array([1e39, 0, 0])))
     assert opened.state.request((32, 24)) == seen
-    transforming.transform(opened, IDENTITY)
+    editing.transform(opened, IDENTITY)
     assert opened.state.request((32, 24)).scene.source is opened.state.scene
 
 
 def test_what_is_saved_is_what_is_seen(opened, tmp_path):
     chosen = selected_mug(opened)
-    transforming.transform(opened, moving(STEP))
+    editing.transform(opened, moving(STEP))
     selecting.export(opened, tmp_path, "edited")
     settle(opened)
     made = load_scene(next(tmp_path.glob("*.ply")))
     np.testing.assert_array_equal(made.gaussians.means, means(opened))
     assert made.language is not None
     assert not opened.state.selection.is_unsaved
-    transforming.transform(opened, moving(STEP))
+    editing.transform(opened, moving(STEP))
     opening.open_scene(opened, Path("plain.ply"))  # is asked about first
     assert opened.state.selection.leaving is not None
     assert chosen.any()
@@ -123,7 +123,7 @@ def test_names_that_were_taught_go_along(opened):
     queries.type_name(opened, "trophy")
     queries.name_selection(opened)
     settle(opened)
-    transforming.transform(opened, moving(STEP))
+    editing.transform(opened, moving(STEP))
     settle(opened)
     assert opened.engine.is_taught("trophy")
     assert [word.name for word in opened.state.scene.language.taught] == ["trophy"]
@@ -132,10 +132,10 @@ def test_names_that_were_taught_go_along(opened):
 def test_the_numbers_of_the_panel(opened):
     """Scaled and rotated about the middle of the selection, then moved; then the fields are neutral again."""
     chosen, before = selected_mug(opened), means(opened)
-    centre = transforming.pivot(opened)
+    centre = editing.pivot(opened)
     form = EditForm(move=(1.0, 0.0, 0.0), rotate=(0.0, 0.0, 90.0), scale=2.0)
-    transforming.fill_form(opened, form)
-    transforming.apply_form(opened)
+    opened.state.edit_form = form
+    editing.apply_form(opened)
     x, y, z = (before[chosen] - centre).T
     expected = centre + np.stack([1 - 2 * y, 2 * x, 2 * z], 1)
     np.testing.assert_allclose(means(opened)[chosen], expected, atol=1e-5)
@@ -145,44 +145,44 @@ def test_the_numbers_of_the_panel(opened):
 @pytest.mark.parametrize("form", [EditForm(scale=0), EditForm(scale=-1), EditForm(move=(1e39, 0.0, 0.0))])
 def test_numbers_that_cannot_be_are_refused(form, opened):
     before = opened.state.scene
-    transforming.fill_form(opened, form)
-    transforming.apply_form(opened)
+    opened.state.edit_form = form
+    editing.apply_form(opened)
     assert len(errors(opened)) == 1
     assert opened.state.scene is before
-    undoing.undo(opened)
+    editing.undo(opened)
     assert "nothing to undo" in opened.state.messages[-1].text
 
 
 def test_cropped_to_a_box_and_undone(opened):
     chosen = selected_mug(opened)
-    transforming.fill_box(opened)
-    transforming.crop(opened)
+    editing.fill_box(opened)
+    editing.crop(opened)
     marks = opened.state.selection.marks
     assert (marks.kept[chosen]).all()
     assert 0 < marks.kept.sum() < len(chosen)
-    undoing.undo(opened)
+    editing.undo(opened)
     assert opened.state.selection.marks.kept.all()
-    transforming.fill_form(opened, EditForm(low=(50.0, 50, 50), high=(51.0, 51, 51)))
-    transforming.crop(opened)
+    opened.state.edit_form = EditForm(low=(50.0, 50, 50), high=(51.0, 51, 51))
+    editing.crop(opened)
     assert "holds nothing" in errors(opened)[-1]
     assert opened.state.selection.marks.kept.all()
 
 
 def test_a_clip_follows_its_box_and_is_undone(opened):
     chosen = selected_mug(opened)
-    transforming.fill_box(opened)
-    transforming.clip(opened, True)
+    editing.fill_box(opened)
+    editing.clip(opened, True)
     marks = opened.state.selection.marks
     assert marks.shown[chosen].all()
     assert 0 < marks.hidden.sum() < len(chosen)
     assert not marks.deleted.any()
-    transforming.set_box(opened, (-9.0, -9.0, -9.0), (9.0, 9.0, 9.0))
-    transforming.follow_box(opened)
+    editing.set_box(opened, (-9.0, -9.0, -9.0), (9.0, 9.0, 9.0))
+    editing.follow_box(opened)
     assert opened.state.selection.marks.shown.all()
-    undoing.undo(opened)
-    transforming.follow_box(opened)  # the box has not moved since: nothing is hidden or shown again
+    editing.undo(opened)
+    editing.follow_box(opened)  # the box has not moved since: nothing is hidden or shown again
     assert opened.state.selection.marks.hidden.any()
-    transforming.clip(opened, False)
+    editing.clip(opened, False)
     assert opened.state.selection.marks.shown.all()
 
 
@@ -193,16 +193,16 @@ def test_the_corners_of_a_dragged_box():
 
 
 def test_without_a_scene_nothing_happens(viewer):
-    for act in (transforming.apply_form, transforming.crop, transforming.fill_box, transforming.next_gizmo):
+    for act in (editing.apply_form, editing.crop, editing.fill_box, editing.next_gizmo):
         act(viewer)
-    transforming.preview(viewer, moving(STEP))
+    editing.preview(viewer, moving(STEP))
     assert viewer.state.moving is None
 
 
 def test_without_a_language_field(viewer):
     open_scene(viewer, "plain.ply")
     before = means(viewer)
-    transforming.transform(viewer, moving(STEP))
+    editing.transform(viewer, moving(STEP))
     settle(viewer)
     np.testing.assert_allclose(means(viewer), before + STEP, atol=1e-5)
     assert viewer.state.scene.language is None
@@ -237,7 +237,7 @@ def test_what_a_drag_means():
 
 
 def test_another_scene_begins_without_transforms(opened):
-    transforming.transform(opened, moving(STEP))
+    editing.transform(opened, moving(STEP))
     opened.state.selection = replace(opened.state.selection, saved_moves=opened.state.selection.moves)
     open_scene(opened, "book.ply")
     assert opened.state.selection.moves == ()

@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from langsplat_viewer.actions import opening, queries, selecting, settings, undoing
-from langsplat_viewer.actions.history import GESTURE, LONGEST
+from langsplat_viewer.actions import editing, opening, queries, selecting, settings
 from langsplat_viewer.actions.selecting import mark
 from langsplat_viewer.marks import Marks, hiding, unmarked
-from langsplat_viewer.rendering.depth import Clip
-from langsplat_viewer.rendering.request import Splats
+from langsplat_viewer.rendering.request import Clip, Splats
+from langsplat_viewer.viewer import GESTURE, MOST_STEPS
 from tests.support.windowless import ask, open_scene, settle
 
 
@@ -23,21 +22,21 @@ def phrases(viewer) -> list[str]:
 
 def test_a_query_is_undone_and_done_again(opened):
     ask(opened, "mug", "book")
-    undoing.undo(opened)
+    editing.undo(opened)
     assert phrases(opened) == ["mug"]
-    undoing.undo(opened)
+    editing.undo(opened)
     assert phrases(opened) == []
     assert opened.state.picture.display == "rgb"
-    undoing.undo(opened)
+    editing.undo(opened)
     assert "nothing to undo" in opened.state.messages[-1].text
-    undoing.redo(opened)
-    undoing.redo(opened)
+    editing.redo(opened)
+    editing.redo(opened)
     settle(opened)
     assert phrases(opened) == ["mug", "book"]
     assert [query.slot for query in opened.state.queries] == [0, 1]
     assert opened.state.picture.display == "relevancy"
     assert len(opened.state.shown_results()) == 2
-    undoing.redo(opened)
+    editing.redo(opened)
     assert "nothing to redo" in opened.state.messages[-1].text
 
 
@@ -47,7 +46,7 @@ def test_a_removed_query_comes_back_with_its_answer_and_colour(opened):
     queries.set_cut(opened, mug, 0.6)
     count = mug.result.members.sum()
     queries.remove(opened, mug)
-    undoing.undo(opened)
+    editing.undo(opened)
     settle(opened)
     assert opened.state.queries[0] is mug
     assert mug.slot == 0
@@ -61,7 +60,7 @@ def leave_by_removing(viewer) -> None:
     queries.remove(viewer, viewer.state.queries[-1])
 
 
-@pytest.mark.parametrize("leave", [leave_by_removing, undoing.undo])
+@pytest.mark.parametrize("leave", [leave_by_removing, editing.undo])
 def test_history_keeps_no_answers_of_queries_that_are_gone(opened, leave):
     """Each has a number for every Gaussian and level."""
     ask(opened, "mug")
@@ -74,7 +73,7 @@ def test_history_keeps_no_answers_of_queries_that_are_gone(opened, leave):
     gc.collect()
     assert [there() for there in gone] == [None, None]
     assert opened.state.queries[0].result is stays
-    (undoing.redo if leave is undoing.undo else undoing.undo)(opened)
+    (editing.redo if leave is editing.undo else editing.undo)(opened)
     settle(opened)
     assert opened.state.queries[-1].phrase == "plant"
     assert opened.state.queries[-1].result.found
@@ -86,7 +85,7 @@ def test_an_answer_that_comes_after_its_query_was_taken_off_is_dropped(opened):
     queries.remove(opened, mug)
     settle(opened)
     assert (mug.result, mug.pending) == (None, False)
-    undoing.undo(opened)
+    editing.undo(opened)
     assert mug.pending
     settle(opened)
     assert mug.result.found
@@ -99,20 +98,20 @@ def test_colour_level_and_display_are_undone(opened):
     queries.set_level(opened, "part")
     settings.set_display(opened, "depth")
     settle(opened)
-    undoing.undo(opened)
+    editing.undo(opened)
     assert opened.state.picture.display == "relevancy"
-    undoing.undo(opened)
+    editing.undo(opened)
     settle(opened)
     assert (opened.state.level, query.result.level) == ("auto", 2)
-    undoing.undo(opened)
+    editing.undo(opened)
     assert query.slot == 0
 
 
 def test_another_scene_and_a_long_day(opened):
-    for _ in range(LONGEST):
+    for _ in range(MOST_STEPS):
         settings.set_display(opened, "depth")
         settings.set_display(opened, "rgb")
-    assert len(opened.history.past) == LONGEST
+    assert len(opened.history.past) == MOST_STEPS
     open_scene(opened, "bare.ply")
     assert opened.history.past == []
 
@@ -148,10 +147,10 @@ def test_a_setting_of_what_is_seen_is_undone_in_one_step(opened, name):
     assert after != before
     SETTINGS["wipe" if name == "levels" else "levels"](opened)
     for wanted in (after, before):
-        undoing.undo(opened)
+        editing.undo(opened)
         assert looks(opened) == wanted
     assert opened.history.past == []
-    undoing.redo(opened)
+    editing.redo(opened)
     assert looks(opened) == after
 
 
@@ -177,19 +176,19 @@ def test_a_slider_that_is_moved_is_one_step_and_another_time_another(opened):
     assert len(opened.history.past) == 1
     slide(opened, 5.9 + 1.1 * GESTURE, 0.9)
     assert len(opened.history.past) == 2
-    undoing.undo(opened)
+    editing.undo(opened)
     assert opened.state.picture.dim == pytest.approx(0.31)
     slide(opened, opened.clock, 0.8)  # after an undo a step of its own
-    undoing.undo(opened)
+    editing.undo(opened)
     assert opened.state.picture.dim == pytest.approx(0.31)
-    undoing.undo(opened)
+    editing.undo(opened)
     assert opened.state.picture.dim == 0.45
 
 
 def test_the_ruler_is_not_undone(opened):
     settings.toggle_wipe(opened)
     settings.measure(opened, True)
-    undoing.undo(opened)
+    editing.undo(opened)
     assert opened.state.ruler.measures
     assert opened.state.settings.split.mode == "off"
 
@@ -199,13 +198,13 @@ def test_an_undone_setting_leaves_the_marks_the_same_objects(opened):
     selecting.select_all(opened)
     settings.toggle_wipe(opened)
     marks = opened.state.selection.marks
-    undoing.undo(opened)
-    undoing.redo(opened)
+    editing.undo(opened)
+    editing.redo(opened)
     assert opened.state.selection.marks is marks
     selecting.hide_selected(opened)
     hidden = opened.state.selection.marks.hidden
     mark(opened, replace(opened.state.selection.marks, selected=~hidden | True))
-    undoing.undo(opened)
+    editing.undo(opened)
     assert opened.state.selection.marks.hidden is hidden
 
 
@@ -222,12 +221,12 @@ def test_a_hundred_changes_of_a_million_gaussians_take_little_memory(viewer):
     viewer.state.selection = replace(viewer.state.selection, marks=unmarked(count))
     tracemalloc.start()
     try:
-        for step in range(LONGEST):
+        for step in range(MOST_STEPS):
             mark(viewer, changed(viewer.state.selection.marks, rng, step))
         held, _ = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert len(viewer.history.past) == LONGEST
+    assert len(viewer.history.past) == MOST_STEPS
     now = viewer.state.selection.marks
     own = sum(mask.nbytes for mask in (now.selected, now.hidden))
     assert held - own < 15e6

@@ -20,9 +20,8 @@ from langsplat_viewer.camera.controls import (
     zoom,
 )
 from langsplat_viewer.camera.flight import Flight, Keyframe, camera_of, pose_at, pose_of
-from langsplat_viewer.rendering.depth import Clip, depth_range, image_formation, why_nothing
 from langsplat_viewer.rendering.renderer import GlRenderer
-from langsplat_viewer.rendering.request import plain_request
+from langsplat_viewer.rendering.request import Clip, depth_range, image_formation, plain_request, why_nothing
 from tests.support.fakes import CENTRES, blob_scene
 
 SIZE = (1280, 720)

@@ -24,8 +24,8 @@ from langsplat_core.scene import Scene
 from langsplat_viewer.actions import selecting, settings
 from langsplat_viewer.commands import COMMANDS, Command
 from langsplat_viewer.files.preferences import with_recent
-from langsplat_viewer.panels.style import scene_area
-from langsplat_viewer.panels.toolbar import button_label
+from langsplat_viewer.panels.layout import button_label
+from langsplat_viewer.panels.ui import scene_area
 from langsplat_viewer.rendering.renderer import Backend, GlRenderer
 from langsplat_viewer.viewer import Services
 from langsplat_viewer.window import Window, WindowRequest

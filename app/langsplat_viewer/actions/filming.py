@@ -13,9 +13,9 @@ import numpy as np
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.errors import InputError, LangSplatError
+from langsplat_core.io.cameras import write_cameras
 from langsplat_core.progress import Progress
 from langsplat_core.scene import LEVELS
-from langsplat_viewer.actions.history import remember
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.actions.viewpoint import glide_to, leave_path, path_seconds
 from langsplat_viewer.camera.controls import from_camera, with_projection
@@ -30,16 +30,54 @@ from langsplat_viewer.camera.flight import (
     view_of,
     with_keyframe,
 )
-from langsplat_viewer.files.flights import MOST, SUFFIX, read_flight, write_flight
-from langsplat_viewer.jobs import one_line
+from langsplat_viewer.files.projects import MOST_KEYFRAMES, PATHS, read_flight, write_flight
 from langsplat_viewer.options import MAX_SIDE, say_compiling
-from langsplat_viewer.output.film import VIDEO, Shot, cameras_of, check_film, find_ffmpeg, make_film
-from langsplat_viewer.output.headless import draw_something
-from langsplat_viewer.output.saving import free_name, save_png, save_view
+from langsplat_viewer.output import (
+    VIDEO,
+    Shot,
+    cameras_of,
+    check_film,
+    draw_something,
+    find_ffmpeg,
+    free_name,
+    make_film,
+    save_png,
+)
 from langsplat_viewer.rendering.renderer import open_renderer
 from langsplat_viewer.rendering.request import Splats
 from langsplat_viewer.state import SPACING, ViewerState, flight_of
-from langsplat_viewer.viewer import Viewer
+from langsplat_viewer.viewer import Viewer, remember
+
+
+def save_picture(viewer: Viewer, folder: Path = Path()) -> Path | None:
+    """Save the scene as shown to a new PNG in `folder`; returns its path, None if that failed."""
+    state = viewer.state
+    if viewer.surface is None or state.scene is None or state.view is None:
+        viewer.say_error("open a scene first, then save a picture of it")
+        return None
+    path = free_name(folder, state.path.stem if state.path else "picture", ".png")
+    surface, other, transparent = viewer.surface, viewer.beside, state.settings.transparent
+
+    def write() -> None:
+        images = [surface.capture(state.request(transparent=transparent))]
+        if other is not None and other.surface is not None and other.state.scene is not None:
+            images.append(other.surface.capture(other.state.request(transparent=transparent)))
+        save_png(path, state.settings.split.joined(images, images[0].shape[1]))
+
+    return viewer.save(path, write)
+
+
+def save_view(viewer: Viewer, folder: Path = Path()) -> Path | None:
+    """Save the camera, in perspective, to a new file that `--camera` reads; its path, None if that failed."""
+    state = viewer.state
+    if state.view is None:
+        viewer.say_error("open a scene first, then save a view of it")
+        return None
+    path = free_name(folder, f"{state.path.stem if state.path else 'view'}-view", ".json")
+    camera = with_projection(state.view, orthographic=False).camera(*state.size)
+    span = f" --orthographic {state.view.span_in(*state.size):.6g}" if state.view.orthographic else ""
+    more = f"; show it again with --camera {path.name}{span}"
+    return viewer.save(path, lambda: write_cameras(path, (camera,)), more)
 
 
 def add_keyframe(viewer: Viewer) -> None:
@@ -49,8 +87,8 @@ def add_keyframe(viewer: Viewer) -> None:
         viewer.say_error("open a scene first, then record a path in it")
         return
     last = record.keyframes[-1].seconds + SPACING if record.keyframes else 0.0
-    if last > LONGEST or len(record.keyframes) >= MOST:
-        viewer.say_error(f"a path has at most {MOST} keyframes and {LONGEST:.0f} seconds")
+    if last > LONGEST or len(record.keyframes) >= MOST_KEYFRAMES:
+        viewer.say_error(f"a path has at most {MOST_KEYFRAMES} keyframes and {LONGEST:.0f} seconds")
         return
     added = Keyframe(last, pose_of(state.view))
     record.turns = False
@@ -59,7 +97,6 @@ def add_keyframe(viewer: Viewer) -> None:
 
 
 def choose_keyframe(viewer: Viewer, key: Keyframe) -> None:
-    """Stand where a keyframe is."""
     state, record = viewer.state, viewer.state.record
     if state.extent is not None:
         glide_to(viewer, view_of(key.pose, state.extent))
@@ -82,14 +119,12 @@ def move_keyframe(viewer: Viewer, key: Keyframe, seconds: float) -> None:
 
 
 def replace_keyframe(viewer: Viewer, key: Keyframe) -> None:
-    """Put the current view in the place of a keyframe."""
     if viewer.state.view is not None:
         new = replace(key, pose=pose_of(viewer.state.view))
         _set(viewer, with_keyframe(viewer.state.record.keyframes, new), new)
 
 
 def set_path_seconds(viewer: Viewer, seconds: float) -> None:
-    """Set the duration of the whole path."""
     record = viewer.state.record
     seconds = min(max(seconds, 0.1), LONGEST)
     if record.turns:
@@ -101,7 +136,6 @@ def set_path_seconds(viewer: Viewer, seconds: float) -> None:
 
 
 def clear_path(viewer: Viewer) -> None:
-    """Take all keyframes off."""
     if viewer.state.record.keyframes:
         _set(viewer, (), None)
 
@@ -120,34 +154,19 @@ def set_turning(viewer: Viewer, turns: bool) -> None:
     viewer.state.record.turns, viewer.state.record.at = turns, 0.0
 
 
-def set_looping(viewer: Viewer, loops: bool) -> None:
-    """Have a played path begin again at its end."""
-    viewer.state.record.loops = loops
-
-
-def type_path_file(viewer: Viewer, text: str) -> None:
-    """Set the text of the box for a file with a path."""
-    viewer.state.record.path_typed = text
-
-
-def save_path(viewer: Viewer, folder: Path) -> Path | None:
+def save_path(viewer: Viewer, folder: Path = Path()) -> Path | None:
     """Save the path to the typed file, or to a new one in `folder`; None where that failed."""
     state, record = viewer.state, viewer.state.record
     if not record.keyframes:
         viewer.say_error("a path to save needs a keyframe: add one at the current view")
         return None
     stem = state.path.stem if state.path else "camera"
-    path = (
-        folder / record.path_typed.strip() if record.path_typed.strip() else free_name(folder, stem, SUFFIX)
-    )
-    try:
-        write_flight(path, flight_of(record.keyframes))
-    except (OSError, ValueError) as error:
-        viewer.say_error(f"{path}: not saved ({one_line(error)})")
-        return None
-    record.path_typed = str(path)
-    state.say(f"saved {path}; langsplat-viewer --headless --path makes a film of it")
-    return path
+    typed = record.path_typed.strip()
+    path = folder.absolute() / typed if typed else free_name(folder, stem, PATHS)
+    more = "; langsplat-viewer --headless --path makes a film of it"
+    saved = viewer.save(path, lambda: write_flight(path, flight_of(record.keyframes)), more)
+    record.path_typed = record.path_typed if saved is None else str(path)
+    return saved
 
 
 def load_path(viewer: Viewer, path: Path) -> None:
@@ -165,11 +184,10 @@ def load_path(viewer: Viewer, path: Path) -> None:
     viewer.state.say(f"{path.name}: {len(flight.keyframes)} keyframes, {flight.seconds:.1f} s")
 
 
-def load_typed_path(viewer: Viewer, folder: Path) -> None:
-    """Take the path of the typed file."""
+def load_typed_path(viewer: Viewer, folder: Path = Path()) -> None:
     typed = viewer.state.record.path_typed.strip()
     if typed:
-        load_path(viewer, folder / typed)
+        load_path(viewer, folder.absolute() / typed)
     else:
         viewer.say_error("type the name of a file with a path first")
 
@@ -183,16 +201,6 @@ def set_film_size(viewer: Viewer, width: int, height: int) -> None:
     viewer.state.record.size = (width, height)
 
 
-def set_film_fps(viewer: Viewer, fps: float) -> None:
-    """Set the images per second of a film."""
-    viewer.state.record.fps = fps
-
-
-def type_film(viewer: Viewer, text: str) -> None:
-    """Set the text of the box for where the film goes."""
-    viewer.state.record.film_typed = text
-
-
 def film_motion(viewer: Viewer) -> Motion | None:
     """The path that is filmed; None without one."""
     state, record = viewer.state, viewer.state.record
@@ -203,7 +211,7 @@ def film_motion(viewer: Viewer) -> Motion | None:
     return flight_of(record.keyframes)
 
 
-def save_film(viewer: Viewer, folder: Path) -> None:
+def save_film(viewer: Viewer, folder: Path = Path()) -> None:
     """Have a film made along the path, to the typed place or to a new name in `folder`."""
     state, record, motion = viewer.state, viewer.state.record, film_motion(viewer)
     if motion is None or state.extent is None:
@@ -228,12 +236,12 @@ def save_film(viewer: Viewer, folder: Path) -> None:
 def _film_out(viewer: Viewer, folder: Path) -> Path:
     typed = viewer.state.record.film_typed.strip()
     if typed:
-        return folder / typed
+        return folder.absolute() / typed
     stem = f"{viewer.state.path.stem if viewer.state.path else 'scene'}-film"
     return free_name(folder, stem, "" if find_ffmpeg() is None else VIDEO)
 
 
-def save_sized_picture(viewer: Viewer, folder: Path) -> None:
+def save_sized_picture(viewer: Viewer, folder: Path = Path()) -> None:
     """Have the scene as shown drawn in the size of a film and saved under a new name in `folder`."""
     state = viewer.state
     if state.view is None:
@@ -263,7 +271,7 @@ def _submit(viewer: Viewer, label: str, work: Callable[[Progress], str]) -> None
     viewer.recorder.submit(label, work, viewer.state.say, viewer.say_error)
 
 
-def copy_command(viewer: Viewer, folder: Path) -> str:
+def copy_command(viewer: Viewer, folder: Path = Path()) -> str:
     """Put the command that draws this image without a window on the clipboard, and return it; "" where that
     failed. A view that is no training camera's is saved to a file in `folder` first."""
     state = viewer.state

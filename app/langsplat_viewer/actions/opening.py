@@ -1,11 +1,8 @@
-"""Opening scenes: read, shown, listed, returned to, chosen in the file browser; and their photographs."""
+"""Opening scenes: read, shown, listed, returned to; their photographs; a second scene beside the first."""
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -13,38 +10,26 @@ from langsplat_core.arrays import Array
 from langsplat_core.compiled import is_compiled
 from langsplat_core.display.displays import DISPLAYS, latent_colours
 from langsplat_core.errors import InputError
-from langsplat_core.io import cameras, language
-from langsplat_core.io.scenes import format_of, scene_files
-from langsplat_core.pipeline.forecast import count_photographs
+from langsplat_core.io.scenes import scene_files
 from langsplat_core.pipeline.report import stated_warnings
 from langsplat_core.progress import Progress
 from langsplat_core.query.engine import no_field
-from langsplat_core.query.finding import Answered, Hit, find
-from langsplat_core.query.library import Library, update_library
 from langsplat_core.scene import Camera, Scene, surface
-from langsplat_core.semantics.encoders import DEMO
-from langsplat_viewer.actions import projects
-from langsplat_viewer.actions.filming import load_path
-from langsplat_viewer.actions.history import forget, remember
+from langsplat_viewer.actions import viewpoint
 from langsplat_viewer.actions.outline import have_things
-from langsplat_viewer.actions.queries import ask, ask_again, load_queries, set_canonical
+from langsplat_viewer.actions.queries import ask_again, ask_one, set_canonical, set_level
 from langsplat_viewer.actions.selecting import leave
-from langsplat_viewer.actions.settings import open_panel, show_scenes
+from langsplat_viewer.actions.settings import show_scenes
 from langsplat_viewer.actions.viewpoint import opening_view, read_bookmarks
-from langsplat_viewer.camera.controls import Extent, extent_of
-from langsplat_viewer.files import PROJECTS, photographs
-from langsplat_viewer.files.browsing import SUFFIX as QUERIES
-from langsplat_viewer.files.browsing import Entry, list_folder
-from langsplat_viewer.files.flights import SUFFIX as PATHS
-from langsplat_viewer.files.photographs import Photograph
-from langsplat_viewer.files.preferences import with_photographs, with_recent
-from langsplat_viewer.files.projects import Things, read_project, scene_of
-from langsplat_viewer.files.watching import Stamps, stamps
-from langsplat_viewer.jobs import one_line
+from langsplat_viewer.camera.controls import Extent, OrbitCamera, extent_of
+from langsplat_viewer.files import disk
+from langsplat_viewer.files.disk import Photograph, Stamps, stamps
+from langsplat_viewer.files.preferences import with_recent
+from langsplat_viewer.files.projects import Things
 from langsplat_viewer.marks import of_scene
-from langsplat_viewer.rendering.depth import UNCLIPPED, why_undrawable
-from langsplat_viewer.state import LibraryView, Recording, SceneState, ViewerState
-from langsplat_viewer.viewer import Viewer, Visit, unanswered, visit_of
+from langsplat_viewer.rendering.request import UNCLIPPED, Split, why_undrawable
+from langsplat_viewer.state import Query, Recording, SceneState, ViewerState
+from langsplat_viewer.viewer import Viewer, Visit, forget, remember, unanswered, visit_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +84,6 @@ def _open(viewer: Viewer, path: Path, then: Callable[[Viewer], None], check: Cal
 
 
 def cancel(viewer: Viewer) -> None:
-    """Drop the work under way."""
     viewer.worker.cancel()
     viewer.state.opening = None
     photograph = viewer.state.photograph
@@ -143,7 +127,8 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
         field = scene.language
         viewer.run("preparing latent colours", lambda progress: latent_colours(field))  # none is needed yet
         _compile_search(viewer)
-        _warm_up_encoder(viewer, viewer.services.encoder_id or scene.language.encoder_id)
+        if viewer.has_encoder_here:  # while the user looks round
+            viewer.run("loading the text encoder", viewer.engine.load_encoder)
 
 
 def _say_opened(viewer: Viewer, path: Path, opened: _Opened) -> None:
@@ -166,14 +151,6 @@ def _compile_search(viewer: Viewer) -> None:
     viewer.run(
         "compiling the search kernels, once per installation (half a minute)", lambda progress: engine.regions
     )
-
-
-def _warm_up_encoder(viewer: Viewer, encoder_id: str) -> None:
-    """Load a local encoder while the user looks round; a hub id may mean a download and waits for the
-    first query that needs it."""
-    if viewer.engine is None or not (encoder_id == DEMO or Path(encoder_id).expanduser().is_dir()):
-        return
-    viewer.run("loading the text encoder", viewer.engine.load_encoder)
 
 
 # Visits: a scene that was shown before is found again as it was left.
@@ -207,8 +184,7 @@ def return_to(viewer: Viewer, visit: Visit) -> None:
 
 
 def reload(viewer: Viewer) -> None:
-    """Read the scene's files again and stay where one is; if that fails the reason is said and the scene is
-    kept."""
+    """Read the scene's files again and stay where one is; where that fails the scene is kept."""
     state = viewer.state
     path, shown = state.path, state.scene
     if path is None or shown is None:
@@ -224,11 +200,6 @@ def reload(viewer: Viewer) -> None:
             raise InputError(f"not read again, the scene stays as it was: {new[0]}")
 
     open_scene(viewer, path, lambda viewer: return_to(viewer, viewer.visits[path.absolute()]), check)
-
-
-def keep_old(viewer: Viewer) -> None:
-    """Keep the scene as it was read, though its files have changed."""
-    viewer.watch.dismiss()
 
 
 # The list of scenes. One is in memory at a time; of the others the visit is kept.
@@ -279,8 +250,7 @@ SAME = 1e-6  # of the scene's radius, and of a rotation: nearer is the same plac
 
 
 def standing_at(state: ViewerState) -> Camera | None:
-    """The training camera whose pose the view has, whatever its field of view; None elsewhere, and without
-    perspective."""
+    """The training camera whose pose the view has; None elsewhere, and without perspective."""
     scene, view, index = state.scene, state.view, state.camera_index
     if (
         scene is None
@@ -316,14 +286,14 @@ def fetch_photograph(viewer: Viewer) -> None:
     camera = standing_at(state) if state.settings.fade > 0 else None
     if camera is None or state.path is None:
         return
-    path, folder = state.path, _folder(viewer)
+    path, folder = state.path, photograph_folder(viewer)
     before = state.photograph
     if before is not None and before.camera is camera and before.folder == folder:
         return
     wanted = state.photograph = Photograph(camera, folder)
 
     def work(progress: Progress) -> Array:
-        return photographs.read(photographs.find(camera.name, path, folder), camera)
+        return disk.read_photograph(disk.find_photograph(camera.name, path, folder), camera)
 
     def done(image: Array) -> None:
         if state.photograph is wanted:
@@ -336,122 +306,10 @@ def fetch_photograph(viewer: Viewer) -> None:
     viewer.run(f"reading the photograph {camera.name}", work, done, failed)
 
 
-def _folder(viewer: Viewer) -> str:
+def photograph_folder(viewer: Viewer) -> str:
+    """Return the folder of the photographs of this scene that was chosen, "" for none."""
     path = viewer.state.path
     return "" if path is None else viewer.state.preferences.photographs.get(str(path.absolute()), "")
-
-
-def ask_for_photographs(viewer: Viewer) -> None:
-    """Open the browser to choose the folder that has the photographs of the scene."""
-    state = viewer.state
-    if state.path is not None:
-        browse(viewer, Path(_folder(viewer) or state.path.parent).absolute())
-        state.picks_folder = "photographs"
-
-
-def choose_photograph_folder(viewer: Viewer, folder: Path) -> None:
-    """Set the folder of this scene's photographs, and remember it."""
-    state = viewer.state
-    state.browser = None
-    if state.path is not None:
-        state.preferences = with_photographs(state.preferences, state.path.absolute(), folder.absolute())
-
-
-# The library: all scenes of a folder, searched by their index.
-
-MOST_HITS = 200  # scenes that the panel lists
-
-
-def ask_for_folder(viewer: Viewer, purpose: Literal["library", "dataset"]) -> None:
-    """Open the browser to choose a folder of scenes, or one to train on."""
-    ask_for_file(viewer)
-    viewer.state.picks_folder = purpose
-
-
-def choose_folder(viewer: Viewer, folder: Path) -> None:
-    """Take the folder that the browser was opened for."""
-    state = viewer.state
-    if state.picks_folder == "library":
-        open_library(viewer, folder)
-    elif state.picks_folder == "dataset":
-        state.browser, state.training_form = None, replace(state.training_form, dataset=str(folder))
-    else:
-        choose_photograph_folder(viewer, folder)
-
-
-def open_library(viewer: Viewer, folder: Path) -> None:
-    """Read the index of a folder, and the scenes that are new there, in the background."""
-    viewer.state.browser, load = None, lru_cache(maxsize=1)(viewer.services.load_encoder)
-
-    def done(library: Library) -> None:
-        hits = [Hit(folder / scene.path, "not here", 0.0, None) for scene in library.scenes]
-        _show_hits(viewer, LibraryView(library, load, said=f"{len(hits)} scenes"), hits)
-        for scene in library.unread:
-            viewer.say_error(f"{scene.path}: {scene.unread}")
-        open_panel(viewer, "Library")
-
-    def work(progress: Progress) -> Library:
-        return update_library(folder, load_encoder=load, progress=progress)
-
-    viewer.run(f"reading the scenes of {folder.name}", work, done)
-
-
-def ask_library(viewer: Viewer, phrase: str) -> None:
-    """Rank the scenes of the library by how certain it is that they have what a phrase names."""
-    view = viewer.state.library
-    if view is None or not phrase.strip():
-        return
-    library, phrase = view.library, phrase.strip()
-
-    def done(answers: list[Answered]) -> None:
-        hits = sorted((hit for each in answers for hit in each.hits), key=lambda hit: -hit.margin)
-        found = sum(hit.verdict == "found" for hit in hits)
-        problems = [each.problem for each in answers if each.problem]
-        said = "; ".join([f"'{phrase}': found in {found} of {len(hits)} scenes", *problems])
-        _show_hits(viewer, replace(view, phrase=phrase, said=said), hits)
-
-    def work(progress: Progress) -> list[Answered]:
-        return find(library, phrase, view.load_encoder, 0, progress)
-
-    viewer.run(f"searching '{phrase}' in {len(library.scenes)} scenes", work, done)
-
-
-def _show_hits(viewer: Viewer, view: LibraryView, hits: Sequence[Hit]) -> None:
-    listed, pictures = tuple(hits[:MOST_HITS]), view.library.thumbnails or {}
-    names = [hit.path.relative_to(view.library.folder).as_posix() for hit in listed]
-    image = np.concatenate([pictures[name] for name in names]) if names else None
-    viewer.state.library = replace(view, hits=listed, thumbnails=image)
-
-
-def type_library(viewer: Viewer, text: str) -> None:
-    """Take the text of the library's box."""
-    viewer.state.library_typed = text
-
-
-def open_hit(viewer: Viewer, hit: Hit) -> None:
-    """Open a scene of the library, and search it for what was looked for in all of them."""
-    view = viewer.state.library
-    phrase = "" if view is None else view.phrase
-    open_scene(viewer, hit.path, lambda viewer: ask(viewer, phrase))
-
-
-# The file browser, typed paths, files dropped onto the window, and recent scenes.
-
-COMPANIONS = (cameras.SUFFIX, language.SUFFIX)  # files beside a scene, read with it
-NAMED = 3  # files that a message names
-
-
-def ask_for_file(viewer: Viewer) -> None:
-    """Open the browser in the folder of the scene that is shown."""
-    state = viewer.state
-    browse(viewer, (Path.cwd() if state.path is None else state.path.parent).absolute())
-    state.picks_folder, state.picks_beside = "", False
-
-
-def ask_for_beside(viewer: Viewer) -> None:
-    """Open the browser to choose a scene to show beside this one."""
-    ask_for_file(viewer)
-    viewer.state.picks_beside = True
 
 
 def open_beside(viewer: Viewer, path: Path) -> None:
@@ -465,126 +323,79 @@ def open_beside(viewer: Viewer, path: Path) -> None:
     open_scene(beside, path)
 
 
-def close_browser(viewer: Viewer) -> None:
-    """Close the browser without choosing a file."""
-    viewer.state.browser = None
+# A second scene, or the same by another encoder or method, right of a line across the image: a viewer of its
+# own without a window, which looks and asks as the first one does.
+
+ALIKE = 0.5, 1.5  # of two scenes in the same coordinates: distance of their middles in radii, ratio of radii
 
 
-def browse(viewer: Viewer, folder: Path) -> None:
-    """Show another folder in the browser."""
-    viewer.state.path_typed, viewer.state.browser = "", list_folder(folder)
-
-
-def choose(viewer: Viewer, entry: Entry) -> None:
-    """Go into a folder, or open a scene."""
-    if entry.is_file:
-        close_browser(viewer)
-        (open_beside if viewer.state.picks_beside else open_file)(viewer, entry.path)
-    else:
-        browse(viewer, entry.path)
-
-
-def open_file(viewer: Viewer, path: Path) -> None:
-    """Open a scene or a project, ask a set of queries, or take a camera path."""
-    if path.name.endswith(PROJECTS):
-        open_project(viewer, path)
-    elif path.name.endswith(QUERIES):
-        load_queries(viewer, path)
-    elif path.name.endswith(PATHS):
-        load_path(viewer, path)
-    else:
-        open_scene(viewer, path)
-
-
-def open_project(viewer: Viewer, path: Path, then: Callable[[Viewer], None] = lambda viewer: None) -> None:
-    """Open the scene of a project, and have in it what the project holds; `then` runs once it is there."""
-    try:
-        project = read_project(path)
-        scene = scene_of(project)
-    except InputError as error:
-        viewer.say_error(one_line(error))
+def follow_beside(viewer: Viewer) -> None:
+    """Give the second scene the first one's view and queries, once per frame, or close it."""
+    state, beside = viewer.state, viewer.beside
+    is_wanted = state.settings.split.mode == "scenes"
+    if beside is None:
+        if is_wanted:  # undone
+            state.settings = replace(state.settings, split=replace(state.settings.split, mode="off"))
         return
-
-    def restore(viewer: Viewer) -> None:
-        return_to(viewer, projects.restore(viewer, project, path.absolute()))
-        then(viewer)
-
-    open_scene(viewer, scene, restore)
-
-
-def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
-    """Open the first scene among files that were dropped onto the window, list the others, ask the queries
-    among them, and say what is none of these; what belongs to a scene lies beside it. A folder of photographs
-    is offered for training."""
-    if len(paths) == 1 and _is_plain_folder(paths[0]) and count_photographs(paths[0])[0]:
-        choose_photographs(viewer, paths[0])
-        open_panel(viewer, "Train")
+    if not is_wanted:
+        beside.worker.close()
+        viewer.beside = None
         return
-    sets = [path for path in paths if path.name.endswith((QUERIES, PATHS, PROJECTS))]
-    files = [path for path in paths if path not in sets]
-    scenes = [path for path in files if not path.name.endswith(COMPANIONS)] or files
-    if not scenes:
-        _ask_sets(viewer, sets)
+    beside.take_results()
+    viewpoint.tick(beside, viewer.clock)
+    for message in beside.state.messages:
+        state.say(f"beside: {message.text}", message.is_error)
+    beside.state.messages = []
+    if beside.state.scene is not None and state.view is not None and state.extent is not None:
+        _look(viewer, beside)
+        _ask(viewer, beside)
+
+
+def _look(viewer: Viewer, beside: Viewer) -> None:
+    state, other, (view, canonical) = viewer.state, beside.state, beside.linked
+    assert state.extent is not None
+    assert other.extent is not None
+    if state.view is not None and view is not state.view:
+        other.view, beside.linked = linked(state.view, state.extent, other.extent), (state.view, canonical)
+    other.picture = state.picture if other.has_field else replace(state.picture, display="rgb")
+    other.latent_level, other.size = state.latent_level, state.size
+    other.settings = replace(state.settings, split=Split())
+
+
+def linked(view: OrbitCamera, here: Extent, there: Extent) -> OrbitCamera:
+    """The same view of another scene: itself where both have the same coordinates, as far as their extents
+    tell, else from the same side and as far away in radii."""
+    ratio = there.radius / here.radius
+    if (
+        np.linalg.norm(here.centre - there.centre) < ALIKE[0] * here.radius
+        and 1 / ALIKE[1] < ratio < ALIKE[1]
+    ):
+        return view
+    target = there.centre + ratio * (view.target - here.centre)
+    return replace(view, target=target, distance=ratio * view.distance)
+
+
+def _ask(viewer: Viewer, beside: Viewer) -> None:
+    """Ask what the first is asked; each answer has the colour of the first one's."""
+    state, other = viewer.state, beside.state
+    if not other.has_field:
         return
-    known = [path for path in scenes if format_of(path)] or scenes[:1]
-    others = [path.name for path in scenes if path not in known]
-    if others:
-        more = f" and {len(others) - NAMED} more" if len(others) > NAMED else ""
-        viewer.say_error(f"not opened: {', '.join(others[:NAMED])}{more}")
-    add_scenes(viewer, known)
-    if len(known) > 1:
-        viewer.state.say(f"{len(known)} scenes: the panel Scene lists them")
-        open_panel(viewer, "Scene")
-    first = known[0]
-    open_scene(viewer, first, lambda viewer: _ask_sets(viewer, sets))
+    if other.level != state.level:
+        set_level(beside, state.level)
+    if beside.linked[1] != state.canonical:
+        beside.linked = beside.linked[0], state.canonical
+        set_canonical(beside, ", ".join(state.canonical))
+    answered = {query.phrase: query for query in other.queries}
+    wanted = {query.phrase: query for query in state.queries}
+    for phrase, query in wanted.items():
+        if phrase not in answered and not query.pending and not query.problem:
+            ask_one(beside, phrase, cut=query.cut)
+        elif phrase in answered:
+            _show_alike(query, answered[phrase])
+    if any(phrase not in wanted for phrase in answered):
+        other.queries = [query for query in other.queries if query.phrase in wanted]
 
 
-def choose_photographs(viewer: Viewer, folder: Path) -> None:
-    """Take a folder of photographs, and a name beside it for the scene."""
-    form = viewer.state.training_form
-    out = form.out or str(folder.with_name(f"{folder.name or 'scene'}.ply"))
-    viewer.state.training_form = replace(form, dataset=str(folder), out=out)
-
-
-def open_all(viewer: Viewer) -> None:
-    """List the scenes of the folder that the browser shows, and open the first."""
-    listing = viewer.state.browser
-    if listing is not None:
-        paths = [entry.path for entry in listing.entries if entry.is_file and format_of(entry.path)]
-        if paths:
-            add_scenes(viewer, paths)
-            close_browser(viewer)
-            open_scene(viewer, paths[0])
-        open_panel(viewer, "Scene")
-
-
-def _ask_sets(viewer: Viewer, sets: Sequence[Path]) -> None:
-    for path in sets:
-        open_file(viewer, path)
-
-
-def open_recent(viewer: Viewer, path: str) -> None:
-    """Open a scene or a project again that was open before."""
-    close_browser(viewer)
-    open_file(viewer, Path(path))
-
-
-def type_path(viewer: Viewer, text: str) -> None:
-    """Take the text of the box for a path."""
-    viewer.state.path_typed = text
-
-
-def open_typed(viewer: Viewer) -> None:
-    """Go to the folder, or open the scene, that the box names: from the folder shown where it is relative."""
-    text, listing = viewer.state.path_typed.strip(), viewer.state.browser
-    if not text:
-        return
-    path = (listing.folder if listing else Path.cwd()) / os.path.expanduser(text)
-    choose(viewer, Entry(path, is_file=not _is_plain_folder(path)))
-
-
-def _is_plain_folder(path: Path) -> bool:
-    try:
-        return path.is_dir() and format_of(path) is None
-    except OSError:  # a name that no file system takes: opening it says so
-        return False
+def _show_alike(query: Query, other: Query) -> None:
+    here = other.result is not None and other.result.verdict != "not here"
+    other.slot, other.shown_since = (query.slot if here else None), query.shown_since

@@ -3,7 +3,6 @@ with a thing, a row of it or what is clicked in the scene."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -15,28 +14,25 @@ from langsplat_core.query.instances import axis_aligned_box
 from langsplat_core.query.selection import at_point
 from langsplat_core.scene import LEVELS, NO_NODE
 from langsplat_core.scene.language import TaughtWord, tidy
-from langsplat_core.semantics.encoders import DEMO
-from langsplat_viewer.actions.history import remember
 from langsplat_viewer.actions.queries import taught, teach
 from langsplat_viewer.actions.selecting import mark, select_alike, take
 from langsplat_viewer.actions.viewpoint import focus_on
 from langsplat_viewer.files.projects import Group, Things, known_things
 from langsplat_viewer.state import OutlineView
-from langsplat_viewer.viewer import Viewer
+from langsplat_viewer.viewer import Viewer, remember
 
 Target = int | Array  # a node of the tree, or a (3,) point on the surface, world units
 
 
 def wanted(viewer: Viewer) -> OutlineView | None:
     """The outline of the scene, as far as it is known; the worker finds it once it has nothing else to do."""
-    state, engine = viewer.state, viewer.engine
-    if engine is None or state.scene is None or state.scene.language is None:
+    state = viewer.state
+    if viewer.engine is None or not state.has_field:
         return None
-    view = state.outline
-    if view is None and viewer.worker.current is None:
-        encoder = viewer.services.encoder_id or state.scene.language.encoder_id
-        if encoder != DEMO and not Path(encoder).expanduser().is_dir() and not state.queries:
-            return OutlineView(problem=f"names come from the encoder '{encoder}': search for something first")
+    if state.outline is None and viewer.worker.current is None:
+        if not viewer.has_encoder_here and not state.queries:
+            reason = f"names come from the encoder '{viewer.encoder_id}': search for something first"
+            return OutlineView(problem=reason)
         state.outline = OutlineView(problem="looking for what is here ...")
         _find(viewer)
     return state.outline
@@ -180,7 +176,6 @@ def visit(viewer: Viewer, target: Target) -> None:
 
 
 def find_alike(viewer: Viewer, target: Target) -> None:
-    """Select everything that is like a thing."""
 
     def act(members: Array) -> None:
         take(viewer, members, "replace")
@@ -201,7 +196,6 @@ def hide(viewer: Viewer, target: Target) -> None:
 
 
 def show(viewer: Viewer, target: Target) -> None:
-    """Show a thing that is hidden."""
 
     def act(members: Array) -> None:
         marks = viewer.state.selection.marks
@@ -224,11 +218,6 @@ def give_name(viewer: Viewer, target: Target, name: str) -> None:
             viewer.state.things = replace(things, names={**things.names, target: name})
 
     with_thing(viewer, target, lambda members: teach(viewer, name, members, done))
-
-
-def write_filter(viewer: Viewer, text: str) -> None:
-    """Take the text of the box over the outline."""
-    viewer.state.outline_typed = text
 
 
 # Locks and groups.
@@ -289,7 +278,6 @@ def _without(group: Group, node: int) -> Group | None:
 
 
 def ungroup(viewer: Viewer, node: int) -> None:
-    """Take a thing out of its group."""
     things = viewer.state.things
     remember(viewer)
     left = (_without(g, node) for g in things.groups)
@@ -297,7 +285,6 @@ def ungroup(viewer: Viewer, node: int) -> None:
 
 
 def rename_group(viewer: Viewer, old: Group, name: str) -> None:
-    """Give a group another name."""
     things, name = viewer.state.things, tidy(name)
     if name in {g.name for g in things.groups if g is not old}:
         viewer.say_error(f"there is a group '{name}' already")
@@ -308,7 +295,6 @@ def rename_group(viewer: Viewer, old: Group, name: str) -> None:
 
 
 def select_group(viewer: Viewer, group: Group) -> None:
-    """Select all of a group."""
     engine = viewer.engine
     if engine is None:
         return

@@ -8,21 +8,20 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import LangSplatError
-from langsplat_viewer.actions.history import now, remember
+from langsplat_viewer.actions.editing import place
 from langsplat_viewer.actions.outline import have_things
 from langsplat_viewer.actions.queries import listed_queries
 from langsplat_viewer.actions.selecting import discard_and_leave
 from langsplat_viewer.actions.selecting import end as end_editing
-from langsplat_viewer.actions.settings import have_panels, open_panel
-from langsplat_viewer.actions.transforming import place
+from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.actions.viewpoint import bookmarked_view
 from langsplat_viewer.camera.flight import pose_of
-from langsplat_viewer.files import PROJECTS
-from langsplat_viewer.files.flights import Bookmark
 from langsplat_viewer.files.preferences import with_recent
 from langsplat_viewer.files.projects import (
     LONGEST_NOTE,
     MOST_NOTES,
+    PROJECTS,
+    Bookmark,
     Note,
     Project,
     Things,
@@ -30,23 +29,18 @@ from langsplat_viewer.files.projects import (
 )
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.marks import Pair, unpack
-from langsplat_viewer.output.saving import free_name
+from langsplat_viewer.output import free_name
 from langsplat_viewer.state import SLOTS, Query, Ruler, ViewerState
-from langsplat_viewer.viewer import Viewer, Visit, visit_of
+from langsplat_viewer.viewer import Viewer, Visit, now, remember, visit_of
 
 # Notes.
 
 
-def pin_notes(viewer: Viewer, on: bool) -> None:
-    """Set whether a click on the scene pins a note there."""
-    viewer.state.pins_notes, viewer.state.ruler = on, Ruler()
-    if on:
-        open_panel(viewer, "Notes")
-
-
 def toggle_pinning(viewer: Viewer) -> None:
-    """Begin to pin notes, or end it."""
-    pin_notes(viewer, not viewer.state.pins_notes)
+    """Have a click on the scene pin a note there, or no longer."""
+    viewer.state.pins_notes, viewer.state.ruler = not viewer.state.pins_notes, Ruler()
+    if viewer.state.pins_notes:
+        open_panel(viewer, "Notes")
 
 
 def pin_at(viewer: Viewer, u: float, v: float) -> None:
@@ -60,7 +54,6 @@ def pin_at(viewer: Viewer, u: float, v: float) -> None:
 
 
 def pin_to_selection(viewer: Viewer) -> None:
-    """Pin a note to the middle of what is selected."""
     state, chosen = viewer.state, viewer.state.selection.marks.selected
     if state.scene is None or not chosen.any():
         viewer.say_error("select something first, then pin a note to it")
@@ -90,14 +83,12 @@ def take_fresh_note(viewer: Viewer, note: Note) -> bool:
 
 
 def write_note(viewer: Viewer, note: Note, text: str) -> None:
-    """Change the text of a note."""
     remember(viewer, f"note at {note.at}")
     changed = replace(note, text=text[:LONGEST_NOTE])
     viewer.state.notes = tuple(changed if other is note else other for other in viewer.state.notes)
 
 
 def remove_note(viewer: Viewer, note: Note) -> None:
-    """Take a note off."""
     remember(viewer)
     viewer.state.notes = tuple(other for other in viewer.state.notes if other is not note)
 
@@ -105,13 +96,13 @@ def remove_note(viewer: Viewer, note: Note) -> None:
 # Projects.
 
 
-def save_project(viewer: Viewer, folder: Path) -> Path | None:
+def save_project(viewer: Viewer, folder: Path = Path()) -> Path | None:
     """Save the project to the file that it came from, or to a new one in `folder`; None where that failed."""
     state = viewer.state
     if state.scene is None or state.path is None or state.view is None:
         viewer.say_error("open a scene first, then save the project")
         return None
-    path = state.project or free_name(folder.absolute(), state.path.stem, PROJECTS)
+    path = state.project or free_name(folder, state.path.stem, PROJECTS)
     moment = now(viewer)
     project = Project(
         scene=state.path.absolute(),
@@ -130,26 +121,23 @@ def save_project(viewer: Viewer, folder: Path) -> Path | None:
         panels=state.preferences.panels or (),
         things=state.things,
     )
-    try:
-        write_project(path, project, [_answer(state, query) for query in state.queries])
-    except OSError as error:
-        viewer.say_error(f"{path}: not saved ({one_line(error)})")
+    answers = [_answer(state, query) for query in state.queries]
+    if viewer.save(path, lambda: write_project(path, project, answers)) is None:
         return None
     state.project, state.preferences = path, with_recent(state.preferences, path)
     state.kept = state.things, state.notes
     marks, moves = state.selection.marks, state.selection.moves
     state.selection = replace(state.selection, saved=marks.deleted, saved_moves=moves)
-    state.say(f"saved {path}")
     return path
 
 
-def save_and_leave(viewer: Viewer, folder: Path) -> None:
+def save_and_leave(viewer: Viewer, folder: Path = Path()) -> None:
     """Save the project and go on; where it cannot be saved one stays."""
     if save_project(viewer, folder) is not None:
         discard_and_leave(viewer)
 
 
-def end(viewer: Viewer, folder: Path) -> None:
+def end(viewer: Viewer, folder: Path = Path()) -> None:
     """Close without a question: what would be lost is first written to new files in `folder`."""
     if viewer.state.has_unsaved_notes:
         save_project(viewer, folder)
@@ -206,7 +194,7 @@ def restore(viewer: Viewer, project: Project, path: Path) -> Visit:
     state.bookmarks = project.bookmarks or state.bookmarks
     if project.panels:
         state.preferences = replace(state.preferences, panels=project.panels)
-        have_panels(viewer, project.panels)
+        viewer.state.shows_panels = project.panels
     return _visit(viewer, project)
 
 

@@ -20,15 +20,13 @@ from langsplat_core.query.instances import Instance
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import TaughtWord
 from langsplat_core.scene.language import phrase_key, split_phrases
-from langsplat_core.semantics.encoders import DEMO
-from langsplat_viewer.actions.history import let_go, remember
 from langsplat_viewer.actions.selecting import has_selection
-from langsplat_viewer.actions.settings import mute_letters, open_panel
-from langsplat_viewer.files.browsing import SUFFIX, QuerySet, SavedQuery, read_queries, write_queries
+from langsplat_viewer.actions.settings import open_panel
+from langsplat_viewer.files.projects import QUERIES, QuerySet, SavedQuery, read_queries, write_queries
 from langsplat_viewer.jobs import one_line
-from langsplat_viewer.output.saving import free_name
+from langsplat_viewer.output import free_name
 from langsplat_viewer.state import SLOTS, EvidenceSheet, Query, ViewerState
-from langsplat_viewer.viewer import Viewer
+from langsplat_viewer.viewer import Viewer, let_go, remember
 
 MOST_THINGS = 20  # of one answer that are told apart
 
@@ -84,11 +82,6 @@ def ask_unanswered(viewer: Viewer) -> None:
             _answer(viewer, query)
 
 
-def type_phrase(viewer: Viewer, text: str) -> None:
-    """Take the text of the search box."""
-    viewer.state.typed = text
-
-
 def ask_typed(viewer: Viewer) -> None:
     """Search for what stands in the box and empty it; the box keeps the keyboard for the next phrase."""
     viewer.state.focus_input = viewer.state.awaits_keyboard = True
@@ -99,7 +92,6 @@ def ask_typed(viewer: Viewer) -> None:
 
 
 def type_name(viewer: Viewer, name: str) -> None:
-    """Take the text of the box for a name of what is selected."""
     viewer.state.selection = replace(viewer.state.selection, name=name)
 
 
@@ -138,7 +130,7 @@ def focus_search(viewer: Viewer) -> None:
     scene = viewer.state.scene
     if scene is None or scene.language is None:
         viewer.say_error("open a scene first, then search it" if scene is None else no_field(scene))
-        mute_letters(viewer, True)
+        viewer.state.letters_muted = True
     else:
         viewer.state.focus_input = viewer.state.awaits_keyboard = True
 
@@ -251,7 +243,6 @@ def hide(viewer: Viewer, query: Query) -> None:
 
 
 def remove(viewer: Viewer, query: Query) -> None:
-    """Take a query off the list."""
     state = viewer.state
     if query in state.queries:
         remember(viewer)
@@ -306,11 +297,6 @@ def explain(viewer: Viewer, query: Query) -> None:
     viewer.run(f"looking for the evidence of '{query.phrase}'", work, done)
 
 
-def close_evidence(viewer: Viewer) -> None:
-    """Close the window with the evidence."""
-    viewer.state.evidence = None
-
-
 # How queries are asked and where they end: own cuts, canonical phrases, whole sets of queries.
 
 
@@ -327,16 +313,11 @@ def set_cut(viewer: Viewer, query: Query, cut: float | None, *, is_new: bool = T
     query.result = query.automatic if cut is None else recut(query.automatic, cut)
 
 
-def type_canonical(viewer: Viewer, text: str) -> None:
-    """Take the text of the box of canonical phrases."""
-    viewer.state.canonical_typed = text
-
-
 def set_canonical(viewer: Viewer, text: str) -> None:
     """Compare everything with other canonical phrases, between commas; "" for the scene's own again."""
     phrases = tuple(split_phrases(text))
     engine, state = viewer.engine, viewer.state
-    if engine is None or state.scene is None or state.scene.language is None:
+    if engine is None or not state.has_field:
         viewer.say_error("open a scene with a language field first")
         return
 
@@ -358,20 +339,15 @@ def listed_queries(state: ViewerState) -> QuerySet:
     return QuerySet(saved, state.level, state.canonical)
 
 
-def save_queries(viewer: Viewer, folder: Path) -> Path | None:
+def save_queries(viewer: Viewer, folder: Path = Path()) -> Path | None:
     """Save the list to a new file in `folder`; returns its path, None if there is none or that failed."""
     state = viewer.state
     if not state.queries:
         viewer.say_error("search for something first, then save the queries")
         return None
-    path = free_name(folder, state.path.stem if state.path else "scene", SUFFIX)
-    try:
-        write_queries(path, listed_queries(state))
-    except OSError as error:
-        viewer.say_error(f"{path}: not saved ({one_line(error)})")
-        return None
-    state.say(f"saved {path}; open it, or drop it onto the window, to ask them again")
-    return path
+    path = free_name(folder, state.path.stem if state.path else "scene", QUERIES)
+    more = "; open it, or drop it onto the window, to ask them again"
+    return viewer.save(path, lambda: write_queries(path, listed_queries(state)), more)
 
 
 def load_queries(viewer: Viewer, path: Path) -> None:
@@ -382,7 +358,7 @@ def load_queries(viewer: Viewer, path: Path) -> None:
     except InputError as error:
         viewer.say_error(one_line(error))
         return
-    if state.scene is None or state.scene.language is None:
+    if not state.has_field:
         viewer.say_error(f"{path.name}: open a scene that can be searched first")
         return
     if wanted.canonical != state.canonical:
@@ -401,12 +377,10 @@ def prepare_suggestions(viewer: Viewer) -> None:
     if state.scene is state.suggestions_of or viewer.worker.current is not None:
         return
     state.suggestions, state.suggestions_of = Suggestions(), state.scene
-    if engine is None or state.scene is None or state.scene.language is None:
-        return
     scene = state.scene
-    encoder_id = viewer.services.encoder_id or state.scene.language.encoder_id
-    local = encoder_id == DEMO or Path(encoder_id).expanduser().is_dir()
-    asked = engine if local else QueryEngine(scene)  # a hub id may mean a download: the phrasebook alone
+    if engine is None or scene is None or not state.has_field:
+        return
+    asked = engine if viewer.has_encoder_here else QueryEngine(scene)  # the phrasebook alone
 
     def work(progress: Progress) -> Suggestions:
         return suggest(asked, progress=progress)

@@ -22,12 +22,11 @@ from langsplat_core.query.instances import Instance
 from langsplat_core.query.selection import at_point, grow, of_rows, shrink
 from langsplat_core.scene import LEVELS, Scene
 from langsplat_viewer import marks
-from langsplat_viewer.actions.history import remember
 from langsplat_viewer.marks import Drawn, Leaving, Marks, Measure, Mode, Stroke, Tool
-from langsplat_viewer.output.saving import free_name
-from langsplat_viewer.rendering.depth import UNCLIPPED
+from langsplat_viewer.output import free_name
+from langsplat_viewer.rendering.request import UNCLIPPED
 from langsplat_viewer.state import Query
-from langsplat_viewer.viewer import Viewer
+from langsplat_viewer.viewer import Viewer, remember
 
 NOTHING = "nothing is selected: choose a tool, or an answer of the search"
 
@@ -64,13 +63,11 @@ def has_selection(viewer: Viewer) -> bool:
 
 
 def select_all(viewer: Viewer) -> None:
-    """Select everything that is shown."""
     if has_scene(viewer):
         take(viewer, viewer.state.selection.marks.shown, "replace")
 
 
 def select_none(viewer: Viewer) -> None:
-    """Clear the selection."""
     if has_scene(viewer):
         take(viewer, np.zeros_like(viewer.state.selection.marks.selected), "replace")
 
@@ -95,7 +92,6 @@ def isolate_selected(viewer: Viewer) -> None:
 
 
 def show_hidden(viewer: Viewer) -> None:
-    """Show everything that was hidden."""
     if has_scene(viewer):
         marks = viewer.state.selection.marks
         mark(viewer, replace(marks, hidden=np.zeros_like(marks.hidden)))
@@ -167,7 +163,6 @@ def select_query(viewer: Viewer, query: Query | None = None, mode: Mode | None =
 
 
 def select_thing(viewer: Viewer, thing: Instance, mode: Mode | None = None) -> None:
-    """Select one of the things that an answer found."""
     if has_scene(viewer):
         take(viewer, of_rows(thing.members, len(viewer.state.selection.marks.selected)), mode)
 
@@ -183,7 +178,6 @@ def set_mode(viewer: Viewer, mode: Mode) -> None:
 
 
 def set_brush(viewer: Viewer, radius: float) -> None:
-    """Set the brush's radius, of the image's height."""
     low, high = marks.BRUSHES
     viewer.state.selection = replace(viewer.state.selection, brush=min(max(radius, low), high))
 
@@ -270,17 +264,6 @@ class Written:
     count: int  # Gaussians, or points
 
 
-def rows_of(marks: Marks, part: Part) -> Array:
-    """(N,) bool: what is selected, all else that was not deleted, or all that was not deleted."""
-    match part:
-        case "selection":
-            return marks.selected
-        case "rest":
-            return marks.kept & ~marks.selected
-        case _:
-            return marks.kept
-
-
 def export(
     viewer: Viewer,
     folder: Path,
@@ -298,7 +281,8 @@ def export(
     field = scene.language
     if field is not None and engine is not None:
         field = replace(field, taught=tuple(engine.taught.values()))
-    rows = np.flatnonzero(rows_of(marks, part))
+    parts = {"selection": marks.selected, "rest": marks.kept & ~marks.selected, "edited": marks.kept}
+    rows = np.flatnonzero(parts[part])
     if len(rows) == 0:
         viewer.say_error(f"the {part} holds no Gaussians: nothing to write")
         return
@@ -356,11 +340,10 @@ def may_close(viewer: Viewer) -> bool:
 
 
 def quit_viewer(viewer: Viewer) -> None:
-    """Have the window close at the next frame."""
     leave(viewer, _close, "the window closes", viewer.state.has_unsaved_notes)
 
 
-def end(viewer: Viewer, folder: Path) -> None:
+def end(viewer: Viewer, folder: Path = Path()) -> None:
     """Close without a question: what is not saved is first written to a new file in `folder`."""
     if viewer.state.selection.is_unsaved:
         export(viewer, folder, "edited", then=end_at_once)
@@ -387,7 +370,7 @@ def _answered(viewer: Viewer) -> Callable[[Viewer], None] | None:
     return None if leaving is None else leaving.then
 
 
-def save_and_leave(viewer: Viewer, folder: Path) -> None:
+def save_and_leave(viewer: Viewer, folder: Path = Path()) -> None:
     """Write the scene without what was deleted to a new file in `folder`, and go on once it is there."""
     then = _answered(viewer)
     if then is not None:

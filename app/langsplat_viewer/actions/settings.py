@@ -5,15 +5,13 @@ from dataclasses import fields, replace
 from langsplat_core.config import ColourMap, Display, PictureConfig
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.query.engine import no_field
-from langsplat_viewer.actions.history import remember
 from langsplat_viewer.actions.selecting import leave_tool, stay
 from langsplat_viewer.actions.viewpoint import glide_to
 from langsplat_viewer.camera.overlays import facing
 from langsplat_viewer.files.preferences import SCALES, Theme
-from langsplat_viewer.rendering.depth import Clip
-from langsplat_viewer.rendering.request import AT_RANGE, MOST_DEGREE, SIZE_RANGE, Splats, Split
-from langsplat_viewer.state import OVERLAYS, Overlay, Ruler, ViewSettings
-from langsplat_viewer.viewer import Viewer
+from langsplat_viewer.rendering.request import AT_RANGE, MOST_DEGREE, SIZE_RANGE, Clip, Splats, Split
+from langsplat_viewer.state import OVERLAYS, Overlay, Recording, Ruler, Timing, ViewerState, ViewSettings
+from langsplat_viewer.viewer import Viewer, remember
 
 
 def compare_with(viewer: Viewer, display: Display, latent_level: int | None = None) -> None:
@@ -25,7 +23,6 @@ def compare_with(viewer: Viewer, display: Display, latent_level: int | None = No
 
 
 def toggle_wipe(viewer: Viewer) -> None:
-    """Show the second display that was chosen last, or one image again."""
     split = viewer.state.settings.split
     if split.mode == "wipe":
         show_one(viewer)
@@ -34,7 +31,6 @@ def toggle_wipe(viewer: Viewer) -> None:
 
 
 def toggle_levels(viewer: Viewer) -> None:
-    """Show the three semantic levels side by side, or one image again."""
     split = viewer.state.settings.split
     if split.mode == "levels":
         show_one(viewer)
@@ -43,12 +39,10 @@ def toggle_levels(viewer: Viewer) -> None:
 
 
 def show_scenes(viewer: Viewer) -> None:
-    """Show the second scene right of the line."""
     _set_split(viewer, replace(viewer.state.settings.split, mode="scenes"))
 
 
 def show_one(viewer: Viewer) -> None:
-    """Have one image fill the scene's area."""
     _set_split(viewer, replace(viewer.state.settings.split, mode="off"))
 
 
@@ -98,7 +92,6 @@ def show_overlay(viewer: Viewer, overlay: Overlay, shown: bool) -> None:
 
 
 def toggle_overlay(viewer: Viewer, overlay: Overlay) -> None:
-    """Show an overlay, or take it away."""
     show_overlay(viewer, overlay, overlay not in viewer.state.preferences.overlays)
 
 
@@ -116,7 +109,6 @@ def measure(viewer: Viewer, on: bool) -> None:
 
 
 def toggle_measuring(viewer: Viewer) -> None:
-    """Begin to measure, or end it."""
     measure(viewer, not viewer.state.ruler.measures)
 
 
@@ -153,6 +145,14 @@ def _set(viewer: Viewer, settings: ViewSettings, setting: str = "") -> None:
 # What is shown and how; which parts of the window are.
 
 
+def put(part: ViewerState | Recording | Timing, **values: object) -> None:
+    """Take what was typed or switched, where nothing follows from it: fields of the state or a part of it,
+    by name. Panels write nothing themselves."""
+    for name, value in values.items():
+        getattr(part, name)  # AttributeError where it has none
+        setattr(part, name, value)
+
+
 def set_display(viewer: Viewer, display: Display, latent_level: int | None = None) -> None:
     """Choose what is shown; `latent_level` is an index into `scene.LEVELS`."""
     state = viewer.state
@@ -173,13 +173,7 @@ def set_picture(viewer: Viewer, picture: PictureConfig) -> None:
         viewer.state.picture = picture
 
 
-def set_coarse_while_moving(viewer: Viewer, coarse: bool) -> None:
-    """Set whether a slow machine draws fewer pixels while the camera moves."""
-    viewer.state.coarse_while_moving = coarse
-
-
 def set_theme(viewer: Viewer, theme: Theme) -> None:
-    """Dark or light panels, from now on."""
     viewer.state.preferences = replace(viewer.state.preferences, theme=theme)
 
 
@@ -194,31 +188,17 @@ def resize(viewer: Viewer, width: int, height: int) -> None:
     viewer.state.size = (max(1, width), max(1, height))
 
 
-def show_panel(viewer: Viewer, shown: bool) -> None:
-    """Set whether the panels are there."""
-    viewer.state.show_panel = shown
-
-
 def toggle_panel(viewer: Viewer) -> None:
-    """Hide the panels, or show them again."""
-    show_panel(viewer, not viewer.state.show_panel)
+    viewer.state.show_panel = not viewer.state.show_panel
 
 
 def open_panel(viewer: Viewer, title: str) -> None:
     """Have a panel opened, in front of those it shares its place with."""
-    show_panel(viewer, True)
-    viewer.state.wanted_panel = title
+    viewer.state.show_panel, viewer.state.wanted_panel = True, title
 
 
 def reset_panels(viewer: Viewer) -> None:
-    """Have the panels where they were at first."""
-    show_panel(viewer, True)
-    viewer.state.resets_panels = True
-
-
-def have_panels(viewer: Viewer, titles: tuple[str, ...]) -> None:
-    """Have these panels open from the next frame on, and no others; none: those that are."""
-    viewer.state.shows_panels = titles
+    viewer.state.show_panel = viewer.state.resets_panels = True
 
 
 def take_panel_reset(viewer: Viewer) -> bool:
@@ -234,20 +214,13 @@ def take_wanted_panel(viewer: Viewer) -> str:
 
 
 def note_panels(viewer: Viewer, titles: tuple[str, ...]) -> None:
-    """Remember which panels are open."""
     state = viewer.state
     if titles != state.preferences.panels:
         state.preferences = replace(state.preferences, panels=titles)
 
 
-def show_help(viewer: Viewer, shown: bool) -> None:
-    """Show or hide the list of keys."""
-    viewer.state.show_help = shown
-
-
 def toggle_help(viewer: Viewer) -> None:
-    """Show the list of keys, or hide it again."""
-    show_help(viewer, not viewer.state.show_help)
+    viewer.state.show_help = not viewer.state.show_help
 
 
 def show_palette(viewer: Viewer, shown: bool) -> None:
@@ -257,30 +230,19 @@ def show_palette(viewer: Viewer, shown: bool) -> None:
 
 
 def toggle_palette(viewer: Viewer) -> None:
-    """Show the list of everything that can be done, or take it away."""
     show_palette(viewer, not viewer.state.show_palette)
-
-
-def type_command(viewer: Viewer, text: str) -> None:
-    """Set the text of the box of that list."""
-    viewer.state.palette_typed = text
-
-
-def mute_letters(viewer: Viewer, muted: bool) -> None:
-    """Set whether letters do nothing for now: they were meant for a box that cannot be typed in."""
-    viewer.state.letters_muted = muted
 
 
 def escape(viewer: Viewer) -> None:
     """Close what lies over the scene, and let letters be keys again; where nothing did, leave the tool."""
     state = viewer.state
     lay_over = state.show_help or state.show_palette or state.browser or state.selection.leaving
-    show_help(viewer, False)
+    state.show_help = False
     show_palette(viewer, False)
     measure(viewer, False)
     state.pins_notes = False
     state.browser = None
     stay(viewer)
-    mute_letters(viewer, False)
+    viewer.state.letters_muted = False
     if not lay_over:
         leave_tool(viewer)

@@ -26,15 +26,14 @@ from langsplat_viewer.camera.controls import (
     from_side,
     holding_distance,
     orbit,
-    spanning,
     with_projection,
     zoom,
 )
 from langsplat_viewer.camera.flight import pose_at, pose_of, view_of
-from langsplat_viewer.files.flights import MOST_VIEWS, Bookmark, named
+from langsplat_viewer.files.projects import MOST_VIEWS, Bookmark, named
 from langsplat_viewer.jobs import one_line
-from langsplat_viewer.rendering.depth import image_formation
 from langsplat_viewer.rendering.renderer import ArrayRenderer
+from langsplat_viewer.rendering.request import image_formation
 from langsplat_viewer.state import GLIDE_SECONDS, Glide, Hover, Query, compared, compared_size, flight_of
 from langsplat_viewer.viewer import Viewer
 
@@ -146,7 +145,6 @@ def open_at(viewer: Viewer, camera: Camera) -> None:
 
 
 def glide_to(viewer: Viewer, end: OrbitCamera) -> None:
-    """Move smoothly to a view."""
     if viewer.state.view is not None:
         leave_path(viewer)
         viewer.state.glide = Glide(viewer.state.view, end, viewer.clock)
@@ -158,11 +156,6 @@ def zoom_by(viewer: Viewer, factor: float) -> None:
     if extent is not None:
         nearest, farthest = NEAREST * extent.radius, extent.farthest
         move(viewer, lambda view: zoom(view, factor, nearest, farthest))
-
-
-def set_fly_speed(viewer: Viewer, speed: float) -> None:
-    """Set the speed of flying with keys, scene radii per second."""
-    viewer.state.fly_speed = speed
 
 
 def opening_view(viewer: Viewer) -> OrbitCamera | None:
@@ -182,15 +175,10 @@ def reset_view(viewer: Viewer) -> None:
     if view is None or extent is None:
         return
     if viewer.state.view is not None and viewer.state.view.orthographic:
-        view = with_projection(view, orthographic=True)
-        if _opens_framed(viewer):
+        view, scene = with_projection(view, orthographic=True), viewer.state.scene
+        if viewer.state.opening_camera is None and scene is not None and not scene.cameras:
             view = frame_all(view, extent, viewer.state.size)
     glide_to(viewer, view)
-
-
-def _opens_framed(viewer: Viewer) -> bool:
-    scene = viewer.state.scene
-    return viewer.state.opening_camera is None and scene is not None and not scene.cameras
 
 
 def frame_scene(viewer: Viewer) -> None:
@@ -221,25 +209,12 @@ def set_orthographic(viewer: Viewer, orthographic: bool) -> None:
 
 
 def toggle_orthographic(viewer: Viewer) -> None:
-    """Look without perspective, or with it again."""
     set_orthographic(viewer, viewer.state.view is not None and not viewer.state.view.orthographic)
 
 
-def open_orthographic(viewer: Viewer, span: float) -> None:
-    """Look without perspective, `span` world units across the shorter side of the uncropped image."""
-    extent = viewer.state.extent
-    if extent is not None:
-        move(viewer, lambda view: spanning(view, span))
-
-
-def set_walking(viewer: Viewer, walks: bool) -> None:
-    """Set whether the keys that fly ahead keep the height of the eye."""
-    viewer.state.walks = walks
-
-
 def toggle_walking(viewer: Viewer) -> None:
-    """Walk, or fly again."""
-    set_walking(viewer, not viewer.state.walks)
+    """Have the keys that fly ahead keep the height of the eye, or no longer."""
+    viewer.state.walks = not viewer.state.walks
     viewer.state.say("W A S D walk at one height" if viewer.state.walks else "W A S D fly")
 
 
@@ -393,11 +368,6 @@ def add_bookmark(viewer: Viewer, name: str = "") -> None:
     state.say(f"bookmark '{added.name}'")
 
 
-def type_bookmark(viewer: Viewer, text: str) -> None:
-    """Take the text of the box for a name."""
-    viewer.state.bookmark_typed = text
-
-
 def go_to_bookmark(viewer: Viewer, bookmark: Bookmark) -> None:
     """Stand where a bookmark was made, turning around the same point."""
     if viewer.state.extent is not None:
@@ -405,14 +375,12 @@ def go_to_bookmark(viewer: Viewer, bookmark: Bookmark) -> None:
 
 
 def bookmarked_view(bookmark: Bookmark, extent: Extent) -> OrbitCamera:
-    """Return the view that a bookmark keeps."""
     view = view_of(bookmark.pose, extent)
     target = view.eye + bookmark.distance * view.rotation[2]
     return replace(view, target=target, distance=bookmark.distance)
 
 
 def delete_bookmark(viewer: Viewer, bookmark: Bookmark) -> None:
-    """Take a bookmark off the list."""
     viewer.state.bookmarks = tuple(other for other in viewer.state.bookmarks if other is not bookmark)
     _keep(viewer)
 
@@ -439,11 +407,6 @@ def _keep(viewer: Viewer) -> None:
 # Timing and the comparison with the reference.
 
 
-def measure_frame(viewer: Viewer) -> None:
-    """Have the steps of this frame measured: the panel is seen."""
-    viewer.state.timing.wanted = True
-
-
 def compare_with_reference(viewer: Viewer) -> None:
     """Draw what is shown at a small size, have the reference rasterizer draw the same in the background, and
     tell the difference."""
@@ -464,8 +427,3 @@ def compare_with_reference(viewer: Viewer) -> None:
         state.timing.comparison = compared(shown, reference, backend)
 
     viewer.recorder.submit("comparing with the reference", work, done, viewer.say_error)
-
-
-def stop_comparing(viewer: Viewer) -> None:
-    """Cancel the comparison with the reference."""
-    viewer.recorder.cancel()

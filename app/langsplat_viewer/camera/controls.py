@@ -130,8 +130,7 @@ Side = Literal["front", "back", "left", "right", "top", "bottom"]
 
 
 def symmetric_intrinsics(fov_degrees: float = DEFAULT_FOV) -> Intrinsics:
-    """Return the intrinsics of a square image that shows `fov_degrees` across, its principal point in the
-    centre."""
+    """Intrinsics of a square image, `fov_degrees` across, its principal point in the centre."""
     focal = 0.5 / math.tan(math.radians(fov_degrees) / 2)
     return Intrinsics(1.0, 1.0, focal, focal, 0.5, 0.5)
 
@@ -284,7 +283,6 @@ def focus(view: OrbitCamera, point: Array, distance: float | None = None) -> Orb
 
 
 def level(view: OrbitCamera) -> OrbitCamera:
-    """The same view with a level horizon."""
     upright = look_at(view.eye, view.target, view.up, (1, 1))
     return replace(view, rotation=upright.rotation)
 
@@ -326,7 +324,6 @@ class Extent:
 
 
 def extent_of(scene: Scene) -> Extent:
-    """Return the extent of a scene."""
     centre, radius = scene.bounds()
     rotation = scene.framing_camera((1000, 1000), (centre, radius)).rotation
     sample = sample_of(scene.gaussians)
@@ -353,8 +350,7 @@ def with_projection(view: OrbitCamera, orthographic: bool) -> OrbitCamera:
 
 
 def spanning(view: OrbitCamera, span: float) -> OrbitCamera:
-    """The orthographic view from the same eye, `span` world units across the shorter side of the uncropped
-    image."""
+    """The orthographic view from the same eye, `span` world units across the uncropped image's short side."""
     distance = view.distance * span / view.span
     return with_projection(focus(view, view.eye + distance * view.rotation[2], distance), orthographic=True)
 
@@ -380,8 +376,7 @@ def holding_distance(view: OrbitCamera, box: Array) -> float:
 
 
 def default_view(scene: Scene, extent: Extent, size: tuple[int, int]) -> OrbitCamera:
-    """The first training camera where there is one, else a view of the whole scene in a window of `size`
-    pixels."""
+    """The first training camera, else a view of the whole scene in a window of `size` pixels."""
     if scene.cameras:
         return from_camera(scene.cameras[0], extent)
     anywhere = OrbitCamera(extent.rotation, extent.centre, extent.radius, extent.up, symmetric_intrinsics())

@@ -85,7 +85,6 @@ class Flight:
 
     @property
     def seconds(self) -> float:
-        """The time of the last keyframe."""
         return self.keyframes[-1].seconds
 
     @cached_property
@@ -142,7 +141,6 @@ def camera_of(pose: Pose, extent: Extent, size: tuple[int, int]) -> Camera:
 
 
 def pose_at(motion: Motion, seconds: float) -> Pose:
-    """Return the pose at one time."""
     return motion.poses(np.array([seconds]))[0]
 
 

@@ -1,45 +1,22 @@
-"""The layout of the window: menus, command palette, list of keys, docked panels, messages and timing."""
+"""The layout of the window: menus, toolbar, command palette, help, docked panels, messages and timing."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 
-from imgui_bundle import ImVec2, hello_imgui, imgui
+from imgui_bundle import ImVec2, ImVec4, hello_imgui, icons_fontawesome_6, imgui
 
 from langsplat_core import __version__
-from langsplat_viewer.actions import filming, opening, settings, viewpoint
+from langsplat_viewer.actions import browsing, filming, opening, settings, viewpoint
 from langsplat_viewer.commands import COMMANDS, HELD, LETTERS_MENU, MENUS, Command, in_menu, matching
-from langsplat_viewer.panels import (
-    library,
-    outline,
-    overlays,
-    record,
-    scene,
-    search,
-    select,
-    toolbar,
-    transform,
-    view,
-)
+from langsplat_viewer.panels import layout, outline, overlays, scene, search, select, ui, view
 from langsplat_viewer.panels.scene import in_words
-from langsplat_viewer.panels.style import (
-    MAIN_DOCK,
-    MOST_OVER,
-    bad,
-    button_if,
-    fitting,
-    muted,
-    scene_area,
-    small_wrapped,
-    stoppable,
-    tip,
-)
 from langsplat_viewer.state import Comparison, memory_bytes
 from langsplat_viewer.viewer import Viewer
 
 
 def draw_menus(viewer: Viewer) -> None:
-    """Draw the menus inside the menu bar."""
     for menu in MENUS:
         if imgui.begin_menu(menu):
             first, *others = in_menu(menu)
@@ -71,7 +48,7 @@ def _recent(viewer: Viewer) -> None:
         for number, path in enumerate(recent):
             name = Path(path)
             if imgui.menu_item(f"{name.parent.name}/{name.name}##{number}", "", False)[0]:
-                opening.open_recent(viewer, path)
+                browsing.open_recent(viewer, path)
             if imgui.is_item_hovered():
                 imgui.set_tooltip(path)
         imgui.end_menu()
@@ -97,18 +74,15 @@ def draw_palette(viewer: Viewer) -> None:
         return
     top = imgui.get_main_viewport().get_center()
     imgui.set_next_window_pos(ImVec2(top.x, 0.15 * top.y), imgui.Cond_.always, ImVec2(0.5, 0))
-    imgui.set_next_window_size(fitting(WIDTH_EM, HEIGHT_EM))
+    imgui.set_next_window_size(ui.fitting(WIDTH_EM, HEIGHT_EM))
     imgui.set_next_window_bg_alpha(1.0)
     flags = imgui.WindowFlags_.no_title_bar | imgui.WindowFlags_.no_resize | imgui.WindowFlags_.no_collapse
     imgui.begin("Commands", None, flags)
     if imgui.is_window_appearing():
         imgui.set_keyboard_focus_here()
-    imgui.set_next_item_width(-1)
-    entered, typed = imgui.input_text_with_hint(
-        "##command", "what to do", viewer.state.palette_typed, imgui.InputTextFlags_.enter_returns_true
-    )
+    entered, typed = ui.box("##command", "what to do", viewer.state.palette_typed)
     typing = imgui.is_item_active()
-    settings.type_command(viewer, typed)
+    settings.put(viewer.state, palette_typed=typed)
     found = matching(typed, viewer.state.preferences.recent)
     chosen = found[0] if entered and found else _clicked(found, typing)
     left = not imgui.is_window_focused(imgui.FocusedFlags_.root_and_child_windows)
@@ -125,14 +99,14 @@ def _clicked(found: list[Command], typing: bool) -> Command | None:
     chosen = None
     if imgui.begin_child("found", child_flags=imgui.ChildFlags_.nav_flattened):
         if not found:
-            imgui.text_colored(muted(), "no command has these words")
+            imgui.text_colored(ui.muted(), "no command has these words")
         right = imgui.get_content_region_avail().x - hello_imgui.em_size(GAP_EM)
         for place, command in enumerate(found):  # Enter does the one that is lit
             if imgui.selectable(command.does, place == 0 and typing)[0]:
                 chosen = command
             keys = ", ".join(command.keys)
             imgui.same_line(right - imgui.calc_text_size(keys).x)
-            imgui.text_colored(muted(), keys)
+            imgui.text_colored(ui.muted(), keys)
     imgui.end_child()
     return chosen
 
@@ -164,18 +138,17 @@ FIRST_STEPS = (
 
 
 def draw_help(viewer: Viewer) -> None:
-    """Draw the window with the first steps and the list of keys."""
     if not viewer.state.show_help:
         return
     flags = imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_collapse
-    area, room = scene_area(), imgui.get_main_viewport().work_size
+    area, room = ui.scene_area(), imgui.get_main_viewport().work_size
     half = hello_imgui.em_size(KEYS_EM + DOES_EM + 4) / 2
     centre = ImVec2(min(area.left + area.width / 2, room.x - half), area.top + area.height / 2)
-    imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(room.x, MOST_OVER * room.y))
+    imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(room.x, ui.MOST_OVER * room.y))
     imgui.set_next_window_pos(centre, imgui.Cond_.always, ImVec2(0.5, 0.5))
     imgui.set_next_window_bg_alpha(1.0)
     _, still_open = imgui.begin("Help", True, flags)
-    settings.show_help(viewer, bool(still_open))
+    settings.put(viewer.state, show_help=bool(still_open))
     imgui.text_disabled(f"LangSplat viewer {__version__}; documentation: docs/README.md of its source")
     if imgui.begin_tab_bar("pages"):
         keys = [(", ".join(command.keys), command.does) for command in COMMANDS if command.keys]
@@ -196,7 +169,7 @@ def _table(rows: Sequence[tuple[str, str]]) -> None:
             imgui.table_next_column()
             imgui.text_unformatted(what)
             imgui.table_next_column()
-            small_wrapped(does, muted())
+            ui.small_wrapped(does, ui.muted())
         imgui.end_table()
 
 
@@ -207,15 +180,15 @@ LEAST_LINES = 2  # of messages, however low the panel is
 
 def draw_messages(viewer: Viewer) -> None:
     """Draw progress, messages (the latest first) and the speed of images."""
-    if viewer.worker.current is not None and stoppable(*viewer.worker.current):
+    if viewer.worker.current is not None and ui.stoppable(*viewer.worker.current):
         opening.cancel(viewer)
     line = imgui.get_text_line_height_with_spacing()
     height = max(imgui.get_content_region_avail().y - line, LEAST_LINES * line)
     if imgui.begin_child("messages", ImVec2(0, height)):
         for message in reversed(viewer.state.messages):
-            small_wrapped(message.text, bad() if message.is_error else muted())
+            ui.small_wrapped(message.text, ui.bad() if message.is_error else ui.muted())
     imgui.end_child()
-    imgui.text_colored(muted(), figures(viewer))
+    imgui.text_colored(ui.muted(), figures(viewer))
 
 
 def figures(viewer: Viewer) -> str:
@@ -233,7 +206,7 @@ def figures(viewer: Viewer) -> str:
 
 def draw_timing(viewer: Viewer) -> None:
     """Draw the panel "Timing": medians of the last images, memory, and a comparison."""
-    viewpoint.measure_frame(viewer)
+    settings.put(viewer.state.timing, wanted=True)
     rows = [(title, f"{milliseconds:.1f} ms") for title, milliseconds in viewer.state.timing.medians()]
     memory = memory_bytes()
     if memory is not None:
@@ -246,18 +219,21 @@ def draw_timing(viewer: Viewer) -> None:
             imgui.table_next_column()
             imgui.text(title)
             imgui.table_next_column()
-            imgui.text_colored(muted(), text)
+            imgui.text_colored(ui.muted(), text)
         imgui.end_table()
     work = viewer.recorder.current
     if work is not None:
-        if stoppable(*work, tag="comparison"):
-            viewpoint.stop_comparing(viewer)
+        if ui.stoppable(*work, tag="comparison"):
+            viewer.recorder.cancel()
     else:
-        if button_if("Compare with the reference", viewer.state.scene is not None):
+        if ui.button(
+            "Compare with the reference",
+            "Draws this view small in float64, in the background: about 15 s for 100,000 Gaussians",
+            enabled=viewer.state.scene is not None,
+        ):
             viewpoint.compare_with_reference(viewer)
-        tip("Draws this view small in float64, in the background: about 15 s for 100,000 Gaussians")
     if viewer.state.timing.comparison is not None:
-        small_wrapped(in_numbers(viewer.state.timing.comparison), muted())
+        ui.small_wrapped(in_numbers(viewer.state.timing.comparison), ui.muted())
 
 
 def in_numbers(comparison: Comparison) -> str:
@@ -294,11 +270,11 @@ PANELS: tuple[Panel, ...] = (
     Panel("Scene", MIDDLE, scene.draw),
     Panel("Outline", MIDDLE, outline.draw, is_open=False),
     Panel("Select", MIDDLE, select.draw, is_open=False),
-    Panel("Transform", MIDDLE, transform.draw, is_open=False),
-    Panel("Library", MIDDLE, library.draw, is_open=False),
+    Panel("Transform", MIDDLE, select.draw_transform, is_open=False),
+    Panel("Library", MIDDLE, scene.draw_library, is_open=False),
     Panel("Train", MIDDLE, scene.draw_training, is_open=False),
-    Panel("Record", MIDDLE, record.draw, is_open=False),
-    Panel("Bookmarks", MIDDLE, record.draw_bookmarks, is_open=False),
+    Panel("Record", MIDDLE, view.draw_record, is_open=False),
+    Panel("Bookmarks", MIDDLE, view.draw_bookmarks, is_open=False),
     Panel("Messages", FOOT, draw_messages),
     Panel("Overlays", MIDDLE, view.draw_overlays, is_open=False),
     Panel("Notes", MIDDLE, view.draw_notes, is_open=False),
@@ -311,7 +287,7 @@ def params(viewer: Viewer, width: float) -> hello_imgui.DockingParams:
     docking = hello_imgui.DockingParams()
     share = min(COLUMN * viewer.state.preferences.ui_scale / width, MOST_SHARE)
     docking.docking_splits = [
-        hello_imgui.DockingSplit(MAIN_DOCK, LEFT, imgui.Dir.left, share),
+        hello_imgui.DockingSplit(ui.MAIN_DOCK, LEFT, imgui.Dir.left, share),
         hello_imgui.DockingSplit(LEFT, FOOT, imgui.Dir.down, FOOT_SHARE),
         hello_imgui.DockingSplit(LEFT, MIDDLE, imgui.Dir.down, MIDDLE_SHARE),
     ]
@@ -338,7 +314,7 @@ def show_wanted(viewer: Viewer) -> None:
     titles = viewer.state.shows_panels
     for window in docking.dockable_windows if any(panel.title in titles for panel in PANELS) else ():
         window.is_visible = window.label in titles
-    settings.have_panels(viewer, ())
+    settings.put(viewer.state, shows_panels=())
     docking.layout_reset |= settings.take_panel_reset(viewer)
     if title:
         docking.dockable_window_of_name(title).is_visible = True
@@ -368,7 +344,7 @@ class Column:
 def _column() -> imgui.internal.DockNode | None:
     """The node of the docks beside the scene, as long as it lies there."""
     docking = hello_imgui.get_runner_params().docking_params
-    root = docking.dock_space_id_from_name(MAIN_DOCK)
+    root = docking.dock_space_id_from_name(ui.MAIN_DOCK)
     node = imgui.internal.dock_builder_get_node(docking.dock_space_id_from_name(LEFT) or 0)
     while node is not None and node.parent_node is not None and node.parent_node.id_ != root:
         node = node.parent_node
@@ -399,8 +375,7 @@ class Hiding:
 
 
 def draw_over(viewer: Viewer) -> None:
-    """Draw what lies over the scene, after the panels."""
-    area = scene_area()
+    area = ui.scene_area()
     said = _said(viewer)
     if said:
         overlays.say(said, area)
@@ -410,10 +385,10 @@ def draw_over(viewer: Viewer) -> None:
         overlays.draw_pointing(viewer)
         select.draw_stroke(viewer, area)
         select.draw_hint(viewer, area)
-        transform.draw_gizmo(viewer, area)
+        select.draw_gizmo(viewer, area)
     overlays.draw_grip(viewer, area)
     overlays.draw_cube(viewer, area)
-    toolbar.draw(viewer, area)
+    layout.draw_toolbar(viewer, area)
     scene.draw_changed(viewer, area)
     scene.draw_unsaved(viewer)
     copied = filming.take_clipboard(viewer)
@@ -430,3 +405,67 @@ def _said(viewer: Viewer) -> str:
     if state.scene is None:
         return f"opening {state.opening.name} ..." if state.opening else "Drop a scene here, or press Ctrl+O"
     return state.nothing
+
+
+# The toolbar: commands that have an icon, in a strip at the left edge of the scene.
+
+GROUPS = [list(group) for _, group in groupby((c for c in COMMANDS if c.icon), lambda c: c.menu)]
+SIDE_EM, GROUP_GAP_EM, MARGIN_EM = 1.75, 0.3, 0.3  # of a button, between groups, around them
+OPACITY = 0.95  # of a button
+MOST_OF_SCENE = 0.4  # of the scene's width
+
+
+def draw_toolbar(viewer: Viewer, area: ui.Area) -> None:
+    """A column of buttons between the titles of images and what is written at their foot, further ones where
+    the scene is low; none where it is too narrow for them."""
+    if viewer.state.scene is None or not viewer.state.show_panel:
+        return
+    side, gap, margin = (float(hello_imgui.em_size(size)) for size in (SIDE_EM, GROUP_GAP_EM, MARGIN_EM))
+    top = area.top + side
+    places = toolbar_places([len(group) for group in GROUPS], area.height - 2 * side - 2 * margin, side, gap)
+    width, height = (max(place[axis] for place in places) + side + 2 * margin for axis in (0, 1))
+    if width > MOST_OF_SCENE * area.width:
+        return
+    imgui.set_next_window_pos(ImVec2(area.left, top))
+    imgui.set_next_window_size(ImVec2(width, height))
+    imgui.set_next_window_bg_alpha(0.0)
+    imgui.push_style_var(imgui.StyleVar_.window_padding, ImVec2(margin, margin))
+    imgui.begin("toolbar", None, ui.OVER | ui.FIXED)
+    for command, (x, y) in zip((c for group in GROUPS for c in group), places, strict=True):
+        imgui.set_cursor_pos(ImVec2(margin + x, margin + y))
+        _tool_button(viewer, command, side)
+    imgui.end()
+    imgui.pop_style_var()
+
+
+def toolbar_places(sizes: list[int], room: float, side: float, gap: float) -> list[tuple[float, float]]:
+    """Places (x, y) of the buttons of groups of `sizes`, in columns not higher than `room`; a group begins a
+    new column where it does not fit into the rest of the last one."""
+    places: list[tuple[float, float]] = []
+    x = y = 0.0
+    for size in sizes:
+        if places and y + size * side > room:
+            x, y = x + side, 0.0
+        for _ in range(size):
+            if y and y + side > room:
+                x, y = x + side, 0.0
+            places.append((x, y))
+            y += side
+        y += gap
+    return places
+
+
+def _tool_button(viewer: Viewer, command: Command, side: float) -> None:
+    lit = command.is_on is not None and command.is_on(viewer)
+    colour = imgui.get_style_color_vec4(imgui.Col_.button_active if lit else imgui.Col_.window_bg)
+    imgui.push_style_color(imgui.Col_.button, ImVec4(colour.x, colour.y, colour.z, OPACITY))
+    if imgui.button(button_label(command), ImVec2(side, side)):
+        command.act(viewer)
+    imgui.pop_style_color()
+    keys = f" ({command.keys[0]})" if command.keys else ""
+    ui.tip(command.does[0].upper() + command.does[1:] + keys)
+
+
+def button_label(command: Command) -> str:
+    """Return the label of a command's button: its icon, and an id that no other command has."""
+    return f"{getattr(icons_fontawesome_6, f'ICON_FA_{command.icon}')}##{command.does}"

@@ -3,14 +3,15 @@ that have a colour for each thing."""
 
 from typing import Any
 
-from imgui_bundle import ImVec2, ImVec4, hello_imgui, icons_fontawesome_6, imgui
+from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
+from imgui_bundle import icons_fontawesome_6 as icons
 
 from langsplat_core.query.describe import OR, Outline
-from langsplat_viewer.actions import outline
+from langsplat_viewer.actions import outline, settings
 from langsplat_viewer.actions.outline import Target
 from langsplat_viewer.files.projects import Group
+from langsplat_viewer.panels import ui
 from langsplat_viewer.panels.overlays import STILL, begin_legend
-from langsplat_viewer.panels.style import Area, elided, muted, small_wrapped, tip, width_of
 from langsplat_viewer.state import OutlineView
 from langsplat_viewer.viewer import Viewer
 
@@ -23,11 +24,11 @@ def draw(viewer: Viewer) -> None:
     """Draw the panel "Outline": a box that filters, groups, and the tree."""
     view = outline.wanted(viewer)
     if view is None or view.problem:
-        small_wrapped(view.problem if view else "open a scene with a language field", muted())
+        ui.small_wrapped(view.problem if view else "open a scene with a language field", ui.muted())
         return
     imgui.set_next_item_width(-1)
     _, typed = imgui.input_text_with_hint("##filter", "filter", viewer.state.outline_typed)
-    outline.write_filter(viewer, typed)
+    settings.put(viewer.state, outline_typed=typed)
     if imgui.begin_child("rows", child_flags=imgui.ChildFlags_.nav_flattened):
         for group in viewer.state.things.groups:
             _group(viewer, view, group)
@@ -69,9 +70,9 @@ def _row(viewer: Viewer, row: Outline, *, in_group: bool = False) -> None:
     name, sure = outline.name_of(viewer, row), ""
     if row.word and row.node not in viewer.state.things.names:
         sure = f" {100 * row.word.probability:.0f} %"
-    icons = (2 if colour is None else 3) * (side + spacing)
-    room = imgui.get_content_region_avail().x - icons - imgui.get_tree_node_to_label_spacing()
-    label = elided(name + sure, room, width_of)
+    taken = (2 if colour is None else 3) * (side + spacing)
+    room = imgui.get_content_region_avail().x - taken - imgui.get_tree_node_to_label_spacing()
+    label = ui.elided(name + sure, room)
     imgui.align_text_to_frame_padding()
     opened = imgui.tree_node_ex(f"{label}###row", flags)
     if _chosen("thing"):
@@ -86,19 +87,16 @@ def _row(viewer: Viewer, row: Outline, *, in_group: bool = False) -> None:
         _things_menu(viewer, row.node)
         _group_menu(viewer, row.node, in_group)
         imgui.end_popup()
-    left = room - width_of(label) - 2 * spacing
+    left = room - ui.width_of(label) - 2 * spacing
     texts = (f"{row.count:,}   {_sides(row)}", f"{row.count:,}")
-    said = next((text for text in texts if width_of(text) < left), "")
+    said = next((text for text in texts if ui.width_of(text) < left), "")
     if said:
-        imgui.same_line(right - icons - width_of(said))
-        imgui.text_colored(muted(), said)
+        imgui.same_line(right - taken - ui.width_of(said))
+        imgui.text_colored(ui.muted(), said)
     if colour is not None:
         imgui.same_line(right - 3 * side - 2 * spacing)
         _swatch(colour, side)
-    imgui.same_line(right - 2 * side - spacing)
-    _eye(viewer, row.node, side)
-    imgui.same_line(right - side)
-    _lock(viewer, row.node, side)
+    _switches(viewer, row.node, right, side)
     imgui.pop_id()
     if opened:
         imgui.indent()
@@ -133,32 +131,28 @@ def _group_menu(viewer: Viewer, node: int, in_group: bool) -> None:
 
 def _about(row: Outline, name: str) -> None:
     outlined = f"outlined in {row.votes[0]} of {sum(row.votes)} photographs"
-    tip(f"{name}: {row.count:,} Gaussians, {_sides(row)} world units, {outlined}")
+    ui.tip(f"{name}: {row.count:,} Gaussians, {_sides(row)} world units, {outlined}")
 
 
 def _sides(row: Outline) -> str:
     return " x ".join(f"{side:.2g}" for side in row.size)
 
 
-def _eye(viewer: Viewer, node: int, side: float) -> None:
-    hidden = bool(outline.hidden_nodes(viewer)[node])
-    icon = icons_fontawesome_6.ICON_FA_EYE_SLASH if hidden else icons_fontawesome_6.ICON_FA_EYE
-    if _icon(f"{icon}###eye", side, lit=not hidden):
+def _switches(viewer: Viewer, node: int, right: float, side: float) -> None:
+    hidden, locked = bool(outline.hidden_nodes(viewer)[node]), node in viewer.state.things.locked
+    imgui.same_line(right - 2 * side - imgui.get_style().item_spacing.x)
+    if _icon(f"{icons.ICON_FA_EYE_SLASH if hidden else icons.ICON_FA_EYE}###eye", side, lit=not hidden):
         (outline.show if hidden else outline.hide)(viewer, node)
-    tip("Show it again" if hidden else "Hide it")
-
-
-def _lock(viewer: Viewer, node: int, side: float) -> None:
-    is_locked = node in viewer.state.things.locked
-    icon = icons_fontawesome_6.ICON_FA_LOCK if is_locked else icons_fontawesome_6.ICON_FA_LOCK_OPEN
-    if _icon(f"{icon}###lock", side, lit=is_locked):
+    ui.tip("Show it again" if hidden else "Hide it")
+    imgui.same_line(right - side)
+    if _icon(f"{icons.ICON_FA_LOCK if locked else icons.ICON_FA_LOCK_OPEN}###lock", side, lit=locked):
         outline.toggle_lock(viewer, node)
-    tip("Locked: no tool selects, hides or deletes it" if is_locked else "Lock it")
+    ui.tip("Locked: no tool selects, hides or deletes it" if locked else "Lock it")
 
 
 def _icon(label: str, side: float, *, lit: bool) -> bool:
     imgui.push_style_color(imgui.Col_.button, ImVec4(0, 0, 0, 0))
-    text = imgui.get_style_color_vec4(imgui.Col_.text) if lit else muted()
+    text = imgui.get_style_color_vec4(imgui.Col_.text) if lit else ui.muted()
     imgui.push_style_color(imgui.Col_.text, ImVec4(text.x, text.y, text.z, 1.0 if lit else 0.45))
     imgui.push_style_var(imgui.StyleVar_.frame_padding, ImVec2(0, 0))  # open locks are wide
     clicked = bool(imgui.button(label, ImVec2(side, side)))
@@ -190,7 +184,7 @@ class ThingsMenu:
     def __init__(self) -> None:
         self._at: Any = None  # (3,) on the surface
 
-    def draw(self, viewer: Viewer, area: Area) -> None:
+    def draw(self, viewer: Viewer, area: ui.Area) -> None:
         """Draw the menu while it is open; once per frame, after the panels."""
         io = imgui.get_io()
         moved = imgui.get_mouse_drag_delta(1, 0.0)
@@ -223,15 +217,14 @@ def _things_menu(viewer: Viewer, target: Target) -> None:
 
 def _named(label: str, hint: str, text: str) -> str:
     """A box for a name; the name once it is entered, else ""."""
-    imgui.set_next_item_width(hello_imgui.em_size(11))
-    entered, typed = imgui.input_text_with_hint(label, hint, text, imgui.InputTextFlags_.enter_returns_true)
-    return str(typed).strip() if entered else ""
+    entered, typed = ui.box(label, hint, text, hello_imgui.em_size(11))
+    return typed.strip() if entered else ""
 
 
 # The legend of displays that have a colour for each thing.
 
 
-def draw_legend(viewer: Viewer, area: Area) -> None:
+def draw_legend(viewer: Viewer, area: ui.Area) -> None:
     """Draw colours and names of the largest things in the image, where latents or the tree are shown."""
     state = viewer.state
     if state.picture.display not in ("latent", "tree") or state.settings.split.columns > 1:
@@ -252,5 +245,5 @@ def draw_legend(viewer: Viewer, area: Area) -> None:
     for name, colour in seen.items():
         _swatch(colour, imgui.get_text_line_height())
         imgui.same_line()
-        imgui.text_unformatted(elided(name, hello_imgui.em_size(LEGEND_EM), width_of))
+        imgui.text_unformatted(ui.elided(name, hello_imgui.em_size(LEGEND_EM)))
     imgui.end()

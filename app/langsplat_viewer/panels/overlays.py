@@ -13,30 +13,21 @@ from langsplat_core.config import ColourMap
 from langsplat_core.display.displays import QUERY_COLOURS, STRENGTH, mapped, painted
 from langsplat_core.query.describe import Words
 from langsplat_core.scene import LEVELS, Camera
-from langsplat_viewer.actions import opening, projects, queries, settings, viewpoint
+from langsplat_viewer.actions import opening, projects, settings, viewpoint
 from langsplat_viewer.camera import overlays
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.camera.overlays import Face, Label, face_at, placed, visible_faces, world_axes
-from langsplat_viewer.files.photographs import corners
-from langsplat_viewer.panels.style import Area, elided, fitting, muted, scene_area, width_of
+from langsplat_viewer.files.disk import corners
+from langsplat_viewer.panels import ui
 from langsplat_viewer.state import Hover
 from langsplat_viewer.viewer import Viewer
 
 GRIP = 12.0  # width of what can be taken hold of, window units
 WHITE, SHADE = 0xFFFFFFFF, 0xA0000000
-UNMOVED = (
-    imgui.WindowFlags_.no_decoration
-    | imgui.WindowFlags_.no_background
-    | imgui.WindowFlags_.no_saved_settings
-    | imgui.WindowFlags_.no_focus_on_appearing
-    | imgui.WindowFlags_.no_bring_to_front_on_focus
-    | imgui.WindowFlags_.no_nav
-    | imgui.WindowFlags_.no_move
-    | imgui.WindowFlags_.no_docking
-)
+UNMOVED = ui.OVER | ui.FIXED | imgui.WindowFlags_.no_background | imgui.WindowFlags_.no_nav
 
 
-def draw_pictures(viewer: Viewer, area: Area, textures: tuple[moderngl.Texture, ...]) -> None:
+def draw_pictures(viewer: Viewer, area: ui.Area, textures: tuple[moderngl.Texture, ...]) -> None:
     """The textures of `Canvas.textures` where they belong, each with its name if there are several."""
     split = viewer.state.settings.split
     if split.mode in ("wipe", "scenes") and len(textures) > 1:
@@ -53,8 +44,7 @@ def draw_pictures(viewer: Viewer, area: Area, textures: tuple[moderngl.Texture, 
     _titles(viewer, area)
 
 
-def _image(area: Area, texture: moderngl.Texture, start: float, stop: float) -> None:
-    """The part of a texture between two fractions of its width, at its place in `area`."""
+def _image(area: ui.Area, texture: moderngl.Texture, start: float, stop: float) -> None:
     imgui.get_background_draw_list().add_image(
         imgui.ImTextureRef(texture.glo),
         ImVec2(area.left + start * area.width, area.top),
@@ -64,14 +54,14 @@ def _image(area: Area, texture: moderngl.Texture, start: float, stop: float) -> 
     )
 
 
-def _divider(area: Area, at: float) -> None:
+def _divider(area: ui.Area, at: float) -> None:
     x, paint = area.left + at * area.width, imgui.get_background_draw_list()
     ends = ImVec2(x, area.top), ImVec2(x, area.top + area.height)
     paint.add_line(*ends, SHADE, 4.0)
     paint.add_line(*ends, WHITE, 1.5)
 
 
-def _titles(viewer: Viewer, area: Area) -> None:
+def _titles(viewer: Viewer, area: ui.Area) -> None:
     """Write what each image shows at its upper edge: left and right of the line of a wipe."""
     split, names = viewer.state.settings.split, tuple(pane.label for pane in viewer.state.panes())
     gap, top = hello_imgui.em_size(0.6), area.top + hello_imgui.em_size(0.5)
@@ -92,7 +82,7 @@ def shade_edge() -> float:
     return float(hello_imgui.em_size(0.2))
 
 
-def text_on_shade(text: str, x: float, y: float, area: Area) -> None:
+def text_on_shade(text: str, x: float, y: float, area: ui.Area) -> None:
     """Write text on a shade, nowhere outside the area."""
     paint, size, edge = imgui.get_background_draw_list(), imgui.calc_text_size(text), shade_edge()
     paint.push_clip_rect(*area.corners)
@@ -103,7 +93,7 @@ def text_on_shade(text: str, x: float, y: float, area: Area) -> None:
     paint.pop_clip_rect()
 
 
-def draw_grip(viewer: Viewer, area: Area) -> None:
+def draw_grip(viewer: Viewer, area: ui.Area) -> None:
     """Draw the grip of the line of a wipe; a double click puts it into the middle."""
     split = viewer.state.settings.split
     if split.mode not in ("wipe", "scenes") or viewer.state.scene is None:
@@ -117,7 +107,9 @@ def draw_grip(viewer: Viewer, area: Area) -> None:
     imgui.invisible_button("line", ImVec2(GRIP, area.height))
     if imgui.is_item_hovered() or imgui.is_item_active():
         imgui.set_mouse_cursor(imgui.MouseCursor_.resize_ew)
-        _knob(x, area)
+        middle, paint = ImVec2(x, area.top + area.height / 2), imgui.get_foreground_draw_list()
+        paint.add_circle_filled(middle, 0.5 * GRIP, WHITE)
+        paint.add_circle(middle, 0.5 * GRIP, SHADE, 0, 2.0)
     if imgui.is_item_hovered() and imgui.is_mouse_double_clicked(0):
         settings.move_line(viewer, 0.5)
     elif imgui.is_item_active() and imgui.get_io().mouse_delta.x:
@@ -126,77 +118,42 @@ def draw_grip(viewer: Viewer, area: Area) -> None:
     imgui.pop_style_var(2)
 
 
-def _knob(x: float, area: Area) -> None:
-    middle, paint = ImVec2(x, area.top + area.height / 2), imgui.get_foreground_draw_list()
-    paint.add_circle_filled(middle, 0.5 * GRIP, WHITE)
-    paint.add_circle(middle, 0.5 * GRIP, SHADE, 0, 2.0)
-
-
 # The photograph of a training camera.
-
-
-class _Uploaded:
-    """Holds an image as a texture."""
-
-    def __init__(self) -> None:
-        self._image: Array | None = None  # what the texture has
-        self._texture: moderngl.Texture | None = None
-
-    def _upload(self, image: Array) -> moderngl.Texture:
-        if self._texture is None or self._image is not image:
-            if self._texture is not None:
-                self._texture.release()
-            height, width = image.shape[:2]
-            texture = moderngl.get_context().texture((width, height), 3, image.tobytes(), alignment=1)
-            texture.build_mipmaps()
-            texture.filter = moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR
-            texture.repeat_x = texture.repeat_y = False
-            self._texture, self._image = texture, image
-        return self._texture
 
 
 EVIDENCE_EM = 50.0, 34.0  # size of the window at first
 
 
-class EvidenceWindow(_Uploaded):
-    """The evidence of an answer, in a window that can be closed."""
-
-    def draw(self, viewer: Viewer) -> None:
-        sheet = viewer.state.evidence
-        if sheet is None:
-            return
-        texture = self._upload(sheet.image)
-        area = scene_area()
-        imgui.set_next_window_pos(ImVec2(area.left, area.top), imgui.Cond_.appearing)
-        imgui.set_next_window_size(fitting(*EVIDENCE_EM), imgui.Cond_.appearing)
-        imgui.set_next_window_bg_alpha(1.0)
-        _, still_open = imgui.begin(f"Evidence: {sheet.phrase}###evidence", True)
-        width = imgui.get_content_region_avail().x
-        size = ImVec2(width, width * texture.height / texture.width)
-        imgui.image(imgui.ImTextureRef(texture.glo), size)
-        imgui.end()
-        if not still_open:
-            queries.close_evidence(viewer)
+def draw_evidence(viewer: Viewer, picture: ui.Picture) -> None:
+    sheet, area = viewer.state.evidence, ui.scene_area()
+    if sheet is None:
+        return
+    texture = picture.texture(sheet.image)
+    imgui.set_next_window_pos(ImVec2(area.left, area.top), imgui.Cond_.appearing)
+    imgui.set_next_window_size(ui.fitting(*EVIDENCE_EM), imgui.Cond_.appearing)
+    imgui.set_next_window_bg_alpha(1.0)
+    _, still_open = imgui.begin(f"Evidence: {sheet.phrase}###evidence", True)
+    width = imgui.get_content_region_avail().x
+    imgui.image(imgui.ImTextureRef(texture.glo), ImVec2(width, width * texture.height / texture.width))
+    imgui.end()
+    if not still_open:
+        settings.put(viewer.state, evidence=None)
 
 
-class PhotographOverlay(_Uploaded):
-    """The photograph of the camera at which one stands, over the image."""
-
-    def draw(self, viewer: Viewer, area: Area) -> None:
-        """Draw the photograph over every image in the area, where one stands at its camera."""
-        state = viewer.state
-        photograph = opening.photograph_here(state)
-        if state.settings.fade == 0 or photograph is None or photograph.image is None or state.view is None:
-            return
-        reference = imgui.ImTextureRef(self._upload(photograph.image).glo)
-        paint = imgui.get_background_draw_list()
-        tint = imgui.get_color_u32((1.0, 1.0, 1.0, state.settings.fade))
-        for part in area.columns(state.settings.split.columns):
-            left, top, right, bottom = corners(photograph.camera, state.view.camera(*part.size))
-            low, high = ImVec2(part.left + left, part.top + top), ImVec2(part.left + right, part.top + bottom)
-            paint.push_clip_rect(*part.corners, True)
-            paint.add_image(reference, low, high, ImVec2(0, 0), ImVec2(1, 1), tint)
-            paint.pop_clip_rect()
+def draw_photograph(viewer: Viewer, area: ui.Area, picture: ui.Picture) -> None:
+    """Draw the photograph of the camera at which one stands, over every image in the area."""
+    state, photograph = viewer.state, opening.photograph_here(viewer.state)
+    if state.settings.fade == 0 or photograph is None or photograph.image is None or state.view is None:
+        return
+    reference = imgui.ImTextureRef(picture.texture(photograph.image).glo)
+    paint = imgui.get_background_draw_list()
+    tint = imgui.get_color_u32((1.0, 1.0, 1.0, state.settings.fade))
+    for part in area.columns(state.settings.split.columns):
+        left, top, right, bottom = corners(photograph.camera, state.view.camera(*part.size))
+        low, high = ImVec2(part.left + left, part.top + top), ImVec2(part.left + right, part.top + bottom)
+        paint.push_clip_rect(*part.corners, True)
+        paint.add_image(reference, low, high, ImVec2(0, 0), ImVec2(1, 1), tint)
+        paint.pop_clip_rect()
 
 
 # Lines: training cameras, boxes of instances, ground grid, ruler; and the clicks on them.
@@ -217,46 +174,53 @@ class Named:
     colour: tuple[float, float, float, float]
 
 
-def draw_lines(viewer: Viewer, area: Area) -> None:
+def draw_lines(viewer: Viewer, area: ui.Area) -> None:
     """Draw grid, cameras, boxes, ruler and notes over every image in the area, after they are drawn."""
     state = viewer.state
     if state.scene is None or state.view is None or state.extent is None:
         return
-    paint = imgui.get_background_draw_list()
-    for column, part in enumerate(area.columns(state.settings.split.columns)):
+    paint, metres = imgui.get_background_draw_list(), state.scene.metres_per_unit
+    least = overlays.LEAST_DEPTH * state.extent.radius  # from this camera z on lines are drawn
+    grid = None
+    if "grid" in state.preferences.overlays:
+        grid = overlays.ground_grid(state.extent, state.view.up, metres)
+    for part in area.columns(state.settings.split.columns):
         camera = state.view.camera(*part.size)
         paint.push_clip_rect(*part.corners, True)
-        if "grid" in state.preferences.overlays:
-            _grid(viewer, part, camera, is_named=column == 0)
+        if grid is not None:
+            _grid(grid, part, camera, least)
         if "cameras" in state.preferences.overlays:
-            _cameras(viewer, part, camera)
+            edges = overlays.frusta(state.scene.cameras, overlays.FRUSTUM_DEPTH * state.extent.radius)
+            _cameras(viewer, edges, part, camera, least)
         if "things" in state.preferences.overlays:  # after the lines, so that its words are readable
-            _things(viewer, part, camera)
-        _ruler(viewer, part, camera)
-        _notes(viewer, part, camera)
+            _things(viewer, part, camera, least)
+        _ruler(viewer, part, camera, least, metres)
+        _notes(viewer, part, camera, least)
         paint.pop_clip_rect()
-    _orthographic(viewer, area)
-    if (state.ruler.measures or state.pins_notes) and not imgui.get_io().want_capture_mouse:
-        cursors, measures = imgui.MouseCursor_, state.ruler.measures
-        imgui.set_mouse_cursor(cursors.resize_all if measures else cursors.hand)
-        if clicked(area):
-            mouse, act = imgui.get_io().mouse_pos, settings.measure_at if measures else projects.pin_at
-            act(viewer, *area.fraction(mouse.x, mouse.y))
-
-
-def _orthographic(viewer: Viewer, area: Area) -> None:
-    """Write that the camera is orthographic, and its scale."""
-    view, scene = viewer.state.view, viewer.state.scene
-    if view is None or scene is None or not view.orthographic:
-        return
     line = imgui.get_text_line_height()
-    lines_below = 2 if "grid" in viewer.state.preferences.overlays else 1
-    span = overlays.length_text(view.span_in(*viewer.state.size), scene.metres_per_unit)
-    text = f"orthographic, {span} across the shorter side"
-    text_on_shade(text, area.left + 0.6 * line, area.top + area.height - 1.6 * lines_below * line, area)
+    left, foot = area.left + 0.6 * line, area.top + area.height
+    if grid is not None:
+        text_on_shade(f"grid {overlays.length_text(grid.spacing, metres)}", left, foot - 1.6 * line, area)
+    if state.view.orthographic:
+        span = overlays.length_text(state.view.span_in(*state.size), metres)
+        below = 1 if grid is None else 2  # lines
+        text_on_shade(f"orthographic, {span} across the shorter side", left, foot - 1.6 * below * line, area)
+    if not imgui.get_io().want_capture_mouse:
+        _take_click(viewer, area)
 
 
-def clicked(area: Area) -> bool:
+def _take_click(viewer: Viewer, area: ui.Area) -> None:
+    """Set a point of the ruler, or pin a note, where the scene is clicked for that."""
+    cursors, measures = imgui.MouseCursor_, viewer.state.ruler.measures
+    if not (measures or viewer.state.pins_notes):
+        return
+    imgui.set_mouse_cursor(cursors.resize_all if measures else cursors.hand)
+    if clicked(area):
+        mouse, act = imgui.get_io().mouse_pos, settings.measure_at if measures else projects.pin_at
+        act(viewer, *area.fraction(mouse.x, mouse.y))
+
+
+def clicked(area: ui.Area) -> bool:
     """Return whether the left button was clicked in the area, without modifiers and without a drag."""
     io = imgui.get_io()
     if io.want_capture_mouse or io.key_ctrl or io.key_shift or not imgui.is_mouse_released(0):
@@ -266,28 +230,19 @@ def clicked(area: Area) -> bool:
     return abs(moved.x) + abs(moved.y) < STILL and 0 <= u <= 1 and 0 <= v <= 1
 
 
-def _least_depth(viewer: Viewer) -> float:
-    """Camera z from which on lines are drawn: a little before the eye."""
-    assert viewer.state.extent is not None
-    return overlays.LEAST_DEPTH * viewer.state.extent.radius
-
-
-def _lines(area: Area, segments: Array, colour: tuple[float, float, float, float], thick: float) -> None:
-    """(K, 2, 2) segments in units of the image in `area`."""
+def _lines(area: ui.Area, segments: Array, colour: tuple[float, float, float, float], thick: float) -> None:
     paint, packed = imgui.get_background_draw_list(), imgui.get_color_u32(colour)
     for (x0, y0), (x1, y1) in (segments + (area.left, area.top)).tolist():
         paint.add_line(ImVec2(x0, y0), ImVec2(x1, y1), packed, thick)
 
 
-def _cameras(viewer: Viewer, area: Area, camera: Camera) -> None:
-    """Draw all but the one that the view looks through; a click on one stands there."""
+def _cameras(viewer: Viewer, edges: Array, area: ui.Area, camera: Camera, least: float) -> None:
+    """(C, 8, 2, 3) edges of all, but for the one that the view looks through; a click on one stands there."""
     state = viewer.state
     assert state.scene is not None
-    assert state.extent is not None
-    edges = overlays.frusta(state.scene.cameras, overlays.FRUSTUM_DEPTH * state.extent.radius)
-    away = np.linalg.norm(edges[:, 0, 0] - camera.position, axis=1) > _least_depth(viewer)
+    away = np.linalg.norm(edges[:, 0, 0] - camera.position, axis=1) > least
     edges = edges * away[:, None, None, None]  # all in one point, which is no line
-    segments, rows = overlays.clip_segments(camera, edges.reshape(-1, 2, 3), _least_depth(viewer))
+    segments, rows = overlays.clip_segments(camera, edges.reshape(-1, 2, 3), least)
     owners = rows // edges.shape[1]
     segments, owners = segments[away[owners]], owners[away[owners]]
     under = -1
@@ -306,7 +261,7 @@ def _cameras(viewer: Viewer, area: Area, camera: Camera) -> None:
             viewpoint.go_to_camera(viewer, under)
 
 
-def _things(viewer: Viewer, area: Area, camera: Camera) -> None:
+def _things(viewer: Viewer, area: ui.Area, camera: Camera, least: float) -> None:
     """A box around each thing that a query shown has found, and the phrase beside it."""
     named: list[Named] = []
     for query in viewer.state.shown():
@@ -315,7 +270,7 @@ def _things(viewer: Viewer, area: Area, camera: Camera) -> None:
         red, green, blue = QUERY_COLOURS[query.slot]
         for number, thing in enumerate(query.things, start=1):
             edges = overlays.box_edges(thing.oriented.corners)
-            segments, _ = overlays.clip_segments(camera, edges, _least_depth(viewer))
+            segments, _ = overlays.clip_segments(camera, edges, least)
             _lines(area, segments, (0.0, 0.0, 0.0, 0.5), 3.0)
             _lines(area, segments, (red, green, blue, 1.0), 1.5)
             if len(segments):
@@ -325,7 +280,7 @@ def _things(viewer: Viewer, area: Area, camera: Camera) -> None:
     _names(named, area)
 
 
-def _names(named: list[Named], area: Area) -> None:
+def _names(named: list[Named], area: ui.Area) -> None:
     """The phrases, above the highest corners of their boxes; a line leads to those that had to make room."""
     line, edge, paint = imgui.get_text_line_height(), shade_edge(), imgui.get_background_draw_list()
     room = (area.width, area.height)
@@ -343,33 +298,19 @@ def _names(named: list[Named], area: Area) -> None:
         text_on_shade(name.text, area.left + label.x + edge, area.top + label.y + edge, area)
 
 
-def _grid(viewer: Viewer, area: Area, camera: Camera, is_named: bool) -> None:
-    """Draw the grid on the ground, each line with its distance from the world's origin; name its spacing."""
-    state = viewer.state
-    assert state.scene is not None
-    assert state.extent is not None
-    assert state.view is not None
-    scale = state.scene.metres_per_unit
-    grid = overlays.ground_grid(state.extent, state.view.up, scale)
-    segments, _ = overlays.clip_segments(camera, grid.segments, _least_depth(viewer))
+def _grid(grid: overlays.Grid, area: ui.Area, camera: Camera, least: float) -> None:
+    """Draw the lines on the ground, each with its distance from the world's origin."""
+    segments, _ = overlays.clip_segments(camera, grid.segments, least)
     _lines(area, segments, GRID, 1.0)
     paint, packed = imgui.get_background_draw_list(), imgui.get_color_u32((*GRID[:3], 1.0))
     for text, point in grid.marks:
-        place = _place(camera, point, _least_depth(viewer))
+        place = _place(camera, point, least)
         if place is not None:
             paint.add_text(ImVec2(area.left + place[0] + 3, area.top + place[1]), packed, text)
-    if not is_named:
-        return
-    spacing = overlays.length_text(grid.spacing, scale)
-    line = imgui.get_text_line_height()
-    text_on_shade(f"grid {spacing}", area.left + 0.6 * line, area.top + area.height - 1.6 * line, area)
 
 
-def _ruler(viewer: Viewer, area: Area, camera: Camera) -> None:
-    """The points that were clicked, and what lies between them."""
-    ruler, scene = viewer.state.ruler, viewer.state.scene
-    assert scene is not None
-    paint, least = imgui.get_background_draw_list(), _least_depth(viewer)
+def _ruler(viewer: Viewer, area: ui.Area, camera: Camera, least: float, metres: float | None) -> None:
+    ruler, paint = viewer.state.ruler, imgui.get_background_draw_list()
     for point in ruler.points:
         place = _place(camera, np.array(point), least)
         if place is not None:
@@ -383,15 +324,15 @@ def _ruler(viewer: Viewer, area: Area, camera: Camera) -> None:
     _lines(area, segments, RULER, 2.0)
     for start, end in segments:
         x, y = (start + end) / 2
-        text = overlays.length_text(ruler.length, scene.metres_per_unit)
+        text = overlays.length_text(ruler.length, metres)
         text_on_shade(text, area.left + float(x) + 8, area.top + float(y) + 8, area)
 
 
-def _notes(viewer: Viewer, area: Area, camera: Camera) -> None:
+def _notes(viewer: Viewer, area: ui.Area, camera: Camera, least: float) -> None:
     """The notes, at the places that they are pinned to."""
     named, paint = [], imgui.get_background_draw_list()
     for note in viewer.state.notes:
-        place = _place(camera, np.array(note.at), _least_depth(viewer))
+        place = _place(camera, np.array(note.at), least)
         if place is not None:
             middle = ImVec2(area.left + place[0], area.top + place[1])
             paint.add_circle_filled(middle, 4.0, imgui.get_color_u32(NOTE))
@@ -411,17 +352,10 @@ def _place(camera: Camera, point: Array, least_depth: float) -> tuple[float, flo
 
 STEPS = 32  # of a colour bar
 BAR_EM, BAR_HEIGHT_EM = 11.0, 0.8
-QUIET = (
-    imgui.WindowFlags_.no_decoration
-    | imgui.WindowFlags_.no_inputs
-    | imgui.WindowFlags_.always_auto_resize
-    | imgui.WindowFlags_.no_saved_settings
-    | imgui.WindowFlags_.no_focus_on_appearing
-    | imgui.WindowFlags_.no_bring_to_front_on_focus
-)
+QUIET = ui.OVER | imgui.WindowFlags_.no_inputs | imgui.WindowFlags_.always_auto_resize
 
 
-def draw_legends(viewer: Viewer, area: Area) -> None:
+def draw_legends(viewer: Viewer, area: ui.Area) -> None:
     """Draw the legend of the scene, and of the one beside it, each on its side of the line."""
     if viewer.beside is None:
         draw_legend(viewer, area)
@@ -431,7 +365,7 @@ def draw_legends(viewer: Viewer, area: Area) -> None:
     draw_legend(viewer.beside, area, "relevancy beside")
 
 
-def draw_legend(viewer: Viewer, area: Area, name: str = "relevancy") -> None:
+def draw_legend(viewer: Viewer, area: ui.Area, name: str = "relevancy") -> None:
     """Draw a colour bar with numbers for every query that is painted."""
     state = viewer.state
     shown = state.shown_results()
@@ -448,7 +382,7 @@ def draw_legend(viewer: Viewer, area: Area, name: str = "relevancy") -> None:
     imgui.end()
 
 
-def begin_legend(name: str, area: Area) -> None:
+def begin_legend(name: str, area: ui.Area) -> None:
     """Begin a window in the lower right corner of the scene's area."""
     margin = hello_imgui.em_size(0.7)
     corner = ImVec2(area.left + area.width - margin, area.top + area.height - margin)
@@ -457,7 +391,7 @@ def begin_legend(name: str, area: Area) -> None:
     imgui.begin(name, None, QUIET)
 
 
-def say(text: str, area: Area, name: str = "said over the scene", top: float | None = None) -> None:
+def say(text: str, area: ui.Area, name: str = "said over the scene", top: float | None = None) -> None:
     """Write a line over the scene, in the middle of its area or `top` window units below its upper edge."""
     x, y = area.left + area.width / 2, area.top + (area.height / 2 if top is None else top)
     imgui.set_next_window_pos(ImVec2(x, y), imgui.Cond_.always, ImVec2(0.5, 0.5 if top is None else 0))
@@ -483,7 +417,7 @@ def bar_colours(slot: int, strength: float, alone: bool, colour_map: ColourMap =
 def _bar(phrase: str, colours: Array, ends: tuple[float, float]) -> None:
     """Phrase, bar, and the relevancies at its ends and in its middle."""
     width, height = hello_imgui.em_size(BAR_EM), hello_imgui.em_size(BAR_HEIGHT_EM)
-    imgui.text_unformatted(elided(phrase, width, width_of))
+    imgui.text_unformatted(ui.elided(phrase, width))
     draw_bar(imgui.get_cursor_screen_pos(), width, height, colours)
     imgui.dummy(ImVec2(width, height))
     low, high = ends
@@ -516,11 +450,11 @@ def draw_pointing(viewer: Viewer) -> None:
     imgui.push_text_wrap_pos(hello_imgui.em_size(24))
     sure = viewer.engine is not None and viewer.engine.basis.calibration is not None
     for name, words in zip(LEVELS, hover.found.words, strict=True):
-        imgui.text_colored(muted(), name)
+        imgui.text_colored(ui.muted(), name)
         imgui.same_line(hello_imgui.em_size(4.5))
         imgui.text_unformatted(said(words, sure))
     for line in pointed_figures(hover):
-        imgui.text_colored(muted(), line)
+        imgui.text_colored(ui.muted(), line)
     imgui.pop_text_wrap_pos()
     imgui.end_tooltip()
 
@@ -554,7 +488,7 @@ LIT, DARK, HOVERED_FACE = 0.80, 0.45, (0.98, 0.78, 0.35)
 INK = (0.08, 0.08, 0.10)
 
 
-def draw_cube(viewer: Viewer, area: Area) -> None:
+def draw_cube(viewer: Viewer, area: ui.Area) -> None:
     """Draw the view cube over the image's corner; a click on a face turns the view there."""
     view = viewer.state.view
     if view is None or "cube" not in viewer.state.preferences.overlays:

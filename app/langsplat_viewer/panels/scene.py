@@ -1,32 +1,19 @@
-"""Files: the panels "Scene" and "Train", the file browser, and the questions about changed and unsaved
-files."""
+"""Files: the panels "Scene", "Train" and "Library", the file browser, the questions before files are lost."""
 
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_core.config import TrainPreset
 from langsplat_core.io.scenes import format_of
-from langsplat_viewer.actions import opening, projects, selecting, settings, training
-from langsplat_viewer.files.browsing import Entry, Listing
-from langsplat_viewer.output import saving
-from langsplat_viewer.panels.style import (
-    Area,
-    bad,
-    beside_boxed,
-    box_with_button,
-    button_width,
-    elided,
-    fitting,
-    muted,
-    next_button,
-    small_wrapped,
-    tip,
-    width_of,
-)
+from langsplat_core.query.finding import Hit
+from langsplat_core.query.library import THUMBNAIL
+from langsplat_viewer.actions import browsing, filming, opening, projects, selecting, settings
+from langsplat_viewer.files.disk import Entry, Listing
+from langsplat_viewer.panels import ui
+from langsplat_viewer.state import LibraryView
 from langsplat_viewer.viewer import Training, Viewer
 
 
@@ -37,17 +24,17 @@ def draw(viewer: Viewer) -> None:
         imgui.text("Opening ..." if state.opening else "No scene is open")
     else:
         imgui.text(state.path.name if state.path else "scene")
-        small_wrapped(_figures(viewer), muted())
+        ui.small_wrapped(_figures(viewer), ui.muted())
         for doubt in state.doubts:
-            small_wrapped(doubt.partition(":")[0], bad())
-            tip(doubt)
+            ui.small_wrapped(doubt.partition(":")[0], ui.bad())
+            ui.tip(doubt)
     if imgui.button("Open ..."):
-        opening.ask_for_file(viewer)
-    if next_button("Save picture"):
-        saving.save_picture(viewer, Path.cwd())
-    if next_button("Save view"):
-        saving.save_view(viewer, Path.cwd())
-    if next_button("Help"):
+        browsing.ask_for_file(viewer)
+    if ui.next_button("Save picture"):
+        filming.save_picture(viewer)
+    if ui.next_button("Save view"):
+        filming.save_view(viewer)
+    if ui.next_button("Help"):
         settings.toggle_help(viewer)
     if len(state.scenes) > 1:
         _list(viewer)
@@ -55,25 +42,19 @@ def draw(viewer: Viewer) -> None:
 
 def _list(viewer: Viewer) -> None:
     """The scenes to switch between; the folder is named too where two have one name."""
-    state, side = viewer.state, imgui.get_frame_height()
+    state = viewer.state
     imgui.separator_text("Scenes")
     if imgui.begin_child("scenes"):
         shown = None if state.path is None else (state.opening or state.path).absolute()
         names = [path.name for path in state.scenes]
         for number, path in enumerate(state.scenes):
             imgui.push_id(number)
-            room = imgui.get_content_region_avail().x - side - imgui.get_style().item_spacing.x
             name = path.name if names.count(path.name) == 1 else f"{path.parent.name}/{path.name}"
-            name = elided(name, room, width_of)
-            imgui.align_text_to_frame_padding()
-            if imgui.selectable(f"{name}##scene", path == shown, size=ImVec2(room, 0))[0]:
+            clicked, gone = ui.row(name, "scene", path == shown, can_go=path != shown, about=str(path))
+            if clicked:
                 opening.switch_scene(viewer, path)
-            tip(str(path))
-            imgui.same_line(room + imgui.get_style().item_spacing.x)
-            imgui.begin_disabled(path == shown)
-            if imgui.button("x", ImVec2(side, 0)):
+            if gone:
                 opening.unlist_scene(viewer, path)
-            imgui.end_disabled()
             imgui.pop_id()
     imgui.end_child()
 
@@ -106,7 +87,7 @@ def draw_browser(viewer: Viewer) -> None:
     listing = viewer.state.browser
     title = BESIDE if viewer.state.picks_beside else TITLES[viewer.state.picks_folder]
     _ask_for_popup(title, listing is not None)
-    imgui.set_next_window_size(fitting(WIDTH_EM, HEIGHT_EM), imgui.Cond_.appearing)
+    imgui.set_next_window_size(ui.fitting(WIDTH_EM, HEIGHT_EM), imgui.Cond_.appearing)
     shown, stays = imgui.begin_popup_modal(title, True, imgui.WindowFlags_.no_saved_settings)
     if not shown:
         return
@@ -114,9 +95,13 @@ def draw_browser(viewer: Viewer) -> None:
         _path_box(viewer)
         _above(viewer, listing.folder)
         _entries(viewer, listing)
-        _foot(viewer, listing)
+        if viewer.state.picks_folder:
+            if imgui.button("Take this folder"):
+                browsing.choose_folder(viewer, listing.folder)
+        elif has_several(listing) and imgui.button("Open all scenes here"):
+            browsing.open_all(viewer)
     if not stays or imgui.is_key_pressed(imgui.Key.escape):
-        opening.close_browser(viewer)
+        settings.put(viewer.state, browser=None)
     if viewer.state.browser is None:
         imgui.close_current_popup()
     imgui.end_popup()
@@ -130,16 +115,7 @@ def _ask_for_popup(title: str, is_wanted: bool) -> None:
     imgui.set_next_window_pos(centre, imgui.Cond_.appearing, ImVec2(0.5, 0.5))
 
 
-def _foot(viewer: Viewer, listing: Listing) -> None:
-    if viewer.state.picks_folder:
-        if imgui.button("Take this folder"):
-            opening.choose_folder(viewer, listing.folder)
-    elif has_several(listing) and imgui.button("Open all scenes here"):
-        opening.open_all(viewer)
-
-
 def has_several(listing: Listing) -> bool:
-    """Return whether there is more than one scene to open."""
     return sum(entry.is_file and format_of(entry.path) is not None for entry in listing.entries) > 1
 
 
@@ -148,21 +124,20 @@ def _path_box(viewer: Viewer) -> None:
         imgui.set_keyboard_focus_here()
     picks = viewer.state.picks_folder
     hint = "path of a folder" if picks else "path of a scene or folder, or drop files onto the window"
-    entered, typed = box_with_button("##path", hint, viewer.state.path_typed, "Open")
-    opening.type_path(viewer, typed)
+    entered, typed = ui.box_with_button("##path", hint, viewer.state.path_typed, "Open")
+    settings.put(viewer.state, path_typed=typed)
     if entered:
-        opening.open_typed(viewer)
+        browsing.open_typed(viewer)
 
 
 def _above(viewer: Viewer, folder: Path) -> None:
-    """The folders above, each to be gone to."""
     for number, parent in enumerate((*reversed(folder.parents), folder)):
         if number:
             imgui.same_line(0, 2)
-            if imgui.get_content_region_avail().x < button_width(parent.name):
+            if imgui.get_content_region_avail().x < ui.button_width(parent.name):
                 imgui.new_line()
         if imgui.small_button(f"{parent.name or parent}##above {number}"):
-            opening.browse(viewer, parent)
+            browsing.browse(viewer, parent)
 
 
 def _entries(viewer: Viewer, listing: Listing) -> None:
@@ -173,21 +148,21 @@ def _entries(viewer: Viewer, listing: Listing) -> None:
     below += imgui.get_frame_height_with_spacing() * (bool(picks) or has_several(listing))
     if imgui.begin_child("entries", ImVec2(0, -below), imgui.ChildFlags_.borders):
         if listing.problem:
-            small_wrapped(listing.problem, bad())
+            ui.small_wrapped(listing.problem, ui.bad())
         elif not listing.entries:
-            small_wrapped("no folders here" if picks else "no scenes and no folders here", muted())
+            ui.small_wrapped("no folders here" if picks else "no scenes and no folders here", ui.muted())
         for entry in (entry for entry in listing.entries if not (picks and entry.is_file)):
             _entry(viewer, entry)
         if listing.left_out:
-            small_wrapped(f"{listing.left_out:,} more: type a path", muted())
+            ui.small_wrapped(f"{listing.left_out:,} more: type a path", ui.muted())
     imgui.end_child()
     if recent:
-        imgui.text_colored(muted(), "Recent")
+        imgui.text_colored(ui.muted(), "Recent")
         foot = imgui.get_frame_height_with_spacing() * has_several(listing)
         if imgui.begin_child("recent", ImVec2(0, -foot)):
             for path in recent:
                 if imgui.selectable(f"{path}##recent", False)[0]:
-                    opening.open_recent(viewer, path)
+                    browsing.open_recent(viewer, path)
         imgui.end_child()
 
 
@@ -195,11 +170,11 @@ def _entry(viewer: Viewer, entry: Entry) -> None:
     right = imgui.get_content_region_avail().x
     name = entry.path.name if entry.is_file else f"{entry.path.name}/"
     if imgui.selectable(name, False)[0]:
-        opening.choose(viewer, entry)
+        browsing.choose(viewer, entry)
     if entry.size:
         text = in_words(entry.size)
         imgui.same_line(right - imgui.calc_text_size(text).x)
-        imgui.text_colored(muted(), text)
+        imgui.text_colored(ui.muted(), text)
 
 
 def in_words(size: float) -> str:
@@ -213,9 +188,8 @@ def in_words(size: float) -> str:
 # The bar of a file that has changed.
 
 BAR = (
-    imgui.WindowFlags_.no_decoration
-    | imgui.WindowFlags_.no_move
-    | imgui.WindowFlags_.no_docking
+    ui.FIXED
+    | imgui.WindowFlags_.no_decoration
     | imgui.WindowFlags_.always_auto_resize
     | imgui.WindowFlags_.no_saved_settings
     | imgui.WindowFlags_.no_focus_on_appearing
@@ -223,8 +197,7 @@ BAR = (
 )
 
 
-def draw_changed(viewer: Viewer, area: Area) -> None:
-    """Draw the file that has changed, and buttons to read it or not."""
+def draw_changed(viewer: Viewer, area: ui.Area) -> None:
     state = viewer.state
     if not viewer.watch.changed or state.path is None or state.opening is not None:
         return
@@ -234,12 +207,11 @@ def draw_changed(viewer: Viewer, area: Area) -> None:
     imgui.align_text_to_frame_padding()
     imgui.text_unformatted(f"{state.path.name} has changed on disk")
     imgui.same_line()
-    if imgui.button("Reload"):
+    if ui.button("Reload", "Read it again; camera, queries and view settings stay"):
         opening.reload(viewer)
-    tip("Read it again; camera, queries and view settings stay")
     imgui.same_line()
     if imgui.button("Not now"):
-        opening.keep_old(viewer)
+        viewer.watch.dismiss()
     imgui.end()
 
 
@@ -274,13 +246,11 @@ def _ask(viewer: Viewer, to: str) -> None:
         imgui.text_unformatted("Notes, names, groups or locks are in no project.")
     imgui.text_unformatted(f"Save before {to}?")
     if selection.is_unsaved:
-        if imgui.button("Save"):
-            selecting.save_and_leave(viewer, Path.cwd())
-        tip("The scene as a new file, without what was deleted")
+        if ui.button("Save", "The scene as a new file, without what was deleted"):
+            selecting.save_and_leave(viewer)
         imgui.same_line()
-    if imgui.button("Save the project"):
-        projects.save_and_leave(viewer, Path.cwd())
-    tip("Everything in one small file; the scene stays as it is")
+    if ui.button("Save the project", "Everything in one small file; the scene stays as it is"):
+        projects.save_and_leave(viewer)
     imgui.same_line()
     if imgui.button("Discard"):
         selecting.discard_and_leave(viewer)
@@ -305,9 +275,8 @@ def _wait_for_film(viewer: Viewer) -> None:
 
 # The panel "Train".
 
-PRESETS: tuple[TrainPreset, ...] = get_args(TrainPreset)
 LOSS_EM = 5.0  # height of its plot
-MEANS = {
+PRESETS: dict[TrainPreset, str] = {
     "quick": "minutes on a CPU",
     "good": "a quarter of an hour and more on a CPU",
     "full": "as published: for a GPU",
@@ -315,7 +284,6 @@ MEANS = {
 
 
 def draw_training(viewer: Viewer) -> None:
-    """Draw the panel "Train": the form, or what a running training says."""
     process = viewer.training
     if process is None:
         _form(viewer)
@@ -329,29 +297,19 @@ def _form(viewer: Viewer) -> None:
         form, dataset=_text_box("Photographs", "a folder, a COLMAP project, transforms.json", form.dataset)
     )
     if imgui.button("Browse ..."):
-        opening.ask_for_folder(viewer, "dataset")
+        browsing.ask_for_folder(viewer, "dataset")
     form = replace(form, out=_text_box("Scene", "scene.ply", form.out))
     form = replace(form, encoder=_text_box("Encoder", '"demo", or a folder or hub id of CLIP', form.encoder))
-    for number, preset in enumerate(PRESETS):
-        if number:
-            beside_boxed(preset)
-        if imgui.radio_button(preset, form.preset == preset):
-            form = replace(form, preset=preset)
-        if imgui.is_item_hovered():
-            imgui.set_tooltip(MEANS[preset])
-    training.fill_in(viewer, form)
+    preset = ui.radio({name: name for name in PRESETS}, form.preset, PRESETS)
+    settings.put(viewer.state, training_form=replace(form, preset=preset))
     if imgui.button("Train"):
-        training.start_training(viewer)
-    small_wrapped("An interrupted training continues where it stopped.", muted())
-    _doubts(viewer)
-
-
-def _doubts(viewer: Viewer) -> None:
+        browsing.start_training(viewer)
+    ui.small_wrapped("An interrupted training continues where it stopped.", ui.muted())
     state = viewer.state
     if state.doubts and state.path is not None:
         imgui.separator_text(f"What speaks against {state.path.name}")
         for doubt in state.doubts:
-            small_wrapped(doubt, bad())
+            ui.small_wrapped(doubt, ui.bad())
 
 
 def _text_box(label: str, hint: str, text: str) -> str:
@@ -364,20 +322,79 @@ def _running(viewer: Viewer, process: Training) -> None:
     progress = process.progress
     imgui.text_unformatted(process.request.out.name)
     for label, fraction in list(progress.stages.items()):
-        small_wrapped(f"{label}: done" if fraction >= 1 else label, muted())
+        ui.small_wrapped(f"{label}: done" if fraction >= 1 else label, ui.muted())
         if fraction < 1:
             imgui.progress_bar(fraction, ImVec2(-1, 0))
     if len(progress.losses) > 1:
         values = np.array(progress.losses, np.float32)
         size = ImVec2(-1, hello_imgui.em_size(LOSS_EM))
         imgui.plot_lines("##loss", values, scale_min=0.0, graph_size=size)
-        tip("How far the pictures are from the photographs, on average: lower is better")
-        imgui.text_colored(muted(), f"loss {values[-1]:.4f}, at first {values[0]:.4f}")
+        ui.tip("How far the pictures are from the photographs, on average: lower is better")
+        imgui.text_colored(ui.muted(), f"loss {values[-1]:.4f}, at first {values[0]:.4f}")
     imgui.separator()
     imgui.progress_bar(progress.overall, ImVec2(-1, 0), progress.left or "starting")
     if imgui.button("Stop"):
-        training.stop_training(viewer)
-    if next_button("Look at it so far"):
-        training.look_at_training(viewer)
+        browsing.stop_training(viewer)
+    if ui.next_button("Look at it so far"):
+        browsing.look_at_training(viewer)
     for line in progress.said[-3:]:
-        small_wrapped(line, muted())
+        ui.small_wrapped(line, ui.muted())
+
+
+# The panel "Library": the scenes of a folder with thumbnails, ranked by a phrase.
+
+THUMBNAIL_EM = 3.6  # of a thumbnail
+
+
+_thumbnails = ui.Picture(shrinks=False)  # all of the list, one below the other
+
+
+def draw_library(viewer: Viewer) -> None:
+    """Draw the folder, the box for a phrase and the list."""
+    view = viewer.state.library
+    if ui.button(
+        "Folder ...", "Search all scenes of a folder and the folders in it. An index of them is kept there"
+    ):
+        browsing.ask_for_folder(viewer, "library")
+    if view is None:
+        return
+    imgui.same_line()
+    imgui.align_text_to_frame_padding()
+    name = str(view.library.folder)
+    imgui.text_colored(ui.muted(), ui.elided(name, imgui.get_content_region_avail().x))
+    ui.tip(name)
+    hint = "what to look for in all of them"
+    entered, typed = ui.box("##library", hint, viewer.state.library_typed)
+    settings.put(viewer.state, library_typed=typed)
+    if entered:
+        browsing.ask_library(viewer, typed)
+    ui.small_wrapped(view.said, ui.muted())
+    if imgui.begin_child("library"):
+        for row, hit in enumerate(view.hits):
+            imgui.push_id(row)
+            _hit(viewer, view, row, hit)
+            imgui.pop_id()
+    imgui.end_child()
+
+
+def _hit(viewer: Viewer, view: LibraryView, row: int, hit: Hit) -> None:
+    """A thumbnail, the scene's name and its verdict; a click anywhere opens the scene."""
+    height = hello_imgui.em_size(THUMBNAIL_EM)
+    width, count = height * THUMBNAIL[0] / THUMBNAIL[1], len(view.hits)
+    start = imgui.get_cursor_pos()
+    if imgui.selectable("##scene", hit.path == viewer.state.path, size=ImVec2(0, height))[0]:
+        browsing.open_hit(viewer, hit)
+    ui.tip(str(hit.path))
+    imgui.set_cursor_pos(start)
+    if view.thumbnails is not None and view.thumbnails.size:
+        texture = _thumbnails.texture(view.thumbnails)
+        ends = ImVec2(0, row / count), ImVec2(1, (row + 1) / count)
+        imgui.image(imgui.ImTextureRef(texture.glo), ImVec2(width, height), *ends)
+    imgui.same_line()
+    imgui.begin_group()
+    room = imgui.get_content_region_avail().x
+    imgui.text(ui.elided(hit.path.relative_to(view.library.folder).as_posix(), room))
+    if view.phrase:
+        sure = "" if hit.probability is None else f" ({100 * hit.probability:.0f} %)"
+        imgui.text_colored(ui.good() if hit.verdict == "found" else ui.muted(), hit.verdict + sure)
+    imgui.end_group()

@@ -4,7 +4,6 @@ import math
 from functools import lru_cache
 from typing import get_args
 
-import numpy as np
 from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
 
 from langsplat_core.arrays import Array
@@ -14,20 +13,9 @@ from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import no_field
 from langsplat_core.scene import CANONICAL_PHRASES, LEVELS
 from langsplat_viewer.actions import queries, settings, viewpoint
+from langsplat_viewer.marks import counted
+from langsplat_viewer.panels import ui
 from langsplat_viewer.panels.overlays import bar_colours, draw_bar
-from langsplat_viewer.panels.style import (
-    bad,
-    beside_boxed,
-    beside_button,
-    button_if,
-    button_width,
-    elided,
-    good,
-    muted,
-    small_wrapped,
-    tip,
-    width_of,
-)
 from langsplat_viewer.state import Query
 from langsplat_viewer.viewer import Viewer
 
@@ -37,9 +25,8 @@ OFFER_LINES = 2  # more are scrolled to
 
 
 def _box(viewer: Viewer) -> None:
-    """Draw the search box, its button and the suggestions."""
     queries.prepare_suggestions(viewer)
-    imgui.set_next_item_width(beside_button("Search"))
+    imgui.set_next_item_width(ui.beside_button("Search"))
     if queries.take_search_focus(viewer):
         imgui.set_keyboard_focus_here()
     flags = imgui.InputTextFlags_.enter_returns_true | imgui.InputTextFlags_.callback_history
@@ -57,21 +44,10 @@ def _box(viewer: Viewer) -> None:
 
     typed = viewer.state.typed
     entered, typed = imgui.input_text_with_hint("##phrase", hint(viewer), typed, flags, recalled)
-    queries.type_phrase(viewer, typed)
+    settings.put(viewer.state, typed=typed)
     imgui.same_line()
     if imgui.button("Search") or entered:
         queries.ask_typed(viewer)
-    _offers(viewer)
-
-
-def hint(viewer: Viewer) -> str:
-    """Return the hint of the empty box: examples of this scene, once they are known."""
-    examples = viewer.state.suggestions.examples[:HINT_EXAMPLES]
-    return ", ".join((*examples, "...")) if examples else HINT
-
-
-def _offers(viewer: Viewer) -> None:
-    """Small buttons, as many in a row as fit, where there is anything to offer."""
     title, phrases = queries.offers(viewer)
     if not phrases:
         return
@@ -81,22 +57,27 @@ def _offers(viewer: Viewer) -> None:
     imgui.end_child()
 
 
+def hint(viewer: Viewer) -> str:
+    """Return the hint of the empty box: examples of this scene, once they are known."""
+    examples = viewer.state.suggestions.examples[:HINT_EXAMPLES]
+    return ", ".join((*examples, "...")) if examples else HINT
+
+
 def _offer_buttons(viewer: Viewer, title: str, phrases: tuple[str, ...]) -> None:
-    imgui.text_colored(muted(), title)
+    imgui.text_colored(ui.muted(), title)
     for number, phrase in enumerate(phrases):
         imgui.same_line()
-        if imgui.get_content_region_avail().x < button_width(phrase):
+        if imgui.get_content_region_avail().x < ui.button_width(phrase):
             imgui.new_line()
-        shown = elided(phrase, imgui.get_content_region_avail().x - button_width(""), width_of)
+        shown = ui.elided(phrase, imgui.get_content_region_avail().x - ui.button_width(""))
         if imgui.small_button(f"{shown}###offer {number}"):
             queries.ask_offered(viewer, phrase)
         if shown != phrase:
-            tip(phrase)
+            ui.tip(phrase)
 
 
 # The threshold of an answer: a histogram of its relevancies, and a slider over it.
 
-BINS = 64
 HISTOGRAM_EM = 3.0
 
 
@@ -112,27 +93,24 @@ def _cut(viewer: Viewer, query: Query, result: QueryResult) -> None:
     colour = imgui.get_color_u32(imgui.Col_.text)
     imgui.get_window_draw_list().add_line(ImVec2(x, corner.y), ImVec2(x, corner.y + size.y), colour, 2.0)
     own = result.own_cut is not None
-    imgui.set_next_item_width(beside_button("Auto") if own else -1)
+    imgui.set_next_item_width(ui.beside_button("Auto") if own else -1)
     changed, value = imgui.slider_float("##cut", result.cut, low, high, "ends at %.3f")
-    tip("What is less relevant than this is no part of the answer; one set by hand stays, whatever the level")
+    ui.tip(
+        "What is less relevant than this is no part of the answer; one set by hand stays, whatever the level"
+    )
     if changed:
         queries.set_cut(viewer, query, value, is_new=not own)
     if own:
         imgui.same_line()
         if imgui.button("Auto"):
             queries.set_cut(viewer, query, None)
-    imgui.text_colored(muted(), f"{int(result.members.sum()):,} Gaussians")
+    imgui.text_colored(ui.muted(), f"{int(result.members.sum()):,} Gaussians")
 
 
 @lru_cache(maxsize=8)
 def histogram(result: QueryResult) -> tuple[float, float, Array]:
-    """Lowest and highest relevancy of an answer, and (BINS,) float32 log(1 + n) of how many Gaussians have
-    which."""
-    values = result.even[np.isfinite(result.even)]
-    low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
-    high = max(high, low + 1e-3)
-    counts, _ = np.histogram(values, BINS, (low, high))
-    return low, high, np.log1p(counts).astype(np.float32)
+    """The relevancies of an answer, as `marks.counted` has them."""
+    return counted(result.even, 1e-3)
 
 
 # The list of queries.
@@ -149,7 +127,7 @@ def _answers(viewer: Viewer) -> None:
     rows = rows_shown(len(viewer.state.queries), imgui.get_content_region_avail().y / row)
     if imgui.begin_child("queries", ImVec2(0, rows * row), imgui.ChildFlags_.nav_flattened):
         if not viewer.state.queries:
-            imgui.text_colored(muted(), "what you search is listed here")
+            imgui.text_colored(ui.muted(), "what you search is listed here")
         for query in reversed(viewer.state.queries):
             imgui.push_id(query.phrase)
             _line(viewer, query)
@@ -174,7 +152,7 @@ def _line(viewer: Viewer, query: Query) -> None:
     _swatch(viewer, query, side)
     imgui.same_line()
     chosen = viewer.state.selected is query
-    name = elided(query.phrase, room, width_of)
+    name = ui.elided(query.phrase, room)
     if imgui.selectable(f"{name}##phrase of list", chosen, size=ImVec2(room, 0))[0]:
         queries.select(viewer, query)
     if name != query.phrase and imgui.is_item_hovered():
@@ -198,7 +176,7 @@ def _swatch(viewer: Viewer, query: Query, side: float) -> None:
             queries.hide(viewer, query)
         else:
             queries.show(viewer, query)
-    tip("Click to hide" if shown else "Click to show")
+    ui.tip("Click to hide" if shown else "Click to show")
     state = viewer.state
     alone = state.picture.display == "relevancy" and len(painted(state.shown_results())) == 1
     if shown and alone and query.result is not None:  # painted by the colour map
@@ -208,11 +186,11 @@ def _swatch(viewer: Viewer, query: Query, side: float) -> None:
 
 def _verdict(query: Query) -> None:
     if query.pending:
-        imgui.text_colored(muted(), "...")
+        imgui.text_colored(ui.muted(), "...")
     elif query.problem:
-        imgui.text_colored(bad(), "not asked")
+        imgui.text_colored(ui.bad(), "not asked")
     elif query.result is not None:
-        imgui.text_colored(good() if query.result.found else muted(), query.result.verdict)
+        imgui.text_colored(ui.good() if query.result.found else ui.muted(), query.result.verdict)
         probability = query.result.probability
         if imgui.is_item_hovered() and probability is not None:
             imgui.set_tooltip(f"{100 * probability:.0f} % likely to be there")
@@ -222,21 +200,24 @@ def _details(viewer: Viewer, query: Query) -> None:
     """Place and a button to go there, scores per level, how it was read or why it was not answered."""
     result = query.result
     place = None if result is None or result.verdict == "not here" else result.place
-    if button_if("Focus", place is not None):
+    if ui.button("Focus", enabled=place is not None):
         viewpoint.focus_result(viewer, query)
     imgui.same_line()
-    if button_if("Why?", result is not None):
+    if ui.button(
+        "Why?",
+        "The photographs and masks that the answer stands on, the best and the worst",
+        enabled=result is not None,
+    ):
         queries.explain(viewer, query)
-    tip("The photographs and masks that the answer stands on, the best and the worst")
     imgui.same_line()
     _combine(viewer, query)
     if place is not None:
-        imgui.text_colored(muted(), "at " + "  ".join(f"{v:.2f}" for v in place))
-        tip("Where it is relevant most; world units")
+        imgui.text_colored(ui.muted(), "at " + "  ".join(f"{v:.2f}" for v in place))
+        ui.tip("Where it is relevant most; world units")
     if query.problem:
-        small_wrapped(query.problem, bad())
+        ui.small_wrapped(query.problem, ui.bad())
     if query.reading:
-        small_wrapped(f"read as: {query.reading}", muted())
+        ui.small_wrapped(f"read as: {query.reading}", ui.muted())
     if result is not None:
         for index, (name, score) in enumerate(zip(LEVELS, result.scores, strict=True)):
             if index:
@@ -245,17 +226,18 @@ def _details(viewer: Viewer, query: Query) -> None:
             if index == result.level:
                 imgui.text(text)
             else:
-                imgui.text_colored(muted(), text)
-            tip(f"The best relevancy at the level '{name}'; the brighter one answers")
+                imgui.text_colored(ui.muted(), text)
+            ui.tip(f"The best relevancy at the level '{name}'; the brighter one answers")
         _cut(viewer, query, result)
 
 
 def _combine(viewer: Viewer, query: Query) -> None:
     """A menu of the other queries, to search for what both, either or only this one finds."""
     others = [other for other in viewer.state.queries if other is not query]
-    if button_if("Combine", bool(others)):
+    if ui.button(
+        "Combine", "Search for this and, or, without another query of the list", enabled=bool(others)
+    ):
         imgui.open_popup("combine")
-    tip("Search for this and, or, without another query of the list")
     if not imgui.begin_popup("combine"):
         return
     for join in queries.JOINS:
@@ -269,14 +251,17 @@ def _combine(viewer: Viewer, query: Query) -> None:
 
 # The panel.
 
-CHOICES: tuple[LevelChoice, ...] = get_args(LevelChoice)
+LEVEL_TIPS: dict[LevelChoice, str] = {
+    name: "The level that answers best" if name == "auto" else "How finely things are divided"
+    for name in get_args(LevelChoice)
+}
 
 
 def draw(viewer: Viewer) -> None:
     """Draw the search box, the level and the list of queries."""
     scene = viewer.state.scene
     if scene is not None and scene.language is None:
-        small_wrapped(no_field(scene), muted())
+        ui.small_wrapped(no_field(scene), ui.muted())
         return
     imgui.begin_disabled(scene is None)
     imgui.begin_group()
@@ -284,30 +269,27 @@ def draw(viewer: Viewer) -> None:
     imgui.end_group()
     hovered = imgui.is_item_hovered(imgui.HoveredFlags_.allow_when_disabled)
     if scene is None and hovered and imgui.is_mouse_clicked(imgui.MouseButton_.left):
-        settings.mute_letters(viewer, True)  # what is typed now was meant for the box
+        settings.put(viewer.state, letters_muted=True)  # what is typed now was meant for the box
     _level(viewer)
     imgui.end_disabled()
     if viewer.engine is not None:
         basis = viewer.engine.basis
-        small_wrapped(basis.short, bad() if basis.guesses else muted())
-        tip(basis.long)
+        ui.small_wrapped(basis.short, ui.bad() if basis.guesses else ui.muted())
+        ui.tip(basis.long)
     _answers(viewer)
     _canonical(viewer)
 
 
 def _canonical(viewer: Viewer) -> None:
-    """Draw the canonical phrases."""
     opened = imgui.collapsing_header("Compared with")
-    tip("Everyday phrases: relevancy is how much nearer a place is to yours than to these")
+    ui.tip("Everyday phrases: relevancy is how much nearer a place is to yours than to these")
     if not opened:
         return
     state = viewer.state
-    small_wrapped("a place is relevant where it is nearer to the phrase than to all of these", muted())
-    imgui.set_next_item_width(-1)
+    ui.small_wrapped("a place is relevant where it is nearer to the phrase than to all of these", ui.muted())
     hint = ", ".join(state.canonical or CANONICAL_PHRASES)
-    flags = imgui.InputTextFlags_.enter_returns_true
-    entered, typed = imgui.input_text_with_hint("##canonical", hint, state.canonical_typed, flags)
-    queries.type_canonical(viewer, typed)
+    entered, typed = ui.box("##canonical", hint, state.canonical_typed)
+    settings.put(state, canonical_typed=typed)
     if entered:
         queries.set_canonical(viewer, typed)
     if state.canonical and imgui.button("The scene's own"):
@@ -317,8 +299,5 @@ def _canonical(viewer: Viewer) -> None:
 def _level(viewer: Viewer) -> None:
     imgui.align_text_to_frame_padding()
     imgui.text("Level")
-    for choice in CHOICES:
-        beside_boxed(choice)
-        if imgui.radio_button(choice, viewer.state.level == choice):
-            queries.set_level(viewer, choice)
-        tip("The level that answers best" if choice == "auto" else "How finely things are divided")
+    ui.beside_boxed(next(iter(LEVEL_TIPS)))
+    queries.set_level(viewer, ui.radio({name: name for name in LEVEL_TIPS}, viewer.state.level, LEVEL_TIPS))

@@ -1,32 +1,26 @@
-"""The panel "Select", and the strokes of its tools over the scene."""
+"""The panels "Select" and "Transform", and the strokes of tools and the gizmo over the scene."""
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
-from imgui_bundle import ImVec2, hello_imgui, imgui
+import numpy as np
+from imgui_bundle import ImVec2, hello_imgui, imgui, imguizmo
 
 from langsplat_core.arrays import Array
+from langsplat_core.errors import LangSplatError
+from langsplat_core.scene import Camera
+from langsplat_core.scene.transform import Similarity, moving, scaling, similarity
 from langsplat_viewer import marks
-from langsplat_viewer.actions import queries, selecting
+from langsplat_viewer.actions import editing, queries, selecting, settings
 from langsplat_viewer.commands import with_key
 from langsplat_viewer.marks import BRUSHES, MODES, REACHES, TOOLS, Marks, Mode, Tool
+from langsplat_viewer.panels import ui
 from langsplat_viewer.panels.overlays import say
-from langsplat_viewer.panels.style import (
-    Area,
-    beside,
-    beside_boxed,
-    box_with_button,
-    button_if,
-    elided,
-    leave_room,
-    muted,
-    next_button,
-    small_wrapped,
-    tip,
-    width_of,
-)
 from langsplat_viewer.rendering.request import TINT
+from langsplat_viewer.state import EditForm, Gizmo, Point
 from langsplat_viewer.viewer import Viewer
 
 Verb = tuple[str, Callable[[Viewer], object], str]  # button, action, tip
@@ -68,12 +62,15 @@ FILES: tuple[Verb, ...] = (
 def draw(viewer: Viewer) -> None:
     """Draw the panel "Select": counts, tools, the search, verbs, files."""
     imgui.begin_disabled(viewer.state.scene is None)
-    small_wrapped(counts(viewer.state.selection.marks), muted())
+    ui.small_wrapped(counts(viewer.state.selection.marks), ui.muted())
     _tools(viewer)
     _found(viewer)
     imgui.separator()
     _buttons(viewer, CHANGES)
-    selecting.set_reach(viewer, _slider("Reach", viewer.state.selection.reach, REACHES, "%.3f of the scene"))
+    reach = ui.slider(
+        "Reach", viewer.state.selection.reach, REACHES, "%.3f of the scene", logarithmic=True, ems=12
+    )
+    selecting.set_reach(viewer, reach)
     _name(viewer)
     imgui.separator()
     _values(viewer)
@@ -97,49 +94,46 @@ def _tools(viewer: Viewer) -> None:
     for place, tool in enumerate(TOOLS):
         active = selection.tool == tool
         if place:
-            beside(tool)
+            ui.beside(tool)
         colour = imgui.Col_.button_active if active else imgui.Col_.button
         imgui.push_style_color(imgui.Col_.button, imgui.get_style_color_vec4(colour))
         if imgui.button(f"{tool.capitalize()}##tool"):
             selecting.use_tool(viewer, None if active else tool)
         imgui.pop_style_color()
-    for place, mode in enumerate(MODES):
-        if place:
-            beside_boxed(mode)
-        if imgui.radio_button(mode.capitalize(), selection.mode == mode):
-            selecting.set_mode(viewer, mode)
+    selecting.set_mode(viewer, ui.radio({mode: mode.capitalize() for mode in MODES}, selection.mode))
     _, only = imgui.checkbox("Only what is visible", selection.only_visible)
     selecting.set_only_visible(viewer, only)
-    tip("Rectangle, lasso and brush leave out what lies behind something")
+    ui.tip("Rectangle, lasso and brush leave out what lies behind something")
     if selection.tool == "brush":
-        selecting.set_brush(viewer, _slider("Brush", selection.brush, BRUSHES, "%.3f of the height"))
+        brush = ui.slider("Brush", selection.brush, BRUSHES, "%.3f of the height", logarithmic=True, ems=12)
+        selecting.set_brush(viewer, brush)
 
 
 def _found(viewer: Viewer) -> None:
-    """Draw buttons that select an answer, whole or thing by thing."""
     query = selecting.chosen_query(viewer)
     if query is None or query.result is None:
         return
-    name = elided(query.phrase, imgui.get_content_region_avail().x - hello_imgui.em_size(4), width_of)
-    if imgui.button(f"Found: {name}##found"):
+    name = ui.elided(query.phrase, imgui.get_content_region_avail().x - hello_imgui.em_size(4))
+    if ui.button(f"Found: {name}##found", "Select what the search has found"):
         selecting.select_query(viewer, query)
-    tip("Select what the search has found")
     if query.result.verdict == "not here" or len(query.things) < 2:
         return
     for number, thing in enumerate(query.things, 1):
-        if next_button(f"{number}##thing"):
+        if ui.next_button(
+            f"{number}##thing",
+            f"{thing.count:,} Gaussians, {100 * thing.share:.0f} % of the answer, score {thing.score:.2f}",
+        ):
             selecting.select_thing(viewer, thing)
-        tip(f"{thing.count:,} Gaussians, {100 * thing.share:.0f} % of the answer, score {thing.score:.2f}")
 
 
 def _name(viewer: Viewer) -> None:
     """Draw the box for a name by which what is selected is found from now on."""
     hint, name = "a name for what is selected", viewer.state.selection.name
-    entered, typed = box_with_button("##name", hint, name, "Name it")
+    entered, typed = ui.box_with_button("##name", hint, name, "Name it")
     queries.type_name(viewer, typed)
     if entered:
         queries.name_selection(viewer)
-    tip("Searching for the name finds this, and what is like it")
+    ui.tip("Searching for the name finds this, and what is like it")
 
 
 HISTOGRAM_EM = 3.0
@@ -150,14 +144,12 @@ def _values(viewer: Viewer) -> None:
     if not imgui.collapsing_header("By numbers"):
         return
     selection = viewer.state.selection
-    for place, measure in enumerate(marks.MEASURES):
-        if place:
-            beside_boxed(measure)
-        if imgui.radio_button(measure.capitalize(), selection.measure == measure):
-            selecting.set_measure(viewer, measure)
+    measure = ui.radio({name: name.capitalize() for name in marks.MEASURES}, selection.measure)
+    if measure != selection.measure:
+        selecting.set_measure(viewer, measure)
     found = selecting.values_shown(viewer)
     if found is None:
-        small_wrapped("search for something first", muted())
+        ui.small_wrapped("search for something first", ui.muted())
         return
     size = ImVec2(imgui.get_content_region_avail().x, hello_imgui.em_size(HISTOGRAM_EM))
     corner = imgui.get_cursor_screen_pos()
@@ -176,13 +168,11 @@ def _values(viewer: Viewer) -> None:
         paint = imgui.get_window_draw_list()
         paint.add_rect_filled(ImVec2(left, corner.y), ImVec2(right, corner.y + size.y), _colour(PAINT))
     start, stop = sorted(brushed) if brushed else (0.0, 1.0)
-    imgui.set_next_item_width(-1)
     hint = f"{_value(viewer, found, start)} to {_value(viewer, found, stop)}"
-    flags = imgui.InputTextFlags_.enter_returns_true
-    entered, typed = imgui.input_text_with_hint("##range", hint, "", flags)
+    entered, typed = ui.box("##range", hint, "")
     if entered:
         selecting.select_range(viewer, typed)
-    tip("Drag over the histogram, or type two numbers; Shift adds, Ctrl removes, both intersect")
+    ui.tip("Drag over the histogram, or type two numbers; Shift adds, Ctrl removes, both intersect")
 
 
 def _value(viewer: Viewer, found: marks.Histogram, part: float) -> str:
@@ -194,17 +184,9 @@ def _buttons(viewer: Viewer, verbs: Sequence[Verb]) -> None:
     nothing = not viewer.state.selection.marks.selected.any()
     for place, (name, act, what) in enumerate(verbs):
         if place:
-            beside(name)
-        if button_if(f"{name}##verb", not (nothing and name in OF_SELECTED)):
+            ui.beside(name)
+        if ui.button(f"{name}##verb", with_key(what, act), enabled=not (nothing and name in OF_SELECTED)):
             act(viewer)
-        tip(with_key(what, act))
-
-
-def _slider(label: str, value: float, limits: tuple[float, float], text: str) -> float:
-    leave_room(label, 12)
-    flags = imgui.SliderFlags_.always_clamp | imgui.SliderFlags_.logarithmic
-    _, value = imgui.slider_float(label, value, *limits, text, flags)
-    return value
 
 
 # Strokes: the left button while a tool selects.
@@ -222,7 +204,7 @@ LIGHT, DARK = (1.0, 1.0, 1.0, 0.95), (0.0, 0.0, 0.0, 0.6)  # a line in two colou
 PAINT = (float(TINT[0]), float(TINT[1]), float(TINT[2]), 0.35)
 
 
-def handle_stroke(viewer: Viewer, area: Area) -> None:
+def handle_stroke(viewer: Viewer, area: ui.Area) -> None:
     """Begin a stroke, go on with it, or end it; once per frame."""
     io, selection = imgui.get_io(), viewer.state.selection
     if selection.tool is None:
@@ -246,7 +228,7 @@ def held_mode() -> Mode | None:
     return "add" if io.key_shift else "remove" if io.key_ctrl else None
 
 
-def draw_stroke(viewer: Viewer, area: Area) -> None:
+def draw_stroke(viewer: Viewer, area: ui.Area) -> None:
     """Draw the outline of what is being enclosed, and the brush."""
     selection = viewer.state.selection
     if selection.tool is None or viewer.state.scene is None:
@@ -268,7 +250,7 @@ def draw_stroke(viewer: Viewer, area: Area) -> None:
     paint.pop_clip_rect()
 
 
-def _on_screen(line: Array, area: Area) -> list[Any]:
+def _on_screen(line: Array, area: ui.Area) -> list[Any]:
     """(K, 2) fractions of the area -> window units."""
     return [ImVec2(area.left + u * area.width, area.top + v * area.height) for u, v in line.tolist()]
 
@@ -281,7 +263,7 @@ def _stripe(paint: Any, points: list[Any], radius: float) -> None:
         paint.add_polyline(points, _colour(PAINT), 2 * radius, 0)
 
 
-def draw_hint(viewer: Viewer, area: Area) -> None:
+def draw_hint(viewer: Viewer, area: ui.Area) -> None:
     """Say what a click on the scene does, while it does not turn the view."""
     state, tool = viewer.state, viewer.state.selection.tool
     if state.ruler.measures:
@@ -297,3 +279,172 @@ def draw_hint(viewer: Viewer, area: Area) -> None:
 
 def _colour(colour: tuple[float, float, float, float]) -> Any:
     return imgui.get_color_u32(colour)
+
+
+# The panel "Transform": gizmo, numbers, crop box; and the gizmo over the scene.
+
+gizmo = imguizmo.im_guizmo
+OPERATIONS = {
+    "move": gizmo.OPERATION.translate,
+    "rotate": gizmo.OPERATION.rotate,
+    "scale": gizmo.OPERATION.scale,
+}
+GIZMOS: dict[Gizmo, str] = {
+    kind: f"{'No gizmo' if kind == 'off' else kind.capitalize()}##gizmo" for kind in get_args(Gizmo)
+}
+NEAR, FAR = 1e-3, 1e3  # depths that the gizmo's camera sees, of the distance to what it turns around
+
+
+def draw_transform(viewer: Viewer) -> None:
+    """Draw the panel "Transform": what is transformed, gizmo, numbers, box."""
+    state = viewer.state
+    imgui.begin_disabled(state.scene is None)
+    chosen = int(state.selection.marks.selected.sum())
+    what = f"{chosen:,} selected Gaussians" if chosen else "The whole scene, with its cameras"
+    ui.small_wrapped(what, ui.muted())
+    form = replace(state.edit_form, gizmo=ui.radio(GIZMOS, state.edit_form.gizmo))
+    settings.put(state, edit_form=_numbers(form))
+    if ui.button("Apply", "Scale and rotate about the middle of what is transformed, then move"):
+        editing.apply_form(viewer)
+    imgui.separator()
+    _crop_box(viewer)
+    if ui.button("Fit", "The box around the selection, or around everything"):
+        editing.fill_box(viewer)
+    if ui.next_button("Crop", "Delete what lies outside the box; the file stays as it is"):
+        editing.crop(viewer)
+    ui.beside_boxed("Clip")
+    changed, clips = imgui.checkbox("Clip", state.edit_form.clips)
+    if changed:
+        editing.clip(viewer, clips)
+    ui.tip("Hide what lies outside the box, and follow its handles")
+    imgui.end_disabled()
+
+
+def _numbers(form: EditForm) -> EditForm:
+    move = _three("Move", form.move, "World units along x, y and z")
+    rotate = _three("Rotate", form.rotate, "Degrees about x, then y, then z, right-handed")
+    ui.leave_room("Scale", 12)
+    _, scale = imgui.input_float("Scale", form.scale, 0, 0, "%.5g")
+    return replace(form, move=move, rotate=rotate, scale=scale)
+
+
+def _crop_box(viewer: Viewer) -> None:
+    form = viewer.state.edit_form
+    low = _three("From", form.low, "A corner of the box, world units")
+    high = _three("To", form.high, "The opposite corner")
+    if (low, high) != (form.low, form.high):
+        editing.set_box(viewer, low, high)
+        editing.follow_box(viewer)
+
+
+def _three(label: str, values: Point, what: str) -> Point:
+    ui.leave_room(label, 16)
+    _, (x, y, z) = imgui.input_float3(label, list(values), "%.5g")
+    ui.tip(what)
+    return x, y, z
+
+
+# The gizmo over the scene. ImGuizmo edits a matrix that lies in the middle of what is transformed.
+
+
+def _is_shown(viewer: Viewer) -> bool:
+    """Whether there is a gizmo: none under what lies over the scene."""
+    state = viewer.state
+    covered = state.show_help or state.show_palette or imgui.is_popup_open("", imgui.PopupFlags_.any_popup)
+    return state.edit_form.gizmo != "off" and state.scene is not None and not covered
+
+
+def holds_mouse(viewer: Viewer) -> bool:
+    """Return whether the mouse is on a gizmo, or drags it."""
+    return _is_shown(viewer) and bool(gizmo.is_using() or gizmo.is_over())
+
+
+def draw_gizmo(viewer: Viewer, area: ui.Area) -> None:
+    """Draw the chosen gizmo where it was dragged to; what it moves follows, and stays on release."""
+    state = viewer.state
+    kind = state.edit_form.gizmo
+    if not _is_shown(viewer) or state.view is None or state.settings.split.columns > 1:
+        return
+    centre = editing.pivot(viewer)
+    if centre is None:
+        return
+    camera = state.view.camera(*area.size)
+    view, projection = gl_matrices(camera, state.view.distance)
+    paint = imgui.get_foreground_draw_list()
+    paint.push_clip_rect(*area.corners)
+    gizmo.begin_frame()
+    gizmo.set_drawlist(paint)
+    gizmo.set_rect(area.left, area.top, area.width, area.height)
+    gizmo.set_orthographic(camera.orthographic)
+    seen = gizmo.Matrix16(_columns(view)), gizmo.Matrix16(_columns(projection))
+    if kind == "box":
+        _box_handles(viewer, seen)
+    else:
+        _handles(viewer, seen, kind, centre)
+    paint.pop_clip_rect()
+
+
+def _handles(viewer: Viewer, seen: tuple[Any, Any], kind: str, centre: Array) -> None:
+    """Arrows, rings or knobs: what is dragged is previewed, on release it is done."""
+    start, held = moving(centre).matrix, viewer.state.moving
+    edited = gizmo.Matrix16(_columns(start if held is None else held[0].to.matrix @ start))
+    changed = gizmo.manipulate(*seen, OPERATIONS[kind], gizmo.MODE.world, edited)
+    if gizmo.is_using():
+        if changed:
+            with suppress(LangSplatError):  # turned inside out: what it was before stays
+                editing.preview(viewer, dragged(start, np.array(edited.values).reshape(4, 4).T))
+    elif held is not None:
+        editing.transform(viewer, held[0].to)
+
+
+def _box_handles(viewer: Viewer, seen: tuple[Any, Any]) -> None:
+    """The box of the panel with handles on its corners and edges; on release the clip follows."""
+    form, unit = viewer.state.edit_form, gizmo.Matrix6([-0.5, -0.5, -0.5, 0.5, 0.5, 0.5])
+    corners = np.array([form.low, form.high])
+    matrix = np.diag([*np.maximum(np.ptp(corners, axis=0), 1e-6), 1.0])
+    matrix[:3, 3] = corners.mean(0)
+    edited = gizmo.Matrix16(_columns(matrix))
+    operation, mode = gizmo.OPERATION.bounds, gizmo.MODE.local
+    if gizmo.manipulate(*seen, operation, mode, edited, local_bounds=unit):
+        low, high = box_of(np.array(edited.values).reshape(4, 4).T)
+        editing.set_box(viewer, low, high)
+    elif not gizmo.is_using():
+        editing.follow_box(viewer)
+
+
+def box_of(matrix: Array) -> tuple[Point, Point]:
+    """Lowest and highest corner of the unit cube about the origin after a (4, 4) matrix without rotation."""
+    half = np.abs(np.diag(matrix)[:3]) / 2
+    low, high = (tuple(map(float, matrix[:3, 3] + sign * half)) for sign in (-1, 1))
+    return (low[0], low[1], low[2]), (high[0], high[1], high[2])
+
+
+def dragged(start: Array, now: Array) -> Similarity:
+    """The similarity that leads from one (4, 4) matrix to another; of unlike scales the one that changed the
+    most. Raises InputError where there is none."""
+    change = now @ np.linalg.inv(start)
+    scales = np.linalg.norm(now[:3, :3], axis=0) / np.linalg.norm(start[:3, :3], axis=0)
+    if np.ptp(scales) < 1e-5:
+        return similarity(change)
+    factor = float(scales[np.argmax(np.abs(np.log(np.maximum(scales, 1e-12))))])
+    return scaling(factor).about(start[:3, 3])
+
+
+def gl_matrices(camera: Camera, distance: float) -> tuple[Array, Array]:
+    """View and projection (4, 4) of a camera as OpenGL has them: y up, z towards the eye, depths -1 to 1."""
+    view = np.diag([1.0, -1.0, -1.0, 1.0]) @ camera.world_to_camera
+    near, far = NEAR * distance, FAR * distance
+    projection = np.zeros((4, 4))
+    projection[0, 0], projection[1, 1] = 2 * camera.fx / camera.width, 2 * camera.fy / camera.height
+    off = np.array([2 * camera.cx / camera.width - 1, 1 - 2 * camera.cy / camera.height])
+    if camera.orthographic:
+        projection[:2, 3], projection[2, 2], projection[3, 3] = off, -2 / (far - near), 1
+        projection[2, 3] = -(far + near) / (far - near)
+    else:
+        projection[:2, 2], projection[2, 2], projection[3, 2] = -off, -(far + near) / (far - near), -1
+        projection[2, 3] = -2 * far * near / (far - near)
+    return view, projection
+
+
+def _columns(matrix: Array) -> list[float]:
+    return [float(number) for number in matrix.T.ravel()]

@@ -1,76 +1,70 @@
-"""The panels "Display", "Camera" and "Overlays"."""
+"""The panels "Display", "Camera", "Overlays", "Notes", "Record" and "Bookmarks"."""
 
 import math
 from dataclasses import replace
 from itertools import groupby
-from pathlib import Path
 
-from imgui_bundle import ImVec2, imgui
+from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, DisplayRow
 from langsplat_core.query.answers import FLOOR
 from langsplat_core.scene import LEVELS
-from langsplat_viewer.actions import opening, projects, settings, viewpoint
+from langsplat_viewer.actions import browsing, filming, opening, projects, settings, viewpoint
 from langsplat_viewer.camera.controls import FOV_RANGE, OrbitCamera, adopt_up, level, with_fov
+from langsplat_viewer.camera.flight import Keyframe
 from langsplat_viewer.camera.overlays import length_text
-from langsplat_viewer.commands import BUTTONS, OVERLAY_TITLES, Button, buttons_of, with_key
-from langsplat_viewer.panels.style import (
-    beside_boxed,
-    button_if,
-    leave_room,
-    muted,
-    next_button,
-    small_wrapped,
-    tip,
-)
-from langsplat_viewer.rendering.depth import Clip
-from langsplat_viewer.rendering.request import MOST_DEGREE, SIZE_RANGE, Splats
+from langsplat_viewer.commands import BUTTONS, OVERLAY_TITLES, Button, buttons_of, is_shown, with_key
+from langsplat_viewer.panels import ui
+from langsplat_viewer.rendering.request import MOST_DEGREE, SIZE_RANGE, Clip, Splats
+from langsplat_viewer.state import FPS_CHOICES
 from langsplat_viewer.viewer import Viewer
 
 CUT_RANGE = (0.01, 20.0)  # of the scene's radius, the least and most that a cut can be chosen
-WIDTH_EM = 11.0  # of sliders and lists, where there is room
+WIDTH_EM = 11.0  # of lists and of sliders of `ui`, where there is room
 LEAST_SPAN = 1e-3  # of a heat scale
-BACKDROPS = {"Black": 0.0, "Grey": 0.5, "White": 1.0}
+BACKDROPS = {(grey, grey, grey): name for name, grey in (("Black", 0.0), ("Grey", 0.5), ("White", 1.0))}
 
 
 def draw_display(viewer: Viewer) -> None:
-    """Draw the panel "Display"."""
     for _, group in groupby(DISPLAYS.values(), lambda row: row.name if row.by_level else row.needs_query):
         _display_line(viewer, tuple(group))
     _compared(viewer)
     picture = viewer.state.picture
     needs_query = DISPLAYS[picture.display].needs_query
     if needs_query and not viewer.state.shown():
-        small_wrapped("search for something to see where it is", muted())
+        ui.small_wrapped("search for something to see where it is", ui.muted())
     if picture.display == "relevancy":
-        picture = replace(picture, heat_opacity=_slider("Heat opacity", picture.heat_opacity, 0.0, 1.0))
+        picture = replace(picture, heat_opacity=ui.slider("Heat opacity", picture.heat_opacity, (0.0, 1.0)))
         picture = replace(picture, heat_scale=_heat_scale(viewer))
     if needs_query:
-        picture = replace(picture, dim=_slider("Rest dimmed to", picture.dim, 0.0, 1.0))
-    _colour_map(viewer)
+        picture = replace(picture, dim=ui.slider("Rest dimmed to", picture.dim, (0.0, 1.0)))
+    if any(pane.row.uses_map for pane in viewer.state.panes()):
+        names = list(COLOUR_MAPS)
+        ui.leave_room("Colour map", WIDTH_EM)
+        changed, chosen = imgui.combo("Colour map", names.index(picture.colour_map), list(names))
+        if changed:
+            settings.set_colour_map(viewer, names[chosen])
     picture = replace(picture, colour_map=viewer.state.picture.colour_map)
     settings.set_picture(viewer, replace(picture, background=_backdrop(picture.background)))
-    tip("What shows where the scene is not")
-    transparent = viewer.state.settings.transparent
-    changed, transparent = imgui.checkbox("Save without backdrop", transparent)
+    ui.tip("What shows where the scene is not")
+    changed, transparent = imgui.checkbox("Save without backdrop", viewer.state.settings.transparent)
     if changed:
         settings.save_transparent(viewer, transparent)
-    tip("Pictures are saved transparent where the scene is not")
+    ui.tip("Pictures are saved transparent where the scene is not")
     _splats(viewer)
 
 
 def _splats(viewer: Viewer) -> None:
-    """Draw the settings of the Gaussians' appearance."""
     scene, splats = viewer.state.scene, viewer.state.settings.splats
-    size = _slider("Splat size", splats.size, *SIZE_RANGE)
-    tip("Smaller, every Gaussian can be seen; answers and files do not change")
+    size = ui.slider("Splat size", splats.size, SIZE_RANGE)
+    ui.tip("Smaller, every Gaussian can be seen; answers and files do not change")
     degree, most = splats.sh_degree, MOST_DEGREE if scene is None else scene.gaussians.sh_degree
     if most > 0:
-        leave_room("SH degree", WIDTH_EM)
+        ui.leave_room("SH degree", WIDTH_EM)
         flags = imgui.SliderFlags_.always_clamp
         changed, chosen = imgui.slider_int("SH degree", min(degree, most), 0, most, "%d", flags)
         degree = (MOST_DEGREE if chosen == most else chosen) if changed else degree
-        tip("Up to which degree colours change with the direction that they are seen from")
+        ui.tip("Up to which degree colours change with the direction that they are seen from")
     settings.set_splats(viewer, Splats(size, degree))
 
 
@@ -78,46 +72,31 @@ def _heat_scale(viewer: Viewer) -> tuple[float, float] | None:
     """Relevancies at the ends of the colour bar: each answer's own, or the same for all."""
     scale = viewer.state.picture.heat_scale
     changed, fixed = imgui.checkbox("Fixed heat scale", scale is not None)
-    tip("The same colour means the same relevancy in every answer, image and scene")
+    ui.tip("The same colour means the same relevancy in every answer, image and scene")
     if changed:
         own = [result.heat_range for result in viewer.state.shown_results() if result is not None]
         lows, highs = zip(*own, strict=True) if own else ((FLOOR,), (1.0,))
         return (min(lows), max(highs)) if fixed else None
     if scale is None:
         return None
-    leave_room("From, to", WIDTH_EM)
+    ui.leave_room("From, to", WIDTH_EM)
     flags = imgui.SliderFlags_.always_clamp
     changed, low, high = imgui.drag_float_range2("From, to", *scale, 0.002, 0.0, 1.0, "%.3f", "%.3f", flags)
     return (low, high) if changed and high - low > LEAST_SPAN else scale
 
 
 def _backdrop(background: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Three to choose from, and one's own."""
-    for place, (name, grey) in enumerate(BACKDROPS.items()):
-        if place:
-            beside_boxed(name)
-        if imgui.radio_button(name, background == (grey,) * 3):
-            return (grey,) * 3
-    beside_boxed("Backdrop")
+    background = ui.radio(BACKDROPS, background)
+    ui.beside_boxed("Backdrop")
     flags = imgui.ColorEditFlags_.no_inputs | imgui.ColorEditFlags_.uint8
     changed, colour = imgui.color_edit3("Backdrop", list(background), flags)
     red, green, blue = (min(max(float(part), 0.0), 1.0) for part in colour)
     return (red, green, blue) if changed else background
 
 
-def _colour_map(viewer: Viewer) -> None:
-    """Draw the choice of a colour map where something is shown by it."""
-    if not any(pane.row.uses_map for pane in viewer.state.panes()):
-        return
-    names = list(COLOUR_MAPS)
-    leave_room("Colour map", WIDTH_EM)
-    changed, chosen = imgui.combo("Colour map", names.index(viewer.state.picture.colour_map), list(names))
-    if changed:
-        settings.set_colour_map(viewer, names[chosen])
-
-
 def _display_line(viewer: Viewer, rows: tuple[DisplayRow, ...]) -> None:
     """Displays that need the same, beside each other; one that has several buttons is named before them."""
+    state = viewer.state
     buttons = [button for row in rows for button in buttons_of(row)]
     if len(buttons) > len(rows):
         imgui.align_text_to_frame_padding()
@@ -125,18 +104,11 @@ def _display_line(viewer: Viewer, rows: tuple[DisplayRow, ...]) -> None:
         imgui.same_line()
     for place, button in enumerate(buttons):
         if place:
-            beside_boxed(button.label)
-        _display_button(viewer, button)
-
-
-def _display_button(viewer: Viewer, button: Button) -> None:
-    state = viewer.state
-    without_field = state.scene is not None and state.scene.language is None
-    chosen = state.picture.display == button.display and button.latent_level in (None, state.latent_level)
-    imgui.begin_disabled(without_field and DISPLAYS[button.display].needs_field)
-    if imgui.radio_button(button.label, chosen):
-        settings.set_display(viewer, button.display, button.latent_level)
-    imgui.end_disabled()
+            ui.beside_boxed(button.label)
+        imgui.begin_disabled(state.lacks_field and DISPLAYS[button.display].needs_field)
+        if imgui.radio_button(button.label, is_shown(state, button)):
+            settings.set_display(viewer, button.display, button.latent_level)
+        imgui.end_disabled()
 
 
 def _compared(viewer: Viewer) -> None:
@@ -146,23 +118,22 @@ def _compared(viewer: Viewer) -> None:
     shown = {"off": "nothing", "levels": "three levels", "wipe": compared_name(second)}.get(split.mode, "")
     if viewer.beside is not None and viewer.beside.state.path is not None:
         shown = viewer.beside.state.path.name
-    leave_room("Beside it", WIDTH_EM)
+    ui.leave_room("Beside it", WIDTH_EM)
     if not imgui.begin_combo("Beside it", shown):
         return
     if imgui.selectable("nothing", split.mode == "off")[0]:
         settings.show_one(viewer)
-    without_field = state.scene is not None and state.scene.language is None
     for button in BUTTONS:
-        imgui.begin_disabled(without_field and DISPLAYS[button.display].needs_field)
+        imgui.begin_disabled(state.lacks_field and DISPLAYS[button.display].needs_field)
         if imgui.selectable(compared_name(button), shown == compared_name(button))[0]:
             settings.compare_with(viewer, button.display, button.latent_level)
         imgui.end_disabled()
-    imgui.begin_disabled(without_field)
+    imgui.begin_disabled(state.lacks_field)
     if imgui.selectable("three levels", split.mode == "levels")[0] and split.mode != "levels":
         settings.toggle_levels(viewer)
     imgui.end_disabled()
     if imgui.selectable("another scene ...", split.mode == "scenes")[0]:
-        opening.ask_for_beside(viewer)
+        browsing.ask_for_beside(viewer)
     imgui.end_combo()
 
 
@@ -173,7 +144,6 @@ def compared_name(button: Button) -> str:
 
 
 def draw_overlays(viewer: Viewer) -> None:
-    """Draw the panel "Overlays"."""
     state = viewer.state
     for name, title in OVERLAY_TITLES.items():
         changed, shown = imgui.checkbox(title.capitalize(), name in state.preferences.overlays)
@@ -182,39 +152,36 @@ def draw_overlays(viewer: Viewer) -> None:
     ruler, scene = state.ruler, state.scene
     measure = with_key("Measure", settings.toggle_measuring)
     imgui.begin_disabled(scene is None)
-    changed, measures = imgui.checkbox(f"{measure}###measure", ruler.measures)
-    if changed:
-        settings.measure(viewer, measures)
-    tip("Click two points on the surface; Esc ends it")
+    if imgui.checkbox(f"{measure}###measure", ruler.measures)[0]:
+        settings.toggle_measuring(viewer)
+    ui.tip("Click two points on the surface; Esc ends it")
     imgui.end_disabled()
     if ruler.measures:
-        words = ("click a first point", "click a second point")
-        length = ruler.length
-        text = words[len(ruler.points) % 2] if length is None or scene is None else ""
-        if length is not None and scene is not None:
-            text = length_text(length, scene.metres_per_unit)
-        small_wrapped(text, muted())
-        if scene is not None and scene.metres_per_unit is None:
-            small_wrapped("the scene has no scale in metres; langsplat scale gives it one", muted())
+        metres = None if scene is None else scene.metres_per_unit
+        text = "click a second point" if ruler.points else "click a first point"
+        if ruler.length is not None:
+            text = length_text(ruler.length, metres)
+        ui.small_wrapped(text, ui.muted())
+        if scene is not None and metres is None:
+            ui.small_wrapped("the scene has no scale in metres; langsplat scale gives it one", ui.muted())
 
 
 def draw_notes(viewer: Viewer) -> None:
     """Draw the panel "Notes": texts pinned to places, kept in the project."""
     state, side = viewer.state, imgui.get_frame_height()
     imgui.begin_disabled(state.scene is None)
-    changed, pins = imgui.checkbox(
-        with_key("Pin one to what is clicked", projects.toggle_pinning), state.pins_notes
-    )
-    if changed:
-        projects.pin_notes(viewer, pins)
-    if button_if("Pin one to the selection", bool(state.selection.marks.selected.any())):
+    pin = with_key("Pin one to what is clicked", projects.toggle_pinning)
+    if imgui.checkbox(pin, state.pins_notes)[0]:
+        projects.toggle_pinning(viewer)
+    if ui.button("Pin one to the selection", enabled=bool(state.selection.marks.selected.any())):
         projects.pin_to_selection(viewer)
-    if next_button("Save project"):
-        projects.save_project(viewer, Path.cwd())
-    tip("Notes, queries, selection, edits, views: one file, to be opened again")
+    if ui.next_button(
+        "Save project", "Notes, queries, selection, edits, views: one file, to be opened again"
+    ):
+        projects.save_project(viewer)
     imgui.end_disabled()
     if not state.notes:
-        small_wrapped("notes are listed here", muted())
+        ui.small_wrapped("notes are listed here", ui.muted())
     for number, note in enumerate(state.notes):
         imgui.push_id(number)
         imgui.set_next_item_width(-side - imgui.get_style().item_spacing.x)
@@ -230,37 +197,30 @@ def draw_notes(viewer: Viewer) -> None:
 
 
 def draw_camera(viewer: Viewer) -> None:
-    """Draw the panel "Camera"."""
     state = viewer.state
     imgui.begin_disabled(state.view is None)
     if state.scene is not None and state.scene.cameras:
         _training_cameras(viewer)
-    if imgui.button(with_key("Reset", viewpoint.reset_view)):
+    if ui.button(with_key("Reset", viewpoint.reset_view), "Return to the opening view"):
         viewpoint.reset_view(viewer)
-    tip("Return to the opening view")
-    if next_button(with_key("Focus", viewpoint.focus_result)):
+    if ui.next_button(with_key("Focus", viewpoint.focus_result)):
         viewpoint.focus_result(viewer)
-    if next_button("Frame all"):
+    if ui.next_button("Frame all", with_key("Show the whole scene from this side", viewpoint.frame_scene)):
         viewpoint.frame_scene(viewer)
-    tip(with_key("Show the whole scene from this side", viewpoint.frame_scene))
-    if imgui.button("Horizon"):
+    if ui.button("Horizon", "Turn the picture until the horizon is level"):
         viewpoint.move(viewer, level)
-    tip("Turn the picture until the horizon is level")
-    if next_button("Up is up"):
+    if ui.next_button("Up is up", "Take what is up in the picture as the world's up"):
         viewpoint.move(viewer, adopt_up)
-    tip("Take what is up in the picture as the world's up")
     if state.view is not None:
         _projection(viewer, state.view)
     _cuts(viewer)
-    speed = _slider("Fly speed", state.fly_speed, 0.05, 4.0, "%.2f", logarithmic=True)
-    viewpoint.set_fly_speed(viewer, speed)
+    speed = ui.slider("Fly speed", state.fly_speed, (0.05, 4.0), logarithmic=True)
     _, walks = imgui.checkbox("Walk", state.walks)
-    viewpoint.set_walking(viewer, walks)
-    tip("W A S D keep the height of the eye")
-    beside_boxed("Coarse while moving")
+    ui.tip("W A S D keep the height of the eye")
+    ui.beside_boxed("Coarse while moving")
     _, coarse = imgui.checkbox("Coarse while moving", state.coarse_while_moving)
-    settings.set_coarse_while_moving(viewer, coarse)
-    tip("Draw fewer pixels and merged Gaussians while the camera moves, where drawing is slow")
+    settings.put(state, fly_speed=speed, walks=walks, coarse_while_moving=coarse)
+    ui.tip("Draw fewer pixels and merged Gaussians while the camera moves, where drawing is slow")
     imgui.end_disabled()
 
 
@@ -269,10 +229,10 @@ def _projection(viewer: Viewer, view: OrbitCamera) -> None:
     text = with_key("Orthographic", viewpoint.toggle_orthographic)
     _, orthographic = imgui.checkbox(f"{text}###orthographic", view.orthographic)
     viewpoint.set_orthographic(viewer, orthographic)
-    tip("No perspective: what is parallel looks parallel; the wheel changes the scale")
+    ui.tip("No perspective: what is parallel looks parallel; the wheel changes the scale")
     before = view.intrinsics.fov_degrees
     imgui.begin_disabled(orthographic)
-    fov = _slider("Field of view", before, *FOV_RANGE, "%.0f deg")
+    fov = ui.slider("Field of view", before, FOV_RANGE, "%.0f deg")
     imgui.end_disabled()
     if abs(fov - before) > 1e-3:
         viewpoint.move(viewer, lambda view: with_fov(view, fov))
@@ -283,18 +243,15 @@ def _cuts(viewer: Viewer) -> None:
     extent, clip = viewer.state.extent, viewer.state.settings.clip
     if extent is None:
         return
-    low, high = (share * extent.radius for share in CUT_RANGE)
-    near = _slider(
-        "Near cut", max(clip.near, low), low, high, "%.3g" if clip.near else "off", logarithmic=True
-    )
-    tip("Nearer than this nothing is drawn, to look into things; world units")
-    far = _slider(
-        "Far cut", min(clip.far, high), low, high, "%.3g" if clip.far < high else "off", logarithmic=True
-    )
-    tip("Farther than this nothing is drawn; world units")
-    settings.set_clip(
-        viewer, Clip(0.0 if near < 1.001 * low else near, math.inf if far > 0.999 * high else far)
-    )
+    low, high = limits = CUT_RANGE[0] * extent.radius, CUT_RANGE[1] * extent.radius
+    text = "%.3g" if clip.near else "off"
+    near = ui.slider("Near cut", max(clip.near, low), limits, text, logarithmic=True)
+    ui.tip("Nearer than this nothing is drawn, to look into things; world units")
+    text = "%.3g" if clip.far < high else "off"
+    far = ui.slider("Far cut", min(clip.far, high), limits, text, logarithmic=True)
+    ui.tip("Farther than this nothing is drawn; world units")
+    clip = Clip(0.0 if near < 1.001 * low else near, math.inf if far > 0.999 * high else far)
+    settings.set_clip(viewer, clip)
 
 
 def _training_cameras(viewer: Viewer) -> None:
@@ -312,38 +269,178 @@ def _training_cameras(viewer: Viewer) -> None:
     changed, index = imgui.slider_int(
         "##camera", index, 0, len(state.scene.cameras) - 1, f"camera %d  {name}"
     )
-    tip("Training cameras: stand where a photograph was taken")
+    ui.tip("Training cameras: stand where a photograph was taken")
     if changed and index != state.camera_index:
         viewpoint.go_to_camera(viewer, index)
-    _photograph(viewer)
-
-
-def _photograph(viewer: Viewer) -> None:
-    """Draw the photograph's opacity, or why there is none."""
-    state = viewer.state
-    leave_room("Photograph", WIDTH_EM)
-    flags = imgui.SliderFlags_.always_clamp
-    changed, fade = imgui.slider_float("Photograph", state.settings.fade, 0.0, 1.0, "%.2f", flags)
-    if changed:
-        opening.fade_photograph(viewer, fade)
-    tip("Lay the photograph of the training camera over the picture")
+    opening.fade_photograph(viewer, ui.slider("Photograph", state.settings.fade, (0.0, 1.0)))
+    ui.tip("Lay the photograph of the training camera over the picture")
     if state.settings.fade == 0:
         return
     photograph = opening.photograph_here(state)
     if photograph is None:
-        small_wrapped("stand at a training camera to see its photograph", muted())
+        ui.small_wrapped("stand at a training camera to see its photograph", ui.muted())
     elif photograph.reason:
-        small_wrapped(photograph.reason, muted())
+        ui.small_wrapped(photograph.reason, ui.muted())
         if imgui.button("Folder of photographs ..."):
-            opening.ask_for_photographs(viewer)
+            browsing.ask_for_photographs(viewer)
 
 
-def _slider(
-    label: str, value: float, low: float, high: float, text: str = "%.2f", *, logarithmic: bool = False
-) -> float:
-    leave_room(label, WIDTH_EM)
-    flags = imgui.SliderFlags_.always_clamp
-    if logarithmic:
-        flags |= imgui.SliderFlags_.logarithmic
-    changed, new = imgui.slider_float(label, value, low, high, text, flags)
-    return new if changed else value  # what comes back unchanged has been rounded
+# The panel "Record": keyframes of the camera path, playing it, films of it.
+
+ROWS = 3.5  # of the list: the half one says that there are more
+NUMBER_EM, FPS_EM = 7.5, 4.5
+
+
+def draw_record(viewer: Viewer) -> None:
+    """Draw the panel "Record": what the path is, playing it, saving it, films."""
+    record = viewer.state.record
+    turns = ui.radio({False: "Keyframes", True: "Turntable"}, record.turns)
+    if turns != record.turns:
+        filming.set_turning(viewer, turns)
+    ui.tip("Once around what the view turns around; F makes that the latest result")
+    imgui.begin_disabled(viewer.state.view is None)
+    _play(viewer)
+    if record.turns:
+        _duration(viewer)
+    else:
+        _keyframes(viewer)
+    _films(viewer)
+    imgui.end_disabled()
+
+
+def _play(viewer: Viewer) -> None:
+    record, seconds = viewer.state.record, viewpoint.path_seconds(viewer)
+    imgui.begin_disabled(seconds <= 0)
+    if ui.button(
+        "Stop##path" if record.began is not None else "Play##path", with_key("Play", viewpoint.toggle_playing)
+    ):
+        viewpoint.toggle_playing(viewer)
+    imgui.same_line()
+    loop = imgui.calc_text_size("Loop").x + imgui.get_frame_height() + 2 * imgui.get_style().item_spacing.x
+    imgui.set_next_item_width(-loop)
+    changed, at = imgui.slider_float("##at", record.at, 0.0, max(seconds, 1e-3), "%.2f s")
+    if changed:
+        viewpoint.scrub(viewer, at)
+    imgui.end_disabled()
+    imgui.same_line()
+    settings.put(record, loops=imgui.checkbox("Loop", record.loops)[1])
+
+
+def _duration(viewer: Viewer) -> None:
+    seconds = viewpoint.path_seconds(viewer)
+    imgui.begin_disabled(seconds <= 0)
+    wanted = _number("Duration", seconds, 1.0)
+    if wanted is not None:
+        filming.set_path_seconds(viewer, wanted)
+    imgui.end_disabled()
+
+
+def _number(label: str, value: float, step: float) -> float | None:
+    """A time to type or to step; the new one once it is entered."""
+    imgui.set_next_item_width(hello_imgui.em_size(NUMBER_EM))
+    flags = imgui.InputTextFlags_.enter_returns_true
+    changed, new = imgui.input_float(label, value, step, 5 * step, "%.2f s", flags)
+    return new if changed and abs(new - value) > 1e-6 else None
+
+
+def _keyframes(viewer: Viewer) -> None:
+    record = viewer.state.record
+    if ui.button("Add keyframe", with_key("The current view", filming.add_keyframe)):
+        filming.add_keyframe(viewer)
+    if ui.next_button("Clear", enabled=bool(record.keyframes)):
+        filming.clear_path(viewer)
+    ui.beside("Duration", hello_imgui.em_size(NUMBER_EM))
+    _duration(viewer)
+    height = ROWS * imgui.get_frame_height_with_spacing()
+    if imgui.begin_child("keyframes", ImVec2(0, height), imgui.ChildFlags_.borders):
+        if not record.keyframes:
+            ui.small_wrapped("Add the current view; the path goes smoothly from one to the next", ui.muted())
+        for number, key in enumerate(record.keyframes, 1):
+            imgui.push_id(number)
+            text = f"{number}   {key.seconds:.2f} s"
+            clicked, gone = ui.row(text, "keyframe", key is record.chosen)
+            ui.tip("Take it off the path")
+            if clicked:
+                filming.choose_keyframe(viewer, key)
+            if gone:
+                filming.delete_keyframe(viewer, key)
+            imgui.pop_id()
+    imgui.end_child()
+    _chosen(viewer, record.chosen)
+    ui.leave_room("", NUMBER_EM + 2)
+    _, typed = imgui.input_text_with_hint("##path file", "file.path.json", record.path_typed)
+    settings.put(record, path_typed=typed)
+    if ui.next_button("Save path"):
+        filming.save_path(viewer)
+    if ui.next_button("Load"):
+        filming.load_typed_path(viewer)
+
+
+def _chosen(viewer: Viewer, key: Keyframe | None) -> None:
+    imgui.begin_disabled(key is None)
+    seconds = _number("##time of the keyframe", 0.0 if key is None else key.seconds, 0.5)
+    if seconds is not None and key is not None:
+        filming.move_keyframe(viewer, key, seconds)
+    if ui.next_button("Set to this view") and key is not None:
+        filming.replace_keyframe(viewer, key)
+    ui.tip("Put the current view in its place")
+    imgui.end_disabled()
+
+
+def _films(viewer: Viewer) -> None:
+    record = viewer.state.record
+    imgui.separator()
+    imgui.set_next_item_width(hello_imgui.em_size(NUMBER_EM))
+    changed, size = imgui.input_int2("Size", list(record.size))
+    if changed:
+        filming.set_film_size(viewer, *size)
+    ui.beside("fps", hello_imgui.em_size(FPS_EM))
+    imgui.set_next_item_width(hello_imgui.em_size(FPS_EM))
+    if imgui.begin_combo("fps", f"{record.fps:g}"):
+        for fps in FPS_CHOICES:
+            if imgui.selectable(f"{fps:g}", fps == record.fps)[0]:
+                settings.put(record, fps=fps)
+        imgui.end_combo()
+    imgui.set_next_item_width(-1)
+    hint = "film.mp4, .webp, .gif or a folder; empty: a new name"
+    _, typed = imgui.input_text_with_hint("##film", hint, record.film_typed)
+    settings.put(record, film_typed=typed)
+    work = viewer.recorder.current
+    if work is not None:
+        if ui.stoppable(*work, tag="film"):
+            filming.cancel_film(viewer)
+        return
+    if imgui.button("Save film"):
+        filming.save_film(viewer)
+    if ui.next_button("Save picture##sized", "What is shown now, in this size"):
+        filming.save_sized_picture(viewer)
+    if ui.next_button("Copy as command", "The command that draws this picture without a window"):
+        filming.copy_command(viewer)
+
+
+# The panel "Bookmarks".
+
+
+def draw_bookmarks(viewer: Viewer) -> None:
+    """Draw the panel "Bookmarks": a box for a name, and the list."""
+    state = viewer.state
+    imgui.begin_disabled(state.view is None)
+    hint = "name of this view"
+    entered, typed = ui.box_with_button("##bookmark", hint, state.bookmark_typed, "Keep")
+    settings.put(state, bookmark_typed=typed)
+    if entered:
+        viewpoint.add_bookmark(viewer, state.bookmark_typed)
+    imgui.end_disabled()
+    if imgui.begin_child("bookmarks"):
+        if not state.bookmarks:
+            words = "views that you keep are listed here"
+            ui.small_wrapped(with_key(words, viewpoint.add_bookmark), ui.muted())
+        for number, bookmark in enumerate(state.bookmarks):
+            imgui.push_id(number)
+            clicked, gone = ui.row(bookmark.name, "bookmark", False)
+            if clicked:
+                viewpoint.go_to_bookmark(viewer, bookmark)
+            if gone:
+                viewpoint.delete_bookmark(viewer, bookmark)
+            imgui.pop_id()
+    imgui.end_child()

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol
+from typing import Literal
 
 import moderngl
 import numpy as np
@@ -32,17 +32,20 @@ from langsplat_core.errors import BackendError
 from langsplat_core.progress import Progress, lap
 from langsplat_core.raster import Rasterizer, View, load_rasterizer
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer, GlView, Source
-from langsplat_core.raster.opengl.scene_textures import (
-    create_egl_context,
-    drawing,
-    is_software,
-    set_uniforms,
-)
+from langsplat_core.raster.opengl.scene_textures import create_egl_context, drawing, is_software, set_uniforms
 from langsplat_core.raster.opengl.shaders import shader
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Gaussians, Scene
-from langsplat_viewer.rendering.depth import VISIBLE_ALPHA, camera_depths, depth_range
-from langsplat_viewer.rendering.request import Channel, Inputs, Pane, RenderKey, RenderRequest
+from langsplat_viewer.rendering.request import (
+    VISIBLE_ALPHA,
+    Channel,
+    Inputs,
+    Pane,
+    RenderKey,
+    RenderRequest,
+    camera_depths,
+    depth_range,
+)
 
 Backend = Literal["auto", "opengl", "cpu", "cuda"]
 Layer = moderngl.Texture | Channels  # what a pane is composed of, by the shader or by `composed`
@@ -69,8 +72,7 @@ def open_renderer(backend: Backend = "auto") -> Iterator["ArrayRenderer | GlRend
 
 
 def render_image(request: RenderRequest, backend: Backend = "auto") -> Array:
-    """(H, W, 3) uint8 image, row 0 on top, (H, W, 4) of a transparent one. Raises what
-    `open_renderer` does."""
+    """(H, W, 3) uint8 image, row 0 on top, (H, W, 4) of a transparent one. Raises as `open_renderer`."""
     with open_renderer(backend) as renderer:
         return renderer.read(request)
 
@@ -121,7 +123,6 @@ class LastView:
         return self._kept[1]
 
     def forget(self) -> None:
-        """Project anew the next time."""
         self._kept = None
 
 
@@ -188,31 +189,8 @@ class ArrayRenderer:
 # Channel layers: what is composed, from either rasterizer.
 
 
-class ChannelSource(Protocol):
-    """Source of channel layers."""
-
-    def render(self, key: RenderKey, wanted: Sequence[Channel]) -> Layers:
-        """Colours, then the layer of each channel (the colours' for an absent one), valid until the next
-        call. At most three with values, none of them twice."""
-
-    def ahead(self, key: RenderKey, wanted: Sequence[Channel]) -> Ahead | None:
-        """Part of `render` that another thread can do, whatever is rendered here meanwhile; None: nothing."""
-
-    def depth_at(self, key: RenderKey, column: int, row: int) -> tuple[float, float]:
-        """Surface depth (world units, 0: nothing) and alpha of one pixel."""
-
-    def depth_map(self, key: RenderKey) -> Array:
-        """(H, W) surface depth, 0 where less than half the light is stopped. It ends `render`'s layers."""
-
-    def forget(self) -> None:
-        """Do every step anew the next time."""
-
-    def release(self) -> None:
-        """Give the device memory back."""
-
-
 class GlSource:
-    """Channels by the graphics pipeline."""
+    """Channel layers by the graphics pipeline."""
 
     def __init__(self, ctx: moderngl.Context, precision: Literal["half", "single"]) -> None:
         self._ctx, self._rasterizer = ctx, GlRasterizer(ctx, precision)
@@ -226,6 +204,8 @@ class GlSource:
         return view
 
     def render(self, key: RenderKey, wanted: Sequence[Channel]) -> Layers:
+        """Colours, then the layer of each channel (the colours' for an absent one), valid until the next
+        call. At most three with values, none of them twice."""
         self._keep(wanted if key.scene is self._of else [])
         self._of, view = key.scene, self._view(key)
         uploads = [self._upload(view.gaussians, c.values) for c in wanted if c.values is not None]
@@ -239,6 +219,7 @@ class GlSource:
         return (colours, *by_channel)
 
     def ahead(self, key: RenderKey, wanted: Sequence[Channel]) -> Ahead | None:
+        """Part of `render` that another thread can do, whatever is rendered here meanwhile; None: nothing."""
         return None  # the context is this thread's
 
     def _upload(self, gaussians: Gaussians, values: Array) -> moderngl.Texture:
@@ -249,14 +230,15 @@ class GlSource:
         return self._uploads[id(values)][1]
 
     def _keep(self, wanted: Sequence[Channel]) -> None:
-        """Release what was uploaded for other channels."""
         for key in set(self._uploads) - {id(channel.values) for channel in wanted}:
             self._uploads.pop(key)[1].release()
 
     def depth_at(self, key: RenderKey, column: int, row: int) -> tuple[float, float]:
+        """Surface depth (world units, 0: nothing) and alpha of one pixel."""
         return self._view(key).depth_at(column, row)
 
     def depth_map(self, key: RenderKey) -> Array:
+        """(H, W) surface depth, 0 where less than half the light is stopped. It ends `render`'s layers."""
         return self._view(key).median_depth()
 
     def forget(self) -> None:
@@ -270,7 +252,7 @@ class GlSource:
 
 
 class ArraySource:
-    """Channels by a rasterizer that returns arrays: uploaded, but on a software driver left to `composed`,
+    """The same by a rasterizer that returns arrays: uploaded, but on a software driver left to `composed`,
     since such a driver takes longer to upload and compose than the rasterizer to draw."""
 
     def __init__(self, ctx: moderngl.Context, rasterizer: Rasterizer) -> None:
@@ -394,7 +376,7 @@ class GlRenderer:
             backend = "opengl" if suits_opengl(ctx) else "cpu"
         self.backend: str = backend
         self._ctx = ctx
-        self._source: ChannelSource
+        self._source: GlSource | ArraySource
         if backend == "opengl":
             self._source = GlSource(ctx, precision or ("single" if is_software(ctx) else "half"))
         else:
@@ -521,8 +503,7 @@ class GlRenderer:
         return depth if alpha > PICK_ALPHA and depth > 0 else None
 
     def depth_map(self, request: RenderRequest) -> Array:
-        """(H, W) camera z of the surface in every pixel of a pane, world units, 0 where nothing stops half
-        the light."""
+        """(H, W) camera z of the surface in a pane, world units, 0 where nothing stops half the light."""
         self._held = None  # the rasterizer draws, and its layers hold until then
         return self._source.depth_map(self._inputs.key(request))
 

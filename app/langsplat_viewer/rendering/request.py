@@ -4,20 +4,125 @@ The canvas of the window, saved images, films, comparisons and `--headless` each
 (`rendering.renderer`) draws it. An image may have several panes: displays of one camera side by side.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 
-from langsplat_core.arrays import Array
-from langsplat_core.config import Display, PictureConfig, RasterSettings
+from langsplat_core.arrays import Array, logit
+from langsplat_core.config import INRIA, Display, PictureConfig, RasterSettings
 from langsplat_core.display.displays import DISPLAYS, Answers, DisplayRow, Ranges, Subject, painted
-from langsplat_core.scene import LEVELS, SH_COUNTS, Camera, Scene
+from langsplat_core.scene import LEVELS, SH_COUNTS, Camera, Gaussians, Scene
 from langsplat_core.scene.gaussians import Merged
 from langsplat_core.scene.transform import C0
 from langsplat_viewer.marks import Marks
-from langsplat_viewer.rendering.depth import UNCLIPPED, Clip, image_formation
+
+# Depths of an image: clipping, near plane, the range of the depth display, and why nothing is seen.
+
+
+@dataclass(frozen=True)
+class Clip:
+    """Range of depths in which Gaussians are drawn, by their centres; world units from the eye. Answers and
+    files have all of them."""
+
+    near: float = 0.0
+    far: float = math.inf
+
+    def keeps(self, depths: Array) -> Array:
+        kept: Array = (depths > self.near) & (depths <= self.far)
+        return kept
+
+
+UNCLIPPED = Clip()
+
+
+# Image formation for looking round: what training would clip is shown, an image of nothing explained.
+
+NEAR_SHARE = 0.25  # of the depth of what is nearest in the image
+NEAREST_SHARE = 0.01  # of the Gaussians in the image that count as the nearest
+LEAST_NEAR = 1e-3  # of the depth of the middle one: nearer, a Gaussian would be a fog over everything
+VISIBLE_ALPHA = 1 / 255
+_SAMPLE = 20_000  # Gaussians looked at; quantiles need no more
+
+
+def _in_image(gaussians: Gaussians, camera: Camera) -> tuple[slice, Array, Array]:
+    """A sample of the Gaussians: their rows, the (M,) camera z of their centres, world units, and (M,) bool,
+    those whose centres are in the image."""
+    rows = slice(None, None, max(len(gaussians) // _SAMPLE, 1))
+    with np.errstate(invalid="ignore", over="ignore"):
+        pixels, depths = camera.project(gaussians.means[rows].astype(np.float64))
+        inside = (depths > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
+    return rows, depths, inside
+
+
+def near_plane(gaussians: Gaussians, camera: Camera, most: float = INRIA.near) -> float:
+    """World units from the camera to the near plane: a share of the depth of what is nearest in the
+    image, so that one can go as near to a thing as it is small; at most `most`, the constant of training,
+    so that the view of a photograph is the one that was trained. Without perspective, that of the eye."""
+    if camera.orthographic:
+        return 0.0
+    rows, depths, inside = _in_image(gaussians, camera)
+    with np.errstate(invalid="ignore"):
+        inside &= gaussians.opacity_logits[rows] > logit(np.array(VISIBLE_ALPHA))
+    if not inside.any():
+        return most
+    nearest, middle = np.quantile(depths[inside], [NEAREST_SHARE, 0.5])
+    return float(min(most, max(NEAR_SHARE * nearest, LEAST_NEAR * middle)))
+
+
+def image_formation(scene: Scene, camera: Camera, clip: Clip = UNCLIPPED) -> RasterSettings:
+    """The scene's own image formation, with the near plane of `near_plane`, and what `clip` cuts away."""
+    settings = scene.raster_settings()
+    near = near_plane(scene.gaussians, camera, settings.near)
+    return replace(settings, near=max(near, clip.near), far=None if math.isinf(clip.far) else clip.far)
+
+
+def depth_range(gaussians: Gaussians, camera: Camera, clip: Clip = UNCLIPPED) -> tuple[float, float]:
+    """Near and far end of the depth display: the 2 % and 98 % quantiles of the camera z of those
+    Gaussians whose centres are in the image and not cut away. World units; (0, 1) where there are none."""
+    _, depths, inside = _in_image(gaussians, camera)
+    with np.errstate(invalid="ignore"):
+        inside &= clip.keeps(depths)
+    if not inside.any():
+        return 0.0, 1.0
+    near, far = np.quantile(depths[inside], [0.02, 0.98])
+    return float(near), float(far)
+
+
+def camera_depths(gaussians: Gaussians, camera: Camera) -> Array:
+    """(N, 1) float32 camera z, world units; finite."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        depths = gaussians.means.astype(np.float64) @ camera.rotation[2] + camera.world_to_camera[2, 3]
+        return np.nan_to_num(depths.astype(np.float32))[:, None]
+
+
+def why_undrawable(gaussians: Gaussians) -> str:
+    """Return why no camera could see anything of these; empty where one could."""
+    count = len(gaussians)
+    if count == 0:
+        return "the scene holds no Gaussians"
+    valid = gaussians.valid()
+    if not valid.any():
+        reasons = ", ".join(f"{rows:,} with {reason}" for reason, rows in gaussians.invalid_rows().items())
+        return f"none of the {count:,} Gaussians can be drawn: {reasons}"
+    if (gaussians.opacity_logits[valid] < logit(np.array(VISIBLE_ALPHA))).all():
+        return f"all {int(valid.sum()):,} Gaussians are transparent"
+    return ""
+
+
+def why_nothing(gaussians: Gaussians, camera: Camera) -> str:
+    reason = why_undrawable(gaussians)
+    if reason:
+        return reason
+    _, depths = camera.project(gaussians.means[gaussians.valid()].astype(np.float64))
+    if (depths <= 0).all():
+        return "the whole scene lies behind the camera"
+    if (depths <= near_plane(gaussians, camera)).all():
+        return "the whole scene lies nearer than the camera can see"
+    return "nothing of the scene lies in this picture"
+
 
 # Parts of a request.
 
@@ -56,8 +161,7 @@ class Split:
         return u * self.columns - min(max(int(u * self.columns), 0), self.columns - 1)
 
     def joined(self, images: Sequence[Array], width: int) -> Array:
-        """(H, W, C) images of all panes -> one of `width` pixels; pixels that columns leave over repeat the
-        last one."""
+        """(H, W, C) images of all panes -> one of `width` pixels; pixels left over repeat the last one."""
         if self.mode in ("wipe", "scenes") and len(images) > 1:
             line = round(self.at * width)
             return np.concatenate([images[0][:, :line], images[1][:, line:]], 1)
@@ -174,7 +278,6 @@ class Pane:
 
     @property
     def row(self) -> DisplayRow:
-        """Row of its display."""
         return DISPLAYS[self.picture.display]
 
     @property
@@ -184,7 +287,6 @@ class Pane:
 
     @property
     def label(self) -> str:
-        """Name over the pane."""
         return self.row.label if self.level is None else f"{self.row.label}, {LEVELS[self.level]}"
 
 
@@ -211,7 +313,6 @@ class RenderRequest:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height of the image, pixels."""
         return self.width, self.camera.height
 
     @property
@@ -295,26 +396,20 @@ class Channel:
         return self.is_depth, id(self.values)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class RenderKey:
     """All that a projection of Gaussians depends on. Equal for the same scene, as an object, cut alike, and
     cameras that see the same."""
 
     scene: Scene  # as it is drawn
-    camera: Camera
+    camera: Camera = field(compare=False)  # compared by `pose`
     clip: Clip = UNCLIPPED
+    pose: tuple[object, ...] = field(init=False, repr=False)
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, RenderKey) and self.scene is other.scene and self._place() == other._place()
-
-    def __hash__(self) -> int:
-        return hash((id(self.scene), self._place()))
-
-    def _place(self) -> tuple[object, ...]:
-        return self.clip, _pose(self.camera)
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "pose", _pose(self.camera))
 
     def settings(self) -> RasterSettings:
-        """Image formation for it."""
         return image_formation(self.scene, self.camera, self.clip)
 
 
@@ -338,7 +433,6 @@ class Inputs:
         return RenderKey(self._scene[1], request.drawn_camera, request.clip)
 
     def channels(self, request: RenderRequest) -> list[Channel]:
-        """The further channel of each pane."""
         of = (request.scene, request.answers, request.detail.merged)
         if self._of != of:
             self._of, self._channels = of, {}
@@ -349,7 +443,6 @@ class Inputs:
         return [self._channels[of_pane] for of_pane in wanted]
 
     def forget(self) -> None:
-        """Hold nothing of the last request."""
         self._scene, self._of, self._channels = None, (), {}
 
 

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from types import MappingProxyType
 from typing import Any
 
@@ -123,17 +124,13 @@ def _train(vectors: Array, config: AutoencoderConfig, progress: Progress) -> Aut
 
 def networks(dim: int, latent_dim: int) -> tuple[nn.Sequential, nn.Sequential]:
     encoder: list[nn.Module] = []
-    width = dim
-    for size in ENCODER_WIDTHS:
+    for width, size in pairwise((dim, *ENCODER_WIDTHS)):
         encoder += [nn.Linear(width, size), nn.BatchNorm1d(size), nn.ReLU()]
-        width = size
-    encoder.append(nn.Linear(width, latent_dim))
+    encoder.append(nn.Linear(ENCODER_WIDTHS[-1], latent_dim))
     decoder: list[nn.Module] = []
-    width = latent_dim
-    for size in DECODER_WIDTHS:
+    for width, size in pairwise((latent_dim, *DECODER_WIDTHS)):
         decoder += [nn.Linear(width, size), nn.ReLU()]
-        width = size
-    decoder.append(nn.Linear(width, dim))
+    decoder.append(nn.Linear(DECODER_WIDTHS[-1], dim))
     return nn.Sequential(*encoder), nn.Sequential(*decoder)
 
 
@@ -266,9 +263,7 @@ def fit_codec(
 ) -> Codec:
     """(M, D) float32 unit CLIP vectors -> a codec for them; what phrases of the `vocabulary` find is what it
     may not change. Deterministic for a given seed on one machine. InputError for settings out of range.
-
-    further: (M', D) vectors that are not kept, but help a kind that interpolates between what it has seen.
-    """
+    further: (M', D) vectors that are not kept, but help a kind that interpolates between what it has seen."""
     check_settings(config, "--codec.")
     if further is not None and (KINDS[config.kind].blends or len(vectors) == 0):
         vectors = np.concatenate([further, vectors])

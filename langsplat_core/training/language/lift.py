@@ -102,11 +102,9 @@ def _weiszfeld(
     first: int, last: int, indptr: Array, indices: Array, data: Array, vectors: Array, centre: Array
 ) -> None:
     """Improve rows [first, last) of `centre` (N, D) in place towards the weighted geometric median on the
-    unit sphere.
-
-    Weiszfeld's iteration: reweight every vector by 1 / chordal distance and average again. The floor on
-    the distance keeps a centre that coincides with a vector finite; it is far below the noise of CLIP.
-    """
+    unit sphere. Weiszfeld's iteration: reweight every vector by 1 / chordal distance and average again. The
+    floor on the distance keeps a centre that coincides with a vector finite; it is far below the noise of
+    CLIP."""
     dim = vectors.shape[1]
     total = np.empty(dim, np.float32)
     for row in range(first, last):
@@ -137,11 +135,9 @@ def lift_latents(
     settings: RasterSettings = INRIA,
     progress: Progress = silent,
 ) -> tuple[Array, Array]:
-    """The paper's quantity in one pass: (3, N, d) latents ``W^T H / W^T 1`` and (3, N) confidence.
-
-    H holds the encoded vector of each pixel's mask; pixels without a mask count in neither sum.
-    All three levels go through one gather per view.
-    """
+    """The paper's quantity in one pass: (3, N, d) latents ``W^T H / W^T 1`` and (3, N) confidence. H holds
+    the encoded vector of each pixel's mask; pixels without a mask count in neither sum. All three levels go
+    through one gather per view."""
     count, d = len(gaussians), codec.latent_dim
     total = np.zeros((count, len(LEVELS), d + 1))
     for done, (camera, features) in enumerate(views):
@@ -197,9 +193,7 @@ def lift_by_gradient(
     progress: Progress = silent,
 ) -> tuple[Array, Array]:
     """(3, N, d) float32 unit latents, zero where unobserved, and (3, N) confidence as of `lift_latents`.
-
-    `config` says for how many steps, how fast, from where. Deterministic for a given seed on the CPU.
-    """
+    `config` says for how many steps, how fast, from where. Deterministic for a given seed on the CPU."""
     start, confidence = lift_latents(rasterizer, gaussians, views, codec, settings, progress)
     import torch  # seconds that other modes need not pay
 
@@ -208,7 +202,10 @@ def lift_by_gradient(
     x = np.zeros_like(start) if published else start.copy()
     features = torch.from_numpy(x)  # the same memory
     adam = torch.optim.Adam([features], config.lr, BETAS, EPSILON, fused=True)
-    targets = [_target(camera, features, codec) for camera, features in views]
+    targets = [
+        _Target(camera, np.asarray(seen.labels, np.int32), plain(codec.encode(seen.vectors)))
+        for camera, seen in views
+    ]
     weights = _Weights(rasterizer, gaussians, [camera for camera, _ in views], settings)
     for step, index in enumerate(_shuffled(len(views), config.steps, config.seed), 1):
         loss, by_y = loss_and_gradient(weights.of(index), targets[index], blended(x, published))
@@ -271,10 +268,6 @@ def _compare(
                 total += abs(difference)
                 signs[row, column, channel] = share * np.sign(difference)
         losses[row] = total
-
-
-def _target(camera: Camera, features: ImageFeatures, codec: Codec) -> _Target:
-    return _Target(camera, np.asarray(features.labels, np.int32), plain(codec.encode(features.vectors)))
 
 
 def _shuffled(views: int, steps: int, seed: int) -> Iterator[int]:

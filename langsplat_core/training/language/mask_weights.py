@@ -40,13 +40,11 @@ def spherical_kmeans(
     start: Array | None = None,
     generator: np.random.Generator | None = None,
 ) -> Array:
-    """At most `count` unit centres (K, D) float32 of (M, D) float32 unit vectors.
-
-    Begins at `start` (K' <= count centres) and adds vectors that these fit badly, drawn by their distance: a
-    quarter more than asked for, of which those are given up again, round by round, that would be missed
-    least. That finds the gaps which plain k-means leaves where two clusters share a centre. Fewer than
-    `count` come back where fewer different vectors are there.
-    """
+    """At most `count` unit centres (K, D) float32 of (M, D) float32 unit vectors. Begins at `start` (K' <=
+    count centres) and adds vectors that these fit badly, drawn by their distance: a quarter more than asked
+    for, of which those are given up again, round by round, that would be missed least. That finds the gaps
+    which plain k-means leaves where two clusters share a centre. Fewer than `count` come back where fewer
+    different vectors are there."""
     generator = generator or np.random.default_rng(0)
     centres = np.zeros((0, vectors.shape[1]), np.float32) if start is None else start
     extra = (count - len(centres)) * EXTRA
@@ -139,14 +137,14 @@ class MaskGroups:
     vectors: Array  # (G, D) float32 unit vectors
 
 
-def group_masks(vectors: Sequence[Array], groups: int = GROUPS, seed: int = 0) -> MaskGroups:
+def group_masks(vectors: Sequence[Array], groups: int = GROUPS) -> MaskGroups:
     """vectors: of each view, (M, D) float32 unit CLIP vectors. At most `groups` groups; where there are not
     more masks than that, each is its own."""
     counts = [len(view) for view in vectors]
     joined = np.concatenate(vectors)
     if len(joined) <= groups:
         return MaskGroups(_per_view(np.arange(len(joined)), counts), joined)
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(0)
     sample = joined[np.sort(generator.permutation(len(joined))[:SAMPLE])]
     centres = spherical_kmeans(sample, groups, ROUNDS, generator=generator)
     return MaskGroups(_per_view(nearest_centres(joined, centres)[0], counts), centres)
@@ -255,17 +253,14 @@ def _row_levels(features: ImageFeatures) -> Array:
 # in 3D is known from MaskClustering, Yan et al. 2024; this is its plainest form.)
 
 SAME = 0.6  # overlap over union of what two masks claim from which they are one thing
-THING_SAMPLE = (
-    50_000  # Gaussians that decide which masks go together: what is compared grows with views squared
-)
+# Gaussians that decide which masks go together: what is compared grows with views squared
+THING_SAMPLE = 50_000
 
 
 def find_things(mask_weights: MaskWeights, counts: Sequence[int], level: int = len(LEVELS) - 1) -> Array:
     """(N,) int32 number of the thing that each Gaussian belongs to, at a level, by default the coarsest;
-    NO_NODE where no mask of that level shows it.
-
-    counts: number of masks of each view. Things are numbered from the largest, by number of Gaussians.
-    """
+    NO_NODE where no mask of that level shows it. counts: number of masks of each view. Things are numbered
+    from the largest, by number of Gaussians."""
     numbers = masks_of_things(mask_weights, counts, level)
     size = int(numbers.max(initial=-1)) + 1
     of_mask = np.split(np.where(numbers >= 0, numbers, size).astype(np.int32), np.cumsum(counts)[:-1])

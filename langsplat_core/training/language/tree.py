@@ -255,9 +255,7 @@ SHOWN = 25.0  # pixels of a node from which a photograph shows it
 
 def count_votes(tree: Tree, mask_weights: MaskWeights, counts: Sequence[int]) -> Array:
     """(K, 2) uint16 photographs with a mask of just each node, and those that show the node without one.
-
-    counts: number of masks of each view. Compared is what the view shows of the node.
-    """
+    counts: number of masks of each view. Compared is what the view shows of the node."""
     masses, labelling = _masses(mask_weights, counts, tree.leaves, tree.count)
     masses, inside = masses.tocsc(), _descendants(tree)
     votes = np.zeros((tree.count, 2), np.uint16)
@@ -399,9 +397,7 @@ CELL = 8  # pixels a side, in which patches of one channel keep apart
 
 def draw_patches(view: LiftingView, gaussians: Gaussians, patches: Array) -> Array:
     """(N,) int32 patches of the Gaussians, -1 for none -> (H, W) int32 the one that most of a pixel is.
-
-    Patches whose boxes in the image do not meet share a channel, so that thousands take some dozen.
-    """
+    Patches whose boxes in the image do not meet share a channel, so that thousands take some dozen."""
     inside = patches >= 0
     seen = np.bincount(patches[inside], view.contributions()[inside]) if inside.any() else np.zeros(0)
     channel_of, owners = _share_channels(_boxes(view.camera, gaussians, patches, len(seen)), seen >= FAINTEST)
@@ -454,10 +450,8 @@ def _share_channels(boxes: Array, shown: Array) -> tuple[Array, Array]:
 
 def nested_maps(drawn: Array, cuts: Sequence[Array], least: float) -> Array:
     """Label maps (3, H, W) int32 as of `masks.label_maps`, of the nodes that each cut makes of patches.
-
     drawn: (H, W) int32 patches, -1 for none; cuts: of each level, the (P,) int32 node of each patch; least:
-    share of the image below which a node is left out.
-    """
+    share of the image below which a node is left out."""
     maps = np.full((len(cuts), *drawn.shape), -1, np.int32)
     first, there = 0, drawn >= 0
     for level, nodes in zip(maps, cuts, strict=True):

@@ -1,4 +1,4 @@
-"""Transforms of the scene or of the selection, and cropping to a box; undone as every other edit is.
+"""Transforms of the scene or of the selection, cropping to a box; undo and redo of every edit.
 
 The scene that is shown is made anew from the one that was opened, by all transforms so far, so that undoing
 them all gives exactly what was there.
@@ -13,30 +13,24 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import LangSplatError
 from langsplat_core.query.selection import in_box
 from langsplat_core.scene.transform import AXES, Similarity, moving, rotating, scaling
-from langsplat_viewer.actions.history import remember
-from langsplat_viewer.actions.queries import ask_again, set_canonical
+from langsplat_viewer.actions.outline import apply_locks
+from langsplat_viewer.actions.queries import ask_again, ask_unanswered, set_canonical, set_cut, set_level
 from langsplat_viewer.actions.selecting import has_scene, mark, show_hidden
 from langsplat_viewer.camera.controls import extent_of
-from langsplat_viewer.marks import Move
+from langsplat_viewer.marks import Move, pack, unpack
 from langsplat_viewer.state import EditForm, Gizmo, Point
-from langsplat_viewer.viewer import Viewer
-
-
-def fill_form(viewer: Viewer, form: EditForm) -> None:
-    """Take what was typed or chosen in the panel."""
-    viewer.state.edit_form = form
+from langsplat_viewer.viewer import Moment, Viewer, let_go, now, remember
 
 
 def next_gizmo(viewer: Viewer) -> None:
     """Show the gizmo that moves, the one that rotates, the one that scales, the handles of the box, none."""
     kinds: tuple[Gizmo, ...] = get_args(Gizmo)
     here = kinds.index(viewer.state.edit_form.gizmo)
-    fill_form(viewer, replace(viewer.state.edit_form, gizmo=kinds[(here + 1) % len(kinds)]))
+    viewer.state.edit_form = replace(viewer.state.edit_form, gizmo=kinds[(here + 1) % len(kinds)])
 
 
 def pivot(viewer: Viewer) -> Array | None:
-    """(3,) middle of what is transformed, world units: the selection, else the whole scene. None without a
-    scene."""
+    """(3,) middle of what is transformed, world units: the selection, else the scene; None without one."""
     state = viewer.state
     if state.scene is None or state.extent is None:
         return None
@@ -56,8 +50,7 @@ def _move_of(viewer: Viewer, to: Similarity) -> Move:
 
 
 def preview(viewer: Viewer, to: Similarity) -> None:
-    """Show the selection, or without one the scene, transformed, until `transform`. Raises InputError where
-    that leads too far."""
+    """Show what `transform` would do, until it does. Raises InputError where that leads too far."""
     if viewer.state.scene is not None:
         move = _move_of(viewer, to)
         viewer.state.moving = move, move.applied(viewer.state.scene)
@@ -119,7 +112,7 @@ def apply_form(viewer: Viewer) -> None:
         viewer.say_error(str(error))
         return
     transform(viewer, to)
-    fill_form(viewer, replace(form, move=EditForm.move, rotate=EditForm.rotate, scale=EditForm.scale))
+    viewer.state.edit_form = replace(form, move=EditForm.move, rotate=EditForm.rotate, scale=EditForm.scale)
 
 
 def fill_box(viewer: Viewer) -> None:
@@ -132,13 +125,12 @@ def fill_box(viewer: Viewer) -> None:
     if chosen.any():
         means = state.scene.gaussians.means[chosen].astype(np.float64)
         low, high = (tuple(corner.tolist()) for corner in (means.min(0), means.max(0)))
-        fill_form(viewer, replace(state.edit_form, low=low, high=high))
+        viewer.state.edit_form = replace(state.edit_form, low=low, high=high)
         follow_box(viewer)
 
 
 def set_box(viewer: Viewer, low: Point, high: Point) -> None:
-    """Set two opposite corners of the box of the panel, world units."""
-    fill_form(viewer, replace(viewer.state.edit_form, low=low, high=high))
+    viewer.state.edit_form = replace(viewer.state.edit_form, low=low, high=high)
 
 
 def _inside(viewer: Viewer) -> Array | None:
@@ -163,7 +155,7 @@ def crop(viewer: Viewer) -> None:
 
 def clip(viewer: Viewer, on: bool) -> None:
     """Hide what lies outside the box from now on, or show again all that is hidden."""
-    fill_form(viewer, replace(viewer.state.edit_form, clips=on, clipped=None))
+    viewer.state.edit_form = replace(viewer.state.edit_form, clips=on, clipped=None)
     if on:
         follow_box(viewer)
     else:
@@ -175,7 +167,61 @@ def follow_box(viewer: Viewer) -> None:
     form, marks = viewer.state.edit_form, viewer.state.selection.marks
     if not form.clips or viewer.state.scene is None or form.clipped == (form.low, form.high):
         return
-    fill_form(viewer, replace(form, clipped=(form.low, form.high)))
+    viewer.state.edit_form = replace(form, clipped=(form.low, form.high))
     inside = _inside(viewer)
     if inside is not None:
         mark(viewer, replace(marks, selected=marks.selected & inside, hidden=marks.kept & ~inside))
+
+
+# Undo and redo of what was asked, shown, selected, hidden and deleted, and of the settings of what is seen.
+# The camera is not undone: its reset leads back.
+
+
+def undo(viewer: Viewer) -> None:
+    """Go back to before the last query, removal, colour, level, keyframe, note, selection, hiding, deletion
+    or transform, or the last change of display, colours, sliders, split, cuts or overlays."""
+    _step(viewer, viewer.history.past, viewer.history.future, "nothing to undo")
+
+
+def redo(viewer: Viewer) -> None:
+    _step(viewer, viewer.history.future, viewer.history.past, "nothing to redo")
+
+
+def _step(viewer: Viewer, there: list[Moment], back: list[Moment], otherwise: str) -> None:
+    if not there:
+        viewer.state.say(otherwise)
+        return
+    viewer.history.setting = ""
+    back.append(now(viewer))
+    _restore(viewer, there.pop())
+
+
+def _restore(viewer: Viewer, moment: Moment) -> None:
+    state, history = viewer.state, viewer.history
+    for query in state.queries:
+        query.slot = None
+    for query, slot, since, cut in moment.queries:
+        query.slot, query.shown_since = slot, since
+        if query.automatic is None:  # it is asked anew
+            query.cut = cut
+        set_cut(viewer, query, cut, is_new=False)
+    state.queries, state.selected = [query for query, *_ in moment.queries], moment.selected
+    marks = unpack(moment.marks, pack(state.selection.marks, history.marks))
+    state.selection = replace(state.selection, marks=marks, stroke=None)
+    state.record.keyframes, state.record.chosen = moment.keyframes, None
+    if moment.things != state.things:
+        state.things = moment.things
+        apply_locks(viewer)
+    state.notes = moment.notes
+    state.picture, state.latent_level = moment.picture, moment.latent_level
+    state.settings = moment.settings
+    looks = replace(state.preferences, colour_map=moment.picture.colour_map, overlays=moment.overlays)
+    state.preferences = looks
+    past, future = history.past, history.future
+    set_level(viewer, moment.level)
+    history.past, history.future = past, future  # what that has remembered is no step of its own
+    let_go(viewer)
+    if moment.moves != state.selection.moves:
+        place(viewer, moment.moves)
+    else:
+        ask_unanswered(viewer)

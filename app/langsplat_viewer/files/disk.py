@@ -1,0 +1,256 @@
+"""What lies around a scene on the disk: folders, photographs, files that change, a training's checkpoints."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path, PurePath
+
+import numpy as np
+from PIL import Image, ImageOps
+from safetensors import SafetensorError, safe_open
+
+from langsplat_core.arrays import Array
+from langsplat_core.errors import InputError, printable_line
+from langsplat_core.io.files import atomic_path
+from langsplat_core.io.hostile import PHOTO_SUFFIXES, opened
+from langsplat_core.io.ply import write_ply
+from langsplat_core.io.scenes import format_of
+from langsplat_core.pipeline.report import work_folder
+from langsplat_core.scene import Camera, Gaussians
+from langsplat_viewer.files.projects import PATHS, PROJECTS, QUERIES
+
+# Folders of the file browser.
+
+MOST_LISTED = 2000  # entries of a folder that are listed
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A file or folder as the browser lists it."""
+
+    path: Path
+    is_file: bool  # to be opened; else a folder to go into
+    size: int = 0  # bytes, of a file
+
+
+@dataclass(frozen=True)
+class Listing:
+    """A folder as the browser shows it."""
+
+    folder: Path
+    entries: tuple[Entry, ...] = ()  # folders first, each kind by name
+    left_out: int = 0  # more than `MOST`
+    problem: str = ""  # why there are none, one line
+
+
+def list_folder(folder: Path) -> Listing:
+    """Folders and scenes in `folder`; hidden ones are left out. Does not raise."""
+    try:
+        paths = sorted(folder.iterdir(), key=lambda path: path.name.lower())
+        entries = [entry for path in paths if (entry := _entry(path)) is not None]
+    except OSError as error:
+        return Listing(folder, problem=f"cannot be listed ({error.strerror or error})")
+    entries.sort(key=lambda entry: entry.is_file)
+    return Listing(folder, tuple(entries[:MOST_LISTED]), max(len(entries) - MOST_LISTED, 0))
+
+
+def _entry(path: Path) -> Entry | None:
+    if path.name.startswith("."):
+        return None
+    try:
+        if path.is_dir():
+            return Entry(path, is_file=format_of(path) is not None)
+        if format_of(path) is not None or path.name.endswith((QUERIES, PATHS, PROJECTS)):
+            return Entry(path, True, path.stat().st_size)
+    except OSError:  # it may not be looked at
+        pass
+    return None
+
+
+# Photographs of training cameras.
+
+LONGEST_SIDE = 2048  # pixels of what is kept: more than an area of a window has
+MOST_FILES = 20_000  # of a folder that are looked at
+ASPECT_TOLERANCE = 0.02  # shrunk copies round their sizes
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """The photograph of one camera, or the reason why there is none."""
+
+    camera: Camera
+    folder: str  # that was chosen when it was looked for, "" for none
+    image: Array | None = (
+        None  # (H, W, 3) uint8, row 0 on top; None while it is read_photograph and without one
+    )
+    reason: str = ""
+
+
+def places(scene: Path) -> tuple[Path, ...]:
+    """Folders in which the photographs of a scene usually lie."""
+    trained_from = scene.with_suffix("")  # as the panel "Train" names a scene
+    beside = scene.parent
+    return trained_from / "images", trained_from, beside / "images", beside
+
+
+def find_photograph(name: str, scene: Path, folder: str) -> Path:
+    """The photograph of the camera `name`: in the chosen `folder` or the folders in it, or where photographs
+    usually lie. InputError where it is in none of them."""
+    if not name:
+        raise InputError("this camera does not name its photograph")
+    looked_in = (Path(folder),) if folder else places(scene)
+    for place in looked_in:
+        paths = place.rglob("*") if folder else place.glob("*")
+        try:
+            photographs = [p for p in islice(paths, MOST_FILES) if p.suffix.lower() in PHOTO_SUFFIXES]
+        except OSError:  # it may not be looked into
+            continue
+        found = [path for path in sorted(photographs) if name in _names(path.relative_to(place))]
+        if found:
+            return found[0]
+    where = folder or f"{scene.parent} and its folders images and {scene.stem}"
+    raise InputError(f"no photograph '{printable_line(name, 60)}' in {where}")
+
+
+def _names(path: PurePath) -> set[str]:
+    """Return the names that a camera of this photograph may have: training names cameras by the stem, where
+    two have the same by the path."""
+    whole = path.with_suffix("").as_posix()
+    return {path.stem, whole, whole.replace("/", "_")}
+
+
+def read_photograph(path: Path, camera: Camera) -> Array:
+    """(H, W, 3) uint8, at most `LONGEST_SIDE` pixels long, turned as its EXIF data ask where only that fits
+    the camera. Raises InputError."""
+    with opened(path) as stored:
+        stored.draft("RGB", (LONGEST_SIDE, LONGEST_SIDE))
+        picture: Image.Image = stored
+        if not _fits(picture.size, camera):
+            picture = ImageOps.exif_transpose(picture)
+        if not _fits(picture.size, camera):
+            width, height = picture.size
+            raise InputError(
+                f"{path} has {width}x{height} pixels, its camera {camera.width}x{camera.height}: "
+                "another shape"
+            )
+        if picture.mode.startswith("I"):  # 16 bits; Pillow's own conversion would clip
+            picture = Image.fromarray((np.asarray(picture) >> 8).astype(np.uint8))
+        picture = picture.convert("RGB")
+        picture.thumbnail((LONGEST_SIDE, LONGEST_SIDE))
+        return np.asarray(picture)
+
+
+def _fits(size: tuple[int, int], camera: Camera) -> bool:
+    return abs(size[0] * camera.height / (size[1] * camera.width) - 1) < ASPECT_TOLERANCE
+
+
+def corners(camera: Camera, shown: Camera) -> tuple[float, float, float, float]:
+    """Left, top, right, bottom of a photograph in the image of another camera of the same pose, pixels."""
+    x, y = shown.fx / camera.fx, shown.fy / camera.fy
+    left, top = shown.cx - camera.cx * x, shown.cy - camera.cy * y
+    return left, top, left + camera.width * x, top + camera.height * y
+
+
+# A scene's files that change while it is shown. A thread of its own looks about once a second, so that the
+# window can sleep until there is something to say.
+
+EVERY = 1.0  # seconds between looks
+
+Stamp = tuple[int, int] | None  # time of change (ns) and bytes of a file; None where there is none
+Stamps = tuple[tuple[Path, Stamp], ...]
+
+
+def stamps(files: tuple[Path, ...]) -> Stamps:
+    return tuple((file, _stamp(file)) for file in files)
+
+
+def _stamp(file: Path) -> Stamp:
+    try:
+        found = file.stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size
+
+
+class Watch:
+    """Looks after the files of one scene."""
+
+    def __init__(self, wake: Callable[[], None] = lambda: None) -> None:
+        """`wake` is called on another thread when `changed` has become another."""
+        self.wake = wake
+        self.changed = False  # the files are others than those read, and have been still for a while
+        self._read: Stamps = ()  # as they were when they were read
+        self._last: Stamps = ()  # as they were at the last look
+        self._lock = threading.Lock()
+        self._closed = threading.Event()
+
+    def begin(self, read: Stamps) -> None:
+        """Look after these files, the scene's own first, from the moment that they were read."""
+        with self._lock:
+            self._read = self._last = read
+            self.changed = False
+
+    def start(self) -> None:
+        threading.Thread(target=self._run, name="langsplat-watch", daemon=True).start()
+
+    def _run(self) -> None:
+        while not self._closed.wait(EVERY):
+            self.look()
+
+    def look(self) -> None:
+        """Look once. What still changes is not spoken of, nor a scene whose own file is gone."""
+        with self._lock:
+            watched, last = self._read, self._last
+        now = stamps(tuple(file for file, _ in watched))
+        with self._lock:
+            if self._read is not watched:  # another scene meanwhile
+                return
+            before, self._last = self.changed, now
+            if now == last:
+                self.changed = bool(now) and now != watched and now[0][1] is not None
+            news = self.changed != before
+        if news:
+            self.wake()
+
+    def dismiss(self) -> None:
+        """Count the files as read in their present state."""
+        with self._lock:
+            self._read = self._last
+            self.changed = False
+
+    def close(self) -> None:
+        self._closed.set()
+
+
+# Gaussians that are still being trained: the checkpoints of `langsplat train` as scenes to look at.
+#
+# A checkpoint has the raw parameters as tensors ``values.*``, colours in two parts; it is read without torch.
+
+PARTS = ("means", "log_scales", "quats_wxyz", "opacity_logits", "sh_dc", "sh_rest")
+IN_TRAINING = ".checkpoint.safetensors"
+PREVIEW = "so-far.ply"  # in the work folder of a training
+
+
+def newest(out: Path) -> Stamps:
+    """The Gaussians of the training of `out` that were written last, in training or done, and their stamp;
+    empty where there are none."""
+    folder = work_folder(out)
+    found = stamps((*folder.glob(f"radiance-*{IN_TRAINING}"), *folder.glob("radiance-*.ply")))
+    return tuple(sorted(found, key=lambda file: file[1] or (0, 0))[-1:])
+
+
+def write_preview(checkpoint: Path) -> Path:
+    """Write the Gaussians of a checkpoint as a scene beside it. InputError where it cannot be read."""
+    try:
+        with safe_open(checkpoint, framework="numpy") as file:
+            held = {name: file.get_tensor(f"values.{name}") for name in PARTS}
+        sh = np.concatenate([held.pop("sh_dc"), held.pop("sh_rest")], 1)
+        gaussians = Gaussians(**held, sh=sh)
+    except (SafetensorError, OSError, ValueError, KeyError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"{checkpoint}: no Gaussians in training ({reason})") from None
+    path = checkpoint.with_name(PREVIEW)
+    with atomic_path(path) as temporary:
+        write_ply(temporary, gaussians)
+    return path

@@ -1,1 +1,0 @@
-"""Images and films as files, with a window or without."""

@@ -1,0 +1,347 @@
+"""What panels share: the scene's area of the window, colours, letters, and small widgets."""
+
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from textwrap import fill
+from typing import TypeVar
+
+import moderngl
+from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
+
+from langsplat_core.arrays import Array
+from langsplat_viewer.files.preferences import Preferences
+
+T = TypeVar("T")
+
+MAIN_DOCK = "MainDockSpace"  # hello_imgui's name for the whole window below the menus
+OVER = (  # a window over the scene: it looks like a part of the image, and does not come to the front
+    imgui.WindowFlags_.no_decoration
+    | imgui.WindowFlags_.no_saved_settings
+    | imgui.WindowFlags_.no_focus_on_appearing
+    | imgui.WindowFlags_.no_bring_to_front_on_focus
+)
+FIXED = imgui.WindowFlags_.no_move | imgui.WindowFlags_.no_docking
+
+
+@dataclass(frozen=True)
+class Area:
+    """The scene's part of the window, in window units (not pixels on a high-density screen)."""
+
+    left: float
+    top: float
+    width: float
+    height: float
+
+    def fraction(self, x: float, y: float) -> tuple[float, float]:
+        """A window position as fractions of the area; outside [0, 1] beyond its edges."""
+        return (x - self.left) / self.width, (y - self.top) / self.height
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in whole window units, at least 1."""
+        return max(round(self.width), 1), max(round(self.height), 1)
+
+    @property
+    def corners(self) -> tuple[ImVec2, ImVec2]:
+        return ImVec2(self.left, self.top), ImVec2(self.left + self.width, self.top + self.height)
+
+    def columns(self, count: int) -> list["Area"]:
+        """The area cut into columns of one width."""
+        width = self.width / count
+        return [Area(self.left + place * width, self.top, width, self.height) for place in range(count)]
+
+
+def scene_area() -> Area:
+    """Return what menus and docked panels leave free, at least one unit wide and high."""
+    dock = hello_imgui.get_runner_params().docking_params.dock_space_id_from_name(MAIN_DOCK)
+    node = imgui.internal.dock_builder_get_central_node(dock) if dock else None
+    if node is None:  # in the first frame
+        display = imgui.get_io().display_size
+        return Area(0.0, 0.0, max(display.x, 1.0), max(display.y, 1.0))
+    return Area(node.pos.x, node.pos.y, max(node.size.x, 1.0), max(node.size.y, 1.0))
+
+
+TIP_LETTERS = 72  # of a line
+MOST_OVER = 0.94  # of the window that something which lies over it may take
+# Window units at a scale of 1.
+SPACES = {
+    "window_padding": (10.0, 8.0),
+    "frame_padding": (4.0, 3.0),
+    "item_spacing": (8.0, 6.0),
+    "item_inner_spacing": (4.0, 4.0),
+    "cell_padding": (4.0, 2.0),
+}
+SIZES = {"frame_rounding": 4.0, "indent_spacing": 21.0, "scrollbar_size": 14.0, "grab_min_size": 12.0}
+
+
+def apply(preferences: Preferences) -> None:
+    """Apply the theme, with one accent and little contrast between the widgets; once for every change."""
+    dark = preferences.theme == "dark"
+    themes = hello_imgui.ImGuiTheme_
+    hello_imgui.apply_theme(themes.darcula_darker if dark else themes.imgui_colors_light)
+    style = imgui.get_style()
+    scale = preferences.ui_scale
+    for name, (x, y) in SPACES.items():
+        setattr(style, name, ImVec2(x * scale, y * scale))
+    for name, size in SIZES.items():
+        setattr(style, name, size * scale)
+    style.window_border_size = 0
+    style.font_scale_main = scale
+    for colour in (imgui.Col_.slider_grab, imgui.Col_.slider_grab_active):  # numbers are read over it
+        style.set_color_(colour, ImVec4(0.18, 0.36, 0.66, 1) if dark else ImVec4(0.62, 0.76, 0.96, 1))
+    popup = style.color_(imgui.Col_.popup_bg)
+    style.set_color_(imgui.Col_.popup_bg, ImVec4(popup.x, popup.y, popup.z, 1))
+
+
+def _readable(on_dark: tuple[float, float, float], on_light: tuple[float, float, float]) -> ImVec4:
+    background = imgui.get_style().color_(imgui.Col_.window_bg)
+    return ImVec4(*(on_dark if background.x + background.y + background.z < 1.5 else on_light), 1.0)
+
+
+def good() -> ImVec4:
+    return _readable((0.47, 0.80, 0.52), (0.05, 0.45, 0.15))
+
+
+def bad() -> ImVec4:
+    return _readable((0.95, 0.58, 0.45), (0.70, 0.15, 0.05))
+
+
+def muted() -> ImVec4:
+    return _readable((0.62, 0.64, 0.67), (0.35, 0.36, 0.40))
+
+
+def small_wrapped(text: str, colour: ImVec4) -> None:
+    """Text of any length, wrapped at the panel's edge."""
+    imgui.push_style_color(imgui.Col_.text, colour)
+    imgui.text_wrapped(text)
+    imgui.pop_style_color()
+
+
+def tip(text: str) -> None:
+    """Show a tooltip while the mouse is over the last item."""
+    if imgui.is_item_hovered():
+        imgui.set_tooltip(fill(text, TIP_LETTERS, break_on_hyphens=False))
+
+
+def stoppable(label: str, fraction: float, tag: str = "") -> bool:
+    """A bar in the accent's colour, with a button beside it; whether that was clicked. `tag` tells the button
+    from others of its name."""
+    width = beside_button("Cancel")
+    if width_of(label) > imgui.get_content_region_avail().x + width:  # no room for it in the bar
+        imgui.text_wrapped(label)
+        label = ""
+    imgui.push_style_color(imgui.Col_.plot_histogram, imgui.get_style_color_vec4(imgui.Col_.button_active))
+    imgui.progress_bar(fraction, ImVec2(width, 0), label)
+    imgui.pop_style_color()
+    imgui.same_line()
+    return bool(imgui.button(f"Cancel##{tag}" if tag else "Cancel"))
+
+
+def width_of(text: str) -> float:
+    return float(imgui.calc_text_size(text).x)
+
+
+def button_width(label: str) -> float:
+    return width_of(label.partition("##")[0]) + 2 * imgui.get_style().frame_padding.x
+
+
+def beside_button(label: str) -> float:
+    """Return the width, as imgui takes it, of an item that leaves room for a button at the end of its row."""
+    return -button_width(label) - imgui.get_style().item_spacing.x
+
+
+def beside(label: str, more: float = 0.0) -> None:
+    """Go on in the last row, unless a widget with this label and `more` window units does not fit there."""
+    imgui.same_line()
+    if imgui.get_content_region_avail().x < button_width(label) + more:
+        imgui.new_line()
+
+
+def button(label: str, about: str = "", *, enabled: bool = True) -> bool:
+    """Draw a button with a tip, that can be clicked where it is `enabled`; whether it was."""
+    imgui.begin_disabled(not enabled)
+    clicked = bool(imgui.button(label))
+    imgui.end_disabled()
+    if about:
+        tip(about)
+    return clicked
+
+
+def next_button(label: str, about: str = "", *, enabled: bool = True) -> bool:
+    beside(label)
+    return button(label, about, enabled=enabled)
+
+
+def box(label: str, hint: str, text: str, width: float = -1.0) -> tuple[bool, str]:
+    """A text box, as wide as the row unless a `width` is given; whether Enter was pressed, and the text."""
+    imgui.set_next_item_width(width)
+    flags = imgui.InputTextFlags_.enter_returns_true
+    entered, typed = imgui.input_text_with_hint(label, hint, text, flags)
+    return bool(entered), str(typed)
+
+
+def box_with_button(label: str, hint: str, text: str, button: str) -> tuple[bool, str]:
+    """A `box`, and a button beside it that does what Enter does."""
+    entered, typed = box(label, hint, text, beside_button(button))
+    imgui.same_line()
+    return bool(imgui.button(button)) or entered, typed
+
+
+def radio(choices: Mapping[T, str], chosen: T, tips: Mapping[T, str] | None = None) -> T:
+    """Draw a radio button with its label for each of the `choices`; the one that is chosen now."""
+    for place, (value, label) in enumerate(choices.items()):
+        if place:
+            beside_boxed(label)
+        if imgui.radio_button(label, value == chosen):
+            chosen = value
+        if tips:
+            tip(tips[value])
+    return chosen
+
+
+def slider(
+    label: str,
+    value: float,
+    limits: tuple[float, float],
+    text: str = "%.2f",
+    *,
+    logarithmic: bool = False,
+    ems: float = 11.0,
+) -> float:
+    """Draw a slider, `ems` wide where there is room; the value that it has now."""
+    leave_room(label, ems)
+    flags = imgui.SliderFlags_.always_clamp
+    if logarithmic:
+        flags |= imgui.SliderFlags_.logarithmic
+    changed, new = imgui.slider_float(label, value, *limits, text, flags)
+    return new if changed else value  # what comes back unchanged has been rounded
+
+
+def row(text: str, tag: str, chosen: bool, *, can_go: bool = True, about: str = "") -> tuple[bool, bool]:
+    """Draw a row of a list and a button that takes it off; whether each was clicked. about: its tip."""
+    side, right = imgui.get_frame_height(), imgui.get_content_region_avail().x
+    room = right - side - imgui.get_style().item_spacing.x
+    imgui.align_text_to_frame_padding()
+    clicked = imgui.selectable(f"{elided(text, room)}##{tag}", chosen, size=ImVec2(room, 0))[0]
+    if about:
+        tip(about)
+    imgui.same_line(imgui.get_cursor_start_pos().x + right - side)
+    imgui.begin_disabled(not can_go)
+    gone = imgui.button("x", ImVec2(side, 0))
+    imgui.end_disabled()
+    return bool(clicked), bool(gone)
+
+
+class Picture:
+    """An image of an action's result as a texture, uploaded where it is another than in the last frame."""
+
+    def __init__(self, *, shrinks: bool = True) -> None:
+        """shrinks: it is drawn smaller than it is."""
+        self._shrinks = shrinks
+        self._image: Array | None = None  # what the texture has
+        self._texture: moderngl.Texture | None = None
+
+    def texture(self, image: Array) -> moderngl.Texture:
+        """The texture of an (H, W, 3) uint8 image, row 0 on top."""
+        if self._texture is None or self._image is not image:
+            if self._texture is not None:
+                self._texture.release()
+            size = (image.shape[1], image.shape[0])
+            texture = moderngl.get_context().texture(size, 3, image.tobytes(), alignment=1)
+            if self._shrinks:
+                texture.build_mipmaps()
+                texture.filter = moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR
+            texture.repeat_x = texture.repeat_y = False
+            self._texture, self._image = texture, image
+        return self._texture
+
+
+def beside_boxed(label: str) -> None:
+    """`beside`, for a radio button or a check box."""
+    beside(label, imgui.get_frame_height())
+
+
+def leave_room(label: str, ems: float) -> None:
+    """The next widget is `ems` wide, or what is left of the row beside its label."""
+    label_width = width_of(label) + imgui.get_style().item_inner_spacing.x
+    room = imgui.get_content_region_avail().x - label_width
+    imgui.set_next_item_width(max(min(hello_imgui.em_size(ems), room), hello_imgui.em_size(2)))
+
+
+def fitting(width_em: float, height_em: float) -> ImVec2:
+    """A size for what lies over the scene, in widths of an m, as far as the window has room for it."""
+    size, room = hello_imgui.em_to_vec2(width_em, height_em), imgui.get_main_viewport().work_size
+    return ImVec2(min(size.x, MOST_OVER * room.x), min(size.y, MOST_OVER * room.y))
+
+
+def elided(text: str, room: float, width_of: Callable[[str], float] = width_of) -> str:
+    """`text` in one line, cut with "..." where it is wider than `room`."""
+    text = " ".join(text.splitlines())
+    if width_of(text) <= room:
+        return text
+    low, high = 0, len(text)  # as many letters as fit
+    while low < high:
+        middle = (low + high + 1) // 2
+        low, high = (middle, high) if width_of(text[:middle] + "...") <= room else (low, middle - 1)
+    return text[:low].rstrip() + "..."
+
+
+# Letters: the window's own font, and behind it others for what that does not have.
+
+FONT_SIZE = 15.0  # window units
+FOLDERS = {
+    "linux": ("/usr/share/fonts", "/usr/local/share/fonts", "~/.local/share/fonts", "~/.fonts"),
+    "darwin": ("/System/Library/Fonts", "/Library/Fonts", "~/Library/Fonts"),
+    "win32": ("C:/Windows/Fonts",),
+}
+# Fonts with the scripts of East Asia and others with many, the first that is there is taken.
+WIDE = (
+    *("NotoSansCJK-Regular.ttc", "NotoSansCJK-VF.ttc", "NotoSansCJKjp-Regular.otf", "SourceHanSans.ttc"),
+    *(
+        "DroidSansFallbackFull.ttf",
+        "DroidSansFallback.ttf",
+        "wqy-microhei.ttc",
+        "wqy-zenhei.ttc",
+        "unifont.ttf",
+    ),
+    *("Arial Unicode.ttf", "PingFang.ttc", "Hiragino Sans GB.ttc", "msyh.ttc", "YuGothM.ttc", "malgun.ttf"),
+)
+BUNDLED = {  # package -> its file; pictographs, and letters: Latin, Greek, Cyrillic, Hebrew, Arabic, more
+    "matplotlib": "mpl-data/fonts/ttf/DejaVuSans.ttf",
+    "imgui_bundle": "demos_assets/fonts/NotoEmoji-Regular.ttf",
+}
+
+
+def load_fonts() -> None:
+    """The callback of hello_imgui: its default font, with what else there is merged into it. Letters are
+    drawn into the texture when they first appear, so that a large font costs nothing until then."""
+    hello_imgui.imgui_default_settings.load_default_font_with_font_awesome_icons()
+    merged = hello_imgui.FontLoadingParams()
+    merged.merge_to_last_font, merged.inside_assets = True, False
+    for path in fallbacks():
+        hello_imgui.load_font(str(path), FONT_SIZE, merged)
+
+
+def fallbacks() -> list[Path]:
+    """Font files to look letters up in, in this order."""
+    found = (*(_bundled(package, file) for package, file in BUNDLED.items()), _installed())
+    return [path for path in found if path is not None]
+
+
+def _bundled(package: str, file: str) -> Path | None:
+    spec = find_spec(package)
+    if spec is None or spec.origin is None:
+        return None
+    path = Path(spec.origin).parent / file
+    return path if path.is_file() else None
+
+
+def _installed() -> Path | None:
+    files: dict[str, Path] = {}
+    for folder in FOLDERS.get(sys.platform, ()):
+        for path in Path(folder).expanduser().rglob("*.[to]t[fc]"):
+            files.setdefault(path.name, path)
+    return next((files[name] for name in WIDE if name in files), None)
