@@ -16,8 +16,8 @@ import pytest
 
 import langsplat_core.pipeline.importing  # noqa: F401  which imports torch
 from langsplat_core.cli.app import parse
+from langsplat_core.cli.export import Convert
 from langsplat_core.cli.run import main
-from langsplat_core.cli.scenes import Convert
 
 
 def run(*words: object) -> int:
