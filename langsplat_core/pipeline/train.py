@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from langsplat_core.arrays import ViewScore
-from langsplat_core.config import RadianceBudget, RadianceConfig, TrainConfig, check_settings
+from langsplat_core.config import QUICK, RadianceBudget, RadianceConfig, TrainConfig, check_settings
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.holdout import split
@@ -158,7 +158,8 @@ def _train(run: _Run, masks_of: Callable[[Capture], MaskSource] | None, given: S
     if processes.is_main:
         scene = Scene(gaussians, language, views.cameras, metres_per_unit=metres)
         save_scene(run.out, scene)
-        scores = evaluate_views(gaussians, capture, held_out) if held_out else []
+        small = capture.read_at(held_out, QUICK.longer_side) if held_out else None
+        scores = evaluate_views(gaussians, capture, held_out, small=small) if held_out else []
         clock.lap("saving and held-out views")
         report = _report(
             *(scene, language, loss, scores),

@@ -168,7 +168,8 @@ def _measured(
     seconds = time.process_time() - began
     if sheet:
         add_row(sheet, gaussians, between(capture.shrunk(train, QUICK.longer_side).cameras))
-    scores = evaluate_views(gaussians, capture, held_out)
+    small = capture.read_at(held_out, QUICK.longer_side)
+    scores = evaluate_views(gaussians, capture, held_out, small=small)
     learnt = evaluate_views(gaussians, capture, train)
     scene = Scene(gaussians, cameras=tuple(capture.cameras[i] for i in train))
     exposed = [score.psnr_exposed for score in scores if score.psnr_exposed is not None]

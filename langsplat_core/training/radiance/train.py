@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from langsplat_core.arrays import Array, ViewScore, psnr, sigmoid
-from langsplat_core.config import INRIA, QUICK, RadianceConfig, check_settings
+from langsplat_core.config import INRIA, RadianceConfig, check_settings
 from langsplat_core.datasets.capture import Capture, shrunk_view
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Cancelled, Progress, Terminated, silent
@@ -360,9 +360,17 @@ def _with_points(capture: Capture, depths: Sequence[DepthMap], config: RadianceC
 
 
 def evaluate_views(
-    gaussians: Gaussians, capture: Capture, indices: Sequence[int], backend: Backend = "auto"
+    gaussians: Gaussians,
+    capture: Capture,
+    indices: Sequence[int],
+    backend: Backend = "auto",
+    small: Capture | None = None,
 ) -> list[ViewScore]:
-    """Draw the views at `indices` and score them against the photographs; colours are clamped to [0, 1]."""
+    """Draw the views at `indices` and score them against the photographs; colours are clamped to [0, 1].
+
+    `small`: the same views read at 320 px, which images are compared with too, shrunk; a photograph that is
+    shrunk twice differs from one that was read at that size, by as much as good images do.
+    """
     renderer = renderer_for(backend)
     state = start(gaussians, 0, renderer.device)
     pictures = _Pictures(capture, indices, renderer.device)
@@ -379,20 +387,20 @@ def evaluate_views(
             share = 1.0 if mask is None else float(mask.float().mean())
             similarity = 1 - (1 - float(ssim(image, target))) / max(share, 1e-9)
             whole = decibels, similarity, float(covered.float().mean())
-            small = _psnr_small(camera, image, target, mask)
-            scores.append(ViewScore(camera.name, *whole, _psnr_exposed(image, target, mask), small))
+            exposed = _psnr_exposed(image, target, mask)
+            compared = (
+                None if small is None else _psnr_small(camera, image, small.images[index], small.mask(index))
+            )
+            scores.append(ViewScore(camera.name, *whole, exposed, compared))
     return scores
 
 
-def _psnr_small(camera: Camera, image: Tensor, target: Tensor, mask: Tensor | None) -> float | None:
-    """PSNR of an image and its photograph, both as small as `QUICK`'s; None where nothing counts then."""
-    share = min(QUICK.longer_side / max(camera.width, camera.height), 1.0)
-    size = max(round(share * camera.width), 1), max(round(share * camera.height), 1)
-    counted = None if mask is None else mask.cpu().numpy()
-    values = [(255 * colours).round().byte().cpu().numpy() for colours in (image, target)]
-    (_, drawn, counts), (_, photograph, _) = (shrunk_view(camera, one, counted, size) for one in values)
-    which = np.ones(drawn.shape[:2], bool) if counts is None else counts
-    return psnr(drawn[which] / 255, photograph[which] / 255) if which.any() else None
+def _psnr_small(camera: Camera, image: Tensor, photograph: Array, mask: Array | None) -> float | None:
+    """PSNR of an image shrunk to the size of a photograph; None where nothing of that counts."""
+    colours = (255 * image).round().byte().cpu().numpy()
+    _, drawn, _ = shrunk_view(camera, colours, None, (photograph.shape[1], photograph.shape[0]))
+    counted = np.ones(drawn.shape[:2], bool) if mask is None else mask
+    return psnr(drawn[counted] / 255, photograph[counted] / 255) if counted.any() else None
 
 
 def _psnr_exposed(image: Tensor, target: Tensor, mask: Tensor | None) -> float | None:

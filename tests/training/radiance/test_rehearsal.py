@@ -158,7 +158,7 @@ def test_scores_compare_between_sizes() -> None:
     mask = np.ones((640, 640), bool)
     mask[:, 301:] = False
     photographs = replace(photographs, masks=(None, mask, *[None] * 6))
-    scores = evaluate_views(scene, photographs, [0, 1], "cpu")
+    scores = evaluate_views(scene, photographs, [0, 1], "cpu", photographs.shrunk([0, 1], 320))
     for index, (score, columns) in enumerate(zip(scores, (320, 150), strict=True)):
         drawn = render(Scene(scene), photographs.cameras[index]).colours.clip(0, 1)
         pair = np.round(255 * drawn).astype(np.uint8), photographs.images[index]
