@@ -35,7 +35,7 @@ from langsplat_viewer.state import TrainingForm
 from langsplat_viewer.window import Window, WindowRequest
 
 sys.path.insert(0, str(Path(__file__).parent.parent))  # the tests
-from tests.support.browser import open_browser, open_tab
+from tests.support.processes import open_browser, open_tab
 
 OUT = Path(__file__).parent.parent / "docs" / "pictures"
 CAMERA = "3"

@@ -12,8 +12,16 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import hypothesis
 import pytest
 
-from tests.support.backends import backend, fast_backend, gl_rasterizers, gsplat_twin
-from tests.support.fixtures import gl, gl_session, measured, print_measured
+from tests.support.backends import (
+    backend,
+    fast_backend,
+    gl,
+    gl_rasterizers,
+    gl_session,
+    gsplat_twin,
+    measured,
+    print_measured,
+)
 
 __all__ = ["backend", "fast_backend", "gl", "gl_rasterizers", "gl_session", "gsplat_twin", "measured"]
 

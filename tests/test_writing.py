@@ -34,9 +34,9 @@ from langsplat_viewer.files.preferences import Preferences, save_preferences
 from langsplat_viewer.files.projects import Bookmark, QuerySet, SavedQuery, Shelf, write_flight, write_queries
 from langsplat_viewer.output import Film, save_png, write_film
 from tests.support.file_samples import random_codec, random_field
-from tests.support.marks_and_flights import flight as some_flight
 from tests.support.processes import bound_by_permissions, files_of_at_most, small_disk
 from tests.support.scenes import random_camera, random_gaussians
+from tests.support.windowless import flight as some_flight
 
 CHECKS = [check_output_file, check_output_folder]
 Check = Callable[[Path], None]

@@ -58,7 +58,7 @@ from langsplat_core.semantics.sam import grid_points, load_segmenter
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language.mask_weights import find_mask_weights
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
-from tests.support import torch_reference
+from tests.support import torch_raster as torch_reference
 
 
 class Missing(Exception):

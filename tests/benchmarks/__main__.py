@@ -4,21 +4,14 @@ import sys
 from typing import Union
 
 from langsplat_core.cli.run import Command, main, parsed, with_codec
-from tests.benchmarks.changed import Changed
-from tests.benchmarks.clean import Clean
-from tests.benchmarks.colours import Colours
+from tests.benchmarks.answers import Rooms, Verdicts
+from tests.benchmarks.evidence import Taught, Votes
 from tests.benchmarks.few import Few
-from tests.benchmarks.formats import Formats
-from tests.benchmarks.library import Found
-from tests.benchmarks.lifting import Lifting
-from tests.benchmarks.maps import Maps
-from tests.benchmarks.meshes import Meshes
+from tests.benchmarks.geometry import Clean, Maps, Meshes
+from tests.benchmarks.library import Changed, Found
+from tests.benchmarks.lifting import Colours, Lifting
 from tests.benchmarks.phrases import Phrases
-from tests.benchmarks.rooms import Rooms
-from tests.benchmarks.scale import Scale
-from tests.benchmarks.taught import Taught
-from tests.benchmarks.verdicts import Verdicts
-from tests.benchmarks.votes import Votes
+from tests.benchmarks.scale import Formats, Scale
 from tests.benchmarks.walks import Walks
 
 PROGRAM = "python -m tests.benchmarks"

@@ -1,8 +1,9 @@
-"""The report `lifting`: methods from masks to answers side by side, in rooms with known truth.
+"""Reports on language fields.
 
-LERF's method, the paper's with and without its autoencoder, its training from both starts, lifted CLIP
-vectors behind every codec, and ours with one part taken out, all with the same Gaussians, outlines and
-encoder.
+* lifting: methods from masks to answers in rooms with known truth: LERF's, the paper's with and without its
+  autoencoder, its training from both starts, lifted CLIP vectors behind every codec, and ours with one part
+  taken out, all with the same Gaussians, outlines and encoder;
+* colours: how far apart the latent colours of neighbours are to the eye.
 """
 
 import json
@@ -13,37 +14,40 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tyro
+from skimage.color import deltaE_ciede2000, rgb2lab
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.bench.measure import markdown
-from langsplat_core.config import CodebookConfig, Count, LevelChoice, LiftConfig, LinearConfig, PictureConfig
+from langsplat_core.config import (
+    AutoencoderConfig,
+    CodebookConfig,
+    Count,
+    LiftConfig,
+    LinearConfig,
+    PictureConfig,
+)
+from langsplat_core.display.displays import latent_colours
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.progress import Progress, TerminalProgress, silent
-from langsplat_core.query.engine import QueryEngine
+from langsplat_core.io.scenes import load_scene
+from langsplat_core.progress import Progress, silent
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.protocol import LiftingRasterizer, View
-from langsplat_core.scene import Camera, Gaussians, Scene
+from langsplat_core.scene import LEVELS, NO_NODE, Camera, Gaussians, Scene
+from langsplat_core.scene.surface import build_surface
 from langsplat_core.semantics.relevancy import relevancy
 from langsplat_core.semantics.store import ImageEncoder, masked_crop
 from langsplat_core.training.language.codec_fit import CodecReport
-from tests.benchmarks.room import (
-    HOLD_OUT,
-    InRooms,
-    MaskOrigin,
-    Room,
-    Variant,
-    autoencoder,
-    ceiling,
-    median_seconds,
-    publish,
-)
+from langsplat_core.training.language.palette import FEWEST_LINKS, LEAST
+from tests.benchmarks.room import HOLD_OUT, InRooms, MaskOrigin, Room, Variant, median_seconds, publish
 from tests.benchmarks.scoring import (
     Answer,
     DirectScore,
     Measured,
     Score,
     ask,
+    grouped,
     loss_cells,
     masks_of_maps,
     of_kind,
@@ -51,7 +55,6 @@ from tests.benchmarks.scoring import (
 
 PATCHES = "LERF's method: patches at seven scales, no masks"
 OURS = "ours"
-ALONE: tuple[LevelChoice, ...] = ("subpart", "part", "whole")
 KINDS = ("object", "part", "subpart", "all")
 
 
@@ -71,9 +74,8 @@ class Lifting(InRooms):
     """Methods whose name holds one of these texts; all of them if empty."""
 
     def run(self) -> None:
-        with TerminalProgress() as progress:
-            kept = KeptRows(self.out / "lifting.rows.jsonl")
-            rows = [row for room in self.rooms(progress) for row in measure_methods(room, self, kept)]
+        kept = KeptRows(self.out / "lifting.rows.jsonl")
+        rows = self.each(lambda room: measure_methods(room, self, kept))
         first = [row for row in rows if row.measured.masks in (self.masks[0], "tiles")]
         publish(self, "lifting", "From masks to answers", method_table(rows), rows, partial(plot, first))
 
@@ -95,36 +97,35 @@ class MethodRow:
 def methods(command: Lifting, masks: MaskOrigin, dim: int) -> list[Variant]:
     """All methods. dim: numbers of the encoder's vectors."""
     ours = Variant(OURS, masks)
-    one_pass, latent = LiftConfig(mode="one-pass"), autoencoder(steps=command.codec_steps)
+    latents = {d: AutoencoderConfig(latent_dim=d, steps=command.codec_steps) for d in (1, 2, 3, 8)}
+    everything = LinearConfig(latent_dim=dim)  # which loses nothing
     trained = LiftConfig(mode="gradient", steps=command.gradient_steps)
     from_zeros = replace(trained, start="zeros-as-published")
-    paper = replace(ours, codec=latent, lift=one_pass, query="paper")
-    made = [
-        ours,
-        replace(paper, name="the paper: autoencoder d = 3, trained", lift=trained),
-        replace(paper, name="the paper, trained from zeros", lift=from_zeros),
-        replace(paper, name=f"the paper without its autoencoder: {dim} numbers", codec=ceiling(dim)),
-    ]
-    made += [
-        replace(paper, name=f"the paper in one pass, d = {d}", codec=autoencoder(d, command.codec_steps))
-        for d in (1, 2, 3, 8)
-    ]
-    made += [
-        replace(paper, name="one-pass latents, answers blended", query="blend answers"),
-        replace(ours, name="ours, mean and autoencoder d = 3", codec=latent, lift=LiftConfig(mode="mean")),
-        replace(ours, name="ours, autoencoder d = 3", codec=latent),
-        replace(ours, name="ours, 64 linear numbers", codec=LinearConfig(latent_dim=64)),
-    ]
-    made += [
-        replace(ours, name=f"ours, codebook of {size}", codec=CodebookConfig(size=size))
-        for size in (256, 1_024, 4_096)
-    ]
-    made.append(replace(ours, name=f"ours, all {dim} numbers", codec=ceiling(dim)))
-    made += [replace(ours, name=f"ours, level {level} alone", level=level) for level in ALONE]
+    paper = replace(ours, codec=latents[3], lift=LiftConfig(mode="one-pass"), query="paper")
+    theirs: dict[str, dict[str, Any]] = {
+        "the paper: autoencoder d = 3, trained": {"lift": trained},
+        "the paper, trained from zeros": {"lift": from_zeros},
+        f"the paper without its autoencoder: {dim} numbers": {"codec": everything},
+        **{f"the paper in one pass, d = {d}": {"codec": codec} for d, codec in latents.items()},
+        "one-pass latents, answers blended": {"query": "blend answers"},
+    }
+    changed: dict[str, dict[str, Any]] = {
+        "mean and autoencoder d = 3": {"codec": latents[3], "lift": LiftConfig(mode="mean")},
+        "autoencoder d = 3": {"codec": latents[3]},
+        "64 linear numbers": {"codec": LinearConfig(latent_dim=64)},
+        **{f"codebook of {size}": {"codec": CodebookConfig(size=size)} for size in (256, 1_024, 4_096)},
+        f"all {dim} numbers": {"codec": everything},
+        **{f"level {level} alone": {"level": level} for level in ("subpart", "part", "whole")},
+    }
     if masks == "truth":
-        made.append(replace(ours, name="ours, masks of the weight-free segmenter", masks="graph"))
-        made.append(replace(ours, name="ours, squares in place of masks", masks="tiles"))
-    return [*made, Variant(PATCHES, masks)]
+        changed["masks of the weight-free segmenter"] = {"masks": "graph"}
+        changed["squares in place of masks"] = {"masks": "tiles"}
+    return [
+        ours,
+        *(replace(paper, name=name, **parts) for name, parts in theirs.items()),
+        *(replace(ours, name=f"{OURS}, {name}", **parts) for name, parts in changed.items()),
+        Variant(PATCHES, masks),
+    ]
 
 
 class KeptRows:
@@ -173,9 +174,9 @@ def measure_methods(room: Room, command: Lifting, kept: KeptRows) -> Iterator[Me
         names = ", ".join(dict.fromkeys(v.name for v in every))
         raise InputError(f"--only {' '.join(command.only)}: no method has that; they are {names}")
     config = room.config
-    size = {"views": config.views, "size": config.size, "steps": config.steps, "most": config.max_gaussians}
-    steps = {"codec_steps": command.codec_steps, "gradient_steps": command.gradient_steps}
-    base = {"room": f"{room.tier} {room.seed}", **size, "encoder": room.weights, "cut": config.cut, **steps}
+    base = {"room": f"{room.tier} {room.seed}", "encoder": room.weights, "most": config.max_gaussians}
+    base |= {name: getattr(config, name) for name in ("views", "size", "steps", "cut")}
+    base |= {name: getattr(command, name) for name in ("codec_steps", "gradient_steps")}
     for variant in chosen:
         made = by_patches if variant.name == PATCHES else partial(Room.measure, fresh=True)
         key = base | {"masks": variant.masks, "method": variant.name}
@@ -187,16 +188,21 @@ def by_patches(room: Room, variant: Variant) -> Measured:
     train, _ = room.capture.split(HOLD_OUT)
     views = [(room.capture.cameras[i], room.capture.images[i]) for i in train]
     vectors = lift_patches(load_lifting_rasterizer("cpu"), room.gaussians, views, room.encoder, room.progress)
-    field, _, _ = room.field(replace(variant, name=OURS))
-    patches = PatchField(vectors, field.canonical, field.reading.temperature)
-    asked = ask(QueryEngine(Scene(room.gaussians, field), lambda _: room.encoder), room.texts)
+    engine = room.engine(replace(variant, name=OURS))
+    patches = PatchField(vectors, engine.field.canonical, engine.field.reading.temperature)
+    asked = ask(engine, room.texts)
     asked = replace(asked, answers=reread(asked.answers, patches))
     one = np.stack([answer.vector for answer in list(asked.answers.values())[:1]])
 
     def picture() -> Array:
         return pictures(patches, CpuRasterizer().view(room.gaussians, room.held_out[0]), one)
 
-    measured = room.measure_asked(asked, variant, partial(judged, patches))
+    def judge(view: View, answers: Sequence[Answer]) -> Iterator[tuple[Array, tuple[int, int]]]:
+        if answers:
+            maps = pictures(patches, view, np.stack([answer.vector for answer in answers]))
+            yield from masks_of_maps(maps)
+
+    measured = room.measure_asked(asked, variant, judge)
     return replace(
         measured,
         codec=f"{vectors.shape[2]} numbers at {len(vectors)} scales",
@@ -208,14 +214,10 @@ def by_patches(room: Room, variant: Variant) -> Measured:
 def method_table(rows: Sequence[MethodRow]) -> str:
     """Markdown: means over rooms, with the standard deviation of mIoU where there are several."""
     lines = []
-    for masks, name in dict.fromkeys((row.measured.masks, row.measured.name) for row in rows):
-        same = [row for row in rows if (row.measured.masks, row.measured.name) == (masks, name)]
+    for (masks, name), same in grouped(rows, "measured.masks", "measured.name").items():
         cells = [_cell(np.array([of_kind(row.measured, kind)[1:] for row in same])) for kind in KINDS]
         seconds = np.mean([row.measured.fit_seconds for row in same])
-        times = (
-            "-" if np.isnan(seconds) else f"{seconds:.0f}",
-            f"{np.mean([row.image_ms for row in same]):.0f}",
-        )
+        times = f"{seconds:.0f}", f"{np.mean([row.image_ms for row in same]):.0f}"
         lines.append((masks, name, *cells, *loss_cells([row.measured for row in same]), *times))
     shares = (f"{kind}: mIoU / loc / 3D %" for kind in KINDS)
     codec = ("codec", "relevancy error mean / p99", "bytes/Gaussian", "s to fit", "ms from phrase to image")
@@ -237,30 +239,20 @@ def plot(rows: Sequence[MethodRow], path: Path) -> None:
     from matplotlib import pyplot
 
     figure, panels = pyplot.subplots(1, 2, figsize=(10, 5.6), layout="constrained", sharex=True)
-    names = list(dict.fromkeys(row.measured.name for row in rows))
+    own = grouped(rows, "measured.name")
     for panel, (title, column) in zip(panels, (("mIoU in images %", 1), ("IoU in 3D %", 3)), strict=True):
-        for number, name in enumerate(names, 1):
-            same = [row for row in rows if row.measured.name == name]
+        for number, (name, same) in enumerate(own.items(), 1):
             shares = np.array([100 * of_kind(row.measured, "all")[column] for row in same])
             at = float(np.mean([row.image_ms for row in same])), float(shares.mean())
             colour = "#0072b2" if name.startswith(OURS) else "#d55e00"
             # Methods that are equally fast stand above each other: their numbers go to both sides in turn.
             side = 1 if number % 2 else -1
             panel.errorbar(*at, yerr=shares.std(), fmt="o", color=colour, capsize=2)
-            panel.annotate(
-                str(number),
-                at,
-                fontsize=9,
-                ha="left" if side > 0 else "right",
-                va="center",
-                xytext=(7 * side, 0),
-                textcoords="offset points",
-            )
-        panel.set_xscale("log")
-        panel.set_xlabel("milliseconds from a phrase to its image")
-        panel.set_ylabel(title)
+            style = {"ha": "left" if side > 0 else "right", "va": "center", "textcoords": "offset points"}
+            panel.annotate(str(number), at, (7 * side, 0), fontsize=9, **style)
+        panel.set(xscale="log", xlabel="milliseconds from a phrase to its image", ylabel=title)
         panel.grid(alpha=0.3)
-    legend = [pyplot.Line2D([], [], linestyle="", label=f"{k}  {name}") for k, name in enumerate(names, 1)]
+    legend = [pyplot.Line2D([], [], linestyle="", label=f"{k}  {name}") for k, name in enumerate(own, 1)]
     figure.legend(
         handles=legend, loc="outside lower center", ncols=2, fontsize=8, handlelength=0, frameon=False
     )
@@ -333,8 +325,7 @@ def lift_patches(
             for part in _parts(vectors.shape[2]):
                 total[row, :, part] += view.gather(np.ascontiguousarray(vectors[..., part]))
         progress("patches of the photographs", (done + 1) / len(views))
-    if total is None:
-        raise ValueError("views: expected at least one")
+    assert total is not None  # there are views
     return np.stack([unit(sums).astype(np.float32) for sums in total])
 
 
@@ -353,13 +344,12 @@ def pictures(field: PatchField, view: View, phrases: Array) -> Array:
         flat = unit(shown.reshape(-1, shown.shape[2]))
         values = relevancy(flat, phrases, field.canonical, field.temperature).astype(np.float32)
         maps = np.where(alpha > gate, np.moveaxis(values.reshape(*alpha.shape, -1), 2, 0), 0)
-        best = maps if best is None else np.where(_peaks(maps) > _peaks(best), maps, best)
+        if best is not None:
+            higher = maps.max((1, 2), keepdims=True) > best.max((1, 2), keepdims=True)
+            maps = np.where(higher, maps, best)
+        best = maps
     assert best is not None  # there are scales
     return best
-
-
-def _peaks(maps: Array) -> Array:
-    return np.asarray(maps.max(axis=(1, 2), keepdims=True))
 
 
 def among_gaussians(field: PatchField, phrases: Array) -> Array:
@@ -375,28 +365,54 @@ def among_gaussians(field: PatchField, phrases: Array) -> Array:
 
 def reread(answers: Mapping[str, Answer], field: PatchField) -> dict[str, Answer]:
     """The answers to the same phrases by patches."""
-    if not answers:
-        return {}
-    values = among_gaussians(field, np.stack([answer.vector for answer in answers.values()]))
-    return {name: _with_values(answers[name], row) for name, row in zip(answers, values, strict=True)}
+    phrases = np.reshape([answer.vector for answer in answers.values()], (-1, field.vectors.shape[2]))
+    found = {}
+    for name, values in zip(answers, among_gaussians(field, phrases), strict=True):
+        seen = values[values > 0]
+        median = float(np.median(seen)) if len(seen) else 0.0
+        peak = float(values.max())
+        found[name] = replace(answers[name], values=values, even=values, peak=peak, median=median)
+    return found
 
 
-def _with_values(answer: Answer, values: Array) -> Answer:
-    seen = values[values > 0]
-    return replace(
-        answer,
-        values=values,
-        even=values,
-        peak=float(values.max()),
-        median=float(np.median(seen)) if len(seen) else 0.0,
-    )
+# Latent colours of things that lie side by side: how far apart they are to the eye.
+
+SHARES = (0.0, 0.1, 0.25, 0.5)  # quantiles that are stated
 
 
-def judged(
-    field: PatchField, view: View, answers: Sequence[Answer]
-) -> Iterator[tuple[Array, tuple[int, int]]]:
-    """The mask (H, W) of each answer in a view, cut half way between the floor and its peak, and the row and
-    column of the peak."""
-    if answers:
-        maps = pictures(field, view, np.stack([answer.vector for answer in answers]))
-        yield from masks_of_maps(maps)
+@dataclass(frozen=True)
+class Colours:
+    """CIEDE2000 differences between the mean latent colours of neighbouring nodes of scenes."""
+
+    scenes: tyro.conf.Positional[tuple[Path, ...]]
+
+    def run(self) -> None:
+        head = ("scene", "level", "neighbours", "smallest", "10 %", "25 %", "median")
+        rows = []
+        for path in self.scenes:
+            scene = load_scene(path)
+            if scene.language is None or scene.language.tree is None:
+                raise InputError(
+                    f"{path}: has no language field with a tree; train one, or choose another scene"
+                )
+            for level in range(len(LEVELS)):
+                found = differences(scene, level)
+                stated = np.quantile(found, SHARES) if len(found) else np.full(len(SHARES), np.nan)
+                rows.append((path.parent.name, LEVELS[level], str(len(found)), *(f"{v:.1f}" for v in stated)))
+        print(markdown(head, rows))
+
+
+def differences(scene: Scene, level: int) -> Array:
+    """(P,) of the pairs of neighbouring nodes at a level."""
+    field = scene.language
+    assert field is not None
+    assert field.tree is not None
+    node, surface = field.tree.at(level), build_surface(scene.gaussians)
+    names, number, sizes = np.unique(node, return_inverse=True, return_counts=True)
+    colours = latent_colours(field)[level].astype(np.float64)
+    means = np.stack([np.bincount(number, colours[:, k]) / sizes for k in range(3)], 1)
+    ends = np.sort(np.stack([number[surface.rows[end]] for end in surface.ends]), axis=0)
+    pairs, links = np.unique(ends[:, ends[0] != ends[1]], axis=1, return_counts=True)
+    counted = (names[pairs] != NO_NODE).all(0) & (sizes[pairs] >= LEAST).all(0) & (links >= FEWEST_LINKS)
+    first, second = (rgb2lab(means[one]) for one in pairs[:, counted])
+    return np.asarray(deltaE_ciede2000(first, second))

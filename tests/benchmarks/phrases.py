@@ -4,9 +4,9 @@ Phrases that are true of a room come from its geometry and its names; the second
 """
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise, product
+from itertools import chain, pairwise, product
 
 import numpy as np
 
@@ -17,17 +17,17 @@ from assets.making.world import World
 from langsplat_core.arrays import Array
 from langsplat_core.bench.measure import markdown
 from langsplat_core.evaluation.report import intersection_over_union
-from langsplat_core.progress import Progress, TerminalProgress, silent
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import Body, Viewpoint, body, most, run_phrase, stands, upright, viewpoint
 from langsplat_core.query.describe import Describer, Entry, WordScores
-from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import EXTREMES, SIDES, atoms, parse
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
-from langsplat_core.scene import LEVELS, Camera, LanguageField, Scene
+from langsplat_core.scene import LEVELS, Camera
+from tests.benchmarks.oracles import surface_points
 from tests.benchmarks.room import InRooms, Room, Seeds, Variant, publish
 from tests.benchmarks.scoring import MIN_GAUSSIANS, masks_and_peaks
 
+METHOD = Variant("the method", "truth")
 POINTS = 3000  # on the surface of every thing, by which it is measured
 MOST_CASES = 16  # of one construction, drawn at random
 SHELL = ("floor", "wall")  # surround everything, and are not related to anything
@@ -48,12 +48,8 @@ class Phrases(InRooms):
     """One room of every tier each; never the bundled scene's. Composing was tuned on 201 and 202."""
 
     def run(self) -> None:
-        composed, named = [], []
-        with TerminalProgress() as progress:
-            for room in self.rooms(progress):
-                field, _, _ = room.field(Variant("the method", "truth"))
-                composed += measure_phrases(room, field, progress)
-                named.append(name_regions(room, field))
+        rows = self.each(lambda room: [(measure_phrases(room), name_regions(room))])
+        composed, named = [score for scores, _ in rows for score in scores], [words for _, words in rows]
         tables = f"{phrase_table(composed)}\n{word_table(named)}"
         publish(self, "phrases", "Phrases with structure, and names", tables, [*composed, *named])
 
@@ -88,17 +84,11 @@ class Things:
 
 def things_in(world: World, frame: Array, seed: int = 0) -> Things:
     """From a room's triangles, in which the origin is that of its cameras. frame: see `instances.upright`."""
-    rng = np.random.default_rng((seed, 5))
-    corners = world.vertices[world.triangles].astype(np.float64)
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    owner = world.ids[world.piece_of, 2]
+    rng, owner = np.random.default_rng((seed, 5)), world.ids[world.piece_of, 2]
     words, extents = {}, {}
-    for number in np.unique(owner):
-        rows = np.flatnonzero(owner == number)
-        rows = rng.choice(rows, POINTS, p=area[rows] / area[rows].sum())
-        shares = rng.dirichlet((1, 1, 1), POINTS)  # even over a triangle
-        words[int(number)] = world.labels[number].thing
-        extents[int(number)] = body((corners[rows] * shares[..., None]).sum(1), frame)
+    for number in np.unique(owner).tolist():
+        points = surface_points(world.vertices, world.triangles[owner == number], rng, count=POINTS)
+        words[number], extents[number] = world.labels[number].thing, body(points, frame)
     return Things(words, extents)
 
 
@@ -106,22 +96,15 @@ def cases(truth: Truth, things: Things, seen_by: Viewpoint, seed: int) -> list[C
     """At most `MOST_CASES` of every construction but of parts, of which there are all."""
     rng = np.random.default_rng((seed, 7))
     found: dict[str, list[Case]] = {name: [] for name in CONSTRUCTIONS}
-    every = [
-        *_parts(truth),
-        *_sets(things, rng),
-        *_relations(things, seen_by),
-        *_extremes(things, seen_by),
-    ]
-    for case in every:
+    places = _relations(things, seen_by), _extremes(things, seen_by)
+    for case in chain(_parts(truth), _sets(things, rng), *places):
         found[case.construction].append(case)
     drawn = []
     for name, group in found.items():
         if "part" in name or len(group) <= MOST_CASES:
             drawn += group
             continue
-        there = [case for case in group if case.ids]
-        absent = [case for case in group if not case.ids]
-        for some in (there, absent):
+        for some in ([case for case in group if case.ids], [case for case in group if not case.ids]):
             drawn += [some[row] for row in sorted(rng.permutation(len(some))[:MOST_CASES])]
     return drawn
 
@@ -164,13 +147,11 @@ def _relations(things: Things, seen_by: Viewpoint) -> Iterator[Case]:
         anchors = things.called(anchor)
         for word in [*_kinds(things), *objects]:
             candidates = [number for number in things.called(word) if number not in anchors]
-            right = tuple(
-                number
-                for number in candidates
-                if any(
-                    stands(side, things.extents[number], things.extents[other], seen_by) for other in anchors
-                )
-            )
+            pairs = [
+                (number, stands(side, things.extents[number], things.extents[other], seen_by))
+                for number, other in product(candidates, anchors)
+            ]
+            right = tuple(dict.fromkeys(number for number, stood in pairs if stood))
             some = 0 < len(right) < len(candidates)
             if some or (word in objects and candidates and not right and side not in VIEWER_SAYS):
                 text = f"{word} {side} the {anchor}"
@@ -184,17 +165,6 @@ def _extremes(things: Things, seen_by: Viewpoint) -> Iterator[Case]:
             one = numbers[most(kind, [things.extents[number] for number in numbers], [], seen_by)]
             text = f"the {kind} {word}"
             yield Case(kind, text, f"{kind} {word}", (one,))
-
-
-@dataclass(frozen=True, eq=False)
-class Judged:
-    """An answer that is about to be compared with the truth."""
-
-    case: Case
-    values: Array  # (N,) relevancy
-    members: Array  # (N,) bool
-    found: bool
-    seconds: float
 
 
 @dataclass(frozen=True)
@@ -213,78 +183,57 @@ class PhraseScore:
     seconds: float
 
 
-def measure_phrases(room: Room, field: LanguageField, progress: Progress = silent) -> list[PhraseScore]:
+def measure_phrases(room: Room) -> list[PhraseScore]:
     """All cases of one room that the encoder knows the words of, whole and composed."""
-    scene, held_out = Scene(room.gaussians, field, tuple(room.capture.cameras)), room.held_out
-    engine = QueryEngine(scene, lambda _: room.encoder)
-    frame = upright(scene.up())
+    engine, held_out = room.engine(METHOD, room.capture.cameras), room.held_out
+    frame = upright(engine.scene.up())
     things = things_in(photographed_room(room.seed, room.tier), frame, room.seed)
     asked = [
         case
         for case in cases(room.truth, things, viewpoint(held_out[0], frame), room.seed)
         if not any(engine.unknown_words(atom.text) for atom in atoms(parse(case.text)))
     ]
-    ways: dict[str, Callable[[Case], Judged]] = {
-        "whole": lambda case: _whole(engine, case),
-        "composed": lambda case: _composed(engine, case, held_out[0]),
-    }
     rows: list[PhraseScore] = []
-    for way, answer in ways.items():
+    for way in ("whole", "composed"):
         engine.run("object")  # so that no time goes into preparation
-        judged = [answer(case) for case in asked]
-        rows += _scores(room, judged, held_out, way)
-        progress(f"room {room.seed}, {way}", 1.0)
+        answered = []
+        for case in asked:
+            start = time.perf_counter()
+            if way == "composed":
+                result = run_phrase(engine, case.text, viewpoint=held_out[0]).answer
+            else:  # without the words that the encoder was never taught, such as "near": with them it refuses
+                unknown = engine.unknown_words(case.whole)
+                result = engine.run(" ".join(word for word in case.whole.split() if word not in unknown))
+            answered.append((case, result, time.perf_counter() - start))
+        rows += _scores(room, answered, held_out, way)
+        room.progress(way, 1.0)
     return rows
 
 
-def _whole(engine: QueryEngine, case: Case) -> Judged:
-    """Without the words that the encoder was never taught, such as "near": with them it refuses."""
-    unknown = set(engine.unknown_words(case.whole))
-    text = " ".join(word for word in case.whole.split() if word not in unknown)
-    start = time.perf_counter()
-    result = engine.run(text)
-    seconds = time.perf_counter() - start
-    return Judged(case, result.even, result.members, result.found, seconds)
-
-
-def _composed(engine: QueryEngine, case: Case, viewpoint: Camera) -> Judged:
-    start = time.perf_counter()
-    result: QueryResult = run_phrase(engine, case.text, viewpoint=viewpoint).answer
-    seconds = time.perf_counter() - start
-    return Judged(case, result.even, result.members, result.found, seconds)
-
-
-def _scores(room: Room, judged: Sequence[Judged], cameras: Sequence[Camera], way: str) -> list[PhraseScore]:
-    ious: list[list[float]] = [[] for _ in judged]
-    hits: list[list[bool]] = [[] for _ in judged]
+def _scores(
+    room: Room, answered: Sequence[tuple[Case, QueryResult, float]], cameras: Sequence[Camera], way: str
+) -> list[PhraseScore]:
+    """Answers, each with the seconds that it took, beside the truth."""
+    ious: list[list[float]] = [[] for _ in answered]
+    hits: list[list[bool]] = [[] for _ in answered]
     for camera in cameras:
-        for row, iou, hit in _in_view(room, judged, camera):
-            ious[row].append(iou)
-            hits[row].append(hit)
+        labels = room.truth.labels(camera.name)
+        masks = [case.mask(labels) for case, _, _ in answered]
+        visible = [row for row, mask in enumerate(masks) if mask.sum() >= MIN_PIXELS]
+        answers = [(answered[row][1].even, answered[row][1].members) for row in visible]
+        view = CpuRasterizer().view(room.gaussians, camera)
+        for row, (found, peak) in zip(visible, masks_and_peaks(view, answers), strict=True):
+            ious[row].append(intersection_over_union(found, masks[row]))
+            hits[row].append(bool(masks[row][peak]))
     seen = (room.labels >= 0).any(axis=0)
     rows = []
-    for number, item in enumerate(judged):
-        right = item.case.mask(room.labels)[seen]
+    for (case, answer, seconds), overlaps, peaks in zip(answered, ious, hits, strict=True):
+        right = case.mask(room.labels)[seen]
         enough = right.sum() >= MIN_GAUSSIANS
-        direct = intersection_over_union(item.members[seen], right) if enough else float("nan")
-        rows.append(
-            PhraseScore(
-                item.case.construction, item.case.text, way, room.seed, bool(item.case.ids), item.found,
-                tuple(ious[number]), tuple(hits[number]), direct, item.seconds,
-            )
-        )  # fmt: skip
+        direct = intersection_over_union(answer.members[seen], right) if enough else float("nan")
+        said = bool(case.ids), answer.found, tuple(overlaps), tuple(peaks), direct, seconds
+        rows.append(PhraseScore(case.construction, case.text, way, room.seed, *said))
     return rows
-
-
-def _in_view(room: Room, judged: Sequence[Judged], camera: Camera) -> Iterator[tuple[int, float, bool]]:
-    """(number, IoU, whether the peak hits) of every answer whose truth is visible."""
-    labels = room.truth.labels(camera.name)
-    view = CpuRasterizer().view(room.gaussians, camera)
-    masks = [item.case.mask(labels) for item in judged]
-    visible = [row for row, mask in enumerate(masks) if mask.sum() >= MIN_PIXELS]
-    answers = [(judged[row].values, judged[row].members) for row in visible]
-    for row, (found, peak) in zip(visible, masks_and_peaks(view, answers), strict=True):
-        yield row, intersection_over_union(found, masks[row]), bool(masks[row][peak])
 
 
 def phrase_table(rows: Sequence[PhraseScore]) -> str:
@@ -356,25 +305,23 @@ class RoomWords:
     inventory: InventoryScore
 
 
-def name_regions(room: Room, field: LanguageField) -> RoomWords:
+def name_regions(room: Room) -> RoomWords:
     """Words for every region of one room, and its inventory."""
-    describer = Describer(QueryEngine(Scene(room.gaussians, field), lambda _: room.encoder))
+    describer = Describer(room.engine(METHOD))
     labels, truth = room.labels, room.truth.regions
-    names = []
-    for how, words in _ways(describer).items():
-        for level in reversed(range(len(LEVELS))):
-            names.append(_names(how, words[level], describer, level, _regions(labels[level]), truth))
+    plain = [replace(words, hubs=np.zeros_like(words.hubs)) for words in describer.words]
+    ways = {"plain cosine": plain, "hubs taken out": describer.words}
+    names = [
+        _names(how, words[level], describer, level, _regions(labels[level]), truth)
+        for how, words in ways.items()
+        for level in reversed(range(len(LEVELS)))
+    ]
     start = time.perf_counter()
     entries = describer.inventory()
     seconds = time.perf_counter() - start
     score = score_inventory(entries, labels, truth, describer.areas, describer.words[2].phrases)
     colour = _colours(describer, _regions(labels[2]), truth)
     return RoomWords(room.seed, tuple(names), colour, replace(score, seconds=seconds))
-
-
-def _ways(describer: Describer) -> dict[str, Sequence[WordScores]]:
-    plain = [replace(words, hubs=np.zeros_like(words.hubs)) for words in describer.words]
-    return {"plain cosine": plain, "hubs taken out": describer.words}
 
 
 def _regions(labels: Array) -> dict[int, Array]:
@@ -406,12 +353,9 @@ def _names(
 
 
 def _colours(describer: Describer, regions: Mapping[int, Array], truth: Regions) -> float:
-    hits = []
-    for key, members in regions.items():
-        colour = truth[key].colour
-        if colour:
-            said = describer.at_gaussians(members)[2].colour
-            hits.append(said is not None and said.phrase in colour_words(colour))
+    coloured = {key: members for key, members in regions.items() if truth[key].colour}
+    said = {key: describer.at_gaussians(members)[2].colour for key, members in coloured.items()}
+    hits = [one is not None and one.phrase in colour_words(truth[key].colour) for key, one in said.items()]
     return float(np.mean(hits)) if hits else 0.0
 
 
@@ -419,8 +363,7 @@ def score_inventory(
     entries: Sequence[Entry], labels: Array, truth: Regions, areas: Array, phrases: Sequence[str]
 ) -> InventoryScore:
     """Entries of whole things against (3, N) truth ids; seconds are left 0."""
-    wholes, named = [entry for entry in entries if entry.level == 2], set()
-    correct = 0
+    wholes, named, correct = [entry for entry in entries if entry.level == 2], set(), 0
     for entry in wholes:
         rows = np.concatenate([spot.rows for spot in entry.spots])
         ids = labels[2, rows]

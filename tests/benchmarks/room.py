@@ -3,15 +3,17 @@ ordinary pipeline, and compared with the truth; and the options and files that a
 
 import hashlib
 import shlex
-import statistics
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from itertools import product
 from pathlib import Path
+from statistics import median
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal, TypeVar, cast
 
 import numpy as np
 import tyro
@@ -25,7 +27,6 @@ from langsplat_core.arrays import Array
 from langsplat_core.cli.evaluate import write_report
 from langsplat_core.cli.run import OutFolder
 from langsplat_core.config import (
-    AutoencoderConfig,
     ClipConfig,
     CodebookConfig,
     CodecConfig,
@@ -33,7 +34,6 @@ from langsplat_core.config import (
     DatasetConfig,
     LevelChoice,
     LiftConfig,
-    LinearConfig,
     MaskConfig,
     PictureConfig,
     RadianceConfig,
@@ -51,7 +51,7 @@ from langsplat_core.pipeline.agreement import agreed_features
 from langsplat_core.pipeline.language import Views, language_field
 from langsplat_core.pipeline.stages import stage_key
 from langsplat_core.pipeline.train import trained_gaussians
-from langsplat_core.progress import Progress
+from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.answers import AnswerRule, decoded_relevancy, splatted_relevancy
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
@@ -63,12 +63,13 @@ from langsplat_core.semantics.sam import load_mask_source
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures, describe_capture
 from langsplat_core.training.language.codec_fit import CodecReport
 from langsplat_core.training.radiance.rehearsal import budgets_for
-from tests.benchmarks.clip_geometry import ClipGeometry, read_geometry
 from tests.benchmarks.oracles import (
+    ClipGeometry,
     TileMasks,
     moved_to_pictures,
     oracle_vectors,
     phrase_vectors,
+    read_geometry,
     true_labels,
     with_wrong_vectors,
 )
@@ -82,10 +83,12 @@ from tests.benchmarks.scoring import (
     evaluate,
     evaluate_direct,
     measured,
+    seconds_of,
 )
 
 HOLD_OUT = 8  # every so many views, one is not trained on
 FRAMES = 5  # timed images of one phrase
+Row = TypeVar("Row")
 ViewCount = Annotated[int, Range(8, 100_000)]
 Seeds = Annotated[tuple[Seed, ...], Range(0, 2**32 - 1, some=True)]
 # The outlines a perfect segmenter would find; the same, but 15 % of the vectors are another region's; the
@@ -122,30 +125,12 @@ class Variant:
     level: LevelChoice = "auto"  # that is asked
 
 
-def autoencoder(d: int = 3, steps: int = 4_000) -> AutoencoderConfig:
-    """The paper's codec."""
-    return AutoencoderConfig(latent_dim=d, steps=steps)
-
-
-def ceiling(dim: int) -> CodecConfig:
-    """A codec that loses nothing: all `dim` numbers."""
-    return LinearConfig(latent_dim=dim)
-
-
 def weights_digest(model: str) -> str:
     """Digest of an encoder's weights: a folder may be filled with others under the same name."""
     found, digest = model_path(model, "--encoder"), hashlib.sha256()
     for path in sorted([*found.glob("*.safetensors"), *found.glob("*.bin")]) if found.is_dir() else [found]:
         digest.update(path.read_bytes())
     return digest.hexdigest()[:12]
-
-
-def room_encoder(model: str, text_vectors: Path | None = None) -> tuple[Encoder | ClipGeometry, str]:
-    """An encoder, simulated ones included (`read_geometry`), and the digest of its weights."""
-    geometry = read_geometry(model, text_vectors)
-    if geometry is None:
-        return load_encoder(model), weights_digest(model)
-    return geometry, geometry.digest
 
 
 @dataclass(frozen=True)
@@ -170,12 +155,19 @@ class InRooms:
             raise InputError(
                 f"--seeds {SEED} is the bundled scene's room, on which things were tuned; take another seed"
             )
-        encoder = room_encoder(self.settings.encoder, self.settings.text_vectors)
-        for tier in self.tiers:
-            for seed in self.seeds:
-                yield Room(
-                    self.settings, tier, seed, self.work, encoder, labelled(progress, f"{tier} {seed}, ")
-                )
+        model = self.settings.encoder
+        geometry = read_geometry(model, self.settings.text_vectors)
+        encoder: tuple[Encoder | ClipGeometry, str] = (
+            (load_encoder(model), weights_digest(model)) if geometry is None else (geometry, geometry.digest)
+        )
+        for tier, seed in product(self.tiers, self.seeds):
+            own = labelled(progress, f"{tier} {seed}, ")
+            yield Room(self.settings, tier, seed, self.work, encoder, own)
+
+    def each(self, measure: "Callable[[Room], Iterable[Row]]") -> list[Row]:
+        """What is measured in every room, one after another."""
+        with TerminalProgress() as progress:
+            return [row for room in self.rooms(progress) for row in measure(room)]
 
 
 class Room:
@@ -204,19 +196,18 @@ class Room:
     @cached_property
     def photographs(self) -> Path:
         """Folder of the photographs, rendered if need be, with the truth in it."""
-        folder, start = self.folder / "photographs", time.perf_counter()
+        folder, config = self.folder / "photographs", self.config
         if not (folder / "transforms.json").exists():
-            write_dataset(folder, self.seed, self.config.views, self.config.size, self.progress, self.tier)
-            self._lap("photographs", start)
+            with self._timed("photographs"):
+                write_dataset(folder, self.seed, config.views, config.size, self.progress, self.tier)
         return folder
 
     @cached_property
     def capture(self) -> Capture:
         """The photographs with their cameras."""
-        start = time.perf_counter()
-        capture = load_capture(self.photographs, self.settings.dataset, self.folder, self.progress)
-        self._lap("photographs", start)
-        return capture
+        photographs = self.photographs
+        with self._timed("photographs"):
+            return load_capture(photographs, self.settings.dataset, self.folder, self.progress)
 
     @cached_property
     def truth(self) -> Truth:
@@ -227,89 +218,81 @@ class Room:
     def gaussians(self) -> Gaussians:
         """Gaussians that were trained without the held-out views."""
         train, _ = self.capture.split(HOLD_OUT)
-        start = time.perf_counter()
         config = self.settings.radiance
-        budget = budgets_for(self.capture, config, len(train))[-1]
-        gaussians = trained_gaussians(self.capture, train, config, budget, self.folder, self.progress)
-        self._lap("radiance", start)
-        return gaussians
+        with self._timed("radiance"):
+            budget = budgets_for(self.capture, config, len(train))[-1]
+            return trained_gaussians(self.capture, train, config, budget, self.folder, self.progress)
 
     @cached_property
     def labels(self) -> Array:
         """(3, N) truth ids of every Gaussian."""
         path = self.folder / f"{stage_key('labels', 1, means_checksum(self.gaussians.means))}.npy"
         if not path.exists():
-            start = time.perf_counter()
             views = [(camera, self.truth.labels(camera.name)) for camera in self.capture.cameras]
-            labels = true_labels(CpuRasterizer(), self.gaussians, views, self.progress)
-            write_npy(path, labels)
-            self._lap("labels of the Gaussians", start)
+            with self._timed("labels of the Gaussians"):
+                write_npy(path, true_labels(CpuRasterizer(), self.gaussians, views, self.progress))
         stored: Array = np.load(path, allow_pickle=False)
         return stored
 
     def views(self, variant: Variant) -> Views:
         """The training views with masks and vectors."""
-        outlines = "truth" if variant.masks == "wrong" else variant.masks
-        source: MaskSource = TruthMasks(self.capture, self.truth)
-        if outlines in ("graph", "tiles"):
-            source = load_mask_source(MaskConfig(source="graph")) if outlines == "graph" else TileMasks()
         train, _ = self.capture.split(HOLD_OUT)
         cameras = [self.capture.cameras[i] for i in train]
-        start = time.perf_counter()
-        photographs, encoder = [self.capture.images[i] for i in train], cast(Encoder, self.encoder)
-        features: Sequence[ImageFeatures] = describe_capture(
-            photographs,
-            [camera.name for camera in cameras],
-            source,
-            encoder if source.agrees else None,
-            FeatureStore(self.folder / f"features-{outlines}-{self.weights if source.agrees else 'none'}"),
-            self.progress,
-        )
-        if not source.agrees:
-            rough, work = list(zip(cameras, features, strict=True)), self.folder / f"agreed-{self.weights}"
-            shared = CpuRasterizer(), work, self.progress
-            features = agreed_features(
-                self.gaussians, rough, [(image, None) for image in photographs], encoder, *shared
-            )
-        self._lap(f"masks ({variant.masks}) and vectors", start)
+        with self._timed(f"masks ({variant.masks}) and vectors"):
+            features = self._features("truth" if variant.masks == "wrong" else variant.masks, train, cameras)
+        ids = [self.truth.labels(camera.name) for camera in cameras]
         if isinstance(self.encoder, ClipGeometry):
-            features = [
-                self.encoder.describe(item, self.truth.labels(camera.name), self.truth, row)
-                for row, (item, camera) in enumerate(zip(features, cameras, strict=True))
-            ]
+            seen = enumerate(zip(features, ids, strict=True))
+            features = [self.encoder.describe(item, true, self.truth, row) for row, (item, true) in seen]
         if variant.masks == "wrong":
             features = [with_wrong_vectors(item, seed) for seed, item in enumerate(features)]
         if variant.vectors == "text":
             words = phrase_vectors(self.truth, self.encoder)
-            told = [
-                oracle_vectors(item, self.truth.labels(camera.name), words)
-                for item, camera in zip(features, cameras, strict=True)
-            ]
+            told = [oracle_vectors(item, true, words) for item, true in zip(features, ids, strict=True)]
             features = moved_to_pictures(told, features)
         return list(zip(cameras, features, strict=True))
+
+    def _features(
+        self, outlines: MaskOrigin, train: Sequence[int], cameras: Sequence[Camera]
+    ) -> Sequence[ImageFeatures]:
+        source: MaskSource = TruthMasks(self.capture, self.truth)
+        if outlines in ("graph", "tiles"):
+            source = load_mask_source(MaskConfig(source="graph")) if outlines == "graph" else TileMasks()
+        photographs, names = [self.capture.images[i] for i in train], [camera.name for camera in cameras]
+        encoder, shared = cast(Encoder, self.encoder), self.progress
+        if source.agrees:
+            store = FeatureStore(self.folder / f"features-{outlines}-{self.weights}")
+            return describe_capture(photographs, names, source, encoder, store, shared)
+        store = FeatureStore(self.folder / f"features-{outlines}-none")
+        rough = zip(cameras, describe_capture(photographs, names, source, None, store, shared), strict=True)
+        pictures, work = [(image, None) for image in photographs], self.folder / f"agreed-{self.weights}"
+        return agreed_features(self.gaussians, list(rough), pictures, encoder, CpuRasterizer(), work, shared)
 
     def field(self, variant: Variant, fresh: bool = False) -> tuple[LanguageField, CodecReport, float]:
         """The language field, what its codec loses, and seconds; `fresh` takes nothing that was kept."""
         views, start = self.views(variant), time.perf_counter()
         settings = replace(self.settings, codec=variant.codec, lift=variant.lift)
-        with TemporaryDirectory(dir=self.folder) as empty:
+        with TemporaryDirectory(dir=self.folder) as empty, self._timed(f"language field ({variant.name})"):
             work = Path(empty) if fresh else self.folder
             encoder = cast(Encoder, self.encoder)
             made = language_field(self.gaussians, views, encoder, settings, work, self.progress)
-        self._lap(f"language field ({variant.name})", start)
         return *made, round(time.perf_counter() - start, 1)
+
+    def engine(self, variant: Variant, cameras: Sequence[Camera] = ()) -> QueryEngine:
+        """Questions to the scene with a variant's field."""
+        scene = Scene(self.gaussians, self.field(variant)[0], tuple(cameras))
+        return QueryEngine(scene, lambda _: self.encoder)
 
     def measure(self, variant: Variant, fresh: bool = False) -> Measured:
         """Ask everything of a variant's field. fresh: take nothing that was kept, so that seconds count."""
         field, loss, seconds = self.field(variant, fresh)
-        start = time.perf_counter()
         by_regions = self.config.cut == "regions" and variant.query != "paper"
         rule: AnswerRule = "regions" if by_regions else "peak"
         # What is no codec has its numbers at hand; going through a codec's interface takes seconds a phrase.
         whole = field.codec.latent_dim == field.codec.vector_dim
         engine = QueryEngine(Scene(self.gaussians, field), lambda _: self.encoder, exact=whole, rule=rule)
-        asked = ask(engine, self.texts, variant.level)
-        self._lap(f"queries ({variant.name})", start)
+        with self._timed(f"queries ({variant.name})"):
+            asked = ask(engine, self.texts, variant.level)
         frame_ms = 1000 * median_seconds(lambda: self._frame(asked, variant))
         return replace(
             self.measure_asked(asked, variant),
@@ -328,16 +311,14 @@ class Room:
     def measure_asked(self, asked: Asked, variant: Variant, judge: Judge | None = None) -> Measured:
         """Compare answers to `texts` with the truth. judge: of another system's answers (`scoring.evaluate`),
         which are then cut half way between the floor and their peak among the Gaussians too."""
-        start = time.perf_counter()
         rule = MaskRule(variant.query == "paper", self.config.cut)
         progress = labelled(self.progress, f"{variant.name}: ")
-        scores = evaluate(asked, CpuRasterizer(), self.held_out, self.truth, rule, progress, judge)
-        direct = evaluate_direct(asked, self.labels, self.truth, "floor" if judge else self.config.cut)
-        result = measured(asked, self.truth, self.truth.absent(EVERYTHING), scores, direct)
-        self._lap(f"queries ({variant.name})", start)
-        return replace(
-            result, **{key: getattr(variant, key) for key in ("name", "masks", "vectors", "query")}
-        )
+        with self._timed(f"queries ({variant.name})"):
+            scores = evaluate(asked, CpuRasterizer(), self.held_out, self.truth, rule, progress, judge)
+            direct = evaluate_direct(asked, self.labels, self.truth, "floor" if judge else self.config.cut)
+            result = measured(asked, self.truth, self.truth.absent(EVERYTHING), scores, direct)
+        named = {key: getattr(variant, key) for key in ("name", "masks", "vectors", "query")}
+        return replace(result, **named)
 
     @cached_property
     def held_out(self) -> list[Camera]:
@@ -355,7 +336,10 @@ class Room:
         for level in range(len(LEVELS)):
             decoded_relevancy(view, asked.engine.field, level, answer.vector[None], gate)
 
-    def _lap(self, name: str, start: float) -> None:
+    @contextmanager
+    def _timed(self, name: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
         self.seconds[name] = round(self.seconds.get(name, 0.0) + time.perf_counter() - start, 1)
 
 
@@ -366,12 +350,7 @@ def labelled(progress: Progress, prefix: str) -> Progress:
 
 def median_seconds(work: Callable[[], object]) -> float:
     """Median of several runs; PyTorch's first takes longer."""
-    times = []
-    for _ in range(FRAMES):
-        start = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
+    return median(seconds_of(work) for _ in range(FRAMES))
 
 
 def publish(

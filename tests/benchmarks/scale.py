@@ -7,6 +7,8 @@
   has them, beside their distance from the full one.
 * endurance: one process, a scene made large, large images and many phrases.
 
+The report `formats`: what writing a scene in each format and reading it back changes.
+
 Loading and lifting run in fresh interpreters (`fresh`), whose peak memory is that of everything in them.
 """
 
@@ -14,45 +16,40 @@ import itertools
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from statistics import mean, median
-from types import MappingProxyType
 from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 import tyro
 from PIL import Image
 
-from langsplat_core.arrays import Array, psnr
+from langsplat_core.arrays import Array, psnr, sigmoid, unit
 from langsplat_core.bench import Size, peak_memory, resident_memory, restart_peak
 from langsplat_core.bench.measure import markdown
 from langsplat_core.bench.query import repeated
 from langsplat_core.cli.run import OutFolder
-from langsplat_core.config import Count, CountOrZero, PictureConfig, Range, RasterSettings
+from langsplat_core.config import Count, CountOrZero, PictureConfig, Range
 from langsplat_core.display.composing import composed
 from langsplat_core.display.displays import Channels
 from langsplat_core.errors import InputError
-from langsplat_core.io.scenes import load_scene
+from langsplat_core.io.ply import write_ply
+from langsplat_core.io.scenes import FORMATS, load_scene, save_scene
 from langsplat_core.progress import Progress, TerminalProgress, lap, silent, watched
 from langsplat_core.query.engine import QueryEngine, TextEncoder, no_field
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.render import render, splat_colours
 from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_core.scene.gaussians import merged
+from langsplat_core.scene.transform import C0
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.semantics.vocabulary import ADJECTIVES, NOUNS
 from langsplat_viewer.state import STEPS
 from tests.benchmarks.fresh import in_fresh_interpreter
 from tests.benchmarks.room import publish
 
-PROPERTIES = (  # 62, as INRIA writes them
-    *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
-    *(f"f_rest_{index}" for index in range(45)),
-    *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
-)
-BLOCK_ROWS = 50_000
 COARSE = ((1.0, False), (0.5, False), (0.25, False), (0.5, True), (0.25, True))  # resolution, whether merged
 PARTS = 4  # that phrases and images are measured in: what grows is seen from one to the next
 Part = Literal["load", "lift", "moving", "endurance"]
@@ -95,8 +92,8 @@ class Scale:
 
     def run(self) -> None:
         with TerminalProgress() as progress:
-            done = {part: MEASURED[part](self, progress) for part in self.only}
-        text = "\n".join(f"## {part}\n\n{TABLES[part](rows)}" for part, rows in done.items())
+            done = {part: REPORTS[part][0](self, progress) for part in self.only}
+        text = "\n".join(f"## {part}\n\n{REPORTS[part][1](rows)}" for part, rows in done.items())
         publish(self, "scale", "Large sizes", text, [row for rows in done.values() for row in rows])
 
 
@@ -126,8 +123,9 @@ def measure_loading(command: Scale, progress: Progress = silent) -> list[Loading
     """Write a binary PLY of degree 3 to a temporary folder, read it with both readers, and remove it."""
     runs: dict[str, list[dict[str, Any]]] = {"langsplat": [], "plyfile": []}
     with tempfile.TemporaryDirectory(prefix="langsplat_load_") as folder:
-        path = Path(folder) / "scene.ply"
-        write_ply(path, command.rows)
+        path, random = Path(folder) / "scene.ply", np.random.default_rng(0).standard_normal
+        shapes = [(command.rows, *each) for each in ((3,), (3,), (4,), (), (16, 3))]
+        write_ply(path, Gaussians(*(random(shape, np.float32) for shape in shapes)))
         size = path.stat().st_size
         turns = list(itertools.product(range(command.repeats), runs))
         for done, (_, reader) in enumerate(turns):
@@ -142,18 +140,6 @@ def measure_loading(command: Scale, progress: Progress = silent) -> list[Loading
         )
         for reader, found in runs.items()
     ]  # fmt: skip
-
-
-def write_ply(path: Path, rows: int) -> None:
-    """A PLY as the INRIA code writes it, block by block."""
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {rows}"]
-    header += [f"property float {name}" for name in PROPERTIES]
-    generator = np.random.default_rng(0)
-    with path.open("wb") as file:
-        file.write(("\n".join([*header, "end_header"]) + "\n").encode())
-        for start in range(0, rows, BLOCK_ROWS):
-            shape = (min(BLOCK_ROWS, rows - start), len(PROPERTIES))
-            file.write(generator.standard_normal(shape, np.float32).astype("<f4").tobytes())
 
 
 def load_table(loadings: Sequence[Loading]) -> str:
@@ -193,7 +179,6 @@ def measure_lifts(command: Scale, progress: Progress = silent) -> list[LiftCost]
 
 
 def lift_table(costs: Sequence[LiftCost]) -> str:
-    """Markdown."""
     lines = (
         (cost.gaussians, cost.views, f"{cost.width}x{cost.height}", f"{cost.seconds:.0f}")
         + (_gb(cost.peak_bytes), _gb(cost.kept_bytes), f"{cost.relevancy_error:.4f}")
@@ -227,48 +212,34 @@ def measure_moving(command: Scale, progress: Progress = silent) -> list[MovingCo
     cameras = [scene.cameras[index].resized(*command.moving_size) for index in chosen]
     fewer = merged(scene.gaussians).gaussians
     rasterizer, settings = CpuRasterizer(), scene.raster_settings()
-    full = [_channels(rasterizer, scene.gaussians, camera, settings).rgb.clip(0, 1) for camera in cameras]
+
+    def channels(gaussians: Gaussians, camera: Camera) -> Channels:
+        drawn = splat_colours(rasterizer.view(gaussians, camera, settings), gaussians, camera)
+        return Channels(drawn.colours, drawn.alpha)
+
+    full = [channels(scene.gaussians, camera).rgb.clip(0, 1) for camera in cameras]
     costs = []
     for done, (scale, is_merged) in enumerate(COARSE):
         progress("drawing", done / len(COARSE))
-        drawn = fewer if is_merged else scene.gaussians
-        costs.append(_cost(rasterizer, drawn, cameras, settings, (scale, is_merged), full))
+        gaussians = fewer if is_merged else scene.gaussians
+        seconds, processor, decibels, errors, steps = [], [], [], [], []
+        for camera, wanted in zip(cameras, full, strict=True):
+            small = camera.resized(max(round(camera.width * scale), 1), max(round(camera.height * scale), 1))
+            wall, cpu = time.perf_counter(), time.process_time()
+            with watched() as laps:
+                drawn = channels(gaussians, small)
+                with lap("compose"):
+                    composed(drawn, PictureConfig())
+            seconds.append(time.perf_counter() - wall)
+            processor.append(time.process_time() - cpu)
+            steps.append(laps)
+            shown = _enlarged(drawn.rgb.clip(0, 1), wanted.shape[1::-1])
+            decibels.append(psnr(shown, wanted))
+            errors.append(float(np.abs(shown - wanted).mean()))
+        times = 1e3 * median(seconds), 1e3 * median(processor)
+        each = {name: median(laps[name] for laps in steps) for name in steps[0]}
+        costs.append(MovingCost(scale, is_merged, len(gaussians), *times, mean(decibels), mean(errors), each))
     return costs
-
-
-def _cost(
-    rasterizer: CpuRasterizer,
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    settings: RasterSettings,
-    coarse: tuple[float, bool],
-    full: Sequence[Array],
-) -> MovingCost:
-    scale, is_merged = coarse
-    seconds, processor, decibels, errors, steps = [], [], [], [], []
-    for camera, wanted in zip(cameras, full, strict=True):
-        small = camera.resized(max(round(camera.width * scale), 1), max(round(camera.height * scale), 1))
-        wall, cpu = time.perf_counter(), time.process_time()
-        with watched() as laps:
-            drawn = _channels(rasterizer, gaussians, small, settings)
-            with lap("compose"):
-                composed(drawn, PictureConfig())
-        seconds.append(time.perf_counter() - wall)
-        processor.append(time.process_time() - cpu)
-        steps.append(laps)
-        shown = _enlarged(drawn.rgb.clip(0, 1), wanted.shape[1::-1])
-        decibels.append(psnr(shown, wanted))
-        errors.append(float(np.abs(shown - wanted).mean()))
-    times = 1e3 * median(seconds), 1e3 * median(processor)
-    each = {name: median(laps[name] for laps in steps) for name in steps[0]}
-    return MovingCost(scale, is_merged, len(gaussians), *times, mean(decibels), mean(errors), each)
-
-
-def _channels(
-    rasterizer: CpuRasterizer, gaussians: Gaussians, camera: Camera, settings: RasterSettings
-) -> Channels:
-    drawn = splat_colours(rasterizer.view(gaussians, camera, settings), gaussians, camera)
-    return Channels(drawn.colours, drawn.alpha)
 
 
 def _enlarged(image: Array, size: tuple[int, ...]) -> Array:
@@ -280,7 +251,6 @@ def _enlarged(image: Array, size: tuple[int, ...]) -> Array:
 
 
 def moving_table(costs: Sequence[MovingCost]) -> str:
-    """Markdown."""
     lines = (
         (f"{cost.scale:g}", f"{cost.gaussians}{' (merged)' if cost.merged else ''}")
         + (f"{cost.milliseconds:.0f}", f"{1e3 / cost.milliseconds:.1f}", f"{cost.processor:.0f}")
@@ -327,8 +297,9 @@ def measure_endurance(command: Scale, progress: Progress = silent) -> list[Stret
     measure("the scene alone", [lambda: made.append(repeated(scene, command.count))])
     large = made.pop()
     camera = scene.cameras[0].resized(*command.size)
-    measure("the first image", [partial(_draw, large, camera)])
-    for part in parts([partial(_draw, large, camera)] * command.images):
+    draw = partial(render, large, camera)
+    measure("the first image", [draw])
+    for part in parts([draw] * command.images):
         measure("further images", part)
     engine = QueryEngine(large, lambda _: encoder)
     measure("regions, once", [lambda: engine.regions])
@@ -338,11 +309,6 @@ def measure_endurance(command: Scale, progress: Progress = silent) -> list[Stret
         measure("further phrases", part)
     measure("the surface, once, for instances", [lambda: engine.surface])
     return stretches
-
-
-def _draw(scene: Scene, camera: Camera) -> None:
-    """An image that is not kept."""
-    render(scene, camera)
 
 
 def _two_words(encoder: TextEncoder, count: int) -> list[str]:
@@ -358,7 +324,6 @@ def parts(doings: Sequence[Callable[[], object]]) -> list[Sequence[Callable[[], 
 
 
 def endurance_table(stretches: Sequence[Stretch]) -> str:
-    """Markdown."""
     lines = (
         (row.what, row.times, f"{row.seconds / row.times:.3g}", f"{row.processor_seconds / row.times:.3g}")
         + (_gb(row.peak_bytes), _gb(row.left_bytes))
@@ -371,9 +336,74 @@ def _gb(size: int | None) -> str:
     return "?" if size is None else f"{size / 1e9:.2f}"
 
 
-MEASURED: Mapping[Part, Callable[[Scale, Progress], list[Any]]] = MappingProxyType(
-    {"load": measure_loading, "lift": measure_lifts, "moving": measure_moving, "endurance": measure_endurance}
-)
-TABLES: Mapping[Part, Callable[[Any], str]] = MappingProxyType(
-    {"load": load_table, "lift": lift_table, "moving": moving_table, "endurance": endurance_table}
-)
+REPORTS: Mapping[Part, tuple[Callable[[Scale, Progress], list[Any]], Callable[[Any], str]]] = {
+    "load": (measure_loading, load_table),
+    "lift": (measure_lifts, lift_table),
+    "moving": (measure_moving, moving_table),
+    "endurance": (measure_endurance, endurance_table),
+}
+
+
+DEMO = Path(__file__).parents[2] / "assets" / "demo" / "scene.ply"
+VIEWS = 4  # that images are compared in
+HEAD = ("format", "MB", "position", "scale, %", "rotation, °", "opacity", "colour", "SH", "PSNR, dB")
+
+
+@dataclass(frozen=True)
+class Formats:
+    """The largest errors of a scene written in each format and read back, and the lowest PSNR of images."""
+
+    scenes: tyro.conf.Positional[tuple[Path, ...]] = (DEMO,)
+    """Scenes to write."""
+
+    def run(self) -> None:
+        for path in self.scenes:
+            scene = replace(load_scene(path), language=None, unread=())
+            print(f"{path.name}: {len(scene.gaussians)} Gaussians of degree {scene.gaussians.sh_degree}\n")
+            print(markdown(HEAD, rows(scene)))
+
+
+def rows(scene: Scene) -> list[list[str]]:
+    """The table's rows: format, megabytes, errors, lowest PSNR."""
+    table = []
+    with tempfile.TemporaryDirectory() as folder:
+        for suffix in (row.suffix for row in FORMATS if row.write is not None):
+            path = Path(folder) / f"scene{suffix}"
+            save_scene(path, scene)
+            got = load_scene(path).gaussians
+            size, lowest = path.stat().st_size / 1e6, lowest_psnr(scene, got)
+            told = [f"{error:.2g}" if error else "0" for error in errors(scene.gaussians, got)]
+            table.append([suffix, f"{size:.2f}", *told, f"{lowest:.1f}"])
+    return table
+
+
+def errors(want: Gaussians, got: Gaussians) -> list[float]:
+    """Largest error of rows that can be drawn: of positions (world units), scales (percent of the Gaussian's
+    longest), rotations (degrees), opacities and base colours (of 1), and higher coefficients."""
+    drawn = (rows.take(want.valid()) for rows in (want, got))
+    a, b = ({name: array.astype(np.float64) for name, array in vars(rows).items()} for rows in drawn)
+    kept = b["sh"][:, : a["sh"].shape[1]]
+    colours = a["sh"].copy()  # what is lost is an error too
+    colours[:, : kept.shape[1]] -= kept
+    # Of two unit quaternions, by the sine of half the angle: a cosine knows no small angles.
+    one, other = (unit(rows["quats_wxyz"], 1e-30) for rows in (a, b))
+    halves = np.minimum(np.linalg.norm(one - other, axis=1), np.linalg.norm(one + other, axis=1)) / 2
+    axes, others = (np.exp(rows["log_scales"]) for rows in (a, b))
+    differences = (
+        b["means"] - a["means"],
+        100 * (others - axes) / np.maximum(axes.max(axis=1, keepdims=True), 1e-300),
+        np.degrees(4 * np.arcsin(halves.clip(0, 1))),
+        sigmoid(b["opacity_logits"]) - sigmoid(a["opacity_logits"]),
+        C0 * colours[:, 0],
+        colours[:, 1:],
+    )
+    return [float(np.abs(difference).max(initial=0)) for difference in differences]
+
+
+def lowest_psnr(scene: Scene, got: Gaussians) -> float:
+    """Of images of `got` against those of the scene, dB; at most 100."""
+    step = max(1, len(scene.cameras) // VIEWS)
+    cameras = scene.cameras[::step][:VIEWS] or (scene.framing_camera((400, 320)),)
+    scenes = (scene, replace(scene, gaussians=got))
+    images = [[render(one, camera).colours.clip(0, 1) for one in scenes] for camera in cameras]
+    return min(psnr(*pair) for pair in images)

@@ -8,7 +8,9 @@ overlap directly among the Gaussians; and rejection: how many absent objects are
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from functools import partial
+from operator import attrgetter
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from scipy.ndimage import uniform_filter
@@ -27,7 +29,8 @@ from langsplat_core.scene import Camera
 from langsplat_core.semantics.relevancy import FLOOR
 from langsplat_core.training.language.codec_fit import CodecReport
 
-MIN_GAUSSIANS = 20  # nor one with fewer Gaussians directly
+Row = TypeVar("Row")
+MIN_GAUSSIANS = 20  # a thing with fewer is not asked for among the Gaussians
 # px: the paper's mean filter for localisation, and its code's majority vote over a mask, both of pictures of
 # 731 rows; smaller pictures get smaller windows, or a part would be lost in one
 FILTER, VOTE, PAPER_ROWS = 20, 7, 731
@@ -38,7 +41,6 @@ HALF = 0.5  # of what a pixel shows: from there it belongs to an answer's Gaussi
 
 
 CutRule = Literal["floor", "median", "range"]
-CUT_RULES: tuple[CutRule, ...] = get_args(CutRule)
 RANGE_SHARE = 0.7  # of the map's range: LangSplat's code maps [0, 1] to [-1, 1] and cuts at 0.4
 
 
@@ -128,7 +130,9 @@ def ask(engine: QueryEngine, texts: Iterable[str], level: LevelChoice = "auto") 
         vectors = engine.text_vectors(some)
         for text, vector, result in zip(some, vectors, engine.run_many(some, level), strict=True):
             answers[text] = _answer(engine, vector, result)
-    return Asked(engine, answers, tuple(unknown), _seconds(engine, known[:TIMED], level))
+    # The engine has answered before, so that no time goes into preparation.
+    seconds = [seconds_of(partial(engine.run, text, level)) for text in known[:TIMED]]
+    return Asked(engine, answers, tuple(unknown), float(np.median(seconds)) if seconds else 0.0)
 
 
 def _answer(engine: QueryEngine, vector: Array, result: QueryResult) -> Answer:
@@ -139,14 +143,11 @@ def _answer(engine: QueryEngine, vector: Array, result: QueryResult) -> Answer:
     return Answer(vector=vector, level=result.level, values=values, median=median, **said)
 
 
-def _seconds(engine: QueryEngine, texts: Sequence[str], level: LevelChoice) -> float:
-    """Median of asking one; the engine has answered before, so that no time goes into preparation."""
-    seconds = []
-    for text in texts:
-        start = time.perf_counter()
-        engine.run(text, level)
-        seconds.append(time.perf_counter() - start)
-    return float(np.median(seconds)) if seconds else 0.0
+def seconds_of(work: Callable[[], object]) -> float:
+    """How long it takes."""
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
 
 
 def evaluate(
@@ -168,16 +169,18 @@ def evaluate(
         masks = {p: _mask(labels, p) for p in truth.phrases if p.text in asked.answers}
         visible = [phrase for phrase, mask in masks.items() if mask.sum() >= MIN_PIXELS]
         answers = [asked.answers[phrase.text] for phrase in visible]
-        for phrase, result in zip(visible, judge(view, answers), strict=True):
-            found, peak = result
-            truth_mask = masks[phrase]
-            score = intersection_over_union(found, truth_mask), bool(truth_mask[peak])
+        for phrase, (found, peak) in zip(visible, judge(view, answers), strict=True):
+            score = intersection_over_union(found, masks[phrase]), bool(masks[phrase][peak])
             results.setdefault(phrase.kind, []).append(score)
         progress("asking phrases", (done + 1) / len(cameras))
-    return [
-        Score(kind, len(rows), float(np.mean([r[0] for r in rows])), float(np.mean([r[1] for r in rows])))
-        for kind, rows in sorted(results.items(), key=lambda item: PHRASE_KINDS.index(item[0]))
-    ]
+    return [Score(*row) for row in _means(results)]
+
+
+def _means(results: Mapping[str, Sequence[tuple[float, float]]]) -> Iterator[tuple[str, int, float, float]]:
+    """Every kind of phrase that there is, with its number of results and the mean of each of both figures."""
+    for kind in sorted(results, key=PHRASE_KINDS.index):
+        one, other = np.mean(results[kind], axis=0).tolist()
+        yield kind, len(results[kind]), one, other
 
 
 def relevancy_maps(
@@ -191,14 +194,13 @@ def relevancy_maps(
             values = np.stack([answer.values for answer in answers[start : start + CHANNELS]], 1)
             yield from np.moveaxis(splatted_relevancy(view, values, gate), 2, 0)
         return
-    maps: list[Array | None] = [None] * len(answers)
+    maps: dict[int, Array] = {}
     for level in {answer.level for answer in answers}:
         rows = [row for row, answer in enumerate(answers) if answer.level == level]
         vectors = np.stack([answers[row].vector for row in rows])
         decoded = decoded_relevancy(view, engine.field, level, vectors, gate)
-        for column, row in enumerate(rows):
-            maps[row] = decoded[..., column]
-    yield from (item for item in maps if item is not None)
+        maps |= dict(zip(rows, np.moveaxis(decoded, 2, 0), strict=True))
+    yield from (maps[row] for row in range(len(answers)))
 
 
 def _mask(labels: Array, phrase: Phrase) -> Array:
@@ -208,14 +210,12 @@ def _mask(labels: Array, phrase: Phrase) -> Array:
 def _judged(
     engine: QueryEngine, view: View, answers: Sequence[Answer], rule: MaskRule
 ) -> Iterator[tuple[Array, tuple[int, int]]]:
-    """The mask (H, W) of each answer, and the row and column of its peak."""
     if rule.cut == "regions" and not rule.paper_order:
         yield from masks_and_peaks(view, [(answer.even, answer.members) for answer in answers])
         return
     level: CutRule = "floor" if rule.cut == "regions" else rule.cut
-    for answer, relevancy in zip(
-        answers, relevancy_maps(engine, view, answers, rule.paper_order), strict=True
-    ):
+    maps = relevancy_maps(engine, view, answers, rule.paper_order)
+    for answer, relevancy in zip(answers, maps, strict=True):
         cut = cut_level(level, relevancy, answer.peak, answer.median)
         yield _smoothed_mask(relevancy > cut), _peak(relevancy)
 
@@ -228,8 +228,7 @@ def masks_and_peaks(
     for start in range(0, len(answers), CHANNELS // 2):
         some = answers[start : start + CHANNELS // 2]
         columns = [*(values for values, _ in some), *(members for _, members in some)]
-        maps = splatted_relevancy(view, np.stack(columns, 1), PictureConfig().alpha_gate)
-        maps = np.moveaxis(maps, 2, 0)
+        maps = np.moveaxis(splatted_relevancy(view, np.stack(columns, 1), PictureConfig().alpha_gate), 2, 0)
         for relevancy, share in zip(maps[: len(some)], maps[len(some) :], strict=True):
             yield _smoothed_mask(share > HALF), _peak(relevancy)
 
@@ -274,12 +273,7 @@ def evaluate_direct(
             found = values > cut_level(rule, values, answer.peak, answer.median)
         best = _ceiling(asked.engine.regions, seen, right) if rule == "regions" else 0.0
         results.setdefault(phrase.kind, []).append((intersection_over_union(found, right), best))
-    return [
-        DirectScore(
-            kind, len(rows), float(np.mean([r[0] for r in rows])), float(np.mean([r[1] for r in rows]))
-        )
-        for kind, rows in sorted(results.items(), key=lambda item: PHRASE_KINDS.index(item[0]))
-    ]
+    return [DirectScore(*row) for row in _means(results)]
 
 
 def _ceiling(regions: Regions, seen: Array, right: Array) -> float:
@@ -334,11 +328,9 @@ def measured(
     present = [phrase.text for phrase in truth.phrases if phrase.kind == "object"]
     accepted, objects = found_rate(asked, present)
     found, count = found_rate(asked, absent)
-    peaks = {
-        text: round(asked.answers[text].peak, 4) for text in [*present, *absent] if text in asked.answers
-    }
-    inside = np.array([peaks[text] for text in present if text in peaks])
-    outside = np.array([peaks[text] for text in absent if text in peaks])
+    known = [text for text in [*present, *absent] if text in asked.answers]
+    peaks = {text: round(asked.answers[text].peak, 4) for text in known}
+    inside, outside = (np.array([peaks[t] for t in texts if t in peaks]) for texts in (present, absent))
     return Measured(
         scores=tuple(scores),
         direct=tuple(direct),
@@ -357,8 +349,22 @@ def separation(present: Array, absent: Array) -> float:
     """Chance that one of `present` (P,) exceeds one of `absent` (A,), ties half; 1 without either."""
     if len(present) == 0 or len(absent) == 0:
         return 1.0
-    above = (present[:, None] > absent).mean() + 0.5 * (present[:, None] == absent).mean()
-    return float(above)
+    return float((present[:, None] > absent).mean() + 0.5 * (present[:, None] == absent).mean())
+
+
+def grouped(rows: Iterable[Row], *names: str) -> dict[Any, list[Row]]:
+    """Rows by what these fields of theirs hold, in the order in which it first comes."""
+    found: dict[Any, list[Row]] = {}
+    for row in rows:
+        found.setdefault(attrgetter(*names)(row), []).append(row)
+    return found
+
+
+def spread(values: Array) -> str:
+    """Mean and standard deviation of percentages, as cells of tables have them."""
+    if len(values) == 0:
+        return "-"
+    return f"{values.mean():.1f} +/- {values.std(ddof=1) if len(values) > 1 else 0:.1f}"
 
 
 def of_kind(measured: Measured, kind: str) -> tuple[int, float, float, float]:
@@ -366,9 +372,8 @@ def of_kind(measured: Measured, kind: str) -> tuple[int, float, float, float]:
     rows = [score for score in measured.scores if kind in (score.kind, "all")]
     count = sum(score.queries for score in rows)
     weights = [score.queries / max(count, 1) for score in rows]
-    iou = float(np.dot(weights, [score.mean_iou for score in rows]))
-    localisation = float(np.dot(weights, [score.localisation for score in rows]))
-    return count, iou, localisation, direct_share(measured, kind, "mean_iou")
+    shares = np.dot(weights, np.reshape([(s.mean_iou, s.localisation) for s in rows], (-1, 2))).tolist()
+    return count, *shares, direct_share(measured, kind, "mean_iou")
 
 
 def loss_cells(measured: Sequence[Measured]) -> tuple[str, str, str]:

@@ -15,28 +15,19 @@ from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.semantics.masks import label_maps
 from langsplat_core.semantics.relevancy import relevancy
 from langsplat_core.semantics.store import ImageFeatures
-from tests.benchmarks.clip_geometry import OTHER, PROMPTS, ClipGeometry, read_geometry
-from tests.benchmarks.lifting import (
-    PatchField,
-    among_gaussians,
-    patch_vectors,
-    pictures,
-)
+from tests.benchmarks.lifting import PatchField, among_gaussians, patch_vectors, pictures
 from tests.benchmarks.oracles import (
+    OTHER,
+    PROMPTS,
     SIDES,
+    ClipGeometry,
     TileMasks,
     oracle_vectors,
     phrase_vectors,
+    read_geometry,
     true_labels,
 )
-from tests.benchmarks.scoring import (
-    Answer,
-    Asked,
-    ask,
-    cut_level,
-    evaluate_direct,
-    found_rate,
-)
+from tests.benchmarks.scoring import Answer, Asked, ask, cut_level, evaluate_direct, found_rate
 from tests.support.fakes import PER_BLOB, FakeEncoder, blob_scene, blobs, cameras
 from tests.support.scenes import random_camera, random_gaussians
 
@@ -81,10 +72,7 @@ def test_direct_overlap_has_its_closed_form(rule):
     assert score.mean_iou == pytest.approx((30 / 100 + 70 / 120) / 2)
 
 
-@pytest.mark.parametrize(
-    ("rule", "expected"),
-    [("floor", 0.7), ("median", 0.6), ("range", 0.1 + 0.7 * 0.8)],
-)
+@pytest.mark.parametrize(("rule", "expected"), [("floor", 0.7), ("median", 0.6), ("range", 0.1 + 0.7 * 0.8)])
 def test_cuts_which_let_no_flat_map_through(rule, expected):
     values = np.array([[0.1, 0.3], [0.3, 0.9]])
     assert cut_level(rule, values, peak=0.9, median=0.3) == pytest.approx(expected)

@@ -21,11 +21,10 @@ from langsplat_core.scene import Camera, Gaussians, Scene, TaughtWord
 from langsplat_core.scene.tree import tree_of_wholes
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures
+from tests.support.backends import Measure
 from tests.support.commands import refusal, run
 from tests.support.comparing import assert_same_extras
-from tests.support.file_samples import random_field, sog_files, write_folder
-from tests.support.fixtures import Measure
-from tests.support.foreign_files import save_model, tensor
+from tests.support.file_samples import random_field, save_model, sog_files, tensor, write_folder
 from tests.support.scenes import random_camera, random_extras, random_gaussians
 
 DEMO = Path(str(files("langsplat_assets"))) / "demo" / "scene.ply"

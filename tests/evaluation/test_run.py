@@ -29,7 +29,7 @@ from langsplat_core.scene import Scene
 from tests.support.commands import refusal, run
 from tests.support.fakes import PER_BLOB, WORDS, FakeEncoder, blob_scene, cameras
 from tests.support.photographs import SIZE, block, lerf_frame, mask_map, ovs_view, rectangle, silhouette
-from tests.support.tiny_room import tiny_room, tiny_settings
+from tests.support.tiny_models import tiny_room, tiny_settings
 
 CODE_RULE = LERF_PROFILES["langsplat-code"].rule
 PLAIN_RULE = MapRule(1, 1.0, "mirror", "peak", True, 0.7, "none", 1, 1, False)

@@ -25,9 +25,9 @@ from langsplat_core.geometry.occupancy import (
 from langsplat_core.geometry.planes import Room
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.scene import Scene
-from tests.support.box_rooms import FLOOR, WALL, box_room
 from tests.support.commands import refusal, run
 from tests.support.fakes import named_scene
+from tests.support.scenes import FLOOR, WALL, box_room
 
 COARSE = "--resolution", 0.1, "--step", 0.15
 ROOM = Room(np.array([0.0, 0.0, 1.0]), FLOOR, None, ())

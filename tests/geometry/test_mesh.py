@@ -11,8 +11,7 @@ from langsplat_core.geometry.mesh import Mesh, close_holes, fuse, generated_came
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.scene import Gaussians, Scene, look_at
 from langsplat_core.scene.transform import AXES, rotation_quaternion, turning
-from tests.support.box_rooms import FLOOR, WALL, box_room
-from tests.support.scenes import random_camera, random_gaussians
+from tests.support.scenes import FLOOR, WALL, box_room, random_camera, random_gaussians
 
 pytest.importorskip("open3d")
 

@@ -21,11 +21,10 @@ from langsplat_core.raster.reference import ReferenceRasterizer, colours
 from langsplat_core.scene import NO_NODE, Scene, TaughtWord
 from langsplat_core.scene.transform import IDENTITY, Similarity, moved_camera, moving, transform_scene
 from langsplat_core.scene.tree import tree_of_wholes
-from tests.support.box_rooms import FLOOR, WALL, box_room
 from tests.support.commands import refusal, run
 from tests.support.fakes import FakeEncoder, blob_scene
 from tests.support.file_samples import random_field
-from tests.support.scenes import random_camera, random_gaussians
+from tests.support.scenes import FLOOR, WALL, box_room, random_camera, random_gaussians
 
 pytest.importorskip("open3d")
 

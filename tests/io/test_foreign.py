@@ -19,7 +19,7 @@ from langsplat_core.io.langsplat_files import read_features, write_features
 from langsplat_core.io.ply import write_ply
 from langsplat_core.scene import Gaussians
 from tests.support.comparing import assert_same
-from tests.support.foreign_files import autoencoder, faiss_index, geometry, save_model, tensor, training_state
+from tests.support.file_samples import autoencoder, faiss_index, geometry, save_model, tensor, training_state
 from tests.support.scenes import random_gaussians
 
 N, D = 20, 24

@@ -12,10 +12,10 @@ import pytest
 import torch
 
 from langsplat_core.io.unpickling import load_torch, plain_array
-from tests.support.foreign_files import geometry, training_state
+from tests.support.commands import Ended, convert_each
+from tests.support.file_samples import geometry, training_state
 from tests.support.mutation import mutant
 from tests.support.scenes import random_gaussians
-from tests.support.warm_children import Ended, convert_each
 
 pytestmark = pytest.mark.long  # a child for every file
 G = random_gaussians(4, sh_degree=0)

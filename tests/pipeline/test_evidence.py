@@ -26,7 +26,7 @@ from langsplat_core.scene import Scene
 from langsplat_core.semantics.store import ImageFeatures
 from tests.support.commands import run
 from tests.support.fakes import DIM, PER_BLOB, FakeEncoder, as_trained, axis, blob_scene, cameras
-from tests.support.tiny_room import tiny_room, tiny_settings
+from tests.support.tiny_models import tiny_room, tiny_settings
 
 VIEWS = 8
 WRONG, MERGED, BLANK, AWAY = 2, 4, 5, 6  # photographs that are not as the others

@@ -26,10 +26,9 @@ from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures
 from langsplat_core.training.language.codec_fit import everyday_vocabulary
 from tests.support.comparing import assert_same
-from tests.support.file_samples import random_field
-from tests.support.foreign_files import autoencoder, save_model, tensor
+from tests.support.file_samples import autoencoder, random_field, save_model, tensor
 from tests.support.scenes import random_gaussians
-from tests.support.tiny_clip import tiny_clip
+from tests.support.tiny_models import tiny_clip
 
 pytestmark = pytest.mark.long
 

@@ -16,7 +16,7 @@ from langsplat_core.datasets.intrinsics import PhotoIntrinsics
 from langsplat_core.progress import ALL_STAGES, Report
 from tests.support.photographs import colmap_reconstruction, poses, write_photos
 from tests.support.processes import resize, small_disk
-from tests.support.tiny_clip import tiny_clip
+from tests.support.tiny_models import tiny_clip
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name == "nt", reason="no signal 9")]
 LENS = PhotoIntrinsics(320, 240, 300.0, 300.0, 160.0, 120.0)

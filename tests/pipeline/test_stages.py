@@ -16,8 +16,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.pipeline.stages import LOCK, ProcessGroup, join_processes, sole_use
 from langsplat_core.pipeline.train import StoredViews
 from tests.support.scenes import make_views
-from tests.support.tiny_room import tiny_room
-from tests.support.tiny_sam import tiny_sam
+from tests.support.tiny_models import tiny_room, tiny_sam
 
 pytestmark = pytest.mark.long
 

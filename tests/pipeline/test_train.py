@@ -37,7 +37,7 @@ from tests.support.commands import run
 from tests.support.comparing import assert_same_tree
 from tests.support.fakes import blob_scene
 from tests.support.processes import bound_by_permissions, stop_at
-from tests.support.tiny_room import tiny_room, tiny_settings
+from tests.support.tiny_models import tiny_room, tiny_settings
 
 pytestmark = pytest.mark.long
 

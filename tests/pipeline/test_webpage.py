@@ -25,9 +25,9 @@ from langsplat_core.raster.opengl.rasterizer import GlRasterizer
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import CANONICAL_PHRASES, LEVELS, Camera, Gaussians, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
-from tests.support.browser import Tab, open_browser, open_tab
+from tests.support.backends import Measure
 from tests.support.file_samples import random_field
-from tests.support.fixtures import Measure
+from tests.support.processes import Tab, open_browser, open_tab
 from tests.support.scenes import random_camera, random_gaussians
 
 pytestmark = pytest.mark.long

@@ -15,7 +15,7 @@ from langsplat_core.scene import NO_NODE, look_at
 from langsplat_core.scene.language import split_phrases
 from langsplat_core.scene.surface import build_surface
 from langsplat_core.scene.tree import tree_of_wholes
-from tests.support.query_scenes import UP, PlainEncoder, front_camera, laid_table, meaning
+from tests.support.fakes import UP, PlainEncoder, front_camera, laid_table, meaning
 
 MUG, BOOK, DESK = Atom("mug"), Atom("book"), Atom("table")
 HANDLE = Atom("handle")

@@ -17,9 +17,8 @@ from langsplat_core.config import GSPLAT, INRIA, RasterSettings
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.raster.reference import ReferenceRasterizer, ReferenceView
 from langsplat_core.scene import Camera, Gaussians, Scene
-from tests.support.backends import Backend
+from tests.support.backends import Backend, Measure
 from tests.support.comparing import assert_adjoint
-from tests.support.fixtures import Measure
 from tests.support.scenes import random_camera, random_gaussians, random_values
 
 pytestmark = pytest.mark.long

@@ -17,7 +17,7 @@ from langsplat_core.raster.cpu.tiles import Grid, _at_most, depth_order
 from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera
-from tests.support import torch_reference
+from tests.support import torch_raster as torch_reference
 from tests.support.comparing import BAND, assert_adjoint, assert_close_off_cuts, assert_gradient
 from tests.support.scenes import random_camera, random_gaussians, random_values, without_perspective
 

@@ -20,7 +20,7 @@ from langsplat_core.training.language.mask_weights import find_mask_weights
 from langsplat_core.training.radiance.differentiable import CpuRenderer, CudaRenderer, DifferentiableRenderer
 from langsplat_core.training.radiance.state import PARAMETERS, start
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
-from tests.support import gsplat_twin as twin
+from tests.support import torch_raster as twin
 from tests.support.scenes import make_views, random_camera, random_gaussians, without_perspective
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("gsplat_twin")]

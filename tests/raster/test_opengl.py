@@ -26,7 +26,7 @@ from langsplat_core.raster.opengl.scene_textures import (
 )
 from langsplat_core.raster.reference import ReferenceRasterizer, colours
 from langsplat_core.scene import Camera, Gaussians
-from tests.support.fixtures import gl_state
+from tests.support.backends import gl_state
 from tests.support.scenes import random_camera, random_gaussians, random_values
 
 RNG = np.random.default_rng(0)

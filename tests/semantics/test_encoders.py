@@ -26,8 +26,7 @@ from langsplat_core.semantics import clip_plain, encoders
 from langsplat_core.semantics.clip_plain import PlainClipText, plain_text_tower, read_pair_tokenizer
 from langsplat_core.semantics.encoders import ClipText, clip_text, load_encoder, load_text_encoder
 from langsplat_core.semantics.weights import Weights
-from tests.support.tiny_clip import SIDE, WORDS, change_json, tiny_clip
-from tests.support.tiny_siglip import LENGTH, SCALE, tiny_siglip
+from tests.support.tiny_models import LENGTH, SCALE, SIDE, WORDS, change_json, tiny_clip, tiny_siglip
 
 pytestmark = pytest.mark.long
 

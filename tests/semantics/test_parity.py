@@ -31,7 +31,7 @@ from langsplat_core.semantics.encoders import load_encoder
 from langsplat_core.semantics.masks import label_maps
 from langsplat_core.semantics.sam import LEVELS, Look, SamMasks, load_mask_source, load_segmenter
 from langsplat_core.semantics.store import masked_crop
-from tests.support.fixtures import Measure
+from tests.support.backends import Measure
 
 PARTS = ("segment_anything.automatic_mask_generator", "sam2.build_sam", "sam2.sam2_image_predictor")
 NAMES = ("torchvision", "open_clip", "segment_anything", "sam2", "cv2")
@@ -188,7 +188,7 @@ def test_siglip_2_of_open_clip(field: SimpleNamespace, tmp_path: Path, measured:
     from safetensors.torch import save_file
     from transformers import SiglipConfig
 
-    from tests.support.tiny_siglip import gemma_tokenizer
+    from tests.support.tiny_models import gemma_tokenizer
 
     model = scrambled(field.open_clip.create_model, "ViT-B-16-SigLIP2")
     tensors = {name: tensor.contiguous() for name, tensor in siglip_tensors(model.state_dict()).items()}

@@ -15,9 +15,14 @@ from langsplat_core.config import MaskConfig
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.progress import Progress, silent
 from langsplat_core.semantics import sam
-from langsplat_core.semantics.sam import SamMasks, load_mask_source, load_segmenter, mask_boxes
-from tests.support.tiny_clip import change_json
-from tests.support.tiny_sam import SIDE, tiny_sam, tiny_sam2, tiny_sam2_video
+from langsplat_core.semantics.sam import (
+    SamMasks,
+    load_mask_source,
+    load_segmenter,
+    mask_boxes,
+)
+from tests.support.tiny_models import SAM_SIDE as SIDE
+from tests.support.tiny_models import change_json, tiny_sam, tiny_sam2, tiny_sam2_video
 
 
 def plain_mask_nms(masks: np.ndarray, scores: np.ndarray, config: MaskConfig) -> list[int]:

@@ -26,10 +26,7 @@ from langsplat_core.semantics import layouts
 from langsplat_core.semantics.encoders import CLIP_MEAN, CLIP_STD, load_encoder, load_text_encoder
 from langsplat_core.semantics.sam import load_segmenter
 from langsplat_core.semantics.weights import COUNTS, SIDES
-from tests.support.tiny_clip import change_json, tiny_clip
-from tests.support.tiny_sam import SIDE as SAM_SIDE
-from tests.support.tiny_sam import tiny_sam, tiny_sam2
-from tests.support.tiny_siglip import tiny_siglip
+from tests.support.tiny_models import SAM_SIDE, change_json, tiny_clip, tiny_sam, tiny_sam2, tiny_siglip
 
 SIDE, PATCH, CONTEXT, SIZE = 32, 8, 20, 24
 MARKS = "'&"

@@ -4,7 +4,8 @@ Image formation has steps: an alpha of just 1/255 counts or does not, a transmit
 pixel or does not. Pixels where rounding may decide are the *band*: a counted allowance of them may differ.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +50,7 @@ def assert_gradient(name: str, got: Array, want: Array, rtol: float = 1e-3) -> N
     assert not off.any(), f"{name}: {off.sum()} of {off.size} off, worst {np.abs(got - want).max():.2e}"
 
 
+TREE = ("leaves", "parents", "levels", "votes")
 FIELDS = ("means", "log_scales", "quats_wxyz", "opacity_logits", "sh")
 
 
@@ -60,7 +62,8 @@ def assert_same(got: Gaussians, want: Gaussians) -> None:
         np.testing.assert_array_equal(a.view(np.uint32), b.view(np.uint32), field)
 
 
-def assert_same_extras(got, want) -> None:
+def assert_same_extras(got: Mapping[str, Array], want: Mapping[str, Array]) -> None:
+    """Named arrays, in this order."""
     assert list(got) == list(want)
     for name, values in want.items():
         assert got[name].dtype == values.dtype
@@ -69,34 +72,28 @@ def assert_same_extras(got, want) -> None:
 
 def assert_same_tree(got: Tree, want: Tree) -> None:
     """Node by node."""
-    for name in ("leaves", "parents", "levels", "votes"):
-        assert getattr(got, name).dtype == getattr(want, name).dtype
-        np.testing.assert_array_equal(getattr(got, name), getattr(want, name), name)
+    assert_same_extras(_arrays(got, TREE), _arrays(want, TREE))
 
 
 def assert_same_field(got: LanguageField, want: LanguageField) -> None:
     """Bit for bit: a saved scene must answer exactly like the one in memory."""
-    for name in ("latents", "confidence", "canonical"):
-        np.testing.assert_array_equal(getattr(got, name), getattr(want, name), name)
-    assert (got.tree is None) == (want.tree is None)
-    if want.tree is not None and got.tree is not None:
-        assert_same_tree(got.tree, want.tree)
-    assert (got.everyday is None) == (want.everyday is None)
-    if want.everyday is not None:
-        np.testing.assert_array_equal(got.everyday, want.everyday)
-    assert got.encoder_id == want.encoder_id
-    assert got.reading == want.reading
-    assert got.codec.kind == want.codec.kind
-    assert got.codec.tensors().keys() == want.codec.tensors().keys()
-    for name, tensor in want.codec.tensors().items():
-        np.testing.assert_array_equal(got.codec.tensors()[name], tensor, name)
-    assert [(w.name, w.level) for w in got.taught] == [(w.name, w.level) for w in want.taught]
-    for one, other in zip(got.taught, want.taught, strict=True):
-        np.testing.assert_array_equal(one.vectors, other.vectors)
-        np.testing.assert_array_equal(one.rivals, other.rivals)
-    assert list(got.phrasebook) == list(want.phrasebook)
-    for phrase, vector in want.phrasebook.items():
-        np.testing.assert_array_equal(got.phrasebook[phrase], vector)
+    for name in ("encoder_id", "reading", "codec.kind"):
+        assert attrgetter(name)(got) == attrgetter(name)(want)
+    for part in (_parts, lambda field: field.codec.tensors(), lambda field: field.phrasebook):
+        assert_same_extras(part(got), part(want))
+
+
+def _parts(field: LanguageField) -> dict[str, Array]:
+    found = _arrays(field, ("latents", "confidence", "canonical"))
+    found |= {} if field.tree is None else _arrays(field.tree, TREE)
+    found |= {} if field.everyday is None else {"everyday": field.everyday}
+    for word in field.taught:
+        found |= _arrays(word, ("vectors", "rivals"), f"{word.name} {word.level} ")
+    return found
+
+
+def _arrays(owner: object, names: Sequence[str], prefix: str = "") -> dict[str, Array]:
+    return {prefix + name: getattr(owner, name) for name in names}
 
 
 def assert_refused(read: Callable[[Path], object], path: Path, message: str | None = None) -> None:

@@ -1,8 +1,8 @@
-"""A scene of three blobs with known meanings, a text encoder that knows their names, and phrases for it."""
+"""Scenes whose meanings are known, three blobs and a laid table, and text encoders that know their words."""
 
 import json
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -21,12 +21,13 @@ from langsplat_core.scene import (
     LanguageField,
     LinearCodec,
     Odds,
+    Reading,
     Scene,
     look_at,
 )
 from langsplat_core.scene.codec import CodebookCodec
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures
-from tests.support.scenes import unturned_gaussians
+from tests.support.scenes import transforms, unturned_gaussians
 
 COUNT = 64
 
@@ -94,14 +95,19 @@ def blob_scene(*, field: bool = True, with_cameras: bool = True, phrasebook: boo
 class FakeEncoder:
     """Knows `WORDS`."""
 
+    words, canonical = WORDS, 3
+
     def encode_texts(self, texts: list[str]) -> Array:
-        return np.stack([axis(3 if text in CANONICAL_PHRASES else WORDS.index(text)) for text in texts])
+        return np.stack([axis(self.canonical) if t in CANONICAL_PHRASES else self.vector(t) for t in texts])
+
+    def vector(self, text: str) -> Array:
+        return axis(WORDS.index(text))
 
     def unknown_words(self, text: str) -> tuple[str, ...]:
-        return tuple(word for word in text.split() if word not in WORDS)
+        return tuple(word for word in text.split() if word not in self.words)
 
     def near_words(self, word: str) -> tuple[str, ...]:
-        return tuple(get_close_matches(word, WORDS))
+        return tuple(get_close_matches(word, self.words))
 
 
 def calibrated_for(phrase: str, logit_of_whole: float) -> Calibration:
@@ -134,13 +140,82 @@ def as_trained(path: Path, scene: Scene, features: Sequence[ImageFeatures]) -> N
     save_scene(path, scene)
     work, photographs = work_folder(path), path.parent / "photographs"
     photographs.mkdir()
-    frames = []
     for camera, seen in zip(scene.cameras, features, strict=True):
         FeatureStore(work / "features").save(camera.name, seen)
         Image.new("RGB", (camera.width, camera.height), (90, 90, 90)).save(photographs / f"{camera.name}.png")
-        pose = np.linalg.inv(camera.world_to_camera) @ np.diag([1.0, -1, -1, 1])
-        frames.append({"file_path": f"{camera.name}.png", "transform_matrix": pose.tolist()})
-    one = scene.cameras[0]
-    lens = {"fl_x": one.fx, "fl_y": one.fy, "cx": one.cx, "cy": one.cy, "w": one.width, "h": one.height}
-    (photographs / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+    files = [f"{camera.name}.png" for camera in scene.cameras]
+    (photographs / "transforms.json").write_text(transforms(scene.cameras, files))
     (work / REPORT).write_text(json.dumps({"dataset": str(photographs)}))
+
+
+# A table with mugs, their handles and a book, of Gaussians whose meanings are known at every level.
+
+AXES = ("mug", "handle", "book", "table", "red", "blue", "anything", "white")  # the seventh is canonical
+TEMPERATURE = 2.0  # so that half as much likeness is visibly less, as published
+SPREAD = 0.3  # of everyday phrases about the canonical one: half as much likeness is another thing
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Block:
+    """A box filled with Gaussians on a grid."""
+
+    name: str
+    centre: tuple[float, float, float]  # world units
+    half: tuple[float, float, float]
+    thing: str  # what it means as a whole
+    part: str = ""  # and as a part of that; "": the same
+
+
+BLOCKS = (
+    Block("table", (0, 0, -0.1), (2.0, 1.0, 0.05), "table"),
+    Block("red mug", (-1.0, 0, 0.2), (0.25, 0.25, 0.24), "red mug"),
+    Block("red handle", (-0.6, 0, 0.2), (0.12, 0.08, 0.12), "red mug", "handle"),
+    Block("blue mug", (1.2, 0, 0.15), (0.2, 0.2, 0.19), "blue mug"),
+    Block("blue handle", (1.5, 0, 0.15), (0.1, 0.08, 0.1), "blue mug", "handle"),
+    Block("book", (-0.3, 0.5, 0.0), (0.25, 0.2, 0.04), "book"),
+    Block("far mug", (0, 0, -3.0), (0.4, 0.4, 0.4), "white mug"),
+)
+STEP = 0.06
+
+
+def meaning(text: str) -> Array:
+    """(DIM,) unit vector of a text of `AXES`; a colour says more than a thing, or all mugs would be red."""
+    return unit(np.sum([np.eye(DIM)[AXES.index(word)] for word in text.split()], 0)).astype(np.float32)
+
+
+class PlainEncoder(FakeEncoder):
+    """Knows `AXES`."""
+
+    words, canonical = AXES, 6
+
+    def vector(self, text: str) -> Array:
+        return meaning(text)
+
+
+def laid_table(phrasebook: dict[str, Array] | None = None) -> tuple[Scene, dict[str, Array]]:
+    """The scene, and (N,) bool of every block by its name. z is up, and the camera looks along +y."""
+    points, owner = [], []
+    for number, block in enumerate(BLOCKS):
+        sides = [np.arange(-half, half + STEP / 2, STEP) for half in block.half]
+        grid = np.stack(np.meshgrid(*sides, indexing="ij"), -1).reshape(-1, 3)
+        points.append(grid + np.array(block.centre))
+        owner += [number] * len(grid)
+    means, owners = np.concatenate(points), np.array(owner)
+    gaussians = unturned_gaussians(means, np.log(0.04), logit(np.array(0.9)))
+    wholes = np.stack([meaning(block.thing) for block in BLOCKS])[owners]
+    parts = np.stack([meaning(block.part or block.thing) for block in BLOCKS])[owners]
+    latents = np.stack([np.zeros_like(wholes), parts, wholes])
+    confidence = np.ones((3, len(means)), np.float32)
+    confidence[0] = 0  # no subparts were outlined
+    field = LanguageField(
+        latents, confidence, LinearCodec(np.eye(DIM, dtype=np.float32)), np.tile(axis(6), (4, 1)), "plain",
+        phrasebook or {}, Reading(temperature=TEMPERATURE), everyday=everyday_about(np.eye(DIM)[6], SPREAD),
+    )  # fmt: skip
+    masks = {block.name: owners == number for number, block in enumerate(BLOCKS)}
+    return Scene(gaussians, field, (front_camera(),)), masks
+
+
+def front_camera() -> Camera:
+    """From in front of the table, looking along +y: x is to the right."""
+    return look_at(np.array([0.0, -6.0, 0.5]), np.zeros(3), UP, (160, 120))

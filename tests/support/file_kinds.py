@@ -8,6 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+import torch
 from PIL import Image
 
 from langsplat_core.arrays import unit
@@ -28,14 +29,17 @@ from langsplat_core.scene import Gaussians, Scene
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures
 from tests.support.file_samples import (
     ascii_ply,
+    autoencoder,
     compressed_ply,
     ksplat_bytes,
     mixed_ply,
     plain_ply,
     random_field,
+    save_model,
     sog_files,
     splat_bytes,
     spz_bytes,
+    tensor,
     zipped,
 )
 from tests.support.mutation import Mutation, in_gzip, in_ply_header, in_png, in_zip, mutant
@@ -137,18 +141,9 @@ def stored_features(path: Path) -> float:
 
 
 def transforms(folder: Path) -> list[bytes]:
+    coefficients = {"k1": 0.01, "k2": 0.001, "p1": 1e-4}
     lenses = [
-        {
-            "fl_x": 50.0,
-            "fl_y": 51.0,
-            "cx": 20,
-            "cy": 15,
-            "w": 40,
-            "h": 30,
-            "k1": 0.01,
-            "k2": 0.001,
-            "p1": 1e-4,
-        },
+        {"fl_x": 50.0, "fl_y": 51.0, "cx": 20, "cy": 15, "w": 40, "h": 30, **coefficients},
         {"camera_angle_x": 0.8, "camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k4": 0.0},
         {"fl_x": 50, "metres_per_unit": 0.5, "applied_transform": np.eye(4)[:3].tolist()},
     ]
@@ -263,8 +258,6 @@ def _scenes(file: str, *samples: bytes, damage: Mutation = mutant) -> FileKind:
 
 def checkpoints(folder: Path) -> list[bytes]:
     """Of Occam's LGS, and without features."""
-    from tests.support.foreign_files import save_model, tensor  # imports torch
-
     vectors = np.random.default_rng(0).normal(size=(20, 24)).astype(np.float32)
     paths = [save_model(folder / "made", SCENE, tensor(vectors)), save_model(folder / "plain", SCENE)]
     return [path.read_bytes() for path in paths]
@@ -272,10 +265,6 @@ def checkpoints(folder: Path) -> list[bytes]:
 
 def autoencoders(folder: Path) -> list[bytes]:
     """Of LangSplat; the checkpoint that goes with it lies beside."""
-    import torch
-
-    from tests.support.foreign_files import autoencoder, save_model, tensor
-
     save_model(folder / "latents_1.pth", SCENE, tensor(np.ones((20, 3), np.float32)))
     torch.save(autoencoder(24, (8, 3), (5,)).state_dict(), folder / "made")
     return [(folder / "made").read_bytes()]

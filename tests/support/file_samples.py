@@ -12,10 +12,13 @@ import struct
 import zipfile
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 import zstandard
 from PIL import Image
+from torch import nn
 
 from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.scene import (
@@ -34,16 +37,9 @@ C0 = 0.28209479177387814
 
 def inria_names(sh_degree: int, normals: bool = True) -> list[str]:
     """Property names in the order of the INRIA code."""
-    rest = 3 * ((sh_degree + 1) ** 2 - 1)
-    return [
-        *"xyz",
-        *(["nx", "ny", "nz"] if normals else []),
-        *(f"f_dc_{i}" for i in range(3)),
-        *(f"f_rest_{i}" for i in range(rest)),
-        "opacity",
-        *(f"scale_{i}" for i in range(3)),
-        *(f"rot_{i}" for i in range(4)),
-    ]
+    numbered = {"f_dc": 3, "f_rest": 3 * ((sh_degree + 1) ** 2 - 1), "scale": 3, "rot": 4}
+    dc, rest, scale, rot = ([f"{name}_{i}" for i in range(n)] for name, n in numbered.items())
+    return [*"xyz", *(["nx", "ny", "nz"] if normals else []), *dc, *rest, "opacity", *scale, *rot]
 
 
 def columns(g: Gaussians) -> dict[str, Array]:
@@ -66,8 +62,7 @@ def ply_bytes(header: list[str], body: bytes, newline: str = "\n") -> bytes:
 
 
 def vertex_table(g: Gaussians, names: list[str], code: str = "<f4") -> Array:
-    values = columns(g)
-    table = np.zeros(len(g), np.dtype([(name, code) for name in names]))
+    values, table = columns(g), np.zeros(len(g), [(name, code) for name in names])
     for name in names:
         table[name] = values.get(name, 7.0)  # 7: a property that is none of ours
     return table
@@ -78,9 +73,8 @@ def plain_ply(
 ) -> bytes:
     """Binary little endian; `front` is the body of a list element `face` of 2 rows before the vertices."""
     names = names or inria_names(g.sh_degree)
-    header = ["format binary_little_endian 1.0"]
-    if front:
-        header += ["element face 2", "property list uchar int vertex_indices"]
+    faces = ["element face 2", "property list uchar int vertex_indices"] if front else []
+    header = ["format binary_little_endian 1.0", *faces]
     header += [f"element vertex {len(g)}", *(f"property float {name}" for name in names)]
     return ply_bytes(header, front + vertex_table(g, names).tobytes(), newline)
 
@@ -117,6 +111,14 @@ def _fields(values: Array, bits: tuple[int, ...]) -> Array:
     return packed
 
 
+def _three(g: Gaussians) -> tuple[Array, Array]:
+    """(N, 3) the components of quaternions whose largest is positive, without that one, and which that is."""
+    quats = unit(g.quats_wxyz.astype(np.float64))
+    largest = np.abs(quats).argmax(1)
+    quats *= np.sign(np.take_along_axis(quats, largest[:, None], 1))
+    return np.array([np.delete(q, i) for q, i in zip(quats, largest, strict=True)]), largest
+
+
 def compressed_ply(g: Gaussians, *, colours: bool = True) -> bytes:
     """SuperSplat's compressed PLY; without `colours` the chunks have the 12 older columns."""
     starts = range(0, len(g), 256)
@@ -132,10 +134,7 @@ def compressed_ply(g: Gaussians, *, colours: bool = True) -> bytes:
             fractions[key][rows] = (block[rows].astype(np.float64) - low) / np.maximum(high - low, 1e-12)
             row += [low, high]
         bounds.append(np.concatenate(row))
-    quats = unit(g.quats_wxyz.astype(np.float64))
-    largest = np.abs(quats).argmax(1)
-    quats *= np.sign(np.take_along_axis(quats, largest[:, None], 1))
-    three = np.array([np.delete(q, i) for q, i in zip(quats, largest, strict=True)])
+    three, largest = _three(g)
     rotation = _fields(three / np.sqrt(2) + 0.5, (10, 10, 10)) | (largest.astype(np.uint32) << 30)
     opacity = sigmoid(g.opacity_logits.astype(np.float64))[:, None]
     packed = [
@@ -162,9 +161,7 @@ def compressed_ply(g: Gaussians, *, colours: bool = True) -> bytes:
 def _webp(pixels: Array) -> bytes:
     buffer = io.BytesIO()
     # exact: else the encoder may change colours under alpha 0
-    Image.fromarray(pixels.astype(np.uint8), "RGBA" if pixels.shape[2] == 4 else "RGB").save(
-        buffer, "WEBP", lossless=True, exact=True
-    )
+    Image.fromarray(pixels.astype(np.uint8)).save(buffer, "WEBP", lossless=True, exact=True)
     return buffer.getvalue()
 
 
@@ -186,10 +183,7 @@ def sog_files(g: Gaussians, palette_entries: int = 70) -> dict[str, bytes]:
     logs = np.sign(g.means) * np.log1p(np.abs(g.means.astype(np.float64)))
     mins, maxs = logs.min(0), logs.max(0)
     code = np.round((logs - mins) / (maxs - mins) * 65535).astype(np.uint32)
-    quats = unit(g.quats_wxyz.astype(np.float64))
-    largest = np.abs(quats).argmax(1)
-    quats *= np.sign(np.take_along_axis(quats, largest[:, None], 1))
-    three = np.array([np.delete(q, i) for q, i in zip(quats, largest, strict=True)])
+    three, largest = _three(g)
     packed = np.concatenate([np.round((three / np.sqrt(2) + 0.5) * 255), 252 + largest[:, None]], 1)
     packed = _plane(packed, width)
     packed[..., 3] = np.maximum(packed[..., 3], 252)  # the padding too
@@ -288,8 +282,7 @@ def random_field(
     )
 
 
-# Encoders of .splat, .ksplat and .spz for tests: one Gaussian at a time, from the published layouts, apart
-# from the readers and writers, so that both would have to be wrong in the same way for a test to miss it.
+# Encoders of .splat, .ksplat and .spz: one Gaussian at a time.
 
 HALF_TURN = np.diag([1.0, -1.0, -1.0])  # right down front <-> right up back
 
@@ -373,8 +366,7 @@ def ksplat_bytes(parts: list[Gaussians], level: int, bucket: int = 8, sh_range: 
 def turned_coefficients(sh: Array, turn: Array) -> Array:
     """(N, K, 3) coefficients of the same colours after the world was multiplied by `turn` (3, 3), found by
     least squares over directions instead of from symmetries."""
-    directions = np.random.default_rng(0).normal(size=(400, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = unit(np.random.default_rng(0).normal(size=(400, 3)))
     count = sh.shape[1]
     matrix = np.linalg.lstsq(sh_basis(directions @ turn.T, count), sh_basis(directions, count), rcond=None)[0]
     return np.einsum("kj,njc->nkc", matrix, sh.astype(float))
@@ -434,3 +426,84 @@ def spz_bytes(
     head += bytes([len(blocks)]) + struct.pack("<I12x", 32 + len(records)) + records
     sizes = [struct.pack("<QQ", len(frame), len(block)) for frame, block in zip(frames, blocks, strict=True)]
     return head + b"".join(sizes) + b"".join(frames)
+
+
+# Checkpoints of other methods.
+
+
+def geometry(g: Gaussians) -> list[Any]:
+    """Elements 0 to 6 of a model: parameters on the CPU, as a checkpoint made there holds them."""
+    arrays = (g.means, g.sh[:, :1], g.sh[:, 1:], g.log_scales, g.quats_wxyz, g.opacity_logits[:, None])
+    return [3, *(nn.Parameter(torch.tensor(np.ascontiguousarray(array))) for array in arrays)]
+
+
+def training_state(g: Gaussians) -> list[Any]:
+    """What ends every tuple: radii, gradients and their counts, optimiser, extent (a NumPy number)."""
+    n = len(g)
+    xyz = nn.Parameter(torch.zeros(n, 3))
+    optimiser = torch.optim.Adam([xyz], lr=0.0025, eps=1e-15)
+    xyz.grad = torch.ones_like(xyz)
+    optimiser.step()
+    sums = [torch.zeros(n), torch.zeros(n, 1), torch.zeros(n, 1)]
+    return [*sums, optimiser.state_dict(), np.float64(4.25)]
+
+
+def save_model(path: Path, g: Gaussians, *between: Any, behind: tuple[Any, ...] = ()) -> Path:
+    """(tuple, iteration) with `between` geometry and training state, and `behind` it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    torch.save(((*geometry(g), *between, *training_state(g), *behind), 30_000), path)
+    return path
+
+
+def tensor(array: Array) -> nn.Parameter:
+    return nn.Parameter(torch.from_numpy(np.array(array)), requires_grad=array.dtype.kind == "f")
+
+
+class LangSplatAutoencoder(nn.Module):
+    """The network whose `state_dict` is `best_ckpt.pth`."""
+
+    def __init__(self, dim: int, encoder: tuple[int, ...], decoder: tuple[int, ...]) -> None:
+        super().__init__()
+        self.encoder = self._chain((dim, *encoder), normalised=True)
+        self.decoder = self._chain((encoder[-1], *decoder, dim), normalised=False)
+
+    @staticmethod
+    def _chain(widths: tuple[int, ...], normalised: bool) -> nn.Sequential:
+        layers: list[nn.Module] = []
+        for into, out in pairwise(widths):
+            between = [nn.BatchNorm1d(into), nn.ReLU()] if normalised else [nn.ReLU()]
+            layers += [*(between if layers else []), nn.Linear(into, out)]
+        return nn.Sequential(*layers)
+
+    def encode(self, x: torch.Tensor) -> torch.Tensor:
+        return nn.functional.normalize(self.encoder(x), dim=-1)
+
+    def decode(self, x: torch.Tensor) -> torch.Tensor:
+        return nn.functional.normalize(self.decoder(x), dim=-1)
+
+
+def autoencoder(
+    dim: int,
+    encoder: tuple[int, ...] = (256, 128, 64, 32, 3),
+    decoder: tuple[int, ...] = (16, 32, 64, 128, 256, 256),
+) -> LangSplatAutoencoder:
+    """In evaluation, with statistics and scales of batch normalisation that are not the initial ones."""
+    torch.manual_seed(1)
+    network = LangSplatAutoencoder(dim, encoder, decoder)
+    for module in network.modules():
+        if isinstance(module, nn.BatchNorm1d):
+            nn.init.uniform_(module.weight, 0.5, 2)
+            nn.init.uniform_(module.bias, -0.3, 0.3)
+    for _ in range(20):
+        network.encoder(torch.randn(64, dim))
+    return network.eval()
+
+
+def faiss_index(centroids: Array, kind: bytes = b"IxPq", metric: int = 1, bits: int = 8) -> bytes:
+    """An IndexPQ as faiss writes it, with three vectors in it."""
+    parts, _, part_dim = centroids.shape
+    dim = parts * part_dim
+    out = kind + struct.pack("<iqqq?i", dim, 3, 1 << 20, 1 << 20, True, metric)
+    out += struct.pack("<f", 0.5) if metric > 1 else b""
+    out += struct.pack("<QQQQ", dim, parts, bits, centroids.size) + centroids.astype("<f4").tobytes()
+    return out + struct.pack("<Q", 3 * parts) + bytes(3 * parts) + struct.pack("<i?i", 0, False, 0)

@@ -43,9 +43,9 @@ class Seen:
         """The same backend's output for the same drawing with some fields changed."""
         return draw(self.backend, replace(self.drawing, **changes))
 
-    def with_rows(self, **fields: Array) -> "Seen":
-        """The same backend's output with some arrays of the Gaussians changed."""
-        return self.again(gaussians=replace(self.drawing.gaussians, **fields))
+    def within(self, atol: float) -> float:
+        """`atol`; half floats within their own error."""
+        return max(atol, 1e-3) if self.backend.name == "opengl-half" else atol
 
 
 Check = Callable[[Seen], None]
@@ -83,24 +83,15 @@ def altered(field: str, rows: Any, value: Any, **options: Any) -> Drawing:
     return replace(drawing, gaussians=replace(drawing.gaussians, **{field: array}))
 
 
-def balls(
-    z: Any, opacity: Any = 0.8, scale: Any = 0.2, x: Any = 0.0, y: Any = 0.0, quat: Any = (1.0, 0, 0, 0)
-) -> Gaussians:
-    """Gaussians at (x, y, z), each argument one number for all or one per Gaussian; a scale may be
-    (N, 3)."""
-    z = np.atleast_1d(np.asarray(z, np.float64))
-    n = len(z)
-    scales = np.broadcast_to(
-        np.reshape(scale, (-1, np.shape(scale)[-1] if np.ndim(scale) > 1 else 1)), (n, 3)
-    )
+def balls(z: Any, opacity: Any = 0.8, scale: Any = 0.2, x: Any = 0.0, y: Any = 0.0) -> Gaussians:
+    """Gaussians at (x, y, z), each argument one number for all or one per Gaussian; a scale may be (N, 3)."""
+    n = np.size(z)
+    means = np.stack(np.broadcast_arrays(x, y, np.atleast_1d(z)), -1).astype(np.float64)
+    scales = np.broadcast_to(scale if np.ndim(scale) > 1 else np.reshape(scale, (-1, 1)), (n, 3))
     with np.errstate(divide="ignore"):
-        return Gaussians(
-            np.stack([np.broadcast_to(x, n), np.broadcast_to(y, n), z], -1),
-            np.log(scales),
-            np.broadcast_to(np.asarray(quat, np.float64), (n, 4)),
-            logit(np.broadcast_to(np.asarray(opacity, np.float64), n)),
-            np.zeros((n, 1, 3)),
-        )
+        opacities = logit(np.broadcast_to(np.asarray(opacity, np.float64), n))
+        quats = np.tile([1.0, 0, 0, 0], (n, 1))
+        return Gaussians(means, np.log(scales), quats, opacities, np.zeros((n, 1, 3)))
 
 
 def identical(seen: Seen, other: Seen) -> None:
@@ -110,20 +101,17 @@ def identical(seen: Seen, other: Seen) -> None:
 
 
 def close(seen: Seen, other: Seen, atol: float) -> None:
-    """Image and alpha within `atol`; half floats within their own error."""
-    atol = max(atol, 1e-3 if seen.backend.name == "opengl-half" else 0)
-    np.testing.assert_allclose(seen.image, other.image, atol=atol)
-    np.testing.assert_allclose(seen.alpha, other.alpha, atol=atol)
+    """Image and alpha within `atol`."""
+    np.testing.assert_allclose(seen.image, other.image, atol=seen.within(atol))
+    np.testing.assert_allclose(seen.alpha, other.alpha, atol=seen.within(atol))
 
 
 def draws_nothing(seen: Seen) -> None:
-    """An empty picture."""
     assert not seen.image.any()
     assert not seen.alpha.any()
 
 
 def draws_something(seen: Seen) -> None:
-    """Not an empty picture."""
     assert seen.alpha.max() > 0.1
 
 
@@ -134,22 +122,10 @@ def draws_something(seen: Seen) -> None:
 # that adjoint and gradients are finite and zero for dropped rows.
 
 ROW = 5  # the row that is made hard where only one is
-_SLOTS = {
-    "means": (ROW, 1),
-    "log_scales": (ROW, 0),
-    "quats_wxyz": (ROW, 2),
-    "opacity_logits": (ROW,),
-    "sh": (ROW, 3, 2),
-}
-_POISONS = {
-    "nan": np.nan,
-    "inf": np.inf,
-    "-inf": -np.inf,
-    "a denormal": 1e-40,
-    "-0": -0.0,
-    "1e38": 1e38,
-    "-1e38": -1e38,
-}
+_SLOTS = {"means": (ROW, 1), "log_scales": (ROW, 0), "quats_wxyz": (ROW, 2)}
+_SLOTS |= {"opacity_logits": (ROW,), "sh": (ROW, 3, 2)}
+_POISONS = {"nan": np.nan, "inf": np.inf, "-inf": -np.inf, "1e38": 1e38, "-1e38": -1e38}
+_POISONS |= {"a denormal": 1e-40, "-0": -0.0}
 _FATAL = {
     **dict.fromkeys(("means", "quats_wxyz"), ("nan", "inf", "-inf")),
     "sh": ("nan", "inf", "-inf", "1e38", "-1e38"),
@@ -180,17 +156,8 @@ def _poisoned(field: str, poison: str) -> Case:
     )
 
 
-def _middle(seen: Seen) -> float:
-    return float(seen.alpha[10, 10])
-
-
-def _alphas_at(seen: Seen, expected: list[float]) -> None:
-    half = seen.backend.name == "opengl-half"
-    np.testing.assert_allclose(seen.alpha[10, 5 : 5 + len(expected)], expected, atol=1e-3 if half else 1e-6)
-
-
 def _thresholds(seen: Seen) -> None:
-    _alphas_at(seen, [0, 0, 0, 0, 1.001 / 255])
+    np.testing.assert_allclose(seen.alpha[10, 5:10], [0, 0, 0, 0, 1.001 / 255], atol=seen.within(1e-6))
     assert seen.alpha[10, 7] == 0 or abs(seen.alpha[10, 7] * 255 - 1) < 1e-3
 
 
@@ -198,13 +165,13 @@ def _dot_of_the_dilation(seen: Seen) -> None:
     squared = (np.arange(21) - 10.0) ** 2
     want = 0.8 * np.exp(-0.5 * (squared[:, None] + squared) / 0.3)
     want[want < 1 / 255] = 0
-    np.testing.assert_allclose(seen.alpha, want, atol=1e-3 if seen.backend.name == "opengl-half" else 1e-6)
+    np.testing.assert_allclose(seen.alpha, want, atol=seen.within(1e-6))
 
 
 def _quaternions_of_length(factor: float) -> Case:
     def check(seen: Seen) -> None:
-        scaled = seen.drawing.gaussians.quats_wxyz * np.float32(factor)
-        other = seen.with_rows(quats_wxyz=scaled)
+        gaussians = seen.drawing.gaussians
+        other = seen.again(gaussians=replace(gaussians, quats_wxyz=gaussians.quats_wxyz * np.float32(factor)))
         if np.log2(factor) % 1 == 0:
             identical(seen, other)
         else:
@@ -225,7 +192,7 @@ def _pancakes_edge_on() -> Drawing:
 
 
 def _no_more_than_the_cap(seen: Seen) -> None:
-    assert abs(_middle(seen) - 0.99) < (1e-3 if seen.backend.name == "opengl-half" else 1e-6)
+    assert abs(float(seen.alpha[10, 10]) - 0.99) < seen.within(1e-6)
 
 
 def _stack_stops(seen: Seen) -> None:
@@ -268,8 +235,7 @@ def _permuted(seen: Seen) -> None:
 
 def _ties_by_index(seen: Seen) -> None:
     weights = seen.again(values=np.eye(3, dtype=np.float32)).image[10, 10]
-    half = seen.backend.name == "opengl-half"
-    np.testing.assert_allclose(weights, [0.5, 0.3, 0.08], atol=1e-3 if half else 1e-6)
+    np.testing.assert_allclose(weights, [0.5, 0.3, 0.08], atol=seen.within(1e-6))
 
 
 def _crop_of(width: int, height: int, left: int, top: int) -> Case:
@@ -283,9 +249,7 @@ def _crop_of(width: int, height: int, left: int, top: int) -> Case:
         camera = replace(wide, width=width, height=height, cx=wide.cx - left, cy=wide.cy - top)
         cropped = seen.again(camera=camera)
         window = np.s_[top : top + height, left : left + width]
-        atol = 1e-3 if seen.backend.name == "opengl-half" else 2e-5
-        np.testing.assert_allclose(cropped.image, seen.image[window], atol=atol)
-        np.testing.assert_allclose(cropped.alpha, seen.alpha[window], atol=atol)
+        close(cropped, replace(seen, image=seen.image[window], alpha=seen.alpha[window]), 2e-5)
 
     name = f"principal point at ({32 - left}, {20 - top})"
     return Case(name, "a crop is a part of the whole", build, check)
@@ -389,16 +353,11 @@ def _sizes(width: int, height: int) -> Case:
     )
 
 
-def _near_plane_steps() -> Drawing:
-    near = np.float32(0.25)  # a float32 and a float64
-    steps = [np.nextafter(near, np.float32(0)), near, np.nextafter(near, np.float32(1))]
-    return Drawing(balls(steps, 0.5, 0.01), settings=replace(INRIA, near=0.25))
-
-
-def _far_plane_steps() -> Drawing:
-    far = np.float32(2.5)
-    steps = [np.nextafter(far, np.float32(0)), far, np.nextafter(far, np.float32(3))]
-    return Drawing(balls(steps, 0.5, 0.01), settings=replace(INRIA, far=2.5))
+def _plane_steps(**plane: float) -> Drawing:
+    """Before, at and behind a plane whose distance float32 holds."""
+    (at,) = (np.float32(distance) for distance in plane.values())
+    steps = [np.nextafter(at, np.float32(0)), at, np.nextafter(at, np.float32(9))]
+    return Drawing(balls(steps, 0.5, 0.01), settings=replace(INRIA, **plane))
 
 
 def _logits() -> Drawing:
@@ -450,10 +409,10 @@ CASES: tuple[Case, ...] = (
     Case("at the camera's centre", "not drawn, and nobody divides by the distance",
          lambda: Drawing(balls([0.0, 3.0], 0.5)), _only(1)),
     Case("behind the camera", "not drawn", lambda: Drawing(balls([-3.0, -0.2, 3.0], 0.5)), _only(2)),
-    Case("one ulp about the near plane", "drawn only beyond it", _near_plane_steps, _only(2)),
+    Case("one ulp about the near plane", "drawn only beyond it", lambda: _plane_steps(near=0.25), _only(2)),
     Case("straddling the near plane", "drawn or not by the centre alone, finite",
          lambda: Drawing(balls([0.19, 0.21], 0.5, 1.0)), _only(1)),
-    Case("one ulp about the far plane", "drawn up to it", _far_plane_steps, _only(0, 1)),
+    Case("one ulp about the far plane", "drawn up to it", lambda: _plane_steps(far=2.5), _only(0, 1)),
     Case("straddling gsplat's near plane", "the same with its nearer plane",
          lambda: Drawing(balls([0.009, 0.011], 0.5, 1.0), settings=GSPLAT), _only(1)),
     Case("far outside the field of view", "the Jacobian is clamped at 1.3 of it, as in the reference",

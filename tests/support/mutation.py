@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
+from langsplat_core.bench import peak_memory, restart_peak
 from langsplat_core.errors import InputError, printable_line
 
 HEADER = 600  # bytes at the beginning in which half of the mutations fall
@@ -95,21 +96,20 @@ def _extreme_number(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -
     return data[:place] + new + data[place + len(new) :]
 
 
-def _inflate(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> bytes:
-    """A number in text becomes another."""
-    return _replace(data, _NUMBER, rng)
+def _other(what: re.Pattern[bytes]) -> Mutation:
+    """Of text, a number or a word becomes another."""
+
+    def replaced(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> bytes:
+        start = _place(data, rng)
+        match = what.search(data, start) or what.search(data)
+        if match is None:
+            return data
+        return data[: match.start()] + TOKENS[int(rng.integers(len(TOKENS)))] + data[match.end() :]
+
+    return replaced
 
 
-def _other_word(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> bytes:
-    return _replace(data, _WORD, rng)
-
-
-def _replace(data: bytes, what: re.Pattern[bytes], rng: np.random.Generator) -> bytes:
-    start = _place(data, rng)
-    match = what.search(data, start) or what.search(data)
-    if match is None:
-        return data
-    return data[: match.start()] + TOKENS[int(rng.integers(len(TOKENS)))] + data[match.end() :]
+_inflate, _other_word = _other(_NUMBER), _other(_WORD)
 
 
 def _swap_lines(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> bytes:
@@ -157,15 +157,12 @@ def in_zip(data: bytes, others: Sequence[bytes], rng: np.random.Generator) -> by
         members = {name: archive.read(name) for name in archive.namelist()}
     name = str(rng.choice(list(members)))
     same = [member for member in members.values() if len(member) > 100]
-    buffer = io.BytesIO()
     methods = [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA]
     method = methods[int(rng.choice([0, 0, 1, 1, 1, 1, 1, 2, 3]))]
+    members[name] = (in_png if members[name][:4] == b"\x89PNG" else mutant)(members[name], same, rng)
+    buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", method) as archive:
         for other, content in members.items():
-            if other == name:
-                content = (
-                    in_png(content, same, rng) if content[:4] == b"\x89PNG" else mutant(content, same, rng)
-                )
             archive.writestr(other, content)
     packed = buffer.getvalue()
     return mutant(packed, others, rng) if rng.random() < 0.2 else packed
@@ -330,9 +327,9 @@ class FuzzRun:
         outcome = self.outcome
         outcome.tried += 1
         self.path.write_bytes(content)
-        before, began = _resident(), time.process_time()
+        before, began = restart_peak() or 0, time.process_time()
         what = self._verdict(said)
-        took, seconds = _peak() - before, time.process_time() - began
+        took, seconds = (peak_memory() or 0) - before, time.process_time() - began
         outcome.peak, outcome.slowest = max(outcome.peak, took), max(outcome.slowest, seconds)
         if what is None and took > MEMORY_FACTOR * len(content) + MEMORY_SLACK:
             what = f"memory: {took / 1e6:.0f} MB for {len(content)} bytes"
@@ -404,24 +401,3 @@ def _standard_error() -> Iterator[Callable[[], str]]:
             os.dup2(kept, 2)
             os.close(kept)
             logging.getLogger("langsplat").propagate = propagate
-
-
-def _resident() -> int:
-    """Bytes of memory in use, after the peak was made to begin here; 0 where the system does not tell."""
-    try:
-        Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        return 0
-    return _status("VmRSS")
-
-
-def _peak() -> int:
-    return _status("VmHWM")
-
-
-def _status(key: str) -> int:
-    try:
-        lines = Path("/proc/self/status").read_text().splitlines()
-    except OSError:
-        return 0
-    return next((1024 * int(line.split()[1]) for line in lines if line.startswith(key + ":")), 0)

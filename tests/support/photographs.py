@@ -38,10 +38,8 @@ TEXTURES = [_texture(seed) for seed in range(3)]
 
 def photograph(intrinsics: PhotoIntrinsics, world_to_camera: Array) -> Array:
     """(H, W, 3) uint8: what a camera in the room sees, sampled at pixel centres."""
-    y, x = np.mgrid[: intrinsics.height, : intrinsics.width] + 0.5
-    xy = np.stack([(x - intrinsics.cx) / intrinsics.fx, (y - intrinsics.cy) / intrinsics.fy], -1).reshape(
-        -1, 2
-    )
+    y, x = np.mgrid[: intrinsics.height, : intrinsics.width].reshape(2, -1) + 0.5
+    xy = np.stack([(x - intrinsics.cx) / intrinsics.fx, (y - intrinsics.cy) / intrinsics.fy], -1)
     if intrinsics.distortion is not None:
         xy = undistorted_points(intrinsics.distortion, xy)
     rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
@@ -98,10 +96,8 @@ def sensor_picture(intrinsics: PhotoIntrinsics, pose: bytes) -> Image.Image:
 
     `pose` holds the bytes of a float64 world-to-camera matrix.
     """
-    matrix = np.frombuffer(pose).reshape(4, 4)
-    return Image.fromarray(
-        photograph(intrinsics.regridded(3 * intrinsics.width, 3 * intrinsics.height), matrix)
-    ).reduce(3)
+    fine = intrinsics.regridded(3 * intrinsics.width, 3 * intrinsics.height)
+    return Image.fromarray(photograph(fine, np.frombuffer(pose).reshape(4, 4))).reduce(3)
 
 
 def write_photos(
@@ -205,10 +201,8 @@ def ovs_view(
     scene: Path, name: str, masks: Mapping[str, Array], photo: tuple[int, int] | None = SIZE
 ) -> None:
     """segmentations/`name`/<class>.png and images/`name`.jpg; classes.txt is extended by what is new."""
-    folder = scene / "segmentations" / name
-    folder.mkdir(parents=True, exist_ok=True)
     for phrase, mask in masks.items():
-        Image.fromarray((255 * mask).astype(np.uint8)).save(folder / f"{phrase}.png")
+        silhouette(scene / "segmentations" / name, phrase, mask)
     listed = scene / "segmentations" / "classes.txt"
     known = listed.read_text().splitlines() if listed.exists() else []
     listed.write_text("\n".join([*known, *(phrase for phrase in masks if phrase not in known)]) + "\n")

@@ -1,18 +1,26 @@
-"""What stops a program: permissions, a full disk, its user."""
+"""What stops a program (permissions, a full disk, its user), programs on a display of their own, browsers."""
 
+import base64
 import ctypes
+import json
 import os
 import resource
 import shutil
+import signal
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
+from langsplat_core.arrays import Array
 from langsplat_core.io import apart
 from langsplat_core.progress import Cancelled, Progress, Report
+from langsplat_core.scene import Camera
 
 PR_CAPBSET_DROP, CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH = 24, 1, 2  # linux/prctl.h, linux/capability.h
 
@@ -75,3 +83,153 @@ def small_disk(folder: Path, size: int) -> Iterator[Path]:
 def resize(disk: Path, size: int) -> None:
     """Make a `small_disk` larger."""
     subprocess.run(["mount", "-o", f"remount,size={size}", str(disk)], check=True, capture_output=True)
+
+
+# Programs of this tree, played on a virtual display in a process of their own.
+
+ROOT = Path(__file__).parents[2]
+
+
+def surroundings(display: str) -> dict[str, str]:
+    """The environment of a program on `display`."""
+    inherited = {key: value for key, value in os.environ.items() if key != "WAYLAND_DISPLAY"}
+    return inherited | {"DISPLAY": display, "PYTHONPATH": os.pathsep.join((str(ROOT), str(ROOT / "app")))}
+
+
+def play(display: str, arguments: list[str], folder: Path, timeout: float, **environment: str) -> str:
+    """What Python says with `arguments`, in `folder`, for at most `timeout` seconds. It has to end well."""
+    done = subprocess.run(
+        [sys.executable, *arguments],
+        env=surroundings(display) | environment,
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+    )
+    assert done.returncode == 0, (done.stdout + done.stderr)[-4000:]
+    return done.stdout
+
+
+class Cast:
+    """A process that has imported a module that calls `serve`, and plays it in forks of itself: what takes
+    seconds to import is imported once."""
+
+    def __init__(self, module: str, display: str) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", module],
+            env=surroundings(display),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def play(self, arguments: list[str], folder: Path, timeout: int) -> str:
+        """As the function of this name."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(json.dumps([arguments, str(folder), timeout]) + "\n")
+        self._process.stdin.flush()
+        code, said = json.loads(self._process.stdout.readline())
+        assert code == 0, said[-4000:]
+        return said
+
+    def close(self) -> None:
+        self._process.communicate()
+
+
+def serve(play_one: Callable[[list[str]], None]) -> None:
+    """Play what `Cast` asks for, one after another, each in a process that ends as any other does."""
+    for line in sys.stdin:
+        arguments, folder, timeout = json.loads(line)
+        said = Path(folder) / "said.txt"
+        if (child := os.fork()) == 0:
+            signal.alarm(timeout)
+            os.chdir(folder)
+            with said.open("wb") as file:
+                os.dup2(file.fileno(), 1)
+                os.dup2(file.fileno(), 2)
+            return play_one(arguments)
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        print(json.dumps([code, said.read_text()]), flush=True)
+        said.unlink()
+
+
+# Pages in a real browser: Debian's Chromium, without a screen, a graphics card or a network.
+
+CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
+FLAGS = (
+    "--no-sandbox --disable-gpu --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader "
+    "--disable-quic --no-first-run --disable-background-networking --disable-component-update --disable-sync"
+)
+IMAGE = """async ([camera, display, phrase]) => {
+  const bytes = await (await langsplat).image(camera, display, phrase);
+  let letters = "";
+  for (let i = 0; i < bytes.length; i += 8192) letters += String.fromCharCode(...bytes.subarray(i, i + 8192));
+  return btoa(letters);
+}"""
+
+
+class Tab:
+    """A page that is open, with all that it asked for and said."""
+
+    def __init__(self, page: Any) -> None:
+        self.page = page
+        self.requests: list[str] = []
+        self.faults: list[str] = []
+        page.on("request", lambda request: self.requests.append(request.url))
+        page.on("pageerror", lambda error: self.faults.append(str(error)))
+
+    def open(self, path: Path) -> None:
+        """Open a file and wait until its scene is there."""
+        self.page.goto(path.as_uri())
+        self.page.evaluate("langsplat.then(() => 0)")
+
+    def run(self, script: str, argument: Any = None) -> Any:
+        """What a function in JavaScript returns."""
+        return self.page.evaluate(script, argument)
+
+    def ask(self, phrase: str, level: str = "auto") -> dict[str, Any]:
+        """The page's answer to a phrase, and the number of its members."""
+        found: dict[str, Any] = self.run(
+            """async ([phrase, level]) => {
+              const { page, ask } = await langsplat, answer = ask(phrase, level);
+              const { values, members } = page.language.spread(answer, answer.level);
+              return { ...answer, values: null, codes: null, members: members.reduce((a, b) => a + b, 0),
+                       mean: values.reduce((a, b) => a + b, 0) / values.length };
+            }""",
+            [phrase, level],
+        )
+        return found
+
+    def image(self, camera: Camera, origin: Array, display: str = "rgb", phrase: str = "") -> Array:
+        """(H, W, 3) uint8 of a camera, which stands `origin` (3,) away from where the page has it."""
+        pose = {"rotation": camera.rotation.ravel().tolist(), "position": (camera.position - origin).tolist()}
+        inner = {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
+        letters = self.run(IMAGE, [pose | inner, display, phrase])
+        image = np.frombuffer(base64.b64decode(letters), np.uint8)
+        return image.reshape(camera.height, camera.width, 4)[..., :3]
+
+
+@contextmanager
+def open_browser() -> Iterator[Any]:
+    """A browser; the test is skipped where there is none."""
+    found = next(filter(None, map(shutil.which, CHROMIUM)), None)
+    if found is None:
+        pytest.skip("no Chromium here: apt-get install chromium")
+    driver = pytest.importorskip("playwright.sync_api", reason="no playwright here: pip install playwright")
+    with driver.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=found, args=FLAGS.split())
+        yield browser
+        browser.close()
+
+
+@contextmanager
+def open_tab(browser: Any, path: Path, **settings: Any) -> Iterator[Tab]:
+    """A file open in a profile of its own; settings: of playwright's `new_context`."""
+    context = browser.new_context(offline=True, **{"viewport": {"width": 480, "height": 360}} | settings)
+    try:
+        tab = Tab(context.new_page())
+        tab.open(path)
+        yield tab
+    finally:
+        context.close()

@@ -1,9 +1,12 @@
-"""Tiny seeded scenes, answers and views with masks that many tests share."""
+"""Small seeded scenes, answers and views with masks that many tests share."""
 
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from langsplat_core.arrays import Array, logit, rotation_matrices, unit
 from langsplat_core.query.selection import Regions, build_regions
@@ -66,15 +69,18 @@ def random_camera(
     camera = look_at(eye, rng.uniform(-0.2, 0.2, size=3), rng.normal(size=3), (width, height))
     if not off_centre:
         return camera
-    return Camera(
-        width,
-        height,
-        camera.fx * 1.1,
-        camera.fy * 0.95,
-        width * rng.uniform(0.35, 0.65),
-        height * rng.uniform(0.35, 0.65),
-        camera.world_to_camera,
-    )
+    cx, cy = width * rng.uniform(0.35, 0.65), height * rng.uniform(0.35, 0.65)
+    return Camera(width, height, camera.fx * 1.1, camera.fy * 0.95, cx, cy, camera.world_to_camera)
+
+
+def transforms(cameras: Sequence[Camera], files: Sequence[str], **more: object) -> str:
+    """nerfstudio's transforms.json of cameras of one lens and their photographs; more: at its top."""
+    one = cameras[0]
+    lens = {"fl_x": one.fx, "fl_y": one.fy, "cx": one.cx, "cy": one.cy, "w": one.width, "h": one.height}
+    poses = [np.linalg.inv(camera.world_to_camera) @ np.diag([1.0, -1, -1, 1]) for camera in cameras]
+    named = zip(files, poses, strict=True)
+    frames = [{"file_path": file, "transform_matrix": pose.tolist()} for file, pose in named]
+    return json.dumps({**lens, **more, "frames": frames})
 
 
 def without_perspective(camera: Camera, distance: float = 3.0) -> Camera:
@@ -101,16 +107,8 @@ def shifted(gaussians: Gaussians, camera: Camera, offset: Array) -> tuple[Gaussi
     return moved, replace(camera, world_to_camera=matrix)
 
 
-PLY_TYPES = {
-    "i1": "char",
-    "u1": "uchar",
-    "i2": "short",
-    "u2": "ushort",
-    "i4": "int",
-    "u4": "uint",
-    "f4": "float",
-    "f8": "double",
-}
+PLY_TYPES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort"}
+PLY_TYPES |= {"i4": "int", "u4": "uint", "f4": "float", "f8": "double"}
 
 
 def random_extras(count: int = 40) -> dict[str, Array]:
@@ -199,3 +197,55 @@ def make_views(count: int = 3) -> list[tuple[Camera, ImageFeatures]]:
 def dense_weights(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     """(H, W, N): column i is the splat of the i-th unit vector."""
     return ReferenceRasterizer().view(gaussians, camera).splat(np.eye(len(gaussians)))[0]
+
+
+# A room of flat Gaussians whose planes are known: a floor, four walls, a table and blocks on it.
+
+FLOOR, WALL = -0.7, 2.0  # height of the floor; distance of the walls from the middle
+STEP = 0.1
+
+
+def _sheet(centre: Array, first: Array, second: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Points over the rectangle centre +- first +- second, jittered in it, and their normals."""
+    counts = [max(round(2 * float(np.linalg.norm(side)) / STEP), 1) for side in (first, second)]
+    u, v = np.meshgrid(*(np.linspace(-1, 1, count) for count in counts))
+    uv = np.stack([u.ravel(), v.ravel()], 1) + rng.uniform(-0.3, 0.3, (u.size, 2)) / counts
+    normal = np.cross(first, second) / np.linalg.norm(np.cross(first, second))
+    return centre + uv @ np.stack([first, second]), np.tile(normal, (u.size, 1))
+
+
+def box_room(seed: int = 0) -> Scene:
+    """The room of a seed, which decides what stands on the table; z is up."""
+    rng = np.random.default_rng(seed)
+    x, y, z = np.eye(3)
+    parts = [_sheet(FLOOR * z, WALL * x, WALL * y, rng)]
+    for side in (x, -x, y, -y):
+        across = np.cross(z, side)
+        parts.append(_sheet(WALL * side + (FLOOR + 0.7) * z, WALL * across, 0.7 * z, rng))
+    blocks = [(np.zeros(3), np.array([0.8, 0.5, 0.03]))]
+    for _ in range(7):
+        half = rng.uniform(0.06, 0.25, 3)
+        blocks.append((np.array([*rng.uniform(-0.6, 0.6, 1), *rng.uniform(-0.35, 0.35, 1), half[2]]), half))
+    blocks += [(np.array([1.5, rng.uniform(-1, 1), FLOOR + 0.3]), np.array([0.3, 0.4, 0.3]))]
+    for centre, half in blocks:
+        for axis in range(3):
+            first, second = np.diag(half)[[(axis + 1) % 3, (axis + 2) % 3]]
+            for sign in (-1, 1):
+                offset = np.zeros(3)
+                offset[axis] = sign * half[axis]
+                parts.append(_sheet(centre + offset, first, second, rng))
+    points, normals = (np.concatenate(column) for column in zip(*parts, strict=True))
+    turns = [
+        Rotation.align_vectors([normal], [[0, 0, 1]])[0].as_quat() for normal in np.unique(normals, axis=0)
+    ]
+    which = np.unique(normals, axis=0, return_inverse=True)[1].reshape(-1)
+    gaussians = Gaussians(
+        means=points,
+        log_scales=np.tile(np.log([STEP, STEP, 0.003]), (len(points), 1)),
+        quats_wxyz=np.array(turns)[which][:, [3, 0, 1, 2]],
+        opacity_logits=np.full(len(points), 4.0),
+        sh=rng.normal(size=(len(points), 1, 3)),
+    )
+    angles = np.linspace(0, 2 * np.pi, 8, endpoint=False)
+    eyes = [np.array([1.4 * np.cos(a), 1.4 * np.sin(a), 0.5]) for a in angles]
+    return Scene(gaussians, cameras=tuple(look_at(eye, FLOOR / 2 * z, z, (96, 72), 70) for eye in eyes))

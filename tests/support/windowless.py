@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +10,14 @@ import numpy as np
 from langsplat_core.errors import FormatError
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions import opening, queries, selecting, settings, viewpoint
+from langsplat_viewer.camera.controls import extent_of, from_camera, orbit
+from langsplat_viewer.camera.flight import Flight, Keyframe, pose_of
 from langsplat_viewer.canvas import Canvas
+from langsplat_viewer.marks import Marks
 from langsplat_viewer.rendering.request import Clip, RenderRequest, Splats
 from langsplat_viewer.state import GLIDE_SECONDS, ViewerState
 from langsplat_viewer.viewer import Viewer
-from tests.support.fakes import blob_scene
+from tests.support.fakes import PER_BLOB, WORDS, blob_scene
 
 SCENES = {
     "blobs.ply": blob_scene(),
@@ -79,14 +83,22 @@ def load(path: Path) -> Scene:
 
 def settle(viewer: Viewer, seconds: float = 120.0) -> None:
     """Frames until the worker has nothing left to do."""
-    end = time.monotonic() + seconds
-    while viewer.worker.current is not None:
-        assert time.monotonic() < end, "the worker never finished"
+
+    def frame() -> None:
         viewer.take_results()
         viewpoint.tick(viewer, 0.0)
+
+    _repeat(frame, lambda: viewer.worker.current is not None, seconds)
+    frame()
+
+
+def _repeat(step: Callable[[], object], goes_on: Callable[[], object], seconds: float) -> None:
+    """Steps, one after another, as long as something goes on."""
+    end = time.monotonic() + seconds
+    while goes_on():
+        assert time.monotonic() < end, "it never finished"
+        step()
         time.sleep(0.002)
-    viewer.take_results()
-    viewpoint.tick(viewer, 0.0)
 
 
 def act(action: Callable[..., object], viewer: Viewer, *arguments: object, **options: object) -> None:
@@ -115,11 +127,7 @@ def ask(viewer: Viewer, *phrases: str) -> None:
 
 def recorded(viewer: Viewer, seconds: float = 60.0) -> None:
     """Until the recorder has nothing left to do."""
-    end = time.monotonic() + seconds
-    while viewer.recorder.current is not None:
-        assert time.monotonic() < end, "never finished"
-        viewer.take_results()
-        time.sleep(0.002)
+    _repeat(viewer.take_results, lambda: viewer.recorder.current is not None, seconds)
     viewer.take_results()
 
 
@@ -156,7 +164,44 @@ def on_screen(canvas: Canvas) -> list[np.ndarray]:
 
 def rest(canvas: Canvas, state: ViewerState, now: float) -> None:
     """Update until the fine picture is there, whoever rasterizes it."""
-    end = time.monotonic() + 60
-    while canvas.update(state, now) and canvas.waits:
-        assert time.monotonic() < end, "the picture never came"
-        time.sleep(0.002)
+    _repeat(lambda: None, lambda: canvas.update(state, now) and canvas.waits, 60)
+
+
+# The scene of three blobs: what is selected, hidden and deleted in it, and a flight around it.
+
+STRAYS = 0.06  # of a blob, in a picture: what is nearer to the eye is farther from the middle
+
+
+def blob(word: str) -> np.ndarray:
+    """(360,) bool: the Gaussians of one blob."""
+    return np.repeat([word == other for other in WORDS], PER_BLOB)
+
+
+def marks_of(viewer: Viewer) -> Marks:
+    return viewer.state.selection.marks
+
+
+def names(rows: np.ndarray) -> str:
+    """The blobs of which `rows` hold all but strays; "?" beside them where one is there in part."""
+    shares = rows.reshape(len(WORDS), PER_BLOB).mean(1)
+    whole = [word for word, share in zip(WORDS, shares, strict=True) if share >= 1 - STRAYS]
+    partly = ["?"] if ((shares > STRAYS) & (shares < 1 - STRAYS)).any() else []
+    return " ".join(whole + partly)
+
+
+def marked(viewer: Viewer) -> tuple[str, str, str]:
+    """Selected, hidden, deleted."""
+    marks = marks_of(viewer)
+    return names(marks.selected), names(marks.hidden), names(marks.deleted)
+
+
+def flight(away: float = 0.0) -> Flight:
+    """A second around the blobs; `away`: turned by so much, radians, everything is behind the camera."""
+    view = from_camera(blob_scene().cameras[0], extent_of(blob_scene()))
+    keys = []
+    for seconds, yaw in ((0.0, 0.0), (0.5, 0.2), (1.0, 0.5)):
+        pose = pose_of(orbit(view, yaw, 0))
+        if away:
+            pose = replace(pose, rotation=pose.rotation * np.array([[-1.0], [1.0], [-1.0]]))
+        keys.append(Keyframe(seconds, pose))
+    return Flight(tuple(keys))

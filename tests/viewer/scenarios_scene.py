@@ -19,7 +19,7 @@ from langsplat_viewer.panels.ui import Area, scene_area
 from langsplat_viewer.rendering.request import TINT
 from langsplat_viewer.state import EditForm
 from tests.support.fakes import CENTRES, blob_scene
-from tests.support.marks_and_flights import marked
+from tests.support.windowless import marked
 
 MUG, BOOK, PLANT = CENTRES
 

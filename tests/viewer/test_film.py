@@ -23,7 +23,7 @@ from langsplat_viewer.output import Shot, cameras_of, find_ffmpeg, fingerprint, 
 from langsplat_viewer.rendering.renderer import render_image
 from langsplat_viewer.rendering.request import RenderRequest, plain_request
 from tests.support.fakes import blob_scene
-from tests.support.marks_and_flights import flight
+from tests.support.windowless import flight
 
 SIZE = (32, 24)
 FRAMES = [f"frame-{number:05d}.png" for number in range(5)]

@@ -11,9 +11,8 @@ from langsplat_viewer.actions import browsing, editing, opening, outline, projec
 from langsplat_viewer.actions.selecting import take
 from langsplat_viewer.files.projects import Things
 from tests.support.fakes import CENTRES, blob_scene
-from tests.support.marks_and_flights import blob, marked
 from tests.support.scenes import with_tree
-from tests.support.windowless import SCENES, act, ask, errors, open_scene, settle
+from tests.support.windowless import SCENES, act, ask, blob, errors, marked, open_scene, settle
 
 
 @pytest.fixture

@@ -15,9 +15,9 @@ import pytest
 
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.scene import Scene
+from tests.support.backends import Measure
 from tests.support.fakes import blob_scene
-from tests.support.fixtures import Measure
-from tests.support.on_display import play, surroundings
+from tests.support.processes import play, surroundings
 
 ROOT = Path(__file__).parents[2]
 DEMO = ROOT / "assets" / "demo" / "scene.ply"

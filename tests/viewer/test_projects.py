@@ -28,8 +28,7 @@ from langsplat_viewer.files.projects import read_project
 from langsplat_viewer.rendering.request import Clip
 from langsplat_viewer.viewer import Services, Viewer
 from tests.support.fakes import CENTRES, FakeEncoder
-from tests.support.marks_and_flights import blob, marked
-from tests.support.windowless import SCENES, FakeSurface, act, ask, errors, load
+from tests.support.windowless import SCENES, FakeSurface, act, ask, blob, errors, load, marked
 
 
 @pytest.fixture

@@ -35,11 +35,10 @@ from langsplat_viewer.rendering.request import (
     why_nothing,
     why_undrawable,
 )
+from tests.support.backends import gl_state
 from tests.support.fakes import CENTRES, blob_scene
-from tests.support.fixtures import gl_state
-from tests.support.marks_and_flights import marked
 from tests.support.scenes import random_answer, random_camera, random_gaussians, random_scene, with_tree
-from tests.support.windowless import on_screen, rest
+from tests.support.windowless import marked, on_screen, rest
 
 COUNT = 150
 SCENE = with_tree(random_scene(COUNT))

@@ -41,9 +41,18 @@ from langsplat_viewer.rendering.request import (
 from langsplat_viewer.state import KEPT, LONGEST_SIDE, OVERLAYS, Ruler, Timing, compared, compared_size
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene, cameras
-from tests.support.marks_and_flights import blob
 from tests.support.scenes import random_gaussians
-from tests.support.windowless import CHANGES, ask, errors, go, on_screen, open_scene, recorded, rest
+from tests.support.windowless import (
+    CHANGES,
+    ask,
+    blob,
+    errors,
+    go,
+    on_screen,
+    open_scene,
+    recorded,
+    rest,
+)
 
 SCENE = blob_scene()
 NOTHING = np.zeros(360, bool)

@@ -16,8 +16,18 @@ from langsplat_viewer.actions.selecting import take
 from langsplat_viewer.camera.controls import from_camera
 from langsplat_viewer.marks import Drawn, Stroke, outlines
 from tests.support.fakes import CENTRES, COLOURS, PER_BLOB
-from tests.support.marks_and_flights import blob, marked, marks_of
-from tests.support.windowless import SCENES, FakeSurface, act, ask, errors, open_scene, settle
+from tests.support.windowless import (
+    SCENES,
+    FakeSurface,
+    act,
+    ask,
+    blob,
+    errors,
+    marked,
+    marks_of,
+    open_scene,
+    settle,
+)
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import pytest
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.scene import Scene
 from tests.support.fakes import blob_scene
-from tests.support.on_display import Cast
+from tests.support.processes import Cast
 
 SCENARIOS = [
     "look_and_search", "without_field", "from_the_command_line", "broken_renderer", "use_shortcuts",

@@ -29,7 +29,7 @@ from langsplat_viewer.rendering.renderer import Backend, GlRenderer
 from langsplat_viewer.viewer import Services, Viewer
 from langsplat_viewer.window import Window, WindowRequest
 from tests.support.fakes import CENTRES, FakeEncoder
-from tests.support.on_display import serve
+from tests.support.processes import serve
 from tests.viewer import scenarios_panels, scenarios_scene
 
 MUG, BOOK, PLANT = CENTRES

@@ -1,0 +1,481 @@
+"""Reports on answers in rooms with known truth.
+
+* rooms: localisation, segmentation and rejection, and an error budget, which swaps one stage at a time for
+  one that makes no mistake;
+* verdicts: accept and reject rates, and how well probabilities are calibrated.
+"""
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import asdict, dataclass, field, replace
+from itertools import pairwise, product
+from pathlib import Path
+from statistics import fmean
+
+import numpy as np
+from scipy.optimize import minimize
+
+from assets.making.config import TIERS, Tier
+from assets.making.objects import EVERYTHING
+from assets.making.truth import PHRASE_KINDS, Region, read_truth
+from assets.making.vocabulary import part_words
+from langsplat_core.arrays import Array
+from langsplat_core.bench.measure import markdown
+from langsplat_core.cli.run import OutFile
+from langsplat_core.config import (
+    AutoencoderConfig,
+    CodebookConfig,
+    CodecConfig,
+    Count,
+    DatasetConfig,
+    LiftConfig,
+    LinearConfig,
+)
+from langsplat_core.datasets import load_capture
+from langsplat_core.errors import InputError
+from langsplat_core.io.files import atomic_path
+from langsplat_core.io.scenes import load_scene
+from langsplat_core.progress import Progress, TerminalProgress, silent
+from langsplat_core.query.answers import WEAK
+from langsplat_core.query.compose import run_phrase
+from langsplat_core.query.engine import QueryEngine, no_field
+from langsplat_core.query.grammar import PARTS, forms, is_part
+from langsplat_core.raster import load_rasterizer
+from langsplat_core.scene import Calibration, Fits, Odds
+from langsplat_core.semantics.encoders import load_text_encoder
+from langsplat_core.training.radiance.train import evaluate_views
+from tests.benchmarks.room import HOLD_OUT, InRooms, MaskOrigin, Room, Seeds, Variant, publish
+from tests.benchmarks.scoring import (
+    MIN_GAUSSIANS,
+    MaskRule,
+    Measured,
+    ask,
+    direct_share,
+    evaluate,
+    found_rate,
+    grouped,
+    loss_cells,
+    of_kind,
+    separation,
+    spread,
+)
+
+WHOLE = DatasetConfig(max_side=65_536)  # photographs are not shrunk
+
+
+@dataclass(frozen=True)
+class Rooms(InRooms):
+    """Localisation, segmentation and rejection in procedural rooms, in views that training did not see.
+
+    Without --scene, fresh rooms are rendered and trained first, some minutes each; an interrupted run
+    continues where it stopped."""
+
+    tiers: tuple[Tier, ...] = TIERS  # how crowded the rooms are
+    seeds: Seeds = (101,)
+    """One room of every tier each; never the bundled scene's."""
+    masks: MaskOrigin = "truth"  # where outlines come from
+    codec: CodecConfig = field(default_factory=CodebookConfig)
+    lift: LiftConfig = field(default_factory=LiftConfig)
+    budget: bool = False  # also swap one stage at a time for one that makes no mistake
+    codec_steps: Count = 4_000  # of training the autoencoder of --budget
+    scene: Path | None = None
+    """Measure this scene, trained on --dataset, instead of fresh rooms; of the settings, --cut applies."""
+    dataset: Path | None = None
+    """The room that --scene shows, as written by `python -m assets.making dataset`."""
+
+    def run(self) -> None:
+        if (self.scene is None) != (self.dataset is None):
+            raise InputError("--scene and --dataset belong together: a scene, and the room it was trained on")
+        if self.scene is not None and self.dataset is not None:
+            with TerminalProgress() as progress:
+                print(measure_scene(self.scene, self.dataset, MaskRule(cut=self.settings.cut), progress))
+            return
+        reports = self.each(lambda room: [room_report(room, variants(self, room.encoder.dim))])
+        tables = [score_table(reports), room_table(reports)]
+        if self.budget:
+            tables.append(budget_table(reports))
+        unknown = sum(len(report.measured[0].unknown) for report in reports)
+        if unknown:
+            tables.append(f"left out: {unknown} phrases with words that the encoder was never taught\n")
+        publish(self, "rooms", "Rooms with known truth", "\n".join(tables), reports)
+
+
+@dataclass(frozen=True)
+class RoomReport:
+    """Figures of one room."""
+
+    tier: str
+    seed: int
+    views: int  # trained on
+    held_out: int
+    gaussians: int
+    psnr: float  # mean over held-out views, dB
+    encoder: str
+    cut: str
+    measured: tuple[Measured, ...]  # the method first
+    seconds: dict[str, float]  # per stage, of this run: a stage that was already done takes almost none
+
+
+def variants(command: Rooms, dim: int) -> list[Variant]:
+    """The method first; then, with --budget, one variant per stage, which differs in that stage alone.
+    dim: numbers of the encoder's vectors."""
+    method = Variant("the method", command.masks, codec=command.codec, lift=command.lift)
+    if not command.budget:
+        return [method]
+    perfect = [replace(method, name="perfect masks", masks="truth")] if command.masks != "truth" else []
+    decoded = replace(method, name="autoencoder, d = 3", codec=AutoencoderConfig(steps=command.codec_steps))
+    return [
+        method,
+        *perfect,
+        replace(method, name="perfect embeddings", vectors="text"),
+        replace(method, name="no codec", codec=LinearConfig(latent_dim=dim)),
+        decoded,
+        replace(decoded, name="autoencoder, the paper's order", query="paper"),
+    ]
+
+
+def room_report(room: Room, chosen: Sequence[Variant]) -> RoomReport:
+    """Measure the variants in one room."""
+    _, held_out = room.capture.split(HOLD_OUT)
+    rows = tuple(room.measure(variant) for variant in chosen)
+    views = evaluate_views(room.gaussians, room.capture, held_out)
+    return RoomReport(
+        tier=room.tier,
+        seed=room.seed,
+        views=len(room.capture) - len(held_out),
+        held_out=len(held_out),
+        gaussians=len(room.gaussians),
+        psnr=float(np.mean([view.psnr for view in views])),
+        encoder=room.encoder.id,
+        cut=room.config.cut,
+        measured=rows,
+        seconds=room.seconds,
+    )
+
+
+def score_table(reports: Sequence[RoomReport]) -> str:
+    """Markdown: the method, per tier and kind of phrase: means over the rooms, and the standard deviation
+    between them where there are several."""
+    head = ("tier", "phrases", "queries", "mIoU %", "localisation %", "3D IoU %", "right regions: 3D IoU %")
+    lines = []
+    for tier, rooms in grouped(reports, "tier").items():
+        for kind in (*PHRASE_KINDS, "all"):
+            of_rooms = [of_kind(room.measured[0], kind) for room in rooms]
+            count = sum(queries for queries, *_ in of_rooms)
+            if count:
+                spreads = [_spread(values) for values in zip(*(row[1:] for row in of_rooms), strict=True)]
+                ceilings = [direct_share(room.measured[0], kind, "ceiling") for room in rooms]
+                spreads.append(_spread(ceilings) if any(ceilings) else "-")
+                lines.append((tier, kind, count, *spreads))
+    return markdown(head, lines)
+
+
+def _spread(shares: Sequence[float]) -> str:
+    """Percent, with the standard deviation of several."""
+    if len(shares) == 1:
+        return _percent(shares[0])
+    return f"{_percent(float(np.mean(shares)))} +/- {_percent(float(np.std(shares, ddof=1)))}"
+
+
+def room_table(reports: Sequence[RoomReport]) -> str:
+    """Markdown: the method, per tier, what is not per kind of phrase."""
+    head = ("tier", "Gaussians", "PSNR dB", "objects found", "absent rejected", "separation %")
+    lines = []
+    for tier, rooms in grouped(reports, "tier").items():
+        ours = [room.measured[0] for room in rooms]
+        objects, absent = sum(m.objects for m in ours), sum(m.absent for m in ours)
+        accepted = sum(m.accepted * m.objects for m in ours) / max(objects, 1)
+        lines.append((
+            tier,
+            round(np.mean([room.gaussians for room in rooms])),
+            f"{np.mean([room.psnr for room in rooms]):.1f}",
+            f"{_percent(accepted)} % of {objects}",
+            f"{_rejected(ours)} % of {absent}",
+            _percent(float(np.mean([m.separation for m in ours]))),
+            f"{np.median([m.query_ms for m in ours]):.1f}",
+            f"{np.median([m.frame_ms for m in ours]):.1f}",
+        ))  # fmt: skip
+    return markdown((*head, "ms/query", "ms/picture"), lines)
+
+
+def budget_table(reports: Sequence[RoomReport]) -> str:
+    """Markdown: per tier and swapped stage, means over the rooms and the difference to the method, in
+    percentage points."""
+    head = ("tier", "swapped", "mIoU %", "+/-", "localisation %", "+/-", "3D IoU %", "+/-", "rejected %")
+    lines = []
+    for tier, rooms in grouped(reports, "tier").items():
+        base = _means(room.measured[0] for room in rooms)
+        for row in range(min(len(room.measured) for room in rooms)):
+            ours = [room.measured[row] for room in rooms]
+            cells = [tier, f"nothing ({ours[0].masks} masks)" if row == 0 else ours[0].name]
+            for mean, of_method in zip(_means(ours), base, strict=True):
+                cells += [_percent(mean), f"{100 * (mean - of_method):+.1f}" if row else ""]
+            lines.append((*cells, _rejected(ours), *loss_cells(ours)))
+    return markdown((*head, "codec", "relevancy error mean / p99", "bytes/Gaussian"), lines)
+
+
+def _means(measured: Iterable[Measured]) -> tuple[float, ...]:
+    """Mean IoU, localisation and 3-D IoU over all phrases, mean over the rooms."""
+    return tuple(float(x) for x in np.mean([of_kind(m, "all")[1:] for m in measured], axis=0))
+
+
+def _rejected(measured: Sequence[Measured]) -> str:
+    return _percent(sum(m.rejected * m.absent for m in measured) / max(sum(m.absent for m in measured), 1))
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f}"
+
+
+def measure_scene(scene_path: Path, dataset: Path, rule: MaskRule, progress: Progress = silent) -> str:
+    """Every phrase of a room in the views that one given scene of it was not trained on; Markdown.
+
+    dataset: the room, as `python -m assets.making dataset` wrote it. Raises InputError for a scene without a
+    language field or without held-out views, and for a dataset without truth.
+    """
+    scene = load_scene(scene_path)
+    if scene.language is None:
+        raise InputError(f"{scene_path}: {no_field(scene)}")
+    truth = read_truth(dataset)
+    trained = {camera.name for camera in scene.cameras}
+    capture = load_capture(dataset, WHOLE, dataset, progress)
+    held_out = [camera for camera in capture.cameras if camera.name not in trained]
+    if not held_out:
+        raise InputError(f"{scene_path}: no view was held out from training")
+    absent = truth.absent(EVERYTHING)
+    texts = [*(phrase.text for phrase in truth.phrases), *absent]
+    asked = ask(QueryEngine(scene, load_text_encoder), texts)
+    scores = evaluate(asked, load_rasterizer("cpu"), held_out, truth, rule, progress)
+    rows = [(s.kind, s.queries, _percent(s.mean_iou), _percent(s.localisation)) for s in scores]
+    found, count = found_rate(asked, absent)
+    lines = ["", f"absent objects rejected: {100 * (1 - found):.0f} % of {count}"]
+    if asked.unknown:
+        lines.append(f"left out: {len(asked.unknown)} phrases with words that the encoder was never taught")
+    return markdown(("phrases", "queries", "mIoU %", "localisation %"), rows) + "\n".join(lines)
+
+
+# How far "found" and "not here" can be trusted, and the calibration of both. Every thing that is there is
+# asked for, and every thing of the catalogue that is not; every part alone, and part words that nothing in
+# the room is called by; every part of a thing, and as many that the thing has not. A calibration is fitted to
+# the fits of each (Platt 1999, with Platt's smoothed targets); it is fair only to rooms that it was not
+# fitted to.
+
+REJECTED = 0.95  # of what is absent, in the rooms that a calibration is fitted to
+BINS = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)  # of probability
+SHARES = (0.9, 0.95, 0.98)  # of absent things rejected, at which acceptance is reported
+PAIRS = {  # what is looked for -> the kinds of phrases that are there and that are not
+    "thing": ("object", "absent"),
+    "part": ("part", "absent part"),
+    "inside": ("part of thing", "absent part of thing"),
+}
+
+
+@dataclass(frozen=True)
+class Verdicts(InRooms):
+    """Things that are there and things that are not, asked for in rooms with known truth: accept and reject
+    rates, the ROC curve's area, and how well the probabilities are calibrated."""
+
+    masks: MaskOrigin = "truth"  # where outlines come from
+    codec: CodecConfig = field(default_factory=CodebookConfig)
+    fit: OutFile | None = None
+    """Fit the encoder's calibration to these rooms and write it into this reading.json; measure elsewhere."""
+
+    def run(self) -> None:
+        variant = Variant("the method", self.masks, codec=self.codec)
+        rows = self.each(lambda room: measure_verdicts(room, variant))
+        if self.fit is not None:
+            calibration = fit_calibration(rows)
+            write_calibration(self.fit, calibration)
+            print(f"{self.fit}: {calibration}")
+        tables = "\n".join([verdict_table(rows), *(curve_table(rows, asked) for asked in PAIRS)])
+        publish(self, "verdicts", "Verdicts: accept and reject rates, and calibration", tables, rows)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One phrase in one room."""
+
+    tier: str
+    seed: int
+    text: str
+    kind: str  # one of those in `PAIRS`, or "colour+object"
+    fits: Fits  # of the best region of each level
+    probability: float | None
+    found: bool
+    excess: float | None = None  # see `QueryResult`
+
+
+def measure_verdicts(room: Room, variant: Variant) -> list[Verdict]:
+    """Every phrase of one room, present and absent, asked of the field of a variant."""
+    engine = room.engine(variant)
+    parts, absent_parts = _part_words(room)
+    asked = [(p.text, p.kind) for p in room.truth.phrases if p.kind in ("object", "colour+object")]
+    asked += product(room.truth.absent(EVERYTHING), ["absent"])
+    asked += [*product(parts, ["part"]), *product(absent_parts, ["absent part"])]
+    asked = [(text, kind) for text, kind in asked if not engine.unknown_words(text)]
+    answers = engine.run_many([text for text, _ in asked])
+    said = [(text, kind, answer) for (text, kind), answer in zip(asked, answers, strict=True)]
+    said += [(text, kind, run_phrase(engine, text).answer) for text, kind in _inside(room, engine)]
+    return [
+        Verdict(room.tier, room.seed, text, kind, one.fits, one.probability, one.found, one.excess)
+        for text, kind, one in said
+    ]
+
+
+def _part_words(room: Room) -> tuple[list[str], list[str]]:
+    """Words of parts that Gaussians of the room show, and such words that nothing in it is called by."""
+    seen, counts = np.unique(room.labels, return_counts=True)
+    shown = {int(number) for number, count in zip(seen, counts, strict=True) if count >= MIN_GAUSSIANS}
+    parts = {
+        region.word for number, region in room.truth.regions.items() if number in shown and _part(region)
+    }
+    return sorted(parts), sorted(_uncalled(PARTS, room.truth.words))
+
+
+def _inside(room: Room, engine: QueryEngine) -> Iterator[tuple[str, str]]:
+    """(phrase, kind): every part of every thing of the room, and as many that it has not."""
+    rng = np.random.default_rng((room.seed, 11))
+    regions = list(room.truth.regions.values())
+    words = sorted({region.word for region in regions if _part(region)})
+    words = [word for word in words if not engine.unknown_words(word)]
+    for thing in sorted({region.thing for region in regions}):
+        own = [region for region in regions if region.thing == thing]
+        has = sorted({region.word for region in own if _part(region)} & set(words))
+        lacks = _uncalled(words, {word for region in own for word in region.words})
+        drawn = rng.permutation(lacks)[: len(has)].tolist()
+        if has and not engine.unknown_words(thing):
+            yield from ((f"{word} of the {thing}", "part of thing") for word in has)
+            yield from ((f"{word} of the {thing}", "absent part of thing") for word in drawn)
+
+
+def _part(region: Region) -> bool:
+    return region.is_part and is_part(region.word)
+
+
+def _uncalled(words: Iterable[str], called: AbstractSet[str]) -> list[str]:
+    """The `words` that neither in this number nor in the other one are among `called`."""
+    return sorted(word for word in words if called.isdisjoint({*forms(word), f"{word}s", *part_words(word)}))
+
+
+def fit_calibration(rows: Sequence[Verdict]) -> Calibration:
+    """Odds of all kinds of phrases. Raises as `fit_odds` does."""
+    return Calibration(
+        **{name: fit_odds(fits_of(rows, there), fits_of(rows, not_)) for name, (there, not_) in PAIRS.items()}
+    )
+
+
+def fit_odds(present: Array, absent: Array) -> Odds:
+    """Odds from fits (P, 3) of things that are there and (A, 3) of things that are not, which weigh the same.
+
+    Raises InputError where there are fewer than ten of either, or the fits do not tell them apart.
+    """
+    if min(len(present), len(absent)) < 10:
+        raise InputError(
+            "a calibration needs ten things that are there and ten that are not; take more rooms"
+        )
+    fits = np.concatenate([present, absent])
+    features = np.stack([fits[:, 2], fits[:, :2].max(axis=1)], axis=1)
+    targets = np.repeat(
+        [(len(present) + 1) / (len(present) + 2), 1 / (len(absent) + 2)], [len(present), len(absent)]
+    )
+    weights = np.repeat([1 / len(present), 1 / len(absent)], [len(present), len(absent)])
+
+    def loss(parameters: Array) -> float:
+        logits = parameters[0] + features @ parameters[1:]
+        return float((weights * (np.logaddexp(0, logits) - targets * logits)).sum())
+
+    constant, whole, finer = minimize(loss, np.array([0.0, 10.0, 0.0]), method="BFGS").x.round(3)
+    if whole + finer <= 0:
+        raise InputError("what is there has no larger fits than what is not: nothing to calibrate")
+    plain = Odds(float(constant), float(whole), float(finer))
+    said = [plain.probability((m[0], m[1], m[2])) for m in absent.tolist()]
+    highest = float(np.quantile(said, REJECTED, method="higher"))
+    return replace(plain, found=float(np.ceil(1000 * max(highest, WEAK)) / 1000))
+
+
+def write_calibration(path: Path, calibration: Calibration) -> None:
+    """Write a calibration into a `reading.json`, whose other fields stay."""
+    stated = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    stated["calibration"] = asdict(calibration)
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(stated, indent=1) + "\n", encoding="utf-8")
+
+
+def fits_of(rows: Sequence[Verdict], kind: str) -> Array:
+    """(n, 3) fits of one kind of phrase."""
+    return np.array([row.fits for row in rows if row.kind == kind])
+
+
+def verdict_table(rows: Sequence[Verdict]) -> str:
+    """Markdown: what is accepted and rejected, and the area under the ROC curve, per tier; means over rooms
+    with their standard deviation."""
+    at = (f"accepted at {100 * share:.0f} % rejected" for share in SHARES)
+    head = ("tier", "asked for", "phrases", "accepted %", "absent rejected %", "ROC area %", *at)
+    lines = []
+    asked = {"thing": PAIRS["thing"], "colour + thing": ("colour+object", "absent"), **PAIRS}
+    for tier, own in grouped(rows, "tier").items():
+        for name, pair in asked.items():
+            here = [row for row in own if row.kind in pair]
+            if any(row.kind == pair[0] for row in here):
+                rooms = grouped(here, "seed").values()
+                columns = 100 * np.array([_shares(room, pair) for room in rooms]).T
+                cells = [spread(column[np.isfinite(column)]) for column in columns]
+                lines.append((tier, name, len(here), *cells))
+    return markdown(head, lines)
+
+
+def _shares(rows: Sequence[Verdict], pair: tuple[str, str]) -> tuple[float, ...]:
+    """What is found and what is rejected, and how well scores tell them apart; NaN of nothing."""
+    here = [[row for row in rows if row.kind == kind] for kind in pair]
+    present, absent = (np.array([_score(row) for row in some]) for some in here)
+    found, wrong = (float(np.mean([row.found for row in some])) if some else np.nan for some in here)
+    compared = [np.nan] * (1 + len(SHARES))  # nothing to compare where one of both was not asked for
+    if len(present) and len(absent):
+        at = (np.mean(present > np.quantile(absent, share, method="higher")) for share in SHARES)
+        compared = [separation(present, absent), *map(float, at)]
+    return found, 1 - wrong, *compared
+
+
+def _score(row: Verdict) -> float:
+    """Value that a threshold would be put on."""
+    if row.probability is not None:
+        return row.probability
+    return max(row.fits) if row.excess is None else row.excess
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """Answers with a probability from `low` to `high`; present and absent weigh the same in all."""
+
+    low: float
+    high: float
+    phrases: int
+    said: float  # mean probability
+    there: float  # share, 0 to 1
+
+
+def curve(rows: Sequence[Verdict], asked: str = "thing") -> list[CurvePoint]:
+    """The calibration curve, without probabilities that nothing was said with. asked: a key of `PAIRS`."""
+    there, not_there = (
+        [row.probability for row in rows if row.kind == kind and row.probability is not None]
+        for kind in PAIRS[asked]
+    )
+    points = []
+    for low, high in pairwise(BINS):
+        right, wrong = ([p for p in said if low <= p < high or high == 1 <= p] for said in (there, not_there))
+        if right or wrong:
+            # Whole weights and sums that are rounded once: the same figure on every machine, in any order.
+            weights = [max(len(not_there), 1)] * len(right) + [max(len(there), 1)] * len(wrong)
+            share = sum(weights[: len(right)]) / sum(weights)
+            points.append(CurvePoint(low, high, len(weights), fmean(right + wrong, weights), share))
+    return points
+
+
+def curve_table(rows: Sequence[Verdict], asked: str = "thing") -> str:
+    """`curve` as Markdown."""
+    lines = (
+        (f"{p.low:g} to {p.high:g}", p.phrases, f"{100 * p.said:.0f}", f"{100 * p.there:.0f}")
+        for p in curve(rows, asked)
+    )
+    return markdown((f"probability of a {asked} said", "phrases", "mean said %", "there %"), lines)
