@@ -172,16 +172,28 @@ class TerminalProgress:
             disable=is_quiet(),
         )
         self._tasks: dict[str, TaskID] = {}
+        self._stage = ""  # the last one
 
     def __enter__(self) -> Progress:
         return Progress(self._show)
 
-    def __exit__(self, *ending: object) -> None:
+    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
+        if error is None:
+            self._complete(self._stage)
+            self._complete(ALL_STAGES)
         if self._tasks:  # stopping a bar that never began prints an empty line before the error's own
             self._bar.stop()
 
+    def _complete(self, stage: str) -> None:
+        """A stage is over where the next one begins, however much of it was needed."""
+        if stage in self._tasks:
+            self._bar.update(self._tasks[stage], completed=1.0)
+
     def _show(self, report: Report) -> None:
         self._bar.start()
+        if report.stage not in (self._stage, ALL_STAGES):
+            self._complete(self._stage)
+            self._stage = report.stage
         if report.stage not in self._tasks:
             self._tasks[report.stage] = self._bar.add_task(report.stage, total=1.0)
         self._bar.update(self._tasks[report.stage], completed=report.fraction, description=report.text)

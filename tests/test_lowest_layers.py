@@ -3,6 +3,7 @@ and in words, with laps where somebody watches."""
 
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -10,7 +11,16 @@ import pytest
 from langsplat_core import errors
 from langsplat_core.arrays import number, psnr, whole_number
 from langsplat_core.errors import EncoderError, InputError, printable_line, quoted
-from langsplat_core.progress import LineProgress, Progress, Report, duration, lap, watched
+from langsplat_core.progress import (
+    ALL_STAGES,
+    LineProgress,
+    Progress,
+    Report,
+    TerminalProgress,
+    duration,
+    lap,
+    watched,
+)
 
 
 def test_psnr() -> None:
@@ -122,6 +132,18 @@ def test_durations_are_as_exact_as_a_forecast():
     assert found == ["10 s", "40 s", "90 s", "2 min", "50 min", "2 h"]
     report = Report("a", 0.5, "b", {"psnr": 20.06, "seconds_left": 100})
     assert report.text == "a: b, PSNR 20.1 dB, about 2 min left"
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+def test_bars_of_stages_that_are_over_are_full(stopped: bool, capsys: pytest.CaptureFixture[str]) -> None:
+    """A stage may end before its last report; one that was stopped did not end."""
+    with suppress(KeyboardInterrupt), TerminalProgress() as report:
+        for stage in ("matching", ALL_STAGES, "locating", ALL_STAGES, "locating"):
+            report(stage, 0.3)
+        if stopped:
+            raise KeyboardInterrupt
+    shares = [line.split()[-3] for line in capsys.readouterr().err.splitlines() if "%" in line]
+    assert shares == (["100%", "30%", "30%"] if stopped else ["100%"] * 3)
 
 
 def test_a_part_reports_within_the_whole():
