@@ -113,7 +113,7 @@ def _tiles(report: TrainReport) -> str:
         "photographs": report.views + report.held_out,
         "held out": report.held_out,
         "held-out PSNR": "none" if report.psnr is None else f"{report.psnr:.1f} dB",
-        "the same at 320 px": "none" if report.psnr_small is None else f"{report.psnr_small:.1f} dB",
+        "PSNR at 320 px": "none" if report.psnr_small is None else f"{report.psnr_small:.1f} dB",
         "held-out SSIM": f"{np.mean([s.ssim for s in scores]):.3f}" if scores else "none",
         "Gaussians": f"{report.gaussians:,}",
         "masks": f"{report.mask_count:,}",
