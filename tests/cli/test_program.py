@@ -244,7 +244,7 @@ def test_how_much_is_said() -> None:
     assert {how.stdout for how in (quiet, plain, verbose)} == {"the answer\n"}
     assert quiet.stderr == ""
     assert '"fraction"' in plain.stderr
-    assert "50%" in plain.stderr
+    assert "100%" in plain.stderr
     assert plain.stderr.endswith("\na warning\n")
     assert "a warning\na detail\nreports " in verbose.stderr
 
