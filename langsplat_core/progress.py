@@ -180,14 +180,14 @@ class TerminalProgress:
     def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
         if error is None:
             self._complete(self._stage)
-            self._complete(ALL_STAGES)
+            self._complete(ALL_STAGES, ALL_STAGES)  # and nothing is left
         if self._tasks:  # stopping a bar that never began prints an empty line before the error's own
             self._bar.stop()
 
-    def _complete(self, stage: str) -> None:
+    def _complete(self, stage: str, text: str | None = None) -> None:
         """A stage is over where the next one begins, however much of it was needed."""
         if stage in self._tasks:
-            self._bar.update(self._tasks[stage], completed=1.0)
+            self._bar.update(self._tasks[stage], completed=1.0, description=text)
 
     def _show(self, report: Report) -> None:
         self._bar.start()

@@ -139,10 +139,12 @@ def test_bars_of_stages_that_are_over_are_full(stopped: bool, capsys: pytest.Cap
     """A stage may end before its last report; one that was stopped did not end."""
     with suppress(KeyboardInterrupt), TerminalProgress() as report:
         for stage in ("matching", ALL_STAGES, "locating", ALL_STAGES, "locating"):
-            report(stage, 0.3)
+            report(stage, 0.3, seconds_left=9.0)
         if stopped:
             raise KeyboardInterrupt
-    shares = [line.split()[-3] for line in capsys.readouterr().err.splitlines() if "%" in line]
+    said = capsys.readouterr().err
+    shares = [line.split()[-3] for line in said.splitlines() if "%" in line]
+    assert stopped == ("all stages: about" in said)
     assert shares == (["100%", "30%", "30%"] if stopped else ["100%"] * 3)
 
 

@@ -87,7 +87,8 @@ def report(held_out: Sequence[str], **fields: object) -> TrainReport:
 def test_a_page_shows_every_view_held_out_ones_first_and_stands_alone(tmp_path: Path) -> None:
     names = [f"{number}{HOSTILE}" for number in range(8)]
     matches = Matches(tuple(names), (900,) * 8, ((0, 1, 80), (1, 2, 20), (5, 6, 3)), frozenset(range(7)))
-    warned = report(names[2:4], warnings=("it is dim: add <light>",))
+    rehearsed = {"500 steps at 320 px": [24.61, 21.1], "1500 steps at 480 px": [24.0]}
+    warned = report(names[2:4], warnings=("it is dim: add <light>",), rehearsed=rehearsed, psnr_small=22.7)
     write_reports(tmp_path, warned, capture(names, matches=matches), gaussians())
     assert read_report(tmp_path) == warned
     page = Read(tmp_path / PAGE)
@@ -98,6 +99,8 @@ def test_a_page_shows_every_view_held_out_ones_first_and_stands_alone(tmp_path: 
     views = page.text.partition("what the scene shows there")[2]
     assert views.index("2<script>") < views.index("3<script>") < views.index("0<script>")
     assert views.count("held out") == 2
+    assert "after 500 steps at 320 px 24.6, 21.1 dB; after 1500 steps at 480 px 24.0 dB" in page.text
+    assert "22.7 dB" in page.text
     for words in ("it is dim: add <light>", "21.4 dB, SSIM 0.712", "7 of 8 photographs are located"):
         assert words in page.text
     assert len(page.of("path")) == 2

@@ -103,4 +103,4 @@ def assert_refused(read: Callable[[Path], object], path: Path, message: str | No
     said = str(caught.value)
     assert said.startswith(str(path))
     assert said.isprintable()
-    assert len(said) < len(str(path)) + 300  # whatever a library adds
+    assert len(said) < len(str(path)) + 200  # whatever a library adds
