@@ -10,8 +10,8 @@ from langsplat_core.errors import optional_imports
 
 if TYPE_CHECKING:
     from langsplat_core.config import TrainConfig
-    from langsplat_core.io.language import Words, read_words, write_words
     from langsplat_core.io.scenes import load_scene, save_scene
+    from langsplat_core.io.sidecar import Words, read_words, write_words
     from langsplat_core.pipeline.train import train_scene
     from langsplat_core.query.answers import QueryResult
     from langsplat_core.query.engine import QueryEngine
@@ -26,7 +26,7 @@ _HOMES = {
     name: f"langsplat_core.{module}"
     for module, names in {
         "io.scenes": "load_scene save_scene",
-        "io.language": "Words read_words write_words",
+        "io.sidecar": "Words read_words write_words",
         "raster.render": "render Rendering",
         "raster": "load_rasterizer load_lifting_rasterizer",
         "semantics.encoders": "load_text_encoder",

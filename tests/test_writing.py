@@ -22,10 +22,10 @@ from langsplat_core.io import files
 from langsplat_core.io.cameras import write_cameras
 from langsplat_core.io.files import atomic_path, check_output_file, check_output_folder
 from langsplat_core.io.langsplat_files import write_autoencoder, write_checkpoint, write_features
-from langsplat_core.io.language import write_language
 from langsplat_core.io.ply import write_ply
 from langsplat_core.io.scenes import WRITABLE, load_scene, save_scene
 from langsplat_core.io.shapes import write_points
+from langsplat_core.io.sidecar import write_language
 from langsplat_core.pipeline.stages import kept, kept_array
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures

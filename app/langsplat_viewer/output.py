@@ -25,7 +25,7 @@ from PIL import Image
 from langsplat_core.arrays import Array
 from langsplat_core.errors import BackendError, InputError, printable_line
 from langsplat_core.io.files import atomic_path, check_output_file, check_output_folder
-from langsplat_core.io.language import SUFFIX
+from langsplat_core.io.sidecar import SUFFIX
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult, recut
 from langsplat_core.query.compose import check_phrase, run_phrase

@@ -25,7 +25,7 @@ from langsplat_core.cli.query import (
 from langsplat_core.cli.run import EncoderOption, OutputConsole, TrainedScene, print_json
 from langsplat_core.config import Count, CountOrZero
 from langsplat_core.errors import EncoderError, InputError
-from langsplat_core.io import language as files
+from langsplat_core.io import sidecar as files
 from langsplat_core.io.files import check_output_file
 from langsplat_core.io.scenes import check_writable, companion_path
 from langsplat_core.pipeline.exporting import export_labels

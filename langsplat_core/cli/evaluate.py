@@ -15,7 +15,7 @@ from langsplat_core.config import ClipConfig, MaskConfig, TrainConfig, TrainPres
 from langsplat_core.errors import InputError
 from langsplat_core.evaluation.profiles import LERF_PROFILES, OVS_PROFILES, LerfProtocol, OvsProtocol, Profile
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.language import SUFFIX
+from langsplat_core.io.sidecar import SUFFIX
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.engine import searchable
 from langsplat_core.semantics.encoders import load_text_encoder

@@ -11,7 +11,6 @@ from langsplat_core.cli.run import AnyScene, EncoderOption
 from langsplat_core.config import CodebookConfig, CodecConfig
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import check_output_file, check_output_folder
-from langsplat_core.io.language import read_words, rematch_language
 from langsplat_core.io.scenes import (
     check_keeps,
     check_writable,
@@ -19,6 +18,7 @@ from langsplat_core.io.scenes import (
     load_without_language,
     save_scene,
 )
+from langsplat_core.io.sidecar import read_words, rematch_language
 from langsplat_core.pipeline.webpage import write_page
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.engine import QueryEngine

@@ -24,7 +24,6 @@ from langsplat_core.cli.run import (
 from langsplat_core.config import Count, CountOrZero, LevelChoice, NotNegative, PictureConfig
 from langsplat_core.errors import EncoderError, InputError, LangSplatError
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.language import read_words
 from langsplat_core.io.scenes import check_keeps, check_writable, save_scene
 from langsplat_core.io.shapes import (
     MESH_SUFFIXES,
@@ -35,6 +34,7 @@ from langsplat_core.io.shapes import (
     write_meshes,
     write_points,
 )
+from langsplat_core.io.sidecar import read_words
 from langsplat_core.pipeline.evidence import draw_evidence, find_evidence, kept_features, kept_photographs
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.answers import QueryResult, decoded_relevancy, peak_pixel, splatted_relevancy

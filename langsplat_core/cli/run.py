@@ -320,14 +320,14 @@ class OutputConsole(Console):
 
 
 @dataclass(frozen=True)
-class Written:
+class OutputPath:
     """Marks an argument that names what is written, so that it can be tried before the work."""
 
     kind: Literal["file", "folder"]
 
 
-OutFile = Annotated[Path, Written("file")]
-OutFolder = Annotated[Path, Written("folder")]
+OutFile = Annotated[Path, OutputPath("file")]
+OutFolder = Annotated[Path, OutputPath("folder")]
 
 # Arguments that several commands have.
 _trained = tyro.conf.arg(help="A trained scene, *.ply with its language field beside it.")
@@ -354,7 +354,7 @@ def check_arguments(command: object) -> None:
         for text in value if isinstance(value, tuple) else (value,):
             if isinstance(text, str):
                 _check_text(option, text)
-        written = next((part for part in annotations(hint) if isinstance(part, Written)), None)
+        written = next((part for part in annotations(hint) if isinstance(part, OutputPath)), None)
         if written is not None and value is not None:
             (check_output_file if written.kind == "file" else check_output_folder)(value)
 

@@ -18,13 +18,14 @@ import numpy as np
 
 from langsplat_core.errors import InputError
 from langsplat_core.io import cameras as camera_files
-from langsplat_core.io import language, ply
+from langsplat_core.io import ply
+from langsplat_core.io import sidecar as language_files
 from langsplat_core.io.cameras import read_cameras, write_cameras
 from langsplat_core.io.files import atomic_path, check_output_file, shown, turns
 from langsplat_core.io.gltf import read_gltf_scene, write_gltf
 from langsplat_core.io.hostile import exists
-from langsplat_core.io.language import read_language, write_language
 from langsplat_core.io.ply import metres_comment, read_ply_scene, write_ply
+from langsplat_core.io.sidecar import read_language, write_language
 from langsplat_core.io.sog import LOD_NAME, META_NAME, read_sog_scene, write_sog
 from langsplat_core.io.splat import read_ksplat, read_splat, write_splat
 from langsplat_core.io.spz import read_spz_scene, write_spz
@@ -132,7 +133,7 @@ def load_scene(path: Path | str) -> Scene:
     as `load_gaussians` does.
     """
     scene = load_without_language(path)
-    sidecar = companion_path(path, language.SUFFIX)
+    sidecar = companion_path(path, language_files.SUFFIX)
     if not exists(sidecar):
         return scene
     try:
@@ -190,7 +191,7 @@ def check_writable(path: Path | str) -> None:
     """InputError unless `save_scene` can write a scene of this name, and its companions, where it lies."""
     _writable(Path(path))
     check_output_file(path)
-    for suffix in (language.SUFFIX, camera_files.SUFFIX):
+    for suffix in (language_files.SUFFIX, camera_files.SUFFIX):
         check_output_file(companion_path(path, suffix))
 
 
@@ -198,7 +199,7 @@ def check_keeps(out: Path, *sources: Path) -> None:
     """InputError where a scene, or a file without companions, that is written as `out` would replace one of
     the scenes `sources`, or what lies beside it."""
     read = {file.resolve() for source in sources for file in (source, *scene_files(source))}
-    companions = [companion_path(out, suffix) for suffix in (language.SUFFIX, camera_files.SUFFIX)]
+    companions = [companion_path(out, suffix) for suffix in (language_files.SUFFIX, camera_files.SUFFIX)]
     scene = any(row.write is not None and out.suffix.lower() == row.suffix for row in FORMATS)
     for path in (out, *(companions if scene else ())):
         if path.resolve() in read:
@@ -229,7 +230,7 @@ def save_scene(path: Path | str, scene: Scene) -> None:
     check_writable(path)
     row = _writable(path)
     assert row.write is not None
-    sidecar, cameras = companion_path(path, language.SUFFIX), companion_path(path, camera_files.SUFFIX)
+    sidecar, cameras = companion_path(path, language_files.SUFFIX), companion_path(path, camera_files.SUFFIX)
     path.parent.mkdir(parents=True, exist_ok=True)
     with turns(path.parent) as wait, ExitStack() as renames:  # made in the reverse order of these lines
         if scene.cameras:
@@ -272,7 +273,7 @@ def scene_files(path: Path | str) -> tuple[Path, ...]:
         streamed = streamed and exists(folder / LOD_NAME)
         own = (folder / (LOD_NAME if streamed else META_NAME), *sorted(folder.glob("*.webp")))
         own += tuple(sorted(folder.glob("*/*"))) if streamed else ()
-    return (*own, companion_path(path, language.SUFFIX), _cameras_path(path))
+    return (*own, companion_path(path, language_files.SUFFIX), _cameras_path(path))
 
 
 def _cameras_path(scene: Path) -> Path:

@@ -9,7 +9,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.config import INRIA
-from langsplat_core.io import cameras, language
+from langsplat_core.io import cameras, sidecar
 from langsplat_core.io.scenes import companion_path
 from langsplat_core.io.sog import LOD_NAME, META_NAME
 from langsplat_core.scene import LEVELS, SH_COUNTS, Gaussians, LanguageField, Scene
@@ -99,7 +99,7 @@ def disk_bytes(scene: Path) -> int:
     """Size of a scene file, or of a folder's files, with the companions beside it."""
     path = scene.parent if scene.name in (META_NAME, LOD_NAME) else scene
     own = [file for file in path.rglob("*") if file.is_file()] if path.is_dir() else [path]
-    companions = [companion_path(scene, suffix) for suffix in (language.SUFFIX, cameras.SUFFIX)]
+    companions = [companion_path(scene, suffix) for suffix in (sidecar.SUFFIX, cameras.SUFFIX)]
     return sum(file.stat().st_size for file in [*own, *companions] if file.is_file())
 
 

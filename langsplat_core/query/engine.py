@@ -11,8 +11,8 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError, UnknownWordError
-from langsplat_core.io.language import SUFFIX, Words
 from langsplat_core.io.scenes import load_scene
+from langsplat_core.io.sidecar import SUFFIX, Words
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import (
     AnswerRule,

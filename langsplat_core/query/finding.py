@@ -9,8 +9,8 @@ import numpy as np
 
 from langsplat_core.arrays import Array, logit
 from langsplat_core.errors import EncoderError, LangSplatError
-from langsplat_core.io.language import SUFFIX, read_stored
 from langsplat_core.io.scenes import companion_path, load_scene
+from langsplat_core.io.sidecar import SUFFIX, read_stored
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import NEARLY, WEAK, QueryResult, Verdict, excess
 from langsplat_core.query.compose import run_phrase

@@ -33,8 +33,8 @@ from langsplat_core.display.displays import mapped
 from langsplat_core.errors import FormatError, InputError, LangSplatError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import exists, open_for_reading, parse_json
-from langsplat_core.io.language import SUFFIX
 from langsplat_core.io.scenes import companion_path, format_of, load_scene, scene_files
+from langsplat_core.io.sidecar import SUFFIX
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import NOTHING, PARTS, Bar, Bars, QueryResult, bars
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, same_vectors

@@ -46,7 +46,7 @@ from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import InputError
 from langsplat_core.io.hostile import write_npy
-from langsplat_core.io.language import means_checksum
+from langsplat_core.io.sidecar import means_checksum
 from langsplat_core.pipeline.agreement import agreed_features
 from langsplat_core.pipeline.language import Views, language_field
 from langsplat_core.pipeline.stages import stage_key

@@ -13,9 +13,9 @@ import pytest
 
 from langsplat_core.arrays import unit
 from langsplat_core.cli.export import Convert
-from langsplat_core.io import language
-from langsplat_core.io.language import write_language
 from langsplat_core.io.scenes import companion_path, load_scene, save_scene
+from langsplat_core.io.sidecar import SUFFIX as SIDECAR
+from langsplat_core.io.sidecar import write_language
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Gaussians, Scene, TaughtWord
 from langsplat_core.scene.tree import tree_of_wholes
@@ -59,9 +59,9 @@ def test_rematch_keeps_cameras_mark_and_extras(tmp_path):
     whole = replace(full_scene(40), extras=random_extras(40))
     save_scene(tmp_path / "whole.ply", whole)
     save_scene(tmp_path / "edited.ply", replace(whole.take(np.arange(5, 40)), language=None))
-    old = companion_path(tmp_path / "whole.ply", language.SUFFIX)
+    old = companion_path(tmp_path / "whole.ply", SIDECAR)
     # a sidecar that does not fit lies beside the edited file, as an editor that saves in place leaves it
-    companion_path(tmp_path / "edited.ply", language.SUFFIX).write_bytes(old.read_bytes())
+    companion_path(tmp_path / "edited.ply", SIDECAR).write_bytes(old.read_bytes())
     Convert(tmp_path / "edited.ply", (tmp_path / "new.ply",), rematch=old).run()
     got = load_scene(tmp_path / "new.ply")
     assert len(got.cameras) == 3

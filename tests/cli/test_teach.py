@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from langsplat_core.cli import query
-from langsplat_core.io.language import read_words
 from langsplat_core.io.scenes import load_scene, save_scene
+from langsplat_core.io.sidecar import read_words
 from langsplat_core.scene import Scene
 from tests.support.commands import refusal, run
 from tests.support.comparing import assert_same_field

@@ -28,10 +28,10 @@ from langsplat_core.io.hostile import (
     read_npy,
     read_npz,
 )
-from langsplat_core.io.language import read_language, write_language
 from langsplat_core.io.ply import read_ply
 from langsplat_core.io.ply_table import GREY, read_cloud
 from langsplat_core.io.scenes import FORMATS, load_gaussians
+from langsplat_core.io.sidecar import read_language, write_language
 from langsplat_core.io.spz import read_spz_scene
 from langsplat_core.pipeline.stages import read_arrays
 from langsplat_core.scene import LanguageField

@@ -11,9 +11,7 @@ import pytest
 from langsplat_core.cli.query import QueryScene
 from langsplat_core.cli.scenes import Inspect
 from langsplat_core.errors import InputError
-from langsplat_core.io import language
 from langsplat_core.io.cameras import read_cameras, write_cameras
-from langsplat_core.io.language import write_language
 from langsplat_core.io.ply import write_ply
 from langsplat_core.io.scenes import (
     FORMATS,
@@ -25,6 +23,8 @@ from langsplat_core.io.scenes import (
     save_scene,
     scene_files,
 )
+from langsplat_core.io.sidecar import SUFFIX as SIDECAR
+from langsplat_core.io.sidecar import write_language
 from langsplat_core.io.summary import disk_bytes, duplicates, summarise
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import NO_NODE, Calibration, Odds, Reading, Scene
@@ -153,7 +153,7 @@ def test_companions_lie_beside_every_kind_of_scene(tmp_path):
         (folder, "b.v2.langsplat.safetensors"),
         (folder / "meta.json", "b.v2.langsplat.safetensors"),
     ):
-        place = companion_path(path, language.SUFFIX)
+        place = companion_path(path, SIDECAR)
         assert place == tmp_path / sidecar
         write_language(place, random_field(N), load_gaussians(path).means)
         loaded = load_scene(path)

@@ -8,7 +8,7 @@ import pytest
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import EncoderError, InputError
-from langsplat_core.io.language import Words, read_language, read_words, write_language, write_words
+from langsplat_core.io.sidecar import Words, read_language, read_words, write_language, write_words
 from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import NO_NODE, LanguageField, Scene, TaughtWord, Tree

@@ -20,8 +20,8 @@ from langsplat_core.io.cameras import read_cameras, write_cameras
 from langsplat_core.io.foreign import read_foreign
 from langsplat_core.io.gltf import write_gltf
 from langsplat_core.io.hostile import picture_size
-from langsplat_core.io.language import read_language, write_language
 from langsplat_core.io.scenes import load_scene
+from langsplat_core.io.sidecar import read_language, write_language
 from langsplat_core.progress import silent
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.render import render

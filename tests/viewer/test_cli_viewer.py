@@ -12,9 +12,9 @@ import pytest
 from PIL import Image
 
 from langsplat_core.config import Display
-from langsplat_core.io import language
 from langsplat_core.io.cameras import write_cameras
 from langsplat_core.io.scenes import companion_path, save_scene
+from langsplat_core.io.sidecar import SUFFIX as SIDECAR
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer import options
 from langsplat_viewer.options import load_text_encoder, parse_size
@@ -35,8 +35,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     moved = blob_scene()
     gaussians = replace(moved.gaussians, means=moved.gaussians.means + 1)
     save_scene(tmp_path / "edited.ply", Scene(gaussians))
-    sidecar = companion_path(tmp_path / "blobs.ply", language.SUFFIX)
-    companion_path(tmp_path / "edited.ply", language.SUFFIX).write_bytes(sidecar.read_bytes())
+    sidecar = companion_path(tmp_path / "blobs.ply", SIDECAR)
+    companion_path(tmp_path / "edited.ply", SIDECAR).write_bytes(sidecar.read_bytes())
     save_scene(tmp_path / "nothing.ply", Scene(gaussians.take(np.zeros(len(gaussians), bool))))
     (tmp_path / "broken.json").write_text('[{"width": 12')
     (tmp_path / "empty.json").write_text("[]")

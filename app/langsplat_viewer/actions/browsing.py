@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from langsplat_core.errors import InputError
-from langsplat_core.io import cameras, language
+from langsplat_core.io import cameras, sidecar
 from langsplat_core.io.scenes import format_of
 from langsplat_core.pipeline.forecast import count_photographs
 from langsplat_core.pipeline.report import work_folder
@@ -111,7 +111,7 @@ def open_hit(viewer: Viewer, hit: Hit) -> None:
 
 # The file browser, typed paths, files dropped onto the window, and recent scenes.
 
-COMPANIONS = (cameras.SUFFIX, language.SUFFIX)  # files beside a scene, read with it
+COMPANIONS = (cameras.SUFFIX, sidecar.SUFFIX)  # files beside a scene, read with it
 NAMED = 3  # files that a message names
 
 

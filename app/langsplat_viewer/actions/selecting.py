@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.io import cameras, language
+from langsplat_core.io import cameras, sidecar
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.io.shapes import write_points
 from langsplat_core.progress import Progress
@@ -252,7 +252,7 @@ def select_range(viewer: Viewer, text: str) -> None:
 # Writing what is selected, the rest, or the scene without what was deleted: to new files, never over old.
 
 Part = Literal["selection", "rest", "edited"]
-COMPANIONS = (language.SUFFIX, cameras.SUFFIX)
+COMPANIONS = (sidecar.SUFFIX, cameras.SUFFIX)
 LONGEST_WAIT = 60.0  # seconds that a window which is closed waits for what is being written
 
 

@@ -13,7 +13,7 @@ from safetensors.numpy import load_file, save_file
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.io.language import (
+from langsplat_core.io.sidecar import (
     Words,
     means_checksum,
     pack_positions,
