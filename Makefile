@@ -11,7 +11,7 @@ PYTEST := $(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist
 export PIP_QUIET := 1
 .SILENT: $(STAMP) demo
 
-.PHONY: help demo quick test slow check format elsewhere parity bench report gpu pictures app light bundle desktop clean
+.PHONY: help demo quick test slow check sizes format elsewhere faults parity bench report gpu pictures app light bundle desktop clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -51,6 +51,9 @@ check: $(STAMP)  ## ruff (rules and format) and mypy only
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
+sizes: $(STAMP)  ## lines of every room beside its budget (CONTRIBUTING.md)
+	$(BIN)/python packaging/sizes.py
+
 format: $(STAMP)  ## put every file into ruff's format
 	$(BIN)/ruff check --fix --select I
 	$(BIN)/ruff format
@@ -64,6 +67,9 @@ elsewhere: system  ## the tests that compute, as on other processors, in other o
 	  && touch $(NEWER)/.installed; fi
 	$(BIN)/python packaging/elsewhere.py $(if $(ONLY),--only $(ONLY)) \
 	  $$([ -e $(NEWER)/.installed ] && echo --newest $(NEWER)/bin/python)
+
+faults: browser  ## small faults, put in one at a time: which of them the tests notice (half an hour)
+	$(BIN)/python packaging/seeded_bugs.py $(if $(ONLY),--only "$(ONLY)")
 
 PARITY := .parity
 parity: $(STAMP)  ## vectors and masks against those of open_clip, segment_anything and sam2, in .parity (docs/encoders.md)
