@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from langsplat_core.query.answers import QueryResult
     from langsplat_core.query.engine import QueryEngine
     from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer
-    from langsplat_core.raster.render import Rendering, render
+    from langsplat_core.raster.render import Rendering, render, view_of
     from langsplat_core.scene import Camera, Gaussians, Intrinsics, LanguageField, Scene, look_at
     from langsplat_core.semantics.encoders import load_text_encoder
 
@@ -27,7 +27,7 @@ _HOMES = {
     for module, names in {
         "io.scenes": "load_scene save_scene",
         "io.sidecar": "Words read_words write_words",
-        "raster.render": "render Rendering",
+        "raster.render": "render Rendering view_of",
         "raster": "load_rasterizer load_lifting_rasterizer",
         "semantics.encoders": "load_text_encoder",
         "query.engine": "QueryEngine QueryResult",
@@ -41,7 +41,8 @@ _HOMES = {
 __all__ = [
     "Camera", "Gaussians", "Intrinsics", "LanguageField", "QueryEngine", "QueryResult", "Rendering",
     "Scene", "TrainConfig", "Words", "load_lifting_rasterizer", "load_rasterizer", "load_scene",
-    "load_text_encoder", "look_at", "read_words", "render", "save_scene", "train_scene", "write_words",
+    "load_text_encoder", "look_at", "read_words", "render", "save_scene", "train_scene", "view_of",
+    "write_words",
 ]  # fmt: skip
 
 

@@ -310,8 +310,8 @@ class Drawn:
         if np.linalg.norm(last - first) < CLICK * self.camera.height:
             return self.reach
         (_,), (depth,) = self.camera.project(self.centre[None])
-        ends = [self.camera.unproject((float(x), float(y)), float(depth)) for x, y in (first, last)]
-        return float(np.linalg.norm(ends[1] - ends[0]))
+        start, end = self.camera.unproject(np.stack([first, last]), depth)
+        return float(np.linalg.norm(end - start))
 
     @property
     def centre(self) -> Array:

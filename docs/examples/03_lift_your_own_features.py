@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from langsplat_core import load_lifting_rasterizer, load_scene, render
+from langsplat_core import load_lifting_rasterizer, load_scene, render, view_of
 
 
 def my_features(picture: np.ndarray) -> np.ndarray:  # (H, W, C) float32; here: the strongest colour
@@ -25,7 +25,7 @@ def main() -> None:
     scene = load_scene(Path(str(files("langsplat_assets"))) / "demo" / "scene.ply")
     rasterizer, total, weight = load_lifting_rasterizer(), 0.0, 0.0
     for camera in [camera.resized(240, 180) for camera in scene.cameras[1::8]]:
-        view = rasterizer.view(scene.gaussians, camera, scene.raster_settings())
+        view = view_of(scene, camera, rasterizer)
         total = total + view.gather(my_features(render(scene, camera).colours))  # W^T H (N, C)
         weight = weight + view.contributions()  # W^T 1 (N,), in pixels
     lifted = total / np.maximum(weight, 1e-6)[:, None]

@@ -4,7 +4,7 @@ from importlib.resources import files
 
 import numpy as np
 
-from langsplat_core import load_rasterizer, load_scene
+from langsplat_core import load_rasterizer, load_scene, view_of
 from langsplat_core.raster import View
 from langsplat_core.raster.protocol import dilation
 
@@ -35,8 +35,8 @@ class Discs:
 
 
 scene = load_scene(str(files("langsplat_assets") / "demo" / "scene.ply"))
-few, camera = scene.gaussians.take(slice(None, None, 32)), scene.cameras[3].resized(80, 60)
-truth, _ = load_rasterizer("reference").view(few, camera).splat(few.sh[:, 0])
+few, camera = scene.take(slice(None, None, 32)), scene.cameras[3].resized(80, 60)
+truth, _ = view_of(few, camera, load_rasterizer("reference")).splat(few.gaussians.sh[:, 0])
 for rasterizer in (Discs(), load_rasterizer("cpu")):
-    error = np.abs(rasterizer.view(few, camera, scene.raster_settings()).splat(few.sh[:, 0])[0] - truth)
+    error = np.abs(view_of(few, camera, rasterizer).splat(few.gaussians.sh[:, 0])[0] - truth)
     print(f"{rasterizer.name}: mean error {error.mean():.1e}, largest {error.max():.1e}")

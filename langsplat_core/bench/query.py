@@ -23,8 +23,8 @@ from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import decoded_relevancy, splatted_relevancy
 from langsplat_core.query.engine import QueryEngine, TextEncoder
-from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.protocol import View
+from langsplat_core.raster.render import view_of
 from langsplat_core.scene import LEVELS, Camera, Codec, LanguageField, Scene
 from langsplat_core.semantics.relevancy import Scale, relevancy_of
 from langsplat_core.semantics.vocabulary import everyday_phrases
@@ -140,12 +140,9 @@ def _batched(engine: QueryEngine, texts: Sequence[str], progress: Progress) -> t
 
 def _paper(scene: Scene, field: LanguageField, camera: Camera, asked: _Asked) -> QueryCost:
     """Costs of the paper's order of work. Decoding is measured once: it takes a minute and more."""
-    rasterizer = CpuRasterizer()
-    rasterizer.view(scene.gaussians, camera, scene.raster_settings()).splat(field.latents[0])
+    view_of(scene, camera).splat(field.latents[0])
     views: list[View] = []
-    camera_seconds = _seconds(
-        lambda: views.append(rasterizer.view(scene.gaussians, camera, scene.raster_settings()))
-    )
+    camera_seconds = _seconds(lambda: views.append(view_of(scene, camera)))
     blending = _seconds(lambda: [views[0].splat(latents) for latents in field.latents])
     vectors = asked.vectors[:1]
     both = _seconds(
@@ -171,16 +168,13 @@ def _ours(
     way: str, engine: QueryEngine, camera: Camera, asked: _Asked, repeats: int, codec: Codec | None
 ) -> QueryCost:
     """codec: by which the codewords were encoded; None: they are what the field has."""
-    scene, rasterizer = engine.scene, CpuRasterizer()
+    scene = engine.scene
     result = engine.run(asked.texts[0], vector=asked.vectors[0])  # what is built once is built now
     found = [engine.relevancy(vector)[asked.known] for vector in asked.vectors]
     pairs = list(zip(asked.texts, asked.vectors, strict=True)) * repeats
     answer = median(_seconds(lambda t=text, v=vector: engine.run(t, vector=v)) for text, vector in pairs)  # type: ignore[misc]
-    view = rasterizer.view(scene.gaussians, camera, scene.raster_settings())
-    seen = median(
-        _seconds(lambda: rasterizer.view(scene.gaussians, camera, scene.raster_settings()))
-        for _ in range(repeats)
-    )
+    view = view_of(scene, camera)
+    seen = median(_seconds(lambda: view_of(scene, camera)) for _ in range(repeats))
     splatted_relevancy(view, result.even[:, None], GATE)
     image = median(
         _seconds(lambda: splatted_relevancy(view, result.even[:, None], GATE)) for _ in range(repeats)

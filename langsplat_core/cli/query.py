@@ -44,8 +44,8 @@ from langsplat_core.query.finding import Hit
 from langsplat_core.query.grammar import Atom, Counted, Phrase, heads, unparse
 from langsplat_core.query.instances import Instance, hull
 from langsplat_core.query.selection import grow, in_pixel, of_rows, shrink
-from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer
-from langsplat_core.raster.render import pixel_weights
+from langsplat_core.raster import load_rasterizer
+from langsplat_core.raster.render import pixel_weights, view_of
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.scene.language import split_phrases
 from langsplat_core.semantics.encoders import load_text_encoder
@@ -278,7 +278,7 @@ def _answer(
         "view": None if camera is None else camera.name,
     }
     if camera is not None:
-        view = load_rasterizer("cpu").view(scene.gaussians, camera, scene.raster_settings())
+        view = view_of(scene, camera)
         gate = PictureConfig().alpha_gate
         if mode == "paper":
             phrase = engine.text_vector(result.phrase)[None]
@@ -515,9 +515,7 @@ def pointed(engine: QueryEngine, camera: int, at: str, option: str, level: Level
         )
     pixel = int(place[1]), int(place[2])
     view = pixel_in(scene, camera, pixel, f"{option} {at}")
-    rows, weights = pixel_weights(
-        load_lifting_rasterizer("cpu"), scene.gaussians, view, pixel, scene.raster_settings()
-    )
+    rows, weights = pixel_weights(scene, view, pixel)
     members = in_pixel(engine.regions, LEVELS.index(level), rows, weights)
     if weights.sum() <= PictureConfig().alpha_gate or not members.any():
         raise InputError(f"{option} {at}: nothing is there in camera {camera}; point at a thing")

@@ -37,7 +37,7 @@ from langsplat_core.config import CleanConfig, check_settings
 from langsplat_core.errors import InputError
 from langsplat_core.io.scenes import check_keeps, check_writable, load_scene, save_scene
 from langsplat_core.progress import Progress, silent
-from langsplat_core.raster import load_rasterizer
+from langsplat_core.raster.render import view_of
 from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_core.scene.gaussians import along_curve
 from langsplat_core.scene.surface import Surface, build_surface
@@ -117,14 +117,12 @@ def _small_regions(surface: Surface, near: Array, largest: int) -> Array:
 def _free_space(scene: Scene, cameras: tuple[Camera, ...], progress: Progress) -> Array:
     """(N,) share of the views of each centre, hidden ones not counted, that see through it to a surface; 0
     where fewer than `VIEWS` do."""
-    gaussians, rasterizer = scene.gaussians, load_rasterizer("cpu")
+    gaussians = scene.gaussians
     ahead, on = np.zeros(len(gaussians), int), np.zeros(len(gaussians), int)
     for index, camera in enumerate(cameras):
-        depths = rasterizer.view(gaussians, camera, scene.raster_settings()).median_depth()
+        depths = view_of(scene, camera).median_depth()
         pixels, z = camera.project(gaussians.means.astype(np.float64))
-        with np.errstate(invalid="ignore"):
-            inside = (z > 0) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(1)
-        rows = np.flatnonzero(inside)
+        rows = np.flatnonzero(camera.in_image(pixels, z))
         column, row = pixels[rows].astype(int).T
         there, z = depths[row, column], z[rows]
         ahead[rows] += (there > 0) & (z < (1 - BEFORE) * there)

@@ -26,11 +26,9 @@ from langsplat_core.errors import InputError
 from langsplat_core.io.scenes import check_keeps, check_writable, load_scene, save_scene
 from langsplat_core.io.summary import disk_bytes, memory_bytes
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.compose import upright
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer
-from langsplat_core.raster.render import colours_seen, splat_colours
-from langsplat_core.scene import SH_COUNTS, Camera, Scene, look_at
+from langsplat_core.raster.render import colours_seen, render, view_of
+from langsplat_core.scene import SH_COUNTS, Camera, Scene
 from langsplat_core.scene.language import phrase_key
 from langsplat_core.semantics.encoders import load_text_encoder
 
@@ -38,10 +36,8 @@ log = logging.getLogger("langsplat")
 
 T = TypeVar("T")
 
-RING_SIZE = (640, 480)
-RING_FOV = 50.0  # degrees, vertical
-RING_DISTANCES = (2.6, 1.6)  # radii of the scene: the whole of it, and nearer, where small Gaussians show
-RING_ELEVATIONS = (-20.0, 60.0)  # degrees above the horizon
+AROUND = (640, 480)  # px, of views of a scene without cameras
+DISTANCES = (2.6, 1.6)  # of theirs, in radii: the whole scene, and nearer, where small Gaussians show
 HOLD_OUT = 6  # every n-th view measures
 FEW = 12  # fewer views than this are halved instead, so that the loss is not that of one or two
 SAME_PLACE = 0.01  # of the cameras' spread: farther apart, scene and photographs have different worlds
@@ -68,11 +64,12 @@ def choose_views(scene: Scene, photos: Path | None, config: BudgetConfig, progre
     if photos is not None:
         return _photographed(scene, photos, config, progress)
     if len(scene.cameras) >= 2:
-        cameras, origin = _thinned(scene.cameras, config.views), "the scene's cameras"
+        chosen: Sequence[Camera] = _thinned(scene.cameras, config.views)
+        origin = "the scene's cameras"
     else:
-        cameras = ring_cameras(scene, min(config.views, 48))
+        chosen = scene.spiral_cameras(min(config.views, 48), AROUND, distances=DISTANCES)
         origin = "a ring around the scene (it has no cameras): what lies inside may be judged invisible"
-    cameras = [camera.within(config.max_side) for camera in cameras]
+    cameras = [camera.within(config.max_side) for camera in chosen]
     held = _every(len(cameras))
     return Views(
         tuple(camera for i, camera in enumerate(cameras) if i not in held),
@@ -80,23 +77,6 @@ def choose_views(scene: Scene, photos: Path | None, config: BudgetConfig, progre
         (None,) * len(held),
         origin,
     )
-
-
-def ring_cameras(scene: Scene, count: int) -> list[Camera]:
-    """`count` cameras on a spiral around the scene's bounds that look at its centre, upright."""
-    centre, radius = scene.bounds()
-    east, north, up = upright(scene.up())
-    golden = np.pi * (3 - np.sqrt(5))
-    cameras = []
-    for index in range(count):
-        low, high = np.sin(np.radians(RING_ELEVATIONS))
-        height = low + (high - low) * (index + 0.5) / count  # equal steps of the sine: even on the sphere
-        flat = np.sqrt(1 - height**2)
-        direction = flat * (np.cos(golden * index) * east + np.sin(golden * index) * north) + height * up
-        eye = centre + RING_DISTANCES[index % len(RING_DISTANCES)] * radius * direction
-        camera = look_at(eye, centre, up, RING_SIZE, RING_FOV)
-        cameras.append(replace(camera, name=f"ring_{index:03d}"))
-    return cameras
 
 
 def _photographed(scene: Scene, photos: Path, config: BudgetConfig, progress: Progress) -> Views:
@@ -196,8 +176,7 @@ class MeasuringView:
 
 def draw(scene: Scene, camera: Camera) -> Array:
     """The (H, W, 3) float32 image of a view in [0, 1], without background."""
-    view = load_rasterizer("cpu").view(scene.gaussians, camera, scene.raster_settings())
-    return np.clip(splat_colours(view, scene.gaussians, camera).colours, 0, 1)
+    return np.clip(render(scene, camera).colours, 0, 1)
 
 
 def measuring_views(
@@ -213,9 +192,9 @@ def measuring_views(
 
 def contributions(scene: Scene, cameras: Sequence[Camera], progress: Progress = silent) -> Array:
     """(N,) float64 >= 0: the largest contribution of each Gaussian to any of `cameras` (see above)."""
-    rasterizer, largest = load_lifting_rasterizer("cpu"), np.zeros(len(scene.gaussians))
+    largest = np.zeros(len(scene.gaussians))
     for index, camera in enumerate(cameras):
-        view = rasterizer.view(scene.gaussians, camera, scene.raster_settings())
+        view = view_of(scene, camera)
         own = colours_seen(scene.gaussians, camera)
         image = view.splat(own)[0]
         stacked = [np.ones_like(image[..., :1]), image, (image**2).sum(-1, keepdims=True)]

@@ -20,12 +20,6 @@ NEAREST, FARTHEST = 0.3, 3.0  # random depths, as multiples of the distance to w
 TELLING_POINTS = 50  # from this many known points on, depths follow theirs
 
 
-def inside(camera: Camera, points: Array) -> Array:
-    """(N,) True where a point lies in front of the camera and inside its image."""
-    pixels, depths = camera.project(points)
-    return (depths > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
-
-
 def look_distance(cameras: Sequence[Camera]) -> float:
     """Typical distance from the cameras to the place they look at, world units, > 0.
 
@@ -64,8 +58,9 @@ def random_points(
     distance = look_distance(cameras)
     near, far = NEAREST * distance, FARTHEST * distance
     if len(known) >= TELLING_POINTS:
-        depths = np.concatenate([c.project(known)[1][inside(c, known)] for c in cameras])
-        near, far = (float(z) for z in np.quantile(depths, (0.02, 0.98)))
+        seen = [camera.project(known) for camera in cameras]
+        depths = [z[camera.in_image(pixels, z)] for camera, (pixels, z) in zip(cameras, seen, strict=True)]
+        near, far = (float(z) for z in np.quantile(np.concatenate(depths), (0.02, 0.98)))
     drawn = np.zeros((2 * count, 3))
     colours = np.zeros((2 * count, 3), np.uint8)
     owner = rng.integers(len(cameras), size=2 * count)
@@ -78,10 +73,9 @@ def random_points(
             at = np.divmod(rng.choice(np.flatnonzero(mask), len(rows)), camera.width)
             y, x = (whole + part % 1 for whole, part in zip(at, (y, x), strict=True))
         z = 1 / rng.uniform(1 / far, 1 / near, len(rows))
-        local = np.stack([(x - camera.cx) / camera.fx * z, (y - camera.cy) / camera.fy * z, z], -1)
-        drawn[rows] = local @ camera.rotation + camera.position
+        drawn[rows] = camera.unproject(np.stack([x, y], -1), z)
         colours[rows] = images[index][y.astype(int), x.astype(int)]
-    shared = np.sum([inside(camera, drawn) for camera in cameras], axis=0)
+    shared = np.sum([camera.in_image(*camera.project(drawn)) for camera in cameras], axis=0)
     best = np.argsort(shared < len(cameras) / 2, kind="stable")[:count]
     return drawn[best], colours[best]
 

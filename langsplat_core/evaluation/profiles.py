@@ -21,9 +21,8 @@ from langsplat_core.evaluation.labels import Size, check_same_image, read_grey
 from langsplat_core.io.hostile import opened, read_npy
 from langsplat_core.query.answers import QueryResult, decoded_relevancy, peak_pixel, splatted_relevancy
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.protocol import View
-from langsplat_core.raster.render import splat_colours
+from langsplat_core.raster.render import render, view_of
 from langsplat_core.scene import LEVELS, Camera
 
 Border = Literal["mirror", "inside"]  # cv2's reflect101; the mean of what lies inside the image
@@ -326,7 +325,7 @@ class SceneSource:
 
     def _predictions(self, camera: Camera, phrases: Sequence[str]) -> list[Prediction]:
         rule, scene = self.profile.rule, self.engine.scene
-        view = load_rasterizer("cpu").view(scene.gaussians, camera, scene.raster_settings())
+        view = view_of(scene, camera)
         if isinstance(rule, MapRule) and self.paper_order:
             return [read_maps(maps, rule) for maps in self._decoded(view, phrases)]
         results = self.engine.run_many(phrases)
@@ -350,9 +349,7 @@ class SceneSource:
         scene = self.engine.scene
         if not result.members.any():
             return np.zeros((camera.height, camera.width), bool)
-        chosen = scene.gaussians.take(result.members)
-        view = load_rasterizer("cpu").view(chosen, camera, scene.raster_settings())
-        drawn = splat_colours(view, chosen, camera)
+        drawn = render(scene.take(result.members), camera)
         return read_silhouette(drawn.colours, drawn.alpha, rule)
 
 

@@ -11,13 +11,13 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from langsplat_core.arrays import Array, across, rotation_matrices, unit
+from langsplat_core.arrays import Array, rotation_matrices, unit
 from langsplat_core.errors import InputError
 from langsplat_core.geometry.points import cloud
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
-from langsplat_core.raster.render import splat_colours
-from langsplat_core.scene import Camera, Gaussians, Scene, look_at
+from langsplat_core.raster.render import splat_colours, view_of
+from langsplat_core.scene import Camera, Gaussians, Scene
 
 SIDE, MOST = 640, 160  # pixels of the longer side of an image, and images, at most
 FINEST = 100  # voxels in the radius of what is fused, unless pixels are larger
@@ -28,7 +28,8 @@ FLATTEST = 1e-3  # of a Gaussian's longest axis: its shortest, for the place whe
 DEVIATIONS = 3.0  # from its centre, beyond which no Gaussian has a surface
 ROOM = 1.5  # extents of the cube in which holes are closed; what bulges out of it stays open
 BLOCK = 8  # voxels a side that are kept together
-TURNS, RISES, AWAY = 48, (-0.6, 0.9), 2.6  # generated views: how many, sines of heights, distance in radii
+VIEWS = 48  # of a scene without cameras, from all around it ...
+ELEVATIONS = (-37.0, 64.0)  # ... at these degrees above its horizon: a mesh has an underside
 STAGE = "fusing depth images"
 
 Depth = tuple[Camera, Array, Array]  # (H, W) float32 along z, 0 where there is none, and (H, W, 3) uint8
@@ -63,10 +64,8 @@ def surface_depth(gaussians: Gaussians, camera: Camera, rows: Array) -> Array:
     densest along the ray through the pixel's centre; 0 where that is -1 or behind the camera."""
     found = np.flatnonzero(rows >= 0)
     chosen, place = np.unique(rows.reshape(-1)[found], return_inverse=True)
-    y, x = np.divmod(found, camera.width)
-    rays = np.stack(
-        [(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, np.ones(len(x))], 1
-    )
+    ahead = camera.unproject(camera.pixel_centres().reshape(-1, 2)[found], 1.0)
+    rays = (ahead - camera.position) @ camera.rotation.T  # of depth 1, in the camera's frame
     means = gaussians.means[chosen] @ camera.rotation.T + camera.world_to_camera[:3, 3]
     axes = camera.rotation @ rotation_matrices(gaussians.quats_wxyz[chosen].astype(np.float64))  # columns
     scales = np.exp(gaussians.log_scales[chosen].astype(np.float64))
@@ -95,7 +94,7 @@ def fuse(
     how many must show a surface, >= 1; more leave out more, and what is left is nearer to the truth; cameras:
     to be rendered, by default the scene's own, or generated ones. Raises InputError where nothing is seen.
     """
-    chosen = cameras or scene.cameras or generated_cameras(scene)
+    chosen = cameras or scene.cameras or scene.spiral_cameras(VIEWS, (SIDE, SIDE * 3 // 4), ELEVATIONS)
     images, pixels = [], []
     for number, index in enumerate(np.unique(np.linspace(0, len(chosen) - 1, MOST).astype(int))):
         progress(STAGE, number / (2 * min(len(chosen), MOST)))
@@ -117,8 +116,8 @@ def fuse(
 
 def _rendered(scene: Scene, camera: Camera) -> Depth:
     small = camera.within(SIDE)
-    view = CpuRasterizer().view(scene.gaussians, small, scene.raster_settings())
-    image = splat_colours(view, scene.gaussians, small)
+    view = view_of(scene, small, CpuRasterizer())
+    image = splat_colours(view, scene.gaussians)
     colours = np.clip(image.colours / np.maximum(image.alpha, 0.5)[..., None], 0, 1)
     depth = surface_depth(scene.gaussians, small, view.median_rows())
     return small, depth, np.rint(255 * colours).astype(np.uint8)
@@ -190,15 +189,3 @@ def close_holes(mesh: Mesh, resolution: float) -> tuple[Mesh, float]:
     middles = closed.vertices[closed.triangles].mean(1)
     gaps = cKDTree(mesh.vertices).query(middles, workers=-1)[0]
     return closed, float(closed.areas()[gaps > 2 * resolution].sum())
-
-
-def generated_cameras(scene: Scene) -> tuple[Camera, ...]:
-    """Views of a scene without cameras, from outside around it."""
-    centre, radius = scene.bounds()
-    up = scene.up()
-    side = unit(across(up), 1e-12)
-    angles = np.arange(TURNS)[:, None] * np.pi * (3 - np.sqrt(5))
-    flat = np.cos(angles) * side + np.sin(angles) * np.cross(up, side)
-    rise = np.linspace(*RISES, TURNS)[:, None]
-    eyes = centre + AWAY * radius * (np.sqrt(1 - rise**2) * flat + rise * up)
-    return tuple(look_at(eye, centre, up, (SIDE, SIDE * 3 // 4)) for eye in eyes)

@@ -15,7 +15,7 @@ from langsplat_core.compiled import kernel
 from langsplat_core.errors import InputError
 from langsplat_core.geometry.planes import Room
 from langsplat_core.progress import Progress, silent
-from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
+from langsplat_core.raster.render import view_of
 from langsplat_core.scene import Scene
 
 MOST_CELLS = 60_000_000  # of a grid
@@ -100,11 +100,8 @@ def find_occupancy(scene: Scene, to_map: Array, resolution: float, progress: Pro
     for number, camera in enumerate(scene.cameras):
         progress(STAGE, number / (2 * len(scene.cameras)))
         small = camera.within(SIDE)
-        depth = CpuRasterizer().view(scene.gaussians, small, scene.raster_settings()).median_depth()
-        rows, columns = np.nonzero(depth > 0)
-        z = depth[rows, columns].astype(np.float64)
-        x, y = (columns + 0.5 - small.cx) / small.fx * z, (rows + 0.5 - small.cy) / small.fy * z
-        points = (np.stack([x, y, z], 1) - small.world_to_camera[:3, 3]) @ small.rotation
+        depth = view_of(scene, small).median_depth()
+        points = small.unproject(small.pixel_centres()[depth > 0], depth[depth > 0])
         rays.append((_moved(small.position[None], to_map)[0], _moved(points, to_map)))
     ends = np.concatenate([points for _, points in rays])
     if len(ends) == 0:

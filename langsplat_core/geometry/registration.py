@@ -8,7 +8,7 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.geometry.points import cloud, sample_surface
 from langsplat_core.progress import Progress, silent
-from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
+from langsplat_core.raster.render import view_of
 from langsplat_core.scene import Camera, Scene
 from langsplat_core.scene.transform import moved_camera
 
@@ -163,5 +163,4 @@ def _some(scene: Scene) -> list[Camera]:
 
 def _depths(scene: Scene, camera: Camera) -> Array:
     """(H, W) depth of half transmittance, 0 where there is none."""
-    view = CpuRasterizer().view(scene.gaussians, camera, scene.raster_settings())
-    return view.median_depth().astype(np.float64)
+    return view_of(scene, camera).median_depth().astype(np.float64)

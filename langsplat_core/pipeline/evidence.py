@@ -24,6 +24,7 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.protocol import Rasterizer
+from langsplat_core.raster.render import view_of
 from langsplat_core.scene import LEVELS, NO_NODE, Scene
 from langsplat_core.scene.surface import SMALLEST
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures, StoredFeatures
@@ -141,7 +142,7 @@ def _best_region(engine: QueryEngine, answer: QueryResult) -> tuple[int, Array] 
 
 def _shown(scene: Scene, view: int, members: Array, rasterizer: Rasterizer) -> Array:
     """(H, W) bool pixels of a view that these Gaussians paint more than half of."""
-    drawn = rasterizer.view(scene.gaussians, scene.cameras[view], scene.raster_settings())
+    drawn = view_of(scene, scene.cameras[view], rasterizer)
     return np.asarray(drawn.splat(members[:, None].astype(np.float32))[0][..., 0] > SOLID)
 
 

@@ -22,7 +22,7 @@ from langsplat_core.query.describe import NAMES, Describer, likely_name
 from langsplat_core.query.engine import QueryEngine, same_vectors
 from langsplat_core.query.instances import axis_aligned_box
 from langsplat_core.raster.protocol import LiftingRasterizer
-from langsplat_core.raster.render import splat_colours
+from langsplat_core.raster.render import splat_colours, view_of
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.scene.surface import surface_areas
 from langsplat_core.scene.transform import moved_camera, similarity
@@ -154,8 +154,8 @@ def _evidence(
     for done, camera in enumerate(own + others):
         progress("comparing the scenes", done / len(own + others))
         pair = ((first, camera), (second, moved_camera(camera, into)[0]))
-        views = [rasterizer.view(s.gaussians, c, s.raster_settings()) for s, c in pair]
-        drawn = [splat_colours(view, s.gaussians, c) for view, (s, c) in zip(views, pair, strict=True)]
+        views = [view_of(scene, at, rasterizer) for scene, at in pair]
+        drawn = [splat_colours(view, scene.gaussians) for view, (scene, _) in zip(views, pair, strict=True)]
         looks = [to_lab(np.clip(image.colours, 0, 1)) for image in drawn]
         near, far = views[0].median_depth(), scale * views[1].median_depth()
         # Where a capture looked and has nothing, nothing is; where it did not look, nobody knows.

@@ -494,8 +494,7 @@ def look_at_pixel(
     Every Gaussian counts by its blending weight there; the surface is at the median of their depths, as the
     rasterizers have it. `settings` of image formation: by default the scene's own."""
     scene = describer.engine.scene
-    formed = settings or scene.raster_settings()
-    rows, weights = pixel_weights(rasterizer, scene.gaussians, camera, pixel, formed)
+    rows, weights = pixel_weights(scene, camera, pixel, rasterizer, settings)
     total = float(weights.sum())
     if total <= PictureConfig().alpha_gate:
         return None

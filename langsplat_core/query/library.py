@@ -39,8 +39,7 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import NOTHING, PARTS, Bar, Bars, QueryResult, bars
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, same_vectors
 from langsplat_core.query.grammar import Named
-from langsplat_core.raster import load_rasterizer
-from langsplat_core.raster.render import splat_colours
+from langsplat_core.raster.render import render
 from langsplat_core.scene import LEVELS, Camera, Odds, Scene
 from langsplat_core.scene.surface import SMALLEST
 from langsplat_core.semantics.relevancy import NARROWEST
@@ -497,9 +496,8 @@ def draw(scene: Scene, size: tuple[int, int], answer: QueryResult | None = None)
     """(H, W, 3) uint8 picture of a scene, of `size` (width, height); with an answer from the training camera
     nearest to its place that has it in its image, with the answer as a heat map."""
     camera = _camera(scene, size, answer)
-    view = load_rasterizer("cpu").view(scene.gaussians, camera, scene.raster_settings())
     values = None if answer is None else answer.even[:, None] * answer.members[:, None]
-    drawn = splat_colours(view, scene.gaussians, camera, values)
+    drawn = render(scene, camera, values)
     image = np.clip(drawn.colours, 0, 1)
     if answer is not None:
         low, high = answer.heat_range

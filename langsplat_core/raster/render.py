@@ -13,76 +13,54 @@
 """
 
 from dataclasses import dataclass
+from functools import cache
+from typing import overload
 
 import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.progress import lap
-from langsplat_core.raster import load_rasterizer
-from langsplat_core.raster.protocol import LiftingRasterizer, View, dilation, farthest
+from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer
+from langsplat_core.raster.protocol import (
+    Backend,
+    LiftingRasterizer,
+    LiftingView,
+    V,
+    View,
+    dilation,
+    farthest,
+)
 from langsplat_core.scene import Camera, Gaussians, Scene
 
 
-def pixel_weights(
-    rasterizer: LiftingRasterizer,
-    gaussians: Gaussians,
+@overload
+def view_of(
+    scene: Scene, camera: Camera, rasterizer: None = None, settings: RasterSettings | None = None
+) -> LiftingView: ...
+@overload
+def view_of(
+    scene: Scene, camera: Camera, rasterizer: Backend[V], settings: RasterSettings | None = None
+) -> V: ...
+def view_of(
+    scene: Scene,
     camera: Camera,
-    pixel: tuple[int, int],
-    settings: RasterSettings = INRIA,
-) -> tuple[Array, Array]:
-    """(M,) int64 numbers of the Gaussians that paint `pixel` (column, row), and their (M,) float32 weights,
-    alpha_i T_i > 0, which add up to the pixel's alpha.
+    rasterizer: Backend[View] | None = None,
+    settings: RasterSettings | None = None,
+) -> View:
+    """Project `scene` into `camera`, once for any number of images.
 
-    Only those that could reach the pixel are projected; they keep their order, so the weights are those
-    of the whole view. The pixel must lie in the image.
+    rasterizer: by default that of the CPU, whose views can lift; settings of image formation: by default
+    those that the scene was trained with.
     """
-    column, row = pixel
-    near = np.flatnonzero(_may_reach(gaussians, camera, pixel, settings))
-    view = rasterizer.view(gaussians.take(near), camera, settings)
-    chosen = np.zeros((camera.height, camera.width, 1), np.float32)
-    chosen[row, column] = 1
-    weights = np.asarray(view.gather(chosen))[:, 0]
-    painting = weights > 0
-    return near[painting], weights[painting]
+    formed = scene.raster_settings() if settings is None else settings
+    return (rasterizer or _cpu()).view(scene.gaussians, camera, formed)
 
 
-def _may_reach(
-    gaussians: Gaussians, camera: Camera, pixel: tuple[int, int], settings: RasterSettings
-) -> Array:
-    """(N,) bool, True for every Gaussian whose footprint may cover the pixel, and for few others.
-
-    The footprint's covariance is J R S S^T R^T J^T + dilation, J the Jacobian (EWA), so its largest
-    eigenvalue is at most |J|^2 s_max^2 + dilation with |J|^2 <= (f/z)^2 (1 + (x/z)^2 + (y/z)^2), and f^2 of
-    an orthographic camera; beyond sqrt(2 ln(1 / alpha_min)) deviations alpha is below the cut-off, whatever
-    the opacity. J is taken at a clamped x/z and y/z, which only makes it smaller.
-    """
-    x, y, z = np.ascontiguousarray(_in_camera(gaussians, camera).T)
-    scale_x, scale_y, scale_z = gaussians.log_scales.T
-    with np.errstate(all="ignore"):  # invalid rows are dropped by the view
-        largest = np.float32(max(camera.fx, camera.fy)) * np.exp(
-            np.maximum(np.maximum(scale_x, scale_y), scale_z)
-        )
-        if not camera.orthographic:
-            x, y = x / z, y / z
-            largest *= np.sqrt(1 + x * x + y * y) / z
-        variance = largest**2 + np.float32(dilation(camera, settings))
-        reach = np.sqrt(np.float32(2 * np.log(1 / settings.alpha_min)) * variance) + 1
-        away = np.maximum(
-            np.abs(camera.fx * x + np.float32(camera.cx - pixel[0] - 0.5)),
-            np.abs(camera.fy * y + np.float32(camera.cy - pixel[1] - 0.5)),
-        )
-        inside: Array = (
-            (z > 0.999 * settings.near) & (z < 1.001 * farthest(settings)) & ~(away > 1.01 * reach)
-        )
-    return inside
-
-
-def _in_camera(gaussians: Gaussians, camera: Camera) -> Array:
-    """(N, 3) float32: this is a sieve with room for rounding, not a projection."""
-    with np.errstate(all="ignore"):
-        points: Array = gaussians.means @ camera.rotation.T.astype(np.float32)
-        return points + camera.world_to_camera[:3, 3].astype(np.float32)
+@cache
+def _cpu() -> LiftingRasterizer:
+    """One for the process, since views of one rasterizer use its memory again."""
+    return load_lifting_rasterizer("cpu")
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,15 +86,16 @@ def render(
     of image formation; the scene's own antialiasing applies. Raises InputError for an unknown backend,
     BackendError for one that cannot load here.
     """
-    view = load_rasterizer(backend).view(scene.gaussians, camera, scene.raster_settings(profile))
-    return splat_colours(view, scene.gaussians, camera, values)
+    rasterizer = _cpu() if backend == "cpu" else load_rasterizer(backend)
+    view = view_of(scene, camera, rasterizer, scene.raster_settings(profile))
+    return splat_colours(view, scene.gaussians, values)
 
 
-def splat_colours(view: View, gaussians: Gaussians, camera: Camera, values: Array | None = None) -> Rendering:
-    """The image of a view that is projected already, in one pass; values as in `render`."""
+def splat_colours(view: View, gaussians: Gaussians, values: Array | None = None) -> Rendering:
+    """Draw the image of a view of `gaussians` in one pass; values as in `render`."""
     rows = view.rows
     with lap("colours"):
-        seen = colours_seen(gaussians, camera, rows)
+        seen = colours_seen(gaussians, view.camera, rows)
         if values is not None:
             seen = np.concatenate([seen, np.asarray(values, np.float32)[rows]], 1)
     image, alpha = view.splat_rows(seen)
@@ -132,3 +111,59 @@ def colours_seen(gaussians: Gaussians, camera: Camera, rows: Array | None = None
         sights = np.broadcast_to(camera.rotation[2].astype(np.float32), gaussians.means.shape)
         return colours(gaussians.sh, sights, np.zeros(3), rows)
     return colours(gaussians.sh, gaussians.means, camera.position, rows)
+
+
+def pixel_weights(
+    scene: Scene,
+    camera: Camera,
+    pixel: tuple[int, int],
+    rasterizer: LiftingRasterizer | None = None,
+    settings: RasterSettings | None = None,
+) -> tuple[Array, Array]:
+    """(M,) int64 numbers of the Gaussians that paint `pixel` (column, row), and their (M,) float32 weights,
+    alpha_i T_i > 0, which add up to the pixel's alpha; rasterizer and settings as in `view_of`.
+
+    Only those that could reach the pixel are projected; they keep their order, so the weights are those
+    of the whole view. The pixel must lie in the image.
+    """
+    column, row = pixel
+    formed = scene.raster_settings() if settings is None else settings
+    near = np.flatnonzero(_may_reach(scene.gaussians, camera, pixel, formed))
+    view = (rasterizer or _cpu()).view(scene.gaussians.take(near), camera, formed)
+    chosen = np.zeros((camera.height, camera.width, 1), np.float32)
+    chosen[row, column] = 1
+    weights = np.asarray(view.gather(chosen))[:, 0]
+    painting = weights > 0
+    return near[painting], weights[painting]
+
+
+def _may_reach(
+    gaussians: Gaussians, camera: Camera, pixel: tuple[int, int], settings: RasterSettings
+) -> Array:
+    """(N,) bool, True for every Gaussian whose footprint may cover the pixel, and for few others.
+
+    The footprint's covariance is J R S S^T R^T J^T + dilation, J the Jacobian (EWA), so its largest
+    eigenvalue is at most |J|^2 s_max^2 + dilation with |J|^2 <= (f/z)^2 (1 + (x/z)^2 + (y/z)^2), and f^2 of
+    an orthographic camera; beyond sqrt(2 ln(1 / alpha_min)) deviations alpha is below the cut-off, whatever
+    the opacity. J is taken at a clamped x/z and y/z, which only makes it smaller.
+    """
+    scale_x, scale_y, scale_z = gaussians.log_scales.T
+    with np.errstate(all="ignore"):  # invalid rows are dropped by the view
+        points = gaussians.means @ camera.rotation.T.astype(np.float32)  # rounded: this is a sieve
+        x, y, z = np.ascontiguousarray((points + camera.world_to_camera[:3, 3].astype(np.float32)).T)
+        largest = np.float32(max(camera.fx, camera.fy)) * np.exp(
+            np.maximum(np.maximum(scale_x, scale_y), scale_z)
+        )
+        if not camera.orthographic:
+            x, y = x / z, y / z
+            largest *= np.sqrt(1 + x * x + y * y) / z
+        variance = largest**2 + np.float32(dilation(camera, settings))
+        reach = np.sqrt(np.float32(2 * np.log(1 / settings.alpha_min)) * variance) + 1
+        away = np.maximum(
+            np.abs(camera.fx * x + np.float32(camera.cx - pixel[0] - 0.5)),
+            np.abs(camera.fy * y + np.float32(camera.cy - pixel[1] - 0.5)),
+        )
+        inside: Array = (
+            (z > 0.999 * settings.near) & (z < 1.001 * farthest(settings)) & ~(away > 1.01 * reach)
+        )
+    return inside

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from langsplat_core.arrays import Array, across, check_array
 
@@ -114,12 +115,25 @@ class Camera:
         safe = 1.0 if self.orthographic else np.where(np.abs(depth) < 1e-12, 1e-12, depth)[:, None]
         return in_camera[:, :2] / safe * (self.fx, self.fy) + (self.cx, self.cy), depth
 
-    def unproject(self, pixel_xy: tuple[float, float], depth: float) -> Array:
-        """World point (3,) at a pixel position and a depth along the camera's z axis."""
-        x, y = pixel_xy
-        scale = 1.0 if self.orthographic else depth
-        in_camera = np.array([(x - self.cx) / self.fx * scale, (y - self.cy) / self.fy * scale, depth])
-        return self.rotation.T @ (in_camera - self.world_to_camera[:3, 3])
+    def unproject(self, pixels: ArrayLike, depths: ArrayLike) -> Array:
+        """(..., 2) pixel positions and (...) depths along z, or one for all -> (..., 3) world points."""
+        places, z = np.asarray(pixels, np.float64), np.asarray(depths, np.float64)[..., None]
+        offsets = (places - (self.cx, self.cy)) / (self.fx, self.fy) * (1.0 if self.orthographic else z)
+        in_camera = np.concatenate([offsets, np.broadcast_to(z, (*offsets.shape[:-1], 1))], -1)
+        points: Array = (in_camera - self.world_to_camera[:3, 3]) @ self.rotation
+        return points
+
+    def pixel_centres(self) -> Array:
+        """(H, W, 2) positions x, y of the centres of all pixels."""
+        x, y = np.meshgrid(np.arange(self.width), np.arange(self.height))
+        return np.stack([x, y], -1) + 0.5
+
+    def in_image(self, pixels: Array, depths: Array) -> Array:
+        """(N,) bool: which points, as `project` returns them, lie in front of the camera and inside its
+        image."""
+        with np.errstate(invalid="ignore"):
+            inside: Array = (depths > 0) & ((pixels >= 0) & (pixels < (self.width, self.height))).all(1)
+        return inside
 
 
 def look_at(

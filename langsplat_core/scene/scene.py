@@ -1,13 +1,13 @@
 """A scene: Gaussians, perhaps a language field, perhaps the cameras it was trained from."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from langsplat_core.arrays import Array, across
+from langsplat_core.arrays import Array, across, unit
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.scene.camera import Camera, look_at
 from langsplat_core.scene.gaussians import Gaussians
@@ -102,6 +102,29 @@ class Scene:
             covered.append(len(np.unique(cells @ (1.0, 4 * REACH / CELL))))  # a number for each cell
         broadest = int(np.argmax(covered))
         return np.asarray(directions[broadest if covered[broadest] > MORE * covered[0] else 0])
+
+    def spiral_cameras(
+        self,
+        count: int,
+        size: tuple[int, int],
+        elevations: tuple[float, float] = (-20.0, 60.0),
+        distances: Sequence[float] = (2.6,),
+    ) -> tuple[Camera, ...]:
+        """`count` cameras of `size` (width, height) around the scene that look at its centre, upright, spread
+        evenly between two `elevations`, degrees; `distances`, radii of the scene, take turns."""
+        centre, radius = self.bounds()
+        up = self.up()
+        east = unit(across(up))
+        north = np.cross(up, east)
+        low, high = np.sin(np.radians(elevations))
+        cameras = []
+        for index in range(count):
+            height = low + (high - low) * (index + 0.5) / count  # equal steps of the sine: even on the sphere
+            angle = np.pi * (3 - np.sqrt(5)) * index
+            level = np.sqrt(1 - height**2) * (np.cos(angle) * east + np.sin(angle) * north)
+            eye = centre + distances[index % len(distances)] * radius * (level + height * up)
+            cameras.append(replace(look_at(eye, centre, up, size), name=f"around_{index:03d}"))
+        return tuple(cameras)
 
     def framing_camera(self, size: tuple[int, int], bounds: tuple[Array, float] | None = None) -> Camera:
         """A camera of `size` (width, height) that frames the `bounds` (by default the scene's), a little from

@@ -214,7 +214,7 @@ def measure_moving(command: Scale, progress: Progress = silent) -> list[MovingCo
     rasterizer, settings = CpuRasterizer(), scene.raster_settings()
 
     def channels(gaussians: Gaussians, camera: Camera) -> Channels:
-        drawn = splat_colours(rasterizer.view(gaussians, camera, settings), gaussians, camera)
+        drawn = splat_colours(rasterizer.view(gaussians, camera, settings), gaussians)
         return Channels(drawn.colours, drawn.alpha)
 
     full = [channels(scene.gaussians, camera).rgb.clip(0, 1) for camera in cameras]

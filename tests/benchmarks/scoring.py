@@ -25,6 +25,7 @@ from langsplat_core.query.answers import SPAN, QueryResult, decoded_relevancy, p
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.selection import Regions
 from langsplat_core.raster.protocol import Rasterizer, View
+from langsplat_core.raster.render import view_of
 from langsplat_core.scene import Camera
 from langsplat_core.semantics.relevancy import FLOOR
 from langsplat_core.training.language.codec_fit import CodecReport
@@ -165,7 +166,7 @@ def evaluate(
     results: dict[str, list[tuple[float, bool]]] = {}
     for done, camera in enumerate(cameras):
         labels = truth.labels(camera.name)
-        view = rasterizer.view(scene.gaussians, camera, scene.raster_settings())
+        view = view_of(scene, camera, rasterizer)
         masks = {p: _mask(labels, p) for p in truth.phrases if p.text in asked.answers}
         visible = [phrase for phrase, mask in masks.items() if mask.sum() >= MIN_PIXELS]
         answers = [asked.answers[phrase.text] for phrase in visible]

@@ -22,7 +22,6 @@ from langsplat_core.compaction.compact import (
     estimated_loss,
     measuring_views,
     psnr_losses,
-    ring_cameras,
     select,
     smallest,
 )
@@ -155,7 +154,7 @@ def test_a_scene_without_cameras_is_seen_from_a_ring(scene, tmp_path):
     assert "ring" in report.views_from
     assert report.answers == ()
     centre, radius = scene.bounds()
-    for camera in ring_cameras(scene, 12):
+    for camera in scene.spiral_cameras(12, (64, 48)):
         pixel, depth = camera.project(centre[None])
         assert depth[0] > radius
         np.testing.assert_allclose(pixel[0], (camera.width / 2, camera.height / 2), atol=1e-6)

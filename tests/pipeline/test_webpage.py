@@ -22,7 +22,7 @@ from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.pipeline.webpage import write_page
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer
-from langsplat_core.raster.render import splat_colours
+from langsplat_core.raster.render import splat_colours, view_of
 from langsplat_core.scene import CANONICAL_PHRASES, LEVELS, Camera, Gaussians, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
 from tests.support.backends import Measure
@@ -93,8 +93,7 @@ def drawn(
 ) -> Array:
     """(H, W, 3) uint8 of the OpenGL backend."""
     rasterizer = GlRasterizer(gl, "single")
-    view = rasterizer.view(scene.gaussians, camera, scene.raster_settings())
-    image = splat_colours(view, scene.gaussians, camera, values)
+    image = splat_colours(view_of(scene, camera, rasterizer), scene.gaussians, values)
     rasterizer.release()
     channels = Channels(image.colours, image.alpha, None if values is None else image.values)
     return compose(channels, PictureConfig(display=look.pop("display", "rgb")), **look)

@@ -165,7 +165,7 @@ def test_without_perspective_a_step_along_the_view_changes_nothing(backend: Back
     moved = replace(camera, world_to_camera=step @ camera.world_to_camera)
     images = []
     for at in (camera, moved):
-        drawn = splat_colours(backend.raster.view(gaussians, at), gaussians, at)
+        drawn = splat_colours(backend.raster.view(gaussians, at), gaussians)
         images.append(np.concatenate([drawn.colours, drawn.alpha[..., None]], -1))
     assert images[0].std() > 0.1
     np.testing.assert_allclose(images[1], images[0], atol=max(backend.tolerance, 1e-6))

@@ -90,10 +90,8 @@ def test_without_perspective_the_map_is_linear():
     for conic, covariance in zip(f.conics, covariances(g), strict=True):
         want = np.linalg.inv(across @ covariance @ across.T + 0.3 * np.eye(2))
         np.testing.assert_allclose(conic, want[[0, 0, 1], [0, 1, 1]], rtol=1e-6, atol=1e-9)
-    found, depths = camera.project(g.means.astype(float))
+    found, _ = camera.project(g.means.astype(float))
     np.testing.assert_allclose(found, pixels, atol=1e-12)
-    back = [camera.unproject(tuple(pixel), z) for pixel, z in zip(found, depths, strict=True)]
-    np.testing.assert_allclose(back, g.means, atol=1e-6)
     seen = colours_seen(g, camera)
     np.testing.assert_allclose(seen, colours(g.sh, camera.rotation[2] + 0 * g.means, np.zeros(3)), atol=1e-6)
 

@@ -53,7 +53,7 @@ def test_the_scenes_antialiasing_and_the_profile_apply():
     settings = Scene(G, antialiased=True).raster_settings(GSPLAT)
     assert settings.antialiased
     assert settings.near == GSPLAT.near
-    want = splat_colours(raster.view(G, CAMERA, settings), G, CAMERA)
+    want = splat_colours(raster.view(G, CAMERA, settings), G)
     got = render(Scene(G, antialiased=True), CAMERA, profile=GSPLAT)
     np.testing.assert_array_equal(got.colours, want.colours)
     assert not np.array_equal(got.colours, render(Scene(G), CAMERA).colours)
@@ -140,7 +140,7 @@ def test_the_row_of_w(backend, distance, orthographic):
     for column, row in [(0, 0), (63, 47), (32, 24), (20, 40), (50, 5)]:
         image = np.zeros((48, 64, 1))
         image[row, column] = 1
-        rows, weights = pixel_weights(rasterizer, gaussians, camera, (column, row))
+        rows, weights = pixel_weights(Scene(gaussians), camera, (column, row), rasterizer)
         got = np.zeros(len(gaussians))
         got[rows] = weights
         assert (weights > 0).all()
@@ -159,8 +159,8 @@ def test_few_are_projected_and_invalid_ones_are_not():
             seen.append(len(some))
             return load_lifting_rasterizer("cpu").view(some, camera, settings)
 
-    rows, _ = pixel_weights(Recorder(), broken, view_from(3.0), (32, 24))
+    rows, _ = pixel_weights(Scene(broken), view_from(3.0), (32, 24), Recorder())
     assert 5 not in rows
     assert seen[0] < 200
-    rows, weights = pixel_weights(Recorder(), gaussians.take(slice(0)), view_from(3.0), (1, 1))
+    rows, weights = pixel_weights(Scene(gaussians.take(slice(0))), view_from(3.0), (1, 1))
     assert len(rows) == len(weights) == 0

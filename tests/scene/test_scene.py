@@ -13,7 +13,7 @@ from langsplat_core.bench.query import repeated
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Cancelled
 from langsplat_core.raster.reference import ReferenceRasterizer
-from langsplat_core.scene import NO_NODE, Gaussians, Odds, Scene, Tree
+from langsplat_core.scene import NO_NODE, Camera, Gaussians, Odds, Scene, Tree
 from langsplat_core.scene.gaussians import GROUP, merged
 from langsplat_core.scene.language import phrase_key, split_phrases, tidy, tokens
 from langsplat_core.scene.transform import (
@@ -62,6 +62,61 @@ def test_a_thin_scene_is_seen_from_its_broad_side(angle: float) -> None:
 
 
 # Fewer Gaussians that look much the same.
+
+
+def test_spiral_cameras_surround_the_scene():
+    scene = Scene(random_gaussians(50, 1))
+    cameras = scene.spiral_cameras(200, (64, 48), (-20.0, 60.0), (2.6, 1.6))
+    centre, radius = scene.bounds()
+    offsets = np.stack([camera.position for camera in cameras]) - centre
+    distances = np.linalg.norm(offsets, axis=1)
+    np.testing.assert_allclose(distances[:4] / radius, [2.6, 1.6, 2.6, 1.6])
+    elevations = np.degrees(np.arcsin(offsets @ scene.up() / distances))
+    assert elevations.min() == pytest.approx(-20, abs=0.5)
+    assert elevations.max() == pytest.approx(60, abs=0.5)
+    assert np.linalg.norm((offsets / distances[:, None]).mean(0) - 0.26 * scene.up()) < 0.02  # all around
+    for camera in cameras[:5]:
+        pixels, depths = camera.project(centre[None])
+        assert depths[0] > radius
+        np.testing.assert_allclose(pixels[0], (32, 24), atol=1e-6)
+
+
+# What cameras project, and where that came from.
+
+
+def off_centre(orthographic: bool) -> Camera:
+    camera = replace(random_camera(4, 60, 40), fx=35.0, fy=42.0, cx=11.3, cy=31.9)
+    return without_perspective(camera) if orthographic else camera
+
+
+@pytest.mark.parametrize("orthographic", [False, True])
+def test_unprojecting_inverts_projecting(orthographic: bool) -> None:
+    camera, points = off_centre(orthographic), np.random.default_rng(0).normal(size=(4, 5, 3))
+    pixels, depths = camera.project(points.reshape(-1, 3))
+    back = camera.unproject(pixels.reshape(4, 5, 2), depths.reshape(4, 5))
+    np.testing.assert_allclose(back, points, atol=1e-12)
+    np.testing.assert_allclose(camera.unproject(pixels[3], depths[3]), points[0, 3], atol=1e-12)
+
+
+@pytest.mark.parametrize("orthographic", [False, True])
+def test_a_pixel_unprojects_along_its_ray(orthographic: bool) -> None:
+    """By hand, in float64: x right, y down, z forward, the first pixel's centre at 0.5."""
+    camera = off_centre(orthographic)
+    right, down, forward = camera.rotation
+    points = camera.unproject(camera.pixel_centres(), np.float32(2.5))
+    assert points.shape == (40, 60, 3)
+    scale = 1.0 if orthographic else 2.5
+    want = camera.position + scale * ((7.5 - 11.3) / camera.fx * right + (3.5 - 31.9) / camera.fy * down)
+    np.testing.assert_allclose(points[3, 7], want + 2.5 * forward, atol=1e-12)
+
+
+def test_points_in_the_image_are_told_apart() -> None:
+    camera = off_centre(False)
+    pixels = np.array([[0.0, 0.0], [59.9, 39.9], [60.0, 5.0], [5.0, 40.0], [-0.1, 5.0], [5.0, 5.0]])
+    points = camera.unproject(pixels, np.array([1.0, 2.0, 1.0, 1.0, 1.0, -1.0]))
+    points = np.append(points + 1e-9 * camera.rotation[:2].sum(0), np.full((1, 3), np.nan), 0)
+    seen = camera.in_image(*camera.project(points))
+    assert seen.tolist() == [True, True, False, False, False, False, False]
 
 
 def test_copies_become_one():

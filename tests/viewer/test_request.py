@@ -291,7 +291,7 @@ def test_only_the_selection_changes_its_colour_from_every_side():
     assert tinted.antialiased == source.antialiased
     for camera in cameras():
         before, after = (
-            splat_colours(ReferenceRasterizer().view(gaussians, camera), gaussians, camera)
+            splat_colours(ReferenceRasterizer().view(gaussians, camera), gaussians)
             for gaussians in (source.gaussians.take(selected), tinted.gaussians.take(selected))
         )
         wanted = (1 - TINT_STRENGTH) * before.colours + TINT_STRENGTH * before.alpha[..., None] * TINT

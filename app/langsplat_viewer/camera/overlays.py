@@ -106,7 +106,7 @@ def frusta(cameras: Sequence[Camera], depth: float) -> Array:
     for row, camera in zip(made, cameras, strict=True):
         w, h = camera.width, camera.height
         row[0] = camera.position
-        row[1:] = [camera.unproject(corner, depth) for corner in ((0, 0), (w, 0), (w, h), (0, h))]
+        row[1:] = camera.unproject([(0, 0), (w, 0), (w, h), (0, h)], depth)
     edges: Array = made[:, np.array(FRUSTUM_EDGES)]
     return edges
 

@@ -34,7 +34,7 @@ from langsplat_core.raster import Rasterizer, View, load_rasterizer
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer, GlView, Source
 from langsplat_core.raster.opengl.scene_textures import create_egl_context, drawing, is_software, set_uniforms
 from langsplat_core.raster.opengl.shaders import shader
-from langsplat_core.raster.render import splat_colours
+from langsplat_core.raster.render import splat_colours, view_of
 from langsplat_core.scene import Gaussians, Scene
 from langsplat_viewer.rendering.request import (
     VISIBLE_ALPHA,
@@ -119,7 +119,7 @@ class LastView:
     def of(self, key: RenderKey) -> View:
         """Return the projected view of `key`, kept from the last call where it is equal."""
         if self._kept is None or self._kept[0] != key:
-            self._kept = key, self._rasterizer.view(key.scene.gaussians, key.camera, key.settings())
+            self._kept = key, view_of(key.scene, key.camera, self._rasterizer, key.settings())
         return self._kept[1]
 
     def forget(self) -> None:
@@ -146,7 +146,7 @@ class ArrayChannels:
         columns = [camera_depths(gaussians, camera) if c.is_depth else c.values for c in wanted]
         present = [column for column in columns if column is not None]
         values = np.concatenate(present, 1) if len(present) > 1 else next(iter(present), None)
-        drawn = splat_colours(self.views.of(key), gaussians, camera, values)
+        drawn = splat_colours(self.views.of(key), gaussians, values)
         ends = np.cumsum([0 if column is None else column.shape[1] for column in columns])
         parts = np.split(drawn.values, ends[:-1], axis=2)
         return [

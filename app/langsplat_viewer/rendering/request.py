@@ -53,8 +53,7 @@ def _in_image(gaussians: Gaussians, camera: Camera) -> tuple[slice, Array, Array
     rows = slice(None, None, max(len(gaussians) // _SAMPLE, 1))
     with np.errstate(invalid="ignore", over="ignore"):
         pixels, depths = camera.project(gaussians.means[rows].astype(np.float64))
-        inside = (depths > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
-    return rows, depths, inside
+    return rows, depths, camera.in_image(pixels, depths)
 
 
 def near_plane(gaussians: Gaussians, camera: Camera, most: float = INRIA.near) -> float:

@@ -16,7 +16,6 @@ import numpy as np
 from langsplat_core.config import INRIA, RadianceBudget, RadianceConfig
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.holdout import chosen
-from langsplat_core.datasets.known_poses import inside
 from langsplat_core.progress import Progress, Report, silent
 from langsplat_core.scene import Camera, Gaussians
 from langsplat_core.training.radiance.train import STAGE as STEPS
@@ -166,8 +165,8 @@ def widened(gaussians: Gaussians, views: Sequence[tuple[Camera, Camera]]) -> Gau
     more pixels, has to see them: what the dilation (`raster.protocol.dilation`) adds there is less."""
     added = np.full(len(gaussians), np.inf)
     for camera, finer in views:
-        seen = inside(camera, gaussians.means)
-        depth = camera.project(gaussians.means)[1]
+        pixels, depth = camera.project(gaussians.means)
+        seen = camera.in_image(pixels, depth)
         less = 1 / (camera.fx * camera.fy) - 1 / (finer.fx * finer.fy)
         added[seen] = np.minimum(added, INRIA.dilation * depth**2 * less)[seen]
     added = np.where(np.isfinite(added), added, 0)[:, None]

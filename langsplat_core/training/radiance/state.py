@@ -18,7 +18,7 @@ from torch.optim.adam import adam
 from langsplat_core.arrays import Array, logit
 from langsplat_core.config import RadianceConfig
 from langsplat_core.datasets.capture import Capture
-from langsplat_core.datasets.known_poses import TELLING_POINTS, inside, random_points
+from langsplat_core.datasets.known_poses import TELLING_POINTS, random_points
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians
@@ -79,7 +79,7 @@ def _usable_points(points: Array, rgb: Array, cameras: Sequence[Camera]) -> tupl
     points, rgb = points[first], rgb[first]
     seen = np.zeros(len(points), bool)
     for camera in cameras:
-        seen |= inside(camera, points)
+        seen |= camera.in_image(*camera.project(points))
     points, rgb = points[seen], rgb[seen]
     if len(points) > NEIGHBOURS:
         distance = _neighbour_distance(points)

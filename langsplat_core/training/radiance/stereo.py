@@ -18,7 +18,7 @@ from scipy.ndimage import minimum_filter
 from langsplat_core.arrays import Array
 from langsplat_core.compiled import helper, kernel, shared_workers
 from langsplat_core.datasets.capture import Capture
-from langsplat_core.datasets.known_poses import TELLING_POINTS, inside, look_distance
+from langsplat_core.datasets.known_poses import TELLING_POINTS, look_distance
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import Camera
 
@@ -57,18 +57,16 @@ class DepthMap:
 
     def points(self) -> tuple[Array, Array]:
         """(N, 3) points of the pixels whose depth is known, and their (N, 3) colours."""
-        rows, columns = np.nonzero(np.isfinite(self.depth))
-        camera, z = self.camera, self.depth[rows, columns]
-        x, y = (columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy
-        points = np.stack([x * z, y * z, z], -1) @ camera.rotation + camera.position
-        return points, self.colours[rows, columns]
+        known = np.isfinite(self.depth)
+        points = self.camera.unproject(self.camera.pixel_centres()[known], self.depth[known])
+        return points, self.colours[known]
 
 
 def _pixels(camera: Camera, points: Array) -> tuple[Array, tuple[Array, Array], Array]:
     """Which of the (N, 3) points lie at pixels of the image, as (M,) indices, rows and columns of these, and
     the depths of the points."""
     pixels, depths = camera.project(points)
-    there = np.flatnonzero(inside(camera, points))
+    there = np.flatnonzero(camera.in_image(pixels, depths))
     columns, rows = pixels[there].astype(int).T
     return there, (rows, columns), depths[there]
 
@@ -148,14 +146,14 @@ def neighbouring_views(cameras: Sequence[Camera], known: Array) -> list[list[int
     distance = look_distance(cameras)
     found = []
     for index, camera in enumerate(cameras):
-        seen = known[inside(camera, known)] if len(known) else known
+        seen = known[camera.in_image(*camera.project(known))]
         ahead = camera.position + distance * camera.rotation[2]
         middle = np.median(seen, axis=0) if len(seen) >= TELLING_POINTS else ahead
         ray = _direction(camera, middle)
         angles = {
             other: float(np.degrees(np.arccos(np.clip(ray @ _direction(at, middle), -1, 1))))
             for other, at in enumerate(cameras)
-            if other != index and inside(at, middle[None])[0]
+            if other != index and at.in_image(*at.project(middle[None]))[0]
         }
         usable = [other for other, angle in angles.items() if ANGLES[0] < angle < ANGLES[1]]
         found.append(sorted(usable, key=lambda other: abs(angles[other] - ANGLE))[:NEIGHBOURS])
@@ -169,7 +167,8 @@ def _direction(camera: Camera, point: Array) -> Array:
 
 def inverse_depths(camera: Camera, cameras: Sequence[Camera], known: Array) -> Array:
     """(PLANES,) ascending inverse depths at which a view looks for surfaces."""
-    depths = camera.project(known)[1][inside(camera, known)] if len(known) else np.zeros(0)
+    pixels, depths = camera.project(known)
+    depths = depths[camera.in_image(pixels, depths)]
     if len(depths) >= TELLING_POINTS // 2:
         near, far = np.quantile(depths, (NEAR_QUANTILE, 1 - NEAR_QUANTILE)) * MARGIN
     else:

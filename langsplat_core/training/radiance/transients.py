@@ -96,27 +96,20 @@ def difference(drawn: Array, seen: Array) -> Array:
 def agreeing(index: int, cameras: Sequence[Camera], depths: Array, alike: Array) -> Array:
     """(2, GRID, GRID) int: how many other views see the surface that view `index` draws in a patch and find
     it `alike` (V, GRID, GRID), and how many see it."""
-    points = patch_points(cameras[index], depths[index])
+    grids = [camera.resized(GRID, GRID) for camera in cameras]  # a pixel for each patch
+    points = grids[index].unproject(grids[index].pixel_centres(), depths[index]).reshape(-1, 3)
     known = np.flatnonzero(np.isfinite(points[:, 0]))
     counts = np.zeros((2, GRID * GRID), int)
-    for other, camera in enumerate(cameras):
+    for other, camera in enumerate(grids):
         if other == index:
             continue
         pixels, z = camera.project(points[known])
-        column, row = np.floor(pixels * GRID / (camera.width, camera.height)).T
-        inside = (z > 0) & (column >= 0) & (column < GRID) & (row >= 0) & (row < GRID)
-        at = other, row[inside].astype(int), column[inside].astype(int)
+        inside = camera.in_image(pixels, z)
+        column, row = pixels[inside].astype(int).T
+        at = other, row, column
         same = np.abs(z[inside] / depths[at] - 1) < AT  # NaN is not
         counts[:, known[inside]] += np.stack([same & alike[at], same])
     return counts.reshape(2, GRID, GRID)
-
-
-def patch_points(camera: Camera, depths: Array) -> Array:
-    """(GRID^2, 3) world points in the middle of the patches; NaN where there is no depth."""
-    y, x = (np.mgrid[:GRID, :GRID] + 0.5) / GRID
-    x, y = (x * camera.width - camera.cx) / camera.fx, (y * camera.height - camera.cy) / camera.fy
-    points: Array = (np.stack([x, y, np.ones_like(x)], -1) * depths[..., None]).reshape(-1, 3)
-    return points @ camera.rotation + camera.position
 
 
 def grown(differs: Array, sizes: Array, sure: float) -> Array:
