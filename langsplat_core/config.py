@@ -276,7 +276,7 @@ class RadianceConfig:
 class MaskConfig:
     """Source of masks, and which are kept (paper section 3.1 and the method's public code)."""
 
-    source: Literal["auto", "sam", "graph"] = "auto"  # auto: sam when `sam` names weights, else graph
+    source: str = "auto"  # sam, graph or an extension's; auto: sam when `sam` names weights, else graph
     # hub id, folder or file of SAM or SAM 2 weights, e.g. facebook/sam-vit-huge
     sam: str = ""
     # layers of crops that SAM sees beside the whole image, 2 x 2 in the first: 0 as the paper's text,

@@ -13,8 +13,8 @@ from imgui_bundle.immapp import testing  # isort: skip
 
 import numpy as np
 
-from langsplat_core.bench.query import with_codec
 from langsplat_core.config import AutoencoderConfig, PictureConfig
+from langsplat_core.extensions.benchmarks.query_speed import with_codec
 from langsplat_core.io.hostile import opened
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.training.language.codec_fit import train_autoencoder

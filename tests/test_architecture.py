@@ -31,17 +31,20 @@ LAYERS = [
     ["langsplat_viewer.jobs"],
     ["langsplat_core.__main__"],
     ["langsplat_core.cli"],
-    ["langsplat_core.bench"],
     ["langsplat_core.pipeline"],
-    ["langsplat_core.evaluation", "langsplat_core.compaction", "langsplat_core.geometry"],
+    ["langsplat_core.compaction"],
     ["langsplat_core.training.radiance", "langsplat_core.training.language", "langsplat_core.query"],
     [f"langsplat_core.{package}" for package in ("raster", "display", "semantics", "datasets")],
     ["langsplat_core.io"],
     ["langsplat_core.scene"],
     ["langsplat_core.config", "langsplat_core.compiled"],
     ["langsplat_core.arrays", "langsplat_core.progress"],
+    ["langsplat_core.registry"],
     ["langsplat_core.errors", "langsplat_core.web"],
 ]
+EXTENSIONS = (
+    "langsplat_core.extensions"  # beside the layers: they see public names of the core, which sees none
+)
 FACADE = "langsplat_core.__init__"  # the public names; it may reach anything below the command line
 HEAVY = ("torch", "open3d", "transformers", "pycolmap", "moderngl", "glfw", "imgui_bundle", "skimage")
 
@@ -106,6 +109,30 @@ def test_imports_run_strictly_downward():
     assert not found, "\n".join(found)
 
 
+def test_core_never_imports_an_extension() -> None:
+    files = [path for path in SOURCES if not module_name(path).startswith((EXTENSIONS, "tests."))]
+    found = [
+        f"{module_name(path)} imports {name}"
+        for path in files
+        for name in imported_modules(path, types_too=True)
+        if f"{name}.".startswith(f"{EXTENSIONS}.")
+    ]
+    assert not found, "\n".join(found)
+
+
+def test_extensions_use_public_names_and_their_own() -> None:
+    """An extension may build on another one, where it says so in its imports, but on no private name."""
+    found = [
+        f"{module_name(path)} imports {name}"
+        for path in (ROOT / "langsplat_core" / "extensions").rglob("*.py")
+        for name in imported_modules(path, types_too=True)
+        if name.startswith("langsplat_")
+        and any(part.startswith("_") for part in name.split("."))
+        and not name.endswith(".__version__")
+    ]
+    assert not found, "\n".join(found)
+
+
 def test_no_files_import_each_other_in_a_circle() -> None:
     files = {module_name(path).removesuffix(".__init__"): path for path in SOURCES}
     del files[FACADE.removesuffix(".__init__")]
@@ -118,7 +145,8 @@ def test_no_files_import_each_other_in_a_circle() -> None:
 
 
 def test_every_module_has_a_layer():
-    homeless = {module_name(path) for path in SOURCES if package_of(module_name(path)) is None}
+    modules = {module_name(path) for path in SOURCES if not module_name(path).startswith(EXTENSIONS)}
+    homeless = {module for module in modules if package_of(module) is None}
     assert homeless <= {FACADE, "langsplat_core.training.__init__", "langsplat_viewer.__init__"}
 
 

@@ -9,11 +9,12 @@ from typing import Annotated, Any
 import numpy as np
 import pytest
 
-from langsplat_core import bench, config
+from langsplat_core import config
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.train import Train
 from langsplat_core.config import AutoencoderConfig, TrainConfig, check_settings, numeric_settings
 from langsplat_core.errors import InputError
+from langsplat_core.extensions.benchmarks import config as bench
 from langsplat_core.pipeline.train import train_scene
 from tests.support.commands import refusal
 

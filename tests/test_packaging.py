@@ -22,7 +22,7 @@ from PIL import Image
 
 from langsplat_core import load_scene
 from langsplat_core.errors import EXTRAS
-from langsplat_core.io.scenes import FORMATS
+from langsplat_core.io.scenes import formats
 from langsplat_core.raster.opengl.scene_textures import create_egl_context
 from langsplat_viewer.viewer import TrainingRequest, command
 
@@ -70,8 +70,8 @@ def test_every_type_of_the_entry_is_described_and_every_kind_of_scene_has_one():
     globs = mime_globs()
     assert set(desktop_entry()["MimeType"].strip(";").split(";")) == set(globs)
     patterns = {pattern for some in globs.values() for pattern in some}
-    assert {f"*{row.suffix}" for row in FORMATS} <= patterns
-    assert {row.mime for row in FORMATS} == set(globs)
+    assert {f"*{row.suffix}" for row in formats()} <= patterns
+    assert {row.mime for row in formats()} == set(globs)
 
 
 def test_a_one_folder_build_trains_by_the_program_beside_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):

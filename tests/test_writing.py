@@ -15,15 +15,19 @@ from threading import Barrier
 import numpy as np
 import pytest
 
-from langsplat_core.cli.evaluate import write_report
 from langsplat_core.cli.run import main
 from langsplat_core.errors import InputError
+from langsplat_core.extensions.benchmarks.commands import write_report
+from langsplat_core.extensions.checkpoints.langsplat_files import (
+    write_autoencoder,
+    write_checkpoint,
+    write_features,
+)
 from langsplat_core.io import files
 from langsplat_core.io.cameras import write_cameras
 from langsplat_core.io.files import atomic_path, check_output_file, check_output_folder
-from langsplat_core.io.langsplat_files import write_autoencoder, write_checkpoint, write_features
 from langsplat_core.io.ply import write_ply
-from langsplat_core.io.scenes import WRITABLE, load_scene, save_scene
+from langsplat_core.io.scenes import load_scene, save_scene, writable_suffixes
 from langsplat_core.io.shapes import write_points
 from langsplat_core.io.sidecar import write_language
 from langsplat_core.pipeline.stages import kept, kept_array
@@ -184,7 +188,10 @@ def stage(folder: Path) -> None:
 
 
 WRITERS: dict[str, Write] = {
-    **{f"scene {end}": lambda folder, end=end: save_scene(folder / f"s{end}", SCENE) for end in WRITABLE},
+    **{
+        f"scene {end}": lambda folder, end=end: save_scene(folder / f"s{end}", SCENE)
+        for end in writable_suffixes()
+    },
     "Gaussians": lambda folder: write_ply(folder / "s.ply", GAUSSIANS),
     "sidecar": lambda folder: write_language(folder / "s.safetensors", FIELD, GAUSSIANS.means),
     "cameras": lambda folder: write_cameras(folder / "cameras.json", SCENE.cameras),

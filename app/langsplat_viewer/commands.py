@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from langsplat_core import registry
 from langsplat_core.config import Display
 from langsplat_core.display.displays import DISPLAYS, DisplayRow
 from langsplat_core.scene import LEVELS
@@ -150,7 +151,8 @@ SIDE_KEYS: tuple[tuple[Side, str], ...] = (
 )
 PANEL_TITLES = (
     *("Search", "Display", "Camera", "Scene", "Outline", "Select", "Transform"),
-    *("Library", "Train", "Record", "Bookmarks", "Messages", "Overlays", "Notes", "Timing"),
+    *("Train", "Record", "Bookmarks", "Messages", "Overlays", "Notes", "Timing"),
+    *registry.references("panels"),
 )
 LETTERS_MENU = "Size of letters"  # in the menu Window
 TOOL_ICONS: dict[Tool, str] = {
@@ -175,7 +177,6 @@ MENUS = ("File", "Edit", "Select", "View", "Camera", "Window", "Help")
 BY_MENU: dict[str, tuple[Command, ...]] = {
     "File": (
         Command("open a scene", browsing.ask_for_file, ("Ctrl+O",)),
-        Command("search all scenes of a folder", lambda viewer: browsing.ask_for_folder(viewer, "library")),
         Command("reload the scene", opening.reload, ("F5",), apart=True),
         Command("next scene of the list", lambda v: opening.step_scene(v, 1), ("Ctrl+PageDown",)),
         Command("previous scene of the list", lambda v: opening.step_scene(v, -1), ("Ctrl+PageUp",)),

@@ -3,11 +3,12 @@
 import math
 import os
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from statistics import median
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -16,10 +17,7 @@ from langsplat_core.config import LevelChoice, PictureConfig, TrainPreset
 from langsplat_core.display.displays import MAX_QUERIES
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.describe import Outline, Pointed, Suggestions
-from langsplat_core.query.engine import LoadEncoder
-from langsplat_core.query.finding import Hit
 from langsplat_core.query.instances import Instance
-from langsplat_core.query.library import Library
 from langsplat_core.scene import Camera, Scene
 from langsplat_core.scene.tree import Tree
 from langsplat_viewer.camera.controls import Extent, OrbitCamera
@@ -210,16 +208,12 @@ class EvidenceSheet:
     image: Array  # (H, W, 3) uint8, row 0 on top
 
 
-@dataclass(frozen=True, eq=False)
-class LibraryView:
-    """The scenes of a folder, as the panel "Library" lists them."""
+@dataclass(frozen=True)
+class FolderChoice:
+    """A folder that the file browser asks for."""
 
-    library: Library
-    load_encoder: LoadEncoder  # keeps the last one
-    phrase: str = ""  # that they are ranked by; "": by name
-    hits: tuple[Hit, ...] = ()  # the first `MOST_HITS` of the ranked
-    said: str = ""  # how many scenes have it, in words
-    thumbnails: Array | None = None  # (H, W, 3) uint8 of the hits listed, one below the other
+    title: str  # of the browser
+    then: Callable[[Any, Path], None]  # is given the Viewer and the folder that was taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -402,10 +396,9 @@ class ViewerState(SceneState):
     shows_panels: tuple[str, ...] = ()  # titles of those that alone are open from now on; (): as they are
     palette_typed: str = ""
     browser: Listing | None = None  # the folder that the file browser shows, while it is open
-    picks_folder: Literal["", "photographs", "library", "dataset"] = ""  # what it chooses a folder for
+    picks_folder: FolderChoice | None = None  # that it is open for; None: a scene
     picks_beside: bool = False  # it chooses a scene to be shown beside this one
-    library: LibraryView | None = None  # scenes of a folder, and what was looked for in them
-    library_typed: str = ""
+    extension_panels: dict[str, Any] = field(default_factory=dict)  # title -> what an extension's panel keeps
     preferences: Preferences = field(default_factory=Preferences)
     letters_muted: bool = False  # letters are no keys: they were meant for a box that cannot be typed in
 

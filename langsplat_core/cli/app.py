@@ -11,37 +11,27 @@ from typing import Annotated, Any, Union
 
 import tyro
 
+from langsplat_core import registry
 from langsplat_core.cli.run import Command, main, parsed, with_codec
 from langsplat_core.errors import InputError
 
 FLAGS = ("-q", "--quiet", "-v", "--verbose")  # may precede a command
-# Name -> class, in a module beside this one that is imported when the command line needs it.
-COMMANDS: Mapping[str, str] = MappingProxyType({
-    "train": "train.Train", "frames": "train.Frames", "query": "query.QueryScene", "find": "find.Find",
-    "changes": "find.Changes", "describe": "describe.Describe", "select": "query.Select",
-    "teach": "describe.Teach", "serve": "serve.Serve", "map": "geometry.Map", "scale": "edit.Scale",
-    "mesh": "geometry.Mesh", "register": "geometry.Register", "merge": "geometry.Merge",
-    "transform": "edit.Transform", "crop": "edit.Crop", "clean": "edit.Clean", "export": "export.Export",
-    "convert": "export.Convert", "compact": "edit.Compact", "inspect": "scenes.Inspect",
-    "doctor": "scenes.Doctor", "demo": "scenes.Demo",
+# Name -> class, imported when the command line needs it; those of extensions follow.
+CORE: Mapping[str, str] = MappingProxyType({
+    "train": "train.Train", "frames": "train.Frames", "query": "query.QueryScene",
+    "describe": "describe.Describe", "select": "query.Select", "teach": "describe.Teach",
+    "scale": "edit.Scale", "transform": "edit.Transform", "crop": "edit.Crop", "clean": "edit.Clean",
+    "export": "export.Export", "convert": "export.Convert", "compact": "edit.Compact",
+    "inspect": "scenes.Inspect", "doctor": "scenes.Doctor", "demo": "scenes.Demo",
 })  # fmt: skip
-_EVALUATIONS = {"lerf-ovs": "EvalLerfOvs", "3d-ovs": "EvalOvs3d", "scannet": "EvalScanNet"}
-_BENCHES = {"raster": "BenchRaster", "query": "BenchQuery"}
-# Name -> what it is about, and its commands.
-GROUPS: Mapping[str, tuple[str, Mapping[str, str]]] = MappingProxyType(
-    {
-        name: (about, {word: f"evaluate.{command}" for word, command in members.items()})
-        for name, about, members in (
-            ("eval", "Measure a scene against ground truth.", _EVALUATIONS),
-            ("bench", "Speed against error, measured in one run.", _BENCHES),
-        )
-    }
-)
 
 
 def parse(args: list[str]) -> Command:
-    """The command that the words of a command line name; SystemExit as tyro raises it, with its message on
-    stderr. Raises InputError for a command that does not exist, and for an unusable `--config`."""
+    """Return the command that the words of a command line name.
+
+    Raises SystemExit as tyro does, with its message on stderr; InputError for a command that does not exist,
+    and for an unusable `--config`.
+    """
     before = list(takewhile(FLAGS.__contains__, args))
     args = args[len(before) :]
     check_commands(args)
@@ -50,22 +40,42 @@ def parse(args: list[str]) -> Command:
 
         args = with_file(args)
         commands = [_subcommand("train", train_command(args))]
-    elif args and args[0] in GROUPS:
-        commands = [_group(args[0], args[1:2])]
-    elif args and args[0] in COMMANDS:
-        commands = [_subcommand(args[0], with_codec(load_command(COMMANDS[args[0]]), args))]
+    elif args[:1] and args[0] in command_names():
+        commands = [_subcommand(args[0], with_codec(load_command(args[0]), args))]
     else:
-        commands = [_subcommand(name, load_command(where)) for name, where in COMMANDS.items()]
-        commands += [_group(name, ()) for name in GROUPS]
+        groups = registry.references("groups")
+        named = args[:1] if args[:1] and args[0] in groups else [*CORE, *_extras(), *groups]
+        commands = [_group(name, args[1:2]) if name in groups else _listed(name) for name in named]
+        commands = [command for command in commands if command is not None]
     about = "Train, query, convert and measure 3D Gaussian scenes with a language field."
     found = parsed("langsplat", _union(commands), [*before, *args], about)
     return getattr(found, "command", found)  # of a group
 
 
-def load_command(where: str) -> type[Command]:
-    """The class at a place of `COMMANDS` or `GROUPS`."""
-    module, _, name = where.partition(".")
-    return getattr(import_module(f"langsplat_core.cli.{module}"), name)
+def command_names() -> list[str]:
+    """Return the names of all commands, those of groups as "group name", of the core and of extensions."""
+    return [*CORE, *registry.references("commands")]
+
+
+def load_command(name: str) -> type[Command]:
+    """Return the class of a command; InputError for one of an extension that cannot be imported."""
+    if name not in CORE:
+        return registry.part("commands", name)
+    module, _, kind = CORE[name].partition(".")
+    return getattr(import_module(f"langsplat_core.cli.{module}"), kind)
+
+
+def _extras() -> list[str]:
+    """Return the commands of extensions that stand in no group."""
+    return [name for name in registry.references("commands") if " " not in name]
+
+
+def _listed(name: str) -> Any:
+    """Return a subcommand for the list of all; None for one of an extension that is broken."""
+    if name in CORE:
+        return _subcommand(name, load_command(name))
+    command = registry.parts("commands").get(name)
+    return None if command is None else _subcommand(name, command)
 
 
 def _subcommand(name: str, command: type[Command]) -> Any:
@@ -73,22 +83,31 @@ def _subcommand(name: str, command: type[Command]) -> Any:
 
 
 def _group(name: str, words: Sequence[str]) -> Any:
-    """A group's commands, or only the one that `words` begins with."""
-    about, members = GROUPS[name]
-    named = [word for word in words if word in members] or list(members)
-    made = _union([_subcommand(member, load_command(members[member])) for member in named])
+    """Return a group's commands, or only the one that `words` begins with."""
+    members = _members(name)
+    named = [word for word in words if word in members] or members
+    made = _union([_subcommand(member, load_command(f"{name} {member}")) for member in named])
     group = make_dataclass("Group", [("command", Annotated[made, tyro.conf.arg(name="")])])
+    about = registry.references("groups")[name]
     return Annotated[group, tyro.conf.subcommand(name=name, description=about)]
 
 
+def _members(group: str) -> list[str]:
+    """Return the names of a group's commands, without the group's own."""
+    return [
+        name.partition(" ")[2] for name in registry.references("commands") if name.startswith(f"{group} ")
+    ]
+
+
 def _union(commands: Sequence[Any]) -> Any:
-    """The union of commands; tyro asks for two subcommands at least."""
+    """Return the union of commands; tyro asks for two subcommands at least."""
     return Union[(*commands, Annotated[None, tyro.conf.Suppress])]
 
 
 def check_commands(args: Sequence[str]) -> None:
-    """InputError that names a command which does not exist, and those that are written like it."""
-    known: Iterable[str] = (*COMMANDS, *GROUPS)
+    """Raise InputError for a command that does not exist, naming those that are written like it."""
+    groups = registry.references("groups")
+    known: Iterable[str] = (*CORE, *_extras(), *groups)
     for place, word in enumerate(args[:2]):
         if word.startswith("-"):
             return
@@ -98,9 +117,9 @@ def check_commands(args: Sequence[str]) -> None:
                 f"did you mean {' or '.join(map(repr, near))}?" if near else f"there are {', '.join(known)}"
             )
             raise InputError(f"no command {' '.join(args[: place + 1])!r}; {hint}")
-        if word not in GROUPS:
+        if word not in groups:
             return
-        known = tuple(GROUPS[word][1])
+        known = _members(word)
 
 
 def entry() -> None:

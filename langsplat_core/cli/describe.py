@@ -28,7 +28,7 @@ from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io import sidecar as files
 from langsplat_core.io.files import check_output_file
 from langsplat_core.io.scenes import check_writable, companion_path
-from langsplat_core.pipeline.exporting import export_labels
+from langsplat_core.pipeline.labels import export_labels
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.describe import Describer, Entry, Words, look_at_pixel
 from langsplat_core.query.engine import QueryEngine, check_words, searchable

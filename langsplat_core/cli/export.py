@@ -2,14 +2,16 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
+from langsplat_core import registry
 from langsplat_core.cli.query import Level
 from langsplat_core.cli.run import AnyScene, EncoderOption
 from langsplat_core.config import CodebookConfig, CodecConfig
 from langsplat_core.errors import InputError
+from langsplat_core.io.exchange import Exporter, ExportRequest, Importer, ImportRequest
 from langsplat_core.io.files import check_output_file, check_output_folder
 from langsplat_core.io.scenes import (
     check_keeps,
@@ -61,14 +63,12 @@ class Export:
         print(f"{self.out}: {report.gaussians:,} Gaussians, {report.bytes / 1e6:.2f} MB; {asked}")
 
 
-CHECKPOINTS = (".pth", ".pt", ".ckpt", ".npz", ".npy", ".faiss")  # no scene has such a name
-Target = Literal["scene", "langsplat", "occam", "features"]
-
-
 @dataclass(frozen=True)
 class Convert:
     """Write any readable scene as .ply, .spz or .splat, with language field and cameras beside it if it has
-    them. A .ply (INRIA's) keeps everything, .spz is ten times smaller and rounded, .splat is without view
+    them.
+
+    A .ply (INRIA's) keeps everything, .spz is ten times smaller and rounded, .splat is without view
     dependence. Checkpoints of LangSplat, LangSplatV2, Occam's LGS, Dr. Splat, OpenGaussian, Feature-3DGS and
     3D Gaussian Splatting become such a scene (see docs/files.md for what to give), and a scene becomes
     checkpoints."""
@@ -81,7 +81,7 @@ class Convert:
     rematch: Path | None = None
     """A language sidecar (*.langsplat.safetensors) made before the Gaussians were edited: its field is
     carried over to the Gaussians of SOURCE by nearest position."""
-    to: Target = "scene"
+    to: Annotated[str, tyro.conf.arg(metavar="scene|langsplat|occam|features")] = "scene"
     """langsplat: a folder with LangSplat's three checkpoints and its autoencoder. occam: with Occam's LGS's
     three checkpoints of whole vectors. features: a folder of masks and vectors of photographs, `features` of
     a training's work folder as LangSplat's language_features, or the other way."""
@@ -106,16 +106,12 @@ class Convert:
         return self.rest[-1]
 
     def run(self) -> None:
+        """Read, and write a scene or what an exporter makes of it."""
         if not self.rest:
             raise InputError(f"{self.source}: name what to read, and then what to write")
-        if self.to == "features":
-            self._convert_features()
-        elif self.to == "scene":
-            self._write_scene()
-        else:
+        if self.to != "scene":
             self._export()
-
-    def _write_scene(self) -> None:
+            return
         check_writable(self.out)  # before minutes are spent on reading
         check_keeps(self.out, *self.sources, *([] if self.rematch is None else [self.rematch]))
         scene = self._read()
@@ -124,68 +120,40 @@ class Convert:
         print(f"{self.out}: {len(scene.gaussians)} Gaussians, {described}")
 
     def _read(self) -> Scene:
-        first = self.source
-        foreign = len(self.sources) > 1 or first.suffix.lower() in CHECKPOINTS or self.encoder is not None
-        if foreign and self.rematch is not None:
+        importer = self._importer()
+        if importer is not None and self.rematch is not None:
             raise InputError(
                 "--rematch is for one scene; import the checkpoints first, then rematch the result"
             )
-        if foreign:
-            return self._import()
+        if importer is not None:
+            request = ImportRequest(self.sources, self.encoder, self.levels, self.phrases, self.codec)
+            with TerminalProgress() as progress:
+                scene, lines = importer.read(request, progress)
+            print(*lines, sep="\n")
+            return scene
         if self.rematch is None:
-            return load_scene(first)
-        scene = load_without_language(first)
+            return load_scene(self.source)
+        scene = load_without_language(self.source)
         return replace(scene, language=rematch_language(self.rematch, scene.gaussians.means))
 
-    def _import(self) -> Scene:
-        from langsplat_core.io.foreign import read_foreign
-        from langsplat_core.pipeline.importing import import_scene  # imports torch: --help need not wait
-
-        foreign = read_foreign(self.sources, self.levels)
-        with TerminalProgress() as progress:
-            scene, report = import_scene(foreign, self.encoder, self.phrases, self.codec, progress)
-        print(f"{report.method}: {'; '.join(report.notes)}")
-        if scene.language is not None:
-            shares = ", ".join(f"{share:.0%}" for share in report.meaningful)
-            print(
-                f"with a meaning at subpart, part, whole: {shares} of the Gaussians; "
-                f"codec {report.codec} of {report.codec_size}, encoder {scene.language.encoder_id}"
-            )
-        if report.loss is not None:
-            print(
-                f"relevancy error of the codec: mean {report.loss.error_mean:.4f}, "
-                f"99 % below {report.loss.error_p99:.4f}; mean cosine {report.loss.cosine:.4f}"
-            )
-        return scene
+    def _importer(self) -> Importer | None:
+        """Return what reads the sources where they are no scene of a known format."""
+        importers: list[Importer] = list(registry.parts("importers").values())
+        suffix = self.source.suffix.lower()
+        named = [one for one in importers if suffix in one.suffixes]
+        if named or not (len(self.sources) > 1 or self.encoder is not None):
+            return named[0] if named else None
+        if not importers:
+            raise InputError("several files, or --encoder, are for checkpoints, and no extension reads any")
+        return importers[0]
 
     def _export(self) -> None:
-        from langsplat_core.pipeline.exporting import export_langsplat, export_occam
-
+        exporters = registry.references("exporters")
+        if self.to not in exporters:
+            raise InputError(f"--to {self.to}: choose one of {', '.join(('scene', *exporters))}")
+        exporter: Exporter = registry.part("exporters", self.to)
         check_output_folder(self.out)
-        scene = replace(self._read(), path=self.source)
+        request = ExportRequest(self.source, lambda: replace(self._read(), path=self.source), self.out)
         with TerminalProgress() as progress:
-            if self.to == "langsplat":
-                written = export_langsplat(scene, self.out, self.source.stem)
-            else:
-                written = export_occam(scene, self.out, progress)
-        for path in written:
-            print(path)
-
-    def _convert_features(self) -> None:
-        from langsplat_core.pipeline.exporting import (
-            features_from_langsplat,
-            features_to_langsplat,
-            langsplat_stems,
-        )
-        from langsplat_core.semantics.store import FeatureStore
-
-        folder = self.source
-        if len(self.sources) > 1 or not folder.is_dir():
-            raise InputError(f"{folder}: --to features reads one folder of masks and vectors of photographs")
-        check_output_folder(self.out)
-        with TerminalProgress() as progress:
-            if langsplat_stems(folder):
-                count = features_from_langsplat(folder, FeatureStore(self.out), progress)
-            else:
-                count = features_to_langsplat(FeatureStore(folder), self.out, progress)
-        print(f"{self.out}: masks and vectors of {count} photographs")
+            lines = exporter.write(request, progress)
+        print(*lines, sep="\n")

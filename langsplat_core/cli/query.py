@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
 import tyro
@@ -40,7 +40,6 @@ from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.answers import QueryResult, decoded_relevancy, peak_pixel, splatted_relevancy
 from langsplat_core.query.compose import Number, check_phrase, count_things, joined, run_phrase
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder, searchable
-from langsplat_core.query.finding import Hit
 from langsplat_core.query.grammar import Atom, Counted, Phrase, heads, unparse
 from langsplat_core.query.instances import Instance, hull
 from langsplat_core.query.selection import grow, in_pixel, of_rows, shrink
@@ -427,7 +426,14 @@ class Unit:
         return between.join(f"{self.length * value:.3f}" for value in values)
 
 
-def unit_of(scene: Scene | Hit, metres_per_unit: float | None = None) -> Unit:
+class HasUnit(Protocol):
+    """A scene, or what stands for one, that may say how long its unit is."""
+
+    @property
+    def metres_per_unit(self) -> float | None: ...
+
+
+def unit_of(scene: HasUnit, metres_per_unit: float | None = None) -> Unit:
     """The unit of lengths in a scene: metres by `metres_per_unit` or the scene's own, else world units."""
     metres = metres_per_unit or scene.metres_per_unit
     return Unit("units", 1.0) if metres is None else Unit("m", metres)

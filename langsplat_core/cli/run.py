@@ -190,6 +190,9 @@ def _run(program: str, parser: Callable[[], Command]) -> None:
         print(f"{program} {__version__}")
         return
     log.setLevel(Verbosity().level)
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_OneLine())
+    logging.basicConfig(handlers=[handler])
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
@@ -198,9 +201,6 @@ def _run(program: str, parser: Callable[[], Command]) -> None:
         if stop.code in (0, None):
             return
         raise InputError(one_line(complaint.getvalue())) from None
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(_OneLine())
-    logging.basicConfig(handlers=[handler])
     warnings.filterwarnings("ignore", module=r"(torch|transformers|huggingface_hub|numba)(\.|$)")
     began = time.perf_counter()
     with _signals_raise(program):

@@ -1,4 +1,4 @@
-"""Scenes on disk: `FORMATS`, the one table that the loader, `langsplat convert`, the file browser, the
+"""Scenes on disk: `formats()`, the one table that the loader, `langsplat convert`, the file browser, the
 desktop entry and the tests of round trips and damaged files read; and a scene's companions.
 
 A scene is `scene.ply` with, beside it, `scene.langsplat.safetensors` and `scene.cameras.json`, either of
@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from langsplat_core import registry
 from langsplat_core.errors import InputError
 from langsplat_core.io import cameras as camera_files
 from langsplat_core.io import ply
@@ -38,7 +39,7 @@ LOOKED_AT = 4096  # rows of a large scene, evenly taken, that tell whether most 
 
 @dataclass(frozen=True)
 class SceneFormat:
-    """A format of scenes: one row of `FORMATS`."""
+    """A format of scenes: one row of `formats()`."""
 
     suffix: str  # of its files, lower case; its name for people too
     read: Callable[[Path], Scene]
@@ -60,7 +61,7 @@ def _write_ply(path: Path, scene: Scene) -> None:
     write_ply(path, scene.gaussians, tuple(comments), scene.extras)
 
 
-FORMATS = (
+CORE_FORMATS = (
     SceneFormat(".ply", read_ply_scene, _write_ply, mime="model/x-ply"),  # plain and compressed
     SceneFormat(
         ".spz",
@@ -97,17 +98,29 @@ FORMATS = (
         for suffix, mime in ((".glb", "model/gltf-binary"), (".gltf", "model/gltf+json"))
     ),
 )
-WRITABLE = tuple(row.suffix for row in FORMATS if row.write is not None)
-SUPPORTED = ", ".join(
-    [row.suffix for row in FORMATS]
-    + [f"a folder with {name} or that file" for row in FORMATS for name in row.folder_files]
-)
+
+
+def formats() -> tuple[SceneFormat, ...]:
+    """Return the formats of scenes, the project's own and then those of extensions."""
+    return (*CORE_FORMATS, *registry.parts("formats").values())
+
+
+def writable_suffixes() -> tuple[str, ...]:
+    """Return the suffixes of the formats that can be written."""
+    return tuple(row.suffix for row in formats() if row.write is not None)
+
+
+def supported_kinds() -> str:
+    """Return what can be opened, in words: suffixes, and folders by the files in them."""
+    suffixes = [row.suffix for row in formats()]
+    folders = [f"a folder with {name} or that file" for row in formats() for name in row.folder_files]
+    return ", ".join(suffixes + folders)
 
 
 def format_of(path: Path) -> SceneFormat | None:
     """Return the format that `path` is named as, or, for a folder, has the file of; None for no scene."""
     folder = os.path.isdir(path)  # which a name too long is not
-    for row in FORMATS:
+    for row in formats():
         if not folder and path.suffix.lower() == row.suffix:
             return row
         if any(path.name == name or exists(path / name) for name in row.folder_files):
@@ -184,7 +197,7 @@ def _read_by_kind(path: Path) -> Scene:
         inside = sorted(path.glob("**/*.ply"))
         hint = f"; perhaps {inside[-1]}" if inside else ""
         raise InputError(f"{path}: a folder without {META_NAME} is not a scene{hint}")
-    raise InputError(f"{path}: not a scene of a known kind; supported: {SUPPORTED}")
+    raise InputError(f"{path}: not a scene of a known kind; supported: {supported_kinds()}")
 
 
 def check_writable(path: Path | str) -> None:
@@ -200,17 +213,17 @@ def check_keeps(out: Path, *sources: Path) -> None:
     the scenes `sources`, or what lies beside it."""
     read = {file.resolve() for source in sources for file in (source, *scene_files(source))}
     companions = [companion_path(out, suffix) for suffix in (language_files.SUFFIX, camera_files.SUFFIX)]
-    scene = any(row.write is not None and out.suffix.lower() == row.suffix for row in FORMATS)
+    scene = any(row.write is not None and out.suffix.lower() == row.suffix for row in formats())
     for path in (out, *(companions if scene else ())):
         if path.resolve() in read:
             raise InputError(f"{shown(path)}: would replace the original scene; choose another name")
 
 
 def _writable(path: Path) -> SceneFormat:
-    for row in FORMATS:
+    for row in formats():
         if row.suffix == path.suffix.lower() and row.write is not None:
             return row
-    raise InputError(f"{path}: scenes are written as {', '.join(WRITABLE)}; choose such a name")
+    raise InputError(f"{path}: scenes are written as {', '.join(writable_suffixes())}; choose such a name")
 
 
 def save_scene(path: Path | str, scene: Scene) -> None:
@@ -253,7 +266,7 @@ def companion_path(scene: Path | str, suffix: str) -> Path:
     folder `a/b` (or `a/b/meta.json`) -> `a/b<suffix>`, beside the folder; `a/b.spz`, .sog, .splat or .ksplat
     -> `a/b.spz<suffix>` and so on."""
     scene = Path(scene)
-    if any(scene.name in row.folder_files for row in FORMATS):
+    if any(scene.name in row.folder_files for row in formats()):
         scene = scene.parent
     row = None if os.path.isdir(scene) else format_of(scene)  # which a name too long is not
     if row is not None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from langsplat_core import registry
 from langsplat_core.arrays import Array
 from langsplat_core.errors import EncoderError, optional_imports
 from langsplat_core.semantics.clip_plain import TEMPERATURE, plain_text_tower
@@ -27,13 +28,13 @@ from langsplat_core.semantics.encoder import (
     pixel_statistics,
     text_cleaner,
 )
-from langsplat_core.semantics.layouts import open_weights
 from langsplat_core.semantics.weights import (
     Weights,
     load_config,
     load_model,
     loading_errors,
     model_type,
+    open_weights,
     read_scalar,
     torch_device,
     weights_path,
@@ -228,9 +229,12 @@ def model_path(model: str, option: str) -> Path:
 
 def _family(weights: Weights) -> Family:
     named = model_type(weights)
-    if named not in FAMILIES:
-        known = ", ".join(FAMILIES)
+    if named in FAMILIES:
+        return FAMILIES[named]
+    more = registry.references("encoders")
+    if named not in more:
+        known = ", ".join((*FAMILIES, *more))
         raise EncoderError(
             f"{weights.id}: its {named!r} model is no image-text encoder known here; known are {known}"
         )
-    return FAMILIES[named]
+    return registry.part("encoders", named)

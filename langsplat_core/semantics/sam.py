@@ -12,11 +12,11 @@ import numpy as np
 from PIL import Image
 from scipy import ndimage
 
+from langsplat_core import registry
 from langsplat_core.arrays import Array
 from langsplat_core.config import MaskConfig
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.progress import Progress
-from langsplat_core.semantics.layouts import open_weights
 from langsplat_core.semantics.masks import GraphMasks, LevelMasks, MaskSource
 from langsplat_core.semantics.weights import (
     Weights,
@@ -24,6 +24,7 @@ from langsplat_core.semantics.weights import (
     load_config,
     load_model,
     model_type,
+    open_weights,
     torch_device,
     weights_path,
 )
@@ -179,10 +180,13 @@ def load_segmenter(model: str, device: str = "auto") -> Segmenter:
     EncoderError where the weights are absent or are those of no family here."""
     weights = open_weights(model, weights_path(model, "--masks.sam"), torch_device(device))
     named = model_type(weights)
-    if named not in FAMILIES:
-        known = ", ".join(FAMILIES)
+    if named in FAMILIES:
+        return FAMILIES[named](weights)
+    more = registry.references("segmenters")
+    if named not in more:
+        known = ", ".join((*FAMILIES, *more))
         raise EncoderError(f"{model}: its {named!r} model is no segmenter known here; known are {known}")
-    return FAMILIES[named](weights)
+    return registry.part("segmenters", named)(weights)
 
 
 # SAM's layers of crops: parts of a photograph that are looked at for themselves, for masks of small things.
@@ -335,10 +339,20 @@ HALF_ON = "cuda"  # where products are float16's: bfloat16's error is seven time
 
 
 def load_mask_source(config: MaskConfig, device: str = "auto") -> MaskSource:
-    """The source that `config` asks for; "auto" is SAM where `config.sam` names weights, else the graph.
-    Raises EncoderError where SAM's weights are absent, InputError where they are not named at all."""
+    """Return the source of masks that `config` asks for.
+
+    "auto" is SAM where `config.sam` names weights, else the graph. Raises EncoderError where SAM's weights
+    are absent, InputError where they are not named at all or the source is none of the core or of an
+    extension.
+    """
     if config.source == "graph" or (config.source == "auto" and not config.sam):
         return GraphMasks()
+    if config.source not in ("auto", "sam"):
+        more = registry.references("mask_sources")
+        if config.source not in more:
+            known = ", ".join(("auto", "sam", "graph", *more))
+            raise InputError(f"masks.source {config.source}: choose one of {known}")
+        return registry.part("mask_sources", config.source)(config, device)
     if not config.sam:
         raise InputError(
             "masks.source sam: name the weights too, such as `--masks.sam facebook/sam-vit-huge`"

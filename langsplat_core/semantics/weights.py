@@ -6,13 +6,14 @@ import pickle
 import re
 import warnings
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from langsplat_core import registry
 from langsplat_core.errors import EncoderError
 
 CONFIG = "config.json"
@@ -46,6 +47,32 @@ class Weights:
     folder: Path  # in Hugging Face layout, or that of `converted`, with what lies beside the weights
     device: str  # of torch: "cpu", "cuda:0"
     converted: Converted | None = None  # where they are in another layout than Hugging Face's
+
+
+Layout = Callable[
+    [str, Path], Converted | None
+]  # id for messages, file -> None where it is of another layout
+
+
+def open_weights(id: str, path: Path, device: str) -> Weights:
+    """Return the weights at `path`, a folder or a file that `weights_path` found.
+
+    Other layouts than Hugging Face's are read by extensions. Raises EncoderError for a file that is damaged,
+    or of no layout known here.
+    """
+    if path.is_dir() and is_hugging_face(path):
+        return Weights(id, path, device)
+    file = path if path.is_file() else next(path / name for name in OPEN_CLIP if (path / name).is_file())
+    layouts: Mapping[str, Layout] = registry.parts("layouts")
+    for layout in layouts.values():
+        converted = layout(id, file)
+        if converted is not None:
+            return Weights(id, file.parent, device, converted)
+    known = "; ".join(layouts) or "none"
+    raise EncoderError(
+        f"{id}: its weights are of no layout known here ({known}); for another model pass a folder or hub id "
+        "in Hugging Face layout"
+    )
 
 
 def weights_path(model: str, option: str) -> Path:

@@ -1,6 +1,6 @@
 """Print the desktop's description of scene files (shared-mime-info), made of the table of formats."""
 
-from langsplat_core.io.scenes import FORMATS
+from langsplat_core.io.scenes import formats
 
 HEAD = '<?xml version="1.0" encoding="UTF-8"?>\n<mime-info xmlns="http://www.freedesktop.org/standards/shared-mime-info">'
 NAMES = {
@@ -24,7 +24,7 @@ def mime_info() -> str:
     """Return the XML, a glob for each suffix."""
     lines = [HEAD]
     for mime, name in NAMES.items():
-        globs = [f'<glob pattern="*{row.suffix}"/>' for row in FORMATS if row.mime == mime]
+        globs = [f'<glob pattern="*{row.suffix}"/>' for row in formats() if row.mime == mime]
         inside = [f"<comment>{name}</comment>", *FURTHER.get(mime, []), *globs]
         lines += [f'  <mime-type type="{mime}">', *(f"    {line}" for line in inside), "  </mime-type>"]
     return "\n".join([*lines, "</mime-info>"])

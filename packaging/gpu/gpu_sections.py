@@ -32,7 +32,10 @@ import torch
 
 from langsplat_core import load_scene, render
 from langsplat_core.arrays import Array, unit
-from langsplat_core.bench.measure import (
+from langsplat_core.config import INRIA, RadianceConfig, RasterSettings
+from langsplat_core.datasets.capture import Capture
+from langsplat_core.errors import BackendError
+from langsplat_core.extensions.benchmarks.measure import (
     Case,
     Foresight,
     default_camera,
@@ -41,12 +44,9 @@ from langsplat_core.bench.measure import (
     reference_windows,
     warm_up,
 )
-from langsplat_core.bench.measure import measure as measure_backend
-from langsplat_core.bench.raster import describe_machine
-from langsplat_core.bench.raster import table as speed_table
-from langsplat_core.config import INRIA, RadianceConfig, RasterSettings
-from langsplat_core.datasets.capture import Capture
-from langsplat_core.errors import BackendError
+from langsplat_core.extensions.benchmarks.measure import measure as measure_backend
+from langsplat_core.extensions.benchmarks.raster_speed import describe_machine
+from langsplat_core.extensions.benchmarks.raster_speed import table as speed_table
 from langsplat_core.io.files import atomic_path
 from langsplat_core.raster import gsplat, load_lifting_rasterizer, load_rasterizer
 from langsplat_core.raster.gsplat import require_device

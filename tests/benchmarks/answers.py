@@ -21,7 +21,6 @@ from assets.making.objects import EVERYTHING
 from assets.making.truth import PHRASE_KINDS, Region, read_truth
 from assets.making.vocabulary import part_words
 from langsplat_core.arrays import Array
-from langsplat_core.bench.measure import markdown
 from langsplat_core.cli.run import OutFile
 from langsplat_core.config import (
     AutoencoderConfig,
@@ -34,6 +33,7 @@ from langsplat_core.config import (
 )
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import InputError
+from langsplat_core.extensions.benchmarks.measure import markdown
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import Progress, TerminalProgress, silent

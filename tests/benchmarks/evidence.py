@@ -9,9 +9,9 @@ import numpy as np
 
 from assets.making.objects import EVERYTHING
 from langsplat_core.arrays import Array
-from langsplat_core.bench.measure import markdown
 from langsplat_core.config import CodebookConfig, CodecConfig, Count
-from langsplat_core.evaluation.report import intersection_over_union
+from langsplat_core.extensions.benchmarks.measure import markdown
+from langsplat_core.extensions.benchmarks.report import intersection_over_union
 from langsplat_core.pipeline.evidence import FEW, find_evidence
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import QueryEngine

@@ -11,7 +11,6 @@ import tyro
 from PIL import Image
 
 from langsplat_core.arrays import Array, psnr
-from langsplat_core.bench.measure import markdown
 from langsplat_core.config import (
     QUICK,
     DatasetConfig,
@@ -24,6 +23,7 @@ from langsplat_core.config import (
 from langsplat_core.datasets import Capture, load_capture
 from langsplat_core.datasets.holdout import split
 from langsplat_core.datasets.known_poses import look_distance
+from langsplat_core.extensions.benchmarks.measure import markdown
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Gaussians, Scene

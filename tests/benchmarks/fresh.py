@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from langsplat_core.arrays import Array, unit
-from langsplat_core.bench import peak_memory
 from langsplat_core.errors import InputError
+from langsplat_core.extensions.benchmarks.config import peak_memory
 from langsplat_core.scene import Camera, Reading, look_at
 from langsplat_core.semantics.store import ImageFeatures
 
@@ -80,8 +80,8 @@ def _read_by_plyfile(path: Path) -> list[Array]:
 
 def lift(count: int, views: int, picture: tuple[int, int]) -> dict[str, Any]:
     """Seconds, bytes and relevancy error of lifting random masks onto random Gaussians."""
-    from langsplat_core.bench.measure import random_scene
     from langsplat_core.config import CodebookConfig, TrainConfig
+    from langsplat_core.extensions.benchmarks.measure import random_scene
     from langsplat_core.pipeline.language import language_field
     from langsplat_core.progress import silent
 

@@ -10,13 +10,13 @@ from scipy.spatial import cKDTree
 from assets.making.dataset import photographed_room
 from assets.making.objects.furniture import TABLE_HEIGHT
 from langsplat_core.arrays import Array, logit, sigmoid
-from langsplat_core.bench.measure import markdown
 from langsplat_core.compaction.clean import clean, find_floaters
 from langsplat_core.compaction.compact import Views, choose_views, mean_psnr, measuring_views
 from langsplat_core.config import CleanConfig
-from langsplat_core.geometry.mesh import fuse
-from langsplat_core.geometry.occupancy import find_occupancy, floor_map, map_axes
-from langsplat_core.geometry.planes import find_room
+from langsplat_core.extensions.benchmarks.measure import markdown
+from langsplat_core.extensions.geometry.mesh import fuse
+from langsplat_core.extensions.geometry.occupancy import find_occupancy, floor_map, map_axes
+from langsplat_core.extensions.geometry.planes import find_room
 from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_core.scene.gaussians import join_gaussians
 from tests.benchmarks.oracles import surface_points

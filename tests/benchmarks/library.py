@@ -21,13 +21,11 @@ from assets.making.kit import Kit, Thing, random_colour
 from assets.making.objects import BRIGHT, TABLE_TOP
 from assets.making.world import ENLARGED, Placed, Surface, assemble, footprint, furnished
 from langsplat_core.arrays import Array, unit
-from langsplat_core.bench.measure import markdown
 from langsplat_core.config import CountOrZero
-from langsplat_core.io.scenes import save_scene
-from langsplat_core.query.changes import Change, changes
-from langsplat_core.query.finding import judged, rank
-from langsplat_core.query.grammar import named
-from langsplat_core.query.library import (
+from langsplat_core.extensions.benchmarks.measure import markdown
+from langsplat_core.extensions.library.changes import Change, changes
+from langsplat_core.extensions.library.finding import judged, rank
+from langsplat_core.extensions.library.index import (
     COLUMNS,
     THUMBNAIL,
     Digest,
@@ -37,6 +35,8 @@ from langsplat_core.query.library import (
     read_library,
     write_library,
 )
+from langsplat_core.io.scenes import save_scene
+from langsplat_core.query.grammar import named
 from langsplat_core.raster import load_lifting_rasterizer
 from tests.benchmarks.room import InRooms, MaskOrigin, Room, Variant, publish
 from tests.benchmarks.scoring import grouped, seconds_of

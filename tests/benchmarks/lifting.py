@@ -18,7 +18,6 @@ import tyro
 from skimage.color import deltaE_ciede2000, rgb2lab
 
 from langsplat_core.arrays import Array, unit
-from langsplat_core.bench.measure import markdown
 from langsplat_core.config import (
     AutoencoderConfig,
     CodebookConfig,
@@ -29,6 +28,7 @@ from langsplat_core.config import (
 )
 from langsplat_core.display.displays import latent_colours
 from langsplat_core.errors import FormatError, InputError
+from langsplat_core.extensions.benchmarks.measure import markdown
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster import load_lifting_rasterizer

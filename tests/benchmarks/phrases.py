@@ -15,8 +15,8 @@ from assets.making.truth import Region, Truth
 from assets.making.vocabulary import CATEGORIES, colour_words, object_words
 from assets.making.world import World
 from langsplat_core.arrays import Array
-from langsplat_core.bench.measure import markdown
-from langsplat_core.evaluation.report import intersection_over_union
+from langsplat_core.extensions.benchmarks.measure import markdown
+from langsplat_core.extensions.benchmarks.report import intersection_over_union
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import Body, Viewpoint, body, most, run_phrase, stands, upright, viewpoint
 from langsplat_core.query.describe import Describer, Entry, WordScores

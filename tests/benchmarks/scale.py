@@ -27,16 +27,16 @@ import tyro
 from PIL import Image
 
 from langsplat_core.arrays import Array, psnr, sigmoid, unit
-from langsplat_core.bench import Size, peak_memory, resident_memory, restart_peak
-from langsplat_core.bench.measure import markdown
-from langsplat_core.bench.query import repeated
 from langsplat_core.cli.run import OutFolder
 from langsplat_core.config import Count, CountOrZero, PictureConfig, Range
 from langsplat_core.display.composing import composed
 from langsplat_core.display.displays import Channels
 from langsplat_core.errors import InputError
+from langsplat_core.extensions.benchmarks.config import Size, peak_memory, resident_memory, restart_peak
+from langsplat_core.extensions.benchmarks.measure import markdown
+from langsplat_core.extensions.benchmarks.query_speed import repeated
 from langsplat_core.io.ply import write_ply
-from langsplat_core.io.scenes import FORMATS, load_scene, save_scene
+from langsplat_core.io.scenes import formats, load_scene, save_scene
 from langsplat_core.progress import Progress, TerminalProgress, lap, silent, watched
 from langsplat_core.query.engine import QueryEngine, TextEncoder, no_field
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
@@ -367,7 +367,7 @@ def rows(scene: Scene) -> list[list[str]]:
     """The table's rows: format, megabytes, errors, lowest PSNR."""
     table = []
     with tempfile.TemporaryDirectory() as folder:
-        for suffix in (row.suffix for row in FORMATS if row.write is not None):
+        for suffix in (row.suffix for row in formats() if row.write is not None):
             path = Path(folder) / f"scene{suffix}"
             save_scene(path, scene)
             got = load_scene(path).gaussians

@@ -19,7 +19,7 @@ from assets.making.dataset import MIN_PIXELS
 from assets.making.truth import PHRASE_KINDS, Phrase, Truth
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice, PictureConfig
-from langsplat_core.evaluation.report import intersection_over_union
+from langsplat_core.extensions.benchmarks.report import intersection_over_union
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import SPAN, QueryResult, decoded_relevancy, peak_pixel, splatted_relevancy
 from langsplat_core.query.engine import QueryEngine

@@ -13,7 +13,7 @@ from assets.making.truth import Region, Truth, read_truth
 from assets.making.world import World, build_room, furnished
 from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.errors import InputError
-from langsplat_core.query.changes import Change
+from langsplat_core.extensions.library.changes import Change
 from langsplat_core.query.compose import upright, viewpoint
 from langsplat_core.query.describe import Entry, Spot
 from langsplat_core.query.engine import QueryEngine

@@ -17,9 +17,9 @@ from assets.making.objects import FURNITURE, TABLE_TOP, furniture
 from assets.making.render import Renderer
 from assets.making.shapes import rotation_about
 from assets.making.world import ENLARGED, Placed, assemble, bounds
-from langsplat_core.bench.measure import markdown
 from langsplat_core.datasets import sfm
 from langsplat_core.datasets.capture import find_photos
+from langsplat_core.extensions.benchmarks.measure import markdown
 from langsplat_core.progress import Progress, TerminalProgress, silent
 from langsplat_core.scene import Camera, look_at
 

@@ -17,7 +17,7 @@ from tyro.extras import get_parser
 
 from langsplat_core import __version__
 from langsplat_core.cli import scenes
-from langsplat_core.cli.app import COMMANDS, GROUPS, entry, load_command, parse
+from langsplat_core.cli.app import command_names, entry, load_command, parse
 from langsplat_core.cli.scenes import Doctor
 from langsplat_core.errors import InputError
 from langsplat_viewer.program import ViewerCommand
@@ -28,8 +28,7 @@ from tests.support.processes import bound_by_permissions
 
 EVERY = {
     "viewer": ViewerCommand,
-    **{name: load_command(where) for name, where in COMMANDS.items()},
-    **{f"{group} {name}": load_command(at) for group in GROUPS for name, at in GROUPS[group][1].items()},
+    **{name: load_command(name) for name in command_names()},
 }
 
 

@@ -12,9 +12,10 @@ import pytest
 from PIL import Image
 from plyfile import PlyData
 
-from langsplat_core.cli import describe, find, query
+from langsplat_core.cli import describe, query
 from langsplat_core.cli.edit import Scale
 from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.extensions.library import commands as find
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster import load_rasterizer

@@ -17,8 +17,8 @@ import zstandard
 from PIL import EpsImagePlugin, Image
 
 from langsplat_core.datasets.capture import find_photos, read_photo
+from langsplat_core.extensions.checkpoints.features import read_part
 from langsplat_core.io.cameras import read_cameras
-from langsplat_core.io.foreign_language import read_part
 from langsplat_core.io.hostile import (
     MOST_PIXELS,
     PictureError,
@@ -30,7 +30,7 @@ from langsplat_core.io.hostile import (
 )
 from langsplat_core.io.ply import read_ply
 from langsplat_core.io.ply_table import GREY, read_cloud
-from langsplat_core.io.scenes import FORMATS, load_gaussians
+from langsplat_core.io.scenes import formats, load_gaussians
 from langsplat_core.io.sidecar import read_language, write_language
 from langsplat_core.io.spz import read_spz_scene
 from langsplat_core.pipeline.stages import read_arrays
@@ -452,7 +452,7 @@ def test_a_few_mutants(tmp_path: Path, name: str) -> None:
 
 
 def test_every_scene_format_is_among_the_kinds() -> None:
-    assert {row.suffix for row in FORMATS} <= {Path(kind.file).suffix for kind in KINDS.values()}
+    assert {row.suffix for row in formats()} <= {Path(kind.file).suffix for kind in KINDS.values()}
 
 
 @pytest.mark.long

@@ -14,9 +14,9 @@ from langsplat_core.errors import InputError
 from langsplat_core.io.cameras import read_cameras, write_cameras
 from langsplat_core.io.ply import write_ply
 from langsplat_core.io.scenes import (
-    FORMATS,
     LOSSES,
     companion_path,
+    formats,
     load_gaussians,
     load_scene,
     load_without_language,
@@ -72,7 +72,7 @@ def spoilt(got: Scene, want: Scene) -> set[str]:
 
 
 @pytest.mark.parametrize("degree", range(1, 4))
-@pytest.mark.parametrize("row", [row for row in FORMATS if row.write], ids=lambda row: row.suffix)
+@pytest.mark.parametrize("row", [row for row in formats() if row.write], ids=lambda row: row.suffix)
 def test_a_scene_comes_back_but_for_what_its_format_loses(tmp_path, row, degree):
     want = replace(full_scene(), gaussians=random_gaussians(N, sh_degree=degree), antialiased=True)
     want = replace(want, extras=random_extras(N), metres_per_unit=1 / 3)
@@ -88,7 +88,7 @@ def test_a_scene_comes_back_but_for_what_its_format_loses(tmp_path, row, degree)
     np.testing.assert_array_equal(load_gaussians(tmp_path / f"again{row.suffix}").means, got.gaussians.means)
 
 
-@pytest.mark.parametrize("row", [row for row in FORMATS if not row.write], ids=lambda row: row.suffix)
+@pytest.mark.parametrize("row", [row for row in formats() if not row.write], ids=lambda row: row.suffix)
 def test_formats_that_are_not_written(tmp_path, row):
     with pytest.raises(InputError, match=r"scenes are written as \.ply, \.spz, \.splat"):
         save_scene(tmp_path / f"scene{row.suffix}", full_scene())

@@ -35,7 +35,7 @@ from assets.making.vocabulary import Label, phrase_book
 from assets.making.world import World
 from langsplat_core.config import PictureConfig
 from langsplat_core.errors import EncoderError
-from langsplat_core.evaluation.report import intersection_over_union
+from langsplat_core.extensions.benchmarks.report import intersection_over_union
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import Cancelled, Progress, Report, silent
 from langsplat_core.query.answers import peak_pixel, splatted_relevancy

@@ -23,7 +23,7 @@ from langsplat_core.cli.run import main
 from langsplat_core.config import numeric_settings
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.errors import InputError
-from langsplat_core.evaluation.labels import Outlines, read_3d_ovs, read_lerf_ovs
+from langsplat_core.extensions.benchmarks.labels import Outlines, read_3d_ovs, read_lerf_ovs
 from langsplat_core.progress import silent
 from langsplat_core.scene import CANONICAL_PHRASES, look_at
 

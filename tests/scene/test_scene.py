@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from langsplat_core import render
 from langsplat_core.arrays import logit, psnr, rotation_matrices, sigmoid, unit
-from langsplat_core.bench.query import repeated
 from langsplat_core.errors import InputError
+from langsplat_core.extensions.benchmarks.query_speed import repeated
 from langsplat_core.progress import Cancelled
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import NO_NODE, Camera, Gaussians, Odds, Scene, Tree

@@ -22,7 +22,7 @@ from torch.nn import functional
 from transformers import CLIPTokenizer
 
 from langsplat_core.errors import EncoderError, InputError
-from langsplat_core.semantics import layouts
+from langsplat_core.extensions.checkpoints import weight_layouts as layouts
 from langsplat_core.semantics.encoders import CLIP_MEAN, CLIP_STD, load_encoder, load_text_encoder
 from langsplat_core.semantics.sam import load_segmenter
 from langsplat_core.semantics.weights import COUNTS, SIDES

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-import langsplat_core.pipeline.importing  # noqa: F401  which imports torch
+import langsplat_core.extensions.checkpoints.importing  # noqa: F401  which imports torch
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.export import Convert
 from langsplat_core.cli.run import main

@@ -16,8 +16,8 @@ from langsplat_core.datasets.capture import Capture, read_photo
 from langsplat_core.datasets.colmap import load_colmap
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.display.displays import latent_colours
+from langsplat_core.extensions.checkpoints.methods import read_foreign
 from langsplat_core.io.cameras import read_cameras, write_cameras
-from langsplat_core.io.foreign import read_foreign
 from langsplat_core.io.gltf import write_gltf
 from langsplat_core.io.hostile import picture_size
 from langsplat_core.io.scenes import load_scene

@@ -26,7 +26,7 @@ from imgui_bundle import imgui, immapp
 from imgui_bundle.glfw_utils import glfw_window_hello_imgui
 
 import glfw  # isort: skip
-from langsplat_core.bench.query import repeated
+from langsplat_core.extensions.benchmarks.query_speed import repeated
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer import canvas

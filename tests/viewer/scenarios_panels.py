@@ -11,6 +11,7 @@ from PIL import Image
 from imgui_bundle import imgui  # isort: skip
 from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
 import glfw  # isort: skip
+from langsplat_core.extensions.library import panel as library_panel
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_viewer import viewer as training
@@ -18,7 +19,7 @@ from langsplat_viewer.actions import browsing, filming, opening, selecting, sett
 from langsplat_viewer.commands import COMMANDS
 from langsplat_viewer.files.preferences import with_recent
 from langsplat_viewer.files.projects import read_flight
-from langsplat_viewer.panels.layout import PANELS, button_label
+from langsplat_viewer.panels.layout import all_panels, button_label
 from langsplat_viewer.panels.ui import scene_area
 from tests.support.fakes import CENTRES, PER_BLOB, as_trained, blob_scene, cameras, named_scene
 
@@ -118,11 +119,11 @@ def search_a_library(s: Any) -> None:
     browsing.open_typed(viewer)
     s.ctx.yield_(3)
     s.ctx.item_click("//**/Take this folder")
-    s.until(lambda: s.state.library is not None)
-    assert len(s.state.library.hits) == 2
-    browsing.ask_library(viewer, "plant")
-    s.until(lambda: s.state.library.phrase == "plant")
-    hits = [(hit.path.name, hit.verdict) for hit in s.state.library.hits]
+    s.until(lambda: library_panel.library_view(viewer) is not None)
+    assert len(library_panel.library_view(viewer).hits) == 2
+    library_panel.ask_library(viewer, "plant")
+    s.until(lambda: library_panel.library_view(viewer).phrase == "plant")
+    hits = [(hit.path.name, hit.verdict) for hit in library_panel.library_view(viewer).hits]
     assert hits == [("named.ply", "found"), ("mug.ply", "not here")]
     s.ctx.item_click("//**/$$0/##scene")
     s.shows("named.ply")
@@ -173,7 +174,7 @@ def large_letters(s: Any) -> None:
     settings.set_ui_scale(s.viewer, 2.0)
     s.settle()
     assert 1.3 * narrow < scene_area().left <= 0.41 * 1280
-    for panel in PANELS:
+    for panel in all_panels():
         s.open_panel(panel.title)
         items = imgui.test_engine.TestItemList()
         s.ctx.gather_items(items, f"//{panel.title}")

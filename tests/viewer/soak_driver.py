@@ -26,7 +26,7 @@ from langsplat_core.scene import Scene
 from langsplat_viewer.actions import browsing, editing, opening, queries, settings
 from langsplat_viewer.commands import COMMANDS
 from langsplat_viewer.jobs import give_memory_back
-from langsplat_viewer.panels.layout import PANELS
+from langsplat_viewer.panels.layout import all_panels
 from langsplat_viewer.rendering.renderer import Backend, GlRenderer
 from langsplat_viewer.rendering.request import Clip, Splats
 from langsplat_viewer.state import memory_bytes
@@ -176,7 +176,7 @@ class Soak:
             lambda: settings.set_splats(viewer, Splats(rng.uniform(0.1, 1), rng.randrange(4))),
             lambda: settings.set_clip(viewer, Clip(rng.uniform(0, 3), rng.uniform(5, 9))),
             lambda: settings.set_ui_scale(viewer, rng.choice((0.8, 1.0, 1.5))),
-            lambda: settings.open_panel(viewer, rng.choice(PANELS).title),
+            lambda: settings.open_panel(viewer, rng.choice(all_panels()).title),
             lambda: queries.set_canonical(viewer, ""),
             lambda: editing.undo(viewer),
         )

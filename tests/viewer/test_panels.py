@@ -14,7 +14,7 @@ from langsplat_viewer.actions import queries, settings, viewpoint
 from langsplat_viewer.commands import COMMANDS, PANEL_TITLES, matching
 from langsplat_viewer.files import preferences
 from langsplat_viewer.panels import layout, ui
-from langsplat_viewer.panels.layout import PANELS
+from langsplat_viewer.panels.layout import all_panels
 from langsplat_viewer.panels.navigation import chord
 from langsplat_viewer.panels.ui import elided
 from langsplat_viewer.state import MAX_MESSAGES
@@ -81,7 +81,7 @@ def test_every_key_does_one_thing_and_is_understood_and_letters_are_plain():
 
 
 def test_every_panel_can_be_opened_by_a_command(viewer):
-    assert tuple(panel.title for panel in PANELS) == PANEL_TITLES
+    assert tuple(panel.title for panel in all_panels()) == PANEL_TITLES
     for title in PANEL_TITLES:
         (command,) = matching(f"panel: {title}")
         command.act(viewer)

@@ -1,22 +1,15 @@
-"""The file browser, dropped files, recent scenes, libraries; and training from photographs."""
+"""The file browser, dropped files, recent scenes; and training from photographs."""
 
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
-from typing import Literal
-
-import numpy as np
 
 from langsplat_core.errors import InputError
 from langsplat_core.io import cameras, sidecar
 from langsplat_core.io.scenes import format_of
 from langsplat_core.pipeline.forecast import count_photographs
 from langsplat_core.pipeline.report import work_folder
-from langsplat_core.progress import Progress
-from langsplat_core.query.finding import Answered, Hit, find
-from langsplat_core.query.library import Library, update_library
 from langsplat_viewer.actions import projects
 from langsplat_viewer.actions.filming import load_path
 from langsplat_viewer.actions.opening import (
@@ -27,87 +20,15 @@ from langsplat_viewer.actions.opening import (
     reload,
     return_to,
 )
-from langsplat_viewer.actions.queries import ask, load_queries
+from langsplat_viewer.actions.queries import load_queries
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.files import disk
 from langsplat_viewer.files.disk import Entry, Stamps, list_folder
 from langsplat_viewer.files.preferences import with_photographs
 from langsplat_viewer.files.projects import PATHS, PROJECTS, QUERIES, read_project, scene_of
 from langsplat_viewer.jobs import one_line
-from langsplat_viewer.state import LibraryView
+from langsplat_viewer.state import FolderChoice
 from langsplat_viewer.viewer import Training, TrainingRequest, Viewer
-
-# The library: all scenes of a folder, searched by their index.
-
-MOST_HITS = 200  # scenes that the panel lists
-
-
-def ask_for_folder(viewer: Viewer, purpose: Literal["library", "dataset"]) -> None:
-    """Open the browser to choose a folder of scenes, or one to train on."""
-    ask_for_file(viewer)
-    viewer.state.picks_folder = purpose
-
-
-def choose_folder(viewer: Viewer, folder: Path) -> None:
-    state = viewer.state
-    if state.picks_folder == "library":
-        open_library(viewer, folder)
-    elif state.picks_folder == "dataset":
-        state.browser, state.training_form = None, replace(state.training_form, dataset=str(folder))
-    else:
-        choose_photograph_folder(viewer, folder)
-
-
-def open_library(viewer: Viewer, folder: Path) -> None:
-    """Read the index of a folder, and the scenes that are new there, in the background."""
-    viewer.state.browser, load = None, lru_cache(maxsize=1)(viewer.services.load_encoder)
-
-    def done(library: Library) -> None:
-        hits = [Hit(folder / scene.path, "not here", 0.0, None) for scene in library.scenes]
-        _show_hits(viewer, LibraryView(library, load, said=f"{len(hits)} scenes"), hits)
-        for scene in library.unread:
-            viewer.say_error(f"{scene.path}: {scene.unread}")
-        open_panel(viewer, "Library")
-
-    def work(progress: Progress) -> Library:
-        return update_library(folder, load_encoder=load, progress=progress)
-
-    viewer.run(f"reading the scenes of {folder.name}", work, done)
-
-
-def ask_library(viewer: Viewer, phrase: str) -> None:
-    """Rank the scenes of the library by how certain it is that they have what a phrase names."""
-    view = viewer.state.library
-    if view is None or not phrase.strip():
-        return
-    library, phrase = view.library, phrase.strip()
-
-    def done(answers: list[Answered]) -> None:
-        hits = sorted((hit for each in answers for hit in each.hits), key=lambda hit: -hit.margin)
-        found = sum(hit.verdict == "found" for hit in hits)
-        problems = [each.problem for each in answers if each.problem]
-        said = "; ".join([f"'{phrase}': found in {found} of {len(hits)} scenes", *problems])
-        _show_hits(viewer, replace(view, phrase=phrase, said=said), hits)
-
-    def work(progress: Progress) -> list[Answered]:
-        return find(library, phrase, view.load_encoder, 0, progress)
-
-    viewer.run(f"searching '{phrase}' in {len(library.scenes)} scenes", work, done)
-
-
-def _show_hits(viewer: Viewer, view: LibraryView, hits: Sequence[Hit]) -> None:
-    listed, pictures = tuple(hits[:MOST_HITS]), view.library.thumbnails or {}
-    names = [hit.path.relative_to(view.library.folder).as_posix() for hit in listed]
-    image = np.concatenate([pictures[name] for name in names]) if names else None
-    viewer.state.library = replace(view, hits=listed, thumbnails=image)
-
-
-def open_hit(viewer: Viewer, hit: Hit) -> None:
-    """Open a scene of the library, and search it for what was looked for in all of them."""
-    view = viewer.state.library
-    phrase = "" if view is None else view.phrase
-    open_scene(viewer, hit.path, lambda viewer: ask(viewer, phrase))
-
 
 # The file browser, typed paths, files dropped onto the window, and recent scenes.
 
@@ -119,7 +40,20 @@ def ask_for_file(viewer: Viewer) -> None:
     """Open the browser in the folder of the scene that is shown."""
     state = viewer.state
     browse(viewer, (Path.cwd() if state.path is None else state.path.parent).absolute())
-    state.picks_folder, state.picks_beside = "", False
+    state.picks_folder, state.picks_beside = None, False
+
+
+def ask_for_folder(viewer: Viewer, choice: FolderChoice) -> None:
+    """Open the browser to choose a folder."""
+    ask_for_file(viewer)
+    viewer.state.picks_folder = choice
+
+
+def choose_folder(viewer: Viewer, folder: Path) -> None:
+    """Close the browser and give the folder to whoever asked for it."""
+    choice, viewer.state.browser = viewer.state.picks_folder, None
+    if choice is not None:
+        choice.then(viewer, folder)
 
 
 def ask_for_beside(viewer: Viewer) -> None:
@@ -246,18 +180,26 @@ def ask_for_photographs(viewer: Viewer) -> None:
     state = viewer.state
     if state.path is not None:
         browse(viewer, Path(photograph_folder(viewer) or state.path.parent).absolute())
-        state.picks_folder = "photographs"
+        state.picks_folder = FolderChoice("Folder of the photographs", _take_photographs)
 
 
-def choose_photograph_folder(viewer: Viewer, folder: Path) -> None:
-    """Set the folder of this scene's photographs, and remember it."""
+def _take_photographs(viewer: Viewer, folder: Path) -> None:
     state = viewer.state
-    state.browser = None
     if state.path is not None:
         state.preferences = with_photographs(state.preferences, state.path.absolute(), folder.absolute())
 
 
 # Training a scene from photographs, in a process of its own.
+
+
+def ask_for_dataset(viewer: Viewer) -> None:
+    """Open the browser to choose the photographs to train on."""
+
+    def take(viewer: Viewer, folder: Path) -> None:
+        viewer.state.training_form = replace(viewer.state.training_form, dataset=str(folder))
+
+    ask_for_folder(viewer, FolderChoice("Photographs to train on", take))
+
 
 WARNING = "warning: "  # before each doubt that `langsplat train` ends with
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from imgui_bundle import ImVec2, ImVec4, hello_imgui, icons_fontawesome_6, imgui
 
-from langsplat_core import __version__
+from langsplat_core import __version__, registry
 from langsplat_viewer.actions import browsing, filming, opening, settings, viewpoint
 from langsplat_viewer.commands import COMMANDS, HELD, LETTERS_MENU, MENUS, Command, in_menu, matching
 from langsplat_viewer.panels import layout, outline, overlays, scene, search, select, ui, view
@@ -263,7 +263,7 @@ class Panel:
     is_open: bool = True  # until it is opened or closed
 
 
-PANELS: tuple[Panel, ...] = (
+CORE_PANELS: tuple[Panel, ...] = (
     Panel("Search", LEFT, search.draw),
     Panel("Display", MIDDLE, view.draw_display),
     Panel("Camera", MIDDLE, view.draw_camera),
@@ -271,7 +271,6 @@ PANELS: tuple[Panel, ...] = (
     Panel("Outline", MIDDLE, outline.draw, is_open=False),
     Panel("Select", MIDDLE, select.draw, is_open=False),
     Panel("Transform", MIDDLE, select.draw_transform, is_open=False),
-    Panel("Library", MIDDLE, scene.draw_library, is_open=False),
     Panel("Train", MIDDLE, scene.draw_training, is_open=False),
     Panel("Record", MIDDLE, view.draw_record, is_open=False),
     Panel("Bookmarks", MIDDLE, view.draw_bookmarks, is_open=False),
@@ -280,6 +279,11 @@ PANELS: tuple[Panel, ...] = (
     Panel("Notes", MIDDLE, view.draw_notes, is_open=False),
     Panel("Timing", MIDDLE, draw_timing, is_open=False),
 )
+
+
+def all_panels() -> tuple[Panel, ...]:
+    """Return the panels of the window, the project's own and then those of extensions."""
+    return (*CORE_PANELS, *registry.parts("panels").values())
 
 
 def params(viewer: Viewer, width: float) -> hello_imgui.DockingParams:
@@ -291,7 +295,7 @@ def params(viewer: Viewer, width: float) -> hello_imgui.DockingParams:
         hello_imgui.DockingSplit(LEFT, FOOT, imgui.Dir.down, FOOT_SHARE),
         hello_imgui.DockingSplit(LEFT, MIDDLE, imgui.Dir.down, MIDDLE_SHARE),
     ]
-    docking.dockable_windows = [_window(viewer, panel) for panel in PANELS]
+    docking.dockable_windows = [_window(viewer, panel) for panel in all_panels()]
     # The scene itself is no panel: nothing is docked over it.
     docking.main_dock_space_node_flags = (
         imgui.DockNodeFlags_.passthru_central_node | imgui.DockNodeFlags_.no_docking_over_central_node
@@ -312,7 +316,7 @@ def show_wanted(viewer: Viewer) -> None:
     """Open the panel that an action wants seen, in front of those it shares its place with."""
     title, docking = settings.take_wanted_panel(viewer), hello_imgui.get_runner_params().docking_params
     titles = viewer.state.shows_panels
-    for window in docking.dockable_windows if any(panel.title in titles for panel in PANELS) else ():
+    for window in docking.dockable_windows if any(panel.title in titles for panel in all_panels()) else ():
         window.is_visible = window.label in titles
     settings.put(viewer.state, shows_panels=())
     docking.layout_reset |= settings.take_panel_reset(viewer)

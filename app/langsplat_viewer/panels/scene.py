@@ -1,4 +1,4 @@
-"""Files: the panels "Scene", "Train" and "Library", the file browser, the questions before files are lost."""
+"""Files: the panels "Scene" and "Train", the file browser, the questions before files are lost."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,12 +8,9 @@ from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_core.config import TrainPreset
 from langsplat_core.io.scenes import format_of
-from langsplat_core.query.finding import Hit
-from langsplat_core.query.library import THUMBNAIL
 from langsplat_viewer.actions import browsing, filming, opening, projects, selecting, settings
 from langsplat_viewer.files.disk import Entry, Listing
 from langsplat_viewer.panels import ui
-from langsplat_viewer.state import LibraryView
 from langsplat_viewer.viewer import Training, Viewer
 
 
@@ -71,13 +68,6 @@ def _figures(viewer: Viewer) -> str:
 
 # The file browser.
 
-BESIDE = "Scene to compare with"
-TITLES = {
-    "": "Open a scene",
-    "photographs": "Folder of the photographs",
-    "library": "Folder of scenes",
-    "dataset": "Photographs to train on",
-}
 WIDTH_EM, HEIGHT_EM = 40.0, 30.0
 UNITS = ("bytes", "kB", "MB", "GB", "TB")
 
@@ -85,7 +75,9 @@ UNITS = ("bytes", "kB", "MB", "GB", "TB")
 def draw_browser(viewer: Viewer) -> None:
     """Draw the browser: a box for a path, the folders above, what is in this one, and recent scenes."""
     listing = viewer.state.browser
-    title = BESIDE if viewer.state.picks_beside else TITLES[viewer.state.picks_folder]
+    choice = viewer.state.picks_folder
+    title = "Scene to compare with" if viewer.state.picks_beside else "Open a scene"
+    title = title if choice is None else choice.title
     _ask_for_popup(title, listing is not None)
     imgui.set_next_window_size(ui.fitting(WIDTH_EM, HEIGHT_EM), imgui.Cond_.appearing)
     shown, stays = imgui.begin_popup_modal(title, True, imgui.WindowFlags_.no_saved_settings)
@@ -297,7 +289,7 @@ def _form(viewer: Viewer) -> None:
         form, dataset=_text_box("Photographs", "a folder, a COLMAP project, transforms.json", form.dataset)
     )
     if imgui.button("Browse ..."):
-        browsing.ask_for_folder(viewer, "dataset")
+        browsing.ask_for_dataset(viewer)
     form = replace(form, out=_text_box("Scene", "scene.ply", form.out))
     form = replace(form, encoder=_text_box("Encoder", '"demo", or a folder or hub id of CLIP', form.encoder))
     preset = ui.radio({name: name for name in PRESETS}, form.preset, PRESETS)
@@ -339,62 +331,3 @@ def _running(viewer: Viewer, process: Training) -> None:
         browsing.look_at_training(viewer)
     for line in progress.said[-3:]:
         ui.small_wrapped(line, ui.muted())
-
-
-# The panel "Library": the scenes of a folder with thumbnails, ranked by a phrase.
-
-THUMBNAIL_EM = 3.6  # of a thumbnail
-
-
-_thumbnails = ui.Picture(shrinks=False)  # all of the list, one below the other
-
-
-def draw_library(viewer: Viewer) -> None:
-    """Draw the folder, the box for a phrase and the list."""
-    view = viewer.state.library
-    if ui.button(
-        "Folder ...", "Search all scenes of a folder and the folders in it. An index of them is kept there"
-    ):
-        browsing.ask_for_folder(viewer, "library")
-    if view is None:
-        return
-    imgui.same_line()
-    imgui.align_text_to_frame_padding()
-    name = str(view.library.folder)
-    imgui.text_colored(ui.muted(), ui.elided(name, imgui.get_content_region_avail().x))
-    ui.tip(name)
-    hint = "what to look for in all of them"
-    entered, typed = ui.box("##library", hint, viewer.state.library_typed)
-    settings.put(viewer.state, library_typed=typed)
-    if entered:
-        browsing.ask_library(viewer, typed)
-    ui.small_wrapped(view.said, ui.muted())
-    if imgui.begin_child("library"):
-        for row, hit in enumerate(view.hits):
-            imgui.push_id(row)
-            _hit(viewer, view, row, hit)
-            imgui.pop_id()
-    imgui.end_child()
-
-
-def _hit(viewer: Viewer, view: LibraryView, row: int, hit: Hit) -> None:
-    """A thumbnail, the scene's name and its verdict; a click anywhere opens the scene."""
-    height = hello_imgui.em_size(THUMBNAIL_EM)
-    width, count = height * THUMBNAIL[0] / THUMBNAIL[1], len(view.hits)
-    start = imgui.get_cursor_pos()
-    if imgui.selectable("##scene", hit.path == viewer.state.path, size=ImVec2(0, height))[0]:
-        browsing.open_hit(viewer, hit)
-    ui.tip(str(hit.path))
-    imgui.set_cursor_pos(start)
-    if view.thumbnails is not None and view.thumbnails.size:
-        texture = _thumbnails.texture(view.thumbnails)
-        ends = ImVec2(0, row / count), ImVec2(1, (row + 1) / count)
-        imgui.image(imgui.ImTextureRef(texture.glo), ImVec2(width, height), *ends)
-    imgui.same_line()
-    imgui.begin_group()
-    room = imgui.get_content_region_avail().x
-    imgui.text(ui.elided(hit.path.relative_to(view.library.folder).as_posix(), room))
-    if view.phrase:
-        sure = "" if hit.probability is None else f" ({100 * hit.probability:.0f} %)"
-        imgui.text_colored(ui.good() if hit.verdict == "found" else ui.muted(), hit.verdict + sure)
-    imgui.end_group()

@@ -1,0 +1,5 @@
+"""Scenes that answer an agent, by the Model Context Protocol."""
+
+from langsplat_core.registry import Extension
+
+EXTENSION = Extension(commands={"serve": "langsplat_core.extensions.agents.commands:Serve"})

@@ -1,0 +1,222 @@
+"""`langsplat serve --mcp`: scenes answer an agent, by the Model Context Protocol over standard streams."""
+
+import io
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import wraps
+from pathlib import Path
+from threading import Lock
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+
+import numpy as np
+import tyro
+from PIL import Image
+
+from langsplat_core.arrays import Array
+from langsplat_core.cli.describe import outline_lines, outline_of
+from langsplat_core.cli.query import camera_of, unit_of
+from langsplat_core.cli.run import EncoderOption
+from langsplat_core.errors import InputError, LangSplatError
+from langsplat_core.extensions.library.index import scenes_in
+from langsplat_core.progress import silent
+from langsplat_core.query.answers import QueryResult
+from langsplat_core.query.compose import body, count_things, gap, run_phrase, separate, upright
+from langsplat_core.query.describe import Describer
+from langsplat_core.query.engine import QueryEngine, searchable
+from langsplat_core.raster.render import render
+from langsplat_core.scene import LEVELS, Camera, Scene
+from langsplat_core.scene.camera import look_at
+from langsplat_core.semantics.encoders import load_text_encoder
+
+if TYPE_CHECKING:
+    from mcp.server import MCPServer
+
+INSTRUCTIONS = (
+    "Trained 3D scenes that can be searched with words. A verdict of 'not here' or 'weak match' is meant: do "
+    "not report such a thing as there. Nothing is changed by any tool."
+)
+MOST_SIDE = 1024  # px of an image that is sent
+SIZE = (640, 480)  # px of an image towards a thing, where the scene has no cameras
+BACK = 2.2  # half diagonals of a thing's box: how far from it such a camera stands
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Serve:
+    """Let an agent ask scenes: find, count, measure, describe, look. Nothing is changed."""
+
+    scene: tyro.conf.Positional[Path]
+    """A trained scene, *.ply with its language field beside it, or a folder of such."""
+    mcp: bool = False
+    """Speak the Model Context Protocol on standard input and output; started by the agent's program."""
+    encoder: EncoderOption = ""
+
+    def run(self) -> None:
+        if not self.mcp:
+            raise InputError("say how: --mcp is the Model Context Protocol, on standard input and output")
+        build_server(Door(scene_files(self.scene), self.encoder)).run("stdio")
+
+
+def scene_files(place: Path) -> dict[str, Path]:
+    """Searchable scenes by name: of a folder all of it, named by their path in it. InputError for none."""
+    if not place.is_dir():
+        return {place.name: place}
+    found = {str(path.relative_to(place)): path for path in scenes_in(place)}
+    if not found:
+        raise InputError(f"{place}: no scene with a language field in it; `langsplat train` makes one")
+    return found
+
+
+class Door:
+    """What an agent may ask of some scenes. Answers are ready for JSON, lengths in metres where the scene
+    says how long its unit is. One question at a time; scenes and encoders are kept once they are loaded."""
+
+    def __init__(self, scenes: dict[str, Path], encoder: str = "") -> None:
+        self._scenes, self._encoder_id = scenes, encoder
+        self._engines: dict[str, QueryEngine] = {}
+
+    def scenes(self) -> list[str]:
+        """The names of the scenes that can be asked."""
+        return list(self._scenes)
+
+    def find(self, phrase: str, scene: str = "") -> dict[str, Any]:
+        """Where something is: a phrase such as 'red mug', 'handle of the mug' or 'book on the table'. The
+        verdict is 'found', 'weak match' or 'not here'; place is the middle of the best one, box its
+        corners."""
+        engine = self._engine(scene)
+        composed = run_phrase(engine, phrase, viewpoint=_first(engine.scene))
+        answer, unit = composed.answer, unit_of(engine.scene)
+        there = answer.found or answer.verdict == "weak match"
+        return {
+            "verdict": answer.verdict,
+            "probability": answer.probability,
+            "read_as": composed.reading,
+            "level": LEVELS[answer.level],
+            "place": _lengths(answer.place, unit.length) if there else None,
+            "box": _lengths(answer.box, unit.length) if there else None,
+            "unit": unit.name,
+            "answers_stand_on": engine.basis.long,
+        }
+
+    def count(self, phrase: str, scene: str = "") -> dict[str, Any]:
+        """How many there are of something, with the least and most there may be; 0 where it is not found."""
+        engine = self._engine(scene)
+        answer = run_phrase(engine, phrase, viewpoint=_first(engine.scene)).answer
+        number = count_things(engine, answer) if answer.found else None
+        counts = (0, 0, 0) if number is None else (number.best, number.least, number.most)
+        return dict(zip(("count", "least", "most"), counts, strict=True)) | {"verdict": answer.verdict}
+
+    def distance(self, first: str, second: str, scene: str = "") -> dict[str, Any]:
+        """How far apart the nearest points of two things are, each named by a phrase."""
+        engine = self._engine(scene)
+        frame, unit = upright(engine.scene.up()), unit_of(engine.scene)
+        bodies = []
+        for phrase in (first, second):
+            answer = self._found(engine, phrase)
+            parts = separate(engine.surface, answer.members[engine.surface.rows], engine.tree)
+            bodies.append([body(engine.surface.positions[part], frame) for part in parts])
+        if not all(bodies):
+            raise InputError("what was found has no surface to measure from; ask for something larger")
+        least = min(gap(one, other) for one in bodies[0] for other in bodies[1])
+        return {"distance": unit.length * least, "unit": unit.name}
+
+    def describe(self, scene: str = "") -> str:
+        """What is in a scene: an outline of its things with their parts, sizes and counts."""
+        engine = self._engine(scene)
+        lines = outline_lines(outline_of(Describer(engine, None, silent)), unit_of(engine.scene))
+        return "\n".join([*lines, f"answers: {engine.basis.long}"])
+
+    def look(self, phrase: str = "", camera: int = 0, scene: str = "") -> Array:
+        """(H, W, 3) uint8 image: towards the best of what a phrase finds, else as a camera of the scene sees
+        it."""
+        engine = self._engine(scene)
+        scene_of = engine.scene
+        if phrase:
+            view = towards(scene_of, self._found(engine, phrase))
+        else:
+            view = camera_of(scene_of, camera) if scene_of.cameras else scene_of.framing_camera(SIZE)
+        colours = render(scene_of, view.within(MOST_SIDE)).colours
+        return np.round(255 * np.clip(colours, 0, 1)).astype(np.uint8)
+
+    def _engine(self, name: str) -> QueryEngine:
+        if not name and len(self._scenes) == 1:
+            name = next(iter(self._scenes))
+        if name not in self._scenes:
+            known = ", ".join(list(self._scenes)[:5]) + (", ..." if len(self._scenes) > 5 else "")
+            raise InputError(f"scene {name!r} is not among these {len(self._scenes)}: {known}")
+        if name not in self._engines:
+            scene = searchable(self._scenes[name])
+            self._engines[name] = QueryEngine(scene, load_text_encoder, encoder_id=self._encoder_id)
+        return self._engines[name]
+
+    def _found(self, engine: QueryEngine, phrase: str) -> QueryResult:
+        answer = run_phrase(engine, phrase, viewpoint=_first(engine.scene)).answer
+        if not answer.found:
+            raise InputError(f"'{phrase}': {answer.verdict}")
+        return answer
+
+
+def _first(scene: Scene) -> Camera | None:
+    return scene.cameras[0] if scene.cameras else None
+
+
+def _lengths(values: Array | None, length: float) -> Any:
+    return None if values is None else np.round(length * values, 4).tolist()
+
+
+def towards(scene: Scene, answer: QueryResult) -> Camera:
+    """The camera of the scene that shows most of the best of an answer, counted by pixels of its box; without
+    one a new camera."""
+    assert answer.box is not None
+    low, high = answer.box
+    corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
+    if not scene.cameras:
+        middle, reach = (low + high) / 2, BACK * float(np.linalg.norm(high - low)) / 2
+        away = scene.framing_camera(SIZE).position - middle
+        return look_at(
+            middle + reach * away / max(float(np.linalg.norm(away)), 1e-9), middle, scene.up(), SIZE
+        )
+
+    def seen(camera: Camera) -> float:
+        pixels, depths = camera.project(corners)
+        if (depths <= 0).any():
+            return 0.0
+        inside = np.clip(pixels, 0, (camera.width, camera.height))
+        return float(np.prod(inside.max(0) - inside.min(0)) / (camera.width * camera.height))
+
+    return max(scene.cameras, key=seen)
+
+
+def build_server(door: Door) -> "MCPServer[Any]":
+    """The door as tools of the protocol. A question that cannot be answered is a tool error of one line."""
+    from mcp.server import MCPServer
+    from mcp.server.mcpserver import Image as Picture
+    from mcp.server.mcpserver.exceptions import ToolError
+    from mcp_types import ToolAnnotations
+
+    server: MCPServer[Any] = MCPServer("langsplat", instructions=INSTRUCTIONS, log_level="ERROR")
+    turn = Lock()
+
+    def guarded(ask: Callable[P, T]) -> Callable[P, T]:
+        @wraps(ask)
+        def asked(*args: P.args, **kwargs: P.kwargs) -> T:
+            try:
+                with turn:
+                    return ask(*args, **kwargs)
+            except (LangSplatError, OSError, MemoryError) as error:
+                raise ToolError(str(error)) from None
+
+        return asked
+
+    def look(phrase: str = "", camera: int = 0, scene: str = "") -> Picture:
+        encoded = io.BytesIO()
+        Image.fromarray(door.look(phrase, camera, scene)).save(encoded, "PNG")
+        return Picture(data=encoded.getvalue(), format="png")
+
+    look.__doc__ = (Door.look.__doc__ or "").replace("(H, W, 3) uint8 image", "An image")
+    hints = ToolAnnotations(read_only_hint=True, destructive_hint=False, open_world_hint=False)
+    for ask in (door.scenes, door.find, door.count, door.distance, door.describe, look):
+        server.tool(annotations=hints)(guarded(ask))
+    return server

@@ -1,0 +1,382 @@
+"""The protocols, each one frozen value that pins every constant and says where it is from; how each turns
+maps, drawn selections or the engine's own answer into a mask and a place; and who answers.
+
+Figures of one benchmark differ by ten points between protocols, so a figure belongs to a profile. Nothing
+here depends on a label: a profile is chosen by name, and no threshold is searched.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+from scipy.ndimage import uniform_filter
+
+from langsplat_core.arrays import Array
+from langsplat_core.config import PictureConfig
+from langsplat_core.errors import FormatError
+from langsplat_core.extensions.benchmarks.labels import Size, check_same_image, read_grey
+from langsplat_core.io.hostile import opened, read_npy
+from langsplat_core.query.answers import QueryResult, decoded_relevancy, peak_pixel, splatted_relevancy
+from langsplat_core.query.engine import QueryEngine
+from langsplat_core.raster.protocol import View
+from langsplat_core.raster.render import render, view_of
+from langsplat_core.scene import LEVELS, Camera
+
+Border = Literal["mirror", "inside"]  # cv2's reflect101; the mean of what lies inside the image
+LevelRule = Literal["peak", "inside"]  # the highest map; the highest mean inside its own mask
+# "clipped": LangSplat's loop, which never counts the last row and column; "inside": V2's.
+Vote = Literal["none", "clipped", "inside"]
+Benchmark = Literal["lerf-ovs", "3d-ovs"]
+LerfProtocol = Literal["langsplat-code", "langsplat-paper", "langsplat-v2", "direct-3d", "ours"]
+OvsProtocol = Literal["langsplat-paper", "direct-3d", "ours"]
+
+
+@dataclass(frozen=True)
+class MapRule:
+    """A rule that turns relevancy maps, one per level, into a mask and a peak."""
+
+    window: int  # px, mean filter of the map that is cut; 1: none
+    raw_share: float  # of the unfiltered map in what is cut
+    border: Border
+    level: LevelRule
+    min_max: bool  # cut the chosen map after it was brought to [0, 1]
+    threshold: float  # strictly above belongs to the mask
+    vote: Vote
+    vote_window: int  # px
+    peak_window: int  # px, mean filter of the map whose peak is the place; its level is chosen apart
+    ties: bool  # every pixel as high as the peak is tried, else the first in reading order
+
+
+@dataclass(frozen=True)
+class SilhouetteRule:
+    """From the image of the selected Gaussians alone to a mask; no place is scored."""
+
+    alpha: float = 0.7  # strictly above, else the pixel is black
+    grey: int = 10  # of 255, strictly above belongs to the mask
+
+
+@dataclass(frozen=True)
+class OwnRule:
+    """The rule that turns the engine's own answer into a mask and a peak (see `own_prediction`)."""
+
+    share: float = 0.5  # of a pixel's light that comes from members, strictly above
+    peak_window: int = 20  # px of an image of `rows` rows, as the paper's; in proportion for others
+    rows: int = 731
+
+
+@dataclass(frozen=True)
+class Profile:
+    """A protocol on one benchmark."""
+
+    name: str
+    source: str  # what pins the constants, and what had to be filled in
+    rule: MapRule | SilhouetteRule | OwnRule
+    max_rows: int = 1080  # higher images are scored at this height, as LangSplat's loader shrinks them
+
+
+_CODE = MapRule(30, 0.5, "mirror", "peak", True, 0.7, "clipped", 7, 30, True)
+_LERF_PAPER = MapRule(20, 0.0, "mirror", "peak", True, 0.7, "none", 1, 20, False)
+_OVS_PAPER = MapRule(1, 1.0, "mirror", "inside", False, 0.4, "none", 1, 20, False)
+_DIRECT = Profile(
+    "direct-3d",
+    "OpenGaussian's protocol: Gaussians are selected by the phrase, drawn alone, and the image is cut; of "
+    "a scene, the members of the engine's answer; how often a Gaussian was seen is not kept and not asked",
+    SilhouetteRule(),
+)
+_OURS = Profile(
+    "ours", "this program's answer as it shows it, its verdict included: not here is an empty mask", OwnRule()
+)
+
+LERF_PROFILES: Mapping[LerfProtocol, Profile] = MappingProxyType(
+    {
+        "langsplat-code": Profile(
+            "langsplat-code",
+            "LangSplat's public evaluator: (filter 30 + raw) / 2, level by the peak before min-max, min-max "
+            "above 0.7, 7x7 majority; place: all highest pixels of the filtered map",
+            _CODE,
+        ),
+        "langsplat-paper": Profile(
+            "langsplat-paper",
+            "LangSplat's text: filter 20, level and place by the filtered peak; the text gives no cut for "
+            "LERF-OVS: min-max above 0.7 as its code, without the vote",
+            _LERF_PAPER,
+        ),
+        "langsplat-v2": Profile(
+            "langsplat-v2",
+            "LangSplatV2's public evaluator: 29x29 mean of what lies inside the image, the same blend and "
+            "cut, 7x7 mean above one half; place as in LangSplat's code",
+            MapRule(29, 0.5, "inside", "peak", True, 0.7, "inside", 7, 29, True),
+        ),
+        "direct-3d": _DIRECT,
+        "ours": _OURS,
+    }
+)
+OVS_PROFILES: Mapping[OvsProtocol, Profile] = MappingProxyType(
+    {
+        "langsplat-paper": Profile(
+            "langsplat-paper",
+            "LangSplat's appendix: absolute 0.4, the level whose mask has the highest mean relevancy, no "
+            "filter; its code for 3D-OVS was never released",
+            _OVS_PAPER,
+        ),
+        "direct-3d": _DIRECT,
+        "ours": _OURS,
+    }
+)
+
+
+# From relevancy maps or images of selected Gaussians to a mask and a place, as a profile says.
+#
+# Everything here is given maps and constants, never a label.
+
+TINY = 1e-9  # added to the range that a map is divided by, as in LangSplat's code: a flat map is 0
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """The answer to a phrase in a view, as it is scored."""
+
+    mask: Array  # (H, W) bool
+    level: int | None = None  # whose map was cut
+    # (P, 2) int column and row: the place, or several as high; empty: none was named
+    peaks: Array = field(default_factory=lambda: np.empty((0, 2), int))
+
+
+def read_maps(maps: Array, rule: MapRule) -> Prediction:
+    """(L, H, W) relevancy per level, L >= 1 -> mask and place."""
+    maps = np.asarray(maps, np.float64)
+    blended = [
+        (1 - rule.raw_share) * mean_filtered(level, rule.window, rule.border) + rule.raw_share * level
+        for level in maps
+    ]
+    if rule.level == "peak":
+        chosen = int(np.argmax([values.max() for values in blended]))
+    else:
+        chosen = int(np.argmax([_mean_inside(values, rule.threshold) for values in blended]))
+    values = blended[chosen]
+    if rule.min_max:
+        values = values - values.min()
+        values = values / (values.max() + TINY)
+    mask = voted(values > rule.threshold, rule.vote, rule.vote_window)
+    return Prediction(mask, chosen, peak_pixels(maps, rule))
+
+
+def peak_pixels(maps: Array, rule: MapRule) -> Array:
+    """(P, 2) column and row of the highest pixel over all levels' filtered maps; more than one where several
+    of that level are as high and the rule tries all."""
+    smooth = [mean_filtered(level, rule.peak_window, rule.border) for level in maps]
+    best = smooth[int(np.argmax([values.max() for values in smooth]))]
+    pixels = np.argwhere(best == best.max())[:, ::-1]
+    return pixels if rule.ties else pixels[:1]
+
+
+def _mean_inside(values: Array, threshold: float) -> float:
+    """Return the mean of the values above the threshold; -1, below every relevancy, where there are none."""
+    inside = values[values > threshold]
+    return float(inside.mean()) if len(inside) else -1.0
+
+
+def mean_filtered(values: Array, window: int, border: Border) -> Array:
+    """(H, W) means over `window` x `window` pixels; an even window reaches one pixel further up and left, as
+    cv2's does."""
+    if window <= 1:
+        return values
+    if border == "mirror":
+        return uniform_filter(values, window, mode="mirror")
+    total = uniform_filter(values, window, mode="constant")
+    return total / uniform_filter(np.ones_like(values), window, mode="constant")
+
+
+def voted(mask: Array, vote: Vote, window: int) -> Array:
+    """(H, W) bool after a majority vote over `window` x `window` pixels inside the image; a tie is False.
+    "clipped": the image's last row and column are never counted, as in LangSplat's code."""
+    if vote == "none" or window <= 1:
+        return mask
+    counted = np.ones(mask.shape)
+    if vote == "clipped":
+        counted[-1], counted[:, -1] = 0, 0
+    votes = uniform_filter(mask * counted, window, mode="constant")
+    of = uniform_filter(counted, window, mode="constant")
+    return np.asarray(2 * votes > of + TINY)
+
+
+def read_silhouette(colours: Array, alpha: Array, rule: SilhouetteRule) -> Array:
+    """(H, W, 3) colours over black and (H, W) alpha of the selected Gaussians alone -> (H, W) mask."""
+    grey = np.clip(colours, 0, 1) @ np.array([0.299, 0.587, 0.114])
+    drawn = np.where(alpha > rule.alpha, np.rint(255 * grey), 0)
+    return np.asarray(drawn > rule.grey)
+
+
+# How this program's own answer becomes a mask and a place in a view: the one place to change it.
+
+
+def own_prediction(view: View, result: QueryResult, rule: OwnRule) -> Prediction:
+    """The mask is what shows mostly members of the answer (hidden ones do not count), the place is the peak
+    of the filtered map of the answer's level. Nothing of either where the verdict is "not here"."""
+    values = np.stack([result.members, result.relevancy[result.level]], 1).astype(np.float32)
+    drawn = splatted_relevancy(view, values, PictureConfig().alpha_gate)
+    if not result.found:
+        return Prediction(np.zeros(drawn.shape[:2], bool), result.level)
+    column, row, _ = peak_pixel(drawn[..., 1], round(rule.peak_window * len(drawn) / rule.rows))
+    return Prediction(drawn[..., 0] > rule.share, result.level, np.array([[column, row]]))
+
+
+# Who answers: a scene of ours, or a folder of relevancy maps and masks that another system rendered. Neither
+# sees a label.
+#
+#     <view>/<phrase>.npy                  float (L, H, W) or (H, W) relevancy; L levels, at most three
+#     <view>/<phrase>.<level>.npy|.png     or one file per level: subpart, part, whole; any of them
+#     <view>/<phrase>.png                  a single map; for protocol direct-3d the drawn silhouette instead
+#
+# A PNG of 8 or 16 bits holds relevancy from 0 to 1. A "/" in a phrase is "_" in its file's name. Maps of one
+# phrase have one size; it need not be the labels', whose masks are then brought to it.
+
+
+def file_name(phrase: str) -> str:
+    """Return the stem of the names of a phrase's files."""
+    return phrase.replace("/", "_")
+
+
+def read_relevancy(folder: Path, phrase: str) -> tuple[Array, tuple[int, ...]] | None:
+    """The (L, H, W) float64 maps of `phrase` in a view's `folder` and their levels, indices into LEVELS; None
+    where there is none. FormatError for a damaged one."""
+    name = file_name(phrase)
+    whole = _existing(folder, name)
+    if whole is not None:
+        maps = _read(whole)
+        maps = maps[None] if maps.ndim == 2 else maps
+        return maps, tuple(range(len(maps)))
+    files = {level: _existing(folder, f"{name}.{word}") for level, word in enumerate(LEVELS)}
+    there = {level: path for level, path in files.items() if path is not None}
+    if not there:
+        return None
+    singles = {path: _read(path) for path in there.values()}
+    first = next(iter(singles.values()))
+    for path, values in singles.items():
+        if values.ndim != 2 or values.shape != first.shape:
+            raise FormatError(
+                f"{path}: shape {values.shape}; the levels of one phrase are (H, W) of one size"
+            )
+    return np.stack(list(singles.values())), tuple(there)
+
+
+def _existing(folder: Path, name: str) -> Path | None:
+    return next((path for s in (".npy", ".png") if (path := folder / f"{name}{s}").is_file()), None)
+
+
+def _read(path: Path) -> Array:
+    values = read_npy(path) if path.suffix == ".npy" else _image(path)
+    if values.ndim not in (2, 3) or 0 in values.shape or (values.ndim == 3 and len(values) > len(LEVELS)):
+        raise FormatError(
+            f"{path}: shape {values.shape}; expected (H, W), or (L, H, W) with at most 3 levels"
+        )
+    if not np.isfinite(values).all():
+        raise FormatError(f"{path}: holds numbers that are not finite")
+    return values.astype(np.float64)
+
+
+def _image(path: Path) -> Array:
+    """(H, W) relevancy in [0, 1] of an image file."""
+    with opened(path) as image:
+        if image.mode.startswith("I"):
+            return np.asarray(image, np.float64) / 65535
+        return np.asarray(image.convert("L"), np.float64) / 255
+
+
+NO_VIEW = "no camera of that name"
+NO_MAP = "no map"
+TOGETHER = 10  # phrases splatted in one pass, three channels each
+
+
+@dataclass(frozen=True, eq=False)
+class SceneSource:
+    """A scene of ours, drawn from the labelled views."""
+
+    engine: QueryEngine
+    cameras: Mapping[str, Camera]  # by name without extension
+    trained: frozenset[str] | None  # names of the training views; None: they are not the dataset's names
+    profile: Profile
+    paper_order: bool = False  # blend latents and decode every pixel, instead of blending relevancies
+
+    def trained_on(self, frame: str) -> bool | None:
+        """Return True where the view was trained on, False where it was not, None where that is not known."""
+        return None if self.trained is None else frame in self.trained
+
+    def answers(self, frame: str, size: Size, phrases: Sequence[str]) -> Mapping[str, Prediction | str]:
+        """phrase -> the answer in the view `frame`, drawn at `size`; or why there is none."""
+        if frame not in self.cameras:
+            return dict.fromkeys(phrases, NO_VIEW)
+        camera = self.cameras[frame]
+        check_same_image(frame, (camera.width, camera.height), size)
+        camera = camera.resized(*size)
+        found: dict[str, Prediction | str] = {}
+        for phrase in phrases:
+            unknown = self.engine.unknown_words(phrase)
+            if unknown:
+                found[phrase] = f"the encoder does not know {', '.join(repr(word) for word in unknown)}"
+        asked = [phrase for phrase in phrases if phrase not in found]
+        for start in range(0, len(asked), TOGETHER):
+            part = asked[start : start + TOGETHER]
+            found |= zip(part, self._predictions(camera, part), strict=True)
+        return found
+
+    def _predictions(self, camera: Camera, phrases: Sequence[str]) -> list[Prediction]:
+        rule, scene = self.profile.rule, self.engine.scene
+        view = view_of(scene, camera)
+        if isinstance(rule, MapRule) and self.paper_order:
+            return [read_maps(maps, rule) for maps in self._decoded(view, phrases)]
+        results = self.engine.run_many(phrases)
+        if isinstance(rule, OwnRule):
+            return [own_prediction(view, result, rule) for result in results]
+        if isinstance(rule, SilhouetteRule):
+            return [Prediction(self._silhouette(camera, result, rule), result.level) for result in results]
+        values = np.concatenate([result.relevancy for result in results]).T
+        maps = np.moveaxis(splatted_relevancy(view, values, PictureConfig().alpha_gate), 2, 0)
+        return [read_maps(maps[row : row + len(LEVELS)], rule) for row in range(0, len(maps), len(LEVELS))]
+
+    def _decoded(self, view: View, phrases: Sequence[str]) -> Array:
+        """(Q, 3, H, W) relevancy in the paper's order: latents blended, every pixel decoded."""
+        vectors = np.stack([self.engine.text_vector(phrase) for phrase in phrases])
+        gate = PictureConfig().alpha_gate
+        levels = [decoded_relevancy(view, self.engine.field, k, vectors, gate) for k in range(len(LEVELS))]
+        return np.moveaxis(np.stack(levels), 3, 0)
+
+    def _silhouette(self, camera: Camera, result: QueryResult, rule: SilhouetteRule) -> Array:
+        """The mask of the answer's Gaussians drawn alone, as if nothing stood before them."""
+        scene = self.engine.scene
+        if not result.members.any():
+            return np.zeros((camera.height, camera.width), bool)
+        drawn = render(scene.take(result.members), camera)
+        return read_silhouette(drawn.colours, drawn.alpha, rule)
+
+
+@dataclass(frozen=True, eq=False)
+class MapSource:
+    """Another system's maps of one scene, scored on their own grid; its files are as above."""
+
+    folder: Path  # <view>/<phrase>...
+    rule: MapRule | SilhouetteRule
+
+    def trained_on(self, frame: str) -> bool | None:
+        return None
+
+    def answers(self, frame: str, size: Size, phrases: Sequence[str]) -> Mapping[str, Prediction | str]:
+        """phrase -> the answer by its map in the view `frame`, whatever its size; or why there is none."""
+        return {phrase: self._answer(self.folder / frame, phrase) for phrase in phrases}
+
+    def _answer(self, folder: Path, phrase: str) -> Prediction | str:
+        if isinstance(self.rule, SilhouetteRule):
+            path = folder / f"{file_name(phrase)}.png"
+            return Prediction(read_grey(path) > self.rule.grey) if path.is_file() else NO_MAP
+        found = read_relevancy(folder, phrase)
+        if found is None:
+            return NO_MAP
+        maps, levels = found
+        answer = read_maps(maps, self.rule)
+        return replace(answer, level=levels[answer.level or 0])
+
+
+Source = SceneSource | MapSource

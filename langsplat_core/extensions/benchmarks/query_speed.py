@@ -1,0 +1,238 @@
+"""The query benchmark (`langsplat bench query`): time and error of a phrase in every order of work.
+
+All methods answer for the same vectors, the scene's codewords: the autoencoder of d = 3 is fitted to them
+here. The paper's order blends latents, decodes every pixel of a view at three levels and compares (LangSplat,
+section 3.4); it knows nothing but that view. The other two, a table over the sphere and a codebook, find the
+relevancy of every Gaussian and answer with level, regions, verdict and place, which hold for all views; an
+image then blends one number per Gaussian.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from langsplat_core.arrays import Array
+from langsplat_core.config import AutoencoderConfig, PictureConfig
+from langsplat_core.errors import InputError
+from langsplat_core.extensions.benchmarks.config import QueryBenchConfig
+from langsplat_core.extensions.benchmarks.measure import markdown
+from langsplat_core.progress import Progress, silent
+from langsplat_core.query.answers import decoded_relevancy, splatted_relevancy
+from langsplat_core.query.engine import QueryEngine, TextEncoder
+from langsplat_core.raster.protocol import View
+from langsplat_core.raster.render import view_of
+from langsplat_core.scene import LEVELS, Camera, Codec, LanguageField, Scene
+from langsplat_core.semantics.relevancy import Scale, relevancy_of
+from langsplat_core.semantics.vocabulary import everyday_phrases
+from langsplat_core.training.language.codec_fit import train_autoencoder
+
+GATE = PictureConfig().alpha_gate
+PAPER = "paper's order"
+
+
+@dataclass(frozen=True)
+class RelevancyError:
+    """Absolute error of relevancy over all Gaussians with a meaning, levels and phrases."""
+
+    mean: float
+    p99: float
+
+
+@dataclass(frozen=True)
+class QueryCost:
+    """Seconds and errors of one order of work."""
+
+    way: str
+    answer: float  # a new phrase: relevancy at three levels, and what else the way has to say
+    shown: float  # a new phrase until its image is there, the camera standing still
+    camera: float  # a new camera, before any phrase can be shown
+    frame: float  # camera and image of a phrase already asked
+    lookup: RelevancyError  # against exact dot products with what the latents decode to, in float64
+    codec: RelevancyError  # against the codewords' 512 numbers, in float64
+
+
+@dataclass(frozen=True)
+class QueryReport:
+    """Costs of all orders on one scene."""
+
+    gaussians: int
+    size: tuple[int, int]
+    surface: float  # s, once for a scene: its surface
+    regions: float  # s, likewise: the codebook's regions
+    costs: tuple[QueryCost, ...]
+    phrases: int
+    alone: float  # s per phrase, codebook, asked and encoded one by one
+    together: float  # s per phrase, all at once
+
+
+@dataclass(frozen=True, eq=False)
+class _Asked:
+    """Phrases, and the codewords of the scene that they are compared with."""
+
+    texts: Sequence[str]
+    vectors: Array  # (Q, D)
+    codes: Array  # (3, N) codeword of every Gaussian
+    known: Array  # (3, N)
+    codewords: Array  # (K, D)
+
+
+def measure_queries(
+    scene: Scene, encoder: TextEncoder, config: QueryBenchConfig, progress: Progress = silent
+) -> QueryReport:
+    """`scene` must have a codebook and a camera; InputError otherwise. The paper's order takes minutes."""
+    if scene.language is None or scene.language.codec.blends or not scene.cameras:
+        raise InputError("bench query needs a scene with a codebook and training cameras")
+    if config.count:
+        scene = repeated(scene, config.count)
+    field = scene.language
+    assert field is not None
+    words = everyday_phrases(encoder.unknown_words)
+    engine = QueryEngine(scene, lambda _: encoder)
+    progress("finding surface and regions", 0.0)
+    surface, regions = _seconds(lambda: engine.surface), _seconds(lambda: engine.regions)
+    alone, together = _batched(engine, words[: config.together], progress)
+    texts = words[: config.phrases]
+    codewords = field.codec.decode(np.arange(field.codec.size, dtype=np.uint16)[:, None])
+    asked = _Asked(texts, engine.text_vectors(texts), field.latents[..., 0], field.known, codewords)
+    fitted = train_autoencoder(codewords, AutoencoderConfig(steps=config.codec_steps), progress)
+    encoded = with_codec(field, fitted)
+    by_table = QueryEngine(replace(scene, language=encoded), lambda _: encoder)
+    camera = scene.cameras[0].resized(*config.size)
+    progress("the paper's order", 0.3)
+    costs = [
+        _paper(scene, encoded, camera, asked),
+        _ours("table lookup", by_table, camera, asked, config.repeats, fitted),
+        _ours("codebook", engine, camera, asked, config.repeats, None),
+    ]
+    progress("asking", 1.0)
+    sizes = len(scene.gaussians), config.size
+    asked_many = min(len(words), config.together)
+    return QueryReport(*sizes, surface, regions, tuple(costs), asked_many, alone, together)
+
+
+def repeated(scene: Scene, count: int) -> Scene:
+    """`count` Gaussians: the scene's over and over, each moved by a random step of its own size."""
+    rows = np.resize(np.arange(len(scene.gaussians)), count)
+    larger = scene.take(rows)
+    gaussians = larger.gaussians
+    steps = np.random.default_rng(0).normal(size=(count, 3)) * np.exp(gaussians.log_scales)
+    return replace(larger, gaussians=replace(gaussians, means=gaussians.means + steps))
+
+
+def with_codec(field: LanguageField, codec: Codec) -> LanguageField:
+    """`field`, which has a codebook, with its codewords encoded by another codec."""
+    codewords = field.codec.decode(np.arange(field.codec.size, dtype=np.uint16)[:, None])
+    latents = codec.encode(codewords)[field.latents[..., 0]]
+    return replace(field, latents=np.where(field.known[..., None], latents, 0), codec=codec)
+
+
+def _batched(engine: QueryEngine, texts: Sequence[str], progress: Progress) -> tuple[float, float]:
+    """Seconds per phrase, encoding included, when asked one by one and all at once."""
+    engine.run_many(texts[:2])
+    progress("asking one by one and all at once", 0.1)
+    alone = _seconds(lambda: [engine.run(text) for text in texts])
+    return alone / len(texts), _seconds(lambda: engine.run_many(texts)) / len(texts)
+
+
+def _paper(scene: Scene, field: LanguageField, camera: Camera, asked: _Asked) -> QueryCost:
+    """Costs of the paper's order of work. Decoding is measured once: it takes a minute and more."""
+    view_of(scene, camera).splat(field.latents[0])
+    views: list[View] = []
+    camera_seconds = _seconds(lambda: views.append(view_of(scene, camera)))
+    blending = _seconds(lambda: [views[0].splat(latents) for latents in field.latents])
+    vectors = asked.vectors[:1]
+    both = _seconds(
+        lambda: [decoded_relevancy(views[0], field, level, vectors, GATE) for level in range(len(LEVELS))]
+    )
+    decoding = max(both - blending, 0.0)
+    decoded = field.codec.decode(field.codec.encode(asked.codewords))
+    published = Scale(field.canonical, None, field.reading.temperature)
+    exact = [_exact(asked, decoded, published, row) for row in range(len(asked.texts))]
+    truth = [_exact(asked, asked.codewords, published, row) for row in range(len(asked.texts))]
+    return QueryCost(
+        PAPER,
+        answer=decoding,
+        shown=decoding,
+        camera=camera_seconds + blending,
+        frame=camera_seconds + both,
+        lookup=RelevancyError(0.0, 0.0),  # it decodes
+        codec=_error(exact, truth),
+    )
+
+
+def _ours(
+    way: str, engine: QueryEngine, camera: Camera, asked: _Asked, repeats: int, codec: Codec | None
+) -> QueryCost:
+    """codec: by which the codewords were encoded; None: they are what the field has."""
+    scene = engine.scene
+    result = engine.run(asked.texts[0], vector=asked.vectors[0])  # what is built once is built now
+    found = [engine.relevancy(vector)[asked.known] for vector in asked.vectors]
+    pairs = list(zip(asked.texts, asked.vectors, strict=True)) * repeats
+    answer = median(_seconds(lambda t=text, v=vector: engine.run(t, vector=v)) for text, vector in pairs)  # type: ignore[misc]
+    view = view_of(scene, camera)
+    seen = median(_seconds(lambda: view_of(scene, camera)) for _ in range(repeats))
+    splatted_relevancy(view, result.even[:, None], GATE)
+    image = median(
+        _seconds(lambda: splatted_relevancy(view, result.even[:, None], GATE)) for _ in range(repeats)
+    )
+    decoded = asked.codewords if codec is None else codec.decode(codec.encode(asked.codewords))
+    exact, truth = (
+        [_exact(asked, vectors, engine.scale, row) for row in range(len(asked.texts))]
+        for vectors in (decoded, asked.codewords)
+    )
+    return QueryCost(
+        way,
+        answer=answer,
+        shown=answer + image,
+        camera=seen,
+        frame=seen + image,
+        lookup=_error(found, exact),
+        codec=_error(found, truth),
+    )
+
+
+def _exact(asked: _Asked, vectors: Array, scale: Scale, row: int) -> Array:
+    """Relevancy of phrase `row` at all Gaussians with a meaning, in float64; vectors: (K, D) of the codes."""
+    doubles = vectors.astype(np.float64)
+    zero, rate = scale.of(doubles @ scale.texts.T)
+    values = relevancy_of(doubles @ asked.vectors[row].astype(np.float64), zero, rate)
+    return np.asarray(values[asked.codes[asked.known]])
+
+
+def _error(got: Sequence[Array], want: Sequence[Array]) -> RelevancyError:
+    apart = np.abs(np.concatenate(got).astype(np.float64) - np.concatenate(want))
+    if not len(apart):
+        return RelevancyError(0.0, 0.0)
+    return RelevancyError(float(apart.mean()), float(np.quantile(apart, 0.99)))
+
+
+def _seconds(work: Callable[[], Any]) -> float:
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def query_table(report: QueryReport) -> str:
+    """Both tables as Markdown; ratios are to the paper's order."""
+    paper, (width, height) = report.costs[0], report.size
+    head = (
+        *("order", "new phrase", "times faster", "shown", "new camera", "frame"),
+        *("lookup error", "codec error"),
+    )
+    rows = (
+        (cost.way, f"{1e3 * cost.answer:.1f}", f"{paper.answer / max(cost.answer, 1e-9):.0f}")
+        + tuple(f"{1e3 * value:.1f}" for value in (cost.shown, cost.camera, cost.frame))
+        + tuple(f"{error.mean:.1e} / {error.p99:.1e}" for error in (cost.lookup, cost.codec))
+        for cost in report.costs
+    )
+    return (
+        f"{report.gaussians} Gaussians, {width}x{height}; milliseconds; errors of relevancy, mean / 99 %\n\n"
+        f"{markdown(head, rows)}\n"
+        f"Once for the scene: surface {report.surface:.1f} s, regions {report.regions:.1f} s. "
+        f"{report.phrases} phrases, encoded and answered: {1e3 * report.alone:.1f} ms each one by one, "
+        f"{1e3 * report.together:.1f} ms at once.\n"
+    )

@@ -1,0 +1,514 @@
+"""Every labelled query against its answer: scores, their means, a table for people, JSON for programs, and
+one image per answer."""
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+from PIL import Image, ImageDraw
+from scipy.ndimage import binary_erosion
+
+from langsplat_core.arrays import Array
+from langsplat_core.datasets.capture import read_photo
+from langsplat_core.datasets.colmap import find_model, load_colmap
+from langsplat_core.datasets.nerfstudio import load_nerfstudio
+from langsplat_core.errors import InputError, shortened
+from langsplat_core.extensions.benchmarks.labels import (
+    Benchmark,
+    Frame,
+    Label,
+    LabelledScene,
+    Size,
+    check_same_image,
+    without_suffix,
+)
+from langsplat_core.extensions.benchmarks.profiles import (
+    MapRule,
+    MapSource,
+    OwnRule,
+    Prediction,
+    Profile,
+    SceneSource,
+    SilhouetteRule,
+    Source,
+    file_name,
+)
+from langsplat_core.io.files import atomic_path, write_json
+from langsplat_core.progress import Progress, silent
+from langsplat_core.query.answers import AnswerRule
+from langsplat_core.query.engine import LoadEncoder, QueryEngine, searchable
+from langsplat_core.scene import LEVELS, Camera
+
+
+def intersection_over_union(found: Array, truth: Array) -> float:
+    """Return the intersection over union of two (H, W) boolean masks; 1 where both are empty."""
+    union = np.logical_or(found, truth).sum()
+    return float(np.logical_and(found, truth).sum() / union) if union else 1.0
+
+
+# The image: photograph, mask that was found, the label's outline and boxes, the place.
+
+FOUND = np.array([250, 115, 25])  # tint of the mask
+TRUTH = (60, 220, 90)  # the label's outline and boxes
+PLACE = (40, 130, 255)
+OPACITY = 0.55
+MAX_MARKS = 100  # of a flat map every pixel is a peak
+
+
+def write_image(folder: Path, frame: Frame, label: Label, answer: Prediction, truth: Array) -> None:
+    """`folder`/<frame>/<phrase>.png on the scored grid; over black where the photograph is not there."""
+    rows, columns = answer.mask.shape
+    photo = np.zeros((rows, columns, 3))
+    if frame.photograph is not None:
+        photo = np.asarray(read_photo(frame.photograph, upright=False).resize((columns, rows)), np.float64)
+    photo = np.where(answer.mask[..., None], (1 - OPACITY) * photo + OPACITY * FOUND, photo)
+    photo[truth & ~binary_erosion(truth)] = TRUTH
+    canvas = Image.fromarray(photo.astype(np.uint8))
+    brush = ImageDraw.Draw(canvas)
+    scale = np.array([columns / frame.size[0], rows / frame.size[1]] * 2)
+    for box in [] if label.boxes is None else label.boxes * scale:
+        corners = np.concatenate([np.minimum(box[:2], box[2:]), np.maximum(box[:2], box[2:])])
+        brush.rectangle([float(value) for value in corners], outline=TRUTH)
+    for column, row in answer.peaks[:MAX_MARKS]:
+        brush.ellipse([column - 4, row - 4, column + 4, row + 4], outline=PLACE, width=2)
+    with atomic_path(folder / frame.name / f"{file_name(label.phrase)}.png") as path:
+        canvas.save(path, "PNG")
+
+
+# Every labelled query against its answer.
+
+
+@dataclass(frozen=True)
+class QueryScore:
+    """One phrase in one labelled view. What was not answered is wrong: a mean is over all queries."""
+
+    scene: str
+    frame: str
+    phrase: str
+    iou: float
+    hit: bool | None  # whether the place lies in a box of the label; None: not scored
+    level: str = ""  # whose map was cut
+    unanswered: str = ""  # why there is no answer
+    trained_on: bool | None = None  # whether the view is a training view; None: not known
+    grid: Size = (0, 0)  # width and height that were scored
+
+
+@dataclass(frozen=True)
+class SceneScores:
+    """The scores of all queries of a scene."""
+
+    queries: tuple[QueryScore, ...]
+    left_out: tuple[str, ...]  # labels that cannot be asked, each "frame: phrase (why)"
+
+
+def score_scene(
+    labelled: LabelledScene,
+    source: Source,
+    profile: Profile,
+    pictures: Path | None = None,
+    progress: Progress = silent,
+) -> SceneScores:
+    """Score every query of a scene; `pictures`: a folder for one image per answer. A frame's answers are
+    complete, cut and all, before any mask of it is drawn. Raises InputError where a map has another shape
+    than the labelled image."""
+    scores: list[QueryScore] = []
+    left_out = list(labelled.left_out)
+    for done, frame in enumerate(labelled.frames):
+        answers = source.answers(
+            frame.name, scored_size(frame.size, profile.max_rows), [label.phrase for label in frame.labels]
+        )
+        for label in frame.labels:
+            answer = answers[label.phrase]
+            size = _grid(answer, frame)
+            truth = label.truth.draw(size)
+            if not truth.any():
+                left_out.append(f"{frame.name}: {label.phrase} (empty mask)")
+                continue
+            score = _score(labelled.name, frame, label, answer, truth, profile)
+            scores.append(replace(score, trained_on=source.trained_on(frame.name), grid=size))
+            if pictures is not None and not isinstance(answer, str):
+                write_image(pictures / labelled.name, frame, label, answer, truth)
+        progress("asking phrases", (done + 1) / len(labelled.frames), labelled.name)
+    return SceneScores(tuple(scores), tuple(left_out))
+
+
+def scored_size(size: Size, max_rows: int) -> Size:
+    """`size`, shrunk to `max_rows` rows where it has more."""
+    width, height = size
+    return size if height <= max_rows else (max(1, int(width * max_rows / height)), max_rows)
+
+
+def _grid(answer: Prediction | str, frame: Frame) -> Size:
+    if isinstance(answer, str):
+        return frame.size
+    rows, columns = answer.mask.shape
+    check_same_image(frame.name, (columns, rows), frame.size)
+    return columns, rows
+
+
+def _score(
+    scene: str, frame: Frame, label: Label, answer: Prediction | str, truth: Array, profile: Profile
+) -> QueryScore:
+    placed = label.boxes is not None and not isinstance(profile.rule, SilhouetteRule)
+    if isinstance(answer, str):
+        return QueryScore(scene, frame.name, label.phrase, 0.0, False if placed else None, unanswered=answer)
+    hit = inside_any_box(answer.peaks, label.boxes, frame.size, truth.shape) if placed else None
+    level = "" if answer.level is None else LEVELS[answer.level]
+    return QueryScore(
+        scene, frame.name, label.phrase, intersection_over_union(answer.mask, truth), hit, level
+    )
+
+
+def inside_any_box(peaks: Array, boxes: Array | None, size: Size, shape: tuple[int, ...]) -> bool:
+    """Return True where any of the (P, 2) peaks, column and row on a grid of `shape` (rows, columns), lies in
+    any of the (B, 4) boxes on the label's grid of `size`, borders included."""
+    if boxes is None or not len(peaks):
+        return False
+    scale = np.array([shape[1] / size[0], shape[0] / size[1]])
+    low, high = np.minimum(boxes[:, :2], boxes[:, 2:]) * scale, np.maximum(boxes[:, :2], boxes[:, 2:]) * scale
+    inside = (peaks[:, None] >= low) & (peaks[:, None] <= high)
+    return bool(inside.all(-1).any())
+
+
+ACCURACY_AT = (0.25, 0.5)  # IoU strictly above
+FIXED = (
+    "every constant of the protocol was fixed before a label was read; none was chosen or tuned by the labels"
+)
+COUNTED = "a query without an answer counts as wrong: IoU 0, no place"
+
+
+# Means of scores, and their report.
+
+
+@dataclass(frozen=True)
+class Means:
+    """Mean scores of a set of queries, or means of such means."""
+
+    queries: int
+    iou: float
+    localisation: float | None  # None: no place is scored
+    accuracy_25: float
+    accuracy_50: float
+
+
+@dataclass(frozen=True)
+class BenchmarkReport:
+    """One system on one benchmark under one protocol."""
+
+    benchmark: str
+    profile: Profile
+    subject: str  # the scene or maps that were scored, and how
+    scenes: dict[str, SceneScores]
+
+    @property
+    def queries(self) -> list[QueryScore]:
+        """Queries of all scenes."""
+        return [query for scores in self.scenes.values() for query in scores.queries]
+
+
+def means(queries: Sequence[QueryScore]) -> Means:
+    """Mean scores over queries; zeros where there are none."""
+    ious = np.array([query.iou for query in queries])
+    hits = [query.hit for query in queries if query.hit is not None]
+    if not len(ious):
+        return Means(0, 0.0, None, 0.0, 0.0)
+    above = [float((ious > least).mean()) for least in ACCURACY_AT]
+    return Means(len(ious), float(ious.mean()), float(np.mean(hits)) if hits else None, above[0], above[1])
+
+
+def macro(queries: Sequence[QueryScore], group: Callable[[QueryScore], object]) -> Means:
+    """The mean of the groups' means, each group with the same weight."""
+    groups: dict[object, list[QueryScore]] = {}
+    for query in queries:
+        groups.setdefault(group(query), []).append(query)
+    rows = [means(members) for members in groups.values()]
+    if not rows:
+        return means(())
+    places = [row.localisation for row in rows if row.localisation is not None]
+    return Means(
+        len(queries),
+        float(np.mean([row.iou for row in rows])),
+        float(np.mean(places)) if places else None,
+        float(np.mean([row.accuracy_25 for row in rows])),
+        float(np.mean([row.accuracy_50 for row in rows])),
+    )
+
+
+def summary(report: BenchmarkReport) -> dict[str, Means]:
+    """The rows of the table: every scene, then macro means over scenes and over frames, then the micro mean
+    over all queries; the last also of what was answered, and of views not trained on, where they differ."""
+    queries = report.queries
+    rows = {name: means(scores.queries) for name, scores in report.scenes.items()}
+    rows["macro, mean of scenes"] = macro(queries, lambda query: query.scene)
+    rows["macro, mean of frames"] = macro(queries, lambda query: (query.scene, query.frame))
+    rows["micro, mean of queries"] = means(queries)
+    answered = [query for query in queries if not query.unanswered]
+    if len(answered) < len(queries):
+        rows["micro, answered ones alone"] = means(answered)
+    held_out = [query for query in queries if query.trained_on is False]
+    if 0 < len(held_out) < len(queries):
+        rows["micro, held-out views alone"] = means(held_out)
+    return rows
+
+
+def table(report: BenchmarkReport) -> str:
+    """The means as a Markdown table, with notes below it."""
+    lines = [
+        "| | queries | mIoU % | localisation % | mAcc@0.25 % | mAcc@0.5 % |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name, row in summary(report).items():
+        shares = (row.iou, row.localisation, row.accuracy_25, row.accuracy_50)
+        cells = ["-" if share is None else f"{100 * share:.1f}" for share in shares]
+        lines.append(f"| {name} | {row.queries} | {' | '.join(cells)} |")
+    return "\n".join([*lines, "", *notes(report)])
+
+
+def notes(report: BenchmarkReport) -> list[str]:
+    """Return lines of plain text on the protocol, the subject and the frames behind the figures."""
+    queries = report.queries
+    lines = [
+        f"{report.benchmark}, protocol {report.profile.name}: {report.profile.source}",
+        f"scored: {report.subject}",
+        f"{FIXED}; a frame's answers are cut before its masks are drawn",
+    ]
+    reasons = dict.fromkeys(query.unanswered for query in queries if query.unanswered)
+    for reason in reasons:
+        names = [f"{query.frame}: {query.phrase}" for query in queries if query.unanswered == reason]
+        lines.append(f"not answered ({reason}), {len(names)} queries: {shortened(names)}")
+    if reasons:
+        lines.append(COUNTED)
+    frames = {(query.scene, query.frame): query.trained_on for query in queries}
+    trained = [frame for (_, frame), was in frames.items() if was]
+    if trained:
+        lines.append(
+            f"{len(trained)} of {len(frames)} labelled frames are training views: {shortened(trained)}"
+        )
+    left_out = [name for scores in report.scenes.values() for name in scores.left_out]
+    if left_out:
+        lines.append(f"{len(left_out)} labels left out: {shortened(left_out)}")
+    return lines
+
+
+def save_json(path: Path, report: BenchmarkReport) -> None:
+    """Write profile, means and every query as JSON."""
+    content = {
+        "benchmark": report.benchmark,
+        "protocol": asdict(report.profile),
+        "scored": report.subject,
+        "notes": notes(report),
+        "means": {name: asdict(row) for name, row in summary(report).items()},
+        "queries": [asdict(query) for query in report.queries],
+        "left_out": {name: list(scores.left_out) for name, scores in report.scenes.items()},
+    }
+    write_json(path, content)
+
+
+# Published figures on the benchmarks, beside the own: mIoU and localisation, percent.
+#
+# LERF and LangSplat: from the paper of LangSplat (CVPR 2024), 3D-OVS's own figures too; N2F2 (ECCV 2024),
+# LangSplatV2 (NeurIPS 2025) and Occam's LGS (BMVC 2025) as later papers repeat them. Figures of other
+# machines, masks and trainings: to see where one stands, not to rank by a point.
+
+Row = Mapping[str, tuple[float, float | None]]  # scene -> mIoU and localisation
+
+
+_LERF_OVS = """
+              figurines  teatime    ramen      waldo_kitchen
+LERF          38.6/75.0  45.0/84.8  28.2/62.0  37.9/72.7
+LangSplat     44.7/80.4  65.1/88.1  51.2/73.2  44.5/95.5
+LangSplatV2   56.4/82.1  72.2/93.2  51.8/74.7  59.1/95.5
+Occam's_LGS   58.6/80.4  70.2/93.2  51.0/74.7  65.3/81.8
+"""
+_OVS_3D = """
+              bed   bench  room  sofa  lawn
+LERF          73.5  53.2   46.6  27.0  73.7
+3D-OVS        89.5  89.3   92.8  74.0  88.2
+LangSplat     92.5  94.2   94.1  90.0  96.1
+N2F2          93.8  92.6   93.5  92.1  96.3
+"""
+
+
+def _rows(table: str) -> Mapping[str, Row]:
+    """Parse a table as above: method -> column -> pair of figures."""
+    head, *lines = table.strip().splitlines()
+    return {
+        name.replace("_", " "): dict(zip(head.split(), map(_pair, cells), strict=True))
+        for name, *cells in (line.split() for line in lines)
+    }
+
+
+def _pair(cell: str) -> tuple[float, float | None]:
+    iou, _, place = cell.partition("/")
+    return float(iou), float(place) if place else None
+
+
+PUBLISHED: Mapping[str, Mapping[str, Row]] = MappingProxyType(
+    {"lerf-ovs": _rows(_LERF_OVS), "3d-ovs": _rows(_OVS_3D)}
+)
+
+
+def beside_published(report: BenchmarkReport) -> str:
+    """Markdown: a column per scene of the report that others published too, and their mean; a row for the
+    report, and one for each of them. "" where there is no such scene."""
+    others = PUBLISHED.get(report.benchmark, {})
+    scenes = [name for name in report.scenes if any(name in row for row in others.values())]
+    if not scenes:
+        return ""
+    means = summary(report)
+    own = {name: (means[name].iou, means[name].localisation) for name in scenes}
+    ours = {name: (100 * iou, None if place is None else 100 * place) for name, (iou, place) in own.items()}
+    lines = [
+        f"| mIoU % / localisation % | {' | '.join(scenes)} | mean |",
+        "|---|" + "---|" * (len(scenes) + 1),
+    ]
+    for method, row in {"this scene": ours, **others}.items():
+        shared = [row[name] for name in scenes if name in row]
+        mean = _mean([pair[0] for pair in shared]), _mean([pair[1] for pair in shared])
+        cells = [_cell(row.get(name)) for name in scenes]
+        lines.append(
+            f"| {method} | {' | '.join(cells)} | {_cell(mean if len(shared) == len(scenes) else None)} |"
+        )
+    return "\n".join(lines)
+
+
+def _mean(values: list[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if values and len(known) == len(values) else None
+
+
+def _cell(pair: tuple[float | None, float | None] | None) -> str:
+    if pair is None or pair[0] is None:
+        return "-"
+    return f"{pair[0]:.1f}" if pair[1] is None else f"{pair[0]:.1f} / {pair[1]:.1f}"
+
+
+# A benchmark's labels, and whoever answers them, brought together by names.
+
+log = logging.getLogger("langsplat")
+FULL_SIZE = 100_000  # px: photographs are read for their cameras alone and not shrunk
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Subject of a measurement: exactly one of `scene` and `maps` is set."""
+
+    scene: Path | None = None  # a scene file, or a folder of <benchmark's scene>.ply
+    maps: Path | None = None  # <view>/<phrase>..., or <benchmark's scene>/<view>/<phrase>...
+    encoder: str = ""  # in place of the one that the scene names
+    paper_order: bool = False
+
+
+def run_benchmark(
+    benchmark: Benchmark,
+    profile: Profile,
+    subject: Subject,
+    load_encoder: LoadEncoder,
+    only: Sequence[str] = (),
+    pictures: Path | None = None,
+    progress: Progress = silent,
+) -> BenchmarkReport:
+    """Score `subject` on the scenes of `benchmark`, or those named by `only`. Raises InputError for a scene
+    or maps that do not belong to the labels, EncoderError where the text encoder cannot be loaded."""
+    if subject.paper_order and (subject.maps is not None or not isinstance(profile.rule, MapRule)):
+        raise InputError(
+            "--paper-order is for a scene under a protocol that reads relevancy maps; leave it out"
+        )
+    names = chosen_scenes(list(benchmark.scenes), only, subject)
+    scores = {}
+    for name in names:
+        labelled = benchmark.scenes[name]
+        source = (
+            _map_source(labelled, len(names), profile, subject.maps)
+            if subject.maps is not None
+            else _scene_source(labelled, profile, subject, load_encoder, progress)
+        )
+        scores[name] = score_scene(labelled, source, profile, pictures, progress)
+    order = ", latents blended and every pixel decoded (the paper's order)" if subject.paper_order else ""
+    return BenchmarkReport(benchmark.name, profile, f"{subject.scene or subject.maps}{order}", scores)
+
+
+def chosen_scenes(labelled: Sequence[str], only: Sequence[str], subject: Subject) -> list[str]:
+    """Names of the `labelled` scenes to score: `only` these, else the one that a scene file is named after
+    where several could be meant. Raises InputError for a name that is not labelled."""
+    wrong = [name for name in only if name not in labelled]
+    if wrong:
+        raise InputError(f"--only {wrong[0]}: no such labelled scene; there are {', '.join(labelled)}")
+    if only or subject.scene is None or subject.scene.is_dir() or len(labelled) == 1:
+        return list(only or labelled)
+    if subject.scene.stem not in labelled:
+        raise InputError(
+            f"{subject.scene} could be any labelled scene of {', '.join(labelled)}; say which with --only"
+        )
+    return [subject.scene.stem]
+
+
+def open_scene(
+    subject: Subject, name: str, load_encoder: LoadEncoder, rule: AnswerRule = "regions"
+) -> QueryEngine:
+    """The scene of `subject` that belongs to the labelled scene `name`, to be asked."""
+    assert subject.scene is not None
+    path = subject.scene / f"{name}.ply" if subject.scene.is_dir() else subject.scene
+    if not path.exists():
+        raise InputError(f"{path}: no such scene; leave {name} out with --only, or name the right folder")
+    return QueryEngine(searchable(path), load_encoder, encoder_id=subject.encoder, rule=rule)
+
+
+def _scene_source(
+    labelled: LabelledScene, profile: Profile, subject: Subject, load_encoder: LoadEncoder, progress: Progress
+) -> SceneSource:
+    # Published maps are read as published.
+    rule: AnswerRule = "peak" if isinstance(profile.rule, MapRule) else "regions"
+    engine = open_scene(subject, labelled.name, load_encoder, rule)
+    own = {without_suffix(camera.name): camera for camera in engine.scene.cameras}
+    others = _other_cameras(own, labelled, progress)
+    # With no name in common the scene's views are named by another rule: nothing is known of training.
+    related = not own.keys().isdisjoint([*others, *(frame.name for frame in labelled.frames)])
+    trained = frozenset(own) if related else None
+    return SceneSource(engine, {**others, **own}, trained, profile, subject.paper_order)
+
+
+def _map_source(labelled: LabelledScene, count: int, profile: Profile, maps: Path) -> MapSource:
+    if isinstance(profile.rule, OwnRule):
+        raise InputError("--protocol ours reads a scene's own answer; score maps by another protocol")
+    candidates = (maps / labelled.name, maps) if count == 1 else (maps / labelled.name,)
+    names = [frame.name for frame in labelled.frames]
+    for folder in candidates:
+        if any((folder / name).is_dir() for name in names):
+            return MapSource(folder, profile.rule)
+    raise InputError(
+        f"{candidates[0]}: no folder is named after a labelled frame ({shortened(names, 3)}); "
+        "expected <view>/<phrase>.npy or .png in it"
+    )
+
+
+def _other_cameras(
+    own: Mapping[str, Camera], labelled: LabelledScene, progress: Progress
+) -> Mapping[str, Camera]:
+    """The dataset's views by name, read where the scene lacks a labelled one; they share its world.
+    InputError where no labelled frame is among either."""
+    wanted = [frame.name for frame in labelled.frames]
+    if all(name in own for name in wanted):
+        return {}
+    others = {camera.name: camera for camera in _dataset_cameras(labelled.dataset, progress)}
+    missing = [name for name in wanted if name not in own and name not in others]
+    if len(missing) == len(wanted):
+        raise InputError(
+            f"{labelled.name}: none of the scene's views ({shortened(own, 3) or 'it has none'}) is a "
+            f"labelled frame ({shortened(wanted, 3)}); views are matched by name, never by number; put the "
+            f"photographs with their cameras into {labelled.dataset}"
+        )
+    if missing:
+        log.warning("%d labelled frames have no camera: %s", len(missing), shortened(missing))
+    return others
+
+
+def _dataset_cameras(folder: Path, progress: Progress) -> tuple[Camera, ...]:
+    """Return the cameras that came with a dataset; none where it has none."""
+    if (folder / "transforms.json").is_file():
+        return load_nerfstudio(folder / "transforms.json", FULL_SIZE, progress).cameras
+    model = find_model(folder)
+    return () if model is None else load_colmap(folder, model, FULL_SIZE, progress).cameras

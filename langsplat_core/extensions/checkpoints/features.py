@@ -1,0 +1,505 @@
+"""Language features of other methods' checkpoints: the files that carry them, and the vectors that they stand
+for, read a block at a time.
+
+`Features` are the vectors of N Gaussians at one level. Methods keep 512 numbers per Gaussian, or something
+smaller that stands for them; either way no (N, 512) array is made here.
+"""
+
+import re
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from langsplat_core.arrays import Array
+from langsplat_core.errors import FormatError, InputError
+from langsplat_core.extensions.checkpoints.langsplat_files import (
+    GEOMETRY,
+    autoencoder_from,
+    gaussians_of,
+    is_autoencoder,
+    model_tuple,
+)
+from langsplat_core.extensions.checkpoints.unpickling import load_torch, plain_array, plain_mapping
+from langsplat_core.io.hostile import MAGIC as NPY
+from langsplat_core.io.hostile import open_for_reading, opened_archive, read_npy, read_npz
+from langsplat_core.io.ply import read_ply_scene
+from langsplat_core.scene import LEVELS, AutoencoderCodec, Gaussians
+from langsplat_core.scene.gaussians import join_gaussians
+
+NO_CODE = 255  # in every place of a product code: no features
+TOPK = 4  # codewords of a Gaussian in LangSplatV2
+
+
+class Features(Protocol):
+    """The vectors of N Gaussians."""
+
+    @property
+    def dim(self) -> int:
+        """Count of numbers per vector."""
+
+    def rows(self, indices: Array) -> Array:
+        """(n,) whole numbers below N -> (n, dim) float32 vectors of any length; zero for no features."""
+
+
+@dataclass(frozen=True, eq=False)
+class Vectors:
+    """A vector for each: Occam's LGS, Feature-3DGS; or a latent for each: LangSplat."""
+
+    values: Array  # (N, D) floats of any length
+
+    @property
+    def dim(self) -> int:
+        return int(self.values.shape[1])
+
+    def rows(self, indices: Array) -> Array:
+        return np.asarray(self.values[indices], np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class SparseCodes:
+    """LangSplatV2: a Gaussian is a mixture of the few codewords that its logits name.
+
+    The weights are the largest `TOPK` of a softmax, scaled to the sum 1. Logits that are all equal were
+    never trained, and stand for nothing.
+    """
+
+    logits: Array  # (N, L K) floats, for L layers of codewords one after the other
+    codewords: Array  # (L, K, D) float32; the layers' mixtures are added
+
+    @property
+    def dim(self) -> int:
+        return int(self.codewords.shape[2])
+
+    def rows(self, indices: Array) -> Array:
+        layers, size, dim = self.codewords.shape
+        logits = np.asarray(self.logits[indices], np.float32)
+        mixed = np.zeros((len(logits), dim), np.float32)
+        for layer in range(layers):
+            weights = _largest_of_softmax(logits[:, layer * size : (layer + 1) * size])
+            mixed += weights @ self.codewords[layer]
+        return np.where(np.ptp(logits, axis=1, keepdims=True) != 0, mixed, np.float32(0))
+
+
+def _largest_of_softmax(logits: Array) -> Array:
+    """(n, K) logits -> (n, K) weights: the `TOPK` largest of their softmax over their sum, else 0."""
+    powers = np.exp(logits - logits.max(1, keepdims=True))
+    shares = powers / powers.sum(1, keepdims=True)
+    largest = np.argsort(-shares, axis=1, kind="stable")[:, :TOPK]
+    kept = np.take_along_axis(shares, largest, 1)
+    weights = np.zeros_like(shares)
+    np.put_along_axis(weights, largest, kept / (kept.sum(1, keepdims=True) + 1e-10), 1)
+    return weights
+
+
+@dataclass(frozen=True, eq=False)
+class ProductCodes:
+    """Dr. Splat: a byte for each of M parts of the vector names one of 256 centroids of that part."""
+
+    codes: Array  # (N, M) uint8; a row of NO_CODE has no features
+    centroids: Array  # (M, 256, D / M) float32
+
+    @property
+    def dim(self) -> int:
+        return int(self.centroids.shape[0] * self.centroids.shape[2])
+
+    def rows(self, indices: Array) -> Array:
+        codes = np.asarray(self.codes[indices])
+        parts = self.centroids[np.arange(codes.shape[1]), codes]
+        known = (codes != NO_CODE).any(1)
+        return np.where(known[:, None], parts.reshape(len(codes), self.dim), np.float32(0))
+
+
+@dataclass(frozen=True, eq=False)
+class Leaves:
+    """OpenGaussian: a Gaussian belongs to one cluster, and the clusters have vectors."""
+
+    index: Array  # (N,) int64 rows of `vectors`; anything beyond them has no features
+    vectors: Array  # (K, D) float32 of any length; zero for a cluster without any
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    @property
+    def dim(self) -> int:
+        return int(self.vectors.shape[1])
+
+    def rows(self, indices: Array) -> Array:
+        index = self.index[indices]
+        named = (index >= 0) & (index < len(self.vectors))
+        return np.where(named[:, None], self.vectors[np.where(named, index, 0)], np.float32(0))
+
+
+@dataclass(frozen=True, eq=False)
+class Rearranged:
+    """Features carried over to other Gaussians."""
+
+    features: Features
+    partner: Array  # (N,) int64 row of `features`; -1 for none
+
+    @property
+    def dim(self) -> int:
+        return self.features.dim
+
+    def rows(self, indices: Array) -> Array:
+        partner = self.partner[indices]
+        out = np.zeros((len(partner), self.dim), np.float32)
+        found = partner >= 0
+        out[found] = self.features.rows(partner[found])
+        return out
+
+
+# The centroids of a product quantiser, which Dr. Splat keeps beside its checkpoints.
+#
+# `pq_index.faiss` is an `IndexPQ` as faiss writes it, little endian, of which only the quantiser is of use:
+#
+#     bytes  4        "IxPq"
+#     int32, int64    D, vectors in the index
+#     int64 x 2, u8   not used; whether it is trained
+#     int32           metric; behind one above 1 a float32
+#     uint64 x 3      D, M parts, bits per part
+#     uint64          float32 numbers that follow: the centroids (M, 2^bits, D / M)
+#
+# The same centroids are also taken as a .npy file of that shape.
+
+MAGIC = b"IxPq"
+CENTROIDS = 256  # of a part: what a byte can name
+_INDEX = struct.Struct("<iqqq?i")
+_QUANTISER = struct.Struct("<QQQQ")
+
+
+def checked_centroids(array: Array, path: Path) -> Array:
+    """(M, 256, D / M) float32. Raises FormatError for another shape and numbers that are not finite."""
+    if array.ndim != 3 or array.shape[1] != CENTROIDS or array.dtype.kind != "f":
+        raise FormatError(
+            f"{path}: holds {array.dtype} {array.shape}; expected the (M, 256, D / M) centroids of Dr. Splat"
+        )
+    if not np.isfinite(array).all():
+        raise FormatError(f"{path}: the quantiser's centroids are not finite")
+    return np.ascontiguousarray(array, np.float32)
+
+
+def read_faiss(path: Path) -> Array:
+    """(M, 256, D / M) float32 centroids. Raises InputError and FormatError."""
+    file, size = open_for_reading(path)
+    with file:
+        kind = file.read(4)
+        if kind != MAGIC:
+            name = kind.decode("ascii", "replace")
+            raise FormatError(
+                f"{path}: a faiss index of the kind {name!r}, expected {MAGIC.decode()!r}; "
+                "give the centroids (M, 256, D / M) as a .npy file"
+            )
+        index = file.read(_INDEX.size)
+        if len(index) == _INDEX.size and _INDEX.unpack(index)[-1] > 1:
+            file.read(4)  # the metric's argument
+        head = file.read(_QUANTISER.size)
+        if len(head) < _QUANTISER.size:
+            raise FormatError(f"{path}: truncated: the index ends in its header")
+        dim, parts, bits, count = _QUANTISER.unpack(head)
+        if bits != 8 or not 0 < parts <= dim or dim % parts or count != dim * CENTROIDS:
+            raise FormatError(
+                f"{path}: a quantiser of {dim} numbers in {parts} parts of {bits} bits; expected 8 bits"
+            )
+        if size - file.tell() < 4 * count:
+            raise FormatError(f"{path}: truncated: {count} centroid numbers do not fit the file")
+        centroids = np.frombuffer(file.read(4 * count), "<f4").reshape(parts, CENTROIDS, dim // parts)
+    return checked_centroids(centroids, path)
+
+
+# One file of what people give to an import, recognised by what it holds, never by its name or length.
+#
+# A `Carrier` has Gaussians, features of one level, or both. What a method keeps beside its checkpoints, an
+# autoencoder, a quantiser or the vectors of clusters, is of no use alone.
+
+PLAIN, UNNAMED = "3D Gaussian Splatting", "LangSplat or Occam's LGS"
+LANGSPLAT, OCCAM, V2 = "LangSplat", "Occam's LGS", "LangSplatV2"
+DR_SPLAT, FEATURE_3DGS, OPEN_GAUSSIAN = "Dr. Splat", "Feature-3DGS", "OpenGaussian"
+INSTANCE = 6  # numbers per Gaussian that OpenGaussian tells instances by, twice; they tell nothing alone
+PICKLE = b"\x80"  # how files of torch began before they were archives
+SEMANTIC = re.compile(r"semantic_\d+")
+
+
+@dataclass(frozen=True, eq=False)
+class Carrier:
+    """A checkpoint or PLY."""
+
+    path: Path
+    method: str
+    gaussians: Gaussians
+    features: Vectors | SparseCodes | None = None
+    codes: Array | None = None  # (N, M) uint8 of Dr. Splat: they need a quantiser
+    extras: Mapping[str, Array] = field(default_factory=dict)  # of a PLY, as `Scene.extras`
+    antialiased: bool = False
+
+    @property
+    def has_features(self) -> bool:
+        """Return whether the file carries more than Gaussians."""
+        return self.method != PLAIN
+
+
+@dataclass(frozen=True, eq=False)
+class Centroids:
+    """The centroids of a product quantiser, as Dr. Splat keeps them beside its checkpoints."""
+
+    path: Path
+    values: Array  # (M, 256, D / M) float32
+
+
+@dataclass(frozen=True, eq=False)
+class Clusters:
+    """Cluster vectors of OpenGaussian, `cluster_lang.npz`."""
+
+    path: Path
+    leaves: Leaves
+
+
+@dataclass(frozen=True, eq=False)
+class Autoencoder:
+    """Autoencoder of LangSplat, `best_ckpt.pth`."""
+
+    path: Path
+    codec: AutoencoderCodec
+
+
+Part = Carrier | Centroids | Clusters | Autoencoder
+
+
+def read_part(path: Path) -> Part:
+    """Read a file of any method, told by its content. Raises InputError where it cannot be opened,
+    FormatError where it is nothing known or damaged."""
+    file, _ = open_for_reading(path)
+    with file:
+        start = file.read(8)
+    if start.startswith((b"ply\n", b"ply\r")):
+        return _from_ply(path)
+    if start.startswith(NPY):
+        return Centroids(path, checked_centroids(read_npy(path), path))
+    if start.startswith((b"Ix", b"Iw")):  # as all kinds of faiss's indexes do
+        return Centroids(path, read_faiss(path))
+    if start.startswith(b"PK") and _is_npz(path):
+        return _clusters(read_npz(path), path)
+    if not start.startswith((b"PK", PICKLE)):
+        raise FormatError(f"{path}: neither a PLY nor a file of torch, NumPy or faiss; name checkpoints")
+    return _from_torch(load_torch(path), path)
+
+
+def _is_npz(path: Path) -> bool:
+    try:
+        with opened_archive(path, "archive") as archive:
+            return all(name.endswith(".npy") for name in archive.names)
+    except FormatError:  # torch finds more in a damaged archive than zipfile does
+        return False
+
+
+def _from_ply(path: Path) -> Carrier:
+    scene = read_ply_scene(path)
+    names = [name for name in scene.extras if SEMANTIC.fullmatch(name)]
+    rest = {name: values for name, values in scene.extras.items() if name not in names}
+    if not names:
+        return Carrier(path, PLAIN, scene.gaussians, extras=rest, antialiased=scene.antialiased)
+    ordered = [f"semantic_{index}" for index in range(len(names))]
+    if set(ordered) != set(names):
+        raise FormatError(f"{path}: {len(names)} properties semantic_*, not counted from 0 without gaps")
+    vectors = np.stack([scene.extras[name].astype(np.float32) for name in ordered], axis=1)
+    return Carrier(path, FEATURE_3DGS, scene.gaussians, Vectors(vectors), None, rest, scene.antialiased)
+
+
+def _clusters(arrays: dict[str, Array], path: Path) -> Clusters:
+    """OpenGaussian's vectors of clusters, and the cluster of each Gaussian."""
+    if not {"leaf_feat", "leaf_ind"} <= set(arrays):
+        shapes = ", ".join(str(array.shape) for array in list(arrays.values())[:6])
+        raise FormatError(
+            f"{path}: holds arrays {shapes or 'of no kind'}; expected leaf_feat and leaf_ind of OpenGaussian"
+        )
+    vectors, index = arrays["leaf_feat"], arrays["leaf_ind"]
+    if vectors.ndim != 2 or vectors.dtype.kind != "f" or index.ndim != 1 or index.dtype.kind not in "iu":
+        raise FormatError(
+            f"{path}: leaf_feat {vectors.dtype} {vectors.shape}, leaf_ind {index.dtype} {index.shape}; "
+            "expected floats (K, D) and whole numbers (N,)"
+        )
+    counts = arrays.get("occu_count", np.ones(len(vectors)))
+    if counts.shape != (len(vectors),):
+        raise FormatError(f"{path}: occu_count has the shape {counts.shape}, leaf_feat {vectors.shape}")
+    known = np.where(counts[:, None] > 0, vectors, 0).astype(np.float32)
+    return Clusters(path, Leaves(index.astype(np.int64), known))
+
+
+def _from_torch(content: Any, path: Path) -> Part:
+    elements = model_tuple(content)
+    if elements is not None:
+        gaussians = gaussians_of(elements, path)
+        method, features, codes = _language(elements, len(gaussians), path)
+        return Carrier(path, method, gaussians, features, codes)
+    mapping = plain_mapping(content)
+    named = {"": content} if mapping is None else mapping
+    if is_autoencoder(named):
+        return Autoencoder(path, autoencoder_from(named, path))
+    arrays = {str(name): plain_array(value, path) for name, value in named.items()}
+    found = {name: array for name, array in arrays.items() if array is not None}
+    if any(array.ndim == 4 for array in found.values()):
+        raise FormatError(
+            f"{path}: a convolutional decoder, as of Feature-3DGS with its speed-up; it decodes pictures, "
+            "not Gaussians, so that such features cannot be imported; train without the speed-up"
+        )
+    raise FormatError(f"{path}: a torch file, but not a checkpoint or autoencoder of a known method")
+
+
+def _language(
+    elements: tuple[Any, ...], count: int, path: Path
+) -> tuple[str, Vectors | SparseCodes | None, Array | None]:
+    """Method, features and codes of what follows the geometry."""
+    first = plain_array(elements[GEOMETRY], path)
+    second = plain_array(elements[GEOMETRY + 1], path) if len(elements) > GEOMETRY + 1 else None
+    if first is None or first.ndim != 2:  # (N,) radii of plain 3D Gaussian Splatting
+        late = [plain_array(element, path) for element in elements[GEOMETRY + 1 :]]
+        wide = [flat for array in late if (flat := _wide(array, count)) is not None]
+        return (FEATURE_3DGS, Vectors(wide[0]), None) if wide else (PLAIN, None, None)
+    if len(first) != count:
+        raise FormatError(f"{path}: features {first.shape} for {count} Gaussians")
+    if first.dtype == np.uint8:
+        return DR_SPLAT, None, first
+    if first.dtype.kind != "f":
+        raise FormatError(
+            f"{path}: features of the type {first.dtype}; expected floats, or bytes of a quantiser"
+        )
+    if second is not None and second.ndim == 3:
+        return V2, _sparse(first, second, path), None
+    if second is not None and first.shape == second.shape == (count, INSTANCE):
+        return OPEN_GAUSSIAN, None, None
+    return UNNAMED, Vectors(first), None
+
+
+def _wide(array: Array | None, count: int) -> Array | None:
+    """(N, D), (N, 1, D) or (N, D, 1) floats as (N, D) where D > 1; None for anything else."""
+    if array is None or array.dtype.kind != "f" or array.ndim not in (2, 3) or len(array) != count:
+        return None
+    flat = array.reshape(count, -1) if 1 in array.shape[1:] or array.ndim == 2 else array
+    return flat if flat.ndim == 2 and flat.shape[1] > 1 else None
+
+
+def _sparse(logits: Array, codewords: Array, path: Path) -> SparseCodes:
+    layers, size, _ = codewords.shape
+    if logits.ndim != 2 or logits.shape[1] != layers * size or not np.isfinite(codewords).all():
+        raise FormatError(
+            f"{path}: logits {logits.shape} for codewords {codewords.shape}; expected (N, L K) and finite "
+            "(L, K, D)"
+        )
+    return SparseCodes(logits, np.asarray(codewords, np.float32))
+
+
+# Which of the three levels a checkpoint is of, and how its Gaussians go with those of the others.
+
+# `chkpnt30000_langfeat_2`, `scene_level_2`, the folders `teatime_2` and, of Dr. Splat, `teatime_2_pq_...`
+_NUMBER = re.compile(r"_(?:level_?)?([1-3])(?:_pq_.*)?$")
+LEAST_SHARED = 0.5  # of the Gaussians of a pruned checkpoint; with fewer in common it is another scene's
+
+
+def levels_of(carriers: Sequence[Carrier], asked: Sequence[str]) -> tuple[list[int], str]:
+    """0, 1 or 2 for each checkpoint, and by what they were told apart.
+
+    As `asked` (names of levels, in the order of the checkpoints); else as their names say or those of their
+    folders; else three in their order, and one alone is the whole. Raises InputError where
+    that leaves a doubt.
+    """
+    if asked:
+        return _as_asked(carriers, asked), "as asked"
+    numbers = [_numbered(carrier.path) for carrier in carriers]
+    chosen = [number - 1 for number in numbers if number is not None]
+    if len(set(chosen)) == len(carriers):
+        return chosen, "by the names of files and folders"
+    if len(carriers) == len(LEVELS) and len(set(numbers)) == 1:
+        return list(range(len(LEVELS))), "by their order"
+    if numbers == [None]:
+        return [len(LEVELS) - 1], "one alone is taken for the whole"
+    paths = ", ".join(str(carrier.path) for carrier in carriers)
+    raise InputError(
+        f"{paths}: of which levels? Say, for example, --levels {' '.join(LEVELS[: len(carriers)])}"
+    )
+
+
+def _as_asked(carriers: Sequence[Carrier], asked: Sequence[str]) -> list[int]:
+    if len(asked) != len(carriers) or len(set(asked)) != len(asked):
+        raise InputError(
+            f"--levels {' '.join(asked)}: {len(carriers)} checkpoints have features; name a level for each, "
+            "each once"
+        )
+    return [LEVELS.index(name) for name in asked]
+
+
+def _numbered(path: Path) -> int | None:
+    """Return the number at the end of a file's name, or of its folder's."""
+    for name in (path.stem, path.resolve().parent.name):
+        found = _NUMBER.search(name)
+        if found:
+            return int(found[1])
+    return None
+
+
+def all_gaussians(carriers: Sequence[Carrier]) -> Gaussians:
+    """Return the Gaussians of checkpoints that lack different ones: those of the first, then what each
+    further one has beside them. Raises FormatError where they are not of one scene."""
+    found = carriers[0].gaussians
+    for carrier in carriers[1:]:
+        theirs = carrier.gaussians
+        if found.sh.shape[1] != theirs.sh.shape[1]:
+            raise FormatError(f"{carrier.path}: SH degree {theirs.sh_degree}, others have {found.sh_degree}")
+        row = _row_of(theirs.means, found.means)
+        _require_shared(row, min(len(found), len(theirs)), carrier)
+        found = join_gaussians([found, theirs.take(row < 0)])
+    return found
+
+
+def partners(means: Array, carrier: Carrier, may_lack: bool) -> Array | None:
+    """(N,) row of the `carrier`'s Gaussian at each of (N, 3) `means`, -1 where it has none; None where they
+    are the same Gaussians. Raises FormatError where they are not of one scene.
+
+    A checkpoint that `may_lack` some Gaussians has removed them: those at the same position, bit for bit, are
+    the same.
+    """
+    theirs = carrier.gaussians.means
+    if np.array_equal(means, theirs, equal_nan=True):
+        return None
+    if not may_lack:
+        raise FormatError(
+            f"{carrier.path}: its {len(theirs)} Gaussians are not the {len(means)} of the other files; "
+            "give checkpoints that were trained from one scene"
+        )
+    row = _row_of(means, theirs)
+    _require_shared(row, len(theirs), carrier)
+    return row
+
+
+def _require_shared(row: Array, count: int, carrier: Carrier) -> None:
+    shared = int((row >= 0).sum())
+    if shared < LEAST_SHARED * count or shared == 0:
+        raise FormatError(
+            f"{carrier.path}: {shared} of {count} Gaussians are at positions of the other files'; "
+            "give checkpoints that were trained from one scene"
+        )
+
+
+def _row_of(means: Array, theirs: Array) -> Array:
+    """(N,) row of `theirs` at the same position; the k-th of several at one place goes with the k-th."""
+    keys = np.concatenate([_keys(means), _keys(theirs)])
+    order = np.lexsort(keys.T)  # stable: of two equal keys, one of each side, that of `means` is first
+    ordered = keys[order]
+    same = (ordered[1:] == ordered[:-1]).all(1)
+    row = np.full(len(means), -1, np.int64)
+    row[order[:-1][same]] = order[1:][same] - len(means)
+    return row
+
+
+def _keys(means: Array) -> Array:
+    """(N, 3) float32 -> (N, 4) uint32: the bits of a position, and the how manieth at that place it is."""
+    bits = np.ascontiguousarray(means, np.float32).view(np.uint32).reshape(len(means), 3)
+    order = np.lexsort(bits.T)
+    first = np.ones(len(means), bool)
+    first[1:] = (bits[order][1:] != bits[order][:-1]).any(1)
+    starts = np.flatnonzero(first)
+    turn = np.empty(len(means), np.uint32)
+    turn[order] = np.arange(len(means)) - np.repeat(starts, np.diff(np.append(starts, len(means))))
+    return np.concatenate([bits, turn[:, None]], axis=1)

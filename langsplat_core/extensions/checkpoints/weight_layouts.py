@@ -1,0 +1,450 @@
+"""Weights in the layouts of open_clip, OpenAI, segment_anything and sam2, renamed to those of transformers.
+
+What a model is made of follows from the shapes of its tensors; an open_clip_config.json beside them says
+what shapes do not: the heads, and which GELU. Without one, CLIP's heads are 64 wide, those for images at
+most 16, as in the models that OpenAI and open_clip published; and the GELU is OpenAI's quick one where the
+file holds OpenAI's `input_resolution` too or has "quickgelu" or "openai" in its name, else the exact one.
+Of SAM 2, whose windows and heads no shape tells, the published sizes are known.
+"""
+
+import io
+import json
+import pickletools
+import re
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from langsplat_core.errors import EncoderError
+from langsplat_core.semantics.weights import (
+    OPEN_CLIP_CONFIG,
+    UNREADABLE,
+    Converted,
+    loading_errors,
+    unpickled,
+)
+
+Tensors = Mapping[str, Any]  # name -> torch.Tensor
+Settings = dict[str, Any]
+Names = tuple[tuple[re.Pattern[str], str], ...]  # of transformers, for patterns of another layout's
+
+MOBILE_SAM = (
+    "a MobileSAM, whose encoder TinyViT transformers does not have; pass sam_vit_b_01ec64.pth in its place, "
+    "or for speed sam2.1_hiera_tiny.pt"
+)
+HEAD_WIDTH, MOST_HEADS = 64, 16
+SAM_HEADS = 8  # of the mask decoder, which no shape tells
+NOT_OURS = "open_clip's {part} states {name} {value!r}, which is not computed here"
+
+WHOLE = {
+    "logit_scale": "logit_scale",
+    "token_embedding.weight": "text_model.embeddings.token_embedding.weight",
+    "positional_embedding": "text_model.embeddings.position_embedding.weight",
+    "visual.class_embedding": "vision_model.embeddings.class_embedding",
+    "visual.conv1.weight": "vision_model.embeddings.patch_embedding.weight",
+    "visual.positional_embedding": "vision_model.embeddings.position_embedding.weight",
+}
+NORMS = {
+    "ln_final": "text_model.final_layer_norm",
+    "visual.ln_pre": "vision_model.pre_layrnorm",  # as transformers spells it
+    "visual.ln_post": "vision_model.post_layernorm",
+}
+TRANSPOSED = {"text_projection": "text_projection.weight", "visual.proj": "visual_projection.weight"}
+OPENAI = {"input_resolution", "context_length", "vocab_size"}  # numbers beside OpenAI's weights
+UNUSED = OPENAI | {"attn_mask"}
+BLOCK = re.compile(r"(visual\.)?transformer\.resblocks\.(\d+)\.(ln_1|ln_2|attn|mlp)[._](.+)")
+IN_BLOCK = {
+    **{f"ln_{number} {part}": f"layer_norm{number}.{part}" for number in "12" for part in ("weight", "bias")},
+    **{f"attn out_proj.{part}": f"self_attn.out_proj.{part}" for part in ("weight", "bias")},
+    **{f"mlp c_fc.{part}": f"mlp.fc1.{part}" for part in ("weight", "bias")},
+    **{f"mlp c_proj.{part}": f"mlp.fc2.{part}" for part in ("weight", "bias")},
+}
+STATED = {  # settings of open_clip_config.json that are read or follow from the shapes
+    "model_cfg": {"embed_dim", "vision_cfg", "text_cfg", "quick_gelu", "custom_text", "init_logit_scale"},
+    "vision_cfg": {"image_size", "patch_size", "width", "layers", "head_width", "mlp_ratio", "patch_dropout"},
+    "text_cfg": {"context_length", "vocab_size", "width", "layers", "heads", "mlp_ratio"},
+}
+# What other settings may be without any effect.
+USUAL: tuple[object, ...] = (None, False, 0, "", {}, "tok", "argmax", "linear")
+
+SAM_NAMES = tuple(
+    (re.compile(pattern), name)
+    for pattern, name in (
+        (r"^image_encoder\.", "vision_encoder."),
+        (r"^vision_encoder\.blocks\.", "vision_encoder.layers."),
+        (r"\.patch_embed\.proj\.", ".patch_embed.projection."),
+        (r"\.norm(\d|_final_attn)\.", r".layer_norm\1."),
+        (r"\.neck\.0\.", ".neck.conv1."),
+        (r"\.neck\.1\.", ".neck.layer_norm1."),
+        (r"\.neck\.2\.", ".neck.conv2."),
+        (r"\.neck\.3\.", ".neck.layer_norm2."),
+        (r"\.pe_layer\.positional_encoding_gaussian_matrix$", ".shared_embedding.positional_embedding"),
+        (r"\.point_embeddings\.", ".point_embed."),
+        (r"\.mask_downscaling\.0\.", ".mask_embed.conv1."),
+        (r"\.mask_downscaling\.1\.", ".mask_embed.layer_norm1."),
+        (r"\.mask_downscaling\.3\.", ".mask_embed.conv2."),
+        (r"\.mask_downscaling\.4\.", ".mask_embed.layer_norm2."),
+        (r"\.mask_downscaling\.6\.", ".mask_embed.conv3."),
+        (r"\.output_upscaling\.0\.", ".upscale_conv1."),
+        (r"\.output_upscaling\.1\.", ".upscale_layer_norm."),
+        (r"\.output_upscaling\.3\.", ".upscale_conv2."),
+        (r"(_head|_mlps\.\d)\.layers\.0\.", r"\1.proj_in."),
+        (r"(_head|_mlps\.\d)\.layers\.1\.", r"\1.layers.0."),
+        (r"(_head|_mlps\.\d)\.layers\.2\.", r"\1.proj_out."),
+    )
+)
+SAM2_NAMES = tuple(  # what is named otherwise than in SAM
+    (re.compile(pattern), name)
+    for pattern, name in (
+        (r"^vision_encoder\.trunk\.", "vision_encoder.backbone."),
+        (r"(\.neck\.convs\.\d)\.conv\.", r"\1."),
+        (r"\.mlp\.layers\.0\.", ".mlp.proj_in."),
+        (r"\.mlp\.layers\.1\.", ".mlp.proj_out."),
+        (r"\.out_proj\.", ".o_proj."),
+        (r"^no_mem_embed$", "no_memory_embedding"),
+    )
+)
+SAM_GRID = "prompt_encoder.shared_embedding.positional_embedding"
+SAM2_POINTS = [f"prompt_encoder.point_embeddings.{n}.weight" for n in range(4)]  # outside, inside, corners
+SAM2_SIDE = 1024  # px, of the square that SAM 2 sees, which no shape tells
+
+
+@dataclass(frozen=True)
+class Hiera:
+    """Settings of a SAM 2's encoder that do not follow from shapes of tensors."""
+
+    heads: int  # of the first stage; they double with the width
+    windows: tuple[int, int, int, int]  # side by stage, in positions of its grid
+    everywhere: tuple[int, ...]  # blocks that attend to the whole image
+
+
+SAM2_SIZES: Mapping[tuple[int, int], Hiera] = MappingProxyType(  # by width of the first stage and blocks
+    {
+        (96, 12): Hiera(1, (8, 4, 14, 7), (5, 7, 9)),  # tiny
+        (96, 16): Hiera(1, (8, 4, 14, 7), (7, 10, 13)),  # small
+        (112, 24): Hiera(2, (8, 4, 14, 7), (12, 16, 20)),  # base plus
+        (144, 48): Hiera(2, (8, 4, 16, 8), (23, 33, 43)),  # large
+    }
+)
+
+
+def converted(id: str, file: Path) -> Converted | None:
+    """Return weights renamed to those of transformers; None where they are of no layout known here.
+
+    id: what messages name. Raises EncoderError for a file that is damaged.
+    """
+    with loading_errors(id, "CLIP or SAM"):
+        tensors = _read(id, file)
+        if "image_encoder.pos_embed" in tensors:
+            return Converted(_sam_config(tensors), _sam_tensors(tensors, SAM_NAMES), {})
+        if "image_encoder.trunk.pos_embed" in tensors:
+            return _sam2({name.removeprefix("sam_"): tensor for name, tensor in tensors.items()})
+        if "image_encoder.patch_embed.seq.0.c.weight" in tensors:
+            raise EncoderError(f"{id}: {MOBILE_SAM}")
+        return _clip(file, tensors) if "visual.class_embedding" in tensors else None
+
+
+def _read(id: str, file: Path) -> Tensors:
+    """The tensors of a file, without the wrappings of a training's checkpoint; none of its code is run."""
+    import torch
+    from safetensors.torch import load_file
+
+    if file.suffix == ".safetensors":
+        return load_file(file)
+    names = zipfile.ZipFile(file).namelist() if zipfile.is_zipfile(file) else []
+    if any(name.endswith("/constants.pkl") for name in names):
+        try:
+            found: Any = _script_tensors(file)
+        except UNREADABLE as error:
+            raise EncoderError(
+                f"{id}: a TorchScript archive that is damaged or whose code would have to be run; pass the "
+                "same weights in another layout, such as the hub id openai/clip-vit-base-patch16"
+            ) from error
+    else:
+        found = unpickled(file)
+    found = found.get("state_dict", found.get("model", found)) if isinstance(found, dict) else {}
+    if not isinstance(found, dict):
+        raise ValueError("it holds no named tensors")
+    tensors = {name: tensor for name, tensor in found.items() if isinstance(tensor, torch.Tensor)}
+    if any(tensor.nbytes > file.stat().st_size for tensor in tensors.values()):
+        raise ValueError("a tensor claims more numbers than the file holds")
+    return {str(name).removeprefix("module.").removeprefix("text."): tensors[name] for name in tensors}
+
+
+class _Module:
+    """Stand-in for every class of a TorchScript archive: its attributes, and none of its code."""
+
+    parts: Mapping[Any, Any] = MappingProxyType({})
+
+    def __setstate__(self, state: Any) -> None:
+        self.parts = state if isinstance(state, dict) else {}
+
+
+def _script_tensors(file: Path) -> dict[str, Any]:
+    """Tensors of a TorchScript archive, as OpenAI publishes CLIP, by their modules' names. torch reads such
+    an archive only by running it, so what holds the tensors is put into one of its own."""
+    import torch
+
+    copy = io.BytesIO()
+    with zipfile.ZipFile(file) as archive, zipfile.ZipFile(copy, "w") as plain:
+        for entry in archive.infolist():
+            _, _, name = entry.filename.partition("/")
+            if name in ("data.pkl", "version", "byteorder") or name.startswith("data/"):
+                if entry.compress_type != zipfile.ZIP_STORED:
+                    raise ValueError("torch compresses nothing")
+                plain.writestr(f"archive/{name}", archive.read(entry))
+        pickled = plain.read("archive/data.pkl")
+    named = (str(argument) for code, argument, _ in pickletools.genops(pickled) if code.name == "GLOBAL")
+    classes = {name.replace(" ", ".", 1) for name in named if name.startswith("__torch__.")}
+    copy.seek(0)
+    with torch.serialization.safe_globals([(_Module, name) for name in sorted(classes)]):
+        waiting = [("", torch.load(copy, map_location="cpu", weights_only=True))]
+    found: dict[str, Any] = {}
+    seen: set[int] = set()  # a part may hold itself
+    while waiting:
+        prefix, module = waiting.pop()
+        if isinstance(module, _Module) and id(module) not in seen:
+            seen.add(id(module))
+            waiting += [(f"{prefix}{name}.", part) for name, part in module.parts.items()]
+        elif isinstance(module, torch.Tensor):
+            found[prefix[:-1]] = module
+    return found
+
+
+def _clip(file: Path, tensors: Tensors) -> Converted:
+    stated = _stated(file.parent / OPEN_CLIP_CONFIG)
+    config = _clip_config(tensors)
+    if stated:
+        model = stated["model_cfg"]
+        _check(model, config)
+        quick = bool(model.get("quick_gelu", False))
+        config["vision_config"]["num_attention_heads"] = config["vision_config"]["hidden_size"] // int(
+            model["vision_cfg"].get("head_width", HEAD_WIDTH)
+        )
+        config["text_config"]["num_attention_heads"] = int(model["text_cfg"].get("heads", 8))
+    else:
+        named = file.name.lower().replace("_", "").replace("-", "")
+        quick = tensors.keys() >= OPENAI or "quickgelu" in named or "openai" in named
+    for half in ("text_config", "vision_config"):
+        config[half]["hidden_act"] = "quick_gelu" if quick else "gelu"
+    pixels = stated.get("preprocess_cfg") or {}
+    statistics = {f"image_{name}": pixels[name] for name in ("mean", "std") if name in pixels}
+    return Converted(config, _clip_tensors(tensors), statistics)
+
+
+def _stated(path: Path) -> Settings:
+    """Content of open_clip_config.json; empty where there is none."""
+    if not path.is_file():
+        return {}
+    try:
+        stated: Settings = json.loads(path.read_text(encoding="utf-8"))
+        parts = [stated["model_cfg"], stated["model_cfg"]["vision_cfg"], stated["model_cfg"]["text_cfg"]]
+        if all(isinstance(part, dict) for part in parts):
+            return stated
+    except (ValueError, LookupError, TypeError, RecursionError):
+        pass
+    raise ValueError(f"{path.name} states no model_cfg with vision_cfg and text_cfg")
+
+
+def _clip_config(tensors: Tensors) -> Settings:
+    """Settings by the shapes, as in a config.json of transformers."""
+    words, wide = _shape(tensors, "token_embedding.weight", 2)
+    channels, _, patch, _ = _shape(tensors, "visual.conv1.weight", 4)
+    positions, _ = _shape(tensors, "visual.positional_embedding", 2)
+    first = "transformer.resblocks.0.mlp.c_fc.weight"
+    text = {
+        "vocab_size": words,
+        "hidden_size": wide,
+        "intermediate_size": _shape(tensors, first, 2)[0],
+        "num_hidden_layers": _count(tensors, r"transformer\.resblocks\.(\d+)\."),
+        "num_attention_heads": wide // HEAD_WIDTH,
+        "max_position_embeddings": _shape(tensors, "positional_embedding", 2)[0],
+        "eos_token_id": 2,  # to transformers: the end is the token with the highest number, as in open_clip
+    }
+    vision = {
+        "image_size": patch * round((positions - 1) ** 0.5),
+        "patch_size": patch,
+        "hidden_size": channels,
+        "intermediate_size": _shape(tensors, f"visual.{first}", 2)[0],
+        "num_hidden_layers": _count(tensors, r"visual\.transformer\.resblocks\.(\d+)\."),
+        "num_attention_heads": min(channels // HEAD_WIDTH, MOST_HEADS),
+    }
+    size = _shape(tensors, "text_projection", 2)[1]
+    return {"model_type": "clip", "projection_dim": size, "text_config": text, "vision_config": vision}
+
+
+def _check(model: Settings, config: Settings) -> None:
+    """Raise ValueError where open_clip_config.json asks for another network than is computed here, or states
+    other numbers than the tensors have."""
+    text, vision = config["text_config"], config["vision_config"]
+    for part in STATED:
+        settings = model if part == "model_cfg" else model[part]
+        for name, value in settings.items():
+            if name not in STATED[part] and value not in USUAL:
+                raise ValueError(NOT_OURS.format(part=part, name=name, value=value))
+    found = {
+        ("vision_cfg", "image_size"): vision["image_size"],
+        ("vision_cfg", "patch_size"): vision["patch_size"],
+        ("vision_cfg", "width"): vision["hidden_size"],
+        ("vision_cfg", "layers"): vision["num_hidden_layers"],
+        ("text_cfg", "context_length"): text["max_position_embeddings"],
+        ("text_cfg", "vocab_size"): text["vocab_size"],
+        ("text_cfg", "width"): text["hidden_size"],
+        ("text_cfg", "layers"): text["num_hidden_layers"],
+    }
+    for (part, name), number in found.items():
+        if model[part].get(name, number) != number:
+            raise ValueError(
+                f"{OPEN_CLIP_CONFIG} states {name} {model[part][name]}, the tensors have {number}"
+            )
+
+
+def _clip_tensors(tensors: Tensors) -> dict[str, Any]:
+    renamed: dict[str, Any] = {}
+    for name, tensor in tensors.items():
+        stem, _, leaf = name.rpartition(".")
+        if name in WHOLE:
+            renamed[WHOLE[name]] = tensor
+        elif stem in NORMS:
+            renamed[f"{NORMS[stem]}.{leaf}"] = tensor
+        elif name in TRANSPOSED:
+            renamed[TRANSPOSED[name]] = tensor.T
+        elif block := BLOCK.fullmatch(name):
+            renamed |= _block(name, block, tensor)
+        elif name not in UNUSED:
+            raise ValueError(f"{name} is no tensor of a CLIP with a vision transformer")
+    return renamed
+
+
+def _block(name: str, found: re.Match[str], tensor: Any) -> dict[str, Any]:
+    """The tensors of a layer that one of open_clip's is: queries, keys and values are one there."""
+    layer = f"{'vision' if found[1] else 'text'}_model.encoder.layers.{found[2]}."
+    if found[4].startswith("in_proj_"):
+        part = found[4].removeprefix("in_proj_")
+        return {
+            f"{layer}self_attn.{role}_proj.{part}": third
+            for role, third in zip("qkv", tensor.chunk(3), strict=True)
+        }
+    inner = f"{found[3]} {found[4]}"
+    if inner not in IN_BLOCK:
+        raise ValueError(f"{name} is no tensor of a CLIP with a vision transformer")
+    return {f"{layer}{IN_BLOCK[inner]}": tensor}
+
+
+def _sam_tensors(tensors: Tensors, names: Names) -> dict[str, Any]:
+    renamed = {}
+    for old, tensor in tensors.items():
+        name = old
+        for pattern, by in names:
+            name = pattern.sub(by, name)
+        renamed[name] = tensor
+    renamed["shared_image_embedding.positional_embedding"] = renamed[SAM_GRID]
+    return renamed
+
+
+def _sam_config(tensors: Tensors) -> Settings:
+    """Settings by the shapes, as in a config.json of transformers."""
+    _, grid, _, wide = _shape(tensors, "image_encoder.pos_embed", 4)
+    patch = _shape(tensors, "image_encoder.patch_embed.proj.weight", 4)[2]
+    layers = _count(tensors, r"image_encoder\.blocks\.(\d+)\.")
+    reach = [_shape(tensors, f"image_encoder.blocks.{n}.attn.rel_pos_h", 2) for n in range(layers)]
+    everywhere = [n for n, (rows, _) in enumerate(reach) if rows == 2 * grid - 1]
+    windows = [(rows + 1) // 2 for n, (rows, _) in enumerate(reach) if n not in everywhere]
+    vision = {
+        "image_size": grid * patch,
+        "patch_size": patch,
+        "hidden_size": wide,
+        "num_hidden_layers": layers,
+        "num_attention_heads": wide // reach[0][1],
+        "mlp_dim": _shape(tensors, "image_encoder.blocks.0.mlp.lin1.weight", 2)[0],
+        "output_channels": _shape(tensors, "image_encoder.neck.0.weight", 4)[0],
+        "window_size": windows[0] if windows else 0,
+        "global_attn_indexes": everywhere,
+        "num_pos_feats": _shape(tensors, "prompt_encoder.pe_layer.positional_encoding_gaussian_matrix", 2)[1],
+    }
+    settings = _decoder_config(tensors, "lin1") | {"model_type": "sam", "vision_config": vision}
+    settings["prompt_encoder_config"] |= {
+        "image_size": grid * patch,
+        "patch_size": patch,
+        "image_embedding_size": grid,
+    }
+    return settings
+
+
+def _decoder_config(tensors: Tensors, first: str) -> Settings:
+    """Settings of the halves for prompts and masks, by the shapes; `first`: of the two layers of an "mlp"."""
+    tokens, size = _shape(tensors, "mask_decoder.mask_tokens.weight", 2)
+    decoder = "mask_decoder.transformer.layers.0."
+    narrow = _shape(tensors, f"{decoder}cross_attn_token_to_image.q_proj.weight", 2)[0]
+    masks = {
+        "hidden_size": size,
+        "mlp_dim": _shape(tensors, f"{decoder}mlp.{first}.weight", 2)[0],
+        "num_hidden_layers": _count(tensors, r"mask_decoder\.transformer\.layers\.(\d+)\."),
+        "num_attention_heads": SAM_HEADS,
+        "attention_downsample_rate": size // narrow,
+        "num_multimask_outputs": tokens - 1,
+        "iou_head_hidden_dim": _shape(tensors, "mask_decoder.iou_prediction_head.layers.0.weight", 2)[0],
+    }
+    channels = _shape(tensors, "prompt_encoder.mask_downscaling.3.weight", 4)[0]
+    prompts = {"hidden_size": size, "mask_input_channels": channels}
+    return {"prompt_encoder_config": prompts, "mask_decoder_config": masks}
+
+
+def _sam2(tensors: dict[str, Any]) -> Converted:
+    """The half of a SAM 2 or 2.1 that sees single images; its memory of films is left out. tensors: without
+    "sam_" before the names of prompt encoder and mask decoder."""
+    import torch
+
+    points = [tensors.pop(name) for name in SAM2_POINTS if _shape(tensors, name, 2)]
+    renamed = _sam_tensors(tensors, SAM_NAMES + SAM2_NAMES)
+    renamed["prompt_encoder.point_embed.weight"] = torch.cat(points)
+    return Converted(_sam2_config(tensors), renamed, {})
+
+
+def _sam2_config(tensors: Tensors) -> Settings:
+    """Settings by shapes and published sizes, as in a config.json of transformers."""
+    _, wide, *background = _shape(tensors, "image_encoder.trunk.pos_embed", 4)
+    blocks = _count(tensors, r"image_encoder\.trunk\.blocks\.(\d+)\.")
+    if (wide, blocks) not in SAM2_SIZES:
+        raise ValueError(f"a SAM 2 of {blocks} blocks, {wide} wide, which is none of the published ones")
+    size = SAM2_SIZES[wide, blocks]
+    widths = [
+        _shape(tensors, f"image_encoder.trunk.blocks.{n}.attn.proj.weight", 2)[0] for n in range(blocks)
+    ]
+    stages = sorted(set(widths))
+    backbone = {
+        "model_type": "sam2_hiera_det_model",
+        "hidden_size": wide,
+        "num_attention_heads": size.heads,
+        "image_size": [SAM2_SIDE, SAM2_SIDE],
+        "window_positional_embedding_background_size": background,
+        "blocks_per_stage": [widths.count(width) for width in stages],
+        "embed_dim_per_stage": stages,
+        "num_attention_heads_per_stage": [size.heads * width // wide for width in stages],
+        "window_size_per_stage": list(size.windows),
+        "global_attention_blocks": list(size.everywhere),
+    }
+    vision = {
+        "backbone_config": backbone,
+        "backbone_channel_list": stages[::-1],
+        "backbone_feature_sizes": [[SAM2_SIDE // step] * 2 for step in (4, 8, 16)],
+        "fpn_hidden_size": _shape(tensors, "image_encoder.neck.convs.0.conv.weight", 4)[0],
+    }
+    settings = _decoder_config(tensors, "layers.0") | {"model_type": "sam2", "vision_config": vision}
+    settings["prompt_encoder_config"]["image_size"] = SAM2_SIDE
+    return settings
+
+
+def _shape(tensors: Tensors, name: str, axes: int) -> tuple[int, ...]:
+    found = tensors.get(name)
+    if found is None or found.ndim != axes or not found.numel():
+        raise ValueError(f"no {name} of {axes} axes among the tensors")
+    return tuple(found.shape)
+
+
+def _count(tensors: Tensors, pattern: str) -> int:
+    """Count the numbers in names that begin with `pattern`."""
+    return len({found[1] for found in map(re.compile(pattern).match, tensors) if found})

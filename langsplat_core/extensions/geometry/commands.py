@@ -1,0 +1,352 @@
+"""`langsplat mesh`, `register` and `merge`: surfaces as triangles, and two scenes of one place."""
+
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+import tyro
+from PIL import Image
+
+from langsplat_core.arrays import Array
+from langsplat_core.cli.query import found_answer, unit_of
+from langsplat_core.cli.run import AnyScene, EncoderOption, OutFile, OutFolder
+from langsplat_core.config import Count, LevelChoice, Positive
+from langsplat_core.errors import EncoderError, InputError, optional_imports
+from langsplat_core.extensions.geometry.merge import merge
+from langsplat_core.extensions.geometry.occupancy import (
+    FloorMap,
+    Occupancy,
+    collider,
+    find_goal,
+    find_occupancy,
+    floor_map,
+    map_axes,
+    reachable,
+)
+from langsplat_core.io.cameras import numbers
+from langsplat_core.io.files import atomic_path, write_json
+from langsplat_core.io.hostile import read_json_file
+from langsplat_core.io.scenes import check_keeps, check_writable, load_scene, save_scene
+from langsplat_core.io.shapes import MESH_SUFFIXES, RGB, check_suffix, gltf_axes, write_meshes
+from langsplat_core.progress import Progress, TerminalProgress
+from langsplat_core.query.compose import check_phrase, run_phrase
+from langsplat_core.query.describe import Describer
+from langsplat_core.query.engine import QueryEngine, searchable
+from langsplat_core.scene import LEVELS, NO_NODE, Scene
+from langsplat_core.scene.surface import surface_weights
+from langsplat_core.scene.transform import Similarity, similarity, transform_scene
+from langsplat_core.semantics.encoders import load_text_encoder
+
+if TYPE_CHECKING:
+    from langsplat_core.extensions.geometry.registration import Registration
+
+TRANSFORM_LIMIT = 1 << 20  # bytes of a file with a matrix
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Write the surface of a scene, or of what a phrase names, as triangles with colours. They are fused from
+    images rendered by the scene's cameras, or from around it, so that what no camera sees has none."""
+
+    scene: AnyScene
+    out: tyro.conf.Positional[OutFile]
+    """File to write: .ply or .obj in world units, .glb in metres with y up."""
+    phrase: str = ""
+    """Of everything that this names alone; the scene then needs its language field."""
+    level: LevelChoice = "auto"
+    """Semantic level of the phrase."""
+    resolution: Positive | None = None
+    """Side of a voxel, in metres if the scene has a scale, else world units; by default 1/100 of the radius,
+    but no less than 1.5 pixels of the images."""
+    views: Count = 2
+    """Images that must agree on a surface: more leave holes, and what is left is nearer to the truth."""
+    watertight: bool = False
+    """Close all holes (Poisson), and say how much of the surface is made up so."""
+    encoder: EncoderOption = ""
+
+    @optional_imports()
+    def run(self) -> None:
+        from langsplat_core.extensions.geometry.mesh import close_holes, fuse
+
+        check_suffix(self.out, MESH_SUFFIXES)
+        check_keeps(self.out, self.scene)
+        scene = searchable(self.scene) if self.phrase else load_scene(self.scene)
+        unit = unit_of(scene)
+        if self.phrase:
+            engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
+            scene = scene.take(found_answer(engine, self.phrase, self.level).members)
+        finest = None if self.resolution is None else self.resolution / unit.length
+        with TerminalProgress() as progress:
+            mesh, side = fuse(scene, finest, self.views, progress=progress)
+            holes, made = mesh.holes(), ""
+            if self.watertight:
+                mesh, area = close_holes(mesh, side)
+                share = 100 * area / max(float(mesh.areas().sum()), 1e-300)
+                left = "" if mesh.holes() == 0 else f", {mesh.holes()} left at the border of the scene"
+                made = f" closed{left}; made up: {area * unit.length**2:.3g} {unit.name}^2 ({share:.0f} %)"
+            mesh = replace(mesh, name=self.phrase or self.scene.stem)
+            write_meshes(self.out, [mesh], gltf_axes(scene))
+        print(
+            f"{self.out}: {len(mesh.triangles)} triangles, {len(mesh.vertices)} vertices, voxels of "
+            f"{side * unit.length:.3g} {unit.name}; {holes} holes{made}"
+        )
+
+
+@dataclass(frozen=True)
+class Register:
+    """Find how a scene lies in the axes of another one of the same place. The exit code is 2 where their
+    surfaces do not agree."""
+
+    moving: tyro.conf.Positional[Path]
+    """The scene that would be moved."""
+    fixed: tyro.conf.Positional[Path]
+    """The scene that stays."""
+    out: OutFile | None = None
+    """File for the matrix, .json, as `langsplat merge --transform` reads it."""
+    scaled: bool = False
+    """Units may differ in length; else they are the same, up to what both scenes say of metres."""
+
+    @optional_imports()
+    def run(self) -> None:
+        with TerminalProgress() as progress:
+            found = registered(load_scene(self.moving), load_scene(self.fixed), self.scaled, progress)
+        if self.out is not None:
+            write_json(self.out, {"matrix": found.transform.tolist()})
+        rows = "; ".join(" ".join(f"{number:.9g}" for number in row) for row in found.transform)
+        print(
+            f"{100 * found.agreement:.0f} % of the surfaces agree, {found.rmse:.3g} units apart; scale "
+            f"{found.scale:.4g}; matrix {rows}"
+        )
+
+
+@dataclass(frozen=True)
+class Merge:
+    """Write two scenes as one: Gaussians, cameras, language field, tree and taught words of both. The second
+    is first laid onto the first, as `langsplat register` finds it, or as told."""
+
+    first: tyro.conf.Positional[Path]
+    """A scene; what is said of a whole scene is as here."""
+    second: tyro.conf.Positional[Path]
+    """The scene that is added, and moved for that."""
+    out: OutFile
+    """Scene to write: .ply, .spz or .splat."""
+    transform: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """How the second lies in the axes of the first: .json of `langsplat register`, instead of a search."""
+    as_is: bool = False
+    """Both are in the same axes already: nothing is moved."""
+    scaled: bool = False
+    """As of `langsplat register`."""
+
+    @optional_imports()
+    def run(self) -> None:
+        check_writable(self.out)
+        check_keeps(self.out, self.first, self.second)
+        if self.as_is and self.transform is not None:
+            raise InputError("--as-is moves nothing, --transform does; give one of them")
+        first, second = load_scene(self.first), load_scene(self.second)
+        said = "as they were"
+        if self.transform is not None:
+            second, said = transform_scene(second, read_transform(self.transform)), "as told"
+        elif not self.as_is:
+            with TerminalProgress() as progress:
+                found = registered(second, first, self.scaled, progress)
+            second = transform_scene(second, similarity(found.transform))
+            said = f"registered, {100 * found.agreement:.0f} % of the surfaces agree"
+        scene = merge(first, second)
+        save_scene(self.out, replace(scene, path=self.out))
+        print(f"{self.out}: {len(scene.gaussians)} Gaussians, {len(scene.cameras)} cameras; {said}")
+
+
+def registered(moving: Scene, fixed: Scene, scaled: bool, progress: Progress) -> "Registration":
+    """How a scene lies in the axes of another; InputError unless renderings confirm it."""
+    from langsplat_core.extensions.geometry.registration import TRUSTED, register
+
+    found = register(moving, fixed, scaled, progress=progress)
+    if not found.trusted:
+        hint = "" if scaled else ", and give --scaled where their units differ"
+        raise InputError(
+            f"the scenes do not show one place as far as can be told: {100 * found.agreement:.0f} % of the "
+            f"surfaces agree where both are seen, of {100 * TRUSTED:.0f} % at least; see that they "
+            f"overlap{hint}"
+        )
+    return found
+
+
+def read_transform(path: Path) -> Similarity:
+    """The similarity in a file of `langsplat register`; InputError and FormatError name the file."""
+    entry = read_json_file(path, TRANSFORM_LIMIT)
+    matrix = numbers(entry if isinstance(entry, dict) else {}, "matrix", (4, 4), str(path))
+    try:
+        return similarity(matrix)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+# `langsplat map`: what a robot needs to know of a scene.
+
+OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # grey values, as map_server of ROS writes and reads them
+THRESHOLDS = {"occupied_thresh": 0.65, "free_thresh": 0.196}
+NO_SCALE = (
+    "nobody said how long a unit of this scene is, and a map is in metres: measure something and give "
+    "`langsplat scale`, or say --metres-per-unit (1 where its units are metres)"
+)
+
+
+@dataclass(frozen=True)
+class Map:
+    """Write what a robot needs: an occupancy grid as Nav2 reads it (map.pgm, map.yaml), labelled voxels
+    (voxels.npz, voxels.ply), a collider (collider.obj), and poses in front of things (goals.json)."""
+
+    scene: tyro.conf.Positional[Path]
+    """A trained scene with its cameras; with a language field voxels have words and goals are found."""
+    out: tyro.conf.Positional[OutFolder]
+    """Folder to write."""
+    resolution: Positive = 0.05
+    """Metres of a cell."""
+    goal: tuple[str, ...] = ()
+    """Phrases: a free, reachable pose in front of each is found. With one that has none the exit code is 2,
+    and everything else is written."""
+    robot_height: Positive = 0.5
+    """Metres: what is higher is no obstacle."""
+    robot_radius: Positive = 0.2
+    """Metres: how far from obstacles its middle stays."""
+    step: Positive = 0.12
+    """Metres: what is lower is driven over, and the floor's own roughness."""
+    start: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="X Y")] = None
+    """Where the robot is, metres on the map; else it may be wherever most of the free floor is connected."""
+    metres_per_unit: Positive | None = None
+    """In place of what the scene says."""
+    encoder: EncoderOption = ""
+
+    @optional_imports()
+    def run(self) -> None:
+        from langsplat_core.extensions.geometry.planes import find_room
+
+        scene = searchable(self.scene) if self.goal else load_scene(self.scene)
+        metres = self.metres_per_unit or scene.metres_per_unit
+        if metres is None:
+            raise InputError(f"{self.scene}: {NO_SCALE}")
+        engine = None
+        if scene.language is not None:
+            engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
+        if engine is not None:
+            for phrase in self.goal:
+                check_phrase(engine, phrase, scene.cameras[0] if scene.cameras else None)
+        with TerminalProgress() as progress:
+            room = find_room(scene)
+            occupancy = find_occupancy(scene, map_axes(room, metres), self.resolution, progress)
+            plan = floor_map(occupancy, self.step, self.robot_height)
+            self.out.mkdir(parents=True, exist_ok=True)
+            write_grid(self.out, plan)
+            write_collider(self.out / "collider.obj", occupancy)
+            write_voxels(self.out, occupancy, scene, engine, progress)
+        floor = (
+            "" if room.floor is not None else " (no floor was found: the ground is nearly the lowest surface)"
+        )
+        print(
+            f"{self.out}: {plan.free.shape[0]} x {plan.free.shape[1]} cells of {self.resolution:g} m, "
+            f"{100 * plan.free.mean():.0f} % free, {100 * plan.occupied.mean():.0f} % occupied, "
+            f"{metres:g} m per unit{floor}"
+        )
+        self._write_goals(plan, occupancy, engine)
+
+    def _write_goals(self, plan: FloorMap, occupancy: Occupancy, engine: QueryEngine | None) -> None:
+        answers, missing = [], []
+        if self.goal:
+            (self.out / "goals.json").unlink(missing_ok=True)
+            where = reachable(plan, self.robot_radius, self.start)
+        for phrase in self.goal:
+            assert engine is not None
+            result = run_phrase(engine, phrase, viewpoint=engine.scene.cameras[0]).answer
+            points = engine.scene.gaussians.means[
+                result.members & (surface_weights(engine.scene.gaussians) > 0)
+            ]
+            goal = None
+            if result.found and len(points):
+                on_map = points @ occupancy.to_map[:3, :3].T + occupancy.to_map[:3, 3]
+                goal = find_goal(plan, where, on_map[:, :2], self.robot_radius + self.resolution)
+            if goal is None:
+                missing.append(
+                    f"'{phrase}': {result.verdict}" if not result.found else f"'{phrase}': no free pose"
+                )
+                continue
+            answers.append({"phrase": phrase, **asdict(goal), "probability": result.probability})
+            pose = f"x {goal.x:.2f} y {goal.y:.2f} m, yaw {goal.yaw:.2f}"
+            print(f"{phrase}: {pose}, {goal.distance:.2f} m from it")
+        if self.goal:
+            write_json(self.out / "goals.json", answers)
+        if missing:
+            raise InputError(f"no goal for {'; '.join(missing)}")
+
+
+def write_grid(folder: Path, plan: FloorMap) -> None:
+    """Write `map.pgm`, whose first row has the largest y, and `map.yaml`."""
+    grey = np.where(plan.occupied, OCCUPIED, np.where(plan.free, FREE, UNKNOWN)).astype(np.uint8)
+    with atomic_path(folder / "map.pgm") as path:
+        Image.fromarray(np.ascontiguousarray(grey.T[::-1])).save(path, "PPM")
+    x, y = plan.origin
+    lines = ["image: map.pgm", "mode: trinary", f"resolution: {plan.resolution}"]
+    lines += [f"origin: [{x:.6f}, {y:.6f}, 0.0]", "negate: 0"]
+    lines += [f"{name}: {value}" for name, value in THRESHOLDS.items()]
+    with atomic_path(folder / "map.yaml") as path:
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def write_collider(path: Path, occupancy: Occupancy) -> None:
+    """Write everything that is occupied as squares, a Wavefront OBJ in metres."""
+    corners, squares = collider(occupancy)
+    with atomic_path(path) as temporary, temporary.open("w", encoding="ascii") as file:
+        np.savetxt(file, corners, "v %.4f %.4f %.4f")
+        np.savetxt(file, squares + 1, "f %d %d %d %d")
+
+
+def write_voxels(
+    folder: Path, occupancy: Occupancy, scene: Scene, engine: QueryEngine | None, progress: Progress
+) -> None:
+    """Write the occupied voxels with the whole of the scene's tree that each is in, and its word, as
+    `voxels.npz` and `voxels.ply`."""
+    cells = np.argwhere(occupancy.occupied)
+    nodes, words = np.full(len(cells), NO_NODE), {}
+    if engine is not None:
+        nodes = _nodes(occupancy, scene, engine, cells)
+        try:
+            outline = Describer(engine, None, progress).outline()
+        except EncoderError as error:  # a phrasebook answers goals, but names nothing
+            print(f"voxels have no words: {error}")
+            outline = ()
+        words = {int(one.node): "" if one.word is None else one.word.phrase for one in outline}
+    names = np.array([words.get(int(node), "") for node in nodes], str)
+    with atomic_path(folder / "voxels.npz") as path:
+        np.savez_compressed(
+            path, cells=cells.astype(np.int32), origin=occupancy.origin, resolution=occupancy.resolution,
+            to_map=occupancy.to_map, nodes=nodes.astype(np.int32), words=names,
+            hits=occupancy.hits[tuple(cells.T)], passes=occupancy.passes[tuple(cells.T)],
+        )  # fmt: skip
+    from plyfile import PlyData, PlyElement
+
+    centres = occupancy.origin + (cells + 0.5) * occupancy.resolution
+    colours = np.random.default_rng(0).integers(40, 256, (int(nodes.max(initial=0)) + 2, 3))
+    columns = [(axis, "f4") for axis in "xyz"] + [("node", "i4")] + [(name, "u1") for name in RGB]
+    table = np.zeros(len(cells), columns)
+    for axis, values in zip("xyz", centres.T, strict=True):
+        table[axis] = values
+    table["node"] = nodes
+    for name, values in zip(RGB, colours[nodes].T, strict=True):
+        table[name] = values
+    with atomic_path(folder / "voxels.ply") as path:
+        PlyData([PlyElement.describe(table, "vertex")]).write(path)
+
+
+def _nodes(occupancy: Occupancy, scene: Scene, engine: QueryEngine, cells: Array) -> Array:
+    """(V,) the whole of the Gaussian nearest to each voxel, NO_NODE far from any."""
+    from scipy.spatial import cKDTree
+
+    whole = engine.tree.at(LEVELS.index("whole"))
+    rows = np.flatnonzero((surface_weights(scene.gaussians) > 0) & (whole != NO_NODE))
+    if len(rows) == 0:
+        return np.full(len(cells), NO_NODE)
+    means = scene.gaussians.means[rows] @ occupancy.to_map[:3, :3].T + occupancy.to_map[:3, 3]
+    centres = occupancy.origin + (cells + 0.5) * occupancy.resolution
+    gaps, nearest = cKDTree(means).query(centres, distance_upper_bound=4 * occupancy.resolution, workers=-1)
+    return np.append(whole[rows], NO_NODE)[np.where(np.isfinite(gaps), nearest, len(rows))]

@@ -1,0 +1,191 @@
+"""Meshes of a scene: rendered depth and colour, fused in a truncated signed distance field (Open3D).
+
+The depth of a pixel is that of the median Gaussian, the one at which the transmittance falls to 0.5, there
+where this Gaussian is densest along the ray. The depth of its centre, which `View.median_depth` gives, is off
+wherever a large Gaussian is seen aslant.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from langsplat_core.arrays import Array, rotation_matrices, unit
+from langsplat_core.errors import InputError
+from langsplat_core.extensions.geometry.points import cloud
+from langsplat_core.progress import Progress, silent
+from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
+from langsplat_core.raster.render import splat_colours, view_of
+from langsplat_core.scene import Camera, Gaussians, Scene
+
+SIDE, MOST = 640, 160  # pixels of the longer side of an image, and images, at most
+FINEST = 100  # voxels in the radius of what is fused, unless pixels are larger
+TRUNCATION = 4  # voxels behind and before a surface
+OVERSAMPLED = 8  # voxels in a pixel, at most
+SPECK = 128  # triangles; a connected piece with fewer is noise
+FLATTEST = 1e-3  # of a Gaussian's longest axis: its shortest, for the place where it is densest
+DEVIATIONS = 3.0  # from its centre, beyond which no Gaussian has a surface
+ROOM = 1.5  # extents of the cube in which holes are closed; what bulges out of it stays open
+BLOCK = 8  # voxels a side that are kept together
+VIEWS = 48  # of a scene without cameras, from all around it ...
+ELEVATIONS = (-37.0, 64.0)  # ... at these degrees above its horizon: a mesh has an underside
+STAGE = "fusing depth images"
+
+Depth = tuple[Camera, Array, Array]  # (H, W) float32 along z, 0 where there is none, and (H, W, 3) uint8
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles, counterclockwise as seen from outside, with a colour at each vertex."""
+
+    vertices: Array  # (V, 3) float64 world units
+    triangles: Array  # (T, 3) int64
+    colour: Array  # (V, 3) float64 display values in [0, 1]
+    name: str = "scene"
+
+    def holes(self) -> int:
+        """Number of holes: loops of edges with a triangle on one side alone."""
+        edges = np.sort(self.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        edges, sides = np.unique(edges, axis=0, return_counts=True)
+        rim = edges[sides == 1]
+        ends, at = np.unique(rim, return_inverse=True)
+        links = coo_matrix((np.ones(len(rim)), tuple(at.reshape(-1, 2).T)), shape=(len(ends), len(ends)))
+        return int(connected_components(links, directed=False)[0]) if len(rim) else 0
+
+    def areas(self) -> Array:
+        """(T,) areas of the triangles, square world units."""
+        a, b, c = (self.vertices[self.triangles[:, corner]] for corner in range(3))
+        return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
+
+
+def surface_depth(gaussians: Gaussians, camera: Camera, rows: Array) -> Array:
+    """(H, W) float32 depth along z, world units, at which each pixel's Gaussian, the one of `rows` (H, W), is
+    densest along the ray through the pixel's centre; 0 where that is -1 or behind the camera."""
+    found = np.flatnonzero(rows >= 0)
+    chosen, place = np.unique(rows.reshape(-1)[found], return_inverse=True)
+    ahead = camera.unproject(camera.pixel_centres().reshape(-1, 2)[found], 1.0)
+    rays = (ahead - camera.position) @ camera.rotation.T  # of depth 1, in the camera's frame
+    means = gaussians.means[chosen] @ camera.rotation.T + camera.world_to_camera[:3, 3]
+    axes = camera.rotation @ rotation_matrices(gaussians.quats_wxyz[chosen].astype(np.float64))  # columns
+    scales = np.exp(gaussians.log_scales[chosen].astype(np.float64))
+    scales = np.maximum(scales, np.maximum(FLATTEST * scales.max(1, keepdims=True), 1e-12))
+    whitening = (axes / scales[:, None]).swapaxes(1, 2)
+    ray = np.einsum("nij,nj->ni", whitening[place], rays)
+    centre = np.einsum("nij,nj->ni", whitening, means)[place]
+    depth = (ray * centre).sum(1) / (ray * ray).sum(1)
+    reach = DEVIATIONS * np.sqrt(np.square(axes[:, 2] * scales).sum(1))
+    depth = np.clip(depth, (means[:, 2] - reach)[place], (means[:, 2] + reach)[place])
+    image = np.zeros(rows.size, np.float32)
+    image[found] = np.maximum(depth, 0)
+    return image.reshape(rows.shape)
+
+
+def fuse(
+    scene: Scene,
+    resolution: float | None = None,
+    views: int = 2,
+    cameras: tuple[Camera, ...] = (),
+    progress: Progress = silent,
+) -> tuple[Mesh, float]:
+    """The surface of a scene, and the side of its voxels, world units.
+
+    resolution: that side, by default a `FINEST` of the scene's radius, but no less than 1.5 pixels; views:
+    how many must show a surface, >= 1; more leave out more, and what is left is nearer to the truth; cameras:
+    to be rendered, by default the scene's own, or generated ones. Raises InputError where nothing is seen.
+    """
+    chosen = cameras or scene.cameras or scene.spiral_cameras(VIEWS, (SIDE, SIDE * 3 // 4), ELEVATIONS)
+    images, pixels = [], []
+    for number, index in enumerate(np.unique(np.linspace(0, len(chosen) - 1, MOST).astype(int))):
+        progress(STAGE, number / (2 * min(len(chosen), MOST)))
+        images.append(_rendered(scene, chosen[index]))
+        camera, depth, _ = images[-1]
+        pixels.append(depth[depth > 0] / camera.fx)
+    if not any(map(len, pixels)):
+        raise InputError("the cameras see no surface, opaque by half at least; nothing to mesh")
+    pixel = float(np.median(np.concatenate(pixels)))
+    if resolution is None:
+        resolution = max(scene.bounds()[1] / FINEST, 1.5 * pixel)
+    if resolution < pixel / OVERSAMPLED:
+        raise InputError(
+            f"voxels of {resolution:g} units are finer than the images, whose pixels are {pixel:.2g} wide; "
+            f"take {pixel / OVERSAMPLED:.2g} or more"
+        )
+    return _cleaned(_fused(images, resolution, views, progress)), resolution
+
+
+def _rendered(scene: Scene, camera: Camera) -> Depth:
+    small = camera.within(SIDE)
+    view = view_of(scene, small, CpuRasterizer())
+    image = splat_colours(view, scene.gaussians)
+    colours = np.clip(image.colours / np.maximum(image.alpha, 0.5)[..., None], 0, 1)
+    depth = surface_depth(scene.gaussians, small, view.median_rows())
+    return small, depth, np.rint(255 * colours).astype(np.uint8)
+
+
+def _fused(images: list[Depth], resolution: float, views: int, progress: Progress) -> Mesh:
+    import open3d
+
+    o3d, core = open3d, open3d.core
+    kinds = core.float32, core.uint16, core.uint16
+    grid = o3d.t.geometry.VoxelBlockGrid(
+        ("tsdf", "weight", "color"), kinds, ((1), (1), (3)), resolution, BLOCK, 10_000
+    )
+    for number, (camera, depth, colours) in enumerate(images):
+        progress(STAGE, 0.5 + number / (2 * len(images)))
+        farthest = float(depth.max())
+        if farthest == 0:
+            continue
+        inner = np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]])
+        pose = core.Tensor(inner), core.Tensor(camera.world_to_camera)
+        limits = 1.0, farthest * 1.001, float(TRUNCATION)
+        image = o3d.t.geometry.Image(core.Tensor(np.ascontiguousarray(depth[..., None])))
+        blocks = grid.compute_unique_block_coordinates(image, *pose, *limits)
+        light = o3d.t.geometry.Image(core.Tensor((colours / 255).astype(np.float32)))  # Open3D takes no bytes
+        grid.integrate(blocks, image, light, *pose, *limits)
+    progress(STAGE, 1.0)
+    return _taken(grid.extract_triangle_mesh(views - 0.5).to_legacy())
+
+
+def _taken(mesh: "object") -> Mesh:
+    """Convert a legacy mesh of Open3D to arrays."""
+    vertices, triangles, colours = (
+        np.asarray(getattr(mesh, name)) for name in ("vertices", "triangles", "vertex_colors")
+    )
+    return Mesh(vertices, triangles.astype(np.int64), colours.clip(0, 1))
+
+
+def _cleaned(mesh: Mesh) -> Mesh:
+    """Without the pieces of fewer triangles than a `SPECK`. InputError where nothing is left."""
+    count = len(mesh.vertices)
+    ends = mesh.triangles[:, [0, 1]].T, mesh.triangles[:, [1, 2]].T
+    links = coo_matrix((np.ones(2 * len(mesh.triangles)), tuple(np.hstack(ends))), shape=(count, count))
+    piece = connected_components(links, directed=False)[1][mesh.triangles[:, 0]]
+    kept = mesh.triangles[np.bincount(piece)[piece] >= SPECK] if len(piece) else mesh.triangles
+    if len(kept) == 0:
+        raise InputError(
+            "too few views show the same surface; ask for fewer --views, or a coarser --resolution"
+        )
+    used, triangles = np.unique(kept, return_inverse=True)
+    return Mesh(mesh.vertices[used], triangles.reshape(-1, 3), mesh.colour[used], mesh.name)
+
+
+def close_holes(mesh: Mesh, resolution: float) -> tuple[Mesh, float]:
+    """A watertight surface through the mesh (Poisson), and how much of it, world units squared, is farther
+    than two voxels from any vertex: made up to close holes."""
+    import open3d
+    from scipy.spatial import cKDTree
+
+    a, b, c = (mesh.vertices[mesh.triangles[:, corner]] for corner in range(3))
+    normals = np.zeros_like(mesh.vertices)
+    for corner in range(3):
+        np.add.at(normals, mesh.triangles[:, corner], np.cross(b - a, c - a))
+    points = cloud(mesh.vertices, unit(normals, 1e-30))
+    points.colors = open3d.utility.Vector3dVector(mesh.colour)
+    extent = float(np.ptp(mesh.vertices, axis=0).max())
+    depth = int(np.clip(np.ceil(np.log2(ROOM * extent / resolution)), 5, 10))
+    poisson = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson
+    closed = _taken(poisson(points, depth=depth, scale=ROOM, n_threads=1)[0])
+    middles = closed.vertices[closed.triangles].mean(1)
+    gaps = cKDTree(mesh.vertices).query(middles, workers=-1)[0]
+    return closed, float(closed.areas()[gaps > 2 * resolution].sum())

@@ -1,0 +1,253 @@
+"""A scene as a robot needs it: voxels that are occupied, free or never seen, the map of the floor that
+follows, and free places on it that face a thing.
+
+Space along a ray of a training camera is free up to the depth of half transmittance and occupied there. What
+no ray passed or met is unknown.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from langsplat_core.arrays import Array
+from langsplat_core.compiled import kernel
+from langsplat_core.errors import InputError
+from langsplat_core.extensions.geometry.planes import Room
+from langsplat_core.progress import Progress, silent
+from langsplat_core.raster.render import view_of
+from langsplat_core.scene import Scene
+
+MOST_CELLS = 60_000_000  # of a grid
+SIDE = 240  # pixels of the longer side of the depth images
+HIT = 0.1  # of the rays that reach a voxel, how many end there from which it is occupied
+OUTSIDE = 0.02  # of the seen surface, at each end of each axis, that a grid leaves out: floaters, what is far
+MARGIN = 5  # voxels around what is seen
+MOST_LOOKS = 20_000  # places from which it is tried whether a thing is seen
+MOST_PAIRS = 4_000_000  # of a place and a cell of a thing, whose distance is measured
+STAGE = "measuring what is free"
+
+
+@dataclass(frozen=True, eq=False)
+class Occupancy:
+    """X x Y x Z voxels in the axes of a map: metres, z up, the ground at z = 0."""
+
+    to_map: Array  # (4, 4) similarity, from world units to the map's metres
+    origin: Array  # (3,) lower corner of the first voxel, metres
+    resolution: float  # metres
+    hits: Array  # (X, Y, Z) uint16 rays that end in each voxel
+    passes: Array  # (X, Y, Z) uint16 rays that go through it
+
+    @property
+    def occupied(self) -> Array:
+        """(X, Y, Z) bool, the voxels in which enough of the rays end."""
+        return np.asarray((self.hits > 0) & (self.hits >= HIT * (self.hits + self.passes.astype(np.float64))))
+
+    @property
+    def seen(self) -> Array:
+        """(X, Y, Z) bool, the voxels that some ray reaches."""
+        return np.asarray((self.hits > 0) | (self.passes > 0))
+
+    def voxels(self, points: Array) -> Array:
+        """(P, 3) world points -> (P, 3) int64 voxels, perhaps outside of the grid."""
+        return np.floor((_moved(points, self.to_map) - self.origin) / self.resolution).astype(np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class FloorMap:
+    """The map of the floor, X x Y cells."""
+
+    origin: Array  # (2,) lower left corner of the first cell, metres
+    resolution: float
+    occupied: Array  # (X, Y) bool: something stands between the step and the robot's height
+    free: Array  # (X, Y) bool: seen there, and nothing stands
+
+    def centres(self, cells: Array) -> Array:
+        """(P, 2) cells -> (P, 2) their middles, metres."""
+        return np.asarray(self.origin + (cells + 0.5) * self.resolution)
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A pose in front of a thing."""
+
+    x: float  # metres
+    y: float
+    yaw: float  # radians from the map's x axis, towards the thing
+    distance: float  # metres from the robot's middle to the thing's nearest point
+
+
+def map_axes(room: Room, metres: float) -> Array:
+    """(4, 4) similarity from world units to the axes of a map: z up, the ground at 0, and x as near to the
+    world's x axis, or its y axis where that is nearly up, as a level axis can be. metres: of a unit."""
+    first = np.eye(3)[0 if abs(room.up[0]) < 0.9 else 1]
+    first = first - (first @ room.up) * room.up
+    first /= np.linalg.norm(first)
+    made = np.eye(4)
+    made[:3, :3] = metres * np.stack([first, np.cross(room.up, first), room.up])
+    made[2, 3] = -metres * room.ground
+    return made
+
+
+def find_occupancy(scene: Scene, to_map: Array, resolution: float, progress: Progress = silent) -> Occupancy:
+    """Voxels along the rays of the scene's cameras. resolution: metres. Raises InputError for a scene without
+    cameras, one whose cameras see nothing, and for a grid of more than `MOST_CELLS`."""
+    if not scene.cameras:
+        raise InputError(
+            "the scene has no cameras, so nobody knows what is free; a map needs a trained scene"
+        )
+    rays = []
+    for number, camera in enumerate(scene.cameras):
+        progress(STAGE, number / (2 * len(scene.cameras)))
+        small = camera.within(SIDE)
+        depth = view_of(scene, small).median_depth()
+        points = small.unproject(small.pixel_centres()[depth > 0], depth[depth > 0])
+        rays.append((_moved(small.position[None], to_map)[0], _moved(points, to_map)))
+    ends = np.concatenate([points for _, points in rays])
+    if len(ends) == 0:
+        raise InputError("the scene's cameras see nothing in it; a map needs surfaces")
+    low, high = np.quantile(ends, [OUTSIDE, 1 - OUTSIDE], axis=0)
+    low, high = low - MARGIN * resolution, high + MARGIN * resolution
+    shape = np.ceil((high - low) / resolution).astype(np.int64)
+    if float(np.prod(shape.astype(np.float64))) > MOST_CELLS:
+        raise InputError(
+            f"{shape[0]} x {shape[1]} x {shape[2]} voxels of {resolution:g} m are too many; "
+            "take a coarser --resolution, or see that the scene's scale is right"
+        )
+    hits, passes = (np.zeros(shape, np.uint16) for _ in range(2))
+    for number, (eye, points) in enumerate(rays):
+        progress(STAGE, 0.5 + number / (2 * len(rays)))
+        trace((eye - low) / resolution, (points - low) / resolution, hits, passes)
+    progress(STAGE, 1.0)
+    return Occupancy(to_map, low, resolution, hits, passes)
+
+
+def _moved(points: Array, transform: Array) -> Array:
+    return np.asarray(points @ transform[:3, :3].T + transform[:3, 3])
+
+
+@kernel
+def trace(eye: Array, ends: Array, hits: Array, passes: Array) -> None:
+    """Walk from `eye` (3,) to each of `ends` (P, 3), in voxels, voxel by voxel (Amanatides and Woo 1987);
+    counts stop at the largest number."""
+    most = np.iinfo(np.uint16).max
+    shape = hits.shape
+    cell, last, step = np.zeros(3, np.int64), np.zeros(3, np.int64), np.zeros(3, np.int64)
+    until, every = np.zeros(3), np.zeros(3)
+    for i in range(len(ends)):
+        total = 0
+        for a in range(3):
+            way = ends[i, a] - eye[a]
+            cell[a], last[a] = np.int64(np.floor(eye[a])), np.int64(np.floor(ends[i, a]))
+            step[a] = 1 if way > 0 else -1
+            every[a] = np.inf if way == 0 else abs(1 / way)
+            border = cell[a] + 1 - eye[a] if way > 0 else eye[a] - cell[a]
+            until[a] = np.inf if way == 0 else border * every[a]
+            total += abs(last[a] - cell[a])
+        for _ in range(total):
+            inside = 0 <= cell[0] < shape[0] and 0 <= cell[1] < shape[1] and 0 <= cell[2] < shape[2]
+            if inside and passes[cell[0], cell[1], cell[2]] < most:
+                passes[cell[0], cell[1], cell[2]] += 1
+            a = 0
+            if until[1] < until[a]:
+                a = 1
+            if until[2] < until[a]:
+                a = 2
+            cell[a] += step[a]
+            until[a] += every[a]
+        inside = 0 <= last[0] < shape[0] and 0 <= last[1] < shape[1] and 0 <= last[2] < shape[2]
+        if inside and hits[last[0], last[1], last[2]] < most:
+            hits[last[0], last[1], last[2]] += 1
+
+
+def floor_map(occupancy: Occupancy, step: float, height: float) -> FloorMap:
+    """The map for a robot of a height, metres, that drives over what is lower than `step`."""
+    floors = occupancy.origin[2] + np.arange(occupancy.hits.shape[2]) * occupancy.resolution
+    band = (floors + occupancy.resolution / 2 >= step) & (floors <= height)
+    if not band.any():
+        raise InputError(
+            f"no voxel lies between a step of {step:g} m and a height of {height:g} m; "
+            "take a finer --resolution"
+        )
+    occupied = np.asarray(occupancy.occupied[:, :, band].any(2))
+    free = np.asarray(occupancy.seen[:, :, band].any(2) & ~occupied)
+    return FloorMap(occupancy.origin[:2], occupancy.resolution, occupied, free)
+
+
+def reachable(plan: FloorMap, radius: float, start: tuple[float, float] | None = None) -> Array:
+    """(X, Y) bool: the cells in which the middle of a robot of a radius, metres, may be, and that are
+    connected with `start`, or with most others. Raises InputError where there are none."""
+    blocked = np.pad(~plan.free, 1, constant_values=True)
+    clear = (ndimage.distance_transform_edt(~blocked)[1:-1, 1:-1] - 0.5) * plan.resolution >= radius
+    labels, count = ndimage.label(clear)
+    if count == 0:
+        raise InputError(f"a robot of {radius:g} m radius fits nowhere; give a smaller --robot-radius")
+    if start is None:
+        return np.asarray(labels == 1 + np.bincount(labels[labels > 0] - 1).argmax())
+    cell = np.floor((np.array(start) - plan.origin) / plan.resolution).astype(int)
+    if (cell < 0).any() or (cell >= plan.free.shape).any() or labels[tuple(cell)] == 0:
+        raise InputError(
+            f"--start {start[0]:g} {start[1]:g}: the robot does not fit there, or it was not seen"
+        )
+    return np.asarray(labels == labels[tuple(cell)])
+
+
+def find_goal(plan: FloorMap, where: Array, points: Array, least: float = 0.0) -> Goal | None:
+    """The pose of `where` (X, Y) bool nearest to a thing, facing it, with nothing between; None for none.
+
+    points: (P, 2) metres, of the thing seen from above, P >= 1; least: metres to be kept from it, also where
+    it hangs.
+    """
+    cells = np.argwhere(where)
+    if len(cells) == 0:
+        return None
+    centres = plan.centres(cells)
+    thing = np.unique(np.floor((points - plan.origin) / plan.resolution).astype(int), axis=0)
+    spots = plan.centres(thing)
+    spots = spots[:: max(len(spots) * len(cells) // MOST_PAIRS, 1)]
+    gaps = np.sqrt(((centres[:, None] - spots[None]) ** 2).sum(2))
+    nearest = gaps.min(1)
+    own = np.zeros(plan.free.shape, bool)
+    inside = ((thing >= 0) & (thing < own.shape)).all(1)
+    own[tuple(thing[inside].T)] = True
+    blocked = plan.occupied & ~ndimage.binary_dilation(own, iterations=2)  # its own outline is no obstacle
+    for best in np.argsort(nearest, kind="stable")[:MOST_LOOKS]:
+        if nearest[best] >= least and not _between(plan, blocked, centres[best], spots[gaps[best].argmin()]):
+            break
+    else:
+        return None
+    ahead = np.median(points, axis=0) - centres[best]
+    x, y = centres[best]
+    return Goal(float(x), float(y), float(np.arctan2(ahead[1], ahead[0])), float(nearest[best]))
+
+
+def _between(plan: FloorMap, blocked: Array, start: Array, end: Array) -> bool:
+    """Whether the straight line between two places (2,), metres, crosses a cell of `blocked` (X, Y) bool."""
+    count = 2 * int(np.linalg.norm(end - start) / plan.resolution) + 2
+    along = start + np.linspace(0, 1, count)[:, None] * (end - start)
+    cells = np.floor((along - plan.origin) / plan.resolution).astype(int)
+    cells = cells[((cells >= 0) & (cells < blocked.shape)).all(1)]
+    return bool(blocked[tuple(cells.T)].any())
+
+
+def collider(occupancy: Occupancy) -> tuple[Array, Array]:
+    """(V, 3) corners, metres, and (F, 4) int64 squares around everything that is occupied, seen from outside
+    counterclockwise."""
+    solid = np.pad(occupancy.occupied, 1)
+    corners, squares = [], []
+    count = 0
+    for axis in range(3):
+        first, second = (axis + 1) % 3, (axis + 2) % 3
+        for side in (0, 1):
+            outside = np.roll(solid, 1 if side == 0 else -1, axis)
+            cells = np.argwhere(solid & ~outside) - 1
+            loop = [(0, 0), (1, 0), (1, 1), (0, 1)] if side == 1 else [(0, 0), (0, 1), (1, 1), (1, 0)]
+            square = np.repeat(cells[:, None], 4, axis=1)
+            square[:, :, axis] += side
+            square[:, :, first] += [one for one, _ in loop]
+            square[:, :, second] += [other for _, other in loop]
+            corners.append(square.reshape(-1, 3))
+            squares.append(count + np.arange(4 * len(cells)).reshape(-1, 4))
+            count += 4 * len(cells)
+    every, which = np.unique(np.concatenate(corners), axis=0, return_inverse=True)
+    return occupancy.origin + every * occupancy.resolution, which.reshape(-1)[np.concatenate(squares)]

@@ -1,0 +1,172 @@
+"""A phrase in all scenes of a library: ranked by its index, the best ones asked of the engine."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from langsplat_core.arrays import Array, logit
+from langsplat_core.errors import EncoderError, LangSplatError
+from langsplat_core.extensions.library.index import Group, Library, Listed, draw, fits_in
+from langsplat_core.io.scenes import companion_path, load_scene
+from langsplat_core.io.sidecar import SUFFIX, read_stored
+from langsplat_core.progress import Progress, silent
+from langsplat_core.query.answers import NEARLY, WEAK, QueryResult, Verdict, excess
+from langsplat_core.query.compose import run_phrase
+from langsplat_core.query.engine import LoadEncoder, QueryEngine
+from langsplat_core.query.grammar import Atom, Named, heads, named, parse
+from langsplat_core.scene import LEVELS, LanguageField, Scene
+from langsplat_core.scene.codec import LinearCodec
+from langsplat_core.scene.gaussians import join_gaussians
+from langsplat_core.scene.language import phrase_key
+from langsplat_core.semantics.relevancy import NARROWEST
+
+PICTURE = (320, 240)  # width and height, pixels, of the picture of an answer
+
+
+@dataclass(frozen=True, eq=False)
+class Hit:
+    """The answer of one scene to a phrase."""
+
+    path: Path
+    verdict: Verdict
+    margin: float  # logits or spreads above what counts as found, see `margin`
+    probability: float | None
+    answer: QueryResult | None = None  # None where only the index was asked
+    metres_per_unit: float | None = None
+    picture: Array | None = None  # (H, W, 3) uint8, the answer as a heat map
+
+
+@dataclass(frozen=True, eq=False)
+class Answered:
+    """The answers of all scenes of one encoder to a phrase."""
+
+    phrase: str
+    encoder_id: str
+    hits: tuple[Hit, ...]  # those asked exactly first, by margin; then the others
+    problem: str = ""  # why nothing was asked
+    unread: tuple[tuple[str, str], ...] = ()  # scenes that could not be opened, and why
+
+    def count(self, verdict: Verdict) -> int:
+        """Number of scenes with this verdict."""
+        return sum(hit.verdict == verdict for hit in self.hits)
+
+
+def margin(probability: float | None, found: float, above: float | None) -> float:
+    """How certain an answer is, 0 where it begins to count as found: logits of its probability above those of
+    `found`, or, where the encoder has no calibration, spreads above chance."""
+    if probability is not None:
+        return float(logit(np.array(probability)) - logit(np.array(min(found, 1 - NARROWEST))))
+    return -math.inf if above is None else above
+
+
+def judged(scene: Listed, fits: Array, kind: Named) -> tuple[float, float | None, Verdict]:
+    """Margin, probability and verdict that the fits of a scene stand for, as `answers.by_regions` says."""
+    triple, odds = (float(fits[0]), float(fits[1]), float(fits[2])), scene.odds(kind)
+    if odds is None:
+        above = excess(triple, scene.bars, kind)
+        return above, None, "found" if above >= 0 else "weak match" if above >= NEARLY else "not here"
+    chance = odds.probability(triple)
+    verdict: Verdict = "found" if chance >= odds.found else "weak match" if chance >= WEAK else "not here"
+    return margin(chance, odds.found, None), chance, verdict
+
+
+def find(
+    library: Library,
+    phrase: str,
+    load_encoder: LoadEncoder | None,
+    at_most: int = 20,
+    progress: Progress = silent,
+) -> list[Answered]:
+    """A phrase in every scene, group by group, the most certain answers first. The first `at_most` scenes of
+    a group that answer are opened and asked exactly; the verdicts of the others are those of the index."""
+    return [_ask_group(library, group, phrase, load_encoder, at_most, progress) for group in library.groups]
+
+
+def _ask_group(
+    library: Library,
+    group: Group,
+    phrase: str,
+    load_encoder: LoadEncoder | None,
+    at_most: int,
+    progress: Progress,
+) -> Answered:
+    key, taught = phrase_key(phrase), {name for scene in group.scenes for name in scene.taught}
+    tree = parse(phrase, taught)
+    try:
+        vectors = {text: _vector(library, group, text, load_encoder) for text in heads(tree)}
+    except EncoderError as error:
+        if key not in taught:
+            return Answered(phrase, group.encoder_id, (), str(error))
+        vectors = {}
+    rough = rank(group, vectors)
+    hits = {
+        scene.path: Hit(library.folder / scene.path, verdict, above, chance)
+        for scene, (above, chance, verdict) in zip(group.scenes, rough, strict=True)
+    }
+    must = [scene.path for scene in group.scenes if not scene.is_indexed or key in scene.taught]
+    order = sorted(hits, key=lambda name: (name not in must, -hits[name].margin))
+    asked: list[Hit] = []
+    unread: list[tuple[str, str]] = []
+    for name in order:
+        if name not in must and (hits[name].verdict == "not here" or len(asked) >= at_most):
+            break
+        progress(f"asking '{phrase}'", len(asked) / max(at_most, 1), name)
+        try:
+            hit = ask_scene(hits[name].path, phrase, load_encoder)
+        except LangSplatError as error:
+            unread.append((name, str(error)))
+            del hits[name]
+            continue
+        hits[name] = hit
+        if hit.verdict != "not here":
+            asked.append(hit)
+    asked.sort(key=lambda hit: -hit.margin)
+    kept = {id(hit) for hit in asked}
+    others = sorted((hit for hit in hits.values() if id(hit) not in kept), key=lambda hit: -hit.margin)
+    return Answered(phrase, group.encoder_id, (*asked, *others), unread=tuple(unread))
+
+
+def rank(group: Group, vectors: Mapping[str, Array]) -> list[tuple[float, float | None, Verdict]]:
+    """Margin, probability and verdict of every scene by the index alone: of the best of some phrases."""
+    best: list[tuple[float, float | None, Verdict]] = [(-math.inf, None, "not here")] * len(group.scenes)
+    for text, vector in vectors.items():
+        kind, every = named(text), fits_in(group, vector)
+        for row, (scene, fits) in enumerate(zip(group.scenes, every, strict=True)):
+            if scene.is_indexed:
+                best[row] = max(best[row], judged(scene, fits, kind), key=lambda found: found[0])
+    return best
+
+
+def _vector(library: Library, group: Group, text: str, load_encoder: LoadEncoder | None) -> Array:
+    """(D,) unit vector of a phrase: from the encoder, checked against the group's canonical vectors, else
+    from the first phrasebook that has it. Raises EncoderError and, for no phrase, InputError."""
+    dim = group.canonical.shape[1]
+    codec = LinearCodec(np.eye(1, dim, dtype=np.float32))
+    none = np.zeros((len(LEVELS), 0, 1), np.float32), np.zeros((len(LEVELS), 0), np.float32)
+    field = LanguageField(*none, codec, group.canonical, group.encoder_id)
+    try:
+        return QueryEngine(Scene(join_gaussians([]), field), load_encoder).text_vector(text)
+    except EncoderError:
+        for scene in group.scenes:
+            if scene.phrases:
+                book = read_stored(companion_path(library.folder / scene.path, SUFFIX)).field.phrasebook
+                if phrase_key(text) in book:
+                    return book[phrase_key(text)]
+        raise
+
+
+def ask_scene(path: Path, phrase: str, load_encoder: LoadEncoder | None) -> Hit:
+    """The engine's own answer to a phrase in one scene, with a picture of it."""
+    scene = load_scene(path)
+    engine = QueryEngine(scene, load_encoder)
+    answer = run_phrase(engine, phrase).answer
+    tree, found, calibration = parse(phrase, engine.taught), 0.5, engine.calibration
+    if calibration is not None and isinstance(tree, Atom):
+        found = (calibration.thing if named(tree.text) == "thing" else calibration.part).found
+    above = answer.excess if answer.excess is not None else 10 * (answer.peak - engine.field.reading.found)
+    picture = draw(scene, PICTURE, answer)
+    certain = margin(answer.probability, found, above)
+    return Hit(path, answer.verdict, certain, answer.probability, answer, scene.metres_per_unit, picture)

@@ -1,0 +1,107 @@
+"""Extensions: the door for all that is no part of the core, the project's own as well as a stranger's.
+
+A package adds to the program by one entry point of the group `langsplat.extensions`, which names an
+`Extension`. Its parts are references, `module:NAME`, imported when they are first needed, so that a scene
+opens without the code of extensions. What cannot be loaded costs one warning and is left out.
+"""
+
+import logging
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, Literal
+
+from langsplat_core.errors import InputError, printable_line, shortened
+
+log = logging.getLogger("langsplat")
+GROUP = "langsplat.extensions"
+HIDDEN = "LANGSPLAT_WITHOUT"  # environment: names of extensions, separated by commas, that are not loaded
+
+Kind = Literal[
+    "commands", "groups", "formats", "importers", "exporters", "encoders", "segmenters", "layouts",
+    "mask_sources", "panels",
+]  # fmt: skip
+References = Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Extension:
+    """Named parts that a package adds to the program; each value is a reference `module:NAME`."""
+
+    commands: References = field(default_factory=dict)  # "mesh" or "bench raster" -> dataclass with `run`
+    groups: References = field(default_factory=dict)  # "bench" -> what its commands do, a sentence for --help
+    formats: References = field(default_factory=dict)  # ".xyz" -> io.scenes.SceneFormat
+    importers: References = field(default_factory=dict)  # method -> io.exchange.Importer
+    exporters: References = field(default_factory=dict)  # word of `convert --to` -> io.exchange.Exporter
+    encoders: References = field(
+        default_factory=dict
+    )  # `model_type` of config.json -> semantics.encoder.Family
+    segmenters: References = field(default_factory=dict)  # `model_type` -> function of Weights to a Segmenter
+    layouts: References = field(default_factory=dict)  # name -> semantics.weights.Layout
+    mask_sources: References = field(
+        default_factory=dict
+    )  # word of `--masks.source` -> function to a MaskSource
+    panels: References = field(default_factory=dict)  # title -> langsplat_viewer.panels.layout.Panel
+
+
+@cache
+def extensions() -> Mapping[str, Extension]:
+    """Return the extensions that are installed, by the names of their entry points, sorted.
+
+    Those that the environment variable `LANGSPLAT_WITHOUT` names are left out, and so are, with a warning,
+    those that cannot be imported.
+    """
+    hidden = {name.strip() for name in os.environ.get(HIDDEN, "").split(",")}
+    points = {point.name: point for point in entry_points(group=GROUP) if point.name not in hidden}
+    found = {name: _loaded(f"extension {name}", points[name]) for name in sorted(points)}
+    for name, extension in found.items():
+        if extension is not None and not isinstance(extension, Extension):
+            _warn(f"extension {name}", f"its entry point is a {type(extension).__name__}, not an Extension")
+    return {name: extension for name, extension in found.items() if isinstance(extension, Extension)}
+
+
+def references(kind: Kind) -> References:
+    """Return the references of one kind by their names, of all extensions; of two of one name the first."""
+    found: dict[str, str] = {}
+    for extension in extensions().values():
+        found = {**getattr(extension, kind), **found}
+    return found
+
+
+def part(kind: Kind, name: str) -> Any:
+    """Return one part of an extension; InputError where there is none of that name or it is broken."""
+    known = references(kind)
+    if name not in known:
+        raise InputError(
+            f"no extension has {name!r} among its {kind}; there are {shortened(known) or 'none'}"
+        )
+    found = _imported(kind, name, known[name])
+    if found is None:
+        raise InputError(f"{name!r} cannot be used: its extension is broken; mend or remove it")
+    return found
+
+
+def parts(kind: Kind) -> Mapping[str, Any]:
+    """Return all parts of one kind by their names; a broken one is left out with a warning."""
+    found = {name: _imported(kind, name, where) for name, where in references(kind).items()}
+    return {name: one for name, one in found.items() if one is not None}
+
+
+@cache
+def _imported(kind: Kind, name: str, where: str) -> Any:
+    return _loaded(f"extension's {kind} {name}", EntryPoint(name, where, GROUP))
+
+
+def _loaded(what: str, point: EntryPoint) -> Any:
+    """Import what an entry point names; None, with one warning, where that fails in whatever way."""
+    try:
+        return point.load()
+    except Exception as error:  # noqa: BLE001  a stranger's code may raise anything
+        _warn(what, f"{type(error).__name__}: {error}")
+        return None
+
+
+def _warn(what: str, why: str) -> None:
+    log.warning("%s is left out: %s", what, printable_line(why, 300))

@@ -1,0 +1,428 @@
+"""The protocols' rules against plain loops, and whole benchmarks whose scores are known by construction."""
+
+import json
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.lib.stride_tricks import sliding_window_view
+from PIL import Image
+
+from langsplat_core.errors import InputError
+from langsplat_core.extensions.benchmarks import commands as evaluate
+from langsplat_core.extensions.benchmarks import profiles
+from langsplat_core.extensions.benchmarks.labels import read_3d_ovs, read_lerf_ovs
+from langsplat_core.extensions.benchmarks.profiles import (
+    LERF_PROFILES,
+    OVS_PROFILES,
+    MapRule,
+    read_maps,
+    voted,
+)
+from langsplat_core.extensions.benchmarks.report import (
+    Subject,
+    inside_any_box,
+    run_benchmark,
+    save_json,
+    scored_size,
+    summary,
+    table,
+)
+from langsplat_core.io.scenes import save_scene
+from langsplat_core.raster.render import render
+from langsplat_core.scene import Scene
+from tests.support.commands import refusal, run
+from tests.support.fakes import PER_BLOB, WORDS, FakeEncoder, blob_scene, cameras
+from tests.support.photographs import SIZE, block, lerf_frame, mask_map, ovs_view, rectangle, silhouette
+from tests.support.tiny_models import tiny_room, tiny_settings
+
+CODE_RULE = LERF_PROFILES["langsplat-code"].rule
+PLAIN_RULE = MapRule(1, 1.0, "mirror", "peak", True, 0.7, "none", 1, 1, False)
+
+
+def plain_mean(values: np.ndarray, window: int, inside: bool) -> np.ndarray:
+    """Every window by itself; NumPy's "reflect" is cv2's reflect101: d c b | a b c d | c b a."""
+    sides = window // 2, window - window // 2 - 1
+    options = {"constant_values": np.nan} if inside else {"mode": "reflect"}
+    padded = np.pad(values, sides, **options)
+    return np.nanmean(sliding_window_view(padded, (window, window)), axis=(2, 3))
+
+
+@pytest.mark.parametrize("window", [2, 5, 6])
+@pytest.mark.parametrize("border", ["mirror", "inside"])
+def test_mean_filter(window, border):
+    values = np.random.default_rng(window).uniform(size=(11, 9))
+    expected = plain_mean(values, window, border == "inside")
+    np.testing.assert_allclose(profiles.mean_filtered(values, window, border), expected, atol=1e-12)
+
+
+def looped_vote(mask: np.ndarray, clipped: bool) -> np.ndarray:
+    """LangSplat's loop slices up to the last row and column, which it never counts; V2 counts all."""
+    counted = mask[:-1, :-1] if clipped else mask
+    out = np.zeros(mask.shape, bool)
+    for y, x in np.ndindex(mask.shape):
+        seen = counted[max(0, y - 3) : y + 4, max(0, x - 3) : x + 4]
+        out[y, x] = 2 * seen.sum() > seen.size
+    return out
+
+
+@pytest.mark.parametrize("vote", ["clipped", "inside"])
+def test_vote(vote):
+    mask = np.random.default_rng(0).uniform(size=(14, 12)) > 0.5
+    np.testing.assert_array_equal(voted(mask, vote, 7), looped_vote(mask, vote == "clipped"))
+
+
+def test_ties_and_flat_maps():
+    mask = np.zeros((8, 8), bool)
+    mask[:, :4] = True
+    assert not voted(mask, "inside", 40).any()  # the window is the whole picture: 32 of 64
+    mask[0, 4] = True
+    assert voted(mask, "inside", 40).all()
+    flat = np.zeros((1, 2, 3))
+    flat[0, 0, 1] = flat[0, 1, 2] = 0.5
+    assert profiles.peak_pixels(flat, replace(PLAIN_RULE, ties=True)).tolist() == [[1, 0], [2, 1]]
+    assert profiles.peak_pixels(flat, PLAIN_RULE).tolist() == [[1, 0]]
+    assert not read_maps(np.full((3, 40, 40), 0.55), CODE_RULE).mask.any()
+
+
+def test_the_code_cuts_the_blend_at_seven_tenths_of_its_range():
+    maps = np.random.default_rng(1).uniform(0.4, 0.6, size=(3, 40, 50))
+    maps[1, 10:30, 10:30] += 0.3
+    answer = read_maps(maps, CODE_RULE)
+    blend = 0.5 * (plain_mean(maps[1], 30, False) + maps[1])
+    cut = blend.min() + 0.7 * (blend.max() - blend.min())
+    assert answer.level == 1
+    np.testing.assert_array_equal(answer.mask, looped_vote(blend > cut, True))
+    column, row = answer.peaks[0]
+    smooth = plain_mean(maps[1], 30, False)
+    assert smooth[row, column] == pytest.approx(smooth.max(), abs=1e-12)
+
+
+def test_the_level_is_chosen_before_min_max():
+    """After it, every level's peak would be 1, and the first would always win."""
+    maps = np.zeros((3, 6, 6))
+    maps[0, 0, 0], maps[2, 5, 5] = 0.5, 0.6
+    answer = read_maps(maps, PLAIN_RULE)
+    assert (answer.level, answer.mask.sum(), answer.peaks.tolist()) == (2, 1, [[5, 5]])
+
+
+def test_the_place_has_its_own_level():
+    """A lone high pixel wins the raw maps, a broad one the filtered ones."""
+    maps = np.zeros((2, 12, 12))
+    maps[0, 1, 1] = 1.0
+    maps[1, 5:10, 5:10] = 0.8
+    answer = read_maps(maps, replace(PLAIN_RULE, peak_window=5))
+    assert (answer.level, answer.peaks.tolist()) == (0, [[7, 7]])
+
+
+def test_3d_ovs_takes_the_level_that_is_highest_inside_its_mask():
+    rule = OVS_PROFILES["langsplat-paper"].rule
+    maps = np.full((3, 5, 5), 0.1)
+    maps[0, :2], maps[1, 3:, 3:], maps[2] = 0.5, 0.9, 0.4  # 0.4 itself is not above 0.4
+    maps[0, 4, 4] = 0.95  # the highest pixel, but 0.54 on average
+    answer = read_maps(maps, rule)
+    assert (answer.level, answer.mask.sum()) == (1, 4)
+    assert not read_maps(np.full((3, 5, 5), 0.4), rule).mask.any()
+
+
+def test_silhouette():
+    rule = profiles.SilhouetteRule()
+    alpha = np.array([[0.7, 0.71, 1.0, 1.0]])
+    grey = np.array([200, 200, 10, 11]) / 255
+    colours = np.repeat(grey[None, :, None], 3, 2)
+    assert profiles.read_silhouette(colours, alpha, rule).tolist() == [[False, True, False, True]]
+
+
+# Whole benchmarks on labels and answers whose scores are known by construction.
+
+DIRECT = LERF_PROFILES["direct-3d"]
+CODE = LERF_PROFILES["langsplat-code"]
+PLAIN = replace(CODE, rule=replace(CODE.rule, window=1, vote="none", peak_window=1))
+
+
+def no_encoder(name):
+    raise AssertionError("maps need no encoder")
+
+
+def of_maps(data, maps, profile=DIRECT, **more):
+    return run_benchmark(read_lerf_ovs(data), profile, Subject(maps=maps), no_encoder, **more)
+
+
+@pytest.fixture
+def two_scenes(tmp_path):
+    """Scene a: 2 frames, of 1 and 2 queries; scene b: 1 frame of 1 query. Silhouettes of known overlap."""
+    data, maps = tmp_path / "data", tmp_path / "maps"
+    whole, half = rectangle(0, 0, 9, 9), block(0, 0, 9, 4)
+    lerf_frame(data / "label" / "a", "one.1", [("mug", whole)])
+    lerf_frame(data / "label" / "a", "two", [("mug", whole), ("red/blue cup", whole)])
+    lerf_frame(data / "label" / "b", "one.1", [("mug", whole)])
+    silhouette(maps / "a" / "one.1", "mug", block(0, 0, 9, 9))  # 1
+    silhouette(maps / "a" / "two", "mug", half)  # 1/2
+    silhouette(maps / "a" / "two", "red_blue cup", block(0, 0, 9, 2))  # 3/10
+    silhouette(maps / "b" / "one.1", "mug", np.zeros((30, 40), bool))  # an empty answer: 0
+    return data, maps
+
+
+def test_macro_and_micro_means_and_all_figures_as_json(two_scenes, tmp_path):
+    report = of_maps(*two_scenes)
+    rows = summary(report)
+    a, b, micro = (1 + 0.5 + 0.3) / 3, 0.0, rows["micro, mean of queries"]
+    assert rows["a"].iou == pytest.approx(a)
+    assert rows["macro, mean of scenes"].iou == pytest.approx((a + b) / 2)
+    assert rows["macro, mean of frames"].iou == pytest.approx((1 + 0.4 + 0) / 3)
+    assert (micro.iou, micro.queries) == (pytest.approx(1.8 / 4), 4)
+    assert (micro.accuracy_25, micro.accuracy_50) == (3 / 4, 1 / 4)  # one half is not above one half
+    assert micro.localisation is None  # direct-3d names no place
+    assert "fixed before a label was read" in table(report)
+    save_json(tmp_path / "out.json", report)
+    content = json.loads((tmp_path / "out.json").read_text())
+    assert content["protocol"]["rule"] == {"alpha": 0.7, "grey": 10}
+    assert [query["iou"] for query in content["queries"]] == pytest.approx([1, 0.5, 0.3, 0])
+
+
+def test_one_scene_alone(two_scenes):
+    data, maps = two_scenes
+    assert list(of_maps(data, maps, only=("b",)).scenes) == ["b"]
+    alone = of_maps(data / "label" / "a", maps / "a")  # its own folders, without the name
+    assert list(alone.scenes) == ["a"]
+    with pytest.raises(InputError, match=r"--only c: .*a, b"):
+        of_maps(data, maps, only=("c",))
+
+
+def test_a_missing_map_counts_as_wrong_and_is_named(two_scenes):
+    data, maps = two_scenes
+    (maps / "a" / "one.1" / "mug.png").unlink()
+    report = of_maps(data, maps)
+    rows = summary(report)
+    assert rows["micro, mean of queries"].iou == pytest.approx(0.8 / 4)
+    assert rows["micro, answered ones alone"].iou == pytest.approx(0.8 / 3)
+    assert "not answered (no map), 1 queries: one.1: mug" in table(report)
+    assert "IoU 0" in table(report)
+
+
+def test_an_empty_label_is_left_out_not_scored(tmp_path):
+    ovs_view(tmp_path / "s", "00", {"cup": block(0, 0, 9, 9), "wall": np.zeros((30, 40), bool)})
+    silhouette(tmp_path / "maps" / "00", "cup", block(0, 0, 9, 9))
+    silhouette(tmp_path / "maps" / "00", "wall", np.zeros((30, 40), bool))
+    subject = Subject(maps=tmp_path / "maps")
+    report = run_benchmark(read_3d_ovs(tmp_path / "s"), OVS_PROFILES["direct-3d"], subject, no_encoder)
+    assert [query.phrase for query in report.queries] == ["cup"]
+    assert "1 labels left out: 00: wall (empty mask)" in table(report)
+
+
+def test_maps_are_scored_on_their_own_grid(tmp_path):
+    """Of twice the labels' size: the same figures; and of another shape: refused."""
+    lerf_frame(tmp_path / "label" / "a", "one", [("mug", rectangle(0, 0, 9, 9))])
+    mask_map(tmp_path / "maps" / "one", "mug", np.kron(block(0, 0, 9, 4), np.ones((2, 2))))
+    (query,) = of_maps(tmp_path, tmp_path / "maps", PLAIN).queries
+    assert (query.grid, query.iou, query.hit) == ((80, 60), pytest.approx(0.5), True)
+    mask_map(tmp_path / "maps" / "one", "mug", block(0, 0, 9, 4, (40, 40)))
+    with pytest.raises(InputError, match="40x40, the labels are 40x30"):
+        of_maps(tmp_path, tmp_path / "maps", PLAIN)
+
+
+@pytest.mark.parametrize("kind", ["npy per level", "png per level", "16 bit", "one array"])
+def test_kinds_of_maps(tmp_path, kind):
+    lerf_frame(tmp_path / "label" / "a", "one", [("mug", rectangle(0, 0, 9, 9))])
+    folder = tmp_path / "maps" / "one"
+    mask_map(folder, "mug.part", 0.4 * block(20, 20, 30, 29))
+    mask_map(folder, "mug.whole", 0.8 * block(0, 0, 9, 9))
+    part, whole = (np.load(folder / f"mug.{level}.npy") for level in ("part", "whole"))
+    if kind == "one array":
+        np.save(folder / "mug.npy", np.stack([0 * part, part, whole]))
+    elif kind != "npy per level":
+        for level, values in (("part", part), ("whole", whole)):
+            (folder / f"mug.{level}.npy").unlink()
+            top, dtype = (65535, np.uint16) if kind == "16 bit" else (255, np.uint8)
+            Image.fromarray(np.rint(top * values).astype(dtype)).save(folder / f"mug.{level}.png")
+    (query,) = of_maps(tmp_path, tmp_path / "maps", PLAIN).queries
+    assert (query.level, query.iou, query.hit) == ("whole", 1.0, True)
+
+
+def test_maps_that_do_not_fit(two_scenes, tmp_path):
+    data, maps = two_scenes
+    with pytest.raises(InputError, match=r"no folder is named after a labelled frame \(one.1, two\)"):
+        of_maps(data / "label" / "a", tmp_path)
+    with pytest.raises(InputError, match="a scene's own answer"):
+        of_maps(data, maps, profile=LERF_PROFILES["ours"])
+    broken = {"not finite": np.full((30, 40), np.nan), "at most 3 levels": np.zeros((4, 30, 40))}
+    for message, array in {**broken, "expected": np.zeros(5)}.items():
+        np.save(maps / "b" / "one.1" / "mug.npy", array)
+        with pytest.raises(InputError, match=message):
+            of_maps(data, maps, CODE, only=("b",))
+
+
+def test_boxes_have_their_borders_inside():
+    boxes = np.array([[10.0, 10, 20, 20], [30, 5, 25, 0]])  # the second with its corners exchanged
+    peaks = np.array([[20, 20], [21, 20], [25, 5], [24, 5]])
+    hits = [inside_any_box(peak[None], boxes, SIZE, (30, 40)) for peak in peaks]
+    assert hits == [True, False, True, False]
+    assert inside_any_box(peaks, boxes, SIZE, (30, 40))
+    assert inside_any_box(np.array([[40, 40]]), boxes, SIZE, (60, 80))
+    assert not inside_any_box(np.empty((0, 2), int), boxes, SIZE, (30, 40))
+    assert scored_size((4032, 3024), 1080) == (1440, 1080)  # a grid with too many rows is shrunk
+    assert scored_size((988, 731), 1080) == (988, 731)
+
+
+def test_pictures(two_scenes, tmp_path):
+    of_maps(*two_scenes, pictures=tmp_path / "out")
+    names = sorted(str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*.png"))
+    assert names == ["a/one.1/mug.png", "a/two/mug.png", "a/two/red_blue cup.png", "b/one.1/mug.png"]
+    assert Image.open(tmp_path / "out" / names[0]).size == SIZE
+
+
+# A scene of ours: three blobs, and labels that are drawn from its own views.
+
+
+def seen(index: int, camera) -> np.ndarray:
+    """(H, W) where a blob is what one mostly sees."""
+    scene = blob_scene()
+    member = np.zeros((3 * PER_BLOB, 1), np.float32)
+    member[index * PER_BLOB : (index + 1) * PER_BLOB] = 1
+    drawn = render(scene, camera, member)
+    return (drawn.alpha > 0.3) & (drawn.values[..., 0] > 0.5 * drawn.alpha)
+
+
+@pytest.fixture
+def blobs_on_disk(tmp_path):
+    """The scene with two of the three views; 3D-OVS labels of the last of them alone."""
+    views = [replace(camera, name=f"photo.{index}.x") for index, camera in enumerate(cameras())]
+    save_scene(tmp_path / "blobs.ply", replace(blob_scene(), cameras=tuple(views[:2])))
+    masks = {word: seen(index, views[1]) for index, word in enumerate(WORDS)}
+    ovs_view(tmp_path / "data", "photo.1.x", masks, (160, 120))
+    return tmp_path, views
+
+
+def of_scene(tmp_path, profile):
+    subject = Subject(scene=tmp_path / "blobs.ply")
+    return run_benchmark(read_3d_ovs(tmp_path / "data"), profile, subject, lambda _: FakeEncoder())
+
+
+def of_phrase(report, phrase):
+    return next(query for query in report.queries if query.phrase == phrase)
+
+
+def test_our_own_answer_in_views_that_are_matched_by_name(blobs_on_disk):
+    """The only label is of the second view; the first has other masks."""
+    tmp_path, views = blobs_on_disk
+    report = of_scene(tmp_path, OVS_PROFILES["ours"])
+    assert {query.phrase for query in report.queries} == set(WORDS)
+    assert min(of_phrase(report, word).iou for word in ("mug", "book")) > 0.95
+    first, second = seen(0, views[0]), seen(0, views[1])
+    assert (first & second).sum() / (first | second).sum() < 0.8
+    assert "1 of 1 labelled frames are training views: photo.1.x" in table(report)
+
+
+def test_the_papers_absolute_cut(blobs_on_disk):
+    """What is as far from the phrase as from the canonical ones has relevancy 0.5, which is above 0.4."""
+    tmp_path, views = blobs_on_disk
+    mug = of_phrase(of_scene(tmp_path, OVS_PROFILES["langsplat-paper"]), "mug")
+    covered = render(blob_scene(), views[1]).alpha > 0.3
+    assert mug.iou == pytest.approx((seen(0, views[1]) & covered).sum() / covered.sum())
+
+
+def test_direct_3d_draws_the_members_alone(blobs_on_disk):
+    tmp_path, views = blobs_on_disk
+    book = of_phrase(of_scene(tmp_path, OVS_PROFILES["direct-3d"]), "book")
+    alone = render(blob_scene().take(np.arange(PER_BLOB, 2 * PER_BLOB)), views[1]).alpha > 0.7
+    truth = seen(1, views[1])
+    assert book.iou == pytest.approx((alone & truth).sum() / (alone | truth).sum())
+    assert book.hit is None
+
+
+def test_a_view_that_is_missing_and_words_that_are_unknown(blobs_on_disk, caplog):
+    tmp_path, _ = blobs_on_disk
+    ovs_view(tmp_path / "data", "photo.2.x", {"mug": block(0, 0, 9, 9, (160, 120))}, (160, 120))
+    ovs_view(tmp_path / "data", "photo.1.x", {"zebra": block(0, 0, 9, 9, (160, 120))}, (160, 120))
+    with caplog.at_level(logging.WARNING, "langsplat"):
+        report = of_scene(tmp_path, OVS_PROFILES["ours"])
+    assert "1 labelled frames have no camera: photo.2.x" in caplog.text
+    text = table(report)
+    assert "not answered (no camera of that name), 1 queries: photo.2.x: mug" in text
+    assert "not answered (the encoder does not know 'zebra'), 1 queries: photo.1.x: zebra" in text
+    rows = summary(report)
+    assert [rows[f"micro, {of}"].queries for of in ("mean of queries", "answered ones alone")] == [5, 3]
+
+
+def test_scenes_and_labels_that_do_not_fit(blobs_on_disk):
+    tmp_path, _ = blobs_on_disk
+    ours, one = OVS_PROFILES["ours"], Subject(scene=tmp_path / "blobs.ply")
+
+    def refused(match: str, data, subject=one) -> None:
+        with pytest.raises(InputError, match=match):
+            run_benchmark(read_3d_ovs(data), ours, subject, lambda _: FakeEncoder())
+
+    ovs_view(tmp_path / "other", "00", {"mug": block(0, 0, 9, 9)})
+    refused(
+        r"none of the scene's views \(photo.0.x, photo.1.x\) is a labelled frame \(00\)", tmp_path / "other"
+    )
+    refused("could be any labelled scene of data, other", tmp_path)
+    refused(r"data\.ply: no such scene", tmp_path, Subject(scene=tmp_path))
+    save_scene(tmp_path / "data.ply", Scene(blob_scene().gaussians, blob_scene().language))
+    refused("it has none", tmp_path / "data", Subject(scene=tmp_path))
+    ovs_view(tmp_path / "data", "photo.0.x", {"mug": block(0, 0, 9, 9, (160, 160))}, (160, 160))
+    refused("the view is 160x120, the labels are 160x160", tmp_path / "data")
+    (tmp_path / "blobs.langsplat.safetensors").unlink()
+    refused("no language field", tmp_path / "data")
+
+
+# `langsplat eval lerf-ovs`, `3d-ovs` and `scannet`: arguments, and one line for what is wrong with them.
+
+
+@pytest.fixture
+def data(tmp_path):
+    lerf_frame(tmp_path / "data" / "label" / "a", "one", [("mug", rectangle(5, 5, 34, 24))])
+    mask_map(tmp_path / "maps" / "one", "mug", block(5, 5, 34, 24))
+    return tmp_path
+
+
+@pytest.mark.parametrize("protocol", ["langsplat-code", "langsplat-paper", "langsplat-v2"])
+def test_maps_of_another_system(data, capsys, protocol):
+    out = data / "out.json"
+    words = ("lerf-ovs", data / "data", "--maps", data / "maps", "--protocol", protocol, "--json", out)
+    assert run("eval", *words) == 0
+    (query,) = json.loads(out.read_text())["queries"]
+    assert (query["hit"], query["level"], query["grid"]) == (True, "subpart", [40, 30])
+    assert f"protocol {protocol}:" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("lerf-ovs", "data"), "give a scene and the benchmark's folder"),
+        (("lerf-ovs", "scene.ply", "data", "--maps", "maps"), "alone with --maps"),
+        (("lerf-ovs", "scene.ply", "data"), "no such scene"),
+        (("lerf-ovs", "data", "--maps", "maps", "--paper-order"), "leave it out"),
+        (("lerf-ovs", "absent", "--maps", "maps"), "no such folder"),
+        (("lerf-ovs", "scene.ply", "data", "--train"), "give the benchmark's folder alone"),
+        (("lerf-ovs", "data", "--train", "--clip.model", "demo", "--masks.source", "graph"), "a: "),
+        (("3d-ovs", "data", "--maps", "maps"), "use `langsplat eval lerf-ovs`"),
+        (("3d-ovs", "data", "--maps", "maps", "--protocol", "langsplat-code"), "invalid choice"),
+        (("scannet", "data", "--maps", "maps"), "not in the layout of ScanNet"),
+        (("lerf-ovs", "data", "--maps", "data"), "no folder is named after a labelled frame"),
+    ],
+)
+def test_bad_arguments_are_one_line(data, monkeypatch, capsys, words, message):
+    monkeypatch.chdir(data)
+    assert message in refusal(capsys, "eval", *words)
+
+
+def test_scenes_are_trained_first(tmp_path, capsys, monkeypatch):
+    """In LERF-OVS's layout; one scene cannot be trained, which is said after the table of the other."""
+    monkeypatch.setattr(
+        evaluate, "with_preset", lambda config, _: replace(tiny_settings(room), masks=config.masks)
+    )
+    room = tiny_room(tmp_path / "data" / "ramen")
+    box = rectangle(0, 0, 63, 47)
+    lerf_frame(tmp_path / "data" / "label" / "ramen", "photo_0", [("mug", box)], (64, 48))
+    lerf_frame(tmp_path / "data" / "label" / "teatime", "photo_0", [("mug", box)], (64, 48))
+    out = ("--out", tmp_path / "scenes")
+    words = ("lerf-ovs", tmp_path / "data", "--train", *out, "--masks.source", "graph")
+    assert run("eval", *words) == 2
+    said = capsys.readouterr()
+    assert "| LangSplat | 51.2 / 73.2 | 51.2 / 73.2 |" in said.out  # beside what others published
+    assert "teatime" in said.err.strip().splitlines()[-1]
+    made = (tmp_path / "scenes" / "ramen.ply").stat().st_mtime_ns
+    assert run("eval", *words, "--only", "ramen") == 0
+    assert (tmp_path / "scenes" / "ramen.ply").stat().st_mtime_ns == made  # it is there already

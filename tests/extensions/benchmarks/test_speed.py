@@ -1,0 +1,210 @@
+"""The rasterizer benchmark: its reference windows, promised ratios and files; the query benchmark on a tiny
+scene. No test looks at a time."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from langsplat_core.errors import InputError
+from langsplat_core.extensions.benchmarks.commands import write_report
+from langsplat_core.extensions.benchmarks.config import (
+    QueryBenchConfig,
+    RasterBenchConfig,
+    peak_memory,
+    resident_memory,
+    restart_peak,
+)
+from langsplat_core.extensions.benchmarks.config import raster as bench_report
+from langsplat_core.extensions.benchmarks.measure import Measurement, reference_windows
+from langsplat_core.extensions.benchmarks.query_speed import (
+    measure_queries,
+    query_table,
+    repeated,
+    with_codec,
+)
+from langsplat_core.extensions.benchmarks.raster_speed import plot, run_plan, sweep
+from langsplat_core.raster.reference import ReferenceRasterizer
+from langsplat_core.scene import CodebookCodec, LanguageField, Scene
+from tests.support.commands import run
+from tests.support.fakes import DIM, PER_BLOB, FakeEncoder, axis, blob_scene
+from tests.support.file_samples import random_codec
+from tests.support.scenes import random_camera, random_gaussians, random_values
+
+
+def measurement(gaussians: int, milliseconds: float, operation: str = "splat") -> Measurement:
+    return Measurement("random", gaussians, 320, 240, 3, operation, "cpu", milliseconds)
+
+
+@pytest.mark.long
+class TestReferenceWindows:
+    g, camera = random_gaussians(400, 7), random_camera(8, 150, 110)
+
+    def test_windows_are_the_whole_reference(self):
+        """Pixels off the windows are not looked at; those in them are equal up to the order of sums."""
+        exact, x = reference_windows(self.g, self.camera), random_values(400, 3)
+        whole = ReferenceRasterizer().view(self.g, self.camera)
+        image = whole.splat(x)[0]
+        band = whole.cut_off_band(1e-3)  # as wide as the benchmark's
+        assert band.any()
+        for window, got in zip(exact.windows, exact.splat(x), strict=True):
+            assert np.abs(got - image[window.at]).max() < 1e-12
+            assert np.array_equal(window.band, band[window.at])
+        assert exact.splat_error(image, x).largest < 1e-12
+        masked = exact.masked(np.random.default_rng(0).normal(size=image.shape).astype(np.float32))
+        assert exact.gather_error(whole.gather(masked), masked).off_cuts < 1e-11  # sums of thousands
+
+    def test_an_error_is_seen_and_a_flip_is_told_apart(self):
+        exact, x = reference_windows(self.g, self.camera), random_values(400, 3)
+        image = ReferenceRasterizer().view(self.g, self.camera).splat(x)[0]
+        window = next(w for w in exact.windows if w.band.any() and not w.band.all())
+        bad = image.copy()
+        bad[window.at][window.band] += 0.25
+        error = exact.splat_error(bad, x)
+        assert error.largest == pytest.approx(0.25)
+        assert error.off_cuts < 1e-12
+        assert error.flips >= window.band.sum()
+        bad[window.at][~window.band] += 0.125
+        assert exact.splat_error(bad, x).off_cuts == pytest.approx(0.125)
+
+
+@pytest.mark.long
+class TestReport:
+    def test_ratios_say_met_missed_and_not_measured(self):
+        rows = [
+            measurement(31_000, 10.0),
+            measurement(31_000, 14.0, "gather"),
+            measurement(31_000, 9.0, "frozen splat"),
+        ]
+        by_text = {r.text: r for r in bench_report.ratios(rows)}
+        gather = by_text["3 channels, 31k, 320x240: cpu gather / cpu splat"]
+        frozen = by_text["3 channels, 31k, 320x240: cpu splat / cpu frozen splat"]
+        assert (gather.ratio, gather.met) == (pytest.approx(1.4), True)
+        assert (frozen.ratio, frozen.met) == (pytest.approx(10 / 9), False)
+        assert by_text["12 channels, 200k, 960x720: cpu splat / cpu splat, 3 channels"].met is None
+        assert "not measured" in bench_report.ratio_table(list(by_text.values()))
+
+    def test_sweep_has_every_pair_once_and_small_ones_first(self):
+        pairs = sweep(
+            (10, 1000, 100), ((8, 8), (4, 4), (16, 16)), 100, ((10, (4, 4)), (7, (4, 4)), (100, (9, 9)))
+        )
+        assert pairs == [
+            (10, (4, 4)), (10, (8, 8)), (100, (4, 4)), (100, (8, 8)), (100, (16, 16)), (1000, (8, 8)),
+        ]  # fmt: skip
+
+
+@pytest.mark.long
+def test_a_tiny_run_writes_three_sane_files(tmp_path):
+    plan = RasterBenchConfig((60, 120, 200), ((40, 30),), 120, (1, 3))
+    unfinished = []
+    report = run_plan(plan, keep=unfinished.append)
+    write_report(tmp_path, "raster", report.text, report.figures, lambda path: plot(report.rows, path))
+    assert [part.machine["unfinished"][0] for part in unfinished] == ["1", "2", "3"]
+    assert {row.gaussians for row in unfinished[0].rows} == {60}
+    record = json.loads((tmp_path / "raster.json").read_text())
+    rows = record["measurements"]
+    cpu = {r["operation"] for r in rows if r["backend"] == "cpu"}
+    assert {"project", "frame", "splat", "gather", "backward"} <= cpu
+    assert all(r["milliseconds"] > 0 and r["calls"] >= 1 for r in rows)
+    exact = [r for r in rows if r["backend"] == "cpu" and not r["operation"].startswith("frozen")]
+    # float32 blending of values in [0, 1].
+    assert all(r["error_off_cuts"] < 2e-5 for r in exact if r["error_off_cuts"] is not None)
+    assert all(r["error_off_cuts"] is not None for r in exact if r["operation"] == "backward")
+    frozen = [r for r in rows if r["operation"].startswith("frozen")]
+    assert all(r["error_off_cuts"] < 2e-3 for r in frozen)  # weights in 16 bits
+    text = (tmp_path / "raster.md").read_text()
+    assert "# Rasterizers" in text
+    assert "## Promised ratios" in text
+    assert Image.open(tmp_path / "raster.png").size[0] > 1000
+
+
+@pytest.mark.long
+def test_what_would_take_too_long_is_named(tmp_path):
+    plan = RasterBenchConfig((60, 4000), ((40, 30),), 60, (1,), limit=1e-9)
+    report = run_plan(plan)
+    assert {r.milliseconds is None for r in report.rows if r.gaussians == 60} == {False}
+    left_out = [r for r in report.rows if r.gaussians == 4000]
+    assert {r.milliseconds is None and "expected" in r.note for r in left_out} == {True}
+    assert "not run" in report.text
+
+
+@pytest.mark.long
+def test_a_peak_begins_anew():
+    if restart_peak() is None:
+        pytest.skip("this system does not tell")
+    block = bytearray(200_000_000)
+    block[::4096] = b"x" * len(block[::4096])
+    del block
+    assert peak_memory() > resident_memory() + 100_000_000
+    restart_peak()
+    assert peak_memory() < resident_memory() + 100_000_000
+
+
+# The query benchmark.
+
+SMALL = QueryBenchConfig(size=(40, 30), phrases=2, together=3, repeats=1, codec_steps=40)
+
+
+def codebook_scene() -> Scene:
+    """The three blobs, each with a codeword of its own at all levels."""
+    codec = CodebookCodec(np.eye(3, DIM, dtype=np.float32), np.zeros((3, 3), np.float32))
+    latents = np.tile(np.repeat(np.arange(3, dtype=np.uint16), PER_BLOB)[:, None], (3, 1, 1))
+    confidence = np.ones((3, 3 * PER_BLOB), np.float32)
+    confidence[0, :50] = 0
+    field = LanguageField(latents, confidence, codec, np.tile(axis(3), (4, 1)), "fake")
+    return replace(blob_scene(), language=field)
+
+
+@pytest.mark.long
+def test_every_order_is_measured_against_what_it_should_find():
+    report = measure_queries(codebook_scene(), FakeEncoder(), SMALL)
+    paper, table, codebook = report.costs
+    assert (report.gaussians, report.size, report.phrases) == (3 * PER_BLOB, (40, 30), 3)
+    assert [cost.way for cost in report.costs] == ["paper's order", "table lookup", "codebook"]
+    assert codebook.lookup.p99 < 1e-6
+    assert codebook.codec == codebook.lookup  # its latents stand for the codewords themselves
+    assert 0 < table.lookup.mean < table.codec.mean  # 40 steps fit nothing; the table shows what they did
+    assert table.codec.mean == pytest.approx(paper.codec.mean, rel=0.1)
+    for cost in report.costs:
+        assert min(cost.answer, cost.camera, cost.frame) >= 0  # seconds: how many is not for a test to say
+        assert cost.way in query_table(report)
+
+
+def test_a_scene_without_a_codebook_is_refused():
+    with pytest.raises(InputError, match="codebook"):
+        measure_queries(blob_scene(), FakeEncoder(), SMALL)
+
+
+def test_repeated_gaussians_lie_beside_their_own_with_their_meaning():
+    scene = codebook_scene()
+    larger = repeated(scene, 1000)
+    assert len(larger.gaussians) == 1000
+    rows = np.arange(1000) % (3 * PER_BLOB)
+    np.testing.assert_array_equal(larger.language.latents, scene.language.latents[:, rows])
+    steps = (larger.gaussians.means - scene.gaussians.means[rows]) / np.exp(scene.gaussians.log_scales[rows])
+    assert 0.9 < steps.std() < 1.1
+
+
+def test_another_codec_encodes_the_codewords():
+    field = codebook_scene().language
+    wide = CodebookCodec(np.eye(3, 16, dtype=np.float32), np.zeros((3, 3), np.float32))
+    field = replace(field, codec=wide, canonical=np.eye(16, dtype=np.float32)[[3] * 4])
+    codec = random_codec("autoencoder")
+    encoded = with_codec(field, codec)
+    want = codec.encode(np.eye(3, 16, dtype=np.float32))[field.latents[2, :, 0]]
+    np.testing.assert_array_equal(encoded.latents[2], want)
+    assert (encoded.latents[0, :50] == 0).all()
+
+
+@pytest.mark.long
+def test_the_command_writes_what_it_measured(tmp_path, capsys):
+    small = "--size 64 48 --phrases 2 --together 2 --repeats 1 --codec-steps 30"
+    words = ["bench", "query", "assets/demo/scene.ply", *small.split(), "--out", tmp_path]
+    assert run(*words) == 0
+    report = json.loads((tmp_path / "query.json").read_text())["report"]
+    assert report["size"] == [64, 48]
+    assert report["costs"][2]["lookup"]["p99"] < 1e-6
+    assert (tmp_path / "query.md").read_text() in capsys.readouterr().out
+    assert run(*words, "--repeats", 0) == 2

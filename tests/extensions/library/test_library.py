@@ -1,0 +1,319 @@
+"""The index of a folder of scenes: its answers are the engine's, it follows its folder, and is refused when
+damaged. Two scenes of one place: what appeared, is gone, moved or has another colour, and nothing else."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from langsplat_core.arrays import Array
+from langsplat_core.errors import EncoderError, FormatError, InputError
+from langsplat_core.extensions.library import index as module
+from langsplat_core.extensions.library.changes import Change, changes, colour_term, to_lab
+from langsplat_core.extensions.library.finding import find, judged
+from langsplat_core.extensions.library.index import (
+    INDEX,
+    MAGIC,
+    fits_in,
+    read_library,
+    scenes_in,
+    update_library,
+)
+from langsplat_core.io.scenes import load_scene, save_scene
+from langsplat_core.query.describe import Describer
+from langsplat_core.query.engine import QueryEngine
+from langsplat_core.raster import load_lifting_rasterizer
+from langsplat_core.scene import Gaussians, Scene
+from tests.support.comparing import FIELDS
+from tests.support.fakes import CENTRES, NAMES, PER_BLOB, WORDS, FakeEncoder, axis, named_scene
+from tests.support.scenes import unturned_gaussians
+
+MUG, BOOK, PLANT = (slice(k * PER_BLOB, (k + 1) * PER_BLOB) for k in range(3))
+
+
+def without(scene: Scene, rows: slice) -> Scene:
+    return scene.take(np.delete(np.arange(len(scene.gaussians)), rows))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Everything, nothing but mug and book, and a scene without a codebook; another without a field."""
+    save_scene(tmp_path / "all.ply", named_scene())
+    (tmp_path / "deep").mkdir()
+    save_scene(tmp_path / "deep" / "few.ply", without(named_scene(), PLANT))
+    save_scene(tmp_path / "linear.spz", named_scene(codebook=False))
+    save_scene(tmp_path / "plain.ply", replace(named_scene(), language=None))
+    return tmp_path
+
+
+def load(name: str) -> FakeEncoder:
+    return FakeEncoder()
+
+
+def test_scenes_with_a_field_are_found_in_all_folders(folder):
+    (folder / ".hidden").mkdir()
+    save_scene(folder / ".hidden" / "scene.ply", named_scene())
+    found = [path.relative_to(folder).as_posix() for path in scenes_in(folder)]
+    assert found == ["all.ply", "linear.spz", "deep/few.ply"]
+    with pytest.raises(InputError, match="no such folder"):
+        scenes_in(folder / "elsewhere")
+
+
+@pytest.mark.parametrize("phrase", WORDS)
+def test_the_index_has_the_fits_of_the_engine(folder, phrase):
+    group = update_library(folder, load_encoder=load).groups[0]
+    vector = FakeEncoder().encode_texts([phrase])[0]
+    for scene, fits in zip(group.scenes, fits_in(group, vector), strict=True):
+        answer = QueryEngine(load_scene(folder / scene.path)).run(phrase, vector=vector)
+        if scene.path == "linear.spz":
+            assert not scene.is_indexed
+            assert np.isneginf(fits).all()
+        else:
+            np.testing.assert_allclose(fits, answer.fits, atol=0.05)  # spreads; 8 bits of a codeword
+            above, chance, verdict = judged(scene, fits, "thing")
+            assert (verdict, chance) == (answer.verdict, answer.probability)
+            assert above == pytest.approx(answer.excess, abs=0.2)
+
+
+def test_the_best_scenes_come_first_and_with_a_place(folder):
+    (answered,) = find(update_library(folder, load_encoder=load), "plant", load)
+    names = [hit.path.name for hit in answered.hits]
+    assert set(names[:2]) == {"all.ply", "linear.spz"}
+    assert names[2] == "few.ply"
+    assert (answered.count("found"), answered.count("not here")) == (2, 1)
+    for hit in answered.hits[:2]:
+        assert np.linalg.norm(hit.answer.place - [1.2, 0, 0]) < 0.2
+        assert np.ptp(hit.picture) > 50
+    assert answered.hits[2].answer is None
+
+
+def test_only_what_has_changed_is_read_again(folder, monkeypatch):
+    first = update_library(folder, load_encoder=load)
+    read: list[str] = []
+    whole = module.digest
+    monkeypatch.setattr(module, "digest", lambda path, name, _: read.append(name) or whole(path, name, load))
+    again = update_library(folder, load_encoder=load)
+    assert read == []
+    assert [scene.path for scene in again.scenes] == [scene.path for scene in first.scenes]
+    save_scene(folder / "all.ply", without(named_scene(), MUG))
+    (folder / "linear.spz.langsplat.safetensors").unlink()
+    third = update_library(folder, load_encoder=load)
+    assert read == ["all.ply"]
+    assert [scene.path for scene in third.scenes] == ["all.ply", "deep/few.ply"]
+    assert {hit.path.name: hit.verdict for hit in find(third, "mug", load)[0].hits} == {
+        "all.ply": "not here",
+        "few.ply": "found",
+    }
+
+
+def test_an_interrupted_update_keeps_what_was_read(folder):
+    def stop(report: object) -> None:
+        if getattr(report, "fraction", 0) > 0.5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        update_library(folder, load_encoder=load, progress=module.Progress(stop))
+    assert len(read_library(folder / INDEX, folder).scenes) == 2
+
+
+def test_without_an_encoder_a_phrasebook_of_the_group_answers(folder):
+    def none(name: str) -> FakeEncoder:
+        raise EncoderError("no weights here")
+
+    library = update_library(folder, load_encoder=none)
+    (answered,) = find(library, NAMES[0], none)
+    assert answered.count("found") == 3
+    (unknown,) = find(library, "teapot", none)
+    assert unknown.problem == "no weights here"
+
+
+def test_scenes_of_two_encoders_are_two_groups(folder):
+    scene = named_scene()
+    field = replace(scene.language, canonical=np.tile(axis(4), (4, 1)), encoder_id="other")
+    save_scene(folder / "other.ply", replace(scene, language=field))
+    groups = find(update_library(folder, load_encoder=load), "mug", load)
+    assert [(each.encoder_id, len(each.hits)) for each in groups] == [("fake", 3), ("other", 1)]
+
+
+def test_a_scene_that_cannot_be_read_is_named(folder):
+    (folder / "all.ply").write_bytes(b"ply\n")
+    library = update_library(folder, load_encoder=load)
+    (unread,) = library.unread
+    assert unread.path == "all.ply"
+    assert "all.ply" in unread.unread
+    assert len(library.scenes) == 2
+
+
+# Damaged and hostile index files.
+
+
+def rewritten(index: Path, change: object) -> None:
+    """The index with another header, its arrays as they were."""
+    data = index.read_bytes()
+    length = int.from_bytes(data[8:16], "little")
+    header = json.loads(data[16 : 16 + length])
+    change(header)  # type: ignore[operator]
+    text = json.dumps(header).encode()
+    rest = data[16 + length + (-length) % 8 :]
+    index.write_bytes(MAGIC + len(text).to_bytes(8, "little") + text + bytes(-len(text) % 8) + rest)
+
+
+def counts(header: dict, value: object) -> None:
+    header["groups"][0][3][0][2] = value
+
+
+HEADERS = {
+    "scene outside": lambda header: header["groups"][0][3][0].__setitem__(0, "../../etc/x.ply"),
+    "absolute": lambda header: header["groups"][0][3][0].__setitem__(0, "/etc/x.ply"),
+    "too many": lambda header: counts(header, [2**40] * 5),
+    "negative": lambda header: counts(header, [-1, 1, 1, 1, 1]),
+    "text": lambda header: counts(header, "many"),
+    "no groups": lambda header: header.pop("groups"),
+    "huge vectors": lambda header: header["groups"][0].__setitem__(2, 2**50),
+    "no numbers": lambda header: header["groups"][0][3][0].__setitem__(3, ["x"] * 20),
+}
+
+
+@pytest.mark.parametrize("name", HEADERS)
+def test_a_header_that_lies_is_refused(folder, name):
+    update_library(folder, load_encoder=load)
+    rewritten(folder / INDEX, HEADERS[name])
+    with pytest.raises(FormatError, match="remove it"):
+        read_library(folder / INDEX, folder)
+
+
+def test_what_is_no_whole_index_is_refused_and_made_again(folder):
+    update_library(folder, load_encoder=load)
+    whole = (folder / INDEX).read_bytes()
+    for wound in (b"", b"LSLIB", MAGIC + b"\xff" * 8, MAGIC + bytes(8), whole[:-8], whole + bytes(8)):
+        (folder / INDEX).write_bytes(wound)
+        with pytest.raises(FormatError):
+            read_library(folder / INDEX, folder)
+        with pytest.raises(FormatError):
+            update_library(folder, load_encoder=load)
+    assert len(update_library(folder, load_encoder=load, rebuild=True).scenes) == 3
+
+
+@pytest.mark.parametrize("column", ["words", "regions", "parents"])
+def test_numbers_out_of_place_are_no_crash(folder, column):
+    group = update_library(folder, load_encoder=load).groups[0]
+    wrong: dict[str, Array] = {name: np.array(values) for name, values in group.columns.items()}
+    wrong[column][0] = 2**30
+    with pytest.raises(FormatError, match="damaged"):
+        fits_in(replace(group, columns=wrong), axis(0))
+
+
+# What changed between two scenes.
+
+
+def with_gaussians(scene: Scene, **changed: Array) -> Scene:
+    return replace(scene, gaussians=replace(scene.gaussians, **changed))
+
+
+def compared(first: Scene, second: Scene, placed: Array | None = None) -> tuple[Change, ...]:
+    engines = [QueryEngine(scene, lambda _: FakeEncoder()) for scene in (first, second)]
+    return changes(*engines, load_lifting_rasterizer("cpu"), placed)
+
+
+@pytest.fixture
+def scene() -> Scene:
+    """Three blobs before a wall: what is gone uncovers something."""
+    made = named_scene()
+    x, y = np.meshgrid(np.linspace(-4, 4, 33), np.linspace(-3, 3, 25))
+    means = np.stack([x.ravel(), y.ravel(), np.full(x.size, 1.6)], 1)
+    wall = unturned_gaussians(means, np.log([0.2, 0.2, 0.01]), 6.0, 1.2)
+    parts = {name: np.concatenate([getattr(made.gaussians, name), getattr(wall, name)]) for name in FIELDS}
+    field, shape = made.language, (3, len(means))
+    latents = np.concatenate([field.latents, np.full((*shape, 1), 3, np.uint16)], 1)
+    confidence = np.concatenate([field.confidence, np.ones(shape, np.float32)], 1)
+    field = replace(field, latents=latents, confidence=confidence, tree=None)
+    return replace(made, gaussians=Gaussians(**parts), language=field)
+
+
+def noisy(scene: Scene, seed: int = 5) -> Scene:
+    """The same from another training: every Gaussian a little elsewhere and of a little other colour."""
+    rng, g = np.random.default_rng(seed), scene.gaussians
+    means = g.means + rng.normal(scale=0.01, size=g.means.shape)
+    return with_gaussians(scene, means=means, sh=g.sh + rng.normal(scale=0.05, size=g.sh.shape))
+
+
+def test_nothing_changed_is_said_of_the_same_of_noise_and_of_another_exposure(scene):
+    darker = with_gaussians(scene, sh=scene.gaussians.sh - 0.9)
+    assert compared(scene, scene) == compared(scene, noisy(scene)) == compared(scene, darker) == ()
+
+
+@pytest.mark.parametrize("number", range(3))
+def test_gone_and_appeared_are_each_other_backwards(scene, number):
+    rows = (MUG, BOOK, PLANT)[number]
+    fewer = noisy(without(scene, rows))
+    for pair, kind in (((scene, fewer), "gone"), ((fewer, scene), "appeared")):
+        (change,) = compared(*pair)
+        assert change.kind == kind
+        np.testing.assert_allclose(change.centre, CENTRES[number], atol=0.1)
+        assert change.share > 0.8
+
+
+def test_before_nothing_what_is_gone_is_told_by_who_looked_there():
+    """The blobs alone: what the second capture did not see may still be there."""
+    scene = named_scene()
+    fewer = without(scene, BOOK)
+    assert [change.kind for change in compared(scene, fewer)] == ["gone"]
+    assert compared(scene, replace(fewer, cameras=())) == ()
+
+
+def test_a_move_is_one_change_and_has_its_length(scene):
+    means = scene.gaussians.means.copy()
+    means[PLANT] += (0.3, -0.2, -1.0)
+    (change,) = compared(scene, with_gaussians(scene, means=means))
+    assert change.kind == "moved"
+    np.testing.assert_allclose(change.moved, (0.3, -0.2, -1.0), atol=0.05)
+    assert change.distance == pytest.approx(np.linalg.norm((0.3, 0.2, 1.0)), abs=0.05)
+
+
+def test_another_colour_is_named(scene):
+    sh = scene.gaussians.sh.copy()
+    sh[MUG] = sh[PLANT]
+    (change,) = compared(scene, with_gaussians(scene, sh=sh))
+    assert (change.kind, change.colours) == ("recoloured", ("red", "blue"))
+
+
+def test_names_are_the_words_of_the_encoder(scene):
+    one, other = (QueryEngine(part, lambda _: FakeEncoder()) for part in (scene, noisy(without(scene, BOOK))))
+    describers = Describer(one, WORDS), Describer(other, WORDS)
+    (change,) = changes(one, other, load_lifting_rasterizer("cpu"), None, describers)
+    assert change.name == "book"
+
+
+def test_another_frame_and_scale_change_nothing(scene):
+    """The second scene is the first one turned by 90 degrees, moved, and twice as large."""
+    turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    g = scene.gaussians
+    means, quats = 2 * g.means @ turn.T + (3.0, -1, 2), np.tile(np.sqrt([0.5, 0, 0.5, 0]), (len(g), 1))
+    turned = with_gaussians(scene, means=means, log_scales=g.log_scales + np.log(2), quats_wxyz=quats)
+    into = np.eye(4)
+    into[:3, :3], into[:3, 3] = turn.T / 2, -turn.T @ (3.0, -1, 2) / 2
+    second = replace(turned, cameras=())  # those of the first are enough
+    assert compared(scene, second, into) == ()
+    (change,) = compared(scene, without(second, MUG), into)
+    np.testing.assert_allclose(change.centre, CENTRES[0], atol=0.1)
+
+
+def test_what_cannot_be_compared_is_said(scene):
+    blind = replace(scene, cameras=())
+    with pytest.raises(InputError, match="cameras"):
+        compared(blind, blind)
+    for matrix in (np.eye(3), np.full((4, 4), np.nan), np.diag([1.0, 2, 1, 1]), np.zeros((4, 4))):
+        with pytest.raises(InputError, match="matrix"):
+            compared(scene, scene, matrix)
+    with pytest.raises(InputError, match="language"):
+        compared(scene, replace(scene, language=None))
+
+
+def test_colours_are_those_of_cie():
+    white, red = to_lab(np.array([[1.0, 1, 1], [1, 0, 0]]))
+    np.testing.assert_allclose(white, (100, 0, 0), atol=0.1)
+    np.testing.assert_allclose(red, (53.2, 80.1, 67.2), atol=0.2)  # of sRGB's red, D65
+    for colour, term in (((0.1, 0.3, 0.9), "blue"), ((0.95, 0.9, 0.3), "yellow")):
+        assert colour_term(to_lab(np.array(colour))) == term
