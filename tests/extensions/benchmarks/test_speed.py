@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from langsplat_core.errors import InputError
+from langsplat_core.extensions.benchmarks import raster_speed as bench_report
 from langsplat_core.extensions.benchmarks.commands import write_report
 from langsplat_core.extensions.benchmarks.config import (
     QueryBenchConfig,
@@ -17,7 +18,6 @@ from langsplat_core.extensions.benchmarks.config import (
     resident_memory,
     restart_peak,
 )
-from langsplat_core.extensions.benchmarks.config import raster as bench_report
 from langsplat_core.extensions.benchmarks.measure import Measurement, reference_windows
 from langsplat_core.extensions.benchmarks.query_speed import (
     measure_queries,
