@@ -56,6 +56,11 @@ class FormatError(InputError):
     """A file whose content breaks a rule of its format."""
 
 
+def malformed(path: object, what: str, remedy: str = "copy it again, or export it anew") -> FormatError:
+    """Return the error of a file that breaks a rule: its name, what is wrong, and how to mend it."""
+    return FormatError(f"{path}: {what}; {remedy}")
+
+
 class BackendError(LangSplatError):
     """A rasterizer, driver or optional library that cannot be loaded on this machine."""
 

@@ -16,6 +16,7 @@ from assets.making.world import World, build_room
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import atomic_path
+from langsplat_core.io.ply_table import write_table
 from langsplat_core.progress import Progress
 from langsplat_core.scene import LEVELS, Camera, look_at
 
@@ -138,8 +139,6 @@ def write_labels(world: World, path: Path) -> None:
 
 def _write_points(world: World, renderer: Renderer, seed: int, path: Path) -> None:
     """Points on the surfaces, denser on the objects than on the room, with noise and colours."""
-    from plyfile import PlyData, PlyElement
-
     rng = np.random.default_rng((seed, 4))
     corners = world.vertices[world.triangles].astype(np.float64)
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
@@ -151,12 +150,9 @@ def _write_points(world: World, renderer: Renderer, seed: int, path: Path) -> No
     spread = np.stack([1 - uv.sum(1), uv[:, 0], uv[:, 1]], 1)
     points = (corners[chosen] * spread[..., None]).sum(1) + rng.normal(0, _POINT_NOISE, (POINTS, 3))
     colours = renderer.colours_at(chosen, uv, np.array([0.0, 0.0, 3.0]))
-    row = np.dtype([(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")])
-    table = np.empty(POINTS, row)
-    for name, column in zip(row.names or (), (*points.T, *colours.T), strict=True):
-        table[name] = column
-    with atomic_path(path) as temporary:
-        PlyData([PlyElement.describe(table, "vertex")]).write(str(temporary))
+    columns = dict(zip("xyz", points.astype(np.float32).T, strict=True))
+    columns |= zip(("red", "green", "blue"), colours.astype(np.uint8).T, strict=True)
+    write_table(path, columns)
 
 
 def camera_to_world_gl(camera: Camera) -> Array:

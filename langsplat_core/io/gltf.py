@@ -26,8 +26,8 @@ from langsplat_core.arrays import Array, logit, rotation_matrices, sigmoid, unit
 from langsplat_core.errors import FormatError, InputError, quoted
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import open_for_reading, parse_json
-from langsplat_core.io.splat import to_bytes
-from langsplat_core.io.spz import coefficient_signs, decode_spz, quaternion_signs
+from langsplat_core.io.packing import coefficient_signs, quaternion_signs, to_bytes
+from langsplat_core.io.spz import decode_spz
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
 from langsplat_core.scene.gaussians import join_gaussians
 from langsplat_core.scene.transform import C0, Similarity, similarity, transform_gaussians

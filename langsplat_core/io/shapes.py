@@ -10,7 +10,8 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.gltf import glb_head
-from langsplat_core.io.splat import to_bytes
+from langsplat_core.io.packing import to_bytes
+from langsplat_core.io.ply_table import write_table
 from langsplat_core.scene import Gaussians, Scene
 from langsplat_core.scene.transform import AXES, C0, scaling, turning
 
@@ -47,22 +48,14 @@ def write_points(path: Path | str, gaussians: Gaussians, extras: Mapping[str, Ar
     """Write the means of the Gaussians that can be drawn as a PLY point cloud, atomically: red, green and
     blue as bytes, each of `extras`, name -> (N,), as a float. Return the number of points. InputError for
     another suffix."""
-    from plyfile import PlyData, PlyElement
-
     path = check_suffix(path, POINT_SUFFIXES)
     extras = extras or {}
     valid = gaussians.valid()
-    columns = [(axis, "<f4") for axis in "xyz"] + [(name, "u1") for name in RGB]
-    table = np.empty(int(valid.sum()), [*columns, *((name, "<f4") for name in extras)])
-    for k, axis in enumerate("xyz"):
-        table[axis] = gaussians.means[valid, k]
-    for name, values in zip(RGB, to_bytes(255 * base_colours(gaussians)[valid]).T, strict=True):
-        table[name] = values
-    for name, values in extras.items():
-        table[name] = values[valid]
-    with atomic_path(path) as temporary:
-        PlyData([PlyElement.describe(table, "vertex")]).write(str(temporary))
-    return len(table)
+    columns = dict(zip("xyz", gaussians.means[valid].T, strict=True))
+    columns |= zip(RGB, to_bytes(255 * base_colours(gaussians)[valid]).T, strict=True)
+    columns |= {name: values[valid].astype(np.float32) for name, values in extras.items()}
+    write_table(path, columns)
+    return int(valid.sum())
 
 
 def write_meshes(path: Path | str, meshes: Sequence[Mesh], to_gltf: Array | None = None) -> None:
@@ -76,7 +69,8 @@ def write_meshes(path: Path | str, meshes: Sequence[Mesh], to_gltf: Array | None
         elif path.suffix.lower() == ".glb":
             temporary.write_bytes(_glb(path, meshes, np.eye(4) if to_gltf is None else to_gltf))
         else:
-            _write_mesh_ply(temporary, meshes)
+            columns, faces = _joined(meshes)
+            write_table(temporary, columns, faces)
 
 
 def gltf_axes(scene: Scene) -> Array:
@@ -105,21 +99,14 @@ def _obj(meshes: Sequence[Mesh]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _write_mesh_ply(path: Path, meshes: Sequence[Mesh]) -> None:
-    from plyfile import PlyData, PlyElement
-
-    firsts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    vertex = np.empty(firsts[-1], [(axis, "<f4") for axis in "xyz"] + [(name, "u1") for name in RGB])
-    places = np.concatenate([mesh.vertices for mesh in meshes])
+def _joined(meshes: Sequence[Mesh]) -> tuple[dict[str, Array], Array]:
+    """Columns of the vertices of all meshes, and (F, 3) numbers of them."""
+    places = np.concatenate([mesh.vertices for mesh in meshes]).astype(np.float32)
     colours = np.concatenate([np.broadcast_to(mesh.colour, mesh.vertices.shape) for mesh in meshes])
-    for names, values in (("xyz", places), (RGB, to_bytes(255 * colours))):
-        for k, name in enumerate(names):
-            vertex[name] = values[:, k]
-    triangles = [mesh.triangles + first for mesh, first in zip(meshes, firsts, strict=False)]
-    face = np.empty(sum(map(len, triangles)), [("vertex_indices", "<i4", (3,))])
-    face["vertex_indices"] = np.concatenate(triangles)
-    elements = [PlyElement.describe(vertex, "vertex"), PlyElement.describe(face, "face")]
-    PlyData(elements).write(str(path))
+    firsts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+    faces = [mesh.triangles + first for mesh, first in zip(meshes, firsts, strict=True)]
+    columns = dict(zip("xyz", places.T, strict=True)) | dict(zip(RGB, to_bytes(255 * colours).T, strict=True))
+    return columns, np.concatenate(faces)
 
 
 def _glb(path: Path, meshes: Sequence[Mesh], to_gltf: Array) -> bytes:

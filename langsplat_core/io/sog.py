@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from langsplat_core.arrays import Array, logit, sigmoid, unit, whole_number
+from langsplat_core.arrays import Array, logit, sigmoid, whole_number
 from langsplat_core.errors import FormatError, quoted
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import (
@@ -42,7 +42,7 @@ from langsplat_core.io.hostile import (
     parse_json,
     read_json_file,
 )
-from langsplat_core.io.ply import OTHERS, smallest_three
+from langsplat_core.io.packing import smallest_three, to_bytes, without_largest
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
 from langsplat_core.scene.gaussians import join_gaussians
 
@@ -357,12 +357,9 @@ LEAST_SCALE = -30.0  # logarithm: a flat axis
 
 def _quaternion_codes(quats: Array, valid: Array) -> Array:
     """(N, 4) uint8: the three smaller components, and 252 plus the number of the largest."""
-    turns = unit(np.where(valid[:, None], quats, [1, 0, 0, 0]).astype(np.float64))
-    largest = np.abs(turns).argmax(1)
-    turns *= np.where(turns[np.arange(len(turns)), largest] < 0, -1, 1)[:, None]
-    three = np.take_along_axis(turns, OTHERS[largest], axis=1)
-    codes = np.rint((three / np.sqrt(2) + 0.5) * 255).clip(0, 255)
-    return np.concatenate([codes, 252 + largest[:, None]], axis=1).astype(np.uint8)
+    three, largest = without_largest(np.where(valid[:, None], quats, [1, 0, 0, 0]))
+    codes = to_bytes((three / np.sqrt(2) + 0.5) * 255)
+    return np.concatenate([codes, 252 + largest[:, None].astype(np.uint8)], axis=1)
 
 
 def _coded(values: Array, counts: Array) -> tuple[Array, Array]:

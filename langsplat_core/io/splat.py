@@ -21,6 +21,7 @@ from langsplat_core.arrays import Array, logit, sigmoid, unit
 from langsplat_core.errors import FormatError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import open_for_reading
+from langsplat_core.io.packing import to_bytes
 from langsplat_core.scene import SH_COUNTS, Gaussians
 from langsplat_core.scene.gaussians import join_gaussians
 from langsplat_core.scene.transform import C0
@@ -86,11 +87,6 @@ def log_of_scales(scales: Array) -> Array:
     """Logarithms of scales: -infinity of 0, a flat axis, and NaN of a negative one, a row dropped later."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.log(scales)
-
-
-def to_bytes(values: Array) -> Array:
-    """Round numbers and clip them to uint8."""
-    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
 # ---- the .ksplat file of mkkellogg's GaussianSplats3D, compression levels 0, 1 and 2 ----

@@ -21,12 +21,17 @@ from typing import BinaryIO
 
 import numpy as np
 
-from langsplat_core.arrays import Array, logit, sigmoid, unit
+from langsplat_core.arrays import Array, logit, sigmoid
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import open_for_reading
-from langsplat_core.io.ply import smallest_three
-from langsplat_core.io.splat import to_bytes
+from langsplat_core.io.packing import (
+    coefficient_signs,
+    quaternion_signs,
+    smallest_three,
+    to_bytes,
+    without_largest,
+)
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
 
 MAGIC, GZIP_MAGIC = b"NGSP", b"\x1f\x8b"
@@ -215,15 +220,6 @@ def _axes(records: bytes, path: Path) -> int:
 
 COLOUR_SCALE = 0.15
 FRACTIONAL_BITS = 12  # what other writers use: steps of 1/4096, up to 2048
-# Whether each spherical harmonic from degree 1 on is odd in x, y, z
-_ODD = np.array(
-    [
-        *([0, 1, 0], [0, 0, 1], [1, 0, 0]),
-        *([1, 1, 0], [0, 1, 1], [0, 0, 0], [1, 0, 1], [0, 0, 0]),
-        *([0, 1, 0], [1, 1, 1], [0, 1, 0], [0, 0, 1], [1, 0, 0], [0, 0, 1], [1, 0, 0]),
-    ],
-    dtype=bool,
-)
 
 
 def read_spz_scene(path: Path | str) -> Scene:
@@ -343,15 +339,10 @@ def _rotations(packed: Packed) -> Array:
 
 def _rotation_codes(quats_wxyz: Array) -> Array:
     """(N, 4) quaternions of any length -> (N, 4) bytes of version 3."""
-    xyzw = unit(quats_wxyz.astype(np.float64), 1e-30)[:, [1, 2, 3, 0]]
-    largest = np.abs(xyzw).argmax(axis=1)
-    words = largest.astype(np.uint32)
-    xyzw *= np.where(np.take_along_axis(xyzw, largest[:, None], 1) < 0, -1, 1)
-    codes = np.rint(np.abs(xyzw) * np.sqrt(2) * 511).clip(0, 511).astype(np.uint32) | (xyzw < 0) * np.uint32(
-        512
-    )
-    for component in range(4):
-        words = np.where(component == largest, words, words << np.uint32(10) | codes[:, component])
+    three, largest = without_largest(quats_wxyz[:, [1, 2, 3, 0]])
+    codes = np.rint(np.abs(three) * np.sqrt(2) * 511).clip(0, 511).astype(np.uint32)
+    codes |= (three < 0) * np.uint32(512)
+    words = largest.astype("<u4") << 30 | codes[:, 0] << 20 | codes[:, 1] << 10 | codes[:, 2]
     return words.astype("<u4")[:, None].view(np.uint8)
 
 
@@ -360,13 +351,3 @@ def _signs_to_rdf(axes: int) -> Array:
     has a bit each for right, up, front."""
     right, up, front = (axes - 1 >> bit & 1 for bit in range(3))
     return np.array([1 if right else -1, -1 if up else 1, 1 if front else -1])
-
-
-def quaternion_signs(signs: Array) -> Array:
-    """(4,) signs of w x y z: mirroring an axis turns the two rotations about the others round."""
-    return np.array([1, signs[1] * signs[2], signs[0] * signs[2], signs[0] * signs[1]])
-
-
-def coefficient_signs(signs: Array, count: int) -> Array:
-    """(count,) signs of the coefficients from degree 1 on."""
-    return np.where(_ODD, signs, 1).prod(axis=1)[:count]

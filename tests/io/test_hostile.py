@@ -126,8 +126,8 @@ def test_colours_of_every_type_are_bytes_whatever_the_numbers(tmp_path, colour, 
     ("old", "new", "message"),
     [
         ("element vertex", "element corner", "no element 'vertex'"),
-        ("property double y", "property double q", "no number 'y'"),
-        ("property double z", "property list uchar int l\nproperty double z", "holds lists"),
+        ("property double y", "property double q", "no number"),
+        ("property double z", "property list uchar int l\nproperty double z", "has a list"),
         ("element vertex 1", "element vertex 1000000000000", "truncated"),
     ],
 )

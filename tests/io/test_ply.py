@@ -10,7 +10,7 @@ import plyfile
 import pytest
 
 from langsplat_core.arrays import rotation_matrices, sigmoid
-from langsplat_core.errors import FormatError, InputError
+from langsplat_core.errors import InputError
 from langsplat_core.io.ply import (
     metres_by_comments,
     metres_comment,
@@ -42,7 +42,7 @@ from tests.support.scenes import random_extras, random_gaussians
 
 @pytest.mark.parametrize("degree", range(4))
 @pytest.mark.parametrize("count", [0, 1, 50])
-def test_what_is_written_is_read_back_bit_for_bit(tmp_path, degree, count):
+def test_written_files_are_read_back_bit_for_bit(tmp_path, degree, count):
     """And is what another reader expects."""
     want, extras = random_gaussians(count, sh_degree=degree), random_extras(50)
     extras = {name: values[:count] for name, values in extras.items()}
@@ -56,12 +56,12 @@ def test_what_is_written_is_read_back_bit_for_bit(tmp_path, degree, count):
 
 
 @pytest.mark.parametrize("encode", [plain_ply, ascii_ply])
-def test_more_rows_than_one_chunk(put, encode):
+def test_rows_of_several_chunks_are_read(put, encode):
     want = random_gaussians(2 * 8192 + 3)
     assert_same(read_ply(put(encode(want))), want)
 
 
-def test_rows_that_cannot_be_drawn_are_kept_as_they_are(tmp_path):
+def test_rows_that_cannot_be_drawn_are_kept(tmp_path):
     want = random_gaussians(8)
     want.means[0], want.log_scales[1], want.quats_wxyz[2] = np.nan, -np.inf, 0
     want.opacity_logits[3:5] = np.inf, -np.inf
@@ -77,7 +77,7 @@ def test_rows_that_cannot_be_drawn_are_kept_as_they_are(tmp_path):
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("code", ["f4", "f8"])
 @pytest.mark.parametrize("degree", [0, 3])
-def test_files_of_another_writer(tmp_path, byte_order, text, code, degree):
+def test_files_of_another_writer_are_read(tmp_path, byte_order, text, code, degree):
     """Properties in any order, those of no layout among them, between elements of other kinds."""
     want, extras = random_gaussians(30, sh_degree=degree), random_extras(30)
     values = {name: column.astype(code) for name, column in columns(want).items()} | extras
@@ -113,33 +113,25 @@ def test_a_double_beyond_float32_becomes_infinite(put):
 
 MARKS = [
     ((), False),
-    (("Exported from Brush", "SplatRenderMode: mip"), True),
+    (("Exported from Brush", "  SPLATRENDERMODE:   MIP "), True),
     (("SplatRenderMode: default",), False),
-    (("SplatRenderMode: 2dgs",), False),
-    (("  SPLATRENDERMODE:   MIP ",), True),
-    (("SplatRenderMode:mip",), True),
     (("antialiased 1",), True),
     (("antialiased 0",), False),
-    (("antialiased",), False),
     (("the antialiased 1 of them",), False),
     (("train_flags exposure antialiasing",), True),
-    (("train_flags exposure",), False),
     (("antialiased 1", "SplatRenderMode: default"), False),
     (("SplatRenderMode: default", "antialiased 1"), True),
 ]
 
 
 @pytest.mark.parametrize(("comments", "antialiased"), MARKS)
-def test_the_marks_of_other_programs(tmp_path, comments, antialiased):
-    path = tmp_path / "a.ply"
-    write_ply(path, random_gaussians(3), comments)
-    assert load_scene(path).antialiased is antialiased
+def test_comments_of_other_programs_say_antialiased(put, comments, antialiased):
     marks = "\ncomment ".join(comments).encode()
-    path.write_bytes(compressed_ply(random_gaussians(3)).replace(b"made by a test", marks))
+    path = put(compressed_ply(random_gaussians(3)).replace(b"made by a test", marks))
     assert read_ply_scene(path).antialiased is antialiased
 
 
-def test_the_mark_of_a_sog(tmp_path):
+def test_a_sog_says_antialiased(tmp_path):
     files = sog_files(random_gaussians(20))
     plain = [{}, {"model": "2dgs"}, {"model": ["antialiased"]}, {"antialias": False}, {"antialias": "no"}]
     for entry in (*plain, {"model": "antialiased"}, {"antialias": True}):
@@ -153,23 +145,17 @@ def test_the_mark_of_a_sog(tmp_path):
     [
         ((), None),
         *(((metres_comment(metres),), metres) for metres in (1 / 3, 1e-12, 12345.678)),
-        (("made by hand", "metres_per_unit 2"), 2.0),
-        (("metres_per_unit: 2.5e-1",), 0.25),
+        (("made by hand", "metres_per_unit: 2.5e-1"), 0.25),
         (("metres_per_unit 2", "metres_per_unit 3"), 3.0),
-        (("metres_per_unit 2", "metres_per_unit none"), None),
-        (("metres_per_unit 0",), None),
-        (("metres_per_unit -1",), None),
-        (("metres_per_unit nan",), None),
-        (("metres_per_unit inf",), None),
-        (("metres_per_unit 2 3",), None),
+        *(((f"metres_per_unit {text}",), None) for text in ("0", "-1", "nan", "inf", "none", "2 3")),
     ],
 )
-def test_comments(comments, want):
+def test_a_comment_says_metres_per_unit(comments, want):
     assert metres_by_comments(comments) == want
 
 
 @pytest.mark.parametrize("wrong", [0.0, -1.0, np.nan, np.inf])
-def test_no_scene_has_a_length_that_is_none(wrong, tmp_path):
+def test_a_length_that_is_not_positive_is_refused(wrong, tmp_path):
     with pytest.raises(ValueError, match="must be above 0"):
         Scene(random_gaussians(2), metres_per_unit=wrong)
     save_scene(tmp_path / "a.ply", Scene(random_gaussians(2)))
@@ -177,7 +163,7 @@ def test_no_scene_has_a_length_that_is_none(wrong, tmp_path):
         write_metres(tmp_path / "a.ply", wrong)
 
 
-def test_only_the_header_changes(tmp_path):
+def test_writing_metres_changes_the_header_alone(tmp_path):
     path = tmp_path / "a.ply"
     save_scene(path, blob_scene())
     plain = path.read_bytes()
@@ -191,7 +177,7 @@ def test_only_the_header_changes(tmp_path):
     assert scene.language is not None  # the sidecar still fits
 
 
-def test_other_plies_stay_what_they_are(tmp_path):
+def test_other_encodings_keep_metres(tmp_path):
     path = tmp_path / "a.compressed.ply"
     path.write_bytes(compressed_ply(random_gaussians(300)))
     before = load_scene(path).gaussians
@@ -208,11 +194,11 @@ def test_other_plies_stay_what_they_are(tmp_path):
     assert load_scene(path).metres_per_unit == 3
 
 
-def test_what_cannot_keep_a_scale(tmp_path):
+def test_metres_of_other_files_are_refused(tmp_path):
     save_scene(tmp_path / "a.spz", Scene(random_gaussians(3)))
     (tmp_path / "c.ply").write_bytes(b"plx\n")
-    for name, message in (("a.spz", "a scale; make one"), ("b.ply", "no such file"), ("c.ply", "not a PLY")):
-        with pytest.raises(InputError, match=message):
+    for name in ("a.spz", "b.ply", "c.ply"):
+        with pytest.raises(InputError):
             write_metres(tmp_path / name, 1)
     assert (tmp_path / "c.ply").read_bytes() == b"plx\n"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.spz", "c.ply"]
@@ -221,7 +207,7 @@ def test_what_cannot_keep_a_scale(tmp_path):
 # ---- extra properties ----
 
 
-def test_numbers_that_an_integer_column_cannot_hold_are_read_without_a_word(tmp_path, recwarn):
+def test_numbers_beyond_an_integer_column_give_no_warning(tmp_path, recwarn):
     content = ascii_ply(random_gaussians(1)).decode()
     content = content.replace("end_header", "property uchar extra\nend_header")
     for number in ("300", "-1", "nan", "1e300"):
@@ -231,18 +217,17 @@ def test_numbers_that_an_integer_column_cannot_hold_are_read_without_a_word(tmp_
 
 
 @pytest.mark.parametrize(
-    ("name", "dtype", "says"),
+    ("name", "dtype"),
     [
-        *((name, "f4", "rename") for name in ("x", "nx", "f_rest_3", "two words", "a\nend_header", "")),
-        ("long", "i8", "type int64"),
-        ("flag", "?", "type bool"),
-        ("half", "f2", "type float16"),
+        *((name, "f4") for name in ("x", "f_rest_3", "two words", "a\nb", "")),
+        ("a", "i8"),
+        ("a", "?"),
     ],
 )
-def test_extras_and_comments_that_no_ply_can_hold(tmp_path, name, dtype, says):
-    with pytest.raises(InputError, match="single line"):
+def test_what_no_header_can_hold_is_refused(tmp_path, name, dtype):
+    with pytest.raises(InputError):
         write_ply(tmp_path / "a.ply", random_gaussians(1), comments=("x\nend_header",))
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError):
         write_ply(tmp_path / "a.ply", random_gaussians(3), extras={name: np.zeros(3, dtype)})
     assert not list(tmp_path.iterdir())
 
@@ -267,7 +252,7 @@ def test_loading_holds_little_beside_the_arrays_it_keeps(tmp_path, extra):
 
 @pytest.mark.parametrize("degree", range(4))
 @pytest.mark.parametrize("colours", [True, False])
-def test_decoding_is_exact_up_to_the_quantisation(put, degree, colours):
+def test_compressed_files_are_exact_to_the_quantisation(put, degree, colours):
     want = random_gaussians(600, sh_degree=degree)  # two chunks and a part of one
     got = read_ply(put(compressed_ply(want, colours=colours)))
     assert len(got) == 600
@@ -289,7 +274,7 @@ def test_decoding_is_exact_up_to_the_quantisation(put, degree, colours):
     assert np.abs(got.sh[:, 1:] - want.sh[:, 1:]).max(initial=0) <= 1 / 64 + 1e-6
 
 
-def test_the_first_and_last_bits_of_every_field(put):
+def test_first_and_last_bits_of_every_field_are_decoded(put):
     """A file made of literal words, with the numbers worked out by hand."""
     header = compressed_ply(random_gaussians(4), colours=False).split(b"end_header\n")[0]
     bounds = np.array([[0, 10, 20, 1, 20, 40, -9, -8, -7, -1, -2, -3]], "<f4")
@@ -314,7 +299,7 @@ def test_the_first_and_last_bits_of_every_field(put):
     np.testing.assert_allclose(sigmoid(got.opacity_logits[3]), 128 / 255, rtol=1e-6)
 
 
-def test_a_real_file(real_data):
+def test_a_real_compressed_file_is_read(real_data):
     got = read_ply(real_data / "gaussians" / "guitar.compressed.ply")
     assert len(got) == 90854
     assert got.valid().all()
@@ -325,158 +310,95 @@ def test_a_real_file(real_data):
     assert ((0.5 + C0 * got.sh[:, 0]) > -0.5).all()
 
 
-# One broken rule of the PLY at a time, and the message of each.
+# ---- what is malformed, beyond what tests/io/test_hostile.py mutates ----
 
-FLOATS = [f"property float {name}" for name in inria_names(0)]
-SIZE = 2 * 4 * len(FLOATS)
-BINARY = ply_bytes(["format binary_little_endian 1.0", "element vertex 2", *FLOATS], bytes(SIZE))
-ASCII = ply_bytes(["format ascii 1.0", "element vertex 1", *FLOATS], b"0 " * (len(FLOATS) - 1) + b"0\n")
-COMPRESSED = compressed_ply(random_gaussians(600, sh_degree=1))
-
-
-def rest(*numbers: int) -> bytes:
-    return b"".join(b"property float f_rest_%d\n" % i for i in numbers) + b"end_header\n" + bytes(9 * SIZE)
-
-
-def face(count: int, kind: str) -> bytes:
-    return f"element face {count}\nproperty list {kind} int i\nelement vertex 2".encode()
-
-
-BROKEN = {  # a good file, what of it is replaced by what, and the message
-    "no opacity": (BINARY, b"float opacity", b"float opaque", "property 'opacity' is missing"),
-    "no rotation": (BINARY, b"property float rot_3\n", b"", "property 'rot_3' is missing"),
-    "44 coefficients": (BINARY, b"end_header\n", rest(*range(44)), r"44 properties f_rest_\*; expected 0, 9"),
-    "a gap among them": (BINARY, b"end_header\n", rest(*range(1, 10)), "'f_rest_0' is missing among 9"),
-    "a list for a number": (BINARY, b"float opacity", b"list uchar float opacity",
-        "'opacity' of vertex is a list"),
-    "a truncated body": (BINARY, b"end_header\n\0", b"end_header\n",
-        f"2 rows of element vertex need at least {SIZE} bytes, the file has {SIZE - 1}"),
-    "10^12 vertices": (BINARY, b"vertex 2", b"vertex 1000000000000", "truncated: 1000000000000 rows"),
-    "10^12 in ascii": (ASCII, b"vertex 1", b"vertex 1000000000000", "truncated: 1000000000000 rows"),
-    "a million faces in front": (BINARY, b"element vertex 2", face(10**6, "uchar"),
-        "truncated: 1000000 rows of element face"),
-    "faces that eat the vertices": (BINARY.replace(b"\0" * 4, b"\xff" * 4, 1), b"element vertex 2",
-        face(1, "uint"), "truncated"),
-    "a negative list length": (BINARY.replace(b"\0", b"\xff", 1), b"element vertex 2", face(1, "char"),
-        "negative list length"),
-    "a negative count": (BINARY, b"vertex 2", b"vertex -2", "count '-2'; expected a whole number"),
-    "a count of many digits": (BINARY, b"vertex 2", b"vertex " + b"9" * 50_000, "expected a whole number"),
-    "an endless header": (BINARY, b"end_header", b"comment x\n" * 10_000,
-        "no 'end_header' line in the first 65536"),
-    "no format": (BINARY, b"format binary_little_endian 1.0\n", b"", "no 'format' line"),
-    "an unknown format": (BINARY, b"binary_little", b"binary_pdp", "not understood"),
-    "an unknown type": (BINARY, b"float x", b"quad x", "'property quad x' is not a valid property"),
-    "a property before any element": (BINARY, b"element vertex 2\n", b"", "not understood"),
-    "a property twice": (BINARY, b"float y", b"float x", "'x' is declared twice"),
-    "an element twice": (BINARY, b"end_header", b"element vertex 2\nend_header", "'vertex' is declared tw"),
-    "not a PLY": (BINARY, b"ply\n", b"solid cube\n", "is not a PLY file"),
-    "an empty file": (BINARY, BINARY, b"", "is not a PLY file"),
-    "no vertices": (BINARY, b"element vertex", b"element corner", "no element 'vertex'"),
-    "a mesh": (BINARY, "\n".join(FLOATS[3:]).encode(), b"property float red",
-        "a mesh or point cloud, not a 3D Gaussian scene"),
-    "words in ascii": (ASCII, b"\n0 0", b"\none two", "unreadable row"),
-    "too few rows in ascii": (ASCII.replace(b"0 ", b"0.000 "), b"vertex 1", b"vertex 2",
-        "has 1 rows, the header says 2"),
-    "no row in ascii": (ASCII, b"0 " * (len(FLOATS) - 1) + b"0", b"\n" * 99,
-        "truncated: element vertex has 0 rows"),
-    "too many values in ascii": (ASCII, b"\n0 0", b"\n0 0 0",
-        f"{len(FLOATS) + 1} values in a row of vertex; expected {len(FLOATS)}"),
-    "too few chunks": (COMPRESSED, b"chunk 3\n", b"chunk 2\n", "2 chunks for 600 Gaussians"),
-    "a bound missing": (COMPRESSED, b"max_y\n", b"ceiling\n", "element chunk has no number 'max_y'"),
-    "a word missing": (COMPRESSED, b"packed_scale", b"size", "element vertex has no number 'packed_scale'"),
-    "a list of bounds": (COMPRESSED, b"float max_y", b"list uchar float max_y", "no number 'max_y'"),
-    "coefficients of fewer": (COMPRESSED, b"sh 600\n", b"sh 599\n", "element sh has 599 rows of 9"),
-    "a coefficient missing": (COMPRESSED, b"property uchar f_rest_8\n", b"", "element sh has 600 rows of 8"),
-    "coefficients of chars": (COMPRESSED, b"uchar f_rest_3", b"char f_rest_3", "beyond 0..255"),
+PLAIN, ASCII = plain_ply(random_gaussians(2)), ascii_ply(random_gaussians(2))
+LONG = PLAIN + bytes(400)  # room for more properties
+OPACITY = b"property float opacity"
+PACKED = compressed_ply(random_gaussians(600, sh_degree=1))
+REST = b"".join(b"property float f_rest_%d\n" % index for index in range(1, 10))
+MALFORMED = {  # a good file, and what of it is replaced by what
+    "empty": (PLAIN, PLAIN, b""),
+    "another format": (PLAIN, b"ply\n", b"solid cube\n"),
+    "no format": (PLAIN, b"format binary_little_endian 1.0\n", b""),
+    "no vertices": (PLAIN, b"element vertex", b"element corner"),
+    "a point cloud": (PLAIN, PLAIN[PLAIN.index(b"f_dc_0") : PLAIN.index(b"rot_3")], b"red\nproperty float "),
+    "no opacity": (PLAIN, b"float opacity", b"float opaque"),
+    "a list for a number": (PLAIN, b"float opacity", b"list uchar float opacity"),
+    "a gap among coefficients": (LONG, OPACITY, REST + OPACITY),
+    "ten coefficients": (LONG, OPACITY, b"property float f_rest_0\n" + REST + OPACITY),
+    "a property twice": (PLAIN, b"float y", b"float x"),
+    "a truncated body": (PLAIN, PLAIN, PLAIN[:-1]),
+    "10^12 vertices": (PLAIN, b"vertex 2", b"vertex 1000000000000"),
+    "10^12 lines": (ASCII, b"vertex 2", b"vertex 1000000000000"),
+    "a negative count": (PLAIN, b"vertex 2", b"vertex -2"),
+    "digits of another script": (PLAIN, b"vertex 2", "vertex ٢".encode()),
+    "an endless header": (PLAIN, b"end_header", b"comment x\n" * 10_000),
+    "a name that clears the screen": (PLAIN, b"element", b"element \x1b[2J 0\nelement"),
+    "lists that eat the vertices": (
+        PLAIN, b"element vertex", b"element face 1\nproperty list uint float i\nelement vertex"),
+    "words in ascii": (ASCII, b"4 0 1 2 3\n", b"4 0 1 2 3\none two"),
+    "a row less in ascii": (ASCII, b"vertex 2", b"vertex 3"),
+    "a value more in ascii": (ASCII, b"property float rot_3\n", b""),
+    "too few chunks": (PACKED, b"chunk 3\n", b"chunk 2\n"),
+    "a bound missing": (PACKED, b"max_y\n", b"ceiling\n"),
+    "coefficients of fewer": (PACKED, b"sh 600\n", b"sh 599\n"),
+    "coefficients of chars": (PACKED, b"uchar f_rest_3", b"char f_rest_3"),
+    "packed numbers of floats": (PACKED, b"uint packed_color", b"float packed_color"),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", BROKEN)
-def test_every_broken_rule_has_its_message(put, case):
-    good, old, new, message = BROKEN[case]
+@pytest.mark.parametrize("case", MALFORMED)
+def test_malformed_files_are_refused_in_a_line(put, bounded, case):
+    good, old, new = MALFORMED[case]
     assert old in good
-    assert_refused(read_ply, put(good.replace(old, new, 1)), message)
+    assert_refused(read_ply, put(good.replace(old, new, 1)))
 
 
-NO_FILES = {
-    "nowhere.ply": r"nowhere\.ply: no such file",
-    "/": "is a folder",
-    "nul\0.ply": "cannot be opened",
-    "/dev/null": "not an ordinary file",
-}
-
-
-@pytest.mark.parametrize("path", NO_FILES)
-def test_paths_that_cannot_be_read(path):
-    with pytest.raises(InputError, match=NO_FILES[path]):
+@pytest.mark.parametrize("path", ["nowhere.ply", "/", "nul\0.ply", "/dev/null"])
+def test_paths_that_are_no_file_are_refused(path):
+    with pytest.raises(InputError):
         read_ply(path)
 
 
-# Every encoding of a PLY: headers that say what is not so, and comments anywhere.
-
-KINDS: dict[str, Callable[[Gaussians], bytes]] = {
+ENCODINGS: dict[str, Callable[[Gaussians], bytes]] = {
     "plain": plain_ply,
-    "no normals": lambda g: plain_ply(g, inria_names(g.sh_degree, normals=False)),
-    "list in front": lambda g: plain_ply(g, front=b"\x01" + bytes(4) + b"\x00"),
+    "lists in front": lambda g: plain_ply(g, front=b"\x01" + bytes(4) + b"\x00"),
     "mixed": mixed_ply,
     "ascii": ascii_ply,
     "compressed": compressed_ply,
 }
-ESCAPE = "\x1b]0;title\x07"
-VERTICES = "element vertex 3"
-FALSE = {  # what stands in place of the number of vertices
-    **{f"count {n}": f"element vertex {n}" for n in ("-1", "+3", "3.0", "1e3", "0x10", "٣", "9" * 21, "3 3")},
-    **{f"count {n}": f"element vertex {n}" for n in (10**12, 2**31, 2**32 + 3, 2**63, 2**64 + 3, 10**19)},
-    "rows in front": f"element other {10**12}\nproperty double d\n{VERTICES}",
-    "a name of an escape": f"element {ESCAPE} -1\n{VERTICES}",
-    "such a name twice": f"element {ESCAPE} 1\nelement {ESCAPE} 1\n{VERTICES}",
-    "a property of such a name": f"{VERTICES}\nproperty float {ESCAPE}",
-    "a list of such a name": f"{VERTICES}\nproperty list float int {ESCAPE}",
-    "a name of 5000 letters": f"element {'x' * 5000} 1000000000000\nproperty int a\n{VERTICES}",
-}
 
 
-@pytest.mark.parametrize("case", FALSE)
-@pytest.mark.parametrize("kind", KINDS)
-def test_headers_that_say_what_is_not_so(put, bounded, kind, case):
-    content = KINDS[kind](random_gaussians(3))
-    assert VERTICES.encode() in content
-    path = put(content.replace(VERTICES.encode(), FALSE[case].encode()))
-    if (kind, case) != ("compressed", "rows in front"):  # it names its elements: their order plays no part
-        assert_refused(read_ply, path)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ENCODINGS)
 @pytest.mark.parametrize("newline", [b"\n", b"\r\n"])
-def test_comments_blanks_and_line_ends_anywhere(put, kind, newline):
-    """Between any two lines, also such as look like other lines, and with bytes that are no text."""
+def test_comments_and_blank_lines_change_nothing(put, kind, newline):
+    """Before every line at once, also such as look like other lines, and with bytes that are no text."""
     scene = random_gaussians(7, sh_degree=1)
     # a body that begins with a line feed must not be taken for a part of the header
     scene.means[0, 0] = np.frombuffer(b"\n\r\n\x3f", "<f4")[0]
-    content = KINDS[kind](scene)
+    content = ENCODINGS[kind](scene)
     want = read_ply(put(content))
     if kind != "compressed":
         assert_same(want, scene)
     header, body = content.split(b"end_header\n", 1)
-    lines = [*header.replace(b"property float x", b"property\tfloat \t x\t").splitlines(), b"end_header"]
-    remarks = [b"comment element vertex 3", b"obj_info \xff\xfe\x00", b"comment", b"", b"  ", b"obj_info"]
-    for place in range(1, len(lines)):
-        remark = remarks[place % len(remarks)]
-        path = put(newline.join([*lines[:place], remark, *lines[place:]]) + newline + body)
-        assert_same(read_ply(path), want)
+    header = header.replace(b"property float x", b"property\tfloat \t x\t")
+    remarks = [b"comment element vertex 3", b"obj_info \xff\xfe\x00", b"", b"  ", b"comment end_header"]
+    lines = [b"ply"]
+    for number, line in enumerate([*header.splitlines()[1:], b"end_header"]):
+        lines += [remarks[number % len(remarks)], line]
+    assert_same(read_ply(put(newline.join(lines) + newline + body)), want)
 
 
-def test_compressed_files_that_fuzzing_found(put):
-    """An element without properties; doubles in place of packed numbers; bounds that are none: the rows of
-    their chunk are dropped."""
-    content = compressed_ply(random_gaussians(3, sh_degree=1))
-    bare = content.replace(b"".join(b"property uchar f_rest_%d\n" % i for i in range(9)), b"")
-    assert read_ply(put(bare)).sh_degree == 0
-    with pytest.raises(FormatError):
-        read_ply(put(content.replace(b"uint packed_color", b"float packed_color")))
+def test_bounds_that_are_no_numbers_drop_their_chunk(put):
     header, body = compressed_ply(random_gaussians(300)).split(b"end_header\n", 1)
     for bound in (np.float32(np.inf).tobytes(), b"\x01\x00\xa0\x7f"):  # little endian NaN; signalling
         valid = read_ply(put(header + b"end_header\n" + bound + body[4:])).valid()
         assert not valid[:256].any()
         assert valid[256:].all()
+
+
+def test_coefficients_without_a_property_are_none(put):
+    content = compressed_ply(random_gaussians(3, sh_degree=1))
+    bare = content.replace(b"".join(b"property uchar f_rest_%d\n" % i for i in range(9)), b"")
+    assert read_ply(put(bare)).sh_degree == 0

@@ -97,7 +97,8 @@ def _arrays(owner: object, names: Sequence[str], prefix: str = "") -> dict[str, 
 
 
 def assert_refused(read: Callable[[Path], object], path: Path, message: str | None = None) -> None:
-    """A FormatError of one short printable line that begins with the path and matches `message`, if given."""
+    """A FormatError of one short printable line that begins with the path and ends with a remedy; it matches
+    `message`, if given."""
     with pytest.raises(FormatError, match=message) as caught:
         read(path)
     said = str(caught.value)

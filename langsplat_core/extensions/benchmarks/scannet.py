@@ -18,8 +18,8 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.extensions.benchmarks.report import FIXED, Subject, chosen_scenes, open_scene
 from langsplat_core.io.files import write_json
-from langsplat_core.io.hostile import open_for_reading, read_npy
-from langsplat_core.io.ply_table import fill_columns, iterate_rows, read_ply_header
+from langsplat_core.io.hostile import read_npy
+from langsplat_core.io.ply_table import open_ply
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import LoadEncoder, QueryEngine
 
@@ -82,17 +82,13 @@ def read_scannet(folder: Path) -> dict[str, Path]:
 
 def read_points(path: Path, name: str) -> LabelledPoints:
     """The labelled vertices of a scene; raises as the PLY reader does."""
-    file, size = open_for_reading(path)
-    with file:
-        header = read_ply_header(file, path)
-        vertex = header.element("vertex")
-        names = [] if vertex is None else [prop.name for prop in vertex.properties if not prop.count_code]
-        if vertex is None or not {"x", "y", "z", "label"} <= set(names):
+    with open_ply(path) as ply:
+        vertex = ply.elements.get("vertex")
+        if vertex is None or not {"x", "y", "z", "label"} <= vertex.numbers.keys():
             raise FormatError(f"{path}: its vertices lack x, y, z or label; it is no label file of ScanNet")
-        chunks = iterate_rows(file, size, header, vertex, path)
-        positions = np.empty((vertex.count, 3), np.float32)
-        labels = np.empty(vertex.count, np.int32)
-        fill_columns(chunks, vertex, {("x", "y", "z"): positions}, {"label": labels})
+        (positions,), columns = ply.read(vertex, ["xyz"], ["label"])
+    with np.errstate(invalid="ignore"):
+        labels = columns["label"].astype(np.int32)
     if not np.isfinite(positions).all():
         raise FormatError(f"{path}: holds positions that are not finite")
     return LabelledPoints(name, positions, labels)

@@ -27,6 +27,7 @@ from langsplat_core.extensions.geometry.occupancy import (
 from langsplat_core.io.cameras import numbers
 from langsplat_core.io.files import atomic_path, write_json
 from langsplat_core.io.hostile import read_json_file
+from langsplat_core.io.ply_table import write_table
 from langsplat_core.io.scenes import check_keeps, check_writable, load_scene, save_scene
 from langsplat_core.io.shapes import MESH_SUFFIXES, RGB, check_suffix, gltf_axes, write_meshes
 from langsplat_core.progress import Progress, TerminalProgress
@@ -323,19 +324,11 @@ def write_voxels(
             to_map=occupancy.to_map, nodes=nodes.astype(np.int32), words=names,
             hits=occupancy.hits[tuple(cells.T)], passes=occupancy.passes[tuple(cells.T)],
         )  # fmt: skip
-    from plyfile import PlyData, PlyElement
-
     centres = occupancy.origin + (cells + 0.5) * occupancy.resolution
     colours = np.random.default_rng(0).integers(40, 256, (int(nodes.max(initial=0)) + 2, 3))
-    columns = [(axis, "f4") for axis in "xyz"] + [("node", "i4")] + [(name, "u1") for name in RGB]
-    table = np.zeros(len(cells), columns)
-    for axis, values in zip("xyz", centres.T, strict=True):
-        table[axis] = values
-    table["node"] = nodes
-    for name, values in zip(RGB, colours[nodes].T, strict=True):
-        table[name] = values
-    with atomic_path(folder / "voxels.ply") as path:
-        PlyData([PlyElement.describe(table, "vertex")]).write(path)
+    columns = dict(zip("xyz", centres.astype(np.float32).T, strict=True)) | {"node": nodes.astype(np.int32)}
+    columns |= zip(RGB, colours[nodes].astype(np.uint8).T, strict=True)
+    write_table(folder / "voxels.ply", columns)
 
 
 def _nodes(occupancy: Occupancy, scene: Scene, engine: QueryEngine, cells: Array) -> Array:
