@@ -69,7 +69,7 @@ class Convert:
     them.
 
     A .ply (INRIA's) keeps everything, .spz is ten times smaller and rounded, .splat is without view
-    dependence. Checkpoints of LangSplat, LangSplatV2, Occam's LGS, Dr. Splat, OpenGaussian, Feature-3DGS and
+    dependence. Checkpoints of LangSplat, LangSplatV2, Occam's LGS, OpenGaussian, Feature-3DGS and
     3D Gaussian Splatting become such a scene (see docs/files.md for what to give), and a scene becomes
     checkpoints."""
 

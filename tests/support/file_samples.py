@@ -497,13 +497,3 @@ def autoencoder(
     for _ in range(20):
         network.encoder(torch.randn(64, dim))
     return network.eval()
-
-
-def faiss_index(centroids: Array, kind: bytes = b"IxPq", metric: int = 1, bits: int = 8) -> bytes:
-    """An IndexPQ as faiss writes it, with three vectors in it."""
-    parts, _, part_dim = centroids.shape
-    dim = parts * part_dim
-    out = kind + struct.pack("<iqqq?i", dim, 3, 1 << 20, 1 << 20, True, metric)
-    out += struct.pack("<f", 0.5) if metric > 1 else b""
-    out += struct.pack("<QQQQ", dim, parts, bits, centroids.size) + centroids.astype("<f4").tobytes()
-    return out + struct.pack("<Q", 3 * parts) + bytes(3 * parts) + struct.pack("<i?i", 0, False, 0)

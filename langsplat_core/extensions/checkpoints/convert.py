@@ -58,7 +58,7 @@ def _export_features(request: ExportRequest, progress: Progress) -> tuple[str, .
     return (f"{request.out}: masks and vectors of {count} photographs",)
 
 
-IMPORTER = Importer((".pth", ".pt", ".ckpt", ".npz", ".npy", ".faiss"), _import)
+IMPORTER = Importer((".pth", ".pt", ".ckpt", ".npz"), _import)
 LANGSPLAT = Exporter("a folder with LangSplat's three checkpoints and its autoencoder", _export_langsplat)
 OCCAM = Exporter("a folder with Occam's LGS's three checkpoints of whole vectors", _export_occam)
 FEATURES = Exporter(

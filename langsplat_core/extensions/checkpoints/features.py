@@ -6,7 +6,6 @@ smaller that stands for them; either way no (N, 512) array is made here.
 """
 
 import re
-import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,13 +23,11 @@ from langsplat_core.extensions.checkpoints.langsplat_files import (
     model_tuple,
 )
 from langsplat_core.extensions.checkpoints.unpickling import load_torch, plain_array, plain_mapping
-from langsplat_core.io.hostile import MAGIC as NPY
-from langsplat_core.io.hostile import open_for_reading, opened_archive, read_npy, read_npz
+from langsplat_core.io.hostile import open_for_reading, opened_archive, read_npz
 from langsplat_core.io.ply import read_ply_scene
 from langsplat_core.scene import LEVELS, AutoencoderCodec, Gaussians
 from langsplat_core.scene.gaussians import join_gaussians
 
-NO_CODE = 255  # in every place of a product code: no features
 TOPK = 4  # codewords of a Gaussian in LangSplatV2
 
 
@@ -96,24 +93,6 @@ def _largest_of_softmax(logits: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class ProductCodes:
-    """Dr. Splat: a byte for each of M parts of the vector names one of 256 centroids of that part."""
-
-    codes: Array  # (N, M) uint8; a row of NO_CODE has no features
-    centroids: Array  # (M, 256, D / M) float32
-
-    @property
-    def dim(self) -> int:
-        return int(self.centroids.shape[0] * self.centroids.shape[2])
-
-    def rows(self, indices: Array) -> Array:
-        codes = np.asarray(self.codes[indices])
-        parts = self.centroids[np.arange(codes.shape[1]), codes]
-        known = (codes != NO_CODE).any(1)
-        return np.where(known[:, None], parts.reshape(len(codes), self.dim), np.float32(0))
-
-
-@dataclass(frozen=True, eq=False)
 class Leaves:
     """OpenGaussian: a Gaussian belongs to one cluster, and the clusters have vectors."""
 
@@ -152,72 +131,14 @@ class Rearranged:
         return out
 
 
-# The centroids of a product quantiser, which Dr. Splat keeps beside its checkpoints.
-#
-# `pq_index.faiss` is an `IndexPQ` as faiss writes it, little endian, of which only the quantiser is of use:
-#
-#     bytes  4        "IxPq"
-#     int32, int64    D, vectors in the index
-#     int64 x 2, u8   not used; whether it is trained
-#     int32           metric; behind one above 1 a float32
-#     uint64 x 3      D, M parts, bits per part
-#     uint64          float32 numbers that follow: the centroids (M, 2^bits, D / M)
-#
-# The same centroids are also taken as a .npy file of that shape.
-
-MAGIC = b"IxPq"
-CENTROIDS = 256  # of a part: what a byte can name
-_INDEX = struct.Struct("<iqqq?i")
-_QUANTISER = struct.Struct("<QQQQ")
-
-
-def checked_centroids(array: Array, path: Path) -> Array:
-    """(M, 256, D / M) float32. Raises FormatError for another shape and numbers that are not finite."""
-    if array.ndim != 3 or array.shape[1] != CENTROIDS or array.dtype.kind != "f":
-        raise FormatError(
-            f"{path}: holds {array.dtype} {array.shape}; expected the (M, 256, D / M) centroids of Dr. Splat"
-        )
-    if not np.isfinite(array).all():
-        raise FormatError(f"{path}: the quantiser's centroids are not finite")
-    return np.ascontiguousarray(array, np.float32)
-
-
-def read_faiss(path: Path) -> Array:
-    """(M, 256, D / M) float32 centroids. Raises InputError and FormatError."""
-    file, size = open_for_reading(path)
-    with file:
-        kind = file.read(4)
-        if kind != MAGIC:
-            name = kind.decode("ascii", "replace")
-            raise FormatError(
-                f"{path}: a faiss index of the kind {name!r}, expected {MAGIC.decode()!r}; "
-                "give the centroids (M, 256, D / M) as a .npy file"
-            )
-        index = file.read(_INDEX.size)
-        if len(index) == _INDEX.size and _INDEX.unpack(index)[-1] > 1:
-            file.read(4)  # the metric's argument
-        head = file.read(_QUANTISER.size)
-        if len(head) < _QUANTISER.size:
-            raise FormatError(f"{path}: truncated: the index ends in its header")
-        dim, parts, bits, count = _QUANTISER.unpack(head)
-        if bits != 8 or not 0 < parts <= dim or dim % parts or count != dim * CENTROIDS:
-            raise FormatError(
-                f"{path}: a quantiser of {dim} numbers in {parts} parts of {bits} bits; expected 8 bits"
-            )
-        if size - file.tell() < 4 * count:
-            raise FormatError(f"{path}: truncated: {count} centroid numbers do not fit the file")
-        centroids = np.frombuffer(file.read(4 * count), "<f4").reshape(parts, CENTROIDS, dim // parts)
-    return checked_centroids(centroids, path)
-
-
 # One file of what people give to an import, recognised by what it holds, never by its name or length.
 #
 # A `Carrier` has Gaussians, features of one level, or both. What a method keeps beside its checkpoints, an
-# autoencoder, a quantiser or the vectors of clusters, is of no use alone.
+# autoencoder or the vectors of clusters, is of no use alone.
 
 PLAIN, UNNAMED = "3D Gaussian Splatting", "LangSplat or Occam's LGS"
 LANGSPLAT, OCCAM, V2 = "LangSplat", "Occam's LGS", "LangSplatV2"
-DR_SPLAT, FEATURE_3DGS, OPEN_GAUSSIAN = "Dr. Splat", "Feature-3DGS", "OpenGaussian"
+FEATURE_3DGS, OPEN_GAUSSIAN = "Feature-3DGS", "OpenGaussian"
 INSTANCE = 6  # numbers per Gaussian that OpenGaussian tells instances by, twice; they tell nothing alone
 PICKLE = b"\x80"  # how files of torch began before they were archives
 SEMANTIC = re.compile(r"semantic_\d+")
@@ -231,7 +152,6 @@ class Carrier:
     method: str
     gaussians: Gaussians
     features: Vectors | SparseCodes | None = None
-    codes: Array | None = None  # (N, M) uint8 of Dr. Splat: they need a quantiser
     extras: Mapping[str, Array] = field(default_factory=dict)  # of a PLY, as `Scene.extras`
     antialiased: bool = False
 
@@ -239,14 +159,6 @@ class Carrier:
     def has_features(self) -> bool:
         """Return whether the file carries more than Gaussians."""
         return self.method != PLAIN
-
-
-@dataclass(frozen=True, eq=False)
-class Centroids:
-    """The centroids of a product quantiser, as Dr. Splat keeps them beside its checkpoints."""
-
-    path: Path
-    values: Array  # (M, 256, D / M) float32
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,7 +177,7 @@ class Autoencoder:
     codec: AutoencoderCodec
 
 
-Part = Carrier | Centroids | Clusters | Autoencoder
+Part = Carrier | Clusters | Autoencoder
 
 
 def read_part(path: Path) -> Part:
@@ -276,14 +188,10 @@ def read_part(path: Path) -> Part:
         start = file.read(8)
     if start.startswith((b"ply\n", b"ply\r")):
         return _from_ply(path)
-    if start.startswith(NPY):
-        return Centroids(path, checked_centroids(read_npy(path), path))
-    if start.startswith((b"Ix", b"Iw")):  # as all kinds of faiss's indexes do
-        return Centroids(path, read_faiss(path))
     if start.startswith(b"PK") and _is_npz(path):
         return _clusters(read_npz(path), path)
     if not start.startswith((b"PK", PICKLE)):
-        raise FormatError(f"{path}: neither a PLY nor a file of torch, NumPy or faiss; name checkpoints")
+        raise FormatError(f"{path}: neither a PLY nor a file of torch or NumPy; name checkpoints")
     return _from_torch(load_torch(path), path)
 
 
@@ -305,7 +213,7 @@ def _from_ply(path: Path) -> Carrier:
     if set(ordered) != set(names):
         raise FormatError(f"{path}: {len(names)} properties semantic_*, not counted from 0 without gaps")
     vectors = np.stack([scene.extras[name].astype(np.float32) for name in ordered], axis=1)
-    return Carrier(path, FEATURE_3DGS, scene.gaussians, Vectors(vectors), None, rest, scene.antialiased)
+    return Carrier(path, FEATURE_3DGS, scene.gaussians, Vectors(vectors), rest, scene.antialiased)
 
 
 def _clusters(arrays: dict[str, Array], path: Path) -> Clusters:
@@ -332,8 +240,8 @@ def _from_torch(content: Any, path: Path) -> Part:
     elements = model_tuple(content)
     if elements is not None:
         gaussians = gaussians_of(elements, path)
-        method, features, codes = _language(elements, len(gaussians), path)
-        return Carrier(path, method, gaussians, features, codes)
+        method, features = _language(elements, len(gaussians), path)
+        return Carrier(path, method, gaussians, features)
     mapping = plain_mapping(content)
     named = {"": content} if mapping is None else mapping
     if is_autoencoder(named):
@@ -348,29 +256,23 @@ def _from_torch(content: Any, path: Path) -> Part:
     raise FormatError(f"{path}: a torch file, but not a checkpoint or autoencoder of a known method")
 
 
-def _language(
-    elements: tuple[Any, ...], count: int, path: Path
-) -> tuple[str, Vectors | SparseCodes | None, Array | None]:
-    """Method, features and codes of what follows the geometry."""
+def _language(elements: tuple[Any, ...], count: int, path: Path) -> tuple[str, Vectors | SparseCodes | None]:
+    """Return the method and the features of what follows the geometry."""
     first = plain_array(elements[GEOMETRY], path)
     second = plain_array(elements[GEOMETRY + 1], path) if len(elements) > GEOMETRY + 1 else None
     if first is None or first.ndim != 2:  # (N,) radii of plain 3D Gaussian Splatting
         late = [plain_array(element, path) for element in elements[GEOMETRY + 1 :]]
         wide = [flat for array in late if (flat := _wide(array, count)) is not None]
-        return (FEATURE_3DGS, Vectors(wide[0]), None) if wide else (PLAIN, None, None)
+        return (FEATURE_3DGS, Vectors(wide[0])) if wide else (PLAIN, None)
     if len(first) != count:
         raise FormatError(f"{path}: features {first.shape} for {count} Gaussians")
-    if first.dtype == np.uint8:
-        return DR_SPLAT, None, first
     if first.dtype.kind != "f":
-        raise FormatError(
-            f"{path}: features of the type {first.dtype}; expected floats, or bytes of a quantiser"
-        )
+        raise FormatError(f"{path}: features of the type {first.dtype}; expected floats")
     if second is not None and second.ndim == 3:
-        return V2, _sparse(first, second, path), None
+        return V2, _sparse(first, second, path)
     if second is not None and first.shape == second.shape == (count, INSTANCE):
-        return OPEN_GAUSSIAN, None, None
-    return UNNAMED, Vectors(first), None
+        return OPEN_GAUSSIAN, None
+    return UNNAMED, Vectors(first)
 
 
 def _wide(array: Array | None, count: int) -> Array | None:
@@ -393,8 +295,7 @@ def _sparse(logits: Array, codewords: Array, path: Path) -> SparseCodes:
 
 # Which of the three levels a checkpoint is of, and how its Gaussians go with those of the others.
 
-# `chkpnt30000_langfeat_2`, `scene_level_2`, the folders `teatime_2` and, of Dr. Splat, `teatime_2_pq_...`
-_NUMBER = re.compile(r"_(?:level_?)?([1-3])(?:_pq_.*)?$")
+_NUMBER = re.compile(r"_(?:level_?)?([1-3])$")  # `chkpnt30000_langfeat_2`, `scene_level_2`, `teatime_2/`
 LEAST_SHARED = 0.5  # of the Gaussians of a pruned checkpoint; with fewer in common it is another scene's
 
 
@@ -494,7 +395,7 @@ def _row_of(means: Array, theirs: Array) -> Array:
 
 
 def _keys(means: Array) -> Array:
-    """(N, 3) float32 -> (N, 4) uint32: the bits of a position, and the how manieth at that place it is."""
+    """(N, 3) float32 -> (N, 4) uint32: the bits of a position, and its rank among those at the same one."""
     bits = np.ascontiguousarray(means, np.float32).view(np.uint32).reshape(len(means), 3)
     order = np.lexsort(bits.T)
     first = np.ones(len(means), bool)

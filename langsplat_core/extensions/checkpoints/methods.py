@@ -14,7 +14,6 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.extensions.checkpoints.features import (
-    DR_SPLAT,
     FEATURE_3DGS,
     LANGSPLAT,
     OCCAM,
@@ -23,11 +22,9 @@ from langsplat_core.extensions.checkpoints.features import (
     UNNAMED,
     Autoencoder,
     Carrier,
-    Centroids,
     Clusters,
     Features,
     Part,
-    ProductCodes,
     Rearranged,
     all_gaussians,
     levels_of,
@@ -94,7 +91,6 @@ def read_foreign(paths: Sequence[Path], levels: Sequence[str] = ()) -> ForeignSc
     carriers = [part for part in parts if isinstance(part, Carrier)]
     plain = _only([carrier for carrier in carriers if not carrier.has_features], "scenes without features")
     clusters = _only([part for part in parts if isinstance(part, Clusters)], "files of clusters")
-    centroids = _only([part for part in parts if isinstance(part, Centroids)], "quantisers")
     autoencoder = _only([part for part in parts if isinstance(part, Autoencoder)], "autoencoders")
     featured = [_named(carrier, autoencoder) for carrier in carriers if carrier.has_features]
     methods = {carrier.method for carrier in featured}
@@ -105,7 +101,7 @@ def read_foreign(paths: Sequence[Path], levels: Sequence[str] = ()) -> ForeignSc
         return _of_clusters(_only([*featured, *([plain] if plain else [])], "scenes"), clusters)
     if not featured:
         return _without_language(plain, [part for part in parts if part is not plain])
-    return _of_levels(plain, featured, levels, centroids, autoencoder)
+    return _of_levels(plain, featured, levels, autoencoder)
 
 
 def _only(found: list[P], what: str) -> P | None:
@@ -163,7 +159,6 @@ def _of_levels(
     plain: Carrier | None,
     featured: list[Carrier],
     asked: Sequence[str],
-    centroids: Centroids | None,
     autoencoder: Autoencoder | None,
 ) -> ForeignScene:
     method = featured[0].method
@@ -179,7 +174,8 @@ def _of_levels(
     paths: list[Path | None] = [None] * len(LEVELS)
     pruned = 0
     for number, carrier in zip(numbers, featured, strict=True):
-        features = _features(carrier, centroids)
+        features = carrier.features
+        assert features is not None
         rows = partners(base.gaussians.means, carrier, method in PRUNED)
         pruned += rows is not None
         levels[number] = features if rows is None else Rearranged(features, rows)
@@ -209,23 +205,6 @@ def _geometry(plain: Carrier | None, featured: list[Carrier]) -> Carrier:
     if carriers[0].method not in PRUNED:
         return carriers[0]
     return replace(carriers[0], gaussians=all_gaussians(carriers))
-
-
-def _features(carrier: Carrier, centroids: Centroids | None) -> Features:
-    if carrier.codes is None:
-        assert carrier.features is not None  # a carrier with features has one or the other
-        return carrier.features
-    if centroids is None:
-        raise InputError(
-            f"{carrier.path}: quantised codes of {DR_SPLAT}; name its pq_index.faiss too, "
-            "or the centroids as .npy"
-        )
-    if carrier.codes.shape[1] != len(centroids.values):
-        raise FormatError(
-            f"{carrier.path}: {carrier.codes.shape[1]} codes per Gaussian, {centroids.path} has "
-            f"{len(centroids.values)} parts; give the quantiser of this scene"
-        )
-    return ProductCodes(carrier.codes, centroids.values)
 
 
 def _notes(numbers: list[int], featured: list[Carrier], how: str, pruned: int) -> tuple[str, ...]:

@@ -7,9 +7,7 @@ file holds OpenAI's `input_resolution` too or has "quickgelu" or "openai" in its
 Of SAM 2, whose windows and heads no shape tells, the published sizes are known.
 """
 
-import io
 import json
-import pickletools
 import re
 import zipfile
 from collections.abc import Mapping
@@ -21,7 +19,6 @@ from typing import Any
 from langsplat_core.errors import EncoderError
 from langsplat_core.semantics.weights import (
     OPEN_CLIP_CONFIG,
-    UNREADABLE,
     Converted,
     loading_errors,
     unpickled,
@@ -154,17 +151,13 @@ def _read(id: str, file: Path) -> Tensors:
 
     if file.suffix == ".safetensors":
         return load_file(file)
-    names = zipfile.ZipFile(file).namelist() if zipfile.is_zipfile(file) else []
-    if any(name.endswith("/constants.pkl") for name in names):
-        try:
-            found: Any = _script_tensors(file)
-        except UNREADABLE as error:
-            raise EncoderError(
-                f"{id}: a TorchScript archive that is damaged or whose code would have to be run; pass the "
-                "same weights in another layout, such as the hub id openai/clip-vit-base-patch16"
-            ) from error
-    else:
-        found = unpickled(file)
+    parts = zipfile.ZipFile(file).namelist() if zipfile.is_zipfile(file) else []
+    if any(name.endswith("/constants.pkl") for name in parts):
+        raise EncoderError(
+            f"{id}: a TorchScript archive, whose code would have to be run; pass the same weights in another "
+            "layout, such as the hub id openai/clip-vit-base-patch16"
+        )
+    found: Any = unpickled(file)
     found = found.get("state_dict", found.get("model", found)) if isinstance(found, dict) else {}
     if not isinstance(found, dict):
         raise ValueError("it holds no named tensors")
@@ -172,46 +165,6 @@ def _read(id: str, file: Path) -> Tensors:
     if any(tensor.nbytes > file.stat().st_size for tensor in tensors.values()):
         raise ValueError("a tensor claims more numbers than the file holds")
     return {str(name).removeprefix("module.").removeprefix("text."): tensors[name] for name in tensors}
-
-
-class _Module:
-    """Stand-in for every class of a TorchScript archive: its attributes, and none of its code."""
-
-    parts: Mapping[Any, Any] = MappingProxyType({})
-
-    def __setstate__(self, state: Any) -> None:
-        self.parts = state if isinstance(state, dict) else {}
-
-
-def _script_tensors(file: Path) -> dict[str, Any]:
-    """Tensors of a TorchScript archive, as OpenAI publishes CLIP, by their modules' names. torch reads such
-    an archive only by running it, so what holds the tensors is put into one of its own."""
-    import torch
-
-    copy = io.BytesIO()
-    with zipfile.ZipFile(file) as archive, zipfile.ZipFile(copy, "w") as plain:
-        for entry in archive.infolist():
-            _, _, name = entry.filename.partition("/")
-            if name in ("data.pkl", "version", "byteorder") or name.startswith("data/"):
-                if entry.compress_type != zipfile.ZIP_STORED:
-                    raise ValueError("torch compresses nothing")
-                plain.writestr(f"archive/{name}", archive.read(entry))
-        pickled = plain.read("archive/data.pkl")
-    named = (str(argument) for code, argument, _ in pickletools.genops(pickled) if code.name == "GLOBAL")
-    classes = {name.replace(" ", ".", 1) for name in named if name.startswith("__torch__.")}
-    copy.seek(0)
-    with torch.serialization.safe_globals([(_Module, name) for name in sorted(classes)]):
-        waiting = [("", torch.load(copy, map_location="cpu", weights_only=True))]
-    found: dict[str, Any] = {}
-    seen: set[int] = set()  # a part may hold itself
-    while waiting:
-        prefix, module = waiting.pop()
-        if isinstance(module, _Module) and id(module) not in seen:
-            seen.add(id(module))
-            waiting += [(f"{prefix}{name}.", part) for name, part in module.parts.items()]
-        elif isinstance(module, torch.Tensor):
-            found[prefix[:-1]] = module
-    return found
 
 
 def _clip(file: Path, tensors: Tensors) -> Converted:

@@ -19,7 +19,7 @@ from langsplat_core.extensions.checkpoints.methods import ForeignScene, read_for
 from langsplat_core.io.ply import write_ply
 from langsplat_core.scene import Gaussians
 from tests.support.comparing import assert_same
-from tests.support.file_samples import autoencoder, faiss_index, geometry, save_model, tensor, training_state
+from tests.support.file_samples import autoencoder, geometry, save_model, tensor, training_state
 from tests.support.scenes import random_gaussians
 
 N, D = 20, 24
@@ -27,7 +27,6 @@ G = random_gaussians(N, sh_degree=3)
 rng = np.random.default_rng(3)
 VECTORS = rng.normal(size=(3, N, D)).astype(np.float32)
 LATENTS = unit(rng.normal(size=(3, N, 3))).astype(np.float32)
-CENTROIDS = rng.normal(size=(4, 256, D // 4)).astype(np.float32)
 ALL = np.arange(N)
 
 
@@ -168,22 +167,6 @@ def test_gaussians_at_one_place_are_kept_apart(tmp_path):
     got = read_foreign([path, less])
     assert len(got.scene.gaussians) == N
     assert_rows(got, 1, np.concatenate([VECTORS[1][:15], np.zeros((5, D))]))
-
-
-def test_dr_splat(tmp_path):
-    codes = rng.integers(0, 256, (N, 4)).astype(np.uint8)
-    codes[3] = 255
-    want = np.stack([CENTROIDS[part, codes[:, part]] for part in range(4)], 1).reshape(N, D)
-    want[3] = 0
-    path = save_model(tmp_path / "figurines_1_pq_openclip" / "chkpnt0.pth", G, tensor(codes))
-    for metric in (0, 1, 4):
-        (tmp_path / "pq_index.faiss").write_bytes(faiss_index(CENTROIDS, metric=metric))
-        assert_rows(read_foreign([path, tmp_path / "pq_index.faiss"]), 0, want)
-    np.save(tmp_path / "a.npy", CENTROIDS)
-    assert_rows(read_foreign([tmp_path / "a.npy", path]), 0, want)
-    refused([path], r"name its pq_index\.faiss")
-    np.save(tmp_path / "a.npy", CENTROIDS[:3])
-    refused([path, tmp_path / "a.npy"], r"4 codes per Gaussian, .* 3 parts")
 
 
 def leaves(path: Path, index: Array, count: int = 6) -> Array:
@@ -356,20 +339,11 @@ def test_damaged_autoencoders(tmp_path):
         refused([tmp_path / "ae.pth", checkpoint], message)
 
 
-def test_damaged_quantisers(tmp_path):
-    path, checkpoint = tmp_path / "pq", save_model(tmp_path / "c.pth", G, tensor(np.zeros((N, 4), np.uint8)))
-    good = faiss_index(CENTROIDS)
-    for content, message in (
-        (faiss_index(CENTROIDS, b"IwPQ"), "of the kind 'IwPQ'"),
-        (faiss_index(CENTROIDS, bits=4), "parts of 4 bits"),
-        (good[:2000], "truncated: 6144 centroid numbers"),
-        (good[:40], "ends in its header"),
-        (faiss_index(CENTROIDS * np.nan), "not finite"),
-        (b"something else", "neither a PLY nor a file of torch"),
-        (b"", "neither a PLY nor a file of torch"),
-    ):
+def test_files_of_no_method_are_refused(tmp_path):
+    path, checkpoint = tmp_path / "x", save_model(tmp_path / "c.pth", G, tensor(VECTORS[0]))
+    for content in (b"something else", b""):
         path.write_bytes(content)
-        refused([path, checkpoint], message)
+        refused([path, checkpoint], "neither a PLY nor a file of torch")
     np.savez(tmp_path / "x.npz", a=np.zeros((3, 4)))
     refused([tmp_path / "x.npz", checkpoint], r"holds arrays \(3, 4\)")
 
