@@ -212,7 +212,7 @@ class RadianceConfig:
     """3D Gaussian Splatting training (Kerbl et al. 2023); defaults are those of the INRIA code.
 
     Step counts below are for `reference_steps`; a smaller `steps` scales every schedule with it and lets
-    geometry learn faster (see `training.radiance.schedule`).
+    geometry learn faster (see `training.radiance.trainer`).
     """
 
     steps: Count = 30_000  # of training

@@ -1,8 +1,8 @@
 """Masks that all photographs agree on, in place of those that each photograph was given.
 
 A segmenter without weights divides every photograph by itself, each one differently. Their consensus is a
-tree of things on the Gaussians (`training.language.tree`); three cuts of it, drawn into each photograph, are
-masks that fit from all sides, and these are shown to the encoder.
+tree of things on the Gaussians (`training.language.merge_tree`); three cuts of it, drawn into each
+photograph, are masks that fit from all sides, and these are shown to the encoder.
 """
 
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ from langsplat_core.semantics.store import (
     fingerprint,
     within,
 )
-from langsplat_core.training.language.tree import MergeTree, draw_patches, find_tree, nested_maps
+from langsplat_core.training.language.merge_tree import MergeTree, draw_patches, find_tree, nested_maps
 
 CUTS = (0.15, 0.4, 0.8)  # costs up to which subparts, parts and wholes grow; chosen in rooms 201 and 203
 LEAST = 2.5e-4  # of the image: smaller regions show the encoder nothing

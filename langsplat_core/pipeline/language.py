@@ -62,12 +62,12 @@ from langsplat_core.training.language.lift import (
 from langsplat_core.training.language.mask_weights import (
     MaskGroups,
     MaskWeights,
-    find_things,
+    find_instances,
     group_masks,
     view_pairs,
 )
+from langsplat_core.training.language.merge_tree import count_votes
 from langsplat_core.training.language.palette import contrasting_colours
-from langsplat_core.training.language.tree import count_votes
 
 Views = Sequence[tuple[Camera, ImageFeatures]]  # read when needed: they may be more than memory holds
 Latents = tuple[Array, Array]  # (3, N, d) of the codec's type, (3, N) float32
@@ -187,7 +187,7 @@ class _Stages:
         def make() -> Tree:
             self._progress("building the tree", 0.5)
             counts, mask_weights = [len(vectors) for vectors in self._vectors], self._mask_weights()[0]
-            things = np.stack([find_things(mask_weights, counts, level) for level in range(len(LEVELS))])
+            things = np.stack([find_instances(mask_weights, counts, level) for level in range(len(LEVELS))])
             tree = build_tree(surface(), field.codec, field.latents, field.known, things)
             return replace(tree, votes=count_votes(tree, mask_weights, counts))
 

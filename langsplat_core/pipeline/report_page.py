@@ -20,7 +20,7 @@ from langsplat_core.pipeline.report import PAGE, TrainReport, camera_groups, sai
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_core.scene.transform import C0
-from langsplat_core.training.radiance.train import evaluate_views
+from langsplat_core.training.radiance.scores import evaluate_views
 
 MOST_VIEWS = 48  # on the page, held-out ones first
 SIDE = 400  # px, longer side of an image

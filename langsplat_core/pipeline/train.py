@@ -53,7 +53,7 @@ from langsplat_core.training.radiance.rehearsal import (
     supported,
     train_within,
 )
-from langsplat_core.training.radiance.train import evaluate_views
+from langsplat_core.training.radiance.scores import evaluate_views
 
 FEWEST_VIEWS = 3
 RADIANCE_VERSION = 7  # of what training and rehearsal make

@@ -34,7 +34,7 @@ from langsplat_core.training.radiance.rehearsal import (
     supported,
     train_within,
 )
-from langsplat_core.training.radiance.train import evaluate_views
+from langsplat_core.training.radiance.scores import evaluate_views
 from tests.benchmarks.captures import Kind, draw_capture
 
 LARGE = 800  # px, of a window beside them: with dilation as at the photographs' size, and growing

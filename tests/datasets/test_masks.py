@@ -16,7 +16,8 @@ from langsplat_core.datasets.intrinsics import PhotoIntrinsics
 from langsplat_core.errors import InputError
 from langsplat_core.progress import silent
 from langsplat_core.scene import look_at
-from langsplat_core.training.radiance.train import evaluate_views, train_radiance
+from langsplat_core.training.radiance.scores import evaluate_views
+from langsplat_core.training.radiance.trainer import train_radiance
 from tests.support.photographs import poses, write_photos
 
 LENS = PhotoIntrinsics(120, 90, 110.0, 110.0, 60.0, 45.0)

@@ -32,7 +32,7 @@ from langsplat_core.progress import Cancelled, Progress, Report
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.semantics import store
 from langsplat_core.semantics.masks import LevelMasks, MaskSource
-from langsplat_core.training.language.mask_weights import find_things
+from langsplat_core.training.language.mask_weights import find_instances
 from tests.support.commands import run
 from tests.support.comparing import assert_same_tree
 from tests.support.fakes import blob_scene
@@ -123,7 +123,7 @@ def test_the_same_command_again_changes_nothing_and_repeats_no_stage(room, tmp_p
         (language, "lift_sample"),
         (language, "lift_block"),
         (language, "fit_codec"),
-        (language, "find_things"),
+        (language, "find_instances"),
         (store, "embed_regions"),
     ):
         monkeypatch.setattr(module, name, forbidden)
@@ -139,7 +139,7 @@ def test_the_same_command_again_changes_nothing_and_repeats_no_stage(room, tmp_p
     np.testing.assert_array_equal(tree.leaves, np.load(path)["leaves"])
     assert (tree.votes[tree.levels == 2] > 0).any()
     path.unlink()  # as in a work folder of before there were any: they alone are found again
-    monkeypatch.setattr(language, "find_things", find_things)
+    monkeypatch.setattr(language, "find_instances", find_instances)
     train_scene(room, out, tiny_settings(room))
     now = kept_results(tmp_path / "scene.work")
     assert {name for name in now if now[name] != kept.get(name)} == {str(path)}

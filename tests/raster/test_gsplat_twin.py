@@ -18,8 +18,9 @@ from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera
 from langsplat_core.training.language.mask_weights import find_mask_weights
 from langsplat_core.training.radiance.differentiable import CpuRenderer, CudaRenderer, DifferentiableRenderer
+from langsplat_core.training.radiance.scores import evaluate_views
 from langsplat_core.training.radiance.state import PARAMETERS, start
-from langsplat_core.training.radiance.train import evaluate_views, train_radiance
+from langsplat_core.training.radiance.trainer import train_radiance
 from tests.support import torch_raster as twin
 from tests.support.scenes import make_views, random_camera, random_gaussians, without_perspective
 

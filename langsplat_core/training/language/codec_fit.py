@@ -19,7 +19,7 @@ from langsplat_core.scene.codec import KINDS, principal_colours
 from langsplat_core.semantics.encoder import PhraseEncoder
 from langsplat_core.semantics.relevancy import Scale, relevancy_of
 from langsplat_core.semantics.vocabulary import everyday_phrases, everyday_vectors
-from langsplat_core.training.language.mask_weights import nearest_centres, spherical_kmeans
+from langsplat_core.training.language.kmeans import nearest_centres, spherical_kmeans
 
 CHUNK = 4_096  # vectors judged at a time
 

@@ -5,7 +5,6 @@ with sigma 1.5; outside the image it sees zeros, as in the INRIA code.
 """
 
 import math
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -246,38 +245,6 @@ def ssim(picture: Tensor, target: Tensor) -> Tensor:
     """
     result: Tensor = _MeanSsim.apply(picture, target)
     return result
-
-
-# Exposure and white balance of a photograph, as an affine change of the scene's colours.
-
-RIDGE = 0.1  # of the mean square of colours: what holds an exposure at none
-
-LEAST_RIDGE = 1e-9  # of the mean square: what is black tells nothing
-
-
-def fit_exposure(pairs: Iterable[tuple[Tensor, Tensor]], ridge: float = RIDGE) -> Tensor:
-    """Return the (4, 3) affine change of colours, (r, g, b, 1) @ change, that takes images to their targets
-    with the least squared error. `ridge`, a share of the mean square of colours, holds it at no change.
-
-    pairs: (..., 3) images and targets, at least one.
-    """
-    moments, wanted, count = None, None, 0
-    for image, target in pairs:
-        padded = torch.nn.functional.pad(image.detach().reshape(-1, 3).double(), (0, 1), value=1.0)
-        goal = target.detach().reshape(-1, 3).double()
-        moments = padded.T @ padded + (0 if moments is None else moments)
-        wanted = padded.T @ goal + (0 if wanted is None else wanted)
-        count += len(padded)
-    assert moments is not None
-    assert wanted is not None
-    hold = max(ridge * float(moments.diagonal()[:3].mean()), LEAST_RIDGE * max(count, 1))
-    none = torch.eye(4, dtype=torch.float64, device=moments.device)
-    return torch.linalg.solve(moments + hold * none, wanted + hold * none[:, :3]).float()
-
-
-def with_exposure(image: Tensor, change: Tensor) -> Tensor:
-    """The (..., 3) image under the (4, 3) affine change of its colours."""
-    return image @ change[:3] + change[3]
 
 
 def radiance_loss(picture: Tensor, target: Tensor, lambda_dssim: float) -> Tensor:

@@ -18,8 +18,9 @@ from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.holdout import chosen
 from langsplat_core.progress import Progress, Report, silent
 from langsplat_core.scene import Camera, Gaussians
-from langsplat_core.training.radiance.train import STAGE as STEPS
-from langsplat_core.training.radiance.train import evaluate_views, train_radiance
+from langsplat_core.training.radiance.scores import evaluate_views
+from langsplat_core.training.radiance.trainer import STAGE as STEPS
+from langsplat_core.training.radiance.trainer import train_radiance
 
 log = logging.getLogger("langsplat")
 

@@ -23,7 +23,8 @@ from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians
 from langsplat_core.scene.transform import C0
-from langsplat_core.training.radiance.transients import Watched, nothing_watched
+from langsplat_core.training.radiance.exposure import no_exposures
+from langsplat_core.training.radiance.transients import Transients, no_transients
 
 INITIAL_OPACITY = 0.1
 NEIGHBOURS = 3
@@ -117,7 +118,7 @@ class TrainingState:
     seen: Tensor  # (N,) float32: in how many steps since the last round the Gaussian was visible
     rng: np.random.Generator
     exposures: Tensor  # (V, 4, 3) affine changes of colours, of the training views
-    watched: Watched  # of the training views; of none where nothing may move
+    transients: Transients  # of the training views; of none where nothing may move
     step: int = 0  # steps done
     queue: list[int] = field(default_factory=list)  # views still to come in this pass over the photographs
     non_finite: int = 0  # gradient entries that were not finite and were taken as zero
@@ -157,13 +158,8 @@ def start(gaussians: Gaussians, seed: int, device: torch.device) -> TrainingStat
         seen=torch.zeros(count, device=device),
         rng=np.random.default_rng(seed),
         exposures=no_exposures(0, device),
-        watched=nothing_watched(0),
+        transients=no_transients(0),
     )
-
-
-def no_exposures(views: int, device: torch.device) -> Tensor:
-    """(views, 4, 3) affine changes of colours, (r, g, b, 1) @ change, that change nothing."""
-    return torch.eye(4, 3, device=device).repeat(views, 1, 1)
 
 
 def rearrange(state: TrainingState, keep: Tensor, added: dict[str, Tensor] | None = None) -> None:
@@ -181,12 +177,6 @@ def rearrange(state: TrainingState, keep: Tensor, added: dict[str, Tensor] | Non
     state.seen = torch.zeros(len(state), device=state.device)
 
 
-def remove(state: TrainingState, rows: Array) -> None:
-    """Remove the Gaussians where the (N,) bool `rows` are True, unless hardly any would be left."""
-    if len(state) - np.count_nonzero(rows) >= FEWEST_GAUSSIANS:
-        rearrange(state, torch.from_numpy(np.flatnonzero(~rows)).to(state.device))
-
-
 def clean_gradients(state: TrainingState) -> None:
     """Zero and count gradient entries that are NaN or infinite: one bad pixel must not end a training."""
     for value in state.values.values():
@@ -195,14 +185,6 @@ def clean_gradients(state: TrainingState) -> None:
         bad = ~torch.isfinite(value.grad)
         state.non_finite += int(bad.sum())
         value.grad[bad] = 0
-
-
-def add_opacity_decay(state: TrainingState, strength: float) -> None:
-    """Add the gradient of `strength` times the mean opacity, as Kheradmand et al. 2024."""
-    logits = state.values["opacity_logits"]
-    raw = logits.detach()
-    slope = torch.sigmoid(raw) * torch.sigmoid(-raw) * (strength / max(len(state), 1))
-    logits.grad = slope if logits.grad is None else logits.grad + slope
 
 
 def adam_step(state: TrainingState, learning_rates: dict[str, float]) -> None:
@@ -259,7 +241,7 @@ def fingerprint(capture: Capture, config: RadianceConfig, train_indices: Sequenc
 def save_checkpoint(path: Path, state: TrainingState, made_from: str) -> None:
     """Write `state`; `made_from` is the run's `fingerprint`."""
     tensors = {"grad_sum": state.grad_sum, "seen": state.seen, "exposures": state.exposures}
-    tensors |= {f"watched.{name}": torch.from_numpy(array) for name, array in vars(state.watched).items()}
+    tensors |= {f"watched.{name}": torch.from_numpy(array) for name, array in vars(state.transients).items()}
     for name in PARAMETERS:
         tensors[f"values.{name}"] = state.values[name].detach()
         tensors[f"first.{name}"] = state.first[name]
@@ -316,114 +298,10 @@ def _rebuild(tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> Traini
         seen=tensors["seen"],
         rng=rng,
         exposures=tensors["exposures"],
-        watched=Watched(*(tensors[f"watched.{part.name}"].cpu().numpy() for part in fields(Watched))),
+        transients=Transients(
+            *(tensors[f"watched.{part.name}"].cpu().numpy() for part in fields(Transients))
+        ),
         step=int(header["step"]),
         queue=[int(index) for index in header["queue"]],
         non_finite=int(header["non_finite"]),
     )
-
-
-# Adaptive density control: where Gaussians are added and removed (Kerbl et al. 2023, section 5.2).
-#
-# The statistic is INRIA's: the norm of the loss gradient by the projected mean, in normalised device
-# coordinates (the gradient per pixel times half the image's width and height), averaged over the steps
-# in which the Gaussian was visible.
-
-SPLIT_SHRINK = 1.6  # children of a split are smaller by this factor
-SPLIT_CHILDREN = 2
-RESET_OPACITY = 0.01
-LARGE_SCALE = 0.1  # of the extent: Gaussians above are removed once the schedule says so
-FEWEST_GAUSSIANS = 64  # pruning never leaves fewer; the most opaque ones stay
-
-
-@dataclass(frozen=True)
-class DensifyReport:
-    """Result of one round, in Gaussians."""
-
-    cloned: int
-    split: int  # parents, each replaced by two children
-    pruned: int
-
-
-def accumulate(state: TrainingState, means_px_grad: Tensor, visible: Tensor, size: tuple[int, int]) -> None:
-    """Add one step to the statistic.
-
-    `means_px_grad` (N, 2) is the loss gradient per pixel of mean position, `visible` (N,) bool, `size`
-    the rendered (width, height).
-    """
-    to_ndc = means_px_grad.new_tensor([0.5 * size[0], 0.5 * size[1]])
-    x, y = (torch.nan_to_num(means_px_grad, 0.0, 0.0, 0.0) * to_ndc).unbind(1)
-    state.grad_sum += torch.hypot(x, y) * visible
-    state.seen += visible
-
-
-def densify(state: TrainingState, config: RadianceConfig, extent: float, prune_large: bool) -> DensifyReport:
-    """One round: clone small and split large Gaussians with large gradients, remove faint ones.
-
-    `extent` is the cameras' extent in world units. When the cap of `config.max_gaussians` is near, the
-    largest gradients go first.
-    """
-    values = {name: value.detach() for name, value in state.values.items()}
-    largest_scale = values["log_scales"].amax(1).exp()
-    too_large = largest_scale > LARGE_SCALE * extent if prune_large else torch.zeros_like(largest_scale) > 0
-    remove = torch.sigmoid(values["opacity_logits"]) < config.prune_opacity
-    gradient = torch.where(remove, -1.0, state.grad_sum / state.seen.clamp(min=1))
-    room = config.max_gaussians - int((~remove).sum())
-    grows = _above(gradient, config.densify_grad, room)
-    splits = grows & (largest_scale > config.percent_dense * extent)
-    clones = grows & ~splits
-
-    children = _children(values, splits, state)
-    if prune_large:
-        small_enough = children["log_scales"].amax(1).exp() <= LARGE_SCALE * extent
-        children = {name: child[small_enough] for name, child in children.items()}
-    added = {name: torch.cat([values[name][clones & ~too_large], children[name]]) for name in PARAMETERS}
-    remove |= too_large & ~splits
-    keep = _keep_some(~(remove | splits), values["opacity_logits"], len(added["means"]))
-    report = DensifyReport(int(clones.sum()), int(splits.sum()), int(remove.sum()))
-    rearrange(state, keep.nonzero()[:, 0], added)
-    return report
-
-
-def reset_opacities(state: TrainingState) -> None:
-    """Cap every opacity at 0.01 and forget its moments, so that floaters can be told from surfaces."""
-    value = state.values["opacity_logits"].detach()
-    cap = torch.logit(value.new_tensor(RESET_OPACITY))
-    state.values["opacity_logits"] = torch.minimum(value, cap).requires_grad_()
-    state.first["opacity_logits"].zero_()
-    state.second["opacity_logits"].zero_()
-
-
-def _above(gradient: Tensor, threshold: float, room: int) -> Tensor:
-    """(N,) True for the at most `room` rows with the largest gradient >= threshold."""
-    chosen = gradient >= threshold
-    if int(chosen.sum()) <= room:
-        return chosen
-    order = torch.argsort(gradient, descending=True, stable=True)[: max(room, 0)]
-    return torch.zeros_like(chosen).index_fill_(0, order, True)
-
-
-def _children(values: dict[str, Tensor], splits: Tensor, state: TrainingState) -> dict[str, Tensor]:
-    """Two children per split Gaussian: means drawn from the parent itself, scales divided by 1.6."""
-    parents = {name: value[splits].repeat_interleave(SPLIT_CHILDREN, dim=0) for name, value in values.items()}
-    draws = state.rng.standard_normal((len(parents["means"]), 3), dtype="float32")
-    offsets = torch.from_numpy(draws).to(state.device) * parents["log_scales"].exp()
-    parents["means"] = parents["means"] + _rotate(parents["quats_wxyz"], offsets)
-    parents["log_scales"] = parents["log_scales"] - torch.log(offsets.new_tensor(SPLIT_SHRINK))
-    return parents
-
-
-def _rotate(quats_wxyz: Tensor, vectors: Tensor) -> Tensor:
-    """(N, 4) quaternions of any length turn (N, 3) vectors: v + 2 w (q x v) + 2 q x (q x v)."""
-    unit = torch.nn.functional.normalize(quats_wxyz, dim=1)
-    w, q = unit[:, :1], unit[:, 1:]
-    cross = torch.linalg.cross(q, vectors)
-    return vectors + 2 * (w * cross + torch.linalg.cross(q, cross))
-
-
-def _keep_some(keep: Tensor, opacity_logits: Tensor, added: int) -> Tensor:
-    """`keep`, widened to the most opaque rows when hardly any Gaussian would be left."""
-    if int(keep.sum()) + added >= FEWEST_GAUSSIANS:
-        return keep
-    best = torch.argsort(opacity_logits, descending=True, stable=True)[:FEWEST_GAUSSIANS]
-    return keep.clone().index_fill_(0, best, True)

@@ -24,7 +24,7 @@ from langsplat_core.scene.tree import tree_of_wholes
 from langsplat_core.semantics.relevancy import Scale
 from langsplat_core.training.language import codec_fit
 from langsplat_core.training.language.codec_fit import codec_report, fit_codebook, fit_codec, rounded
-from langsplat_core.training.language.mask_weights import nearest_centres, spherical_kmeans
+from langsplat_core.training.language.kmeans import nearest_centres, spherical_kmeans
 from langsplat_core.training.language.palette import contrasting_colours
 from tests.support.file_samples import random_field
 from tests.support.scenes import unturned_gaussians

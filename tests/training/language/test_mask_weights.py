@@ -113,7 +113,7 @@ def counts_of(views: Sequence[Array]) -> list[int]:
 
 
 def found(views: Sequence[Array], count: int) -> Array:
-    return module.find_things(MaskWeights(list(views), count), counts_of(views))
+    return module.find_instances(MaskWeights(list(views), count), counts_of(views))
 
 
 def random_views(seed: int, count: int = 240, views: int = 8) -> list[Array]:
@@ -169,7 +169,7 @@ def plain_masks_of_things(views: Sequence[Array], level: int) -> list[int]:
 @pytest.mark.parametrize("seed", range(4))
 def test_masks_go_together_by_the_plain_rule(seed, level):
     views = random_views(seed)
-    got = module.masks_of_things(MaskWeights(views, 240), counts_of(views), level)
+    got = module.instances_of_masks(MaskWeights(views, 240), counts_of(views), level)
     want = np.array(plain_masks_of_things(views, level))
     assert ((got == -1) == (want == -1)).all()
     pairs = len({*zip(got.tolist(), want.tolist(), strict=True)})
@@ -248,16 +248,16 @@ def test_masks_of_other_levels_show_no_thing():
     rows = np.arange(20)
     views = [joined(view(np.where(rows < 10, 0, UNSEEN)), view(np.full(20, 1), level=1))] * 2
     for level, want in ((WHOLE, [0, -1, 0, -1]), (1, [-1, 0, -1, 0]), (0, [-1] * 4)):
-        assert module.masks_of_things(MaskWeights(views, 20), [2, 2], level).tolist() == want
+        assert module.instances_of_masks(MaskWeights(views, 20), [2, 2], level).tolist() == want
     assert found(views, 20).tolist() == [0] * 10 + [NO_NODE] * 10
-    hidden = module.find_things(MaskWeights([np.zeros(0, PAIR)], 5), [3])  # masks behind everything
+    hidden = module.find_instances(MaskWeights([np.zeros(0, PAIR)], 5), [3])  # masks behind everything
     assert hidden.tolist() == [NO_NODE] * 5
 
 
 def test_a_gaussian_that_two_masks_share_evenly_is_claimed_by_neither():
     even = joined(view([0, 0, 0]), view([1, UNSEEN, UNSEEN]))
     assert plain_masks_of_things([even], WHOLE) == [0, -1]
-    assert module.masks_of_things(MaskWeights([even], 3), [2], WHOLE).tolist() == [0, -1]
+    assert module.instances_of_masks(MaskWeights([even], 3), [2], WHOLE).tolist() == [0, -1]
     assert found([even], 3).tolist() == [0, 0, 0]
 
 

@@ -3,7 +3,6 @@
 import math
 import os
 import signal
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -22,34 +21,30 @@ from langsplat_core.progress import Cancelled, Progress, Report
 from langsplat_core.raster.reference import ReferenceRasterizer, colours
 from langsplat_core.scene import Camera, Gaussians, look_at
 from langsplat_core.scene.transform import C0
+from langsplat_core.training.radiance.density import accumulate, add_opacity_decay, densify, reset_opacities
 from langsplat_core.training.radiance.differentiable import CpuRenderer, renderer_for
+from langsplat_core.training.radiance.exposure import fit_exposure, with_exposure
 from langsplat_core.training.radiance.losses import (
     blur,
-    fit_exposure,
     radiance_loss,
     raw_moments,
     ssim,
     ssim_terms,
-    with_exposure,
 )
+from langsplat_core.training.radiance.scores import evaluate_views
 from langsplat_core.training.radiance.state import (
     PARAMETERS,
     TrainingState,
-    accumulate,
     adam_step,
-    add_opacity_decay,
     clean_gradients,
-    densify,
     fingerprint,
     initial_gaussians,
     load_checkpoint,
-    reset_opacities,
     save_checkpoint,
     start,
 )
 from langsplat_core.training.radiance.stereo import STAGE
-from langsplat_core.training.radiance.train import (
-    evaluate_views,
+from langsplat_core.training.radiance.trainer import (
     for_few_views,
     schedule_for,
     train_radiance,
@@ -531,24 +526,6 @@ def test_training_learns_the_scene() -> None:
     assert all(0 < score.covered <= 1 for score in [*before, *after])
     assert trained.valid().all()
     assert trained.opacity_logits.min() > -5.6  # none below alpha 1/255
-
-
-def reported(times: int, monkeypatch: pytest.MonkeyPatch) -> list[Mapping[str, float]]:
-    """The metrics of six steps whose mean loss is reported so many times."""
-    monkeypatch.setattr("langsplat_core.training.radiance.train.LOSSES_SAID", times)
-    reports: list[Report] = []
-    config = replace(SHORT, steps=6, reference_steps=6)
-    train_radiance(capture(), config, [0, 1], progress=Progress(reports.append))
-    return [report.metrics for report in reports if report.stage != STAGE]
-
-
-@pytest.mark.long
-def test_the_mean_loss_since_the_last_one_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    losses = [metrics["loss"] for metrics in reported(6, monkeypatch)]
-    first, *others = reported(3, monkeypatch)
-    means = np.reshape(losses, (3, 2)).mean(1)
-    assert not first
-    assert [metrics["loss"] for metrics in others] == pytest.approx(means[[0, 0, 1, 1, 2]])
 
 
 @pytest.mark.long

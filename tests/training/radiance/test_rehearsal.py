@@ -23,7 +23,7 @@ from langsplat_core.training.radiance.rehearsal import (
     supported,
     train_within,
 )
-from langsplat_core.training.radiance.train import evaluate_views
+from langsplat_core.training.radiance.scores import evaluate_views
 
 VIEWS = 8
 SHORT = RadianceConfig(steps=36, reference_steps=36, backend="cpu", sh_degree=0, max_gaussians=200)

@@ -9,16 +9,14 @@ import torch
 from langsplat_core.arrays import Array
 from langsplat_core.scene import Camera, look_at
 from langsplat_core.training.radiance.transients import (
-    AT,
     GRID,
     MOST,
-    agreeing,
-    difference,
-    grown,
-    look,
-    nothing_watched,
-    patches,
-    pixels_of,
+    SAME_SURFACE,
+    colour_difference,
+    connected_patches,
+    count_agreeing,
+    no_transients,
+    patch_means,
 )
 
 SIZE = (64, 48)
@@ -37,8 +35,8 @@ def wall(camera: Camera) -> Array:
     return -camera.position[2] / (np.stack(local, -1) @ camera.rotation)[..., 2]
 
 
-def agreeing_slowly(index: int, depths: Array, alike: Array) -> Array:
-    """`agreeing` by one patch after the other."""
+def counted_slowly(index: int, depths: Array, alike: Array) -> Array:
+    """`count_agreeing` by one patch after the other."""
     counts, camera = np.zeros((2, GRID, GRID), int), cameras()[index]
     for row in range(GRID):
         for column in range(GRID):
@@ -49,7 +47,12 @@ def agreeing_slowly(index: int, depths: Array, alike: Array) -> Array:
                     continue
                 (x, y), z = (part[0] for part in at.project(point[None]))
                 r, c = math.floor(y * GRID / SIZE[1]), math.floor(x * GRID / SIZE[0])
-                if z > 0 and 0 <= r < GRID and 0 <= c < GRID and abs(z / depths[other, r, c] - 1) < AT:
+                if (
+                    z > 0
+                    and 0 <= r < GRID
+                    and 0 <= c < GRID
+                    and abs(z / depths[other, r, c] - 1) < SAME_SURFACE
+                ):
                     counts[:, row, column] += bool(alike[other, r, c]), 1
     return counts
 
@@ -61,8 +64,8 @@ def test_views_agree_on_the_surface_that_both_see() -> None:
     depths[rng.random(depths.shape) < 0.1] = np.nan
     alike = rng.random(depths.shape) < 0.6
     for index in range(3):
-        found = agreeing(index, cameras(), depths, alike)
-        np.testing.assert_array_equal(found, agreeing_slowly(index, depths, alike))
+        found = count_agreeing(index, cameras(), depths, alike)
+        np.testing.assert_array_equal(found, counted_slowly(index, depths, alike))
         assert found.max() == 2
 
 
@@ -72,7 +75,7 @@ def test_a_difference_is_what_no_exposure_explains() -> None:
     seen = 0.8 * drawn + np.float32(0.05)
     seen[4:10, 4:10] += 0.3
     drawn[20, :] = np.nan  # masked
-    found = difference(drawn, seen)
+    found = colour_difference(drawn, seen)
     moved = np.zeros((GRID, GRID), bool)
     moved[4:10, 4:10] = True
     assert np.abs(found[~moved & (np.arange(GRID) != 20)[:, None]]).max() < 0.02  # what the ridge holds
@@ -84,11 +87,11 @@ def test_what_moves_holds_together() -> None:
     differs, sizes = np.zeros((GRID, GRID), bool), np.zeros((GRID, GRID))
     differs[3:5, 3:5], differs[10:13, 10], differs[20:23, 20:23] = True, True, True
     sizes[3, 3], sizes[11, 10] = 0.2, 0.2  # the second piece is too small, the third nowhere sure
-    found = grown(differs, sizes, 0.1)
+    found = connected_patches(differs, sizes, 0.1)
     want = np.zeros_like(found)
     want[2:6, 2:6] = True
     np.testing.assert_array_equal(found, want)
-    everything = grown(np.ones_like(differs), np.random.default_rng(0).random(differs.shape), 0.1)
+    everything = connected_patches(np.ones_like(differs), np.random.default_rng(0).random(differs.shape), 0.1)
     assert everything.mean() == pytest.approx(MOST, abs=0.01)
 
 
@@ -98,27 +101,29 @@ def test_one_view_that_the_others_contradict() -> None:
     colours = rng.uniform(0.2, 0.8, (GRID, GRID, 3)).astype(np.float32)
     apart = colours.copy()
     apart[12:18, 12:18, 0] += 0.3
-    watched, depths = nothing_watched(3), [wall(camera) for camera in cameras()]
+    found, depths = no_transients(3), [wall(camera) for camera in cameras()]
     for index, seen in ((0, colours), (2, colours), (1, apart), (1, apart)):
-        look(watched, index, cameras(), colours, seen, depths[index])
+        found.observe(index, cameras(), colours, seen, depths[index])
     inside = np.zeros((GRID, GRID), bool)
     inside[12:18, 12:18] = True
-    assert watched.moving[1][inside].all()
-    assert watched.moving[1].sum() <= 8 * 8
-    assert not watched.moving[[0, 2]].any()
-    assert watched.explained() > 0.9
+    assert found.moving[1][inside].all()
+    assert found.moving[1].sum() <= 8 * 8
+    assert not found.moving[[0, 2]].any()
+    assert found.explained() > 0.9
     for _ in range(3):
         for index in range(3):
             everywhere = colours.copy()
             everywhere[8:24, 6:26, 0] += 0.3
-            look(watched, index, cameras(), colours, everywhere, depths[index])
-    assert not watched.moving[1][14:16, 14:16].any()
+            found.observe(index, cameras(), colours, everywhere, depths[index])
+    assert not found.moving[1][14:16, 14:16].any()
 
 
 def test_patches_and_their_pixels() -> None:
     picture = torch.arange(64 * 96, dtype=torch.float32).reshape(64, 96, 1)
     want = picture.numpy().reshape(GRID, 2, GRID, 3).mean((1, 3))
-    np.testing.assert_allclose(patches(picture)[..., 0], want, rtol=1e-6)
+    np.testing.assert_allclose(patch_means(picture)[..., 0], want, rtol=1e-6)
     moving = np.random.default_rng(3).random((GRID, GRID)) < 0.5
-    pixels = pixels_of(moving, (64, 96), torch.device("cpu")).numpy()
-    np.testing.assert_array_equal(pixels, moving.repeat(2, 0).repeat(3, 1))
+    transients = no_transients(1)
+    transients.moving[0] = moving
+    still = transients.still_pixels(0, (64, 96), torch.device("cpu")).numpy()
+    np.testing.assert_array_equal(still, ~moving.repeat(2, 0).repeat(3, 1))

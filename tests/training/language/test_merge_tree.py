@@ -13,9 +13,9 @@ from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Tree
 from langsplat_core.scene.surface import build_surface
 from langsplat_core.semantics.store import ImageFeatures
-from langsplat_core.training.language import tree as module
+from langsplat_core.training.language import merge_tree as module
 from langsplat_core.training.language.mask_weights import PAIR, MaskWeights, find_mask_weights
-from langsplat_core.training.language.tree import MergeTree, Patches, draw_patches, find_tree, merge
+from langsplat_core.training.language.merge_tree import MergeTree, Patches, draw_patches, find_tree, merge
 from tests.support.fakes import PER_BLOB, blob_scene, cameras
 from tests.support.scenes import make_views, random_camera, random_gaussians
 
