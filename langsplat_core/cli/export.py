@@ -65,13 +65,12 @@ class Export:
 
 @dataclass(frozen=True)
 class Convert:
-    """Write any readable scene as .ply, .spz or .splat, with language field and cameras beside it if it has
-    them.
+    """Write any readable scene in another format, with its language field and cameras beside it.
 
     A .ply (INRIA's) keeps everything, .spz is ten times smaller and rounded, .splat is without view
-    dependence. Checkpoints of LangSplat, LangSplatV2, Occam's LGS, OpenGaussian, Feature-3DGS and
-    3D Gaussian Splatting become such a scene (see docs/files.md for what to give), and a scene becomes
-    checkpoints."""
+    dependence. Checkpoints of LangSplat, LangSplatV2, Occam's LGS, OpenGaussian, Feature-3DGS and 3D Gaussian
+    Splatting become such a scene (see docs/files.md for what to give), and a scene becomes checkpoints.
+    """
 
     source: tyro.conf.Positional[Path]
     """Scene to read, of any format; or the first of the files that another method has of one scene."""

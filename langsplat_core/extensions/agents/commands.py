@@ -70,21 +70,26 @@ def scene_files(place: Path) -> dict[str, Path]:
 
 
 class Door:
-    """What an agent may ask of some scenes. Answers are ready for JSON, lengths in metres where the scene
-    says how long its unit is. One question at a time; scenes and encoders are kept once they are loaded."""
+    """What an agent may ask of some scenes.
+
+    Answers are ready for JSON, lengths in metres where the scene says how long its unit is. One question at a
+    time; scenes and encoders are kept once they are loaded.
+    """
 
     def __init__(self, scenes: dict[str, Path], encoder: str = "") -> None:
         self._scenes, self._encoder_id = scenes, encoder
         self._engines: dict[str, QueryEngine] = {}
 
     def scenes(self) -> list[str]:
-        """The names of the scenes that can be asked."""
+        """Return the names of the scenes that can be asked."""
         return list(self._scenes)
 
     def find(self, phrase: str, scene: str = "") -> dict[str, Any]:
-        """Where something is: a phrase such as 'red mug', 'handle of the mug' or 'book on the table'. The
-        verdict is 'found', 'weak match' or 'not here'; place is the middle of the best one, box its
-        corners."""
+        """Where something is: a phrase such as 'red mug', 'handle of the mug' or 'book on the table'.
+
+        The verdict is 'found', 'weak match' or 'not here'; place is the middle of the best one, box its
+        corners.
+        """
         engine = self._engine(scene)
         composed = run_phrase(engine, phrase, viewpoint=_first(engine.scene))
         answer, unit = composed.answer, unit_of(engine.scene)
@@ -123,14 +128,16 @@ class Door:
         return {"distance": unit.length * least, "unit": unit.name}
 
     def describe(self, scene: str = "") -> str:
-        """What is in a scene: an outline of its things with their parts, sizes and counts."""
+        """Return what is in a scene: an outline of its things with their parts, sizes and counts."""
         engine = self._engine(scene)
         lines = outline_lines(outline_of(Describer(engine, None, silent)), unit_of(engine.scene))
         return "\n".join([*lines, f"answers: {engine.basis.long}"])
 
     def look(self, phrase: str = "", camera: int = 0, scene: str = "") -> Array:
-        """(H, W, 3) uint8 image: towards the best of what a phrase finds, else as a camera of the scene sees
-        it."""
+        """Return an (H, W, 3) uint8 image, towards the best of what a phrase finds if one is given.
+
+        Without a phrase, or without a find, it is what a camera of the scene sees.
+        """
         engine = self._engine(scene)
         scene_of = engine.scene
         if phrase:
@@ -167,8 +174,10 @@ def _lengths(values: Array | None, length: float) -> Any:
 
 
 def towards(scene: Scene, answer: QueryResult) -> Camera:
-    """The camera of the scene that shows most of the best of an answer, counted by pixels of its box; without
-    one a new camera."""
+    """Return the camera of the scene that shows most of the best of an answer.
+
+    It is counted by pixels of the box of the answer; a scene without cameras is given a new one.
+    """
     assert answer.box is not None
     low, high = answer.box
     corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
@@ -190,7 +199,10 @@ def towards(scene: Scene, answer: QueryResult) -> Camera:
 
 
 def build_server(door: Door) -> "MCPServer[Any]":
-    """The door as tools of the protocol. A question that cannot be answered is a tool error of one line."""
+    """Return the door as tools of the protocol.
+
+    A question that cannot be answered is a tool error of one line.
+    """
     from mcp.server import MCPServer
     from mcp.server.mcpserver import Image as Picture
     from mcp.server.mcpserver.exceptions import ToolError

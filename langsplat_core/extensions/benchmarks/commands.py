@@ -1,4 +1,4 @@
-"""`langsplat eval lerf-ovs | 3d-ovs | scannet`: the field's benchmarks."""
+"""`langsplat eval ...` and `langsplat bench ...`: the field's benchmarks, and speed against error."""
 
 import json
 from collections.abc import Callable
@@ -46,7 +46,7 @@ class _Eval:
     encoder: EncoderOption = ""
 
     def scene_and_data(self) -> tuple[Path | None, Path]:
-        """The scene, None for maps, and the benchmark's folder."""
+        """Return the scene, None for maps, and the benchmark's folder."""
         wanted = 1 if self.maps else 2
         if len(self.paths) != wanted:
             raise InputError(
@@ -135,7 +135,8 @@ class EvalLerfOvs(_EvalLabels):
     """LERF-OVS: mIoU and localisation in labelled frames, by a named protocol.
 
     DATA is the folder with label/SCENE/FRAME.json. Frames are matched to views by name; the cameras of those
-    that the scene was not trained on are taken from the dataset beside the labels."""
+    that the scene was not trained on are taken from the dataset beside the labels.
+    """
 
     protocol: LerfProtocol = "langsplat-code"
     """Whose constants: filters, cut and choice of level; docs/evaluating.md lists them."""
@@ -150,7 +151,8 @@ class EvalLerfOvs(_EvalLabels):
 class EvalOvs3d(_EvalLabels):
     """3D-OVS: mIoU of every class in every labelled view, by a named protocol.
 
-    DATA is a folder with segmentations/classes.txt and segmentations/VIEW/CLASS.png, or one of several."""
+    DATA is a folder with segmentations/classes.txt and segmentations/VIEW/CLASS.png, or one of several.
+    """
 
     protocol: OvsProtocol = "langsplat-paper"
     """Whose constants: cut and choice of level; docs/evaluating.md lists them."""
@@ -165,7 +167,8 @@ class EvalOvs3d(_EvalLabels):
 class EvalScanNet(_Eval):
     """ScanNet, direct in 3D: mIoU and mAcc of 19, 15 and 10 classes among the labelled vertices.
 
-    DATA is a folder of NAME/NAME_vh_clean_2.labels.ply; maps are NAME.npy, one class id per vertex."""
+    DATA is a folder of NAME/NAME_vh_clean_2.labels.ply; maps are NAME.npy, one class id per vertex.
+    """
 
     def run(self) -> None:
         from langsplat_core.extensions.benchmarks.report import Subject
@@ -214,8 +217,11 @@ class BenchRaster:
 
 @dataclass(frozen=True)
 class BenchQuery:
-    """The paper's order, a table over the sphere and a codebook on one scene: time of a new phrase, a new
-    camera and a frame, beside the error of relevancy. Some minutes, nearly all of them the paper's order."""
+    """Time phrases, cameras and frames on one scene in the paper's order and in ours, beside the error.
+
+    The paper's order, a table and a codebook are compared by the error of relevancy. Some minutes, nearly all
+    of them the paper's order.
+    """
 
     scene: tyro.conf.Positional[Path]
     """A scene with a codebook, and its cameras beside it."""

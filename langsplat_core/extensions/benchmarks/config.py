@@ -1,5 +1,7 @@
-"""Settings of `langsplat bench raster` and `langsplat bench query`: speed against error on this machine; and
-the resident memory of this process, as Linux tells it."""
+"""Settings of `langsplat bench raster` and `langsplat bench query`: speed against error on this machine.
+
+And the resident memory of this process, as Linux tells it.
+"""
 
 import ctypes
 import re
@@ -62,8 +64,10 @@ def resident_memory() -> int | None:
 
 
 def peak_memory() -> int | None:
-    """Most bytes of this process since it began or since `restart_peak`. Not getrusage: its maximum is
-    inherited from the parent process on Linux."""
+    """Most bytes of this process since it began or since `restart_peak`.
+
+    Not getrusage: its maximum is inherited from the parent process on Linux.
+    """
     return _status("VmHWM")
 
 

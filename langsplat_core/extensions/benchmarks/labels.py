@@ -24,8 +24,10 @@ class Outlines:
     polygons: tuple[Array, ...]  # (K, 2) float x, y each, K >= 3
 
     def draw(self, size: Size) -> Array:
-        """(H, W) bool on a grid of `size`: inside the polygons. Corners are cut to whole pixels, and an
-        outline belongs to the inside."""
+        """Return the mask on a grid of `size`, (H, W) bool.
+
+        True is above half of 255, or above 0 where the file holds no more than 0 and 1.
+        """
         canvas = Image.new("L", self.size)
         brush = ImageDraw.Draw(canvas)
         for polygon in self.polygons:
@@ -113,13 +115,13 @@ def check_same_image(frame: str, drawn: Size, labelled: Size) -> None:
 
 
 def without_suffix(name: str) -> str:
-    """A view's name without a photograph's extension; other dots stay."""
+    """Return a view's name without a photograph's extension; other dots stay."""
     stem, dot, suffix = name.rpartition(".")
     return stem if dot and f".{suffix.lower()}" in PHOTO_SUFFIXES else name
 
 
 def photograph_of(folder: Path, name: str) -> Path | None:
-    """The photograph called `name` in a folder, whatever its kind."""
+    """Return the photograph called `name` in a folder, whatever its kind."""
     candidates = (folder / f"{name}{suffix}" for suffix in (*PHOTO_SUFFIXES, ".JPG", ".JPEG", ".PNG"))
     return next((path for path in candidates if path.is_file()), None)
 
@@ -140,8 +142,11 @@ WANTED = "expected label/<scene>/<frame>.json in it, or one scene's folder of th
 
 
 def read_lerf_ovs(folder: Path) -> Benchmark:
-    """The labels in `folder`: the benchmark's, one scene's of `label`, or one scene's dataset beside `label`.
-    Raises InputError for a folder of another layout and FormatError for a file that breaks it."""
+    """Return the labels in `folder`.
+
+    The folder is the benchmark's, one scene's of `label`, or one scene's dataset beside `label`. Raises
+    InputError for a folder of another layout and FormatError for a file that breaks it.
+    """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; {WANTED}")
     if (folder / "label").is_dir():
@@ -180,7 +185,7 @@ def _read_scene(name: str, labels: Path, dataset: Path) -> LabelledScene:
 
 
 def _read_frame(path: Path, dataset: Path) -> tuple[Frame, list[str]]:
-    """The frame, and the categories of it that have no polygon with an inside."""
+    """Return the frame, and the categories of it that have no polygon with an inside."""
     content = read_json_file(path, LIMIT)
     size = _size(content, path)
     objects = content.get("objects")
@@ -256,8 +261,11 @@ WANTED_PICTURES = "expected segmentations/classes.txt in it, or in folders of it
 
 
 def read_3d_ovs(folder: Path) -> Benchmark:
-    """The labels in `folder`: one scene's, or several scenes' folders. What a view has an image of is asked
-    there. Raises InputError for a folder of another layout and FormatError for a scene that breaks it."""
+    """Return the labels in `folder`: one scene's, or several scenes' folders.
+
+    What a view has an image of is asked there. Raises InputError for a folder of another layout and
+    FormatError for a scene that breaks it.
+    """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; {WANTED_PICTURES}")
     scenes = [folder] if _is_scene(folder) else [path for path in sorted(folder.iterdir()) if _is_scene(path)]

@@ -37,7 +37,7 @@ _FLIP = 2e-5  # an error in the band is a flip if larger than this and than twic
 
 
 def markdown(head: Sequence[str], rows: Iterable[Iterable[object]]) -> str:
-    """A Markdown table that ends with a newline."""
+    """Return a Markdown table that ends with a newline."""
     lines = ["| " + " | ".join(map(str, line)) + " |\n" for line in (head, *rows)]
     return "".join([lines[0], "|" + "---|" * len(head) + "\n", *lines[1:]])
 
@@ -68,7 +68,7 @@ def random_scene(count: int) -> Gaussians:
 
 
 def default_camera(width: int, height: int) -> Camera:
-    """A camera that sees the whole ball of `random_scene`."""
+    """Return a camera that sees the whole ball of `random_scene`."""
     return look_at(np.array([0.0, 0.0, -2.6]), np.zeros(3), np.array([0.0, -1.0, 0.0]), (width, height))
 
 
@@ -120,7 +120,7 @@ class Foresight:
         self._rates: dict[tuple[str, str, int], float] = {}  # seconds per overlap
 
     def expected(self, key: tuple[str, str, int], overlaps: int) -> float:
-        """Expected seconds; 0 where nothing like it ran before."""
+        """Return the expected seconds; 0 where nothing like it ran before."""
         return self._rates.get(key, 0.0) * overlaps
 
     def learn(self, key: tuple[str, str, int], overlaps: int, seconds: float) -> None:
@@ -128,7 +128,7 @@ class Foresight:
 
 
 def label(backend: Rasterizer) -> str:
-    """The backend's name, with the precision where it offers several."""
+    """Return the backend's name, with the precision where it offers several."""
     return f"{backend.name} {getattr(backend, 'precision', '')}".strip()
 
 
@@ -171,7 +171,7 @@ def measure(
 def operations(
     backend: Rasterizer, case: Case, channels: int, exact: "ReferenceWindows | None"
 ) -> Iterator[Operation]:
-    """The operations that `backend` has; without `exact` their errors are not measured."""
+    """Return the operations that `backend` has; without `exact` their errors are not measured."""
     values, image = _inputs(case, channels)
     cameras = _two_cameras(case.camera)
     turn = iter(range(sys.maxsize))
@@ -198,7 +198,7 @@ def operations(
 def _linear(
     view: Any, values: Array, image: Array, exact: "ReferenceWindows | None", prefix: str
 ) -> Iterator[Operation]:
-    """The operation `splat` and, where the view has it, `gather`."""
+    """Return the operation `splat` and, where the view has it, `gather`."""
     splat_error = None if exact is None else lambda: exact.splat_error(view.splat(values)[0], values)
     yield Operation(f"{prefix}splat", lambda: view.splat(values), splat_error)
     if hasattr(view, "gather"):
@@ -247,15 +247,17 @@ def _inputs(case: Case, channels: int) -> tuple[Array, Array]:
 
 
 def _two_cameras(camera: Camera) -> tuple[Camera, Camera]:
-    """The camera, and one that has moved ahead by a thousandth of a world unit."""
+    """Return the camera, and one that has moved ahead by a thousandth of a world unit."""
     moved = camera.world_to_camera.copy()
     moved[2, 3] -= 1e-3
     return camera, replace(camera, world_to_camera=moved)
 
 
 def _gradient_error(view: Any, case: Case, values: Array, image: Array, exact: "ReferenceWindows") -> Error:
-    """Error of `backward`: its derivatives along random directions of all parameters at once, against central
-    differences of the float64 reference."""
+    """Return the error of `backward` against central differences of the float64 reference.
+
+    Derivatives are compared along random directions of all parameters at once.
+    """
     masked, scene = exact.masked(image), case.gaussians.take(exact.rows)
     got = view.backward(values, masked)
     features, generator, worst = values[exact.rows], np.random.default_rng(2), 0.0
@@ -281,7 +283,7 @@ def _gradient_error(view: Any, case: Case, values: Array, image: Array, exact: "
 
 
 def _pulled(scene: Gaussians, features: Array, camera: Camera, masked: Array) -> float:
-    """The product of `masked` (H, W, C) and the reference's image of (K, C) features, float64."""
+    """Return the product of `masked` (H, W, C) and the reference's image of (K, C) features, float64."""
     drawn = reference_windows(scene, camera)
     return float((drawn.gather(masked) * features[drawn.rows]).sum())
 
@@ -349,8 +351,10 @@ class ReferenceWindows:
         return Error(max(float(error.max()) for error in errors), off, flips)
 
     def masked(self, image: Array) -> Array:
-        """`image` with 0 outside the windows and in their bands: what a backend must gather to be
-        compared, as a window knows nothing of the pixels outside."""
+        """Return `image` with 0 outside the windows and in their bands.
+
+        This is what a backend must gather to be compared: a window knows nothing of the pixels outside.
+        """
         kept = np.zeros_like(image)
         for window in self.windows:
             kept[window.at] = image[window.at] * ~window.band[..., None]

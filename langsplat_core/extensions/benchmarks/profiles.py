@@ -1,5 +1,6 @@
-"""The protocols, each one frozen value that pins every constant and says where it is from; how each turns
-maps, drawn selections or the engine's own answer into a mask and a place; and who answers.
+"""The protocols, each one frozen value that pins every constant and says where it is from.
+
+How each turns maps, drawn selections or the engine's own answer into a mask and a place; and who answers.
 
 Figures of one benchmark differ by ten points between protocols, so a figure belongs to a profile. Nothing
 here depends on a label: a profile is chosen by name, and no threshold is searched.
@@ -165,8 +166,10 @@ def read_maps(maps: Array, rule: MapRule) -> Prediction:
 
 
 def peak_pixels(maps: Array, rule: MapRule) -> Array:
-    """(P, 2) column and row of the highest pixel over all levels' filtered maps; more than one where several
-    of that level are as high and the rule tries all."""
+    """(P, 2) column and row of the highest pixel over all levels' filtered maps.
+
+    More than one where several of that level are as high and the rule tries all.
+    """
     smooth = [mean_filtered(level, rule.peak_window, rule.border) for level in maps]
     best = smooth[int(np.argmax([values.max() for values in smooth]))]
     pixels = np.argwhere(best == best.max())[:, ::-1]
@@ -180,8 +183,10 @@ def _mean_inside(values: Array, threshold: float) -> float:
 
 
 def mean_filtered(values: Array, window: int, border: Border) -> Array:
-    """(H, W) means over `window` x `window` pixels; an even window reaches one pixel further up and left, as
-    cv2's does."""
+    """(H, W) means over `window` x `window` pixels.
+
+    An even window reaches one pixel further up and left, as cv2's does.
+    """
     if window <= 1:
         return values
     if border == "mirror":
@@ -192,7 +197,9 @@ def mean_filtered(values: Array, window: int, border: Border) -> Array:
 
 def voted(mask: Array, vote: Vote, window: int) -> Array:
     """(H, W) bool after a majority vote over `window` x `window` pixels inside the image; a tie is False.
-    "clipped": the image's last row and column are never counted, as in LangSplat's code."""
+
+    "clipped": the image's last row and column are never counted, as in LangSplat's code.
+    """
     if vote == "none" or window <= 1:
         return mask
     counted = np.ones(mask.shape)
@@ -214,8 +221,11 @@ def read_silhouette(colours: Array, alpha: Array, rule: SilhouetteRule) -> Array
 
 
 def own_prediction(view: View, result: QueryResult, rule: OwnRule) -> Prediction:
-    """The mask is what shows mostly members of the answer (hidden ones do not count), the place is the peak
-    of the filtered map of the answer's level. Nothing of either where the verdict is "not here"."""
+    """Return the mask and the place of an answer as the program shows it.
+
+    The mask is what shows mostly members of the answer (hidden ones do not count), the place is the peak of
+    the filtered map of the answer's level. Nothing of either where the verdict is "not here".
+    """
     values = np.stack([result.members, result.relevancy[result.level]], 1).astype(np.float32)
     drawn = splatted_relevancy(view, values, PictureConfig().alpha_gate)
     if not result.found:
@@ -241,8 +251,10 @@ def file_name(phrase: str) -> str:
 
 
 def read_relevancy(folder: Path, phrase: str) -> tuple[Array, tuple[int, ...]] | None:
-    """The (L, H, W) float64 maps of `phrase` in a view's `folder` and their levels, indices into LEVELS; None
-    where there is none. FormatError for a damaged one."""
+    """Return the (L, H, W) float64 maps of `phrase` in a view's `folder` and their levels.
+
+    Levels are indices into LEVELS. None where there is no map; FormatError for a damaged one.
+    """
     name = file_name(phrase)
     whole = _existing(folder, name)
     if whole is not None:
@@ -306,7 +318,7 @@ class SceneSource:
         return None if self.trained is None else frame in self.trained
 
     def answers(self, frame: str, size: Size, phrases: Sequence[str]) -> Mapping[str, Prediction | str]:
-        """phrase -> the answer in the view `frame`, drawn at `size`; or why there is none."""
+        """Return the answer to each phrase in the view `frame`, drawn at `size`, or why there is none."""
         if frame not in self.cameras:
             return dict.fromkeys(phrases, NO_VIEW)
         camera = self.cameras[frame]
@@ -345,7 +357,7 @@ class SceneSource:
         return np.moveaxis(np.stack(levels), 3, 0)
 
     def _silhouette(self, camera: Camera, result: QueryResult, rule: SilhouetteRule) -> Array:
-        """The mask of the answer's Gaussians drawn alone, as if nothing stood before them."""
+        """Return the mask of the answer's Gaussians drawn alone, as if nothing stood before them."""
         scene = self.engine.scene
         if not result.members.any():
             return np.zeros((camera.height, camera.width), bool)
@@ -364,7 +376,7 @@ class MapSource:
         return None
 
     def answers(self, frame: str, size: Size, phrases: Sequence[str]) -> Mapping[str, Prediction | str]:
-        """phrase -> the answer by its map in the view `frame`, whatever its size; or why there is none."""
+        """Return the answer to each phrase by its map in the view `frame`, or why there is none."""
         return {phrase: self._answer(self.folder / frame, phrase) for phrase in phrases}
 
     def _answer(self, folder: Path, phrase: str) -> Prediction | str:

@@ -54,7 +54,7 @@ _NOTES = """- The size with most scenes and the most channels; every other measu
 
 
 def quick_plan(plan: RasterBenchConfig) -> RasterBenchConfig:
-    """A smaller plan, which takes about a minute on two cores."""
+    """Return a smaller plan, which takes about a minute on two cores."""
     counts, sizes = (3_000, 10_000, 31_000), ((160, 120), (320, 240), (640, 480))
     return replace(plan, counts=counts, sizes=sizes, pivot=10_000, limit=min(plan.limit, 3.0))
 
@@ -101,8 +101,10 @@ class Report:
 def run_plan(
     plan: RasterBenchConfig, progress: Progress = silent, keep: Callable[[Report], None] = lambda _: None
 ) -> Report:
-    """Measure; a few minutes for the default plan. `keep` is given what there is after every scene and size,
-    so that an interrupted run leaves that."""
+    """Measure; a few minutes for the default plan.
+
+    `keep` is given what there is after every scene and size, so that an interrupted run leaves that.
+    """
     machine = describe_machine()
     backends = _backends(machine)
     progress("bench: compiling", 0.0)
@@ -127,9 +129,11 @@ def run_plan(
 def sweep(
     counts: tuple[int, ...], sizes: tuple[tuple[int, int], ...], pivot: int, extra: tuple[SceneSize, ...] = ()
 ) -> list[SceneSize]:
-    """The random scenes: every count at the middle size, every size at `pivot` Gaussians, and those of
-    `extra` whose count and size are asked for; small ones first, so that the time of large ones can be
-    foretold."""
+    """Return the numbers of Gaussians and image sizes of the random scenes, small ones first.
+
+    They are every count at the middle size, every size at `pivot` Gaussians, and those of `extra` whose count
+    and size are asked for. The time of large ones is foretold from small ones.
+    """
     middle = sorted(sizes)[len(sizes) // 2]
     pairs = {(count, middle) for count in counts} | {(pivot, size) for size in sizes}
     pairs |= {(count, size) for count, size in extra if count in (*counts, pivot) and size in sizes}
@@ -201,7 +205,7 @@ def ratios(rows: Sequence[Measurement]) -> list[Ratio]:
 
 
 def table(rows: Sequence[Measurement]) -> str:
-    """The measurements as a Markdown table."""
+    """Return the measurements as a Markdown table."""
     head = ("scene", "Gaussians", "size", "channels", "operation", "backend", "ms", "MiB")
     return markdown(
         (*head, "error off cut-offs", "largest error", "flips"),
@@ -215,13 +219,13 @@ def table(rows: Sequence[Measurement]) -> str:
 
 
 def _selection(rows: Sequence[Measurement]) -> list[Measurement]:
-    """The rows of the most measured image size, with the most channels."""
+    """Return the rows of the most measured image size, with the most channels."""
     size, channels = _busiest(rows), max((r.channels for r in rows), default=0)
     return [r for r in rows if (r.width, r.height) == size and r.channels == channels]
 
 
 def ratio_table(found: Sequence[Ratio]) -> str:
-    """The promised ratios as a Markdown table."""
+    """Return the promised ratios as a Markdown table."""
     words = {None: "not measured", True: "yes", False: "NO"}
     rows = ((r.text, _cell(r.ratio, ".2f"), r.target, words[r.met]) for r in found)
     return markdown(("ratio", "measured", "target", "met"), rows)
@@ -237,8 +241,10 @@ _ORDER = ("project", "frame", "splat", "gather", "backward", "freeze", "frozen s
 
 
 def plot(rows: Sequence[Measurement], path: Path) -> None:
-    """Two lines of panels: milliseconds over Gaussians, at the size with most counts; solid for the fewest,
-    dashed for the most channels. Third line: error against time of everything compared."""
+    """Two lines of panels: milliseconds over Gaussians, at the size with most counts.
+
+    Solid for the fewest, dashed for the most channels. Third line: error against time of everything compared.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -309,7 +315,7 @@ def _log_axes(panel: Any, x: Sequence[float], y: Sequence[float]) -> None:
 
 
 def _busiest(rows: Sequence[Measurement]) -> tuple[int, int] | None:
-    """The image size that was measured with the most numbers of Gaussians."""
+    """Return the image size that was measured with the most numbers of Gaussians."""
     counts: dict[tuple[int, int], set[int]] = {}
     for r in rows:
         counts.setdefault((r.width, r.height), set()).add(r.gaussians)

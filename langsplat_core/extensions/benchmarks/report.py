@@ -1,5 +1,4 @@
-"""Every labelled query against its answer: scores, their means, a table for people, JSON for programs, and
-one image per answer."""
+"""Every labelled query against its answer: scores, their means, tables, JSON and images."""
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
@@ -111,9 +110,11 @@ def score_scene(
     pictures: Path | None = None,
     progress: Progress = silent,
 ) -> SceneScores:
-    """Score every query of a scene; `pictures`: a folder for one image per answer. A frame's answers are
-    complete, cut and all, before any mask of it is drawn. Raises InputError where a map has another shape
-    than the labelled image."""
+    """Score every query of a scene; `pictures`: a folder for one image per answer.
+
+    A frame's answers are complete, cut and all, before any mask of it is drawn. Raises InputError where a map
+    has another shape than the labelled image.
+    """
     scores: list[QueryScore] = []
     left_out = list(labelled.left_out)
     for done, frame in enumerate(labelled.frames):
@@ -163,8 +164,10 @@ def _score(
 
 
 def inside_any_box(peaks: Array, boxes: Array | None, size: Size, shape: tuple[int, ...]) -> bool:
-    """Return True where any of the (P, 2) peaks, column and row on a grid of `shape` (rows, columns), lies in
-    any of the (B, 4) boxes on the label's grid of `size`, borders included."""
+    """Return True where any of the (P, 2) peaks lies in any of the (B, 4) boxes, borders included.
+
+    peaks: column and row on a grid of `shape` (rows, columns); boxes: on the label's grid of `size`.
+    """
     if boxes is None or not len(peaks):
         return False
     scale = np.array([shape[1] / size[0], shape[0] / size[1]])
@@ -220,7 +223,7 @@ def means(queries: Sequence[QueryScore]) -> Means:
 
 
 def macro(queries: Sequence[QueryScore], group: Callable[[QueryScore], object]) -> Means:
-    """The mean of the groups' means, each group with the same weight."""
+    """Return the mean of the groups' means, each group with the same weight."""
     groups: dict[object, list[QueryScore]] = {}
     for query in queries:
         groups.setdefault(group(query), []).append(query)
@@ -238,8 +241,11 @@ def macro(queries: Sequence[QueryScore], group: Callable[[QueryScore], object]) 
 
 
 def summary(report: BenchmarkReport) -> dict[str, Means]:
-    """The rows of the table: every scene, then macro means over scenes and over frames, then the micro mean
-    over all queries; the last also of what was answered, and of views not trained on, where they differ."""
+    """Return the rows of the table: scenes, then means of scenes, of frames and of queries.
+
+    The last mean, over all queries, stands also for what was answered and for views not trained on, where
+    they differ.
+    """
     queries = report.queries
     rows = {name: means(scores.queries) for name, scores in report.scenes.items()}
     rows["macro, mean of scenes"] = macro(queries, lambda query: query.scene)
@@ -255,7 +261,7 @@ def summary(report: BenchmarkReport) -> dict[str, Means]:
 
 
 def table(report: BenchmarkReport) -> str:
-    """The means as a Markdown table, with notes below it."""
+    """Return the means as a Markdown table, with notes below it."""
     lines = [
         "| | queries | mIoU % | localisation % | mAcc@0.25 % | mAcc@0.5 % |",
         "|---|---|---|---|---|---|",
@@ -352,8 +358,10 @@ PUBLISHED: Mapping[str, Mapping[str, Row]] = MappingProxyType(
 
 
 def beside_published(report: BenchmarkReport) -> str:
-    """Markdown: a column per scene of the report that others published too, and their mean; a row for the
-    report, and one for each of them. "" where there is no such scene."""
+    """Markdown: a column per scene of the report that others published too, and their mean.
+
+    A row for the report, and one for each of them. "" where there is no such scene.
+    """
     others = PUBLISHED.get(report.benchmark, {})
     scenes = [name for name in report.scenes if any(name in row for row in others.values())]
     if not scenes:
@@ -411,8 +419,11 @@ def run_benchmark(
     pictures: Path | None = None,
     progress: Progress = silent,
 ) -> BenchmarkReport:
-    """Score `subject` on the scenes of `benchmark`, or those named by `only`. Raises InputError for a scene
-    or maps that do not belong to the labels, EncoderError where the text encoder cannot be loaded."""
+    """Score `subject` on the scenes of `benchmark`, or those named by `only`.
+
+    Raises InputError for a scene or maps that do not belong to the labels, EncoderError where the text
+    encoder cannot be loaded.
+    """
     if subject.paper_order and (subject.maps is not None or not isinstance(profile.rule, MapRule)):
         raise InputError(
             "--paper-order is for a scene under a protocol that reads relevancy maps; leave it out"
@@ -432,8 +443,11 @@ def run_benchmark(
 
 
 def chosen_scenes(labelled: Sequence[str], only: Sequence[str], subject: Subject) -> list[str]:
-    """Names of the `labelled` scenes to score: `only` these, else the one that a scene file is named after
-    where several could be meant. Raises InputError for a name that is not labelled."""
+    """Return the names of the `labelled` scenes to score.
+
+    These are `only`, or the one that a scene file is named after where several could be meant. Raises
+    InputError for a name that is not labelled.
+    """
     wrong = [name for name in only if name not in labelled]
     if wrong:
         raise InputError(f"--only {wrong[0]}: no such labelled scene; there are {', '.join(labelled)}")
@@ -449,7 +463,7 @@ def chosen_scenes(labelled: Sequence[str], only: Sequence[str], subject: Subject
 def open_scene(
     subject: Subject, name: str, load_encoder: LoadEncoder, rule: AnswerRule = "regions"
 ) -> QueryEngine:
-    """The scene of `subject` that belongs to the labelled scene `name`, to be asked."""
+    """Return the scene of `subject` that belongs to the labelled scene `name`, to be asked."""
     assert subject.scene is not None
     path = subject.scene / f"{name}.ply" if subject.scene.is_dir() else subject.scene
     if not path.exists():
@@ -488,8 +502,10 @@ def _map_source(labelled: LabelledScene, count: int, profile: Profile, maps: Pat
 def _other_cameras(
     own: Mapping[str, Camera], labelled: LabelledScene, progress: Progress
 ) -> Mapping[str, Camera]:
-    """The dataset's views by name, read where the scene lacks a labelled one; they share its world.
-    InputError where no labelled frame is among either."""
+    """Return the dataset's views by name, read where the scene lacks a labelled one; they share its world.
+
+    InputError where no labelled frame is among either.
+    """
     wanted = [frame.name for frame in labelled.frames]
     if all(name in own for name in wanted):
         return {}

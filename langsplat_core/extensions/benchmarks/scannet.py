@@ -70,7 +70,7 @@ class PointScore:
 
 
 def read_scannet(folder: Path) -> dict[str, Path]:
-    """scene -> its file of labels. InputError for another layout."""
+    """Return the file of labels of each scene; InputError for another layout."""
     if folder.is_file() and folder.name.endswith(ENDING):
         files = [folder]
     else:
@@ -81,7 +81,7 @@ def read_scannet(folder: Path) -> dict[str, Path]:
 
 
 def read_points(path: Path, name: str) -> LabelledPoints:
-    """The labelled vertices of a scene; raises as the PLY reader does."""
+    """Return the labelled vertices of a scene; raises as the PLY reader does."""
     with open_ply(path) as ply:
         vertex = ply.elements.get("vertex")
         if vertex is None or not {"x", "y", "z", "label"} <= vertex.numbers.keys():
@@ -95,8 +95,10 @@ def read_points(path: Path, name: str) -> LabelledPoints:
 
 
 def scene_classes(engine: QueryEngine, points: LabelledPoints) -> tuple[list[Array], tuple[str, ...]]:
-    """Per set of classes (V,) int32 the id that every vertex is given, 0 for none, without a look at the
-    labels; and the class names with words that the encoder was never taught."""
+    """Return the class that every vertex is given, and the class names that the encoder does not know.
+
+    The classes are (V,) int32 ids for each set of classes, 0 for none, found without a look at the labels.
+    """
     field, gaussians = engine.field, engine.scene.gaussians
     rows = np.flatnonzero(field.known.any(0) & gaussians.valid())
     if not len(rows):
@@ -118,8 +120,10 @@ def scene_classes(engine: QueryEngine, points: LabelledPoints) -> tuple[list[Arr
 
 
 def map_classes(folder: Path, points: LabelledPoints) -> list[Array]:
-    """Another system's answer, `folder`/<scene>.npy: (V,) whole ids of NYU40 in the vertices' order, or
-    (S, V) with one row per set of classes."""
+    """Return another system's answer, read from `folder`/<scene>.npy, for each set of classes.
+
+    The file holds (V,) whole ids of NYU40 in the vertices' order, or (S, V) with one row per set of classes.
+    """
     path = folder / f"{points.name}.npy"
     ids = read_npy(path)
     count = len(CLASS_SETS)
@@ -170,8 +174,10 @@ def run_scannet(
     only: Sequence[str] = (),
     progress: Progress = silent,
 ) -> PointReport:
-    """Score `subject` on the scenes whose label files are given, or those named by `only`. Raises InputError
-    for a scene or maps that do not belong to them."""
+    """Score `subject` on the scenes whose label files are given, or those named by `only`.
+
+    Raises InputError for a scene or maps that do not belong to them.
+    """
     names = chosen_scenes(list(files), only, subject)
     scores: list[PointScore] = []
     for done, name in enumerate(names):
@@ -187,7 +193,7 @@ def run_scannet(
 
 
 def point_table(report: PointReport) -> str:
-    """The scores as a Markdown table, with notes below it."""
+    """Return the scores as a Markdown table, with notes below it."""
     lines = ["| | classes | of them present | vertices | mIoU % | mAcc % |", "|---|---|---|---|---|---|"]
     for s in report.scores:
         shares = f"{100 * s.iou:.1f} | {100 * s.accuracy:.1f}"

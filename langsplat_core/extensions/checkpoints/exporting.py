@@ -44,8 +44,10 @@ def export_langsplat(scene: Scene, folder: Path, name: str) -> list[Path]:
 
 
 def export_occam(scene: Scene, folder: Path, progress: Progress = silent) -> list[Path]:
-    """`chkpnt30000_langfeat_{1,2,3}.pth` with (N, D) unit vectors, zero for no meaning, in `folder`; returns
-    what was written. One level is held in memory at a time: 5 GB for 2.5 million Gaussians."""
+    """`chkpnt30000_langfeat_{1,2,3}.pth` with (N, D) unit vectors, zero for no meaning, in `folder`.
+
+    Returns what was written. One level is held in memory at a time: 5 GB for 2.5 million Gaussians.
+    """
     language = _language(scene)
     written = []
     for level in range(len(LEVELS)):
@@ -93,8 +95,10 @@ def features_to_langsplat(store: FeatureStore, folder: Path, progress: Progress 
 
 
 def features_from_langsplat(folder: Path, store: FeatureStore, progress: Progress = silent) -> int:
-    """Every photograph's `_s.npy` and `_f.npy` in `folder` as an item of `store`, by its name without ending;
-    returns how many. Raises InputError where there are none, or latents in place of vectors."""
+    """Store every photograph's `_s.npy` and `_f.npy` in `folder` under its stem; return how many.
+
+    Raises InputError where there are none, or latents in place of vectors.
+    """
     stems = langsplat_stems(folder)
     if not stems:
         raise InputError(f"{folder}: holds no *{VECTORS_ENDING}; give LangSplat's folder language_features")
@@ -116,7 +120,7 @@ def langsplat_stems(folder: Path) -> list[str]:
 
 
 def _of_levels(vectors: Array, labels: Array) -> ImageFeatures:
-    """The features of (3, H, W) labels, without the vectors that none of them names, as default masks'."""
+    """Return the features of (3, H, W) labels, without vectors that only default masks name."""
     used, compact = np.unique(labels, return_inverse=True)
     empty = int(used[0] == -1) if len(used) else 0
     rows = compact.reshape(labels.shape).astype(np.int32) - empty

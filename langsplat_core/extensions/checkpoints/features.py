@@ -1,5 +1,4 @@
-"""Language features of other methods' checkpoints: the files that carry them, and the vectors that they stand
-for, read a block at a time.
+"""Language features of other methods' checkpoints, read a block of Gaussians at a time.
 
 `Features` are the vectors of N Gaussians at one level. Methods keep 512 numbers per Gaussian, or something
 smaller that stands for them; either way no (N, 512) array is made here.
@@ -181,8 +180,10 @@ Part = Carrier | Clusters | Autoencoder
 
 
 def read_part(path: Path) -> Part:
-    """Read a file of any method, told by its content. Raises InputError where it cannot be opened,
-    FormatError where it is nothing known or damaged."""
+    """Read a file of any method, told by its content.
+
+    Raises InputError where it cannot be opened, FormatError where it is nothing known or damaged.
+    """
     file, _ = open_for_reading(path)
     with file:
         start = file.read(8)
@@ -341,8 +342,11 @@ def _numbered(path: Path) -> int | None:
 
 
 def all_gaussians(carriers: Sequence[Carrier]) -> Gaussians:
-    """Return the Gaussians of checkpoints that lack different ones: those of the first, then what each
-    further one has beside them. Raises FormatError where they are not of one scene."""
+    """Return the Gaussians of checkpoints that lack different ones.
+
+    Those of the first come first, then what each further one has beside them. Raises FormatError where they
+    are not of one scene.
+    """
     found = carriers[0].gaussians
     for carrier in carriers[1:]:
         theirs = carrier.gaussians
@@ -355,8 +359,9 @@ def all_gaussians(carriers: Sequence[Carrier]) -> Gaussians:
 
 
 def partners(means: Array, carrier: Carrier, may_lack: bool) -> Array | None:
-    """(N,) row of the `carrier`'s Gaussian at each of (N, 3) `means`, -1 where it has none; None where they
-    are the same Gaussians. Raises FormatError where they are not of one scene.
+    """(N,) row of the `carrier`'s Gaussian at each of (N, 3) `means`, -1 where it has none.
+
+    None where they are the same Gaussians. Raises FormatError where they are not of one scene.
 
     A checkpoint that `may_lack` some Gaussians has removed them: those at the same position, bit for bit, are
     the same.

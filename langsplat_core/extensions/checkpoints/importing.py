@@ -52,7 +52,7 @@ def import_scene(
     config: CodecConfig | None = None,
     progress: Progress = silent,
 ) -> tuple[Scene, ImportReport]:
-    """The scene with its language field; without one where `foreign` has no meanings.
+    """Return the scene with its language field; without one where `foreign` has no meanings.
 
     `encoder_id` is the text encoder of the space that the method's vectors are in, by default that of
     LangSplat; `phrases` are stored encoded. A Gaussian's confidence is 1 where it has a meaning, else 0.
@@ -86,7 +86,7 @@ def _first_path(foreign: ForeignScene) -> object:
 def _codec(
     foreign: ForeignScene, config: CodecConfig, vocabulary: Vocabulary, progress: Progress
 ) -> tuple[Codec, CodecReport | None]:
-    """The codec of the scene, and what it loses where it is not the method's own."""
+    """Return the codec of the scene, and what it loses where it is not the method's own."""
     if foreign.codec is not None:
         return foreign.codec, None
     clusters = foreign.levels[-1]
@@ -100,8 +100,10 @@ def _codec(
 
 
 def _cluster_codec(clusters: Leaves, config: CodecConfig) -> Codec | None:
-    """The codec of the vectors of all clusters with a meaning that Gaussians belong to, in their order; None
-    for a kind that keeps no vectors as they are."""
+    """Return a codec that keeps the vectors of all clusters in use exactly, in their order.
+
+    None for a kind of codec that keeps no vectors as they are.
+    """
     named = (clusters.index >= 0) & (clusters.index < len(clusters.vectors))
     counts = np.bincount(clusters.index[named], minlength=len(clusters.vectors))
     used = np.flatnonzero((counts > 0) & _has_meaning(clusters.vectors))

@@ -1,5 +1,6 @@
-"""Files of the original LangSplat and of Gaussian Splatting in torch: features of photographs, the
-autoencoder, and checkpoints of Gaussian models.
+"""Files of the original LangSplat and of Gaussian Splatting in torch.
+
+These are features of photographs, the autoencoder, and checkpoints of Gaussian models.
 
 The masks and CLIP vectors of one photograph:
 
@@ -92,7 +93,10 @@ def is_autoencoder(content: Mapping[Any, Any]) -> bool:
 
 
 def autoencoder_from(content: Mapping[str, Any], path: Path) -> AutoencoderCodec:
-    """The codec of these weights, batch normalisation folded into the linear layers. Raises FormatError."""
+    """Return the codec of these weights, batch normalisation folded into the linear layers.
+
+    Raises FormatError.
+    """
     try:
         with np.errstate(all="ignore"):  # what is not finite is refused below
             codec = AutoencoderCodec(
@@ -133,7 +137,10 @@ def _folded(layers: list[Layer]) -> tuple[tuple[Array, Array], ...]:
 
 
 def autoencoder_weights(encoder: Layers, decoder: Layers) -> dict[str, Array]:
-    """The dictionary of a codec; its batch normalisations change nothing, because theirs are folded in."""
+    """Return the dictionary of a codec.
+
+    Its batch normalisations change nothing, because theirs are folded in.
+    """
     named: dict[str, Array] = {}
     last = len(encoder) - 1
     for number, (weight, bias) in enumerate(encoder):
@@ -168,7 +175,7 @@ GEOMETRY = 7  # elements that every method has
 
 
 def model_tuple(content: Any) -> tuple[Any, ...] | None:
-    """The elements of a Gaussian model in what a file holds; None where it is something else."""
+    """Return the elements of a Gaussian model in what a file holds; None where it is something else."""
     if isinstance(content, (tuple, list)) and len(content) == 2 and isinstance(content[0], (tuple, list)):
         content = content[0]
     if not isinstance(content, (tuple, list)) or len(content) <= GEOMETRY:
@@ -177,7 +184,10 @@ def model_tuple(content: Any) -> tuple[Any, ...] | None:
 
 
 def gaussians_of(elements: tuple[Any, ...], path: Path) -> Gaussians:
-    """The Gaussians in elements 1 to 6. Raises FormatError where one has another shape."""
+    """Return the Gaussians in elements 1 to 6.
+
+    Raises FormatError where one has another shape.
+    """
     means = _element(elements, 1, (None, 3), "positions (N, 3)", path)
     count = len(means)
     base = _element(elements, 2, (count, 1, 3), f"base colours ({count}, 1, 3)", path)
@@ -216,8 +226,10 @@ ITERATION = 30_000
 
 
 def write_checkpoint(path: Path, gaussians: Gaussians, features: Array) -> None:
-    """A level's checkpoint with (N, D) float32 `features`, zero where a Gaussian has no meaning; atomically.
-    It loads with and without `weights_only`."""
+    """Return a level's checkpoint with (N, D) float32 `features`, zero where a Gaussian has no meaning.
+
+    Atomically. It loads with and without `weights_only`.
+    """
     import torch
 
     count = len(gaussians)

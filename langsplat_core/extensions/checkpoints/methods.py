@@ -82,7 +82,7 @@ class ForeignScene:
 
 
 def read_foreign(paths: Sequence[Path], levels: Sequence[str] = ()) -> ForeignScene:
-    """The scene in checkpoints of another method and in what belongs to them, in any order.
+    """Return the scene in checkpoints of another method and in what belongs to them, in any order.
 
     `levels` names those of the checkpoints with features, in their order. Raises InputError where a file
     cannot be opened or one is missing, FormatError where one is damaged, unknown, or of another scene.
@@ -223,7 +223,7 @@ def _notes(numbers: list[int], featured: list[Carrier], how: str, pruned: int) -
 
 
 def _scene(carrier: Carrier) -> Scene:
-    """The carrier's Gaussians, and the cameras that 3D Gaussian Splatting puts into the model's folder."""
+    """Return the carrier's Gaussians, with the cameras in the model's folder."""
     warn_of_undrawable(carrier.path, carrier.gaussians)
     folder = carrier.path.resolve().parent
     model = folder.parent.parent if carrier.path.name == "point_cloud.ply" else folder

@@ -45,7 +45,10 @@ class _Kind:
         raise FormatError("holds NumPy data of a type made of others, or damaged; save plain tensors")
 
     def array(self, shape: tuple[Any, ...], data: Any, order: Any) -> Array:
-        """A copy of `data` in the machine's byte order. Raises FormatError where shape and bytes differ."""
+        """Return a copy of `data` in the machine's byte order.
+
+        Raises FormatError where shape and bytes differ.
+        """
         whole = len(shape) <= 32 and all(type(size) is int and size >= 0 for size in shape)
         if not whole or type(data) is not bytes or len(data) != math.prod(shape) * self.dtype.itemsize:
             raise FormatError(f"damaged: an array of {self.dtype} and its bytes differ in size")
@@ -94,8 +97,9 @@ _NAMED = {
 
 @optional_imports()
 def load_torch(path: Path) -> Any:
-    """Return the content of a file of `torch.save`; tensors are on the CPU and, where the file allows, read
-    when used.
+    """Return the content of a file of `torch.save`.
+
+    Tensors are on the CPU and, where the file allows, read when used.
 
     Tensors, containers, and NumPy's numbers and arrays, which training code leaves among them; `plain_array`
     and `plain_mapping` say what they are. Raises InputError where the file cannot be opened; FormatError
@@ -158,8 +162,9 @@ def _check_pickle(stream: IO[bytes]) -> None:
 
 
 def plain_array(value: Any, path: Path) -> Array | None:
-    """A tensor (or array) of numbers as a NumPy array, not copied where it need not be; None for anything
-    else.
+    """Return a tensor (or array) of numbers as a NumPy array, not copied where it need not be.
+
+    None for anything else.
 
     Raises FormatError for a tensor that no array can be, or that claims more numbers than the file holds.
     """
@@ -180,5 +185,8 @@ def plain_array(value: Any, path: Path) -> Array | None:
 
 
 def plain_mapping(value: Any) -> dict[Any, Any] | None:
-    """A dictionary, without what a file may have set in place of its methods; None for anything else."""
+    """Return a dictionary, without what a file may have set in place of its methods.
+
+    None for anything else.
+    """
     return dict(dict.items(value)) if isinstance(value, dict) else None

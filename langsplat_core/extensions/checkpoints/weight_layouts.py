@@ -145,7 +145,10 @@ def converted(id: str, file: Path) -> Converted | None:
 
 
 def _read(id: str, file: Path) -> Tensors:
-    """The tensors of a file, without the wrappings of a training's checkpoint; none of its code is run."""
+    """Return the tensors of a file, without the wrappings of a training's checkpoint.
+
+    None of its code is run.
+    """
     import torch
     from safetensors.torch import load_file
 
@@ -203,7 +206,7 @@ def _stated(path: Path) -> Settings:
 
 
 def _clip_config(tensors: Tensors) -> Settings:
-    """Settings by the shapes, as in a config.json of transformers."""
+    """Return settings by the shapes, as in a config.json of transformers."""
     words, wide = _shape(tensors, "token_embedding.weight", 2)
     channels, _, patch, _ = _shape(tensors, "visual.conv1.weight", 4)
     positions, _ = _shape(tensors, "visual.positional_embedding", 2)
@@ -230,8 +233,7 @@ def _clip_config(tensors: Tensors) -> Settings:
 
 
 def _check(model: Settings, config: Settings) -> None:
-    """Raise ValueError where open_clip_config.json asks for another network than is computed here, or states
-    other numbers than the tensors have."""
+    """Raise ValueError where open_clip_config.json asks for another network than the tensors are."""
     text, vision = config["text_config"], config["vision_config"]
     for part in STATED:
         settings = model if part == "model_cfg" else model[part]
@@ -273,7 +275,7 @@ def _clip_tensors(tensors: Tensors) -> dict[str, Any]:
 
 
 def _block(name: str, found: re.Match[str], tensor: Any) -> dict[str, Any]:
-    """The tensors of a layer that one of open_clip's is: queries, keys and values are one there."""
+    """Return the tensors of a layer that one of open_clip's is: queries, keys and values are one there."""
     layer = f"{'vision' if found[1] else 'text'}_model.encoder.layers.{found[2]}."
     if found[4].startswith("in_proj_"):
         part = found[4].removeprefix("in_proj_")
@@ -299,7 +301,7 @@ def _sam_tensors(tensors: Tensors, names: Names) -> dict[str, Any]:
 
 
 def _sam_config(tensors: Tensors) -> Settings:
-    """Settings by the shapes, as in a config.json of transformers."""
+    """Return settings by the shapes, as in a config.json of transformers."""
     _, grid, _, wide = _shape(tensors, "image_encoder.pos_embed", 4)
     patch = _shape(tensors, "image_encoder.patch_embed.proj.weight", 4)[2]
     layers = _count(tensors, r"image_encoder\.blocks\.(\d+)\.")
@@ -328,7 +330,10 @@ def _sam_config(tensors: Tensors) -> Settings:
 
 
 def _decoder_config(tensors: Tensors, first: str) -> Settings:
-    """Settings of the halves for prompts and masks, by the shapes; `first`: of the two layers of an "mlp"."""
+    """Return settings of the halves for prompts and masks, by the shapes.
+
+    `first`: of the two layers of an "mlp".
+    """
     tokens, size = _shape(tensors, "mask_decoder.mask_tokens.weight", 2)
     decoder = "mask_decoder.transformer.layers.0."
     narrow = _shape(tensors, f"{decoder}cross_attn_token_to_image.q_proj.weight", 2)[0]
@@ -347,8 +352,10 @@ def _decoder_config(tensors: Tensors, first: str) -> Settings:
 
 
 def _sam2(tensors: dict[str, Any]) -> Converted:
-    """The half of a SAM 2 or 2.1 that sees single images; its memory of films is left out. tensors: without
-    "sam_" before the names of prompt encoder and mask decoder."""
+    """Return the half of a SAM 2 or 2.1 that sees single images; its memory of films is left out.
+
+    tensors: without "sam_" before the names of prompt encoder and mask decoder.
+    """
     import torch
 
     points = [tensors.pop(name) for name in SAM2_POINTS if _shape(tensors, name, 2)]
@@ -358,7 +365,7 @@ def _sam2(tensors: dict[str, Any]) -> Converted:
 
 
 def _sam2_config(tensors: Tensors) -> Settings:
-    """Settings by shapes and published sizes, as in a config.json of transformers."""
+    """Return settings by shapes and published sizes, as in a config.json of transformers."""
     _, wide, *background = _shape(tensors, "image_encoder.trunk.pos_embed", 4)
     blocks = _count(tensors, r"image_encoder\.trunk\.blocks\.(\d+)\.")
     if (wide, blocks) not in SAM2_SIZES:

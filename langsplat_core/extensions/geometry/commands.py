@@ -47,8 +47,11 @@ TRANSFORM_LIMIT = 1 << 20  # bytes of a file with a matrix
 
 @dataclass(frozen=True)
 class Mesh:
-    """Write the surface of a scene, or of what a phrase names, as triangles with colours. They are fused from
-    images rendered by the scene's cameras, or from around it, so that what no camera sees has none."""
+    """Write the surface of a scene, or of what a phrase names, as triangles with colours.
+
+    They are fused from images rendered by the scene's cameras, or from around it, so that what no camera sees
+    has none.
+    """
 
     scene: AnyScene
     out: tyro.conf.Positional[OutFile]
@@ -96,8 +99,10 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Register:
-    """Find how a scene lies in the axes of another one of the same place. The exit code is 2 where their
-    surfaces do not agree."""
+    """Find how a scene lies in the axes of another one of the same place.
+
+    The exit code is 2 where their surfaces do not agree.
+    """
 
     moving: tyro.conf.Positional[Path]
     """The scene that would be moved."""
@@ -123,8 +128,10 @@ class Register:
 
 @dataclass(frozen=True)
 class Merge:
-    """Write two scenes as one: Gaussians, cameras, language field, tree and taught words of both. The second
-    is first laid onto the first, as `langsplat register` finds it, or as told."""
+    """Write two scenes as one: Gaussians, cameras, language field, tree and taught words of both.
+
+    The second is first laid onto the first, as `langsplat register` finds it, or as told.
+    """
 
     first: tyro.conf.Positional[Path]
     """A scene; what is said of a whole scene is as here."""
@@ -175,7 +182,7 @@ def registered(moving: Scene, fixed: Scene, scaled: bool, progress: Progress) ->
 
 
 def read_transform(path: Path) -> Similarity:
-    """The similarity in a file of `langsplat register`; InputError and FormatError name the file."""
+    """Return the similarity in a file of `langsplat register`; InputError and FormatError name the file."""
     entry = read_json_file(path, TRANSFORM_LIMIT)
     matrix = numbers(entry if isinstance(entry, dict) else {}, "matrix", (4, 4), str(path))
     try:
@@ -196,8 +203,11 @@ NO_SCALE = (
 
 @dataclass(frozen=True)
 class Map:
-    """Write what a robot needs: an occupancy grid as Nav2 reads it (map.pgm, map.yaml), labelled voxels
-    (voxels.npz, voxels.ply), a collider (collider.obj), and poses in front of things (goals.json)."""
+    """Write what a robot needs to know of a scene: maps, labelled voxels and poses.
+
+    There is an occupancy grid as Nav2 reads it (map.pgm, map.yaml), labelled voxels (voxels.npz, voxels.ply),
+    a collider (collider.obj), and poses in front of things (goals.json).
+    """
 
     scene: tyro.conf.Positional[Path]
     """A trained scene with its cameras; with a language field voxels have words and goals are found."""
@@ -305,8 +315,10 @@ def write_collider(path: Path, occupancy: Occupancy) -> None:
 def write_voxels(
     folder: Path, occupancy: Occupancy, scene: Scene, engine: QueryEngine | None, progress: Progress
 ) -> None:
-    """Write the occupied voxels with the whole of the scene's tree that each is in, and its word, as
-    `voxels.npz` and `voxels.ply`."""
+    """Write the occupied voxels as `voxels.npz` and `voxels.ply`.
+
+    Each has the number of the whole of the scene's tree that it is in, and the word of that.
+    """
     cells = np.argwhere(occupancy.occupied)
     nodes, words = np.full(len(cells), NO_NODE), {}
     if engine is not None:

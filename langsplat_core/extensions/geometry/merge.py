@@ -13,7 +13,7 @@ from langsplat_core.scene.tree import NO_NODE
 
 
 def merge(first: Scene, second: Scene) -> Scene:
-    """The Gaussians of both, those of `first` first, and all that belongs to them.
+    """Return the Gaussians of both, those of `first` first, and all that belongs to them.
 
     Gaussians of a scene without a language field get no meaning. Where both say something of the whole scene
     or of one word, `first` counts; properties that only one has are left out. Raises InputError where one
@@ -66,7 +66,7 @@ def _language(first: Scene, second: Scene) -> LanguageField | None:
 
 
 def _meaningless(field: LanguageField, count: int) -> LanguageField:
-    """A field of `count` Gaussians that mean nothing, in the way of `field`."""
+    """Return a field of `count` Gaussians that mean nothing, in the way of `field`."""
     nothing = np.zeros(0, np.int32)
     empty = Tree(np.full(count, NO_NODE, np.int32), nothing, nothing.astype(np.uint8),
                  np.zeros((0, 2), np.uint16))  # fmt: skip
@@ -79,7 +79,7 @@ def _meaningless(field: LanguageField, count: int) -> LanguageField:
 
 
 def _one_codec(a: LanguageField, b: LanguageField) -> tuple[Codec, Array]:
-    """A codec of both fields, and the (3, N, d) latents of both in it."""
+    """Return a codec of both fields, and the (3, N, d) latents of both in it."""
     mine, theirs = a.codec, b.codec
     both = np.concatenate
     if type(mine) is type(theirs) and _same(mine.tensors(), theirs.tensors()):
@@ -106,7 +106,7 @@ def _same(mine: dict[str, Array], theirs: dict[str, Array]) -> bool:
 
 
 def _one_tree(a: Tree, b: Tree) -> Tree:
-    """The nodes of `a`, then those of `b`."""
+    """Return the nodes of `a`, then those of `b`."""
     shifted = [np.where(row == NO_NODE, row, row + np.int32(a.count)) for row in (b.leaves, b.parents)]
     columns = {"leaves": shifted[0], "parents": shifted[1], "levels": b.levels, "votes": b.votes}
     names = [column.name for column in fields(Tree)]

@@ -45,7 +45,7 @@ class Mesh:
     name: str = "scene"
 
     def holes(self) -> int:
-        """Number of holes: loops of edges with a triangle on one side alone."""
+        """Return the number of holes: loops of edges with a triangle on one side alone."""
         edges = np.sort(self.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
         edges, sides = np.unique(edges, axis=0, return_counts=True)
         rim = edges[sides == 1]
@@ -60,8 +60,11 @@ class Mesh:
 
 
 def surface_depth(gaussians: Gaussians, camera: Camera, rows: Array) -> Array:
-    """(H, W) float32 depth along z, world units, at which each pixel's Gaussian, the one of `rows` (H, W), is
-    densest along the ray through the pixel's centre; 0 where that is -1 or behind the camera."""
+    """Return the depth at which the Gaussian of each pixel is densest along its ray, (H, W) float32.
+
+    The ray runs through the pixel's centre, its Gaussian is that of `rows` (H, W); depth is along z, world
+    units, and 0 where the row is -1 or the point behind the camera.
+    """
     found = np.flatnonzero(rows >= 0)
     chosen, place = np.unique(rows.reshape(-1)[found], return_inverse=True)
     ahead = camera.unproject(camera.pixel_centres().reshape(-1, 2)[found], 1.0)
@@ -88,7 +91,7 @@ def fuse(
     cameras: tuple[Camera, ...] = (),
     progress: Progress = silent,
 ) -> tuple[Mesh, float]:
-    """The surface of a scene, and the side of its voxels, world units.
+    """Return the surface of a scene, and the side of its voxels, world units.
 
     resolution: that side, by default a `FINEST` of the scene's radius, but no less than 1.5 pixels; views:
     how many must show a surface, >= 1; more leave out more, and what is left is nearer to the truth; cameras:
@@ -171,8 +174,10 @@ def _cleaned(mesh: Mesh) -> Mesh:
 
 
 def close_holes(mesh: Mesh, resolution: float) -> tuple[Mesh, float]:
-    """A watertight surface through the mesh (Poisson), and how much of it, world units squared, is farther
-    than two voxels from any vertex: made up to close holes."""
+    """Return a watertight surface through the mesh (Poisson), and how much of it was made up.
+
+    Made up to close holes is what is farther than two voxels from any vertex, world units squared.
+    """
     import open3d
     from scipy.spatial import cKDTree
 

@@ -1,5 +1,4 @@
-"""A scene as a robot needs it: voxels that are occupied, free or never seen, the map of the floor that
-follows, and free places on it that face a thing.
+"""A scene as a robot needs it: voxels, the map of the floor, and free places that face a thing.
 
 Space along a ray of a training camera is free up to the depth of half transmittance and occupied there. What
 no ray passed or met is unknown.
@@ -78,8 +77,11 @@ class Goal:
 
 
 def map_axes(room: Room, metres: float) -> Array:
-    """(4, 4) similarity from world units to the axes of a map: z up, the ground at 0, and x as near to the
-    world's x axis, or its y axis where that is nearly up, as a level axis can be. metres: of a unit."""
+    """Return the (4, 4) similarity from world units to the axes of a map.
+
+    z is up, the ground at 0, and x as near to the world's x axis, or its y axis where that is nearly up, as a
+    level axis can be. metres: of a unit.
+    """
     first = np.eye(3)[0 if abs(room.up[0]) < 0.9 else 1]
     first = first - (first @ room.up) * room.up
     first /= np.linalg.norm(first)
@@ -90,8 +92,11 @@ def map_axes(room: Room, metres: float) -> Array:
 
 
 def find_occupancy(scene: Scene, to_map: Array, resolution: float, progress: Progress = silent) -> Occupancy:
-    """Voxels along the rays of the scene's cameras. resolution: metres. Raises InputError for a scene without
-    cameras, one whose cameras see nothing, and for a grid of more than `MOST_CELLS`."""
+    """Voxels along the rays of the scene's cameras.
+
+    resolution: metres. Raises InputError for a scene without cameras, one whose cameras see nothing, and for
+    a grid of more than `MOST_CELLS`.
+    """
     if not scene.cameras:
         raise InputError(
             "the scene has no cameras, so nobody knows what is free; a map needs a trained scene"
@@ -128,8 +133,10 @@ def _moved(points: Array, transform: Array) -> Array:
 
 @kernel
 def trace(eye: Array, ends: Array, hits: Array, passes: Array) -> None:
-    """Walk from `eye` (3,) to each of `ends` (P, 3), in voxels, voxel by voxel (Amanatides and Woo 1987);
-    counts stop at the largest number."""
+    """Walk from `eye` (3,) to each of `ends` (P, 3), in voxels, voxel by voxel (Amanatides and Woo 1987).
+
+    Counts stop at the largest number.
+    """
     most = np.iinfo(np.uint16).max
     shape = hits.shape
     cell, last, step = np.zeros(3, np.int64), np.zeros(3, np.int64), np.zeros(3, np.int64)
@@ -161,7 +168,7 @@ def trace(eye: Array, ends: Array, hits: Array, passes: Array) -> None:
 
 
 def floor_map(occupancy: Occupancy, step: float, height: float) -> FloorMap:
-    """The map for a robot of a height, metres, that drives over what is lower than `step`."""
+    """Return the map for a robot of a height, metres, that drives over what is lower than `step`."""
     floors = occupancy.origin[2] + np.arange(occupancy.hits.shape[2]) * occupancy.resolution
     band = (floors + occupancy.resolution / 2 >= step) & (floors <= height)
     if not band.any():
@@ -175,8 +182,11 @@ def floor_map(occupancy: Occupancy, step: float, height: float) -> FloorMap:
 
 
 def reachable(plan: FloorMap, radius: float, start: tuple[float, float] | None = None) -> Array:
-    """(X, Y) bool: the cells in which the middle of a robot of a radius, metres, may be, and that are
-    connected with `start`, or with most others. Raises InputError where there are none."""
+    """Return the cells in which the middle of a robot may be, (X, Y) bool.
+
+    They are as far as its radius, metres, from obstacles, and connected with `start`, or with most others.
+    Raises InputError where there are none.
+    """
     blocked = np.pad(~plan.free, 1, constant_values=True)
     clear = (ndimage.distance_transform_edt(~blocked)[1:-1, 1:-1] - 0.5) * plan.resolution >= radius
     labels, count = ndimage.label(clear)
@@ -193,7 +203,9 @@ def reachable(plan: FloorMap, radius: float, start: tuple[float, float] | None =
 
 
 def find_goal(plan: FloorMap, where: Array, points: Array, least: float = 0.0) -> Goal | None:
-    """The pose of `where` (X, Y) bool nearest to a thing, facing it, with nothing between; None for none.
+    """Return the pose of `where` (X, Y) bool nearest to a thing, facing it, with nothing between.
+
+    None for none.
 
     points: (P, 2) metres, of the thing seen from above, P >= 1; least: metres to be kept from it, also where
     it hangs.
@@ -231,8 +243,10 @@ def _between(plan: FloorMap, blocked: Array, start: Array, end: Array) -> bool:
 
 
 def collider(occupancy: Occupancy) -> tuple[Array, Array]:
-    """(V, 3) corners, metres, and (F, 4) int64 squares around everything that is occupied, seen from outside
-    counterclockwise."""
+    """Return squares around everything that is occupied: (V, 3) corners, metres, (F, 4) int64 faces.
+
+    Seen from outside, corners run counterclockwise.
+    """
     solid = np.pad(occupancy.occupied, 1)
     corners, squares = [], []
     count = 0

@@ -43,10 +43,10 @@ class Room:
 
 
 def find_planes(points: Array, near: float, least: float, seed: int = 0) -> list[Plane]:
-    """The planes with the most of (P, 3) points, the largest first: found one after the other, each among
-    what the ones before it left over.
+    """Return the planes with the most of (P, 3) points, the largest first.
 
-    near: how far from a plane its points lie; least: points of a plane. Shares are of these points.
+    They are found one after the other, each among the points that the ones before it left over. near: how far
+    from a plane its points lie; least: points of a plane. Shares are of these points.
     """
     import open3d
 
@@ -64,8 +64,11 @@ def find_planes(points: Array, near: float, least: float, seed: int = 0) -> list
 
 
 def find_room(scene: Scene, seed: int = 0) -> Room:
-    """Floor, walls and up of a scene. The floor is the largest level plane with hardly any surface below it.
-    Raises InputError for a scene without a surface."""
+    """Floor, walls and up of a scene.
+
+    The floor is the largest level plane with hardly any surface below it. Raises InputError for a scene
+    without a surface.
+    """
     points, normals = sample_surface(scene.gaussians, SAMPLES, seed)
     centre, radius = scene.bounds()
     up, near, least = scene.up(), NEAR * radius, LEAST * len(points)
@@ -92,8 +95,10 @@ def find_room(scene: Scene, seed: int = 0) -> Room:
 
 
 def _facing(plane: Plane, towards: Array, offset: float = 0.0) -> Plane:
-    """The plane with its normal on the side of `towards` (3,): a direction, or a point with the plane's own
-    offset."""
+    """Return the plane with its normal on the side of `towards`, a (3,) direction.
+
+    `towards` may also be a point with the plane's own offset.
+    """
     if towards @ plane.normal >= offset:
         return plane
     return Plane(-plane.normal, -plane.offset, plane.share)

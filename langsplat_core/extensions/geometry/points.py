@@ -16,11 +16,11 @@ FEWEST = 100  # Gaussians: fewer have no surface to speak of
 
 
 def sample_surface(gaussians: Gaussians, count: int, seed: int = 0) -> tuple[Array, Array]:
-    """(count, 3) float64 points on the surface, as many on equal areas, and their (count, 3) unit normals, of
-    either sign. Raises InputError for a scene with less than `FEWEST` opaque Gaussians.
+    """Return (count, 3) float64 points on the surface, as many on equal areas, and their unit normals.
 
-    A Gaussian is a disc across its shortest axis, with the density of its two longest ones; one of a wall
-    counts as many times as it covers.
+    Normals, (count, 3), are of either sign. A Gaussian is a disc across its shortest axis, with the density
+    of its two longest ones; one of a wall counts as many times as it covers. Raises InputError for a scene
+    with less than `FEWEST` opaque Gaussians.
     """
     rows = np.flatnonzero(surface_weights(gaussians) > 0)
     areas = surface_areas(gaussians)[rows]

@@ -1,5 +1,7 @@
-"""How two scenes of one place lie to each other: features of surface points, RANSAC, ICP (Open3D), and a
-check by rendering whether the answer can be trusted."""
+"""The transform between two scenes of one place, and whether it can be trusted.
+
+Features of surface points are matched by RANSAC and refined by ICP (Open3D); renderings check the answer.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -93,8 +95,10 @@ def quarter_turns(scene: Scene) -> list[Array]:
 def _aligned(
     moving: Array, fixed: Array, turns: list[Array], radius: float, scaled: bool, seed: int
 ) -> tuple[Array, float]:
-    """(4, 4) that lays points (P, 3) onto others, and the error of those that lie on each other. turns:
-    (4, 4) each, tried after RANSAC."""
+    """(4, 4) that lays points (P, 3) onto others, and the error of those that lie on each other.
+
+    turns: (4, 4) each, tried after RANSAC.
+    """
     import open3d
 
     methods = open3d.pipelines.registration
@@ -133,8 +137,11 @@ def _aligned(
 
 
 def agreement(moving: Scene, fixed: Scene, transform: Array) -> float:
-    """The share of pixels at which two scenes have surfaces at the same depth, of those that both fill, as
-    seen by cameras of both; 0 where no camera sees enough of both. transform: (4, 4), moving to fixed."""
+    """Return the share of pixels at which two scenes have surfaces at the same depth.
+
+    It is of the pixels that both fill, as seen by cameras of both; 0 where no camera sees enough of both.
+    transform: (4, 4), moving to fixed.
+    """
     back = np.linalg.inv(transform)
     views = [(camera, *moved_camera(camera, transform)) for camera in _some(fixed)]
     for camera in _some(moving):
@@ -151,7 +158,7 @@ def agreement(moving: Scene, fixed: Scene, transform: Array) -> float:
 
 
 def _some(scene: Scene) -> list[Camera]:
-    """A few cameras of a scene, small; two that frame it where it has none."""
+    """Return a few cameras of a scene, small; two that frame it where it has none."""
     cameras = scene.cameras or (scene.framing_camera((SIDE, SIDE)),)
     chosen = np.unique(np.linspace(0, len(cameras) - 1, VIEWS).astype(int))
     shrink = [SIDE / max(cameras[i].width, cameras[i].height) for i in chosen]

@@ -1,11 +1,11 @@
-"""What changed between two scenes of one place: nodes of their trees that appeared, are gone, moved, or have
-another colour.
+"""What changed between two scenes of one place: what appeared, is gone, moved or has another colour.
 
 Both scenes are rendered from the training cameras of both. A pixel of one scene is *gone* where the other has
 its surface clearly farther behind, *hidden* where it has it nearer, and else *kept*; what is kept may have
 *another colour*. With the adjoint of the rasterizer these four are summed over the Gaussians that paint a
-pixel, and from them over the nodes. So a node changes where most of its own pixels say so, however the two
-trees are divided; what one capture did not see, or what stands behind something new, says nothing.
+pixel, and from them over the nodes of the scene's tree. So a node changes where most of its own pixels say so,
+however the two trees are divided; what one capture did not see, or what stands behind something new, says
+nothing.
 """
 
 from collections.abc import Sequence
@@ -108,10 +108,12 @@ def changes(
     describers: tuple[Describer, Describer] | None = None,
     progress: Progress = silent,
 ) -> tuple[Change, ...]:
-    """What changed from the first scene to the second, the largest first of each of `KINDS`. placed: (4, 4)
-    similarity from the second scene's frame into the first one's; None: they are one. describers: of both,
-    for names. Raises InputError for a scene without cameras or language field, and for a matrix that is no
-    similarity."""
+    """Return what changed from the first scene to the second, the largest first of each of `KINDS`.
+
+    placed: (4, 4) similarity from the second scene's frame into the first one's; None: they are one.
+    describers: of both, for names. Raises InputError for a scene without cameras or language field, and for a
+    matrix that is no similarity.
+    """
     into = np.eye(4) if placed is None else similarity(placed).matrix
     before, after = _evidence(first.scene, second.scene, into, rasterizer, progress)
     home = (first, before, np.eye(4)), (second, after, into)
@@ -209,7 +211,10 @@ _TERMS = {
 
 
 def colour_term(lab: Array) -> str:
-    """The basic colour term nearest to a colour (3,) in CIE L*a*b*; lightness counts half, for the shade."""
+    """Return the basic colour term nearest to a colour (3,) in CIE L*a*b*.
+
+    Lightness counts half, for the shade.
+    """
     terms = to_lab(np.array(list(_TERMS.values())) / 255)
     return list(_TERMS)[int((((terms - lab) * (0.5, 1, 1)) ** 2).sum(1).argmin())]
 
@@ -242,8 +247,10 @@ def _has_changed(evidence: Array) -> bool:
 
 
 def _meanings(engine: QueryEngine) -> tuple[Array, Array, Array]:
-    """(U, D) vectors of distinct codewords, from the mean of the scene; their (N,) number at level whole, -1
-    for none; and the (N,) areas of Gaussians."""
+    """(U, D) vectors of distinct codewords, from the mean of the scene.
+
+    Their (N,) number at level whole, -1 for none; and the (N,) areas of Gaussians.
+    """
     field, level = engine.field, len(LEVELS) - 1
     number, areas = np.full(len(field), -1), surface_areas(engine.scene.gaussians)
     known = field.known[level]
@@ -298,7 +305,7 @@ def _together(
 
 
 def _meet(one: Array, other: Array) -> bool:
-    """True if two boxes (2, 3) overlap, or nearly."""
+    """Return True if two boxes (2, 3) overlap, or nearly."""
     room = TOUCHING * max(np.linalg.norm(one[1] - one[0]), np.linalg.norm(other[1] - other[0]))
     return bool(((one[0] - room <= other[1]) & (other[0] - room <= one[1])).all())
 
@@ -329,6 +336,6 @@ def _change(kind: Kind, piece: _Piece, scene: int, describers: tuple[Describer, 
 
 
 def _name(describer: Describer, rows: Array) -> str | None:
-    """The likeliest name of the Gaussians `rows` as one whole."""
+    """Return the likeliest name of the Gaussians `rows` as one whole."""
     name = likely_name(describer.at_gaussians(rows, top=NAMES)[-1].words)
     return None if name is None else name.phrase

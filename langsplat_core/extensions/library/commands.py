@@ -34,8 +34,10 @@ COLUMNS, CAPTION, GAP = 4, 44, 8  # of a sheet: pictures in a row; pixels below 
 
 @dataclass(frozen=True)
 class Find:
-    """Find phrases in all scenes of a folder: the most certain answers first, with scene, place and box. An
-    index of what the scenes mean is kept in the folder and brought up to date; the first call reads all."""
+    """Find phrases in all scenes of a folder: the most certain answers first, with scene, place and box.
+
+    An index of what the scenes mean is kept in the folder and brought up to date; the first call reads all.
+    """
 
     words: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="TEXT... FOLDER")]
     """Phrases, each in quotes if it has several words, and last the folder; scenes in its folders count."""
@@ -140,7 +142,7 @@ def _hit_fields(hit: Hit, library: Library) -> dict[str, Any]:
 
 
 def _write_sheet(path: Path, listed: Sequence[tuple[Answered, list[Hit]]], library: Library) -> None:
-    """The answers that have pictures, under the headings of their phrases."""
+    """Return the answers that have pictures, under the headings of their phrases."""
     with atomic_path(path) as temporary:
         if path.suffix.lower() == ".html":
             temporary.write_text(_html(listed, library), encoding="utf-8")
@@ -190,7 +192,9 @@ def _image(listed: Sequence[tuple[Answered, list[Hit]]], library: Library) -> Im
 @dataclass(frozen=True)
 class Changes:
     """Say what changed between two scenes of one place: what appeared, is gone, moved, or has another colour.
-    Places are in the first scene's frame."""
+
+    Places are in the first scene's frame.
+    """
 
     before: TrainedScene
     after: tyro.conf.Positional[Path]

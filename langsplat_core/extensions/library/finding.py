@@ -50,13 +50,16 @@ class Answered:
     unread: tuple[tuple[str, str], ...] = ()  # scenes that could not be opened, and why
 
     def count(self, verdict: Verdict) -> int:
-        """Number of scenes with this verdict."""
+        """Return the number of scenes with this verdict."""
         return sum(hit.verdict == verdict for hit in self.hits)
 
 
 def margin(probability: float | None, found: float, above: float | None) -> float:
-    """How certain an answer is, 0 where it begins to count as found: logits of its probability above those of
-    `found`, or, where the encoder has no calibration, spreads above chance."""
+    """Return how certain an answer is; 0 is where it begins to count as found.
+
+    The margin is in logits of its probability above those of `found`, or, where the encoder has no
+    calibration, in spreads above chance.
+    """
     if probability is not None:
         return float(logit(np.array(probability)) - logit(np.array(min(found, 1 - NARROWEST))))
     return -math.inf if above is None else above
@@ -80,8 +83,11 @@ def find(
     at_most: int = 20,
     progress: Progress = silent,
 ) -> list[Answered]:
-    """A phrase in every scene, group by group, the most certain answers first. The first `at_most` scenes of
-    a group that answer are opened and asked exactly; the verdicts of the others are those of the index."""
+    """Return a phrase in every scene, group by group, the most certain answers first.
+
+    The first `at_most` scenes of a group that answer are opened and asked exactly; the verdicts of the others
+    are those of the index.
+    """
     return [_ask_group(library, group, phrase, load_encoder, at_most, progress) for group in library.groups]
 
 
@@ -141,8 +147,11 @@ def rank(group: Group, vectors: Mapping[str, Array]) -> list[tuple[float, float 
 
 
 def _vector(library: Library, group: Group, text: str, load_encoder: LoadEncoder | None) -> Array:
-    """(D,) unit vector of a phrase: from the encoder, checked against the group's canonical vectors, else
-    from the first phrasebook that has it. Raises EncoderError and, for no phrase, InputError."""
+    """Return the (D,) unit vector of a phrase.
+
+    It is the encoder's, checked against the group's canonical vectors, else that of the first phrasebook that
+    has it. Raises EncoderError and, for no phrase, InputError.
+    """
     dim = group.canonical.shape[1]
     codec = LinearCodec(np.eye(1, dim, dtype=np.float32))
     none = np.zeros((len(LEVELS), 0, 1), np.float32), np.zeros((len(LEVELS), 0), np.float32)
@@ -159,7 +168,7 @@ def _vector(library: Library, group: Group, text: str, load_encoder: LoadEncoder
 
 
 def ask_scene(path: Path, phrase: str, load_encoder: LoadEncoder | None) -> Hit:
-    """The engine's own answer to a phrase in one scene, with a picture of it."""
+    """Return the engine's own answer to a phrase in one scene, with a picture of it."""
     scene = load_scene(path)
     engine = QueryEngine(scene, load_encoder)
     answer = run_phrase(engine, phrase).answer

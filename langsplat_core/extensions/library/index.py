@@ -96,7 +96,7 @@ class Listed:
         return one, two, three, four
 
     def odds(self, kind: Named) -> Odds | None:
-        """The calibration for what is named; None where the encoder has none here."""
+        """Return the calibration for what is named; None where the encoder has none here."""
         at = 8 if kind == "thing" else 12
         return None if math.isnan(self.numbers[at]) else Odds(*self.numbers[at : at + 4])
 
@@ -136,8 +136,10 @@ class Library:
 
 
 def scenes_in(folder: Path) -> list[Path]:
-    """Every scene below a folder with a language field beside it, by name; hidden folders are left out. Of
-    several scenes beside one field the first. InputError where there is no such folder."""
+    """Every scene below a folder with a language field beside it, by name; hidden folders are left out.
+
+    Of several scenes beside one field the first. InputError where there is no such folder.
+    """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; name one with scenes in it")
     found: list[Path] = []
@@ -206,7 +208,7 @@ def digest(path: Path, name: str, load_encoder: LoadEncoder | None) -> Digest:
 
 
 def _columns(engine: QueryEngine) -> tuple[dict[str, Array], tuple[int, ...]]:
-    """The arrays of a scene, and their `Listed.counts`."""
+    """Return the arrays of a scene, and their `Listed.counts`."""
     field, regions, scale = engine.field, engine.regions, engine.scale
     latents, of = field.codec.unique(field.latents[field.known])
     number = np.full(field.known.shape, -1, np.int64)
@@ -248,9 +250,12 @@ def update_library(
     progress: Progress = silent,
     rebuild: bool = False,
 ) -> Library:
-    """The library of a folder, with scenes that are new or have changed read again, and the index written
-    where anything is different. An interrupted call keeps what it had read. rebuild: every scene is read,
-    whatever the index says. Raises InputError without scenes and FormatError for an index that is none."""
+    """Return the library of a folder, with new and changed scenes read again.
+
+    The index is written where anything is different; an interrupted call keeps what it had read. rebuild:
+    every scene is read, whatever the index says. Raises InputError without scenes and FormatError for an
+    index that is none.
+    """
     index = folder / INDEX if index is None else index
     paths = {path.relative_to(folder).as_posix(): path for path in scenes_in(folder)}
     if not paths:
@@ -337,8 +342,11 @@ def _stated(listed: Listed) -> list[Any]:
 
 
 def read_library(index: Path, folder: Path) -> Library:
-    """Map an index into memory. Raises InputError where it cannot be opened, and FormatError for what breaks
-    a rule of its layout; nothing is allocated on the word of its header."""
+    """Map an index into memory.
+
+    Raises InputError where it cannot be opened, and FormatError for what breaks a rule of its layout; nothing
+    is allocated on the word of its header.
+    """
     file, size = open_for_reading(index)
     with file:
         start = file.read(16)
@@ -412,8 +420,10 @@ def _listed(row: Any) -> Listed:
 
 
 def fits_in(group: Group, vector: Array) -> Array:
-    """(S, 3) float64 fits of a phrase's (D,) unit vector in every scene, see `QueryResult.fits`; -inf in
-    those that are not indexed. FormatError for an index whose numbers do not fit each other."""
+    """(S, 3) float64 fits of a phrase's (D,) unit vector in every scene, see `QueryResult.fits`.
+
+    -inf in those that are not indexed. FormatError for an index whose numbers do not fit each other.
+    """
     found, columns = np.full((len(group.scenes), len(LEVELS)), -np.inf), group.columns
     levels = np.array([scene.counts[1:4] for scene in group.scenes], np.int64).reshape(-1, 3)
     arrays, phrase = Columns(**columns), np.require(vector, np.float32, "C")
@@ -493,8 +503,11 @@ def _best_fits(fits: Array, parents: Array, solid: Array, levels: Array, found: 
 
 
 def draw(scene: Scene, size: tuple[int, int], answer: QueryResult | None = None) -> Array:
-    """(H, W, 3) uint8 picture of a scene, of `size` (width, height); with an answer from the training camera
-    nearest to its place that has it in its image, with the answer as a heat map."""
+    """(H, W, 3) uint8 picture of a scene, of `size` (width, height).
+
+    With an answer from the training camera nearest to its place that has it in its image, with the answer as
+    a heat map.
+    """
     camera = _camera(scene, size, answer)
     values = None if answer is None else answer.even[:, None] * answer.members[:, None]
     drawn = render(scene, camera, values)
