@@ -3,8 +3,8 @@
 Both scenes are rendered from the training cameras of both. A pixel of one scene is *gone* where the other has
 its surface clearly farther behind, *hidden* where it has it nearer, and else *kept*; what is kept may have
 *another colour*. With the adjoint of the rasterizer these four are summed over the Gaussians that paint a
-pixel, and from them over the nodes of the scene's tree. So a node changes where most of its own pixels say so,
-however the two trees are divided; what one capture did not see, or what stands behind something new, says
+pixel, and from them over the nodes of the scene's tree. So a node changes where most of its own pixels say
+so, however the two trees are divided; what one capture did not see, or what stands behind something new, says
 nothing.
 """
 
