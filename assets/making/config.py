@@ -1,7 +1,6 @@
 """Settings of the rooms and of the demo encoder's training; the command line is derived from them."""
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Literal, get_args
 
 from langsplat_core.config import Count, CountOrZero, Range, Rate, Seed
@@ -17,7 +16,6 @@ Size = tuple[Pixels, Pixels]  # width and height of a picture
 class EncoderConfig:
     """Training of the demo encoder."""
 
-    start: Path | None = None  # folder of an earlier demo encoder to begin from; None: random weights
     rooms: Count = 400  # random rooms that crops are rendered from
     views: Count = 3  # photographs of each room
     plain_crops: CountOrZero = 8_000  # crops of nothing but a colour or a texture

@@ -124,21 +124,6 @@ def normalised(crops: Array) -> Tensor:
     return (pixels - torch.tensor(MEAN).view(3, 1, 1)) / torch.tensor(STD).view(3, 1, 1)
 
 
-def begin_from(model: Any, vocabulary: dict[str, int], folder: Path) -> None:
-    """Give `model` the weights of the encoder in `folder`, and its vectors of the tokens of `vocabulary`
-    (token -> row) that it knows."""
-    from transformers import CLIPModel, CLIPTokenizerFast
-
-    old = CLIPModel.from_pretrained(folder).state_dict()
-    old_rows = CLIPTokenizerFast.from_pretrained(folder).get_vocab()
-    tokens = "text_model.embeddings.token_embedding.weight"
-    vectors = model.state_dict()[tokens].clone()
-    for token, row in vocabulary.items():
-        if token in old_rows:
-            vectors[row] = old[tokens][old_rows[token]]
-    model.load_state_dict({**old, tokens: vectors})
-
-
 def image_features(model: Any, pixels: Tensor, keep: float = 1.0) -> Tensor:
     """(B, 160) features before the projection; `keep` < 1 shows the model that share of the patches, drawn
     at random but rather those that are not all black surroundings."""
@@ -411,8 +396,6 @@ def train_encoder(out: Path, config: EncoderConfig, progress: Progress) -> list[
     sampler = Sampler(crops, book, token_of, ends)
     torch.manual_seed(config.seed)
     model = build_model(len(tokenizer), *ends)
-    if config.start is not None:
-        begin_from(model, tokenizer.get_vocab(), config.start)
     run = _Run(model, sampler.class_counts, config)
     run.resume(work / "state.pt")
     while run.step < config.steps:

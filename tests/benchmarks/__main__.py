@@ -5,14 +5,13 @@ from typing import Union
 
 from langsplat_core.cli.run import Command, main, parsed, with_codec
 from tests.benchmarks.answers import Rooms, Verdicts
-from tests.benchmarks.evidence import Taught, Votes
+from tests.benchmarks.evidence import Votes
 from tests.benchmarks.few import Few
 from tests.benchmarks.geometry import Clean, Maps, Meshes
 from tests.benchmarks.library import Changed, Found
-from tests.benchmarks.lifting import Colours, Lifting
+from tests.benchmarks.lifting import Lifting
 from tests.benchmarks.phrases import Phrases
 from tests.benchmarks.scale import Formats, Scale
-from tests.benchmarks.walks import Walks
 
 PROGRAM = "python -m tests.benchmarks"
 
@@ -21,8 +20,8 @@ def parse(args: list[str]) -> Command:
     """The report that the words of a command line name; SystemExit as tyro raises it."""
     about = "Measure this project where the truth is known, and at large sizes."
     known = (
-        *(Rooms, Verdicts, Taught, Phrases, Votes, Clean, Maps, Meshes),
-        *(Lifting, Scale, Found, Changed, Formats, Colours, Walks, Few),
+        *(Rooms, Verdicts, Phrases, Votes, Clean, Maps, Meshes),
+        *(Lifting, Scale, Found, Changed, Formats, Few),
     )
     reports = tuple(with_codec(report, args) for report in known)
     command: Command = parsed(PROGRAM, Union[(*reports,)], args, about)

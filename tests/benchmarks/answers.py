@@ -48,7 +48,6 @@ from langsplat_core.training.radiance.scores import evaluate_views
 from tests.benchmarks.room import HOLD_OUT, InRooms, MaskOrigin, Room, Seeds, Variant, publish
 from tests.benchmarks.scoring import (
     MIN_GAUSSIANS,
-    MaskRule,
     Measured,
     ask,
     direct_share,
@@ -80,7 +79,7 @@ class Rooms(InRooms):
     budget: bool = False  # also swap one stage at a time for one that makes no mistake
     codec_steps: Count = 4_000  # of training the autoencoder of --budget
     scene: Path | None = None
-    """Measure this scene, trained on --dataset, instead of fresh rooms; of the settings, --cut applies."""
+    """Measure this scene, trained on --dataset, instead of fresh rooms."""
     dataset: Path | None = None
     """The room that --scene shows, as written by `python -m assets.making dataset`."""
 
@@ -89,7 +88,7 @@ class Rooms(InRooms):
             raise InputError("--scene and --dataset belong together: a scene, and the room it was trained on")
         if self.scene is not None and self.dataset is not None:
             with TerminalProgress() as progress:
-                print(measure_scene(self.scene, self.dataset, MaskRule(cut=self.settings.cut), progress))
+                print(measure_scene(self.scene, self.dataset, progress))
             return
         reports = self.each(lambda room: [room_report(room, variants(self, room.encoder.dim))])
         tables = [score_table(reports), room_table(reports)]
@@ -112,7 +111,6 @@ class RoomReport:
     gaussians: int
     psnr: float  # mean over held-out views, dB
     encoder: str
-    cut: str
     measured: tuple[Measured, ...]  # the method first
     seconds: dict[str, float]  # per stage, of this run: a stage that was already done takes almost none
 
@@ -148,7 +146,6 @@ def room_report(room: Room, chosen: Sequence[Variant]) -> RoomReport:
         gaussians=len(room.gaussians),
         psnr=float(np.mean([view.psnr for view in views])),
         encoder=room.encoder.id,
-        cut=room.config.cut,
         measured=rows,
         seconds=room.seconds,
     )
@@ -228,7 +225,7 @@ def _percent(share: float) -> str:
     return f"{100 * share:.1f}"
 
 
-def measure_scene(scene_path: Path, dataset: Path, rule: MaskRule, progress: Progress = silent) -> str:
+def measure_scene(scene_path: Path, dataset: Path, progress: Progress = silent) -> str:
     """Every phrase of a room in the views that one given scene of it was not trained on; Markdown.
 
     dataset: the room, as `python -m assets.making dataset` wrote it. Raises InputError for a scene without a
@@ -246,7 +243,7 @@ def measure_scene(scene_path: Path, dataset: Path, rule: MaskRule, progress: Pro
     absent = truth.absent(EVERYTHING)
     texts = [*(phrase.text for phrase in truth.phrases), *absent]
     asked = ask(QueryEngine(scene, load_text_encoder), texts)
-    scores = evaluate(asked, load_rasterizer("cpu"), held_out, truth, rule, progress)
+    scores = evaluate(asked, load_rasterizer("cpu"), held_out, truth, progress=progress)
     rows = [(s.kind, s.queries, _percent(s.mean_iou), _percent(s.localisation)) for s in scores]
     found, count = found_rate(asked, absent)
     lines = ["", f"absent objects rejected: {100 * (1 - found):.0f} % of {count}"]

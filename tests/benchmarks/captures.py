@@ -9,21 +9,21 @@ from PIL import Image
 
 from assets.making.dataset import FIRST_ROOM, LIGHT, write_transforms
 from assets.making.kit import COLOURS, Kit, Piece, Thing
-from assets.making.objects import furniture
+from assets.making.objects import FURNITURE, TABLE_TOP, furniture
 from assets.making.render import Light, Picture, Renderer
 from assets.making.shapes import ball, cylinder, pillow, rotation_about
-from assets.making.world import Placed, assemble, furnished
+from assets.making.world import ENLARGED, Placed, assemble, bounds, furnished
 from langsplat_core.arrays import Array
 from langsplat_core.datasets.holdout import chosen
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera, look_at
-from tests.benchmarks.walks import AHEAD, Walks, street, walk_cameras
 
 Kind = Literal["few", "walk"]  # on an arc around a room's table; straight ahead along a street
 VIEWS = 12
 WIDTH = 400  # px; the height is three quarters
 ARC = 150.0  # degrees
 STEP = 0.5  # metres from one photograph of a walk to the next
+AHEAD = 8.0  # metres, what the walker looks at
 EMPTY = 0.2  # of the photographs of a peopled capture
 NEAREST = 0.8  # metres from a camera to a person
 SHARES = (0.02, 0.25)  # of a photograph's pixels, that people cover
@@ -77,9 +77,39 @@ def _room(seed: int) -> _Place:
 
 
 def _street(seed: int) -> _Place:
-    walk = Walks(views=VIEWS, step=STEP, width=WIDTH, seed=seed)
-    things = street(seed, VIEWS * STEP + 2 * AHEAD)
-    return _Place(_named(walk_cameras(walk)), things, replace(LIGHT, key=0.0, sky=2.0), 0.0, 7.0)
+    """Somebody walks along x through a furnished street, and sways by some centimetres and degrees."""
+    rng, cameras = np.random.default_rng(seed), []
+    for number in range(VIEWS):
+        eye = np.array([number * STEP, 0.0, 1.5]) + rng.normal(0, (0.05, 0.06, 0.03))
+        target = eye + np.array([AHEAD, 0, -0.8]) + rng.normal(0, (0, 0.25, 0.15))
+        cameras.append(look_at(eye, target, np.array([0.0, 0, 1]), (WIDTH, WIDTH * 3 // 4), 50.0))
+    things = furnished_street(seed, VIEWS * STEP + 2 * AHEAD)
+    return _Place(_named(cameras), things, replace(LIGHT, key=0.0, sky=2.0), 0.0, 7.0)
+
+
+def furnished_street(seed: int, length: float) -> list[Placed]:
+    """Return floor and walls along x from 0 to `length` metres, with furniture, pictures and
+    things on the floor along the way."""
+    kit = Kit(np.random.default_rng((seed, 29)))
+    placed: list[Placed] = []
+    for at in np.arange(furniture.ROOM / 2, length + furniture.ROOM / 2, furniture.ROOM):
+        shell = furniture.shell(kit)
+        ends = [shell[0], shell[2], shell[4]]  # the floor and the walls at both sides
+        placed += [Placed(thing, np.eye(3), np.array([at, 0, 0])) for thing in ends]
+    for at in np.arange(0.6, length, 1.2):
+        for side in (0.0, 180.0):
+            turn = rotation_about("z", side)
+            builder, words = FURNITURE[kit.pick("sofa", "shelf", "cabinet")]
+            thing = builder(kit, kit.pick(*[word for word in words if word in COLOURS]))
+            back = furniture.ROOM / 2 - 0.03
+            placed.append(Placed(thing, turn, turn @ (0, back - bounds(thing)[1][1], 0) + (at, 0, 0)))
+            picture = furniture.picture(kit, kit.pick("brown", "black", "white"))
+            placed.append(Placed(picture, turn, turn @ (0, back, kit.size(1.4, 1.9)) + (at, 0, 0)))
+            builder, words = TABLE_TOP[kit.pick(*TABLE_TOP)]
+            own = rotation_about("z", kit.size(0, 360))
+            beside = turn @ (kit.size(-0.5, 0.5), kit.size(0.5, 1.4), 0) + (at, 0, 0)
+            placed.append(Placed(builder(kit, kit.pick(*words)), own, beside, 2 * ENLARGED))
+    return placed
 
 
 def _named(cameras: list[Camera]) -> list[Camera]:

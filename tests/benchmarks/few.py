@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from PIL import Image
 
 from langsplat_core.arrays import Array, psnr
 from langsplat_core.config import (
@@ -22,11 +21,10 @@ from langsplat_core.config import (
 )
 from langsplat_core.datasets import Capture, load_capture
 from langsplat_core.datasets.holdout import split
-from langsplat_core.datasets.known_poses import look_distance
 from langsplat_core.extensions.benchmarks.measure import markdown
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.raster.render import render
-from langsplat_core.scene import Camera, Gaussians, Scene
+from langsplat_core.scene import Camera, Scene
 from langsplat_core.training.radiance.rehearsal import (
     budgets_for,
     in_words,
@@ -38,8 +36,11 @@ from langsplat_core.training.radiance.scores import evaluate_views
 from tests.benchmarks.captures import Kind, draw_capture
 
 LARGE = 800  # px, of a window beside them: with dilation as at the photographs' size, and growing
-SHEET_VIEWS = 4
-NEARER = 0.2  # of the distance to what cameras look at
+HEAD = (
+    "capture", "training / held out", "preset", "with", "seed", "held out, dB", "exposure fitted, dB",
+    f"at {QUICK.longer_side} px, dB", f"at {LARGE} px: dilation constant, growing", "SSIM", "training, dB",
+    "budget", "rehearsed, dB", "Gaussians", "CPU-s",
+)  # fmt: skip
 # What a training has, beside its preset.
 VARIANTS: dict[str, dict[str, object]] = {
     "before": {"few_views": 0, "rehearsed_views": 0, "exposure": "off", "transients": "off"},
@@ -73,8 +74,6 @@ class Few:
     seeds: tuple[int, ...] = (0,)
     work: Path | None = None
     """Folder where drawn captures and cameras are kept from run to run."""
-    sheets: Path | None = None
-    """Folder for a sheet of each capture: a row a training, of views between the photographs and nearer."""
 
     def run(self) -> None:
         rows: list[tuple[str, ...]] = []
@@ -89,21 +88,7 @@ class Few:
             for folder in (*self.folders, *drawn):
                 name = folder.parent.name if folder in drawn else folder.name
                 rows += self._rows(folder, name, work / name, progress)
-        titles = (
-            *("capture", "training / held out", "preset", "with", "seed", "held out, dB"),
-            *(
-                "exposure fitted, dB",
-                f"at {QUICK.longer_side} px, dB",
-                f"at {LARGE} px: dilation as it was, growing",
-                "SSIM",
-                "training, dB",
-                "budget",
-                "rehearsed, dB",
-                "Gaussians",
-                "CPU-s",
-            ),
-        )
-        print(markdown(titles, rows))
+        print(markdown(HEAD, rows))
 
     def _rows(self, folder: Path, name: str, work: Path, progress: Progress) -> Iterator[tuple[str, ...]]:
         large = self._capture(folder, work, LARGE, progress)[0]
@@ -113,8 +98,7 @@ class Few:
             for variant in self.variants:
                 for seed in self.seeds:
                     settings = replace(config.radiance, seed=seed, **VARIANTS[variant])  # type: ignore[arg-type]
-                    sheet = self.sheets and self.sheets / f"{name}.png"
-                    found = _measured(capture, large, settings, train, held_out, progress, sheet)
+                    found = _measured(capture, large, settings, train, held_out, progress)
                     counts = f"{len(train)} / {len(held_out)}"
                     yield (name, counts, preset, variant, str(seed), *found)
 
@@ -159,15 +143,12 @@ def _measured(
     train: Sequence[int],
     held_out: Sequence[int],
     progress: Progress,
-    sheet: Path | None,
 ) -> tuple[str, ...]:
     began = time.process_time()
     found = rehearse(capture, config, train, progress=progress)
     budget = supported(found, budgets_for(capture, config, len(train)))
     gaussians = train_within(capture, budget, config, train, progress=progress)
     seconds = time.process_time() - began
-    if sheet:
-        add_row(sheet, gaussians, between(capture.shrunk(train, QUICK.longer_side).cameras))
     small = capture.read_at(held_out, QUICK.longer_side)
     scores = evaluate_views(gaussians, capture, held_out, small=small)
     learnt = evaluate_views(gaussians, capture, train)
@@ -190,35 +171,6 @@ def _measured(
         *(in_words(budget), "; ".join(", ".join(f"{decibels:.2f}" for decibels in each) for each in found)),
         *(str(len(gaussians)), f"{seconds:.0f}"),
     )
-
-
-def between(cameras: Sequence[Camera]) -> list[Camera]:
-    """Cameras halfway from one to its nearest neighbour and a fifth nearer to what it looks at, spread over
-    the capture."""
-    places = np.array([camera.position for camera in cameras])
-    distance = look_distance(cameras)
-    found = []
-    for index in np.linspace(0, len(cameras) - 1, SHEET_VIEWS).round().astype(int):
-        apart = np.linalg.norm(places - places[index], axis=1)
-        apart[index] = np.inf
-        camera, other = cameras[index], cameras[int(apart.argmin())]
-        eye = (camera.position + other.position) / 2 + NEARER * distance * camera.rotation[2]
-        moved = camera.world_to_camera.copy()
-        moved[:3, 3] = -camera.rotation @ eye
-        found.append(replace(camera, world_to_camera=moved))
-    return found
-
-
-def add_row(sheet: Path, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
-    """Draw the Gaussians by the cameras, side by side, below what the sheet shows so far."""
-    height = max(camera.height for camera in cameras)
-    images = [
-        np.pad(_image(Scene(gaussians), one), ((0, height - one.height), (0, 4), (0, 0))) for one in cameras
-    ]
-    row = np.concatenate(images, 1)
-    rows = [np.asarray(Image.open(sheet)), np.zeros_like(row[:4]), row] if sheet.exists() else [row]
-    sheet.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(np.concatenate(rows)).save(sheet)
 
 
 def _image(scene: Scene, camera: Camera) -> Array:

@@ -16,7 +16,6 @@ words of a phrase and a part with its thing mix (`MODIFIER`, `OWNER`); `own` and
 """
 
 import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -34,12 +33,10 @@ from langsplat_core.query.engine import TextEncoder
 from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.scene import LEVELS, Camera, Gaussians, Reading
 from langsplat_core.scene.language import phrase_key
-from langsplat_core.semantics.masks import LevelMasks, MaskSource
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language.mask_weights import MaskGroups, find_mask_weights
 
 WRONG = 0.15  # share of masks with another region's vector
-SIDES = (1 / 16, 1 / 8, 1 / 4)  # of the picture's height, at the levels subpart, part, whole
 
 
 def oracle_vectors(features: ImageFeatures, ids: Array, vectors: Mapping[int, Array]) -> ImageFeatures:
@@ -146,28 +143,6 @@ def _as_rows(ids: Array) -> tuple[Array, Array]:
             rows[level][truth == number] = len(numbers)
             numbers.append(int(number))
     return rows, np.array(numbers, np.int64)
-
-
-class TileMasks(MaskSource):
-    """A `semantics.masks.MaskSource` that looks at nothing: a grid of squares at each level."""
-
-    name = "tiles"
-    key = json.dumps(["tiles", 1, SIDES])
-
-    def __call__(self, image: Array, progress: Progress) -> LevelMasks:
-        """The grids of an image (H, W, 3)."""
-        subpart, part, whole = (_grid(image.shape[0], image.shape[1], share) for share in SIDES)
-        progress("tiles", 1.0)
-        scores = [np.ones(len(masks), np.float32) for masks in (subpart, part, whole)]
-        return LevelMasks((subpart, part, whole), (scores[0], scores[1], scores[2]))
-
-
-def _grid(height: int, width: int, share: float) -> Array:
-    """(M, H, W) bool: squares from the upper left; the last ones may be cut off."""
-    side = max(round(share * height), 1)
-    rows, columns = np.arange(height) // side, np.arange(width) // side
-    number = rows[:, None] * (columns[-1] + 1) + columns
-    return np.asarray(number == np.arange(number.max() + 1)[:, None, None])
 
 
 PREFIX = "clip-geometry:"

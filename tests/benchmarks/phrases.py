@@ -220,7 +220,7 @@ def _scores(
         labels = room.truth.labels(camera.name)
         masks = [case.mask(labels) for case, _, _ in answered]
         visible = [row for row, mask in enumerate(masks) if mask.sum() >= MIN_PIXELS]
-        answers = [(answered[row][1].even, answered[row][1].members) for row in visible]
+        answers = [answered[row][1] for row in visible]
         view = CpuRasterizer().view(room.gaussians, camera)
         for row, (found, peak) in zip(visible, masks_and_peaks(view, answers), strict=True):
             ious[row].append(intersection_over_union(found, masks[row]))

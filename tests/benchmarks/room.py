@@ -65,7 +65,6 @@ from langsplat_core.training.language.codec_fit import CodecReport
 from langsplat_core.training.radiance.rehearsal import budgets_for
 from tests.benchmarks.oracles import (
     ClipGeometry,
-    TileMasks,
     moved_to_pictures,
     oracle_vectors,
     phrase_vectors,
@@ -75,9 +74,6 @@ from tests.benchmarks.oracles import (
 )
 from tests.benchmarks.scoring import (
     Asked,
-    CutRule,
-    Judge,
-    MaskRule,
     Measured,
     ask,
     evaluate,
@@ -87,13 +83,13 @@ from tests.benchmarks.scoring import (
 )
 
 HOLD_OUT = 8  # every so many views, one is not trained on
-FRAMES = 5  # timed images of one phrase
+FRAMES = 5  # timed images of one phrase; PyTorch's first takes longer
 Row = TypeVar("Row")
 ViewCount = Annotated[int, Range(8, 100_000)]
 Seeds = Annotated[tuple[Seed, ...], Range(0, 2**32 - 1, some=True)]
 # The outlines a perfect segmenter would find; the same, but 15 % of the vectors are another region's; the
-# weight-free segmenter's; squares in place of masks.
-MaskOrigin = Literal["truth", "wrong", "graph", "tiles"]
+# weight-free segmenter's.
+MaskOrigin = Literal["truth", "wrong", "graph"]
 
 
 @dataclass(frozen=True)
@@ -108,8 +104,6 @@ class RoomSettings:
     """"demo" for the bundled one, a folder, a hub id, or clip-geometry:OWN[,ALIKE]: vectors made from truth
     with the geometry of CLIP, OWN being the cosine of an image with its words (0.22 to 0.32)."""
     text_vectors: Path | None = None  # .npy of real text vectors for clip-geometry, names in a .txt beside it
-    cut: CutRule | Literal["regions"] = "regions"
-    """How an answer becomes a mask: whole regions, or a rule of `scoring.cut_level` for the map."""
 
 
 @dataclass(frozen=True)
@@ -256,8 +250,8 @@ class Room:
         self, outlines: MaskOrigin, train: Sequence[int], cameras: Sequence[Camera]
     ) -> Sequence[ImageFeatures]:
         source: MaskSource = TruthMasks(self.capture, self.truth)
-        if outlines in ("graph", "tiles"):
-            source = load_mask_source(MaskConfig(source="graph")) if outlines == "graph" else TileMasks()
+        if outlines == "graph":
+            source = load_mask_source(MaskConfig(source="graph"))
         photographs, names = [self.capture.images[i] for i in train], [camera.name for camera in cameras]
         encoder, shared = cast(Encoder, self.encoder), self.progress
         if source.agrees:
@@ -284,41 +278,35 @@ class Room:
         return QueryEngine(scene, lambda _: self.encoder)
 
     def measure(self, variant: Variant, fresh: bool = False) -> Measured:
-        """Ask everything of a variant's field. fresh: take nothing that was kept, so that seconds count."""
+        """Ask everything of a variant's field, and compare the answers with the truth.
+
+        fresh: take nothing that was kept, so that seconds count.
+        """
         field, loss, seconds = self.field(variant, fresh)
-        by_regions = self.config.cut == "regions" and variant.query != "paper"
-        rule: AnswerRule = "regions" if by_regions else "peak"
+        paper_order = variant.query == "paper"
+        rule: AnswerRule = "peak" if paper_order else "regions"
         # What is no codec has its numbers at hand; going through a codec's interface takes seconds a phrase.
         whole = field.codec.latent_dim == field.codec.vector_dim
         engine = QueryEngine(Scene(self.gaussians, field), lambda _: self.encoder, exact=whole, rule=rule)
+        absent, progress = self.truth.absent(EVERYTHING), labelled(self.progress, f"{variant.name}: ")
         with self._timed(f"queries ({variant.name})"):
             asked = ask(engine, self.texts, variant.level)
-        frame_ms = 1000 * median_seconds(lambda: self._frame(asked, variant))
+            scores = evaluate(asked, CpuRasterizer(), self.held_out, self.truth, paper_order, progress)
+            direct = evaluate_direct(asked, self.labels, self.truth)
         return replace(
-            self.measure_asked(asked, variant),
+            measured(asked, self.truth, absent, scores, direct),
+            **{key: getattr(variant, key) for key in ("name", "masks", "vectors", "query")},
             codec=f"{field.codec.kind} {field.codec.size}",
             codec_loss=loss,
             fit_seconds=seconds,
             bytes_per_gaussian=field.latents.nbytes / max(len(field), 1),
-            frame_ms=frame_ms,
+            frame_ms=1000 * median(seconds_of(lambda: self._frame(asked, variant)) for _ in range(FRAMES)),
         )
 
     @cached_property
     def texts(self) -> list[str]:
         """Phrases that are asked: everything that is there, and things that are not."""
         return [*(phrase.text for phrase in self.truth.phrases), *self.truth.absent(EVERYTHING)]
-
-    def measure_asked(self, asked: Asked, variant: Variant, judge: Judge | None = None) -> Measured:
-        """Compare answers to `texts` with the truth. judge: of another system's answers (`scoring.evaluate`),
-        which are then cut half way between the floor and their peak among the Gaussians too."""
-        rule = MaskRule(variant.query == "paper", self.config.cut)
-        progress = labelled(self.progress, f"{variant.name}: ")
-        with self._timed(f"queries ({variant.name})"):
-            scores = evaluate(asked, CpuRasterizer(), self.held_out, self.truth, rule, progress, judge)
-            direct = evaluate_direct(asked, self.labels, self.truth, "floor" if judge else self.config.cut)
-            result = measured(asked, self.truth, self.truth.absent(EVERYTHING), scores, direct)
-        named = {key: getattr(variant, key) for key in ("name", "masks", "vectors", "query")}
-        return replace(result, **named)
 
     @cached_property
     def held_out(self) -> list[Camera]:
@@ -331,10 +319,11 @@ class Room:
         view, gate = CpuRasterizer().view(self.gaussians, self.held_out[0]), PictureConfig().alpha_gate
         answer = next(iter(asked.answers.values()))
         if variant.query != "paper":
-            splatted_relevancy(view, answer.values[:, None], gate)
+            splatted_relevancy(view, answer.relevancy[answer.level][:, None], gate)
             return
+        vector = asked.engine.text_vectors([answer.phrase])
         for level in range(len(LEVELS)):
-            decoded_relevancy(view, asked.engine.field, level, answer.vector[None], gate)
+            decoded_relevancy(view, asked.engine.field, level, vector, gate)
 
     @contextmanager
     def _timed(self, name: str) -> Iterator[None]:
@@ -346,11 +335,6 @@ class Room:
 def labelled(progress: Progress, prefix: str) -> Progress:
     """`progress` under labels that begin with `prefix`."""
     return Progress(lambda at: progress.show(replace(at, stage=prefix + at.stage)))
-
-
-def median_seconds(work: Callable[[], object]) -> float:
-    """Median of several runs; PyTorch's first takes longer."""
-    return median(seconds_of(work) for _ in range(FRAMES))
 
 
 def publish(

@@ -41,61 +41,12 @@ TIMED = 15  # phrases that are asked alone
 HALF = 0.5  # of what a pixel shows: from there it belongs to an answer's Gaussians
 
 
-CutRule = Literal["floor", "median", "range"]
-RANGE_SHARE = 0.7  # of the map's range: LangSplat's code maps [0, 1] to [-1, 1] and cuts at 0.4
-
-
-def cut_level(rule: CutRule, values: Array, peak: float, median: float) -> float:
-    """The relevancy above which `values` belong to the answer.
-
-    values: the map that is cut, any shape, in [0, 1], read by "range" alone; peak: the smoothed peak of the
-    whole scene at the chosen level; median: of the scene's Gaussians at that level. Rules:
-
-    * "floor": half way between the floor, no better than the canonical phrases, and the peak;
-    * "median": half way between the scene's median and the peak, since what is typical of the scene is not
-      what was asked for, wherever the encoder puts it;
-    * "range": at 0.7 of the map's range, as the public code of LangSplat does; it always finds something.
-    """
-    if rule == "range":
-        low, high = (float(values.min()), float(values.max())) if np.size(values) else (0.0, 1.0)
-        return low + RANGE_SHARE * (high - low)
-    low = FLOOR if rule == "floor" else median
-    return low + 0.5 * max(peak - low, SPAN)
-
-
-@dataclass(frozen=True)
-class MaskRule:
-    """How an answer becomes a map and a mask."""
-
-    paper_order: bool = False  # blend latents and decode pixels, instead of blending relevancies
-    cut: CutRule | Literal["regions"] = "regions"
-
-
-@dataclass(frozen=True, eq=False)
-class Answer:
-    """What the engine says to one phrase."""
-
-    vector: Array  # (D,) of the phrase
-    level: int
-    values: Array  # (N,) relevancy at that level
-    members: Array  # (N,) bool
-    even: Array  # (N,) relevancy, the same all over a region
-    peak: float
-    median: float  # of the values of Gaussians with a meaning
-    found: bool
-    probability: float | None = None
-
-
-Judge = Callable[[View, Sequence[Answer]], Iterable[tuple[Array, tuple[int, int]]]]
-"""The mask (H, W) of each answer in a view, and the row and column of its peak."""
-
-
 @dataclass(frozen=True, eq=False)
 class Asked:
     """Answers to all phrases, each asked once."""
 
     engine: QueryEngine
-    answers: Mapping[str, Answer]
+    answers: Mapping[str, QueryResult]
     unknown: tuple[str, ...]  # phrases with words that the encoder was never taught: not asked
     seconds: float  # median of one query from text to place; 0 where nothing was asked
 
@@ -125,23 +76,13 @@ def ask(engine: QueryEngine, texts: Iterable[str], level: LevelChoice = "auto") 
     texts = list(dict.fromkeys(texts))
     unknown = [text for text in texts if engine.unknown_words(text)]
     known = [text for text in texts if text not in unknown]
-    answers: dict[str, Answer] = {}
+    answers: dict[str, QueryResult] = {}
     for start in range(0, len(known), TOGETHER):
         some = known[start : start + TOGETHER]
-        vectors = engine.text_vectors(some)
-        for text, vector, result in zip(some, vectors, engine.run_many(some, level), strict=True):
-            answers[text] = _answer(engine, vector, result)
+        answers |= zip(some, engine.run_many(some, level), strict=True)
     # The engine has answered before, so that no time goes into preparation.
     seconds = [seconds_of(partial(engine.run, text, level)) for text in known[:TIMED]]
     return Asked(engine, answers, tuple(unknown), float(np.median(seconds)) if seconds else 0.0)
-
-
-def _answer(engine: QueryEngine, vector: Array, result: QueryResult) -> Answer:
-    values = result.relevancy[result.level]
-    known = engine.field.confidence[result.level] > 0
-    median = float(np.median(values[known])) if known.any() else 0.0
-    said = {name: getattr(result, name) for name in ("members", "even", "peak", "found", "probability")}
-    return Answer(vector=vector, level=result.level, values=values, median=median, **said)
 
 
 def seconds_of(work: Callable[[], object]) -> float:
@@ -156,13 +97,15 @@ def evaluate(
     rasterizer: Rasterizer,
     cameras: Sequence[Camera],
     truth: Truth,
-    rule: MaskRule | None = None,
+    paper_order: bool = False,
     progress: Progress = silent,
-    judge: Judge | None = None,
 ) -> list[Score]:
-    """Every phrase that was asked, in every view where its thing is visible. judge: in place of `rule`."""
-    settled, scene = rule or MaskRule(), asked.engine.scene
-    judge = judge or (lambda view, answers: _judged(asked.engine, view, answers, settled))
+    """Score every phrase that was asked, in every view where its thing is visible.
+
+    paper_order: latents are blended and pixels decoded, instead of blending relevancies.
+    """
+    scene = asked.engine.scene
+    masks_of = partial(_paper_masks, asked.engine) if paper_order else masks_and_peaks
     results: dict[str, list[tuple[float, bool]]] = {}
     for done, camera in enumerate(cameras):
         labels = truth.labels(camera.name)
@@ -170,7 +113,7 @@ def evaluate(
         masks = {p: _mask(labels, p) for p in truth.phrases if p.text in asked.answers}
         visible = [phrase for phrase, mask in masks.items() if mask.sum() >= MIN_PIXELS]
         answers = [asked.answers[phrase.text] for phrase in visible]
-        for phrase, (found, peak) in zip(visible, judge(view, answers), strict=True):
+        for phrase, (found, peak) in zip(visible, masks_of(view, answers), strict=True):
             score = intersection_over_union(found, masks[phrase]), bool(masks[phrase][peak])
             results.setdefault(phrase.kind, []).append(score)
         progress("asking phrases", (done + 1) / len(cameras))
@@ -184,61 +127,43 @@ def _means(results: Mapping[str, Sequence[tuple[float, float]]]) -> Iterator[tup
         yield kind, len(results[kind]), one, other
 
 
-def relevancy_maps(
-    engine: QueryEngine, view: View, answers: Sequence[Answer], paper_order: bool
-) -> Iterator[Array]:
-    """(H, W) relevancy of each answer. A pixel is splatted, and in the paper's order decoded, once for all
-    phrases (at each level)."""
-    gate = PictureConfig().alpha_gate
-    if not paper_order:
-        for start in range(0, len(answers), CHANNELS):
-            values = np.stack([answer.values for answer in answers[start : start + CHANNELS]], 1)
-            yield from np.moveaxis(splatted_relevancy(view, values, gate), 2, 0)
-        return
-    maps: dict[int, Array] = {}
-    for level in {answer.level for answer in answers}:
-        rows = [row for row, answer in enumerate(answers) if answer.level == level]
-        vectors = np.stack([answers[row].vector for row in rows])
-        decoded = decoded_relevancy(view, engine.field, level, vectors, gate)
-        maps |= dict(zip(rows, np.moveaxis(decoded, 2, 0), strict=True))
-    yield from (maps[row] for row in range(len(answers)))
-
-
 def _mask(labels: Array, phrase: Phrase) -> Array:
     return np.asarray(np.isin(labels, phrase.ids).any(axis=0))
 
 
-def _judged(
-    engine: QueryEngine, view: View, answers: Sequence[Answer], rule: MaskRule
-) -> Iterator[tuple[Array, tuple[int, int]]]:
-    if rule.cut == "regions" and not rule.paper_order:
-        yield from masks_and_peaks(view, [(answer.even, answer.members) for answer in answers])
-        return
-    level: CutRule = "floor" if rule.cut == "regions" else rule.cut
-    maps = relevancy_maps(engine, view, answers, rule.paper_order)
-    for answer, relevancy in zip(answers, maps, strict=True):
-        cut = cut_level(level, relevancy, answer.peak, answer.median)
-        yield _smoothed_mask(relevancy > cut), _peak(relevancy)
+def masks_and_peaks(view: View, answers: Sequence[QueryResult]) -> Iterator[tuple[Array, tuple[int, int]]]:
+    """Yield the mask (H, W) of each answer in a view, and the row and column of its peak.
 
-
-def masks_and_peaks(
-    view: View, answers: Sequence[tuple[Array, Array]]
-) -> Iterator[tuple[Array, tuple[int, int]]]:
-    """(N,) relevancy and (N,) bool members of each answer -> its mask (H, W): where members are more than
-    half of what a pixel shows; and the row and column of the peak."""
+    The mask is where members are more than half of what a pixel shows.
+    """
     for start in range(0, len(answers), CHANNELS // 2):
         some = answers[start : start + CHANNELS // 2]
-        columns = [*(values for values, _ in some), *(members for _, members in some)]
-        maps = np.moveaxis(splatted_relevancy(view, np.stack(columns, 1), PictureConfig().alpha_gate), 2, 0)
+        columns = np.stack([*(one.even for one in some), *(one.members for one in some)], 1)
+        maps = np.moveaxis(splatted_relevancy(view, columns, PictureConfig().alpha_gate), 2, 0)
         for relevancy, share in zip(maps[: len(some)], maps[len(some) :], strict=True):
             yield _smoothed_mask(share > HALF), _peak(relevancy)
 
 
-def masks_of_maps(maps: Iterable[Array]) -> Iterator[tuple[Array, tuple[int, int]]]:
-    """(H, W) relevancy -> the mask of what is above half way between the floor and its maximum; its peak."""
-    for relevancy in maps:
-        cut = cut_level("floor", relevancy, float(relevancy.max()), FLOOR)
-        yield _smoothed_mask(relevancy > cut), _peak(relevancy)
+def _paper_masks(
+    engine: QueryEngine, view: View, answers: Sequence[QueryResult]
+) -> Iterator[tuple[Array, tuple[int, int]]]:
+    """Yield masks and peaks in the paper's order: pixels are decoded, at each level once for all phrases."""
+    maps: dict[int, Array] = {}
+    for level in {answer.level for answer in answers}:
+        rows = [row for row, answer in enumerate(answers) if answer.level == level]
+        vectors = engine.text_vectors([answers[row].phrase for row in rows])
+        decoded = decoded_relevancy(view, engine.field, level, vectors, PictureConfig().alpha_gate)
+        maps |= dict(zip(rows, np.moveaxis(decoded, 2, 0), strict=True))
+    for row, answer in enumerate(answers):
+        yield _smoothed_mask(maps[row] > half_way(answer.peak)), _peak(maps[row])
+
+
+def half_way(peak: float) -> float:
+    """Return the relevancy above which values belong to an answer in the paper's order.
+
+    Half way between the floor, no better than the canonical phrases, and the scene's smoothed peak.
+    """
+    return FLOOR + 0.5 * max(peak - FLOOR, SPAN)
 
 
 def majority(mask: Array, window: int = 7) -> Array:
@@ -255,9 +180,7 @@ def _peak(relevancy: Array) -> tuple[int, int]:
     return row, column
 
 
-def evaluate_direct(
-    asked: Asked, labels: Array, truth: Truth, rule: CutRule | Literal["regions"] = "regions"
-) -> list[DirectScore]:
+def evaluate_direct(asked: Asked, labels: Array, truth: Truth) -> list[DirectScore]:
     """The overlap without any view. labels: (3, N) the true id of every Gaussian at each level, -1 for those
     that no photograph shows, which count on neither side (see `oracles.true_labels`)."""
     seen = np.asarray((labels >= 0).any(axis=0))
@@ -267,13 +190,8 @@ def evaluate_direct(
         if phrase.text not in asked.answers or right.sum() < MIN_GAUSSIANS:
             continue
         answer = asked.answers[phrase.text]
-        values = answer.values[seen]
-        if rule == "regions":
-            found = answer.members[seen]
-        else:
-            found = values > cut_level(rule, values, answer.peak, answer.median)
-        best = _ceiling(asked.engine.regions, seen, right) if rule == "regions" else 0.0
-        results.setdefault(phrase.kind, []).append((intersection_over_union(found, right), best))
+        overlap = intersection_over_union(answer.members[seen], right)
+        results.setdefault(phrase.kind, []).append((overlap, _ceiling(asked.engine.regions, seen, right)))
     return [DirectScore(*row) for row in _means(results)]
 
 
