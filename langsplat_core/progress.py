@@ -126,10 +126,6 @@ class Cancelled(Exception):
     """Raised by a `Progress` to stop the work; what was stored so far stays valid."""
 
 
-class Terminated(KeyboardInterrupt):
-    """The system asked the process to end (SIGTERM); what was stored so far stays valid."""
-
-
 class LineProgress:
     """Progress for other programs, a context manager: a line of JSON on stderr for every report that says
     anything new, ``{"stage": "training", "fraction": 0.2, "note": "step 9", "metrics": {"loss": 0.03}}``."""

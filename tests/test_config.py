@@ -214,13 +214,6 @@ def test_a_file_that_cannot_be_used_is_named_with_its_key(
     assert said in line
 
 
-@pytest.mark.parametrize(
-    "option", ["--radiance.steps", "--codec.max-relevancy-error", "--dataset.test-every"]
-)
-def test_numbers_in_other_digits_are_refused(option: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert f"{option}: '١' is not written" in refusal(capsys, *WORDS, option, "١")
-
-
 @pytest.mark.parametrize("name", ["absent.toml", "."])
 def test_a_file_that_cannot_be_read(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert str(tmp_path / name) in refusal(capsys, *WORDS, "--config", tmp_path / name)

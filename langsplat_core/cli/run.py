@@ -1,4 +1,4 @@
-"""Running of commands, each of which exits with 0, with 2 and one line on stderr, or with 130 (143) when
+"""How commands run: each exits with 0, with 2 and one line on stderr, or with 130 (143) and one line when
 interrupted (terminated).
 
 A command is a dataclass whose fields are its arguments (tyro derives the parser), checked before anything is
@@ -11,26 +11,21 @@ import io
 import json
 import logging
 import os
-import re
 import signal
 import sys
-import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import MISSING, dataclass, fields, make_dataclass
-from itertools import dropwhile, pairwise, takewhile
+from itertools import pairwise
 from pathlib import Path
-from types import FrameType
 from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
 import tyro
 from rich.console import Console
-from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from langsplat_core import __version__
-from langsplat_core.arrays import number, whole_number
 from langsplat_core.config import (
     CODEC_CONFIGS,
     CodecConfig,
@@ -39,21 +34,15 @@ from langsplat_core.config import (
     check_settings,
     named_values,
 )
-from langsplat_core.errors import InputError, LangSplatError, end, is_import, optional_imports, printable_line
+from langsplat_core.errors import InputError, LangSplatError, optional_imports, printable_line
+from langsplat_core.interrupts import SAID, Terminated, raised
 from langsplat_core.io.files import NO_ROOM, check_output_file, check_output_folder, shown
-from langsplat_core.progress import Terminated
 
 log = logging.getLogger("langsplat")
 COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
 SHELLS = ("bash", "zsh", "fish", "tcsh")
 _CONTINUES = "; the same command continues where it stopped"
-_LOG_LIMIT = 2000  # characters of a warning
-# What writing to an open file or standard output ends in where there is no room or no file.
-_UNWRITTEN = (*NO_ROOM, errno.EBADF)
 _ROOM = "make room, or choose another place; what was finished is kept"
-_FRAME = re.compile(r"[│╭╮╰╯]|─+")
-_RULE = re.compile(r"[\s│╰╯├┤]*(─{2,}|-{5,})[\s│╰╯├┤]*")
-
 
 _Flag = Annotated[
     tyro.conf.FlagCreatePairsOff[bool], tyro.conf.create_mutex_group(required=False, title="how much is said")
@@ -79,7 +68,7 @@ class _OneLine(logging.Formatter):
     """Formatter that prints a record as one line of printable characters, as errors are printed."""
 
     def format(self, record: logging.LogRecord) -> str:
-        return printable_line(record.getMessage(), _LOG_LIMIT)
+        return printable_line(record.getMessage(), 2000)
 
 
 class Command(Protocol):
@@ -120,13 +109,16 @@ def with_codec(command: type[Command], args: Sequence[str]) -> type[Command]:
 
 
 def one_line(box: str) -> str:
-    """tyro's framed complaint as one line: its title and text, without rule and hints below it."""
-    title, *body = box.strip().splitlines() or [""]
-    body = list(dropwhile(_RULE.fullmatch, body))  # below the title where the terminal has no frames
-    text = takewhile(lambda line: not _RULE.fullmatch(line), body)
-    words = " ".join(_FRAME.sub(" ", " ".join(text)).split())
-    heading = " ".join(_FRAME.sub(" ", title).split()).lower()
-    return f"{words or heading or 'unusable arguments'} (see --help)"
+    """Return tyro's framed complaint as one line, without the hints that stand behind a rule."""
+    title, *body = [line.strip(" │") for line in box.strip().splitlines()] or [""]
+    said: list[str] = []
+    for line in body:
+        if not line or set(line) - set("─-╰╯"):
+            said.append(line)
+        elif said:
+            break
+    words = " ".join(" ".join(said).split()) or title.strip(" ╭╮─").lower()
+    return f"{words or 'unusable arguments'} (see --help)"
 
 
 def parsed(program: str, kind: Any, args: Sequence[str], description: str | None = None) -> Any:
@@ -149,28 +141,9 @@ def parsed(program: str, kind: Any, args: Sequence[str], description: str | None
         description=description,
         args=args,
         config=(tyro.conf.CascadeSubcommandArgs,),
-        registry=_NUMBERS,
     )
     log.setLevel(found.verbosity.level)
     return found.command
-
-
-_NUMBERS = ConstructorRegistry()
-
-
-@_NUMBERS.primitive_rule
-def _read_number(option: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-    """How tyro reads numbers, but for the digits of other scripts."""
-    kind, read = option.type, {int: whole_number, float: number}.get(option.type)
-    if read is None:
-        return None
-    return PrimitiveConstructorSpec(
-        nargs=1,
-        metavar=kind.__name__.upper(),
-        instance_from_str=lambda words: read(words[0]),
-        is_instance=lambda value: isinstance(value, kind) or ("~" if isinstance(value, int) else False),
-        str_from_instance=lambda value: [str(value)],
-    )
 
 
 def main(program: str, parser: Callable[[], Command]) -> int:
@@ -203,7 +176,7 @@ def _run(program: str, parser: Callable[[], Command]) -> None:
         raise InputError(one_line(complaint.getvalue())) from None
     warnings.filterwarnings("ignore", module=r"(torch|transformers|huggingface_hub|numba)(\.|$)")
     began = time.perf_counter()
-    with _signals_raise(program):
+    with raised(program, _CONTINUES):
         check_arguments(command)
         command.run()
     log.debug("%s %s: %.1f s", program, __version__, time.perf_counter() - began)
@@ -215,9 +188,9 @@ def _ended(program: str, error: BaseException) -> int:
         _drop_standard_output()
         return 0
     if isinstance(error, KeyboardInterrupt):
-        how, code = ("terminated", 143) if isinstance(error, Terminated) else ("interrupted", 130)
-        print(f"{program}: {how}{_CONTINUES}", file=sys.stderr)
-        return code
+        number = signal.SIGTERM if isinstance(error, Terminated) else signal.SIGINT
+        print(f"{program}: {SAID[number]}{_CONTINUES}", file=sys.stderr)
+        return 128 + number
     if isinstance(error, OSError):
         return _fail(program, _system_complaint(error))
     if isinstance(error, MemoryError):
@@ -225,62 +198,32 @@ def _ended(program: str, error: BaseException) -> int:
     return _fail(program, str(error))
 
 
-@contextlib.contextmanager
-def _signals_raise(program: str) -> Iterator[None]:
-    """Have SIGTERM end a command as Ctrl-C does: with what is finished kept, and a line."""
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        if is_import(frame):
-            end(program, number, _CONTINUES)
-        raise Terminated if number == signal.SIGTERM else KeyboardInterrupt
-
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    own = dict.fromkeys((signal.SIGTERM, signal.SIGINT), stop)
-    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # started in a shell's background
-        del own[signal.SIGINT]
-    before = {number: signal.signal(number, handler) for number, handler in own.items()}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler if handler is not None else signal.SIG_DFL)
-
-
 class _StandardError(io.FileIO):
-    """Standard error. What it does not take is lost, and the work goes on."""
+    """Standard error, of which what cannot be written is lost, and the work goes on."""
 
     def write(self, data: Any) -> int:
         """Write `data`, or lose it; return its number of bytes."""
-        try:
+        with contextlib.suppress(OSError):
             return super().write(data)
-        except OSError:
-            return len(data)
+        return len(data)
 
 
 def _prepare_standard_streams() -> None:
-    """Names that cannot be encoded are printed with escapes. A closed standard output fails when it is
-    written to, standard error never does, and no file that is opened later takes their place."""
+    """Have a closed standard output fail when it is written to, and standard error never; print names that
+    cannot be encoded with escapes."""
+    for number in (1, 2):
+        try:
+            os.fstat(number)
+        except OSError:  # closed: no file that is opened later shall take its place
+            os.dup2(os.open(os.devnull, os.O_RDONLY), number)
     if sys.stdout is None:
-        _occupy(1, os.O_RDONLY)
         sys.stdout = open(1, "w", encoding="utf-8", closefd=False)  # noqa: SIM115  as long as the process
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
     if sys.stderr is sys.__stderr__:
-        if sys.stderr is None:
-            _occupy(2, os.O_WRONLY)
         encoding = "utf-8" if sys.stderr is None else sys.stderr.encoding
         raw = io.BufferedWriter(_StandardError(2, "w", closefd=False))
         sys.stderr = io.TextIOWrapper(raw, encoding, errors="backslashreplace", line_buffering=True)
-
-
-def _occupy(descriptor: int, flags: int) -> None:
-    """Open the null device as a standard stream that is closed."""
-    nowhere = os.open(os.devnull, flags)
-    if nowhere != descriptor:
-        os.dup2(nowhere, descriptor)
-        os.close(nowhere)
 
 
 def _drop_standard_output() -> None:
@@ -295,7 +238,7 @@ def _system_complaint(error: OSError) -> str:
     if isinstance(error.filename, str | bytes):
         remedy = f"; {_ROOM}" if error.errno in NO_ROOM else ""
         return f"{shown(os.fsdecode(error.filename))}: {reason}{remedy}"
-    if error.errno in _UNWRITTEN:
+    if error.errno in (*NO_ROOM, errno.EBADF):  # EBADF: of a stream that is closed
         _drop_standard_output()  # perhaps the culprit, which would complain again at exit
         return f"a file or standard output cannot be written ({reason}); {_ROOM}"
     return reason

@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from langsplat_core.arrays import Array, logit, number
+from langsplat_core.arrays import Array, logit
 from langsplat_core.errors import InputError, malformed
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.packing import smallest_three
@@ -155,7 +155,7 @@ def metres_by_comments(comments: Iterable[str]) -> float | None:
         match comment.replace(":", " ").split():
             case [key, text] if key == METRES:
                 try:
-                    value = number(text)
+                    value = float(text)
                 except ValueError:
                     value = math.nan
                 found = value if 0 < value < math.inf else None

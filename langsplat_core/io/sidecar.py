@@ -70,7 +70,7 @@ from numpy.typing import DTypeLike
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from langsplat_core.arrays import Array, check_array, number
+from langsplat_core.arrays import Array, check_array
 from langsplat_core.errors import FormatError, printable_line, quoted
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import open_for_reading, parse_json
@@ -210,7 +210,7 @@ def _field(tensors: dict[str, Array], metadata: dict[str, str], path: Path) -> L
     reading = Reading()
     if metadata["version"] != "1":
         calibration = _calibration(metadata, path)
-        reading = Reading(number(metadata["temperature"]), number(metadata["found"]), calibration)
+        reading = Reading(float(metadata["temperature"]), float(metadata["found"]), calibration)
     return LanguageField(
         codec.from_file(tensors),
         tensors["confidence"],

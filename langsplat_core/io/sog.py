@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from langsplat_core.arrays import Array, logit, sigmoid, whole_number
+from langsplat_core.arrays import Array, logit, sigmoid
 from langsplat_core.errors import FormatError, quoted
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import (
@@ -108,7 +108,7 @@ def _finest_ranges(tree: Any) -> dict[int, list[tuple[int, int]]]:
     while waiting:
         node = waiting.pop()
         waiting += reversed(node.get("children", []))
-        leaves.append({whole_number(level): place for level, place in node.get("lods", {}).items()})
+        leaves.append({int(level): place for level, place in node.get("lods", {}).items()})
     finest = min((level for leaf in leaves for level in leaf), default=0)
     ranges: dict[int, list[tuple[int, int]]] = {}
     for place in (leaf[finest] for leaf in leaves if finest in leaf):

@@ -287,7 +287,7 @@ def test_a_signal_ends_a_command_in_a_line(number: int, said: str, tmp_path: Pat
 @pytest.mark.parametrize("seconds", [0.0, 0.2])
 def test_a_signal_while_modules_are_imported_is_a_line(program: str, number: int, seconds: float) -> None:
     code = (
-        "import signal, sys\nfrom langsplat_core.errors import end_in_a_line\n"
+        "import signal, sys\nfrom langsplat_core.interrupts import end_in_a_line\n"
         f"from {program}.__main__ import entry\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "end_in_a_line('begins')\nprint('ready', flush=True)\nsys.argv = ['x', '--help']\nentry()\n"

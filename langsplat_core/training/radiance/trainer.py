@@ -22,7 +22,8 @@ from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.config import INRIA, RadianceConfig, check_settings
 from langsplat_core.datasets.capture import Capture, shrunk_view
 from langsplat_core.errors import InputError
-from langsplat_core.progress import Cancelled, Progress, Terminated, silent
+from langsplat_core.interrupts import Terminated
+from langsplat_core.progress import Cancelled, Progress, silent
 from langsplat_core.scene import Camera, Gaussians
 from langsplat_core.training import one_torch_thread
 from langsplat_core.training.radiance.density import (
