@@ -1,6 +1,6 @@
-// From channels to an image; displays.py beside it is the plain twin of this file and a test compares the
-// two. Channels are premultiplied by alpha, row 0 is the top row. HEAT_FADE, SEGMENT_OPACITY, LEAST_ALPHA,
-// MAX_QUERIES, MAP_NODES and SHOWN, the drawings of all displays, are defined from there.
+// From channels to an image; composing.py beside it does the same on the CPU and a test compares the two.
+// Channels are premultiplied by alpha, row 0 is the top row. HEAT_FADE, SEGMENT_OPACITY, LEAST_ALPHA,
+// MAX_QUERIES, MAP_NODES and SHOWN, all drawings as one expression, are defined from displays.py.
 
 uniform sampler2D colours;      // rgb, alpha
 uniform sampler2D extra;        // latent colours, alpha; one query per channel (0: none), alpha; or
@@ -9,7 +9,7 @@ uniform sampler2D colour_maps;  // MAP_NODES x maps
 uniform int colour_map;         // row of the one in use
 uniform vec3 query_colours[MAX_QUERIES];
 
-uniform int display;            // index of its row
+uniform int display;            // number of its drawing
 uniform vec2 ranges[MAX_QUERIES];  // per component of the further channel, the values drawn as 0 and as 1
 uniform bool own_colours;       // heat in the colour of each query instead of the colour map
 uniform float heat_opacity;

@@ -1,13 +1,14 @@
-"""Displays: one table of what can be shown, and how rasterized channels become an image.
+"""Displays: one table of what can be shown, and the values per Gaussian that each shows.
 
-A rasterizer delivers premultiplied channels (colours, and the one further channel of the display) and alpha;
-`compose` turns them into what a person sees. Every display is drawn twice, here in NumPy and in
-`compose.frag.glsl`; constants reach the shader by `shader_defines`, and a test compares the images. Buttons,
-keys, options, channels and both drawings come from `DISPLAYS`.
+A rasterizer delivers premultiplied channels (colours, and the one further channel of the display) and alpha,
+which become what a person sees in one of six drawings: on the CPU by `composing`, on a graphics device by
+`compose.frag.glsl`. Constants reach the shader by `shader_defines`, and a test compares the images. Buttons,
+keys, options, channels and drawings come from `DISPLAYS`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from importlib.resources import files
 from types import MappingProxyType
 from typing import Literal, Protocol
@@ -16,7 +17,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import ColourMap, Display, PictureConfig
+from langsplat_core.config import ColourMap, Display
 from langsplat_core.io.hostile import opened
 from langsplat_core.scene import NO_NODE, LanguageField
 
@@ -197,7 +198,7 @@ def nodes(subject: Subject) -> Array | None:
     return np.asarray(colours.astype(np.float32)[of.reshape(-1)])
 
 
-# From channels to an image.
+# From channels to an image: `composing` draws it on the CPU, `compose.frag.glsl` on a graphics device.
 
 HEAT_FADE = 0.35  # heat at which the heat map reaches its full opacity
 SEGMENT_OPACITY = 0.6
@@ -213,35 +214,26 @@ class Channels:
     extra: Array | None = None  # (H, W, C) the display's further channel, C <= 3
 
 
-@dataclass(frozen=True, eq=False)
-class _Sheet:
-    """The rasterized channels and settings that a display is drawn from."""
+class Drawing(IntEnum):
+    """How a pixel is drawn; each is a branch of the kernel in `composing` and an expression in GLSL."""
 
-    channels: Channels
-    extra: Array  # (H, W, C) the display's further channel; alpha for displays without one
-    picture: PictureConfig
-    ranges: Ranges
+    COLOURS = 0  # over the background
+    SUMS = 1  # the same with the further channel in place of the colours
+    DEPTH = 2  # mean of the further channel by the colour map, near to far; the background where alpha is low
+    ALPHA = 3  # opaque grey
+    HEAT = 4  # one query by the colour map, several by their own colours
+    SEGMENTS = 5  # the query that has most of a pixel, in its colour
 
-    def uncovered(self) -> Array:
-        """(H, W, 3) the background as far as the scene leaves it uncovered."""
-        if self.picture.transparent:
-            return np.zeros_like(self.channels.rgb)
-        return (1 - self.channels.alpha)[..., None] * np.asarray(self.picture.background)
 
-    def colours(self) -> Array:
-        """(H, W, 3) in [0, 1], the scene over the background."""
-        return np.clip(self.of_scene(self.channels.rgb) + self.uncovered(), 0, 1)
-
-    def of_scene(self, total: Array) -> Array:
-        """(H, W, 3) premultiplied sums as they enter the image: where that is transparent its colours are
-        the scene's own, undiluted, as PNG wants them."""
-        if not self.picture.transparent:
-            return total
-        return total / np.maximum(self.channels.alpha, LEAST_ALPHA)[..., None]
-
-    def mean(self) -> Array:
-        """(H, W, C) mean value of the further channel, 0 where alpha is below the gate."""
-        return gated_mean(self.extra, self.channels.alpha, self.picture.alpha_gate)
+# Each of type vec4 in the variables of `main` in `compose.frag.glsl`; the fourth is a transparent image's.
+_GLSL = {
+    Drawing.COLOURS: "vec4(base, c.a)",
+    Drawing.SUMS: "vec4(sums.rgb / share + uncovered, c.a)",
+    Drawing.DEPTH: "depth_map(sums.rg)",
+    Drawing.ALPHA: "vec4(vec3(c.a), 1.0)",
+    Drawing.HEAT: "vec4(heat_map(base, mean), c.a)",
+    Drawing.SEGMENTS: "vec4(segments(base, mean), c.a)",
+}
 
 
 def gated_mean(total: Array, alpha: Array, gate: float) -> Array:
@@ -250,76 +242,9 @@ def gated_mean(total: Array, alpha: Array, gate: float) -> Array:
     return np.where(open_[..., None], total / np.where(open_, alpha, 1)[..., None], 0)
 
 
-def full_ranges(ranges: Ranges, count: int) -> Ranges:
-    """`ranges` of `count` components: those without one spread over all of [0, 1]."""
-    return (*ranges[:count], *[(0.0, 1.0)] * (count - len(ranges)))
-
-
-def compose(channels: Channels, picture: PictureConfig, ranges: Ranges = ()) -> Array:
-    """(H, W, 3) uint8 image; with `picture.transparent` (H, W, 4), its colours not premultiplied. Where a
-    display's further channel is absent it shows the plain colours. `ranges`: see `full_ranges`."""
-    row = DISPLAYS[picture.display]
-    draw = row.draw if row.channel is None or channels.extra is not None else _colours
-    extra = channels.alpha[..., None] if channels.extra is None else channels.extra
-    sheet = _Sheet(channels, extra, picture, ranges)
-    drawn = draw(sheet)
-    if not picture.transparent:
-        drawn = drawn[..., :3]
-    elif drawn.shape[-1] == 3:
-        drawn = np.concatenate([drawn, channels.alpha[..., None]], -1)
-    return np.rint(255 * np.clip(drawn, 0, 1)).astype(np.uint8)
-
-
-def _colours(sheet: _Sheet) -> Array:
-    return sheet.colours()
-
-
-def _latent(sheet: _Sheet) -> Array:
-    return sheet.of_scene(sheet.extra) + sheet.uncovered()
-
-
-def _heat(sheet: _Sheet) -> Array:
-    """Heat map: one query by the colour map, several by their own colours. Where they overlap, the mean of
-    the colours, weighted by heat, as opaque as the hottest of them."""
-    picture, relevancy = sheet.picture, sheet.mean()
-    count = relevancy.shape[-1]
-    low, high = np.transpose(full_ranges(sheet.ranges, count))
-    heats = np.clip((relevancy - low) / (high - low), 0, 1)
-    heat = heats.max(-1)
-    if picture.own_colours:
-        fade, total = heat, np.maximum(heats.sum(-1, keepdims=True), 1e-9)
-        colours = heats / total @ QUERY_COLOURS[:count]
-    else:
-        fade, colours = np.clip(heat / HEAT_FADE, 0, 1), mapped(heat, picture.colour_map)
-    mix = (picture.heat_opacity * fade * fade * (3 - 2 * fade))[..., None]  # smoothstep
-    return sheet.colours() * picture.dim * (1 - mix) + colours * mix
-
-
-def _segments(sheet: _Sheet) -> Array:
-    """The query that has most of a pixel, in its colour, as opaque as its value of 1 is hot."""
-    picture, relevancy, colours = sheet.picture, sheet.mean(), sheet.colours()
-    low, high = np.transpose(full_ranges(sheet.ranges, relevancy.shape[-1]))
-    opacity = SEGMENT_OPACITY * np.clip((1 - low) / (high - low), 0, 1)
-    winner = relevancy.argmax(-1)
-    inside = (relevancy.max(-1) > picture.threshold)[..., None]
-    mix = opacity[winner][..., None]
-    return np.where(inside, colours * (1 - mix) + QUERY_COLOURS[winner] * mix, colours * picture.dim)
-
-
-def _depth(sheet: _Sheet) -> Array:
-    """Depth by the colour map; a pixel of a transparent image is opaque, or nothing at all."""
-    covered = (sheet.channels.alpha > sheet.picture.alpha_gate)[..., None]
-    ((near, far),) = full_ranges(sheet.ranges, 1)
-    t = np.clip((sheet.mean()[..., 0] - near) / max(far - near, 1e-9), 0, 1)
-    backdrop = np.zeros(3) if sheet.picture.transparent else np.asarray(sheet.picture.background)
-    colours = np.where(covered, mapped(1 - t, sheet.picture.colour_map), backdrop)
-    return np.concatenate([colours, covered], -1)
-
-
-def _alpha(sheet: _Sheet) -> Array:
-    """Return alpha as an opaque (h, w, 4) grey image."""
-    alpha = sheet.channels.alpha
-    return np.stack([alpha, alpha, alpha, np.ones_like(alpha)], -1)
+def full_ranges(ranges: Ranges) -> Array:
+    """(MAX_QUERIES, 2) `ranges` of the components of a channel; all of [0, 1] for those without one."""
+    return np.array([*ranges, *[(0.0, 1.0)] * MAX_QUERIES][:MAX_QUERIES])
 
 
 # One row per display, in the order of buttons and keys.
@@ -327,13 +252,11 @@ def _alpha(sheet: _Sheet) -> Array:
 
 @dataclass(frozen=True)
 class DisplayRow:
-    """One display. Its GLSL is an expression of type vec4 in the variables of `main` in `compose.frag.glsl`,
-    its opacity that of a transparent image; a NumPy drawing without a fourth component has the scene's."""
+    """One display."""
 
     name: Display
     label: str  # on its button
-    draw: Callable[[_Sheet], Array]  # (H, W, 3 or 4) in [0, 1]
-    glsl: str
+    drawing: Drawing
     channel: Callable[[Subject], Array | None] | Literal["depth"] | None = None  # (N, 1 to 3), or camera z
     # of the answers, by `PictureConfig.heat_scale`
     ranges: Callable[[Answers, tuple[float, float] | None], Ranges] = lambda answers, scale: ()
@@ -346,14 +269,13 @@ class DisplayRow:
 
 
 _ROWS = (
-    DisplayRow("rgb", "Colours", _colours, "vec4(base, c.a)"),
-    DisplayRow("depth", "Depth", _depth, "depth_map(sums.rg)", "depth", uses_map=True),
-    DisplayRow("alpha", "Alpha", _alpha, "vec4(vec3(c.a), 1.0)"),
+    DisplayRow("rgb", "Colours", Drawing.COLOURS),
+    DisplayRow("depth", "Depth", Drawing.DEPTH, "depth", uses_map=True),
+    DisplayRow("alpha", "Alpha", Drawing.ALPHA),
     DisplayRow(
         "relevancy",
         "Relevancy",
-        _heat,
-        "vec4(heat_map(base, mean), c.a)",
+        Drawing.HEAT,
         relevancies,
         heat_ranges,
         legend=True,
@@ -364,41 +286,27 @@ _ROWS = (
     DisplayRow(
         "segmentation",
         "Segmentation",
-        _segments,
-        "vec4(segments(base, mean), c.a)",
+        Drawing.SEGMENTS,
         members,
         member_ranges,
         needs_field=True,
         needs_query=True,
     ),
-    DisplayRow(
-        "latent",
-        "Latent",
-        _latent,
-        "vec4(sums.rgb / share + uncovered, c.a)",
-        latents,
-        is_colour=True,
-        by_level=True,
-        needs_field=True,
-    ),
-    DisplayRow(
-        "tree",
-        "Tree",
-        _latent,
-        "vec4(sums.rgb / share + uncovered, c.a)",
-        nodes,
-        is_colour=True,
-        by_level=True,
-        needs_field=True,
-    ),
+    DisplayRow("latent", "Latent", Drawing.SUMS, latents, is_colour=True, by_level=True, needs_field=True),
+    DisplayRow("tree", "Tree", Drawing.SUMS, nodes, is_colour=True, by_level=True, needs_field=True),
 )
 DISPLAYS: Mapping[Display, DisplayRow] = MappingProxyType({row.name: row for row in _ROWS})
-NUMBERS: Mapping[Display, int] = MappingProxyType({name: number for number, name in enumerate(DISPLAYS)})
+
+
+def drawing_of(display: Display, has_channel: bool) -> Drawing:
+    """Drawing of a display; plain colours where it needs a further channel that is not there."""
+    row = DISPLAYS[display]
+    return row.drawing if has_channel or row.channel is None else Drawing.COLOURS
 
 
 def shader_defines() -> dict[str, int | float | str]:
-    """Constants that the shader shares with this module, and all displays' drawings as one expression."""
-    shown = "".join(f"display == {number} ? ({row.glsl}) : " for number, row in enumerate(_ROWS))
+    """Constants that the shader shares with this module, and all drawings as one expression."""
+    shown = "".join(f"display == {drawing.value} ? ({glsl}) : " for drawing, glsl in _GLSL.items())
     return {
         "HEAT_FADE": HEAT_FADE,
         "SEGMENT_OPACITY": SEGMENT_OPACITY,

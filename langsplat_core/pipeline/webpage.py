@@ -24,7 +24,7 @@ from scipy.sparse import csr_matrix
 
 from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.config import PictureConfig
-from langsplat_core.display.displays import COLOUR_MAPS, NUMBERS, QUERY_COLOURS, STRENGTH, shader_defines
+from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, QUERY_COLOURS, STRENGTH, shader_defines
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.progress import Progress, silent
@@ -86,7 +86,11 @@ def write_page(
         "raster": asdict(scene.raster_settings()),
         "sh_count": scene.gaussians.sh.shape[1],
         "views": views(scene),
-        "picture": {**asdict(PictureConfig()), "displays": dict(NUMBERS), "strength": dict(STRENGTH)},
+        "picture": {
+            **asdict(PictureConfig()),
+            "displays": {name: row.drawing for name, row in DISPLAYS.items()},
+            "strength": dict(STRENGTH),
+        },
         "query_colours": QUERY_COLOURS.tolist(),
         "shaders": page_shaders(),
     }

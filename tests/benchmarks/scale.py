@@ -29,7 +29,7 @@ from PIL import Image
 from langsplat_core.arrays import Array, psnr, sigmoid, unit
 from langsplat_core.cli.run import OutFolder
 from langsplat_core.config import Count, CountOrZero, PictureConfig, Range
-from langsplat_core.display.composing import composed
+from langsplat_core.display.composing import compose_upwards
 from langsplat_core.display.displays import Channels
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.benchmarks.config import Size, peak_memory, resident_memory, restart_peak
@@ -229,7 +229,7 @@ def measure_moving(command: Scale, progress: Progress = silent) -> list[MovingCo
             with watched() as laps:
                 drawn = channels(gaussians, small)
                 with lap("compose"):
-                    composed(drawn, PictureConfig())
+                    compose_upwards(drawn, PictureConfig())
             seconds.append(time.perf_counter() - wall)
             processor.append(time.process_time() - cpu)
             steps.append(laps)

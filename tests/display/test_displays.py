@@ -1,4 +1,4 @@
-"""The table of displays: channels of answers and latents, and composition in NumPy."""
+"""The table of displays: channels of answers and latents, and composition on the CPU."""
 
 from dataclasses import replace
 from typing import get_args
@@ -8,6 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from langsplat_core.config import ColourMap, Display, PictureConfig
+from langsplat_core.display.composing import compose
 from langsplat_core.display.displays import (
     COLOUR_MAPS,
     DISPLAYS,
@@ -17,7 +18,6 @@ from langsplat_core.display.displays import (
     SEGMENT_OPACITY,
     Channels,
     Subject,
-    compose,
     heat_ranges,
     latent_colours,
     mapped,

@@ -16,7 +16,8 @@ from langsplat_core.arrays import Array, psnr, unit
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.export import Export
 from langsplat_core.config import PictureConfig
-from langsplat_core.display.displays import Channels, compose, heat_ranges, latent_colours
+from langsplat_core.display.composing import compose
+from langsplat_core.display.displays import Channels, heat_ranges, latent_colours
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.pipeline.webpage import write_page

@@ -16,15 +16,13 @@ import moderngl
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.display.composing import composed
+from langsplat_core.display.composing import compose, compose_upwards
 from langsplat_core.display.displays import (
     COLOUR_MAPS,
-    MAX_QUERIES,
-    NUMBERS,
     QUERY_COLOURS,
     Channels,
     Ranges,
-    compose,
+    drawing_of,
     full_ranges,
     shader_defines,
 )
@@ -48,7 +46,7 @@ from langsplat_viewer.rendering.request import (
 )
 
 Backend = Literal["auto", "opengl", "cpu", "cuda"]
-Layer = moderngl.Texture | Channels  # what a pane is composed of, by the shader or by `composed`
+Layer = moderngl.Texture | Channels  # what a pane is composed of, by the shader or by `compose`
 Layers = tuple[Layer, ...]  # colours with alpha, then one for each channel that was wanted
 Ahead = Callable[[Progress], Callable[[], Layers]]  # for any thread; what it returns: for the context's
 PICK_ALPHA = 0.1  # a pixel with less alpha shows nothing that could be picked
@@ -164,7 +162,7 @@ class ArrayChannels:
 
 
 class ArrayRenderer:
-    """Draws requests with a rasterizer that returns arrays, and composes them in NumPy."""
+    """Draws requests with a rasterizer that returns arrays, and composes them on the CPU."""
 
     def __init__(self, rasterizer: Rasterizer) -> None:
         self._channels, self._inputs = ArrayChannels(rasterizer), Inputs()
@@ -252,7 +250,7 @@ class GlSource:
 
 
 class ArraySource:
-    """The same by a rasterizer that returns arrays: uploaded, but on a software driver left to `composed`,
+    """The same by a rasterizer that returns arrays: uploaded, but on a software driver left to `compose`,
     since such a driver takes longer to upload and compose than the rasterizer to draw."""
 
     def __init__(self, ctx: moderngl.Context, rasterizer: Rasterizer) -> None:
@@ -468,7 +466,7 @@ class GlRenderer:
             (image,) = target.color_attachments
             assert isinstance(image, moderngl.Texture)
             with lap("compose", self._ctx.finish):
-                image.write(composed(layer, pane.picture, ranges))
+                image.write(compose_upwards(layer, pane.picture, ranges))
             target.use()
             return
         set_uniforms(self._program, _uniforms(pane, ranges, channel.is_absent))
@@ -532,9 +530,9 @@ def _uniforms(pane: Pane, ranges: Ranges, is_absent: bool) -> dict[str, object]:
         "colour_maps": 2,
         "colour_map": list(COLOUR_MAPS).index(picture.colour_map),
         "transparent": picture.transparent,
-        "display": NUMBERS["rgb" if is_absent and pane.row.channel is not None else picture.display],
+        "display": int(drawing_of(picture.display, not is_absent)),
         "query_colours": QUERY_COLOURS.astype("f4").tobytes(),
-        "ranges": np.array(full_ranges(ranges, MAX_QUERIES), "f4").tobytes(),
+        "ranges": full_ranges(ranges).astype("f4").tobytes(),
         "own_colours": picture.own_colours,
         "heat_opacity": picture.heat_opacity,
         "dim": picture.dim,
