@@ -23,13 +23,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from PIL import Image
 from scipy.sparse import csr_matrix
 
 from langsplat_core.arrays import Array
 from langsplat_core.compiled import helper, kernel, shared_workers
 from langsplat_core.config import PictureConfig
-from langsplat_core.display.displays import mapped
+from langsplat_core.display.composing import compose
+from langsplat_core.display.displays import Channels
 from langsplat_core.errors import FormatError, InputError, LangSplatError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import exists, open_for_reading, parse_json
@@ -508,18 +508,12 @@ def draw(scene: Scene, size: tuple[int, int], answer: QueryResult | None = None)
     With an answer from the training camera nearest to its place that has it in its image, with the answer as
     a heat map.
     """
-    camera = _camera(scene, size, answer)
-    values = None if answer is None else answer.even[:, None] * answer.members[:, None]
-    drawn = render(scene, camera, values)
-    image = np.clip(drawn.colours, 0, 1)
-    if answer is not None:
-        low, high = answer.heat_range
-        heat = drawn.values[..., 0] / np.maximum(drawn.alpha, 1e-6)
-        share = np.clip((heat - low) / (high - low), 0, 1)[..., None]
-        solid = np.where(share > 0, PictureConfig().heat_opacity, 0) * (drawn.alpha[..., None] > 0.02)
-        grey = image.mean(2, keepdims=True) * 0.7 + 0.05
-        image = grey * (1 - solid) + solid * mapped(share[..., 0])
-    return np.asarray(Image.fromarray(np.rint(255 * image).astype(np.uint8)).convert("RGB"))
+    if answer is None:
+        drawn = render(scene, _camera(scene, size, None))
+        return compose(Channels(drawn.colours, drawn.alpha), PictureConfig())
+    drawn = render(scene, _camera(scene, size, answer), (answer.even * answer.members)[:, None])
+    heat = Channels(drawn.colours, drawn.alpha, drawn.values)
+    return compose(heat, PictureConfig(display="relevancy"), (answer.heat_range,))
 
 
 def _camera(scene: Scene, size: tuple[int, int], answer: QueryResult | None) -> Camera:
