@@ -37,11 +37,12 @@ from langsplat_core.io.shapes import (
 from langsplat_core.io.sidecar import read_words
 from langsplat_core.pipeline.evidence import draw_evidence, find_evidence, kept_features, kept_photographs
 from langsplat_core.progress import TerminalProgress
-from langsplat_core.query.answers import QueryResult, decoded_relevancy, peak_pixel, splatted_relevancy
+from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import Number, check_phrase, count_things, joined, run_phrase
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder, searchable
 from langsplat_core.query.grammar import Atom, Counted, Phrase, heads, unparse
 from langsplat_core.query.instances import Instance, hull
+from langsplat_core.query.pixels import decoded_relevancy, peak_pixel, splatted_relevancy
 from langsplat_core.query.selection import grow, in_pixel, of_rows, shrink
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.render import pixel_weights, view_of

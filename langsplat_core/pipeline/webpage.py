@@ -28,18 +28,17 @@ from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, QUERY_COLOURS
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query import answers, grammar, taught
-from langsplat_core.query.answers import place_of
+from langsplat_core.query import grammar, taught
 from langsplat_core.query.describe import suggest
 from langsplat_core.query.engine import QueryEngine, TextEncoder, no_field
 from langsplat_core.query.instances import BOXED, oriented_box
+from langsplat_core.query.regions import place_of
+from langsplat_core.query.rule import RULE, bars_of
 from langsplat_core.raster.opengl.shaders import WEB, shader, splat_shaders
 from langsplat_core.scene import LEVELS, Camera, Gaussians, Scene
 from langsplat_core.scene.gaussians import along_curve
-from langsplat_core.scene.surface import SMALLEST
 from langsplat_core.semantics.clip_plain import PlainClipText
 from langsplat_core.semantics.encoder import PhraseEncoder
-from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, NARROWEST
 from langsplat_core.semantics.vocabulary import BUNDLED, bundled_vocabulary
 
 MODULES = ("data", "language", "camera", "draw", "page")  # in the order in which they import each other
@@ -210,7 +209,7 @@ def language_tables(
         "palette": np.rint(255 * palette).astype(np.uint8),
         **_region_tables(engine),
     }
-    bars = [] if engine.chance is None else [asdict(bar) for bar in answers.bars(engine.chance)]
+    bars = [] if engine.chance is None else [asdict(bar) for bar in bars_of(engine.chance)]
     progress("choosing phrases", 0.3)
     suggested = suggest(engine)
     numbers: dict[str, Any] = {
@@ -220,7 +219,8 @@ def language_tables(
         "guess": engine.basis.short if engine.basis.guesses else "",
         "bars": bars,
         "calibration": None if engine.calibration is None else asdict(engine.calibration),
-        "rules": _rules(),
+        "rule": RULE.as_json() | {"least_likeness": [-taught.HEAT, -1 / taught.UNIT]},
+        "grammar": _words_of_grammar(),
         "examples": suggested.examples,
         "phrases": suggested.phrases,
     }
@@ -234,25 +234,10 @@ def language_tables(
     return numbers | words, tensors | own
 
 
-def _rules() -> dict[str, Any]:
-    """The constants of `query.answers`, `query.taught` and `query.grammar`."""
-    words = ("ARTICLES", "STOP_WORDS", "ADJECTIVES", "PARTS")
-    return {
-        **{name.lower(): sorted(getattr(grammar, name)) for name in words},
-        "found": {name: [None if np.isinf(x) else x for x in pair] for name, pair in answers.FOUND.items()},
-        "advantage": dict(answers.ADVANTAGE),
-        "parts_share": answers.PARTS,
-        "reach": [answers.REACH, answers.NEAREST, answers.FARTHEST],
-        "nothing": answers.NOTHING,
-        "smallest": SMALLEST,
-        "narrowest": NARROWEST,
-        "floor": FLOOR,
-        "heat_span": MIN_HEAT_SPAN,
-        "weak": answers.WEAK,
-        "nearly": answers.NEARLY,
-        "least_fit": -taught.HEAT,
-        "least_above": -1 / taught.UNIT,
-    }
+def _words_of_grammar() -> dict[str, list[str]]:
+    """Return the word lists by which a part is told from a thing, sorted."""
+    names = ("ARTICLES", "STOP_WORDS", "ADJECTIVES", "PARTS")
+    return {name.lower(): sorted(getattr(grammar, name)) for name in names}
 
 
 def _region_tables(engine: QueryEngine) -> dict[str, Array]:

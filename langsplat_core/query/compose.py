@@ -3,7 +3,7 @@
 How things stand to each other is measured in their own sizes, so that a scene needs no scale.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -14,7 +14,7 @@ from langsplat_core.arrays import Array, across
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.answers import QueryResult, even_relevancy, excess, locate, lowest, triple
+from langsplat_core.query.answers import QueryResult, even_relevancy, locate
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import (
     Atom,
@@ -35,6 +35,7 @@ from langsplat_core.query.grammar import (
     unparse,
 )
 from langsplat_core.query.instances import axis_aligned_box, told_apart
+from langsplat_core.query.rule import RULE, combined, judge, triple
 from langsplat_core.scene import LEVELS, Camera
 from langsplat_core.scene.language import phrase_key, tidy
 from langsplat_core.scene.surface import Surface
@@ -146,7 +147,7 @@ def count_things(engine: QueryEngine, answer: QueryResult) -> Number:
     reached less far or farther below its best region."""
     fits = engine.scale.fit(answer.even)
     best = float(fits[answer.members].max(initial=-np.inf))
-    least, most = (fits >= lowest(best, share) for share in (STRICT, WIDE))
+    least, most = (fits >= RULE.least_fit(best, share) for share in (STRICT, WIDE))
     low, own, high = (
         len(separate(engine.surface, inside[engine.surface.rows], engine.tree))
         for inside in (least & answer.members, answer.members, most | answer.members)
@@ -275,16 +276,12 @@ def cut_inside(
     own_surface = thing.members & known[chosen]  # without what it touches, which may be anything
     low = float(np.quantile(even[chosen][own_surface], LEAST)) if own_surface.any() else peak
     members = inside & (even[chosen] > low + SHARE * max(peak - low, SPAN))
-    fits, probability = triple(engine.scale.fit(np.array(peaks))), thing.probability
-    right, above = True, None
-    if engine.calibration is not None and probability is not None:
-        odds = engine.calibration.inside
-        right = odds.probability(fits) >= odds.found
-        probability = min(probability, odds.probability(fits))
-    elif engine.chance is not None:
-        above = excess(fits, engine.chance_among(there), "inside", level)
-        right = above >= 0
-        above = _combined([above, thing.excess], min)
+    fits, judgements = triple(engine.scale.fit(np.array(peaks))), [thing.judgement]
+    if engine.chance is not None:
+        calibration = engine.calibration if thing.probability is not None else None
+        bars = engine.chance_among(there) if calibration is None else None
+        judgements += [judge(fits, "inside", level, bars, calibration)]
+    judgement = combined(judgements, all_needed=True)
     return replace(
         asked[0],
         level=chosen,
@@ -293,9 +290,7 @@ def cut_inside(
         even=even[chosen],
         peak=peak,
         fits=fits,
-        probability=_of_any(members, probability),
-        excess=above,
-        found=bool(members.any() and thing.found and right),
+        judgement=judgement if members.any() else judgement.absent,
         members=members,
     )
 
@@ -312,9 +307,7 @@ def joined(answers: Sequence[QueryResult], all_needed: bool) -> QueryResult:
         relevancy=np.tile(values.astype(np.float32), (len(LEVELS), 1)),
         even=np.max([np.where(a.members, a.even, 0) for a in counting], axis=0),
         peak=peak,
-        probability=_combined([answer.probability for answer in counting], score),
-        excess=_combined([answer.excess for answer in counting], score),
-        found=(all if all_needed else any)(answer.found for answer in answers),
+        judgement=combined([answer.judgement for answer in counting], all_needed),
         members=np.any([answer.members for answer in counting], axis=0),
     )
 
@@ -329,31 +322,19 @@ def surest(engine: QueryEngine, answer: QueryResult) -> QueryResult:
     the answer to "red mug", for want of a better one; it is not what "not red mug" means."""
     fits = engine.scale.fit(answer.even)
     best = float(fits[answer.members].max(initial=-np.inf))
-    return replace(answer, members=answer.members & (fits >= lowest(best, SURE)))
-
-
-def _combined(values: Sequence[float | None], score: Callable[[Iterable[float]], float]) -> float | None:
-    """The smallest or largest value, by `score`; None where a value is not known."""
-    known = [value for value in values if value is not None]
-    return score(known) if len(known) == len(values) else None
-
-
-def _of_any(members: Array, probability: float | None) -> float | None:
-    """`probability`, but 0 where there are no members; None without calibration."""
-    return probability if probability is None or members.any() else 0.0
+    return replace(answer, members=answer.members & (fits >= RULE.least_fit(best, SURE)))
 
 
 def restricted(answer: QueryResult, keep: Array, needed: QueryResult) -> QueryResult:
     """`answer` limited to `keep` (N,); nothing is found where `needed` is not."""
     members = answer.members & keep
+    judgement = combined([answer.judgement, needed.judgement], all_needed=True)
     return replace(
         answer,
         relevancy=np.where(members, answer.relevancy, 0),
         even=np.where(members, answer.even, 0),
-        probability=_of_any(members, _combined([answer.probability, needed.probability], min)),
-        excess=_combined([answer.excess, needed.excess], min),
         peak=answer.peak if members.any() else 0.0,
-        found=bool(members.any() and answer.found and needed.found),
+        judgement=judgement if members.any() else judgement.absent,
         members=members,
     )
 
@@ -471,7 +452,7 @@ class _Asking:
             case Counted(count, what):
                 every = self.answer(what, level)
                 enough = every.found and count_things(self.engine, every).most >= count
-                return replace(every, found=enough)
+                return replace(every, judgement=replace(every.judgement, found=enough))
             case Relation() | Superlative():
                 return self._chosen(tree, level)
 

@@ -14,21 +14,12 @@ from langsplat_core.errors import EncoderError, InputError, UnknownWordError
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.io.sidecar import SUFFIX, Words
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.answers import (
-    AnswerRule,
-    Bars,
-    Chance,
-    Lookup,
-    QueryResult,
-    bars,
-    build_lookup,
-    by_peak,
-    by_regions,
-    chance_in,
-)
+from langsplat_core.query.answers import AnswerRule, QueryResult, by_peak, by_regions
 from langsplat_core.query.grammar import STOP_WORDS, check_names, only
 from langsplat_core.query.instances import Instance, find_instances
-from langsplat_core.query.selection import Regions, build_regions
+from langsplat_core.query.lookup import Lookup, through_cells
+from langsplat_core.query.regions import Regions, build_regions, chance_in
+from langsplat_core.query.rule import Bars, Chance, bars_of
 from langsplat_core.query.taught import WordSpace, build_word_space, by_showing, compared, shown
 from langsplat_core.scene import CANONICAL_PHRASES, LEVELS, Calibration, LanguageField, Scene, TaughtWord
 from langsplat_core.scene.language import LONGEST_NAME, MOST_SHOWN, phrase_key, split_phrases, tidy
@@ -88,7 +79,7 @@ class QueryEngine:
     ) -> None:
         """load_encoder: usually `semantics.encoders.load_text_encoder`; without one only the scene's own
         phrasebook can be asked. encoder_id: in place of the encoder that the scene names. exact: compare
-        every latent instead of looking it up in a table, to measure the table by. rule: see `answers`;
+        every latent itself instead of its cell, to measure the cells by. rule: see `answers`;
         "regions" becomes "peak" where neither scene nor encoder has everyday phrases to compare with. words:
         taught ones of the user, before those of the scene; EncoderError where they are of another encoder."""
         self.scene = scene
@@ -181,7 +172,7 @@ class QueryEngine:
         canonical = self.text_vectors(phrases, progress) if phrases else None
         self._canonical = canonical
         self.canonical_phrases = tuple(map(phrase_key, phrases)) or CANONICAL_PHRASES
-        for made in ("_lookup", "chance", "_bars"):
+        for made in ("compared", "_lookup", "chance", "_bars"):
             self.__dict__.pop(made, None)
 
     def load_encoder(self, progress: Progress = silent) -> TextEncoder:
@@ -219,25 +210,30 @@ class QueryEngine:
         return build_regions(self.tree, surface_weights(self.scene.gaussians))
 
     @cached_property
+    def compared(self) -> LanguageField:
+        """The field as phrases are compared with it, see `through_cells`."""
+        return self.field if self.exact else through_cells(self.field)
+
+    @cached_property
     def _lookup(self) -> Lookup:
-        return build_lookup(self.field, self.scale, self.exact)
+        return Lookup(self.compared, self.scale)
 
     @cached_property
     def chance(self) -> Chance | None:
         """The fits of everyday phrases in the scene; None where there are none."""
         if self.scale.everyday is None:
             return None
-        return chance_in(self.field, self.regions, self.scale)
+        return chance_in(self.compared, self.regions, self.scale)
 
     @cached_property
     def _bars(self) -> Bars | None:
-        return None if self.chance is None else bars(self.chance)
+        return None if self.chance is None else bars_of(self.chance)
 
     def chance_among(self, members: Array) -> Bars:
         """The best fits of everyday phrases at the regions of some Gaussians, (N,) bool."""
         assert self.chance is not None
         everywhere = self.regions.everywhere[:, members]
-        return bars(self.chance, [np.unique(row[row >= 0]) for row in everywhere])
+        return bars_of(self.chance, [np.unique(row[row >= 0]) for row in everywhere])
 
     def unknown_words(self, phrase: str) -> tuple[str, ...]:
         """Words for which `phrase` cannot be asked; none where it was taught or the phrasebook has it.

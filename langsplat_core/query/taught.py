@@ -16,8 +16,9 @@ import numpy as np
 from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import InputError
-from langsplat_core.query.answers import QueryResult, place_of, sums_of_meanings, triple
-from langsplat_core.query.selection import Regions
+from langsplat_core.query.answers import QueryResult
+from langsplat_core.query.regions import Regions, feature_sums, place_of
+from langsplat_core.query.rule import Verdict, triple
 from langsplat_core.scene import LEVELS, LanguageField, TaughtWord
 from langsplat_core.scene.surface import SMALLEST
 
@@ -73,7 +74,7 @@ def _means(
     a meaning. of: (N,) number of each Gaussian's set, -1 for none; weights: (N,)."""
     counted = field.known[level] & (of >= 0)
     totals = np.bincount(of[counted], weights[counted], count)
-    sums = sums_of_meanings(field, level, of, weights, count, partial(field.codec.cosines, vectors=basis))
+    sums = feature_sums(field, level, of, weights, count, partial(field.codec.cosines, vectors=basis))
     return sums / np.maximum(totals, 1e-12)[:, None], totals > 0
 
 
@@ -133,7 +134,7 @@ def by_showing(
     fits, above = likeness(word, space)
     every = [sigmoid(row) for row in fits]
     solid = [sizes >= min(SMALLEST, sizes.max(initial=0)) for sizes in regions.sizes]
-    peaks = triple(row[some].max(initial=0) for row, some in zip(every, solid, strict=True))
+    peaks = triple(np.array([row[some].max(initial=0) for row, some in zip(every, solid, strict=True)]))
     best = np.where(solid[chosen], fits[chosen], -np.inf)
     excess = float(np.where(solid[chosen], above[chosen], -np.inf).max(initial=-1 / UNIT))
     inside = solid[chosen] & (best >= min(0.0, best.max(initial=-np.inf)))
@@ -151,10 +152,8 @@ def by_showing(
         relevancy=relevancy,
         even=relevancy[chosen],
         peak=peaks[chosen],
-        fits=triple(row[some].max(initial=-HEAT) for row, some in zip(fits, solid, strict=True)),
-        probability=None,
-        excess=excess,
-        found=excess >= 0,
+        fits=triple(np.array([row[some].max(initial=-HEAT) for row, some in zip(fits, solid, strict=True)])),
+        judgement=Verdict(excess >= 0, "example", excess),
         members=regions.spread(chosen, inside, nothing > 0),
         place=place,
         box=box,

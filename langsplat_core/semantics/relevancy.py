@@ -58,6 +58,12 @@ def latent_relevancy(
     return out
 
 
+def fit_of(relevancy: Array | float, rate: float = 1.0) -> Array:
+    """Return the fit that a relevancy in [0, 1] stands for; finite at 0 and 1."""
+    clipped = np.clip(np.asarray(relevancy, np.float64), NARROWEST, 1 - NARROWEST)
+    return np.asarray(np.log(clipped / (1 - clipped)) / rate)
+
+
 @dataclass(frozen=True, eq=False)
 class Scale:
     """Scale on which the cosines of a field are read."""
@@ -86,6 +92,4 @@ class Scale:
 
     def fit(self, relevancy: Array | float) -> Array:
         """Relevancy in [0, 1] -> the fit it stands for, in spreads; as published, the margin of cosines."""
-        clipped = np.clip(np.asarray(relevancy, np.float64), NARROWEST, 1 - NARROWEST)
-        rate = 1.0 if self.everyday is not None else self.temperature
-        return np.asarray(np.log(clipped / (1 - clipped)) / rate)
+        return fit_of(relevancy, 1.0 if self.everyday is not None else self.temperature)

@@ -55,7 +55,7 @@ export class Language {
     this.keys = new Map(meta.keys.map((key, row) => [key, row]));
     this.taught = new Map(meta.taught.map((word, row) => [phraseKey(word.name), { ...word, row }]));
     this.sets = Object.fromEntries(
-      ["articles", "stop_words", "adjectives", "parts"].map((name) => [name, new Set(meta.rules[name])]),
+      ["articles", "stop_words", "adjectives", "parts"].map((name) => [name, new Set(meta.grammar[name])]),
     );
     this.shapes = tensors;
   }
@@ -104,7 +104,7 @@ export class Language {
 
   // Fits of all regions, subparts first: of each its own mean, and something of its best part's.
   fits(relevancies) {
-    const { share, share_of, share_code, sizes, parents } = this.t, rules = this.meta.rules;
+    const { share, share_of, share_code, sizes, parents } = this.t, rules = this.meta.rule;
     const means = new Float64Array(sizes.length);
     for (let i = 0; i < share.length; ++i) means[share_of[i]] += share[i] * relevancies[share_code[i]];
     const own = means.map((mean) => {
@@ -118,7 +118,7 @@ export class Language {
     return own.map((fit, r) => {
       if (best[r] === -Infinity)
         best[r] = fit > rules.nothing && sizes[r] >= rules.smallest ? fit : -Infinity;
-      return best[r] === -Infinity ? fit : (1 - rules.parts_share) * fit + rules.parts_share * best[r];
+      return best[r] === -Infinity ? fit : (1 - rules.part_share) * fit + rules.part_share * best[r];
     });
   }
 
@@ -133,13 +133,13 @@ export class Language {
     let solid = -Infinity, any = -Infinity;
     for (let r = first; r < last; ++r) {
       any = Math.max(any, values[r]);
-      if (sizes[r] >= this.meta.rules.smallest) solid = Math.max(solid, values[r]);
+      if (sizes[r] >= this.meta.rule.smallest) solid = Math.max(solid, values[r]);
     }
     return Math.max(solid > -Infinity ? solid : any, 0);
   }
 
   answer(phrase, relevancies, level) {
-    const { rules, levels, calibration } = this.meta, named = this.named(phrase);
+    const { rule: rules, levels, calibration } = this.meta, named = this.named(phrase);
     const every = this.fits(relevancies);
     const values = every.map((fit) => (fit > rules.nothing ? sigmoid(fit) : 0));
     const scores = levels.map((_, at) => this.best(values, at));
@@ -149,7 +149,7 @@ export class Language {
     });
     const given = fits.map((fit, at) => fit + rules.advantage[named][at]);
     const chosen = level === "auto" ? given.lastIndexOf(Math.max(...given)) : levels.indexOf(level);
-    const [reach, nearest, farthest] = rules.reach, best = fits[chosen];
+    const { reach, nearest, farthest } = rules, best = fits[chosen];
     const least = best - Math.min(Math.max(reach * best, nearest), farthest);
     let probability = null, excess = null, found;
     if (calibration) {
@@ -173,8 +173,8 @@ export class Language {
   }
 
   excess(fits, named, level) {
-    const [whole, finer] = this.meta.rules.found[named].map((x) => (x === null ? Infinity : x)),
-      { bars, rules } = this.meta;
+    const [whole, finer] = this.meta.rule.found[named].map((x) => (x === null ? Infinity : x)),
+      { bars, rule: rules } = this.meta;
     const above = (bar, fit, spreads) => (fit - bar.median) / Math.max(bar.spread, rules.narrowest) - spreads;
     if (level !== "auto") {
       const at = this.meta.levels.indexOf(level);
@@ -185,7 +185,7 @@ export class Language {
 
   // The answer to a taught word: its fits were computed when the page was made.
   shown(word, level) {
-    const { rules, levels } = this.meta, { sizes } = this.t, all = sizes.length;
+    const { rule: rules, levels } = this.meta, { sizes } = this.t, all = sizes.length;
     const every = this.t.taught_fits.subarray(word.row * all, (word.row + 1) * all);
     const above = this.t.taught_above.subarray(word.row * all, (word.row + 1) * all);
     const solid = levels.map((_, at) => {
@@ -193,10 +193,10 @@ export class Language {
       const least = Math.min(rules.smallest, Math.max(0, ...sizes.subarray(first, last)));
       return Array.from({ length: last - first }, (_, i) => first + i).filter((r) => sizes[r] >= least);
     });
-    const fits = solid.map((rows) => Math.max(rules.least_fit, ...rows.map((r) => every[r])));
+    const fits = solid.map((rows) => Math.max(rules.least_likeness[0], ...rows.map((r) => every[r])));
     const scores = solid.map((rows) => Math.max(0, ...rows.map((r) => sigmoid(every[r]))));
     const chosen = level === "auto" ? word.level : levels.indexOf(level), rows = solid[chosen];
-    const excess = Math.max(rules.least_above, ...rows.map((r) => above[r]));
+    const excess = Math.max(rules.least_likeness[1], ...rows.map((r) => above[r]));
     const least = Math.min(0, Math.max(...rows.map((r) => every[r])));
     const inside = rows.filter((r) => every[r] >= least);
     const top = rows.reduce((best, r) => (best < 0 || every[r] > every[best] ? r : best), -1);
@@ -207,12 +207,12 @@ export class Language {
   }
 
   result(answer) {
-    const { rules } = this.meta,
+    const { rule: rules } = this.meta,
       { places, boxes } = this.t, { level, found, probability, excess, inside, top } = answer;
     const peak = answer.scores[level];
     let verdict = "not here";
     if (found) verdict = "found";
-    else if (probability !== null ? probability >= rules.weak : excess >= rules.nearly && inside.length)
+    else if (probability !== null ? probability >= rules.weak_probability : excess >= rules.weak_excess && inside.length)
       verdict = "weak match";
     let heat = [rules.floor, Math.max(peak, rules.floor + rules.heat_span)];
     if (found && peak < rules.floor + rules.heat_span) heat = [peak - rules.heat_span, peak];

@@ -264,7 +264,7 @@ class Page {
   boxes(answer) {
     if (!answer || answer.verdict === "not here") return [];
     const { language } = this, { sizes, parents } = language.t, things = new Map();
-    const solid = answer.inside.filter((r) => sizes[r] >= this.meta.language.rules.smallest);
+    const solid = answer.inside.filter((r) => sizes[r] >= this.meta.language.rule.smallest);
     for (const r of (solid.length ? solid : answer.inside).toSorted(
       (a, b) => answer.values[b] - answer.values[a],
     )) {

@@ -37,10 +37,11 @@ from langsplat_core.extensions.benchmarks.measure import markdown
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import Progress, TerminalProgress, silent
-from langsplat_core.query.answers import WEAK
+from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine, no_field
 from langsplat_core.query.grammar import PARTS, forms, is_part
+from langsplat_core.query.rule import RULE
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import Calibration, Fits, Odds
 from langsplat_core.semantics.encoders import load_text_encoder
@@ -300,7 +301,11 @@ class Verdict:
     fits: Fits  # of the best region of each level
     probability: float | None
     found: bool
-    excess: float | None = None  # see `QueryResult`
+    excess: float | None = None  # spreads above chance; None where the verdict is not reached by these
+
+
+def _excess(answer: QueryResult) -> float | None:
+    return answer.judgement.margin if answer.judgement.reached == "chance" else None
 
 
 def measure_verdicts(room: Room, variant: Variant) -> list[Verdict]:
@@ -315,7 +320,7 @@ def measure_verdicts(room: Room, variant: Variant) -> list[Verdict]:
     said = [(text, kind, answer) for (text, kind), answer in zip(asked, answers, strict=True)]
     said += [(text, kind, run_phrase(engine, text).answer) for text, kind in _inside(room, engine)]
     return [
-        Verdict(room.tier, room.seed, text, kind, one.fits, one.probability, one.found, one.excess)
+        Verdict(room.tier, room.seed, text, kind, one.fits, one.probability, one.found, _excess(one))
         for text, kind, one in said
     ]
 
@@ -388,7 +393,7 @@ def fit_odds(present: Array, absent: Array) -> Odds:
     plain = Odds(float(constant), float(whole), float(finer))
     said = [plain.probability((m[0], m[1], m[2])) for m in absent.tolist()]
     highest = float(np.quantile(said, REJECTED, method="higher"))
-    return replace(plain, found=float(np.ceil(1000 * max(highest, WEAK)) / 1000))
+    return replace(plain, found=float(np.ceil(1000 * max(highest, RULE.weak_probability)) / 1000))
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:

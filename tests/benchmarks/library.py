@@ -24,7 +24,7 @@ from langsplat_core.arrays import Array, unit
 from langsplat_core.config import CountOrZero
 from langsplat_core.extensions.benchmarks.measure import markdown
 from langsplat_core.extensions.library.changes import Change, changes
-from langsplat_core.extensions.library.finding import judged, rank
+from langsplat_core.extensions.library.finding import rank
 from langsplat_core.extensions.library.index import (
     COLUMNS,
     THUMBNAIL,
@@ -37,6 +37,7 @@ from langsplat_core.extensions.library.index import (
 )
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.query.grammar import named
+from langsplat_core.query.rule import judge, triple
 from langsplat_core.raster import load_lifting_rasterizer
 from tests.benchmarks.room import InRooms, MaskOrigin, Room, Variant, publish
 from tests.benchmarks.scoring import grouped, seconds_of
@@ -87,7 +88,8 @@ def compare(room: Room, masks: MaskOrigin) -> Iterator[Compared]:
         group = read_library(Path(folder, "index"), Path(folder)).groups[0]
         for answer in engine.run_many([text for text in room.texts if not engine.unknown_words(text)]):
             fits = fits_in(group, engine.text_vector(answer.phrase))[0]
-            verdict = judged(group.scenes[0], fits, named(answer.phrase))[2]
+            scene, kind = group.scenes[0], named(answer.phrase)
+            verdict = judge(triple(fits), kind, "auto", scene.bars, scene.calibration).outcome
             error = float(np.abs(fits - answer.fits).max())
             yield Compared(room.seed, masks, answer.phrase, verdict, answer.verdict, error)
 

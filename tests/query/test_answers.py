@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from langsplat_core.arrays import Array, sigmoid
-from langsplat_core.query import answers
-from langsplat_core.query.answers import Bar, QueryResult, bars, by_peak, by_regions
+from langsplat_core.query import regions as module
+from langsplat_core.query.answers import QueryResult, by_peak, by_regions
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import Named
-from langsplat_core.query.selection import Regions, build_regions
+from langsplat_core.query.regions import Regions, build_regions, chance_in
+from langsplat_core.query.rule import RULE, Bar, bars_of, excess, region_fits
 from langsplat_core.scene import LEVELS, NO_NODE, Calibration, Gaussians, LanguageField, Odds, Reading, Scene
 from langsplat_core.scene.surface import SMALLEST, Surface, build_surface
 from langsplat_core.semantics.relevancy import FLOOR, Scale
@@ -37,7 +38,7 @@ def asked(
     if rule == "peak":
         return by_peak(phrase, relevancy, surface, scale, field.reading.found, level)
     regions, calibration = regions_of(Scene(gaussians, field), surface), field.reading.calibration
-    by_chance = bars(answers.chance_in(field, regions, replace(scale, everyday=field.everyday[:9])))
+    by_chance = bars_of(chance_in(field, regions, replace(scale, everyday=field.everyday[:9])))
     return by_regions(phrase, relevancy, gaussians.means, regions, scale, by_chance, calibration, level)
 
 
@@ -172,13 +173,14 @@ BARS = (Bar(0.0, 1.0), Bar(0.5, 1.0), Bar(-1.0, 2.0), Bar(0.6, 0.5))
 
 @pytest.mark.parametrize("kind", ["codebook", "autoencoder", "linear"])
 def test_fits_by_chance_are_those_of_looking_everyday_phrases_up(kind, monkeypatch):
-    monkeypatch.setattr(answers, "CHUNK", 7)  # several
+    monkeypatch.setattr(module, "CHUNK", 7)  # several
     engine = QueryEngine(Scene(random_gaussians(400), random_field(400, kind)))
     fits = engine.chance
     for number, vector in enumerate(engine.field.everyday):
-        means = engine.regions.means(engine.relevancy(vector))
-        every = answers.with_parts(engine.regions, tuple(map(engine.scale.fit, means)))
-        for level, want in enumerate(every):
+        means = np.concatenate(engine.regions.means(engine.relevancy(vector)))
+        every = region_fits(engine.regions.table, engine.scale.fit(means))
+        for level in range(len(LEVELS)):
+            want = engine.regions.table.level(level, every)
             solid = engine.regions.sizes[level] >= SMALLEST
             np.testing.assert_allclose(fits[level][solid, number], want[solid], atol=TOLERANCE[kind])
             assert np.isneginf(fits[level][~solid, number]).all() or not solid.any()
@@ -187,22 +189,22 @@ def test_fits_by_chance_are_those_of_looking_everyday_phrases_up(kind, monkeypat
 def test_bars_are_quantiles_of_the_best_and_those_of_some_regions_are_lower():
     rng = np.random.default_rng(0)
     fits = tuple(rng.normal(size=(9, 101)) for _ in LEVELS)
-    whole = bars(fits)
+    whole = bars_of(fits)
     for bar, level in zip(whole[:3], fits, strict=True):
         low, median = np.quantile(level.max(0), [0.16, 0.5])
         assert (bar.median, bar.spread) == (pytest.approx(median), pytest.approx(median - low))
     finer = np.maximum(fits[0].max(0), fits[1].max(0))
     assert whole[3].median == pytest.approx(np.median(finer))
-    some = bars(fits, (np.array([2]), np.array([0, 1]), np.array([], int)))
+    some = bars_of(fits, (np.array([2]), np.array([0, 1]), np.array([], int)))
     assert some[0].median < whole[0].median
     assert not np.isfinite(some[2].median)  # nothing is found where there is nothing
 
 
-@pytest.mark.parametrize("named", answers.FOUND)
+@pytest.mark.parametrize("named", RULE.found)
 @pytest.mark.parametrize("level", ["auto", *LEVELS])
 def test_excess_is_counted_from_the_bars(named, level):
     rng = np.random.default_rng(1)
-    whole, finer = answers.FOUND[named]
+    whole, finer = RULE.found[named]
     for fits in rng.normal(scale=4, size=(50, 3)).tolist():
         if level == "auto":
             by_whole = (fits[2] - BARS[2].median) / BARS[2].spread - whole
@@ -210,7 +212,7 @@ def test_excess_is_counted_from_the_bars(named, level):
         else:
             bar, fit = BARS[LEVELS.index(level)], fits[LEVELS.index(level)]
             want = (fit - bar.median) / bar.spread - min(whole, finer)
-        assert answers.excess(tuple(fits), BARS, named, level) == pytest.approx(want)
+        assert excess(tuple(fits), BARS, named, level) == pytest.approx(want)
     assert np.isfinite(Bar(0.3, 0.0).excess(0.3, 1.0))  # without width
 
 
@@ -220,7 +222,7 @@ def test_the_scene_needs_everyday_phrases_else_the_peak_answers():
     engine = QueryEngine(scene, lambda _: FakeEncoder())  # which knows too few of them
     assert (engine.rule, engine.chance, engine.calibration) == ("peak", None, None)
     result = engine.run("mug")
-    assert (result.found, result.excess, result.probability) == (True, None, None)
+    assert (result.found, result.judgement.reached, result.probability) == (True, "relevancy", None)
     few = replace(field, everyday=np.ones((3, 8), np.float32))
     assert QueryEngine(replace(scene, language=few), lambda _: FakeEncoder()).rule == "peak"
 
@@ -266,15 +268,13 @@ def plain_extent(fits, sizes, level: str, named: Named) -> tuple[int, list[bool]
     """The level and the regions that answer."""
     solid = [n for n, size in enumerate(sizes) if size >= SMALLEST] or list(range(len(sizes)))
     best = [max(row[n] for n in solid) for row in fits]
-    given = [value + more for value, more in zip(best, answers.ADVANTAGE[named], strict=True)]
+    given = [value + more for value, more in zip(best, RULE.advantage[named], strict=True)]
     chosen = given.index(max(given)) if level == "auto" else LEVELS.index(level)
-    limit = best[chosen] - min(max(answers.REACH * best[chosen], answers.NEAREST), answers.FARTHEST)
+    limit = best[chosen] - min(max(RULE.reach * best[chosen], RULE.nearest), RULE.farthest)
     return chosen, [value >= limit for value in fits[chosen]]
 
 
-@pytest.mark.parametrize(
-    ("level", "named"), [*product(["auto"], answers.ADVANTAGE), *product(LEVELS, ["part"])]
-)
+@pytest.mark.parametrize(("level", "named"), [*product(["auto"], RULE.advantage), *product(LEVELS, ["part"])])
 @pytest.mark.parametrize("middle", [-2.0, 0.0, 1.0])
 def test_the_extent_is_that_of_the_plain_rule(surface, level, named, middle):
     rng = np.random.default_rng(0)
@@ -286,7 +286,7 @@ def test_the_extent_is_that_of_the_plain_rule(surface, level, named, middle):
         regions = regions_by(surface, sizes)
         got = answer_of(surface, spread_out(surface, regions, fits), regions, level, named)
         solid = np.array(sizes) >= SMALLEST  # every region has one part, all of it; of crumbs it says nothing
-        fits[1:, solid] = (1 - answers.PARTS) * fits[1:, solid] + answers.PARTS * fits[:-1, solid]
+        fits[1:, solid] = (1 - RULE.part_share) * fits[1:, solid] + RULE.part_share * fits[:-1, solid]
         chosen, answering = plain_extent(fits, sizes, level, named)
         of = regions.everywhere[chosen, surface.rows]
         assert got.level == chosen

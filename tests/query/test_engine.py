@@ -17,17 +17,10 @@ import pytest
 
 from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.errors import EncoderError, InputError, UnknownWordError
-from langsplat_core.query.answers import (
-    SphereTable,
-    build_lookup,
-    decoded_relevancy,
-    octahedral_to_sphere,
-    peak_pixel,
-    sphere_to_octahedral,
-    splatted_relevancy,
-)
 from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.lookup import Lookup, sphere_cells, through_cells
+from langsplat_core.query.pixels import decoded_relevancy, peak_pixel, splatted_relevancy
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.raster.render import render
@@ -313,7 +306,7 @@ class Speaker(FakeEncoder):
 def test_everyday_phrases_of_the_encoder_count_once_they_are_there():
     engine = QueryEngine(scene_of("lab/clip", Reading(), everyday=False), lambda _: Speaker())
     published = engine.basis
-    assert engine.run("mug").excess is not None
+    assert engine.run("mug").judgement.reached == "chance"
     assert engine.basis.short != published.short
 
 
@@ -323,13 +316,17 @@ def test_without_a_calibration_combined_answers_have_no_probability_and_the_weak
     engine = QueryEngine(replace(scene, language=replace(scene.language, phrasebook=book)))
     parts = [engine.run(text) for text in ("mug", "wall")]
     both = run_phrase(engine, "mug and wall").answer
-    assert both.excess == min(part.excess for part in parts) < parts[0].excess
+    assert both.judgement.margin == min(part.judgement.margin for part in parts) < parts[0].judgement.margin
     either = run_phrase(engine, "mug or wall").answer
-    assert either.excess == parts[0].excess
-    assert run_phrase(engine, "mug near the wall").answer.excess == parts[1].excess
+    assert either.judgement.margin == parts[0].judgement.margin
+    assert run_phrase(engine, "mug near the wall").answer.judgement.margin == parts[1].judgement.margin
     assert [part.found for part in (*parts, both, either)] == [True, False, False, True]
     inside = run_phrase(engine, "handle of the wall").answer
-    assert inside.excess == parts[1].excess < run_phrase(engine, "handle of the mug").answer.excess
+    assert (
+        inside.judgement.margin
+        == parts[1].judgement.margin
+        < run_phrase(engine, "handle of the mug").answer.judgement.margin
+    )
     none = run_phrase(engine, "mug, not mug").answer
     assert not none.members.any()
     assert {answer.probability for answer in (both, either, inside, none)} == {None}
@@ -337,8 +334,6 @@ def test_without_a_calibration_combined_answers_have_no_probability_and_the_weak
 
 
 # Relevancy of every Gaussian, by whatever the codec allows, against the definition.
-
-TOLERANCE = {"codebook": 1e-6, "linear": 1e-5, "autoencoder": 0.05}  # the last interpolates in a table
 
 
 def scale_of(field: LanguageField, chance: bool) -> Scale:
@@ -365,11 +360,11 @@ def test_every_lookup_finds_the_relevancy_of_what_latents_stand_for(kind, temper
     field.confidence[1, 5:20] = 0
     scale = scale_of(field, chance)
     phrase = unit(np.random.default_rng(3).normal(size=field.codec.vector_dim)).astype(np.float32)
-    got = next(build_lookup(field, scale, exact).relevancies(phrase[None]))
+    got = next(Lookup(field if exact else through_cells(field), scale).relevancies(phrase[None]))
     vectors = field.codec.decode(field.latents.reshape(-1, field.latents.shape[2]))
     known = field.known.reshape(-1)
     want = [plain_relevancy(v, phrase, scale) if k else 0 for v, k in zip(vectors, known, strict=True)]
-    assert np.abs(got - want).max() < (1e-5 if exact else TOLERANCE[kind])
+    assert np.abs(got - want).max() < 1e-5
     assert (got.reshape(3, 300)[1, 5:20] == 0).all()
 
 
@@ -378,7 +373,7 @@ def test_codeword_zero_is_a_meaning_like_any_other():
     field.latents[:] = 0
     field.confidence[:] = 1
     field.confidence[2, 4] = 0
-    lookup = build_lookup(field, scale_of(field, chance=False))
+    lookup = Lookup(field, scale_of(field, chance=False))
     values = next(lookup.relevancies(field.codec.vectors[:1])).reshape(3, 10)
     assert values[2, 4] == 0
     assert (np.delete(values[2], 4) > 0.5).all()
@@ -400,8 +395,8 @@ def test_margins_of_another_size_change_nothing():
     narrow = replace(field, codec=codec, canonical=canonical, everyday=everyday, phrasebook={})
     phrase = unit(np.random.default_rng(3).normal(size=dim))[None].astype(np.float32)
     for chance, tolerance in ((True, 1e-5), (False, None)):
-        wide = next(build_lookup(field, scale_of(field, chance)).relevancies(phrase))
-        close = next(build_lookup(narrow, scale_of(narrow, chance)).relevancies(beside(phrase, 1)))
+        wide = next(Lookup(field, scale_of(field, chance)).relevancies(phrase))
+        close = next(Lookup(narrow, scale_of(narrow, chance)).relevancies(beside(phrase, 1)))
         apart = np.abs(wide - close).max()
         assert apart < tolerance if tolerance else apart > 0.2
 
@@ -460,30 +455,45 @@ def test_published_relevancy_is_the_minimum_of_pairwise_softmaxes(linear):
     assert relevancy(vectors[:1], vectors[:1], vectors[:1]).tolist() == [[relevancies.FLOOR]]
 
 
-def test_octahedral_map_is_a_bijection_of_the_sphere():
+def test_cells_are_small_and_each_has_its_latents_around_its_centre():
     rng = np.random.default_rng(5)
-    vectors = unit(rng.normal(size=(1000, 3)))
-    vectors = np.concatenate([vectors, np.eye(3), -np.eye(3)])
-    uv = sphere_to_octahedral(vectors)
-    np.testing.assert_allclose(octahedral_to_sphere(uv), vectors, atol=1e-12)
-    assert 0 <= uv.min() < uv.max() <= 1
+    latents = unit(rng.normal(size=(5000, 3)) * (1, 1, 0.2)).astype(np.float32)
+    latents[:6] = np.concatenate([np.eye(3), -np.eye(3)])  # the fold's corners and edges
+    for most, farthest in ((300, 0.25), (1200, 0.13)):
+        cells, centres = sphere_cells(5 * latents, most)
+        assert 0.6 * most < len(centres) <= most
+        assert np.array_equal(np.unique(cells), np.arange(len(centres)))
+        np.testing.assert_allclose(np.linalg.norm(centres, axis=1), 1, atol=1e-6)
+        assert np.linalg.norm(latents - centres[cells], axis=1).max() < farthest
+    cells, centres = sphere_cells(latents, 5000)
+    np.testing.assert_allclose(centres[cells], latents, atol=1e-6)
 
 
-def test_table_agrees_with_exact_decoding_and_improves_with_resolution():
+def test_cells_agree_with_exact_decoding_and_improve_with_their_number():
     rng = np.random.default_rng(6)
     codec = smooth_codec(rng)
     latents = unit(rng.normal(size=(4000, 3))).astype(np.float32)
-    latents[:6] = np.concatenate([np.eye(3), -np.eye(3)])  # the fold's corners and edges
     phrases, canonical = unit(rng.normal(size=(5, D))), unit(rng.normal(size=(4, D)))
     exact = latent_relevancy(codec, latents, phrases, canonical)
     errors = {}
-    for resolution in (48, 192):
-        table = SphereTable(codec, latents, Scale(canonical, None, 10.0), resolution=resolution)
-        got = np.stack(list(table.relevancies(phrases)), 1)
-        errors[resolution] = np.abs(got - exact)
-    assert errors[192].mean() < 3e-4
-    assert errors[192].max() < 0.02  # at creases of the ReLU decoder
-    assert errors[192].mean() < errors[48].mean() / 6  # bilinear: second order where smooth
+    for most in (200, 3200):
+        cells, centres = sphere_cells(latents, most)
+        errors[most] = np.abs(latent_relevancy(codec, centres, phrases, canonical)[cells] - exact)
+    assert errors[3200].mean() < 6e-3
+    assert errors[3200].mean() < errors[200].mean() / 3  # of first order in the side of a cell
+
+
+def test_field_through_cells_keeps_what_is_unknown():
+    field = random_field(300, "autoencoder")
+    field.confidence[1, 5:20] = 0
+    field.latents[2, 30:40] = 0
+    read = through_cells(field)
+    np.testing.assert_array_equal(read.known, field.known)
+    np.testing.assert_allclose(
+        read.codec.decode(read.latents[0]), field.codec.decode(field.latents[0]), atol=1e-5
+    )
+    nothing = replace(field, confidence=0 * field.confidence)
+    assert not through_cells(nothing).known.any()
 
 
 def test_both_orders_agree_inside_one_object_and_are_gated_outside():

@@ -75,7 +75,7 @@ def test_what_was_shown_is_found_in_another_scene_and_what_is_absent_is_not():
     assert np.mean(right[:12]) >= 0.8
     assert np.mean([answer.found for answer in answers[12:]]) <= 0.25
     for answer in answers:
-        assert answer.verdict == ("found" if answer.excess >= 0 else answer.verdict)
+        assert answer.verdict == ("found" if answer.judgement.margin >= 0 else answer.verdict)
         assert answer.probability is None
         assert answer.members.any()
         assert answer.box is not None
@@ -129,7 +129,7 @@ def test_a_scene_and_a_file_keep_words_exactly(tmp_path):
     assert list(user.taught) == list(after.taught) == ["grandma's vase", "tür"]
     for engine in (after, user):
         for name in before.taught:
-            assert engine.run(name).excess == before.run(name).excess
+            assert engine.run(name).judgement.margin == before.run(name).judgement.margin
             np.testing.assert_array_equal(engine.run(name).even, before.run(name).even)
 
 
@@ -190,7 +190,7 @@ def test_scenes_of_almost_nothing_answer():
         for everyday in (scene.language.everyday, None):
             field = replace(scene.language, everyday=everyday, taught=(taught(3),))
             answer = QueryEngine(Scene(scene.gaussians, field), rule="peak").run("grandma's vase")
-            assert np.isfinite([answer.excess, *answer.relevancy.ravel()]).all()
+            assert np.isfinite([answer.judgement.margin, *answer.relevancy.ravel()]).all()
             assert answer.members.shape == (len(scene.gaussians),)
     nothing = asking(SHOWN.take(np.zeros(0, int)), taught(3)).run("grandma's vase")
     assert (nothing.found, nothing.place) == (False, None)

@@ -110,7 +110,7 @@ def test_what_the_search_found_or_did_not(searched):
     np.testing.assert_array_equal(np.flatnonzero(marks_of(searched).selected), thing.members)
     selecting.select_none(searched)
     queries.remove(searched, mug)
-    query.result = replace(query.result, found=False, probability=None, excess=None)
+    query.result = replace(query.result, judgement=query.result.judgement.absent)
     selecting.select_query(searched)
     assert "'book' is not here" in searched.state.messages[-1].text
     queries.remove(searched, query)

@@ -20,8 +20,9 @@ from langsplat_core.config import PictureConfig
 from langsplat_core.errors import FormatError
 from langsplat_core.extensions.benchmarks.labels import Size, check_same_image, read_grey
 from langsplat_core.io.hostile import opened, read_npy
-from langsplat_core.query.answers import QueryResult, decoded_relevancy, peak_pixel, splatted_relevancy
+from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.pixels import decoded_relevancy, peak_pixel, splatted_relevancy
 from langsplat_core.raster.protocol import View
 from langsplat_core.raster.render import render, view_of
 from langsplat_core.scene import LEVELS, Camera

@@ -21,8 +21,8 @@ from langsplat_core.errors import InputError
 from langsplat_core.extensions.benchmarks.config import QueryBenchConfig
 from langsplat_core.extensions.benchmarks.measure import markdown
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.answers import decoded_relevancy, splatted_relevancy
 from langsplat_core.query.engine import QueryEngine, TextEncoder
+from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
 from langsplat_core.raster.protocol import View
 from langsplat_core.raster.render import view_of
 from langsplat_core.scene import LEVELS, Camera, Codec, LanguageField, Scene

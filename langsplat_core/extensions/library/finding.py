@@ -7,21 +7,21 @@ from pathlib import Path
 
 import numpy as np
 
-from langsplat_core.arrays import Array, logit
+from langsplat_core.arrays import Array
 from langsplat_core.errors import EncoderError, LangSplatError
-from langsplat_core.extensions.library.index import Group, Library, Listed, draw, fits_in
+from langsplat_core.extensions.library.index import Group, Library, draw, fits_in
 from langsplat_core.io.scenes import companion_path, load_scene
 from langsplat_core.io.sidecar import SUFFIX, read_stored
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.answers import NEARLY, WEAK, QueryResult, Verdict, excess
+from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import LoadEncoder, QueryEngine
-from langsplat_core.query.grammar import Atom, Named, heads, named, parse
+from langsplat_core.query.grammar import heads, named, parse
+from langsplat_core.query.rule import Outcome, Verdict, judge, triple
 from langsplat_core.scene import LEVELS, LanguageField, Scene
 from langsplat_core.scene.codec import LinearCodec
 from langsplat_core.scene.gaussians import join_gaussians
 from langsplat_core.scene.language import phrase_key
-from langsplat_core.semantics.relevancy import NARROWEST
 
 PICTURE = (320, 240)  # width and height, pixels, of the picture of an answer
 
@@ -31,12 +31,25 @@ class Hit:
     """The answer of one scene to a phrase."""
 
     path: Path
-    verdict: Verdict
-    margin: float  # logits or spreads above what counts as found, see `margin`
-    probability: float | None
+    judgement: Verdict
     answer: QueryResult | None = None  # None where only the index was asked
     metres_per_unit: float | None = None
     picture: Array | None = None  # (H, W, 3) uint8, the answer as a heat map
+
+    @property
+    def verdict(self) -> Outcome:
+        """The verdict in words."""
+        return self.judgement.outcome
+
+    @property
+    def margin(self) -> float:
+        """How certain the answer is, 0 where it begins to count as found, see `Verdict`."""
+        return self.judgement.margin
+
+    @property
+    def probability(self) -> float | None:
+        """The probability that it is there at all; None where nothing is calibrated."""
+        return self.judgement.probability
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,31 +62,9 @@ class Answered:
     problem: str = ""  # why nothing was asked
     unread: tuple[tuple[str, str], ...] = ()  # scenes that could not be opened, and why
 
-    def count(self, verdict: Verdict) -> int:
-        """Return the number of scenes with this verdict."""
+    def count(self, verdict: Outcome) -> int:
+        """Number of scenes with this verdict."""
         return sum(hit.verdict == verdict for hit in self.hits)
-
-
-def margin(probability: float | None, found: float, above: float | None) -> float:
-    """Return how certain an answer is; 0 is where it begins to count as found.
-
-    The margin is in logits of its probability above those of `found`, or, where the encoder has no
-    calibration, in spreads above chance.
-    """
-    if probability is not None:
-        return float(logit(np.array(probability)) - logit(np.array(min(found, 1 - NARROWEST))))
-    return -math.inf if above is None else above
-
-
-def judged(scene: Listed, fits: Array, kind: Named) -> tuple[float, float | None, Verdict]:
-    """Margin, probability and verdict that the fits of a scene stand for, as `answers.by_regions` says."""
-    triple, odds = (float(fits[0]), float(fits[1]), float(fits[2])), scene.odds(kind)
-    if odds is None:
-        above = excess(triple, scene.bars, kind)
-        return above, None, "found" if above >= 0 else "weak match" if above >= NEARLY else "not here"
-    chance = odds.probability(triple)
-    verdict: Verdict = "found" if chance >= odds.found else "weak match" if chance >= WEAK else "not here"
-    return margin(chance, odds.found, None), chance, verdict
 
 
 def find(
@@ -109,8 +100,8 @@ def _ask_group(
         vectors = {}
     rough = rank(group, vectors)
     hits = {
-        scene.path: Hit(library.folder / scene.path, verdict, above, chance)
-        for scene, (above, chance, verdict) in zip(group.scenes, rough, strict=True)
+        scene.path: Hit(library.folder / scene.path, verdict)
+        for scene, verdict in zip(group.scenes, rough, strict=True)
     }
     must = [scene.path for scene in group.scenes if not scene.is_indexed or key in scene.taught]
     order = sorted(hits, key=lambda name: (name not in must, -hits[name].margin))
@@ -135,14 +126,14 @@ def _ask_group(
     return Answered(phrase, group.encoder_id, (*asked, *others), unread=tuple(unread))
 
 
-def rank(group: Group, vectors: Mapping[str, Array]) -> list[tuple[float, float | None, Verdict]]:
-    """Margin, probability and verdict of every scene by the index alone: of the best of some phrases."""
-    best: list[tuple[float, float | None, Verdict]] = [(-math.inf, None, "not here")] * len(group.scenes)
+def rank(group: Group, vectors: Mapping[str, Array]) -> list[Verdict]:
+    """Return the verdict on every scene by the index alone: on the best of some phrases."""
+    best = [Verdict(False, "chance", -math.inf)] * len(group.scenes)
     for text, vector in vectors.items():
-        kind, every = named(text), fits_in(group, vector)
-        for row, (scene, fits) in enumerate(zip(group.scenes, every, strict=True)):
+        for row, (scene, fits) in enumerate(zip(group.scenes, fits_in(group, vector), strict=True)):
             if scene.is_indexed:
-                best[row] = max(best[row], judged(scene, fits, kind), key=lambda found: found[0])
+                verdict = judge(triple(fits), named(text), "auto", scene.bars, scene.calibration)
+                best[row] = max(best[row], verdict, key=lambda found: found.margin)
     return best
 
 
@@ -172,10 +163,4 @@ def ask_scene(path: Path, phrase: str, load_encoder: LoadEncoder | None) -> Hit:
     scene = load_scene(path)
     engine = QueryEngine(scene, load_encoder)
     answer = run_phrase(engine, phrase).answer
-    tree, found, calibration = parse(phrase, engine.taught), 0.5, engine.calibration
-    if calibration is not None and isinstance(tree, Atom):
-        found = (calibration.thing if named(tree.text) == "thing" else calibration.part).found
-    above = answer.excess if answer.excess is not None else 10 * (answer.peak - engine.field.reading.found)
-    picture = draw(scene, PICTURE, answer)
-    certain = margin(answer.probability, found, above)
-    return Hit(path, answer.verdict, certain, answer.probability, answer, scene.metres_per_unit, picture)
+    return Hit(path, answer.judgement, answer, scene.metres_per_unit, draw(scene, PICTURE, answer))

@@ -17,7 +17,7 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,13 +36,20 @@ from langsplat_core.io.hostile import exists, open_for_reading, parse_json
 from langsplat_core.io.scenes import companion_path, format_of, load_scene, scene_files
 from langsplat_core.io.sidecar import SUFFIX
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.answers import NOTHING, PARTS, Bar, Bars, QueryResult, bars
+from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, same_vectors
-from langsplat_core.query.grammar import Named
+from langsplat_core.query.rule import (
+    Bar,
+    Bars,
+    RegionTable,
+    bars_of,
+    best_relevancies,
+    region_fits,
+    region_relevancies,
+)
 from langsplat_core.raster.render import render
-from langsplat_core.scene import LEVELS, Camera, Odds, Scene
-from langsplat_core.scene.surface import SMALLEST
-from langsplat_core.semantics.relevancy import NARROWEST
+from langsplat_core.scene import LEVELS, Calibration, Camera, Odds, Scene
+from langsplat_core.semantics.relevancy import fit_of
 
 INDEX = ".langsplat-library"  # its name in the folder
 MAGIC = b"LSLIB\x00\x00\x01"
@@ -95,10 +102,12 @@ class Listed:
         one, two, three, four = (Bar(*pairs[at : at + 2]) for at in range(0, 8, 2))
         return one, two, three, four
 
-    def odds(self, kind: Named) -> Odds | None:
-        """Return the calibration for what is named; None where the encoder has none here."""
-        at = 8 if kind == "thing" else 12
-        return None if math.isnan(self.numbers[at]) else Odds(*self.numbers[at : at + 4])
+    @property
+    def calibration(self) -> Calibration | None:
+        """The calibration of its encoder; None where that has none here. ValueError for numbers of none."""
+        if math.isnan(self.numbers[8]):
+            return None
+        return Calibration(*(Odds(*self.numbers[at : at + 4]) for at in (8, 12, 16)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +124,14 @@ class Group:
         """(S + 1, 3) int64: where the codewords, mixtures and regions of each scene begin."""
         sizes = [(c[0], c[4], sum(c[1:4])) for c in (scene.counts for scene in self.scenes)]
         return np.cumsum([(0, 0, 0), *sizes], axis=0)
+
+    @cached_property
+    def table(self) -> RegionTable:
+        """The regions of all scenes, as the rule for answers reads them."""
+        counts = np.array([scene.counts[1:4] for scene in self.scenes], np.int64).reshape(-1, len(LEVELS))
+        firsts = np.repeat(self.starts[:-1, 2], counts.sum(1))
+        parents = self.columns["parents"].astype(np.int64)
+        return RegionTable(counts, np.where(parents < 0, -1, parents + firsts), self.columns["solid"] > 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,7 +215,7 @@ def digest(path: Path, name: str, load_encoder: LoadEncoder | None) -> Digest:
         return made
     calibration = engine.calibration
     odds = () if calibration is None else (calibration.thing, calibration.part, calibration.inside)
-    numbers = [number for bar in bars(engine.chance) for number in (bar.median, bar.spread)]
+    numbers = [number for bar in bars_of(engine.chance) for number in (bar.median, bar.spread)]
     numbers += [n for odd in odds for n in (odd.constant, odd.whole, odd.finer, odd.found)]
     if not np.isfinite(numbers).all():
         return made
@@ -233,7 +250,7 @@ def _columns(engine: QueryEngine) -> tuple[dict[str, Array], tuple[int, ...]]:
         "words": np.concatenate([part[1] for part in mixtures]),
         "regions": np.concatenate([part[2] for part in mixtures]),
         "parents": np.concatenate(above),
-        "solid": np.concatenate([each >= SMALLEST for each in regions.sizes]),
+        "solid": regions.table.solid,
         "codewords": np.rint(vectors / steps[:, None]),
     }
     made = {name: columns[name].astype(kind) for name, kind, _ in COLUMNS}
@@ -411,8 +428,7 @@ def _listed(row: Any) -> Listed:
     if len(counts) != 5 or len(floats) != FLOATS or (counts[0] and not np.isfinite(floats[:8]).all()):
         raise ValueError("a scene without its numbers")
     found = Listed(path, tuple(map(_whole, stamp)), counts, floats, tuple(taught), _whole(phrases), unread)
-    for kind in ("thing", "part"):
-        found.odds(kind)  # which checks them
+    found.calibration  # noqa: B018  which checks it
     return found
 
 
@@ -420,17 +436,20 @@ def _listed(row: Any) -> Listed:
 
 
 def fits_in(group: Group, vector: Array) -> Array:
-    """(S, 3) float64 fits of a phrase's (D,) unit vector in every scene, see `QueryResult.fits`.
+    """Return the (S, 3) float64 fits of a phrase's (D,) unit vector in every scene, see `QueryResult.fits`.
 
-    -inf in those that are not indexed. FormatError for an index whose numbers do not fit each other.
+    They are -inf in scenes that are not indexed. Raises FormatError for an index whose numbers do not fit
+    each other.
     """
-    found, columns = np.full((len(group.scenes), len(LEVELS)), -np.inf), group.columns
-    levels = np.array([scene.counts[1:4] for scene in group.scenes], np.int64).reshape(-1, 3)
-    arrays, phrase = Columns(**columns), np.require(vector, np.float32, "C")
-    shared_workers().run(_fits, len(found), phrase, arrays, group.starts, levels, found)
-    if np.isnan(found).any():
+    arrays, phrase = Columns(**group.columns), np.require(vector, np.float32, "C")
+    means, sound = np.zeros(len(arrays.parents)), np.ones(len(group.scenes), bool)
+    shared_workers().run(_region_means, len(sound), phrase, arrays, group.starts, means, sound)
+    if not sound.all():
         raise FormatError("the index of scenes is damaged; remove it, and it is made again")
-    return found
+    fits = region_fits(group.table, fit_of(means))
+    best = fit_of(best_relevancies(group.table, region_relevancies(fits)))
+    indexed = np.array([scene.is_indexed for scene in group.scenes], bool)
+    return np.where(indexed[:, None], best, -np.inf)
 
 
 @partial(helper, fastmath={"reassoc", "contract", "nsz"})
@@ -442,61 +461,27 @@ def _dot(row: Array, vector: Array) -> np.float32:
 
 
 @kernel
-def _fits(
-    first: int, last: int, vector: Array, columns: Columns, starts: Array, levels: Array, found: Array
+def _region_means(
+    first: int, last: int, vector: Array, columns: Columns, starts: Array, means: Array, sound: Array
 ) -> None:
-    """Rows [first, last) of `found` (S, 3): as `answers.by_regions` says; NaN for numbers out of place."""
+    """Add to `means` (R,), of scenes [first, last), the mean relevancy of every region; of a scene with a
+    number out of place set `sound` (S,) to False."""
     for scene in range(first, last):
         k, m, r = starts[scene]
         last_k, last_m, last_r = starts[scene + 1]
-        if last_k == k:
-            continue
         relevancy = np.empty(last_k - k, np.float64)
         for i in range(k, last_k):
             cosine = _dot(columns.codewords[i], vector) * columns.steps[i]
             relevancy[i - k] = 1 / (1 + np.exp(-columns.rates[i] * (cosine - columns.zeros[i])))
-        fits, parents = np.zeros(last_r - r), columns.parents[r:last_r]
-        shares, words = columns.shares[m:last_m], columns.words[m:last_m]
-        if _mix(fits, relevancy, shares, words, columns.regions[m:last_m], parents):
-            _best_fits(fits, parents, columns.solid[r:last_r], levels[scene], found[scene])
-        else:
-            found[scene] = np.nan
-
-
-@helper
-def _mix(fits: Array, relevancy: Array, shares: Array, words: Array, regions: Array, parents: Array) -> bool:
-    """Set `fits` (R,) to those of the mean relevancy of regions; False where a number is out of place."""
-    for i in range(len(shares)):
-        if regions[i] >= len(fits) or words[i] >= len(relevancy):
-            return False
-        fits[regions[i]] += shares[i] * relevancy[words[i]]
-    for i in range(len(fits)):
-        if np.isnan(fits[i]) or parents[i] >= len(fits):
-            return False
-        value = min(max(fits[i], NARROWEST), 1 - NARROWEST)
-        fits[i] = np.log(value / (1 - value))
-    return True
-
-
-@helper
-def _best_fits(fits: Array, parents: Array, solid: Array, levels: Array, found: Array) -> None:
-    """Set `found` (3,) to the best fits with parts, see `answers.with_parts`; crumbs count where all are."""
-    best = np.full(len(fits), -np.inf)
-    for i in range(len(fits)):
-        if solid[i] and fits[i] > NOTHING and parents[i] >= 0:
-            best[parents[i]] = max(best[parents[i]], fits[i])
-    at = 0
-    for level in range(len(levels)):
-        top = crumbs = -np.inf
-        for i in range(at, at + levels[level]):
-            part = best[i]
-            if np.isinf(part) and solid[i] and fits[i] > NOTHING:
-                part = fits[i]
-            value = fits[i] if np.isinf(part) else (1 - PARTS) * fits[i] + PARTS * part
-            top, crumbs = max(top, value if solid[i] else -np.inf), max(crumbs, value)
-        at += levels[level]
-        top = crumbs if np.isinf(top) else top
-        found[level] = top if top > NOTHING else np.log(NARROWEST / (1 - NARROWEST))
+        for i in range(m, last_m):
+            region, word = columns.regions[i], columns.words[i]
+            if region >= last_r - r or word >= last_k - k:
+                sound[scene] = False
+                break
+            means[r + region] += columns.shares[i] * relevancy[word]
+        for i in range(r, last_r):
+            if np.isnan(means[i]) or columns.parents[i] >= last_r - r:
+                sound[scene] = False
 
 
 # Pictures.

@@ -1,5 +1,6 @@
 """The panel "Library": the scenes of a folder with thumbnails, ranked by a phrase."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -13,6 +14,7 @@ from langsplat_core.extensions.library.finding import Answered, Hit, find
 from langsplat_core.extensions.library.index import THUMBNAIL, Library, update_library
 from langsplat_core.progress import Progress
 from langsplat_core.query.engine import LoadEncoder
+from langsplat_core.query.rule import Verdict
 from langsplat_viewer.actions.browsing import ask_for_folder
 from langsplat_viewer.actions.opening import open_scene
 from langsplat_viewer.actions.queries import ask
@@ -40,6 +42,9 @@ class LibraryView:
     typed: str = ""
 
 
+UNASKED = Verdict(False, "chance", -math.inf)
+
+
 def library_view(viewer: Viewer) -> LibraryView | None:
     """Return the library that is open; None before one was chosen."""
     return viewer.state.extension_panels.get(TITLE)
@@ -50,7 +55,7 @@ def open_library(viewer: Viewer, folder: Path) -> None:
     load = lru_cache(maxsize=1)(viewer.services.load_encoder)
 
     def done(library: Library) -> None:
-        hits = [Hit(folder / scene.path, "not here", 0.0, None) for scene in library.scenes]
+        hits = [Hit(folder / scene.path, UNASKED) for scene in library.scenes]
         _show_hits(viewer, LibraryView(library, load, said=f"{len(hits)} scenes"), hits)
         for scene in library.unread:
             viewer.say_error(f"{scene.path}: {scene.unread}")

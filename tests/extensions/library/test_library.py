@@ -12,7 +12,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import EncoderError, FormatError, InputError
 from langsplat_core.extensions.library import index as module
 from langsplat_core.extensions.library.changes import Change, changes, colour_term, to_lab
-from langsplat_core.extensions.library.finding import find, judged
+from langsplat_core.extensions.library.finding import find
 from langsplat_core.extensions.library.index import (
     INDEX,
     MAGIC,
@@ -24,6 +24,7 @@ from langsplat_core.extensions.library.index import (
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.rule import judge, triple
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Gaussians, Scene
 from tests.support.comparing import FIELDS
@@ -72,9 +73,9 @@ def test_the_index_has_the_fits_of_the_engine(folder, phrase):
             assert np.isneginf(fits).all()
         else:
             np.testing.assert_allclose(fits, answer.fits, atol=0.05)  # spreads; 8 bits of a codeword
-            above, chance, verdict = judged(scene, fits, "thing")
-            assert (verdict, chance) == (answer.verdict, answer.probability)
-            assert above == pytest.approx(answer.excess, abs=0.2)
+            verdict = judge(triple(fits), "thing", "auto", scene.bars, scene.calibration)
+            assert (verdict.outcome, verdict.probability) == (answer.verdict, answer.probability)
+            assert verdict.margin == pytest.approx(answer.judgement.margin, abs=0.2)
 
 
 def test_the_best_scenes_come_first_and_with_a_place(folder):

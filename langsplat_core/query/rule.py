@@ -1,0 +1,297 @@
+"""The rule that turns the fits of regions into an answer: one table of numbers, `RULE`, and `decide`.
+
+A fit (`semantics.relevancy.Scale`) says by how many spreads a region is nearer to a phrase than everyday
+phrases are to it by chance, so that one rule serves all encoders. The exported page has the table as JSON and
+`decide` in JavaScript (`web/rule.js`); the index over scans calls the same functions for many scenes at once.
+The numbers were chosen on rooms 201 to 203, with the bundled encoder and with the geometry of CLIP, never on
+rooms that measure.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from langsplat_core.arrays import Array, logit, sigmoid
+from langsplat_core.config import LevelChoice
+from langsplat_core.query.grammar import Named
+from langsplat_core.scene import LEVELS, Calibration, Fits
+from langsplat_core.scene.surface import SMALLEST
+from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, NARROWEST, fit_of
+
+Sought = Named | Literal["inside"]  # "inside": a part, among what is on a thing that is there
+
+
+@dataclass(frozen=True)
+class Rule:
+    """The numbers of the rule. Fits are spreads, relevancies and probabilities are in [0, 1]."""
+
+    # Added to the fit of each level before the best level is chosen, by what a phrase names. A thing is one
+    # whole, whatever some part of it looks like.
+    advantage: Mapping[Named, Fits]
+    # Spreads above the median best fit of everyday phrases from which a phrase is found: among whole things,
+    # and at the finer levels. One absent phrase in twenty exceeds them. Some everyday phrases are there,
+    # which raises their median; that is in these numbers.
+    found: Mapping[Sought, tuple[float, float]]
+    part_share: float = 0.25  # weight of its best part in the fit of a region: of a thing, something is sure
+    reach: float = 0.45  # of the best fit: a region that fits less by this or less belongs to the answer,
+    nearest: float = 0.15  # by this at least,
+    farthest: float = 1.0  # and by this at most
+    nothing: float = float(logit(np.array(2 * NARROWEST)))  # fit; what fits less has no meaning
+    smallest: int = SMALLEST  # Gaussians; smaller regions are crumbs and count where there is nothing else
+    narrowest: float = NARROWEST  # distance of a relevancy from 0 and 1; least spread
+    floor: float = FLOOR  # relevancy at which a heat map begins
+    heat_span: float = MIN_HEAT_SPAN  # least range of a heat map
+    weak_probability: float = 0.5  # from which what is not found is a weak match,
+    weak_excess: float = -0.5  # likewise in spreads, where there is no probability
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the table for JSON, which has no infinity: None stands for it."""
+        found = {name: [None if np.isinf(x) else x for x in pair] for name, pair in self.found.items()}
+        return asdict(self) | {"advantage": dict(self.advantage), "found": found}
+
+    def least_fit(self, best: float, share: float = 1.0) -> float:
+        """Return the fit from which a region belongs to an answer whose best region has the fit `best`.
+
+        share: of the way that such an answer reaches.
+        """
+        return best - share * float(np.clip(self.reach * best, self.nearest, self.farthest))
+
+
+RULE = Rule(
+    advantage={
+        "thing": (0.0, 0.25, 0.75),
+        "part": (0.0, 0.0, 0.5),
+        "part of a thing": (0.0, 0.1, 0.0),
+    },
+    found={
+        "thing": (1.35, 2.6),
+        "part": (2.55, 1.3),
+        "part of a thing": (2.55, 1.3),
+        "inside": (np.inf, 1.8),
+    },
+)
+
+
+# The fits of regions, of one scene or of many.
+
+
+@dataclass(frozen=True, eq=False)
+class RegionTable:
+    """R regions of S scenes, scene by scene, each with its subparts first, then its parts and wholes."""
+
+    counts: Array  # (S, 3) int64 regions of each level
+    parents: Array  # (R,) int64 row of the region of the level above; -1 for none
+    solid: Array  # (R,) bool, False for crumbs: regions of fewer Gaussians than `Rule.smallest`
+
+    def level(self, level: int, values: Array) -> Array:
+        """Return the (r, ...) rows of one level of the first scene, of (R, ...) values."""
+        first = int(self.counts[0, :level].sum())
+        return values[first : first + int(self.counts[0, level])]
+
+
+def region_fits(table: RegionTable, own: Array) -> Array:
+    """Return the (R, ...) fits of regions, each mixed with the fit of its best part.
+
+    own: (R, ...) fits of the mean relevancy of each region's Gaussians. Parts without a meaning, and crumbs,
+    say nothing; a region without parts is its own part.
+    """
+    telling = ((own > RULE.nothing).T & table.solid).T
+    heard = np.where(telling, own, -np.inf)
+    best = np.full_like(heard, -np.inf)
+    parts = np.flatnonzero(table.parents >= 0)
+    np.maximum.at(best, table.parents[parts], heard[parts])
+    best = np.where(np.isfinite(best), best, heard)
+    return np.where(np.isfinite(best), (1 - RULE.part_share) * own + RULE.part_share * best, own)
+
+
+def region_relevancies(fits: Array) -> Array:
+    """Return the relevancies that fits stand for, 0 for what has no meaning."""
+    return np.where(fits > RULE.nothing, sigmoid(fits), 0)
+
+
+def best_relevancies(table: RegionTable, relevancies: Array) -> Array:
+    """Return the (S, 3) best relevancy of each scene and level; of crumbs only where a level has no more.
+
+    relevancies: (R,) of the regions.
+    """
+    counts = table.counts.ravel()
+    filled, starts = counts > 0, np.cumsum(counts) - counts
+    best = np.zeros((2, len(counts)))
+    if filled.any():
+        candidates = np.stack([np.where(table.solid, relevancies, -np.inf), relevancies])
+        best[:, filled] = np.maximum.reduceat(candidates, starts[filled], axis=1)
+    solid, every = best
+    return np.maximum(np.where(np.isfinite(solid), solid, every), 0).reshape(-1, len(LEVELS))
+
+
+# Chance: the fits of everyday phrases in a scene, most of which name nothing there. The more places a scene
+# has, the better the best of them fits a phrase by chance; so what counts as found is measured by the best
+# fits of everyday phrases in the scene itself.
+
+LOW = 0.16  # quantile one standard deviation below the median; what is there lies above, and widens nothing
+
+
+@dataclass(frozen=True)
+class Bar:
+    """The best fit of phrases by chance: its median and spread."""
+
+    median: float
+    spread: float
+
+    def excess(self, fit: float, spreads: float) -> float:
+        """Return the spreads by which `fit` exceeds what is so many above the median."""
+        return (fit - self.median) / max(self.spread, RULE.narrowest) - spreads
+
+
+Bars = tuple[Bar, Bar, Bar, Bar]  # of each level, and of the better one of the finer two
+Chance = tuple[Array, ...]  # (r, V) float32 of each level: fits of V everyday phrases at r regions
+
+
+def bars_of(chance: Chance, rows: Sequence[Array] | None = None) -> Bars:
+    """Return the bars of a scene, or of some regions `rows` of each level alone."""
+    chosen = [fits if rows is None else fits[rows[level]] for level, fits in enumerate(chance)]
+    subpart, part, whole = (fits.max(0, initial=-np.inf) for fits in chosen)
+    return _bar(subpart), _bar(part), _bar(whole), _bar(np.maximum(subpart, part))
+
+
+def _bar(best: Array) -> Bar:
+    if len(best) == 0 or not np.isfinite(best).all():
+        return Bar(np.inf, 1.0)
+    low, median = np.quantile(best, [LOW, 0.5])
+    return Bar(float(median), float(median - low))
+
+
+def excess(fits: Fits, bars: Bars, sought: Sought, level: LevelChoice = "auto") -> float:
+    """Return the spreads by which the best fits of a phrase exceed those from which it is found.
+
+    At one `level`, or, where that is free, at any.
+    """
+    whole, finer = RULE.found[sought]
+    if level != "auto":
+        index = LEVELS.index(level)
+        return bars[index].excess(fits[index], min(whole, finer))
+    return max(bars[2].excess(fits[2], whole), bars[3].excess(max(fits[:2]), finer))
+
+
+# Verdicts.
+
+Outcome = Literal["found", "weak match", "not here"]
+# By a calibrated probability; by the fits of everyday phrases; by likeness to a taught word's examples; by
+# the relevancy itself, as published; several: by different ones for the parts of a phrase with structure.
+Reached = Literal["calibration", "chance", "example", "relevancy", "several"]
+IN_SPREADS: tuple[Reached, ...] = ("chance", "example")  # those whose margins can be compared
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The judgement whether what was asked for is there, and how it was reached."""
+
+    found: bool
+    reached: Reached
+    margin: float  # above what counts as found: logits of the probability, spreads, or tenths of relevancy
+    probability: float | None = None  # that it is there at all; None where nothing is calibrated
+
+    @property
+    def outcome(self) -> Outcome:
+        """The verdict in words: a weak match may be there, but was not found."""
+        if self.found:
+            return "found"
+        if self.probability is not None:
+            weak = self.probability >= RULE.weak_probability
+        else:
+            weak = self.reached in IN_SPREADS and self.margin >= RULE.weak_excess
+        return "weak match" if weak else "not here"
+
+    @property
+    def absent(self) -> "Verdict":
+        """The same of nothing at all."""
+        return Verdict(False, self.reached, -np.inf, None if self.probability is None else 0.0)
+
+
+def combined(verdicts: Sequence[Verdict], all_needed: bool) -> Verdict:
+    """Return the verdict on several things: the weakest where all are needed, else the strongest."""
+    score = min if all_needed else max
+    ways = {verdict.reached for verdict in verdicts}
+    probabilities = [verdict.probability for verdict in verdicts if verdict.probability is not None]
+    return Verdict(
+        found=(all if all_needed else any)(verdict.found for verdict in verdicts),
+        reached=ways.pop() if len(ways) == 1 else "chance" if ways <= {*IN_SPREADS} else "several",
+        margin=score(verdict.margin for verdict in verdicts),
+        probability=score(probabilities) if len(probabilities) == len(verdicts) else None,
+    )
+
+
+def judge(
+    fits: Fits, sought: Sought, level: LevelChoice, bars: Bars | None, calibration: Calibration | None
+) -> Verdict:
+    """Return the verdict that the best fits of a scene's levels stand for.
+
+    bars: where nothing is calibrated.
+    """
+    if calibration is None:
+        assert bars is not None
+        margin = excess(fits, bars, sought, level)
+        return Verdict(margin >= 0, "chance", margin)
+    alone = calibration.thing if sought == "thing" else calibration.part
+    odds = calibration.inside if sought == "inside" else alone
+    probability = odds.probability(fits)
+    margin = float(logit(np.array(probability)) - logit(np.array(min(odds.found, 1 - RULE.narrowest))))
+    # It may be there, but what the wanted level shows is nearer to other phrases.
+    shown = level == "auto" or sought == "inside" or fits[LEVELS.index(level)] >= 0
+    return Verdict(shown and probability >= odds.found, "calibration", margin, probability)
+
+
+# The answer in one scene.
+
+
+@dataclass(frozen=True, eq=False)
+class Decision:
+    """The level of an answer, its regions, and the verdict."""
+
+    level: int  # index into LEVELS
+    scores: Fits  # best relevancy per level
+    fits: Fits  # that these stand for
+    relevancies: Array  # (r,) float32 of the regions of the level
+    inside: Array  # (r,) bool: the regions that answer
+    best: int  # the region that the place is taken from; -1 for none
+    verdict: Verdict
+
+
+def decide(
+    table: RegionTable,
+    own: Array,
+    named: Named,
+    level: LevelChoice,
+    bars: Bars,
+    calibration: Calibration | None,
+) -> Decision:
+    """Return the answer of the whole regions that fit nearly as well as the best one.
+
+    table: of one scene. own: (R,) fits of the mean relevancy of each region. named: what the phrase names.
+    """
+    fits = region_fits(table, own)
+    relevancies = region_relevancies(fits)
+    scores = best_relevancies(table, relevancies)[0]
+    best = fit_of(scores)
+    given = best + RULE.advantage[named]
+    # Of equal levels the coarsest.
+    chosen = int(np.flatnonzero(given == given.max())[-1]) if level == "auto" else LEVELS.index(level)
+    shown = table.level(chosen, relevancies).astype(np.float32)
+    solid = np.where(shown > np.float32(scores[chosen]), 0, shown)  # what is above the best is a crumb
+    return Decision(
+        level=chosen,
+        scores=triple(scores),
+        fits=triple(best),
+        relevancies=shown,
+        inside=table.level(chosen, fits) >= RULE.least_fit(float(best[chosen])),
+        best=int(solid.argmax()) if solid.max(initial=0) > 0 else -1,
+        verdict=judge(triple(best), named, level, bars, calibration),
+    )
+
+
+def triple(values: Array) -> Fits:
+    """Return (3,) values as Python numbers."""
+    subpart, part, whole = values
+    return float(subpart), float(part), float(whole)
