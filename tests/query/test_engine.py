@@ -322,11 +322,7 @@ def test_without_a_calibration_combined_answers_have_no_probability_and_the_weak
     assert run_phrase(engine, "mug near the wall").answer.judgement.margin <= parts[1].judgement.margin
     assert [part.found for part in (*parts, both, either)] == [True, False, False, True]
     inside = run_phrase(engine, "handle of the wall").answer
-    assert (
-        inside.judgement.margin
-        <= parts[1].judgement.margin
-        < run_phrase(engine, "handle of the mug").answer.judgement.margin
-    )
+    assert inside.judgement.margin == parts[1].judgement.margin
     none = run_phrase(engine, "mug, not mug").answer
     assert not none.members.any()
     assert {answer.probability for answer in (both, either, inside, none)} == {None}
@@ -489,9 +485,8 @@ def test_field_through_cells_keeps_what_is_unknown():
     field.latents[2, 30:40] = 0
     read = through_cells(field)
     np.testing.assert_array_equal(read.known, field.known)
-    np.testing.assert_allclose(
-        read.codec.decode(read.latents[0]), field.codec.decode(field.latents[0]), atol=1e-5
-    )
+    vectors, want = (each.codec.decode(each.latents[0][each.known[0]]) for each in (read, field))
+    np.testing.assert_allclose(vectors, want, atol=1e-5)
     nothing = replace(field, confidence=0 * field.confidence)
     assert not through_cells(nothing).known.any()
 
