@@ -36,7 +36,6 @@ from langsplat_core.extensions.benchmarks.report import intersection_over_union
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import Cancelled, Progress, Report
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.pixels import peak_pixel, splatted_relevancy
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import CANONICAL_PHRASES, Camera, Scene
 from langsplat_core.semantics.encoders import load_encoder, load_text_encoder

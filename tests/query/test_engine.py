@@ -322,7 +322,7 @@ def test_without_a_calibration_combined_answers_have_no_probability_and_the_weak
     assert run_phrase(engine, "mug near the wall").answer.judgement.margin <= parts[1].judgement.margin
     assert [part.found for part in (*parts, both, either)] == [True, False, False, True]
     inside = run_phrase(engine, "handle of the wall").answer
-    assert inside.judgement.margin == parts[1].judgement.margin
+    assert inside.judgement.margin <= parts[1].judgement.margin
     none = run_phrase(engine, "mug, not mug").answer
     assert not none.members.any()
     assert {answer.probability for answer in (both, either, inside, none)} == {None}
