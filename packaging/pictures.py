@@ -204,10 +204,6 @@ def _timed(ctx: Any, window: Window) -> None:
     viewer = window.viewer
     settings.open_panel(viewer, "Timing")
     ctx.yield_(30)
-    ctx.item_click("//Timing/Compare with the reference")  # what draws must run where the window does
-    ctx.mouse_teleport_to_pos((900, 600))
-    while viewer.state.timing.comparison is None:
-        ctx.yield_()
 
 
 def _trained(ctx: Any, window: Window) -> None:

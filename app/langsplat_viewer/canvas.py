@@ -10,9 +10,9 @@ Needs a GL context but no window. It is in one of three phases:
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Generic, Literal, TypeVar
 
 import moderngl
@@ -20,30 +20,43 @@ import moderngl
 from langsplat_core.arrays import Array
 from langsplat_core.errors import BackendError
 from langsplat_core.progress import Progress, watched
-from langsplat_core.scene import Gaussians
 from langsplat_core.scene.gaussians import Merged, merged
 from langsplat_viewer.actions import editing, selecting, viewpoint
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.commands import with_key
 from langsplat_viewer.jobs import Worker
-from langsplat_viewer.rendering.renderer import GlRenderer, Rasterized, Rasterizing
-from langsplat_viewer.rendering.request import (
-    FULL,
-    UNCLIPPED,
-    Detail,
-    RenderRequest,
-    why_nothing,
-    why_undrawable,
-)
+from langsplat_viewer.rendering.renderer import GlRenderer, Layers
+from langsplat_viewer.rendering.request import UNCLIPPED, RenderRequest, why_nothing, why_undrawable
 from langsplat_viewer.state import FrameStats, ViewerState
 
 REST_SECONDS = 0.07  # without a move, after which the camera rests
+MOVING_BUDGET = 25.0  # milliseconds of an image: with the panels, some thirty a second
 KEPT_SIZES = 3  # of images: the full one and two coarse ones
 NOTHING_LEFT = "all of the scene is hidden or deleted"
 NOTHING_BETWEEN = "nothing of the scene in this picture lies between the cuts: move them in the panel Camera"
 
 Phase = Literal["moving", "settling", "still"]
 Key = tuple[int, int, int]  # which pane, width, height
+
+
+@dataclass(frozen=True)
+class Detail:
+    """Level of detail of an image."""
+
+    scale: float = 1.0  # of the sides of the window's image
+    merged: bool = False  # drawn from fewer, merged Gaussians, see `langsplat_core.scene.gaussians`
+
+
+FULL = Detail()
+
+
+@dataclass(frozen=True)
+class Timed:
+    """Layers that another thread rasterized, and the time of that."""
+
+    layers: Layers
+    milliseconds: float
+    laps: Mapping[str, float]  # see `langsplat_core.progress`
 
 
 class Canvas:
@@ -54,31 +67,28 @@ class Canvas:
         ctx: moderngl.Context,
         renderer: GlRenderer,
         clock: Callable[[], float] = time.perf_counter,
-        quick: GlRenderer | None = None,
+        budget: float = MOVING_BUDGET,
     ) -> None:
-        """`clock`, in seconds, times the drawing. `quick`: another renderer, which draws merged Gaussians
-        while the camera moves, where images take long."""
-        self._ctx, self._fine, self._quick, self._clock = ctx, renderer, quick, clock
-        self._merger: Latest[Gaussians, Merged] = Latest(merged)
-        self._background: Latest[Rasterizing, Rasterized] = Latest(
-            lambda wanted, report: _rasterize(wanted, report, clock)
-        )
-        self._pace = Pace()
+        """`clock`, in seconds, times the images; `budget`: milliseconds that one may take while it moves."""
+        self._ctx, self._renderer, self._clock = ctx, renderer, clock
+        self._merges = renderer.backend == "cpu"  # a graphics device draws large scenes as they are
+        self._merger: Latest[Merged] = Latest()
+        self._background: Latest[Timed] = Latest()
+        self._resolution = AdaptiveResolution(budget)
         self._targets: dict[Key, moderngl.Framebuffer] = {}  # the latest used last
-        self._textures: dict[Key, moderngl.Texture] = {}
         self.phase: Phase = "still"
         self._view: OrbitCamera | None = None
         self._moving: object = None  # what a gizmo does
         self._moved = -1e9  # when the view last changed, seconds
-        self._tried: RenderRequest | None = None  # the last one that was drawn, if only in vain
-        self._shown: RenderRequest | None = None  # what the textures show
+        self._wanted: tuple[RenderRequest, Detail] | None = None  # what was drawn last, if only in vain
+        self._drawn: RenderRequest | None = None  # the same at its level of detail
         self._timed = False  # the steps of drawing are measured
         self._unsure = False  # whether the image shows anything is not known yet
         # One for each pane; RGBA8, first row at the bottom, as GL has it.
         self.textures: tuple[moderngl.Texture, ...] = ()
 
     def update(self, state: ViewerState, now: float) -> bool:
-        """Draw if anything changed since the last call; returns whether a finer image is still due.
+        """Draw if anything changed since the last call; return whether a finer image is still due.
 
         `now` in seconds. Raises what the renderer raises (BackendError, moderngl.Error); the same
         request is then not tried again.
@@ -90,28 +100,156 @@ class Canvas:
         if state.view is not self._view or state.moving is not self._moving:
             self._moved = now if self._view is not None else self._moved
             self._view, self._moving = state.view, state.moving
-        request = state.request().without_line()
-        self._pace.expect(len(state.scene.gaussians))
         moving = now - self._moved < REST_SECONDS
-        if self._begins_timing(state, moving):
-            self._tried = None
-            self._fine.forget()
-        self.phase = "moving" if moving else self._at_rest(request)
-        if self.phase == "settling" and self._pace.is_slow:
-            self._settle(state, request)
-        else:
+        request = state.request().without_line()
+        self._resolution.expect(len(state.scene.gaussians))
+        self._begin_timing(state, moving)
+        if moving:
             self._background.drop()
-            if self.phase == "settling":
-                self._draw(state, request)
-            elif moving:
-                self._follow(state, request)
-        self.phase = "moving" if moving else self._at_rest(request)
+            self._follow(state, request)
+        elif self._wanted != (request, FULL):
+            self._settle(state, request)
+        is_full = self._wanted == (request, FULL)
+        self.phase = "moving" if moving else "still" if is_full else "settling"
         if self.phase == "still":
+            self._background.drop()
             self._explain_nothing(state)
         return self.phase != "still"
 
-    def _at_rest(self, request: RenderRequest) -> Phase:
-        return "still" if request == self._tried else "settling"
+    def _follow(self, state: ViewerState, request: RenderRequest) -> None:
+        """Draw the image of a camera that moves, at the level of detail that keeps up with it."""
+        if not state.coarse_while_moving:
+            if self._wanted != (request, FULL):
+                self._draw(state, request)
+        elif self._changes(request):
+            fewer = self._merged(request)
+            self._draw(state, request, self._resolution.finest(fewer is not None), fewer)
+
+    def _settle(self, state: ViewerState, request: RenderRequest) -> None:
+        """Draw the full image of a camera that rests.
+
+        Where that takes long it is drawn once another thread has rasterized it; until then merged Gaussians
+        stand in where they are there, else the image before stays.
+        """
+        ahead = self._renderer.ahead(request) if self._resolution.is_slow else None
+        if ahead is None:
+            self._background.drop()
+            self._draw(state, request)
+            return
+        key, work = ahead
+        self._background.want(key, lambda report: _timed(work, report, self._clock))
+        try:
+            made = self._background.made(key)
+        except BackendError:
+            self._background.drop()
+            self._wanted = request, FULL
+            raise
+        if made is not None:
+            self._background.drop()
+            self._draw(state, request, made=made)
+        elif state.coarse_while_moving and self._changes(request):
+            fewer, detail = self._merged(request), self._resolution.stand_in()
+            if fewer is not None and detail is not None:
+                self._draw(state, request, detail, fewer)
+
+    def _changes(self, request: RenderRequest) -> bool:
+        """Return whether the image on screen is of another request, at any level of detail."""
+        return self._wanted is None or self._wanted[0] != request
+
+    def _merged(self, request: RenderRequest) -> Merged | None:
+        with suppress(BackendError):  # for want of memory: images stay as they are
+            return self._merger.made(request.gaussians)
+        return None
+
+    def _draw(
+        self,
+        state: ViewerState,
+        request: RenderRequest,
+        detail: Detail = FULL,
+        fewer: Merged | None = None,
+        made: Timed | None = None,
+    ) -> None:
+        """Draw an image and show it; `made`: its layers, where another thread has rasterized them."""
+        drawn = request.reduced(detail.scale, fewer if detail.merged else None)
+        before = self._drawn
+        if before is not None and before.scene.source is not request.scene.source:
+            self._merger.drop()  # of another scene
+        self._wanted, self._drawn = (request, detail), drawn  # also where it fails: it is not tried again
+        camera = drawn.camera
+        targets = self._framebuffers(camera.width, camera.height, len(drawn.panes))
+        began = self._clock()
+        with watched() if state.timing.wanted else nullcontext(dict[str, float]()) as laps:
+            if made is not None:
+                self._renderer.take(made.layers)
+            self._renderer.draw(drawn, targets)
+        self._ctx.finish()
+        milliseconds = 1e3 * (self._clock() - began)
+        if made is not None:
+            milliseconds, laps = milliseconds + made.milliseconds, {**made.laps, **laps}
+        if state.timing.wanted and detail == FULL:
+            for name, taken in (*laps.items(), ("picture", milliseconds)):
+                state.timing.add(name, taken)
+        if before is None or drawn.projection != before.projection:
+            self._resolution.drew(detail, milliseconds)
+        if self._merges and self._resolution.is_slow:
+            gaussians = request.gaussians
+            self._merger.want(gaussians, lambda report: merged(gaussians, report))
+        self.textures = tuple(_texture_of(target) for target in targets)
+        state.stats = FrameStats(milliseconds, camera.width, camera.height, detail.scale, detail.merged)
+        state.nothing, self._unsure = "", True
+
+    def _framebuffers(self, width: int, height: int, panes: int) -> list[moderngl.Framebuffer]:
+        """Return one for each pane; those of the last few sizes are kept: moving alternates between two."""
+        for key in [(place, width, height) for place in range(panes)]:
+            target = self._targets.pop(key, None)
+            while target is None and len(self._targets) >= KEPT_SIZES * panes:
+                _release(self._targets.pop(next(iter(self._targets))))
+            if target is None:
+                texture = self._ctx.texture((width, height), 4)
+                texture.repeat_x = texture.repeat_y = False
+                target = self._ctx.framebuffer([texture])
+            self._targets[key] = target
+        return list(self._targets.values())[-panes:]
+
+    def _begin_timing(self, state: ViewerState, moving: bool) -> None:
+        """At the first frame whose steps are measured, forget what would take no time: once it rests."""
+        if moving and state.timing.wanted:
+            return
+        if state.timing.wanted and not self._timed:
+            self._wanted = None
+            self._renderer.forget()
+        self._timed = state.timing.wanted
+
+    def _explain_nothing(self, state: ViewerState) -> None:
+        """Say why an image shows nothing; asked once, at rest, since it reads the image back."""
+        if self._unsure and self._drawn is not None:
+            self._unsure = False
+            if self._renderer.shows_nothing():
+                state.nothing = _why_nothing(self._drawn)
+
+    # What others see of it.
+
+    @property
+    def backend(self) -> str:
+        """Name of the rasterizer."""
+        return self._renderer.backend
+
+    def point_at(self, u: float, v: float) -> Array | None:
+        """Return the (3,) world point of the surface at a place in the image, fractions from the top left."""
+        if self._drawn is None:
+            return None
+        camera = self._drawn.camera
+        pixel = (self._drawn.split.within_pane(u) * camera.width, v * camera.height)
+        depth = self._renderer.depth_at(self._drawn, *pixel)
+        return None if depth is None else camera.unproject(pixel, depth)
+
+    def depths(self) -> Array | None:
+        """Return the (H, W) camera z of the surface all over the image, see `Surface.depths`."""
+        return None if self._drawn is None else self._renderer.depth_map(self._drawn)
+
+    def capture(self, request: RenderRequest) -> Array:
+        """Return the image of a request, see `Surface.capture`."""
+        return self._renderer.read(request)
 
     @property
     def waits(self) -> bool:
@@ -127,148 +265,35 @@ class Canvas:
         """Have `wake` called on another thread when `update` should be."""
         self._background.worker.wake = wake
 
-    def _follow(self, state: ViewerState, request: RenderRequest) -> None:
-        if not state.coarse_while_moving:
-            if request != self._tried:
-                self._draw(state, request)
-        elif self._changes(request):
-            level = self._pace.level(self._merged(request) is not None)
-            self._draw(state, self._at(request, level))
-
-    def _settle(self, state: ViewerState, request: RenderRequest) -> None:
-        """Settling, slowly: draw the full image once another thread has rasterized it; until then one of
-        merged Gaussians where they are there, else what was there stays."""
-        rasterizing = self._fine.ahead(request)
-        if rasterizing is None:
-            self._background.drop()
-            self._draw(state, request)
-            return
-        self._background.want(rasterizing)
-        try:
-            made = self._background.made(rasterizing)
-        except BackendError:
-            self._background.drop()
-            self._tried = request
-            raise
-        if made is not None:
-            self._background.drop()
-            self._draw(state, request, made)
-        elif self._changes(request) and state.coarse_while_moving and self._merged(request) is not None:
-            level = self._pace.stand_in()
-            if level is not None:
-                self._draw(state, self._at(request, level))
-
-    def _changes(self, request: RenderRequest) -> bool:
-        """True where the image on screen is of another request, at any level of detail."""
-        return self._tried is None or replace(self._tried, detail=FULL) != request
-
-    def _merged(self, request: RenderRequest) -> Merged | None:
-        if self._quick is not None:
-            with suppress(BackendError):  # for want of memory: images stay as they are
-                return self._merger.made(request.scene.scene.gaussians)
-        return None
-
-    def _at(self, request: RenderRequest, level: "Level") -> RenderRequest:
-        fewer = self._merged(request) if level.merged else None
-        return replace(request, detail=Detail(level.scale, fewer))
-
-    def _renderer_of(self, request: RenderRequest) -> GlRenderer:
-        return self._fine if request.detail.merged is None or self._quick is None else self._quick
-
-    def _draw(self, state: ViewerState, request: RenderRequest, made: Rasterized | None = None) -> None:
-        """`made`: by another thread, of the full image."""
-        is_projected = self._tried is None or request.placement != self._tried.placement
-        if self._quick is not None and (
-            self._tried is None or request.scene.source is not self._tried.scene.source
-        ):
-            self._quick.forget()  # another scene
-        self._tried = request  # also where it fails: it is not tried again
-        camera, detail = request.drawn_camera, request.detail
-        keys = [(place, camera.width, camera.height) for place in range(len(request.panes))]
-        targets = [self._target(key, len(keys)) for key in keys]
-        began = self._clock()
-        with watched() if state.timing.wanted else nullcontext(dict[str, float]()) as laps:
-            if made is not None:
-                self._fine.take(made)
-            self._renderer_of(request).draw(request, targets)
-        self._ctx.finish()
-        milliseconds = 1e3 * (self._clock() - began)
-        if made is not None:
-            milliseconds, laps = milliseconds + made.milliseconds, {**made.laps, **laps}
-        if state.timing.wanted and detail == FULL:
-            for name, taken in (*laps.items(), ("picture", milliseconds)):
-                state.timing.add(name, taken)
-        if is_projected:
-            self._pace.drew(Level(detail.scale, detail.merged is not None), milliseconds)
-        if self._quick is not None and self._pace.is_slow:
-            self._merger.want(request.scene.scene.gaussians)
-        self._shown = request
-        self.textures = tuple(self._textures[key] for key in keys)
-        size = (camera.width, camera.height)
-        state.stats = FrameStats(milliseconds, *size, detail.scale, detail.merged is not None)
-        state.nothing, self._unsure = "", True
-
-    def _begins_timing(self, state: ViewerState, moving: bool) -> bool:
-        """True for the first frame whose steps are measured: what was kept of earlier ones would have
-        taken no time."""
-        if state.timing.wanted and moving:
-            return False  # once it rests
-        before, self._timed = self._timed, state.timing.wanted
-        return self._timed and not before
-
-    def _explain_nothing(self, state: ViewerState) -> None:
-        """Say why an image shows nothing; asked once, at rest, since it reads the image back."""
-        if self._unsure and self._shown is not None:
-            self._unsure = False
-            if self._renderer_of(self._shown).shows_nothing():
-                state.nothing = _why_nothing(self._shown)
-
-    def _target(self, key: Key, count: int) -> moderngl.Framebuffer:
-        """A framebuffer for one of `count` panes; those of the last few sizes are kept, because moving
-        alternates between two."""
-        if key not in self._targets:
-            while len(self._targets) >= KEPT_SIZES * count:
-                oldest = next(iter(self._targets))
-                self._targets.pop(oldest).release()
-                self._textures.pop(oldest).release()
-            texture = self._ctx.texture(key[1:], 4)
-            texture.repeat_x = texture.repeat_y = False
-            self._textures[key] = texture
-            self._targets[key] = self._ctx.framebuffer([texture])
-        self._targets[key] = self._targets.pop(key)
-        return self._targets[key]
-
-    @property
-    def backend(self) -> str:
-        return self._fine.backend
-
     def close(self) -> None:
+        """Take on no more work on other threads."""
         self._background.worker.close()
         self._merger.worker.close()
 
     def release(self) -> None:
         """Give device memory back; the canvas cannot be used afterwards."""
         for target in self._targets.values():
-            target.release()
-        for texture in self._textures.values():
-            texture.release()
-        for renderer in (self._fine, self._quick):
-            if renderer is not None:
-                renderer.release()
+            _release(target)
+        self._renderer.release()
 
-    def point_at(self, u: float, v: float) -> Array | None:
-        if self._shown is None:
-            return None
-        camera = self._shown.drawn_camera
-        pixel = (self._shown.split.within_pane(u) * camera.width, v * camera.height)
-        depth = self._renderer_of(self._shown).depth_at(self._shown, *pixel)
-        return None if depth is None else camera.unproject(pixel, depth)
 
-    def depths(self) -> Array | None:
-        return None if self._shown is None else self._renderer_of(self._shown).depth_map(self._shown)
+def _texture_of(target: moderngl.Framebuffer) -> moderngl.Texture:
+    (texture,) = target.color_attachments
+    assert isinstance(texture, moderngl.Texture)
+    return texture
 
-    def capture(self, request: RenderRequest) -> Array:
-        return self._fine.read(request)
+
+def _release(target: moderngl.Framebuffer) -> None:
+    texture = _texture_of(target)
+    target.release()
+    texture.release()
+
+
+def _timed(work: Callable[[Progress], Layers], report: Progress, clock: Callable[[], float]) -> Timed:
+    began = clock()
+    with watched() as laps:
+        layers = work(report)
+    return Timed(layers, 1e3 * (clock() - began), laps)
 
 
 def _why_nothing(request: RenderRequest) -> str:
@@ -284,128 +309,105 @@ def _why_nothing(request: RenderRequest) -> str:
     return f"{reason}: {back}" if elsewhere else reason
 
 
-# Level of detail while the camera moves, learned from the times of earlier images.
+# Adaptive resolution: the level of detail while the camera moves, learned from the times of earlier images.
 
-MOVING_BUDGET = 25.0  # milliseconds: with the panels, some thirty images a second
-GUESS = 4e-4  # milliseconds of a full image for each Gaussian, before one was drawn
-MERGED_SHARE = 0.25  # of an image's time, guessed, when four Gaussians are drawn as one
-FORGET = 0.8  # what was learned is lowered by this with every full image, so that better is tried again
-
-
-@dataclass(frozen=True)
-class Level:
-    """One level of detail."""
-
-    scale: float = 1.0  # of the window's resolution
-    merged: bool = False  # see `langsplat_core.scene.gaussians`
-
-    @property
-    def guess(self) -> float:
-        """Time, as a share of a full image's."""
-        return self.scale**2 * (MERGED_SHARE if self.merged else 1)
-
-
-FINE = Level()
-PLAIN = (FINE, Level(0.5), Level(0.25))
+PLAIN = (FULL, Detail(0.5), Detail(0.25))
 # Merged at half the resolution is nearer to the full image than all of it at a quarter, and cheaper.
-WITH_MERGED = (FINE, Level(0.5), Level(0.5, merged=True), Level(0.25, merged=True))
+WITH_MERGED = (FULL, Detail(0.5), Detail(0.5, merged=True), Detail(0.25, merged=True))
 
 
-class Pace:
-    """Times of images by level of detail, in milliseconds."""
+class AdaptiveResolution:
+    """Chooses the level of detail whose image is expected within a budget of time."""
 
-    def __init__(self) -> None:
+    def __init__(self, budget: float = MOVING_BUDGET) -> None:
+        """`budget` in milliseconds."""
+        self._budget = budget
         self._count = 1
-        self._each = GUESS  # of a full image's time, for one Gaussian
-        self._shares: dict[Level, float] = {}  # of the full image's time, measured
+        self._each = 4e-4  # milliseconds of a full image for each Gaussian; a guess before one was drawn
+        self._shares: dict[Detail, float] = {}  # of the full image's time, measured
 
     def expect(self, count: int) -> None:
+        """Take `count` Gaussians as those of the next images."""
         self._count = max(count, 1)
 
     @property
     def is_slow(self) -> bool:
         """True where full images are too slow to follow a movement."""
-        return not self._is_within(FINE)
+        return not self._is_within_budget(FULL)
 
-    def drew(self, level: Level, milliseconds: float) -> None:
-        if level == FINE:
+    def drew(self, detail: Detail, milliseconds: float) -> None:
+        """Learn from the time of an image."""
+        if detail == FULL:
             self._each = milliseconds / self._count
-            self._shares = {other: FORGET * share for other, share in self._shares.items()}
+            # Coarse ones are held to be a little faster with every full image, so that better is tried again.
+            self._shares = {other: 0.8 * share for other, share in self._shares.items()}
         elif self._each > 0:
-            self._shares[level] = (self._share(level) + milliseconds / (self._each * self._count)) / 2
+            self._shares[detail] = (self._share(detail) + milliseconds / (self._each * self._count)) / 2
 
-    def level(self, has_merged: bool) -> Level:
-        """The finest at which an image is expected within the budget, or the coarsest of all."""
+    def finest(self, has_merged: bool) -> Detail:
+        """Return the finest level expected within the budget, or the coarsest of all."""
         levels = WITH_MERGED if has_merged else PLAIN
-        return next(filter(self._is_within, levels), levels[-1])
+        return next(filter(self._is_within_budget, levels), levels[-1])
 
-    def stand_in(self) -> Level | None:
-        """The finest of merged Gaussians that is expected within the budget, if there is one: all of them are
-        projected for few pixels, too."""
-        merged = (level for level in WITH_MERGED if level.merged)
-        return next(filter(self._is_within, merged), None)
+    def stand_in(self) -> Detail | None:
+        """Return the finest of merged Gaussians that is expected within the budget, if there is one.
 
-    def _is_within(self, level: Level) -> bool:
-        return self._each * self._count * self._share(level) <= MOVING_BUDGET
+        All of the Gaussians are projected for few pixels, too.
+        """
+        return next(filter(self._is_within_budget, (detail for detail in WITH_MERGED if detail.merged)), None)
 
-    def _share(self, level: Level) -> float:
-        return 1.0 if level == FINE else self._shares.get(level, level.guess)
+    def _is_within_budget(self, detail: Detail) -> bool:
+        return self._each * self._count * self._share(detail) <= self._budget
+
+    def _share(self, detail: Detail) -> float:
+        """Return the time as a share of a full image's; guessed, a quarter where four are drawn as one."""
+        if detail == FULL:
+            return 1.0
+        return self._shares.get(detail, detail.scale**2 * (0.25 if detail.merged else 1))
 
 
 # Other threads: one rasterizes the full image of a large scene, one merges its Gaussians.
 
-
-W = TypeVar("W")
 M = TypeVar("M")
 
 
-class Latest(Generic[W, M]):
-    """Makes one thing at a time on a thread of its own: the one that is wanted now. Results of others are
-    dropped."""
+class Latest(Generic[M]):
+    """Makes what was wanted last on a thread of its own, and drops the results of what was wanted before."""
 
-    def __init__(self, make: Callable[[W, Progress], M]) -> None:
+    def __init__(self) -> None:
         self.worker = Worker()
-        self._make = make
-        self._wanted: W | None = None
+        self._key: object = None  # of what is wanted
         self._made: M | None = None
         self._problem = ""
 
     @property
     def waits(self) -> bool:
         """True while something is wanted that has not been dropped."""
-        return self._wanted is not None
+        return self._key is not None
 
-    def want(self, wanted: W) -> None:
-        """Begin to make the result for `wanted`, unless it is under way or there."""
-        if wanted != self._wanted:
+    def want(self, key: object, make: Callable[[Progress], M]) -> None:
+        """Begin to `make` what has that key, unless it is under way or there."""
+        if key != self._key:
             self.drop()
-            self._wanted = wanted
-            make = self._make
-            self.worker.submit("", lambda report: make(wanted, report), self._keep, self._fail)
+            self._key = key
+            self.worker.submit("", make, self._keep, self._fail)
 
-    def made(self, wanted: W) -> M | None:
-        """The result, if it is ready. Raises BackendError, once, where it failed."""
+    def made(self, key: object) -> M | None:
+        """Return what has that key, if it is ready. Raises BackendError, once, where it failed."""
         self.worker.poll()
         problem, self._problem = self._problem, ""
         if problem:
             raise BackendError(problem)
-        return self._made if wanted == self._wanted else None
+        return self._made if key == self._key else None
 
     def drop(self) -> None:
         """Cancel the work under way, and drop its result."""
         self.worker.cancel()
         self.worker.poll()  # so that nothing of a job that was left is held
-        self._wanted, self._made, self._problem = None, None, ""
+        self._key, self._made, self._problem = None, None, ""
 
     def _keep(self, made: M) -> None:
         self._made = made
 
     def _fail(self, problem: str) -> None:
         self._problem = problem
-
-
-def _rasterize(wanted: Rasterizing, report: Progress, clock: Callable[[], float]) -> Rasterized:
-    began = clock()
-    with watched() as laps:
-        finish = wanted.work(report)
-    return Rasterized(wanted, finish, 1e3 * (clock() - began), laps)

@@ -255,7 +255,6 @@ BY_MENU: dict[str, tuple[Command, ...]] = {
         ),
         Command("compare with another scene", browsing.ask_for_beside),
         *(_overlay(name, title) for name, title in OVERLAY_TITLES.items()),
-        Command("compare the picture with the reference", viewpoint.compare_with_reference, apart=True),
         Command(
             "measure a distance",
             settings.toggle_measuring,

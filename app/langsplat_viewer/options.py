@@ -214,14 +214,13 @@ def warm_up(scene: Scene, backend: str, progress: Progress = silent) -> None:
     if backend == "cpu":
         say_compiling(progress)
         from langsplat_core.raster import load_rasterizer
-        from langsplat_viewer.rendering.renderer import ArrayChannels
-        from langsplat_viewer.rendering.request import RenderKey
+        from langsplat_core.raster.render import splat_colours
 
         few = Scene(scene.gaussians.take(np.arange(min(len(scene.gaussians), WARMING))))
-        channels = ArrayChannels(load_rasterizer("cpu"))
-        key = RenderKey(few, few.framing_camera((16, 16)))
-        channels.render(key)
-        channels.depth_at(key, 8, 8)
+        camera = few.framing_camera((16, 16))
+        view = load_rasterizer("cpu").view(few.gaussians, camera)
+        splat_colours(view, few.gaussians)
+        view.depth_at(8, 8)
 
 
 def say_compiling(progress: Progress) -> None:

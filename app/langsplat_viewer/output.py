@@ -44,9 +44,8 @@ from langsplat_viewer.camera.controls import (
 from langsplat_viewer.camera.flight import Motion, camera_of, frame_times, turntable
 from langsplat_viewer.files.projects import read_flight
 from langsplat_viewer.options import ViewerOptions, check_display, chosen_camera, latent_level, say_compiling
-from langsplat_viewer.rendering.renderer import ArrayRenderer, Backend, GlRenderer, open_renderer
+from langsplat_viewer.rendering.renderer import ArrayRenderer, Backend, GlRenderer, Inputs, open_renderer
 from langsplat_viewer.rendering.request import (
-    Inputs,
     RenderRequest,
     plain_request,
     why_nothing,
@@ -301,10 +300,10 @@ def fingerprint(shot: Shot) -> str:
     """Return a digest that is the same for shots that give the same images, whoever asks for them."""
     digest, inputs = hashlib.sha256(), Inputs()
     request = shot.request
-    scene = inputs.key(request).scene
+    scene = inputs.scene(request)
     _add(digest.update, (scene.gaussians, scene.raster_settings(), request.clip, request.split, request.size))
     _add(digest.update, [(pane.picture, pane.ranges) for pane in request.panes])
-    _add(digest.update, [channel.values for channel in inputs.channels(request)])
+    _add(digest.update, [c if isinstance(c, np.ndarray) else None for c in inputs.channels(request)])
     _add(digest.update, (shot.backend, shot.fps, shot.cameras))
     return digest.hexdigest()
 

@@ -74,7 +74,7 @@ class Ruler:
         return replace(self, points=(*self.points, point) if len(self.points) == 1 else (point,))
 
 
-# Times of the steps of drawing, and the comparison with the reference: the panel "Timing".
+# Times of the steps of drawing: the panel "Timing".
 
 KEPT = 31  # measurements of which the median is told
 STEPS = {  # names of laps, and what they are called; in the order of the panel
@@ -89,33 +89,6 @@ STEPS = {  # names of laps, and what they are called; in the order of the panel
     "panels": "Panels",
     "search": "Search",
 }
-LONGEST_SIDE = 160  # pixels of an image that is compared: the reference takes as long for more
-
-
-def compared_size(size: tuple[int, int]) -> tuple[int, int]:
-    """Pixels of the image that is compared, of the shape of a window of `size`."""
-    factor = min(LONGEST_SIDE / max(size), 1.0)
-    return max(round(size[0] * factor), 1), max(round(size[1] * factor), 1)
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """Differences of an image from the reference, at a small size; errors in display values, 0 to 255."""
-
-    size: tuple[int, int]  # pixels
-    largest: int
-    mean: float
-    psnr: float  # dB; infinite where they are the same
-    backend: str  # that was compared
-
-
-def compared(shown: Array, reference: Array, backend: str) -> Comparison:
-    """Return the differences of two (H, W, C) uint8 images of one size."""
-    errors = np.abs(shown.astype(np.float64) - reference)
-    squared = float((errors**2).mean())
-    psnr = math.inf if squared == 0 else 10 * math.log10(255**2 / squared)
-    height, width = shown.shape[:2]
-    return Comparison((width, height), int(errors.max()), float(errors.mean()), psnr, backend)
 
 
 @dataclass(eq=False)
@@ -124,7 +97,6 @@ class Timing:
 
     wanted: bool = False  # this frame is measured: the panel is seen
     laps: dict[str, deque[float]] = field(default_factory=dict)  # milliseconds by the names of STEPS
-    comparison: Comparison | None = None  # the last one
 
     def add(self, name: str, milliseconds: float) -> None:
         self.laps.setdefault(name, deque(maxlen=KEPT)).append(milliseconds)

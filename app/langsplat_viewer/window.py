@@ -27,7 +27,7 @@ from langsplat_viewer.actions import (
     viewpoint,
 )
 from langsplat_viewer.camera.controls import spanning
-from langsplat_viewer.canvas import Canvas
+from langsplat_viewer.canvas import MOVING_BUDGET, Canvas
 from langsplat_viewer.files.preferences import (
     FILE_NAME,
     LAYOUT_NAME,
@@ -178,6 +178,7 @@ class WindowRequest:
     path_file: Path | None = None  # a camera path
     beside: Path | None = None  # a second scene
     settings: Path | None = None  # folder of what is remembered between windows; None: nothing is
+    moving_budget: float = MOVING_BUDGET  # milliseconds that an image may take while the camera moves
 
 
 def open_window(request: WindowRequest, services: Services) -> None:
@@ -282,10 +283,7 @@ class Window:
             opening.open_scene(self.viewer, self._request.path, self._first_view)
 
     def _new_canvas(self, ctx: moderngl.Context) -> Canvas:
-        renderer = self._make_renderer(ctx)
-        # A graphics device draws large scenes as they are.
-        quick = self._make_renderer(ctx) if renderer.backend == "cpu" else None
-        canvas = Canvas(ctx, renderer, quick=quick)
+        canvas = Canvas(ctx, self._make_renderer(ctx), budget=self._request.moving_budget)
         canvas.wake_with(glfw.post_empty_event)
         return canvas
 

@@ -60,6 +60,15 @@ class View(ABC):
         _, alpha = self.splat(np.empty((self.count, 0), np.float32))
         return np.where(alpha >= 0.5, self.depth(), 0)
 
+    def depth_at(self, column: int, row: int) -> tuple[float, float]:
+        """Return depth of the surface (camera z, world units; 0: nothing) and alpha of one pixel.
+
+        The depth is the median or, where the transmittance stays above 0.5, the alpha-weighted mean.
+        """
+        _, alpha = self.splat(np.empty((self.count, 0), np.float32))
+        median = self.median_depth()[row, column]
+        return float(median or self.depth()[row, column]), float(alpha[row, column])
+
 
 class LiftingView(View):
     """A view whose backend also has the adjoint."""

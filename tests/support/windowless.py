@@ -13,7 +13,7 @@ from langsplat_viewer.actions import opening, queries, selecting, settings, view
 from langsplat_viewer.camera.controls import extent_of, from_camera, orbit
 from langsplat_viewer.camera.flight import Flight, Keyframe, pose_of
 from langsplat_viewer.canvas import Canvas
-from langsplat_viewer.marks import Marks
+from langsplat_viewer.marks import Marks, unmarked
 from langsplat_viewer.rendering.request import Clip, RenderRequest, Splats
 from langsplat_viewer.state import GLIDE_SECONDS, ViewerState
 from langsplat_viewer.viewer import Viewer
@@ -44,14 +44,12 @@ class FakeSurface:
 class FakeRenderer:
     """Notes the requests it draws, and takes as long as it is told to, on a clock of its own."""
 
-    backend = "fake"
-
-    def __init__(self, seconds: float = 0.0) -> None:
+    def __init__(self, seconds: float = 0.0, seconds_merged: float = 0.0, backend: str = "opengl") -> None:
+        """An image takes `seconds`, one of merged Gaussians `seconds_merged`."""
+        self.backend, self.seconds, self.seconds_merged = backend, seconds, seconds_merged
         self.drawn: list[RenderRequest] = []
-        self.seconds = seconds  # that an image takes
         self.now = 0.0
         self.nothing = False  # whether images show nothing
-        self.depth: float | None = None  # of the surface; None: 2 in the right half
 
     def clock(self) -> float:
         return self.now
@@ -64,7 +62,7 @@ class FakeRenderer:
 
     def draw(self, request: RenderRequest, targets) -> None:
         self.drawn.append(request)
-        self.now += self.seconds
+        self.now += self.seconds if request.merged is None else self.seconds_merged
         for target in targets:
             target.clear(1.0, 0.0, 0.0, 1.0)
 
@@ -72,7 +70,8 @@ class FakeRenderer:
         return self.nothing
 
     def depth_at(self, request: RenderRequest, x_px: float, y_px: float) -> float | None:
-        return self.depth or (2.0 if x_px > 100 else None)
+        """Only in the right half of the image there is a surface; merged Gaussians are farther away."""
+        return None if x_px <= request.camera.width / 2 else 2.0 if request.merged is None else 3.0
 
 
 def load(path: Path) -> Scene:
@@ -179,6 +178,13 @@ def blob(word: str) -> np.ndarray:
 
 def marks_of(viewer: Viewer) -> Marks:
     return viewer.state.selection.marks
+
+
+def put_marks(viewer: Viewer, **masks: np.ndarray) -> None:
+    """Mark nothing but the (N,) `selected`, `hidden` and `deleted` that are given."""
+    assert viewer.state.scene is not None
+    marks = replace(unmarked(len(viewer.state.scene.gaussians)), **masks)
+    viewer.state.selection = replace(viewer.state.selection, marks=marks)
 
 
 def names(rows: np.ndarray) -> str:

@@ -29,7 +29,6 @@ import glfw  # isort: skip
 from langsplat_core.extensions.benchmarks.query_speed import repeated
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.scene import Scene
-from langsplat_viewer import canvas
 from langsplat_viewer.actions import viewpoint
 from langsplat_viewer.camera.controls import orbit
 from langsplat_viewer.panels.navigation import Event
@@ -141,13 +140,14 @@ def ride(
     seconds: float,
     size: tuple[int, int],
     renderer: type[GlRenderer] = GlRenderer,
+    **request: float,
 ) -> Orbiting:
     def load(path: Path) -> Scene:
         found = load_scene(path)
         return repeated(found, count) if count else found
 
     window = Window(
-        WindowRequest(scene, size=size), Services(load, lambda encoder_id: FakeEncoder()), renderer
+        WindowRequest(scene, size=size, **request), Services(load, lambda encoder_id: FakeEncoder()), renderer
     )
     window.idles = False
     rider = Rider(window, seconds)
@@ -308,8 +308,6 @@ if __name__ == "__main__":
     parser.add_argument("--at-once", action="store_true", help="full pictures in the window's thread")
     parser.add_argument("--slow", action="store_true", help="as if the machine were slow")
     asked = parser.parse_args()
-    if asked.slow:
-        canvas.MOVING_BUDGET = 0.0
     if asked.idle:
         idle(asked.idle)
     elif asked.type:
@@ -318,4 +316,6 @@ if __name__ == "__main__":
         leave(asked.leave)
     else:
         renderer = AtOnce if asked.at_once else GlRenderer
-        print(json.dumps(asdict(ride(asked.scene, asked.count, asked.seconds, tuple(asked.size), renderer))))
+        more = {"moving_budget": 0.0} if asked.slow else {}
+        seen = ride(asked.scene, asked.count, asked.seconds, tuple(asked.size), renderer, **more)
+        print(json.dumps(asdict(seen)))

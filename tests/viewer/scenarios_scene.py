@@ -90,17 +90,14 @@ def draw_over_the_scene(s: Any) -> None:
     assert not s.state.ruler.measures
 
 
-def time_and_compare(s: Any) -> None:
-    """The panel tells medians while it is seen, and the error of what is shown."""
+def time_the_steps(s: Any) -> None:
+    """The panel tells medians while it is seen."""
     s.open_panel("Timing", frames=3)
     for key in "21":
         s.key(key)
     s.search("mug")
     told = dict(s.state.timing.medians())
     assert {"Blend", "Picture, all of it", "Panels", "Search"} <= set(told)
-    s.ctx.item_click("//Timing/Compare with the reference")
-    s.until(lambda: s.state.timing.comparison is not None)
-    assert s.state.timing.comparison.psnr > 40
     assert len(s.state.timing.laps["panels"]) > 2
     s.menu("Window", "Timing")
     drawn = len(s.state.timing.laps["blend"])

@@ -15,31 +15,31 @@ import pytest
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.errors import BackendError
 from langsplat_core.raster import load_rasterizer
-from langsplat_viewer.actions import editing, selecting, settings, viewpoint
-from langsplat_viewer.camera.controls import default_view, extent_of, orbit
-from langsplat_viewer.canvas import FINE, MOVING_BUDGET, NOTHING_LEFT, REST_SECONDS, Canvas, Level, Pace
-from langsplat_viewer.marks import unmarked
-from langsplat_viewer.rendering import renderer as renderers
+from langsplat_viewer.actions import editing, opening, selecting, settings, viewpoint
+from langsplat_viewer.camera.controls import orbit
+from langsplat_viewer.canvas import FULL, MOVING_BUDGET, REST_SECONDS, AdaptiveResolution, Canvas, Detail
 from langsplat_viewer.rendering.renderer import GlRenderer
 from langsplat_viewer.rendering.request import Clip, Splats
-from langsplat_viewer.state import ViewerState
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
-from tests.support.windowless import CHANGES, FakeRenderer, go, on_screen, rest
+from tests.support.windowless import CHANGES, FakeRenderer, go, on_screen, put_marks, rest
 
 
 @pytest.fixture
-def state() -> ViewerState:
-    scene = blob_scene()
-    extent = extent_of(scene)
-    return ViewerState(
-        scene=scene, extent=extent, view=default_view(scene, extent, (200, 120)), size=(200, 120)
-    )
+def shown(opened: Viewer) -> Viewer:
+    """Shows the scene of three blobs in 200 x 120 pixels."""
+    settings.resize(opened, 200, 120)
+    return opened
+
+
+def turn(viewer: Viewer) -> None:
+    """Move the camera."""
+    viewpoint.move(viewer, lambda view: orbit(view, 0.1, 0))
 
 
 def sizes(renderer: FakeRenderer) -> list[tuple[int, int]]:
     """Sizes of what was drawn since the last call."""
-    found = [(one.drawn_camera.width, one.drawn_camera.height) for one in renderer.drawn]
+    found = [(one.camera.width, one.camera.height) for one in renderer.drawn]
     renderer.drawn.clear()
     return found
 
@@ -47,145 +47,63 @@ def sizes(renderer: FakeRenderer) -> list[tuple[int, int]]:
 # Only changes are drawn.
 
 
-def test_only_changes_are_drawn_and_then_it_is_still(gl, state):
+def test_canvas_draws_only_changes_and_is_then_still(gl, shown):
     renderer = FakeRenderer()
     canvas = Canvas(gl, renderer)
-    assert not canvas.update(state, 0.0)
+    assert not canvas.update(shown.state, 0.0)
     assert sizes(renderer) == [(200, 120)]
-    state.settings = replace(state.settings, transparent=True, fade=0.5)
+    settings.save_transparent(shown, True)
+    opening.fade_photograph(shown, 0.5)
     for second in range(1, 5):
-        assert not canvas.update(state, float(second))
+        assert not canvas.update(shown.state, float(second))
     assert (canvas.phase, sizes(renderer)) == ("still", [])
-    state.picture = replace(state.picture, display="depth")
-    canvas.update(state, 6.0)
+    settings.set_display(shown, "depth")
+    canvas.update(shown.state, 6.0)
     assert sizes(renderer) == [(200, 120)]
     assert (on_screen(canvas)[0] == (255, 0, 0)).all()
 
 
-def test_edits_are_drawn_once(gl, state):
+def test_canvas_draws_each_edit_once(gl, shown):
     renderer = FakeRenderer()
-    canvas = Canvas(gl, renderer)
-    canvas.update(state, 0.0)
-    marks = unmarked(360)
-    for hidden, count in ((np.arange(360) < 100, 260), (np.ones(360, bool), 0), (marks.hidden, 360)):
+    canvas, everything = Canvas(gl, renderer), np.ones(360, bool)
+    for hidden, count in ((np.arange(360) < 100, 260), (everything, 0), (~everything, 360)):
+        put_marks(shown, hidden=hidden)
         renderer.drawn.clear()
-        state.selection = replace(state.selection, marks=replace(marks, hidden=hidden))
         for second in range(3):
-            canvas.update(state, float(second))
+            canvas.update(shown.state, float(second))
         (request,) = renderer.drawn
-        assert len(request.scene.scene.gaussians) == count
-    assert request.scene.scene is state.scene  # the source itself again
+        assert len(request.gaussians) == count
+    assert request.gaussians is shown.state.scene.gaussians  # the source itself again
     renderer.nothing = True
-    state.selection = replace(state.selection, marks=replace(marks, deleted=np.ones(360, bool)))
-    canvas.update(state, 9.0)
-    assert state.nothing == f"{NOTHING_LEFT}: show what is hidden (U), or undo (Ctrl+Z)"
+    put_marks(shown, deleted=everything)
+    canvas.update(shown.state, 9.0)
+    assert "hidden or deleted: show what is hidden (U), or undo (Ctrl+Z)" in shown.state.nothing
 
 
-@pytest.mark.parametrize(("fine_ms", "coarse"), [(10, (200, 120)), (75, (100, 60)), (5000, (50, 30))])
-def test_it_is_coarse_only_while_a_slow_camera_moves(gl, state, fine_ms, coarse):
-    renderer = FakeRenderer(seconds=fine_ms / 1000)
-    canvas = Canvas(gl, renderer, renderer.clock)
-    canvas.update(state, 0.0)
-    assert state.stats.milliseconds == pytest.approx(fine_ms)
-    sizes(renderer)
-    state.view = orbit(state.view, 0.1, 0)
-    assert canvas.update(state, 10.0)  # a finer picture is due
-    assert sizes(renderer) == [coarse]
-    canvas.update(state, 10.0 + 0.5 * REST_SECONDS)
-    assert sizes(renderer) == []
-    assert not canvas.update(state, 10.0 + 2 * REST_SECONDS)
-    assert sizes(renderer) == ([] if coarse == (200, 120) else [(200, 120)])
-
-
-@pytest.fixture
-def merging(gl) -> Iterator[tuple[Canvas, FakeRenderer, FakeRenderer]]:
-    """A canvas, its renderer of whole pictures, which takes 0.3 s, and that of merged Gaussians."""
-    renderer, quick = FakeRenderer(seconds=0.3), FakeRenderer(seconds=0.025)
-    quick.depth = 3.0
-    made = Canvas(gl, renderer, lambda: renderer.now + quick.now, quick)
-    yield made, renderer, quick
-    made.close()
-
-
-def moved_until_merged(canvas: Canvas, state: ViewerState, quick: FakeRenderer, now: float = 0.0) -> float:
-    """Move the camera until the quick renderer draws: the thread that merges may take a while."""
-    quick.drawn.clear()
-    while not quick.drawn:
-        assert now < 3000
-        time.sleep(0.01)
-        state.view = orbit(state.view, 0.1, 0)
-        now += 1.0
-        canvas.update(state, now)
-    return now
-
-
-def test_merged_gaussians_are_drawn_while_a_large_scene_moves(merging, state):
-    """As soon as they are there; at rest all of them again. Under the cursor is what was drawn last."""
-    canvas, renderer, quick = merging
-    canvas.update(state, 0.0)
-    now = moved_until_merged(canvas, state, quick)
-    assert set(sizes(renderer)) <= {(200, 120), (50, 30)}
-    (request,) = quick.drawn
-    assert len(request.detail.merged.gaussians) < len(state.scene.gaussians) == 360
-    assert sizes(quick) == [(100, 60)]
-    away = np.linalg.norm(canvas.point_at(0.5, 0.5) - state.view.camera(200, 120).position)
-    assert away == pytest.approx(3, rel=1e-3)
-    assert not canvas.update(state, now + 1.0)
-    assert (sizes(renderer), quick.drawn) == ([(200, 120)], [])
-    assert canvas.point_at(0.2, 0.25) is None  # the fine renderer's answer
-    state.view = orbit(state.view, 0.1, 0)
-    canvas.update(state, now + 2.0)
-    assert sizes(quick) == [(100, 60)]
-
-
-def test_the_edited_scene_is_merged_and_anew_after_an_edit(merging, state):
-    canvas, _, quick = merging
-    counts, now = [], 0.0
-    for marks in (unmarked(360), replace(unmarked(360), hidden=np.arange(360) < 120)):
-        state.selection = replace(state.selection, marks=marks)
-        canvas.update(state, now := now + 1.0)
-        now = moved_until_merged(canvas, state, quick, now)
-        counts.append(len(quick.drawn[0].detail.merged.gaussians))
-    assert 0 < counts[1] < counts[0] < 360
-
-
-def test_a_scene_that_was_left_is_let_go_by_both_renderers(merging, state):
-    canvas, *renderers = merging
-    left = weakref.ref(state.scene)
-    now = moved_until_merged(canvas, state, renderers[1])
-    state.scene = blob_scene()
-    for _ in range(2):
-        canvas.update(state, now := now + 1.0)
-    for renderer in renderers:
-        renderer.drawn.clear()
-    gc.collect()
-    assert left() is None
-
-
-def test_it_keeps_few_textures(gl, state):
+def test_canvas_keeps_few_textures(gl, shown):
     canvas, seen = Canvas(gl, FakeRenderer()), []
     for width in range(20, 40):
-        state.size = (width, 20)
-        canvas.update(state, 0.0)
+        settings.resize(shown, width, 20)
+        canvas.update(shown.state, 0.0)
         assert canvas.textures[0].size == (width, 20)
         seen.append(canvas.textures[0])
     assert sum(not isinstance(texture.mglo, moderngl.InvalidObject) for texture in seen) <= 3
 
 
-def test_it_finds_the_point_under_the_cursor(gl, state):
+def test_point_at_is_the_surface_in_the_last_image(gl, shown):
     canvas = Canvas(gl, FakeRenderer())
     assert canvas.point_at(0.8, 0.5) is None  # nothing was drawn yet
-    canvas.update(state, 0.0)
-    pixels, depth = state.view.camera(200, 120).project(canvas.point_at(0.8, 0.25)[None])
+    canvas.update(shown.state, 0.0)
+    pixels, depth = shown.state.view.camera(200, 120).project(canvas.point_at(0.8, 0.25)[None])
     np.testing.assert_allclose(pixels[0], (160, 30))
     np.testing.assert_allclose(depth, 2.0)
     assert canvas.point_at(0.2, 0.25) is None
 
 
-def test_several_panes_are_drawn_and_then_it_rests(gl, opened):
+def test_canvas_draws_several_panes_and_no_line(gl, opened):
     renderer = GlRenderer(gl, "cpu")
     canvas, state = Canvas(gl, renderer), opened.state
-    state.size = (60, 40)
+    settings.resize(opened, 60, 40)
     drawn, original = [], renderer.draw
     renderer.draw = lambda request, targets: (drawn.append(request), original(request, targets))
     for display in DISPLAYS:
@@ -206,17 +124,98 @@ def test_several_panes_are_drawn_and_then_it_rests(gl, opened):
     renderer.release()
 
 
-def test_the_surface_is_found_in_every_column(gl, opened):
-    canvas, state = Canvas(gl, GlRenderer(gl, "cpu")), opened.state
-    state.size = (240, 120)
+def test_point_at_finds_the_surface_in_every_column(gl, opened):
+    canvas = Canvas(gl, GlRenderer(gl, "cpu"))
+    settings.resize(opened, 240, 120)
     settings.toggle_levels(opened)
-    rest(canvas, state, 1.0)
+    rest(canvas, opened.state, 1.0)
     places = [canvas.point_at((column + 0.5) / 3, 0.5) for column in range(3)]
     assert all(place is not None for place in places)
     np.testing.assert_allclose(places[1:], [places[0]] * 2)
     settings.show_one(opened)
-    rest(canvas, state, 2.0)
+    rest(canvas, opened.state, 2.0)
     np.testing.assert_allclose(canvas.point_at(0.5, 0.5), places[0], atol=0.1)
+
+
+# While the camera moves.
+
+
+@pytest.mark.parametrize(("full_ms", "coarse"), [(10, (200, 120)), (75, (100, 60)), (5000, (50, 30))])
+def test_image_is_coarse_only_while_a_slow_camera_moves(gl, shown, full_ms, coarse):
+    renderer = FakeRenderer(seconds=full_ms / 1000)
+    canvas = Canvas(gl, renderer, renderer.clock)
+    canvas.update(shown.state, 0.0)
+    assert shown.state.stats.milliseconds == pytest.approx(full_ms)
+    sizes(renderer)
+    turn(shown)
+    assert canvas.update(shown.state, 10.0)  # a finer image is due
+    assert sizes(renderer) == [coarse]
+    canvas.update(shown.state, 10.0 + 0.5 * REST_SECONDS)
+    assert sizes(renderer) == []
+    assert not canvas.update(shown.state, 10.0 + 2 * REST_SECONDS)
+    assert sizes(renderer) == ([] if coarse == (200, 120) else [(200, 120)])
+
+
+@pytest.fixture
+def merging(gl) -> Iterator[tuple[Canvas, FakeRenderer]]:
+    """A canvas whose full images take 0.3 s, those of merged Gaussians 0.025."""
+    renderer = FakeRenderer(0.3, 0.025, "cpu")
+    made = Canvas(gl, renderer, renderer.clock)
+    yield made, renderer
+    made.close()
+
+
+def moved_until_merged(canvas: Canvas, renderer: FakeRenderer, viewer: Viewer, now: float = 0.0) -> float:
+    """Move the camera until merged Gaussians are drawn: the thread that merges may take a while."""
+    renderer.drawn.clear()
+    while not renderer.drawn or renderer.drawn[-1].merged is None:
+        assert now < 3000
+        time.sleep(0.01)
+        turn(viewer)
+        now += 1.0
+        canvas.update(viewer.state, now)
+    return now
+
+
+def test_merged_gaussians_are_drawn_while_a_large_scene_moves(merging, shown):
+    canvas, renderer = merging
+    canvas.update(shown.state, 0.0)
+    now = moved_until_merged(canvas, renderer, shown)
+    *others, request = renderer.drawn
+    assert all(one.merged is None for one in others)
+    assert len(request.gaussians) < len(shown.state.scene.gaussians) == 360
+    assert sizes(renderer)[-1] == (100, 60)
+    away = np.linalg.norm(canvas.point_at(0.8, 0.5) - shown.state.view.camera(200, 120).position)
+    assert away > 2.9  # of the merged ones: they were drawn last
+    assert not canvas.update(shown.state, now + 1.0)
+    assert sizes(renderer) == [(200, 120)]  # at rest all of them again
+    turn(shown)
+    canvas.update(shown.state, now + 2.0)
+    assert sizes(renderer) == [(100, 60)]
+
+
+def test_gaussians_are_merged_anew_after_an_edit(merging, shown):
+    canvas, renderer = merging
+    counts, now = [], 0.0
+    for hidden in (0, 120):
+        put_marks(shown, hidden=np.arange(360) < hidden)
+        canvas.update(shown.state, now := now + 1.0)
+        now = moved_until_merged(canvas, renderer, shown, now)
+        counts.append(len(renderer.drawn[-1].gaussians))
+    assert 0 < counts[1] < counts[0] < 360
+
+
+def test_canvas_lets_go_of_a_scene_that_was_left(merging, shown):
+    canvas, renderer = merging
+    shown.state.scene = blob_scene()
+    left = weakref.ref(shown.state.scene)
+    now = moved_until_merged(canvas, renderer, shown)
+    shown.state.scene = blob_scene()
+    for _ in range(2):
+        canvas.update(shown.state, now := now + 1.0)
+    renderer.drawn.clear()
+    gc.collect()
+    assert left() is None
 
 
 # Another thread rasterizes the full image of a slow scene.
@@ -243,12 +242,8 @@ class Gated:
 
 
 @pytest.fixture
-def gated(monkeypatch: pytest.MonkeyPatch) -> Gated:
-    """What "cpu" is; every picture is held to be slow before it was drawn, and found so."""
-    made = Gated()
-    monkeypatch.setattr(renderers, "load_rasterizer", lambda name: made)
-    monkeypatch.setattr("langsplat_viewer.canvas.GUESS", 1.0)
-    return made
+def gated() -> Gated:
+    return Gated()
 
 
 def slow_clock() -> Callable[[], float]:
@@ -266,9 +261,9 @@ def until(condition: Callable[[], bool]) -> None:
 
 @pytest.fixture
 def canvas(gl: moderngl.Context, gated: Gated, asked: Viewer) -> Iterator[Canvas]:
-    """Nothing is drawn yet."""
-    renderer = GlRenderer(gl, "cpu")
-    asked.surface = made = Canvas(gl, renderer, slow_clock())
+    """Nothing is drawn yet; every image is held to be slow."""
+    renderer = GlRenderer(gl, gated)
+    asked.surface = made = Canvas(gl, renderer, slow_clock(), budget=0.0)
     yield made
     gated.gate.set()
     made.close()
@@ -285,14 +280,14 @@ def begun(canvas: Canvas, asked: Viewer, gated: Gated) -> Canvas:
 
 
 def assert_rests_as_drawn_anew(gl: moderngl.Context, canvas: Canvas, viewer: Viewer, now: float) -> None:
-    """The fine picture comes, and is that of another renderer."""
+    """The full image comes, and is that of another renderer."""
     rest(canvas, viewer.state, now)
     renderer, (shown,) = GlRenderer(gl, "cpu"), on_screen(canvas)
-    np.testing.assert_array_equal(shown, Canvas(gl, renderer).capture(viewer.state.request()))
+    np.testing.assert_array_equal(shown, renderer.read(viewer.state.request()))
     renderer.release()
 
 
-def test_the_window_s_thread_projects_no_fine_picture(gl, asked, begun, gated):
+def test_another_thread_projects_the_full_image(gl, asked, begun, gated):
     assert begun.waits
     assert begun.textures == ()
     gated.gate.set()
@@ -316,20 +311,17 @@ STALE = {
 
 
 @pytest.mark.parametrize("name", STALE)
-def test_what_became_stale_is_dropped(gl, asked, begun, gated, monkeypatch, name):
-    taken, take = [], GlRenderer.take
-    monkeypatch.setattr(GlRenderer, "take", lambda self, made: (taken.append(made.of), take(self, made)))
+def test_stale_layers_are_never_shown(gl, asked, begun, gated, name):
     go(STALE[name], asked)
     for now in (20.0, 21.0):
         begun.update(asked.state, now)
     gated.gate.set()
     assert_rests_as_drawn_anew(gl, begun, asked, 22.0)
-    (of,) = taken
-    assert of.key.camera.width == asked.state.size[0]
+    assert begun.textures[0].size == asked.state.size
 
 
-def test_what_changes_no_projection_does_not_begin_anew(gl, asked, begun, gated):
-    settings.set_picture(asked, replace(asked.state.picture, dim=0.1))
+def test_a_slider_does_not_begin_the_projection_anew(gl, asked, begun, gated):
+    settings.set_picture(asked, replace(asked.state.request().picture, dim=0.1))
     begun.update(asked.state, 1.0)
     gated.gate.set()
     rest(begun, asked.state, 2.0)
@@ -338,7 +330,7 @@ def test_what_changes_no_projection_does_not_begin_anew(gl, asked, begun, gated)
 
 
 @pytest.mark.parametrize("coarse", [True, False])
-def test_a_camera_that_moves_on_is_followed_in_the_windows_thread(asked, begun, gated, coarse):
+def test_the_window_s_thread_follows_a_moving_camera(asked, begun, gated, coarse):
     asked.state.coarse_while_moving = coarse
     go(viewpoint.look_from, asked, "left")
     begun.update(asked.state, 10.0)
@@ -351,7 +343,7 @@ def test_a_camera_that_moves_on_is_followed_in_the_windows_thread(asked, begun, 
     assert (asked.state.stats.scale < 1) == coarse  # of the old view nothing is shown
 
 
-def test_an_error_is_said_once_and_another_picture_is_tried(gl, asked, canvas, gated):
+def test_an_error_is_raised_once_and_the_next_request_drawn(gl, asked, canvas, gated):
     gated.error = FloatingPointError("out of range")
     gated.gate.set()
     canvas.update(asked.state, 0.0)
@@ -365,34 +357,33 @@ def test_an_error_is_said_once_and_another_picture_is_tried(gl, asked, canvas, g
     assert_rests_as_drawn_anew(gl, canvas, asked, 3.0)
 
 
-def test_until_it_is_there_merged_gaussians_show_what_was_changed(gl, asked, gated, monkeypatch):
-    renderer, quick = GlRenderer(gl, "cpu"), FakeRenderer()
-    canvas = Canvas(gl, renderer, slow_clock(), quick)
+def test_merged_gaussians_stand_in_for_the_full_image(gl, asked, gated):
+    renderer = GlRenderer(gl, gated)
+    canvas = Canvas(gl, renderer, slow_clock(), budget=50.0)
     gated.gate.set()
     rest(canvas, asked.state, 0.0)
     until(lambda: not canvas.is_running)
     gated.gate.clear()
-    monkeypatch.setattr("langsplat_viewer.canvas.MERGED_SHARE", 1e-3)
     settings.set_splats(asked, Splats(0.5))
     for now in (1.0, 2.0, 3.0):
         assert canvas.update(asked.state, now)
-    assert sizes(quick) == [(60, 45)]
     assert asked.state.stats.merged
+    assert canvas.textures[0].size == (60, 45)
     gated.gate.set()
     assert_rests_as_drawn_anew(gl, canvas, asked, 4.0)
-    assert asked.state.stats.scale == 1
+    assert not asked.state.stats.merged
     canvas.close()
     renderer.release()
 
 
-def test_closing_does_not_wait_for_it(begun, gated):
+def test_closing_does_not_wait_for_the_other_thread(begun, gated):
     begun.close()
     assert begun.is_running
     gated.gate.set()
     until(lambda: not begun.is_running and not gated.threads[0].is_alive())
 
 
-def test_it_wakes_the_window(asked, begun, gated):
+def test_the_other_thread_wakes_the_window(asked, begun, gated):
     woken = Event()
     begun.wake_with(woken.set)
     assert not woken.is_set()
@@ -403,7 +394,7 @@ def test_it_wakes_the_window(asked, begun, gated):
     assert asked.state.stats.scale == 1
 
 
-def test_a_scene_that_was_left_is_let_go_by_the_thread(asked, canvas, gated):
+def test_the_other_thread_lets_go_of_a_scene_that_was_left(asked, canvas, gated):
     asked.state.scene = replace(asked.state.scene)
     left = weakref.ref(asked.state.scene)
     canvas.update(asked.state, 0.0)
@@ -415,60 +406,63 @@ def test_a_scene_that_was_left_is_let_go_by_the_thread(asked, canvas, gated):
     assert left() is None
 
 
-# Level of detail.
+# Adaptive resolution.
+
+HALF, QUARTER = Detail(0.5), Detail(0.25)
+MERGED, COARSEST = Detail(0.5, merged=True), Detail(0.25, merged=True)
 
 
-HALF, QUARTER = Level(0.5), Level(0.25)
-MERGED, COARSEST = Level(0.5, merged=True), Level(0.25, merged=True)
-
-
-def after(*pictures: tuple[Level, float]) -> Pace:
-    pace = Pace()
-    for level, milliseconds in pictures:
-        pace.drew(level, milliseconds)
-    return pace
+def after(*images: tuple[Detail, float]) -> AdaptiveResolution:
+    resolution = AdaptiveResolution()
+    for detail, milliseconds in images:
+        resolution.drew(detail, milliseconds)
+    return resolution
 
 
 @pytest.mark.parametrize(
-    ("fine_ms", "plain", "with_merged", "stand_in"),
+    ("full_ms", "plain", "with_merged", "stand_in"),
     [
-        (0, FINE, FINE, MERGED),
-        (MOVING_BUDGET, FINE, FINE, MERGED),
+        (0, FULL, FULL, MERGED),
+        (MOVING_BUDGET, FULL, FULL, MERGED),
         (3 * MOVING_BUDGET, HALF, HALF, MERGED),
         (12 * MOVING_BUDGET, QUARTER, MERGED, MERGED),
         (1000, QUARTER, COARSEST, COARSEST),
         (1e5, QUARTER, COARSEST, None),
     ],
 )
-def test_first_guess(fine_ms, plain, with_merged, stand_in):
-    pace = after((FINE, fine_ms))
-    assert (pace.level(False), pace.level(True), pace.stand_in()) == (plain, with_merged, stand_in)
-    assert pace.is_slow == (fine_ms > MOVING_BUDGET)
+def test_the_first_level_of_detail_is_guessed(full_ms, plain, with_merged, stand_in):
+    resolution = after((FULL, full_ms))
+    assert (resolution.finest(False), resolution.finest(True), resolution.stand_in()) == (
+        plain,
+        with_merged,
+        stand_in,
+    )
+    assert resolution.is_slow == (full_ms > MOVING_BUDGET)
 
 
 @pytest.mark.parametrize(
-    ("pictures", "level"),
+    ("images", "detail"),
     [
-        ([(FINE, 75)], HALF),
-        ([(FINE, 75), (HALF, 60)], MERGED),  # hardly faster: projecting takes as long for few pixels
-        ([(FINE, 75), (HALF, 10), (HALF, 10), (HALF, 30)], HALF),  # one slow picture is forgiven
-        ([(FINE, 75), (HALF, 60), (FINE, 19)], FINE),  # on a machine that became free
-        ([(FINE, 75), (HALF, 35)], MERGED),
-        ([(FINE, 75), (HALF, 35), *3 * [(FINE, 75)]], HALF),  # better is tried again after some rests
+        ([(FULL, 75)], HALF),
+        ([(FULL, 75), (HALF, 60)], MERGED),  # hardly faster: projecting takes as long for few pixels
+        ([(FULL, 75), (HALF, 10), (HALF, 10), (HALF, 30)], HALF),  # one slow image is forgiven
+        ([(FULL, 75), (HALF, 60), (FULL, 19)], FULL),  # on a machine that became free
+        ([(FULL, 75), (HALF, 35)], MERGED),
+        ([(FULL, 75), (HALF, 35), *3 * [(FULL, 75)]], HALF),  # better is tried again after some rests
     ],
 )
-def test_what_was_measured_chooses_the_level(pictures, level):
-    assert after(*pictures).level(True) == level
+def test_measured_times_choose_the_level_of_detail(images, detail):
+    assert after(*images).finest(True) == detail
 
 
-def test_other_scenes_take_as_long_as_they_are_large():
-    pace = Pace()
-    pace.expect(1000)
-    assert not pace.is_slow
-    pace.expect(1_000_000)  # guessed
-    assert pace.is_slow
-    pace.drew(FINE, 500)
-    pace.expect(100_000)
-    assert pace.level(False) == HALF
-    pace.expect(50_000)
-    assert pace.level(False) == FINE
+def test_times_of_other_scenes_follow_from_their_size():
+    resolution = AdaptiveResolution()
+    resolution.expect(1000)
+    assert not resolution.is_slow
+    resolution.expect(1_000_000)  # guessed
+    assert resolution.is_slow
+    resolution.drew(FULL, 500)
+    resolution.expect(100_000)
+    assert resolution.finest(False) == HALF
+    resolution.expect(50_000)
+    assert resolution.finest(False) == FULL

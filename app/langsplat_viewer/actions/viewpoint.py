@@ -12,7 +12,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress
 from langsplat_core.query.describe import Describer, Pointed, look_at_pixel
 from langsplat_core.query.engine import no_field
-from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer
+from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Camera
 from langsplat_viewer.camera.controls import (
     Extent,
@@ -32,9 +32,8 @@ from langsplat_viewer.camera.controls import (
 from langsplat_viewer.camera.flight import pose_at, pose_of, view_of
 from langsplat_viewer.files.projects import MOST_VIEWS, Bookmark, named
 from langsplat_viewer.jobs import one_line
-from langsplat_viewer.rendering.renderer import ArrayRenderer
 from langsplat_viewer.rendering.request import image_formation
-from langsplat_viewer.state import GLIDE_SECONDS, Glide, Hover, Query, compared, compared_size, flight_of
+from langsplat_viewer.state import GLIDE_SECONDS, Glide, Hover, Query, flight_of
 from langsplat_viewer.viewer import Viewer
 
 
@@ -402,28 +401,3 @@ def _keep(viewer: Viewer) -> None:
         viewer.shelf.write(state.path, state.bookmarks)
     except (OSError, InputError) as error:
         viewer.say_error(f"bookmarks not kept: {one_line(error)}")
-
-
-# Timing and the comparison with the reference.
-
-
-def compare_with_reference(viewer: Viewer) -> None:
-    """Draw what is shown at a small size, have the reference rasterizer draw the same in the background, and
-    tell the difference."""
-    state = viewer.state
-    if state.scene is None or state.view is None or viewer.surface is None:
-        viewer.say_error("open a scene first, then compare its picture")
-        return
-    if viewer.recorder.current is not None:
-        viewer.say_error("a film or a comparison is being drawn; wait for it or cancel it")
-        return
-    request, backend = state.request(compared_size(state.size)), state.backend
-    shown = viewer.surface.capture(request)
-
-    def work(progress: Progress) -> Array:
-        return ArrayRenderer(load_rasterizer("reference")).read(request)
-
-    def done(reference: Array) -> None:
-        state.timing.comparison = compared(shown, reference, backend)
-
-    viewer.recorder.submit("comparing with the reference", work, done, viewer.say_error)

@@ -8,11 +8,11 @@ from pathlib import Path
 from imgui_bundle import ImVec2, ImVec4, hello_imgui, icons_fontawesome_6, imgui
 
 from langsplat_core import __version__, registry
-from langsplat_viewer.actions import browsing, filming, opening, settings, viewpoint
+from langsplat_viewer.actions import browsing, filming, opening, settings
 from langsplat_viewer.commands import COMMANDS, HELD, LETTERS_MENU, MENUS, Command, in_menu, matching
 from langsplat_viewer.panels import layout, outline, overlays, scene, search, select, ui, view
 from langsplat_viewer.panels.scene import in_words
-from langsplat_viewer.state import Comparison, memory_bytes
+from langsplat_viewer.state import memory_bytes
 from langsplat_viewer.viewer import Viewer
 
 
@@ -205,7 +205,7 @@ def figures(viewer: Viewer) -> str:
 
 
 def draw_timing(viewer: Viewer) -> None:
-    """Draw the panel "Timing": medians of the last images, memory, and a comparison."""
+    """Draw the panel "Timing": medians of the last images, and memory."""
     settings.put(viewer.state.timing, wanted=True)
     rows = [(title, f"{milliseconds:.1f} ms") for title, milliseconds in viewer.state.timing.medians()]
     memory = memory_bytes()
@@ -221,29 +221,6 @@ def draw_timing(viewer: Viewer) -> None:
             imgui.table_next_column()
             imgui.text_colored(ui.muted(), text)
         imgui.end_table()
-    work = viewer.recorder.current
-    if work is not None:
-        if ui.stoppable(*work, tag="comparison"):
-            viewer.recorder.cancel()
-    else:
-        if ui.button(
-            "Compare with the reference",
-            "Draws this view small in float64, in the background: about 15 s for 100,000 Gaussians",
-            enabled=viewer.state.scene is not None,
-        ):
-            viewpoint.compare_with_reference(viewer)
-    if viewer.state.timing.comparison is not None:
-        ui.small_wrapped(in_numbers(viewer.state.timing.comparison), ui.muted())
-
-
-def in_numbers(comparison: Comparison) -> str:
-    """Return the comparison's figures as one line."""
-    width, height = comparison.size
-    what = f"{comparison.backend} against the reference, {width} x {height}"
-    if comparison.largest == 0:
-        return f"{what}: every pixel is the same"
-    errors = f"error at most {comparison.largest} of 255, mean {comparison.mean:.3g}"
-    return f"{what}: {errors}, PSNR {comparison.psnr:.1f} dB"
 
 
 # Panels, docked around the scene, each where its user left it.

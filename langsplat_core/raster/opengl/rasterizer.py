@@ -272,11 +272,7 @@ class GlView(View):
         return mean_depth(total, alpha)
 
     def depth_at(self, column: int, row: int) -> tuple[float, float]:
-        """Surface depth and alpha of one pixel, from the projection read back.
-
-        The depth is the median (see `View.median_depth`) or, where the transmittance stays above 0.5, the
-        alpha-weighted mean; camera z in world units, 0 where nothing is drawn.
-        """
+        """Return what `View.depth_at` does, from the projection read back."""
         scene = self.rasterizer.project(self)
         order = self.order.rows(scene)[::-1]
         x, y, z, opacity = np.frombuffer(scene.placement.read(), "f4").reshape(-1, 4)[order].T
