@@ -33,7 +33,7 @@ from langsplat_core.raster.opengl.rasterizer import GlRasterizer, GlView, Source
 from langsplat_core.raster.opengl.scene_textures import create_egl_context, drawing, is_software, set_uniforms
 from langsplat_core.raster.opengl.shaders import shader
 from langsplat_core.raster.render import splat_colours, view_of
-from langsplat_core.scene import Camera, Scene
+from langsplat_core.scene import Scene
 from langsplat_viewer.rendering.request import (
     VISIBLE_ALPHA,
     Pane,
