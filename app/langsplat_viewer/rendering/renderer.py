@@ -1,9 +1,9 @@
 """Renderers: a render request becomes an image. No window here.
 
 An image is made in two steps. A rasterizer projects the Gaussians and splats layers: colours with alpha, and
-the one further channel of each pane, all in one pass. Compositing turns the layers into pixels:
-`ArrayRenderer` with a compiled kernel, without a graphics device, `GlRenderer` with that or a shader. It keeps
-the layers while scene, camera and answers stay, so that moving a slider costs only the compositing.
+the one further channel of each pane, all in one pass. Compositing turns the layers into pixels: with a
+compiled kernel, or on a graphics device with a shader. `GlRenderer` keeps the layers while scene, camera and
+answers stay, so that moving a slider costs only the compositing.
 """
 
 from collections.abc import Callable, Iterator, Sequence
