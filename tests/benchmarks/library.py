@@ -26,8 +26,9 @@ from langsplat_core.extensions.benchmarks.measure import markdown
 from langsplat_core.extensions.library.changes import Change, changes
 from langsplat_core.extensions.library.finding import rank
 from langsplat_core.extensions.library.index import (
-    COLUMNS,
+    KINDS,
     THUMBNAIL,
+    Columns,
     Digest,
     Listed,
     digest,
@@ -37,7 +38,7 @@ from langsplat_core.extensions.library.index import (
 )
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.query.grammar import named
-from langsplat_core.query.rule import judge, triple
+from langsplat_core.query.rule import Bar, judge, triple
 from langsplat_core.raster import load_lifting_rasterizer
 from tests.benchmarks.room import InRooms, MaskOrigin, Room, Variant, publish
 from tests.benchmarks.scoring import grouped, seconds_of
@@ -132,20 +133,20 @@ def synthetic(seed: int) -> Digest:
     parents = np.concatenate([
         one + rng.integers(two, size=one), one + two + rng.integers(three, size=two), np.full(three, -1)
     ])  # fmt: skip
-    columns = {
-        "steps": np.full(CODEWORDS, DIM**-0.5 / 30),
-        "zeros": np.full(CODEWORDS, 0.1),
-        "rates": np.full(CODEWORDS, 25.0),
-        "shares": np.full(regions * MIXED, 1 / MIXED),
-        "words": rng.integers(CODEWORDS, size=regions * MIXED),
-        "regions": np.repeat(np.arange(regions), MIXED),
-        "parents": parents,
-        "solid": np.ones(regions),
-        "codewords": rng.integers(-60, 61, (CODEWORDS, DIM)),
-    }
-    counts = (CODEWORDS, *REGIONS, regions * MIXED)
-    listed = Listed(f"{seed}.ply", (seed,), counts, (0.0, 1.0) * 4 + (float("nan"),) * 12)
-    made = {name: columns[name].astype(kind) for name, kind, _ in COLUMNS}
+    columns = Columns(
+        steps=np.full(CODEWORDS, DIM**-0.5 / 30),
+        zeros=np.full(CODEWORDS, 0.1),
+        rates=np.full(CODEWORDS, 25.0),
+        shares=np.full(regions * MIXED, 1 / MIXED),
+        words=rng.integers(CODEWORDS, size=regions * MIXED),
+        regions=np.repeat(np.arange(regions), MIXED),
+        parents=parents,
+        solid=np.ones(regions),
+        codewords=rng.integers(-60, 61, (CODEWORDS, DIM)),
+    )
+    made = Columns(*(values.astype(kind) for values, kind in zip(columns, KINDS, strict=True)))
+    bars = (Bar(0.0, 1.0),) * 4
+    listed = Listed(f"{seed}.ply", (seed,), CODEWORDS, regions * MIXED, REGIONS, bars)
     width, height = THUMBNAIL
     picture = np.zeros((height, width, 3), np.uint8)
     return Digest(listed, "synthetic", np.eye(4, DIM, dtype=np.float32), made, picture)

@@ -6,23 +6,22 @@ relevancies of few codewords. So the index keeps, of every scene, its codewords 
 From these the fits and the verdict of `answers.by_regions` are computed without opening the scene, up to the
 rounding of codewords. The scenes that answer best are then opened and asked by `QueryEngine`.
 
-The index is one file, mapped into memory: `MAGIC`, the length of a JSON header as uint64, the header, zeros
-up to a multiple of 8, then for each group of scenes of one encoder its canonical vectors, the arrays of
-`COLUMNS` and the thumbnails. All lengths follow from the numbers of the header, so that a file of another
-length is refused.
+The index is a safetensors file: the scenes as JSON in its metadata, and for each group of scenes of one
+encoder, `N.`, its canonical vectors, the `Columns` of all its scenes and their thumbnails.
 """
 
-import json
-import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import accumulate
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
+import msgspec
 import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
 from scipy.sparse import csr_matrix
 
 from langsplat_core.arrays import Array
@@ -30,16 +29,15 @@ from langsplat_core.compiled import helper, kernel, shared_workers
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.composing import compose
 from langsplat_core.display.displays import Channels
-from langsplat_core.errors import FormatError, InputError, LangSplatError
+from langsplat_core.errors import FormatError, InputError, LangSplatError, printable_line
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.hostile import exists, open_for_reading, parse_json
+from langsplat_core.io.hostile import exists, open_for_reading
 from langsplat_core.io.scenes import companion_path, format_of, load_scene, scene_files
 from langsplat_core.io.sidecar import SUFFIX
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, same_vectors
 from langsplat_core.query.rule import (
-    Bar,
     Bars,
     RegionTable,
     bars_of,
@@ -48,66 +46,59 @@ from langsplat_core.query.rule import (
     region_relevancies,
 )
 from langsplat_core.raster.render import render
-from langsplat_core.scene import LEVELS, Calibration, Camera, Odds, Scene
+from langsplat_core.scene import LEVELS, Calibration, Camera, Scene
 from langsplat_core.semantics.relevancy import fit_of
 
 INDEX = ".langsplat-library"  # its name in the folder
-MAGIC = b"LSLIB\x00\x00\x01"
-LONGEST_HEADER = 2**30  # bytes
+SCENES = "scenes"  # key of the metadata
 THUMBNAIL = (96, 72)  # width and height, pixels, of the picture that the index keeps of a scene
-# Name, type, and what has a row: k, d codewords, m entries of mixtures, r regions, those of subparts first.
-COLUMNS: tuple[tuple[str, str, str], ...] = (
-    *(("steps", "<f4", "k"), ("zeros", "<f4", "k"), ("rates", "<f4", "k")),
-    *(("shares", "<f4", "m"), ("words", "<u4", "m"), ("regions", "<u4", "m")),
-    *(("parents", "<i4", "r"), ("solid", "<u4", "r"), ("codewords", "<i1", "d")),
-)
-FLOATS = 8 + 4 * len(LEVELS)  # of a scene: median and spread of four bars; odds, or NaN
+Whole = Annotated[int, msgspec.Meta(ge=0, lt=2**62)]
 
 
 class Columns(NamedTuple):
-    """The arrays of scenes, one scene after the other, in the order of `COLUMNS`."""
+    """The arrays of scenes, one scene after the other: of K codewords, M entries of mixtures, R regions."""
 
-    steps: Array  # (K,) of the 8 bits: a codeword is step times codewords
-    zeros: Array  # (K,) see `Scale.of`
-    rates: Array  # (K,)
-    shares: Array  # (M,) of a codeword in the mean of a region
-    words: Array  # (M,) codeword, from 0 in each scene
-    regions: Array  # (M,) region, from 0 in each scene
-    parents: Array  # (R,) region of the level above, from 0 in each scene; -1 for none
-    solid: Array  # (R,) whether it is no crumb
-    codewords: Array  # (K, D)
+    steps: Array  # (K,) float32 of the 8 bits: a codeword is step times codewords
+    zeros: Array  # (K,) float32, see `Scale.of`
+    rates: Array  # (K,) float32
+    shares: Array  # (M,) float32 of a codeword in the mean of a region
+    words: Array  # (M,) uint32 codeword, from 0 in each scene
+    regions: Array  # (M,) uint32 region, from 0 in each scene, those of subparts first
+    parents: Array  # (R,) int32 region of the level above, from 0 in each scene; -1 for none
+    solid: Array  # (R,) uint32 whether it is no crumb
+    codewords: Array  # (K, D) int8
 
 
-@dataclass(frozen=True, eq=False)
+KINDS = Columns("<f4", "<f4", "<f4", "<f4", "<u4", "<u4", "<i4", "<u4", "|i1")  # type: ignore[arg-type]
+ROWS = Columns(0, 0, 0, 1, 1, 1, 2, 2, 0)  # type: ignore[arg-type]  # column of `Group.starts` that counts them
+
+
+@dataclass(frozen=True)
 class Listed:
     """A scene of the folder, as the index describes it."""
 
     path: str  # below the folder, "/" between names
-    stamp: tuple[int, ...]  # size and time of change, ns, of each of its files
-    counts: tuple[int, ...] = (0,) * 5  # codewords; regions of each level; entries of its mixtures
-    numbers: tuple[float, ...] = (math.nan,) * FLOATS
+    stamp: tuple[Whole, ...]  # size and time of change, ns, of each of its files
+    codewords: Whole = 0  # 0: only the engine can answer, as for another codec than a codebook
+    mixtures: Whole = 0  # entries of them
+    regions: tuple[Whole, Whole, Whole] = (0, 0, 0)  # of each level
+    bars: Bars | None = None  # of the fits of everyday phrases; None where there are no codewords
+    calibration: Calibration | None = None  # of its encoder
     taught: tuple[str, ...] = ()  # keys of taught words
-    phrases: int = 0  # in its phrasebook
+    phrases: Whole = 0  # in its phrasebook
     unread: str = ""  # why it has no answers; one line
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a path out of the folder, or codewords without bars."""
+        if Path(self.path).is_absolute() or ".." in Path(self.path).parts:
+            raise ValueError("a scene outside of the folder")
+        if self.codewords and (self.bars is None or not np.isfinite([bar.median for bar in self.bars]).all()):
+            raise ValueError("a scene without its numbers")
 
     @property
     def is_indexed(self) -> bool:
-        """False for a scene that only the engine can answer: of another codec than a codebook."""
-        return self.counts[0] > 0
-
-    @property
-    def bars(self) -> Bars:
-        """The fits of everyday phrases."""
-        pairs = self.numbers[:8]
-        one, two, three, four = (Bar(*pairs[at : at + 2]) for at in range(0, 8, 2))
-        return one, two, three, four
-
-    @property
-    def calibration(self) -> Calibration | None:
-        """The calibration of its encoder; None where that has none here. ValueError for numbers of none."""
-        if math.isnan(self.numbers[8]):
-            return None
-        return Calibration(*(Odds(*self.numbers[at : at + 4]) for at in (8, 12, 16)))
+        """Return False for a scene that only the engine can answer."""
+        return self.codewords > 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,21 +108,21 @@ class Group:
     encoder_id: str
     canonical: Array  # (C, D) float32
     scenes: tuple[Listed, ...]
-    columns: Mapping[str, Array]
+    columns: Columns
 
-    @property
+    @cached_property
     def starts(self) -> Array:
         """(S + 1, 3) int64: where the codewords, mixtures and regions of each scene begin."""
-        sizes = [(c[0], c[4], sum(c[1:4])) for c in (scene.counts for scene in self.scenes)]
+        sizes = [(each.codewords, each.mixtures, sum(each.regions)) for each in self.scenes]
         return np.cumsum([(0, 0, 0), *sizes], axis=0)
 
     @cached_property
     def table(self) -> RegionTable:
         """The regions of all scenes, as the rule for answers reads them."""
-        counts = np.array([scene.counts[1:4] for scene in self.scenes], np.int64).reshape(-1, len(LEVELS))
+        counts = np.array([scene.regions for scene in self.scenes], np.int64).reshape(-1, len(LEVELS))
         firsts = np.repeat(self.starts[:-1, 2], counts.sum(1))
-        parents = self.columns["parents"].astype(np.int64)
-        return RegionTable(counts, np.where(parents < 0, -1, parents + firsts), self.columns["solid"] > 0)
+        parents = self.columns.parents.astype(np.int64)
+        return RegionTable(counts, np.where(parents < 0, -1, parents + firsts), self.columns.solid > 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +186,7 @@ class Digest:
     listed: Listed
     encoder_id: str = ""
     canonical: Array | None = None
-    columns: Mapping[str, Array] | None = None
+    columns: Columns | None = None
     thumbnail: Array | None = None  # (H, W, 3) uint8
 
 
@@ -213,19 +204,24 @@ def digest(path: Path, name: str, load_encoder: LoadEncoder | None) -> Digest:
     made = Digest(listed, field.encoder_id, field.canonical, None, picture)
     if field.codec.blends or engine.chance is None or not field.known.any():
         return made
-    calibration = engine.calibration
-    odds = () if calibration is None else (calibration.thing, calibration.part, calibration.inside)
-    numbers = [number for bar in bars_of(engine.chance) for number in (bar.median, bar.spread)]
-    numbers += [n for odd in odds for n in (odd.constant, odd.whole, odd.finer, odd.found)]
-    if not np.isfinite(numbers).all():
+    bars = bars_of(engine.chance)
+    if not np.isfinite([(bar.median, bar.spread) for bar in bars]).all():
         return made
-    numbers += [math.nan] * (FLOATS - len(numbers))
-    columns, counts = _columns(engine)
-    return replace(made, listed=replace(listed, counts=counts, numbers=tuple(numbers)), columns=columns)
+    columns, regions = _columns(engine), engine.regions.table.counts[0]
+    subparts, parts, wholes = (int(count) for count in regions)
+    listed = replace(
+        listed,
+        codewords=len(columns.steps),
+        mixtures=len(columns.shares),
+        regions=(subparts, parts, wholes),
+        bars=bars,
+        calibration=engine.calibration,
+    )
+    return replace(made, listed=listed, columns=columns)
 
 
-def _columns(engine: QueryEngine) -> tuple[dict[str, Array], tuple[int, ...]]:
-    """Return the arrays of a scene, and their `Listed.counts`."""
+def _columns(engine: QueryEngine) -> Columns:
+    """Return the arrays of a scene."""
     field, regions, scale = engine.field, engine.regions, engine.scale
     latents, of = field.codec.unique(field.latents[field.known])
     number = np.full(field.known.shape, -1, np.int64)
@@ -233,28 +229,18 @@ def _columns(engine: QueryEngine) -> tuple[dict[str, Array], tuple[int, ...]]:
     zeros, rates = scale.of(field.codec.cosines(latents, scale.texts))
     vectors = field.codec.decode(latents)
     steps = np.maximum(np.abs(vectors).max(1), 1e-12) / 127
-    sizes = [len(totals) for totals in regions.totals]
-    firsts = [0, *accumulate(sizes)]
+    firsts = accumulate([0, *map(len, regions.totals)])
     mixtures = []
     for level, (totals, first) in enumerate(zip(regions.totals, firsts, strict=False)):
         rows = np.flatnonzero((number[level] >= 0) & (regions.weights > 0))
         where = regions.everywhere[level, rows], number[level, rows]
         shares = csr_matrix((regions.weights[rows], where), shape=(len(totals), len(latents))).tocoo()
         mixtures.append((shares.data / totals[shares.row], shares.col, shares.row + first))
-    above = [regions.parents[0] + firsts[1], regions.parents[1] + firsts[2], np.full(sizes[2], -1)]
-    columns = {
-        "steps": steps,
-        "zeros": zeros,
-        "rates": rates,
-        "shares": np.concatenate([part[0] for part in mixtures]),
-        "words": np.concatenate([part[1] for part in mixtures]),
-        "regions": np.concatenate([part[2] for part in mixtures]),
-        "parents": np.concatenate(above),
-        "solid": regions.table.solid,
-        "codewords": np.rint(vectors / steps[:, None]),
-    }
-    made = {name: columns[name].astype(kind) for name, kind, _ in COLUMNS}
-    return made, (len(latents), *sizes, len(made["shares"]))
+    shares, words, rows = (np.concatenate(part) for part in zip(*mixtures, strict=True))
+    codewords = np.rint(vectors / steps[:, None])
+    table = regions.table
+    made = Columns(steps, zeros, rates, shares, words, rows, table.parents, table.solid, codewords)
+    return Columns(*(values.astype(kind) for values, kind in zip(made, KINDS, strict=True)))
 
 
 # The index file.
@@ -301,13 +287,20 @@ def _digests(library: Library) -> Iterator[Digest]:
     for group in library.groups:
         starts = group.starts
         for row, scene in enumerate(group.scenes):
-            place = {"k": 0, "d": 0, "m": 1, "r": 2}
-            columns = {
-                name: group.columns[name][starts[row, place[of]] : starts[row + 1, place[of]]]
-                for name, _, of in COLUMNS
-            }
+            ends = starts[row], starts[row + 1]
+            columns = Columns(*(
+                values[ends[0][of] : ends[1][of]] for values, of in zip(group.columns, ROWS, strict=True)
+            ))  # fmt: skip
             yield Digest(scene, group.encoder_id, group.canonical, columns, pictures[scene.path])
     yield from map(Digest, library.unread)
+
+
+@dataclass(frozen=True)
+class _Stated:
+    """What the metadata of an index say of its scenes."""
+
+    groups: tuple[tuple[str, tuple[Listed, ...]], ...]  # encoder, and its scenes
+    unread: tuple[Listed, ...]
 
 
 def write_library(index: Path, digests: Sequence[Digest]) -> None:
@@ -318,25 +311,22 @@ def write_library(index: Path, digests: Sequence[Digest]) -> None:
             alike = [members for members in groups if _same_encoder(members[0], each)]
             groups += [] if alike else [[]]
             (alike or groups)[-1].append(each)
-    header = {
-        "groups": [
-            [members[0].encoder_id, *_canonical(members).shape, [_stated(each.listed) for each in members]]
-            for members in groups
-        ],
-        "unread": [_stated(each.listed) for each in digests if each.canonical is None],
-    }
-    text = json.dumps(header).encode()
-    with atomic_path(index) as temporary, temporary.open("wb") as file:
-        file.write(MAGIC + len(text).to_bytes(8, "little") + text + bytes(-len(text) % 8))
-        for members in groups:
-            file.write(_canonical(members).astype("<f4").tobytes())
-            for name, _, _ in COLUMNS:
-                for each in members:
-                    file.write(b"" if each.columns is None else each.columns[name].tobytes())
-            for each in members:
-                assert each.thumbnail is not None
-                file.write(each.thumbnail.tobytes())
-            file.write(bytes(-file.tell() % 8))
+    tensors = dict[str, Array]()
+    for number, members in enumerate(groups):
+        canonical = np.asarray(members[0].canonical, "<f4")
+        empty = Columns(*(np.zeros(0, kind) for kind in KINDS))
+        empty = empty._replace(codewords=np.zeros((0, canonical.shape[1]), KINDS.codewords))
+        parts = [empty, *(each.columns for each in members if each.columns is not None)]
+        named = {name: [getattr(part, name) for part in parts] for name in Columns._fields}
+        tensors |= {f"{number}.{name}": np.concatenate(arrays) for name, arrays in named.items()}
+        tensors[f"{number}.canonical"] = canonical
+        tensors[f"{number}.thumbnails"] = np.stack([np.asarray(each.thumbnail) for each in members])
+    stated = _Stated(
+        tuple((members[0].encoder_id, tuple(each.listed for each in members)) for members in groups),
+        tuple(each.listed for each in digests if each.canonical is None),
+    )
+    with atomic_path(index) as temporary:
+        save_file(tensors, temporary, {SCENES: msgspec.json.encode(stated).decode()})
 
 
 def _same_encoder(one: Digest, other: Digest) -> bool:
@@ -345,91 +335,41 @@ def _same_encoder(one: Digest, other: Digest) -> bool:
     return one.encoder_id == other.encoder_id and same_vectors(one.canonical, other.canonical)
 
 
-def _canonical(members: Sequence[Digest]) -> Array:
-    assert members[0].canonical is not None
-    return members[0].canonical
-
-
-def _stated(listed: Listed) -> list[Any]:
-    numbers = [None if math.isnan(number) else number for number in listed.numbers]
-    return [
-        *(listed.path, listed.stamp, listed.counts, numbers if listed.is_indexed else []),
-        *(listed.taught, listed.phrases, listed.unread),
-    ]
-
-
 def read_library(index: Path, folder: Path) -> Library:
-    """Map an index into memory.
+    """Return the library that an index describes.
 
-    Raises InputError where it cannot be opened, and FormatError for what breaks a rule of its layout; nothing
-    is allocated on the word of its header.
+    Raises InputError where it cannot be opened, and FormatError for what breaks a rule of its layout.
     """
-    file, size = open_for_reading(index)
-    with file:
-        start = file.read(16)
-        length = int.from_bytes(start[8:], "little")
-        if start[:8] != MAGIC or not 0 < length <= min(size, LONGEST_HEADER):
-            raise _refused(index, "it begins otherwise")
-        header = parse_json(file.read(length), index)
+    open_for_reading(index)[0].close()  # the same messages for a missing file as everywhere
     try:
-        return _mapped(header, index, folder, 16 + length + (-length) % 8, size)
-    except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
-        raise _refused(index, str(error)[:80]) from None
+        with safe_open(index, framework="numpy") as file:
+            stated = msgspec.json.decode((file.metadata() or {}).get(SCENES, ""), type=_Stated)
+            groups, pictures = [], dict[str, Array]()
+            for number, (encoder, scenes) in enumerate(stated.groups):
+                group, shown = _group(file, number, encoder, scenes)
+                groups.append(group)
+                pictures |= {scene.path: picture for scene, picture in zip(scenes, shown, strict=True)}
+    except (SafetensorError, msgspec.MsgspecError, ValueError) as error:
+        why = printable_line(error, 80)
+        raise FormatError(f"{index}: no index of scenes ({why}); remove it, and it is made again") from None
+    return Library(folder, tuple(groups), stated.unread, pictures)
 
 
-def _refused(index: Path, why: str) -> FormatError:
-    return FormatError(f"{index}: no index of scenes ({why}); remove it, and it is made again")
-
-
-def _mapped(header: Any, index: Path, folder: Path, at: int, size: int) -> Library:
-    data = np.memmap(index, np.uint8, "r")
-    groups, pictures, width, height = [], dict[str, Array](), *THUMBNAIL
-
-    def taken(kind: str, count: int) -> Array:
-        nonlocal at
-        end = at + count * np.dtype(kind).itemsize
-        if end > size:
-            raise ValueError("shorter than its header says")
-        at, part = end, data[at:end]
-        return part.view(kind)
-
-    for encoder, phrases, dim, rows in header["groups"]:
-        scenes = tuple(map(_listed, rows))
-        if not (isinstance(encoder, str) and min(_whole(phrases), _whole(dim)) > 0):
-            raise ValueError("a group without an encoder")
-        k, m = sum(scene.counts[0] for scene in scenes), sum(scene.counts[4] for scene in scenes)
-        lengths = {"k": k, "d": k * dim, "m": m, "r": sum(sum(scene.counts[1:4]) for scene in scenes)}
-        canonical = taken("<f4", phrases * dim).reshape(phrases, dim)
-        columns = {name: taken(kind, lengths[of]) for name, kind, of in COLUMNS}
-        columns["codewords"] = columns["codewords"].reshape(k, dim)
-        shown = taken("|u1", len(scenes) * width * height * 3).reshape(len(scenes), height, width, 3)
-        at += -at % 8
-        pictures |= {scene.path: picture for scene, picture in zip(scenes, shown, strict=True)}
-        groups.append(Group(encoder, np.array(canonical), scenes, columns))
-    if at != size:
-        raise ValueError("longer than its header says")
-    return Library(folder, tuple(groups), tuple(map(_listed, header["unread"])), pictures)
-
-
-def _whole(value: Any) -> int:
-    if type(value) is not int or not 0 <= value < 2**62:
-        raise ValueError("a count that is none")
-    return value
-
-
-def _listed(row: Any) -> Listed:
-    path, stamp, counts, numbers, taught, phrases, unread = row
-    if not (isinstance(path, str) and isinstance(unread, str) and all(isinstance(t, str) for t in taught)):
-        raise ValueError("a scene without a name")
-    if Path(path).is_absolute() or ".." in Path(path).parts:
-        raise ValueError("a scene outside of the folder")
-    counts = tuple(map(_whole, counts))
-    floats = tuple(math.nan if n is None else float(n) for n in numbers) or (math.nan,) * FLOATS
-    if len(counts) != 5 or len(floats) != FLOATS or (counts[0] and not np.isfinite(floats[:8]).all()):
-        raise ValueError("a scene without its numbers")
-    found = Listed(path, tuple(map(_whole, stamp)), counts, floats, tuple(taught), _whole(phrases), unread)
-    found.calibration  # noqa: B018  which checks it
-    return found
+def _group(file: Any, number: int, encoder: str, scenes: tuple[Listed, ...]) -> tuple[Group, Array]:
+    """Return a group and its (S, H, W, 3) thumbnails; ValueError for arrays that do not fit its scenes."""
+    canonical, shown = file.get_tensor(f"{number}.canonical"), file.get_tensor(f"{number}.thumbnails")
+    group = Group(
+        encoder, canonical, scenes, Columns(*(file.get_tensor(f"{number}.{c}") for c in KINDS._fields))
+    )
+    if canonical.dtype != np.float32 or canonical.ndim != 2:
+        raise ValueError("a group without an encoder")
+    if shown.dtype != np.uint8 or shown.shape != (len(scenes), THUMBNAIL[1], THUMBNAIL[0], 3):
+        raise ValueError("scenes without pictures")
+    for name, values, kind, of in zip(Columns._fields, group.columns, KINDS, ROWS, strict=True):
+        wanted = (group.starts[-1, of], *(canonical.shape[1:] if name == "codewords" else ()))
+        if values.dtype != np.dtype(kind) or values.shape != wanted:
+            raise ValueError(f"{name} of another length than the scenes have")
+    return group, shown
 
 
 # The first pass: fits of a phrase in all scenes of a group.
@@ -441,7 +381,7 @@ def fits_in(group: Group, vector: Array) -> Array:
     They are -inf in scenes that are not indexed. Raises FormatError for an index whose numbers do not fit
     each other.
     """
-    arrays, phrase = Columns(**group.columns), np.require(vector, np.float32, "C")
+    arrays, phrase = group.columns, np.require(vector, np.float32, "C")
     means, sound = np.zeros(len(arrays.parents)), np.ones(len(group.scenes), bool)
     shared_workers().run(_region_means, len(sound), phrase, arrays, group.starts, means, sound)
     if not sound.all():

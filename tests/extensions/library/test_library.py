@@ -4,9 +4,12 @@ damaged. Two scenes of one place: what appeared, is gone, moved or has another c
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from safetensors import safe_open
+from safetensors.numpy import load_file, save_file
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import EncoderError, FormatError, InputError
@@ -15,7 +18,7 @@ from langsplat_core.extensions.library.changes import Change, changes, colour_te
 from langsplat_core.extensions.library.finding import find
 from langsplat_core.extensions.library.index import (
     INDEX,
-    MAGIC,
+    SCENES,
     fits_in,
     read_library,
     scenes_in,
@@ -150,60 +153,63 @@ def test_a_scene_that_cannot_be_read_is_named(folder):
 # Damaged and hostile index files.
 
 
-def rewritten(index: Path, change: object) -> None:
-    """The index with another header, its arrays as they were."""
-    data = index.read_bytes()
-    length = int.from_bytes(data[8:16], "little")
-    header = json.loads(data[16 : 16 + length])
-    change(header)  # type: ignore[operator]
-    text = json.dumps(header).encode()
-    rest = data[16 + length + (-length) % 8 :]
-    index.write_bytes(MAGIC + len(text).to_bytes(8, "little") + text + bytes(-len(text) % 8) + rest)
+def stated(index: Path) -> Any:
+    """Return the scenes that an index states, and the tensors beside them."""
+    with safe_open(index, "numpy") as file:
+        return json.loads(file.metadata()[SCENES])
 
 
-def counts(header: dict, value: object) -> None:
-    header["groups"][0][3][0][2] = value
-
-
-HEADERS = {
-    "scene outside": lambda header: header["groups"][0][3][0].__setitem__(0, "../../etc/x.ply"),
-    "absolute": lambda header: header["groups"][0][3][0].__setitem__(0, "/etc/x.ply"),
-    "too many": lambda header: counts(header, [2**40] * 5),
-    "negative": lambda header: counts(header, [-1, 1, 1, 1, 1]),
-    "text": lambda header: counts(header, "many"),
-    "no groups": lambda header: header.pop("groups"),
-    "huge vectors": lambda header: header["groups"][0].__setitem__(2, 2**50),
-    "no numbers": lambda header: header["groups"][0][3][0].__setitem__(3, ["x"] * 20),
+STATEMENTS = {
+    "scene outside": lambda scene: scene.update(path="../../etc/x.ply"),
+    "absolute path": lambda scene: scene.update(path="/etc/x.ply"),
+    "too many regions": lambda scene: scene.update(regions=[2**40, 1, 1]),
+    "negative count": lambda scene: scene.update(codewords=-1),
+    "count that is a text": lambda scene: scene.update(mixtures="many"),
+    "no stamp": lambda scene: scene.pop("stamp"),
+    "no bars": lambda scene: scene.pop("bars"),
+    "calibration of texts": lambda scene: scene.update(calibration={"thing": "x"}),
 }
 
 
-@pytest.mark.parametrize("name", HEADERS)
-def test_a_header_that_lies_is_refused(folder, name):
+@pytest.mark.parametrize("name", STATEMENTS)
+def test_index_with_a_false_statement_is_refused(folder, name):
     update_library(folder, load_encoder=load)
-    rewritten(folder / INDEX, HEADERS[name])
+    index = folder / INDEX
+    content, tensors = stated(index), load_file(index)
+    STATEMENTS[name](content["groups"][0][1][0])
+    save_file(tensors, index, {SCENES: json.dumps(content)})
     with pytest.raises(FormatError, match="remove it"):
-        read_library(folder / INDEX, folder)
+        read_library(index, folder)
 
 
-def test_what_is_no_whole_index_is_refused_and_made_again(folder):
+@pytest.mark.parametrize("name", ["canonical", "thumbnails", "codewords", "parents"])
+def test_index_with_arrays_of_other_sizes_is_refused(folder, name):
+    update_library(folder, load_encoder=load)
+    tensors, index = load_file(folder / INDEX), folder / INDEX
+    text = json.dumps(stated(index))
+    for values in (tensors[f"0.{name}"][..., :-1], tensors[f"0.{name}"].astype(np.float64)):
+        save_file(tensors | {f"0.{name}": np.ascontiguousarray(values)}, index, {SCENES: text})
+        with pytest.raises(FormatError, match="remove it"):
+            read_library(index, folder)
+
+
+def test_damaged_index_is_refused_until_it_is_made_again(folder):
     update_library(folder, load_encoder=load)
     whole = (folder / INDEX).read_bytes()
-    for wound in (b"", b"LSLIB", MAGIC + b"\xff" * 8, MAGIC + bytes(8), whole[:-8], whole + bytes(8)):
-        (folder / INDEX).write_bytes(wound)
-        with pytest.raises(FormatError):
-            read_library(folder / INDEX, folder)
+    for damaged in (b"", b"LSLIB\x00\x00\x01" + bytes(8), whole[:-8], whole + bytes(8)):
+        (folder / INDEX).write_bytes(damaged)
         with pytest.raises(FormatError):
             update_library(folder, load_encoder=load)
     assert len(update_library(folder, load_encoder=load, rebuild=True).scenes) == 3
 
 
 @pytest.mark.parametrize("column", ["words", "regions", "parents"])
-def test_numbers_out_of_place_are_no_crash(folder, column):
+def test_indices_out_of_range_are_refused(folder, column):
     group = update_library(folder, load_encoder=load).groups[0]
-    wrong: dict[str, Array] = {name: np.array(values) for name, values in group.columns.items()}
-    wrong[column][0] = 2**30
+    wrong = np.array(getattr(group.columns, column))
+    wrong[0] = 2**30
     with pytest.raises(FormatError, match="damaged"):
-        fits_in(replace(group, columns=wrong), axis(0))
+        fits_in(replace(group, columns=group.columns._replace(**{column: wrong})), axis(0))
 
 
 # What changed between two scenes.
