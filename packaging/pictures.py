@@ -86,8 +86,8 @@ def _outlined(ctx: Any, window: Window) -> None:
         node for name, node in named.items() if name.split(" or ")[0] in ("hamburger", "laptop", "present")
     ]
     outline.group(viewer, things[1], things[0])
-    outline.group(viewer, things[2], viewer.state.things.groups[0])
-    outline.rename_group(viewer, viewer.state.things.groups[0], "on the table")
+    outline.group(viewer, things[2], viewer.state.session.things.groups[0])
+    outline.rename_group(viewer, viewer.state.session.things.groups[0], "on the table")
     outline.toggle_lock(viewer, things[0])
     settings.set_display(viewer, "latent", 2)
     ctx.yield_(10)
@@ -109,7 +109,7 @@ def _noted(ctx: Any, window: Window) -> None:
     settings.open_panel(viewer, "Notes")
     for place, text in (((0.37, 0.36), "a gift of 1987"), ((0.62, 0.55), "eaten by the children")):
         projects.pin_at(viewer, *place)
-        projects.write_note(viewer, viewer.state.notes[-1], text)
+        projects.write_note(viewer, viewer.state.session.notes[-1], text)
 
 
 def _beside(ctx: Any, window: Window) -> None:
@@ -124,7 +124,7 @@ def _beside(ctx: Any, window: Window) -> None:
     language = replace(with_codec(field, codec), tree=None)
     save_scene(path, replace(scene, language=language, path=path))
     opening.open_beside(viewer, path)
-    while viewer.beside is None or not any(query.result for query in viewer.beside.state.queries):
+    while viewer.beside is None or not any(viewer.beside.state.shown_results()):
         ctx.yield_()
 
 
@@ -167,7 +167,7 @@ def _overlays(ctx: Any, window: Window) -> None:
     viewer = window.viewer
     settings.open_panel(viewer, "Overlays")
     for overlay in ("cameras", "cube", "grid"):
-        settings.show_overlay(viewer, overlay, True)
+        settings.toggle_overlay(viewer, overlay)
     settings.set_display(viewer, "rgb")
     viewpoint.step_camera(viewer, 6)
     viewpoint.zoom_by(viewer, 2.2)
@@ -185,8 +185,8 @@ def _orthographic(ctx: Any, window: Window) -> None:
     viewpoint.look_from(viewer, "top")
     _settled(ctx, window)
     viewpoint.zoom_by(viewer, 1.6)
-    settings.show_overlay(viewer, "cube", True)
-    settings.show_overlay(viewer, "grid", True)
+    settings.toggle_overlay(viewer, "cube")
+    settings.toggle_overlay(viewer, "grid")
     _settled(ctx, window)
 
 
@@ -270,7 +270,8 @@ def window_picture(path: Path, queries: tuple[str, ...], act: Act) -> None:
         state = window.viewer.state
         for _ in range(FRAMES):
             ctx.yield_()
-            answered = state.queries and all(query.result is not None for query in state.queries)
+            queries = state.session.queries
+            answered = queries and all(state.result(query) is not None for query in queries)
             if answered and window.viewer.worker.current is None:
                 break
         act(ctx, window)

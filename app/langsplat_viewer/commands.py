@@ -24,7 +24,8 @@ from langsplat_viewer.actions.selecting import Part
 from langsplat_viewer.camera.controls import Side, adopt_up, level
 from langsplat_viewer.files.preferences import THEMES, Theme
 from langsplat_viewer.marks import TOOLS, Tool
-from langsplat_viewer.state import Overlay, ViewerState
+from langsplat_viewer.session import Overlay
+from langsplat_viewer.state import ViewerState
 from langsplat_viewer.viewer import Viewer
 
 
@@ -69,7 +70,10 @@ class Command:
 
 def is_shown(state: ViewerState, button: Button) -> bool:
     """Return whether the scene is looked at in this way."""
-    return state.picture.display == button.display and button.latent_level in (None, state.latent_level)
+    return state.session.picture.display == button.display and button.latent_level in (
+        None,
+        state.session.latent_level,
+    )
 
 
 def _display(button: Button, number: int) -> Command:
@@ -113,7 +117,7 @@ def _overlay(name: Overlay, title: str) -> Command:
         f"show or hide the {title}",
         lambda viewer: settings.toggle_overlay(viewer, name),
         ("B",) if name == "things" else (),
-        is_on=lambda viewer: name in viewer.state.preferences.overlays,
+        is_on=lambda viewer: name in viewer.state.session.overlays,
     )
 
 
@@ -121,7 +125,7 @@ def _tool(tool: Tool) -> Command:
     return Command(
         f"select: {tool}",
         lambda viewer: selecting.use_tool(viewer, tool),
-        is_on=lambda viewer: viewer.state.selection.tool == tool,
+        is_on=lambda viewer: viewer.state.tools.tool == tool,
         icon=TOOL_ICONS[tool],
     )
 
@@ -216,7 +220,7 @@ BY_MENU: dict[str, tuple[Command, ...]] = {
         Command(
             "select with no tool: the left button turns the view",
             selecting.leave_tool,
-            is_on=lambda viewer: viewer.state.selection.tool is None,
+            is_on=lambda viewer: viewer.state.tools.tool is None,
             icon="HAND",
             apart=True,
         ),
@@ -244,13 +248,13 @@ BY_MENU: dict[str, tuple[Command, ...]] = {
             "compare two displays",
             settings.toggle_wipe,
             ("V",),
-            is_on=lambda viewer: viewer.state.settings.split.mode == "wipe",
+            is_on=lambda viewer: viewer.state.session.split.mode == "wipe",
             icon="TABLE_COLUMNS",
         ),
         Command(
             "three levels side by side",
             settings.toggle_levels,
-            is_on=lambda viewer: viewer.state.settings.split.mode == "levels",
+            is_on=lambda viewer: viewer.state.session.split.mode == "levels",
             icon="LAYER_GROUP",
         ),
         Command("compare with another scene", browsing.ask_for_beside),
@@ -259,8 +263,9 @@ BY_MENU: dict[str, tuple[Command, ...]] = {
             "measure a distance",
             settings.toggle_measuring,
             ("M",),
-            is_on=lambda viewer: viewer.state.ruler.measures,
+            is_on=lambda viewer: viewer.state.session.ruler.measures,
             icon="RULER",
+            apart=True,
         ),
         Command(
             "pin a note to what is clicked",

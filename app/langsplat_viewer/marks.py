@@ -1,11 +1,9 @@
-"""Selection: which Gaussians are selected, hidden and deleted, and the tools that mark them."""
+"""Marks: which Gaussians are selected, hidden and deleted, and the tools that mark them."""
 
 import math
-from collections.abc import Callable
-from concurrent.futures import Future
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from itertools import combinations
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -20,7 +18,6 @@ from langsplat_core.query.selection import (
     project,
 )
 from langsplat_core.scene import Camera, Scene
-from langsplat_core.scene.transform import Similarity, transform_scene
 
 # Numbers of Gaussians that a range of selects.
 
@@ -111,11 +108,8 @@ class Marks:
 
     def same(self, other: "Marks") -> bool:
         """Return whether the same are marked in both."""
-        pairs = ((getattr(self, name), getattr(other, name)) for name in NAMES)
+        pairs = ((getattr(self, part.name), getattr(other, part.name)) for part in fields(Marks))
         return all(a is b or np.array_equal(a, b) for a, b in pairs)
-
-
-NAMES = tuple(field.name for field in fields(Marks))
 
 
 def unmarked(count: int) -> Marks:
@@ -142,141 +136,12 @@ def hiding(marks: Marks) -> Marks:
     return Marks(np.zeros_like(marks.selected), marks.hidden | marks.selected, marks.deleted)
 
 
-@dataclass(frozen=True, eq=False)
-class Move:
-    """A transform of the whole scene, or of some of its `count` Gaussians."""
-
-    to: Similarity
-    packed: Array | None  # ceil(count / 8) bytes, a bit each; None: all of them, and the cameras
-    count: int
-
-    def applied(self, scene: Scene) -> Scene:
-        """The scene with it. Raises InputError where it leads too far."""
-        rows = None if self.packed is None else np.unpackbits(self.packed, count=self.count).astype(bool)
-        return transform_scene(scene, self.to, rows)
-
-    def moves_same(self, other: "Move") -> bool:
-        """Return whether both are of the same Gaussians."""
-        if self.packed is None or other.packed is None:
-            return self.packed is other.packed
-        return np.array_equal(self.packed, other.packed)
-
-    def then(self, other: "Move") -> "Move":
-        """Return both as one, where they are of the same."""
-        return replace(self, to=self.to.then(other.to))
-
-
 @dataclass(frozen=True)
 class Stroke:
     """A stroke of the mouse. Places are fractions of the image, (0, 0) its top left corner."""
 
     path: tuple[tuple[float, float], ...]  # where the mouse was, one place or more
     centre: tuple[float, float, float] | None = None  # of a sphere or box: on the surface, world units
-
-
-@dataclass(frozen=True, eq=False)
-class Leaving:
-    """An action that waits for the answer whether deletions are to be saved, or for a film."""
-
-    then: Callable[[Any], None]  # takes the `Viewer`
-    to: str  # what it does, in words: "the window closes"
-    film: bool = False  # it is done as soon as the recorder is
-
-
-@dataclass(frozen=True, eq=False)
-class Selection:
-    """Marks, tool and its settings; replaced as a whole at every change."""
-
-    marks: Marks = field(default_factory=lambda: unmarked(0))
-    saved: Array | None = None  # (N,) what was deleted when the scene was last saved; None: not yet
-    locked: Array = field(default_factory=lambda: np.zeros(0, bool))  # (N,) what tools leave alone
-    moves: tuple[Move, ...] = ()  # transforms so far, since the scene was opened
-    saved_moves: tuple[Move, ...] = ()  # the same when it was last saved
-    tool: Tool | None = None  # what a drag in the scene does; None: it turns the camera
-    mode: Mode = "replace"
-    brush: float = 0.03  # radius, of the image's height, within BRUSHES
-    reach: float = 0.05  # how far growing goes, and how large a sphere of one click is; of the scene's radius
-    only_visible: bool = True  # rectangle, lasso and brush leave out what lies behind something
-    name: str = ""  # that is being typed for what is selected
-    measure: Measure = "opacity"  # whose histogram is shown
-    brushed: tuple[float, float] | None = None  # of it, where the mouse went down and is, fractions
-    stroke: Stroke | None = None
-    leaving: Leaving | None = None
-    writing: Future[Any] | None = None  # what was last written, or is being written
-    may_close: bool = False  # the window closes at the next frame
-
-    @property
-    def is_unsaved(self) -> bool:
-        """True where something was deleted or transformed since the scene was opened or saved."""
-        deleted = self.marks.deleted
-        if self.moves != self.saved_moves:
-            return True
-        return bool(deleted.any()) and (self.saved is None or not np.array_equal(deleted, self.saved))
-
-
-def of_scene(selection: Selection, count: int) -> Selection:
-    """Return the selection for another scene, of `count` Gaussians: the tool and its settings stay."""
-    return replace(
-        selection,
-        marks=unmarked(count),
-        locked=np.zeros(count, bool),
-        saved=None,
-        moves=(),
-        saved_moves=(),
-        stroke=None,
-        leaving=None,
-    )
-
-
-# Marks as history keeps them: one bit each, and none for what is not marked at all.
-
-
-@dataclass(frozen=True, eq=False)
-class PackedMarks:
-    """The three masks of `Marks`, of `count` Gaussians each."""
-
-    count: int
-    masks: tuple[Array | None, ...]  # ceil(count / 8) bytes, in the order of NAMES; None: nothing is marked
-
-
-@dataclass(frozen=True, eq=False)
-class Pair:
-    """The same marks, packed and as they are."""
-
-    marks: Marks
-    packed: PackedMarks
-
-
-def pack(marks: Marks, before: Pair | None) -> Pair:
-    """`before`, the pair that was made last, lends the masks that are the same objects."""
-    if before is not None and before.marks is marks:
-        return before
-    masks = tuple(_packed(getattr(marks, name), name, before) for name in NAMES)
-    return Pair(marks, PackedMarks(len(marks.selected), masks))
-
-
-def _packed(mask: Array, name: str, before: Pair | None) -> Array | None:
-    if before is not None and getattr(before.marks, name) is mask:
-        return before.packed.masks[NAMES.index(name)]
-    return np.packbits(mask) if mask.any() else None
-
-
-def unpack(packed: PackedMarks, now: Pair) -> Marks:
-    """The marks again; `now`, of the same scene, lends the masks that are the same, so that nothing is drawn
-    anew for those."""
-    if now.packed is packed:
-        return now.marks
-    return Marks(*(_unpacked(packed, place, now) for place in range(len(NAMES))))
-
-
-def _unpacked(packed: PackedMarks, place: int, now: Pair) -> Array:
-    bits, current = packed.masks[place], now.packed.masks[place]
-    if bits is current:
-        mask: Array = getattr(now.marks, NAMES[place])
-        return mask
-    if bits is None:
-        return np.zeros(packed.count, bool)
-    return np.unpackbits(bits, count=packed.count).astype(bool)
 
 
 # What a drag with a tool encloses: the Gaussians in it, and its outline. Plain maths, no window.

@@ -51,7 +51,7 @@ from langsplat_viewer.rendering.request import (
     why_nothing,
     why_undrawable,
 )
-from langsplat_viewer.state import SLOTS
+from langsplat_viewer.session import SLOTS
 from langsplat_viewer.viewer import Services
 
 

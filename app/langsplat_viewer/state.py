@@ -1,21 +1,20 @@
-"""The viewer's state: plain data that actions change, and that panels and the canvas read."""
+"""The viewer's state: the session, what follows from it, and what the window shows beside the scene."""
 
-import math
 import os
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from statistics import median
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import LevelChoice, PictureConfig, TrainPreset
-from langsplat_core.display.displays import MAX_QUERIES
-from langsplat_core.query.answers import QueryResult
+from langsplat_core.config import TrainPreset
+from langsplat_core.query.answers import QueryResult, recut
 from langsplat_core.query.describe import Outline, Pointed, Suggestions
 from langsplat_core.query.instances import Instance
 from langsplat_core.scene import Camera, Scene
@@ -24,55 +23,9 @@ from langsplat_viewer.camera.controls import Extent, OrbitCamera
 from langsplat_viewer.camera.flight import Flight, Keyframe
 from langsplat_viewer.files.disk import Listing, Photograph
 from langsplat_viewer.files.preferences import Preferences
-from langsplat_viewer.files.projects import Bookmark, Note, Things
-from langsplat_viewer.marks import Move, Selection
-from langsplat_viewer.rendering.request import (
-    UNCLIPPED,
-    Clip,
-    EditedScene,
-    Pane,
-    RenderRequest,
-    Splats,
-    Split,
-    edited_scene,
-    panes,
-)
-
-# View settings and the ruler.
-
-
-@dataclass(frozen=True)
-class ViewSettings:
-    """View settings of the scene, apart from display and camera; undone together."""
-
-    split: Split = field(default_factory=Split)
-    splats: Splats = field(default_factory=Splats)
-    clip: Clip = UNCLIPPED
-    transparent: bool = False  # images are saved without a background
-    fade: float = 0.0  # how much of the photograph of a training camera lies over the image, 0 to 1
-
-
-Overlay = Literal["things", "cameras", "cube", "grid"]
-OVERLAYS: tuple[Overlay, ...] = get_args(Overlay)
-Point = tuple[float, float, float]  # world units
-
-
-@dataclass(frozen=True)
-class Ruler:
-    """A distance between two points on the surface."""
-
-    measures: bool = False  # a click on the scene sets a point
-    points: tuple[Point, ...] = ()  # at most two
-
-    @property
-    def length(self) -> float | None:
-        """World units; None before there are two points."""
-        return math.dist(*self.points) if len(self.points) > 1 else None
-
-    def with_point(self, point: Point) -> "Ruler":
-        """Set the second point, or the first of a new measurement."""
-        return replace(self, points=(*self.points, point) if len(self.points) == 1 else (point,))
-
+from langsplat_viewer.marks import Marks, Measure, Mode, Stroke, Tool, unmarked
+from langsplat_viewer.rendering.request import EditedScene, Pane, RenderRequest, edited_scene, panes
+from langsplat_viewer.session import Move, Note, Point, Query, Session
 
 # Times of the steps of drawing: the panel "Timing".
 
@@ -93,7 +46,7 @@ STEPS = {  # names of laps, and what they are called; in the order of the panel
 
 @dataclass(eq=False)
 class Timing:
-    """A part of the viewer's state."""
+    """Times of the last images, for the panel."""
 
     wanted: bool = False  # this frame is measured: the panel is seen
     laps: dict[str, deque[float]] = field(default_factory=dict)  # milliseconds by the names of STEPS
@@ -107,7 +60,7 @@ class Timing:
 
 
 def memory_bytes() -> int | None:
-    """Bytes that this process holds in memory; None where the system does not tell."""
+    """Return the bytes that this process holds in memory; None where the system does not tell."""
     try:
         resident = Path("/proc/self/statm").read_text(encoding="ascii").split()[1]
     except OSError:
@@ -118,21 +71,19 @@ def memory_bytes() -> int | None:
 # Camera path and film: the panel "Record".
 
 SPACING = 2.0  # seconds from the last keyframe to one that is added
-TURN_SECONDS = 8.0
 FPS_CHOICES = (10.0, 24.0, 25.0, 30.0, 60.0)
 
 
 @dataclass(eq=False)
 class Recording:
-    """A part of the viewer's state."""
+    """How the camera path is played and filmed."""
 
-    keyframes: tuple[Keyframe, ...] = ()  # in the order of time
     chosen: Keyframe | None = None  # in the list
     at: float = 0.0  # seconds: where on the path the view is
     began: float | None = None  # when `at` was 0, seconds on the window's clock; None while nothing is played
     loops: bool = False
     turns: bool = False  # once around in place of the keyframes
-    turn_seconds: float = TURN_SECONDS
+    turn_seconds: float = 8.0
     turn_from: OrbitCamera | None = None  # where the turn that is played began
     size: tuple[int, int] = (1280, 720)  # of films, and of images that are no screenshots, pixels
     fps: float = 30.0
@@ -143,33 +94,62 @@ class Recording:
 
 @lru_cache(maxsize=2)
 def flight_of(keyframes: tuple[Keyframe, ...]) -> Flight:
-    """The path through them; its curve is computed once for many frames of a window."""
+    """Return the path through them; its curve is computed once for many frames of a window."""
     return Flight(keyframes)
 
 
-# The state as one dataclass.
+# Parts of the state.
 
-SLOTS = MAX_QUERIES  # queries shown at a time: one colour each
 MAX_MESSAGES = 50
 GLIDE_SECONDS = 0.35
 
 
-@dataclass(eq=False)
-class Query:
-    """One line of the query list."""
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """The answer to a query, or the reason why there is none; neither while it is pending."""
 
-    phrase: str
-    slot: int | None = None  # index of its colour while shown, None while hidden
-    shown_since: int = 0  # larger for a query shown later
-    result: QueryResult | None = None  # as it is shown
-    automatic: QueryResult | None = None  # the same where it ends by itself
-    things: tuple[Instance, ...] = ()  # what it found, one by one, where it ends by itself
-    cut: float | None = None  # relevancy at which it ends instead
+    result: QueryResult | None = None  # with the threshold of its own
+    things: tuple[Instance, ...] = ()  # the instances found, with that threshold
     reading: str = ""  # how the phrase was understood, where it has structure
     asked_for: tuple[str, ...] = ()  # its words without what that is related to, see `grammar.heads`
     problem: str = ""  # why it has no result, one line
     meant: str = ""  # the phrase with its unknown words replaced by known ones, where there are such
-    pending: bool = True
+    pending: bool = False
+    milliseconds: float = 0.0  # that the search took
+    _cuts: dict[float, QueryResult] = field(default_factory=dict)  # the last one that was wanted
+
+    def at(self, cut: float | None) -> QueryResult | None:
+        """Return the result with another threshold; with its own one for None."""
+        if cut is None or self.result is None:
+            return self.result
+        if cut not in self._cuts:
+            self._cuts.clear()
+            self._cuts[cut] = recut(self.result, cut)
+        return self._cuts[cut]
+
+
+@dataclass(frozen=True)
+class Tools:
+    """How the mouse selects."""
+
+    tool: Tool | None = None  # what a drag in the scene does; None: it turns the camera
+    mode: Mode = "replace"
+    brush: float = 0.03  # radius, of the image's height, within BRUSHES
+    reach: float = 0.05  # how far growing goes, and how large a sphere of one click is; of the scene's radius
+    only_visible: bool = True  # rectangle, lasso and brush leave out what lies behind something
+    name: str = ""  # that is being typed for what is selected
+    measure: Measure = "opacity"  # whose histogram is shown
+    brushed: tuple[float, float] | None = None  # of it, where the mouse went down and is, fractions
+    stroke: Stroke | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Leaving:
+    """An action that waits for the answer whether edits are to be saved, or for a film."""
+
+    then: Callable[[Any], None]  # takes the `Viewer`
+    to: str  # what it does, in words: "the window closes"
+    film: bool = False  # it is done as soon as the recorder is
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,43 +258,44 @@ class EditForm:
     clipped: tuple[Point, Point] | None = None  # the box that it was last done for
 
 
+# The state as one dataclass.
+
+
 @dataclass(eq=False)
 class SceneState:
     """The part of the state that begins anew with every scene."""
 
+    session: Session = field(default_factory=Session)
+    saved: Session = field(default_factory=Session)  # as a project or an exported scene last had it
+    project: Path | None = None  # the file that it is saved to again
+
     scene: Scene | None = None
-    opened: Scene | None = None  # as its file has it, once something was transformed
-    moving: tuple[Move, Scene] | None = None  # what a gizmo that is held does, and what is seen of it
     path: Path | None = None
     extent: Extent | None = None  # there whenever a scene is
     doubts: tuple[str, ...] = ()  # quality warnings of its training, with the remedies
     nothing: str = ""  # why the image shows nothing of the scene, where it does not
+
+    # what follows from the session
+    opened: Scene | None = None  # the scene as its file has it, once something was transformed
+    marks: Marks = field(default_factory=lambda: unmarked(0))
+    locked: Array = field(default_factory=lambda: np.zeros(0, bool))  # (N,) what tools leave alone
+    answers: dict[str, Answer] = field(default_factory=dict)  # by phrase
 
     view: OrbitCamera | None = None
     glide: Glide | None = None
     opening_camera: Camera | None = None  # what R returns to, where that is not the scene's own choice
     camera_index: int | None = None  # training camera last jumped to
     photograph: Photograph | None = None  # that was looked for last
-    bookmarks: tuple[Bookmark, ...] = ()
-    bookmark_typed: str = ""
+    moving: tuple[Move, Scene] | None = None  # what a gizmo that is held does, and what is seen of it
     record: Recording = field(default_factory=Recording)
     hover: Hover | None = None
-    ruler: Ruler = field(default_factory=Ruler)
-    notes: tuple[Note, ...] = ()
     fresh_note: Note | None = None  # just pinned, to be written now
-    kept: tuple[Things, tuple[Note, ...]] = Things(), ()  # things and notes as a project has them
-    project: Path | None = None  # the file that all this is saved to again
-    selection: Selection = field(default_factory=Selection)
-
     outline: OutlineView | None = None  # once it was wanted
-    things: Things = field(default_factory=Things)
-    queries: list[Query] = field(default_factory=list)
-    selected: Query | None = None  # whose details are shown
     evidence: EvidenceSheet | None = None  # in a window of its own, while that is open
-    canonical: tuple[str, ...] = ()  # phrases that everything is compared with; none: the scene's own
-    canonical_typed: str = ""
     suggestions: Suggestions = field(default_factory=Suggestions)
     suggestions_of: Scene | None = None  # the scene for which they were looked for
+    bookmark_typed: str = ""
+    canonical_typed: str = ""
     _edited: EditedScene | None = None  # of the last request
 
     @property
@@ -327,6 +308,18 @@ class SceneState:
         """True where a scene without one is open."""
         return self.scene is not None and self.scene.language is None
 
+    @property
+    def is_unsaved(self) -> bool:
+        """True where something was deleted or transformed since the scene was opened or saved."""
+        deleted, saved = self.session.marks.deleted, self.saved
+        return self.session.moves != saved.moves or (deleted is not None and deleted != saved.marks.deleted)
+
+    @property
+    def has_unsaved_notes(self) -> bool:
+        """True where no project has the notes, names, groups and locks that there are."""
+        session, saved = self.session, self.saved
+        return (session.things, session.notes) != (saved.things, saved.notes)
+
 
 @dataclass(eq=False)
 class ViewerState(SceneState):
@@ -335,10 +328,10 @@ class ViewerState(SceneState):
     scenes: tuple[Path, ...] = ()  # to switch between, absolute
     opening: Path | None = None  # the file being read, until it is open or has failed
 
-    picture: PictureConfig = field(default_factory=PictureConfig)
-    latent_level: int = 2  # index into scene.LEVELS
-    settings: ViewSettings = field(default_factory=ViewSettings)
-    level: LevelChoice = "auto"
+    tools: Tools = field(default_factory=Tools)
+    leaving: Leaving | None = None
+    writing: Future[Any] | None = None  # what was last written, or is being written
+    may_close: bool = False  # the window closes at the next frame
     pins_notes: bool = False  # a click on the scene pins one
     pointing: bool = False  # it is said what lies under the cursor
     fly_speed: float = 0.5  # scene radii per second
@@ -379,49 +372,54 @@ class ViewerState(SceneState):
         for part in fields(SceneState):
             setattr(self, part.name, getattr(fresh, part.name))
 
-    @property
-    def has_unsaved_notes(self) -> bool:
-        """True where no project has the notes, names, groups and locks that there are."""
-        return (self.things, self.notes) != self.kept
-
     def say(self, text: str, is_error: bool = False) -> None:
         """Add one line to the messages area."""
         message = Message(" ".join(text.split()), is_error)
         if not self.messages or self.messages[-1] != message:
             self.messages = [*self.messages[1 - MAX_MESSAGES :], message]
 
-    def in_order_of_showing(self) -> list[Query]:
-        """Queries that have a colour, the one shown longest first."""
-        return sorted((q for q in self.queries if q.slot is not None), key=lambda q: q.shown_since)
+    def answer(self, query: Query) -> Answer:
+        """Return the answer to a query of the list."""
+        return self.answers.get(query.phrase, Answer(pending=True))
+
+    def result(self, query: Query) -> QueryResult | None:
+        """Return the result of a query with its threshold, None without one."""
+        return self.answer(query).at(query.cut)
+
+    @property
+    def chosen_query(self) -> Query | None:
+        """The query whose details are shown."""
+        return self.session.query(self.session.chosen)
 
     def shown(self) -> list[Query | None]:
-        """Answered queries by slot, as many as the highest slot in use."""
-        by_slot = {q.slot: q for q in self.queries if q.slot is not None and q.result is not None}
+        """Return the answered queries by slot, as many as the highest slot in use."""
+        queries = self.session.queries
+        by_slot = {q.slot: q for q in queries if q.slot is not None and self.answer(q).result is not None}
         return [by_slot.get(slot) for slot in range(max(by_slot, default=-1) + 1)]
 
     def shown_results(self) -> tuple[QueryResult | None, ...]:
-        return tuple(None if query is None else query.result for query in self.shown())
+        return tuple(None if query is None else self.result(query) for query in self.shown())
 
     def panes(self) -> tuple[Pane, ...]:
-        """Displays in the scene's area, from left to right."""
-        return panes(self.picture, self.latent_level, self.shown_results(), self.settings.split)
+        """Return the displays in the scene's area, from left to right."""
+        session = self.session
+        return panes(session.picture, session.latent_level, self.shown_results(), session.split)
 
     def request(self, size: tuple[int, int] | None = None, transparent: bool = False) -> RenderRequest:
-        """The image that the scene's area shows, or the same of another size (width, height) in pixels."""
+        """Return the image that the scene's area shows, or the same of another (width, height) in pixels."""
         assert self.scene is not None
         assert self.view is not None
-        settings = self.settings
-        size = size or self.size
+        session, size = self.session, size or self.size
         seen = self.scene if self.moving is None else self.moving[1]
-        self._edited = edited_scene(seen, self.selection.marks, self._edited)
+        self._edited = edited_scene(seen, self.marks, self._edited)
         return RenderRequest(
             self._edited,
-            self.view.camera(*settings.split.pane_size(size)),
+            self.view.camera(*session.split.pane_size(size)),
             size[0],
-            replace(self.picture, transparent=transparent),
-            self.latent_level,
+            replace(session.picture, transparent=transparent),
+            session.latent_level,
             self.shown_results(),
-            settings.split,
-            settings.splats,
-            settings.clip,
+            session.split,
+            session.splats,
+            session.clip,
         )

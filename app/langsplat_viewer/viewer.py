@@ -7,12 +7,12 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import IO, Protocol, TypeVar
+from typing import IO, Any, Protocol, TypeVar
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import Display, LevelChoice, PictureConfig, TrainPreset
+from langsplat_core.config import TrainPreset
 from langsplat_core.errors import LangSplatError, printable_line
 from langsplat_core.progress import ALL_STAGES, Progress, Report
 from langsplat_core.query.describe import Describer
@@ -20,13 +20,13 @@ from langsplat_core.query.engine import LoadEncoder, QueryEngine
 from langsplat_core.scene import Camera, Scene
 from langsplat_core.semantics.encoders import DEMO
 from langsplat_viewer.camera.controls import OrbitCamera
-from langsplat_viewer.camera.flight import Keyframe
 from langsplat_viewer.files.disk import Stamps, Watch
-from langsplat_viewer.files.projects import Note, Shelf, Things
+from langsplat_viewer.files.projects import Shelf
 from langsplat_viewer.jobs import Job, Worker, one_line
-from langsplat_viewer.marks import Histogram, Marks, Move, PackedMarks, Pair, pack
-from langsplat_viewer.rendering.request import Clip, RenderRequest
-from langsplat_viewer.state import OutlineView, Query, Ruler, ViewerState, ViewSettings
+from langsplat_viewer.marks import Histogram, Marks
+from langsplat_viewer.rendering.request import RenderRequest
+from langsplat_viewer.session import Session
+from langsplat_viewer.state import OutlineView, ViewerState
 
 PREVIEW_EVERY = 100  # steps between the checkpoints that can be looked at
 KEPT = 20  # lines of what it says that are kept
@@ -134,62 +134,23 @@ class Training:
             self.process.kill()
 
 
-# Where one stood in a scene and what was asked there, to be found again. It holds nothing of the scene.
-
-
 @dataclass(frozen=True, eq=False)
 class Visit:
-    """State of a scene that was left, to be found again."""
+    """A scene that was left, as it is found again."""
 
+    session: Session
+    saved: Session
+    project: Path | None
     view: OrbitCamera | None
     opening_camera: Camera | None
     camera_index: int | None
-    display: Display
-    latent_level: int
-    queries: tuple[Query, ...]  # without their answers
-    selected: int | None  # index of the query whose details are shown
-    canonical: tuple[str, ...]
-    keyframes: tuple[Keyframe, ...]
-    ruler: Ruler
-    clip: Clip
-    things: Things
-    notes: tuple[Note, ...]
-    kept: tuple[Things, tuple[Note, ...]]
-    project: Path | None
     count: int  # Gaussians
-
-
-def visit_of(state: ViewerState) -> Visit:
-    chosen = [place for place, query in enumerate(state.queries) if query is state.selected]
-    return Visit(
-        view=state.view,
-        opening_camera=state.opening_camera,
-        camera_index=state.camera_index,
-        display=state.picture.display,
-        latent_level=state.latent_level,
-        queries=tuple(unanswered(query) for query in state.queries),
-        selected=chosen[0] if chosen else None,
-        canonical=state.canonical,
-        keyframes=state.record.keyframes,
-        ruler=state.ruler,
-        clip=state.settings.clip,
-        things=state.things,
-        notes=state.notes,
-        kept=state.kept,
-        project=state.project,
-        count=0 if state.scene is None else len(state.scene.gaussians),
-    )
-
-
-def unanswered(query: Query) -> Query:
-    """Return the same question without its answer, to be asked again."""
-    return Query(query.phrase, query.slot, query.shown_since, cut=query.cut)
 
 
 T = TypeVar("T")
 
 
-class Surface(Protocol):
+class ShownImage(Protocol):
     """The image on screen, as far as actions need it."""
 
     def point_at(self, u: float, v: float) -> Array | None:
@@ -217,31 +178,16 @@ class Services:
         return QueryEngine(scene, self.load_encoder, encoder_id=self.encoder_id)
 
 
-@dataclass(frozen=True, eq=False)
-class Moment:
-    """The queries and how they were looked at; what is selected, hidden, deleted and moved."""
-
-    queries: tuple[tuple[Query, int | None, int, float | None], ...]  # with slot, shown_since and cut
-    selected: Query | None
-    picture: PictureConfig
-    latent_level: int
-    level: LevelChoice
-    settings: ViewSettings
-    overlays: tuple[str, ...]
-    marks: PackedMarks
-    moves: tuple[Move, ...]
-    keyframes: tuple[Keyframe, ...]
-    things: Things
-    notes: tuple[Note, ...]
+MOST_STEPS = 100  # steps that can be undone
+GESTURE = 1.0  # seconds: changes of one setting that follow each other sooner are one step
 
 
 @dataclass(eq=False)
 class History:
-    """Moments to return to, the nearest one last."""
+    """Sessions to return to, the nearest one last."""
 
-    past: list[Moment] = field(default_factory=list)
-    future: list[Moment] = field(default_factory=list)
-    marks: Pair | None = None  # as they were packed last
+    past: list[Session] = field(default_factory=list)
+    future: list[Session] = field(default_factory=list)
     setting: str = ""  # that was changed by the last step, where others of it may join the step
     set_at: float = 0.0  # when, seconds on the window's clock
 
@@ -257,17 +203,38 @@ class Viewer:
     watch: Watch = field(default_factory=Watch)  # over the files of the scene shown
     visits: dict[Path, Visit] = field(default_factory=dict)  # of scenes that were left
     shelf: Shelf = field(default_factory=Shelf)
+    history: History = field(default_factory=History)
     engine: QueryEngine | None = None  # of the scene shown; asked on the worker only
     describer: Describer | None = None  # of the same scene, once it was needed
     histogram: tuple[tuple[object, ...], Histogram | None] | None = None  # the last one, and what it is of
     pivot: tuple[Scene, Array, Array] | None = None  # of what is selected in which scene, a point (3,)
     out_of_sight: tuple[OutlineView, Marks, Array] | None = None  # nodes with nothing shown, of which
     beside: "Viewer | None" = None  # of a second scene, seen and asked as this one is
-    linked: tuple[OrbitCamera | None, tuple[str, ...]] = (None, ())  # view and canonical phrases given to it
-    surface: Surface | None = None
+    followed: OrbitCamera | None = None  # the view of the first scene that this second one was given last
+    surface: ShownImage | None = None
     training: Training | None = None  # under way
-    history: History = field(default_factory=History)
     clock: float = 0.0  # seconds, as of the last frame
+
+    def change(self, setting: str = "", **values: Any) -> None:
+        """Change fields of the session, as one step that can be undone, unless they are so already. `setting`
+        names one that is moved, as sliders are: its changes in quick succession are one step."""
+        session = replace(self.state.session, **values)
+        if session != self.state.session:
+            self.remember(setting)
+            self.state.session = session
+
+    def put(self, **values: Any) -> None:
+        """Change fields of the session without a step of its own to undo."""
+        self.state.session = replace(self.state.session, **values)
+
+    def remember(self, setting: str = "") -> None:
+        """Make what follows one step that can be undone; `setting` as in `change`."""
+        history = self.history
+        goes_on = setting != "" and setting == history.setting and self.clock - history.set_at < GESTURE
+        history.setting, history.set_at = setting, self.clock
+        if not goes_on:
+            history.past = [*history.past[1 - MOST_STEPS :], self.state.session]
+            history.future = []
 
     def run(
         self,
@@ -310,56 +277,3 @@ class Viewer:
     def say_error(self, reason: str) -> None:
         """Add one line to the messages area, as an error."""
         self.state.say(reason, is_error=True)
-
-
-# History: queries, view settings, notes and marks as they were before each change, to be undone.
-
-MOST_STEPS = 100  # steps that can be undone
-GESTURE = 1.0  # seconds: changes of one setting that follow each other sooner are one step
-
-
-def now(viewer: Viewer) -> Moment:
-    state = viewer.state
-    viewer.history.marks = pack(state.selection.marks, viewer.history.marks)
-    return Moment(
-        queries=tuple((query, query.slot, query.shown_since, query.cut) for query in state.queries),
-        selected=state.selected,
-        picture=state.picture,
-        latent_level=state.latent_level,
-        level=state.level,
-        settings=state.settings,
-        overlays=state.preferences.overlays,
-        marks=viewer.history.marks.packed,
-        moves=state.selection.moves,
-        keyframes=state.record.keyframes,
-        things=state.things,
-        notes=state.notes,
-    )
-
-
-def remember(viewer: Viewer, setting: str = "") -> None:
-    """Make what follows one step that can be undone; call it before a change. `setting` names one that is
-    moved, as sliders are: its changes in quick succession are one step."""
-    history = viewer.history
-    goes_on = setting != "" and setting == history.setting and viewer.clock - history.set_at < GESTURE
-    history.setting, history.set_at = setting, viewer.clock
-    if not goes_on:
-        history.past = [*history.past[1 - MOST_STEPS :], now(viewer)]
-        history.future = []
-
-
-def let_go(viewer: Viewer) -> None:
-    """Drop the answers of queries that are in no list any more but in what can be undone: numbers for every
-    Gaussian. They are asked anew when they come back."""
-    listed = {id(query) for query in viewer.state.queries}
-    for moment in (*viewer.history.past, *viewer.history.future):
-        for query, *_ in moment.queries:
-            if id(query) not in listed:
-                query.result = query.automatic = None
-                query.things, query.pending = (), False
-
-
-def forget(viewer: Viewer) -> None:
-    """Empty the history: nothing that was done in another scene can be undone."""
-    history = viewer.history
-    history.past, history.future, history.marks, history.setting = [], [], None, ""

@@ -42,7 +42,6 @@ from langsplat_viewer.options import chosen_camera, latent_level
 from langsplat_viewer.panels import layout, navigation, outline, overlays, ui
 from langsplat_viewer.panels.navigation import Keyboard
 from langsplat_viewer.rendering.renderer import Backend, GlRenderer
-from langsplat_viewer.state import ViewerState
 from langsplat_viewer.viewer import Services, Viewer
 
 # 4.3 sorts splats, 4.1 draws them on every system; 3.3 still shows the CPU's images.
@@ -90,10 +89,10 @@ def _gl_hints(major: int, minor: int) -> None:
 class Remembered:
     """Keeps a folder and the window's looks in step with the preferences of a `ViewerState`."""
 
-    def __init__(self, folder: Path | None, state: ViewerState) -> None:
+    def __init__(self, folder: Path | None, viewer: Viewer) -> None:
         """`folder` None: nothing is read and nothing written."""
         self._folder = folder
-        self._state = state
+        self._viewer, self._state = viewer, viewer.state
         self._kept: Preferences | None = None  # as they lie on disk; None: they are not kept there
         self._styled: Preferences | None = None  # as the window looks
 
@@ -113,7 +112,7 @@ class Remembered:
             return
         self._state.show_help = not (self._folder / FILE_NAME).exists()  # at the first start
         self._kept = self._state.preferences
-        self._state.picture = replace(self._state.picture, colour_map=self._kept.colour_map)
+        settings.take_preferences(self._viewer)
         params.ini_disable = False
         params.ini_folder_type = hello_imgui.IniFolderType.absolute_path
         params.ini_filename = str(self._folder / LAYOUT_NAME)
@@ -126,6 +125,7 @@ class Remembered:
 
     def update(self) -> None:
         """Apply and keep the preferences that have changed; once per frame."""
+        settings.keep_preferences(self._viewer)
         preferences = self._state.preferences
         if self._styled is not None and preferences != self._styled:
             self.style()
@@ -205,7 +205,7 @@ class Window:
         self._make_renderer = make_renderer
         self.keyboard = Keyboard(self.viewer.state)
         self._hiding, self._column = layout.Hiding(), layout.Column()
-        self._remembered = Remembered(request.settings, self.viewer.state)
+        self._remembered = Remembered(request.settings, self.viewer)
         self._canvas: Canvas | None = None
         self._menu = outline.ThingsMenu()
         self._photograph, self._evidence = ui.Picture(), ui.Picture()
@@ -319,7 +319,7 @@ class Window:
         if span is not None:
             viewpoint.move(viewer, lambda view: spanning(view, span))
         wanted = request.picture
-        looks = replace(state.picture, heat_opacity=wanted.heat_opacity, dim=wanted.dim)
+        looks = replace(state.session.picture, heat_opacity=wanted.heat_opacity, dim=wanted.dim)
         settings.set_picture(viewer, replace(looks, heat_scale=wanted.heat_scale))
         if request.path_file is not None:
             filming.load_path(viewer, request.path_file)
@@ -342,7 +342,7 @@ class Window:
             return
         if len(self.signals) > self._obeyed:
             self._obey()
-        if viewer.state.selection.may_close:
+        if viewer.state.may_close:
             hello_imgui.get_runner_params().app_shall_exit = True
         self._began = time.perf_counter()
         viewer.take_results()
@@ -366,14 +366,14 @@ class Window:
             projects.end(self.viewer)
         else:
             selecting.quit_viewer(self.viewer)
-            if not self.viewer.state.selection.may_close:
+            if not self.viewer.state.may_close:
                 print("asked in the window; Ctrl + C again ends at once", file=sys.stderr)
 
     def _pace(self) -> None:
         """Say how soon the next frame is wanted: at once only while something moves or has just changed."""
         state, idling = self.viewer.state, hello_imgui.get_runner_params().fps_idling
         news = (self.viewer.worker.delivered, self.viewer.recorder.delivered)
-        asked = (state.selection.leaving, state.selection.may_close)
+        asked = (state.leaving, state.may_close)
         seen = (self.unfinished, state.nothing, state.hover)
         there = (state.view, self.viewer.watch.changed, self.keyboard.given, *news, *seen, *asked)
         changed = len(there) != len(self._last) or any(

@@ -137,7 +137,17 @@ def arrive(viewer: Viewer) -> None:
 
 def phrases(viewer: Viewer) -> list[str]:
     """Of the queries, in their order."""
-    return [query.phrase for query in viewer.state.queries]
+    return [query.phrase for query in viewer.state.session.queries]
+
+
+def result(viewer: Viewer, which: int = -1):
+    """The result of a query of the list, with its threshold."""
+    return viewer.state.result(viewer.state.session.queries[which])
+
+
+def answer(viewer: Viewer, which: int = -1):
+    """The answer to a query of the list."""
+    return viewer.state.answer(viewer.state.session.queries[which])
 
 
 def errors(viewer: Viewer) -> list[str]:
@@ -146,8 +156,8 @@ def errors(viewer: Viewer) -> list[str]:
 
 CHANGES = {  # of what is seen, after a search
     "display": lambda v: settings.set_display(v, "depth"),
-    "hidden query": lambda v: queries.hide(v, v.state.queries[0]),
-    "splats": lambda v: settings.set_splats(v, Splats(0.5)),
+    "hidden query": lambda v: queries.hide(v, v.state.session.queries[0].phrase),
+    "splats": lambda v: v.change(splats=Splats(0.5)),
     "near cut": lambda v: settings.set_clip(v, Clip(1.0)),
     "marks": selecting.select_all,
     "size": lambda v: settings.resize(v, 100, 80),
@@ -177,14 +187,14 @@ def blob(word: str) -> np.ndarray:
 
 
 def marks_of(viewer: Viewer) -> Marks:
-    return viewer.state.selection.marks
+    return viewer.state.marks
 
 
 def put_marks(viewer: Viewer, **masks: np.ndarray) -> None:
     """Mark nothing but the (N,) `selected`, `hidden` and `deleted` that are given."""
     assert viewer.state.scene is not None
     marks = replace(unmarked(len(viewer.state.scene.gaussians)), **masks)
-    viewer.state.selection = replace(viewer.state.selection, marks=marks)
+    selecting.put_marks(viewer, marks)
 
 
 def names(rows: np.ndarray) -> str:

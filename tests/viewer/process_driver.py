@@ -257,12 +257,12 @@ def typing(window: Window) -> Iterator[None]:
     yield from press(window, "Ctrl+F", *"hamburger")
     assert (state.typed, state.view is before) == ("hamburger", True)
     yield from press(window, "escape", "Ctrl+A", "h")  # keys of the scene again
-    assert state.selection.marks.hidden.all()
+    assert state.marks.hidden.all()
     yield from press(window, *"u231")
-    assert not state.selection.marks.hidden.any()
-    assert state.picture.display == "rgb"
+    assert not state.marks.hidden.any()
+    assert state.session.picture.display == "rgb"
     yield from press(window, "Ctrl+F", *"mug", "enter", *"plant", "enter", *"bo")
-    assert ([query.phrase for query in state.queries], state.typed) == (["mug", "plant"], "bo")
+    assert ([query.phrase for query in state.session.queries], state.typed) == (["mug", "plant"], "bo")
     yield from press(window, "tab")
     assert (state.typed, state.show_panel) == ("book", True)
     yield from press(window, "up_arrow")

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from tests.support.windowless import answer, result
+
 from imgui_bundle import imgui  # isort: skip
 from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
 import glfw  # isort: skip
@@ -36,7 +38,7 @@ def reload_what_changed(s: Any) -> None:
     s.ctx.item_click("//changed/Reload")
     s.until(lambda: s.state.scene is not before)
     assert s.state.view is view
-    assert s.state.queries[0].result.found
+    assert result(s, 0).found
     assert not s.ctx.item_exists("//changed/Reload")
     hot = s.at(s.shot("reloaded"), CENTRES[0])
     assert hot[0] > hot[2] + 60
@@ -52,7 +54,7 @@ def fade_in_a_photograph(s: Any) -> None:
     s.open_panel("Camera", frames=1)
     viewpoint.go_to_camera(viewer, 1)
     plain = s.shot("plain")
-    opening.fade_photograph(viewer, 1.0)
+    viewer.change(fade=1.0)
     s.settle()
     assert "no photograph 'photo_1'" in s.state.photograph.reason
     assert (s.shot("none")[100:500, 400:] == plain[100:500, 400:]).all()
@@ -66,7 +68,7 @@ def fade_in_a_photograph(s: Any) -> None:
     left, right = (middle, int(area.left) + quarter), (middle, int(area.left) + 3 * quarter)
     np.testing.assert_allclose([shot[left], shot[right]], [(250, 120, 10), (20, 60, 240)], atol=3)
     assert (shot == plain)[int(area.top) + 30, left[1]].all()
-    opening.fade_photograph(viewer, 0.5)
+    viewer.change(fade=0.5)
     np.testing.assert_allclose(s.shot("half")[left], (shot[left] + plain[left]) / 2, atol=4)
     s.drag((600, 300), (656, 279))
     assert opening.photograph_here(s.state) is None
@@ -127,8 +129,8 @@ def search_a_library(s: Any) -> None:
     assert hits == [("named.ply", "found"), ("mug.ply", "not here")]
     s.ctx.item_click("//**/$$0/##scene")
     s.shows("named.ply")
-    assert s.state.queries[0].phrase == "plant"
-    assert s.state.queries[0].result.found
+    assert s.state.session.queries[0].phrase == "plant"
+    assert result(s, 0).found
 
 
 TRAINS = """
@@ -169,7 +171,7 @@ def large_letters(s: Any) -> None:
     """At twice the size, in a small window: the column grows, and no widget of any panel is cut off."""
     for phrase in ("mug or plant", LONG):
         s.search(phrase)
-    assert s.state.queries[-1].meant  # a long one, and so is the button for it
+    assert answer(s, -1).meant  # a long one, and so is the button for it
     narrow = scene_area().left
     settings.set_ui_scale(s.viewer, 2.0)
     s.settle()
@@ -206,20 +208,20 @@ def use_the_outline(s: Any) -> None:
     first, second = (row.node for row in s.state.outline.roots[:2])
     row = f"//**/node {first}/###"
     s.click(f"{row}row")
-    chosen = s.state.selection.marks.selected
+    chosen = s.state.marks.selected
     assert (chosen == s.state.outline.tree.members(first)).all()
     s.click(f"{row}eye")
-    assert (s.state.selection.marks.hidden == chosen).all()
+    assert (s.state.marks.hidden == chosen).all()
     s.click(f"{row}eye")
     s.click(f"{row}lock")
-    assert s.state.things.locked == {first}
+    assert s.state.session.things.locked == {first}
     s.ctx.item_drag_and_drop(f"{row}row", f"//**/node {second}/###row")
     s.settle()
-    (group,) = s.state.things.groups
+    (group,) = s.state.session.things.groups
     assert group.nodes == (second, first)
     for _ in range(2):
         s.key("Ctrl+Z")
-    assert (s.state.things.locked, s.state.things.groups) == (set(), ())
+    assert (s.state.session.things.locked, s.state.session.things.groups) == (set(), ())
 
     use_the_outline_by_keys(s, first)
     s.key("R")
@@ -229,8 +231,8 @@ def use_the_outline(s: Any) -> None:
     s.ctx.yield_(3)
     s.ctx.item_click("//**/##name this")
     s.enter("the atlas")
-    assert s.state.queries[-1].phrase == "the atlas"
-    assert s.state.queries[-1].result.members.reshape(3, -1).all(1).tolist() == [False, True, False]
+    assert s.state.session.queries[-1].phrase == "the atlas"
+    assert result(s, -1).members.reshape(3, -1).all(1).tolist() == [False, True, False]
 
 
 def use_the_outline_by_keys(s: Any, node: int) -> None:
@@ -240,11 +242,11 @@ def use_the_outline_by_keys(s: Any, node: int) -> None:
     s.ctx.item_click("//**/##filter")
     s.key("down_arrow", frames=2)
     s.key("enter")
-    assert (s.state.selection.marks.selected == s.state.outline.tree.members(node)).all()
+    assert (s.state.marks.selected == s.state.outline.tree.members(node)).all()
     s.key("menu", frames=3)
     s.key("up_arrow", frames=2)  # to the last
     s.key("enter", frames=3)
-    assert [group.nodes for group in s.state.things.groups] == [(node,)]
+    assert [group.nodes for group in s.state.session.things.groups] == [(node,)]
     s.key("Ctrl+Z")
 
 
@@ -259,11 +261,11 @@ def record_and_play(s: Any) -> None:
         s.key("K", frames=1)
         s.drag((600, 300), end)
     s.click("//Record/Add keyframe", frames=2)
-    assert [key.seconds for key in record.keyframes] == [0, 2, 4]
+    assert [key.seconds for key in s.state.session.keyframes] == [0, 2, 4]
     last = s.state.view
     s.ctx.item_click("//Record/Clear")
     s.key("Ctrl+Z", frames=2)
-    assert len(record.keyframes) == 3
+    assert len(s.state.session.keyframes) == 3
 
     filming.set_path_seconds(s.viewer, 60.0)  # longer than a frame may take
     start = s.shot("start")
@@ -305,8 +307,8 @@ def mark_and_return(s: Any) -> None:
     np.testing.assert_allclose(s.state.view.rotation, start.rotation, atol=1e-6)
     s.ctx.item_click("//**/##bookmark")
     s.enter("by the key of k", frames=2)
-    assert [mark.name for mark in s.state.bookmarks] == ["view 1", "by the key of k"]
-    assert s.state.record.keyframes == ()
+    assert [mark.name for mark in s.state.session.bookmarks] == ["view 1", "by the key of k"]
+    assert s.state.session.keyframes == ()
     s.key("Ctrl+Shift+C", frames=3)
     assert imgui.get_clipboard_text().startswith("langsplat-viewer ")
 
@@ -323,7 +325,7 @@ def use_the_palette(s: Any) -> None:
     assert np.ptp(seen[:, right - 100 : right], axis=0).max() > 60  # keys
     assert np.ptp(seen[:, right - 5 : right - 1], axis=0).max() < 10
     s.enter("show depth", frames=3)
-    assert s.state.picture.display == "depth"
+    assert s.state.session.picture.display == "depth"
     assert not s.state.show_palette
 
     s.key("Ctrl+Shift+P", frames=3)
@@ -347,7 +349,7 @@ def use_shortcuts(s: Any) -> None:
     for key in "RPD2E":
         s.key(f"Ctrl+{key}", frames=3)
     assert s.state.view is before
-    assert s.state.picture.display == "rgb"
+    assert s.state.session.picture.display == "rgb"
     assert not list(s.folder.glob("blobs-*.png"))
 
     s.key("Ctrl+F", frames=3)
@@ -374,7 +376,7 @@ def use_shortcuts(s: Any) -> None:
     s.key("escape", frames=1)
     use_the_palette(s)
     s.key("Ctrl+Z", frames=2)
-    assert s.state.picture.display == "rgb"
+    assert s.state.session.picture.display == "rgb"
     s.key("Ctrl+O", frames=3)
     assert s.ctx.item_exists("//**/##path")
 
@@ -387,7 +389,7 @@ def use_the_toolbar(s: Any) -> None:
         assert s.ctx.item_exists(icon), does
     s.ctx.item_click(icons["show depth"])
     s.click(icons["select: lasso"], frames=2)
-    assert (s.state.picture.display, s.state.selection.tool) == ("depth", "lasso")
+    assert (s.state.session.picture.display, s.state.tools.tool) == ("depth", "lasso")
     s.ctx.item_click(icons["select with no tool: the left button turns the view"])
     for phrase in ("mug", "book"):
         s.search(phrase)
@@ -395,10 +397,10 @@ def use_the_toolbar(s: Any) -> None:
     s.click("//Search/Combine", frames=2)
     s.click("//$FOCUSED/or", frames=2)
     s.click("//**/book##other")
-    assert [query.phrase for query in s.state.queries] == ["mug", "book", "mug or book"]
+    assert [query.phrase for query in s.state.session.queries] == ["mug", "book", "mug or book"]
     s.click("//**/Fixed heat scale", frames=2)
-    lows, highs = zip(*(query.result.heat_range for query in s.state.shown()), strict=True)
-    assert s.state.picture.heat_scale == (min(lows), max(highs))
+    lows, highs = zip(*(found.heat_range for found in s.state.shown_results()), strict=True)
+    assert s.state.session.picture.heat_scale == (min(lows), max(highs))
 
 
 def many_queries(s: Any) -> None:
@@ -408,20 +410,20 @@ def many_queries(s: Any) -> None:
     for phrase in ("mug", "plant", "book or plant", long, "pot"):
         s.search(phrase)
         assert s.ctx.item_info("//**/Colours").rect_full.min.y == display
-    names = [f"//**/{query.phrase}/x" for query in s.state.queries]
+    names = [f"//**/{query.phrase}/x" for query in s.state.session.queries]
     closes = [s.ctx.item_info(name).rect_full for name in names if s.ctx.item_exists(name)]
     ((_, right),) = {(rect.min.x, rect.max.x) for rect in closes}
     assert right <= s.ctx.item_info("//Search/Search").rect_full.max.x + 1
-    phrase = s.state.queries[-1].phrase
+    phrase = s.state.session.queries[-1].phrase
     s.click(f"//**/{phrase}/x", frames=2)
-    assert phrase not in [query.phrase for query in s.state.queries]
+    assert phrase not in [query.phrase for query in s.state.session.queries]
     assert s.ctx.item_info("//**/Colours").rect_full.min.y == display
 
 
 def arrange_panels(s: Any) -> None:
     """Menus do what keys do; panels are closed, opened and moved; the browser opens a scene."""
     s.menu("View", "Show depth")
-    assert s.state.picture.display == "depth"
+    assert s.state.session.picture.display == "depth"
     s.menu("Window", "Light theme")
     light = s.shot("light")
     assert light[300:500, 5].min() > 150
@@ -497,7 +499,7 @@ def travel_by_keys(s: Any) -> None:
     for _ in range(3):
         s.key("down_arrow", frames=2)
     s.key("enter", frames=3)
-    assert s.state.picture.display == "depth"
+    assert s.state.session.picture.display == "depth"
     s.key("Ctrl+Shift+P", frames=3)
     s.enter("teleport", frames=3)
     assert s.state.show_palette

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from tests.support.windowless import result
+
 from imgui_bundle import hello_imgui, imgui  # isort: skip
 from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
 import glfw  # isort: skip
@@ -28,7 +30,7 @@ def split_the_view(s: Any) -> None:
     """The line is dragged without the camera; nothing is drawn for it, and nothing at rest."""
     rgb = s.shot("rgb")
     s.key("V")
-    assert s.state.settings.split.mode == "wipe"
+    assert s.state.session.split.mode == "wipe"
     both, area, before = s.shot("both"), scene_area(), s.state.view
     np.testing.assert_allclose(s.at(both, MUG), s.at(rgb, MUG), atol=2)
     assert np.abs(s.at(both, PLANT) - s.at(rgb, PLANT)).max() > 40  # depth
@@ -36,7 +38,7 @@ def split_the_view(s: Any) -> None:
     middle, y = area.left + area.width / 2, area.top + 0.8 * area.height
     drawn = s.renderer.count
     s.drag((middle, y), (area.left + 0.9 * area.width, y))
-    assert abs(s.state.settings.split.at - 0.9) < 0.02
+    assert abs(s.state.session.split.at - 0.9) < 0.02
     assert s.state.view is before
     assert s.renderer.count == drawn
     np.testing.assert_allclose(s.at(s.shot("wiped"), PLANT), s.at(rgb, PLANT), atol=2)
@@ -79,15 +81,15 @@ def draw_over_the_scene(s: Any) -> None:
     for thing in (MUG, BOOK):
         s.click_at(s.on_screen(thing))
     assert s.state.view is turned
-    assert abs(s.state.ruler.length - np.linalg.norm(MUG - BOOK)) < 0.2
+    assert abs(s.state.session.ruler.length - np.linalg.norm(MUG - BOOK)) < 0.2
     s.ctx.mouse_double_click(0)  # two points in quick succession; elsewhere it would move the view
     s.settle()
     assert s.state.view is turned
-    assert s.state.ruler.length is not None
-    assert s.state.ruler.length < 0.05
+    assert s.state.session.ruler.length is not None
+    assert s.state.session.ruler.length < 0.05
     s.draws_nothing()
     s.key("escape", frames=2)
-    assert not s.state.ruler.measures
+    assert not s.state.session.ruler.measures
 
 
 def time_the_steps(s: Any) -> None:
@@ -160,7 +162,7 @@ def look_without_perspective(s: Any) -> None:
 
 def name_what_is_close(s: Any) -> None:
     """Things in one line of sight have their names one above the other."""
-    settings.show_overlay(s.viewer, "things", True)
+    settings.toggle_overlay(s.viewer, "things")
     for word in ("mug", "book", "plant"):
         s.search(word)
     viewpoint.look_from(s.viewer, "left")
@@ -204,7 +206,7 @@ def select_with_the_mouse(s: Any) -> None:
     s.menu("Window", "Select")
     s.click("//**/Rectangle##tool")
     s.drag(*around(s, PLANT))
-    seen = s.state.selection.marks.selected
+    seen = s.state.marks.selected
     assert 10 < seen.sum() < 110  # the front of it
     s.click("//**/Only what is visible")
     before = s.state.view
@@ -225,7 +227,7 @@ def select_with_the_mouse(s: Any) -> None:
     s.key("Ctrl+Z")
     assert marked(s.viewer) == ("book plant", "", "")
     s.key("escape", frames=3)
-    assert s.state.selection.tool is None
+    assert s.state.tools.tool is None
     s.drag((600, 300), (656, 279))
     assert not np.array_equal(before.rotation, s.state.view.rotation)  # the drag turns again
 
@@ -238,13 +240,13 @@ def outline_and_rest(s: Any) -> None:
     for place in ((700, 200), (700, 400), (520, 390)):
         s.ctx.mouse_teleport_to_pos(place)
         s.ctx.yield_(2)
-    assert len(s.state.selection.stroke.path) == 4
+    assert len(s.state.tools.stroke.path) == 4
     line = s.shot("lasso")[196:205, 600]
     assert line.min(1).max() > 100  # a light line on black
     s.key("escape", frames=1)
     s.ctx.mouse_up(0)
     s.settle()
-    assert (s.state.selection.stroke, s.state.selection.tool) == (None, "lasso")
+    assert (s.state.tools.stroke, s.state.tools.tool) == (None, "lasso")
     assert marked(s.viewer)[0] == ""
     s.draws_nothing()
 
@@ -262,9 +264,9 @@ def ask_before_leaving(s: Any) -> None:
     s.menu("File", "Quit")
     assert not hello_imgui.get_runner_params().app_shall_exit
     s.click("//**/Cancel")
-    assert not s.state.selection.may_close
+    assert not s.state.may_close
     glfw.set_window_should_close(glfw_window_hello_imgui(), True)  # its cross was clicked
-    s.wait(lambda: s.state.selection.leaving is not None)
+    s.wait(lambda: s.state.leaving is not None)
     s.click("//**/Cancel")
     assert marked(s.viewer) == ("", "", "mug")
 
@@ -283,9 +285,8 @@ def name_what_is_clicked(s: Any) -> None:
     assert marked(s.viewer)[0] == "plant"
     s.ctx.item_click("//Select/##name")
     s.enter("grandma's mug")
-    query = s.state.queries[-1]
-    assert (query.phrase, query.result.found) == ("grandma's mug", True)
-    np.testing.assert_array_equal(query.result.members, s.state.selection.marks.selected)
+    assert s.state.session.chosen == "grandma's mug"
+    np.testing.assert_array_equal(result(s).members, s.state.marks.selected)
     s.click("//**/More like it##verb")
     assert marked(s.viewer)[0] == "plant"
 
@@ -300,7 +301,7 @@ def drag_the_gizmo(s: Any) -> None:
     settings.set_display(viewer, "rgb")
     s.open_panel("Transform", frames=1)
     s.key("G")
-    view, chosen = s.state.view, s.state.selection.marks.selected
+    view, chosen = s.state.view, s.state.marks.selected
     x, y = s.on_screen(editing.pivot(viewer))
     s.ctx.mouse_teleport_to_pos((x, y))
     for covered in (True, False):  # by a window over the scene, whose mouse it leaves alone
@@ -330,11 +331,11 @@ def drag_the_gizmo(s: Any) -> None:
     form = s.state.edit_form
     viewer.state.edit_form = replace(form, high=(*form.high[:2], (form.low[2] + form.high[2]) / 2))
     s.click("//Transform/Crop")
-    assert 0 < s.state.selection.marks.deleted.sum() < len(chosen)
+    assert 0 < s.state.marks.deleted.sum() < len(chosen)
     for _ in range(5):
         s.key("Ctrl+Z")
     np.testing.assert_array_equal(s.state.scene.gaussians.means, before)
-    assert not s.state.selection.is_unsaved
+    assert not s.state.is_unsaved
 
 
 def clip_and_brush(s: Any) -> None:
@@ -346,7 +347,7 @@ def clip_and_brush(s: Any) -> None:
     s.ctx.yield_(2)
     s.ctx.item_click("//Transform/Box##gizmo")
     s.click("//Transform/Clip")
-    assert s.state.selection.marks.shown.all()
+    assert s.state.marks.shown.all()
     form, means = s.state.edit_form, s.state.scene.gaussians.means
     middle = np.array(s.on_screen(np.mean([form.low, form.high], 0)))
     for corner in product(*zip(form.low, form.high, strict=True)):
@@ -356,11 +357,11 @@ def clip_and_brush(s: Any) -> None:
             break
     low, high = s.state.edit_form.low, s.state.edit_form.high
     inside = ((means >= low) & (means <= high)).all(1)
-    np.testing.assert_array_equal(s.state.selection.marks.shown, inside)
+    np.testing.assert_array_equal(s.state.marks.shown, inside)
     assert 0 < inside.sum() < len(means)
     s.ctx.item_click("//Transform/Clip")
     s.ctx.item_click("//Transform/No gizmo##gizmo")
-    assert s.state.selection.marks.shown.all()
+    assert s.state.marks.shown.all()
     brush_numbers(s)
 
 
@@ -373,14 +374,14 @@ def brush_numbers(s: Any) -> None:
     y = place.min.y + 5
     s.drag((place.min.x + 1, y), ((place.min.x + place.max.x) / 2, y))
     away = np.linalg.norm(s.state.scene.gaussians.means - s.state.view.eye, axis=1)
-    chosen = s.state.selection.marks.selected
+    chosen = s.state.marks.selected
     assert 0 < chosen.sum() < len(away)
     between = (away >= away[chosen].min()) & (away <= away[chosen].max())
     np.testing.assert_array_equal(chosen, between)
     s.ctx.item_click("//Select/Opacity")
     s.ctx.item_click("//Select/##range")
     s.enter("0 1", frames=2)
-    assert s.state.selection.marks.selected.all()
+    assert s.state.marks.selected.all()
 
 
 def compare_two_scenes(s: Any) -> None:
@@ -395,7 +396,7 @@ def compare_two_scenes(s: Any) -> None:
     settings.set_display(viewer, "rgb")
     rgb = s.shot("rgb one")
     opening.open_beside(viewer, s.folder / "other.ply")
-    s.wait(lambda: len(viewer.beside.state.queries) == 1 and viewer.beside.worker.current is None)
+    s.wait(lambda: len(viewer.beside.state.session.queries) == 1 and viewer.beside.worker.current is None)
     settings.move_line(viewer, 0.5)
     both = s.shot("rgb two")
     middle = int(area.left + area.width / 2)
@@ -410,7 +411,7 @@ def compare_two_scenes(s: Any) -> None:
     shown = s.shot("shown")[int(area.top) :, int(area.left) :]
     np.testing.assert_allclose(saved[120:400, 100 : half - 8], shown[120:400, 100 : half - 8], atol=3)
     np.testing.assert_allclose(saved[120:400, half + 8 :], shown[120:400, half + 8 : saved.shape[1]], atol=3)
-    settings.show_one(viewer)
+    settings.set_split(viewer, "off")
     assert (s.shot("alone again") == alone)[100:450, 450:].all()
     assert viewer.beside is None
 
@@ -422,13 +423,13 @@ def pin_a_note(s: Any) -> None:
     s.wait(lambda: imgui.get_io().want_text_input)
     s.ctx.key_chars("lent by Ada")
     s.key("enter", frames=2)
-    (note,) = s.state.notes
+    (note,) = s.state.session.notes
     assert (note.text, s.state.pins_notes) == ("lent by Ada", False)
     assert np.linalg.norm(note.at - BOOK) < 1.0
     s.key("Ctrl+Shift+S", frames=1)
     s.until((s.folder / "blobs-001.langsplat").exists)
     for left in (1, 0):
         s.key("Ctrl+Z")
-        assert len(s.state.notes) == left
+        assert len(s.state.session.notes) == left
     browsing.open_file(s.viewer, s.folder / "blobs-001.langsplat")
-    s.until(lambda: s.state.notes == (note,))
+    s.until(lambda: s.state.session.notes == (note,))

@@ -127,7 +127,7 @@ class Soak:
             self.s.do(lambda: opening.add_scenes(self.viewer, [path]))
             self.s.do(lambda: opening.switch_scene(self.viewer, path.absolute()))
         self.s.ctx.yield_(3)
-        if self.state.selection.leaving is not None:
+        if self.state.leaving is not None:
             self.s.ctx.item_click("//**/Discard")
         self.s.wait(lambda: self.state.opening is None and self.state.path.name == name)
         self.settle()
@@ -162,22 +162,22 @@ class Soak:
         """What the list of queries offers, and undoing."""
         viewer, rng = self.viewer, self.rng
         self.s.do(lambda: queries.set_level(viewer, rng.choice(("auto", "subpart", "part", "whole"))))
-        for query in rng.sample(self.state.queries, min(2, len(self.state.queries))):
-            act = rng.choice((queries.show, queries.hide, queries.remove, queries.select))
-            self.s.do(partial(act, viewer, query))
-            self.s.do(partial(queries.set_cut, viewer, query, rng.choice((None, 0.6, 0.7))))
+        for query in rng.sample(self.state.session.queries, min(2, len(self.state.session.queries))):
+            act = rng.choice((queries.show, queries.hide, queries.remove))
+            self.s.do(partial(act, viewer, query.phrase))
+            self.s.do(partial(queries.set_cut, viewer, query.phrase, rng.choice((None, 0.6, 0.7))))
         self.s.do(partial(rng.choice((editing.undo, editing.redo)), viewer))
 
     def look(self) -> None:
         """What sliders and boxes of the panels do."""
         viewer, rng = self.viewer, self.rng
         steps: tuple[Callable[[], object], ...] = (
-            lambda: settings.set_picture(viewer, replace(self.state.picture, dim=rng.random())),
-            lambda: settings.set_splats(viewer, Splats(rng.uniform(0.1, 1), rng.randrange(4))),
+            lambda: settings.set_picture(viewer, replace(self.state.session.picture, dim=rng.random())),
+            lambda: viewer.change(splats=Splats(rng.uniform(0.1, 1), rng.randrange(4))),
             lambda: settings.set_clip(viewer, Clip(rng.uniform(0, 3), rng.uniform(5, 9))),
             lambda: settings.set_ui_scale(viewer, rng.choice((0.8, 1.0, 1.5))),
             lambda: settings.open_panel(viewer, rng.choice(all_panels()).title),
-            lambda: queries.set_canonical(viewer, ""),
+            lambda: queries.set_canonical(viewer, ()),
             lambda: editing.undo(viewer),
         )
         self.s.do(rng.choice(steps))

@@ -13,12 +13,13 @@ from langsplat_core.arrays import Array
 from langsplat_core.scene import Camera, Intrinsics, Scene
 from langsplat_viewer.actions import settings, viewpoint
 from langsplat_viewer.camera import controls
-from langsplat_viewer.files.projects import BOOKMARKS, MOST_VIEWS, Shelf
-from langsplat_viewer.state import GLIDE_SECONDS
+from langsplat_viewer.files.projects import BOOKMARKS, Shelf
+from langsplat_viewer.session import MOST_BOOKMARKS
+from langsplat_viewer.state import GLIDE_SECONDS, Answer
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
 from tests.support.scenes import random_camera, random_gaussians
-from tests.support.windowless import ask, errors, go, open_scene
+from tests.support.windowless import ask, errors, go, open_scene, result
 
 SIZE = (320, 200)
 
@@ -203,7 +204,7 @@ def test_everything_is_framed_in_a_window_of_any_shape(opened, size, frame):
 def test_focus_brings_the_latest_result_found_to_the_centre(opened):
     ask(opened, "mug", "plant", "sofa")
     go(viewpoint.focus_result, opened)
-    place = opened.state.queries[1].result.place
+    place = result(opened, 1).place
     pixels, depth = opened.state.view.camera(160, 120).project(place[None])
     assert_allclose(pixels[0], (80, 60), atol=1e-6)
     assert 0 < depth[0] < 5
@@ -276,16 +277,18 @@ def test_zooming_out_ends_while_the_scene_is_still_seen(opened):
 
 def test_focus_goes_as_near_as_the_thing_is_small_and_for_a_huge_one_stays_in_the_room(opened):
     ask(opened, "mug")
-    query, distances = opened.state.queries[0], []
-    place, box = query.result.place, query.result.box
+    found, distances = result(opened), []
+    place, box = found.place, found.box
     for size in (1.0, 0.1, 0.01):
-        query.result = replace(query.result, box=place + size * (box - place))
+        smaller = replace(found, box=place + size * (box - place))
+        opened.state.answers["mug"] = Answer(smaller)
         go(viewpoint.focus_result, opened)
         distances.append(opened.state.view.distance)
     assert_allclose(distances, distances[0] * np.array([1, 0.1, 0.01]), rtol=1e-6)
-    pixels, _ = opened.state.view.camera(100, 100).project(query.result.box)
+    pixels, _ = opened.state.view.camera(100, 100).project(smaller.box)
     assert 10 < np.ptp(pixels, axis=0).max() < 100
-    query.result = replace(query.result, box=1e3 * np.array([[-1.0] * 3, [1.0] * 3]))
+    huge = replace(found, box=1e3 * np.array([[-1.0] * 3, [1.0] * 3]))
+    opened.state.answers["mug"] = Answer(huge)
     before = np.linalg.norm(opened.state.view.eye - place)
     go(viewpoint.focus_result, opened)
     assert opened.state.view.distance <= max(before, opened.state.extent.radius * 5)  # stays in the room
@@ -350,7 +353,7 @@ def test_weights_are_opacity_times_size_and_faults_have_none():
 
 
 def names(viewer) -> list[str]:
-    return [bookmark.name for bookmark in viewer.state.bookmarks]
+    return [bookmark.name for bookmark in viewer.state.session.bookmarks]
 
 
 def test_a_bookmark_leads_back_and_is_there_the_next_time(opened, tmp_path):
@@ -363,9 +366,9 @@ def test_a_bookmark_leads_back_and_is_there_the_next_time(opened, tmp_path):
     viewpoint.add_bookmark(opened)
     open_scene(opened, "blobs.ply")
     assert names(opened) == ["the mug"]
-    go(viewpoint.go_to_bookmark, opened, opened.state.bookmarks[0])
+    go(viewpoint.go_to_bookmark, opened, opened.state.session.bookmarks[0])
     assert_same(opened.state.view, marked)
-    viewpoint.delete_bookmark(opened, opened.state.bookmarks[0])
+    viewpoint.delete_bookmark(opened, opened.state.session.bookmarks[0])
     open_scene(opened, "blobs.ply")
     assert names(opened) == []
     open_scene(opened, "plain.ply")
@@ -378,9 +381,9 @@ def test_names_are_numbers_or_replaced_and_end_somewhere(opened):
     viewpoint.add_bookmark(opened)
     viewpoint.add_bookmark(opened, "view 2")
     assert names(opened) == ["view 1", "view 3", "view 2"]
-    for _ in range(MOST_VIEWS):
+    for _ in range(MOST_BOOKMARKS):
         viewpoint.add_bookmark(opened)
-    assert len(names(opened)) == MOST_VIEWS
+    assert len(names(opened)) == MOST_BOOKMARKS
     assert "at most" in errors(opened)[-1]
 
 

@@ -15,7 +15,7 @@ import pytest
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.errors import BackendError
 from langsplat_core.raster import load_rasterizer
-from langsplat_viewer.actions import editing, opening, selecting, settings, viewpoint
+from langsplat_viewer.actions import editing, selecting, settings, viewpoint
 from langsplat_viewer.camera.controls import orbit
 from langsplat_viewer.canvas import FULL, MOVING_BUDGET, REST_SECONDS, AdaptiveResolution, Canvas, Detail
 from langsplat_viewer.rendering.renderer import GlRenderer
@@ -52,8 +52,8 @@ def test_canvas_draws_only_changes_and_is_then_still(gl, shown):
     canvas = Canvas(gl, renderer)
     assert not canvas.update(shown.state, 0.0)
     assert sizes(renderer) == [(200, 120)]
-    settings.save_transparent(shown, True)
-    opening.fade_photograph(shown, 0.5)
+    settings.set_picture(shown, replace(shown.state.session.picture, transparent=True))
+    shown.change(fade=0.5)
     for second in range(1, 5):
         assert not canvas.update(shown.state, float(second))
     assert (canvas.phase, sizes(renderer)) == ("still", [])
@@ -115,7 +115,7 @@ def test_canvas_draws_several_panes_and_no_line(gl, opened):
     rest(canvas, state, 2.0)
     assert drawn == []
     both = canvas.capture(state.request())
-    settings.show_one(opened)
+    settings.set_split(opened, "off")
     np.testing.assert_array_equal(canvas.capture(state.request())[:, :12], both[:, :12])
     settings.toggle_levels(opened)
     rest(canvas, state, 3.0)
@@ -132,7 +132,7 @@ def test_point_at_finds_the_surface_in_every_column(gl, opened):
     places = [canvas.point_at((column + 0.5) / 3, 0.5) for column in range(3)]
     assert all(place is not None for place in places)
     np.testing.assert_allclose(places[1:], [places[0]] * 2)
-    settings.show_one(opened)
+    settings.set_split(opened, "off")
     rest(canvas, opened.state, 2.0)
     np.testing.assert_allclose(canvas.point_at(0.5, 0.5), places[0], atol=0.1)
 
@@ -364,7 +364,7 @@ def test_merged_gaussians_stand_in_for_the_full_image(gl, asked, gated):
     rest(canvas, asked.state, 0.0)
     until(lambda: not canvas.is_running)
     gated.gate.clear()
-    settings.set_splats(asked, Splats(0.5))
+    asked.change(splats=Splats(0.5))
     for now in (1.0, 2.0, 3.0):
         assert canvas.update(asked.state, now)
     assert asked.state.stats.merged

@@ -17,7 +17,7 @@ from langsplat_viewer.options import say_compiling
 from langsplat_viewer.panels.scene import has_several
 from langsplat_viewer.rendering.request import UNCLIPPED, Clip
 from tests.support.fakes import blob_scene
-from tests.support.windowless import SCENES, act, ask, errors, go, open_scene, settle
+from tests.support.windowless import SCENES, act, ask, errors, go, open_scene, result, settle
 
 
 def test_unusable_gaussians_are_counted(viewer):
@@ -41,12 +41,12 @@ def test_a_broken_file_leaves_the_open_scene_alone(opened):
 def test_a_scene_without_language_field_says_what_makes_one(viewer):
     settings.set_display(viewer, "relevancy")
     open_scene(viewer, "plain.ply")
-    assert viewer.state.picture.display == "rgb"
+    assert viewer.state.session.picture.display == "rgb"
     assert "langsplat train" in viewer.state.messages[-1].text
     queries.ask(viewer, "mug")
     settings.set_display(viewer, "latent")
-    assert viewer.state.queries == []
-    assert viewer.state.picture.display == "rgb"
+    assert viewer.state.session.queries == ()
+    assert viewer.state.session.picture.display == "rgb"
     assert "langsplat train" in errors(viewer)[-1]
 
 
@@ -128,30 +128,28 @@ def three(viewer):
 def test_a_display_of_answers_comes_back_after_a_scene_without_and_no_arrays_are_kept(three):
     ask(three, "mug")
     act(opening.switch_scene, three, PLAIN)
-    assert three.state.picture.display == "rgb"
+    assert three.state.session.picture.display == "rgb"
     (visit,) = three.visits.values()
-    assert [query.result for query in visit.queries] == [None]
     assert not any(isinstance(value, np.ndarray) and value.size > 16 for value in vars(visit).values())
     act(opening.switch_scene, three, BLOBS)
-    assert three.state.picture.display == "relevancy"
+    assert three.state.session.picture.display == "relevancy"
 
 
 def test_camera_and_queries_of_each_are_found_again(three):
     assert (three.state.scene, three.state.scenes) == (SCENES["blobs.ply"], (BLOBS, PLAIN, BARE))
     assert settings.take_wanted_panel(three) == "Scene"
     ask(three, "mug", "book")
-    act(queries.set_canonical, three, "plant")
-    mug, book = three.state.queries
-    queries.hide(three, mug)
-    queries.set_cut(three, book, 0.7)
+    act(queries.set_canonical, three, ("plant",))
+    queries.hide(three, "mug")
+    queries.set_cut(three, "book", 0.7)
     go(viewpoint.go_to_camera, three, 2)
     settings.set_clip(three, Clip(1.0, 9.0))
     filming.add_keyframe(three)
     view = three.state.view
     act(opening.switch_scene, three, BARE)
     assert three.state.scene is SCENES["bare.ply"]
-    assert (three.state.queries, three.state.canonical) == ([], ())
-    assert three.state.settings.clip == UNCLIPPED
+    assert (three.state.session.queries, three.state.session.canonical) == ((), ())
+    assert three.state.session.clip == UNCLIPPED
     ask(three, "plant")
     viewpoint.zoom_by(three, 2.0)
     bare = three.state.view
@@ -159,15 +157,18 @@ def test_camera_and_queries_of_each_are_found_again(three):
     act(opening.switch_scene, three, BLOBS)
     state = three.state
     assert state.view is view
-    assert [(q.phrase, q.slot, q.cut) for q in state.queries] == [("mug", None, None), ("book", 1, 0.7)]
-    assert state.queries[1].result.own_cut == 0.7
-    assert state.canonical == three.engine.canonical_phrases == ("plant",)
-    assert (state.camera_index, len(state.record.keyframes)) == (2, 1)
-    assert state.settings.clip == Clip(1.0, 9.0)
+    assert [(q.phrase, q.slot, q.cut) for q in state.session.queries] == [
+        ("mug", None, None),
+        ("book", 1, 0.7),
+    ]
+    assert result(three, 1).own_cut == 0.7
+    assert state.session.canonical == three.engine.canonical_phrases == ("plant",)
+    assert (state.camera_index, len(state.session.keyframes)) == (2, 1)
+    assert state.session.clip == Clip(1.0, 9.0)
     act(opening.switch_scene, three, BARE)
     assert three.state.view is bare
     assert errors(three) == []
-    assert [query.phrase for query in three.state.queries] == ["plant"]
+    assert [query.phrase for query in three.state.session.queries] == ["plant"]
     assert three.state.shown_results()[0].found
     assert three.engine.canonical_phrases != ("plant",)
 
@@ -332,15 +333,14 @@ def test_a_companion_that_comes_or_goes_is_a_change_and_a_scene_that_is_gone_is_
 
 def test_reload_keeps_camera_queries_and_settings(shown):
     ask(shown, "mug", "book")
-    mug, book = shown.state.queries
-    queries.set_cut(shown, mug, 0.6)
-    queries.hide(shown, book)
-    queries.select(shown, mug)
+    queries.set_cut(shown, "mug", 0.6)
+    queries.hide(shown, "book")
+    shown.put(chosen="mug")
     viewpoint.go_to_camera(shown, 1)
     viewpoint.tick(shown, shown.clock + 10)
     filming.add_keyframe(shown)
-    settings.set_splats(shown, replace(shown.state.settings.splats, size=0.5))
-    settings.set_picture(shown, replace(shown.state.picture, dim=0.1))
+    shown.change(splats=replace(shown.state.session.splats, size=0.5))
+    settings.set_picture(shown, replace(shown.state.session.picture, dim=0.1))
     view, before = shown.state.view, shown.state.scene
     dyed = replace(before.gaussians, sh=-before.gaussians.sh)
     save_scene(shown.state.path, replace(before, gaussians=dyed, cameras=before.cameras[:2], path=None))
@@ -350,11 +350,18 @@ def test_reload_keeps_camera_queries_and_settings(shown):
     assert state.scene is not before
     np.testing.assert_array_equal(state.scene.gaussians.sh, dyed.sh)
     assert state.view is view
-    assert [(q.phrase, q.slot, q.cut) for q in state.queries] == [("mug", 0, 0.6), ("book", None, None)]
-    assert state.queries[0].result.own_cut == 0.6
-    assert state.selected is state.queries[0]
-    assert (state.picture.display, state.picture.dim, state.settings.splats.size) == ("relevancy", 0.1, 0.5)
-    assert len(state.record.keyframes) == 1
+    assert [(q.phrase, q.slot, q.cut) for q in state.session.queries] == [
+        ("mug", 0, 0.6),
+        ("book", None, None),
+    ]
+    assert result(shown, 0).own_cut == 0.6
+    assert state.session.chosen == "mug"
+    assert (state.session.picture.display, state.session.picture.dim, state.session.splats.size) == (
+        "relevancy",
+        0.1,
+        0.5,
+    )
+    assert len(state.session.keyframes) == 1
     assert state.camera_index == 1
     assert not look(shown)
     assert errors(shown) == []
@@ -365,23 +372,21 @@ def test_a_reload_with_other_gaussians_asks_anew(shown):
     half = np.arange(0, 360, 2)
     save_scene(shown.state.path, replace(blob_scene().take(half), path=None))
     act(opening.reload, shown)
-    (query,) = shown.state.queries
-    assert query.result.members.shape == (180,)
-    assert shown.state.selection.marks.selected.shape == (180,)
+    assert result(shown).members.shape == (180,)
+    assert shown.state.marks.selected.shape == (180,)
 
 
 @pytest.mark.parametrize("name", FILES)
 def test_a_half_written_file_leaves_the_scene_as_it_was(shown, name):
     ask(shown, "mug")
-    query, before, view = shown.state.queries[0], shown.state.scene, shown.state.view
-    answer = query.result
+    before, view, found = shown.state.scene, shown.state.view, result(shown)
     file = shown.state.path.with_name(name)
     whole = file.read_bytes()
     file.write_bytes(whole[: len(whole) // 2])
     assert look(shown)
     act(opening.reload, shown)
     assert shown.state.scene is before
-    assert (shown.state.view, shown.state.queries, query.result) == (view, [query], answer)
+    assert (shown.state.view, result(shown)) == (view, found)
     assert name in errors(shown)[-1]
     assert shown.watch.changed  # to be tried again
     file.write_bytes(whole)
@@ -394,8 +399,8 @@ def test_a_field_that_went_away_takes_its_display_along(shown):
     ask(shown, "mug")
     save_scene(shown.state.path, replace(blob_scene(field=False), path=None))
     act(opening.reload, shown)
-    assert shown.state.picture.display == "rgb"
-    assert shown.state.queries == []
+    assert shown.state.session.picture.display == "rgb"
+    assert shown.state.session.queries == ()
 
 
 def test_a_watch_looks_by_itself_and_stops(tmp_path, monkeypatch):
@@ -438,25 +443,29 @@ def meet(viewer) -> None:
 def test_both_are_seen_and_asked_alike(two):
     other = two.beside.state
     assert other.path == Path("book.ply")
-    assert [(query.phrase, query.slot) for query in other.queries] == [("mug", 0)]
-    assert other.queries[0].result.found
+    assert [(query.phrase, query.slot) for query in other.session.queries] == [("mug", 0)]
+    assert result(two.beside).found
     assert other.view is two.state.view
     for phrase in ("book", "nothing like this"):
         queries.ask(two, phrase)
     queries.set_level(two, "whole")
-    queries.set_canonical(two, "book, plant")
+    queries.set_canonical(two, ("book", "plant"))
     settings.set_display(two, "segmentation")
     settings.resize(two, 77, 55)
     act(viewpoint.move, two, lambda view: orbit(view, 0.2, 0.1))
     meet(two)
-    assert {query.phrase: query.slot for query in other.queries} == {"mug": 0, "book": 1}
-    assert (other.level, other.picture.display, other.size) == ("whole", "segmentation", (77, 55))
-    assert other.canonical == ("book", "plant")
+    assert {query.phrase: query.slot for query in other.session.queries} == {"mug": 0, "book": 1}
+    assert (other.session.level, other.session.picture.display, other.size) == (
+        "whole",
+        "segmentation",
+        (77, 55),
+    )
+    assert other.session.canonical == ("book", "plant")
     assert other.view is two.state.view
-    queries.hide(two, two.state.queries[0])
-    queries.remove(two, two.state.queries[1])
+    queries.hide(two, "mug")
+    queries.remove(two, "book")
     meet(two)
-    assert [(query.phrase, query.slot) for query in other.queries] == [("mug", None)]
+    assert [(query.phrase, query.slot) for query in other.session.queries] == [("mug", None)]
 
 
 def test_a_scene_without_a_field_shows_its_colours_and_what_cannot_be_opened_is_said_here(two):
@@ -465,18 +474,18 @@ def test_a_scene_without_a_field_shows_its_colours_and_what_cannot_be_opened_is_
         opening.open_beside(two, Path(name))
         meet(two)
         if name == "plain.ply":
-            assert (two.beside.state.picture.display, two.beside.state.queries) == ("rgb", [])
+            assert (two.beside.state.session.picture.display, two.beside.state.session.queries) == ("rgb", ())
     assert "broken.ply" in errors(two)[-1]
     assert two.state.scene is not None
 
 
 def test_it_goes_with_the_line_and_does_not_come_back_by_itself(two):
-    settings.show_one(two)
+    settings.set_split(two, "off")
     opening.follow_beside(two)
     assert two.beside is None
     editing.undo(two)
     opening.follow_beside(two)
-    assert two.state.settings.split.mode == "off"
+    assert two.state.session.split.mode == "off"
 
 
 def test_a_scene_with_other_coordinates_is_seen_from_the_same_side():

@@ -202,7 +202,7 @@ def test_keyframes_and_bookmarks_bring_their_own(flat, tmp_path):
         viewpoint.zoom_by(flat, 2.0)
     for back, kept in (
         (viewpoint.go_to_bookmark, flat.shelf.read(flat.state.path)),
-        (filming.choose_keyframe, flat.state.record.keyframes),
+        (filming.choose_keyframe, flat.state.session.keyframes),
     ):
         go(back, flat, kept[0])
         assert flat.state.view.orthographic

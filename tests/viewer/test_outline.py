@@ -9,10 +9,10 @@ import pytest
 
 from langsplat_viewer.actions import browsing, editing, opening, outline, projects, selecting, settings
 from langsplat_viewer.actions.selecting import take
-from langsplat_viewer.files.projects import Things
+from langsplat_viewer.session import Things
 from tests.support.fakes import CENTRES, blob_scene
 from tests.support.scenes import with_tree
-from tests.support.windowless import SCENES, act, ask, blob, errors, marked, open_scene, settle
+from tests.support.windowless import SCENES, act, ask, blob, errors, marked, open_scene, result, settle
 
 
 @pytest.fixture
@@ -102,8 +102,8 @@ def test_a_name_is_taught_shown_filtered_and_undone(outlined):
     mug = row_of(outlined, "mug")
     act(outline.give_name, outlined, mug.node, "  grandma's cup ")
     assert outline.name_of(outlined, mug) == "grandma's cup"
-    assert outlined.state.queries[-1].phrase == "grandma's cup"
-    assert outlined.state.queries[-1].result.found
+    assert outlined.state.session.queries[-1].phrase == "grandma's cup"
+    assert result(outlined, -1).found
     rows = list(outline.filtered(outlined, outlined.state.outline.roots, "CUP grand"))
     assert [row.node for row in rows] == [mug.node]
     assert list(outline.filtered(outlined, outlined.state.outline.roots, "zebra")) == []
@@ -112,7 +112,7 @@ def test_a_name_is_taught_shown_filtered_and_undone(outlined):
     act(outline.give_name, outlined, book, "the atlas")  # also of what no tool takes
     assert outlined.engine.taught.keys() == {"grandma's cup", "the atlas"}
     act(outline.give_name, outlined, book, "of")  # which names nothing
-    assert outlined.state.things.names[book] == "the atlas"
+    assert outlined.state.session.things.names[book] == "the atlas"
     outlined.state.messages.clear()
     outline.give_name(outlined, mug.node, " ")
     assert errors(outlined) == []
@@ -121,32 +121,32 @@ def test_a_name_is_taught_shown_filtered_and_undone(outlined):
 def test_groups_are_made_named_and_left(outlined, nodes):
     mug, book, plant = nodes
     outline.group(outlined, mug, book)
-    (group,) = outlined.state.things.groups
+    (group,) = outlined.state.session.things.groups
     assert group.nodes == (book, mug)
     outline.group(outlined, plant, group)
-    outline.rename_group(outlined, outlined.state.things.groups[0], "on the table")
-    (group,) = outlined.state.things.groups
+    outline.rename_group(outlined, outlined.state.session.things.groups[0], "on the table")
+    (group,) = outlined.state.session.things.groups
     assert (group.name, group.nodes) == ("on the table", (book, mug, plant))
     other = replace(group, name="other", nodes=(plant,))
-    outlined.state.things = replace(outlined.state.things, groups=(group, other))
+    outlined.put(things=Things(groups=(group, other)))
     outline.rename_group(outlined, other, "on the table")
     assert "already" in errors(outlined)[-1]
-    outlined.state.things = replace(outlined.state.things, groups=(group,))
+    outlined.put(things=Things(groups=(group,)))
     outline.select_group(outlined, group)
     assert marked(outlined)[0] == "mug book plant"
     outline.ungroup(outlined, mug)
-    assert outlined.state.things.groups[0].nodes == (book, plant)
+    assert outlined.state.session.things.groups[0].nodes == (book, plant)
     editing.undo(outlined)
-    assert outlined.state.things.groups[0].nodes == (book, mug, plant)
+    assert outlined.state.session.things.groups[0].nodes == (book, mug, plant)
     for node in (mug, book, plant):
         outline.ungroup(outlined, node)
-    assert outlined.state.things.groups == ()
+    assert outlined.state.session.things.groups == ()
     outline.group(outlined, mug, None)
     outline.group(outlined, mug, None)  # out of the first, which is then empty
-    assert [group.nodes for group in outlined.state.things.groups] == [(mug,)]
+    assert [group.nodes for group in outlined.state.session.things.groups] == [(mug,)]
     outline.ungroup(outlined, mug)
     outline.group(outlined, mug, mug)
-    assert outlined.state.things.groups == ()
+    assert outlined.state.session.things.groups == ()
 
 
 @pytest.mark.parametrize("field", [True, False])
@@ -160,22 +160,23 @@ def test_a_project_keeps_names_groups_and_locks_and_of_another_tree_what_is_know
     outline.group(outlined, mug, book)
     outline.toggle_lock(outlined, mug)
     act(outline.give_name, outlined, book, "the atlas")
-    things, path = outlined.state.things, projects.save_project(outlined, tmp_path)
+    things, path = outlined.state.session.things, projects.save_project(outlined, tmp_path)
     open_scene(outlined, "plain.ply")
-    assert outlined.state.things != things
+    assert outlined.state.session.things != things
     act(browsing.open_project, outlined, path)
-    assert outlined.state.things == things
+    assert outlined.state.session.things == things
     selecting.select_all(outlined)
     assert marked(outlined)[0] == "book plant"
     top = json.loads(path.read_text())
     odd = [mug, 10**9, 10**9, mug]
     groups = [{"name": "a", "nodes": odd}, {"name": "b", "nodes": [10**9]}]
-    top["things"] = {"names": [[10**9, "ghost"], [mug, "cup"]], "groups": groups, "locked": odd}
+    names = {10**9: "ghost", mug: "cup"}
+    top["session"]["things"] = {"names": names, "groups": groups, "locked": odd}
     path.write_text(json.dumps(top))
     if not field:
         monkeypatch.setitem(SCENES, "tree.ply", replace(SCENES["tree.ply"], language=None))
     act(browsing.open_project, outlined, path)
-    things = outlined.state.things
+    things = outlined.state.session.things
     selecting.select_all(outlined)
     if field:
         assert (things.names, things.locked, things.groups[0].nodes) == ({mug: "cup"}, {mug}, (mug,))
@@ -189,13 +190,13 @@ def test_a_project_keeps_names_groups_and_locks_and_of_another_tree_what_is_know
 def test_a_scene_that_was_trained_anew_is_read_again(outlined, monkeypatch):
     """Its tree is another: what was locked by the number of a node is not."""
     outline.toggle_lock(outlined, row_of(outlined, "mug").node)
-    outlined.state.things = replace(outlined.state.things, locked=frozenset({10**6}))
+    outlined.put(things=Things(locked=frozenset({10**6})))
     act(opening.reload, outlined)
-    assert outlined.state.things.locked == frozenset()
+    assert outlined.state.session.things.locked == frozenset()
     outline.toggle_lock(outlined, 0)  # of another number of Gaussians
     monkeypatch.setitem(SCENES, "tree.ply", with_tree(SCENES["tree.ply"].take(np.arange(300))))
     act(opening.reload, outlined)
-    assert outlined.state.things == Things()
+    assert outlined.state.session.things == Things()
 
 
 def test_things_have_the_colour_that_the_image_has(outlined, nodes):

@@ -376,8 +376,7 @@ def stand(viewer, index: int) -> None:
 def test_it_is_read_once_it_is_wanted_and_only_at_its_camera(beside_photograph):
     stand(beside_photograph, 1)
     assert beside_photograph.state.photograph is None
-    opening.fade_photograph(beside_photograph, 3.0)
-    assert beside_photograph.state.settings.fade == 1
+    beside_photograph.change(fade=1.0)
     stand(beside_photograph, 1)
     found = opening.photograph_here(beside_photograph.state)
     assert found.image.shape == (120, 160, 3)
@@ -393,7 +392,7 @@ def test_it_is_read_once_it_is_wanted_and_only_at_its_camera(beside_photograph):
 
 def test_a_chosen_folder_is_looked_into_and_remembered(beside_photograph, tmp_path):
     photograph(tmp_path / "away" / "deep" / "photo_2.jpg")
-    opening.fade_photograph(beside_photograph, 1.0)
+    beside_photograph.change(fade=1.0)
     stand(beside_photograph, 2)
     browsing.ask_for_photographs(beside_photograph)
     assert beside_photograph.state.picks_folder

@@ -4,12 +4,13 @@ import copy
 import json
 import zlib
 from base64 import b64encode
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from langsplat_core.config import PictureConfig
 from langsplat_core.errors import LangSplatError
 from langsplat_core.scene.transform import moving
 from langsplat_viewer.actions import (
@@ -24,11 +25,13 @@ from langsplat_viewer.actions import (
     viewpoint,
 )
 from langsplat_viewer.camera.controls import orbit
-from langsplat_viewer.files.projects import read_project
+from langsplat_viewer.files.preferences import Preferences, load_preferences
+from langsplat_viewer.files.projects import Shelf, read_flight, read_project, read_queries
 from langsplat_viewer.rendering.request import Clip
+from langsplat_viewer.session import Group, Note, Query, Things
 from langsplat_viewer.viewer import Services, Viewer
 from tests.support.fakes import CENTRES, FakeEncoder
-from tests.support.windowless import SCENES, FakeSurface, act, ask, blob, errors, load, marked
+from tests.support.windowless import SCENES, FakeSurface, act, ask, blob, errors, load, marked, result
 
 
 @pytest.fixture
@@ -37,20 +40,20 @@ def saved(opened, tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
     Path("blobs.ply").touch()  # what is in it comes from `windowless.load`
     ask(opened, "mug", "book", "plant", "mug or book")
-    queries.set_cut(opened, opened.state.queries[1], 0.6)
-    queries.hide(opened, opened.state.queries[2])
+    queries.set_cut(opened, "book", 0.6)
+    queries.hide(opened, "plant")
     selecting.take(opened, blob("plant"))
     act(editing.transform, opened, moving(np.array([0.0, 1.0, 0.0])))
     selecting.hide_selected(opened)
     selecting.take(opened, blob("book"))
-    looks = replace(opened.state.picture, dim=0.7, heat_scale=(0.4, 0.9), colour_map="magma")
+    looks = replace(opened.state.session.picture, dim=0.7, heat_scale=(0.4, 0.9), colour_map="magma")
     settings.set_picture(opened, looks)
     settings.set_clip(opened, Clip(0.5, 40.0))
     viewpoint.move(opened, lambda view: orbit(view, 0.3, 0.1))
     filming.add_keyframe(opened)
     projects.toggle_pinning(opened)
     projects.pin_at(opened, 0.5, 0.5)
-    projects.write_note(opened, opened.state.notes[0], 'a "note" <b>of</b> 1987')
+    projects.write_note(opened, opened.state.session.notes[0], 'a "note" <b>of</b> 1987')
     opened.state.preferences = replace(opened.state.preferences, panels=("Search", "Notes"))
     path = projects.save_project(opened, tmp_path)
     assert path is not None
@@ -70,25 +73,23 @@ def again(saved):
 def test_everything_comes_back(opened, saved, again):
     before, after = opened.state, again.state
     assert errors(again) == []
-    asked = [(query.phrase, query.cut, query.slot is None) for query in after.queries]
-    assert asked == [(query.phrase, query.cut, query.slot is None) for query in before.queries]
-    for one, other in zip(before.queries, after.queries, strict=True):
-        np.testing.assert_array_equal(one.result.members, other.result.members)
+    for place in range(4):
+        np.testing.assert_array_equal(result(again, place).members, result(opened, place).members)
     assert marked(again) == marked(opened) == ("book", "plant", "")
     np.testing.assert_allclose(after.scene.gaussians.means, before.scene.gaussians.means, atol=1e-6)
-    for name in ("picture", "notes"):
-        assert getattr(after, name) == getattr(before, name)
-    assert after.settings.clip == before.settings.clip
+    for part in fields(before.session):
+        if part.name not in ("moves", "keyframes"):  # of arrays
+            assert getattr(after.session, part.name) == getattr(before.session, part.name), part.name
     np.testing.assert_allclose(after.view.eye, before.view.eye, atol=1e-9)
     np.testing.assert_allclose(after.view.target, before.view.target, atol=1e-6)
-    assert len(after.record.keyframes) == 1
+    assert len(after.session.keyframes) == 1
     assert settings.take_wanted_panel(again) == ""
     assert after.shows_panels == ("Search", "Notes")
-    assert not after.selection.is_unsaved
+    assert not after.is_unsaved
     assert (before.preferences.recent[0], after.preferences.recent[0]) == (str(saved), str(saved))
     queries.remove_all(again)
     act(browsing.open_recent, again, str(saved))
-    assert len(after.queries) == 4
+    assert len(after.session.queries) == 4
     assert projects.save_project(again, Path("/nowhere")) == saved  # where it came from
 
 
@@ -107,9 +108,13 @@ def test_other_programs_find_the_answers_in_it(opened, saved):
     assert answers["mug"]["verdict"] == "found"
     np.testing.assert_allclose(answers["mug"]["place"], CENTRES[0], atol=0.25)
     assert answers["mug"]["gaussians"] == 120
-    nearest = ((opened.state.scene.gaussians.means - np.array(opened.state.notes[0].at)) ** 2).sum(1).argmin()
-    for query in opened.state.queries:
-        inside = bool(query.result.members[nearest])
+    nearest = (
+        ((opened.state.scene.gaussians.means - np.array(opened.state.session.notes[0].at)) ** 2)
+        .sum(1)
+        .argmin()
+    )
+    for query in opened.state.session.queries:
+        inside = bool(opened.state.result(query).members[nearest])
         assert bool(answers[query.phrase]["notes"]) == inside
 
 
@@ -117,12 +122,77 @@ def test_a_scene_that_has_changed_keeps_its_questions_alone(saved, viewer, monke
     smaller = SCENES["blobs.ply"].take(np.arange(240))
     monkeypatch.setitem(SCENES, "blobs.ply", smaller)
     act(browsing.open_project, viewer, saved)
-    assert len(viewer.state.queries) == 4
-    assert not viewer.state.selection.marks.selected.any()
+    assert len(viewer.state.session.queries) == 4
+    assert not viewer.state.marks.selected.any()
     assert any("has changed" in text for text in errors(viewer))
 
 
-def test_whatever_is_broken_is_one_line(saved):
+SAVED = Path(__file__).parent / "saved"  # files as version 1 wrote them
+
+
+def test_project_of_version_1_opens_and_means_the_same(viewer, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("blobs.ply").touch()
+    path = tmp_path / "version1.langsplat"
+    path.write_bytes((SAVED / path.name).read_bytes())
+    settings.toggle_overlay(viewer, "grid")
+    act(browsing.open_file, viewer, path)
+    assert errors(viewer) == []
+    state, session = viewer.state, viewer.state.session
+    assert session.queries == (
+        Query("mug"),
+        Query("book", 0.6, 0, 1),
+        Query("plant", shown_since=2),
+        Query("mug or book", slot=1, shown_since=3),
+    )
+    assert (session.chosen, session.level, session.canonical) == ("mug or book", "whole", ("plant",))
+    assert result(viewer).found
+    assert session.picture == PictureConfig("relevancy", dim=0.7, heat_scale=(0.4, 0.9), colour_map="magma")
+    assert (session.clip, session.overlays) == (Clip(0.5, 40.0), ("grid",))  # it says nothing of overlays
+    assert marked(viewer) == ("book", "plant", "")
+    moved = state.scene.gaussians.means - SCENES["blobs.ply"].gaussians.means
+    np.testing.assert_allclose(moved[blob("plant")], np.tile([0.0, 1.0, 0.0], (120, 1)), atol=1e-6)
+    assert session.notes == (Note('a "note" <b>of</b> 1987', (0.0, 0.0, 0.0)),)
+    assert session.ruler.length == 1.0
+    assert [(key.seconds, key.pose.span is None) for key in session.keyframes] == [(0.0, True), (2.0, False)]
+    assert [bookmark.name for bookmark in session.bookmarks] == ["from the left"]
+    np.testing.assert_allclose(state.view.eye, [-3.551118, -1.122909, -3.418507], atol=1e-5)
+    assert state.shows_panels == ("Search", "Notes")
+
+
+def test_other_files_of_version_1_open_and_mean_the_same(viewer):
+    project = read_project(SAVED / "version1.langsplat")
+    assert project.session.things == Things(
+        {3: "the atlas"}, (Group("on the table", (1, 2)),), frozenset({4})
+    )
+    asked = read_queries(SAVED / "version1.queries.json")
+    assert [(q.phrase, q.cut, q.shown) for q in asked.queries][1:3] == [
+        ("book", 0.6, True),
+        ("plant", None, False),
+    ]
+    assert (asked.level, asked.canonical) == ("whole", ("plant",))
+    (bookmark,) = Shelf(SAVED).read(Path("/scenes/blobs.ply"))
+    first, second = read_flight(SAVED / "version1.path.json").keyframes
+    for pose in (bookmark.pose, first.pose, project.view.pose):
+        np.testing.assert_allclose(pose.position, [-3.551118, -1.122909, -3.418507], atol=1e-5)
+        np.testing.assert_allclose(pose.rotation[2], [0.702835, 0.222248, 0.675743], atol=1e-5)
+    assert (bookmark.name, second.seconds) == ("from the left", 2.0)
+    assert second.pose.span == pytest.approx(4.705585)
+    assert load_preferences(SAVED) == Preferences(
+        "light",
+        1.25,
+        ("/scenes/blobs.ply",),
+        ("Search", "Notes"),
+        "viridis",
+        ("things", "grid"),
+        {"/scenes/blobs.ply": "/photographs"},
+    )
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_damaged_project_is_refused_in_one_line(saved, version):
+    if version == 1:
+        saved.write_bytes((SAVED / "version1.langsplat").read_bytes())
     top = json.loads(saved.read_text())
     refused: list[str] = []
     tried = 0
@@ -142,14 +212,28 @@ def test_whatever_is_broken_is_one_line(saved):
             except LangSplatError as error:
                 refused.append(str(error))
     assert tried > len(refused) > 400
-    assert not [text for text in refused if "\n" in text]
-    # Marks: not base64, not zlib, too few, a bomb, a number.
-    packed = [
-        b64encode(raw).decode() for raw in (b"abc", zlib.compress(b"abc"), zlib.compress(bytes(50_000_000)))
+    assert all(text.startswith(f"{saved}: no project (") for text in refused)
+    assert not [text for text in refused if "\n" in text or not text.endswith("; save it anew")]
+
+
+def test_project_with_impossible_values_is_refused(saved):
+    top = json.loads(saved.read_text())
+    session = top["session"]
+    # masks: not base64, not zlib, too few, a bomb, a number
+    raw = (b"abc", zlib.compress(b"abc"), zlib.compress(bytes(50_000_000)))
+    packed = [b64encode(content).decode() for content in raw]
+    changes = [
+        *({"marks": {"hidden": bits}} for bits in ("&&&", *packed, 7)),
+        {"things": {"groups": [{"name": "a", "nodes": [1]}] * 2}},
+        {"clip": {"near": 2.0, "far": 1.0}},
+        {"picture": {"heat_scale": [0.9, 0.1]}},
+        {"picture": {"dim": 7.0}},
+        {"latent_level": 3},
+        {"keyframes": session["keyframes"] * 2},
     ]
-    marks = [{**top, "marks": {**top["marks"], "hidden": bits}} for bits in ("&&&", *packed, 7)]
-    for broken in ({"format": "other"}, {**top, "version": 2}, [], *marks):
-        saved.write_text(json.dumps(broken))
+    broken = [{**top, "session": {**session, **change}} for change in changes]
+    for content in ({"format": "other"}, {**top, "version": 3}, [], {**top, "gaussians": 10**12}, *broken):
+        saved.write_text(json.dumps(content))
         with pytest.raises(LangSplatError) as raised:
             read_project(saved)
         assert "\n" not in str(raised.value)
@@ -167,23 +251,23 @@ def places(value, way=()):
 def test_notes_are_pinned_written_and_taken_off(opened):
     projects.toggle_pinning(opened)
     projects.pin_at(opened, 0.95, 0.5)  # nothing is there
-    assert opened.state.notes == ()
+    assert opened.state.session.notes == ()
     assert opened.state.pins_notes
     projects.pin_at(opened, 0.5, 0.5)
     assert not opened.state.pins_notes
-    (note,) = opened.state.notes
+    (note,) = opened.state.session.notes
     projects.write_note(opened, note, "x" * 9000)
-    assert len(opened.state.notes[0].text) == 500
+    assert len(opened.state.session.notes[0].text) == 500
     settings.escape(opened)
-    projects.remove_note(opened, opened.state.notes[0])
-    assert opened.state.notes == ()
+    projects.remove_note(opened, opened.state.session.notes[0])
+    assert opened.state.session.notes == ()
     editing.undo(opened)
-    assert [len(note.text) for note in opened.state.notes] == [500]
+    assert [len(note.text) for note in opened.state.session.notes] == [500]
     editing.undo(opened)
-    assert opened.state.notes == (note,)
+    assert opened.state.session.notes == (note,)
     editing.redo(opened)
     editing.redo(opened)
-    assert opened.state.notes == ()
+    assert opened.state.session.notes == ()
 
 
 @pytest.mark.parametrize("leave", [projects.save_and_leave, projects.end])
@@ -193,24 +277,24 @@ def test_notes_are_asked_about_before_the_window_closes(opened, tmp_path, leave)
     selecting.stay(opened)
     editing.undo(opened)
     assert selecting.may_close(opened)
-    opened.state.selection = replace(opened.state.selection, may_close=False)
+    opened.state.may_close = False
     editing.redo(opened)
     assert not selecting.may_close(opened)
     leave(opened, tmp_path)
-    assert opened.state.selection.may_close
-    assert len(read_project(tmp_path / "blobs-001.langsplat").notes) == 1
+    assert opened.state.may_close
+    assert len(read_project(tmp_path / "blobs-001.langsplat").session.notes) == 1
     assert selecting.may_close(opened)
 
 
 def test_notes_are_there_again_after_another_scene(opened):
     projects.pin_at(opened, 0.5, 0.5)
-    notes = opened.state.notes
+    notes = opened.state.session.notes
     opening.add_scenes(opened, [Path("blobs.ply"), Path("plain.ply")])
     for step, there in ((1, ()), (-1, notes)):
         act(opening.step_scene, opened, step)
-        assert opened.state.notes == there
+        assert opened.state.session.notes == there
     act(opening.reload, opened)
-    assert opened.state.notes == notes
+    assert opened.state.session.notes == notes
     assert opened.state.has_unsaved_notes
 
 
@@ -219,6 +303,9 @@ def test_a_note_is_pinned_to_what_is_selected(opened):
     assert "select something" in errors(opened)[-1]
     selecting.take(opened, blob("book"))
     projects.pin_to_selection(opened)
-    np.testing.assert_allclose(opened.state.notes[0].at, CENTRES[1], atol=0.1)
+    np.testing.assert_allclose(opened.state.session.notes[0].at, CENTRES[1], atol=0.1)
     assert settings.take_wanted_panel(opened) == "Notes"
-    assert [projects.take_fresh_note(opened, opened.state.notes[0]) for _ in range(2)] == [True, False]
+    assert [projects.take_fresh_note(opened, opened.state.session.notes[0]) for _ in range(2)] == [
+        True,
+        False,
+    ]

@@ -13,44 +13,56 @@ from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.scene import CANONICAL_PHRASES, Reading
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_viewer.actions import browsing, editing, queries
-from langsplat_viewer.files.projects import QuerySet, SavedQuery, read_queries, write_queries
+from langsplat_viewer.files.projects import read_queries, write_queries
 from langsplat_viewer.marks import BINS
 from langsplat_viewer.output import describe
 from langsplat_viewer.panels.search import hint, histogram
+from langsplat_viewer.session import Query, Session
 from langsplat_viewer.viewer import Services
 from tests.support.fakes import CENTRES, FakeEncoder, as_trained, axis, blob_scene, calibrated_for, language
-from tests.support.windowless import SCENES, act, ask, errors, load, open_scene, phrases, settle
+from tests.support.windowless import (
+    SCENES,
+    act,
+    answer,
+    ask,
+    errors,
+    load,
+    open_scene,
+    phrases,
+    result,
+    settle,
+)
 
 
 def test_a_query_is_answered_and_shown(opened):
     queries.ask(opened, "  mug ")
-    query = opened.state.queries[0]
-    assert query.pending
+    assert answer(opened).pending
     settle(opened)
-    assert (query.phrase, query.slot, query.pending, query.problem) == ("mug", 0, False, "")
-    assert query.result.found
-    assert query.result.level == 2
-    assert_allclose(query.result.place, CENTRES[0], atol=0.25)
-    assert opened.state.picture.display == "relevancy"
+    assert opened.state.session.queries == (Query("mug", slot=0, shown_since=1),)
+    assert (answer(opened).pending, answer(opened).problem) == (False, "")
+    assert result(opened).found
+    assert result(opened).level == 2
+    assert_allclose(result(opened).place, CENTRES[0], atol=0.25)
+    assert opened.state.session.picture.display == "relevancy"
     (pane,) = opened.state.panes()
     columns = relevancies(Subject(360, answers=pane.answers))
     assert columns.shape == (360, 1)
     assert columns[:120].mean() > 0.9 > 0.6 > columns[120:].mean()
-    assert pane.ranges == (query.result.heat_range,)
+    assert pane.ranges == (result(opened).heat_range,)
 
 
 def test_a_correction_is_offered_and_takes_the_place_of_the_typo(opened):
     ask(opened, "red plamt")
     assert queries.offers(opened) == ("did you mean", ())  # "red" is like no word
     ask(opened, "plamt")
-    unknown, typo = opened.state.queries
-    assert [(query.meant, query.slot) for query in (unknown, typo)] == [("", None), ("plant", None)]
-    assert "did you mean 'plant'?" in typo.problem
+    assert [answer(opened, place).meant for place in (0, 1)] == ["", "plant"]
+    assert opened.state.shown() == []
+    assert "did you mean 'plant'?" in answer(opened).problem
     assert queries.offers(opened) == ("did you mean", ("plant",))
     act(queries.ask_offered, opened, "plant")
     assert phrases(opened) == ["red plamt", "plant"]
-    assert opened.state.queries[1].result.found
-    assert opened.state.queries[1].slot == 0
+    assert result(opened, 1).found
+    assert opened.state.session.queries[1].slot == 0
 
 
 def test_commas_separate_searches_and_quotes_are_no_part_of_them(opened):
@@ -61,7 +73,7 @@ def test_commas_separate_searches_and_quotes_are_no_part_of_them(opened):
     queries.ask(opened, "?!")
     assert "no word to look for" in errors(opened)[-1]
     ask(opened, "the")
-    assert "names nothing" in opened.state.queries[-1].problem or "names nothing" in errors(opened)[-1]
+    assert "names nothing" in answer(opened, -1).problem or "names nothing" in errors(opened)[-1]
 
 
 def test_earlier_phrases_come_back_by_the_arrows(opened):
@@ -85,7 +97,7 @@ def test_examples_are_offered_until_the_first_search_and_each_is_found(viewer):
     assert queries.offers(viewer) == ("", ("book",))
     viewer.state.typed = ""
     act(queries.ask_offered, viewer, "book")
-    assert viewer.state.queries[0].result.found
+    assert result(viewer, 0).found
     open_scene(viewer, "plain.ply")
     queries.prepare_suggestions(viewer)
     assert queries.offers(viewer) == ("try", ())
@@ -93,45 +105,43 @@ def test_examples_are_offered_until_the_first_search_and_each_is_found(viewer):
 
 def test_hiding_keeps_the_colours_of_the_others_and_a_fourth_takes_that_of_the_longest_shown(opened):
     ask(opened, "mug", "book")
-    mug, book = opened.state.queries
-    queries.hide(opened, mug)
+    queries.hide(opened, "mug")
     (pane,) = opened.state.panes()
     columns = relevancies(Subject(360, answers=pane.answers))
     assert columns.shape == (360, 2)
     assert not columns[:, 0].any()
-    assert pane.ranges == (NO_HEAT, book.result.heat_range)
+    assert pane.ranges == (NO_HEAT, result(opened, 1).heat_range)
     assert columns[120:240, 1].mean() > 0.9
-    queries.show(opened, mug)
-    assert (mug.slot, book.slot) == (0, 1)
+    queries.show(opened, "mug")
+    assert [query.slot for query in opened.state.session.queries] == [0, 1]
     ask(opened, "plant", "mug or book")
-    assert [query.slot for query in opened.state.queries] == [0, None, 2, 1]
-    queries.remove(opened, mug)
+    assert [query.slot for query in opened.state.session.queries] == [0, None, 2, 1]
+    queries.remove(opened, "mug")
     assert [result is not None for result in opened.state.shown_results()] == [False, True, True]
     queries.remove_all(opened)
-    assert (opened.state.queries, opened.state.selected, opened.state.shown_results()) == ([], None, ())
+    assert (opened.state.session.queries, opened.state.chosen_query, opened.state.answers) == ((), None, {})
     editing.undo(opened)
     assert phrases(opened) == ["book", "plant", "mug or book"]
 
 
 def test_queries_are_combined_as_the_grammar_reads_them(opened):
     ask(opened, "mug", "book")
-    mug, book = opened.state.queries
     for join in queries.JOINS:
-        queries.ask_combined(opened, mug, join, book)
+        queries.ask_combined(opened, "mug", join, "book")
     settle(opened)
-    both, either, only = opened.state.queries[2:]
-    assert [query.result.found for query in (both, either, only)] == [True] * 3
-    assert either.result.members.sum() == 240 > only.result.members.sum() == 120
-    assert (only.result.members == mug.result.members).all()
+    mug, _, both, either, only = (result(opened, place) for place in range(5))
+    assert [found.found for found in (both, either, only)] == [True] * 3
+    assert either.members.sum() == 240 > only.members.sum() == 120
+    assert (only.members == mug.members).all()
 
 
 def test_the_box_is_emptied_by_a_search_and_by_nothing_else(opened):
     opened.state.typed = "  "
     queries.ask_typed(opened)
-    assert (opened.state.typed, opened.state.queries) == ("  ", [])
+    assert (opened.state.typed, opened.state.session.queries) == ("  ", ())
     opened.state.typed = "mug "
     queries.ask_typed(opened)
-    assert (opened.state.typed, opened.state.queries[0].phrase) == ("", "mug")
+    assert (opened.state.typed, opened.state.session.queries[0].phrase) == ("", "mug")
     assert queries.take_search_focus(opened)  # for the next phrase
     opened.state.show_panel = False
     queries.focus_search(opened)
@@ -146,11 +156,11 @@ def test_a_calibrated_scene_gives_verdicts_with_probability(viewer, monkeypatch,
     monkeypatch.setitem(SCENES, "sure.ply", replace(blob_scene(), language=sure))
     open_scene(viewer, "sure.ply")
     ask(viewer, "mug")
-    result = viewer.state.queries[0].result
-    assert (result.verdict, result.found) == (verdict, verdict == "found")
-    assert (viewer.state.queries[0].slot is None) == (verdict == "not here")
-    said = f"'mug': {verdict} ({100 * result.probability:.0f} %), score "
-    assert describe(result).startswith(said)
+    found = result(viewer)
+    assert (found.verdict, found.found) == (verdict, verdict == "found")
+    assert (viewer.state.session.queries[0].slot is None) == (verdict == "not here")
+    said = f"'mug': {verdict} ({100 * found.probability:.0f} %), score "
+    assert describe(found).startswith(said)
 
 
 # Evidence.
@@ -159,7 +169,7 @@ def test_a_calibrated_scene_gives_verdicts_with_probability(viewer, monkeypatch,
 def test_an_answer_is_explained_by_what_training_kept(opened, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     ask(opened, "book")
-    (query,) = opened.state.queries
+    (query,) = opened.state.session.queries
     act(queries.explain, opened, query)
     assert "--work" in errors(opened)[-1]
     scene = opened.state.scene
@@ -176,72 +186,71 @@ def test_an_answer_is_explained_by_what_training_kept(opened, tmp_path, monkeypa
 
 
 def test_an_answer_ends_where_one_says_and_can_end_by_itself_again(asked):
-    (query,) = asked.state.queries
-    automatic = query.result
+    automatic = result(asked)
     assert automatic.own_cut is None
     assert 0 < automatic.members.sum() < 360
     key = asked.state.panes()
-    for cut in (0.0, float(np.median(automatic.even)), 1.1):
-        queries.set_cut(asked, query, cut)
-        assert query.result.cut == cut
-        np.testing.assert_array_equal(query.result.members, automatic.even >= np.float32(cut))
-        assert query.result.heat_range[0] <= min(cut, automatic.peak)
+    for cut in (0.0, float(np.median(automatic.even)), 1.0):
+        queries.set_cut(asked, "mug", cut)
+        found = result(asked)
+        assert found.cut == cut
+        assert result(asked) is found  # so that nothing is drawn anew
+        np.testing.assert_array_equal(found.members, automatic.even >= np.float32(cut))
+        assert found.heat_range[0] <= min(cut, automatic.peak)
     assert asked.state.panes() != key
-    queries.set_cut(asked, query, None)
-    assert query.result is automatic
+    queries.set_cut(asked, "mug", None)
+    assert result(asked) is automatic
 
 
 def test_a_cut_is_undone_in_one_step_and_outlives_another_level(asked):
-    (query,) = asked.state.queries
-    automatic = query.result
-    queries.set_cut(asked, query, 0.6)
+    automatic = result(asked)
+    queries.set_cut(asked, "mug", 0.6)
     for value in (0.61, 0.62):  # the slider moves on
-        queries.set_cut(asked, query, value, is_new=False)
+        queries.set_cut(asked, "mug", value, is_new=False)
     act(queries.set_level, asked, "part")
-    assert (query.result.level, query.result.own_cut) == (1, 0.62)
+    assert (result(asked).level, result(asked).own_cut) == (1, 0.62)
     act(editing.undo, asked)
-    assert query.result.own_cut == 0.62
+    assert result(asked).own_cut == 0.62
     act(editing.undo, asked)
-    assert query.result.own_cut is None
-    np.testing.assert_array_equal(query.result.members, automatic.members)
+    assert result(asked).own_cut is None
+    np.testing.assert_array_equal(result(asked).members, automatic.members)
     editing.redo(asked)
-    assert query.result.own_cut == 0.62
+    assert result(asked).own_cut == 0.62
 
 
 def test_everything_can_be_compared_with_other_phrases(asked):
-    (query,) = asked.state.queries
-    before = query.result
-    act(queries.set_canonical, asked, "book, plant")
-    assert asked.state.canonical == ("book", "plant")
+    before = result(asked)
+    act(queries.set_canonical, asked, ("book", "plant"))
+    assert asked.state.session.canonical == ("book", "plant")
     assert asked.engine.canonical_phrases == ("book", "plant")
-    assert np.abs(query.result.relevancy - before.relevancy).max() > 0.01
-    assert query.result.probability is None
-    act(queries.set_canonical, asked, "sofa")  # never taught: all stays as it was
+    assert np.abs(result(asked).relevancy - before.relevancy).max() > 0.01
+    assert result(asked).probability is None
+    act(queries.set_canonical, asked, ("sofa",))  # never taught: all stays as it was
     assert "sofa" in errors(asked)[-1]
-    assert asked.state.canonical == ("book", "plant")
-    act(queries.set_canonical, asked, "")
-    assert asked.state.canonical == ()
+    assert asked.state.session.canonical == ("book", "plant")
+    act(queries.set_canonical, asked, ())
+    assert asked.state.session.canonical == ()
     assert asked.engine.canonical_phrases == CANONICAL_PHRASES
-    np.testing.assert_array_equal(query.result.relevancy, before.relevancy)
+    np.testing.assert_array_equal(result(asked).relevancy, before.relevancy)
 
 
 @pytest.mark.parametrize("dropped", [lambda path: [path], lambda path: [path, Path("blobs.ply")]])
 def test_a_set_of_queries_is_asked_again_alone_or_with_its_scene(asked, tmp_path, dropped):
-    queries.set_cut(asked, asked.state.queries[0], 0.7)
+    queries.set_cut(asked, "mug", 0.7)
     ask(asked, "plant")
-    queries.hide(asked, asked.state.queries[1])
+    queries.hide(asked, "plant")
     queries.set_level(asked, "whole")
-    act(queries.set_canonical, asked, "book")
+    act(queries.set_canonical, asked, ("book",))
     path = queries.save_queries(asked, tmp_path)
     assert path.name == "blobs-001.queries.json"
     open_scene(asked, "blobs.ply")
-    assert (asked.state.queries, asked.state.canonical) == ([], ())
+    assert (asked.state.session.queries, asked.state.session.canonical) == ((), ())
     act(browsing.open_dropped, asked, dropped(path))
-    found = [(query.phrase, query.cut, query.slot is None) for query in asked.state.queries]
+    found = [(query.phrase, query.cut, query.slot is None) for query in asked.state.session.queries]
     assert found == [("mug", 0.7, False), ("plant", None, True)]
-    assert asked.state.canonical == ("book",)
-    assert asked.state.level == "whole"
-    assert asked.state.queries[0].result.own_cut == 0.7
+    assert asked.state.session.canonical == ("book",)
+    assert asked.state.session.level == "whole"
+    assert result(asked, 0).own_cut == 0.7
 
 
 def test_nothing_to_save_and_nothing_to_ask_of(viewer, opened, tmp_path):
@@ -249,12 +258,12 @@ def test_nothing_to_save_and_nothing_to_ask_of(viewer, opened, tmp_path):
     queries.load_queries(opened, tmp_path / "gone.queries.json")
     assert "gone.queries.json" in errors(opened)[-1]
     open_scene(opened, "plain.ply")
-    write_queries(tmp_path / "a.queries.json", QuerySet((SavedQuery("mug"),)))
+    write_queries(tmp_path / "a.queries.json", Session(queries=(Query("mug"),)))
     queries.load_queries(opened, tmp_path / "a.queries.json")
     assert "searched" in errors(opened)[-1]
-    queries.set_canonical(opened, "book")
+    queries.set_canonical(opened, ("book",))
     assert "language field" in errors(opened)[-1]
-    assert opened.state.queries == []
+    assert opened.state.session.queries == ()
 
 
 GOOD = {"format": "langsplat-queries", "queries": [{"phrase": "mug"}]}
@@ -283,7 +292,7 @@ GOOD = {"format": "langsplat-queries", "queries": [{"phrase": "mug"}]}
 def test_a_broken_set_is_one_line(tmp_path, change):
     path = tmp_path / "a.queries.json"
     path.write_text(json.dumps(GOOD))
-    assert read_queries(path) == QuerySet((SavedQuery("mug"),))
+    assert [query.phrase for query in read_queries(path).queries] == ["mug"]
     path.write_text(json.dumps(GOOD | change))
     with pytest.raises(InputError, match="no set of queries") as caught:
         read_queries(path)
@@ -291,8 +300,8 @@ def test_a_broken_set_is_one_line(tmp_path, change):
 
 
 def test_the_histogram_counts_every_gaussian(asked):
-    low, high, counts = histogram(asked.state.queries[0].result)
-    even = asked.state.queries[0].result.even
+    low, high, counts = histogram(result(asked, 0))
+    even = result(asked, 0).even
     assert (low, high) == (even.min(), max(even.max(), low + 1e-3))
     assert len(counts) == BINS
     assert np.expm1(counts.astype(np.float64)).sum() == pytest.approx(360, rel=1e-5)
@@ -315,9 +324,8 @@ def test_an_encoder_that_fails_is_one_line_and_a_phrasebook_needs_none(viewer, e
     viewer.services = replace(viewer.services, load_encoder=broken)
     open_scene(viewer, "book.ply")
     ask(viewer, "Book", "mug")
-    book, mug = viewer.state.queries
-    assert book.result.found
-    assert mug.problem == said
+    assert result(viewer, 0).found
+    assert answer(viewer, 1).problem == said
 
 
 @pytest.mark.parametrize("encoder_id", ["demo", "~", "somebody/some-model"])
@@ -331,4 +339,4 @@ def test_a_local_encoder_is_loaded_while_the_user_looks_round(viewer, encoder_id
     assert viewer.worker.current == ("searching 'mug'", 0.0) or asked
     settle(viewer)
     assert asked == [encoder_id]
-    assert viewer.state.queries[0].result.found
+    assert result(viewer, 0).found

@@ -20,7 +20,7 @@ from langsplat_viewer.rendering.renderer import render_image
 from langsplat_viewer.rendering.request import Clip, Splats
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
-from tests.support.windowless import act, ask, errors, open_scene, recorded
+from tests.support.windowless import act, ask, errors, open_scene, recorded, result
 
 
 def turn(viewer: Viewer, yaw: float) -> None:
@@ -38,7 +38,7 @@ def record_three(viewer: Viewer) -> list:
 
 
 def times(viewer: Viewer) -> list[float]:
-    return [key.seconds for key in viewer.state.record.keyframes]
+    return [key.seconds for key in viewer.state.session.keyframes]
 
 
 @pytest.fixture
@@ -97,21 +97,21 @@ def test_a_turntable_comes_back_and_begins_anew_after_a_drag(opened):
 
 def test_keyframes_are_changed_and_changes_undone(opened):
     record_three(opened)
-    first, second, third = opened.state.record.keyframes
+    first, second, third = opened.state.session.keyframes
     filming.move_keyframe(opened, second, 5.0)
     assert times(opened) == [0, 4, 5]
-    filming.move_keyframe(opened, opened.state.record.keyframes[2], 4.0)  # there is one
+    filming.move_keyframe(opened, opened.state.session.keyframes[2], 4.0)  # there is one
     assert times(opened) == [0, 4, 4.01]
     filming.delete_keyframe(opened, first)
     assert times(opened) == [4, 4.01]
     for expected in ([0, 4, 4.01], [0, 4, 5], [0, 2, 4], [0, 2]):
         editing.undo(opened)
         assert times(opened) == expected
-    assert opened.state.record.keyframes == (first, second)
+    assert opened.state.session.keyframes == (first, second)
     editing.redo(opened)
-    assert opened.state.record.keyframes == (first, second, third)
+    assert opened.state.session.keyframes == (first, second, third)
     filming.replace_keyframe(opened, first)
-    assert_allclose(opened.state.record.keyframes[0].pose.position, opened.state.view.eye)
+    assert_allclose(opened.state.session.keyframes[0].pose.position, opened.state.view.eye)
     filming.set_path_seconds(opened, 8)
     assert times(opened) == [0, 4, 8]
     filming.clear_path(opened)
@@ -164,7 +164,7 @@ def test_a_film_is_made_beside_the_window(opened, folder):
     assert "blobs-film-001/: 32x24, 5 pictures" in " ".join(m.text for m in opened.state.messages)
     seen = sorted((folder / "blobs-film-001").glob("*.png"))
     assert len(seen) == 5
-    camera = opened.state.record.keyframes[1].pose.camera(32, 24)
+    camera = opened.state.session.keyframes[1].pose.camera(32, 24)
     expected = render_image(request.seen_by(camera), "cpu")
     np.testing.assert_array_equal(np.asarray(Image.open(seen[2])), expected)
 
@@ -187,8 +187,8 @@ def see_depth(viewer) -> None:
 
 def cut_by_hand(viewer) -> None:
     settings.set_display(viewer, "segmentation")
-    query = viewer.state.queries[1]
-    queries.set_cut(viewer, query, float(np.median(query.automatic.even[query.automatic.members])))
+    found = result(viewer, 1)
+    queries.set_cut(viewer, found.phrase, float(np.median(found.even[found.members])))
 
 
 def look_flat(viewer) -> None:
@@ -208,11 +208,11 @@ LOOKS = {  # whether after a search, and what is set then
     "clip": (False, lambda viewer: settings.set_clip(viewer, Clip(4.4, 5.1))),
     "latent": (False, lambda viewer: settings.set_display(viewer, "latent", 1)),
     "queries": (True, lambda viewer: None),
-    "colours": (True, lambda viewer: queries.hide(viewer, viewer.state.queries[0])),
+    "colours": (True, lambda viewer: queries.hide(viewer, viewer.state.session.queries[0])),
     "sliders": (True, lambda viewer: settings.set_picture(viewer, SLIDERS)),
     "scale": (True, lambda viewer: settings.set_picture(viewer, replace(SLIDERS, heat_scale=(0.4, 0.9)))),
     "cuts": (True, cut_by_hand),
-    "canonical": (True, lambda viewer: act(queries.set_canonical, viewer, "book, plant")),
+    "canonical": (True, lambda viewer: act(queries.set_canonical, viewer, ("book", "plant"))),
 }
 
 
@@ -243,7 +243,7 @@ def test_the_command_on_the_clipboard_draws_the_same_picture(opened, folder, run
 
 
 def test_what_the_command_cannot_say_is_said(opened, folder):
-    settings.set_splats(opened, Splats(0.5))
+    opened.change(splats=Splats(0.5))
     settings.toggle_wipe(opened)
     filming.copy_command(opened, folder)
     (said,) = errors(opened)

@@ -409,7 +409,7 @@ def test_clip_moves_the_near_plane_only_away_from_the_eye():
 def test_the_far_cut_is_not_nearer_than_the_near_one(opened):
     for wanted, kept in ((Clip(3.0, 2.0), Clip(3.0, 3.0)), (Clip(-1.0, 2.0), Clip(0.0, 2.0))):
         settings.set_clip(opened, wanted)
-        assert opened.state.settings.clip == kept
+        assert opened.state.session.clip == kept
 
 
 @pytest.fixture

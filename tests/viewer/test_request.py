@@ -14,7 +14,8 @@ from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Scene
 from langsplat_viewer import output
-from langsplat_viewer.actions import filming, opening, queries, selecting, settings, viewpoint
+from langsplat_viewer.actions import filming, queries, selecting, settings, viewpoint
+from langsplat_viewer.actions.selecting import mark
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.commands import BUTTONS, COMMANDS, OVERLAY_TITLES, matching
 from langsplat_viewer.files.preferences import FILE_NAME, load_preferences, save_preferences
@@ -34,7 +35,8 @@ from langsplat_viewer.rendering.request import (
     plain_request,
     with_splats,
 )
-from langsplat_viewer.state import KEPT, OVERLAYS, Ruler, Timing
+from langsplat_viewer.session import OVERLAYS, Ruler
+from langsplat_viewer.state import KEPT, Timing
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene, cameras
 from tests.support.scenes import random_gaussians
@@ -48,6 +50,7 @@ from tests.support.windowless import (
     open_scene,
     recorded,
     rest,
+    result,
 )
 
 SCENE = blob_scene()
@@ -59,20 +62,20 @@ NOTHING = np.zeros(360, bool)
 
 def edit_everything(viewer: Viewer, mode: str) -> None:
     """Every setting off its default: one blob hidden in part, one selected, one deleted in part."""
-    state, odd = viewer.state, np.arange(360) % 2 == 1
+    odd = np.arange(360) % 2 == 1
     settings.resize(viewer, 160, 120)
     go(viewpoint.look_from, viewer, "left")
     ask(viewer, "mug", "plant")
     marks = Marks(blob("book") & odd, blob("mug") & odd, blob("plant") & odd)
-    state.selection = replace(state.selection, marks=marks)
-    settings.set_splats(viewer, Splats(0.8, 0))
+    mark(viewer, marks)
+    viewer.change(splats=Splats(0.8, 0))
     settings.set_clip(viewer, Clip(0.5, 6.5))
     heat = {"heat_opacity": 0.6, "dim": 0.7, "threshold": 0.3, "heat_scale": (0.1, 0.8)}
     settings.set_picture(viewer, PictureConfig(**heat, alpha_gate=0.2, background=(0.1, 0.6, 0.3)))
     settings.set_colour_map(viewer, "viridis")
     settings.set_display(viewer, "relevancy", 1)
     split = Split(mode, second="segmentation", second_level=0, at=0.4)
-    state.settings = replace(state.settings, split=split)
+    viewer.change(split=split)
 
 
 def image(path: Path) -> np.ndarray:
@@ -99,7 +102,7 @@ def test_screen_file_film_and_reference_agree(gl, opened, tmp_path, monkeypatch,
             assert getattr(request.picture, field.name) != field.default, field.name
 
     rest(canvas, state, 1.0)
-    screen = state.settings.split.joined(on_screen(canvas), state.size[0]).astype(int)
+    screen = state.session.split.joined(on_screen(canvas), state.size[0]).astype(int)
     images = {"screen": screen, "saved": image(filming.save_picture(opened, tmp_path))}
     filming.set_film_size(opened, *state.size)
     filming.save_sized_picture(opened, tmp_path)
@@ -126,7 +129,7 @@ def test_images_are_saved_without_background_if_so_chosen(gl, opened, tmp_path):
     settings.resize(opened, 40, 30)
     filming.set_film_size(opened, 40, 30)
     assert image(filming.save_picture(opened, tmp_path)).shape == (30, 40, 3)
-    settings.save_transparent(opened, True)
+    settings.set_picture(opened, replace(opened.state.session.picture, transparent=True))
     saved = image(filming.save_picture(opened, tmp_path))
     filming.save_sized_picture(opened, tmp_path)
     recorded(opened)
@@ -139,8 +142,8 @@ def test_images_are_saved_without_background_if_so_chosen(gl, opened, tmp_path):
 
 SEEN = {
     **CHANGES,
-    "slider": lambda v: settings.set_picture(v, replace(v.state.picture, dim=0.1)),
-    "cut": lambda v: queries.set_cut(v, v.state.queries[0], 0.7),
+    "slider": lambda v: settings.set_picture(v, replace(v.state.session.picture, dim=0.1)),
+    "cut": lambda v: queries.set_cut(v, "mug", 0.7),
     "split": settings.toggle_wipe,
 }
 UNSEEN = {
@@ -148,9 +151,11 @@ UNSEEN = {
     "ruler": settings.toggle_measuring,
     "tool": lambda v: selecting.use_tool(v, "brush"),
     "word": lambda v: setattr(v.state, "typed", "plant"),
-    "chosen query": lambda v: queries.select(v, None),
-    "photograph": lambda v: opening.fade_photograph(v, 0.5),
-    "saved without background": lambda v: settings.save_transparent(v, True),
+    "chosen query": lambda v: v.put(chosen=""),
+    "photograph": lambda v: v.change(fade=0.5),
+    "saved without background": lambda v: settings.set_picture(
+        v, replace(v.state.session.picture, transparent=True)
+    ),
 }
 
 
@@ -198,7 +203,7 @@ def test_the_second_pane_is_what_the_display_would_show_alone(opened):
     settings.compare_with(opened, "relevancy")
     first, second = opened.state.panes()
     assert (first.picture.display, second.picture.display) == ("rgb", "relevancy")
-    settings.show_one(opened)
+    settings.set_split(opened, "off")
     settings.set_display(opened, "relevancy")
     assert opened.state.panes() == (second,)
 
@@ -212,11 +217,11 @@ def test_three_levels_of_latents_or_of_answers(opened):
     assert (request.camera.width, request.camera.height, request.size) == (66, 90, (200, 90))
     ask(opened, "plant")
     settings.set_display(opened, "segmentation")
-    result = opened.state.queries[0].result
+    relevancy = result(opened).relevancy
     panes, found = opened.state.panes(), Inputs().channels(opened.state.request())
     assert [pane.picture.display for pane in panes] == ["relevancy"] * 3
     for level, channel in enumerate(found):
-        np.testing.assert_array_equal(channel[:, 0], result.relevancy[level])
+        np.testing.assert_array_equal(channel[:, 0], relevancy[level])
     assert len({pane.ranges for pane in panes}) == 1  # they share one scale
     settings.toggle_levels(opened)
     assert [pane.label for pane in opened.state.panes()] == ["Segmentation"]
@@ -226,19 +231,19 @@ def test_without_a_field_levels_and_latents_are_refused(viewer):
     viewer.state.scene = Scene(random_gaussians(5))
     settings.toggle_levels(viewer)
     settings.compare_with(viewer, "latent", 1)
-    assert viewer.state.settings.split.mode == "off"
+    assert viewer.state.session.split.mode == "off"
     assert len(errors(viewer)) == 1  # the same line is not said twice
     (wipe,) = (command for command in COMMANDS if "V" in command.keys)
     for mode in ("wipe", "off"):
         wipe.act(viewer)
-        assert viewer.state.settings.split.mode == mode
+        assert viewer.state.session.split.mode == mode
     assert len({compared_name(button) for button in BUTTONS}) == len(BUTTONS)
 
 
 def test_panes_are_joined_at_the_line(opened):
     for at, kept in ((-3.0, AT_RANGE[0]), (0.3, 0.3), (2.0, AT_RANGE[1])):
         settings.move_line(opened, at)
-        assert opened.state.settings.split.at == kept
+        assert opened.state.session.split.at == kept
     for u, inside in ((0.0, 0.0), (0.2, 0.6), (0.5, 0.5), (1.0, 1.0)):
         assert Split("levels").within_pane(u) == pytest.approx(inside)
         assert Split("wipe").within_pane(u) == u
@@ -316,16 +321,13 @@ def test_edited_scenes_share_what_did_not_change():
     assert other.scene is not first.scene
 
 
-def test_splats_are_drawn_smaller_and_of_one_colour(opened):
+def test_splats_are_drawn_smaller_and_of_one_colour():
     scene = Scene(random_gaussians(40, sh_degree=3))
     assert with_splats(scene, Splats()) is scene
     drawn = with_splats(scene, Splats(0.25, 1)).gaussians
     np.testing.assert_allclose(np.exp(drawn.log_scales), 0.25 * np.exp(scene.gaussians.log_scales), rtol=1e-5)
     np.testing.assert_array_equal(drawn.sh, scene.gaussians.sh[:, :4])
     assert with_splats(Scene(drawn), Splats(sh_degree=2)).gaussians is drawn  # it has no more
-    for wanted, kept in ((Splats(7.0, 9), Splats()), (Splats(0.0, -1), Splats(0.1, 0))):
-        settings.set_splats(opened, wanted)
-        assert opened.state.settings.splats == kept
 
 
 # Over the image: overlays and the ruler.
@@ -334,16 +336,16 @@ def test_splats_are_drawn_smaller_and_of_one_colour(opened):
 def test_overlays_and_colour_map_have_commands_and_are_remembered(opened, tmp_path):
     for name in reversed(OVERLAYS):
         (command,) = matching(OVERLAY_TITLES[name])
-        if name not in opened.state.preferences.overlays:
+        if name not in opened.state.session.overlays:
             command.act(opened)
-    assert opened.state.preferences.overlays == OVERLAYS
+    assert opened.state.session.overlays == OVERLAYS
     settings.set_colour_map(opened, "cividis")
     assert opened.state.request().picture.colour_map == "cividis"
+    settings.keep_preferences(opened)
     save_preferences(tmp_path, opened.state.preferences)
     assert load_preferences(tmp_path) == opened.state.preferences
-    for _ in range(2):
-        settings.show_overlay(opened, "cube", False)
-    assert opened.state.preferences.overlays == tuple(name for name in OVERLAYS if name != "cube")
+    settings.toggle_overlay(opened, "cube")
+    assert opened.state.session.overlays == tuple(name for name in OVERLAYS if name != "cube")
     (tmp_path / FILE_NAME).write_text('{"colour_map": "rainbow"}')
     with pytest.raises(InputError, match=r"rainbow.*viridis"):
         load_preferences(tmp_path)
@@ -351,21 +353,21 @@ def test_overlays_and_colour_map_have_commands_and_are_remembered(opened, tmp_pa
 
 def test_two_clicks_measure_and_a_third_begins_anew(opened):
     settings.toggle_measuring(opened)
-    assert opened.state.ruler.length is None
+    assert opened.state.session.ruler.length is None
     settings.measure_at(opened, 0.95, 0.5)
-    assert opened.state.ruler.points == ()
+    assert opened.state.session.ruler.points == ()
     assert "nothing under the cursor" in opened.state.messages[-1].text
     settings.measure_at(opened, 0.5, 0.5)
     settings.measure_at(opened, 0.8, 0.1)  # the fake surface: (u - 0.5, v - 0.5, 0)
-    assert opened.state.ruler.length == pytest.approx(0.5)
+    assert opened.state.session.ruler.length == pytest.approx(0.5)
     settings.measure_at(opened, 0.6, 0.6)
-    assert opened.state.ruler.length is None
-    assert len(opened.state.ruler.points) == 1
+    assert opened.state.session.ruler.length is None
+    assert len(opened.state.session.ruler.points) == 1
     for end in (settings.escape, lambda viewer: open_scene(viewer, "plain.ply")):
         settings.measure(opened, True)
         settings.measure_at(opened, 0.5, 0.5)
         end(opened)
-        assert opened.state.ruler == Ruler()
+        assert opened.state.session.ruler == Ruler()
 
 
 # Times of the steps.

@@ -15,17 +15,21 @@ from langsplat_viewer.actions import editing, opening, queries, selecting, setti
 from langsplat_viewer.actions.selecting import take
 from langsplat_viewer.camera.controls import from_camera
 from langsplat_viewer.marks import Drawn, Stroke, outlines
+from langsplat_viewer.state import Answer
 from tests.support.fakes import CENTRES, COLOURS, PER_BLOB
 from tests.support.windowless import (
     SCENES,
     FakeSurface,
     act,
+    answer,
     ask,
     blob,
     errors,
     marked,
     marks_of,
     open_scene,
+    phrases,
+    result,
     settle,
 )
 
@@ -65,7 +69,7 @@ def test_what_is_hidden_or_deleted_is_never_selected(opened):
 )
 def test_what_is_found_is_combined_by_the_mode(opened, mode, selected):
     take(opened, blob("mug") | blob("book"))
-    selecting.set_mode(opened, mode)
+    selecting.set_tools(opened, mode=mode)
     take(opened, blob("book") | blob("plant"))
     assert marked(opened)[0] == selected
 
@@ -94,7 +98,7 @@ def test_what_changes_nothing_is_no_step(opened):
     take(opened, blob("mug"))
     assert len(opened.history.past) == 1
     selecting.use_tool(opened, "brush")
-    selecting.set_brush(opened, 0.1)
+    selecting.set_tools(opened, brush=0.1)
     assert len(opened.history.past) == 1
 
 
@@ -104,16 +108,16 @@ def test_what_the_search_found_or_did_not(searched):
     ask(searched, "mug")
     selecting.select_query(searched, mode="add")
     assert marked(searched)[0] == "mug book"
-    query, mug = searched.state.queries
-    (thing,) = query.things
+    (thing,) = answer(searched, 0).things
     selecting.select_thing(searched, thing)
     np.testing.assert_array_equal(np.flatnonzero(marks_of(searched).selected), thing.members)
     selecting.select_none(searched)
-    queries.remove(searched, mug)
-    query.result = replace(query.result, judgement=query.result.judgement.absent)
+    queries.remove(searched, "mug")
+    absent = replace(result(searched), judgement=result(searched).judgement.absent)
+    searched.state.answers["book"] = Answer(absent)
     selecting.select_query(searched)
     assert "'book' is not here" in searched.state.messages[-1].text
-    queries.remove(searched, query)
+    queries.remove(searched, "book")
     selecting.select_query(searched)
     assert "search for something first" in searched.state.messages[-1].text
     assert marked(searched) == ("", "", "")
@@ -123,7 +127,7 @@ def test_growing_and_shrinking_follow_the_surface(opened):
     means = opened.state.scene.gaussians.means
     core = np.linalg.norm(means, axis=1) < 0.15
     take(opened, core)
-    selecting.set_reach(opened, 0.15)
+    selecting.set_tools(opened, reach=0.15)
     act(selecting.grow_selection, opened)
     grown = marks_of(opened).selected.copy()
     assert core.sum() < grown.sum()
@@ -147,10 +151,10 @@ def test_another_scene_has_no_marks_but_the_tool_stays(opened):
     take(opened, blob("mug"))
     selecting.hide_selected(opened)
     selecting.use_tool(opened, "lasso")
-    selecting.set_mode(opened, "add")
+    selecting.set_tools(opened, mode="add")
     open_scene(opened, "plain.ply")
     assert marked(opened) == ("", "", "")
-    assert (opened.state.selection.tool, opened.state.selection.mode) == ("lasso", "add")
+    assert (opened.state.tools.tool, opened.state.tools.mode) == ("lasso", "add")
 
 
 # Selecting with the mouse: what a stroke encloses, and what becomes of it. No window.
@@ -199,9 +203,9 @@ def test_a_stroke_selects_what_it_encloses_or_sweeps_over_and_is_undone(front):
     editing.undo(front)
     assert marked(front)[0] == "mug"
     assert draw(front, "lasso", around(front, CENTRES[1])) == "book"
-    selecting.set_brush(front, 0.12)
+    selecting.set_tools(front, brush=0.12)
     assert draw(front, "brush", [place(front, CENTRES[0]), place(front, CENTRES[1])]) == "mug book"
-    selecting.set_brush(front, 0.01)
+    selecting.set_tools(front, brush=0.01)
     draw(front, "brush", [place(front, CENTRES[2])])
     assert 0 < marks_of(front).selected.sum() < PER_BLOB
 
@@ -226,7 +230,7 @@ def test_what_lies_behind_something_is_left_out_unless_all_is_wanted(front, monk
     draw(front, "rectangle", corners(front, CENTRES[1]))
     z = front.state.scene.gaussians.means[:, 2]
     in_front = marks_of(front).selected
-    selecting.set_only_visible(front, False)
+    selecting.set_tools(front, only_visible=False)
     assert draw(front, "rectangle", corners(front, CENTRES[1])) == "book"
     np.testing.assert_array_equal(in_front, marks_of(front).selected & (z + 5 <= 4.95 * 1.03))
     assert 20 < in_front.sum() < 100
@@ -253,12 +257,12 @@ def test_escape_gives_up_the_stroke_then_the_tool_and_help_before_both(front):
     selecting.begin_stroke(front, 0.1, 0.1)
     front.state.show_help = True
     settings.escape(front)
-    assert front.state.selection.stroke is not None
+    assert front.state.tools.stroke is not None
     settings.escape(front)
-    assert (front.state.selection.stroke, front.state.selection.tool) == (None, "lasso")
+    assert (front.state.tools.stroke, front.state.tools.tool) == (None, "lasso")
     selecting.end_stroke(front)  # of nothing
     settings.escape(front)
-    assert front.state.selection.tool is None
+    assert front.state.tools.tool is None
     assert marked(front) == ("", "", "")
 
 
@@ -315,7 +319,7 @@ def test_the_selection_and_the_rest_are_scenes_with_their_field(pruned, tmp_path
         written, means = load_scene(path), SCENES["blobs.ply"].gaussians.means
         np.testing.assert_array_equal(written.gaussians.means, means[blob(word)])
         assert (len(written.language), len(written.cameras)) == (120, 3)
-    assert pruned.state.selection.is_unsaved  # neither is the scene
+    assert pruned.state.is_unsaved  # neither is the scene
 
 
 def test_points_have_their_colours(opened, tmp_path):
@@ -361,19 +365,19 @@ def test_deleting_is_unsaved_until_the_scene_is_saved(pruned, tmp_path):
         (selecting.delete_selected, True),
     ):
         act(action, pruned)
-        assert pruned.state.selection.is_unsaved == unsaved, action
+        assert pruned.state.is_unsaved == unsaved, action
     assert kept_in(tmp_path) == 240
 
 
 def test_another_scene_waits_for_the_answer(pruned, tmp_path):
-    for answer in (selecting.stay, settings.escape, selecting.discard_and_leave):
+    for reply in (selecting.stay, settings.escape, selecting.discard_and_leave):
         opening.open_scene(pruned, Path("plain.ply"))
         assert pruned.state.opening is None
-        assert pruned.state.selection.leaving.to == "plain.ply is opened"
+        assert pruned.state.leaving.to == "plain.ply is opened"
         assert marked(pruned) == ("", "", "plant")
-        act(answer, pruned)
-        left = answer is selecting.discard_and_leave
-        assert pruned.state.selection.leaving is None
+        act(reply, pruned)
+        left = reply is selecting.discard_and_leave
+        assert pruned.state.leaving is None
         assert pruned.state.path.name == ("plain.ply" if left else "blobs.ply")
     assert names_in(tmp_path) == []
 
@@ -382,7 +386,7 @@ def test_a_broken_scene_after_discarding_loses_nothing(pruned):
     opening.open_scene(pruned, Path("broken.ply"))
     act(selecting.discard_and_leave, pruned)
     assert marked(pruned) == ("", "", "plant")
-    assert pruned.state.selection.is_unsaved
+    assert pruned.state.is_unsaved
 
 
 def test_saving_comes_before_what_waited(pruned, tmp_path):
@@ -400,15 +404,15 @@ def test_where_saving_fails_nothing_is_left(pruned, tmp_path):
     (tmp_path / "file").write_text("")
     act(selecting.save_and_leave, pruned, tmp_path / "file")
     assert "not saved" in errors(pruned)[-1]
-    assert not pruned.state.selection.may_close
-    assert pruned.state.selection.is_unsaved
+    assert not pruned.state.may_close
+    assert pruned.state.is_unsaved
 
 
 def test_a_process_that_has_to_end_saves_what_is_not(pruned, tmp_path):
     selecting.end(pruned, tmp_path)
-    assert not pruned.state.selection.may_close
+    assert not pruned.state.may_close
     settle(pruned)
-    assert pruned.state.selection.may_close
+    assert pruned.state.may_close
     assert kept_in(tmp_path) == 240
 
 
@@ -416,10 +420,9 @@ def test_what_is_named_is_found_by_its_name_and_kept_where_it_is_saved(opened, t
     take(opened, blob("plant"))
     queries.type_name(opened, "grandma's mug")
     act(queries.name_selection, opened)
-    query = opened.state.queries[-1]
-    assert query.phrase == "grandma's mug"
-    np.testing.assert_array_equal(query.result.members, blob("plant"))
-    assert opened.state.selection.name == ""
+    assert phrases(opened) == ["grandma's mug"]
+    np.testing.assert_array_equal(result(opened).members, blob("plant"))
+    assert opened.state.tools.name == ""
     act(selecting.export, opened, tmp_path, "edited")
     (saved,) = tmp_path.glob("*.ply")
     assert [word.name for word in load_scene(saved).language.taught] == ["grandma's mug"]
@@ -433,14 +436,14 @@ def test_what_cannot_be_a_name_is_said(opened):
     queries.type_name(opened, "the")
     act(queries.name_selection, opened)
     assert "'the' cannot be a name" in errors(opened)[-1]
-    assert (opened.state.queries, opened.state.selection.name) == ([], "the")
+    assert (opened.state.session.queries, opened.state.tools.name) == ((), "the")
 
 
 # By numbers.
 
 
 def test_values_in_a_range_are_selected_and_nothing_that_is_hidden(opened):
-    selecting.set_measure(opened, "relevancy")  # of an answer: there is none
+    selecting.set_tools(opened, measure="relevancy")  # of an answer: there is none
     assert selecting.values_shown(opened) is None
     selecting.brush_values(opened, 0.5)
     selecting.end_brush(opened)
@@ -450,7 +453,7 @@ def test_values_in_a_range_are_selected_and_nothing_that_is_hidden(opened):
     away = np.linalg.norm(means - opened.state.view.eye, axis=1)
     take(opened, away < np.median(away))
     selecting.hide_selected(opened)
-    selecting.set_measure(opened, "distance")
+    selecting.set_tools(opened, measure="distance")
     found = selecting.values_shown(opened)
     assert found is selecting.values_shown(opened)
     assert found.counts.sum() > 0
@@ -460,17 +463,17 @@ def test_values_in_a_range_are_selected_and_nothing_that_is_hidden(opened):
     selecting.brush_values(opened, -3.0)  # the mouse is outside
     selecting.end_brush(opened)
     cut = 10 ** ((found.low + found.high) / 2)
-    chosen = opened.state.selection.marks.selected
+    chosen = opened.state.marks.selected
     np.testing.assert_array_equal(chosen, (away >= np.median(away)) & (away <= cut))
     selecting.select_none(opened)
     selecting.select_range(opened, f"{10**found.low:.9g} to {cut:.9g}")
-    assert (opened.state.selection.marks.selected != chosen).sum() <= 2  # at the ends
+    assert (opened.state.marks.selected != chosen).sum() <= 2  # at the ends
     for text in ("0.5", "near to far", ""):
         selecting.select_range(opened, text)
         assert "two numbers" in errors(opened)[-1]
     viewpoint.frame_scene(opened)
-    selecting.set_measure(opened, "relevancy")
-    assert selecting.values_shown(opened).high == pytest.approx(opened.state.queries[0].result.even.max())
+    selecting.set_tools(opened, measure="relevancy")
+    assert selecting.values_shown(opened).high == pytest.approx(result(opened, 0).even.max())
 
 
 @pytest.mark.parametrize("measure", marks.MEASURES)

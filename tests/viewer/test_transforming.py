@@ -1,6 +1,5 @@
 """The scene and the selection are transformed and cropped, as seen and as saved; and that is undone."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from langsplat_viewer.panels.select import box_of, dragged, gl_matrices
 from langsplat_viewer.state import EditForm
 from tests.support.fakes import CENTRES
 from tests.support.scenes import random_camera, without_perspective
-from tests.support.windowless import act, ask, errors, open_scene, settle
+from tests.support.windowless import act, ask, errors, open_scene, result, settle
 
 MUG = CENTRES[0]
 STEP = np.array([0.0, 2.0, -1.0])
@@ -23,7 +22,7 @@ STEP = np.array([0.0, 2.0, -1.0])
 def selected_mug(viewer) -> np.ndarray:
     ask(viewer, "mug")
     selecting.select_query(viewer)
-    chosen: np.ndarray = viewer.state.selection.marks.selected
+    chosen: np.ndarray = viewer.state.marks.selected
     assert 0 < chosen.sum() < len(chosen)
     return chosen
 
@@ -34,21 +33,21 @@ def means(viewer) -> np.ndarray:
 
 def test_the_selection_moves_alone_and_is_found_where_it_went(opened):
     chosen, before = selected_mug(opened), means(opened)
-    place, cameras = opened.state.queries[0].result.place, opened.state.scene.cameras
+    place, cameras = result(opened, 0).place, opened.state.scene.cameras
     act(editing.transform, opened, moving(STEP))
     np.testing.assert_allclose(means(opened)[chosen], before[chosen] + STEP, atol=1e-5)
     np.testing.assert_array_equal(means(opened)[~chosen], before[~chosen])
     assert opened.state.scene.cameras is cameras
-    np.testing.assert_allclose(opened.state.queries[0].result.place, place + STEP, atol=1e-4)
-    np.testing.assert_array_equal(opened.state.selection.marks.selected, chosen)
+    np.testing.assert_allclose(result(opened, 0).place, place + STEP, atol=1e-4)
+    np.testing.assert_array_equal(opened.state.marks.selected, chosen)
     queries.type_name(opened, "trophy")  # what is taught goes along
     act(queries.name_selection, opened)
     act(editing.transform, opened, moving(STEP))
     assert opened.engine.is_taught("trophy")
     assert [word.name for word in opened.state.scene.language.taught] == ["trophy"]
-    opened.state.selection = replace(opened.state.selection, saved_moves=opened.state.selection.moves)
+    opened.state.saved = opened.state.session
     open_scene(opened, "plain.ply")  # begins without transforms, and has no language field
-    assert (opened.state.selection.moves, opened.state.opened) == ((), None)
+    assert (opened.state.session.moves, opened.state.opened) == ((), None)
     before = means(opened)
     act(editing.transform, opened, moving(STEP))
     np.testing.assert_allclose(means(opened), before + STEP, atol=1e-5)
@@ -68,7 +67,7 @@ def test_the_whole_scene_takes_its_cameras_along(opened):
 
 def test_undone_exactly_and_done_again(opened):
     chosen, first = selected_mug(opened), means(opened)
-    place = opened.state.queries[0].result.place
+    place = result(opened, 0).place
     editing.transform(opened, rotating(AXES["x"], 33).about(MUG))
     editing.transform(opened, moving(STEP))
     selecting.select_none(opened)
@@ -78,17 +77,17 @@ def test_undone_exactly_and_done_again(opened):
         editing.undo(opened)
     settle(opened)
     np.testing.assert_array_equal(means(opened), first)
-    np.testing.assert_array_equal(opened.state.selection.marks.selected, chosen)
-    np.testing.assert_allclose(opened.state.queries[0].result.place, place, atol=1e-6)
-    assert not opened.state.selection.is_unsaved
+    np.testing.assert_array_equal(opened.state.marks.selected, chosen)
+    np.testing.assert_allclose(result(opened, 0).place, place, atol=1e-6)
+    assert not opened.state.is_unsaved
     for _ in range(4):
         editing.redo(opened)
     settle(opened)
     np.testing.assert_array_equal(means(opened), last)
-    assert opened.state.selection.is_unsaved
+    assert opened.state.is_unsaved
     for _ in range(12):  # a full turn: of the same part all are one, and nothing to float32
         editing.transform(opened, rotating(AXES["y"], 30))
-    assert len(opened.state.selection.moves) == 2
+    assert len(opened.state.session.moves) == 2
     np.testing.assert_allclose(means(opened), last, atol=1e-5)
 
 
@@ -115,43 +114,43 @@ def test_what_is_saved_is_what_is_seen(opened, tmp_path):
     made = load_scene(next(tmp_path.glob("*.ply")))
     np.testing.assert_array_equal(made.gaussians.means, means(opened))
     assert made.language is not None
-    assert not opened.state.selection.is_unsaved
+    assert not opened.state.is_unsaved
     editing.transform(opened, moving(STEP))
     opening.open_scene(opened, Path("plain.ply"))  # is asked about first
-    assert opened.state.selection.leaving is not None
+    assert opened.state.leaving is not None
 
 
 def test_cropped_to_a_box_and_undone(opened):
     chosen = selected_mug(opened)
     editing.fill_box(opened)
     editing.crop(opened)
-    marks = opened.state.selection.marks
+    marks = opened.state.marks
     assert (marks.kept[chosen]).all()
     assert 0 < marks.kept.sum() < len(chosen)
     editing.undo(opened)
-    assert opened.state.selection.marks.kept.all()
+    assert opened.state.marks.kept.all()
     opened.state.edit_form = EditForm(low=(50.0, 50, 50), high=(51.0, 51, 51))
     editing.crop(opened)
     assert "holds nothing" in errors(opened)[-1]
-    assert opened.state.selection.marks.kept.all()
+    assert opened.state.marks.kept.all()
 
 
 def test_a_clip_follows_its_box_and_is_undone(opened):
     chosen = selected_mug(opened)
     editing.fill_box(opened)
     editing.clip(opened, True)
-    marks = opened.state.selection.marks
+    marks = opened.state.marks
     assert marks.shown[chosen].all()
     assert 0 < marks.hidden.sum() < len(chosen)
     assert not marks.deleted.any()
     editing.set_box(opened, (-9.0, -9.0, -9.0), (9.0, 9.0, 9.0))
     editing.follow_box(opened)
-    assert opened.state.selection.marks.shown.all()
+    assert opened.state.marks.shown.all()
     editing.undo(opened)
     editing.follow_box(opened)  # the box has not moved since: nothing is hidden or shown again
-    assert opened.state.selection.marks.hidden.any()
+    assert opened.state.marks.hidden.any()
     editing.clip(opened, False)
-    assert opened.state.selection.marks.shown.all()
+    assert opened.state.marks.shown.all()
 
 
 def test_the_numbers_of_the_panel(opened):

@@ -8,12 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from langsplat_viewer.actions import editing, opening, queries, selecting, settings
+from langsplat_viewer.actions import editing, queries, selecting, settings
 from langsplat_viewer.actions.selecting import mark
 from langsplat_viewer.marks import Marks, hiding, unmarked
 from langsplat_viewer.rendering.request import Clip, Splats
+from langsplat_viewer.session import Query, Ruler
 from langsplat_viewer.viewer import GESTURE, MOST_STEPS
-from tests.support.windowless import act, ask, open_scene, phrases, settle
+from tests.support.windowless import act, answer, ask, open_scene, phrases, result, settle
 
 
 def test_a_query_is_undone_and_done_again(opened):
@@ -22,14 +23,14 @@ def test_a_query_is_undone_and_done_again(opened):
     assert phrases(opened) == ["mug"]
     editing.undo(opened)
     assert phrases(opened) == []
-    assert opened.state.picture.display == "rgb"
+    assert opened.state.session.picture.display == "rgb"
     editing.undo(opened)
     assert "nothing to undo" in opened.state.messages[-1].text
     editing.redo(opened)
     act(editing.redo, opened)
     assert phrases(opened) == ["mug", "book"]
-    assert [query.slot for query in opened.state.queries] == [0, 1]
-    assert opened.state.picture.display == "relevancy"
+    assert [query.slot for query in opened.state.session.queries] == [0, 1]
+    assert opened.state.session.picture.display == "relevancy"
     assert len(opened.state.shown_results()) == 2
     editing.redo(opened)
     assert "nothing to redo" in opened.state.messages[-1].text
@@ -37,55 +38,52 @@ def test_a_query_is_undone_and_done_again(opened):
 
 def test_a_removed_query_comes_back_with_its_answer_and_colour(opened):
     ask(opened, "mug", "book")
-    mug = opened.state.queries[0]
-    queries.set_cut(opened, mug, 0.6)
-    count = mug.result.members.sum()
-    queries.remove(opened, mug)
+    queries.set_cut(opened, "mug", 0.6)
+    mug, count = opened.state.session.queries[0], result(opened, 0).members.sum()
+    queries.remove(opened, "mug")
     act(editing.undo, opened)
-    assert opened.state.queries[0] is mug
-    assert (mug.slot, mug.cut, mug.result.found, len(mug.things)) == (0, 0.6, True, 1)
-    assert mug.result.members.sum() == count
+    assert opened.state.session.queries[0] == mug == Query("mug", 0.6, 0, 1)
+    assert (result(opened, 0).found, len(answer(opened, 0).things)) == (True, 1)
+    assert result(opened, 0).members.sum() == count
 
 
-@pytest.mark.parametrize("leave", [lambda v: queries.remove(v, v.state.queries[-1]), editing.undo])
+@pytest.mark.parametrize("leave", [lambda v: queries.remove(v, phrases(v)[-1]), editing.undo])
 def test_history_keeps_no_answers_of_queries_that_are_gone(opened, leave):
     """Each has a number for every Gaussian and level."""
     ask(opened, "mug")
-    stays, gone = opened.state.queries[0].result, []
+    stays, gone = result(opened, 0), []
     for word in ("book", "plant"):
         ask(opened, word)
-        gone.append(weakref.ref(opened.state.queries[-1].result))
+        gone.append(weakref.ref(result(opened, -1)))
         opened.state.panes()
         leave(opened)
     gc.collect()
     assert [there() for there in gone] == [None, None]
-    assert opened.state.queries[0].result is stays
+    assert result(opened, 0) is stays
     (editing.redo if leave is editing.undo else editing.undo)(opened)
     settle(opened)
-    assert opened.state.queries[-1].phrase == "plant"
-    assert opened.state.queries[-1].result.found
+    assert opened.state.session.queries[-1].phrase == "plant"
+    assert result(opened, -1).found
 
 
 def test_an_answer_that_comes_after_its_query_was_taken_off_is_dropped(opened):
     queries.ask(opened, "mug")
-    mug = opened.state.queries[0]
-    act(queries.remove, opened, mug)
-    assert (mug.result, mug.pending) == (None, False)
+    act(queries.remove, opened, "mug")
+    assert opened.state.answers == {}
     editing.undo(opened)
-    assert mug.pending
+    assert answer(opened).pending
     settle(opened)
-    assert mug.result.found
+    assert result(opened).found
 
 
 def test_answers_come_back_at_their_level_and_another_scene_has_no_history(opened):
     ask(opened, "mug")
-    query = opened.state.queries[0]
-    queries.hide(opened, query)
+    queries.hide(opened, "mug")
     act(queries.set_level, opened, "part")
     act(editing.undo, opened)
-    assert (opened.state.level, query.result.level) == ("auto", 2)
+    assert (opened.state.session.level, result(opened).level) == ("auto", 2)
     editing.undo(opened)
-    assert query.slot == 0
+    assert opened.state.session.queries[0].slot == 0
     for _ in range(MOST_STEPS):
         settings.set_display(opened, "depth")
         settings.set_display(opened, "rgb")
@@ -96,33 +94,27 @@ def test_answers_come_back_at_their_level_and_another_scene_has_no_history(opene
 
 SETTINGS = {
     "picture": lambda v: settings.set_picture(
-        v, replace(v.state.picture, dim=0.2, background=(1.0, 1.0, 1.0))
+        v, replace(v.state.session.picture, dim=0.2, background=(1.0, 1.0, 1.0))
     ),
     "display": lambda v: settings.set_display(v, "depth"),
     "colour map": lambda v: settings.set_colour_map(v, "viridis"),
     "wipe": settings.toggle_wipe,
     "levels": settings.toggle_levels,
     "line": lambda v: settings.move_line(v, 0.3),
-    "splats": lambda v: settings.set_splats(v, Splats(0.5, 0)),
+    "splats": lambda v: v.change(splats=Splats(0.5, 0)),
     "cut": lambda v: settings.set_clip(v, Clip(1.0, 2.0)),
     "overlay": lambda v: settings.toggle_overlay(v, "grid"),
-    "backdrop": lambda v: settings.save_transparent(v, True),
-    "photograph": lambda v: opening.fade_photograph(v, 0.5),
+    "backdrop": lambda v: settings.set_picture(v, replace(v.state.session.picture, transparent=True)),
+    "photograph": lambda v: v.change(fade=0.5),
     "latents": lambda v: settings.set_display(v, "latent", 1),
 }
 
 
-def looks(viewer) -> tuple[object, ...]:
-    state = viewer.state
-    kept = (state.preferences.overlays, state.preferences.colour_map)
-    return state.picture, state.settings, state.latent_level, kept
-
-
 @pytest.mark.parametrize("name", SETTINGS)
 def test_a_setting_of_what_is_seen_is_undone_in_one_step(opened, name):
-    before = looks(opened)
+    before = opened.state.session
     SETTINGS[name](opened)
-    after = looks(opened)
+    after = opened.state.session
     assert after != before
     if name not in ("wipe", "levels", "overlay"):  # which would go back
         SETTINGS[name](opened)  # changes nothing, and is no step
@@ -131,16 +123,15 @@ def test_a_setting_of_what_is_seen_is_undone_in_one_step(opened, name):
     SETTINGS["wipe" if name == "levels" else "levels"](opened)
     for wanted in (after, before):
         editing.undo(opened)
-        assert looks(opened) == wanted
+        assert opened.state.session == replace(wanted, ruler=Ruler(measures=True))
     assert opened.history.past == []
-    assert opened.state.ruler.measures
     editing.redo(opened)
-    assert looks(opened) == after
+    assert opened.state.session == replace(after, ruler=Ruler(measures=True))
 
 
 def slide(viewer, seconds: float, dim: float) -> None:
     viewer.clock = seconds
-    settings.set_picture(viewer, replace(viewer.state.picture, dim=dim))
+    settings.set_picture(viewer, replace(viewer.state.session.picture, dim=dim))
 
 
 def test_a_slider_that_is_moved_is_one_step_and_another_time_another(opened):
@@ -150,27 +141,27 @@ def test_a_slider_that_is_moved_is_one_step_and_another_time_another(opened):
     slide(opened, 5.9 + 1.1 * GESTURE, 0.9)
     assert len(opened.history.past) == 2
     editing.undo(opened)
-    assert opened.state.picture.dim == pytest.approx(0.31)
+    assert opened.state.session.picture.dim == pytest.approx(0.31)
     slide(opened, opened.clock, 0.8)  # after an undo a step of its own
     editing.undo(opened)
-    assert opened.state.picture.dim == pytest.approx(0.31)
+    assert opened.state.session.picture.dim == pytest.approx(0.31)
     editing.undo(opened)
-    assert opened.state.picture.dim == 0.45
+    assert opened.state.session.picture.dim == 0.45
 
 
 def test_an_undone_setting_leaves_the_marks_the_same_objects(opened):
     """Else the scene would be made anew for every slider."""
     selecting.select_all(opened)
     settings.toggle_wipe(opened)
-    marks = opened.state.selection.marks
+    marks = opened.state.marks
     editing.undo(opened)
     editing.redo(opened)
-    assert opened.state.selection.marks is marks
+    assert opened.state.marks is marks
     selecting.hide_selected(opened)
-    hidden = opened.state.selection.marks.hidden
-    mark(opened, replace(opened.state.selection.marks, selected=~hidden | True))
+    hidden = opened.state.marks.hidden
+    mark(opened, replace(opened.state.marks, selected=~hidden | True))
     editing.undo(opened)
-    assert opened.state.selection.marks.hidden is hidden
+    assert opened.state.marks.hidden is hidden
 
 
 def changed(marks: Marks, rng: np.random.Generator, step: int) -> Marks:
@@ -183,15 +174,15 @@ def changed(marks: Marks, rng: np.random.Generator, step: int) -> Marks:
 def test_a_hundred_changes_of_a_million_gaussians_take_little_memory(viewer):
     """At random, so that nothing could be shared."""
     count, rng = 1_000_000, np.random.default_rng(0)
-    viewer.state.selection = replace(viewer.state.selection, marks=unmarked(count))
+    viewer.state.marks = unmarked(count)
     tracemalloc.start()
     try:
         for step in range(MOST_STEPS):
-            mark(viewer, changed(viewer.state.selection.marks, rng, step))
+            mark(viewer, changed(viewer.state.marks, rng, step))
         held, _ = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
     assert len(viewer.history.past) == MOST_STEPS
-    now = viewer.state.selection.marks
+    now = viewer.state.marks
     own = sum(mask.nbytes for mask in (now.selected, now.hidden))
     assert held - own < 15e6

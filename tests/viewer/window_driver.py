@@ -16,6 +16,8 @@ from threading import Event, Timer
 import numpy as np
 from PIL import Image
 
+from tests.support.windowless import answer, result
+
 from imgui_bundle import ImVec2, hello_imgui, imgui  # isort: skip
 from imgui_bundle.immapp import testing  # isort: skip
 from langsplat_core.config import PictureConfig
@@ -268,7 +270,7 @@ def find_the_plant(s: Session, rgb: np.ndarray) -> None:
     s.search("plant", stay=True)
     assert s.state.view is before
     assert list(s.folder.glob("blobs-*.png")) == []
-    assert s.state.queries[0].result.found
+    assert result(s, 0).found
     # The box keeps the keyboard, until Esc leaves it: then the next letter is a key again.
     assert imgui.get_io().want_text_input
     s.type("ff", frames=2)
@@ -278,7 +280,7 @@ def find_the_plant(s: Session, rgb: np.ndarray) -> None:
         s.key("escape", frames=2)
     s.key("F")
     assert s.state.typed == ""
-    np.testing.assert_allclose(s.state.view.target, s.state.queries[0].result.place)
+    np.testing.assert_allclose(s.state.view.target, result(s, 0).place)
     s.key("R")
     heat = s.shot("heat")
     assert is_hot(s.at(heat, PLANT))  # it is blue
@@ -299,7 +301,7 @@ def is_hot(colour: np.ndarray) -> bool:
 
 def find_more(s: Session) -> np.ndarray:
     s.search("sofa")
-    assert "sofa" in s.state.queries[1].problem
+    assert "sofa" in answer(s, 1).problem
     s.search("mug")
     both = s.shot("both")
     for point, slot in ((PLANT, 0), (MUG, 1)):  # each in its own colour; what is unknown takes none
@@ -327,18 +329,18 @@ def use_keys(s: Session) -> None:
     displays = ("rgb", "depth", "alpha", "relevancy", "segmentation", "latent", "latent")
     for digit, display in enumerate(displays, start=1):
         s.key(str(digit), frames=2)
-        assert s.state.picture.display == display
-    assert s.state.latent_level == 1
+        assert s.state.session.picture.display == display
+    assert s.state.session.latent_level == 1
     s.key("1", frames=1)
     s.key("R")
-    assert s.state.picture.display == "rgb"
+    assert s.state.session.picture.display == "rgb"
     width = s.state.size[0]
     s.key("f11")
     assert s.state.size[0] == 860
     assert width < 600
     s.key("f11")
     s.key("F")
-    np.testing.assert_allclose(s.state.view.target, s.state.queries[-1].result.place)
+    np.testing.assert_allclose(s.state.view.target, result(s, -1).place)
 
 
 def save_with_a_key(s: Session) -> None:
@@ -355,7 +357,7 @@ def without_field(s: Session) -> None:
     assert any("langsplat train" in message.text for message in s.state.messages)
     assert not s.ctx.item_exists("//**/##phrase")
     s.key("4", frames=1)  # relevancy: refused with a line, not a crash
-    assert s.state.picture.display == "rgb"
+    assert s.state.session.picture.display == "rgb"
 
     s.drop("truncated.ply")
     assert s.state.messages[-1].is_error
@@ -372,10 +374,10 @@ def without_field(s: Session) -> None:
 
 
 def from_the_command_line(s: Session) -> None:
-    assert [query.phrase for query in s.state.queries] == ["mug", "sofa", "plant"]
-    assert [query.result is not None for query in s.state.queries] == [True, False, True]
-    assert s.state.picture.display == "segmentation"
-    assert s.state.level == "whole"
+    assert [query.phrase for query in s.state.session.queries] == ["mug", "sofa", "plant"]
+    assert [s.state.result(query) is not None for query in s.state.session.queries] == [True, False, True]
+    assert s.state.session.picture.display == "segmentation"
+    assert s.state.session.level == "whole"
     expected = s.state.scene.cameras[2]
     np.testing.assert_allclose(s.state.view.eye, expected.position, atol=1e-9)
     np.testing.assert_allclose(s.state.view.rotation, expected.rotation, atol=1e-9)
@@ -445,16 +447,16 @@ def end_by_signals(s: Session) -> None:
     """What is not saved is asked about, and a film is waited for."""
     s.viewer.recorder.submit("a film", slow_film, print, print)
     selecting.quit_viewer(s.viewer)
-    s.until(lambda: s.state.selection.leaving is not None)
+    s.until(lambda: s.state.leaving is not None)
     s.click("//**/Stay", frames=2)
-    assert not s.state.selection.may_close
+    assert not s.state.may_close
     s.viewer.recorder.cancel()
     s.search("mug")
     s.menu("Select", "Select what the search found")
     s.key("delete")
     s.window.signals.append(signal.SIGINT)
-    s.until(lambda: s.state.selection.leaving is not None)
-    assert not s.state.selection.may_close
+    s.until(lambda: s.state.leaving is not None)
+    assert not s.state.may_close
     s.click("//**/Cancel", frames=2)
 
 

@@ -18,7 +18,6 @@ from langsplat_viewer.actions.opening import (
     open_scene,
     photograph_folder,
     reload,
-    return_to,
 )
 from langsplat_viewer.actions.queries import load_queries
 from langsplat_viewer.actions.settings import open_panel
@@ -97,7 +96,7 @@ def open_project(viewer: Viewer, path: Path, then: Callable[[Viewer], None] = la
         return
 
     def restore(viewer: Viewer) -> None:
-        return_to(viewer, projects.restore(viewer, project, path.absolute()))
+        projects.restore(viewer, project, path.absolute())
         then(viewer)
 
     open_scene(viewer, scene, restore)

@@ -14,12 +14,12 @@ from langsplat_core.errors import LangSplatError
 from langsplat_core.query.selection import in_box
 from langsplat_core.scene.transform import AXES, Similarity, moving, rotating, scaling
 from langsplat_viewer.actions.outline import apply_locks
-from langsplat_viewer.actions.queries import ask_again, ask_unanswered, set_canonical, set_cut, set_level
-from langsplat_viewer.actions.selecting import has_scene, mark, show_hidden
+from langsplat_viewer.actions.queries import ask_again, ask_unanswered, forget_unlisted, set_canonical
+from langsplat_viewer.actions.selecting import has_scene, mark, set_tools, show_hidden
 from langsplat_viewer.camera.controls import extent_of
-from langsplat_viewer.marks import Move, pack, unpack
-from langsplat_viewer.state import EditForm, Gizmo, Point
-from langsplat_viewer.viewer import Moment, Viewer, let_go, now, remember
+from langsplat_viewer.session import Move, Point, Session, pack
+from langsplat_viewer.state import EditForm, Gizmo
+from langsplat_viewer.viewer import Viewer
 
 
 def next_gizmo(viewer: Viewer) -> None:
@@ -34,7 +34,7 @@ def pivot(viewer: Viewer) -> Array | None:
     state = viewer.state
     if state.scene is None or state.extent is None:
         return None
-    selected, kept = state.selection.marks.selected, viewer.pivot
+    selected, kept = state.marks.selected, viewer.pivot
     if kept is None or kept[0] is not state.scene or kept[1] is not selected:  # asked in every frame
         chosen = selected & state.scene.gaussians.valid()
         middle = state.extent.centre
@@ -45,8 +45,7 @@ def pivot(viewer: Viewer) -> Array | None:
 
 
 def _move_of(viewer: Viewer, to: Similarity) -> Move:
-    selected = viewer.state.selection.marks.selected
-    return Move(to, np.packbits(selected) if selected.any() else None, len(selected))
+    return Move(to, pack(viewer.state.marks.selected))
 
 
 def preview(viewer: Viewer, to: Similarity) -> None:
@@ -61,38 +60,37 @@ def transform(viewer: Viewer, to: Similarity) -> None:
     viewer.state.moving = None
     if not has_scene(viewer) or to.is_identity:
         return
-    move, moves = _move_of(viewer, to), viewer.state.selection.moves
-    joined = (*moves[:-1], moves[-1].then(move)) if moves and moves[-1].moves_same(move) else (*moves, move)
-    remember(viewer)
+    move, before = _move_of(viewer, to), viewer.state.session
+    moves = before.moves
+    joined = (*moves[:-1], moves[-1].then(move)) if moves and moves[-1].of == move.of else (*moves, move)
+    viewer.change(moves=joined, ruler=replace(before.ruler, points=()))
     try:
-        place(viewer, joined)
+        place(viewer)
     except LangSplatError as error:
-        viewer.history.past.pop()
+        viewer.state.session = viewer.history.past.pop()
         viewer.say_error(str(error))
         return
-    what = "the scene" if move.packed is None else "the selection"
+    what = "the scene" if move.of is None else "the selection"
     viewer.state.say(f"transformed {what}; save the scene to keep it")
 
 
-def place(viewer: Viewer, moves: tuple[Move, ...]) -> None:
-    """Show the scene that was opened with `moves`; what was asked is asked anew. Raises InputError where a
-    move leads too far, and leaves everything as it was."""
+def place(viewer: Viewer) -> None:
+    """Make the scene that is shown from the one that was opened, by the session's transforms; what was asked
+    is asked anew. Raises InputError where one leads too far, and then changes nothing."""
     state = viewer.state
     if state.scene is None:
         return
     opened = state.opened or state.scene
     scene, field = opened, state.scene.language
-    for move in moves:
+    for move in state.session.moves:
         scene = move.applied(scene)
     if field is not None and viewer.engine is not None:
         field = replace(field, taught=tuple(viewer.engine.taught.values()))
     scene = replace(scene, language=field)
     state.opened, state.scene, state.extent, state.moving = opened, scene, extent_of(scene), None
-    state.ruler = replace(state.ruler, points=())
-    state.selection = replace(state.selection, moves=moves)
     viewer.engine, viewer.describer = viewer.services.engine(scene), None
-    if state.canonical:
-        set_canonical(viewer, ", ".join(state.canonical))  # which asks again
+    if state.session.canonical:
+        set_canonical(viewer, state.session.canonical)  # which asks again
     else:
         ask_again(viewer)
 
@@ -120,7 +118,7 @@ def fill_box(viewer: Viewer) -> None:
     state = viewer.state
     if state.scene is None:
         return
-    marks = state.selection.marks
+    marks = state.marks
     chosen = (marks.selected if marks.selected.any() else marks.shown) & state.scene.gaussians.valid()
     if chosen.any():
         means = state.scene.gaussians.means[chosen].astype(np.float64)
@@ -139,8 +137,8 @@ def _inside(viewer: Viewer) -> Array | None:
     if not has_scene(viewer) or state.scene is None:
         return None
     corners = np.array([form.low, form.high])
-    inside = in_box(state.scene.gaussians.means, corners.min(0), corners.max(0)) | state.selection.locked
-    if not (inside & state.selection.marks.kept).any():
+    inside = in_box(state.scene.gaussians.means, corners.min(0), corners.max(0)) | state.locked
+    if not (inside & state.marks.kept).any():
         viewer.say_error("the box holds nothing: set its corners around something, or press Fit")
         return None
     return inside
@@ -148,7 +146,7 @@ def _inside(viewer: Viewer) -> Array | None:
 
 def crop(viewer: Viewer) -> None:
     """Delete what lies outside the box of the panel; refused where nothing lies inside."""
-    inside, marks = _inside(viewer), viewer.state.selection.marks
+    inside, marks = _inside(viewer), viewer.state.marks
     if inside is not None:
         mark(viewer, replace(marks, selected=marks.selected & inside, deleted=marks.deleted | ~inside))
 
@@ -164,7 +162,7 @@ def clip(viewer: Viewer, on: bool) -> None:
 
 def follow_box(viewer: Viewer) -> None:
     """Hide what lies outside the box where it clips and has changed."""
-    form, marks = viewer.state.edit_form, viewer.state.selection.marks
+    form, marks = viewer.state.edit_form, viewer.state.marks
     if not form.clips or viewer.state.scene is None or form.clipped == (form.low, form.high):
         return
     viewer.state.edit_form = replace(form, clipped=(form.low, form.high))
@@ -173,13 +171,11 @@ def follow_box(viewer: Viewer) -> None:
         mark(viewer, replace(marks, selected=marks.selected & inside, hidden=marks.kept & ~inside))
 
 
-# Undo and redo of what was asked, shown, selected, hidden and deleted, and of the settings of what is seen.
-# The camera is not undone: its reset leads back.
+# Undo and redo. The camera is not undone: its reset leads back.
 
 
 def undo(viewer: Viewer) -> None:
-    """Go back to before the last query, removal, colour, level, keyframe, note, selection, hiding, deletion
-    or transform, or the last change of display, colours, sliders, split, cuts or overlays."""
+    """Go back to the session before the last step."""
     _step(viewer, viewer.history.past, viewer.history.future, "nothing to undo")
 
 
@@ -187,41 +183,32 @@ def redo(viewer: Viewer) -> None:
     _step(viewer, viewer.history.future, viewer.history.past, "nothing to redo")
 
 
-def _step(viewer: Viewer, there: list[Moment], back: list[Moment], otherwise: str) -> None:
+def _step(viewer: Viewer, there: list[Session], back: list[Session], otherwise: str) -> None:
     if not there:
         viewer.state.say(otherwise)
         return
     viewer.history.setting = ""
-    back.append(now(viewer))
-    _restore(viewer, there.pop())
+    back.append(viewer.state.session)
+    adopt(viewer, there.pop().undone(now=viewer.state.session))
 
 
-def _restore(viewer: Viewer, moment: Moment) -> None:
-    state, history = viewer.state, viewer.history
-    for query in state.queries:
-        query.slot = None
-    for query, slot, since, cut in moment.queries:
-        query.slot, query.shown_since = slot, since
-        if query.automatic is None:  # it is asked anew
-            query.cut = cut
-        set_cut(viewer, query, cut, is_new=False)
-    state.queries, state.selected = [query for query, *_ in moment.queries], moment.selected
-    marks = unpack(moment.marks, pack(state.selection.marks, history.marks))
-    state.selection = replace(state.selection, marks=marks, stroke=None)
-    state.record.keyframes, state.record.chosen = moment.keyframes, None
-    if moment.things != state.things:
-        state.things = moment.things
+def adopt(viewer: Viewer, session: Session) -> None:
+    """Take another session of the scene that is shown, and bring in line with it what follows from it: masks,
+    locks, the transformed scene, answers. Raises InputError where a transform leads too far."""
+    state, before = viewer.state, viewer.state.session
+    set_tools(viewer, stroke=None)
+    state.record.chosen = None
+    state.marks = session.marks.masks(before.marks, state.marks)
+    state.session = replace(session, canonical=before.canonical)  # until the engine compares with others
+    forget_unlisted(viewer)
+    if session.things.locked != before.things.locked:
         apply_locks(viewer)
-    state.notes = moment.notes
-    state.picture, state.latent_level = moment.picture, moment.latent_level
-    state.settings = moment.settings
-    looks = replace(state.preferences, colour_map=moment.picture.colour_map, overlays=moment.overlays)
-    state.preferences = looks
-    past, future = history.past, history.future
-    set_level(viewer, moment.level)
-    history.past, history.future = past, future  # what that has remembered is no step of its own
-    let_go(viewer)
-    if moment.moves != state.selection.moves:
-        place(viewer, moment.moves)
+    if session.moves != before.moves:
+        viewer.put(canonical=session.canonical)
+        place(viewer)
+    elif session.canonical != before.canonical:
+        set_canonical(viewer, session.canonical)  # which asks again
+    elif session.level != before.level:
+        ask_again(viewer)
     else:
         ask_unanswered(viewer)

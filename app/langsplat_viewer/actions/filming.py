@@ -46,7 +46,7 @@ from langsplat_viewer.output import (
 from langsplat_viewer.rendering.renderer import open_renderer
 from langsplat_viewer.rendering.request import Splats
 from langsplat_viewer.state import SPACING, ViewerState, flight_of
-from langsplat_viewer.viewer import Viewer, remember
+from langsplat_viewer.viewer import Viewer
 
 
 def save_picture(viewer: Viewer, folder: Path = Path()) -> Path | None:
@@ -56,13 +56,13 @@ def save_picture(viewer: Viewer, folder: Path = Path()) -> Path | None:
         viewer.say_error("open a scene first, then save a picture of it")
         return None
     path = free_name(folder, state.path.stem if state.path else "picture", ".png")
-    surface, other, transparent = viewer.surface, viewer.beside, state.settings.transparent
+    surface, other, transparent = viewer.surface, viewer.beside, state.session.picture.transparent
 
     def write() -> None:
         images = [surface.capture(state.request(transparent=transparent))]
         if other is not None and other.surface is not None and other.state.scene is not None:
             images.append(other.surface.capture(other.state.request(transparent=transparent)))
-        save_png(path, state.settings.split.joined(images, images[0].shape[1]))
+        save_png(path, state.session.split.joined(images, images[0].shape[1]))
 
     return viewer.save(path, write)
 
@@ -86,14 +86,15 @@ def add_keyframe(viewer: Viewer) -> None:
     if state.view is None:
         viewer.say_error("open a scene first, then record a path in it")
         return
-    last = record.keyframes[-1].seconds + SPACING if record.keyframes else 0.0
-    if last > LONGEST or len(record.keyframes) >= MOST_KEYFRAMES:
+    keyframes = state.session.keyframes
+    last = keyframes[-1].seconds + SPACING if keyframes else 0.0
+    if last > LONGEST or len(keyframes) >= MOST_KEYFRAMES:
         viewer.say_error(f"a path has at most {MOST_KEYFRAMES} keyframes and {LONGEST:.0f} seconds")
         return
     added = Keyframe(last, pose_of(state.view))
     record.turns = False
-    _set(viewer, (*record.keyframes, added), added)
-    state.say(f"keyframe {len(record.keyframes)} at {added.seconds:.1f} s")
+    _set(viewer, (*keyframes, added), added)
+    state.say(f"keyframe {len(keyframes) + 1} at {added.seconds:.1f} s")
 
 
 def choose_keyframe(viewer: Viewer, key: Keyframe) -> None:
@@ -105,12 +106,12 @@ def choose_keyframe(viewer: Viewer, key: Keyframe) -> None:
 
 def delete_keyframe(viewer: Viewer, key: Keyframe) -> None:
     """Take a keyframe off the path; the others keep their times."""
-    _set(viewer, tuple(other for other in viewer.state.record.keyframes if other is not key), None)
+    _set(viewer, tuple(other for other in viewer.state.session.keyframes if other is not key), None)
 
 
 def move_keyframe(viewer: Viewer, key: Keyframe, seconds: float) -> None:
     """Move a keyframe to another time, or beside a keyframe that has that time."""
-    others = tuple(other for other in viewer.state.record.keyframes if other is not key)
+    others = tuple(other for other in viewer.state.session.keyframes if other is not key)
     seconds = min(max(seconds, 0.0), LONGEST)
     while any(abs(other.seconds - seconds) < SAME_TIME for other in others):
         seconds += 0.01
@@ -121,30 +122,30 @@ def move_keyframe(viewer: Viewer, key: Keyframe, seconds: float) -> None:
 def replace_keyframe(viewer: Viewer, key: Keyframe) -> None:
     if viewer.state.view is not None:
         new = replace(key, pose=pose_of(viewer.state.view))
-        _set(viewer, with_keyframe(viewer.state.record.keyframes, new), new)
+        _set(viewer, with_keyframe(viewer.state.session.keyframes, new), new)
 
 
 def set_path_seconds(viewer: Viewer, seconds: float) -> None:
-    record = viewer.state.record
+    state, record = viewer.state, viewer.state.record
     seconds = min(max(seconds, 0.1), LONGEST)
     if record.turns:
         record.at *= seconds / record.turn_seconds
         record.turn_seconds = seconds
     elif path_seconds(viewer) > 0:
-        steps = len(record.keyframes) * SAME_TIME
-        _set(viewer, stretched(record.keyframes, max(seconds, steps)), None)
+        steps = len(state.session.keyframes) * SAME_TIME
+        _set(viewer, stretched(state.session.keyframes, max(seconds, steps)), None)
 
 
 def clear_path(viewer: Viewer) -> None:
-    if viewer.state.record.keyframes:
+    if viewer.state.session.keyframes:
         _set(viewer, (), None)
 
 
 def _set(viewer: Viewer, keyframes: tuple[Keyframe, ...], chosen: Keyframe | None) -> None:
-    remember(viewer)
     leave_path(viewer)
+    viewer.change(keyframes=keyframes)
     record = viewer.state.record
-    record.keyframes, record.chosen = keyframes, chosen
+    record.chosen = chosen
     record.at = chosen.seconds if chosen is not None else min(record.at, path_seconds(viewer))
 
 
@@ -157,14 +158,14 @@ def set_turning(viewer: Viewer, turns: bool) -> None:
 def save_path(viewer: Viewer, folder: Path = Path()) -> Path | None:
     """Save the path to the typed file, or to a new one in `folder`; None where that failed."""
     state, record = viewer.state, viewer.state.record
-    if not record.keyframes:
+    if not state.session.keyframes:
         viewer.say_error("a path to save needs a keyframe: add one at the current view")
         return None
     stem = state.path.stem if state.path else "camera"
     typed = record.path_typed.strip()
     path = folder.absolute() / typed if typed else free_name(folder, stem, PATHS)
     more = "; langsplat-viewer --headless --path makes a film of it"
-    saved = viewer.save(path, lambda: write_flight(path, flight_of(record.keyframes)), more)
+    saved = viewer.save(path, lambda: write_flight(path, flight_of(state.session.keyframes)), more)
     record.path_typed = record.path_typed if saved is None else str(path)
     return saved
 
@@ -208,7 +209,7 @@ def film_motion(viewer: Viewer) -> Motion | None:
         return None
     if record.turns:
         return turntable(record.turn_from or state.view, record.turn_seconds)
-    return flight_of(record.keyframes)
+    return flight_of(state.session.keyframes)
 
 
 def save_film(viewer: Viewer, folder: Path = Path()) -> None:
@@ -248,7 +249,7 @@ def save_sized_picture(viewer: Viewer, folder: Path = Path()) -> None:
         viewer.say_error("open a scene first, then save a picture of it")
         return
     width, height = state.record.size
-    request = state.request((width, height), state.settings.transparent)
+    request = state.request((width, height), state.session.picture.transparent)
     stem = f"{state.path.stem if state.path else 'picture'}-{width}x{height}"
 
     def work(progress: Progress) -> str:
@@ -317,16 +318,16 @@ def _training_camera(state: ViewerState) -> str | None:
 
 def _display_words(state: ViewerState) -> list[str]:
     """Return what is shown as options; queries only where the display shows them."""
-    row, picture = DISPLAYS[state.picture.display], state.picture
+    row, picture = DISPLAYS[state.session.picture.display], state.session.picture
     words = ["--display", picture.display]
     if row.by_level:
-        words += ["--level", LEVELS[state.latent_level]]
+        words += ["--level", LEVELS[state.session.latent_level]]
     shown = [(slot, query) for slot, query in enumerate(state.shown()) if query is not None]
     if not row.needs_query:
         return words
     if not shown:  # as the window shows it: plain colours
         return ["--display", "rgb"]
-    words += ["--level", state.level]
+    words += ["--level", state.session.level]
     for slot, query in shown:
         words += ["--query", query.phrase, "--colour", str(slot + 1)]
     for option, value, usual in (
@@ -339,14 +340,14 @@ def _display_words(state: ViewerState) -> list[str]:
         words += ["--heat-scale", *map(repr, picture.heat_scale)]
     if any(query.cut is not None for _, query in shown):
         words += [word for _, query in shown for word in ("--cut", repr(float(query.cut or 0.0)))]
-    if state.canonical:
-        words += ["--canonical", ", ".join(state.canonical)]
+    if state.session.canonical:
+        words += ["--canonical", ", ".join(state.session.canonical)]
     return words
 
 
 def _look_words(state: ViewerState) -> list[str]:
     """Return how it is shown as options; say what has none."""
-    clip, picture = state.settings.clip, state.picture
+    clip, picture = state.session.clip, state.session.picture
     words = []
     if picture.colour_map != PictureConfig.colour_map:
         words += ["--colour-map", picture.colour_map]
@@ -354,12 +355,12 @@ def _look_words(state: ViewerState) -> list[str]:
         words += ["--near-cut", repr(clip.near)]
     if not math.isinf(clip.far):
         words += ["--far-cut", repr(clip.far)]
-    marks = state.selection.marks
+    marks = state.marks
     left_out = {
         "what is hidden or selected": not marks.shown.all() or bool(marks.selected.any()),
-        "the size of splats and their SH degree": state.settings.splats != Splats(),
+        "the size of splats and their SH degree": state.session.splats != Splats(),
         "the backdrop": picture.background != PictureConfig.background,
-        "the picture beside it": state.settings.split.mode != "off",
+        "the picture beside it": state.session.split.mode != "off",
     }
     names = ", ".join(name for name, is_there in left_out.items() if is_there)
     if names:

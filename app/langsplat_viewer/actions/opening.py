@@ -16,20 +16,19 @@ from langsplat_core.progress import Progress
 from langsplat_core.query.engine import no_field
 from langsplat_core.scene import Camera, Scene, surface
 from langsplat_viewer.actions import viewpoint
-from langsplat_viewer.actions.outline import have_things
-from langsplat_viewer.actions.queries import ask_again, ask_one, set_canonical, set_level
-from langsplat_viewer.actions.selecting import leave
-from langsplat_viewer.actions.settings import show_scenes
+from langsplat_viewer.actions.editing import adopt
+from langsplat_viewer.actions.selecting import leave, set_tools
+from langsplat_viewer.actions.settings import set_split
 from langsplat_viewer.actions.viewpoint import opening_view, read_bookmarks
 from langsplat_viewer.camera.controls import Extent, OrbitCamera, extent_of
 from langsplat_viewer.files import disk
 from langsplat_viewer.files.disk import Photograph, Stamps, stamps
 from langsplat_viewer.files.preferences import with_recent
-from langsplat_viewer.files.projects import Things
-from langsplat_viewer.marks import of_scene
-from langsplat_viewer.rendering.request import UNCLIPPED, Split, why_undrawable
-from langsplat_viewer.state import Query, Recording, SceneState, ViewerState
-from langsplat_viewer.viewer import Viewer, Visit, forget, remember, unanswered, visit_of
+from langsplat_viewer.marks import unmarked
+from langsplat_viewer.rendering.request import Split, why_undrawable
+from langsplat_viewer.session import Query, Session, Things
+from langsplat_viewer.state import Recording, SceneState, ViewerState
+from langsplat_viewer.viewer import History, Viewer, Visit
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,39 +88,43 @@ def cancel(viewer: Viewer) -> None:
     photograph = viewer.state.photograph
     if photograph is not None and photograph.image is None and not photograph.reason:
         viewer.state.photograph = replace(photograph, reason="cancelled")
-    waiting = [query for query in viewer.state.queries if query.pending]
-    for query in waiting:
-        query.pending = False
-        query.problem = "" if query.result else "cancelled"
+    state = viewer.state
+    for query in state.session.queries:
+        answer = state.answer(query)
+        if answer.pending:
+            reason = "" if answer.result else "cancelled"
+            state.answers[query.phrase] = replace(answer, pending=False, problem=reason)
 
 
 def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     state, scene = viewer.state, opened.scene
     if state.path is not None:
-        viewer.visits[state.path.absolute()] = visit_of(state)
+        viewer.visits[state.path.absolute()] = _visit(state)
+    session = state.session.of_next_scene(read_bookmarks(viewer, path))
+    if scene.language is None:
+        state.pointing = False
+        session = _without_field(session)
     fresh = SceneState(
+        session=session,
+        saved=session,
         scene=scene,
         path=path,
         extent=opened.extent,
         doubts=opened.doubts,
         nothing=why_undrawable(scene.gaussians),
+        marks=unmarked(len(scene.gaussians)),
+        locked=np.zeros(len(scene.gaussians), bool),
         camera_index=0 if scene.cameras else None,
-        bookmarks=read_bookmarks(viewer, path),
         record=Recording(size=state.record.size, fps=state.record.fps),
-        selection=of_scene(state.selection, len(scene.gaussians)),
     )
     state.begin(fresh)
-    state.view, state.opening = opening_view(viewer), None
-    state.settings = replace(state.settings, clip=UNCLIPPED)
-    if scene.language is None:
-        state.pointing = False
-        if DISPLAYS[state.picture.display].needs_field:
-            state.picture = replace(state.picture, display="rgb")
+    state.view, state.opening, state.leaving = opening_view(viewer), None, None
+    set_tools(viewer, stroke=None)
     add_scenes(viewer, [path])
     state.preferences = with_recent(state.preferences, path.absolute())
     viewer.engine, viewer.describer = viewer.services.engine(scene), None
     viewer.watch.begin(opened.read)
-    forget(viewer)
+    viewer.history = History()
     _say_opened(viewer, path, opened)
     if scene.language is not None:
         field = scene.language
@@ -129,6 +132,13 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
         _compile_search(viewer)
         if viewer.has_encoder_here:  # while the user looks round
             viewer.run("loading the text encoder", viewer.engine.load_encoder)
+
+
+def _without_field(session: Session) -> Session:
+    """Return the session of a scene that cannot be searched."""
+    if not DISPLAYS[session.picture.display].needs_field:
+        return replace(session, queries=(), canonical=())
+    return replace(session, queries=(), canonical=(), picture=replace(session.picture, display="rgb"))
 
 
 def _say_opened(viewer: Viewer, path: Path, opened: _Opened) -> None:
@@ -156,31 +166,41 @@ def _compile_search(viewer: Viewer) -> None:
 # Visits: a scene that was shown before is found again as it was left.
 
 
+def _visit(state: ViewerState) -> Visit:
+    return Visit(
+        state.session,
+        state.saved,
+        state.project,
+        state.view,
+        state.opening_camera,
+        state.camera_index,
+        0 if state.scene is None else len(state.scene.gaussians),
+    )
+
+
 def return_to(viewer: Viewer, visit: Visit) -> None:
-    """Restore a visit in the scene that was just opened; what was asked is asked anew."""
+    """Find the scene that was just opened again as it was left; what was asked is asked anew."""
     state = viewer.state
     if state.scene is None:
         return
     state.view, state.opening_camera = visit.view or state.view, visit.opening_camera
-    count = len(state.scene.cameras)
-    if visit.camera_index is not None and visit.camera_index < count:
+    if visit.camera_index is not None and visit.camera_index < len(state.scene.cameras):
         state.camera_index = visit.camera_index
-    state.settings, state.ruler = replace(state.settings, clip=visit.clip), visit.ruler
-    state.record.keyframes, state.notes = visit.keyframes, visit.notes
-    state.kept, state.project = visit.kept, visit.project
-    have_things(viewer, visit.things if visit.count == len(state.scene.gaussians) else Things())
-    if state.scene.language is None and DISPLAYS[visit.display].needs_field:
-        return
-    state.picture = replace(state.picture, display=visit.display)
-    state.latent_level = visit.latent_level
-    if state.scene.language is None:
-        return
-    state.queries = [unanswered(query) for query in visit.queries]
-    state.selected = None if visit.selected is None else state.queries[visit.selected]
-    if visit.canonical:
-        set_canonical(viewer, ", ".join(visit.canonical))  # which asks again
+    session, saved = visit.session.found_again(now=state.session), visit.saved
+    state.saved = replace(state.session, things=saved.things, notes=saved.notes)
+    state.project = visit.project
+    things = session.things if visit.count == len(state.scene.gaussians) else Things()
+    take_session(viewer, replace(session, things=things))
+
+
+def take_session(viewer: Viewer, session: Session) -> None:
+    """Adopt a session of an earlier time, as far as the scene that is shown has what it speaks of."""
+    engine, things = viewer.engine, session.things
+    if viewer.state.has_field and engine is not None:
+        known = things.known(engine.tree.count) if things != Things() else things
+        adopt(viewer, replace(session, things=known))
     else:
-        ask_again(viewer)
+        adopt(viewer, replace(_without_field(session), things=Things()))
 
 
 def reload(viewer: Viewer) -> None:
@@ -272,18 +292,10 @@ def photograph_here(state: ViewerState) -> Photograph | None:
     return photograph if photograph is not None and photograph.camera is standing_at(state) else None
 
 
-def fade_photograph(viewer: Viewer, fade: float) -> None:
-    """Set the opacity of the photograph over the image, 0 to 1."""
-    fade = min(max(fade, 0.0), 1.0)
-    if fade != viewer.state.settings.fade:
-        remember(viewer, "fade")
-        viewer.state.settings = replace(viewer.state.settings, fade=fade)
-
-
 def fetch_photograph(viewer: Viewer) -> None:
     """Have the worker look for a photograph that is wanted and was not looked for; called once per frame."""
     state = viewer.state
-    camera = standing_at(state) if state.settings.fade > 0 else None
+    camera = standing_at(state) if state.session.fade > 0 else None
     if camera is None or state.path is None:
         return
     path, folder = state.path, photograph_folder(viewer)
@@ -312,6 +324,12 @@ def photograph_folder(viewer: Viewer) -> str:
     return "" if path is None else viewer.state.preferences.photographs.get(str(path.absolute()), "")
 
 
+# A second scene, or the same by another encoder or method, right of a line across the image: a viewer of its
+# own without a window, whose session follows from the first one's.
+
+ALIKE = 0.5, 1.5  # of two scenes in the same coordinates: distance of their middles in radii, ratio of radii
+
+
 def open_beside(viewer: Viewer, path: Path) -> None:
     """Show another scene right of a line, seen and asked as this one is."""
     beside = Viewer(viewer.services)
@@ -319,83 +337,61 @@ def open_beside(viewer: Viewer, path: Path) -> None:
     if viewer.beside is not None:
         viewer.beside.worker.close()
     viewer.beside = beside
-    show_scenes(viewer)
+    set_split(viewer, "scenes")
     open_scene(beside, path)
 
 
-# A second scene, or the same by another encoder or method, right of a line across the image: a viewer of its
-# own without a window, which looks and asks as the first one does.
-
-ALIKE = 0.5, 1.5  # of two scenes in the same coordinates: distance of their middles in radii, ratio of radii
-
-
 def follow_beside(viewer: Viewer) -> None:
-    """Give the second scene the first one's view and queries, once per frame, or close it."""
+    """Give the second scene the first one's view and session, once per frame, or close it."""
     state, beside = viewer.state, viewer.beside
-    is_wanted = state.settings.split.mode == "scenes"
-    if beside is None:
+    is_wanted = state.session.split.mode == "scenes"
+    if beside is None or not is_wanted:
         if is_wanted:  # undone
-            state.settings = replace(state.settings, split=replace(state.settings.split, mode="off"))
+            viewer.put(split=replace(state.session.split, mode="off"))
+        elif beside is not None:
+            beside.worker.close()
+            viewer.beside = None
         return
-    if not is_wanted:
-        beside.worker.close()
-        viewer.beside = None
-        return
+    other = beside.state
     beside.take_results()
     viewpoint.tick(beside, viewer.clock)
-    for message in beside.state.messages:
+    for message in other.messages:
         state.say(f"beside: {message.text}", message.is_error)
-    beside.state.messages = []
-    if beside.state.scene is not None and state.view is not None and state.extent is not None:
-        _look(viewer, beside)
-        _ask(viewer, beside)
+    other.messages, other.size = [], state.size
+    if other.extent is None or state.extent is None or state.view is None:
+        return
+    if beside.followed is not state.view:
+        other.view, beside.followed = linked(state.view, state.extent, other.extent), state.view
+    session = _mirrored(state, other)
+    if session != other.session:
+        take_session(beside, session)
 
 
-def _look(viewer: Viewer, beside: Viewer) -> None:
-    state, other, (view, canonical) = viewer.state, beside.state, beside.linked
-    assert state.extent is not None
-    assert other.extent is not None
-    if state.view is not None and view is not state.view:
-        other.view, beside.linked = linked(state.view, state.extent, other.extent), (state.view, canonical)
-    other.picture = state.picture if other.has_field else replace(state.picture, display="rgb")
-    other.latent_level, other.size = state.latent_level, state.size
-    other.settings = replace(state.settings, split=Split())
+def _mirrored(state: ViewerState, other: ViewerState) -> Session:
+    """Return the first scene's session for the second one: what is asked and how it is shown, without edits.
+    It asks what the first has answered; what is not here gets no colour there."""
+
+    def hidden(query: Query) -> bool:
+        result = other.result(query)
+        return result is None or result.verdict == "not here"
+
+    first = state.session
+    answered = [query for query in first.queries if state.answer(query).result is not None]
+    return replace(
+        first.of_next_scene(other.session.bookmarks),
+        split=Split(),
+        clip=first.clip,
+        canonical=first.canonical,
+        queries=tuple(replace(query, slot=None) if hidden(query) else query for query in answered),
+    )
 
 
 def linked(view: OrbitCamera, here: Extent, there: Extent) -> OrbitCamera:
-    """The same view of another scene: itself where both have the same coordinates, as far as their extents
-    tell, else from the same side and as far away in radii."""
+    """Return the same view of another scene: itself where both have the same coordinates, as far as their
+    extents tell, else from the same side and as far away in radii."""
     ratio = there.radius / here.radius
-    if (
-        np.linalg.norm(here.centre - there.centre) < ALIKE[0] * here.radius
-        and 1 / ALIKE[1] < ratio < ALIKE[1]
-    ):
+    away = np.linalg.norm(here.centre - there.centre)
+    if away < ALIKE[0] * here.radius and 1 / ALIKE[1] < ratio < ALIKE[1]:
         return view
     target = there.centre + ratio * (view.target - here.centre)
     return replace(view, target=target, distance=ratio * view.distance)
-
-
-def _ask(viewer: Viewer, beside: Viewer) -> None:
-    """Ask what the first is asked; each answer has the colour of the first one's."""
-    state, other = viewer.state, beside.state
-    if not other.has_field:
-        return
-    if other.level != state.level:
-        set_level(beside, state.level)
-    if beside.linked[1] != state.canonical:
-        beside.linked = beside.linked[0], state.canonical
-        set_canonical(beside, ", ".join(state.canonical))
-    answered = {query.phrase: query for query in other.queries}
-    wanted = {query.phrase: query for query in state.queries}
-    for phrase, query in wanted.items():
-        if phrase not in answered and not query.pending and not query.problem:
-            ask_one(beside, phrase, cut=query.cut)
-        elif phrase in answered:
-            _show_alike(query, answered[phrase])
-    if any(phrase not in wanted for phrase in answered):
-        other.queries = [query for query in other.queries if query.phrase in wanted]
-
-
-def _show_alike(query: Query, other: Query) -> None:
-    here = other.result is not None and other.result.verdict != "not here"
-    other.slot, other.shown_since = (query.slot if here else None), query.shown_since

@@ -13,13 +13,13 @@ from langsplat_core.query.describe import Describer, Outline
 from langsplat_core.query.instances import axis_aligned_box
 from langsplat_core.query.selection import at_point
 from langsplat_core.scene import LEVELS, NO_NODE
-from langsplat_core.scene.language import TaughtWord, tidy
-from langsplat_viewer.actions.queries import taught, teach
-from langsplat_viewer.actions.selecting import mark, select_alike, take
+from langsplat_core.scene.language import tidy
+from langsplat_viewer.actions.queries import teach
+from langsplat_viewer.actions.selecting import mark, put_marks, select_alike, take
 from langsplat_viewer.actions.viewpoint import focus_on
-from langsplat_viewer.files.projects import Group, Things, known_things
+from langsplat_viewer.session import Group
 from langsplat_viewer.state import OutlineView
-from langsplat_viewer.viewer import Viewer, remember
+from langsplat_viewer.viewer import Viewer
 
 Target = int | Array  # a node of the tree, or a (3,) point on the surface, world units
 
@@ -30,7 +30,7 @@ def wanted(viewer: Viewer) -> OutlineView | None:
     if viewer.engine is None or not state.has_field:
         return None
     if state.outline is None and viewer.worker.current is None:
-        if not viewer.has_encoder_here and not state.queries:
+        if not viewer.has_encoder_here and not state.session.queries:
             reason = f"names come from the encoder '{viewer.encoder_id}': search for something first"
             return OutlineView(problem=reason)
         state.outline = OutlineView(problem="looking for what is here ...")
@@ -74,7 +74,7 @@ def _totals(own: Array, parents: Array) -> Array:
 
 def name_of(viewer: Viewer, row: Outline) -> str:
     """The name that was given to a row, else what it is likely to be."""
-    given = viewer.state.things.names.get(row.node)
+    given = viewer.state.session.things.names.get(row.node)
     return given or ("unknown" if row.word is None else row.word.phrase)
 
 
@@ -92,7 +92,7 @@ def filtered(viewer: Viewer, rows: Iterable[Outline], text: str) -> Iterator[Out
 
 def hidden_nodes(viewer: Viewer) -> Array:
     """(K,) bool: nodes of which nothing is shown."""
-    view, marks = viewer.state.outline, viewer.state.selection.marks
+    view, marks = viewer.state.outline, viewer.state.marks
     if view is None or view.tree is None:
         return np.zeros(0, bool)
     if viewer.out_of_sight is None or viewer.out_of_sight[:2] != (view, marks):
@@ -105,14 +105,14 @@ def hidden_nodes(viewer: Viewer) -> Array:
 def colour_of(viewer: Viewer, node: int) -> tuple[float, float, float] | None:
     """Mean colour of a node's Gaussians where what is shown has one for each: the latents, or the tree."""
     state = viewer.state
-    display, view = state.picture.display, state.outline
+    display, view = state.session.picture.display, state.outline
     if display not in ("latent", "tree") or view is None or view.tree is None or state.scene is None:
         return None
-    key = (display, state.latent_level, node)
+    key = (display, state.session.latent_level, node)
     field = state.scene.language
     if key not in view.colours and field is not None:
-        subject = Subject(len(state.scene.gaussians), field, level=state.latent_level)
-        values = latent_colours(field)[state.latent_level] if display == "latent" else nodes(subject)
+        subject = Subject(len(state.scene.gaussians), field, level=state.session.latent_level)
+        values = latent_colours(field)[state.session.latent_level] if display == "latent" else nodes(subject)
         inside = view.tree.members(node)
         mean = np.zeros(3) if values is None else np.median(values[inside], axis=0)
         view.colours[key] = (float(mean[0]), float(mean[1]), float(mean[2]))
@@ -124,7 +124,9 @@ def in_view(viewer: Viewer) -> list[Outline]:
     state = viewer.state
     if state.outline is None or state.view is None:
         return []
-    rows = [row for row in state.outline.roots if row.word is not None or row.node in state.things.names]
+    rows = [
+        row for row in state.outline.roots if row.word is not None or row.node in state.session.things.names
+    ]
     if not rows:
         return []
     camera = state.view.camera(*state.size)
@@ -139,7 +141,7 @@ def in_view(viewer: Viewer) -> list[Outline]:
 
 def with_thing(viewer: Viewer, target: Target, act: Callable[[Array], None]) -> None:
     """Have the worker find (N,) bool of a thing, and then `act` with it."""
-    engine, scene, level = viewer.engine, viewer.state.scene, viewer.state.level
+    engine, scene, level = viewer.engine, viewer.state.scene, viewer.state.session.level
     if engine is None or scene is None or scene.language is None:
         viewer.say_error("things are known where there is a language field")
         return
@@ -188,8 +190,8 @@ def hide(viewer: Viewer, target: Target) -> None:
     """Hide a thing; what is selected stays so."""
 
     def act(members: Array) -> None:
-        marks = viewer.state.selection.marks
-        hidden = marks.hidden | (members & ~viewer.state.selection.locked)
+        marks = viewer.state.marks
+        hidden = marks.hidden | (members & ~viewer.state.locked)
         mark(viewer, replace(marks, selected=marks.selected & ~hidden, hidden=hidden))
 
     with_thing(viewer, target, act)
@@ -198,7 +200,7 @@ def hide(viewer: Viewer, target: Target) -> None:
 def show(viewer: Viewer, target: Target) -> None:
 
     def act(members: Array) -> None:
-        marks = viewer.state.selection.marks
+        marks = viewer.state.marks
         mark(viewer, replace(marks, hidden=marks.hidden & ~members))
 
     with_thing(viewer, target, act)
@@ -210,12 +212,10 @@ def give_name(viewer: Viewer, target: Target, name: str) -> None:
     if not name:
         return
 
-    def done(word: TaughtWord) -> None:
-        taught(viewer, word)
+    def done(taught: str) -> None:
         if isinstance(target, int):
-            things = viewer.state.things
-            remember(viewer)
-            viewer.state.things = replace(things, names={**things.names, target: name})
+            things = viewer.state.session.things
+            viewer.change(things=replace(things, names={**things.names, target: name}))
 
     with_thing(viewer, target, lambda members: teach(viewer, name, members, done))
 
@@ -226,39 +226,27 @@ def give_name(viewer: Viewer, target: Target, name: str) -> None:
 def toggle_lock(viewer: Viewer, node: int) -> None:
     """Lock a thing: nothing selects, hides or deletes it; or unlock it."""
     state = viewer.state
-    if state.outline is None or state.outline.tree is None:
-        return
-    remember(viewer)
-    state.things = replace(state.things, locked=state.things.locked ^ {node})
-    apply_locks(viewer)
-
-
-def have_things(viewer: Viewer, things: Things) -> None:
-    """Take names, groups and locks, as far as the scene's tree has their nodes."""
-    state, engine = viewer.state, viewer.engine
-    state.things = Things()
-    has_tree = engine is not None and state.scene is not None and state.scene.language is not None
-    if engine is not None and has_tree and things != Things():
-        state.things = known_things(things, engine.tree.count)
-    apply_locks(viewer)
+    if state.outline is not None and state.outline.tree is not None:
+        things = state.session.things
+        viewer.change(things=replace(things, locked=things.locked ^ {node}))
+        apply_locks(viewer)
+        if (state.marks.selected & state.locked).any():
+            put_marks(viewer, replace(state.marks, selected=state.marks.selected & ~state.locked))
 
 
 def apply_locks(viewer: Viewer) -> None:
-    """Have the selection know what is locked."""
+    """Have the tools know what is locked."""
     state, engine = viewer.state, viewer.engine
     if engine is None or state.scene is None:
         return
-    locked = np.zeros(len(state.scene.gaussians), bool)
-    for node in state.things.locked:
-        locked |= engine.tree.members(node)
-    marks = state.selection.marks
-    kept = replace(marks, selected=marks.selected & ~locked) if marks.selected.any() else marks
-    state.selection = replace(state.selection, locked=locked, marks=kept)
+    state.locked = np.zeros(len(state.scene.gaussians), bool)
+    for node in state.session.things.locked:
+        state.locked |= engine.tree.members(node)
 
 
 def group(viewer: Viewer, node: int, onto: int | Group | None) -> None:
     """Put a thing into a group, or into a new one, with the node `onto` where that is given."""
-    things = viewer.state.things
+    things = viewer.state.session.things
     others = tuple(g for g in (_without(g, node) for g in things.groups) if g is not None)
     if isinstance(onto, Group):
         new = tuple(replace(g, nodes=(*g.nodes, node)) if g.name == onto.name else g for g in others)
@@ -268,8 +256,7 @@ def group(viewer: Viewer, node: int, onto: int | Group | None) -> None:
         taken = {g.name for g in things.groups}
         name = next(f"group {k}" for k in range(1, len(taken) + 2) if f"group {k}" not in taken)
         new = (*others, Group(name, (node,) if onto is None else (onto, node)))
-    remember(viewer)
-    viewer.state.things = replace(things, groups=new)
+    viewer.change(things=replace(things, groups=new))
 
 
 def _without(group: Group, node: int) -> Group | None:
@@ -278,20 +265,18 @@ def _without(group: Group, node: int) -> Group | None:
 
 
 def ungroup(viewer: Viewer, node: int) -> None:
-    things = viewer.state.things
-    remember(viewer)
+    things = viewer.state.session.things
     left = (_without(g, node) for g in things.groups)
-    viewer.state.things = replace(things, groups=tuple(g for g in left if g is not None))
+    viewer.change(things=replace(things, groups=tuple(g for g in left if g is not None)))
 
 
 def rename_group(viewer: Viewer, old: Group, name: str) -> None:
-    things, name = viewer.state.things, tidy(name)
+    things, name = viewer.state.session.things, tidy(name)
     if name in {g.name for g in things.groups if g is not old}:
         viewer.say_error(f"there is a group '{name}' already")
     elif name:
-        remember(viewer)
         groups = tuple(replace(g, name=name) if g is old else g for g in things.groups)
-        viewer.state.things = replace(things, groups=groups)
+        viewer.change(things=replace(things, groups=groups))
 
 
 def select_group(viewer: Viewer, group: Group) -> None:

@@ -8,37 +8,27 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import LangSplatError
-from langsplat_viewer.actions.editing import place
-from langsplat_viewer.actions.outline import have_things
-from langsplat_viewer.actions.queries import listed_queries
+from langsplat_viewer.actions.opening import take_session
 from langsplat_viewer.actions.selecting import discard_and_leave
 from langsplat_viewer.actions.selecting import end as end_editing
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.actions.viewpoint import bookmarked_view
 from langsplat_viewer.camera.flight import pose_of
 from langsplat_viewer.files.preferences import with_recent
-from langsplat_viewer.files.projects import (
-    LONGEST_NOTE,
-    MOST_NOTES,
-    PROJECTS,
-    Bookmark,
-    Note,
-    Project,
-    Things,
-    write_project,
-)
+from langsplat_viewer.files.projects import PROJECTS, Project, write_project
 from langsplat_viewer.jobs import one_line
-from langsplat_viewer.marks import Pair, unpack
 from langsplat_viewer.output import free_name
-from langsplat_viewer.state import SLOTS, Query, Ruler, ViewerState
-from langsplat_viewer.viewer import Viewer, Visit, now, remember, visit_of
+from langsplat_viewer.session import LONGEST_NOTE, MOST_NOTES, Bookmark, Marked, Note, Query, Ruler, Things
+from langsplat_viewer.state import ViewerState
+from langsplat_viewer.viewer import Viewer
 
 # Notes.
 
 
 def toggle_pinning(viewer: Viewer) -> None:
     """Have a click on the scene pin a note there, or no longer."""
-    viewer.state.pins_notes, viewer.state.ruler = not viewer.state.pins_notes, Ruler()
+    viewer.state.pins_notes = not viewer.state.pins_notes
+    viewer.put(ruler=Ruler())
     if viewer.state.pins_notes:
         open_panel(viewer, "Notes")
 
@@ -54,7 +44,7 @@ def pin_at(viewer: Viewer, u: float, v: float) -> None:
 
 
 def pin_to_selection(viewer: Viewer) -> None:
-    state, chosen = viewer.state, viewer.state.selection.marks.selected
+    state, chosen = viewer.state, viewer.state.marks.selected
     if state.scene is None or not chosen.any():
         viewer.say_error("select something first, then pin a note to it")
         return
@@ -63,15 +53,14 @@ def pin_to_selection(viewer: Viewer) -> None:
 
 
 def _pin(viewer: Viewer, point: Array) -> None:
-    state = viewer.state
-    if len(state.notes) >= MOST_NOTES:
+    state, notes = viewer.state, viewer.state.session.notes
+    if len(notes) >= MOST_NOTES:
         viewer.say_error("no room for more notes")
         return
-    remember(viewer)
     x, y, z = (float(part) for part in point)
-    state.fresh_note = Note(f"note {len(state.notes) + 1}", (x, y, z))
-    state.notes, state.pins_notes = (*state.notes, state.fresh_note), False
-    state.awaits_keyboard = True
+    state.fresh_note = Note(f"note {len(notes) + 1}", (x, y, z))
+    viewer.change(notes=(*notes, state.fresh_note))
+    state.pins_notes, state.awaits_keyboard = False, True
     open_panel(viewer, "Notes")
 
 
@@ -83,14 +72,13 @@ def take_fresh_note(viewer: Viewer, note: Note) -> bool:
 
 
 def write_note(viewer: Viewer, note: Note, text: str) -> None:
-    remember(viewer, f"note at {note.at}")
     changed = replace(note, text=text[:LONGEST_NOTE])
-    viewer.state.notes = tuple(changed if other is note else other for other in viewer.state.notes)
+    notes = tuple(changed if other is note else other for other in viewer.state.session.notes)
+    viewer.change(f"note at {note.at}", notes=notes)
 
 
 def remove_note(viewer: Viewer, note: Note) -> None:
-    remember(viewer)
-    viewer.state.notes = tuple(other for other in viewer.state.notes if other is not note)
+    viewer.change(notes=tuple(other for other in viewer.state.session.notes if other is not note))
 
 
 # Projects.
@@ -103,31 +91,18 @@ def save_project(viewer: Viewer, folder: Path = Path()) -> Path | None:
         viewer.say_error("open a scene first, then save the project")
         return None
     path = state.project or free_name(folder, state.path.stem, PROJECTS)
-    moment = now(viewer)
     project = Project(
-        scene=state.path.absolute(),
-        count=len(state.scene.gaussians),
+        scene=str(state.path.absolute()),
+        gaussians=len(state.scene.gaussians),
         view=Bookmark("view", pose_of(state.view), state.view.distance),
-        picture=state.picture,
-        latent_level=state.latent_level,
-        clip=state.settings.clip,
-        queries=listed_queries(state),
-        keyframes=state.record.keyframes,
-        bookmarks=state.bookmarks,
-        notes=state.notes,
-        ruler=state.ruler.points,
-        marks=moment.marks,
-        moves=state.selection.moves,
+        session=state.session,
         panels=state.preferences.panels or (),
-        things=state.things,
     )
-    answers = [_answer(state, query) for query in state.queries]
+    answers = [_answer(state, query) for query in state.session.queries]
     if viewer.save(path, lambda: write_project(path, project, answers)) is None:
         return None
     state.project, state.preferences = path, with_recent(state.preferences, path)
-    state.kept = state.things, state.notes
-    marks, moves = state.selection.marks, state.selection.moves
-    state.selection = replace(state.selection, saved=marks.deleted, saved_moves=moves)
+    state.saved = state.session
     return path
 
 
@@ -146,17 +121,17 @@ def end(viewer: Viewer, folder: Path = Path()) -> None:
 
 def _answer(state: ViewerState, query: Query) -> dict[str, Any]:
     """The answer to a query as a project keeps it, for other programs."""
-    result = query.result
+    answer, result = state.answer(query), state.result(query)
     if result is None:
-        return {"phrase": query.phrase, "problem": query.problem}
+        return {"phrase": query.phrase, "problem": answer.problem}
     return {
         "phrase": query.phrase,
         "verdict": result.verdict,
         "probability": result.probability,
         "place": None if result.place is None else [float(part) for part in result.place],
         "gaussians": int(result.members.sum()),
-        "boxes": [thing.box.tolist() for thing in query.things],
-        "notes": [note.text for note in state.notes if result.members[_nearest(state, note)]],
+        "boxes": [thing.box.tolist() for thing in answer.things],
+        "notes": [note.text for note in state.session.notes if result.members[_nearest(state, note)]],
     }
 
 
@@ -169,53 +144,29 @@ def _nearest(state: ViewerState, note: Note) -> int:
     return int(np.nanargmin(np.where(np.isfinite(away), away, np.inf)))
 
 
-def restore(viewer: Viewer, project: Project, path: Path) -> Visit:
-    """Have in the scene, which was just opened, what the project in the file `path` holds; the rest is in the
-    visit that is returned, to be taken by `opening.return_to`."""
-    state = viewer.state
+def restore(viewer: Viewer, project: Project, path: Path) -> None:
+    """Have in the scene, which was just opened, what the project in the file `path` holds."""
+    state, session = viewer.state, project.session
     assert state.scene is not None
-    if len(state.scene.gaussians) == project.count:
-        have_things(viewer, project.things)
-        pair = Pair(state.selection.marks, now(viewer).marks)
-        state.selection = replace(state.selection, marks=unpack(project.marks, pair))
-        try:
-            place(viewer, project.moves)
-        except LangSplatError as error:
-            viewer.say_error(f"{path}: its transforms are left out: {one_line(error)}")
-        marks, moves = state.selection.marks, state.selection.moves
-        state.selection = replace(state.selection, saved=marks.deleted, saved_moves=moves)
-    elif project.moves or project.things != Things() or any(m is not None for m in project.marks.masks):
-        what = "what was selected, hidden, moved and named is left out"
-        viewer.say_error(f"the scene has changed since: {what}")
-    state.picture = project.picture
-    state.notes, state.project = project.notes, path
-    state.kept = state.things, state.notes
+    now = state.session
+    session = replace(session, bookmarks=session.bookmarks or now.bookmarks)
+    if project.version == 1:  # which had no other settings
+        session = replace(session, split=now.split, splats=now.splats, fade=now.fade, overlays=now.overlays)
+    edits = (session.marks, session.moves, session.things)
+    if len(state.scene.gaussians) != project.gaussians:
+        session = replace(session, marks=Marked(), moves=(), things=Things())
+        if edits != (session.marks, session.moves, session.things):
+            what = "what was selected, hidden, moved and named is left out"
+            viewer.say_error(f"the scene has changed since: {what}")
+    try:
+        take_session(viewer, session)
+    except LangSplatError as error:
+        viewer.say_error(f"{path}: its transforms are left out: {one_line(error)}")
+        take_session(viewer, replace(session, moves=()))
+    assert state.extent is not None
+    state.view = bookmarked_view(project.view, state.extent)
+    state.saved, state.project = state.session, path
     state.preferences = with_recent(state.preferences, path)
-    state.bookmarks = project.bookmarks or state.bookmarks
     if project.panels:
         state.preferences = replace(state.preferences, panels=project.panels)
-        viewer.state.shows_panels = project.panels
-    return _visit(viewer, project)
-
-
-def _visit(viewer: Viewer, project: Project) -> Visit:
-    state, asked = viewer.state, project.queries
-    assert state.extent is not None
-    state.level = asked.level
-    shown = iter([*range(SLOTS), *[None] * len(asked.queries)])
-    queries = tuple(
-        Query(query.phrase, next(shown) if query.shown else None, number, cut=query.cut)
-        for number, query in enumerate(asked.queries)
-    )
-    return replace(
-        visit_of(state),
-        view=bookmarked_view(project.view, state.extent),
-        display=project.picture.display,
-        latent_level=project.latent_level,
-        queries=queries,
-        selected=len(queries) - 1 if queries else None,
-        canonical=asked.canonical,
-        keyframes=project.keyframes,
-        ruler=Ruler(points=project.ruler),
-        clip=project.clip,
-    )
+        state.shows_panels = project.panels

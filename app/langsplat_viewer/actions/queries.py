@@ -1,4 +1,4 @@
-"""Searching: the box, the list of queries, their colours and their level."""
+"""Searching: the box, the list of queries, their colours, thresholds and level."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,8 +11,8 @@ from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.errors import InputError, UnknownWordError
 from langsplat_core.pipeline.evidence import draw_evidence, find_evidence, kept_features, kept_photographs
 from langsplat_core.progress import Progress
-from langsplat_core.query.answers import QueryResult, recut
-from langsplat_core.query.compose import ComposedResult, run_phrase
+from langsplat_core.query.answers import QueryResult
+from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.describe import Suggestions, completions, corrected, suggest
 from langsplat_core.query.engine import QueryEngine, no_field
 from langsplat_core.query.grammar import Atom, heads
@@ -22,13 +22,14 @@ from langsplat_core.scene import TaughtWord
 from langsplat_core.scene.language import phrase_key, split_phrases
 from langsplat_viewer.actions.selecting import has_selection
 from langsplat_viewer.actions.settings import open_panel
-from langsplat_viewer.files.projects import QUERIES, QuerySet, SavedQuery, read_queries, write_queries
+from langsplat_viewer.files.projects import QUERIES, read_queries, write_queries
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.output import free_name
-from langsplat_viewer.state import SLOTS, EvidenceSheet, Query, ViewerState
-from langsplat_viewer.viewer import Viewer, let_go, remember
+from langsplat_viewer.session import Query
+from langsplat_viewer.state import Answer, EvidenceSheet
+from langsplat_viewer.viewer import Viewer
 
-MOST_THINGS = 20  # of one answer that are told apart
+MOST_THINGS = 20  # instances of one answer
 
 
 def ask(viewer: Viewer, text: str) -> None:
@@ -41,45 +42,109 @@ def ask(viewer: Viewer, text: str) -> None:
 
 
 def ask_one(viewer: Viewer, phrase: str, *, cut: float | None = None, then_show: bool = True) -> None:
-    """Search the scene for one phrase. cut: a relevancy of one's own at which the answer ends; then_show:
-    give it a colour if it may be there."""
-    state = viewer.state
+    """Search the scene for one phrase. cut: a threshold in place of the answer's own; then_show: give it a
+    colour if it may be there."""
+    state, key = viewer.state, phrase_key(phrase)
     if state.scene is None or viewer.engine is None:
         viewer.say_error("open a scene first, then search it")
         return
     if state.scene.language is None:
         viewer.say_error(no_field(state.scene))
         return
-    key = phrase_key(phrase)
-    query = next((q for q in state.queries if phrase_key(q.phrase) == key), None) or Query(phrase)
-    remember(viewer)
-    state.queries = [*(q for q in state.queries if q is not query), query]  # in order of asking
+    viewer.remember()
+    queries = state.session.queries
+    query = next((query for query in queries if phrase_key(query.phrase) == key), Query(phrase))
+    others = (other for other in queries if other is not query)
+    viewer.put(queries=(*others, replace(query, cut=cut)), chosen=query.phrase)  # in the order of asking
     state.asked = [*(earlier for earlier in state.asked if phrase_key(earlier) != key), phrase]
     state.recalled = len(state.asked)
-    query.cut = cut
-    select(viewer, query)
-    _answer(viewer, query, then_show)
+    answer(viewer, query.phrase, then_show)
+
+
+def answer(viewer: Viewer, phrase: str, then_show: bool = False) -> None:
+    """Have the worker answer a query of the list; only what may be there takes a colour. Its instances come
+    later: the surface that they are told apart on takes seconds where there are a million Gaussians."""
+    state, engine, level = viewer.state, viewer.engine, viewer.state.session.level
+    if engine is None:
+        return
+    viewpoint = None if state.view is None else state.view.camera(*state.size)
+
+    def work(progress: Progress) -> Answer:
+        began = perf_counter()
+        try:
+            composed = run_phrase(engine, phrase, level, viewpoint, progress)
+        except UnknownWordError as error:
+            return Answer(problem=str(error), meant=corrected(phrase, error.near) or "")
+        reading = "" if isinstance(composed.tree, Atom) else composed.reading
+        milliseconds = 1e3 * (perf_counter() - began)
+        return Answer(composed.answer, (), reading, heads(composed.tree), milliseconds=milliseconds)
+
+    def done(found: Answer) -> None:
+        result = found.result
+        if phrase not in state.answers:  # it was taken off meanwhile
+            return
+        state.answers[phrase] = found
+        if result is None:
+            viewer.say_error(found.problem)
+            return
+        state.timing.add("search", found.milliseconds)
+        if then_show:
+            _show_answer(viewer, phrase, result)
+        if result.found:
+            viewer.run(
+                "telling instances apart",
+                lambda progress: engine.instances(result, MOST_THINGS),
+                lambda things: _tell_apart(viewer, phrase, result, things),
+            )
+
+    def failed(reason: str) -> None:
+        done(Answer(problem=reason))
+
+    state.answers[phrase] = replace(state.answers.get(phrase, Answer()), pending=True)
+    viewer.run(f"searching '{phrase}'", work, done, failed)
+
+
+def _show_answer(viewer: Viewer, phrase: str, result: QueryResult) -> None:
+    session = viewer.state.session
+    if result.verdict != "not here":  # nothing is painted for it
+        session = session.showing(phrase)
+    if not DISPLAYS[session.picture.display].needs_query:
+        session = replace(session, picture=replace(session.picture, display="relevancy"))
+    viewer.state.session = session
+
+
+def _tell_apart(viewer: Viewer, phrase: str, result: QueryResult, things: tuple[Instance, ...]) -> None:
+    answers = viewer.state.answers
+    if phrase in answers and answers[phrase].result is result:
+        answers[phrase] = replace(answers[phrase], things=things)
+
+
+def ask_again(viewer: Viewer) -> None:
+    """Answer every query of the list anew: what they depend on has changed."""
+    for query in viewer.state.session.queries:
+        answer(viewer, query.phrase)
+
+
+def ask_unanswered(viewer: Viewer) -> None:
+    """Answer the queries of the list that were not asked yet."""
+    for query in viewer.state.session.queries:
+        if query.phrase not in viewer.state.answers:
+            answer(viewer, query.phrase)
+
+
+def forget_unlisted(viewer: Viewer) -> None:
+    """Drop the answers to queries that are in the list no more: they have numbers for every Gaussian."""
+    state = viewer.state
+    listed = {query.phrase for query in state.session.queries}
+    state.answers = {phrase: known for phrase, known in state.answers.items() if phrase in listed}
 
 
 JOINS = {"and": "{} and {}", "or": "{} or {}", "without": "{}, not {}"}  # as the grammar reads them
 
 
-def ask_combined(viewer: Viewer, first: Query, join: str, second: Query) -> None:
-    """Search for two queries at once, joined by one of `JOINS`."""
-    ask_one(viewer, JOINS[join].format(first.phrase, second.phrase))
-
-
-def ask_again(viewer: Viewer) -> None:
-    """Answer every query of the list anew: what they depend on has changed."""
-    for query in viewer.state.queries:
-        _answer(viewer, query)
-
-
-def ask_unanswered(viewer: Viewer) -> None:
-    """Answer the queries of the list that have neither an answer nor a reason why not, nor wait for one."""
-    for query in viewer.state.queries:
-        if query.automatic is None and not query.problem and not query.pending:
-            _answer(viewer, query)
+def ask_combined(viewer: Viewer, first: str, join: str, second: str) -> None:
+    """Search for two phrases at once, joined by one of `JOINS`."""
+    ask_one(viewer, JOINS[join].format(first, second))
 
 
 def ask_typed(viewer: Viewer) -> None:
@@ -89,39 +154,6 @@ def ask_typed(viewer: Viewer) -> None:
         return
     ask(viewer, viewer.state.typed)
     viewer.state.typed = ""
-
-
-def type_name(viewer: Viewer, name: str) -> None:
-    viewer.state.selection = replace(viewer.state.selection, name=name)
-
-
-def name_selection(viewer: Viewer) -> None:
-    """Teach the typed name by what is selected, and search for it. What is saved from now on keeps it."""
-
-    def done(word: TaughtWord) -> None:
-        type_name(viewer, "")
-        taught(viewer, word)
-
-    if has_selection(viewer):
-        selection = viewer.state.selection
-        teach(viewer, selection.name, selection.marks.selected, done)
-
-
-def teach(viewer: Viewer, name: str, members: Array, done: Callable[[TaughtWord], None]) -> None:
-    """Have the worker teach a name by what (N,) bool mean; then `done`, if the scene is still there."""
-    engine, scene = viewer.engine, viewer.state.scene
-    if engine is not None:
-        viewer.run(
-            f"teaching '{name}'",
-            lambda progress: engine.teach(name, members),
-            lambda word: done(word) if viewer.state.scene is scene else None,
-        )
-
-
-def taught(viewer: Viewer, word: TaughtWord) -> None:
-    """Say that a word was taught, and search for it."""
-    viewer.state.say(f"taught '{word.name}'; to keep it, save the scene")
-    ask_one(viewer, word.name)
 
 
 def focus_search(viewer: Viewer) -> None:
@@ -141,182 +173,88 @@ def take_search_focus(viewer: Viewer) -> bool:
     return wanted
 
 
-Answered = ComposedResult | UnknownWordError
+# Names that are taught.
 
 
-def _answer(viewer: Viewer, query: Query, then_show: bool = False) -> None:
-    """Have the worker answer `query` at the current level choice; only what may be there takes a colour."""
-    engine, level = viewer.engine, viewer.state.level
-    if engine is None:
-        return
-    view = viewer.state.view
-    viewpoint = None if view is None else view.camera(*viewer.state.size)
-    took: list[float] = []  # milliseconds
-
-    def work(progress: Progress) -> Answered:
-        began = perf_counter()
-        try:
-            composed = run_phrase(engine, query.phrase, level, viewpoint, progress)
-        except UnknownWordError as error:
-            return error
-        took.append(1e3 * (perf_counter() - began))
-        return composed
-
-    def done(answered: Answered) -> None:
-        if query not in viewer.state.queries:  # it was taken off meanwhile
-            return
-        if isinstance(answered, UnknownWordError):
-            query.meant = corrected(query.phrase, answered.near) or ""
-            failed(str(answered))
-            return
-        viewer.state.timing.add("search", took[0])
-        _take(query, answered)
-        if then_show:
-            _show_answer(viewer, query, answered.answer)
-        if answered.answer.found:
-            _tell_apart(viewer, query, answered.answer)
-
-    def failed(reason: str) -> None:
-        query.problem, query.pending = reason, False
-        viewer.say_error(reason)
-
-    query.pending = True
-    viewer.run(f"searching '{query.phrase}'", work, done, failed)
-
-
-def _tell_apart(viewer: Viewer, query: Query, answer: QueryResult) -> None:
-    """Have the worker find the instances of an answer that is shown by then: the surface that they are told
-    apart on takes seconds where there are a million Gaussians."""
-    engine = viewer.engine
+def teach(viewer: Viewer, name: str, members: Array, done: Callable[[str], None]) -> None:
+    """Have the worker teach a name by what (N,) bool mean, and search for it. What is saved from now on keeps
+    it. `done` gets the name, if the scene is still there."""
+    engine, scene = viewer.engine, viewer.state.scene
     if engine is None:
         return
 
-    def done(things: tuple[Instance, ...]) -> None:
-        if query.automatic is answer:
-            query.things = things
+    def taught(word: TaughtWord) -> None:
+        if viewer.state.scene is scene:
+            done(word.name)
+            viewer.state.say(f"taught '{word.name}'; to keep it, save the scene")
+            ask_one(viewer, word.name)
 
-    viewer.run("telling things apart", lambda progress: engine.instances(answer, MOST_THINGS), done)
-
-
-def _take(query: Query, composed: ComposedResult) -> None:
-    query.automatic, query.things = composed.answer, ()
-    query.problem, query.meant, query.pending = "", "", False
-    query.result = composed.answer if query.cut is None else recut(composed.answer, query.cut)
-    query.asked_for = heads(composed.tree)
-    query.reading = "" if isinstance(composed.tree, Atom) else composed.reading
+    viewer.run(f"teaching '{name}'", lambda progress: engine.teach(name, members), taught)
 
 
-def _show_answer(viewer: Viewer, query: Query, answer: QueryResult) -> None:
-    if answer.verdict != "not here":  # nothing is painted for it
-        _give_slot(viewer, query)
-    if not DISPLAYS[viewer.state.picture.display].needs_query:
-        viewer.state.picture = replace(viewer.state.picture, display="relevancy")
+def name_selection(viewer: Viewer) -> None:
+    """Teach the typed name by what is selected."""
+    if has_selection(viewer):
+        state = viewer.state
+        teach(viewer, state.tools.name, state.marks.selected, lambda name: type_name(viewer, ""))
 
 
-def select(viewer: Viewer, query: Query | None) -> None:
-    """Have the details of a query shown below the list."""
-    viewer.state.selected = query
+def type_name(viewer: Viewer, name: str) -> None:
+    viewer.state.tools = replace(viewer.state.tools, name=name)
 
 
-def show(viewer: Viewer, query: Query) -> None:
-    """Show a query's heat; it takes the first free colour, else that of the longest shown one."""
-    if query.slot is None:
-        remember(viewer)
-        _give_slot(viewer, query)
+# The list of queries.
 
 
-def _give_slot(viewer: Viewer, query: Query) -> None:
-    if query.slot is not None:
-        return
-    shown = viewer.state.in_order_of_showing()
-    free = sorted(set(range(SLOTS)) - {q.slot for q in shown})
-    query.slot = free[0] if free else shown[0].slot
-    query.shown_since = 1 + max((q.shown_since for q in shown), default=0)
-    if not free:
-        shown[0].slot = None
+def show(viewer: Viewer, phrase: str) -> None:
+    """Show the heat of a query; it takes the first free colour, else that of the longest shown one."""
+    viewer.change(queries=viewer.state.session.showing(phrase).queries)
 
 
-def hide(viewer: Viewer, query: Query) -> None:
+def hide(viewer: Viewer, phrase: str) -> None:
     """Keep a query in the list without its heat."""
-    remember(viewer)
-    query.slot = None
+    viewer.change(queries=viewer.state.session.with_query(phrase, slot=None).queries)
 
 
-def remove(viewer: Viewer, query: Query) -> None:
-    state = viewer.state
-    if query in state.queries:
-        remember(viewer)
-        state.queries = [q for q in state.queries if q is not query]
-        if state.selected is query:
-            select(viewer, state.queries[-1] if state.queries else None)
-        let_go(viewer)
+def remove(viewer: Viewer, phrase: str) -> None:
+    """Take a query off the list; where it was chosen, the latest one is."""
+    session = viewer.state.session
+    left = tuple(query for query in session.queries if query.phrase != phrase)
+    latest = left[-1].phrase if left else ""
+    viewer.change(queries=left, chosen=latest if session.chosen == phrase else session.chosen)
+    forget_unlisted(viewer)
 
 
 def remove_all(viewer: Viewer) -> None:
     """Take all queries off the list; one undo brings them back."""
-    state = viewer.state
-    if state.queries:
-        remember(viewer)
-        state.queries = []
-        select(viewer, None)
-        let_go(viewer)
+    viewer.change(queries=(), chosen="")
+    forget_unlisted(viewer)
 
 
 def set_level(viewer: Viewer, level: LevelChoice) -> None:
     """Choose the semantic level of all queries, or leave it to the score ("auto")."""
-    if level == viewer.state.level:
-        return
-    remember(viewer)
-    viewer.state.level = level
-    ask_again(viewer)
+    if level != viewer.state.session.level:
+        viewer.change(level=level)
+        ask_again(viewer)
 
 
-# What an answer stands on.
-
-
-def explain(viewer: Viewer, query: Query) -> None:
-    """Have the worker draw the evidence of an answer, and show it."""
-    engine, state, result = viewer.engine, viewer.state, query.result
-    if engine is None or result is None or state.path is None:
-        return
-    path, scene = state.path, engine.scene
-
-    def work(progress: Progress) -> Array:
-        features = kept_features(path, scene)
-        photographs = kept_photographs(path, scene, progress=progress)
-        rasterizer = load_rasterizer("cpu")
-        found = find_evidence(engine, result, query.asked_for, features, rasterizer, progress)
-        if found is None:
-            raise InputError(f"'{query.phrase}': nothing in the scene answers")
-        return draw_evidence(found, result, scene, features, photographs, rasterizer)
-
-    def done(image: Array) -> None:
-        if query in state.queries:
-            state.evidence = EvidenceSheet(query.phrase, image)
-
-    viewer.run(f"looking for the evidence of '{query.phrase}'", work, done)
-
-
-# How queries are asked and where they end: own cuts, canonical phrases, whole sets of queries.
-
-
-def set_cut(viewer: Viewer, query: Query, cut: float | None, *, is_new: bool = True) -> None:
-    """Let an answer end at a relevancy of one's own, or (None) where it ends by itself.
+def set_cut(viewer: Viewer, phrase: str, cut: float | None, *, is_new: bool = True) -> None:
+    """Give an answer a threshold in place of its own, or (None) its own again.
 
     is_new: a step of its own to undo, and not a slider that moves on.
     """
-    if query.automatic is None or cut == query.cut:
+    state, cut = viewer.state, None if cut is None else min(max(cut, 0.0), 1.0)
+    query = state.session.query(phrase)
+    if query is None or state.answer(query).result is None or cut == query.cut:
         return
     if is_new:
-        remember(viewer)
-    query.cut = cut
-    query.result = query.automatic if cut is None else recut(query.automatic, cut)
+        viewer.remember()
+    state.session = state.session.with_query(phrase, cut=cut)
 
 
-def set_canonical(viewer: Viewer, text: str) -> None:
-    """Compare everything with other canonical phrases, between commas; "" for the scene's own again."""
-    phrases = tuple(split_phrases(text))
-    engine, state = viewer.engine, viewer.state
+def set_canonical(viewer: Viewer, phrases: tuple[str, ...]) -> None:
+    """Compare everything with other canonical phrases; none: with the scene's own again."""
+    engine, state, before = viewer.engine, viewer.state, viewer.state.session.canonical
     if engine is None or not state.has_field:
         viewer.say_error("open a scene with a language field first")
         return
@@ -326,43 +264,71 @@ def set_canonical(viewer: Viewer, text: str) -> None:
         return engine.canonical_phrases
 
     def done(canonical: tuple[str, ...]) -> None:
-        state.canonical, state.canonical_typed = phrases, ", ".join(canonical)
+        viewer.put(canonical=phrases)
+        state.canonical_typed = ", ".join(canonical)
         state.say(f"compared with {', '.join(canonical)}")
         ask_again(viewer)
 
-    viewer.run("encoding canonical phrases", work, done)
+    def failed(reason: str) -> None:
+        viewer.say_error(reason)
+        viewer.put(canonical=before if before != phrases else ())
+        ask_unanswered(viewer)
+
+    viewer.run("encoding canonical phrases", work, done, failed)
 
 
-def listed_queries(state: ViewerState) -> QuerySet:
-    """The list as it is saved."""
-    saved = tuple(SavedQuery(query.phrase, query.cut, query.slot is not None) for query in state.queries)
-    return QuerySet(saved, state.level, state.canonical)
+# What an answer stands on.
+
+
+def explain(viewer: Viewer, query: Query) -> None:
+    """Have the worker draw the evidence of an answer, and show it."""
+    engine, state, result = viewer.engine, viewer.state, viewer.state.result(query)
+    if engine is None or result is None or state.path is None:
+        return
+    path, scene, asked_for = state.path, engine.scene, state.answer(query).asked_for
+
+    def work(progress: Progress) -> Array:
+        features = kept_features(path, scene)
+        photographs = kept_photographs(path, scene, progress=progress)
+        rasterizer = load_rasterizer("cpu")
+        found = find_evidence(engine, result, asked_for, features, rasterizer, progress)
+        if found is None:
+            raise InputError(f"'{query.phrase}': nothing in the scene answers")
+        return draw_evidence(found, result, scene, features, photographs, rasterizer)
+
+    def done(image: Array) -> None:
+        if query.phrase in state.answers:
+            state.evidence = EvidenceSheet(query.phrase, image)
+
+    viewer.run(f"looking for the evidence of '{query.phrase}'", work, done)
+
+
+# Sets of queries in files.
 
 
 def save_queries(viewer: Viewer, folder: Path = Path()) -> Path | None:
     """Save the list to a new file in `folder`; returns its path, None if there is none or that failed."""
     state = viewer.state
-    if not state.queries:
+    if not state.session.queries:
         viewer.say_error("search for something first, then save the queries")
         return None
     path = free_name(folder, state.path.stem if state.path else "scene", QUERIES)
     more = "; open it, or drop it onto the window, to ask them again"
-    return viewer.save(path, lambda: write_queries(path, listed_queries(state)), more)
+    return viewer.save(path, lambda: write_queries(path, state.session), more)
 
 
 def load_queries(viewer: Viewer, path: Path) -> None:
     """Ask all queries of a file, after those that are listed already."""
-    state = viewer.state
     try:
         wanted = read_queries(path)
     except InputError as error:
         viewer.say_error(one_line(error))
         return
-    if not state.has_field:
+    if not viewer.state.has_field:
         viewer.say_error(f"{path.name}: open a scene that can be searched first")
         return
-    if wanted.canonical != state.canonical:
-        set_canonical(viewer, ", ".join(wanted.canonical))
+    if wanted.canonical != viewer.state.session.canonical:
+        set_canonical(viewer, wanted.canonical)
     set_level(viewer, wanted.level)
     for query in wanted.queries:
         ask_one(viewer, query.phrase, cut=query.cut, then_show=query.shown)
@@ -376,50 +342,50 @@ def prepare_suggestions(viewer: Viewer) -> None:
     state, engine = viewer.state, viewer.engine
     if state.scene is state.suggestions_of or viewer.worker.current is not None:
         return
-    state.suggestions, state.suggestions_of = Suggestions(), state.scene
     scene = state.scene
+    state.suggestions, state.suggestions_of = Suggestions(), scene
     if engine is None or scene is None or not state.has_field:
         return
     asked = engine if viewer.has_encoder_here else QueryEngine(scene)  # the phrasebook alone
 
-    def work(progress: Progress) -> Suggestions:
-        return suggest(asked, progress=progress)
-
     def done(found: Suggestions) -> None:
-        if viewer.state.scene is scene:
-            viewer.state.suggestions = found
+        if state.scene is scene:
+            state.suggestions = found
 
-    viewer.run("finding examples", work, done, lambda reason: None)
+    viewer.run(
+        "finding examples", lambda progress: suggest(asked, progress=progress), done, lambda reason: None
+    )
 
 
 def offers(viewer: Viewer) -> tuple[str, tuple[str, ...]]:
     """Return a title and the phrases to offer now: those that go on from what is typed, else a correction of
     the last query, else, before the first query, examples."""
-    state = viewer.state
+    state, queries = viewer.state, viewer.state.session.queries
     if state.typed.strip():
         return "", tuple(completions(state.typed, state.suggestions.phrases))
-    last = state.queries[-1] if state.queries else None
-    if last is None:
+    if not queries:
         return "try", state.suggestions.examples
-    return "did you mean", (last.meant,) if last.meant else ()
+    meant = state.answer(queries[-1]).meant
+    return "did you mean", (meant,) if meant else ()
 
 
 def completion(viewer: Viewer) -> str:
-    """The phrase that goes on from what is typed, "" for none."""
+    """Return the phrase that goes on from what is typed, "" for none."""
     phrases = offers(viewer)[1] if viewer.state.typed.strip() else ()
     return phrases[0] if phrases else ""
 
 
 def ask_offered(viewer: Viewer, phrase: str) -> None:
     """Search for what was offered; a query that it corrects leaves the list."""
-    for query in [query for query in viewer.state.queries if query.meant == phrase]:
-        remove(viewer, query)
-    viewer.state.typed = ""
+    state = viewer.state
+    for query in [query for query in state.session.queries if state.answer(query).meant == phrase]:
+        remove(viewer, query.phrase)
+    state.typed = ""
     ask(viewer, phrase)
 
 
 def recall(viewer: Viewer, step: int) -> str:
-    """The phrase `step` places later than the last recalled, -1 for the one before; "" behind the last."""
+    """Return the phrase `step` places after the last recalled, -1 for the one before; "" behind the last."""
     state = viewer.state
     state.recalled = min(max(state.recalled + step, 0), len(state.asked))
     return state.asked[state.recalled] if state.recalled < len(state.asked) else ""

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from concurrent.futures import wait
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -22,27 +22,34 @@ from langsplat_core.query.instances import Instance
 from langsplat_core.query.selection import at_point, grow, of_rows, shrink
 from langsplat_core.scene import LEVELS, Scene
 from langsplat_viewer import marks
-from langsplat_viewer.marks import Drawn, Leaving, Marks, Measure, Mode, Stroke, Tool
+from langsplat_viewer.marks import Drawn, Marks, Mode, Stroke, Tool
 from langsplat_viewer.output import free_name
 from langsplat_viewer.rendering.request import UNCLIPPED
-from langsplat_viewer.state import Query
-from langsplat_viewer.viewer import Viewer, remember
+from langsplat_viewer.session import Query
+from langsplat_viewer.state import Leaving
+from langsplat_viewer.viewer import Viewer
 
 NOTHING = "nothing is selected: choose a tool, or an answer of the search"
 
 
 def mark(viewer: Viewer, marks: Marks) -> None:
     """Take other marks, unless they mark the same."""
-    selection = viewer.state.selection
-    if not marks.same(selection.marks):
-        remember(viewer)
-        viewer.state.selection = replace(selection, marks=marks)
+    if not marks.same(viewer.state.marks):
+        viewer.remember()
+        put_marks(viewer, marks)
+
+
+def put_marks(viewer: Viewer, marks: Marks) -> None:
+    """Take other marks without a step of its own to undo."""
+    state = viewer.state
+    viewer.put(marks=state.session.marks.of(marks, state.marks))
+    state.marks = marks
 
 
 def take(viewer: Viewer, found: Array, mode: Mode | None = None) -> None:
     """Combine the selection with `found` (N,) bool; `mode` in place of the one that is set."""
-    selection = viewer.state.selection
-    mark(viewer, marks.combined(selection.marks, found & ~selection.locked, mode or selection.mode))
+    state = viewer.state
+    mark(viewer, marks.combined(state.marks, found & ~state.locked, mode or state.tools.mode))
 
 
 def has_scene(viewer: Viewer) -> bool:
@@ -56,7 +63,7 @@ def has_selection(viewer: Viewer) -> bool:
     """Return whether something is selected; say so where nothing is."""
     if not has_scene(viewer):
         return False
-    some = bool(viewer.state.selection.marks.selected.any())
+    some = bool(viewer.state.marks.selected.any())
     if not some:
         viewer.state.say(NOTHING)
     return some
@@ -64,70 +71,70 @@ def has_selection(viewer: Viewer) -> bool:
 
 def select_all(viewer: Viewer) -> None:
     if has_scene(viewer):
-        take(viewer, viewer.state.selection.marks.shown, "replace")
+        take(viewer, viewer.state.marks.shown, "replace")
 
 
 def select_none(viewer: Viewer) -> None:
     if has_scene(viewer):
-        take(viewer, np.zeros_like(viewer.state.selection.marks.selected), "replace")
+        take(viewer, np.zeros_like(viewer.state.marks.selected), "replace")
 
 
 def invert_selection(viewer: Viewer) -> None:
     """Select what is shown and was not selected."""
     if has_scene(viewer):
-        take(viewer, ~viewer.state.selection.marks.selected, "replace")
+        take(viewer, ~viewer.state.marks.selected, "replace")
 
 
 def hide_selected(viewer: Viewer) -> None:
     """Take the selection out of the image until all is shown again."""
     if has_selection(viewer):
-        mark(viewer, marks.hiding(viewer.state.selection.marks))
+        mark(viewer, marks.hiding(viewer.state.marks))
 
 
 def isolate_selected(viewer: Viewer) -> None:
     """Hide everything that is not selected."""
     if has_selection(viewer):
-        marks, locked = viewer.state.selection.marks, viewer.state.selection.locked
+        marks, locked = viewer.state.marks, viewer.state.locked
         mark(viewer, replace(marks, hidden=marks.kept & ~(marks.selected | locked)))
 
 
 def show_hidden(viewer: Viewer) -> None:
     if has_scene(viewer):
-        marks = viewer.state.selection.marks
+        marks = viewer.state.marks
         mark(viewer, replace(marks, hidden=np.zeros_like(marks.hidden)))
 
 
 def delete_selected(viewer: Viewer) -> None:
     """Take the selection out of the image and of what is saved; the file that was opened stays as it is."""
     if has_selection(viewer):
-        marks = viewer.state.selection.marks
+        marks = viewer.state.marks
         mark(viewer, Marks(np.zeros_like(marks.selected), marks.hidden, marks.deleted | marks.selected))
 
 
 def reach(viewer: Viewer) -> float:
     """Return how far growing and shrinking go at a time, world units."""
     extent = viewer.state.extent
-    return viewer.state.selection.reach * (0.0 if extent is None else extent.radius)
+    return viewer.state.tools.reach * (0.0 if extent is None else extent.radius)
 
 
 def grow_selection(viewer: Viewer) -> None:
     """Add what is within reach along the surface."""
     if has_selection(viewer):
-        selected, distance = viewer.state.selection.marks.selected, reach(viewer)
+        selected, distance = viewer.state.marks.selected, reach(viewer)
         find(viewer, "growing", lambda engine: grow(engine.surface, selected, distance), "add")
 
 
 def shrink_selection(viewer: Viewer) -> None:
     """Leave out what is within reach of something else along the surface."""
     if has_selection(viewer):
-        selected, distance = viewer.state.selection.marks.selected, reach(viewer)
+        selected, distance = viewer.state.marks.selected, reach(viewer)
         find(viewer, "shrinking", lambda engine: shrink(engine.surface, selected, distance), "intersect")
 
 
 def select_alike(viewer: Viewer) -> None:
     """Select everything that is like what is selected, wherever it is, by `QueryEngine.like`."""
     if has_selection(viewer):
-        selected = viewer.state.selection.marks.selected
+        selected = viewer.state.marks.selected
         find(viewer, "looking for more like", lambda engine: engine.like(selected).members, "replace")
 
 
@@ -147,58 +154,38 @@ def find(viewer: Viewer, label: str, work: Callable[[QueryEngine], Array], mode:
 def chosen_query(viewer: Viewer) -> Query | None:
     """Return the query whose details are shown, else the latest; None without one."""
     state = viewer.state
-    return state.selected or (state.queries[-1] if state.queries else None)
+    return state.chosen_query or (state.session.queries[-1] if state.session.queries else None)
 
 
 def select_query(viewer: Viewer, query: Query | None = None, mode: Mode | None = None) -> None:
     """Select the members of an answer, by default that of `chosen_query`."""
     query = query or chosen_query(viewer)
-    if has_scene(viewer) and query is not None and query.result is not None:
-        if query.result.verdict == "not here":
+    result = None if query is None else viewer.state.result(query)
+    if has_scene(viewer) and query is not None and result is not None:
+        if result.verdict == "not here":
             viewer.state.say(f"'{query.phrase}' is not here: nothing to select")
             return
-        take(viewer, query.result.members, mode)
+        take(viewer, result.members, mode)
     elif viewer.state.scene is not None:
         viewer.state.say("search for something first, then select what was found")
 
 
 def select_thing(viewer: Viewer, thing: Instance, mode: Mode | None = None) -> None:
     if has_scene(viewer):
-        take(viewer, of_rows(thing.members, len(viewer.state.selection.marks.selected)), mode)
+        take(viewer, of_rows(thing.members, len(viewer.state.marks.selected)), mode)
+
+
+def set_tools(viewer: Viewer, **values: Any) -> None:
+    """Change how the mouse selects: fields of `Tools`."""
+    viewer.state.tools = replace(viewer.state.tools, **values)
 
 
 def use_tool(viewer: Viewer, tool: Tool | None) -> None:
     """Choose the tool of the left button; None: a drag turns the camera again."""
-    viewer.state.selection = replace(viewer.state.selection, tool=tool, stroke=None)
-
-
-def set_mode(viewer: Viewer, mode: Mode) -> None:
-    """Set how what is found is combined with the selection, unless a held key says otherwise."""
-    viewer.state.selection = replace(viewer.state.selection, mode=mode)
-
-
-def set_brush(viewer: Viewer, radius: float) -> None:
-    low, high = marks.BRUSHES
-    viewer.state.selection = replace(viewer.state.selection, brush=min(max(radius, low), high))
-
-
-def set_reach(viewer: Viewer, share: float) -> None:
-    """Set how far growing goes, of the scene's radius."""
-    low, high = marks.REACHES
-    viewer.state.selection = replace(viewer.state.selection, reach=min(max(share, low), high))
-
-
-def set_only_visible(viewer: Viewer, only: bool) -> None:
-    """Set whether rectangle, lasso and brush leave out what lies behind something."""
-    viewer.state.selection = replace(viewer.state.selection, only_visible=only)
+    set_tools(viewer, tool=tool, stroke=None)
 
 
 # Brushing over a histogram of the Gaussians' numbers.
-
-
-def set_measure(viewer: Viewer, measure: Measure) -> None:
-    """Choose the numbers whose histogram is shown."""
-    viewer.state.selection = replace(viewer.state.selection, measure=measure, brushed=None)
 
 
 def values_shown(viewer: Viewer) -> marks.Histogram | None:
@@ -206,8 +193,9 @@ def values_shown(viewer: Viewer) -> marks.Histogram | None:
     state, query = viewer.state, chosen_query(viewer)
     if state.scene is None or state.view is None:
         return None
-    measure, marked = state.selection.measure, state.selection.marks
-    relevancy = None if query is None or query.result is None else query.result.even
+    measure, marked = state.tools.measure, state.marks
+    result = None if query is None else state.result(query)
+    relevancy = None if result is None else result.even
     view = state.view if measure == "distance" else None
     of = (state.scene, measure, relevancy, view, marked.hidden, marked.deleted)
     kept = viewer.histogram
@@ -219,16 +207,14 @@ def values_shown(viewer: Viewer) -> marks.Histogram | None:
 
 def brush_values(viewer: Viewer, at: float) -> None:
     """The mouse is held at a fraction `at` of the histogram's range."""
-    selection = viewer.state.selection
-    at = min(max(at, 0.0), 1.0)
-    start = at if selection.brushed is None else selection.brushed[0]
-    viewer.state.selection = replace(selection, brushed=(start, at))
+    brushed, at = viewer.state.tools.brushed, min(max(at, 0.0), 1.0)
+    set_tools(viewer, brushed=(at if brushed is None else brushed[0], at))
 
 
 def end_brush(viewer: Viewer, mode: Mode | None = None) -> None:
     """The button goes up: select what has values in the range that was brushed."""
-    brushed, found = viewer.state.selection.brushed, values_shown(viewer)
-    viewer.state.selection = replace(viewer.state.selection, brushed=None)
+    brushed, found = viewer.state.tools.brushed, values_shown(viewer)
+    set_tools(viewer, brushed=None)
     if brushed is not None and found is not None:
         take(viewer, found.between(*brushed), mode)
 
@@ -243,7 +229,7 @@ def select_range(viewer: Viewer, text: str) -> None:
     if found is None or len(ends) != 2:
         viewer.say_error(f"'{text}' is not two numbers, such as 0.5 to 0.9")
         return
-    if viewer.state.selection.measure in marks.LOGARITHMIC:
+    if viewer.state.tools.measure in marks.LOGARITHMIC:
         ends = np.log10(np.maximum(ends, 1e-30))
     start, stop = (ends - found.low) / (found.high - found.low)
     take(viewer, found.between(start, stop))
@@ -276,7 +262,7 @@ def export(
     if not (has_scene(viewer) if part == "edited" else has_selection(viewer)):
         return
     state, engine = viewer.state, viewer.engine
-    scene, marks, moves = state.scene, state.selection.marks, state.selection.moves
+    scene, marks, session = state.scene, state.marks, state.session
     assert scene is not None
     field = scene.language
     if field is not None and engine is not None:
@@ -295,14 +281,13 @@ def export(
         kind = "points" if as_points else "Gaussians"
         state.say(f"saved {written.path}: {written.count:,} {kind}")
         if part == "edited" and not as_points and state.scene is scene:
-            state.selection = replace(state.selection, saved=marks.deleted, saved_moves=moves)
+            state.saved = replace(state.saved, marks=session.marks, moves=session.moves)
         then(viewer)
 
     def failed(reason: str) -> None:
         viewer.say_error(f"not saved: {reason}")
 
-    job = viewer.run(f"saving the {part}", work, done, failed)
-    state.selection = replace(state.selection, writing=job.future)
+    state.writing = viewer.run(f"saving the {part}", work, done, failed).future
 
 
 def _write(scene: Scene, rows: Array, folder: Path, stem: str, as_points: bool) -> Written:
@@ -315,9 +300,8 @@ def _write(scene: Scene, rows: Array, folder: Path, stem: str, as_points: bool) 
 
 def finish_writing(viewer: Viewer) -> None:
     """Wait until what is being written is there: the window closes, and the worker's thread ends with it."""
-    writing = viewer.state.selection.writing
-    if writing is not None:
-        wait([writing], LONGEST_WAIT)
+    if viewer.state.writing is not None:
+        wait([viewer.state.writing], LONGEST_WAIT)
 
 
 # Another scene, or none: what was deleted and not saved is asked about first.
@@ -325,18 +309,17 @@ def finish_writing(viewer: Viewer) -> None:
 
 def leave(viewer: Viewer, then: Callable[[Viewer], None], to: str, loses_more: bool = False) -> None:
     """Do `then`: at once if nothing is lost by it, else when that was answered; `to` says what it is."""
-    selection = viewer.state.selection
-    if selection.is_unsaved or loses_more:
-        viewer.state.selection = replace(selection, leaving=Leaving(then, to))
+    if viewer.state.is_unsaved or loses_more:
+        viewer.state.leaving = Leaving(then, to)
     else:
         then(viewer)
 
 
 def may_close(viewer: Viewer) -> bool:
     """Return whether the window may close now; where not, ask."""
-    if not viewer.state.selection.may_close:
+    if not viewer.state.may_close:
         quit_viewer(viewer)
-    return viewer.state.selection.may_close
+    return viewer.state.may_close
 
 
 def quit_viewer(viewer: Viewer) -> None:
@@ -345,7 +328,7 @@ def quit_viewer(viewer: Viewer) -> None:
 
 def end(viewer: Viewer, folder: Path = Path()) -> None:
     """Close without a question: what is not saved is first written to a new file in `folder`."""
-    if viewer.state.selection.is_unsaved:
+    if viewer.state.is_unsaved:
         export(viewer, folder, "edited", then=end_at_once)
     else:
         end_at_once(viewer)
@@ -353,20 +336,18 @@ def end(viewer: Viewer, folder: Path = Path()) -> None:
 
 def end_at_once(viewer: Viewer) -> None:
     """Close, whatever is lost."""
-    viewer.state.selection = replace(viewer.state.selection, leaving=None, may_close=True)
+    viewer.state.leaving, viewer.state.may_close = None, True
 
 
 def _close(viewer: Viewer) -> None:
-    selection = viewer.state.selection
     if viewer.recorder.current is not None:
-        viewer.state.selection = replace(selection, leaving=Leaving(_close, "the window closes", film=True))
+        viewer.state.leaving = Leaving(_close, "the window closes", film=True)
     else:
         end_at_once(viewer)
 
 
 def _answered(viewer: Viewer) -> Callable[[Viewer], None] | None:
-    leaving = viewer.state.selection.leaving
-    viewer.state.selection = replace(viewer.state.selection, leaving=None)
+    leaving, viewer.state.leaving = viewer.state.leaving, None
     return None if leaving is None else leaving.then
 
 
@@ -398,7 +379,7 @@ LONGEST = 4000  # places of a stroke that are kept
 def begin_stroke(viewer: Viewer, u: float, v: float) -> None:
     """The button goes down. A sphere and a box are drawn around the surface that lies there."""
     state = viewer.state
-    tool, centre = state.selection.tool, None
+    tool, centre = state.tools.tool, None
     if tool is None or state.scene is None or state.view is None:
         return
     if tool not in marks.ON_SCREEN:
@@ -408,19 +389,17 @@ def begin_stroke(viewer: Viewer, u: float, v: float) -> None:
             return
         centre = (float(point[0]), float(point[1]), float(point[2]))
     state.glide = None
-    state.selection = replace(state.selection, stroke=Stroke(((u, v),), centre))
+    set_tools(viewer, stroke=Stroke(((u, v),), centre))
 
 
 def extend_stroke(viewer: Viewer, u: float, v: float) -> None:
     """Add a place (u, v) to the stroke under way."""
-    selection = viewer.state.selection
-    stroke = selection.stroke
+    stroke = viewer.state.tools.stroke
     if stroke is None:
         return
     (last_u, last_v), moved = stroke.path[-1], stroke.path
     if max(abs(u - last_u), abs(v - last_v)) >= STEP and len(moved) < LONGEST:
-        stroke = replace(stroke, path=(*moved, (u, v)))
-        viewer.state.selection = replace(selection, stroke=stroke)
+        set_tools(viewer, stroke=replace(stroke, path=(*moved, (u, v))))
 
 
 def end_stroke(viewer: Viewer, mode: Mode | None = None) -> None:
@@ -428,13 +407,13 @@ def end_stroke(viewer: Viewer, mode: Mode | None = None) -> None:
     state, drawn = viewer.state, drawn_stroke(viewer)
     if drawn is None or state.scene is None:
         return
-    cancel_stroke(viewer)
+    set_tools(viewer, stroke=None)
     if drawn.tool == "thing":
         _select_under(viewer, drawn.stroke, mode)
         return
-    wanted = state.selection.only_visible and drawn.tool in marks.ON_SCREEN and viewer.surface is not None
+    wanted = state.tools.only_visible and drawn.tool in marks.ON_SCREEN and viewer.surface is not None
     depths = viewer.surface.depths() if wanted and viewer.surface is not None else None
-    means, clip = state.scene.gaussians.means, state.settings.clip
+    means, clip = state.scene.gaussians.means, state.session.clip
     found = marks.caught(drawn, means, depths)
     if clip != UNCLIPPED and drawn.tool in marks.ON_SCREEN:  # what is not drawn lies under no outline
         found &= clip.keeps(means @ drawn.camera.rotation[2] + drawn.camera.world_to_camera[2, 3])
@@ -444,21 +423,16 @@ def end_stroke(viewer: Viewer, mode: Mode | None = None) -> None:
 def drawn_stroke(viewer: Viewer) -> Drawn | None:
     """The stroke under way, in the image as it is; None without one."""
     state = viewer.state
-    tool, stroke = state.selection.tool, state.selection.stroke
+    tool, stroke = state.tools.tool, state.tools.stroke
     if tool is None or stroke is None or state.view is None:
         return None
-    return Drawn(tool, stroke, state.view.camera(*state.size), state.selection.brush, reach(viewer))
-
-
-def cancel_stroke(viewer: Viewer) -> None:
-    """Drop the stroke under way; nothing is selected by it."""
-    viewer.state.selection = replace(viewer.state.selection, stroke=None)
+    return Drawn(tool, stroke, state.view.camera(*state.size), state.tools.brush, reach(viewer))
 
 
 def leave_tool(viewer: Viewer) -> None:
     """Give up the stroke under way; without one, the tool."""
-    if viewer.state.selection.stroke is not None:
-        cancel_stroke(viewer)
+    if viewer.state.tools.stroke is not None:
+        set_tools(viewer, stroke=None)
     else:
         use_tool(viewer, None)
 
@@ -471,7 +445,7 @@ def _select_under(viewer: Viewer, stroke: Stroke, mode: Mode | None) -> None:
     if state.scene.language is None:
         viewer.say_error("without a language field no things are known: use a brush, sphere or box")
         return
-    level = LEVELS.index("whole" if state.level == "auto" else state.level)
+    level = LEVELS.index("whole" if state.session.level == "auto" else state.session.level)
     centre = np.array(stroke.centre)
     find(
         viewer,

@@ -1,4 +1,4 @@
-"""The viewpoint: camera moves, the camera path as it is played, the cursor, bookmarks and the comparison."""
+"""The viewpoint: camera moves, the camera path as it is played, the cursor, bookmarks."""
 
 import math
 from collections.abc import Callable
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.errors import InputError
+from langsplat_core.errors import InputError, printable_line
 from langsplat_core.progress import Progress
 from langsplat_core.query.describe import Describer, Pointed, look_at_pixel
 from langsplat_core.query.engine import no_field
@@ -30,19 +30,19 @@ from langsplat_viewer.camera.controls import (
     zoom,
 )
 from langsplat_viewer.camera.flight import pose_at, pose_of, view_of
-from langsplat_viewer.files.projects import MOST_VIEWS, Bookmark, named
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.rendering.request import image_formation
-from langsplat_viewer.state import GLIDE_SECONDS, Glide, Hover, Query, flight_of
+from langsplat_viewer.session import LONGEST_NAME, MOST_BOOKMARKS, Bookmark, Query
+from langsplat_viewer.state import GLIDE_SECONDS, Glide, Hover, flight_of
 from langsplat_viewer.viewer import Viewer
 
 
 def path_seconds(viewer: Viewer) -> float:
     """Return how long the path takes, seconds; 0 without one."""
-    record = viewer.state.record
+    record, keyframes = viewer.state.record, viewer.state.session.keyframes
     if record.turns:
         return record.turn_seconds
-    return record.keyframes[-1].seconds if record.keyframes else 0.0
+    return keyframes[-1].seconds if keyframes else 0.0
 
 
 def toggle_playing(viewer: Viewer) -> None:
@@ -63,7 +63,7 @@ def toggle_playing(viewer: Viewer) -> None:
 def scrub(viewer: Viewer, seconds: float) -> None:
     """Show the path at a time, stopped."""
     state, record = viewer.state, viewer.state.record
-    if state.view is None or not (record.turns or record.keyframes):
+    if state.view is None or not (record.turns or state.session.keyframes):
         return
     if record.turns and record.turn_from is None:
         record.turn_from = state.view
@@ -104,9 +104,9 @@ def _view_at(viewer: Viewer, seconds: float) -> OrbitCamera | None:
     state, record = viewer.state, viewer.state.record
     if record.turns and record.turn_from is not None:
         return orbit(record.turn_from, 2 * math.pi * seconds / record.turn_seconds, 0)
-    if state.extent is None or not record.keyframes:
+    if state.extent is None or not state.session.keyframes:
         return state.view
-    return view_of(pose_at(flight_of(record.keyframes), seconds), state.extent)
+    return view_of(pose_at(flight_of(state.session.keyframes), seconds), state.extent)
 
 
 # Camera moves, at once or gliding from view to view.
@@ -240,14 +240,13 @@ def focus_result(viewer: Viewer, query: Query | None = None) -> None:
     state = viewer.state
     if state.extent is None or state.view is None:
         return
-    if query is None:
-        found = [q for q in state.in_order_of_showing() if q.result and q.result.found]
-        query = found[-1] if found else None
-    place = None if query is None or query.result is None else query.result.place
-    if query is None or query.result is None or place is None:
+    shown = state.session.in_order_of_showing() if query is None else [query]
+    results = [result for query in shown if (result := state.result(query)) is not None]
+    found = [result for result in results if result.found or query is not None]
+    if found and found[-1].place is not None:
+        focus_on(viewer, found[-1].place, found[-1].box)
+    else:
         frame_scene(viewer)
-        return
-    focus_on(viewer, place, query.result.box)
 
 
 def focus_on(viewer: Viewer, place: Array, box: Array | None) -> None:
@@ -322,9 +321,9 @@ def _ask(viewer: Viewer, place: Hover) -> None:
     if engine is None:
         return
     camera = place.view.camera(*viewer.state.size)
-    shown = [query for query in viewer.state.shown() if query is not None and query.result is not None]
-    settings = image_formation(engine.scene, camera, viewer.state.settings.clip)
-    results = [query.result for query in shown if query.result is not None]
+    phrases = tuple(query.phrase for query in viewer.state.shown() if query is not None)
+    settings = image_formation(engine.scene, camera, viewer.state.session.clip)
+    results = [result for result in viewer.state.shown_results() if result is not None]
 
     def work(progress: Progress) -> tuple[Describer, Pointed | None]:
         describer = viewer.describer
@@ -337,7 +336,7 @@ def _ask(viewer: Viewer, place: Hover) -> None:
 
     def done(found: tuple[Describer, Pointed | None]) -> None:
         viewer.describer, place.found = found
-        place.phrases = tuple(query.phrase for query in shown)
+        place.phrases = phrases
 
     viewer.run("looking under the cursor", work, done)
 
@@ -351,19 +350,19 @@ def add_bookmark(viewer: Viewer, name: str = "") -> None:
     if state.view is None:
         viewer.say_error("open a scene first, then bookmark a view of it")
         return
-    kept = state.bookmarks
+    kept = state.session.bookmarks
     if not name.strip():
         number = len(kept) + 1
         while f"view {number}" in {bookmark.name for bookmark in kept}:
             number += 1
         name = f"view {number}"
-    added = Bookmark(named(name), pose_of(state.view), state.view.distance)
+    added = Bookmark(printable_line(name, LONGEST_NAME), pose_of(state.view), state.view.distance)
     others = tuple(bookmark for bookmark in kept if bookmark.name != added.name)
-    if len(others) >= MOST_VIEWS:
-        viewer.say_error(f"a scene has at most {MOST_VIEWS} bookmarks: delete one")
+    if len(others) >= MOST_BOOKMARKS:
+        viewer.say_error(f"a scene has at most {MOST_BOOKMARKS} bookmarks: delete one")
         return
-    state.bookmarks, state.bookmark_typed = (*others, added), ""
-    _keep(viewer)
+    state.bookmark_typed = ""
+    _keep(viewer, (*others, added))
     state.say(f"bookmark '{added.name}'")
 
 
@@ -380,8 +379,7 @@ def bookmarked_view(bookmark: Bookmark, extent: Extent) -> OrbitCamera:
 
 
 def delete_bookmark(viewer: Viewer, bookmark: Bookmark) -> None:
-    viewer.state.bookmarks = tuple(other for other in viewer.state.bookmarks if other is not bookmark)
-    _keep(viewer)
+    _keep(viewer, tuple(other for other in viewer.state.session.bookmarks if other is not bookmark))
 
 
 def read_bookmarks(viewer: Viewer, scene: Path) -> tuple[Bookmark, ...]:
@@ -393,11 +391,12 @@ def read_bookmarks(viewer: Viewer, scene: Path) -> tuple[Bookmark, ...]:
         return ()
 
 
-def _keep(viewer: Viewer) -> None:
+def _keep(viewer: Viewer, bookmarks: tuple[Bookmark, ...]) -> None:
     state = viewer.state
+    viewer.put(bookmarks=bookmarks)
     if state.path is None:
         return
     try:
-        viewer.shelf.write(state.path, state.bookmarks)
+        viewer.shelf.write(state.path, bookmarks)
     except (OSError, InputError) as error:
         viewer.say_error(f"bookmarks not kept: {one_line(error)}")

@@ -193,7 +193,7 @@ def draw_messages(viewer: Viewer) -> None:
 
 def figures(viewer: Viewer) -> str:
     """Return backend, time and size of the last image, and the count of the selection, as one line."""
-    stats, selected = viewer.state.stats, int(viewer.state.selection.marks.selected.sum())
+    stats, selected = viewer.state.stats, int(viewer.state.marks.selected.sum())
     parts = [viewer.state.backend]
     if stats.width:
         parts += [f"{stats.milliseconds:.0f} ms", f"{stats.width} x {stats.height}"]

@@ -243,9 +243,9 @@ def _pixel(area: ui.Area) -> tuple[int, int] | None:
 def _mouse(viewer: Viewer, area: ui.Area) -> None:
     """The left button turns; while a tool has it, the middle one does."""
     io = imgui.get_io()
-    free = viewer.state.selection.tool is None
+    free = viewer.state.tools.tool is None
     turns = 0 if free else 2
-    if free and imgui.is_mouse_double_clicked(0) and not viewer.state.ruler.measures:
+    if free and imgui.is_mouse_double_clicked(0) and not viewer.state.session.ruler.measures:
         viewpoint.focus_pixel(viewer, *area.fraction(io.mouse_pos.x, io.mouse_pos.y))
         return
     dx, dy = io.mouse_delta.x, io.mouse_delta.y

@@ -9,9 +9,9 @@ from imgui_bundle import icons_fontawesome_6 as icons
 from langsplat_core.query.describe import OR, Outline
 from langsplat_viewer.actions import outline, settings
 from langsplat_viewer.actions.outline import Target
-from langsplat_viewer.files.projects import Group
 from langsplat_viewer.panels import ui
 from langsplat_viewer.panels.overlays import STILL, begin_legend
+from langsplat_viewer.session import Group
 from langsplat_viewer.state import OutlineView
 from langsplat_viewer.viewer import Viewer
 
@@ -30,9 +30,9 @@ def draw(viewer: Viewer) -> None:
     _, typed = imgui.input_text_with_hint("##filter", "filter", viewer.state.outline_typed)
     settings.put(viewer.state, outline_typed=typed)
     if imgui.begin_child("rows", child_flags=imgui.ChildFlags_.nav_flattened):
-        for group in viewer.state.things.groups:
+        for group in viewer.state.session.things.groups:
             _group(viewer, view, group)
-        inside = {node for group in viewer.state.things.groups for node in group.nodes}
+        inside = {node for group in viewer.state.session.things.groups for node in group.nodes}
         for row in outline.filtered(viewer, view.roots, typed):
             if row.node not in inside or typed:
                 _row(viewer, row)
@@ -68,7 +68,7 @@ def _row(viewer: Viewer, row: Outline, *, in_group: bool = False) -> None:
     flags |= imgui.TreeNodeFlags_.leaf if not row.parts else 0
     colour = outline.colour_of(viewer, row.node)
     name, sure = outline.name_of(viewer, row), ""
-    if row.word and row.node not in viewer.state.things.names:
+    if row.word and row.node not in viewer.state.session.things.names:
         sure = f" {100 * row.word.probability:.0f} %"
     taken = (2 if colour is None else 3) * (side + spacing)
     room = imgui.get_content_region_avail().x - taken - imgui.get_tree_node_to_label_spacing()
@@ -122,7 +122,7 @@ def _chosen(menu: str) -> bool:
 def _group_menu(viewer: Viewer, node: int, in_group: bool) -> None:
     if imgui.menu_item("Into a new group", "", False)[0]:
         outline.group(viewer, node, None)
-    for group in viewer.state.things.groups:
+    for group in viewer.state.session.things.groups:
         if node not in group.nodes and imgui.menu_item(f"Into '{group.name}'", "", False)[0]:
             outline.group(viewer, node, group)
     if in_group and imgui.menu_item("Out of the group", "", False)[0]:
@@ -139,7 +139,7 @@ def _sides(row: Outline) -> str:
 
 
 def _switches(viewer: Viewer, node: int, right: float, side: float) -> None:
-    hidden, locked = bool(outline.hidden_nodes(viewer)[node]), node in viewer.state.things.locked
+    hidden, locked = bool(outline.hidden_nodes(viewer)[node]), node in viewer.state.session.things.locked
     imgui.same_line(right - 2 * side - imgui.get_style().item_spacing.x)
     if _icon(f"{icons.ICON_FA_EYE_SLASH if hidden else icons.ICON_FA_EYE}###eye", side, lit=not hidden):
         (outline.show if hidden else outline.hide)(viewer, node)
@@ -227,7 +227,7 @@ def _named(label: str, hint: str, text: str) -> str:
 def draw_legend(viewer: Viewer, area: ui.Area) -> None:
     """Draw colours and names of the largest things in the image, where latents or the tree are shown."""
     state = viewer.state
-    if state.picture.display not in ("latent", "tree") or state.settings.split.columns > 1:
+    if state.session.picture.display not in ("latent", "tree") or state.session.split.columns > 1:
         return
     view = outline.wanted(viewer)
     if view is None or view.problem:

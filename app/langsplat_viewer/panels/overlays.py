@@ -29,7 +29,7 @@ UNMOVED = ui.OVER | ui.FIXED | imgui.WindowFlags_.no_background | imgui.WindowFl
 
 def draw_pictures(viewer: Viewer, area: ui.Area, textures: tuple[moderngl.Texture, ...]) -> None:
     """The textures of `Canvas.textures` where they belong, each with its name if there are several."""
-    split = viewer.state.settings.split
+    split = viewer.state.session.split
     if split.mode in ("wipe", "scenes") and len(textures) > 1:
         _image(area, textures[0], 0.0, split.at)
         _image(area, textures[1], split.at, 1.0)
@@ -63,7 +63,7 @@ def _divider(area: ui.Area, at: float) -> None:
 
 def _titles(viewer: Viewer, area: ui.Area) -> None:
     """Write what each image shows at its upper edge: left and right of the line of a wipe."""
-    split, names = viewer.state.settings.split, tuple(pane.label for pane in viewer.state.panes())
+    split, names = viewer.state.session.split, tuple(pane.label for pane in viewer.state.panes())
     gap, top = hello_imgui.em_size(0.6), area.top + hello_imgui.em_size(0.5)
     if split.mode == "scenes":
         there = None if viewer.beside is None else viewer.beside.state.path
@@ -95,7 +95,7 @@ def text_on_shade(text: str, x: float, y: float, area: ui.Area) -> None:
 
 def draw_grip(viewer: Viewer, area: ui.Area) -> None:
     """Draw the grip of the line of a wipe; a double click puts it into the middle."""
-    split = viewer.state.settings.split
+    split = viewer.state.session.split
     if split.mode not in ("wipe", "scenes") or viewer.state.scene is None:
         return
     x = area.left + split.at * area.width
@@ -143,12 +143,12 @@ def draw_evidence(viewer: Viewer, picture: ui.Picture) -> None:
 def draw_photograph(viewer: Viewer, area: ui.Area, picture: ui.Picture) -> None:
     """Draw the photograph of the camera at which one stands, over every image in the area."""
     state, photograph = viewer.state, opening.photograph_here(viewer.state)
-    if state.settings.fade == 0 or photograph is None or photograph.image is None or state.view is None:
+    if state.session.fade == 0 or photograph is None or photograph.image is None or state.view is None:
         return
     reference = imgui.ImTextureRef(picture.texture(photograph.image).glo)
     paint = imgui.get_background_draw_list()
-    tint = imgui.get_color_u32((1.0, 1.0, 1.0, state.settings.fade))
-    for part in area.columns(state.settings.split.columns):
+    tint = imgui.get_color_u32((1.0, 1.0, 1.0, state.session.fade))
+    for part in area.columns(state.session.split.columns):
         left, top, right, bottom = corners(photograph.camera, state.view.camera(*part.size))
         low, high = ImVec2(part.left + left, part.top + top), ImVec2(part.left + right, part.top + bottom)
         paint.push_clip_rect(*part.corners, True)
@@ -182,17 +182,17 @@ def draw_lines(viewer: Viewer, area: ui.Area) -> None:
     paint, metres = imgui.get_background_draw_list(), state.scene.metres_per_unit
     least = overlays.LEAST_DEPTH * state.extent.radius  # from this camera z on lines are drawn
     grid = None
-    if "grid" in state.preferences.overlays:
+    if "grid" in state.session.overlays:
         grid = overlays.ground_grid(state.extent, state.view.up, metres)
-    for part in area.columns(state.settings.split.columns):
+    for part in area.columns(state.session.split.columns):
         camera = state.view.camera(*part.size)
         paint.push_clip_rect(*part.corners, True)
         if grid is not None:
             _grid(grid, part, camera, least)
-        if "cameras" in state.preferences.overlays:
+        if "cameras" in state.session.overlays:
             edges = overlays.frusta(state.scene.cameras, overlays.FRUSTUM_DEPTH * state.extent.radius)
             _cameras(viewer, edges, part, camera, least)
-        if "things" in state.preferences.overlays:  # after the lines, so that its words are readable
+        if "things" in state.session.overlays:  # after the lines, so that its words are readable
             _things(viewer, part, camera, least)
         _ruler(viewer, part, camera, least, metres)
         _notes(viewer, part, camera, least)
@@ -211,7 +211,7 @@ def draw_lines(viewer: Viewer, area: ui.Area) -> None:
 
 def _take_click(viewer: Viewer, area: ui.Area) -> None:
     """Set a point of the ruler, or pin a note, where the scene is clicked for that."""
-    cursors, measures = imgui.MouseCursor_, viewer.state.ruler.measures
+    cursors, measures = imgui.MouseCursor_, viewer.state.session.ruler.measures
     if not (measures or viewer.state.pins_notes):
         return
     imgui.set_mouse_cursor(cursors.resize_all if measures else cursors.hand)
@@ -246,7 +246,7 @@ def _cameras(viewer: Viewer, edges: Array, area: ui.Area, camera: Camera, least:
     owners = rows // edges.shape[1]
     segments, owners = segments[away[owners]], owners[away[owners]]
     under = -1
-    if not (imgui.get_io().want_capture_mouse or state.ruler.measures):
+    if not (imgui.get_io().want_capture_mouse or state.session.ruler.measures):
         mouse = imgui.get_io().mouse_pos
         row, distance = overlays.nearest_segment(segments, (mouse.x - area.left, mouse.y - area.top))
         under = int(owners[row]) if distance < REACH else -1
@@ -268,14 +268,15 @@ def _things(viewer: Viewer, area: ui.Area, camera: Camera, least: float) -> None
         if query is None or query.slot is None:
             continue
         red, green, blue = QUERY_COLOURS[query.slot]
-        for number, thing in enumerate(query.things, start=1):
+        things = viewer.state.answer(query).things
+        for number, thing in enumerate(things, start=1):
             edges = overlays.box_edges(thing.oriented.corners)
             segments, _ = overlays.clip_segments(camera, edges, least)
             _lines(area, segments, (0.0, 0.0, 0.0, 0.5), 3.0)
             _lines(area, segments, (red, green, blue, 1.0), 1.5)
             if len(segments):
                 x, y = segments.reshape(-1, 2)[segments.reshape(-1, 2)[:, 1].argmin()].tolist()
-                text = query.phrase if len(query.things) == 1 else f"{query.phrase} {number}"
+                text = query.phrase if len(things) == 1 else f"{query.phrase} {number}"
                 named.append(Named(text, (x, y), (red, green, blue, 1.0)))
     _names(named, area)
 
@@ -310,7 +311,7 @@ def _grid(grid: overlays.Grid, area: ui.Area, camera: Camera, least: float) -> N
 
 
 def _ruler(viewer: Viewer, area: ui.Area, camera: Camera, least: float, metres: float | None) -> None:
-    ruler, paint = viewer.state.ruler, imgui.get_background_draw_list()
+    ruler, paint = viewer.state.session.ruler, imgui.get_background_draw_list()
     for point in ruler.points:
         place = _place(camera, np.array(point), least)
         if place is not None:
@@ -331,7 +332,7 @@ def _ruler(viewer: Viewer, area: ui.Area, camera: Camera, least: float, metres: 
 def _notes(viewer: Viewer, area: ui.Area, camera: Camera, least: float) -> None:
     """The notes, at the places that they are pinned to."""
     named, paint = [], imgui.get_background_draw_list()
-    for note in viewer.state.notes:
+    for note in viewer.state.session.notes:
         place = _place(camera, np.array(note.at), least)
         if place is not None:
             middle = ImVec2(area.left + place[0], area.top + place[1])
@@ -360,7 +361,7 @@ def draw_legends(viewer: Viewer, area: ui.Area) -> None:
     if viewer.beside is None:
         draw_legend(viewer, area)
         return
-    at = viewer.state.settings.split.at
+    at = viewer.state.session.split.at
     draw_legend(viewer, replace(area, width=at * area.width))
     draw_legend(viewer.beside, area, "relevancy beside")
 
@@ -377,8 +378,8 @@ def draw_legend(viewer: Viewer, area: ui.Area, name: str = "relevancy") -> None:
         result = shown[slot]
         if result is not None:
             strength = STRENGTH[result.verdict]
-            colours = bar_colours(slot, strength, len(slots) == 1, state.picture.colour_map)
-            _bar(result.phrase, colours, state.picture.heat_scale or result.heat_range)
+            colours = bar_colours(slot, strength, len(slots) == 1, state.session.picture.colour_map)
+            _bar(result.phrase, colours, state.session.picture.heat_scale or result.heat_range)
     imgui.end()
 
 
@@ -491,7 +492,7 @@ INK = (0.08, 0.08, 0.10)
 def draw_cube(viewer: Viewer, area: ui.Area) -> None:
     """Draw the view cube over the image's corner; a click on a face turns the view there."""
     view = viewer.state.view
-    if view is None or "cube" not in viewer.state.preferences.overlays:
+    if view is None or "cube" not in viewer.state.session.overlays:
         return
     side = min(hello_imgui.em_size(SIDE_EM), area.width, area.height)
     corner = ImVec2(area.left + area.width - side, area.top)

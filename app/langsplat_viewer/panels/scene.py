@@ -214,7 +214,7 @@ UNSAVED = "Not saved"
 
 def draw_unsaved(viewer: Viewer) -> None:
     """Ask whether to save, discard or stay; over everything else, while something waits for the answer."""
-    leaving = viewer.state.selection.leaving
+    leaving = viewer.state.leaving
     _ask_for_popup(UNSAVED, leaving is not None)
     flags = imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_saved_settings
     if not imgui.begin_popup_modal(UNSAVED, None, flags)[0]:
@@ -223,21 +223,21 @@ def draw_unsaved(viewer: Viewer) -> None:
         _wait_for_film(viewer)
     elif leaving is not None:
         _ask(viewer, leaving.to)
-    if viewer.state.selection.leaving is None:
+    if viewer.state.leaving is None:
         imgui.close_current_popup()
     imgui.end_popup()
 
 
 def _ask(viewer: Viewer, to: str) -> None:
-    selection = viewer.state.selection
-    if selection.is_unsaved:
-        moved = " and some transformed" if selection.moves else ""
-        count = f"{int(selection.marks.deleted.sum()):,} Gaussians"
+    state = viewer.state
+    if state.is_unsaved:
+        moved = " and some transformed" if state.session.moves else ""
+        count = f"{int(state.marks.deleted.sum()):,} Gaussians"
         imgui.text_unformatted(f"{count} were deleted{moved}, and the scene is not saved so.")
-    if viewer.state.has_unsaved_notes:
+    if state.has_unsaved_notes:
         imgui.text_unformatted("Notes, names, groups or locks are in no project.")
     imgui.text_unformatted(f"Save before {to}?")
-    if selection.is_unsaved:
+    if state.is_unsaved:
         if ui.button("Save", "The scene as a new file, without what was deleted"):
             selecting.save_and_leave(viewer)
         imgui.same_line()

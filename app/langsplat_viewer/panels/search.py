@@ -12,11 +12,12 @@ from langsplat_core.display.displays import QUERY_COLOURS, STRENGTH, painted
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import no_field
 from langsplat_core.scene import CANONICAL_PHRASES, LEVELS
+from langsplat_core.scene.language import split_phrases
 from langsplat_viewer.actions import queries, settings, viewpoint
 from langsplat_viewer.marks import counted
 from langsplat_viewer.panels import ui
 from langsplat_viewer.panels.overlays import bar_colours, draw_bar
-from langsplat_viewer.state import Query
+from langsplat_viewer.session import Query
 from langsplat_viewer.viewer import Viewer
 
 HINT = "what to look for"
@@ -83,7 +84,7 @@ HISTOGRAM_EM = 3.0
 
 def _cut(viewer: Viewer, query: Query, result: QueryResult) -> None:
     """Histogram, slider, and a button that lets the answer end by itself again."""
-    low, high, counts = histogram(query.automatic or result)
+    low, high, counts = histogram(viewer.state.answer(query).result or result)
     height = hello_imgui.em_size(HISTOGRAM_EM)
     imgui.plot_histogram("##relevancies", counts, graph_size=ImVec2(-1, height))
     corner, size = imgui.get_item_rect_min(), imgui.get_item_rect_size()
@@ -99,11 +100,11 @@ def _cut(viewer: Viewer, query: Query, result: QueryResult) -> None:
         "What is less relevant than this is no part of the answer; one set by hand stays, whatever the level"
     )
     if changed:
-        queries.set_cut(viewer, query, value, is_new=not own)
+        queries.set_cut(viewer, query.phrase, value, is_new=not own)
     if own:
         imgui.same_line()
         if imgui.button("Auto"):
-            queries.set_cut(viewer, query, None)
+            queries.set_cut(viewer, query.phrase, None)
     imgui.text_colored(ui.muted(), f"{int(result.members.sum()):,} Gaussians")
 
 
@@ -124,16 +125,17 @@ def _answers(viewer: Viewer) -> None:
     """The list, newest first, which grows when something is asked and not when an answer arrives; and below
     it the chosen query."""
     row = imgui.get_frame_height_with_spacing()
-    rows = rows_shown(len(viewer.state.queries), imgui.get_content_region_avail().y / row)
+    listed = viewer.state.session.queries
+    rows = rows_shown(len(listed), imgui.get_content_region_avail().y / row)
     if imgui.begin_child("queries", ImVec2(0, rows * row), imgui.ChildFlags_.nav_flattened):
-        if not viewer.state.queries:
+        if not listed:
             imgui.text_colored(ui.muted(), "what you search is listed here")
-        for query in reversed(viewer.state.queries):
+        for query in reversed(listed):
             imgui.push_id(query.phrase)
             _line(viewer, query)
             imgui.pop_id()
     imgui.end_child()
-    chosen = viewer.state.selected
+    chosen = viewer.state.chosen_query
     if chosen is not None:
         _details(viewer, chosen)
 
@@ -151,18 +153,18 @@ def _line(viewer: Viewer, query: Query) -> None:
     room = right - 2 * side - verdict_width - 3 * spacing
     _swatch(viewer, query, side)
     imgui.same_line()
-    chosen = viewer.state.selected is query
+    chosen = viewer.state.session.chosen == query.phrase
     name = ui.elided(query.phrase, room)
     if imgui.selectable(f"{name}##phrase of list", chosen, size=ImVec2(room, 0))[0]:
-        queries.select(viewer, query)
+        viewer.put(chosen=query.phrase)
     if name != query.phrase and imgui.is_item_hovered():
         imgui.set_tooltip(query.phrase)
     imgui.same_line(left + right - side - spacing - verdict_width)
     imgui.align_text_to_frame_padding()
-    _verdict(query)
+    _verdict(viewer, query)
     imgui.same_line(left + right - side)
     if imgui.button("x", ImVec2(side, 0)):
-        queries.remove(viewer, query)
+        queries.remove(viewer, query.phrase)
     if imgui.is_item_hovered():
         imgui.set_tooltip("Take it off the list")
 
@@ -173,32 +175,33 @@ def _swatch(viewer: Viewer, query: Query, side: float) -> None:
     flags = imgui.ColorEditFlags_.no_tooltip
     if imgui.color_button("##shown", ImVec4(red, green, blue, 1.0), flags, ImVec2(side, side)):
         if shown:
-            queries.hide(viewer, query)
+            queries.hide(viewer, query.phrase)
         else:
-            queries.show(viewer, query)
+            queries.show(viewer, query.phrase)
     ui.tip("Click to hide" if shown else "Click to show")
-    state = viewer.state
-    alone = state.picture.display == "relevancy" and len(painted(state.shown_results())) == 1
-    if shown and alone and query.result is not None:  # painted by the colour map
-        colours = bar_colours(0, STRENGTH[query.result.verdict], True, state.picture.colour_map)
+    state, result = viewer.state, viewer.state.result(query)
+    alone = state.session.picture.display == "relevancy" and len(painted(state.shown_results())) == 1
+    if shown and alone and result is not None:  # painted by the colour map
+        colours = bar_colours(0, STRENGTH[result.verdict], True, state.session.picture.colour_map)
         draw_bar(imgui.get_item_rect_min(), side, side, colours)
 
 
-def _verdict(query: Query) -> None:
-    if query.pending:
+def _verdict(viewer: Viewer, query: Query) -> None:
+    answer, result = viewer.state.answer(query), viewer.state.result(query)
+    if answer.pending:
         imgui.text_colored(ui.muted(), "...")
-    elif query.problem:
+    elif answer.problem:
         imgui.text_colored(ui.bad(), "not asked")
-    elif query.result is not None:
-        imgui.text_colored(ui.good() if query.result.found else ui.muted(), query.result.verdict)
-        probability = query.result.probability
+    elif result is not None:
+        imgui.text_colored(ui.good() if result.found else ui.muted(), result.verdict)
+        probability = result.probability
         if imgui.is_item_hovered() and probability is not None:
             imgui.set_tooltip(f"{100 * probability:.0f} % likely to be there")
 
 
 def _details(viewer: Viewer, query: Query) -> None:
     """Place and a button to go there, scores per level, how it was read or why it was not answered."""
-    result = query.result
+    answer, result = viewer.state.answer(query), viewer.state.result(query)
     place = None if result is None or result.verdict == "not here" else result.place
     if ui.button("Focus", enabled=place is not None):
         viewpoint.focus_result(viewer, query)
@@ -214,10 +217,10 @@ def _details(viewer: Viewer, query: Query) -> None:
     if place is not None:
         imgui.text_colored(ui.muted(), "at " + "  ".join(f"{v:.2f}" for v in place))
         ui.tip("Where it is relevant most; world units")
-    if query.problem:
-        ui.small_wrapped(query.problem, ui.bad())
-    if query.reading:
-        ui.small_wrapped(f"read as: {query.reading}", ui.muted())
+    if answer.problem:
+        ui.small_wrapped(answer.problem, ui.bad())
+    if answer.reading:
+        ui.small_wrapped(f"read as: {answer.reading}", ui.muted())
     if result is not None:
         for index, (name, score) in enumerate(zip(LEVELS, result.scores, strict=True)):
             if index:
@@ -233,7 +236,7 @@ def _details(viewer: Viewer, query: Query) -> None:
 
 def _combine(viewer: Viewer, query: Query) -> None:
     """A menu of the other queries, to search for what both, either or only this one finds."""
-    others = [other for other in viewer.state.queries if other is not query]
+    others = [other for other in viewer.state.session.queries if other.phrase != query.phrase]
     if ui.button(
         "Combine", "Search for this and, or, without another query of the list", enabled=bool(others)
     ):
@@ -244,7 +247,7 @@ def _combine(viewer: Viewer, query: Query) -> None:
         if imgui.begin_menu(join):
             for other in others:
                 if imgui.menu_item(f"{other.phrase}##other", "", False)[0]:
-                    queries.ask_combined(viewer, query, join, other)
+                    queries.ask_combined(viewer, query.phrase, join, other.phrase)
             imgui.end_menu()
     imgui.end_popup()
 
@@ -287,17 +290,19 @@ def _canonical(viewer: Viewer) -> None:
         return
     state = viewer.state
     ui.small_wrapped("a place is relevant where it is nearer to the phrase than to all of these", ui.muted())
-    hint = ", ".join(state.canonical or CANONICAL_PHRASES)
+    hint = ", ".join(state.session.canonical or CANONICAL_PHRASES)
     entered, typed = ui.box("##canonical", hint, state.canonical_typed)
     settings.put(state, canonical_typed=typed)
     if entered:
-        queries.set_canonical(viewer, typed)
-    if state.canonical and imgui.button("The scene's own"):
-        queries.set_canonical(viewer, "")
+        queries.set_canonical(viewer, tuple(split_phrases(typed)))
+    if state.session.canonical and imgui.button("The scene's own"):
+        queries.set_canonical(viewer, ())
 
 
 def _level(viewer: Viewer) -> None:
     imgui.align_text_to_frame_padding()
     imgui.text("Level")
     ui.beside_boxed(next(iter(LEVEL_TIPS)))
-    queries.set_level(viewer, ui.radio({name: name for name in LEVEL_TIPS}, viewer.state.level, LEVEL_TIPS))
+    queries.set_level(
+        viewer, ui.radio({name: name for name in LEVEL_TIPS}, viewer.state.session.level, LEVEL_TIPS)
+    )

@@ -20,7 +20,8 @@ from langsplat_viewer.marks import BRUSHES, MODES, REACHES, TOOLS, Marks, Mode, 
 from langsplat_viewer.panels import ui
 from langsplat_viewer.panels.overlays import say
 from langsplat_viewer.rendering.request import TINT
-from langsplat_viewer.state import EditForm, Gizmo, Point
+from langsplat_viewer.session import Point
+from langsplat_viewer.state import EditForm, Gizmo
 from langsplat_viewer.viewer import Viewer
 
 Verb = tuple[str, Callable[[Viewer], object], str]  # button, action, tip
@@ -62,15 +63,15 @@ FILES: tuple[Verb, ...] = (
 def draw(viewer: Viewer) -> None:
     """Draw the panel "Select": counts, tools, the search, verbs, files."""
     imgui.begin_disabled(viewer.state.scene is None)
-    ui.small_wrapped(counts(viewer.state.selection.marks), ui.muted())
+    ui.small_wrapped(counts(viewer.state.marks), ui.muted())
     _tools(viewer)
     _found(viewer)
     imgui.separator()
     _buttons(viewer, CHANGES)
     reach = ui.slider(
-        "Reach", viewer.state.selection.reach, REACHES, "%.3f of the scene", logarithmic=True, ems=12
+        "Reach", viewer.state.tools.reach, REACHES, "%.3f of the scene", logarithmic=True, ems=12
     )
-    selecting.set_reach(viewer, reach)
+    selecting.set_tools(viewer, reach=reach)
     _name(viewer)
     imgui.separator()
     _values(viewer)
@@ -90,9 +91,9 @@ def counts(marks: Marks) -> str:
 
 
 def _tools(viewer: Viewer) -> None:
-    selection = viewer.state.selection
+    tools = viewer.state.tools
     for place, tool in enumerate(TOOLS):
-        active = selection.tool == tool
+        active = tools.tool == tool
         if place:
             ui.beside(tool)
         colour = imgui.Col_.button_active if active else imgui.Col_.button
@@ -100,25 +101,27 @@ def _tools(viewer: Viewer) -> None:
         if imgui.button(f"{tool.capitalize()}##tool"):
             selecting.use_tool(viewer, None if active else tool)
         imgui.pop_style_color()
-    selecting.set_mode(viewer, ui.radio({mode: mode.capitalize() for mode in MODES}, selection.mode))
-    _, only = imgui.checkbox("Only what is visible", selection.only_visible)
-    selecting.set_only_visible(viewer, only)
+    mode = ui.radio({mode: mode.capitalize() for mode in MODES}, tools.mode)
+    _, only = imgui.checkbox("Only what is visible", tools.only_visible)
+    selecting.set_tools(viewer, mode=mode, only_visible=only)
     ui.tip("Rectangle, lasso and brush leave out what lies behind something")
-    if selection.tool == "brush":
-        brush = ui.slider("Brush", selection.brush, BRUSHES, "%.3f of the height", logarithmic=True, ems=12)
-        selecting.set_brush(viewer, brush)
+    if viewer.state.tools.tool == "brush":
+        brush = ui.slider("Brush", tools.brush, BRUSHES, "%.3f of the height", logarithmic=True, ems=12)
+        selecting.set_tools(viewer, brush=brush)
 
 
 def _found(viewer: Viewer) -> None:
     query = selecting.chosen_query(viewer)
-    if query is None or query.result is None:
+    result = None if query is None else viewer.state.result(query)
+    if query is None or result is None:
         return
     name = ui.elided(query.phrase, imgui.get_content_region_avail().x - hello_imgui.em_size(4))
     if ui.button(f"Found: {name}##found", "Select what the search has found"):
         selecting.select_query(viewer, query)
-    if query.result.verdict == "not here" or len(query.things) < 2:
+    things = viewer.state.answer(query).things
+    if result.verdict == "not here" or len(things) < 2:
         return
-    for number, thing in enumerate(query.things, 1):
+    for number, thing in enumerate(things, 1):
         if ui.next_button(
             f"{number}##thing",
             f"{thing.count:,} Gaussians, {100 * thing.share:.0f} % of the answer, score {thing.score:.2f}",
@@ -128,7 +131,7 @@ def _found(viewer: Viewer) -> None:
 
 def _name(viewer: Viewer) -> None:
     """Draw the box for a name by which what is selected is found from now on."""
-    hint, name = "a name for what is selected", viewer.state.selection.name
+    hint, name = "a name for what is selected", viewer.state.tools.name
     entered, typed = ui.box_with_button("##name", hint, name, "Name it")
     queries.type_name(viewer, typed)
     if entered:
@@ -143,10 +146,10 @@ def _values(viewer: Viewer) -> None:
     """A histogram of a number that every Gaussian has; a drag over it selects those in its range."""
     if not imgui.collapsing_header("By numbers"):
         return
-    selection = viewer.state.selection
-    measure = ui.radio({name: name.capitalize() for name in marks.MEASURES}, selection.measure)
-    if measure != selection.measure:
-        selecting.set_measure(viewer, measure)
+    tools = viewer.state.tools
+    measure = ui.radio({name: name.capitalize() for name in marks.MEASURES}, tools.measure)
+    if measure != tools.measure:
+        selecting.set_tools(viewer, measure=measure, brushed=None)
     found = selecting.values_shown(viewer)
     if found is None:
         ui.small_wrapped("search for something first", ui.muted())
@@ -160,9 +163,9 @@ def _values(viewer: Viewer) -> None:
     at = (imgui.get_io().mouse_pos.x - corner.x) / size.x
     if imgui.is_item_active():
         selecting.brush_values(viewer, at)
-    elif selection.brushed is not None:
+    elif tools.brushed is not None:
         selecting.end_brush(viewer, held_mode())
-    brushed = viewer.state.selection.brushed
+    brushed = viewer.state.tools.brushed
     if brushed is not None:
         left, right = (corner.x + part * size.x for part in sorted(brushed))
         paint = imgui.get_window_draw_list()
@@ -177,11 +180,11 @@ def _values(viewer: Viewer) -> None:
 
 def _value(viewer: Viewer, found: marks.Histogram, part: float) -> str:
     value = found.low + part * (found.high - found.low)
-    return f"{10**value if viewer.state.selection.measure in marks.LOGARITHMIC else value:.3g}"
+    return f"{10**value if viewer.state.tools.measure in marks.LOGARITHMIC else value:.3g}"
 
 
 def _buttons(viewer: Viewer, verbs: Sequence[Verb]) -> None:
-    nothing = not viewer.state.selection.marks.selected.any()
+    nothing = not viewer.state.marks.selected.any()
     for place, (name, act, what) in enumerate(verbs):
         if place:
             ui.beside(name)
@@ -206,11 +209,11 @@ PAINT = (float(TINT[0]), float(TINT[1]), float(TINT[2]), 0.35)
 
 def handle_stroke(viewer: Viewer, area: ui.Area) -> None:
     """Begin a stroke, go on with it, or end it; once per frame."""
-    io, selection = imgui.get_io(), viewer.state.selection
-    if selection.tool is None:
+    io, tools = imgui.get_io(), viewer.state.tools
+    if tools.tool is None:
         return
     place = area.fraction(io.mouse_pos.x, io.mouse_pos.y)
-    if selection.stroke is None:
+    if tools.stroke is None:
         if imgui.is_mouse_clicked(imgui.MouseButton_.left) and not io.want_capture_mouse:
             selecting.begin_stroke(viewer, *place)
     elif imgui.is_mouse_down(imgui.MouseButton_.left):
@@ -230,21 +233,21 @@ def held_mode() -> Mode | None:
 
 def draw_stroke(viewer: Viewer, area: ui.Area) -> None:
     """Draw the outline of what is being enclosed, and the brush."""
-    selection = viewer.state.selection
-    if selection.tool is None or viewer.state.scene is None:
+    tools = viewer.state.tools
+    if tools.tool is None or viewer.state.scene is None:
         return
     paint = imgui.get_foreground_draw_list()
     paint.push_clip_rect(*area.corners)
-    drawn, radius = selecting.drawn_stroke(viewer), selection.brush * area.height
+    drawn, radius = selecting.drawn_stroke(viewer), tools.brush * area.height
     for line in marks.outlines(drawn) if drawn is not None else []:
         points = _on_screen(line, area)
-        if selection.tool == "brush":
+        if tools.tool == "brush":
             _stripe(paint, points, radius)
         else:
             paint.add_polyline(points, _colour(DARK), 3.0, 0)
             paint.add_polyline(points, _colour(LIGHT), 1.5, 0)
     io = imgui.get_io()
-    if selection.tool == "brush" and (drawn is not None or not io.want_capture_mouse):
+    if tools.tool == "brush" and (drawn is not None or not io.want_capture_mouse):
         paint.add_circle(io.mouse_pos, radius, _colour(DARK), 0, 3.0)
         paint.add_circle(io.mouse_pos, radius, _colour(LIGHT), 0, 1.0)
     paint.pop_clip_rect()
@@ -265,8 +268,8 @@ def _stripe(paint: Any, points: list[Any], radius: float) -> None:
 
 def draw_hint(viewer: Viewer, area: ui.Area) -> None:
     """Say what a click on the scene does, while it does not turn the view."""
-    state, tool = viewer.state, viewer.state.selection.tool
-    if state.ruler.measures:
+    state, tool = viewer.state, viewer.state.tools.tool
+    if state.session.ruler.measures:
         text = "Ruler: click two points on the surface; Esc ends it"
     elif state.pins_notes:
         text = "Note: click what it is about; Esc leaves"
@@ -299,7 +302,7 @@ def draw_transform(viewer: Viewer) -> None:
     """Draw the panel "Transform": what is transformed, gizmo, numbers, box."""
     state = viewer.state
     imgui.begin_disabled(state.scene is None)
-    chosen = int(state.selection.marks.selected.sum())
+    chosen = int(state.marks.selected.sum())
     what = f"{chosen:,} selected Gaussians" if chosen else "The whole scene, with its cameras"
     ui.small_wrapped(what, ui.muted())
     form = replace(state.edit_form, gizmo=ui.radio(GIZMOS, state.edit_form.gizmo))
@@ -363,7 +366,7 @@ def draw_gizmo(viewer: Viewer, area: ui.Area) -> None:
     """Draw the chosen gizmo where it was dragged to; what it moves follows, and stays on release."""
     state = viewer.state
     kind = state.edit_form.gizmo
-    if not _is_shown(viewer) or state.view is None or state.settings.split.columns > 1:
+    if not _is_shown(viewer) or state.view is None or state.session.split.columns > 1:
         return
     centre = editing.pivot(viewer)
     if centre is None:

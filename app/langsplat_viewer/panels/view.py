@@ -29,7 +29,7 @@ def draw_display(viewer: Viewer) -> None:
     for _, group in groupby(DISPLAYS.values(), lambda row: row.name if row.by_level else row.needs_query):
         _display_line(viewer, tuple(group))
     _compared(viewer)
-    picture = viewer.state.picture
+    picture = viewer.state.session.picture
     needs_query = DISPLAYS[picture.display].needs_query
     if needs_query and not viewer.state.shown():
         ui.small_wrapped("search for something to see where it is", ui.muted())
@@ -44,18 +44,17 @@ def draw_display(viewer: Viewer) -> None:
         changed, chosen = imgui.combo("Colour map", names.index(picture.colour_map), list(names))
         if changed:
             settings.set_colour_map(viewer, names[chosen])
-    picture = replace(picture, colour_map=viewer.state.picture.colour_map)
-    settings.set_picture(viewer, replace(picture, background=_backdrop(picture.background)))
+    picture = replace(picture, colour_map=viewer.state.session.picture.colour_map)
+    picture = replace(picture, background=_backdrop(picture.background))
     ui.tip("What shows where the scene is not")
-    changed, transparent = imgui.checkbox("Save without backdrop", viewer.state.settings.transparent)
-    if changed:
-        settings.save_transparent(viewer, transparent)
+    picture = replace(picture, transparent=imgui.checkbox("Save without backdrop", picture.transparent)[1])
     ui.tip("Pictures are saved transparent where the scene is not")
+    settings.set_picture(viewer, picture)
     _splats(viewer)
 
 
 def _splats(viewer: Viewer) -> None:
-    scene, splats = viewer.state.scene, viewer.state.settings.splats
+    scene, splats = viewer.state.scene, viewer.state.session.splats
     size = ui.slider("Splat size", splats.size, SIZE_RANGE)
     ui.tip("Smaller, every Gaussian can be seen; answers and files do not change")
     degree, most = splats.sh_degree, MOST_DEGREE if scene is None else scene.gaussians.sh_degree
@@ -65,12 +64,12 @@ def _splats(viewer: Viewer) -> None:
         changed, chosen = imgui.slider_int("SH degree", min(degree, most), 0, most, "%d", flags)
         degree = (MOST_DEGREE if chosen == most else chosen) if changed else degree
         ui.tip("Up to which degree colours change with the direction that they are seen from")
-    settings.set_splats(viewer, Splats(size, degree))
+    viewer.change("splats", splats=Splats(size, degree))
 
 
 def _heat_scale(viewer: Viewer) -> tuple[float, float] | None:
     """Relevancies at the ends of the colour bar: each answer's own, or the same for all."""
-    scale = viewer.state.picture.heat_scale
+    scale = viewer.state.session.picture.heat_scale
     changed, fixed = imgui.checkbox("Fixed heat scale", scale is not None)
     ui.tip("The same colour means the same relevancy in every answer, image and scene")
     if changed:
@@ -113,7 +112,7 @@ def _display_line(viewer: Viewer, rows: tuple[DisplayRow, ...]) -> None:
 
 def _compared(viewer: Viewer) -> None:
     """Draw the choice of what is shown beside it."""
-    state, split = viewer.state, viewer.state.settings.split
+    state, split = viewer.state, viewer.state.session.split
     second = Button("", split.second, split.second_level if DISPLAYS[split.second].by_level else None)
     shown = {"off": "nothing", "levels": "three levels", "wipe": compared_name(second)}.get(split.mode, "")
     if viewer.beside is not None and viewer.beside.state.path is not None:
@@ -122,7 +121,7 @@ def _compared(viewer: Viewer) -> None:
     if not imgui.begin_combo("Beside it", shown):
         return
     if imgui.selectable("nothing", split.mode == "off")[0]:
-        settings.show_one(viewer)
+        settings.set_split(viewer, "off")
     for button in BUTTONS:
         imgui.begin_disabled(state.lacks_field and DISPLAYS[button.display].needs_field)
         if imgui.selectable(compared_name(button), shown == compared_name(button))[0]:
@@ -146,10 +145,9 @@ def compared_name(button: Button) -> str:
 def draw_overlays(viewer: Viewer) -> None:
     state = viewer.state
     for name, title in OVERLAY_TITLES.items():
-        changed, shown = imgui.checkbox(title.capitalize(), name in state.preferences.overlays)
-        if changed:
-            settings.show_overlay(viewer, name, shown)
-    ruler, scene = state.ruler, state.scene
+        if imgui.checkbox(title.capitalize(), name in state.session.overlays)[0]:
+            settings.toggle_overlay(viewer, name)
+    ruler, scene = state.session.ruler, state.scene
     measure = with_key("Measure", settings.toggle_measuring)
     imgui.begin_disabled(scene is None)
     if imgui.checkbox(f"{measure}###measure", ruler.measures)[0]:
@@ -173,16 +171,16 @@ def draw_notes(viewer: Viewer) -> None:
     pin = with_key("Pin one to what is clicked", projects.toggle_pinning)
     if imgui.checkbox(pin, state.pins_notes)[0]:
         projects.toggle_pinning(viewer)
-    if ui.button("Pin one to the selection", enabled=bool(state.selection.marks.selected.any())):
+    if ui.button("Pin one to the selection", enabled=bool(state.marks.selected.any())):
         projects.pin_to_selection(viewer)
     if ui.next_button(
         "Save project", "Notes, queries, selection, edits, views: one file, to be opened again"
     ):
         projects.save_project(viewer)
     imgui.end_disabled()
-    if not state.notes:
+    if not state.session.notes:
         ui.small_wrapped("notes are listed here", ui.muted())
-    for number, note in enumerate(state.notes):
+    for number, note in enumerate(state.session.notes):
         imgui.push_id(number)
         imgui.set_next_item_width(-side - imgui.get_style().item_spacing.x)
         if projects.take_fresh_note(viewer, note):
@@ -240,7 +238,7 @@ def _projection(viewer: Viewer, view: OrbitCamera) -> None:
 
 def _cuts(viewer: Viewer) -> None:
     """Near and far cut; at the ends of their sliders there is none."""
-    extent, clip = viewer.state.extent, viewer.state.settings.clip
+    extent, clip = viewer.state.extent, viewer.state.session.clip
     if extent is None:
         return
     low, high = limits = CUT_RANGE[0] * extent.radius, CUT_RANGE[1] * extent.radius
@@ -272,9 +270,9 @@ def _training_cameras(viewer: Viewer) -> None:
     ui.tip("Training cameras: stand where a photograph was taken")
     if changed and index != state.camera_index:
         viewpoint.go_to_camera(viewer, index)
-    opening.fade_photograph(viewer, ui.slider("Photograph", state.settings.fade, (0.0, 1.0)))
+    viewer.change("fade", fade=ui.slider("Photograph", state.session.fade, (0.0, 1.0)))
     ui.tip("Lay the photograph of the training camera over the picture")
-    if state.settings.fade == 0:
+    if state.session.fade == 0:
         return
     photograph = opening.photograph_here(state)
     if photograph is None:
@@ -344,18 +342,18 @@ def _number(label: str, value: float, step: float) -> float | None:
 
 
 def _keyframes(viewer: Viewer) -> None:
-    record = viewer.state.record
+    record, keyframes = viewer.state.record, viewer.state.session.keyframes
     if ui.button("Add keyframe", with_key("The current view", filming.add_keyframe)):
         filming.add_keyframe(viewer)
-    if ui.next_button("Clear", enabled=bool(record.keyframes)):
+    if ui.next_button("Clear", enabled=bool(keyframes)):
         filming.clear_path(viewer)
     ui.beside("Duration", hello_imgui.em_size(NUMBER_EM))
     _duration(viewer)
     height = ROWS * imgui.get_frame_height_with_spacing()
     if imgui.begin_child("keyframes", ImVec2(0, height), imgui.ChildFlags_.borders):
-        if not record.keyframes:
+        if not keyframes:
             ui.small_wrapped("Add the current view; the path goes smoothly from one to the next", ui.muted())
-        for number, key in enumerate(record.keyframes, 1):
+        for number, key in enumerate(keyframes, 1):
             imgui.push_id(number)
             text = f"{number}   {key.seconds:.2f} s"
             clicked, gone = ui.row(text, "keyframe", key is record.chosen)
@@ -432,10 +430,10 @@ def draw_bookmarks(viewer: Viewer) -> None:
         viewpoint.add_bookmark(viewer, state.bookmark_typed)
     imgui.end_disabled()
     if imgui.begin_child("bookmarks"):
-        if not state.bookmarks:
+        if not state.session.bookmarks:
             words = "views that you keep are listed here"
             ui.small_wrapped(with_key(words, viewpoint.add_bookmark), ui.muted())
-        for number, bookmark in enumerate(state.bookmarks):
+        for number, bookmark in enumerate(state.session.bookmarks):
             imgui.push_id(number)
             clicked, gone = ui.row(bookmark.name, "bookmark", False)
             if clicked:

@@ -7,9 +7,10 @@ The canvas of the window, saved images, films and `--headless` each fill one in;
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from msgspec import Meta
 
 from langsplat_core.arrays import Array, logit
 from langsplat_core.config import INRIA, Display, PictureConfig, RasterSettings
@@ -29,8 +30,8 @@ class Clip:
     Answers and files have all of them.
     """
 
-    near: float = 0.0
-    far: float = math.inf
+    near: Annotated[float, Meta(ge=0)] = 0.0
+    far: Annotated[float, Meta(ge=0)] = math.inf
 
     def keeps(self, depths: Array) -> Array:
         """Return (N,) bool, which of (N,) depths are within the range."""
@@ -47,8 +48,10 @@ MOST_DEGREE = 3
 class Splats:
     """Sizes and colours of the Gaussians as drawn; answers and files have them as they are."""
 
-    size: float = 1.0  # factor of every axis, within SIZE_RANGE: small ones are points, and show gaps
-    sh_degree: int = MOST_DEGREE  # at most; 0: colours that do not depend on the direction
+    # factor of every axis: small ones are points, and show gaps
+    size: Annotated[float, Meta(ge=SIZE_RANGE[0], le=SIZE_RANGE[1])] = 1.0
+    # at most; 0: colours that do not depend on the direction
+    sh_degree: Annotated[int, Meta(ge=0, le=MOST_DEGREE)] = MOST_DEGREE
 
 
 SplitMode = Literal["off", "wipe", "levels", "scenes"]
@@ -67,8 +70,10 @@ class Split:
 
     mode: SplitMode = "off"
     second: Display = "depth"
-    second_level: int = 2  # index into scene.LEVELS, where latents are shown
-    at: float = 0.5  # where the line is, of the area's width
+    second_level: Annotated[int, Meta(ge=0, lt=len(LEVELS))] = (
+        2  # index into scene.LEVELS, where latents are shown
+    )
+    at: Annotated[float, Meta(ge=AT_RANGE[0], le=AT_RANGE[1])] = 0.5  # where the line is, of the area's width
 
     @property
     def columns(self) -> int:

@@ -1,0 +1,281 @@
+"""The session: what is shown, asked, selected, edited, named and bookmarked in a scene, as one frozen tree.
+
+Undo goes back to earlier sessions, a scene that was left is found again by its session, and project files
+hold one. So a field that is added here is undone and saved. The bounds beside the types hold for files.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Literal, get_args
+
+import numpy as np
+from msgspec import Meta
+
+from langsplat_core.arrays import Array
+from langsplat_core.config import LevelChoice, PictureConfig
+from langsplat_core.display.displays import MAX_QUERIES
+from langsplat_core.scene import FARTHEST, LEVELS, Scene
+from langsplat_core.scene.transform import Similarity, transform_scene
+from langsplat_viewer.camera.flight import Keyframe, Pose
+from langsplat_viewer.marks import Marks
+from langsplat_viewer.rendering.request import Clip, Splats, Split
+
+SLOTS = MAX_QUERIES  # queries shown at a time: one colour each
+LONGEST_NAME, LONGEST_NOTE = 80, 500  # characters
+MOST_BOOKMARKS = 50
+MOST_NOTES = 1000
+
+Coordinate = Annotated[float, Meta(ge=-FARTHEST, le=FARTHEST)]  # world units
+Point = tuple[Coordinate, Coordinate, Coordinate]
+Phrase = Annotated[str, Meta(pattern=r"\S", max_length=1000)]
+Name = Annotated[str, Meta(pattern=r"\S", max_length=LONGEST_NOTE)]
+Node = Annotated[int, Meta(ge=0, lt=2**31)]  # of the scene's tree
+Level = Annotated[int, Meta(ge=0, lt=len(LEVELS))]  # index into LEVELS
+Overlay = Literal["things", "cameras", "cube", "grid"]
+OVERLAYS: tuple[Overlay, ...] = get_args(Overlay)
+
+
+# Marks and transforms. Of masks a session keeps bits, an eighth of their size: histories hold a hundred.
+
+
+class Bits:
+    """Booleans, one for each of `count` Gaussians, packed into bytes."""
+
+    def __init__(self, count: int, packed: bytes) -> None:
+        self.count, self.packed = count, packed
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Bits) and (self.count, self.packed) == (other.count, other.packed)
+
+    def __hash__(self) -> int:
+        return hash((self.count, self.packed))
+
+    @property
+    def mask(self) -> Array:
+        """(count,) bool."""
+        return np.unpackbits(np.frombuffer(self.packed, np.uint8), count=self.count).astype(bool)
+
+
+def pack(mask: Array) -> Bits | None:
+    """Return the bits of an (N,) mask; None where nothing is set."""
+    return Bits(len(mask), np.packbits(mask).tobytes()) if mask.any() else None
+
+
+@dataclass(frozen=True)
+class Marked:
+    """The masks of `Marks` as a session keeps them; None: nothing is marked."""
+
+    selected: Bits | None = None
+    hidden: Bits | None = None
+    deleted: Bits | None = None
+
+    def of(self, marks: Marks, now: Marks) -> "Marked":
+        """Return the bits of `marks`; the bits of these, which are those of `now`, are used as far as both
+        share their masks."""
+        kept = ((name, getattr(marks, name), getattr(now, name)) for name in MASKS)
+        return Marked(**{name: getattr(self, name) if new is old else pack(new) for name, new, old in kept})
+
+    def masks(self, before: "Marked", marks: Marks) -> Marks:
+        """Return the masks; those of `marks`, which are those of `before`, as far as they are the same: what
+        is drawn by them need not be drawn anew."""
+        if self == before:
+            return marks
+        count, masks = len(marks.selected), []
+        for name in MASKS:
+            bits, old = getattr(self, name), getattr(before, name)
+            if bits == old:
+                masks.append(getattr(marks, name))
+            else:
+                masks.append(np.zeros(count, bool) if bits is None else bits.mask)
+        return Marks(*masks)
+
+
+MASKS = ("selected", "hidden", "deleted")
+
+
+@dataclass(frozen=True, eq=False)
+class Move:
+    """A transform of the whole scene with its cameras (`of` is None), or of some of its Gaussians."""
+
+    to: Similarity
+    of: Bits | None = None
+
+    def applied(self, scene: Scene) -> Scene:
+        """Return the scene with it. Raises InputError where it leads too far."""
+        return transform_scene(scene, self.to, None if self.of is None else self.of.mask)
+
+    def then(self, other: "Move") -> "Move":
+        """Return both as one, where they are of the same Gaussians."""
+        return replace(self, to=self.to.then(other.to))
+
+
+# Queries, names, notes and views.
+
+
+@dataclass(frozen=True)
+class Query:
+    """One line of the query list."""
+
+    phrase: Phrase
+    cut: Annotated[float, Meta(ge=0, le=1)] | None = (
+        None  # relevancy from which on it answers, if set by hand
+    )
+    slot: Annotated[int, Meta(ge=0, lt=SLOTS)] | None = None  # index of its colour while shown, None: hidden
+    shown_since: int = 0  # larger for a query shown later
+
+
+@dataclass(frozen=True)
+class Note:
+    """A text pinned to a place of the scene."""
+
+    text: Annotated[str, Meta(max_length=LONGEST_NOTE)]
+    at: Point
+
+
+@dataclass(frozen=True)
+class Group:
+    """Things that belong together."""
+
+    name: Name
+    nodes: Annotated[tuple[Node, ...], Meta(min_length=1)]
+
+
+@dataclass(frozen=True)
+class Things:
+    """Names, groups and locks that a user gave to nodes of the scene's tree."""
+
+    names: Mapping[Node, Name] = field(default_factory=dict)
+    groups: tuple[Group, ...] = ()
+    locked: frozenset[Node] = frozenset()
+
+    def known(self, count: int) -> "Things":
+        """Return those of the first `count` nodes."""
+        inside = [
+            replace(g, nodes=tuple(n for n in dict.fromkeys(g.nodes) if n < count)) for g in self.groups
+        ]
+        return Things(
+            {node: name for node, name in self.names.items() if node < count},
+            tuple(group for group in inside if group.nodes),
+            frozenset(node for node in self.locked if node < count),
+        )
+
+
+@dataclass(frozen=True)
+class Ruler:
+    """A distance between two points on the surface."""
+
+    measures: bool = False  # a click on the scene sets a point
+    points: Annotated[tuple[Point, ...], Meta(max_length=2)] = ()
+
+    @property
+    def length(self) -> float | None:
+        """World units; None before there are two points."""
+        return math.dist(*self.points) if len(self.points) > 1 else None
+
+    def with_point(self, point: Point) -> "Ruler":
+        """Set the second point, or the first of a new measurement."""
+        return replace(self, points=(*self.points, point) if len(self.points) == 1 else (point,))
+
+
+@dataclass(frozen=True, eq=False)
+class Bookmark:
+    """A view to return to."""
+
+    name: Annotated[str, Meta(pattern=r"\S", max_length=LONGEST_NAME)]
+    pose: Pose
+    distance: Annotated[float, Meta(gt=0, le=FARTHEST)]  # to what it turns around, world units
+
+
+@dataclass(frozen=True)
+class Session:
+    """All that a user sees and did in a scene."""
+
+    # how it is shown
+    picture: PictureConfig = field(default_factory=PictureConfig)
+    latent_level: Level = 2  # whose latents and nodes are shown
+    split: Split = field(default_factory=Split)
+    splats: Splats = field(default_factory=Splats)
+    clip: Clip = field(default_factory=Clip)
+    fade: Annotated[float, Meta(ge=0, le=1)] = 0.0  # of a training camera's photograph over the image
+    overlays: tuple[Overlay, ...] = ()  # what lies over the scene
+
+    # what was asked
+    queries: Annotated[tuple[Query, ...], Meta(max_length=200)] = ()  # in the order of asking
+    chosen: str = ""  # the phrase whose details are shown
+    level: LevelChoice = "auto"
+    canonical: Annotated[
+        tuple[Phrase, ...], Meta(max_length=200)
+    ] = ()  # all is compared with; none: the scene's
+
+    # what was selected, edited, named and noted
+    marks: Marked = field(default_factory=Marked)
+    moves: Annotated[tuple[Move, ...], Meta(max_length=100)] = ()  # transforms since the scene was opened
+    things: Things = field(default_factory=Things)
+    notes: Annotated[tuple[Note, ...], Meta(max_length=MOST_NOTES)] = ()
+
+    # where one stood
+    keyframes: Annotated[tuple[Keyframe, ...], Meta(max_length=10_000)] = ()  # of the camera path, by time
+    bookmarks: Annotated[tuple[Bookmark, ...], Meta(max_length=MOST_BOOKMARKS)] = ()
+    ruler: Ruler = field(default_factory=Ruler)
+
+    def query(self, phrase: str) -> Query | None:
+        """Return the query of a phrase, None where it is not listed."""
+        return next((query for query in self.queries if query.phrase == phrase), None)
+
+    def in_order_of_showing(self) -> list[Query]:
+        """Return the queries that have a colour, the one shown longest first."""
+        return sorted((q for q in self.queries if q.slot is not None), key=lambda query: query.shown_since)
+
+    def with_query(self, phrase: str, **values: object) -> "Session":
+        """Return the session with other values of the query of a phrase."""
+        changed = (replace(q, **values) if q.phrase == phrase else q for q in self.queries)  # type: ignore[arg-type]
+        return replace(self, queries=tuple(changed))
+
+    def showing(self, phrase: str) -> "Session":
+        """Return the session with a query shown, in the first free colour, else that of the longest shown."""
+        shown = self.in_order_of_showing()
+        if any(query.phrase == phrase for query in shown):
+            return self
+        free = [slot for slot in range(SLOTS) if slot not in {query.slot for query in shown}]
+        slot = free[0] if free else shown[0].slot
+        session = self if free else self.with_query(shown[0].phrase, slot=None)
+        return session.with_query(
+            phrase, slot=slot, shown_since=1 + max((q.shown_since for q in shown), default=0)
+        )
+
+    def undone(self, now: "Session") -> "Session":
+        """Return this earlier session with what is never undone as it is `now`."""
+        ruler = now.ruler if now.moves == self.moves else replace(now.ruler, points=())
+        return replace(self, canonical=now.canonical, bookmarks=now.bookmarks, ruler=ruler)
+
+    def of_next_scene(self, bookmarks: tuple[Bookmark, ...]) -> "Session":
+        """Return the session that another scene begins with: settings of the window stay."""
+        return Session(
+            picture=self.picture,
+            latent_level=self.latent_level,
+            split=self.split,
+            splats=self.splats,
+            fade=self.fade,
+            overlays=self.overlays,
+            level=self.level,
+            bookmarks=bookmarks,
+        )
+
+    def found_again(self, now: "Session") -> "Session":
+        """Return the session of a scene that is shown again. Settings of the window are as `now`; what was
+        selected, hidden, deleted and moved was saved or discarded when it was left."""
+        settings = now.of_next_scene(now.bookmarks)
+        return replace(
+            settings,
+            picture=replace(now.picture, display=self.picture.display),
+            latent_level=self.latent_level,
+            clip=self.clip,
+            queries=self.queries,
+            chosen=self.chosen,
+            canonical=self.canonical,
+            things=self.things,
+            notes=self.notes,
+            keyframes=self.keyframes,
+            ruler=self.ruler,
+        )
