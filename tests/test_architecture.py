@@ -25,6 +25,7 @@ LAYERS = [
     ["langsplat_viewer.viewer"],
     ["langsplat_viewer.state"],
     ["langsplat_viewer.files"],
+    ["langsplat_viewer.session"],
     ["langsplat_viewer.rendering"],
     ["langsplat_viewer.marks"],
     ["langsplat_viewer.camera"],

@@ -396,7 +396,7 @@ def test_a_chosen_folder_is_looked_into_and_remembered(beside_photograph, tmp_pa
     stand(beside_photograph, 2)
     browsing.ask_for_photographs(beside_photograph)
     assert beside_photograph.state.picks_folder
-    browsing.choose_photograph_folder(beside_photograph, tmp_path / "away")
+    browsing.choose_folder(beside_photograph, tmp_path / "away")
     assert beside_photograph.state.browser is None
     stand(beside_photograph, 2)
     assert opening.photograph_here(beside_photograph.state).image.shape == (120, 160, 3)
