@@ -46,9 +46,9 @@ from langsplat_core.semantics.sam import load_mask_source
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures, StoredFeatures, describe_capture
 from langsplat_core.training.language.codec_fit import CodecReport
 from langsplat_core.training.radiance.rehearsal import (
+    budget_text,
     budgets_for,
     checkpoints_of,
-    in_words,
     rehearse,
     supported,
     train_within,
@@ -213,12 +213,12 @@ def _gaussians(run: _Run, capture: Capture, train: list[int]) -> tuple[Gaussians
     found = once(lambda: rehearsals(capture, train, config, *shared))
     budget = supported(found, budgets)
     scores = [[round(decibels, 2) for decibels in each] for each in found]
-    rehearsed = dict(zip(map(in_words, budgets), scores, strict=False))
+    rehearsed = dict(zip(map(budget_text, budgets), scores, strict=False))
     if budget != budgets[-1]:
         log.info(
             "training takes %s, not %s: with so few photographs more does not pay (held out: %s); "
             "--radiance.rehearsed-views 0 spends all",
-            *(in_words(budget), in_words(budgets[-1]), said_of(rehearsed) or "none could be"),
+            *(budget_text(budget), budget_text(budgets[-1]), said_of(rehearsed) or "none could be"),
         )
     return once(lambda: trained_gaussians(capture, train, config, budget, *shared)), rehearsed
 

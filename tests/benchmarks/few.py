@@ -26,8 +26,8 @@ from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Scene
 from langsplat_core.training.radiance.rehearsal import (
+    budget_text,
     budgets_for,
-    in_words,
     rehearse,
     supported,
     train_within,
@@ -168,7 +168,10 @@ def _measured(
         *(f"{mean:.2f}" for mean in means),
         ", ".join(f"{mean:.2f}" for mean in larger),
         *(f"{ssim:.3f}", f"{np.mean([score.psnr for score in learnt]):.2f}"),
-        *(in_words(budget), "; ".join(", ".join(f"{decibels:.2f}" for decibels in each) for each in found)),
+        *(
+            budget_text(budget),
+            "; ".join(", ".join(f"{decibels:.2f}" for decibels in each) for each in found),
+        ),
         *(str(len(gaussians)), f"{seconds:.0f}"),
     )
 

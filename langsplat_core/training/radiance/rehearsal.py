@@ -1,9 +1,9 @@
-"""Rehearsal of a training: how much a few photographs support.
+"""Rehearsal of a training: how large a budget a few photographs support.
 
-Few photographs can be learnt by heart, and from some budget on they are: views that were held out get worse.
-Which one that is depends on the capture (docs/photographs.md). So some of the training views are held out,
-and the others trained on with the smallest budget, then with larger ones, unless one clearly loses. The
-training itself then takes all views.
+Few photographs can be overfitted, and from some budget on they are: views that were held out get worse. Which
+one that is depends on the capture (docs/photographs.md). So some of the training views are held out, and the
+others trained on with the smallest budget, then with larger ones, unless one clearly loses. The training
+itself then takes all views.
 """
 
 import logging
@@ -25,14 +25,17 @@ from langsplat_core.training.radiance.trainer import train_radiance
 log = logging.getLogger("langsplat")
 
 STAGE = "rehearsing"
-HELD_OUT = 8  # one view in so many: the more are left, the more it is like the training itself
-FEWEST_HELD_OUT = 3  # views in all, each in one rehearsal: single ones differ by a decibel or two
 LEAST_GAIN = 0.25  # dB, for which more is spent: less may be chance
 
 
 def budgets_for(capture: Capture, config: RadianceConfig, views: int) -> list[RadianceBudget]:
-    """Ascending budgets that `views` of the capture's photographs may be trained with."""
+    """Return the ascending budgets that `views` of the capture's photographs may be trained with."""
     return config.budgets(views, max(max(camera.width, camera.height) for camera in capture.cameras))
+
+
+def budget_text(budget: RadianceBudget) -> str:
+    """Return the budget as messages and reports name it."""
+    return f"{budget.steps} steps at {budget.longer_side} px"
 
 
 def rehearse(
@@ -42,10 +45,12 @@ def rehearse(
     checkpoint: Path | None = None,
     progress: Progress = silent,
 ) -> list[list[float]]:
-    """Mean PSNR (dB, exposures fitted) of views held out of those at `train_indices`, for each budget from
-    the smallest on up to one that clearly loses, in one rehearsal after the other; one in which a budget
-    does not gain is its last. Empty where there is nothing to decide: many views, so few that none can be
-    held out, or few steps.
+    """Train without some of the views at `train_indices`, and score these.
+
+    Returns for each budget, from the smallest on up to one that clearly loses, the mean PSNR (dB, exposures
+    fitted) of the held-out views, in one rehearsal after the other; one in which a budget does not gain is
+    its last. Empty where there is nothing to decide: many views, so few that none can be held out, or few
+    steps.
 
     With a `checkpoint` path an interrupted rehearsal goes on where it stopped; the files are those of
     `checkpoints_of` it, and stay.
@@ -57,21 +62,26 @@ def rehearse(
     found: list[list[float]] = [[] for _ in budgets]
 
     def score(index: int, number: int) -> float:
+        """Return what budget `index` reaches in rehearsal `number`."""
         if len(found[index]) == number:
             done, most = sum(map(len, found)), len(budgets) * len(held_out)
+            budget, without = budgets[index], held_out[number]
+            told = _steps_alone(progress.part(done, most, STAGE, budget_text(budget)))
             at = checkpoint and checkpoint.with_name(f"{index}-{number}-{checkpoint.name}")
-            reports = _of_steps(progress.part(done, most, STAGE, in_words(budgets[index])))
-            without = held_out[number]
-            found[index].append(_score(capture, config, budgets[index], train_indices, without, at, reports))
+            small = capture.read_at(train_indices, budget.longer_side)
+            train = [row for row in range(len(small)) if row not in without]
+            gaussians = train_radiance(small, config.spending(budget), train, at, told)
+            scores = evaluate_views(gaussians, small, without, config.backend)
+            found[index].append(float(np.mean([score.psnr_exposed or score.psnr for score in scores])))
+            log.debug("%s without %s: %.2f dB", budget_text(budget), without, found[index][-1])
         return found[index][number]
 
     best = 0
     for index in range(1, len(budgets)):
         gains: list[float] = []
         while len(gains) < len(held_out) and all(gain > 0 for gain in gains):
-            number = len(gains)
-            before = score(best, number)
-            gains.append(score(index, number) - before)
+            before = score(best, len(gains))
+            gains.append(score(index, len(gains)) - before)
         if _pays(gains):
             best = index
         elif np.mean(gains) < -LEAST_GAIN:
@@ -80,41 +90,18 @@ def rehearse(
 
 
 def _held_out(cameras: Sequence[Camera]) -> list[list[int]]:
-    """Views that the rehearsals leave out, one after the other: `FEWEST_HELD_OUT` at least in all."""
+    """Views that the rehearsals leave out, one rehearsal after the other: an eighth in each, so that it is
+    like the training itself, and three in all at least, since single ones differ by a decibel or two."""
     views: list[list[int]] = []
-    while sum(map(len, views)) < FEWEST_HELD_OUT:
-        more = chosen(cameras, HELD_OUT, [index for taken in views for index in taken])
+    while sum(map(len, views)) < 3:
+        more = chosen(cameras, 8, [index for taken in views for index in taken])
         if not more:
             break
         views.append(more)
     return views
 
 
-def _score(
-    capture: Capture,
-    config: RadianceConfig,
-    budget: RadianceBudget,
-    train_indices: Sequence[int],
-    held_out: Sequence[int],
-    checkpoint: Path | None,
-    progress: Progress,
-) -> float:
-    """Mean PSNR of the views `held_out` of a training with the budget on the others."""
-    small = capture.read_at(train_indices, budget.longer_side)
-    train = [row for row in range(len(small)) if row not in held_out]
-    gaussians = train_radiance(small, config.spending(budget), train, checkpoint, progress)
-    scores = evaluate_views(gaussians, small, held_out, config.backend)
-    found = float(np.mean([score.psnr_exposed or score.psnr for score in scores]))
-    log.debug("rehearsal of %s without %s: %.2f dB", in_words(budget), list(held_out), found)
-    return found
-
-
-def in_words(budget: RadianceBudget) -> str:
-    """The budget as messages and reports name it."""
-    return f"{budget.steps} steps at {budget.longer_side} px"
-
-
-def _of_steps(progress: Progress) -> Progress:
+def _steps_alone(progress: Progress) -> Progress:
     """Progress of the steps alone: depths, found in seconds, would count as the whole."""
 
     def show(report: Report) -> None:
@@ -125,13 +112,13 @@ def _of_steps(progress: Progress) -> Progress:
 
 
 def checkpoints_of(checkpoint: Path) -> list[Path]:
-    """The files that `rehearse` wrote."""
+    """Return the files that `rehearse` wrote."""
     return list(checkpoint.parent.glob(f"*-{checkpoint.name}"))
 
 
 def supported(found: Sequence[Sequence[float]], budgets: Sequence[RadianceBudget]) -> RadianceBudget:
-    """The budget that rehearsals `found` best, a larger one only where it gains in every one of them; the
-    smallest where no view could be held out."""
+    """Return the budget that rehearsals `found` best: a larger one only where it gains in every one of them;
+    the smallest where no view could be held out."""
     best = 0
     for index in range(1, len(found)):
         if _pays([more - less for more, less in zip(found[index], found[best], strict=False)]):
@@ -140,7 +127,7 @@ def supported(found: Sequence[Sequence[float]], budgets: Sequence[RadianceBudget
 
 
 def _pays(gains: Sequence[float]) -> bool:
-    """Whether a larger budget pays that gained so much (dB) in rehearsals: one view alone tells little."""
+    """True where a larger budget pays that gained so much (dB) in rehearsals: one view alone tells little."""
     return min(gains) > 0 and float(np.mean(gains)) >= LEAST_GAIN
 
 
@@ -152,7 +139,7 @@ def train_within(
     checkpoint: Path | None = None,
     progress: Progress = silent,
 ) -> Gaussians:
-    """`train_radiance` with the budget's share of `config`, for images as large as the photographs."""
+    """Call `train_radiance` with the budget's share of `config`, for images as large as the photographs."""
     spent, cameras = config.spending(budget), capture.cameras
     if all(max(camera.width, camera.height) <= budget.longer_side for camera in cameras):
         return train_radiance(capture, spent, train_indices, checkpoint, progress)
@@ -162,8 +149,11 @@ def train_within(
 
 
 def widened(gaussians: Gaussians, views: Sequence[tuple[Camera, Camera]]) -> Gaussians:
-    """Gaussians fitted to the first camera of each view, as large as the second, which has the same place and
-    more pixels, has to see them: what the dilation (`raster.protocol.dilation`) adds there is less."""
+    """Return Gaussians fitted to the first camera of each view, as large as the second has to see them.
+
+    The second has the same place and more pixels: what the dilation (`raster.protocol.dilation`) adds there
+    is less.
+    """
     added = np.full(len(gaussians), np.inf)
     for camera, finer in views:
         pixels, depth = camera.project(gaussians.means)

@@ -26,10 +26,7 @@ from langsplat_core.scene.transform import C0
 from langsplat_core.training.radiance.exposure import no_exposures
 from langsplat_core.training.radiance.transients import Transients, no_transients
 
-INITIAL_OPACITY = 0.1
-NEIGHBOURS = 3
-SMALLEST_DISTANCE = 1e-7**0.5  # world units; INRIA bounds the squared distance by 1e-7
-ISOLATED = 10.0  # a point is an outlier when its neighbours are this many times the median distance away
+NEIGHBOURS = 3  # points, whose mean distance is the size of the Gaussian that begins at a point
 # Fewer points are topped up to this number: features are found where there is detail, and what lies between
 # is covered from random ones better than by splitting what is elsewhere (docs/photographs.md) ...
 FEWEST_POINTS = 3_000
@@ -39,11 +36,11 @@ RANDOM_POINTS = 10_000  # ... or to this one, when they are too few to show wher
 def initial_gaussians(
     capture: Capture, train_indices: Sequence[int], sh_degree: int, max_gaussians: int, seed: int
 ) -> Gaussians:
-    """Isotropic Gaussians at the capture's points (Kerbl et al. 2023, section 5.1), as large as the mean
-    distance to three neighbours.
+    """Return isotropic Gaussians at the capture's points (Kerbl et al. 2023, section 5.1).
 
-    Points that no training camera sees, repeated points and isolated outliers are left out. Too few
-    points are topped up with random ones from the volume that the training cameras see.
+    Each is as large as the mean distance to three neighbours. Points that no training camera sees, repeated
+    points and isolated outliers are left out. Too few points are topped up with random ones from the volume
+    that the training cameras see.
     """
     rng = np.random.default_rng(seed)
     cameras = [capture.cameras[i] for i in train_indices]
@@ -66,17 +63,16 @@ def initial_gaussians(
         means=points,
         log_scales=np.repeat(np.log(_neighbour_distance(points))[:, None], 3, axis=1),
         quats_wxyz=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-        opacity_logits=np.full(count, logit(np.array(INITIAL_OPACITY))),
+        opacity_logits=np.full(count, logit(np.array(0.1))),
         sh=sh,
     )
 
 
 def _usable_points(points: Array, rgb: Array, cameras: Sequence[Camera]) -> tuple[Array, Array]:
-    """The points (and colours) worth starting from; see `initial_gaussians`."""
+    """Leave out points, with their colours, that are no good to start from; see `initial_gaussians`."""
     keep = np.isfinite(points).all(1)
     points, rgb = points[keep], rgb[keep]
-    _, first = np.unique(points, axis=0, return_index=True)
-    first.sort()
+    first = np.sort(np.unique(points, axis=0, return_index=True)[1])
     points, rgb = points[first], rgb[first]
     seen = np.zeros(len(points), bool)
     for camera in cameras:
@@ -84,7 +80,7 @@ def _usable_points(points: Array, rgb: Array, cameras: Sequence[Camera]) -> tupl
     points, rgb = points[seen], rgb[seen]
     if len(points) > NEIGHBOURS:
         distance = _neighbour_distance(points)
-        keep = distance <= ISOLATED * np.median(distance)
+        keep = distance <= 10 * np.median(distance)
         points, rgb = points[keep], rgb[keep]
     return points, rgb
 
@@ -95,15 +91,13 @@ def _neighbour_distance(points: Array) -> Array:
         return np.ones(len(points))
     neighbours = min(NEIGHBOURS, len(points) - 1)
     distances, _ = cKDTree(points).query(points, k=neighbours + 1)
-    return np.maximum(np.sqrt((distances[:, 1:] ** 2).mean(1)), SMALLEST_DISTANCE)
+    return np.sqrt(np.maximum((distances[:, 1:] ** 2).mean(1), 1e-7))  # the bound is INRIA's
 
 
 # Parameters, Adam's moments and statistics. All of it has one row per Gaussian, so that adding and removing
 # Gaussians is one operation (`rearrange`) that cannot leave the optimiser behind the parameters.
 
 PARAMETERS = ("means", "log_scales", "quats_wxyz", "opacity_logits", "sh_dc", "sh_rest")
-ADAM_BETAS = (0.9, 0.999)
-ADAM_EPSILON = 1e-15  # as INRIA: gradients of single Gaussians are tiny, 1e-8 would swallow them
 
 
 @dataclass
@@ -205,11 +199,11 @@ def adam_step(state: TrainingState, learning_rates: dict[str, float]) -> None:
                 [torch.tensor(float(state.updates[name]), device=state.device)],
                 fused=True,
                 amsgrad=False,
-                beta1=ADAM_BETAS[0],
-                beta2=ADAM_BETAS[1],
+                beta1=0.9,
+                beta2=0.999,
                 lr=learning_rates[name],
                 weight_decay=0.0,
-                eps=ADAM_EPSILON,
+                eps=1e-15,  # as INRIA: gradients of single Gaussians are tiny, 1e-8 would swallow them
                 maximize=False,
             )
         state.updates[name] += 1

@@ -1,7 +1,7 @@
 """Depths by plane sweeping (Collins 1996) between photographs with known cameras.
 
-Structure from motion finds some hundred points in nine photographs. What lies between them is then learnt by
-heart: each photograph gets Gaussians of its own, anywhere along its rays. Depths are the remedy: Gaussians
+Structure from motion finds some hundred points in nine photographs. Training then overfits what lies between
+them: each photograph gets Gaussians of its own, anywhere along its rays. Depths are the remedy: Gaussians
 begin at the surfaces, and none stay before one.
 
 A view is compared with each neighbour as that would look if the scene were a plane parallel to the view. Of
@@ -13,9 +13,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import minimum_filter
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, unit
 from langsplat_core.compiled import helper, kernel, shared_workers
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.known_poses import TELLING_POINTS, look_distance
@@ -26,20 +27,11 @@ STAGE = "finding depths"
 LONGER_SIDE = 320  # px at most, of the images that are compared
 PLANES = 96
 RADIUS = 3  # px, of the windows that are compared
-NEIGHBOURS = 4  # views that each is compared with ...
-BEST = 2  # ... of which so many count: others may see something before it
-ANGLES = (2.0, 35.0)  # degrees between two views' rays to what they see
-ANGLE = 12.0  # degrees, the best: wider ones tell depth better and look less alike
+BEST = 2  # scores of neighbours that count: others may see something before a pixel
 NEAR_QUANTILE = 0.02  # of depths, which passes for the nearest
-MARGIN = (0.75, 1.5)  # of the nearest and farthest depth of known points: where planes begin and end
-FLAT = np.float32(1e-5)  # added to variances, grey values in [0, 1]: what is flat correlates with nothing
-LEAST_SCORE = 0.6  # of a pixel whose depth is kept ...
-LEAST_CONFIRMING = 0.5  # ... and of the one in another view that confirms it
-AGREEMENT = 0.015  # of the depth, by which two views' may differ
-BEFORE = 0.05  # of the depth, from which on something lies before a surface ...
-AT = 0.025  # ... and up to which it belongs to it
-LEAST_ALIKE = 0.4  # of the pixels around, as far as windows reach, that share a depth which frees space ...
-ALIKE = 0.03  # ... up to this part of it
+BEFORE = 0.05  # of the depth, from which on something lies before a surface
+ALIKE = 0.03  # of the depth, up to which another pixel shares it
+LEAST_ALIKE = 0.4  # of the pixels of a window, that share a depth which frees space
 AROUND = 1 / 16  # of the image's longer side: how far from a pixel a depth tells of its surface ...
 NEARER = 0.15  # ... which is nearer than all those by this share of them at most
 NEARER_THAN_ALL = 0.5  # the same where there are none around, against the nearest of the image
@@ -47,33 +39,26 @@ NEARER_THAN_ALL = 0.5  # the same where there are none around, against the neare
 
 @dataclass(frozen=True)
 class DepthMap:
-    """Depths of a view's pixels."""
+    """Depths of a view's pixels, world units along the camera's z axis."""
 
     camera: Camera
-    depth: Array  # (H, W) world units along the camera's z axis; NaN where none is known
-    nearest: Array  # (H, W) depth from which on there may be something: before, space is free
+    depth: Array  # (H, W); NaN where none is known
+    free: Array  # (H, W) depth up to which space is free
     score: Array  # (H, W) mean of the best `BEST` correlations, at most 1
     colours: Array  # (H, W, 3) uint8
 
     def points(self) -> tuple[Array, Array]:
-        """(N, 3) points of the pixels whose depth is known, and their (N, 3) colours."""
+        """Return the (N, 3) points of the pixels whose depth is known, and their (N, 3) colours."""
         known = np.isfinite(self.depth)
         points = self.camera.unproject(self.camera.pixel_centres()[known], self.depth[known])
         return points, self.colours[known]
 
 
-def _pixels(camera: Camera, points: Array) -> tuple[Array, tuple[Array, Array], Array]:
-    """Which of the (N, 3) points lie at pixels of the image, as (M,) indices, rows and columns of these, and
-    the depths of the points."""
-    pixels, depths = camera.project(points)
-    there = np.flatnonzero(camera.in_image(pixels, depths))
-    columns, rows = pixels[there].astype(int).T
-    return there, (rows, columns), depths[there]
-
-
 def find_depths(capture: Capture, indices: Sequence[int], progress: Progress = silent) -> list[DepthMap]:
-    """Depths of the photographs at `indices` that another one confirms; photographs without neighbours have
-    no map. Masked pixels have no depth."""
+    """Find the depths of the photographs at `indices` that another one confirms.
+
+    Photographs without neighbours have no map. Masked pixels have no depth.
+    """
     small = capture.shrunk(indices, LONGER_SIDE)
     masks = [np.True_ if (mask := small.mask(index)) is None else mask for index in range(len(small))]
     # Windows reach into what is masked: it is the same in all photographs.
@@ -92,93 +77,45 @@ def find_depths(capture: Capture, indices: Sequence[int], progress: Progress = s
         progress(STAGE, (index + 1) / len(small))
     depths = [confirmed(one, [other for other in maps if other is not one]) for one in maps]
     return [
-        replace(one, depth=depth, nearest=nearest(one.camera, shared(depth), capture.points))
+        replace(one, depth=depth, free=free_depths(one.camera, shared_depths(depth), capture.points))
         for one, depth in zip(maps, depths, strict=True)
     ]
 
 
-def in_free_space(points: Array, maps: Sequence[DepthMap]) -> Array:
-    """(N,) True for points that lie in the free space of more views than at their surfaces."""
-    balance = np.zeros(len(points), int)
-    for one in maps:
-        there, pixels, depths = _pixels(one.camera, points)
-        balance[there] += depths < one.nearest[pixels]
-        balance[there] -= np.abs(depths / one.depth[pixels] - 1) < AT
-    return balance > 0
-
-
-def shared(depth: Array) -> Array:
-    """The (H, W) depths without those that few pixels around share: NaN.
-
-    What two views agree on by chance is alone. Where views lie one behind another, as on a walk, that is one
-    depth in ten, and each would free a window of space behind the surface.
-    """
-    height, width = depth.shape
-    padded = np.pad(depth, RADIUS, constant_values=np.nan)
-    alike = np.zeros(depth.shape, int)
-    for row, column in np.ndindex(2 * RADIUS + 1, 2 * RADIUS + 1):
-        alike += np.abs(padded[row : row + height, column : column + width] / depth - 1) < ALIKE
-    return np.where(alike >= LEAST_ALIKE * (2 * RADIUS + 1) ** 2, depth, np.nan)
-
-
-def nearest(camera: Camera, depth: Array, known: Array) -> Array:
-    """(H, W) depths from which on there may be something, by the surfaces of the (H, W) `depth`, NaN where
-    it is not known, and by the (N, 3) `known` points.
-
-    What no other photograph confirms is mostly flat, or seen by this one alone: there nothing else tells haze
-    from a surface. It is not much nearer than the surfaces around it.
-    """
-    told = np.where(np.isfinite(depth), depth, np.inf)
-    _, pixels, depths = _pixels(camera, known)
-    np.minimum.at(told, pixels, depths)
-    if not np.isfinite(told).any():
-        return np.zeros_like(told)
-    reach = max(round(AROUND * max(told.shape)), 1)
-    around = (1 - NEARER) * minimum_filter(told, 2 * reach + 1, mode="nearest")
-    anywhere = (1 - NEARER_THAN_ALL) * np.quantile(told[np.isfinite(told)], NEAR_QUANTILE)
-    free = np.where(np.isfinite(around), around, anywhere)
-    return np.where(np.isfinite(depth), (1 - BEFORE) * depth, free)
-
-
 def neighbouring_views(cameras: Sequence[Camera], known: Array) -> list[list[int]]:
-    """For each view the views that it is best compared with, at most `NEIGHBOURS`: those that see the middle
-    of what it sees from about `ANGLE` aside."""
-    distance = look_distance(cameras)
+    """Return for each view the at most four views that it is best compared with: those that see the middle of
+    what it sees from about 12 degrees aside. Wider angles tell depth better and look less alike."""
+    distance, positions = look_distance(cameras), np.stack([camera.position for camera in cameras])
     found = []
     for index, camera in enumerate(cameras):
         seen = known[camera.in_image(*camera.project(known))]
         ahead = camera.position + distance * camera.rotation[2]
         middle = np.median(seen, axis=0) if len(seen) >= TELLING_POINTS else ahead
-        ray = _direction(camera, middle)
-        angles = {
-            other: float(np.degrees(np.arccos(np.clip(ray @ _direction(at, middle), -1, 1))))
+        rays = unit(middle - positions, 1e-12)
+        angles = np.degrees(np.arccos(np.clip(rays @ rays[index], -1, 1)))
+        usable = [
+            other
             for other, at in enumerate(cameras)
-            if other != index and at.in_image(*at.project(middle[None]))[0]
-        }
-        usable = [other for other, angle in angles.items() if ANGLES[0] < angle < ANGLES[1]]
-        found.append(sorted(usable, key=lambda other: abs(angles[other] - ANGLE))[:NEIGHBOURS])
+            if 2 < angles[other] < 35 and at.in_image(*at.project(middle[None]))[0]
+        ]
+        found.append(sorted(usable, key=lambda other: abs(angles[other] - 12))[:4])
     return found
 
 
-def _direction(camera: Camera, point: Array) -> Array:
-    ray = point - camera.position
-    return ray / max(float(np.linalg.norm(ray)), 1e-12)
-
-
 def inverse_depths(camera: Camera, cameras: Sequence[Camera], known: Array) -> Array:
-    """(PLANES,) ascending inverse depths at which a view looks for surfaces."""
+    """Return the (PLANES,) ascending inverse depths at which a view looks for surfaces."""
     pixels, depths = camera.project(known)
     depths = depths[camera.in_image(pixels, depths)]
     if len(depths) >= TELLING_POINTS // 2:
-        near, far = np.quantile(depths, (NEAR_QUANTILE, 1 - NEAR_QUANTILE)) * MARGIN
+        near, far = np.quantile(depths, (NEAR_QUANTILE, 1 - NEAR_QUANTILE)) * (0.75, 1.5)
     else:
         near, far = look_distance(cameras) * np.array((0.3, 3.0))
     return np.linspace(1 / far, 1 / near, PLANES)
 
 
 def warp(camera: Camera, other: Camera) -> tuple[Array, Array]:
-    """(3, 3) `turn` and (3,) `shift` by which a pixel (x, y) at depth 1/w lies in the `other` view at
-    (p[0] / p[2], p[1] / p[2]), p = turn @ (x, y, 1) + w shift."""
+    """Return the (3, 3) `turn` and (3,) `shift` by which a pixel (x, y) at depth 1/w lies in the `other` view
+    at (p[0] / p[2], p[1] / p[2]), p = turn @ (x, y, 1) + w shift."""
     rotation = other.rotation @ camera.rotation.T
     matrix = np.array([[other.fx, 0, other.cx], [0, other.fy, other.cy], [0, 0, 1]])
     back = np.array(
@@ -190,67 +127,56 @@ def warp(camera: Camera, other: Camera) -> tuple[Array, Array]:
 def sweep(
     index: int, others: Sequence[int], cameras: Sequence[Camera], greys: Sequence[Array], known: Array
 ) -> tuple[Array, Array]:
-    """(H, W) depths of view `index` by its neighbours `others`, and their scores; greys: (H, W) float32 in
-    [0, 1]."""
+    """Return the (H, W) depths of view `index` by its neighbours `others`, and their scores; greys: (H, W)
+    float32 in [0, 1]."""
     camera, grey = cameras[index], greys[index]
     planes = inverse_depths(camera, cameras, known)
     best = np.full((BEST, PLANES, *grey.shape), -1, np.float32)
     for other in others:
-        turn, shift = warp(camera, cameras[other])
-        shared_workers().run(_score, PLANES, grey, greys[other], turn, shift, planes, best)
+        shared_workers().run(
+            score_planes, PLANES, grey, greys[other], *warp(camera, cameras[other]), planes, best
+        )
     at, score = np.empty(grey.shape, np.float32), np.empty(grey.shape, np.float32)
-    shared_workers().run(_choose, len(grey), best, min(BEST, len(others)), at, score)
+    shared_workers().run(_choose_planes, len(grey), best, min(BEST, len(others)), at, score)
     return 1 / (planes[0] + at.astype(np.float64) * (planes[1] - planes[0])), score
 
 
 @kernel
-def _score(
+def score_planes(
     first: int, last: int, grey: Array, other: Array, turn: Array, shift: Array, planes: Array, best: Array
 ) -> None:
     """Correlate windows of `grey` with those of `other` at planes [first, last); `best` (BEST, P, H, W) has
     the highest scores of all neighbours so far, in descending order."""
     height, width = grey.shape
-    seen = np.empty((height, width), np.float32)
-    moments = np.empty((5, height, width), np.float32)  # horizontal sums of x, y, x^2, y^2, x y
+    warped = np.empty((height, width), np.float32)
+    moments = np.empty((5, height, width), np.float32)  # sums of x, y, x^2, y^2, x y along rows of windows
     sums = np.empty((5, width), np.float32)
     for plane in range(first, last):
-        _look(other, turn, shift, planes[plane], seen)
+        _warp_image(other, turn, shift, planes[plane], warped)
         for row in range(height):
-            _sum_along(grey[row], seen[row], moments, row)
+            _sum_along(grey[row], warped[row], moments, row)
         for row in range(height):
-            count = _sum_across(moments, row, sums)
+            top, bottom = max(row - RADIUS, 0), min(row + RADIUS + 1, height)
+            sums[:] = 0
+            for r in range(top, bottom):
+                for m in range(5):
+                    for x in range(width):
+                        sums[m, x] += moments[m, r, x]
             for x in range(width):
                 across = min(x + RADIUS + 1, width) - max(x - RADIUS, 0)
-                score = _correlation(sums, x, np.float32(1) / np.float32(count * across))
-                _rank(best[:, plane, row, x], score if seen[row, x] >= 0 else np.float32(-1))
+                score = _correlation(sums, x, np.float32(1) / np.float32((bottom - top) * across))
+                score = score if warped[row, x] >= 0 else np.float32(-1)
+                for k in range(BEST):
+                    if score > best[k, plane, row, x]:
+                        score, best[k, plane, row, x] = best[k, plane, row, x], score
 
 
 @helper
-def _sum_across(moments: Array, row: int, sums: Array) -> int:
-    """Sums over the rows of windows around `row`, and how many rows these are."""
-    first, last = max(row - RADIUS, 0), min(row + RADIUS + 1, moments.shape[1])
-    sums[:] = 0
-    for r in range(first, last):
-        for m in range(moments.shape[0]):
-            for x in range(sums.shape[1]):
-                sums[m, x] += moments[m, r, x]
-    return last - first
-
-
-@helper
-def _rank(best: Array, score: float) -> None:
-    """Put a score into its place among the highest."""
-    for k in range(best.shape[0]):
-        if score > best[k]:
-            score, best[k] = best[k], score
-
-
-@helper
-def _look(other: Array, turn: Array, shift: Array, inverse_depth: float, seen: Array) -> None:
-    """`seen`: the other image through the plane, bilinear; -1 outside of it."""
+def _warp_image(other: Array, turn: Array, shift: Array, inverse_depth: float, warped: Array) -> None:
+    """Fill `warped` with the other image through the plane, bilinear; -1 outside of it."""
     height, width = other.shape
-    for row in range(seen.shape[0]):
-        for column in range(seen.shape[1]):
+    for row in range(warped.shape[0]):
+        for column in range(warped.shape[1]):
             x, y = column + 0.5, row + 0.5
             z = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] + inverse_depth * shift[2]
             u = (turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] + inverse_depth * shift[0]) / z - 0.5
@@ -260,20 +186,20 @@ def _look(other: Array, turn: Array, shift: Array, inverse_depth: float, seen: A
                 a, b = np.float32(u - i), np.float32(v - j)
                 above = other[j, i] + a * (other[j, i + 1] - other[j, i])
                 below = other[j + 1, i] + a * (other[j + 1, i + 1] - other[j + 1, i])
-                seen[row, column] = above + b * (below - above)
+                warped[row, column] = above + b * (below - above)
             else:
-                seen[row, column] = -1
+                warped[row, column] = -1
 
 
 @helper
-def _sum_along(grey: Array, seen: Array, moments: Array, row: int) -> None:
-    """Sums over a row's windows; beside the image there is nothing."""
+def _sum_along(grey: Array, warped: Array, moments: Array, row: int) -> None:
+    """Sum along the windows of a row; beside the image there is nothing."""
     width = grey.shape[0]
     for m in range(5):
         moments[m, row] = 0
     for offset in range(-RADIUS, RADIUS + 1):
         for x in range(max(-offset, 0), min(width - offset, width)):
-            a, b = grey[x + offset], seen[x + offset]
+            a, b = grey[x + offset], warped[x + offset]
             moments[0, row, x] += a
             moments[1, row, x] += b
             moments[2, row, x] += a * a
@@ -283,16 +209,17 @@ def _sum_along(grey: Array, seen: Array, moments: Array, row: int) -> None:
 
 @helper
 def _correlation(sums: Array, x: int, share: float) -> float:
-    """Zero-mean normalised cross-correlation of a window."""
+    """Zero-mean normalised cross-correlation of a window; what is flat correlates with nothing."""
+    flat = np.float32(1e-5)  # added to variances, of grey values in [0, 1]
     mean_a, mean_b = sums[0, x] * share, sums[1, x] * share
-    spread_a = max(sums[2, x] * share - mean_a * mean_a, np.float32(0)) + FLAT
-    spread_b = max(sums[3, x] * share - mean_b * mean_b, np.float32(0)) + FLAT
+    spread_a = max(sums[2, x] * share - mean_a * mean_a, np.float32(0)) + flat
+    spread_b = max(sums[3, x] * share - mean_b * mean_b, np.float32(0)) + flat
     return (sums[4, x] * share - mean_a * mean_b) / np.sqrt(spread_a * spread_b)
 
 
 @kernel
-def _choose(first: int, last: int, best: Array, count: int, at: Array, score: Array) -> None:
-    """The plane of every pixel of rows [first, last), between planes by a parabola, and its score."""
+def _choose_planes(first: int, last: int, best: Array, count: int, at: Array, score: Array) -> None:
+    """Find the plane of every pixel of rows [first, last), between planes by a parabola, and its score."""
     planes, width = best.shape[1], best.shape[3]
     mean = np.empty(planes, np.float32)
     for row in range(first, last):
@@ -311,13 +238,63 @@ def _choose(first: int, last: int, best: Array, count: int, at: Array, score: Ar
 
 
 def confirmed(one: DepthMap, others: Sequence[DepthMap]) -> Array:
-    """(H, W) depths of the map, NaN where their score is low or no other map confirms them."""
-    depth = np.where(one.score > LEAST_SCORE, one.depth, np.nan)
+    """Return the (H, W) depths of the map, NaN where their score is low or no other map confirms them."""
+    depth = np.where(one.score > 0.6, one.depth, np.nan)
     points, _ = replace(one, depth=depth).points()
     kept = np.zeros(len(points), bool)
     for other in others:
-        there, pixels, depths = _pixels(other.camera, points)
-        agree = np.abs(depths / other.depth[pixels] - 1) < AGREEMENT
-        kept[there] |= agree & (other.score[pixels] > LEAST_CONFIRMING)
+        there, pixels, depths = _in_view(other.camera, points)
+        agree = np.abs(depths / other.depth[pixels] - 1) < 0.015
+        kept[there] |= agree & (other.score[pixels] > 0.5)
     depth[np.isfinite(depth)] = np.where(kept, depth[np.isfinite(depth)], np.nan)
     return depth
+
+
+def shared_depths(depth: Array) -> Array:
+    """Return the (H, W) depths, NaN where too few pixels around share one.
+
+    What two views agree on by chance is alone. Where views lie one behind another, as on a walk, that is one
+    depth in ten, and each would free a window of space behind the surface.
+    """
+    size = 2 * RADIUS + 1
+    windows = sliding_window_view(np.pad(depth, RADIUS, constant_values=np.nan), (size, size))
+    alike = (np.abs(windows / depth[..., None, None] - 1) < ALIKE).sum((2, 3))
+    return np.where(alike >= LEAST_ALIKE * size**2, depth, np.nan)
+
+
+def free_depths(camera: Camera, depth: Array, known: Array) -> Array:
+    """Return the (H, W) depths up to which space is free, by the surfaces of the (H, W) `depth`, NaN where it
+    is not known, and by the (N, 3) `known` points.
+
+    What no other photograph confirms is mostly flat, or seen by this one alone: there nothing else tells haze
+    from a surface. It is not much nearer than the surfaces around it.
+    """
+    told = np.where(np.isfinite(depth), depth, np.inf)
+    _, pixels, depths = _in_view(camera, known)
+    np.minimum.at(told, pixels, depths)
+    if not np.isfinite(told).any():
+        return np.zeros_like(told)
+    reach = max(round(AROUND * max(told.shape)), 1)
+    around = (1 - NEARER) * minimum_filter(told, 2 * reach + 1, mode="nearest")
+    anywhere = (1 - NEARER_THAN_ALL) * np.quantile(told[np.isfinite(told)], NEAR_QUANTILE)
+    free = np.where(np.isfinite(around), around, anywhere)
+    return np.where(np.isfinite(depth), (1 - BEFORE) * depth, free)
+
+
+def in_free_space(points: Array, maps: Sequence[DepthMap]) -> Array:
+    """Return (N,) bool: the points that lie in the free space of more views than at their surfaces."""
+    balance = np.zeros(len(points), int)
+    for one in maps:
+        there, pixels, depths = _in_view(one.camera, points)
+        balance[there] += depths < one.free[pixels]
+        balance[there] -= np.abs(depths / one.depth[pixels] - 1) < BEFORE / 2
+    return balance > 0
+
+
+def _in_view(camera: Camera, points: Array) -> tuple[Array, tuple[Array, Array], Array]:
+    """Indices of the (N, 3) points that lie in the image, the rows and columns of their pixels, and their
+    depths."""
+    pixels, depths = camera.project(points)
+    there = np.flatnonzero(camera.in_image(pixels, depths))
+    columns, rows = pixels[there].astype(int).T
+    return there, (rows, columns), depths[there]

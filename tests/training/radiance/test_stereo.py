@@ -85,7 +85,7 @@ def test_scores_are_those_of_the_reference() -> None:
     greys = [picture(camera).mean(2, dtype=np.float32) / 255 for camera in (one, two)]
     planes = inverse_depths(one, [one, two], capture().points)
     best = np.full((stereo.BEST, PLANES, *greys[0].shape), -1, np.float32)
-    stereo._score(0, PLANES, *greys, *warp(one, two), planes, best)  # noqa: SLF001
+    stereo.score_planes(0, PLANES, *greys, *warp(one, two), planes, best)
     judged = 0
     for row, column, plane in ((20, 30, 40), (27, 36, 60), (33, 41, 5), (15, 52, 77)):
         rows, columns = range(row - RADIUS, row + RADIUS + 1), range(column - RADIUS, column + RADIUS + 1)
@@ -130,7 +130,7 @@ def test_depths_that_are_alone_tell_nothing() -> None:
     rng = np.random.default_rng(5)
     depth = np.where(rng.random(SIZE[::-1]) < 0.6, rng.normal(5, 0.1, SIZE[::-1]), np.nan)
     depth[10, 10] = 9.0
-    kept = stereo.shared(depth)
+    kept = stereo.shared_depths(depth)
     for (row, column), found in np.ndenumerate(kept):
         window = depth[
             max(row - RADIUS, 0) : row + RADIUS + 1, max(column - RADIUS, 0) : column + RADIUS + 1
@@ -152,7 +152,7 @@ def test_what_is_nearest_is_told_by_depths_and_points_around() -> None:
     reach = round(stereo.AROUND * SIZE[0])
     anywhere = (1 - stereo.NEARER_THAN_ALL) * np.quantile(told[np.isfinite(told)], stereo.NEAR_QUANTILE)
     alone = 0
-    for (row, column), found in np.ndenumerate(stereo.nearest(camera, depth, points)):
+    for (row, column), found in np.ndenumerate(stereo.free_depths(camera, depth, points)):
         window = told[
             max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1
         ]  # fmt: skip
