@@ -26,7 +26,8 @@ from langsplat_core.semantics.store import (
     fingerprint,
     within,
 )
-from langsplat_core.training.language.merge_tree import MergeTree, draw_patches, find_tree, nested_maps
+from langsplat_core.training.language.merge_tree import MergeTree, find_tree
+from langsplat_core.training.language.patch_maps import draw_patches, nested_maps
 
 CUTS = (0.15, 0.4, 0.8)  # costs up to which subparts, parts and wholes grow; chosen in rooms 201 and 203
 LEAST = 2.5e-4  # of the image: smaller regions show the encoder nothing

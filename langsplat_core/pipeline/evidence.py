@@ -28,7 +28,8 @@ from langsplat_core.raster.render import view_of
 from langsplat_core.scene import LEVELS, NO_NODE, Scene
 from langsplat_core.scene.surface import SMALLEST
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures, StoredFeatures
-from langsplat_core.training.language.merge_tree import SHOWN, SOLID, VOTE
+from langsplat_core.training.language.mask_weights import SHOWN, VOTE
+from langsplat_core.training.language.patch_maps import SOLID
 
 TAILS = (0.05, 0.95)  # quantiles of the share of votes between which it is given
 STAGE = "comparing photographs"

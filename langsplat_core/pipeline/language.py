@@ -62,11 +62,11 @@ from langsplat_core.training.language.lift import (
 from langsplat_core.training.language.mask_weights import (
     MaskGroups,
     MaskWeights,
+    count_votes,
     find_instances,
     group_masks,
     view_pairs,
 )
-from langsplat_core.training.language.merge_tree import count_votes
 from langsplat_core.training.language.palette import contrasting_colours
 
 Views = Sequence[tuple[Camera, ImageFeatures]]  # read when needed: they may be more than memory holds

@@ -8,7 +8,7 @@ from langsplat_core.progress import Cancelled, Progress, Report, silent
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.render import render
 from langsplat_core.semantics.store import ImageFeatures
-from langsplat_core.training.language.merge_tree import draw_patches
+from langsplat_core.training.language.patch_maps import draw_patches
 from tests.support.fakes import PER_BLOB, blob_scene, cameras
 
 

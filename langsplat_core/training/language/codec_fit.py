@@ -19,9 +19,10 @@ from langsplat_core.scene.codec import KINDS, principal_colours
 from langsplat_core.semantics.encoder import PhraseEncoder
 from langsplat_core.semantics.relevancy import Scale, relevancy_of
 from langsplat_core.semantics.vocabulary import everyday_phrases, everyday_vectors
+from langsplat_core.training import one_torch_thread
 from langsplat_core.training.language.kmeans import nearest_centres, spherical_kmeans
 
-CHUNK = 4_096  # vectors judged at a time
+log = logging.getLogger("langsplat")
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,13 +49,12 @@ def everyday_vocabulary(encoder: PhraseEncoder, phrases: tuple[str, ...] = ()) -
 def relevancy_error(made: Array, vectors: Array, vocabulary: Vocabulary) -> tuple[float, float]:
     """Mean and 99 % quantile of the change of relevancy, over vectors and phrases, with (M, D) `made` in
     place of (M, D) `vectors`, both float32 unit vectors; 0 where M = 0."""
-    differences = [
-        np.abs(vocabulary.relevancy(made[i : i + CHUNK]) - vocabulary.relevancy(vectors[i : i + CHUNK]))
-        for i in range(0, len(vectors), CHUNK)
-    ]
-    if not differences:
+    if not len(vectors):
         return 0.0, 0.0
-    errors = np.concatenate([part.astype(np.float32).ravel() for part in differences])
+    errors = np.empty((len(vectors), len(vocabulary.phrases)), np.float32)
+    for start in range(0, len(vectors), 4_096):
+        part = slice(start, start + 4_096)
+        errors[part] = np.abs(vocabulary.relevancy(made[part]) - vocabulary.relevancy(vectors[part]))
     return float(errors.mean(dtype=np.float64)), float(np.quantile(errors, 0.99))
 
 
@@ -87,18 +87,10 @@ DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)
 def train_autoencoder(
     vectors: Array, config: AutoencoderConfig, progress: Progress = silent
 ) -> AutoencoderCodec:
-    """The autoencoder of (M, D) unit vectors: Adam with a cosine schedule on random batches; progress shows
-    the batch's mean cosine. Deterministic for a given seed on one machine."""
-    # Layers this small are slower on several threads than on one, and many times slower on a busy machine.
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        return _train(vectors, config, progress)
-    finally:
-        torch.set_num_threads(threads)
+    """Train the autoencoder of (M, D) unit vectors: Adam with a cosine schedule on random batches.
 
-
-def _train(vectors: Array, config: AutoencoderConfig, progress: Progress) -> AutoencoderCodec:
+    Progress shows the batch's mean cosine. Deterministic for a given seed on one machine.
+    """
     torch.manual_seed(config.seed)
     data = torch.from_numpy(np.ascontiguousarray(vectors, np.float32))
     encoder, decoder = networks(data.shape[1], config.latent_dim)
@@ -106,23 +98,25 @@ def _train(vectors: Array, config: AutoencoderConfig, progress: Progress) -> Aut
     optimiser = torch.optim.Adam(parameters, lr=config.lr, fused=True)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, config.steps)
     generator = torch.Generator().manual_seed(config.seed)
-    for step in range(config.steps):
-        batch = data[torch.randint(len(data), (config.batch,), generator=generator)]
-        latent = nn.functional.normalize(encoder(batch), dim=1, eps=1e-6)
-        output = nn.functional.normalize(decoder(latent), dim=1, eps=1e-6)
-        cosine = (output * batch).sum(1).mean()
-        loss = nn.functional.l1_loss(output, batch) + (1 - cosine)
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        optimiser.step()
-        schedule.step()
-        if step % 50 == 0 or step + 1 == config.steps:
-            progress("codec", (step + 1) / config.steps, cosine=cosine.item())
-    _settle_statistics(encoder, data)
+    with one_torch_thread():
+        for step in range(config.steps):
+            batch = data[torch.randint(len(data), (config.batch,), generator=generator)]
+            latent = nn.functional.normalize(encoder(batch), dim=1, eps=1e-6)
+            output = nn.functional.normalize(decoder(latent), dim=1, eps=1e-6)
+            cosine = (output * batch).sum(1).mean()
+            loss = nn.functional.l1_loss(output, batch) + (1 - cosine)
+            optimiser.zero_grad(set_to_none=True)
+            loss.backward()
+            optimiser.step()
+            schedule.step()
+            if step % 50 == 0 or step + 1 == config.steps:
+                progress("codec", (step + 1) / config.steps, cosine=cosine.item())
+        _settle_statistics(encoder, data)
     return AutoencoderCodec(folded_layers(encoder), folded_layers(decoder))
 
 
 def networks(dim: int, latent_dim: int) -> tuple[nn.Sequential, nn.Sequential]:
+    """Return the encoder and the decoder, with random weights."""
     encoder: list[nn.Module] = []
     for width, size in pairwise((dim, *ENCODER_WIDTHS)):
         encoder += [nn.Linear(width, size), nn.BatchNorm1d(size), nn.ReLU()]
@@ -135,15 +129,15 @@ def networks(dim: int, latent_dim: int) -> tuple[nn.Sequential, nn.Sequential]:
 
 
 def _settle_statistics(encoder: nn.Sequential, data: torch.Tensor) -> None:
-    """Recompute batch statistics over the data with final weights: running averages lag behind them,
-    and with few vectors that lag is most of the reconstruction error."""
+    """Recompute batch statistics over the data with final weights: running averages lag behind them, and with
+    few vectors that lag is most of the reconstruction error."""
     for module in encoder:
         if isinstance(module, nn.BatchNorm1d):
             module.reset_running_stats()
             module.momentum = None  # cumulative average
     encoder.train()
     with torch.no_grad():
-        for chunk in data.split(max(2, 8192)):
+        for chunk in data.split(8_192):
             if len(chunk) > 1:
                 encoder(chunk)
     encoder.eval()
@@ -166,37 +160,34 @@ def folded_layers(network: nn.Sequential) -> tuple[tuple[Array, Array], ...]:
     return tuple((w.astype(np.float32), b.astype(np.float32)) for w, b in layers)
 
 
-# A scene's own codebook: as many codewords as its meanings need, and not more.
-
-log = logging.getLogger("langsplat")
-
-SMALLEST = 64  # codewords that are tried first
-LARGEST_SHARE = 4  # vectors per codeword, at least: with fewer, a codebook is a copy
-JUDGED = 5  # every so many vectors, one is kept from the fit and judges it
-FIRST_ROUNDS, FURTHER_ROUNDS = 8, 4
-REFINEMENTS = 2  # halvings of the interval that holds the smallest codebook, by ratio
+# A scene's own codebook: as many codewords as its language features need, and not more.
 
 
 def fit_codebook(
     vectors: Array, config: CodebookConfig, vocabulary: Vocabulary, progress: Progress = silent
 ) -> CodebookCodec:
-    """The codebook of (M, D) float32 unit vectors: of `config.size` codewords, or, where that is 0, the
-    smallest that keeps the mean relevancy error on vectors it was not fitted to within
-    `config.max_relevancy_error`. Codewords are float16 numbers, so that a file can hold them as such."""
+    """Fit a codebook to (M, D) float32 unit vectors.
+
+    It has `config.size` codewords, or, where that is 0, is the smallest that keeps the mean relevancy error
+    on vectors it was not fitted to within `config.max_relevancy_error`. Codewords are float16 numbers, so
+    that a file can hold them as such.
+    """
     order = np.random.default_rng(config.seed).permutation(len(vectors))
-    judged = vectors[order[::JUDGED]] if len(vectors) > 4 * JUDGED else vectors
-    fitted = vectors[np.delete(order, np.s_[::JUDGED])] if len(vectors) > 4 * JUDGED else vectors
+    fitted = judged = vectors
+    if len(vectors) > 20:
+        judged, fitted = vectors[order[::5]], vectors[np.delete(order, np.s_[::5])]
     generator = np.random.default_rng(config.seed)
 
     def grow(size: int, start: Array | None) -> Array:
         progress("codebook", 0.1 + 0.6 * min(size / 2_048, 1), f"{size} codewords")
-        rounds = FIRST_ROUNDS if start is None else FURTHER_ROUNDS
-        return rounded(spherical_kmeans(fitted, size, rounds, start, generator))
+        return rounded(spherical_kmeans(fitted, size, 8 if start is None else 4, start, generator))
 
     if config.size:
         codewords = grow(config.size, None)
     else:
-        codewords = _smallest(grow, judged, len(fitted), config.max_relevancy_error, vocabulary)
+        # With fewer than four vectors per codeword, a codebook is a copy.
+        most = max(min(len(fitted) // 4, 65_535), 1)
+        codewords = _smallest(grow, most, judged, config.max_relevancy_error, vocabulary)
     progress("colours of the codewords", 0.8)
     nearest, _ = nearest_centres(fitted, codewords)
     usage = np.bincount(nearest, minlength=len(codewords)).astype(np.float64)
@@ -211,14 +202,13 @@ def codebook_of(vectors: Array, usage: Array) -> CodebookCodec:
 
 def _smallest(
     grow: Callable[[int, Array | None], Array],
+    most: int,
     judged: Array,
-    available: int,
     budget: float,
     vocabulary: Vocabulary,
 ) -> Array:
-    """The smallest codebook within `budget`: sizes are doubled, then the last interval is halved."""
-    most = max(min(available // LARGEST_SHARE, 65_535), 1)
-    size, smaller, codewords = min(SMALLEST, most), None, np.zeros((0, 0), np.float32)
+    """The smallest codebook within `budget`: sizes are doubled, then the last interval is halved twice."""
+    size, smaller = min(64, most), None
     while True:
         codewords = grow(size, smaller)
         error = codebook_error(codewords, judged, vocabulary)
@@ -230,7 +220,7 @@ def _smallest(
     if smaller is None or error > budget:
         return codewords
     low, high = len(smaller), len(codewords)
-    for _ in range(REFINEMENTS):
+    for _ in range(2):
         middle = round((low * high) ** 0.5)
         tried = grow(middle, smaller)
         if codebook_error(tried, judged, vocabulary) <= budget:
@@ -261,9 +251,11 @@ def fit_codec(
     progress: Progress = silent,
     further: Array | None = None,
 ) -> Codec:
-    """(M, D) float32 unit CLIP vectors -> a codec for them; what phrases of the `vocabulary` find is what it
-    may not change. Deterministic for a given seed on one machine. InputError for settings out of range.
-    further: (M', D) vectors that are not kept, but help a kind that interpolates between what it has seen."""
+    """Fit a codec to (M, D) float32 unit CLIP vectors, so that phrases of the `vocabulary` find the same.
+
+    Deterministic for a given seed on one machine. Raises InputError for settings out of range. further: (M',
+    D) vectors that are not kept, but help a kind that interpolates between what it has seen.
+    """
     check_settings(config, "--codec.")
     if further is not None and (KINDS[config.kind].blends or len(vectors) == 0):
         vectors = np.concatenate([further, vectors])
@@ -271,8 +263,8 @@ def fit_codec(
 
 
 def fit_linear(vectors: Array, config: LinearConfig) -> LinearCodec:
-    """The leading right singular vectors, `config.latent_dim` of them: the best basis in the least-squares
-    sense (Eckart-Young)."""
+    """Fit the leading `config.latent_dim` right singular vectors: the best basis in the least-squares sense
+    (Eckart-Young)."""
     # Through the D x D Gram matrix: D is 512, M may be a million. float64 keeps its squared condition usable.
     wide = np.asarray(vectors, np.float64)
     _, axes = np.linalg.eigh(wide.T @ wide)

@@ -5,8 +5,7 @@ import numpy as np
 from langsplat_core.arrays import Array, unit
 
 CHUNK = 8_192  # vectors compared with all centres at a time
-HELPING = 8  # one in so many centres is added, or given up, at a time
-EXTRA = 0.25  # of the new centres: are tried beyond those asked for
+STEP = 8  # one in so many centres is added, or given up, at a time
 
 
 def nearest_centres(vectors: Array, centres: Array) -> tuple[Array, Array]:
@@ -27,14 +26,16 @@ def spherical_kmeans(
     start: Array | None = None,
     generator: np.random.Generator | None = None,
 ) -> Array:
-    """At most `count` unit centres (K, D) float32 of (M, D) float32 unit vectors. Begins at `start` (K' <=
-    count centres) and adds vectors that these fit badly, drawn by their distance: a quarter more than asked
-    for, of which those are given up again, round by round, that would be missed least. That finds the gaps
-    which plain k-means leaves where two clusters share a centre. Fewer than `count` come back where fewer
-    different vectors are there."""
+    """Return at most `count` unit centres (K, D) float32 of (M, D) float32 unit vectors.
+
+    Begins at `start` (K' <= count centres) and adds vectors that these fit badly, drawn by their distance: a
+    quarter more than asked for, of which those are given up again, round by round, that would be missed
+    least. That finds the gaps which plain k-means leaves where two clusters share a centre. Fewer than
+    `count` come back where fewer different vectors are there.
+    """
     generator = generator or np.random.default_rng(0)
     centres = np.zeros((0, vectors.shape[1]), np.float32) if start is None else start
-    extra = (count - len(centres)) * EXTRA
+    extra = (count - len(centres)) / 4
     centres = _grown(vectors, centres, count + round(extra), generator)
     for done in range(1, rounds + 1):
         nearest, counts, missed = _assigned(vectors, centres)
@@ -50,9 +51,9 @@ def spherical_kmeans(
 
 
 def _without_spare(missed: Array, size: int) -> Array:
-    """(K,) bool: all but those missed least, where there are more than `size`; only one in `HELPING` at a
+    """(K,) bool: all but those missed least, where there are more than `size`; only one in `STEP` at a
     time, because of two that are alike neither is missed."""
-    spare = min(max(len(missed) - size, 0), 1 + len(missed) // HELPING)
+    spare = min(max(len(missed) - size, 0), 1 + len(missed) // STEP)
     kept = np.ones(len(missed), bool)
     kept[np.argsort(missed, kind="stable")[:spare]] = False
     return kept
@@ -75,13 +76,13 @@ def _assigned(vectors: Array, centres: Array) -> tuple[Array, Array, Array]:
 
 
 def _grown(vectors: Array, centres: Array, count: int, generator: np.random.Generator) -> Array:
-    """`centres` and badly fitted vectors, in small helpings: one gap is not filled ten times."""
+    """`centres` and badly fitted vectors, few at a time: one gap is not filled ten times."""
     distance = np.full(len(vectors), 2, np.float32)
     new = centres if len(centres) else vectors[_badly_fitted(distance, 1, generator)]
     while True:
         distance = np.minimum(distance, 1 - nearest_centres(vectors, new)[1])
         centres = np.concatenate([centres, new]) if new is not centres else centres
-        rows = _badly_fitted(distance, min(count - len(centres), 1 + len(centres) // HELPING), generator)
+        rows = _badly_fitted(distance, min(count - len(centres), 1 + len(centres) // STEP), generator)
         if len(rows) == 0:
             return centres
         new = vectors[rows]

@@ -1,11 +1,11 @@
 """Lifting: from masks in photographs to CLIP vectors on Gaussians, on the unit sphere.
 
 Each Gaussian takes the geometric median, or the weighted mean, of the vectors of the masks it belongs to; a
-codec encodes that afterwards. Averaging in CLIP space never meets the meaning of a third object half way
+codec encodes that afterwards. Averaging in CLIP space never yields the vector of a third object half way
 between two latents.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -14,15 +14,12 @@ from scipy import sparse
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.compiled import helper, kernel, plain, shared_workers
-from langsplat_core.config import INRIA, LiftConfig, RasterSettings, check_settings
+from langsplat_core.config import LiftConfig, check_settings
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.protocol import LiftingRasterizer, LiftingView
 from langsplat_core.scene import LEVELS, Camera, Codec, Gaussians
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language.mask_weights import MaskGroups, MaskWeights
-
-MEDIAN_STEPS = 8
-FAINT = 2e-3  # share of a Gaussian's weight below which a mask has no say in its median
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +31,7 @@ class Lifted:
 
 
 def lift_block(mask_weights: MaskWeights, groups: MaskGroups, number: int, robust: bool) -> Lifted:
-    """Lift onto the Gaussians of one block. `robust` takes the geometric median, else the mean."""
+    """Lift onto the Gaussians of one block; `robust` takes the geometric median, else the mean."""
     return lift_weights(mask_weights.block(number, groups), groups.vectors, robust)
 
 
@@ -59,29 +56,26 @@ def lift_sample(
 
 
 def lift_weights(weights: sparse.csr_matrix, vectors: Array, robust: bool) -> Lifted:
-    """weights: (n, 3 G) of n Gaussians in G groups of masks, level after level; vectors: (G, D) float32."""
-    levels = list(_levels(weights, vectors, robust))
-    return Lifted(np.stack([vectors for vectors, _ in levels]), np.stack([c for _, c in levels]))
+    """Lift by the (n, 3 G) weights of n Gaussians in G groups of masks, level after level.
 
-
-def _levels(weights: sparse.csr_matrix, vectors: Array, robust: bool) -> Iterator[tuple[Array, Array]]:
-    for level in range(len(LEVELS)):
+    vectors: (G, D) float32 unit vectors of the groups.
+    """
+    lifted = Lifted(
+        np.zeros((len(LEVELS), weights.shape[0], vectors.shape[1]), np.float32),
+        np.zeros((len(LEVELS), weights.shape[0]), np.float32),
+    )
+    for level, (centre, confidence) in enumerate(zip(lifted.vectors, lifted.confidence, strict=True)):
         at_level = weights[:, level * len(vectors) : (level + 1) * len(vectors)].tocsr()
-        confidence = np.asarray(at_level.sum(1), np.float32).ravel()
-        centre = unit(at_level @ vectors).astype(np.float32)
+        confidence[:] = np.asarray(at_level.sum(1)).ravel()
+        centre[:] = unit(at_level @ vectors)
         if robust and at_level.nnz:
-            strong = _without_faint(at_level, confidence)
-            parts = (strong.indptr, strong.indices, strong.data, vectors, centre)
+            # Pairs below 0.2 % of their Gaussian's total: half of all pairs, and little of the weight.
+            at_level.data[at_level.data < 2e-3 * np.repeat(confidence, np.diff(at_level.indptr))] = 0
+            at_level.eliminate_zeros()
+            parts = (at_level.indptr, at_level.indices, at_level.data, vectors, centre)
             shared_workers().run(_weiszfeld, len(centre), *parts)
-        yield np.where(confidence[:, None] > 0, centre, 0).astype(np.float32), confidence
-
-
-def _without_faint(weights: sparse.csr_matrix, confidence: Array) -> sparse.csr_matrix:
-    """Without the pairs below `FAINT` of their Gaussian's total: half of all pairs, little of the weight."""
-    rows = np.repeat(np.arange(weights.shape[0]), np.diff(weights.indptr))
-    keep = weights.data >= FAINT * confidence[rows]
-    indptr = np.concatenate([[0], np.cumsum(np.bincount(rows[keep], minlength=weights.shape[0]))])
-    return sparse.csr_matrix((weights.data[keep], weights.indices[keep], indptr), shape=weights.shape)
+        centre[confidence == 0] = 0
+    return lifted
 
 
 @partial(helper, fastmath={"reassoc", "contract", "nsz"})
@@ -111,7 +105,7 @@ def _weiszfeld(
         start, stop = indptr[row], indptr[row + 1]
         if stop - start < 2:
             continue
-        for _ in range(MEDIAN_STEPS):
+        for _ in range(8):  # within a degree of the converged median
             total[:] = 0
             for entry in range(start, stop):
                 _add_reweighted(total, vectors[indices[entry]], centre[row], data[entry])
@@ -132,12 +126,13 @@ def lift_latents(
     gaussians: Gaussians,
     views: Sequence[tuple[Camera, ImageFeatures]],
     codec: Codec,
-    settings: RasterSettings = INRIA,
     progress: Progress = silent,
 ) -> tuple[Array, Array]:
-    """The paper's quantity in one pass: (3, N, d) latents ``W^T H / W^T 1`` and (3, N) confidence. H holds
-    the encoded vector of each pixel's mask; pixels without a mask count in neither sum. All three levels go
-    through one gather per view."""
+    """Return the paper's quantity in one pass: (3, N, d) latents ``W^T H / W^T 1`` and (3, N) confidence.
+
+    H holds the encoded vector of each pixel's mask; pixels without a mask count in neither sum. All three
+    levels go through one gather per view.
+    """
     count, d = len(gaussians), codec.latent_dim
     total = np.zeros((count, len(LEVELS), d + 1))
     for done, (camera, features) in enumerate(views):
@@ -147,7 +142,7 @@ def lift_latents(
         images = latents[features.labels]  # label -1 indexes the last row: zeros
         height, width = features.labels.shape[1:]
         stacked = np.moveaxis(images, 0, 2).reshape(height, width, -1)
-        view = rasterizer.view(gaussians, camera, settings)
+        view = rasterizer.view(gaussians, camera)
         total += view.gather(np.ascontiguousarray(stacked)).reshape(count, len(LEVELS), d + 1)
         progress("lifting latents onto the Gaussians", (done + 1) / len(views))
     confidence = total[..., d]
@@ -169,8 +164,6 @@ def lift_latents(
 # moves; from the one-pass mean the same loss is reached much sooner. The three levels share W and do not
 # otherwise meet: one splat and one gather serve them all.
 
-BETAS, EPSILON = (0.9, 0.999), 1e-15  # of Adam, as in the INRIA code
-PUBLISHED_EPSILON = 1e-9  # in x / (|x| + 1e-9)
 KEPT_BYTES = 4e9  # weights of views that are kept; further views are projected again at every step
 
 
@@ -189,51 +182,63 @@ def lift_by_gradient(
     views: Sequence[tuple[Camera, ImageFeatures]],
     codec: Codec,
     config: LiftConfig,
-    settings: RasterSettings = INRIA,
     progress: Progress = silent,
 ) -> tuple[Array, Array]:
-    """(3, N, d) float32 unit latents, zero where unobserved, and (3, N) confidence as of `lift_latents`.
-    `config` says for how many steps, how fast, from where. Deterministic for a given seed on the CPU."""
-    start, confidence = lift_latents(rasterizer, gaussians, views, codec, settings, progress)
+    """Return (3, N, d) float32 unit latents, zero where unobserved, and (3, N) confidence as of
+    `lift_latents`.
+
+    `config` says for how many steps, how fast, from where. Deterministic for a given seed on the CPU.
+    """
+    start, confidence = lift_latents(rasterizer, gaussians, views, codec, progress)
     import torch  # seconds that other modes need not pay
 
     check_settings(config, "--lift.")
     published = config.start == "zeros-as-published"
     x = np.zeros_like(start) if published else start.copy()
     features = torch.from_numpy(x)  # the same memory
-    adam = torch.optim.Adam([features], config.lr, BETAS, EPSILON, fused=True)
+    adam = torch.optim.Adam([features], config.lr, (0.9, 0.999), 1e-15, fused=True)  # as in the INRIA code
     targets = [
         _Target(camera, np.asarray(seen.labels, np.int32), plain(codec.encode(seen.vectors)))
         for camera, seen in views
     ]
-    weights = _Weights(rasterizer, gaussians, [camera for camera, _ in views], settings)
-    for step, index in enumerate(_shuffled(len(views), config.steps, config.seed), 1):
-        loss, by_y = loss_and_gradient(weights.of(index), targets[index], blended(x, published))
-        gradient = by_features(x, by_y) if published else by_y
-        features.grad = torch.from_numpy(plain(gradient))
+    kept: dict[int, LiftingView] = {}
+    generator = np.random.default_rng(config.seed)
+    order = generator.permutation(len(views))
+    for step in range(config.steps):
+        if step and step % len(views) == 0:  # each view once in every pass
+            order = generator.permutation(len(views))
+        index = int(order[step % len(views)])
+        view = kept.get(index)
+        if view is None:  # the geometry is frozen: weights are kept as far as memory allows
+            view = rasterizer.view(gaussians, targets[index].camera)
+            if sum(one.nbytes for one in kept.values()) <= KEPT_BYTES:
+                frozen = view.frozen()
+                if frozen is not view:
+                    view = kept[index] = frozen
+        loss, gradient = loss_and_gradient(view, targets[index], blended(x) if published else x)
+        features.grad = torch.from_numpy(plain(by_features(x, gradient) if published else gradient))
         adam.step()
-        if step % 20 == 0 or step == config.steps:
-            progress("training language features", step / config.steps, loss=loss)
-    latents = unit(x)
-    return np.where(confidence[..., None] > 0, latents, 0).astype(np.float32), confidence
+        if (step + 1) % 20 == 0 or step + 1 == config.steps:
+            progress("training language features", (step + 1) / config.steps, loss=loss)
+    return np.where(confidence[..., None] > 0, unit(x), 0).astype(np.float32), confidence
 
 
-def blended(x: Array, published: bool) -> Array:
-    """(3, N, d) features -> the values that are blended: unit vectors where `published`."""
-    if not published:
-        return x
-    return x / (np.linalg.norm(x, axis=-1, keepdims=True) + PUBLISHED_EPSILON)
+def blended(x: Array) -> Array:
+    """Return the values that are blended as published, for (..., d) features: x / (|x| + 1e-9)."""
+    return x / (np.linalg.norm(x, axis=-1, keepdims=True) + 1e-9)
 
 
 def by_features(x: Array, by_y: Array) -> Array:
-    """Gradient by x from that by y = x / (|x| + 1e-9); at zero the norm's own gradient counts as zero."""
+    """Return the gradient by x from that by y = `blended` x; at zero the norm's own gradient counts as
+    zero."""
     length = np.linalg.norm(x, axis=-1, keepdims=True)
     along = (x * by_y).sum(-1, keepdims=True) / np.maximum(length, 1e-30)
-    return by_y / (length + PUBLISHED_EPSILON) - x * along / (length + PUBLISHED_EPSILON) ** 2
+    return by_y / (length + 1e-9) - x * along / (length + 1e-9) ** 2
 
 
 def loss_and_gradient(view: LiftingView, target: _Target, y: Array) -> tuple[float, Array]:
-    """Masked L1 of one view, mean over levels, pixels and numbers, and its (3, N, d) gradient by y."""
+    """Return the masked L1 of one view, mean over levels, pixels and numbers, and its (3, N, d) gradient by
+    y."""
     levels, count, d = y.shape
     image = view.splat(np.ascontiguousarray(np.moveaxis(y, 0, 1).reshape(count, levels * d)))[0]
     signs, losses = np.empty_like(image), np.empty(len(image))
@@ -268,39 +273,3 @@ def _compare(
                 total += abs(difference)
                 signs[row, column, channel] = share * np.sign(difference)
         losses[row] = total
-
-
-def _shuffled(views: int, steps: int, seed: int) -> Iterator[int]:
-    """`steps` indices of views, each view once in every pass."""
-    generator = np.random.default_rng(seed)
-    for step in range(steps):
-        if step % views == 0:
-            order = generator.permutation(views)
-        yield int(order[step % views])
-
-
-class _Weights:
-    """The blending weights of every view, kept as far as memory allows: the geometry is frozen."""
-
-    def __init__(
-        self,
-        rasterizer: LiftingRasterizer,
-        gaussians: Gaussians,
-        cameras: Sequence[Camera],
-        settings: RasterSettings,
-    ) -> None:
-        self._rasterizer, self._gaussians = rasterizer, gaussians
-        self._cameras, self._settings = cameras, settings
-        self._kept: dict[int, LiftingView] = {}
-        self._bytes = 0.0
-
-    def of(self, index: int) -> LiftingView:
-        """The view of camera `index`, kept where memory allows."""
-        if index in self._kept:
-            return self._kept[index]
-        view = self._rasterizer.view(self._gaussians, self._cameras[index], self._settings)
-        frozen = view.frozen() if self._bytes <= KEPT_BYTES else view
-        if frozen is not view:
-            self._bytes += frozen.nbytes
-            self._kept[index] = frozen
-        return frozen

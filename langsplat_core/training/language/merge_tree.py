@@ -29,9 +29,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.compiled import kernel, shared_workers
 from langsplat_core.io.shapes import base_colours
 from langsplat_core.progress import Progress, silent
-from langsplat_core.raster.protocol import LiftingView
-from langsplat_core.raster.reference import project
-from langsplat_core.scene import LEVELS, NO_NODE, Camera, Gaussians, Tree
+from langsplat_core.scene import LEVELS, Gaussians
 from langsplat_core.scene.surface import Surface, divide, surface_areas
 from langsplat_core.training.language.mask_weights import MaskWeights
 
@@ -41,7 +39,6 @@ STEP_BENT = 0.1  # weight of concavity in the step between two Gaussians
 SCALE, SMALLEST = 0.6, 10  # of the division into patches, see `surface.divide`
 PLAIN, SMALL = 1 / 200, 0.1  # share of the area that merges at its plain cost, and the power of the others
 ENOUGH = 4.0  # pixels of a Gaussian in a mask from which it counts no more
-DARKEST = 0.02  # of a display value: chromaticity has no meaning below
 STAGE = "merging what masks agree on"
 
 
@@ -107,16 +104,15 @@ def find_tree(
         return MergeTree(everywhere, np.zeros((0, 2), np.int32), np.zeros(0))
     disagreement = link_disagreement(surface, mask_weights, progress)
     concavity = link_concavity(surface, eyes)
-    colours = _chromaticities(gaussians, surface)
+    colours = base_colours(gaussians)[surface.rows].astype(np.float64).clip(0.02, 1)  # black has none
+    colours /= colours.sum(1, keepdims=True)  # chromaticity
     a, b = surface.ends
     steps = disagreement + STEP_BENT * concavity + COLOUR * np.linalg.norm(colours[a] - colours[b], axis=1)
     of = divide(surface, steps, np.argsort(steps, kind="stable").astype(np.int32), SCALE, SMALLEST)
     everywhere[surface.rows] = of
-    masses, labelling = _masses(mask_weights, counts, everywhere, int(of.max()) + 1)
     sizes = np.bincount(of)
     patches = Patches(
-        masses,
-        labelling,
+        *mask_weights.sums(everywhere, len(sizes), counts),
         np.stack([np.bincount(of, channel) / sizes for channel in colours.T], 1),
         np.maximum(np.bincount(of, surface_areas(gaussians)[surface.rows]), 1e-30),
         find_borders(of, surface.ends, disagreement, concavity),
@@ -138,25 +134,19 @@ def link_disagreement(surface: Surface, mask_weights: MaskWeights, progress: Pro
     number = np.full(mask_weights.count, -1, np.int32)
     number[surface.rows] = np.arange(len(surface.rows))
     for done, pairs in enumerate(mask_weights.pairs, 1):
-        masks = np.full((len(LEVELS), len(surface.rows)), -1, np.int32)
-        weights = np.zeros((len(LEVELS), len(surface.rows)), np.float32)
-        pieces = number[pairs["row"]], pairs["mask"], pairs["level"], pairs["weight"]
-        _heaviest(*map(np.ascontiguousarray, pieces), masks, weights)
-        shared_workers().run(_compare, len(first), first, second, masks, weights, apart, seen)
+        pairs = pairs[number[pairs["row"]] >= 0]
+        place = pairs["level"].astype(np.int64) * len(surface.rows) + number[pairs["row"]]
+        weight = np.ascontiguousarray(pairs["weight"])
+        most = np.zeros(len(LEVELS) * len(surface.rows), np.float32)
+        np.maximum.at(most, place, weight)
+        # The mask that each Gaussian paints most of at each level; of equal ones the first, written last.
+        mask = np.full(len(most), -1, np.int32)
+        heaviest = np.flatnonzero(weight == most[place])[::-1]
+        mask[place[heaviest]] = pairs["mask"][heaviest]
+        levels = (one.reshape(len(LEVELS), -1) for one in (mask, most))
+        shared_workers().run(_compare, len(first), first, second, *levels, apart, seen)
         progress(STAGE, 0.8 * done / len(mask_weights.pairs))
     return np.where(seen > 0, apart / np.maximum(seen, 1e-9), UNSEEN).astype(np.float64)
-
-
-@kernel
-def _heaviest(
-    numbers: Array, pair_masks: Array, levels: Array, pair_weights: Array, masks: Array, weights: Array
-) -> None:
-    """Find the mask that each Gaussian paints most of at each level, the first of equal ones."""
-    for pair in range(len(numbers)):
-        number, level = numbers[pair], levels[pair]
-        if number >= 0 and pair_weights[pair] > weights[level, number]:
-            weights[level, number] = pair_weights[pair]
-            masks[level, number] = pair_masks[pair]
 
 
 @kernel
@@ -170,7 +160,7 @@ def _compare(
     apart: Array,
     seen: Array,
 ) -> None:
-    """Add a view's levels to links [start, stop)."""
+    """Add a view's levels to links [start, stop): (3, M) mask and weight of each Gaussian."""
     for link in range(start, stop):
         a, b = first[link], second[link]
         for level in range(masks.shape[0]):
@@ -206,36 +196,7 @@ def _normals(surface: Surface) -> Array:
     return normals
 
 
-def _chromaticities(gaussians: Gaussians, surface: Surface) -> Array:
-    """(M, 3) colours without brightness: each adds up to 1."""
-    colours = base_colours(gaussians)[surface.rows].astype(np.float64).clip(DARKEST, 1)
-    return np.asarray(colours / colours.sum(1, keepdims=True))
-
-
 # Patches, and their merging.
-
-
-def _masses(
-    mask_weights: MaskWeights, counts: Sequence[int], patches: Array, size: int
-) -> tuple[sparse.csr_matrix, Array]:
-    """(P, masks of all views) pixels that each patch paints of each mask, and the view and level of each mask
-    as one number. patches: (N,) of the Gaussians, -1 for those of none."""
-    rows, columns, weights = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros(0, np.float32)]
-    labelling = np.zeros(sum(counts), np.int32)
-    for view, (first, count) in enumerate(zip(np.cumsum([0, *counts]), counts, strict=False)):
-        pairs = mask_weights.pairs[view]
-        pairs = pairs[patches[pairs["row"]] >= 0]
-        place = patches[pairs["row"]].astype(np.int64) * count + pairs["mask"]
-        sums = np.bincount(place, pairs["weight"], size * count)
-        filled = np.flatnonzero(sums)
-        rows.append(filled // count)
-        columns.append(first + filled % count)
-        weights.append(sums[filled].astype(np.float32))
-        labelling[first + pairs["mask"]] = len(LEVELS) * view + pairs["level"]
-    entries = np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))
-    masses = sparse.csr_matrix(entries, shape=(size, len(labelling)))
-    masses.sort_indices()
-    return masses, labelling
 
 
 def find_borders(of: Array, ends: tuple[Array, Array], disagreement: Array, concavity: Array) -> Borders:
@@ -247,39 +208,6 @@ def find_borders(of: Array, ends: tuple[Array, Array], disagreement: Array, conc
     sums = [np.bincount(row, values[between], len(found)) for values in (disagreement, concavity)]
     first, second = (found // max(size, 1)).astype(np.int32), (found % max(size, 1)).astype(np.int32)
     return Borders(first, second, np.bincount(row, minlength=len(found)).astype(np.float64), *sums)
-
-
-VOTE = 0.5  # overlap over union of a node and a mask from which the mask is of just that node
-SHOWN = 25.0  # pixels of a node from which a photograph shows it
-
-
-def count_votes(tree: Tree, mask_weights: MaskWeights, counts: Sequence[int]) -> Array:
-    """(K, 2) uint16 photographs with a mask of just each node, and those that show the node without one.
-    counts: number of masks of each view. Compared is what the view shows of the node."""
-    masses, labelling = _masses(mask_weights, counts, tree.leaves, tree.count)
-    masses, inside = masses.tocsc(), _descendants(tree)
-    votes = np.zeros((tree.count, 2), np.uint16)
-    for pairs, first, count in zip(mask_weights.pairs, np.cumsum([0, *counts]), counts, strict=False):
-        shared = (inside @ masses[:, first : first + count]).toarray()  # (K, M) pixels
-        level_of = labelling[first : first + count] % len(LEVELS)
-        visible = np.stack([shared[:, level_of == level].sum(1) for level in range(len(LEVELS))], 1)
-        every = np.bincount(pairs["mask"], pairs["weight"], count)
-        union = visible[:, level_of] + every - shared
-        agree = (shared > VOTE * union).any(1)
-        shown = visible.max(1) >= SHOWN
-        votes += np.stack([shown & agree, shown & ~agree], 1).astype(np.uint16)
-    return votes
-
-
-def _descendants(tree: Tree) -> sparse.csr_matrix:
-    """(K, K) float32, 1 where the column's node is the row's or a descendant of it."""
-    rows, columns = [np.arange(tree.count)], [np.arange(tree.count)]
-    while len(rows[-1]):
-        above = tree.parents[rows[-1]]
-        rows.append(above[above != NO_NODE])
-        columns.append(columns[-1][above != NO_NODE])
-    places = np.concatenate(rows), np.concatenate(columns)
-    return sparse.csr_matrix((np.ones(len(places[0]), np.float32), places), (tree.count, tree.count))
 
 
 class _Merger:
@@ -385,80 +313,3 @@ def _agreement(
             i += 1
             j += 1
     return agreed / seen
-
-
-# The nodes as one sees them in a photograph.
-
-SOLID = 0.5  # of a pixel: where the Gaussians cover less, there is nothing
-CHANNELS = 32  # that are drawn at a time
-FAINTEST = 1.0  # pixels: what a view shows less of is not drawn
-CELL = 8  # pixels a side, in which patches of one channel keep apart
-
-
-def draw_patches(view: LiftingView, gaussians: Gaussians, patches: Array) -> Array:
-    """(N,) int32 patches of the Gaussians, -1 for none -> (H, W) int32 the one that most of a pixel is.
-    Patches whose boxes in the image do not meet share a channel, so that thousands take some dozen."""
-    inside = patches >= 0
-    seen = np.bincount(patches[inside], view.contributions()[inside]) if inside.any() else np.zeros(0)
-    channel_of, owners = _share_channels(_boxes(view.camera, gaussians, patches, len(seen)), seen >= FAINTEST)
-    channels, view = np.where(inside, channel_of[patches] if len(seen) else -1, -1), view.frozen()
-    most = np.zeros((view.camera.height, view.camera.width), np.float32)
-    drawn = np.full(most.shape, -1, np.int32)
-    rows, columns = np.indices(most.shape) // CELL
-    for start in range(0, len(owners), CHANNELS):
-        some = np.arange(start, min(start + CHANNELS, len(owners)))
-        image, alpha = view.splat((channels[:, None] == some).astype(np.float32))
-        best = image.max(-1)
-        more = (best > most) & (alpha > SOLID)
-        drawn[more] = owners[some[image.argmax(-1)[more]], rows[more], columns[more]]
-        most = np.where(more, best, most)
-    return drawn
-
-
-def _boxes(camera: Camera, gaussians: Gaussians, patches: Array, count: int) -> Array:
-    """(P, 4) left, top, right, bottom cell of everything that a patch may paint, the last two exclusive."""
-    footprints = project(gaussians, camera)
-    drawn = np.flatnonzero((patches >= 0) & (footprints.opacities > 0))
-    low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
-    np.minimum.at(low, patches[drawn], footprints.means_px[drawn] - footprints.extents_px[drawn] - 1)
-    np.maximum.at(high, patches[drawn], footprints.means_px[drawn] + footprints.extents_px[drawn] + 1)
-    size = camera.width, camera.height
-    boxes = np.concatenate([np.clip(low, 0, size) // CELL, -(-np.clip(high, 0, size) // CELL)], 1)
-    return np.asarray(boxes.astype(np.int64))
-
-
-def _share_channels(boxes: Array, shown: Array) -> tuple[Array, Array]:
-    """(P,) channel of each patch, -1 for those not shown, and (C, rows, columns) int32 the patch that each
-    cell of a channel belongs to. The largest boxes choose first."""
-    channel_of = np.full(len(boxes), -1)
-    owners: list[Array] = []
-    rows, columns = (int(boxes[:, side].max(initial=0)) for side in (3, 2))
-    areas = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
-    for patch in np.argsort(-areas, kind="stable"):
-        left, top, right, bottom = boxes[patch]
-        if not shown[patch] or right <= left or bottom <= top:
-            continue
-        place = np.s_[top:bottom, left:right]
-        free = (number for number, owner in enumerate(owners) if owner[place].max() < 0)
-        channel = next(free, len(owners))
-        if channel == len(owners):
-            owners.append(np.full((rows, columns), -1, np.int32))
-        owners[channel][place] = patch
-        channel_of[patch] = channel
-    return channel_of, np.stack(owners) if owners else np.zeros((0, rows, columns), np.int32)
-
-
-def nested_maps(drawn: Array, cuts: Sequence[Array], least: float) -> Array:
-    """Label maps (3, H, W) int32 as of `masks.label_maps`, of the nodes that each cut makes of patches.
-    drawn: (H, W) int32 patches, -1 for none; cuts: of each level, the (P,) int32 node of each patch; least:
-    share of the image below which a node is left out."""
-    maps = np.full((len(cuts), *drawn.shape), -1, np.int32)
-    first, there = 0, drawn >= 0
-    for level, nodes in zip(maps, cuts, strict=True):
-        found = nodes[drawn[there]]
-        kept = np.flatnonzero(np.bincount(found) >= max(least * drawn.size, 1))
-        rows = np.full(int(nodes.max(initial=-1)) + 1, -1, np.int32)
-        rows[kept] = np.arange(first, first + len(kept))
-        level[there] = rows[found]
-        first += len(kept)
-    return maps

@@ -30,7 +30,7 @@ class Rendered:
     means_px: Tensor  # its `grad`, after `backward`, is the loss gradient by the projected means, 1/px
 
     def means_px_grad(self) -> Tensor:
-        """(N, 2); zeros when nothing was differentiated."""
+        """Return the (N, 2) gradient; zeros when nothing was differentiated."""
         if self.means_px.grad is None:
             return torch.zeros_like(self.means_px).reshape(-1, 2)
         return self.means_px.grad.reshape(-1, 2)
@@ -46,14 +46,14 @@ class DifferentiableRenderer(Protocol):
 
 
 def sh_coefficients(parameters: dict[str, Tensor], sh_degree: int) -> Tensor:
-    """(N, (degree + 1)^2, 3): the coefficients in use, without the copy when degree 0 is all there is."""
+    """Return the (N, (degree + 1)^2, 3) coefficients in use, without a copy when degree 0 is all there is."""
     if sh_degree == 0:
         return parameters["sh_dc"]
     rest = parameters["sh_rest"][:, : (sh_degree + 1) ** 2 - 1]
     return torch.cat([parameters["sh_dc"], rest], dim=1)
 
 
-class _CpuPicture(torch.autograd.Function):
+class _CpuImage(torch.autograd.Function):
     """(means, log scales, quaternions, opacity logits, sh, means_px probe) -> (image, alpha).
 
     The probe is not read: it is an input only so that autograd hands out the gradient by the projected
@@ -110,7 +110,7 @@ class CpuRenderer:
         p = parameters
         probe = torch.zeros(len(p["means"]), 2, requires_grad=p["means"].requires_grad)
         visible: list[Tensor] = []
-        image, alpha = _CpuPicture.apply(
+        image, alpha = _CpuImage.apply(
             (lambda gaussians: self._rasterizer.view(gaussians, camera, self._settings), camera, visible),
             p["means"],
             p["log_scales"],
@@ -145,7 +145,7 @@ Backend = Literal["auto", "cpu", "cuda"]
 
 
 def renderer_for(backend: Backend) -> DifferentiableRenderer:
-    """The renderer a user asked for; `auto` takes CUDA where gsplat really draws there, else the CPU.
+    """Return the renderer a user asked for; `auto` takes CUDA where gsplat really draws there, else the CPU.
 
     Raises BackendError when `cuda` is asked for and cannot work.
     """

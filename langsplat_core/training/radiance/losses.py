@@ -57,14 +57,14 @@ def _across(rows: Array, y: int, out: Array, taps: Array) -> None:
 
 @kernel
 def _blur_moments(
-    first: int, last: int, picture: Array, target: Array, channels: int, taps: Array, moments: Array
+    first: int, last: int, image: Array, target: Array, channels: int, taps: Array, moments: Array
 ) -> None:
     """Pass 1: (H, n) images -> `moments` (4, H, n), x, y, x^2 + y^2, x y blurred along rows."""
-    n, edge = picture.shape[1], RADIUS * channels
+    n, edge = image.shape[1], RADIUS * channels
     padded = np.zeros((4, n + 2 * edge), np.float32)
     squares, products = padded[2, edge : edge + n], padded[3, edge : edge + n]
     for row in range(first, last):
-        x, y = picture[row], target[row]
+        x, y = image[row], target[row]
         padded[0, edge : edge + n] = x
         padded[1, edge : edge + n] = y
         for i in range(n):
@@ -116,7 +116,7 @@ def _compare(
 def _gather_gradient(
     first: int,
     last: int,
-    picture: Array,
+    image: Array,
     target: Array,
     derivatives: Array,
     weights: Array,
@@ -125,14 +125,14 @@ def _gather_gradient(
     row_l1: Array,
 ) -> None:
     """Pass 3: the gradient by the image, weights[0] sign(x - y) - weights[1] dSSIM/dx; L1 sums per row."""
-    n = picture.shape[1]
+    n = image.shape[1]
     d = np.empty((3, n), np.float32)
     difference = np.empty(n, np.float32)
     l1, dssim, zero = weights[0], weights[1], np.float32(0)
     for row in range(first, last):
         for k in range(3):
             _across(derivatives[k], row, d[k], taps)
-        x, y, out = picture[row], target[row], gradient[row]
+        x, y, out = image[row], target[row], gradient[row]
         for i in range(n):
             difference[i] = abs(x[i] - y[i])
             sign = l1 if x[i] > y[i] else (-l1 if x[i] < y[i] else zero)
@@ -140,11 +140,11 @@ def _gather_gradient(
         row_l1[row] = difference.sum()
 
 
-def loss_and_gradient(picture: Array, target: Array, lambda_dssim: float) -> tuple[float, Array]:
-    """(H, W, C) contiguous float32 images -> the loss and its (H, W, C) gradient by `picture`."""
-    height, width, channels = picture.shape
+def loss_and_gradient(image: Array, target: Array, lambda_dssim: float) -> tuple[float, Array]:
+    """Return the loss of (H, W, C) contiguous float32 images, and its (H, W, C) gradient by `image`."""
+    height, width, channels = image.shape
     n = width * channels
-    x, y = picture.reshape(height, n), target.reshape(height, n)
+    x, y = image.reshape(height, n), target.reshape(height, n)
     taps, constants = np.array(_window(), np.float32), np.array((C1, C2), np.float32)
     moments, derivatives = np.empty((4, height, n), np.float32), np.empty((3, height, n), np.float32)
     row_ssim, row_l1 = np.empty(height), np.empty(height)
@@ -155,37 +155,37 @@ def loss_and_gradient(picture: Array, target: Array, lambda_dssim: float) -> tup
     run(_compare, height, moments, constants, channels, taps, derivatives, row_ssim)
     run(_gather_gradient, height, x, y, derivatives, weights, taps, gradient, row_l1)
     loss = (1 - lambda_dssim) * row_l1.sum() / x.size + lambda_dssim * (1 - row_ssim.sum() / x.size)
-    return float(loss), gradient.reshape(picture.shape)
+    return float(loss), gradient.reshape(image.shape)
 
 
 # The same by torch, on any device, and the loss of training.
 
 
-def blur(pictures: Tensor) -> Tensor:
-    """(..., H, W, C) -> the same shape, each channel under the SSIM window; zeros outside.
+def blur(images: Tensor) -> Tensor:
+    """Blur each channel of (..., H, W, C) under the SSIM window; zeros outside.
 
     Eleven shifted additions per axis: on a CPU about 25 times as fast as a grouped `conv2d`.
     The operator is symmetric, so it is its own adjoint.
     """
     taps = _window()
-    height, width = pictures.shape[-3], pictures.shape[-2]
+    height, width = images.shape[-3], images.shape[-2]
     for axis, size in ((-2, width), (-3, height)):
         padding = [0, 0] * (-axis - 1) + [RADIUS, RADIUS]
-        padded = torch.nn.functional.pad(pictures, padding)
-        pictures = padded.narrow(axis, 0, size) * taps[0]
+        padded = torch.nn.functional.pad(images, padding)
+        images = padded.narrow(axis, 0, size) * taps[0]
         for offset, tap in enumerate(taps[1:], start=1):
-            pictures.add_(padded.narrow(axis, offset, size), alpha=tap)
-    return pictures
+            images.add_(padded.narrow(axis, offset, size), alpha=tap)
+    return images
 
 
-def raw_moments(picture: Tensor, target: Tensor) -> Tensor:
-    """(4, H, W, C): x, y, x^2 + y^2, x y. SSIM needs the two squares only as their sum."""
-    squares = torch.addcmul(picture * picture, target, target)
-    return torch.stack([picture, target, squares, picture * target])
+def raw_moments(image: Tensor, target: Tensor) -> Tensor:
+    """Return (4, H, W, C): x, y, x^2 + y^2, x y. SSIM needs the two squares only as their sum."""
+    squares = torch.addcmul(image * image, target, target)
+    return torch.stack([image, target, squares, image * target])
 
 
 def ssim_terms(moments: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """(4, H, W, C) blurred x, y, x^2 + y^2, xy -> the four factors of SSIM = a1 a2 / (b1 b2)."""
+    """Return the four factors of SSIM = a1 a2 / (b1 b2) from (4, H, W, C) blurred x, y, x^2 + y^2, xy."""
     mx, my, xx_yy, xy = moments
     product, squares = mx * my, torch.addcmul(mx * mx, my, my)
     return 2 * product + C1, 2 * (xy - product) + C2, squares + C1, xx_yy - squares + C2
@@ -201,21 +201,21 @@ class _MeanSsim(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, picture: Tensor, target: Tensor) -> Tensor:
-        moments = blur(raw_moments(picture, target))
+    def forward(ctx: Any, image: Tensor, target: Tensor) -> Tensor:
+        moments = blur(raw_moments(image, target))
         a1, a2, b1, b2 = ssim_terms(moments)
         similarity = (a1 * a2) / (b1 * b2)
         if ctx.needs_input_grad[0]:
-            ctx.save_for_backward(picture, target, moments[0], moments[1], a1, a2, b1, b2, similarity)
+            ctx.save_for_backward(image, target, moments[0], moments[1], a1, a2, b1, b2, similarity)
         return similarity.mean()
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
-        picture, target, mx, my, a1, a2, b1, b2, similarity = ctx.saved_tensors
+        image, target, mx, my, a1, a2, b1, b2, similarity = ctx.saved_tensors
         inverse = 1 / (b1 * b2)
         by_mx = 2 * my * (a2 - a1) * inverse - 2 * mx * similarity * (1 / b1 - 1 / b2)
         blurred = blur(torch.stack([by_mx, similarity / b2, a1 * inverse]))
-        gradient = blurred[0] - 2 * picture * blurred[1] + 2 * target * blurred[2]
+        gradient = blurred[0] - 2 * image * blurred[1] + 2 * target * blurred[2]
         return gradient * (grads[0] / similarity.numel()), None
 
 
@@ -223,9 +223,9 @@ class _CpuLoss(torch.autograd.Function):
     """`radiance_loss` by the compiled kernels, which find value and gradient together."""
 
     @staticmethod
-    def forward(ctx: Any, picture: Tensor, target: Tensor, lambda_dssim: float) -> Tensor:
+    def forward(ctx: Any, image: Tensor, target: Tensor, lambda_dssim: float) -> Tensor:
         value, gradient = loss_and_gradient(
-            picture.detach().contiguous().numpy(),
+            image.detach().contiguous().numpy(),
             target.contiguous().numpy(),
             lambda_dssim,
         )
@@ -238,25 +238,25 @@ class _CpuLoss(torch.autograd.Function):
         return gradient * grads[0], None, None
 
 
-def ssim(picture: Tensor, target: Tensor) -> Tensor:
-    """Mean structural similarity of two (H, W, C) images, a scalar in [-1, 1].
+def ssim(image: Tensor, target: Tensor) -> Tensor:
+    """Return the mean structural similarity of two (H, W, C) images, a scalar in [-1, 1].
 
-    Differentiable by `picture` only.
+    Differentiable by `image` only.
     """
-    result: Tensor = _MeanSsim.apply(picture, target)
+    result: Tensor = _MeanSsim.apply(image, target)
     return result
 
 
-def radiance_loss(picture: Tensor, target: Tensor, lambda_dssim: float) -> Tensor:
-    """(1 - lambda) L1 + lambda (1 - SSIM): equation 7 of Kerbl et al. 2023; a scalar >= 0.
+def radiance_loss(image: Tensor, target: Tensor, lambda_dssim: float) -> Tensor:
+    """Return (1 - lambda) L1 + lambda (1 - SSIM), equation 7 of Kerbl et al. 2023; a scalar >= 0.
 
-    Differentiable by `picture` only. Single precision on the CPU takes the compiled kernels, four times
+    Differentiable by `image` only. Single precision on the CPU takes the compiled kernels, four times
     as fast; they agree with the formula below to 1e-6.
     """
-    if picture.device.type == "cpu" and picture.dtype == torch.float32:
-        loss: Tensor = _CpuLoss.apply(picture, target, lambda_dssim)
+    if image.device.type == "cpu" and image.dtype == torch.float32:
+        loss: Tensor = _CpuLoss.apply(image, target, lambda_dssim)
         return loss
-    l1 = (picture - target).abs().mean()
+    l1 = (image - target).abs().mean()
     if lambda_dssim == 0:
         return l1
-    return (1 - lambda_dssim) * l1 + lambda_dssim * (1 - ssim(picture, target))
+    return (1 - lambda_dssim) * l1 + lambda_dssim * (1 - ssim(image, target))

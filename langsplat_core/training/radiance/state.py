@@ -125,14 +125,14 @@ class TrainingState:
         return self.values["means"].device
 
     def gaussians(self) -> Gaussians:
-        """A copy as scene data."""
+        """Return a copy as scene data."""
         v = {name: value.detach().cpu().numpy().copy() for name, value in self.values.items()}
         sh = np.concatenate([v["sh_dc"], v["sh_rest"]], axis=1)
         return Gaussians(v["means"], v["log_scales"], v["quats_wxyz"], v["opacity_logits"], sh)
 
 
 def start(gaussians: Gaussians, seed: int, device: torch.device) -> TrainingState:
-    """The state before the first step."""
+    """Return the state before the first step."""
     arrays = {
         "means": gaussians.means,
         "log_scales": gaussians.log_scales,
@@ -182,7 +182,7 @@ def clean_gradients(state: TrainingState) -> None:
 
 
 def adam_step(state: TrainingState, learning_rates: dict[str, float]) -> None:
-    """One Adam update (Kingma and Ba 2015) of every parameter that has a gradient; gradients are dropped.
+    """Update every parameter that has a gradient by Adam (Kingma and Ba 2015); gradients are dropped.
 
     A parameter without gradient (harmonics of a degree not yet in use) is left alone entirely.
     """
@@ -220,7 +220,7 @@ KIND = "langsplat-radiance-checkpoint-3"
 
 
 def fingerprint(capture: Capture, config: RadianceConfig, train_indices: Sequence[int]) -> str:
-    """A digest of everything that decides the result of a training, photographs included.
+    """Return a digest of everything that decides the result of a training, photographs included.
 
     The backend and how often checkpoints are written are left out: a run may go on elsewhere.
     """

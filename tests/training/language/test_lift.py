@@ -15,7 +15,6 @@ from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera, LinearCodec
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language import lift
-from langsplat_core.training.language import mask_weights as blocks
 from langsplat_core.training.language.lift import lift_block, lift_by_gradient, lift_latents
 from langsplat_core.training.language.mask_weights import find_mask_weights, group_masks
 from tests.support.processes import stop_at
@@ -52,12 +51,11 @@ def test_mean_and_confidence(gaussians, lifting):
     np.testing.assert_allclose(lifted.vectors[2][seen], unit(total[seen]), atol=2e-3)
 
 
-def test_a_sample_is_some_of_the_rows(lifting, monkeypatch):
+def test_a_sample_is_some_of_the_rows(lifting):
     mask_weights, groups = lifting
     whole = lift_block(mask_weights, groups, 0, robust=True)
-    monkeypatch.setattr(blocks, "BLOCK", 8)
     rows = np.array([0, 3, 7, 8, 22])
-    again = type(mask_weights)(mask_weights.pairs, mask_weights.count)
+    again = replace(mask_weights, block_size=8)
     some = lift.lift_sample(again, groups, rows, robust=True)
     np.testing.assert_allclose(some.vectors, whole.vectors[:, rows], atol=1e-6)
     np.testing.assert_allclose(some.confidence, whole.confidence[:, rows], rtol=1e-6)
@@ -191,7 +189,7 @@ def test_the_gradient_through_the_published_normalisation():
     x[0, 0] = 0
     leaf = torch.tensor(x, requires_grad=True)
     y = leaf / (torch.linalg.vector_norm(leaf, dim=-1, keepdim=True) + 1e-9)
-    np.testing.assert_allclose(lift.blended(x, True), y.detach().numpy(), atol=1e-12)
+    np.testing.assert_allclose(lift.blended(x), y.detach().numpy(), atol=1e-12)
     (want,) = torch.autograd.grad(y, leaf, torch.tensor(by_y))
     np.testing.assert_allclose(lift.by_features(x, by_y), want.numpy(), rtol=1e-9, atol=1e-9)
 

@@ -1,6 +1,7 @@
 """MaskWeights against dense weights, block by block, and groups of masks."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from langsplat_core.arrays import Array, unit
 from langsplat_core.raster import load_lifting_rasterizer, protocol
 from langsplat_core.raster.reference import ReferenceRasterizer
-from langsplat_core.scene import LEVELS, NO_NODE
+from langsplat_core.scene import LEVELS, NO_NODE, Tree
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language import mask_weights as module
 from langsplat_core.training.language.mask_weights import PAIR, MaskWeights, find_mask_weights, group_masks
@@ -43,13 +44,12 @@ def test_a_mask_weight_is_the_weight_inside_the_mask(gaussians, backend, togethe
     assert not got.any()  # nothing at any other level
 
 
-def test_blocks_are_the_rows_of_the_whole(gaussians, monkeypatch):
+def test_blocks_are_the_rows_of_the_whole(gaussians):
     views = make_views()
     mask_weights = find_mask_weights(ReferenceRasterizer(), gaussians, views)
     groups = ungrouped(views)
     whole = mask_weights.block(0, groups).toarray()
-    monkeypatch.setattr(module, "BLOCK", 7)
-    again = find_mask_weights(ReferenceRasterizer(), gaussians, views)
+    again = replace(mask_weights, block_size=7)
     assert again.blocks == [(0, 7), (7, 14), (14, 21), (21, 25)]
     parts = [again.block(number, groups).toarray() for number in range(4)]
     np.testing.assert_array_equal(np.concatenate(parts), whole)
@@ -112,8 +112,8 @@ def counts_of(views: Sequence[Array]) -> list[int]:
     return [int(pairs["mask"].max()) + 1 if len(pairs) else 0 for pairs in views]
 
 
-def found(views: Sequence[Array], count: int) -> Array:
-    return module.find_instances(MaskWeights(list(views), count), counts_of(views))
+def found(views: Sequence[Array], count: int, **options: int) -> Array:
+    return module.find_instances(MaskWeights(list(views), count), counts_of(views), **options)
 
 
 def random_views(seed: int, count: int = 240, views: int = 8) -> list[Array]:
@@ -262,26 +262,55 @@ def test_a_gaussian_that_two_masks_share_evenly_is_claimed_by_neither():
 
 
 @pytest.mark.parametrize("sample", [60, 200])
-def test_a_sample_is_enough_to_tell_things_apart(monkeypatch, sample):
+def test_a_sample_is_enough_to_tell_things_apart(sample):
     truth = np.repeat([0, 1, 2], [300, 100, 200])
     views = [view(np.array(order)[truth]) for order in ([0, 1, 2], [2, 0, 1])]
     whole = found(views, 600)
-    monkeypatch.setattr(module, "THING_SAMPLE", sample)
-    np.testing.assert_array_equal(found(views, 600), whole)
-    np.testing.assert_array_equal(found(views, 600), found(views, 600))
+    np.testing.assert_array_equal(found(views, 600, sample=sample), whole)
 
 
-def test_a_mask_that_the_sample_misses_shows_no_thing(monkeypatch):
+def test_a_mask_that_the_sample_misses_shows_no_thing():
     of_row = np.zeros(200, int)
     of_row[7] = 1
     assert found([view(of_row)], 200)[7] == 1
     missed = [s for s in range(1, 200) if 7 not in np.random.default_rng(0).permutation(200)[:s]]
-    monkeypatch.setattr(module, "THING_SAMPLE", missed[-1])
-    assert found([view(of_row)], 200)[7] == NO_NODE
+    assert found([view(of_row)], 200, sample=missed[-1])[7] == NO_NODE
 
 
-def test_blocks_change_nothing(monkeypatch):
+def test_blocks_change_nothing():
     views = random_views(5)
     whole = found(views, 240)
-    monkeypatch.setattr(module, "BLOCK", 37)
-    np.testing.assert_array_equal(found(views, 240), whole)
+    blocks = MaskWeights(views, 240, block_size=37)
+    np.testing.assert_array_equal(module.find_instances(blocks, counts_of(views)), whole)
+
+
+# Votes: masks of just one node, in photograph after photograph.
+
+
+def test_votes_are_masks_of_just_that_node():
+    """Two subparts in a whole. One photograph outlines the whole, one both subparts, one something else."""
+    rows = np.arange(40)
+    tree = Tree(
+        (rows // 20).astype(np.int32),
+        np.array([2, 2, -1], np.int32),
+        np.array([0, 0, 2], np.uint8),
+        np.zeros((3, 2), np.uint16),
+    )
+
+    def photograph(mask: Array, level: int, seen: Array) -> Array:
+        pairs = np.zeros(int(seen.sum()), PAIR)
+        pairs["row"], pairs["mask"], pairs["level"] = rows[seen], mask[seen], level
+        pairs["weight"] = 3.0
+        return pairs
+
+    everything = rows >= 0
+    views = [
+        photograph(np.zeros(40, int), 2, everything),
+        photograph(rows // 20, 0, everything),
+        photograph((rows >= 13).astype(int), 1, everything),  # 13 and 27: overlaps of 0.65, 0.74 and 0.675
+        photograph(np.zeros(40, int), 2, rows < 8),  # 24 pixels show nothing
+        photograph(np.zeros(40, int), 2, rows < 9),  # the part that is seen is all that counts
+        np.zeros(0, PAIR),
+    ]
+    votes = module.count_votes(tree, MaskWeights(views, 40), [1, 2, 2, 1, 1, 0])
+    assert votes.tolist() == [[3, 1], [2, 1], [3, 1]]

@@ -7,15 +7,14 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from langsplat_core.arrays import Array
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
-from langsplat_core.scene import Tree
 from langsplat_core.scene.surface import build_surface
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language import merge_tree as module
 from langsplat_core.training.language.mask_weights import PAIR, MaskWeights, find_mask_weights
-from langsplat_core.training.language.merge_tree import MergeTree, Patches, draw_patches, find_tree, merge
+from langsplat_core.training.language.merge_tree import MergeTree, Patches, find_tree, merge
+from langsplat_core.training.language.patch_maps import SOLID, draw_patches, nested_maps
 from tests.support.fakes import PER_BLOB, blob_scene, cameras
 from tests.support.scenes import make_views, random_camera, random_gaussians
 
@@ -173,17 +172,15 @@ def test_a_pixel_has_the_patch_it_shows_most_of():
     each = (patches[:, None] == np.arange(5)).astype(np.float64)
     image, alpha = ReferenceRasterizer().view(gaussians, camera).splat(each)
     two = np.sort(image, axis=-1)[..., -2:]
-    clear = (two[..., 1] - two[..., 0] > 1e-3) & (np.abs(alpha - module.SOLID) > 1e-3)
-    want = np.where((alpha > module.SOLID) & (image.max(-1) > 0), image.argmax(-1), -1)
+    clear = (two[..., 1] - two[..., 0] > 1e-3) & (np.abs(alpha - SOLID) > 1e-3)
+    want = np.where((alpha > SOLID) & (image.max(-1) > 0), image.argmax(-1), -1)
     assert clear.mean() > 0.8
     np.testing.assert_array_equal(drawn[clear], want[clear])
 
 
 def test_maps_number_what_is_seen_of_three_cuts():
     drawn = np.array([[0, 0, 1, 1], [2, 2, 3, -1]])
-    maps = module.nested_maps(
-        drawn, [np.arange(4), np.array([0, 0, 1, 1]), np.zeros(4, np.int64)], 2 / drawn.size
-    )
+    maps = nested_maps(drawn, [np.arange(4), np.array([0, 0, 1, 1]), np.zeros(4, np.int64)], 2 / drawn.size)
     assert maps.tolist() == [
         [[0, 0, 1, 1], [2, 2, -1, -1]],
         [[3, 3, 3, 3], [4, 4, 4, -1]],
@@ -203,36 +200,4 @@ def test_almost_nothing():
     gaussians = random_gaussians(3)
     view = CpuRasterizer().view(gaussians, random_camera(0, 8, 6))
     assert (draw_patches(view, gaussians, np.full(3, -1, np.int32)) == -1).all()
-    assert (module.nested_maps(np.full((6, 8), -1, np.int32), [np.zeros(0, np.int32)] * 3, 0.1) == -1).all()
-
-
-# Votes: masks of just one node, in photograph after photograph.
-
-
-def test_votes_are_masks_of_just_that_node():
-    """Two subparts in a whole. One photograph outlines the whole, one both subparts, one something else."""
-    rows = np.arange(40)
-    tree = Tree(
-        (rows // 20).astype(np.int32),
-        np.array([2, 2, -1], np.int32),
-        np.array([0, 0, 2], np.uint8),
-        np.zeros((3, 2), np.uint16),
-    )
-
-    def photograph(mask: Array, level: int, seen: Array) -> Array:
-        pairs = np.zeros(int(seen.sum()), PAIR)
-        pairs["row"], pairs["mask"], pairs["level"] = rows[seen], mask[seen], level
-        pairs["weight"] = 3.0
-        return pairs
-
-    everything = rows >= 0
-    views = [
-        photograph(np.zeros(40, int), 2, everything),
-        photograph(rows // 20, 0, everything),
-        photograph((rows >= 13).astype(int), 1, everything),  # 13 and 27: overlaps of 0.65, 0.74 and 0.675
-        photograph(np.zeros(40, int), 2, rows < 8),  # 24 pixels show nothing
-        photograph(np.zeros(40, int), 2, rows < 9),  # the part that is seen is all that counts
-        np.zeros(0, PAIR),
-    ]
-    votes = module.count_votes(tree, MaskWeights(views, 40), [1, 2, 2, 1, 1, 0])
-    assert votes.tolist() == [[3, 1], [2, 1], [3, 1]]
+    assert (nested_maps(np.full((6, 8), -1, np.int32), [np.zeros(0, np.int32)] * 3, 0.1) == -1).all()
