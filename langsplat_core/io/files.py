@@ -1,4 +1,4 @@
-"""Writing files so that a reader never sees half of one, and saying beforehand where none can be written."""
+"""How files are written: a reader never sees half of one; and where none can be written, beforehand."""
 
 import errno
 import json

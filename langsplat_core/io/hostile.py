@@ -1,14 +1,11 @@
-"""Reading files that nobody vouches for: whatever is wrong with one is a single InputError or FormatError,
-and no memory is taken on the word of a header."""
+"""Files that nobody vouches for: whatever is wrong with one is a single InputError or FormatError, and no
+memory is taken on the word of a header."""
 
-import ctypes
 import io
 import json
 import logging
 import math
-import re
 import stat
-import threading
 import warnings
 import zipfile
 from collections.abc import Iterator
@@ -17,25 +14,23 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from PIL import Image, _imaging, features
+from PIL import Image, features
 
 from langsplat_core.arrays import Array
-from langsplat_core.errors import FormatError, InputError, LangSplatError, printable_line, quoted, remedy
+from langsplat_core.errors import (
+    FormatError,
+    InputError,
+    LangSplatError,
+    malformed,
+    printable_line,
+    quoted,
+    remedy,
+)
 from langsplat_core.io.files import atomic_path
 
 # ---- .npy and .npz: plain numbers or texts, read without pickles and without belief in their headers ----
 
-MAGIC = b"\x93NUMPY"
-HEADER_LIMIT = 10_000  # bytes; NumPy writes 118
 MEMBER_LIMIT = 2**31  # bytes of one array in an .npz: packed ones may be a thousand times their file
-# What NumPy writes, to the letter. Its own reader evaluates the text as a Python literal, and on damaged
-# headers raises tokenizer errors and warnings. A comma stands between two sizes: were it optional, a run of a
-# hundred digits could be divided in so many ways that trying them takes minutes.
-_HEADER = re.compile(
-    rb"\{'descr': '(?P<dtype>[<>|](?:[iu][1248]|f[248]|U[1-9]\d{0,3}))', "
-    rb"'fortran_order': (?P<order>True|False), "
-    rb"'shape': \((?P<shape>(?:\d{1,18}(?:, ?\d{1,18}){0,7},?)?)\), ?\} *\n?$"
-)
 
 
 def write_npy(path: Path, array: Array) -> None:
@@ -51,14 +46,15 @@ def write_npy(path: Path, array: Array) -> None:
 
 
 def read_npy(path: Path) -> Array:
-    """The array of numbers in a .npy file. Raises InputError where it cannot be opened, else FormatError."""
+    """Return the array of numbers in a .npy file. Raises InputError where it cannot be opened, else
+    FormatError."""
     file, size = open_for_reading(path)
     with file:
         return _parse(file, size, str(path))
 
 
 def read_npz(path: Path) -> dict[str, Array]:
-    """The arrays in an .npz file, by their names without .npy. Raises as `read_npy` does."""
+    """Return the arrays in an .npz file, by their names without .npy. Raises as `read_npy` does."""
     arrays = {}
     with opened_archive(path, ".npz file") as archive:
         for member in archive.names:
@@ -70,25 +66,23 @@ def read_npz(path: Path) -> dict[str, Array]:
 
 def _parse(file: BinaryIO, size: int, name: str) -> Array:
     """`numpy.load` that believes the header only as far as `size` bytes of `file` go; `name` for messages."""
-    prefix = file.read(8)
-    version = prefix[6] if len(prefix) == 8 and prefix.startswith(MAGIC) else 0
-    length_size = {1: 2, 2: 4, 3: 4}.get(version, 0)
-    length = int.from_bytes(file.read(length_size), "little")
-    header = _HEADER.match(file.read(min(length, HEADER_LIMIT)))
-    if header is None:
-        raise FormatError(f"{name}: not a .npy file of plain numbers; was it made by another program?")
-    dtype = np.dtype(header["dtype"].decode())
-    shape = tuple(int(number) for number in header["shape"].split(b",") if number.strip())
-    needed = math.prod(shape) * dtype.itemsize
-    if file.tell() + needed != size:
-        raise FormatError(
-            f"{name}: truncated or damaged: shape {shape} needs {needed} bytes, "
-            f"the file has {size - file.tell()}"
-        )
+    form = np.lib.format
+    try:
+        if form.read_magic(file) != (1, 0):  # as NumPy writes all but records of thousands of columns
+            raise ValueError("version")
+        shape, in_columns, dtype = form.read_array_header_1_0(file)
+        plain = (dtype.kind in "iuf" and dtype.itemsize <= 8) or (dtype.kind == "U" and dtype.itemsize > 0)
+        if not plain or dtype.subdtype is not None or min(shape, default=0) < 0:
+            raise ValueError(dtype)
+    except Exception:  # noqa: BLE001  the header is a Python literal: tokenizer, parser and NumPy may raise any
+        raise malformed(name, "not a .npy file of plain numbers", "was it made by another program?") from None
+    left = size - file.tell()
+    if math.prod(shape) * dtype.itemsize != left:
+        raise malformed(name, f"truncated or damaged: shape {quoted(shape)} does not fit its {left} bytes")
     data = np.frombuffer(file.read(), dtype)
     if dtype.kind == "U" and data.size and not _is_text(data):
-        raise FormatError(f"{name}: holds a text that is not Unicode")
-    return data.reshape(shape, order="F" if header["order"] == b"True" else "C")
+        raise malformed(name, "holds a text that is not Unicode")
+    return data.reshape(shape, order="F" if in_columns else "C")
 
 
 def _is_text(data: Array) -> bool:
@@ -101,7 +95,7 @@ def _is_text(data: Array) -> bool:
 
 
 def open_for_reading(path: Path) -> tuple[BinaryIO, int]:
-    """An ordinary file opened in binary mode, and its size in bytes.
+    """Return an ordinary file opened in binary mode, and its size in bytes.
 
     Raises InputError for a path that does not exist, is a folder, a device or a pipe (which could block
     or never end), or may not be read.
@@ -111,7 +105,7 @@ def open_for_reading(path: Path) -> tuple[BinaryIO, int]:
         if stat.S_ISDIR(status.st_mode):
             raise InputError(f"{path}: is a folder; name a file in it")
         if not stat.S_ISREG(status.st_mode):
-            raise InputError(f"{path}: is not an ordinary file")
+            raise InputError(f"{path}: is not an ordinary file; copy it into one")
         return path.open("rb"), status.st_size
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; check the spelling and the folder") from None
@@ -122,7 +116,7 @@ def open_for_reading(path: Path) -> tuple[BinaryIO, int]:
 
 
 def exists(path: Path) -> bool:
-    """`Path.exists`, where a name too long or a folder that may not be searched means no."""
+    """Return `path.exists()`, where a name too long or a folder that may not be searched means no."""
     try:
         return path.exists()
     except OSError:
@@ -130,22 +124,22 @@ def exists(path: Path) -> bool:
 
 
 def read_json_file(path: Path, limit: int) -> Any:
-    """The value in a JSON file of at most `limit` bytes. Raises InputError and FormatError."""
+    """Return the value in a JSON file of at most `limit` bytes. Raises InputError and FormatError."""
     file, size = open_for_reading(path)
     with file:
         if size > limit:
-            raise FormatError(f"{path}: {size} bytes; a file of this kind never exceeds {limit}")
+            raise malformed(path, f"{size} bytes, but a file of this kind never exceeds {limit}")
         return parse_json(file.read(size), path)
 
 
 def parse_json(text: bytes, path: Path) -> Any:
-    """`json.loads` with its failures as FormatError: bad syntax, bad UTF-8, endless nesting or digits."""
+    """Return the value of a JSON text; FormatError for bad syntax, bad UTF-8, endless nesting or digits."""
     try:
         return json.loads(text)
     except RecursionError:
-        raise FormatError(f"{path}: not readable as JSON (nested too deeply)") from None
+        raise malformed(path, "not readable as JSON (nested too deeply)") from None
     except ValueError as error:
-        raise FormatError(f"{path}: not readable as JSON ({str(error)[:80]})") from None
+        raise malformed(path, f"not readable as JSON ({str(error)[:80]})") from None
 
 
 # ---- zip archives, without belief in their directories ----
@@ -169,28 +163,29 @@ class Archive:
         return self._archive.namelist()
 
     def read(self, name: str, limit: int) -> bytes:
-        """The content of a member; FormatError where there is none, or where it unfolds to more than `limit`
-        bytes, which is noticed before more are held."""
+        """Return the content of a member; FormatError where there is none, or where it unfolds to more than
+        `limit` bytes, which is noticed before more are held."""
         try:
             info = self._archive.getinfo(name)
         except KeyError:
-            raise FormatError(f"{self.path}: has no {quoted(name, 60)} inside") from None
+            raise malformed(self.path, f"has no {quoted(name, 60)} inside") from None
         if info.compress_type not in METHODS:
-            raise FormatError(
-                f"{self.path}: {quoted(name, 60)} inside is packed by method {info.compress_type}; "
-                "pack the archive again with deflate"
-            )
+            what = f"{quoted(name, 60)} inside is packed by method {info.compress_type}"
+            raise malformed(self.path, what, "pack the archive again with deflate")
         with self._archive.open(info) as member:
             content = member.read(limit + 1)
         if len(content) > limit:
-            raise FormatError(f"{self.path}: {quoted(name, 60)} inside has more than {limit} bytes")
+            raise malformed(self.path, f"{quoted(name, 60)} inside has more than {limit} bytes")
         return content
 
 
 @contextmanager
 def opened_archive(path: Path, kind: str) -> Iterator[Archive]:
-    """The archive in a file; `kind` is for messages ("SOG archive"). Raises InputError where the file cannot
-    be opened, and FormatError for whatever zipfile raises inside the block."""
+    """Open the archive in a file; `kind` is for messages ("SOG archive").
+
+    Raises InputError where the file cannot be opened, and FormatError for whatever zipfile raises inside the
+    block.
+    """
     file, size = open_for_reading(path)
     with file:
         try:
@@ -200,7 +195,7 @@ def opened_archive(path: Path, kind: str) -> Iterator[Archive]:
             raise
         except Exception as error:  # noqa: BLE001  any at all, see the top of this file
             what = str(error)[:80] or type(error).__name__
-            raise FormatError(f"{path}: not a readable {kind} ({what})") from None
+            raise malformed(path, f"not a readable {kind} ({what})") from None
 
 
 # ---- images: the one place of the project that hands a file to Pillow ----
@@ -209,8 +204,10 @@ def opened_archive(path: Path, kind: str) -> Iterator[Archive]:
 # Pillow start other programs or allocate what a header of a few bytes asks for. The size that the header
 # declares is judged before a pixel is decoded. Pillow lets through whatever its decoders meet in damaged
 # data (IndexError, AssertionError, TypeError, NotImplementedError ...), so here every exception means an
-# unreadable image, and its warnings about damaged metadata are silenced: an image is either read or
-# refused.
+# unreadable image, and what it says of damaged metadata is silenced: an image is either read or refused.
+
+warnings.filterwarnings("ignore", module=r"PIL\.")
+logging.getLogger("PIL").setLevel(logging.CRITICAL)
 
 KINDS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")  # always; AVIF where Pillow has a codec, HEIF with pillow_heif
 # HEIF is named where it cannot be read, too: the message then says why such photographs are left out
@@ -235,7 +232,7 @@ class PictureError(FormatError):
 def opened(
     source: Path | bytes, name: str | None = None, kinds: tuple[str, ...] | None = None
 ) -> Iterator[Image.Image]:
-    """The image in a file or in bytes, not decoded yet; inside the block it may be.
+    """Open the image in a file or in bytes, not decoded yet; inside the block it may be.
 
     `name` is for messages, by default the path. Raises PictureError for what cannot be opened, is of none of
     the `kinds` (default: all that are read) or declares too many pixels, and for whatever Pillow raises
@@ -243,10 +240,13 @@ def opened(
     """
     name = name or (str(source) if isinstance(source, Path) else "a picture in memory")
     try:
-        file, size = _file(source)
+        if isinstance(source, Path):
+            file, size = open_for_reading(source)
+        else:
+            file, size = io.BytesIO(source), len(source)
     except InputError as error:
         raise PictureError(name, str(error).removeprefix(f"{name}: ")) from None
-    with file, _quiet:
+    with file:
         try:
             lacking = _lacks_heif(file)
             # Image.open looks at the first bytes only to choose the kind; the name's ending plays no part
@@ -265,12 +265,12 @@ def opened(
 
 
 def is_video(path: Path) -> bool:
-    """True for a file whose name ends as a video's."""
+    """Return whether a file's name ends as a video's."""
     return path.suffix.lower() in VIDEO_SUFFIXES and not path.is_dir()
 
 
 def readable_kinds() -> tuple[str, ...]:
-    """Pillow's names of the kinds that are read on this machine."""
+    """Return Pillow's names of the kinds that are read on this machine."""
     return KINDS + ("AVIF",) * bool(features.check("avif")) + ("HEIF",) * ("HEIF" in Image.OPEN)
 
 
@@ -289,15 +289,9 @@ def _lacks_heif(file: BinaryIO) -> bool:
 
 
 def picture_size(path: Path) -> tuple[int, int]:
-    """(width, height) in pixels as the header declares them. Raises PictureError."""
+    """Return (width, height) in pixels as the header declares them. Raises PictureError."""
     with opened(path) as picture:
         return picture.size
-
-
-def _file(source: Path | bytes) -> tuple[BinaryIO, int]:
-    if isinstance(source, bytes):
-        return io.BytesIO(source), len(source)
-    return open_for_reading(source)
 
 
 def _check_size(name: str, picture: Image.Image, file_size: int) -> None:
@@ -318,47 +312,3 @@ def _reason(error: Exception) -> str:
     # these say what is wrong with the file; others, such as IndexError, with Pillow's handling of it
     telling = isinstance(error, OSError | SyntaxError | ValueError) and text
     return text if telling else f"damaged: {text or type(error).__name__}"
-
-
-class _Quiet:
-    """A context without Python warnings while any thread is inside.
-
-    `warnings.catch_warnings` alone is not safe where threads overlap: the one that leaves last would restore
-    what another had set.
-    """
-
-    def __init__(self) -> None:
-        self._lock, self._inside = threading.Lock(), 0
-        self._filters = warnings.catch_warnings()
-
-    def __enter__(self) -> None:
-        with self._lock:
-            self._inside += 1
-            if self._inside == 1:
-                self._filters = warnings.catch_warnings()
-                self._filters.__enter__()
-                warnings.simplefilter("ignore")
-
-    def __exit__(self, *_: object) -> None:
-        with self._lock:
-            self._inside -= 1
-            if self._inside == 0:
-                self._filters.__exit__(None, None, None)
-
-
-_quiet = _Quiet()
-
-
-def _silence() -> None:
-    """Pillow's loggers and libtiff itself write to the standard error what they then raise as well."""
-    logging.getLogger("PIL").setLevel(logging.CRITICAL)
-    library = ctypes.CDLL(_imaging.__file__)  # the copy that Pillow is linked to
-    for kind in ("Error", "Warning"):
-        # absent where libtiff is linked in without names
-        set_handler = getattr(library, f"TIFFSet{kind}Handler", None)
-        if set_handler is not None:
-            set_handler.argtypes, set_handler.restype = (ctypes.c_void_p,), ctypes.c_void_p
-            set_handler(None)
-
-
-_silence()

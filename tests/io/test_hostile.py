@@ -5,10 +5,9 @@ import io
 import json
 import re
 import struct
-import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,6 @@ import zstandard
 from PIL import EpsImagePlugin, Image
 
 from langsplat_core.datasets.capture import find_photos, read_photo
-from langsplat_core.extensions.checkpoints.features import read_part
 from langsplat_core.io.cameras import read_cameras
 from langsplat_core.io.hostile import (
     MOST_PIXELS,
@@ -33,12 +31,11 @@ from langsplat_core.io.ply_table import GREY, read_cloud
 from langsplat_core.io.scenes import formats, load_gaussians
 from langsplat_core.io.sidecar import read_language, write_language
 from langsplat_core.io.spz import read_spz_scene
-from langsplat_core.pipeline.stages import read_arrays
 from langsplat_core.scene import LanguageField
 from tests.support.comparing import assert_refused
-from tests.support.file_kinds import KINDS
+from tests.support.file_kinds import KINDS, STRICT
 from tests.support.file_samples import plain_ply, random_field, sog_files, spz_bytes, write_folder
-from tests.support.mutation import FuzzRun, Outcome
+from tests.support.mutation import fuzz, tried
 from tests.support.scenes import random_gaussians
 
 
@@ -55,11 +52,10 @@ def read(path: Path, limit: int = 10_000) -> bytes:
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
 def test_other_methods_are_refused_before_they_run(tmp_path: Path, method: int) -> None:
-    message = f"packed by method {method}; pack the archive again with deflate"
-    assert_refused(read, packed(tmp_path / "a.zip", method), message)
+    assert_refused(read, packed(tmp_path / "a.zip", method), f"packed by method {method}")
 
 
-def test_archives_of_a_version_that_nobody_has(tmp_path: Path) -> None:
+def test_archives_of_an_unknown_version_are_refused(tmp_path: Path) -> None:
     """ZIP says which version it takes to be unpacked: 12.7, or an encrypted member."""
     np.savez(tmp_path / "a.npz", key=np.ones(3))
     good = (tmp_path / "a.npz").read_bytes()
@@ -68,17 +64,16 @@ def test_archives_of_a_version_that_nobody_has(tmp_path: Path) -> None:
         data = bytearray(good)
         data[entry + place] = value
         (tmp_path / "a.npz").write_bytes(data)
-        for reading in (read_npz, read_part, read_arrays):
-            assert_refused(reading, tmp_path / "a.npz")
+        assert_refused(read_npz, tmp_path / "a.npz")
 
 
-def test_what_unfolds_beyond_the_limit_is_refused(tmp_path: Path) -> None:
+def test_members_larger_than_the_limit_are_refused(tmp_path: Path) -> None:
     path = packed(tmp_path / "a.zip", zipfile.ZIP_DEFLATED)
     assert_refused(lambda path: read(path, 699), path, "has more than 699 bytes")
     assert len(read(path, 700)) == 700
 
 
-def test_an_array_of_text_that_is_none(tmp_path: Path) -> None:
+def test_texts_that_are_not_unicode_are_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "good.npz", key=np.array("abc"))
     assert str(read_npz(tmp_path / "good.npz")["key"]) == "abc"
     buffer = io.BytesIO()
@@ -116,7 +111,7 @@ HUGE = f"1{'0' * 400}"  # an integer beyond any float
         ("uchar", f"{HUGE} 0 nan 1{'0' * 30} 0 nan", [np.inf, 0, np.nan], [255, 0, 0]),
     ],
 )
-def test_colours_of_every_type_are_bytes_whatever_the_numbers(tmp_path, colour, row, point, shade) -> None:
+def test_colours_of_every_type_become_bytes(tmp_path, colour, row, point, shade) -> None:
     points, colours = read_cloud(ascii_cloud(tmp_path, colour, row))
     np.testing.assert_array_equal(points, [point])
     np.testing.assert_array_equal(colours, [shade])
@@ -131,7 +126,7 @@ def test_colours_of_every_type_are_bytes_whatever_the_numbers(tmp_path, colour, 
         ("element vertex 1", "element vertex 1000000000000", "truncated"),
     ],
 )
-def test_what_is_no_cloud_is_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
+def test_malformed_clouds_are_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
     path = ascii_cloud(tmp_path, "uchar", "1 2 3 4 5 6")
     path.write_text(path.read_text().replace(old, new))
     assert_refused(read_cloud, path, message)
@@ -141,20 +136,26 @@ def test_what_is_no_cloud_is_refused(tmp_path: Path, old: str, new: str, message
 
 
 @pytest.mark.parametrize("shape", [(), (3,), (0,), (2, 3), (1, 2, 1, 2, 1, 2, 1, 2)])
-def test_what_numpy_writes_is_read(tmp_path: Path, shape: tuple[int, ...]) -> None:
+def test_arrays_that_numpy_writes_are_read(tmp_path: Path, shape: tuple[int, ...]) -> None:
     array = np.arange(np.prod(shape, dtype=int), dtype=np.float32).reshape(shape)
     np.save(tmp_path / "a.npy", array)
     np.testing.assert_array_equal(read_npy(tmp_path / "a.npy"), array)
 
 
 @pytest.mark.parametrize(
-    "shape",  # the first may be divided in so many ways that trying all of them would never end
-    ["9" * 400 + "x", "1, " * 400 + "x", "1, 1, 1, 1, 1, 1, 1, 1, 1", "1" * 19 + ",", "1 1,", ",", "-1,"],
+    "shape", ["9" * 400 + ",", "1, " * 400, "9" * 19 + ",", "1 1,", ",", "-1,", "-1, -1,", "(" * 200, "'a',"]
 )
-def test_other_shapes_are_refused_at_once(put: Callable[..., Path], shape: str) -> None:
+def test_arrays_of_other_shapes_are_refused(put: Callable[..., Path], bounded: None, shape: str) -> None:
     header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({shape}), }}".encode()
     content = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(4)
-    assert_refused(read_npy, put(content), r"not a \.npy file of plain numbers")
+    assert_refused(read_npy, put(content) if shape != "1, " * 400 else put(content + bytes(4)))
+
+
+@pytest.mark.parametrize("dtype", ["O", "c8", "V4", "M8", "?", [("a", "f4")]])
+def test_arrays_of_other_types_are_refused(put: Callable[..., Path], dtype: object) -> None:
+    buffer = io.BytesIO()
+    np.save(buffer, np.zeros(3, dtype), allow_pickle=True)
+    assert_refused(read_npy, put(buffer.getvalue()))
 
 
 # Pictures are opened by their content, in one place, within limits, and every failure is one error.
@@ -177,7 +178,7 @@ def png_that_claims(width: int, height: int) -> bytes:
     return bytes(data)
 
 
-def test_nothing_else_opens_pictures() -> None:
+def test_one_place_alone_opens_images() -> None:
     folders = (ROOT / name for name in ("langsplat_core", "app", "packaging"))
     sources = [path for folder in folders for path in folder.rglob("*.py")]
     openers = [path for path in sources if re.search(r"\bImage\.open\(", path.read_text())]
@@ -194,20 +195,20 @@ def test_postscript_starts_no_program(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP", "TIFF", "BMP"])
-def test_the_content_tells_the_kind(tmp_path: Path, kind: str) -> None:
+def test_the_content_tells_the_kind_of_an_image(tmp_path: Path, kind: str) -> None:
     (tmp_path / "a.jpg").write_bytes(saved(kind))
     assert picture_size(tmp_path / "a.jpg") == (20, 15)
     assert read_photo(tmp_path / "a.jpg", upright=True).size == (20, 15)
 
 
 @pytest.mark.parametrize("kind", ["GIF", "PPM", "TGA", "ICO", "DDS", "PCX"])
-def test_kinds_that_are_not_claimed_are_refused(tmp_path: Path, kind: str) -> None:
+def test_other_kinds_of_images_are_refused(tmp_path: Path, kind: str) -> None:
     (tmp_path / "a.png").write_bytes(saved(kind))
     with pytest.raises(PictureError, match="the content is none of"):
         picture_size(tmp_path / "a.png")
 
 
-def test_bitmaps_and_new_kinds_are_photographs(tmp_path: Path) -> None:
+def test_photographs_are_found_by_their_suffixes(tmp_path: Path) -> None:
     for name in ("a.bmp", "b.avif", "c.heic", "d.gif"):
         (tmp_path / name).touch()
     assert [path.name for path in find_photos(tmp_path)] == ["a.bmp", "b.avif", "c.heic"]
@@ -220,7 +221,7 @@ def test_a_declared_size_is_judged_before_decoding(size: tuple[int, int]) -> Non
         pytest.fail(f"opened {picture.size}")
 
 
-def test_large_photographs_are_let_through() -> None:
+def test_large_photographs_are_opened() -> None:
     """Judged by the size of the file: 100 megapixels of a real camera take at least a megabyte."""
     data = png_that_claims(12_000, 8_000)
     padding = b"\0" * 1_000_000
@@ -232,27 +233,12 @@ def test_large_photographs_are_let_through() -> None:
 @pytest.mark.parametrize(
     "error", [IndexError, AssertionError, TypeError, NotImplementedError, RuntimeError, MemoryError]
 )
-def test_whatever_a_decoder_raises_is_one_error(tmp_path: Path, error: type[Exception]) -> None:
+def test_any_exception_of_a_decoder_is_one_error(tmp_path: Path, error: type[Exception]) -> None:
     (tmp_path / "a.png").write_bytes(saved("PNG"))
     with pytest.raises(PictureError) as caught, opened(tmp_path / "a.png"):
         raise error("inside\nPillow")
     assert str(caught.value) == f"{tmp_path / 'a.png'}: not a readable picture (damaged: inside Pillow)"
     assert caught.value.reason == "damaged: inside Pillow"
-
-
-def test_warnings_are_back_when_the_last_picture_is_closed() -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        before = list(warnings.filters)
-        first, second = opened(saved("PNG")), opened(saved("BMP"))
-        first.__enter__()
-        second.__enter__()
-        first.__exit__(None, None, None)
-        warnings.warn("the second is still open", UserWarning, stacklevel=1)
-        second.__exit__(None, None, None)
-        assert warnings.filters == before
-        with pytest.raises(UserWarning):
-            warnings.warn("none is", UserWarning, stacklevel=1)
 
 
 # Files made to exhaust memory: what they claim or unfold to is refused before it is held.
@@ -271,12 +257,12 @@ def webp_that_claims(width: int, height: int) -> bytes:
 
 @pytest.mark.parametrize("width", [200, 16384])
 @pytest.mark.parametrize("name", ["means_l.webp", "quats.webp", "shN_centroids.webp", "shN_labels.webp"])
-def test_images_that_unfold_to_gigabytes(tmp_path, bounded, name, width):
+def test_images_that_unfold_to_gigabytes_are_refused(tmp_path, bounded, name, width):
     folder = write_folder(tmp_path / "a", sog_files(SCENE) | {name: webp_that_claims(width, 16384)})
     assert_refused(load_gaussians, folder, name)
 
 
-def test_a_count_that_the_images_would_have_to_be_bombs_for(tmp_path, bounded):
+def test_a_count_beyond_any_compression_is_refused(tmp_path, bounded):
     files = sog_files(SCENE)
     meta = json.dumps(json.loads(files["meta.json"]) | {"count": 16384 * 16384}).encode()
     files = dict.fromkeys(files, webp_that_claims(16384, 16384)) | {"meta.json": meta}
@@ -285,7 +271,7 @@ def test_a_count_that_the_images_would_have_to_be_bombs_for(tmp_path, bounded):
 
 
 @pytest.mark.long
-def test_an_archive_that_unfolds_to_gigabytes(tmp_path, bounded):
+def test_archives_that_unfold_to_gigabytes_are_refused(tmp_path, bounded):
     path = tmp_path / "a.sog"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in sog_files(SCENE).items():
@@ -305,7 +291,7 @@ def hole(path: Path, size: int) -> Path:
     return path
 
 
-def test_a_meta_of_gigabytes(tmp_path, bounded):
+def test_json_of_gigabytes_is_refused(tmp_path, bounded):
     folder = write_folder(tmp_path / "a", sog_files(SCENE))
     meta = hole(folder / "meta.json", 3 << 30)
     assert_refused(load_gaussians, folder, r"meta\.json: 3221225472 bytes; expected at most")
@@ -317,7 +303,7 @@ def zeros(size: int) -> Iterator[bytes]:
 
 
 @pytest.mark.long
-def test_spz_streams_that_unfold_to_gigabytes(tmp_path, bounded):
+def test_gzip_streams_that_unfold_to_gigabytes_are_refused(tmp_path, bounded):
     """Zeros are legal Gaussians, and compress a thousand times or more."""
     path = tmp_path / "a.spz"
     count = (128 << 20) // 20
@@ -343,7 +329,7 @@ def spz_4_of_zeros(count: int, claimed: int, path: Path) -> None:
     path.write_bytes(header + b"".join(table) + b"".join(frames))
 
 
-def test_spz_4_streams_that_unfold_to_gigabytes(tmp_path, bounded):
+def test_zstandard_frames_that_unfold_to_gigabytes_are_refused(tmp_path, bounded):
     path = tmp_path / "a.spz"
     for claimed, message in ((1 << 23, "cannot be in a file of"), (5, "fewer or more than the 45 bytes")):
         spz_4_of_zeros(1 << 23, claimed, path)
@@ -359,7 +345,7 @@ def test_spz_4_streams_that_unfold_to_gigabytes(tmp_path, bounded):
 
 
 @pytest.mark.parametrize("name", ["a.ksplat", "a.spz"])
-def test_files_of_a_terabyte_of_nothing(tmp_path, bounded, name):
+def test_files_of_a_terabyte_of_zeros_are_refused(tmp_path, bounded, name):
     assert_refused(load_gaussians, hole(tmp_path / name, 10**12))
 
 
@@ -371,7 +357,7 @@ def test_files_of_a_terabyte_of_nothing(tmp_path, bounded, name):
         (b"property float x", "".join(f"property char a{i}\n" for i in range(3000))),
     ],
 )
-def test_headers_that_cost_nothing_or_everything(put, bounded, before, lines):
+def test_headers_are_compared_with_the_file(put, bounded, before, lines):
     """An element without properties takes no bytes, however many rows it has; empty lists take one each."""
     path = put(plain_ply(SCENE).replace(before, lines.encode() + before))
     if "nothing" in lines:
@@ -385,12 +371,12 @@ def sidecar(path: Path) -> LanguageField:
 
 
 @pytest.mark.parametrize("length", [2**63 - 1, 2**40, 100_000_001])
-def test_a_sidecar_whose_header_claims_gigabytes(put, bounded, length):
+def test_a_sidecar_that_claims_gigabytes_is_refused(put, bounded, length):
     path = put(struct.pack("<Q", length) + b"{" * 100)
     assert_refused(sidecar, path, "not a whole safetensors file")
 
 
-def test_a_sidecar_with_weights_that_do_not_fit_each_other(tmp_path, bounded):
+def test_a_sidecar_of_unfitting_shapes_is_refused(tmp_path, bounded):
     """Shapes are checked before any product is formed: nothing is broadcast, nothing blows up."""
     path = tmp_path / "a.langsplat.safetensors"
     write_language(path, random_field(20), SCENE.means)
@@ -410,45 +396,22 @@ def test_a_sidecar_with_weights_that_do_not_fit_each_other(tmp_path, bounded):
 # read, or refused in one line, and nothing else.
 
 SEEDS, MUTANTS = (1, 2), 3000  # of the slow tier; of a kind and seed
-# In which a byte that is missing cannot go unseen, nor can another format's file be taken for one.
-STRICT = ["INRIA PLY", "compressed PLY", "SOG", "SPZ 3", "SPZ 4", ".splat", ".ksplat"]
-STRICT += ["sidecar", "cameras.json"]
-
-
-def tried(name: str, folder: Path, contents: Iterable[bytes]) -> Outcome:
-    """What became of each, as the contents of a file of the kind."""
-    outcome = FuzzRun(folder / KINDS[name].file, KINDS[name].read).run(iter(contents))
-    assert not outcome.faults, outcome.summary()
-    return outcome
-
-
-def fuzz(name: str, folder: Path, count: int, seed: int) -> Outcome:
-    """What became of `count` mutants, after the good samples were read without a word."""
-    kind, rng = KINDS[name], np.random.default_rng(seed)
-    samples = kind.samples(folder)
-    good = tried(name, folder, samples)
-    assert (good.loaded, good.warned) == (len(samples), 0), good.summary()
-    mutants = (kind.damage(samples[number % len(samples)], samples, rng) for number in range(count))
-    outcome = tried(name, folder, mutants)
-    assert outcome.refused + outcome.loaded == outcome.tried
-    assert outcome.refused + outcome.warned > outcome.tried / 50  # the mutations do hurt
-    return outcome
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", KINDS)
-def test_mutants(tmp_path: Path, name: str, request: pytest.FixtureRequest) -> None:
+def test_many_mutants_are_read_or_refused(tmp_path: Path, name: str, request: pytest.FixtureRequest) -> None:
     seed = request.config.getoption("--seed")
     for used in SEEDS if seed is None else (seed,):
         folder = tmp_path / str(used)
         folder.mkdir()
-        print(f"{name}, seed {used}: {fuzz(name, folder, MUTANTS, used).summary()}")
+        print(f"{name}, seed {used}: {fuzz(KINDS[name], folder, MUTANTS, used).summary()}")
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", KINDS)
-def test_a_few_mutants(tmp_path: Path, name: str) -> None:
-    fuzz(name, tmp_path, 60, seed=0)
+def test_a_few_mutants_are_read_or_refused(tmp_path: Path, name: str) -> None:
+    fuzz(KINDS[name], tmp_path, 60, seed=0)
 
 
 def test_every_scene_format_is_among_the_kinds() -> None:
@@ -457,13 +420,13 @@ def test_every_scene_format_is_among_the_kinds() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", STRICT)
-def test_truncated_at_many_places(tmp_path: Path, name: str) -> None:
+def test_truncated_files_are_refused(tmp_path: Path, name: str) -> None:
     sample = KINDS[name].samples(tmp_path)[0]
     size = len(sample) - (name == "cameras.json")  # the line feed behind JSON means nothing
     places = sorted({*range(0, size, max(1, size // 150)), *range(size - 12, size)})
     if name == ".splat":  # nothing in it tells how many Gaussians follow
         places = [place for place in places if place % 32 or place == 0]
-    assert tried(name, tmp_path, (sample[:place] for place in places)).refused == len(places)
+    assert tried(KINDS[name], tmp_path, (sample[:place] for place in places)).refused == len(places)
 
 
 @pytest.mark.long
@@ -474,4 +437,4 @@ def test_random_bytes_and_other_formats_are_refused(tmp_path: Path, name: str) -
     noise = [magic[: 8 * (number % 2)] + rng.bytes(int(rng.integers(1, 3000)) | 1) for number in range(60)]
     others = [KINDS[other] for other in STRICT if KINDS[other].file != kind.file]
     noise += [other.samples(tmp_path)[0] for other in others]
-    assert tried(name, tmp_path, noise).refused == len(noise)
+    assert tried(kind, tmp_path, noise).refused == len(noise)

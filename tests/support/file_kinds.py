@@ -3,12 +3,10 @@ read."""
 
 import io
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-import torch
 from PIL import Image
 
 from langsplat_core.arrays import unit
@@ -16,7 +14,6 @@ from langsplat_core.datasets.capture import Capture, read_photo
 from langsplat_core.datasets.colmap import load_colmap
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.display.displays import latent_colours
-from langsplat_core.extensions.checkpoints.methods import read_foreign
 from langsplat_core.io.cameras import read_cameras, write_cameras
 from langsplat_core.io.gltf import write_gltf
 from langsplat_core.io.hostile import picture_size
@@ -29,35 +26,22 @@ from langsplat_core.scene import Gaussians, Scene
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures
 from tests.support.file_samples import (
     ascii_ply,
-    autoencoder,
     compressed_ply,
     ksplat_bytes,
     mixed_ply,
     plain_ply,
     random_field,
-    save_model,
     sog_files,
     splat_bytes,
     spz_bytes,
-    tensor,
     zipped,
 )
-from tests.support.mutation import Mutation, in_gzip, in_ply_header, in_png, in_zip, mutant
+from tests.support.mutation import FileKind, Mutation, in_gzip, in_ply_header, in_png, in_zip, mutant
 from tests.support.photographs import write_colmap, write_nerfstudio
 from tests.support.scenes import random_camera, random_gaussians
 
 SCENE = random_gaussians(20, sh_degree=1)
 PLAIN = random_gaussians(300, seed=1)
-
-
-@dataclass(frozen=True)
-class FileKind:
-    """One format."""
-
-    file: str  # where the mutants are written, below the folder of the test
-    samples: Callable[[Path], list[bytes]]  # also writes what has to lie beside them into the folder
-    read: Callable[[Path], float]  # the share of sound content
-    damage: Mutation = mutant
 
 
 def gltf_bytes(gaussians: Gaussians, suffix: str = ".glb") -> bytes:
@@ -249,33 +233,12 @@ def photograph(path: Path) -> float:
 
 
 def _photographs(kind: str, damage: Mutation = mutant) -> FileKind:
-    return FileKind("a.png", pictures(kind), photograph, damage)  # the name's ending plays no part
+    # The name's ending plays no part; libtiff has words of its own.
+    return FileKind("a.png", pictures(kind), photograph, damage, complains=kind == "TIFF")
 
 
 def _scenes(file: str, *samples: bytes, damage: Mutation = mutant) -> FileKind:
     return FileKind(file, lambda _: [*samples], scene_share, damage)
-
-
-def checkpoints(folder: Path) -> list[bytes]:
-    """Of Occam's LGS, and without features."""
-    vectors = np.random.default_rng(0).normal(size=(20, 24)).astype(np.float32)
-    paths = [save_model(folder / "made", SCENE, tensor(vectors)), save_model(folder / "plain", SCENE)]
-    return [path.read_bytes() for path in paths]
-
-
-def autoencoders(folder: Path) -> list[bytes]:
-    """Of LangSplat; the checkpoint that goes with it lies beside."""
-    save_model(folder / "latents_1.pth", SCENE, tensor(np.ones((20, 3), np.float32)))
-    torch.save(autoencoder(24, (8, 3), (5,)).state_dict(), folder / "made")
-    return [(folder / "made").read_bytes()]
-
-
-def imported(path: Path) -> float:
-    beside = path.with_name("latents_1.pth")
-    scene = read_foreign([path, *[beside] * beside.exists()])
-    for level in (level for level in range(3) if scene.levels[level] is not None):
-        scene.rows(level, np.arange(len(scene.scene.gaussians)))
-    return drawable_share(scene.scene.gaussians)
 
 
 KINDS = {
@@ -307,8 +270,9 @@ KINDS = {
         for part in ("cameras", "images", "points3D")
     },
     ".features.npz": FileKind("a.features.npz", feature_files, stored_features, in_zip),
-    "checkpoint": FileKind("a.pth", checkpoints, imported),
-    "autoencoder": FileKind("a.pth", autoencoders, imported),
     "PNG": _photographs("PNG", in_png),
     **{kind: _photographs(kind) for kind in ("JPEG", "WEBP", "TIFF", "BMP", "AVIF")},
 }
+# In which a byte that is missing cannot go unseen, nor can another format's file be taken for one.
+STRICT = ["INRIA PLY", "compressed PLY", "SOG", "SPZ 3", "SPZ 4", ".splat", ".ksplat"]
+STRICT += ["sidecar", "cameras.json"]

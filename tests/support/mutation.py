@@ -13,7 +13,7 @@ import warnings
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -308,11 +308,41 @@ class Outcome:
         return "\n".join([*lines, *(f"  {count} x {what}" for what, count in self.faults.most_common())])
 
 
+@dataclass(frozen=True)
+class FileKind:
+    """A format whose damaged files are tried."""
+
+    file: str  # where the mutants are written, below the folder of the test
+    samples: Callable[[Path], list[bytes]]  # also writes what has to lie beside them into the folder
+    read: Callable[[Path], float]  # the share of sound content
+    damage: Mutation = mutant
+    complains: bool = False  # native code writes to the standard error what it meets in damaged files
+
+
+def tried(kind: FileKind, folder: Path, contents: Iterable[bytes]) -> Outcome:
+    """What became of each, as the contents of a file of the kind."""
+    outcome = FuzzRun(folder / kind.file, kind.read, kind.complains).run(iter(contents))
+    assert not outcome.faults, outcome.summary()
+    return outcome
+
+
+def fuzz(kind: FileKind, folder: Path, count: int, seed: int) -> Outcome:
+    """What became of `count` mutants, after the good samples were read without a word."""
+    samples, rng = kind.samples(folder), np.random.default_rng(seed)
+    good = tried(kind, folder, samples)
+    assert (good.loaded, good.warned) == (len(samples), 0), good.summary()
+    mutants = (kind.damage(samples[number % len(samples)], samples, rng) for number in range(count))
+    outcome = tried(kind, folder, mutants)
+    assert outcome.refused + outcome.loaded == outcome.tried
+    assert outcome.refused + outcome.warned > outcome.tried / 50  # the mutations do hurt
+    return outcome
+
+
 class FuzzRun:
     """`read(path)` returns the share of sound content, in [0, 1]; below a half a warning is due."""
 
-    def __init__(self, path: Path, read: Callable[[Path], float]) -> None:
-        self.path, self._read = path, read
+    def __init__(self, path: Path, read: Callable[[Path], float], complains: bool = False) -> None:
+        self.path, self._read, self._complains = path, read, complains
         self.outcome = Outcome()
 
     def run(self, mutants: Iterator[bytes]) -> Outcome:
@@ -335,7 +365,7 @@ class FuzzRun:
             what = f"memory: {took / 1e6:.0f} MB for {len(content)} bytes"
         if what is None and seconds > SECONDS:
             what = f"time: {seconds:.0f} s for {len(content)} bytes"
-        if text := stray():
+        if (text := stray()) and not self._complains:
             what = what or f"on the standard error: {text[:100]!r}"
         if what is not None:
             outcome.fault(what, content)
