@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.errors import FormatError
+from langsplat_core.errors import malformed
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import PHOTO_SUFFIXES, read_json_file
 from langsplat_core.scene import FARTHEST, Camera
@@ -36,7 +36,7 @@ def read_cameras(path: Path | str) -> tuple[Camera, ...]:
     path = Path(path)
     entries = read_json_file(path, SIZE_LIMIT)
     if not isinstance(entries, list):
-        raise FormatError(f"{path}: expected a list of cameras at the top")
+        raise malformed(path, "expected a list of cameras at the top")
     return tuple(_camera(entry, f"{path}: camera {index}") for index, entry in enumerate(entries))
 
 
@@ -65,22 +65,20 @@ def write_cameras(path: Path | str, cameras: tuple[Camera, ...]) -> None:
 def _camera(entry: Any, what: str) -> Camera:
     """`what` names the file and the camera in messages."""
     if not isinstance(entry, dict):
-        raise FormatError(f"{what}: expected an object with width, height, position, rotation, fx, fy")
+        raise malformed(what, "expected an object with width, height, position, rotation, fx, fy")
     width, height = (_pixels(entry, key, what) for key in ("width", "height"))
     position = numbers(entry, "position", (3,), what)
     if np.abs(position).max() > FARTHEST:
-        raise FormatError(
-            f"{what}: 'position' is more than {FARTHEST:g} units from the origin; move the world"
-        )
+        raise malformed(what, f"'position' is more than {FARTHEST:g} units from the origin", "move the world")
     rotation = numbers(entry, "rotation", (3, 3), what)
     if not is_rotation(rotation):
-        raise FormatError(f"{what}: 'rotation' is not a rotation matrix")
+        raise malformed(what, "'rotation' is not a rotation matrix")
     matrix = np.eye(4)
     matrix[:3, :3] = rotation.T
     matrix[:3, 3] = -rotation.T @ position
     name = entry.get("img_name", "")
     if not isinstance(name, str):
-        raise FormatError(f"{what}: 'img_name' is not a text")
+        raise malformed(what, "'img_name' is not a text")
     try:
         return Camera(
             width,
@@ -93,7 +91,7 @@ def _camera(entry: Any, what: str) -> Camera:
             _without_image_suffix(name),
         )
     except ValueError as error:  # what the camera itself refuses: fx of 0, for one
-        raise FormatError(f"{what}: {error}") from None
+        raise malformed(what, f"{error}") from None
 
 
 def is_rotation(matrix: Array) -> bool:
@@ -113,7 +111,7 @@ def _without_image_suffix(name: str) -> str:
 def _pixels(entry: dict[str, Any], key: str, what: str) -> int:
     value = float(numbers(entry, key, (), what))
     if value != math.floor(value) or not 1 <= value <= MAX_PIXELS:
-        raise FormatError(f"{what}: {key!r} is {value:g}; expected whole pixels, 1 to {MAX_PIXELS}")
+        raise malformed(what, f"{key!r} is {value:g}; expected whole pixels, 1 to {MAX_PIXELS}")
     return int(value)
 
 
@@ -121,13 +119,13 @@ def numbers(entry: dict[str, Any], key: str, shape: tuple[int, ...], what: str) 
     """Finite float64 numbers of the given shape under `key`: (), (3,), (3, 3) or (4, 4). FormatError,
     beginning with `what`, where there are none."""
     if key not in entry:
-        raise FormatError(f"{what}: {key!r} is missing")
+        raise malformed(what, f"{key!r} is missing")
     kinds = {(): "a number", (3,): "3 numbers", (3, 3): "3 rows of 3 numbers", (4, 4): "4 rows of 4 numbers"}
     kind = kinds[shape]
     try:
         found = np.array(entry[key])
     except ValueError:  # rows of unequal length
-        raise FormatError(f"{what}: {key!r} is not {kind}") from None
+        raise malformed(what, f"{key!r} is not {kind}") from None
     if found.dtype.kind not in "iuf" or found.shape != shape or not np.isfinite(found).all():
-        raise FormatError(f"{what}: {key!r} is not {kind}, all finite")
+        raise malformed(what, f"{key!r} is not {kind}, all finite")
     return found.astype(np.float64)

@@ -23,9 +23,9 @@ from urllib.parse import unquote
 import numpy as np
 
 from langsplat_core.arrays import Array, logit, rotation_matrices, sigmoid, unit
-from langsplat_core.errors import FormatError, InputError, quoted
+from langsplat_core.errors import InputError, malformed, quoted
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.hostile import open_for_reading, parse_json
+from langsplat_core.io.hostile import is_plain_name, open_for_reading, parse_json
 from langsplat_core.io.packing import coefficient_signs, quaternion_signs, to_bytes
 from langsplat_core.io.spz import decode_spz
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
@@ -62,9 +62,9 @@ def read_gltf_scene(path: Path | str) -> Scene:
     try:
         parts = list(_parts(file))
     except (LookupError, TypeError, AttributeError, ValueError, OverflowError) as error:
-        raise FormatError(f"{path}: not a sound glTF file ({str(error)[:80]}); export it again") from None
+        raise malformed(path, f"not a sound glTF file ({str(error)[:80]})", "export it again") from None
     if not parts and EXTENSION not in file.content.get("extensionsUsed", ()):
-        raise FormatError(f"{path}: holds no Gaussians ({EXTENSION}); meshes are not read")
+        raise malformed(path, f"holds no Gaussians ({EXTENSION}); meshes are not read")
     return Scene(_turned(join_gaussians(parts)))
 
 
@@ -86,20 +86,18 @@ def _parts(file: "_File") -> Iterator[Gaussians]:
     for place, primitive in _placed(file):
         extension = primitive["extensions"][EXTENSION]
         if primitive.get("mode") != POINTS:
-            raise FormatError(f"{file.path}: Gaussians in a primitive that is not of points")
+            raise malformed(file.path, "Gaussians in a primitive that is not of points")
         views = [one["bufferView"] for name, one in extension.get("extensions", {}).items() if name in PACKED]
         if views:
             data = file.view(views[0])[0]
             left -= len(data)
         else:
             if extension.get("colorSpace", SRGB) != SRGB:
-                raise FormatError(
-                    f"{file.path}: colours are not {SRGB} but {quoted(extension['colorSpace'])}"
-                )
+                raise malformed(file.path, f"colours are not {SRGB} but {quoted(extension['colorSpace'])}")
             count = file.whole_number(file.content["accessors"], primitive["attributes"]["POSITION"], "count")
             left -= LEAST_ROW * count
         if left < 0:
-            raise FormatError(f"{file.path}: shows more Gaussians than {file.size} bytes can hold")
+            raise malformed(file.path, f"shows more Gaussians than {file.size} bytes can hold")
         if views:
             gaussians = _turned(decode_spz(bytes(data), file.path).gaussians)
         else:
@@ -107,7 +105,7 @@ def _parts(file: "_File") -> Iterator[Gaussians]:
         try:
             yield gaussians if place.is_identity else transform_gaussians(gaussians, place)
         except InputError as error:
-            raise FormatError(f"{file.path}: {error}") from None
+            raise malformed(file.path, f"{error}") from None
 
 
 def _placed(file: "_File") -> Iterator[tuple[Similarity, Any]]:
@@ -115,7 +113,7 @@ def _placed(file: "_File") -> Iterator[tuple[Similarity, Any]]:
     content = file.content
     nodes, meshes = content.get("nodes", []), content.get("meshes", [])
     if len(nodes) > MOST_NODES:
-        raise FormatError(f"{file.path}: {len(nodes)} nodes; at most {MOST_NODES} are read")
+        raise malformed(file.path, f"{len(nodes)} nodes; at most {MOST_NODES} are read")
     scenes = content.get("scenes", [])
     roots = scenes[content.get("scene", 0)].get("nodes", []) if scenes else range(len(nodes))
     waiting = [(_index(root), np.eye(4)) for root in reversed(roots)]
@@ -123,7 +121,7 @@ def _placed(file: "_File") -> Iterator[tuple[Similarity, Any]]:
     while waiting:
         number, above = waiting.pop()
         if number in seen:
-            raise FormatError(f"{file.path}: node {number} is in two places or within itself")
+            raise malformed(file.path, f"node {number} is in two places or within itself")
         seen.add(number)
         node = nodes[number]
         matrix = above @ _matrix(node)
@@ -133,10 +131,10 @@ def _placed(file: "_File") -> Iterator[tuple[Similarity, Any]]:
                 try:
                     yield similarity(matrix), primitive
                 except InputError as error:
-                    raise FormatError(f"{file.path}: node {number}: {error}") from None
+                    raise malformed(file.path, f"node {number}: {error}") from None
         waiting += [(_index(child), matrix) for child in reversed(node.get("children", []))]
         if len(waiting) > MOST_NODES:
-            raise FormatError(f"{file.path}: more than {MOST_NODES} nodes in its tree")
+            raise malformed(file.path, f"more than {MOST_NODES} nodes in its tree")
 
 
 def _matrix(node: Any) -> Array:
@@ -159,7 +157,7 @@ def _gaussians(file: "_File", attributes: Any, count: int) -> Gaussians:
 
     have = sum(name in attributes for name in COEFFICIENTS)
     if have not in SH_COUNTS.values() or COEFFICIENTS[have - 1] not in attributes:
-        raise FormatError(f"{file.path}: {have} of the coefficients of its colours; expected 1, 4, 9 or 16")
+        raise malformed(file.path, f"{have} of the coefficients of its colours; expected 1, 4, 9 or 16")
     quats = column(f"{EXTENSION}:ROTATION", 4)
     scales = column(f"{EXTENSION}:SCALE", 3)
     log_scales = scales if (scales < 0).any() else np.log(scales)
@@ -189,42 +187,37 @@ class _File:
                 text, self._binary = self._chunks(start, memoryview(file.read()))
             else:
                 if self.size > 2**31:
-                    raise FormatError(f"{path}: {self.size} bytes of JSON; write it as .glb")
+                    raise malformed(path, f"{self.size} bytes of JSON", "write it as .glb")
                 text, self._binary = start + file.read(), memoryview(b"")
         self.content = parse_json(text, path)
         if not isinstance(self.content, dict) or not isinstance(self.content.get("asset"), dict):
-            raise FormatError(f"{path}: not a glTF file: it has no 'asset'")
-        if str(self.content["asset"].get("version"))[:2] != "2.":
-            raise FormatError(
-                f"{path}: glTF version {quoted(self.content['asset'].get('version'))}; only 2 is read"
-            )
+            raise malformed(path, "not a glTF file: it has no 'asset'")
+        version = self.content["asset"].get("version")
+        if str(version)[:2] != "2.":
+            raise malformed(path, f"glTF version {quoted(version)}; only 2 is read", "export it as glTF 2.0")
         required = self.content.get("extensionsRequired", [])
         unknown = (
             [name for name in required if name not in KNOWN] if isinstance(required, list) else [required]
         )
         if unknown:
-            raise FormatError(f"{path}: needs {quoted(unknown[0])}, which is not read; export it without")
+            raise malformed(path, f"needs {quoted(unknown[0])}, which is not read", "export it without")
         self._buffers: dict[int, bytes | memoryview] = {}
 
     def _chunks(self, start: bytes, rest: memoryview) -> tuple[bytes, memoryview]:
         """The JSON and the binary chunk of a .glb."""
         version, length = struct.unpack("<II", start[4:]) if len(start) == 12 else (0, 0)
         if version != 2 or length > self.size:
-            raise FormatError(
-                f"{self.path}: a .glb of version {version} and {length} bytes, found {self.size}"
-            )
+            raise malformed(self.path, f"a .glb of version {version} and {length} bytes, found {self.size}")
         found: list[tuple[bytes, memoryview]] = []
         at = 0
         while at + 8 <= length - 12 and len(found) < 2:
             size, kind = struct.unpack_from("<I4s", rest, at)
             if at + 8 + size > len(rest):
-                raise FormatError(f"{self.path}: truncated: a chunk of {size} bytes does not fit")
+                raise malformed(self.path, f"truncated: a chunk of {size} bytes does not fit")
             found.append((kind, rest[at + 8 : at + 8 + size]))
             at += 8 + size
         if not found or found[0][0] != JSON_CHUNK or len(found[0][1]) > JSON_LIMIT:
-            raise FormatError(
-                f"{self.path}: does not begin with a chunk of JSON of at most {JSON_LIMIT} bytes"
-            )
+            raise malformed(self.path, f"does not begin with a chunk of JSON of at most {JSON_LIMIT} bytes")
         binary = found[1][1] if len(found) == 2 and found[1][0] == BINARY_CHUNK else rest[:0]
         return bytes(found[0][1]), binary
 
@@ -232,7 +225,7 @@ class _File:
         """Return entry `key` of `entries[index]`, a whole number from 0."""
         value = entries[_index(index)].get(key, default)
         if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 2**40:
-            raise FormatError(f"{self.path}: {key} of entry {index} is not a whole number from 0")
+            raise malformed(self.path, f"{key} of entry {index} is not a whole number from 0")
         return value
 
     def accessor(self, index: Any, width: int, count: int, name: str) -> Array:
@@ -241,7 +234,7 @@ class _File:
         dtype, offset = np.dtype(COMPONENTS[about["componentType"]]), about.get("byteOffset", 0)
         fits = WIDTHS.get(about["type"]) == width and about["count"] == count and "sparse" not in about
         if not fits or "bufferView" not in about or _index(offset) > self.size:
-            raise FormatError(f"{self.path}: {name} is not {count} times {width} numbers in a buffer")
+            raise malformed(self.path, f"{name} is not {count} times {width} numbers in a buffer")
         data, stride = self.view(about["bufferView"])
         row = dtype.itemsize * width
         stride = stride or row
@@ -250,7 +243,7 @@ class _File:
             or (stride > 252 and stride != row)
             or offset + stride * (count - 1) + row > len(data)
         ):
-            raise FormatError(f"{self.path}: truncated: {name} of {count} Gaussians does not fit its buffer")
+            raise malformed(self.path, f"truncated: {name} of {count} Gaussians does not fit its buffer")
         shape, strides = (count, width), (stride, dtype.itemsize)
         values: Array = np.ndarray(shape, dtype, data, offset, strides).astype(np.float32)
         if about.get("normalized") and dtype.kind in "iu":
@@ -266,7 +259,7 @@ class _File:
         )
         buffer = self._buffer(_index(views[index]["buffer"]))
         if offset + size > len(buffer):
-            raise FormatError(f"{self.path}: truncated: buffer view {index} lies beyond its buffer")
+            raise malformed(self.path, f"truncated: buffer view {index} lies beyond its buffer")
         return memoryview(buffer)[offset : offset + size], stride
 
     def _buffer(self, index: int) -> bytes | memoryview:
@@ -278,7 +271,7 @@ class _File:
                 try:
                     self._buffers[index] = base64.b64decode(uri.partition(";base64,")[2], validate=True)
                 except (binascii.Error, ValueError):
-                    raise FormatError(f"{self.path}: buffer {index} is not base64") from None
+                    raise malformed(self.path, f"buffer {index} is not base64") from None
             else:
                 self._buffers[index] = self._beside(uri)
         return self._buffers[index]
@@ -286,8 +279,8 @@ class _File:
     def _beside(self, uri: Any) -> bytes:
         """A file in the same folder: a path could lead out of it."""
         name = unquote(uri) if isinstance(uri, str) else ""
-        if not name or set(name) & set("/\\:\0") or name in (".", ".."):
-            raise FormatError(f"{self.path}: buffer {quoted(uri)} is no plain file name")
+        if not is_plain_name(name):
+            raise malformed(self.path, f"buffer {quoted(uri)} is no plain file name")
         file, size = open_for_reading(self.path.parent / name)
         with file:
             self.size += size

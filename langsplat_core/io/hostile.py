@@ -115,6 +115,11 @@ def open_for_reading(path: Path) -> tuple[BinaryIO, int]:
         raise InputError(f"{path}: cannot be opened ({error})") from None
 
 
+def is_plain_name(name: object) -> bool:
+    """Return whether a name in a file is one of a file beside it: a path could lead out of its folder."""
+    return isinstance(name, str) and name not in ("", ".", "..") and not set(name) & set("/\\:\0")
+
+
 def exists(path: Path) -> bool:
     """Return `path.exists()`, where a name too long or a folder that may not be searched means no."""
     try:
@@ -225,7 +230,7 @@ class PictureError(FormatError):
 
     def __init__(self, name: object, reason: str) -> None:
         self.reason = reason
-        super().__init__(f"{name}: not a readable picture ({reason})")
+        super().__init__(f"{name}: not a readable picture ({reason}); save it again as PNG or JPEG")
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""The language field of a scene: `scene.langsplat.safetensors` beside `scene.ply`.
+"""The sidecar: the language field of a scene, in `scene.langsplat.safetensors` beside `scene.ply`.
 
 A safetensors file (an 8-byte length, a JSON header, raw little-endian tensors: nothing in it is ever
 executed). Version 3, for N Gaussians, CLIP vectors of D numbers, P phrases and K nodes:
@@ -60,7 +60,8 @@ import hashlib
 import json
 import math
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -71,7 +72,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from langsplat_core.arrays import Array, check_array
-from langsplat_core.errors import FormatError, printable_line, quoted
+from langsplat_core.errors import malformed, printable_line, quoted
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import open_for_reading, parse_json
 from langsplat_core.scene import (
@@ -92,13 +93,13 @@ from langsplat_core.scene.tree import tree_of_wholes
 FORMAT, VERSION = "langsplat", "3"
 WORDS_FORMAT, WORDS_VERSION = "langsplat words", "1"
 CODEC = "codec."
-WAYS = len(fields(Calibration))  # to look for something, each with odds of its own
-_KEYS_1 = ("encoder", "levels", "codec", "d", "gaussians", "means_blake2b", "phrases")
-_KEYS_2 = (*_KEYS_1, "temperature", "found")
-_KEYS = {"1": _KEYS_1, "2": _KEYS_2, "3": _KEYS_2}
-UNIT = 10.0  # more than any number of a vector whose length is about 1
-_MOST = {"confidence": 1e12, "latents": 1e3}  # and of tensors that are not made of such vectors
-_WHOLE = {  # types of tensors that hold no floating-point numbers
+SUFFIX = ".langsplat.safetensors"
+UPDATE = "update this program"
+_KEYS = ("encoder", "levels", "codec", "d", "gaussians", "means_blake2b", "phrases")
+_KEYS_OF = {"1": _KEYS, "2": (*_KEYS, "temperature", "found"), "3": (*_KEYS, "temperature", "found")}
+# Largest numbers: of a vector whose length is about 1 no number is 10.
+_MOST = {"confidence": 1e12, "latents": 1e3, "corners": math.inf}
+_KINDS = {  # types of tensors that hold no floating-point numbers
     "codes": ("U16",),
     "things": ("U16",),
     "positions": ("U64",),
@@ -120,10 +121,30 @@ class Stored:
 
 
 def read_stored(path: Path) -> Stored:
-    """Everything in the sidecar `path`. Raises InputError when it cannot be opened and FormatError when it
-    breaks a rule of the layout."""
+    """Return everything in the sidecar `path`.
+
+    Raises InputError when it cannot be opened and FormatError when it breaks a rule of the layout.
+    """
     tensors, metadata = _read_tensors(path, _check_metadata)
-    return _assemble(tensors, metadata, path)
+    with _faults(path):
+        field = _field(tensors, metadata, path)
+        means, precision = _means(tensors, len(field))
+    if (metadata["d"], metadata["gaussians"]) != (str(field.codec.latent_dim), str(len(field))):
+        raise malformed(path, "the header's d or number of Gaussians is not that of the tensors")
+    if (field.confidence < 0).any():
+        raise malformed(path, "tensor 'confidence' holds negative numbers")
+    return Stored(field, means, precision, metadata["means_blake2b"])
+
+
+@contextmanager
+def _faults(path: Path) -> Iterator[None]:
+    """Turn what missing and unfitting tensors raise where they are put together into FormatError."""
+    try:
+        yield
+    except KeyError as missing:
+        raise malformed(path, f"tensor {missing} is missing") from None
+    except (ValueError, TypeError, IndexError) as error:
+        raise malformed(path, str(error)) from None
 
 
 def _read_tensors(
@@ -131,22 +152,20 @@ def _read_tensors(
 ) -> tuple[dict[str, Array], dict[str, str]]:
     """Tensors, floats as float32, and metadata, which `check` raises FormatError for."""
     open_for_reading(path)[0].close()  # the same messages for a missing file as everywhere
+    tensors = {}
     try:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
             check(metadata, path)
-            tensors = {}
             for name in file.keys():  # noqa: SIM118 (not a dictionary)
-                kind = file.get_slice(name).get_dtype()
-                wanted = _WHOLE.get(name, ("F32", "F16"))
+                kind, wanted = file.get_slice(name).get_dtype(), _KINDS.get(name, ("F32", "F16"))
                 if kind not in wanted:
-                    raise FormatError(
-                        f"{path}: tensor {quoted(name)} is {kind}; expected {' or '.join(wanted)}"
-                    )
+                    what = f"tensor {quoted(name)} is {kind}; expected {' or '.join(wanted)}"
+                    raise malformed(path, what)
                 tensor = file.get_tensor(name)
-                tensors[name] = tensor if name in _WHOLE else tensor.astype(np.float32)
+                tensors[name] = tensor if name in _KINDS else tensor.astype(np.float32)
     except SafetensorError as error:
-        raise FormatError(f"{path}: not a whole safetensors file ({printable_line(error, 80)})") from None
+        raise malformed(path, f"not a whole safetensors file ({printable_line(error, 80)})") from None
     for name, tensor in tensors.items():
         _check_numbers(name, tensor, path)
     return tensors, metadata
@@ -154,63 +173,48 @@ def _read_tensors(
 
 def _check_numbers(name: str, tensor: Array, path: Path) -> None:
     """FormatError for numbers that the layout above has no room for, and that overflow when they are used."""
+    layers = name.startswith((f"{CODEC}encoder.", f"{CODEC}decoder."))  # which the codec bounds itself
     if name == "means" or tensor.dtype != np.float32:
         return
     if not np.isfinite(tensor).all():
-        raise FormatError(f"{path}: tensor {quoted(name)} holds numbers that are not finite")
-    layers = name.startswith((f"{CODEC}encoder.", f"{CODEC}decoder."))  # which the codec bounds itself
-    most = math.inf if layers or name == "corners" else _MOST.get(name, UNIT)
-    largest = float(np.abs(tensor).max(initial=0))
+        raise malformed(path, f"tensor {quoted(name)} holds numbers that are not finite")
+    largest, most = np.abs(tensor).max(initial=0), math.inf if layers else _MOST.get(name, 10.0)
     if largest > most:
-        raise FormatError(f"{path}: tensor {quoted(name)} holds {largest:g}; expected numbers up to {most:g}")
+        raise malformed(path, f"tensor {quoted(name)} holds {largest:g}; expected numbers up to {most:g}")
 
 
 def _check_metadata(metadata: dict[str, str], path: Path) -> None:
     if metadata.get("format") != FORMAT:
-        raise FormatError(f"{path}: a safetensors file, but not a language field of this program")
-    version = metadata.get("version")
-    if version not in _KEYS:
-        raise FormatError(
-            f"{path}: language format version {quoted(version)}; this program reads {' and '.join(_KEYS)}, "
-            "update it"
-        )
-    for key in _KEYS[version]:
+        raise malformed(path, "a safetensors file, but not a language field of this program")
+    version = metadata.get("version", "")
+    if version not in _KEYS_OF:
+        known = " and ".join(_KEYS_OF)
+        what = f"language format version {quoted(version)}; this program reads {known}"
+        raise malformed(path, what, UPDATE)
+    for key in _KEYS_OF[version]:
         if key not in metadata:
-            raise FormatError(f"{path}: the header has no {key!r}")
+            raise malformed(path, f"the header has no {key!r}")
     if metadata["levels"] != ",".join(LEVELS):
-        raise FormatError(f"{path}: levels {quoted(metadata['levels'], 60)}; expected {','.join(LEVELS)!r}")
-
-
-def _assemble(tensors: dict[str, Array], metadata: dict[str, str], path: Path) -> Stored:
-    places = ("means",) if metadata["version"] == "1" else ("positions", "corners")
-    for name in ("confidence", "canonical", *places):
-        if name not in tensors:
-            raise FormatError(f"{path}: tensor {name!r} is missing")
-    try:
-        field = _field(tensors, metadata, path)
-        means, precision = _means(tensors, len(field))
-    except KeyError as missing:
-        raise FormatError(f"{path}: tensor {missing} is missing") from None
-    except (ValueError, TypeError, IndexError) as error:
-        raise FormatError(f"{path}: {error}") from None
-    if (metadata["d"], metadata["gaussians"]) != (str(field.codec.latent_dim), str(len(field))):
-        raise FormatError(f"{path}: the header's d or number of Gaussians is not that of the tensors")
-    if (field.confidence < 0).any():
-        raise FormatError(f"{path}: tensor 'confidence' holds negative numbers")
-    return Stored(field, means, precision, metadata["means_blake2b"])
+        what = f"levels {quoted(metadata['levels'], 60)}; expected {','.join(LEVELS)!r}"
+        raise malformed(path, what)
 
 
 def _field(tensors: dict[str, Array], metadata: dict[str, str], path: Path) -> LanguageField:
-    weights = {name.removeprefix(CODEC): t for name, t in tensors.items() if name.startswith(CODEC)}
-    codec = codec_from_tensors(metadata["codec"], weights)
-    phrases = _phrases(metadata, path)
+    codec = codec_from_tensors(
+        metadata["codec"],
+        {name.removeprefix(CODEC): t for name, t in tensors.items() if name.startswith(CODEC)},
+    )
+    phrases = _listed(metadata, "phrases", path, lambda phrase: isinstance(phrase, str), "texts")
+    if len(set(phrases)) != len(phrases):
+        raise malformed(path, "the header's 'phrases' name one phrase twice")
     vectors = tensors.get("phrasebook", np.zeros((0, codec.vector_dim), np.float32))
     check_array("phrasebook", vectors, (len(phrases), codec.vector_dim))
     check_array("canonical", tensors["canonical"], (len(CANONICAL_PHRASES), codec.vector_dim))
     reading = Reading()
     if metadata["version"] != "1":
-        calibration = _calibration(metadata, path)
-        reading = Reading(float(metadata["temperature"]), float(metadata["found"]), calibration)
+        reading = Reading(
+            float(metadata["temperature"]), float(metadata["found"]), _calibration(metadata, path)
+        )
     return LanguageField(
         codec.from_file(tensors),
         tensors["confidence"],
@@ -234,12 +238,38 @@ def _tree(tensors: dict[str, Array]) -> Tree | None:
     return Tree(leaves, parents, tensors["tree.levels"], tensors["tree.votes"])
 
 
+def _listed(
+    metadata: dict[str, str], key: str, path: Path, suits: Callable[[Any], bool], expected: str
+) -> list[Any]:
+    """The JSON list under `key`, whose every entry `suits`."""
+    found = parse_json(metadata[key].encode(), path)
+    if not isinstance(found, list) or not all(map(suits, found)):
+        raise malformed(path, f"the header's {key!r} is not a list of {expected}")
+    return found
+
+
+def _calibration(metadata: dict[str, str], path: Path) -> Calibration | None:
+    if "odds" not in metadata:
+        return None
+
+    def four(numbers: Any) -> bool:
+        return isinstance(numbers, list) and [*map(type, numbers)] == [float] * 4
+
+    odds = _listed(metadata, "odds", path, four, "lists of four numbers")
+    if len(odds) != len(fields(Calibration)):
+        raise malformed(path, f"the header's 'odds' are {len(odds)}; expected {len(fields(Calibration))}")
+    return Calibration(*(Odds(*numbers) for numbers in odds))
+
+
 def _taught(tensors: dict[str, Array], metadata: dict[str, str], path: Path) -> tuple[TaughtWord, ...]:
     if "taught" not in metadata:
         return ()
-    stated = parse_json(metadata["taught"].encode(), path)
-    if not isinstance(stated, list) or not all(map(_stated, stated)):
-        raise FormatError(f"{path}: the header's 'taught' is not a list of names, levels and counts")
+
+    def sound(word: Any) -> bool:
+        kinds = [*map(type, word)] if isinstance(word, list) else []
+        return kinds == [str, int, int] and 0 < word[2] <= MOST_SHOWN
+
+    stated = _listed(metadata, "taught", path, sound, "names, levels and counts")
     vectors, rivals = tensors["taught"], tensors["taught.rivals"]
     check_array("taught", vectors, (sum(count for *_, count in stated), "D"))
     check_array("taught.rivals", rivals, (len(vectors),))
@@ -248,17 +278,12 @@ def _taught(tensors: dict[str, Array], metadata: dict[str, str], path: Path) -> 
     return tuple(TaughtWord(name, level, *examples) for (name, level, _), *examples in every)
 
 
-def _stated(word: object) -> bool:
-    kinds = list(map(type, word)) if isinstance(word, list) else []
-    return kinds == [str, int, int] and 0 < word[2] <= MOST_SHOWN  # type: ignore[index]
-
-
 def _taught_parts(words: Sequence[TaughtWord]) -> tuple[dict[str, Array], dict[str, str]]:
     """Tensors and metadata of taught words; nothing for none."""
     if not words:
         return {}, {}
     stated = [[word.name, word.level, len(word.vectors)] for word in words]
-    vectors, rivals = np.concatenate([w.vectors for w in words]), np.concatenate([w.rivals for w in words])
+    vectors, rivals = (np.concatenate([getattr(w, part) for w in words]) for part in ("vectors", "rivals"))
     texts = {"taught": json.dumps(stated, ensure_ascii=False)}
     return {"taught": _narrow(vectors), "taught.rivals": _narrow(rivals)}, texts
 
@@ -273,37 +298,15 @@ def _unsigned(numbers: Array, kind: DTypeLike) -> Array:
     return np.where(numbers == NO_NODE, np.iinfo(kind).max, numbers).astype(kind)
 
 
-def _calibration(metadata: dict[str, str], path: Path) -> Calibration | None:
-    if "odds" not in metadata:
-        return None
-    odds = parse_json(metadata["odds"].encode(), path)
-    if not isinstance(odds, list) or len(odds) != WAYS or not all(map(_four, odds)):
-        raise FormatError(f"{path}: the header's 'odds' are not {WAYS} lists of four numbers")
-    return Calibration(*(Odds(*numbers) for numbers in odds))
-
-
-def _four(numbers: object) -> bool:
-    return isinstance(numbers, list) and len(numbers) == 4 and all(isinstance(n, float) for n in numbers)
-
-
 def _means(tensors: dict[str, Array], count: int) -> tuple[Array, float]:
     """Positions of the Gaussians, and how precise they are."""
-    if "means" in tensors:
+    if "means" in tensors:  # of version 1
         check_array("means", tensors["means"], (count, 3))
         return tensors["means"], 0.0
-    check_array("positions", tensors["positions"], (count,))
-    check_array("corners", tensors["corners"], (2, 3))
-    corners = tensors["corners"]
-    return unpack_positions(tensors["positions"], corners), position_step(corners)
-
-
-def _phrases(metadata: dict[str, str], path: Path) -> list[str]:
-    phrases = parse_json(metadata["phrases"].encode(), path)
-    if not isinstance(phrases, list) or not all(isinstance(phrase, str) for phrase in phrases):
-        raise FormatError(f"{path}: the header's 'phrases' are not a list of texts")
-    if len(set(phrases)) != len(phrases):
-        raise FormatError(f"{path}: the header's 'phrases' name one phrase twice")
-    return phrases
+    positions, corners = tensors["positions"], tensors["corners"]
+    check_array("positions", positions, (count,))
+    check_array("corners", corners, (2, 3))
+    return unpack_positions(positions, corners), position_step(corners)
 
 
 def save_tensors(path: Path, tensors: dict[str, Array], metadata: dict[str, str]) -> None:
@@ -322,12 +325,8 @@ def save_tensors(path: Path, tensors: dict[str, Array], metadata: dict[str, str]
             file.write(text.ljust(size))
 
 
-SUFFIX = ".langsplat.safetensors"
-
-
 def means_checksum(means: Array) -> str:
-    """Return the BLAKE2b-128 of (N, 3) float32 positions; every bit counts, so that any edit or reordering is
-    noticed."""
+    """Return the BLAKE2b-128 of (N, 3) float32 positions, which notices any edit and reordering."""
     data = np.ascontiguousarray(means, dtype="<f4")
     return hashlib.blake2b(data.tobytes(), digest_size=16).hexdigest()
 
@@ -391,31 +390,27 @@ def write_words(path: Path | str, words: Words) -> None:
 
 
 def read_words(path: Path | str) -> Words:
-    """The taught words in a file of `write_words`. Raises as `read_stored` does."""
+    """Return the taught words in a file of `write_words`. Raises as `read_stored` does."""
     path = Path(path)
     tensors, metadata = _read_tensors(path, _check_words)
-    try:
+    with _faults(path):
         canonical, words = tensors["canonical"], _taught(tensors, metadata, path)
         dims = check_array("canonical", canonical, (len(CANONICAL_PHRASES), "D"))
         for word in words:
             check_array("taught", word.vectors, ("T", "D"), {"D": dims["D"]})
-    except KeyError as missing:
-        raise FormatError(f"{path}: tensor {missing} is missing") from None
-    except (ValueError, TypeError) as error:
-        raise FormatError(f"{path}: {error}") from None
     if len({word.key for word in words}) != len(words):
-        raise FormatError(f"{path}: two taught words have one name")
+        raise malformed(path, "two taught words have one name")
     return Words(metadata["encoder"], canonical, words)
 
 
 def _check_words(metadata: dict[str, str], path: Path) -> None:
     if metadata.get("format") != WORDS_FORMAT or "encoder" not in metadata:
-        raise FormatError(f"{path}: a safetensors file, but not of taught words; `langsplat teach` makes one")
+        what = "a safetensors file, but not of taught words"
+        raise malformed(path, what, "`langsplat teach` makes one")
     if metadata.get("version") != WORDS_VERSION:
-        raise FormatError(
-            f"{path}: version {quoted(metadata.get('version'))} of taught words; this program reads "
-            f"{WORDS_VERSION}, update it"
-        )
+        version = quoted(metadata.get("version"))
+        what = f"version {version} of taught words; this program reads {WORDS_VERSION}"
+        raise malformed(path, what, UPDATE)
 
 
 def _narrow(tensor: Array) -> Array:
@@ -428,25 +423,25 @@ def _narrow(tensor: Array) -> Array:
 
 
 def read_language(path: Path | str, means: Array) -> LanguageField:
-    """The field in the sidecar `path`, which must belong to the Gaussians at `means` (N, 3) float32.
+    """Return the field in the sidecar `path`, which must belong to the Gaussians at `means` (N, 3) float32.
 
     Raises InputError when it cannot be opened and FormatError when it breaks a rule of the layout or was
     made for other Gaussians.
     """
     path = Path(path)
     stored = read_stored(path)
-    mend = f"; if the PLY was edited, run 'langsplat convert EDITED.ply NEW.ply --rematch {path}'"
+    mend = f"if the PLY was edited, run 'langsplat convert EDITED.ply NEW.ply --rematch {path}'"
     if len(stored.field) != len(means):
-        raise FormatError(f"{path}: made for {len(stored.field)} Gaussians, the scene has {len(means)}{mend}")
+        raise malformed(path, f"made for {len(stored.field)} Gaussians, the scene has {len(means)}", mend)
     if stored.checksum != means_checksum(means):
-        raise FormatError(f"{path}: made for Gaussians at other positions than the scene's{mend}")
+        raise malformed(path, "made for Gaussians at other positions than the scene's", mend)
     return stored.field
 
 
 def rematch_language(
     sidecar: Path | str, new_means: Array, max_distance: float | None = None
 ) -> LanguageField:
-    """The field in `sidecar`, carried over to Gaussians at `new_means` (N, 3) by nearest position.
+    """Return the field in `sidecar`, carried over to Gaussians at `new_means` (N, 3) by nearest position.
 
     `max_distance` is in world units; by default the median distance of the old Gaussians to their nearest
     neighbours, so that positions may have been rounded (a compressed PLY does) but what was added or
@@ -493,7 +488,7 @@ _STEPS = 2**_BITS - 1
 
 
 def pack_positions(means: Array) -> tuple[Array, Array]:
-    """(N, 3) float32 -> (N,) uint64 and (2, 3) float32 lower and upper corner of what is finite."""
+    """Return (N, 3) float32 positions as (N,) uint64, and the (2, 3) float32 corners of what is finite."""
     finite = np.isfinite(means).all(1)
     if not finite.any():
         return np.full(len(means), _NOWHERE), np.zeros((2, 3), np.float32)
@@ -506,7 +501,7 @@ def pack_positions(means: Array) -> tuple[Array, Array]:
 
 
 def unpack_positions(packed: Array, corners: Array) -> Array:
-    """The inverse, (N, 3) float64 to half a `position_step` on each axis; NaN for what was not finite."""
+    """Return the (N, 3) float64 positions, to half a `position_step` an axis; NaN for what was not finite."""
     low, span = _box(corners)
     axes = [(packed >> np.uint64(shift)) & np.uint64(_STEPS) for shift in (0, _BITS, 2 * _BITS)]
     means = np.stack(axes, 1).astype(np.float64) / _STEPS * span + low
@@ -515,7 +510,7 @@ def unpack_positions(packed: Array, corners: Array) -> Array:
 
 
 def position_step(corners: Array) -> float:
-    """Largest distance between two neighbouring packed numbers, in the units of the positions."""
+    """Return the largest distance between two neighbouring packed numbers, in units of the positions."""
     return float(_box(corners)[1].max() / _STEPS)
 
 

