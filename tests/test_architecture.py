@@ -20,6 +20,7 @@ LAYERS = [
     ["langsplat_viewer.canvas"],
     ["langsplat_viewer.commands"],
     ["langsplat_viewer.actions"],
+    ["langsplat_viewer.headless"],
     ["langsplat_viewer.output"],
     ["langsplat_viewer.options"],
     ["langsplat_viewer.viewer"],

@@ -34,14 +34,13 @@ class ViewerCommand(ViewerOptions):
             self._window(path)
 
     def _without_window(self, path: Path) -> None:
-        from langsplat_viewer.output import check_options, draw_film, draw_image
+        from langsplat_viewer.headless import check_options, draw
 
         check_options(self)
         bars: AbstractContextManager[Progress] = nullcontext(silent)
         if sys.stderr.isatty():
             bars = TerminalProgress()
         with bars as progress:
-            draw = draw_film if self.is_film else draw_image
             lines = draw(self, path, services(self.encoder), progress)
         print("\n".join(lines))
 

@@ -14,8 +14,8 @@ from langsplat_core.scene import CANONICAL_PHRASES, Reading
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_viewer.actions import browsing, editing, queries
 from langsplat_viewer.files.projects import read_queries, write_queries
+from langsplat_viewer.headless import answer_line
 from langsplat_viewer.marks import BINS
-from langsplat_viewer.output import describe
 from langsplat_viewer.panels.search import hint, histogram
 from langsplat_viewer.session import Query, Session
 from langsplat_viewer.viewer import Services
@@ -160,7 +160,7 @@ def test_a_calibrated_scene_gives_verdicts_with_probability(viewer, monkeypatch,
     assert (found.verdict, found.found) == (verdict, verdict == "found")
     assert (viewer.state.session.queries[0].slot is None) == (verdict == "not here")
     said = f"'mug': {verdict} ({100 * found.probability:.0f} %), score "
-    assert describe(found).startswith(said)
+    assert answer_line(found).startswith(said)
 
 
 # Evidence.

@@ -43,7 +43,8 @@ def times(viewer: Viewer) -> list[float]:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(output, "find_ffmpeg", lambda: None)
+    monkeypatch.setattr(output, "has_video", lambda: False)
+    monkeypatch.setattr(filming, "has_video", lambda: False)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -38,8 +38,8 @@ from langsplat_viewer.output import (
     cameras_of,
     check_film,
     draw_something,
-    find_ffmpeg,
     free_name,
+    has_video,
     make_film,
     save_png,
 )
@@ -239,7 +239,7 @@ def _film_out(viewer: Viewer, folder: Path) -> Path:
     if typed:
         return folder.absolute() / typed
     stem = f"{viewer.state.path.stem if viewer.state.path else 'scene'}-film"
-    return free_name(folder, stem, "" if find_ffmpeg() is None else VIDEO)
+    return free_name(folder, stem, VIDEO if has_video() else "")
 
 
 def save_sized_picture(viewer: Viewer, folder: Path = Path()) -> None:

@@ -1,0 +1,194 @@
+"""`--headless`: an image or a film without a window. Imports neither glfw nor imgui."""
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from langsplat_core.display.displays import MAX_QUERIES
+from langsplat_core.errors import InputError
+from langsplat_core.io.files import check_output_file
+from langsplat_core.io.sidecar import SUFFIX
+from langsplat_core.progress import Progress, silent
+from langsplat_core.query.answers import QueryResult, recut
+from langsplat_core.query.compose import check_phrase, run_phrase
+from langsplat_core.query.engine import QueryEngine
+from langsplat_core.scene import LEVELS, Camera, Scene
+from langsplat_core.scene.language import split_phrases
+from langsplat_viewer.camera.controls import (
+    default_view,
+    extent_of,
+    focus,
+    from_camera,
+    holding_distance,
+    spanning,
+)
+from langsplat_viewer.camera.flight import Motion, turntable
+from langsplat_viewer.files.projects import read_flight
+from langsplat_viewer.options import ViewerOptions, check_display, chosen_camera, latent_level, say_compiling
+from langsplat_viewer.output import (
+    VIDEO,
+    Shot,
+    cameras_of,
+    check_film,
+    draw_something,
+    in_one_line,
+    make_film,
+    save_png,
+)
+from langsplat_viewer.rendering.renderer import open_renderer
+from langsplat_viewer.rendering.request import plain_request, why_undrawable
+from langsplat_viewer.viewer import Services
+
+DEFAULT_SIZE = (1280, 720)
+log = logging.getLogger("langsplat")
+
+
+def check_options(options: ViewerOptions) -> Path:
+    """Return where the image or film goes. InputError where that cannot work, before anything slow."""
+    if options.path is not None and options.turntable is not None:
+        raise InputError("--path and --turntable are two films; choose one")
+    if options.path is not None and options.orthographic is not None:
+        raise InputError("--orthographic is for one view; the keyframes of a --path say it themselves")
+    if options.is_film and options.transparent:
+        raise InputError("--transparent is for pictures; films have a background")
+    if options.is_film:
+        return check_film(options.out, options.wanted_size)
+    if options.out is None:
+        raise InputError("--headless needs somewhere to draw to; add --out picture.png")
+    if options.out.suffix.lower() != ".png":
+        raise InputError(f"--out {options.out}: only PNG is written; end the name in .png")
+    check_output_file(options.out)
+    return options.out
+
+
+def draw(options: ViewerOptions, path: Path, services: Services, progress: Progress = silent) -> list[str]:
+    """Draw the image or film that is asked for; return lines for people and scripts.
+
+    The first is of the file, then follow one of each query, and what the answers stand on. Raises InputError
+    and what the services do.
+    """
+    out = check_options(options)
+    flight = None if options.path is None else read_flight(options.path)  # before anything slow is done
+    if out != options.out:
+        log.warning("PyAV is not installed: pictures are written into the folder %s instead", out)
+    progress("opening the scene", 0.1)
+    scene = services.load_scene(path)
+    reason = why_undrawable(scene.gaussians)
+    if reason:  # before a text encoder is loaded for nothing
+        raise InputError(f"{path}: {reason}; export it again, or open another scene")
+    check_display(scene, options.shown_display, options.query)
+    camera, engine = _first_camera(scene, options), services.engine(scene)
+    results = _answers(engine, options, camera, progress)
+    if out.suffix.lower() == VIDEO:  # whose sides are even, those of a training camera need not be
+        width, height = (max(side - side % 2, 2) for side in (camera.width, camera.height))
+        camera = camera.with_intrinsics(camera.intrinsics.fitted(width, height))
+    request = plain_request(
+        scene,
+        camera,
+        options.picture,
+        level=latent_level(options.level),
+        answers=_by_colour(results, options.colour),
+        clip=options.clip,
+    )
+    if options.backend in ("auto", "cpu"):
+        say_compiling(progress)
+    if options.is_film:
+        motion = flight or _turn(scene, camera, results, options)
+        cameras = cameras_of(motion, extent_of(scene), options.fps, request.size)
+        lines = make_film(Shot(request, cameras, options.fps, options.backend), out, progress)
+    else:
+        progress("drawing", 0.8)
+        size = f"{camera.width}x{camera.height}"
+        with in_one_line(out, size), open_renderer(options.backend) as renderer:
+            save_png(out, draw_something(request, renderer))
+        lines = [f"{out}: {size}, {options.shown_display}"]
+    for reason in scene.unread:
+        if SUFFIX in reason:  # of the cameras it was said when they were read
+            log.warning("opened without its language field: %s", reason)
+    basis = [f"answers: {engine.basis.long}"] if results else []
+    return [*lines, *map(answer_line, results), *basis]
+
+
+def _first_camera(scene: Scene, options: ViewerOptions) -> Camera:
+    """Return the camera that is chosen, else the first training camera, else one that frames the scene."""
+    size = options.wanted_size
+    camera = chosen_camera(scene, options.camera) or (scene.cameras[0] if scene.cameras else None)
+    if camera is None:
+        camera = default_view(scene, extent_of(scene), size or DEFAULT_SIZE).camera(*(size or DEFAULT_SIZE))
+    elif size is not None and size != (camera.width, camera.height):
+        camera = camera.with_intrinsics(camera.intrinsics.fitted(*size))
+    if options.orthographic is not None:  # at the same eye
+        view = spanning(from_camera(camera, extent_of(scene)), options.orthographic)
+        camera = view.camera(camera.width, camera.height)
+    return camera
+
+
+def _answers(
+    engine: QueryEngine, options: ViewerOptions, camera: Camera, progress: Progress
+) -> tuple[QueryResult, ...]:
+    """Return the answers to the queries, in their order, cut where the options say so."""
+    phrases = [phrase for text in options.query for phrase in split_phrases(text) or [text]]
+    colours = options.colour
+    if colours and (len(colours) != len(phrases) or len(set(colours)) != len(phrases)):
+        raise InputError(f"--colour {colours[0]}: give each --query a colour of its own, or none any")
+    if options.cut and len(options.cut) != len(phrases):
+        raise InputError(f"--cut {options.cut[0]:g}: give each --query a cut, 0 for its own, or none any")
+    if options.canonical:
+        canonical = split_phrases(options.canonical)
+        if engine.scene.language is None or not canonical:
+            needed = "needs a phrase, and a scene with a language field"
+            raise InputError(f"--canonical {options.canonical}: {needed}")
+        engine.compare_with(canonical, progress)
+    for phrase in phrases:  # before anything slow is done
+        check_phrase(engine, phrase, camera, progress)
+    results = tuple(run_phrase(engine, phrase, options.level, camera, progress).answer for phrase in phrases)
+    if not options.cut:
+        return results
+    pairs = zip(results, options.cut, strict=True)
+    return tuple(recut(result, cut) if cut > 0 else result for result, cut in pairs)
+
+
+def _by_colour(results: Sequence[QueryResult], colours: tuple[int, ...]) -> tuple[QueryResult | None, ...]:
+    """Return the answers by colour.
+
+    Without `colours` they come in their order, the last ones only, as in the window, where a fourth query
+    takes the oldest one's colour.
+    """
+    if not colours:
+        return tuple(results[-MAX_QUERIES:])
+    by_colour = dict(zip(colours, results, strict=True))
+    return tuple(by_colour.get(number) for number in range(1, max(colours) + 1))
+
+
+def _turn(scene: Scene, camera: Camera, results: Sequence[QueryResult], options: ViewerOptions) -> Motion:
+    """Return the turn around what the camera sees in its middle, or around the place of the last answer.
+
+    The answer fills half of the image then. InputError where nothing was found.
+    """
+    extent = extent_of(scene)
+    view = from_camera(camera, extent)
+    if options.around == "answer":
+        found = [r for r in results if r.verdict != "not here" and r.place is not None]
+        if not found:
+            raise InputError("--around answer: nothing was found; add --query with a thing of this scene")
+        place, box = found[-1].place, found[-1].box
+        assert place is not None
+        if box is None:
+            box = np.stack([place, place + 0.1 * extent.radius])
+        nearer = min(holding_distance(view, box), float(np.linalg.norm(place - view.eye)))
+        view = focus(view, place, None if view.orthographic else nearer)  # whose scale was chosen
+    assert options.turntable is not None
+    return turntable(view, options.turntable)
+
+
+def answer_line(result: QueryResult) -> str:
+    """Return the answer as a line for people and for scripts."""
+    shown = None if result.verdict == "not here" else result.place
+    place = "none" if shown is None else "({})".format(", ".join(f"{v:.3f}" for v in shown))
+    verdict: str = result.verdict
+    if result.probability is not None:
+        verdict += f" ({100 * result.probability:.0f} %)"
+    level = LEVELS[result.level]
+    return f"'{result.phrase}': {verdict}, score {result.peak:.3f}, level {level}, place {place}"
