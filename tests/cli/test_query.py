@@ -1,4 +1,4 @@
-"""`langsplat query`, `select`, `describe`, `scale`, `find` and `changes`."""
+"""`langsplat query`, `select`, `describe`, and `scale`."""
 
 import json
 import os
@@ -9,16 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 from plyfile import PlyData
 
 from langsplat_core.cli import describe, query
 from langsplat_core.cli.edit import Scale
 from langsplat_core.errors import EncoderError, InputError
-from langsplat_core.extensions.library import commands as find
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import Reading, Scene
 from langsplat_core.semantics.encoder import OPEN_MODEL
 from tests.support.commands import refusal, run
@@ -95,21 +92,6 @@ def test_phrases_of_the_phrasebook_need_no_encoder(tmp_path):
     assert first.split()[0] == "1"
     assert pot.startswith("PLANT pot: found")
     assert heavy == "[]"
-
-
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_queries_draw_as_the_file_says(folder, monkeypatch, antialiased):
-    seen = []
-
-    class Recorder:
-        def view(self, gaussians, camera, settings):
-            seen.append(settings.antialiased)
-            return load_rasterizer("cpu").view(gaussians, camera, settings)
-
-    save_scene("b.ply", Scene(blobs(), language(phrasebook=True), cameras(1), None, antialiased))
-    monkeypatch.setattr(query, "load_rasterizer", lambda _: Recorder())
-    assert run("query", "b.ply", "book") == 0
-    assert seen == [antialiased]
 
 
 def test_another_phrase_is_answered_by_the_encoder_named(folder, monkeypatch, capsys):
@@ -423,86 +405,3 @@ def test_bad_input_is_one_line_and_nothing_is_written(described, capsys, words, 
     out = ("--out", "b.ply") if words.startswith("select") and "--out" not in words else ()
     assert message in refusal(capsys, *words.split(), *out)
     assert sorted(path.name for path in described.iterdir()) == before
-
-
-# `langsplat find` and `langsplat changes`.
-
-
-@pytest.fixture
-def scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The working folder; in "scans" a scene with mug, book and plant, and one without the mug."""
-    (tmp_path / "scans" / "<b>&").mkdir(parents=True)
-    save_scene(tmp_path / "scans" / "whole.ply", named_scene())
-    fewer = named_scene().take(np.arange(PER_BLOB, 3 * PER_BLOB))
-    save_scene(tmp_path / "scans" / "<b>&" / "fewer.ply", fewer)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(find, "load_text_encoder", lambda name: FakeEncoder())
-    return tmp_path
-
-
-def test_find_lists_the_scenes_that_have_it(scans, capsys):
-    assert run("find", "mug", "book", "scans", "--json") == 0
-    mug, book = json.loads(capsys.readouterr().out)
-    assert (mug["phrase"], mug["found"], mug["not_here"]) == ("mug", 1, 1)
-    assert [scene["scene"] for scene in mug["scenes"]] == ["whole.ply"]
-    np.testing.assert_allclose(mug["scenes"][0]["place"], (-1.2, 0, 0), atol=0.2)
-    assert book["found"] == 2
-    assert run("find", "mug", "scans", "--all") == 0
-    text = capsys.readouterr().out
-    assert "found in 1 of 2 scenes" in text
-    assert "fewer.ply: not here" in text
-
-
-def test_sheets_show_every_answer_and_escape_names(scans):
-    assert run("find", "book", "scans", "--sheet", "sheet.html") == 0
-    text = (scans / "sheet.html").read_text()
-    assert text.count("<img") == 2
-    assert "&lt;b&gt;&amp;/fewer.ply" in text
-    assert "<b>" not in text
-    assert run("find", "book", "scans", "--sheet", "sheet.png") == 0
-    picture = np.asarray(Image.open(scans / "sheet.png"))
-    assert picture.shape[1] > 4 * 320
-    assert np.ptp(picture[60:200, 20:600].astype(int)) > 100
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["mug"], "phrases and a folder"),
-        (["mug", "elsewhere"], "no such folder"),
-        (["mug", "scans", "--sheet", "sheet.txt"], ".html"),
-        (["the", "scans"], "the"),
-    ],
-)
-def test_find_says_what_is_wrong_in_a_line(scans, capsys, words, said):
-    assert said in refusal(capsys, "find", *words)
-    assert not (scans / "sheet.txt").exists()
-
-
-def test_changes_are_said_in_words_and_in_json(scans, capsys):
-    pair = "scans/whole.ply", "scans/<b>&/fewer.ply"
-    assert run("changes", *pair) == 0
-    assert capsys.readouterr().out.startswith("gone: ")
-    assert run("changes", pair[0], pair[0]) == 0
-    assert capsys.readouterr().out.strip() == "nothing changed"
-    scene = named_scene()
-    sh = scene.gaussians.sh.copy()
-    sh[:PER_BLOB] = sh[2 * PER_BLOB :]
-    save_scene(scans / "painted.ply", replace(scene, gaussians=replace(scene.gaussians, sh=sh)))
-    assert run("changes", pair[0], "painted.ply") == 0
-    assert "red to blue" in capsys.readouterr().out
-    (scans / "placed.json").write_text(json.dumps({"matrix": np.eye(4).tolist()}))
-    assert run("changes", pair[0], "painted.ply", "--transform", "placed.json", "--json") == 0
-    (change,) = json.loads(capsys.readouterr().out)["changes"]
-    assert (change["kind"], change["colours"]) == ("recoloured", ["red", "blue"])
-    both = "--transform", "placed.json", "--register"
-    assert "leave one of them out" in refusal(capsys, "changes", pair[0], "painted.ply", *both)
-
-
-@pytest.mark.parametrize(
-    "text", ["[[1]]", "{}", "[[1, 2], [3]]", '"x"', "[" * 50, '{"matrix": [[0,0,0,0]]}', '{"matrix": 3}']
-)
-def test_a_transform_that_is_none_is_refused(scans, capsys, text):
-    (scans / "placed.json").write_text(text)
-    words = "scans/whole.ply", "scans/whole.ply", "--transform", "placed.json"
-    assert "placed.json" in refusal(capsys, "changes", *words)

@@ -2,12 +2,15 @@
 scene. No test looks at a time."""
 
 import json
+import logging
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from langsplat_core.cli.app import parse
+from langsplat_core.config import numeric_settings
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.benchmarks import raster_speed as bench_report
 from langsplat_core.extensions.benchmarks.commands import write_report
@@ -208,3 +211,20 @@ def test_the_command_writes_what_it_measured(tmp_path, capsys):
     assert report["costs"][2]["lookup"]["p99"] < 1e-6
     assert (tmp_path / "query.md").read_text() in capsys.readouterr().out
     assert run(*words, "--repeats", 0) == 2
+
+
+def test_members_of_a_group_are_named_and_take_verbosity_anywhere() -> None:
+    with pytest.raises(InputError, match="no command 'bench quary'; did you mean 'query'"):
+        parse(["bench", "quary"])
+    log = logging.getLogger("langsplat")
+    for words in (["bench", "-q", "raster"], ["bench", "raster", "-q"]):
+        log.setLevel(logging.INFO)
+        parse(words)
+        assert log.level == logging.ERROR
+    log.setLevel(logging.INFO)
+
+
+@pytest.mark.parametrize("words", [["bench", "raster"], ["bench", "query", "s.ply"]])
+def test_every_number_of_a_command_has_a_range(words: list[str]) -> None:
+    command = parse(words)
+    assert [setting.option for setting in numeric_settings(command) if setting.range is None] == []
