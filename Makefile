@@ -46,17 +46,29 @@ test: browser  ## install everything, then lint, type-check and run every test b
 slow: system  ## the slow tier alone: fuzzing at length, large scenes, accuracy on real ones
 	$(PYTEST) --dist worksteal --slow -m slow
 
-check: $(STAMP)  ## ruff (rules and format) and mypy only
+# Prettier and eslint for the exported page's modules, installed once.
+WEB := packaging/web
+NPM := $(WEB)/node_modules
+$(NPM)/.installed: $(WEB)/package.json $(WEB)/package-lock.json $(STAMP)
+	$(BIN)/npm ci --prefix $(WEB) --silent --no-audit --no-fund
+	touch $@
+PRETTIER = $(BIN)/node $(NPM)/prettier/bin/prettier.cjs --config $(WEB)/.prettierrc.json --log-level warn
+PAGE = langsplat_core/web/*.js $(WEB)/*.js
+
+check: $(STAMP) $(NPM)/.installed  ## rules and format of Python and of the page's JavaScript, and mypy
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
+	$(PRETTIER) --check $(PAGE)
+	$(BIN)/node $(NPM)/eslint/bin/eslint.js --config $(WEB)/eslint.config.js langsplat_core/web
 
 sizes: $(STAMP)  ## lines of every room beside its budget (CONTRIBUTING.md)
 	$(BIN)/python packaging/sizes.py
 
-format: $(STAMP)  ## put every file into ruff's format
+format: $(STAMP) $(NPM)/.installed  ## put every file into ruff's and prettier's format
 	$(BIN)/ruff check --fix --select I
 	$(BIN)/ruff format
+	$(PRETTIER) --write $(PAGE)
 
 # NEWEST: the newest Python that there are wheels of everything for; its row is left out where it is not installed.
 NEWEST ?= python3.14
@@ -129,4 +141,4 @@ desktop: $(STAMP)  ## show the viewer among this user's programs, and open scene
 	-update-desktop-database $(DATA)/applications
 
 clean:  ## remove what these targets made
-	rm -rf $(VENV) $(LIGHT) $(GPU) $(NEWER) $(PARITY) demo_out elsewhere_out bench_out dist .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) $(LIGHT) $(GPU) $(NEWER) $(PARITY) demo_out elsewhere_out bench_out dist .pytest_cache .mypy_cache .ruff_cache $(NPM)

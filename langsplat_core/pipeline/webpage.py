@@ -41,13 +41,13 @@ from langsplat_core.semantics.clip_plain import PlainClipText
 from langsplat_core.semantics.encoder import PhraseEncoder
 from langsplat_core.semantics.vocabulary import BUNDLED, bundled_vocabulary
 
-MODULES = ("data", "language", "camera", "draw", "page")  # in the order in which they import each other
+# In an order in which each imports only those before it, so that their code can stand in one script.
+MODULES = ("words", "rule", "encoder", "language", "data", "camera", "draw", "page")
+BEGIN, END = "// [page]\n", "// [/page]\n"  # around the code of a module, without its imports and exports
 WIDE = 10  # columns of 16 bits: means, scales, quaternions
 CHUNK = 256  # Gaussians that share the range of a quantised column
 FLATTEST, OPAQUE = -46.0, 20.0  # bounds of the logarithm of a scale, whatever a file holds; of a logit
 MOST_VIEWS = 200  # bookmarks; of more cameras every so-manyth
-IMPORT = re.compile(r"^import .*?;\n", re.MULTILINE | re.DOTALL)
-EXPORT = re.compile(r"^export (?=async |class|const|function|let)", re.MULTILINE)
 NO_TABLES = "a page answers by everyday phrases, and neither the scene nor an encoder here has them"
 
 
@@ -261,14 +261,13 @@ def _region_tables(engine: QueryEngine) -> dict[str, Array]:
         matrix = csr_matrix((regions.weights[own].astype(np.float64), where), shape=shape).tocoo()
         shares.append((matrix.row + first, matrix.col, matrix.data / total[matrix.row]))
     of, code, share = (np.concatenate(parts) for parts in zip(*shares, strict=True))
-    above = [parents + first for parents, first in zip(regions.parents, firsts[1:], strict=False)]
     count = int(firsts[-1])
     return {
         "share_of": of.astype(np.uint32),
         "share_code": code.astype(np.uint16),
         "share": share.astype(np.float32),
         "sizes": np.concatenate(regions.sizes).astype(np.uint32),
-        "parents": np.concatenate([*above, np.full(len(regions.nodes[2]), count)]).astype(np.uint32),
+        "parents": regions.table.parents.astype(np.int32),
         "places": np.array(places, np.float64).reshape(count, 3),
         "boxes": np.array(boxes, np.float64).reshape(count, 6),
         "corners": np.array(corners, np.float32).reshape(count, 24),
@@ -312,8 +311,8 @@ def pack(tensors: dict[str, Array], meta: dict[str, Any]) -> bytes:
 def page_text(title: str, data: bytes) -> str:
     """The HTML file. Its policy lets nothing run but its own script, and nothing be fetched."""
     folder = files("langsplat_core.web")
-    script = "\n".join(folder.joinpath(f"{name}.js").read_text(encoding="utf-8") for name in MODULES)
-    script = EXPORT.sub("", IMPORT.sub("", script))
+    modules = [folder.joinpath(f"{name}.js").read_text(encoding="utf-8") for name in MODULES]
+    script = "\n".join(module.split(BEGIN)[1].split(END)[0] for module in modules)
     style = folder.joinpath("page.css").read_text(encoding="utf-8")
     script_hash, style_hash = (
         base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in (script, style)

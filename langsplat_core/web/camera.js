@@ -2,20 +2,24 @@
 // A camera is { width, height, fx, fy, cx, cy, rotation, position }: rotation is 3 x 3 world to camera, by
 // rows; positions are relative to the page's origin.
 
-const add = (a, b, t = 1) => a.map((v, i) => v + t * b[i]);
+// [page]
+const add = (a, b, times = 1) => a.map((value, i) => value + times * b[i]);
 const inner = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-const unit = (a) => a.map((v) => v / (Math.hypot(...a) || 1));
-const axes = ({ rotation: r }) => [r.slice(0, 3), r.slice(3, 6), r.slice(6, 9)];
+const unit = (a) => a.map((value) => value / (Math.hypot(...a) || 1));
+const axes = ({ rotation }) => [rotation.slice(0, 3), rotation.slice(3, 6), rotation.slice(6, 9)];
 
-// `axis` of length 1; Rodrigues' formula.
-function turned(v, axis, angle) {
-  const c = Math.cos(angle), s = Math.sin(angle), along = inner(axis, v) * (1 - c), side = cross(axis, v);
-  return v.map((x, i) => x * c + side[i] * s + axis[i] * along);
+// A vector turned about an axis of length 1, by Rodrigues' formula.
+function turned(vector, axis, angle) {
+  const cosine = Math.cos(angle);
+  const sine = Math.sin(angle);
+  const along = inner(axis, vector) * (1 - cosine);
+  const side = cross(axis, vector);
+  return vector.map((value, i) => value * cosine + side[i] * sine + axis[i] * along);
 }
 
 // Pixels of a camera in which a point is seen, and its depth.
-export function project(camera, point) {
+function project(camera, point) {
   const [x, y, z] = axes(camera).map((axis) => inner(axis, add(point, camera.position, -1)));
   return [(camera.fx * x) / z + camera.cx, (camera.fy * y) / z + camera.cy, z];
 }
@@ -23,7 +27,7 @@ export function project(camera, point) {
 const STEP = 24; // pixels of a drag that a press of an arrow key is worth
 const FLIGHT = 700; // ms
 
-export class Controls {
+class Controls {
   // changed(): called when the camera has another pose. free(): left, top, width and height of what no panel
   // covers, pixels of CSS.
   constructor(element, { radius, up }, free, changed) {
@@ -31,8 +35,9 @@ export class Controls {
     this.calm = matchMedia("(prefers-reduced-motion: reduce)");
     element.addEventListener("pointerdown", (event) => this.down(event));
     element.addEventListener("pointermove", (event) => this.move(event));
-    for (const name of ["pointerup", "pointercancel"])
+    for (const name of ["pointerup", "pointercancel"]) {
       element.addEventListener(name, (event) => this.pointers.delete(event.pointerId));
+    }
     element.addEventListener(
       "wheel",
       (event) => {
@@ -48,12 +53,17 @@ export class Controls {
   // The camera that fills the window, at so many pixels for one of CSS: the bookmark's whole image lies in
   // the middle of what is free.
   camera(dots) {
-    const { view } = this, [left, top, across, along] = this.free().map((length) => length * dots);
+    const { view } = this;
+    const [left, top, across, along] = this.free().map((length) => length * dots);
     const scale = Math.min(across / view.width, along / view.height);
     return {
-      width: Math.max(Math.round(innerWidth * dots), 1), height: Math.max(Math.round(innerHeight * dots), 1),
-      fx: view.fx * scale, fy: view.fy * scale, cx: (view.cx - view.width / 2) * scale + left + across / 2,
-      cy: (view.cy - view.height / 2) * scale + top + along / 2, rotation: view.rotation,
+      width: Math.max(Math.round(innerWidth * dots), 1),
+      height: Math.max(Math.round(innerHeight * dots), 1),
+      fx: view.fx * scale,
+      fy: view.fy * scale,
+      cx: (view.cx - view.width / 2) * scale + left + across / 2,
+      cy: (view.cy - view.height / 2) * scale + top + along / 2,
+      rotation: view.rotation,
       position: view.position,
     };
   }
@@ -67,27 +77,38 @@ export class Controls {
 
   move(event) {
     const last = this.pointers.get(event.pointerId);
-    if (!last) return;
-    const here = [event.clientX, event.clientY], dx = here[0] - last[0], dy = here[1] - last[1];
+    if (!last) {
+      return;
+    }
+    const here = [event.clientX, event.clientY];
+    const [dx, dy] = add(here, last, -1);
     const other = [...this.pointers].find(([id]) => id !== event.pointerId)?.[1];
     this.pointers.set(event.pointerId, here);
     if (other) {
       this.pan(dx / 2, dy / 2);
-      this.zoom(
-        Math.hypot(here[0] - other[0], here[1] - other[1]) /
-          Math.max(Math.hypot(last[0] - other[0], last[1] - other[1]), 1),
-      );
-    } else if (event.shiftKey || event.buttons & 6) this.pan(dx, dy);
-    else this.orbit(dx, dy);
+      const [now, before] = [here, last].map((place) => Math.hypot(...add(place, other, -1)));
+      this.zoom(now / Math.max(before, 1));
+    } else if (event.shiftKey || event.buttons & 6) {
+      this.pan(dx, dy);
+    } else {
+      this.orbit(dx, dy);
+    }
   }
 
   key(event) {
     const arrow = { ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
-    if (event.ctrlKey || event.metaKey || event.altKey) return;
-    if (arrow) this[event.shiftKey ? "pan" : "orbit"](STEP * arrow[0], STEP * arrow[1]);
-    else if (event.key === "+" || event.key === "=") this.zoom(1.15);
-    else if (event.key === "-") this.zoom(1 / 1.15);
-    else return;
+    if (event.ctrlKey || event.metaKey || event.altKey) {
+      return;
+    }
+    if (arrow) {
+      this[event.shiftKey ? "pan" : "orbit"](STEP * arrow[0], STEP * arrow[1]);
+    } else if (event.key === "+" || event.key === "=") {
+      this.zoom(1.15);
+    } else if (event.key === "-") {
+      this.zoom(1 / 1.15);
+    } else {
+      return;
+    }
     event.preventDefault();
   }
 
@@ -99,36 +120,39 @@ export class Controls {
   // Turn around the pivot, `distance` ahead, by a drag in pixels; never over the pole.
   orbit(dx, dy) {
     this.moving++;
-    const { up, view } = this, pivot = this.pivot(), angle = Math.PI / Math.max(innerWidth, innerHeight);
-    let rows = axes(view).map((axis) => turned(axis, up, -dx * angle)), right = rows[0];
+    const { up, view } = this;
+    const pivot = this.pivot();
+    const angle = Math.PI / Math.max(innerWidth, innerHeight);
+    let rows = axes(view).map((axis) => turned(axis, up, -dx * angle));
+    const right = rows[0];
     const lifted = rows.map((axis) => turned(axis, right, -dy * angle));
-    if (
-      Math.abs(inner(lifted[2], up)) < 0.995 ||
-      Math.abs(inner(lifted[2], up)) < Math.abs(inner(rows[2], up))
-    )
+    const [before, after] = [rows, lifted].map(([, , ahead]) => Math.abs(inner(ahead, up)));
+    if (after < 0.995 || after < before) {
       rows = lifted;
+    }
     this.pose(rows.flat(), add(pivot, rows[2], -this.distance));
   }
 
   pan(dx, dy) {
     this.moving++;
-    const [right, down] = axes(this.view), { fx } = this.camera(1);
-    this.pose(
-      this.view.rotation,
-      add(add(this.view.position, right, (-dx * this.distance) / fx), down, (-dy * this.distance) / fx),
-    );
+    const [right, down] = axes(this.view);
+    const { fx } = this.camera(1);
+    const perPixel = this.distance / fx;
+    const aside = add(this.view.position, right, -dx * perPixel);
+    this.pose(this.view.rotation, add(aside, down, -dy * perPixel));
   }
 
   // Come closer to the pivot by a factor; close to it, move it on ahead.
   zoom(factor) {
     this.moving++;
-    const ahead = axes(this.view)[2], least = 0.05 * this.radius, pivot = this.pivot();
+    const ahead = axes(this.view)[2];
+    const least = 0.05 * this.radius;
+    const pivot = this.pivot();
     const distance = Math.min(this.distance / factor, 50 * this.radius);
     const step = distance < least ? (this.distance * (factor - 1)) / factor : 0;
     this.distance = Math.max(distance, least);
-    this.pose(
-      this.view.rotation, step ? add(this.view.position, ahead, step) : add(pivot, ahead, -this.distance),
-    );
+    const position = step ? add(this.view.position, ahead, step) : add(pivot, ahead, -this.distance);
+    this.pose(this.view.rotation, position);
   }
 
   pivot() {
@@ -146,32 +170,42 @@ export class Controls {
     const points = Array.from({ length: 8 }, (_, k) => Array.from(corners.slice(3 * k, 3 * k + 3)));
     const middle = points.reduce((sum, point) => add(sum, point, 1 / 8), [0, 0, 0]);
     const reach = Math.max(...points.map((point) => Math.hypot(...add(point, middle, -1))));
-    const [, , width, height] = this.free(), { fx } = this.camera(1);
+    const [, , width, height] = this.free();
+    const { fx } = this.camera(1);
     const distance = Math.max((4 * reach * fx) / Math.min(width, height), 0.1 * this.radius);
     const [, , ahead] = axes(this.view);
     this.fly({ ...this.view, position: add(middle, ahead, -distance) }, distance);
   }
 
   fly(view, distance) {
-    const from = this.view, turn = ++this.moving, begun = performance.now();
+    const from = this.view;
+    const turn = ++this.moving;
+    const begun = performance.now();
     this.distance = distance;
     if (!from || this.calm.matches) {
       this.view = view;
       return this.changed();
     }
     const step = (now) => {
-      if (turn !== this.moving) return; // something else moves the camera
-      const t = Math.min((now - begun) / FLIGHT, 1), s = t * t * (3 - 2 * t);
-      const mixed = from.rotation.map((v, i) => v + s * (view.rotation[i] - v));
-      const ahead = unit(mixed.slice(6, 9)), right = unit(cross(mixed.slice(3, 6), ahead));
+      if (turn !== this.moving) {
+        return; // something else moves the camera
+      }
+      const time = Math.min((now - begun) / FLIGHT, 1);
+      const share = time * time * (3 - 2 * time);
+      const mixed = add(from.rotation, add(view.rotation, from.rotation, -1), share);
+      const ahead = unit(mixed.slice(6, 9));
+      const right = unit(cross(mixed.slice(3, 6), ahead));
       const rotation = [...right, ...cross(ahead, right), ...ahead];
-      this.view =
-        t === 1
-          ? view
-          : { ...view, rotation, position: add(from.position, add(view.position, from.position, -1), s) };
+      const position = add(from.position, add(view.position, from.position, -1), share);
+      this.view = time === 1 ? view : { ...view, rotation, position };
       this.changed();
-      if (t < 1) requestAnimationFrame(step);
+      if (time < 1) {
+        requestAnimationFrame(step);
+      }
     };
     requestAnimationFrame(step);
   }
 }
+// [/page]
+
+export { Controls, add, inner, project, unit };

@@ -1,30 +1,40 @@
 // The scene inside the page: base64 of a deflated safetensors file, as pipeline/webpage.py packs it.
 
+// [page]
 const HALVES = new Float32Array(65536).map((_, bits) => {
-  const exponent = (bits >> 10) & 31, fraction = bits & 1023, sign = bits & 32768 ? -1 : 1;
-  if (exponent === 0) return sign * fraction * 2 ** -24;
+  const exponent = (bits >> 10) & 31;
+  const fraction = bits & 1023;
+  const sign = bits & 32768 ? -1 : 1;
+  if (exponent === 0) {
+    return sign * fraction * 2 ** -24;
+  }
   return exponent === 31 ? NaN : sign * (1 + fraction / 1024) * 2 ** (exponent - 15);
 });
 const KINDS = {
-  U8: Uint8Array, U16: Uint16Array, I32: Int32Array, U32: Uint32Array, F32: Float32Array, F64: Float64Array,
+  U8: Uint8Array,
+  U16: Uint16Array,
+  I32: Int32Array,
+  U32: Uint32Array,
+  F32: Float32Array,
+  F64: Float64Array,
 };
 
 // Tensors by name as { values, shape }, half floats as single ones, and the JSON that lies beside them.
-export async function readPage(text) {
+async function readPage(text) {
   const letters = atob(text.trim());
   const packed = new Uint8Array(letters.length);
-  for (let i = 0; i < letters.length; ++i) packed[i] = letters.charCodeAt(i);
+  for (let i = 0; i < letters.length; ++i) {
+    packed[i] = letters.charCodeAt(i);
+  }
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
   const buffer = await new Response(stream).arrayBuffer();
   const size = Number(new DataView(buffer).getBigUint64(0, true));
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 8, size)));
   const tensors = {};
   const { __metadata__: metadata, ...listed } = header;
-  for (const [
-    name,
-    { dtype, shape, data_offsets: [from, to] },
-  ] of Object.entries(listed)) {
-    const bytes = buffer.slice(8 + size + from, 8 + size + to);
+  for (const [name, { dtype, shape, data_offsets: offsets }] of Object.entries(listed)) {
+    const [from, to] = offsets.map((offset) => 8 + size + offset);
+    const bytes = buffer.slice(from, to);
     const values =
       dtype === "F16"
         ? Float32Array.from(new Uint16Array(bytes), (bits) => HALVES[bits])
@@ -34,23 +44,30 @@ export async function readPage(text) {
   return { tensors, meta: JSON.parse(metadata.page) };
 }
 
-const CHUNK = 256;
-const MEAN = 0, SCALE = 3, QUATERNION = 6, OPACITY = 10,
-  SH = 11; // first column of each
+const CHUNK = 256; // Gaussians that share the range of a column
+// The first column of each property.
+const MEAN = 0;
+const SCALE = 3;
+const QUATERNION = 6;
+const OPACITY = 10;
+const SH = 11;
 
 // The Gaussians as textures take them: `means` (M, 3), relative to the page's origin; `geometry`, three layers
 // of RGBA floats (mean and opacity, scales, unit quaternion) and `sh`, the coefficients four to a texel.
-export function unpackGaussians({ low, high, ranges }, texels) {
+function unpackGaussians({ low, high, ranges }, texels) {
   const [columns, count] = low.shape;
-  const wide = high.shape[0], chunks = ranges.shape[1];
+  const wide = high.shape[0];
+  const chunks = ranges.shape[1];
   const value = (column, i) => {
-    const at = column * count + i, range = 2 * (column * chunks + Math.floor(i / CHUNK));
+    const at = column * count + i;
+    const range = 2 * (column * chunks + Math.floor(i / CHUNK));
     const part = column < wide ? (low.values[at] + 256 * high.values[at]) / 65535 : low.values[at] / 255;
     return ranges.values[range] + part * (ranges.values[range + 1] - ranges.values[range]);
   };
   const layers = Math.ceil((columns - SH) / 4);
-  const means = new Float32Array(3 * count),
-    geometry = new Float32Array(12 * texels), sh = new Float32Array(4 * layers * texels);
+  const means = new Float32Array(3 * count);
+  const geometry = new Float32Array(12 * texels);
+  const sh = new Float32Array(4 * layers * texels);
   const quaternion = [0, 0, 0, 0];
   for (let i = 0; i < count; ++i) {
     for (let axis = 0; axis < 3; ++axis) {
@@ -58,10 +75,19 @@ export function unpackGaussians({ low, high, ranges }, texels) {
       geometry[4 * (texels + i) + axis] = Math.exp(value(SCALE + axis, i));
     }
     geometry[4 * i + 3] = 1 / (1 + Math.exp(-value(OPACITY, i)));
-    for (let k = 0; k < 4; ++k) quaternion[k] = value(QUATERNION + k, i);
+    for (let k = 0; k < 4; ++k) {
+      quaternion[k] = value(QUATERNION + k, i);
+    }
     const length = Math.hypot(...quaternion) || 1;
-    for (let k = 0; k < 4; ++k) geometry[4 * (2 * texels + i) + k] = quaternion[k] / length;
-    for (let c = SH; c < columns; ++c) sh[4 * (((c - SH) >> 2) * texels + i) + ((c - SH) & 3)] = value(c, i);
+    for (let k = 0; k < 4; ++k) {
+      geometry[4 * (2 * texels + i) + k] = quaternion[k] / length;
+    }
+    for (let c = SH; c < columns; ++c) {
+      sh[4 * (((c - SH) >> 2) * texels + i) + ((c - SH) & 3)] = value(c, i);
+    }
   }
   return { count, means, geometry, sh, layers };
 }
+// [/page]
+
+export { readPage, unpackGaussians };

@@ -1,8 +1,10 @@
 // The scene drawn with WebGL 2 by the shaders of the OpenGL backend, in three passes: project every Gaussian
 // once for a camera, splat one quad of each back to front, compose the image that is seen.
 
+import { add, inner } from "./camera.js";
 import { unpackGaussians } from "./data.js";
 
+// [page]
 // In a worker: Gaussians ahead of the near plane, back to front by camera z, of equal ones the later first.
 function sortWorker() {
   let means;
@@ -11,20 +13,32 @@ function sortWorker() {
       means = data.means;
       return;
     }
-    const { plane: [a, b, c, d], near, far, ticket } = data, count = means.length / 3;
-    const depth = new Float32Array(1), bits = new Uint32Array(depth.buffer);
-    let keys = new Uint32Array(count), rows = new Int32Array(count), ahead = 0;
+    const { plane, near, far, ticket } = data;
+    const [a, b, c, d] = plane;
+    const count = means.length / 3;
+    const depth = new Float32Array(1);
+    const bits = new Uint32Array(depth.buffer);
+    let keys = new Uint32Array(count);
+    let rows = new Int32Array(count);
+    let ahead = 0;
     for (let i = count - 1; i >= 0; --i) {
       depth[0] = a * means[3 * i] + b * means[3 * i + 1] + c * means[3 * i + 2] + d;
-      if (!(depth[0] > near && depth[0] <= far)) continue;
+      if (!(depth[0] > near && depth[0] <= far)) {
+        continue;
+      }
       keys[ahead] = ~bits[0]; // bits of positive floats rise with them
       rows[ahead++] = i;
     }
-    let otherKeys = new Uint32Array(ahead), otherRows = new Int32Array(ahead);
+    let otherKeys = new Uint32Array(ahead);
+    let otherRows = new Int32Array(ahead);
     for (const shift of [0, 16]) {
       const places = new Uint32Array(65537);
-      for (let i = 0; i < ahead; ++i) places[((keys[i] >>> shift) & 65535) + 1]++;
-      for (let digit = 0; digit < 65536; ++digit) places[digit + 1] += places[digit];
+      for (let i = 0; i < ahead; ++i) {
+        places[((keys[i] >>> shift) & 65535) + 1]++;
+      }
+      for (let digit = 0; digit < 65536; ++digit) {
+        places[digit + 1] += places[digit];
+      }
       for (let i = 0; i < ahead; ++i) {
         const place = places[(keys[i] >>> shift) & 65535]++;
         otherKeys[place] = keys[i];
@@ -37,24 +51,29 @@ function sortWorker() {
   };
 }
 
-export class Painter {
+class Painter {
   // Throws an Error with a sentence for people where this browser cannot draw the scene.
   constructor(canvas, meta, tensors) {
-    const gl = (this.gl = canvas.getContext("webgl2", {
-      antialias: false, alpha: false, powerPreference: "high-performance",
-    }));
-    if (!gl) throw new Error("This browser offers no WebGL 2, which the scene is drawn with.");
-    if (!gl.getExtension("EXT_color_buffer_float"))
+    const options = { antialias: false, alpha: false, powerPreference: "high-performance" };
+    const gl = canvas.getContext("webgl2", options);
+    if (!gl) {
+      throw new Error("This browser offers no WebGL 2, which the scene is drawn with.");
+    }
+    if (!gl.getExtension("EXT_color_buffer_float")) {
       throw new Error("This browser's graphics cannot draw into float textures.");
-    Object.assign(this, { canvas, meta });
-    const count = tensors.low.shape[1], most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
+    }
+    Object.assign(this, { gl, canvas, meta });
+    const count = tensors.low.shape[1];
+    const most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     this.columns = Math.min(4096, most, count);
     this.rows = Math.ceil(count / this.columns);
-    if (this.rows > most)
+    if (this.rows > most) {
       throw new Error(
         `This browser's graphics hold ${most * most} Gaussians at most; the scene has ${count}.`,
       );
-    const texels = this.columns * this.rows, scene = unpackGaussians(tensors, texels);
+    }
+    const texels = this.columns * this.rows;
+    const scene = unpackGaussians(tensors, texels);
     this.count = count;
     this.places = scene.geometry.slice(0, 4 * count); // mean and opacity of each Gaussian
     this.geometry = this.layers(gl.RGBA32F, 3, scene.geometry);
@@ -63,8 +82,10 @@ export class Painter {
     this.extra = this.texture(gl.RGBA32F, this.columns, this.rows);
     this.values = new Float32Array(4 * texels);
     this.colourMap = this.texture(gl.RGBA8, 256, 1);
-    const map = tensors.colour_map.values,
-      rgba = Uint8Array.from({ length: 1024 }, (_, i) => (i % 4 === 3 ? 255 : map[3 * (i >> 2) + (i % 4)]));
+    const map = tensors.colour_map.values;
+    const rgba = Uint8Array.from({ length: 1024 }, (_, i) =>
+      i % 4 === 3 ? 255 : map[3 * (i >> 2) + (i % 4)],
+    );
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, 256, 1, gl.RGBA, gl.UNSIGNED_BYTE, rgba);
     this.programs = Object.fromEntries(
       Object.entries(meta.shaders).map(([name, pair]) => [name, this.program(...pair)]),
@@ -87,17 +108,25 @@ export class Painter {
   }
 
   program(vertex, fragment) {
-    const { gl } = this, program = gl.createProgram();
-    for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+    const { gl } = this;
+    const program = gl.createProgram();
+    for (const [kind, source] of [
+      [gl.VERTEX_SHADER, vertex],
+      [gl.FRAGMENT_SHADER, fragment],
+    ]) {
       const made = gl.createShader(kind);
       gl.shaderSource(made, source);
       gl.compileShader(made);
       gl.attachShader(program, made);
-      if (!gl.getShaderParameter(made, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(made));
+      if (!gl.getShaderParameter(made, gl.COMPILE_STATUS)) {
+        throw new Error(gl.getShaderInfoLog(made));
+      }
     }
     gl.bindAttribLocation(program, 0, "gaussian");
     gl.linkProgram(program);
-    if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
+    if (!gl.getProgramParameter(program, gl.LINK_STATUS)) {
+      throw new Error(gl.getProgramInfoLog(program));
+    }
     const uniforms = {};
     for (let i = 0; i < gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS); ++i) {
       const { name, type } = gl.getActiveUniform(program, i);
@@ -108,17 +137,26 @@ export class Painter {
 
   // Use a program with these uniforms; arrays as they lie in memory. Names that it lacks are passed over.
   use(name, values) {
-    const { gl } = this, { program, uniforms } = this.programs[name];
+    const { gl } = this;
+    const { program, uniforms } = this.programs[name];
     gl.useProgram(program);
     const set = {
-      [gl.FLOAT]: "uniform1fv", [gl.FLOAT_VEC2]: "uniform2fv", [gl.FLOAT_VEC3]: "uniform3fv",
+      [gl.FLOAT]: "uniform1fv",
+      [gl.FLOAT_VEC2]: "uniform2fv",
+      [gl.FLOAT_VEC3]: "uniform3fv",
       [gl.FLOAT_VEC4]: "uniform4fv",
     };
     for (const [key, value] of Object.entries(values)) {
-      if (!uniforms[key]) continue;
-      const { type, at } = uniforms[key], list = [value].flat();
-      if (type === gl.FLOAT_MAT3) gl.uniformMatrix3fv(at, false, list);
-      else gl[set[type] || "uniform1iv"](at, list);
+      if (!uniforms[key]) {
+        continue;
+      }
+      const { type, at } = uniforms[key];
+      const list = [value].flat();
+      if (type === gl.FLOAT_MAT3) {
+        gl.uniformMatrix3fv(at, false, list);
+      } else {
+        gl[set[type] || "uniform1iv"](at, list);
+      }
     }
   }
 
@@ -131,30 +169,36 @@ export class Painter {
   }
 
   texture(format, width, height) {
-    const { gl } = this, texture = gl.createTexture();
+    const { gl } = this;
+    const texture = gl.createTexture();
     gl.bindTexture(gl.TEXTURE_2D, texture);
     gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
-    for (const key of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER])
+    for (const key of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
       gl.texParameteri(gl.TEXTURE_2D, key, gl.NEAREST);
-    for (const key of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T])
+    }
+    for (const key of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) {
       gl.texParameteri(gl.TEXTURE_2D, key, gl.CLAMP_TO_EDGE);
+    }
     return texture;
   }
 
   layers(format, count, values) {
-    const { gl } = this, texture = gl.createTexture();
+    const { gl } = this;
+    const texture = gl.createTexture();
     gl.bindTexture(gl.TEXTURE_2D_ARRAY, texture);
     gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, format, this.columns, this.rows, count);
-    for (const key of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER])
+    for (const key of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
       gl.texParameteri(gl.TEXTURE_2D_ARRAY, key, gl.NEAREST);
-    gl.texSubImage3D(
-      gl.TEXTURE_2D_ARRAY, 0, 0, 0, 0, this.columns, this.rows, count, gl.RGBA, gl.FLOAT, values,
-    );
+    }
+    const origin = [0, 0, 0];
+    const size = [this.columns, this.rows, count];
+    gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, ...origin, ...size, gl.RGBA, gl.FLOAT, values);
     return texture;
   }
 
   target(width, height, formats) {
-    const { gl } = this, framebuffer = gl.createFramebuffer();
+    const { gl } = this;
+    const framebuffer = gl.createFramebuffer();
     gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
     const textures = formats.map((format, i) => {
       const texture = this.texture(format, width, height);
@@ -162,8 +206,9 @@ export class Painter {
       return texture;
     });
     gl.drawBuffers(formats.map((_, i) => gl.COLOR_ATTACHMENT0 + i));
-    if (gl.checkFramebufferStatus(gl.FRAMEBUFFER) !== gl.FRAMEBUFFER_COMPLETE)
+    if (gl.checkFramebufferStatus(gl.FRAMEBUFFER) !== gl.FRAMEBUFFER_COMPLETE) {
       throw new Error("This browser's graphics refuse the images that the scene is drawn into.");
+    }
     return { framebuffer, textures, width, height };
   }
 
@@ -171,8 +216,11 @@ export class Painter {
   show(values, components) {
     const { gl } = this;
     this.values.fill(0);
-    for (let i = 0; i < this.count; ++i)
-      for (let c = 0; c < components; ++c) this.values[4 * i + c] = values[components * i + c];
+    for (let i = 0; i < this.count; ++i) {
+      for (let c = 0; c < components; ++c) {
+        this.values[4 * i + c] = values[components * i + c];
+      }
+    }
     gl.bindTexture(gl.TEXTURE_2D, this.extra);
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, this.columns, this.rows, gl.RGBA, gl.FLOAT, this.values);
   }
@@ -180,13 +228,19 @@ export class Painter {
   // Ask for the draw order of a camera; one sort runs at a time, and only the newest request waits. Resolves
   // when the order of this camera is here (true), or that of a later one (false).
   sort(camera) {
-    const r = camera.rotation, p = camera.position, { near, far } = this.meta.raster;
-    const plane = [r[6], r[7], r[8], -(r[6] * p[0] + r[7] * p[1] + r[8] * p[2])];
-    if (this.plane && plane.every((v, i) => v === this.plane[i])) return this.last;
+    const { near, far } = this.meta.raster;
+    const ahead = camera.rotation.slice(6, 9);
+    const plane = [...ahead, -inner(ahead, camera.position)];
+    if (this.plane && plane.every((value, i) => value === this.plane[i])) {
+      return this.last;
+    }
     this.plane = plane;
     this.next = { plane, near, far: far ?? Infinity, ticket: ++this.ticket };
-    if (!this.busy) this.post();
-    return (this.last = new Promise((resolve) => this.waiting.push([this.ticket, resolve])));
+    if (!this.busy) {
+      this.post();
+    }
+    this.last = new Promise((resolve) => this.waiting.push([this.ticket, resolve]));
+    return this.last;
   }
 
   post() {
@@ -201,16 +255,26 @@ export class Painter {
     gl.bufferData(gl.ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);
     this.drawn = order.length;
     this.busy = false;
-    if (this.next) this.post();
+    if (this.next) {
+      this.post();
+    }
     this.waiting = this.waiting.filter(([wanted, resolve]) => wanted > ticket || resolve(wanted === ticket));
     this.onorder?.();
   }
 
-  // Draw into the canvas, which gets the camera's size. look: { display, ranges, dim } by names of displays.
-  paint(camera, look) {
-    const { gl, meta } = this, { width, height } = camera, { raster, picture } = meta;
-    if (this.canvas.width !== width || this.canvas.height !== height)
+  // Draw into the canvas, which gets the camera's size. appearance: { display, ranges, dim }.
+  paint(camera, appearance) {
+    this.resize(camera);
+    this.project(camera);
+    this.splat(camera);
+    this.compose(camera, appearance);
+  }
+
+  resize({ width, height }) {
+    const { gl } = this;
+    if (this.canvas.width !== width || this.canvas.height !== height) {
       Object.assign(this.canvas, { width, height });
+    }
     if (this.image?.width !== width || this.image?.height !== height) {
       if (this.image) {
         this.image.textures.forEach((texture) => gl.deleteTexture(texture));
@@ -218,36 +282,79 @@ export class Painter {
       }
       this.image = this.target(width, height, Array(2).fill(gl.RGBA16F));
     }
+  }
+
+  // Project every Gaussian into three textures: where it is, its shape, its colour.
+  project(camera) {
+    const { gl, meta } = this;
+    const { width, height } = camera;
+    const { raster } = meta;
     // As raster.protocol.dilation.
     const finer = raster.focal ? (camera.fx * camera.fy) / raster.focal ** 2 : 1;
-    const r = camera.rotation, high = camera.position.map(Math.fround);
-    const mx = (0.5 * (raster.fov_clamp - 1) * width) / camera.fx,
-      my = (0.5 * (raster.fov_clamp - 1) * height) / camera.fy;
+    const r = camera.rotation;
+    const high = camera.position.map(Math.fround);
+    const beyond = 0.5 * (raster.fov_clamp - 1); // of the image, on each side
+    const tangents = [camera.cx, camera.cy, width - camera.cx, height - camera.cy].map((pixels, side) => {
+      const [size, focal] = side % 2 ? [height, camera.fy] : [width, camera.fx];
+      return (pixels + beyond * size) / focal;
+    });
     this.use("project", {
-      gaussians: 0, sh: 1, orthographic: 0, sh_count: meta.sh_count, antialiased: +raster.antialiased,
-      dilation: raster.dilation * Math.min(Math.max(finer, 1), 256), alpha_min: raster.alpha_min, colour_max: 65504,
-      focal: [camera.fx, camera.fy], principal: [camera.cx, camera.cy],
-      world_to_camera: [r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]], camera_high: high,
-      camera_low: camera.position.map((v, i) => v - high[i]),
-      tangents: [
-        camera.cx / camera.fx + mx, camera.cy / camera.fy + my, (width - camera.cx) / camera.fx + mx,
-        (height - camera.cy) / camera.fy + my,
-      ],
+      gaussians: 0,
+      sh: 1,
+      orthographic: 0,
+      sh_count: meta.sh_count,
+      antialiased: +raster.antialiased,
+      dilation: raster.dilation * Math.min(Math.max(finer, 1), 256),
+      alpha_min: raster.alpha_min,
+      colour_max: 65504,
+      focal: [camera.fx, camera.fy],
+      principal: [camera.cx, camera.cy],
+      world_to_camera: [r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]],
+      camera_high: high,
+      camera_low: add(camera.position, high, -1),
+      tangents,
     });
     this.bound([gl.TEXTURE_2D_ARRAY, this.geometry], [gl.TEXTURE_2D_ARRAY, this.sh]);
     this.pass(this.projected, null);
+  }
+
+  // Blend the quads of all Gaussians ahead.
+  splat({ width, height }) {
+    const { gl } = this;
+    const { raster } = this.meta;
     this.use("splat", {
-      placement: 0, shape: 1, values: [2, 3], columns: this.columns, image_size: [width, height],
-      alpha_min: raster.alpha_min, alpha_max: raster.alpha_max,
+      placement: 0,
+      shape: 1,
+      values: [2, 3],
+      columns: this.columns,
+      image_size: [width, height],
+      alpha_min: raster.alpha_min,
+      alpha_max: raster.alpha_max,
     });
     const [placement, shape, colours] = this.projected.textures;
     this.bound(...[placement, shape, colours, this.extra].map((texture) => [gl.TEXTURE_2D, texture]));
     this.pass(this.image, this.quads);
+  }
+
+  // Turn blended values into the display that is seen.
+  compose({ width, height }, appearance) {
+    const { gl, meta } = this;
+    const { picture } = meta;
     this.use("compose", {
-      colours: 0, extra: 1, colour_maps: 2, colour_map: 0, query_colours: meta.query_colours.flat(),
-      display: picture.displays[look.display], ranges: look.ranges.flat(), own_colours: 0,
-      heat_opacity: picture.heat_opacity, dim: look.dim ?? picture.dim, threshold: picture.threshold,
-      alpha_gate: picture.alpha_gate, background: picture.background, transparent: 0,
+      colours: 0,
+      extra: 1,
+      colour_maps: 2,
+      colour_map: 0,
+      query_colours: meta.query_colours.flat(),
+      display: picture.displays[appearance.display],
+      ranges: appearance.ranges.flat(),
+      own_colours: 0,
+      heat_opacity: picture.heat_opacity,
+      dim: appearance.dim ?? picture.dim,
+      threshold: picture.threshold,
+      alpha_gate: picture.alpha_gate,
+      background: picture.background,
+      transparent: 0,
     });
     this.bound(...[...this.image.textures, this.colourMap].map((texture) => [gl.TEXTURE_2D, texture]));
     this.pass({ framebuffer: null, width, height }, null);
@@ -259,7 +366,9 @@ export class Painter {
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.framebuffer);
     gl.viewport(0, 0, target.width, target.height);
     gl.bindVertexArray(quads);
-    if (!quads) return gl.drawArrays(gl.TRIANGLES, 0, 3);
+    if (!quads) {
+      return gl.drawArrays(gl.TRIANGLES, 0, 3);
+    }
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT);
     gl.enable(gl.BLEND);
@@ -270,11 +379,18 @@ export class Painter {
 
   // (height, width, 4) bytes of what `paint` drew in this very task, its top row first.
   pixels() {
-    const { gl } = this, { width, height } = this.canvas, bytes = new Uint8Array(4 * width * height);
+    const { gl } = this;
+    const { width, height } = this.canvas;
+    const bytes = new Uint8Array(4 * width * height);
     gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
-    const rows = new Uint8Array(bytes.length), row = 4 * width;
-    for (let y = 0; y < height; ++y)
+    const rows = new Uint8Array(bytes.length);
+    const row = 4 * width;
+    for (let y = 0; y < height; ++y) {
       rows.set(bytes.subarray(row * (height - 1 - y), row * (height - y)), row * y);
+    }
     return rows;
   }
 }
+// [/page]
+
+export { Painter };

@@ -211,6 +211,8 @@ def same(found: dict[str, Any], expected: Any, members: int) -> None:
             assert found[name] is None, name
         else:
             np.testing.assert_allclose(found[name], np.ravel(value), atol=1e-3, rtol=0, err_msg=name)
+    assert found["reached"] == expected.judgement.reached
+    np.testing.assert_allclose(found["margin"], expected.judgement.margin, atol=1e-2)
     np.testing.assert_allclose(found["heat"], expected.heat_range, atol=1e-3)
     assert abs(found["members"] - members) <= 1e-3 * members
 

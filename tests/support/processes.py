@@ -194,8 +194,9 @@ class Tab:
             """async ([phrase, level]) => {
               const { page, ask } = await langsplat, answer = ask(phrase, level);
               const { values, members } = page.language.spread(answer, answer.level);
-              return { ...answer, values: null, codes: null, members: members.reduce((a, b) => a + b, 0),
-                       mean: values.reduce((a, b) => a + b, 0) / values.length };
+              const sum = (numbers) => numbers.reduce((a, b) => a + b, 0);
+              return { ...answer, ...answer.verdict, verdict: answer.verdict.outcome, regionFits: null,
+                       codes: null, members: sum(members), mean: sum(values) / values.length };
             }""",
             [phrase, level],
         )

@@ -1,0 +1,160 @@
+// The text half of CLIP, for the words that it was taught: the plain twin of semantics/clip_plain.py.
+
+import { sigmoid } from "./rule.js";
+
+// [page]
+// What a browser says of a phrase that cannot be asked.
+class PhraseError extends Error {}
+
+// The dot product of `size` numbers of two arrays, from a place in each.
+function dot(a, firstOfA, b, size, firstOfB = 0) {
+  let sum = 0;
+  for (let i = 0; i < size; ++i) {
+    sum += a[firstOfA + i] * b[firstOfB + i];
+  }
+  return sum;
+}
+
+class ClipText {
+  // described: { words, config, begin, end }; weight(name): values of a tensor; dim: numbers of a vector.
+  constructor(described, weight, dim) {
+    Object.assign(this, described);
+    this.weight = weight;
+    this.dim = dim;
+    this.width = this.config.hidden_size;
+  }
+
+  // The unit vector of a phrase. PhraseError for words that it was never taught.
+  encode(key) {
+    const ids = this.tokenNumbers(key);
+    const { config, width } = this;
+    let states = this.embedded(ids);
+    for (let number = 0; number < config.num_hidden_layers; ++number) {
+      const layer = (name) => `text_model.encoder.layers.${number}.${name}`;
+      const attended = this.attention(
+        layer("self_attn."),
+        this.normed(layer("layer_norm1"), states),
+        ids.length,
+      );
+      states = states.map((value, i) => value + attended[i]);
+      const inner = this.linear(layer("mlp.fc1"), this.normed(layer("layer_norm2"), states), width);
+      const outer = this.linear(layer("mlp.fc2"), inner.map(this.activation()), config.intermediate_size);
+      states = states.map((value, i) => value + outer[i]);
+    }
+    const end = states.subarray((ids.length - 1) * width);
+    const last = this.normed("text_model.final_layer_norm", end);
+    const projection = this.weight("text_projection.weight");
+    const vector = Float32Array.from({ length: this.dim }, (_, i) => dot(projection, i * width, last, width));
+    const length = Math.max(Math.sqrt(dot(vector, 0, vector, this.dim)), 1e-6);
+    return vector.map((value) => value / length);
+  }
+
+  tokenNumbers(key) {
+    const ids = [this.begin];
+    for (const word of key.match(/[\p{L}\p{N}]+(?:'[\p{L}\p{N}]+)?/gu) || []) {
+      const known = [word, word.split("'")[0]].find((form) => Object.hasOwn(this.words, form));
+      if (known === undefined) {
+        throw new PhraseError(`This page's encoder was never taught “${word}”${this.suggestion(word)}.`);
+      }
+      ids.push(...this.words[known]);
+    }
+    if (ids.length > this.config.max_position_embeddings - 1 || ids.length === 1) {
+      throw new PhraseError("Use fewer, plain words.");
+    }
+    return [...ids, this.end];
+  }
+
+  suggestion(word) {
+    const near = Object.keys(this.words)
+      .filter((known) => known.slice(0, 3) === word.slice(0, 3))
+      .slice(0, 2);
+    return near.length ? `; it knows ${near.map((known) => `“${known}”`).join(" and ")}` : "";
+  }
+
+  embedded(ids) {
+    const token = this.weight("text_model.embeddings.token_embedding.weight");
+    const position = this.weight("text_model.embeddings.position_embedding.weight");
+    const states = new Float32Array(ids.length * this.width);
+    ids.forEach((id, row) => {
+      for (let i = 0; i < this.width; ++i) {
+        states[row * this.width + i] = token[id * this.width + i] + position[row * this.width + i];
+      }
+    });
+    return states;
+  }
+
+  activation() {
+    if (this.config.hidden_act === "quick_gelu") {
+      return (value) => value * sigmoid(1.702 * value);
+    }
+    return (value) => 0.5 * value * (1 + errorFunction(value * Math.SQRT1_2));
+  }
+
+  linear(name, states, width) {
+    const weight = this.weight(`${name}.weight`);
+    const bias = this.weight(`${name}.bias`);
+    const rows = states.length / width;
+    const out = new Float32Array(rows * bias.length);
+    for (let row = 0; row < rows; ++row) {
+      for (let i = 0; i < bias.length; ++i) {
+        out[row * bias.length + i] = bias[i] + dot(weight, i * width, states, width, row * width);
+      }
+    }
+    return out;
+  }
+
+  // Layer normalisation of rows.
+  normed(name, states) {
+    const { width } = this;
+    const weight = this.weight(`${name}.weight`);
+    const bias = this.weight(`${name}.bias`);
+    const out = new Float32Array(states.length);
+    for (let row = 0; row < states.length; row += width) {
+      const values = states.subarray(row, row + width);
+      const mean = values.reduce((sum, value) => sum + value, 0) / width;
+      const variance = values.reduce((sum, value) => sum + (value - mean) ** 2, 0) / width;
+      const spread = Math.sqrt(variance + this.config.layer_norm_eps);
+      for (let i = 0; i < width; ++i) {
+        out[row + i] = ((values[i] - mean) / spread) * weight[i] + bias[i];
+      }
+    }
+    return out;
+  }
+
+  // Causal self-attention: each token looks at those before it and at itself.
+  attention(name, states, length) {
+    const { width } = this;
+    const size = width / this.config.num_attention_heads;
+    const [query, key, value] = ["q", "k", "v"].map((part) =>
+      this.linear(`${name}${part}_proj`, states, width),
+    );
+    const mixed = new Float32Array(states.length);
+    for (let head = 0; head < width; head += size) {
+      for (let row = 0; row < length; ++row) {
+        const scores = Array.from({ length: row + 1 }, (_, other) => {
+          return dot(query, row * width + head, key, size, other * width + head) * size ** -0.5;
+        });
+        const top = Math.max(...scores);
+        const weights = scores.map((score) => Math.exp(score - top));
+        const total = weights.reduce((sum, weight) => sum + weight, 0);
+        for (let other = 0; other <= row; ++other) {
+          for (let i = head; i < head + size; ++i) {
+            mixed[row * width + i] += (weights[other] / total) * value[other * width + i];
+          }
+        }
+      }
+    }
+    return this.linear(`${name}out_proj`, mixed, width);
+  }
+}
+
+// Error function to 1.5e-7 (Abramowitz and Stegun 1964, formula 7.1.26).
+function errorFunction(x) {
+  const t = 1 / (1 + 0.3275911 * Math.abs(x));
+  const tail =
+    t * (0.254829592 + t * (-0.284496736 + t * (1.421413741 + t * (-1.453152027 + t * 1.061405429))));
+  return Math.sign(x) * (1 - tail * Math.exp(-x * x));
+}
+// [/page]
+
+export { PhraseError, ClipText, dot };

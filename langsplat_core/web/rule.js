@@ -1,0 +1,133 @@
+// The rule that turns the fits of regions into an answer: the twin of query/rule.py, where the table of numbers
+// (`rule`) comes from and says what each is for.
+//
+// Regions are { counts, parents, sizes }: of all levels one after the other, subparts first; `parents` is the
+// region of the level above, -1 for none.
+
+// [page]
+const sigmoid = (x) => 1 / (1 + Math.exp(-x));
+const logit = (share) => Math.log(share / (1 - share));
+
+// The fit that a relevancy stands for; finite at 0 and 1.
+function fitOf(rule, relevancy) {
+  return logit(Math.min(Math.max(relevancy, rule.narrowest), 1 - rule.narrowest));
+}
+
+// Fits of regions, each mixed with that of its best part. own: fits of the mean relevancy of each.
+function regionFits(rule, regions, own) {
+  const { parents, sizes } = regions;
+  const telling = (region) => own[region] > rule.nothing && sizes[region] >= rule.smallest;
+  const best = new Float64Array(own.length).fill(-Infinity);
+  for (let region = 0; region < own.length; ++region) {
+    const parent = parents[region];
+    if (parent >= 0 && telling(region)) {
+      best[parent] = Math.max(best[parent], own[region]);
+    }
+  }
+  return own.map((fit, region) => {
+    const part = best[region] === -Infinity && telling(region) ? fit : best[region];
+    return part === -Infinity ? fit : (1 - rule.part_share) * fit + rule.part_share * part;
+  });
+}
+
+// Relevancies that fits stand for, 0 for what has no meaning.
+function regionRelevancies(rule, fits) {
+  return fits.map((fit) => (fit > rule.nothing ? sigmoid(fit) : 0));
+}
+
+// Numbers [first, last) of the regions of a level.
+function levelRange({ counts }, level) {
+  const first = counts.slice(0, level).reduce((sum, count) => sum + count, 0);
+  return [first, first + counts[level]];
+}
+
+// The best relevancy of a level; of crumbs only where it has no more.
+function bestRelevancy(rule, regions, relevancies, level) {
+  const [first, last] = levelRange(regions, level);
+  let solid = -Infinity;
+  let any = 0;
+  for (let region = first; region < last; ++region) {
+    any = Math.max(any, relevancies[region]);
+    if (regions.sizes[region] >= rule.smallest) {
+      solid = Math.max(solid, relevancies[region]);
+    }
+  }
+  return Math.max(solid > -Infinity ? solid : any, 0);
+}
+
+// Spreads by which the best fits of the levels exceed those from which a phrase is found. level: number, or -1
+// where it is free. bars: of each level, and of the better one of the finer two.
+function excess(rule, fits, named, level, bars) {
+  const [whole, finer] = rule.found[named].map((spreads) => spreads ?? Infinity);
+  const above = (bar, fit, spreads) => (fit - bar.median) / Math.max(bar.spread, rule.narrowest) - spreads;
+  if (level >= 0) {
+    return above(bars[level], fits[level], Math.min(whole, finer));
+  }
+  return Math.max(above(bars[2], fits[2], whole), above(bars[3], Math.max(fits[0], fits[1]), finer));
+}
+
+// A verdict: `outcome` in words, how it was `reached`, `margin` above what counts as found, `probability`.
+function verdict(rule, found, reached, margin, probability = null) {
+  const weak = probability === null ? margin >= rule.weak_excess : probability >= rule.weak_probability;
+  const outcome = found ? "found" : weak ? "weak match" : "not here";
+  return { outcome, found, reached, margin, probability };
+}
+
+// The verdict that the best fits of the levels stand for. level: number, or -1 where it is free.
+function judge(rule, fits, named, level, { bars, calibration }) {
+  if (!calibration) {
+    const margin = excess(rule, fits, named, level, bars);
+    return verdict(rule, margin >= 0, "chance", margin);
+  }
+  const odds = named === "thing" ? calibration.thing : calibration.part;
+  const logits = odds.constant + odds.whole * fits[2] + odds.finer * Math.max(fits[0], fits[1]);
+  const probability = sigmoid(logits);
+  const shown = level < 0 || fits[level] >= 0;
+  const margin = logits - logit(Math.min(odds.found, 1 - rule.narrowest));
+  return verdict(rule, shown && probability >= odds.found, "calibration", margin, probability);
+}
+
+// The answer of the whole regions that fit nearly as well as the best one: its level, `scores` and `fits` of
+// all levels, the regions that are `inside`, the `best` one that the place is of (-1: none), and the verdict.
+// evidence: { bars, calibration }.
+function decide(rule, regions, own, named, level, evidence) {
+  const every = regionFits(rule, regions, own);
+  const relevancies = regionRelevancies(rule, every);
+  const scores = regions.counts.map((_, at) => bestRelevancy(rule, regions, relevancies, at));
+  const fits = scores.map((score) => fitOf(rule, score));
+  const given = fits.map((fit, at) => fit + rule.advantage[named][at]);
+  const chosen = level < 0 ? given.lastIndexOf(Math.max(...given)) : level; // of equal levels the coarsest
+  const reach = Math.min(Math.max(rule.reach * fits[chosen], rule.nearest), rule.farthest);
+  const [first, last] = levelRange(regions, chosen);
+  const inside = [];
+  let best = -1;
+  for (let region = first; region < last; ++region) {
+    if (every[region] >= fits[chosen] - reach) {
+      inside.push(region);
+    }
+    const solid = relevancies[region] > 0 && relevancies[region] <= scores[chosen];
+    if (solid && (best < 0 || relevancies[region] > relevancies[best])) {
+      best = region;
+    }
+  }
+  return {
+    level: chosen,
+    scores,
+    fits,
+    regionFits: every,
+    inside,
+    best,
+    verdict: judge(rule, fits, named, level, evidence),
+  };
+}
+
+// Relevancies at which a heat map of an answer is coldest and hottest.
+function heatRange(rule, peak, found) {
+  if (found && peak < rule.floor + rule.heat_span) {
+    return [peak - rule.heat_span, peak];
+  }
+  return [rule.floor, Math.max(peak, rule.floor + rule.heat_span)];
+}
+// [/page]
+
+export { decide, fitOf, heatRange, levelRange, sigmoid, verdict };
