@@ -1,4 +1,4 @@
-"""Run the tests as on other machines and write docs/benchmarks/elsewhere.md (`make elsewhere`); Linux, x86-64
+"""Run the tests as on other machines and write docs/benchmarks/elsewhere.md (`make elsewhere`).
 
     python packaging/elsewhere.py [--only avx2,shuffled] [--newest PYTHON] [--seed 7]
 

@@ -113,7 +113,7 @@ def _noted(ctx: Any, window: Window) -> None:
 
 
 def _beside(ctx: Any, window: Window) -> None:
-    """The scene with an autoencoder of three numbers, as the paper has it, in place of its codebook."""
+    """Return the scene with the paper's autoencoder of three numbers in place of its codebook."""
     viewer, folder = window.viewer, Path(tempfile.mkdtemp())
     scene, path = viewer.state.scene, folder / "autoencoder.ply"
     assert scene is not None
@@ -207,7 +207,7 @@ def _timed(ctx: Any, window: Window) -> None:
 
 
 def _trained(ctx: Any, window: Window) -> None:
-    """A room of a dozen photographs, in the midst of its training."""
+    """Return a room of a dozen photographs, in the midst of its training."""
     viewer, folder = window.viewer, Path(tempfile.mkdtemp())
     room = ["dataset", "--seed", "3", "--views", "12", "--out", str(folder / "room")]
     subprocess.run([sys.executable, "-m", "assets.making", *room], check=True)
@@ -252,7 +252,7 @@ WINDOWS: dict[str, tuple[tuple[str, ...], Act]] = {
 
 
 def window_picture(path: Path, queries: tuple[str, ...], act: Act) -> None:
-    """A screenshot of the window with the demo scene and answered queries."""
+    """Return a screenshot of the window with the demo scene and answered queries."""
     request = WindowRequest(
         scene_path(None),
         queries=queries,
@@ -286,7 +286,7 @@ def window_picture(path: Path, queries: tuple[str, ...], act: Act) -> None:
 
 
 def page_picture(path: Path) -> None:
-    """A screenshot of the demo scene's page in a browser."""
+    """Return a screenshot of the demo scene's page in a browser."""
     with tempfile.TemporaryDirectory() as folder, open_browser() as browser:
         page = Path(folder) / "room.html"
         command = [sys.executable, "-m", "langsplat_core", "export", "--quiet", "--title", "A toy table"]

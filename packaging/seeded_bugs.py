@@ -1,4 +1,4 @@
-"""Put small faults into a copy of the checkout, one at a time, and see which of them the tests notice
+"""Put small faults into a copy of the checkout, one at a time, and see which of them the tests notice.
 
     python packaging/seeded_bugs.py [--list] [--only NAME] [--out out/seeded_bugs.md]
 

@@ -1,4 +1,4 @@
-"""Print the size of every room beside its budget, from the table in CONTRIBUTING.md (`make sizes`)
+"""Print the size of every room beside its budget, from the table in CONTRIBUTING.md (`make sizes`).
 
 Exit code 1 where a room is larger than its budget.
 """

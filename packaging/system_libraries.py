@@ -34,8 +34,10 @@ def missing_packages() -> list[str]:
 
 
 def main() -> int:
-    """Install what is missing, or print the line that does; 0 unless an install failed. With --tests also a
-    browser; its tests are skipped where it cannot be had."""
+    """Install what is missing, or print the line that does; 0 unless an install failed.
+
+    With --tests also a browser; its tests are skipped where it cannot be had.
+    """
     if not sys.platform.startswith("linux"):
         return 0
     code = install(missing_packages())

@@ -36,6 +36,7 @@ class Dataset:
     """lerf-ovs, 3d-ovs: the photographs in OUT/room, and every eighth labelled as in that benchmark."""
 
     def run(self) -> None:
+        """Write the dataset."""
         from assets.making.dataset import write_labelled
 
         with TerminalProgress() as progress:
@@ -54,6 +55,7 @@ class Encoder:
     config: Annotated[EncoderConfig, tyro.conf.arg(name="")] = field(default_factory=EncoderConfig)
 
     def run(self) -> None:
+        """Train the encoder and print its figures."""
         from assets.making.encoder import report_table, train_encoder
 
         with TerminalProgress() as progress:
@@ -71,6 +73,7 @@ class Build:
     """Keep the Gaussians of this scene of the same room, and make only their language field again."""
 
     def run(self) -> None:
+        """Build the scene."""
         from assets.making.scene import build_scene
 
         with TerminalProgress() as progress:
@@ -79,7 +82,7 @@ class Build:
 
 
 def parse(args: list[str]) -> Command:
-    """The command that the words of a command line name; SystemExit as tyro raises it."""
+    """Return the command that the words of a command line name; SystemExit as tyro raises it."""
     command: Command = parsed(PROGRAM, Dataset | Encoder | Build, args, "Make the bundled files again.")
     return command
 

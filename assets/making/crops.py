@@ -97,7 +97,7 @@ def plain_crops(count: int, seed: int) -> CropSet:
 
 
 def _random_camera(rng: np.random.Generator) -> Camera:
-    """A camera around the table that looks at some point on it, or now and then at the furniture."""
+    """Return a camera around the table that looks at some point on it, or now and then at the furniture."""
     azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(12, 62))
     distance = rng.uniform(0.75, 1.7)
     target = np.array([rng.uniform(-0.45, 0.45), rng.uniform(-0.35, 0.35), 0.05])
@@ -111,7 +111,7 @@ def _random_camera(rng: np.random.Generator) -> Camera:
 
 
 def _photograph(image: Array, rng: np.random.Generator) -> Array:
-    """The image with exposure, white balance, blur, noise and compression of a real camera."""
+    """Return the image with exposure, white balance, blur, noise and compression of a real camera."""
     gain = np.exp(rng.normal(0, 0.14)) * np.exp(rng.normal(0, 0.035, 3))
     pixels = to_display(to_linear(np.arange(256) / 255)[:, None] * gain)  # (256, 3) look-up per channel
     result = Image.fromarray(

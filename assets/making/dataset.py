@@ -87,7 +87,7 @@ def write_dataset(
 
 
 def photographed_room(seed: int, tier: Tier = "clutter") -> World:
-    """The room that `write_dataset` photographs; the demo encoder has never seen one of them."""
+    """Return the room that `write_dataset` photographs; the demo encoder has never seen one of them."""
     return build_room(FIRST_ROOM + seed, tier)
 
 
@@ -208,8 +208,11 @@ def write_labelled(
     progress: Progress,
     tier: Tier = "clutter",
 ) -> Path:
-    """Render a room as `write_dataset` does, into `out` itself or, in a benchmark's layout, into `out`/room,
-    and label every eighth view in that layout. Returns the photographs' folder. Raises as `write_dataset`."""
+    """Render a room as `write_dataset` does, and label every eighth view in a benchmark's layout.
+
+    Photographs go into `out` itself or, in a benchmark's layout, into `out`/room; returns their folder.
+    Raises as `write_dataset`.
+    """
     folder = out if layout == "plain" else out / SCENE
     write_dataset(folder, seed, views, size, progress, tier, NAMES[layout])
     if layout == "plain":
@@ -224,15 +227,18 @@ def write_labelled(
 
 
 def _visible(truth: Truth, name: str, kinds: tuple[str, ...]) -> dict[Phrase, Array]:
-    """The phrases that are true for enough of a view to be asked there, and where."""
+    """Return the phrases that are true for enough of a view to be asked there, and where."""
     labels = truth.labels(name)
     masks = {p: np.asarray(np.isin(labels, p.ids).any(axis=0)) for p in truth.phrases if p.kind in kinds}
     return {phrase: mask for phrase, mask in masks.items() if mask.sum() >= MIN_PIXELS}
 
 
 def write_lerf_ovs(dataset: Path, labels: Path, truth: Truth, names: list[str]) -> None:
-    """Write label/<scene>/<frame>.json and .jpg. A mask of several pieces, or with holes, becomes several
-    objects of one category, whose polygons joined are the mask."""
+    """Write label/<scene>/<frame>.json and .jpg.
+
+    A mask of several pieces, or with holes, becomes several objects of one category, whose polygons joined
+    are the mask.
+    """
     for name in names:
         photograph = (dataset / "images" / f"{name}.jpg").read_bytes()
         with atomic_path(labels / f"{name}.jpg") as path:

@@ -101,7 +101,7 @@ def _merged(symbols: list[str], pair: tuple[str, str]) -> list[str]:
 
 
 def build_model(tokens: int, start: int, end: int) -> Any:
-    """A `transformers.CLIPModel` of 2.4 million weights for a vocabulary of `tokens`."""
+    """Return a `transformers.CLIPModel` of 2.4 million weights for a vocabulary of `tokens`."""
     from transformers import CLIPConfig, CLIPModel
 
     text = {
@@ -125,8 +125,11 @@ def normalised(crops: Array) -> Tensor:
 
 
 def image_features(model: Any, pixels: Tensor, keep: float = 1.0) -> Tensor:
-    """(B, 160) features before the projection; `keep` < 1 shows the model that share of the patches, drawn
-    at random but rather those that are not all black surroundings."""
+    """Return (B, 160) features before the projection.
+
+    keep: share of the patches that the model is shown, drawn at random but rather those that are not all
+    black surroundings.
+    """
     vision = model.vision_model
     hidden = vision.embeddings(pixels)
     if keep < 1:
@@ -152,8 +155,7 @@ def text_vectors(model: Any, tokens: Tensor) -> Tensor:
 
 
 def calibrate_canonical(model: Any, tokens: Tensor, images: Tensor, cosine: float) -> None:
-    """Move the word vectors of the four canonical phrases, and nothing else, until their cosine with `images`
-    is `cosine` on average.
+    """Move the word vectors of the canonical phrases until their mean cosine with `images` is `cosine`.
 
     tokens: (4, L) int64, one word each, behind the start token; images: (M, 512) unit vectors of crops that
     show something nameable. Relevancy 0.5 then lies where a user wants it, between right and wrong phrases.
@@ -234,7 +236,7 @@ class Sampler:
         return [group for group in groups if len(group)]
 
     def batch(self, config: EncoderConfig, rng: np.random.Generator) -> Batch:
-        """The next batch of `config.batch` crops and `config.phrases` phrases."""
+        """Return the next batch of `config.batch` crops and `config.phrases` phrases."""
         chosen = rng.choice(len(self._rows), config.batch, p=self._weight)
         canonical = len(CANONICAL_PHRASES)
         phrases = list(range(canonical))
@@ -365,7 +367,7 @@ def _kind_report(kind: str, scores: Array, fits: Array) -> KindReport:
 
 
 def report_table(rows: list[KindReport]) -> str:
-    """The report as a table of Markdown."""
+    """Return the report as a table of Markdown."""
     head = "| kind of phrase | phrases | best phrase is right | right ones found | wrong ones found |"
     lines = [
         f"| {row.kind} | {row.phrases} | {row.top1:.0%} | {row.right_found:.0%} | {row.wrong_found:.1%} |"
@@ -375,12 +377,11 @@ def report_table(rows: list[KindReport]) -> str:
 
 
 def train_encoder(out: Path, config: EncoderConfig, progress: Progress) -> list[KindReport]:
-    """Train the demo encoder into folder `out`, in the layout that `transformers` loads; return its figures
-    on crops of rooms that it was not trained in.
+    """Train the demo encoder into folder `out`, in the layout that `transformers` loads.
 
-    Crops and the state of the training are kept in `out`/work and reused by the next call with the same
-    settings; `out` itself always holds the latest saved model. The same settings give the same model up
-    to rounding, interrupted or not.
+    Returns its figures on crops of rooms that it was not trained in. Crops and the state of the training are
+    kept in `out`/work and reused by the next call with the same settings; `out` itself always holds the
+    latest saved model. The same settings give the same model up to rounding, interrupted or not.
     """
     work = out / "work"
     write_crops(work / "crops", config, progress)

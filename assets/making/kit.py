@@ -55,7 +55,7 @@ COLOURS = tuple(_BOXES)
 
 
 def to_linear(display: Array) -> Array:
-    """sRGB display values in [0, 1] -> linear light."""
+    """Return linear light of sRGB display values in [0, 1]."""
     display = np.asarray(display, np.float64)
     return np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
 
@@ -85,7 +85,7 @@ def from_lch(lch: Array) -> Array:
 
 
 def colour_word(display: Array) -> str | None:
-    """The word that certainly fits one sRGB colour (3,), or None near a border between words."""
+    """Return the word that certainly fits one sRGB colour (3,), or None near a border between words."""
     lightness, chroma, hue = to_lch(display)
     for word, (l0, l1, c0, c1, h0, h1) in _BOXES.items():
         if l0 <= lightness <= l1 and c0 <= chroma <= c1 and (hue - h0) % 360 <= h1 - h0:
@@ -135,7 +135,7 @@ class Thing:
     pieces: tuple[Piece, ...]
 
     def centred(self) -> "Thing":
-        """The same thing with the middle of its footprint's bounding box at the origin."""
+        """Return the same thing with the middle of its footprint's bounding box at the origin."""
         points = np.concatenate([p.mesh.vertices[:, :2] for p in self.pieces])
         x, y = -(points.min(0) + points.max(0)) / 2
         return replace(self, pieces=tuple(replace(p, mesh=p.mesh.moved((x, y, 0.0))) for p in self.pieces))
@@ -153,7 +153,7 @@ class Kit:
         self.rng = rng
 
     def size(self, low: float, high: float) -> float:
-        """A length between two bounds."""
+        """Return a length between two bounds."""
         return float(self.rng.uniform(low, high))
 
     def pick(self, *words: Word) -> Word:
@@ -172,7 +172,7 @@ class Kit:
         shift: float = 14,
         substance: Substance | None = None,
     ) -> Material:
-        """A material of a named colour; the second colour is the first one `shift` lightness darker.
+        """Return a material of a named colour; the second colour is the first one `shift` lightness darker.
 
         Cloth, metal and wooden textures are of those materials unless `substance` says otherwise.
         """
@@ -206,7 +206,7 @@ class Kit:
         return self.paint(word, "wood", 0.12, 12)
 
     def wall_paint(self, word: str) -> Material:
-        """A pale, muted version of a colour; it keeps its word only where it still fits."""
+        """Return a pale, muted version of a colour; it keeps its word only where it still fits."""
         lch = to_lch(random_colour(word, self.rng))
         colour = np.clip(from_lch(np.array([70 + 0.2 * lch[0], 0.4 * lch[1], lch[2]])), 0, 1)
         return Material(colour_word(colour) or "", colour, darker(colour, 4), "plaster", 0.0)
@@ -217,7 +217,7 @@ class Kit:
 
 
 def darker(colour: Array, by: float) -> Array:
-    """The same hue `by` units of CIE lightness darker (negative: lighter), clipped to what can be shown."""
+    """Return the same hue `by` units of CIE lightness darker, clipped to what can be shown."""
     lch = to_lch(colour)
     return np.clip(from_lch(np.array([np.clip(lch[0] - by, 3, 98), lch[1] * 0.95, lch[2]])), 0, 1)
 
@@ -266,8 +266,10 @@ def finish_of(material: Material) -> Finish:
 
 
 def material_table(materials: tuple[Material, ...]) -> tuple[Array, Array]:
-    """(P,) int32 pattern of every piece, and (P, 12) float32: colour, second colour (sRGB), mirror,
-    sharpness, diffuse, tint, relief, 0."""
+    """Return the (P,) int32 pattern of every piece, and a (P, 12) float32 table of numbers.
+
+    Its columns are colour, second colour (sRGB), mirror, sharpness, diffuse, tint, relief, 0.
+    """
     kinds = np.array([TEXTURES.index(m.texture) for m in materials], np.int32)
     rows = np.zeros((len(materials), 12), np.float32)
     for row, material in zip(rows, materials, strict=True):

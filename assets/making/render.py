@@ -1,12 +1,11 @@
-"""Photographs of a `World` by ray casting: patterns, baked light, and highlights, which alone depend on the
-view.
+"""Photographs of a `World` by ray casting: patterns, baked light, and highlights.
 
-Patterns are functions of the point in the object's own frame, so every view agrees. Light is a soft lamp, a
-sky, and one bounce between surfaces, gathered once, so that all views see the same shadows. It is kept at
-the vertices and, where it changes within a triangle, on a finer lattice of that triangle ("mesh colours",
-Yuksel et al. 2010). All points use the same set of rays, so there is no noise; steps of a shadow are far
-below what a display shows. Patterns and shading are compiled, one point at a time: a photograph asks for
-about a million points, twice where there is relief.
+Only highlights depend on the view. Patterns are functions of the point in the object's own frame, so every
+view agrees. Light is a soft lamp, a sky, and one bounce between surfaces, gathered once, so that all views
+see the same shadows. It is kept at the vertices and, where it changes within a triangle, on a finer lattice
+of that triangle ("mesh colours", Yuksel et al. 2010). All points use the same set of rays, so there is no
+noise; steps of a shadow are far below what a display shows. Patterns and shading are compiled, one point at a
+time: a photograph asks for about a million points, twice where there is relief.
 """
 
 import math
@@ -79,7 +78,7 @@ def _fraction(value):  # type: ignore[no-untyped-def]
 
 @_compiled
 def _scatter(value):  # type: ignore[no-untyped-def]
-    """A number in [0, 1) that looks random for every whole `value`."""
+    """Return a number in [0, 1) that looks random for every whole `value`."""
     return _fraction(math.sin(value * 12.9898) * 43758.5453)
 
 
@@ -142,7 +141,7 @@ def _painting(v, x, y, z):  # type: ignore[no-untyped-def]
 
 @_compiled
 def _small(kind, v, x, y, z):  # type: ignore[no-untyped-def]  # noqa: PLR0911  one row of a table each
-    """The patterns of one line each."""
+    """Return the patterns of one line each."""
     if kind == 5:  # metal: brushed
         return 0.4 + 0.4 * noise_at(v, x / 0.02, y / 0.02, z / 0.5) + 0.1 * noise_at(v, x / 0.3, y / 0.3, z)
     if kind == 1:  # speckled
@@ -240,8 +239,11 @@ class Tracer:
 
 
 def bake(tracer: Tracer, world: World, light: Light, samples: int, cell: float) -> LightMap:
-    """`samples`: rays towards the lamp and again all around, per place; `cell`: spacing of the finest
-    lattice in metres, 0 for vertices only."""
+    """Gather the light of every place.
+
+    samples: rays towards the lamp and again all around, per place; cell: spacing of the finest lattice in
+    metres, 0 for vertices only.
+    """
     lamp = _lamp_light(tracer, light, world.vertices, world.normals, samples)
     triangles = world.triangles
     corner = lamp[triangles].mean(1, keepdims=True)
@@ -358,7 +360,7 @@ class Surfaces(NamedTuple):
 
 
 def surfaces(world: World, light: Light, baked: LightMap) -> Surfaces:
-    """A world and its light, as arrays."""
+    """Return a world and its light, as arrays."""
     kinds, table = material_table(world.materials)
     points = np.concatenate([world.vertices, world.normals, world.local], 1).astype(np.float32)
     lamp = np.stack([light.position, KEY * light.key]).astype(np.float32)
@@ -479,14 +481,13 @@ class Renderer:
     """Holds the ray tracer and the light that reaches every surface."""
 
     def __init__(self, world: World, light: Light, samples: int = 32, cell: float = 0.0) -> None:
-        """`samples`: rays for the lamp and again for everything around, per place where light is kept;
-        `cell`: spacing of those places in metres where light varies, 0 for the vertices alone."""
+        """Bake the light; `samples` and `cell` as of `bake`."""
         self._world = world
         self._tracer = Tracer(world)
         self._surfaces = surfaces(world, light, bake(self._tracer, world, light, samples, cell))
 
     def picture(self, camera: Camera, oversample: int = 2) -> Picture:
-        """A view of the room. `oversample`: rays per pixel and axis; labels come from the pixel's centre."""
+        """Render a view with `oversample` rays per pixel and axis; labels are those of pixel centres."""
         fine = camera.resized(camera.width * oversample, camera.height * oversample)
         triangle, uv, depth = self._cast(fine)
         linear = self._shade(triangle, uv, camera.position)

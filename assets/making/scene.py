@@ -36,10 +36,11 @@ CONFIG = TrainConfig(
 
 
 def build_scene(out: Path, gaussians: Path | None = None, progress: Progress = silent) -> str:
-    """Render the room, train, and drop what the photographs do not miss; or, given `gaussians`, a scene of
-    that room, find only what those mean. Returns a line about what was made.
+    """Render the room, train a scene, and drop what its photographs do not miss.
 
-    Photographs and truth stay in `<out>.work/photographs`, the scene as trained in `<out>.work/trained.ply`.
+    Given `gaussians`, a scene of that room, only its language field is made anew. Returns a line about what
+    was made. Photographs and truth stay in `<out>.work/photographs`, the scene as trained in
+    `<out>.work/trained.ply`.
     """
     work = out.with_name(out.stem + ".work")
     photographs, trained = work / "photographs", work / "trained.ply"

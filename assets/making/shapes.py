@@ -22,19 +22,19 @@ class Mesh:
     normals: Array  # (V, 3) float64, outward, unit length
 
     def moved(self, offset: tuple[float, float, float] | Array) -> "Mesh":
-        """The mesh shifted by `offset` (3,) metres."""
+        """Return the mesh shifted by `offset` (3,) metres."""
         return Mesh(self.vertices + np.asarray(offset, np.float64), self.triangles, self.normals)
 
     def turned(self, rotation: Array) -> "Mesh":
-        """The mesh turned about the origin by a (3, 3) rotation."""
+        """Return the mesh turned about the origin by a (3, 3) rotation."""
         return Mesh(self.vertices @ rotation.T, self.triangles, self.normals @ rotation.T)
 
     def spun(self, axis: str, degrees: float) -> "Mesh":
-        """The mesh turned about a coordinate axis, right-handed."""
+        """Return the mesh turned about a coordinate axis, right-handed."""
         return self.turned(rotation_about(axis, degrees))
 
     def stretched(self, factors: tuple[float, float, float]) -> "Mesh":
-        """The mesh scaled per axis by positive `factors`."""
+        """Return the mesh scaled per axis by positive `factors`."""
         normals = self.normals / np.asarray(factors)
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         return Mesh(self.vertices * np.asarray(factors), self.triangles, normals)
@@ -68,7 +68,7 @@ def _vertex_normals(vertices: Array, triangles: Array) -> Array:
 
 
 def sheet(width: float, height: float, cell: float) -> Mesh:
-    """A rectangle in the plane z = 0, centred, facing +z, in cells of about `cell` metres."""
+    """Return a rectangle in the plane z = 0, centred, facing +z, in cells of about `cell` metres."""
     nx, ny = max(int(np.ceil(width / cell)), 1) + 1, max(int(np.ceil(height / cell)), 1) + 1
     x, y = np.meshgrid(np.linspace(-width / 2, width / 2, nx), np.linspace(-height / 2, height / 2, ny))
     vertices = np.stack([x.ravel(), y.ravel(), np.zeros(nx * ny)], 1)
@@ -86,7 +86,7 @@ def join(meshes: list[Mesh]) -> Mesh:
 
 
 def box(width: float, depth: float, height: float, cell: float = 0.02) -> Mesh:
-    """A cuboid along x, y, z standing on z = 0, centred in x and y."""
+    """Return a cuboid along x, y, z standing on z = 0, centred in x and y."""
     w, d, h = width, depth, height
     sides = []
     for (a, b, distance), turn in (
@@ -102,7 +102,7 @@ def box(width: float, depth: float, height: float, cell: float = 0.02) -> Mesh:
 
 
 def lathe(profile: list[tuple[float, float]], around: int = 32, cell: float = 0.01) -> Mesh:
-    """A surface of revolution about z through (radius, z) points, listed from bottom to top.
+    """Return a surface of revolution about z through (radius, z) points, listed from bottom to top.
 
     Going up with positive radius the surface faces outwards; going down it faces the axis (a vessel's
     inside). Points closer than `cell` are left as they are, longer stretches are subdivided.
@@ -123,7 +123,7 @@ def lathe(profile: list[tuple[float, float]], around: int = 32, cell: float = 0.
 
 
 def ball(radius: float, around: int = 28) -> Mesh:
-    """A sphere centred at the origin."""
+    """Return a sphere centred at the origin."""
     angle = np.linspace(-np.pi / 2, np.pi / 2, around // 2 + 1)
     profile = [(radius * max(float(np.cos(a)), 0.0), radius * float(np.sin(a))) for a in angle]
     mesh = lathe(profile, around, cell=1.0)
@@ -131,7 +131,7 @@ def ball(radius: float, around: int = 28) -> Mesh:
 
 
 def cylinder(radius: float, height: float, around: int = 28, cell: float = 0.015) -> Mesh:
-    """A closed cylinder standing on z = 0; its edges are sharp."""
+    """Return a closed cylinder standing on z = 0; its edges are sharp."""
     top = lathe([(radius, height), (0.0, height)], around, cell)
     side = lathe([(radius, 0.0), (radius, height)], around, cell)
     bottom = lathe([(0.0, 0.0), (radius, 0.0)], around, cell)
@@ -139,7 +139,7 @@ def cylinder(radius: float, height: float, around: int = 28, cell: float = 0.015
 
 
 def tube(path: Array, radius: float | Array, around: int = 12) -> Mesh:
-    """A pipe along `path` (N, 3) with one radius or (N,) radii; closed when the radii end at zero."""
+    """Return a pipe along `path` (N, 3) with one radius or (N,) radii; closed when the radii end at zero."""
     path = np.asarray(path, np.float64)
     radii = np.broadcast_to(np.asarray(radius, np.float64), (len(path),))
     tangent = np.gradient(path, axis=0)
@@ -166,7 +166,7 @@ def arc(centre: tuple[float, float], radius: float, start: float, stop: float, c
 
 
 def slab(outline: list[tuple[float, float]], thickness: float, cell: float = 0.02) -> Mesh:
-    """A convex polygon (counter-clockwise, x and z) extruded along y by `thickness`, centred in y."""
+    """Return a convex polygon (counter-clockwise, x and z) extruded along y by `thickness`, centred in y."""
     points = np.array(outline)
     n = len(points)
     fan = np.array([[0, i, i + 1] for i in range(1, n - 1)])
@@ -185,7 +185,7 @@ def slab(outline: list[tuple[float, float]], thickness: float, cell: float = 0.0
 
 
 def _refined(mesh: Mesh, cell: float) -> Mesh:
-    """The same flat faces cut into triangles with edges of at most `cell`: light is kept per vertex."""
+    """Cut flat faces into triangles with edges of at most `cell`, since light is kept per vertex."""
     corners, normals = mesh.vertices[mesh.triangles], mesh.normals[mesh.triangles]
     while True:
         edges = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
@@ -204,7 +204,7 @@ def _refined(mesh: Mesh, cell: float) -> Mesh:
 
 
 def rod(start: Point | Array, stop: Point | Array, radius: float, end: float = 0.0, around: int = 14) -> Mesh:
-    """A straight limb with round ends from one point to another; `end`: radius at `stop`, 0 for the same."""
+    """Return a straight limb with round ends; `end`: radius at `stop`, 0 for the same."""
     a, b = np.asarray(start, np.float64), np.asarray(stop, np.float64)
     last = end or radius
     axis = (b - a) / np.linalg.norm(b - a)
@@ -220,7 +220,7 @@ def rod(start: Point | Array, stop: Point | Array, radius: float, end: float = 0
 
 
 def ring(radius: float, thick: float, around: int = 32, sides: int = 14) -> Mesh:
-    """A torus in the plane z = 0: `radius` of its centre line, `thick` of its tube."""
+    """Return a torus in the plane z = 0: `radius` of its centre line, `thick` of its tube."""
     turn = np.linspace(-np.pi, np.pi, sides + 1)
     line = [(radius + thick * float(np.cos(t)), thick * float(np.sin(t))) for t in turn]
     mesh = lathe(line, around, cell=1.0)
@@ -230,14 +230,14 @@ def ring(radius: float, thick: float, around: int = 32, sides: int = 14) -> Mesh
 
 
 def cone(radius: float, height: float, top: float = 0.0, around: int = 28) -> Mesh:
-    """A closed (cut) cone standing on z = 0."""
+    """Return a closed (cut) cone standing on z = 0."""
     cap = [lathe([(top, height), (0.0, height)], around, 0.02)] if top > 0 else []
     side = lathe([(radius, 0.0), (top, height)], around, 0.02)
     return join([lathe([(0.0, 0.0), (radius, 0.0)], around, 0.02), side, *cap])
 
 
 def pillow(width: float, depth: float, height: float, power: float = 5.0, around: int = 32) -> Mesh:
-    """A box with rounded edges standing on z = 0; `power` 2 is an ellipsoid, 8 nearly a box.
+    """Return a box with rounded edges standing on z = 0; `power` 2 is an ellipsoid, 8 nearly a box.
 
     A superellipsoid |x|^p + |y|^p + |z|^p = 1, stretched (Barr 1981).
     """
@@ -251,7 +251,7 @@ def pillow(width: float, depth: float, height: float, power: float = 5.0, around
 
 
 def plate_of(outline: Array, thickness: float, centre: tuple[float, float] = (0.0, 0.0)) -> Mesh:
-    """A board lying on z = 0 with a star-shaped outline.
+    """Return a board lying on z = 0 with a star-shaped outline.
 
     outline: (N, 2) x and y, counter-clockwise, every point visible from `centre`. Corners of more than
     40 degrees stay sharp, the others are smooth.

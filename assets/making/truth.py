@@ -70,7 +70,7 @@ class Truth:
 
 
 def read_truth(dataset: Path) -> Truth:
-    """The truth beside the photographs; InputError where there is none."""
+    """Return the truth beside the photographs; InputError where there is none."""
     folder = dataset / "truth"
     if not (folder / "labels.json").is_file():
         raise InputError(
@@ -93,7 +93,7 @@ def read_truth(dataset: Path) -> Truth:
 
 
 def _asked(region: Region) -> Iterator[tuple[str, str]]:
-    """The phrases that are asked about one region: (text, kind)."""
+    """Return the phrases that are asked about one region: (text, kind)."""
     if region.level == "whole" and region.thing:
         yield region.thing, "object"
         if region.colour:

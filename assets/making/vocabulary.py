@@ -79,17 +79,17 @@ BULK = frozenset(
 
 
 def object_words(word: str) -> tuple[str, ...]:
-    """An object's word and its synonyms."""
+    """Return an object's word and its synonyms."""
     return (word, *OBJECT_SYNONYMS.get(word, ()))
 
 
 def part_words(word: str) -> tuple[str, ...]:
-    """A part's word and its synonyms."""
+    """Return a part's word and its synonyms."""
     return (word, *PART_SYNONYMS.get(word, ()))
 
 
 def colour_words(word: str) -> tuple[str, ...]:
-    """A colour's word and its synonyms; none for ""."""
+    """Return a colour's word and its synonyms; none for ""."""
     return COLOUR_SYNONYMS.get(word, (word,)) if word else ()
 
 
@@ -105,12 +105,12 @@ def material_phrases(substance: str) -> list[str]:
 
 
 def material_whole_phrases(thing: str, substance: str) -> list[str]:
-    """A material and an object, e.g. "wooden chair"; none for ""."""
+    """Return a material and an object, e.g. "wooden chair"; none for ""."""
     return [f"{word} {name}" for word in MATERIALS.get(substance, ())[:1] for name in object_words(thing)]
 
 
 def material_part_phrases(part: str, thing: str, substance: str) -> list[str]:
-    """A material and a part, e.g. "wooden leg", "wooden chair leg"; none for ""."""
+    """Return a material and a part, e.g. "wooden leg", "wooden chair leg"; none for ""."""
     return [
         phrase
         for word in MATERIALS.get(substance, ())[:1]
@@ -181,7 +181,7 @@ class Label:
 
 
 def label_region(level: int, thing: Thing, piece: Piece) -> Label:
-    """The label of the region that `piece` represents at a level; a part's colour is its first piece's."""
+    """Label the region that `piece` represents at a level; a part's colour is its first piece's."""
     same_part = [p for p in thing.pieces if (p.part, p.instance) == (piece.part, piece.instance)]
     if level == 2:
         word, colour, inside = thing.word, thing.colour, list(thing.pieces)
@@ -219,7 +219,7 @@ class PhraseBook:
 
 
 def phrase_book(labels: list[Label]) -> PhraseBook:
-    """The phrases for a set of labels, and every object in every colour beside them."""
+    """Return the phrases for a set of labels, and every object in every colour beside them."""
     distinct = tuple(dict.fromkeys(labels))
     kinds = _kinds(distinct)
     phrases = tuple(kinds)

@@ -48,8 +48,10 @@ def _base(thing: Thing) -> Array:
 
 
 def apart(one: Array, other: Array, gap: float) -> Array:
-    """(...) whether rectangles (..., 4, 2) keep a distance of `gap` from one rectangle (4, 2) along one of
-    the four directions of their sides."""
+    """Return (...) bool: rectangles (..., 4, 2) keep a distance of `gap` from one rectangle (4, 2).
+
+    The distance is along one of the four directions of their sides.
+    """
     axes = np.concatenate(
         [np.diff(one[..., :3, :], axis=-2), np.diff(np.broadcast_to(other, one.shape)[..., :3, :], axis=-2)],
         axis=-2,
@@ -164,7 +166,7 @@ def _chosen(kit: Kit, plan: _Plan) -> list[Thing]:
 
 
 def _filled(host: Placed, kit: Kit) -> list[Placed]:
-    """The thing itself, and fruit in it where it is a bowl or a plate."""
+    """Return the thing itself, and fruit in it where it is a bowl or a plate."""
     if host.thing.word not in ("bowl", "plate"):
         return [host]
     builder, words = TABLE_TOP[kit.pick("orange", "apple")]
@@ -229,7 +231,7 @@ class World:
 
 
 def build_room(seed: int, tier: Tier = "clutter") -> World:
-    """The furnished room of a seed: the same arguments always give the same room, object for object.
+    """Return the furnished room of a seed: the same arguments always give the same room, object for object.
 
     tier: "separate" objects at a distance, "clutter" on the table and the floor, or "occlusion": packed
     tightly, with look-alikes (the same class in other colours, the same colour on other classes).

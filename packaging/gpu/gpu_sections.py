@@ -1,7 +1,7 @@
 """What a machine with a GPU is asked, section by section; `packaging/gpu/run.py` gives each its own process.
 
 Every section is a function `measure_NAME(plan)`, which yields pieces of Markdown as they are found, so that a
-section that is stopped leaves what it had. It raises `Missing` where the machine lacks what it is about.
+section that is stopped leaves what it had. It raises `MissingError` where the machine lacks what it is about.
 
     python -m gpu_sections NAME PLAN REPORT.md
 
@@ -62,7 +62,7 @@ from langsplat_core.training.radiance.trainer import train_radiance
 from tests.support import torch_raster as torch_reference
 
 
-class Missing(Exception):
+class MissingError(Exception):
     """What the section needs is not on this machine; its text is the reason, one line."""
 
 
@@ -128,9 +128,9 @@ def _cell(value: object) -> str:
 
 
 def need_cuda() -> None:
-    """Raise Missing unless gsplat has its device."""
+    """Raise MissingError unless gsplat has its device."""
     if not gsplat.has_device():
-        raise Missing("no CUDA device")
+        raise MissingError("no CUDA device")
 
 
 def milliseconds(call: Callable[[], object], times: int = 10) -> float:
@@ -361,7 +361,7 @@ POINTS = 10_000  # of the scene's own centres, shaken, in place of structure fro
 
 
 def bundled_scene(plan: Plan) -> Scene:
-    """The demo, at most so many of its Gaussians, without what they mean."""
+    """Return the demo, at most so many of its Gaussians, without what they mean."""
     whole = load_scene(Path(str(files("langsplat_assets"))) / "demo" / "scene.ply")
     rows = np.arange(min(len(whole.gaussians), plan.most))
     return Scene(whole.gaussians.take(rows), cameras=whole.cameras)
@@ -472,10 +472,10 @@ def measure_opengl(plan: Plan) -> Iterator[str]:
     try:
         context = create_egl_context()
     except BackendError as error:
-        raise Missing(f"no OpenGL: {error}") from error
+        raise MissingError(f"no OpenGL: {error}") from error
     with context:
         if is_software(context):
-            raise Missing(f"no GPU's OpenGL driver, only {context.info['GL_RENDERER']}")
+            raise MissingError(f"no GPU's OpenGL driver, only {context.info['GL_RENDERER']}")
         yield from tables(plan, context)
 
 
@@ -640,7 +640,7 @@ def measure_tests(plan: Plan) -> Iterator[str]:
     """Run the plan's tests, and yield the end of pytest's output."""
     need_cuda()
     if find_spec("pytest") is None or find_spec("hypothesis") is None:
-        raise Missing("no pytest or no hypothesis")
+        raise MissingError("no pytest or no hypothesis")
     yield f"# Tests: pytest {' '.join(plan.tests)}\n"
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "--measured", *plan.tests]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
@@ -664,7 +664,7 @@ def main(name: str, plan: str, report: Path) -> int:
             pieces.append(piece)
             with atomic_path(report) as path:
                 path.write_text("\n".join(pieces))
-    except Missing as reason:
+    except MissingError as reason:
         print(reason, file=sys.stderr)
         return ABSENT
     return 0

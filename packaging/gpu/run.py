@@ -44,6 +44,7 @@ class Outcome:
 
     @property
     def failed(self) -> bool:
+        """True where it ended with an error or was stopped."""
         return self.state.startswith(("failed", "stopped"))
 
 
@@ -75,7 +76,7 @@ def run_section(name: str, plan: str, report: Path, limit: float) -> Outcome:
 
 
 def summary(outcomes: list[Outcome], head: str) -> str:
-    """The page that says what ran, what did not, and why."""
+    """Return the page that says what ran, what did not, and why."""
     lines = [
         "# On a machine with a GPU",
         "",
@@ -141,7 +142,7 @@ def main() -> int:
 
 
 def write(folder: Path, outcomes: list[Outcome], reports: dict[str, Path]) -> None:
-    """A page for every section that found something, and the summary."""
+    """Return a page for every section that found something, and the summary."""
     folder.mkdir(parents=True, exist_ok=True)
     environment = reports.get("environment")
     head = environment.read_text() if environment and environment.exists() else ""
