@@ -11,8 +11,8 @@ from scipy.ndimage import binary_dilation, binary_erosion
 
 from assets.making.config import TIERS, EncoderConfig
 from assets.making.kit import COLOURS, from_lch, random_colour, to_display, to_lch, to_linear
-from assets.making.render import Light, Picture, Renderer, noise
-from assets.making.vocabulary import Label
+from assets.making.render import Light, RenderedView, Renderer, noise
+from assets.making.vocabulary import RegionLabel
 from assets.making.world import World, build_room
 from langsplat_core.arrays import Array
 from langsplat_core.io.files import atomic_path
@@ -27,7 +27,7 @@ _LEAST = (40, 60, 90)  # px: smaller visible regions of a level are not used
 _ROOMS_PER_FILE = 10
 _HELD_OUT = 1_000_000  # room seeds from here on are never trained with
 _TIER_SHARES = (0.35, 0.5, 0.15)  # of the rooms
-_CLUTTER = Label(-1, "", "", "", "", ())  # generic: the canonical phrases are right, no other
+_CLUTTER = RegionLabel(-1, "", "", "", "", ())  # generic: the canonical phrases are right, no other
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,9 @@ class CropSet:
     """Crops and what each one shows."""
 
     images: Array  # (N, 64, 64, 3) uint8
-    labels: tuple[Label, ...]  # N; level -1 with no colour: clutter; level -1 with a colour: only that colour
+    labels: tuple[
+        RegionLabel, ...
+    ]  # N; level -1: clutter, or nothing but its colour
 
     def save(self, path: Path) -> None:
         """Write one compressed file."""
@@ -51,7 +53,7 @@ class CropSet:
             images = data["images"]
         for row in rows:
             row["hues"], row["materials"] = tuple(row["hues"]), tuple(row.get("materials", ()))
-        return CropSet(images, tuple(Label(**row) for row in rows))
+        return CropSet(images, tuple(RegionLabel(**row) for row in rows))
 
     @staticmethod
     def join(sets: list["CropSet"]) -> "CropSet":
@@ -69,7 +71,7 @@ def room_crops(seed: int, views: int) -> CropSet:
     light = Light(position, rng.uniform(0.3, 0.9), rng.uniform(0.6, 1.15), rng.uniform(0.75, 1.3))
     renderer = Renderer(world, light, samples=10)
     images: list[Array] = []
-    labels: list[Label] = []
+    labels: list[RegionLabel] = []
     for _ in range(views):
         picture = renderer.picture(_random_camera(rng), oversample=1)
         image = _photograph(picture.image, rng)
@@ -88,7 +90,7 @@ def plain_crops(count: int, seed: int) -> CropSet:
         if rng.random() < 0.75:
             word = str(rng.choice(COLOURS))
             image = _coloured(word, rng)
-            label = Label(-1, "", "", word, "", (word,))
+            label = RegionLabel(-1, "", "", word, "", (word,))
         else:
             image, label = _meaningless(rng), _CLUTTER
         images.append(masked_crop(_photograph(image, rng), mask, CROP))
@@ -128,10 +130,12 @@ def _photograph(image: Array, rng: np.random.Generator) -> Array:
     return np.clip(np.asarray(result) + grain, 0, 255).astype(np.uint8)
 
 
-def _regions(world: World, picture: Picture, rng: np.random.Generator) -> list[tuple[Array, Label]]:
+def _regions(
+    world: World, picture: RenderedView, rng: np.random.Generator
+) -> list[tuple[Array, RegionLabel]]:
     """One imperfect mask for every region that is large enough; equal regions of two levels once."""
     ids = np.where(picture.pieces[..., None] >= 0, world.ids[picture.pieces], -1)
-    found: list[tuple[Array, Label]] = []
+    found: list[tuple[Array, RegionLabel]] = []
     seen: set[tuple[int, int, int]] = set()
     for level in (2, 1, 0):
         for number, count in zip(*np.unique(ids[..., level], return_counts=True), strict=True):
@@ -188,12 +192,14 @@ def _imperfect(mask: Array, rng: np.random.Generator) -> Array:
     return result
 
 
-def _clutter(world: World, picture: Picture, rng: np.random.Generator) -> list[tuple[Array, Label]]:
+def _clutter(
+    world: World, picture: RenderedView, rng: np.random.Generator
+) -> list[tuple[Array, RegionLabel]]:
     """Masks that cover bits of several objects, so that no word is right for them."""
     height, width = picture.pieces.shape
     wholes = np.where(picture.pieces >= 0, world.ids[picture.pieces, 2], -1)
     y, x = np.mgrid[:height, :width]
-    found: list[tuple[Array, Label]] = []
+    found: list[tuple[Array, RegionLabel]] = []
     for _ in range(14):
         cy, cx, r = rng.uniform(0, height), rng.uniform(0, width), rng.uniform(20, 90)
         wave = 1 + 0.3 * np.sin(3 * np.arctan2(y - cy, x - cx) + rng.uniform(0, 6))

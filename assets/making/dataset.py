@@ -10,7 +10,7 @@ from scipy.ndimage import binary_fill_holes, find_objects
 from scipy.ndimage import label as connected
 
 from assets.making.config import LabelLayout, Tier
-from assets.making.render import Light, Picture, Renderer
+from assets.making.render import Light, RenderedView, Renderer
 from assets.making.truth import Phrase, Truth, read_truth
 from assets.making.world import World, build_room
 from langsplat_core.arrays import Array
@@ -91,7 +91,7 @@ def photographed_room(seed: int, tier: Tier = "clutter") -> World:
     return build_room(FIRST_ROOM + seed, tier)
 
 
-def truth_ids(world: World, picture: Picture) -> Array:
+def truth_ids(world: World, picture: RenderedView) -> Array:
     """(3, H, W) int32 label ids of a picture at subpart, part and whole level, -1 where nothing is."""
     ids = np.where(picture.pieces[..., None] >= 0, world.ids[picture.pieces], -1)
     return np.moveaxis(ids, -1, 0).astype(np.int32)

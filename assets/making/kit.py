@@ -10,7 +10,7 @@ from typing import Literal, TypeVar, get_args
 
 import numpy as np
 
-from assets.making.shapes import Mesh
+from assets.making.shapes import TriMesh
 from langsplat_core.arrays import Array
 
 Texture = Literal[
@@ -121,7 +121,7 @@ class Piece:
 
     part: str  # word of the part, e.g. "handle"
     subpart: str  # word of the finer region, "" where the part has none
-    mesh: Mesh
+    mesh: TriMesh
     material: Material
     instance: int = 0  # tells equal parts of one object apart, e.g. four wheels
 

@@ -469,7 +469,7 @@ def shade(s, triangle, uv, eye, out):  # type: ignore[no-untyped-def]
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class RenderedView:
     """One rendered view."""
 
     image: Array  # (H, W, 3) uint8 sRGB
@@ -486,7 +486,7 @@ class Renderer:
         self._tracer = Tracer(world)
         self._surfaces = surfaces(world, light, bake(self._tracer, world, light, samples, cell))
 
-    def picture(self, camera: Camera, oversample: int = 2) -> Picture:
+    def picture(self, camera: Camera, oversample: int = 2) -> RenderedView:
         """Render a view with `oversample` rays per pixel and axis; labels are those of pixel centres."""
         fine = camera.resized(camera.width * oversample, camera.height * oversample)
         triangle, uv, depth = self._cast(fine)
@@ -497,7 +497,7 @@ class Renderer:
             triangle, _, depth = self._cast(camera)
         pieces = np.where(triangle >= 0, self._world.piece_of[triangle], -1).astype(np.int32)
         shape = (camera.height, camera.width)
-        return Picture(image, pieces.reshape(shape), depth.reshape(shape))
+        return RenderedView(image, pieces.reshape(shape), depth.reshape(shape))
 
     def _cast(self, camera: Camera) -> tuple[Array, Array, Array]:
         """First surface at pixel centres: (H*W,) triangle or -1, (H*W, 2) barycentrics, (H*W,) depth."""

@@ -1,6 +1,6 @@
 """Triangle meshes of simple solids, as plain arrays. Lengths in metres, z points up.
 
-Every builder returns a `Mesh` whose triangles face outwards (counter-clockwise seen from outside).
+Every builder returns a `TriMesh` whose triangles face outwards (counter-clockwise seen from outside).
 """
 
 import itertools
@@ -14,30 +14,30 @@ Point = tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
-class Mesh:
+class TriMesh:
     """Vertices and triangles of one surface."""
 
     vertices: Array  # (V, 3) float64, metres
     triangles: Array  # (T, 3) int64 rows of `vertices`
     normals: Array  # (V, 3) float64, outward, unit length
 
-    def moved(self, offset: tuple[float, float, float] | Array) -> "Mesh":
+    def moved(self, offset: tuple[float, float, float] | Array) -> "TriMesh":
         """Return the mesh shifted by `offset` (3,) metres."""
-        return Mesh(self.vertices + np.asarray(offset, np.float64), self.triangles, self.normals)
+        return TriMesh(self.vertices + np.asarray(offset, np.float64), self.triangles, self.normals)
 
-    def turned(self, rotation: Array) -> "Mesh":
+    def turned(self, rotation: Array) -> "TriMesh":
         """Return the mesh turned about the origin by a (3, 3) rotation."""
-        return Mesh(self.vertices @ rotation.T, self.triangles, self.normals @ rotation.T)
+        return TriMesh(self.vertices @ rotation.T, self.triangles, self.normals @ rotation.T)
 
-    def spun(self, axis: str, degrees: float) -> "Mesh":
+    def spun(self, axis: str, degrees: float) -> "TriMesh":
         """Return the mesh turned about a coordinate axis, right-handed."""
         return self.turned(rotation_about(axis, degrees))
 
-    def stretched(self, factors: tuple[float, float, float]) -> "Mesh":
+    def stretched(self, factors: tuple[float, float, float]) -> "TriMesh":
         """Return the mesh scaled per axis by positive `factors`."""
         normals = self.normals / np.asarray(factors)
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        return Mesh(self.vertices * np.asarray(factors), self.triangles, normals)
+        return TriMesh(self.vertices * np.asarray(factors), self.triangles, normals)
 
 
 def rotation_about(axis: str, degrees: float) -> Array:
@@ -67,25 +67,25 @@ def _vertex_normals(vertices: Array, triangles: Array) -> Array:
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-15)
 
 
-def sheet(width: float, height: float, cell: float) -> Mesh:
+def sheet(width: float, height: float, cell: float) -> TriMesh:
     """Return a rectangle in the plane z = 0, centred, facing +z, in cells of about `cell` metres."""
     nx, ny = max(int(np.ceil(width / cell)), 1) + 1, max(int(np.ceil(height / cell)), 1) + 1
     x, y = np.meshgrid(np.linspace(-width / 2, width / 2, nx), np.linspace(-height / 2, height / 2, ny))
     vertices = np.stack([x.ravel(), y.ravel(), np.zeros(nx * ny)], 1)
-    return Mesh(vertices, _grid_triangles(ny, nx), np.tile([0.0, 0.0, 1.0], (nx * ny, 1)))
+    return TriMesh(vertices, _grid_triangles(ny, nx), np.tile([0.0, 0.0, 1.0], (nx * ny, 1)))
 
 
-def join(meshes: list[Mesh]) -> Mesh:
+def join(meshes: list[TriMesh]) -> TriMesh:
     """Several surfaces as one."""
     offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
-    return Mesh(
+    return TriMesh(
         np.concatenate([mesh.vertices for mesh in meshes]),
         np.concatenate([mesh.triangles + o for mesh, o in zip(meshes, offsets, strict=True)]),
         np.concatenate([mesh.normals for mesh in meshes]),
     )
 
 
-def box(width: float, depth: float, height: float, cell: float = 0.02) -> Mesh:
+def box(width: float, depth: float, height: float, cell: float = 0.02) -> TriMesh:
     """Return a cuboid along x, y, z standing on z = 0, centred in x and y."""
     w, d, h = width, depth, height
     sides = []
@@ -101,7 +101,7 @@ def box(width: float, depth: float, height: float, cell: float = 0.02) -> Mesh:
     return join(sides).moved((0, 0, h / 2))
 
 
-def lathe(profile: list[tuple[float, float]], around: int = 32, cell: float = 0.01) -> Mesh:
+def lathe(profile: list[tuple[float, float]], around: int = 32, cell: float = 0.01) -> TriMesh:
     """Return a surface of revolution about z through (radius, z) points, listed from bottom to top.
 
     Going up with positive radius the surface faces outwards; going down it faces the axis (a vessel's
@@ -119,18 +119,18 @@ def lathe(profile: list[tuple[float, float]], around: int = 32, cell: float = 0.
     tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
     out, up = tangent[:, 1:], -tangent[:, :1]  # the tangent turned by -90 degrees
     normals = np.stack([out * np.cos(angle), out * np.sin(angle), up + 0 * angle], -1)
-    return Mesh(vertices.reshape(-1, 3), _grid_triangles(len(line), around + 1), normals.reshape(-1, 3))
+    return TriMesh(vertices.reshape(-1, 3), _grid_triangles(len(line), around + 1), normals.reshape(-1, 3))
 
 
-def ball(radius: float, around: int = 28) -> Mesh:
+def ball(radius: float, around: int = 28) -> TriMesh:
     """Return a sphere centred at the origin."""
     angle = np.linspace(-np.pi / 2, np.pi / 2, around // 2 + 1)
     profile = [(radius * max(float(np.cos(a)), 0.0), radius * float(np.sin(a))) for a in angle]
     mesh = lathe(profile, around, cell=1.0)
-    return Mesh(mesh.vertices, mesh.triangles, mesh.vertices / radius)
+    return TriMesh(mesh.vertices, mesh.triangles, mesh.vertices / radius)
 
 
-def cylinder(radius: float, height: float, around: int = 28, cell: float = 0.015) -> Mesh:
+def cylinder(radius: float, height: float, around: int = 28, cell: float = 0.015) -> TriMesh:
     """Return a closed cylinder standing on z = 0; its edges are sharp."""
     top = lathe([(radius, height), (0.0, height)], around, cell)
     side = lathe([(radius, 0.0), (radius, height)], around, cell)
@@ -138,7 +138,7 @@ def cylinder(radius: float, height: float, around: int = 28, cell: float = 0.015
     return join([bottom, side, top])
 
 
-def tube(path: Array, radius: float | Array, around: int = 12) -> Mesh:
+def tube(path: Array, radius: float | Array, around: int = 12) -> TriMesh:
     """Return a pipe along `path` (N, 3) with one radius or (N,) radii; closed when the radii end at zero."""
     path = np.asarray(path, np.float64)
     radii = np.broadcast_to(np.asarray(radius, np.float64), (len(path),))
@@ -154,7 +154,7 @@ def tube(path: Array, radius: float | Array, around: int = 12) -> Mesh:
         rings.append(point + r * (np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * other))
     vertices = np.concatenate(rings)
     triangles = _grid_triangles(len(path), around + 1)
-    return Mesh(vertices, triangles, _vertex_normals(vertices, triangles))
+    return TriMesh(vertices, triangles, _vertex_normals(vertices, triangles))
 
 
 def arc(centre: tuple[float, float], radius: float, start: float, stop: float, count: int = 14) -> Array:
@@ -165,7 +165,7 @@ def arc(centre: tuple[float, float], radius: float, start: float, stop: float, c
     )
 
 
-def slab(outline: list[tuple[float, float]], thickness: float, cell: float = 0.02) -> Mesh:
+def slab(outline: list[tuple[float, float]], thickness: float, cell: float = 0.02) -> TriMesh:
     """Return a convex polygon (counter-clockwise, x and z) extruded along y by `thickness`, centred in y."""
     points = np.array(outline)
     n = len(points)
@@ -173,18 +173,18 @@ def slab(outline: list[tuple[float, float]], thickness: float, cell: float = 0.0
     front = np.stack([points[:, 0], np.full(n, -thickness / 2), points[:, 1]], 1)
     back = front + (0, thickness, 0)
     faces = [
-        Mesh(front, fan, np.tile([0.0, -1.0, 0.0], (n, 1))),
-        Mesh(back, fan[:, ::-1], np.tile([0.0, 1.0, 0.0], (n, 1))),
+        TriMesh(front, fan, np.tile([0.0, -1.0, 0.0], (n, 1))),
+        TriMesh(back, fan[:, ::-1], np.tile([0.0, 1.0, 0.0], (n, 1))),
     ]
     for i in range(n):
         j = (i + 1) % n
         vertices = np.stack([front[i], front[j], back[j], back[i]])
         triangles = np.array([[0, 2, 1], [0, 3, 2]])
-        faces.append(Mesh(vertices, triangles, _vertex_normals(vertices, triangles)))
+        faces.append(TriMesh(vertices, triangles, _vertex_normals(vertices, triangles)))
     return _refined(join(faces), cell)
 
 
-def _refined(mesh: Mesh, cell: float) -> Mesh:
+def _refined(mesh: TriMesh, cell: float) -> TriMesh:
     """Cut flat faces into triangles with edges of at most `cell`, since light is kept per vertex."""
     corners, normals = mesh.vertices[mesh.triangles], mesh.normals[mesh.triangles]
     while True:
@@ -200,10 +200,12 @@ def _refined(mesh: Mesh, cell: float) -> Mesh:
         corners = np.concatenate([corners[~split], *halves])
         normals = np.concatenate([normals[~split], normals[split], normals[split]])
     count = len(corners)
-    return Mesh(corners.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3), normals.reshape(-1, 3))
+    return TriMesh(corners.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3), normals.reshape(-1, 3))
 
 
-def rod(start: Point | Array, stop: Point | Array, radius: float, end: float = 0.0, around: int = 14) -> Mesh:
+def rod(
+    start: Point | Array, stop: Point | Array, radius: float, end: float = 0.0, around: int = 14
+) -> TriMesh:
     """Return a straight limb with round ends; `end`: radius at `stop`, 0 for the same."""
     a, b = np.asarray(start, np.float64), np.asarray(stop, np.float64)
     last = end or radius
@@ -216,27 +218,27 @@ def rod(start: Point | Array, stop: Point | Array, radius: float, end: float = 0
     centre = np.where((np.arange(len(heads)) < 5)[:, None], a, b).repeat(around + 1, axis=0)
     normals = mesh.vertices - centre
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return Mesh(mesh.vertices, mesh.triangles, normals)
+    return TriMesh(mesh.vertices, mesh.triangles, normals)
 
 
-def ring(radius: float, thick: float, around: int = 32, sides: int = 14) -> Mesh:
+def ring(radius: float, thick: float, around: int = 32, sides: int = 14) -> TriMesh:
     """Return a torus in the plane z = 0: `radius` of its centre line, `thick` of its tube."""
     turn = np.linspace(-np.pi, np.pi, sides + 1)
     line = [(radius + thick * float(np.cos(t)), thick * float(np.sin(t))) for t in turn]
     mesh = lathe(line, around, cell=1.0)
     flat = np.hypot(mesh.vertices[:, 0], mesh.vertices[:, 1])[:, None]
     centre = mesh.vertices * (1, 1, 0) * (radius / flat)
-    return Mesh(mesh.vertices, mesh.triangles, (mesh.vertices - centre) / thick)
+    return TriMesh(mesh.vertices, mesh.triangles, (mesh.vertices - centre) / thick)
 
 
-def cone(radius: float, height: float, top: float = 0.0, around: int = 28) -> Mesh:
+def cone(radius: float, height: float, top: float = 0.0, around: int = 28) -> TriMesh:
     """Return a closed (cut) cone standing on z = 0."""
     cap = [lathe([(top, height), (0.0, height)], around, 0.02)] if top > 0 else []
     side = lathe([(radius, 0.0), (top, height)], around, 0.02)
     return join([lathe([(0.0, 0.0), (radius, 0.0)], around, 0.02), side, *cap])
 
 
-def pillow(width: float, depth: float, height: float, power: float = 5.0, around: int = 32) -> Mesh:
+def pillow(width: float, depth: float, height: float, power: float = 5.0, around: int = 32) -> TriMesh:
     """Return a box with rounded edges standing on z = 0; `power` 2 is an ellipsoid, 8 nearly a box.
 
     A superellipsoid |x|^p + |y|^p + |z|^p = 1, stretched (Barr 1981).
@@ -247,10 +249,10 @@ def pillow(width: float, depth: float, height: float, power: float = 5.0, around
     normals = np.sign(point) * np.abs(point) ** (power - 1) / half
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     triangles = ball(1.0, around).triangles
-    return Mesh(point * half + (0, 0, half[2]), triangles, normals)
+    return TriMesh(point * half + (0, 0, half[2]), triangles, normals)
 
 
-def plate_of(outline: Array, thickness: float, centre: tuple[float, float] = (0.0, 0.0)) -> Mesh:
+def plate_of(outline: Array, thickness: float, centre: tuple[float, float] = (0.0, 0.0)) -> TriMesh:
     """Return a board lying on z = 0 with a star-shaped outline.
 
     outline: (N, 2) x and y, counter-clockwise, every point visible from `centre`. Corners of more than
@@ -263,7 +265,7 @@ def plate_of(outline: Array, thickness: float, centre: tuple[float, float] = (0.
     fan = np.stack([np.full(n, n), np.arange(n), after], 1)
     top = np.column_stack([rim, np.full(n + 1, thickness)])
     up = np.tile([0.0, 0.0, 1.0], (n + 1, 1))
-    faces = [Mesh(top, fan, up), Mesh(top - (0, 0, thickness), fan[:, ::-1], -up)]
+    faces = [TriMesh(top, fan, up), TriMesh(top - (0, 0, thickness), fan[:, ::-1], -up)]
     edge = points[after] - points
     out = np.stack([edge[:, 1], -edge[:, 0]], 1) / np.linalg.norm(edge, axis=1, keepdims=True)
     for i in range(n):
@@ -274,7 +276,7 @@ def plate_of(outline: Array, thickness: float, centre: tuple[float, float] = (0.
         corners = np.column_stack([side, [0, 0, thickness, thickness]])
         lean = np.column_stack([np.stack([first, second, second, first]), np.zeros(4)])
         lean /= np.linalg.norm(lean, axis=1, keepdims=True)
-        faces.append(Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), lean))
+        faces.append(TriMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), lean))
     return join(faces)
 
 

@@ -6,7 +6,7 @@ from itertools import chain
 import numpy as np
 
 from assets.making.kit import COLOUR_SYNONYMS, COLOURS, Piece, Thing
-from assets.making.shapes import Mesh
+from assets.making.shapes import TriMesh
 from langsplat_core.arrays import Array
 from langsplat_core.scene import CANONICAL_PHRASES
 
@@ -141,7 +141,7 @@ def part_phrases(part: str, thing: str, colour: str, thing_colour: str) -> list[
 
 
 @dataclass(frozen=True)
-class Label:
+class RegionLabel:
     """Words for one region. An empty word stands for "no single word fits"."""
 
     level: int  # 0 subpart, 1 part, 2 whole; -1 for pictures that show no object
@@ -180,7 +180,7 @@ class Label:
         return tuple(dict.fromkeys([*self.names, *alone]))
 
 
-def label_region(level: int, thing: Thing, piece: Piece) -> Label:
+def label_region(level: int, thing: Thing, piece: Piece) -> RegionLabel:
     """Label the region that `piece` represents at a level; a part's colour is its first piece's."""
     same_part = [p for p in thing.pieces if (p.part, p.instance) == (piece.part, piece.instance)]
     if level == 2:
@@ -196,10 +196,10 @@ def label_region(level: int, thing: Thing, piece: Piece) -> Label:
     main = max(area, key=lambda key: area[key])
     if area[main] < _MOST * sum(area.values()):
         main = ""
-    return Label(level, word, thing.word, colour, thing.colour, hues, main, tuple(sorted(area)))
+    return RegionLabel(level, word, thing.word, colour, thing.colour, hues, main, tuple(sorted(area)))
 
 
-def _area(mesh: Mesh) -> float:
+def _area(mesh: TriMesh) -> float:
     """Square metres."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.triangles], 1, 0)
     return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
@@ -214,11 +214,11 @@ class PhraseBook:
 
     phrases: tuple[str, ...]  # P; the four canonical phrases come first
     kinds: tuple[str, ...]  # (P) "canonical", one of BOOK_KINDS
-    labels: tuple[Label, ...]  # U distinct labels
+    labels: tuple[RegionLabel, ...]  # U distinct labels
     fits: Array  # (U, P) int8: 1 right, 0 wrong, -1 neither (left out of the loss)
 
 
-def phrase_book(labels: list[Label]) -> PhraseBook:
+def phrase_book(labels: list[RegionLabel]) -> PhraseBook:
     """Return the phrases for a set of labels, and every object in every colour beside them."""
     distinct = tuple(dict.fromkeys(labels))
     kinds = _kinds(distinct)
@@ -228,7 +228,7 @@ def phrase_book(labels: list[Label]) -> PhraseBook:
     return PhraseBook(phrases, tuple(kinds.values()), distinct, fits)
 
 
-def _kinds(labels: tuple[Label, ...]) -> dict[str, str]:
+def _kinds(labels: tuple[RegionLabel, ...]) -> dict[str, str]:
     """Every phrase and its kind, the canonical ones first; a phrase of several kinds has the first."""
     kinds: dict[str, str] = dict.fromkeys(CANONICAL_PHRASES, "canonical")
     for colour in COLOURS:
@@ -248,7 +248,7 @@ def _kinds(labels: tuple[Label, ...]) -> dict[str, str]:
     return kinds
 
 
-def _row(label: Label, column: dict[str, int]) -> Array:
+def _row(label: RegionLabel, column: dict[str, int]) -> Array:
     """(P,) int8 of one label: 1 right, 0 wrong, -1 neither."""
     row = np.zeros(len(column), np.int8)
 

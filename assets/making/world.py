@@ -9,7 +9,7 @@ from assets.making.config import Tier
 from assets.making.kit import COLOURS, Kit, Material, Piece, Thing
 from assets.making.objects import BRIGHT, FURNITURE, TABLE_TOP, furniture
 from assets.making.shapes import rotation_about
-from assets.making.vocabulary import Label, label_region
+from assets.making.vocabulary import RegionLabel, label_region
 from langsplat_core.arrays import Array
 
 _CLEARANCE = 0.001  # metres under an object: a flat bottom in the very plane it stands on would flicker
@@ -62,7 +62,7 @@ def apart(one: Array, other: Array, gap: float) -> Array:
 
 
 @dataclass(eq=False)
-class Surface:
+class StandingArea:
     """A level rectangle that carries things, and what stands on it already."""
 
     centre: Array  # (3,) metres
@@ -98,7 +98,7 @@ class _Plan:
     table: int  # objects to try to place on the table
     floor: int  # and around it
     gap: float  # metres between footprints
-    crowd: int  # see Surface
+    crowd: int  # see StandingArea
     classes: int  # different classes among them; 0: all different
     largest: float = 1.0  # square metres of an object's footprint
 
@@ -116,9 +116,9 @@ def furnished(seed: int, tier: Tier) -> list[Placed]:
     kit, plan = Kit(rng), _PLANS[tier]
     room = _large_things(kit)
     objects = _chosen(kit, plan)
-    table = Surface(np.zeros(3), _HALF_TABLE, plan.gap, ENLARGED, plan.crowd)
+    table = StandingArea(np.zeros(3), _HALF_TABLE, plan.gap, ENLARGED, plan.crowd)
     on_table = [table.stand(thing, rng) for thing in _wide_first(objects[: plan.table])]
-    floor = Surface(np.array([0, 0, -furniture.TABLE_HEIGHT]), np.array([1.5, 1.5]), 0.03, ENLARGED)
+    floor = StandingArea(np.array([0, 0, -furniture.TABLE_HEIGHT]), np.array([1.5, 1.5]), 0.03, ENLARGED)
     floor.taken = [
         footprint(item) for item in room if item.thing.word not in ("floor", "rug", "wall", "picture")
     ]
@@ -226,7 +226,7 @@ class World:
     materials: tuple[Material, ...]
     frames: Array  # (P, 3, 3) rotation of every piece from its object's frame into the world
     ids: Array  # (P, 3) int32 label ids of every piece: subpart, part, whole
-    labels: tuple[Label, ...]  # indexed by id
+    labels: tuple[RegionLabel, ...]  # indexed by id
     solid: Array  # (T,) bool: surfaces that an outline of the room's objects should cover (not the room)
 
 
@@ -242,7 +242,7 @@ def build_room(seed: int, tier: Tier = "clutter") -> World:
 def assemble(placed: list[Placed]) -> World:
     """One set of arrays from placed things; ids count up through wholes, parts and subparts."""
     columns: dict[str, list[Array]] = {key: [] for key in ("v", "n", "l", "t", "p")}
-    labels: list[Label] = []
+    labels: list[RegionLabel] = []
     known: dict[tuple[object, ...], int] = {}
     ids: list[list[int]] = []
     materials: list[Material] = []

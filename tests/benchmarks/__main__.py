@@ -5,7 +5,6 @@ from typing import Union
 
 from langsplat_core.cli.run import Command, main, parsed, with_codec
 from tests.benchmarks.answers import Rooms, Verdicts
-from tests.benchmarks.evidence import Votes
 from tests.benchmarks.few import Few
 from tests.benchmarks.geometry import Clean, Maps, Meshes
 from tests.benchmarks.library import Changed, Found
@@ -20,7 +19,7 @@ def parse(args: list[str]) -> Command:
     """The report that the words of a command line name; SystemExit as tyro raises it."""
     about = "Measure this project where the truth is known, and at large sizes."
     known = (
-        *(Rooms, Verdicts, Phrases, Votes, Clean, Maps, Meshes),
+        *(Rooms, Verdicts, Phrases, Clean, Maps, Meshes),
         *(Lifting, Scale, Found, Changed, Formats, Few),
     )
     reports = tuple(with_codec(report, args) for report in known)

@@ -10,7 +10,7 @@ from PIL import Image
 from assets.making.dataset import FIRST_ROOM, LIGHT, write_transforms
 from assets.making.kit import COLOURS, Kit, Piece, Thing
 from assets.making.objects import FURNITURE, TABLE_TOP, furniture
-from assets.making.render import Light, Picture, Renderer
+from assets.making.render import Light, RenderedView, Renderer
 from assets.making.shapes import ball, cylinder, pillow, rotation_about
 from assets.making.world import ENLARGED, Placed, assemble, bounds, furnished
 from langsplat_core.arrays import Array
@@ -116,7 +116,7 @@ def _named(cameras: list[Camera]) -> list[Camera]:
     return [replace(camera, name=f"view_{number:03d}") for number, camera in enumerate(cameras)]
 
 
-def _with_people(picture: Picture, camera: Camera, place: _Place, kit: Kit) -> Array | None:
+def _with_people(picture: RenderedView, camera: Camera, place: _Place, kit: Kit) -> Array | None:
     """The (H, W, 3) image with people in it; None where they cover too much or too little of it."""
     standing = []
     for _ in range(int(kit.rng.integers(1, 4))):

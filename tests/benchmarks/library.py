@@ -19,7 +19,7 @@ import numpy as np
 from assets.making.dataset import FIRST_ROOM, write_dataset
 from assets.making.kit import Kit, Thing, random_colour
 from assets.making.objects import BRIGHT, TABLE_TOP
-from assets.making.world import ENLARGED, Placed, Surface, assemble, footprint, furnished
+from assets.making.world import ENLARGED, Placed, StandingArea, assemble, footprint, furnished
 from langsplat_core.arrays import Array, unit
 from langsplat_core.config import CountOrZero
 from langsplat_core.extensions.benchmarks.measure import markdown
@@ -213,7 +213,7 @@ def alter(seed: int, placed: list[Placed]) -> tuple[list[Placed], list[Done]]:
 def _stand(thing: Thing, room: list[Placed], rng: np.random.Generator) -> Placed | None:
     """A thing at a free place on the table; None where there is no room."""
     others = [footprint(item) for item in room if item.offset[2] > -0.1]
-    return Surface(np.zeros(3), HALF_TABLE, 0.012, ENLARGED, taken=others).stand(thing, rng)
+    return StandingArea(np.zeros(3), HALF_TABLE, 0.012, ENLARGED, taken=others).stand(thing, rng)
 
 
 def _brought(room: list[Placed], here: set[str], rng: np.random.Generator) -> list[Placed]:

@@ -57,8 +57,7 @@ class Lifting(InRooms):
     def run(self) -> None:
         kept = KeptRows(self.out / "lifting.rows.jsonl")
         rows = self.each(lambda room: measure_methods(room, self, kept))
-        first = [row for row in rows if row.measured.masks == self.masks[0]]
-        publish(self, "lifting", "From masks to answers", method_table(rows), rows, partial(plot, first))
+        publish(self, "lifting", "From masks to answers", method_table(rows), rows)
 
 
 @dataclass(frozen=True)
@@ -178,33 +177,3 @@ def _cell(shares: Array) -> str:
     """(rooms, 3) -> such as "83.8 / 96.0 / 81.6 +/- 5.4"; the spread is that of the first."""
     mean = " / ".join(f"{100 * share:.1f}" for share in shares.mean(axis=0))
     return mean if len(shares) < 2 else f"{mean} +/- {100 * shares[:, 0].std(ddof=1):.1f}"
-
-
-def plot(rows: Sequence[MethodRow], path: Path) -> None:
-    """Accuracy in images and among Gaussians against the time from a phrase to an image; means over rooms,
-    with bars of one standard deviation."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, panels = pyplot.subplots(1, 2, figsize=(10, 5.6), layout="constrained", sharex=True)
-    own = grouped(rows, "measured.name")
-    for panel, (title, column) in zip(panels, (("mIoU in images %", 1), ("IoU in 3D %", 3)), strict=True):
-        for number, (name, same) in enumerate(own.items(), 1):
-            shares = np.array([100 * of_kind(row.measured, "all")[column] for row in same])
-            at = float(np.mean([row.image_ms for row in same])), float(shares.mean())
-            colour = "#0072b2" if name.startswith(OURS) else "#d55e00"
-            # Methods that are equally fast stand above each other: their numbers go to both sides in turn.
-            side = 1 if number % 2 else -1
-            panel.errorbar(*at, yerr=shares.std(), fmt="o", color=colour, capsize=2)
-            style = {"ha": "left" if side > 0 else "right", "va": "center", "textcoords": "offset points"}
-            panel.annotate(str(number), at, (7 * side, 0), fontsize=9, **style)
-        panel.set(xscale="log", xlabel="milliseconds from a phrase to its image", ylabel=title)
-        panel.grid(alpha=0.3)
-    legend = [pyplot.Line2D([], [], linestyle="", label=f"{k}  {name}") for k, name in enumerate(own, 1)]
-    figure.legend(
-        handles=legend, loc="outside lower center", ncols=2, fontsize=8, handlelength=0, frameon=False
-    )
-    figure.savefig(path, dpi=100)
-    pyplot.close(figure)

@@ -19,7 +19,7 @@ from langsplat_core.extensions.benchmarks.measure import markdown
 from langsplat_core.extensions.benchmarks.report import intersection_over_union
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import Body, Viewpoint, body, most, run_phrase, stands, upright, viewpoint
-from langsplat_core.query.describe import Describer, Entry, WordScores
+from langsplat_core.query.describe import Describer, Entry
 from langsplat_core.query.grammar import EXTREMES, SIDES, atoms, parse
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.scene import LEVELS, Camera
@@ -273,9 +273,8 @@ Regions = Mapping[int, Region]  # by truth id
 
 @dataclass(frozen=True)
 class LevelNames:
-    """One way of scoring words, at one level: every region counts once."""
+    """Words for the regions of one level, each of which counts once."""
 
-    how: str
     level: str
     regions: int  # that a word of the vocabulary is right for
     first: float  # share whose most probable word is right
@@ -309,13 +308,7 @@ def name_regions(room: Room) -> RoomWords:
     """Words for every region of one room, and its inventory."""
     describer = Describer(room.engine(METHOD))
     labels, truth = room.labels, room.truth.regions
-    plain = [replace(words, hubs=np.zeros_like(words.hubs)) for words in describer.words]
-    ways = {"plain cosine": plain, "hubs taken out": describer.words}
-    names = [
-        _names(how, words[level], describer, level, _regions(labels[level]), truth)
-        for how, words in ways.items()
-        for level in reversed(range(len(LEVELS)))
-    ]
+    names = [_names(describer, level, _regions(labels[level]), truth) for level in (2, 1, 0)]
     start = time.perf_counter()
     entries = describer.inventory()
     seconds = time.perf_counter() - start
@@ -330,15 +323,9 @@ def _regions(labels: Array) -> dict[int, Array]:
     return {key: rows for key, rows in found.items() if len(rows) >= MIN_GAUSSIANS}
 
 
-def _names(
-    how: str,
-    words: WordScores,
-    describer: Describer,
-    level: int,
-    regions: Mapping[int, Array],
-    truth: Regions,
-) -> LevelNames:
-    field, known, rows = describer.engine.field, describer.engine.field.known[level], []
+def _names(describer: Describer, level: int, regions: Mapping[int, Array], truth: Regions) -> LevelNames:
+    field, known, words = describer.engine.field, describer.engine.field.known[level], describer.words[level]
+    rows = []
     for key, members in regions.items():
         right = np.isin(words.phrases, truth[key].words)
         members = members[known[members]]
@@ -349,7 +336,7 @@ def _names(
         best = np.argsort(-shares, kind="stable")[:TOP]
         rows.append((right[best[0]], right[best].any(), shares[best[0]], shares[right].sum()))
     mean = np.mean(rows, axis=0) if rows else np.zeros(4)
-    return LevelNames(how, LEVELS[level], len(rows), *(float(value) for value in mean))
+    return LevelNames(LEVELS[level], len(rows), *(float(value) for value in mean))
 
 
 def _colours(describer: Describer, regions: Mapping[int, Array], truth: Regions) -> float:
@@ -384,9 +371,9 @@ def score_inventory(
 
 def word_table(rooms: Sequence[RoomWords]) -> str:
     """Both tables as Markdown: names of regions, and inventories."""
-    head = ("room", "words", "level", "regions", "first right %", "one of five %", "p of first", "p of right")
+    head = ("room", "level", "regions", "first right %", "one of five %", "p of first", "p of right")
     names = (
-        (room.seed, row.how, row.level, row.regions, f"{100 * row.first:.0f}", f"{100 * row.among:.0f}")
+        (room.seed, row.level, row.regions, f"{100 * row.first:.0f}", f"{100 * row.among:.0f}")
         + (f"{row.probability:.2f}", f"{row.right:.2f}")
         for room in rooms
         for row in room.names

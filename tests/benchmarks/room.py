@@ -338,17 +338,12 @@ def labelled(progress: Progress, prefix: str) -> Progress:
     return Progress(lambda at: progress.show(replace(at, stage=prefix + at.stage)))
 
 
-def publish(
-    command: Any,
-    name: str,
-    title: str,
-    text: str,
-    rows: Sequence[Any],
-    plot: Callable[[Path], None] | None = None,
-) -> None:
-    """Print a report's tables, and write them with title and command line into `command.out`, beside all
-    figures of its rows, dataclasses, and the settings of its command, another one."""
+def publish(command: Any, name: str, title: str, text: str, rows: Sequence[Any]) -> None:
+    """Print a report's tables, and write them and all figures into `command.out`.
+
+    The figures are those of its rows, dataclasses, and the settings of its command, another one.
+    """
     line = f"python -m tests.benchmarks {shlex.join(sys.argv[1:])}"
     figures = {"settings": asdict(command), "rows": [asdict(row) for row in rows]}
-    write_report(command.out, name, f"# {title}\n\n    {line}\n\n{text}", figures, plot)
+    write_report(command.out, name, f"# {title}\n\n    {line}\n\n{text}", figures)
     print(text)

@@ -2,14 +2,13 @@
 
 * load: a large PLY, read by this program and by plyfile, into the same five arrays. The file has just been
   written, so it is in the system's cache.
-* lift: random masks lifted onto random Gaussians, at several sizes.
 * moving: the coarse images that the viewer draws while the camera moves, step by step as its panel Timing
   has them, beside their distance from the full one.
 * endurance: one process, a scene made large, large images and many phrases.
 
 The report `formats`: what writing a scene in each format and reading it back changes.
 
-Loading and lifting run in fresh interpreters (`fresh`), whose peak memory is that of everything in them.
+Loading runs in fresh interpreters (`fresh`), whose peak memory is that of everything in them.
 """
 
 import itertools
@@ -20,7 +19,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from statistics import mean, median
-from typing import Annotated, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import tyro
@@ -28,7 +27,7 @@ from PIL import Image
 
 from langsplat_core.arrays import Array, psnr, sigmoid, unit
 from langsplat_core.cli.run import OutFolder
-from langsplat_core.config import Count, CountOrZero, PictureConfig, Range
+from langsplat_core.config import Count, CountOrZero, PictureConfig
 from langsplat_core.display.composing import compose_upwards
 from langsplat_core.display.displays import Channels
 from langsplat_core.errors import InputError
@@ -52,13 +51,12 @@ from tests.benchmarks.room import publish
 
 COARSE = ((1.0, False), (0.5, False), (0.25, False), (0.5, True), (0.25, True))  # resolution, whether merged
 PARTS = 4  # that phrases and images are measured in: what grows is seen from one to the next
-Part = Literal["load", "lift", "moving", "endurance"]
-LiftSizes = Annotated[tuple[tuple[Count, Count], ...], Range(1, 1_000_000_000, some=True)]
+Part = Literal["load", "moving", "endurance"]
 
 
 @dataclass(frozen=True)
 class Scale:
-    """Loading, lifting, images while the camera moves and a long session at large sizes: time and memory.
+    """Loading, images while the camera moves and a long session at large sizes: time and memory.
     Half an hour and 8 GB as it stands."""
 
     scene: tyro.conf.Positional[Path] = Path("assets/demo/scene.ply")
@@ -69,10 +67,6 @@ class Scale:
     """load: Gaussians in the file, which takes 248 bytes each in the temporary folder while it runs."""
     repeats: Count = 3
     """load: readings with each program; the fastest counts."""
-    lifted: LiftSizes = ((100_000, 15), (100_000, 30), (200_000, 30), (400_000, 30))
-    """lift: numbers of Gaussians and of views."""
-    picture: Size = (720, 540)
-    """lift: width and height of the views, pixels."""
     moving: CountOrZero = 500_000
     """moving: Gaussians; the scene's are repeated, each beside itself. 0: as they are."""
     moving_size: Size = (1280, 800)
@@ -130,7 +124,7 @@ def measure_loading(command: Scale, progress: Progress = silent) -> list[Loading
         turns = list(itertools.product(range(command.repeats), runs))
         for done, (_, reader) in enumerate(turns):
             progress(f"reading with {reader}", done / len(turns))
-            runs[reader].append(in_fresh_interpreter("read", reader, path))
+            runs[reader].append(in_fresh_interpreter(reader, path))
     right = runs["langsplat"][0]["digest"]
     return [
         Loading(
@@ -152,40 +146,6 @@ def load_table(loadings: Sequence[Loading]) -> str:
     )
     head = ("reader", "seconds", "times ours", "kept, GB", "peak, GB", "same arrays")
     return f"{first.rows} Gaussians, {first.file_bytes / 1e6:.0f} MB\n\n{markdown(head, lines)}"
-
-
-@dataclass(frozen=True)
-class LiftCost:
-    """Lifting at one size."""
-
-    gaussians: int
-    views: int
-    width: int
-    height: int
-    seconds: float
-    peak_bytes: int | None  # of the process; None where the system does not tell
-    kept_bytes: int  # in the work folder
-    relevancy_error: float  # mean, of the codebook
-
-
-def measure_lifts(command: Scale, progress: Progress = silent) -> list[LiftCost]:
-    """Every size, each in a fresh interpreter."""
-    costs = []
-    for count, views in command.lifted:
-        size = (count, views, *command.picture)
-        costs.append(LiftCost(*size, **in_fresh_interpreter("lift", *size)))
-        progress("lifting", len(costs) / len(command.lifted))
-    return costs
-
-
-def lift_table(costs: Sequence[LiftCost]) -> str:
-    lines = (
-        (cost.gaussians, cost.views, f"{cost.width}x{cost.height}", f"{cost.seconds:.0f}")
-        + (_gb(cost.peak_bytes), _gb(cost.kept_bytes), f"{cost.relevancy_error:.4f}")
-        for cost in costs
-    )
-    head = ("Gaussians", "views", "image", "seconds", "peak, GB", "kept on disk, GB", "relevancy error")
-    return markdown(head, lines)
 
 
 @dataclass(frozen=True)
@@ -338,7 +298,6 @@ def _gb(size: int | None) -> str:
 
 REPORTS: Mapping[Part, tuple[Callable[[Scale, Progress], list[Any]], Callable[[Any], str]]] = {
     "load": (measure_loading, load_table),
-    "lift": (measure_lifts, lift_table),
     "moving": (measure_moving, moving_table),
     "endurance": (measure_endurance, endurance_table),
 }

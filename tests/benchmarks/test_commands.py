@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from assets.making import dataset
 from assets.making.scene import SEED
@@ -23,7 +22,7 @@ from langsplat_core.semantics.masks import label_maps
 from tests.benchmarks import scoring
 from tests.benchmarks.__main__ import PROGRAM, parse
 from tests.benchmarks.answers import Rooms, measure_verdicts, variants
-from tests.benchmarks.lifting import KeptRows, Lifting, measure_methods, method_table, plot
+from tests.benchmarks.lifting import KeptRows, Lifting, measure_methods, method_table
 from tests.benchmarks.phrases import Phrases
 from tests.benchmarks.room import HOLD_OUT, RoomSettings, Variant
 from tests.benchmarks.scale import COARSE
@@ -113,7 +112,7 @@ def test_truth_masks_are_the_regions_of_the_truth(run):
         "rooms --codec.kind autoencoder --codec.batch 1",
         "rooms --scene a.ply",
         "rooms --encoder clip-geometry:0.9",
-        "scale --lifted 0 2",
+        "scale --rows 0",
     ],
 )
 def test_mistakes_end_with_one_line(words, capsys, tmp_path, monkeypatch):
@@ -162,9 +161,6 @@ def test_lifting_compares_methods_and_keeps_their_rows(run, tmp_path):
     assert trained.peaks != zeros.peaks
     assert len({row.scores for row in (trained, codebook, subpart)}) == 3
     assert method_table(rows).count("\n") == 2 + len(rows)
-    plot(rows, tmp_path / "a.png")
-    with Image.open(tmp_path / "a.png") as drawn:
-        assert np.asarray(drawn.convert("L")).std() > 5
     with pytest.raises(InputError, match="--only nothing"):
         list(measure_methods(run.room, replace(command, only=("nothing",)), KeptRows(kept)))
     kept.write_text(kept.read_text()[:-20])
@@ -172,7 +168,7 @@ def test_lifting_compares_methods_and_keeps_their_rows(run, tmp_path):
         KeptRows(kept)
 
 
-SMALL = """scale --rows 5001 --repeats 1 --lifted 400 2 --picture 64 48 --moving 0 --moving-size 160 100
+SMALL = """scale --rows 5001 --repeats 1 --moving 0 --moving-size 160 100
 --views 2 --count 3000 --size 40 30 --images 2 --phrases 9"""
 
 
@@ -186,8 +182,6 @@ def test_scale_measures_every_part_at_small_sizes(tmp_path, monkeypatch):
     ours, theirs = (row for row in rows if "reader" in row)
     assert (ours["reader"], theirs["reader"], theirs["same"]) == ("langsplat", "plyfile", True)
     assert ours["kept_bytes"] == theirs["kept_bytes"] == 5001 * 59 * 4
-    (lifted,) = [row for row in rows if "relevancy_error" in row]
-    assert (lifted["gaussians"], lifted["views"]) == (400, 2)
     costs = [row for row in rows if "psnr" in row]
     assert tuple((cost["scale"], cost["merged"]) for cost in costs) == COARSE
     full, half, quarter, half_merged, quarter_merged = costs

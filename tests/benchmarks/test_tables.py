@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from langsplat_core.errors import InputError
 from langsplat_core.extensions.library.changes import Change
 from langsplat_core.query.compose import upright, viewpoint
 from langsplat_core.query.describe import Entry, Spot
-from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import Atom
 from langsplat_core.query.grammar import parse as parse_phrase
 from langsplat_core.scene import Calibration, Odds, look_at
@@ -32,18 +30,11 @@ from tests.benchmarks.answers import (
     verdict_table,
     write_calibration,
 )
-from tests.benchmarks.evidence import (
-    Explained,
-    answer_table,
-    measure_evidence,
-    vote_table,
-)
 from tests.benchmarks.geometry import with_floaters
 from tests.benchmarks.library import FAR, alter, matched, middle
 from tests.benchmarks.phrases import CONSTRUCTIONS, Case, InventoryScore, cases, score_inventory, things_in
 from tests.benchmarks.room import InRooms
 from tests.benchmarks.scale import errors
-from tests.support.fakes import NAMES, PER_BLOB, FakeEncoder, axis, blob_scene
 from tests.support.scenes import random_camera, random_gaussians
 
 TRUE = Odds(-1.0, 18.0, 6.0)
@@ -161,46 +152,6 @@ def test_verdicts_write_tables_and_a_calibration(tmp_path, monkeypatch):
     assert all(10 < Odds(**stated[name]).whole < 30 for name in PAIRS)
 
 
-# -- evidence --
-
-
-def explained(right: bool, fits: tuple[float, ...], replaced: tuple[bool, ...], **figures) -> Explained:
-    return Explained(1, "wrong", "mug", right, fits=fits, replaced=replaced, **figures)
-
-
-VOTES = [
-    explained(True, (2, 1, -1), (False, False, True), probability=0.8, share=0.7, fitting=0.6),
-    explained(True, (1, 0.5), (False, False), probability=0.9, share=0.8, fitting=0.7),
-    explained(False, (2, 0, -2), (False, True, False), probability=0.85, share=0.9, fitting=0.1),
-]
-
-
-def test_evidence_tables_state_roc_areas():
-    """2, 1, 2 and -2 are right, -1 and 0 are not: six of eight pairs lie the right way round."""
-    assert "| wrong | 6 | 2 | 75.0 | 100.0 | 50.0 |" in vote_table(VOTES)
-    assert "| wrong | 3 | 2 | 50.0 | 0.0 | 100.0 |" in answer_table(VOTES)
-
-
-def test_evidence_is_compared_with_the_truth():
-    """A mug that is there, a book that the truth calls a plant."""
-    scene, mask = blob_scene(), np.zeros((3, 120, 160), np.int32)
-    seen = SimpleNamespace(labels=mask, vectors=axis(0)[None])
-    phrases = [SimpleNamespace(text=text, kind="object", ids=(n,)) for text, n in (("mug", 0), ("book", 2))]
-    views = [(camera, seen) for camera in scene.cameras]
-    room = SimpleNamespace(
-        seed=7, views=lambda _: views, labels=np.tile(np.repeat([0, 1, 2], PER_BLOB), (3, 1)),
-        truth=SimpleNamespace(phrases=phrases, absent=lambda _: list(NAMES[3:])),
-        engine=lambda *_: QueryEngine(scene, lambda _: FakeEncoder()),
-    )  # fmt: skip
-    mug, book = measure_evidence(room, "truth")
-    assert (mug.text, mug.right, book.text, book.right) == ("mug", True, "book", False)
-    assert mug.fits == mug.replaced == ()  # the mask is of everything
-    assert mug.share < 0.5
-
-
-# -- changes --
-
-
 def test_altered_room_keeps_all_but_eight_things():
     placed = furnished(FIRST_ROOM + 9, "clutter")
     altered, done = alter(9, placed)
@@ -223,9 +174,6 @@ def test_changes_are_matched_by_kind_and_place():
     assert (len(row.found), len(row.missed), len(row.false)) == (1, 1, 1)
 
 
-# -- floaters --
-
-
 def test_floaters_follow_the_rooms_own_gaussians():
     room, cameras = random_gaussians(500, sh_degree=1), [random_camera(seed) for seed in range(5)]
     made, kinds = with_floaters(room, cameras, seed=3)
@@ -235,9 +183,6 @@ def test_floaters_follow_the_rooms_own_gaussians():
     size = (np.quantile(room.means, 0.98, axis=0) - np.quantile(room.means, 0.02, axis=0)).max()
     near = cKDTree(room.means[sigmoid(room.opacity_logits) > 0.1])
     assert near.query(made.means[kinds == 1])[0].min() > 0.039 * size
-
-
-# -- formats --
 
 
 def test_format_errors_are_those_that_were_made():
@@ -257,8 +202,6 @@ def test_format_errors_are_those_that_were_made():
     bare = replace(want, sh=want.sh[:, :1])  # what is lost is an error too
     assert errors(want, bare)[5] == np.abs(want.sh[:, 1:]).max()
 
-
-# -- phrases with structure, names and inventories --
 
 UP = np.array([0.0, 0.0, 1.0])
 FRAME = upright(UP)

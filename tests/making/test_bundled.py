@@ -29,7 +29,7 @@ from assets.making.encoder import (
 from assets.making.kit import COLOURS, to_lch
 from assets.making.render import Renderer
 from assets.making.scene import SEED, SIZE, VIEWS
-from assets.making.vocabulary import Label, phrase_book
+from assets.making.vocabulary import RegionLabel, phrase_book
 from assets.making.world import World
 from langsplat_core.errors import EncoderError
 from langsplat_core.extensions.benchmarks.report import intersection_over_union
@@ -43,16 +43,16 @@ from tests.benchmarks.scoring import masks_and_peaks
 
 pytestmark = pytest.mark.long
 
-MUG = Label(2, "mug", "mug", "red", "red", ("red", "white"))
-HANDLE = Label(1, "handle", "mug", "red", "red", ("red",))
-BODY = Label(1, "body", "mug", "red", "red", ("red", "white"))
-RIM = Label(0, "rim", "mug", "white", "red", ("white",))
-CLUTTER = Label(-1, "", "", "", "", ())
-GREEN = Label(-1, "", "", "green", "", ("green",))
-LEG = Label(1, "leg", "chair", "brown", "red", ("brown",), "wood", ("wood",))
-CHAIR = Label(2, "chair", "chair", "red", "red", ("brown", "red"), "wood", ("cloth", "wood"))
-PIPE = Label(1, "handle", "pan", "gray", "gray", ("gray",), "metal", ("metal",))
-CUSHION = Label(0, "cushion", "chair", "red", "red", ("red",), "cloth", ("cloth",))
+MUG = RegionLabel(2, "mug", "mug", "red", "red", ("red", "white"))
+HANDLE = RegionLabel(1, "handle", "mug", "red", "red", ("red",))
+BODY = RegionLabel(1, "body", "mug", "red", "red", ("red", "white"))
+RIM = RegionLabel(0, "rim", "mug", "white", "red", ("white",))
+CLUTTER = RegionLabel(-1, "", "", "", "", ())
+GREEN = RegionLabel(-1, "", "", "green", "", ("green",))
+LEG = RegionLabel(1, "leg", "chair", "brown", "red", ("brown",), "wood", ("wood",))
+CHAIR = RegionLabel(2, "chair", "chair", "red", "red", ("brown", "red"), "wood", ("cloth", "wood"))
+PIPE = RegionLabel(1, "handle", "pan", "gray", "gray", ("gray",), "metal", ("metal",))
+CUSHION = RegionLabel(0, "cushion", "chair", "red", "red", ("red",), "cloth", ("cloth",))
 LABELS = [MUG, HANDLE, BODY, RIM, CLUTTER, GREEN, LEG, CHAIR, PIPE, CUSHION]
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from assets.making.kit import Kit, Piece, Thing
 from assets.making.shapes import (
-    Mesh,
+    TriMesh,
     arc,
     ball,
     box,
@@ -64,7 +64,7 @@ def umbrella(kit: Kit, colour: str) -> Thing:
     normals = (outward / np.linalg.norm(outward, axis=-1, keepdims=True)).reshape(-1, 3)
     cells = dome.triangles[:, ::-1]
     points = grid.reshape(-1, 3)
-    inside = Mesh(points - 0.002 * normals, cells[:, ::-1], -normals)
+    inside = TriMesh(points - 0.002 * normals, cells[:, ::-1], -normals)
     wedge = (np.arange(wide * 8).reshape(8, wide) % wide // 5 % 2).ravel()
     odd = np.concatenate([wedge, wedge]) == 1
     rib = [rod((0, 0, h - 0.06), rotation_about("z", 45 * k) @ (0.6 * r, 0, h - 0.25 * r), 0.0018, around=6)
@@ -73,8 +73,8 @@ def umbrella(kit: Kit, colour: str) -> Thing:
                                 [[0, 0, 0.05], [0, 0, 0.075]]]), 0.0075, 12)  # fmt: skip
     canopy = kit.cloth(colour)
     return Thing("umbrella", colour, (
-        Piece("canopy", "", join([Mesh(points, cells[~odd], normals), inside]), canopy),
-        Piece("canopy", "panels", Mesh(points, cells[odd], normals), kit.cloth(kit.pick(colour, second))),
+        Piece("canopy", "", join([TriMesh(points, cells[~odd], normals), inside]), canopy),
+        Piece("canopy", "panels", TriMesh(points, cells[odd], normals), kit.cloth(kit.pick(colour, second))),
         Piece("shaft", "", join([rod((0, 0, 0.07), (0, 0, h + 0.02), 0.0045), *rib]), kit.metal()),
         Piece("handle", "", hook, kit.wood(kit.pick("brown", "beige"))),
     ))  # fmt: skip
@@ -167,7 +167,7 @@ def globe(kit: Kit, colour: str) -> Thing:
     wave = sum(np.cos(sea.normals @ (2.3 * seed[:, k]) + 2 * k) for k in range(9))
     dry = np.greater(wave, np.quantile(wave, 0.68))[sea.triangles].sum(1) >= 2
     parts = [
-        Mesh(sea.vertices, sea.triangles[keep], sea.normals).turned(tilt).moved((0, 0, up))
+        TriMesh(sea.vertices, sea.triangles[keep], sea.normals).turned(tilt).moved((0, 0, up))
         for keep in (~dry, dry)
     ]
     bow = tube(arc((0, 0), 1.16 * r, -90, 90, 24), 0.007, 10).turned(tilt).moved((0, 0, up))
@@ -256,7 +256,7 @@ def hat(kit: Kit, colour: str) -> Thing:
     turn = np.arctan2(brim.vertices[:, 1], brim.vertices[:, 0])
     far = np.clip(np.hypot(brim.vertices[:, 0], brim.vertices[:, 1]) / r - 1, 0, 1)
     wave = 0.012 * (1 + np.cos(2 * turn + kit.size(0, 6))) * far
-    bent = Mesh(brim.vertices + np.stack([0 * wave, 0 * wave, wave], 1), brim.triangles, brim.normals)
+    bent = TriMesh(brim.vertices + np.stack([0 * wave, 0 * wave, wave], 1), brim.triangles, brim.normals)
     crown = lathe([(1.02 * r, 0.014), (0.97 * r, 0.05), (0.85 * r, 0.082), (0.5 * r, 0.1), (0, 0.104)], 40)
     band = lathe([(1.045 * r, 0.018), (1.02 * r, 0.042)], 40)
     loops = [
@@ -291,7 +291,7 @@ def shoe(kit: Kit, colour: str) -> Thing:
     lid = np.stack([np.repeat(along[:, None], 17, 1), across, rise], -1)
     grid = lathe([(1.0, float(k)) for k in range(15)], 16, cell=10.0).triangles
     points = lid.reshape(-1, 3)
-    upper = Mesh(points, grid, _outward(points, (0.05 * n, 0, 0.02)))
+    upper = TriMesh(points, grid, _outward(points, (0.05 * n, 0, 0.02)))
     hole = ball(0.5, 22).stretched((0.36 * n, 0.19 * n, 0.03)).spun("y", -5)
     hole = hole.moved((0.25 * n, 0, 0.02 + 0.425 * n))
     collar = ring(0.5, 0.09, 28, 10).stretched((0.36 * n, 0.2 * n, 0.12))
@@ -477,7 +477,7 @@ def cactus(kit: Kit, colour: str) -> Thing:
               for k in range(6)]  # fmt: skip
     bloom = join([*petals, ball(0.007, 8)]).moved((0, 0, 0.06 + h))
     green = kit.paint("green", "plain", 0.15, substance="leaf")
-    shaft = Mesh(ribbed, trunk.triangles, trunk.normals)
+    shaft = TriMesh(ribbed, trunk.triangles, trunk.normals)
     return Thing("cactus", "green", (
         Piece("pot", "", join([pot, lip]), kit.paint(colour, "speckled", 0.2, substance="ceramic")),
         Piece("soil", "", soil, kit.paint("brown", "rug", 0.0, substance="skin")),

@@ -7,7 +7,7 @@ import numpy as np
 
 from assets.making.kit import Kit, Material, Piece, Thing
 from assets.making.shapes import (
-    Mesh,
+    TriMesh,
     arc,
     ball,
     box,
@@ -236,7 +236,7 @@ def pan(kit: Kit, colour: str) -> Thing:
     egg = lathe([(0.42 * r, 0.007), (0.4 * r, 0.012), (0.2 * r, 0.015), (0, 0.016)], 36)
     turn = np.arctan2(egg.vertices[:, 1], egg.vertices[:, 0])
     wobble = 1 + 0.14 * np.sin(3 * turn + kit.size(0, 6)) + 0.07 * np.sin(5 * turn)
-    white = Mesh(egg.vertices * np.stack([wobble, wobble, 1 + 0 * turn], 1), egg.triangles, egg.normals)
+    white = TriMesh(egg.vertices * np.stack([wobble, wobble, 1 + 0 * turn], 1), egg.triangles, egg.normals)
     spot = (kit.size(-0.2, 0.2) * r, kit.size(-0.2, 0.2) * r, 0.0)
     yolk = ball(0.16 * r, 18).stretched((1, 1, 0.55)).moved((0, 0, 0.016))
     return Thing("pan", colour, (
@@ -352,14 +352,14 @@ def carrot(kit: Kit, colour: str) -> Thing:
     top = join(leaves).moved((0, 0, n / 2 - 0.004)).turned(lie)
     lift = (0.0, 0.0, -float(root.vertices[:, 2].min()))
     green = top.moved(lift)
-    flat = Mesh(np.maximum(green.vertices, (-9, -9, 0.003)), green.triangles, green.normals)
+    flat = TriMesh(np.maximum(green.vertices, (-9, -9, 0.003)), green.triangles, green.normals)
     return Thing("carrot", "orange", (
         Piece("root", "", root.moved(lift), kit.paint("orange", "peel", 0.2)),
         Piece("leaves", "", flat, kit.paint("green", "leaf", 0.15)),
     )).centred()  # fmt: skip
 
 
-def _disc_sector(profile: list[tuple[float, float]], gap: float) -> tuple[Mesh, Mesh]:
+def _disc_sector(profile: list[tuple[float, float]], gap: float) -> tuple[TriMesh, TriMesh]:
     """A turned body with a wedge of `gap` degrees missing at -y, and the two cut faces."""
     full = lathe(profile, 42, 0.02)
     angle = np.degrees(np.arctan2(full.vertices[:, 1], full.vertices[:, 0]) + np.pi / 2) % 360
@@ -372,7 +372,7 @@ def _disc_sector(profile: list[tuple[float, float]], gap: float) -> tuple[Mesh, 
         face.spun("z", -90 + gap / 2),
         face.spun("x", 180).moved((0, 0, z0 + z1)).spun("z", -90 - gap / 2),
     ]
-    return Mesh(full.vertices, full.triangles[keep], full.normals), join(cuts)
+    return TriMesh(full.vertices, full.triangles[keep], full.normals), join(cuts)
 
 
 def cake(kit: Kit, colour: str) -> Thing:
@@ -404,9 +404,9 @@ def donut(kit: Kit, colour: str) -> Thing:
     crown = ring(r, t * 1.06, 48, 20)
     wave = 0.25 * np.sin(7 * np.arctan2(crown.vertices[:, 1], crown.vertices[:, 0])) * t
     keep = (crown.vertices[:, 2] > wave + 0.1 * t)[crown.triangles].any(1)
-    glaze = Mesh(crown.vertices, crown.triangles[keep], crown.normals).moved((0, 0, t))
+    glaze = TriMesh(crown.vertices, crown.triangles[keep], crown.normals).moved((0, 0, t))
     hues = [word for word in ("red", "yellow", "blue", "green", "white") if word != colour]
-    bits: list[Mesh] = []
+    bits: list[TriMesh] = []
     for _ in range(26):
         lean = kit.size(-0.75, 0.75)
         spot: Array = np.array([r + t * 1.08 * np.sin(lean), 0, t + t * 1.08 * np.cos(lean)])
@@ -458,14 +458,16 @@ def burger(kit: Kit, colour: str) -> Thing:
     leaf = lathe([(0.7 * r, 0.067), (1.1 * r, 0.07), (1.12 * r, 0.073), (0.7 * r, 0.076)], 52, 0.02)
     angle = np.arctan2(leaf.vertices[:, 1], leaf.vertices[:, 0])
     ruffle = 0.009 * np.sin(13 * angle) * (np.hypot(leaf.vertices[:, 0], leaf.vertices[:, 1]) > r)
-    salad = Mesh(leaf.vertices + np.stack([0 * ruffle, 0 * ruffle, ruffle], 1), leaf.triangles, leaf.normals)
+    salad = TriMesh(
+        leaf.vertices + np.stack([0 * ruffle, 0 * ruffle, ruffle], 1), leaf.triangles, leaf.normals
+    )
     slices = lathe([(0, 0.076), (0.98 * r, 0.076), (1.02 * r, 0.083), (0.97 * r, 0.09)], 36)
     seeds = []
     for _ in range(20):
         tilt, turn = kit.size(0.1, 0.8) * r, rotation_about("z", kit.size(0, 360))
         height = np.interp(tilt / r, [0, 0.4, 0.75, 0.97], [0.166, 0.162, 0.148, 0.122])
         seeds.append(ball(0.004, 6).stretched((1.5, 1, 0.6)).moved((tilt, 0, height + 0.001)).turned(turn))
-    flat = Mesh(
+    flat = TriMesh(
         cheese.vertices - np.stack([0 * droop, 0 * droop, droop], 1), cheese.triangles, cheese.normals
     )
     return Thing("burger", "brown", (

@@ -9,7 +9,7 @@ import numpy as np
 
 from assets.making.kit import Kit, Material, Piece, Thing
 from assets.making.shapes import (
-    Mesh,
+    TriMesh,
     arc,
     ball,
     box,
@@ -163,7 +163,7 @@ def robot(kit: Kit, colour: str) -> Thing:
     ))  # fmt: skip
 
 
-def _wheel(radius: float, width: float, x: float, y: float) -> tuple[Mesh, Mesh]:
+def _wheel(radius: float, width: float, x: float, y: float) -> tuple[TriMesh, TriMesh]:
     """Tyre and hub that stand on z = 0 at x, with their axle along y."""
     turn = rotation_about("x", 90)
     place = (x, y + width / 2, radius)
@@ -260,7 +260,7 @@ def boat(kit: Kit, colour: str) -> Thing:
     rise = shell.vertices[:, 2:] / deep
     squeeze = np.where(rise > 0, 1, 0.55)
     lifted = shell.vertices * np.concatenate([0.5 + squeeze / 2, squeeze, 1 + 0 * rise], 1)
-    hull = Mesh(lifted, shell.triangles, shell.normals)
+    hull = TriMesh(lifted, shell.triangles, shell.normals)
     mast = rod((0, 0, deep), (0, 0, h), 0.0055)
     boom = rod((0, 0, deep + 0.025), (0.42 * n, 0, deep + 0.025), 0.0045)
     main = slab([(0.008, deep + 0.032), (0.41 * n, deep + 0.032), (0.008, h - 0.006)], 0.004)
@@ -336,7 +336,7 @@ def truck(kit: Kit, colour: str) -> Thing:
     ))  # fmt: skip
 
 
-def _pair(mesh: Mesh, x: float, y: float, z: float) -> list[Mesh]:
+def _pair(mesh: TriMesh, x: float, y: float, z: float) -> list[TriMesh]:
     """The mesh on both sides of the plane x = 0."""
     return [mesh.moved((side * x, y, z)) for side in (-1, 1)]
 
