@@ -88,7 +88,7 @@ def test_commands_parse(
                     pytest.fail(f"{program} {shlex.join(words)}: {capsys.readouterr().err}")
 
 
-def test_the_readme_has_commands() -> None:
+def test_readme_shows_the_main_commands() -> None:
     found = [" ".join(words[:2]) for words in commands(README.read_text())]
     wanted = {"make demo", "make test", "langsplat train", "langsplat query", "langsplat compact"}
     assert wanted <= set(found)
@@ -117,26 +117,26 @@ def run(start: list[str], more: tuple[str, ...] = ()) -> None:
     assert main(words[0], lambda: PARSERS[words[0]]([*words[1:], *more])) == 0
 
 
-def test_inspect(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_readme_inspect_runs(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run(["langsplat", "inspect"])
     assert "81,288" in capsys.readouterr().out
 
 
 @pytest.mark.long
-def test_query(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_readme_query_runs(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run(["langsplat", "query"])
     answers = json.loads(capsys.readouterr().out)
     assert [answer["phrase"] for answer in answers] == ["handle of the red mug"]
     assert all(len(answer["pixel"]) == 2 for answer in answers)
 
 
-def test_convert(folder: Path) -> None:
+def test_readme_convert_runs(folder: Path) -> None:
     run(["langsplat", "convert"])
     assert len(load_scene(folder / "guitar.spz").gaussians) == 300
 
 
 @pytest.mark.long
-def test_a_picture_without_a_window(folder: Path) -> None:
+def test_readme_headless_viewer_runs(folder: Path) -> None:
     run(["langsplat-viewer", "scene.ply", "--headless"], ("--size", "160x120"))
     assert Image.open(folder / "heat.png").size == (160, 120)
 
@@ -151,7 +151,7 @@ BLOCKS = [
 
 @pytest.mark.long
 @pytest.mark.parametrize("block", BLOCKS)
-def test_python_runs(block: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_python_blocks_run(block: str, capsys: pytest.CaptureFixture[str]) -> None:
     exec(compile(block, "README.md", "exec"), {})
     shapes, answer = capsys.readouterr().out.splitlines()
     assert shapes == "(240, 320, 3) (240, 320)"
@@ -177,7 +177,7 @@ def pixels(path: Path) -> np.ndarray:
 
 
 @pytest.mark.long
-def test_render_a_picture(tmp_path: Path) -> None:
+def test_example_renders_images(tmp_path: Path) -> None:
     shares = re.findall(r"(\d+)% covered", run_example("01_render_a_picture", tmp_path))
     assert len(shares) == 2
     for share, name in zip(shares, ("photograph.png", "own_place.png"), strict=True):
@@ -188,7 +188,7 @@ def test_render_a_picture(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_ask_a_phrase(tmp_path: Path) -> None:
+def test_example_asks_a_phrase(tmp_path: Path) -> None:
     there, place, absent = run_example("02_ask_a_phrase", tmp_path).splitlines()
     assert there.startswith("blue gift: found, score 0.")
     assert len(re.findall(r"-?\d+\.\d+", place)) == 3
@@ -200,7 +200,7 @@ def test_ask_a_phrase(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_lift_your_own_features(tmp_path: Path) -> None:
+def test_example_lifts_own_features(tmp_path: Path) -> None:
     observed, agree = map(
         int, re.findall(r"(\d+)(?: Gaussians|%)", run_example("03_lift_your_own_features", tmp_path))
     )
@@ -210,7 +210,7 @@ def test_lift_your_own_features(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_write_a_backend(tmp_path: Path) -> None:
+def test_example_adds_a_backend(tmp_path: Path) -> None:
     errors = re.findall(
         r"(\w+): mean error (\S+), largest (\S+)", run_example("04_write_a_backend", tmp_path)
     )

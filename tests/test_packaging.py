@@ -58,7 +58,7 @@ def mime_globs() -> dict[str, list[str]]:
     }
 
 
-def test_the_desktop_entry_starts_the_program_with_a_file():
+def test_desktop_entry_starts_the_viewer_with_a_file():
     entry = desktop_entry()
     assert entry["Type"] == "Application"
     assert entry["Exec"].split() == ["langsplat-viewer", "%f"]
@@ -66,7 +66,7 @@ def test_the_desktop_entry_starts_the_program_with_a_file():
     assert all(entry[key].endswith(";") for key in ("MimeType", "Categories", "Keywords"))
 
 
-def test_every_type_of_the_entry_is_described_and_every_kind_of_scene_has_one():
+def test_desktop_entry_and_mime_types_cover_every_format():
     globs = mime_globs()
     assert set(desktop_entry()["MimeType"].strip(";").split(";")) == set(globs)
     patterns = {pattern for some in globs.values() for pattern in some}
@@ -74,7 +74,7 @@ def test_every_type_of_the_entry_is_described_and_every_kind_of_scene_has_one():
     assert {row.mime for row in formats()} == set(globs)
 
 
-def test_a_one_folder_build_trains_by_the_program_beside_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_frozen_viewer_trains_by_the_program_beside_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     request = TrainingRequest(tmp_path / "photographs", tmp_path / "scene.ply")
     plain = command(request)
     monkeypatch.setattr("sys.frozen", True, raising=False)
@@ -83,7 +83,7 @@ def test_a_one_folder_build_trains_by_the_program_beside_it(monkeypatch: pytest.
     assert frozen == [str(tmp_path / "langsplat"), *plain[3:]]
 
 
-def test_a_row_of_another_machine_leaves_the_other_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_elsewhere_keeps_the_rows_it_does_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     module = script("elsewhere", monkeypatch)
     python = tmp_path / "python"
     python.write_text('#!/bin/sh\necho "$*"\necho "$CODE failed, 2 passed, 3 skipped in 1s"\nexit $CODE\n')
@@ -144,7 +144,7 @@ def numbers(text: str, first: str) -> list[float]:
 
 
 @pytest.mark.long
-def test_sections_over_the_twin(sections: ModuleType, gsplat_twin: None) -> None:
+def test_gpu_sections_agree_with_the_twin(sections: ModuleType, gsplat_twin: None) -> None:
     said = pieces(sections, "gradients")
     for name in ("means", "log_scales", "quats_wxyz", "opacity_logits", "values", "means_px"):
         assert max(numbers(said, name)) < 1e-4
@@ -158,7 +158,7 @@ def test_sections_over_the_twin(sections: ModuleType, gsplat_twin: None) -> None
 
 
 @pytest.mark.slow
-def test_longer_sections_over_the_twin(sections: ModuleType, gsplat_twin: None) -> None:
+def test_longer_gpu_sections_agree_with_the_twin(sections: ModuleType, gsplat_twin: None) -> None:
     said = pieces(sections, "raster")
     errors = [line.split(" | ")[8] for line in said.splitlines() if "| gather | cuda |" in line]
     assert errors
@@ -171,7 +171,7 @@ def test_longer_sections_over_the_twin(sections: ModuleType, gsplat_twin: None) 
 
 
 @pytest.mark.long
-def test_opengl_tables_on_any_driver(sections: ModuleType, gl_session: object) -> None:
+def test_opengl_section_works_on_any_driver(sections: ModuleType, gl_session: object) -> None:
     with create_egl_context() as context:
         said = "\n".join(sections.tables(sections.TINY, context))
     errors = [line.split(" | ")[8] for line in said.splitlines() if "| splat | opengl single |" in line]
@@ -181,7 +181,7 @@ def test_opengl_tables_on_any_driver(sections: ModuleType, gl_session: object) -
 
 @pytest.mark.long
 @pytest.mark.skipif("__import__('torch').cuda.is_available()", reason="needs a machine without CUDA")
-def test_without_a_gpu_it_says_so_in_one_line_and_writes_nothing(
+def test_gpu_run_without_a_gpu_writes_nothing(
     tmp_path: Path, runner: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
@@ -194,7 +194,7 @@ def test_without_a_gpu_it_says_so_in_one_line_and_writes_nothing(
     assert not out.exists()
 
 
-def test_a_section_that_fails_or_takes_too_long_does_not_stop_the_others(
+def test_gpu_run_goes_on_after_a_failed_or_slow_section(
     fake_sections: Path, runner: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = fake_sections / "out"
@@ -209,7 +209,7 @@ def test_a_section_that_fails_or_takes_too_long_does_not_stop_the_others(
     assert not (out / "opengl.md").exists()
 
 
-def test_what_needs_gsplat_is_not_begun_where_it_does_not_work(
+def test_gpu_run_skips_sections_where_gsplat_fails(
     fake_sections: Path, runner: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     main = fake_sections / "gpu_sections.py"
@@ -222,7 +222,7 @@ def test_what_needs_gsplat_is_not_begun_where_it_does_not_work(
 
 
 @pytest.mark.parametrize("words", [["--minutes", "0"], ["--only", "raster,tables"], ["--plan", "huge"]])
-def test_unusable_arguments(
+def test_gpu_run_refuses_unusable_arguments(
     words: list[str], runner: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["run.py", *words])
@@ -232,14 +232,14 @@ def test_unusable_arguments(
     assert words[0] in capsys.readouterr().err
 
 
-def test_every_section_has_a_function_and_a_row_in_the_docs(runner: ModuleType, sections: ModuleType) -> None:
+def test_gpu_sections_have_functions_and_docs(runner: ModuleType, sections: ModuleType) -> None:
     page = (PACKAGING.parent / "docs" / "speed.md").read_text()
     for name, limit in runner.SECTIONS.items():
         assert callable(getattr(sections, f"measure_{name}"))
         assert f"| {name} | {limit} |" in page
 
 
-def test_the_wheels_are_those_of_the_constraints() -> None:
+def test_gpu_requirements_follow_the_constraints() -> None:
     constraints = (PACKAGING / "constraints.txt").read_text().split()
     for line in ("torch==2.13.0", "gsplat==1.5.3"):
         assert line in constraints
@@ -303,14 +303,14 @@ def run(light: Path, program: str, *options: str | Path) -> subprocess.Completed
 
 
 @pytest.mark.long
-def test_it_holds_none_of_the_optional_packages(light: Path) -> None:
+def test_plain_install_holds_no_optional_package(light: Path) -> None:
     look = "import importlib.util as i, sys; print(*[n for n in sys.argv[1:] if i.find_spec(n)])"
     found = run(light, "python", "-c", look, "numpy", "langsplat_assets", *EXTRAS)
     assert found.stdout.split() == ["numpy", "langsplat_assets"]
 
 
 @pytest.mark.long
-def test_a_scene_is_drawn_and_searched(light: Path, tmp_path: Path) -> None:
+def test_plain_install_draws_and_searches_a_scene(light: Path, tmp_path: Path) -> None:
     out = tmp_path / "heat.png"
     # OpenGL: the CPU's kernels would be compiled for this environment alone.
     asked = ("--query", "keyboard", "--backend", "opengl", "--size", "320x240")
@@ -321,7 +321,7 @@ def test_a_scene_is_drawn_and_searched(light: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_what_is_found_is_selected(light: Path, tmp_path: Path) -> None:
+def test_plain_install_selects_what_is_found(light: Path, tmp_path: Path) -> None:
     scene = next(light.parent.glob("lib/python*/site-packages/langsplat_assets/demo/scene.ply"))
     done = run(light, "langsplat", "select", scene, "keyboard", "--out", tmp_path / "keyboard.ply")
     assert done.returncode == 0, done.stderr
@@ -329,7 +329,7 @@ def test_what_is_found_is_selected(light: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_missing_package_ends_in_the_line_that_installs_it(light: Path, tmp_path: Path) -> None:
+def test_missing_package_ends_in_the_line_that_installs_it(light: Path, tmp_path: Path) -> None:
     for number in range(3):
         Image.new("RGB", (32, 24), (number, 0, 0)).save(tmp_path / f"{number}.png")
     done = run(light, "langsplat", "train", tmp_path, "--out", tmp_path / "scene.ply")

@@ -235,7 +235,7 @@ class Measured:
     vectors: str = ""
     codec: str = ""
     query: str = ""
-    bytes_per_gaussian: float = 0.0  # of its meanings at three levels
+    bytes_per_gaussian: float = 0.0  # of its language features
     codec_loss: CodecReport = CodecReport(1.0, 0.0, 0.0)  # noqa: RUF009 (frozen)
     fit_seconds: float = 0.0  # from masks to latents; what an earlier run has made is not in it
     frame_ms: float = 0.0  # median, one phrase into one view

@@ -80,13 +80,13 @@ def unseen_room():
         (CHAIR, ("wooden chair",), (), ("cloth",)),  # its cushion is
     ],
 )
-def test_which_phrases_are_right(book, label, right, wrong, neither):
+def test_phrase_book_tells_right_wrong_and_neither(book, label, right, wrong, neither):
     fits = dict(zip(book.phrases, book.fits[book.labels.index(label)].tolist(), strict=True))
     want = dict.fromkeys(right, 1) | dict.fromkeys(wrong, 0) | dict.fromkeys(neither, -1)
     assert {phrase: fits[phrase] for phrase in want} == want
 
 
-def test_every_word_is_one_token_and_reloads(book, tmp_path):
+def test_tokenizer_has_one_token_for_every_word(book, tmp_path):
     words = word_list(book)
     assert {"of", "the", *CANONICAL_PHRASES, *COLOURS} <= set(words)
     write_tokenizer(words, tmp_path)
@@ -105,7 +105,7 @@ def test_every_word_is_one_token_and_reloads(book, tmp_path):
     assert word_merges(["aba", "ab"]) == [("a", "b"), ("a", "b</w>"), ("ab", "a</w>")]
 
 
-def test_loss_wants_right_above_canonical_above_wrong_and_ignores_the_rest():
+def test_loss_ranks_right_canonical_and_wrong_phrases():
     fits = torch.tensor([[0, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 1]], dtype=torch.int8)
     nameable = torch.tensor([True, True])
     good = torch.tensor([[CANONICAL_COSINE] * 4 + [0.9, -0.2], [CANONICAL_COSINE] * 4 + [-0.2, 0.9]])
@@ -122,7 +122,7 @@ def test_loss_wants_right_above_canonical_above_wrong_and_ignores_the_rest():
     assert loss_of(other, fits, nameable) == loss_of(good, fits, nameable)
 
 
-def test_crops_of_a_room(unseen_room, tmp_path):
+def test_room_crops_survive_saving_and_loading(unseen_room, tmp_path):
     levels = [label.level for label in unseen_room.labels]
     assert {-1, 0, 1, 2} == set(levels)
     assert len(levels) > 60
@@ -153,7 +153,7 @@ def few_crops(monkeypatch):
     return crops
 
 
-def test_training_in_miniature(monkeypatch, few_crops, tmp_path):
+def test_interrupted_training_goes_on_and_answers(monkeypatch, few_crops, tmp_path):
     """Two steps, an interruption, the rest: what is written loads and answers; all steps were taken."""
     monkeypatch.setattr(demo_encoder, "SAVE_EVERY", 2)
     config = EncoderConfig(steps=4, batch=8, phrases=8)
@@ -178,7 +178,7 @@ def test_training_in_miniature(monkeypatch, few_crops, tmp_path):
     assert size < 12e6
 
 
-def test_calibration_moves_the_canonical_phrases_only(tmp_path):
+def test_calibration_moves_only_the_canonical_phrases(tmp_path):
     words = [*CANONICAL_PHRASES, "red"]
     write_tokenizer(words, tmp_path)
     tokenizer = CLIPTokenizerFast.from_pretrained(tmp_path)
@@ -196,7 +196,7 @@ def test_calibration_moves_the_canonical_phrases_only(tmp_path):
     torch.testing.assert_close(after[4], before[4])
 
 
-def test_bundled_encoder_in_a_room_it_never_saw(unseen_room):
+def test_bundled_encoder_recognises_unseen_crops(unseen_room):
     bundled = load_encoder("demo", "cpu")
     figures = {row.kind: row for row in report(bundled, unseen_room)}
     for kind, top1, separation in (("colour", 0.82, 0.97), ("object", 0.75, 0.88)):
@@ -239,7 +239,7 @@ def held_out(scene: Scene, world: World) -> list[tuple[Camera, np.ndarray]]:
     return [(camera, truth_ids(world, renderer.picture(camera, oversample=1))) for camera in cameras]
 
 
-def test_it_is_small_enough_to_ship_and_has_everything_a_query_needs(scene):
+def test_bundled_scene_is_small_and_complete(scene):
     size = sum(path.stat().st_size for path in ASSETS.rglob("*") if path.is_file())
     assert size < 21e6
     assert scene.language is not None
@@ -270,7 +270,7 @@ def test_typed_words_find_their_things(world, engine, held_out):
     assert np.mean(overlaps) >= 0.95  # 0.99 measured
 
 
-def test_place_is_where_the_thing_is(world, engine):
+def test_place_lies_on_the_thing_that_was_asked_for(world, engine):
     """In metres, against the vertices of the gift."""
     of_gift = np.isin(world.ids[world.piece_of][:, 2], ids_of(world, "gift"))
     corners = world.vertices[world.triangles[of_gift]].reshape(-1, 3)
@@ -280,6 +280,6 @@ def test_place_is_where_the_thing_is(world, engine):
     assert np.linalg.norm(corners - answer.place, axis=1).min() < 0.05
 
 
-def test_an_unknown_word_is_named(engine):
+def test_unknown_word_is_named(engine):
     with pytest.raises(EncoderError, match="'zebra'"):
         engine.run("zebra")

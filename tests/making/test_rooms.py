@@ -73,7 +73,7 @@ def test_truth_is_nested_and_follows_the_seed(world):
     assert world.labels == again.labels != other.labels
 
 
-def test_two_views_agree_where_they_see_the_same_point(world, renderer):
+def test_views_agree_on_the_points_they_share(world, renderer):
     one = look_at(np.array([0.2, -1.3, 0.8]), np.zeros(3), UP, (120, 90))
     two = look_at(np.array([0.7, -1.1, 0.8]), np.zeros(3), UP, (120, 90))
     a, b = renderer.picture(one, oversample=2), renderer.picture(two, oversample=2)
@@ -93,7 +93,7 @@ def test_two_views_agree_where_they_see_the_same_point(world, renderer):
     assert np.median(difference) < 8  # of 255: highlights move, textures are sampled half a pixel apart
 
 
-def test_dataset_on_disk(tmp_path, coarse_light):
+def test_written_dataset_is_read_back(tmp_path, coarse_light):
     write_dataset(tmp_path, 1, 5, (64, 48), silent)
     capture = load_nerfstudio(tmp_path / "transforms.json", 800, silent)
     assert (capture.metres_per_unit, capture.drawn) == (1, True)
@@ -111,7 +111,7 @@ def test_dataset_on_disk(tmp_path, coarse_light):
     assert nearest < 0.1  # the cloud covers what the camera sees: conventions of both agree
 
 
-def test_interrupted_dataset_goes_on(tmp_path, coarse_light):
+def test_interrupted_dataset_renders_missing_views_only(tmp_path, coarse_light):
     write_dataset(tmp_path, 1, 4, (32, 24), silent)
     before = {path: path.stat().st_mtime_ns for path in tmp_path.glob("images/*")}
     image = np.asarray(Image.open(tmp_path / "images" / "view_002.png"))
@@ -134,7 +134,7 @@ def small_things(placed):
 @pytest.mark.parametrize(
     ("line", "wrong"), [("dataset --out d", "--views 0"), ("encoder --out d", "--batch 0")]
 )
-def test_commands_refuse_what_lies_outside_a_range(line, wrong, capsys, tmp_path, monkeypatch):
+def test_commands_refuse_numbers_outside_their_range(line, wrong, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert all(setting.range for setting in numeric_settings(parse(line.split())))
     assert main(PROGRAM, lambda: parse(f"{line} {wrong}".split())) == 2
@@ -171,7 +171,7 @@ def test_tiers_grow_harder():
 
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("sigma", [0.0, 0.7, 2.0])
-def test_polygons_give_back_the_mask(seed, sigma):
+def test_polygons_reproduce_the_mask(seed, sigma):
     """Pieces, holes, islands in holes, single pixels, diagonal lines, the picture's border."""
     values = gaussian_filter(np.random.default_rng(seed).normal(size=(40, 50)), sigma)
     mask = values > np.quantile(values, 0.35 if seed % 2 else 0.6)
@@ -198,7 +198,7 @@ def rooms(tmp_path_factory, coarse_light):
         ("3d-ovs", read_3d_ovs, ("object",), ["00", "08"]),
     ],
 )
-def test_labels_are_the_truth(rooms, layout, read, kinds, names):
+def test_labels_state_the_truth_of_their_view(rooms, layout, read, kinds, names):
     (scene,) = read(rooms / layout).scenes.values()
     assert [frame.name for frame in scene.frames] == names
     truth, several = read_truth(scene.dataset), 0
@@ -214,7 +214,7 @@ def test_labels_are_the_truth(rooms, layout, read, kinds, names):
 
 
 @pytest.mark.parametrize(("layout", "protocol"), [("lerf-ovs", "langsplat-code"), ("3d-ovs", "ours")])
-def test_the_whole_command_on_a_complete_set(rooms, tmp_path, capsys, layout, protocol):
+def test_eval_scores_the_bundled_scene_on_a_written_set(rooms, tmp_path, capsys, layout, protocol):
     """The bundled scene shows the same room; it has never seen these views, whose cameras the dataset has."""
     out = tmp_path / "out.json"
     words = ["eval", layout, "assets/demo/scene.ply", str(rooms / layout), "--protocol", protocol]
@@ -255,7 +255,7 @@ def things():
 
 
 @pytest.mark.parametrize("name", EVERYTHING)
-def test_meshes_are_sound_and_stand_where_they_should(name, things):
+def test_things_have_sound_meshes_and_stand_on_ground(name, things):
     for thing in things[name]:
         assert thing.word == name
         assert thing.colour in ("", *COLOURS)
@@ -305,7 +305,7 @@ def test_parts_are_named_and_nested(name, things):
             assert all(label.material in ("", *MATERIALS) for label in labels)
 
 
-def test_no_word_stands_for_two_different_things(things):
+def test_words_stand_for_one_thing(things):
     meant = defaultdict(set)
     for name in [*EVERYTHING, "rug", "floor", "wall"]:
         for word in object_words(name):
@@ -325,7 +325,7 @@ def test_no_word_stands_for_two_different_things(things):
     assert {word for word, roles in meant.items() if len(roles) > 1} <= SHARED
 
 
-def test_no_phrase_names_a_whole_and_a_part(things):
+def test_phrases_name_a_whole_or_a_part(things):
     """A snowman's hat is a hat; any other phrase for a part must not be one for a thing."""
     wholes, parts = set(), set()
     for group in things.values():
