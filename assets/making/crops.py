@@ -35,9 +35,7 @@ class CropSet:
     """Crops and what each one shows."""
 
     images: Array  # (N, 64, 64, 3) uint8
-    labels: tuple[
-        RegionLabel, ...
-    ]  # N; level -1: clutter, or nothing but its colour
+    labels: tuple[RegionLabel, ...]  # N; level -1: clutter, or nothing but its colour
 
     def save(self, path: Path) -> None:
         """Write one compressed file."""
