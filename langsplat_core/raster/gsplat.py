@@ -36,7 +36,7 @@ class DeviceGaussians:
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
+class DifferentiableImage:
     """An image that can be differentiated by the Gaussians and their values."""
 
     image: Tensor  # (H, W, C)
@@ -83,7 +83,7 @@ def draw(
     settings: RasterSettings,
     sh_degree: int | None = None,
     view_matrix: Array | None = None,
-) -> Drawn:
+) -> DifferentiableImage:
     """Blend (N, C) `values`; or with `sh_degree`, the colours of (N, K, 3) spherical harmonics.
 
     view_matrix: (4, 4) world to camera, in place of the camera's own.
@@ -114,7 +114,7 @@ def draw(
     if means_px.requires_grad:
         means_px.retain_grad()
     visible = extra["radii"].reshape(len(gaussians.means), -1).amin(1) > 0  # (N,) or (N, 2), by version
-    return Drawn(images[0], alphas[0, ..., 0], means_px, visible)
+    return DifferentiableImage(images[0], alphas[0, ..., 0], means_px, visible)
 
 
 def to_device(array: Array) -> Tensor:

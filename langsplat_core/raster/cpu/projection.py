@@ -51,7 +51,7 @@ class Rows(NamedTuple):
     sizes: Array  # (N,) float32 the largest of a row's scales or a little more; see `UNKNOWN`, `UNUSABLE`
 
 
-class Projected(NamedTuple):
+class Projection(NamedTuple):
     """Gaussians projected onto the image plane, as `project` returns them."""
 
     geometry: Array  # (N, 8) float64, columns MEAN_X to HALF_HEIGHT; only where DRAWN
@@ -230,7 +230,7 @@ def _is_outside(x: float, y: float, over: float, size: float, camera: KernelCame
 
 
 @kernel
-def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Projected) -> None:
+def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Projection) -> None:
     """Fill `out` for rows [first, last), and sizes that are not known yet.
 
     A Gaussian whose alpha = alpha_min contour meets no pixel centre is UNDRAWN.

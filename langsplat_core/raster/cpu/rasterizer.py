@@ -48,7 +48,7 @@ class CpuView(TileOperator):
             _sizes_of(gaussians),
         )
         self._memory = memory
-        found = projection.Projected(
+        found = projection.Projection(
             memory.empty((n, projection.COLUMNS), np.float64),
             memory.empty((n,), np.float64),
             memory.empty((n,), np.uint8),

@@ -45,7 +45,7 @@ _PIECES = 16  # of the depth order that are binned side by side; the result does
 Ellipse = tuple[float, float, float, float, float, float]
 
 
-class Grid(NamedTuple):
+class TileGrid(NamedTuple):
     """An image cut into tiles."""
 
     width: float  # px; a float, as it is compared with floats
@@ -188,13 +188,13 @@ def _rows_in_column(ellipse: Ellipse, column: int, height: float) -> tuple[int, 
 
 
 @helper
-def _columns_touched(g: Array, grid: Grid) -> tuple[int, int]:
+def _columns_touched(g: Array, grid: TileGrid) -> tuple[int, int]:
     first, last = _span(g[cp.MEAN_X], -g[cp.HALF_WIDTH], g[cp.HALF_WIDTH], grid.width)
     return first // TILE, (last + TILE - 1) // TILE if last > first else first // TILE
 
 
 @helper
-def _at_most(g: Array, grid: Grid) -> float:
+def _at_most(g: Array, grid: TileGrid) -> float:
     """No fewer tiles than a footprint touches: those of its box; or, for a needle, of the area within a
     tile's side of it (Steiner)."""
     wide, high = 2 * g[cp.HALF_WIDTH] / TILE, 2 * g[cp.HALF_HEIGHT] / TILE
@@ -208,7 +208,7 @@ def _at_most(g: Array, grid: Grid) -> float:
 
 @kernel
 def _touch(
-    first: int, last: int, order: Array, footprints: Array, grid: Grid, geometry: Array, firsts: Array
+    first: int, last: int, order: Array, footprints: Array, grid: TileGrid, geometry: Array, firsts: Array
 ) -> tuple[tuple[Array, Array, Array], int, Array]:
     """For ranks [first, last): geometry[rank] <- footprints[order[rank]], firsts[rank + 1] <- how many tiles
     it touches; returns the ranks, tiles and spans of rows of these intersections, their number, and how often
@@ -272,7 +272,7 @@ def bin_tiles(
     intersections with the tiles of an image of `size`, width and height."""
     geometry = memory.empty((len(order), cp.COLUMNS), np.float64)
     width, height = size
-    grid = Grid(float(width), float(height), -(-width // TILE), -(-height // TILE))
+    grid = TileGrid(float(width), float(height), -(-width // TILE), -(-height // TILE))
     firsts = memory.empty((len(order) + 1,), np.int64)
     firsts[0] = 0
     edges = [len(order) * i // _PIECES for i in range(_PIECES + 1)]
