@@ -15,10 +15,12 @@ def check_array(
     dims: dict[str, int] | None = None,
     dtype: type | None = None,
 ) -> dict[str, int]:
-    """Require `array` to have `shape`; letters in the shape must agree with `dims`, or are bound now. Returns
-    the letters bound so far, so that calls can be chained over the fields of one object. Raises TypeError for
-    a wrong dtype and ValueError for a wrong shape, both naming the array: ``scales: expected shape (N, 3)
-    with {'N': 6}, got (5, 3)``."""
+    """Require `array` to have `shape`; letters in the shape must agree with `dims`, or are bound now.
+
+    Returns the letters bound so far, so that calls can be chained over the fields of one object. Raises
+    TypeError for a wrong dtype and ValueError for a wrong shape, both naming the array: ``scales: expected
+    shape (N, 3) with {'N': 6}, got (5, 3)``.
+    """
     dims = dict(dims or {})
     if not isinstance(array, np.ndarray):
         raise TypeError(f"{name}: expected a NumPy array, got {type(array).__name__}")
@@ -35,13 +37,16 @@ def check_array(
 
 
 def number(text: str) -> float:
-    """The number that a text states in the digits 0 to 9. ValueError for the digits of other scripts and for
-    1_000, which Python reads and other programs do not, and for what is no number."""
+    """Return the number that a text states in the digits 0 to 9.
+
+    ValueError for the digits of other scripts and for 1_000, which Python reads and other programs do not,
+    and for what is no number.
+    """
     return float(_plain(text))
 
 
 def whole_number(text: str) -> int:
-    """The whole number that a text states, with the limits of `number`."""
+    """Return the whole number that a text states, with the limits of `number`."""
     return int(_plain(text))
 
 

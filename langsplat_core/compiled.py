@@ -50,8 +50,10 @@ def helper(function: Callable[..., Any], **options: Any) -> Any:
 
 
 def kernel(function: Callable[..., Any], **options: Any) -> Any:
-    """Compile `function` at its first call, or take the machine code of an earlier process. options: further
-    ones of `numba.njit`, such as `fastmath`."""
+    """Compile `function` at its first call, or take the machine code of an earlier process.
+
+    options: further ones of `numba.njit`, such as `fastmath`.
+    """
     folder = kernel_folder(Path(function.__code__.co_filename))
     with _cache_folder(folder) if folder else nullcontext():
         made = numba.njit(cache=folder is not None, nogil=True, error_model="numpy", **options)(function)
@@ -77,8 +79,10 @@ def _compiled_once(lock: Path, compiled: Callable[..., Any], signature: Any) -> 
 
 
 def _kept_if_there_is_room(save: Callable[..., None], *overload: Any) -> None:
-    """Keep a kernel's machine code; on a full disk the next process compiles it again. numba renames what it
-    wrote, so that nothing is left half."""
+    """Keep a kernel's machine code; on a full disk the next process compiles it again.
+
+    numba renames what it wrote, so that nothing is left half.
+    """
     try:
         save(*overload)
     except OSError as error:
@@ -112,7 +116,7 @@ def is_compiled(source: Path) -> bool:
 
 @cache
 def _cache_root(given: str) -> Path | None:
-    """The first folder that can be written to; `given`: as the user asked for, or empty."""
+    """Return the first folder that can be written to; `given`: as the user asked for, or empty."""
     places = [Path(given)] if given else [_PACKAGE / "__pycache__" / "kernels", *_user_cache()]
     found = next(filter(_is_writable, places), None)
     if found is not None:
@@ -131,7 +135,7 @@ def _cache_root(given: str) -> Path | None:
 
 
 def _user_cache() -> list[Path]:
-    """The user's cache folder; none for users without a home."""
+    """Return the user's cache folder; none for users without a home."""
     try:
         cache_home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     except RuntimeError:
@@ -170,7 +174,10 @@ def _with_imports(source: Path) -> set[Path]:
 
 
 def _imported(text: str) -> Iterator[Path]:
-    """The package's files that a source imports; names of a module that are no files are passed over."""
+    """Return the package's files that a source imports.
+
+    Names of a module that are no files are passed over.
+    """
     for module, names in _IMPORT.findall(text):
         base = _PACKAGE.joinpath(*module.split(".")[1:])
         candidates = [base, *(base / name for name in re.findall(r"\w+", names))]
@@ -180,8 +187,10 @@ def _imported(text: str) -> Iterator[Path]:
 
 @contextmanager
 def _cache_folder(folder: Path) -> Iterator[None]:
-    """numba puts the code of functions decorated meanwhile into `folder`; where that lies beside the package,
-    the code of older sources goes."""
+    """numba puts the code of functions decorated meanwhile into `folder`.
+
+    Where that lies beside the package, the code of older sources goes.
+    """
     if folder.is_relative_to(_PACKAGE) and not folder.exists():
         for older in folder.parent.glob("*"):
             if older != folder:  # another process may have made it meanwhile

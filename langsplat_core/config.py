@@ -29,7 +29,7 @@ class Range:
     some: bool = False  # of a field with several numbers: there must be at least one
 
     def holds(self, value: float) -> bool:
-        """True where `value` lies in the range; NaN lies in none."""
+        """Return True where `value` lies in the range; NaN lies in none."""
         return (self.low < value if self.above else self.low <= value) and value <= self.high
 
     def __str__(self) -> str:
@@ -49,7 +49,9 @@ class Setting:
 
 def check_settings(settings: object, option: str = "--") -> None:
     """InputError for the first number in `settings`, a dataclass, that is outside the range of its field.
-    `option` is what precedes the fields' names on the command line, such as ``--codec.``."""
+
+    `option` is what precedes the fields' names on the command line, such as ``--codec.``.
+    """
     for setting in numeric_settings(settings, option):
         problem = _problem(setting)
         if problem:
@@ -89,7 +91,7 @@ def annotations(hint: Any) -> Iterator[Any]:
 
 
 def _kinds(hint: Any) -> Iterator[type]:
-    """The plain types in a type hint: int and float of ``tuple[int, ...] | float``."""
+    """Return the plain types in a type hint: int and float of ``tuple[int, ...] | float``."""
     if get_origin(hint) is typing.Literal:
         return
     if get_origin(hint) is Annotated:
@@ -118,7 +120,10 @@ def _problem(setting: Setting) -> str | None:
 
 
 def _flat(value: Any) -> Iterator[Any]:
-    """The values in tuples and lists of them; an absent one and a word in place of a number are none."""
+    """Return the values in tuples and lists of them.
+
+    An absent one and a word in place of a number are none.
+    """
     if isinstance(value, tuple | list):
         for part in value:
             yield from _flat(part)
@@ -253,9 +258,11 @@ class RadianceConfig:
     seed: Seed = 0  # of random numbers
 
     def budgets(self, views: int, longer_side: int) -> list[RadianceBudget]:
-        """Ascending budgets that are tried with so many training views of so many pixels; the last is all
-        that is asked for, and the only one with many views or few steps. A larger preset's begin with the
-        smaller one's, so that it cannot choose worse."""
+        """Ascending budgets that are tried with so many training views of so many pixels.
+
+        The last is all that is asked for, and the only one with many views or few steps. A larger preset's
+        begin with the smaller one's, so that it cannot choose worse.
+        """
         whole = RadianceBudget(longer_side, self.steps, self.max_gaussians, self.sh_degree)
         steps = [QUICK.steps]
         while REHEARSAL_FACTOR**2 * steps[-1] <= self.steps:
@@ -266,7 +273,7 @@ class RadianceConfig:
         return list(dict.fromkeys(budget.at_most(whole) for budget in (QUICK, *sizes, whole)))
 
     def spending(self, budget: RadianceBudget) -> "RadianceConfig":
-        """These settings with the budget's steps, Gaussians and degree."""
+        """Return these settings with the budget's steps, Gaussians and degree."""
         return replace(
             self, steps=budget.steps, max_gaussians=budget.max_gaussians, sh_degree=budget.sh_degree
         )

@@ -51,15 +51,19 @@ class Planes(NamedTuple):
 
 
 def compose(channels: Channels, picture: PictureConfig, ranges: Ranges = ()) -> Array:
-    """(H, W, 3) uint8 image; with `picture.transparent` (H, W, 4), its colours not premultiplied. Where a
-    display's further channel is absent it shows the plain colours. `ranges`: see `full_ranges`."""
+    """(H, W, 3) uint8 image; with `picture.transparent` (H, W, 4), its colours not premultiplied.
+
+    Where a display's further channel is absent it shows the plain colours. `ranges`: see `full_ranges`.
+    """
     image = compose_upwards(channels, picture, ranges)[::-1]
     return np.ascontiguousarray(image if picture.transparent else image[..., :3])
 
 
 def compose_upwards(channels: Channels, picture: PictureConfig, ranges: Ranges = ()) -> Array:
-    """(H, W, 4) uint8, the image of `compose` with row 0 at the bottom, as OpenGL has it; opaque unless the
-    picture is transparent."""
+    """(H, W, 4) uint8, the image of `compose` with row 0 at the bottom, as OpenGL has it.
+
+    Opaque unless the picture is transparent.
+    """
     extra = channels.alpha[..., None] if channels.extra is None else channels.extra
     planes = Planes(*(np.asarray(plane, np.float32) for plane in (channels.rgb, channels.alpha, extra)))
     style = Style(

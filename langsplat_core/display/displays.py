@@ -38,8 +38,11 @@ def _turbo() -> Array:
 
 
 def _published() -> dict[ColourMap, Array]:
-    """Viridis and magma by N. Smith and S. van der Walt (2015) and cividis by J. Nunez, C. Anderton and
-    R. Renslow (2018), as matplotlib has them: the rows of a small image beside this file."""
+    """Viridis and magma by N.
+
+    Smith and S. van der Walt (2015) and cividis by J. Nunez, C. Anderton and R. Renslow (2018), as matplotlib
+    has them: the rows of a small image beside this file.
+    """
     table = files(__package__).joinpath("colour_maps.png").read_bytes()
     with opened(table, "colour_maps.png") as picture:
         rows = np.asarray(picture.convert("RGB"))
@@ -133,8 +136,10 @@ def _by_slot(subject: Subject, values_of: Callable[[Answer], Array]) -> Array | 
 
 
 def heat_ranges(answers: Answers, scale: tuple[float, float] | None = None) -> Ranges:
-    """Relevancies at which the heat of each slot is 0 and 1, by one `scale` or by each answer's own; a weak
-    match gets no hotter than a half."""
+    """Relevancies at which the heat of each slot is 0 and 1, by one `scale` or by each answer's own.
+
+    A weak match gets no hotter than a half.
+    """
     return _weakened(answers, lambda answer: scale or answer.heat_range)
 
 
@@ -164,8 +169,9 @@ def latents(subject: Subject) -> Array | None:
 
 
 def latent_colours(field: LanguageField) -> Array:
-    """(3, N, 3) float32 colours in [0, 1] of the latents at each level; grey where nothing was observed. Made
-    once for each field.
+    """(3, N, 3) float32 colours in [0, 1] of the latents at each level; grey where nothing was observed.
+
+    Made once for each field.
 
     A codeword has its own. Latents of 3 numbers are colours by themselves, others have their first three
     principal axes over all levels together (one basis for the scene, so that colours agree between views
@@ -186,8 +192,10 @@ UNLIKE = 0.35, 0.6, 0.85  # brightnesses that nodes of one hue are told apart by
 
 
 def nodes(subject: Subject) -> Array | None:
-    """(N, 3) colours of the tree's nodes at a level, each its own; grey where there is none. None for a scene
-    that keeps no tree."""
+    """(N, 3) colours of the tree's nodes at a level, each its own; grey where there is none.
+
+    None for a scene that keeps no tree.
+    """
     if subject.language is None or subject.language.tree is None or subject.level is None:
         return None
     found, of = np.unique(subject.language.tree.at(subject.level), return_inverse=True)

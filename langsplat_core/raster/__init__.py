@@ -38,7 +38,7 @@ BACKENDS: Mapping[str, _Backend] = MappingProxyType(
 
 
 def load_rasterizer(name: str, **resources: Any) -> Rasterizer:
-    """The rasterizer called `name`, one of `BACKENDS`, given the resources it needs (opengl: `ctx`).
+    """Return the rasterizer called `name`, one of `BACKENDS`, given the resources it needs (opengl: `ctx`).
 
     Raises InputError for an unknown name and BackendError where its library or device is missing.
     """
@@ -75,7 +75,7 @@ def load_lifting_rasterizer(backend: str = "auto") -> LiftingRasterizer:
 
 
 def _cuda_may_work() -> bool:
-    """True where gsplat, which takes seconds to import, and a CUDA device are there."""
+    """Return True where gsplat, which takes seconds to import, and a CUDA device are there."""
     if find_spec("gsplat") is None or find_spec("torch") is None:
         return False
     from torch import cuda

@@ -46,7 +46,7 @@ class DifferentiableImage:
 
 
 def has_device() -> bool:
-    """True where torch finds the device that gsplat draws on."""
+    """Return True where torch finds the device that gsplat draws on."""
     return torch.cuda.is_available()
 
 

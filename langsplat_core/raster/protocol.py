@@ -55,8 +55,10 @@ class View(ABC):
         """(H, W) alpha-weighted mean depth along camera z, world units; 0 where nothing is drawn."""
 
     def median_depth(self) -> Array:
-        """(H, W) camera z, world units, of the Gaussian at which the transmittance falls to 0.5 or below; 0
-        where it never does. A backend that cannot tell gives the mean depth there."""
+        """(H, W) camera z, world units, of the Gaussian at which the transmittance falls to 0.5 or below.
+
+        0 where it never does. A backend that cannot tell gives the mean depth there.
+        """
         _, alpha = self.splat(np.empty((self.count, 0), np.float32))
         return np.where(alpha >= 0.5, self.depth(), 0)
 
@@ -132,7 +134,7 @@ LiftingRasterizer = Backend[LiftingView]
 
 
 def farthest(settings: RasterSettings) -> float:
-    """The largest camera z at which Gaussians are drawn, world units."""
+    """Return the largest camera z at which Gaussians are drawn, world units."""
     return math.inf if settings.far is None else settings.far
 
 
@@ -154,7 +156,7 @@ def tangent_limits(camera: Camera, settings: RasterSettings) -> tuple[float, flo
 
 
 def dilation(camera: Camera, settings: RasterSettings) -> float:
-    """What is added to both variances of a footprint, px^2.
+    """Return what is added to both variances of a footprint, px^2.
 
     Gaussians are fitted with the dilation around them. In an image of more pixels than the photographs had,
     the same number of pixels is less of the world: what was closed there opens, and edges fray into needles
@@ -181,8 +183,10 @@ def check_picture(camera: Camera) -> None:
 
 @cache
 def memory_bytes() -> float:
-    """Most that a process here may use: the machine's memory, or its container's share; infinite where the
-    system does not say."""
+    """Most that a process here may use: the machine's memory, or its container's share.
+
+    Infinite where the system does not say.
+    """
     found = [float("inf")]
     if "SC_PHYS_PAGES" in getattr(os, "sysconf_names", {}):
         found.append(float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")))

@@ -27,7 +27,7 @@ class Intrinsics:
             raise ValueError("focal lengths must be positive and the principal point finite")
 
     def resized(self, width: float, height: float) -> "Intrinsics":
-        """The same camera on another pixel grid over the same image."""
+        """Return the same camera on another pixel grid over the same image."""
         sx, sy = width / self.width, height / self.height
         return Intrinsics(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
 
@@ -100,11 +100,11 @@ class Camera:
         return replace(self, width=int(intrinsics.width), height=int(intrinsics.height), **inner)
 
     def resized(self, width: int, height: int) -> "Camera":
-        """The same view on another pixel grid."""
+        """Return the same view on another pixel grid."""
         return self.with_intrinsics(self.intrinsics.resized(width, height))
 
     def within(self, side: int) -> "Camera":
-        """The same view, no side of whose image is longer than `side` pixels."""
+        """Return the same view, no side of whose image is longer than `side` pixels."""
         share = min(side / max(self.width, self.height), 1.0)
         return self.resized(max(round(share * self.width), 1), max(round(share * self.height), 1))
 
@@ -139,7 +139,7 @@ class Camera:
 def look_at(
     eye: Array, target: Array, up: Array, size: tuple[int, int], fov_y_degrees: float = 50.0
 ) -> Camera:
-    """A camera at `eye` that sees `target` in its centre; `up` (world) points up in the image.
+    """Return a camera at `eye` that sees `target` in its centre; `up` (world) points up in the image.
 
     `size` is (width, height) in pixels. An `up` parallel to the view is replaced by a world axis.
     """

@@ -78,7 +78,7 @@ class Codec(ABC):
     @classmethod
     @abstractmethod
     def from_tensors(cls, tensors: dict[str, Array]) -> Self:
-        """The inverse of `tensors`; ValueError if they do not belong together."""
+        """Return the inverse of `tensors`; ValueError if they do not belong together."""
 
     def to_file(self, latents: Array) -> dict[str, Array]:
         """(3, N, d) latents as the named tensor of the scene file."""
@@ -86,7 +86,7 @@ class Codec(ABC):
 
     @classmethod
     def from_file(cls, tensors: Mapping[str, Array]) -> Array:
-        """The inverse of `to_file`; KeyError for a tensor that is missing."""
+        """Return the inverse of `to_file`; KeyError for a tensor that is missing."""
         return tensors["latents"]
 
     def check(self, latents: Array) -> None:  # noqa: B027  any numbers will do
@@ -98,8 +98,10 @@ class Codec(ABC):
         return known
 
     def unique(self, latents: Array) -> tuple[Array, Array]:
-        """(M, d) latents -> (U, d) distinct ones and the (M,) int64 index of each latent among them. Where
-        latents hardly ever repeat, these are the latents themselves."""
+        """(M, d) latents -> (U, d) distinct ones and the (M,) int64 index of each latent among them.
+
+        Where latents hardly ever repeat, these are the latents themselves.
+        """
         return latents, np.arange(len(latents))
 
     def directions(self, latents: Array) -> Array:
@@ -242,7 +244,7 @@ class AutoencoderCodec(Codec):
 
 
 def _largest(layers: Layers) -> float:
-    """A bound of all numbers that the layers make of a vector of length 1."""
+    """Return a bound of all numbers that the layers make of a vector of length 1."""
     bound = 1.0
     for weight, bias in layers:
         sums = np.abs(weight).sum(1, dtype=np.float64) * bound + np.abs(bias)

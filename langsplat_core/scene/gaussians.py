@@ -1,5 +1,7 @@
-"""The Gaussians of a scene, stored as the INRIA PLY stores them: raw, not activated; and fewer, larger ones
-that look much the same."""
+"""The Gaussians of a scene, stored as the INRIA PLY stores them: raw, not activated.
+
+And fewer, larger ones that look much the same.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
@@ -20,8 +22,11 @@ LARGEST_COEFFICIENT = 1e20  # of the spherical harmonics: sums of sixteen and th
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """N anisotropic Gaussians as a structure of float32 arrays, which are not changed any more. Rows may be
-    invalid (NaN, zero quaternion): backends drop and count them, nothing here repairs them silently."""
+    """N anisotropic Gaussians as a structure of float32 arrays, which are not changed any more.
+
+    Rows may be invalid (NaN, zero quaternion): backends drop and count them, nothing here repairs them
+    silently.
+    """
 
     means: Array  # (N, 3) world units
     log_scales: Array  # (N, 3) natural logarithm of world units; -inf is a flat axis
@@ -50,7 +55,7 @@ class Gaussians:
         return {count: degree for degree, count in SH_COUNTS.items()}[self.sh.shape[1]]
 
     def take(self, rows: Array) -> "Gaussians":
-        """The Gaussians at `rows`: indices or a boolean mask of length N."""
+        """Return the Gaussians at `rows`: indices or a boolean mask of length N."""
         return Gaussians(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def valid(self) -> Array:
@@ -150,7 +155,10 @@ class _Part(NamedTuple):
 
 
 def merged(gaussians: Gaussians, progress: Progress = silent) -> Merged:
-    """A quarter to all of the drawable rows, in another order; rows that are not valid are left out."""
+    """Return a quarter to all of the drawable rows, in another order.
+
+    Rows that are not valid are left out.
+    """
     rows = np.flatnonzero(gaussians.valid())
     rows = rows[np.argsort(along_curve(gaussians.means[rows]))]
     grouped = rows[: len(rows) // GROUP * GROUP].reshape(-1, GROUP)

@@ -20,14 +20,18 @@ _APOSTROPHES = str.maketrans(dict.fromkeys("’‘ʼ′＇´`", "'"))
 
 
 def split_phrases(text: str) -> list[str]:
-    """The phrases in a line, tidy, separated by ";" or ","; "mug, not red" is one. Empty ones are left
-    out."""
+    """Return the phrases in a line, tidy, separated by ";" or ","; "mug, not red" is one.
+
+    Empty ones are left out.
+    """
     return [part for part in (tidy(part) for part in _SEPARATE.split(text)) if part]
 
 
 def tidy(text: str) -> str:
-    """A phrase as it is shown: words without quotes and punctuation around them, single spaces; commas stay
-    behind their words."""
+    """Return a phrase as it is shown: words without quotes and punctuation around them, single spaces.
+
+    Commas stay behind their words.
+    """
     return " ".join(tokens(text)).replace(" ,", ",").lstrip(", ")
 
 
@@ -212,7 +216,7 @@ class LanguageField:
         return known
 
     def take(self, rows: Array) -> "LanguageField":
-        """The field of the Gaussians at `rows` (indices or a boolean mask)."""
+        """Return the field of the Gaussians at `rows` (indices or a boolean mask)."""
         return replace(
             self,
             latents=self.latents[:, rows],

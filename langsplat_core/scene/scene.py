@@ -44,7 +44,7 @@ class Scene:
             )
 
     def take(self, rows: Array) -> "Scene":
-        """The scene of the Gaussians at `rows` (indices or a boolean mask), without a path."""
+        """Return the scene of the Gaussians at `rows` (indices or a boolean mask), without a path."""
         return replace(
             self,
             gaussians=self.gaussians.take(rows),
@@ -59,8 +59,10 @@ class Scene:
 
     @cached_property
     def _focal(self) -> float | None:
-        """Median focal length of the cameras, px; None without cameras, and where it is one of no lens, as in
-        files that state it in other units."""
+        """Median focal length of the cameras, px.
+
+        None without cameras, and where it is one of no lens, as in files that state it in other units.
+        """
         lengths = [
             (np.sqrt(camera.fx * camera.fy), camera.width)
             for camera in self.cameras

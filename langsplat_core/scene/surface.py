@@ -31,7 +31,7 @@ class Parts:
     labels: Array  # (M,) int32 part of every Gaussian of the surface; -1 for those that are no members
 
     def each(self) -> list[Array]:
-        """The numbers of every part, ascending."""
+        """Return the numbers of every part, ascending."""
         return [np.sort(part) for part in np.split(self.order, self.starts[1:])] if len(self.starts) else []
 
 
@@ -67,7 +67,7 @@ class Surface:
         return smoothed
 
     def parts(self, numbers: Array) -> Parts:
-        """The connected parts of the Gaussians `numbers` (K,), in [0, M), each once."""
+        """Return the connected parts of the Gaussians `numbers` (K,), in [0, M), each once."""
         labels = np.full(len(self.rows), _OUTSIDE, np.int32)
         labels[numbers] = _WAITING
         order, starts = np.empty(len(numbers), np.int32), np.empty(len(numbers), np.int32)
@@ -165,8 +165,10 @@ def _smooth(
 def _label(
     indptr: Array, indices: Array, seeds: Array, labels: Array, order: Array, starts: Array
 ) -> tuple[int, int]:
-    """Number the parts that `seeds` are in, breadth first over what is `_WAITING` in `labels`; how many parts
-    there are, and Gaussians in them."""
+    """Return the number the parts that `seeds` are in, breadth first over what is `_WAITING` in `labels`.
+
+    How many parts there are, and Gaussians in them.
+    """
     parts = found = done = 0
     for seed in seeds:
         if labels[seed] != _WAITING:
@@ -248,7 +250,7 @@ STEPS = 65_535 / (UNKNOWN + 2 * BORDER)  # of 1 - cosine that are told apart: 16
 def build_tree(
     surface: Surface, codec: Codec, latents: Array, known: Array, things: Array | None = None
 ) -> Tree:
-    """The tree of a scene, without votes.
+    """Return the tree of a scene, without votes.
 
     latents: (3, N, d); known: (3, N) bool; things: (3, N) int32 number, from 0, of what masks of many
     photographs say is one, at each level, NO_NODE for none.

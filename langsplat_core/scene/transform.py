@@ -98,8 +98,10 @@ def scaling(factor: float) -> Similarity:
 
 
 def rotating(axis: Array, degrees: float) -> Similarity:
-    """Return the right-handed rotation about `axis` (3,) through the origin; of quarter turns about an axis
-    of the world, exactly."""
+    """Return the right-handed rotation about `axis` (3,) through the origin.
+
+    Of quarter turns about an axis of the world, exactly.
+    """
     if not (np.isfinite(axis).all() and np.linalg.norm(axis) > 1e-12 and math.isfinite(degrees)):
         raise InputError("a rotation about no direction; give an axis that is not zero and finite degrees")
     x, y, z = unit(np.asarray(axis, np.float64), 1e-300)
@@ -123,8 +125,10 @@ def turning(direction: Array, onto: Array) -> Similarity:
 
 
 def similarity(matrix: Array) -> Similarity:
-    """Return the similarity of a (4, 4) or (3, 4) matrix. InputError for one that is mirrored, flat, sheared,
-    projective or not finite."""
+    """Return the similarity of a (4, 4) or (3, 4) matrix.
+
+    InputError for one that is mirrored, flat, sheared, projective or not finite.
+    """
     matrix = np.asarray(matrix, np.float64)
     if matrix.shape not in ((4, 4), (3, 4)):
         raise InputError("a transform is a matrix of 4 x 4 numbers, or 3 x 4")
@@ -200,8 +204,10 @@ def transform_rows(gaussians: Gaussians, selected: Array, to: Similarity) -> Gau
 
 
 def transform_scene(scene: Scene, to: Similarity, selected: Array | None = None) -> Scene:
-    """Return the whole scene transformed with its cameras and its metres per unit; or the `selected` (N,)
-    bool of its Gaussians alone, where the rest and the cameras stay."""
+    """Return the whole scene transformed with its cameras and its metres per unit.
+
+    Or the `selected` (N,) bool of its Gaussians alone, where the rest and the cameras stay.
+    """
     if to.is_identity:
         return scene
     if selected is not None:

@@ -70,7 +70,10 @@ class Tree:
         return np.where(votes[at], at, np.int32(NO_NODE))
 
     def path(self, node: int) -> tuple[int, ...]:
-        """The node, its parent, that one's parent, ... up to a root."""
+        """Return the node, its parent, that one's parent, ...
+
+        up to a root.
+        """
         found = [int(node)]
         while self.parents[found[-1]] != NO_NODE:
             found.append(int(self.parents[found[-1]]))
@@ -89,7 +92,7 @@ class Tree:
         return np.asarray(inside[self.leaves])
 
     def gaussians(self) -> list[Array]:
-        """The Gaussians of each node, ascending."""
+        """Return the Gaussians of each node, ascending."""
         order = np.argsort(self.leaves, kind="stable")
         firsts = np.searchsorted(self.leaves[order], np.arange(self.count + 1))
         found = [order[a:b] for a, b in pairwise(firsts)]
@@ -116,12 +119,18 @@ class Tree:
         return replace(self, votes=votes)
 
     def take(self, rows: Array) -> "Tree":
-        """The tree of the Gaussians at `rows` (indices or a boolean mask); its nodes keep their numbers."""
+        """Return the tree of the Gaussians at `rows` (indices or a boolean mask).
+
+        Its nodes keep their numbers.
+        """
         return replace(self, leaves=self.leaves[rows])
 
 
 def tree_of_wholes(things: Array) -> Tree:
-    """The tree of things alone: (N,) number of the thing of each Gaussian, from 0; NO_NODE for none."""
+    """Return the tree of things alone: (N,) number of the thing of each Gaussian, from 0.
+
+    NO_NODE for none.
+    """
     count = int(things.max(initial=NO_NODE)) + 1
     votes = np.tile(np.array([1, 0], np.uint16), (count, 1))
     return Tree(

@@ -56,7 +56,7 @@ _TAPE = 128 * TILE * _ENTRY  # its first length: 128 Gaussians that fill the til
 
 @helper
 def _grown(tape: Array, used: int) -> Array:
-    """The tape, with room for one more Gaussian behind `used` numbers."""
+    """Return the tape, with room for one more Gaussian behind `used` numbers."""
     if used + TILE * _ENTRY <= tape.shape[0]:
         return tape
     longer = np.empty(2 * tape.shape[0], np.float32)
@@ -69,8 +69,9 @@ def _grown(tape: Array, used: int) -> Array:
 def _record(
     tile: int, tiles: Tiles, geometry: Array, cutoffs: Cutoffs, state: Array, spans: Array, tape: Array
 ) -> tuple[Array, int, int]:
-    """`walk`, but with a tape that may have to grow on the way; returns it (a longer one where it was full),
-    its length and the end of the intersections visited.
+    """`walk`, but with a tape that may have to grow on the way.
+
+    Returns it (a longer one where it was full), its length and the end of the intersections visited.
 
     spans[s - first] <- rows [low, high) of each intersection that were blended; none where no pixel got any
     weight, and nothing on the tape.
@@ -177,8 +178,11 @@ def backward(
     partial: Array,
     reached: Array,
 ) -> None:
-    """(M, C) values in depth order; gradients (H, W, C) and (H, W, 1) by image and alpha; fills (I,) bool
-    `reached`, and (I, 8 + padded(C)) partial sums where that is True. float32, for tiles [first, last)."""
+    """(M, C) values in depth order; gradients (H, W, C) and (H, W, 1) by image and alpha.
+
+    Fills (I,) bool `reached`, and (I, 8 + padded(C)) partial sums where that is True. float32, for tiles
+    [first, last).
+    """
     count = tiles.starts.shape[0] - 1
     tape = np.empty(_TAPE, np.float32)
     for i in range(first, last):
@@ -352,7 +356,10 @@ def _point_gradient(point: cp.Point, camera: cp.KernelCamera, du: float, dv: flo
 def _axes_gradient(
     work: Array, scales: cp.Point, by_covariance: cp.Point, by_turn: Array, by_b: Array, by_log_scale: Array
 ) -> None:
-    """A = B turn diag(s) gets 2 G A from the covariance's gradient G; from there to B, turn and log(s)."""
+    """Return a = B turn diag(s) gets 2 G A from the covariance's gradient G.
+
+    From there to B, turn and log(s).
+    """
     turn, b, a = work[0], work[1], work[2]
     gxx, gxy, gyy = by_covariance
     by_b[:] = 0

@@ -34,7 +34,7 @@ from langsplat_core.scene import Camera
 
 @helper
 def write_alpha(transmittance: Array, alpha: Array, tile: int, tiles: Tiles) -> None:
-    """The tile of (H, W, 1) alpha <- 1 - |T|; changes `transmittance`."""
+    """Return the tile of (H, W, 1) alpha <- 1 - |T|; changes `transmittance`."""
     for n in range(PIXELS):
         transmittance[n] = np.float32(1) - abs(transmittance[n])
     write_tile(transmittance, alpha, tile, tiles.columns)
@@ -133,7 +133,7 @@ def sum_partials(first: int, last: int, tiles: Tiles, order: Array, partial: Arr
 
 @helper
 def sum_over_tiles(rank: int, tiles: Tiles, partial: Array, sums: Array) -> None:
-    """sums <- the first numbers of the rank's partial sums, added up in the order of its tiles."""
+    """Return sums <- the first numbers of the rank's partial sums, added up in the order of its tiles."""
     sums[:] = 0
     end = tiles.slots.shape[0] - 1
     for n in range(tiles.firsts[rank], tiles.firsts[rank + 1]):

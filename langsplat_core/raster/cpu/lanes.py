@@ -44,7 +44,7 @@ def constant(value: float) -> ir.Constant:
 
 
 def as_lanes(builder: Any, value: Any) -> Any:
-    """A float, double or lanes as lanes."""
+    """Return a float, double or lanes as lanes."""
     if value.type == FLOATS:
         return value
     if isinstance(value.type, ir.DoubleType):
@@ -99,13 +99,13 @@ def ramp(typing: Any) -> Any:
 
 @intrinsic
 def where_greater(typing: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
-    """a > b ? yes : no"""
+    """Return a > b ? yes : no."""
     return lanes16(a, b, yes, no), lambda context, builder, sig, args: _select(builder, ">", *args)
 
 
 @intrinsic
 def where_at_least(typing: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
-    """a >= b ? yes : no"""
+    """Return a >= b ? yes : no."""
     return lanes16(a, b, yes, no), lambda context, builder, sig, args: _select(builder, ">=", *args)
 
 
@@ -167,7 +167,7 @@ def total(typing: Any, value: Any) -> Any:
 
 @intrinsic
 def largest(typing: Any, value: Any) -> Any:
-    """The greatest of the lanes as a float32."""
+    """Return the greatest of the lanes as a float32."""
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
         return _fold(
@@ -285,7 +285,7 @@ def store_four(typing: Any, array: Any, index: Any, stride: Any, a: Any, b: Any,
 
 @intrinsic
 def load_four(typing: Any, array: Any, index: Any, stride: Any) -> Any:
-    """The inverse of `store_four`: a tuple of four lanes."""
+    """Return the inverse of `store_four`: a tuple of four lanes."""
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
         pixels = []
@@ -326,7 +326,7 @@ def store_three(typing: Any, array: Any, index: Any, a: Any, b: Any, c: Any) -> 
 
 @intrinsic
 def load_three(typing: Any, array: Any, index: Any) -> Any:
-    """The inverse of `store_three`: a tuple of three lanes."""
+    """Return the inverse of `store_three`: a tuple of three lanes."""
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
         blocks = []

@@ -25,8 +25,11 @@ def _references(blocks: Blocks) -> list[int]:
 
 
 class Memory:
-    """Blocks of memory. Each is free again once no array that lies in it is referred to any more: an array
-    made from another refers to the block itself."""
+    """Blocks of memory.
+
+    Each is free again once no array that lies in it is referred to any more: an array made from another
+    refers to the block itself.
+    """
 
     def __init__(self) -> None:
         self._lock = Lock()

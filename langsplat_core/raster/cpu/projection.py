@@ -205,7 +205,7 @@ def opacity_of(logit: float) -> float:
 
 @helper
 def _is_valid(rows: Rows, i: int) -> bool:
-    """The compiled twin of `Gaussians.valid`."""
+    """Return the compiled twin of `Gaussians.valid`."""
     mean, log_scales, quat, sh_bits = rows.means[i], rows.log_scales[i], rows.quats_wxyz[i], rows.sh_bits[i]
     ok = not np.isnan(rows.opacity_logits[i])
     squared = 0.0
@@ -392,8 +392,9 @@ def _backward(
 
 
 def colours(sh: Array, means: Array, camera_position: Array, rows: Array | None = None) -> Array:
-    """(N, K, 3) float32 coefficients, (N, 3) float32 means -> (N, 3) float32 display colours >= 0; with
-    `rows`, (M,) int32, those of these Gaussians.
+    """(N, K, 3) float32 coefficients, (N, 3) float32 means -> (N, 3) float32 display colours >= 0.
+
+    With `rows`, (M,) int32, those of these Gaussians.
 
     Invalid rows give 0; see `spherical_harmonics.colours`.
     """

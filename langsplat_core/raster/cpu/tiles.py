@@ -73,7 +73,7 @@ def pack_span(low: int, high: int) -> int:
 
 @helper
 def unpack_span(packed: int) -> tuple[int, int]:
-    """The inverse of `pack_span`."""
+    """Return the inverse of `pack_span`."""
     return packed & 255, packed >> 8
 
 
@@ -87,8 +87,10 @@ class Sorting(NamedTuple):
 
 @helper
 def _fill_keys(status: Array, depth_bits: Array, out: Sorting, counts: Array) -> None:
-    """keys[0], order[0] <- the 32 leading bits in which drawn depths differ, and their rows; counts[digit,
-    value] <- how often."""
+    """keys[0], order[0] <- the 32 leading bits in which drawn depths differ, and their rows.
+
+    Counts[digit, value] <- how often.
+    """
     low, high = np.uint64(2**64 - 1), np.uint64(0)
     for i in range(status.shape[0]):
         if status[i] == cp.DRAWN:
@@ -195,8 +197,10 @@ def _columns_touched(g: Array, grid: TileGrid) -> tuple[int, int]:
 
 @helper
 def _at_most(g: Array, grid: TileGrid) -> float:
-    """No fewer tiles than a footprint touches: those of its box; or, for a needle, of the area within a
-    tile's side of it (Steiner)."""
+    """No fewer tiles than a footprint touches: those of its box.
+
+    Or, for a needle, of the area within a tile's side of it (Steiner).
+    """
     wide, high = 2 * g[cp.HALF_WIDTH] / TILE, 2 * g[cp.HALF_HEIGHT] / TILE
     box = min(float(grid.columns), wide + 2) * min(float(grid.lines), high + 2)  # in this order also of a NaN
     if box <= _FEW:
@@ -302,7 +306,7 @@ def bin_tiles(
 
 @helper
 def spread(index: int, count: int) -> int:
-    """A permutation of range(count) whose every stretch samples the whole image evenly.
+    """Return a permutation of range(count) whose every stretch samples the whole image evenly.
 
     Threads take contiguous pieces of a loop over tiles, and busy tiles lie together. The stride is near the
     golden section of `count` and prime to it.
@@ -332,7 +336,7 @@ padded_inside = helper(padded)
 
 @helper
 def add_weighted(sums: Array, at: int, channels: int, weight: Lanes, x: Array) -> None:
-    """sums[at + 16 channel : + 16] += weight x[channel]"""
+    """sums[at + 16 channel : + 16] += weight x[channel]."""
     for channel in range(0, channels & ~3, 4):
         store(sums, at, load(sums, at) + weight * x[channel])
         store(sums, at + TILE, load(sums, at + TILE) + weight * x[channel + 1])
@@ -376,8 +380,10 @@ def write_tile(planes: Array, image: Array, tile: int, columns: int) -> None:
 
 @helper
 def load_tile(planes: Array, image: Array, tile: int, columns: int) -> None:
-    """planes[(row, channel, column)] <- that tile (of `columns` in a row of tiles) of (H, W, C) image; 0
-    beyond its border and in the fourth channel of three."""
+    """planes[(row, channel, column)] <- that tile (of `columns` in a row of tiles) of (H, W, C) image.
+
+    0 beyond its border and in the fourth channel of three.
+    """
     x0, y0 = tile % columns * TILE, tile // columns * TILE
     height, width, channels = image.shape
     lines = padded_inside(channels)
@@ -453,13 +459,13 @@ class Cutoffs(NamedTuple):
 
 
 def make_cutoffs(settings: RasterSettings) -> Cutoffs:
-    """The settings as kernels take them."""
+    """Return the settings as kernels take them."""
     return Cutoffs(float(settings.alpha_min), float(settings.alpha_max), float(settings.transmittance_min))
 
 
 @helper
 def start_tile(tile: int, tiles: Tiles, width: int, height: int) -> Array:
-    """A tile's transmittance: 1 inside the image; pixels beyond its border have stopped already."""
+    """Return a tile's transmittance: 1 inside the image; pixels beyond its border have stopped already."""
     x0, y0 = tile % tiles.columns * TILE, tile // tiles.columns * TILE
     transmittance = np.empty(PIXELS, np.float32)
     for row in range(TILE):
@@ -481,22 +487,23 @@ def running_rows(transmittance: Array, low: int, high: int) -> tuple[int, int]:
 
 @helper
 def rows_to_blend(packed: int, top: int, bottom: int) -> tuple[int, int]:
-    """The rows of a packed span that are within the running rows [top, bottom)."""
+    """Return the rows of a packed span that are within the running rows [top, bottom)."""
     low, high = unpack_span(packed)
     return max(low, top), min(high, bottom)
 
 
 @helper
 def enter(geometry: Array, tiles: Tiles, s: int, later: int) -> Array:
-    """The footprint of intersection `s`; that of `later` is asked for, as memory is far away."""
+    """Return the footprint of intersection `s`; that of `later` is asked for, as memory is far away."""
     prefetch(geometry, np.int64(tiles.ranks[later]) * cp.COLUMNS)
     return geometry[tiles.ranks[s]]
 
 
 @helper
 def begin_rows(g: Array, x: float, y: float) -> tuple[Lanes, float, float, float, float, float]:
-    """For rows whose first pixel centre is (x, y): of sixteen pixels the steps in w (see `projection`);
-    the log2 of the peak alpha; w and v at (x, y), and what a step of one row adds to them.
+    """For rows whose first pixel centre is (x, y): of sixteen pixels the steps in w (see `projection`).
+
+    The log2 of the peak alpha; w and v at (x, y), and what a step of one row adds to them.
 
     float64: across a long thin footprint w is the small difference of large numbers.
     """
@@ -535,8 +542,10 @@ def walk(
     row_: Callable[..., None],
     close_: Callable[..., None],
 ) -> int:
-    """Blend the tile, changing its `transmittance`; returns the end of the intersections visited, which comes
-    early where no pixel runs any more."""
+    """Blend the tile, changing its `transmittance`.
+
+    Returns the end of the intersections visited, which comes early where no pixel runs any more.
+    """
     x, y = tile % tiles.columns * TILE + 0.5, tile // tiles.columns * TILE + 0.5
     first, last = tiles.starts[tile], tiles.starts[tile + 1]
     top, bottom = 0, TILE

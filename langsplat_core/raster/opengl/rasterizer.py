@@ -97,7 +97,7 @@ class GlRasterizer:
         return GlView(self, gaussians, camera, settings, order)
 
     def scene(self, gaussians: Gaussians) -> SceneTextures:
-        """The scene's textures, uploaded if another scene was drawn last."""
+        """Return the scene's textures, uploaded if another scene was drawn last."""
         if self._scene is None or self._scene.gaussians is not gaussians:
             if self._scene is not None:
                 self._scene.release()
@@ -152,7 +152,7 @@ class GlRasterizer:
         return targets.images
 
     def project(self, view: "GlView") -> SceneTextures:
-        """The scene's textures, with the projection and the draw order of `view` in them."""
+        """Return the scene's textures, with the projection and the draw order of `view` in them."""
         scene = self.scene(view.gaussians)
         if self._current is not view:
             self._fill(scene, view)

@@ -26,7 +26,7 @@ SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swrast", "swr ", "software", "swi
 
 
 def is_software(ctx: moderngl.Context) -> bool:
-    """True where the driver draws on the CPU."""
+    """Return True where the driver draws on the CPU."""
     renderer = ctx.info["GL_RENDERER"].lower()
     return any(name in renderer for name in SOFTWARE_RENDERERS)
 
@@ -157,7 +157,7 @@ class DepthSorter:
         }
 
     def holds(self, count: int) -> bool:
-        """True where the driver's buffers are large enough for so many points."""
+        """Return True where the driver's buffers are large enough for so many points."""
         return bool(MEAN_BYTES * count <= self._ctx.info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"])
 
     def sort(self, buffers: SortBuffers, plane: Array, near: float, far: float) -> None:
@@ -192,7 +192,7 @@ class DepthSorter:
         self._ctx.memory_barrier()
 
     def is_right(self) -> bool:
-        """True where a small sort comes out right: drivers are known to get such shaders wrong."""
+        """Return True where a small sort comes out right: drivers are known to get such shaders wrong."""
         depths = np.random.default_rng(0).integers(-2, 60, _PROBE) * np.pi
         means = np.zeros((_PROBE, 3))
         means[:, 2] = depths
@@ -212,7 +212,10 @@ class DepthSorter:
 
 
 def working_sorter(ctx: moderngl.Context) -> DepthSorter | None:
-    """A sorter that was seen to sort; None where the driver has no compute shaders or fails at them."""
+    """Return a sorter that was seen to sort.
+
+    None where the driver has no compute shaders or fails at them.
+    """
     if ctx.version_code < 430:
         return None
     try:
@@ -226,8 +229,11 @@ def working_sorter(ctx: moderngl.Context) -> DepthSorter | None:
 
 
 def chosen_sorter(ctx: moderngl.Context, sort: Sort) -> DepthSorter | None:
-    """None where the CPU is to sort. "auto": a sorter that works, but none on a driver that runs on the CPU,
-    where NumPy is faster. BackendError for "device" where there is none."""
+    """None where the CPU is to sort.
+
+    "auto": a sorter that works, but none on a driver that runs on the CPU, where NumPy is faster.
+    BackendError for "device" where there is none.
+    """
     if sort == "cpu" or (sort == "auto" and is_software(ctx)):
         return None
     sorter = working_sorter(ctx)
@@ -276,8 +282,11 @@ class SceneTextures:
         )
 
     def depths(self, camera: Camera) -> Array:
-        """(n,) float64 camera z. Term by term, as in the reference: a matrix product may round equal rows
-        differently, and equal depths must tie."""
+        """(n,) float64 camera z.
+
+        Term by term, as in the reference: a matrix product may round equal rows differently, and equal depths
+        must tie.
+        """
         x, y, z = self._means
         a, b, c, d = camera.world_to_camera[2]
         depths: Array = x * a + y * b + z * c + d
