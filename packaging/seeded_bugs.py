@@ -56,9 +56,10 @@ def copy_checkout(to: Path) -> None:
         if (ROOT / name).exists():  # not deleted in the working tree
             (to / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, to / name, follow_symlinks=False)
-    kernels = Path("langsplat_core", "__pycache__", "kernels")
-    if (ROOT / kernels).is_dir():
-        shutil.copytree(ROOT / kernels, to / kernels)
+    for kernel in ROOT.glob("langsplat_core/**/__pycache__/*.nb[ic]"):
+        copy = to / kernel.relative_to(ROOT)
+        copy.parent.mkdir(exist_ok=True)
+        shutil.copy2(kernel, copy)
 
 
 def run_tests(root: Path, tests: list[str]) -> tuple[str, str]:

@@ -228,7 +228,7 @@ def say_compiling(progress: Progress) -> None:
     from langsplat_core.compiled import is_compiled
     from langsplat_core.raster.cpu import blend
 
-    if not is_compiled(Path(blend.__file__)):
+    if not is_compiled(blend.splat):
         progress("compiling the drawing kernels, once per installation (half a minute)", 0.7)
 
 

@@ -198,12 +198,12 @@ def divide(surface: Surface, steps: Array, order: Array, scale: float, smallest:
     step. steps: (E,) of the links `Surface.ends`, >= 0; order: (E,) int32 of the links, by rising step;
     scale: of the criterion, in steps times Gaussians, larger for larger patches.
     """
-    roots = _merge(len(surface.rows), *surface.ends, steps.astype(np.float32), order, scale, smallest)
+    roots = merge_patches(len(surface.rows), *surface.ends, steps.astype(np.float32), order, scale, smallest)
     return np.unique(roots, return_inverse=True)[1].astype(np.int32).reshape(-1)
 
 
 @kernel
-def _merge(
+def merge_patches(
     count: int, first: Array, second: Array, steps: Array, order: Array, scale: float, smallest: int
 ) -> Array:
     """(M,) a member of each Gaussian's patch, the same for all of a patch."""

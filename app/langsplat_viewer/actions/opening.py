@@ -156,7 +156,7 @@ def _say_opened(viewer: Viewer, path: Path, opened: _Opened) -> None:
 
 def _compile_search(viewer: Viewer) -> None:
     engine = viewer.engine
-    if engine is None or is_compiled(Path(surface.__file__)):
+    if engine is None or is_compiled(surface.merge_patches):
         return
     viewer.run(
         "compiling the search kernels, once per installation (half a minute)", lambda progress: engine.regions
