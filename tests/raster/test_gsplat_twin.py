@@ -21,7 +21,7 @@ from langsplat_core.training.radiance.differentiable import CpuRenderer, CudaRen
 from langsplat_core.training.radiance.scores import evaluate_views
 from langsplat_core.training.radiance.state import PARAMETERS, start
 from langsplat_core.training.radiance.trainer import train_radiance
-from tests.support import torch_raster as twin
+from tests.support import gsplat_twin as twin
 from tests.support.scenes import make_views, random_camera, random_gaussians, without_perspective
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("gsplat_twin")]

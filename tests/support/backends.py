@@ -18,9 +18,9 @@ from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.gsplat import drawn_settings
 from langsplat_core.raster.opengl.scene_textures import create_egl_context
 from langsplat_core.scene import Gaussians
-from tests.support.torch_raster import gsplat_on_cpu
+from tests.support.gsplat_twin import gsplat_on_cpu
 
-# "cuda-twin": the CUDA backend over gsplat's kernels in plain PyTorch, see `torch_raster`.
+# "cuda-twin": the CUDA backend over gsplat's kernels in plain PyTorch, see `gsplat_twin`.
 NAMES = (
     "reference",
     "cpu",

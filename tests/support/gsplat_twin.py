@@ -1,5 +1,4 @@
-"""Image formation in plain PyTorch: gsplat's compiled kernels (`gsplat.cuda._backend._C` as of 1.5.3) for the
-CPU, and a differentiable reference in float64 (`render`).
+"""A twin of gsplat's compiled kernels (`gsplat.cuda._backend._C` as of 1.5.3) in plain PyTorch, for the CPU.
 
 gsplat's own Python code runs unchanged above them: its signatures, checks of shapes, padding of channels and
 chunks are the real ones. Arguments and results below are those of its `Ops.h`, arithmetic and its order
@@ -19,14 +18,10 @@ from types import ModuleType
 from typing import Any
 from unittest.mock import patch
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.raster import gsplat
-from langsplat_core.raster.protocol import dilation, farthest
-from langsplat_core.scene import Camera, Gaussians
 
 PINHOLE, ORTHO = 0, 1  # pybind exports the values of this enumeration beside it
 CameraModelType = ModuleType("CameraModelType")
@@ -330,70 +325,3 @@ def spherical_harmonics_bwd(  # gsplat's signature
 def _harmonics() -> Any:
     """gsplat's own plain function."""
     return import_module("gsplat.cuda._torch_impl")._spherical_harmonics  # noqa: SLF001  under no other name
-
-
-# Image formation once more, dense and differentiable: float64, every Gaussian at every pixel, to check
-# gradients. Cut-offs are decided by detached comparisons: autograd gives the gradient of what is drawn. Keep
-# scenes to a few dozen Gaussians and a few thousand pixels.
-
-
-def parameters(gaussians: Gaussians) -> dict[str, torch.Tensor]:
-    """Leaves in float64 that `render` takes."""
-    names = ("means", "log_scales", "quats_wxyz", "opacity_logits")
-    arrays = {name: getattr(gaussians, name) for name in names}
-    return {name: torch.tensor(a, dtype=torch.float64, requires_grad=True) for name, a in arrays.items()}
-
-
-def project(
-    leaves: dict[str, torch.Tensor], camera: Camera, settings: RasterSettings = INRIA
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Pixel means (N, 2), 2D covariances (N, 2, 2), opacities (N,), depths (N,)."""
-    rotation = torch.tensor(camera.rotation)
-    points = leaves["means"] @ rotation.T + torch.tensor(camera.world_to_camera[:3, 3])
-    x, y, z = points.T
-    axes = (x, camera.width, camera.fx, camera.cx), (y, camera.height, camera.fy, camera.cy)
-    nought, over, kept = torch.zeros_like(z), torch.ones_like(z), [torch.zeros_like(z)] * 2
-    if not camera.orthographic:
-        grow = 0.5 * (settings.fov_clamp - 1)  # of the image's size, on every side
-        kept = [(p / z).clamp((-c - grow * size) / f, (size - c + grow * size) / f) for p, size, f, c in axes]
-        over = z
-    tx, ty = kept
-    jacobian = torch.stack(
-        [camera.fx / over, nought, -camera.fx * tx / z, nought, camera.fy / over, -camera.fy * ty / z], -1
-    ).reshape(-1, 2, 3)
-    a = jacobian @ rotation @ (_rotations(leaves["quats_wxyz"]) * torch.exp(leaves["log_scales"])[:, None, :])
-    sharp = a @ a.mT
-    covariance = sharp + dilation(camera, settings) * torch.eye(2, dtype=torch.float64)
-    opacity = torch.sigmoid(leaves["opacity_logits"])
-    if settings.antialiased:
-        ratio = torch.linalg.det(sharp) / torch.linalg.det(covariance)
-        opacity = opacity * torch.sqrt(torch.clamp(ratio, min=0.005**2))
-    means_px = torch.stack([camera.fx * x / over + camera.cx, camera.fy * y / over + camera.cy], -1)
-    return means_px, covariance, opacity, z
-
-
-def render(
-    leaves: dict[str, torch.Tensor], values: torch.Tensor, camera: Camera, settings: RasterSettings = INRIA
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """(N, C) values -> image (H, W, C), alpha (H, W), and the pixel means for their gradient."""
-    means_px, covariance, opacity, depth = project(leaves, camera, settings)
-    means_px.retain_grad()
-    ys, xs = np.mgrid[: camera.height, : camera.width] + 0.5
-    pixels = torch.tensor(np.stack([xs.ravel(), ys.ravel()], -1))
-    image = torch.zeros(len(pixels), values.shape[1], dtype=torch.float64)
-    transmittance = torch.ones(len(pixels), dtype=torch.float64)
-    running = torch.ones(len(pixels), dtype=torch.bool)
-    for n in torch.argsort(depth.detach(), stable=True).tolist():
-        if not settings.near < depth[n] <= farthest(settings):
-            continue
-        offset = pixels - means_px[n]
-        power = -0.5 * (offset @ torch.linalg.inv(covariance[n]) * offset).sum(1)
-        alpha = torch.clamp(opacity[n] * torch.exp(power), max=float(np.float32(settings.alpha_max)))
-        hit = running & (alpha.detach() >= settings.alpha_min)
-        stop = hit & ((transmittance * (1 - alpha)).detach() <= settings.transmittance_min)
-        running = running & ~stop
-        alpha = torch.where(hit & ~stop, alpha, 0.0)
-        image = image + (alpha * transmittance)[:, None] * values[n]
-        transmittance = transmittance * (1 - alpha)
-    shape = (camera.height, camera.width)
-    return image.reshape(*shape, -1), (1 - transmittance).reshape(shape), means_px
