@@ -232,7 +232,7 @@ def _overlapping(claims: sparse.csr_matrix, view_of: Array) -> sparse.csr_matrix
     visible = (claims.T @ seen).tocsr()  # (M, V): Gaussians of the mask that the view sees
     union = -both.data
     for mask, other in ((a, b), (b, a)):
-        union += np.asarray(visible[mask, view_of[other]]).ravel()
+        union = union + np.asarray(visible[mask, view_of[other]]).ravel()
     same = (view_of[a] != view_of[b]) & (both.data > SAME * union)
     return sparse.csr_matrix((np.ones(int(same.sum()), bool), (a[same], b[same])), (count, count))
 
