@@ -144,7 +144,8 @@ def _side_by_side(ctx: Any, window: Window) -> None:
 
 def _palette(ctx: Any, window: Window) -> None:
     settings.show_palette(window.viewer, True)
-    window.viewer.state.palette_typed = "sel"
+    ctx.yield_(2)
+    window.viewer.state.drafts["##command"] = "sel"
 
 
 def _light(ctx: Any, window: Window) -> None:

@@ -87,8 +87,8 @@ class Recording:
     turn_from: OrbitCamera | None = None  # where the turn that is played began
     size: tuple[int, int] = (1280, 720)  # of films, and of images that are no screenshots, pixels
     fps: float = 30.0
-    film_typed: str = ""  # where the film goes; empty: a new name
-    path_typed: str = ""  # a file with a path
+    film_file: str = ""  # where the film goes; empty: a new name
+    path_file: str = ""  # where the path goes, and came from; empty: a new name
     clipboard: str = ""  # put there at the next frame
 
 
@@ -137,7 +137,6 @@ class Tools:
     brush: float = 0.03  # radius, of the image's height, within BRUSHES
     reach: float = 0.05  # how far growing goes, and how large a sphere of one click is; of the scene's radius
     only_visible: bool = True  # rectangle, lasso and brush leave out what lies behind something
-    name: str = ""  # that is being typed for what is selected
     measure: Measure = "opacity"  # whose histogram is shown
     brushed: tuple[float, float] | None = None  # of it, where the mouse went down and is, fractions
     stroke: Stroke | None = None
@@ -294,8 +293,6 @@ class SceneState:
     evidence: EvidenceSheet | None = None  # in a window of its own, while that is open
     suggestions: Suggestions = field(default_factory=Suggestions)
     suggestions_of: Scene | None = None  # the scene for which they were looked for
-    bookmark_typed: str = ""
-    canonical_typed: str = ""
     _edited: EditedScene | None = None  # of the last request
 
     @property
@@ -338,7 +335,6 @@ class ViewerState(SceneState):
     walks: bool = False  # the keys fly level, as one walks
     coarse_while_moving: bool = True
 
-    typed: str = ""
     asked: list[str] = field(default_factory=list)  # what was searched for, the oldest first
     recalled: int = 0  # index into `asked` of the phrase last recalled; its length: none
     focus_input: bool = False  # the query box takes the keyboard at the next frame
@@ -346,8 +342,7 @@ class ViewerState(SceneState):
 
     training_form: TrainingForm = field(default_factory=TrainingForm)
     edit_form: EditForm = field(default_factory=EditForm)
-    path_typed: str = ""
-    outline_typed: str = ""  # what its rows are filtered by
+    drafts: dict[str, str] = field(default_factory=dict)  # half-typed texts of the panels, by their boxes
     messages: list[Message] = field(default_factory=list)
     timing: Timing = field(default_factory=Timing)
     stats: FrameStats = field(default_factory=FrameStats)
@@ -359,7 +354,6 @@ class ViewerState(SceneState):
     show_palette: bool = False
     resets_panels: bool = False  # at the next frame
     shows_panels: tuple[str, ...] = ()  # titles of those that alone are open from now on; (): as they are
-    palette_typed: str = ""
     browser: Listing | None = None  # the folder that the file browser shows, while it is open
     picks_folder: FolderChoice | None = None  # that it is open for; None: a scene
     picks_beside: bool = False  # it chooses a scene to be shown beside this one

@@ -255,18 +255,21 @@ def typing(window: Window) -> Iterator[None]:
         yield
     before = state.view
     yield from press(window, "Ctrl+F", *"hamburger")
-    assert (state.typed, state.view is before) == ("hamburger", True)
+    assert (state.drafts["##phrase"], state.view is before) == ("hamburger", True)
     yield from press(window, "escape", "Ctrl+A", "h")  # keys of the scene again
     assert state.marks.hidden.all()
     yield from press(window, *"u231")
     assert not state.marks.hidden.any()
     assert state.session.picture.display == "rgb"
     yield from press(window, "Ctrl+F", *"mug", "enter", *"plant", "enter", *"bo")
-    assert ([query.phrase for query in state.session.queries], state.typed) == (["mug", "plant"], "bo")
+    assert ([query.phrase for query in state.session.queries], state.drafts["##phrase"]) == (
+        ["mug", "plant"],
+        "bo",
+    )
     yield from press(window, "tab")
-    assert (state.typed, state.show_panel) == ("book", True)
+    assert (state.drafts["##phrase"], state.show_panel) == ("book", True)
     yield from press(window, "up_arrow")
-    assert state.typed == "plant"
+    assert state.drafts["##phrase"] == "plant"
     handle = glfw_window_hello_imgui()
     for key in (glfw.KEY_ESCAPE, glfw.KEY_F1):
         for action in (glfw.PRESS, glfw.RELEASE):

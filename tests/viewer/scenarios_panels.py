@@ -117,8 +117,7 @@ def search_a_library(s: Any) -> None:
     save_scene(s.folder / "deep" / "mug.ply", replace(fewer, cameras=cameras()))
     s.open_panel("Library", frames=3)
     s.click("//Library/Folder ...", frames=4)
-    viewer.state.path_typed = "deep"
-    browsing.open_typed(viewer)
+    browsing.open_typed(viewer, "deep")
     s.ctx.yield_(3)
     s.ctx.item_click("//**/Take this folder")
     s.until(lambda: library_panel.library_view(viewer) is not None)
@@ -290,7 +289,7 @@ def record_and_play(s: Any) -> None:
     filming.set_path_seconds(s.viewer, 1.0)
     filming.set_film_size(s.viewer, 32, 24)
     s.viewer.state.record.fps = 4.0
-    s.viewer.state.record.film_typed = "film"
+    s.viewer.state.record.film_file = "film"
     s.ctx.item_click("//Record/Save film")
     s.until(lambda: s.viewer.recorder.current is None)
     assert len(list((s.folder / "film").glob("frame-*.png"))) == 5
@@ -354,7 +353,7 @@ def use_shortcuts(s: Any) -> None:
 
     s.key("Ctrl+F", frames=3)
     s.type("far", frames=3)
-    assert (s.state.typed, s.state.view is before) == ("far", True)
+    assert (s.state.drafts["##phrase"], s.state.view is before) == ("far", True)
     s.key("f1", frames=2)  # also while typing
     assert s.state.show_help
     s.key("f1", frames=1)
@@ -433,7 +432,7 @@ def arrange_panels(s: Any) -> None:
     assert s.state.size[0] == 860 > whole[0]  # the scene has taken their place
     s.key("Ctrl+F", frames=4)
     s.type("mug", frames=3)
-    assert s.state.typed == "mug"  # the panel is open again, and its box has the keyboard
+    assert s.state.drafts["##phrase"] == "mug"  # the panel is open again, and its box has the keyboard
     s.key("escape", frames=1)
     s.menu("Window", "Panels as at first")
     for title in ("Scene", "Display", "Camera", "Messages"):

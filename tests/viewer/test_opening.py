@@ -247,8 +247,7 @@ def test_one_goes_into_folders_and_opens_scenes(viewer, folder):
 
 def enter(viewer, typed: str) -> None:
     """Type a path in the browser, and open it."""
-    viewer.state.path_typed = typed
-    act(browsing.open_typed, viewer)
+    act(browsing.open_typed, viewer, typed)
 
 
 @pytest.mark.parametrize("typed", [" blobs.ply ", "B folder/../blobs.ply"])
@@ -259,7 +258,6 @@ def test_a_path_can_be_typed(viewer, folder, typed):
         assert viewer.state.browser is not None
     enter(viewer, "B folder")
     assert viewer.state.browser.folder == folder / "B folder"
-    assert viewer.state.path_typed == ""
     browsing.browse(viewer, folder)
     enter(viewer, typed)
     assert viewer.state.scene is SCENES["blobs.ply"]

@@ -53,12 +53,12 @@ def test_a_query_is_answered_and_shown(opened):
 
 def test_a_correction_is_offered_and_takes_the_place_of_the_typo(opened):
     ask(opened, "red plamt")
-    assert queries.offers(opened) == ("did you mean", ())  # "red" is like no word
+    assert queries.offers(opened, "") == ("did you mean", ())  # "red" is like no word
     ask(opened, "plamt")
     assert [answer(opened, place).meant for place in (0, 1)] == ["", "plant"]
     assert opened.state.shown() == []
     assert "did you mean 'plant'?" in answer(opened).problem
-    assert queries.offers(opened) == ("did you mean", ("plant",))
+    assert queries.offers(opened, "") == ("did you mean", ("plant",))
     act(queries.ask_offered, opened, "plant")
     assert phrases(opened) == ["red plamt", "plant"]
     assert result(opened, 1).found
@@ -85,22 +85,20 @@ def test_earlier_phrases_come_back_by_the_arrows(opened):
 
 def test_examples_are_offered_until_the_first_search_and_each_is_found(viewer):
     open_scene(viewer, "book.ply")
-    assert queries.offers(viewer) == ("try", ())
+    assert queries.offers(viewer, "") == ("try", ())
     queries.prepare_suggestions(viewer)
     assert viewer.worker.current == ("finding examples", 0.0) or viewer.state.suggestions.examples
     settle(viewer)
-    assert queries.offers(viewer) == ("try", ("book",))
+    assert queries.offers(viewer, "") == ("try", ("book",))
     assert hint(viewer) == "book, ..."
     queries.prepare_suggestions(viewer)
     assert viewer.worker.current is None  # once per scene
-    viewer.state.typed = "bo"
-    assert queries.offers(viewer) == ("", ("book",))
-    viewer.state.typed = ""
+    assert queries.offers(viewer, "bo") == ("", ("book",))
     act(queries.ask_offered, viewer, "book")
     assert result(viewer, 0).found
     open_scene(viewer, "plain.ply")
     queries.prepare_suggestions(viewer)
-    assert queries.offers(viewer) == ("try", ())
+    assert queries.offers(viewer, "") == ("try", ())
 
 
 def test_hiding_keeps_the_colours_of_the_others_and_a_fourth_takes_that_of_the_longest_shown(opened):
@@ -135,19 +133,12 @@ def test_queries_are_combined_as_the_grammar_reads_them(opened):
     assert (only.members == mug.members).all()
 
 
-def test_the_box_is_emptied_by_a_search_and_by_nothing_else(opened):
-    opened.state.typed = "  "
-    queries.ask_typed(opened)
-    assert (opened.state.typed, opened.state.session.queries) == ("  ", ())
-    opened.state.typed = "mug "
-    queries.ask_typed(opened)
-    assert (opened.state.typed, opened.state.session.queries[0].phrase) == ("", "mug")
-    assert queries.take_search_focus(opened)  # for the next phrase
+def test_search_box_takes_the_keyboard_once(opened):
     opened.state.show_panel = False
     queries.focus_search(opened)
     assert opened.state.show_panel
     assert queries.take_search_focus(opened)
-    assert not queries.take_search_focus(opened)  # said once
+    assert not queries.take_search_focus(opened)
 
 
 @pytest.mark.parametrize(("logit", "verdict"), [(9.0, "found"), (1.0, "weak match"), (-3.0, "not here")])

@@ -131,8 +131,8 @@ def test_a_path_is_saved_loaded_and_dropped(opened, folder):
     assert times(opened) == [0, 2, 4]
     assert opened.state.wanted_panel == "Record"
     (folder / "bad.path.json").write_text("{}")
-    opened.state.record.path_typed = "bad.path.json"
-    filming.load_typed_path(opened, folder)
+    opened.state.record.path_file = "bad.path.json"
+    filming.load_path_file(opened, folder)
     assert "no camera path" in errors(opened)[-1]
     assert times(opened) == [0, 2, 4]
     filming.set_film_size(opened, 640, 0)
@@ -145,9 +145,9 @@ def test_what_cannot_be_done_is_said(viewer, opened, folder):
     viewpoint.toggle_playing(opened)
     filming.save_film(opened, folder)
     filming.save_path(opened, folder)
-    filming.load_typed_path(opened, folder)
+    filming.load_path_file(opened, folder)
     record_three(opened)
-    opened.state.record.film_typed = "film.avi"
+    opened.state.record.film_file = "film.avi"
     filming.save_film(opened, folder)
     wanted = ["two keyframes", "needs a path", "needs a keyframe", "type the name", "a film is .mp4"]
     assert [reason in text for reason, text in zip(wanted, errors(opened), strict=True)] == [True] * 5

@@ -418,11 +418,9 @@ def test_a_process_that_has_to_end_saves_what_is_not(pruned, tmp_path):
 
 def test_what_is_named_is_found_by_its_name_and_kept_where_it_is_saved(opened, tmp_path):
     take(opened, blob("plant"))
-    queries.type_name(opened, "grandma's mug")
-    act(queries.name_selection, opened)
+    act(queries.name_selection, opened, "grandma's mug")
     assert phrases(opened) == ["grandma's mug"]
     np.testing.assert_array_equal(result(opened).members, blob("plant"))
-    assert opened.state.tools.name == ""
     act(selecting.export, opened, tmp_path, "edited")
     (saved,) = tmp_path.glob("*.ply")
     assert [word.name for word in load_scene(saved).language.taught] == ["grandma's mug"]
@@ -430,13 +428,12 @@ def test_what_is_named_is_found_by_its_name_and_kept_where_it_is_saved(opened, t
 
 
 def test_what_cannot_be_a_name_is_said(opened):
-    queries.name_selection(opened)
+    queries.name_selection(opened, "cup")
     assert "nothing is selected" in opened.state.messages[-1].text
     take(opened, blob("plant"))
-    queries.type_name(opened, "the")
-    act(queries.name_selection, opened)
+    act(queries.name_selection, opened, "the")
     assert "'the' cannot be a name" in errors(opened)[-1]
-    assert (opened.state.session.queries, opened.state.tools.name) == ((), "the")
+    assert opened.state.session.queries == ()
 
 
 # By numbers.

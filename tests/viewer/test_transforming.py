@@ -40,8 +40,7 @@ def test_the_selection_moves_alone_and_is_found_where_it_went(opened):
     assert opened.state.scene.cameras is cameras
     np.testing.assert_allclose(result(opened, 0).place, place + STEP, atol=1e-4)
     np.testing.assert_array_equal(opened.state.marks.selected, chosen)
-    queries.type_name(opened, "trophy")  # what is taught goes along
-    act(queries.name_selection, opened)
+    act(queries.name_selection, opened, "trophy")  # what is taught goes along
     act(editing.transform, opened, moving(STEP))
     assert opened.engine.is_taught("trophy")
     assert [word.name for word in opened.state.scene.language.taught] == ["trophy"]

@@ -274,12 +274,12 @@ def find_the_plant(s: Session, rgb: np.ndarray) -> None:
     # The box keeps the keyboard, until Esc leaves it: then the next letter is a key again.
     assert imgui.get_io().want_text_input
     s.type("ff", frames=2)
-    assert s.state.typed == "ff"
+    assert s.state.drafts["##phrase"] == "ff"
     assert s.state.view is before
     for _ in range(2):
         s.key("escape", frames=2)
     s.key("F")
-    assert s.state.typed == ""
+    assert s.state.drafts.get("##phrase", "") == ""
     np.testing.assert_allclose(s.state.view.target, result(s, 0).place)
     s.key("R")
     heat = s.shot("heat")

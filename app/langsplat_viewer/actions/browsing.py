@@ -62,7 +62,7 @@ def ask_for_beside(viewer: Viewer) -> None:
 
 
 def browse(viewer: Viewer, folder: Path) -> None:
-    viewer.state.path_typed, viewer.state.browser = "", list_folder(folder)
+    viewer.state.browser = list_folder(folder)
 
 
 def choose(viewer: Viewer, entry: Entry) -> None:
@@ -158,9 +158,9 @@ def open_recent(viewer: Viewer, path: str) -> None:
     open_file(viewer, Path(path))
 
 
-def open_typed(viewer: Viewer) -> None:
-    """Go to the folder, or open the scene, that the box names: from the folder shown where it is relative."""
-    text, listing = viewer.state.path_typed.strip(), viewer.state.browser
+def open_typed(viewer: Viewer, text: str) -> None:
+    """Go to the folder, or open the scene, of a path: from the folder shown where it is relative."""
+    text, listing = text.strip(), viewer.state.browser
     if not text:
         return
     path = (listing.folder if listing else Path.cwd()) / os.path.expanduser(text)

@@ -162,11 +162,11 @@ def save_path(viewer: Viewer, folder: Path = Path()) -> Path | None:
         viewer.say_error("a path to save needs a keyframe: add one at the current view")
         return None
     stem = state.path.stem if state.path else "camera"
-    typed = record.path_typed.strip()
+    typed = record.path_file.strip()
     path = folder.absolute() / typed if typed else free_name(folder, stem, PATHS)
     more = "; langsplat-viewer --headless --path makes a film of it"
     saved = viewer.save(path, lambda: write_flight(path, flight_of(state.session.keyframes)), more)
-    record.path_typed = record.path_typed if saved is None else str(path)
+    record.path_file = record.path_file if saved is None else str(path)
     return saved
 
 
@@ -180,13 +180,13 @@ def load_path(viewer: Viewer, path: Path) -> None:
     record = viewer.state.record
     record.turns = False
     _set(viewer, flight.keyframes, None)
-    record.at, record.path_typed = 0.0, str(path)
+    record.at, record.path_file = 0.0, str(path)
     open_panel(viewer, "Record")
     viewer.state.say(f"{path.name}: {len(flight.keyframes)} keyframes, {flight.seconds:.1f} s")
 
 
-def load_typed_path(viewer: Viewer, folder: Path = Path()) -> None:
-    typed = viewer.state.record.path_typed.strip()
+def load_path_file(viewer: Viewer, folder: Path = Path()) -> None:
+    typed = viewer.state.record.path_file.strip()
     if typed:
         load_path(viewer, folder.absolute() / typed)
     else:
@@ -235,7 +235,7 @@ def save_film(viewer: Viewer, folder: Path = Path()) -> None:
 
 
 def _film_out(viewer: Viewer, folder: Path) -> Path:
-    typed = viewer.state.record.film_typed.strip()
+    typed = viewer.state.record.film_file.strip()
     if typed:
         return folder.absolute() / typed
     stem = f"{viewer.state.path.stem if viewer.state.path else 'scene'}-film"

@@ -147,15 +147,6 @@ def ask_combined(viewer: Viewer, first: str, join: str, second: str) -> None:
     ask_one(viewer, JOINS[join].format(first, second))
 
 
-def ask_typed(viewer: Viewer) -> None:
-    """Search for what stands in the box and empty it; the box keeps the keyboard for the next phrase."""
-    viewer.state.focus_input = viewer.state.awaits_keyboard = True
-    if not viewer.state.typed.strip():
-        return
-    ask(viewer, viewer.state.typed)
-    viewer.state.typed = ""
-
-
 def focus_search(viewer: Viewer) -> None:
     """Have the search box take the keyboard; where there is nothing to search, what is typed goes nowhere."""
     open_panel(viewer, "Search")
@@ -176,7 +167,7 @@ def take_search_focus(viewer: Viewer) -> bool:
 # Names that are taught.
 
 
-def teach(viewer: Viewer, name: str, members: Array, done: Callable[[str], None]) -> None:
+def teach(viewer: Viewer, name: str, members: Array, done: Callable[[str], None] = lambda name: None) -> None:
     """Have the worker teach a name by what (N,) bool mean, and search for it. What is saved from now on keeps
     it. `done` gets the name, if the scene is still there."""
     engine, scene = viewer.engine, viewer.state.scene
@@ -192,15 +183,10 @@ def teach(viewer: Viewer, name: str, members: Array, done: Callable[[str], None]
     viewer.run(f"teaching '{name}'", lambda progress: engine.teach(name, members), taught)
 
 
-def name_selection(viewer: Viewer) -> None:
-    """Teach the typed name by what is selected."""
+def name_selection(viewer: Viewer, name: str) -> None:
+    """Teach a name by what is selected."""
     if has_selection(viewer):
-        state = viewer.state
-        teach(viewer, state.tools.name, state.marks.selected, lambda name: type_name(viewer, ""))
-
-
-def type_name(viewer: Viewer, name: str) -> None:
-    viewer.state.tools = replace(viewer.state.tools, name=name)
+        teach(viewer, name, viewer.state.marks.selected)
 
 
 # The list of queries.
@@ -265,7 +251,6 @@ def set_canonical(viewer: Viewer, phrases: tuple[str, ...]) -> None:
 
     def done(canonical: tuple[str, ...]) -> None:
         viewer.put(canonical=phrases)
-        state.canonical_typed = ", ".join(canonical)
         state.say(f"compared with {', '.join(canonical)}")
         ask_again(viewer)
 
@@ -357,21 +342,21 @@ def prepare_suggestions(viewer: Viewer) -> None:
     )
 
 
-def offers(viewer: Viewer) -> tuple[str, tuple[str, ...]]:
+def offers(viewer: Viewer, typed: str) -> tuple[str, tuple[str, ...]]:
     """Return a title and the phrases to offer now: those that go on from what is typed, else a correction of
     the last query, else, before the first query, examples."""
     state, queries = viewer.state, viewer.state.session.queries
-    if state.typed.strip():
-        return "", tuple(completions(state.typed, state.suggestions.phrases))
+    if typed.strip():
+        return "", tuple(completions(typed, state.suggestions.phrases))
     if not queries:
         return "try", state.suggestions.examples
     meant = state.answer(queries[-1]).meant
     return "did you mean", (meant,) if meant else ()
 
 
-def completion(viewer: Viewer) -> str:
+def completion(viewer: Viewer, typed: str) -> str:
     """Return the phrase that goes on from what is typed, "" for none."""
-    phrases = offers(viewer)[1] if viewer.state.typed.strip() else ()
+    phrases = offers(viewer, typed)[1] if typed.strip() else ()
     return phrases[0] if phrases else ""
 
 
@@ -380,7 +365,6 @@ def ask_offered(viewer: Viewer, phrase: str) -> None:
     state = viewer.state
     for query in [query for query in state.session.queries if state.answer(query).meant == phrase]:
         remove(viewer, query.phrase)
-    state.typed = ""
     ask(viewer, phrase)
 
 

@@ -199,8 +199,8 @@ def toggle_help(viewer: Viewer) -> None:
 
 
 def show_palette(viewer: Viewer, shown: bool) -> None:
-    """Set whether the list of everything that can be done is there, its box empty."""
-    viewer.state.show_palette, viewer.state.palette_typed = shown, ""
+    """Set whether the list of everything that can be done is there."""
+    viewer.state.show_palette = shown
     viewer.state.awaits_keyboard |= shown
 
 

@@ -361,7 +361,6 @@ def add_bookmark(viewer: Viewer, name: str = "") -> None:
     if len(others) >= MOST_BOOKMARKS:
         viewer.say_error(f"a scene has at most {MOST_BOOKMARKS} bookmarks: delete one")
         return
-    state.bookmark_typed = ""
     _keep(viewer, (*others, added))
     state.say(f"bookmark '{added.name}'")
 

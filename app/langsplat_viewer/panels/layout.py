@@ -79,10 +79,11 @@ def draw_palette(viewer: Viewer) -> None:
     flags = imgui.WindowFlags_.no_title_bar | imgui.WindowFlags_.no_resize | imgui.WindowFlags_.no_collapse
     imgui.begin("Commands", None, flags)
     if imgui.is_window_appearing():
+        viewer.state.drafts.pop("##command", None)
         imgui.set_keyboard_focus_here()
-    entered, typed = ui.box("##command", "what to do", viewer.state.palette_typed)
+    entered, typed = ui.box("##command", "what to do", viewer.state.drafts.get("##command", ""))
     typing = imgui.is_item_active()
-    settings.put(viewer.state, palette_typed=typed)
+    viewer.state.drafts["##command"] = typed
     found = matching(typed, viewer.state.preferences.recent)
     chosen = found[0] if entered and found else _clicked(found, typing)
     left = not imgui.is_window_focused(imgui.FocusedFlags_.root_and_child_windows)

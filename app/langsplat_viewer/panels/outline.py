@@ -7,7 +7,7 @@ from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
 from imgui_bundle import icons_fontawesome_6 as icons
 
 from langsplat_core.query.describe import OR, Outline
-from langsplat_viewer.actions import outline, settings
+from langsplat_viewer.actions import outline
 from langsplat_viewer.actions.outline import Target
 from langsplat_viewer.panels import ui
 from langsplat_viewer.panels.overlays import STILL, begin_legend
@@ -27,8 +27,9 @@ def draw(viewer: Viewer) -> None:
         ui.small_wrapped(view.problem if view else "open a scene with a language field", ui.muted())
         return
     imgui.set_next_item_width(-1)
-    _, typed = imgui.input_text_with_hint("##filter", "filter", viewer.state.outline_typed)
-    settings.put(viewer.state, outline_typed=typed)
+    drafts = viewer.state.drafts
+    _, typed = imgui.input_text_with_hint("##filter", "filter", drafts.get("##filter", ""))
+    drafts["##filter"] = typed
     if imgui.begin_child("rows", child_flags=imgui.ChildFlags_.nav_flattened):
         for group in viewer.state.session.things.groups:
             _group(viewer, view, group)

@@ -113,13 +113,13 @@ def has_several(listing: Listing) -> bool:
 
 def _path_box(viewer: Viewer) -> None:
     if imgui.is_window_appearing():
+        viewer.state.drafts.pop("##path", None)
         imgui.set_keyboard_focus_here()
     picks = viewer.state.picks_folder
     hint = "path of a folder" if picks else "path of a scene or folder, or drop files onto the window"
-    entered, typed = ui.box_with_button("##path", hint, viewer.state.path_typed, "Open")
-    settings.put(viewer.state, path_typed=typed)
-    if entered:
-        browsing.open_typed(viewer)
+    typed = ui.kept_box(viewer, "##path", hint, "Open")
+    if typed is not None:
+        browsing.open_typed(viewer, typed)
 
 
 def _above(viewer: Viewer, folder: Path) -> None:

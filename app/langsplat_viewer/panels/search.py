@@ -31,7 +31,8 @@ def _box(viewer: Viewer) -> None:
     if queries.take_search_focus(viewer):
         imgui.set_keyboard_focus_here()
     flags = imgui.InputTextFlags_.enter_returns_true | imgui.InputTextFlags_.callback_history
-    completion = queries.completion(viewer)
+    drafts, label = viewer.state.drafts, "##phrase"
+    completion = queries.completion(viewer, drafts.get(label, ""))
     if completion:
         flags |= imgui.InputTextFlags_.callback_completion  # else Tab goes on to the next widget
 
@@ -43,13 +44,14 @@ def _box(viewer: Viewer) -> None:
         data.insert_chars(0, text)
         return 0
 
-    typed = viewer.state.typed
-    entered, typed = imgui.input_text_with_hint("##phrase", hint(viewer), typed, flags, recalled)
-    settings.put(viewer.state, typed=typed)
+    typed = drafts.get(label, "")
+    entered, drafts[label] = imgui.input_text_with_hint(label, hint(viewer), typed, flags, recalled)
     imgui.same_line()
     if imgui.button("Search") or entered:
-        queries.ask_typed(viewer)
-    title, phrases = queries.offers(viewer)
+        settings.put(viewer.state, focus_input=True, awaits_keyboard=True)  # for the next phrase
+        if drafts[label].strip():
+            queries.ask(viewer, drafts.pop(label))
+    title, phrases = queries.offers(viewer, drafts.get(label, ""))
     if not phrases:
         return
     height = OFFER_LINES * imgui.get_text_line_height_with_spacing()
@@ -72,6 +74,7 @@ def _offer_buttons(viewer: Viewer, title: str, phrases: tuple[str, ...]) -> None
             imgui.new_line()
         shown = ui.elided(phrase, imgui.get_content_region_avail().x - ui.button_width(""))
         if imgui.small_button(f"{shown}###offer {number}"):
+            viewer.state.drafts.pop("##phrase", None)
             queries.ask_offered(viewer, phrase)
         if shown != phrase:
             ui.tip(phrase)
@@ -290,10 +293,9 @@ def _canonical(viewer: Viewer) -> None:
         return
     state = viewer.state
     ui.small_wrapped("a place is relevant where it is nearer to the phrase than to all of these", ui.muted())
-    hint = ", ".join(state.session.canonical or CANONICAL_PHRASES)
-    entered, typed = ui.box("##canonical", hint, state.canonical_typed)
-    settings.put(state, canonical_typed=typed)
-    if entered:
+    hint = ", ".join(CANONICAL_PHRASES)
+    typed = ui.kept_box(viewer, "##canonical", hint, text=", ".join(state.session.canonical))
+    if typed is not None:
         queries.set_canonical(viewer, tuple(split_phrases(typed)))
     if state.session.canonical and imgui.button("The scene's own"):
         queries.set_canonical(viewer, ())

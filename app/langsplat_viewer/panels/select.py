@@ -131,11 +131,9 @@ def _found(viewer: Viewer) -> None:
 
 def _name(viewer: Viewer) -> None:
     """Draw the box for a name by which what is selected is found from now on."""
-    hint, name = "a name for what is selected", viewer.state.tools.name
-    entered, typed = ui.box_with_button("##name", hint, name, "Name it")
-    queries.type_name(viewer, typed)
-    if entered:
-        queries.name_selection(viewer)
+    name = ui.kept_box(viewer, "##name", "a name for what is selected", "Name it")
+    if name is not None:
+        queries.name_selection(viewer, name)
     ui.tip("Searching for the name finds this, and what is like it")
 
 

@@ -13,6 +13,7 @@ from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
 
 from langsplat_core.arrays import Array
 from langsplat_viewer.files.preferences import Preferences
+from langsplat_viewer.viewer import Viewer
 
 T = TypeVar("T")
 
@@ -183,11 +184,21 @@ def box(label: str, hint: str, text: str, width: float = -1.0) -> tuple[bool, st
     return bool(entered), str(typed)
 
 
-def box_with_button(label: str, hint: str, text: str, button: str) -> tuple[bool, str]:
-    """A `box`, and a button beside it that does what Enter does."""
-    entered, typed = box(label, hint, text, beside_button(button))
-    imgui.same_line()
-    return bool(imgui.button(button)) or entered, typed
+def kept_box(viewer: Viewer, label: str, hint: str, button: str = "", text: str = "") -> str | None:
+    """Draw a box that keeps what is half typed, with a button that does what Enter does where one is named.
+
+    Return the text once it is entered, and empty the box: it shows `text` until something is typed.
+    """
+    drafts = viewer.state.drafts
+    width = beside_button(button) if button else -1.0
+    entered, drafts[label] = box(label, hint, drafts.get(label, text), width)
+    if button:
+        imgui.same_line()
+        entered |= bool(imgui.button(button))
+    typed = drafts[label]
+    if entered or typed == text:
+        del drafts[label]
+    return typed if entered else None
 
 
 def radio(choices: Mapping[T, str], chosen: T, tips: Mapping[T, str] | None = None) -> T:

@@ -366,12 +366,12 @@ def _keyframes(viewer: Viewer) -> None:
     imgui.end_child()
     _chosen(viewer, record.chosen)
     ui.leave_room("", NUMBER_EM + 2)
-    _, typed = imgui.input_text_with_hint("##path file", "file.path.json", record.path_typed)
-    settings.put(record, path_typed=typed)
+    _, typed = imgui.input_text_with_hint("##path file", "file.path.json", record.path_file)
+    settings.put(record, path_file=typed)
     if ui.next_button("Save path"):
         filming.save_path(viewer)
     if ui.next_button("Load"):
-        filming.load_typed_path(viewer)
+        filming.load_path_file(viewer)
 
 
 def _chosen(viewer: Viewer, key: Keyframe | None) -> None:
@@ -401,8 +401,8 @@ def _films(viewer: Viewer) -> None:
         imgui.end_combo()
     imgui.set_next_item_width(-1)
     hint = "film.mp4, .webp, .gif or a folder; empty: a new name"
-    _, typed = imgui.input_text_with_hint("##film", hint, record.film_typed)
-    settings.put(record, film_typed=typed)
+    _, typed = imgui.input_text_with_hint("##film", hint, record.film_file)
+    settings.put(record, film_file=typed)
     work = viewer.recorder.current
     if work is not None:
         if ui.stoppable(*work, tag="film"):
@@ -424,10 +424,9 @@ def draw_bookmarks(viewer: Viewer) -> None:
     state = viewer.state
     imgui.begin_disabled(state.view is None)
     hint = "name of this view"
-    entered, typed = ui.box_with_button("##bookmark", hint, state.bookmark_typed, "Keep")
-    settings.put(state, bookmark_typed=typed)
-    if entered:
-        viewpoint.add_bookmark(viewer, state.bookmark_typed)
+    name = ui.kept_box(viewer, "##bookmark", hint, "Keep")
+    if name is not None:
+        viewpoint.add_bookmark(viewer, name)
     imgui.end_disabled()
     if imgui.begin_child("bookmarks"):
         if not state.session.bookmarks:
