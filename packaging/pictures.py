@@ -150,7 +150,7 @@ def _palette(ctx: Any, window: Window) -> None:
 
 def _light(ctx: Any, window: Window) -> None:
     viewer = window.viewer
-    settings.set_theme(viewer, "light")
+    settings.prefer(viewer, theme="light")
     settings.set_colour_map(viewer, "cividis")
 
 

@@ -118,7 +118,7 @@ class Canvas:
 
     def _follow(self, state: ViewerState, request: RenderRequest) -> None:
         """Draw the image of a camera that moves, at the level of detail that keeps up with it."""
-        if not state.coarse_while_moving:
+        if not state.preferences.coarse_while_moving:
             if self._wanted != (request, FULL):
                 self._draw(state, request)
         elif self._changes(request):
@@ -147,7 +147,7 @@ class Canvas:
         if made is not None:
             self._background.drop()
             self._draw(state, request, made=made)
-        elif state.coarse_while_moving and self._changes(request):
+        elif state.preferences.coarse_while_moving and self._changes(request):
             fewer, detail = self._merged(request), self._resolution.stand_in()
             if fewer is not None and detail is not None:
                 self._draw(state, request, detail, fewer)

@@ -90,7 +90,7 @@ def _display(button: Button, number: int) -> Command:
 def _theme(theme: Theme) -> Command:
     return Command(
         f"{theme} theme",
-        lambda viewer: settings.set_theme(viewer, theme),
+        lambda viewer: settings.prefer(viewer, theme=theme),
         is_on=lambda viewer: viewer.state.preferences.theme == theme,
     )
 
@@ -98,7 +98,7 @@ def _theme(theme: Theme) -> Command:
 def _letters(scale: float) -> Command:
     return Command(
         f"letters of {100 * scale:.0f} %",
-        lambda viewer: settings.set_ui_scale(viewer, scale),
+        lambda viewer: settings.prefer(viewer, ui_scale=scale),
         is_on=lambda viewer: abs(viewer.state.preferences.ui_scale - scale) < 1e-6,
     )
 
@@ -286,7 +286,11 @@ BY_MENU: dict[str, tuple[Command, ...]] = {
         Command("take the picture's up as the world's", lambda viewer: viewpoint.move(viewer, adopt_up)),
         *(_side(side, key) for side, key in SIDE_KEYS),
         Command("orthographic view, and back", viewpoint.toggle_orthographic, ("O", "Keypad5"), apart=True),
-        Command("walk in place of flying, and back", viewpoint.toggle_walking, is_on=lambda v: v.state.walks),
+        Command(
+            "walk in place of flying, and back",
+            viewpoint.toggle_walking,
+            is_on=lambda v: v.state.preferences.walks,
+        ),
         Command("bookmark this view", viewpoint.add_bookmark, ("Ctrl+B",), apart=True),
         Command("add a keyframe here", filming.add_keyframe, ("K",)),
         Command("play the camera path, or stop", viewpoint.toggle_playing, ("Shift+K",)),

@@ -1,7 +1,8 @@
 """The session: what is shown, asked, selected, edited, named and bookmarked in a scene, as one frozen tree.
 
 Undo goes back to earlier sessions, a scene that was left is found again by its session, and project files
-hold one. So a field that is added here is undone and saved. The bounds beside the types hold for files.
+hold one. So a field that is added here is undone and saved. The bounds beside the types hold for files and
+widgets; what has a title gets its widget in the panel that is named with it.
 """
 
 import math
@@ -197,7 +198,16 @@ class Session:
     split: Split = field(default_factory=Split)
     splats: Splats = field(default_factory=Splats)
     clip: Clip = field(default_factory=Clip)
-    fade: Annotated[float, Meta(ge=0, le=1)] = 0.0  # of a training camera's photograph over the image
+    fade: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=1,
+            title="Photograph",
+            description="Lay the photograph of the training camera over the picture",
+            extra={"panel": "Camera"},
+        ),
+    ] = 0.0
     overlays: tuple[Overlay, ...] = ()  # what lies over the scene
 
     # what was asked

@@ -331,9 +331,6 @@ class ViewerState(SceneState):
     may_close: bool = False  # the window closes at the next frame
     pins_notes: bool = False  # a click on the scene pins one
     pointing: bool = False  # it is said what lies under the cursor
-    fly_speed: float = 0.5  # scene radii per second
-    walks: bool = False  # the keys fly level, as one walks
-    coarse_while_moving: bool = True
 
     asked: list[str] = field(default_factory=list)  # what was searched for, the oldest first
     recalled: int = 0  # index into `asked` of the phrase last recalled; its length: none

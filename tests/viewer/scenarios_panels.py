@@ -172,7 +172,7 @@ def large_letters(s: Any) -> None:
         s.search(phrase)
     assert answer(s, -1).meant  # a long one, and so is the button for it
     narrow = scene_area().left
-    settings.set_ui_scale(s.viewer, 2.0)
+    settings.prefer(s.viewer, ui_scale=2.0)
     s.settle()
     assert 1.3 * narrow < scene_area().left <= 0.41 * 1280
     for panel in all_panels():
@@ -187,14 +187,14 @@ def large_letters(s: Any) -> None:
         (3.0, settings.toggle_palette, "Commands"),
         (3.0, browsing.ask_for_file, "Open a scene"),
     ):
-        settings.set_ui_scale(s.viewer, scale)
+        settings.prefer(s.viewer, ui_scale=scale)
         show(s.viewer)
         s.settle()
         over = s.ctx.window_info(f"//{name}").window
         assert 0 <= over.pos.x <= over.pos.x + over.size.x <= 1280, name
         assert 0 <= over.pos.y <= over.pos.y + over.size.y <= 720, name
         settings.escape(s.viewer)
-    settings.set_ui_scale(s.viewer, 1.0)
+    settings.prefer(s.viewer, ui_scale=1.0)
     s.settle()
     assert abs(scene_area().left - narrow) < 0.15 * narrow
 

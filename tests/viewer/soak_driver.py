@@ -175,7 +175,7 @@ class Soak:
             lambda: settings.set_picture(viewer, replace(self.state.session.picture, dim=rng.random())),
             lambda: viewer.change(splats=Splats(rng.uniform(0.1, 1), rng.randrange(4))),
             lambda: settings.set_clip(viewer, Clip(rng.uniform(0, 3), rng.uniform(5, 9))),
-            lambda: settings.set_ui_scale(viewer, rng.choice((0.8, 1.0, 1.5))),
+            lambda: settings.prefer(viewer, ui_scale=rng.choice((0.8, 1.0, 1.5))),
             lambda: settings.open_panel(viewer, rng.choice(all_panels()).title),
             lambda: queries.set_canonical(viewer, ()),
             lambda: editing.undo(viewer),

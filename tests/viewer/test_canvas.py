@@ -331,7 +331,7 @@ def test_a_slider_does_not_begin_the_projection_anew(gl, asked, begun, gated):
 
 @pytest.mark.parametrize("coarse", [True, False])
 def test_the_window_s_thread_follows_a_moving_camera(asked, begun, gated, coarse):
-    asked.state.coarse_while_moving = coarse
+    settings.prefer(asked, coarse_while_moving=coarse)
     go(viewpoint.look_from, asked, "left")
     begun.update(asked.state, 10.0)
     assert gated.threads[1:] == [main_thread()]

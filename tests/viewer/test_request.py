@@ -396,7 +396,7 @@ def drawn(gl, opened, request):
 def test_steps_are_measured_while_the_panel_is_seen(gl, drawn):
     assert drawn.state.timing.medians() == []
     drawn.state.timing.wanted = True
-    drawn.state.coarse_while_moving = False
+    settings.prefer(drawn, coarse_while_moving=False)
     go(viewpoint.look_from, drawn, "left")
     rest(drawn.surface, drawn.state, 10.0)
     laps, steps = drawn.state.timing.laps, {"projection", "sort", "blend", "compose"}

@@ -1,6 +1,7 @@
 """Settings of what is shown and how: displays side by side, overlays, the ruler; which panels are seen."""
 
 from dataclasses import fields, replace
+from typing import Any
 
 from langsplat_core.config import ColourMap, Display, PictureConfig
 from langsplat_core.display.displays import DISPLAYS
@@ -8,7 +9,6 @@ from langsplat_core.query.engine import no_field
 from langsplat_viewer.actions.selecting import leave_tool, stay
 from langsplat_viewer.actions.viewpoint import glide_to
 from langsplat_viewer.camera.overlays import facing
-from langsplat_viewer.files.preferences import SCALES, Theme
 from langsplat_viewer.rendering.request import AT_RANGE, Clip, SplitMode
 from langsplat_viewer.session import OVERLAYS, Overlay, Ruler
 from langsplat_viewer.state import Recording, Timing, ViewerState
@@ -135,33 +135,24 @@ def measure_at(viewer: Viewer, u: float, v: float) -> None:
 # The window: preferences and panels.
 
 
-def set_theme(viewer: Viewer, theme: Theme) -> None:
-    viewer.state.preferences = replace(viewer.state.preferences, theme=theme)
-
-
-def set_ui_scale(viewer: Viewer, scale: float) -> None:
-    """Set how large letters and widgets are, within `preferences.SCALES`."""
-    low, high = SCALES
-    viewer.state.preferences = replace(viewer.state.preferences, ui_scale=min(max(scale, low), high))
+def prefer(viewer: Viewer, **values: Any) -> None:
+    """Change fields of the preferences."""
+    preferences = replace(viewer.state.preferences, **values)
+    if preferences != viewer.state.preferences:
+        viewer.state.preferences = preferences
 
 
 def keep_preferences(viewer: Viewer) -> None:
     """Have the preferences keep what outlives a window of the session's settings."""
-    before, session = viewer.state.preferences, viewer.state.session
-    kept = replace(before, colour_map=session.picture.colour_map, overlays=session.overlays)
-    viewer.state.preferences = before if kept == before else kept
+    session = viewer.state.session
+    prefer(viewer, colour_map=session.picture.colour_map, overlays=session.overlays)
 
 
 def take_preferences(viewer: Viewer) -> None:
     """Begin the session with the settings that outlived the last window."""
     kept, picture = viewer.state.preferences, viewer.state.session.picture
-    viewer.put(picture=replace(picture, colour_map=kept.colour_map), overlays=kept.overlays)
-
-
-def note_panels(viewer: Viewer, titles: tuple[str, ...]) -> None:
-    """Have the preferences keep which panels are open."""
-    if titles != viewer.state.preferences.panels:
-        viewer.state.preferences = replace(viewer.state.preferences, panels=titles)
+    overlays = tuple(name for name in OVERLAYS if name in kept.overlays)
+    viewer.put(picture=replace(picture, colour_map=kept.colour_map), overlays=overlays)
 
 
 def resize(viewer: Viewer, width: int, height: int) -> None:

@@ -213,8 +213,9 @@ def toggle_orthographic(viewer: Viewer) -> None:
 
 def toggle_walking(viewer: Viewer) -> None:
     """Have the keys that fly ahead keep the height of the eye, or no longer."""
-    viewer.state.walks = not viewer.state.walks
-    viewer.state.say("W A S D walk at one height" if viewer.state.walks else "W A S D fly")
+    walks = not viewer.state.preferences.walks
+    viewer.state.preferences = replace(viewer.state.preferences, walks=walks)
+    viewer.state.say("W A S D walk at one height" if walks else "W A S D fly")
 
 
 def go_to_camera(viewer: Viewer, index: int) -> None:

@@ -1,13 +1,16 @@
-"""Preferences: choices that outlive a window, kept in the platform's folder for settings."""
+"""Preferences: choices that outlive a window, kept in the platform's folder for settings.
 
-import json
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field, fields, replace
+A field that is added here is kept, and what has a title gets its widget in the panel that is named with it.
+"""
+
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Literal, get_args
 
+import msgspec
 import numpy as np
 import platformdirs
+from msgspec import Meta
 
 from langsplat_core.config import ColourMap
 from langsplat_core.errors import InputError, printable_line
@@ -21,7 +24,7 @@ MOST_RECENT = 12
 MOST_FOLDERS = 100  # scenes whose folder of photographs is remembered
 FILE_NAME, LAYOUT_NAME = "preferences.json", "layout.ini"
 LARGEST = 1_000_000  # bytes of the file
-_LISTS = {"recent", "panels", "overlays"}
+CAMERA = {"panel": "Camera"}
 
 
 @dataclass(frozen=True)
@@ -29,31 +32,27 @@ class Preferences:
     """The settings that outlive a window."""
 
     theme: Theme = "dark"
-    ui_scale: float = 1.0  # of letters and widgets, within `SCALES`
+    ui_scale: Annotated[float, Meta(ge=SCALES[0], le=SCALES[1])] = 1.0  # of letters and widgets
     recent: tuple[str, ...] = ()  # scenes that were opened, the latest first
     panels: tuple[str, ...] | None = None  # titles of those that are open; None: those that are at first
-    colour_map: ColourMap = "turbo"  # of relevancy and depth
-    overlays: tuple[str, ...] = ()  # of `state.OVERLAYS`, those that lie over the scene
+    colour_map: ColourMap = "turbo"  # that a session begins with
+    overlays: tuple[str, ...] = ()  # that a session begins with
     photographs: dict[str, str] = field(default_factory=dict)  # scene -> folder; the latest chosen last
-
-    def __post_init__(self) -> None:
-        if self.theme not in THEMES:
-            raise InputError(f'theme "{printable_line(self.theme, 40)}"; there are {", ".join(THEMES)}')
-        if self.colour_map not in get_args(ColourMap):
-            known = ", ".join(get_args(ColourMap))
-            raise InputError(f'colour_map "{printable_line(self.colour_map, 40)}"; there are {known}')
-        is_number = isinstance(self.ui_scale, int | float) and not isinstance(self.ui_scale, bool)
-        if not (is_number and SCALES[0] <= self.ui_scale <= SCALES[1]):
-            raise InputError(f"ui_scale is not a number from {SCALES[0]} to {SCALES[1]}")
-        for name in _LISTS:
-            if not _are_texts(getattr(self, name) or ()):
-                raise InputError(f"{name} is not a list of texts")
-        if not (isinstance(self.photographs, dict) and _are_texts(self.photographs.values())):
-            raise InputError("photographs is not an object of texts")
-
-
-def _are_texts(values: Iterable[object]) -> bool:
-    return all(isinstance(value, str) for value in values)
+    fly_speed: Annotated[
+        float,
+        Meta(ge=0.05, le=4, title="Fly speed", description="Scene radii per second", extra=CAMERA),
+    ] = 0.5
+    walks: Annotated[
+        bool, Meta(title="Walk", description="W A S D keep the height of the eye", extra=CAMERA)
+    ] = False
+    coarse_while_moving: Annotated[
+        bool,
+        Meta(
+            title="Coarse while moving",
+            description="Where drawing is slow: fewer pixels and merged Gaussians while the camera moves",
+            extra=CAMERA,
+        ),
+    ] = True
 
 
 def preferences_folder() -> Path:
@@ -62,7 +61,7 @@ def preferences_folder() -> Path:
 
 
 def fitting_scale(height: float) -> float:
-    """The size of letters for a screen `height` units high: at 1080 that of the design."""
+    """Return the size of letters for a screen `height` units high: at 1080 that of the design."""
     return float(np.clip(round(4 * height / DESIGNED) / 4, 1.0, SCALES[1]))
 
 
@@ -71,33 +70,19 @@ def load_preferences(folder: Path, at_first: Preferences | None = None) -> Prefe
     file makes no sense."""
     path = folder / FILE_NAME
     try:
-        text = path.read_bytes()[:LARGEST]
-        return _from_json(json.loads(text))
+        return msgspec.json.decode(path.read_bytes()[:LARGEST], type=Preferences)
     except FileNotFoundError:
         return at_first or Preferences()
-    except (OSError, ValueError, RecursionError, InputError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         reason = printable_line(getattr(error, "strerror", None) or error, 120)
         raise InputError(f"{path}: {reason}; the defaults are used; mend or delete it") from None
-
-
-def _from_json(top: Any) -> Preferences:
-    if not isinstance(top, dict):
-        raise InputError("no JSON object")
-    known = {row.name for row in fields(Preferences)}
-    values = {name: value for name, value in top.items() if name in known}  # a later version may add some
-    for name in _LISTS & values.keys():
-        if isinstance(values[name], list):
-            values[name] = tuple(values[name])
-        elif values[name] is not None or name != "panels":
-            raise InputError(f"{name} is not a list of texts")
-    return Preferences(**values)
 
 
 def save_preferences(folder: Path, preferences: Preferences) -> None:
     """Write the preferences, whole or not at all. OSError where the folder cannot be written."""
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_path(folder / FILE_NAME) as temporary:
-        temporary.write_text(json.dumps(asdict(preferences), indent=1), encoding="utf-8")
+        temporary.write_bytes(msgspec.json.format(msgspec.json.encode(preferences), indent=1))
 
 
 def with_recent(preferences: Preferences, path: Path) -> Preferences:

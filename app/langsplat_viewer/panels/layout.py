@@ -81,9 +81,9 @@ def draw_palette(viewer: Viewer) -> None:
     if imgui.is_window_appearing():
         viewer.state.drafts.pop("##command", None)
         imgui.set_keyboard_focus_here()
-    entered, typed = ui.box("##command", "what to do", viewer.state.drafts.get("##command", ""))
-    typing = imgui.is_item_active()
-    viewer.state.drafts["##command"] = typed
+    drafts = viewer.state.drafts
+    entered, typed = ui.box("##command", "what to do", drafts.get("##command", ""))
+    typing, drafts["##command"] = imgui.is_item_active(), typed
     found = matching(typed, viewer.state.preferences.recent)
     chosen = found[0] if entered and found else _clicked(found, typing)
     left = not imgui.is_window_focused(imgui.FocusedFlags_.root_and_child_windows)
@@ -353,7 +353,7 @@ class Hiding:
             self._hidden = []
         if shown:
             visible = (window.label for window in docking.dockable_windows if window.is_visible)
-            settings.note_panels(viewer, tuple(visible))
+            settings.prefer(viewer, panels=tuple(visible))
 
 
 def draw_over(viewer: Viewer) -> None:

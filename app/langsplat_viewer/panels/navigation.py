@@ -279,8 +279,8 @@ def _fly(viewer: Viewer) -> None:
     right, up, ahead = held(key.d, key.a), held(key.e, key.q), held(key.w, key.s)
     if right or up or ahead:
         pace = 4.0 if io.key_shift else 0.25 if io.key_alt else 1.0
-        step = pace * viewer.state.fly_speed * extent.radius * seconds
-        go = controls.walk if viewer.state.walks else controls.fly
+        step = pace * viewer.state.preferences.fly_speed * extent.radius * seconds
+        go = controls.walk if viewer.state.preferences.walks else controls.fly
         viewpoint.move(viewer, lambda view: go(view, right * step, up * step, ahead * step))
     turn = held(key.right_bracket, key.left_bracket)
     if turn:

@@ -3,13 +3,15 @@
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from textwrap import fill
-from typing import TypeVar
+from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import moderngl
 from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
+from msgspec import Meta
 
 from langsplat_core.arrays import Array
 from langsplat_viewer.files.preferences import Preferences
@@ -199,6 +201,44 @@ def kept_box(viewer: Viewer, label: str, hint: str, button: str = "", text: str 
     if entered or typed == text:
         del drafts[label]
     return typed if entered else None
+
+
+@cache
+def _titled(kind: Any, panel: str) -> list[tuple[str, Any, Meta]]:
+    """Name, type and annotation of the fields of a dataclass that have their widget in a panel."""
+    found = []
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        metas = hint.__metadata__ if get_origin(hint) is Annotated else ()
+        titled = [
+            meta for meta in metas if isinstance(meta, Meta) and (meta.extra or {}).get("panel") == panel
+        ]
+        found += [(name, hint.__origin__, meta) for meta in titled]
+    return found
+
+
+def draw_fields(holder: Any, panel: str) -> dict[str, object]:
+    """Draw a widget for every field of a dataclass that has a title and names the panel.
+
+    Return their values: a check box for a bool, a slider for a number, a list for a `Literal`.
+    """
+    values: dict[str, object] = {}
+    for name, kind, meta in _titled(type(holder), panel):
+        value, title = getattr(holder, name), meta.title or name
+        if kind is bool:
+            value = imgui.checkbox(title, value)[1]
+        elif kind is float:
+            low, high = float(meta.ge or 0), float(meta.le or 1)
+            value = slider(title, value, (low, high), logarithmic=low > 0)
+        elif kind is int:
+            leave_room(title, 11.0)
+            value = imgui.slider_int(title, value, int(meta.ge or 0), int(meta.le or 1))[1]
+        else:
+            choices = list(get_args(kind))
+            leave_room(title, 11.0)
+            value = choices[imgui.combo(title, choices.index(value), choices)[1]]
+        tip(meta.description or "")
+        values[name] = value
+    return values
 
 
 def radio(choices: Mapping[T, str], chosen: T, tips: Mapping[T, str] | None = None) -> T:

@@ -50,6 +50,7 @@ def draw_display(viewer: Viewer) -> None:
     picture = replace(picture, transparent=imgui.checkbox("Save without backdrop", picture.transparent)[1])
     ui.tip("Pictures are saved transparent where the scene is not")
     settings.set_picture(viewer, picture)
+    viewer.change("settings", **ui.draw_fields(viewer.state.session, "Display"))
     _splats(viewer)
 
 
@@ -212,13 +213,7 @@ def draw_camera(viewer: Viewer) -> None:
     if state.view is not None:
         _projection(viewer, state.view)
     _cuts(viewer)
-    speed = ui.slider("Fly speed", state.fly_speed, (0.05, 4.0), logarithmic=True)
-    _, walks = imgui.checkbox("Walk", state.walks)
-    ui.tip("W A S D keep the height of the eye")
-    ui.beside_boxed("Coarse while moving")
-    _, coarse = imgui.checkbox("Coarse while moving", state.coarse_while_moving)
-    settings.put(state, fly_speed=speed, walks=walks, coarse_while_moving=coarse)
-    ui.tip("Draw fewer pixels and merged Gaussians while the camera moves, where drawing is slow")
+    settings.prefer(viewer, **ui.draw_fields(state.preferences, "Camera"))
     imgui.end_disabled()
 
 
@@ -270,8 +265,7 @@ def _training_cameras(viewer: Viewer) -> None:
     ui.tip("Training cameras: stand where a photograph was taken")
     if changed and index != state.camera_index:
         viewpoint.go_to_camera(viewer, index)
-    viewer.change("fade", fade=ui.slider("Photograph", state.session.fade, (0.0, 1.0)))
-    ui.tip("Lay the photograph of the training camera over the picture")
+    viewer.change("fade", **ui.draw_fields(state.session, "Camera"))
     if state.session.fade == 0:
         return
     photograph = opening.photograph_here(state)
