@@ -222,7 +222,8 @@ def draw_fields(holder: Any, panel: str) -> dict[str, object]:
     Return their values: a check box for a bool, a slider for a number, a list for a `Literal`.
     """
     values: dict[str, object] = {}
-    for name, kind, meta in _titled(type(holder), panel):
+    holders: Any = type(holder)
+    for name, kind, meta in _titled(holders, panel):
         value, title = getattr(holder, name), meta.title or name
         if kind is bool:
             value = imgui.checkbox(title, value)[1]
