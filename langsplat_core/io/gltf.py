@@ -11,21 +11,21 @@ Source: Khronos' public specification of the extension, release candidate of 202
 """
 
 import base64
-import binascii
 import json
 import struct
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 from urllib.parse import unquote
 
 import numpy as np
+from msgspec import Meta, Struct
 
 from langsplat_core.arrays import Array, logit, rotation_matrices, sigmoid, unit
 from langsplat_core.errors import InputError, malformed, quoted
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.hostile import is_plain_name, open_for_reading, parse_json
+from langsplat_core.io.hostile import decode_json, is_plain_name, open_for_reading
 from langsplat_core.io.packing import coefficient_signs, quaternion_signs, to_bytes
 from langsplat_core.io.spz import decode_spz
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
@@ -49,6 +49,76 @@ MOST_NODES = 1 << 16
 SIGNS = np.array([-1, -1, 1], np.float32)  # left up front to right down front, and back
 SRGB = "srgb_rec709_display"
 
+# What is read of the JSON; entries that are not named here are passed over.
+
+Index = Annotated[int, Meta(ge=0, lt=2**40)]
+Number = Annotated[float, Meta(ge=-1e30, le=1e30)]
+
+
+class _View(Struct, rename="camel"):
+    buffer: Index
+    byte_length: Index
+    byte_offset: Index = 0
+    byte_stride: Index = 0  # 0: rows follow each other
+
+
+class _Accessor(Struct, rename="camel"):
+    component_type: int
+    count: Index
+    type: str
+    buffer_view: Index | None = None
+    byte_offset: Index = 0
+    normalized: bool = False
+    sparse: Any = None
+
+
+class _Packed(Struct, rename="camel"):
+    buffer_view: Index | None = None
+
+
+class _Splatting(Struct, rename="camel"):
+    color_space: str = SRGB
+    extensions: dict[str, _Packed] = {}
+
+
+class _Primitive(Struct):
+    attributes: dict[str, Index]
+    mode: int = 4
+    extensions: dict[str, _Splatting] = {}
+
+
+class _Mesh(Struct):
+    primitives: list[_Primitive]
+
+
+class _Node(Struct):
+    mesh: Index | None = None
+    children: list[Index] = []
+    matrix: Annotated[list[Number], Meta(min_length=16, max_length=16)] | None = None  # by columns
+    rotation: tuple[Number, Number, Number, Number] = (0, 0, 0, 1)
+    scale: tuple[Number, Number, Number] = (1, 1, 1)
+    translation: tuple[Number, Number, Number] = (0, 0, 0)
+
+
+class _Scene(Struct):
+    nodes: list[Index] = []
+
+
+class _Head(Struct, rename="camel"):
+    asset: dict[str, Any]
+    extensions_required: list[str] = []
+
+
+class _Content(_Head, rename="camel"):
+    accessors: list[_Accessor] = []
+    buffer_views: list[_View] = []
+    buffers: list[dict[str, Any]] = []
+    extensions_used: list[str] = []
+    meshes: list[_Mesh] = []
+    nodes: Annotated[list[_Node], Meta(max_length=MOST_NODES)] = []
+    scene: Index = 0
+    scenes: list[_Scene] = []
+
 
 @np.errstate(all="ignore")  # whatever numbers a file holds: rows that come out unsound are not drawn
 def read_gltf_scene(path: Path | str) -> Scene:
@@ -61,9 +131,9 @@ def read_gltf_scene(path: Path | str) -> Scene:
     file = _File(path)
     try:
         parts = list(_parts(file))
-    except (LookupError, TypeError, AttributeError, ValueError, OverflowError) as error:
-        raise malformed(path, f"not a sound glTF file ({str(error)[:80]})", "export it again") from None
-    if not parts and EXTENSION not in file.content.get("extensionsUsed", ()):
+    except LookupError as error:
+        raise malformed(path, f"names what it lacks ({str(error)[:80]})", "export it again") from None
+    if not parts and EXTENSION not in file.content.extensions_used:
         raise malformed(path, f"holds no Gaussians ({EXTENSION}); meshes are not read")
     return Scene(_turned(join_gaussians(parts)))
 
@@ -83,73 +153,64 @@ def _turned(gaussians: Gaussians) -> Gaussians:
 def _parts(file: "_File") -> Iterator[Gaussians]:
     """Yield the Gaussians of every primitive that has some, placed by their nodes, along glTF's axes."""
     left = file.size  # bytes that are not shown yet: an honest file has no need to show one again and again
-    for place, primitive in _placed(file):
-        extension = primitive["extensions"][EXTENSION]
-        if primitive.get("mode") != POINTS:
+    for place, primitive, splatting in _placed(file):
+        if primitive.mode != POINTS:
             raise malformed(file.path, "Gaussians in a primitive that is not of points")
-        views = [one["bufferView"] for name, one in extension.get("extensions", {}).items() if name in PACKED]
-        if views:
-            data = file.view(views[0])[0]
-            left -= len(data)
-        else:
-            if extension.get("colorSpace", SRGB) != SRGB:
-                raise malformed(file.path, f"colours are not {SRGB} but {quoted(extension['colorSpace'])}")
-            count = file.whole_number(file.content["accessors"], primitive["attributes"]["POSITION"], "count")
-            left -= LEAST_ROW * count
+        if splatting.color_space != SRGB:
+            raise malformed(file.path, f"colours are not {SRGB} but {quoted(splatting.color_space)}")
+        views = [found.buffer_view for name, found in splatting.extensions.items() if name in PACKED]
+        packed = views[0] if views else None
+        data = b"" if packed is None else file.view(packed)[0]
+        count = 0 if packed is not None else file.content.accessors[primitive.attributes["POSITION"]].count
+        left -= len(data) + LEAST_ROW * count
         if left < 0:
             raise malformed(file.path, f"shows more Gaussians than {file.size} bytes can hold")
-        if views:
+        if packed is not None:
             gaussians = _turned(decode_spz(bytes(data), file.path).gaussians)
         else:
-            gaussians = _gaussians(file, primitive["attributes"], count)
+            gaussians = _gaussians(file, primitive.attributes, count)
         try:
             yield gaussians if place.is_identity else transform_gaussians(gaussians, place)
         except InputError as error:
-            raise malformed(file.path, f"{error}") from None
+            raise malformed(file.path, str(error)) from None
 
 
-def _placed(file: "_File") -> Iterator[tuple[Similarity, Any]]:
+def _placed(file: "_File") -> Iterator[tuple[Similarity, _Primitive, _Splatting]]:
     """Yield the primitives with Gaussians and where they are. Every node has one parent at most."""
     content = file.content
-    nodes, meshes = content.get("nodes", []), content.get("meshes", [])
-    if len(nodes) > MOST_NODES:
-        raise malformed(file.path, f"{len(nodes)} nodes; at most {MOST_NODES} are read")
-    scenes = content.get("scenes", [])
-    roots = scenes[content.get("scene", 0)].get("nodes", []) if scenes else range(len(nodes))
-    waiting = [(_index(root), np.eye(4)) for root in reversed(roots)]
+    roots = content.scenes[content.scene].nodes if content.scenes else range(len(content.nodes))
+    waiting = [(root, np.eye(4)) for root in reversed(roots)]
     seen: set[int] = set()
     while waiting:
         number, above = waiting.pop()
         if number in seen:
             raise malformed(file.path, f"node {number} is in two places or within itself")
         seen.add(number)
-        node = nodes[number]
+        node = content.nodes[number]
         matrix = above @ _matrix(node)
-        mesh = meshes[_index(node["mesh"])] if "mesh" in node else {"primitives": []}
-        for primitive in mesh["primitives"]:
-            if EXTENSION in primitive.get("extensions", {}):
+        for primitive in () if node.mesh is None else content.meshes[node.mesh].primitives:
+            if EXTENSION in primitive.extensions:
                 try:
-                    yield similarity(matrix), primitive
+                    yield similarity(matrix), primitive, primitive.extensions[EXTENSION]
                 except InputError as error:
                     raise malformed(file.path, f"node {number}: {error}") from None
-        waiting += [(_index(child), matrix) for child in reversed(node.get("children", []))]
+        waiting += [(child, matrix) for child in reversed(node.children)]
         if len(waiting) > MOST_NODES:
             raise malformed(file.path, f"more than {MOST_NODES} nodes in its tree")
 
 
-def _matrix(node: Any) -> Array:
+def _matrix(node: _Node) -> Array:
     """Return the (4, 4) matrix from the axes of a node to those of its parent."""
-    if "matrix" in node:
-        return np.array(node["matrix"], np.float64).reshape(4, 4).T  # stored by columns
-    x, y, z, w = unit(np.array(node.get("rotation", [0, 0, 0, 1]), np.float64), 1e-300)
-    turn = rotation_matrices(np.array([w, x, y, z]))
+    if node.matrix is not None:
+        return np.array(node.matrix).reshape(4, 4).T
+    x, y, z, w = unit(np.array(node.rotation, np.float64), 1e-300)
     matrix = np.eye(4)
-    matrix[:3, :3] = turn * np.array(node.get("scale", [1, 1, 1]), np.float64).reshape(3)
-    matrix[:3, 3] = np.array(node.get("translation", [0, 0, 0]), np.float64).reshape(3)
+    matrix[:3, :3] = rotation_matrices(np.array([w, x, y, z])) * np.array(node.scale)
+    matrix[:3, 3] = node.translation
     return matrix
 
 
-def _gaussians(file: "_File", attributes: Any, count: int) -> Gaussians:
+def _gaussians(file: "_File", attributes: dict[str, int], count: int) -> Gaussians:
     """`count` Gaussians along glTF's axes."""
 
     def column(name: str, width: int) -> Array:
@@ -168,13 +229,6 @@ def _gaussians(file: "_File", attributes: Any, count: int) -> Gaussians:
     return Gaussians(column("POSITION", 3), log_scales, quats[:, [3, 0, 1, 2]], logits, sh)
 
 
-def _index(value: Any) -> int:
-    """`value`, where it is a place in a list; negative numbers would count from the end."""
-    if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-        raise ValueError(f"{quoted(value)} is no index")
-    return value
-
-
 class _File:
     """The JSON of a glTF file and its buffers, whose every entry is checked when it is asked for."""
 
@@ -189,18 +243,14 @@ class _File:
                 if self.size > 2**31:
                     raise malformed(path, f"{self.size} bytes of JSON", "write it as .glb")
                 text, self._binary = start + file.read(), memoryview(b"")
-        self.content = parse_json(text, path)
-        if not isinstance(self.content, dict) or not isinstance(self.content.get("asset"), dict):
-            raise malformed(path, "not a glTF file: it has no 'asset'")
-        version = self.content["asset"].get("version")
+        head = decode_json(text, _Head, path)
+        version = head.asset.get("version")
         if str(version)[:2] != "2.":
             raise malformed(path, f"glTF version {quoted(version)}; only 2 is read", "export it as glTF 2.0")
-        required = self.content.get("extensionsRequired", [])
-        unknown = (
-            [name for name in required if name not in KNOWN] if isinstance(required, list) else [required]
-        )
-        if unknown:
-            raise malformed(path, f"needs {quoted(unknown[0])}, which is not read", "export it without")
+        for name in head.extensions_required:
+            if name not in KNOWN:
+                raise malformed(path, f"needs {quoted(name)}, which is not read", "export it without")
+        self.content = decode_json(text, _Content, path)
         self._buffers: dict[int, bytes | memoryview] = {}
 
     def _chunks(self, start: bytes, rest: memoryview) -> tuple[bytes, memoryview]:
@@ -221,70 +271,51 @@ class _File:
         binary = found[1][1] if len(found) == 2 and found[1][0] == BINARY_CHUNK else rest[:0]
         return bytes(found[0][1]), binary
 
-    def whole_number(self, entries: Any, index: Any, key: str, default: int | None = None) -> int:
-        """Return entry `key` of `entries[index]`, a whole number from 0."""
-        value = entries[_index(index)].get(key, default)
-        if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 2**40:
-            raise malformed(self.path, f"{key} of entry {index} is not a whole number from 0")
-        return value
-
-    def accessor(self, index: Any, width: int, count: int, name: str) -> Array:
-        """(count, width) float32 values of an accessor."""
-        about = self.content["accessors"][_index(index)]
-        dtype, offset = np.dtype(COMPONENTS[about["componentType"]]), about.get("byteOffset", 0)
-        fits = WIDTHS.get(about["type"]) == width and about["count"] == count and "sparse" not in about
-        if not fits or "bufferView" not in about or _index(offset) > self.size:
+    def accessor(self, index: int, width: int, count: int, name: str) -> Array:
+        """Return the (count, width) float32 values of an accessor."""
+        about = self.content.accessors[index]
+        fits = WIDTHS.get(about.type) == width and about.count == count and about.sparse is None
+        if not fits or about.buffer_view is None:
             raise malformed(self.path, f"{name} is not {count} times {width} numbers in a buffer")
-        data, stride = self.view(about["bufferView"])
+        dtype, offset = np.dtype(COMPONENTS[about.component_type]), about.byte_offset
+        data, stride = self.view(about.buffer_view)
         row = dtype.itemsize * width
         stride = stride or row
-        if (
-            stride < row
-            or (stride > 252 and stride != row)
-            or offset + stride * (count - 1) + row > len(data)
-        ):
+        if not row <= stride <= max(row, 252) or offset + stride * (count - 1) + row > len(data):
             raise malformed(self.path, f"truncated: {name} of {count} Gaussians does not fit its buffer")
         shape, strides = (count, width), (stride, dtype.itemsize)
         values: Array = np.ndarray(shape, dtype, data, offset, strides).astype(np.float32)
-        if about.get("normalized") and dtype.kind in "iu":
+        if about.normalized and dtype.kind in "iu":
             values = np.maximum(values / np.iinfo(dtype).max, -1)
         return values
 
-    def view(self, index: Any) -> tuple[memoryview, int]:
-        """Bytes of a buffer view and its stride, 0 where rows follow each other."""
-        views = self.content["bufferViews"]
-        offset, size, stride = (
-            self.whole_number(views, index, key, default)
-            for key, default in (("byteOffset", 0), ("byteLength", None), ("byteStride", 0))
-        )
-        buffer = self._buffer(_index(views[index]["buffer"]))
-        if offset + size > len(buffer):
+    def view(self, index: int) -> tuple[memoryview, int]:
+        """Return the bytes of a buffer view and its stride, 0 where rows follow each other."""
+        about = self.content.buffer_views[index]
+        data = memoryview(self._buffer(about.buffer))[about.byte_offset :][: about.byte_length]
+        if len(data) < about.byte_length:
             raise malformed(self.path, f"truncated: buffer view {index} lies beyond its buffer")
-        return memoryview(buffer)[offset : offset + size], stride
+        return data, about.byte_stride
 
     def _buffer(self, index: int) -> bytes | memoryview:
         if index not in self._buffers:
-            uri = self.content["buffers"][index].get("uri")
+            uri = self.content.buffers[index].get("uri")
             if uri is None and index == 0:
                 self._buffers[index] = self._binary
             elif isinstance(uri, str) and uri.startswith("data:"):
                 try:
                     self._buffers[index] = base64.b64decode(uri.partition(";base64,")[2], validate=True)
-                except (binascii.Error, ValueError):
+                except ValueError:
                     raise malformed(self.path, f"buffer {index} is not base64") from None
             else:
-                self._buffers[index] = self._beside(uri)
+                name = unquote(uri) if isinstance(uri, str) else ""
+                if not is_plain_name(name):
+                    raise malformed(self.path, f"buffer {quoted(uri)} is no plain file name")
+                file, size = open_for_reading(self.path.parent / name)
+                with file:
+                    self.size += size
+                    self._buffers[index] = file.read()
         return self._buffers[index]
-
-    def _beside(self, uri: Any) -> bytes:
-        """A file in the same folder: a path could lead out of it."""
-        name = unquote(uri) if isinstance(uri, str) else ""
-        if not is_plain_name(name):
-            raise malformed(self.path, f"buffer {quoted(uri)} is no plain file name")
-        file, size = open_for_reading(self.path.parent / name)
-        with file:
-            self.size += size
-            return file.read()
 
 
 def write_gltf(path: Path | str, gaussians: Gaussians) -> None:

@@ -11,8 +11,9 @@ import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
+import msgspec
 import numpy as np
 from PIL import Image, features
 
@@ -30,6 +31,7 @@ from langsplat_core.io.files import atomic_path
 
 # ---- .npy and .npz: plain numbers or texts, read without pickles and without belief in their headers ----
 
+T = TypeVar("T")
 MEMBER_LIMIT = 2**31  # bytes of one array in an .npz: packed ones may be a thousand times their file
 
 
@@ -145,6 +147,16 @@ def parse_json(text: bytes, path: Path) -> Any:
         raise malformed(path, "not readable as JSON (nested too deeply)") from None
     except ValueError as error:
         raise malformed(path, f"not readable as JSON ({str(error)[:80]})") from None
+
+
+def decode_json(text: bytes, kind: type[T], path: Path) -> T:
+    """Return the value of a JSON text, which has to fit the msgspec structure `kind`; FormatError."""
+    try:
+        return msgspec.json.decode(text, type=kind)
+    except RecursionError:
+        raise malformed(path, "not readable as JSON (nested too deeply)") from None
+    except ValueError as error:
+        raise malformed(path, f"not readable as JSON ({printable_line(error, 100)})") from None
 
 
 # ---- zip archives, without belief in their directories ----

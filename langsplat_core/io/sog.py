@@ -26,22 +26,22 @@ import json
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta, Struct
 from PIL import Image
 
 from langsplat_core.arrays import Array, logit, sigmoid
 from langsplat_core.errors import malformed, quoted
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import (
+    decode_json,
     exists,
     is_plain_name,
     open_for_reading,
     opened,
     opened_archive,
-    parse_json,
-    read_json_file,
 )
 from langsplat_core.io.packing import smallest_three, to_bytes, without_largest
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
@@ -58,6 +58,69 @@ PIXELS_PER_BYTE = 64
 SLACK_PIXELS = 65536
 
 Fetch = Callable[[str, int], bytes]  # (file name, most bytes) -> content
+
+
+# What is read of `meta.json` and `lod-meta.json`.
+
+Number = Annotated[float, Meta(ge=-1e30, le=1e30)]
+Whole = Annotated[int, Meta(ge=0, le=2**32)]
+Codebook = Annotated[list[Number], Meta(min_length=256, max_length=256)]
+One = Annotated[list[str], Meta(min_length=1)]  # names of images
+Two = Annotated[list[str], Meta(min_length=2)]
+
+
+class _Versioned(Struct):
+    version: Any = 1
+
+
+class _Means(Struct):
+    mins: tuple[Number, Number, Number]
+    maxs: tuple[Number, Number, Number]
+    files: Two
+
+
+class _Quats(Struct):
+    files: One
+
+
+class _Coded(Struct):
+    codebook: Codebook
+    files: One
+
+
+class _Higher(Struct):
+    codebook: Codebook
+    files: Two
+    count: Annotated[int, Meta(ge=1, le=65536)]
+    bands: Annotated[int, Meta(ge=1, le=3)]
+
+
+class _Meta(Struct, rename={"higher": "shN"}):
+    count: Whole
+    means: _Means
+    scales: _Coded
+    quats: _Quats
+    sh0: _Coded
+    higher: _Higher | None = None
+    model: Any = None
+    antialias: Any = None
+
+
+class _Place(Struct):
+    file: Whole
+    offset: Whole
+    count: Whole
+
+
+class _Node(Struct):
+    children: list["_Node"] = []
+    lods: dict[int, _Place] = {}
+
+
+class _Streamed(Struct):
+    filenames: list[str]
+    tree: _Node
+    environment: str | None = None
 
 
 def read_sog_scene(path: Path | str) -> Scene:
@@ -80,53 +143,47 @@ def read_sog_scene(path: Path | str) -> Scene:
 
 
 def _read_streamed(path: Path) -> Scene:
-    content = read_json_file(path, LOD_LIMIT)
+    content = decode_json(_folder_reader(path.parent)(path.name, LOD_LIMIT), _Streamed, path)
+    ranges = _finest_ranges(content.tree)
     try:
-        names, tree = content["filenames"], content["tree"]
-        ranges = _finest_ranges(tree)
-        environment = content.get("environment")
-        files = {number: _inside(path, names[number]) for number in ranges}
-        around = [] if environment is None else [_inside(path, environment)]
-        if len({*files.values(), *around}) < len(files) + len(around):
-            raise ValueError("a file is named twice")
-    except (LookupError, TypeError, AttributeError, ValueError) as error:
-        raise malformed(path, f"not a sound {LOD_NAME} ({str(error)[:80]})", "export it again") from None
+        files = {number: _inside(path, content.filenames[number]) for number in ranges}
+        around = [] if content.environment is None else [_inside(path, content.environment)]
+    except LookupError:
+        raise malformed(path, "its tree names files that it lacks") from None
+    if len({*files.values(), *around}) < len(files) + len(around):
+        raise malformed(path, "a file is named twice")
     parts, antialiased = [], False
     for number, file in files.items():
         scene = read_sog_scene(file)
         count, rows = len(scene.gaussians), ranges[number]
         if sum(length for _, length in rows) > count or any(at + length > count for at, length in rows):
-            raise malformed(path, f"asks for more than the {count} Gaussians of {file}")
+            raise malformed(path, f"asks for more than the {count} Gaussians of {file.name}")
         parts += [scene.gaussians.take(np.arange(at, at + length)) for at, length in rows]
         antialiased |= scene.antialiased
     parts += [read_sog_scene(file).gaussians for file in around]
     return Scene(join_gaussians(parts), antialiased=antialiased)
 
 
-def _finest_ranges(tree: Any) -> dict[int, list[tuple[int, int]]]:
+def _finest_ranges(tree: _Node) -> dict[int, list[tuple[int, int]]]:
     """File -> (offset, count) of the rows of the finest level, in the order of the tree."""
     waiting, leaves = [tree], []
     while waiting:
         node = waiting.pop()
-        waiting += reversed(node.get("children", []))
-        leaves.append({int(level): place for level, place in node.get("lods", {}).items()})
+        waiting += reversed(node.children)
+        leaves.append(node.lods)
     finest = min((level for leaf in leaves for level in leaf), default=0)
     ranges: dict[int, list[tuple[int, int]]] = {}
     for place in (leaf[finest] for leaf in leaves if finest in leaf):
-        numbers = [place[key] for key in ("file", "offset", "count")]
-        if any(type(number) is not int or number < 0 for number in numbers):
-            raise ValueError(f"{quoted(place)} is no place")
-        ranges.setdefault(numbers[0], []).append((numbers[1], numbers[2]))
+        ranges.setdefault(place.file, []).append((place.offset, place.count))
     return ranges
 
 
-def _inside(path: Path, name: Any) -> Path:
-    """A file beside `path` or in a folder there: a path could lead out of it."""
-    parts = name.split("/") if isinstance(name, str) else []
-    if not 1 <= len(parts) <= 2 or not all(map(is_plain_name, parts)):
-        raise ValueError(f"{quoted(name)} is no file in the scene's folder")
-    if parts[-1] != META_NAME and not parts[-1].endswith(".sog"):
-        raise ValueError(f"{quoted(name)} is no SOG")
+def _inside(path: Path, name: str) -> Path:
+    """A SOG beside `path` or in a folder there: a path could lead out of it."""
+    parts = name.split("/")
+    sog = parts[-1] == META_NAME or parts[-1].endswith(".sog")
+    if not sog or len(parts) > 2 or not all(map(is_plain_name, parts)):
+        raise malformed(path, f"{quoted(name)} is no SOG in the scene's folder")
     return path.parent.joinpath(*parts)
 
 
@@ -143,128 +200,84 @@ def _folder_reader(folder: Path) -> Fetch:
 
 def _decode(fetch: Fetch, meta_path: Path) -> Scene:
     """Decode the scene whose meta file `fetch` finds by the last part of `meta_path`."""
-    meta = _Meta(parse_json(fetch(meta_path.name, META_LIMIT), meta_path), meta_path)
-    return Scene(_gaussians(fetch, meta), antialiased=meta.antialiased())
+    text = fetch(meta_path.name, META_LIMIT)
+    version = decode_json(text, _Versioned, meta_path).version
+    if version != 2:
+        what = f"SOG version {quoted(version)}; only 2 is read"
+        raise malformed(meta_path, what, "export the scene again")
+    meta = decode_json(text, _Meta, meta_path)
+    antialiased = meta.model == "antialiased" or meta.antialias is True
+    return Scene(_gaussians(_Planes(fetch, meta_path, meta.count), meta), antialiased=antialiased)
 
 
-def _gaussians(fetch: Fetch, meta: "_Meta") -> Gaussians:
-    count = meta.whole_number("count", least=0, most=2**32)
-    planes = _Planes(fetch, meta, count)
-    low, high = planes.of_gaussians("means", 0), planes.of_gaussians("means", 1)
+def _gaussians(planes: "_Planes", meta: _Meta) -> Gaussians:
+    low, high = (planes.of_gaussians(name, True) for name in meta.means.files[:2])
     fractions = (low[:, :3] + high[:, :3].astype(np.uint32) * 256) / 65535
-    mins, maxs = (meta.numbers("means", key, 3) for key in ("mins", "maxs"))
+    mins, maxs = np.array(meta.means.mins), np.array(meta.means.maxs)
     logs = mins + (maxs - mins) * fractions
-    quats = planes.of_gaussians("quats", 0)
-    if count and quats[:, 3].min() < 252:
-        raise malformed(meta.path, "'quats' holds an alpha below 252", "was the image saved lossily?")
-    sh0 = planes.of_gaussians("sh0", 0)
-    base = meta.numbers("sh0", "codebook", 256)[sh0[:, :3]]
+    quats = planes.of_gaussians(meta.quats.files[0])
+    if meta.count and quats[:, 3].min() < 252:
+        raise malformed(planes.path, "'quats' holds an alpha below 252", "was the image saved lossily?")
+    sh0 = planes.of_gaussians(meta.sh0.files[0])
+    base = np.array(meta.sh0.codebook)[sh0[:, :3]]
     with np.errstate(over="ignore"):  # overflow to infinity makes rows that are dropped later
         means = np.sign(logs) * np.expm1(np.abs(logs))
     return Gaussians(
         means=means,
-        log_scales=meta.numbers("scales", "codebook", 256)[planes.of_gaussians("scales", 0)[:, :3]],
+        log_scales=np.array(meta.scales.codebook)[planes.of_gaussians(meta.scales.files[0])[:, :3]],
         quats_wxyz=smallest_three((quats[:, :3] / 255 - 0.5) * np.sqrt(2), quats[:, 3] - 252),
         opacity_logits=logit(sh0[:, 3] / 255),
-        sh=np.concatenate([base[:, None], _rest(planes, meta)], axis=1),
+        sh=np.concatenate([base[:, None], _rest(planes, meta.higher)], axis=1),
     )
 
 
-def _rest(planes: "_Planes", meta: "_Meta") -> Array:
+def _rest(planes: "_Planes", meta: _Higher | None) -> Array:
     """(N, K - 1, 3) higher coefficients, from the palette."""
-    if "shN" not in meta.content:
+    if meta is None:
         return np.zeros((planes.count, 0, 3))
-    bands = meta.whole_number("shN", "bands", least=1, most=3)
-    entries = meta.whole_number("shN", "count", least=1, most=65536)
-    coefficients = SH_COUNTS[bands] - 1
-    palette = planes.palette(coefficients, entries)
-    labels = planes.of_gaussians("shN", 1)
+    palette = planes.palette(meta.files[0], SH_COUNTS[meta.bands] - 1, meta.count)
+    labels = planes.of_gaussians(meta.files[1])
     entry = labels[:, 0] + labels[:, 1].astype(np.uint32) * 256
-    if planes.count and entry.max() >= entries:
-        raise malformed(meta.path, f"a label of 'shN' is {entry.max()}", f"the palette has {entries} entries")
-    return meta.numbers("shN", "codebook", 256)[palette[entry]]
+    if planes.count and entry.max() >= meta.count:
+        what = f"a label of 'shN' is {entry.max()}, the palette has {meta.count} entries"
+        raise malformed(planes.path, what)
+    return np.array(meta.codebook)[palette[entry]]
 
 
 class _Planes:
     """The images, each checked before it is decoded."""
 
-    def __init__(self, fetch: Fetch, meta: "_Meta", count: int) -> None:
-        self._fetch, self._meta, self.count = fetch, meta, count
+    def __init__(self, fetch: Fetch, path: Path, count: int) -> None:
+        self.path, self.count, self._fetch = path, count, fetch
 
-    def of_gaussians(self, key: str, index: int) -> Array:
-        """(N, 4) uint8 rgba of image `index` of property `key`."""
-        pixels = self._image(key, index, lambda w, h: self.count <= w * h <= 2 * self.count + SLACK_PIXELS)
-        return pixels.reshape(-1, 4)[: self.count]
+    def of_gaussians(self, name: str, is_noise: bool = False) -> Array:
+        """Return the (N, 4) uint8 rgba of an image; `is_noise`: which no compression gains much on."""
 
-    def palette(self, coefficients: int, entries: int) -> Array:
-        """(entries, coefficients, 3) uint8 codes of the image shN.files[0]."""
-        rows = -(-entries // PALETTE_ROW)
-        width = PALETTE_ROW * coefficients
-        pixels = self._image("shN", 0, lambda w, h: w == width and rows <= h <= PALETTE_ROWS)
+        def suits(width: int, height: int) -> bool:
+            return self.count <= width * height <= 2 * self.count + SLACK_PIXELS
+
+        return self._image(name, suits, is_noise).reshape(-1, 4)[: self.count]
+
+    def palette(self, name: str, coefficients: int, entries: int) -> Array:
+        """Return the (entries, coefficients, 3) uint8 codes of an image."""
+        rows, width = -(-entries // PALETTE_ROW), PALETTE_ROW * coefficients
+        pixels = self._image(name, lambda w, h: w == width and rows <= h <= PALETTE_ROWS)
         return pixels[:rows].reshape(rows * PALETTE_ROW, coefficients, 4)[:entries, :, :3]
 
-    def _image(self, key: str, index: int, suits: Callable[[int, int], bool]) -> Array:
+    def _image(self, name: str, suits: Callable[[int, int], bool], is_noise: bool = False) -> Array:
         """(H, W, 4) uint8; `suits` judges (width, height) before anything is decoded."""
-        name = self._meta.file_name(key, index)
-        what = f"{self._meta.path}: image {quoted(name)} of {key!r}"
+        if not is_plain_name(name):
+            raise malformed(self.path, f"{quoted(name)} is no plain file name")
+        what = f"{self.path}: image {quoted(name)}"
         data = self._fetch(name, IMAGE_LIMIT)
-        if key == "means" and self.count > PIXELS_PER_BYTE * len(data) + SLACK_PIXELS:
-            raise malformed(self._meta.path, f"image {quoted(name)} is too small for {self.count} Gaussians")
+        if is_noise and self.count > PIXELS_PER_BYTE * len(data) + SLACK_PIXELS:
+            raise malformed(what, f"{len(data)} bytes are too few for {self.count} Gaussians")
         with opened(data, what, ("WEBP", "PNG")) as image:
             if not suits(*image.size):
                 size = f"{image.width}x{image.height}"
                 raise malformed(what, f"{size} pixels do not suit {self.count} Gaussians")
             # A lossless image of full opacity is stored without alpha: convert makes it 255 again.
             return np.asarray(image.convert("RGBA"))
-
-
-class _Meta:
-    """`meta.json`, whose every entry is checked when it is asked for."""
-
-    def __init__(self, content: Any, path: Path) -> None:
-        if not isinstance(content, dict):
-            raise malformed(path, "expected a JSON object")
-        version = content.get("version", 1)
-        if version != 2:
-            raise malformed(path, f"SOG version {quoted(version)}; only 2 is read, export the scene again")
-        self.content, self.path = content, path
-
-    def antialiased(self) -> bool:
-        return self.content.get("model") == "antialiased" or self.content.get("antialias") is True
-
-    def whole_number(self, *keys: str, least: int, most: int) -> int:
-        value = self._at(keys)
-        if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
-            raise malformed(self.path, f"{'.'.join(keys)} is not a whole number from {least} to {most}")
-        return value
-
-    def numbers(self, group: str, key: str, count: int) -> Array:
-        """Return the list under `group` and `key` as a (count,) array of finite float64."""
-        value = self._at((group, key))
-        if not isinstance(value, list) or len(value) != count or not all(map(_is_finite_number, value)):
-            raise malformed(self.path, f"{group}.{key} is not a list of {count} numbers")
-        return np.array(value, dtype=np.float64)
-
-    def file_name(self, group: str, index: int) -> str:
-        """A plain file name: a path could lead out of the scene's folder."""
-        files = self._at((group, "files"))
-        name = files[index] if isinstance(files, list) and len(files) > index else None
-        if not is_plain_name(name):
-            raise malformed(self.path, f"{group}.files has no plain file name at place {index}")
-        return str(name)
-
-    def _at(self, keys: tuple[str, ...]) -> Any:
-        value: Any = self.content
-        for key in keys:
-            if not isinstance(value, dict) or key not in value:
-                raise malformed(self.path, f"{'.'.join(keys)} is missing")
-            value = value[key]
-        return value
-
-
-def _is_finite_number(value: Any) -> bool:
-    # Python's integers have no limit: one beyond float64 must not reach NumPy
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300
 
 
 # Writing: one `.sog` file, rows in their order.
