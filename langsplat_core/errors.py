@@ -8,9 +8,11 @@ LINE_LIMIT = 1000  # characters of a message: room for two long paths, not for a
 
 
 def printable_line(text: object, limit: int = LINE_LIMIT) -> str:
-    """`text` as one line that a terminal may show, at most `limit` characters long. Runs of blanks and line
-    ends become one blank, what cannot be printed (control characters, lone surrogates) is escaped, and what
-    is too long loses its middle."""
+    """Return `text` as one line that a terminal may show, at most `limit` characters long.
+
+    Runs of blanks and line ends become one blank, what cannot be printed (control characters, lone
+    surrogates) is escaped, and what is too long loses its middle.
+    """
     line = " ".join(
         "".join(c if c.isprintable() or c.isspace() else repr(c)[1:-1] for c in str(text)).split()
     )
@@ -21,7 +23,7 @@ def printable_line(text: object, limit: int = LINE_LIMIT) -> str:
 
 
 def shortened(names: Iterable[str], limit: int = 5, width: int = 200) -> str:
-    """``a, b, c and 4 more``, about `width` characters at most; long names lose their middle."""
+    """Return ``a, b, c and 4 more``, about `width` characters at most; long names lose their middle."""
     listed = sorted(names)
     rest = len(listed) - limit
     shown = printable_line(", ".join(printable_line(name, 80) for name in listed[:limit]), width)
@@ -29,14 +31,16 @@ def shortened(names: Iterable[str], limit: int = 5, width: int = 200) -> str:
 
 
 def quoted(content: object, limit: int = 60) -> str:
-    """Content of a file, quoted as a part of a message: at most `limit` characters with its escapes."""
+    """Return content of a file, quoted for a message: at most `limit` characters with its escapes."""
     return printable_line(repr(content), limit)
 
 
 class LangSplatError(Exception):
-    """Base of every error that the command line turns into one line and exit code 2. Whatever a file brought
-    into the message, `str()` of it is a `printable_line`. Who quotes a file or another program's error
-    shortens it, with `printable_line` too."""
+    """Base of every error that the command line turns into one line and exit code 2.
+
+    Whatever a file brought into the message, `str()` of it is a `printable_line`. Who quotes a file or
+    another program's error shortens it, with `printable_line` too.
+    """
 
     def __str__(self) -> str:
         return printable_line(super().__str__())
@@ -86,14 +90,16 @@ EXTRAS: Mapping[str, str] = MappingProxyType({  # name as imported -> extra, as 
 
 
 def remedy(package: str) -> str:
-    """The command that installs a package of `EXTRAS`."""
+    """Return the command that installs a package of `EXTRAS`."""
     return f'pip install "langsplat-viewer[{EXTRAS[package]}]"'
 
 
 @contextmanager
 def optional_imports(error: type[LangSplatError] = BackendError) -> Iterator[None]:
-    """Turn a failed import of a package of `EXTRAS`, in the body or in the function that this decorates, into
-    `error` with the line that installs it."""
+    """Turn a failed import of a package of `EXTRAS` into `error` with the line that installs it.
+
+    A context manager for a block, or a decorator of a function.
+    """
     try:
         yield
     except ModuleNotFoundError as missing:

@@ -1,5 +1,6 @@
-"""How commands run: each exits with 0, with 2 and one line on stderr, or with 130 (143) and one line when
-interrupted (terminated).
+"""How commands run: they end with 0, with 2 and one line, or with 130 or 143 and one line.
+
+The line is on stderr and says what is wrong and how to mend it; 130 is of Ctrl-C, 143 of SIGTERM.
 
 A command is a dataclass whose fields are its arguments (tyro derives the parser), checked before anything is
 done, and whose `run` does the work. The viewer's program ends the same way and uses this module too.
@@ -89,8 +90,10 @@ def named(args: Sequence[str], option: str) -> str:
 
 
 def codec_settings(args: Sequence[str], default: CodecConfig) -> CodecConfig:
-    """The default settings of the codec that `args` choose by `--codec.kind`; `default` itself where it is of
-    that kind or none is chosen. InputError for an unknown kind."""
+    """Return the default settings of the codec that `args` choose by `--codec.kind`.
+
+    That is `default` itself where it is of that kind or none is chosen. InputError for an unknown kind.
+    """
     kind = named(args, "--codec.kind") or default.kind
     if kind not in CODEC_CONFIGS:
         raise InputError(f"--codec.kind {kind}: choose one of {', '.join(CODEC_CONFIGS)}")
@@ -122,9 +125,11 @@ def one_line(box: str) -> str:
 
 
 def parsed(program: str, kind: Any, args: Sequence[str], description: str | None = None) -> Any:
-    """The command of type `kind`, a dataclass or a union of subcommands, that the words `args` name. Sets how
-    much is said; -v and -q may stand anywhere. SystemExit as tyro raises it, with help and completion scripts
-    on stdout and complaints on stderr. InputError for completion of an unknown shell."""
+    """Return the command of type `kind`, a dataclass or a union of subcommands, that the words `args` name.
+
+    Sets how much is said; -v and -q may stand anywhere. SystemExit as tyro raises it, with help and
+    completion scripts on stdout and complaints on stderr. InputError for completion of an unknown shell.
+    """
     if args and args[0] in COMPLETION and args[1:2] and args[1] not in SHELLS:
         raise InputError(f"{args[0]} {args[1]}: there is {', '.join(SHELLS)}")
     line = make_dataclass(
@@ -209,8 +214,10 @@ class _StandardError(io.FileIO):
 
 
 def _prepare_standard_streams() -> None:
-    """Have a closed standard output fail when it is written to, and standard error never; print names that
-    cannot be encoded with escapes."""
+    """Have a closed standard output fail when it is written to, and standard error never.
+
+    Names that cannot be encoded are printed with escapes.
+    """
     for number in (1, 2):
         try:
             os.fstat(number)
@@ -290,8 +297,10 @@ WordsOption = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help=_taught)
 
 
 def check_arguments(command: object) -> None:
-    """InputError, in one line, for the first argument of a command, a dataclass, that it cannot work with: a
-    number outside of its range, a text that is not UTF-8, a place that cannot be written to."""
+    """Raise InputError for the first argument of a command, a dataclass, that it cannot work with.
+
+    That is a number outside of its range, a text that is not UTF-8, or a place that cannot be written to.
+    """
     check_settings(command)
     for option, value, hint in named_values(command):
         for text in value if isinstance(value, tuple) else (value,):

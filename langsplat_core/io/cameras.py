@@ -63,7 +63,7 @@ def write_cameras(path: Path | str, cameras: tuple[Camera, ...]) -> None:
 
 
 def _camera(entry: Any, what: str) -> Camera:
-    """`what` names the file and the camera in messages."""
+    """Return the camera of an entry; `what` names the file and the camera in messages."""
     if not isinstance(entry, dict):
         raise malformed(what, "expected an object with width, height, position, rotation, fx, fy")
     width, height = (_pixels(entry, key, what) for key in ("width", "height"))
@@ -116,8 +116,10 @@ def _pixels(entry: dict[str, Any], key: str, what: str) -> int:
 
 
 def numbers(entry: dict[str, Any], key: str, shape: tuple[int, ...], what: str) -> Array:
-    """Finite float64 numbers of the given shape under `key`: (), (3,), (3, 3) or (4, 4). FormatError,
-    beginning with `what`, where there are none."""
+    """Return finite float64 numbers of the given shape under `key`: (), (3,), (3, 3) or (4, 4).
+
+    FormatError, beginning with `what`, where there are none.
+    """
     if key not in entry:
         raise malformed(what, f"{key!r} is missing")
     kinds = {(): "a number", (3,): "3 numbers", (3, 3): "3 rows of 3 numbers", (4, 4): "4 rows of 4 numbers"}

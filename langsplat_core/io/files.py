@@ -120,10 +120,11 @@ def name_max(folder: Path) -> int:
 
 
 def check_output_file(path: Path | str) -> None:
-    """InputError, in one line, where no file can be written at `path`: a name that the file system does not
-    take, a folder, a place under a file, in the system's own folders, or where one may not write.
+    """Raise InputError, in one line, where no file can be written at `path`.
 
-    Folders that are missing will be made; nothing is left behind by the check.
+    That is a name that the file system does not take, a folder, a place under a file, in the system's own
+    folders, or where one may not write. Folders that are missing will be made; nothing is left behind by the
+    check.
     """
     target = Path(path)
     folder = _existing_folder(target)
@@ -139,8 +140,10 @@ def check_output_file(path: Path | str) -> None:
 
 
 def check_output_folder(path: Path | str) -> None:
-    """InputError, in one line, where files cannot be written into a folder `path`, which may be missing yet;
-    see `check_output_file`."""
+    """Raise InputError, in one line, where files cannot be written into a folder `path`.
+
+    It may be missing yet; see `check_output_file`.
+    """
     target = Path(path)
     folder = _existing_folder(target)
     if os.path.lexists(target) and not os.path.isdir(target):
@@ -149,13 +152,16 @@ def check_output_folder(path: Path | str) -> None:
 
 
 def shown(path: Path | str) -> str:
-    """A path for a message: printable, and without its middle where it is long."""
+    """Return a path for a message: printable, and without its middle where it is long."""
     text = str(path).encode("utf-8", "backslashreplace").decode()
     return text if len(text) <= 100 else f"{text[:50]}...{text[-47:]}"
 
 
 def _existing_folder(target: Path) -> Path:
-    """The nearest folder above `target` that exists. InputError for names that it cannot hold."""
+    """Return the nearest folder above `target` that exists.
+
+    InputError for names that it cannot hold.
+    """
     try:
         size = len(str(target).encode())
     except UnicodeEncodeError:

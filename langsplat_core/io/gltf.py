@@ -254,7 +254,7 @@ class _File:
         self._buffers: dict[int, bytes | memoryview] = {}
 
     def _chunks(self, start: bytes, rest: memoryview) -> tuple[bytes, memoryview]:
-        """The JSON and the binary chunk of a .glb."""
+        """Return the JSON and the binary chunk of a .glb."""
         version, length = struct.unpack("<II", start[4:]) if len(start) == 12 else (0, 0)
         if version != 2 or length > self.size:
             raise malformed(self.path, f"a .glb of version {version} and {length} bytes, found {self.size}")
@@ -374,7 +374,9 @@ def write_gltf(path: Path | str, gaussians: Gaussians) -> None:
 
 def glb_head(content: dict[str, Any], size: int, path: Path) -> bytes:
     """Everything of a .glb that is in front of its `size` bytes of binary data, a multiple of four.
-    InputError, naming `path`, for more than a .glb can hold."""
+
+    InputError, naming `path`, for more than a .glb can hold.
+    """
     text = json.dumps(content).encode()
     text += b" " * (-len(text) % 4)
     binary = struct.pack("<I", size) + BINARY_CHUNK if size else b""

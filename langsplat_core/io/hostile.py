@@ -1,5 +1,8 @@
-"""Files that nobody vouches for: whatever is wrong with one is a single InputError or FormatError, and no
-memory is taken on the word of a header."""
+"""Files that nobody vouches for: arrays, JSON, archives and images.
+
+Whatever is wrong with one is a single InputError or FormatError, and no memory is taken on the word of a
+header.
+"""
 
 import io
 import json
@@ -48,8 +51,10 @@ def write_npy(path: Path, array: Array) -> None:
 
 
 def read_npy(path: Path) -> Array:
-    """Return the array of numbers in a .npy file. Raises InputError where it cannot be opened, else
-    FormatError."""
+    """Return the array of numbers in a .npy file.
+
+    Raises InputError where it cannot be opened, else FormatError.
+    """
     file, size = open_for_reading(path)
     with file:
         return _parse(file, size, str(path))
@@ -180,8 +185,11 @@ class Archive:
         return self._archive.namelist()
 
     def read(self, name: str, limit: int) -> bytes:
-        """Return the content of a member; FormatError where there is none, or where it unfolds to more than
-        `limit` bytes, which is noticed before more are held."""
+        """Return the content of a member.
+
+        FormatError where there is none, or where it unfolds to more than `limit` bytes, which is noticed
+        before more are held.
+        """
         try:
             info = self._archive.getinfo(name)
         except KeyError:

@@ -1,5 +1,7 @@
-"""Codes that several formats of small files share: bytes, quaternions without their largest component, and
-the signs of Gaussians along mirrored axes."""
+"""Codes that several formats of small files share.
+
+They are bytes, quaternions without their largest component, and the signs of Gaussians along mirrored axes.
+"""
 
 import numpy as np
 
@@ -24,8 +26,10 @@ def to_bytes(values: Array) -> Array:
 
 
 def smallest_three(three: Array, largest: Array) -> Array:
-    """Return (N, 4) unit quaternions from their (N, 3) components other than the largest, which is positive,
-    and its (N,) index."""
+    """Return (N, 4) unit quaternions from their (N, 3) components other than the largest.
+
+    largest: (N,) index of that one, which is positive.
+    """
     out = np.empty((len(three), 4))
     rows = np.arange(len(three))[:, None]
     out[rows, OTHERS[largest]] = three
@@ -34,8 +38,7 @@ def smallest_three(three: Array, largest: Array) -> Array:
 
 
 def without_largest(quats: Array) -> tuple[Array, Array]:
-    """Return the inverse of `smallest_three` for (N, 4) quaternions of any length: (N, 3) components, (N,)
-    index."""
+    """Return (N, 3) components and (N,) index for `smallest_three`, of (N, 4) quaternions of any length."""
     turns = unit(quats.astype(np.float64), 1e-30)
     largest = np.abs(turns).argmax(axis=1)
     turns *= np.where(np.take_along_axis(turns, largest[:, None], 1) < 0, -1, 1)
@@ -43,8 +46,10 @@ def without_largest(quats: Array) -> tuple[Array, Array]:
 
 
 def quaternion_signs(signs: Array) -> Array:
-    """Return the (4,) signs of w x y z where the axes have the (3,) `signs`: mirroring an axis turns the two
-    rotations about the others round."""
+    """Return the (4,) signs of w x y z where the axes have the (3,) `signs`.
+
+    Mirroring an axis turns the two rotations about the others round.
+    """
     return np.array([1, signs[1] * signs[2], signs[0] * signs[2], signs[0] * signs[1]])
 
 

@@ -1,5 +1,6 @@
-"""3D Gaussian scenes as PLY: INRIA's layout in all its variants, written in its plain form, and SuperSplat's
-compressed PLY.
+"""3D Gaussian scenes as PLY: INRIA's layout, and SuperSplat's compressed one.
+
+INRIA's is read in all its variants and written in its plain form.
 
 One element `vertex`, one row per Gaussian. As written: binary little endian, float32, in order
 ``x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3``. Opacities are logits, scales natural

@@ -123,11 +123,11 @@ class PlyFile:
         columns: Sequence[str] = (),
         dtype: DTypeLike = np.float32,
     ) -> tuple[list[Array], dict[str, Array]]:
-        """Return a (rows, names) table of `dtype` for each group of properties; and `columns`, by name, each
-        of its own type.
+        """Return a (rows, names) table of `dtype` for each group of properties, and `columns` by name.
 
-        Beside the arrays only a chunk a thread is held. A number beyond its type becomes infinite or, in an
-        integer, arbitrary. FormatError for an element without these properties, or with lists.
+        Columns keep their own type. Beside the arrays only a chunk a thread is held. A number beyond its type
+        becomes infinite or, in an integer, arbitrary. FormatError for an element without these properties, or
+        with lists.
         """
         absent = [name for names in (*groups, columns) for name in names if name not in element.numbers]
         if absent or element.lists:
@@ -263,8 +263,11 @@ def write_table(
     faces: Array | None = None,
     comments: Sequence[str] = (),
 ) -> None:
-    """Write a binary little-endian PLY, atomically: an element `vertex` of `columns`, name -> (N,) of a type
-    in `TYPE_NAMES`, and one `face` of (F, 3) numbers of vertices. `comments` are of one line each."""
+    """Write a binary little-endian PLY, atomically.
+
+    columns: of the element `vertex`, name -> (N,) of a type in `TYPE_NAMES`. faces: (F, 3) numbers of
+    vertices. comments: of one line each.
+    """
     count = len(next(iter(columns.values())))
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
     header += [f"element vertex {count}"]
@@ -292,11 +295,11 @@ GREY = 128  # of points without colours
 
 
 def read_cloud(path: Path) -> tuple[Array, Array]:
-    """Return (M, 3) float64 positions and (M, 3) uint8 colours of the element `vertex`, as they are: a
-    position may be infinite or NaN.
+    """Return (M, 3) float64 positions and (M, 3) uint8 colours of the element `vertex`.
 
-    Colours are whole numbers from 0 to 255, or floats from 0 to 1; what lies beyond is clipped. Raises
-    InputError when the file cannot be opened and FormatError when it breaks a rule of the format.
+    A position may be infinite or NaN. Colours are whole numbers from 0 to 255, or floats from 0 to 1; what
+    lies beyond is clipped. Raises InputError when the file cannot be opened and FormatError when it breaks a
+    rule of the format.
     """
     with open_ply(path) as ply:
         vertex = ply.elements.get("vertex")

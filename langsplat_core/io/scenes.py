@@ -1,10 +1,11 @@
-"""Scenes on disk: `formats()`, the one table that the loader, `langsplat convert`, the file browser, the
-desktop entry and the tests of round trips and damaged files read; and a scene's companions.
+"""Scenes on disk: their formats, and their companions.
 
-A scene is `scene.ply` with, beside it, `scene.langsplat.safetensors` and `scene.cameras.json`, either of
-which may be absent. The same companions are looked for beside a compressed PLY or a SOG folder. Those of
-the other formats keep its suffix, `scene.spz.langsplat.safetensors`: the sidecar knows the rounded positions
-of that file, so that it could not serve a `scene.ply` in the same folder.
+`formats()` is the one table that the loader, `langsplat convert`, the file browser, the desktop entry and the
+tests of round trips and damaged files read. A scene is `scene.ply` with, beside it,
+`scene.langsplat.safetensors` and `scene.cameras.json`, either of which may be absent. The same companions are
+looked for beside a compressed PLY or a SOG folder. Those of the other formats keep its suffix,
+`scene.spz.langsplat.safetensors`: the sidecar knows the rounded positions of that file, so that it could not
+serve a `scene.ply` in the same folder.
 """
 
 import logging
@@ -201,7 +202,7 @@ def _read_by_kind(path: Path) -> Scene:
 
 
 def check_writable(path: Path | str) -> None:
-    """InputError unless `save_scene` can write a scene of this name, and its companions, where it lies."""
+    """Raise InputError unless `save_scene` can write a scene of this name and its companions there."""
     _writable(Path(path))
     check_output_file(path)
     for suffix in (language_files.SUFFIX, camera_files.SUFFIX):
@@ -209,8 +210,10 @@ def check_writable(path: Path | str) -> None:
 
 
 def check_keeps(out: Path, *sources: Path) -> None:
-    """InputError where a scene, or a file without companions, that is written as `out` would replace one of
-    the scenes `sources`, or what lies beside it."""
+    """Raise InputError where writing `out` would replace one of the scenes `sources`.
+
+    That goes for what lies beside a source, and for the companions of a scene `out`.
+    """
     read = {file.resolve() for source in sources for file in (source, *scene_files(source))}
     companions = [companion_path(out, suffix) for suffix in (language_files.SUFFIX, camera_files.SUFFIX)]
     scene = any(row.write is not None and out.suffix.lower() == row.suffix for row in formats())
@@ -262,9 +265,11 @@ def save_scene(path: Path | str, scene: Scene) -> None:
 
 
 def companion_path(scene: Path | str, suffix: str) -> Path:
-    """Return where the companion of a scene that ends in `suffix` lies: `a/b.ply` -> `a/b<suffix>`; a SOG
-    folder `a/b` (or `a/b/meta.json`) -> `a/b<suffix>`, beside the folder; `a/b.spz`, .sog, .splat or .ksplat
-    -> `a/b.spz<suffix>` and so on."""
+    """Return where the companion of a scene that ends in `suffix` lies: `a/b.ply` -> `a/b<suffix>`.
+
+    A SOG folder `a/b` (or `a/b/meta.json`) -> `a/b<suffix>`, beside the folder; `a/b.spz`, .sog, .splat or
+    .ksplat -> `a/b.spz<suffix>` and so on.
+    """
     scene = Path(scene)
     if any(scene.name in row.folder_files for row in formats()):
         scene = scene.parent
@@ -276,8 +281,11 @@ def companion_path(scene: Path | str, suffix: str) -> Path:
 
 
 def scene_files(path: Path | str) -> tuple[Path, ...]:
-    """Return the files that `load_scene` reads, the scene's own first (of a SOG folder its meta.json or
-    lod-meta.json, then images), then language field and cameras, whether these are there or not."""
+    """Return the files that `load_scene` reads, whether they are there or not.
+
+    The scene's own are first (of a SOG folder its meta.json or lod-meta.json, then images), then language
+    field and cameras.
+    """
     path = Path(path)
     own: tuple[Path, ...] = (path,)
     folder = path if os.path.isdir(path) else path.parent  # which a name too long is not

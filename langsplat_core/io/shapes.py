@@ -20,7 +20,7 @@ MESH_SUFFIXES = (".ply", ".obj", ".glb")
 RGB = ("red", "green", "blue")
 
 
-class Mesh(Protocol):
+class MeshLike(Protocol):
     """Triangles with a name, and one colour or one a vertex."""
 
     @property
@@ -39,15 +39,17 @@ class Mesh(Protocol):
 
 
 def base_colours(gaussians: Gaussians) -> Array:
-    """(N, 3) float64 display values in [0, 1]: of every Gaussian, the same from all sides."""
+    """Return (N, 3) float64 display values in [0, 1]: of every Gaussian, the same from all sides."""
     colours = 0.5 + C0 * gaussians.sh[:, 0].astype(np.float64)
     return np.clip(np.nan_to_num(colours), 0, 1)
 
 
 def write_points(path: Path | str, gaussians: Gaussians, extras: Mapping[str, Array] | None = None) -> int:
-    """Write the means of the Gaussians that can be drawn as a PLY point cloud, atomically: red, green and
-    blue as bytes, each of `extras`, name -> (N,), as a float. Return the number of points. InputError for
-    another suffix."""
+    """Write the means of the Gaussians that can be drawn as a PLY point cloud, atomically.
+
+    Red, green and blue are bytes, each of `extras`, name -> (N,), a float. Return the number of points.
+    InputError for another suffix.
+    """
     path = check_suffix(path, POINT_SUFFIXES)
     extras = extras or {}
     valid = gaussians.valid()
@@ -58,10 +60,12 @@ def write_points(path: Path | str, gaussians: Gaussians, extras: Mapping[str, Ar
     return int(valid.sum())
 
 
-def write_meshes(path: Path | str, meshes: Sequence[Mesh], to_gltf: Array | None = None) -> None:
-    """Write all meshes in one .ply, or in one .obj or .glb with an object each, atomically. InputError for
-    another suffix. to_gltf: (4, 4) from world units to metres with y up, as glTF has them; nothing else is
-    moved."""
+def write_meshes(path: Path | str, meshes: Sequence[MeshLike], to_gltf: Array | None = None) -> None:
+    """Write all meshes in one .ply, or in one .obj or .glb with an object each, atomically.
+
+    InputError for another suffix. to_gltf: (4, 4) from world units to metres with y up, as glTF has them;
+    nothing else is moved.
+    """
     path = check_suffix(path, MESH_SUFFIXES)
     with atomic_path(path) as temporary:
         if path.suffix.lower() == ".obj":
@@ -74,12 +78,12 @@ def write_meshes(path: Path | str, meshes: Sequence[Mesh], to_gltf: Array | None
 
 
 def gltf_axes(scene: Scene) -> Array:
-    """(4, 4) from world units to the axes of glTF: metres, where the scene's scale is known, with y up."""
+    """Return (4, 4) from world units to the axes of glTF: y up, in metres where the scale is known."""
     return turning(scene.up(), AXES["y"]).then(scaling(scene.metres_per_unit or 1.0)).matrix
 
 
 def check_suffix(path: Path | str, suffixes: Sequence[str]) -> Path:
-    """`path`; InputError unless it ends in one of `suffixes`."""
+    """Return `path`; InputError unless it ends in one of `suffixes`."""
     path = Path(path)
     if path.suffix.lower() not in suffixes:
         raise InputError(
@@ -88,7 +92,7 @@ def check_suffix(path: Path | str, suffixes: Sequence[str]) -> Path:
     return path
 
 
-def _obj(meshes: Sequence[Mesh]) -> str:
+def _obj(meshes: Sequence[MeshLike]) -> str:
     lines, first = [], 1
     for mesh in meshes:
         lines.append(f"o {'_'.join(mesh.name.split())}")
@@ -99,7 +103,7 @@ def _obj(meshes: Sequence[Mesh]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _joined(meshes: Sequence[Mesh]) -> tuple[dict[str, Array], Array]:
+def _joined(meshes: Sequence[MeshLike]) -> tuple[dict[str, Array], Array]:
     """Columns of the vertices of all meshes, and (F, 3) numbers of them."""
     places = np.concatenate([mesh.vertices for mesh in meshes]).astype(np.float32)
     colours = np.concatenate([np.broadcast_to(mesh.colour, mesh.vertices.shape) for mesh in meshes])
@@ -109,7 +113,7 @@ def _joined(meshes: Sequence[Mesh]) -> tuple[dict[str, Array], Array]:
     return columns, np.concatenate(faces)
 
 
-def _glb(path: Path, meshes: Sequence[Mesh], to_gltf: Array) -> bytes:
+def _glb(path: Path, meshes: Sequence[MeshLike], to_gltf: Array) -> bytes:
     """Binary glTF 2.0. Colours are light as it was photographed, so the material is unlit, and linear."""
     chunks: list[bytes] = []
     views, accessors, shapes, nodes = [], [], [], []

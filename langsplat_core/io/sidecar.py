@@ -241,7 +241,7 @@ def _tree(tensors: dict[str, Array]) -> Tree | None:
 def _listed(
     metadata: dict[str, str], key: str, path: Path, suits: Callable[[Any], bool], expected: str
 ) -> list[Any]:
-    """The JSON list under `key`, whose every entry `suits`."""
+    """Return the JSON list under `key`, whose every entry `suits`."""
     found = parse_json(metadata[key].encode(), path)
     if not isinstance(found, list) or not all(map(suits, found)):
         raise malformed(path, f"the header's {key!r} is not a list of {expected}")

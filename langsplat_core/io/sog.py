@@ -124,8 +124,10 @@ class _Streamed(Struct):
 
 
 def read_sog_scene(path: Path | str) -> Scene:
-    """Return the Gaussians of a SOG folder, its `meta.json` or a `.sog` file, and whether they are to be
-    drawn antialiased; of a streamed scene (`lod-meta.json`) all of its finest level.
+    """Return the Gaussians of a SOG folder, its `meta.json` or a `.sog` file.
+
+    The scene says whether they are to be drawn antialiased. Of a streamed scene (`lod-meta.json`) all of the
+    finest level is read.
 
     Raises InputError when a file cannot be opened and FormatError when it breaks a rule of the format.
     """
@@ -179,7 +181,7 @@ def _finest_ranges(tree: _Node) -> dict[int, list[tuple[int, int]]]:
 
 
 def _inside(path: Path, name: str) -> Path:
-    """A SOG beside `path` or in a folder there: a path could lead out of it."""
+    """Return where a SOG lies, beside `path` or in a folder there: a path could lead out of it."""
     parts = name.split("/")
     sog = parts[-1] == META_NAME or parts[-1].endswith(".sog")
     if not sog or len(parts) > 2 or not all(map(is_plain_name, parts)):
@@ -371,8 +373,10 @@ def _quaternion_codes(quats: Array, valid: Array) -> Array:
 
 
 def _coded(values: Array, counts: Array) -> tuple[Array, Array]:
-    """(N, C) uint8 codes, and the (256,) rising values that they stand for: those with the least squared
-    error over the rows that count, by Lloyd's algorithm in one dimension."""
+    """Return (N, C) uint8 codes, and the (256,) rising values that they stand for.
+
+    These have the least squared error over the rows that count, by Lloyd's algorithm in one dimension.
+    """
     known = np.sort(values[counts].ravel())
     if len(known) == 0:
         return np.zeros(values.shape, np.uint8), np.zeros(CODES)
@@ -389,8 +393,11 @@ def _coded(values: Array, counts: Array) -> tuple[Array, Array]:
 
 
 def _palette(values: Array, counts: Array) -> tuple[Array, Array]:
-    """(N,) number of a palette entry, and (P, D) entries: every row that counts its own while there is room,
-    else the means of groups that are halved where they vary most (median cut)."""
+    """Return the (N,) number of a palette entry, and (P, D) entries.
+
+    Every row that counts has its own while there is room; else entries are the means of groups that are
+    halved where they vary most (median cut).
+    """
     rows = np.flatnonzero(counts)
     group = np.zeros(len(values), np.int64)
     if len(rows) <= MOST_ENTRIES:

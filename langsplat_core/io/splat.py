@@ -31,7 +31,7 @@ _RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1"
 
 
 def read_splat(path: Path | str) -> Gaussians:
-    """The Gaussians of a .splat file, of SH degree 0.
+    """Return the Gaussians of a .splat file, of SH degree 0.
 
     A file cut off between two Gaussians cannot be told from a whole one. Raises InputError when the file
     cannot be opened and FormatError when it is no such file.
@@ -103,7 +103,7 @@ def log_of_scales(scales: Array) -> Array:
 
 
 def _layout(size: int, fields: dict[str, tuple[int, str]]) -> np.dtype[Any]:
-    """The type of a record of `size` bytes; field name -> (offset, type)."""
+    """Return the type of a record of `size` bytes; field name -> (offset, type)."""
     offsets, kinds = zip(*fields.values(), strict=True)
     return np.dtype({"names": [*fields], "formats": kinds, "offsets": offsets, "itemsize": size})
 
@@ -140,7 +140,9 @@ _LEVELS = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
 
 
 def read_ksplat(path: Path | str) -> Gaussians:
-    """The Gaussians of a .ksplat file in its order; sections of lower SH degree are filled up with zeros.
+    """Return the Gaussians of a .ksplat file in its order.
+
+    Sections of lower SH degree are filled up with zeros.
 
     Raises InputError when the file cannot be opened and FormatError when it breaks a rule of the format.
     """

@@ -163,7 +163,10 @@ def _read_streams(file: BinaryIO, file_size: int, path: Path) -> Packed:
 
 
 def _unpacked(data: bytes, size: int, path: Path) -> bytes:
-    """A Zstandard frame that holds exactly `size` bytes; never more of it is unpacked than one byte more."""
+    """Return the content of a Zstandard frame, which holds exactly `size` bytes.
+
+    Never more than one byte beyond them is unpacked.
+    """
     import zstandard  # needed by version 4 alone
 
     try:
@@ -177,8 +180,10 @@ def _unpacked(data: bytes, size: int, path: Path) -> bytes:
 
 
 def _axes(records: bytes, path: Path) -> int:
-    """Return the axes that the extension records name, 1 to 8. Records of other layouts, which older programs
-    wrote, end the search."""
+    """Return the axes that the extension records name, 1 to 8.
+
+    Records of other layouts, which older programs wrote, end the search.
+    """
     at = 0
     while at + 8 <= len(records):
         kind, length = struct.unpack_from("<II", records, at)
@@ -216,7 +221,7 @@ FRACTIONAL_BITS = 12  # what other writers use: steps of 1/4096, up to 2048
 
 
 def read_spz_scene(path: Path | str) -> Scene:
-    """The Gaussians of a .spz file, and whether they are to be drawn antialiased.
+    """Return the Gaussians of a .spz file, and whether they are to be drawn antialiased.
 
     Raises InputError when the file cannot be opened and FormatError when it breaks a rule of the format.
     """
@@ -227,7 +232,10 @@ def read_spz_scene(path: Path | str) -> Scene:
 
 
 def decode_spz(data: bytes, path: Path) -> Scene:
-    """The scene of an .spz file in memory, along the axes of the PLY; `path` is for messages. FormatError."""
+    """Return the scene of an .spz file in memory, along the axes of the PLY.
+
+    path: for messages. Raises FormatError.
+    """
     return _scene(_read_packed(io.BytesIO(data), len(data), path))
 
 
@@ -340,7 +348,9 @@ def _rotation_codes(quats_wxyz: Array) -> Array:
 
 
 def _signs_to_rdf(axes: int) -> Array:
-    """(3,) 1 or -1: what turns coordinates of a file into right, down, front, those of the PLY. `axes` - 1
-    has a bit each for right, up, front."""
+    """(3,) 1 or -1: what turns coordinates of a file into right, down, front, those of the PLY.
+
+    `axes` - 1 has a bit each for right, up, front.
+    """
     right, up, front = (axes - 1 >> bit & 1 for bit in range(3))
     return np.array([1 if right else -1, -1 if up else 1, 1 if front else -1])

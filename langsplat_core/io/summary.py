@@ -58,7 +58,7 @@ class SceneSummary:
 
 
 def summarise(scene: Scene) -> SceneSummary:
-    """Every figure of `SceneSummary` for a scene of any size, an empty one included."""
+    """Return every figure of `SceneSummary` for a scene of any size, an empty one included."""
     gaussians = scene.gaussians
     valid = gaussians.valid()
     drawn = gaussians.take(valid)
@@ -87,7 +87,7 @@ def summarise(scene: Scene) -> SceneSummary:
 
 
 def memory_bytes(scene: Scene) -> int:
-    """Bytes in memory of the arrays that grow with the number of Gaussians."""
+    """Return the bytes in memory of the arrays that grow with the number of Gaussians."""
     arrays = [getattr(scene.gaussians, field.name) for field in fields(scene.gaussians)]
     arrays += list(scene.extras.values())
     if scene.language is not None:
@@ -96,7 +96,7 @@ def memory_bytes(scene: Scene) -> int:
 
 
 def disk_bytes(scene: Path) -> int:
-    """Size of a scene file, or of a folder's files, with the companions beside it."""
+    """Return the size of a scene file, or of a folder's files, with the companions beside it."""
     path = scene.parent if scene.name in (META_NAME, LOD_NAME) else scene
     own = [file for file in path.rglob("*") if file.is_file()] if path.is_dir() else [path]
     companions = [companion_path(scene, suffix) for suffix in (sidecar.SUFFIX, cameras.SUFFIX)]
@@ -104,7 +104,7 @@ def disk_bytes(scene: Path) -> int:
 
 
 def duplicates(gaussians: Gaussians) -> int:
-    """Number of rows that could go because an earlier one equals them bit for bit."""
+    """Return the number of rows that could go because an earlier one equals them bit for bit."""
     if len(gaussians) == 0:
         return 0
     columns = [getattr(gaussians, field.name).reshape(len(gaussians), -1) for field in fields(gaussians)]
@@ -114,7 +114,7 @@ def duplicates(gaussians: Gaussians) -> int:
 
 
 def axis_ratios(gaussians: Gaussians) -> Array:
-    """(N,) float64 >= 1: longest over shortest axis; infinite where an axis is flat and another is not."""
+    """Return (N,) float64 >= 1: longest over shortest axis; infinite where one is flat and another not."""
     log_scales = gaussians.log_scales.astype(np.float64)
     longest, shortest = log_scales.max(1, initial=-np.inf), log_scales.min(1, initial=np.inf)
     point = np.isneginf(longest)  # flat in every direction
@@ -129,8 +129,11 @@ def _opacity_shares(gaussians: Gaussians) -> tuple[float, ...]:
 
 
 def _sh_energy(gaussians: Gaussians) -> tuple[float, ...]:
-    """The basis is orthonormal: squared coefficients are energy over the sphere of directions. The base
-    colour counts with its offset of 0.5, else a grey scene would seem all highlights."""
+    """Return the share of each degree in the squared coefficients.
+
+    The basis is orthonormal: squares are energy over the sphere of directions. The base colour counts with
+    its offset of 0.5, else a grey scene would seem all highlights.
+    """
     squares = gaussians.sh.astype(np.float64) ** 2
     squares[:, 0] = (gaussians.sh[:, 0].astype(np.float64) + 0.5 * np.sqrt(4 * np.pi)) ** 2
     per_coefficient = squares.sum((0, 2))
