@@ -135,7 +135,7 @@ class Note:
 
 
 @dataclass(frozen=True)
-class Group:
+class NodeGroup:
     """Things that belong together."""
 
     name: Name
@@ -147,7 +147,7 @@ class Things:
     """Names, groups and locks that a user gave to nodes of the scene's tree."""
 
     names: Mapping[Node, Name] = field(default_factory=dict)
-    groups: tuple[Group, ...] = ()
+    groups: tuple[NodeGroup, ...] = ()
     locked: frozenset[Node] = frozenset()
 
     def known(self, count: int) -> "Things":

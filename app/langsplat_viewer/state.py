@@ -271,7 +271,7 @@ class SceneState:
     scene: Scene | None = None
     path: Path | None = None
     extent: Extent | None = None  # there whenever a scene is
-    doubts: tuple[str, ...] = ()  # quality warnings of its training, with the remedies
+    warnings: tuple[str, ...] = ()  # quality warnings of its training, with the remedies
     nothing: str = ""  # why the image shows nothing of the scene, where it does not
 
     # what follows from the session

@@ -12,7 +12,7 @@ from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions import browsing, editing, filming, opening, queries, settings, viewpoint
 from langsplat_viewer.camera.controls import default_view, extent_of, orbit
-from langsplat_viewer.files.disk import MOST_LISTED, Entry, Watch, list_folder, stamps
+from langsplat_viewer.files.disk import MOST_LISTED, FolderEntry, Watch, list_folder, stamps
 from langsplat_viewer.options import say_compiling
 from langsplat_viewer.panels.scene import has_several
 from langsplat_viewer.rendering.request import UNCLIPPED, Clip
@@ -233,10 +233,10 @@ def test_a_crowded_folder_is_cut(tmp_path, monkeypatch):
 def test_one_goes_into_folders_and_opens_scenes(viewer, folder):
     browsing.ask_for_file(viewer)
     assert viewer.state.browser.folder == folder
-    browsing.choose(viewer, Entry(folder / "B folder", is_file=False))
+    browsing.choose(viewer, FolderEntry(folder / "B folder", is_file=False))
     assert viewer.state.browser.folder == folder / "B folder"
     browsing.browse(viewer, folder)
-    act(browsing.choose, viewer, Entry(folder / "blobs.ply", is_file=True))
+    act(browsing.choose, viewer, FolderEntry(folder / "blobs.ply", is_file=True))
     assert viewer.state.browser is None
     assert viewer.state.scene is SCENES["blobs.ply"]
     browsing.ask_for_file(viewer)

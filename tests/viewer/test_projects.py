@@ -28,7 +28,7 @@ from langsplat_viewer.camera.controls import orbit
 from langsplat_viewer.files.preferences import Preferences, load_preferences
 from langsplat_viewer.files.projects import Shelf, read_flight, read_project, read_queries
 from langsplat_viewer.rendering.request import Clip
-from langsplat_viewer.session import Group, Note, Query, Things
+from langsplat_viewer.session import NodeGroup, Note, Query, Things
 from langsplat_viewer.viewer import Services, Viewer
 from tests.support.fakes import CENTRES, FakeEncoder
 from tests.support.windowless import SCENES, FakeSurface, act, ask, blob, errors, load, marked, result
@@ -163,7 +163,7 @@ def test_project_of_version_1_opens_and_means_the_same(viewer, tmp_path, monkeyp
 def test_other_files_of_version_1_open_and_mean_the_same(viewer):
     project = read_project(SAVED / "version1.langsplat")
     assert project.session.things == Things(
-        {3: "the atlas"}, (Group("on the table", (1, 2)),), frozenset({4})
+        {3: "the atlas"}, (NodeGroup("on the table", (1, 2)),), frozenset({4})
     )
     asked = read_queries(SAVED / "version1.queries.json")
     assert [(q.phrase, q.cut, q.shown) for q in asked.queries][1:3] == [

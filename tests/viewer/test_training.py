@@ -82,23 +82,23 @@ def test_a_folder_of_photographs_becomes_a_scene_that_opens(viewer, folder, begi
 
 
 def test_what_speaks_against_the_scene_is_said(viewer, folder, begin):
-    doubts = [
+    warnings = [
         "held-out photographs are reproduced at 9.1 dB, below 16: take more",
         "two groups",
         "few pixels",
     ]
     report = folder.with_name("blobs.work") / REPORT
     report.parent.mkdir()
-    report.write_text(json.dumps({"gaussians": 360, "doubts": doubts}))
-    begin(GOOD + "".join(f"; print('warning: {doubt}')" for doubt in doubts), "blobs.ply")
+    report.write_text(json.dumps({"gaussians": 360, "warnings": warnings}))
+    begin(GOOD + "".join(f"; print('warning: {warning}')" for warning in warnings), "blobs.ply")
     finish(viewer)
-    assert viewer.state.doubts == tuple(doubts)
-    assert errors(viewer) == doubts
+    assert viewer.state.warnings == tuple(warnings)
+    assert errors(viewer) == warnings
     said = [message.text for message in viewer.state.messages]
     assert "done: 3 Gaussians" in said  # not pushed out by the warnings, which are not said twice
     assert not any(text.startswith("warning") for text in said)
     open_scene(viewer, folder.with_name("plain.ply"))
-    assert viewer.state.doubts == ()
+    assert viewer.state.warnings == ()
 
 
 def test_what_goes_wrong_is_said(viewer, begin):

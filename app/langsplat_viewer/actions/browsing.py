@@ -22,7 +22,7 @@ from langsplat_viewer.actions.opening import (
 from langsplat_viewer.actions.queries import load_queries
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.files import disk
-from langsplat_viewer.files.disk import Entry, Stamps, list_folder
+from langsplat_viewer.files.disk import FolderEntry, Stamps, list_folder
 from langsplat_viewer.files.preferences import with_photographs
 from langsplat_viewer.files.projects import PATHS, PROJECTS, QUERIES, read_project, scene_of
 from langsplat_viewer.jobs import one_line
@@ -65,7 +65,7 @@ def browse(viewer: Viewer, folder: Path) -> None:
     viewer.state.browser = list_folder(folder)
 
 
-def choose(viewer: Viewer, entry: Entry) -> None:
+def choose(viewer: Viewer, entry: FolderEntry) -> None:
     """Go into a folder, or open a scene."""
     if entry.is_file:
         viewer.state.browser = None
@@ -164,7 +164,7 @@ def open_typed(viewer: Viewer, text: str) -> None:
     if not text:
         return
     path = (listing.folder if listing else Path.cwd()) / os.path.expanduser(text)
-    choose(viewer, Entry(path, is_file=not _is_plain_folder(path)))
+    choose(viewer, FolderEntry(path, is_file=not _is_plain_folder(path)))
 
 
 def _is_plain_folder(path: Path) -> bool:
@@ -200,7 +200,7 @@ def ask_for_dataset(viewer: Viewer) -> None:
     ask_for_folder(viewer, FolderChoice("Photographs to train on", take))
 
 
-WARNING = "warning: "  # before each doubt that `langsplat train` ends with
+WARNING = "warning: "  # before each warning that `langsplat train` ends with
 
 
 def start_training(viewer: Viewer) -> None:

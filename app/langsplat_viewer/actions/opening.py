@@ -39,7 +39,7 @@ class _Opened:
     unusable: dict[str, int]  # reason -> Gaussians that are therefore not drawn
     extent: Extent
     read: Stamps  # its files as they were before they were read
-    doubts: tuple[str, ...]  # what the report of its training says against it
+    warnings: tuple[str, ...]  # what the report of its training says against it
 
 
 def open_scene(
@@ -68,8 +68,8 @@ def _open(viewer: Viewer, path: Path, then: Callable[[Viewer], None], check: Cal
         viewer.services.warm_up(scene, backend, progress)
         progress(f"preparing {path.name}", 0.9)
         unusable = scene.gaussians.invalid_rows()
-        doubts = stated_warnings(path, len(scene.gaussians))
-        return _Opened(scene, unusable, extent_of(scene), read, doubts)
+        warnings = stated_warnings(path, len(scene.gaussians))
+        return _Opened(scene, unusable, extent_of(scene), read, warnings)
 
     def done(opened: _Opened) -> None:
         _show_scene(viewer, path, opened)
@@ -110,7 +110,7 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
         scene=scene,
         path=path,
         extent=opened.extent,
-        doubts=opened.doubts,
+        warnings=opened.warnings,
         nothing=why_undrawable(scene.gaussians),
         marks=unmarked(len(scene.gaussians)),
         locked=np.zeros(len(scene.gaussians), bool),
@@ -148,8 +148,8 @@ def _say_opened(viewer: Viewer, path: Path, opened: _Opened) -> None:
     viewer.state.say(f"{path.name}: {len(scene.gaussians):,} Gaussians{not_drawn}")
     for reason in scene.unread:
         viewer.say_error(f"opened without what lies beside it: {reason}")
-    for doubt in opened.doubts:
-        viewer.say_error(doubt)
+    for warning in opened.warnings:
+        viewer.say_error(warning)
     if scene.language is None:
         viewer.state.say(no_field(scene))
 

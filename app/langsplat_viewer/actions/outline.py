@@ -17,7 +17,7 @@ from langsplat_core.scene.language import tidy
 from langsplat_viewer.actions.queries import teach
 from langsplat_viewer.actions.selecting import mark, put_marks, select_alike, take
 from langsplat_viewer.actions.viewpoint import focus_on
-from langsplat_viewer.session import Group
+from langsplat_viewer.session import NodeGroup
 from langsplat_viewer.state import OutlineView
 from langsplat_viewer.viewer import Viewer
 
@@ -244,22 +244,22 @@ def apply_locks(viewer: Viewer) -> None:
         state.locked |= engine.tree.members(node)
 
 
-def group(viewer: Viewer, node: int, onto: int | Group | None) -> None:
+def group(viewer: Viewer, node: int, onto: int | NodeGroup | None) -> None:
     """Put a thing into a group, or into a new one, with the node `onto` where that is given."""
     things = viewer.state.session.things
     others = tuple(g for g in (_without(g, node) for g in things.groups) if g is not None)
-    if isinstance(onto, Group):
+    if isinstance(onto, NodeGroup):
         new = tuple(replace(g, nodes=(*g.nodes, node)) if g.name == onto.name else g for g in others)
     elif onto == node:
         return
     else:
         taken = {g.name for g in things.groups}
         name = next(f"group {k}" for k in range(1, len(taken) + 2) if f"group {k}" not in taken)
-        new = (*others, Group(name, (node,) if onto is None else (onto, node)))
+        new = (*others, NodeGroup(name, (node,) if onto is None else (onto, node)))
     viewer.change(things=replace(things, groups=new))
 
 
-def _without(group: Group, node: int) -> Group | None:
+def _without(group: NodeGroup, node: int) -> NodeGroup | None:
     left = tuple(other for other in group.nodes if other != node)
     return replace(group, nodes=left) if left else None
 
@@ -270,7 +270,7 @@ def ungroup(viewer: Viewer, node: int) -> None:
     viewer.change(things=replace(things, groups=tuple(g for g in left if g is not None)))
 
 
-def rename_group(viewer: Viewer, old: Group, name: str) -> None:
+def rename_group(viewer: Viewer, old: NodeGroup, name: str) -> None:
     things, name = viewer.state.session.things, tidy(name)
     if name in {g.name for g in things.groups if g is not old}:
         viewer.say_error(f"there is a group '{name}' already")
@@ -279,7 +279,7 @@ def rename_group(viewer: Viewer, old: Group, name: str) -> None:
         viewer.change(things=replace(things, groups=groups))
 
 
-def select_group(viewer: Viewer, group: Group) -> None:
+def select_group(viewer: Viewer, group: NodeGroup) -> None:
     engine = viewer.engine
     if engine is None:
         return

@@ -26,7 +26,7 @@ MOST_LISTED = 2000  # entries of a folder that are listed
 
 
 @dataclass(frozen=True)
-class Entry:
+class FolderEntry:
     """A file or folder as the browser lists it."""
 
     path: Path
@@ -39,7 +39,7 @@ class Listing:
     """A folder as the browser shows it."""
 
     folder: Path
-    entries: tuple[Entry, ...] = ()  # folders first, each kind by name
+    entries: tuple[FolderEntry, ...] = ()  # folders first, each kind by name
     left_out: int = 0  # more than `MOST`
     problem: str = ""  # why there are none, one line
 
@@ -55,14 +55,14 @@ def list_folder(folder: Path) -> Listing:
     return Listing(folder, tuple(entries[:MOST_LISTED]), max(len(entries) - MOST_LISTED, 0))
 
 
-def _entry(path: Path) -> Entry | None:
+def _entry(path: Path) -> FolderEntry | None:
     if path.name.startswith("."):
         return None
     try:
         if path.is_dir():
-            return Entry(path, is_file=format_of(path) is not None)
+            return FolderEntry(path, is_file=format_of(path) is not None)
         if format_of(path) is not None or path.name.endswith((QUERIES, PATHS, PROJECTS)):
-            return Entry(path, True, path.stat().st_size)
+            return FolderEntry(path, True, path.stat().st_size)
     except OSError:  # it may not be looked at
         pass
     return None

@@ -11,7 +11,7 @@ from langsplat_viewer.actions import outline
 from langsplat_viewer.actions.outline import Target
 from langsplat_viewer.panels import ui
 from langsplat_viewer.panels.overlays import STILL, begin_legend
-from langsplat_viewer.session import Group
+from langsplat_viewer.session import NodeGroup
 from langsplat_viewer.state import OutlineView
 from langsplat_viewer.viewer import Viewer
 
@@ -40,7 +40,7 @@ def draw(viewer: Viewer) -> None:
     imgui.end_child()
 
 
-def _group(viewer: Viewer, view: OutlineView, group: Group) -> None:
+def _group(viewer: Viewer, view: OutlineView, group: NodeGroup) -> None:
     imgui.push_id(group.name)
     imgui.set_next_item_open(True, imgui.Cond_.once)
     flags = imgui.TreeNodeFlags_.open_on_arrow | imgui.TreeNodeFlags_.span_avail_width
@@ -167,7 +167,7 @@ def _swatch(colour: tuple[float, float, float], side: float) -> None:
     imgui.color_button("##colour", ImVec4(*colour, 1.0), flags, ImVec2(side, side))
 
 
-def _drop(viewer: Viewer, onto: int | Group) -> None:
+def _drop(viewer: Viewer, onto: int | NodeGroup) -> None:
     """A row that is dropped here is grouped with this."""
     if imgui.begin_drag_drop_target():
         payload = imgui.accept_drag_drop_payload_py_id(DRAGGED)

@@ -9,7 +9,7 @@ from imgui_bundle import ImVec2, hello_imgui, imgui
 from langsplat_core.config import TrainPreset
 from langsplat_core.io.scenes import format_of
 from langsplat_viewer.actions import browsing, filming, opening, projects, selecting, settings
-from langsplat_viewer.files.disk import Entry, Listing
+from langsplat_viewer.files.disk import FolderEntry, Listing
 from langsplat_viewer.panels import ui
 from langsplat_viewer.viewer import Training, Viewer
 
@@ -22,9 +22,9 @@ def draw(viewer: Viewer) -> None:
     else:
         imgui.text(state.path.name if state.path else "scene")
         ui.small_wrapped(_figures(viewer), ui.muted())
-        for doubt in state.doubts:
-            ui.small_wrapped(doubt.partition(":")[0], ui.bad())
-            ui.tip(doubt)
+        for warning in state.warnings:
+            ui.small_wrapped(warning.partition(":")[0], ui.bad())
+            ui.tip(warning)
     if imgui.button("Open ..."):
         browsing.ask_for_file(viewer)
     if ui.next_button("Save picture"):
@@ -158,7 +158,7 @@ def _entries(viewer: Viewer, listing: Listing) -> None:
         imgui.end_child()
 
 
-def _entry(viewer: Viewer, entry: Entry) -> None:
+def _entry(viewer: Viewer, entry: FolderEntry) -> None:
     right = imgui.get_content_region_avail().x
     name = entry.path.name if entry.is_file else f"{entry.path.name}/"
     if imgui.selectable(name, False)[0]:
@@ -298,10 +298,10 @@ def _form(viewer: Viewer) -> None:
         browsing.start_training(viewer)
     ui.small_wrapped("An interrupted training continues where it stopped.", ui.muted())
     state = viewer.state
-    if state.doubts and state.path is not None:
+    if state.warnings and state.path is not None:
         imgui.separator_text(f"What speaks against {state.path.name}")
-        for doubt in state.doubts:
-            ui.small_wrapped(doubt, ui.bad())
+        for warning in state.warnings:
+            ui.small_wrapped(warning, ui.bad())
 
 
 def _text_box(label: str, hint: str, text: str) -> str:
