@@ -1,5 +1,7 @@
-"""Everything that can be done with one key or one click: one table, from which the menus, the keys, the list
-of keys and the list of commands are made."""
+"""Everything that can be done with one key or one click, as one table.
+
+The menus, the keys, the list of keys and the list of commands are made from it.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -336,11 +338,14 @@ def with_key(text: str, act: Callable[[Viewer], object]) -> str:
 
 
 def matching(text: str, recent: Sequence[str] = ()) -> list[Command]:
-    """The commands whose words hold every word of `text`; all of them for none. `recent` scenes are some."""
+    """Return the commands whose words hold every word of `text`; all of them for none.
+
+    `recent` scenes are some.
+    """
     words, commands = text.lower().split(), (*COMMANDS, *map(_recent, recent))
     return [command for command in commands if all(word in command.does.lower() for word in words)]
 
 
 def in_menu(menu: str) -> list[Command]:
-    """The commands of one of MENUS, in their order."""
+    """Return the commands of one of MENUS, in their order."""
     return [command for command in COMMANDS if command.menu == menu]

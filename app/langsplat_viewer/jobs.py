@@ -20,14 +20,18 @@ _ARENA_MAX = -8  # M_ARENA_MAX of malloc.h
 
 
 def share_one_heap() -> None:
-    """Have threads that begin after this take memory from one heap, where the C library allows it: with one
-    each, all of them keep what they have freed."""
+    """Have threads that begin after this take memory from one heap, where the C library allows it.
+
+    With one each, all of them keep what they have freed.
+    """
     _in_c_library("mallopt", _ARENA_MAX, 1)
 
 
 def give_memory_back() -> None:
-    """Return to the system what the C library keeps of memory that was freed, where it can: reading a scene
-    leaves tens of megabytes of it."""
+    """Return to the system what the C library keeps of memory that was freed, where it can.
+
+    Reading a scene leaves tens of megabytes of it.
+    """
     _in_c_library("malloc_trim", 0)
 
 
@@ -40,8 +44,11 @@ def _in_c_library(name: str, *arguments: object) -> None:
 
 @contextmanager
 def on_signals(wake: Callable[[], None]) -> Iterator[list[int]]:
-    """Within, Ctrl + C and SIGTERM interrupt nothing: their numbers are added to the list, and `wake` is
-    called on another thread, since Python's handlers run only once a sleeping main thread is awake again."""
+    """Keep Ctrl + C and SIGTERM from interrupting anything within.
+
+    Their numbers are added to the list that is yielded, and `wake` is called on another thread, since
+    Python's handlers run only once a sleeping main thread is awake again.
+    """
     caught: list[int] = []
     reader, writer = socket.socketpair()
     writer.setblocking(False)
@@ -165,8 +172,10 @@ class Worker:
         return any(not job.future.done() for job in self._jobs)
 
     def close(self, patience: float = 0.0) -> None:
-        """Stop taking work; a job that runs has `patience` seconds to tidy up after itself, else it ends with
-        the process."""
+        """Stop taking work.
+
+        A job that runs has `patience` seconds to tidy up after itself, else it ends with the process.
+        """
         self.cancel()
         self._waiting.put(None)
         if self._thread is not None and patience > 0:
@@ -188,7 +197,10 @@ def deliver(job: Job) -> None:
 
 
 def one_line(error: BaseException) -> str:
-    """An error as one line for a person; a class that no user causes is named, so that it can be reported."""
+    """Return an error as one line for a person.
+
+    A class that no user causes is named, so that it can be reported.
+    """
     text = " ".join(str(error).split())
     if isinstance(error, LangSplatError):
         return text

@@ -140,7 +140,7 @@ class ViewerOptions:
 
 
 def parse_size(text: str) -> tuple[int, int] | None:
-    """ "1280x720" -> (1280, 720); "" -> None. Raises InputError."""
+    """Return (1280, 720) for "1280x720", None for "". Raises InputError."""
     if not text:
         return None
     match = re.fullmatch(r"([0-9]{1,6})[xX×]([0-9]{1,6})", text.strip())
@@ -151,7 +151,10 @@ def parse_size(text: str) -> tuple[int, int] | None:
 
 
 def scene_path(scene: Path | None) -> Path:
-    """The file to open; without one the bundled demo. InputError where it is absent or not a file."""
+    """Return the file to open; without one the bundled demo.
+
+    InputError where it is absent or not a file.
+    """
     if scene is None:
         demo = Path(str(files("langsplat_assets") / "demo" / "scene.ply"))
         if not demo.is_file():
@@ -168,7 +171,10 @@ def scene_path(scene: Path | None) -> Path:
 
 
 def camera_file(choice: str) -> Camera | None:
-    """The camera of a `--camera FILE`; None where `choice` is empty or an index. Raises InputError."""
+    """Return the camera of a `--camera FILE`; None where `choice` is empty or an index.
+
+    Raises InputError.
+    """
     if not choice or re.fullmatch(r"-?[0-9]+", choice):
         return None
     cameras = read_cameras(Path(choice))
@@ -178,7 +184,10 @@ def camera_file(choice: str) -> Camera | None:
 
 
 def chosen_camera(scene: Scene, choice: str) -> Camera | None:
-    """The camera that `--camera` names, of a file or by its index; None for no choice. Raises InputError."""
+    """Return the camera that `--camera` names, of a file or by its index; None for no choice.
+
+    Raises InputError.
+    """
     if not choice:
         return None
     of_file = camera_file(choice)
@@ -233,4 +242,5 @@ def say_compiling(progress: Progress) -> None:
 
 
 def services(encoder_id: str) -> Services:
+    """Return what the viewer needs from the layers below."""
     return Services(load_scene, load_text_encoder, encoder_id, warm_up)

@@ -83,10 +83,11 @@ class ViewerCommand(ViewerOptions):
 
 
 def parse(args: Sequence[str]) -> ViewerCommand:
-    """The command that the words of a command line make; SystemExit as tyro raises it."""
+    """Return the command that the words of a command line make; SystemExit as tyro raises it."""
     found: ViewerCommand = parsed("langsplat-viewer", ViewerCommand, args)
     return found
 
 
 def entry() -> None:
+    """Run the command line."""
     sys.exit(main("langsplat-viewer", lambda: parse(sys.argv[1:])))

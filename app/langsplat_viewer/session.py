@@ -72,14 +72,19 @@ class Marked:
     deleted: Bits | None = None
 
     def of(self, marks: Marks, now: Marks) -> "Marked":
-        """Return the bits of `marks`; the bits of these, which are those of `now`, are used as far as both
-        share their masks."""
+        """Return the bits of `marks`.
+
+        Those of this object, which are the bits of `now`, are used as far as both share their masks.
+        """
         kept = ((name, getattr(marks, name), getattr(now, name)) for name in MASKS)
         return Marked(**{name: getattr(self, name) if new is old else pack(new) for name, new, old in kept})
 
     def masks(self, before: "Marked", marks: Marks) -> Marks:
-        """Return the masks; those of `marks`, which are those of `before`, as far as they are the same: what
-        is drawn by them need not be drawn anew."""
+        """Return the masks.
+
+        Those of `marks`, which are the masks of `before`, are used as far as both mark the same: what is drawn
+        by them need not be drawn anew.
+        """
         if self == before:
             return marks
         count, masks = len(marks.selected), []
@@ -273,8 +278,11 @@ class Session:
         )
 
     def found_again(self, now: "Session") -> "Session":
-        """Return the session of a scene that is shown again. Settings of the window are as `now`; what was
-        selected, hidden, deleted and moved was saved or discarded when it was left."""
+        """Return the session of a scene that is shown again.
+
+        Settings of the window are as `now`; what was selected, hidden, deleted and moved was saved or
+        discarded when it was left.
+        """
         settings = now.of_next_scene(now.bookmarks)
         return replace(
             settings,

@@ -1,5 +1,4 @@
-"""The viewer without its window: its state, what it needs from elsewhere, a training in a process of its own,
-and the history of what can be undone."""
+"""The viewer without its window: state, history, what it needs from elsewhere, a training's process."""
 
 import os
 import signal
@@ -71,7 +70,7 @@ class TrainingProgress:
 
 
 def command(request: TrainingRequest) -> list[str]:
-    """The command line of a request, for this interpreter or the program beside a one-folder build."""
+    """Return the command line of a request, for this interpreter or the program beside a one-folder build."""
     program = [sys.executable, "-m", "langsplat_core"]
     if getattr(sys, "frozen", False):
         program = [str(Path(sys.executable).with_stem("langsplat"))]
@@ -157,8 +156,10 @@ class ShownImage(Protocol):
         """(3,) world point of the surface at a place in the image, fractions from the top left corner."""
 
     def depths(self) -> Array | None:
-        """(H, W) camera z of the surface all over the image, world units, 0 where nothing is drawn; its
-        size may be another than the window's. None while there is no image."""
+        """(H, W) camera z of the surface all over the image, world units, 0 where nothing is drawn.
+
+        Its size may be another than the window's. None while there is no image.
+        """
 
     def capture(self, request: RenderRequest) -> Array:
         """(H, W, 3) uint8, or (H, W, 4) of a transparent image: the request at full resolution."""
@@ -216,8 +217,10 @@ class Viewer:
     clock: float = 0.0  # seconds, as of the last frame
 
     def change(self, setting: str = "", **values: Any) -> None:
-        """Change fields of the session, as one step that can be undone, unless they are so already. `setting`
-        names one that is moved, as sliders are: its changes in quick succession are one step."""
+        """Change fields of the session, as one step that can be undone, unless they are so already.
+
+        `setting` names one that is moved, as sliders are: its changes in quick succession are one step.
+        """
         session = replace(self.state.session, **values)
         if session != self.state.session:
             self.remember(setting)
@@ -243,8 +246,10 @@ class Viewer:
         done: Callable[[T], None] = lambda result: None,
         failed: Callable[[str], None] | None = None,
     ) -> Job:
-        """Have the worker do `work`; `take_results` then calls `done` with its result, or `failed` with the
-        reason, which by default is said."""
+        """Have the worker do `work`.
+
+        `take_results` then calls `done` with its result, or `failed` with the reason, by default `say_error`.
+        """
         return self.worker.submit(label, work, done, failed or self.say_error)
 
     @property

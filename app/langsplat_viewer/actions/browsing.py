@@ -62,6 +62,7 @@ def ask_for_beside(viewer: Viewer) -> None:
 
 
 def browse(viewer: Viewer, folder: Path) -> None:
+    """Show a folder in the browser."""
     viewer.state.browser = list_folder(folder)
 
 
@@ -103,9 +104,12 @@ def open_project(viewer: Viewer, path: Path, then: Callable[[Viewer], None] = la
 
 
 def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
-    """Open the first scene among files that were dropped onto the window, list the others, ask the queries
-    among them, and say what is none of these; what belongs to a scene lies beside it. A folder of photographs
-    is offered for training."""
+    """Open what was dropped onto the window.
+
+    Of scenes the first is opened and all are listed; then sets of queries are asked and paths taken. What
+    belongs to a scene lies beside it. A folder of photographs is offered for training. What is none of these
+    is said.
+    """
     if len(paths) == 1 and _is_plain_folder(paths[0]) and count_photographs(paths[0])[0]:
         choose_photographs(viewer, paths[0])
         open_panel(viewer, "Train")
@@ -154,6 +158,7 @@ def _ask_sets(viewer: Viewer, sets: Sequence[Path]) -> None:
 
 
 def open_recent(viewer: Viewer, path: str) -> None:
+    """Open a scene or project of those opened lately."""
     viewer.state.browser = None
     open_file(viewer, Path(path))
 
@@ -225,13 +230,16 @@ def start_training(viewer: Viewer) -> None:
 
 
 def stop_training(viewer: Viewer) -> None:
+    """Ask the training under way to stop."""
     if viewer.training is not None:
         viewer.training.interrupt()
 
 
 def look_at_training(viewer: Viewer) -> None:
-    """Open the Gaussians of a training under way, before they have a meaning; while they are still trained,
-    as they were at the last checkpoint, and from then on at the next ones."""
+    """Open the Gaussians of a training under way, before they have a meaning.
+
+    While they are still trained, as they were at the last checkpoint, and from then on at the next ones.
+    """
     training = viewer.training
     if training is None:
         return

@@ -75,8 +75,10 @@ def transform(viewer: Viewer, to: Similarity) -> None:
 
 
 def place(viewer: Viewer) -> None:
-    """Make the scene that is shown from the one that was opened, by the session's transforms; what was asked
-    is asked anew. Raises InputError where one leads too far, and then changes nothing."""
+    """Make the scene that is shown from the one that was opened, by the session's transforms.
+
+    What was asked is asked anew. Raises InputError where one leads too far, and then changes nothing.
+    """
     state = viewer.state
     if state.scene is None:
         return
@@ -128,6 +130,7 @@ def fill_box(viewer: Viewer) -> None:
 
 
 def set_box(viewer: Viewer, low: Point, high: Point) -> None:
+    """Set two opposite corners of the crop box."""
     viewer.state.edit_form = replace(viewer.state.edit_form, low=low, high=high)
 
 
@@ -180,6 +183,7 @@ def undo(viewer: Viewer) -> None:
 
 
 def redo(viewer: Viewer) -> None:
+    """Take back the last undo."""
     _step(viewer, viewer.history.future, viewer.history.past, "nothing to redo")
 
 
@@ -193,8 +197,11 @@ def _step(viewer: Viewer, there: list[Session], back: list[Session], otherwise: 
 
 
 def adopt(viewer: Viewer, session: Session) -> None:
-    """Take another session of the scene that is shown, and bring in line with it what follows from it: masks,
-    locks, the transformed scene, answers. Raises InputError where a transform leads too far."""
+    """Take another session of the scene that is shown.
+
+    What follows from it is brought in line: masks, locks, the transformed scene, answers. Raises InputError
+    where a transform leads too far.
+    """
     state, before = viewer.state, viewer.state.session
     set_tools(viewer, stroke=None)
     state.record.chosen = None

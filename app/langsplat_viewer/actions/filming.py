@@ -98,6 +98,7 @@ def add_keyframe(viewer: Viewer) -> None:
 
 
 def choose_keyframe(viewer: Viewer, key: Keyframe) -> None:
+    """Go to a keyframe."""
     state, record = viewer.state, viewer.state.record
     if state.extent is not None:
         glide_to(viewer, view_of(key.pose, state.extent))
@@ -120,12 +121,14 @@ def move_keyframe(viewer: Viewer, key: Keyframe, seconds: float) -> None:
 
 
 def replace_keyframe(viewer: Viewer, key: Keyframe) -> None:
+    """Put the current view in the place of a keyframe."""
     if viewer.state.view is not None:
         new = replace(key, pose=pose_of(viewer.state.view))
         _set(viewer, with_keyframe(viewer.state.session.keyframes, new), new)
 
 
 def set_path_seconds(viewer: Viewer, seconds: float) -> None:
+    """Set how long the path, or the turn, takes."""
     state, record = viewer.state, viewer.state.record
     seconds = min(max(seconds, 0.1), LONGEST)
     if record.turns:
@@ -137,6 +140,7 @@ def set_path_seconds(viewer: Viewer, seconds: float) -> None:
 
 
 def clear_path(viewer: Viewer) -> None:
+    """Take all keyframes off the path."""
     if viewer.state.session.keyframes:
         _set(viewer, (), None)
 
@@ -186,6 +190,7 @@ def load_path(viewer: Viewer, path: Path) -> None:
 
 
 def load_path_file(viewer: Viewer, folder: Path = Path()) -> None:
+    """Take the path of the file that the panel names."""
     typed = viewer.state.record.path_file.strip()
     if typed:
         load_path(viewer, folder.absolute() / typed)
@@ -203,7 +208,7 @@ def set_film_size(viewer: Viewer, width: int, height: int) -> None:
 
 
 def film_motion(viewer: Viewer) -> Motion | None:
-    """The path that is filmed; None without one."""
+    """Return the path that is filmed; None without one."""
     state, record = viewer.state, viewer.state.record
     if state.view is None or path_seconds(viewer) <= 0:
         return None
@@ -273,8 +278,10 @@ def _submit(viewer: Viewer, label: str, work: Callable[[Progress], str]) -> None
 
 
 def copy_command(viewer: Viewer, folder: Path = Path()) -> str:
-    """Put the command that draws this image without a window on the clipboard, and return it; "" where that
-    failed. A view that is no training camera's is saved to a file in `folder` first."""
+    """Put the command that draws this image without a window on the clipboard, and return it.
+
+    "" where that failed. A view that is no training camera's is saved to a file in `folder` first.
+    """
     state = viewer.state
     if state.view is None or state.path is None:
         viewer.say_error("open a scene first, then copy the command of its picture")
@@ -304,7 +311,7 @@ def take_clipboard(viewer: Viewer) -> str:
 
 
 def _training_camera(state: ViewerState) -> str | None:
-    """The number of the training camera whose view it is, exactly, with perspective or without."""
+    """Return the number of the training camera whose view it is, exactly, with perspective or without."""
     if state.view is None or state.scene is None or state.extent is None:
         return None
     here = with_projection(state.view, orthographic=False).camera(*state.size)

@@ -48,9 +48,11 @@ def open_scene(
     then: Callable[[Viewer], None] = lambda viewer: None,
     check: Callable[[Scene], None] = lambda scene: None,
 ) -> None:
-    """Read a scene in the background; `then` runs once it is on screen. The scene shown so far stays
-    until the new one is there, and for good if that fails; what was deleted in it and not saved is asked
-    about first. `check` raises InputError for a scene that is not to be shown."""
+    """Read a scene in the background; `then` runs once it is on screen.
+
+    The scene shown so far stays until the new one is there, and for good if that fails; what was deleted in
+    it and not saved is asked about first. `check` raises InputError for a scene that is not to be shown.
+    """
     leave(viewer, lambda viewer: _open(viewer, path, then, check), f"{path.name} is opened")
 
 
@@ -83,6 +85,7 @@ def _open(viewer: Viewer, path: Path, then: Callable[[Viewer], None], check: Cal
 
 
 def cancel(viewer: Viewer) -> None:
+    """Drop what the worker does and is to do."""
     viewer.worker.cancel()
     viewer.state.opening = None
     photograph = viewer.state.photograph
@@ -248,7 +251,7 @@ def switch_scene(viewer: Viewer, path: Path) -> None:
 
 
 def step_scene(viewer: Viewer, by: int) -> None:
-    """The next (1) or previous (-1) of the list, beyond its ends from the other one."""
+    """Return the next (1) or previous (-1) of the list, beyond its ends from the other one."""
     state = viewer.state
     others = [path for path in state.scenes if state.path is None or path != state.path.absolute()]
     if not others:
@@ -270,7 +273,7 @@ SAME = 1e-6  # of the scene's radius, and of a rotation: nearer is the same plac
 
 
 def standing_at(state: ViewerState) -> Camera | None:
-    """The training camera whose pose the view has; None elsewhere, and without perspective."""
+    """Return the training camera whose pose the view has; None elsewhere, and without perspective."""
     scene, view, index = state.scene, state.view, state.camera_index
     if (
         scene is None
@@ -369,7 +372,9 @@ def follow_beside(viewer: Viewer) -> None:
 
 def _mirrored(state: ViewerState, other: ViewerState) -> Session:
     """Return the first scene's session for the second one: what is asked and how it is shown, without edits.
-    It asks what the first has answered; what is not here gets no colour there."""
+
+    It asks what the first has answered; what is not here gets no colour there.
+    """
 
     def hidden(query: Query) -> bool:
         result = other.result(query)
@@ -387,8 +392,11 @@ def _mirrored(state: ViewerState, other: ViewerState) -> Session:
 
 
 def linked(view: OrbitCamera, here: Extent, there: Extent) -> OrbitCamera:
-    """Return the same view of another scene: itself where both have the same coordinates, as far as their
-    extents tell, else from the same side and as far away in radii."""
+    """Return the same view of another scene.
+
+    It is itself where both have the same coordinates, as far as their extents tell, else it is from the same
+    side and as far away in radii.
+    """
     ratio = there.radius / here.radius
     away = np.linalg.norm(here.centre - there.centre)
     if away < ALIKE[0] * here.radius and 1 / ALIKE[1] < ratio < ALIKE[1]:

@@ -1,5 +1,7 @@
-"""The outline: the scene's tree in words, with names, groups and locks of one's own; and what can be done
-with a thing, a row of it or what is clicked in the scene."""
+"""The outline: the scene's tree in words, with names, groups and locks of one's own.
+
+And what can be done with a thing, a row of it or what is clicked in the scene.
+"""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
@@ -25,7 +27,10 @@ Target = int | Array  # a node of the tree, or a (3,) point on the surface, worl
 
 
 def wanted(viewer: Viewer) -> OutlineView | None:
-    """The outline of the scene, as far as it is known; the worker finds it once it has nothing else to do."""
+    """Return the outline of the scene, as far as it is known.
+
+    The worker finds it once it has nothing else to do.
+    """
     state = viewer.state
     if viewer.engine is None or not state.has_field:
         return None
@@ -73,7 +78,7 @@ def _totals(own: Array, parents: Array) -> Array:
 
 
 def name_of(viewer: Viewer, row: Outline) -> str:
-    """The name that was given to a row, else what it is likely to be."""
+    """Return the name that was given to a row, else what it is likely to be."""
     given = viewer.state.session.things.names.get(row.node)
     return given or ("unknown" if row.word is None else row.word.phrase)
 
@@ -178,6 +183,7 @@ def visit(viewer: Viewer, target: Target) -> None:
 
 
 def find_alike(viewer: Viewer, target: Target) -> None:
+    """Select everything like a thing."""
 
     def act(members: Array) -> None:
         take(viewer, members, "replace")
@@ -198,6 +204,7 @@ def hide(viewer: Viewer, target: Target) -> None:
 
 
 def show(viewer: Viewer, target: Target) -> None:
+    """Show a thing that is hidden."""
 
     def act(members: Array) -> None:
         marks = viewer.state.marks
@@ -265,12 +272,14 @@ def _without(group: NodeGroup, node: int) -> NodeGroup | None:
 
 
 def ungroup(viewer: Viewer, node: int) -> None:
+    """Take a thing out of its group."""
     things = viewer.state.session.things
     left = (_without(g, node) for g in things.groups)
     viewer.change(things=replace(things, groups=tuple(g for g in left if g is not None)))
 
 
 def rename_group(viewer: Viewer, old: NodeGroup, name: str) -> None:
+    """Give a group another name, that no other has."""
     things, name = viewer.state.session.things, tidy(name)
     if name in {g.name for g in things.groups if g is not old}:
         viewer.say_error(f"there is a group '{name}' already")
@@ -280,6 +289,7 @@ def rename_group(viewer: Viewer, old: NodeGroup, name: str) -> None:
 
 
 def select_group(viewer: Viewer, group: NodeGroup) -> None:
+    """Select all things of a group."""
     engine = viewer.engine
     if engine is None:
         return

@@ -44,6 +44,7 @@ def pin_at(viewer: Viewer, u: float, v: float) -> None:
 
 
 def pin_to_selection(viewer: Viewer) -> None:
+    """Pin a note to the middle of what is selected."""
     state, chosen = viewer.state, viewer.state.marks.selected
     if state.scene is None or not chosen.any():
         viewer.say_error("select something first, then pin a note to it")
@@ -72,12 +73,14 @@ def take_fresh_note(viewer: Viewer, note: Note) -> bool:
 
 
 def write_note(viewer: Viewer, note: Note, text: str) -> None:
+    """Change the text of a note."""
     changed = replace(note, text=text[:LONGEST_NOTE])
     notes = tuple(changed if other is note else other for other in viewer.state.session.notes)
     viewer.change(f"note at {note.at}", notes=notes)
 
 
 def remove_note(viewer: Viewer, note: Note) -> None:
+    """Take a note off."""
     viewer.change(notes=tuple(other for other in viewer.state.session.notes if other is not note))
 
 
@@ -120,7 +123,7 @@ def end(viewer: Viewer, folder: Path = Path()) -> None:
 
 
 def _answer(state: ViewerState, query: Query) -> dict[str, Any]:
-    """The answer to a query as a project keeps it, for other programs."""
+    """Return the answer to a query as a project keeps it, for other programs."""
     answer, result = state.answer(query), state.result(query)
     if result is None:
         return {"phrase": query.phrase, "problem": answer.problem}
@@ -136,7 +139,7 @@ def _answer(state: ViewerState, query: Query) -> dict[str, Any]:
 
 
 def _nearest(state: ViewerState, note: Note) -> int:
-    """The Gaussian whose centre is nearest to a note."""
+    """Return the Gaussian whose centre is nearest to a note."""
     assert state.scene is not None
     means = state.scene.gaussians.means.astype(np.float64)
     with np.errstate(all="ignore"):

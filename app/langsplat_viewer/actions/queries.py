@@ -42,8 +42,10 @@ def ask(viewer: Viewer, text: str) -> None:
 
 
 def ask_one(viewer: Viewer, phrase: str, *, cut: float | None = None, then_show: bool = True) -> None:
-    """Search the scene for one phrase. cut: a threshold in place of the answer's own; then_show: give it a
-    colour if it may be there."""
+    """Search the scene for one phrase.
+
+    cut: a threshold in place of the answer's own; then_show: give it a colour if it may be there.
+    """
     state, key = viewer.state, phrase_key(phrase)
     if state.scene is None or viewer.engine is None:
         viewer.say_error("open a scene first, then search it")
@@ -62,8 +64,11 @@ def ask_one(viewer: Viewer, phrase: str, *, cut: float | None = None, then_show:
 
 
 def answer(viewer: Viewer, phrase: str, then_show: bool = False) -> None:
-    """Have the worker answer a query of the list; only what may be there takes a colour. Its instances come
-    later: the surface that they are told apart on takes seconds where there are a million Gaussians."""
+    """Have the worker answer a query of the list; only what may be there takes a colour.
+
+    Its instances come later: the surface that they are told apart on takes seconds where there are a million
+    Gaussians.
+    """
     state, engine, level = viewer.state, viewer.engine, viewer.state.session.level
     if engine is None:
         return
@@ -168,8 +173,10 @@ def take_search_focus(viewer: Viewer) -> bool:
 
 
 def teach(viewer: Viewer, name: str, members: Array, done: Callable[[str], None] = lambda name: None) -> None:
-    """Have the worker teach a name by what (N,) bool mean, and search for it. What is saved from now on keeps
-    it. `done` gets the name, if the scene is still there."""
+    """Have the worker teach a name by what (N,) bool mean, and search for it.
+
+    What is saved from now on keeps it. `done` gets the name, if the scene is still there.
+    """
     engine, scene = viewer.engine, viewer.state.scene
     if engine is None:
         return
@@ -343,8 +350,10 @@ def prepare_suggestions(viewer: Viewer) -> None:
 
 
 def offers(viewer: Viewer, typed: str) -> tuple[str, tuple[str, ...]]:
-    """Return a title and the phrases to offer now: those that go on from what is typed, else a correction of
-    the last query, else, before the first query, examples."""
+    """Return a title and the phrases to offer now.
+
+    They go on from what is typed; else they correct the last query, or, before the first, are examples.
+    """
     state, queries = viewer.state, viewer.state.session.queries
     if typed.strip():
         return "", tuple(completions(typed, state.suggestions.phrases))

@@ -70,11 +70,13 @@ def has_selection(viewer: Viewer) -> bool:
 
 
 def select_all(viewer: Viewer) -> None:
+    """Select everything that is shown."""
     if has_scene(viewer):
         take(viewer, viewer.state.marks.shown, "replace")
 
 
 def select_none(viewer: Viewer) -> None:
+    """Select nothing."""
     if has_scene(viewer):
         take(viewer, np.zeros_like(viewer.state.marks.selected), "replace")
 
@@ -99,6 +101,7 @@ def isolate_selected(viewer: Viewer) -> None:
 
 
 def show_hidden(viewer: Viewer) -> None:
+    """Show all that is hidden."""
     if has_scene(viewer):
         marks = viewer.state.marks
         mark(viewer, replace(marks, hidden=np.zeros_like(marks.hidden)))
@@ -171,6 +174,7 @@ def select_query(viewer: Viewer, query: Query | None = None, mode: Mode | None =
 
 
 def select_thing(viewer: Viewer, thing: Instance, mode: Mode | None = None) -> None:
+    """Select one instance of an answer."""
     if has_scene(viewer):
         take(viewer, of_rows(thing.members, len(viewer.state.marks.selected)), mode)
 
@@ -189,7 +193,7 @@ def use_tool(viewer: Viewer, tool: Tool | None) -> None:
 
 
 def values_shown(viewer: Viewer) -> marks.Histogram | None:
-    """The histogram of the chosen numbers, of what is shown; None where there are none of them."""
+    """Return the histogram of the chosen numbers, of what is shown; None where there are none of them."""
     state, query = viewer.state, chosen_query(viewer)
     if state.scene is None or state.view is None:
         return None
@@ -206,13 +210,13 @@ def values_shown(viewer: Viewer) -> marks.Histogram | None:
 
 
 def brush_values(viewer: Viewer, at: float) -> None:
-    """The mouse is held at a fraction `at` of the histogram's range."""
+    """Return the mouse is held at a fraction `at` of the histogram's range."""
     brushed, at = viewer.state.tools.brushed, min(max(at, 0.0), 1.0)
     set_tools(viewer, brushed=(at if brushed is None else brushed[0], at))
 
 
 def end_brush(viewer: Viewer, mode: Mode | None = None) -> None:
-    """The button goes up: select what has values in the range that was brushed."""
+    """Return the button goes up: select what has values in the range that was brushed."""
     brushed, found = viewer.state.tools.brushed, values_shown(viewer)
     set_tools(viewer, brushed=None)
     if brushed is not None and found is not None:
@@ -257,8 +261,11 @@ def export(
     as_points: bool = False,
     then: Callable[[Viewer], None] = lambda viewer: None,
 ) -> None:
-    """Have the worker write a part of the scene to a new file in `folder`: a PLY with its language field and
-    cameras, or a point cloud. `then` runs once it is written; if that fails the reason is said."""
+    """Have the worker write a part of the scene to a new file in `folder`.
+
+    It is a PLY with its language field and cameras, or a point cloud. `then` runs once it is written; if that
+    fails the reason is said.
+    """
     if not (has_scene(viewer) if part == "edited" else has_selection(viewer)):
         return
     state, engine = viewer.state, viewer.engine
@@ -323,6 +330,7 @@ def may_close(viewer: Viewer) -> bool:
 
 
 def quit_viewer(viewer: Viewer) -> None:
+    """Close the window; ask first where something would be lost."""
     leave(viewer, _close, "the window closes", viewer.state.has_unsaved_notes)
 
 
@@ -377,7 +385,10 @@ LONGEST = 4000  # places of a stroke that are kept
 
 
 def begin_stroke(viewer: Viewer, u: float, v: float) -> None:
-    """The button goes down. A sphere and a box are drawn around the surface that lies there."""
+    """Return the button goes down.
+
+    A sphere and a box are drawn around the surface that lies there.
+    """
     state = viewer.state
     tool, centre = state.tools.tool, None
     if tool is None or state.scene is None or state.view is None:
@@ -403,7 +414,7 @@ def extend_stroke(viewer: Viewer, u: float, v: float) -> None:
 
 
 def end_stroke(viewer: Viewer, mode: Mode | None = None) -> None:
-    """The button goes up: select what the stroke encloses; `mode` in place of the one that is set."""
+    """Return the button goes up: select what the stroke encloses; `mode` in place of the one that is set."""
     state, drawn = viewer.state, drawn_stroke(viewer)
     if drawn is None or state.scene is None:
         return
@@ -421,7 +432,7 @@ def end_stroke(viewer: Viewer, mode: Mode | None = None) -> None:
 
 
 def drawn_stroke(viewer: Viewer) -> Drawn | None:
-    """The stroke under way, in the image as it is; None without one."""
+    """Return the stroke under way, in the image as it is; None without one."""
     state = viewer.state
     tool, stroke = state.tools.tool, state.tools.stroke
     if tool is None or stroke is None or state.view is None:
@@ -438,7 +449,7 @@ def leave_tool(viewer: Viewer) -> None:
 
 
 def _select_under(viewer: Viewer, stroke: Stroke, mode: Mode | None) -> None:
-    """The thing at the stroke's centre, or the part of it if that is the level of the queries."""
+    """Return the thing at the stroke's centre, or the part of it if that is the level of the queries."""
     state = viewer.state
     if state.scene is None or stroke.centre is None:
         return

@@ -16,8 +16,10 @@ from langsplat_viewer.viewer import Viewer
 
 
 def put(part: ViewerState | Recording | Timing, **values: object) -> None:
-    """Take what was typed or switched, where nothing follows from it: fields of the state or a part of it,
-    by name. Panels write nothing themselves."""
+    """Take what was typed or switched, where nothing follows from it.
+
+    `values` are fields of the state or a part of it, by name. Panels write nothing themselves.
+    """
     for name, value in values.items():
         getattr(part, name)  # AttributeError where it has none
         setattr(part, name, value)
@@ -119,6 +121,7 @@ def measure(viewer: Viewer, on: bool) -> None:
 
 
 def toggle_measuring(viewer: Viewer) -> None:
+    """Begin to measure, or end it."""
     measure(viewer, not viewer.state.session.ruler.measures)
 
 
@@ -161,6 +164,7 @@ def resize(viewer: Viewer, width: int, height: int) -> None:
 
 
 def toggle_panel(viewer: Viewer) -> None:
+    """Hide all panels, or bring them back."""
     viewer.state.show_panel = not viewer.state.show_panel
 
 
@@ -170,6 +174,7 @@ def open_panel(viewer: Viewer, title: str) -> None:
 
 
 def reset_panels(viewer: Viewer) -> None:
+    """Put the panels where they are at first."""
     viewer.state.show_panel = viewer.state.resets_panels = True
 
 
@@ -186,6 +191,7 @@ def take_wanted_panel(viewer: Viewer) -> str:
 
 
 def toggle_help(viewer: Viewer) -> None:
+    """Show or close the help."""
     viewer.state.show_help = not viewer.state.show_help
 
 
@@ -196,6 +202,7 @@ def show_palette(viewer: Viewer, shown: bool) -> None:
 
 
 def toggle_palette(viewer: Viewer) -> None:
+    """Show or close the list of commands."""
     show_palette(viewer, not viewer.state.show_palette)
 
 

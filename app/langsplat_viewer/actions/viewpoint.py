@@ -89,7 +89,7 @@ def advance(viewer: Viewer) -> None:
 
 
 def leave_path(viewer: Viewer) -> None:
-    """The view goes elsewhere: nothing is played any more, and a turn begins anew from there."""
+    """Return the view goes elsewhere: nothing is played any more, and a turn begins anew from there."""
     viewer.state.record.began = None
     if viewer.state.record.turn_from is not None:
         viewer.state.record.turn_from, viewer.state.record.at = None, 0.0
@@ -144,6 +144,7 @@ def open_at(viewer: Viewer, camera: Camera) -> None:
 
 
 def glide_to(viewer: Viewer, end: OrbitCamera) -> None:
+    """Send the camera to a view."""
     if viewer.state.view is not None:
         leave_path(viewer)
         viewer.state.glide = Glide(viewer.state.view, end, viewer.clock)
@@ -158,8 +159,11 @@ def zoom_by(viewer: Viewer, factor: float) -> None:
 
 
 def opening_view(viewer: Viewer) -> OrbitCamera | None:
-    """Return the first view of a scene: that of the camera that was asked for, else the first training
-    camera, else a view of everything in the window as it is now. None without a scene."""
+    """Return the first view of a scene, None without a scene.
+
+    It is that of the camera that was asked for, else of the first training camera, else of everything in the
+    window as it is now.
+    """
     state = viewer.state
     if state.scene is None or state.extent is None:
         return None
@@ -208,6 +212,7 @@ def set_orthographic(viewer: Viewer, orthographic: bool) -> None:
 
 
 def toggle_orthographic(viewer: Viewer) -> None:
+    """Look without perspective, or with it again."""
     set_orthographic(viewer, viewer.state.view is not None and not viewer.state.view.orthographic)
 
 
@@ -231,13 +236,15 @@ def go_to_camera(viewer: Viewer, index: int) -> None:
 
 
 def step_camera(viewer: Viewer, by: int) -> None:
-    """The next (1) or previous (-1) training camera."""
+    """Return the next (1) or previous (-1) training camera."""
     go_to_camera(viewer, (viewer.state.camera_index or 0) + by)
 
 
 def focus_result(viewer: Viewer, query: Query | None = None) -> None:
-    """Bring a query's place to the centre, as near as the thing is small; without `query` the latest
-    one shown that was found; without any the whole scene."""
+    """Bring a query's place to the centre, as near as the thing is small.
+
+    Without `query` the latest one shown that was found; without any the whole scene.
+    """
     state = viewer.state
     if state.extent is None or state.view is None:
         return
@@ -257,8 +264,10 @@ def focus_on(viewer: Viewer, place: Array, box: Array | None) -> None:
 
 
 def _distance_for(viewer: Viewer, place: Array, box: Array | None) -> float:
-    """Distance from which a thing at `place` (3,) in `box` (2, 3) is seen, world units: no farther back than
-    the eye or the opening view are now, which in a room would be behind its wall."""
+    """Return the distance from which a thing at `place` (3,) in `box` (2, 3) is seen, world units.
+
+    It is no farther back than the eye or the opening view are now, which in a room would be behind its wall.
+    """
     view, extent, home = viewer.state.view, viewer.state.extent, opening_view(viewer)
     assert view is not None
     assert extent is not None
@@ -298,8 +307,10 @@ def toggle_pointing(viewer: Viewer) -> None:
 
 
 def hover(viewer: Viewer, pixel: tuple[int, int] | None) -> None:
-    """Once per frame: the mouse is over this pixel (column, row) of the scene's area; None: elsewhere, or it
-    drags. What lies there is asked once the mouse and the camera rest."""
+    """Once per frame: the mouse is over this pixel (column, row) of the scene's area.
+
+    None: elsewhere, or it drags. What lies there is asked once the mouse and the camera rest.
+    """
     state = viewer.state
     if not state.pointing or state.view is None or pixel is None:
         state.hover = None
@@ -373,12 +384,14 @@ def go_to_bookmark(viewer: Viewer, bookmark: Bookmark) -> None:
 
 
 def bookmarked_view(bookmark: Bookmark, extent: Extent) -> OrbitCamera:
+    """Return the view of a bookmark."""
     view = view_of(bookmark.pose, extent)
     target = view.eye + bookmark.distance * view.rotation[2]
     return replace(view, target=target, distance=bookmark.distance)
 
 
 def delete_bookmark(viewer: Viewer, bookmark: Bookmark) -> None:
+    """Take a bookmark off the list."""
     _keep(viewer, tuple(other for other in viewer.state.session.bookmarks if other is not bookmark))
 
 

@@ -95,8 +95,11 @@ def places(scene: Path) -> tuple[Path, ...]:
 
 
 def find_photograph(name: str, scene: Path, folder: str) -> Path:
-    """The photograph of the camera `name`: in the chosen `folder` or the folders in it, or where photographs
-    usually lie. InputError where it is in none of them."""
+    """Return the path of the photograph of the camera `name`.
+
+    It is looked for in the chosen `folder` and the folders in it, or where photographs usually lie.
+    InputError where it is in none of them.
+    """
     if not name:
         raise InputError("this camera does not name its photograph")
     looked_in = (Path(folder),) if folder else places(scene)
@@ -114,15 +117,19 @@ def find_photograph(name: str, scene: Path, folder: str) -> Path:
 
 
 def _names(path: PurePath) -> set[str]:
-    """Return the names that a camera of this photograph may have: training names cameras by the stem, where
-    two have the same by the path."""
+    """Return the names that a camera of this photograph may have.
+
+    Training names cameras by the stem, where two have the same by the path.
+    """
     whole = path.with_suffix("").as_posix()
     return {path.stem, whole, whole.replace("/", "_")}
 
 
 def read_photograph(path: Path, camera: Camera) -> Array:
-    """(H, W, 3) uint8, at most `LONGEST_SIDE` pixels long, turned as its EXIF data ask where only that fits
-    the camera. Raises InputError."""
+    """Return a photograph as (H, W, 3) uint8, at most `LONGEST_SIDE` pixels long.
+
+    It is turned as its EXIF data ask where only that fits the camera. Raises InputError.
+    """
     with opened(path) as stored:
         stored.draft("RGB", (LONGEST_SIDE, LONGEST_SIDE))
         picture: Image.Image = stored
@@ -162,6 +169,7 @@ Stamps = tuple[tuple[Path, Stamp], ...]
 
 
 def stamps(files: tuple[Path, ...]) -> Stamps:
+    """Return the times of change and sizes of files."""
     return tuple((file, _stamp(file)) for file in files)
 
 
@@ -233,8 +241,10 @@ PREVIEW = "so-far.ply"  # in the work folder of a training
 
 
 def newest(out: Path) -> Stamps:
-    """The Gaussians of the training of `out` that were written last, in training or done, and their stamp;
-    empty where there are none."""
+    """Return the Gaussians that the training of `out` wrote last, in training or done, with their stamp.
+
+    Empty where there are none.
+    """
     folder = work_folder(out)
     found = stamps((*folder.glob(f"radiance-*{IN_TRAINING}"), *folder.glob("radiance-*.ply")))
     return tuple(sorted(found, key=lambda file: file[1] or (0, 0))[-1:])

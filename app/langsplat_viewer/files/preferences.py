@@ -66,8 +66,10 @@ def fitting_scale(height: float) -> float:
 
 
 def load_preferences(folder: Path, at_first: Preferences | None = None) -> Preferences:
-    """Read the preferences in `folder`, `at_first` or the defaults where there are none. InputError where the
-    file makes no sense."""
+    """Read the preferences in `folder`, `at_first` or the defaults where there are none.
+
+    InputError where the file makes no sense.
+    """
     path = folder / FILE_NAME
     try:
         return msgspec.json.decode(path.read_bytes()[:LARGEST], type=Preferences)

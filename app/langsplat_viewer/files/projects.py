@@ -78,8 +78,10 @@ def _bits(text: Any, count: int) -> Bits:
 
 
 def _read(path: Path, what: str, decode: Callable[[Any], T], limit: int = SIZE_LIMIT) -> T:
-    """Return what `decode` makes of the JSON in a file. InputError and FormatError, in one line, where it is
-    no `what`."""
+    """Return what `decode` makes of the JSON in a file.
+
+    InputError and FormatError, in one line, where it is no `what`.
+    """
     top = read_json_file(path, limit)
     try:
         return decode(top)
@@ -187,8 +189,11 @@ class Shelf:
         return self._bookmarks(lambda top: _bookmarks(top.get(str(scene.absolute()), [])), ())
 
     def write(self, scene: Path, bookmarks: tuple[Bookmark, ...]) -> None:
-        """Keep the bookmarks of a scene beside those of others. InputError where the file that is there
-        makes no sense: it stays as it is. OSError where it cannot be written."""
+        """Keep the bookmarks of a scene beside those of others.
+
+        InputError where the file that is there makes no sense: it stays as it is. OSError where it cannot be
+        written.
+        """
         if self.folder is None:
             return
         none: dict[str, Any] = {}
@@ -313,8 +318,10 @@ def read_project(path: Path) -> Project:
 
 
 def _checked(session: Session) -> Session:
-    """Return a session of a file, its names on one line. ValueError, or InputError, where something is wrong
-    in it that its types do not say."""
+    """Return a session of a file, its names on one line.
+
+    ValueError, or InputError, where something is wrong in it that its types do not say.
+    """
     check_settings(session.picture)
     scale = session.picture.heat_scale
     if scale is not None and scale[0] >= scale[1]:
