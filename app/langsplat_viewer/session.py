@@ -82,8 +82,8 @@ class Marked:
     def masks(self, before: "Marked", marks: Marks) -> Marks:
         """Return the masks.
 
-        Those of `marks`, which are the masks of `before`, are used as far as both mark the same: what is drawn
-        by them need not be drawn anew.
+        Those of `marks`, which are the masks of `before`, are used as far as both mark the same: nothing is
+        drawn anew for them.
         """
         if self == before:
             return marks
