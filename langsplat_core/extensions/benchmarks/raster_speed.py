@@ -30,17 +30,6 @@ from langsplat_core.raster.opengl.scene_textures import create_egl_context
 from langsplat_core.raster.protocol import Rasterizer
 
 SceneSize = tuple[int, tuple[int, int]]  # Gaussians, (width, height)
-_LARGE, _SMALL = (200_000, (960, 720)), (31_000, (320, 240))
-_PROMISES = (  # scene; backend, operation, channels above and below the line; target; whether it is the least
-    (_LARGE, ("opengl half", "frame", 12), ("cpu", "frame", 12), 3.0, True),
-    (_LARGE, ("opengl half", "splat", 12), ("cpu", "splat", 12), 3.0, True),
-    (_SMALL, ("cpu", "gather", 3), ("cpu", "splat", 3), 1.5, False),
-    (_LARGE, ("cpu", "splat", 12), ("cpu", "splat", 3), 1.6, False),
-    (_LARGE, ("cpu", "frame", 12), ("cpu", "frame", 3), 1.6, False),
-    (_SMALL, ("cpu", "frame", 3), ("cpu", "frozen splat", 3), 4.0, True),
-    (_SMALL, ("cpu", "splat", 3), ("cpu", "frozen splat", 3), 4.0, True),
-    (_SMALL, ("cpu", "gather", 3), ("cpu", "frozen gather", 3), 4.0, True),
-)
 _NOTES = """- The size with most scenes and the most channels; every other measurement is in raster.json.
 - ms: median of the calls after the first.
 - frame: project + splat with a camera that has moved since the last frame.
@@ -60,16 +49,6 @@ def quick_plan(plan: RasterBenchConfig) -> RasterBenchConfig:
 
 
 @dataclass(frozen=True)
-class Ratio:
-    """A ratio that the project promises, and its measured value."""
-
-    text: str
-    ratio: float | None  # None: not measured in this run
-    target: str  # ">= 3" or "<= 2"
-    met: bool | None
-
-
-@dataclass(frozen=True)
 class Report:
     """Results of one run of the benchmark."""
 
@@ -78,14 +57,12 @@ class Report:
 
     @property
     def text(self) -> str:
-        """The machine, a selection of the measurements and the promised ratios, as Markdown."""
+        """The machine and a selection of the measurements, as Markdown."""
         return "\n".join([
             "# Rasterizers: time against error\n",
             "\n".join(f"- {name}: {value}" for name, value in self.machine.items()) + "\n",
             table(_selection(self.rows)),
             _NOTES,
-            "## Promised ratios\n",
-            ratio_table(ratios(self.rows)),
         ])  # fmt: skip
 
     @property
@@ -94,7 +71,6 @@ class Report:
         return {
             "machine": self.machine,
             "measurements": [asdict(row) for row in self.rows],
-            "ratios": [asdict(row) for row in ratios(self.rows)],
         }
 
 
@@ -111,7 +87,7 @@ def run_plan(
     warm_up(backends, plan.channels)
     foresight = Foresight(plan.limit)
     rows: list[Measurement] = []
-    pairs = sweep(plan.counts, plan.sizes, plan.pivot, (_SMALL, _LARGE))
+    pairs = sweep(plan.counts, plan.sizes, plan.pivot)
     total = len(plan.scenes) + len(pairs)
     for n, case in enumerate(_cases(plan, pairs)):
         name = f"bench: {case.scene} {len(case.gaussians)} at {case.camera.width}x{case.camera.height}"
@@ -126,17 +102,14 @@ def run_plan(
     return Report(machine, rows)
 
 
-def sweep(
-    counts: tuple[int, ...], sizes: tuple[tuple[int, int], ...], pivot: int, extra: tuple[SceneSize, ...] = ()
-) -> list[SceneSize]:
+def sweep(counts: tuple[int, ...], sizes: tuple[tuple[int, int], ...], pivot: int) -> list[SceneSize]:
     """Return the numbers of Gaussians and image sizes of the random scenes, small ones first.
 
-    They are every count at the middle size, every size at `pivot` Gaussians, and those of `extra` whose count
-    and size are asked for. The time of large ones is foretold from small ones.
+    They are every count at the middle size, and every size at `pivot` Gaussians. The time of large ones is
+    foretold from small ones.
     """
     middle = sorted(sizes)[len(sizes) // 2]
     pairs = {(count, middle) for count in counts} | {(pivot, size) for size in sizes}
-    pairs |= {(count, size) for count, size in extra if count in (*counts, pivot) and size in sizes}
     return sorted(pairs, key=lambda pair: (pair[0], pair[1][0] * pair[1][1]))
 
 
@@ -185,25 +158,6 @@ def _processor() -> str:
     return platform.processor() or platform.machine()
 
 
-def ratios(rows: Sequence[Measurement]) -> list[Ratio]:
-    """Every promised ratio, from the rows of one run."""
-    times = {
-        ((r.gaussians, (r.width, r.height)), (r.backend, r.operation, r.channels)): r.milliseconds
-        for r in rows
-        if r.scene == "random"
-    }
-    found = []
-    for scene, above, below, target, at_least in _PROMISES:
-        one, other = times.get((scene, above)), times.get((scene, below))
-        ratio = None if one is None or other is None else one / other
-        met = None if ratio is None else (ratio >= target if at_least else ratio <= target)
-        (count, (width, height)), (backend, operation, channels) = scene, above
-        against = f"{below[0]} {below[1]}" + (f", {below[2]} channels" if below[2] != channels else "")
-        text = f"{channels} channels, {count // 1000}k, {width}x{height}: {backend} {operation} / {against}"
-        found.append(Ratio(text, ratio, f"{'>=' if at_least else '<='} {target:g}", met))
-    return found
-
-
 def table(rows: Sequence[Measurement]) -> str:
     """Return the measurements as a Markdown table."""
     head = ("scene", "Gaussians", "size", "channels", "operation", "backend", "ms", "MiB")
@@ -222,13 +176,6 @@ def _selection(rows: Sequence[Measurement]) -> list[Measurement]:
     """Return the rows of the most measured image size, with the most channels."""
     size, channels = _busiest(rows), max((r.channels for r in rows), default=0)
     return [r for r in rows if (r.width, r.height) == size and r.channels == channels]
-
-
-def ratio_table(found: Sequence[Ratio]) -> str:
-    """Return the promised ratios as a Markdown table."""
-    words = {None: "not measured", True: "yes", False: "NO"}
-    rows = ((r.text, _cell(r.ratio, ".2f"), r.target, words[r.met]) for r in found)
-    return markdown(("ratio", "measured", "target", "met"), rows)
 
 
 def _cell(value: float | None, form: str) -> str:
