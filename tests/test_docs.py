@@ -18,7 +18,7 @@ from PIL import Image
 
 from assets.making.__main__ import parse as parse_making
 from langsplat_core.cli.app import parse
-from langsplat_core.cli.run import Command, main
+from langsplat_core.cli.run import Runnable, main
 from langsplat_core.io.scenes import load_scene
 from langsplat_viewer.program import parse as parse_viewer
 from tests.benchmarks.__main__ import parse as parse_benchmarks
@@ -33,7 +33,7 @@ TOML = re.compile(r"^```toml\n(.*?)^```", re.MULTILINE | re.DOTALL)
 PYTHON = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 
-PARSERS: dict[str, Callable[[list[str]], Command]] = {
+PARSERS: dict[str, Callable[[list[str]], Runnable]] = {
     "langsplat": parse,
     "langsplat-viewer": parse_viewer,
     "assets.making": parse_making,

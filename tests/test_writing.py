@@ -57,20 +57,20 @@ def refusal(check: Check, path: Path) -> str:
 
 @pytest.mark.parametrize("check", CHECKS)
 @pytest.mark.parametrize("name", ["a" * 256, "é" * 128, "there/" + "b" * 256 + "/c", "d" * 300 + "/e.ply"])
-def test_names_longer_than_the_file_system_takes(check: Check, name: str, tmp_path: Path) -> None:
+def test_names_beyond_the_file_system_are_refused(check: Check, name: str, tmp_path: Path) -> None:
     assert "this file system takes 255" in refusal(check, tmp_path / name)
     assert "choose a shorter one" in refusal(check, tmp_path / "/".join(["x" * 200] * 30))
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("check", CHECKS)
-def test_names_that_no_terminal_could_show(check: Check, tmp_path: Path) -> None:
+def test_names_that_are_not_text_are_refused(check: Check, tmp_path: Path) -> None:
     assert "not UTF-8" in refusal(check, tmp_path / "caf\udce9.ply")
     assert "zero byte" in refusal(check, tmp_path / "a\0b")
 
 
 @pytest.mark.parametrize("check", CHECKS)
-def test_names_that_the_language_settings_cannot_hold(
+def test_names_beyond_the_locale_are_refused(
     check: Check, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "fsencode", lambda path: str(path).encode("latin5"))
@@ -82,11 +82,11 @@ def test_names_that_the_language_settings_cannot_hold(
 @pytest.mark.parametrize(
     "place", ["/proc/x.ply", "/proc/self/fd/x", "/dev/x.ply", "/dev/a/b/x", "/sys/x.ply"]
 )
-def test_the_systems_own_folders(check: Check, place: str) -> None:
+def test_folders_of_the_system_are_refused(check: Check, place: str) -> None:
     assert "folder of the system's own" in refusal(check, Path(place))
 
 
-def test_a_folder_is_no_file_and_a_file_no_folder(tmp_path: Path) -> None:
+def test_folders_and_files_are_told_apart(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     assert "is a folder; name a file in it" in refusal(check_output_file, tmp_path)
     assert "is a file; name a folder" in refusal(check_output_folder, tmp_path / "file")
@@ -96,7 +96,7 @@ def test_a_folder_is_no_file_and_a_file_no_folder(tmp_path: Path) -> None:
     assert "no ordinary file" in refusal(check_output_file, tmp_path / "pipe")
 
 
-def test_what_can_be_written_passes_and_leaves_nothing(tmp_path: Path) -> None:
+def test_checking_a_place_leaves_nothing_there(tmp_path: Path) -> None:
     names = ["a.ply", "a/b/c.ply", "a" * 255]
     for name in names + ["日本語 (1).ply"] * sys.getfilesystemencoding().startswith("utf"):
         for check in CHECKS:
@@ -106,7 +106,7 @@ def test_what_can_be_written_passes_and_leaves_nothing(tmp_path: Path) -> None:
     assert [path.read_text() for path in tmp_path.iterdir()] == ["kept"]
 
 
-def test_where_one_may_not_write(tmp_path: Path) -> None:
+def test_folders_without_permission_are_refused(tmp_path: Path) -> None:
     closed = tmp_path / "closed"
     closed.mkdir(mode=0o555)
     code = (
@@ -270,7 +270,7 @@ def test_a_full_disk_is_one_line(name: str, tmp_path: Path, capsys: pytest.Captu
             assert content == before.get(path) or len(content) == len(whole[path])
 
 
-def test_a_scene_is_kept_whole_when_its_sidecar_finds_no_room(tmp_path: Path) -> None:
+def test_a_full_disk_keeps_the_old_scene_whole(tmp_path: Path) -> None:
     save_scene(tmp_path / "s.ply", SCENE)
     before = contents(tmp_path)
     other = Scene(random_gaussians(40, 2, sh_degree=1), random_field(40, seed=3), SCENE.cameras)
@@ -281,7 +281,7 @@ def test_a_scene_is_kept_whole_when_its_sidecar_finds_no_room(tmp_path: Path) ->
         assert contents(tmp_path) == before
 
 
-def test_two_who_write_one_scene_at_once(tmp_path: Path) -> None:
+def test_two_writers_of_one_scene_take_turns(tmp_path: Path) -> None:
     """Scenes of the same positions, so that no checksum would notice a sidecar of the other one."""
     fields = {name: random_field(40, phrases=(name,)) for name in ("red", "old")}
     none = np.zeros(40, np.float32)
@@ -301,7 +301,7 @@ def test_two_who_write_one_scene_at_once(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 3
 
 
-def test_other_faults_of_a_writer_stay_what_they_are(tmp_path: Path) -> None:
+def test_other_errors_of_a_writer_are_raised(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="of the writer"), atomic_path(tmp_path / "a"):
         raise ValueError("of the writer")
     with pytest.raises(InputError, match="ours"), files_of_at_most(0), atomic_path(tmp_path / "a"):
@@ -327,7 +327,7 @@ FILLED: dict[str, Write] = {**WRITERS, **{f"large {name}": write for name, write
 
 
 @pytest.mark.parametrize("name", FILLED)
-def test_a_small_disk_that_fills_up_is_one_line(
+def test_a_small_disk_that_fills_up_is_a_line(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A file system of its own, filled by another file but for less than what is written, and for the last

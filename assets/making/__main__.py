@@ -11,7 +11,7 @@ from typing import Annotated
 import tyro
 
 from assets.making.config import EncoderConfig, LabelLayout, Size, Tier
-from langsplat_core.cli.run import Command, OutFile, OutFolder, main, parsed
+from langsplat_core.cli.run import OutFile, OutFolder, Runnable, main, parsed
 from langsplat_core.config import Count, Seed
 from langsplat_core.progress import TerminalProgress
 
@@ -81,9 +81,9 @@ class Build:
         print(f"{self.out}: {made}")
 
 
-def parse(args: list[str]) -> Command:
+def parse(args: list[str]) -> Runnable:
     """Return the command that the words of a command line name; SystemExit as tyro raises it."""
-    command: Command = parsed(PROGRAM, Dataset | Encoder | Build, args, "Make the bundled files again.")
+    command: Runnable = parsed(PROGRAM, Dataset | Encoder | Build, args, "Make the bundled files again.")
     return command
 
 

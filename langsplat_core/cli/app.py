@@ -12,7 +12,7 @@ from typing import Annotated, Any, Union
 import tyro
 
 from langsplat_core import registry
-from langsplat_core.cli.run import Command, main, parsed, with_codec
+from langsplat_core.cli.run import Runnable, main, parsed, with_codec
 from langsplat_core.errors import InputError
 
 FLAGS = ("-q", "--quiet", "-v", "--verbose")  # may precede a command
@@ -20,13 +20,13 @@ FLAGS = ("-q", "--quiet", "-v", "--verbose")  # may precede a command
 CORE: Mapping[str, str] = MappingProxyType({
     "train": "train.Train", "frames": "train.Frames", "query": "query.QueryScene",
     "describe": "describe.Describe", "select": "query.Select", "teach": "describe.Teach",
-    "scale": "edit.Scale", "transform": "edit.Transform", "crop": "edit.Crop", "clean": "edit.Clean",
+    "scale": "edit.SetScale", "transform": "edit.Transform", "crop": "edit.Crop", "clean": "edit.Clean",
     "export": "export.Export", "convert": "export.Convert", "compact": "edit.Compact",
     "inspect": "scenes.Inspect", "doctor": "scenes.Doctor", "demo": "scenes.Demo",
 })  # fmt: skip
 
 
-def parse(args: list[str]) -> Command:
+def parse(args: list[str]) -> Runnable:
     """Return the command that the words of a command line name.
 
     Raises SystemExit as tyro does, with its message on stderr; InputError for a command that does not exist,
@@ -57,7 +57,7 @@ def command_names() -> list[str]:
     return [*CORE, *registry.references("commands")]
 
 
-def load_command(name: str) -> type[Command]:
+def load_command(name: str) -> type[Runnable]:
     """Return the class of a command; InputError for one of an extension that cannot be imported."""
     if name not in CORE:
         return registry.part("commands", name)
@@ -78,7 +78,7 @@ def _listed(name: str) -> Any:
     return None if command is None else _subcommand(name, command)
 
 
-def _subcommand(name: str, command: type[Command]) -> Any:
+def _subcommand(name: str, command: type[Runnable]) -> Any:
     return Annotated[command, tyro.conf.subcommand(name=name)]
 
 

@@ -245,7 +245,7 @@ def _notes(report: "CompactReport") -> list[str]:
 
 
 @dataclass(frozen=True)
-class Scale:
+class SetScale:
     """Say how long a scene's unit is, so that answers are in metres: by a known length in it, or by a
     factor. Without either, print what the scene says. Only the header of the .ply is changed."""
 

@@ -72,7 +72,7 @@ class _OneLine(logging.Formatter):
         return printable_line(record.getMessage(), 2000)
 
 
-class Command(Protocol):
+class Runnable(Protocol):
     """Parsed arguments of a command, with the work that they ask for."""
 
     def run(self) -> None:
@@ -100,7 +100,7 @@ def codec_settings(args: Sequence[str], default: CodecConfig) -> CodecConfig:
     return default if kind == default.kind else CODEC_CONFIGS[kind]()
 
 
-def with_codec(command: type[Command], args: Sequence[str]) -> type[Command]:
+def with_codec(command: type[Runnable], args: Sequence[str]) -> type[Runnable]:
     """`command` with the settings of the codec that `args` choose, where it has a field `codec`."""
     entry: Any = next((entry for entry in fields(command) if entry.name == "codec"), None)  # type: ignore[arg-type]
     if entry is None:
@@ -151,7 +151,7 @@ def parsed(program: str, kind: Any, args: Sequence[str], description: str | None
     return found.command
 
 
-def main(program: str, parser: Callable[[], Command]) -> int:
+def main(program: str, parser: Callable[[], Runnable]) -> int:
     """Parse and run; returns the exit code. All that is printed is printed in here, help and version too."""
     _prepare_standard_streams()
     try:
@@ -163,7 +163,7 @@ def main(program: str, parser: Callable[[], Command]) -> int:
 
 
 @optional_imports()
-def _run(program: str, parser: Callable[[], Command]) -> None:
+def _run(program: str, parser: Callable[[], Runnable]) -> None:
     if sys.argv[1:] == ["--version"]:
         print(f"{program} {__version__}")
         return

@@ -3,7 +3,7 @@
 import sys
 from typing import Union
 
-from langsplat_core.cli.run import Command, main, parsed, with_codec
+from langsplat_core.cli.run import Runnable, main, parsed, with_codec
 from tests.benchmarks.answers import Rooms, Verdicts
 from tests.benchmarks.few import Few
 from tests.benchmarks.geometry import Clean, Maps, Meshes
@@ -15,7 +15,7 @@ from tests.benchmarks.scale import Formats, Scale
 PROGRAM = "python -m tests.benchmarks"
 
 
-def parse(args: list[str]) -> Command:
+def parse(args: list[str]) -> Runnable:
     """The report that the words of a command line name; SystemExit as tyro raises it."""
     about = "Measure this project where the truth is known, and at large sizes."
     known = (
@@ -23,7 +23,7 @@ def parse(args: list[str]) -> Command:
         *(Lifting, Scale, Found, Changed, Formats, Few),
     )
     reports = tuple(with_codec(report, args) for report in known)
-    command: Command = parsed(PROGRAM, Union[(*reports,)], args, about)
+    command: Runnable = parsed(PROGRAM, Union[(*reports,)], args, about)
     return command
 
 

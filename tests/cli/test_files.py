@@ -87,7 +87,7 @@ def checkpoints(tmp_path: Path) -> list[Path]:
 
 
 @pytest.mark.long
-def test_checkpoints_become_a_scene_and_a_scene_checkpoints(tmp_path, checkpoints, capsys):
+def test_checkpoints_become_a_scene_and_back(tmp_path, checkpoints, capsys):
     read = ("--encoder", "demo", "--phrases", "apple", "red mug")
     assert run("convert", *checkpoints, tmp_path / "a.ply", *read) == 0
     printed = capsys.readouterr().out
@@ -104,7 +104,7 @@ def test_checkpoints_become_a_scene_and_a_scene_checkpoints(tmp_path, checkpoint
     assert "--to occam" in refusal(capsys, *words)
 
 
-def test_a_checkpoint_of_gaussians_alone(tmp_path, capsys):
+def test_a_checkpoint_of_gaussians_is_converted(tmp_path, capsys):
     g = random_gaussians(20, sh_degree=3)
     path = save_model(tmp_path / "chkpnt30000.pth", g)
     assert run("convert", path, tmp_path / "a.spz") == 0
@@ -121,7 +121,7 @@ def test_a_scene_of_an_autoencoder_becomes_langsplats(tmp_path):
     assert made == ["best_ckpt.pth", *(f"case_{level}/chkpnt30000.pth" for level in (1, 2, 3))]
 
 
-def test_masks_and_vectors_both_ways(tmp_path):
+def test_features_are_converted_both_ways(tmp_path):
     labels = np.arange(12, dtype=np.int32).reshape(3, 2, 2)
     store = FeatureStore(tmp_path / "features")
     store.save("a.jpg", ImageFeatures(labels, np.eye(12, 20, dtype=np.float32)))
@@ -144,14 +144,14 @@ def test_masks_and_vectors_both_ways(tmp_path):
         (["{0}", "out.ply", "--levels", "whole", "--encoder", "/nowhere"], "autoencoder"),
     ],
 )
-def test_what_cannot_be_imported_is_one_line(tmp_path, capsys, monkeypatch, words, message):
+def test_unusable_sources_are_refused(tmp_path, capsys, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
     g = random_gaussians(20)
     paths = [save_model(tmp_path / f"{name}.pth", g, tensor(np.ones((20, 3), np.float32))) for name in "ab"]
     assert re.search(message, refusal(capsys, "convert", *(word.format(*paths) for word in words)))
 
 
-def test_no_scene_that_is_read_is_replaced_by_any_other_name(tmp_path, capsys, monkeypatch):
+def test_sources_are_not_replaced_by_another_name(tmp_path, capsys, monkeypatch):
     """Nor what lies beside it: a folder of SOG and a PLY of its name have one sidecar."""
     monkeypatch.chdir(tmp_path)
     write_folder(Path("a"), sog_files(random_gaussians(20)))
@@ -178,7 +178,7 @@ def psnr(scene: Gaussians, truth: Gaussians, cameras: list[Camera]) -> float:
 
 @pytest.mark.long
 @pytest.mark.parametrize(("suffix", "least", "bytes_each"), [(".spz", 48, 29), (".splat", 55, 32)])
-def test_the_demo_scene_in_small_formats(
+def test_small_formats_keep_the_demo_scenes_image(
     suffix: str, least: float, bytes_each: int, tmp_path: Path, measured: Measure
 ) -> None:
     """A base colour in .spz is off by at most 0.28 * 0.5 / 255 / 0.15 = 3.7e-3, evenly, thus by 2.1e-3 in the
@@ -292,7 +292,7 @@ def test_crop_keeps_what_lies_in_all_shapes(words, kept, scene, source, tmp_path
         ["crop", "--box", -9, -9, -9, 9, 9, 9, "--outside"],
     ],
 )
-def test_what_cannot_be_done_writes_nothing(words, source, tmp_path, capsys):
+def test_impossible_edits_write_nothing(words, source, tmp_path, capsys):
     before = sorted(tmp_path.iterdir())
     command, *options = words
     refusal(capsys, command, source, tmp_path / "out.ply", *options)
@@ -307,7 +307,7 @@ def test_the_original_is_never_replaced(command, source, capsys):
     assert source.read_bytes() == content
 
 
-def test_a_scene_without_companions_and_far_away(tmp_path):
+def test_far_scenes_without_companions_are_edited(tmp_path):
     gaussians = random_gaussians(N)
     far = replace(gaussians, means=gaussians.means + np.float32(1e6))
     save_scene(tmp_path / "far.ply", Scene(far))
@@ -319,7 +319,7 @@ def test_a_scene_without_companions_and_far_away(tmp_path):
     assert run("crop", near, tmp_path / "half.ply", "--plane", 1, 0, 0, 0) == 0
 
 
-def test_clean_says_what_went(scene, source, tmp_path, capsys):
+def test_clean_reports_what_it_removes(scene, source, tmp_path, capsys):
     out = tmp_path / "out.ply"
     assert run("clean", source, out, "--region", 3, "--max-psnr-loss", 3, "--json") == 0
     report = json.loads(capsys.readouterr().out)

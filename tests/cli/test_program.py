@@ -49,14 +49,14 @@ def test_every_option_is_described(name):
         (["--tyro-print-completion", "ksh"], "--tyro-print-completion ksh: there is bash, zsh"),
     ],
 )
-def test_a_command_or_a_shell_that_does_not_exist_is_named(words, said):
+def test_unknown_commands_and_shells_are_named(words, said):
     with pytest.raises(InputError) as error:
         parse(words)
     assert str(error.value).startswith(said)
 
 
 @pytest.mark.parametrize(("program", "begin"), [("langsplat", entry), ("langsplat-viewer", viewer_entry)])
-def test_versions(program, begin, monkeypatch, capsys):
+def test_version_is_printed(program, begin, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [program, "--version"])
     with pytest.raises(SystemExit) as stop:
         begin()
@@ -65,7 +65,7 @@ def test_versions(program, begin, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(("flag", "level"), [("-q", "ERROR"), ("--verbose", "DEBUG")])
-def test_how_much_is_said_stands_anywhere(flag, level):
+def test_verbosity_may_stand_anywhere(flag, level):
     log = logging.getLogger("langsplat")
     for words in ([flag, "doctor"], ["doctor", flag]):
         log.setLevel(logging.INFO)
@@ -102,7 +102,7 @@ def test_bash_completes_commands_options_and_choices(capsys):
     assert said.splitlines() == ["query", "raster", "--max-relevancy-error", "good"]
 
 
-def test_doctor_says_what_draws_and_what_encodes(capsys):
+def test_doctor_names_opengl_and_encoder(capsys):
     Doctor().run()
     said = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
     assert said["langsplat"] == __version__
@@ -142,7 +142,7 @@ WRITING = [
 
 @pytest.mark.parametrize("line", WRITING)
 @pytest.mark.parametrize("place", ["/proc/x", "{here}/file/x", "{here}/" + "n" * 300])
-def test_every_command_that_writes_tries_the_place_first(
+def test_commands_try_the_place_to_write_first(
     line: str, place: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -156,11 +156,11 @@ def test_every_command_that_writes_tries_the_place_first(
 @pytest.mark.parametrize(
     "words", [["query", DEMO, "caf\udce9"], ["query", DEMO, "cup", "--encoder", "\udcff"]]
 )
-def test_texts_that_are_not_utf_8(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_texts_that_are_not_utf_8_are_refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert "is not UTF-8" in refusal(capsys, *words)
 
 
-def test_a_name_that_is_not_utf_8_can_be_read_and_is_printed_with_escapes(tmp_path: Path) -> None:
+def test_names_that_are_not_utf_8_are_printed_with_escapes(tmp_path: Path) -> None:
     scene = tmp_path / os.fsdecode(b"caf\xe9.ply")
     scene.symlink_to(DEMO)
     done = subprocess.run([*RUN, "scale", str(scene)], capture_output=True, text=True, check=True)
@@ -169,7 +169,7 @@ def test_a_name_that_is_not_utf_8_can_be_read_and_is_printed_with_escapes(tmp_pa
 
 
 @pytest.mark.parametrize("name", ["x" * 300 + ".ply", "file/x.ply", "/proc/self/mem"])
-def test_names_that_cannot_be_read(
+def test_names_that_cannot_be_read_are_refused(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -230,14 +230,14 @@ def in_a_shell(line: str) -> subprocess.CompletedProcess[str]:
         ("reports -q >/dev/full", 2, 0, 1),
     ],
 )
-def test_output_that_nobody_takes(line: str, code: int, printed: int, said: int) -> None:
+def test_closed_and_full_outputs_end_in_a_line(line: str, code: int, printed: int, said: int) -> None:
     done = in_a_shell(line)
     assert (done.returncode, done.stdout.count("\n"), done.stderr.count("\n")) == (code, printed, said)
     assert not said or "standard output cannot be written" in done.stderr
 
 
 @pytest.mark.long
-def test_how_much_is_said() -> None:
+def test_verbosity_chooses_messages() -> None:
     quiet, plain, verbose = (in_a_shell(f"reports {flag}") for flag in ("-q", "", "-v"))
     assert {how.stdout for how in (quiet, plain, verbose)} == {"the answer\n"}
     assert quiet.stderr == ""
@@ -284,7 +284,7 @@ def test_a_signal_ends_a_command_in_a_line(number: int, said: str, tmp_path: Pat
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 @pytest.mark.parametrize("program", ["langsplat_core", "langsplat_viewer"])
 @pytest.mark.parametrize("seconds", [0.0, 0.2])
-def test_a_signal_while_modules_are_imported_is_a_line(program: str, number: int, seconds: float) -> None:
+def test_a_signal_before_the_command_is_a_line(program: str, number: int, seconds: float) -> None:
     code = (
         "import signal, sys\nfrom langsplat_core.interrupts import end_in_a_line\n"
         f"from {program}.__main__ import entry\n"
@@ -297,9 +297,7 @@ def test_a_signal_while_modules_are_imported_is_a_line(program: str, number: int
 
 
 @ENDED
-def test_a_signal_while_a_command_imports_is_not_for_the_module(
-    number: int, said: str, tmp_path: Path
-) -> None:
+def test_a_signal_during_an_import_ends_the_command(number: int, said: str, tmp_path: Path) -> None:
     """As pycolmap, which makes another error of any, and torch, which swallows some."""
     module = f"import os\ntry:\n    os.kill(os.getpid(), {int(number)})\nexcept BaseException:\n    pass\n"
     (tmp_path / "heavy.py").write_text(module)
@@ -326,7 +324,7 @@ for words in json.load(sys.stdin):
 
 
 @pytest.mark.long
-def test_datasets_that_may_not_be_read(tmp_path: Path) -> None:
+def test_datasets_without_permission_are_refused(tmp_path: Path) -> None:
     """One process tries them all: to be bound by permissions it has to be one of its own."""
     lines, paths = [], []
     for number, closed in enumerate(CLOSED):
