@@ -15,8 +15,10 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.config import TrainPreset
 from langsplat_core.query.answers import QueryResult, recut
-from langsplat_core.query.describe import Outline, Pointed, Suggestions
+from langsplat_core.query.describe import Pointed
 from langsplat_core.query.instances import Instance
+from langsplat_core.query.outline import Outline
+from langsplat_core.query.suggestions import Suggestions
 from langsplat_core.scene import Camera, Scene
 from langsplat_core.scene.tree import Tree
 from langsplat_viewer.camera.controls import Extent, OrbitCamera

@@ -30,8 +30,10 @@ from langsplat_core.io.files import check_output_file
 from langsplat_core.io.scenes import check_writable, companion_path
 from langsplat_core.pipeline.labels import export_labels
 from langsplat_core.progress import Progress, TerminalProgress
-from langsplat_core.query.describe import Describer, Entry, Words, look_at_pixel
+from langsplat_core.query.describe import Describer, LevelWords, look_at_pixel
 from langsplat_core.query.engine import QueryEngine, check_words, searchable
+from langsplat_core.query.inventory import InventoryEntry, scene_inventory
+from langsplat_core.query.outline import scene_outline
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import LEVELS, LanguageField, Scene, TaughtWord
 from langsplat_core.scene.language import phrase_key
@@ -145,7 +147,7 @@ class Describe:
         asked = {"asked": len(describer.words[0].phrases), "left_out": len(describer.left_out)}
         if self.outline:
             return asked | {"outline": outline_of(describer)}
-        found: Sequence[Words | Entry]
+        found: Sequence[LevelWords | InventoryEntry]
         place: dict[str, Any] = {}
         if self.pixel is not None:
             camera = engine.scene.cameras[self.camera]
@@ -161,7 +163,7 @@ class Describe:
             found = describer.at_gaussians(np.array([self.gaussian]), np.ones(1), self.top)
             place = {"gaussian": self.gaussian}
         else:
-            found = describer.inventory(progress)
+            found = scene_inventory(describer, progress)
         wanted = [_plain(one, sure) for one in found if self.level in (None, LEVELS[one.level])]
         return place | asked | {"inventory" if self._everything else "levels": wanted}
 
@@ -213,7 +215,7 @@ def _print_inventory(entries: list[dict[str, Any]]) -> None:
 def outline_of(describer: Describer) -> list[dict[str, Any]]:
     """The scene as a tree, ready for JSON."""
     sure = describer.engine.basis.calibration is not None
-    return [_plain(one, sure) for one in describer.outline()]
+    return [_plain(one, sure) for one in scene_outline(describer)]
 
 
 def outline_lines(nodes: list[dict[str, Any]], unit: Unit) -> list[str]:

@@ -9,8 +9,10 @@ import numpy as np
 
 from langsplat_core.io.files import atomic_path, check_output_file
 from langsplat_core.io.scenes import check_writable, save_scene
-from langsplat_core.query.describe import OR, Describer, Outline
+from langsplat_core.query.describe import Describer
 from langsplat_core.query.instances import axis_aligned_box
+from langsplat_core.query.outline import Outline, scene_outline
+from langsplat_core.query.word_scores import OR
 from langsplat_core.scene import LEVELS, NO_NODE
 
 
@@ -18,9 +20,9 @@ def export_labels(describer: Describer, path: Path) -> Path:
     """Write the scene as a .ply of that name whose Gaussians have the int properties `instance`, `part` and
     `class`, and `<name>.labels.json` beside it; returns that one.
 
-    An instance is a node at the top of `describer.outline()`, a part the smallest node of it that a Gaussian
-    is in, both by their numbers in the tree; a class is the place of the instance's likeliest word in the
-    JSON's `classes`. -1 is none. The JSON has the nodes of the outline, each with its parent, level, word and
+    An instance is a node at the top of the outline, a part the smallest node of it that a Gaussian is in,
+    both by their numbers in the tree; a class is the place of the instance's likeliest word in the JSON's
+    `classes`. -1 is none. The JSON has the nodes of the outline, each with its parent, level, word and
     class, Gaussians, axis-aligned box (lower and upper corner, between 2 % and 98 % of the Gaussians) and
     votes.
     """
@@ -50,7 +52,7 @@ def export_labels(describer: Describer, path: Path) -> Path:
         for part in outline.parts:  # whose Gaussians are among these, and take their own number
             place(part, outline.node)
 
-    for outline in describer.outline():
+    for outline in scene_outline(describer):
         place(outline, NO_NODE)
     beside = path.with_suffix(".labels.json")
     check_writable(path)

@@ -29,11 +29,11 @@ from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query import grammar, taught
-from langsplat_core.query.describe import suggest
 from langsplat_core.query.engine import QueryEngine, TextEncoder, no_field
 from langsplat_core.query.instances import BOXED, oriented_box
 from langsplat_core.query.regions import place_of
 from langsplat_core.query.rule import RULE, bars_of
+from langsplat_core.query.suggestions import suggest
 from langsplat_core.raster.opengl.shaders import WEB, shader, splat_shaders
 from langsplat_core.scene import LEVELS, Camera, Gaussians, Scene
 from langsplat_core.scene.gaussians import along_curve

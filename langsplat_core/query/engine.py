@@ -349,7 +349,7 @@ class QueryEngine:
         return self._answer(tidy(phrase), self.relevancy(vector), level)
 
     def run_many(self, phrases: Sequence[str], level: LevelChoice = "auto") -> list[QueryResult]:
-        """The answers of `run` to each of `phrases`, which are encoded and compared with the scene's meanings
+        """The answers of `run` to each of `phrases`, which are encoded and compared with the scene's features
         together. An answer keeps 17 bytes per Gaussian. Raises as `text_vector` does, before any is asked."""
         plain = [phrase for phrase in phrases if not self.is_taught(phrase)]
         relevancies = self._relevancies(self.text_vectors(plain))

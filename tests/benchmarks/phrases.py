@@ -19,8 +19,9 @@ from langsplat_core.extensions.benchmarks.measure import markdown
 from langsplat_core.extensions.benchmarks.report import intersection_over_union
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import Body, Viewpoint, body, most, run_phrase, stands, upright, viewpoint
-from langsplat_core.query.describe import Describer, Entry
+from langsplat_core.query.describe import Describer
 from langsplat_core.query.grammar import EXTREMES, SIDES, atoms, parse
+from langsplat_core.query.inventory import InventoryEntry, scene_inventory
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.scene import LEVELS, Camera
 from tests.benchmarks.oracles import surface_points
@@ -310,7 +311,7 @@ def name_regions(room: Room) -> RoomWords:
     labels, truth = room.labels, room.truth.regions
     names = [_names(describer, level, _regions(labels[level]), truth) for level in (2, 1, 0)]
     start = time.perf_counter()
-    entries = describer.inventory()
+    entries = scene_inventory(describer)
     seconds = time.perf_counter() - start
     score = score_inventory(entries, labels, truth, describer.areas, describer.words[2].phrases)
     colour = _colours(describer, _regions(labels[2]), truth)
@@ -347,7 +348,7 @@ def _colours(describer: Describer, regions: Mapping[int, Array], truth: Regions)
 
 
 def score_inventory(
-    entries: Sequence[Entry], labels: Array, truth: Regions, areas: Array, phrases: Sequence[str]
+    entries: Sequence[InventoryEntry], labels: Array, truth: Regions, areas: Array, phrases: Sequence[str]
 ) -> InventoryScore:
     """Entries of whole things against (3, N) truth ids; seconds are left 0."""
     wholes, named, correct = [entry for entry in entries if entry.level == 2], set(), 0

@@ -14,9 +14,9 @@ from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.library.changes import Change
 from langsplat_core.query.compose import upright, viewpoint
-from langsplat_core.query.describe import Entry, Spot
 from langsplat_core.query.grammar import Atom
 from langsplat_core.query.grammar import parse as parse_phrase
+from langsplat_core.query.inventory import InventoryEntry, Spot
 from langsplat_core.scene import Calibration, Odds, look_at
 from tests.benchmarks import answers
 from tests.benchmarks.__main__ import parse
@@ -254,9 +254,9 @@ TRUTH = {
 LABELS = np.stack([np.repeat([-1, -1, -1, -1], 30), np.repeat([-1] * 4, 30), np.repeat([0, 1, 2, -1], 30)])
 
 
-def entry(phrase: str, rows: range, level: int = 2) -> Entry:
+def entry(phrase: str, rows: range, level: int = 2) -> InventoryEntry:
     spot = Spot(np.zeros(3), np.zeros((2, 3)), np.array(rows), 0.1, None, None)
-    return Entry(phrase, (), level, 0.9, 0.9, 0.1, (spot,))
+    return InventoryEntry(phrase, (), level, 0.9, 0.9, 0.1, (spot,))
 
 
 def test_inventory_entry_is_judged_by_most_of_its_surface():

@@ -1,4 +1,4 @@
-"""Phrases with structure: what the grammar reads, and what is found on a table whose meanings are known."""
+"""Phrases with structure: what the grammar reads, and what is found on a table whose features are known."""
 
 import numpy as np
 import pytest

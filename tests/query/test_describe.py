@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 
 from langsplat_core.arrays import Array, unit
-from langsplat_core.query import describe
-from langsplat_core.query.describe import Describer, build_attributes, build_words, hubs, meanings
+from langsplat_core.query import describe, word_scores
+from langsplat_core.query.describe import Describer, look_at_pixel
 from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.inventory import same_things, scene_inventory
+from langsplat_core.query.suggestions import completions, corrected, suggest
+from langsplat_core.query.word_scores import WordScores, build_attributes, build_words, field_features, hubs
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import LanguageField, LinearCodec, Scene
 from langsplat_core.scene.codec import CodebookCodec
@@ -96,7 +99,7 @@ def test_a_pixel_is_what_the_rows_of_w_say(codebook, backend):
         if weights.sum() <= 0.3:
             continue
         rasterizer = load_lifting_rasterizer(backend)
-        found = describe.look_at_pixel(rasterizer, asked, camera, (column, row), results, top=4)
+        found = look_at_pixel(rasterizer, asked, camera, (column, row), results, top=4)
         want = weights @ own / weights.sum()
         for word in found.words[2].words:
             assert word.probability == pytest.approx(want[names.phrases.index(word.phrase)], abs=1e-4)
@@ -111,12 +114,12 @@ def test_a_pixel_is_what_the_rows_of_w_say(codebook, backend):
             in_front = weights[depths < found.depth - 1e-9].sum()
             there = weights[np.abs(depths - found.depth) < 1e-6].sum()
             assert in_front < weights.sum() / 2 <= in_front + there
-    assert describe.look_at_pixel(load_lifting_rasterizer(backend), asked, camera, (0, 0)) is None
+    assert look_at_pixel(load_lifting_rasterizer(backend), asked, camera, (0, 0)) is None
 
 
 @pytest.mark.parametrize("codebook", [True, False])
 def test_the_inventory_lists_what_is_there_where_it_is(codebook):
-    entries = {entry.phrase: entry for entry in describer(named_scene(codebook)).inventory()}
+    entries = {entry.phrase: entry for entry in scene_inventory(describer(named_scene(codebook)))}
     assert set(entries) == set(WORDS)
     for centre, word in zip(CENTRES, WORDS, strict=True):
         entry = entries[word]
@@ -134,13 +137,13 @@ def test_two_names_are_one_entry_and_two_places_two_spots():
     codes[2, 2 * PER_BLOB :] = codes[2, 0]  # the third blob is another mug
     book = {**field.phrasebook, "cup": axis(0), "beaker": axis(0)}
     scene = replace(named_scene(), language=replace(field, latents=codes, phrasebook=book))
-    entries = describer(scene, (*NAMES, "cup", "beaker")).inventory()
+    entries = scene_inventory(describer(scene, (*NAMES, "cup", "beaker")))
     (mug,) = [entry for entry in entries if "mug" in (entry.phrase, *entry.also)]
     assert {mug.phrase, *mug.also} == {"mug", "cup", "beaker"}
     assert mug.probability > 0.95  # of all three together
     assert sorted(float(spot.centre[0]) for spot in mug.spots) == pytest.approx([-1.2, 1.2], abs=0.1)
     # The best word of a foreign list may still be wrong: the canonical phrases are nearer.
-    assert describer(named_scene(), ("wall",)).inventory() == []
+    assert scene_inventory(describer(named_scene(), ("wall",))) == []
 
 
 def test_the_bundled_parts_are_not_offered_for_whole_things():
@@ -156,8 +159,8 @@ def test_groups_of_words_that_claim_the_same():
     cup = np.array([0.45, 0.4, 0.1, 0])
     vague = np.array([0.05, 0.1, 0.9, 0.4])  # everywhere a little: a name for neither
     names = np.stack([vague, mug, cup], 1)
-    assert describe.same_things(names, surface) == [[0], [1, 2]]
-    assert describe.same_things(np.zeros((0, 0)), np.zeros(0)) == []
+    assert same_things(names, surface) == [[0], [1, 2]]
+    assert same_things(np.zeros((0, 0)), np.zeros(0)) == []
 
 
 def test_surface_of_gaussians():
@@ -170,13 +173,13 @@ def test_surface_of_gaussians():
     assert len(surface_areas(gaussians.take(np.zeros(0, int)))) == 0
 
 
-# Words of meanings, against a plain float64 reference.
+# Words of field_features, against a plain float64 reference.
 
 D, K, N, V = 24, 40, 90, 17
 
 
 def field(kind: str) -> LanguageField:
-    """Random meanings, by a codebook or by a linear codec; every seventh Gaussian has none."""
+    """Random field_features, by a codebook or by a linear codec; every seventh Gaussian has none."""
     rng = np.random.default_rng(4)
     confidence = np.ones((3, N), np.float32)
     confidence[:, ::7] = 0
@@ -201,9 +204,9 @@ def plain_probabilities(made: LanguageField, vectors: Array, latents: Array, ban
     hub = []
     for word in every:
         cosines = sorted((float(word @ meaning) for meaning in bank.astype(np.float64)), reverse=True)
-        hub.append(np.mean(cosines[: describe.NEAREST]))
+        hub.append(np.mean(cosines[: word_scores.NEAREST]))
     spreads = [np.std([float(word @ meaning) for word in every[: len(vectors)]]) for meaning in bank]
-    rows, scale = [], describe.WORD_SCALE / np.median(spreads)
+    rows, scale = [], word_scores.WORD_SCALE / np.median(spreads)
     for vector in made.codec.decode(latents).astype(np.float64):
         fits = np.array([scale * (vector @ word - own / 2) for word, own in zip(every, hub, strict=True)])
         shares = np.exp(fits - fits.max())
@@ -213,12 +216,12 @@ def plain_probabilities(made: LanguageField, vectors: Array, latents: Array, ban
 
 @pytest.mark.parametrize("kind", ["codebook", "linear"])
 def test_probabilities_and_mixtures_are_those_of_the_formula(kind, monkeypatch):
-    monkeypatch.setattr(describe, "CELLS", 7 * (V + 4))  # several blocks
+    monkeypatch.setattr(word_scores, "CELLS", 7 * (V + 4))  # several blocks
     made = field(kind)
     names, vectors = phrases()
     words = build_words(made, names, vectors)
     latents = made.latents[made.known][:60]
-    want = plain_probabilities(made, vectors, latents, meanings(made))
+    want = plain_probabilities(made, vectors, latents, field_features(made))
     np.testing.assert_allclose(words.probabilities(made.codec, latents), want, atol=2e-5)
     weights = np.random.default_rng(6).uniform(size=len(latents))
     mixture = words.mixture(made.codec, latents, weights)
@@ -231,10 +234,12 @@ def test_probabilities_and_mixtures_are_those_of_the_formula(kind, monkeypatch):
 
 def test_the_bank_holds_every_meaning_that_some_gaussian_has_once():
     made = field("codebook")
-    np.testing.assert_array_equal(meanings(made), made.codec.vectors[np.unique(made.latents[made.known])])
-    assert len(meanings(field("linear"))) == field("linear").known.sum()
+    np.testing.assert_array_equal(
+        field_features(made), made.codec.vectors[np.unique(made.latents[made.known])]
+    )
+    assert len(field_features(field("linear"))) == field("linear").known.sum()
     vectors, axes = np.eye(D, dtype=np.float32)[:2], np.eye(D, dtype=np.float32)
-    np.testing.assert_allclose(hubs(vectors, axes[:4]), [0.25, 0.25])  # of few meanings, and of none
+    np.testing.assert_allclose(hubs(vectors, axes[:4]), [0.25, 0.25])  # of few field_features, and of none
     np.testing.assert_array_equal(hubs(vectors, axes[:0]), [0, 0])
 
 
@@ -260,7 +265,7 @@ def test_a_word_that_is_near_everything_is_not_the_answer_everywhere():
 def test_very_different_cosines_do_not_overflow():
     made = field("codebook")
     names, vectors = phrases()
-    words = describe.WordScores(names, vectors, np.zeros(V, np.float32), 1e6)
+    words = WordScores(names, vectors, np.zeros(V, np.float32), 1e6)
     found = words.probabilities(made.codec, made.latents[0])
     assert np.isfinite(found).all()
     np.testing.assert_allclose(found.sum(1), 1, atol=1e-5)
@@ -291,18 +296,18 @@ PHRASES = ("teddy bear", "tea pot", "red mug", "teapot", "mug")
 
 def test_every_example_is_found_in_the_scene():
     engine = QueryEngine(blob_scene(), lambda _: FakeEncoder())
-    found = describe.suggest(engine)
+    found = suggest(engine)
     assert {"mug", "book", "plant"} >= set(found.examples) > set()
     assert all(engine.run(phrase).found for phrase in found.examples)
     assert set(found.examples) <= set(found.phrases)
-    assert len(describe.suggest(engine, at_most=1).examples) == 1
+    assert len(suggest(engine, at_most=1).examples) == 1
 
 
 def test_without_an_encoder_the_phrasebook_is_asked():
     nothing = (-axis(0) - axis(1) - axis(2)) / np.float32(np.sqrt(3))
     book = {"mug": axis(0), "unicorn": nothing, "of": axis(1)}
     scene = replace(blob_scene(), language=replace(language(), phrasebook=book))
-    found = describe.suggest(QueryEngine(scene))
+    found = suggest(QueryEngine(scene))
     assert (found.examples, found.phrases) == (("mug",), ("mug", "unicorn", "of"))
 
 
@@ -320,10 +325,10 @@ def test_without_an_encoder_the_phrasebook_is_asked():
     ],
 )
 def test_what_is_typed_is_completed(typed, offered):
-    assert describe.completions(typed, PHRASES) == offered
-    assert describe.completions(typed, PHRASES, at_most=1) == offered[:1]
+    assert completions(typed, PHRASES) == offered
+    assert completions(typed, PHRASES, at_most=1) == offered[:1]
 
 
 def test_a_correction_replaces_the_unknown_words_alone():
-    assert describe.corrected("the Red mugg", {"mugg": ("mug", "muff")}) == "the red mug"
-    assert describe.corrected("red mugg", {"mugg": ()}) is None
+    assert corrected("the Red mugg", {"mugg": ("mug", "muff")}) == "the red mug"
+    assert corrected("red mugg", {"mugg": ()}) is None

@@ -376,7 +376,7 @@ def test_codeword_zero_is_a_meaning_like_any_other():
 
 
 def test_margins_of_another_size_change_nothing():
-    """All texts and meanings mixed with directions of their own lie closer together, as CLIP's do; what a
+    """All texts and features mixed with directions of their own lie closer together, as CLIP's do; what a
     phrase fits against everyday phrases stays, and as published it does not."""
     field = random_field(200, "codebook")
     dim, share = field.codec.vector_dim, 0.2

@@ -113,7 +113,7 @@ def links_of(surface: Surface) -> list[tuple[int, int]]:
 
 
 def plain_step(field: LanguageField, level: int, a: int, b: int) -> float:
-    """Between the meanings of two Gaussians of the scene."""
+    """Between the features of two Gaussians of the scene."""
     known = field.known[level]
     if not (known[a] and known[b]):
         return surfaces.UNKNOWN if known[a] or known[b] else 0.0

@@ -11,8 +11,9 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.display.displays import Subject, latent_colours, nodes
 from langsplat_core.progress import Progress
-from langsplat_core.query.describe import Describer, Outline
+from langsplat_core.query.describe import Describer
 from langsplat_core.query.instances import axis_aligned_box
+from langsplat_core.query.outline import Outline, scene_outline
 from langsplat_core.query.selection import at_point
 from langsplat_core.scene import LEVELS, NO_NODE
 from langsplat_core.scene.language import tidy
@@ -52,7 +53,7 @@ def _find(viewer: Viewer) -> None:
         if describer is None or describer.engine is not engine:
             describer = Describer(engine, progress=progress)
         progress("looking for what is here", 0.5)
-        roots = describer.outline()
+        roots = scene_outline(describer)
         tree = engine.tree
         sizes = _totals(np.bincount(tree.leaves[tree.leaves != NO_NODE], minlength=tree.count), tree.parents)
         return describer, OutlineView(roots, tree, sizes)

@@ -11,7 +11,7 @@ from imgui_bundle import ImVec2, hello_imgui, imgui
 from langsplat_core.arrays import Array
 from langsplat_core.config import ColourMap
 from langsplat_core.display.displays import QUERY_COLOURS, STRENGTH, mapped, painted
-from langsplat_core.query.describe import Words
+from langsplat_core.query.describe import LevelWords
 from langsplat_core.scene import LEVELS, Camera
 from langsplat_viewer.actions import opening, projects, settings, viewpoint
 from langsplat_viewer.camera import overlays
@@ -460,7 +460,7 @@ def draw_pointing(viewer: Viewer) -> None:
     imgui.end_tooltip()
 
 
-def said(words: Words, sure: bool) -> str:
+def said(words: LevelWords, sure: bool) -> str:
     """ "teddy bear 64 %, toy 12 %": the most probable words of a place at one level, without percentages
     where none are `sure`."""
     likely = [word for word in words.words if word.probability > UNSURE]

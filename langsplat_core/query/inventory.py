@@ -1,0 +1,184 @@
+"""The inventory of a scene: every word that is true in it, where, and how probable it is.
+
+Every feature of the scene has its best word, and so every Gaussian. Words that cover enough of the surface
+are candidates; those that claim the same features are one thing by two names ("mug" and "cup"); and what is
+listed was asked for, as a phrase, and found where it was claimed.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import get_args
+
+import numpy as np
+
+from langsplat_core.arrays import Array
+from langsplat_core.config import LevelChoice
+from langsplat_core.progress import Progress, silent
+from langsplat_core.query.describe import Describer
+from langsplat_core.query.instances import axis_aligned_box
+from langsplat_core.query.word_scores import LIKELY, Word, WordScores
+from langsplat_core.scene import LEVELS, Codec
+from langsplat_core.scene.surface import Surface
+from langsplat_core.semantics.relevancy import FLOOR
+
+LEAST_SHARE = 5e-4  # of the scene's surface that a word, with others for the same, must be the best for
+LEAST_SPOT = 0.15  # of its largest spot's surface: a smaller one is a splinter of a border
+LEAST_COUNT = 12  # Gaussians of a spot
+SAME = 0.5  # overlap of claims from which two words name the same thing
+RUNNERS_UP = 5  # words per feature that may be names for it
+MOST = 200  # candidates per level, the largest first
+
+
+@dataclass(frozen=True, eq=False)
+class Spot:
+    """One connected place where a word is true."""
+
+    centre: Array  # (3,) world units
+    box: Array  # (2, 3) lower and upper corner, world units, between 2 % and 98 % of its Gaussians
+    rows: Array  # (M,) int64 numbers of its Gaussians
+    share: float  # of the scene's surface, in [0, 1]
+    colour: Word | None
+    material: Word | None
+
+
+@dataclass(frozen=True, eq=False)
+class InventoryEntry:
+    """A word that is true in the scene."""
+
+    phrase: str
+    also: tuple[str, ...]  # other words for the same
+    level: int  # index into LEVELS
+    probability: float  # that it or a word of `also` is right, a mean over its surface
+    score: float  # peak relevancy of the phrase, as a query gives it
+    share: float  # of the scene's surface, in [0, 1]
+    spots: tuple[Spot, ...]  # the largest first
+
+
+@dataclass(frozen=True, eq=False)
+class _Claim:
+    """A group of words that claim the same features at one level."""
+
+    level: int
+    phrases: tuple[str, ...]  # the most claimed first
+    rows: Array  # (M,) int64 numbers of the Gaussians for which one of them is the best
+    probability: float
+
+
+def _claims(
+    codec: Codec, latents: Array, of: Array, words: WordScores, level: int, areas: Array
+) -> Iterator[_Claim]:
+    """Yield groups of words at a level, those that cover most first.
+
+    latents: (M, d) the distinct ones of the field; of: (N,) int64 number of each Gaussian's, -1 for none.
+    """
+    best, shares = words.best(codec, latents, RUNNERS_UP)
+    if best.size == 0:  # no words, or no features
+        return
+    has = of >= 0
+    surface = np.bincount(of[has], areas[has], minlength=len(latents))
+    least = LEAST_SHARE * max(float(areas.sum()), 1e-300)
+    mass = np.bincount(best.ravel(), (surface[:, None] * shares).ravel())
+    order = np.argsort(-mass, kind="stable")[:MOST]
+    candidates = order[mass[order] >= least / 2]
+    names = np.zeros((len(surface), len(candidates)), np.float32)  # (M, C) probability of each candidate
+    for column, word in enumerate(candidates):
+        names[:, column] = np.where(best == word, shares, 0).sum(1)
+    for group in same_things(names, surface):
+        numbers = candidates[group]
+        winners = np.isin(best[:, 0], numbers)
+        weight = surface[winners]
+        if weight.sum() < least:
+            continue
+        probability = float(weight @ names[winners][:, group].sum(1)) / float(weight.sum())
+        if probability < LIKELY:
+            continue
+        rows = np.flatnonzero(has & winners[np.maximum(of, 0)])
+        yield _Claim(level, tuple(words.phrases[number] for number in numbers), rows, probability)
+
+
+def same_things(names: Array, surface: Array) -> list[list[int]]:
+    """Return groups of columns that name the same.
+
+    names: (M, C) probabilities of C words, the most claimed first; surface: (M,) of each feature. Two
+    words name the same where most of what either claims is claimed by the other as well:
+    sum_m s_m min(p_ma, p_mb) >= SAME max(sum_m s_m p_ma, sum_m s_m p_mb). A word joins the first group
+    whose most claimed word it agrees with.
+    """
+    weighted = names.astype(np.float64) * surface[:, None]
+    totals = weighted.sum(0)
+    groups: list[list[int]] = []
+    for word in range(names.shape[1]):
+        for group in groups:
+            head = group[0]
+            common = np.minimum(weighted[:, word], weighted[:, head]).sum()
+            if common >= SAME * max(totals[word], totals[head]):
+                group.append(word)
+                break
+        else:
+            groups.append([word])
+    return groups
+
+
+def scene_inventory(describer: Describer, progress: Progress = silent) -> list[InventoryEntry]:
+    """Return every word that is true in the scene, whole things first, then by surface.
+
+    A word is listed once, at the coarsest level where it is claimed and found.
+    """
+    field, known = describer.engine.field, describer.known
+    of = np.full(known.shape, -1, np.int64)
+    latents, of[known] = field.codec.unique(field.latents[known])
+    entries: list[InventoryEntry] = []
+    named: set[str] = set()
+    for level in reversed(range(len(LEVELS))):
+        claims = list(
+            _claims(field.codec, latents, of[level], describer.words[level], level, describer.areas)
+        )
+        for done, claim in enumerate(claims):
+            progress("checking words", done / len(claims), LEVELS[level])
+            if named.isdisjoint(claim.phrases):
+                entry = _verified(describer, claim)
+                if entry is not None:
+                    entries.append(entry)
+                    named.update(claim.phrases)
+        progress("checking words", 1.0, LEVELS[level])
+    return entries
+
+
+def _verified(describer: Describer, claim: _Claim) -> InventoryEntry | None:
+    """Return the claim as an entry under the first of its words that a query finds there, if any."""
+    engine, areas, level = describer.engine, describer.areas, claim.level
+    for phrase in claim.phrases:
+        vector = describer.words[level].vector(phrase)
+        result = engine.run(phrase, get_args(LevelChoice)[1 + level], vector=vector)  # after "auto"
+        agreed = claim.rows[result.relevancy[level, claim.rows] > FLOOR]
+        if not result.found or 2 * areas[agreed].sum() < areas[claim.rows].sum():
+            continue
+        spots = tuple(_spot(describer, level, part) for part in _solid(engine.surface, areas, agreed))
+        if spots:
+            others = tuple(other for other in claim.phrases if other != phrase)
+            share = float(sum(spot.share for spot in spots))
+            return InventoryEntry(phrase, others, level, claim.probability, result.peak, share, spots)
+    return None
+
+
+def _solid(surface: Surface, areas: Array, rows: Array) -> list[Array]:
+    """Return the connected parts of Gaussians `rows` (M,), the largest first, without splinters."""
+    numbers = np.flatnonzero(np.isin(surface.rows, rows))
+    found = [surface.rows[part] for part in surface.parts(numbers).each()]
+    parts = sorted(found, key=lambda part: -areas[part].sum())
+    least = LEAST_SPOT * areas[parts[0]].sum() if parts else 0.0
+    return [part for part in parts if len(part) >= LEAST_COUNT and areas[part].sum() >= least]
+
+
+def _spot(describer: Describer, level: int, rows: Array) -> Spot:
+    engine, weights = describer.engine, np.maximum(describer.areas[rows], 1e-300)
+    positions = engine.scene.gaussians.means[rows].astype(np.float64)
+    colour, material = describer.appearance(engine.field.latents[level, rows], weights)
+    return Spot(
+        centre=weights @ positions / weights.sum(),
+        box=axis_aligned_box(positions),
+        rows=rows,
+        share=float(weights.sum()) / float(describer.areas.sum()),
+        colour=colour,
+        material=material,
+    )
