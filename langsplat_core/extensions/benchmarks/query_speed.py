@@ -2,7 +2,7 @@
 
 All methods answer for the same vectors, the scene's codewords: the autoencoder of d = 3 is fitted to them
 here. The paper's order blends latents, decodes every pixel of a view at three levels and compares (LangSplat,
-section 3.4); it knows nothing but that view. The other two, a table over the sphere and a codebook, find the
+section 3.4); it knows nothing but that view. The other two, cells of the sphere and a codebook, find the
 relevancy of every Gaussian and answer with level, regions, verdict and place, which hold for all views; an
 image then blends one number per Gaussian.
 """
@@ -100,12 +100,12 @@ def measure_queries(
     asked = _Asked(texts, engine.text_vectors(texts), field.latents[..., 0], field.known, codewords)
     fitted = train_autoencoder(codewords, AutoencoderConfig(steps=config.codec_steps), progress)
     encoded = with_codec(field, fitted)
-    by_table = QueryEngine(replace(scene, language=encoded), lambda _: encoder)
+    by_cells = QueryEngine(replace(scene, language=encoded), lambda _: encoder)
     camera = scene.cameras[0].resized(*config.size)
     progress("the paper's order", 0.3)
     costs = [
         _paper(scene, encoded, camera, asked),
-        _ours("table lookup", by_table, camera, asked, config.repeats, fitted),
+        _ours("cells", by_cells, camera, asked, config.repeats, fitted),
         _ours("codebook", engine, camera, asked, config.repeats, None),
     ]
     progress("asking", 1.0)

@@ -140,7 +140,7 @@ def test_every_order_is_measured_against_what_it_should_find():
     report = measure_queries(codebook_scene(), FakeEncoder(), SMALL)
     paper, table, codebook = report.costs
     assert (report.gaussians, report.size, report.phrases) == (3 * PER_BLOB, (40, 30), 3)
-    assert [cost.way for cost in report.costs] == ["paper's order", "table lookup", "codebook"]
+    assert [cost.way for cost in report.costs] == ["paper's order", "cells", "codebook"]
     assert codebook.lookup.p99 < 1e-6
     assert codebook.codec == codebook.lookup  # its latents stand for the codewords themselves
     assert 0 < table.lookup.mean < table.codec.mean  # 40 steps fit nothing; the table shows what they did
