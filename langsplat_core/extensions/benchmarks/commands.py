@@ -84,7 +84,7 @@ class _EvalLabels(_Eval):
     def evaluate(self, benchmark: "Benchmark", profile: Profile) -> None:
         """Train the scenes with --train, score them, print the tables and write the files asked for."""
         from langsplat_core.extensions.benchmarks.report import (
-            Subject,
+            Evaluated,
             beside_published,
             run_benchmark,
             save_json,
@@ -98,7 +98,7 @@ class _EvalLabels(_Eval):
         if failed and not left:
             raise InputError(reasons)
         only = tuple(left) if failed else self.only
-        subject = Subject(self.scene_and_data()[0], self.maps, self.encoder, self.paper_order)
+        subject = Evaluated(self.scene_and_data()[0], self.maps, self.encoder, self.paper_order)
         with TerminalProgress() as progress:
             report = run_benchmark(
                 benchmark, profile, subject, load_text_encoder, only, self.pictures, progress
@@ -171,7 +171,7 @@ class EvalScanNet(_Eval):
     """
 
     def run(self) -> None:
-        from langsplat_core.extensions.benchmarks.report import Subject
+        from langsplat_core.extensions.benchmarks.report import Evaluated
         from langsplat_core.extensions.benchmarks.scannet import (
             point_table,
             read_scannet,
@@ -182,7 +182,7 @@ class EvalScanNet(_Eval):
 
         scene, data = self.scene_and_data()
         with TerminalProgress() as progress:
-            subject = Subject(scene, self.maps, self.encoder)
+            subject = Evaluated(scene, self.maps, self.encoder)
             report = run_scannet(read_scannet(data), subject, load_text_encoder, self.only, progress)
         print(point_table(report))
         if self.json is not None:
@@ -203,9 +203,9 @@ class BenchRaster:
     """Folder for raster.md, raster.json and raster.png."""
 
     def run(self) -> None:
-        from langsplat_core.extensions.benchmarks.raster_speed import Report, plot, quick_plan, run_plan
+        from langsplat_core.extensions.benchmarks.raster_speed import RasterReport, plot, quick_plan, run_plan
 
-        def keep(report: Report) -> None:
+        def keep(report: RasterReport) -> None:
             draw = partial(plot, report.rows)
             write_report(self.out, "raster", report.text, report.figures, draw)
 

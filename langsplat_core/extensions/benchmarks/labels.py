@@ -54,7 +54,7 @@ Truth = Outlines | MaskFile  # true mask of a phrase in a frame
 
 
 @dataclass(frozen=True, eq=False)
-class Label:
+class LabelledPhrase:
     """A phrase that is asked in a frame, with the true mask and boxes."""
 
     phrase: str
@@ -69,7 +69,7 @@ class Frame:
 
     name: str  # of its photograph, without extension; dots inside belong to it
     size: Size  # of the label's grid
-    labels: tuple[Label, ...]
+    labels: tuple[LabelledPhrase, ...]
     photograph: Path | None = None  # to draw on
 
 
@@ -202,7 +202,7 @@ def _read_frame(path: Path, dataset: Path) -> tuple[Frame, list[str]]:
             polygons[phrase].append(polygon)
             boxes.setdefault(phrase, []).append(_box(item.get("bbox"), polygon))
     labels = tuple(
-        Label(phrase, Outlines(size, tuple(outlines)), np.stack(boxes[phrase]))
+        LabelledPhrase(phrase, Outlines(size, tuple(outlines)), np.stack(boxes[phrase]))
         for phrase, outlines in polygons.items()
         if outlines
     )
@@ -314,5 +314,5 @@ def _read_ovs3d_frame(folder: Path, view: Path, classes: tuple[str, ...]) -> Fra
     files = {name: view / f"{name}.png" for name in classes if (view / f"{name}.png").is_file()}
     photograph = photograph_of(folder / "images", view.name)
     grid = photograph or next(iter(files.values()), None)
-    labels = tuple(Label(name, MaskFile(path), None) for name, path in files.items())
+    labels = tuple(LabelledPhrase(name, MaskFile(path), None) for name, path in files.items())
     return Frame(view.name, (1, 1) if grid is None else picture_size(grid), labels, photograph)

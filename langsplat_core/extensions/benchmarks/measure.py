@@ -309,7 +309,7 @@ def _timed(call: Callable[[], Any]) -> tuple[list[float], float | None]:
 
 
 @dataclass(frozen=True, eq=False)
-class Window:
+class ReferenceWindow:
     """Part of an image and its exact blending weights."""
 
     at: tuple[slice, slice]  # rows and columns of the image
@@ -332,7 +332,7 @@ class ReferenceWindows:
 
     footprints: Footprints  # of all N
     rows: Array  # (K,) ascending: the Gaussians that reach into a window
-    windows: tuple[Window, ...]
+    windows: tuple[ReferenceWindow, ...]
 
     def splat(self, values: Array) -> list[Array]:
         """(N, C) -> each window's (h, w, C) image, float64."""
@@ -420,7 +420,7 @@ def _window(
     settings: RasterSettings,
     at: tuple[slice, slice],
     place: tuple[int, Array],
-) -> Window:
+) -> ReferenceWindow:
     """`place`: how many columns the matrix has, and the column of each footprint."""
     count, where_to = place
     rows, columns = at
@@ -436,4 +436,4 @@ def _window(
         indices.append(np.full(len(where[-1]), where_to[step.index]))
     entries = (np.concatenate(weights), (np.concatenate(where), np.concatenate(indices)))
     matrix = scipy.sparse.csr_array(entries, shape=(height * width, count))
-    return Window(at, matrix, view.cut_off_band(_BAND))
+    return ReferenceWindow(at, matrix, view.cut_off_band(_BAND))

@@ -49,7 +49,7 @@ def quick_plan(plan: RasterBenchConfig) -> RasterBenchConfig:
 
 
 @dataclass(frozen=True)
-class Report:
+class RasterReport:
     """Results of one run of the benchmark."""
 
     machine: dict[str, object]
@@ -75,8 +75,10 @@ class Report:
 
 
 def run_plan(
-    plan: RasterBenchConfig, progress: Progress = silent, keep: Callable[[Report], None] = lambda _: None
-) -> Report:
+    plan: RasterBenchConfig,
+    progress: Progress = silent,
+    keep: Callable[[RasterReport], None] = lambda _: None,
+) -> RasterReport:
     """Measure; a few minutes for the default plan.
 
     `keep` is given what there is after every scene and size, so that an interrupted run leaves that.
@@ -97,9 +99,9 @@ def run_plan(
         for step, (channels, backend) in enumerate(steps):
             progress(f"{name}, {backend.name}", (n + step / len(steps)) / total)
             rows += measure(backend, case, channels, exact, foresight)
-        keep(Report(machine | {"unfinished": f"{n + 1} of {total} scenes and sizes"}, list(rows)))
+        keep(RasterReport(machine | {"unfinished": f"{n + 1} of {total} scenes and sizes"}, list(rows)))
     progress("bench: done", 1.0)
-    return Report(machine, rows)
+    return RasterReport(machine, rows)
 
 
 def sweep(counts: tuple[int, ...], sizes: tuple[tuple[int, int], ...], pivot: int) -> list[SceneSize]:

@@ -18,7 +18,7 @@ from langsplat_core.errors import InputError, shortened
 from langsplat_core.extensions.benchmarks.labels import (
     Benchmark,
     Frame,
-    Label,
+    LabelledPhrase,
     LabelledScene,
     Size,
     check_same_image,
@@ -57,7 +57,7 @@ OPACITY = 0.55
 MAX_MARKS = 100  # of a flat map every pixel is a peak
 
 
-def write_image(folder: Path, frame: Frame, label: Label, answer: Prediction, truth: Array) -> None:
+def write_image(folder: Path, frame: Frame, label: LabelledPhrase, answer: Prediction, truth: Array) -> None:
     """`folder`/<frame>/<phrase>.png on the scored grid; over black where the photograph is not there."""
     rows, columns = answer.mask.shape
     photo = np.zeros((rows, columns, 3))
@@ -151,7 +151,7 @@ def _grid(answer: Prediction | str, frame: Frame) -> Size:
 
 
 def _score(
-    scene: str, frame: Frame, label: Label, answer: Prediction | str, truth: Array, profile: Profile
+    scene: str, frame: Frame, label: LabelledPhrase, answer: Prediction | str, truth: Array, profile: Profile
 ) -> QueryScore:
     placed = label.boxes is not None and not isinstance(profile.rule, SilhouetteRule)
     if isinstance(answer, str):
@@ -401,8 +401,8 @@ FULL_SIZE = 100_000  # px: photographs are read for their cameras alone and not 
 
 
 @dataclass(frozen=True)
-class Subject:
-    """Subject of a measurement: exactly one of `scene` and `maps` is set."""
+class Evaluated:
+    """Evaluated of a measurement: exactly one of `scene` and `maps` is set."""
 
     scene: Path | None = None  # a scene file, or a folder of <benchmark's scene>.ply
     maps: Path | None = None  # <view>/<phrase>..., or <benchmark's scene>/<view>/<phrase>...
@@ -413,7 +413,7 @@ class Subject:
 def run_benchmark(
     benchmark: Benchmark,
     profile: Profile,
-    subject: Subject,
+    subject: Evaluated,
     load_encoder: LoadEncoder,
     only: Sequence[str] = (),
     pictures: Path | None = None,
@@ -442,7 +442,7 @@ def run_benchmark(
     return BenchmarkReport(benchmark.name, profile, f"{subject.scene or subject.maps}{order}", scores)
 
 
-def chosen_scenes(labelled: Sequence[str], only: Sequence[str], subject: Subject) -> list[str]:
+def chosen_scenes(labelled: Sequence[str], only: Sequence[str], subject: Evaluated) -> list[str]:
     """Return the names of the `labelled` scenes to score.
 
     These are `only`, or the one that a scene file is named after where several could be meant. Raises
@@ -461,7 +461,7 @@ def chosen_scenes(labelled: Sequence[str], only: Sequence[str], subject: Subject
 
 
 def open_scene(
-    subject: Subject, name: str, load_encoder: LoadEncoder, rule: AnswerRule = "regions"
+    subject: Evaluated, name: str, load_encoder: LoadEncoder, rule: AnswerRule = "regions"
 ) -> QueryEngine:
     """Return the scene of `subject` that belongs to the labelled scene `name`, to be asked."""
     assert subject.scene is not None
@@ -472,7 +472,11 @@ def open_scene(
 
 
 def _scene_source(
-    labelled: LabelledScene, profile: Profile, subject: Subject, load_encoder: LoadEncoder, progress: Progress
+    labelled: LabelledScene,
+    profile: Profile,
+    subject: Evaluated,
+    load_encoder: LoadEncoder,
+    progress: Progress,
 ) -> SceneSource:
     # Published maps are read as published.
     rule: AnswerRule = "peak" if isinstance(profile.rule, MapRule) else "regions"

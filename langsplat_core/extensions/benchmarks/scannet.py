@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.extensions.benchmarks.report import FIXED, Subject, chosen_scenes, open_scene
+from langsplat_core.extensions.benchmarks.report import FIXED, Evaluated, chosen_scenes, open_scene
 from langsplat_core.io.files import write_json
 from langsplat_core.io.hostile import read_npy
 from langsplat_core.io.ply_table import open_ply
@@ -169,7 +169,7 @@ class PointReport:
 
 def run_scannet(
     files: Mapping[str, Path],
-    subject: Subject,
+    subject: Evaluated,
     load_encoder: LoadEncoder,
     only: Sequence[str] = (),
     progress: Progress = silent,

@@ -4,5 +4,10 @@ from langsplat_core.registry import Extension
 
 _COMMANDS = "langsplat_core.extensions.geometry.commands"
 EXTENSION = Extension(
-    commands={name: f"{_COMMANDS}:{name.title()}" for name in ("map", "mesh", "register", "merge")}
+    commands={
+        "map": f"{_COMMANDS}:Map",
+        "mesh": f"{_COMMANDS}:WriteMesh",
+        "register": f"{_COMMANDS}:Register",
+        "merge": f"{_COMMANDS}:Merge",
+    }
 )

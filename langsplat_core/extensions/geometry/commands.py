@@ -47,7 +47,7 @@ TRANSFORM_LIMIT = 1 << 20  # bytes of a file with a matrix
 
 
 @dataclass(frozen=True)
-class Mesh:
+class WriteMesh:
     """Write the surface of a scene, or of what a phrase names, as triangles with colours.
 
     They are fused from images rendered by the scene's cameras, or from around it, so that what no camera sees

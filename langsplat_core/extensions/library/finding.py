@@ -9,7 +9,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import EncoderError, LangSplatError
-from langsplat_core.extensions.library.index import Group, Library, draw, fits_in
+from langsplat_core.extensions.library.index import EncoderGroup, Library, draw, fits_in
 from langsplat_core.io.scenes import companion_path, load_scene
 from langsplat_core.io.sidecar import SUFFIX, read_stored
 from langsplat_core.progress import Progress, silent
@@ -84,7 +84,7 @@ def find(
 
 def _ask_group(
     library: Library,
-    group: Group,
+    group: EncoderGroup,
     phrase: str,
     load_encoder: LoadEncoder | None,
     at_most: int,
@@ -126,7 +126,7 @@ def _ask_group(
     return Answered(phrase, group.encoder_id, (*asked, *others), unread=tuple(unread))
 
 
-def rank(group: Group, vectors: Mapping[str, Array]) -> list[Verdict]:
+def rank(group: EncoderGroup, vectors: Mapping[str, Array]) -> list[Verdict]:
     """Return the verdict on every scene by the index alone: on the best of some phrases."""
     best = [Verdict(False, "chance", -math.inf)] * len(group.scenes)
     for text, vector in vectors.items():
@@ -137,7 +137,7 @@ def rank(group: Group, vectors: Mapping[str, Array]) -> list[Verdict]:
     return best
 
 
-def _vector(library: Library, group: Group, text: str, load_encoder: LoadEncoder | None) -> Array:
+def _vector(library: Library, group: EncoderGroup, text: str, load_encoder: LoadEncoder | None) -> Array:
     """Return the (D,) unit vector of a phrase.
 
     It is the encoder's, checked against the group's canonical vectors, else that of the first phrasebook that

@@ -70,7 +70,7 @@ class Columns(NamedTuple):
 
 
 KINDS = Columns("<f4", "<f4", "<f4", "<f4", "<u4", "<u4", "<i4", "<u4", "|i1")  # type: ignore[arg-type]
-ROWS = Columns(0, 0, 0, 1, 1, 1, 2, 2, 0)  # type: ignore[arg-type]  # column of `Group.starts` that counts them
+ROWS = Columns(0, 0, 0, 1, 1, 1, 2, 2, 0)  # type: ignore[arg-type]  # column of `EncoderGroup.starts` that counts them
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class Listed:
 
 
 @dataclass(frozen=True, eq=False)
-class Group:
+class EncoderGroup:
     """The scenes of one encoder, and the arrays of `COLUMNS` of all of them, one after the other."""
 
     encoder_id: str
@@ -130,7 +130,7 @@ class Library:
     """A folder of scenes with its index."""
 
     folder: Path
-    groups: tuple[Group, ...]
+    groups: tuple[EncoderGroup, ...]
     unread: tuple[Listed, ...] = ()  # scenes that cannot be opened
     thumbnails: Mapping[str, Array] | None = None  # by path: (H, W, 3) uint8
 
@@ -355,10 +355,10 @@ def read_library(index: Path, folder: Path) -> Library:
     return Library(folder, tuple(groups), stated.unread, pictures)
 
 
-def _group(file: Any, number: int, encoder: str, scenes: tuple[Listed, ...]) -> tuple[Group, Array]:
+def _group(file: Any, number: int, encoder: str, scenes: tuple[Listed, ...]) -> tuple[EncoderGroup, Array]:
     """Return a group and its (S, H, W, 3) thumbnails; ValueError for arrays that do not fit its scenes."""
     canonical, shown = file.get_tensor(f"{number}.canonical"), file.get_tensor(f"{number}.thumbnails")
-    group = Group(
+    group = EncoderGroup(
         encoder, canonical, scenes, Columns(*(file.get_tensor(f"{number}.{c}") for c in KINDS._fields))
     )
     if canonical.dtype != np.float32 or canonical.ndim != 2:
@@ -375,7 +375,7 @@ def _group(file: Any, number: int, encoder: str, scenes: tuple[Listed, ...]) -> 
 # The first pass: fits of a phrase in all scenes of a group.
 
 
-def fits_in(group: Group, vector: Array) -> Array:
+def fits_in(group: EncoderGroup, vector: Array) -> Array:
     """Return the (S, 3) float64 fits of a phrase's (D,) unit vector in every scene, see `QueryResult.fits`.
 
     They are -inf in scenes that are not indexed. Raises FormatError for an index whose numbers do not fit

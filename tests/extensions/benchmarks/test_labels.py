@@ -11,7 +11,7 @@ from plyfile import PlyData, PlyElement
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.extensions.benchmarks import scannet
 from langsplat_core.extensions.benchmarks.labels import read_3d_ovs, read_lerf_ovs, without_suffix
-from langsplat_core.extensions.benchmarks.report import Subject
+from langsplat_core.extensions.benchmarks.report import Evaluated
 from langsplat_core.extensions.benchmarks.scannet import NYU40, read_points, read_scannet, run_scannet
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.query.engine import QueryEngine
@@ -172,7 +172,7 @@ def labelled(tmp_path):
 def run(tmp_path, ids, **more):
     (tmp_path / "maps").mkdir(exist_ok=True)
     np.save(tmp_path / "maps" / f"{NAME}.npy", np.asarray(ids))
-    return run_scannet(read_scannet(tmp_path / "data"), Subject(maps=tmp_path / "maps"), None, **more)
+    return run_scannet(read_scannet(tmp_path / "data"), Evaluated(maps=tmp_path / "maps"), None, **more)
 
 
 def test_means_over_the_classes_that_are_there(labelled):
@@ -208,7 +208,7 @@ def test_vertices_take_the_nearest_meaning(tmp_path):
     positions = np.repeat(CENTRES, 2, 0) + 0.01
     names = ["wall", "wall", "floor", "floor", "bed", "sofa"]  # the last is called bed
     write_labels(tmp_path / "data", positions, [NYU40[name] for name in names])
-    report = run_scannet(read_scannet(tmp_path / "data"), Subject(scene=tmp_path), None)
+    report = run_scannet(read_scannet(tmp_path / "data"), Evaluated(scene=tmp_path), None)
     score = report.scores[0]
     assert (score.iou, score.accuracy) == pytest.approx(((1 + 1 + 1 / 2 + 0) / 4, 3 / 4))
 
@@ -243,4 +243,4 @@ def test_other_layouts(labelled, tmp_path):
     with pytest.raises(InputError, match="--only other"):
         run(labelled, np.zeros(10, int), only=("other",))
     with pytest.raises(InputError, match="no such file"):
-        run_scannet(read_scannet(labelled / "data"), Subject(maps=tmp_path / "nothing"), None)
+        run_scannet(read_scannet(labelled / "data"), Evaluated(maps=tmp_path / "nothing"), None)

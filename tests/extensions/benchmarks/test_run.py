@@ -21,7 +21,7 @@ from langsplat_core.extensions.benchmarks.profiles import (
     voted,
 )
 from langsplat_core.extensions.benchmarks.report import (
-    Subject,
+    Evaluated,
     inside_any_box,
     run_benchmark,
     save_json,
@@ -146,7 +146,7 @@ def no_encoder(name):
 
 
 def of_maps(data, maps, profile=DIRECT, **more):
-    return run_benchmark(read_lerf_ovs(data), profile, Subject(maps=maps), no_encoder, **more)
+    return run_benchmark(read_lerf_ovs(data), profile, Evaluated(maps=maps), no_encoder, **more)
 
 
 @pytest.fixture
@@ -205,7 +205,7 @@ def test_an_empty_label_is_left_out_not_scored(tmp_path):
     ovs_view(tmp_path / "s", "00", {"cup": block(0, 0, 9, 9), "wall": np.zeros((30, 40), bool)})
     silhouette(tmp_path / "maps" / "00", "cup", block(0, 0, 9, 9))
     silhouette(tmp_path / "maps" / "00", "wall", np.zeros((30, 40), bool))
-    subject = Subject(maps=tmp_path / "maps")
+    subject = Evaluated(maps=tmp_path / "maps")
     report = run_benchmark(read_3d_ovs(tmp_path / "s"), OVS_PROFILES["direct-3d"], subject, no_encoder)
     assert [query.phrase for query in report.queries] == ["cup"]
     assert "1 labels left out: 00: wall (empty mask)" in table(report)
@@ -295,7 +295,7 @@ def blobs_on_disk(tmp_path):
 
 
 def of_scene(tmp_path, profile):
-    subject = Subject(scene=tmp_path / "blobs.ply")
+    subject = Evaluated(scene=tmp_path / "blobs.ply")
     return run_benchmark(read_3d_ovs(tmp_path / "data"), profile, subject, lambda _: FakeEncoder())
 
 
@@ -347,7 +347,7 @@ def test_a_view_that_is_missing_and_words_that_are_unknown(blobs_on_disk, caplog
 
 def test_scenes_and_labels_that_do_not_fit(blobs_on_disk):
     tmp_path, _ = blobs_on_disk
-    ours, one = OVS_PROFILES["ours"], Subject(scene=tmp_path / "blobs.ply")
+    ours, one = OVS_PROFILES["ours"], Evaluated(scene=tmp_path / "blobs.ply")
 
     def refused(match: str, data, subject=one) -> None:
         with pytest.raises(InputError, match=match):
@@ -358,9 +358,9 @@ def test_scenes_and_labels_that_do_not_fit(blobs_on_disk):
         r"none of the scene's views \(photo.0.x, photo.1.x\) is a labelled frame \(00\)", tmp_path / "other"
     )
     refused("could be any labelled scene of data, other", tmp_path)
-    refused(r"data\.ply: no such scene", tmp_path, Subject(scene=tmp_path))
+    refused(r"data\.ply: no such scene", tmp_path, Evaluated(scene=tmp_path))
     save_scene(tmp_path / "data.ply", Scene(blob_scene().gaussians, blob_scene().language))
-    refused("it has none", tmp_path / "data", Subject(scene=tmp_path))
+    refused("it has none", tmp_path / "data", Evaluated(scene=tmp_path))
     ovs_view(tmp_path / "data", "photo.0.x", {"mug": block(0, 0, 9, 9, (160, 160))}, (160, 160))
     refused("the view is 160x120, the labels are 160x160", tmp_path / "data")
     (tmp_path / "blobs.langsplat.safetensors").unlink()
