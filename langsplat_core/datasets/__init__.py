@@ -1,4 +1,4 @@
-"""Photographs with cameras, whatever they came with."""
+"""Photographs with cameras: COLMAP's, nerfstudio's, or found from the photographs."""
 
 import os
 from dataclasses import replace
@@ -8,7 +8,10 @@ from langsplat_core.config import DatasetConfig, check_settings
 from langsplat_core.datasets.capture import Capture, metres_of
 from langsplat_core.datasets.colmap import find_model, load_colmap
 from langsplat_core.datasets.holdout import split
+from langsplat_core.datasets.known_poses import add_points
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
+from langsplat_core.datasets.photos import photo_folder
+from langsplat_core.datasets.sfm import load_photos
 from langsplat_core.datasets.video import kept_frames
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import shown
@@ -24,28 +27,25 @@ ACCEPTED = (
 
 
 def load_capture(path: Path, config: DatasetConfig, work: Path, progress: Progress = silent) -> Capture:
-    """Undistorted photographs of at most ``config.max_side`` pixels, their cameras and points.
+    """Return undistorted photographs of at most ``config.max_side`` pixels, their cameras and points.
 
     Recognises, in this order, a nerfstudio ``transforms.json``, a COLMAP model, and plain photographs,
     whose cameras are then found by structure from motion. A dataset with cameras but without points gets
     ones that are triangulated from its training views. Whatever had to be computed is kept in ``work/sfm-*``
-    and not computed again for the same photographs. The world is the dataset's own; how long its unit is, is
-    said by `config`, the dataset, or the places (GPS) of the photographs. What had to be left out
-    is reported once, by a warning of the logger "langsplat". Raises InputError where nothing usable remains.
+    and not computed again for the same photographs. The world is the dataset's own; `config`, the dataset, or
+    the places (GPS) of the photographs tell how long its unit is. What had to be left out is reported once,
+    by a warning of the logger "langsplat". Raises InputError where nothing usable remains.
     """
     capture = load_photographs(path, config, work, progress)
     metres = config.metres_per_unit or capture.metres_per_unit or metres_of(capture)
     capture = replace(capture, metres_per_unit=metres)
     if len(capture.points):
         return capture
-    # pycolmap is imported where something is computed: a dataset with cameras and points does without.
-    from langsplat_core.datasets.known_poses import add_points
-
     return add_points(capture, split(capture, config)[0], work, progress)
 
 
 def load_photographs(path: Path, config: DatasetConfig, work: Path, progress: Progress = silent) -> Capture:
-    """`load_capture` with the points and the scale that the dataset states, or none."""
+    """Return what `load_capture` does, with the points and the scale that the dataset states, or none."""
     path = Path(path)
     check_settings(config, "--dataset.")
     if not os.path.exists(path):  # unlike Path.exists, also no for names that no file system could hold
@@ -58,15 +58,14 @@ def load_photographs(path: Path, config: DatasetConfig, work: Path, progress: Pr
 
 def _load(path: Path, config: DatasetConfig, work: Path, progress: Progress) -> Capture:
     max_side = config.max_side
+    frames = path / "transforms.json"
     if path.is_file() and path.suffix.lower() == ".json":
         return load_nerfstudio(path, max_side, progress)
-    if (path / "transforms.json").is_file():
-        return load_nerfstudio(path / "transforms.json", max_side, progress)
+    if frames.is_file():
+        return load_nerfstudio(frames, max_side, progress)
     model = find_model(path)
     if model is not None:
         return load_colmap(path, model, max_side, progress)
-    from langsplat_core.datasets.sfm import load_photos, photo_folder
-
     if is_video(path):
         path = kept_frames(path, config.frames, work, progress)
     photos = photo_folder(path)

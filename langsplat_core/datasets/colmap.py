@@ -1,29 +1,24 @@
-"""COLMAP's sparse models, binary or text, read by ourselves: pycolmap does not notice where a file ends
-and fills cameras of a truncated one with whatever lies in memory.
+"""COLMAP's sparse models, binary or text, and datasets with one in ``sparse/0`` or ``sparse``.
 
-Layout: https://colmap.github.io/format.html. Rigs and frames (COLMAP >= 3.12) add nothing here, because
-images.bin still carries every image's own pose.
+Models are read here and not by pycolmap, which fills cameras of a truncated file with whatever lies in
+memory, cuts the names of a text model at their first blank, and refuses a model without points. So cameras
+open without the extra that brings pycolmap, too. Layout: https://colmap.github.io/format.html. Rigs and
+frames (COLMAP >= 3.12) add nothing here, because images.bin still carries every image's own pose.
 """
 
 import logging
 import os
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
-from langsplat_core.arrays import Array, number, rotation_matrices, whole_number
-from langsplat_core.datasets.capture import (
-    Capture,
-    Photo,
-    develop,
-    find_photos,
-    mask_beside,
-    tell_of_lost_points,
-)
+from langsplat_core.arrays import Array, rotation_matrices
+from langsplat_core.datasets.capture import Capture, warn_of_lost_points
 from langsplat_core.datasets.intrinsics import (
     BrownDistortion,
     ColmapDistortion,
@@ -31,17 +26,15 @@ from langsplat_core.datasets.intrinsics import (
     FisheyeDistortion,
     PhotoIntrinsics,
 )
+from langsplat_core.datasets.photos import Photo, develop, find_photos, mask_beside
 from langsplat_core.errors import FormatError, InputError, printable_line, shortened
 from langsplat_core.io.files import shown
 from langsplat_core.progress import Progress
 from langsplat_core.scene import FARTHEST
 
-Result = TypeVar("Result")
-
-MOST_DIGITS = 20  # of a whole number of 64 bits
-
-# id -> name and parameters, in file order
-CAMERA_MODELS = {
+# COLMAP's mapper drops points above 4 px itself, so only models that were made otherwise lose any here.
+MAX_POINT_ERROR = 4.0  # pixels
+CAMERA_MODELS = MappingProxyType({  # id -> name and parameters, in file order
     0: ("SIMPLE_PINHOLE", "f cx cy"),
     1: ("PINHOLE", "fx fy cx cy"),
     2: ("SIMPLE_RADIAL", "f cx cy k1"),
@@ -59,22 +52,32 @@ CAMERA_MODELS = {
     14: ("SIMPLE_FISHEYE", "f cx cy"),
     15: ("FISHEYE", "fx fy cx cy"),
     16: ("EUCM", "fx fy cx cy alpha beta"),
-}
+})  # fmt: skip
+_PARAMETERS = dict(CAMERA_MODELS.values())
+_BROWN = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+_FISHEYE = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
+
+log = logging.getLogger("langsplat")
 
 
 @dataclass(frozen=True)
 class ModelCamera:
-    """A row of cameras.bin."""
+    """A camera of a model; ValueError where no camera has such numbers."""
 
     model: str  # name in CAMERA_MODELS
     width: int
     height: int
     params: tuple[float, ...]
 
+    def __post_init__(self) -> None:
+        if len(self.params) != len(_PARAMETERS.get(self.model, "").split()):
+            raise ValueError(f"{len(self.params)} parameters do not make a {self.model} camera")
+        if not (self.width > 0 and self.height > 0 and np.isfinite(self.params).all()):
+            raise ValueError(f"a {self.model} camera of {self.width}x{self.height} pixels, {self.params}")
+
     def named(self) -> dict[str, float]:
-        """Parameters by name; a single focal length appears as both fx and fy."""
-        keys = next(keys for name, keys in CAMERA_MODELS.values() if name == self.model)
-        values = dict(zip(keys.split(), self.params, strict=True))
+        """Return parameters by name; a single focal length appears as both fx and fy."""
+        values = dict(zip(_PARAMETERS[self.model].split(), self.params, strict=True))
         if "f" in values:
             values["fx"] = values["fy"] = values.pop("f")
         return values
@@ -82,7 +85,7 @@ class ModelCamera:
 
 @dataclass(frozen=True, eq=False)
 class ModelImage:
-    """A row of images.bin, without its 2D points."""
+    """An image of a model, without its 2D points."""
 
     name: str
     camera_id: int
@@ -103,74 +106,64 @@ class SparseModel:
 
 def has_model(folder: Path) -> bool:
     """Return True where cameras and images lie in `folder`, both binary or both text."""
-    return any(_complete(folder, suffix) for suffix in (".bin", ".txt"))
-
-
-def _complete(folder: Path, suffix: str) -> bool:
-    return all((folder / f"{part}{suffix}").is_file() for part in ("cameras", "images"))
-
-
-def _suffix(folder: Path) -> str:
-    if not has_model(folder):
-        raise InputError(f"{folder} holds no cameras.bin and images.bin (or .txt)")
-    return ".bin" if _complete(folder, ".bin") else ".txt"
+    return any(
+        all((folder / f"{part}{suffix}").is_file() for part in ("cameras", "images"))
+        for suffix in (".bin", ".txt")
+    )
 
 
 def read_images(folder: Path) -> list[ModelImage]:
-    """Read the images of the model in `folder` alone. FormatError where they are damaged."""
-    suffix = _suffix(folder)
-    return _guarded((_BINARY if suffix == ".bin" else _TEXT)[1], folder / f"images{suffix}")
+    """Return the images of the model in `folder` alone. FormatError where they are damaged."""
+    images: list[ModelImage] = _content(_file(folder, "images"))
+    return images
 
 
 def read_model(folder: Path) -> SparseModel:
-    """Read the model in `folder`; binary is preferred. FormatError names the file that is broken."""
-    suffix = _suffix(folder)
-    read_cameras, _, read_points = _BINARY if suffix == ".bin" else _TEXT
-    cameras = _guarded(read_cameras, folder / f"cameras{suffix}")
-    images = read_images(folder)
+    """Return the model in `folder`; binary is preferred. FormatError names the file that is broken."""
+    cameras, images = _content(_file(folder, "cameras")), read_images(folder)
     for image in images:
         if image.camera_id not in cameras:
             raise FormatError(
-                f"{folder / f'images{suffix}'}: {printable_line(image.name, 80)} was taken with camera "
-                f"{image.camera_id}, "
-                "which the model lacks; export the model again"
+                f"{_file(folder, 'images')}: {printable_line(image.name, 80)} was taken with camera "
+                f"{printable_line(image.camera_id, 40)}, which the model lacks; export the model again"
             )
-    points_file = folder / f"points3D{suffix}"
-    points = _guarded(read_points, points_file) if points_file.is_file() else _points([])
-    return SparseModel(cameras, images, *points)
+    points = _file(folder, "points3D")
+    return SparseModel(cameras, images, *(_content(points) if points.is_file() else _points(())))
 
 
-def _guarded(read: Callable[[bytes], Result], path: Path) -> Result:
+def _file(folder: Path, part: str) -> Path:
+    """Return the file of a part of the model in `folder`."""
+    if not has_model(folder):
+        raise InputError(f"{folder} holds no cameras.bin and images.bin (or .txt)")
+    is_binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
+    return folder / f"{part}{'.bin' if is_binary else '.txt'}"
+
+
+def _content(path: Path) -> Any:
+    """Return what the reader of a file's name makes of it."""
     try:
-        return read(path.read_bytes())
+        return _READERS[path.name](path.read_bytes())
     except (struct.error, ValueError, IndexError, OverflowError) as error:
         raise FormatError(
             f"{path} is no readable COLMAP file ({printable_line(error, 120)}); export the model again"
         ) from None
 
 
-def _image(name: str, camera_id: int, quaternion_wxyz: Array, translation: Array) -> ModelImage:
-    largest = np.abs(quaternion_wxyz).max()
+def _image(name: str, camera_id: int, pose: list[float]) -> ModelImage:
+    """Return the image of a pose, which is a quaternion wxyz of any length and a translation."""
+    quaternion, translation = np.array(pose[:4]), np.array(pose[4:])
+    largest = np.abs(quaternion).max()
     if not ((np.abs(translation) <= FARTHEST).all() and 1e-9 < largest < 1e9):
         raise ValueError(f"image {name} has an impossible pose")
     matrix = np.eye(4)
-    matrix[:3, :3] = rotation_matrices(quaternion_wxyz[None])[0]
+    matrix[:3, :3] = rotation_matrices(quaternion[None])[0]
     matrix[:3, 3] = translation
     return ModelImage(name, camera_id, matrix)
 
 
-def _camera(model: str, width: int, height: int, params: tuple[float, ...]) -> ModelCamera:
-    if not (width > 0 and height > 0 and np.isfinite(params).all()):
-        raise ValueError(f"a {model} camera of {width}x{height} pixels with parameters {params}")
-    return ModelCamera(model, width, height, params)
-
-
-PointRow = tuple[Any, Any, float, int]  # position (3,), colour (3,), error, track length
-Points = tuple[Array, Array, Array, Array]
-
-
-def _points(rows: list[PointRow]) -> Points:
-    positions, colours, errors, tracks = zip(*rows, strict=True) if rows else ((), (), (), ())
+def _points(rows: Iterable[tuple[Any, Any, float, int]]) -> tuple[Array, Array, Array, Array]:
+    """Return the arrays of rows of position, colour, error and track length."""
+    positions, colours, errors, tracks = [list(column) for column in zip(*rows, strict=True)] or [[]] * 4
     return (
         np.array(positions, np.float64).reshape(-1, 3),
         np.array(colours, np.uint8).reshape(-1, 3),
@@ -179,108 +172,91 @@ def _points(rows: list[PointRow]) -> Points:
     )
 
 
+# Binary files: a count, and rows; a count too large ends in struct.error at the end of the data.
+
+
 def _binary_cameras(data: bytes) -> dict[int, ModelCamera]:
-    (count,) = struct.unpack_from("<Q", data)
     offset, cameras = 8, {}
-    for _ in range(count):  # a count too large ends in struct.error at the end of the data
+    for _ in range(*struct.unpack_from("<Q", data)):
         camera_id, model_id, width, height = struct.unpack_from("<iiQQ", data, offset)
         if model_id not in CAMERA_MODELS:
             raise ValueError(f"camera model number {model_id} is unknown or not a pinhole with a lens")
         model, keys = CAMERA_MODELS[model_id]
         params = struct.unpack_from(f"<{len(keys.split())}d", data, offset + 24)
-        cameras[camera_id] = _camera(model, width, height, params)
+        cameras[camera_id] = ModelCamera(model, width, height, params)
         offset += 24 + 8 * len(params)
     return cameras
 
 
-def _binary_images(data: bytes) -> list[ModelImage]:
-    (count,) = struct.unpack_from("<Q", data)
-    offset, images = 8, []
-    for _ in range(count):
+def _binary_images(data: bytes) -> Iterator[ModelImage]:
+    offset = 8
+    for _ in range(*struct.unpack_from("<Q", data)):
         _, *pose, camera_id = struct.unpack_from("<i7di", data, offset)
         end = data.index(b"\0", offset + 64)
-        images.append(
-            _image(data[offset + 64 : end].decode(), camera_id, np.array(pose[:4]), np.array(pose[4:]))
-        )
+        name = data[offset + 64 : end].decode()
         (observations,) = struct.unpack_from("<Q", data, end + 1)
         offset = end + 9 + 24 * observations
         if offset > len(data):
-            raise ValueError(f"the file ends inside image {images[-1].name}")
-    return images
+            raise ValueError(f"the file ends inside image {name}")
+        yield _image(name, camera_id, pose)
 
 
-def _binary_points(data: bytes) -> Points:
-    (count,) = struct.unpack_from("<Q", data)
-    offset, rows = 8, []
-    for _ in range(count):
+def _binary_points(data: bytes) -> Iterator[tuple[Any, Any, float, int]]:
+    offset = 8
+    for _ in range(*struct.unpack_from("<Q", data)):
         _, x, y, z, r, g, b, error, track = struct.unpack_from("<Q3d3BdQ", data, offset)
         offset += 51 + 8 * track
         if offset > len(data):
             raise ValueError("the file ends inside a point")
-        rows.append(((x, y, z), (r, g, b), error, track))
-    return _points(rows)
+        yield (x, y, z), (r, g, b), error, track
+
+
+# Text files: a line for each row, after comments.
 
 
 def _lines(data: bytes) -> list[str]:
     return [line.strip() for line in data.decode().splitlines() if not line.startswith("#")]
 
 
-def _whole(text: str) -> int:
-    """Parse a whole number of at most `MOST_DIGITS` digits; longer ones have no place in a message."""
-    if len(text) > MOST_DIGITS:
-        raise ValueError(f"a whole number of {len(text)} digits")
-    return whole_number(text)
-
-
 def _text_cameras(data: bytes) -> dict[int, ModelCamera]:
-    sizes = {name: len(keys.split()) for name, keys in CAMERA_MODELS.values()}
     cameras = {}
     for line in filter(None, _lines(data)):
         camera_id, model, width, height, *params = line.split()
-        if len(params) != sizes.get(model):
-            raise ValueError(f"camera {camera_id}: {len(params)} parameters do not make a {model}")
-        cameras[_whole(camera_id)] = _camera(model, _whole(width), _whole(height), tuple(map(number, params)))
+        cameras[int(camera_id)] = ModelCamera(model, int(width), int(height), tuple(map(float, params)))
     return cameras
 
 
-def _text_images(data: bytes) -> list[ModelImage]:
+def _text_images(data: bytes) -> Iterator[ModelImage]:
     lines = _lines(data)
     while lines and not lines[-1]:
         lines.pop()
-    images = []
     for line in lines[::2]:  # every second line lists 2D points, and may be empty
         _, *pose, camera_id, name = line.split(maxsplit=9)
-        numbers = np.array(list(map(number, pose)))
-        images.append(_image(name, _whole(camera_id), numbers[:4], numbers[4:]))
-    return images
+        yield _image(name, int(camera_id), list(map(float, pose)))
 
 
-def _text_points(data: bytes) -> Points:
-    rows: list[PointRow] = []
+def _text_points(data: bytes) -> Iterator[tuple[Any, Any, float, int]]:
     for line in filter(None, _lines(data)):
         fields = line.split()
-        numbers = [number(field) for field in fields[1:4]]
-        rows.append((numbers, [_whole(c) for c in fields[4:7]], number(fields[7]), len(fields[8:]) // 2))
-    return _points(rows)
+        position, colour = list(map(float, fields[1:4])), list(map(int, fields[4:7]))
+        yield position, colour, float(fields[7]), len(fields[8:]) // 2
 
 
-_BINARY = (_binary_cameras, _binary_images, _binary_points)
-_TEXT = (_text_cameras, _text_images, _text_points)
+_READERS: dict[str, Callable[[bytes], Any]] = {
+    "cameras.bin": _binary_cameras,
+    "cameras.txt": _text_cameras,
+    "images.bin": lambda data: list(_binary_images(data)),
+    "images.txt": lambda data: list(_text_images(data)),
+    "points3D.bin": lambda data: _points(_binary_points(data)),
+    "points3D.txt": lambda data: _points(_text_points(data)),
+}
 
 
-# Datasets with a COLMAP model: ``sparse/0`` (or another number) or ``sparse``, beside ``images``.
-
-log = logging.getLogger("langsplat")
-
-# COLMAP's mapper drops points above 4 px itself, so only models that were made otherwise lose any here.
-MAX_POINT_ERROR = 4.0  # pixels
-_BROWN = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-_FISHEYE = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
-_INTRINSICS = ("fx", "fy", "cx", "cy")
+# Datasets.
 
 
 def find_model(folder: Path) -> Path | None:
-    """The folder of the COLMAP model of a dataset, if it has one.
+    """Return the folder of the COLMAP model of a dataset, if it has one.
 
     Photographs that COLMAP cannot place together end in several models, of which the first is not always the
     largest: that with most photographs is taken, of equal ones the first, and a warning says which.
@@ -306,7 +282,7 @@ def find_model(folder: Path) -> Path | None:
 
 
 def _photographs_of(model_folder: Path) -> int:
-    """Number of photographs with a camera in a model; 0 if it is damaged."""
+    """Return the number of photographs with a camera in a model; 0 if it is damaged."""
     try:
         return len({image.name for image in read_images(model_folder)})
     except FormatError:
@@ -314,10 +290,9 @@ def _photographs_of(model_folder: Path) -> int:
 
 
 def intrinsics_of(camera: ModelCamera) -> PhotoIntrinsics:
-    """Intrinsics of a COLMAP camera; ValueError if its focal length is impossible."""
-    named = camera.named()
-    fx, fy, cx, cy = (named[key] for key in _INTRINSICS)
-    rest = {key: value for key, value in named.items() if key not in _INTRINSICS}
+    """Return the intrinsics of a COLMAP camera; ValueError if its focal length is impossible."""
+    rest = camera.named()
+    fx, fy, cx, cy = (rest.pop(key) for key in ("fx", "fy", "cx", "cy"))
     distortion: Distortion
     if camera.model in _BROWN:
         distortion = BrownDistortion(**rest)
@@ -329,9 +304,11 @@ def intrinsics_of(camera: ModelCamera) -> PhotoIntrinsics:
 
 
 def load_colmap(folder: Path, model_folder: Path, max_side: int, progress: Progress) -> Capture:
-    """The photographs of `folder` with the cameras and points of the model; see `load_capture`."""
+    """Return the photographs of `folder` with the cameras and points of the model; see `load_capture`."""
     model = read_model(model_folder)
-    photos = located_photos(model, _photo_folder(folder, model), model_folder)
+    # Without a folder of their own, photographs lie in the dataset's.
+    images = folder / "images" if (folder / "images").is_dir() or not model.images else folder
+    photos = located_photos(model, images, model_folder)
     # os.path.isfile, unlike Path.is_file, also says no to names that no file system could hold.
     missing = {photo.label for photo in photos if not os.path.isfile(photo.path)}
     if missing and len(missing) == len(photos):
@@ -347,7 +324,7 @@ def load_colmap(folder: Path, model_folder: Path, max_side: int, progress: Progr
             shortened(missing),
         )
     there = [photo for photo in photos if photo.label not in missing]
-    present = len(find_photos(_photo_folder(folder, model)))
+    present = len(find_photos(images))
     if 2 * len(there) < present:
         log.warning(
             "%s has cameras for only %d of the %d photographs beside it; another model may have more",
@@ -355,41 +332,33 @@ def load_colmap(folder: Path, model_folder: Path, max_side: int, progress: Progr
             len(there),
             present,
         )
-    cameras, images, files, masks = develop(there, max_side, progress)
-    return Capture(cameras, images, *good_points(model), photos=files, masks=masks)
+    cameras, pixels, files, masks = develop(there, max_side, progress)
+    return Capture(cameras, pixels, *good_points(model), photos=files, masks=masks)
 
 
-def _photo_folder(folder: Path, model: SparseModel) -> Path:
-    """``images`` if it is there, else the dataset's own folder."""
-    return folder / "images" if (folder / "images").is_dir() or not model.images else folder
-
-
-def located_photos(model: SparseModel, photo_folder: Path, source: Path) -> list[Photo]:
-    """The model's images as photographs in `photo_folder`; FormatError names `source` for a bad camera."""
-    by_id = {}
+def located_photos(model: SparseModel, folder: Path, source: Path) -> list[Photo]:
+    """Return the model's images as photographs in `folder`; FormatError names `source` for a bad camera."""
+    lenses = {}
     for camera_id, camera in model.cameras.items():
         try:
-            by_id[camera_id] = intrinsics_of(camera)
+            lenses[camera_id] = intrinsics_of(camera)
         except ValueError as error:
             raise FormatError(f"{source}: camera {camera_id}: {error}; export the model again") from None
-    by_name = {image.name: image for image in model.images}
     return [
-        Photo(
-            photo_folder / name,
-            name,
-            by_id[image.camera_id],
-            image.world_to_camera,
-            mask=mask_beside(photo_folder / name),
-        )
-        for name, image in by_name.items()
+        Photo(path, name, lenses[image.camera_id], image.world_to_camera, mask=mask_beside(path))
+        for name, image in {image.name: image for image in model.images}.items()
+        for path in (folder / name,)
     ]
 
 
 def good_points(model: SparseModel) -> tuple[Array, Array]:
-    """(M, 3) points and (M, 3) colours without those that are plainly wrong: not finite, seen by a single
-    image, or reprojected more than `MAX_POINT_ERROR` off. Unknown errors and tracks count as good."""
+    """Return (M, 3) points and (M, 3) colours without those that are plainly wrong.
+
+    These are not finite, seen by a single image, or reprojected more than `MAX_POINT_ERROR` off. Unknown
+    errors and tracks count as good.
+    """
     good = np.isfinite(model.points).all(1)
     good &= ~(model.errors > MAX_POINT_ERROR)
     good &= model.track_lengths != 1
-    tell_of_lost_points(good, "the COLMAP model")
+    warn_of_lost_points(good, "the COLMAP model")
     return model.points[good], model.colours[good]

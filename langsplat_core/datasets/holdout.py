@@ -15,7 +15,7 @@ RADIAN = 2.0  # typical steps between cameras that a turn by a radian counts for
 
 
 def split(capture: Capture, config: DatasetConfig) -> tuple[list[int], list[int]]:
-    """Indices of (training, held-out) views, about one in ``config.test_every``; see `DatasetConfig`."""
+    """Return indices of (training, held-out) views, about one in ``config.test_every``."""
     if config.hold_out == "every":
         return capture.split(config.test_every)
     held_out = chosen(capture.cameras, config.test_every)
@@ -23,8 +23,9 @@ def split(capture: Capture, config: DatasetConfig) -> tuple[list[int], list[int]
 
 
 def chosen(cameras: Sequence[Camera], every: int, beside: Sequence[int] = ()) -> list[int]:
-    """Indices of one view in `every`, in ascending order, of which each lies among training views: those at
-    the ends of a walk show what no other photograph does, and tell nothing of the training.
+    """Return indices of one view in `every`, in ascending order, of which each lies among training views.
+
+    Those at the ends of a walk show what no other photograph does, and tell nothing of the training.
 
     One after the other that view is taken which lies best in the middle of its nearest training views, by
     place and direction, measured by how far those are away. Its own nearest ones are then left to training,
@@ -51,7 +52,7 @@ def chosen(cameras: Sequence[Camera], every: int, beside: Sequence[int] = ()) ->
 
 
 def _stands(cameras: Sequence[Camera]) -> Array:
-    """(M, 6) place and direction of every camera, in typical steps from one camera to the next."""
+    """Return (M, 6) place and direction of every camera, in typical steps from one camera to the next."""
     places = np.array([camera.position for camera in cameras])
     directions = np.array([camera.world_to_camera[2, :3] for camera in cameras])
     gaps = np.linalg.norm(places[:, None] - places[None], axis=2)
@@ -64,8 +65,10 @@ def _stands(cameras: Sequence[Camera]) -> Array:
 
 
 def _lean(stands: Array, apart: Array, training: Array, index: int) -> float:
-    """How far view `index` is from the middle of its nearest training views, over how far those are: 0 in the
-    middle, about 1 beside them."""
+    """Return how far view `index` is from the middle of its nearest training views, over how far those are.
+
+    It is 0 in the middle, about 1 beside them.
+    """
     others = training[training != index]
     nearest = others[np.argsort(apart[index, others], kind="stable")[:NEIGHBOURS]]
     offset = np.linalg.norm(stands[nearest].mean(0) - stands[index])

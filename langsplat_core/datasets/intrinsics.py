@@ -1,17 +1,13 @@
-"""Lenses of photographs: their formulas, their inverses, and resampling to a pinhole; and pycolmap.
+"""Lenses of photographs: their formulas, their inverses, and resampling to a pinhole.
 
-Import `pycolmap` from here, where it leaves signals alone and its libraries keep to one thread. Its logging
-library installs a handler of its own for SIGTERM and SIGABRT, which prints a stack trace and kills the
-process: what was there before is put back, and in the 30 ms until then the trace is printed nowhere. Where it
-aborts, as on a full disk, its reason is so the last thing it says. Its wheel brings OpenMP (and a package of
-other make may bring OpenBLAS) of its own, which ask the environment how many threads to use when they are
-loaded, and never again.
+A point in the camera's frame has *normalised* coordinates (x/z, y/z). A distortion maps normalised to
+distorted coordinates, and the pixel position is ``(fx * x_d + cx, fy * y_d + cy)``, with pixel centres
+at +0.5. Formulas: OpenCV's "Camera Calibration and 3D Reconstruction" and "Fisheye camera model".
+Everything here is float64; it is the reference that resampling follows.
 """
 
-import ctypes
-import os
 import signal
-import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -25,77 +21,6 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.scene import Camera, Intrinsics
 
-__all__ = ["pycolmap"]
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Have what is loaded meanwhile keep to one thread."""
-    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-    before = {name: os.environ.get(name) for name in names}
-    os.environ.update(dict.fromkeys(names, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
-def _handler(number: int, handler: int | None) -> int | None:
-    """Set the C handler of a signal; returns what was there, as a pointer. Any thread may do this, unlike
-    Python's own `signal.signal`."""
-    install = ctypes.CDLL(None).signal
-    install.restype, install.argtypes = ctypes.c_void_p, (ctypes.c_int, ctypes.c_void_p)
-    before: int | None = install(number, handler)
-    return before
-
-
-@contextmanager
-def _silent() -> Iterator[None]:
-    """Have what is written to standard error meanwhile, by whichever library, lead nowhere."""
-    try:
-        kept = os.dup(2)
-    except OSError:  # it is closed
-        yield
-        return
-    with open(os.devnull, "wb") as nowhere:
-        os.dup2(nowhere.fileno(), 2)
-    try:
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-
-
-if sys.platform == "win32":  # no such handler there
-    with _one_thread():
-        import pycolmap
-else:
-    _before = {number: _handler(number, None) for number in (signal.SIGTERM, signal.SIGABRT)}
-    for _number in _before:
-        _handler(_number, _before[_number])
-    try:
-        with _one_thread(), _silent():
-            import pycolmap
-    finally:
-        for _number in _before:
-            _handler(_number, _before[_number])
-        signal.siginterrupt(signal.SIGTERM, True)  # as Python has it: a call that waits shall return
-
-
-pycolmap.logging.minloglevel = 3  # its log lines would tear the progress bars apart
-
-
-# Intrinsics of photographs: where a photograph's pixels look, in the conventions of COLMAP and OpenCV.
-#
-# A point in the camera's frame has *normalised* coordinates (x/z, y/z). A distortion maps normalised to
-# distorted coordinates, and the pixel position is ``(fx * x_d + cx, fy * y_d + cy)``, with pixel centres
-# at +0.5. Formulas: OpenCV's "Camera Calibration and 3D Reconstruction" and "Fisheye camera model".
-# Everything here is float64; it is the reference that resampling follows.
-
 # What no photograph exceeds; numbers of damaged files would overflow in what is computed from them.
 MOST_SIDE = 1 << 20  # pixels
 FOCAL_RANGE = (1e-3, 1e5)  # in lengths of the longer side; a telescope of 100 m on a 36 mm sensor has 3000
@@ -103,18 +28,23 @@ MOST_SHIFT = 1e3  # of the principal point, in lengths of the longer side
 
 
 class Distortion(Protocol):
-    """Maps (N, 2) normalised to (N, 2) distorted coordinates, float64. Hashable, so that photographs
-    taken with one lens share what is computed from it."""
+    """Map from (N, 2) normalised to (N, 2) distorted coordinates, float64.
 
-    def __call__(self, xy: Array) -> Array: ...
+    Hashable, so that photographs taken with one lens share what is computed from it.
+    """
+
+    def __call__(self, xy: Array) -> Array:
+        """Return distorted coordinates."""
 
     def __hash__(self) -> int: ...
 
 
 @dataclass(frozen=True)
 class BrownDistortion:
-    """Radial (rational, k1 to k6) and decentring (p1, p2) distortion of ordinary lenses; COLMAP's
-    SIMPLE_RADIAL, RADIAL, OPENCV and FULL_OPENCV."""
+    """Radial (rational, k1 to k6) and decentring (p1, p2) distortion of ordinary lenses.
+
+    COLMAP's SIMPLE_RADIAL, RADIAL, OPENCV and FULL_OPENCV.
+    """
 
     k1: float = 0.0
     k2: float = 0.0
@@ -126,6 +56,7 @@ class BrownDistortion:
     k6: float = 0.0
 
     def __call__(self, xy: Array) -> Array:
+        """Return (N, 2) distorted coordinates."""
         x, y = xy[:, 0], xy[:, 1]
         r2 = x * x + y * y
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
@@ -137,8 +68,10 @@ class BrownDistortion:
 
 @dataclass(frozen=True)
 class FisheyeDistortion:
-    """Equidistant projection with a polynomial in the angle from the axis; COLMAP's OPENCV_FISHEYE,
-    SIMPLE_RADIAL_FISHEYE and RADIAL_FISHEYE."""
+    """Equidistant projection with a polynomial in the angle from the axis.
+
+    COLMAP's OPENCV_FISHEYE, SIMPLE_RADIAL_FISHEYE and RADIAL_FISHEYE.
+    """
 
     k1: float = 0.0
     k2: float = 0.0
@@ -146,12 +79,25 @@ class FisheyeDistortion:
     k4: float = 0.0
 
     def __call__(self, xy: Array) -> Array:
+        """Return (N, 2) distorted coordinates."""
         r = np.linalg.norm(xy, axis=-1)
         theta = np.arctan(r)
         t2 = theta * theta
         distorted = theta * (1 + t2 * (self.k1 + t2 * (self.k2 + t2 * (self.k3 + t2 * self.k4))))
         scale = np.divide(distorted, r, out=np.ones_like(r), where=r > 1e-12)
         return xy * scale[:, None]
+
+
+@contextmanager
+def signals_kept() -> Iterator[None]:
+    """Keep the handlers of signals that pycolmap's logging library replaces when it is imported.
+
+    Its own print a stack trace and kill the process. Python sets handlers in the main thread alone.
+    """
+    yield
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGTERM, signal.SIGABRT):
+            signal.signal(number, signal.getsignal(number))
 
 
 @dataclass(frozen=True)
@@ -165,7 +111,14 @@ class ColmapDistortion:
     cx: float
     cy: float
 
+    def __post_init__(self) -> None:
+        with signals_kept():  # here, as threads call the lens
+            import pycolmap  # noqa: F401
+
     def __call__(self, xy: Array) -> Array:
+        """Return (N, 2) distorted coordinates."""
+        import pycolmap
+
         # The size plays no part in these models, but pycolmap asks for one.
         camera = pycolmap.Camera(model=self.model, width=1, height=1, params=np.array(self.params))
         rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
@@ -198,7 +151,7 @@ class PhotoIntrinsics(Intrinsics):
             object.__setattr__(self, "distortion", None)
 
     def regridded(self, width: int, height: int) -> "PhotoIntrinsics":
-        """The same lens on another pixel grid over the same image."""
+        """Return the same lens on another pixel grid over the same image."""
         inner = self.resized(width, height)
         return PhotoIntrinsics(width, height, inner.fx, inner.fy, inner.cx, inner.cy, self.distortion)
 
@@ -216,7 +169,7 @@ NEWTON_STEPS = 30
 
 
 def _radial_profile(distortion: Distortion) -> tuple[Array, Array]:
-    """Radii 0 to R that can be inverted, and the mean distorted radius of each.
+    """Return radii 0 to R that can be inverted, and the mean distorted radius of each.
 
     R is the cap `MAX_HALF_ANGLE` or just inside the first radius at which the map folds over, that is
     where its Jacobian is singular in some direction: fitted polynomials often do so beyond the corners.
@@ -266,7 +219,7 @@ def undistorted_points(distortion: Distortion, distorted: Array) -> Array:
 
 
 def pinhole_for(intrinsics: PhotoIntrinsics, max_side: int) -> Camera:
-    """The pinhole camera (identity pose) that a photograph of `lens` is resampled to.
+    """Return the pinhole camera (identity pose) that a photograph is resampled to.
 
     It shows the largest upright rectangle with no pixel from outside the photograph (OpenCV's
     ``alpha = 0``), with the lens's own central magnification, then shrunk so that the longer side has at
@@ -291,7 +244,7 @@ def pinhole_for(intrinsics: PhotoIntrinsics, max_side: int) -> Camera:
 
 
 def _inner_rectangle(intrinsics: PhotoIntrinsics) -> tuple[float, float, float, float]:
-    """Normalised left, top, right, bottom of a rectangle wholly inside the undistorted outline."""
+    """Return normalised left, top, right, bottom of a rectangle wholly inside the undistorted outline."""
     assert intrinsics.distortion is not None
     t = np.linspace(0, 1, BORDER_SAMPLES)
     zero, one = np.zeros_like(t), np.ones_like(t)
@@ -322,11 +275,11 @@ def source_positions(intrinsics: PhotoIntrinsics, camera: Camera) -> Array:
 def resample(
     photo: Image.Image, intrinsics: PhotoIntrinsics, camera: Camera, positions: Array | None
 ) -> Array:
-    """(H, W, 3) uint8 image of `camera` from an RGB photograph of `lens`, which has the same size.
+    """Return the (H, W, 3) uint8 image of `camera` from an RGB photograph.
 
-    `positions` is `source_positions(lens, camera)`, or None for a lens without distortion. The
-    photograph is first shrunk to the camera's magnification by an area-weighted filter, so that the
-    interpolation (cubic spline) that follows neither aliases nor blurs.
+    The photograph has the size of `intrinsics`. `positions` is `source_positions(intrinsics, camera)`, or
+    None for a lens without distortion. The photograph is first shrunk to the camera's magnification by an
+    area-weighted filter, so that the interpolation (cubic spline) that follows neither aliases nor blurs.
     """
     if positions is None:
         size = (camera.width, camera.height)

@@ -9,9 +9,10 @@ import numpy as np
 from PIL import Image
 
 from langsplat_core.arrays import Array
-from langsplat_core.datasets import sfm
-from langsplat_core.datasets.capture import Capture, developer
+from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.colmap import good_points, has_model, read_model
+from langsplat_core.datasets.photos import developer
+from langsplat_core.datasets.workspace import FAILURES, MASKS, Group, open_workspace, run_apart
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera
@@ -21,7 +22,7 @@ TELLING_POINTS = 50  # from this many known points on, depths follow theirs
 
 
 def look_distance(cameras: Sequence[Camera]) -> float:
-    """Typical distance from the cameras to the place they look at, world units, > 0.
+    """Return the typical distance from the cameras to the place they look at, world units, > 0.
 
     That place is nearest to all optical axes in the least-squares sense; a small pull to the cameras'
     own mean keeps parallel axes from running to infinity.
@@ -47,8 +48,7 @@ def random_points(
     rng: np.random.Generator,
     masks: Sequence[Array | None] = (),
 ) -> tuple[Array, Array]:
-    """`count` points in the cameras' view volume, (count, 3), with the (count, 3) uint8 colours of the pixels
-    that they fall on.
+    """Draw (count, 3) points in the cameras' view volume, with the (count, 3) uint8 colours of their pixels.
 
     images: (H, W, 3) uint8, one per camera; masks: (H, W) bool each, pixels that count; known: (M, 3) points
     whose depths tell where the scene is, M may be 0. Depths are uniform in 1/z, so that near and far are
@@ -92,8 +92,11 @@ MAX_ANGLE = 75.0  # degrees between the axes of views that are matched
 
 
 def add_points(capture: Capture, views: Sequence[int], work: Path, progress: Progress) -> Capture:
-    """The capture with points in its own world, from the photographs at `views`: triangulated ones (kept in
-    ``work/sfm-*``), or random ones in front of the cameras when fewer than `MIN_POINTS` can be."""
+    """Return the capture with points in its own world, from the photographs at `views`.
+
+    They are triangulated (kept in ``work/sfm-*``), or random ones in front of the cameras when fewer than
+    `MIN_POINTS` can be.
+    """
     points, colours = _triangulated(capture, views, work, progress)
     if len(points) < MIN_POINTS:
         log.warning(
@@ -109,33 +112,47 @@ def add_points(capture: Capture, views: Sequence[int], work: Path, progress: Pro
 def _triangulated(
     capture: Capture, views: Sequence[int], work: Path, progress: Progress
 ) -> tuple[Array, Array]:
-    workspace = sfm.open_workspace(work, ["known poses", 3, POINTS_SIDE, capture.digest(views)])
+    workspace = open_workspace(work, ["known poses", 3, POINTS_SIDE, capture.digest(views)])
     try:
         if not has_model(workspace / "sparse"):
             names = [f"{index:05d}.png" for index in range(len(views))]
-            cameras = _write_pictures(workspace / "images", names, capture, views, progress)
-            sfm.run_apart(_found, workspace, names, cameras, workspace=workspace, progress=progress)
+            cameras = _write_images(workspace / "images", names, capture, views, progress)
+            run_apart(
+                _match_and_triangulate, workspace, names, cameras, workspace=workspace, progress=progress
+            )
         return good_points(read_model(workspace / "sparse"))
-    except (*sfm.FAILURES, InputError) as error:
+    except (*FAILURES, InputError) as error:
         log.warning("points could not be triangulated: %s", str(error).splitlines()[0])
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
 
 
-def _found(workspace: Path, names: Sequence[str], cameras: Sequence[Camera], progress: Progress) -> None:
-    """Points from the pictures of a workspace, written there."""
-    sfm.extract_features(workspace, _groups(names, cameras), progress)
+def _match_and_triangulate(
+    workspace: Path, names: Sequence[str], cameras: Sequence[Camera], progress: Progress
+) -> None:
+    """Write points from the images of a workspace; in the process of its own."""
+    from langsplat_core.datasets.reconstruction import extract_features, match_features, triangulate
+
+    members: dict[tuple[str, int], list[str]] = {}
+    for name, camera in zip(names, cameras, strict=True):
+        params = ",".join(repr(float(value)) for value in (camera.fx, camera.fy, camera.cx, camera.cy))
+        members.setdefault((params, max(camera.width, camera.height)), []).append(name)
+    groups = [Group(tuple(group), "PINHOLE", params, side) for (params, side), group in members.items()]
+    extract_features(workspace, groups, progress)
     pairs = [(names[i], names[j]) for i, j in neighbouring_views(cameras)]
-    sfm.match_features(workspace, pairs, progress)
+    match_features(workspace, pairs, progress)
     progress("triangulating points", 0.0)
-    sfm.triangulate(workspace, names, cameras)
+    triangulate(workspace, names, cameras)
     progress("triangulating points", 1.0)
 
 
-def _write_pictures(
+def _write_images(
     folder: Path, names: Sequence[str], capture: Capture, views: Sequence[int], progress: Progress
 ) -> tuple[Camera, ...]:
-    """Images to seek features in, one after the other; returns their cameras. They are made from the files
-    again, larger than what is trained on: small images lack the details that features are found at."""
+    """Write images to seek features in, one after the other, and return their cameras.
+
+    They are made from the files again, larger than what is trained on: small images lack the details that
+    features are found at.
+    """
     enlarge = developer(POINTS_SIDE)
     cameras = []
     for count, (name, index) in enumerate(zip(names, views, strict=True)):
@@ -145,24 +162,16 @@ def _write_pictures(
             camera, image, mask = enlarge(capture.photos[index])
         Image.fromarray(image).save(folder / name, compress_level=1)
         if capture.masks:  # one each: COLMAP finds nothing in a photograph that lacks its own
-            seen = np.ones(image.shape[:2], bool) if mask is None else mask
-            folder.with_name(sfm.MASKS).mkdir(exist_ok=True)
-            Image.fromarray(seen).save(folder.with_name(sfm.MASKS) / f"{name}.png")
+            counted = np.ones(image.shape[:2], bool) if mask is None else mask
+            folder.with_name(MASKS).mkdir(exist_ok=True)
+            Image.fromarray(counted).save(folder.with_name(MASKS) / f"{name}.png")
         cameras.append(camera)
     progress("preparing photographs", 1.0)
     return tuple(cameras)
 
 
-def _groups(names: Sequence[str], cameras: Sequence[Camera]) -> list[sfm.Group]:
-    members: dict[tuple[str, int], list[str]] = {}
-    for name, camera in zip(names, cameras, strict=True):
-        params = ",".join(repr(float(value)) for value in (camera.fx, camera.fy, camera.cx, camera.cy))
-        members.setdefault((params, max(camera.width, camera.height)), []).append(name)
-    return [sfm.Group(tuple(group), "PINHOLE", params, side) for (params, side), group in members.items()]
-
-
 def neighbouring_views(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
-    """Pairs (i < j) worth matching: for every view the nearest `NEIGHBOURS` that look a similar way."""
+    """Return pairs (i < j) to match: every view with the nearest `NEIGHBOURS` that look a similar way."""
     centres = np.array([camera.position for camera in cameras])
     axes = np.array([camera.rotation[2] for camera in cameras])
     distance = np.linalg.norm(centres[:, None] - centres[None], axis=-1)

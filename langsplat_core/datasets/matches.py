@@ -1,11 +1,14 @@
-"""Which photographs share verified matches, as structure from motion found: groups, and gaps between them."""
+"""Graph of the photographs that share verified matches, by structure from motion: groups and gaps."""
 
 import json
-from collections import defaultdict
 from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from langsplat_core.errors import InputError, printable_line, shortened
 
@@ -38,42 +41,41 @@ class Matches:
     @cached_property
     def groups(self) -> list[list[int]]:
         """Rows in groups: the located ones, then what matches join among the others, larger ones first."""
-        joined = defaultdict[int, set[int]](set)
-        for a, b, count in self.pairs:
-            if count >= FEWEST_MATCHES and not self.located & {a, b}:
-                joined[a].add(b)
-                joined[b].add(a)
-        found: list[list[int]] = []
-        waiting = set(range(len(self.names))) - self.located
-        while waiting:
-            group, edge = set[int](), {min(waiting)}
-            while edge:
-                group |= edge
-                edge = set.union(*(joined[row] for row in edge)) - group
-            waiting -= group
-            found.append(sorted(group))
-        found.sort(key=len, reverse=True)
-        return [sorted(self.located), *found] if self.located else found
+        count = len(self.names)
+        joins = [(a, b) for a, b, n in self.pairs if n >= FEWEST_MATCHES and not self.located & {a, b}]
+        rows, columns = np.array(joins, int).reshape(-1, 2).T
+        graph = coo_array((np.ones(len(rows), bool), (rows, columns)), (count, count))
+        _, labels = connected_components(graph, directed=False)
+        found: dict[int, list[int]] = {}
+        for row in range(count):
+            if row not in self.located:
+                found.setdefault(int(labels[row]), []).append(row)
+        others = sorted(found.values(), key=len, reverse=True)
+        return [sorted(self.located), *others] if self.located else others
 
     def why(self, row: int) -> str:
-        """The reason why a photograph has no camera."""
+        """Return the reason why a photograph has no camera."""
         if self.features[row] < 0:
             return "cannot be read"
         if self.features[row] == 0:
             return "no features (nothing but plain areas, or blurred)"
         if self.features[row] < FEWEST_FEATURES:
             return "too few features (plain, dark, blurred or tiny)"
-        friends = {a + b - row for (a, b), n in self.shared.items() if row in (a, b) and n >= FEWEST_MATCHES}
-        if not friends:
+        neighbours = {
+            a + b - row for (a, b), count in self.shared.items() if row in (a, b) and count >= FEWEST_MATCHES
+        }
+        if not neighbours:
             return "no matches with any other"
-        if self.located and not friends & self.located:
+        if self.located and not neighbours & self.located:
             return "matches only others that have no camera"
         return "matched, but from one and the same place, or without enough overlap"
 
     def gaps(self) -> list[tuple[int, int]]:
-        """Rows of two photographs each, between which more would join one more group to those before: of two
-        groups the pair that shares most, or the neighbours in name order where none shares enough. At most
-        `MOST_TOLD`; photographs without features are no part of it."""
+        """Return pairs of rows between which more photographs would join one more group to those before.
+
+        Of two groups that is the pair that shares most, or the neighbours in name order where none shares
+        enough. At most `MOST_TOLD`; photographs without features have no part in them.
+        """
         useful = [[row for row in group if self.features[row] >= FEWEST_FEATURES] for group in self.groups]
         joined, *apart = [group for group in useful if group] or [[]]
         found: list[tuple[int, int]] = []
@@ -90,12 +92,12 @@ class Matches:
         return (-shared if shared >= FEWEST_MATCHES else 0), pair[1] - pair[0]
 
     def joined(self) -> str:
-        """The groups that matches join, in words; empty where there are none."""
-        large = [self._told(group) for group in self.groups if len(group) > 1][:MOST_TOLD]
+        """Return the groups that matches join, in words; empty where there are none."""
+        large = [self._listed(group) for group in self.groups if len(group) > 1][:MOST_TOLD]
         return f"matches join {', '.join(large)}; " if large else ""
 
     def advice(self) -> str:
-        """Advice in words where to take more photographs."""
+        """Return advice in words where to take more photographs."""
         gaps = self.gaps()
         if not gaps:
             return _STEP_ASIDE if self.joined() and not self.located else _ADVICE
@@ -104,7 +106,7 @@ class Matches:
             for a, b in gaps
         )
 
-    def _told(self, group: list[int]) -> str:
+    def _listed(self, group: list[int]) -> str:
         if group == list(range(group[0], group[-1] + 1)) and len(group) > 2:
             return f"{self._name(group[0])} to {self._name(group[-1])} ({len(group)})"
         return shortened((self._name(row) for row in group), 3, 100)
@@ -122,8 +124,10 @@ class NotLocatedError(InputError):
 
 
 def read_matches(folder: Path, files: dict[str, Path], located: Collection[str]) -> Matches:
-    """The graph of matches of a workspace. `files`: photographs by their names there, see `numbered`;
-    `located`: names of those that have a camera."""
+    """Return the graph of matches of a workspace.
+
+    files: photographs by their names there, see `sfm.numbered`; located: names of those that have a camera
+    """
     kept = json.loads((folder / MATCHES).read_text())
     row = {name: index for index, name in enumerate(files)}
     return Matches(

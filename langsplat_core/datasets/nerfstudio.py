@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.capture import Capture, Photo, develop, mask_beside, tell_of_lost_points
+from langsplat_core.datasets.capture import Capture, warn_of_lost_points
 from langsplat_core.datasets.intrinsics import BrownDistortion, Distortion, FisheyeDistortion, PhotoIntrinsics
+from langsplat_core.datasets.photos import Photo, develop, mask_beside
 from langsplat_core.errors import FormatError, InputError, printable_line, quoted, shortened
 from langsplat_core.io.hostile import PHOTO_SUFFIXES, PictureError, picture_size, read_json_file
 from langsplat_core.io.ply_table import read_cloud
@@ -32,7 +33,7 @@ Json = dict[str, Any]
 
 
 def load_nerfstudio(file: Path, max_side: int, progress: Progress) -> Capture:
-    """The photographs and cameras that `file` lists; points only if it names a PLY."""
+    """Return the photographs and cameras that `file` lists; points only if it names a PLY."""
     top = read_json_file(file, JSON_LIMIT)
     if not isinstance(top, dict):
         raise FormatError(f"{file} is not a nerfstudio dataset: expected an object at the top")
@@ -64,7 +65,7 @@ def load_nerfstudio(file: Path, max_side: int, progress: Progress) -> Capture:
 
 
 def _metres_per_unit(file: Path, top: Json) -> float | None:
-    """The length of a unit, a key of our own: nerfstudio's files do not state it."""
+    """Return the length of a unit, a key of our own: nerfstudio's files do not state it."""
     if top.get("metres_per_unit") is None:
         return None
     try:
@@ -94,14 +95,14 @@ def _report_missing(file: Path, missing: list[str], total: int) -> None:
 
 
 def _photo_file(folder: Path, label: str) -> Path | None:
-    """The photograph called `label`; some datasets leave its suffix away."""
+    """Return the photograph called `label`; some datasets leave its suffix away."""
     candidates = (f"{folder / label}{suffix}" for suffix in ("", *PHOTO_SUFFIXES))
     # os.path.isfile, unlike Path.is_file, also says no to names that no file system could hold.
     return next((Path(candidate) for candidate in candidates if os.path.isfile(candidate)), None)
 
 
 def _mask_file(folder: Path, frame: Json) -> Path | None:
-    """The file of a frame's "mask_path"; ValueError where there is none."""
+    """Return the file of a frame's "mask_path"; ValueError where there is none."""
     label = frame.get("mask_path")
     if label is None:
         return None
@@ -111,7 +112,7 @@ def _mask_file(folder: Path, frame: Json) -> Path | None:
 
 
 def _number(values: Json, key: str, default: float | None = None) -> float:
-    """Read a finite number; the ValueError names its key."""
+    """Return a finite number; the ValueError names its key."""
     value = values.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e15:
         raise ValueError(f'"{key}" must be a finite number, got {reprlib.repr(value)}')
@@ -119,7 +120,7 @@ def _number(values: Json, key: str, default: float | None = None) -> float:
 
 
 def _stored_size(path: Path) -> tuple[int, int] | None:
-    """Width and height in the file's header; None if it is no image."""
+    """Return width and height in the file's header; None if it is no image."""
     try:
         return picture_size(path)
     except PictureError:
@@ -127,7 +128,7 @@ def _stored_size(path: Path) -> tuple[int, int] | None:
 
 
 def _lens(values: Json, size: tuple[int, int]) -> PhotoIntrinsics:
-    """The lens of merged top-level and per-frame values; `size` counts where they give none."""
+    """Return the lens of merged top-level and per-frame values; `size` counts where they give none."""
     width, height = (round(_number(values, key, default)) for key, default in zip("wh", size, strict=True))
     fx = _focal(values, "x", width, None)
     return PhotoIntrinsics(
@@ -142,7 +143,7 @@ def _lens(values: Json, size: tuple[int, int]) -> PhotoIntrinsics:
 
 
 def _focal(values: Json, axis: str, side: int, default: float | None) -> float:
-    """Focal length in pixels, from ``fl_*`` or the field of view ``camera_angle_*``, radians."""
+    """Return the focal length in pixels, from ``fl_*`` or the field of view ``camera_angle_*``, radians."""
     if f"fl_{axis}" in values:
         return _number(values, f"fl_{axis}")
     if f"camera_angle_{axis}" in values:
@@ -170,7 +171,7 @@ def _distortion(values: Json) -> Distortion:
 
 
 def _pose(frame: Json) -> Array:
-    """(4, 4) world-to-camera in OpenCV's frame."""
+    """Return the (4, 4) world-to-camera matrix in OpenCV's frame."""
     try:
         matrix = np.array(frame.get("transform_matrix"), np.float64)
     except (TypeError, ValueError, OverflowError):  # whole numbers have no limit in JSON
@@ -188,7 +189,7 @@ def _pose(frame: Json) -> Array:
 
 
 def _points(file: Path, name: object) -> tuple[Array, Array]:
-    """(M, 3) float64 and (M, 3) uint8 of the PLY; none if the dataset names none or it is not there."""
+    """Return (M, 3) float64 points and (M, 3) uint8 colours of the PLY; none if there is none."""
     none = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     if not isinstance(name, str) or not name:
         return none
@@ -201,5 +202,5 @@ def _points(file: Path, name: object) -> tuple[Array, Array]:
     except FormatError as error:
         raise FormatError(f"{error}; mend it or remove ply_file_path from {file.name}") from None
     finite = np.asarray(np.isfinite(points).all(1))
-    tell_of_lost_points(finite, path.name)
+    warn_of_lost_points(finite, path.name)
     return points[finite], colours[finite]

@@ -25,7 +25,7 @@ FEWEST = 3  # images, of which cameras can be found
 
 
 def kept_frames(video: Path, count: int, work: Path, progress: Progress = silent) -> Path:
-    """The folder in `work` with the images of `video`, made there unless it is whole already."""
+    """Return the folder in `work` with the images of `video`, made there unless it is whole already."""
     file, _ = open_for_reading(video)
     with file:
         content = hashlib.file_digest(file, "sha256").hexdigest()[:12]  # type: ignore[arg-type]
@@ -37,11 +37,11 @@ def kept_frames(video: Path, count: int, work: Path, progress: Progress = silent
 
 @optional_imports()
 def extract_frames(video: Path, out: Path, count: int, progress: Progress = silent) -> list[Path]:
-    """Write the sharpest image of each of `count` equal spans of time as out/frame_0001.jpg ..., turned as
-    the video is shown. `out` appears when it is whole. Spans without an image are left out.
+    """Write the sharpest image of each of `count` equal spans of time as out/frame_0001.jpg ...
 
-    Raises InputError where `out` has something in it already or too little is left, and FormatError for a
-    file that cannot be read as a video.
+    Images are turned as the video is shown. `out` appears when it is whole. Spans without an image are left
+    out. Raises InputError where `out` has something in it already or too little is left, and FormatError for
+    a file that cannot be read as a video.
     """
     import av
 
@@ -100,7 +100,7 @@ def _write(container: "av.container.InputContainer", folder: Path, count: int, p
 
 
 def _decoded(container: "av.container.InputContainer", stream: Any) -> Iterator[Any]:
-    """Every image that can be decoded: a recording that broke off has a last one that cannot."""
+    """Yield every image that can be decoded: a recording that broke off has a last one that cannot."""
     import av
 
     for packet in container.demux(stream):
@@ -111,7 +111,7 @@ def _decoded(container: "av.container.InputContainer", stream: Any) -> Iterator[
 
 
 def sharpness(frame: Any) -> float:
-    """Variance of the Laplacian of the grey image, at `SHARPNESS_WIDTH`."""
+    """Return the variance of the Laplacian of the grey image, at `SHARPNESS_WIDTH`."""
     width = min(SHARPNESS_WIDTH, frame.width)
     height = max(1, round(frame.height * width / frame.width))
     grey: Array = frame.reformat(width=width, height=height, format="gray").to_ndarray().astype(np.float32)

@@ -3,6 +3,10 @@
 The process is a fresh interpreter, which knows nothing of this one but what it is given: the function, named
 by its module, and arguments, which are pickled. Progress and messages come back while it runs. It ends with
 this process, however that ends, and at once where the work is cancelled.
+
+Not `concurrent.futures.ProcessPoolExecutor`: its processes import the caller's ``__main__`` anew, which a
+script without a guard does not survive; it does not say how a process ended, nor the last that it printed;
+and what it runs in native code outlives a cancelled or killed caller.
 """
 
 import contextlib
@@ -13,15 +17,15 @@ import pickle
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
-from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import IO, Any
 
 from langsplat_core.errors import printable_line
 from langsplat_core.progress import Progress, Report
 
-SAID = 20  # last lines of standard error that are kept
 _DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of prctl(2): where who started this process ends
 _SERVE = "from langsplat_core.io.apart import serve; serve()"
 
@@ -32,53 +36,50 @@ class AbortedError(Exception):
     """The process ended without a result; the message is how, and the last it said."""
 
 
-def run(function: Callable[..., Any], *arguments: Any, progress: Progress) -> Any:
-    """``function(*arguments, progress)`` in a process of its own: what it returns, or raises; AbortedError
-    where the process ended before. What `progress` raises ends the process. Where programs are frozen into
-    one folder there is no interpreter to start, and the function runs here."""
+def run(
+    function: Callable[..., Any],
+    *arguments: Any,
+    progress: Progress,
+    environment: Mapping[str, str] = MappingProxyType({}),
+) -> Any:
+    """Return what ``function(*arguments, progress)`` returns, or raise what it raises, in another process.
+
+    environment: variables of that process, beside those of this one. Raises AbortedError where the process
+    ended before. What `progress` raises ends the process. Where programs are frozen into one folder there is
+    no interpreter to start, and the function runs here.
+    """
     if getattr(sys, "frozen", False) or not sys.executable:
         return function(*arguments, progress)
-    process = subprocess.Popen(
-        [sys.executable, "-P", "-c", _SERVE],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)},
-        start_new_session=True,  # Ctrl-C in the terminal is ours
-    )
-    assert process.stdin is not None
-    assert process.stdout is not None
-    assert process.stderr is not None
-    said: deque[str] = deque(maxlen=SAID)
-    listener = threading.Thread(target=_listen, args=(process.stderr, said), daemon=True)
-    listener.start()
-    try:
-        pickle.dump((log.getEffectiveLevel(), function, arguments), process.stdin)
-        process.stdin.flush()
-        return _result(process.stdout, progress)
-    except (EOFError, pickle.UnpicklingError, BrokenPipeError):  # it ended within or before a message
-        code = process.wait()
-        listener.join()
-        last = next((line for line in reversed(said) if line), "it said nothing")
-        raise AbortedError(f"ended with {_named(code)}: {last}") from None
-    finally:
-        process.kill()
-        process.wait()
-        listener.join()
-        for pipe in (process.stdin, process.stdout, process.stderr):
+    path = {"PYTHONPATH": os.pathsep.join(folder or os.getcwd() for folder in sys.path)}
+    with (
+        tempfile.TemporaryFile() as printed,
+        subprocess.Popen(
+            [sys.executable, "-P", "-c", _SERVE],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=printed,
+            env={**os.environ, **environment, **path},
+            start_new_session=True,  # Ctrl-C in the terminal is ours
+        ) as process,
+    ):
+        assert process.stdin is not None
+        assert process.stdout is not None
+        try:
+            pickle.dump((log.getEffectiveLevel(), function, arguments), process.stdin)
+            process.stdin.flush()
+            return _result(process.stdout, progress)
+        except (EOFError, pickle.UnpicklingError, BrokenPipeError):  # it ended within or before a message
+            code = process.wait()
+            how = signal.Signals(-code).name if code < 0 else f"code {code}"
+            how += ", as where memory runs out" if how == "SIGKILL" else ""
+            printed.seek(0)
+            lines = [line for line in printed.read().splitlines() if line.strip()]
+            last = printable_line(lines[-1].decode(errors="backslashreplace"), 300) if lines else "no message"
+            raise AbortedError(f"ended with {how}: {last}") from None
+        finally:
+            process.kill()
             with contextlib.suppress(BrokenPipeError):
-                pipe.close()
-
-
-def _named(code: int) -> str:
-    if code == -signal.SIGKILL:
-        return "SIGKILL, as where memory runs out"
-    return signal.Signals(-code).name if code < 0 else f"code {code}"
-
-
-def _listen(errors: IO[bytes], said: deque[str]) -> None:
-    for line in errors:
-        said.append(printable_line(line.decode(errors="backslashreplace"), 300))
+                process.stdin.close()
 
 
 def _result(messages: IO[bytes], progress: Progress) -> Any:
@@ -96,7 +97,7 @@ def _result(messages: IO[bytes], progress: Progress) -> Any:
 
 
 def serve() -> None:
-    """The other process: run what standard input brings, and write what comes of it to standard output."""
+    """Run in the other process what standard input brings, and write the result to standard output."""
     given = sys.stdin.buffer
     out = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what a library prints is no message
@@ -112,11 +113,15 @@ def serve() -> None:
         def emit(self, record: logging.LogRecord) -> None:
             send("message", (record.levelno, "%s", record.getMessage()))
 
+    def end_with_caller() -> None:
+        given.read(1)  # nothing, once the caller's end of the pipe is closed
+        os._exit(1)
+
     level, function, arguments = pickle.load(given)
     log.addHandler(Handler())
     log.setLevel(level)
     log.propagate = False
-    threading.Thread(target=_end_with, args=(given,), daemon=True).start()
+    threading.Thread(target=end_with_caller, daemon=True).start()
     if sys.platform == "linux":  # the thread waits for native code that keeps the interpreter to itself
         ctypes.CDLL(None).prctl(_DEATH_SIGNAL, signal.SIGKILL)
     progress = Progress(lambda at: send("progress", (at.stage, at.fraction, at.note, dict(at.metrics))))
@@ -128,14 +133,8 @@ def serve() -> None:
 
 
 def _portable(error: Exception) -> Exception:
-    """The error, or where it cannot be pickled one that says the same."""
+    """Return the error, or where it cannot be pickled one that says the same."""
     try:
         return pickle.loads(pickle.dumps(error))
     except Exception:  # noqa: BLE001  whatever its class does
         return RuntimeError(f"{type(error).__name__}: {error}")
-
-
-def _end_with(given: IO[bytes]) -> None:
-    """End this process with the one that started it: its end of the pipe closes."""
-    given.read(1)
-    os._exit(1)

@@ -15,16 +15,11 @@ from PIL.TiffImagePlugin import IFDRational
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets import Capture, load_capture
-from langsplat_core.datasets.capture import (
-    Album,
-    metres_per_unit,
-    on_the_ground,
-    place,
-    read_photo,
-    unique_names,
-)
+from langsplat_core.datasets.capture import metres_per_unit, on_the_ground
+from langsplat_core.datasets.exif import place
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics
 from langsplat_core.datasets.known_poses import look_distance, random_points
+from langsplat_core.datasets.photos import Album, count_photographs, read_photo, unique_names
 from langsplat_core.errors import InputError
 from langsplat_core.scene import Camera, look_at
 from tests.support.photographs import (
@@ -189,6 +184,18 @@ def test_names_stay_unique() -> None:
     assert unique_names(["a.png", "b.jpg"]) == ["a", "b"]
     assert unique_names(["l/a.png", "r/a.png"]) == ["l_a", "r_a"]
     assert unique_names(["a.png", "a.jpg"]) == ["a_png", "a_jpg"]
+
+
+def test_photographs_are_counted_where_they_lie(tmp_path: Path) -> None:
+    assert count_photographs(tmp_path / "gone") == 0
+    for name in ("a.jpg", "b.PNG", "c.txt"):
+        (tmp_path / name).write_bytes(b"")
+    assert count_photographs(tmp_path) == 2
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "a.jpg").write_bytes(b"")
+    (tmp_path / "transforms.json").write_text("{}")
+    assert count_photographs(tmp_path) == count_photographs(tmp_path / "transforms.json") == 1
+    assert count_photographs(tmp_path / "walk.mp4") == DatasetConfig.frames
 
 
 # How long a unit is by the places of photographs.

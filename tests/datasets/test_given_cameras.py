@@ -379,25 +379,17 @@ def test_transparent_photographs_lie_over_black(tmp_path: Path) -> None:
     ("change", "words"),
     [
         ({"transform_matrix": [[1, 2], [3, 4]]}, "transform_matrix"),
-        ({"transform_matrix": None}, "transform_matrix"),
-        ({"transform_matrix": [["a"] * 4] * 4}, "transform_matrix"),
         ({"transform_matrix": np.diag([2.0, 2, 2, 1]).tolist()}, "rotation"),
         ({"transform_matrix": np.diag([1.0, 1, -1, 1]).tolist()}, "rotation"),
-        ({"transform_matrix": np.full((4, 4), np.nan).tolist()}, "transform_matrix"),
         ({"transform_matrix": [[10**400] * 4] * 4}, "transform_matrix"),
         ({"transform_matrix": [[1, 0, 0, 1e300], [0, 1, 0, 0], [0, 0, 1, 0]]}, "transform_matrix"),
         ({"fl_x": "wide"}, "fl_x"),
         ({"fl_x": 1e-9}, "none has such a lens"),
-        ({"fl_x": 1e14}, "none has such a lens"),
         ({"cx": 1e14}, "far outside"),
         ({"w": 1e9, "h": 1e9}, "pixels a side"),
-        ({"fl_x": -3}, "focal"),
-        ({"fl_x": float("inf")}, "fl_x"),
         ({"w": 0}, "pixels"),
-        ({"cx": None}, "cx"),
         ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR"),
         ({"k4": 0.1}, "k4"),
-        ({"file_path": 3}, "file_path"),
     ],
 )
 def test_a_broken_frame_is_named(tmp_path: Path, change: dict[str, Any], words: str) -> None:
@@ -441,18 +433,16 @@ def test_a_dataset_may_say_how_long_its_unit_is_and_that_it_is_drawn(tmp_path: P
         load_capture(tmp_path, DatasetConfig(metres_per_unit=0.0), tmp_path / "work")
 
 
-# Datasets that are broken, odd or meant to harm: what is sound loads, the rest is refused in one line.
+# Datasets that are broken or odd: what is sound loads, the rest is refused in one line. Files with bytes
+# changed at random are tried by the fuzzer (tests/io/test_hostile.py).
 
 
-def test_what_is_no_dataset_is_told_what_is(tmp_path: Path) -> None:
+def test_what_is_no_dataset_is_refused_with_what_is(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "scene.ply").write_bytes(b"ply")
     (tmp_path / "photo.jpg" / "inner").mkdir(parents=True)  # a folder that is called like a photograph
     for name in ("absent", "empty", "scene.ply", "photo.jpg", "."):
-        message = refuse(tmp_path / name, tmp_path / "work")
-        assert "transforms.json" in message
-        assert "sparse/0" in message
-        assert "three photographs" in message
+        assert "transforms.json" in refuse(tmp_path / name, tmp_path / "work")
 
 
 def test_half_a_colmap_model_is_no_model(tmp_path: Path) -> None:
@@ -460,36 +450,21 @@ def test_half_a_colmap_model_is_no_model(tmp_path: Path) -> None:
     assert "2 photographs" in refuse(tmp_path, tmp_path / "work")  # taken for a plain folder of photographs
 
 
-@pytest.mark.parametrize("side", [0, -5, 3])
-def test_a_useless_size_is_refused(tmp_path: Path, side: int) -> None:
+def test_a_useless_size_is_refused(tmp_path: Path) -> None:
     write_colmap(tmp_path)
     with pytest.raises(InputError, match=r"--dataset\.max-side"):
-        load_capture(tmp_path, DatasetConfig(max_side=side), tmp_path / "work")
+        load_capture(tmp_path, DatasetConfig(max_side=3), tmp_path / "work")
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
-def test_a_damaged_binary_model_is_refused(tmp_path: Path, name: str) -> None:
-    """Cut anywhere, counting a million million rows, or with any byte changed, which may do no harm. pycolmap
-    reads a cut one without complaint, with numbers that happened to lie in memory."""
+def test_a_truncated_binary_model_is_refused(tmp_path: Path, name: str) -> None:
+    """Cut anywhere, or counting a million million rows. pycolmap reads a cut one without complaint."""
     file = write_colmap(tmp_path) / name
     whole = file.read_bytes()
-    for length in range(len(whole)):
-        file.write_bytes(whole[:length])
+    for content in (*(whole[:length] for length in range(len(whole))), struct.pack("<Q", 10**12) + whole[8:]):
+        file.write_bytes(content)
         with pytest.raises(FormatError, match=name.replace(".", r"\.")):
             read_model(file.parent)
-    file.write_bytes(struct.pack("<Q", 10**12) + whole[8:])
-    assert name in refuse(tmp_path, tmp_path / "work")
-    rng = np.random.default_rng(0)
-    refused = 0
-    for _ in range(200):
-        data = bytearray(whole)
-        data[rng.integers(len(data))] = rng.integers(256)
-        file.write_bytes(data)
-        try:
-            read_model(file.parent)
-        except FormatError:
-            refused += 1
-    assert refused > 0
 
 
 @pytest.mark.parametrize(
@@ -500,22 +475,10 @@ def test_a_damaged_binary_model_is_refused(tmp_path: Path, name: str) -> None:
         ("cameras.txt", "1 PINHOLE 0 30 50 50 20 15\n"),
         ("cameras.txt", "1 PINHOLE 40 30 nan 50 20 15\n"),
         ("cameras.txt", "1 PINHOLE 40 30 -50 50 20 15\n"),
-        ("cameras.txt", "1 PINHOLE 40 30 5٠ 50 20 15\n"),
-        ("cameras.txt", "1 PINHOLE 4_0 30 50 50 20 15\n"),
-        ("points3D.txt", "1 0 0 ٠ 1 2 3 0.5\n"),
-        ("images.txt", "1 1 0 0 ٠ 0 0 0 1 a.png\n\n"),
-        ("cameras.txt", "1 PINHOLE wide 30 50 50 20 15\n"),
-        ("cameras.txt", "1\n"),
         ("cameras.txt", "2 PINHOLE 40 30 50 50 20 15\n"),
         ("images.txt", "1 0 0 0 0 0 0 0 1 a.png\n\n"),
         ("images.txt", "1 1 0 0 0 nan 0 0 1 a.png\n\n"),
-        ("images.txt", "1 1 0 0 0 0 0 0 1\n\n"),
-        ("images.txt", "1 1 0 0 0 0 0 0 9 a.png\n\n"),
         ("images.txt", f"1 1 0 0 0 0 0 0 {'9' * 400} a.png\n\n"),
-        ("cameras.txt", f"{'9' * 400} PINHOLE 40 30 50 50 20 15\n"),
-        ("points3D.txt", f"1 0 0 0 1 2 {'9' * 400} 0.5\n"),
-        ("images.txt", "\x00\x01\x02"),
-        ("points3D.txt", "1 0 0 zero 1 2 3 0.5\n"),
         ("points3D.txt", "1 0 0 0 1 2 300 0.5\n"),
         ("points3D.txt", "1 0 0\n"),
     ],
@@ -546,22 +509,13 @@ def test_odd_names_in_a_model(tmp_path: Path, name: str, found: list[str]) -> No
 @pytest.mark.parametrize(
     "content",
     [
-        b"",
         b"{",
-        b"\xff\xfe\x00\x80",
         b"[]",
-        b"null",
-        b"{}",
         b'{"frames": []}',
-        b'{"frames": {}}',
-        b'{"frames": [3]}',
         b'{"frames": [{}]}',
-        b'{"frames": ' + b"[" * 100_000,
-        b'{"frames": [{"file_path": "", "transform_matrix": []}]}',
         b'{"frames": [{"file_path": "/", "transform_matrix": []}]}',
         b'{"frames": [{"file_path": "a\\u0000b", "transform_matrix": []}]}',
         b'{"fl_x": 1' + b"0" * 5000 + b', "frames": [{"file_path": "a.png"}]}',
-        b'{"fl_x": 1' + b"0" * 400 + b', "frames": [{"file_path": "a.png"}]}',
     ],
 )
 def test_a_broken_json_is_refused(tmp_path: Path, content: bytes) -> None:
@@ -570,26 +524,11 @@ def test_a_broken_json_is_refused(tmp_path: Path, content: bytes) -> None:
     assert "transforms.json" in refuse(tmp_path, tmp_path / "work")
 
 
-AXES = b"property float x\nproperty float y\nproperty float z\n"
-PLY = b"ply\nformat %s 1.0\nelement vertex %d\n" + AXES + b"end_header\n"
+PLY = b"ply\nformat ascii 1.0\nelement vertex 2\n%send_header\n1 2 3\n"
 
 
 @pytest.mark.parametrize(
-    "content",
-    [
-        b"",
-        b"not a ply",
-        PLY % (b"binary_little_endian", 10**12) + bytes(24),
-        PLY % (b"binary_little_endian", 3) + bytes(35),
-        PLY % (b"ascii", 2) + b"1 2 3\n",
-        PLY % (b"ascii", 2) + b"1 2 3\n1 two 3\n",
-        PLY % (b"ascii", 10**12) + b"1 2 3\n",
-        b"ply\nformat ascii 1.0\nelement face 0\nproperty float x\nend_header\n",
-        b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",
-        b"ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar float x\n"
-        b"property float y\nproperty float z\nend_header\n1 5 2 3\n",
-        (PLY % (b"ascii", 1)).replace(b"vertex 1", b"vertex -4"),
-    ],
+    "content", [b"not a ply", PLY % b"".join(b"property float %c\n" % axis for axis in b"xyz"), PLY % b""]
 )
 def test_a_broken_cloud_is_refused(tmp_path: Path, content: bytes) -> None:
     write_nerfstudio(tmp_path, ply_file_path="cloud.ply")

@@ -11,8 +11,9 @@ from PIL import Image
 from langsplat_core.arrays import Array
 from langsplat_core.config import RadianceConfig
 from langsplat_core.datasets import sfm
-from langsplat_core.datasets.capture import Capture, Photo, develop, find_photos, mask_beside
+from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics
+from langsplat_core.datasets.photos import Photo, develop, find_photos, mask_beside
 from langsplat_core.errors import InputError
 from langsplat_core.progress import silent
 from langsplat_core.scene import look_at

@@ -9,7 +9,8 @@ import pytest
 from PIL import Image
 
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.capture import optics, read_photo
+from langsplat_core.datasets.exif import optics
+from langsplat_core.datasets.photos import read_photo
 from langsplat_core.datasets.video import extract_frames, kept_frames, sharpness
 from langsplat_core.errors import FormatError, InputError, LangSplatError
 from langsplat_core.io.hostile import PictureError, is_video

@@ -1,9 +1,9 @@
 """Structure from motion and triangulation, in a textured room and in a street, and EXIF focal lengths."""
 
+import ctypes
 import logging
 import os
 import shutil
-import subprocess
 import sys
 from contextlib import suppress
 from dataclasses import replace
@@ -18,12 +18,15 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
-from langsplat_core.datasets import load_capture, sfm
-from langsplat_core.datasets.capture import Capture, find_photos, optics
+from langsplat_core.datasets import load_capture, reconstruction, sfm
+from langsplat_core.datasets.capture import Capture
+from langsplat_core.datasets.exif import optics
 from langsplat_core.datasets.intrinsics import BrownDistortion, PhotoIntrinsics
 from langsplat_core.datasets.known_poses import add_points, neighbouring_views
 from langsplat_core.datasets.matches import read_matches
+from langsplat_core.datasets.photos import find_photos
 from langsplat_core.datasets.sfm import pairs_by_name
+from langsplat_core.datasets.workspace import ROOM, run_apart
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Cancelled, Progress, Report, silent
 from langsplat_core.scene import Camera, look_at
@@ -394,8 +397,8 @@ def test_every_way_gives_the_same_bytes_again(way: int, found: int, matched: Pat
     for name in ("first", "second"):
         folder = tmp_path / name
         folder.mkdir()
-        models = sfm.WAYS[way](matched, folder, advance)
-        assert max((len(sfm.located_names(model)) for model in models), default=0) == found
+        models = reconstruction.MAPPERS[way](matched, folder, advance)
+        assert max((len(reconstruction.located_names(model)) for model in models), default=0) == found
         for model in models:
             model.write_binary(folder)
         written.append({path.name: path.read_bytes() for path in sorted(folder.glob("*.bin"))})
@@ -414,12 +417,12 @@ def synthetic(images: int, points: int) -> "pycolmap.Reconstruction":
 
 def test_the_model_with_most_well_held_photographs_is_kept() -> None:
     small, large = synthetic(4, 100), synthetic(6, 100)
-    assert sfm.best_model(None, [small, large]) is large
+    assert reconstruction.best_model(None, [small, large]) is large
     again = pycolmap.Reconstruction(large)
-    assert sfm.best_model(large, [small, again]) is large  # equal: the earlier way
-    wobbly = synthetic(7, sfm.FEWEST_POINTS - 1)  # all of its cameras are guesses
-    assert sfm.best_model(large, [wobbly]) is large
-    assert sfm.best_model(None, [wobbly]) is None
+    assert reconstruction.best_model(large, [small, again]) is large  # equal: the earlier way
+    wobbly = synthetic(7, reconstruction.FEWEST_POINTS - 1)  # all of its cameras are guesses
+    assert reconstruction.best_model(large, [wobbly]) is large
+    assert reconstruction.best_model(None, [wobbly]) is None
 
 
 def test_of_models_about_as_good_the_first_is_kept() -> None:
@@ -430,24 +433,21 @@ def test_of_models_about_as_good_the_first_is_kept() -> None:
         return model
 
     first, better, more = erring(6, 1.0), erring(6, 0.94), erring(7, 2.0)
-    assert sfm.best_model(first, [erring(6, 0.96)]) is first
-    assert sfm.best_model(None, [first, erring(6, 0.96), better]) is better
-    assert sfm.best_model(None, [better, more, first]) is more
+    assert reconstruction.best_model(first, [erring(6, 0.96)]) is first
+    assert reconstruction.best_model(None, [first, erring(6, 0.96), better]) is better
+    assert reconstruction.best_model(None, [better, more, first]) is more
+
+
+def threads_of_pycolmap(_: Progress) -> list[int]:
+    """Threads that the OpenMP library of pycolmap's wheel would use."""
+    maps = Path("/proc/self/maps").read_text().splitlines()
+    libraries = {line.split()[-1] for line in maps if "pycolmap.libs/libgomp" in line}
+    return [ctypes.CDLL(path).omp_get_max_threads() for path in libraries]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_libraries_inside_of_pycolmap_keep_to_one_thread_and_others_do_not() -> None:
-    code = """
-import ctypes, os
-from langsplat_core.datasets.intrinsics import pycolmap
-libraries = {line.split()[-1] for line in open("/proc/self/maps") if "pycolmap.libs/libgomp" in line}
-print([ctypes.CDLL(path).omp_get_max_threads() for path in libraries], os.environ["OMP_NUM_THREADS"])
-"""
-    environment = os.environ | {"OMP_NUM_THREADS": "3"}
-    told = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
-    )
-    assert told.stdout.split() == ["[1]", "3"]
+def test_structure_from_motion_runs_pycolmap_on_one_thread(tmp_path: Path) -> None:
+    assert run_apart(threads_of_pycolmap, workspace=tmp_path, progress=silent) == [1]
 
 
 @pytest.mark.parametrize(("prior", "focal", "lost"), [
@@ -466,7 +466,7 @@ def test_a_focal_length_that_is_of_no_such_lens_tells_a_wrong_world(
     with pycolmap.Database.open(tmp_path / "database.db") as database:
         database.write_camera(before, use_camera_id=True)
     camera.focal_length = focal
-    assert sfm.is_astray(model, tmp_path) == lost
+    assert reconstruction.is_astray(model, tmp_path) == lost
 
 
 @pytest.fixture(scope="module")
@@ -505,11 +505,11 @@ def test_two_views_are_refused_although_they_are_half(
         model = synthetic(2, 100)
         for number, image in sorted(model.images.items()):
             image.name = f"{number - 1:05d}.jpg"
-        sfm.keep_matches(folder)
-        sfm.store_model(model, folder)
+        reconstruction.keep_matches(folder)
+        reconstruction.store_model(model, folder)
 
     in_this_process(monkeypatch)
-    monkeypatch.setattr(sfm, "map_cameras", gives_up)
+    monkeypatch.setattr(reconstruction, "map_cameras", gives_up)
     for _ in range(2):
         with pytest.raises(InputError, match="only 2 of 4 photographs"):
             load_capture(tmp_path, SMALL, tmp_path / "work")
@@ -519,7 +519,7 @@ def test_two_views_are_refused_although_they_are_half(
 def test_a_disk_that_another_program_fills_meanwhile(label: str, mostly_noise: Path, tmp_path: Path) -> None:
     """pycolmap then aborts, or raises, wherever it is."""
     told = DatasetConfig(max_side=64, allow_few_cameras=True)
-    with small_disk(tmp_path / "disk", sfm.ROOM + (16 << 20)) as disk:
+    with small_disk(tmp_path / "disk", ROOM + (16 << 20)) as disk:
 
         def fill(at: Report) -> None:
             if at.stage == label and not (disk / "full").exists():
@@ -544,9 +544,9 @@ def test_a_model_that_was_cut_off_is_not_kept(tmp_path: Path) -> None:
             files_of_at_most((tmp_path / "whole" / name).stat().st_size - 1),
             pytest.raises(OSError, match="No space"),
         ):
-            sfm.store_model(model, tmp_path)
+            reconstruction.store_model(model, tmp_path)
         assert not (tmp_path / "sparse").exists()
-    sfm.store_model(model, tmp_path)
+    reconstruction.store_model(model, tmp_path)
     assert (tmp_path / "sparse").is_dir()
 
 

@@ -15,7 +15,7 @@ import pytest
 import zstandard
 from PIL import EpsImagePlugin, Image
 
-from langsplat_core.datasets.capture import find_photos, read_photo
+from langsplat_core.datasets.photos import find_photos, read_photo
 from langsplat_core.io.cameras import read_cameras
 from langsplat_core.io.hostile import (
     MOST_PIXELS,

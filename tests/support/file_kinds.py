@@ -10,9 +10,10 @@ import numpy as np
 from PIL import Image
 
 from langsplat_core.arrays import unit
-from langsplat_core.datasets.capture import Capture, read_photo
+from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.colmap import load_colmap
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
+from langsplat_core.datasets.photos import read_photo
 from langsplat_core.display.displays import latent_colours
 from langsplat_core.io.cameras import read_cameras, write_cameras
 from langsplat_core.io.gltf import write_gltf

@@ -42,7 +42,7 @@ def bound_by_permissions() -> Callable[[], None] | None:
 
 def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """What runs in a process of its own runs in this one, where what is patched is so for it too."""
-    monkeypatch.setattr(apart, "run", lambda function, *given, progress: function(*given, progress))
+    monkeypatch.setattr(apart, "run", lambda function, *given, progress, **_: function(*given, progress))
 
 
 @contextmanager

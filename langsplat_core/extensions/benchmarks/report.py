@@ -11,9 +11,9 @@ from PIL import Image, ImageDraw
 from scipy.ndimage import binary_erosion
 
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.capture import read_photo
 from langsplat_core.datasets.colmap import find_model, load_colmap
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
+from langsplat_core.datasets.photos import read_photo
 from langsplat_core.errors import InputError, shortened
 from langsplat_core.extensions.benchmarks.labels import (
     Benchmark,

@@ -1,0 +1,252 @@
+"""Photographs on disk: finding them, reading them whatever their kind, and resampling them to pinholes."""
+
+import logging
+import os
+import tempfile
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from PIL import Image, ImageOps
+
+from langsplat_core.arrays import Array
+from langsplat_core.config import DatasetConfig
+from langsplat_core.datasets.intrinsics import PhotoIntrinsics, pinhole_for, resample, source_positions
+from langsplat_core.errors import InputError, shortened
+from langsplat_core.io.hostile import PHOTO_SUFFIXES, PictureError, is_video, opened
+from langsplat_core.progress import Progress
+from langsplat_core.scene import Camera
+
+ASPECT_TOLERANCE = 0.02  # shrunk copies round their sizes
+WORKERS = 2  # decoding and resampling release the interpreter; more would only hold more pixels
+
+log = logging.getLogger("langsplat")
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """A photograph on disk and the camera it was taken with."""
+
+    path: Path
+    label: str  # path inside the dataset, "/" between its parts
+    intrinsics: PhotoIntrinsics
+    world_to_camera: Array  # (4, 4) float64, rigid
+    upright: bool = False  # the lens describes the photograph turned as its EXIF data ask
+    mask: Path | None = None  # an image of the same shape, black where the photograph does not count
+
+
+class Album:
+    """Images in bounded memory.
+
+    Beyond a limit they lie in files without a name in the temporary folder (`TMPDIR`), which the system reads
+    in where they are used and which end with the process.
+    """
+
+    def __init__(self, in_memory: int = 512_000_000) -> None:
+        """in_memory: bytes of images that are held there."""
+        self._left = in_memory
+
+    def keep(self, image: Array) -> Array:
+        """Return the same (H, W, 3) uint8 image, in memory as long as there is room, else in a file."""
+        self._left -= image.nbytes
+        if self._left >= 0:
+            return image
+        try:
+            with tempfile.TemporaryFile(prefix="langsplat-") as file:
+                # Written, not mapped and filled: on a full disk that would kill the process without a word.
+                file.write(np.ascontiguousarray(image).data)
+                file.flush()
+                return np.memmap(file, np.uint8, "c", shape=image.shape)
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, tempfile.gettempdir()) from error
+
+
+def find_photos(folder: Path) -> list[Path]:
+    """Return photographs directly in `folder`, by name; hidden files do not count."""
+    if not folder.is_dir():
+        return []
+    found = (p for p in folder.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES and p.name[0] != ".")
+    return sorted(p for p in found if p.is_file())
+
+
+def photo_folder(folder: Path) -> Path | None:
+    """Return the folder of the photographs of a dataset: `folder` itself or one level down."""
+    candidates = (folder, folder / "images", folder / "photos")
+    return next((candidate for candidate in candidates if find_photos(candidate)), None)
+
+
+def count_photographs(dataset: Path) -> int:
+    """Return the number of photographs in a dataset: of a video those that are taken out of it by default.
+
+    It is 0 where there are none, and where the dataset cannot be read.
+    """
+    try:
+        if is_video(dataset):
+            return DatasetConfig.frames
+        folder = dataset if dataset.is_dir() else dataset.parent
+        return len(find_photos(folder / "images") or find_photos(photo_folder(folder) or folder))
+    except OSError:
+        return 0
+
+
+def mask_beside(photo: Path) -> Path | None:
+    """Return the mask of a photograph where COLMAP and nerfstudio keep it.
+
+    That is masks/NAME.jpg.png or masks/NAME.png, in the photograph's folder or beside that.
+    """
+    folders = (photo.parent / "masks", photo.parent.parent / "masks")
+    names = (f"{photo.name}.png", f"{photo.stem}.png")
+    candidates = (folder / name for folder in folders for name in names)
+    # os.path.isfile, unlike Path.is_file, also says no to names that no file system could hold.
+    return next((path for path in candidates if path != photo and os.path.isfile(path)), None)
+
+
+def unique_names(labels: Sequence[str]) -> list[str]:
+    """Return file stems where those differ, else paths with "_" for "/" and for the suffix's dot."""
+    stems = [PurePosixPath(label).stem for label in labels]
+    if len(set(stems)) == len(stems):
+        return stems
+    paths = [str(PurePosixPath(label).with_suffix("")).replace("/", "_") for label in labels]
+    if len(set(paths)) == len(paths):
+        return paths
+    return [label.replace("/", "_").replace(".", "_") for label in labels]
+
+
+def read_photo(path: Path, upright: bool) -> Image.Image:
+    """Return an RGB image; transparent pixels are laid over black, 16 bits become 8.
+
+    With `upright` it is turned as its EXIF data ask; unreadable EXIF data count as none. Raises PictureError.
+    """
+    with opened(path) as stored:
+        image = stored
+        if upright:
+            stored.load()  # so that nothing but the EXIF data can fail below
+            try:
+                image = ImageOps.exif_transpose(stored)
+            except Exception:  # noqa: BLE001  Pillow's parser lets through what damaged tags cause
+                image = stored.copy()
+        if image.mode.startswith("I") or image.mode == "F":  # Pillow's own conversion would clip
+            values = np.asarray(image)
+            if image.mode == "F" or not 0 <= values.min(initial=0) <= values.max(initial=0) <= 65535:
+                raise PictureError(path, "more than 16 bits per channel")
+            # the nearest of 256 shades: v / 257 rounded, in whole numbers
+            return Image.fromarray(((values.astype(np.uint32) + 128) // 257).astype(np.uint8)).convert("RGB")
+        if image.has_transparency_data:
+            black = Image.new("RGBA", image.size, (0, 0, 0, 255))
+            return Image.alpha_composite(black, image.convert("RGBA")).convert("RGB")
+        return image.convert("RGB")
+
+
+def _read_for(photo: Photo) -> tuple[Image.Image, PhotoIntrinsics]:
+    """Read a photograph, and return its intrinsics on the pixel grid of the file.
+
+    COLMAP reads pixels as stored, other tools turn them first; when the stored shape does not fit the
+    lens but the turned one does, the latter is meant.
+    """
+    intrinsics = photo.intrinsics
+    image = read_photo(photo.path, photo.upright)
+    if not photo.upright and not _fits(image.size, intrinsics):
+        image = read_photo(photo.path, upright=True)
+    if not _fits(image.size, intrinsics):
+        raise InputError(
+            f"{photo.path} is {image.width}x{image.height} pixels but its camera is "
+            f"{intrinsics.width}x{intrinsics.height}; use the photographs that the cameras were computed from"
+        )
+    try:
+        return image, intrinsics.regridded(*image.size)
+    except ValueError as error:  # a camera of one or two pixels, at the edge of what a lens may be
+        raise InputError(f"{photo.path}: {error}; export the cameras again") from None
+
+
+def _fits(size: tuple[int, int], intrinsics: PhotoIntrinsics) -> bool:
+    ratio = (size[0] * intrinsics.height) / (size[1] * intrinsics.width)
+    return (
+        abs(ratio - 1) < ASPECT_TOLERANCE
+        or max(abs(size[0] - intrinsics.width), abs(size[1] - intrinsics.height)) <= 1
+    )
+
+
+def _read_mask(path: Path, size: tuple[int, int]) -> Image.Image:
+    """Return the mask of a photograph of `size` pixels, as large. InputError for one of another shape."""
+    mask = read_photo(path, upright=False)
+    if abs(mask.width * size[1] / (mask.height * size[0]) - 1) > ASPECT_TOLERANCE:
+        raise InputError(
+            f"{path}: is {mask.width}x{mask.height} pixels, its photograph {size[0]}x{size[1]}; a mask has "
+            "the shape of the photograph as it is shown"
+        )
+    return mask.resize(size, Image.Resampling.NEAREST)
+
+
+# A pinhole, its (H, W, 3) uint8 image, and its (H, W) bool pixels that count (None: all).
+View = tuple[Camera, Array, Array | None]
+
+
+def developer(max_side: int) -> Callable[[Photo], View]:
+    """Return the function that makes the view of a photograph, at most `max_side` pixels long.
+
+    The camera has no name yet. The function raises PictureError for a file that cannot be read.
+    """
+
+    # Photographs of one lens share its pinhole and its map; a few maps are kept, not one per photograph.
+    @lru_cache(maxsize=4)
+    def plan(intrinsics: PhotoIntrinsics) -> tuple[Camera, Array | None]:
+        camera = pinhole_for(intrinsics, max_side)
+        return camera, None if intrinsics.distortion is None else source_positions(intrinsics, camera)
+
+    def view(photo: Photo) -> View:
+        image, intrinsics = _read_for(photo)
+        camera, positions = plan(intrinsics)
+        camera = replace(camera, world_to_camera=photo.world_to_camera)
+        pixels = resample(image, intrinsics, camera, positions)
+        if photo.mask is None:
+            return camera, pixels, None
+        mask = resample(_read_mask(photo.mask, image.size), intrinsics, camera, positions)
+        return camera, pixels, np.asarray(mask[..., 0] >= 128)
+
+    return view
+
+
+def develop(
+    photos: Sequence[Photo], max_side: int, progress: Progress
+) -> tuple[tuple[Camera, ...], tuple[Array, ...], tuple[Photo, ...], tuple[Array | None, ...]]:
+    """Return the cameras, images, files and masks of the views of `photos`, sorted by name.
+
+    There are no masks at all where no photograph has one. Files that cannot be read are reported once and
+    left out; InputError when none is left.
+    """
+    if not photos:
+        raise InputError("the dataset lists no photographs")
+    names = unique_names([photo.label for photo in photos])
+    order = sorted(range(len(photos)), key=names.__getitem__)
+    view_of = developer(max_side)
+
+    def view(index: int) -> View | str:
+        photo = photos[index]
+        try:
+            camera, image, mask = view_of(photo)
+        except PictureError as error:
+            return f"{photo.label} ({error.reason})"
+        if mask is not None and not mask.any():
+            return f"{photo.label} (its mask leaves nothing of it)"
+        return replace(camera, name=names[index]), image, mask
+
+    album = Album()
+    done: list[tuple[Camera, Array, Photo, Array | None]] = []
+    broken: list[str] = []
+    with ThreadPoolExecutor(WORKERS) as pool:
+        for count, (index, found) in enumerate(zip(order, pool.map(view, order), strict=True), 1):
+            if isinstance(found, str):
+                broken.append(found)
+            else:
+                camera, image, mask = found
+                done.append((camera, album.keep(image), photos[index], mask))
+            progress("reading photographs", count / len(order))
+    if not done:
+        raise InputError(f"no photograph can be read: {shortened(broken)}")
+    if broken:
+        log.warning("%d photographs cannot be used and are left out: %s", len(broken), shortened(broken))
+    cameras, images, files, masks = zip(*done, strict=True)
+    return cameras, images, files, masks if any(mask is not None for mask in masks) else ()

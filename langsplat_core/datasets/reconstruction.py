@@ -1,0 +1,345 @@
+"""Structure from motion by pycolmap: features, matches, cameras and points, in steps that report and resume.
+
+pycolmap may abort the process that it runs in, so this module is imported in a process of its own
+(`workspace.run_apart`). The database of a workspace keeps what was computed, so an interrupted run goes on,
+and within one machine ends with the same cameras, byte for byte: photographs are numbered in the order of
+their names, every random choice has its seed, and what adds up over photographs runs on one thread.
+Extraction and matching use all cores: one thread does a whole photograph or pair, and the database is the
+same. Another processor may round otherwise, and find other matches.
+"""
+
+import itertools
+import json
+import math
+import shutil
+from collections.abc import Callable, Collection, Iterable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from langsplat_core.datasets.colmap import read_model
+from langsplat_core.datasets.intrinsics import signals_kept
+from langsplat_core.datasets.matches import FEWEST_MATCHES, MATCHES
+from langsplat_core.datasets.workspace import MASKS, Group, Pair, disk_full
+from langsplat_core.errors import FormatError
+from langsplat_core.io.files import atomic_path
+from langsplat_core.progress import Progress
+from langsplat_core.scene import Camera
+
+with signals_kept():
+    import pycolmap
+
+pycolmap.logging.minloglevel = 3  # where it aborts, its reason is the last thing it says
+
+FEATURES = 8192  # per photograph
+SMALL_SIDE = 1000  # px; smaller photographs are doubled before features are sought, as SIFT proposes
+EXTRACT_BATCH = 8  # photographs per step: a step is the unit of progress and of resuming
+MATCH_BATCH = 64  # pairs per step
+
+Model: TypeAlias = pycolmap.Reconstruction
+
+
+def extract_features(folder: Path, groups: Sequence[Group], progress: Progress) -> None:
+    """Put SIFT features of every photograph of `groups` into the database; those it has are kept."""
+    database, images = folder / "database.db", folder / "images"
+    total, done = sum(len(group.names) for group in groups), 0
+    # Rows first, in the order of the names: extraction on several threads would number photographs as it
+    # happens, and what follows depends on the numbers.
+    for group in groups:
+        with pycolmap.Database.open(database) as opened:
+            known = {image.name: image.camera_id for image in opened.read_all_images()}
+        lacking = [name for name in group.names if name not in known]
+        if lacking:
+            pycolmap.import_images(
+                database_path=database,
+                image_path=images,
+                camera_mode=pycolmap.CameraMode.SINGLE,
+                image_names=lacking,
+                options=_reader(group, known.get(group.names[0], -1), images.with_name(MASKS)),
+            )
+    for group in groups:
+        for start in range(0, len(group.names), EXTRACT_BATCH):
+            progress("finding features", done / total)
+            names = group.names[start : start + EXTRACT_BATCH]
+            _extract(database, images, group, names)
+            done += len(names)
+    progress("finding features", 1.0)
+
+
+def _reader(group: Group, camera_id: int, masks: Path) -> "pycolmap.ImageReaderOptions":
+    """Return options to take in photographs of a group; with -1 COLMAP makes a new camera for them."""
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = group.model
+    reader.camera_params = group.params
+    reader.existing_camera_id = camera_id
+    if masks.is_dir():
+        reader.mask_path = masks
+    return reader
+
+
+def _extract(database: Path, images: Path, group: Group, names: Sequence[str]) -> None:
+    with pycolmap.Database.open(database) as opened:
+        known = {image.name: image for image in opened.read_all_images()}
+        lacking = [n for n in names if n not in known or not opened.exists_keypoints(known[n].image_id)]
+    if not lacking:
+        return
+    options = pycolmap.FeatureExtractionOptions()
+    options.sift.max_num_features = FEATURES
+    options.sift.first_octave = -1 if group.side <= SMALL_SIDE else 0
+    pycolmap.extract_features(
+        database_path=database,
+        image_path=images,
+        image_names=lacking,
+        camera_mode=pycolmap.CameraMode.SINGLE,
+        reader_options=_reader(group, known[group.names[0]].camera_id, images.with_name(MASKS)),
+        extraction_options=options,
+        device=pycolmap.Device.cpu,
+    )
+
+
+def match_features(folder: Path, pairs: Sequence[Pair], progress: Progress) -> None:
+    """Match and verify `pairs` into the database; pairs it has are kept."""
+    with pycolmap.Database.open(folder / "database.db") as opened:
+        ids = {image.name: image.image_id for image in opened.read_all_images()}
+        lacking = [(a, b) for a, b in pairs if not opened.exists_two_view_geometry(ids[a], ids[b])]
+    done = len(pairs) - len(lacking)
+    for start in range(0, len(lacking), MATCH_BATCH):
+        progress("matching photographs", (done + start) / len(pairs))
+        batch = lacking[start : start + MATCH_BATCH]
+        listing = folder / "pairs.txt"
+        listing.write_text("".join(f"{first} {second}\n" for first, second in batch))
+        pairing = pycolmap.ImportedPairingOptions()
+        pairing.match_list_path = listing
+        verification = pycolmap.TwoViewGeometryOptions()
+        verification.ransac.random_seed = 0
+        pycolmap.match_image_pairs(
+            database_path=folder / "database.db",
+            pairing_options=pairing,
+            verification_options=verification,
+            device=pycolmap.Device.cpu,
+        )
+    progress("matching photographs", 1.0)
+
+
+def triangulate(folder: Path, names: Sequence[str], cameras: Sequence[Camera]) -> None:
+    """Write points from matched features and known pinhole cameras, which stay fixed, to ``sparse``."""
+    model = Model()
+    with pycolmap.Database.open(folder / "database.db") as database:
+        for name, camera in zip(names, cameras, strict=True):
+            row = database.read_image_with_name(name)
+            if row.camera_id not in model.cameras:
+                model.add_camera_with_trivial_rig(database.read_camera(row.camera_id))
+            image = pycolmap.Image(name=name, camera_id=row.camera_id, image_id=row.image_id)
+            pose = pycolmap.Rigid3d(np.ascontiguousarray(camera.world_to_camera[:3]))
+            model.add_image_with_trivial_frame(image, pose)
+    attempts = folder / "attempts"
+    attempts.mkdir(exist_ok=True)
+    result = pycolmap.triangulate_points(
+        reconstruction=model,
+        database_path=folder / "database.db",
+        image_path=folder / "images",
+        output_path=attempts,
+        options=_repeatable(pycolmap.IncrementalPipelineOptions()),
+    )
+    store_model(result, folder)
+
+
+def _repeatable(options: "pycolmap.IncrementalPipelineOptions") -> "pycolmap.IncrementalPipelineOptions":
+    """Set seeds, and one thread: sums of several threads differ from run to run."""
+    options.random_seed = 0
+    options.triangulation.random_seed = 0
+    options.num_threads = 1
+    return options
+
+
+def store_model(model: Model, folder: Path) -> None:
+    """Write the model as ``sparse``, which exists only when it is whole, and drop what led to it.
+
+    pycolmap says nothing where the disk takes only a part, so that what was written is read. OSError then.
+    """
+    unfinished = folder / "sparse.part"
+    shutil.rmtree(unfinished, ignore_errors=True)
+    unfinished.mkdir()
+    model.write_binary(unfinished)
+    try:
+        written = read_model(unfinished)
+    except FormatError:
+        raise disk_full(folder) from None
+    if len(written.points) != model.num_points3D():
+        raise disk_full(folder)
+    shutil.rmtree(folder / "sparse", ignore_errors=True)
+    unfinished.rename(folder / "sparse")
+    for name in ("database.db", "pairs.txt"):
+        (folder / name).unlink(missing_ok=True)
+    for name in ("images", MASKS, "attempts"):
+        shutil.rmtree(folder / name, ignore_errors=True)
+
+
+# Cameras from matched photographs: COLMAP's mapper with several settings, of which the best result is kept.
+#
+# The usual one begins with two photographs that see the same things from well apart, which a walk straight
+# ahead does not have; the others begin with less, or place all photographs at once.
+
+ENOUGH = 0.9  # share of the photographs; with fewer located the next method is tried
+ASTRAY, ASTRAY_GUESS = 2.0, 4.0  # times the focal length of EXIF data, and a normal lens's without them
+TIE = 0.05  # of the reprojection error: methods that end at the same cameras differ by 1 to 2 %
+FEWEST_POINTS = 30  # that hold a camera; the incremental mapper demands as many, the global one none
+# For first pairs of a walk straight ahead: degrees between rays, share of motion that is forward, matches.
+_CLOSE_PAIRS = {"init_min_tri_angle": 4.0, "init_max_forward_motion": 1.0, "init_min_num_inliers": 50}
+# For long walks: each photograph shares little with those before it, and what it shares lies far ahead.
+_FEW_SHARED = _CLOSE_PAIRS | {
+    "init_min_tri_angle": 2.0,
+    "abs_pose_min_num_inliers": FEWEST_MATCHES,
+    "abs_pose_min_inlier_ratio": 0.1,
+    "filter_min_tri_angle": 0.5,
+}
+
+
+def map_cameras(folder: Path, count: int, progress: Progress) -> None:
+    """Locate the `count` photographs of a workspace that was matched.
+
+    `MAPPERS` are tried until one locates `ENOUGH`; the best model (see `best_model`) becomes ``sparse``.
+    Where no two could be located there is none.
+    """
+    best: Model | None = None
+    astray: Model | None = None
+    for number, mapper in enumerate(MAPPERS):
+        attempts = folder / "attempts" / str(number)
+        attempts.mkdir(parents=True, exist_ok=True)
+        models = list(mapper(folder, attempts, _counted(count, progress)))
+        lost = [model for model in models if is_astray(model, folder)]
+        best = best_model(best, (model for model in models if model not in lost))
+        astray = best_model(astray, lost)
+        if best is not None and len(located_names(best)) >= ENOUGH * count:
+            break
+    if astray and (best is None or 2 * len(located_names(best)) < len(located_names(astray))):
+        best = astray
+    keep_matches(folder)
+    if best is not None:
+        store_model(best, folder)
+    progress("locating cameras", 1.0)
+
+
+def _counted(count: int, progress: Progress) -> Callable[[], None]:
+    """Report that the work begins, and return what is to be called for every photograph that is placed."""
+    progress("locating cameras", 0.0)
+    placed = itertools.count(1)
+    return lambda: progress("locating cameras", min(next(placed) / count, 0.99))
+
+
+def is_astray(model: Model, folder: Path) -> bool:
+    """Return True where a focal length ended far from what EXIF data say, or without them from any lens.
+
+    On a walk as on rails another focal length explains the photographs as well, in a world of another depth.
+    """
+    with pycolmap.Database.open(folder / "database.db") as database:
+        before = {camera.camera_id: camera for camera in database.read_all_cameras()}
+    return any(
+        abs(math.log(camera.mean_focal_length() / before[number].mean_focal_length()))
+        > math.log(ASTRAY if before[number].has_prior_focal_length else ASTRAY_GUESS)
+        for number, camera in model.cameras.items()
+    )
+
+
+def best_model(best: Model | None, models: Iterable[Model]) -> Model | None:
+    """Return the best of `best` and `models`.
+
+    That is one that locates more than those before it, or as many with a reprojection error that is less by
+    more than `TIE`. Cameras that see fewer than `FEWEST_POINTS` are taken out: where they stand is a guess.
+    """
+    most, least = (0, 0.0) if best is None else _worth(best)
+    for model in models:
+        for image in list(model.images.values()):
+            if image.has_pose and image.num_points3D < FEWEST_POINTS:
+                model.deregister_frame(image.frame_id)
+        count, error = _worth(model)
+        if count > most or (count == most and error < (1 - TIE) * least):
+            best, most, least = model, count, error
+    return best
+
+
+def _worth(model: Model) -> tuple[int, float]:
+    """Return the number of located photographs, and the mean reprojection error, px."""
+    return len(located_names(model)), float(model.compute_mean_reprojection_error())
+
+
+def located_names(model: Model) -> set[str]:
+    """Return photographs that have a camera, by their names in the workspace."""
+    return {image.name for image in model.images.values() if image.has_pose}
+
+
+def _incremental(
+    folder: Path,
+    attempts: Path,
+    advance: Callable[[], None],
+    limits: dict[str, float],
+    focal: Literal["refined", "of EXIF", "guessed"] = "refined",
+) -> Collection[Model]:
+    """Place one photograph after the other, onto a first pair.
+
+    limits: of COLMAP's mapper; focal: lengths that EXIF data say of all photographs stay as they are, or
+    those which no EXIF data say stay a normal lens's. What lies far ahead looks much the same from any
+    distance through another lens.
+    """
+    known = False
+    if focal != "refined":
+        with pycolmap.Database.open(folder / "database.db") as database:
+            known = all(camera.has_prior_focal_length for camera in database.read_all_cameras())
+    if focal == "guessed" and known:  # as with "of EXIF"
+        return []
+    options = _repeatable(pycolmap.IncrementalPipelineOptions())
+    options.min_model_size = 3
+    options.max_num_models = 5
+    options.mapper.mergedict(limits)
+    if known or focal == "guessed":
+        options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = False
+    models: dict[int, Model] = pycolmap.incremental_mapping(
+        database_path=folder / "database.db",
+        image_path=folder / "images",
+        output_path=attempts,
+        options=options,
+        next_image_callback=advance,
+    )
+    return models.values()
+
+
+def _all_at_once(folder: Path, attempts: Path, advance: Callable[[], None]) -> Collection[Model]:
+    """Find the rotations of all photographs first, then their places (GLOMAP)."""
+    options = pycolmap.GlobalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1
+    mapper = options.mapper
+    stages = mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation
+    for seeded in (options, mapper, *stages):
+        seeded.random_seed = 0
+    mapper.global_positioning.use_gpu = False
+    mapper.bundle_adjustment.ceres.use_gpu = False
+    models: dict[int, Model] = pycolmap.global_mapping(
+        database_path=folder / "database.db",
+        image_path=folder / "images",
+        output_path=attempts,
+        options=options,
+    )
+    return models.values()
+
+
+MAPPERS: tuple[Callable[[Path, Path, Callable[[], None]], Collection[Model]], ...] = (
+    partial(_incremental, limits={}),
+    partial(_incremental, limits=_CLOSE_PAIRS),
+    _all_at_once,
+    partial(_incremental, limits=_FEW_SHARED, focal="of EXIF"),
+    partial(_incremental, limits=_FEW_SHARED, focal="guessed"),
+)
+
+
+def keep_matches(folder: Path) -> None:
+    """Write what `read_matches` reads: the database does not outlive the model."""
+    with pycolmap.Database.open(folder / "database.db") as database:
+        names = {image.image_id: image.name for image in database.read_all_images()}
+        features = {name: database.num_keypoints_for_image(number) for number, name in names.items()}
+        pairs, inliers = database.read_two_view_geometry_num_inliers()
+    ends = [[names[number] for number in pycolmap.pair_id_to_image_pair(pair)] for pair in pairs]
+    kept = [[*end, int(count)] for end, count in zip(ends, inliers, strict=True) if count]
+    with atomic_path(folder / MATCHES) as temporary:
+        temporary.write_text(json.dumps({"features": features, "pairs": sorted(kept)}))
