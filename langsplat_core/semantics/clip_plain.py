@@ -1,5 +1,7 @@
-"""The text half of a small CLIP in NumPy, from the files of its weights and tokenizer: it needs neither torch
-nor transformers nor tokenizers, which take seconds to import and hundreds of megabytes to install.
+"""The text half of a small CLIP in NumPy, from the files of its weights and tokenizer.
+
+Written here so that search needs neither torch nor transformers nor tokenizers, which take seconds to import
+and hundreds of megabytes to install.
 
 The network is that of Radford et al. 2021: token and position vectors, layers of causal self-attention and a
 two-layer perceptron, each behind a layer norm and added to what came in, a last norm, and the vector at the
@@ -110,8 +112,10 @@ class PlainClipText:
 
 
 def plain_text_tower(weights: Weights) -> PlainClipText | None:
-    """The text half in `weights`, if it is small, whole and of a kind that is computed here; else None, and
-    torch reads the folder, or says what is wrong with it."""
+    """Return the text half in `weights`, if it is small, whole and of a kind that is computed here.
+
+    Else None, and torch reads the folder, or says what is wrong with it.
+    """
     if weights.device != "cpu" or weights.converted:
         return None
     config = _text_config(weights)
@@ -198,7 +202,7 @@ _ACTIVATIONS: Mapping[str, Callable[[Array], Array]] = {"quick_gelu": _quick_gel
 
 
 def _text_config(weights: Weights) -> TextConfig | None:
-    """Settings of the text half in config.json; None where they cannot be understood."""
+    """Return settings of the text half in config.json; None where they cannot be understood."""
     try:
         whole = json.loads((weights.folder / CONFIG).read_text(encoding="utf-8"))
         stated = {**(whole.get("text_config") or {}), **(whole.get("text_config_dict") or {})}
@@ -226,7 +230,7 @@ class PairTokenizer:
         return [self.numbers.get(token, self.end) for piece in _pieces(text) for token in self._merged(piece)]
 
     def _merged(self, piece: str) -> list[str]:
-        """The tokens of a word: its bytes, of which neighbours are merged in the order of their ranks."""
+        """Return the tokens of a word: its bytes, of which neighbours are merged by their ranks."""
         if piece in ("<|startoftext|>", "<|endoftext|>"):
             return [""]  # neither may stand within a phrase
         word = [BYTES[byte] for byte in piece.encode()]
@@ -251,8 +255,10 @@ def _pieces(text: str) -> Iterator[str]:
 
 
 def _byte_letters() -> tuple[str, ...]:
-    """The letter that stands for each byte in a byte-level vocabulary: itself where Latin-1 prints it, the
-    others from U+0100 on (Radford et al. 2019)."""
+    """Return the letter that stands for each byte in a byte-level vocabulary (Radford et al. 2019).
+
+    It is the byte itself where Latin-1 prints it, the others from U+0100 on.
+    """
     shown = [*range(0x21, 0x7F), *range(0xA1, 0xAD), *range(0xAE, 0x100)]
     others = [byte for byte in range(256) if byte not in shown]
     return tuple(chr(byte if byte in shown else 256 + others.index(byte)) for byte in range(256))
@@ -262,7 +268,10 @@ BYTES = _byte_letters()
 
 
 def read_pair_tokenizer(path: Path) -> PairTokenizer | None:
-    """The tokenizer of a tokenizer.json that states CLIP's rules; None for another, and for no file."""
+    """Return the tokenizer of a tokenizer.json that states CLIP's rules.
+
+    None for another, and for no file.
+    """
     try:
         stated = json.loads(path.read_text(encoding="utf-8"))
         model, ends = stated["model"], stated["post_processor"]
@@ -289,8 +298,10 @@ def read_pair_tokenizer(path: Path) -> PairTokenizer | None:
 
 
 def _tensors(folder: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Array] | None:
-    """The tensors of these names as float32, from all safetensors of a folder; None where one is absent, has
-    another shape, or is of a type that NumPy lacks."""
+    """Return the tensors of these names as float32, from all safetensors of a folder.
+
+    None where one is absent, has another shape, or is of a type that NumPy lacks.
+    """
     from safetensors import SafetensorError, safe_open
 
     found: dict[str, Array] = {}

@@ -67,9 +67,11 @@ def load_tokens(weights: Weights, length: int) -> Tokens:
 
 
 def text_cleaner() -> Callable[[str], str]:
-    """Return the cleaning that open_clip does before its tokenizer reads a text: broken Unicode is mended,
-    curly quotes and ligatures are made plain, names of HTML replaced, spaces made single. The function raises
-    InputError where no letter and no digit is left."""
+    """Return the cleaning that open_clip does before its tokenizer reads a text.
+
+    Broken Unicode is mended, curly quotes and ligatures are made plain, names of HTML replaced, spaces made
+    single. The function raises InputError where no letter and no digit is left.
+    """
     import ftfy
 
     def clean(text: str) -> str:
@@ -82,10 +84,12 @@ def text_cleaner() -> Callable[[str], str]:
 
 
 def check_whole(text: str, ids: Sequence[int], room: int, ends: Collection[int]) -> None:
-    """Refuse a phrase of which a model would not see all. ids: its tokens without those that begin and end a
-    phrase; room: how many the model reads; ends: tokens that end a phrase, which some tokenizers give for
-    every mark that they cannot read. Raises InputError for a phrase that is too long, EncoderError for one
-    that would end early."""
+    """Refuse a phrase of which a model would not see all.
+
+    ids: its tokens without those that begin and end a phrase; room: how many the model reads; ends: tokens
+    that end a phrase, which some tokenizers give for every mark that they cannot read. Raises InputError for
+    a phrase that is too long, EncoderError for one that would end early.
+    """
     if len(ids) > room:
         raise InputError(
             f"'{text[:40]} ...' is too long: {len(ids)} tokens; this encoder reads {room}, so use fewer words"
@@ -95,7 +99,10 @@ def check_whole(text: str, ids: Sequence[int], room: int, ends: Collection[int])
 
 
 def read_tokenizer(weights: Weights) -> Any:
-    """The folder's `tokenizers.Tokenizer`, which neither cuts nor pads. EncoderError for a damaged file."""
+    """Return the folder's `tokenizers.Tokenizer`, which neither cuts nor pads.
+
+    EncoderError for a damaged file.
+    """
     from tokenizers import Tokenizer
 
     try:
@@ -112,7 +119,7 @@ def read_tokenizer(weights: Weights) -> Any:
 
 
 def _number(weights: Weights, tokenizer: Any, role: str) -> int:
-    """The number of the token with a role: as the folder states it, else by its usual names."""
+    """Return the number of the token with a role: as the folder states it, else by its usual names."""
     stated = [_stated(weights, name, role) for name in STATED_IN]
     for token in (*stated, *USUAL[role]):
         number = None if token is None else tokenizer.token_to_id(token)
@@ -159,8 +166,10 @@ class TextTower(Protocol):
         """Temperature of relevancy, see `SHARE_OF_SCALE`."""
 
     def encode(self, texts: list[str]) -> Array:
-        """(B, D) float32 vectors, of any length, of B > 0 phrases. Raises InputError and EncoderError as
-        `check_whole`: no part of a phrase is left out in silence."""
+        """(B, D) float32 vectors, of any length, of B > 0 phrases.
+
+        Raises InputError and EncoderError as `check_whole`: no part of a phrase is left out in silence.
+        """
 
 
 class ImageTower(Protocol):
@@ -216,17 +225,19 @@ class PhraseEncoder:
         return tuple(get_close_matches(word.lower(), sorted(self.words or ()), n=SUGGESTIONS))
 
     def _taught(self, word: str) -> str | None:
-        """The word in which the encoder was taught `word`: itself, or of a possessive its owner."""
+        """Return the word in which the encoder was taught `word`: itself, or of a possessive its owner."""
         assert self.words is not None
         owner = word.partition("'")[0]
         return next((form for form in (word, owner) if form in self.words), None)
 
     def encode_texts(self, texts: Sequence[str]) -> Array:
-        """(M, D) float32 unit vectors of M phrases, raw: no prompt template, as in LangSplat. An encoder of a
-        closed vocabulary is given its words and nothing else: any mark that its tokenizer lacks might end the
-        phrase. Raises InputError for a phrase without a letter or digit or with more tokens than the model
-        reads, UnknownWordError for words it was not taught, EncoderError for other marks that it cannot
-        read."""
+        """(M, D) float32 unit vectors of M phrases, raw: no prompt template, as in LangSplat.
+
+        An encoder of a closed vocabulary is given its words and nothing else: any mark that its tokenizer
+        lacks might end the phrase. Raises InputError for a phrase without a letter or digit or with more
+        tokens than the model reads, UnknownWordError for words it was not taught, EncoderError for other
+        marks that it cannot read.
+        """
         for text in texts:
             self._check(text)
         said = [self._said(text) for text in texts]
@@ -286,7 +297,7 @@ class Encoder(PhraseEncoder):
 
 @asking_errors("the encoder")
 def inferred(forward: Callable[[], Any]) -> Array:
-    """The float32 array of a torch tensor that `forward` computes, without gradients."""
+    """Return the float32 array of a torch tensor that `forward` computes, without gradients."""
     import torch
 
     with torch.inference_mode():
@@ -314,9 +325,11 @@ def _reading(weights: Weights, temperature: float) -> Reading:
 
 
 def pixel_statistics(weights: Weights, mean: Triple, std: Triple) -> tuple[Array, Array]:
-    """(3,) mean and (3,) standard deviation of the pixels a model was trained with, in [0, 1]: those that the
-    folder's preprocessor_config.json states, else `mean` and `std`. Raises EncoderError where that file
-    cannot be read, or states no three numbers."""
+    """Return (3,) mean and (3,) standard deviation of the pixels a model was trained with, in [0, 1].
+
+    They are those that the folder's preprocessor_config.json states, else `mean` and `std`. Raises
+    EncoderError where that file cannot be read, or states no three numbers.
+    """
     path = weights.folder / "preprocessor_config.json"
     name = OPEN_CLIP_CONFIG if weights.converted else path.name
     try:

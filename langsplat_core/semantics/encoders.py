@@ -1,5 +1,7 @@
-"""Families of image-text encoders and their loading: CLIP (Radford et al. 2021, with OpenCLIP and the bundled
-demo encoder) and SigLIP."""
+"""Families of image-text encoders and their loading: CLIP and SigLIP.
+
+CLIP is that of Radford et al. 2021, with OpenCLIP and the bundled demo encoder.
+"""
 
 import math
 import string
@@ -87,6 +89,7 @@ class Images:
 
 
 def clip_images(weights: Weights) -> ImageTower:
+    """Return the image tower of a CLIP, by torch."""
     from transformers import CLIPVisionModelWithProjection
 
     model = _load(CLIPVisionModelWithProjection, "vision", weights)
@@ -94,7 +97,7 @@ def clip_images(weights: Weights) -> ImageTower:
 
 
 def clip_text(weights: Weights) -> TextTower:
-    """The text tower in NumPy where the model is small, else by torch."""
+    """Return the text tower in NumPy where the model is small, else by torch."""
     return plain_text_tower(weights) or ClipText(weights)
 
 
@@ -166,13 +169,16 @@ class SiglipText:
         return inferred(lambda: self._model(input_ids=ids.to(self._device)).pooler_output)
 
     def canonical(self, text: str) -> str:
-        """Return `text` like the captions of its training: clean, in lower case; SigLIP 1 had no punctuation
-        either."""
+        """Return `text` like the captions of its training: clean, in lower case.
+
+        SigLIP 1 had no punctuation either.
+        """
         lower = self._clean(text).lower()
         return " ".join(lower.translate(NO_PUNCTUATION).split()) if self._tokens.is_unigram else lower
 
 
 def siglip_images(weights: Weights) -> ImageTower:
+    """Return the image tower of a SigLIP, by torch."""
     from transformers import SiglipVisionModel
 
     model = load_model(SiglipVisionModel, weights, _siglip_config(weights).vision_config)
@@ -200,18 +206,22 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(  # by `model_type` of config.
 
 @optional_imports(EncoderError)
 def load_text_encoder(model: str, device: str = "cpu") -> PhraseEncoder:
-    """Load the text half of `model`: a folder, a file, a hub id, or "demo" for the bundled encoder. The
-    device is the CPU unless told otherwise, because a phrase takes it a few milliseconds. Raises EncoderError
-    where the weights are absent or are those of no family here."""
+    """Load the text half of `model`: a folder, a file, a hub id, or "demo" for the bundled encoder.
+
+    The device is the CPU unless told otherwise, because a phrase takes it a few milliseconds. Raises
+    EncoderError where the weights are absent or are those of no family here.
+    """
     weights = open_weights(model, model_path(model, "--encoder"), torch_device(device))
     return PhraseEncoder(weights, _family(weights).text(weights))
 
 
 @optional_imports(EncoderError)
 def load_encoder(model: str, device: str = "auto", batch: int = 32) -> Encoder:
-    """Load both halves of `model`: a folder, a file, a hub id, or "demo" for the bundled encoder. batch:
-    images per forward pass. Raises EncoderError where the weights are absent or are those of no family
-    here."""
+    """Load both halves of `model`: a folder, a file, a hub id, or "demo" for the bundled encoder.
+
+    batch: images per forward pass. Raises EncoderError where the weights are absent or are those of no family
+    here.
+    """
     weights = open_weights(model, model_path(model, "--clip.model"), torch_device(device))
     family = _family(weights)
     return Encoder(weights, family.text(weights), family.images(weights), batch)

@@ -49,17 +49,21 @@ class MaskSource(Protocol):
         """Masks of an image (H, W, 3) uint8."""
 
     def begin(self, image: Array, progress: Progress) -> Callable[[], LevelMasks]:
-        """Do the model's part; what is returned does the rest, in any thread, while a model sees the next
-        photograph. By default all is done at once."""
+        """Do the model's part, and return what does the rest, in any thread.
+
+        A model meanwhile sees the next photograph. By default all is done at once.
+        """
         found = self(image, progress)
         return lambda: found
 
 
 def label_maps(levels: LevelMasks) -> Array:
-    """(3, H, W) int32: the row of the mask that is on top at each pixel, -1 where there is none. Rows count
-    through all three levels, subpart first, as in LangSplat's `*_s.npy` (without its "default" level); within
-    a level later masks cover earlier ones. Unlike there, a mask that ends with no visible pixel has no row,
-    so every row from 0 to the maximum occurs, each in one level."""
+    """(3, H, W) int32: the row of the mask that is on top at each pixel, -1 where there is none.
+
+    Rows count through all three levels, subpart first, as in LangSplat's `*_s.npy` (without its "default"
+    level); within a level later masks cover earlier ones. Unlike there, a mask that ends with no visible
+    pixel has no row, so every row from 0 to the maximum occurs, each in one level.
+    """
     maps = np.full((len(levels.masks), *levels.masks[0].shape[1:]), -1, np.int32)
     first = 0
     for level, masks in enumerate(levels.masks):
@@ -84,10 +88,12 @@ ENCLOSED = 0.5  # a region wholly inside another merges with it at this much les
 
 
 class RegionGraph:
-    """Regions of an image with their neighbours; the cheapest pair merges first, so that every later
-    partition is made of unions of every earlier one. The cost of a pair is the distance of its mean colours
-    plus the mean contrast along the common boundary, less for small regions and for those that the other one
-    encloses."""
+    """Regions of an image with their neighbours.
+
+    The cheapest pair merges first, so that every later partition is made of unions of every earlier one. The
+    cost of a pair is the distance of its mean colours plus the mean contrast along the common boundary, less
+    for small regions and for those that the other one encloses.
+    """
 
     def __init__(self, labels: Array, colours: Array) -> None:
         """labels: (H, W) int, 0..N-1, each present; colours: (H, W, 3) lightness and two chromaticities."""
@@ -109,8 +115,10 @@ class RegionGraph:
                     self._push(i, j)
 
     def merge_until(self, cost: float, min_fraction: float) -> None:
-        """Merge every pair cheaper than `cost`, then every region below `min_fraction` of the image with
-        its cheapest neighbour."""
+        """Merge every pair cheaper than `cost`, then small regions with their cheapest neighbour.
+
+        Small is below `min_fraction` of the image.
+        """
         while self._heap and self._heap[0][0] <= cost:
             _, i, j, version_i, version_j = heapq.heappop(self._heap)
             if (self._version[i], self._version[j]) == (version_i, version_j):
@@ -222,8 +230,10 @@ class GraphMasks(MaskSource):
 
 
 def nested_partitions(image: Array) -> Array:
-    """(3, H, W) int32 regions of an image (H, W, 3) uint8, numbered from 0 at each level; every region is
-    a union of regions of the level before. Deterministic."""
+    """(3, H, W) int32 regions of an image (H, W, 3) uint8, numbered from 0 at each level.
+
+    Every region is a union of regions of the level before. Deterministic.
+    """
     from skimage.color import rgb2lab
     from skimage.restoration import denoise_tv_chambolle
 
@@ -243,11 +253,13 @@ def nested_partitions(image: Array) -> Array:
 
 
 def _paint(lab: Array) -> Array:
-    """(H, W, 3) CIELAB -> (H, W, 3) colours of which shading changes only the first channel, lightness. In
-    CIELAB both a, b and L + 16 are differences of cube roots, so all three scale alike with the light that
+    """(H, W, 3) CIELAB -> (H, W, 3) colours of which shading changes only the first channel, lightness.
+
+    In CIELAB both a, b and L + 16 are differences of cube roots, so all three scale alike with the light that
     falls on a surface: a / (L + 16) and b / (L + 16) hardly depend on it. Large chromas are compressed, since
     the eye tells those apart less well (the factor 0.045 is that of CIE 94), and since in deep shade the cube
-    roots of CIELAB turn into straight lines."""
+    roots of CIELAB turn into straight lines.
+    """
     lightness = np.maximum(lab[..., :1], 0)
     chromaticity = lab[..., 1:] * TYPICAL / (lightness + 16)
     chroma = np.linalg.norm(chromaticity, axis=-1, keepdims=True)

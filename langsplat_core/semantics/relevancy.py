@@ -5,13 +5,13 @@
 
 The temperature t is 10 in the method's code, absent from the paper's formula; other encoders have another,
 and cosines of 0.3 for what one calls 0.6. So answers read a phrase against everyday phrases, most of which
-are not there: at every meaning of the scene its cosine is compared with theirs, in units of their spread,
+are not there: at every language feature its cosine is compared with theirs, in units of their spread,
 
     fit  =  (F.q - zero) / spread,        relevancy  =  sigmoid(fit),
 
 where the spread is the standard deviation of the everyday phrases' cosines there, and zero is what the best
 of them have by chance (the mean of the largest `TOP`), mixed with the nearest of the canonical phrases, which
-are LERF's own null, of four. A meaning that lies near all phrases ("hub") thereby loses its advantage.
+are LERF's own null, of four. A feature that lies near all phrases ("hub") thereby loses its advantage.
 """
 
 from dataclasses import dataclass
@@ -30,8 +30,10 @@ CHUNK = 16_384  # decoded vectors held at a time: 32 MB at 512 float32 numbers
 
 
 def relevancy_of(cosines: Array, zero: Array, rate: Array | float) -> Array:
-    """Relevancy in (0, 1) of cosines, zeros and rates whose shapes go together. As published: zero is the
-    largest cosine with a canonical phrase, the rate the temperature."""
+    """Relevancy in (0, 1) of cosines, zeros and rates whose shapes go together.
+
+    As published: zero is the largest cosine with a canonical phrase, the rate the temperature.
+    """
     return sigmoid(rate * (cosines - zero))
 
 
@@ -45,8 +47,10 @@ def relevancy(
 def latent_relevancy(
     codec: Codec, latents: Array, phrases: Array, canonical: Array, temperature: float = Reading.temperature
 ) -> Array:
-    """(M, d) latents of any length, (Q, D), (C, D) -> (M, Q) relevancy of what they stand for, exact, in
-    bounded memory. A latent without meaning gets relevancy 0."""
+    """Return the (M, Q) relevancy of what (M, d) latents stand for, exact, in bounded memory.
+
+    Latents have any length; phrases: (Q, D); canonical: (C, D). An unobserved latent gets relevancy 0.
+    """
     out = np.zeros((len(latents), len(phrases)), np.float32)
     known = np.flatnonzero(codec.known(latents))
     texts = np.concatenate([phrases, canonical])
@@ -78,8 +82,10 @@ class Scale:
         return self.canonical if self.everyday is None else np.concatenate([self.canonical, self.everyday])
 
     def of(self, cosines: Array) -> tuple[Array, Array]:
-        """(M, T) cosines of meanings with `texts` -> (M,) float32 zero and rate of each: relevancy is
-        sigmoid(rate * (cosine - zero))."""
+        """Return the (M,) float32 zeros and rates of language features with (M, T) cosines with `texts`.
+
+        Their relevancy is sigmoid(rate * (cosine - zero)).
+        """
         nearest = cosines[:, : len(self.canonical)].max(1)
         if self.everyday is None:
             return nearest, np.full(len(cosines), self.temperature, np.float32)

@@ -31,11 +31,11 @@ from langsplat_core.semantics.weights import (
 
 PIXEL_MEAN = (123.675, 116.28, 103.53)  # ImageNet's, values 0..255; of every model here
 PIXEL_STD = (58.395, 57.12, 57.375)
-LEVELS = 3  # masks per point
+MASKS_PER_POINT = 3  # masks per point
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class EncodedImage:
     """An image after the model's encoder, which can be asked for masks at points."""
 
     model: Any  # a transformers model
@@ -46,9 +46,11 @@ class Look:
     ordered: bool  # whether the three answers to a point are subpart, part, whole, in this order
 
     @asking_errors("the segmenter")
-    def ask(self, points: Array) -> tuple[Any, Any]:
-        """(P, 2) float32 points x, y, px of the image -> (P, 3) predicted IoU and (P, 3, h, w) logits, low
-        resolution, of the masks subpart, part, whole at each point."""
+    def masks_at(self, points: Array) -> tuple[Any, Any]:
+        """Return (P, 3) predicted IoU and (P, 3, h, w) logits of the masks at each point.
+
+        They are subpart, part, whole, logits in low resolution. points: (P, 2) float32 x, y, px of the image
+        """
         import torch
 
         height, width = self.size or (self.side, self.side)
@@ -70,12 +72,12 @@ class Segmenter(Protocol):
     def name(self) -> str:
         """Name for messages, such as "SAM 2"."""
 
-    def look(self, image: Array) -> Look:
+    def encode(self, image: Array) -> EncodedImage:
         """Show the model an image (H, W, 3) uint8 once."""
 
 
 def by_area(ious: Any, logits: Any) -> tuple[Any, Any]:
-    """The (P, 3) scores and (P, 3, h, w) masks of each point from the smallest mask to the largest."""
+    """Return the (P, 3) scores and (P, 3, h, w) masks of each point from the smallest mask to the largest."""
     import torch
 
     order = torch.argsort((logits > 0).flatten(2).sum(2), dim=1, stable=True)
@@ -85,7 +87,9 @@ def by_area(ious: Any, logits: Any) -> tuple[Any, Any]:
 
 def padded(image: Array, side: int) -> tuple[Array, tuple[int, int]]:
     """Scale the longer side of (H, W, 3) uint8 to `side`, normalise, pad with zeros to the right and below.
-    Returns (1, 3, side, side) float32 and the (height, width) of the image in it, px."""
+
+    Returns (1, 3, side, side) float32 and the (height, width) of the image in it, px.
+    """
     height, width = image.shape[:2]
     scale = side / max(height, width)
     size = max(1, int(height * scale + 0.5)), max(1, int(width * scale + 0.5))
@@ -106,7 +110,7 @@ def _normalised(image: Array, size: tuple[int, int]) -> Array:
 
 
 def upscale(logits: Any, side: int, size: tuple[int, int] | None, shape: tuple[int, int]) -> Any:
-    """(B, h, w) low-resolution logits of the square -> (B, H, W) of the photograph; `size` as in `Look`."""
+    """(B, h, w) low-resolution logits of the square -> (B, H, W) of the photograph; `size`: see there."""
     from torch.nn.functional import interpolate
 
     square = logits[:, None].float()
@@ -134,14 +138,14 @@ class Sam:
         self._model: Any = load_model(SamModel, weights, settings)
 
     @asking_errors("the segmenter")
-    def look(self, image: Array) -> Look:
+    def encode(self, image: Array) -> EncodedImage:
         import torch
 
         side = int(self._model.config.vision_config.image_size)
         pixels, size = padded(image, side)
         given = torch.from_numpy(pixels).to(self._model.device)
         seen = {"image_embeddings": self._model.get_image_embeddings(given)}
-        return Look(self._model, seen, side, size, image.shape[:2], ordered=True)
+        return EncodedImage(self._model, seen, side, size, image.shape[:2], ordered=True)
 
 
 # SAM 2 and 2.1 (Ravi et al. 2024) on single images, by the image half of their video model.
@@ -159,13 +163,13 @@ class Sam2:
         self._model: Any = load_model(Sam2Model, weights, load_config(Sam2Config, weights, self.name))
 
     @asking_errors("the segmenter")
-    def look(self, image: Array) -> Look:
+    def encode(self, image: Array) -> EncodedImage:
         import torch
 
         side = int(self._model.config.prompt_encoder_config.image_size)
         pixels = torch.from_numpy(squashed(image, side)).to(self._model.device)
         seen = {"image_embeddings": self._model.get_image_embeddings(pixels)}
-        return Look(self._model, seen, side, None, image.shape[:2], ordered=False)
+        return EncodedImage(self._model, seen, side, None, image.shape[:2], ordered=False)
 
 
 # Segmenters by hub id, folder or file: a new family is a class above and one row here.
@@ -176,8 +180,10 @@ FAMILIES: Mapping[str, Callable[[Weights], Segmenter]] = MappingProxyType(  # by
 
 
 def load_segmenter(model: str, device: str = "auto") -> Segmenter:
-    """Load `model`: a folder in Hugging Face layout, a file of segment_anything or sam2, or a hub id. Raises
-    EncoderError where the weights are absent or are those of no family here."""
+    """Load `model`: a folder in Hugging Face layout, a file of segment_anything or sam2, or a hub id.
+
+    Raises EncoderError where the weights are absent or are those of no family here.
+    """
     weights = open_weights(model, weights_path(model, "--masks.sam"), torch_device(device))
     named = model_type(weights)
     if named in FAMILIES:
@@ -199,7 +205,9 @@ EDGE = 20.0  # px: a box that ends this near to an edge touches it
 
 def crop_boxes(shape: tuple[int, int], layers: int) -> Array:
     """(C, 4) int64 left, top, right, bottom, px, of the whole image and its crops; the last two exclusive.
-    shape: (height, width); layer k cuts 2^k x 2^k crops that overlap. The whole image comes first."""
+
+    shape: (height, width); layer k cuts 2^k x 2^k crops that overlap. The whole image comes first.
+    """
     height, width = shape
     boxes = [(0, 0, width, height)]
     for layer in range(1, layers + 1):
@@ -218,9 +226,11 @@ def _spans(length: int, count: int, overlap: int) -> list[tuple[int, int]]:
 
 
 def cut_by_crop(boxes: Array, crop: Array, shape: tuple[int, int]) -> Array:
-    """(...,) bool: whether a mask's box ends at an edge of the crop that is no edge of the image: what it
-    shows goes on outside, and the next crop or the whole image shows it better. boxes: (..., 4); crop: (4,)
-    left, top, right, bottom, px of the image; shape: its (height, width)."""
+    """Return (...,) bool, True where a box ends at an edge of the crop that is no edge of the image.
+
+    What such a mask shows goes on outside, and the next crop or the whole image shows it better. boxes:
+    (..., 4); crop: (4,) left, top, right, bottom, px of the image; shape: its (height, width).
+    """
     picture = np.array([0, 0, shape[1], shape[0]])
     at_crop, at_picture = np.abs(boxes - crop) <= EDGE, np.abs(boxes - picture) <= EDGE
     return (at_crop & ~at_picture).any(axis=-1)
@@ -244,8 +254,10 @@ def mask_boxes(masks: Array) -> Array:
 
 
 def box_nms(boxes: Array, scores: Array, iou: float) -> Array:
-    """Greedy non-maximum suppression: (K,) indices kept, by falling score; ties by index. boxes: (M, 4) left,
-    top, right, bottom, non-empty; a box goes when its IoU with a kept one is > `iou`."""
+    """Greedy non-maximum suppression: (K,) indices kept, by falling score; ties by index.
+
+    boxes: (M, 4) left, top, right, bottom, non-empty; a box goes when its IoU with a kept one is > `iou`.
+    """
     order = np.argsort(-scores, kind="stable")
     left, top, right, bottom = boxes.astype(float).T
     area = (right - left) * (bottom - top)
@@ -261,9 +273,11 @@ def box_nms(boxes: Array, scores: Array, iou: float) -> Array:
 
 
 def clean_regions(mask: Array, min_region: int) -> tuple[Array, bool]:
-    """Fill holes below `min_region` px, then drop islands below it; the largest island always stays. mask:
-    (H, W) bool, not empty. Returns the mask and whether anything changed. As SAM's `remove_small_regions`;
-    only the surroundings of the mask are looked at, which changes nothing else."""
+    """Fill holes below `min_region` px, then drop islands below it; the largest island always stays.
+
+    mask: (H, W) bool, not empty. Returns the mask and whether anything changed. As SAM's
+    `remove_small_regions`; only the surroundings of the mask are looked at, which changes nothing else.
+    """
     (left, top, right, bottom), (height, width) = mask_boxes(mask[None])[0], mask.shape
     gaps = np.array([top * width, (height - bottom) * width, left * height, (width - right) * height])
     if ((gaps > 0) & (gaps < min_region)).any():  # what lies beyond the box may itself be a small hole
@@ -308,11 +322,13 @@ def common_pixels(masks: Array) -> Array:
 
 
 def mask_nms(masks: Array, scores: Array, config: MaskConfig) -> Array:
-    """(K,) indices of the masks that stay, rising. masks: (M, H, W) bool, none empty; scores: (M,) stability
-    times predicted IoU. A mask goes when its IoU with any higher-scored mask, gone or not, is > nms_iou; when
-    its score is <= nms_score; or when it lies inside another mask, whatever the scores, so that 1 - (its
-    share in both areas multiplied) > nms_inner. Source: `mask_nms` of LangSplat's preprocessing, with the
-    thresholds that it passes."""
+    """(K,) indices of the masks that stay, rising.
+
+    masks: (M, H, W) bool, none empty; scores: (M,) stability times predicted IoU. A mask goes when its IoU
+    with any higher-scored mask, gone or not, is > nms_iou; when its score is <= nms_score; or when it lies
+    inside another mask, whatever the scores, so that 1 - (its share in both areas multiplied) > nms_inner.
+    Source: `mask_nms` of LangSplat's preprocessing, with the thresholds that it passes.
+    """
     common = common_pixels(masks)
     area = np.diag(common)
     order = np.argsort(-scores, kind="stable")
@@ -405,7 +421,7 @@ class SamMasks(MaskSource):
     def begin(self, image: Array, progress: Progress) -> Callable[[], LevelMasks]:
         """Ask the model; the function that is returned compares pixels and gives the masks."""
         crops = crop_boxes(image.shape[:2], self._config.crop_layers)
-        levels: list[list[Proposal]] = [[] for _ in range(LEVELS)]
+        levels: list[list[Proposal]] = [[] for _ in range(MASKS_PER_POINT)]
         for index, crop in enumerate(crops):
             part = progress.part(index, len(crops))
             try:
@@ -422,8 +438,10 @@ class SamMasks(MaskSource):
         return LevelMasks((kept[0][0], kept[1][0], kept[2][0]), (kept[0][1], kept[1][1], kept[2][1]))
 
     def _in_crop(self, image: Array, crop: Array, progress: Progress, half: bool) -> list[list[Proposal]]:
-        """The proposals that one crop (4,) of the image gives at each level, in pixels of the image. Raises
-        OverflowError for `half` where numbers are larger than float16 holds."""
+        """Return the proposals that one crop (4,) of the image gives at each level, in pixels of the image.
+
+        Raises OverflowError for `half` where numbers are larger than float16 holds.
+        """
         import torch
 
         left, top, right, bottom = crop
@@ -434,31 +452,34 @@ class SamMasks(MaskSource):
         with torch.inference_mode():
             progress("finding masks", 0.0)
             with torch.autocast(HALF_ON, torch.float16, enabled=half):
-                look = self._segmenter.look(part)
+                encoded = self._segmenter.encode(part)
             for start in range(0, len(points), step):
                 if start:
                     progress("finding masks", start / len(points))
                 with torch.autocast(HALF_ON, torch.float16, enabled=half):
-                    answer = look.ask(points[start : start + step])
+                    answer = encoded.masks_at(points[start : start + step])
                 if half and not bool(answer[0].isfinite().all()):
                     raise OverflowError
-                found.append(self._passing(look, answer, crop, image.shape[:2]))
+                found.append(self._passing(encoded, answer, crop, image.shape[:2]))
             figures = np.concatenate([some for some, _ in found])
             logits = torch.cat([some for _, some in found])
-            return [self._best(look, figures, logits, level, crop) for level in range(LEVELS)]
+            return [self._best(encoded, figures, logits, level, crop) for level in range(MASKS_PER_POINT)]
 
     def _passing(
-        self, look: Look, answer: tuple[Any, Any], crop: Array, shape: tuple[int, int]
+        self, encoded: EncodedImage, answer: tuple[Any, Any], crop: Array, shape: tuple[int, int]
     ) -> tuple[Array, Any]:
-        """Masks that pass the tests for themselves: (M, 7) level, predicted IoU, stability and box in
-        the image, and (M, h, w) logits, low resolution, still on the device."""
+        """Return masks that pass the tests for themselves.
+
+        (M, 7) level, predicted IoU, stability and box in the image, and (M, h, w) logits, low resolution,
+        still on the device.
+        """
         import torch
 
         ious, logits = (found.flatten(0, 1).float() for found in answer)
         rows = torch.nonzero(ious > self._config.predicted_iou)[:, 0]
         offset = self._config.stability_offset
-        measured = [measure(look.enlarge(logits[some]), offset) for some in rows.split(MASKS_AT_ONCE)]
-        columns = [rows % LEVELS, ious[rows], *torch.cat(measured).unbind(1)]
+        measured = [measure(encoded.enlarge(logits[some]), offset) for some in rows.split(MASKS_AT_ONCE)]
+        columns = [rows % MASKS_PER_POINT, ious[rows], *torch.cat(measured).unbind(1)]
         figures = torch.stack(columns, dim=1).cpu().numpy()  # the one transfer
         figures[:, 3:] += np.tile(crop[:2], 2)
         boxes = figures[:, 3:]
@@ -466,16 +487,20 @@ class SamMasks(MaskSource):
         good &= ~cut_by_crop(boxes, crop, shape)
         return figures[good], logits[rows[torch.from_numpy(good).to(rows.device)]]
 
-    def _best(self, look: Look, figures: Array, logits: Any, level: int, crop: Array) -> list[Proposal]:
-        """Proposals of a level whose box no better one resembles: only they are enlarged and leave the
-        device."""
+    def _best(
+        self, encoded: EncodedImage, figures: Array, logits: Any, level: int, crop: Array
+    ) -> list[Proposal]:
+        """Return the proposals of a level whose box no better one resembles.
+
+        Only they are enlarged and leave the device.
+        """
         rows = np.flatnonzero(figures[:, 0] == level)
         rows = rows[box_nms(figures[rows, 3:], figures[rows, 1], self._config.box_nms)]
         area = int((crop[2] - crop[0]) * (crop[3] - crop[1]))
         proposals = []
         for start in range(0, len(rows), MASKS_AT_ONCE):
             some = rows[start : start + MASKS_AT_ONCE]
-            masks = (look.enlarge(logits[some]) > 0).cpu().numpy()
+            masks = (encoded.enlarge(logits[some]) > 0).cpu().numpy()
             for mask, (_, iou, stability, *edges) in zip(masks, figures[some].tolist(), strict=True):
                 box = np.array(edges, int)
                 left, top, right, bottom = box - np.tile(crop[:2], 2)
@@ -485,9 +510,12 @@ class SamMasks(MaskSource):
 
 
 def measure(logits: Any, offset: float) -> Any:
-    """(B, 5) float32 of (B, H, W) full-size logits, on their device: stability, left, top, right, bottom, px;
-    right and bottom exclusive, all 0 of an empty mask. At full size, as in segment_anything: at the decoder's
-    own, areas and boxes of small masks differ."""
+    """Return (B, 5) float32 stability, left, top, right, bottom of (B, H, W) full-size logits.
+
+    On their device, px; right and bottom exclusive, all 0 of an empty mask. At full size, as in
+    segment_anything: at the
+    decoder's own, areas and boxes of small masks differ.
+    """
     import torch
 
     inside = ((logits > cut).view(torch.uint8).flatten(1) for cut in (offset, -offset))
@@ -502,10 +530,12 @@ def measure(logits: Any, offset: float) -> Any:
 def filter_level(
     proposals: list[Proposal], shape: tuple[int, int], config: MaskConfig
 ) -> tuple[Array, Array]:
-    """Filter one level: (M, H, W) bool masks and (M,) float32 scores, stability times IoU. proposals: of each
-    crop those that no better one resembled. Order of the steps as in SAM's mask generator with LangSplat's
-    mask suppression behind it: boxes of different crops, where the smaller crop shows more of a thing,
-    crumbs, boxes again (there an untouched mask beats a cleaned one), pixels."""
+    """Filter one level: (M, H, W) bool masks and (M,) float32 scores, stability times IoU.
+
+    proposals: of each crop those that no better one resembled. Order of the steps as in SAM's mask generator
+    with LangSplat's mask suppression behind it: boxes of different crops, where the smaller crop shows more
+    of a thing, crumbs, boxes again (there an untouched mask beats a cleaned one), pixels.
+    """
     if not proposals:
         return np.zeros((0, *shape), bool), np.zeros(0, np.float32)
     closeness = np.array([1 / proposal.crop_area for proposal in proposals])
@@ -522,8 +552,10 @@ def filter_level(
 
 
 def grid_points(per_side: int, size: tuple[int, int]) -> Array:
-    """(per_side^2, 2) float32 points x, y in an image of `size` (height, width): centres of equal cells,
-    row by row."""
+    """Return (per_side^2, 2) float32 points x, y in an image of `size` (height, width).
+
+    They are the centres of equal cells, row by row.
+    """
     centres = (np.arange(per_side) + 0.5) / per_side
     x, y = np.meshgrid(centres * size[1], centres * size[0])
     return np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32)

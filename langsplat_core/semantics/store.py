@@ -1,84 +1,22 @@
-"""Regions of photographs: what CLIP is shown of each, its vectors, and their store on disk."""
+"""Store of masks and vectors, one compact file a photograph, so that an interrupted run can continue."""
 
 import hashlib
-import json
 import logging
 import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 from urllib.parse import quote, unquote
 
 import numpy as np
-from PIL import Image
-from scipy import ndimage
 
 from langsplat_core.arrays import Array, check_array, unit
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import exists, read_npz
-from langsplat_core.progress import Progress, silent
-from langsplat_core.semantics.masks import LevelMasks, MaskSource, label_maps
 
-
-def masked_crop(image: Array, mask: Array, size: int) -> Array:
-    """Cut one region out: black outside the mask, bounding box, centred on a black square, resized. image:
-    (H, W, 3) uint8; mask: (H, W) bool with at least one pixel set; size: side of the result, px. Returns
-    (size, size, 3) uint8. Bilinear, with antialiasing when shrinking. This is the crop of the method's public
-    code (LangSplat `preprocess.py`), which the encoder must also be trained with. Raises ValueError for an
-    empty mask, which has no bounding box."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    if rows.size == 0:
-        raise ValueError("masked_crop: the mask is empty")
-    box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    patch = np.where(mask[box][..., None], image[box], np.uint8(0))
-    height, width = patch.shape[:2]
-    side = max(height, width)
-    square = np.zeros((side, side, 3), np.uint8)
-    top, left = (side - height) // 2, (side - width) // 2
-    square[top : top + height, left : left + width] = patch
-    if side == size:
-        return square
-    return np.asarray(Image.fromarray(square).resize((size, size), Image.Resampling.BILINEAR))
-
-
-# CLIP vectors of the regions of a photograph.
-
-
-class ImageEncoder(Protocol):
-    """The image half of a CLIP model, with its name."""
-
-    @property
-    def id(self) -> str:
-        """Hub id or folder."""
-
-    @property
-    def image_size(self) -> int:
-        """Side of the images it takes, px."""
-
-    def encode_images(self, crops: Array) -> Array:
-        """(M, S, S, 3) uint8 -> (M, D) float32 unit vectors."""
-
-
-def embed_regions(image: Array, label_maps: Array, encoder: ImageEncoder) -> Array:
-    """(M, D) float32 unit vectors of the M regions that `label_maps` numbers. image: (H, W, 3) uint8;
-    label_maps: (3, H, W) int32 as of `masks.label_maps`. A region is shown as it is visible in its map, on
-    black; where masks of one level overlap, LangSplat shows the covered part too."""
-    crops = np.zeros((int(label_maps.max()) + 1, encoder.image_size, encoder.image_size, 3), np.uint8)
-    for labels in label_maps:
-        for row, box in enumerate(ndimage.find_objects(labels + 1)):
-            if box is not None:  # a row of another level
-                crops[row] = masked_crop(image[box], labels[box] == row, encoder.image_size)
-    return encoder.encode_images(crops)
-
-
-# What is known of every photograph, one compact file each, so that an interrupted run can continue.
-
-VERSION = 1
 SUFFIX = ".features.npz"
-_PARTS = {"key": "U", "labels": "i", "vectors": "f"}  # of a file, with the kind of its type
 LONGEST_NAME = 200  # bytes before the suffix; file systems take 255, the suffix and a temporary name more
 SHORTENED = "%~"  # percent-encoding never writes this
 
@@ -102,16 +40,21 @@ class ImageFeatures:
 
 
 class FeatureStore:
-    """A folder with one file per photograph: labels as int16 (int32 from 32768 regions on), vectors as
-    float16 (cosine error below 1e-6), deflated. Never pickled, never half written."""
+    """A folder with one file per photograph, never pickled and never half written.
+
+    Labels are int16 (int32 from 32768 regions on), vectors float16 (cosine error below 1e-6), deflated.
+    """
 
     def __init__(self, folder: Path | str) -> None:
         self.folder = Path(folder)
-        self._reported: set[str] = set()  # names whose damaged files were told of
+        self._warned: set[str] = set()  # names of damaged files
 
     def path(self, name: str) -> Path:
-        """File of the photograph called `name`: by its name, percent-encoded, or, where that is longer
-        than files' names may be, by the beginning of it and a digest. The file itself holds the whole."""
+        """Return the file of the photograph called `name`: its name percent-encoded.
+
+        A name that is longer than files' names may be is cut, and a digest stands in for the rest. The file
+        itself holds the whole name.
+        """
         quoted = quote(name, safe=" ", errors="surrogateescape")
         if len(quoted) > LONGEST_NAME:
             digest = hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
@@ -119,7 +62,7 @@ class FeatureStore:
         return self.folder / (quoted + SUFFIX)
 
     def names(self) -> list[str]:
-        """Names of the photographs in the store, sorted. Raises FormatError for a damaged file."""
+        """Return the names of the photographs in the store, sorted. Raises FormatError for a damaged file."""
         return sorted(self._name(path) for path in self.folder.glob(f"*{SUFFIX}"))
 
     def _name(self, path: Path) -> str:
@@ -132,15 +75,17 @@ class FeatureStore:
         return os.fsdecode(stored.tobytes())
 
     def has(self, name: str, key: str | None = None) -> bool:
-        """Return True where a whole file for `name` exists; with `key`, only if it was saved with that key. A
-        damaged one counts as absent, and is told of once: what it held is then made again."""
+        """Return True where a whole file for `name` exists; with `key`, only if it was saved with that key.
+
+        A damaged file counts as absent, and is warned of once: what it held is then made again.
+        """
         try:
             if not exists(self.path(name)):
                 return False
             stored_key = self._read(name)[1]
         except InputError as error:
-            if name not in self._reported:
-                self._reported.add(name)
+            if name not in self._warned:
+                self._warned.add(name)
                 log.warning("%s; made again", error)
             return False
         return key is None or stored_key == key
@@ -159,47 +104,32 @@ class FeatureStore:
             )
 
     def load(self, name: str) -> ImageFeatures:
-        """The features of one photograph. Raises FormatError for an absent or damaged file."""
+        """Return the features of one photograph. Raises FormatError for an absent or damaged file."""
         try:
             return self._read(name)[0]
         except InputError as error:
             raise FormatError(f"{error}; delete it and run again") from None
 
     def _read(self, name: str) -> tuple[ImageFeatures, str]:
-        """The features and the key they were saved with. Raises InputError and FormatError."""
+        """Return the features and the key they were saved with. Raises InputError and FormatError."""
         path = self.path(name)
         arrays = read_npz(path)
-        for part, kind in _PARTS.items():
-            if part not in arrays or arrays[part].dtype.kind != kind:
-                raise FormatError(
-                    f"{path}: no readable image features ({part!r} is missing or of another type)"
-                )
-        if arrays["key"].ndim or not np.isfinite(arrays["vectors"]).all():
-            raise FormatError(f"{path}: no readable image features (numbers that are not finite)")
-        labels, vectors = arrays["labels"].astype(np.int32), arrays["vectors"].astype(np.float32)
         try:
-            return ImageFeatures(labels, unit(vectors)), str(arrays["key"])
+            key, labels, vectors = arrays["key"], arrays["labels"], arrays["vectors"]
+            if (key.dtype.kind, labels.dtype.kind, vectors.dtype.kind) != ("U", "i", "f") or key.ndim:
+                raise TypeError("arrays of other types")
+            if not np.isfinite(vectors).all():
+                raise ValueError("numbers that are not finite")
+            features = ImageFeatures(labels.astype(np.int32), unit(vectors.astype(np.float32)))
+        except KeyError as error:
+            raise FormatError(f"{path}: no readable image features ({error} is missing)") from None
         except (ValueError, TypeError) as error:
             raise FormatError(f"{path}: no readable image features ({error})") from None
-
-
-def feature_key(image: Array, mask_source: MaskSource, encoder: str) -> str:
-    """A short name of everything that the features of `image` depend on; `encoder` is the encoder's
-    `fingerprint`."""
-    settings = json.dumps([VERSION, mask_source.key, encoder, image.shape])
-    return hashlib.sha256(settings.encode() + np.ascontiguousarray(image).tobytes()).hexdigest()[:16]
-
-
-def fingerprint(encoder: ImageEncoder) -> str:
-    """Tells an encoder from others, also from other weights under the same name: what it makes of a ramp."""
-    side = encoder.image_size
-    ramp = np.linspace(0, 255, side * side * 3).reshape(1, side, side, 3).astype(np.uint8)
-    made = np.round(encoder.encode_images(ramp)[0], 2) + 0.0  # minus zero is zero
-    return json.dumps([encoder.id, side, made.tolist()])
+        return features, str(key)
 
 
 class StoredFeatures(Sequence[ImageFeatures]):
-    """Features of photographs in a store, each read when it is looked at."""
+    """Features of photographs in a store, each read when it is used."""
 
     def __init__(self, store: FeatureStore, names: Sequence[str]) -> None:
         self._store, self._names = store, tuple(names)
@@ -210,60 +140,3 @@ class StoredFeatures(Sequence[ImageFeatures]):
     def __getitem__(self, index: Any) -> Any:
         """Return the features of photograph `index`, a number; slices are not supported."""
         return self._store.load(self._names[index])
-
-
-MASKS_STAGE = "masks and vectors"
-
-
-def within(labels: Array, mask: Array | None) -> Array:
-    """(L, H, W) label maps without what lies outside of the (H, W) mask; numbers stay without gaps."""
-    if mask is None:
-        return labels
-    kept = np.where(mask, labels, -1)
-    numbers = np.unique(kept[kept >= 0])
-    return np.where(kept >= 0, np.searchsorted(numbers, kept), -1).astype(labels.dtype)
-
-
-def describe_capture(
-    images: Sequence[Array],
-    names: Sequence[str],
-    mask_source: MaskSource,
-    encoder: ImageEncoder | None,
-    store: FeatureStore,
-    progress: Progress = silent,
-    counted: Sequence[Array | None] = (),
-) -> StoredFeatures:
-    """Masks and CLIP vectors of every photograph, in order; those that `store` has already are not redone.
-    Without an encoder the vectors have no numbers. images: (H, W, 3) uint8 each; names: unique, one per
-    image; counted: (H, W) bool each, outside of which no mask is kept (None: everywhere). What is finished is
-    in the store even when `progress` interrupts the work. Each photograph's regions are encoded by
-    themselves: its file does not depend on which others were made beside it."""
-    made_by = "none" if encoder is None else fingerprint(encoder)
-
-    def keep(finish: Callable[[], LevelMasks], index: int, key: str) -> None:
-        image, name = images[index], names[index]
-        labels = within(label_maps(finish()), counted[index] if counted else None)
-        if encoder is None:
-            vectors = np.zeros((int(labels.max()) + 1, 0), np.float32)
-        else:
-            vectors = embed_regions(image, labels, encoder)
-        store.save(name, ImageFeatures(labels, vectors), key)
-
-    with ThreadPoolExecutor(1) as worker:  # filters, crops and files of one while masks of the next are found
-        before: Future[None] | None = None
-        for index, (image, name) in enumerate(zip(images, names, strict=True)):
-            mask = counted[index] if counted else None
-            part = progress.part(index, len(images), MASKS_STAGE, name)
-            part(MASKS_STAGE, 0.0)
-            key = feature_key(image, mask_source, made_by)
-            if mask is not None:
-                key += hashlib.sha256(np.packbits(mask).tobytes()).hexdigest()[:12]
-            if not store.has(name, key):
-                finish = mask_source.begin(image, part)
-                if before is not None:  # one photograph's full-size masks at a time
-                    before.result()
-                before = worker.submit(keep, finish, index, key)
-        if before is not None:
-            before.result()
-    progress(MASKS_STAGE, 1.0)
-    return StoredFeatures(store, names)

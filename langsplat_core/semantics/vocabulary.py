@@ -18,15 +18,19 @@ LONGEST = 80  # characters of a phrase: CLIP reads 77 tokens, and a whole paragr
 
 
 def bundled_vocabulary(name: Bundled) -> tuple[str, ...]:
-    """The phrases of a bundled list: everyday things, parts of things, colours, materials. Raises InputError
-    where it is missing from the installation."""
+    """Return the phrases of a bundled list: everyday things, parts of things, colours, materials.
+
+    Raises InputError where it is missing from the installation.
+    """
     return read_vocabulary(Path(str(files("langsplat_assets") / "vocabulary" / f"{name}.txt")))
 
 
 def read_vocabulary(path: Path) -> tuple[str, ...]:
-    """The phrases of a UTF-8 text file, one a line, in lower case, each once, in the file's order. Empty
-    lines and lines that begin with # do not count. Raises InputError for a file that cannot be read, that has
-    no phrase, or with a line that is none (no letter or digit, too long, no text), which is named."""
+    """Return the phrases of a UTF-8 text file, one a line, in lower case, each once, in the file's order.
+
+    Empty lines and lines that begin with # do not count. Raises InputError for a file that cannot be read,
+    that has no phrase, or with a line that is none (no letter or digit, too long, no text), which is named.
+    """
     try:
         lines = path.read_bytes().removeprefix(b"\xef\xbb\xbf").splitlines()
     except OSError as error:
@@ -42,7 +46,10 @@ def read_vocabulary(path: Path) -> tuple[str, ...]:
 
 
 def _phrase(line: bytes, where: str) -> str:
-    """The phrase of a line, "" where it has none; InputError that begins with `where` for a bad line."""
+    """Return the phrase of a line, "" where it has none.
+
+    InputError that begins with `where` for a bad line.
+    """
     try:
         text = line.decode("utf-8").strip()
     except UnicodeDecodeError:
@@ -104,8 +111,10 @@ class TextEncoder(Protocol):
 
 
 def everyday_phrases(unknown_words: Callable[[str], Sequence[str]]) -> list[str]:
-    """Nouns, and as many as `MIXED` random pairs of an adjective and a noun, the same each time; without
-    words that the encoder was never taught."""
+    """Nouns, and as many as `MIXED` random pairs of an adjective and a noun, the same each time.
+
+    Without words that the encoder was never taught.
+    """
     nouns = [word for word in NOUNS if not unknown_words(word)]
     adjectives = [word for word in ADJECTIVES if not unknown_words(word)]
     if not nouns or not adjectives:
@@ -116,8 +125,10 @@ def everyday_phrases(unknown_words: Callable[[str], Sequence[str]]) -> list[str]
 
 
 def everyday_vectors(encoder: TextEncoder) -> Array | None:
-    """(V, D) float32 unit vectors of the everyday phrases, of float16 precision, as a scene keeps them; None
-    for an encoder that was taught too few of them."""
+    """(V, D) float32 unit vectors of the everyday phrases, of float16 precision, as a scene keeps them.
+
+    None for an encoder that was taught too few of them.
+    """
     phrases = everyday_phrases(encoder.unknown_words)
     if len(phrases) < FEWEST:
         return None

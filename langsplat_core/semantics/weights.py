@@ -76,10 +76,12 @@ def open_weights(id: str, path: Path, device: str) -> Weights:
 
 
 def weights_path(model: str, option: str) -> Path:
-    """The folder or file that holds `model`, downloaded when it is a hub id that is not cached yet. model: an
-    existing folder or file, or a hub id "owner/name"; option: the setting to name in messages, such as
-    "--clip.model". What exists is never looked up on the hub, and with HF_HUB_OFFLINE set nothing is. Raises
-    EncoderError saying what to pass or to run."""
+    """Return the folder or file that holds `model`, downloaded when it is a hub id that is not cached yet.
+
+    model: an existing folder or file, or a hub id "owner/name"; option: the setting to name in messages, such
+    as "--clip.model". What exists is never looked up on the hub, and with HF_HUB_OFFLINE set nothing is.
+    Raises EncoderError saying what to pass or to run.
+    """
     path = Path(model).expanduser()
     if path.is_file():
         plain = any(path.match(pattern) for pattern in SAFE + PICKLED)
@@ -138,8 +140,10 @@ def _from_hub(model: str, option: str) -> Path:
 
 
 def model_type(weights: Weights) -> str:
-    """The architecture that the folder's config.json names, "" where it names none. Raises EncoderError for a
-    file that is no JSON."""
+    """Return the architecture that the folder's config.json names, "" where it names none.
+
+    Raises EncoderError for a file that is no JSON.
+    """
     if weights.converted:
         return str(weights.converted.config["model_type"])
     try:
@@ -150,84 +154,69 @@ def model_type(weights: Weights) -> str:
 
 
 def load_config(kind: Any, weights: Weights, name: str) -> Any:
-    """The configuration of `weights` as transformers' class `kind`; `name` is the family's in messages.
-    Raises EncoderError where it cannot be read."""
+    """Return the configuration of `weights` as transformers' class `kind`.
+
+    `name` is the family's in messages. Raises EncoderError where it cannot be read.
+    """
     with loading_errors(weights.id, name):
         if weights.converted:
             return kind.from_dict(deepcopy(weights.converted.config))
-        _check_sizes(weights)
+        _check_counts(weights)
         return kind.from_pretrained(weights.folder, local_files_only=True)
 
 
-# In config.json: sizes that are a side of some tensor, or fewer; numbers of what has a tensor each.
-SIDES = (
-    *("hidden_size", "intermediate_size", "vocab_size", "max_position_embeddings", "num_attention_heads"),
-    *("patch_size", "num_channels", "projection_size", "mlp_dim", "output_channels", "mask_input_channels"),
-    *("iou_head_hidden_dim", "fpn_hidden_size", "embed_dim_per_stage", "backbone_channel_list"),
-)
-COUNTS = (
-    *("num_hidden_layers", "iou_head_depth", "num_multimask_outputs", "num_point_embeddings"),
-    "blocks_per_stage",
-)
-LARGEST_IMAGE = 1 << 16  # pixels; no other number is larger either
-_LAYER = re.compile(r"(?:encoder|transformer)\.layers\.(\d+)\.|backbone\.blocks\.(\d+)\.", re.ASCII)
+# Names in config.json of the numbers of parts that are built one by one, each with tensors of its own.
+COUNTS = frozenset({
+    "num_hidden_layers", "blocks_per_stage", "iou_head_depth", "num_multimask_outputs",
+    "num_point_embeddings",
+})  # fmt: skip
+LARGEST_IMAGE = 1 << 14  # pixels a side
+_LAYER = re.compile(r"(?:layers|blocks)\.\d+\.")
 
 
-def _check_sizes(weights: Weights) -> None:
-    """EncoderError where config.json states sizes that its tensors cannot have: a model of those would be
-    built, with random numbers, before anybody compares."""
-    settings, shapes = json.loads((weights.folder / CONFIG).read_text(encoding="utf-8")), _shapes(weights)
-    largest = max((side for shape in shapes.values() for side in shape), default=0)
-    for prefix, name, value in _numbers_in(settings):
-        half = prefix.partition("_")[0]  # text_config.: tensors text_model.
-        layers = {int(n) for key in shapes if half and key.startswith(half) for n in _layer_of(key)}
-        if name in ("num_hidden_layers", "blocks_per_stage") and layers:
-            total = sum(value) if name == "blocks_per_stage" and _whole(value) else value
-            _check_size(weights, prefix + name, total, len(layers), len(layers))
-        if name in SIDES or (name == "projection_dim" and not prefix):
-            _check_size(weights, prefix + name, value, 1, largest)
-        elif name in COUNTS:
-            _check_size(weights, prefix + name, value, 1, len(shapes))
-        elif name == "image_size":
-            _check_size(weights, prefix + name, value, 1, LARGEST_IMAGE)
-        elif _whole(value):
-            most = max(largest, LARGEST_IMAGE)
-            _check_size(weights, prefix + name, value, -most, most)
+def _check_counts(weights: Weights) -> None:
+    """Raise EncoderError where config.json states more parts than the weights have tensors, or huge images.
+
+    Building such parts could take hours, before anybody compares.
+    """
+    settings = json.loads((weights.folder / CONFIG).read_text(encoding="utf-8"))
+    largest = dict.fromkeys(COUNTS, len(_shapes(weights))) | {"image_size": LARGEST_IMAGE}
+    for name, value in _named_values(settings):
+        values = value if isinstance(value, list) else [value]
+        most = largest.get(name, 0)
+        if most and not all(isinstance(n, int) and 1 <= n <= most for n in values if n is not None):
+            raise EncoderError(
+                f"{weights.id}: {CONFIG}: {name} is {json.dumps(value)[:40]}, its weights allow 1 to {most}; "
+                "take the file that belongs to them"
+            )
 
 
-def _numbers_in(settings: Any, prefix: str = "") -> Iterator[tuple[str, str, Any]]:
-    """(names of the parts that it is in, its own, value) of every value of a configuration, part by part."""
+def _named_values(settings: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the name and value of every setting, part by part."""
     for name, value in settings.items() if isinstance(settings, dict) else ():
-        if isinstance(value, dict):
-            yield from _numbers_in(value, f"{prefix}{name}.")
-        elif value is not None:  # which leaves it to the family
-            yield prefix, name, value
+        yield from _named_values(value) if isinstance(value, dict) else ((name, value),)
 
 
-def _layer_of(tensor: str) -> Iterator[str]:
-    """The number of the layer that a tensor belongs to, if it is in one of the many."""
-    found = _LAYER.search(tensor)
-    return filter(None, found.groups()) if found else iter(())
+def _check_size(kind: Any, weights: Weights, config: Any) -> None:
+    """Raise EncoderError where a model of this configuration holds more numbers than its weights.
 
+    transformers would fill memory with random ones, before anybody compares. The model is built on torch's
+    meta device, where it takes no room.
+    """
+    import torch
 
-def _whole(value: Any) -> bool:
-    """Return whether a value is a whole number, or a list of such."""
-    values = value if isinstance(value, list) else [value]
-    return all(isinstance(v, int) and not isinstance(v, bool) for v in values)
-
-
-def _check_size(weights: Weights, name: str, value: Any, least: int, most: int) -> None:
-    values = value if isinstance(value, list) else [value]  # image_size may have two
-    if not (_whole(value) and all(least <= v <= most for v in values)):
-        expected = f"{least}" if least == most else f"a whole number from {least} to {most}"
+    with torch.device("meta"):
+        asked = sum(parameter.numel() for parameter in kind(config).parameters())
+    held = sum(math.prod(shape) for shape in _shapes(weights).values())
+    if asked > held:
         raise EncoderError(
-            f"{weights.id}: {CONFIG}: {name} is {json.dumps(value)[:40]}, its weights have {expected}; take "
-            "the file that belongs to them"
+            f"{weights.id}: {CONFIG} states a model of {asked} numbers, its weights have {held}; take the "
+            "file that belongs to them"
         )
 
 
 def _shapes(weights: Weights) -> dict[str, tuple[int, ...]]:
-    """The shapes of all tensors of a folder, by name; of pickles without reading their numbers."""
+    """Return the shapes of all tensors of a folder, by name; of pickles without reading their numbers."""
     from safetensors import safe_open
 
     found: dict[str, tuple[int, ...]] = {}
@@ -241,7 +230,7 @@ def _shapes(weights: Weights) -> dict[str, tuple[int, ...]]:
 
 
 def _weight_files(folder: Path) -> list[Path]:
-    """The files with a folder's weights: of both kinds the first, which transformers prefers, too."""
+    """Return the files with a folder's weights: of both kinds the first, which transformers prefers, too."""
     for patterns in (SAFE, PICKLED):
         if paths := sorted(path for pattern in patterns for path in folder.glob(pattern)):
             return paths
@@ -249,7 +238,7 @@ def _weight_files(folder: Path) -> list[Path]:
 
 
 def unpickled(path: Path) -> dict[str, Any]:
-    """The tensors of a file of torch, by name, read when they are used where the file allows."""
+    """Return the tensors of a file of torch, by name, read when they are used where the file allows."""
     import torch
 
     mapped = zipfile.is_zipfile(path)  # files of PyTorch before 1.6 are none, and are read whole
@@ -257,23 +246,28 @@ def unpickled(path: Path) -> dict[str, Any]:
 
 
 def load_model(kind: Any, weights: Weights, config: Any) -> Any:
-    """A transformers model of class `kind` in float32 on the device of `weights`, ready to be asked. Raises
-    EncoderError where the folder lacks some of its weights or has them in another shape: transformers alone
-    would fill those with random numbers. Converted weights may hold no more than the model has, either: what
-    was deduced from them may be wrong."""
+    """Return a transformers model of class `kind` in float32 on the device of `weights`, ready to be asked.
+
+    Raises EncoderError where the folder lacks some of its weights or has them in another shape: transformers
+    alone would fill those with random numbers. Nor may it have more layers than the model, and converted
+    weights anything more: what was deduced from them may be wrong.
+    """
     import torch
 
     options = {"local_files_only": True, "ignore_mismatched_sizes": True, "output_loading_info": True}
     with loading_errors(weights.id, kind.__name__):
+        if not weights.converted:
+            _check_size(kind, weights, config)
         source = None if weights.converted else weights.folder
         tensors = dict(weights.converted.tensors) if weights.converted else None
         model, report = kind.from_pretrained(
             source, config=config, state_dict=tensors, dtype=torch.float32, **options
         )
     wrong = sorted(report["missing_keys"]) or sorted(str(key[0]) for key in report["mismatched_keys"])
-    if weights.converted and not wrong:
+    if not wrong:  # a layer more, or of converted weights anything more
         halves = {name.partition(".")[0] for name in model.state_dict()}
-        wrong = sorted(name for name in report["unexpected_keys"] if name.partition(".")[0] in halves)
+        more = (name for name in report["unexpected_keys"] if name.partition(".")[0] in halves)
+        wrong = sorted(name for name in more if weights.converted or _LAYER.search(name))
     if wrong:
         raise EncoderError(
             f"{weights.id}: not weights of {kind.__name__}: {len(wrong)} do not fit, such as {wrong[0]}"
@@ -283,7 +277,9 @@ def load_model(kind: Any, weights: Weights, config: Any) -> Any:
 
 def read_scalar(weights: Weights, name: str) -> float:
     """Read a number that is among the weights, without loading the rest of them; NaN where it is not there.
-    Half a model (a text tower) has no place for what belongs to the pair, such as a logit scale."""
+
+    Half a model (a text tower) has no place for what belongs to the pair, such as a logit scale.
+    """
     from safetensors import safe_open
 
     value = math.nan
@@ -329,8 +325,10 @@ def loading_errors(id: str, kind: str) -> Iterator[None]:
 
 @contextmanager
 def asking_errors(what: str) -> Iterator[None]:
-    """While a loaded model is asked: EncoderError where its configuration, of which loading compares no more
-    than sizes, turns out not to fit its weights."""
+    """Turn the errors of asking a loaded model into EncoderError.
+
+    Loading compares no more than sizes; whether a configuration fits its weights may show later.
+    """
     import torch
 
     try:
@@ -343,8 +341,10 @@ def asking_errors(what: str) -> Iterator[None]:
 
 
 def torch_device(device: str) -> str:
-    """Device that "auto" means here: cuda where PyTorch sees one, else cpu. EncoderError for an absent
-    device. By its number: which one is current is a matter of each thread."""
+    """Device that "auto" means here: cuda where PyTorch sees one, else cpu.
+
+    EncoderError for an absent device. By its number: which one is current is a matter of each thread.
+    """
     if device == "cpu":
         return device  # without importing torch, which a small text encoder does without
     import torch

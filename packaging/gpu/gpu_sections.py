@@ -589,20 +589,20 @@ def _segmenter(folder: str, plan: Plan) -> str:
     with torch.inference_mode():
         for _ in range(2):  # the first chooses algorithms
             laps = [_now()]
-            look = segmenter.look(image)
+            encoded = segmenter.encode(image)
             laps.append(_now())
-            answers = [look.ask(points) for _ in range(plan.batches)]
+            answers = [encoded.masks_at(points) for _ in range(plan.batches)]
             laps.append(_now())
             for _, logits in answers:
                 for some in logits.flatten(0, 1).split(ENLARGED):
-                    torch.gt(look.enlarge(some), 0)  # what a mask is made by
+                    torch.gt(encoded.enlarge(some), 0)  # what a mask is made by
             laps.append(_now())
             rows.append([after - before for before, after in pairwise(laps)])
         memory = peak_mib()
         ious, logits = (part.cpu().numpy() for part in answers[0])
         start = time.perf_counter()
-        there = load_segmenter(folder, "cpu").look(image)
-        wanted = [part.numpy() for part in there.ask(points)]
+        there = load_segmenter(folder, "cpu").encode(image)
+        wanted = [part.numpy() for part in there.masks_at(points)]
         slow = time.perf_counter() - start
     errors = (
         _largest_difference(ious, wanted[0]),

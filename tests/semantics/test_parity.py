@@ -29,8 +29,14 @@ from langsplat_core.config import MaskConfig
 from langsplat_core.progress import silent
 from langsplat_core.semantics.encoders import load_encoder
 from langsplat_core.semantics.masks import label_maps
-from langsplat_core.semantics.sam import LEVELS, Look, SamMasks, load_mask_source, load_segmenter
-from langsplat_core.semantics.store import masked_crop
+from langsplat_core.semantics.regions import masked_crop
+from langsplat_core.semantics.sam import (
+    MASKS_PER_POINT,
+    EncodedImage,
+    SamMasks,
+    load_mask_source,
+    load_segmenter,
+)
 from tests.support.backends import Measure
 
 PARTS = ("segment_anything.automatic_mask_generator", "sam2.build_sam", "sam2.sam2_image_predictor")
@@ -216,19 +222,21 @@ POINTS = np.array([[100, 200], [700, 500], [1300, 1000]], np.float32) / (1440, 1
 
 
 def compare(
-    name: str, look: Look, embedding: Any, points: Array, want: tuple[Any, Any], measured: Measure
+    name: str, encoded: EncodedImage, embedding: Any, points: Array, want: tuple[Any, Any], measured: Measure
 ) -> None:
-    """A `Look` against the package's `embedding` (1, C, h, w), and what it answers from that same one against
-    `want`, scores (P, 3) and full-size logits (P, 3, H, W); what rounding grows to by both is measured."""
+    """Compare an `EncodedImage` with the package's `embedding` (1, C, h, w), and its answers with `want`.
+
+    `want`: scores (P, 3) and full-size logits (P, 3, H, W); what rounding grows to by both is measured.
+    """
     field = upstream()
     scores, full = want
-    seen = look.seen["image_embeddings"]
+    seen = encoded.seen["image_embeddings"]
     mine, alike = (seen[-1], [*seen[:-1], embedding]) if isinstance(seen, list) else (seen, embedding)
     scaled = (some[0] / embedding.std() for some in (mine, embedding))
     close(f"{name}, embedding / sd", *scaled, 5e-5, measured)
     for what, given in (("alone", alike), ("and picture", seen)):
-        ious, logits = replace(look, seen={"image_embeddings": given}, ordered=True).ask(points)
-        enlarged = torch.stack([look.enlarge(masks) for masks in logits])
+        ious, logits = replace(encoded, seen={"image_embeddings": given}, ordered=True).masks_at(points)
+        enlarged = torch.stack([encoded.enlarge(masks) for masks in logits])
         measured(f"{name}, decoder {what}", "predicted IoU", (ious - scores).abs().max().item())
         share = ((enlarged > 0) != (full > 0)).float().mean().item()
         measured(f"{name}, decoder {what}", "share of pixels otherwise", share)
@@ -252,8 +260,8 @@ def test_sam_of_segment_anything(field: SimpleNamespace, tmp_path: Path, measure
         predictor.set_image(photograph)
         given = torch.from_numpy(predictor.transform.apply_coords(points, photograph.shape[:2]))[:, None]
         full, scores, _ = predictor.predict_torch(given, torch.ones(len(points), 1), return_logits=True)
-        look = segmenter.look(photograph)
-        compare("SAM ViT-B", look, predictor.features, points.astype(np.float32), (scores, full), measured)
+        encoded = segmenter.encode(photograph)
+        compare("SAM ViT-B", encoded, predictor.features, points.astype(np.float32), (scores, full), measured)
 
 
 def test_sam_2_of_sam2(field: SimpleNamespace, tmp_path: Path, measured: Measure) -> None:
@@ -271,10 +279,10 @@ def test_sam_2_of_sam2(field: SimpleNamespace, tmp_path: Path, measured: Measure
         answers = [predictor.predict(point[None], np.ones(1), **asked) for point in points]
         want = tuple(torch.from_numpy(np.stack([answer[part] for answer in answers])) for part in (1, 0))
         embedding = predictor.get_image_embedding()
-        compare("SAM 2.1 tiny", segmenter.look(square), embedding, points, (want[0], want[1]), measured)
+        compare("SAM 2.1 tiny", segmenter.encode(square), embedding, points, (want[0], want[1]), measured)
     every = MaskConfig(sam=str(file), points_per_side=2, predicted_iou=0, stability=0, **PASSING)
     levels = load_mask_source(every, "cpu")(square, silent)
-    assert [len(masks) > 0 for masks in levels.masks] == [True] * LEVELS
+    assert [len(masks) > 0 for masks in levels.masks] == [True] * MASKS_PER_POINT
 
 
 class Drawn:
@@ -286,7 +294,7 @@ class Drawn:
     transform = SimpleNamespace(apply_coords=lambda points, size: points.astype(np.float32))
     picture = np.stack(np.mgrid[: shape[0], : shape[1]][::-1], axis=2)
 
-    def __init__(self, levels: tuple[int, ...] = tuple(range(LEVELS))) -> None:
+    def __init__(self, levels: tuple[int, ...] = tuple(range(MASKS_PER_POINT))) -> None:
         rng = np.random.default_rng(0)
         self._noise = ndimage.gaussian_filter(rng.normal(size=self.shape), 1.5) * 4
         self._ellipses = [
@@ -295,12 +303,12 @@ class Drawn:
         ]
         self._levels = list(levels)
 
-    def look(self, image: Array) -> Any:
+    def encode(self, image: Array) -> Any:
         """See `Segmenter`."""
         self._seen = image
-        return SimpleNamespace(ask=self._ask, enlarge=lambda logits: logits)
+        return SimpleNamespace(masks_at=self._ask, enlarge=lambda logits: logits)
 
-    set_image = look
+    set_image = encode
 
     def reset_image(self) -> None:
         del self._seen
@@ -315,8 +323,11 @@ class Drawn:
 
     def _answer(self, point: Array) -> tuple[Array, Array]:
         rng = np.random.default_rng((point * 4).astype(int))
-        shifts, stretches = rng.normal(size=(LEVELS, 2)), np.exp(rng.normal(size=(LEVELS, 2)) * 0.08)
-        roughness, ious = rng.uniform(0.2, 1.5, LEVELS), rng.uniform(0.6, 1, LEVELS)
+        shifts, stretches = (
+            rng.normal(size=(MASKS_PER_POINT, 2)),
+            np.exp(rng.normal(size=(MASKS_PER_POINT, 2)) * 0.08),
+        )
+        roughness, ious = rng.uniform(0.2, 1.5, MASKS_PER_POINT), rng.uniform(0.6, 1, MASKS_PER_POINT)
         x, y = self._seen[0, :, 0], self._seen[:, 0, 1, None]
         logits = []
         for n in self._levels:
@@ -356,14 +367,14 @@ def test_the_filters_of_segment_anything_but_for_its_boxes(
         sorted(np.packbits(mask).tobytes() for mask in masks)
         for masks in SamMasks(Drawn(), config)(Drawn.picture, silent).masks
     ]
-    as_they_are = [generated(level) for level in range(LEVELS)]
+    as_they_are = [generated(level) for level in range(MASKS_PER_POINT)]
     for level, (mine, other) in enumerate(zip(ours, as_they_are, strict=True)):
         for whose, masks in (("ours", mine), ("segment_anything's", other), ("both", {*mine} & {*other})):
             measured(f"masks of level {level}", whose, len(masks))
     assert as_they_are != ours
     after = torch.tensor([0, 0, 1, 1])
     monkeypatch.setattr(module, "batched_mask_to_box", lambda masks: theirs(masks) + after)
-    assert [generated(level) for level in range(LEVELS)] == ours
+    assert [generated(level) for level in range(MASKS_PER_POINT)] == ours
     assert min(map(len, ours)) > 20
 
 

@@ -156,7 +156,7 @@ class Blind:
 
     name = "blind"
 
-    def look(self, image: np.ndarray) -> "Seen":
+    def encode(self, image: np.ndarray) -> "Seen":
         return Seen(image[..., 0])
 
 
@@ -165,7 +165,7 @@ class Seen:
         self.colours = colours
         self.from_afar = colours.size >= 200 * 200
 
-    def ask(self, points: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+    def masks_at(self, points: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
         masks = [self.mask(self.colours[int(y), int(x)]) for x, y in points]
         logits = torch.from_numpy(np.stack(masks) * 20.0 - 10)[:, None].repeat(1, 3, 1, 1)
         scores = torch.zeros(len(points), 3)
@@ -391,8 +391,8 @@ def test_the_decoder_has_its_authors_norms_whatever_the_file_states(tmp_path: Pa
     for epsilon in (1e-6, 0.5):
         decoder_setting(tmp_path, layer_norm_eps=epsilon)
         with torch.inference_mode():
-            look = load_segmenter(str(tmp_path), "cpu").look(photograph())
-            answers.append(look.ask(sam.grid_points(2, (48, 80))))
+            encoded = load_segmenter(str(tmp_path), "cpu").encode(photograph())
+            answers.append(encoded.masks_at(sam.grid_points(2, (48, 80))))
     assert torch.equal(answers[0][1], answers[1][1])
 
 
@@ -475,12 +475,12 @@ def test_what_float16_cannot_hold_is_asked_again(config: MaskConfig, monkeypatch
     class Overflowing:
         name = "overflowing"
 
-        def look(self, image: np.ndarray) -> sam.Look:
+        def encode(self, image: np.ndarray) -> sam.EncodedImage:
             asked.append(torch.is_autocast_enabled("cpu"))
-            look = segmenter.look(image)
+            encoded = segmenter.encode(image)
             if asked[-1]:
-                look.seen["image_embeddings"].fill_(torch.inf)
-            return look
+                encoded.seen["image_embeddings"].fill_(torch.inf)
+            return encoded
 
     found = SamMasks(Overflowing(), config, half=True)(photograph(), silent)
     for got, want in zip(found.masks, SamMasks(segmenter, config)(photograph(), silent).masks, strict=True):

@@ -12,15 +12,14 @@ from langsplat_core.arrays import unit
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.progress import Cancelled, Progress, Report, silent
 from langsplat_core.semantics.masks import LevelMasks, MaskSource
-from langsplat_core.semantics.store import (
-    FeatureStore,
-    ImageFeatures,
+from langsplat_core.semantics.regions import (
     describe_capture,
     embed_regions,
     feature_key,
     fingerprint,
     masked_crop,
 )
+from langsplat_core.semantics.store import FeatureStore, ImageFeatures
 
 
 def test_a_square_region_of_the_right_size_is_copied_exactly() -> None:
@@ -126,7 +125,7 @@ def random_features(seed: int = 0, count: int = 7) -> ImageFeatures:
     return ImageFeatures(rng.integers(-1, count, (3, 9, 8)).astype(np.int32), vectors)
 
 
-def test_what_is_saved_comes_back(tmp_path: Path) -> None:
+def test_a_store_returns_what_was_saved(tmp_path: Path) -> None:
     store, features = FeatureStore(tmp_path), random_features()
     assert not store.has("frame.001")
     store.save("frame.001", features, "a")
@@ -148,7 +147,7 @@ def test_more_regions_than_half_integers_hold(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["left/001", "..", "ä b", "a.b.c"])
-def test_any_name_is_one_file_in_the_folder(tmp_path: Path, name: str) -> None:
+def test_a_store_keeps_any_name_in_its_folder(tmp_path: Path, name: str) -> None:
     store = FeatureStore(tmp_path / "store")
     store.save(name, random_features())
     assert store.has(name)
@@ -156,7 +155,7 @@ def test_any_name_is_one_file_in_the_folder(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("keep", [0, 100, -40])
-def test_a_damaged_file_is_named(tmp_path: Path, keep: int) -> None:
+def test_loading_names_a_damaged_file(tmp_path: Path, keep: int) -> None:
     store = FeatureStore(tmp_path)
     store.save("a", random_features(), "k")
     path = store.path("a")
@@ -185,7 +184,7 @@ def with_header(path: Path, old: bytes, new: bytes) -> None:
         (b"labels", b"label\x1b"),
     ],
 )
-def test_a_damaged_header_counts_as_absent_and_is_told_of_once(
+def test_a_damaged_header_counts_as_absent_with_one_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, old: bytes, new: bytes
 ) -> None:
     store = FeatureStore(tmp_path)
@@ -204,27 +203,30 @@ def test_a_damaged_header_counts_as_absent_and_is_told_of_once(
     assert store.has("a", "k")
 
 
-def test_the_key_follows_all_that_matters() -> None:
+def test_the_key_changes_with_image_mask_source_and_encoder() -> None:
     image, others = red_and_blue(), ColourEncoder()
     others.id = "others"
     made_by = fingerprint(ColourEncoder())
-    first = feature_key(image, Halves(), made_by)
-    assert feature_key(image[::-1], Halves(), made_by) == first  # upside down this picture is the same one
+    first = feature_key(image, None, Halves(), made_by)
+    assert (
+        feature_key(image[::-1], None, Halves(), made_by) == first
+    )  # upside down this picture is the same one
     keys = {
         first,
-        feature_key(image, OtherHalves(), made_by),
-        feature_key(red_and_blue(20, 10), Halves(), made_by),
-        feature_key(image, Halves(), fingerprint(others)),
+        feature_key(image, None, OtherHalves(), made_by),
+        feature_key(red_and_blue(20, 10), None, Halves(), made_by),
+        feature_key(image, None, Halves(), fingerprint(others)),
+        feature_key(image, image[..., 0] > 0, Halves(), made_by),
     }
-    assert len(keys) == 4
+    assert len(keys) == 5
 
     class Retrained(ColourEncoder):
         def encode_images(self, crops: np.ndarray) -> np.ndarray:
             return unit(super().encode_images(crops) * np.float32([1, 0.5, 0.2]))
 
     # Other weights under the same name.
-    assert feature_key(image, Halves(), fingerprint(Retrained())) not in keys
-    assert feature_key(image, Halves(), fingerprint(ColourEncoder())) == first
+    assert feature_key(image, None, Halves(), fingerprint(Retrained())) not in keys
+    assert feature_key(image, None, Halves(), fingerprint(ColourEncoder())) == first
 
 
 def test_an_interrupted_run_continues_where_it_stopped(tmp_path: Path) -> None:
@@ -277,7 +279,7 @@ class InTwoParts(Halves):
         return finish
 
 
-def test_filters_of_one_photograph_run_beside_the_model_of_the_next(tmp_path: Path) -> None:
+def test_filters_run_beside_the_model_of_the_next_photograph(tmp_path: Path) -> None:
     source, encoder = InTwoParts(), ColourEncoder()
     found = describe_capture(IMAGES, NAMES, source, encoder, FeatureStore(tmp_path / "two"))
     assert {thread for _, what, thread in source.log if what == "asked"} == {get_ident()}
@@ -287,7 +289,7 @@ def test_filters_of_one_photograph_run_beside_the_model_of_the_next(tmp_path: Pa
 
 
 @pytest.mark.parametrize("fails", [1, 3])
-def test_what_fails_behind_the_model_is_raised(fails: int, tmp_path: Path) -> None:
+def test_errors_of_filters_are_raised(fails: int, tmp_path: Path) -> None:
     store = FeatureStore(tmp_path)
     with pytest.raises(InputError, match="no room"):
         describe_capture(IMAGES, NAMES, InTwoParts(fails), ColourEncoder(), store)

@@ -2,6 +2,7 @@
 Face."""
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from string import ascii_lowercase, digits
@@ -41,6 +42,16 @@ from langsplat_core.scene import Scene, look_at
 from tests.support.scenes import random_gaussians, transforms
 
 TOWER = {"hidden_size": 32, "intermediate_size": 48, "num_hidden_layers": 2, "num_attention_heads": 2}
+
+
+class MakesFolder:
+    """Unpickling it makes a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return os.mkdir, (str(self.folder),)
 
 
 def _saved(kind: Any, config: Any, folder: Path, seed: int, alter: Callable[[Any], None]) -> Any:

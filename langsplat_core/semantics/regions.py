@@ -1,0 +1,145 @@
+"""Regions of photographs: what CLIP is shown of each, and the masks and vectors of whole captures."""
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Protocol
+
+import numpy as np
+from PIL import Image
+from scipy import ndimage
+
+from langsplat_core.arrays import Array
+from langsplat_core.progress import Progress, silent
+from langsplat_core.semantics.masks import LevelMasks, MaskSource, label_maps
+from langsplat_core.semantics.store import FeatureStore, ImageFeatures, StoredFeatures
+
+VERSION = 1  # of what is stored of a photograph
+STAGE = "masks and vectors"
+
+
+class ImageEncoder(Protocol):
+    """The image half of a CLIP model, with its name."""
+
+    @property
+    def id(self) -> str:
+        """Hub id or folder."""
+
+    @property
+    def image_size(self) -> int:
+        """Side of the images it takes, px."""
+
+    def encode_images(self, crops: Array) -> Array:
+        """(M, S, S, 3) uint8 -> (M, D) float32 unit vectors."""
+
+
+def masked_crop(image: Array, mask: Array, size: int) -> Array:
+    """Cut one region out: black outside the mask, bounding box, centred on a black square, resized.
+
+    image: (H, W, 3) uint8; mask: (H, W) bool with at least one pixel set; size: side of the result, px.
+    Returns (size, size, 3) uint8. Bilinear, with antialiasing when shrinking. This is the crop of the
+    method's public code (LangSplat `preprocess.py`), which the encoder must also be trained with. Raises
+    ValueError for an empty mask, which has no bounding box.
+    """
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if rows.size == 0:
+        raise ValueError("masked_crop: the mask is empty")
+    box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    patch = np.where(mask[box][..., None], image[box], np.uint8(0))
+    height, width = patch.shape[:2]
+    side = max(height, width)
+    square = np.zeros((side, side, 3), np.uint8)
+    top, left = (side - height) // 2, (side - width) // 2
+    square[top : top + height, left : left + width] = patch
+    if side == size:
+        return square
+    return np.asarray(Image.fromarray(square).resize((size, size), Image.Resampling.BILINEAR))
+
+
+def embed_regions(image: Array, label_maps: Array, encoder: ImageEncoder) -> Array:
+    """Return (M, D) float32 unit vectors of the M regions that `label_maps` numbers.
+
+    image: (H, W, 3) uint8; label_maps: (3, H, W) int32 as of `masks.label_maps`. A region is shown as it is
+    visible in its map, on black; where masks of one level overlap, LangSplat shows the covered part too.
+    """
+    crops = np.zeros((int(label_maps.max()) + 1, encoder.image_size, encoder.image_size, 3), np.uint8)
+    for labels in label_maps:
+        for row, box in enumerate(ndimage.find_objects(labels + 1)):
+            if box is not None:  # a row of another level
+                crops[row] = masked_crop(image[box], labels[box] == row, encoder.image_size)
+    return encoder.encode_images(crops)
+
+
+def within(labels: Array, mask: Array | None) -> Array:
+    """Return (L, H, W) label maps without what lies outside of the (H, W) mask; numbers stay without gaps."""
+    if mask is None:
+        return labels
+    kept = np.where(mask, labels, -1)
+    numbers = np.unique(kept[kept >= 0])
+    return np.where(kept >= 0, np.searchsorted(numbers, kept), -1).astype(labels.dtype)
+
+
+def fingerprint(encoder: ImageEncoder) -> str:
+    """Return what tells an encoder from others, also from other weights under the same name.
+
+    That is the vector that it makes of a ramp.
+    """
+    side = encoder.image_size
+    ramp = np.linspace(0, 255, side * side * 3).reshape(1, side, side, 3).astype(np.uint8)
+    made = np.round(encoder.encode_images(ramp)[0], 2) + 0.0  # minus zero is zero
+    return json.dumps([encoder.id, side, made.tolist()])
+
+
+def feature_key(image: Array, mask: Array | None, mask_source: MaskSource, encoder: str) -> str:
+    """Return a short name of everything that the features of a photograph depend on.
+
+    image: (H, W, 3) uint8; mask: (H, W) bool pixels that count, or None; encoder: its `fingerprint`
+    """
+    settings = json.dumps([VERSION, mask_source.key, encoder, image.shape])
+    key = hashlib.sha256(settings.encode() + np.ascontiguousarray(image).tobytes()).hexdigest()[:16]
+    return key if mask is None else key + hashlib.sha256(np.packbits(mask).tobytes()).hexdigest()[:12]
+
+
+def describe_capture(
+    images: Sequence[Array],
+    names: Sequence[str],
+    mask_source: MaskSource,
+    encoder: ImageEncoder | None,
+    store: FeatureStore,
+    progress: Progress = silent,
+    counted: Sequence[Array | None] = (),
+) -> StoredFeatures:
+    """Find the masks and CLIP vectors of every photograph, in order; those that `store` has are not redone.
+
+    Without an encoder the vectors have no numbers. images: (H, W, 3) uint8 each; names: unique, one per
+    image; counted: (H, W) bool each, outside of which no mask is kept (None: everywhere). What is finished is
+    in the store even when `progress` interrupts the work. Each photograph's regions are encoded by
+    themselves: its file does not depend on which others were made beside it.
+    """
+    made_by = "none" if encoder is None else fingerprint(encoder)
+
+    def keep(finish: Callable[[], LevelMasks], index: int, mask: Array | None, key: str) -> None:
+        labels = within(label_maps(finish()), mask)
+        if encoder is None:
+            vectors = np.zeros((int(labels.max()) + 1, 0), np.float32)
+        else:
+            vectors = embed_regions(images[index], labels, encoder)
+        store.save(names[index], ImageFeatures(labels, vectors), key)
+
+    with ThreadPoolExecutor(1) as worker:  # filters, crops and files of one while masks of the next are found
+        before: Future[None] | None = None
+        for index, (image, name) in enumerate(zip(images, names, strict=True)):
+            part = progress.part(index, len(images), STAGE, name)
+            part(STAGE, 0.0)
+            mask = counted[index] if counted else None
+            key = feature_key(image, mask, mask_source, made_by)
+            if not store.has(name, key):
+                finish = mask_source.begin(image, part)
+                if before is not None:  # one photograph's full-size masks at a time
+                    before.result()
+                before = worker.submit(keep, finish, index, mask, key)
+        if before is not None:
+            before.result()
+    progress(STAGE, 1.0)
+    return StoredFeatures(store, names)
