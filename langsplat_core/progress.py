@@ -41,8 +41,6 @@ def lap(name: str, finish: Callable[[], object] = lambda: None) -> Iterator[None
 
 log = logging.getLogger("langsplat")
 
-ALL_STAGES = "all stages"  # the stage under which the whole of several is reported
-
 
 @dataclass(frozen=True)
 class Report:
@@ -51,11 +49,11 @@ class Report:
     stage: str  # constant while it runs
     fraction: float  # done, in [0, 1]
     note: str = ""  # the item under way
-    metrics: Mapping[str, float] = field(default_factory=dict)  # such as loss, psnr (dB), seconds_left
+    metrics: Mapping[str, float] = field(default_factory=dict)  # such as loss, psnr (dB)
 
     @classmethod
     def from_json(cls, line: str) -> "Report":
-        """Read a line of `LineProgress`; ValueError for any other."""
+        """Return the report in a line of `LineProgress`; ValueError for any other line."""
         try:
             stated = json.loads(line)
             metrics = {str(name): float(value) for name, value in stated.get("metrics", {}).items()}
@@ -65,12 +63,12 @@ class Report:
 
     @property
     def details(self) -> str:
-        """The note and the metrics in words: "9 Gaussians, loss 0.0312, about 3 min left"."""
+        """Note and metrics in words: "9 Gaussians, loss 0.0312"."""
         return ", ".join(filter(None, [self.note, *(_metric(*item) for item in self.metrics.items())]))
 
     @property
     def text(self) -> str:
-        """The stage and its details: "training: 9 Gaussians, loss 0.0312"."""
+        """Stage, note and metrics in words: "training: 9 Gaussians, loss 0.0312"."""
         return ": ".join(filter(None, [self.stage, self.details]))
 
 
@@ -82,10 +80,11 @@ class Progress:
     """It may raise to interrupt the work (Ctrl-C, the window's cancel button)."""
 
     def __call__(self, stage: str, fraction: float, note: str = "", **metrics: float) -> None:
+        """Report that `fraction` of a stage, in [0, 1], is done."""
         self.show(Report(stage, fraction, note, metrics))
 
     def part(self, index: int, count: int, stage: str = "", note: str = "") -> "Progress":
-        """The progress of item `index` of `count`; `stage` and `note` replace the item's own."""
+        """Return the progress of item `index` of `count`; `stage` and `note` replace the item's own."""
 
         def show(report: Report) -> None:
             fraction = (index + report.fraction) / count
@@ -97,23 +96,7 @@ class Progress:
 silent = Progress(lambda report: None)
 
 
-def duration(seconds: float) -> str:
-    """Return "40 s", "12 min" or "3 h": as exact as a forecast is."""
-    seconds = coarse(seconds)
-    if seconds <= 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds <= 90 * 60 else f"{seconds / 3600:.0f} h"
-
-
-def coarse(seconds: float) -> float:
-    """Round seconds to tens, minutes or hours; never below ten seconds."""
-    unit = 10 if seconds <= 90 else 60 if seconds <= 90 * 60 else 3600
-    return max(unit * round(seconds / unit), 10)
-
-
 def _metric(name: str, value: float) -> str:
-    if name == "seconds_left":
-        return f"about {duration(value)} left"
     return f"PSNR {value:.1f} dB" if name == "psnr" else f"{name} {value:.4f}"
 
 
@@ -127,8 +110,10 @@ class Cancelled(Exception):
 
 
 class LineProgress:
-    """Progress for other programs, a context manager: a line of JSON on stderr for every report that says
-    anything new, ``{"stage": "training", "fraction": 0.2, "note": "step 9", "metrics": {"loss": 0.03}}``."""
+    """Progress for other programs, a context manager: a line of JSON on stderr for every new report.
+
+    ``{"stage": "training", "fraction": 0.2, "note": "step 9", "metrics": {"loss": 0.03}}``
+    """
 
     def __init__(self) -> None:
         self._last = ""
@@ -175,20 +160,19 @@ class TerminalProgress:
 
     def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
         if error is None:
-            self._complete(self._stage)
-            self._complete(ALL_STAGES, ALL_STAGES)  # and nothing is left
+            self._complete()
         if self._tasks:  # stopping a bar that never began prints an empty line before the error's own
             self._bar.stop()
 
-    def _complete(self, stage: str, text: str | None = None) -> None:
-        """A stage is over where the next one begins, however much of it was needed."""
-        if stage in self._tasks:
-            self._bar.update(self._tasks[stage], completed=1.0, description=text)
+    def _complete(self) -> None:
+        """Fill the bar of the last stage, which is over where the next one begins."""
+        if self._stage in self._tasks:
+            self._bar.update(self._tasks[self._stage], completed=1.0)
 
     def _show(self, report: Report) -> None:
         self._bar.start()
-        if report.stage not in (self._stage, ALL_STAGES):
-            self._complete(self._stage)
+        if report.stage != self._stage:
+            self._complete()
             self._stage = report.stage
         if report.stage not in self._tasks:
             self._tasks[report.stage] = self._bar.add_task(report.stage, total=1.0)

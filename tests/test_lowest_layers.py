@@ -12,12 +12,10 @@ from langsplat_core import errors
 from langsplat_core.arrays import number, psnr, whole_number
 from langsplat_core.errors import EncoderError, InputError, printable_line, quoted
 from langsplat_core.progress import (
-    ALL_STAGES,
     LineProgress,
     Progress,
     Report,
     TerminalProgress,
-    duration,
     lap,
     watched,
 )
@@ -127,25 +125,20 @@ def test_progress_as_lines_for_other_programs(capsys):
             Report.from_json(line)
 
 
-def test_durations_are_as_exact_as_a_forecast():
-    found = [duration(seconds) for seconds in (0, 44, 89, 100, 3000, 9000)]
-    assert found == ["10 s", "40 s", "90 s", "2 min", "50 min", "2 h"]
-    report = Report("a", 0.5, "b", {"psnr": 20.06, "seconds_left": 100})
-    assert report.text == "a: b, PSNR 20.1 dB, about 2 min left"
+def test_a_report_in_words_names_its_metrics():
+    assert Report("a", 0.5, "b", {"psnr": 20.06}).text == "a: b, PSNR 20.1 dB"
 
 
 @pytest.mark.parametrize("stopped", [False, True])
-def test_bars_of_stages_that_are_over_are_full(stopped: bool, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bars_of_finished_stages_are_full(stopped: bool, capsys: pytest.CaptureFixture[str]) -> None:
     """A stage may end before its last report; one that was stopped did not end."""
     with suppress(KeyboardInterrupt), TerminalProgress() as report:
-        for stage in ("matching", ALL_STAGES, "locating", ALL_STAGES, "locating"):
-            report(stage, 0.3, seconds_left=9.0)
+        for stage in ("matching", "locating", "locating"):
+            report(stage, 0.3)
         if stopped:
             raise KeyboardInterrupt
-    said = capsys.readouterr().err
-    shares = [line.split()[-3] for line in said.splitlines() if "%" in line]
-    assert stopped == ("all stages: about" in said)
-    assert shares == (["100%", "30%", "30%"] if stopped else ["100%"] * 3)
+    shares = [line.split()[-3] for line in capsys.readouterr().err.splitlines() if "%" in line]
+    assert shares == (["100%", "30%"] if stopped else ["100%"] * 2)
 
 
 def test_a_part_reports_within_the_whole():

@@ -13,7 +13,7 @@ from typing import IO, Any, Protocol, TypeVar
 from langsplat_core.arrays import Array
 from langsplat_core.config import TrainPreset
 from langsplat_core.errors import LangSplatError, printable_line
-from langsplat_core.progress import ALL_STAGES, Progress, Report
+from langsplat_core.progress import Progress, Report
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import LoadEncoder, QueryEngine
 from langsplat_core.scene import Camera, Scene
@@ -46,8 +46,6 @@ class TrainingProgress:
     """Progress of a training run. Written by the listening thread, read by the window's."""
 
     stages: dict[str, float] = field(default_factory=dict)  # name -> fraction in [0, 1], in their order
-    overall: float = 0.0
-    left: str = ""  # "about 3 min left"
     losses: list[float] = field(default_factory=list)  # of the Gaussians, as far as they are trained
     said: list[str] = field(default_factory=list)  # lines that are no progress, the latest last
 
@@ -59,9 +57,6 @@ class TrainingProgress:
             text = printable_line(line, 300)
             if text:
                 self.said = [*self.said[1 - KEPT :], text]
-            return
-        if report.stage == ALL_STAGES:
-            self.overall, self.left = report.fraction, report.details
             return
         self.stages[report.stage] = report.fraction
         loss = report.metrics.get("loss")

@@ -24,15 +24,18 @@ from langsplat_core.config import (
     with_preset,
 )
 from langsplat_core.errors import InputError
-from langsplat_core.progress import LineProgress, Progress, TerminalProgress, silent
+from langsplat_core.progress import LineProgress, TerminalProgress, silent
 
 log = logging.getLogger("langsplat")
 
 
 @dataclass(frozen=True)
 class Train:
-    """Train a searchable scene from photographs: a COLMAP folder, a nerfstudio transforms.json, or a
-    plain folder of photographs. An interrupted run continues where it stopped."""
+    """Train a searchable scene from photographs.
+
+    DATASET is a COLMAP folder, a nerfstudio transforms.json, a video or a plain folder of photographs. An
+    interrupted run continues where it stopped.
+    """
 
     dataset: tyro.conf.Positional[Path]
     """Folder of photographs, video, COLMAP project folder, or transforms.json."""
@@ -51,32 +54,26 @@ class Train:
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE.toml")] = None
     """A file of options, `preset = "good"` or `radiance.steps = 7000`; options beside it count more."""
     gaussians: Path | None = None
-    """Take the Gaussians of this scene, trained elsewhere from the same cameras, and give them a meaning."""
+    """Take the Gaussians of this scene, trained elsewhere from the same cameras, and describe them."""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
 
     def run(self) -> None:
+        """Train, and print the figures of the scene."""
         # They import torch: seconds that --help need not pay.
         from langsplat_core.errors import shortened
-        from langsplat_core.pipeline.forecast import Forecast, count_photographs, forecast_in_words, plan
         from langsplat_core.pipeline.report import PAGE, work_folder
         from langsplat_core.pipeline.stages import join_processes
         from langsplat_core.pipeline.train import train_scene
-        from langsplat_core.semantics.weights import torch_device
 
         processes = join_processes()
         shown = LineProgress() if self.progress == "lines" else TerminalProgress()
-        photographs, given = count_photographs(self.dataset)
-        on_gpu = torch_device(self.config.clip.device) != "cpu"
-        stages = plan(self.config, photographs, given, self.gaussians is not None, on_gpu)
-        if processes.is_main and photographs:
-            log.info("%d photographs: %s", photographs, forecast_in_words(stages, on_gpu))
         with shown if processes.is_main else nullcontext(silent) as progress:
             report = train_scene(
                 self.dataset,
                 self.out,
                 self.config,
                 self.work,
-                Progress(Forecast(stages, progress).show),
+                progress,
                 processes=processes,
                 gaussians_from=self.gaussians,
             )
@@ -98,13 +95,16 @@ class Train:
         )
         for warning in report.warnings:
             print(f"warning: {warning}")
-        print(f"photographs beside what the scene shows: {(self.work or work_folder(self.out)) / PAGE}")
+        page = (self.work or work_folder(self.out)) / PAGE
+        print(f"photographs beside what the scene shows: {page}")
 
 
 @dataclass(frozen=True)
 class Frames:
-    """Take photographs out of a video: the sharpest image of each of COUNT equal parts. `langsplat train`
-    does it by itself for a video; this is to look at them, and to sort out."""
+    """Take photographs out of a video: the sharpest image of each of COUNT equal parts.
+
+    `langsplat train` does so for a video; with this command one looks at them first, and sorts out.
+    """
 
     video: tyro.conf.Positional[Path]
     """The video: mp4, mov, m4v, mkv, webm or avi."""
@@ -114,6 +114,7 @@ class Frames:
     """At most, of the whole video: two or three a second of a slow walk around something."""
 
     def run(self) -> None:
+        """Write the photographs."""
         from langsplat_core.datasets.video import extract_frames
 
         with TerminalProgress() as progress:
@@ -122,7 +123,7 @@ class Frames:
 
 
 def train_command(args: Sequence[str]) -> type[Train]:
-    """`Train` with the settings of the profile and preset that `args` name as defaults."""
+    """Return `Train` with the settings of the profile and preset that `args` name as defaults."""
     profile, preset = named(args, "--profile"), named(args, "--preset")
     config = PAPER if profile == "paper" else TrainConfig()
     config = replace(config, codec=codec_settings(args, config.codec))
@@ -139,8 +140,11 @@ def train_command(args: Sequence[str]) -> type[Train]:
 
 
 def with_file(args: Sequence[str]) -> list[str]:
-    """The words of `langsplat train ...`, those of the file that --config names before all others, so that
-    options beside it win. InputError that names file and key for what is no option, or not of its kind."""
+    """Return the words of `langsplat train ...` with those of the file that --config names before all others.
+
+    So options beside it win. Raises InputError that names file and key for what is no option, or not of its
+    kind.
+    """
     name = named(args, "--config")
     if not name:
         return list(args)
@@ -159,7 +163,7 @@ def with_file(args: Sequence[str]) -> list[str]:
 
 
 def _words(table: Mapping[str, Any], before: str = "") -> Iterator[str]:
-    """A TOML table as the words of a command line; ValueError for what cannot be told from an option."""
+    """Yield a TOML table as words of a command line; ValueError for what cannot be told from an option."""
     for key, value in table.items():
         values = list(map(str, value)) if isinstance(value, list) else []
         if f"{before}{key}" == "config" or any(text.startswith("-") for text in values):

@@ -11,21 +11,14 @@ from pathlib import Path
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.pipeline.language import Views, kept_mask_weights
+from langsplat_core.pipeline.language_field import Views, kept_mask_weights
 from langsplat_core.pipeline.stages import ProcessGroup, features_digest, gaussians_digest, kept, stage_key
 from langsplat_core.progress import Progress
 from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.scene import Gaussians
 from langsplat_core.scene.surface import build_surface
-from langsplat_core.semantics.store import (
-    FeatureStore,
-    ImageEncoder,
-    ImageFeatures,
-    StoredFeatures,
-    embed_regions,
-    fingerprint,
-    within,
-)
+from langsplat_core.semantics.regions import ImageEncoder, embed_regions, fingerprint, within
+from langsplat_core.semantics.store import FeatureStore, ImageFeatures, StoredFeatures
 from langsplat_core.training.language.merge_tree import MergeTree, find_tree
 from langsplat_core.training.language.patch_maps import draw_patches, nested_maps
 
@@ -45,7 +38,7 @@ def agreed_features(
     progress: Progress,
     processes: ProcessGroup | None = None,
 ) -> StoredFeatures:
-    """Masks and CLIP vectors of every view by the consensus of all views' masks, whose vectors are not read.
+    """Describe masks by the consensus of all views' masks, whose vectors are not read.
 
     photographs: (H, W, 3) uint8 of each view, and its (H, W) bool mask of pixels that count (None: all do).
     What is finished is kept in `work`.

@@ -1,9 +1,9 @@
-"""Evidence of an answer: the photographs with a mask of just what answers, those that show it without one,
-and the fit of the phrase to each mask, so that one sees a wrong vote.
+"""Evidence of an answer: the photographs that show it, with the mask of each that overlaps most with it.
 
-What a region means is a mean over masks, in which a wrong one hides, and which looks as sure for three
-photographs as for thirty. So every photograph counts as one vote, for the region or against it, and the share
-of votes for it has a beta distribution.
+The language features of a region are a mean over masks, in which a wrong one hides, and which looks as sure
+for three photographs as for thirty. So every photograph counts as one vote, for the region if it has a mask
+of just that, else against it, and the share of votes for it has a beta distribution. The fit of the phrase to
+each mask shows a wrong vote.
 """
 
 from collections.abc import Mapping, Sequence
@@ -94,7 +94,7 @@ def find_evidence(
     rasterizer: Rasterizer,
     progress: Progress = silent,
 ) -> Evidence | None:
-    """Evidence of the best region of `answer`; None where no region answers.
+    """Return the evidence of the best region of `answer`; None where no region answers.
 
     phrases: masks are compared with the one that fits the region best; features: of the scene's cameras.
     Raises FormatError for features of another scene.
@@ -130,7 +130,7 @@ def find_evidence(
 
 
 def _best_region(engine: QueryEngine, answer: QueryResult) -> tuple[int, Array] | None:
-    """The node of the best region of an answer, and what of the answer is in it."""
+    """Return the node of the best region of an answer, and what of the answer is in it."""
     at = engine.tree.at(answer.level)
     inside = answer.members & (at != NO_NODE)
     if not inside.any():
@@ -142,13 +142,13 @@ def _best_region(engine: QueryEngine, answer: QueryResult) -> tuple[int, Array] 
 
 
 def _shown(scene: Scene, view: int, members: Array, rasterizer: Rasterizer) -> Array:
-    """(H, W) bool pixels of a view that these Gaussians paint more than half of."""
+    """Return (H, W) bool pixels of a view that these Gaussians paint more than half of."""
     drawn = view_of(scene, scene.cameras[view], rasterizer)
     return np.asarray(drawn.splat(members[:, None].astype(np.float32))[0][..., 0] > SOLID)
 
 
 def _nearest(seen: ImageFeatures, shown: Array) -> tuple[int, float]:
-    """The mask, of any level, that overlaps most with `shown` (H, W), or -1, and its overlap."""
+    """Return the mask, of any level, that overlaps most with `shown` (H, W), or -1, and its overlap."""
     count = len(seen.vectors)
     overlaps = np.zeros(count)
     for labels in seen.labels:
@@ -164,8 +164,10 @@ def _nearest(seen: ImageFeatures, shown: Array) -> tuple[int, float]:
 
 
 def kept_features(path: Path, scene: Scene, work: Path | None = None) -> StoredFeatures:
-    """Masks and vectors of the photographs of the scene in `path`, from `work` or the folder beside it.
-    Raises InputError where there are none."""
+    """Return masks and vectors of the photographs of a scene, from `work` or the folder beside it.
+
+    Raises InputError where there are none.
+    """
     store = FeatureStore((work or work_folder(path)) / "features")
     missing = [camera.name for camera in scene.cameras if not exists(store.path(camera.name))]
     if missing or not scene.cameras:
@@ -184,9 +186,12 @@ def kept_photographs(
     dataset: Path | None = None,
     progress: Progress = silent,
 ) -> dict[str, Array]:
-    """Photographs by the name of their camera, (H, W, 3) uint8 as training saw them, from `dataset` or from
-    where the report of the training says. Raises InputError where some are missing."""
-    from langsplat_core.datasets import load_photographs  # pycolmap: half a second
+    """Return photographs by the name of their camera, (H, W, 3) uint8 as training saw them.
+
+    They are read from `dataset`, or from where the report of the training says. Raises InputError where some
+    are missing.
+    """
+    from langsplat_core.datasets import load_photographs
 
     work = work or work_folder(path)
     dataset = dataset or _stated_dataset(path, work / REPORT)
@@ -205,7 +210,7 @@ def kept_photographs(
 
 
 def _stated_dataset(path: Path, report: Path) -> Path:
-    """The dataset that a report names, if it is still there."""
+    """Return the dataset that a report names, if it is still there."""
     try:
         stated = read_json_file(report, LIMIT)
     except InputError:
@@ -235,8 +240,11 @@ def draw_evidence(
     photographs: Mapping[str, Array],
     rasterizer: Rasterizer,
 ) -> Array:
-    """(H, W, 3) uint8 contact sheet: the best votes, the worst ones, and photographs that show the answer
-    without a mask of just that. Yellow outlines the mask, blue the answer as rendered."""
+    """Return an (H, W, 3) uint8 contact sheet of votes.
+
+    It has the best votes, the worst ones, and photographs that show the answer without a mask of just that.
+    Yellow outlines the mask, blue the answer as rendered.
+    """
     rows = {"best votes": evidence.votes[:FEW]}
     rows["worst votes"] = evidence.votes[FEW:][-FEW:]
     rows["shown without a mask of just that"] = evidence.others[:FEW]
@@ -263,7 +271,7 @@ def draw_evidence(
 
 
 def _thumbnail(photograph: Array, mask: Array, shown: Array) -> Image.Image:
-    """The square of a photograph around mask and answer, with both outlined."""
+    """Return the square of a photograph around mask and answer, with both outlined."""
     rows, columns = np.nonzero(mask | shown)
     low, high = np.array([columns.min(), rows.min()]), np.array([columns.max(), rows.max()]) + 1
     size = np.array([photograph.shape[1], photograph.shape[0]])

@@ -37,8 +37,8 @@ class TrainReport:
     codec_cosine: float  # mean, of a Gaussian's vector with what the codec makes of it
     relevancy_error: float  # mean absolute, of what the codec makes of it, over everyday phrases
     relevancy_error_p99: float
-    observed: float  # fraction of Gaussians with a meaning at the whole level
-    warnings: tuple[str, ...]  # what speaks against the scene, with the remedy
+    observed: float  # fraction of Gaussians with language features at the whole level
+    warnings: tuple[str, ...]  # quality warnings, each with its remedy
     seconds: dict[str, float]  # per stage, of this run: a stage that was already done takes almost none
     dataset: str = ""  # absolute path of the photographs; "" in reports of earlier versions
     held_out_views: tuple[ViewScore, ...] = ()  # one by one
@@ -47,8 +47,8 @@ class TrainReport:
     rehearsed: dict[str, list[float]] = field(default_factory=dict)
 
 
-def said_of(rehearsed: Mapping[str, Sequence[float]]) -> str:
-    """``after 500 steps at 320 px 24.6, 21.1 dB; after 500 steps at 480 px 24.0 dB``."""
+def rehearsals_in_words(rehearsed: Mapping[str, Sequence[float]]) -> str:
+    """Return ``after 500 steps at 320 px 24.6, 21.1 dB; after 500 steps at 480 px 24.0 dB``."""
     return "; ".join(
         f"after {budget} {', '.join(f'{decibels:.1f}' for decibels in found)} dB"
         for budget, found in rehearsed.items()
@@ -56,7 +56,7 @@ def said_of(rehearsed: Mapping[str, Sequence[float]]) -> str:
 
 
 def work_folder(out: Path) -> Path:
-    """Default folder in which the training of a scene keeps its stages."""
+    """Return the default folder in which the training of a scene keeps its stages."""
     return out.with_name(f"{out.stem}.work")
 
 
@@ -74,21 +74,24 @@ def read_report(work: Path) -> TrainReport:
 
 
 def stated_warnings(scene: Path, gaussians: int) -> tuple[str, ...]:
-    """Quality warnings of the report beside a scene. None where there is no report, where it cannot be
-    read, or where it is of a scene with another number of Gaussians than this file has."""
+    """Return the quality warnings of the report beside a scene.
+
+    There are none without a report, where it cannot be read, and where it is of a scene with another number
+    of Gaussians than this file has.
+    """
     try:
         stated = read_json_file(work_folder(scene) / REPORT, LIMIT)
     except (InputError, FormatError):
         return ()
     if not isinstance(stated, dict) or stated.get("gaussians") != gaussians:
         return ()
-    said = stated.get("warnings", stated.get("doubts"))  # the name in reports of earlier versions
-    lines = said[:MOST_WARNINGS] if isinstance(said, list) else []
+    warnings = stated.get("warnings")
+    lines = warnings[:MOST_WARNINGS] if isinstance(warnings, list) else []
     return tuple(printable_line(line, 300) for line in lines if isinstance(line, str))
 
 
 def quality_warnings(scores: Sequence[ViewScore], cameras: Sequence[Camera]) -> tuple[str, ...]:
-    """Return what speaks against a scene that was trained without an error, one sentence each, with a remedy.
+    """Return warnings of a poor scene that was trained without an error, one sentence each, with a remedy.
 
     scores: of held-out views, or none; cameras: all that were trained on.
     """
@@ -117,8 +120,10 @@ def quality_warnings(scores: Sequence[ViewScore], cameras: Sequence[Camera]) -> 
 
 
 def camera_groups(positions: Array) -> list[Array]:
-    """Rows of (M, 3) positions in groups that lie `APART`, the largest first; one where they are together.
-    A single camera on its own is no group."""
+    """Return rows of (M, 3) positions in groups that lie `APART`, the largest first.
+
+    Cameras that stand together are one group; a single camera on its own is none.
+    """
     from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
     from scipy.spatial.distance import pdist, squareform
 

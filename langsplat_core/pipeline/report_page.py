@@ -1,5 +1,8 @@
-"""The page of a training, `report.html` in its work folder: photographs beside what the scene shows, cameras
-from above, the graph of matches, warnings and figures, in one file without scripts."""
+"""Page of a training, `report.html` in its work folder, in one file without scripts.
+
+It shows photographs beside what the scene shows, cameras from above, the graph of matches, warnings and
+figures.
+"""
 
 import html
 import io
@@ -16,9 +19,9 @@ from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.matches import FEWEST_MATCHES, Matches, NotLocatedError
 from langsplat_core.errors import printable_line
 from langsplat_core.io.files import atomic_path
-from langsplat_core.pipeline.report import PAGE, TrainReport, camera_groups, said_of, write_report
+from langsplat_core.pipeline.report import PAGE, TrainReport, camera_groups, rehearsals_in_words, write_report
 from langsplat_core.raster.render import render
-from langsplat_core.scene import Camera, Gaussians, Scene
+from langsplat_core.scene import Gaussians, Scene
 from langsplat_core.scene.transform import C0
 from langsplat_core.training.radiance.scores import evaluate_views
 
@@ -56,7 +59,7 @@ def write_reports(work: Path, report: TrainReport, capture: Capture, gaussians: 
 
 
 def write_refusal(work: Path, error: NotLocatedError) -> Path:
-    """Write the page of a training that ended without cameras; its path."""
+    """Write the page of a training that ended without cameras, and return its path."""
     matches = error.matches
     groups = (
         f"<tr><td class=number>{len(group)}<td>{', '.join(_text(matches.names[row], 60) for row in group)}"
@@ -71,7 +74,7 @@ def write_refusal(work: Path, error: NotLocatedError) -> Path:
 
 
 def from_all_over(rows: Sequence[int], most: int) -> list[int]:
-    """At most `most` of `rows`, evenly spaced."""
+    """Return at most `most` of `rows`, evenly spaced."""
     return [rows[at] for at in np.linspace(0, len(rows) - 1, min(len(rows), most)).round().astype(int)]
 
 
@@ -88,7 +91,7 @@ def _write(path: Path, title: str, parts: Iterable[str]) -> None:
 
 
 def _text(text: object, limit: int = 120) -> str:
-    """Text for HTML, of whatever origin."""
+    """Return text of whatever origin as HTML."""
     return html.escape(printable_line(text, limit))
 
 
@@ -101,10 +104,10 @@ def _key(colour: str, name: str) -> str:
 
 
 def _warnings(warnings: Iterable[str]) -> Iterator[str]:
-    """A card each; what stands behind the colon is the remedy."""
+    """Yield a card for each warning, in which the remedy stands behind the colon."""
     for warning in warnings:
-        said, colon, remedy = warning.partition(": ")
-        yield f"<div class='card warning'><b>{_text(said + colon, 600)}</b> {_text(remedy, 1000)}</div>"
+        fault, colon, remedy = warning.partition(": ")
+        yield f"<div class='card warning'><b>{_text(fault + colon, 600)}</b> {_text(remedy, 1000)}</div>"
 
 
 def _tiles(report: TrainReport) -> str:
@@ -131,12 +134,12 @@ def _figures(report: TrainReport) -> Iterator[str]:
         for name, seconds in report.seconds.items()
     )
     figures = {
-        "rehearsed": said_of(report.rehearsed) or "no",
+        "rehearsed": rehearsals_in_words(report.rehearsed) or "no",
         "masks": report.masks,
         "encoder": report.encoder,
         "codec": f"{report.codec} of {report.codec_size}, mean cosine {report.codec_cosine:.4f}",
         "relevancy error": f"{report.relevancy_error:.4f} (99 % below {report.relevancy_error_p99:.3f})",
-        "Gaussians with a meaning": f"{100 * report.observed:.1f} %",
+        "Gaussians with language features": f"{100 * report.observed:.1f} %",
     }
     rows = "".join(f"<tr><td>{name}<td>{_text(value, 300)}" for name, value in figures.items())
     yield _section("Seconds per stage", f"<table>{stages}</table>")
@@ -171,13 +174,13 @@ def _uri(image: Image.Image) -> str:
 
 
 def _from_above(scene: Scene, held_out: Container[str]) -> str:
-    """A drawing of the cameras and the Gaussians, against the world's up, longest way across."""
+    """Draw the cameras and the Gaussians from above, with the cameras' longest way across the page."""
     up, eyes = scene.up(), np.array([camera.position for camera in scene.cameras])
     flat = (eyes - eyes.mean(0)) - np.outer((eyes - eyes.mean(0)) @ up, up)
     right = np.linalg.svd(flat)[2][0]
     axes = np.stack([right - (right @ up) * up, np.cross(up, right)])  # right and, on the page, up
-    valid = scene.gaussians.valid()
-    points, places = scene.gaussians.means[valid].astype(np.float64) @ axes.T, eyes @ axes.T
+    gaussians = scene.gaussians.take(np.flatnonzero(scene.gaussians.valid()))
+    points, places = gaussians.means.astype(np.float64) @ axes.T, eyes @ axes.T
     low, high = places.min(0), places.max(0)
     margin = max(float((high - low).max()), 1e-6)
     if len(points):
@@ -190,44 +193,44 @@ def _from_above(scene: Scene, held_out: Container[str]) -> str:
     def at(place: Array) -> Array:
         return np.asarray((place - low) * scale * (1, -1) + (0, height))
 
-    drawn = [_map(at(points), scene.gaussians.take(np.flatnonzero(valid)), width, height)]
-    drawn += _group_rings(eyes, at(places))
+    drawn = [_map(at(points), gaussians, width, height), *_group_rings(eyes, at(places))]
     for camera, place in zip(scene.cameras, at(places), strict=True):
-        drawn.append(_wedge(camera, axes, place, _ORANGE if camera.name in held_out else _BLUE))
+        # A wedge for what a camera looks towards; one that looks straight down is its dot alone.
+        ahead = axes @ camera.rotation[2] * (1, -1)
+        across = np.array([-ahead[1], ahead[0]]) * min(0.5 * camera.width / camera.fx, 1.0)
+        corners = (place, place + 17 * (ahead + across), place + 17 * (ahead - across))
+        drawn.append(
+            f"<g fill='{_ORANGE if camera.name in held_out else _BLUE}'><title>{_text(camera.name)}</title>"
+            f"<circle cx='{place[0]:.1f}' cy='{place[1]:.1f}' r='3.4'/><polygon fill-opacity='.45' "
+            f"points='{' '.join(f'{x:.1f},{y:.1f}' for x, y in corners)}'/></g>"
+        )
     return f"<svg viewBox='0 0 {width:.0f} {height:.0f}' role=img>{''.join(drawn)}</svg>"
 
 
-def _wedge(camera: Camera, axes: Array, place: Array, colour: str) -> str:
-    """A camera's place and what it looks towards; one that looks straight down is its dot alone."""
-    ahead = axes @ camera.rotation[2] * (1, -1)
-    across = np.array([-ahead[1], ahead[0]]) * min(0.5 * camera.width / camera.fx, 1.0)
-    corners = (place, place + 17 * (ahead + across), place + 17 * (ahead - across))
-    return (
-        f"<g fill='{colour}'><title>{_text(camera.name)}</title><circle cx='{place[0]:.1f}' "
-        f"cy='{place[1]:.1f}' r='3.4'/><polygon fill-opacity='.45' "
-        f"points='{' '.join(f'{x:.1f},{y:.1f}' for x, y in corners)}'/></g>"
-    )
-
-
 def _map(places: Array, gaussians: Gaussians, width: float, height: float) -> str:
-    """The Gaussians' colours from above, faint as a map's ground; `places`: (N, 2) on the page."""
+    """Draw the mean colours of Gaussians at `places` (N, 2) on the page, faint as a map's ground."""
     cell = max(width, height) / MAP_SIDE
     rows, columns = max(1, int(np.ceil(height / cell))), max(1, int(np.ceil(width / cell)))
-    column, row = np.floor(places / cell).astype(int).T
-    inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
-    flat, weight = (row * columns + column)[inside], sigmoid(gaussians.opacity_logits[inside])
-    colours = (0.5 + C0 * gaussians.sh[inside, 0]).clip(0, 1)
-    channels = (*colours.T, np.ones(len(flat)))
-    sums = np.stack([np.bincount(flat, weight * c, rows * columns) for c in channels], 1)
-    full = float(np.quantile(sums[sums[:, 3] > 0, 3], 0.7)) if len(flat) else 1.0
-    solid = 0.75 * np.minimum(1, sums[:, 3:] / full)
-    mean = sums[:, :3] / np.maximum(sums[:, 3:], 1e-9)
-    image = Image.fromarray((255 * (1 - solid * (1 - mean)) + 0.5).astype(np.uint8).reshape(rows, columns, 3))
-    return f"<image width='{columns * cell:.1f}' height='{rows * cell:.1f}' href='{_uri(image)}'/>"
+    opacities = sigmoid(gaussians.opacity_logits)
+    colours = (0.5 + C0 * gaussians.sh[:, 0]).clip(0, 1)
+    edges = (0, rows * cell), (0, columns * cell)
+    sums = np.stack(
+        [
+            np.histogram2d(places[:, 1], places[:, 0], (rows, columns), edges, weights=opacities * channel)[0]
+            for channel in (*colours.T, np.ones(len(places)))
+        ],
+        axis=-1,
+    )
+    total = sums[..., 3:]
+    full = float(np.quantile(total[total > 0], 0.7)) if total.any() else 1.0
+    solid = 0.75 * np.minimum(1, total / full)
+    shade = 1 - solid * (1 - sums[..., :3] / np.maximum(total, 1e-9))
+    uri = _uri(Image.fromarray((255 * shade + 0.5).astype(np.uint8)))
+    return f"<image width='{columns * cell:.1f}' height='{rows * cell:.1f}' href='{uri}'/>"
 
 
 def _group_rings(eyes: Array, places: Array) -> Iterator[str]:
-    """A dashed ring around each group of cameras, where there are several."""
+    """Yield a dashed ring around each group of cameras, where there are several."""
     groups = camera_groups(eyes)
     for number, group in enumerate(groups if len(groups) > 1 else (), 1):
         middle = places[group].mean(0)
@@ -243,16 +246,15 @@ def _group_rings(eyes: Array, places: Array) -> Iterator[str]:
 
 
 def _matches(matches: Matches) -> str:
-    located = len(matches.located)
-    said = f"<p>{located} of {len(matches.names)} photographs are located.</p>"
+    text = f"<p>{len(matches.located)} of {len(matches.names)} photographs are located.</p>"
     if matches.gaps():
-        said += f"<p>To join the others (dashed), {_text(matches.advice(), 600)}.</p>"
+        text += f"<p>To join the others (dashed), {_text(matches.advice(), 600)}.</p>"
     key = _key(_BLUE, "located") + _key(_RED, "not located")
-    return _section("Which photographs match", _graph(matches), key, said)
+    return _section("Which photographs match", _graph(matches), key, text)
 
 
 def _graph(matches: Matches) -> str:
-    """Photographs around a circle in the order of their names, and lines between those that match."""
+    """Draw photographs around a circle, in the order of their names, and lines between those that match."""
     count, middle = len(matches.names), PLOT / 2
     radius = middle - (88 if count <= NAMED else 24)
     angles = 2 * np.pi * np.arange(count) / max(count, 1) - np.pi / 2
@@ -282,7 +284,7 @@ def _graph(matches: Matches) -> str:
 
 
 def _strongest(matches: Matches) -> list[tuple[int, int, int]]:
-    """Pairs that join, of which each photograph has its `STRONGEST`."""
+    """Return the pairs that join, up to `STRONGEST` for each photograph."""
     taken: dict[int, int] = {}
     found = []
     for a, b, shared in sorted(matches.pairs, key=lambda pair: -pair[2]):

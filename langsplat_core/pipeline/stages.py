@@ -1,5 +1,4 @@
-"""Base of all stages of a training: results kept under a key of settings and inputs, a lock on the work
-folder, and the group of processes that share the work."""
+"""Results of stages, kept under a key of settings and inputs; the work folder's lock; groups of processes."""
 
 import contextlib
 import hashlib
@@ -40,7 +39,7 @@ Arrays = Mapping[str, Array]
 
 
 def stage_key(name: str, version: int, *inputs: Any) -> str:
-    """A short name such as ``radiance-7293f2d8d936`` that changes with any setting or input.
+    """Return a short name such as ``radiance-7293f2d8d936`` that changes with any setting or input.
 
     `inputs` are dataclasses, strings, numbers or lists of them; `version` is raised when the stage's
     code changes what it makes.
@@ -51,8 +50,11 @@ def stage_key(name: str, version: int, *inputs: Any) -> str:
 
 
 def kept(path: Path, make: Callable[[], T], pack: Callable[[T], Arrays], unpack: Callable[[Arrays], T]) -> T:
-    """Return the result of a stage: read from `path` (*.npz) where it was made before, else made and stored
-    there, whole or not at all. `pack` and `unpack` turn it into named arrays and back."""
+    """Return the result of a stage, read from `path` (*.npz) where it was made before.
+
+    Else it is made and stored there, whole or not at all. `pack` and `unpack` turn it into named arrays and
+    back.
+    """
     if path.exists():
         log.debug("%s: kept from an earlier run", path.name)
         return unpack(read_arrays(path))
@@ -69,7 +71,7 @@ def kept_array(path: Path, make: Callable[[], Array]) -> None:
 
 
 def open_array(path: Path) -> Array:
-    """The array in `path` (*.npy), read where it is looked at; FormatError for a damaged file."""
+    """Map the array in `path` (*.npy) into memory; FormatError for a damaged file."""
     try:
         try:
             return np.load(path, mmap_mode="r", allow_pickle=False)
@@ -84,7 +86,7 @@ _DAMAGED = OSError, ValueError, LookupError, EOFError, RuntimeError
 
 
 def read_arrays(path: Path) -> dict[str, Array]:
-    """The arrays of an .npz file; FormatError for a damaged one."""
+    """Return the arrays of an .npz file; FormatError for a damaged one."""
     try:
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
@@ -93,12 +95,12 @@ def read_arrays(path: Path) -> dict[str, Array]:
 
 
 def gaussians_digest(gaussians: Gaussians) -> str:
-    """Digest of every number of the Gaussians."""
+    """Return a digest of every number of the Gaussians."""
     return _digest(*(getattr(gaussians, field.name) for field in fields(gaussians)))
 
 
 def features_digest(features: ImageFeatures) -> str:
-    """Digest of the masks and vectors of a photograph."""
+    """Return a digest of the masks and vectors of a photograph."""
     return _digest(features.labels, features.vectors)
 
 
@@ -112,12 +114,12 @@ def _digest(*arrays: Array) -> str:
 
 @contextmanager
 def sole_use(folder: Path) -> Iterator[None]:
-    """Hold `folder` for one training, as two would write each other's stages; make it if it is missing, and
-    remove it again if nothing came into it.
+    """Hold `folder` for one training, as two would write each other's stages.
 
-    The lock is the operating system's: it ends with its process, however that ends, so that none is ever left
-    by a dead one. On file systems without locks nothing is held. Raises InputError where another process, or
-    another training in this one, holds the folder.
+    It is made if it is missing, and removed again if nothing came into it. The lock is the operating
+    system's: it ends with its process, however that ends, so that none is ever left by a dead one. On file
+    systems without locks nothing is held. Raises InputError where another process, or another training in
+    this one, holds the folder.
     """
     if fcntl is None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -136,7 +138,7 @@ def sole_use(folder: Path) -> Iterator[None]:
 
 
 def _locked(folder: Path) -> io.FileIO:
-    """The lock's file, opened, and locked where the file system knows locks."""
+    """Open the lock's file, and lock it where the file system knows locks."""
     while True:
         folder.mkdir(parents=True, exist_ok=True)
         file = io.FileIO(folder / LOCK, "a+")
@@ -174,11 +176,11 @@ class ProcessGroup:
         return self.rank == 0
 
     def share(self, items: Sequence[T]) -> list[T]:
-        """The part of `items` that is this process's work."""
+        """Return the part of `items` that is this process's work."""
         return list(items[self.rank :: self.size])
 
     def barrier(self) -> None:
-        """Wait for all. Raises InputError where one of them is no more."""
+        """Wait for all processes. Raises InputError where one of them has ended."""
         if self.size < 2:
             return
         import torch.distributed
@@ -193,7 +195,7 @@ class ProcessGroup:
             ) from None
 
     def once(self, make: Callable[[], T]) -> T:
-        """The result of `make`, which keeps it in a file: made by one process and read by the others."""
+        """Return the result of `make`, which keeps it in a file: one process makes it, the others read it."""
         if self.is_main:
             result = make()
             self.barrier()

@@ -1,62 +1,44 @@
-"""From photographs to a searchable scene: the whole method, one line a stage.
+"""From photographs to a searchable scene: the whole method, one step a stage.
 
 Every stage keeps its result in the work folder under a key of its settings, so that an interrupted run
 continues where it stopped and a changed setting recomputes only what depends on it.
 """
 
-import json
 import logging
 import time
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from langsplat_core.arrays import ViewScore
-from langsplat_core.config import QUICK, RadianceBudget, RadianceConfig, TrainConfig, check_settings
+from langsplat_core.config import QUICK, TrainConfig, check_settings
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.holdout import split
 from langsplat_core.datasets.matches import NotLocatedError
 from langsplat_core.errors import InputError
-from langsplat_core.io.files import atomic_path, check_output_folder, shown
-from langsplat_core.io.ply import read_ply, write_ply
+from langsplat_core.io.files import check_output_folder, shown
 from langsplat_core.io.scenes import check_writable, load_scene, save_scene
 from langsplat_core.pipeline.agreement import agreed_features
-from langsplat_core.pipeline.language import check_lift, check_masks, language_field
-from langsplat_core.pipeline.report import (
-    TrainReport,
-    quality_warnings,
-    read_report,
-    said_of,
-    work_folder,
-)
+from langsplat_core.pipeline.language_field import StoredViews, check_lift, check_masks, language_field
+from langsplat_core.pipeline.radiance import gaussians_of
+from langsplat_core.pipeline.report import TrainReport, quality_warnings, read_report, work_folder
 from langsplat_core.pipeline.report_page import write_refusal, write_reports
-from langsplat_core.pipeline.stages import ProcessGroup, sole_use, stage_key
+from langsplat_core.pipeline.stages import ProcessGroup, sole_use
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster import load_lifting_rasterizer
-from langsplat_core.scene import Camera, Gaussians, LanguageField, Scene
+from langsplat_core.scene import Scene
 from langsplat_core.semantics.encoder import Encoder
 from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE, load_encoder
 from langsplat_core.semantics.masks import MaskSource
+from langsplat_core.semantics.regions import describe_capture
 from langsplat_core.semantics.sam import load_mask_source
-from langsplat_core.semantics.store import FeatureStore, ImageFeatures, StoredFeatures, describe_capture
-from langsplat_core.training.language.codec_fit import CodecReport
-from langsplat_core.training.radiance.rehearsal import (
-    budget_text,
-    budgets_for,
-    checkpoints_of,
-    rehearse,
-    supported,
-    train_within,
-)
+from langsplat_core.semantics.store import FeatureStore, StoredFeatures
 from langsplat_core.training.radiance.scores import evaluate_views
 
 FEWEST_VIEWS = 3
-RADIANCE_VERSION = 7  # of what training and rehearsal make
 
 log = logging.getLogger("langsplat")
 
@@ -92,23 +74,9 @@ def train_scene(
         return _train(_Run(dataset, out, config, work, progress, processes), masks_of, given)
 
 
-class _Clock:
-    """Clock of the seconds that each stage takes."""
-
-    def __init__(self) -> None:
-        self.laps: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, name: str) -> None:
-        now = time.perf_counter()
-        self.laps[name] = round(now - self._last, 1)
-        log.debug("%s: %.1f s", name, self.laps[name])
-        self._last = now
-
-
 @dataclass(frozen=True)
 class _Run:
-    """Constants of a training."""
+    """What all stages of a training share."""
 
     dataset: Path
     out: Path
@@ -116,58 +84,79 @@ class _Run:
     work: Path
     progress: Progress
     processes: ProcessGroup
-    clock: _Clock = field(default_factory=_Clock)
+    seconds: dict[str, float] = field(default_factory=dict)  # that each stage took
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Note the seconds that a stage takes."""
+        began = time.perf_counter()
+        yield
+        self.seconds[stage] = round(time.perf_counter() - began, 1)
+        log.debug("%s: %.1f s", stage, self.seconds[stage])
 
 
 def _train(run: _Run, masks_of: Callable[[Capture], MaskSource] | None, given: Scene | None) -> TrainReport:
-    """`train_scene` in a folder that is its own; `given`: the scene whose Gaussians are taken."""
-    config, processes, clock = run.config, run.processes, run.clock
-    # First: absent weights should not cost an hour.
-    encoder = load_encoder(config.clip.model, config.clip.device, config.clip.batch)
-    named = None if masks_of else load_mask_source(config.masks, config.clip.device)
-    # One process solves for cameras, the others find them in the work folder.
-    capture = processes.once(lambda: _photographs(run))
-    mask_source = named or masks_of(capture)  # type: ignore[misc]  # one of them is there
+    """Train in a work folder that is this run's own; `given`: the scene whose Gaussians are taken."""
+    config, processes, shared = run.config, run.processes, (run.work, run.progress, run.processes)
+    with run.timed("photographs"):
+        # First: absent weights should not cost an hour.
+        encoder = load_encoder(config.clip.model, config.clip.device, config.clip.batch)
+        named_source = None if masks_of else load_mask_source(config.masks, config.clip.device)
+        # One process solves for cameras, the others find them in the work folder.
+        capture = processes.once(lambda: _photographs(run))
+        train, held_out = split(capture, config.dataset)
+    mask_source = named_source or masks_of(capture)  # type: ignore[misc]  # one of them is there
     log.info("masks: %s, encoder: %s", mask_source.name, encoder.id)
     if encoder.id == DEMO and not capture.drawn:
         log.warning("%s", DEMO_ELSEWHERE)
-    train, held_out = split(capture, config.dataset)
-    clock.lap("photographs")
 
-    views = _described(run, capture, train, mask_source, encoder)
-    check_masks(views.features)  # before the Gaussians, which may cost hours
-    clock.lap("masks and vectors")
+    with run.timed("masks and vectors"):
+        views = _described_views(run, capture, train, mask_source, encoder)
+        check_masks(views.features)  # before the Gaussians, which may cost hours
 
-    gaussians, rehearsed = _gaussians(run, capture, train) if given is None else (given.gaussians, {})
-    said = None if given is None else given.metres_per_unit  # the dataset's may be an estimate
-    metres = config.dataset.metres_per_unit or said or capture.metres_per_unit
-    clock.lap("radiance")
+    with run.timed("radiance"):
+        gaussians, rehearsed = (
+            gaussians_of(capture, train, config.radiance, *shared) if given is None else (given.gaussians, {})
+        )
 
-    shared = run.work, run.progress, processes
     if not mask_source.agrees:
-        rasterizer = load_lifting_rasterizer(config.lift.backend)
-        photographs = [(capture.images[i], capture.mask(i)) for i in train]
-        features = agreed_features(gaussians, views, photographs, encoder, rasterizer, *shared)
-        views = StoredViews(views.cameras, features)
-        clock.lap("masks that agree")
-    language, loss = language_field(gaussians, views, encoder, config, *shared)
-    if not capture.drawn:
-        language = replace(language, reading=language.reading.elsewhere)
-    clock.lap("language field")
+        with run.timed("masks that agree"):
+            rasterizer = load_lifting_rasterizer(config.lift.backend)
+            photographs = [(capture.images[i], capture.mask(i)) for i in train]
+            features = agreed_features(gaussians, views, photographs, encoder, rasterizer, *shared)
+            views = StoredViews(views.cameras, features)
+
+    with run.timed("language field"):
+        language, codec_report = language_field(gaussians, views, encoder, config, *shared)
+        if not capture.drawn:
+            language = replace(language, reading=language.reading.elsewhere)
 
     if processes.is_main:
-        scene = Scene(gaussians, language, views.cameras, metres_per_unit=metres)
-        save_scene(run.out, scene)
-        small = capture.read_at(held_out, QUICK.longer_side) if held_out else None
-        scores = evaluate_views(gaussians, capture, held_out, small=small) if held_out else []
-        clock.lap("saving and held-out views")
-        report = _report(
-            *(scene, language, loss, scores),
+        with run.timed("saving and held-out views"):
+            said = None if given is None else given.metres_per_unit  # the dataset's may be an estimate
+            metres = config.dataset.metres_per_unit or said or capture.metres_per_unit
+            save_scene(run.out, Scene(gaussians, language, views.cameras, metres_per_unit=metres))
+            small = capture.read_at(held_out, QUICK.longer_side) if held_out else None
+            scores = evaluate_views(gaussians, capture, held_out, small=small) if held_out else []
+        report = TrainReport(
+            views=len(views),
+            held_out=len(scores),
+            gaussians=len(gaussians),
+            psnr=_mean(score.psnr for score in scores),
+            psnr_small=_mean(score.psnr_small for score in scores),
             masks=mask_source.name,
             encoder=encoder.id,
             mask_count=sum(len(item.vectors) for item in views.features),
-            seconds=clock.laps,
+            codec=language.codec.kind,
+            codec_size=language.codec.size,
+            codec_cosine=codec_report.cosine,
+            relevancy_error=codec_report.error_mean,
+            relevancy_error_p99=codec_report.error_p99,
+            observed=float((language.confidence[2] > 0).mean()) if len(gaussians) else 0.0,
+            warnings=quality_warnings(scores, views.cameras),
+            seconds=run.seconds,
             dataset=str(run.dataset.resolve()),
+            held_out_views=tuple(scores),
             rehearsed=rehearsed,
         )
         write_reports(run.work, report, capture, gaussians)
@@ -176,7 +165,7 @@ def _train(run: _Run, masks_of: Callable[[Capture], MaskSource] | None, given: S
 
 
 def _photographs(run: _Run) -> Capture:
-    """The photographs that have cameras, enough for a scene."""
+    """Return the photographs that have cameras, enough for a scene."""
     try:
         capture = load_capture(run.dataset, run.config.dataset, run.work, run.progress)
     except NotLocatedError as error:
@@ -190,11 +179,13 @@ def _photographs(run: _Run) -> Capture:
     return capture
 
 
-def _described(
+def _described_views(
     run: _Run, capture: Capture, train: list[int], source: MaskSource, encoder: Encoder
-) -> "StoredViews":
-    """The photographs at `train` with their masks, and the vectors of these where masks agree: else masks are
-    described when they do. Keyed by mask settings, encoder and image."""
+) -> StoredViews:
+    """Find the masks of the photographs at `train`, and their vectors where masks agree between photographs.
+
+    Others are described once they agree. Kept by mask settings, encoder and image.
+    """
     store = FeatureStore(run.work / ("features" if source.agrees else "masks"))
     mine = run.processes.share(train)
     names = [capture.cameras[i].name for i in mine]
@@ -206,105 +197,7 @@ def _described(
     return StoredViews(cameras, StoredFeatures(store, [camera.name for camera in cameras]))
 
 
-def _gaussians(run: _Run, capture: Capture, train: list[int]) -> tuple[Gaussians, dict[str, list[float]]]:
-    """The trained Gaussians, and what rehearsals found."""
-    config, once, shared = run.config.radiance, run.processes.once, (run.work, run.progress)
-    budgets = budgets_for(capture, config, len(train))
-    found = once(lambda: rehearsals(capture, train, config, *shared))
-    budget = supported(found, budgets)
-    scores = [[round(decibels, 2) for decibels in each] for each in found]
-    rehearsed = dict(zip(map(budget_text, budgets), scores, strict=False))
-    if budget != budgets[-1]:
-        log.info(
-            "training takes %s, not %s: with so few photographs more does not pay (held out: %s); "
-            "--radiance.rehearsed-views 0 spends all",
-            *(budget_text(budget), budget_text(budgets[-1]), said_of(rehearsed) or "none could be"),
-        )
-    return once(lambda: trained_gaussians(capture, train, config, budget, *shared)), rehearsed
-
-
-def _report(
-    scene: Scene, language: LanguageField, loss: CodecReport, scores: list[ViewScore], **training: Any
-) -> TrainReport:
-    """The figures of a scene, and those of its `training`, by their names in the report."""
-    return TrainReport(
-        views=len(scene.cameras),
-        held_out=len(scores),
-        gaussians=len(scene.gaussians),
-        psnr=_mean(score.psnr for score in scores),
-        psnr_small=_mean(score.psnr_small for score in scores),
-        codec=language.codec.kind,
-        codec_size=language.codec.size,
-        codec_cosine=loss.cosine,
-        relevancy_error=loss.error_mean,
-        relevancy_error_p99=loss.error_p99,
-        observed=float((language.confidence[2] > 0).mean()) if len(scene.gaussians) else 0.0,
-        warnings=quality_warnings(scores, scene.cameras),
-        held_out_views=tuple(scores),
-        **training,
-    )
-
-
 def _mean(scores: Iterable[float | None]) -> float | None:
-    """The mean of those that could be measured; None where none could."""
+    """Return the mean of the scores that could be measured; None where none could."""
     measured = [score for score in scores if score is not None]
     return float(np.mean(measured)) if measured else None
-
-
-def rehearsals(
-    capture: Capture, train: list[int], config: RadianceConfig, work: Path, progress: Progress
-) -> list[list[float]]:
-    """`rehearse` for the photographs at `train`, from `work` where that was done before."""
-    done = work / f"{_radiance_key('rehearsal', capture, train, config)}.json"
-    if not done.exists():
-        checkpoint = done.with_suffix(".checkpoint.safetensors")
-        found = rehearse(capture, config, train, checkpoint, progress)
-        with atomic_path(done) as temporary:
-            temporary.write_text(json.dumps(found))
-        for left in checkpoints_of(checkpoint):
-            left.unlink(missing_ok=True)
-    return [[float(decibels) for decibels in each] for each in json.loads(done.read_text())]
-
-
-def trained_gaussians(
-    capture: Capture,
-    train: list[int],
-    config: RadianceConfig,
-    budget: RadianceBudget,
-    work: Path,
-    progress: Progress,
-) -> Gaussians:
-    """The Gaussians of the photographs at `train`, from `work` where they were trained before."""
-    done = work / f"{_radiance_key('radiance', capture, train, config, budget)}.ply"
-    if done.exists():
-        log.debug("%s: kept from an earlier run", done.name)
-        return read_ply(done)
-    checkpoint = done.with_suffix(".checkpoint.safetensors")
-    gaussians = train_within(capture, budget, config, train, checkpoint, progress)
-    write_ply(done, gaussians)
-    checkpoint.unlink(missing_ok=True)
-    return gaussians
-
-
-def _radiance_key(
-    name: str, capture: Capture, train: list[int], config: RadianceConfig, *more: RadianceBudget
-) -> str:
-    # The backend changes who computes, not what, so that a run may move between machines; nor do checkpoints.
-    every = RadianceConfig.checkpoint_every
-    settings = replace(config, backend="auto", checkpoint_every=every)
-    return stage_key(name, RADIANCE_VERSION, settings, capture.digest(train), *more)
-
-
-class StoredViews(Sequence[tuple[Camera, ImageFeatures]]):
-    """Cameras with the features of what each saw, read when a view is looked at: hundreds of label maps are
-    more than memory holds."""
-
-    def __init__(self, cameras: tuple[Camera, ...], features: Sequence[ImageFeatures]) -> None:
-        self.cameras, self.features = cameras, features
-
-    def __len__(self) -> int:
-        return len(self.cameras)
-
-    def __getitem__(self, index: Any) -> Any:
-        """Return view `index`, a number; slices are not supported."""
-        return self.cameras[index], self.features[index]

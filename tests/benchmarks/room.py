@@ -48,9 +48,9 @@ from langsplat_core.extensions.benchmarks.commands import write_report
 from langsplat_core.io.hostile import write_npy
 from langsplat_core.io.sidecar import means_checksum
 from langsplat_core.pipeline.agreement import agreed_features
-from langsplat_core.pipeline.language import Views, language_field
+from langsplat_core.pipeline.language_field import Views, language_field
+from langsplat_core.pipeline.radiance import trained_gaussians
 from langsplat_core.pipeline.stages import stage_key
-from langsplat_core.pipeline.train import trained_gaussians
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.answers import AnswerRule
 from langsplat_core.query.engine import QueryEngine
@@ -60,8 +60,9 @@ from langsplat_core.scene import LEVELS, Camera, Gaussians, LanguageField, Scene
 from langsplat_core.semantics.encoder import Encoder
 from langsplat_core.semantics.encoders import load_encoder, model_path
 from langsplat_core.semantics.masks import MaskSource
+from langsplat_core.semantics.regions import describe_capture
 from langsplat_core.semantics.sam import load_mask_source
-from langsplat_core.semantics.store import FeatureStore, ImageFeatures, describe_capture
+from langsplat_core.semantics.store import FeatureStore, ImageFeatures
 from langsplat_core.training.language.codec_fit import CodecReport
 from langsplat_core.training.radiance.rehearsal import budgets_for
 from tests.benchmarks.oracles import (

@@ -13,8 +13,8 @@ import torch.distributed
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
 from langsplat_core.errors import InputError
+from langsplat_core.pipeline.language_field import StoredViews
 from langsplat_core.pipeline.stages import LOCK, ProcessGroup, join_processes, sole_use
-from langsplat_core.pipeline.train import StoredViews
 from tests.support.scenes import make_views
 from tests.support.tiny_models import tiny_room, tiny_sam
 

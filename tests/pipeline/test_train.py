@@ -26,11 +26,11 @@ from langsplat_core.config import (
 from langsplat_core.errors import EncoderError, FormatError, InputError
 from langsplat_core.io.ply import write_metres
 from langsplat_core.io.scenes import load_scene, save_scene
-from langsplat_core.pipeline import language, train
+from langsplat_core.pipeline import language_field, radiance
 from langsplat_core.pipeline.train import train_scene
 from langsplat_core.progress import Cancelled, Progress, Report
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.semantics import store
+from langsplat_core.semantics import regions
 from langsplat_core.semantics.masks import LevelMasks, MaskSource
 from langsplat_core.training.language.mask_weights import find_instances
 from tests.support.commands import run
@@ -117,14 +117,14 @@ def test_the_same_command_again_changes_nothing_and_repeats_no_stage(room, tmp_p
         raise AssertionError("a stage that was done is done again")
 
     for module, name in (
-        (train, "train_within"),
-        (language, "view_pairs"),
-        (language, "group_masks"),
-        (language, "lift_sample"),
-        (language, "lift_block"),
-        (language, "fit_codec"),
-        (language, "find_instances"),
-        (store, "embed_regions"),
+        (radiance, "train_within"),
+        (language_field, "view_pairs"),
+        (language_field, "group_masks"),
+        (language_field, "lift_sample"),
+        (language_field, "lift_block"),
+        (language_field, "fit_codec"),
+        (language_field, "find_instances"),
+        (regions, "embed_regions"),
     ):
         monkeypatch.setattr(module, name, forbidden)
     again = train_scene(room, out, tiny_settings(room))
@@ -139,7 +139,7 @@ def test_the_same_command_again_changes_nothing_and_repeats_no_stage(room, tmp_p
     np.testing.assert_array_equal(tree.leaves, np.load(path)["leaves"])
     assert (tree.votes[tree.levels == 2] > 0).any()
     path.unlink()  # as in a work folder of before there were any: they alone are found again
-    monkeypatch.setattr(language, "find_instances", find_instances)
+    monkeypatch.setattr(language_field, "find_instances", find_instances)
     train_scene(room, out, tiny_settings(room))
     now = kept_results(tmp_path / "scene.work")
     assert {name for name in now if now[name] != kept.get(name)} == {str(path)}

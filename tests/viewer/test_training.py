@@ -26,9 +26,8 @@ from tests.support.windowless import SCENES, act, errors, open_scene, settle
 
 SAYS = """
 import json, sys
-for stage, fraction, left in (("reading photographs", 1.0, 0), ("all stages", 0.25, 180)):
-    report = {"stage": stage, "fraction": fraction, "metrics": {"seconds_left": left}}
-    print(json.dumps(report), file=sys.stderr, flush=True)
+report = {"stage": "reading photographs", "fraction": 1.0}
+print(json.dumps(report), file=sys.stderr, flush=True)
 """
 GOOD = SAYS + "print('done: 3 Gaussians')"
 BAD = SAYS + "print('langsplat: photos: none can be located', file=sys.stderr); sys.exit(2)"
@@ -76,7 +75,6 @@ def test_a_folder_of_photographs_becomes_a_scene_that_opens(viewer, folder, begi
     progress = viewer.training.progress
     finish(viewer)
     assert progress.stages == {"reading photographs": 1.0}
-    assert (progress.overall, progress.left) == (0.25, "about 3 min left")
     assert any(message.text == "done: 3 Gaussians" for message in viewer.state.messages)
     assert viewer.state.scene is SCENES["blobs.ply"]
 
@@ -166,7 +164,6 @@ def test_the_loss_is_heard_once_for_every_time_that_it_is_said():
     progress = TrainingProgress()
     for fraction, loss in ((0.0, {}), (0.1, {"loss": 0.25}), (0.11, {"loss": 0.25}), (0.2, {"loss": 0.125})):
         progress.hear(json.dumps({"stage": "training Gaussians", "fraction": fraction, "metrics": loss}))
-    progress.hear('{"stage": "all stages", "fraction": 0.5, "metrics": {"seconds_left": 180}}')
     assert progress.losses == [0.25, 0.125]
     assert progress.stages == {"training Gaussians": 0.2}
 

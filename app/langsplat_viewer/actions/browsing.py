@@ -5,10 +5,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from langsplat_core.datasets.photos import count_photographs
 from langsplat_core.errors import InputError
 from langsplat_core.io import cameras, sidecar
 from langsplat_core.io.scenes import format_of
-from langsplat_core.pipeline.forecast import count_photographs
 from langsplat_core.pipeline.report import work_folder
 from langsplat_viewer.actions import projects
 from langsplat_viewer.actions.filming import load_path
@@ -110,7 +110,7 @@ def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
     belongs to a scene lies beside it. A folder of photographs is offered for training. What is none of these
     is said.
     """
-    if len(paths) == 1 and _is_plain_folder(paths[0]) and count_photographs(paths[0])[0]:
+    if len(paths) == 1 and _is_plain_folder(paths[0]) and count_photographs(paths[0]):
         choose_photographs(viewer, paths[0])
         open_panel(viewer, "Train")
         return
@@ -216,7 +216,7 @@ def start_training(viewer: Viewer) -> None:
         return
     dataset = Path(form.dataset.strip()).expanduser()
     out = Path(form.out.strip() or f"{dataset}.ply").expanduser()
-    photographs, _ = count_photographs(dataset)
+    photographs = count_photographs(dataset)
     if not form.dataset.strip() or photographs == 0:
         viewer.say_error(f"no photographs in '{form.dataset.strip()}'; name a folder that has some")
         return

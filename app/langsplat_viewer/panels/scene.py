@@ -313,6 +313,8 @@ def _text_box(label: str, hint: str, text: str) -> str:
 def _running(viewer: Viewer, process: Training) -> None:
     progress = process.progress
     imgui.text_unformatted(process.request.out.name)
+    if not progress.stages:
+        imgui.text_colored(ui.muted(), "starting")
     for label, fraction in list(progress.stages.items()):
         ui.small_wrapped(f"{label}: done" if fraction >= 1 else label, ui.muted())
         if fraction < 1:
@@ -324,7 +326,6 @@ def _running(viewer: Viewer, process: Training) -> None:
         ui.tip("How far the pictures are from the photographs, on average: lower is better")
         imgui.text_colored(ui.muted(), f"loss {values[-1]:.4f}, at first {values[0]:.4f}")
     imgui.separator()
-    imgui.progress_bar(progress.overall, ImVec2(-1, 0), progress.left or "starting")
     if imgui.button("Stop"):
         browsing.stop_training(viewer)
     if ui.next_button("Look at it so far"):

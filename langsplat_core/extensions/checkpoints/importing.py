@@ -14,7 +14,7 @@ from langsplat_core.config import CodebookConfig, CodecConfig, check_settings
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.checkpoints.features import Leaves
 from langsplat_core.extensions.checkpoints.methods import ForeignScene
-from langsplat_core.pipeline.language import field_of
+from langsplat_core.pipeline.language_field import field_of
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import LEVELS, Codec, Scene
 from langsplat_core.scene.codec import LARGEST, SHORTEST

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -76,6 +77,23 @@ LATENT_LIFTS = frozenset({"one-pass", "gradient"})  # modes that average latents
 MOST_CONFIDENCE = 65_504.0  # pixels; the largest number that float16 holds
 
 
+class StoredViews(Sequence[tuple[Camera, ImageFeatures]]):
+    """Cameras with the features of what each saw, read when a view is looked at.
+
+    Hundreds of label maps are more than memory holds.
+    """
+
+    def __init__(self, cameras: tuple[Camera, ...], features: Sequence[ImageFeatures]) -> None:
+        self.cameras, self.features = cameras, features
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def __getitem__(self, index: Any) -> Any:
+        """Return view `index`, a number; slices are not supported."""
+        return self.cameras[index], self.features[index]
+
+
 def language_field(
     gaussians: Gaussians,
     views: Views,
@@ -85,7 +103,7 @@ def language_field(
     progress: Progress,
     processes: ProcessGroup | None = None,
 ) -> tuple[LanguageField, CodecReport]:
-    """The language field of the views' mask vectors, and what its codec loses.
+    """Return the language field of the views' mask vectors, and what its codec loses.
 
     Raises InputError where no view has a mask, and for a codebook whose numbers the lifting would average.
     """
@@ -101,7 +119,7 @@ def language_field(
 
 
 def _coloured(field: LanguageField, tree: Tree, gaussians: Gaussians) -> Codec:
-    """The codec of a field; a codebook gets colours that differ between neighbours."""
+    """Return the codec of a field; a codebook gets colours that differ between neighbours."""
     if not isinstance(field.codec, CodebookCodec):
         return field.codec
     colours = contrasting_colours(field, tree, build_surface(gaussians))
@@ -109,7 +127,7 @@ def _coloured(field: LanguageField, tree: Tree, gaussians: Gaussians) -> Codec:
 
 
 def check_lift(config: TrainConfig) -> None:
-    """Raises InputError for a codec of latents that cannot be averaged with a lifting that does."""
+    """Raise InputError for a codec whose latents cannot be averaged with a lifting that averages them."""
     if config.lift.mode in LATENT_LIFTS and not KINDS[config.codec.kind].blends:
         raise InputError(
             f"--lift.mode {config.lift.mode}: a {config.codec.kind} has no latents that can be averaged; "
@@ -118,7 +136,7 @@ def check_lift(config: TrainConfig) -> None:
 
 
 def check_masks(features: Iterable[ImageFeatures]) -> None:
-    """Raises InputError where no photograph has a mask; looks no further than the first that has one."""
+    """Raise InputError where no photograph has a mask; only files up to the first with one are read."""
     if not any(len(seen.vectors) for seen in features):
         raise InputError(
             "no masks were found in any photograph; try --masks.source graph, or larger photographs"
@@ -140,7 +158,7 @@ class _Stages:
     ) -> None:
         self._gaussians, self._views, self._encoder = gaussians, views, encoder
         self._config, self._work, self._processes, self._progress = config, work, processes, progress
-        self._lift = _what_matters(config.lift)
+        self._lift = _settings_in_key(config.lift)
         self._robust = self._lift.mode == "median"
         self._vectors, digests = [], []
         for _, features in views:
@@ -150,8 +168,10 @@ class _Stages:
         self._made: tuple[MaskWeights, MaskGroups] | None = None
 
     def codec(self) -> tuple[Codec, CodecReport]:
-        """Fitted to lifted vectors and, where that helps, to the masks' own; to these alone where latents are
-        averaged themselves."""
+        """Return the codec, fitted to lifted vectors and, where that helps, to the masks' own.
+
+        Where latents are averaged themselves it is fitted to the masks' vectors alone.
+        """
         fitted_to = "masks" if self._lift.mode in LATENT_LIFTS else self._lift.mode
         path = self._work / f"{stage_key('codec', 2, *self._inputs, fitted_to, self._config.codec)}.npz"
         if self._lift.mode not in LATENT_LIFTS and not path.exists():
@@ -173,8 +193,10 @@ class _Stages:
         return made
 
     def tree(self, field: LanguageField) -> Tree:
-        """Return the tree of the scene; without votes where latents are averaged themselves, which needs no
-        mask weights."""
+        """Return the tree of the scene.
+
+        It has no votes where latents are averaged themselves, which needs no mask weights.
+        """
         surface = partial(build_surface, self._gaussians)
         if self._lift.mode in LATENT_LIFTS:
             return self._processes.once(
@@ -214,7 +236,7 @@ class _Stages:
         return samples[0], samples[1]
 
     def _lift_blocks(self, codec: Codec, folder: Path) -> None:
-        """This process's share of the blocks of Gaussians, each in a file."""
+        """Lift this process's share of the blocks of Gaussians, each into a file."""
         mask_weights, groups = self._mask_weights()
 
         def lift(number: int) -> Latents:
@@ -239,7 +261,7 @@ class _Stages:
         return latents, confidence
 
     def _mask_weights(self) -> tuple[MaskWeights, MaskGroups]:
-        """Pairs of every view, in files that are read where they are needed, and the groups of the masks."""
+        """Return the mask weights, in files that are read where they are needed, and the groups of masks."""
         if self._made is None:
             folder = self._work / stage_key("memberships", 2, *self._inputs)
             shared = self._rasterizer(), self._processes, self._progress
@@ -267,7 +289,7 @@ def kept_mask_weights(
     processes: ProcessGroup,
     progress: Progress,
 ) -> MaskWeights:
-    """Mask weights of all views, a file in `folder` each, which is read where it is looked at."""
+    """Return the mask weights of all views, a file in `folder` each, which is read where it is needed."""
 
     def pairs(index: int) -> Array:
         camera, features = views[index]
@@ -281,8 +303,8 @@ def kept_mask_weights(
     return MaskWeights([open_array(path) for path in files], len(gaussians))
 
 
-def _what_matters(config: LiftConfig) -> LiftConfig:
-    """The settings that change the result: not the backend and the batches, which change who computes."""
+def _settings_in_key(config: LiftConfig) -> LiftConfig:
+    """Return the settings that change the result: not the backend and batches, which change who computes."""
     if config.mode != "gradient":
         return LiftConfig(mode=config.mode)
     return replace(config, backend="auto")
@@ -324,8 +346,10 @@ def _unpack_codec(arrays: Arrays) -> tuple[Codec, CodecReport]:
 def field_of(
     latents: Latents, codec: Codec, encoder: PhraseEncoder, phrases: tuple[str, ...]
 ) -> LanguageField:
-    """The field of latents and confidences, without a tree, with all that a query needs of the encoder; its
-    phrasebook has each of `phrases` once."""
+    """Return the field of latents and confidences, without a tree.
+
+    It holds all that a query needs of the encoder; its phrasebook has each of `phrases` once.
+    """
     names = list(dict.fromkeys(phrase_key(phrase) for phrase in phrases))
     return LanguageField(
         *latents,
