@@ -12,7 +12,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.colmap import good_points, has_model, read_model
 from langsplat_core.datasets.photos import developer
-from langsplat_core.datasets.workspace import FAILURES, MASKS, Group, open_workspace, run_apart
+from langsplat_core.datasets.workspace import FAILURES, MASKS, CameraGroup, open_workspace, run_apart
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera
@@ -136,7 +136,7 @@ def _match_and_triangulate(
     for name, camera in zip(names, cameras, strict=True):
         params = ",".join(repr(float(value)) for value in (camera.fx, camera.fy, camera.cx, camera.cy))
         members.setdefault((params, max(camera.width, camera.height)), []).append(name)
-    groups = [Group(tuple(group), "PINHOLE", params, side) for (params, side), group in members.items()]
+    groups = [CameraGroup(tuple(group), "PINHOLE", params, side) for (params, side), group in members.items()]
     extract_features(workspace, groups, progress)
     pairs = [(names[i], names[j]) for i, j in neighbouring_views(cameras)]
     match_features(workspace, pairs, progress)

@@ -22,7 +22,7 @@ import numpy as np
 from langsplat_core.datasets.colmap import read_model
 from langsplat_core.datasets.intrinsics import signals_kept
 from langsplat_core.datasets.matches import FEWEST_MATCHES, MATCHES
-from langsplat_core.datasets.workspace import MASKS, Group, Pair, disk_full
+from langsplat_core.datasets.workspace import MASKS, CameraGroup, Pair, disk_full
 from langsplat_core.errors import FormatError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.progress import Progress
@@ -41,7 +41,7 @@ MATCH_BATCH = 64  # pairs per step
 Model: TypeAlias = pycolmap.Reconstruction
 
 
-def extract_features(folder: Path, groups: Sequence[Group], progress: Progress) -> None:
+def extract_features(folder: Path, groups: Sequence[CameraGroup], progress: Progress) -> None:
     """Put SIFT features of every photograph of `groups` into the database; those it has are kept."""
     database, images = folder / "database.db", folder / "images"
     total, done = sum(len(group.names) for group in groups), 0
@@ -68,7 +68,7 @@ def extract_features(folder: Path, groups: Sequence[Group], progress: Progress) 
     progress("finding features", 1.0)
 
 
-def _reader(group: Group, camera_id: int, masks: Path) -> "pycolmap.ImageReaderOptions":
+def _reader(group: CameraGroup, camera_id: int, masks: Path) -> "pycolmap.ImageReaderOptions":
     """Return options to take in photographs of a group; with -1 COLMAP makes a new camera for them."""
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = group.model
@@ -79,7 +79,7 @@ def _reader(group: Group, camera_id: int, masks: Path) -> "pycolmap.ImageReaderO
     return reader
 
 
-def _extract(database: Path, images: Path, group: Group, names: Sequence[str]) -> None:
+def _extract(database: Path, images: Path, group: CameraGroup, names: Sequence[str]) -> None:
     with pycolmap.Database.open(database) as opened:
         known = {image.name: image for image in opened.read_all_images()}
         lacking = [n for n in names if n not in known or not opened.exists_keypoints(known[n].image_id)]

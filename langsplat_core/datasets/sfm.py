@@ -12,7 +12,7 @@ from langsplat_core.datasets.colmap import good_points, has_model, located_photo
 from langsplat_core.datasets.exif import EXIF_IFD, optics
 from langsplat_core.datasets.matches import Matches, NotLocatedError, read_matches
 from langsplat_core.datasets.photos import Photo, develop, find_photos, mask_beside, read_photo
-from langsplat_core.datasets.workspace import FAILURES, MASKS, Group, Pair, open_workspace, run_apart
+from langsplat_core.datasets.workspace import FAILURES, MASKS, CameraGroup, Pair, open_workspace, run_apart
 from langsplat_core.errors import InputError, shortened
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import PictureError, opened
@@ -132,7 +132,7 @@ def match_photos(workspace: Path, files: dict[str, Path], progress: Progress) ->
     return len(names)
 
 
-def _small_copies(folder: Path, files: dict[str, Path], progress: Progress) -> list[Group]:
+def _small_copies(folder: Path, files: dict[str, Path], progress: Progress) -> list[CameraGroup]:
     """Write copies that COLMAP can read and finds the same way up as we do; unreadable files are left out.
 
     Photographs of one size and one set of optics (maker, camera, focal length) share a camera.
@@ -162,7 +162,9 @@ def _small_copies(folder: Path, files: dict[str, Path], progress: Progress) -> l
     count = len(files) - len(broken)
     if count < MIN_PHOTOS:
         raise InputError(f"only {count} photographs can be read; at least {MIN_PHOTOS} are needed")
-    return [Group(tuple(names), "SIMPLE_RADIAL", side=max(size)) for (size, _), names in members.items()]
+    return [
+        CameraGroup(tuple(names), "SIMPLE_RADIAL", side=max(size)) for (size, _), names in members.items()
+    ]
 
 
 def _write_mask(mask: Path | None, copy: Path, out: Path) -> None:

@@ -26,7 +26,7 @@ Pair = tuple[str, str]
 
 
 @dataclass(frozen=True)
-class Group:
+class CameraGroup:
     """Photographs of one size that share one camera."""
 
     names: tuple[str, ...]  # file names in the workspace's images folder
