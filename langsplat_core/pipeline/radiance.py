@@ -48,7 +48,11 @@ def gaussians_of(
         log.info(
             "training takes %s, not %s: with so few photographs more does not pay (held out: %s); "
             "--radiance.rehearsed-views 0 spends all",
-            *(budget_text(budget), budget_text(budgets[-1]), rehearsals_in_words(rehearsed) or "none could be"),
+            *(
+                budget_text(budget),
+                budget_text(budgets[-1]),
+                rehearsals_in_words(rehearsed) or "none could be",
+            ),
         )
     made = processes.once(lambda: trained_gaussians(capture, train, config, budget, work, progress))
     return made, rehearsed
