@@ -45,9 +45,11 @@ class Histogram:
 
 
 def measured(scene: Scene, measure: Measure, eye: Array, relevancy: Array | None = None) -> Array | None:
-    """(N,) float64 values of a scene's Gaussians as `Histogram` has them: opacity 0 to 1, size (the longest
-    axis's standard deviation) and distance from `eye` (3,) in world units, and the relevancy of an answer.
-    None for relevancy without one."""
+    """Return (N,) float64 values of a scene's Gaussians as `Histogram` has them.
+
+    Opacity 0 to 1, size (the longest axis's standard deviation) and distance from `eye` (3,) in world units,
+    and the relevancy of an answer; None for relevancy without one.
+    """
     gaussians = scene.gaussians
     with np.errstate(all="ignore"):
         match measure:
@@ -63,8 +65,10 @@ def measured(scene: Scene, measure: Measure, eye: Array, relevancy: Array | None
 
 
 def counted(values: Array, least: float) -> tuple[float, float, Array]:
-    """Lowest and highest of the finite ones of (N,) values, at least `least` apart, and (BINS,) float32
-    log(1 + n) of how many lie in which step between them."""
+    """Return lowest and highest of the finite ones of (N,) values, and the counts of the steps between.
+
+    The two are at least `least` apart; the counts are (BINS,) float32 log(1 + n).
+    """
     finite = values[np.isfinite(values)]
     low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
     high = max(high, low + least)
@@ -113,12 +117,16 @@ class Marks:
 
 
 def unmarked(count: int) -> Marks:
+    """Return marks of `count` Gaussians of which none is marked."""
     nothing = np.zeros(count, bool)
     return Marks(nothing, nothing, nothing)
 
 
 def combined(marks: Marks, found: Array, mode: Mode) -> Marks:
-    """Marks with the selection replaced by `found` (N,) bool, or combined with it; of what is shown."""
+    """Return the marks with the selection replaced by `found` (N,) bool, or combined with it.
+
+    What is not shown is not selected.
+    """
     match mode:
         case "add":
             selected = marks.selected | found
@@ -184,8 +192,11 @@ class Drawn:
 
 
 def caught(drawn: Drawn, means: Array, depths: Array | None = None) -> Array:
-    """(N, 3) means -> (N,) bool, those inside. depths: (H, W) of the surface, as `Surface.depths` has them,
-    to leave out what a rectangle, lasso or brush meets behind it; None: all the way through."""
+    """Return, for (N, 3) means, the (N,) bool of those inside.
+
+    depths: (H, W) of the surface, as `Surface.depths` has them, to leave out what a rectangle, lasso or brush
+    meets behind it; None: all the way through.
+    """
     if drawn.tool not in ON_SCREEN:
         return _in_body(drawn, means)
     camera, pixels = drawn.camera, drawn.pixels

@@ -49,7 +49,10 @@ GL_VERSIONS = ((4, 3), (4, 1), (3, 3))
 
 
 def probe_gl() -> tuple[int, int]:
-    """The newest of `GL_VERSIONS` that a window can have here. Raises BackendError without a display."""
+    """Return the newest of `GL_VERSIONS` that a window can have here.
+
+    Raises BackendError without a display.
+    """
     hint = "to draw a picture without a window add --headless --out picture.png"
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", glfw.GLFWError)
@@ -86,8 +89,8 @@ def _gl_hints(major: int, minor: int) -> None:
 # Preferences and the layout of the panels outlive the window.
 
 
-class Remembered:
-    """Keeps a folder and the window's looks in step with the preferences of a `ViewerState`."""
+class Workspace:
+    """Keeps a folder and the window's appearance in step with the preferences of a `ViewerState`."""
 
     def __init__(self, folder: Path | None, viewer: Viewer) -> None:
         """`folder` None: nothing is read and nothing written."""
@@ -97,8 +100,10 @@ class Remembered:
         self._styled: Preferences | None = None  # as the window looks
 
     def load(self, params: hello_imgui.RunnerParams, restore_size: bool) -> None:
-        """Take the preferences that are there, and say where the layout is. Where the folder cannot be
-        written or understood, the reason is said and nothing is kept."""
+        """Take the preferences that are there, and say where the layout is.
+
+        Where the folder cannot be written or understood, the reason is said and nothing is kept.
+        """
         params.ini_disable = True
         params.app_window_params.restore_previous_geometry = False
         self._state.preferences = replace(self._state.preferences, ui_scale=fitting_scale(_screen_height()))
@@ -205,7 +210,7 @@ class Window:
         self._make_renderer = make_renderer
         self.keyboard = Keyboard(self.viewer.state)
         self._hiding, self._column = layout.Hiding(), layout.Column()
-        self._remembered = Remembered(request.settings, self.viewer)
+        self._workspace = Workspace(request.settings, self.viewer)
         self._canvas: Canvas | None = None
         self._menu = outline.ThingsMenu()
         self._photograph, self._evidence = ui.Picture(), ui.Picture()
@@ -227,7 +232,7 @@ class Window:
         params = hello_imgui.RunnerParams()
         window = params.app_window_params
         window.window_title = TITLE
-        self._remembered.load(params, restore_size=self._request.size is None)
+        self._workspace.load(params, restore_size=self._request.size is None)
         scale = self.viewer.state.preferences.ui_scale
         width, height = DEFAULT_SIZE
         window.window_geometry.size = self._request.size or (round(scale * width), round(scale * height))
@@ -248,12 +253,12 @@ class Window:
         params.fps_idling.time_active_after_last_event = AWAKE_SECONDS
         params.callbacks.default_icon_font = hello_imgui.DefaultIconFont.font_awesome6
         params.callbacks.load_additional_fonts = ui.load_fonts
-        params.callbacks.setup_imgui_style = self._remembered.style
+        params.callbacks.setup_imgui_style = self._workspace.style
         params.callbacks.show_menus = lambda: layout.draw_menus(self.viewer)
         params.callbacks.post_init = self._start
         params.callbacks.pre_new_frame = self.keyboard.feed
         params.callbacks.show_gui = self._gui
-        params.callbacks.before_imgui_render = self._picture
+        params.callbacks.before_imgui_render = self._draw
         params.callbacks.confirm_exit = self._may_close
         params.callbacks.before_exit = self._stop
         return params
@@ -306,7 +311,7 @@ class Window:
             queries.ask(viewer, phrase)
 
     def _first_view(self, viewer: Viewer) -> None:
-        """The scene of the command line is open: do what else the command line asks for."""
+        """Do what else the command line asks for, once its scene is open."""
         state, request = viewer.state, self._request
         assert state.scene is not None
         try:
@@ -319,8 +324,8 @@ class Window:
         if span is not None:
             viewpoint.move(viewer, lambda view: spanning(view, span))
         wanted = request.picture
-        looks = replace(state.session.picture, heat_opacity=wanted.heat_opacity, dim=wanted.dim)
-        settings.set_picture(viewer, replace(looks, heat_scale=wanted.heat_scale))
+        given = {name: getattr(wanted, name) for name in ("heat_opacity", "dim", "heat_scale")}
+        settings.set_picture(viewer, replace(state.session.picture, **given))
         if request.path_file is not None:
             filming.load_path(viewer, request.path_file)
         queries.set_level(viewer, request.level)
@@ -355,7 +360,7 @@ class Window:
         self._column.apply(viewer)
         layout.show_wanted(viewer)
         self._title()
-        self._remembered.update()
+        self._workspace.update()
 
     def _obey(self) -> None:
         """Obey the last signal: Ctrl + C asks what to save, SIGTERM saves it, a second one ends at once."""
@@ -369,18 +374,15 @@ class Window:
             if not self.viewer.state.may_close:
                 print("asked in the window; Ctrl + C again ends at once", file=sys.stderr)
 
-    def _pace(self) -> None:
+    def _set_idling(self) -> None:
         """Say how soon the next frame is wanted: at once only while something moves or has just changed."""
-        state, idling = self.viewer.state, hello_imgui.get_runner_params().fps_idling
-        news = (self.viewer.worker.delivered, self.viewer.recorder.delivered)
-        asked = (state.leaving, state.may_close)
-        seen = (self.unfinished, state.nothing, state.hover)
-        there = (state.view, self.viewer.watch.changed, self.keyboard.given, *news, *seen, *asked)
-        changed = len(there) != len(self._last) or any(
-            a is not b and a != b for a, b in zip(there, self._last, strict=True)
-        )
-        self._last = there
-        self._frames = AWAKE_FRAMES if changed else max(self._frames - 1, 0)
+        viewer, state = self.viewer, self.viewer.state
+        idling = hello_imgui.get_runner_params().fps_idling
+        news = (viewer.worker.delivered, viewer.recorder.delivered)
+        seen = (state.view, state.nothing, state.hover, state.leaving, state.may_close)
+        now = (news, seen, self.unfinished, viewer.watch.changed, self.keyboard.given)
+        self._frames = AWAKE_FRAMES if now != self._last else max(self._frames - 1, 0)
+        self._last = now
         awaits = any(canvas is not None and canvas.waits for canvas in self._canvases)  # and is woken
         busy = (
             (self.unfinished and not awaits)
@@ -417,7 +419,7 @@ class Window:
             glfw.set_window_title(glfw_window_hello_imgui(), f"{path.name} - {TITLE}")
             self._titled = path
 
-    def _picture(self) -> None:
+    def _draw(self) -> None:
         """Take what the panels left of mouse and keys, bring the image up to date and draw it behind them."""
         if self.failure is not None:
             return
@@ -432,7 +434,7 @@ class Window:
         if state.timing.wanted:
             state.timing.add("panels", 1e3 * (time.perf_counter() - self._began))
         if canvas is None or self._screen is None or self.is_minimised():
-            self._pace()
+            self._set_idling()
             return
         try:
             self.unfinished = canvas.update(state, imgui.get_time())
@@ -440,7 +442,7 @@ class Window:
         except DRAW_ERRORS as error:
             self.unfinished, textures = False, canvas.textures
             viewer.say_error(one_line(error))
-        self._pace()
+        self._set_idling()
         self._screen.use()
         self._screen.color_mask = True, True, True, True  # a mask left set would colour the panels
         overlays.draw_pictures(viewer, area, textures)
@@ -454,7 +456,7 @@ class Window:
 
     def _stop(self) -> None:
         selecting.finish_writing(self.viewer)
-        self._remembered.update()
+        self._workspace.update()
         self.viewer.watch.close()
         for canvas in self._canvases:
             if canvas is not None:

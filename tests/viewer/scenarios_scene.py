@@ -14,7 +14,7 @@ from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
 import glfw  # isort: skip
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_viewer.actions import browsing, editing, opening, selecting, settings, viewpoint
-from langsplat_viewer.camera.overlays import Label, visible_faces
+from langsplat_viewer.camera.overlays import PlacedText, visible_faces
 from langsplat_viewer.panels import overlays, select
 from langsplat_viewer.panels.overlays import EDGE
 from langsplat_viewer.panels.ui import Area, scene_area
@@ -171,7 +171,7 @@ def name_what_is_close(s: Any) -> None:
 
     def remembered(text: str, x: float, y: float, area: Area) -> None:
         size = imgui.calc_text_size(text)
-        written.append((text, Label(x, y, size.x, size.y)))
+        written.append((text, PlacedText(x, y, size.x, size.y)))
         write(text, x, y, area)
 
     overlays.text_on_shade = remembered

@@ -18,7 +18,7 @@ from langsplat_core.scene import look_at
 from langsplat_viewer.actions import browsing, opening, settings, viewpoint
 from langsplat_viewer.camera import overlays
 from langsplat_viewer.camera.controls import default_view, extent_of, frame_of, from_side, orbit
-from langsplat_viewer.camera.overlays import FACES, Label, face_at, facing, placed, visible_faces
+from langsplat_viewer.camera.overlays import FACES, PlacedText, face_at, facing, placed, visible_faces
 from langsplat_viewer.files.disk import LONGEST_SIDE, corners, find_photograph, read_photograph
 from langsplat_viewer.files.preferences import load_preferences, save_preferences
 from langsplat_viewer.panels.overlays import pointed_figures, said
@@ -140,14 +140,14 @@ PICTURE = (400.0, 300.0)
     ],
 )
 def test_labels_that_meet_lie_one_below_the_other(wanted, picture, heights):
-    labels = placed([Label(0, y, 50, 20) for y in wanted], picture)
+    labels = placed([PlacedText(0, y, 50, 20) for y in wanted], picture)
     assert [label.y for label in labels] == heights
 
 
-def random_labels(seed: int, count: int) -> list[Label]:
+def random_labels(seed: int, count: int) -> list[PlacedText]:
     rng = np.random.default_rng(seed)
     return [
-        Label(*map(float, rng.uniform((-20, -20), (420, 320))), float(rng.uniform(20, 90)), 18.0)
+        PlacedText(*map(float, rng.uniform((-20, -20), (420, 320))), float(rng.uniform(20, 90)), 18.0)
         for _ in range(count)
     ]
 
@@ -168,7 +168,7 @@ def test_small_moves_move_labels_as_little_until_two_meet():
     before, jumps = placed(start, PICTURE), 0
     for frame in range(1, 400):
         moved = [
-            Label(label.x + frame * float(dx), label.y + frame * float(dy), label.width, label.height)
+            PlacedText(label.x + frame * float(dx), label.y + frame * float(dy), label.width, label.height)
             for label, (dx, dy) in zip(start, drift, strict=True)
         ]
         after = placed(moved, PICTURE)

@@ -12,7 +12,7 @@ from langsplat_core.scene import Camera, Gaussians, Intrinsics, Scene, look_at
 
 
 def narrowed(inner: Intrinsics, factor: float) -> Intrinsics:
-    """The same image by a lens that is longer by `factor`."""
+    """Return the same image by a lens that is longer by `factor`."""
     return replace(inner, fx=inner.fx * factor, fy=inner.fy * factor)
 
 
@@ -33,8 +33,11 @@ class Sample:
 
 
 def sample_of(gaussians: Gaussians) -> Sample:
-    """Evenly spaced rows of those that can be drawn. The size of a Gaussian is the root of its largest
-    section, a length: areas would let a few huge ones speak for all."""
+    """Return evenly spaced rows of those that can be drawn.
+
+    The size of a Gaussian is the root of its largest section, a length: areas would let a few huge ones speak
+    for all.
+    """
     rows = np.flatnonzero(gaussians.valid())
     rows = rows[:: max(len(rows) // SAMPLE, 1)]
     sections = np.sort(gaussians.log_scales[rows].astype(np.float64), axis=1)[:, 1:].mean(1)
@@ -49,8 +52,10 @@ def reach(sample: Sample, centre: Array) -> float:
 
 
 def framing_eye(sample: Sample, rotation: Array, inner: Intrinsics, share: float = SHARE) -> Array | None:
-    """(3,) where a camera of that `rotation` (world to camera) and `inner` geometry stands nearest while
-    `share` of the weight lies in its image, filled to `MARGIN`; None without points.
+    """Return the (3,) place from which a camera sees `share` of the weight, filling the image to `MARGIN`.
+
+    `rotation` (3, 3) world to camera and `inner` are the camera's; there is no nearer such place. None
+    without points.
 
     A point is inside the right border where x - t z <= ex - t ez, with t the tangent of the angle to that
     border and e the eye: so a border is one number, the quantile of x - t z, and both eye and distance follow
@@ -91,8 +96,10 @@ def median_depth(sample: Sample, eye: Array, forward: Array) -> float:
 
 
 def nearest_depth(sample: Sample, eye: Array, forward: Array) -> float:
-    """Return the depth from `eye` (3,) along the unit `forward` (3,) before which only `1 - SHARE` of the
-    weight lies, world units; negative behind it."""
+    """Return the depth from `eye` (3,) along the unit `forward` (3,) before which almost nothing lies.
+
+    World units, negative behind the eye; `1 - SHARE` of the weight lies before it.
+    """
     return weighted_quantile((sample.points - eye) @ forward, sample.weights, 1 - SHARE)
 
 
@@ -152,7 +159,7 @@ class OrbitCamera:
         return self.target - self.distance * self.rotation[2]
 
     def camera(self, width: int, height: int) -> Camera:
-        """The camera for an image of `width` x `height` pixels."""
+        """Return the camera for an image of `width` x `height` pixels."""
         matrix = np.eye(4)
         matrix[:3, :3] = self.rotation
         matrix[:3, 3] = -self.rotation @ self.eye
@@ -168,7 +175,7 @@ class OrbitCamera:
         return self.span_in(self.intrinsics.width, self.intrinsics.height)
 
     def span_in(self, width: float, height: float) -> float:
-        """The same of an image of `width` x `height` pixels."""
+        """Return the `span` of an image of `width` x `height` pixels."""
         inner = self.intrinsics.fitted(width, height)
         return self.distance * min(width, height) / min(inner.fx, inner.fy)
 
@@ -196,7 +203,7 @@ def orbit(view: OrbitCamera, yaw: float, pitch: float) -> OrbitCamera:
 
 
 def _orthonormal(rotation: Array) -> Array:
-    """The nearest rotation: thousands of small drags must not let the axes drift apart."""
+    """Return the nearest rotation: thousands of small drags must not let the axes drift apart."""
     u, _, vt = np.linalg.svd(rotation)
     return u @ vt
 
@@ -222,9 +229,11 @@ def pan(view: OrbitCamera, dx: float, dy: float, size: tuple[int, int]) -> Orbit
 def zoom(
     view: OrbitCamera, factor: float, min_distance: float, max_distance: float = math.inf
 ) -> OrbitCamera:
-    """Multiply the distance by `factor`; at `min_distance` the target is pushed on, so it never sticks, and
-    at `max_distance` the way back ends (a view from farther away stays where it is). Without perspective
-    pushing on would make nothing larger."""
+    """Multiply the distance by `factor`.
+
+    At `min_distance` the target is pushed on, so it never sticks, and at `max_distance` the way back ends (a
+    view from farther away stays where it is). Without perspective pushing on would make nothing larger.
+    """
     wanted = view.distance * factor
     distance = min(max(wanted, min_distance), max(max_distance, view.distance))
     push = distance - wanted if factor < 1 and not view.orthographic else 0.0
@@ -238,8 +247,10 @@ def fly(view: OrbitCamera, right: float, up: float, forward: float) -> OrbitCame
 
 
 def walk(view: OrbitCamera, right: float, up: float, forward: float) -> OrbitCamera:
-    """Move as `fly` does, but ahead is level; who looks straight up or down goes where the image's top or
-    foot points."""
+    """Move as `fly` does, but ahead is level.
+
+    Who looks straight up or down goes where the image's top or foot points.
+    """
     ahead = view.rotation[2] - (view.rotation[2] @ view.up) * view.up
     if np.linalg.norm(ahead) < 1e-3:
         ahead = -view.rotation[1] if view.elevation < 0 else view.rotation[1]
@@ -250,8 +261,10 @@ def walk(view: OrbitCamera, right: float, up: float, forward: float) -> OrbitCam
 
 
 def frame_of(up: Array) -> Array:
-    """(3, 3) rows right, up and front of a world whose up is `up` (3,) unit. Who looks at the front looks
-    along the world's z axis, made level, or along y where z is up."""
+    """Return the (3, 3) rows right, up and front of a world whose up is `up` (3,) unit.
+
+    Who looks at the front looks along the world's z axis, made level, or along y where z is up.
+    """
     forward = np.eye(3)[2 if abs(up[2]) < 0.9 else 1]
     forward = forward - (forward @ up) * up
     forward /= np.linalg.norm(forward)
@@ -259,8 +272,10 @@ def frame_of(up: Array) -> Array:
 
 
 def from_side(view: OrbitCamera, side: Side) -> OrbitCamera:
-    """The same target from the same distance, along an axis of `frame_of`; from the top and from below the
-    image's foot is the front."""
+    """Return the same target from the same distance, along an axis of `frame_of`.
+
+    From the top and from below the image's foot is the front.
+    """
     right, up, front = frame_of(view.up)
     forward, down = {
         "front": (-front, -up),
@@ -283,6 +298,7 @@ def focus(view: OrbitCamera, point: Array, distance: float | None = None) -> Orb
 
 
 def level(view: OrbitCamera) -> OrbitCamera:
+    """Return the view with a level horizon."""
     upright = look_at(view.eye, view.target, view.up, (1, 1))
     return replace(view, rotation=upright.rotation)
 
@@ -293,12 +309,15 @@ def adopt_up(view: OrbitCamera) -> OrbitCamera:
 
 
 def with_fov(view: OrbitCamera, fov_degrees: float) -> OrbitCamera:
-    """The same view with the principal point in the centre and `fov_degrees` across the shorter side."""
+    """Return the same view with `fov_degrees` across the shorter side and the principal point centred."""
     return replace(view, intrinsics=symmetric_intrinsics(float(np.clip(fov_degrees, *FOV_RANGE))))
 
 
 def between(start: OrbitCamera, end: OrbitCamera, t: float) -> OrbitCamera:
-    """A view on the way from `start` (t = 0) to `end` (t = 1); intrinsics and projection are the end's."""
+    """Return a view on the way from `start` (t = 0) to `end` (t = 1).
+
+    Intrinsics and projection are the end's.
+    """
     if t >= 1:
         return end
     ease = t * t * (3 - 2 * t)
@@ -324,6 +343,7 @@ class Extent:
 
 
 def extent_of(scene: Scene) -> Extent:
+    """Return the extent of a scene's Gaussians."""
     centre, radius = scene.bounds()
     rotation = scene.framing_camera((1000, 1000), (centre, radius)).rotation
     sample = sample_of(scene.gaussians)
@@ -332,8 +352,10 @@ def extent_of(scene: Scene) -> Extent:
 
 
 def from_camera(camera: Camera, extent: Extent) -> OrbitCamera:
-    """The exact view of `camera`, turning around the depth at which it sees the scene's middle; of an
-    orthographic one, around that at which a lens of the default angle shows as much."""
+    """Return the exact view of `camera`, turning around the depth at which it sees the scene's middle.
+
+    Of an orthographic one, around that at which a lens of the default angle shows as much.
+    """
     forward, inner = camera.rotation[2], camera.intrinsics
     if camera.orthographic:
         distance = symmetric_intrinsics().fitted(camera.width, camera.height).fx / camera.fx
@@ -345,12 +367,15 @@ def from_camera(camera: Camera, extent: Extent) -> OrbitCamera:
 
 
 def with_projection(view: OrbitCamera, orthographic: bool) -> OrbitCamera:
-    """The same view with or without perspective: what is as far as the target keeps its size."""
+    """Return the same view with or without perspective: what is as far as the target keeps its size."""
     return replace(view, orthographic=orthographic)
 
 
 def spanning(view: OrbitCamera, span: float) -> OrbitCamera:
-    """The orthographic view from the same eye, `span` world units across the uncropped image's short side."""
+    """Return the orthographic view from the same eye whose shorter side spans `span` world units.
+
+    That is the side of the uncropped image.
+    """
     distance = view.distance * span / view.span
     return with_projection(focus(view, view.eye + distance * view.rotation[2], distance), orthographic=True)
 
@@ -376,7 +401,7 @@ def holding_distance(view: OrbitCamera, box: Array) -> float:
 
 
 def default_view(scene: Scene, extent: Extent, size: tuple[int, int]) -> OrbitCamera:
-    """The first training camera, else a view of the whole scene in a window of `size` pixels."""
+    """Return the first training camera, else a view of the whole scene in a window of `size` pixels."""
     if scene.cameras:
         return from_camera(scene.cameras[0], extent)
     anywhere = OrbitCamera(extent.rotation, extent.centre, extent.radius, extent.up, symmetric_intrinsics())

@@ -37,8 +37,10 @@ class Pose:
     span: float | None = None  # world units across that side without perspective, > 0; None: in perspective
 
     def camera(self, width: int, height: int) -> Camera:
-        """The pinhole camera of an image of `width` x `height` pixels, its principal point in the centre;
-        `camera_of` minds `span`."""
+        """Return the pinhole camera of an image of `width` x `height` pixels, its principal point centred.
+
+        `camera_of` minds `span`.
+        """
         matrix = np.eye(4)
         matrix[:3, :3] = self.rotation
         matrix[:3, 3] = -self.rotation @ self.position
@@ -71,8 +73,11 @@ class Motion(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """A path through keyframes. It lasts from 0 to the time of the last one; before the first one, the camera
-    stands there. ValueError without keyframes, or where their times do not rise."""
+    """A path through keyframes.
+
+    It lasts from 0 to the time of the last one; before the first one, the camera stands there. ValueError
+    without keyframes, or where their times do not rise.
+    """
 
     keyframes: tuple[Keyframe, ...]
     closed: bool = False
@@ -123,30 +128,39 @@ def turntable(view: OrbitCamera, seconds: float) -> Turntable:
 
 
 def pose_of(view: OrbitCamera) -> Pose:
-    """The eye of a view. A principal point that is off the centre moves there."""
+    """Return the eye of a view.
+
+    A principal point that is off the centre moves there.
+    """
     span = view.span if view.orthographic else None
     return Pose(view.eye, view.rotation, view.intrinsics.fov_degrees, span)
 
 
 def view_of(pose: Pose, extent: Extent) -> OrbitCamera:
-    """A view from `pose`, turning around the depth at which it sees the scene's middle; without perspective
-    around the depth of which perspective would show as much."""
+    """Return a view from `pose`, turning around the depth at which it sees the scene's middle.
+
+    Without perspective around the depth of which perspective would show as much.
+    """
     view = from_camera(pose.camera(1, 1), extent)
     return view if pose.span is None else spanning(view, pose.span)
 
 
 def camera_of(pose: Pose, extent: Extent, size: tuple[int, int]) -> Camera:
-    """The camera of an image of `size` (width, height) pixels from `pose`."""
+    """Return the camera of an image of `size` (width, height) pixels from `pose`."""
     return pose.camera(*size) if pose.span is None else view_of(pose, extent).camera(*size)
 
 
 def pose_at(motion: Motion, seconds: float) -> Pose:
+    """Return the pose at a time, seconds."""
     return motion.poses(np.array([seconds]))[0]
 
 
 def frame_times(motion: Motion, fps: float) -> Array:
-    """(T,) when a film of `fps` images a second is taken, T >= 1. A motion that ends where it began leaves
-    its last image out: it would be there twice when the film is repeated."""
+    """Return the (T,) times at which a film of `fps` images a second is taken, seconds.
+
+    A motion that ends where it began leaves its last image out: it would be there twice when the film is
+    repeated.
+    """
     if motion.closed:
         count = max(round(motion.seconds * fps), 1)
     else:
@@ -161,7 +175,10 @@ def with_keyframe(keyframes: tuple[Keyframe, ...], added: Keyframe) -> tuple[Key
 
 
 def stretched(keyframes: tuple[Keyframe, ...], seconds: float) -> tuple[Keyframe, ...]:
-    """The same path in another time: all of it, `seconds` > 0, in proportion. Paths of no duration stay."""
+    """Return the same path in another time: all of it, `seconds` > 0, in proportion.
+
+    Paths of no duration stay.
+    """
     if not keyframes or keyframes[-1].seconds <= 0:
         return keyframes
     factor = seconds / keyframes[-1].seconds
@@ -225,9 +242,12 @@ def _without_gaps(spans: Sequence[float | None]) -> list[float]:
 
 
 def tangents(times: Array, steps: Array, least: float) -> Array:
-    """(K, 3) velocities at K >= 2 keyframes of rising `times` (K,), whose differences are `steps` (K - 1, 3):
-    of the parabola through a keyframe and its two neighbours, at the ends of the straight line to the one
-    neighbour, and none beside a step shorter than `least`."""
+    """Return the (K, 3) velocities at K >= 2 keyframes of rising `times` (K,).
+
+    The keyframes differ by `steps` (K - 1, 3). Velocities are those of the parabola through a keyframe and
+    its two neighbours, at the ends of the straight line to the one neighbour, and none beside a step shorter
+    than `least`.
+    """
     spans = np.diff(times)[:, None]
     slopes = steps / spans
     inner = (spans[:-1] * slopes[1:] + spans[1:] * slopes[:-1]) / (spans[:-1] + spans[1:])

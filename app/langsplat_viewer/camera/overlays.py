@@ -12,45 +12,47 @@ from langsplat_viewer.camera.controls import Extent, OrbitCamera, frame_of, weig
 
 
 @dataclass(frozen=True)
-class Label:
-    """The room that words take, in units of the image, y down."""
+class PlacedText:
+    """The place of a text in an image, in units of the image, y down."""
 
     x: float  # left edge, where they are wanted
     y: float  # upper edge
     width: float
     height: float
 
-    def covers(self, other: "Label") -> bool:
+    def covers(self, other: "PlacedText") -> bool:
         """Return whether the two overlap; edges that touch do not."""
         beside = self.x + self.width <= other.x or other.x + other.width <= self.x
         return not (beside or self.y + self.height <= other.y or other.y + other.height <= self.y)
 
 
-def placed(labels: Sequence[Label], size: tuple[float, float]) -> list[Label]:
-    """The labels, none over another, in an image of `size` (width, height). Each one goes straight up until
-    it is free of those before it, where the image ends straight down; where there is no room it stays.
+def placed(labels: Sequence[PlacedText], size: tuple[float, float]) -> list[PlacedText]:
+    """Return the labels, none over another, in an image of `size` (width, height).
+
+    Each one goes straight up until it is free of those before it, where the image ends straight down; where
+    there is no room it stays.
 
     A label depends on those before it alone and in always the same way: it moves with its thing, and jumps
     only where it meets another or parts from it.
     """
-    found: list[Label] = []
+    found: list[PlacedText] = []
     for label in labels:
         x = max(min(label.x, size[0] - label.width), 0.0)
         y = max(min(label.y, size[1] - label.height), 0.0)
-        inside = Label(x, y, label.width, label.height)
+        inside = PlacedText(x, y, label.width, label.height)
         free = _moved(inside, found, up=True) or _moved(inside, found, up=False)
         found.append(inside if free is None or free.y + free.height > size[1] else free)
     return found
 
 
-def _moved(label: Label, others: Sequence[Label], *, up: bool) -> Label | None:
+def _moved(label: PlacedText, others: Sequence[PlacedText], *, up: bool) -> PlacedText | None:
     """Move a label up or down as far as it must; None beyond the upper edge of the image."""
     while label.y >= 0:
         met = next((other for other in others if label.covers(other)), None)
         if met is None:
             return label
         y = met.y - label.height if up else met.y + met.height
-        label = Label(label.x, y, label.width, label.height)
+        label = PlacedText(label.x, y, label.width, label.height)
     return None
 
 
@@ -65,12 +67,11 @@ FRUSTUM_EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1))
 
 
 def clip_segments(camera: Camera, segments: Array, least_depth: float) -> tuple[Array, Array]:
-    """(M, 2, 3) segments between world points -> (K, 2, 2) their visible parts in pixels of `camera`, and the
-    (K,) rows they come from, in rising order.
+    """Return the visible parts of (M, 2, 3) segments between world points, and the rows they come from.
 
-    A segment is cut where its camera z is `least_depth` (world units, > 0) and at the four planes of the
-    image's borders. All are linear in camera space, so that nothing is divided before the cut and no
-    coordinate on screen is beyond the image.
+    (K, 2, 2) pixels of `camera`, and (K,) in rising order. A segment is cut where its camera z is
+    `least_depth` (world units, > 0) and at the four planes of the image's borders. All are linear in camera
+    space, so that nothing is divided before the cut and no coordinate on screen is beyond the image.
     """
     points = segments.astype(np.float64) @ camera.rotation.T + camera.world_to_camera[:3, 3]
     start, step = points[:, 0], points[:, 1] - points[:, 0]
@@ -100,8 +101,10 @@ def clip_segments(camera: Camera, segments: Array, least_depth: float) -> tuple[
 
 
 def frusta(cameras: Sequence[Camera], depth: float) -> Array:
-    """(C, 8, 2, 3) edges of the pyramids from each camera's eye to its image at `depth` world units, the
-    four from the eye first."""
+    """Return the (C, 8, 2, 3) edges of the pyramids from each camera's eye to its image at `depth`.
+
+    World units. The four from the eye come first.
+    """
     made = np.zeros((len(cameras), 5, 3))
     for row, camera in zip(made, cameras, strict=True):
         w, h = camera.width, camera.height
@@ -112,14 +115,17 @@ def frusta(cameras: Sequence[Camera], depth: float) -> Array:
 
 
 def box_edges(corners: Array) -> Array:
-    """(8, 3) corners, in the order of `query.instances.OrientedBox` -> (12, 2, 3) edges."""
+    """Return the (12, 2, 3) edges of (8, 3) corners, in the order of `query.instances.OrientedBox`."""
     pairs = [(a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a & bit]
     edges: Array = corners[np.array(pairs)]
     return edges
 
 
 def nearest_segment(segments: Array, point: tuple[float, float]) -> tuple[int, float]:
-    """The row of (K, 2, 2) segments nearest to a point, and its distance in pixels; (-1, inf) for none."""
+    """Return the row of (K, 2, 2) segments nearest to a point, and its distance in pixels.
+
+    (-1, inf) for none.
+    """
     if not len(segments):
         return -1, math.inf
     start, step = segments[:, 0], segments[:, 1] - segments[:, 0]
@@ -131,13 +137,13 @@ def nearest_segment(segments: Array, point: tuple[float, float]) -> tuple[int, f
 
 
 def round_length(length: float) -> float:
-    """The nearest of 1, 2 and 5 times a power of ten; `length` > 0."""
+    """Return the nearest of 1, 2 and 5 times a power of ten; `length` > 0."""
     power = 10.0 ** math.floor(math.log10(length))
     return min((factor * power for factor in (1, 2, 5, 10)), key=lambda value: abs(math.log(value / length)))
 
 
 def length_text(units: float, metres_per_unit: float | None) -> str:
-    """A length in world units, and in metres where the scene has a scale."""
+    """Return a length in world units, and in metres where the scene has a scale."""
     text = f"{units:.4g} units"
     return text if metres_per_unit is None else f"{units * metres_per_unit:.4g} m ({text})"
 
@@ -152,8 +158,11 @@ class Grid:
 
 
 def ground_grid(extent: Extent, up: Array, metres_per_unit: float | None) -> Grid:
-    """A level grid below almost all of the scene. Its lines are round lengths apart and at round distances
-    from the world's origin: in metres where the scene has a scale, else in world units."""
+    """Return a level grid below almost all of the scene.
+
+    Its lines are round lengths apart and at round distances from the world's origin: in metres where the
+    scene has a scale, else in world units.
+    """
     scale = metres_per_unit or 1.0
     frame = frame_of(up)
     spacing = round_length(2 * GRID_REACH * extent.radius / GRID_LINES * scale) / scale
@@ -202,7 +211,7 @@ class Face:
 
 
 def visible_faces(view: OrbitCamera) -> tuple[Face, ...]:
-    """The one to three sides that face the eye, without perspective."""
+    """Return the one to three sides that face the eye, without perspective."""
     to_screen = view.rotation @ frame_of(view.up).T
     faces = []
     for name, normal in FACES.items():
@@ -216,7 +225,7 @@ def visible_faces(view: OrbitCamera) -> tuple[Face, ...]:
 
 
 def face_at(faces: Sequence[Face], point: tuple[float, float]) -> str:
-    """The name of the face at a place in the cube's own units; "" beside the cube."""
+    """Return the name of the face at a place in the cube's own units; "" beside the cube."""
     for face in faces:
         edges = np.roll(face.corners, -1, 0) - face.corners
         to_point = np.asarray(point) - face.corners
@@ -227,9 +236,10 @@ def face_at(faces: Sequence[Face], point: tuple[float, float]) -> str:
 
 
 def facing(view: OrbitCamera, name: str) -> OrbitCamera:
-    """The view that sees the face `name` from straight ahead, around the same target at the same distance.
+    """Return the view that sees the face `name` from straight ahead.
 
-    The world's up is up; from above and below the axis that is nearest to the image's up now.
+    It turns around the same target at the same distance. The world's up is up; from above and below the axis
+    that is nearest to the image's up now.
     """
     frame = frame_of(view.up)
     normal = np.array(FACES[name], float) @ frame

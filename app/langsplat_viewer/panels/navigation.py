@@ -37,7 +37,7 @@ FOCUS_FRAMES = 3, 8  # least and most that a box has to take the keyboard; the o
 
 
 def _keys() -> dict[int, imgui.Key]:
-    """glfw's keys as imgui's; those that imgui does not know are left out."""
+    """Return GLFW's keys as imgui's; those that imgui does not know are left out."""
     found = {}
     for name in dir(glfw):
         if name.startswith("KEY_"):
@@ -89,9 +89,11 @@ class Keyboard:
         self.add(Event(_as_printed(key, scancode), action == glfw.PRESS, held))
 
     def typed(self, window: Any, character: int) -> None:
+        """Take a character."""
         self.add(Event(character=character))
 
     def add(self, event: Event) -> None:
+        """Queue an event."""
         self._events.append(event)
 
     def feed(self) -> None:
@@ -120,7 +122,7 @@ class Keyboard:
 
 
 def _as_printed(key: int, scancode: int) -> imgui.Key | None:
-    """The key by what is printed on it, where that is a letter or a digit: Ctrl + Z is Z on every layout."""
+    """Return a key by the letter or digit printed on it, where it has one: Ctrl + Z is Z on every layout."""
     name = "" if glfw.KEY_KP_0 <= key <= glfw.KEY_KP_EQUAL else glfw.get_key_name(key, scancode) or ""
     name = name.decode() if isinstance(name, bytes) else name
     if len(name) == 1 and name.isascii() and name.isalnum():
@@ -231,7 +233,7 @@ def handle(viewer: Viewer, area: ui.Area) -> None:
 
 
 def _pixel(area: ui.Area) -> tuple[int, int] | None:
-    """The mouse's place in the scene's area, pixels; None where a panel has it or a button is held."""
+    """Return the mouse's place in the scene's area, pixels; None where a panel has it or a button is held."""
     io = imgui.get_io()
     if io.want_capture_mouse or any(imgui.is_mouse_down(button) for button in range(3)):
         return None
@@ -241,7 +243,7 @@ def _pixel(area: ui.Area) -> tuple[int, int] | None:
 
 
 def _mouse(viewer: Viewer, area: ui.Area) -> None:
-    """The left button turns; while a tool has it, the middle one does."""
+    """Turn by the left button; while a tool has it, by the middle one."""
     io = imgui.get_io()
     free = viewer.state.tools.tool is None
     turns = 0 if free else 2
@@ -262,8 +264,11 @@ def _mouse(viewer: Viewer, area: ui.Area) -> None:
 
 
 def _held(button: int) -> bool:
-    """Return whether a button drags. Where frames are slow, the way to the place of the click and the click
-    itself fall into one frame; that way was no drag."""
+    """Return whether a button drags.
+
+    Where frames are slow, the way to the place of the click and the click itself fall into one frame; that
+    way was no drag.
+    """
     return imgui.is_mouse_down(button) and not imgui.is_mouse_clicked(button)
 
 
@@ -278,8 +283,8 @@ def _fly(viewer: Viewer) -> None:
     seconds = min(io.delta_time, LONGEST_FRAME)
     right, up, ahead = held(key.d, key.a), held(key.e, key.q), held(key.w, key.s)
     if right or up or ahead:
-        pace = 4.0 if io.key_shift else 0.25 if io.key_alt else 1.0
-        step = pace * viewer.state.preferences.fly_speed * extent.radius * seconds
+        factor = 4.0 if io.key_shift else 0.25 if io.key_alt else 1.0
+        step = factor * viewer.state.preferences.fly_speed * extent.radius * seconds
         go = controls.walk if viewer.state.preferences.walks else controls.fly
         viewpoint.move(viewer, lambda view: go(view, right * step, up * step, ahead * step))
     turn = held(key.right_bracket, key.left_bracket)

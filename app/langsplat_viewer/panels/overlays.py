@@ -16,7 +16,7 @@ from langsplat_core.scene import LEVELS, Camera
 from langsplat_viewer.actions import opening, projects, settings, viewpoint
 from langsplat_viewer.camera import overlays
 from langsplat_viewer.camera.controls import OrbitCamera
-from langsplat_viewer.camera.overlays import Face, Label, face_at, placed, visible_faces, world_axes
+from langsplat_viewer.camera.overlays import Face, PlacedText, face_at, placed, visible_faces, world_axes
 from langsplat_viewer.files.disk import corners
 from langsplat_viewer.panels import ui
 from langsplat_viewer.state import Hover
@@ -28,7 +28,7 @@ UNMOVED = ui.OVER | ui.FIXED | imgui.WindowFlags_.no_background | imgui.WindowFl
 
 
 def draw_pictures(viewer: Viewer, area: ui.Area, textures: tuple[moderngl.Texture, ...]) -> None:
-    """The textures of `Canvas.textures` where they belong, each with its name if there are several."""
+    """Draw the textures of `Canvas.textures` where they belong, each with its name if there are several."""
     split = viewer.state.session.split
     if split.mode in ("wipe", "scenes") and len(textures) > 1:
         _image(area, textures[0], 0.0, split.at)
@@ -125,6 +125,7 @@ EVIDENCE_EM = 50.0, 34.0  # size of the window at first
 
 
 def draw_evidence(viewer: Viewer, picture: ui.Picture) -> None:
+    """Draw the sheet of photographs and masks that an answer stands on, in a window of its own."""
     sheet, area = viewer.state.evidence, ui.scene_area()
     if sheet is None:
         return
@@ -262,7 +263,7 @@ def _cameras(viewer: Viewer, edges: Array, area: ui.Area, camera: Camera, least:
 
 
 def _things(viewer: Viewer, area: ui.Area, camera: Camera, least: float) -> None:
-    """A box around each thing that a query shown has found, and the phrase beside it."""
+    """Draw a box around each thing that a query shown has found, and the phrase beside it."""
     named: list[Named] = []
     for query in viewer.state.shown():
         if query is None or query.slot is None:
@@ -282,13 +283,16 @@ def _things(viewer: Viewer, area: ui.Area, camera: Camera, least: float) -> None
 
 
 def _names(named: list[Named], area: ui.Area) -> None:
-    """The phrases, above the highest corners of their boxes; a line leads to those that had to make room."""
+    """Write the phrases above the highest corners of their boxes.
+
+    A line leads to those that had to make room.
+    """
     line, edge, paint = imgui.get_text_line_height(), shade_edge(), imgui.get_background_draw_list()
     room = (area.width, area.height)
     wanted = []
     for name in named:
         (x, y), size = name.corner, imgui.calc_text_size(name.text)
-        wanted.append(Label(x + 4 - edge, y - 1.4 * line - edge, size.x + 2 * edge, size.y + 2 * edge))
+        wanted.append(PlacedText(x + 4 - edge, y - 1.4 * line - edge, size.x + 2 * edge, size.y + 2 * edge))
     found = placed(wanted, room)
     for name, alone, label in zip(named, wanted, found, strict=True):
         if abs(label.y - placed([alone], room)[0].y) > label.height / 2:
@@ -330,7 +334,7 @@ def _ruler(viewer: Viewer, area: ui.Area, camera: Camera, least: float, metres: 
 
 
 def _notes(viewer: Viewer, area: ui.Area, camera: Camera, least: float) -> None:
-    """The notes, at the places that they are pinned to."""
+    """Write the notes at the places that they are pinned to."""
     named, paint = [], imgui.get_background_draw_list()
     for note in viewer.state.session.notes:
         place = _place(camera, np.array(note.at), least)
@@ -407,8 +411,11 @@ def say(text: str, area: ui.Area, name: str = "said over the scene", top: float 
 
 
 def bar_colours(slot: int, strength: float, alone: bool, colour_map: ColourMap = "turbo") -> Array:
-    """(STEPS, 3) colours of a bar from its coldest to its hottest end, as the image has them: the colour
-    map for a query that is painted alone, else black to its own colour; what is half as strong ends there."""
+    """Return the (STEPS, 3) colours of a bar from its coldest to its hottest end, as the image has them.
+
+    That is the colour map for a query that is painted alone, else black to its own colour; what is half as
+    strong ends there.
+    """
     heat = np.linspace(0, strength, STEPS)
     if alone:
         return mapped(heat, colour_map)
@@ -461,8 +468,10 @@ def draw_pointing(viewer: Viewer) -> None:
 
 
 def said(words: LevelWords, sure: bool) -> str:
-    """ "teddy bear 64 %, toy 12 %": the most probable words of a place at one level, without percentages
-    where none are `sure`."""
+    """Return the most probable words of a place at one level, such as "teddy bear 64 %, toy 12 %".
+
+    Percentages are left out where none are `sure`.
+    """
     likely = [word for word in words.words if word.probability > UNSURE]
     named = [word.phrase + (f" {100 * word.probability:.0f} %" if sure else "") for word in likely]
     of_colour = "" if words.colour is None else f"{words.colour.phrase}: "
@@ -479,7 +488,8 @@ def pointed_figures(hover: Hover) -> list[str]:
     return [*lines, f"at {x:.2f}  {y:.2f}  {z:.2f}, {hover.found.depth:.2f} away"]
 
 
-# The view cube; a click on a face turns the view there.
+# The view cube; a click on a face turns the view there. ImGuizmo's takes y as up and names no side; its
+# documentation warns of a patent.
 
 SIDE_EM = 7.0  # of the corner that it takes
 EDGE = 0.24  # of that side, half the cube's edge: its corners reach 1.73 times as far
@@ -527,7 +537,7 @@ def _face(face: Face, middle: tuple[float, float], scale: float, hovered: bool) 
 
 
 def _axes(view: OrbitCamera, middle: tuple[float, float], scale: float, *, behind: bool) -> None:
-    """The world's own axes, from the middle of the cube; those that point away lie behind it."""
+    """Draw the world's own axes, from the middle of the cube; those that point away lie behind it."""
     paint = imgui.get_window_draw_list()
     for (name, colour), axis in zip(AXES, world_axes(view), strict=True):
         if (axis[2] > 0) == behind:

@@ -39,7 +39,7 @@ class Area:
     height: float
 
     def fraction(self, x: float, y: float) -> tuple[float, float]:
-        """A window position as fractions of the area; outside [0, 1] beyond its edges."""
+        """Return a window position as fractions of the area; outside [0, 1] beyond its edges."""
         return (x - self.left) / self.width, (y - self.top) / self.height
 
     @property
@@ -52,7 +52,7 @@ class Area:
         return ImVec2(self.left, self.top), ImVec2(self.left + self.width, self.top + self.height)
 
     def columns(self, count: int) -> list["Area"]:
-        """The area cut into columns of one width."""
+        """Return the area cut into columns of one width."""
         width = self.width / count
         return [Area(self.left + place * width, self.top, width, self.height) for place in range(count)]
 
@@ -105,14 +105,17 @@ def _readable(on_dark: tuple[float, float, float], on_light: tuple[float, float,
 
 
 def good() -> ImVec4:
+    """Return the colour of what is found."""
     return _readable((0.47, 0.80, 0.52), (0.05, 0.45, 0.15))
 
 
 def bad() -> ImVec4:
+    """Return the colour of errors."""
     return _readable((0.95, 0.58, 0.45), (0.70, 0.15, 0.05))
 
 
 def muted() -> ImVec4:
+    """Return the colour of what matters less."""
     return _readable((0.62, 0.64, 0.67), (0.35, 0.36, 0.40))
 
 
@@ -130,8 +133,10 @@ def tip(text: str) -> None:
 
 
 def stoppable(label: str, fraction: float, tag: str = "") -> bool:
-    """A bar in the accent's colour, with a button beside it; whether that was clicked. `tag` tells the button
-    from others of its name."""
+    """Draw a bar in the accent's colour, with a button beside it; return whether that was clicked.
+
+    `tag` tells the button from others of its name.
+    """
     width = beside_button("Cancel")
     if width_of(label) > imgui.get_content_region_avail().x + width:  # no room for it in the bar
         imgui.text_wrapped(label)
@@ -144,10 +149,12 @@ def stoppable(label: str, fraction: float, tag: str = "") -> bool:
 
 
 def width_of(text: str) -> float:
+    """Return the width of a text, window units."""
     return float(imgui.calc_text_size(text).x)
 
 
 def button_width(label: str) -> float:
+    """Return the width of a button, window units."""
     return width_of(label.partition("##")[0]) + 2 * imgui.get_style().frame_padding.x
 
 
@@ -164,7 +171,7 @@ def beside(label: str, more: float = 0.0) -> None:
 
 
 def button(label: str, about: str = "", *, enabled: bool = True) -> bool:
-    """Draw a button with a tip, that can be clicked where it is `enabled`; whether it was."""
+    """Draw a button with a tip, that can be clicked where it is `enabled`; return whether it was."""
     imgui.begin_disabled(not enabled)
     clicked = bool(imgui.button(label))
     imgui.end_disabled()
@@ -174,12 +181,16 @@ def button(label: str, about: str = "", *, enabled: bool = True) -> bool:
 
 
 def next_button(label: str, about: str = "", *, enabled: bool = True) -> bool:
+    """Draw a button in the last row, where there is room; return whether it was clicked."""
     beside(label)
     return button(label, about, enabled=enabled)
 
 
 def box(label: str, hint: str, text: str, width: float = -1.0) -> tuple[bool, str]:
-    """A text box, as wide as the row unless a `width` is given; whether Enter was pressed, and the text."""
+    """Draw a text box; return whether Enter was pressed, and the text.
+
+    It is as wide as the row unless a `width` is given.
+    """
     imgui.set_next_item_width(width)
     flags = imgui.InputTextFlags_.enter_returns_true
     entered, typed = imgui.input_text_with_hint(label, hint, text, flags)
@@ -243,7 +254,7 @@ def draw_fields(holder: Any, panel: str) -> dict[str, object]:
 
 
 def radio(choices: Mapping[T, str], chosen: T, tips: Mapping[T, str] | None = None) -> T:
-    """Draw a radio button with its label for each of the `choices`; the one that is chosen now."""
+    """Draw a radio button with its label for each of the `choices`; return the one that is chosen now."""
     for place, (value, label) in enumerate(choices.items()):
         if place:
             beside_boxed(label)
@@ -263,7 +274,7 @@ def slider(
     logarithmic: bool = False,
     ems: float = 11.0,
 ) -> float:
-    """Draw a slider, `ems` wide where there is room; the value that it has now."""
+    """Draw a slider, `ems` wide where there is room; return the value that it has now."""
     leave_room(label, ems)
     flags = imgui.SliderFlags_.always_clamp
     if logarithmic:
@@ -273,7 +284,10 @@ def slider(
 
 
 def row(text: str, tag: str, chosen: bool, *, can_go: bool = True, about: str = "") -> tuple[bool, bool]:
-    """Draw a row of a list and a button that takes it off; whether each was clicked. about: its tip."""
+    """Draw a row of a list, and a button that takes it off; return whether each was clicked.
+
+    about: its tip.
+    """
     side, right = imgui.get_frame_height(), imgui.get_content_region_avail().x
     room = right - side - imgui.get_style().item_spacing.x
     imgui.align_text_to_frame_padding()
@@ -297,7 +311,7 @@ class Picture:
         self._texture: moderngl.Texture | None = None
 
     def texture(self, image: Array) -> moderngl.Texture:
-        """The texture of an (H, W, 3) uint8 image, row 0 on top."""
+        """Return the texture of an (H, W, 3) uint8 image, row 0 on top."""
         if self._texture is None or self._image is not image:
             if self._texture is not None:
                 self._texture.release()
@@ -317,20 +331,20 @@ def beside_boxed(label: str) -> None:
 
 
 def leave_room(label: str, ems: float) -> None:
-    """The next widget is `ems` wide, or what is left of the row beside its label."""
+    """Make the next widget `ems` wide, or what is left of the row beside its label."""
     label_width = width_of(label) + imgui.get_style().item_inner_spacing.x
     room = imgui.get_content_region_avail().x - label_width
     imgui.set_next_item_width(max(min(hello_imgui.em_size(ems), room), hello_imgui.em_size(2)))
 
 
 def fitting(width_em: float, height_em: float) -> ImVec2:
-    """A size for what lies over the scene, in widths of an m, as far as the window has room for it."""
+    """Return a size for what lies over the scene, in widths of an m, as far as the window has room for it."""
     size, room = hello_imgui.em_to_vec2(width_em, height_em), imgui.get_main_viewport().work_size
     return ImVec2(min(size.x, MOST_OVER * room.x), min(size.y, MOST_OVER * room.y))
 
 
 def elided(text: str, room: float, width_of: Callable[[str], float] = width_of) -> str:
-    """`text` in one line, cut with "..." where it is wider than `room`."""
+    """Return `text` in one line, cut with "..." where it is wider than `room`."""
     text = " ".join(text.splitlines())
     if width_of(text) <= room:
         return text
@@ -351,16 +365,10 @@ FOLDERS = {
 }
 # Fonts with the scripts of East Asia and others with many, the first that is there is taken.
 WIDE = (
-    *("NotoSansCJK-Regular.ttc", "NotoSansCJK-VF.ttc", "NotoSansCJKjp-Regular.otf", "SourceHanSans.ttc"),
-    *(
-        "DroidSansFallbackFull.ttf",
-        "DroidSansFallback.ttf",
-        "wqy-microhei.ttc",
-        "wqy-zenhei.ttc",
-        "unifont.ttf",
-    ),
-    *("Arial Unicode.ttf", "PingFang.ttc", "Hiragino Sans GB.ttc", "msyh.ttc", "YuGothM.ttc", "malgun.ttf"),
-)
+    "NotoSansCJK-Regular.ttc", "NotoSansCJK-VF.ttc", "NotoSansCJKjp-Regular.otf", "SourceHanSans.ttc",
+    "DroidSansFallbackFull.ttf", "DroidSansFallback.ttf", "wqy-microhei.ttc", "wqy-zenhei.ttc", "unifont.ttf",
+    "Arial Unicode.ttf", "PingFang.ttc", "Hiragino Sans GB.ttc", "msyh.ttc", "YuGothM.ttc", "malgun.ttf",
+)  # fmt: skip
 BUNDLED = {  # package -> its file; pictographs, and letters: Latin, Greek, Cyrillic, Hebrew, Arabic, more
     "matplotlib": "mpl-data/fonts/ttf/DejaVuSans.ttf",
     "imgui_bundle": "demos_assets/fonts/NotoEmoji-Regular.ttf",
@@ -368,8 +376,10 @@ BUNDLED = {  # package -> its file; pictographs, and letters: Latin, Greek, Cyri
 
 
 def load_fonts() -> None:
-    """The callback of hello_imgui: its default font, with what else there is merged into it. Letters are
-    drawn into the texture when they first appear, so that a large font costs nothing until then."""
+    """Load hello_imgui's default font, with what else there is merged into it; a callback.
+
+    Letters are drawn into the texture when they first appear, so that a large font costs nothing until then.
+    """
     hello_imgui.imgui_default_settings.load_default_font_with_font_awesome_icons()
     merged = hello_imgui.FontLoadingParams()
     merged.merge_to_last_font, merged.inside_assets = True, False
@@ -378,22 +388,13 @@ def load_fonts() -> None:
 
 
 def fallbacks() -> list[Path]:
-    """Font files to look letters up in, in this order."""
-    found = (*(_bundled(package, file) for package, file in BUNDLED.items()), _installed())
-    return [path for path in found if path is not None]
-
-
-def _bundled(package: str, file: str) -> Path | None:
-    spec = find_spec(package)
-    if spec is None or spec.origin is None:
-        return None
-    path = Path(spec.origin).parent / file
-    return path if path.is_file() else None
-
-
-def _installed() -> Path | None:
-    files: dict[str, Path] = {}
-    for folder in FOLDERS.get(sys.platform, ()):
-        for path in Path(folder).expanduser().rglob("*.[to]t[fc]"):
-            files.setdefault(path.name, path)
-    return next((files[name] for name in WIDE if name in files), None)
+    """Return font files to look letters up in, in this order."""
+    specs = ((find_spec(package), file) for package, file in BUNDLED.items())
+    found = [Path(spec.origin).parent / file for spec, file in specs if spec is not None and spec.origin]
+    folders = (Path(folder).expanduser() for folder in FOLDERS.get(sys.platform, ()))
+    installed = {path.name: path for folder in folders for path in folder.rglob("*.[to]t[fc]")}
+    return [
+        path
+        for path in (*found, *[installed[name] for name in WIDE if name in installed][:1])
+        if path.is_file()
+    ]

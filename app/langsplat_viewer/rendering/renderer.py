@@ -254,7 +254,7 @@ class UploadedLayers:
     """
 
     def __init__(self, ctx: moderngl.Context, rasterizer: Rasterizer, uploads: bool | None = None) -> None:
-        """`uploads` None: as the driver suits."""
+        """Take `uploads` None as what suits the driver."""
         self.rasterizer = rasterizer
         self._ctx, self._uploads = ctx, not is_software(ctx) if uploads is None else uploads
         self._textures: dict[tuple[int, int], moderngl.Texture] = {}  # by place and number of components
