@@ -11,7 +11,7 @@ five programs, 0.8 to 1.4 % of the Gaussians are in regions that 1.25 extents le
 its centre lies before the surface that is seen through it (the median depth). Veils are found
 first and are no part of regions, which they would bridge.
 
-**Visibility.** What contributes the least to any view (`compact.contributions`) goes first, as many as the
+**Visibility.** What contributes the least to any view (`views.contributions`) goes first, as many as the
 loss, measured on other views, allows.
 """
 
@@ -23,14 +23,12 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from langsplat_core.arrays import Array, rotation_matrices
-from langsplat_core.compaction.compact import (
+from langsplat_core.compaction.views import (
     MeasuringView,
     Views,
-    check_likeness,
     choose_views,
     contributions,
     mean_psnr,
-    measuring_views,
     psnr_losses,
 )
 from langsplat_core.config import CleanConfig, check_settings
@@ -42,15 +40,10 @@ from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_core.scene.gaussians import along_curve
 from langsplat_core.scene.surface import Surface, build_surface
 
-# From the least suspicious to the most; chosen in rooms 201 to 203 of `python -m tests.benchmarks clean`.
+# From the least suspicious to the most; `python -m tests.benchmarks clean` measures them.
 TOUCH = (1.1, 1.25, 1.5)  # a region that touches no other even if so many extents are bridged
-USUAL = 0.45  # median gap to the nearest in trained scenes, at most; sparser ones get as much larger a TOUCH
 AHEAD = (0.4, 0.55, 0.7)  # share of the views of a place in which it lies in free space
-FAINTEST = 0.02  # opacity of what belongs to a region; what is fainter is judged by free space alone
-BEFORE = 0.05  # of the surface's depth: what is nearer to it lies on it
-VIEWS = 2  # fewer views of free space tell nothing
-GROUPS = 12  # of the floaters, tried one after the other
-RESOLUTION = 96  # groups are halved down to this fraction of the floaters
+USUAL = 0.45  # median gap to the nearest in trained scenes, at most; sparser ones get as much larger a TOUCH
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +57,10 @@ class Floaters:
 def find_floaters(
     scene: Scene, cameras: tuple[Camera, ...], largest: int, progress: Progress = silent
 ) -> Floaters:
-    """Return the floaters of `scene`, seen from `cameras`; `largest`: Gaussians of a region that may be one.
-    The largest region of all is never one."""
+    """Return the floaters of `scene`, seen from `cameras`.
+
+    largest: Gaussians of a region that may be one; the largest region of all is never one.
+    """
     gaussians = scene.gaussians
     suspicion = np.zeros(len(gaussians), np.int8)
     share = _free_space(scene, cameras, progress)
@@ -73,7 +68,7 @@ def find_floaters(
         suspicion[share >= least] = level
     rows = np.flatnonzero(suspicion == 0)  # a veil would bridge what lies before and behind it
     solid = gaussians.take(rows)
-    surface = build_surface(solid, FAINTEST)
+    surface = build_surface(solid, min_opacity=0.02)  # free space alone judges what is fainter
     gaps = _gaps(solid, surface)
     nearest = float(np.median(np.partition(gaps, 1, axis=1)[:, 1])) if gaps.shape[1] > 1 else USUAL
     region = np.zeros(len(gaussians), bool)
@@ -116,7 +111,7 @@ def _small_regions(surface: Surface, near: Array, largest: int) -> Array:
 
 def _free_space(scene: Scene, cameras: tuple[Camera, ...], progress: Progress) -> Array:
     """(N,) share of the views of each centre, hidden ones not counted, that see through it to a surface; 0
-    where fewer than `VIEWS` do."""
+    where only one does."""
     gaussians = scene.gaussians
     ahead, on = np.zeros(len(gaussians), int), np.zeros(len(gaussians), int)
     for index, camera in enumerate(cameras):
@@ -125,10 +120,10 @@ def _free_space(scene: Scene, cameras: tuple[Camera, ...], progress: Progress) -
         rows = np.flatnonzero(camera.in_image(pixels, z))
         column, row = pixels[rows].astype(int).T
         there, z = depths[row, column], z[rows]
-        ahead[rows] += (there > 0) & (z < (1 - BEFORE) * there)
-        on[rows] += (there > 0) & (np.abs(z - there) <= BEFORE * there)
+        ahead[rows] += (there > 0) & (z < 0.95 * there)  # what is nearer to the surface lies on it
+        on[rows] += (there > 0) & (np.abs(z - there) <= 0.05 * there)
         progress("finding floaters", (index + 1) / len(cameras))
-    share: Array = np.where(ahead >= VIEWS, ahead / np.maximum(ahead + on, 1), 0.0)
+    share: Array = np.where(ahead > 1, ahead / np.maximum(ahead + on, 1), 0.0)
     return share
 
 
@@ -159,13 +154,14 @@ class CleanReport:
 def clean(
     scene: Scene, views: Views, config: CleanConfig, progress: Progress = silent
 ) -> tuple[Array, CleanReport]:
-    """Return the rows (N,) bool of `scene` that stay, and the report. Raises InputError where nothing can be
-    drawn or the photographs show something else."""
+    """Return the rows (N,) bool of `scene` that stay, and the report.
+
+    Raises InputError where nothing can be drawn or the photographs show something else.
+    """
     valid = scene.gaussians.valid()
     if not valid.any():
         raise InputError("the scene holds nothing that can be drawn: there is nothing to clean")
-    measured = measuring_views(scene, views.measuring, views.photographs)
-    check_likeness(measured)
+    measured = views.measured(scene)
     found = find_floaters(scene, views.ranking, config.region, progress)
     cost = contributions(scene, views.ranking, progress)
     suspects = np.flatnonzero(found.suspicion)
@@ -174,8 +170,7 @@ def clean(
         _by_change(trial, suspects[np.argsort(cost[suspects], kind="stable")])
     else:
         _by_photographs(trial, suspects[np.lexsort((cost[suspects], -found.suspicion[suspects]))])
-    losses, keep = trial.losses(), trial.keep
-    keep &= valid
+    losses, keep = trial.losses(), trial.keep & valid
     gone = valid & ~keep
     report = CleanReport(
         gaussians=len(keep),
@@ -215,7 +210,7 @@ class _Trial:
 def _by_change(trial: _Trial, rising: Array) -> None:
     """Remove as many of `rising`, by rising contribution, as the budget allows: by bisection."""
     low, high = 0, len(rising) + 1
-    middle = len(rising)  # all of them, first
+    middle = len(rising)  # first all of them
     while middle > low:
         trial.keep[rising] = np.arange(len(rising)) >= middle
         if trial.losses().mean() <= trial.config.max_psnr_loss:
@@ -238,8 +233,9 @@ def _by_photographs(trial: _Trial, order: Array) -> None:
     """
     keep, budget = trial.keep, trial.config.max_psnr_loss
     losses, spent, done = np.zeros(len(trial.measured)), 0.0, 0
-    least = max(len(order) // RESOLUTION, 1)
-    waiting = [group for group in np.array_split(order, GROUPS) if len(group)][::-1]
+    resolution = 96  # groups are halved down to this fraction of the floaters
+    least = max(len(order) // resolution, 1)
+    waiting = [group for group in np.array_split(order, 12) if len(group)][::-1]
     while waiting:
         group = waiting.pop()
         keep[group] = False
@@ -256,7 +252,7 @@ def _by_photographs(trial: _Trial, order: Array) -> None:
         trial.progress("removing within the budget", done / len(order))
     rows = np.flatnonzero(~keep)
     rows = rows[np.argsort(along_curve(trial.scene.gaussians.means[rows]))]
-    gone = [group for group in np.array_split(rows, RESOLUTION) if len(group)]
+    gone = [group for group in np.array_split(rows, resolution) if len(group)]
     costs = np.zeros(len(gone))
     for index, group in enumerate(gone):
         keep[group] = True

@@ -11,7 +11,7 @@ from assets.making.dataset import photographed_room
 from assets.making.objects.furniture import TABLE_HEIGHT
 from langsplat_core.arrays import Array, logit, sigmoid
 from langsplat_core.compaction.clean import clean, find_floaters
-from langsplat_core.compaction.compact import Views, choose_views, mean_psnr, measuring_views
+from langsplat_core.compaction.views import Views, choose_views, mean_psnr
 from langsplat_core.config import CleanConfig
 from langsplat_core.extensions.benchmarks.measure import markdown
 from langsplat_core.extensions.geometry.mesh import fuse
@@ -264,6 +264,7 @@ def _clean_room(room: Room) -> Iterator[Cleaned]:
 
 def _judged(scene: Scene, judging: list[tuple[Any, ...]]) -> float:
     """Mean PSNR against photographs that had no say, dB."""
-    found = mean_psnr(scene, measuring_views(scene, *judging))
+    cameras, photographs = judging
+    found = mean_psnr(scene, Views((), cameras, photographs, "photographs").measured(scene))
     assert found is not None
     return found

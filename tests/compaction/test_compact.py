@@ -8,22 +8,20 @@ import pytest
 from langsplat_core.arrays import Array, psnr
 from langsplat_core.cli import run as command_line
 from langsplat_core.cli.edit import Compact
-from langsplat_core.compaction import compact
+from langsplat_core.compaction import compact, views
 from langsplat_core.compaction.clean import CleanReport, clean, find_floaters
-from langsplat_core.compaction.compact import (
+from langsplat_core.compaction.compact import Choice, compact_scene, find_reduction, smallest
+from langsplat_core.compaction.views import (
     ALONE,
     HOLD_OUT,
-    Choice,
+    MeasuringView,
     Views,
+    check_same_world,
     choose_views,
-    compact_scene,
     contributions,
     draw,
     estimated_loss,
-    measuring_views,
     psnr_losses,
-    select,
-    smallest,
 )
 from langsplat_core.config import CleanConfig, CompactConfig
 from langsplat_core.datasets import Capture
@@ -90,7 +88,7 @@ def test_loss_without_photographs_is_that_of_uncorrelated_errors(scene):
     """Photographs made as the picture plus noise of known strength: measured and derived loss agree."""
     view = scene.cameras[0].resized(256, 192)
     less, picture = scene.take(np.arange(N) % 9 > 0), draw(scene, view)
-    (plain,) = measuring_views(scene, [view], [None])
+    plain = MeasuringView(view, picture)
     noise = np.random.default_rng(0).normal(0, 10 ** (-30 / 20), picture.shape)
     measured = psnr_losses(less, [replace(plain, photograph=picture + noise)], 30.0)[0]
     derived = psnr_losses(less, [plain], 30.0)[0]
@@ -100,22 +98,21 @@ def test_loss_without_photographs_is_that_of_uncorrelated_errors(scene):
 
 
 def test_nothing_that_any_view_needs_is_dropped(scene):
-    views = choose_views(scene, None, CONFIG, silent)
-    measured = measuring_views(scene, views.measuring, views.photographs)
-    selection = select(scene, views, measured, CONFIG)
-    every = (*views.ranking, *views.measuring)
+    chosen = choose_views(scene, None, CONFIG, silent)
+    reduction = find_reduction(scene, chosen, chosen.measured(scene), CONFIG)
+    every = (*chosen.ranking, *chosen.measuring)
     score = contributions(scene, every)
     each = [contributions(scene, [view]) for view in every]
     np.testing.assert_array_equal(score, np.max(each, axis=0))
-    assert 0 < (~selection.keep).sum() < N
-    assert score[~selection.keep].max() <= selection.threshold
+    assert 0 < (~reduction.keep).sum() < N
+    assert score[~reduction.keep].max() <= reduction.threshold
 
 
-def test_views_that_measure_do_not_rank(scene):
-    views = choose_views(scene, None, CONFIG, silent)
-    assert len(views.measuring) == len(scene.cameras) // HOLD_OUT
-    assert len(views.ranking) + len(views.measuring) == len(scene.cameras)
-    assert not set(map(id, views.ranking)) & set(map(id, views.measuring))
+def test_measuring_views_do_not_rank(scene):
+    chosen = choose_views(scene, None, CONFIG, silent)
+    assert len(chosen.measuring) == len(scene.cameras) // HOLD_OUT
+    assert len(chosen.ranking) + len(chosen.measuring) == len(scene.cameras)
+    assert not set(map(id, chosen.ranking)) & set(map(id, chosen.measuring))
     thinned = choose_views(scene, None, replace(CONFIG, views=4), silent)
     assert (len(thinned.ranking), len(thinned.measuring)) == (2, 2)
 
@@ -132,8 +129,8 @@ def test_budget_companions_and_order_survive_the_file(scene, source, tmp_path):
     np.testing.assert_array_equal(small.language.latents, scene.language.latents[:, rows])
     np.testing.assert_array_equal(small.language.tree.leaves, scene.language.tree.leaves[rows])
     assert len(small.cameras) == len(scene.cameras)
-    held = choose_views(scene, None, CONFIG, silent).measuring
-    losses = psnr_losses(small, measuring_views(scene, held, [None] * len(held)), CONFIG.assumed_psnr)
+    measured = choose_views(scene, None, CONFIG, silent).measured(scene)
+    losses = psnr_losses(small, measured, CONFIG.assumed_psnr)
     assert losses.mean() == pytest.approx(report.loss)
     assert report.loss <= CONFIG.max_psnr_loss
     assert [answer.phrase for answer in report.answers] == ["red mug", "door"]
@@ -217,10 +214,10 @@ def test_bisection_finds_the_edge_and_weighs_degrees():
 
 def test_photographs_of_another_world_are_refused(scene):
     named = [replace(camera, name=f"v{i}") for i, camera in enumerate(scene.cameras)]
-    compact.check_same_world(named, named, "photos")
+    check_same_world(named, named, "photos")
     moved = [moving(np.array([0.2, 0, 0])).camera(camera) for camera in named]
     with pytest.raises(InputError, match="lie elsewhere"):
-        compact.check_same_world(named, moved, "photos")
+        check_same_world(named, moved, "photos")
 
 
 def test_photographs_held_out_from_training_measure(scene, source, tmp_path, monkeypatch):
@@ -230,7 +227,7 @@ def test_photographs_held_out_from_training_measure(scene, source, tmp_path, mon
     pictures = [draw(scene, camera) for camera in shot]
     noisy = [np.clip(255 * p + rng.normal(0, 12, p.shape), 0, 255).astype(np.uint8) for p in pictures]
     capture = Capture(tuple(shot), tuple(noisy), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-    monkeypatch.setattr(compact, "load_capture", lambda *_: capture)
+    monkeypatch.setattr(views, "load_capture", lambda *_: capture)
     save_scene(source, replace(scene, cameras=tuple(shot[2:])))
     report = compact_scene(source, tmp_path / "out.ply", CONFIG, photos=tmp_path)
     assert (report.ranking_views, report.measuring_views) == (12, 2)
@@ -239,7 +236,7 @@ def test_photographs_held_out_from_training_measure(scene, source, tmp_path, mon
     truth = [psnr(p, n.astype(np.float32) / 255) for p, n in zip(pictures[:2], noisy[:2], strict=True)]
     assert report.before.psnr == pytest.approx(np.mean(truth), abs=1e-3)
     strangers = replace(capture, images=tuple(255 - image for image in noisy))
-    monkeypatch.setattr(compact, "load_capture", lambda *_: strangers)
+    monkeypatch.setattr(views, "load_capture", lambda *_: strangers)
     with pytest.raises(InputError, match="something else"):
         compact_scene(source, tmp_path / "out.ply", CONFIG, photos=tmp_path)
 

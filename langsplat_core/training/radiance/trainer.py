@@ -8,9 +8,7 @@ checkpoint exactly where it stopped.
 import logging
 import math
 import signal
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,7 +20,7 @@ from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.config import INRIA, RadianceConfig, check_settings
 from langsplat_core.datasets.capture import Capture, shrunk_view
 from langsplat_core.errors import InputError
-from langsplat_core.interrupts import Terminated
+from langsplat_core.interrupts import Terminated, handled
 from langsplat_core.progress import Cancelled, Progress, silent
 from langsplat_core.scene import Camera, Gaussians
 from langsplat_core.training import one_torch_thread
@@ -195,7 +193,8 @@ def train_radiance(
 
     losses: list[float] = []  # since the last mean
     metrics: dict[str, float] = {}
-    with one_torch_thread(), _interrupts_between_steps() as raise_if_interrupted:
+    signals: list[int] = []  # held back while a step runs: half a step is no state to resume from
+    with one_torch_thread(), handled(lambda number, _: signals.append(number)):
         try:
             while state.step < config.steps:
                 losses.append(_step(run, state))
@@ -203,7 +202,8 @@ def train_radiance(
                 if state.step * 200 // config.steps > (state.step - 1) * 200 // config.steps:
                     metrics, losses = {"loss": float(np.mean(losses))}, []
                 progress(STAGE, state.step / config.steps, f"{len(state)} Gaussians", **metrics)
-                raise_if_interrupted()
+                if signals:
+                    raise Terminated if signal.SIGTERM in signals else KeyboardInterrupt
                 if checkpoint and (state.step % config.checkpoint_every == 0 or state.step == config.steps):
                     save_checkpoint(checkpoint, state, made_from)
         except (KeyboardInterrupt, Cancelled):
@@ -355,29 +355,3 @@ def _extent(capture: Capture, gaussians: Gaussians) -> float:
     centre = np.mean([camera.position for camera in capture.cameras], axis=0)
     distance = float(np.median(np.linalg.norm(gaussians.means - centre, axis=1)))
     return max(capture.extent(), 0.05 * distance)
-
-
-@contextmanager
-def _interrupts_between_steps() -> Iterator[Callable[[], None]]:
-    """Hold Ctrl-C and SIGTERM back while a step runs, because half a step is no state to resume from.
-
-    Yields a function that raises the KeyboardInterrupt or Terminated that came meanwhile. Other threads than
-    the main one never receive them and need no care. SIGTERM is left to whoever wants it otherwise: it is
-    held back only where it would raise.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield lambda: None
-        return
-    pending: list[int] = []
-    held = [signal.SIGINT, *([signal.SIGTERM] if callable(signal.getsignal(signal.SIGTERM)) else [])]
-    previous = {one: signal.signal(one, lambda number, _: pending.append(number)) for one in held}
-
-    def raise_if_interrupted() -> None:
-        if pending:
-            raise Terminated if signal.SIGTERM in pending else KeyboardInterrupt
-
-    try:
-        yield raise_if_interrupted
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler if handler is not None else signal.SIG_DFL)
