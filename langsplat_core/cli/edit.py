@@ -1,5 +1,7 @@
-"""`langsplat transform`, `crop`, `clean`, `compact` and `scale`: scenes edited by numbers; what belongs to
-them goes along."""
+"""`langsplat transform`, `crop`, `clean`, `compact` and `scale`: scenes edited by numbers.
+
+What belongs to them goes along.
+"""
 
 import math
 from dataclasses import asdict, dataclass, field, replace
@@ -51,8 +53,10 @@ Turn = tuple[Literal["x", "y", "z"], float]
 
 @dataclass(frozen=True)
 class Transform:
-    """Move, rotate and scale a whole scene, colours seen from the side, cameras and metres per unit
-    included. Steps are taken in this order: --matrix, --up, --rotate, --scale, --move."""
+    """Move, rotate and scale a whole scene, colours seen from the side, cameras and metres per unit included.
+
+    Steps are taken in this order: --matrix, --up, --rotate, --scale, --move.
+    """
 
     scene: AnyScene
     out: WrittenScene
@@ -88,8 +92,10 @@ class Transform:
 
 @dataclass(frozen=True)
 class Crop:
-    """Keep the Gaussians whose centres lie in all of the given boxes, spheres and half-spaces, with all that
-    belongs to them; or with --outside everything else. World units."""
+    """Keep the Gaussians whose centres lie in all of the given boxes, spheres and half-spaces.
+
+    What belongs to them goes along; with --outside everything else is kept. World units.
+    """
 
     scene: AnyScene
     out: WrittenScene
@@ -133,9 +139,11 @@ class Crop:
 
 @dataclass(frozen=True)
 class Clean:
-    """Remove floaters: small regions that touch nothing and veils in free space, as many as the allowed loss
-    of PSNR lets go, the least visible first. The loss is measured on photographs that the scene was not
-    trained on where --photos has some, else derived from how far its images change."""
+    """Remove floaters: small regions that touch nothing and veils in free space, the least visible first.
+
+    As many go as the allowed loss of PSNR lets go. It is measured on photographs that the scene was not
+    trained on where --photos has some, else derived from how far the scene's images change.
+    """
 
     scene: AnyScene
     out: WrittenScene
@@ -172,7 +180,7 @@ def _lines(report: "CleanReport") -> list[str]:
 
 
 def _extent(scene: Scene) -> str:
-    """The extent of a scene's Gaussians, in words."""
+    """Return the extent of a scene's Gaussians, in words."""
     means = scene.gaussians.means[np.isfinite(scene.gaussians.means).all(1)]
     if not len(means):
         return "the scene holds none that lies anywhere"
@@ -182,8 +190,10 @@ def _extent(scene: Scene) -> str:
 
 @dataclass(frozen=True)
 class Compact:
-    """Drop the Gaussians and colour harmonics that the views do not need, within an error budget. Nothing
-    is retrained; the language field, the cameras and extra properties are taken along."""
+    """Drop the Gaussians and colour harmonics that the views do not need, within an error budget.
+
+    Nothing is retrained; the language field, the cameras and extra properties are taken along.
+    """
 
     scene: AnyScene
     out: OutFile | None = None
@@ -246,8 +256,10 @@ def _notes(report: "CompactReport") -> list[str]:
 
 @dataclass(frozen=True)
 class SetScale:
-    """Say how long a scene's unit is, so that answers are in metres: by a known length in it, or by a
-    factor. Without either, print what the scene says. Only the header of the .ply is changed."""
+    """Say how long a scene's unit is, so that answers are in metres: by a known length in it, or by a factor.
+
+    Without either, print what the scene says. Only the header of the .ply is changed.
+    """
 
     scene: tyro.conf.Positional[Path]
     """The scene, *.ply."""
@@ -275,8 +287,10 @@ class SetScale:
 
 
 def metres_per_unit(metres: float, between: Box) -> float:
-    """Metres per unit of a length in metres between two points. InputError unless both lengths are
-    positive."""
+    """Return the metres per unit of a length in metres between two points.
+
+    Raises InputError unless both lengths are positive.
+    """
     units = math.dist(between[:3], between[3:])
     if not (0 < metres < math.inf and 0 < units < math.inf):
         raise InputError(

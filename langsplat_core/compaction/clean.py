@@ -1,5 +1,6 @@
-"""Scenes without floaters: Gaussians that hang in free space, found by three measures and removed within an
-error budget.
+"""Scenes without floaters: Gaussians that hang in free space.
+
+They are found by three measures and removed within an error budget.
 
 **Regions.** Two neighbours touch where the gap between their centres is no longer than `TOUCH` times the sum
 of their extents (one standard deviation) along it. What touches is one region; a region of few Gaussians
@@ -95,8 +96,10 @@ def _gaps(gaussians: Gaussians, surface: Surface) -> Array:
 
 
 def _small_regions(surface: Surface, near: Array, largest: int) -> Array:
-    """Rows of the Gaussians in regions of at most `largest`, but for the largest of all; near: (M, k) bool
-    which neighbours touch."""
+    """Rows of the Gaussians in regions of at most `largest`, but for the largest of all.
+
+    near: (M, k) bool, which neighbours touch.
+    """
     count, width = near.shape
     if count == 0:
         return surface.rows
@@ -110,8 +113,10 @@ def _small_regions(surface: Surface, near: Array, largest: int) -> Array:
 
 
 def _free_space(scene: Scene, cameras: tuple[Camera, ...], progress: Progress) -> Array:
-    """(N,) share of the views of each centre, hidden ones not counted, that see through it to a surface; 0
-    where only one does."""
+    """Return the (N,) share of the views of each centre that see through it to a surface.
+
+    Views in which it is hidden do not count; 0 where only one sees through it.
+    """
     gaussians = scene.gaussians
     ahead, on = np.zeros(len(gaussians), int), np.zeros(len(gaussians), int)
     for index, camera in enumerate(cameras):
@@ -265,7 +270,7 @@ def _by_photographs(trial: _Trial, order: Array) -> None:
 
 
 def _cost(added: Array) -> float:
-    """What (V,) dB added to the loss of the views take from the budget."""
+    """Return what (V,) dB added to the loss of the views take from the budget."""
     return max(float(added.mean() + added.std() / np.sqrt(len(added))), 0.0)
 
 

@@ -188,11 +188,10 @@ def find_reduction(
 def smallest(
     whole: Choice, loss_of: Callable[[Choice], float], budget: float, progress: Progress = silent
 ) -> Choice | None:
-    """Return the choice with the fewest numbers whose loss is within `budget` dB; None if even `whole`
-    exceeds it.
+    """Return the choice with the fewest numbers whose loss is within `budget` dB.
 
-    `loss_of` should not rise with the count; where it does, the answer is within the budget all the same,
-    only perhaps not the smallest.
+    None if even `whole` exceeds it. `loss_of` should not rise with the count; where it does, the answer is
+    within the budget all the same, only perhaps not the smallest.
     """
     best: Choice | None = None
     for degree in range(whole.sh_degree, -1, -1):

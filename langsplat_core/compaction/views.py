@@ -87,12 +87,11 @@ class Views:
 
 
 def choose_views(scene: Scene, photos: Path | None, config: BudgetConfig, progress: Progress) -> Views:
-    """Choose the cameras of the photographs, else of the scene, else some around it; at most
-    ``config.views``.
+    """Choose the cameras of the photographs, else of the scene, else some around it.
 
-    Photographs that the scene was not trained on, if there are any, all measure; otherwise every
-    `HOLD_OUT`-th view does. Raises InputError where fewer than two views are left or the photographs belong
-    to another world than the scene.
+    At most ``config.views``. Photographs that the scene was not trained on, if there are any, all measure;
+    otherwise every `HOLD_OUT`-th view does. Raises InputError where fewer than two views are left or the
+    photographs belong to another world than the scene.
     """
     check_settings(config)
     if photos is not None:
@@ -134,8 +133,7 @@ def _photographed(scene: Scene, photos: Path, config: BudgetConfig, progress: Pr
 
 
 def check_same_world(own: Sequence[Camera], photographed: Sequence[Camera], photos: Path) -> None:
-    """Raise InputError where cameras of one name stand elsewhere in the scene than in the photographs'
-    world."""
+    """Raise InputError where cameras of one name stand elsewhere in the scene and in the photographs."""
     places = {camera.name: camera.position for camera in own}
     pairs = [(places[c.name], c.position) for c in photographed if c.name in places]
     if not pairs:
@@ -159,8 +157,10 @@ def _thinned(items: Sequence[T], most: int) -> list[T]:
 
 
 def _divided(items: list[T]) -> tuple[list[T], list[T]]:
-    """Items that rank, and those that measure: every `HOLD_OUT`-th, but half of fewer than twelve, so that
-    the loss is not that of one or two."""
+    """Return the items that rank, and those that measure: every `HOLD_OUT`-th.
+
+    Half of fewer than twelve measure, so that the loss is not that of one or two.
+    """
     step = HOLD_OUT if len(items) >= 12 else 2
     measuring = items[step // 2 :: step]
     return [item for i, item in enumerate(items) if i % step != step // 2], measuring

@@ -39,7 +39,7 @@ class Vocabulary:
 
 
 def everyday_vocabulary(encoder: PhraseEncoder, phrases: tuple[str, ...] = ()) -> Vocabulary:
-    """The vocabulary of `phrases` and everyday ones in the vectors of `encoder`."""
+    """Return the vocabulary of `phrases` and everyday ones in the vectors of `encoder`."""
     texts = list(dict.fromkeys([*phrases, *everyday_phrases(encoder.unknown_words)]))
     canonical = encoder.encode_texts(list(CANONICAL_PHRASES))
     scale = Scale(canonical, everyday_vectors(encoder), encoder.temperature)
@@ -47,8 +47,10 @@ def everyday_vocabulary(encoder: PhraseEncoder, phrases: tuple[str, ...] = ()) -
 
 
 def relevancy_error(made: Array, vectors: Array, vocabulary: Vocabulary) -> tuple[float, float]:
-    """Mean and 99 % quantile of the change of relevancy, over vectors and phrases, with (M, D) `made` in
-    place of (M, D) `vectors`, both float32 unit vectors; 0 where M = 0."""
+    """Return the mean and the 99 % quantile of the change of relevancy, over vectors and phrases.
+
+    With (M, D) `made` in place of (M, D) `vectors`, both float32 unit vectors; 0 where M = 0.
+    """
     if not len(vectors):
         return 0.0, 0.0
     errors = np.empty((len(vectors), len(vocabulary.phrases)), np.float32)
@@ -129,8 +131,10 @@ def networks(dim: int, latent_dim: int) -> tuple[nn.Sequential, nn.Sequential]:
 
 
 def _settle_statistics(encoder: nn.Sequential, data: torch.Tensor) -> None:
-    """Recompute batch statistics over the data with final weights: running averages lag behind them, and with
-    few vectors that lag is most of the reconstruction error."""
+    """Recompute batch statistics over the data with final weights.
+
+    Running averages lag behind them, and with few vectors that lag is most of the reconstruction error.
+    """
     for module in encoder:
         if isinstance(module, nn.BatchNorm1d):
             module.reset_running_stats()
@@ -195,7 +199,7 @@ def fit_codebook(
 
 
 def codebook_of(vectors: Array, usage: Array) -> CodebookCodec:
-    """The codebook of (K, D) float32 unit vectors that occur (K,) `usage` times, rounded to float16."""
+    """Return the codebook of (K, D) unit vectors, rounded to float16, that occur (K,) `usage` times."""
     codewords = rounded(vectors)
     return CodebookCodec(codewords, rounded(principal_colours(codewords, usage)))
 
@@ -207,7 +211,10 @@ def _smallest(
     budget: float,
     vocabulary: Vocabulary,
 ) -> Array:
-    """The smallest codebook within `budget`: sizes are doubled, then the last interval is halved twice."""
+    """Return the smallest codebook within `budget`.
+
+    Sizes are doubled, then the last interval is halved twice.
+    """
     size, smaller = min(64, most), None
     while True:
         codewords = grow(size, smaller)
@@ -263,8 +270,10 @@ def fit_codec(
 
 
 def fit_linear(vectors: Array, config: LinearConfig) -> LinearCodec:
-    """Fit the leading `config.latent_dim` right singular vectors: the best basis in the least-squares sense
-    (Eckart-Young)."""
+    """Fit the leading `config.latent_dim` right singular vectors.
+
+    They are the best basis in the least-squares sense (Eckart-Young).
+    """
     # Through the D x D Gram matrix: D is 512, M may be a million. float64 keeps its squared condition usable.
     wide = np.asarray(vectors, np.float64)
     _, axes = np.linalg.eigh(wide.T @ wide)
@@ -272,8 +281,10 @@ def fit_linear(vectors: Array, config: LinearConfig) -> LinearCodec:
 
 
 def exact_codec(vectors: Array, usage: Array, config: CodecConfig) -> Codec | None:
-    """The codec whose latents stand for just the (K, D) float32 unit vectors, which occur (K,) `usage` times;
-    None for a kind that only comes near to them."""
+    """Return the codec whose latents stand for just the (K, D) float32 unit vectors.
+
+    They occur (K,) `usage` times. None for a kind that only comes near to them.
+    """
     return EXACT[config.kind](vectors, usage) if config.kind in EXACT else None
 
 

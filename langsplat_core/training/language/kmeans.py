@@ -9,7 +9,10 @@ STEP = 8  # one in so many centres is added, or given up, at a time
 
 
 def nearest_centres(vectors: Array, centres: Array) -> tuple[Array, Array]:
-    """(M, D) and (K, D) float32 unit vectors -> (M,) int64 the nearest centre and (M,) float32 its cosine."""
+    """Return the (M,) int64 nearest centre of each vector, and its (M,) float32 cosine.
+
+    vectors: (M, D), centres: (K, D) float32 unit vectors.
+    """
     nearest, cosines = np.empty(len(vectors), np.int64), np.empty(len(vectors), np.float32)
     for start in range(0, len(vectors), CHUNK):
         part = slice(start, start + CHUNK)
@@ -51,8 +54,10 @@ def spherical_kmeans(
 
 
 def _without_spare(missed: Array, size: int) -> Array:
-    """(K,) bool: all but those missed least, where there are more than `size`; only one in `STEP` at a
-    time, because of two that are alike neither is missed."""
+    """(K,) bool: all but those missed least, where there are more than `size`.
+
+    Only one in `STEP` goes at a time, because of two that are alike neither is missed.
+    """
     spare = min(max(len(missed) - size, 0), 1 + len(missed) // STEP)
     kept = np.ones(len(missed), bool)
     kept[np.argsort(missed, kind="stable")[:spare]] = False
@@ -60,8 +65,10 @@ def _without_spare(missed: Array, size: int) -> Array:
 
 
 def _assigned(vectors: Array, centres: Array) -> tuple[Array, Array, Array]:
-    """(M,) nearest centre of every vector, (K,) vectors of every centre, and (K,) by how much the sum of
-    cosines would fall without that centre."""
+    """Return the nearest centre of each vector, and how many and how much each centre serves.
+
+    (M,) centres, (K,) vectors of every centre, and (K,) by how much the sum of cosines would fall without it.
+    """
     nearest = np.empty(len(vectors), np.int64)
     gain = np.zeros(len(vectors), np.float32)
     for start in range(0, len(vectors), CHUNK):

@@ -80,7 +80,7 @@ def lift_weights(weights: sparse.csr_matrix, vectors: Array, robust: bool) -> Li
 
 @partial(helper, fastmath={"reassoc", "contract", "nsz"})
 def _add_reweighted(total: Array, vector: Array, centre: Array, weight: float) -> None:
-    """total += weight / |vector - centre| vector, for unit vectors."""
+    """Add weight / |vector - centre| vector to `total`, for unit vectors."""
     cosine = np.float32(0)
     for k in range(total.shape[0]):
         cosine += vector[k] * centre[k]
@@ -95,10 +95,11 @@ def _add_reweighted(total: Array, vector: Array, centre: Array, weight: float) -
 def _weiszfeld(
     first: int, last: int, indptr: Array, indices: Array, data: Array, vectors: Array, centre: Array
 ) -> None:
-    """Improve rows [first, last) of `centre` (N, D) in place towards the weighted geometric median on the
-    unit sphere. Weiszfeld's iteration: reweight every vector by 1 / chordal distance and average again. The
-    floor on the distance keeps a centre that coincides with a vector finite; it is far below the noise of
-    CLIP."""
+    """Improve rows [first, last) of `centre` (N, D) towards the weighted geometric median on the sphere.
+
+    Weiszfeld's iteration: reweight every vector by 1 / chordal distance and average again. The floor on the
+    distance keeps a centre that coincides with a vector finite; it is far below the noise of CLIP.
+    """
     dim = vectors.shape[1]
     total = np.empty(dim, np.float32)
     for row in range(first, last):
@@ -184,10 +185,10 @@ def lift_by_gradient(
     config: LiftConfig,
     progress: Progress = silent,
 ) -> tuple[Array, Array]:
-    """Return (3, N, d) float32 unit latents, zero where unobserved, and (3, N) confidence as of
-    `lift_latents`.
+    """Return (3, N, d) float32 unit latents and (3, N) confidence, both as of `lift_latents`.
 
-    `config` says for how many steps, how fast, from where. Deterministic for a given seed on the CPU.
+    Latents are zero where unobserved. `config` says for how many steps, how fast, from where. Deterministic
+    for a given seed on the CPU.
     """
     start, confidence = lift_latents(rasterizer, gaussians, views, codec, progress)
     import torch  # seconds that other modes need not pay
@@ -229,16 +230,20 @@ def blended(x: Array) -> Array:
 
 
 def by_features(x: Array, by_y: Array) -> Array:
-    """Return the gradient by x from that by y = `blended` x; at zero the norm's own gradient counts as
-    zero."""
+    """Return the gradient by x from that by y = `blended` x.
+
+    At zero the norm's own gradient counts as zero.
+    """
     length = np.linalg.norm(x, axis=-1, keepdims=True)
     along = (x * by_y).sum(-1, keepdims=True) / np.maximum(length, 1e-30)
     return by_y / (length + 1e-9) - x * along / (length + 1e-9) ** 2
 
 
 def loss_and_gradient(view: LiftingView, target: _Target, y: Array) -> tuple[float, Array]:
-    """Return the masked L1 of one view, mean over levels, pixels and numbers, and its (3, N, d) gradient by
-    y."""
+    """Return the masked L1 of one view, and its (3, N, d) gradient by y.
+
+    The mean over levels, pixels and numbers.
+    """
     levels, count, d = y.shape
     image = view.splat(np.ascontiguousarray(np.moveaxis(y, 0, 1).reshape(count, levels * d)))[0]
     signs, losses = np.empty_like(image), np.empty(len(image))
@@ -259,8 +264,11 @@ def _compare(
     signs: Array,
     losses: Array,
 ) -> None:
-    """Rows [first, last) of an image: `share` with the sign of (image - latents of the labels), zero where
-    there is no label, and the sum of the absolute differences of each row."""
+    """Compare rows [first, last) of an image with the latents of its labels.
+
+    `signs`: `share` with the sign of (image - latents), zero where there is no label; `losses`: the sum of
+    the absolute differences of each row.
+    """
     levels, d = labels.shape[0], latents.shape[1]
     for row in range(first, last):
         total = 0.0

@@ -75,8 +75,10 @@ class MaskWeights:
         return [np.searchsorted(view["row"], firsts) for view in self.pairs]
 
     def block(self, number: int, groups: MaskGroups) -> sparse.csr_matrix:
-        """Return the (n, 3 G) float32 weights, in pixels, of a block's Gaussians in the G groups at each
-        level."""
+        """Return the (n, 3 G) float32 weights, in pixels, of a block's Gaussians.
+
+        In the G groups at each level, level after level.
+        """
         first, last = self.blocks[number]
         rows, columns, weights = [], [], []
         for pairs, edges, group in zip(self.pairs, self._edges, groups.of_mask, strict=True):
@@ -91,11 +93,9 @@ class MaskWeights:
         return sparse.coo_matrix(entries, shape).tocsr()  # which adds up what falls on one place
 
     def sums(self, sets: Array, size: int, counts: Sequence[int]) -> tuple[sparse.csr_matrix, Array]:
-        """Return the float32 pixels that each set of Gaussians paints of each mask, (size, masks of all
-        views).
+        """Return the float32 pixels that each set of Gaussians paints of each mask, and labels of masks.
 
-        The second is the int32 view and level of each mask as one number, 3 view + level.
-
+        (size, masks of all views), and the int32 view and level of each mask as one number, 3 view + level.
         sets: (N,) set of each Gaussian, -1 for those of none; counts: number of masks of each view.
         """
         views, labelling = [sparse.csr_matrix((size, 0))], [np.zeros(0, np.int32)]
@@ -244,8 +244,7 @@ SHOWN = 25.0  # pixels of a node from which a photograph shows it
 
 
 def count_votes(tree: Tree, mask_weights: MaskWeights, counts: Sequence[int]) -> Array:
-    """Return the (K, 2) uint16 numbers of photographs with a mask of just each node, and of those without
-    one.
+    """Return the (K, 2) uint16 numbers of photographs with a mask of just each node, and without one.
 
     Compared is what a view shows of the node; a photograph that hardly shows it has no vote. counts: number
     of masks of each view.

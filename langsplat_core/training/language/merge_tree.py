@@ -56,8 +56,10 @@ class MergeTree:
         return int(self.patches.max(initial=-1)) + 1
 
     def cut(self, cost: float) -> Array:
-        """Return the (P,) int32 number, from 0, of the largest node around each patch within which nothing
-        costs more than `cost`."""
+        """Return the (P,) int32 number, from 0, of the largest node around each patch up to a cost.
+
+        Nothing within the node costs more than `cost`.
+        """
         total = self.count + len(self.children)
         highest, owner = np.zeros(total), np.arange(total)
         for node, (children, own) in enumerate(zip(self.children, self.costs, strict=True), self.count):
@@ -98,7 +100,10 @@ def find_tree(
     eyes: Array,
     progress: Progress = silent,
 ) -> MergeTree:
-    """The tree of a scene. counts: number of masks of each view; eyes: (V, 3) positions of the cameras."""
+    """Return the tree of a scene.
+
+    counts: number of masks of each view; eyes: (V, 3) positions of the cameras.
+    """
     everywhere = np.full(len(gaussians), -1, np.int32)
     if len(surface.rows) == 0:
         return MergeTree(everywhere, np.zeros((0, 2), np.int32), np.zeros(0))
@@ -127,8 +132,10 @@ def find_tree(
 
 
 def link_disagreement(surface: Surface, mask_weights: MaskWeights, progress: Progress = silent) -> Array:
-    """(E,) share of views and levels in which the two ends of each link lie in two masks, in [0, 1]: of those
-    where both lie in one, weighted by the pixels of the fainter end, at most `ENOUGH`."""
+    """Return the (E,) share of views and levels in which the ends of each link lie in two masks.
+
+    In [0, 1], of those where both lie in one, weighted by the pixels of the fainter end, at most `ENOUGH`.
+    """
     first, second = surface.ends
     apart, seen = np.zeros(len(first), np.float32), np.zeros(len(first), np.float32)
     number = np.full(mask_weights.count, -1, np.int32)
@@ -172,8 +179,10 @@ def _compare(
 
 
 def link_concavity(surface: Surface, eyes: Array) -> Array:
-    """(E,) how far the normals at the ends of each link lean towards each other, in [0, 1]; 0 where the
-    surface is flat or bends away. eyes: (V, 3) of the cameras, which tell outside from inside."""
+    """Return how far the normals at the ends of each link lean towards each other, (E,) in [0, 1].
+
+    0 where the surface is flat or bends away. eyes: (V, 3) of the cameras, which tell outside from inside.
+    """
     normals = _normals(surface)
     away = surface.positions - eyes[cKDTree(eyes).query(surface.positions)[1]]
     normals[(normals * away).sum(1) > 0] *= -1
@@ -200,7 +209,10 @@ def _normals(surface: Surface) -> Array:
 
 
 def find_borders(of: Array, ends: tuple[Array, Array], disagreement: Array, concavity: Array) -> Borders:
-    """The borders of patches. of: (M,) patch of each end; (E,) values of each link."""
+    """Return the borders of patches.
+
+    of: (M,) patch of each end; ends, disagreement, concavity: (E,) of each link.
+    """
     a, b = of[ends[0]].astype(np.int64), of[ends[1]].astype(np.int64)
     between, size = a != b, int(of.max(initial=-1)) + 1
     keys = np.minimum(a, b)[between] * size + np.maximum(a, b)[between]
@@ -264,8 +276,10 @@ class _Merger:
 
 
 def merge(patches: Patches, progress: Progress = silent) -> tuple[Array, Array]:
-    """(K, 2) int32 nodes that are merged and (K,) float64 costs, in their order; see `MergeTree`. Of equal
-    costs the older nodes merge first."""
+    """Return the (K, 2) int32 nodes that are merged and the (K,) float64 costs, in their order.
+
+    See `MergeTree`. Of equal costs the older nodes merge first.
+    """
     nodes, count = _Merger(patches), len(patches.areas)
     waiting = [(nodes.cost(a, b), a, b) for a in range(count) for b in nodes.neighbours[a] if a < b]
     heapq.heapify(waiting)

@@ -12,10 +12,12 @@ LEAST = 30  # Gaussians of a node that has a say
 
 
 def contrasting_colours(field: LanguageField, tree: Tree, surface: Surface) -> Array | None:
-    """(K, 3) float32 in [0, 1]: colours of a codebook's words, the same for all levels and views. None where
-    nothing lies beside anything else. The axes are those along which the mean vectors of neighbouring nodes,
-    at all levels, differ the most. Along each, words are ranked, so that all of it is used: a node has as
-    much say in that as another, however large it is."""
+    """Return (K, 3) float32 colours in [0, 1] of a codebook's words, the same for all levels and views.
+
+    None where nothing lies beside anything else. The axes are those along which the mean vectors of
+    neighbouring nodes, at all levels, differ the most. Along each, words are ranked, so that all of it is
+    used: a node has as much say in that as another, however large it is.
+    """
     vectors = field.codec.decode(np.arange(field.codec.size, dtype=np.uint16)[:, None]).astype(np.float64)
     ends = np.stack([surface.rows[end] for end in surface.ends])
     differences, weights = [np.zeros((0, vectors.shape[1]))], np.zeros(len(vectors))

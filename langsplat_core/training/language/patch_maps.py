@@ -50,8 +50,11 @@ def _boxes(camera: Camera, gaussians: Gaussians, patches: Array, count: int) -> 
 
 
 def _share_channels(boxes: Array, shown: Array) -> tuple[Array, Array]:
-    """(P,) channel of each patch, -1 for those not shown, and (C, rows, columns) int32 the patch that each
-    cell of a channel belongs to. The largest boxes choose first."""
+    """Return the (P,) channel of each patch, -1 for those not shown, and what channels show.
+
+    (C, rows, columns) int32: the patch that each cell of a channel belongs to. The largest boxes choose
+    first.
+    """
     channel_of = np.full(len(boxes), -1)
     owners: list[Array] = []
     rows, columns = (int(boxes[:, side].max(initial=0)) for side in (3, 2))
@@ -69,8 +72,7 @@ def _share_channels(boxes: Array, shown: Array) -> tuple[Array, Array]:
 
 
 def nested_maps(drawn: Array, cuts: Sequence[Array], least: float) -> Array:
-    """Return label maps (3, H, W) int32, as of `masks.label_maps`, of the nodes that each cut makes of
-    patches.
+    """Return label maps (3, H, W) int32, as of `masks.label_maps`, of the nodes of patches.
 
     drawn: (H, W) int32 patches, -1 for none; cuts: of each level, the (P,) int32 node of each patch; least:
     share of the image below which a node is left out.

@@ -10,11 +10,11 @@ RIDGE = 0.1  # of the mean square of colours: pulls an exposure towards no chang
 
 
 def fit_exposure(pairs: Sequence[tuple[Tensor, Tensor]], ridge: float = RIDGE) -> Tensor:
-    """Return the (4, 3) affine change of colours, (r, g, b, 1) @ change, that takes images to their targets
-    with the least squared error.
+    """Return the (4, 3) affine change of colours that best takes images to their targets.
 
-    pairs: (..., 3) images and targets, at least one pair. ridge: a share of the mean square of colours, by
-    which the change is pulled to none.
+    With the least squared error; (r, g, b, 1) @ change are the new colours. pairs: (..., 3) images and
+    targets, at least one pair. ridge: a share of the mean square of colours, by which the change is pulled to
+    none.
     """
     device = pairs[0][0].device
     moments = torch.zeros((4, 4), dtype=torch.float64, device=device)
@@ -41,10 +41,10 @@ def no_exposures(views: int, device: torch.device) -> Tensor:
 
 
 def fit_exposures(pairs: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, float]:
-    """Return the (V, 4, 3) exposure of each view beyond what all views have in common, and by how much they
-    bring images nearer to their targets over all views, dB.
+    """Return the (V, 4, 3) exposure of each view beyond what all views have in common, and the gain.
 
-    pairs: (..., 3) image and target of each view.
+    The gain is by how much the exposures bring images nearer to their targets over all views, dB. pairs:
+    (..., 3) image and target of each view.
     """
     common = fit_exposure(pairs)
     pairs = [(with_exposure(image, common), target) for image, target in pairs]

@@ -21,7 +21,7 @@ _ONE = np.float32(1)
 
 
 def _window() -> list[float]:
-    """The 11 normalised taps of the one-dimensional window."""
+    """Return the 11 normalised taps of the one-dimensional window."""
     taps = [math.exp(-0.5 * (k / SIGMA) ** 2) for k in range(-RADIUS, RADIUS + 1)]
     return [tap / sum(taps) for tap in taps]
 
@@ -34,7 +34,7 @@ def _window() -> list[float]:
 
 @helper
 def _add_scaled(out: Array, tap: float, source: Array) -> None:
-    """out += tap * source. A loop over two plain rows is one the compiler vectorises."""
+    """Add tap * source to `out`: a loop over two plain rows is one the compiler vectorises."""
     for i in range(out.shape[0]):
         out[i] += tap * source[i]
 

@@ -90,8 +90,11 @@ def rehearse(
 
 
 def _held_out(cameras: Sequence[Camera]) -> list[list[int]]:
-    """Views that the rehearsals leave out, one rehearsal after the other: an eighth in each, so that it is
-    like the training itself, and three in all at least, since single ones differ by a decibel or two."""
+    """Return the views that the rehearsals leave out, one rehearsal after the other.
+
+    An eighth in each, so that it is like the training itself, and three in all at least, since single ones
+    differ by a decibel or two.
+    """
     views: list[list[int]] = []
     while sum(map(len, views)) < 3:
         more = chosen(cameras, 8, [index for taken in views for index in taken])
@@ -117,8 +120,10 @@ def checkpoints_of(checkpoint: Path) -> list[Path]:
 
 
 def supported(found: Sequence[Sequence[float]], budgets: Sequence[RadianceBudget]) -> RadianceBudget:
-    """Return the budget that rehearsals `found` best: a larger one only where it gains in every one of them;
-    the smallest where no view could be held out."""
+    """Return the budget that rehearsals `found` best.
+
+    A larger one only where it gains in every one of them; the smallest where no view could be held out.
+    """
     best = 0
     for index in range(1, len(found)):
         if _pays([more - less for more, less in zip(found[index], found[best], strict=False)]):
@@ -127,7 +132,7 @@ def supported(found: Sequence[Sequence[float]], budgets: Sequence[RadianceBudget
 
 
 def _pays(gains: Sequence[float]) -> bool:
-    """True where a larger budget pays that gained so much (dB) in rehearsals: one view alone tells little."""
+    """Return True where a larger budget pays that gained so much (dB): one view alone tells little."""
     return min(gains) > 0 and float(np.mean(gains)) >= LEAST_GAIN
 
 

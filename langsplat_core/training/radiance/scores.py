@@ -55,8 +55,10 @@ def evaluate_views(
 
 
 def _psnr_exposed(image: Tensor, target: Tensor, counted: Tensor) -> float | None:
-    """PSNR of an image whose halves, left and right, each have the exposure that fits the other best; None
-    where a half has no pixel that counts."""
+    """PSNR of an image whose halves, left and right, each have the exposure that fits the other best.
+
+    None where a half has no pixel that counts.
+    """
     left, right = counted.clone(), counted.clone()
     left[:, image.shape[1] // 2 :] = False
     right[:, : image.shape[1] // 2] = False

@@ -83,8 +83,11 @@ def find_depths(capture: Capture, indices: Sequence[int], progress: Progress = s
 
 
 def neighbouring_views(cameras: Sequence[Camera], known: Array) -> list[list[int]]:
-    """Return for each view the at most four views that it is best compared with: those that see the middle of
-    what it sees from about 12 degrees aside. Wider angles tell depth better and look less alike."""
+    """Return for each view the at most four views that it is best compared with.
+
+    Those that see the middle of what it sees from about 12 degrees aside: wider angles tell depth better and
+    look less alike.
+    """
     distance, positions = look_distance(cameras), np.stack([camera.position for camera in cameras])
     found = []
     for index, camera in enumerate(cameras):
@@ -114,8 +117,11 @@ def inverse_depths(camera: Camera, cameras: Sequence[Camera], known: Array) -> A
 
 
 def warp(camera: Camera, other: Camera) -> tuple[Array, Array]:
-    """Return the (3, 3) `turn` and (3,) `shift` by which a pixel (x, y) at depth 1/w lies in the `other` view
-    at (p[0] / p[2], p[1] / p[2]), p = turn @ (x, y, 1) + w shift."""
+    """Return the (3, 3) `turn` and (3,) `shift` that take pixels to another view.
+
+    A pixel (x, y) at depth 1/w lies in the `other` view at (p[0] / p[2], p[1] / p[2]), p = turn @ (x, y, 1) +
+    w shift.
+    """
     rotation = other.rotation @ camera.rotation.T
     matrix = np.array([[other.fx, 0, other.cx], [0, other.fy, other.cy], [0, 0, 1]])
     back = np.array(
@@ -127,8 +133,10 @@ def warp(camera: Camera, other: Camera) -> tuple[Array, Array]:
 def sweep(
     index: int, others: Sequence[int], cameras: Sequence[Camera], greys: Sequence[Array], known: Array
 ) -> tuple[Array, Array]:
-    """Return the (H, W) depths of view `index` by its neighbours `others`, and their scores; greys: (H, W)
-    float32 in [0, 1]."""
+    """Return the (H, W) depths of view `index` by its neighbours `others`, and their scores.
+
+    greys: (H, W) float32 in [0, 1].
+    """
     camera, grey = cameras[index], greys[index]
     planes = inverse_depths(camera, cameras, known)
     best = np.full((BEST, PLANES, *grey.shape), -1, np.float32)
@@ -145,8 +153,10 @@ def sweep(
 def score_planes(
     first: int, last: int, grey: Array, other: Array, turn: Array, shift: Array, planes: Array, best: Array
 ) -> None:
-    """Correlate windows of `grey` with those of `other` at planes [first, last); `best` (BEST, P, H, W) has
-    the highest scores of all neighbours so far, in descending order."""
+    """Correlate windows of `grey` with those of `other` at planes [first, last).
+
+    `best` (BEST, P, H, W) has the highest scores of all neighbours so far, in descending order.
+    """
     height, width = grey.shape
     warped = np.empty((height, width), np.float32)
     moments = np.empty((5, height, width), np.float32)  # sums of x, y, x^2, y^2, x y along rows of windows
@@ -263,11 +273,11 @@ def shared_depths(depth: Array) -> Array:
 
 
 def free_depths(camera: Camera, depth: Array, known: Array) -> Array:
-    """Return the (H, W) depths up to which space is free, by the surfaces of the (H, W) `depth`, NaN where it
-    is not known, and by the (N, 3) `known` points.
+    """Return the (H, W) depths up to which space is free.
 
-    What no other photograph confirms is mostly flat, or seen by this one alone: there nothing else tells haze
-    from a surface. It is not much nearer than the surfaces around it.
+    By the surfaces of the (H, W) `depth`, NaN where it is not known, and by the (N, 3) `known` points. What
+    no other photograph confirms is mostly flat, or seen by this one alone: there nothing else tells haze from
+    a surface. It is not much nearer than the surfaces around it.
     """
     told = np.where(np.isfinite(depth), depth, np.inf)
     _, pixels, depths = _in_view(camera, known)
@@ -292,8 +302,10 @@ def in_free_space(points: Array, maps: Sequence[DepthMap]) -> Array:
 
 
 def _in_view(camera: Camera, points: Array) -> tuple[Array, tuple[Array, Array], Array]:
-    """Indices of the (N, 3) points that lie in the image, the rows and columns of their pixels, and their
-    depths."""
+    """Return the numbers of the (N, 3) points that lie in the image, their pixels and their depths.
+
+    Pixels are rows and columns.
+    """
     pixels, depths = camera.project(points)
     there = np.flatnonzero(camera.in_image(pixels, depths))
     columns, rows = pixels[there].astype(int).T

@@ -81,8 +81,10 @@ class Schedule:
         return self.densify_from < step < self.densify_until and step % self.densify_every == 0
 
     def clears_free_space(self, step: int) -> bool:
-        """Return True where Gaussians that stand before known surfaces are removed after the step. The last
-        steps mend what a removal leaves."""
+        """Return True where Gaussians that stand before known surfaces are removed after the step.
+
+        The last steps mend what a removal leaves.
+        """
         return self.densify_from < step <= 0.9 * self.steps and step % self.densify_every == 0
 
     def prunes_large(self, step: int) -> bool:
@@ -139,8 +141,11 @@ def schedule_for(config: RadianceConfig, extent: float) -> Schedule:
 
 
 def for_few_views(config: RadianceConfig) -> RadianceConfig:
-    """Return `config` without resets of opacities, after which few photographs let what stands close before
-    each camera come back first. Their decay takes what no photograph needs."""
+    """Return `config` without resets of opacities, for few photographs.
+
+    After a reset these let what stands close before each camera come back first. A decay of opacities takes
+    what no photograph needs.
+    """
     return replace(config, opacity_reset_every=0, opacity_decay=max(config.opacity_decay, 0.01))
 
 
@@ -271,15 +276,18 @@ def _exposures(run: _Run, state: TrainingState) -> Tensor:
 
 
 def _transients_count_from(config: RadianceConfig) -> int:
-    """The step from which on what is transient no longer counts: a fifth of the run has to show what is."""
+    """Return the step from which on transients do not count: a fifth of the run has to show what is."""
     return max(round(config.steps / 5), 1)
 
 
 def _observe_transients(
     run: _Run, state: TrainingState, index: int, image: Tensor, target: Tensor, mask: Tensor | None
 ) -> None:
-    """Judge the patches of view `index`, of which this step renders `image`. Transients that explain too
-    little of the error, less than 24 % of its squares, are given up for the rest of the run."""
+    """Judge the patches of view `index`, of which this step renders `image`.
+
+    Transients that explain too little of the error, less than 24 % of its squares, are given up for the rest
+    of the run.
+    """
     transients = state.transients
     judged = state.step == _transients_count_from(run.config) and run.config.transients == "auto"
     if judged and transients.explained() < 0.24:
@@ -295,7 +303,7 @@ def _observe_transients(
 def _counted(
     run: _Run, state: TrainingState, index: int, mask: Tensor | None, size: tuple[int, int]
 ) -> Tensor | None:
-    """The (H, W) bool pixels of view `index` that count, of those of its `mask`; None: all of them."""
+    """Return the (H, W) bool pixels of view `index` that count, of those of its `mask`; None: all of them."""
     moving = state.transients.moving
     if not len(moving) or state.step < _transients_count_from(run.config) or not moving[index].any():
         return mask
@@ -304,8 +312,10 @@ def _counted(
 
 
 class _Views:
-    """Photographs and cameras of the training views, whole and at half size. On a GPU they are copied to it;
-    else they stay as they are, which for many is in files (`capture.Album`)."""
+    """Photographs and cameras of the training views, whole and at half size.
+
+    On a GPU they are copied to it; else they stay as they are, which for many is in files (`capture.Album`).
+    """
 
     def __init__(self, capture: Capture, indices: Sequence[int], device: torch.device) -> None:
         def kept(image: Array | None) -> Array | Tensor | None:
@@ -322,22 +332,21 @@ class _Views:
         return len(self._fine)
 
     def at(self, index: int, coarse: bool) -> tuple[Camera, Tensor, Tensor | None]:
-        """Return the camera, its (H, W, 3) float image in [0, 1], and the (H, W) bool mask of pixels that
-        count."""
+        """Return the camera, its (H, W, 3) float image in [0, 1], and the (H, W) bool mask of what counts."""
         camera, photograph, mask = (self._coarse if coarse else self._fine)[index]
         copy = photograph if isinstance(photograph, Tensor) else torch.tensor(photograph)
         return camera, copy.float().div_(255), None if mask is None else torch.as_tensor(mask)
 
 
 def _halved(camera: Camera, image: Array, mask: Array | None) -> tuple[Camera, Array, Array | None]:
-    """The view at half its size; one below 64 px as it is."""
+    """Return the view at half its size; one below 64 px as it is."""
     if min(camera.width, camera.height) < 64:
         return camera, image, mask
     return shrunk_view(camera, image, mask, (camera.width // 2, camera.height // 2))
 
 
 def _with_points(capture: Capture, depths: Sequence[DepthMap], config: RadianceConfig) -> Capture:
-    """The capture with points of the depths beside its own, as many as leave room for splitting."""
+    """Return the capture with points of the depths beside its own, as many as leave room for splitting."""
     found = [(np.zeros((0, 3)), np.zeros((0, 3), np.uint8)), *(one.points() for one in depths)]
     points, colours = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
     wanted = min(20_000, config.max_gaussians // 3)
@@ -350,8 +359,10 @@ def _with_points(capture: Capture, depths: Sequence[DepthMap], config: RadianceC
 
 
 def _extent(capture: Capture, gaussians: Gaussians) -> float:
-    """The cameras' extent; one camera, or cameras in one place, have none: a twentieth of their distance to
-    the Gaussians at least."""
+    """Return the cameras' extent, a twentieth of their distance to the Gaussians at least.
+
+    One camera, or cameras in one place, have no extent.
+    """
     centre = np.mean([camera.position for camera in capture.cameras], axis=0)
     distance = float(np.median(np.linalg.norm(gaussians.means - centre, axis=1)))
     return max(capture.extent(), 0.05 * distance)

@@ -46,8 +46,11 @@ class Transients:
     def observe(
         self, index: int, cameras: Sequence[Camera], rendered: Array, photographed: Array, depths: Array
     ) -> None:
-        """Judge the patches of view `index` by its mean colours, rendered and photographed, (GRID, GRID, 3),
-        NaN where masked, and the (GRID, GRID) depths rendered."""
+        """Judge the patches of view `index` anew.
+
+        By its mean colours, rendered and photographed, (GRID, GRID, 3), NaN where masked, and the (GRID,
+        GRID) depths rendered.
+        """
         found, before = colour_difference(rendered, photographed), self.differences[index]
         self.differences[index] = np.where(np.isnan(before), found, (before + found) / 2)
         self.depths[index] = depths
@@ -72,8 +75,10 @@ def no_transients(views: int) -> Transients:
 
 
 def colour_difference(rendered: Array, photographed: Array) -> Array:
-    """Return the (GRID, GRID, 3) colours rendered less those photographed, under the exposure that brings
-    most patches together."""
+    """Return the (GRID, GRID, 3) colours rendered less those photographed.
+
+    Under the exposure that brings most patches together.
+    """
     image, target = (torch.from_numpy(colours.reshape(-1, 3)) for colours in (rendered, photographed))
     fits = torch.isfinite(image).all(1)
     for _ in range(3):  # the 70 % of the patches that fit best tell the exposure
@@ -84,8 +89,11 @@ def colour_difference(rendered: Array, photographed: Array) -> Array:
 
 
 def count_agreeing(index: int, cameras: Sequence[Camera], depths: Array, alike: Array) -> Array:
-    """Return the (2, GRID, GRID) numbers of other views that see the surface which view `index` renders in a
-    patch and find it `alike` (V, GRID, GRID), and of those that see it."""
+    """Return how many other views see the surface in each patch of view `index`, and find it alike.
+
+    (2, GRID, GRID): the numbers of views that find it `alike` (V, GRID, GRID), and of those that see it where
+    view `index` renders it.
+    """
     grids = [camera.resized(GRID, GRID) for camera in cameras]  # a pixel for each patch
     points = grids[index].unproject(grids[index].pixel_centres(), depths[index]).reshape(-1, 3)
     known = np.flatnonzero(np.isfinite(points[:, 0]))
@@ -102,8 +110,10 @@ def count_agreeing(index: int, cameras: Sequence[Camera], depths: Array, alike: 
 
 
 def connected_patches(contradicts: Array, sizes: Array, sure: float) -> Array:
-    """Return the (GRID, GRID) bool patches that `contradicts` in connected pieces of 4 at least, one of them
-    of a size above `sure`, and those around them; of more than `MOST` of all patches those that differ most.
+    """Return the (GRID, GRID) bool patches that `contradicts` in connected pieces, and those around them.
+
+    Pieces have four patches at least, one of them of a size above `sure`. Of more than `MOST` of all patches
+    those remain that differ most.
     """
     pieces, _ = label(contradicts)
     numbers, counts = np.unique(pieces[contradicts], return_counts=True)
@@ -121,8 +131,10 @@ def patch_means(image: Tensor) -> Array:
 
 
 def rendered_depths(renderer: DifferentiableRenderer, values: dict[str, Tensor], camera: Camera) -> Array:
-    """Return the (GRID, GRID) mean depths of what a camera sees, NaN where little is; `values` as of
-    `TrainingState`."""
+    """Return the (GRID, GRID) mean depths of what a camera sees, NaN where little is.
+
+    values: as of `TrainingState`.
+    """
     small = camera.resized(64, max(1, round(64 * camera.height / camera.width)))
     z = camera.project(values["means"].detach().cpu().numpy())[1].clip(0).astype(np.float32)
     grey = torch.from_numpy(np.repeat((z[:, None, None] - 0.5) / C0, 3, axis=2)).to(values["means"].device)
