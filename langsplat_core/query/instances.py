@@ -147,12 +147,12 @@ def told_apart(surface: Surface, numbers: Array, wholes: Array | None, join: boo
     """Divide the Gaussians `numbers` (K,) of a surface into single things. wholes: (N,) voted wholes, see
     `Tree.voted`, which tell apart things that touch; join: what is of one whole is one, connected or not."""
     if wholes is None:
-        return surface.parts(numbers).each()
+        return surface.parts(numbers)
     owner = wholes[surface.rows[numbers]]
     found: list[Array] = []
     for whole in np.unique(owner):
         own = numbers[owner == whole]
-        found += [own] if join and whole != NO_NODE else surface.parts(own).each()
+        found += [own] if join and whole != NO_NODE else surface.parts(own)
     return found
 
 

@@ -164,7 +164,7 @@ def _verified(describer: Describer, claim: _Claim) -> InventoryEntry | None:
 def _solid(surface: Surface, areas: Array, rows: Array) -> list[Array]:
     """Return the connected parts of Gaussians `rows` (M,), the largest first, without splinters."""
     numbers = np.flatnonzero(np.isin(surface.rows, rows))
-    found = [surface.rows[part] for part in surface.parts(numbers).each()]
+    found = [surface.rows[part] for part in surface.parts(numbers)]
     parts = sorted(found, key=lambda part: -areas[part].sum())
     least = LEAST_SPOT * areas[parts[0]].sum() if parts else 0.0
     return [part for part in parts if len(part) >= LEAST_COUNT and areas[part].sum() >= least]

@@ -32,8 +32,10 @@ class Intrinsics:
         return Intrinsics(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
 
     def fitted(self, width: float, height: float) -> "Intrinsics":
-        """The same camera in a window that holds its whole image, centred, as large as it goes, with
-        square pixels kept square."""
+        """Return the same camera in a window that holds its whole image, centred, as large as it goes.
+
+        Square pixels are kept square.
+        """
         scale = min(width / self.width, height / self.height)
         cx = (self.cx - self.width / 2) * scale + width / 2
         cy = (self.cy - self.height / 2) * scale + height / 2
@@ -129,8 +131,7 @@ class Camera:
         return np.stack([x, y], -1) + 0.5
 
     def in_image(self, pixels: Array, depths: Array) -> Array:
-        """(N,) bool: which points, as `project` returns them, lie in front of the camera and inside its
-        image."""
+        """(N,) bool, which points, as `project` returns them, lie before the camera and inside its image."""
         with np.errstate(invalid="ignore"):
             inside: Array = (depths > 0) & ((pixels >= 0) & (pixels < (self.width, self.height))).all(1)
         return inside

@@ -68,8 +68,10 @@ class Codec(ABC):
 
     @abstractmethod
     def cosines(self, latents: Array, vectors: Array) -> Array:
-        """(M, d) latents of any length, (Q, D) unit vectors -> (M, Q) float32 cosines of the decoded latents
-        with the vectors. A blended latent is shorter than 1 but keeps its direction; zero gives zeros."""
+        """(M, d) latents of any length, (Q, D) unit vectors -> (M, Q) float32 cosines of both, decoded.
+
+        A blended latent is shorter than 1 but keeps its direction; zero gives zeros.
+        """
 
     @abstractmethod
     def tensors(self) -> dict[str, Array]:
@@ -105,8 +107,10 @@ class Codec(ABC):
         return latents, np.arange(len(latents))
 
     def directions(self, latents: Array) -> Array:
-        """(M, d) latents -> (M, c) float32 unit vectors whose cosines are those of what the latents mean, or
-        close to them; zero for a latent without a meaning."""
+        """(M, d) latents -> (M, c) float32 unit vectors; zero for a latent without a meaning.
+
+        Their cosines are those of the decoded latents, or close to them.
+        """
         return _directions(latents)[0]
 
     def distances(self, latents: Array, first: Array, second: Array) -> Array:
@@ -122,8 +126,10 @@ class Codec(ABC):
         return found
 
     def spread(self, latents: Array) -> float:
-        """The mean distance between two of (M, d) latents, M >= 1: 1 minus the squared length of their mean
-        direction."""
+        """Return the mean distance between two of (M, d) latents, M >= 1.
+
+        It is 1 minus the squared length of their mean direction.
+        """
         distinct, of = self.unique(latents)
         mean = np.bincount(of, minlength=len(distinct)) @ self.directions(distinct) / len(latents)
         return max(1 - float(mean @ mean), 0.0)
@@ -184,8 +190,10 @@ class LinearCodec(Codec):
 
 @dataclass(frozen=True, eq=False)
 class AutoencoderCodec(Codec):
-    """The scene-wise autoencoder of LangSplat (section 3.2 of the paper): linear layers with ReLU between
-    them, batch normalisation folded in; latents have length 1."""
+    """The scene-wise autoencoder of LangSplat (section 3.2 of the paper).
+
+    Linear layers with ReLU between them, batch normalisation folded in; latents have length 1.
+    """
 
     encoder: Layers
     decoder: Layers
@@ -360,8 +368,10 @@ class CodebookCodec(Codec):
 
 
 def principal_colours(vectors: Array, weights: Array) -> Array:
-    """(K, c) vectors of any meaning -> (K, 3) float32 colours in [0, 1]: their first three principal axes,
-    each stretched between its 2 % and 98 % quantiles; an axis that is missing or flat is grey.
+    """(K, c) vectors -> (K, 3) float32 colours in [0, 1], near ones for near vectors.
+
+    Their first three principal axes, each stretched between its 2 % and 98 % quantiles; an axis that is
+    missing or flat is grey.
 
     weights: (K,) >= 0, how often each occurs; the axes and quantiles are those of what occurs.
     """

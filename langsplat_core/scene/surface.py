@@ -1,5 +1,9 @@
-"""The surface that Gaussians lie on, as the nearest neighbours of each: to smooth over it, to walk along it,
-to divide it into patches, and these into the nodes of the scene's tree."""
+"""The surface that Gaussians lie on, as the nearest neighbours of each.
+
+Values are smoothed over it, what is connected is found along it, and it is divided into patches, the nodes of
+the scene's tree. Connected parts are found by an own breadth-first search: those of an answer are a few of
+all Gaussians, and cutting their graph out for `scipy.sparse.csgraph` takes ten times as long.
+"""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,21 +22,6 @@ NEIGHBOURS = 16
 FAINTEST = 1e-3  # weight of a Gaussian whose opacity is less, so that no mean divides by nothing
 SOME = 1 << 18  # Gaussians whose distances are held at a time: all of five million take gigabytes
 REACH = 4.0  # times the median distance of a Gaussian's neighbours: what is farther is another surface
-
-_OUTSIDE, _WAITING = -1, -2  # labels that are no part
-
-
-@dataclass(frozen=True, eq=False)
-class Parts:
-    """The C connected parts of some members of a surface, with the members part by part."""
-
-    order: Array  # (K,) int32 numbers on the surface
-    starts: Array  # (C,) int32 where each part begins in `order`
-    labels: Array  # (M,) int32 part of every Gaussian of the surface; -1 for those that are no members
-
-    def each(self) -> list[Array]:
-        """Return the numbers of every part, ascending."""
-        return [np.sort(part) for part in np.split(self.order, self.starts[1:])] if len(self.starts) else []
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,9 +43,9 @@ class Surface:
         return links.row[once].astype(np.int32), links.col[once].astype(np.int32)
 
     def smooth(self, values: Array, numbers: Array | None = None) -> Array:
-        """(N,) float32 values of all Gaussians -> (K,) float32 opacity-weighted means over the neighbourhoods
-        of `numbers` (K,), by default of all M.
+        """(N,) float32 values of all Gaussians -> (K,) float32 opacity-weighted means over neighbourhoods.
 
+        numbers: (K,) whose neighbourhoods, by default those of all M.
         The 3D counterpart of the mean filter that the paper applies to a relevancy map before it takes the
         peak (section 4.1, "implementation details"): one stray Gaussian decides nothing.
         """
@@ -66,25 +55,24 @@ class Surface:
         shared_workers().run(_smooth, len(chosen), *arguments)
         return smoothed
 
-    def parts(self, numbers: Array) -> Parts:
-        """Return the connected parts of the Gaussians `numbers` (K,), in [0, M), each once."""
-        labels = np.full(len(self.rows), _OUTSIDE, np.int32)
-        labels[numbers] = _WAITING
-        order, starts = np.empty(len(numbers), np.int32), np.empty(len(numbers), np.int32)
-        count, _ = _label(self.links.indptr, self.links.indices, numbers, labels, order, starts)
-        return Parts(order, starts[:count].copy(), labels)
+    def parts(self, numbers: Array) -> list[Array]:
+        """Return the numbers of each connected part of the Gaussians `numbers` (K,), in [0, M), ascending."""
+        inside = np.zeros(len(self.rows), bool)
+        inside[numbers] = True
+        order, starts = _search(self.links.indptr, self.links.indices, numbers, inside)
+        return [np.sort(part) for part in np.split(order, starts)]
 
     def connected(self, inside: Array, seed: int) -> Array:
         """(M,) bool, and a member of it -> numbers of all that are linked to that member through members."""
-        labels = np.where(inside, np.int32(_WAITING), np.int32(_OUTSIDE))
-        order, starts = np.empty(int(inside.sum()), np.int32), np.empty(1, np.int32)
-        _, count = _label(self.links.indptr, self.links.indices, np.array([seed]), labels, order, starts)
-        return order[:count]
+        order, _ = _search(self.links.indptr, self.links.indices, np.array([seed]), inside.copy())
+        return order
 
 
 def surface_weights(gaussians: Gaussians, min_opacity: float = 0.1) -> Array:
-    """(N,) float32 opacity of what the surface consists of, 0 for all others: valid Gaussians with at least
-    `min_opacity`, or all valid ones if none has."""
+    """(N,) float32 opacity of what the surface consists of, 0 for all others.
+
+    These are the valid Gaussians with at least `min_opacity`, or all valid ones if none has.
+    """
     valid = gaussians.valid()
     opacity = np.where(valid, sigmoid(gaussians.opacity_logits.astype(np.float64)), 0)
     counts = opacity >= min_opacity
@@ -121,9 +109,11 @@ def build_surface(gaussians: Gaussians, min_opacity: float = 0.1) -> Surface:
 
 
 def surface_areas(gaussians: Gaussians) -> Array:
-    """(N,) float64 area that each Gaussian covers, world units squared: opacity times its two longest axes
-    (one standard deviation each), 0 for invalid rows. What is larger than 99 % of them counts as that: a
-    veil of a few huge Gaussians is no surface."""
+    """(N,) float64 area that each Gaussian covers, world units squared, 0 for invalid rows.
+
+    Opacity times its two longest axes (one standard deviation each). What is larger than 99 % of them counts
+    as that: a veil of a few huge Gaussians is no surface.
+    """
     valid = gaussians.valid()
     scales = np.sort(np.where(valid[:, None], gaussians.log_scales, -np.inf).astype(np.float64), axis=1)
     opacity = sigmoid(np.where(valid, gaussians.opacity_logits, -np.inf).astype(np.float64))
@@ -162,19 +152,19 @@ def _smooth(
 
 
 @kernel
-def _label(
-    indptr: Array, indices: Array, seeds: Array, labels: Array, order: Array, starts: Array
-) -> tuple[int, int]:
-    """Return the number the parts that `seeds` are in, breadth first over what is `_WAITING` in `labels`.
+def _search(indptr: Array, indices: Array, seeds: Array, waiting: Array) -> tuple[Array, Array]:
+    """Collect the parts that `seeds` are in, breadth first over what is `waiting` (M,), which is unset.
 
-    How many parts there are, and Gaussians in them.
+    (K,) int32 numbers, part by part, and (C - 1,) where each part but the first begins.
     """
+    order, starts = np.empty(waiting.sum(), np.int32), np.empty(len(seeds), np.int32)
     parts = found = done = 0
     for seed in seeds:
-        if labels[seed] != _WAITING:
+        if not waiting[seed]:
             continue
         starts[parts] = found
-        labels[seed] = parts
+        parts += 1
+        waiting[seed] = False
         order[found] = seed
         found += 1
         while done < found:
@@ -182,12 +172,11 @@ def _label(
             done += 1
             for entry in range(indptr[here], indptr[here + 1]):
                 there = indices[entry]
-                if labels[there] == _WAITING:
-                    labels[there] = parts
+                if waiting[there]:
+                    waiting[there] = False
                     order[found] = there
                     found += 1
-        parts += 1
-    return parts, found
+    return order[:found], starts[1:parts]
 
 
 def divide(surface: Surface, steps: Array, order: Array, scale: float, smallest: int) -> Array:
@@ -277,8 +266,11 @@ def build_tree(
 def _divided(
     surface: Surface, codec: Codec, latents: Array, known: Array, above: Array | None, things: Array
 ) -> Array:
-    """(M,) int32 number, from 0, of the patch of each Gaussian at one level, with borders between `things`
-    (M,). Without a level `above` (M,) what is of one thing is one, else patches are within those above."""
+    """(M,) int32 number, from 0, of the patch of each Gaussian at one level.
+
+    There are borders between `things` (M,). Without a level `above` (M,) what is of one thing is one, else
+    patches are within those above.
+    """
     a, b = surface.ends
     steps = _steps(codec, latents, known, a, b)
     # Between two Gaussians drawn by chance, on average: what is far in this encoder's space.

@@ -40,7 +40,7 @@ class Similarity:
 
     @cached_property
     def is_identity(self) -> bool:
-        """Whether the map leaves every point where it is."""
+        """True where the map leaves every point where it is."""
         return bool((self.matrix == np.eye(4)).all())
 
     def points(self, points: Array) -> Array:
@@ -72,8 +72,10 @@ class Similarity:
         return turned
 
     def camera(self, camera: Camera) -> Camera:
-        """Return `camera` moved along: it sees the transformed world as it saw the world, depths times the
-        scale. InputError where it would lie farther out than a camera file may say."""
+        """Return `camera` moved along: it sees the transformed world as it saw the world.
+
+        Depths are times the scale. InputError where it would lie farther out than a camera file may say.
+        """
         position = self.points(camera.position[None])[0]
         if np.abs(position).max() > FARTHEST:
             raise InputError(f"a camera would lie more than {FARTHEST:g} units from the origin; move by less")
@@ -150,32 +152,12 @@ def similarity(matrix: Array) -> Similarity:
     return Similarity(rotation, matrix[:3, 3].copy(), scale)
 
 
-def moved_camera(camera: Camera, transform: Array) -> tuple[Camera, float]:
-    """A camera of a fixed scene as it sees a moving one before that is moved by a (4, 4) similarity, and the
-    factor from its depths to those of the fixed scene."""
-    scale = float(np.cbrt(np.linalg.det(transform[:3, :3])))
-    if not (np.isfinite(transform).all() and scale > 0):
-        raise InputError("a transform must be a similarity: turned, scaled by a positive factor, and moved")
-    matrix = camera.world_to_camera @ transform
-    matrix[:3] /= scale
-    return replace(camera, world_to_camera=matrix), scale
-
-
 def rotation_quaternion(rotation: Array) -> Array:
-    """(3, 3) -> (4,) unit quaternion wxyz with w >= 0, by the largest of its four squares (Shepperd 1978)."""
-    m = rotation
-    squares = np.array([np.trace(m), *np.diag(m)])
-    k = int(squares.argmax())
-    w = [1 + np.trace(m), m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]
-    if k == 0:
-        quat = np.array(w)
-    else:
-        i, j, n = k - 1, k % 3, (k + 1) % 3
-        quat = np.zeros(4)
-        quat[0], quat[k] = w[k], 1 + m[i, i] - m[j, j] - m[n, n]
-        quat[1 + j], quat[1 + n] = m[j, i] + m[i, j], m[n, i] + m[i, n]
-    quat /= np.linalg.norm(quat)
-    return quat if quat[0] >= 0 else -quat
+    """(3, 3) -> (4,) unit quaternion wxyz with w >= 0."""
+    from scipy.spatial.transform import Rotation  # here, since every program that opens a scene comes by
+
+    quat: Array = Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
+    return quat
 
 
 def transform_gaussians(gaussians: Gaussians, to: Similarity) -> Gaussians:
@@ -258,9 +240,9 @@ def sh_basis(directions: Array, count: int) -> Array:
 
 
 def sh_rotations(rotation: Array, degree: int) -> list[Array]:
-    """Return of each degree l = 0 to `degree` the (2l + 1, 2l + 1) float64 orthogonal matrix that turns the
-    coefficients of a function into those of the function rotated along.
+    """Return the (2l + 1, 2l + 1) float64 orthogonal matrix of each degree l = 0 to `degree`.
 
+    It turns the coefficients of a function into those of the function rotated along.
     The rotated function is f'(d) = f(R^T d), and each degree is closed under rotations, so that its matrix
     solves B(d) M = B(R^T d) for directions d that determine it (Wigner's matrices of the real basis).
     """

@@ -12,7 +12,7 @@ from langsplat_core.extensions.geometry.points import cloud, sample_surface
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.render import view_of
 from langsplat_core.scene import Camera, Scene
-from langsplat_core.scene.transform import moved_camera
+from langsplat_core.scene.transform import similarity
 
 SAMPLES = 40_000  # points of each surface
 ROUGH, FINE = 0.06, 0.03  # of the fixed scene's radius: spacing of points for features, and for ICP
@@ -142,18 +142,16 @@ def agreement(moving: Scene, fixed: Scene, transform: Array) -> float:
     It is of the pixels that both fill, as seen by cameras of both; 0 where no camera sees enough of both.
     transform: (4, 4), moving to fixed.
     """
-    back = np.linalg.inv(transform)
-    views = [(camera, *moved_camera(camera, transform)) for camera in _some(fixed)]
-    for camera in _some(moving):
-        other, scale = moved_camera(camera, back)
-        views.append((other, camera, 1 / scale))
+    there = similarity(transform)
+    views = [(camera, there.inverse().camera(camera)) for camera in _some(fixed)]
+    views += [(there.camera(camera), camera) for camera in _some(moving)]
     same = both = 0
-    for in_fixed, in_moving, scale in views:
+    for in_fixed, in_moving in views:
         near, far = (_depths(scene, view) for scene, view in ((fixed, in_fixed), (moving, in_moving)))
         filled = (near > 0) & (far > 0)
         if filled.mean() >= OVERLAP:
             both += int(filled.sum())
-            same += int((np.abs(scale * far - near) <= ALIKE * near)[filled].sum())
+            same += int((np.abs(there.scale * far - near) <= ALIKE * near)[filled].sum())
     return same / both if both else 0.0
 
 

@@ -27,7 +27,7 @@ from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.raster.render import splat_colours, view_of
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.scene.surface import surface_areas
-from langsplat_core.scene.transform import moved_camera, similarity
+from langsplat_core.scene.transform import similarity
 
 Kind = Literal["gone", "appeared", "moved", "recoloured"]
 KINDS: tuple[Kind, ...] = ("gone", "appeared", "moved", "recoloured")
@@ -149,19 +149,19 @@ def _evidence(
     first: Scene, second: Scene, into: Array, rasterizer: LiftingRasterizer, progress: Progress
 ) -> tuple[Array, Array]:
     """(N, `_CHANNELS`) float64 of the Gaussians of both scenes."""
-    back = np.linalg.inv(into)
-    own, others = _some(first.cameras), [moved_camera(camera, back)[0] for camera in _some(second.cameras)]
+    there = similarity(into)
+    back = there.inverse()
+    own, others = _some(first.cameras), [there.camera(camera) for camera in _some(second.cameras)]
     if not own + others:
         raise InputError("neither scene has cameras to look from; keep .cameras.json beside one of them")
-    scale = float(np.cbrt(np.linalg.det(into[:3, :3])))
     sums = np.zeros((len(first.gaussians), _CHANNELS)), np.zeros((len(second.gaussians), _CHANNELS))
     for done, camera in enumerate(own + others):
         progress("comparing the scenes", done / len(own + others))
-        pair = ((first, camera), (second, moved_camera(camera, into)[0]))
+        pair = ((first, camera), (second, back.camera(camera)))
         views = [view_of(scene, at, rasterizer) for scene, at in pair]
         drawn = [splat_colours(view, scene.gaussians) for view, (scene, _) in zip(views, pair, strict=True)]
         looks = [to_lab(np.clip(image.colours, 0, 1)) for image in drawn]
-        near, far = views[0].median_depth(), scale * views[1].median_depth()
+        near, far = views[0].median_depth(), there.scale * views[1].median_depth()
         # Where a capture looked and has nothing, nothing is; where it did not look, nobody knows.
         if done < len(own):
             near = np.where(drawn[0].alpha < EMPTY, np.inf, near)
