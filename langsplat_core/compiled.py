@@ -125,7 +125,7 @@ def digest_of_sources(source: Path) -> str:
 
 
 def _imported(text: str) -> Iterator[Path]:
-    """The package's files that a source imports; names of a module that are no files are passed over."""
+    """Yield the package's files that a source imports, whatever else it imports."""
     for module, names in _IMPORT.findall(text):
         base = _PACKAGE.joinpath(*module.split(".")[1:])
         candidates = [base, *(base / name for name in re.findall(r"\w+", names))]
@@ -134,8 +134,10 @@ def _imported(text: str) -> Iterator[Path]:
 
 
 def plain(array: Array) -> Array:
-    """The array as float32, contiguous and writeable: one type for numba, which compiles once per type. Only
-    a read-only array is copied for that reason; kernels never write to their inputs."""
+    """Return the array as float32, contiguous and writeable: numba compiles once per type.
+
+    Only a read-only array is copied for that reason; kernels never write to their inputs.
+    """
     return np.require(array, np.float32, ["C", "W"])
 
 
@@ -151,14 +153,16 @@ class Workers:
         self._pool, self._process = ThreadPoolExecutor(self.threads, "kernels"), os.getpid()
 
     def run(self, compiled: Callable[..., Any], count: int, *arguments: Any) -> list[Any]:
-        """compiled(first, last, *arguments) for pieces [first, last) that cover range(count), in order; what
-        they return."""
+        """Run compiled(first, last, *arguments) for pieces [first, last) that cover range(count).
+
+        Returns what they return, in order.
+        """
         pieces = min(count, self.threads * _PIECES_PER_THREAD if self.threads > 1 else 1)
         edges = [count * i // max(pieces, 1) for i in range(max(pieces, 1) + 1)]
         return self.each(compiled, [(*edge, *arguments) for edge in pairwise(edges)])
 
     def each(self, compiled: Callable[..., Any], calls: Sequence[tuple[Any, ...]]) -> list[Any]:
-        """compiled(*call) for every call; what they return."""
+        """Run compiled(*call) for every call; return what they return."""
         if len(calls) <= 1 or self.threads <= 1:
             return [compiled(*call) for call in calls]
         if self._process != os.getpid():  # after a fork, which takes no threads along

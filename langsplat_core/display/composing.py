@@ -1,6 +1,8 @@
-"""Images of channels, composed on the CPU by a compiled kernel: one pass over the pixels, in float32, on all
-cores. `compose.frag.glsl` does the same on a graphics device; software OpenGL would take longer for it than
-the rasterizer does."""
+"""Images of channels, composed on the CPU: a compiled kernel in float32, one pass over the pixels.
+
+`compose.frag.glsl` does the same on a graphics device; software OpenGL would take longer for it than the
+rasterizer does.
+"""
 
 from typing import Any, NamedTuple
 

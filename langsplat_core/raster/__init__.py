@@ -57,9 +57,9 @@ def load_rasterizer(name: str, **resources: Any) -> Rasterizer:
 
 
 def load_lifting_rasterizer(backend: str = "auto") -> LiftingRasterizer:
-    """A rasterizer whose views can gather: "cpu", "cuda", "reference", or "auto", CUDA where gsplat draws on
-    this machine, else the CPU.
+    """Return a rasterizer whose views can gather.
 
+    backend: "cpu", "cuda", "reference", or "auto": CUDA where gsplat draws on this machine, else the CPU.
     Raises InputError for one that cannot gather and BackendError as `load_rasterizer` does.
     """
     if backend == "auto":

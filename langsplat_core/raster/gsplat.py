@@ -51,13 +51,13 @@ def has_device() -> bool:
 
 
 def drawn_settings(settings: RasterSettings) -> RasterSettings:
-    """Settings that the installed gsplat draws with in place of `settings`: its cap of alpha is its own."""
+    """Return the settings that the installed gsplat draws with: its cap of alpha is its own."""
     release = tuple(int(part) for part in version("gsplat").split(".")[:2])
     return replace(settings, alpha_max=0.999 if release < (1, 6) else 0.99)
 
 
 def require_device() -> None:
-    """Raises BackendError unless gsplat draws, forwards and backwards, on a CUDA device of this machine.
+    """Raise BackendError unless gsplat draws, forwards and backwards, on a CUDA device of this machine.
 
     The first use on a machine may compile for some minutes.
     """

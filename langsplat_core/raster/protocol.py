@@ -42,8 +42,7 @@ class View(ABC):
 
     @property
     def rows(self) -> Array:
-        """(M,) int32 rows of which `splat_rows` takes values: the ones that are drawn, where the backend
-        knows them."""
+        """(M,) int32 rows of which `splat_rows` takes values: those drawn, where the backend knows them."""
         return np.arange(self.count, dtype=np.int32)
 
     def splat_rows(self, values: Array) -> tuple[Array, Array]:
@@ -107,8 +106,10 @@ class LiftingView(View):
             raise ValueError(f"maps: labels {maps.min()} to {maps.max()}, expected -1 to {count - 1}")
 
     def frozen(self) -> "LiftingView":
-        """The same view with W kept, in fewer digits: `splat` and `gather` get cheaper, from some calls on.
-        The view itself where nothing is gained."""
+        """Return the same view with W kept, in fewer digits, or the view itself where nothing is gained.
+
+        `splat` and `gather` get cheaper, from some calls on.
+        """
         return self
 
     @property

@@ -1,4 +1,18 @@
-"""The float64 rasterizer that every other backend is tested against, with view-dependent colour."""
+"""The truth: a float64 rasterizer written to be read. Every other backend is tested against it.
+
+Image formation, from top to bottom (constants in `config.RasterSettings`):
+
+1. Camera space: p = R x + t; Gaussians with p.z <= near or p.z > far are not drawn.
+2. Footprint: the perspective map is linearised at p, with p.x/p.z and p.y/p.z clamped to 1.3 times the half
+   field of view on each side of the principal point (of an orthographic camera, whose map is linear, J is
+   diag(fx, fy) without a third column). With A = J R rotation diag(scales) (2x3) the 2D covariance is
+   A A^T + 0.3 I, positive definite by construction.
+3. alpha(u) = min(0.99, opacity * exp(-1/2 (u-m)^T cov^-1 (u-m))) at pixel centres u; alphas below 1/255 are
+   skipped, so a Gaussian's extent is the ellipse where alpha equals 1/255.
+4. Front to back by camera z, ties by index: weight = alpha * T, T <- T (1 - alpha); a pixel stops before the
+   Gaussian that would bring T to 1e-4 or below. The cap of 0.99 is the float32 next to it, as in every
+   kernel: two capped layers then leave T just below 1e-4, where the double nearest 0.99 leaves it just above.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -26,22 +40,6 @@ def colours(sh: Array, means: Array, camera_position: Array) -> Array:
     return np.where(np.isfinite(rgb), np.maximum(rgb, 0), 0)
 
 
-# The truth: a float64 rasterizer written to be read. Every other backend is tested against it.
-#
-# Image formation, from top to bottom (constants in `config.RasterSettings`):
-#
-# 1. Camera space: p = R x + t; Gaussians with p.z <= near or p.z > far are not drawn. 2. Footprint (of an
-# orthographic camera, whose map is linear, J is diag(fx, fy) without a third column): the
-# perspective map is linearised at p, with p.x/p.z and p.y/p.z clamped to 1.3 times the half field of view
-# on each side of the principal point. With A = J R rotation diag(scales) (2x3) the 2D covariance is A A^T +
-# 0.3 I, positive definite by construction. 3. alpha(u) = min(0.99, opacity * exp(-1/2 (u-m)^T cov^-1
-# (u-m))) at pixel centres u; alphas below 1/255 are skipped, so a Gaussian's extent is the ellipse where
-# alpha equals 1/255. 4. Front to back by camera z, ties by index: weight = alpha * T, T <- T (1 - alpha); a
-# pixel stops before the Gaussian that would bring T to 1e-4 or below. The cap of 0.99 is the float32 next
-# to it, as in every kernel: two capped layers then leave T just below 1e-4, where the double nearest 0.99
-# leaves it just above.
-
-
 @dataclass(frozen=True, eq=False)
 class Footprints:
     """Projected Gaussians, N rows; rows that are not drawn have opacity 0."""
@@ -54,7 +52,7 @@ class Footprints:
 
 
 def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA) -> Footprints:
-    """Steps 1 and 2 of the module's list, for all Gaussians at once."""
+    """Do steps 1 and 2 of the module's list, for all Gaussians at once."""
     valid = gaussians.valid()
     means = np.where(valid[:, None], gaussians.means, 0).astype(np.float64)
     # Not a matrix product: BLAS may round equal rows differently, and equal depths tie by index.
@@ -177,8 +175,10 @@ class ReferenceView(LiftingView):
             yield Step(int(i), window, weights, transmittance[window])
 
     def cut_off_band(self, relative: float) -> Array:
-        """(H, W) True where some Gaussian's alpha, or the transmittance behind it, is within `relative` of a
-        cut-off: there rounding decides, and a fast rasterizer may come out on the other side."""
+        """(H, W) True where some Gaussian's alpha, or T behind it, is within `relative` of a cut-off.
+
+        There rounding decides, and a fast rasterizer may come out on the other side.
+        """
         f, s = self.footprints, self.settings
         size = (self.camera.width, self.camera.height)
         band, running = np.zeros(size[::-1], bool), np.ones(size[::-1], bool)

@@ -103,8 +103,10 @@ def splat_colours(view: View, gaussians: Gaussians, values: Array | None = None)
 
 
 def colours_seen(gaussians: Gaussians, camera: Camera, rows: Array | None = None) -> Array:
-    """(N, 3) float32 display colours >= 0 of the Gaussians as seen from the camera, of those at `rows` where
-    they are given; invalid rows are 0."""
+    """(N, 3) float32 display colours >= 0 of the Gaussians as seen from the camera; invalid rows are 0.
+
+    rows: (M,) int32, to have those of these alone.
+    """
     from langsplat_core.raster.cpu.projection import colours  # numba: a second that OpenGL need not wait for
 
     if camera.orthographic:
@@ -120,9 +122,9 @@ def pixel_weights(
     rasterizer: LiftingRasterizer | None = None,
     settings: RasterSettings | None = None,
 ) -> tuple[Array, Array]:
-    """(M,) int64 numbers of the Gaussians that paint `pixel` (column, row), and their (M,) float32 weights,
-    alpha_i T_i > 0, which add up to the pixel's alpha; rasterizer and settings as in `view_of`.
+    """(M,) int64 numbers of the Gaussians that paint `pixel` (column, row), and their (M,) float32 weights.
 
+    The weights, alpha_i T_i > 0, add up to the pixel's alpha; rasterizer and settings as in `view_of`.
     Only those that could reach the pixel are projected; they keep their order, so the weights are those
     of the whole view. The pixel must lie in the image.
     """

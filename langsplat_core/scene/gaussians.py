@@ -59,8 +59,11 @@ class Gaussians:
         return Gaussians(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def valid(self) -> Array:
-        """(N,) True where a row can be drawn: finite mean, a non-zero finite quaternion, scales and colours
-        that are not NaN or so large that they overflow, an opacity that is not NaN."""
+        """(N,) True where a row can be drawn.
+
+        Its mean is finite, its quaternion finite and not zero, scales and colours are not NaN or so large
+        that they overflow, its opacity is not NaN.
+        """
         usable = _VALID.get(self)
         if usable is None:
             usable = np.ones(len(self), bool)
@@ -86,7 +89,7 @@ class Gaussians:
         return counts
 
     def _requirements(self) -> tuple[tuple[str, Any], ...]:
-        """Requirements of a row that is drawn: name of the fault, (N,) True where there is none."""
+        """Return what a drawn row needs: name of the fault, (N,) True where there is none."""
         with np.errstate(over="ignore", invalid="ignore"):
             length_squared = (self.quats_wxyz.astype(np.float64) ** 2).sum(1)
             sound_colour = (np.abs(self.sh) <= LARGEST_COEFFICIENT).all((1, 2))

@@ -79,9 +79,11 @@ Fits = tuple[float, float, float]  # of each level, the best, see `semantics.rel
 
 @dataclass(frozen=True)
 class Odds:
-    """A logistic function of the best fits of an answer (Platt 1999):
+    """A logistic function of the best fits of an answer (Platt 1999).
+
     ``probability = sigmoid(constant + whole * fit of whole things + finer * the better one of the finer
-    levels)``, present and absent being as likely beforehand."""
+    levels)``, present and absent being as likely beforehand.
+    """
 
     constant: float
     whole: float

@@ -112,8 +112,10 @@ class Scene:
         elevations: tuple[float, float] = (-20.0, 60.0),
         distances: Sequence[float] = (2.6,),
     ) -> tuple[Camera, ...]:
-        """`count` cameras of `size` (width, height) around the scene that look at its centre, upright, spread
-        evenly between two `elevations`, degrees; `distances`, radii of the scene, take turns."""
+        """Return `count` upright cameras of `size` (width, height) around the scene that look at its centre.
+
+        They are spread evenly between two `elevations`, degrees; `distances`, radii of the scene, take turns.
+        """
         centre, radius = self.bounds()
         up = self.up()
         east = unit(across(up))
@@ -129,8 +131,10 @@ class Scene:
         return tuple(cameras)
 
     def framing_camera(self, size: tuple[int, int], bounds: tuple[Array, float] | None = None) -> Camera:
-        """A camera of `size` (width, height) that frames the `bounds` (by default the scene's), a little from
-        above, and from where they are broadest."""
+        """Return a camera of `size` (width, height) that frames the `bounds`, by default the scene's.
+
+        It looks a little from above, and from where they are broadest.
+        """
         centre, radius = bounds or self.bounds()
         up = self.up()
         direction = self._across(centre, radius, up) + 0.35 * up

@@ -70,10 +70,7 @@ class Tree:
         return np.where(votes[at], at, np.int32(NO_NODE))
 
     def path(self, node: int) -> tuple[int, ...]:
-        """Return the node, its parent, that one's parent, ...
-
-        up to a root.
-        """
+        """Return the node, its parent, that one's parent, and so on up to a root."""
         found = [int(node)]
         while self.parents[found[-1]] != NO_NODE:
             found.append(int(self.parents[found[-1]]))
@@ -108,8 +105,10 @@ class Tree:
         return np.stack([np.where(levels[row] == level, row, NO_NODE) for level, row in enumerate(voted)])
 
     def voted_by(self, things: Array) -> "Tree":
-        """The tree with a vote for each node that is mostly of `things`, see `build_tree`: of scenes that do
-        not know how many photographs said so."""
+        """Return the tree with a vote for each node that is mostly of `things`, see `build_tree`.
+
+        For scenes that do not know how many photographs said so.
+        """
         votes = np.zeros((self.count, 2), np.uint16)
         for level, row in enumerate(things):
             at = self.at(level)

@@ -17,7 +17,7 @@ from langsplat_core.errors import BackendError, InputError
 from langsplat_core.io.cameras import read_cameras, write_cameras
 from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer, protocol, reference
 from langsplat_core.raster import render as front_door
-from langsplat_core.raster.render import pixel_weights, splat_colours
+from langsplat_core.raster.render import pixel_weights, splat_colours, view_of
 from langsplat_core.scene import look_at
 from tests.support.scenes import random_camera, random_gaussians, random_values, without_perspective
 
@@ -86,6 +86,24 @@ def test_cameras_of_no_lens_do_not_spread_gaussians_over_the_image(factor: float
     assert Scene(G, cameras=(wrong,)).raster_settings().focal is None
     settings = replace(INRIA, focal=wrong.fx)
     assert protocol.dilation(CAMERA, settings) <= protocol.MOST_GROWTH * INRIA.dilation
+
+
+@either
+def test_a_view_is_formed_as_the_scene_was_trained(backend):
+    """Antialiasing and the focal length that dilation follows; settings that are given take their place."""
+    fitted = Scene(G, cameras=(CAMERA,), antialiased=True)
+    camera, x = CAMERA.resized(3 * CAMERA.width, 3 * CAMERA.height), random_values(len(G), 2)
+    rasterizer = load_lifting_rasterizer(backend)
+    own = replace(INRIA, antialiased=True, focal=float(np.sqrt(CAMERA.fx * CAMERA.fy)))
+    for got, settings in (
+        (view_of(fitted, camera, rasterizer), own),
+        (view_of(fitted, camera, rasterizer, INRIA), INRIA),
+    ):
+        want = rasterizer.view(G, camera, settings).splat(x)[0]
+        np.testing.assert_array_equal(got.splat(x)[0], want)
+    drawn = render(fitted, camera, x, backend).values
+    np.testing.assert_allclose(drawn, rasterizer.view(G, camera, own).splat(x)[0], atol=1e-5)
+    assert np.abs(drawn - rasterizer.view(G, camera).splat(x)[0]).max() > 0.01
 
 
 def test_what_cannot_draw_or_lift_is_said():

@@ -216,8 +216,7 @@ class Sums(NamedTuple):
 
 @helper
 def _fetch(i: int, last: int, tiles: Tiles, sums: Sums) -> None:
-    """Ask for what belongs to the rows after `i`, step by step, as each step needs what the one before
-    brought."""
+    """Ask for the memory of rows after `i`, in steps: each needs what the one before brought."""
     rank = sums.rank_of[min(i + 3 * AHEAD, last - 1)]
     if rank >= 0:
         prefetch(tiles.firsts, np.int64(rank))
@@ -234,7 +233,7 @@ def _fetch(i: int, last: int, tiles: Tiles, sums: Sums) -> None:
 
 @helper
 def _add_up(rank: int, tiles: Tiles, sums: Sums, out: Array) -> bool:
-    """out <- the rank's partial sums, added up in the order of its tiles; False where there are none."""
+    """Add up the rank's partial sums into `out`, in the order of its tiles; False where there are none."""
     some = False
     for n in range(tiles.firsts[rank], tiles.firsts[rank + 1]):
         slot = tiles.slots[n]
@@ -280,7 +279,7 @@ def _footprint_gradient(g: Array, moments: Array) -> tuple[float, float, cp.Poin
 
 @helper
 def _with_compensation(by_covariance: cp.Point, a: Array, camera: cp.KernelCamera, q: float) -> cp.Point:
-    """Adds the gradient of Mip-Splatting's factor sqrt(det sharp / det dilated) to that by the covariance."""
+    """Add the gradient of Mip-Splatting's factor sqrt(det sharp / det dilated) to that by the covariance."""
     xx, xy, yy, det, sharp = cp.covariance(a, camera.dilation)
     if not camera.antialiased or sharp / det <= cp.COMPENSATION_MIN:
         return by_covariance
@@ -383,8 +382,10 @@ def to_parameters(
     camera: cp.KernelCamera,
     out: GaussianGradients,
 ) -> None:
-    """For rows [first, last): sum what `backward` left, in the order of the tiles, and pull the moments back
-    through the projection."""
+    """Fill `out` for rows [first, last).
+
+    Sums what `backward` left, in the order of the tiles, and pulls the moments back through the projection.
+    """
     added = np.empty(sums.partial.shape[1])
     moments = added[:MOMENTS]
     work, by_b, by_turn = np.empty((3, 3, 3)), np.empty((2, 3)), np.empty((3, 3))

@@ -1,4 +1,7 @@
-"""Blending on the CPU: ``W x``, ``W^T y`` and the depth of half transmittance, tile by tile (see `walk`)."""
+"""Blending on the CPU: ``W x``, ``W^T y`` and the depth of half transmittance, tile by tile (see `walk`).
+
+Below: ``W^T onehot(labels)`` in one walk, and the view that runs these kernels in parts of a few channels.
+"""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -34,7 +37,7 @@ from langsplat_core.scene import Camera
 
 @helper
 def write_alpha(transmittance: Array, alpha: Array, tile: int, tiles: Tiles) -> None:
-    """Return the tile of (H, W, 1) alpha <- 1 - |T|; changes `transmittance`."""
+    """Write 1 - |T| to the tile of (H, W, 1) alpha; changes `transmittance`."""
     for n in range(PIXELS):
         transmittance[n] = np.float32(1) - abs(transmittance[n])
     write_tile(transmittance, alpha, tile, tiles.columns)
@@ -84,7 +87,7 @@ def splat(
 
 
 @helper
-def keep_weight(work: Any, mine: Any, s: int, row: int, low: int, added: Lanes, before: Lanes) -> None:
+def _keep_weight(work: Any, mine: Any, s: int, row: int, low: int, added: Lanes, before: Lanes) -> None:
     store(work[0], (row - low) * TILE, added * before)
 
 
@@ -115,7 +118,7 @@ def gather(
             transmittance,
             work,
             nothing_to_open,
-            keep_weight,
+            _keep_weight,
             _correlate_weights,
         )
         partial[end : tiles.starts[tile + 1]] = 0
@@ -133,7 +136,7 @@ def sum_partials(first: int, last: int, tiles: Tiles, order: Array, partial: Arr
 
 @helper
 def sum_over_tiles(rank: int, tiles: Tiles, partial: Array, sums: Array) -> None:
-    """Return sums <- the first numbers of the rank's partial sums, added up in the order of its tiles."""
+    """Add up the first numbers of the rank's partial sums into `sums`, in the order of its tiles."""
     sums[:] = 0
     end = tiles.slots.shape[0] - 1
     for n in range(tiles.firsts[rank], tiles.firsts[rank + 1]):
@@ -207,8 +210,10 @@ class LabelRows(NamedTuple):
 def _meet_regions(
     first: int, last: int, maps: Array, columns: int, regions: TileRegions, counts: Array
 ) -> None:
-    """For tiles [first, last) of (L, H, W) maps: counts[tile] <- how many labels >= 0 they hold; and, where
-    there is room in `regions`, which."""
+    """Count the labels >= 0 in each of tiles [first, last) of (L, H, W) maps.
+
+    counts[tile] <- how many; and, where there is room in `regions`, which.
+    """
     levels, height, width = maps.shape
     found = np.empty(levels * PIXELS, np.int32)
     for tile in range(first, last):
@@ -287,7 +292,9 @@ def _gather(
         _fill_planes(planes, maps, tile, tiles.columns, regions, lines)
         state = start_tile(tile, tiles, width, height)
         work = (weights, planes, partial, start)
-        end = walk(tile, tiles, geometry, cutoffs, state, work, nothing_to_open, keep_weight, _correlate_here)
+        end = walk(
+            tile, tiles, geometry, cutoffs, state, work, nothing_to_open, _keep_weight, _correlate_here
+        )
         partial[end - start :] = 0
 
 
@@ -338,9 +345,9 @@ def _merge(
 def gather_labels(
     run: Callable[..., None], tiles: Tiles, workers: Workers, maps: Array, count: int, least: float
 ) -> sparse.csr_matrix:
-    """(L, H, W) int32 maps of labels below `count`, -1 for none -> (M, count) float32 weights, pixels, a row
-    per drawn Gaussian in depth order; entries of at most `least` are left out.
+    """(L, H, W) int32 maps of labels below `count`, -1 for none -> (M, count) float32 weights, pixels.
 
+    A row per drawn Gaussian in depth order; entries of at most `least` are left out.
     `run(kernel, *arguments)` runs a kernel over the view's tiles.
     """
     number = len(tiles.starts) - 1

@@ -1,6 +1,6 @@
-"""Frozen geometry: the blending weights W of one CPU view, kept, so that `splat` and `gather` need no
-exponential and no transmittance again.
+"""Frozen geometry: the blending weights W of one CPU view, kept.
 
+`splat` and `gather` then need no exponential and no transmittance again.
 A weight is kept as sixteen bits of fixed point, a row of a tile as sixteen of them: W is off by at most
 1 / 131070 in every entry, and `gather` is still the exact adjoint of `splat`.
 """
@@ -62,8 +62,10 @@ def _keep_span(work: Any, mine: Any, s: int, low: int, high: int) -> None:
 def find_spans(
     first: int, last: int, tiles: Tiles, geometry: Array, cutoffs: Cutoffs, spans: Array, alpha: Array
 ) -> None:
-    """Fill (I,) uint16 spans, 0 at first, as `Tiles.rows`: the rows of every intersection that have a weight;
-    and (H, W, 1) alpha."""
+    """Fill (I,) uint16 spans, 0 at first, and (H, W, 1) alpha.
+
+    A span has the rows of an intersection that have a weight, packed as `Tiles.rows`.
+    """
     count = tiles.starts.shape[0] - 1
     height, width, _ = alpha.shape
     seen = np.empty(2, np.int64)
@@ -77,7 +79,7 @@ def find_spans(
 
 @helper
 def _rows_kept(work: Any, s: int, later: int) -> tuple[int, int, int]:
-    """The rows of intersection s that are kept, and where the first of them would lie if it were row 0."""
+    """Return the rows of intersection s that are kept, and where row 0 of them would lie."""
     spans, firsts, _ = work
     start, end = unpack_span(spans[s])
     return start, end, firsts[s] - start

@@ -39,7 +39,7 @@ class _LanesModel(models.PrimitiveModel):
         super().__init__(manager, numba_type, FLOATS)
 
 
-def constant(value: float) -> ir.Constant:
+def _constant(value: float) -> ir.Constant:
     return ir.Constant(FLOATS, [float(value)] * LANES)
 
 
@@ -123,7 +123,7 @@ def _select(builder: Any, comparison: str, a: Any, b: Any, yes: Any, no: Any) ->
 @intrinsic
 def reciprocal(typing: Any, value: Any) -> Any:
     """Return 1 / value, lane by lane."""
-    return lanes16(value), lambda context, builder, sig, args: builder.fdiv(constant(1), args[0])
+    return lanes16(value), lambda context, builder, sig, args: builder.fdiv(_constant(1), args[0])
 
 
 @intrinsic
@@ -131,15 +131,15 @@ def exp2(typing: Any, power: Any) -> Any:
     """2^power for power <= 0.5, relative error 2e-7; powers below -100 give 2^-100."""
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        low = constant(-100)
+        low = _constant(-100)
         power = builder.select(builder.fcmp_ordered(">", arguments[0], low), arguments[0], low)
         # Conversion truncates, and power - 0.5 <= 0: so this rounds to the nearest integer.
-        whole = builder.fptosi(builder.fsub(power, constant(0.5)), INTS)
+        whole = builder.fptosi(builder.fsub(power, _constant(0.5)), INTS)
         rest = builder.fsub(power, builder.sitofp(whole, FLOATS))
-        result = constant(_EXP2[-1])
+        result = _constant(_EXP2[-1])
         for coefficient in _EXP2[-2::-1]:
             product = builder.fmul(result, rest, flags=_FUSE)
-            result = builder.fadd(product, constant(coefficient), flags=_FUSE)
+            result = builder.fadd(product, _constant(coefficient), flags=_FUSE)
         # Multiplying by 2^whole is an addition to the exponent's bits.
         bits = builder.add(builder.bitcast(result, INTS), builder.shl(whole, ir.Constant(INTS, [23] * LANES)))
         return builder.bitcast(bits, FLOATS)
@@ -355,7 +355,7 @@ def load_units(typing: Any, array: Any, index: Any) -> Any:
         shorts = ir.VectorType(ir.IntType(16), LANES).as_pointer()
         value = builder.load(builder.bitcast(builder.gep(data, [arguments[1]]), shorts))
         value.align = 2
-        return builder.fmul(builder.sitofp(builder.zext(value, INTS), FLOATS), constant(1 / UNIT))
+        return builder.fmul(builder.sitofp(builder.zext(value, INTS), FLOATS), _constant(1 / UNIT))
 
     return lanes16(array, types.intp), lower
 
@@ -365,7 +365,7 @@ def store_units(typing: Any, array: Any, index: Any, value: Any) -> Any:
     """array.flat[index : index + 16] = lanes in [0, 1] times UNIT, rounded, as uint16, unchecked."""
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        scaled = builder.fadd(builder.fmul(arguments[2], constant(UNIT)), constant(0.5))
+        scaled = builder.fadd(builder.fmul(arguments[2], _constant(UNIT)), _constant(0.5))
         shorts = ir.VectorType(ir.IntType(16), LANES)
         data = context.make_array(sig.args[0])(context, builder, arguments[0]).data
         pointer = builder.bitcast(builder.gep(data, [arguments[1]]), shorts.as_pointer())

@@ -86,6 +86,7 @@ class KernelCamera(NamedTuple):
 
 
 def kernel_camera(camera: Camera, settings: RasterSettings) -> KernelCamera:
+    """Return camera and settings as kernels take them."""
     left, top, right, bottom = tangent_limits(camera, settings)
     added = dilation(camera, settings)
     # Half width = reach sqrt((A A^T)_xx + dilation), A = J R S: so at most
@@ -120,6 +121,7 @@ def kernel_camera(camera: Camera, settings: RasterSettings) -> KernelCamera:
 
 @helper
 def camera_point(mean: Array, camera: KernelCamera) -> Point:
+    """Return a mean in the camera's frame, float64, in the reference's order of operations."""
     r, t = camera.rotation, camera.translation
     m0, m1, m2 = np.float64(mean[0]), np.float64(mean[1]), np.float64(mean[2])
     return (
@@ -143,8 +145,10 @@ def _jacobian(x: float, y: float, z: float, camera: KernelCamera) -> tuple[float
 def fill_axes(
     point: Point, log_scales: Array, quat: Array, camera: KernelCamera, work: Array
 ) -> tuple[Point, float]:
-    """work[0] <- rotation of the quaternion, work[1] <- B = J R (two rows), work[2] <- A = B rotation
-    diag(s); returns the scales s and the inverse length of the quaternion."""
+    """Fill work: [0] the quaternion's rotation, [1] B = J R (two rows), [2] A = B rotation diag(s).
+
+    Returns the scales s and the inverse length of the quaternion.
+    """
     x, y, z = point
     j00, j02, j11, j12 = _jacobian(x, y, z, camera)
     q0, q1, q2, q3 = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
@@ -199,6 +203,7 @@ def covariance(a: Array, dilation: float) -> tuple[float, float, float, float, f
 
 @helper
 def opacity_of(logit: float) -> float:
+    """Return the logistic function of a logit, float64."""
     e = np.exp(-abs(np.float64(logit)))
     return (1.0 if logit >= 0 else e) / (1 + e)
 
@@ -221,8 +226,10 @@ def _is_valid(rows: Rows, i: int) -> bool:
 
 @helper
 def _is_outside(x: float, y: float, over: float, size: float, camera: KernelCamera) -> bool:
-    """True only for footprints that cannot meet a pixel centre, whatever their shape: most of those that do
-    not. `over`: depth, or 1 without perspective."""
+    """Return True only for footprints that cannot meet a pixel centre, whatever their shape.
+
+    These are most of those that do not. over: depth, or 1 without perspective.
+    """
     u, v = camera.fx * x / over + camera.cx, camera.fy * y / over + camera.cy
     wide = camera.reach_x * size / over + camera.margin
     high = camera.reach_y * size / over + camera.margin
@@ -279,7 +286,7 @@ def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Projec
         g[HALF_WIDTH], g[HALF_HEIGHT] = wide, high
 
 
-# View-dependent colours on the CPU: the compiled twin of `spherical_harmonics.colours`, and its adjoint.
+# View-dependent colours on the CPU: the compiled twin of `reference.colours`, and its adjoint.
 
 _C20, _C21, _C22 = C2
 _C30, _C31, _C32, _C33, _C34 = C3
@@ -289,7 +296,7 @@ _NEAREST = 1e-12  # world units; a Gaussian closer to the camera than this has n
 
 @helper
 def _direction(mean: Array, position: Array) -> tuple[float, float, float, float]:
-    """Unit vector from the camera to the Gaussian, and the inverse distance."""
+    """Return the unit vector from the camera to the Gaussian, and the inverse distance."""
     x, y, z = mean[0] - position[0], mean[1] - position[1], mean[2] - position[2]
     inverse = 1 / max(np.sqrt(x * x + y * y + z * z), _NEAREST)
     return x * inverse, y * inverse, z * inverse, inverse
@@ -396,7 +403,7 @@ def colours(sh: Array, means: Array, camera_position: Array, rows: Array | None 
 
     With `rows`, (M,) int32, those of these Gaussians.
 
-    Invalid rows give 0; see `spherical_harmonics.colours`.
+    Invalid rows give 0; see `reference.colours`.
     """
     n = check_array("sh", sh, ("N", "K", 3), dtype=np.float32)
     check_array("means", means, ("N", 3), n, dtype=np.float32)

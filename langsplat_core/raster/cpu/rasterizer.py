@@ -95,13 +95,13 @@ class CpuView(TileOperator):
         return sparse.csr_matrix((found.data, found.indices, indptr), shape=(drawn + 1, count))[place]
 
     def frozen(self) -> FrozenView:
-        """This view with W itself kept: `splat` and `gather` get cheaper the more often they are called."""
+        """Return this view with W kept: `splat` and `gather` get cheaper the more often they are called."""
         return FrozenView(self, lambda kernel, *rest: self._over_tiles(kernel, self._cutoffs, *rest))
 
     def backward(
         self, values: Array, image_grad: Array, alpha_grad: Array | None = None
     ) -> GaussianGradients:
-        """Gradients of a loss, given those by `splat(values)`: (H, W, C) by the image, (H, W) by alpha.
+        """Return gradients of a loss, given those by `splat(values)`: (H, W, C) image and (H, W) alpha.
 
         They are those of image formation as it is: 0 through a capped alpha and across the cut-offs.
         """
@@ -135,8 +135,10 @@ class CpuView(TileOperator):
         return self._at_half(self._depths)
 
     def median_rows(self) -> Array:
-        """(H, W) int64 the Gaussian at which the transmittance falls to 0.5 or below (see `median_depth`), -1
-        where it never does; of more than 2^24 that are drawn perhaps the next in depth."""
+        """(H, W) int64 the Gaussian at which the transmittance falls to 0.5 or below, -1 where it never does.
+
+        Of more than 2^24 that are drawn it may be the next in depth.
+        """
         place = self._at_half(np.arange(1, len(self.order) + 1, dtype=np.float32)).astype(np.int64)
         return np.append(self.order, -1)[place - 1]
 
@@ -166,8 +168,7 @@ def _sizes_of(gaussians: Gaussians) -> Array:
 
 
 class CpuRasterizer:
-    """Kernels are compiled at first use (some seconds) and cached beside the package, or in the user's cache
-    folder where that cannot be written."""
+    """Rasterizer `cpu`. Kernels are compiled at first use (some seconds), see `langsplat_core.compiled`."""
 
     name = "cpu"
 

@@ -1,4 +1,8 @@
-"""Tiles of 16x16 pixels and the Gaussians that touch each, front to back: binning for the CPU backend."""
+"""Tiles of 16x16 pixels and the Gaussians that touch each, front to back, for the CPU backend.
+
+From top to bottom: the depth order, binning, a tile's own memory, and the walk over a tile that blending,
+its adjoint and its gradients share.
+"""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -115,9 +119,9 @@ def _digit_of(key: Any, digit: int) -> Any:
 
 @kernel
 def _depth_order(status: Array, depth_bits: Array, out: Sorting) -> bool:
-    """(N,) status and depths reinterpreted as uint64 -> fills `out`, of the length of what is drawn, by
-    depth, ties by index. False where it gave up, as very many depths are nearly equal.
+    """(N,) status and depths reinterpreted as uint64 -> fills `out`, of the length of what is drawn.
 
+    By depth, ties by index. False where it gave up, as very many depths are nearly equal.
     Positive floats order as their bits do. Sorted by their 32 leading bits that differ (radix, least
     significant digit first, each pass stable); then neighbours that are still in the wrong order change
     places.
@@ -197,9 +201,9 @@ def _columns_touched(g: Array, grid: TileGrid) -> tuple[int, int]:
 
 @helper
 def _at_most(g: Array, grid: TileGrid) -> float:
-    """No fewer tiles than a footprint touches: those of its box.
+    """Return a bound of the tiles that a footprint touches.
 
-    Or, for a needle, of the area within a tile's side of it (Steiner).
+    Those of its box, or, for a needle, of the area within a tile's side of it (Steiner).
     """
     wide, high = 2 * g[cp.HALF_WIDTH] / TILE, 2 * g[cp.HALF_HEIGHT] / TILE
     box = min(float(grid.columns), wide + 2) * min(float(grid.lines), high + 2)  # in this order also of a NaN
@@ -214,9 +218,11 @@ def _at_most(g: Array, grid: TileGrid) -> float:
 def _touch(
     first: int, last: int, order: Array, footprints: Array, grid: TileGrid, geometry: Array, firsts: Array
 ) -> tuple[tuple[Array, Array, Array], int, Array]:
-    """For ranks [first, last): geometry[rank] <- footprints[order[rank]], firsts[rank + 1] <- how many tiles
-    it touches; returns the ranks, tiles and spans of rows of these intersections, their number, and how often
-    each tile of the image was touched."""
+    """Find the tiles that ranks [first, last) touch.
+
+    geometry[rank] <- footprints[order[rank]], firsts[rank + 1] <- how many tiles it touches. Returns the
+    ranks, tiles and spans of rows of these intersections, their number, and how often each tile was touched.
+    """
     most = 0.0
     for rank in range(first, last):
         prefetch(footprints, np.int64(order[min(rank + 2 * AHEAD, last - 1)]) * cp.COLUMNS)
@@ -257,9 +263,11 @@ def _touch(
 def _place(
     first: int, last: int, touched: tuple[Array, Array, Array], places: Array, start: int, tiles: Tiles
 ) -> None:
-    """Write intersections [first, last) that `_touch` found into their tiles, those of a tile from
-    places[tile] on: within a tile ranks ascend, whoever runs which piece. They are the view's from `start`
-    on."""
+    """Write intersections [first, last) that `_touch` found into their tiles.
+
+    Those of a tile go to places[tile] and on: within a tile ranks ascend, whoever runs which piece. They are
+    the view's from `start` on.
+    """
     ranks, where, spans = touched
     for n in range(first, last):
         tile = where[n]
@@ -272,8 +280,10 @@ def _place(
 def bin_tiles(
     footprints: Array, order: Array, size: tuple[int, int], workers: Workers, memory: Memory
 ) -> tuple[Array, Tiles]:
-    """(N, 8) footprints, (M,) the drawn ones in depth order -> (M, 8) geometry in that order, and the
-    intersections with the tiles of an image of `size`, width and height."""
+    """(N, 8) footprints, (M,) the drawn ones in depth order -> (M, 8) geometry in that order, and the tiles.
+
+    size: width and height of the image.
+    """
     geometry = memory.empty((len(order), cp.COLUMNS), np.float64)
     width, height = size
     grid = TileGrid(float(width), float(height), -(-width // TILE), -(-height // TILE))

@@ -1,4 +1,8 @@
-"""An OpenGL context without a window or a display, and what kind of driver is behind one."""
+"""Scenes in the memory of an OpenGL device, and their draw order.
+
+From top to bottom: a context without a window or a display, tools for drawing with moderngl, the sort on the
+device, the textures of a scene, and the draw order of a view, by the CPU or by the device.
+"""
 
 import math
 import sys
@@ -32,7 +36,7 @@ def is_software(ctx: moderngl.Context) -> bool:
 
 
 def create_egl_context() -> moderngl.Context:
-    """An OpenGL context of 4.1 or newer that needs no display: EGL on Linux, the system's own way elsewhere.
+    """Return an OpenGL context of 4.1 or newer that needs no display: EGL on Linux.
 
     Raises BackendError where there is no driver for one.
     """
