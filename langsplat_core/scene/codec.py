@@ -135,7 +135,7 @@ class Codec(ABC):
         return max(1 - float(mean @ mean), 0.0)
 
     def colours(self, latents: Array, weights: Array) -> Array:
-        """(M, d) latents -> (M, 3) float32 colours in [0, 1]; near meanings have near ones.
+        """(M, d) latents -> (M, 3) float32 colours in [0, 1]; near vectors have near ones.
 
         weights: (M,) >= 0, how often each occurs.
         """
