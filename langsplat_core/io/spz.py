@@ -42,24 +42,30 @@ SPZ_SH_COUNTS = (1, 4, 9, 16, 25)  # of degree 0 to 4, the base colour included
 # Quantised Gaussians compress 3 to 1 at best. A file that claims to have gained 64 to 1 is made to
 # exhaust memory.
 BYTES_PER_BYTE = 64
-PIECE = 65536  # bytes read at once behind the blocks; extension records have some tens
-SLACK = 1024 * 1024  # bytes, for small files of equal Gaussians
+SLACK = 1024 * 1024  # bytes, for small files of equal Gaussians, and for records behind them
+
+
+@dataclass(frozen=True)
+class _Header:
+    version: int  # 1 to 4
+    count: int  # Gaussians
+    sh_degree: int  # 0 to 4
+    fractional_bits: int  # of positions, from version 2 on
+    flags: int
+    streams: int  # of version 4
 
 
 @dataclass(frozen=True, eq=False)
 class Packed:
     """The content of a .spz file, unpacked but still quantised."""
 
-    version: int  # 1 to 4
-    sh_degree: int  # 0 to 4
-    fractional_bits: int  # of positions, from version 2 on
-    antialiased: bool
+    header: _Header
     axes: int  # 1 to 8, see above
     blocks: dict[str, Array]  # attribute -> (N, bytes of one Gaussian) uint8
 
 
 def widths(version: int, sh_degree: int) -> dict[str, int]:
-    """Attribute -> bytes of one Gaussian, in the order of the file."""
+    """Return attribute -> bytes of one Gaussian, in the order of the file."""
     return {
         "positions": 6 if version == 1 else 9,
         "alphas": 1,
@@ -84,22 +90,6 @@ def _read_packed(file: BinaryIO, size: int, path: Path) -> Packed:
     return _read_one_stream(file, size, path)
 
 
-@dataclass(frozen=True)
-class _Header:
-    version: int
-    count: int
-    sh_degree: int
-    fractional_bits: int
-    flags: int
-    streams: int  # of version 4
-
-    def packed(self, axes: int, blocks: list[bytes]) -> Packed:
-        named = zip(widths(self.version, self.sh_degree).items(), blocks, strict=True)
-        arrays = {name: np.frombuffer(b, np.uint8).reshape(self.count, width) for (name, width), b in named}
-        antialiased = bool(self.flags & ANTIALIASED)
-        return Packed(self.version, self.sh_degree, self.fractional_bits, antialiased, axes, arrays)
-
-
 def _header(data: bytes, path: Path) -> _Header:
     if len(data) < HEADER_SIZE or not data.startswith(MAGIC):
         raise malformed(path, f"not an .spz file: neither it nor what is zipped begins with {MAGIC.decode()}")
@@ -120,17 +110,16 @@ def _read_one_stream(file: BinaryIO, limit: int, path: Path) -> Packed:
     blocks = [file.read(size) for size in sizes]
     if sum(map(len, blocks)) < sum(sizes):
         raise malformed(path, f"truncated: {header.count} Gaussians need {sum(sizes)} bytes")
-    behind = file.read(PIECE)
-    _read_to_the_end(file, limit - HEADER_SIZE - sum(sizes) - len(behind), path)
-    return header.packed(_axes(behind if header.flags & EXTENDED else b"", path), blocks)
+    behind = file.read(SLACK + 1)  # to the end, where gzip checks its sum
+    if len(behind) > SLACK:
+        raise malformed(path, "too many bytes behind its Gaussians")
+    return _packed(header, behind, blocks, path)
 
 
-def _read_to_the_end(file: BinaryIO, limit: int, path: Path) -> None:
-    """Read to the end, where gzip checks its sum; at most `limit` bytes of other data may remain."""
-    while piece := file.read(PIECE):
-        limit -= len(piece)
-        if limit < 0:
-            raise malformed(path, "too many bytes behind its Gaussians")
+def _packed(header: _Header, records: bytes, blocks: list[bytes], path: Path) -> Packed:
+    named = zip(widths(header.version, header.sh_degree).items(), blocks, strict=True)
+    arrays = {name: np.frombuffer(b, np.uint8).reshape(header.count, width) for (name, width), b in named}
+    return Packed(header, _axes(records if header.flags & EXTENDED else b"", path), arrays)
 
 
 def _read_streams(file: BinaryIO, file_size: int, path: Path) -> Packed:
@@ -159,7 +148,7 @@ def _read_streams(file: BinaryIO, file_size: int, path: Path) -> Packed:
         raise malformed(path, f"truncated: its streams do not fit into the {left} bytes behind its table")
     streams = iter([_unpacked(file.read(zipped), whole, path) for zipped, whole in table if whole])
     blocks = [next(streams) if size else b"" for size in sizes]
-    return header.packed(_axes(records if header.flags & EXTENDED else b"", path), blocks)
+    return _packed(header, records, blocks, path)
 
 
 def _unpacked(data: bytes, size: int, path: Path) -> bytes:
@@ -241,7 +230,7 @@ def decode_spz(data: bytes, path: Path) -> Scene:
 
 def _scene(packed: Packed) -> Scene:
     blocks, signs = packed.blocks, _signs_to_rdf(packed.axes)
-    count, degree = len(blocks["alphas"]), min(packed.sh_degree, 3)
+    count, degree = len(blocks["alphas"]), min(packed.header.sh_degree, 3)
     rest = blocks["sh"].reshape(count, blocks["sh"].shape[1] // 3, 3)[:, : SH_COUNTS[degree] - 1]
     rest = (rest.astype(np.float32) - 128) / 128 * coefficient_signs(signs, rest.shape[1])[:, None]
     base = (blocks["colours"] / 255 - 0.5) / COLOUR_SCALE
@@ -254,7 +243,7 @@ def _scene(packed: Packed) -> Scene:
         opacity_logits=logit(blocks["alphas"][:, 0] / 255),
         sh=np.concatenate([base[:, None], rest], axis=1),
     )
-    return Scene(gaussians, antialiased=packed.antialiased)
+    return Scene(gaussians, antialiased=bool(packed.header.flags & ANTIALIASED))
 
 
 def write_spz(path: Path | str, gaussians: Gaussians, antialiased: bool = False) -> None:
@@ -313,7 +302,7 @@ def _fractional_bits(drawn: Gaussians, path: Path) -> int:
 def _positions(packed: Packed) -> Array:
     """(N, 3) positions along the axes of the file."""
     data = packed.blocks["positions"]
-    if packed.version == 1:
+    if packed.header.version == 1:
         return np.ascontiguousarray(data).view("<f2").astype(np.float32)
     parts = data.reshape(len(data), 3, 3)
     codes = (
@@ -321,13 +310,13 @@ def _positions(packed: Packed) -> Array:
         | parts[..., 1].astype(np.int32) << 8
         | parts[..., 2].astype(np.int8).astype(np.int32) << 16
     )
-    return codes / 2.0**packed.fractional_bits
+    return codes / 2.0**packed.header.fractional_bits
 
 
 def _rotations(packed: Packed) -> Array:
     """(N, 4) unit quaternions w x y z."""
     data = packed.blocks["rotations"]
-    if packed.version < 3:
+    if packed.header.version < 3:
         xyz = data / 127.5 - 1
         w = np.sqrt(np.maximum(0, 1 - (xyz**2).sum(axis=1, keepdims=True)))
         return np.concatenate([w, xyz], axis=1)
