@@ -35,8 +35,9 @@ from langsplat_core.scene import Scene
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures
 from langsplat_core.training.radiance.state import save_checkpoint
 from langsplat_viewer.files.preferences import Preferences, save_preferences
-from langsplat_viewer.files.projects import Bookmark, QuerySet, SavedQuery, Shelf, write_flight, write_queries
+from langsplat_viewer.files.projects import Bookmark, Shelf, write_flight, write_queries
 from langsplat_viewer.output import Film, save_png, write_film
+from langsplat_viewer.session import Query, Session
 from tests.support.file_samples import random_codec, random_field
 from tests.support.processes import bound_by_permissions, files_of_at_most, small_disk
 from tests.support.scenes import random_camera, random_gaussians
@@ -221,7 +222,7 @@ WRITERS: dict[str, Write] = {
     "camera path": flight,
     "bookmarks": bookmarks,
     "preferences": lambda folder: save_preferences(folder, Preferences()),
-    "queries": lambda folder: write_queries(folder / "q.json", QuerySet((SavedQuery("cup"),))),
+    "queries": lambda folder: write_queries(folder / "q.json", Session(queries=(Query("cup"),))),
 }
 
 

@@ -1,4 +1,4 @@
-"""How files are written: a reader never sees half of one; and where none can be written, beforehand."""
+"""How files are written, whole or not at all; and checks of where none can be written."""
 
 import errno
 import json
@@ -10,7 +10,6 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from threading import Lock
 
 from langsplat_core.errors import InputError, LangSplatError
 
@@ -20,38 +19,30 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 NAME_MAX, PATH_MAX = 255, 4_096  # bytes, where the system does not say
-RANDOM = 8  # characters that `tempfile` puts into a name
 LONGEST_SUFFIX = 64  # bytes of a suffix that a temporary name keeps
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # where a disk is full, or broken
-PROBE = 1 << 16  # bytes that are written to find out
 # Where files are none: what is written there is read by the system or by nobody, and is gone afterwards.
 _SYSTEM, _MEMORY = ("/proc", "/sys", "/dev"), "/dev/shm"
-
-
-_asking_umask = Lock()
+_UMASK = os.umask(0o077)
+os.umask(_UMASK)  # the only way to ask is to change it
 
 
 @contextmanager
 def atomic_path(path: Path | str) -> Iterator[Path]:
     """Yield a temporary name beside `path`; on a clean exit it is renamed to `path`, else removed.
 
-    The temporary name keeps the suffix, because some writers choose the format by it; it is no longer than
-    `path` may be. Where the disk takes no more, an OSError with `path` comes out, whatever the writer said.
+    The temporary name keeps the suffix, because some writers choose the format by it. Where the disk takes no
+    more, an OSError with `path` comes out, whatever the writer said.
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     suffix = target.suffix if len(os.fsencode(target.suffix)) <= LONGEST_SUFFIX else ""
-    room = name_max(target.parent) - RANDOM - 2 - len(os.fsencode(suffix))
-    stem = os.fsencode(target.stem)[:room].decode(errors="ignore")
-    handle, name = tempfile.mkstemp(prefix=f".{stem}.", suffix=suffix, dir=target.parent)
+    handle, name = tempfile.mkstemp(prefix=".writing-", suffix=suffix, dir=target.parent)
     os.close(handle)
     temporary = Path(name)
     try:
         yield temporary
-        with _asking_umask:  # the only way is to change it
-            umask = os.umask(0)
-            os.umask(umask)
-        temporary.chmod(0o666 & ~umask)  # mkstemp makes private files; ours are ordinary ones
+        temporary.chmod(0o666 & ~_UMASK)  # mkstemp makes private files; ours are ordinary ones
         temporary.replace(target)
     except Exception as error:
         cause = _no_room(error, temporary)
@@ -105,7 +96,7 @@ def _no_room(error: Exception, temporary: Path) -> OSError | None:
         return OSError(int(said[1]), os.strerror(int(said[1])))
     try:
         with temporary.open("ab") as file:
-            file.write(bytes(PROBE))
+            file.write(bytes(1 << 16))
     except OSError as found:
         return found if found.errno in NO_ROOM else None
     return None
