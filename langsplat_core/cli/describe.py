@@ -1,5 +1,8 @@
-"""`langsplat describe` and `teach`: words for what is in a scene, everywhere, at a place, or as a tree; and a
-name for something that is pointed at, by which it is then found."""
+"""`langsplat describe` and `langsplat teach`.
+
+Words for what is in a scene, everywhere, at a place, or as a tree; and a name for something that is pointed
+at, by which it is then found.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
@@ -43,8 +46,7 @@ from langsplat_core.semantics.vocabulary import read_vocabulary
 
 @dataclass(frozen=True)
 class Describe:
-    """Name what is here: the best words of a vocabulary for a pixel, a Gaussian or an instance of a phrase,
-    or the scene's inventory."""
+    """Name what is here: in a pixel, in an instance of a phrase, of a Gaussian, or in the whole scene."""
 
     scene: TrainedScene
     camera: Annotated[CountOrZero, tyro.conf.arg(metavar="INDEX")] = 0
@@ -73,6 +75,7 @@ class Describe:
     """Print JSON."""
 
     def run(self) -> None:
+        """Describe, and print the words."""
         phrases = None if self.vocabulary is None else read_vocabulary(self.vocabulary)
         scene = searchable(self.scene)
         self._check(scene)
@@ -141,7 +144,7 @@ class Describe:
         check_writable(out)
 
     def _described(self, describer: Describer, progress: Progress) -> dict[str, Any]:
-        """The inventory, or the words of the place that is asked for, ready for JSON."""
+        """Return the inventory, or the words of the place that is asked for, ready for JSON."""
         engine = describer.engine
         sure = engine.basis.calibration is not None
         asked = {"asked": len(describer.words[0].phrases), "left_out": len(describer.left_out)}
@@ -169,8 +172,10 @@ class Describe:
 
 
 def _plain(value: Any, sure: bool) -> Any:
-    """Words, spots and entries, ready for JSON. A share of the softmax over a vocabulary is a probability too
-    where that is `sure`."""
+    """Words, spots and entries, ready for JSON.
+
+    A share of the softmax over a vocabulary is a probability too where that is `sure`.
+    """
     if isinstance(value, tuple):
         return [_plain(item, sure) for item in value]
     if not is_dataclass(value):
@@ -213,13 +218,13 @@ def _print_inventory(entries: list[dict[str, Any]]) -> None:
 
 
 def outline_of(describer: Describer) -> list[dict[str, Any]]:
-    """The scene as a tree, ready for JSON."""
+    """Return the scene as a tree, ready for JSON."""
     sure = describer.engine.basis.calibration is not None
     return [_plain(one, sure) for one in scene_outline(describer)]
 
 
 def outline_lines(nodes: list[dict[str, Any]], unit: Unit) -> list[str]:
-    """An outline as text, without what has neither a name nor parts."""
+    """Return an outline as text, without what has neither a name nor parts."""
     named = [one for one in nodes if one["word"] is not None or one["parts"]]
     lines = list(_outline_lines(named, unit, 0))
     if len(named) < len(nodes):
@@ -260,8 +265,11 @@ def _print_words(levels: list[dict[str, Any]]) -> None:
 
 @dataclass(frozen=True)
 class Teach:
-    """Name what is in a pixel. `langsplat query` then finds the name in this scene or, with --into, in every
-    scene of the same encoder. Teaching a name again adds an example."""
+    """Name what is in a pixel.
+
+    `langsplat query` then finds the name in this scene or, with --into, in every scene of the same encoder.
+    Teaching a name again adds an example.
+    """
 
     scene: tyro.conf.Positional[Path]
     """A trained scene, *.ply with its language field beside it, into which the word is written."""
@@ -279,6 +287,7 @@ class Teach:
     """Forget the word, with all its examples."""
 
     def run(self) -> None:
+        """Learn the word, or forget it, and write the file."""
         scene = searchable(self.scene)
         field, target = scene.language, self.into or companion_path(self.scene, files.SUFFIX)
         assert field is not None

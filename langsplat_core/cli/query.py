@@ -89,6 +89,7 @@ class QueryScene:
     json: JsonOption = False
 
     def run(self) -> None:
+        """Ask, and print the answers."""
         scene = searchable(self.scene)
         self._check()
         explain = _Explainer(self, scene) if self.why is not None else None
@@ -142,8 +143,11 @@ class QueryScene:
             raise InputError("--why is of phrases; give what --like finds a name with `langsplat teach`")
 
     def _askable(self, engine: QueryEngine, camera: Camera | None) -> list[str]:
-        """The phrases that can be asked; the others are named on stderr with the reason, before anything is
-        searched. Raises that reason where none is left."""
+        """Return the phrases that can be asked.
+
+        The others are named on stderr with the reason, before anything is searched. Raises that reason where
+        none is left.
+        """
         phrases = [phrase for text in self.texts for phrase in split_phrases(text) or [text]]
         reasons: dict[str, list[str]] = {}  # why not -> these phrases
         for phrase in dict.fromkeys(phrases):
@@ -170,7 +174,7 @@ class QueryScene:
     def _ask(
         self, engine: QueryEngine, text: str, camera: Camera | None
     ) -> tuple[QueryResult, Phrase | None, tuple[str, ...]]:
-        """The answer, how the phrase was read where it has structure, and the words of what is asked for."""
+        """Return the answer, the phrase's tree where it has structure, and the words of what is asked for."""
         if self._plainly:
             return engine.run(text, self.level), None, (text,)
         composed = run_phrase(engine, text, self.level, camera)
@@ -182,7 +186,7 @@ class _Explainer:
     """Evidence of answers, and the contact sheets of all of them in one image."""
 
     def __init__(self, asked: QueryScene, scene: Scene) -> None:
-        """Raises InputError where masks or photographs are missing, before anything is asked."""
+        """Find the masks and photographs; InputError where they are missing, before anything is asked."""
         assert asked.why is not None
         if asked.why.suffix.lower() != ".png":
             raise InputError(f"--why {asked.why}: evidence is drawn as an image; name a .png file")
@@ -195,7 +199,7 @@ class _Explainer:
     def __call__(
         self, engine: QueryEngine, answer: QueryResult, phrases: tuple[str, ...]
     ) -> dict[str, Any] | None:
-        """The evidence of an answer, ready for JSON; it is drawn too."""
+        """Return the evidence of an answer, ready for JSON; it is drawn too."""
         with TerminalProgress() as progress:
             found = find_evidence(engine, answer, phrases, self._features, self._rasterizer, progress)
         if found is None:
@@ -232,8 +236,10 @@ def _reasons(evidence: dict[str, Any] | None = None) -> list[str]:
 
 
 def once(load: LoadEncoder, instead: str = "") -> LoadEncoder:
-    """`load`, or `instead` of what it is asked for, but once: a hub out of reach is not asked again
-    either."""
+    """Return `load`, called but once for each encoder: a hub out of reach is not asked again either.
+
+    instead: the encoder that is loaded in place of any other.
+    """
     known: dict[str, TextEncoder | EncoderError] = {}
 
     def load_once(model: str) -> TextEncoder:
@@ -301,8 +307,10 @@ Shape = Literal["scene", "points", "hull"]
 
 @dataclass(frozen=True)
 class Select:
-    """Write what a phrase names as a scene of its own, with its language field and cameras, as points or as a
-    mesh; or, with --remove, the scene without it. Prints the things that were found, best first."""
+    """Write what a phrase names as a scene, points or a mesh of its own; with --remove, all the rest.
+
+    Prints the things that were found, best first.
+    """
 
     scene: TrainedScene
     texts: tyro.conf.Positional[tuple[str, ...]]
@@ -327,6 +335,7 @@ class Select:
     json: JsonOption = False
 
     def run(self) -> None:
+        """Select, write the file, and print what is in it."""
         self._check()
         scene = searchable(self.scene)
         unit = unit_of(scene, self.scale)
@@ -431,11 +440,15 @@ class HasUnit(Protocol):
     """A scene, or what stands for one, that may say how long its unit is."""
 
     @property
-    def metres_per_unit(self) -> float | None: ...
+    def metres_per_unit(self) -> float | None:
+        """Metres per world unit; None where nobody said."""
 
 
 def unit_of(scene: HasUnit, metres_per_unit: float | None = None) -> Unit:
-    """The unit of lengths in a scene: metres by `metres_per_unit` or the scene's own, else world units."""
+    """Return the unit of lengths in a scene: metres where a scale is known, else world units.
+
+    metres_per_unit: in place of the scene's own scale.
+    """
     metres = metres_per_unit or scene.metres_per_unit
     return Unit("units", 1.0) if metres is None else Unit("m", metres)
 
@@ -467,7 +480,7 @@ def _listed(instances: Sequence[Instance]) -> dict[str, Any]:
 
 
 def instance_fields(instance: Instance, number: int) -> dict[str, Any]:
-    """An instance, ready for JSON, lengths in world units."""
+    """Return an instance, ready for JSON, lengths in world units."""
     box = instance.oriented
     return {
         "number": number,
@@ -483,7 +496,7 @@ def instance_fields(instance: Instance, number: int) -> dict[str, Any]:
 
 
 def found_answer(engine: QueryEngine, text: str, level: LevelChoice) -> QueryResult:
-    """The answer to a phrase; InputError where it was not found."""
+    """Return the answer to a phrase; InputError where it was not found."""
     answer = run_phrase(engine, text, level).answer
     if not answer.found or not answer.members.any():
         raise InputError(
@@ -494,7 +507,10 @@ def found_answer(engine: QueryEngine, text: str, level: LevelChoice) -> QueryRes
 
 
 def chosen_instances(found: Sequence[Instance], numbers: Sequence[int]) -> Sequence[Instance]:
-    """The instances of these numbers, the best is 1; all without numbers. Raises InputError for another."""
+    """Return the instances of these numbers, the best is 1; all without numbers.
+
+    Raises InputError for another.
+    """
     if not found:
         raise InputError("what was found lies nowhere on a surface: nothing to select")
     for number in numbers:
@@ -504,6 +520,7 @@ def chosen_instances(found: Sequence[Instance], numbers: Sequence[int]) -> Seque
 
 
 def basis_fields(engine: QueryEngine) -> dict[str, Any]:
+    """Return what the answers stand on, ready for JSON."""
     return {"encoder": engine.basis.encoder, "calibration": engine.basis.calibration}
 
 
@@ -511,8 +528,10 @@ def basis_fields(engine: QueryEngine) -> dict[str, Any]:
 
 
 def pointed(engine: QueryEngine, camera: int, at: str, option: str, level: LevelChoice) -> Array:
-    """(N,) bool: the region in a pixel, "X,Y" as the user gave it with an option. Raises InputError for what
-    is no pixel of the camera, and for one without a region."""
+    """(N,) bool: the region in a pixel, "X,Y" as the user gave it with an option.
+
+    Raises InputError for what is no pixel of the camera, and for one without a region.
+    """
     scene, place = engine.scene, re.fullmatch(r"([0-9]{1,9}), ?([0-9]{1,9})", at)
     if not scene.cameras:
         raise InputError(f"the scene has no cameras, so {option} means nothing")
@@ -530,7 +549,7 @@ def pointed(engine: QueryEngine, camera: int, at: str, option: str, level: Level
 
 
 def pixel_in(scene: Scene, index: int, pixel: tuple[int, int], given: str) -> Camera:
-    """The camera of a number; InputError where there is none, or `pixel` is outside its image."""
+    """Return the camera of a number; InputError where there is none, or `pixel` is outside its image."""
     camera, (column, row) = camera_of(scene, index), pixel
     if not (0 <= column < camera.width and 0 <= row < camera.height):
         raise InputError(
@@ -540,7 +559,7 @@ def pixel_in(scene: Scene, index: int, pixel: tuple[int, int], given: str) -> Ca
 
 
 def camera_of(scene: Scene, index: int) -> Camera:
-    """The camera of a number; InputError where there is none."""
+    """Return the camera of a number; InputError where there is none."""
     if not 0 <= index < len(scene.cameras):
         raise InputError(f"--camera {index}: the scene has cameras 0 to {len(scene.cameras) - 1}")
     return scene.cameras[index]

@@ -65,8 +65,9 @@ class PageReport:
 def write_page(
     path: Path, scene: Scene, engine: QueryEngine | None, title: str, progress: Progress = silent
 ) -> PageReport:
-    """Write `scene` as an HTML file. engine: of the same scene, None where it is only to be
-    looked at. title: plain text.
+    """Write `scene` as an HTML file.
+
+    engine: of the same scene, None where it is only to be looked at. title: plain text.
 
     Raises InputError for a scene of which nothing can be drawn.
     """
@@ -130,8 +131,11 @@ def drawable(gaussians: Gaussians) -> Array:
 
 
 def pack_gaussians(gaussians: Gaussians, centre: Array) -> dict[str, Array]:
-    """`low` and `high` (C, M) uint8 bytes of the columns, high ones of the first `WIDE` alone, and `ranges`
-    (C, M / CHUNK, 2) float32; columns as listed here, means relative to `centre`."""
+    """Return the columns of the Gaussians in 8 or 16 bits.
+
+    `low` and `high` are (C, M) uint8 bytes of the columns, high ones of the first `WIDE` alone; `ranges` are
+    (C, M / CHUNK, 2) float32. Columns are as listed here, means relative to `centre`.
+    """
     count = len(gaussians)
     columns = np.concatenate(
         [
@@ -161,7 +165,7 @@ def pack_gaussians(gaussians: Gaussians, centre: Array) -> dict[str, Array]:
 
 
 def views(scene: Scene) -> list[dict[str, Any]]:
-    """The scene's cameras as bookmarks, relative to the page's origin; one that frames it without any."""
+    """Return the scene's cameras, relative to the page's origin; one that frames it where it has none."""
     centre, _ = scene.bounds()
     cameras: Sequence[Camera] = scene.cameras or (scene.framing_camera((1280, 800)),)
     step = -(-len(cameras) // MOST_VIEWS)
@@ -193,7 +197,10 @@ def page_shaders() -> dict[str, list[str]]:
 def language_tables(
     engine: QueryEngine, rows: Array, progress: Progress = silent
 ) -> tuple[dict[str, Any], dict[str, Array]]:
-    """What answers need: numbers and words, and tensors. rows: (M,) Gaussians of the page."""
+    """Return what answers need: numbers and words, and tensors.
+
+    rows: (M,) Gaussians of the page.
+    """
     field, regions = engine.field, engine.regions
     codebook = field.codec.decode(np.arange(field.codec.size)[:, None])
     scale = engine.scale
@@ -241,8 +248,11 @@ def _words_of_grammar() -> dict[str, list[str]]:
 
 
 def _region_tables(engine: QueryEngine) -> dict[str, Array]:
-    """Tensors of all regions, those of subparts first: `share_of`, `share_code` and `share`, a sparse matrix
-    that takes relevancies of codewords to means of regions; sizes, parents, places, boxes, corners."""
+    """Return tensors of all regions, those of subparts first.
+
+    `share_of`, `share_code` and `share` are a sparse matrix that takes relevancies of codewords to means of
+    regions; beside it sizes, parents, places, boxes and corners.
+    """
     field, regions = engine.field, engine.regions
     means = engine.scene.gaussians.means
     firsts = np.cumsum([0, *map(len, regions.nodes)])
@@ -275,7 +285,7 @@ def _region_tables(engine: QueryEngine) -> dict[str, Array]:
 
 
 def _words(engine: QueryEngine, suggested: Sequence[str]) -> tuple[dict[str, Any], dict[str, Array]]:
-    """The phrases whose vectors are in the page; the encoder too where it is small and its words are few."""
+    """Return the phrases whose vectors are in the page, and the encoder where it is small enough."""
     book = tuple(engine.field.phrasebook)
     try:
         encoder: TextEncoder | None = engine.load_encoder()
@@ -309,7 +319,10 @@ def pack(tensors: dict[str, Array], meta: dict[str, Any]) -> bytes:
 
 
 def page_text(title: str, data: bytes) -> str:
-    """The HTML file. Its policy lets nothing run but its own script, and nothing be fetched."""
+    """Return the HTML file.
+
+    Its policy lets nothing run but its own script, and nothing be fetched.
+    """
     folder = files("langsplat_core.web")
     modules = [folder.joinpath(f"{name}.js").read_text(encoding="utf-8") for name in MODULES]
     script = "\n".join(module.split(BEGIN)[1].split(END)[0] for module in modules)

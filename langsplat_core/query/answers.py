@@ -1,5 +1,4 @@
-"""Answers to a phrase: whole regions of the surface by `rule.decide`, or, as published, what is around the
-peak."""
+"""Answers to a phrase: whole regions by `rule.decide`, or, as published, what is around the peak."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -136,8 +135,11 @@ SPAN = 0.02  # the least distance between the floor and the peak that is divided
 def by_peak(
     phrase: str, relevancy: Array, surface: Surface, scale: Scale, found: float, level: LevelChoice
 ) -> QueryResult:
-    """Return the answer as published: the level with the highest smoothed peak, cut half way between the
-    floor and that peak. found: relevancy from which a phrase counts as found."""
+    """Return the answer as published: the level with the highest smoothed peak.
+
+    Members are cut half way between the floor and that peak. found: relevancy from which a phrase counts as
+    found.
+    """
     smoothed = np.stack([surface.smooth(values) for values in relevancy])
     scores = triple(smoothed.max(1, initial=0))
     chosen = int(np.argmax(scores)) if level == "auto" else LEVELS.index(level)

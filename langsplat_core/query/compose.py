@@ -1,16 +1,11 @@
-"""Phrases with structure: each phrase of the tree is asked for itself, and the answers are combined.
-
-How things stand to each other is measured in their own sizes, so that a scene needs no scale.
-"""
+"""Phrases with structure: each phrase of the tree is asked for itself, and the answers are combined."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from langsplat_core.arrays import Array, across
+from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.progress import Progress, silent
@@ -20,11 +15,9 @@ from langsplat_core.query.grammar import (
     Atom,
     Both,
     Counted,
-    Extreme,
     Inside,
     Phrase,
     Relation,
-    Side,
     Superlative,
     Union,
     Without,
@@ -34,218 +27,18 @@ from langsplat_core.query.grammar import (
     parse,
     unparse,
 )
-from langsplat_core.query.instances import axis_aligned_box, told_apart
+from langsplat_core.query.relations import WHOLE, Body, body, most, separate, stands, upright, viewpoint
 from langsplat_core.query.rule import RULE, combined, judge, triple
 from langsplat_core.scene import LEVELS, Camera
 from langsplat_core.scene.language import phrase_key, tidy
 from langsplat_core.scene.surface import Surface
-from langsplat_core.scene.tree import Tree
 from langsplat_core.semantics.relevancy import FLOOR
-
-FEWEST = 8  # Gaussians; what has fewer is a speck
-SPECK = 0.1  # of the largest instance's Gaussians; so is what has fewer
-SAMPLE = 1500  # points of a thing that distances are measured with
-NEAR = 0.75  # of the smaller thing's size: the widest gap that is still near
-TOUCH = 0.1  # of the smaller thing's size: the widest gap that is still touching
-FOOT = 0.4  # of a thing's height: what it stands on touches it below
-FLAT = 0.5  # of a thing's points: what touches so many, it lies or hangs on
-HELD = 0.6  # of a thing's points: what holds so many, it is in
-SUNK = 0.25  # of a thing's height: what is in another has so much of it below the rim
-ASIDE = 0.25  # of the mean size: what is closer than this sideways or in depth is level with the other
-
-
-@dataclass(frozen=True, eq=False)
-class Body:
-    """The points of one thing, in axes of which the last is up."""
-
-    points: Array  # (P, 3) world units
-    low: Array  # (3,) 2 % quantiles
-    high: Array  # (3,) 98 % quantiles
-
-    @property
-    def centre(self) -> Array:
-        """(3,) centre of its bounding box."""
-        return (self.low + self.high) / 2
-
-    @property
-    def size(self) -> float:
-        """Diagonal of its bounding box, world units."""
-        return float(np.linalg.norm(self.high - self.low))
-
-    @cached_property
-    def tree(self) -> cKDTree:
-        """A k-d tree of its points."""
-        return cKDTree(self.points)
-
-    @cached_property
-    def spacing(self) -> float:
-        """Median distance of a point to the nearest other, world units."""
-        return float(np.median(self.tree.query(self.points, k=2)[0][:, 1]))
-
-
-@dataclass(frozen=True, eq=False)
-class Viewpoint:
-    """The camera from which left, right, near, far, behind and in front are said."""
-
-    matrix: Array  # (4, 4) from the axes of bodies to the camera's
-
-    def centre(self, body: Body) -> Array:
-        """(3,) centre of a body, in the camera's axes."""
-        return self.matrix[:3, :3] @ body.centre + self.matrix[:3, 3]
-
-    def seen(self, body: Body) -> tuple[float, float]:
-        """Tangent of the angle to the right of the viewing direction, and depth; NaN for what is behind."""
-        x, _, z = self.centre(body)
-        return (float(x / z), float(z)) if z > 0 else (float("nan"), float("nan"))
-
-
-def upright(up: Array) -> Array:
-    """(3,) unit -> (3, 3) rotation of world points into axes of which the last is up."""
-    first = across(up)
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(up, first), up])
-
-
-def viewpoint(camera: Camera, frame: Array) -> Viewpoint:
-    """`camera` as seen in the axes of `frame` (3, 3), see `upright`."""
-    turned = np.eye(4)
-    turned[:3, :3] = frame.T
-    return Viewpoint(camera.world_to_camera @ turned)
-
-
-def body(positions: Array, frame: Array) -> Body:
-    """(P, 3) world points of one thing, P >= 1 -> its body in the axes of `frame`."""
-    points = positions[:: max(1, -(-len(positions) // SAMPLE))] @ frame.T
-    low, high = axis_aligned_box(points)
-    return Body(points, low, high)
-
-
-def separate(surface: Surface, inside: Array, tree: Tree | None = None) -> list[Array]:
-    """(M,) bool -> surface numbers of each single thing in it, the largest first, without specks. tree: what
-    tells apart things that touch, by its wholes that masks voted for. All other Gaussians are taken apart
-    where the surface is."""
-    wholes = None if tree is None else tree.voted(WHOLE)
-    parts = told_apart(surface, np.flatnonzero(inside), wholes, join=True)
-    parts.sort(key=len, reverse=True)
-    return [part for part in parts if len(part) >= max(FEWEST, SPECK * len(parts[0]))]
-
-
-@dataclass(frozen=True)
-class Number:
-    """How many single things an answer has, and how many it may have."""
-
-    best: int
-    least: int  # with a stricter cut
-    most: int  # with a wider one
-
-
-STRICT, WIDE = 0.25, 2.0  # of the way that an answer reaches
-
-
-def count_things(engine: QueryEngine, answer: QueryResult) -> Number:
-    """The number of single things in an answer, as `separate` tells them apart, and in what it would be if it
-    reached less far or farther below its best region."""
-    fits = engine.scale.fit(answer.even)
-    best = float(fits[answer.members].max(initial=-np.inf))
-    least, most = (fits >= RULE.least_fit(best, share) for share in (STRICT, WIDE))
-    low, own, high = (
-        len(separate(engine.surface, inside[engine.surface.rows], engine.tree))
-        for inside in (least & answer.members, answer.members, most | answer.members)
-    )
-    return Number(own, min(low, own), max(high, own))
-
-
-def gap(one: Body, other: Body) -> float:
-    """Least distance between points of two things, world units."""
-    return float(other.tree.query(one.points)[0].min())
-
-
-def stands(kind: Side, what: Body, anchor: Body, seen_by: Viewpoint | None) -> bool:
-    """True if `what` stands so to `anchor`. "left of", "right of", "behind" and "in front of" are said from a
-    viewpoint, which is then not None."""
-    match kind:
-        case "on":
-            return _on(what, anchor)
-        case "in":
-            return _in(what, anchor)
-        case "near":
-            return gap(what, anchor) <= NEAR * min(what.size, anchor.size)
-        case "above":
-            return _above(what, anchor)
-        case "below":
-            return _above(anchor, what)
-        case _:
-            assert seen_by is not None
-            return _beside(kind, what, anchor, seen_by)
-
-
-def _on(what: Body, anchor: Body) -> bool:
-    reach = TOUCH * min(what.size, anchor.size) + anchor.spacing
-    touching = anchor.tree.query(what.points, distance_upper_bound=reach)[0] < np.inf
-    if not touching.any() or what.size > anchor.size:
-        return False
-    above = what.centre[2] > anchor.low[2] and _over(what, anchor)
-    foot = what.points[touching, 2].mean() <= what.low[2] + FOOT * (what.high[2] - what.low[2])
-    return bool((above and foot) or touching.mean() >= FLAT)
-
-
-def _over(what: Body, anchor: Body) -> bool:
-    """True if the middle of `what`, seen from above, lies within `anchor`."""
-    return bool(((what.centre >= anchor.low) & (what.centre <= anchor.high))[:2].all())
-
-
-def _in(what: Body, anchor: Body) -> bool:
-    height = what.high[2] - what.low[2]
-    head = np.array([0, 0, 0.5 * height])  # it may look out of an open vessel
-    sunk = what.low[2] <= anchor.high[2] - SUNK * height  # and does not merely stand on a flat top
-    held = ((what.points >= anchor.low) & (what.points <= anchor.high + head)).all(1)
-    return bool(what.size < anchor.size and sunk and _over(what, anchor) and held.mean() >= HELD)
-
-
-def _above(what: Body, anchor: Body) -> bool:
-    overlap = ((what.low <= anchor.high) & (anchor.low <= what.high))[:2].all()
-    return bool(overlap and what.centre[2] > anchor.high[2] and what.low[2] > anchor.centre[2])
-
-
-def _beside(kind: Side, what: Body, anchor: Body, seen_by: Viewpoint) -> bool:
-    (x, z), (anchor_x, anchor_z) = seen_by.seen(what), seen_by.seen(anchor)
-    apart = ASIDE * (what.size + anchor.size) / 2
-    aside = (x - anchor_x) * anchor_z  # world units at the anchor's depth
-    if kind == "left of":
-        return aside < -apart
-    if kind == "right of":
-        return aside > apart
-    in_line = abs(aside) <= (what.size + anchor.size) / 2
-    return in_line and (z - anchor_z > apart if kind == "behind" else anchor_z - z > apart)
-
-
-def most(kind: Extreme, things: list[Body], anchors: list[Body], seen_by: Viewpoint | None) -> int:
-    """Number of the one of `things` (at least one) that is most so. "nearest" and "farthest" are measured
-    from any of `anchors`, and without one from the viewpoint, as "leftmost" and "rightmost" are."""
-    sign = -1 if kind in ("smallest", "nearest", "lowest", "leftmost") else 1
-    return int(np.nanargmax([sign * _measure(kind, thing, anchors, seen_by) for thing in things]))
-
-
-def _measure(kind: Extreme, thing: Body, anchors: list[Body], seen_by: Viewpoint | None) -> float:
-    if kind in ("biggest", "smallest"):
-        return thing.size
-    if kind in ("highest", "lowest"):
-        return float(thing.centre[2])
-    if kind in ("nearest", "farthest") and anchors:
-        return min(gap(thing, anchor) for anchor in anchors)
-    assert seen_by is not None
-    if kind in ("nearest", "farthest"):
-        return float(np.linalg.norm(seen_by.centre(thing)))
-    aside = seen_by.seen(thing)[0]
-    return (np.inf if kind == "leftmost" else -np.inf) if np.isnan(aside) else aside
-
 
 # Answers to single phrases, combined among the Gaussians into one of the same form.
 #
 # The relevancy of a combined answer is zero wherever it does not hold, and the same at every level where it
 # has parts of several; its peak is that of its weakest necessary part.
 
-WHOLE = LEVELS.index("whole")
 SHARE = 0.6  # of the way from what is typical of a thing's least fitting surface to the part's peak on it
 LEAST = 0.05  # quantile of a part's relevancy on its thing that stands for "not this part"
 SPAN = 0.02  # of relevancy: the least distance that is divided
@@ -264,7 +57,10 @@ def grown(surface: Surface, members: Array) -> Array:
 def cut_inside(
     engine: QueryEngine, asked: list[QueryResult], thing: QueryResult, there: Array, level: LevelChoice
 ) -> QueryResult:
-    """The answers of a part in one, cut anew among the Gaussians of its thing. there: (N,) bool."""
+    """Return the answers of a part in one, cut anew among the Gaussians of its thing.
+
+    there: (N,) bool.
+    """
     surface, known = engine.surface, engine.field.known
     relevancy = np.asarray(np.mean([result.relevancy for result in asked], axis=0, dtype=np.float32))
     even = np.where(there, even_relevancy(engine.regions, engine.scale, relevancy), 0)
@@ -296,7 +92,10 @@ def cut_inside(
 
 
 def joined(answers: Sequence[QueryResult], all_needed: bool) -> QueryResult:
-    """The union of answers, found if all are, or any is; what is not found of alternatives does not count."""
+    """Return the union of answers, found if all are, or any is.
+
+    What is not found of alternatives does not count.
+    """
     counting = answers if all_needed else [answer for answer in answers if answer.found] or answers
     score = min if all_needed else max
     values = np.max([np.where(a.members, a.relevancy[a.level], 0) for a in counting], axis=0)
@@ -313,13 +112,16 @@ def joined(answers: Sequence[QueryResult], all_needed: bool) -> QueryResult:
 
 
 def without(what: QueryResult, unwanted: QueryResult) -> QueryResult:
-    """`what` without the members of `unwanted`, if that was found."""
+    """Return `what` without the members of `unwanted`, if that was found."""
     return restricted(what, ~unwanted.members, what) if unwanted.found else what
 
 
 def surest(engine: QueryEngine, answer: QueryResult) -> QueryResult:
-    """`answer` with those members alone that fit nearly as well as the best one does. A green mug may be in
-    the answer to "red mug", for want of a better one; it is not what "not red mug" means."""
+    """`answer` with those members alone that fit nearly as well as the best one does.
+
+    A green mug may be in the answer to "red mug", for want of a better one; it is not what "not red mug"
+    means.
+    """
     fits = engine.scale.fit(answer.even)
     best = float(fits[answer.members].max(initial=-np.inf))
     return replace(answer, members=answer.members & (fits >= RULE.least_fit(best, SURE)))
@@ -345,6 +147,36 @@ def placed(surface: Surface, answer: QueryResult) -> QueryResult:
     smoothed = surface.smooth(values)
     place, box = locate(surface, smoothed, HALF * float(smoothed.max(initial=0)))
     return replace(answer, place=place, box=box)
+
+
+# Counting.
+
+
+@dataclass(frozen=True)
+class Number:
+    """How many single things an answer has, and how many it may have."""
+
+    best: int
+    least: int  # with a stricter cut
+    most: int  # with a wider one
+
+
+STRICT, WIDE = 0.25, 2.0  # of the way that an answer reaches
+
+
+def count_things(engine: QueryEngine, answer: QueryResult) -> Number:
+    """Return the number of single things in an answer, as `separate` tells them apart.
+
+    The range is that of the answers that would reach less far, or farther, below the best region.
+    """
+    fits = engine.scale.fit(answer.even)
+    best = float(fits[answer.members].max(initial=-np.inf))
+    least, most = (fits >= RULE.least_fit(best, share) for share in (STRICT, WIDE))
+    low, own, high = (
+        len(separate(engine.surface, inside[engine.surface.rows], engine.tree))
+        for inside in (least & answer.members, answer.members, most | answer.members)
+    )
+    return Number(own, min(low, own), max(high, own))
 
 
 # Answers to whole trees: each phrase is asked at its fitting level.
@@ -373,12 +205,14 @@ def run_phrase(
     viewpoint: Camera | None = None,
     progress: Progress = silent,
 ) -> ComposedResult:
-    """Answer a phrase as the grammar reads it; whole, as `QueryEngine.run` does, where it finds no structure,
-    or where only the whole phrase can be asked (of a phrasebook). level: of what is asked for; the things
-    that it is related to keep their own. viewpoint: from where "left of", "right of", "behind", "in front
-    of", "leftmost" and "rightmost" are said, and "nearest" and "farthest" where they are of nothing else.
-    Raises InputError as `grammar.parse` does and where a viewpoint is needed, EncoderError as
-    `QueryEngine.run`."""
+    """Answer a phrase as the grammar reads it.
+
+    It is asked whole, as `QueryEngine.run` does, where the grammar finds no structure, and where only the
+    whole phrase can be asked (of a phrasebook). level: of what is asked for; the things that it is related to
+    keep their own. viewpoint: from where "left of", "right of", "behind", "in front of", "leftmost" and
+    "rightmost" are said, and "nearest" and "farthest" where they are of nothing else. Raises InputError as
+    `grammar.parse` does and where a viewpoint is needed, EncoderError as `QueryEngine.run`.
+    """
     tree = parse(text, engine.taught)
     if not isinstance(tree, Atom):
         _check_viewpoint(tree, viewpoint)
@@ -398,8 +232,11 @@ def run_phrase(
 def check_phrase(
     engine: QueryEngine, text: str, viewpoint: Camera | None = None, progress: Progress = silent
 ) -> None:
-    """Raise what `run_phrase` would, without searching: for a phrase that names nothing, unknown words, an
-    encoder that cannot be loaded, a viewpoint that is needed. What was encoded for it is kept."""
+    """Raise what `run_phrase` would, without searching.
+
+    That is for a phrase that names nothing, unknown words, an encoder that cannot be loaded, and a viewpoint
+    that is needed. What was encoded for it is kept.
+    """
     tree = parse(text, engine.taught)
     if not isinstance(tree, Atom):
         _check_viewpoint(tree, viewpoint)
@@ -435,7 +272,7 @@ class _Asking:
         self._viewpoint = None if camera is None else viewpoint(camera, self._frame)
 
     def answer(self, tree: Phrase, level: LevelChoice = "auto") -> QueryResult:
-        """The answer to a tree; without a place, which only the last answer needs."""
+        """Return the answer to a tree; without a place, which only the last answer needs."""
         match tree:
             case Atom(text):
                 return self._thing(text, level)
@@ -463,7 +300,7 @@ class _Asking:
         return self._asked[key]
 
     def _thing(self, text: str, level: LevelChoice) -> QueryResult:
-        """The answer to a phrase; a thing is looked for among wholes, unless it is a part, or fits none."""
+        """Return the answer to a phrase; a thing is looked for among wholes, unless it fits none."""
         if level != "auto" or named(text) != "thing" or self.engine.is_taught(text):
             return self._ask(text, level)
         whole = self._ask(text, "whole")

@@ -138,9 +138,11 @@ def look_at_pixel(
     top: int = 3,
     settings: RasterSettings | None = None,
 ) -> Pointed | None:
-    """The surface that `camera` sees at `pixel` (column, row) of its image; None where that is mostly empty.
+    """Return the surface that `camera` sees at a pixel (column, row); None where that is mostly empty.
+
     Every Gaussian counts by its blending weight there; the surface is at the median of their depths, as the
-    rasterizers have it. `settings` of image formation: by default the scene's own."""
+    rasterizers have it. `settings` of image formation: by default the scene's own.
+    """
     scene = describer.engine.scene
     rows, weights = pixel_weights(scene, camera, pixel, rasterizer, settings)
     total = float(weights.sum())

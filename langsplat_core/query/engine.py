@@ -35,13 +35,13 @@ NO_FIELD = "this scene has no language field: it can be looked at, not searched;
 
 
 def no_field(scene: Scene) -> str:
-    """The reason why a scene has no language field."""
+    """Return the reason why a scene has no language field."""
     unread = [reason for reason in scene.unread if SUFFIX in reason]
     return f"it can be looked at, not searched: {unread[0]}" if unread else NO_FIELD
 
 
 def searchable(path: Path) -> Scene:
-    """The scene of a file; InputError where it has no language field."""
+    """Return the scene of a file; InputError where it has no language field."""
     scene = load_scene(path)
     if scene.language is None:
         raise InputError(f"{path}: {no_field(scene)}")
@@ -63,9 +63,12 @@ LoadEncoder = Callable[[str], TextEncoder]  # from a hub id, a folder or "demo";
 
 
 class QueryEngine:
-    """Queries against one scene. What depends on the scene alone is computed at the first query, and the text
-    encoder is loaded when a phrase first needs it. Several threads may ask at once, and take turns at the
-    encoder; none may call `compare_with` meanwhile."""
+    """Queries against one scene.
+
+    What depends on the scene alone is computed at the first query, and the text encoder is loaded when a
+    phrase first needs it. Several threads may ask at once, and take turns at the encoder; none may call
+    `compare_with` meanwhile.
+    """
 
     def __init__(
         self,
@@ -77,11 +80,14 @@ class QueryEngine:
         rule: AnswerRule = "regions",
         words: Words | None = None,
     ) -> None:
-        """load_encoder: usually `semantics.encoders.load_text_encoder`; without one only the scene's own
+        """Prepare queries against a scene; nothing is computed yet.
+
+        load_encoder: usually `semantics.encoders.load_text_encoder`; without one only the scene's own
         phrasebook can be asked. encoder_id: in place of the encoder that the scene names. exact: compare
-        every latent itself instead of its cell, to measure the cells by. rule: see `answers`;
-        "regions" becomes "peak" where neither scene nor encoder has everyday phrases to compare with. words:
-        taught ones of the user, before those of the scene; EncoderError where they are of another encoder."""
+        every latent itself instead of its cell, to measure the cells by. rule: see `answers`; "regions"
+        becomes "peak" where neither scene nor encoder has everyday phrases to compare with. words: taught
+        ones of the user, before those of the scene; EncoderError where they are of another encoder.
+        """
         self.scene = scene
         self.exact = exact
         self._rule: AnswerRule = rule
@@ -120,8 +126,10 @@ class QueryEngine:
 
     @property
     def calibration(self) -> Calibration | None:
-        """The calibration of probabilities; None where the encoder has none, and with other canonical phrases
-        than those it was fitted with."""
+        """The calibration of probabilities; None where the encoder has none.
+
+        Nor has it one with other canonical phrases than those that it was fitted with.
+        """
         usual = self._canonical is None and self.rule == "regions"
         return self.field.reading.calibration if usual else None
 
@@ -166,9 +174,11 @@ class QueryEngine:
             return None
 
     def compare_with(self, phrases: Sequence[str] = (), progress: Progress = silent) -> None:
-        """Take other canonical phrases (LERF, section 3.3: what everything is compared with) from now on;
-        none: the scene's own again. With others no probability is said, since it was calibrated on those.
-        Raises as `text_vectors` does, and leaves everything as it was then."""
+        """Take other canonical phrases from now on; without any, the scene's own again.
+
+        They are what everything is compared with (LERF, section 3.3). With others no probability is said,
+        since it was calibrated on those. Raises as `text_vectors` does, and leaves everything as it was then.
+        """
         canonical = self.text_vectors(phrases, progress) if phrases else None
         self._canonical = canonical
         self.canonical_phrases = tuple(map(phrase_key, phrases)) or CANONICAL_PHRASES
@@ -176,8 +186,10 @@ class QueryEngine:
             self.__dict__.pop(made, None)
 
     def load_encoder(self, progress: Progress = silent) -> TextEncoder:
-        """The text encoder, loaded at the first call, which imports torch: seconds. Raises EncoderError where
-        it cannot be loaded, or where the engine was given no way to."""
+        """Return the text encoder, loaded at the first call, which imports torch: seconds.
+
+        Raises EncoderError where it cannot be loaded, or where the engine was given no way to.
+        """
         with self._turn:
             if self._encoder is None:
                 if self._load_encoder is None:
@@ -230,22 +242,26 @@ class QueryEngine:
         return None if self.chance is None else bars_of(self.chance)
 
     def chance_among(self, members: Array) -> Bars:
-        """The best fits of everyday phrases at the regions of some Gaussians, (N,) bool."""
+        """Return the best fits of everyday phrases at the regions of some Gaussians, (N,) bool."""
         assert self.chance is not None
         everywhere = self.regions.everywhere[:, members]
         return bars_of(self.chance, [np.unique(row[row >= 0]) for row in everywhere])
 
     def unknown_words(self, phrase: str) -> tuple[str, ...]:
         """Words for which `phrase` cannot be asked; none where it was taught or the phrasebook has it.
-        EncoderError as `load_encoder` raises it."""
+
+        EncoderError as `load_encoder` raises it.
+        """
         if self.is_taught(phrase) or phrase_key(phrase) in self.field.phrasebook:
             return ()
         return self.load_encoder().unknown_words(phrase_key(phrase))
 
     def text_vector(self, phrase: str, progress: Progress = silent) -> Array:
-        """(D,) unit vector of a phrase: from the scene's phrasebook, else from the encoder. Raises InputError
-        for an empty phrase and one of stop words alone, UnknownWordError for words that the encoder was never
-        taught, and EncoderError for one that is not the scene's or cannot be loaded."""
+        """(D,) unit vector of a phrase: from the scene's phrasebook, else from the encoder.
+
+        Raises InputError for an empty phrase and one of stop words alone, UnknownWordError for words that the
+        encoder was never taught, and EncoderError for one that is not the scene's or cannot be loaded.
+        """
         return self.text_vectors([phrase], progress)[0]
 
     def text_vectors(self, phrases: Sequence[str], progress: Progress = silent) -> Array:
@@ -267,9 +283,11 @@ class QueryEngine:
     def known_vectors(
         self, phrases: Iterable[str], progress: Progress = silent
     ) -> tuple[tuple[str, ...], Array]:
-        """The `phrases` whose words the encoder was taught, each once as `phrase_key` has it, and their
-        (V, D) unit vectors: from the phrasebook, else encoded together. Raises EncoderError for an encoder
-        that is not the scene's, or one that cannot be loaded."""
+        """Return the `phrases` whose words the encoder was taught, each once, and their (V, D) vectors.
+
+        Phrases are as of `phrase_key`, vectors from the phrasebook, else encoded together. Raises
+        EncoderError for an encoder that is not the scene's, or one that cannot be loaded.
+        """
         keys = tuple(dict.fromkeys(map(phrase_key, phrases)))
         fresh = [key for key in self._fresh(keys) if not only(STOP_WORDS, key.split())]
         if fresh:
@@ -281,7 +299,7 @@ class QueryEngine:
         return known, self._vectors(known)
 
     def _fresh(self, keys: Iterable[str]) -> list[str]:
-        """The phrases that are neither in the phrasebook nor encoded yet, each once."""
+        """Return the phrases that are neither in the phrasebook nor encoded yet, each once."""
         book = self.field.phrasebook
         return [key for key in dict.fromkeys(keys) if key not in book and key not in self._encoded]
 
@@ -308,8 +326,11 @@ class QueryEngine:
             progress("reading the vocabulary", (start + len(batch)) / len(keys))
 
     def _check_encoder(self, encoder: TextEncoder) -> None:
-        """EncoderError unless `encoder` turns the canonical phrases into the vectors that the scene has for
-        them. Other weights would answer with noise, whatever their name."""
+        """Raise EncoderError unless `encoder` is the scene's.
+
+        It must turn the canonical phrases into the vectors that the scene has for them. Other weights would
+        answer with noise, whatever their name.
+        """
         if self._encoder_checked:
             return
         canonical = np.asarray(encoder.encode_texts(list(CANONICAL_PHRASES)), np.float64)
@@ -338,9 +359,12 @@ class QueryEngine:
         progress: Progress = silent,
         vector: Array | None = None,
     ) -> QueryResult:
-        """Answer `phrase`; a taught word by what was shown. The level is chosen once for the scene, on raw
-        relevancy, so that the image does not flicker between levels as the camera moves. vector: (D,) unit,
-        the phrase's own, where it is at hand. Raises as `text_vector` does."""
+        """Answer `phrase`; a taught word by what was shown.
+
+        The level is chosen once for the scene, on raw relevancy, so that the image does not flicker between
+        levels as the camera moves. vector: (D,) unit, the phrase's own, where it is at hand. Raises as
+        `text_vector` does.
+        """
         if vector is None and self.is_taught(phrase):
             return self._by_showing(self.taught[phrase_key(phrase)], level)
         if vector is None:
@@ -349,8 +373,10 @@ class QueryEngine:
         return self._answer(tidy(phrase), self.relevancy(vector), level)
 
     def run_many(self, phrases: Sequence[str], level: LevelChoice = "auto") -> list[QueryResult]:
-        """The answers of `run` to each of `phrases`, which are encoded and compared with the scene's features
-        together. An answer keeps 17 bytes per Gaussian. Raises as `text_vector` does, before any is asked."""
+        """Return the answers of `run` to each of `phrases`, which are encoded and compared together.
+
+        An answer keeps 17 bytes per Gaussian. Raises as `text_vector` does, before any is asked.
+        """
         plain = [phrase for phrase in phrases if not self.is_taught(phrase)]
         relevancies = self._relevancies(self.text_vectors(plain))
         return [
@@ -377,10 +403,13 @@ class QueryEngine:
         return phrase_key(phrase) in self.taught
 
     def teach(self, name: str, members: Array, level: LevelChoice = "auto") -> TaughtWord:
-        """Learn `name` for what `members` (N,) bool mean at a level, by default the one with a region most
-        like them. It answers from now on, in place of any text; a word that is taught again, at its own
-        level, has one example more. Nothing is written. Raises InputError for what is no name, members
-        without a meaning, and a word that is known at another level or by enough examples."""
+        """Learn `name` for the features of `members` (N,) bool at a level.
+
+        By default that is the level with a region most like them. The name answers from now on, in place of
+        any text; a word that is taught again, at its own level, has one example more. Nothing is written.
+        Raises InputError for what is no name, members without a feature, and a word that is known at another
+        level or by enough examples.
+        """
         tidied = tidy(name)
         unsayable = only(STOP_WORDS, phrase_key(name).split()) or split_phrases(name) != [tidied]
         if unsayable or len(tidied) > LONGEST_NAME or "," in tidied:
@@ -414,8 +443,11 @@ class QueryEngine:
         return by_showing(word, self.word_space, self.regions, self.scene.gaussians.means, level)
 
     def compare(self, phrase: str, vectors: Array, level: int) -> tuple[Array, Array]:
-        """Cosines (M,) of a phrase with (M, D) unit vectors of images, and their fits, in spreads; of a
-        taught word at a level (index into LEVELS), see `taught.compared`. Raises as `text_vector` does."""
+        """Return (M,) cosines of a phrase with (M, D) unit vectors of images, and their fits, in spreads.
+
+        Those of a taught word are at a level (index into LEVELS), see `taught.compared`. Raises as
+        `text_vector` does.
+        """
         if self.is_taught(phrase):
             return compared(self.taught[phrase_key(phrase)], self.word_space, vectors, level)
         cosines = vectors @ self.text_vector(phrase)
@@ -423,7 +455,7 @@ class QueryEngine:
         return cosines, self.scale.fit(relevancy_of(cosines, zero, rate))
 
     def instances(self, result: QueryResult, at_most: int | None = None) -> tuple[Instance, ...]:
-        """The things among the members of an answer, best first, or only so many of them."""
+        """Return the things among the members of an answer, best first, or only so many of them."""
         relevancy = result.relevancy[result.level]
         whole = len(LEVELS) - 1
         told = self.tree.voted(whole), result.level == whole
@@ -440,7 +472,7 @@ def check_words(field: LanguageField, words: Words) -> None:
 
 
 def same_vectors(canonical: Array, own: Array) -> bool:
-    """True if two sets of canonical vectors are of the same encoder."""
+    """Return whether two sets of canonical vectors are of the same encoder."""
     return canonical.shape == own.shape and bool(
         ((canonical.astype(np.float64) * own).sum(1) >= SAME_ENCODER).all()
     )

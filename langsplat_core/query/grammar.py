@@ -81,15 +81,17 @@ Phrase = Atom | Inside | Relation | Both | Union | Without | Superlative | Count
 
 
 def atoms(tree: Phrase) -> tuple[Atom, ...]:
-    """The phrases of a tree, in the order in which they are written."""
+    """Return the phrases of a tree, in the order in which they are written."""
     if isinstance(tree, Atom):
         return (tree,)
     return tuple(atom for child in children(tree) for atom in atoms(child))
 
 
 def heads(tree: Phrase) -> tuple[str, ...]:
-    """The words of what is asked for, without what that is related to: "mug" and "handle" of "mug or handle
-    of the cup"."""
+    """Return the words of what is asked for, without what that is related to.
+
+    "mug" and "handle" of "mug or handle of the cup".
+    """
     if isinstance(tree, Atom):
         return (tree.text,)
     asked = children(tree) if isinstance(tree, Both | Union) else children(tree)[:1]
@@ -97,7 +99,7 @@ def heads(tree: Phrase) -> tuple[str, ...]:
 
 
 def unparse(tree: Phrase) -> str:  # noqa: PLR0911  one row of a table each
-    """A tree as text, such as "handle  inside  red mug"; groups in a group stand in brackets."""
+    """Return a tree as text, such as "handle  inside  red mug"; groups in a group stand in brackets."""
     match tree:
         case Atom(text):
             return text
@@ -123,7 +125,7 @@ def _nested(tree: Phrase) -> str:
 
 
 def children(tree: Phrase) -> tuple[Phrase, ...]:
-    """The trees that a tree is made of."""
+    """Return the trees that a tree is made of."""
     values = (value if isinstance(value, tuple) else (value,) for value in vars(tree).values())
     return tuple(part for several in values for part in several if isinstance(part, Phrase))
 
@@ -188,7 +190,7 @@ OWNERS = _words(
 
 
 def forms(word: str) -> tuple[str, ...]:
-    """A word in lower case and what it may be the plural of."""
+    """Return a word in lower case and what it may be the plural of."""
     low = word.lower()
     return (low, low.removesuffix("s"), low.removesuffix("es"))
 
@@ -202,7 +204,7 @@ _ALWAYS_PLURAL = _words("scissors glasses jeans trousers headphones shorts pants
 
 
 def singular(word: str) -> str:
-    """The singular of an English noun; a word that is none already stays."""
+    """Return the singular of an English noun; a word that is none already stays."""
     low = word.lower()
     if low in _PLURALS or low in _ALWAYS_PLURAL:
         return _PLURALS.get(low, word)
@@ -213,13 +215,15 @@ def singular(word: str) -> str:
 
 
 def is_part(word: str) -> bool:
-    """True of a noun, in either number, that is a part of things."""
+    """Return whether a noun, in either number, is a part of things."""
     return not PARTS.isdisjoint(forms(word))
 
 
 def named(phrase: str) -> Named:
-    """Kind of what a phrase without structure names: "red mug" a thing, "red handle" and "keyboard" a part,
-    "mug handle" a part of a thing."""
+    """Return the kind of what a phrase without structure names.
+
+    "red mug" is a thing, "red handle" and "keyboard" are parts, "mug handle" is a part of a thing.
+    """
     *before, last = phrase.split() or [""]
     if not is_part(last):
         return "thing"
@@ -227,7 +231,7 @@ def named(phrase: str) -> Named:
 
 
 def only(words: frozenset[str], tokens: Sequence[str]) -> bool:
-    """True if all `tokens` are among `words`, whatever their case; so also of no tokens."""
+    """Return whether all `tokens` are among `words`, whatever their case; so also of no tokens."""
     return all(token.lower() in words for token in tokens)
 
 
@@ -299,9 +303,12 @@ _EXCLUSIONS = tuple(
 
 
 def parse(text: str, names: Collection[str] = ()) -> Phrase:
-    """The tree of one query. names: keys of phrases that are one name, whatever words they have. Raises
-    InputError where nothing is named, where something is only excluded ("not the cup"), and for a text beyond
-    `MAX_CHARACTERS` or `MAX_ATOMS`."""
+    """Return the tree of one query.
+
+    names: keys of phrases that are one name, whatever words they have. Raises InputError where nothing is
+    named, where something is only excluded ("not the cup"), and for a text beyond `MAX_CHARACTERS` or
+    `MAX_ATOMS`.
+    """
     if len(text) > MAX_CHARACTERS:
         raise InputError(f"a query of {len(text)} characters; use at most {MAX_CHARACTERS}")
     tokens = _with_names(tokens_of(text), names)
@@ -320,7 +327,7 @@ def parse(text: str, names: Collection[str] = ()) -> Phrase:
 
 
 def _with_names(tokens: list[str], names: Collection[str]) -> list[str]:
-    """The tokens, those of a name as one with no-break spaces, the longest name first."""
+    """Return the tokens, those of a name as one with no-break spaces, the longest name first."""
     at = 0
     longest = max((len(name.split()) for name in names), default=0)
     while at < len(tokens):
@@ -358,7 +365,7 @@ def _of_it(unwanted: Phrase, wanted: Phrase) -> Phrase:
 
 
 def _exclusion_at(tokens: list[str], at: int) -> int:
-    """Number of tokens of the exclusion that begins at token `at`; 0 for none."""
+    """Return number of tokens of the exclusion that begins at token `at`; 0 for none."""
     for words in _EXCLUSIONS:
         if tuple(token.lower() for token in tokens[at : at + len(words)]) == words:
             return len(words)
@@ -392,7 +399,7 @@ def _split(tokens: list[str], marks: tuple[str, ...]) -> list[list[str]]:
 
 
 def _names(tokens: list[str]) -> bool:
-    """True for words that name a thing: more than stop words and descriptions."""
+    """Return whether words name a thing: more than stop words and descriptions."""
     words = [token for token in tokens if token != ","]
     return not only(_EMPTY, words) or (bool(words) and words[-1].lower() in ALSO_NOUNS)
 
@@ -420,12 +427,12 @@ def _clause(tokens: list[str]) -> Phrase:
 
 
 def _digits(word: str) -> int:
-    """The number that a word writes in at most three digits; 0 for any other word."""
+    """Return the number that a word writes in at most three digits; 0 for any other word."""
     return int(word) if re.fullmatch("[0-9]{1,3}", word) else 0
 
 
 def _one_of(tree: Phrase) -> Phrase:
-    """The tree with what is asked for in the singular, since a mask shows one thing."""
+    """Return the tree with what is asked for in the singular, since a mask shows one thing."""
     match tree:
         case Atom(text):
             *before, last = text.split()
@@ -454,8 +461,7 @@ def _related(tokens: list[str]) -> Phrase:
 
 
 def _holds(tokens: list[str]) -> bool:
-    """True of a noun, in either number, that holds or counts what follows "of", with words that describe
-    it."""
+    """Return whether a noun, with words that describe it, holds or counts what follows "of"."""
     return not MEASURES.isdisjoint(forms(tokens[-1])) and only(_EMPTY, tokens[:-1])
 
 
@@ -473,6 +479,6 @@ def _thing(tokens: list[str]) -> Phrase:
 
 
 def _without_articles(tokens: list[str]) -> list[str]:
-    """The tokens without articles at the beginning, unless there is nothing else."""
+    """Return the tokens without articles at the beginning, unless there is nothing else."""
     first = next((at for at, token in enumerate(tokens) if token.lower() not in ARTICLES), 0)
     return tokens[first:]

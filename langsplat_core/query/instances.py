@@ -45,11 +45,13 @@ def axis_aligned_box(points: Array) -> Array:
 
 
 def oriented_box(points: Array) -> OrientedBox:
-    """Box around (M, 3) points, M >= 1, between the `INNER` quantiles along each of its axes. The axes begin
-    as the principal ones of the points that are no strays, and are then turned about one another to the least
-    area of the box's faces: principal axes alone say nothing about how a square, a cube or a round table top
-    with something on it lies. Where the points leave axes open (a single point, a line) they are some that
-    fit."""
+    """Box around (M, 3) points, M >= 1, between the `INNER` quantiles along each of its axes.
+
+    The axes begin as the principal ones of the points that are no strays, and are then turned about one
+    another to the least area of the box's faces: principal axes alone say nothing about how a square, a cube
+    or a round table top with something on it lies. Where the points leave axes open (a single point, a line)
+    they are some that fit.
+    """
     columns = np.ascontiguousarray(points.T, np.float64)
     low, high = axis_aligned_box(points)[..., None]
     core = columns[:, ((columns >= low) & (columns <= high)).all(0)]
@@ -87,14 +89,14 @@ def _turned(columns: Array, axes: Array) -> Array:
 
 
 def _widths(rows: Array) -> Array:
-    """(A, M) -> (A,) between the `INNER` quantiles of each row, to the nearest point."""
+    """Return (A, M) -> (A,) between the `INNER` quantiles of each row, to the nearest point."""
     low, high = (round(q * (rows.shape[1] - 1)) for q in INNER)
     rows.partition((low, high), axis=1)
     return rows[:, high] - rows[:, low]
 
 
 def _right_handed(axes: Array) -> Array:
-    """The same axes with settled signs: the largest entry of the first two is positive."""
+    """Return the same axes with settled signs: the largest entry of the first two is positive."""
     signs = np.sign(axes[np.abs(axes).argmax(0), range(3)])
     signs[2] = signs[0] * signs[1] * np.sign(np.linalg.det(axes))
     return axes * signs
@@ -144,8 +146,11 @@ class Instance:
 
 
 def told_apart(surface: Surface, numbers: Array, wholes: Array | None, join: bool) -> list[Array]:
-    """Divide the Gaussians `numbers` (K,) of a surface into single things. wholes: (N,) voted wholes, see
-    `Tree.voted`, which tell apart things that touch; join: what is of one whole is one, connected or not."""
+    """Divide the Gaussians `numbers` (K,) of a surface into single things.
+
+    wholes: (N,) voted wholes, see `Tree.voted`, which tell apart things that touch; join: what is of one
+    whole is one, connected or not.
+    """
     if wholes is None:
         return surface.parts(numbers)
     owner = wholes[surface.rows[numbers]]
@@ -165,10 +170,12 @@ def find_instances(
     wholes: Array | None = None,
     join: bool = False,
 ) -> tuple[Instance, ...]:
-    """The instances among `members` (N,) bool, best first by score, of equal ones the larger first.
+    """Return the instances among `members` (N,) bool, best first by score, of equal ones the larger first.
+
     relevancy: (N,) in [0, 1], at the level of the answer. wholes, join: see `told_apart`. at_most: only so
     many of the best. Crumbs are left out: parts of fewer than `CRUMB_COUNT` Gaussians on the surface, or of
-    less than `CRUMB_SHARE` of the largest part's extent. Where all are crumbs, the largest alone is kept."""
+    less than `CRUMB_SHARE` of the largest part's extent. Where all are crumbs, the largest alone is kept.
+    """
     every = np.flatnonzero(members)
     numbers = surface.anchors[every]
     near = numbers >= 0
@@ -194,7 +201,7 @@ def find_instances(
 
 
 def _ranked(scores: Array, extents: Array, counts: Array) -> Array:
-    """Indices of the parts that are not crumbs, best first."""
+    """Return the indices of the parts that are not crumbs, best first."""
     kept = np.flatnonzero((counts >= CRUMB_COUNT) & (extents >= CRUMB_SHARE * extents.max()))
     if len(kept) == 0:
         return np.array([int(extents.argmax())])
@@ -205,7 +212,7 @@ def _ranked(scores: Array, extents: Array, counts: Array) -> Array:
 def _instance(
     surface: Surface, own: Array, members: Array, relevancy: Array, score: float, share: float
 ) -> Instance:
-    """The thing with the Gaussians `own` on the surface; members: rows of these and of faint ones."""
+    """Return the thing with the Gaussians `own` on the surface; members: rows of these and of faint ones."""
     points, weights = surface.positions[own], surface.weights[own].astype(np.float64)
     weights /= weights.sum()
     return Instance(
@@ -219,8 +226,10 @@ def _instance(
 
 
 def _extent(gaussians: Gaussians, rows: Array) -> Array:
-    """(K,) float64: opacity times the largest cross-section. A volume would count flat Gaussians, which
-    surfaces are made of, as nothing."""
+    """(K,) float64: opacity times the largest cross-section.
+
+    A volume would count flat Gaussians, which surfaces are made of, as nothing.
+    """
     x, y, z = np.maximum(gaussians.log_scales[rows].astype(np.float64), _FLAT).T
     opacity = sigmoid(gaussians.opacity_logits[rows].astype(np.float64))
     return opacity * np.exp(x + y + z - np.minimum(np.minimum(x, y), z))
@@ -233,7 +242,7 @@ THICKNESS = 1e-3  # of the longest side: what is flatter than this is given it, 
 
 
 @dataclass(frozen=True, eq=False)
-class Mesh:
+class Hull:
     """Triangles that close around something."""
 
     name: str
@@ -242,10 +251,12 @@ class Mesh:
     colour: Array  # (3,) display values in [0, 1], of the whole
 
 
-def hull(instance: Instance, gaussians: Gaussians, colours: Array, name: str) -> Mesh:
-    """Hull around the instance's Gaussians that lie in its oriented box: strays would stretch it. colours:
-    (N, 3) of the scene's Gaussians, in [0, 1]; the mesh has the mean of its own. Raises InputError where all
-    lie at one point."""
+def hull(instance: Instance, gaussians: Gaussians, colours: Array, name: str) -> Hull:
+    """Hull around the instance's Gaussians that lie in its oriented box: strays would stretch it.
+
+    colours: (N, 3) of the scene's Gaussians, in [0, 1]; the mesh has the mean of its own. Raises InputError
+    where all lie at one point.
+    """
     box, rows = instance.oriented, instance.members
     means = gaussians.means[rows].astype(np.float64)
     inside = box.contains(means)
@@ -268,11 +279,11 @@ def hull(instance: Instance, gaussians: Gaussians, colours: Array, name: str) ->
     number[found.vertices] = np.arange(len(found.vertices))
     vertices = own[found.vertices]
     triangles = _outward(vertices, number[found.simplices], found.equations[:, :3])
-    return Mesh(name, box.centre + vertices @ box.axes.T, triangles, colours[rows[inside]].mean(0))
+    return Hull(name, box.centre + vertices @ box.axes.T, triangles, colours[rows[inside]].mean(0))
 
 
 def _outward(vertices: Array, triangles: Array, normals: Array) -> Array:
-    """The triangles, turned where they run against their outward `normals` (T, 3)."""
+    """Return the triangles, turned where they run against their outward `normals` (T, 3)."""
     a, b, c = vertices[triangles].transpose(1, 0, 2)
     inward = (np.cross(b - a, c - a) * normals).sum(1) < 0
     return np.where(inward[:, None], triangles[:, [0, 2, 1]], triangles)

@@ -61,8 +61,10 @@ class Regions:
         return spread
 
     def level_of(self, members: Array) -> int:
-        """Return the level with the region that overlaps most with `members` (N,) bool; the coarsest of equal
-        ones."""
+        """Return the level with the region that overlaps most with `members` (N,) bool.
+
+        Of equal ones that is the coarsest.
+        """
         best = []
         for of, sizes in zip(self.everywhere, self.sizes, strict=True):
             hits = np.bincount(of[members & (of >= 0) & (self.weights > 0)], minlength=len(sizes))

@@ -26,8 +26,10 @@ def of_rows(rows: Array, count: int) -> Array:
 
 
 def in_sphere(means: Array, centre: Array, radius: float) -> Array:
-    """(N, 3) -> (N,) bool: at most `radius` from `centre` (3,), world units. A mean that is not finite is
-    nowhere."""
+    """(N, 3) -> (N,) bool: at most `radius` from `centre` (3,), world units.
+
+    A mean that is not finite is nowhere.
+    """
     offsets = np.asarray(means, np.float64) - centre
     with np.errstate(invalid="ignore"):
         squares: Array = (offsets**2).sum(1)
@@ -41,15 +43,20 @@ def in_box(means: Array, low: Array, high: Array) -> Array:
 
 def above_plane(means: Array, normal: Array, offset: float) -> Array:
     """(N, 3) -> (N,) bool: on the side of a plane that its `normal` (3,) points to, itself included.
-    offset: of its points along the normal as it is given. A mean that is not finite is nowhere."""
+
+    offset: of its points along the normal as it is given. A mean that is not finite is nowhere.
+    """
     with np.errstate(invalid="ignore"):
         above: Array = np.asarray(means, np.float64) @ np.asarray(normal, np.float64) >= offset
         return above & np.isfinite(means).all(1)
 
 
 def at_point(surface: Surface, regions: Regions, level: int, point: Array) -> Array:
-    """(N,) bool: the whole region, at a level (index into LEVELS), of what lies nearest to `point` (3,),
-    world units, with the faint ones beside it. Nothing where the scene has no surface."""
+    """Return the (N,) bool region of what lies nearest to `point` (3,), world units.
+
+    It is the whole region at a level (index into LEVELS), with the faint Gaussians beside it. Nothing where
+    the scene has no surface.
+    """
     if len(surface.rows) == 0:
         return np.zeros(len(surface.anchors), bool)
     nearest = int(((surface.positions - point) ** 2).sum(1).argmin())
@@ -57,15 +64,17 @@ def at_point(surface: Surface, regions: Regions, level: int, point: Array) -> Ar
 
 
 def in_pixel(regions: Regions, level: int, rows: Array, weights: Array) -> Array:
-    """(N,) bool: the whole region, at a level, that paints most of a pixel, by the `rows` (M,) of Gaussians
-    in it and their blending weights. Nothing where no region does."""
+    """Return the (N,) bool region, at a level, that paints most of a pixel.
+
+    rows: (M,) Gaussians in the pixel; weights: (M,) blending weights. Nothing where no region does.
+    """
     of = regions.everywhere[level]
     shares = np.bincount(of[rows] + 1, weights, 1)[1:]
     return np.asarray(of == shares.argmax()) if shares.any() else np.zeros(len(of), bool)
 
 
 def grow(surface: Surface, selected: Array, distance: float) -> Array:
-    """`selected` and all that lies within `distance` of it along the surface, world units."""
+    """Return `selected` and all that lies within `distance` of it along the surface, world units."""
     if not 0 <= distance < float("inf"):
         raise InputError(f"a distance of {distance:g} cannot be walked along the surface; give 0 or more")
     reached = selected[surface.rows]
@@ -78,20 +87,22 @@ def grow(surface: Surface, selected: Array, distance: float) -> Array:
 
 
 def shrink(surface: Surface, selected: Array, distance: float) -> Array:
-    """`selected` without what lies within `distance` of the rest along the surface, world units. Where the
-    surface itself ends, nothing is lost."""
+    """Return `selected` without what lies within `distance` of the rest along the surface, world units.
+
+    Where the surface itself ends, nothing is lost.
+    """
     return ~grow(surface, ~selected, distance)
 
 
 def _with_reached(surface: Surface, selected: Array, reached: Array) -> Array:
-    """`selected` and every Gaussian at a `reached` (M,) point of the surface."""
+    """Return `selected` and every Gaussian at a `reached` (M,) point of the surface."""
     if len(reached) == 0:
         return selected.copy()
     return selected | (reached[surface.anchors] & (surface.anchors >= 0))
 
 
 def _lengths(surface: Surface) -> csr_matrix:
-    """The links of the surface, weighted by their lengths, world units."""
+    """Return the links of the surface, weighted by their lengths, world units."""
     links = surface.links
     source = np.repeat(np.arange(len(surface.rows)), np.diff(links.indptr))
     gaps = np.linalg.norm(surface.positions[source] - surface.positions[links.indices], axis=1)
@@ -136,10 +147,12 @@ def in_rectangle(seen: Projected, corner: Array, opposite: Array) -> Array:
 
 
 def in_polygon(seen: Projected, outline: Array) -> Array:
-    """(N,) bool: inside the closed `outline` (K, 2), pixels, by the even-odd rule; nothing for fewer than
-    three corners. What lies exactly on an edge may count either way. A ray from the centre to the right
-    crosses an odd number of edges (Shimrat 1962, Algorithm 112). Centres are sorted by height once, so that
-    an edge meets only those that are level with it."""
+    """Return (N,) bool: inside the closed `outline` (K, 2), pixels, by the even-odd rule.
+
+    Nothing is inside fewer than three corners. What lies exactly on an edge may count either way. A ray from
+    the centre to the right crosses an odd number of edges (Shimrat 1962, Algorithm 112). Centres are sorted
+    by height once, so that an edge meets only those that are level with it.
+    """
     outline = np.asarray(outline, np.float64)
     check_array("outline", outline, ("K", 2))
     inside = np.zeros(len(seen.depths), bool)
@@ -159,8 +172,10 @@ def in_polygon(seen: Projected, outline: Array) -> Array:
 
 
 def in_stroke(seen: Projected, path: Array, radius: float) -> Array:
-    """(N,) bool: at most `radius` pixels from the line through `path` (K, 2), pixels, K >= 1; of one place, a
-    disk. Between two places of a fast mouse there is no gap."""
+    """Return (N,) bool: at most `radius` pixels from the line through `path` (K, 2), pixels, K >= 1.
+
+    Of one place, that is a disk. Between two places of a fast mouse there is no gap.
+    """
     path = np.asarray(path, np.float64)
     check_array("path", path, ("K", 2))
     inside = np.zeros(len(seen.depths), bool)
@@ -184,10 +199,12 @@ def in_stroke(seen: Projected, path: Array, radius: float) -> Array:
 
 
 def on_surface(seen: Projected, depths: Array, size: tuple[int, int], behind: float = BEHIND) -> Array:
-    """(N,) bool: in the image and not hidden there: the depth of the centre is at most that of the surface in
-    its pixel and `behind` of it more. Where nothing is drawn, nothing hides. depths: (H, W) camera z of the
-    surface, world units, 0 where nothing is drawn; it may be coarser or finer than the `size` (width, height)
-    of the image that the centres were projected into."""
+    """Return (N,) bool: in the image and not hidden there.
+
+    The depth of the centre is at most that of the surface in its pixel and `behind` of it more. Where nothing
+    is drawn, nothing hides. depths: (H, W) camera z of the surface, world units, 0 where nothing is drawn; it
+    may be coarser or finer than the `size` (width, height) of the image that the centres were projected into.
+    """
     check_array("depths", depths, ("H", "W"))
     height, width = depths.shape
     columns, rows = np.floor(seen.pixels * (width / size[0], height / size[1])).T

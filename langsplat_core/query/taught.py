@@ -45,9 +45,11 @@ class WordSpace:
 
 
 def build_word_space(field: LanguageField, regions: Regions, votes: Array) -> WordSpace:
-    """The word space of a scene; that of all images where the scene keeps no everyday phrases. votes: (K,) of
-    the tree's nodes. Where masks voted, mean and rival are of those regions that have a vote: the others are
-    mostly fragments of walls and floors, many of one thing."""
+    """Return the word space of a scene; that of all images where the scene keeps no everyday phrases.
+
+    votes: (K,) of the tree's nodes. Where masks voted, mean and rival are of those regions that have a vote:
+    the others are mostly fragments of walls and floors, many of one thing.
+    """
     basis = np.eye(field.codec.vector_dim, dtype=np.float32)
     if field.everyday is not None and len(field.everyday) > 1:
         _, spreads, axes = np.linalg.svd(field.everyday - field.everyday.mean(0), full_matrices=False)
@@ -70,8 +72,10 @@ def build_word_space(field: LanguageField, regions: Regions, votes: Array) -> Wo
 def _means(
     field: LanguageField, basis: Array, level: int, of: Array, weights: Array, count: int
 ) -> tuple[Array, Array]:
-    """(count, W) means in a space of what sets of Gaussians mean, and (count,) bool, False for a set without
-    a meaning. of: (N,) number of each Gaussian's set, -1 for none; weights: (N,)."""
+    """Return the mean features of sets of Gaussians in a space, and whether each set has any.
+
+    They are (count, W) and (count,) bool. of: (N,) number of each Gaussian's set, -1 for none; weights: (N,).
+    """
     counted = field.known[level] & (of >= 0)
     totals = np.bincount(of[counted], weights[counted], count)
     sums = feature_sums(field, level, of, weights, count, partial(field.codec.cosines, vectors=basis))
@@ -81,8 +85,10 @@ def _means(
 def shown(
     space: WordSpace, field: LanguageField, regions: Regions, name: str, members: Array, level: int
 ) -> TaughtWord:
-    """The word for `members` (N,) bool at a level (index into LEVELS). Raises InputError where they mean
-    nothing, or nothing that tells them from the rest of the scene."""
+    """Return the word for `members` (N,) bool at a level (index into LEVELS).
+
+    Raises InputError where they mean nothing, or nothing that tells them from the rest of the scene.
+    """
     sets = np.where(members, 0, -1)
     (mean,), (known,) = _means(field, space.basis, level, sets, regions.weights, 1)
     vector = unit(mean - space.centres[level]) @ space.basis
@@ -94,8 +100,10 @@ def shown(
 
 
 def compared(word: TaughtWord, space: WordSpace, vectors: Array, level: int) -> tuple[Array, Array]:
-    """(M, D) unit vectors of images -> (M,) the largest cosine with an example at a level (index into
-    LEVELS), both in the word space, and (M,) the fits."""
+    """Return (M,) the largest cosine of images with an example, and (M,) the fits.
+
+    vectors: (M, D) unit, of images; cosines are in the word space, at a level (index into LEVELS).
+    """
     examples, bars = _examples(word, space)
     alike = unit(vectors @ space.basis.T - space.centres[level]) @ examples.T
     return alike.max(1), _fits(alike, bars[level])
@@ -114,8 +122,10 @@ def _fits(alike: Array, bar: Array) -> Array:
 
 
 def likeness(word: TaughtWord, space: WordSpace) -> tuple[list[Array], list[Array]]:
-    """Of each level the (R,) fits of the regions, and the (R,) `UNIT`s by which they are more like an example
-    than what is found has to be."""
+    """Return of each level the (R,) fits of the regions, and the (R,) margins above what is found.
+
+    A margin is by how many `UNIT`s a region is more like an example than what is found has to be.
+    """
     examples, bars = _examples(word, space)
     fits, above = [], []
     for row, bar in zip(space.regions, bars, strict=True):
@@ -128,8 +138,10 @@ def likeness(word: TaughtWord, space: WordSpace) -> tuple[list[Array], list[Arra
 def by_showing(
     word: TaughtWord, space: WordSpace, regions: Regions, means: Array, level: LevelChoice
 ) -> QueryResult:
-    """The answer to a taught word: the whole regions that are like one of its examples. At the level that was
-    shown unless another `level` is asked for. means: (N, 3) of the Gaussians."""
+    """Return the answer to a taught word: the whole regions that are like one of its examples.
+
+    At the level that was shown unless another `level` is asked for. means: (N, 3) of the Gaussians.
+    """
     chosen = word.level if level == "auto" else LEVELS.index(level)
     fits, above = likeness(word, space)
     every = [sigmoid(row) for row in fits]

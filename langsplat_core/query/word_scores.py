@@ -79,8 +79,11 @@ class WordScores:
         return total / total.sum()
 
     def best(self, codec: Codec, latents: Array, count: int) -> tuple[Array, Array]:
-        """Return the (M, count) numbers of the most probable phrases for (M, d) latents, the best first, and
-        their (M, count) float32 probabilities; fewer where the vocabulary has fewer."""
+        """Return the (M, count) numbers of the most probable phrases, the best first.
+
+        Beside them their (M, count) float32 probabilities; fewer columns where the vocabulary has fewer.
+        latents: (M, d).
+        """
         count = min(count, len(self.phrases))
         if count == 0:
             return np.empty((len(latents), 0), np.int32), np.empty((len(latents), 0), np.float32)
@@ -132,8 +135,11 @@ def _spread(field: LanguageField, vectors: Array, bank: Array) -> float:
 
 
 def field_features(field: LanguageField) -> Array:
-    """Return (B, D) float32 unit vectors: every codeword that some Gaussian has, or the features of evenly
-    spread Gaussians where there are no codewords."""
+    """Return (B, D) float32 unit vectors that the scene's Gaussians have.
+
+    Every codeword that one of them has, or the features of evenly spread Gaussians where there are no
+    codewords.
+    """
     latents, _ = field.codec.unique(field.latents[field.known])
     most = SAMPLES if field.codec.blends else BANK  # latents that are no numbers are all distinct features
     chosen = np.unique(np.linspace(0, len(latents) - 1, min(most, len(latents))).astype(np.int64))

@@ -18,10 +18,11 @@ from langsplat_core.arrays import Array
 from langsplat_core.extensions.benchmarks.measure import markdown
 from langsplat_core.extensions.benchmarks.report import intersection_over_union
 from langsplat_core.query.answers import QueryResult
-from langsplat_core.query.compose import Body, Viewpoint, body, most, run_phrase, stands, upright, viewpoint
+from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.grammar import EXTREMES, SIDES, atoms, parse
 from langsplat_core.query.inventory import InventoryEntry, scene_inventory
+from langsplat_core.query.relations import Body, Viewpoint, body, most, stands, upright, viewpoint
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.scene import LEVELS, Camera
 from tests.benchmarks.oracles import surface_points

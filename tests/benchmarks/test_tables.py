@@ -13,10 +13,10 @@ from assets.making.world import World, build_room, furnished
 from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.library.changes import Change
-from langsplat_core.query.compose import upright, viewpoint
 from langsplat_core.query.grammar import Atom
 from langsplat_core.query.grammar import parse as parse_phrase
 from langsplat_core.query.inventory import InventoryEntry, Spot
+from langsplat_core.query.relations import upright, viewpoint
 from langsplat_core.scene import Calibration, Odds, look_at
 from tests.benchmarks import answers
 from tests.benchmarks.__main__ import parse

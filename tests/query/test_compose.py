@@ -8,9 +8,10 @@ from hypothesis import strategies as st
 from langsplat_core.arrays import Array
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.query import grammar
-from langsplat_core.query.compose import Body, body, most, run_phrase, separate, stands, upright, viewpoint
+from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import Atom, Both, Counted, Inside, Relation, Superlative, Union, Without
+from langsplat_core.query.relations import Body, body, most, separate, stands, upright, viewpoint
 from langsplat_core.scene import NO_NODE, look_at
 from langsplat_core.scene.language import split_phrases
 from langsplat_core.scene.surface import build_surface

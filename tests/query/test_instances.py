@@ -226,13 +226,13 @@ def colours(n: int) -> Array:
     return np.tile([0.2, 0.4, 0.6], (n, 1))
 
 
-def volume(mesh: instances.Mesh) -> float:
+def volume(mesh: instances.Hull) -> float:
     """Positive where the triangles are turned outwards; a closed mesh is needed."""
     a, b, c = mesh.vertices[mesh.triangles].transpose(1, 0, 2)
     return float((np.cross(a, b) * c).sum() / 6)
 
 
-def check_closed(mesh: instances.Mesh) -> None:
+def check_closed(mesh: instances.Hull) -> None:
     edges = [(int(t[k]), int(t[(k + 1) % 3])) for t in mesh.triangles for k in range(3)]
     assert len(set(edges)) == len(edges)
     assert {(b, a) for a, b in edges} == set(edges)

@@ -20,9 +20,10 @@ from langsplat_core.errors import InputError, LangSplatError
 from langsplat_core.extensions.library.index import scenes_in
 from langsplat_core.progress import silent
 from langsplat_core.query.answers import QueryResult
-from langsplat_core.query.compose import body, count_things, gap, run_phrase, separate, upright
+from langsplat_core.query.compose import count_things, run_phrase
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import QueryEngine, searchable
+from langsplat_core.query.relations import body, gap, separate, upright
 from langsplat_core.raster.render import render
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.scene.camera import look_at
