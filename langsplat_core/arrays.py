@@ -36,26 +36,6 @@ def check_array(
     return dims
 
 
-def number(text: str) -> float:
-    """Return the number that a text states in the digits 0 to 9.
-
-    ValueError for the digits of other scripts and for 1_000, which Python reads and other programs do not,
-    and for what is no number.
-    """
-    return float(_plain(text))
-
-
-def whole_number(text: str) -> int:
-    """Return the whole number that a text states, with the limits of `number`."""
-    return int(_plain(text))
-
-
-def _plain(text: str) -> str:
-    if not text.isascii() or "_" in text:
-        raise ValueError(f"{text[:40]!r} is not written in the digits 0 to 9")
-    return text
-
-
 def sigmoid(x: Array) -> Array:
     """Logistic function, exact at +-infinity and free of overflow; dtype is kept."""
     x = np.asarray(x)

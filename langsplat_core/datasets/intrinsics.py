@@ -97,7 +97,7 @@ def signals_kept() -> Iterator[None]:
     yield
     if threading.current_thread() is threading.main_thread():
         for number in (signal.SIGTERM, signal.SIGABRT):
-            signal.signal(number, signal.getsignal(number))
+            signal.signal(number, signal.getsignal(number) or signal.SIG_DFL)
 
 
 @dataclass(frozen=True)

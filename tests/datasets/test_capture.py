@@ -55,7 +55,7 @@ def test_rounding_of_another_processor_changes_no_digest():
 
 
 @pytest.mark.parametrize("indices", [[0, 1], [1, 0, 2]])
-def test_other_views_or_another_world_change_it(indices: list[int]):
+def test_digest_changes_with_views_and_world(indices: list[int]):
     assert captured().digest(indices) != captured().digest([0, 1, 2])
     assert captured(1e-6).digest(indices) != captured().digest(indices)
 
@@ -63,7 +63,7 @@ def test_other_views_or_another_world_change_it(indices: list[int]):
 # Photographs beyond the limit lie in files, and are the same pictures.
 
 
-def test_what_memory_does_not_hold_is_filed_unchanged(tmp_path, monkeypatch):
+def test_album_files_images_unchanged_beyond_memory(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     pictures = np.random.default_rng(0).integers(256, size=(5, 6, 8, 3)).astype(np.uint8)
     album = Album(in_memory=2 * pictures[0].nbytes + 1)
@@ -73,7 +73,7 @@ def test_what_memory_does_not_hold_is_filed_unchanged(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []  # the files have no name: nothing is left behind
 
 
-def test_a_full_disk_is_said_and_not_a_dead_process(tmp_path, monkeypatch):
+def test_album_raises_where_the_disk_is_full(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     picture = np.zeros((60, 80, 3), np.uint8)
     for size in (0, picture.nbytes - 1):
@@ -157,7 +157,7 @@ def test_a_broken_photograph_is_left_out_and_named(
 
 
 @pytest.mark.parametrize("lens", [{}, {"k1": 0.2, "p2": 0.01}])
-def test_read_again_at_another_size_it_is_as_if_read_at_that(tmp_path: Path, lens: dict[str, float]) -> None:
+def test_read_at_gives_what_reading_at_that_size_gives(tmp_path: Path, lens: dict[str, float]) -> None:
     write_nerfstudio(tmp_path, **lens)
     write_picture(tmp_path / "masks/a.png", seed=1)
     large, small = (
@@ -248,26 +248,26 @@ def photo(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("around", [HERE, (-33.9, 18.4), (64.1, 179.9999), (0.01, -179.9999)])
-def test_a_way_in_metres_says_how_long_a_unit_is(around: tuple[float, float]) -> None:
+def test_scale_follows_from_places_along_a_walk(around: tuple[float, float]) -> None:
     found = metres_per_unit(located(walk(), 2.5), places_at(walk(), around))
     assert found == pytest.approx(2.5, rel=0.008)  # the earth is no sphere
 
 
-def test_an_arc_of_the_meridian_and_of_a_parallel() -> None:
+def test_ground_distances_follow_the_ellipsoid() -> None:
     """A degree at 45 degrees north is 111 132 m to the north and 78 847 m to the east (WGS 84)."""
     ground = on_the_ground(np.array([[45.0, 7.0], [45.001, 7.0], [45.0, 7.001]]))
     assert_allclose(ground, [[0, 0], [0, 111.132], [78.847, 0]], atol=2e-3)
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_places_that_err_by_less_than_the_way_is_long(seed: int) -> None:
+def test_scale_bears_noisy_places_on_a_long_walk(seed: int) -> None:
     noise = np.random.default_rng(seed).normal(scale=3.0, size=(40, 2))
     found = metres_per_unit(located(walk(), 2.5), places_at(walk() + noise))
     assert found == pytest.approx(2.5, rel=0.05)
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_around_a_thing_places_say_nothing(seed: int) -> None:
+def test_scale_is_unknown_where_places_are_noisier_than_the_walk(seed: int) -> None:
     """Two metres around a table, and places that err by four."""
     angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
     circle = 2 * np.stack([np.cos(angle), np.sin(angle)], 1)
@@ -275,7 +275,7 @@ def test_around_a_thing_places_say_nothing(seed: int) -> None:
     assert metres_per_unit(located(circle, 1.0), places_at(circle + noise)) is None
 
 
-def test_one_place_for_all_says_nothing() -> None:
+def test_scale_is_unknown_from_one_place() -> None:
     assert metres_per_unit(located(walk(), 1.0), places_at(0 * walk())) is None
     assert metres_per_unit(np.ones((9, 3)), places_at(walk(9))) is None
 
@@ -294,7 +294,7 @@ def test_the_place_of_a_photograph(photo: Path) -> None:
         ((47.0, 22.0, 1.0), "X"),
     ],
 )
-def test_what_is_no_place(photo: Path, latitude: object, north: str) -> None:
+def test_implausible_exif_places_are_unknown(photo: Path, latitude: object, north: str) -> None:
     assert all(map(math.isnan, place(photo)))
     assert all(map(math.isnan, place(tagged(photo, latitude, parts(8.0), (north, "E")))))
     photo.write_bytes(b"no photograph")

@@ -101,9 +101,7 @@ def test_a_capture_shows_what_its_cameras_see(tmp_path: Path, form: str, subfold
     assert not (tmp_path / "work").exists()  # nothing had to be computed
 
 
-def test_of_several_models_the_one_with_most_photographs_is_taken(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_model_with_most_photographs_is_taken(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     for name, views in (("0", 2), ("1", 4), ("2", 4), ("10", 3)):
         write_dataset(tmp_path, subfolder=f"sparse/{name}", views=views)
     (tmp_path / "sparse/other").mkdir()
@@ -135,7 +133,7 @@ def test_photographs_in_subfolders_keep_apart(tmp_path: Path) -> None:
     assert [camera.name for camera in capture.cameras] == ["left_0001", "right_0001"]
 
 
-def test_photographs_and_cameras_that_lack_each_other_are_told_of(
+def test_missing_photographs_and_cameras_are_warned_of(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     write_dataset(tmp_path)
@@ -174,9 +172,7 @@ def test_photographs_of_another_shape_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("tag", "turn"), [(6, Image.Transpose.ROTATE_90), (8, Image.Transpose.ROTATE_270)])
-def test_a_turned_photograph_is_turned_back_when_its_camera_is_upright(
-    tmp_path: Path, tag: int, turn: Image.Transpose
-) -> None:
+def test_photographs_are_turned_to_their_cameras(tmp_path: Path, tag: int, turn: Image.Transpose) -> None:
     write_dataset(tmp_path)
     want = load_capture(tmp_path, WHOLE, tmp_path / "work")
     exif = Image.Exif()
@@ -322,7 +318,7 @@ def write_ply(path: Path, columns: dict[str, Array]) -> None:
     PlyData([PlyElement.describe(rows, "vertex")]).write(path)
 
 
-def test_points_stay_in_the_cameras_world(tmp_path: Path) -> None:
+def test_applied_transform_changes_neither_points_nor_poses(tmp_path: Path) -> None:
     """An applied_transform is already in poses and points, so it must change neither."""
     rng = np.random.default_rng(0)
     points = rng.normal(size=(50, 3)).astype(np.float32)
@@ -341,9 +337,7 @@ def test_points_stay_in_the_cameras_world(tmp_path: Path) -> None:
     np.testing.assert_allclose(capture.cameras[0].world_to_camera, poses(3)[0], atol=1e-9)
 
 
-def test_points_that_are_not_there_are_named_in_short(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_missing_cloud_is_named_in_short(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_transforms(tmp_path, {**GLOBAL, "ply_file_path": "a" * 2000 + ".ply"})
     with caplog.at_level(logging.WARNING, "langsplat"):
         assert len(load(tmp_path).points) == 0
@@ -412,7 +406,7 @@ def test_the_real_dataset_with_missing_files(caplog: pytest.LogCaptureFixture) -
     assert all(image.mean() > 30 for image in capture.images)
 
 
-def test_a_dataset_may_say_how_long_its_unit_is_and_that_it_is_drawn(tmp_path: Path) -> None:
+def test_transforms_json_states_scale_and_drawn(tmp_path: Path) -> None:
     data = write_transforms(tmp_path, GLOBAL)
     assert load(tmp_path).metres_per_unit is None
     rewrite(tmp_path, {**data, "metres_per_unit": 0.5})
@@ -437,7 +431,7 @@ def test_a_dataset_may_say_how_long_its_unit_is_and_that_it_is_drawn(tmp_path: P
 # changed at random are tried by the fuzzer (tests/io/test_hostile.py).
 
 
-def test_what_is_no_dataset_is_refused_with_what_is(tmp_path: Path) -> None:
+def test_unknown_datasets_are_refused_with_known_kinds(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "scene.ply").write_bytes(b"ply")
     (tmp_path / "photo.jpg" / "inner").mkdir(parents=True)  # a folder that is called like a photograph
@@ -537,7 +531,7 @@ def test_a_broken_cloud_is_refused(tmp_path: Path, content: bytes) -> None:
 
 
 @pytest.mark.parametrize("name", [None, 3, "", "absent.ply", "."])
-def test_a_cloud_that_is_not_there_is_done_without(tmp_path: Path, name: object) -> None:
+def test_a_missing_cloud_is_replaced_by_random_points(tmp_path: Path, name: object) -> None:
     write_nerfstudio(tmp_path, ply_file_path=name)
     capture = load_capture(tmp_path, CONFIG, tmp_path / "work")
     assert len(capture.points) > 100  # random ones: a single view triangulates nothing

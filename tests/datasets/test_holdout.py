@@ -26,7 +26,7 @@ def walk(count: int) -> list[Camera]:
 
 
 @pytest.mark.parametrize(("count", "expected"), [(3, 0), (5, 0), (6, 1), (7, 1), (12, 2), (40, 5)])
-def test_about_one_in_eight_and_none_of_a_few(count, expected):
+def test_one_view_in_eight_is_held_out_of_enough(count, expected):
     for cameras in (ring(count), walk(count)):
         found = chosen(cameras, 8)
         assert len(found) == len(set(found)) == expected
@@ -49,12 +49,12 @@ def test_a_view_on_its_own_is_trained_on():
     assert not {0, 15} & set(found)
 
 
-def test_none_without_a_share_and_every_second_at_most():
+def test_held_out_share_is_bounded():
     assert chosen(ring(12), 0) == chosen(ring(12), 1) == []
     assert len(chosen(ring(12), 2)) <= 6
 
 
-def test_another_world_and_other_last_digits_choose_the_same():
+def test_held_out_views_survive_rounding_and_similarity():
     rng = np.random.default_rng(0)
     eyes = rng.normal(0, 2, (23, 3))
     cameras = [look_at(eye, rng.normal(0, 0.3, 3), UP, SIZE, 50.0) for eye in eyes]
@@ -73,7 +73,7 @@ def test_cameras_in_one_place_are_told_apart_by_direction():
     assert 2 <= found[0] <= 6
 
 
-def test_by_name_as_benchmarks_do():
+def test_every_eighth_view_by_name_is_held_out():
     cameras = tuple(replace(camera, name=f"v{k}") for k, camera in enumerate(ring(10)))
     images = tuple(np.zeros((SIZE[1], SIZE[0], 3), np.uint8) for _ in cameras)
     capture = Capture(cameras, images, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))

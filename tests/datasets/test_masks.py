@@ -83,7 +83,7 @@ def test_no_feature_is_sought_where_a_mask_is_black(tmp_path: Path) -> None:
     assert ends[1] < 121 < min(ends[0], ends[2])
 
 
-def test_what_is_masked_neither_trains_nor_counts() -> None:
+def test_masked_pixels_neither_train_nor_count() -> None:
     rng = np.random.default_rng(3)
     cameras = [
         look_at(np.array([x, 0, -3.0]), np.zeros(3), np.array([0, -1.0, 0]), (32, 24)) for x in (-1, 0, 1)

@@ -29,7 +29,7 @@ def test_groups_and_the_gaps_between_them():
     assert matches.why(4) == "matches only others that have no camera"
 
 
-def test_what_matches_but_too_little_is_joined_where_it_matches_most():
+def test_gaps_join_photographs_where_they_match_most():
     matches = graph(5, chain(range(4)) + [(1, 4, 20), (2, 4, 31), (3, 4, 3)], range(4))
     assert matches.gaps() == [(2, 4)]
     assert "without enough overlap" in matches.why(4)
@@ -41,7 +41,7 @@ def test_all_from_one_place_are_told_to_step_aside():
 
 
 @pytest.mark.parametrize("features", [0, 20, -1])
-def test_more_photographs_beside_blank_ones_help_nothing(features: int):
+def test_blank_photographs_are_no_gap(features: int):
     matches = graph(4, [], features=features)
     assert matches.gaps() == []
     assert "two thirds" in matches.advice()

@@ -73,7 +73,7 @@ def test_sharpness_falls_with_blur_and_stands_tiny_images():
     assert sharpness(av.VideoFrame.from_ndarray(np.zeros((2, 2, 3), np.uint8), format="rgb24")) == 0
 
 
-def test_a_work_folder_keeps_them_and_an_interrupted_run_leaves_nothing(clip: Path, tmp_path: Path) -> None:
+def test_work_folder_keeps_whole_sets_of_frames_alone(clip: Path, tmp_path: Path) -> None:
     work = tmp_path / "work"
     with pytest.raises(Cancelled):
         kept_frames(clip, 6, work, stop_at("taking photographs out of the video"))
@@ -104,7 +104,7 @@ def test_damaged_videos_end_in_a_line_or_give_what_can_be_read(clip: Path, tmp_p
 
 
 @pytest.mark.parametrize("content", [b"", b"no video at all" * 50])
-def test_what_is_no_video(content: bytes, tmp_path: Path) -> None:
+def test_other_files_are_no_videos(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "a.mp4").write_bytes(content)
     with pytest.raises(FormatError, match=r"a\.mp4: not a readable video"):
         extract_frames(tmp_path / "a.mp4", tmp_path / "out", 5)
@@ -112,7 +112,7 @@ def test_what_is_no_video(content: bytes, tmp_path: Path) -> None:
         extract_frames(tmp_path / "b.mp4", tmp_path / "out", 5)
 
 
-def test_nothing_is_written_over(clip: Path, tmp_path: Path) -> None:
+def test_frames_are_not_written_over(clip: Path, tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match="holds something already"):
         extract_frames(clip, tmp_path, 5)

@@ -155,7 +155,7 @@ def test_cameras_are_found_where_they_were(located) -> None:  # type: ignore[no-
     assert np.median(distance_to_room(room)) < 0.01
 
 
-def test_what_was_left_out_is_reported(located) -> None:  # type: ignore[no-untyped-def]
+def test_photographs_left_out_are_warned_of(located) -> None:  # type: ignore[no-untyped-def]
     _, _, _, messages = located
     assert any("aa_broken.jpg" in message and "cannot be read" in message for message in messages)
     (lost,) = [message for message in messages if "could not be located" in message]
@@ -282,7 +282,7 @@ def test_featureless_views_start_from_random_points(tmp_path: Path, caplog: pyte
     assert (found.colours == 90).all()
 
 
-def test_every_pair_of_few_photographs_and_a_linked_selection_of_many() -> None:
+def test_pairs_are_all_of_few_and_linked_ones_of_many() -> None:
     few = pairs_by_name([str(i) for i in range(5)])
     assert len(few) == len(set(few)) == 10
     many = pairs_by_name([f"{i:04d}" for i in range(400)])
@@ -335,7 +335,7 @@ def test_photographs_that_do_not_overlap_say_so(tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_each_photograph_that_has_no_camera_is_told_why(tmp_path: Path) -> None:
+def test_messages_say_why_a_photograph_has_no_camera(tmp_path: Path) -> None:
     """Black, tiny, alone, and one view taken three times."""
     (name,) = write_photos(tmp_path, LENS, poses(1))
     for copy in ("b.png", "c.png"):
@@ -391,7 +391,7 @@ def test_a_walk_straight_ahead_is_located(street: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("way", "found"), [(0, 0), (1, STEPS), (2, STEPS), (3, STEPS)])
-def test_every_way_gives_the_same_bytes_again(way: int, found: int, matched: Path, tmp_path: Path) -> None:
+def test_every_mapper_repeats_its_bytes(way: int, found: int, matched: Path, tmp_path: Path) -> None:
     """And the usual way is what does not find this street."""
     written = []
     for name in ("first", "second"):
@@ -425,7 +425,7 @@ def test_the_model_with_most_well_held_photographs_is_kept() -> None:
     assert reconstruction.best_model(None, [wobbly]) is None
 
 
-def test_of_models_about_as_good_the_first_is_kept() -> None:
+def test_best_model_keeps_the_first_of_equals() -> None:
     def erring(images: int, error: float) -> "pycolmap.Reconstruction":
         model = synthetic(images, 100)
         for point in model.points3D.values():
@@ -454,7 +454,7 @@ def test_structure_from_motion_runs_pycolmap_on_one_thread(tmp_path: Path) -> No
     (True, 700, False), (True, 210, True), (True, 2000, True),
     (False, 210, False), (False, 60, True), (False, 2000, False), (False, 5000, True),
 ])  # fmt: skip
-def test_a_focal_length_that_is_of_no_such_lens_tells_a_wrong_world(
+def test_models_with_implausible_focal_lengths_are_astray(
     prior: bool, focal: float, lost: bool, tmp_path: Path
 ) -> None:
     model = synthetic(4, 100)
@@ -480,7 +480,7 @@ def mostly_noise(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_below_half_is_refused_each_time_unless_told_otherwise(mostly_noise: Path, tmp_path: Path) -> None:
+def test_fewer_than_half_located_is_refused_unless_allowed(mostly_noise: Path, tmp_path: Path) -> None:
     for _ in range(2):  # the second time from what the first one kept
         with pytest.raises(InputError, match="only 4 of 9 photographs could be located") as caught:
             load_capture(mostly_noise, SMALL, tmp_path)
@@ -494,7 +494,7 @@ def test_below_half_is_refused_each_time_unless_told_otherwise(mostly_noise: Pat
     assert [len(group) for group in matches.groups] == [4, 1, 1, 1, 1, 1]
 
 
-def test_two_views_are_refused_although_they_are_half(
+def test_two_located_views_are_refused(
     mostly_noise: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """COLMAP may end with a first pair that nothing else was added to."""
@@ -516,7 +516,7 @@ def test_two_views_are_refused_although_they_are_half(
 
 
 @pytest.mark.parametrize("label", ["finding features", "matching photographs", "locating cameras"])
-def test_a_disk_that_another_program_fills_meanwhile(label: str, mostly_noise: Path, tmp_path: Path) -> None:
+def test_a_disk_that_fills_up_is_an_error_of_the_disk(label: str, mostly_noise: Path, tmp_path: Path) -> None:
     """pycolmap then aborts, or raises, wherever it is."""
     told = DatasetConfig(max_side=64, allow_few_cameras=True)
     with small_disk(tmp_path / "disk", ROOM + (16 << 20)) as disk:
@@ -534,7 +534,7 @@ def test_a_disk_that_another_program_fills_meanwhile(label: str, mostly_noise: P
         assert len(load_capture(mostly_noise, told, disk / "work")) == 4
 
 
-def test_a_model_that_was_cut_off_is_not_kept(tmp_path: Path) -> None:
+def test_truncated_models_are_not_kept(tmp_path: Path) -> None:
     """pycolmap writes what fits and says nothing."""
     model = synthetic(4, 100)
     (tmp_path / "whole").mkdir()
@@ -569,7 +569,9 @@ def on_film(path: Path) -> float | None:
 
 
 @pytest.mark.parametrize(("unit", "millimetres"), [(2, 25.4), (3, 10.0), (4, 1.0), (None, 25.4)])
-def test_a_sensor_counted_by_the_inch(unit: int | None, millimetres: float, tmp_path: Path) -> None:
+def test_focal_length_follows_from_pixels_per_inch(
+    unit: int | None, millimetres: float, tmp_path: Path
+) -> None:
     """A sensor 22.3 mm wide, of 4 to 3, 4000 pixels; the file was made smaller since."""
     tags: dict[int, float] = {FOCAL_TAG: 18.0, PLANE_X: 4000 / 22.3 * millimetres, WIDTH: 4000}
     if unit is not None:
@@ -589,11 +591,11 @@ def test_a_sensor_counted_by_the_inch(unit: int | None, millimetres: float, tmp_
         {FOCAL_TAG: 1e6, PLANE_X: 1e9},
     ],
 )
-def test_what_is_no_lens_is_left_out(tags: dict[int, float], tmp_path: Path) -> None:
+def test_implausible_exif_lenses_are_left_out(tags: dict[int, float], tmp_path: Path) -> None:
     assert on_film(photo(tmp_path / "a.jpg", tags)) is None
 
 
-def test_colmap_begins_with_it(tmp_path: Path) -> None:
+def test_colmap_starts_from_the_exif_focal_length(tmp_path: Path) -> None:
     """The database's camera, of photographs that were shrunk; where they were taken is not passed on."""
     for index in range(3):
         photo(tmp_path / f"{index}.jpg", {FOCAL_TAG: 18.0, PLANE_X: 4000 / 22.3 * 25.4, WIDTH: 4000})

@@ -66,14 +66,14 @@ def test_results_progress_and_messages_come_back(caplog: pytest.LogCaptureFixtur
 
 
 @pytest.mark.parametrize("error", [FormatError("no model"), OSError(28, "No space left", "/a"), Cancelled()])
-def test_what_is_raised_there_is_raised_here(error: Exception) -> None:
+def test_errors_of_the_process_are_raised(error: Exception) -> None:
     with pytest.raises(type(error)) as caught:
         apart.run(fail, error, progress=silent)
     assert caught.value.args == error.args
     assert str(caught.value) == str(error)
 
 
-def test_an_error_that_does_not_travel_says_the_same() -> None:
+def test_unpicklable_errors_keep_their_message() -> None:
     with pytest.raises(RuntimeError, match=r"PictureError: a\.png: not a readable picture \(cut off\)"):
         apart.run(fail, _Unpacked(), progress=silent)
 
@@ -95,7 +95,7 @@ def test_a_process_that_ends_early_is_an_error(number: int, said: str) -> None:
         apart.run(abort, number, progress=silent)
 
 
-def test_what_is_cancelled_ends_at_once(tmp_path: Path) -> None:
+def test_cancelled_work_ends_at_once(tmp_path: Path) -> None:
     def stop(_: Report) -> None:
         raise Cancelled
 
@@ -106,7 +106,7 @@ def test_what_is_cancelled_ends_at_once(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs /proc, and prctl(2) for native code")
 @pytest.mark.parametrize("busy", ["wait", "hold"])
-def test_it_ends_with_who_asked(busy: str, tmp_path: Path) -> None:
+def test_process_ends_with_its_caller(busy: str, tmp_path: Path) -> None:
     """Killed without a chance to tell."""
     code = (
         f"import sys, pathlib; from tests.io.test_apart import apart, silent, {busy};"

@@ -176,7 +176,7 @@ def trained(tmp_path, monkeypatch, scene, features):
     return tmp_path
 
 
-def test_the_command_draws_and_says_why(trained, capsys):
+def test_query_why_draws_a_sheet(trained, capsys):
     assert run("query", "a.ply", "mug", "book", "--why", "out.png", "--json") == 0
     mug, book = (answer["evidence"] for answer in json.loads(capsys.readouterr().out))
     assert (mug["for"], mug["against"], mug["phrase"]) == (5, 2, "mug")
@@ -194,7 +194,7 @@ def test_the_command_draws_and_says_why(trained, capsys):
 @pytest.mark.parametrize(
     "spoil", ["work", "mask", "truncated", "report", "list", "photographs", "photograph", "jpg"]
 )
-def test_what_is_missing_is_said_in_one_line(trained, capsys, spoil):
+def test_missing_masks_are_one_line(trained, capsys, spoil):
     work, out = trained / "a.work", "out.png"
     mask = work / "features" / "photo_3.features.npz"
     told = {
@@ -215,7 +215,7 @@ def test_what_is_missing_is_said_in_one_line(trained, capsys, spoil):
     assert not (trained / out).exists()
 
 
-def test_both_may_lie_elsewhere(trained, capsys):
+def test_evidence_reads_masks_and_photographs_elsewhere(trained, capsys):
     (trained / "a.work").rename(trained / "w")
     (trained / "photographs").rename(trained / "p")
     assert run("query", "a.ply", "mug", "--why", "out.png", "--work", "w", "--photographs", "p") == 0

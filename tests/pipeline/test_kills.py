@@ -124,7 +124,7 @@ def assert_same(folder: Path, whole: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["photographs", "COLMAP"])
 @pytest.mark.parametrize("how", ["killed", "signals"])
-def test_stopped_in_every_stage_it_ends_with_the_same_bytes(
+def test_training_stopped_in_every_stage_ends_with_the_same_bytes(
     how: str, kind: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
     """One run, stopped once in each stage at a random moment and begun again, against one that was not."""
@@ -155,7 +155,7 @@ def test_stopped_in_every_stage_it_ends_with_the_same_bytes(
 
 
 @pytest.mark.parametrize("kind", ["photographs", "COLMAP"])
-def test_a_disk_that_is_full_again_and_again(kind: str, tmp_path: Path) -> None:
+def test_training_resumes_after_full_disks(kind: str, tmp_path: Path) -> None:
     """In any stage. Each time the disk fills up it is made a little larger."""
     data, encoder = photographs(tmp_path / "data", kind), tmp_path / "encoder"
     tiny_clip(encoder)
@@ -176,7 +176,7 @@ def test_a_disk_that_is_full_again_and_again(kind: str, tmp_path: Path) -> None:
         assert_same(disk / "out", tmp_path / "whole")
 
 
-def test_photographs_that_change_while_it_is_stopped(tmp_path: Path) -> None:
+def test_photographs_changed_between_runs_are_trained_on(tmp_path: Path) -> None:
     """One is replaced between a stop in the last stages and the next run, which then ends as a
     training of what is there now."""
     data, encoder = photographs(tmp_path / "data", "COLMAP"), tmp_path / "encoder"

@@ -84,7 +84,7 @@ def report(held_out: Sequence[str], **fields: object) -> TrainReport:
     return TrainReport(**stated | fields)  # type: ignore[arg-type]
 
 
-def test_a_page_shows_every_view_held_out_ones_first_and_stands_alone(tmp_path: Path) -> None:
+def test_page_shows_held_out_views_first_and_needs_no_other_file(tmp_path: Path) -> None:
     names = [f"{number}{HOSTILE}" for number in range(8)]
     matches = Matches(tuple(names), (900,) * 8, ((0, 1, 80), (1, 2, 20), (5, 6, 3)), frozenset(range(7)))
     rehearsed = {"500 steps at 320 px": [24.61, 21.1], "1500 steps at 480 px": [24.0]}
@@ -122,7 +122,7 @@ def test_few_cameras_and_no_gaussians(count: int, tmp_path: Path) -> None:
     assert len(Read(tmp_path / PAGE).of("img")) == 2 * count
 
 
-def test_of_many_views_some_from_all_over_are_shown():
+def test_page_shows_evenly_spaced_views():
     chosen = from_all_over(range(1000), MOST_VIEWS)
     assert (len(chosen), chosen[0], chosen[-1]) == (MOST_VIEWS, 0, 999)
     assert from_all_over(range(3), 10) == [0, 1, 2]
@@ -138,7 +138,7 @@ def test_a_refusal_shows_its_groups(tmp_path: Path) -> None:
         assert words in page.text
 
 
-def test_photographs_that_do_not_match_end_in_a_line_that_names_the_page(tmp_path: Path) -> None:
+def test_refusal_of_unmatched_photographs_names_the_page(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     for index in range(3):
         noise = rng.integers(0, 256, (120, 160, 3), dtype=np.uint8)

@@ -26,7 +26,7 @@ HOLD = (
 )
 
 
-def test_a_second_one_is_told_who_is_there_and_a_dead_one_holds_nothing(tmp_path: Path) -> None:
+def test_lock_names_its_owner_and_expires_with_it(tmp_path: Path) -> None:
     work = tmp_path / "scene.work"
     with subprocess.Popen(
         [sys.executable, "-c", HOLD, str(work)], stdout=subprocess.PIPE, text=True
@@ -42,7 +42,7 @@ def test_a_second_one_is_told_who_is_there_and_a_dead_one_holds_nothing(tmp_path
             assert (work / LOCK).read_text().startswith(f"process {os.getpid()} ")
 
 
-def test_one_after_the_other_and_never_two_in_one_process(tmp_path: Path) -> None:
+def test_lock_excludes_a_second_training_in_one_process(tmp_path: Path) -> None:
     work = tmp_path / "c"
     for _ in range(2):
         with sole_use(work), pytest.raises(InputError, match="--work"), sole_use(work):
@@ -70,7 +70,7 @@ def test_every_item_is_shared_once(monkeypatch):
     assert join_processes() == ProcessGroup(0, 1)  # without a launcher
 
 
-def test_a_lost_process_is_said_in_one_line(monkeypatch):
+def test_barrier_names_a_lost_process(monkeypatch):
     def lost() -> None:
         raise RuntimeError("Connection closed by peer [127.0.0.1]:55\nmore")
 
@@ -79,7 +79,7 @@ def test_a_lost_process_is_said_in_one_line(monkeypatch):
         ProcessGroup(1, 2).barrier()
 
 
-def test_views_are_read_when_they_are_looked_at():
+def test_stored_views_read_features_on_access():
     pairs = make_views(3)
     views = StoredViews([camera for camera, _ in pairs], [features for _, features in pairs])
     assert len(views) == 3

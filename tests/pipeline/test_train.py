@@ -47,7 +47,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tiny_room(tmp_path_factory.mktemp("room"))
 
 
-def test_a_calibration_is_kept_in_drawn_rooms_alone(room, tmp_path):
+def test_training_keeps_a_calibration_for_drawn_rooms_alone(room, tmp_path):
     """Also by a work folder of earlier."""
     data, sidecar = tmp_path / "room", tmp_path / "scene.langsplat.safetensors"
     shutil.copytree(room, data)
@@ -105,7 +105,7 @@ def kept_results(work: Path) -> dict[str, int]:
     return {str(path): path.stat().st_mtime_ns for pattern in STAGES for path in sorted(work.glob(pattern))}
 
 
-def test_the_same_command_again_changes_nothing_and_repeats_no_stage(room, tmp_path, monkeypatch):
+def test_the_same_command_repeats_no_stage(room, tmp_path, monkeypatch):
     out = tmp_path / "scene.ply"
     first = train_scene(room, out, tiny_settings(room))
     kept = kept_results(tmp_path / "scene.work")
@@ -169,7 +169,7 @@ def test_more_steps_of_lifting_do_not_fit_the_codec_again(room, tmp_path):
 @pytest.mark.parametrize(
     "name", ["memberships-*/*.npy", "memberships-*/*.npz", "codec-*", "latents-*", "nodes-*"]
 )
-def test_a_damaged_result_is_one_line(room, tmp_path, name):
+def test_a_damaged_stage_ends_in_one_line(room, tmp_path, name):
     out, work = tmp_path / "scene.ply", tmp_path / "scene.work"
     train_scene(room, out, tiny_settings(room))
     damaged = sorted(work.glob(name))
@@ -182,7 +182,7 @@ def test_a_damaged_result_is_one_line(room, tmp_path, name):
 
 
 @pytest.mark.parametrize("mode", ["mean", "one-pass", "gradient"])
-def test_other_liftings(room, tmp_path, mode):
+def test_every_lifting_mode_trains(room, tmp_path, mode):
     linear = LinearConfig(latent_dim=8)
     config = replace(tiny_settings(room), lift=LiftConfig(mode=mode, steps=30), codec=linear)
     if mode != "mean":
@@ -210,7 +210,7 @@ def test_an_interrupted_run_leaves_no_scene_and_resumes(room, tmp_path, stage):
     assert load_scene(out).language is not None
 
 
-def test_what_cannot_be_used_is_said_before_anything_is_made(room, tmp_path):
+def test_unusable_arguments_are_refused_before_work(room, tmp_path):
     with pytest.raises(InputError, match=r"\*\.ply"):
         train_scene(room, tmp_path / "scene.splat", tiny_settings(room))
     absent = replace(tiny_settings(room), clip=ClipConfig(model=str(tmp_path / "nothing")))
@@ -256,7 +256,7 @@ def test_two_views_are_no_scene_unless_told_otherwise(room, tmp_path):
     assert train_scene(pair, tmp_path / "scene.ply", told).views == 1
 
 
-def test_a_trained_scene_is_given_a_meaning(room, tmp_path):
+def test_given_gaussians_are_described_and_not_trained(room, tmp_path):
     first = tmp_path / "trained.ply"
     train_scene(room, first, tiny_settings(room))
     again = tmp_path / "again.ply"
@@ -286,7 +286,7 @@ def test_profiles_are_defaults_that_options_override():
     assert other.config == replace(PAPER, codec=replace(PAPER.codec, latent_dim=8))
 
 
-def test_the_papers_profile_runs_whole(room, tmp_path, capsys):
+def test_paper_profile_runs(room, tmp_path, capsys):
     out = tmp_path / "scene.ply"
     options = ["--dataset.max-side", 64, "--dataset.test-every", 4, "--radiance.steps", 10]
     options += ["--masks.source", "graph", "--clip.model", room / "encoder", "--clip.device", "cpu"]
@@ -331,14 +331,14 @@ def retrained(data: Path, folder: Path, config: TrainConfig) -> None:
     assert scene_in(folder) == scene_in(folder / "fresh")
 
 
-def test_other_options_after_an_interruption(room: Path, tmp_path: Path) -> None:
+def test_changed_options_after_an_interruption_start_fresh_stages(room: Path, tmp_path: Path) -> None:
     config = tiny_settings(room)
     interrupted(room, tmp_path, config)
     radiance, dataset = replace(config.radiance, seed=7), replace(config.dataset, max_side=48)
     retrained(room, tmp_path, replace(config, radiance=radiance, dataset=dataset))
 
 
-def test_other_photographs_after_an_interruption(room: Path, tmp_path: Path) -> None:
+def test_changed_photographs_after_an_interruption_start_fresh_stages(room: Path, tmp_path: Path) -> None:
     data = tmp_path / "data"
     shutil.copytree(room, data)
     interrupted(data, tmp_path, tiny_settings(room))
@@ -350,7 +350,7 @@ def test_other_photographs_after_an_interruption(room: Path, tmp_path: Path) -> 
     retrained(data, tmp_path, tiny_settings(room))
 
 
-def test_everything_moved_after_an_interruption(room: Path, whole: dict[str, bytes], tmp_path: Path) -> None:
+def test_a_moved_work_folder_resumes(room: Path, whole: dict[str, bytes], tmp_path: Path) -> None:
     shutil.copytree(room, tmp_path / "here" / "data")
     interrupted(tmp_path / "here" / "data", tmp_path / "here", tiny_settings(room))
     (tmp_path / "here").rename(tmp_path / "there")
@@ -367,7 +367,9 @@ def test_everything_moved_after_an_interruption(room: Path, whole: dict[str, byt
 
 
 @pytest.mark.parametrize("year", YEARS)
-def test_a_clock_that_was_wrong(year: str, room: Path, whole: dict[str, bytes], tmp_path: Path) -> None:
+def test_resuming_ignores_dates_of_files(
+    year: str, room: Path, whole: dict[str, bytes], tmp_path: Path
+) -> None:
     """Nothing is decided by dates: files of long ago and of the future count as any."""
     data = tmp_path / "data"
     shutil.copytree(room, data)
@@ -386,9 +388,7 @@ def test_a_clock_that_was_wrong(year: str, room: Path, whole: dict[str, bytes], 
 @pytest.mark.parametrize(
     "surroundings", [{"HOME": "/nonexistent", "LANG": "C", "LC_ALL": "C"}, {"LANG": "xx_YY.nothing"}]
 )
-def test_questions_without_a_home_a_language_or_a_place_to_write(
-    surroundings: dict[str, str], tmp_path: Path
-) -> None:
+def test_query_needs_no_home_locale_or_writable_folder(surroundings: dict[str, str], tmp_path: Path) -> None:
     """The scene's folder and the file are read-only, and its name is not ASCII."""
     folder = tmp_path / "büro"
     folder.mkdir()

@@ -116,7 +116,7 @@ def test_weights_of_another_model_are_refused(tmp_path: Path) -> None:
         load_encoder(str(tmp_path), "cpu")
 
 
-def test_how_an_encoder_is_read_lies_beside_its_weights(tmp_path):
+def test_reading_json_is_read_beside_the_weights(tmp_path):
     tiny_clip(tmp_path)
     odds = {"constant": -1, "whole": 18.5, "finer": 2.5, "found": 0.7}
     stated = {"thing": odds, "part": {"constant": 0, "whole": 0, "finer": 9}, "inside": odds}
@@ -163,7 +163,7 @@ BROKEN_NORMALISATIONS = ("{", "[]", '{"image_mean": [0.5]}', '{"image_std": [0, 
         *(("preprocessor_config.json", "preprocessor_config.json", text) for text in BROKEN_NORMALISATIONS),
     ],
 )
-def test_a_broken_file_beside_the_weights_is_named(tmp_path, name, said, text):
+def test_broken_files_beside_weights_are_named(tmp_path, name, said, text):
     tiny_clip(tmp_path)
     (tmp_path / name).write_text(text, encoding="utf-8")
     with pytest.raises(EncoderError, match=re.escape(said)):
@@ -307,7 +307,7 @@ def taught(folder: Path) -> list[str]:
     return (folder / "vocabulary.txt").read_text(encoding="utf-8").split()
 
 
-def test_the_bundled_encoder_says_the_same_of_every_word_it_knows(measured) -> None:
+def test_bundled_encoder_in_numpy_agrees_with_torch(measured) -> None:
     words = taught(DEMO)
     phrases = [*words, *(f"{a} {b}" for a, b in zip(words, words[7:], strict=False)), "handle of the red mug"]
     tower = clip_text(Weights("demo", DEMO, "cpu"))
@@ -321,7 +321,7 @@ def test_the_bundled_encoder_says_the_same_of_every_word_it_knows(measured) -> N
 
 @pytest.mark.parametrize("activation", ["quick_gelu", "gelu"])
 @pytest.mark.parametrize("half", [False, True])
-def test_a_random_one_agrees_with_float64(tmp_path: Path, activation: str, half: bool) -> None:
+def test_random_weights_agree_with_float64(tmp_path: Path, activation: str, half: bool) -> None:
     tiny_clip(tmp_path, half)
     text_setting(hidden_act=activation)(tmp_path)
     tower = clip_text(Weights("tiny", tmp_path, "cpu"))
@@ -336,7 +336,7 @@ def test_a_random_one_agrees_with_float64(tmp_path: Path, activation: str, half:
     assert tower.dim == by_torch.dim == 24
 
 
-def test_an_end_token_numbered_as_of_old(tmp_path: Path) -> None:
+def test_legacy_end_tokens_are_understood(tmp_path: Path) -> None:
     """OpenAI's and OpenCLIP's configurations say 2, and mean the token with the highest number."""
     tiny_clip(tmp_path)
     text_setting(eos_token_id=2)(tmp_path)
@@ -359,7 +359,7 @@ NOT_PLAIN: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("case", NOT_PLAIN)
-def test_what_is_not_computed_here_is_left_to_torch(tmp_path: Path, case: str) -> None:
+def test_unknown_clip_configurations_are_left_to_torch(tmp_path: Path, case: str) -> None:
     tiny_clip(tmp_path)
     weights = Weights("tiny", tmp_path, "cpu")
     assert plain_text_tower(weights) is not None
@@ -379,7 +379,7 @@ def test_large_models_and_other_devices_are_left_to_torch(
 
 
 @pytest.mark.parametrize("plain", [True, False])
-def test_no_phrase_loses_words_in_silence(tmp_path: Path, plain: bool) -> None:
+def test_long_phrases_are_refused_and_not_cut(tmp_path: Path, plain: bool) -> None:
     """The tokenizer's token for what it cannot read is the one that ends a phrase."""
     tiny_clip(tmp_path)
     weights = Weights("tiny", tmp_path, "cpu")
@@ -440,7 +440,7 @@ def test_phrases_are_read_as_tokenizers_reads_them(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("place", ["normalizer", "pre_tokenizer", "post_processor"])
-def test_a_tokenizer_of_other_rules_is_not_read(tmp_path: Path, place: str) -> None:
+def test_tokenizers_of_other_rules_are_left_to_torch(tmp_path: Path, place: str) -> None:
     path = tmp_path / "tokenizer.json"
     spelled_bytes(path)
     change_json(path, lambda stated: stated.update({place: {"type": "Sequence"}}))

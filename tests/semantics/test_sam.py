@@ -143,7 +143,7 @@ def test_crops_are_those_of_the_public_code() -> None:
         assert boxes.max(axis=0).tolist() == [*boxes[:, :2].max(axis=0), shape[1], shape[0]]
 
 
-def test_a_mask_that_goes_on_outside_its_crop_is_not_taken() -> None:
+def test_masks_cut_by_their_crop_are_dropped() -> None:
     crop, shape = np.array([0, 0, 904, 724]), (1080, 1440)
     assert not sam.cut_by_crop(np.array([30, 30, 500, 500]), crop, shape)
     assert not sam.cut_by_crop(np.array([0, 0, 500, 500]), crop, shape)  # the picture itself ends there
@@ -385,7 +385,7 @@ def decoder_setting(folder: Path, **settings: float) -> None:
     change_json(folder / "config.json", lambda stated: stated["mask_decoder_config"].update(settings))
 
 
-def test_the_decoder_has_its_authors_norms_whatever_the_file_states(tmp_path: Path) -> None:
+def test_sam_decoder_norms_have_the_published_epsilon(tmp_path: Path) -> None:
     tiny_sam(tmp_path)
     answers = []
     for epsilon in (1e-6, 0.5):
@@ -396,7 +396,7 @@ def test_the_decoder_has_its_authors_norms_whatever_the_file_states(tmp_path: Pa
     assert torch.equal(answers[0][1], answers[1][1])
 
 
-def test_three_answers_are_put_in_order_of_size_for_each_point() -> None:
+def test_sam_2_masks_are_ordered_by_size_at_each_point() -> None:
     logits = -torch.ones(2, 3, 4, 4)
     for point, sizes in enumerate([(3, 1, 2), (2, 2, 1)]):
         for k, size in enumerate(sizes):
@@ -468,7 +468,9 @@ def test_half_the_digits_give_nearly_the_same_masks(
         assert (apart > 0).any()  # so it was rounded
 
 
-def test_what_float16_cannot_hold_is_asked_again(config: MaskConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_overflow_of_float16_is_computed_in_float32(
+    config: MaskConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(sam, "HALF_ON", "cpu")
     segmenter, asked = load_segmenter(config.sam, "cpu"), []
 

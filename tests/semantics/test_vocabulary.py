@@ -32,7 +32,7 @@ def test_bundled_lists_are_tidy(name):
     assert bundled_vocabulary(name) == tuple(lines)
 
 
-def test_a_file_is_read_as_people_write_it(tmp_path):
+def test_vocabulary_files_are_read_leniently(tmp_path):
     """A byte order mark, lines ended as on Windows, capitals, spaces, doubles, comments, other scripts."""
     path = tmp_path / "mine.txt"
     path.write_bytes("\ufeffRed  Mug\r\n# kitchen\r\n\r\n  cup \r\nred mug\r\nтарелка\r\n".encode())
@@ -50,7 +50,7 @@ def test_a_file_is_read_as_people_write_it(tmp_path):
         (b"# nothing\n\n", "is empty"),
     ],
 )
-def test_what_is_wrong_is_said_with_file_and_line(tmp_path, content, problem):
+def test_broken_vocabularies_are_named_by_file_and_line(tmp_path, content, problem):
     path = tmp_path / "mine.txt"
     path.write_bytes(content)
     with pytest.raises(InputError, match=re.escape(str(path)) + ".*" + re.escape(problem)):

@@ -31,7 +31,7 @@ PLAIN, WEIGHTS = "pytorch_model.bin", "model.safetensors"
 @pytest.mark.parametrize(
     ("make", "load"), [(tiny_clip, load_encoder), (tiny_clip, load_text_encoder), (tiny_sam, load_segmenter)]
 )
-def test_a_pickle_is_refused_in_a_line_and_not_run(write, make, load, tmp_path: Path, recwarn) -> None:  # type: ignore[no-untyped-def]
+def test_a_pickle_with_code_is_refused_and_not_run(write, make, load, tmp_path: Path, recwarn) -> None:  # type: ignore[no-untyped-def]
     folder = tmp_path / "model"
     folder.mkdir()
     make(folder)
@@ -48,7 +48,7 @@ def test_a_pickle_is_refused_in_a_line_and_not_run(write, make, load, tmp_path: 
     "content", [b"", b"\x80", b"not weights", bytes(8) + b"{}", b"PK\x03\x04" + bytes(40)]
 )
 @pytest.mark.parametrize("name", [PLAIN, WEIGHTS])
-def test_bytes_that_are_no_weights(content: bytes, name: str, tmp_path: Path) -> None:
+def test_bytes_that_are_no_weights_are_refused(content: bytes, name: str, tmp_path: Path) -> None:
     tiny_clip(tmp_path)
     (tmp_path / WEIGHTS).unlink()
     (tmp_path / name).write_bytes(content)
@@ -62,7 +62,7 @@ def setting(folder: Path, part: str, name: str, value: object) -> str:
     return str(folder)
 
 
-def test_a_configuration_that_contradicts_itself_is_named(tmp_path: Path) -> None:
+def test_a_contradictory_configuration_is_named(tmp_path: Path) -> None:
     tiny_clip(tmp_path)
     setting(tmp_path, "vision_config", "num_attention_heads", 7)  # of a width of 32
     with pytest.raises(EncoderError, match="multiple of the number of attention heads"):
@@ -114,7 +114,7 @@ def test_a_configuration_of_other_sizes_is_refused(
         assert str(caught.value).startswith(str(tmp_path))
 
 
-def test_a_configuration_that_only_asking_shows_to_be_wrong_is_named(tmp_path: Path) -> None:
+def test_asking_names_a_configuration_that_does_not_fit(tmp_path: Path) -> None:
     tiny_clip(tmp_path / "clip")
     encoder = load_encoder(setting(tmp_path / "clip", "text_config", "eos_token_id", None))
     with pytest.raises(EncoderError, match=r"the encoder: cannot be asked; does config\.json belong to it"):

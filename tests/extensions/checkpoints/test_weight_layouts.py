@@ -300,7 +300,7 @@ def test_heads_of_a_wide_model_without_configuration(tmp_path: Path) -> None:
     compare((tmp_path / "quickgelu.pt", 16, 2, True, None), tensors)
 
 
-def test_what_lies_beside_does_not_stand_in_for_a_file(tmp_path: Path) -> None:
+def test_a_named_file_wins_over_its_folder(tmp_path: Path) -> None:
     tensors = open_clip_tensors()
     tiny_clip(tmp_path)  # another model, of which a tokenizer will be replaced
     (tmp_path / "tokenizer.json").unlink()
@@ -310,7 +310,7 @@ def test_what_lies_beside_does_not_stand_in_for_a_file(tmp_path: Path) -> None:
     assert folder.image_size == load_encoder(str(tmp_path), "cpu").image_size == 32
 
 
-def test_without_its_tokenizer_a_clip_says_which_file_to_put_beside(tmp_path: Path) -> None:
+def test_a_missing_tokenizer_names_the_file_to_add(tmp_path: Path) -> None:
     path = training_checkpoint(tmp_path, open_clip_tensors())[0]
     with pytest.raises(EncoderError, match=r"put tokenizer\.json there.*openai/clip-vit-base-patch32"):
         load_text_encoder(str(path))
@@ -412,7 +412,7 @@ def test_tensors_of_no_model_known_are_named(make, change, load, tmp_path: Path)
     refusal(load, tmp_path / "model.pt")
 
 
-def test_a_mobile_sam_is_told_what_to_take_in_its_place(tmp_path: Path) -> None:
+def test_mobile_sam_is_refused_with_alternatives(tmp_path: Path) -> None:
     encoder = {"image_encoder.patch_embed.seq.0.c.weight": torch.zeros(32, 3, 3, 3)}
     tensors = sam_checkpoint(tmp_path).items()
     decoder = {name: tensor for name, tensor in tensors if not name.startswith("image_encoder")}
@@ -421,7 +421,7 @@ def test_a_mobile_sam_is_told_what_to_take_in_its_place(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("load", [load_encoder, load_segmenter])
-def test_damaged_files_are_named_and_run_nothing(load: Callable[[str], object], tmp_path: Path) -> None:
+def test_damaged_weights_are_named_and_run_nothing(load: Callable[[str], object], tmp_path: Path) -> None:
     whole = tmp_path / "whole.pt"
     torch.save(open_clip_tensors(), whole)
     for name, content in (("a.pt", whole.read_bytes()[:-900]), ("b.pth", b""), ("c.safetensors", b"\x08{}")):
