@@ -112,7 +112,7 @@ def test_weights_of_another_model_are_refused(tmp_path: Path) -> None:
     with pytest.raises(EncoderError, match="6 do not fit, such as"):
         load_encoder(str(tmp_path), "cpu")
     config.write_text(text.replace('"num_hidden_layers": 2', '"num_hidden_layers": 3'), encoding="utf-8")
-    with pytest.raises(EncoderError, match="num_hidden_layers is 3, its weights have 2"):
+    with pytest.raises(EncoderError, match=r"16 do not fit, such as .*layers\.2"):
         load_encoder(str(tmp_path), "cpu")
 
 
