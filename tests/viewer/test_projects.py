@@ -81,6 +81,7 @@ def test_everything_comes_back(opened, saved, again):
         if part.name not in ("moves", "keyframes"):  # of arrays
             assert getattr(after.session, part.name) == getattr(before.session, part.name), part.name
     np.testing.assert_allclose(after.view.eye, before.view.eye, atol=1e-9)
+    assert after.view.intrinsics == before.view.intrinsics
     np.testing.assert_allclose(after.view.target, before.view.target, atol=1e-6)
     assert len(after.session.keyframes) == 1
     assert settings.take_wanted_panel(again) == ""

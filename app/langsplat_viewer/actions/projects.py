@@ -99,6 +99,7 @@ def save_project(viewer: Viewer, folder: Path = Path()) -> Path | None:
         gaussians=len(state.scene.gaussians),
         view=Bookmark("view", pose_of(state.view), state.view.distance),
         session=state.session,
+        intrinsics=state.view.intrinsics,
         panels=state.preferences.panels or (),
     )
     answers = [_answer(state, query) for query in state.session.queries]
@@ -167,7 +168,8 @@ def restore(viewer: Viewer, project: Project, path: Path) -> None:
         viewer.say_error(f"{path}: its transforms are left out: {one_line(error)}")
         take_session(viewer, replace(session, moves=()))
     assert state.extent is not None
-    state.view = bookmarked_view(project.view, state.extent)
+    view = bookmarked_view(project.view, state.extent)
+    state.view = view if project.intrinsics is None else replace(view, intrinsics=project.intrinsics)
     state.saved, state.project = state.session, path
     state.preferences = with_recent(state.preferences, path)
     if project.panels:

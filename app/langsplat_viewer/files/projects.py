@@ -24,7 +24,7 @@ from langsplat_core.errors import FormatError, InputError, printable_line, quote
 from langsplat_core.io.cameras import is_rotation, numbers
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import read_json_file
-from langsplat_core.scene import FARTHEST
+from langsplat_core.scene import FARTHEST, Intrinsics
 from langsplat_core.scene.transform import similarity
 from langsplat_viewer.camera.flight import FOV_LIMITS, LONGEST, SAME_TIME, SPAN_LIMITS, Flight, Keyframe, Pose
 from langsplat_viewer.session import LONGEST_NOTE, MOST_BOOKMARKS, SLOTS, Bits, Bookmark, Phrase, Session
@@ -265,7 +265,7 @@ def read_queries(path: Path) -> QuerySet:
 # {"format": "langsplat-project", "version": 2,
 #  "scene": "room.ply",     from the project's folder, or absolute
 #  "gaussians": 81288,      that it has; of another number marks, moves and names are not taken
-#  "view": {...},           as a bookmark
+#  "view": {...},           as a bookmark, and "intrinsics"
 #  "panels": ["Search"],    that are open
 #  "session": {...},        the fields of `Session`. Masks are a bit for each Gaussian, zlib, base64
 #  "answers": [...]}        of the queries, for other programs; it is not read
@@ -281,6 +281,7 @@ class Project(msgspec.Struct):
     gaussians: Annotated[int, Meta(ge=0, le=1_000_000_000)]
     view: Bookmark
     session: Session
+    intrinsics: Intrinsics | None = None  # of the view, where the field of view does not say all
     panels: Annotated[tuple[str, ...], Meta(max_length=100)] = ()
     version: int = VERSION
 
@@ -310,6 +311,8 @@ def read_project(path: Path) -> Project:
         count = top["gaussians"] if isinstance(top["gaussians"], int) else 0
         project: Project = _converted(top, Project, min(max(count, 0), 1_000_000_000))
         _check_pose(project.view.pose)
+        if project.intrinsics is not None:
+            _check_pose(replace(project.view.pose, fov_degrees=project.intrinsics.fov_degrees))
         project.session = _checked(project.session)
         project.scene = os.path.abspath(path.parent / project.scene)
         return project
