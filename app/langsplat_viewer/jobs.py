@@ -14,6 +14,7 @@ from queue import SimpleQueue
 from typing import Any, TypeVar
 
 from langsplat_core.errors import LangSplatError
+from langsplat_core.interrupts import handled
 from langsplat_core.progress import Cancelled, Progress, Report
 
 _ARENA_MAX = -8  # M_ARENA_MAX of malloc.h
@@ -57,17 +58,13 @@ def on_signals(wake: Callable[[], None]) -> Iterator[list[int]]:
         while reader.recv(1):
             wake()
 
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    for number in before:
-        signal.signal(number, lambda number, frame: caught.append(number))
     old = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
     threading.Thread(target=listen, name="langsplat-signals", daemon=True).start()
     try:
-        yield caught
+        with handled(lambda number, frame: caught.append(number)):
+            yield caught
     finally:
         signal.set_wakeup_fd(old)
-        for number, handler in before.items():
-            signal.signal(number, handler)
         writer.close()
 
 

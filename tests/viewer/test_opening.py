@@ -137,7 +137,7 @@ def test_a_display_of_answers_comes_back_after_a_scene_without_and_no_arrays_are
 
 def test_camera_and_queries_of_each_are_found_again(three):
     assert (three.state.scene, three.state.scenes) == (SCENES["blobs.ply"], (BLOBS, PLAIN, BARE))
-    assert settings.take_wanted_panel(three) == "Scene"
+    assert settings.take(three.state, "wanted_panel") == "Scene"
     ask(three, "mug", "book")
     act(queries.set_canonical, three, ("plant",))
     queries.hide(three, "mug")

@@ -84,8 +84,8 @@ def test_every_panel_can_be_opened_by_a_command(viewer):
     for title in PANEL_TITLES:
         (command,) = matching(f"panel: {title}")
         command.act(viewer)
-        assert settings.take_wanted_panel(viewer) == title
-    assert settings.take_wanted_panel(viewer) == ""
+        assert settings.take(viewer.state, "wanted_panel") == title
+    assert settings.take(viewer.state, "wanted_panel") == ""
     assert matching("") == list(COMMANDS)
     assert [command.act for command in matching("OPENING view")] == [viewpoint.reset_view]
     assert matching("make coffee") == []

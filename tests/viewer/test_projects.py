@@ -84,7 +84,7 @@ def test_everything_comes_back(opened, saved, again):
     assert after.view.intrinsics == before.view.intrinsics
     np.testing.assert_allclose(after.view.target, before.view.target, atol=1e-6)
     assert len(after.session.keyframes) == 1
-    assert settings.take_wanted_panel(again) == ""
+    assert settings.take(again.state, "wanted_panel") == ""
     assert after.shows_panels == ("Search", "Notes")
     assert not after.is_unsaved
     assert (before.preferences.recent[0], after.preferences.recent[0]) == (str(saved), str(saved))
@@ -305,7 +305,7 @@ def test_a_note_is_pinned_to_what_is_selected(opened):
     selecting.take(opened, blob("book"))
     projects.pin_to_selection(opened)
     np.testing.assert_allclose(opened.state.session.notes[0].at, CENTRES[1], atol=0.1)
-    assert settings.take_wanted_panel(opened) == "Notes"
+    assert settings.take(opened.state, "wanted_panel") == "Notes"
     assert [projects.take_fresh_note(opened, opened.state.session.notes[0]) for _ in range(2)] == [
         True,
         False,

@@ -12,7 +12,7 @@ from langsplat_core.display.displays import NO_HEAT, Subject, relevancies
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.scene import CANONICAL_PHRASES, Reading
 from langsplat_core.semantics.store import ImageFeatures
-from langsplat_viewer.actions import browsing, editing, queries
+from langsplat_viewer.actions import browsing, editing, queries, settings
 from langsplat_viewer.files.projects import read_queries, write_queries
 from langsplat_viewer.headless import answer_line
 from langsplat_viewer.marks import BINS
@@ -137,8 +137,8 @@ def test_search_box_takes_the_keyboard_once(opened):
     opened.state.show_panel = False
     queries.focus_search(opened)
     assert opened.state.show_panel
-    assert queries.take_search_focus(opened)
-    assert not queries.take_search_focus(opened)
+    assert settings.take(opened.state, "focus_input")
+    assert not settings.take(opened.state, "focus_input")
 
 
 @pytest.mark.parametrize(("logit", "verdict"), [(9.0, "found"), (1.0, "weak match"), (-3.0, "not here")])

@@ -230,7 +230,10 @@ def test_the_command_on_the_clipboard_draws_the_same_picture(opened, folder, run
         ask(opened, "mug", "plant", "book")
     set_it(opened)
     command = filming.copy_command(opened, folder)
-    assert [filming.take_clipboard(opened), filming.take_clipboard(opened)] == [command, ""]
+    assert [
+        settings.take(opened.state.record, "clipboard"),
+        settings.take(opened.state.record, "clipboard"),
+    ] == [command, ""]
     written = [path.suffix for path in folder.iterdir() if path.is_file()]
     assert written == ([] if case == "training camera" else [".json"])
     expected = render_image(opened.state.request(), "cpu")

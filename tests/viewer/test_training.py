@@ -70,7 +70,7 @@ def test_a_folder_of_photographs_becomes_a_scene_that_opens(viewer, folder, begi
     browsing.open_dropped(viewer, [folder])
     form = viewer.state.training_form
     assert (form.dataset, form.out) == (str(folder), str(folder.with_suffix(".ply")))
-    assert settings.take_wanted_panel(viewer) == "Train"
+    assert settings.take(viewer.state, "wanted_panel") == "Train"
     begin(GOOD, "blobs.ply")
     progress = viewer.training.progress
     finish(viewer)

@@ -304,12 +304,6 @@ def copy_command(viewer: Viewer, folder: Path = Path()) -> str:
     return state.record.clipboard
 
 
-def take_clipboard(viewer: Viewer) -> str:
-    """Return what is put on the clipboard now, "" for nothing; once."""
-    text, viewer.state.record.clipboard = viewer.state.record.clipboard, ""
-    return text
-
-
 def _training_camera(state: ViewerState) -> str | None:
     """Return the number of the training camera whose view it is, exactly, with perspective or without."""
     if state.view is None or state.scene is None or state.extent is None:

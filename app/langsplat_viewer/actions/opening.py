@@ -17,7 +17,7 @@ from langsplat_core.query.engine import no_field
 from langsplat_core.scene import Camera, Scene, surface
 from langsplat_viewer.actions import viewpoint
 from langsplat_viewer.actions.editing import adopt
-from langsplat_viewer.actions.selecting import leave, set_tools
+from langsplat_viewer.actions.selecting import leave
 from langsplat_viewer.actions.settings import set_split
 from langsplat_viewer.actions.viewpoint import opening_view, read_bookmarks
 from langsplat_viewer.camera.controls import Extent, OrbitCamera, extent_of
@@ -53,25 +53,17 @@ def open_scene(
     The scene shown so far stays until the new one is there, and for good if that fails; what was deleted in
     it and not saved is asked about first. `check` raises InputError for a scene that is not to be shown.
     """
-    leave(viewer, lambda viewer: _open(viewer, path, then, check), f"{path.name} is opened")
 
-
-def _open(viewer: Viewer, path: Path, then: Callable[[Viewer], None], check: Callable[[Scene], None]) -> None:
-    cancel(viewer)
-    viewer.state.opening = path
-    backend = viewer.state.backend
-
-    def work(progress: Progress) -> _Opened:
+    def load(progress: Progress) -> _Opened:
         progress(f"opening {path.name}", 0.1)
         read = stamps(scene_files(path))
         scene = viewer.services.load_scene(path)
         check(scene)
         progress(f"preparing {path.name}", 0.6)
-        viewer.services.warm_up(scene, backend, progress)
+        viewer.services.warm_up(scene, viewer.state.backend, progress)
         progress(f"preparing {path.name}", 0.9)
-        unusable = scene.gaussians.invalid_rows()
         warnings = stated_warnings(path, len(scene.gaussians))
-        return _Opened(scene, unusable, extent_of(scene), read, warnings)
+        return _Opened(scene, scene.gaussians.invalid_rows(), extent_of(scene), read, warnings)
 
     def done(opened: _Opened) -> None:
         _show_scene(viewer, path, opened)
@@ -81,7 +73,15 @@ def _open(viewer: Viewer, path: Path, then: Callable[[Viewer], None], check: Cal
         viewer.state.opening = None
         viewer.say_error(reason)
 
-    viewer.run(f"opening {path.name}", work, done, failed)
+    def begin(viewer: Viewer) -> None:
+        cancel(viewer)
+        viewer.state.opening = path
+        viewer.run(f"opening {path.name}", load, done, failed)
+
+    if viewer.state.is_unsaved:
+        leave(viewer, begin, f"{path.name} is opened")
+    else:
+        begin(viewer)
 
 
 def cancel(viewer: Viewer) -> None:
@@ -122,7 +122,7 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     )
     state.begin(fresh)
     state.view, state.opening, state.leaving = opening_view(viewer), None, None
-    set_tools(viewer, stroke=None)
+    state.tools = replace(state.tools, stroke=None)
     add_scenes(viewer, [path])
     state.preferences = with_recent(state.preferences, path.absolute())
     viewer.engine, viewer.describer = viewer.services.engine(scene), None

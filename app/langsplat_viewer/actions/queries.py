@@ -163,12 +163,6 @@ def focus_search(viewer: Viewer) -> None:
         viewer.state.focus_input = viewer.state.awaits_keyboard = True
 
 
-def take_search_focus(viewer: Viewer) -> bool:
-    """Return whether the search box takes the keyboard now; True once."""
-    wanted, viewer.state.focus_input = viewer.state.focus_input, False
-    return wanted
-
-
 # Names that are taught.
 
 

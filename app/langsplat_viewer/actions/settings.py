@@ -25,6 +25,13 @@ def put(part: ViewerState | Recording | Timing, **values: object) -> None:
         setattr(part, name, value)
 
 
+def take(part: ViewerState | Recording, name: str) -> Any:
+    """Return a field that is wanted for one frame, and empty it."""
+    value = getattr(part, name)
+    setattr(part, name, type(value)())
+    return value
+
+
 def set_display(viewer: Viewer, display: Display, latent_level: int | None = None) -> None:
     """Choose what is shown; `latent_level` is an index into `scene.LEVELS`."""
     if _can_show(viewer, DISPLAYS[display].needs_field):
@@ -176,18 +183,6 @@ def open_panel(viewer: Viewer, title: str) -> None:
 def reset_panels(viewer: Viewer) -> None:
     """Put the panels where they are at first."""
     viewer.state.show_panel = viewer.state.resets_panels = True
-
-
-def take_panel_reset(viewer: Viewer) -> bool:
-    """Return whether the panels go back to their first places now; True once."""
-    reset, viewer.state.resets_panels = viewer.state.resets_panels, False
-    return reset
-
-
-def take_wanted_panel(viewer: Viewer) -> str:
-    """Return the title of the panel that is opened now, "" for none; once."""
-    title, viewer.state.wanted_panel = viewer.state.wanted_panel, ""
-    return title
 
 
 def toggle_help(viewer: Viewer) -> None:

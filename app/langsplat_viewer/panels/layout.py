@@ -8,7 +8,7 @@ from pathlib import Path
 from imgui_bundle import ImVec2, ImVec4, hello_imgui, icons_fontawesome_6, imgui
 
 from langsplat_core import __version__, registry
-from langsplat_viewer.actions import browsing, filming, opening, settings
+from langsplat_viewer.actions import browsing, opening, settings
 from langsplat_viewer.commands import COMMANDS, HELD, LETTERS_MENU, MENUS, Command, in_menu, matching
 from langsplat_viewer.panels import layout, outline, overlays, scene, search, select, ui, view
 from langsplat_viewer.panels.scene import in_words
@@ -292,12 +292,15 @@ def _window(viewer: Viewer, panel: Panel) -> hello_imgui.DockableWindow:
 
 def show_wanted(viewer: Viewer) -> None:
     """Open the panel that an action wants seen, in front of those it shares its place with."""
-    title, docking = settings.take_wanted_panel(viewer), hello_imgui.get_runner_params().docking_params
+    title, docking = (
+        settings.take(viewer.state, "wanted_panel"),
+        hello_imgui.get_runner_params().docking_params,
+    )
     titles = viewer.state.shows_panels
     for window in docking.dockable_windows if any(panel.title in titles for panel in all_panels()) else ():
         window.is_visible = window.label in titles
     settings.put(viewer.state, shows_panels=())
-    docking.layout_reset |= settings.take_panel_reset(viewer)
+    docking.layout_reset |= settings.take(viewer.state, "resets_panels")
     if title:
         docking.dockable_window_of_name(title).is_visible = True
         docking.focus_dockable_window(title)
@@ -373,7 +376,7 @@ def draw_over(viewer: Viewer) -> None:
     layout.draw_toolbar(viewer, area)
     scene.draw_changed(viewer, area)
     scene.draw_unsaved(viewer)
-    copied = filming.take_clipboard(viewer)
+    copied = settings.take(viewer.state.record, "clipboard")
     if copied:
         imgui.set_clipboard_text(copied)
     scene.draw_browser(viewer)

@@ -28,7 +28,7 @@ OFFER_LINES = 2  # more are scrolled to
 def _box(viewer: Viewer) -> None:
     queries.prepare_suggestions(viewer)
     imgui.set_next_item_width(ui.beside_button("Search"))
-    if queries.take_search_focus(viewer):
+    if settings.take(viewer.state, "focus_input"):
         imgui.set_keyboard_focus_here()
     flags = imgui.InputTextFlags_.enter_returns_true | imgui.InputTextFlags_.callback_history
     drafts, label = viewer.state.drafts, "##phrase"
