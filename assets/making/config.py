@@ -9,7 +9,7 @@ Tier = Literal["separate", "clutter", "occlusion"]  # objects apart, cluttered, 
 TIERS: tuple[Tier, ...] = get_args(Tier)
 LabelLayout = Literal["plain", "lerf-ovs", "3d-ovs"]  # how a rendered room's truth is written
 Pixels = Annotated[int, Range(1, 65_536)]
-Size = tuple[Pixels, Pixels]  # width and height of a picture
+Size = tuple[Pixels, Pixels]  # width and height of an image
 
 
 @dataclass(frozen=True)

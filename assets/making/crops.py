@@ -1,4 +1,4 @@
-"""Training pictures for the demo encoder: masked crops of random rooms, of plain colours, of clutter."""
+"""Training images for the demo encoder: masked crops of random rooms, of plain colours, of clutter."""
 
 import io
 import json
@@ -71,9 +71,9 @@ def room_crops(seed: int, views: int) -> CropSet:
     images: list[Array] = []
     labels: list[RegionLabel] = []
     for _ in range(views):
-        picture = renderer.picture(_random_camera(rng), oversample=1)
-        image = _photograph(picture.image, rng)
-        for mask, label in _regions(world, picture, rng) + _clutter(world, picture, rng):
+        rendered = renderer.render(_random_camera(rng), oversample=1)
+        image = _photograph(rendered.image, rng)
+        for mask, label in _regions(world, rendered, rng) + _clutter(world, rendered, rng):
             images.append(masked_crop(image, mask, CROP))
             labels.append(label)
     return CropSet(np.stack(images), tuple(labels))
@@ -129,10 +129,10 @@ def _photograph(image: Array, rng: np.random.Generator) -> Array:
 
 
 def _regions(
-    world: World, picture: RenderedView, rng: np.random.Generator
+    world: World, rendered: RenderedView, rng: np.random.Generator
 ) -> list[tuple[Array, RegionLabel]]:
     """One imperfect mask for every region that is large enough; equal regions of two levels once."""
-    ids = np.where(picture.pieces[..., None] >= 0, world.ids[picture.pieces], -1)
+    ids = np.where(rendered.pieces[..., None] >= 0, world.ids[rendered.pieces], -1)
     found: list[tuple[Array, RegionLabel]] = []
     seen: set[tuple[int, int, int]] = set()
     for level in (2, 1, 0):
@@ -191,11 +191,11 @@ def _imperfect(mask: Array, rng: np.random.Generator) -> Array:
 
 
 def _clutter(
-    world: World, picture: RenderedView, rng: np.random.Generator
+    world: World, rendered: RenderedView, rng: np.random.Generator
 ) -> list[tuple[Array, RegionLabel]]:
     """Masks that cover bits of several objects, so that no word is right for them."""
-    height, width = picture.pieces.shape
-    wholes = np.where(picture.pieces >= 0, world.ids[picture.pieces, 2], -1)
+    height, width = rendered.pieces.shape
+    wholes = np.where(rendered.pieces >= 0, world.ids[rendered.pieces, 2], -1)
     y, x = np.mgrid[:height, :width]
     found: list[tuple[Array, RegionLabel]] = []
     for _ in range(14):
@@ -203,8 +203,8 @@ def _clutter(
         wave = 1 + 0.3 * np.sin(3 * np.arctan2(y - cy, x - cx) + rng.uniform(0, 6))
         mask = np.hypot(y - cy, x - cx) < r * wave
         if rng.random() < 0.5:  # loose bits of what lies there instead of all of it
-            bits = np.unique(picture.pieces[mask])
-            mask &= np.isin(picture.pieces, rng.permutation(bits)[: max(2, len(bits) // 2)])
+            bits = np.unique(rendered.pieces[mask])
+            mask &= np.isin(rendered.pieces, rng.permutation(bits)[: max(2, len(bits) // 2)])
         if mask.sum() > 300 and np.unique(wholes[mask], return_counts=True)[1].max() < 0.55 * mask.sum():
             found.append((mask, _CLUTTER))
     return found[:6]

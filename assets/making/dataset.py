@@ -91,9 +91,9 @@ def photographed_room(seed: int, tier: Tier = "clutter") -> World:
     return build_room(FIRST_ROOM + seed, tier)
 
 
-def truth_ids(world: World, picture: RenderedView) -> Array:
-    """(3, H, W) int32 label ids of a picture at subpart, part and whole level, -1 where nothing is."""
-    ids = np.where(picture.pieces[..., None] >= 0, world.ids[picture.pieces], -1)
+def truth_ids(world: World, rendered: RenderedView) -> Array:
+    """(3, H, W) int32 label ids of an image at subpart, part and whole level, -1 where nothing is."""
+    ids = np.where(rendered.pieces[..., None] >= 0, world.ids[rendered.pieces], -1)
     return np.moveaxis(ids, -1, 0).astype(np.int32)
 
 
@@ -119,11 +119,11 @@ def orbit_cameras(views: int, size: tuple[int, int], seed: int) -> list[Camera]:
 
 
 def _write_view(renderer: Renderer, world: World, camera: Camera, out: Path, suffix: str) -> None:
-    picture = renderer.picture(camera)
+    rendered = renderer.render(camera)
     with atomic_path(out / "images" / f"{camera.name}{suffix}") as path:
-        Image.fromarray(picture.image).save(path, quality=95)  # PNG has no quality and does not read it
+        Image.fromarray(rendered.image).save(path, quality=95)  # PNG has no quality and does not read it
     with atomic_path(out / "truth" / f"{camera.name}.npz") as path:
-        np.savez_compressed(path, ids=truth_ids(world, picture), depth=picture.depth)
+        np.savez_compressed(path, ids=truth_ids(world, rendered), depth=rendered.depth)
 
 
 def write_labels(world: World, path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The demo encoder: a small CLIP that comes with the program, trained on pictures of procedural rooms alone.
+"""The demo encoder: a small CLIP that comes with the program, trained on images of procedural rooms alone.
 
 Each step shows the model a batch of crops and a sample of phrases, of which ground truth says which are
 right, wrong or neither for every crop. Three losses on their cosines: a sigmoid loss about a fixed cosine
@@ -177,7 +177,7 @@ def calibrate_canonical(model: Any, tokens: Tensor, images: Tensor, cosine: floa
 
 
 def export(model: Any, out: Path) -> None:
-    """Write `model` in half precision, its configuration and how pictures are normalised."""
+    """Write `model` in half precision, its configuration and how images are normalised."""
     from safetensors.torch import save_file
 
     weights = {name: tensor.detach().half().contiguous() for name, tensor in model.state_dict().items()}
@@ -280,7 +280,7 @@ def _flipped(images: Array, rng: np.random.Generator) -> Array:
 
 
 def _jitter(pixels: Tensor, rng: np.random.Generator) -> Tensor:
-    """Turn, stretch and shift pictures, change their exposure, and now and then cover a part."""
+    """Turn, stretch and shift images, change their exposure, and now and then cover a part."""
     count, size = len(pixels), pixels.shape[-1]
     black = -torch.tensor(MEAN).view(3, 1, 1) / torch.tensor(STD).view(3, 1, 1)
     angle, shear = rng.normal(0, 0.2, count), rng.normal(0, 0.08, count)
@@ -430,7 +430,7 @@ class _Run:
         self.model, self.config, self.step, self.loss = model.train(), config, 0, math.nan
         self.mean = type(model)(model.config)
         self.mean.load_state_dict(model.state_dict())
-        # Plain classifiers of the picture, for training only: they teach shapes sooner than phrases do.
+        # Plain classifiers of the image, for training only: they teach shapes sooner than phrases do.
         width = model.config.vision_config.hidden_size
         self.heads = nn.ModuleList(nn.Linear(width, count) for count in class_counts)
         every = [*model.parameters(), *self.heads.parameters()]

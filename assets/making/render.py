@@ -486,7 +486,7 @@ class Renderer:
         self._tracer = Tracer(world)
         self._surfaces = surfaces(world, light, bake(self._tracer, world, light, samples, cell))
 
-    def picture(self, camera: Camera, oversample: int = 2) -> RenderedView:
+    def render(self, camera: Camera, oversample: int = 2) -> RenderedView:
         """Render a view with `oversample` rays per pixel and axis; labels are those of pixel centres."""
         fine = camera.resized(camera.width * oversample, camera.height * oversample)
         triangle, uv, depth = self._cast(fine)

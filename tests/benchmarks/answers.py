@@ -194,7 +194,7 @@ def room_table(reports: Sequence[RoomReport]) -> str:
             f"{np.median([m.query_ms for m in ours]):.1f}",
             f"{np.median([m.frame_ms for m in ours]):.1f}",
         ))  # fmt: skip
-    return markdown((*head, "ms/query", "ms/picture"), lines)
+    return markdown((*head, "ms/query", "ms/image"), lines)
 
 
 def budget_table(reports: Sequence[RoomReport]) -> str:

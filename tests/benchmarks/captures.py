@@ -54,10 +54,10 @@ def draw_capture(
     for number, camera in enumerate(place.cameras):
         progress("drawing photographs", number / VIEWS)
         fine = camera.resized(2 * camera.width, 2 * camera.height)
-        picture, image = renderer.picture(fine, oversample=1), None
+        rendered, image = renderer.render(fine, oversample=1), None
         while people and image is None and number not in held_out and kit.rng.random() > EMPTY:
-            image = _with_people(picture, fine, place, kit)
-        drawn = Image.fromarray(picture.image if image is None else image)
+            image = _with_people(rendered, fine, place, kit)
+        drawn = Image.fromarray(rendered.image if image is None else image)
         size = (camera.width, camera.height)
         drawn.resize(size, Image.Resampling.BOX).save(folder / "images" / f"{camera.name}.png")
     write_transforms(place.cameras, ".png", folder / "transforms.json", points="")
@@ -116,7 +116,7 @@ def _named(cameras: list[Camera]) -> list[Camera]:
     return [replace(camera, name=f"view_{number:03d}") for number, camera in enumerate(cameras)]
 
 
-def _with_people(picture: RenderedView, camera: Camera, place: _Place, kit: Kit) -> Array | None:
+def _with_people(rendered: RenderedView, camera: Camera, place: _Place, kit: Kit) -> Array | None:
     """The (H, W, 3) image with people in it; None where they cover too much or too little of it."""
     standing = []
     for _ in range(int(kit.rng.integers(1, 4))):
@@ -125,10 +125,10 @@ def _with_people(picture: RenderedView, camera: Camera, place: _Place, kit: Kit)
         at = camera.position + kit.size(NEAREST, place.reach) * ray / np.linalg.norm(ray)
         turn = rotation_about("z", kit.size(0, 360))
         standing.append(Placed(person(kit), turn, np.array([at[0], at[1], place.floor])))
-    drawn = Renderer(assemble(standing), place.light, samples=8).picture(camera, oversample=1)
-    before = drawn.depth < picture.depth
+    drawn = Renderer(assemble(standing), place.light, samples=8).render(camera, oversample=1)
+    before = drawn.depth < rendered.depth
     fits = SHARES[0] < before.mean() < SHARES[1]
-    return np.where(before[..., None], drawn.image, picture.image) if fits else None
+    return np.where(before[..., None], drawn.image, rendered.image) if fits else None
 
 
 def person(kit: Kit) -> Thing:

@@ -2,15 +2,15 @@
 
 `ClipGeometry` is an encoder with the geometry of real CLIP, the standing second test bed. The bundled encoder
 tells what is there from what is not by margins of 0.2; CLIP's are 0.05 to 0.11, its texts lie close together,
-and its pictures lie on the other side of a gap. Here a text vector is the common direction of all prompts and
-what is the word's own, of real CLIP vectors where a file has them; a picture's vector is made of what its
+and its images lie on the other side of a gap. Here a text vector is the common direction of all prompts and
+what is the word's own, of real CLIP vectors where a file has them; an image's vector is made of what its
 pixels truly show:
 
     v  =  a g  +  c m  +  s r  +  noise of the region, in all views  +  noise of the mask, in this view
 
-with g the direction of pictures, orthogonal to all texts (Liang et al. 2022, "Mind the gap"), m the common
+with g the direction of images, orthogonal to all texts (Liang et al. 2022, "Mind the gap"), m the common
 direction of texts and r the own direction of the words that are true. a, c, s follow from three cosines: of a
-picture with its own words (`own`), with other words (`OTHER`), and of two pictures of different things
+image with its own words (`own`), with other words (`OTHER`), and of two images of different things
 (`alike`). One mask in seven shows another region. What is a guess: that noise is one part text-like, how the
 words of a phrase and a part with its thing mix (`MODIFIER`, `OWNER`); `own` and `alike` are to be varied.
 """
@@ -69,11 +69,11 @@ def with_wrong_vectors(features: ImageFeatures, seed: int) -> ImageFeatures:
     return replace(features, vectors=vectors)
 
 
-def moved_to_pictures(told: Sequence[ImageFeatures], seen: Sequence[ImageFeatures]) -> list[ImageFeatures]:
-    """Text vectors moved by one vector, the same for all, to where the encoder puts pictures.
+def moved_to_images(told: Sequence[ImageFeatures], seen: Sequence[ImageFeatures]) -> list[ImageFeatures]:
+    """Text vectors moved by one vector, the same for all, to where the encoder puts images.
 
-    CLIP's pictures and phrases lie in two separate clouds ("Mind the gap", Liang et al. 2022). Against the
-    canonical phrases, which are text, every text vector is right or wrong by more than any picture can be:
+    CLIP's images and phrases lie in two separate clouds ("Mind the gap", Liang et al. 2022). Against the
+    canonical phrases, which are text, every text vector is right or wrong by more than any image can be:
     relevancy saturates. What is shifted is the mean of `told`, onto the mean of `seen`; the differences
     between phrases, which are what a perfect embedding has, stay.
     """
@@ -149,26 +149,26 @@ PREFIX = "clip-geometry:"
 VERSION = 2  # of the simulation
 DIM = 512
 PROMPTS = 0.565  # mean cosine of two prompts, ViT-B/16
-OTHER = 0.19  # cosine of a picture with words that are not true of it
+OTHER = 0.19  # cosine of an image with words that are not true of it
 TEXT_LIKE = 0.3  # share of the noise's variance that lies where words differ
 LASTING = 0.5  # share of the noise's variance that a region has in all views
 MODIFIER = 0.8  # of "red" in "red mug", beside 1 for the head: their cosine is then 0.9
-OWNER = 0.5  # of its thing in the picture of a part
+OWNER = 0.5  # of its thing in the image of a part
 CLUSTERS, KINSHIP = 120, 0.55  # of words without a file: kinds, and the cosine of words of a kind
-HUB = 0.02  # by how much a prompt lies nearer to all pictures than another does, standard deviation
+HUB = 0.02  # by how much a prompt lies nearer to all images than another does, standard deviation
 LITTLE = frozenset({"of", "the", "a", "an", "on", "in", "with"})
 
 
 @dataclass(frozen=True, eq=False)
 class ClipGeometry:
-    """A simulated image-text encoder; its pictures are described from the truth (`describe`)."""
+    """A simulated image-text encoder; its images are described from the truth (`describe`)."""
 
-    own: float  # cosine of a picture with the words that are true of it
-    alike: float = 0.65  # cosine of pictures of different things
+    own: float  # cosine of an image with the words that are true of it
+    alike: float = 0.65  # cosine of images of different things
     # (V, 512) or (512, V) .npy of text vectors; names in a .txt beside it that begins alike
     vectors: Path | None = None
     reading: Reading = field(default_factory=Reading)
-    image_size: int = 8  # of pictures that nobody looks at
+    image_size: int = 8  # of images that nobody looks at
     _contents: dict[str, Array] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -176,7 +176,7 @@ class ClipGeometry:
         if not (OTHER < self.own < 1 and noise > 0 and self.alike > OTHER**2 / PROMPTS):
             raise InputError(
                 f"{self.id}: no vectors have these cosines; give an own cosine between {OTHER} and 0.45 and, "
-                "behind a comma, a cosine between pictures from 0.1 to 0.85"
+                "behind a comma, a cosine between images from 0.1 to 0.85"
             )
 
     @property
@@ -203,7 +203,7 @@ class ClipGeometry:
 
     @property
     def _strength(self) -> float:
-        """s: how strongly a picture shows its words."""
+        """s: how strongly an image shows its words."""
         return (self.own - OTHER) / float(np.sqrt(1 - PROMPTS))
 
     def unknown_words(self, text: str) -> tuple[str, ...]:
@@ -251,7 +251,7 @@ class ClipGeometry:
         return with_wrong_vectors(replace(features, vectors=vectors), view)
 
     def _content(self, truth: Truth, number: int) -> Array:
-        """(D,) what a region of the truth adds to a picture of it, its lasting noise included."""
+        """(D,) what a region of the truth adds to an image of it, its lasting noise included."""
         key = f"{number} {truth.folder.parent.parent.name}"  # another room, other noise
         if key not in self._contents:
             noise = np.sqrt(LASTING) * self._noise_scale * self._noise(_random(key))
@@ -285,7 +285,7 @@ class ClipGeometry:
 
     @cached_property
     def _base(self) -> Array:
-        """What all pictures have in common."""
+        """What all images have in common."""
         common = OTHER / np.sqrt(PROMPTS)
         return np.asarray(np.sqrt(self.alike - common**2) * self._gap + common * self._middle)
 
@@ -350,7 +350,7 @@ def read_geometry(text: str, vectors: Path | None = None) -> ClipGeometry | None
         numbers = [float(number) for number in text.removeprefix(PREFIX).split(",")]
         own, alike = [*numbers, 0.65][:2]
     except ValueError:
-        wanted = f"the cosine of a picture with its own words, as in {PREFIX}0.31"
+        wanted = f"the cosine of an image with its own words, as in {PREFIX}0.31"
         raise InputError(f"{text}: write {wanted}") from None
     return ClipGeometry(own, alike, vectors)
 

@@ -67,7 +67,7 @@ from langsplat_core.training.language.codec_fit import CodecReport
 from langsplat_core.training.radiance.rehearsal import budgets_for
 from tests.benchmarks.oracles import (
     ClipGeometry,
-    moved_to_pictures,
+    moved_to_images,
     oracle_vectors,
     phrase_vectors,
     read_geometry,
@@ -245,7 +245,7 @@ class Room:
         if variant.vectors == "text":
             words = phrase_vectors(self.truth, self.encoder)
             told = [oracle_vectors(item, true, words) for item, true in zip(features, ids, strict=True)]
-            features = moved_to_pictures(told, features)
+            features = moved_to_images(told, features)
         return list(zip(cameras, features, strict=True))
 
     def _features(
@@ -261,8 +261,8 @@ class Room:
             return describe_capture(photographs, names, source, encoder, store, shared)
         store = FeatureStore(self.folder / f"features-{outlines}-none")
         rough = zip(cameras, describe_capture(photographs, names, source, None, store, shared), strict=True)
-        pictures, work = [(image, None) for image in photographs], self.folder / f"agreed-{self.weights}"
-        return agreed_features(self.gaussians, list(rough), pictures, encoder, CpuRasterizer(), work, shared)
+        images, work = [(image, None) for image in photographs], self.folder / f"agreed-{self.weights}"
+        return agreed_features(self.gaussians, list(rough), images, encoder, CpuRasterizer(), work, shared)
 
     def field(self, variant: Variant, fresh: bool = False) -> tuple[LanguageField, CodecReport, float]:
         """The language field, what its codec loses, and seconds; `fresh` takes nothing that was kept."""

@@ -33,8 +33,8 @@ from langsplat_core.training.language.codec_fit import CodecReport
 
 Row = TypeVar("Row")
 MIN_GAUSSIANS = 20  # a thing with fewer is not asked for among the Gaussians
-# px: the paper's mean filter for localisation, and its code's majority vote over a mask, both of pictures of
-# 731 rows; smaller pictures get smaller windows, or a part would be lost in one
+# px: the paper's mean filter for localisation, and its code's majority vote over a mask, both of images of
+# 731 rows; smaller images get smaller windows, or a part would be lost in one
 FILTER, VOTE, PAPER_ROWS = 20, 7, 731
 CHANNELS = 32  # phrases that are splatted at a time
 TOGETHER = 64  # phrases that are asked at a time

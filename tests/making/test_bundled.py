@@ -235,7 +235,7 @@ def held_out(scene: Scene, world: World) -> list[tuple[Camera, np.ndarray]]:
     trained = {camera.name for camera in scene.cameras}
     cameras = [camera for camera in orbit_cameras(VIEWS, SIZE, SEED) if camera.name not in trained][:3]
     renderer = Renderer(world, LIGHT, samples=1)  # labels need no light
-    return [(camera, truth_ids(world, renderer.picture(camera, oversample=1))) for camera in cameras]
+    return [(camera, truth_ids(world, renderer.render(camera, oversample=1))) for camera in cameras]
 
 
 def test_bundled_scene_is_small_and_complete(scene):

@@ -1,4 +1,4 @@
-"""Procedural rooms and their objects: geometry, colours, light, pictures, and the folders they go to."""
+"""Procedural rooms and their objects: geometry, colours, light, images, and the folders they go to."""
 
 import json
 from collections import defaultdict
@@ -72,7 +72,7 @@ def test_truth_is_nested_and_follows_the_seed(world):
 def test_views_agree_on_the_points_they_share(world, renderer):
     one = look_at(np.array([0.2, -1.3, 0.8]), np.zeros(3), UP, (120, 90))
     two = look_at(np.array([0.7, -1.1, 0.8]), np.zeros(3), UP, (120, 90))
-    a, b = renderer.picture(one, oversample=2), renderer.picture(two, oversample=2)
+    a, b = renderer.render(one, oversample=2), renderer.render(two, oversample=2)
     rows, columns = np.nonzero(np.isfinite(a.depth))
     points = np.array(
         [one.unproject((c + 0.5, r + 0.5), a.depth[r, c]) for r, c in zip(rows, columns, strict=True)]
@@ -220,7 +220,7 @@ def test_things_have_sound_meshes_and_stand_on_ground(name, things):
         area = np.linalg.norm(face, axis=1)
         # A few slivers of round ends and ruffles may disagree.
         assert area[against].sum() < 0.02 * area.sum(), (piece.part, piece.subpart)
-        # A region far below a hundredth of its thing would be no use in any picture.
+        # A region far below a hundredth of its thing would be no use in any image.
         assert np.ptp(piece.mesh.vertices, axis=0).max() / extent > 0.05, (piece.part, piece.subpart)
 
 
