@@ -16,7 +16,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, BinaryIO
 from urllib.parse import unquote
 
 import numpy as np
@@ -39,8 +39,7 @@ COEFFICIENTS = [
     f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{n}" for degree in range(4) for n in range(2 * degree + 1)
 ]
 POINTS = 0  # mode of a primitive
-FLOAT, UNSIGNED_BYTE = 5126, 5121
-COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", FLOAT: "<f4"}
+COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 MAGIC, JSON_CHUNK, BINARY_CHUNK = b"glTF", b"JSON", b"BIN\0"
 JSON_LIMIT = 16 << 20  # bytes; ours has 10 kB
@@ -326,29 +325,15 @@ def write_gltf(path: Path | str, gaussians: Gaussians) -> None:
     written with opacity 0. Raises InputError for more than a .glb can hold, 4 GiB.
     """
     path = Path(path)
-    views: list[dict[str, Any]] = []
-    accessors: list[dict[str, Any]] = []
-    attributes, blocks, size = {}, [], 0
-    for name, values in _columns(gaussians).items() if len(gaussians) else ():
-        block = np.ascontiguousarray(values)
-        kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[block[0].size]
-        attributes[name] = len(accessors)
-        views.append({"buffer": 0, "byteOffset": size, "byteLength": block.nbytes, "target": 34962})
-        about = {"bufferView": len(accessors), "count": len(block), "type": kind}
-        byte = block.dtype == np.uint8
-        about |= {"componentType": UNSIGNED_BYTE, "normalized": True} if byte else {"componentType": FLOAT}
-        if name == "POSITION":
-            about |= {"min": block.min(0).tolist(), "max": block.max(0).tolist()}
-        accessors.append(about)
-        blocks.append(block)
-        size += block.nbytes  # always a multiple of four
+    buffer, columns = BufferWriter(), _columns(gaussians) if len(gaussians) else {}
+    attributes = {name: buffer.add(values, name == "POSITION") for name, values in columns.items()}
     content: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "langsplat-viewer"},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{}],
     }
-    if blocks:
+    if columns:
         says = {"kernel": "ellipse", "colorSpace": SRGB}
         says |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
         primitive = {"attributes": attributes, "mode": POINTS, "extensions": {EXTENSION: says}}
@@ -356,34 +341,63 @@ def write_gltf(path: Path | str, gaussians: Gaussians) -> None:
             "scenes": [{"nodes": [0]}],
             "nodes": [{"mesh": 0}],
             "meshes": [{"primitives": [primitive]}],
-            "accessors": accessors,
-            "bufferViews": views,
-            "buffers": [{"byteLength": size}],
-        }
+        } | buffer.content()
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         if path.suffix.lower() == ".gltf":
-            if blocks:
-                data = base64.b64encode(b"".join(block.tobytes() for block in blocks)).decode()
+            if columns:
+                data = base64.b64encode(b"".join(buffer.blocks)).decode()
                 content["buffers"][0]["uri"] = f"data:application/octet-stream;base64,{data}"
             file.write(json.dumps(content).encode())
             return
-        file.write(glb_head(content, size, path))
-        for block in blocks:
-            file.write(block.data)
+        write_glb(file, content, buffer, path)
 
 
-def glb_head(content: dict[str, Any], size: int, path: Path) -> bytes:
-    """Everything of a .glb that is in front of its `size` bytes of binary data, a multiple of four.
+class BufferWriter:
+    """The one buffer of a glTF file that is written, and the accessors into it."""
 
-    InputError, naming `path`, for more than a .glb can hold.
-    """
+    def __init__(self) -> None:
+        self.blocks: list[memoryview] = []
+        self.size = 0  # bytes, always a multiple of four
+        self._accessors: list[dict[str, Any]] = []
+        self._views: list[dict[str, Any]] = []
+
+    def add(self, values: Array, bounded: bool = False) -> int:
+        """Append (N,) or (N, k) values, N > 0, and return the index of their accessor.
+
+        Small integers are fractions of their largest; `bounded` states least and greatest values.
+        """
+        block = np.ascontiguousarray(values)
+        code = next(code for code, kind in COMPONENTS.items() if np.dtype(kind) == block.dtype)
+        shape = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[block[0].size]
+        about = {"bufferView": len(self._views), "componentType": code, "count": len(block), "type": shape}
+        if block.dtype.itemsize < 4:
+            about["normalized"] = True
+        if bounded:
+            about |= {"min": block.min(0).tolist(), "max": block.max(0).tolist()}
+        target = 34963 if block.dtype == np.uint32 else 34962  # indices, attributes
+        view = {"buffer": 0, "byteOffset": self.size, "byteLength": block.nbytes, "target": target}
+        self._accessors.append(about)
+        self._views.append(view)
+        self.blocks.append(block.data.cast("B"))
+        self.size += block.nbytes
+        return len(self._accessors) - 1
+
+    def content(self) -> dict[str, Any]:
+        """Return the entries of the JSON that describe the buffer."""
+        buffers = [{"byteLength": self.size}]
+        return {"accessors": self._accessors, "bufferViews": self._views, "buffers": buffers}
+
+
+def write_glb(file: BinaryIO, content: dict[str, Any], buffer: BufferWriter, path: Path) -> None:
+    """Write a .glb; InputError, naming `path`, for more than one can hold."""
     text = json.dumps(content).encode()
     text += b" " * (-len(text) % 4)
-    binary = struct.pack("<I", size) + BINARY_CHUNK if size else b""
-    whole = 20 + len(text) + len(binary) + size
+    binary = struct.pack("<I", buffer.size) + BINARY_CHUNK if buffer.size else b""
+    whole = 20 + len(text) + len(binary) + buffer.size
     if whole >= 2**32:
         raise InputError(f"{path}: {whole} bytes are more than a .glb can hold; write .spz or .sog")
-    return MAGIC + struct.pack("<III", 2, whole, len(text)) + JSON_CHUNK + text + binary
+    file.write(MAGIC + struct.pack("<III", 2, whole, len(text)) + JSON_CHUNK + text + binary)
+    file.writelines(buffer.blocks)
 
 
 def _columns(gaussians: Gaussians) -> dict[str, Array]:

@@ -2,14 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import BinaryIO, Protocol
 
 import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.gltf import glb_head
+from langsplat_core.io.gltf import BufferWriter, write_glb
 from langsplat_core.io.packing import to_bytes
 from langsplat_core.io.ply_table import write_table
 from langsplat_core.scene import Gaussians, Scene
@@ -71,7 +71,8 @@ def write_meshes(path: Path | str, meshes: Sequence[MeshLike], to_gltf: Array | 
         if path.suffix.lower() == ".obj":
             temporary.write_text(_obj(meshes), encoding="utf-8")
         elif path.suffix.lower() == ".glb":
-            temporary.write_bytes(_glb(path, meshes, np.eye(4) if to_gltf is None else to_gltf))
+            with temporary.open("wb") as file:
+                _write_glb(file, path, meshes, np.eye(4) if to_gltf is None else to_gltf)
         else:
             columns, faces = _joined(meshes)
             write_table(temporary, columns, faces)
@@ -113,34 +114,23 @@ def _joined(meshes: Sequence[MeshLike]) -> tuple[dict[str, Array], Array]:
     return columns, np.concatenate(faces)
 
 
-def _glb(path: Path, meshes: Sequence[MeshLike], to_gltf: Array) -> bytes:
-    """Binary glTF 2.0. Colours are light as it was photographed, so the material is unlit, and linear."""
-    chunks: list[bytes] = []
-    views, accessors, shapes, nodes = [], [], [], []
+def _write_glb(file: BinaryIO, path: Path, meshes: Sequence[MeshLike], to_gltf: Array) -> None:
+    """Colours are light as it was photographed, so the material is unlit, and linear."""
+    buffer, shapes, nodes = BufferWriter(), [], []
     for number, mesh in enumerate(meshes):
         display = np.broadcast_to(mesh.colour, mesh.vertices.shape)
         linear = np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
-        places = mesh.vertices.astype("<f4")
-        corners = {"min": places.min(0).tolist(), "max": places.max(0).tolist()}
         light = np.column_stack([linear, np.ones(len(linear))])
-        for values, kind, component, more in (
-            (places, "VEC3", 5126, corners),
-            (np.rint(65_535 * light).astype("<u2"), "VEC4", 5123, {"normalized": True}),
-            (mesh.triangles.reshape(-1, 1).astype("<u4"), "SCALAR", 5125, {}),
-        ):
-            start = sum(map(len, chunks))
-            views.append({"buffer": 0, "byteOffset": start, "byteLength": values.nbytes})
-            accessors.append(
-                {"bufferView": len(views) - 1, "componentType": component, "count": len(values)}
-                | {"type": kind, **more}
-            )
-            chunks.append(values.tobytes())
-        first = 3 * number
-        primitive = {"attributes": {"POSITION": first, "COLOR_0": first + 1}, "indices": first + 2}
-        shapes.append({"name": mesh.name, "primitives": [primitive | {"material": 0}]})
+        attributes = {
+            "POSITION": buffer.add(mesh.vertices.astype("<f4"), bounded=True),
+            "COLOR_0": buffer.add(np.rint(65_535 * light).astype("<u2")),
+        }
+        corners = buffer.add(mesh.triangles.reshape(-1).astype("<u4"))
+        primitive = {"attributes": attributes, "indices": corners, "material": 0}
+        shapes.append({"name": mesh.name, "primitives": [primitive]})
         nodes.append({"name": mesh.name, "mesh": number, "matrix": to_gltf.T.reshape(-1).tolist()})
     unlit = "KHR_materials_unlit"
-    document = {
+    content = {
         "asset": {"version": "2.0", "generator": "langsplat"},
         "extensionsUsed": [unlit],
         "scene": 0,
@@ -148,9 +138,5 @@ def _glb(path: Path, meshes: Sequence[MeshLike], to_gltf: Array) -> bytes:
         "nodes": nodes,
         "meshes": shapes,
         "materials": [{"doubleSided": True, "extensions": {unlit: {}}}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": sum(map(len, chunks))}],
     }
-    data = b"".join(chunks)  # of numbers of 4 and 8 bytes
-    return glb_head(document, len(data), path) + data
+    write_glb(file, content | buffer.content(), buffer, path)
