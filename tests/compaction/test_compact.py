@@ -97,7 +97,7 @@ def test_loss_without_photographs_is_that_of_uncorrelated_errors(scene):
     assert estimated_loss(1e-3, 30.0) == pytest.approx(10 * np.log10(2))
 
 
-def test_nothing_that_any_view_needs_is_dropped(scene):
+def test_gaussians_that_any_view_needs_are_kept(scene):
     chosen = choose_views(scene, None, CONFIG, silent)
     reduction = find_reduction(scene, chosen, chosen.measured(scene), CONFIG)
     every = (*chosen.ranking, *chosen.measuring)
@@ -117,7 +117,7 @@ def test_measuring_views_do_not_rank(scene):
     assert (len(thinned.ranking), len(thinned.measuring)) == (2, 2)
 
 
-def test_budget_companions_and_order_survive_the_file(scene, source, tmp_path):
+def test_compact_file_keeps_budget_order_and_companions(scene, source, tmp_path):
     out = tmp_path / "out.ply"
     report = compact_scene(source, out, CONFIG)
     small = load_scene(out)
@@ -201,7 +201,7 @@ def test_interruption_leaves_the_old_file(source, tmp_path, monkeypatch):
     assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == old
 
 
-def test_bisection_finds_the_edge_and_weighs_degrees():
+def test_bisection_weighs_counts_against_sh_degrees():
     def loss_of(choice: Choice) -> float:
         return (1000 - choice.count) / 1000 + 0.1 * (1 - choice.sh_degree)
 
@@ -283,7 +283,7 @@ def test_floaters_are_told_from_the_wall(dirty):
     np.testing.assert_array_equal(find_floaters(there, there.cameras, 100).suspicion, found.suspicion)
 
 
-def test_photographs_let_all_of_them_go(dirty):
+def test_photographs_let_all_floaters_go(dirty):
     """Of the wall alone: without floaters its images are these."""
     wall, held = dirty.take(WALL), dirty.cameras[1::3]
     photographs = tuple((255 * draw(wall, camera)).round().astype(np.uint8) for camera in held)
@@ -295,7 +295,7 @@ def test_photographs_let_all_of_them_go(dirty):
 
 
 @pytest.mark.parametrize("budget", [0.0, 0.2, 50.0])
-def test_without_photographs_the_images_may_change_so_much(dirty, budget):
+def test_cleaning_without_photographs_keeps_the_budget(dirty, budget):
     keep, report = cleaned(dirty, max_psnr_loss=budget)
     assert report.loss <= budget + 1e-9
     assert report.removed == (~keep).sum()
@@ -304,7 +304,7 @@ def test_without_photographs_the_images_may_change_so_much(dirty, budget):
     assert (report.removed == 12) == (budget == 50)
 
 
-def test_rows_that_cannot_be_drawn_go(dirty):
+def test_cleaning_removes_invalid_rows(dirty):
     dirty.gaussians.means[5] = np.nan
     keep, report = cleaned(dirty)
     assert not keep[5]
@@ -312,12 +312,12 @@ def test_rows_that_cannot_be_drawn_go(dirty):
 
 
 @pytest.mark.parametrize("count", [1, 2, 40])
-def test_a_scene_that_is_one_small_region_stays(count):
+def test_cleaning_keeps_a_single_small_region(count):
     keep, report = cleaned(Scene(random_gaussians(count, scale_range=(0.5, 0.8))))
     assert keep.any()
     assert report.loss <= CLEAN.max_psnr_loss
 
 
-def test_nothing_cannot_be_cleaned():
+def test_empty_scenes_cannot_be_cleaned():
     with pytest.raises(InputError, match="nothing"):
         clean(Scene(random_gaussians(0)), Views((), (), (), ""), CLEAN)

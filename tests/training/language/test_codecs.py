@@ -68,7 +68,7 @@ def test_a_codec_is_a_kind_its_settings_and_its_fit() -> None:
     assert all(CODEC_CONFIGS[kind]().kind == KINDS[kind].kind == kind for kind in KINDS)
 
 
-def test_storage_and_latents(codec: Codec) -> None:
+def test_codecs_survive_storage(codec: Codec) -> None:
     vectors, _ = clusters(12, 10)
     latents = codec.encode(vectors)
     assert (latents.dtype, latents.shape) == (codec.dtype, (120, codec.latent_dim))
@@ -98,7 +98,7 @@ def test_cosines_are_those_of_what_is_decoded(codec: Codec) -> None:
         np.testing.assert_allclose(got, want[rows], atol=2e-6)
 
 
-def test_distinct_latents_distances_and_colours(codec: Codec) -> None:
+def test_latents_have_distances_and_colours(codec: Codec) -> None:
     latents = codec.encode(clusters(12, 10)[0])
     distinct, of = codec.unique(latents)
     np.testing.assert_array_equal(distinct[of], latents)
@@ -180,7 +180,7 @@ def test_further_vectors_help_kinds_that_interpolate_only() -> None:
     assert fit_codec(vectors[:0], CodebookConfig(size=5), WORDS, further=further).size == 5
 
 
-def test_given_vectors_are_kept_by_a_codebook_alone() -> None:
+def test_only_a_codebook_keeps_given_vectors_exactly() -> None:
     vectors = rounded(clusters(20, 1)[0])
     made = codec_fit.exact_codec(vectors, np.ones(20), CodebookConfig())
     assert made is not None
@@ -188,7 +188,7 @@ def test_given_vectors_are_kept_by_a_codebook_alone() -> None:
     assert codec_fit.exact_codec(vectors, np.ones(20), LinearConfig()) is None
 
 
-def test_the_size_of_a_codebook_is_the_smallest_that_keeps_the_budget() -> None:
+def test_codebook_is_the_smallest_within_its_error_budget() -> None:
     vectors, _ = clusters(100, 20, noise=0.01)
     sizes = []
     for budget in (0.15, 0.06, 0.02):
@@ -203,7 +203,7 @@ def test_the_size_of_a_codebook_is_the_smallest_that_keeps_the_budget() -> None:
 
 
 @pytest.mark.parametrize(("count", "each"), [(9, 100), (1, 1), (2, 1), (7, 1)])
-def test_a_scene_with_few_meanings_gets_few_codewords(count: int, each: int) -> None:
+def test_few_distinct_vectors_get_few_codewords(count: int, each: int) -> None:
     vectors, _ = clusters(count, each, noise=0.0)
     made = fit_codebook(vectors, CodebookConfig(), WORDS)
     assert 1 <= made.size <= count
@@ -212,7 +212,7 @@ def test_a_scene_with_few_meanings_gets_few_codewords(count: int, each: int) -> 
         assert codec_report(made, vectors, WORDS).error_mean < 1e-3
 
 
-def test_a_budget_that_cannot_be_kept_is_said(caplog: pytest.LogCaptureFixture) -> None:
+def test_unreachable_error_budget_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     vectors = unit(np.random.default_rng(0).normal(size=(900, D))).astype(np.float32)
     with caplog.at_level(logging.WARNING, "langsplat"):
         made = fit_codebook(vectors, CodebookConfig(max_relevancy_error=1e-4), WORDS)
@@ -220,7 +220,7 @@ def test_a_budget_that_cannot_be_kept_is_said(caplog: pytest.LogCaptureFixture) 
     assert "still have a mean relevancy error" in caplog.text
 
 
-def test_codewords_and_colours_are_float16_and_near_ones_have_near_colours() -> None:
+def test_similar_codewords_have_similar_float16_colours() -> None:
     vectors, _ = clusters(12, 300, noise=0.03)
     made = fit_codebook(vectors, CodebookConfig(size=60), WORDS)
     for numbers in (made.vectors, made.palette):
@@ -343,7 +343,7 @@ def test_neighbours_differ_more_than_by_the_axes_of_everything():
         assert least_between_neighbours(found) > 1.5 * least_between_neighbours(field.codec.palette)
 
 
-def test_nothing_beside_anything_has_no_colours():
+def test_scenes_without_neighbours_have_no_colours():
     vectors = unit(np.random.default_rng(0).normal(size=(3, 32))).astype(np.float32)
     for thing in (NO_NODE, 0):
         field = field_of(np.full(SIDE * SIDE, thing), vectors)

@@ -34,7 +34,7 @@ def lifting(gaussians):
     return find_mask_weights(ReferenceRasterizer(), gaussians, views), groups
 
 
-def test_mean_and_confidence(gaussians, lifting):
+def test_mean_lift_weights_vectors_by_blending_weights(gaussians, lifting):
     lifted = lift_block(*lifting, 0, robust=False)
     assert lifted.vectors.shape == (3, 25, LIFTED_DIM)
     assert (lifted.vectors[0] == 0).all()
@@ -51,7 +51,7 @@ def test_mean_and_confidence(gaussians, lifting):
     np.testing.assert_allclose(lifted.vectors[2][seen], unit(total[seen]), atol=2e-3)
 
 
-def test_a_sample_is_some_of_the_rows(lifting):
+def test_lifting_a_sample_equals_its_rows_of_the_whole(lifting):
     mask_weights, groups = lifting
     whole = lift_block(mask_weights, groups, 0, robust=True)
     rows = np.array([0, 3, 7, 8, 22])
@@ -86,7 +86,7 @@ def test_median_outvotes_a_wrong_mask_that_the_mean_follows():
     assert median @ reference_median(np.ones(10), vectors) > np.cos(np.radians(1))
 
 
-def test_no_masks_anywhere(gaussians):
+def test_views_without_masks_lift_nothing(gaussians):
     empty = ImageFeatures(np.full((3, 6, 8), -1, np.int32), np.zeros((0, LIFTED_DIM), np.float32))
     mask_weights = find_mask_weights(ReferenceRasterizer(), gaussians, [(random_camera(0, 8, 6), empty)])
     lifted = lift_block(mask_weights, group_masks([empty.vectors]), 0, robust=True)
@@ -163,7 +163,7 @@ def test_descent_from_the_mean_lowers_the_loss():
 
 
 @pytest.mark.long
-def test_frozen_weights_change_nothing_that_matters():
+def test_frozen_weights_lead_to_the_same_latents():
     pairs = views()
     fast = lift_by_gradient(load_lifting_rasterizer("cpu"), GAUSSIANS, pairs, CODEC, SHORT)[0]
     slow = lift_by_gradient(load_lifting_rasterizer("reference"), GAUSSIANS, pairs, CODEC, SHORT)[0]
@@ -173,7 +173,7 @@ def test_frozen_weights_change_nothing_that_matters():
 
 
 @pytest.mark.long
-def test_zeros_as_published_waste_their_first_steps():
+def test_published_start_learns_more_slowly():
     pairs, cpu = views(), load_lifting_rasterizer("cpu")
     from_mean = l1(lift_by_gradient(cpu, GAUSSIANS, pairs, CODEC, SHORT)[0], pairs)
     published = replace(SHORT, start="zeros-as-published")
@@ -181,7 +181,7 @@ def test_zeros_as_published_waste_their_first_steps():
 
 
 @pytest.mark.long
-def test_the_gradient_through_the_published_normalisation():
+def test_published_normalisation_has_its_exact_gradient():
     import torch
 
     rng = np.random.default_rng(0)
@@ -195,7 +195,7 @@ def test_the_gradient_through_the_published_normalisation():
 
 
 @pytest.mark.long
-def test_it_is_deterministic_and_can_be_interrupted():
+def test_gradient_lift_is_deterministic_and_interruptible():
     pairs, cpu = views(), load_lifting_rasterizer("cpu")
     one, two = (lift_by_gradient(cpu, GAUSSIANS, pairs, CODEC, SHORT)[0] for _ in range(2))
     np.testing.assert_array_equal(one, two)

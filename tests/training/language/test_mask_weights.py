@@ -167,7 +167,7 @@ def plain_masks_of_things(views: Sequence[Array], level: int) -> list[int]:
 
 @pytest.mark.parametrize("level", [1, 2])
 @pytest.mark.parametrize("seed", range(4))
-def test_masks_go_together_by_the_plain_rule(seed, level):
+def test_masks_are_linked_by_the_plain_rule(seed, level):
     views = random_views(seed)
     got = module.instances_of_masks(MaskWeights(views, 240), counts_of(views), level)
     want = np.array(plain_masks_of_things(views, level))
@@ -180,7 +180,7 @@ def test_masks_go_together_by_the_plain_rule(seed, level):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_gaussian_belongs_to_the_thing_that_it_paints_most(seed):
+def test_gaussians_belong_to_the_instance_they_paint_most(seed):
     views = random_views(seed)
     counts = counts_of(views)
     things = found(views, 240)
@@ -234,7 +234,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_things_of_a_case(name):
+def test_instances_of_hard_cases(name):
     """Things of one size may be numbered either way."""
     views, want = CASES[name]
     things = found(views, len(want))
@@ -244,7 +244,7 @@ def test_things_of_a_case(name):
     np.testing.assert_array_equal(things, want)
 
 
-def test_masks_of_other_levels_show_no_thing():
+def test_masks_of_other_levels_show_no_instance():
     rows = np.arange(20)
     views = [joined(view(np.where(rows < 10, 0, UNSEEN)), view(np.full(20, 1), level=1))] * 2
     for level, want in ((WHOLE, [0, -1, 0, -1]), (1, [-1, 0, -1, 0]), (0, [-1] * 4)):
@@ -254,7 +254,7 @@ def test_masks_of_other_levels_show_no_thing():
     assert hidden.tolist() == [NO_NODE] * 5
 
 
-def test_a_gaussian_that_two_masks_share_evenly_is_claimed_by_neither():
+def test_evenly_shared_gaussians_are_claimed_by_no_mask():
     even = joined(view([0, 0, 0]), view([1, UNSEEN, UNSEEN]))
     assert plain_masks_of_things([even], WHOLE) == [0, -1]
     assert module.instances_of_masks(MaskWeights([even], 3), [2], WHOLE).tolist() == [0, -1]
@@ -262,14 +262,14 @@ def test_a_gaussian_that_two_masks_share_evenly_is_claimed_by_neither():
 
 
 @pytest.mark.parametrize("sample", [60, 200])
-def test_a_sample_is_enough_to_tell_things_apart(sample):
+def test_a_sample_finds_the_same_instances(sample):
     truth = np.repeat([0, 1, 2], [300, 100, 200])
     views = [view(np.array(order)[truth]) for order in ([0, 1, 2], [2, 0, 1])]
     whole = found(views, 600)
     np.testing.assert_array_equal(found(views, 600, sample=sample), whole)
 
 
-def test_a_mask_that_the_sample_misses_shows_no_thing():
+def test_masks_outside_the_sample_show_no_instance():
     of_row = np.zeros(200, int)
     of_row[7] = 1
     assert found([view(of_row)], 200)[7] == 1
@@ -277,7 +277,7 @@ def test_a_mask_that_the_sample_misses_shows_no_thing():
     assert found([view(of_row)], 200, sample=missed[-1])[7] == NO_NODE
 
 
-def test_blocks_change_nothing():
+def test_blocks_do_not_change_instances():
     views = random_views(5)
     whole = found(views, 240)
     blocks = MaskWeights(views, 240, block_size=37)
@@ -287,7 +287,7 @@ def test_blocks_change_nothing():
 # Votes: masks of just one node, in photograph after photograph.
 
 
-def test_votes_are_masks_of_just_that_node():
+def test_votes_count_masks_of_just_one_node():
     """Two subparts in a whole. One photograph outlines the whole, one both subparts, one something else."""
     rows = np.arange(40)
     tree = Tree(

@@ -85,7 +85,7 @@ def test_merging_is_average_linkage(seed):
     np.testing.assert_allclose(costs, want_costs, rtol=1e-5)  # masses are summed in float32
 
 
-def test_disagreement_of_links():
+def test_link_disagreement_is_the_weighted_share_of_views():
     gaussians = random_gaussians(120, seed=3, scale_range=(0.1, 0.3))
     mask_weights = find_mask_weights(CpuRasterizer(), gaussians, make_views(4))
     surface = build_surface(gaussians)
@@ -105,7 +105,7 @@ def test_disagreement_of_links():
         assert found[link] == pytest.approx(apart / seen if seen else module.UNSEEN, abs=1e-5)
 
 
-def test_a_surface_bends_towards_itself_in_a_corner_and_away_on_a_ridge():
+def test_concavity_is_high_in_corners_and_low_on_ridges():
     """Two planes that meet in a right angle, seen from the open side and from behind."""
     rng = np.random.default_rng(0)
     flat = np.concatenate([rng.uniform(0, 1, (800, 2)), np.zeros((800, 1))], 1)
@@ -139,7 +139,7 @@ def blob_views(wrong: float) -> tuple:
 
 
 @pytest.mark.parametrize("wrong", [0.0, 0.15])
-def test_things_come_out_though_some_masks_are_wrong(wrong):
+def test_tree_finds_instances_despite_wrong_masks(wrong):
     scene, blob, views = blob_views(wrong)
     mask_weights = find_mask_weights(CpuRasterizer(), scene.gaussians, views)
     surface = build_surface(scene.gaussians)
@@ -153,7 +153,7 @@ def test_things_come_out_though_some_masks_are_wrong(wrong):
         assert (own & (nodes == node)).sum() / (own | (nodes == node)).sum() > 0.9
 
 
-def test_cuts_are_nested_and_end_at_their_cost():
+def test_cuts_at_rising_costs_are_nested():
     patches = random_patches(1)
     children, costs = merge(patches)
     tree = MergeTree(np.arange(24, dtype=np.int32), children, costs)
@@ -165,7 +165,7 @@ def test_cuts_are_nested_and_end_at_their_cost():
         assert len(np.unique(np.stack([fine, coarse]), axis=1).T) == len(np.unique(fine))
 
 
-def test_a_pixel_has_the_patch_it_shows_most_of():
+def test_pixels_show_their_heaviest_patch():
     gaussians, camera = random_gaussians(60, scale_range=(0.1, 0.4)), random_camera(1, 24, 18)
     patches = np.random.default_rng(0).integers(-1, 5, 60).astype(np.int32)
     drawn = draw_patches(CpuRasterizer().view(gaussians, camera), gaussians, patches)
@@ -178,7 +178,7 @@ def test_a_pixel_has_the_patch_it_shows_most_of():
     np.testing.assert_array_equal(drawn[clear], want[clear])
 
 
-def test_maps_number_what_is_seen_of_three_cuts():
+def test_nested_maps_number_visible_nodes_of_each_cut():
     drawn = np.array([[0, 0, 1, 1], [2, 2, 3, -1]])
     maps = nested_maps(drawn, [np.arange(4), np.array([0, 0, 1, 1]), np.zeros(4, np.int64)], 2 / drawn.size)
     assert maps.tolist() == [
@@ -188,7 +188,7 @@ def test_maps_number_what_is_seen_of_three_cuts():
     ]
 
 
-def test_almost_nothing():
+def test_empty_scenes_have_empty_trees():
     """No Gaussian, one, and masks that no Gaussian paints."""
     eyes = np.zeros((1, 3))
     for count in (0, 1, 3):

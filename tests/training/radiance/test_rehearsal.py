@@ -78,7 +78,7 @@ def pretended(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
     return pretend
 
 
-def test_it_ends_where_more_loses(pretended: Callable[..., list[str]]) -> None:
+def test_rehearsals_stop_at_a_losing_budget(pretended: Callable[..., list[str]]) -> None:
     photographs, config = capture(800), RadianceConfig()
     budgets = budgets_for(photographs, config, VIEWS)
     scores = {
@@ -96,7 +96,7 @@ def test_it_ends_where_more_loses(pretended: Callable[..., list[str]]) -> None:
     assert supported(found, budgets) == budgets[2]
 
 
-def test_one_view_that_loses_is_enough(pretended: Callable[..., list[str]]) -> None:
+def test_one_losing_view_rejects_a_budget(pretended: Callable[..., list[str]]) -> None:
     photographs, config = capture(480), RadianceConfig(steps=1_500, max_gaussians=60_000, sh_degree=1)
     scores = {(500, 320): [20.0, 18.0], (500, 480): [19.9], (1_500, 480): [22.0, 17.9]}
     pretended(scores)
@@ -105,7 +105,7 @@ def test_one_view_that_loses_is_enough(pretended: Callable[..., list[str]]) -> N
     assert supported(found, budgets_for(photographs, config, VIEWS)) == QUICK
 
 
-def test_where_no_view_can_be_spared_it_is_the_smallest(pretended: Callable[..., list[str]]) -> None:
+def test_smallest_budget_is_taken_without_spare_views(pretended: Callable[..., list[str]]) -> None:
     tried = pretended({})
     budgets = budgets_for(capture(), RadianceConfig(), 3)
     assert rehearse(capture(), RadianceConfig(), [0, 4, 7]) == []
@@ -113,7 +113,7 @@ def test_where_no_view_can_be_spared_it_is_the_smallest(pretended: Callable[...,
     assert supported([], budgets) == budgets[0]
 
 
-def test_fewer_pixels_show_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_widened_gaussians_look_the_same_at_full_size(monkeypatch: pytest.MonkeyPatch) -> None:
     photographs, sizes = capture(160), []
     rng = np.random.default_rng(1)
     fitted = Gaussians(
@@ -144,7 +144,7 @@ def test_fewer_pixels_show_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_allclose(np.exp(2 * wide.log_scales[0].astype(float)), grown, rtol=1e-4)
 
 
-def test_scores_compare_between_sizes() -> None:
+def test_small_scores_compare_shrunk_images() -> None:
     """As if both had been shrunk beforehand; what a mask leaves out of a small pixel leaves out the pixel."""
     rng = np.random.default_rng(2)
     photographs = capture(640)

@@ -80,7 +80,7 @@ def looked_up(other: Array, camera: Camera, to: Camera, depth: float, column: in
     return float(above * (1 - b) + below * b)
 
 
-def test_scores_are_those_of_the_reference() -> None:
+def test_sweep_scores_equal_the_reference() -> None:
     one, two = cameras()[1:3]
     greys = [picture(camera).mean(2, dtype=np.float32) / 255 for camera in (one, two)]
     planes = inverse_depths(one, [one, two], capture().points)
@@ -101,7 +101,7 @@ def test_scores_are_those_of_the_reference() -> None:
     assert (best[1] == -1).all()  # one neighbour has one score
 
 
-def test_depths_of_a_surface() -> None:
+def test_depths_lie_on_the_true_surface() -> None:
     maps = find_depths(capture(), range(5))
     assert len(maps) == 4  # the view that looks away has none
     for one, camera in zip(maps, cameras(), strict=False):
@@ -126,7 +126,7 @@ def test_space_before_a_surface_is_free() -> None:
     assert not in_free_space(surface, []).any()
 
 
-def test_depths_that_are_alone_tell_nothing() -> None:
+def test_isolated_depths_are_dropped() -> None:
     rng = np.random.default_rng(5)
     depth = np.where(rng.random(SIZE[::-1]) < 0.6, rng.normal(5, 0.1, SIZE[::-1]), np.nan)
     depth[10, 10] = 9.0
@@ -142,7 +142,7 @@ def test_depths_that_are_alone_tell_nothing() -> None:
     assert 0.2 < np.isfinite(kept).mean() < 0.6
 
 
-def test_what_is_nearest_is_told_by_depths_and_points_around() -> None:
+def test_free_depth_follows_nearby_depths_and_points() -> None:
     rng = np.random.default_rng(4)
     camera = cameras()[1]
     depth = np.where(rng.random(SIZE[::-1]) < 0.01, rng.uniform(2, 9, SIZE[::-1]), np.nan)
@@ -167,7 +167,7 @@ def test_what_is_nearest_is_told_by_depths_and_points_around() -> None:
     assert 0 < alone < depth.size / 2
 
 
-def test_nothing_stands_close_before_what_no_photograph_confirms() -> None:
+def test_space_before_unconfirmed_surfaces_is_free() -> None:
     images = list(capture().images)
     images[0] = images[0].copy()
     images[0][20:34, 20:30] = 120  # flat in this view alone
@@ -190,13 +190,13 @@ def test_masked_pixels_have_no_depth() -> None:
     assert np.isfinite(first.depth[:, 30:]).any()
 
 
-def test_alone_or_without_texture_nothing_is_known() -> None:
+def test_single_or_flat_views_have_no_depths() -> None:
     assert find_depths(capture(), [0]) == []
     flat = replace(capture(), images=tuple(np.full((*SIZE[::-1], 3), 120, np.uint8) for _ in range(5)))
     assert not any(np.isfinite(one.depth).any() for one in find_depths(flat, range(4)))
 
 
-def test_neighbours_see_the_same_from_aside() -> None:
+def test_neighbouring_views_see_the_same_from_aside() -> None:
     near = neighbouring_views(cameras(), capture().points)
     assert near[4] == []
     assert all(4 not in others and len(others) == 3 for others in near[:4])

@@ -69,7 +69,7 @@ def test_views_agree_on_the_surface_that_both_see() -> None:
         assert found.max() == 2
 
 
-def test_a_difference_is_what_no_exposure_explains() -> None:
+def test_colour_difference_ignores_exposure() -> None:
     rng = np.random.default_rng(1)
     drawn = rng.random((GRID, GRID, 3)).astype(np.float32)
     seen = 0.8 * drawn + np.float32(0.05)
@@ -83,7 +83,7 @@ def test_a_difference_is_what_no_exposure_explains() -> None:
     assert np.isnan(found[20]).all()
 
 
-def test_what_moves_holds_together() -> None:
+def test_transients_are_connected_patches() -> None:
     differs, sizes = np.zeros((GRID, GRID), bool), np.zeros((GRID, GRID))
     differs[3:5, 3:5], differs[10:13, 10], differs[20:23, 20:23] = True, True, True
     sizes[3, 3], sizes[11, 10] = 0.2, 0.2  # the second piece is too small, the third nowhere sure
@@ -95,7 +95,7 @@ def test_what_moves_holds_together() -> None:
     assert everything.mean() == pytest.approx(MOST, abs=0.01)
 
 
-def test_one_view_that_the_others_contradict() -> None:
+def test_patches_that_other_views_contradict_are_transient() -> None:
     """A patch counts as moving while its view alone differs there; once all differ it counts again."""
     rng = np.random.default_rng(2)
     colours = rng.uniform(0.2, 0.8, (GRID, GRID, 3)).astype(np.float32)
@@ -118,7 +118,7 @@ def test_one_view_that_the_others_contradict() -> None:
     assert not found.moving[1][14:16, 14:16].any()
 
 
-def test_patches_and_their_pixels() -> None:
+def test_patches_map_to_their_pixels() -> None:
     picture = torch.arange(64 * 96, dtype=torch.float32).reshape(64, 96, 1)
     want = picture.numpy().reshape(GRID, 2, GRID, 3).mean((1, 3))
     np.testing.assert_allclose(patch_means(picture)[..., 0], want, rtol=1e-6)

@@ -1,0 +1,272 @@
+"""Radiance training: its schedule, and whole runs on a tiny scene drawn by the reference rasterizer."""
+
+import math
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from langsplat_core.arrays import Array
+from langsplat_core.config import INRIA, RadianceConfig
+from langsplat_core.datasets.capture import Capture
+from langsplat_core.errors import BackendError, InputError
+from langsplat_core.progress import Cancelled, Progress, Report
+from langsplat_core.scene import Gaussians, look_at
+from langsplat_core.training.radiance.differentiable import CpuRenderer, renderer_for
+from langsplat_core.training.radiance.scores import evaluate_views
+from langsplat_core.training.radiance.state import (
+    PARAMETERS,
+    initial_gaussians,
+    start,
+)
+from langsplat_core.training.radiance.stereo import STAGE
+from langsplat_core.training.radiance.trainer import (
+    for_few_views,
+    schedule_for,
+    train_radiance,
+)
+from tests.support.processes import stop_at
+from tests.support.radiance import SHORT, SIZE, capture, picture, truth
+
+
+def test_the_full_budget_is_the_inria_schedule() -> None:
+    schedule = schedule_for(RadianceConfig(coarse_fraction=0), extent=5.0)
+    rounds = [step for step in range(1, 30_001) if schedule.densifies(step)]
+    assert rounds == list(range(600, 15_000, 100))
+    resets = [step for step in range(1, 30_001) if schedule.resets_opacity(step)]
+    assert resets == [3_000, 6_000, 9_000, 12_000]
+    degrees = [schedule.active_sh_degree(step) for step in (1, 999, 1_000, 2_999, 3_000, 9_000)]
+    assert degrees == [0, 0, 1, 2, 3, 3]
+    for step in (1, 7_000, 15_000, 30_000):
+        t = step / 30_000
+        want = 5.0 * math.exp(math.log(1.6e-4) * (1 - t) + math.log(1.6e-6) * t)
+        rates = schedule.learning_rates(step)
+        assert rates.pop("means") == pytest.approx(want, rel=1e-12)
+        assert rates == {
+            "log_scales": 5e-3,
+            "quats_wxyz": 1e-3,
+            "opacity_logits": 0.05,
+            "sh_dc": 2.5e-3,
+            "sh_rest": 2.5e-3 / 20,
+        }
+    assert not schedule.prunes_large(3_000)
+    assert schedule.prunes_large(3_100)
+    assert schedule.coarse_until == 0
+
+
+def test_a_small_budget_moves_geometry_faster() -> None:
+    full, short = (schedule_for(RadianceConfig(steps=n), 2.0).learning_rates(n) for n in (30_000, 300))
+    for name in ("means", "log_scales", "quats_wxyz"):
+        assert short[name] == pytest.approx(10 * full[name])  # the root of 100
+    for name in ("opacity_logits", "sh_dc", "sh_rest"):
+        assert short[name] == full[name]
+    longer = schedule_for(RadianceConfig(steps=60_000), 2.0).learning_rates(60_000)
+    assert longer == full
+
+
+@pytest.mark.parametrize("steps", [100, 300, 600, 1_000, 3_000, 7_000])
+def test_small_budgets_leave_time_to_recover(steps: int) -> None:
+    schedule = schedule_for(RadianceConfig(steps=steps), extent=1.0)
+    resets = [step for step in range(1, steps + 1) if schedule.resets_opacity(step)]
+    rounds = [step for step in range(1, steps + 1) if schedule.densifies(step)]
+    assert all(step <= steps * 2 / 3 for step in resets + rounds)
+    assert all(steps - step >= 600 for step in resets)
+    assert schedule.densify_every >= 20
+    assert len(rounds) >= (5 if steps >= 600 else 1)
+
+
+def steps_into(steps: list[int]) -> Progress:
+    """Progress of `SHORT` that notes the number of every step."""
+
+    def note(at: Report) -> None:
+        if at.stage != STAGE:
+            steps.append(round(at.fraction * SHORT.steps))
+
+    return Progress(note)
+
+
+def as_arrays(gaussians: Gaussians) -> list[Array]:
+    return [getattr(gaussians, name) for name in gaussians.__dataclass_fields__]
+
+
+def test_gradients_are_those_of_the_reference_picture() -> None:
+    """A random direction in every parameter, against central differences of the float64 picture.
+
+    Without the cut-offs: a difference quotient also sees the jumps of 1/255 where pixels enter an extent,
+    which no rasterizer's gradient contains. The step is short enough to swap no two depths.
+    """
+    smooth = replace(INRIA, alpha_min=1e-7, transmittance_min=1e-12, alpha_max=0.9999)
+    rng = np.random.default_rng(0)
+    base = truth()
+    base = replace(base, sh=np.concatenate([base.sh, 0.1 * rng.normal(size=(40, 3, 3))], axis=1))
+    camera, weight = capture().cameras[0], rng.normal(size=(48, 48, 3))
+    parameters = start(base, 0, torch.device("cpu")).values
+    rendered = CpuRenderer(smooth).render(parameters, camera, 1)
+    np.testing.assert_allclose(rendered.image.detach().numpy(), picture(base, camera, smooth), atol=1e-5)
+    assert bool(rendered.visible.all())
+    (rendered.image * torch.tensor(weight, dtype=torch.float32)).sum().backward()
+    for name in PARAMETERS:
+        direction = 1e-4 * torch.from_numpy(rng.normal(size=parameters[name].shape).astype(np.float32))
+        ends, places = [], []
+        for sign in (1, -1):
+            moved = start(base, 0, torch.device("cpu"))
+            with torch.no_grad():
+                moved.values[name] += sign * direction
+            ends.append((picture(moved.gaussians(), camera, smooth) * weight).sum())
+            places.append(moved.values[name].detach().double())
+        grad = parameters[name].grad
+        assert grad is not None
+        ours = float((grad.double() * (places[0] - places[1])).sum())  # rounded to float32, both ways
+        assert ours == pytest.approx(ends[0] - ends[1], rel=1e-3, abs=1e-6), name
+
+
+@pytest.mark.long
+def test_training_learns_the_scene() -> None:
+    config = RadianceConfig(steps=250, backend="cpu", sh_degree=0, max_gaussians=2_000)
+    views = [0, 1, 2, 3, 4]
+    first = initial_gaussians(capture(), views, 0, 2_000, 0)
+    before = evaluate_views(first, capture(), [*views, 5], "cpu")
+    trained = train_radiance(capture(), config, views)
+    after = evaluate_views(trained, capture(), [*views, 5], "cpu")
+    assert np.mean([s.psnr for s in after[:5]]) > np.mean([s.psnr for s in before[:5]]) + 10
+    assert after[5].psnr > before[5].psnr + 5  # the view that was not trained on
+    assert after[5].ssim > before[5].ssim
+    assert all(0 < score.covered <= 1 for score in [*before, *after])
+    assert trained.valid().all()
+    assert trained.opacity_logits.min() > -5.6  # none below alpha 1/255
+
+
+@pytest.mark.long
+def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path: Path) -> None:
+    straight_path, path = tmp_path / "straight.safetensors", tmp_path / "resumed.safetensors"
+    straight = train_radiance(capture(), SHORT, [0, 1, 2], straight_path)
+
+    with pytest.raises(Cancelled):
+        train_radiance(capture(), SHORT, [0, 1, 2], path, stop_at("training", 0.5))
+    steps: list[int] = []
+    resumed = train_radiance(capture(), SHORT, [0, 1, 2], path, steps_into(steps))
+    assert steps == list(range(21, 41))
+    for a, b in zip(as_arrays(straight), as_arrays(resumed), strict=True):
+        np.testing.assert_array_equal(a, b)
+    one, other = load_file(path), load_file(straight_path)  # moments and statistics too
+    assert one.keys() == other.keys()
+    for name in one:
+        torch.testing.assert_close(one[name], other[name], rtol=0, atol=0, equal_nan=True)
+    again = train_radiance(capture(), SHORT, [0, 1, 2], path)  # finished: nothing is left to do
+    np.testing.assert_array_equal(again.means, straight.means)
+    with pytest.raises(InputError, match="other photographs or settings"):
+        train_radiance(capture(), replace(SHORT, steps=50), [0, 1, 2], path)
+
+
+def test_ctrl_c_ends_training_with_a_checkpoint(tmp_path: Path) -> None:
+    path = tmp_path / "run.safetensors"
+    seen: list[int] = []
+
+    def interrupt(at: Report) -> None:
+        steps_into(seen).show(at)
+        if seen and seen[-1] == 7:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    handler = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        train_radiance(capture(), SHORT, [0, 1, 2], path, Progress(interrupt))
+    assert signal.getsignal(signal.SIGINT) is handler
+    train_radiance(capture(), SHORT, [0, 1, 2], path, steps_into(seen))
+    assert seen == list(range(1, 41))
+
+
+def test_one_view_is_enough_and_none_is_refused() -> None:
+    trained = train_radiance(capture(), replace(SHORT, steps=5), [0])
+    assert len(trained) > 0
+    with pytest.raises(InputError, match="no photographs to train on"):
+        train_radiance(capture(), SHORT, [])
+
+
+def test_empty_views_do_not_disturb_training() -> None:
+    away = look_at(np.array([0, 0, -4.0]), np.array([0, 0, -9.0]), np.array([0.0, -1.0, 0.0]), SIZE)
+    blind = replace(capture(), cameras=(away, *capture().cameras[1:]))
+    trained = train_radiance(blind, replace(SHORT, steps=12), [0, 1])
+    assert len(trained) > 100
+    assert trained.valid().all()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
+def test_missing_cuda_is_refused_in_one_line() -> None:
+    with pytest.raises(BackendError, match="no CUDA device; use --backend cpu") as caught:
+        train_radiance(capture(), replace(SHORT, backend="cuda"), [0])
+    assert "\n" not in str(caught.value)
+    assert isinstance(renderer_for("auto"), CpuRenderer)
+
+
+@pytest.mark.long
+def test_training_finds_exposures_of_photographs() -> None:
+    """Every other photograph is brighter by a third, the others darker: the scene's colours are neither's."""
+    gains = [1.3, 0.7, 1.3, 0.7, 1.0, 1.0]  # a half is taken of all, so that nothing is clipped
+    images = [
+        (0.5 * gain * image.astype(np.float64)).clip(0, 255).astype(np.uint8)
+        for image, gain in zip(capture().images, gains, strict=True)
+    ]
+    uneven = replace(capture(), images=tuple(images))
+    even = replace(capture(), images=tuple((0.5 * image).astype(np.uint8) for image in capture().images))
+    config = RadianceConfig(steps=200, backend="cpu", sh_degree=1, max_gaussians=2_000)
+    scores = {}
+    for exposure in ("off", "auto", "on"):
+        trained = train_radiance(uneven, replace(config, exposure=exposure), [0, 1, 2, 3])  # type: ignore[arg-type]
+        scores[exposure] = evaluate_views(trained, even, [0, 1, 2, 3], "cpu")
+    means = {exposure: np.mean([score.psnr for score in found]) for exposure, found in scores.items()}
+    assert means["on"] > means["off"] + 2
+    apart = evaluate_views(trained, uneven, [0, 1, 2], "cpu")  # in its own exposure each is further away
+    assert all(score.psnr_exposed is not None and score.psnr_exposed > score.psnr + 2 for score in apart)
+    assert means["auto"] == means["on"]
+    same = {
+        exposure: train_radiance(even, replace(config, exposure=exposure), [0, 1, 2, 3])  # type: ignore[arg-type]
+        for exposure in ("off", "auto")
+    }
+    np.testing.assert_array_equal(same["off"].sh, same["auto"].sh)  # nothing to explain
+
+
+def watched(config: RadianceConfig, photographs: Capture, path: Path) -> tuple[Gaussians, Array]:
+    """What a training makes, and the (V, 32, 32) patches that move at its end."""
+    trained = train_radiance(photographs, config, [0, 1, 2, 3, 4], path)
+    return trained, load_file(path)["watched.moving"].numpy()
+
+
+@pytest.mark.long
+def test_training_ignores_transients(tmp_path: Path) -> None:
+    config = RadianceConfig(steps=250, backend="cpu", sh_degree=0, max_gaussians=2_000)
+    images = [image.copy() for image in capture().images]
+    images[1][16:34, 18:30] = (250, 40, 250)
+    passed = replace(capture(), images=tuple(images))
+    trained, moving = watched(config, passed, tmp_path / "auto")
+    square = np.s_[12:22, 13:19]  # of patches, within the 48 pixels
+    assert moving[1][square].mean() > 0.8
+    assert moving[[0, 2, 3, 4]].mean() < 0.02
+    off, _ = watched(replace(config, transients="off"), passed, tmp_path / "off")
+    with_it, without = (evaluate_views(one, capture(), [1], "cpu")[0].psnr for one in (off, trained))
+    assert without > with_it + 3
+    still = [
+        watched(replace(config, transients=kind), capture(), tmp_path / f"still-{kind}")[0]  # type: ignore[arg-type]
+        for kind in ("auto", "off")
+    ]
+    np.testing.assert_array_equal(still[0].means, still[1].means)  # nothing is masked
+
+
+@pytest.mark.long
+def test_few_views_use_depths_instead_of_opacity_resets() -> None:
+    few, many = for_few_views(SHORT), SHORT
+    assert schedule_for(many, 1.0).resets_opacity(25)
+    schedule = schedule_for(few, 1.0)
+    assert not any(schedule.resets_opacity(step) or schedule.prunes_large(step) for step in range(1, 41))
+    assert few.opacity_decay > 0
+    stages: list[str] = []
+    told = Progress(lambda at: stages.append(at.stage))
+    train_radiance(capture(), replace(SHORT, steps=2), [0, 1, 2], progress=told)
+    assert STAGE in stages
+    stages.clear()
+    train_radiance(capture(), replace(SHORT, steps=2, few_views=2), [0, 1, 2], progress=told)
+    assert STAGE not in stages
