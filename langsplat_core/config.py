@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from numbers import Integral, Real
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args, get_origin
+from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
 import tyro
 
@@ -82,7 +82,7 @@ def named_values(settings: object, option: str = "--") -> Iterator[tuple[str, An
 
 
 def annotations(hint: Any) -> Iterator[Any]:
-    """Parts of `Annotated` beside the type, also inside of unions, tuples and further `Annotated`."""
+    """Yield the parts of `Annotated` beside the type, inside of unions, tuples and `Annotated` too."""
     if get_origin(hint) is Annotated:
         yield from hint.__metadata__
     if get_origin(hint) is not typing.Literal:
@@ -203,13 +203,12 @@ class RadianceBudget(NamedTuple):
     sh_degree: int
 
     def at_most(self, limit: "RadianceBudget") -> "RadianceBudget":
-        """No more of anything than `limit`."""
+        """Return the smaller of both budgets in each respect."""
         return RadianceBudget(*map(min, self, limit))
 
 
 QUICK = RadianceBudget(320, 500, 30_000, 1)  # with fewer steps no capture is learnt
 GOOD = RadianceBudget(480, 1_500, 60_000, 1)
-REHEARSAL_FACTOR = 3  # between the steps of one rehearsal and the next one
 
 
 @dataclass(frozen=True)
@@ -256,21 +255,6 @@ class RadianceConfig:
     transients: Literal["auto", "on", "off"] = "auto"
     checkpoint_every: Count = 2_000  # steps of this run
     seed: Seed = 0  # of random numbers
-
-    def budgets(self, views: int, longer_side: int) -> list[RadianceBudget]:
-        """Ascending budgets that are tried with so many training views of so many pixels.
-
-        The last is all that is asked for, and the only one with many views or few steps. A larger preset's
-        begin with the smaller one's, so that it cannot choose worse.
-        """
-        whole = RadianceBudget(longer_side, self.steps, self.max_gaussians, self.sh_degree)
-        steps = [QUICK.steps]
-        while REHEARSAL_FACTOR**2 * steps[-1] <= self.steps:
-            steps.append(REHEARSAL_FACTOR * steps[-1])
-        if views > self.rehearsed_views or self.steps < REHEARSAL_FACTOR * QUICK.steps:
-            return [whole]
-        sizes = [(GOOD if count <= GOOD.steps else whole)._replace(steps=count) for count in steps]
-        return list(dict.fromkeys(budget.at_most(whole) for budget in (QUICK, *sizes, whole)))
 
     def spending(self, budget: RadianceBudget) -> "RadianceConfig":
         """Return these settings with the budget's steps, Gaussians and degree."""
@@ -327,11 +311,6 @@ class CodebookConfig:
     max_relevancy_error: Annotated[Share, tyro.conf.arg(aliases=["--max-relevancy-error"])] = 0.006
     seed: Seed = 0  # of random numbers
 
-    @property
-    def seconds(self) -> float:
-        """Seconds that the fit is expected to take on two cores."""
-        return 3 + 0.02 * min(self.size or 2_500, 4_096)
-
 
 @dataclass(frozen=True)
 class AutoencoderConfig:
@@ -344,10 +323,6 @@ class AutoencoderConfig:
     lr: Rate = 3e-3  # 7e-4 in the public code: with as many steps a quarter more error
     seed: Seed = 0  # of random numbers
 
-    @property
-    def seconds(self) -> float:
-        return 3 + 0.013 * self.steps
-
 
 @dataclass(frozen=True)
 class LinearConfig:
@@ -356,7 +331,6 @@ class LinearConfig:
     kind: Annotated[Literal["linear"], _KIND] = "linear"
     latent_dim: LatentDim = 3  # numbers per Gaussian and level
     seed: Seed = 0  # of the vectors that are sampled
-    seconds: ClassVar[float] = 3.0
 
 
 # The kinds of codecs. On the command line `--codec.kind` chooses one, whose settings are then options.
@@ -455,7 +429,7 @@ LevelChoice = Literal["auto", "subpart", "part", "whole"]
 
 @dataclass(frozen=True)
 class PictureConfig:
-    """Settings for composing an image of channels, in the window's shader and in NumPy alike."""
+    """Settings for composing an image of channels, on a graphics device and on the CPU alike."""
 
     display: Display = "rgb"
     heat_opacity: Share = 0.85  # of the heat map over the colours where relevancy is high

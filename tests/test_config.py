@@ -14,14 +14,12 @@ from langsplat_core.cli.app import parse
 from langsplat_core.cli.train import Train
 from langsplat_core.config import AutoencoderConfig, TrainConfig, check_settings, numeric_settings
 from langsplat_core.errors import InputError
-from langsplat_core.extensions.benchmarks import config as bench
 from langsplat_core.pipeline.train import train_scene
 from tests.support.commands import refusal
 
 CONFIGS = {
     name: value
-    for module in (config, bench)
-    for name, value in vars(module).items()
+    for name, value in vars(config).items()
     if dataclasses.is_dataclass(value)
     and isinstance(value, type)
     and value not in (config.Range, config.Setting)

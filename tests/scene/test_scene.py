@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from langsplat_core import render
 from langsplat_core.arrays import logit, psnr, rotation_matrices, sigmoid, unit
 from langsplat_core.errors import InputError
-from langsplat_core.extensions.benchmarks.query_speed import repeated
 from langsplat_core.progress import Cancelled
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import NO_NODE, Camera, Gaussians, Odds, Scene, Tree
@@ -152,7 +151,9 @@ def test_what_lies_apart_is_left_as_it_is():
 @pytest.fixture(scope="module")
 def dense() -> Gaussians:
     small = random_gaussians(200, 1, sh_degree=1, scale_range=(0.05, 0.2))
-    return repeated(Scene(small), 1600).gaussians
+    many = small.take(np.resize(np.arange(len(small)), 1600))  # each moved by a random step of its own size
+    steps = np.random.default_rng(0).normal(size=(1600, 3)) * np.exp(many.log_scales)
+    return replace(many, means=many.means + steps)
 
 
 def test_a_dense_scene_shrinks_and_looks_alike(dense):

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from langsplat_core.config import INRIA, RadianceBudget, RadianceConfig
+from langsplat_core.config import GOOD, INRIA, QUICK, RadianceBudget, RadianceConfig
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.holdout import chosen
 from langsplat_core.progress import Progress, Report, silent
@@ -25,12 +25,30 @@ from langsplat_core.training.radiance.trainer import train_radiance
 log = logging.getLogger("langsplat")
 
 STAGE = "rehearsing"
+FACTOR = 3  # between the steps of one rehearsal and the next one
 LEAST_GAIN = 0.25  # dB, for which more is spent: less may be chance
 
 
 def budgets_for(capture: Capture, config: RadianceConfig, views: int) -> list[RadianceBudget]:
     """Return the ascending budgets that `views` of the capture's photographs may be trained with."""
-    return config.budgets(views, max(max(camera.width, camera.height) for camera in capture.cameras))
+    longer_side = max(max(camera.width, camera.height) for camera in capture.cameras)
+    return ascending_budgets(config, views, longer_side)
+
+
+def ascending_budgets(config: RadianceConfig, views: int, longer_side: int) -> list[RadianceBudget]:
+    """Return the ascending budgets that are tried with so many training views of so many pixels.
+
+    The last is all that is asked for, and the only one with many views or few steps. A larger preset's begin
+    with the smaller one's, so that it cannot choose worse.
+    """
+    whole = RadianceBudget(longer_side, config.steps, config.max_gaussians, config.sh_degree)
+    steps = [QUICK.steps]
+    while FACTOR**2 * steps[-1] <= config.steps:
+        steps.append(FACTOR * steps[-1])
+    if views > config.rehearsed_views or config.steps < FACTOR * QUICK.steps:
+        return [whole]
+    sizes = [(GOOD if count <= GOOD.steps else whole)._replace(steps=count) for count in steps]
+    return list(dict.fromkeys(budget.at_most(whole) for budget in (QUICK, *sizes, whole)))
 
 
 def budget_text(budget: RadianceBudget) -> str:

@@ -17,6 +17,7 @@ from langsplat_core.raster.render import render
 from langsplat_core.scene import Gaussians, Scene, look_at
 from langsplat_core.training.radiance import rehearsal
 from langsplat_core.training.radiance.rehearsal import (
+    ascending_budgets,
     budgets_for,
     checkpoints_of,
     rehearse,
@@ -41,14 +42,14 @@ def capture(side: int = 24) -> Capture:
 
 def test_presets_are_rehearsed_with_few_views_only() -> None:
     quick, good, full = (with_preset(TrainConfig(), name) for name in ("quick", "good", "full"))
-    tried = [one.radiance.budgets(9, one.dataset.max_side) for one in (quick, good, full)]
+    tried = [ascending_budgets(one.radiance, 9, one.dataset.max_side) for one in (quick, good, full)]
     assert tried[0] == [QUICK]
     assert tried[1] == [QUICK, RadianceBudget(480, 500, 60_000, 1), GOOD]
     whole = RadianceBudget(800, 30_000, 1_000_000, 3)
     assert tried[2] == [*tried[1], whole._replace(steps=4_500), whole]
-    assert RadianceConfig().budgets(RadianceConfig.rehearsed_views + 1, 800) == [whole]
-    assert RadianceConfig(rehearsed_views=0).budgets(9, 800) == [whole]
-    small = RadianceConfig(steps=1_500, max_gaussians=5_000, sh_degree=0).budgets(9, 200)
+    assert ascending_budgets(RadianceConfig(), RadianceConfig.rehearsed_views + 1, 800) == [whole]
+    assert ascending_budgets(RadianceConfig(rehearsed_views=0), 9, 800) == [whole]
+    small = ascending_budgets(RadianceConfig(steps=1_500, max_gaussians=5_000, sh_degree=0), 9, 200)
     assert small == [RadianceBudget(200, steps, 5_000, 0) for steps in (500, 1500)]
 
 
