@@ -12,7 +12,7 @@ import pytest
 from plyfile import PlyData
 
 from langsplat_core.cli import describe, query
-from langsplat_core.cli.edit import Scale
+from langsplat_core.cli.edit import SetScale
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.query.engine import QueryEngine
@@ -79,7 +79,7 @@ print([name for name in ("torch", "transformers") if name in sys.modules])
 
 
 @pytest.mark.long
-def test_phrases_of_the_phrasebook_need_no_encoder(tmp_path):
+def test_phrasebook_phrases_need_no_encoder(tmp_path):
     """However they are written: loading one imports torch, which takes seconds."""
     field = replace(language(), phrasebook={"book": axis(1), "plant pot": axis(2)})
     save_scene(tmp_path / "a.ply", Scene(blobs(), field, cameras(1)))
@@ -94,7 +94,7 @@ def test_phrases_of_the_phrasebook_need_no_encoder(tmp_path):
     assert heavy == "[]"
 
 
-def test_another_phrase_is_answered_by_the_encoder_named(folder, monkeypatch, capsys):
+def test_named_encoder_answers_other_phrases(folder, monkeypatch, capsys):
     loaded = []
     monkeypatch.setattr(query, "load_text_encoder", lambda name: loaded.append(name) or FakeEncoder())
     lines(capsys, "query", "a.ply", "book")
@@ -105,7 +105,7 @@ def test_another_phrase_is_answered_by_the_encoder_named(folder, monkeypatch, ca
     assert loaded == ["mine", "fake"]
 
 
-def test_what_cannot_be_asked_is_said_before_anything_is_searched(folder, monkeypatch, capsys):
+def test_unaskable_phrases_are_named_before_searching(folder, monkeypatch, capsys):
     assert run("query", "a.ply", "mug", "plamt", "the", "book or sofa", '"book"', "--json") == 0
     out, err = capsys.readouterr()
     assert [answer["phrase"] for answer in json.loads(out)] == ["mug", "book"]
@@ -121,7 +121,7 @@ def test_what_cannot_be_asked_is_said_before_anything_is_searched(folder, monkey
     assert (out, "does not know 'sofa'" in err) == ("", True)
 
 
-def test_an_encoder_that_cannot_be_loaded_is_tried_once(folder, monkeypatch, capsys):
+def test_broken_encoder_is_tried_once(folder, monkeypatch, capsys):
     tried = []
 
     def absent(name):
@@ -142,7 +142,7 @@ def test_commas_separate_phrases_and_exclusions_stay_one(folder, capsys):
     assert found[2]["reading"] == "(mug  or  book)  without  book"
 
 
-def test_the_things_of_an_answer_are_listed(folder, capsys):
+def test_query_lists_the_instances(folder, capsys):
     """Two of the three blobs are a "pair", in a scene whose unit is half a metre."""
     found, absent = answers(capsys, "query", "a.ply", "pair", "void")
     assert absent["instances"] == []
@@ -168,7 +168,7 @@ def test_the_things_of_an_answer_are_listed(folder, capsys):
     ("logit", "verdict", "probability"),
     [(9.0, "found", 1.0), (1.0, "weak match", 0.73), (-3.0, "not here", 0.05)],
 )
-def test_a_verdict_comes_with_its_probability(folder, capsys, logit, verdict, probability):
+def test_query_prints_the_probability(folder, capsys, logit, verdict, probability):
     save_fake(reading=Reading(calibration=calibrated_for("book", logit)))
     (answer,) = answers(capsys, "query", "b.ply", "book")
     assert answer["probability"] == pytest.approx(probability, abs=0.01)
@@ -178,7 +178,7 @@ def test_a_verdict_comes_with_its_probability(folder, capsys, logit, verdict, pr
     assert (answer["instances"] == []) == (verdict != "found")
 
 
-def test_without_a_calibration_there_is_no_probability(folder, capsys):
+def test_query_prints_no_probability_without_calibration(folder, capsys):
     save_fake()
     (answer,) = answers(capsys, "query", "b.ply", "book")
     assert (answer["probability"], answer["encoder"], answer["calibration"]) == (None, "fake", None)
@@ -191,7 +191,7 @@ def test_without_a_calibration_there_is_no_probability(folder, capsys):
     assert not any(OPEN_MODEL in line for line in said)
 
 
-def test_structure_is_read_unless_the_phrase_is_asked_whole(folder, capsys):
+def test_whole_option_ignores_structure(folder, capsys):
     save_fake(phrasebook={"mug": axis(0), "plant": axis(2), "mug near the plant": axis(1)})
     (answer,) = answers(capsys, "query", "b.ply", "mug or plant")
     said = lines(capsys, "query", "b.ply", "mug or plant")
@@ -213,7 +213,7 @@ def blob_of(scene: Scene) -> list[int]:
     return np.bincount(nearest, minlength=3).tolist()
 
 
-def test_a_thing_is_a_scene_of_its_own_and_removing_is_the_complement(folder, capsys):
+def test_select_writes_a_thing_and_remove_its_complement(folder, capsys):
     assert run("select", "a.ply", "mug", "--out", "mug.ply") == 0
     assert "size, m" in capsys.readouterr().out
     whole, mug = load_scene("a.ply"), load_scene("mug.ply")
@@ -231,13 +231,13 @@ def test_a_thing_is_a_scene_of_its_own_and_removing_is_the_complement(folder, ca
     assert not QueryEngine(rest, lambda name: FakeEncoder()).run("mug").found
 
 
-def test_several_phrases_and_one_with_structure(folder):
+def test_select_takes_several_phrases(folder):
     for phrases, want in ((("mug", "book"), [1, 1, 0]), (("pair, not mug",), [0, 0, 1])):
         assert run("select", "a.ply", *phrases, "--out", "b.ply") == 0
         assert [count > 0.8 * PER_BLOB for count in blob_of(load_scene("b.ply"))] == [bool(k) for k in want]
 
 
-def test_one_of_several_things(folder, capsys):
+def test_select_takes_one_instance(folder, capsys):
     assert run("select", "a.ply", "pair", "--out", "all.ply", "--json") == 0
     answer = json.loads(capsys.readouterr().out)
     assert [thing["number"] for thing in answer["instances"]] == answer["taken"] == [1, 2]
@@ -250,7 +250,7 @@ def test_one_of_several_things(folder, capsys):
     np.testing.assert_allclose(centre, answer["instances"][1]["centre"], atol=0.05)
 
 
-def test_growing_and_shrinking_are_in_metres(folder):
+def test_select_grows_and_shrinks_in_metres(folder):
     sizes = {}
     for name, words in {"0": (), "g": ("--grow", "0.2"), "s": ("--shrink", "0.01")}.items():
         assert run("select", "a.ply", "book", "--out", f"{name}.ply", *words) == 0
@@ -260,7 +260,7 @@ def test_growing_and_shrinking_are_in_metres(folder):
     assert len(load_scene("u.ply").gaussians) == sizes["g"]
 
 
-def test_points_and_hulls(folder, capsys):
+def test_select_writes_points_and_hulls(folder, capsys):
     assert run("select", "a.ply", "mug", "--out", "p.ply", "--as", "points") == 0
     vertex = PlyData.read("p.ply")["vertex"]
     assert 0.9 * PER_BLOB < len(vertex["x"]) <= PER_BLOB
@@ -274,7 +274,7 @@ def test_points_and_hulls(folder, capsys):
     assert len(PlyData.read("rest.ply")["vertex"]["x"]) >= 2 * PER_BLOB
 
 
-def test_a_known_length_gives_the_scale(folder, capsys):
+def test_known_length_gives_the_scale(folder, capsys):
     assert run("scale", "a.ply", "--metres", "0.3", "--between", "-1", "0", "0", "0.2", "0", "0") == 0
     assert load_scene("a.ply").metres_per_unit == pytest.approx(0.25)
     assert "0.25 m per unit" in capsys.readouterr().out
@@ -295,9 +295,9 @@ def test_a_known_length_gives_the_scale(folder, capsys):
         ({"metres_per_unit": 0.0}, "must be above 0"),
     ],
 )
-def test_a_scale_that_is_none(folder, given, message):
+def test_invalid_scale_is_refused(folder, given, message):
     with pytest.raises(InputError, match=message):
-        Scale(folder / "a.ply", **given).run()
+        SetScale(folder / "a.ply", **given).run()
     assert load_scene("a.ply").metres_per_unit == 0.5
 
 
@@ -317,7 +317,7 @@ def described(folder: Path) -> Path:
     return folder
 
 
-def test_the_outline_lists_wholes_with_what_is_new_in_them(described, capsys):
+def test_outline_lists_wholes_with_their_parts(described, capsys):
     words = ("describe", "named.ply", "--vocabulary", "list.txt", "--outline")
     said = lines(capsys, *words)
     assert {line.split(":")[0] for line in said[:3]} == {"mug", "book", "plant"}
@@ -330,7 +330,7 @@ def test_the_outline_lists_wholes_with_what_is_new_in_them(described, capsys):
         assert (np.diff(node["size"]) <= 0).all()
 
 
-def test_the_inventory_as_a_table_and_as_json(described, capsys):
+def test_inventory_is_printed_as_table_and_json(described, capsys):
     words = ("describe", "named.ply", "--vocabulary", "list.txt")
     said = "\n".join(lines(capsys, *words))
     assert all(word in said for word in ("mug", "book", "plant", "sofa"))
@@ -346,7 +346,7 @@ def test_the_inventory_as_a_table_and_as_json(described, capsys):
     assert answers(capsys, *words, "--level", "subpart")["inventory"] == []
 
 
-def test_words_for_a_gaussian_a_thing_and_a_pixel(described, capsys):
+def test_describe_names_a_gaussian_a_thing_and_a_pixel(described, capsys):
     words = ("describe", "named.ply", "--vocabulary", "list.txt")
     found = answers(capsys, *words, "--gaussian", "0", "--level", "whole")
     assert found["gaussian"] == 0

@@ -51,7 +51,7 @@ def asked(capsys, *words: str):
     return json.loads(capsys.readouterr().out)
 
 
-def test_a_scene_keeps_what_it_was_taught_and_forgets_it(folder, capsys):
+def test_scene_keeps_and_forgets_taught_words(folder, capsys):
     before = load_scene("a.ply").language
     teach = ("teach", "a.ply", "--name", "grandma's vase")
     assert run(*teach, "--at", MUG) == 0
@@ -72,7 +72,7 @@ def test_a_scene_keeps_what_it_was_taught_and_forgets_it(folder, capsys):
     assert_same_field(load_scene("a.ply").language, before)
 
 
-def test_a_users_own_words_go_from_scene_to_scene(folder, capsys):
+def test_users_words_work_in_other_scenes(folder, capsys):
     teach = ("--into", "words.safetensors", "--camera", "0")
     untouched = Path("a.langsplat.safetensors").read_bytes()
     assert run("teach", "a.ply", "--name", "book", "--at", MUG, *teach) == 0
@@ -89,7 +89,7 @@ def test_a_users_own_words_go_from_scene_to_scene(folder, capsys):
     assert len(load_scene("c.ply").gaussians) == PER_BLOB
 
 
-def test_more_like_this_stands_beside_phrases_or_alone(folder, capsys):
+def test_like_option_stands_beside_phrases_or_alone(folder, capsys):
     (alone,) = asked(capsys, "a.ply", "--like", BOOK)
     assert (alone["phrase"], alone["found"]) == (f"like {BOOK}", True)
     assert alone["instances"][0]["gaussians"] == PER_BLOB
@@ -134,7 +134,7 @@ def test_bad_input_is_one_line_and_nothing_is_written(folder, capsys, monkeypatc
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
-def test_a_taught_word_may_be_a_part(folder, capsys):
+def test_taught_word_may_be_a_part(folder, capsys):
     field = language()
     field.latents[1] = field.latents[2]
     save_scene("parts.ply", Scene(SCENE.gaussians, field, SCENE.cameras))

@@ -111,7 +111,7 @@ def compare(measured: Measure, what: str, ours: Array, theirs: Array) -> None:
 
 
 @pytest.mark.parametrize("view", [0, 11, 30])
-def test_the_bundled_scene_is_drawn_as_opengl_draws_it(
+def test_page_draws_the_bundled_scene_as_opengl_does(
     tab: Tab, demo: Scene, gl: moderngl.Context, measured: Measure, view: int
 ) -> None:
     camera = demo.cameras[view]
@@ -119,7 +119,7 @@ def test_the_bundled_scene_is_drawn_as_opengl_draws_it(
     compare(measured, "demo, colours", ours, drawn(gl, demo, camera))
 
 
-def test_heat_and_latents_are_drawn_as_opengl_draws_them(
+def test_page_draws_heat_and_latents_as_opengl_does(
     tab: Tab, demo: Scene, engine: QueryEngine, gl: moderngl.Context, measured: Measure
 ) -> None:
     camera, origin = demo.cameras[3], demo.bounds()[0]
@@ -167,7 +167,7 @@ def hard(kind: str) -> Gaussians:
         *("one", "flat and needles", "right angles", "far away", "broken rows"),
     ],
 )
-def test_hard_scenes_are_drawn_as_opengl_draws_them(
+def test_page_draws_hard_scenes_as_opengl_does(
     browser: Any, gl: moderngl.Context, measured: Measure, tmp_path: Path, kind: str
 ) -> None:
     scene = Scene(hard(kind), antialiased=kind == "degree 1")
@@ -182,7 +182,7 @@ def test_hard_scenes_are_drawn_as_opengl_draws_them(
     compare(measured, "hard scenes", ours, drawn(gl, scene, camera))
 
 
-def test_an_image_is_of_its_own_camera_whatever_the_page_asks_for(browser: Any, tmp_path: Path) -> None:
+def test_image_waits_for_the_order_of_its_camera(browser: Any, tmp_path: Path) -> None:
     """The page's own camera looks elsewhere while the order for the image is waited for."""
     scene = Scene(hard("one"))
     camera = Scene(random_gaussians(600, 4)).framing_camera((64, 48))
@@ -217,9 +217,7 @@ def same(found: dict[str, Any], expected: Any, members: int) -> None:
     assert abs(found["members"] - members) <= 1e-3 * members
 
 
-def test_a_hundred_phrases_are_answered_as_python_answers_them(
-    tab: Tab, engine: QueryEngine, measured: Measure
-) -> None:
+def test_page_answers_100_phrases_as_python_does(tab: Tab, engine: QueryEngine, measured: Measure) -> None:
     assert len(set(PHRASES)) == 100
     verdicts = set()
     visible = engine.scene.gaussians.opacity_logits >= -np.log(254)
@@ -247,7 +245,7 @@ def without_encoder(demo: Scene, **field: Any) -> tuple[Scene, QueryEngine]:
     return scene, QueryEngine(scene, no_encoder)
 
 
-def test_without_an_encoder_the_phrasebook_and_taught_words_answer(
+def test_page_without_encoder_answers_phrasebook_and_taught_words(
     browser: Any, demo: Scene, engine: QueryEngine, tmp_path: Path
 ) -> None:
     book = dict(zip(PHRASES[:60], engine.text_vectors(PHRASES[:60]), strict=True))
@@ -284,9 +282,7 @@ class Fluent:
     near_words = unknown_words
 
 
-def test_with_an_encoder_that_stays_here_the_page_knows_thousands_of_phrases(
-    browser: Any, demo: Scene, tmp_path: Path
-) -> None:
+def test_page_without_small_encoder_knows_encoded_phrases(browser: Any, demo: Scene, tmp_path: Path) -> None:
     scene = demo.take(np.arange(0, len(demo.gaussians), 8))
     assert scene.language is not None
     encoder = Fluent(scene.language.canonical)
@@ -303,7 +299,7 @@ def test_with_an_encoder_that_stays_here_the_page_knows_thousands_of_phrases(
             same(tab.ask(phrase), expected, int(expected.members[visible].sum()))
 
 
-def test_names_with_markup_are_text_and_nothing_else(
+def test_markup_in_names_is_shown_as_text(
     browser: Any, demo: Scene, engine: QueryEngine, tmp_path: Path
 ) -> None:
     name = MARKUP.replace(",", "")[:80]
@@ -333,7 +329,7 @@ def test_names_with_markup_are_text_and_nothing_else(
         assert tab.faults == []
 
 
-def test_the_page_is_small_alone_and_asks_for_nothing(browser: Any, page: Path, tmp_path: Path) -> None:
+def test_page_is_small_and_requests_nothing(browser: Any, page: Path, tmp_path: Path) -> None:
     assert page.stat().st_size < 8e6
     assert re.findall(r"https?://[^\s\"'`]+", page.read_text(encoding="utf-8").split('id="data">')[0]) == []
     alone = tmp_path / "alone.html"
@@ -352,7 +348,7 @@ STATE = """async () => {
 }"""
 
 
-def test_keys_alone_find_a_thing_and_go_around_it(browser: Any, thin: Path) -> None:
+def test_keyboard_alone_searches_and_moves(browser: Any, thin: Path) -> None:
     with open_tab(browser, thin, reduced_motion="reduce", viewport={"width": 800, "height": 600}) as tab:
         keys = tab.page.keyboard
         reached = []
@@ -392,7 +388,7 @@ def test_keys_alone_find_a_thing_and_go_around_it(browser: Any, thin: Path) -> N
         assert tab.faults == []
 
 
-def test_mouse_and_fingers_move_the_camera(browser: Any, thin: Path) -> None:
+def test_mouse_and_touch_move_the_camera(browser: Any, thin: Path) -> None:
     with open_tab(browser, thin, has_touch=True, viewport={"width": 390, "height": 800}) as tab:
         tab.page.wait_for_timeout(50)
         states = [tab.run(STATE)]
@@ -425,7 +421,7 @@ def test_mouse_and_fingers_move_the_camera(browser: Any, thin: Path) -> None:
         assert tab.faults == []
 
 
-def test_scenes_that_cannot_be_searched_can_be_looked_at(browser: Any, tmp_path: Path) -> None:
+def test_unsearchable_scenes_are_shown(browser: Any, tmp_path: Path) -> None:
     cameras = tuple(random_camera(seed) for seed in range(2))
     scene = Scene(random_gaussians(40), random_field(40), cameras)
     report = write_page(tmp_path / "a.html", scene, QueryEngine(scene, no_encoder), "A")
@@ -436,7 +432,7 @@ def test_scenes_that_cannot_be_searched_can_be_looked_at(browser: Any, tmp_path:
         assert tab.faults == []
 
 
-def test_what_cannot_be_exported_is_said_in_one_line(tmp_path: Path) -> None:
+def test_export_errors_are_one_line(tmp_path: Path) -> None:
     save_scene(tmp_path / "s.ply", Scene(random_gaussians(4)))
     with pytest.raises(InputError, match=r"written as \.html"):
         Export(tmp_path / "s.ply", tmp_path / "room.png").run()
@@ -447,7 +443,7 @@ def test_what_cannot_be_exported_is_said_in_one_line(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("*.html"))
 
 
-def test_the_command_writes_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_command_writes_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     save_scene(tmp_path / "s.ply", Scene(random_gaussians(40)))
     parse(["export", str(tmp_path / "s.ply"), str(tmp_path / "room.html"), "--title", "Über <b>"]).run()
     assert "40 Gaussians" in capsys.readouterr().out

@@ -45,7 +45,7 @@ def asked(
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("kind", ["codebook", "autoencoder", "linear"])
 @pytest.mark.parametrize("level", ["auto", *LEVELS])
-def test_whatever_is_asked_the_answer_is_sound(kind, rule, level):
+def test_answers_are_finite_and_repeatable_for_every_codec(kind, rule, level):
     gaussians, field = random_gaussians(300), random_field(300, kind)
     engine = QueryEngine(Scene(gaussians, field), rule=rule)
     result = engine.run("red mug", level)
@@ -65,7 +65,7 @@ def test_whatever_is_asked_the_answer_is_sound(kind, rule, level):
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_the_answer_is_the_thing(rule):
+def test_answer_members_are_the_thing_asked_for(rule):
     engine = QueryEngine(blob_scene(), lambda _: FakeEncoder(), rule=rule)
     result = engine.run("book")
     assert (result.level, result.found, result.verdict) == (2, True, "found")
@@ -80,7 +80,7 @@ def test_the_answer_is_the_thing(rule):
     assert not part.found
 
 
-def test_a_crumb_is_no_place():
+def test_place_ignores_crumbs():
     """A few stray Gaussians far off mean it more than the thing does, and are no thing."""
     far, gaussians = np.arange(SMALLEST - 1), blobs()
     gaussians.means[far] += np.array([60, 0, 0], np.float32)
@@ -96,7 +96,7 @@ def test_a_crumb_is_no_place():
 @pytest.mark.parametrize(
     ("below", "verdict"), [(0.1, "found"), (-0.5, "weak match"), (-1.5, "not here"), (9.0, "found")]
 )
-def test_a_calibrated_verdict(below, verdict):
+def test_calibrated_verdict_follows_the_probability(below, verdict):
     """`below`: what the odds of the book's whole lie above those that are even by, as a logit, less 1."""
     fit = calibrated(None).run("book").fits[2]
     odds = Odds(1 + below - 2 * fit, whole=2.0, finer=0.0, found=sigmoid(np.array(1.0)).item())
@@ -106,7 +106,7 @@ def test_a_calibrated_verdict(below, verdict):
     assert (result.found, result.verdict) == (verdict == "found", verdict)
 
 
-def test_a_part_that_is_asked_for_alone_has_odds_of_its_own():
+def test_part_asked_for_alone_has_its_own_calibration():
     gaussians, field = random_gaussians(300), random_field(300, "codebook")
     relevancy = np.full((3, 300), 0.4, np.float32)
     relevancy[1, :100] = 0.8  # among the parts it is there, among wholes it is not
@@ -119,7 +119,7 @@ def test_a_part_that_is_asked_for_alone_has_odds_of_its_own():
     assert (thing.found, thing.probability) == (False, pytest.approx(sigmoid(np.array(20 * part.fits[2]))))
 
 
-def test_probability_is_of_being_there_at_all():
+def test_probability_does_not_depend_on_the_level():
     """It knows no level: what is asked for at another one is there all the same. The peak, whose scale is
     another, has none."""
     scene = calibrated(SURE).scene
@@ -131,7 +131,7 @@ def test_probability_is_of_being_there_at_all():
     assert calibrated(None).run("mug").probability is None
 
 
-def test_of_the_peak_the_best_relevancy_decides():
+def test_peak_rule_finds_by_the_best_relevancy():
     for found, says in ((0.6, True), (0.9999, True), (1.0, False)):
         scene = replace(blob_scene(), language=replace(language(), reading=Reading(found=found)))
         result = QueryEngine(scene, lambda _: FakeEncoder(), rule="peak").run("mug")
@@ -139,7 +139,7 @@ def test_of_the_peak_the_best_relevancy_decides():
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_negative_fits_everywhere(rule):
+def test_negative_fits_give_no_answer(rule):
     gaussians, field = random_gaussians(200), random_field(200, "codebook")
     relevancy = np.random.default_rng(0).uniform(0.05, 0.2, (3, 200)).astype(np.float32)
     for level in ("auto", *LEVELS):
@@ -153,7 +153,7 @@ def test_negative_fits_everywhere(rule):
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("calibration", [None, SURE])
 @pytest.mark.parametrize("count", [0, 1, 150])
-def test_almost_no_gaussians_and_no_meaning_anywhere(rule, calibration, count):
+def test_scenes_without_features_give_finite_answers(rule, calibration, count):
     field = replace(random_field(count), reading=Reading(calibration=calibration))
     if count > 1:
         field = replace(field, latents=0 * field.latents, confidence=0 * field.confidence)
@@ -172,7 +172,7 @@ BARS = (Bar(0.0, 1.0), Bar(0.5, 1.0), Bar(-1.0, 2.0), Bar(0.6, 0.5))
 
 
 @pytest.mark.parametrize("kind", ["codebook", "autoencoder", "linear"])
-def test_fits_by_chance_are_those_of_looking_everyday_phrases_up(kind, monkeypatch):
+def test_chance_equals_fits_of_everyday_phrases(kind, monkeypatch):
     monkeypatch.setattr(module, "CHUNK", 7)  # several
     engine = QueryEngine(Scene(random_gaussians(400), random_field(400, kind)))
     fits = engine.chance
@@ -186,7 +186,7 @@ def test_fits_by_chance_are_those_of_looking_everyday_phrases_up(kind, monkeypat
             assert np.isneginf(fits[level][~solid, number]).all() or not solid.any()
 
 
-def test_bars_are_quantiles_of_the_best_and_those_of_some_regions_are_lower():
+def test_bars_are_quantiles_of_the_best_fits():
     rng = np.random.default_rng(0)
     fits = tuple(rng.normal(size=(9, 101)) for _ in LEVELS)
     whole = bars_of(fits)
@@ -216,7 +216,7 @@ def test_excess_is_counted_from_the_bars(named, level):
     assert np.isfinite(Bar(0.3, 0.0).excess(0.3, 1.0))  # without width
 
 
-def test_the_scene_needs_everyday_phrases_else_the_peak_answers():
+def test_peak_rule_answers_without_everyday_phrases():
     field = replace(language(), everyday=None, reading=Reading(found=0.6))
     scene = replace(blob_scene(), language=field)
     engine = QueryEngine(scene, lambda _: FakeEncoder())  # which knows too few of them
@@ -276,7 +276,7 @@ def plain_extent(fits, sizes, level: str, named: Named) -> tuple[int, list[bool]
 
 @pytest.mark.parametrize(("level", "named"), [*product(["auto"], RULE.advantage), *product(LEVELS, ["part"])])
 @pytest.mark.parametrize("middle", [-2.0, 0.0, 1.0])
-def test_the_extent_is_that_of_the_plain_rule(surface, level, named, middle):
+def test_extent_equals_that_of_the_rule_written_out(surface, level, named, middle):
     rng = np.random.default_rng(0)
     count = len(surface.rows)
     for _ in range(30):
@@ -297,7 +297,7 @@ def test_the_extent_is_that_of_the_plain_rule(surface, level, named, middle):
         assert got.members.any()
 
 
-def test_where_all_are_crumbs_or_as_bad_all_of_it_answers(surface):
+def test_all_regions_answer_where_none_is_better(surface):
     small = build_surface(random_gaussians(4), min_opacity=0.0)
     crumbs = regions_by(small, (1, len(small.rows) - 1))
     got = answer_of(small, spread_out(small, crumbs, [(0.9, 0.2)] * 3), crumbs)

@@ -66,23 +66,23 @@ READ |= {text: Atom(text) for text in ASKED_WHOLE}
 
 
 @pytest.mark.parametrize("text", READ)
-def test_what_is_read(text):
+def test_grammar_reads_phrases_as_trees(text):
     assert grammar.parse(text) == READ[text]
 
 
 @pytest.mark.parametrize("text", ["", " \n\t", "'?!'", "the", "of the", "and", "\u200b", "\x00"])
-def test_what_names_nothing_is_refused(text):
+def test_phrase_that_names_nothing_is_refused(text):
     with pytest.raises(InputError):
         grammar.parse(text)
 
 
 @pytest.mark.parametrize("text", ["not cup", "not", "without the mug", ", not red", "except the mug"])
-def test_a_negative_phrase_needs_a_positive(text):
+def test_exclusion_alone_is_refused(text):
     with pytest.raises(InputError, match="what not to look for"):
         grammar.parse(text)
 
 
-def test_a_text_without_end_is_refused():
+def test_long_text_is_refused():
     with pytest.raises(InputError, match=f"10000 characters; use at most {grammar.MAX_CHARACTERS}"):
         grammar.parse("mug " * 2500)
     with pytest.raises(InputError, match=f"at most {grammar.MAX_ATOMS}"):
@@ -94,11 +94,11 @@ def test_a_text_without_end_is_refused():
     [("books", "book"), ("boxes", "box"), ("glass", "glass"), ("shelves", "shelf"), ("cherries", "cherry")]
     + [("Chairs", "Chair"), ("scissors", "scissors"), ("cactus", "cactus"), ("benches", "bench")],
 )
-def test_things_are_counted_in_the_singular(plural, one):
+def test_counted_things_are_asked_in_the_singular(plural, one):
     assert grammar.singular(plural) == one
 
 
-def test_readings_show_the_structure():
+def test_unparse_shows_the_structure():
     assert grammar.unparse(grammar.parse("red mug handle")) == "handle  inside  red mug"
     assert grammar.unparse(grammar.parse("biggest mug on the table")) == "biggest  (mug  on  table)"
     assert grammar.unparse(grammar.parse("mug nearest to the book")) == "nearest  mug  from  book"
@@ -114,7 +114,7 @@ WORDS = st.sampled_from(
 
 @settings(max_examples=400)
 @given(st.one_of(st.text(max_size=60), st.lists(WORDS, max_size=14).map(" ".join)))
-def test_every_text_is_read_or_refused(text):
+def test_any_text_is_parsed_or_refused(text):
     """Nothing but InputError is raised, every phrase of a tree says something, and a reading shows it."""
     for query in [text, *split_phrases(text)]:
         try:
@@ -124,7 +124,7 @@ def test_every_text_is_read_or_refused(text):
         assert all(atom.text.strip() and atom.text in grammar.unparse(tree) for atom in grammar.atoms(tree))
 
 
-def test_what_is_asked_for_is_told_from_what_it_is_related_to():
+def test_heads_exclude_what_they_are_related_to():
     assert grammar.heads(grammar.parse("biggest red mug on the table")) == ("red mug",)
     assert grammar.heads(grammar.parse("mug, not red mug")) == ("mug",)
     assert grammar.heads(grammar.parse("mug or handle of the cup")) == ("mug", "handle")
@@ -138,7 +138,7 @@ NAMED = {
 
 
 @pytest.mark.parametrize("what", NAMED)
-def test_a_part_word_at_the_end_names_a_part_and_a_thing_before_it_whose(what):
+def test_part_word_at_the_end_names_a_part_of_a_thing(what):
     assert {grammar.named(phrase) for phrase in NAMED[what]} == {what}
 
 
@@ -197,7 +197,7 @@ def test_every_construction_finds_its_gaussians(table, text):
 
 
 @pytest.mark.parametrize("text", SAID_BY_VIEWER)
-def test_what_a_viewer_says_needs_one(table, text):
+def test_sides_need_a_viewpoint(table, text):
     with pytest.raises(InputError, match="give a camera"):
         run_phrase(table[0], text)
 
@@ -206,11 +206,11 @@ NOT_SO = ("handle of the book", "book on the red mug", "mug in the book", "bigge
 
 
 @pytest.mark.parametrize("text", [*NOT_SO, "nine mugs"])
-def test_what_is_not_so_is_not_found(table, text):
+def test_relation_that_does_not_hold_is_not_found(table, text):
     assert not run_phrase(table[0], text).answer.found
 
 
-def test_a_phrase_without_structure_is_asked_whole(table):
+def test_phrase_without_structure_is_asked_whole(table):
     engine, _ = table
     got, want = run_phrase(engine, "the red mug!", "part"), engine.run("red mug", "part")
     assert got.reading == "red mug"
@@ -219,7 +219,7 @@ def test_a_phrase_without_structure_is_asked_whole(table):
     assert (got.answer.peak, got.answer.level, got.answer.found) == (want.peak, want.level, want.found)
 
 
-def test_a_phrasebook_that_has_only_the_whole_phrase_is_asked_for_it():
+def test_phrasebook_answers_a_whole_phrase():
     scene, blocks = laid_table({"handle of the mug": meaning("handle"), "mug": meaning("mug")})
     engine = QueryEngine(scene)
     result = run_phrase(engine, "handle of the mug")
@@ -229,7 +229,7 @@ def test_a_phrasebook_that_has_only_the_whole_phrase_is_asked_for_it():
         run_phrase(engine, "lid of the mug")
 
 
-def test_a_part_is_cut_inside_at_the_level_that_is_asked_for(table):
+def test_part_is_cut_inside_at_the_wanted_level(table):
     result = run_phrase(table[0], "handle of the red mug")
     assert (result.answer.level, result.answer.phrase) == (1, "handle of the red mug")
     assert result.reading == "handle  inside  red mug"
@@ -286,13 +286,13 @@ FALSE = {
 
 
 @pytest.mark.parametrize("kind", TRUE)
-def test_how_things_stand(kind):
+def test_relations_hold_for_boxes(kind):
     assert all(stands(kind, what, anchor, EYE) for what, anchor in TRUE[kind])
     assert not any(stands(kind, what, anchor, EYE) for what, anchor in FALSE[kind])
 
 
 @pytest.mark.parametrize("turn", [0, 90, 211])
-def test_what_is_upright_does_not_depend_on_the_world(turn):
+def test_relations_do_not_depend_on_the_worlds_axes(turn):
     """The same things under another up direction stand the same."""
     angle = np.radians(turn)
     rotation = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
@@ -305,14 +305,14 @@ def test_what_is_upright_does_not_depend_on_the_world(turn):
         assert not any(stands(kind, turned(what), turned(anchor), None) for what, anchor in FALSE[kind])
 
 
-def test_the_most_extreme_thing():
+def test_most_picks_the_extreme_thing():
     things = [CUP, BOWL, LAMP]
     want = {"biggest": 2, "smallest": 0, "highest": 2, "lowest": 0, "rightmost": 1, "farthest": 2}
     assert {kind: most(kind, things, [], EYE) for kind in want} == want
     assert most("nearest", things, [FRUIT], None) == 1
 
 
-def test_single_things_are_connected_and_no_specks():
+def test_separate_drops_specks():
     scene, blocks = laid_table()
     surface = build_surface(scene.gaussians)
     inside: Array = (blocks["far mug"] | blocks["book"])[surface.rows]
@@ -322,7 +322,7 @@ def test_single_things_are_connected_and_no_specks():
     assert separate(surface, np.zeros(len(surface.rows), bool)) == []
 
 
-def test_what_is_known_of_things_tells_apart_what_touches_and_keeps_together_what_is_hidden():
+def test_voted_wholes_divide_touching_things_and_join_hidden_ones():
     """A mug and the table under it are one connected surface, and two things; of what is of no thing, the
     surface decides."""
     scene, blocks = laid_table()

@@ -57,7 +57,7 @@ def test_every_blob_is_its_word(codebook):
             assert part.other > part.words[0].probability
 
 
-def test_a_mask_is_as_good_as_numbers_and_weights_count():
+def test_boolean_rows_and_weights_are_accepted():
     asked = describer(named_scene())
     mask = np.zeros(3 * PER_BLOB, bool)
     mask[[0, PER_BLOB]] = True
@@ -70,7 +70,7 @@ def test_a_mask_is_as_good_as_numbers_and_weights_count():
     assert two.material is None
 
 
-def test_gaussians_without_a_surface_still_mean_something():
+def test_gaussians_without_surface_have_words():
     scene = named_scene()
     flat = replace(scene.gaussians, log_scales=np.full_like(scene.gaussians.log_scales, -np.inf))
     asked = describer(replace(scene, gaussians=flat))
@@ -80,7 +80,7 @@ def test_gaussians_without_a_surface_still_mean_something():
 
 @pytest.mark.parametrize("codebook", [True, False])
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
-def test_a_pixel_is_what_the_rows_of_w_say(codebook, backend):
+def test_pixel_words_follow_the_rows_of_w(codebook, backend):
     """Against float64: the reference's weights at the pixel, and every Gaussian's own words and relevancy.
     The surface is at the median of their depths."""
     scene = named_scene(codebook)
@@ -118,7 +118,7 @@ def test_a_pixel_is_what_the_rows_of_w_say(codebook, backend):
 
 
 @pytest.mark.parametrize("codebook", [True, False])
-def test_the_inventory_lists_what_is_there_where_it_is(codebook):
+def test_inventory_lists_every_thing_at_its_place(codebook):
     entries = {entry.phrase: entry for entry in scene_inventory(describer(named_scene(codebook)))}
     assert set(entries) == set(WORDS)
     for centre, word in zip(CENTRES, WORDS, strict=True):
@@ -131,7 +131,7 @@ def test_the_inventory_lists_what_is_there_where_it_is(codebook):
         assert len(spot.rows) > 0.95 * PER_BLOB
 
 
-def test_two_names_are_one_entry_and_two_places_two_spots():
+def test_synonyms_share_an_entry_and_places_are_spots():
     field = named_field()
     codes = field.latents.copy()
     codes[2, 2 * PER_BLOB :] = codes[2, 0]  # the third blob is another mug
@@ -146,14 +146,14 @@ def test_two_names_are_one_entry_and_two_places_two_spots():
     assert scene_inventory(describer(named_scene(), ("wall",))) == []
 
 
-def test_the_bundled_parts_are_not_offered_for_whole_things():
+def test_bundled_parts_are_not_offered_for_wholes():
     asked = describer(named_scene(), None)
     assert asked.words[2].phrases == ("mug", "book")
     assert asked.words[0].phrases == asked.words[1].phrases == ("mug", "book", "plant")
     assert asked.left_out == ("handle",)
 
 
-def test_groups_of_words_that_claim_the_same():
+def test_words_that_claim_the_same_are_grouped():
     surface = np.array([2.0, 1.0, 1.0, 4.0])
     mug = np.array([0.5, 0.5, 0, 0])
     cup = np.array([0.45, 0.4, 0.1, 0])
@@ -232,7 +232,7 @@ def test_probabilities_and_mixtures_are_those_of_the_formula(kind, monkeypatch):
     np.testing.assert_allclose(shares, np.take_along_axis(want, order, 1), atol=2e-5)
 
 
-def test_the_bank_holds_every_meaning_that_some_gaussian_has_once():
+def test_bank_holds_every_used_feature_once():
     made = field("codebook")
     np.testing.assert_array_equal(
         field_features(made), made.codec.vectors[np.unique(made.latents[made.known])]
@@ -243,7 +243,7 @@ def test_the_bank_holds_every_meaning_that_some_gaussian_has_once():
     np.testing.assert_array_equal(hubs(vectors, axes[:0]), [0, 0])
 
 
-def test_a_word_that_is_near_everything_is_not_the_answer_everywhere():
+def test_hub_word_does_not_answer_everywhere():
     """Forty things around a common direction: "hub" is closest to most of them by the plain cosine."""
     rng = np.random.default_rng(0)
     centre = unit(np.ones(64))
@@ -271,7 +271,7 @@ def test_very_different_cosines_do_not_overflow():
     np.testing.assert_allclose(found.sum(1), 1, atol=1e-5)
 
 
-def test_the_canonical_phrases_take_what_no_word_fits():
+def test_canonical_phrases_take_what_no_word_fits():
     made = field("codebook")
     names, vectors = phrases()
     latents = made.latents[made.known][:1]
@@ -280,7 +280,7 @@ def test_the_canonical_phrases_take_what_no_word_fits():
     assert build_words(nothing, names, vectors).mixture(made.codec, latents, np.ones(1))[V:].sum() > 0.9
 
 
-def test_words_that_are_taken_keep_their_numbers():
+def test_taken_words_keep_their_scores():
     made, (names, vectors) = field("codebook"), phrases()
     words = build_words(made, names, vectors)
     few = words.take(np.arange(V) % 2 == 0)
@@ -324,11 +324,11 @@ def test_without_an_encoder_the_phrasebook_is_asked():
         ("zebra", []),
     ],
 )
-def test_what_is_typed_is_completed(typed, offered):
+def test_completions_continue_the_typed_text(typed, offered):
     assert completions(typed, PHRASES) == offered
     assert completions(typed, PHRASES, at_most=1) == offered[:1]
 
 
-def test_a_correction_replaces_the_unknown_words_alone():
+def test_correction_replaces_unknown_words_only():
     assert corrected("the Red mugg", {"mugg": ("mug", "muff")}) == "the red mug"
     assert corrected("red mugg", {"mugg": ()}) is None

@@ -78,7 +78,7 @@ def test_stop_words_alone_are_refused(phrase):
     assert engine.known_vectors([phrase, "mug"])[0] == ("mug",)
 
 
-def test_a_check_raises_what_asking_would():
+def test_check_phrase_raises_what_asking_would():
     engine = QueryEngine(blob_scene(phrasebook=True))
     check_phrase(engine, "Book")
     with pytest.raises(EncoderError, match="phrasebook"):
@@ -94,7 +94,7 @@ def test_a_check_raises_what_asking_would():
 
 
 @pytest.mark.parametrize(("encoder_id", "asked_for"), [("", "fake"), ("mine", "mine")])
-def test_the_encoder_is_loaded_once_by_the_first_phrase_that_needs_it(encoder_id, asked_for):
+def test_encoder_is_loaded_once_when_needed(encoder_id, asked_for):
     loaded = []
 
     def load(name: str) -> FakeEncoder:
@@ -116,7 +116,7 @@ def test_the_encoder_is_loaded_once_by_the_first_phrase_that_needs_it(encoder_id
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (30, 40)])
-def test_peak_pixel_of_any_size(shape):
+def test_peak_pixel_accepts_any_window(shape):
     image = np.zeros(shape)
     image[-1, -1] = 1
     column, row, _ = peak_pixel(image, 20)
@@ -127,7 +127,7 @@ def test_peak_pixel_of_any_size(shape):
 @pytest.mark.parametrize("kind", ["codebook", "autoencoder", "linear"])
 @pytest.mark.parametrize("rule", ["regions", "peak"])
 @pytest.mark.parametrize("exact", [False, True])
-def test_many_phrases_together_are_answered_as_one_by_one(kind, rule, exact):
+def test_run_many_equals_run_one_by_one(kind, rule, exact):
     field = random_field(400, kind)
     vectors = unit(np.random.default_rng(8).normal(size=(20, field.codec.vector_dim))).astype(np.float32)
     book = {f"phrase {number}": vector for number, vector in enumerate(vectors)}
@@ -144,7 +144,7 @@ def test_many_phrases_together_are_answered_as_one_by_one(kind, rule, exact):
         np.testing.assert_allclose(alone.even[differ], min(alone.cut, together.cut), atol=1e-5)
 
 
-def test_many_phrases_are_encoded_in_one_batch_or_not_at_all():
+def test_run_many_encodes_in_one_batch_or_not_at_all():
     class Counting(FakeEncoder):
         def encode_texts(self, texts):
             batches.append(texts)
@@ -208,7 +208,7 @@ def check_equal(found: list[Array], wanted: list[Array]) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("how", ["fork", "spawn", "forkserver"])
-def test_a_child_gives_its_parents_answers(how: str) -> None:
+def test_forked_process_gives_its_parents_answers(how: str) -> None:
     if how not in multiprocessing.get_all_start_methods():
         pytest.skip(f"no {how} on this system")
     wanted = answers()  # with its threads begun, of which a fork takes none along
@@ -221,7 +221,7 @@ def test_a_child_gives_its_parents_answers(how: str) -> None:
 
 @pytest.mark.long
 @pytest.mark.skipif(sys.platform == "win32", reason="no fork")
-def test_a_forked_child_may_fork_again() -> None:
+def test_forked_process_may_fork_again() -> None:
     wanted = answers()
     child = os.fork()
     if child == 0:
@@ -236,7 +236,7 @@ def test_a_forked_child_may_fork_again() -> None:
 
 
 @pytest.mark.long
-def test_twelve_threads_on_one_engine_and_one_rasterizer() -> None:
+def test_twelve_threads_share_engine_and_rasterizer() -> None:
     wanted = answers()
     shared.cache_clear()
     fresh, made = shared(), OneAtATime.made  # nothing is remembered yet: all threads ask first
@@ -270,7 +270,7 @@ def scene_of(encoder: str, reading: Reading, *, everyday: bool = True) -> Scene:
 @pytest.mark.parametrize("encoder", [DEMO, "lab/clip"])
 @pytest.mark.parametrize("reading", [CALIBRATED, Reading()])
 @pytest.mark.parametrize("everyday", [True, False])
-def test_a_calibration_is_named_exactly_where_probabilities_are_said(encoder, reading, everyday):
+def test_basis_names_a_calibration_where_there_is_one(encoder, reading, everyday):
     engine = QueryEngine(scene_of(encoder, reading, everyday=everyday))
     before = engine.basis  # known before anything is asked, without loading an encoder
     answer = engine.run("mug")
@@ -284,7 +284,7 @@ def test_a_calibration_is_named_exactly_where_probabilities_are_said(encoder, re
     assert engine.basis.calibration is None
 
 
-def test_ways_to_an_answer_are_told_apart():
+def test_basis_tells_rules_apart():
     demo, clip = scene_of(DEMO, CALIBRATED), scene_of("lab/clip", Reading())
     guessed, published = scene_of(DEMO, Reading()), scene_of("lab/clip", Reading(), everyday=False)
     said = [QueryEngine(scene).basis for scene in (demo, clip, guessed, published)]
@@ -303,14 +303,14 @@ class Speaker(FakeEncoder):
         return ()
 
 
-def test_everyday_phrases_of_the_encoder_count_once_they_are_there():
+def test_everyday_phrases_of_the_encoder_are_used_once_loaded():
     engine = QueryEngine(scene_of("lab/clip", Reading(), everyday=False), lambda _: Speaker())
     published = engine.basis
     assert engine.run("mug").judgement.reached == "chance"
     assert engine.basis.short != published.short
 
 
-def test_without_a_calibration_combined_answers_have_no_probability_and_the_weakest_excess():
+def test_combined_answers_take_the_weakest_margin():
     scene = scene_of("lab/clip", Reading())
     book = scene.language.phrasebook | {"handle": axis(3)}
     engine = QueryEngine(replace(scene, language=replace(scene.language, phrasebook=book)))
@@ -351,7 +351,7 @@ def plain_relevancy(vector: Array, phrase: Array, scale: Scale) -> float:
 @pytest.mark.parametrize("temperature", [10.0, 25.0])
 @pytest.mark.parametrize("exact", [False, True])
 @pytest.mark.parametrize("chance", [False, True])
-def test_every_lookup_finds_the_relevancy_of_what_latents_stand_for(kind, temperature, exact, chance):
+def test_every_lookup_finds_the_relevancy_of_its_latents(kind, temperature, exact, chance):
     field = replace(random_field(300, kind), reading=Reading(temperature))
     field.confidence[1, 5:20] = 0
     scale = scale_of(field, chance)
@@ -364,7 +364,7 @@ def test_every_lookup_finds_the_relevancy_of_what_latents_stand_for(kind, temper
     assert (got.reshape(3, 300)[1, 5:20] == 0).all()
 
 
-def test_codeword_zero_is_a_meaning_like_any_other():
+def test_codeword_zero_is_a_feature():
     field = random_field(10, "codebook")
     field.latents[:] = 0
     field.confidence[:] = 1
@@ -375,7 +375,7 @@ def test_codeword_zero_is_a_meaning_like_any_other():
     assert (np.delete(values[2], 4) > 0.5).all()
 
 
-def test_margins_of_another_size_change_nothing():
+def test_fits_do_not_depend_on_the_size_of_cosines():
     """All texts and features mixed with directions of their own lie closer together, as CLIP's do; what a
     phrase fits against everyday phrases stays, and as published it does not."""
     field = random_field(200, "codebook")
@@ -398,7 +398,7 @@ def test_margins_of_another_size_change_nothing():
 
 
 @pytest.mark.parametrize("everyday", [np.ones((1, 4)), np.eye(4)[[0] * 60], np.zeros((60, 4))])
-def test_phrases_that_are_all_alike_are_no_scale_but_no_nan(everyday):
+def test_identical_everyday_phrases_give_finite_scales(everyday):
     scale = Scale(np.eye(4, dtype=np.float32)[:1], unit(everyday).astype(np.float32), 10.0)
     zero, rate = scale.of(np.eye(4, dtype=np.float32) @ scale.texts.T)
     values = relevancy_of(np.linspace(-1, 1, 4, dtype=np.float32), zero, rate)
@@ -407,7 +407,7 @@ def test_phrases_that_are_all_alike_are_no_scale_but_no_nan(everyday):
     assert np.isfinite(scale.fit(values)).all()
 
 
-def test_a_fit_is_relevancy_undone():
+def test_fit_inverts_relevancy():
     fits = np.linspace(-6, 6, 50)
     for scale, rate in ((Scale(np.eye(2), np.eye(2), 7.0), 1), (Scale(np.eye(2), None, 7.0), 7)):
         np.testing.assert_allclose(scale.fit(sigmoid(fits)), fits / rate, atol=1e-9)
@@ -451,7 +451,7 @@ def test_published_relevancy_is_the_minimum_of_pairwise_softmaxes(linear):
     assert relevancy(vectors[:1], vectors[:1], vectors[:1]).tolist() == [[relevancies.FLOOR]]
 
 
-def test_cells_are_small_and_each_has_its_latents_around_its_centre():
+def test_cells_hold_latents_near_their_centres():
     rng = np.random.default_rng(5)
     latents = unit(rng.normal(size=(5000, 3)) * (1, 1, 0.2)).astype(np.float32)
     latents[:6] = np.concatenate([np.eye(3), -np.eye(3)])  # the fold's corners and edges
@@ -465,7 +465,7 @@ def test_cells_are_small_and_each_has_its_latents_around_its_centre():
     np.testing.assert_allclose(centres[cells], latents, atol=1e-6)
 
 
-def test_cells_agree_with_exact_decoding_and_improve_with_their_number():
+def test_cells_converge_to_exact_decoding():
     rng = np.random.default_rng(6)
     codec = smooth_codec(rng)
     latents = unit(rng.normal(size=(4000, 3))).astype(np.float32)
@@ -479,7 +479,7 @@ def test_cells_agree_with_exact_decoding_and_improve_with_their_number():
     assert errors[3200].mean() < errors[200].mean() / 3  # of first order in the side of a cell
 
 
-def test_field_through_cells_keeps_what_is_unknown():
+def test_field_through_cells_keeps_unknown_gaussians():
     field = random_field(300, "autoencoder")
     field.confidence[1, 5:20] = 0
     field.latents[2, 30:40] = 0
@@ -491,7 +491,7 @@ def test_field_through_cells_keeps_what_is_unknown():
     assert not through_cells(nothing).known.any()
 
 
-def test_both_orders_agree_inside_one_object_and_are_gated_outside():
+def test_both_orders_agree_inside_an_object():
     scene = named_scene(codebook=False)
     scene = scene.take(np.arange(3 * PER_BLOB) // PER_BLOB != 1)  # the outer two blobs: they do not overlap
     view = ReferenceRasterizer().view(scene.gaussians, scene.cameras[1])

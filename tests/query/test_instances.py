@@ -34,7 +34,7 @@ def smoothed(surface: Surface, values: Array) -> Array:
     return (weights * values.astype(np.float64)[surface.rows][surface.neighbours]).sum(1) / weights.sum(1)
 
 
-def test_every_ball_is_an_instance_with_the_figures_of_a_plain_account():
+def test_every_ball_is_an_instance_with_its_figures():
     gaussians, number = balls([60, 200, 90])
     relevancy = np.array([0.7, 0.9, 0.8])[number] + 0.01 * np.sin(np.arange(350))
     surface = build_surface(gaussians)
@@ -59,7 +59,7 @@ def test_every_ball_is_an_instance_with_the_figures_of_a_plain_account():
     assert [i.count for i in find_instances(surface, gaussians, members, relevancy, at_most=2)] == [200, 90]
 
 
-def test_wholes_that_masks_voted_for_tell_apart_what_touches():
+def test_voted_wholes_divide_touching_instances():
     """A row of 80 that touch: two wholes, then ten of none. An answer of wholes joins what is of one of them,
     a finer one takes apart what lies apart."""
     gaussians = balls([80])[0]
@@ -77,7 +77,7 @@ def test_wholes_that_masks_voted_for_tell_apart_what_touches():
     assert counts(members, wholes, False) == [10, 14, 15, 30]
 
 
-def test_of_equal_scores_the_larger_comes_first():
+def test_equal_scores_are_ranked_by_size():
     gaussians, number = balls([50, 150, 80])
     relevancy = 0.8 + np.array([0.4, 0.0, 0.2])[number] * instances.EQUAL_SCORES
     found = find_instances(build_surface(gaussians), gaussians, np.ones(280, bool), relevancy)
@@ -100,7 +100,7 @@ def test_crumbs_are_dropped_unless_there_is_nothing_else():
     assert only.share == pytest.approx(1)
 
 
-def test_faint_gaussians_go_with_the_nearest():
+def test_faint_gaussians_join_the_nearest_instance():
     gaussians, number = balls([100, 100])
     gaussians.opacity_logits[:] = 3.0
     gaussians.opacity_logits[::10] = -6.0
@@ -115,7 +115,7 @@ def test_faint_gaussians_go_with_the_nearest():
     assert [instance.members.tolist() for instance in found] == [list(range(1, 100))]
 
 
-def test_nothing_is_nothing_and_flat_and_invisible_gaussians_have_finite_shares():
+def test_empty_flat_and_transparent_gaussians_have_finite_shares():
     gaussians = random_gaussians(50)
     surface = build_surface(gaussians)
     faint = ~np.isin(np.arange(50), surface.rows)
@@ -132,7 +132,7 @@ def test_nothing_is_nothing_and_flat_and_invisible_gaussians_have_finite_shares(
     assert all(np.isfinite(instance.centre).all() for instance in found)
 
 
-def test_boxes_of_many_points_are_taken_from_some_of_them(measured):
+def test_boxes_of_many_points_use_a_sample(measured):
     gaussians, _ = balls([5 * instances.BOXED])
     surface = build_surface(gaussians)
     (found,) = find_instances(surface, gaussians, np.ones(len(gaussians), bool), np.ones(len(gaussians)))
@@ -164,7 +164,7 @@ def check(box: OrientedBox) -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("sides", [(3, 2, 1), (1, 1, 0.3), (2, 0.5, 0.5), (1, 1, 1), (4, 3, 0)])
-def test_a_turned_box_is_found_again(sides, seed, measured):
+def test_oriented_box_recovers_a_turned_box(sides, seed, measured):
     rotation, shift = turned(seed), np.array([5.0, -2, 9])
     box = oriented_box(filled(sides, seed=seed) @ rotation.T + shift)
     check(box)
@@ -175,7 +175,7 @@ def test_a_turned_box_is_found_again(sides, seed, measured):
     assert error < 0.08
 
 
-def test_strays_do_not_count():
+def test_boxes_ignore_strays():
     points = filled((3, 2, 1))
     before = oriented_box(points)
     points[:20] = np.random.default_rng(1).normal(scale=50, size=(20, 3))
@@ -183,7 +183,7 @@ def test_strays_do_not_count():
     assert (np.abs(axis_aligned_box(points)) < 1.6).all()
 
 
-def test_no_more_than_the_quantiles_lie_outside():
+def test_boxes_hold_points_between_their_quantiles():
     points = filled((1, 2, 3)) @ turned(2).T
     box = oriented_box(points)
     low, high = axis_aligned_box(points)
@@ -201,12 +201,12 @@ def test_no_more_than_the_quantiles_lie_outside():
     ],
     ids=["one", "coincident", "two", "three", "plane", "tiny", "huge", "float32"],
 )
-def test_degenerate_points(points):
+def test_degenerate_points_have_boxes(points):
     check(oriented_box(points))
     assert np.isfinite(axis_aligned_box(points)).all()
 
 
-def test_a_line_has_a_length():
+def test_line_has_a_length():
     box = oriented_box(np.linspace(0, 1, 101)[:, None] * [3.0, 4, 0])
     check(box)
     np.testing.assert_allclose(2 * box.half_extents, [5 * INSIDE, 0, 0], atol=1e-9)
@@ -238,7 +238,7 @@ def check_closed(mesh: instances.Hull) -> None:
     assert {(b, a) for a, b in edges} == set(edges)
 
 
-def test_the_hull_of_a_cloud_is_its_convex_hull_within_the_box():
+def test_hull_equals_the_convex_hull_within_the_box():
     points = np.random.default_rng(0).uniform(size=(3000, 3)) * [3, 2, 1]
     points[:5] += 100  # strays
     instance, gaussians = thing(points)
@@ -252,7 +252,7 @@ def test_the_hull_of_a_cloud_is_its_convex_hull_within_the_box():
 
 
 @pytest.mark.parametrize("flat", [[1, 1, 0], [1, 0, 0]], ids=["sheet", "line"])
-def test_sheets_and_lines_are_given_a_thickness(flat):
+def test_hulls_of_sheets_and_lines_have_a_thickness(flat):
     instance, gaussians = thing(np.random.default_rng(0).uniform(size=(200, 3)) * flat)
     mesh = hull(instance, gaussians, colours(200), "red mug 1")
     assert mesh.name == "red mug 1"
@@ -260,7 +260,7 @@ def test_sheets_and_lines_are_given_a_thickness(flat):
     assert volume(mesh) > 0
 
 
-def test_four_points_are_enough_and_one_is_not():
+def test_hull_needs_more_than_one_point():
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
     assert volume(hull(*thing(points), colours(4), "four")) == pytest.approx(1 / 6)
     with pytest.raises(InputError, match="mug 1 is a single point"):

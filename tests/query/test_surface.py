@@ -60,7 +60,7 @@ def test_links_are_symmetric_and_parts_are_the_connected_components():
     assert not np.concatenate(surface.parts(numbers[:0])).size
 
 
-def test_the_far_side_of_a_gap_is_another_surface():
+def test_gap_divides_surfaces():
     gaussians = random_gaussians(60)
     gaussians.means[:] = np.random.default_rng(2).normal(scale=0.05, size=(60, 3))
     gaussians.means[50:, 0] += 9  # fewer than the neighbours everyone has: they reach across
@@ -189,7 +189,7 @@ def assert_sound(regions: Regions, surface: Surface) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("things", [False, True])
-def test_regions_are_those_of_the_plain_criterion(kind, things):
+def test_regions_follow_the_criterion_written_out(kind, things):
     gaussians, field = patched(kind, seed=KINDS.index(kind), things=things)
     surface = build_surface(gaussians)
     regions = regions_of(Scene(gaussians, field), surface)
@@ -200,7 +200,7 @@ def test_regions_are_those_of_the_plain_criterion(kind, things):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_order_of_the_gaussians_moves_no_border(kind):
+def test_borders_do_not_depend_on_the_order_of_gaussians(kind):
     """Where all have a meaning: what has none is as far from everyone, and somebody has to be first."""
     gaussians, field = patched(kind)
     field = replace(field, confidence=np.ones_like(field.confidence))
@@ -219,7 +219,7 @@ def test_the_order_of_the_gaussians_moves_no_border(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("known", [0, 1])
-def test_one_meaning_or_none_is_a_region_for_every_part_of_the_surface(kind, known):
+def test_uniform_features_give_a_region_per_part(kind, known):
     field = random_field(70, kind)
     latents = np.broadcast_to(field.latents[:1, :1], field.latents.shape).copy()
     field = replace(field, latents=latents, confidence=np.full_like(field.confidence, known))
@@ -260,7 +260,7 @@ def test_borders_of_regions_on_a_line(meaning, known, things, finer, whole):
         assert_same_partition(of, np.broadcast_to(want, 80)[surface.rows])
 
 
-def test_values_without_meaning_elsewhere_harm_no_mean():
+def test_means_ignore_nan_of_uncounted_gaussians():
     """Faint Gaussians are off the surface: what they hold is not looked at."""
     gaussians, field = patched("codebook")
     gaussians.opacity_logits[::3] = -9
@@ -293,7 +293,7 @@ def scattered() -> tuple[Surface, Regions]:
     return surface, regions_of(Scene(gaussians, field), surface)
 
 
-def test_means_of_regions_and_what_is_spread_from_them(scattered):
+def test_means_and_spread_follow_their_formulas(scattered):
     """Faint Gaussians beside a region take its value; those near nothing keep their own."""
     surface, regions = scattered
     values = np.random.default_rng(5).uniform(size=(3, 3000)).astype(np.float32)
@@ -311,7 +311,7 @@ def test_means_of_regions_and_what_is_spread_from_them(scattered):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("count", [0, 1, 2])
-def test_almost_no_gaussians(kind, count):
+def test_few_gaussians_have_a_surface(kind, count):
     surface = build_surface(random_gaussians(count), min_opacity=0.0)
     assert surface.smooth(np.full(count, 0.25, np.float32)).tolist() == [0.25] * len(surface.rows)
     for selected in (np.zeros(count, bool), np.ones(count, bool)):
@@ -358,7 +358,7 @@ def random_selection(n: int, seed: int = 0, share: float = 0.1) -> np.ndarray:
     return np.random.default_rng(seed).uniform(size=n) < share
 
 
-def test_spheres_and_boxes_hold_their_faces_and_nothing_without_a_place():
+def test_spheres_and_boxes_include_their_faces():
     means = np.array([[0, 0, 0], [1, 0, 0], [1.001, 0, 0], [nan, 0, 0], [0, -1, 1]], np.float32)
     assert selection.in_sphere(means, np.zeros(3), 1.0).tolist() == [True, True, False, False, False]
     inside = selection.in_box(means, np.array([0, -1, 0]), np.array([1, 0, 1]))
@@ -366,7 +366,7 @@ def test_spheres_and_boxes_hold_their_faces_and_nothing_without_a_place():
 
 
 @pytest.mark.parametrize("distance", [0.0, 0.15, 0.4, 100.0])
-def test_growing_by_a_distance_is_the_shortest_way(distance):
+def test_growing_follows_shortest_paths(distance):
     gaussians = random_gaussians(300)
     surface = build_surface(gaussians)
     selected = random_selection(300, share=0.03)
@@ -376,7 +376,7 @@ def test_growing_by_a_distance_is_the_shortest_way(distance):
     assert (grown >= selected).all()
 
 
-def test_shrinking_undoes_growing_on_a_sheet_and_faint_ones_follow():
+def test_shrinking_undoes_growing_on_a_sheet():
     gaussians = sheet()
     surface = build_surface(gaussians)
     start = selection.in_box(gaussians.means, np.array([0.7, 0.7, -1]), np.array([1.2, 1.2, 1]))
@@ -394,7 +394,7 @@ def test_shrinking_undoes_growing_on_a_sheet_and_faint_ones_follow():
     assert selection.shrink(surface, everything, 0.2).tolist() == everything.tolist()
 
 
-def test_what_lies_nearest_to_a_point_is_selected_as_a_region():
+def test_at_point_selects_the_nearest_region():
     scene = blob_scene()
     surface, blob = build_surface(scene.gaussians), np.repeat(np.arange(3), PER_BLOB)
     regions = regions_of(scene, surface)
@@ -406,7 +406,7 @@ def test_what_lies_nearest_to_a_point_is_selected_as_a_region():
 
 
 @pytest.mark.parametrize("wrong", [-1, inf, nan])
-def test_a_distance_that_cannot_be_walked(wrong):
+def test_invalid_distances_are_refused(wrong):
     with pytest.raises(InputError, match="give 0 or more"):
         selection.grow(build_surface(sheet(5)), np.zeros(50, bool), wrong)
 
@@ -446,7 +446,7 @@ def plainly_from_segment(x: float, y: float, start, end) -> float:
     return hypot(x - x0 - t * (x1 - x0), y - y0 - t * (y1 - y0))
 
 
-def test_an_outline_holds_what_a_walk_around_it_says(seen):
+def test_polygon_holds_points_by_their_winding(seen):
     for outline in (star(), star()[::-1], np.array([[5, 5], [70, 20], [30, 55.0]])):
         wanted = [
             bool(z > 0 and plainly_in_polygon(x, y, outline.tolist()))
@@ -458,7 +458,7 @@ def test_an_outline_holds_what_a_walk_around_it_says(seen):
         assert not in_polygon(seen, few).any()
 
 
-def test_a_stroke_is_as_wide_as_its_brush(seen):
+def test_stroke_is_as_wide_as_its_brush(seen):
     path = np.array([[10, 10], [60, 15], [60, 15], [62, 50.0]])
     segments = list(zip(path[:-1].tolist(), path[1:].tolist(), strict=True))
     wanted = [
@@ -472,14 +472,14 @@ def test_a_stroke_is_as_wide_as_its_brush(seen):
     assert not in_stroke(seen, np.zeros((0, 2)), 12.0).any()
 
 
-def test_a_rectangle_is_the_same_from_every_corner(seen):
+def test_rectangle_is_the_same_from_every_corner(seen):
     x, y = seen.pixels.T
     wanted = (seen.depths > 0) & (x >= 20) & (x <= 60) & (y >= 5) & (y <= 40)
     for corner, opposite in (((20, 5), (60, 40)), ((60, 5), (20, 40)), ((60, 40), (20, 5))):
         assert in_rectangle(seen, np.array(corner), np.array(opposite)).tolist() == wanted.tolist()
 
 
-def test_what_has_no_place_in_the_picture_is_nowhere():
+def test_points_behind_the_camera_are_never_inside():
     camera = look_at(np.array([0, 0, -5.0]), np.zeros(3), np.array([0, -1.0, 0]), SIZE)
     means = np.array([[0, 0, 0], [0, 0, -9], [0, 0, -5], [nan, 0, 0], [inf, 0, 0]], np.float32)
     seen = project(means, camera)
@@ -493,7 +493,7 @@ def test_what_has_no_place_in_the_picture_is_nowhere():
 
 
 @pytest.mark.parametrize("coarser", [1, 4])
-def test_what_lies_behind_the_surface_is_hidden(seen, coarser):
+def test_points_behind_the_surface_are_hidden(seen, coarser):
     depths = np.full((60 // coarser, 80 // coarser), 4.0)
     depths[:, : 40 // coarser] = 0  # nothing is drawn there, and nothing hides
     found = on_surface(seen, depths, SIZE, behind=0.05)

@@ -68,7 +68,7 @@ def asking(scene: Scene, *words: TaughtWord) -> QueryEngine:
     return QueryEngine(Scene(scene.gaussians, replace(scene.language, taught=words)))
 
 
-def test_what_was_shown_is_found_in_another_scene_and_what_is_absent_is_not():
+def test_taught_words_find_their_things_in_other_scenes():
     there = scene_of(list(range(12)) + list(range(24, 36)), seed=2)
     answers = [asking(there, taught(kind)).run("grandma's vase") for kind in ROOM]
     right = [answer.found and answer.members[members(kind, 24)].all() for kind, answer in enumerate(answers)]
@@ -83,7 +83,7 @@ def test_what_was_shown_is_found_in_another_scene_and_what_is_absent_is_not():
         assert (answer.peak >= 0.5) == answer.found
 
 
-def test_every_one_that_is_there_answers_and_the_place_is_of_the_best():
+def test_taught_word_finds_every_thing_and_places_the_best():
     there = scene_of([*range(6, 24), 3, 30, 3], seed=3)
     answer = asking(there, taught(3)).run("Grandma’s vase")
     assert set(np.flatnonzero(answer.members) // EACH) == {18, 20}
@@ -91,7 +91,7 @@ def test_every_one_that_is_there_answers_and_the_place_is_of_the_best():
     assert min(abs(answer.place[0] - 4 * 18), abs(answer.place[0] - 4 * 20)) < 0.5
 
 
-def test_more_like_this_is_teaching_and_asking_but_nothing_is_kept():
+def test_like_equals_teach_and_run_without_keeping():
     there = scene_of([*range(20), 3], seed=4)
     engine = QueryEngine(there)
     alike = engine.like(members(3, 21))
@@ -103,7 +103,7 @@ def test_more_like_this_is_teaching_and_asking_but_nothing_is_kept():
     np.testing.assert_array_equal(engine.run("vase").members, alike.members)
 
 
-def test_an_example_more_is_found_too():
+def test_further_example_is_found_too():
     engine = QueryEngine(SHOWN)
     engine.teach("both", members(3, 24))
     word = engine.teach("Both!", members(9, 24))
@@ -117,7 +117,7 @@ def test_an_example_more_is_found_too():
         engine.teach("both", members(3, 24))
 
 
-def test_a_scene_and_a_file_keep_words_exactly(tmp_path):
+def test_scenes_and_files_keep_taught_words_exactly(tmp_path):
     words = (taught(3), taught(5, "tür"))
     field, means = replace(SHOWN.language, taught=words), SHOWN.gaussians.means
     write_language(tmp_path / "a.safetensors", field, means)
@@ -133,7 +133,7 @@ def test_a_scene_and_a_file_keep_words_exactly(tmp_path):
             np.testing.assert_array_equal(engine.run(name).even, before.run(name).even)
 
 
-def test_words_of_another_encoder_are_refused_by_their_canonical_vectors():
+def test_words_of_another_encoder_are_refused():
     words = (taught(3),)
     canonical = SHOWN.language.canonical
     QueryEngine(SHOWN, words=Words("the same elsewhere", canonical, words))
@@ -152,7 +152,7 @@ class OneVector(FakeEncoder):
         return tuple(word for word in text.split() if word == "vase")
 
 
-def test_a_taught_name_is_no_text_alone_and_within_a_phrase():
+def test_taught_name_replaces_text_in_phrases():
     engine = QueryEngine(SHOWN, lambda _: OneVector())
     engine.teach("vase on the left", members(3, 24))
     alone = run_phrase(engine, "the vase on the left")
@@ -170,21 +170,21 @@ def test_a_taught_name_is_no_text_alone_and_within_a_phrase():
 
 
 @pytest.mark.parametrize("name", ["", " ?! ", "the", "a; b", "a, b", "x" * (LONGEST_NAME + 1)])
-def test_what_cannot_be_a_name(name):
+def test_invalid_names_are_refused(name):
     engine = QueryEngine(SHOWN)
     with pytest.raises(InputError, match="cannot be a name"):
         engine.teach(name, members(3, 24))
     assert engine.taught == {}
 
 
-def test_what_means_nothing_cannot_be_shown():
+def test_gaussians_without_features_cannot_be_taught():
     dark = Scene(SHOWN.gaussians, replace(SHOWN.language, confidence=0 * SHOWN.language.confidence))
     for scene, some in ((SHOWN, np.zeros(len(SHOWN.gaussians), bool)), (dark, members(3, 24))):
         with pytest.raises(InputError, match="point at something else"):
             QueryEngine(scene).teach("vase", some)
 
 
-def test_scenes_of_almost_nothing_answer():
+def test_tiny_scenes_answer_taught_words():
     for things in ([3], [3, 3], [30, 31]):
         scene = scene_of(things, seed=6)
         for everyday in (scene.language.everyday, None):
@@ -196,7 +196,7 @@ def test_scenes_of_almost_nothing_answer():
     assert (nothing.found, nothing.place) == (False, None)
 
 
-def test_the_level_is_the_one_that_has_what_was_marked():
+def test_teaching_takes_the_level_of_the_marked_region():
     scene = scene_of([*range(8)], seed=7)
     leaves = (np.arange(len(scene.gaussians)) // EACH).astype(np.int32)
     count, pairs = int(leaves.max()) + 1, int(leaves.max()) // 2 + 1  # wholes of two things each
@@ -223,12 +223,12 @@ def test_the_level_is_the_one_that_has_what_was_marked():
         {"rivals": np.array([0.5, 0.5], np.float32)},
     ],
 )
-def test_a_word_that_breaks_a_rule_is_refused(change):
+def test_malformed_taught_word_is_refused(change):
     with pytest.raises(ValueError, match=r"taught word|rivals: expected"):
         replace(taught(3), **change)
 
 
-def test_one_name_is_one_word_and_vectors_are_the_fields_own():
+def test_taught_names_are_unique_in_a_field():
     with pytest.raises(ValueError, match="two words have one name"):
         replace(SHOWN.language, taught=(taught(3), taught(4, "Grandma’s  vase")))
     short = replace(taught(3), vectors=np.eye(1, 8, dtype=np.float32))
