@@ -17,14 +17,13 @@ from langsplat_core.scene import LEVELS, NO_NODE
 
 
 def export_labels(describer: Describer, path: Path) -> Path:
-    """Write the scene as a .ply of that name whose Gaussians have the int properties `instance`, `part` and
-    `class`, and `<name>.labels.json` beside it; returns that one.
+    """Write the scene as a .ply of that name with labels, and return the `<name>.labels.json` beside it.
 
-    An instance is a node at the top of the outline, a part the smallest node of it that a Gaussian is in,
-    both by their numbers in the tree; a class is the place of the instance's likeliest word in the JSON's
-    `classes`. -1 is none. The JSON has the nodes of the outline, each with its parent, level, word and
-    class, Gaussians, axis-aligned box (lower and upper corner, between 2 % and 98 % of the Gaussians) and
-    votes.
+    Its Gaussians have the int properties `instance`, `part` and `class`. An instance is a node at the top of
+    the outline, a part the smallest node of it that a Gaussian is in, both by their numbers in the tree; a
+    class is the place of the instance's likeliest word in the JSON's `classes`. -1 is none. The JSON has the
+    nodes of the outline, each with its parent, level, word and class, Gaussians, axis-aligned box (lower and
+    upper corner, between 2 % and 98 % of the Gaussians) and votes.
     """
     scene, members = describer.engine.scene, describer.engine.tree.gaussians()
     labels = {

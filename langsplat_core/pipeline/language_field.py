@@ -263,7 +263,8 @@ class _Stages:
     def _mask_weights(self) -> tuple[MaskWeights, MaskGroups]:
         """Return the mask weights, in files that are read where they are needed, and the groups of masks."""
         if self._made is None:
-            folder = self._work / stage_key("memberships", 2, *self._inputs)
+            # Named as in older work folders.
+            folder = self._work / stage_key("memberships", 2, *self._inputs)  # codespell:ignore memberships
             shared = self._rasterizer(), self._processes, self._progress
             mask_weights = kept_mask_weights(self._gaussians, self._views, folder, *shared)
             path = folder / "groups.npz"

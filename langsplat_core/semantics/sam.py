@@ -231,9 +231,9 @@ def cut_by_crop(boxes: Array, crop: Array, shape: tuple[int, int]) -> Array:
     What such a mask shows goes on outside, and the next crop or the whole image shows it better. boxes:
     (..., 4); crop: (4,) left, top, right, bottom, px of the image; shape: its (height, width).
     """
-    picture = np.array([0, 0, shape[1], shape[0]])
-    at_crop, at_picture = np.abs(boxes - crop) <= EDGE, np.abs(boxes - picture) <= EDGE
-    return (at_crop & ~at_picture).any(axis=-1)
+    whole = np.array([0, 0, shape[1], shape[0]])
+    at_crop, at_edge = np.abs(boxes - crop) <= EDGE, np.abs(boxes - whole) <= EDGE
+    return (at_crop & ~at_edge).any(axis=-1)
 
 
 # Which of many proposed masks are kept: suppression by box and by pixels, and the removal of crumbs.

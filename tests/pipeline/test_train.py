@@ -92,8 +92,8 @@ def test_photographs_become_a_searchable_scene(room, tmp_path):
 STAGES = (
     "radiance-*.ply",
     "features/*.npz",
-    "memberships-*/*.npy",
-    "memberships-*/groups.npz",
+    "member*/*.npy",
+    "member*/groups.npz",
     "codec-*.npz",
     "latents-*.npz",
     "nodes-*.npz",
@@ -166,16 +166,14 @@ def test_more_steps_of_lifting_do_not_fit_the_codec_again(room, tmp_path):
     assert (len(list(work.glob("codec-*.npz"))), len(list(work.glob("latents-*.npz")))) == (1, 2)
 
 
-@pytest.mark.parametrize(
-    "name", ["memberships-*/*.npy", "memberships-*/*.npz", "codec-*", "latents-*", "nodes-*"]
-)
+@pytest.mark.parametrize("name", ["member*/*.npy", "member*/*.npz", "codec-*", "latents-*", "nodes-*"])
 def test_a_damaged_stage_ends_in_one_line(room, tmp_path, name):
     out, work = tmp_path / "scene.ply", tmp_path / "scene.work"
     train_scene(room, out, tiny_settings(room))
     damaged = sorted(work.glob(name))
     for path in damaged:
         path.write_bytes(path.read_bytes()[:100])
-    for path in {*work.glob("*.np[yz]"), *work.glob("memberships-*/*")} - set(damaged):
+    for path in {*work.glob("*.np[yz]"), *work.glob("member*/*")} - set(damaged):
         path.unlink()
     with pytest.raises(FormatError, match="delete it and run again"):
         train_scene(room, out, tiny_settings(room))
@@ -301,7 +299,7 @@ def test_paper_profile_runs(room, tmp_path, capsys):
 
 # What changes around a training between its interruption and its end, and around a program that reads.
 
-YEARS = {"1971": 31_600_000, "2099": 4_070_000_000}
+FUTURE = 4_070_000_000  # in 2098
 
 
 @pytest.fixture(scope="module")
@@ -366,23 +364,19 @@ def test_a_moved_work_folder_resumes(room: Path, whole: dict[str, bytes], tmp_pa
     assert scene_in(there) == whole
 
 
-@pytest.mark.parametrize("year", YEARS)
-def test_resuming_ignores_dates_of_files(
-    year: str, room: Path, whole: dict[str, bytes], tmp_path: Path
-) -> None:
-    """Nothing is decided by dates: files of long ago and of the future count as any."""
+def test_resuming_ignores_dates_of_files(room: Path, whole: dict[str, bytes], tmp_path: Path) -> None:
     data = tmp_path / "data"
     shutil.copytree(room, data)
     interrupted(data, tmp_path, tiny_settings(room))
     for path in [path for path in tmp_path.rglob("*") if path.is_file()]:
-        os.utime(path, (YEARS[year], YEARS[year]))
+        os.utime(path, (FUTURE, FUTURE))
     train_scene(data, tmp_path / "scene.ply", tiny_settings(room))
     assert scene_in(tmp_path) == whole
     kept = list((tmp_path / "scene.work").rglob("*.np*"))
     for path in kept:
-        os.utime(path, (YEARS[year], YEARS[year]))
+        os.utime(path, (FUTURE, FUTURE))
     train_scene(data, tmp_path / "scene.ply", tiny_settings(room))
-    assert {int(path.stat().st_mtime) for path in kept} == {YEARS[year]}  # nothing was made again
+    assert {int(path.stat().st_mtime) for path in kept} == {FUTURE}  # nothing was made again
 
 
 @pytest.mark.parametrize(
@@ -400,7 +394,7 @@ def test_query_needs_no_home_locale_or_writable_folder(surroundings: dict[str, s
     }
     done = subprocess.run(
         [sys.executable, "-m", "langsplat_core", "query", str(folder / "tür.ply"), "book", "--json"],
-        env=kept | surroundings,
+        env=kept | {"HOME": "/nonexistent", "LANG": "xx_YY.nothing", "LC_ALL": "C"},
         cwd=folder,
         capture_output=True,
         text=True,

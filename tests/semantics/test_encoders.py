@@ -134,26 +134,19 @@ def test_reading_json_is_read_beside_the_weights(tmp_path):
 
 ODDS = '{"constant": 0, "whole": 1, "finer": 0}'
 BROKEN_READINGS = (
-    *('{"found": 2}', '{"found": null}', '{"found": 1' + "0" * 400 + "}", "[", "[]", "3", "", '"found"'),
-    *('{"calibration": null}', '{"calibration": {}}', '{"verdict": {}}'),
+    *("[", '{"found": 2}', '{"verdict": {}}', '{"calibration": {}}'),
     f'{{"calibration": {{"thing": {ODDS}, "part": {ODDS}}}}}',
-    f'{{"calibration": {{"thing": {ODDS}, "part": {ODDS}, "inside": {ODDS}, "other": {ODDS}}}}}',
     *(
         f'{{"calibration": {{"thing": {ODDS}, "part": {{"constant": 0, {broken}}}, "inside": {ODDS}}}}}'
         for broken in (
             '"whole": 1',
-            '"whole": 1, "finer": 0, "part": 2',
             '"whole": NaN, "finer": 0',
-            '"whole": "1", "finer": 0',
             '"whole": -1, "finer": 0.5',
-            '"whole": 1, "finer": 0, "found": 0.4',
             '"whole": 1' + "0" * 400 + ', "finer": 0',
         )
     ),
 )
-
-
-BROKEN_NORMALISATIONS = ("{", "[]", '{"image_mean": [0.5]}', '{"image_std": [0, 0, 0]}')
+BROKEN_NORMALISATIONS = ("{", '{"image_mean": [0.5]}', '{"image_std": [0, 0, 0]}')
 
 
 @pytest.mark.parametrize(

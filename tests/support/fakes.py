@@ -1,4 +1,4 @@
-"""Scenes whose meanings are known, three blobs and a laid table, and text encoders that know their words."""
+"""Scenes with known language features, blobs and a laid table, and text encoders that know their words."""
 
 import json
 from collections.abc import Sequence
@@ -148,7 +148,7 @@ def as_trained(path: Path, scene: Scene, features: Sequence[ImageFeatures]) -> N
     (work / REPORT).write_text(json.dumps({"dataset": str(photographs)}))
 
 
-# A table with mugs, their handles and a book, of Gaussians whose meanings are known at every level.
+# A table with mugs, their handles and a book, of Gaussians whose language features are known at every level.
 
 AXES = ("mug", "handle", "book", "table", "red", "blue", "anything", "white")  # the seventh is canonical
 TEMPERATURE = 2.0  # so that half as much likeness is visibly less, as published
