@@ -107,7 +107,7 @@ GLIDE_SECONDS = 0.35
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class QueryAnswer:
     """The answer to a query, or the reason why there is none; neither while it is pending."""
 
     result: QueryResult | None = None  # with the threshold of its own
@@ -280,7 +280,7 @@ class SceneState:
     opened: Scene | None = None  # the scene as its file has it, once something was transformed
     marks: Marks = field(default_factory=lambda: unmarked(0))
     locked: Array = field(default_factory=lambda: np.zeros(0, bool))  # (N,) what tools leave alone
-    answers: dict[str, Answer] = field(default_factory=dict)  # by phrase
+    answers: dict[str, QueryAnswer] = field(default_factory=dict)  # by phrase
 
     view: OrbitCamera | None = None
     glide: Glide | None = None
@@ -371,9 +371,9 @@ class ViewerState(SceneState):
         if not self.messages or self.messages[-1] != message:
             self.messages = [*self.messages[1 - MAX_MESSAGES :], message]
 
-    def answer(self, query: Query) -> Answer:
+    def answer(self, query: Query) -> QueryAnswer:
         """Return the answer to a query of the list."""
-        return self.answers.get(query.phrase, Answer(pending=True))
+        return self.answers.get(query.phrase, QueryAnswer(pending=True))
 
     def result(self, query: Query) -> QueryResult | None:
         """Return the result of a query with its threshold, None without one."""

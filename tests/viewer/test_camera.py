@@ -15,7 +15,7 @@ from langsplat_viewer.actions import settings, viewpoint
 from langsplat_viewer.camera import controls
 from langsplat_viewer.files.projects import BOOKMARKS, Shelf
 from langsplat_viewer.session import MOST_BOOKMARKS
-from langsplat_viewer.state import GLIDE_SECONDS, Answer
+from langsplat_viewer.state import GLIDE_SECONDS, QueryAnswer
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
 from tests.support.scenes import random_camera, random_gaussians
@@ -281,14 +281,14 @@ def test_focus_goes_as_near_as_the_thing_is_small_and_for_a_huge_one_stays_in_th
     place, box = found.place, found.box
     for size in (1.0, 0.1, 0.01):
         smaller = replace(found, box=place + size * (box - place))
-        opened.state.answers["mug"] = Answer(smaller)
+        opened.state.answers["mug"] = QueryAnswer(smaller)
         go(viewpoint.focus_result, opened)
         distances.append(opened.state.view.distance)
     assert_allclose(distances, distances[0] * np.array([1, 0.1, 0.01]), rtol=1e-6)
     pixels, _ = opened.state.view.camera(100, 100).project(smaller.box)
     assert 10 < np.ptp(pixels, axis=0).max() < 100
     huge = replace(found, box=1e3 * np.array([[-1.0] * 3, [1.0] * 3]))
-    opened.state.answers["mug"] = Answer(huge)
+    opened.state.answers["mug"] = QueryAnswer(huge)
     before = np.linalg.norm(opened.state.view.eye - place)
     go(viewpoint.focus_result, opened)
     assert opened.state.view.distance <= max(before, opened.state.extent.radius * 5)  # stays in the room

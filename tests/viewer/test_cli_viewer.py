@@ -61,7 +61,7 @@ def colour_at(image: np.ndarray, camera: Camera, point: np.ndarray) -> np.ndarra
     return image[row - 2 : row + 3, column - 2 : column + 3].reshape(-1, 3).mean(0)
 
 
-def test_a_picture_from_the_first_training_camera(run_viewer, folder):
+def test_headless_image_uses_the_first_camera(run_viewer, folder):
     assert draw(run_viewer, "a.png") == ["a.png: 160x120, rgb"]
     image, camera = picture(folder / "a.png"), blob_scene().cameras[0]
     assert image.shape == (120, 160, 3)
@@ -76,7 +76,7 @@ def test_a_picture_from_the_first_training_camera(run_viewer, folder):
     np.testing.assert_array_equal(picture(folder / "c.png"), picture(folder / "d.png"))
 
 
-def test_a_query_answers_in_words_and_as_heat(run_viewer, folder):
+def test_headless_query_prints_and_paints_answers(run_viewer, folder):
     draw(run_viewer, "rgb.png", "--camera", "1")
     out = draw(run_viewer, "a.png", "--query", "plant", "--query", "Book", "--camera", "1")
     assert out[0] == "a.png: 160x120, relevancy"
@@ -95,7 +95,7 @@ def test_a_query_answers_in_words_and_as_heat(run_viewer, folder):
     assert "level part" in out[1]
 
 
-def test_every_display_is_another_picture(run_viewer, folder):
+def test_each_display_is_another_image(run_viewer, folder):
     seen = []
     for display in get_args(Display):
         out = draw(run_viewer, f"{display}.png", "--query", "mug", "--display", display)
@@ -105,7 +105,7 @@ def test_every_display_is_another_picture(run_viewer, folder):
         seen.append(image)
 
 
-def test_a_transparent_picture_in_another_colour_map(run_viewer, folder):
+def test_transparent_image_in_another_colour_map(run_viewer, folder):
     draw(run_viewer, "a.png", "--display", "depth")
     draw(run_viewer, "b.png", "--display", "depth", "--colour-map", "cividis", "--transparent")
     plain, clear = picture(folder / "a.png"), picture(folder / "b.png")
@@ -116,7 +116,7 @@ def test_a_transparent_picture_in_another_colour_map(run_viewer, folder):
     assert np.abs(clear[..., :3][inside] - plain[inside]).max() > 60
 
 
-def test_without_perspective_the_picture_has_the_scale_that_was_asked_for(run_viewer, folder):
+def test_orthographic_image_has_the_asked_scale(run_viewer, folder):
     """Three units across 120 pixels; each blob is as large as the others, however far away."""
     assert draw(run_viewer, "a.png", "--orthographic", "3") == ["a.png: 160x120, rgb"]
     image, camera = picture(folder / "a.png"), blob_scene().cameras[0]
@@ -130,7 +130,7 @@ def test_without_perspective_the_picture_has_the_scale_that_was_asked_for(run_vi
     assert abs(middles[2] - middles[0] - along * 120 / 3) < 4
 
 
-def test_a_cut_of_zero_is_the_answers_own(run_viewer, folder):
+def test_cut_of_zero_is_the_own_threshold(run_viewer, folder):
     asked = ("--display", "segmentation", "--query", "mug", "--query", "plant")
     for out, cuts in (("a.png", ()), ("b.png", ("0", "0")), ("c.png", ("0", "0.01"))):
         draw(run_viewer, out, *asked, *[word for cut in cuts for word in ("--cut", cut)])
@@ -139,7 +139,7 @@ def test_a_cut_of_zero_is_the_answers_own(run_viewer, folder):
     assert np.abs(own - cut).max() > 30
 
 
-def test_a_scene_without_cameras_is_framed(run_viewer, folder):
+def test_scene_without_cameras_is_framed(run_viewer, folder):
     code, out, _ = run_viewer("plain.ply", "--headless", "--out", "new/folder/a.png", "--size", "96x64")
     assert (code, out) == (0, ["new/folder/a.png: 96x64, rgb"])
     covered = (picture(folder / "new/folder/a.png").max(-1) > 40).mean()
@@ -189,7 +189,7 @@ def test_a_scene_without_cameras_is_framed(run_viewer, folder):
         (["blobs.ply", "--orthographic", "4", "--near-cut", "30"], "nothing of the scene"),
     ],
 )
-def test_what_cannot_work_is_one_line(run_viewer, folder, arguments, reason):
+def test_impossible_options_are_one_line(run_viewer, folder, arguments, reason):
     code, out, err = run_viewer(*arguments, "--headless", "--out", "a.png")
     assert (code, out, len(err)) == (2, [], 1)
     assert reason in err[0]
@@ -215,14 +215,14 @@ def test_what_cannot_work_is_one_line(run_viewer, folder, arguments, reason):
         (["--far-cut", "1"], "panel Camera"),
     ],
 )
-def test_what_needs_another_option_is_one_line(run_viewer, folder, arguments, reason):
+def test_missing_options_are_named_in_one_line(run_viewer, folder, arguments, reason):
     (folder / "folder.png").mkdir()
     code, out, err = run_viewer("blobs.ply", *arguments)
     assert (code, out, len(err)) == (2, [], 1)
     assert reason in err[0]
 
 
-def test_an_encoder_that_is_absent_is_one_line(run_viewer, monkeypatch, folder):
+def test_absent_encoder_is_one_line(run_viewer, monkeypatch, folder):
     monkeypatch.setattr(options, "load_text_encoder", load_text_encoder)
     code, _, errors = run_viewer("blobs.ply", "--headless", "--out", "a.png", "--query", "mug")
     assert (code, len(errors)) == (2, 1)
@@ -230,7 +230,7 @@ def test_an_encoder_that_is_absent_is_one_line(run_viewer, monkeypatch, folder):
     assert not (folder / "a.png").exists()
 
 
-def test_a_failed_picture_leaves_the_old_one(run_viewer, folder):
+def test_failed_image_leaves_the_old_one(run_viewer, folder):
     (folder / "a.png").write_bytes(b"old")
     run_viewer("truncated.ply", "--headless", "--out", "a.png")
     assert (folder / "a.png").read_bytes() == b"old"
@@ -250,7 +250,7 @@ def run_python(*arguments: str, **environment: str) -> subprocess.CompletedProce
 @pytest.mark.long
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the message is about X11")
 @pytest.mark.parametrize("display", [{}, {"DISPLAY": ":987"}])
-def test_no_display_suggests_a_picture_without_a_window(folder, display):
+def test_missing_display_suggests_headless(folder, display):
     run = run_python("-m", "langsplat_viewer", "blobs.ply", **display)
     assert (run.returncode, len(run.stderr.splitlines())) == (2, 1), run.stderr
     assert "--headless" in run.stderr
@@ -269,7 +269,7 @@ print([name for name in ("glfw", "imgui_bundle", "torch", "transformers", "open3
 
 
 @pytest.mark.long
-def test_without_a_window_no_windowing_library_is_loaded(folder):
+def test_headless_loads_no_windowing_library(folder):
     run = run_python("-c", WINDOWLESS)
     assert run.returncode == 0, run.stderr
     assert run.stdout.splitlines()[-1] == "[]"

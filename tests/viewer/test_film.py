@@ -185,7 +185,7 @@ def test_pictures_of_nothing_are_counted_and_a_film_of_nothing_is_refused(folder
         (["--colour", "1", "--colour", "1", "--query", "mug", "--out", "a.png"], "--colour 1"),
     ],
 )
-def test_what_cannot_work_is_one_line(viewer, folder, arguments, reason):
+def test_impossible_options_are_one_line(viewer, folder, arguments, reason):
     before = sorted(folder.rglob("*"))
     code, out, err = viewer("blobs.ply", *arguments)
     assert (code, out, len(err)) == (2, [], 1)

@@ -20,7 +20,7 @@ from tests.support.fakes import blob_scene
 from tests.support.windowless import SCENES, act, ask, errors, go, open_scene, result, settle
 
 
-def test_unusable_gaussians_are_counted(viewer):
+def test_opening_counts_unusable_gaussians(viewer):
     scene = blob_scene(field=False)
     scene.gaussians.means[[3, 7]] = np.nan
     viewer.services = replace(viewer.services, load_scene=lambda path: scene)
@@ -29,7 +29,7 @@ def test_unusable_gaussians_are_counted(viewer):
     assert np.isfinite(viewer.state.view.camera(160, 120).world_to_camera).all()
 
 
-def test_a_broken_file_leaves_the_open_scene_alone(opened):
+def test_broken_file_leaves_the_open_scene(opened):
     before = opened.state.view
     open_scene(opened, "broken.ply")
     assert opened.state.scene is SCENES["blobs.ply"]
@@ -38,7 +38,7 @@ def test_a_broken_file_leaves_the_open_scene_alone(opened):
     assert errors(opened) == ["broken.ply: broken; export it again"]
 
 
-def test_a_scene_without_language_field_says_what_makes_one(viewer):
+def test_scene_without_field_says_what_makes_one(viewer):
     settings.set_display(viewer, "relevancy")
     open_scene(viewer, "plain.ply")
     assert viewer.state.session.picture.display == "rgb"
@@ -68,7 +68,7 @@ def test_cancelled_opening_shows_nothing(viewer):
     assert viewer.state.scene is None
 
 
-def test_a_scene_with_broken_companions_opens_and_says_why(tmp_path, viewer):
+def test_scene_with_broken_companions_opens_and_says_why(tmp_path, viewer):
     path = tmp_path / "a.ply"
     save_scene(path, replace(blob_scene(), path=None))
     names = ("a.cameras.json", "a.langsplat.safetensors")
@@ -88,7 +88,7 @@ def test_a_scene_with_broken_companions_opens_and_says_why(tmp_path, viewer):
         (["blobs.ply", *"abcde"], "blobs.ply", "not opened: a, b, c and 2 more"),
     ],
 )
-def test_of_dropped_files_the_scene_is_opened_and_what_is_none_is_said(viewer, names, opened_name, said):
+def test_dropping_opens_the_scene_and_names_other_files(viewer, names, opened_name, said):
     act(browsing.open_dropped, viewer, [Path(name) for name in names])
     assert viewer.state.path.name == opened_name
     assert [path.name for path in viewer.state.scenes] == [opened_name]
@@ -100,7 +100,7 @@ def test_of_dropped_files_the_scene_is_opened_and_what_is_none_is_said(viewer, n
 BLOBS, PLAIN, BARE = (Path(f"{name}.ply").absolute() for name in ("blobs", "plain", "bare"))
 
 
-def test_the_first_run_says_that_it_compiles(viewer, monkeypatch):
+def test_first_run_says_that_it_compiles(viewer, monkeypatch):
     seen = []
 
     def warm_up(scene, backend, progress):
@@ -125,7 +125,7 @@ def three(viewer):
     return viewer
 
 
-def test_a_display_of_answers_comes_back_after_a_scene_without_and_no_arrays_are_kept(three):
+def test_display_returns_with_its_scene_and_visits_keep_no_arrays(three):
     ask(three, "mug")
     act(opening.switch_scene, three, PLAIN)
     assert three.state.session.picture.display == "rgb"
@@ -135,7 +135,7 @@ def test_a_display_of_answers_comes_back_after_a_scene_without_and_no_arrays_are
     assert three.state.session.picture.display == "relevancy"
 
 
-def test_camera_and_queries_of_each_are_found_again(three):
+def test_scene_returns_with_its_camera_and_queries(three):
     assert (three.state.scene, three.state.scenes) == (SCENES["blobs.ply"], (BLOBS, PLAIN, BARE))
     assert settings.take(three.state, "wanted_panel") == "Scene"
     ask(three, "mug", "book")
@@ -173,7 +173,7 @@ def test_camera_and_queries_of_each_are_found_again(three):
     assert three.engine.canonical_phrases != ("plant",)
 
 
-def test_a_scene_is_taken_off_the_list(three):
+def test_scene_is_removed_from_the_list(three):
     act(opening.switch_scene, three, PLAIN)
     opening.unlist_scene(three, BLOBS)
     assert three.state.scenes == (PLAIN, BARE)
@@ -182,7 +182,7 @@ def test_a_scene_is_taken_off_the_list(three):
     assert three.state.path == BARE
 
 
-def test_all_scenes_of_a_folder_are_opened_together(viewer, tmp_path):
+def test_folder_opens_all_its_scenes(viewer, tmp_path):
     for name in ("blobs.ply", "plain.ply", "a.queries.json"):
         (tmp_path / name).write_bytes(b"")
     (tmp_path / "folder").mkdir()
@@ -211,7 +211,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_folders_come_first_and_what_is_no_scene_is_left_out(folder):
+def test_listing_has_folders_first_and_only_scenes(folder):
     listing = list_folder(folder)
     listed = [(entry.path.name, entry.is_file, entry.size) for entry in listing.entries]
     files = [("a.ply", True, 5), ("sog folder", True, 0), ("Z.SPZ", True, 5)]
@@ -221,7 +221,7 @@ def test_folders_come_first_and_what_is_no_scene_is_left_out(folder):
     assert "Not a directory" in list_folder(folder / "notes.txt").problem
 
 
-def test_a_crowded_folder_is_cut(tmp_path, monkeypatch):
+def test_listing_of_a_crowded_folder_is_cut(tmp_path, monkeypatch):
     monkeypatch.setattr("langsplat_viewer.files.disk.MOST_LISTED", 3)
     for number in range(5):
         (tmp_path / f"{number}.ply").write_bytes(b"")
@@ -230,7 +230,7 @@ def test_a_crowded_folder_is_cut(tmp_path, monkeypatch):
     assert MOST_LISTED > 100
 
 
-def test_one_goes_into_folders_and_opens_scenes(viewer, folder):
+def test_browser_enters_folders_and_opens_scenes(viewer, folder):
     browsing.ask_for_file(viewer)
     assert viewer.state.browser.folder == folder
     browsing.choose(viewer, FolderEntry(folder / "B folder", is_file=False))
@@ -251,7 +251,7 @@ def enter(viewer, typed: str) -> None:
 
 
 @pytest.mark.parametrize("typed", [" blobs.ply ", "B folder/../blobs.ply"])
-def test_a_path_can_be_typed(viewer, folder, typed):
+def test_typed_path_is_opened(viewer, folder, typed):
     browsing.ask_for_file(viewer)
     for nothing in ("", "  "):
         enter(viewer, nothing)
@@ -264,13 +264,13 @@ def test_a_path_can_be_typed(viewer, folder, typed):
 
 
 @pytest.mark.parametrize("typed", ["gone.ply", "x" * 5000, "~nobody-of-this-name/a.ply"])
-def test_a_path_that_leads_nowhere_is_an_error_line(viewer, folder, typed):
+def test_typed_path_that_does_not_exist_is_one_error(viewer, folder, typed):
     browsing.ask_for_file(viewer)
     enter(viewer, typed)
     assert len(errors(viewer)) == 1
 
 
-def test_scenes_that_were_open_are_remembered_the_latest_first(viewer):
+def test_recent_scenes_are_listed_latest_first(viewer):
     for name in ("blobs.ply", "plain.ply", "blobs.ply"):
         open_scene(viewer, name)
     recent = viewer.state.preferences.recent
@@ -304,7 +304,7 @@ FILES = ["blobs.ply", "blobs.langsplat.safetensors", "blobs.cameras.json"]
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_change_of_any_file_is_noticed_once_it_is_over(shown, name):
+def test_watch_reports_a_finished_change_of_any_file(shown, name):
     file, woken = shown.state.path.with_name(name), []
     shown.watch.wake = lambda: woken.append(name)
     for second in range(3):  # it is being written
@@ -319,7 +319,7 @@ def test_a_change_of_any_file_is_noticed_once_it_is_over(shown, name):
     assert look(shown)
 
 
-def test_a_companion_that_comes_or_goes_is_a_change_and_a_scene_that_is_gone_is_not_offered(shown):
+def test_watch_reports_companions_but_no_missing_scene(shown):
     sidecar = shown.state.path.with_name(FILES[1])
     kept = sidecar.rename(sidecar.with_name("kept"))
     assert look(shown)
@@ -365,7 +365,7 @@ def test_reload_keeps_camera_queries_and_settings(shown):
     assert errors(shown) == []
 
 
-def test_a_reload_with_other_gaussians_asks_anew(shown):
+def test_reload_with_other_gaussians_asks_anew(shown):
     ask(shown, "plant")
     half = np.arange(0, 360, 2)
     save_scene(shown.state.path, replace(blob_scene().take(half), path=None))
@@ -375,7 +375,7 @@ def test_a_reload_with_other_gaussians_asks_anew(shown):
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_half_written_file_leaves_the_scene_as_it_was(shown, name):
+def test_half_written_file_leaves_the_scene(shown, name):
     ask(shown, "mug")
     before, view, found = shown.state.scene, shown.state.view, result(shown)
     file = shown.state.path.with_name(name)
@@ -393,7 +393,7 @@ def test_a_half_written_file_leaves_the_scene_as_it_was(shown, name):
     assert not look(shown)
 
 
-def test_a_field_that_went_away_takes_its_display_along(shown):
+def test_reload_without_field_resets_the_display(shown):
     ask(shown, "mug")
     save_scene(shown.state.path, replace(blob_scene(field=False), path=None))
     act(opening.reload, shown)
@@ -401,7 +401,7 @@ def test_a_field_that_went_away_takes_its_display_along(shown):
     assert shown.state.session.queries == ()
 
 
-def test_a_watch_looks_by_itself_and_stops(tmp_path, monkeypatch):
+def test_watch_runs_by_itself_and_stops(tmp_path, monkeypatch):
     monkeypatch.setattr("langsplat_viewer.files.disk.EVERY", 0.005)
     file: Path = tmp_path / "a.ply"
     file.write_bytes(b"a")
@@ -438,7 +438,7 @@ def meet(viewer) -> None:
     opening.follow_beside(viewer)
 
 
-def test_both_are_seen_and_asked_alike(two):
+def test_second_scene_follows_view_and_queries(two):
     other = two.beside.state
     assert other.path == Path("book.ply")
     assert [(query.phrase, query.slot) for query in other.session.queries] == [("mug", 0)]
@@ -466,7 +466,7 @@ def test_both_are_seen_and_asked_alike(two):
     assert [(query.phrase, query.slot) for query in other.session.queries] == [("mug", None)]
 
 
-def test_a_scene_without_a_field_shows_its_colours_and_what_cannot_be_opened_is_said_here(two):
+def test_second_scene_without_field_shows_colours_or_says_why(two):
     for name in ("plain.ply", "broken.ply"):
         assert errors(two) == []
         opening.open_beside(two, Path(name))
@@ -477,7 +477,7 @@ def test_a_scene_without_a_field_shows_its_colours_and_what_cannot_be_opened_is_
     assert two.state.scene is not None
 
 
-def test_it_goes_with_the_line_and_does_not_come_back_by_itself(two):
+def test_second_scene_closes_with_the_split(two):
     settings.set_split(two, "off")
     opening.follow_beside(two)
     assert two.beside is None
@@ -486,7 +486,7 @@ def test_it_goes_with_the_line_and_does_not_come_back_by_itself(two):
     assert two.state.session.split.mode == "off"
 
 
-def test_a_scene_with_other_coordinates_is_seen_from_the_same_side():
+def test_second_scene_of_other_coordinates_is_seen_from_that_side():
     scene = SCENES["blobs.ply"]
     moved = replace(scene.gaussians, means=3 * scene.gaussians.means + 50)
     here, there = extent_of(scene), extent_of(replace(scene, gaussians=moved))

@@ -39,7 +39,7 @@ def nodes(outlined) -> list[int]:
     return [row_of(outlined, word).node for word in ("mug", "book", "plant")]
 
 
-def test_every_thing_has_a_row_with_its_word_that_is_selected_and_looked_at(outlined):
+def test_outline_row_is_named_and_selects_its_thing(outlined):
     before = outlined.state.view
     for word, centre in zip(("mug", "book", "plant"), CENTRES, strict=True):
         row = row_of(outlined, word)
@@ -53,7 +53,7 @@ def test_every_thing_has_a_row_with_its_word_that_is_selected_and_looked_at(outl
     assert sum(row.count for row in outlined.state.outline.roots) == 360
 
 
-def test_what_is_clicked_in_the_scene_is_the_thing_there(outlined):
+def test_clicked_thing_is_selected(outlined):
     for choose, centre, word in (
         (outline.select, CENTRES[2], "plant"),
         (outline.find_alike, CENTRES[0], "mug"),
@@ -62,7 +62,7 @@ def test_what_is_clicked_in_the_scene_is_the_thing_there(outlined):
         assert marked(outlined)[0] == word
 
 
-def test_rows_are_hidden_and_shown_and_the_selection_stays(outlined, nodes):
+def test_hidden_row_keeps_the_selection(outlined, nodes):
     mug, book, _ = nodes
     take(outlined, blob("plant"))
     act(outline.hide, outlined, mug)
@@ -76,7 +76,7 @@ def test_rows_are_hidden_and_shown_and_the_selection_stays(outlined, nodes):
     assert outline.hidden_nodes(outlined)[mug]
 
 
-def test_what_is_locked_is_left_alone(outlined, nodes):
+def test_locked_thing_is_left_alone(outlined, nodes):
     mug = nodes[0]
     take(outlined, blob("mug") | blob("book"))
     outline.toggle_lock(outlined, mug)
@@ -98,7 +98,7 @@ def test_what_is_locked_is_left_alone(outlined, nodes):
     assert marked(outlined)[0] == "mug book plant"
 
 
-def test_a_name_is_taught_shown_filtered_and_undone(outlined):
+def test_given_name_is_taught_and_filtered(outlined):
     mug = row_of(outlined, "mug")
     act(outline.give_name, outlined, mug.node, "  grandma's cup ")
     assert outline.name_of(outlined, mug) == "grandma's cup"
@@ -118,7 +118,7 @@ def test_a_name_is_taught_shown_filtered_and_undone(outlined):
     assert errors(outlined) == []
 
 
-def test_groups_are_made_named_and_left(outlined, nodes):
+def test_groups_are_made_renamed_and_dissolved(outlined, nodes):
     mug, book, plant = nodes
     outline.group(outlined, mug, book)
     (group,) = outlined.state.session.things.groups
@@ -150,9 +150,7 @@ def test_groups_are_made_named_and_left(outlined, nodes):
 
 
 @pytest.mark.parametrize("field", [True, False])
-def test_a_project_keeps_names_groups_and_locks_and_of_another_tree_what_is_known(
-    outlined, nodes, tmp_path, monkeypatch, field
-):
+def test_project_keeps_names_groups_and_locks_of_known_nodes(outlined, nodes, tmp_path, monkeypatch, field):
     """As after training anew, or for a scene whose field is gone."""
     monkeypatch.chdir(tmp_path)
     Path("tree.ply").touch()
@@ -187,7 +185,7 @@ def test_a_project_keeps_names_groups_and_locks_and_of_another_tree_what_is_know
         assert marked(outlined)[0] == "mug book plant"
 
 
-def test_a_scene_that_was_trained_anew_is_read_again(outlined, monkeypatch):
+def test_retrained_scene_drops_unknown_locks(outlined, monkeypatch):
     """Its tree is another: what was locked by the number of a node is not."""
     outline.toggle_lock(outlined, row_of(outlined, "mug").node)
     outlined.put(things=Things(locked=frozenset({10**6})))
@@ -199,7 +197,7 @@ def test_a_scene_that_was_trained_anew_is_read_again(outlined, monkeypatch):
     assert outlined.state.session.things == Things()
 
 
-def test_things_have_the_colour_that_the_image_has(outlined, nodes):
+def test_things_have_the_colour_of_the_image(outlined, nodes):
     settings.set_display(outlined, "rgb")
     mug, book, _ = nodes
     assert outline.colour_of(outlined, mug) is None
@@ -211,7 +209,7 @@ def test_things_have_the_colour_that_the_image_has(outlined, nodes):
     assert {"mug", "book", "plant"} <= {word for name in named for word in name.split()}
 
 
-def test_a_scene_without_a_field_has_none_and_for_it_no_encoder_is_downloaded(viewer, monkeypatch):
+def test_outline_needs_a_field_and_downloads_no_encoder(viewer, monkeypatch):
     scene = SCENES["blobs.ply"]
     far = replace(scene, language=replace(scene.language, encoder_id="hub/of-someone"))
     monkeypatch.setitem(SCENES, "blobs.ply", far)

@@ -35,21 +35,21 @@ def blobs(tmp_path: Path) -> str:
 
 
 @pytest.mark.long
-def test_idle_no_frame_is_drawn_and_no_time_is_used(display, tmp_path, blobs):
+def test_idle_window_draws_nothing(display, tmp_path, blobs):
     words = run(display, tmp_path, "--idle", blobs).split()
     assert int(words[1]) <= 2  # one in a hundred seconds, and a late one
     assert float(words[3]) < 0.01
 
 
 @pytest.mark.long
-def test_closing_does_not_wait_for_what_is_being_read(display, tmp_path, blobs):
+def test_closing_does_not_wait_for_reading(display, tmp_path, blobs):
     began = time.monotonic()
     run(display, tmp_path, "--leave", blobs)
     assert time.monotonic() - began < 45  # the reading takes 60
 
 
 @pytest.mark.long
-def test_keys_that_come_faster_than_frames_keep_their_order(display, tmp_path):
+def test_fast_keys_keep_their_order(display, tmp_path):
     save_scene(tmp_path / "many.ply", blob_scene(phrasebook=True))
     assert "PASSED" in run(display, tmp_path, "--type", str(tmp_path / "many.ply"))
 
@@ -57,7 +57,7 @@ def test_keys_that_come_faster_than_frames_keep_their_order(display, tmp_path):
 @pytest.mark.long
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="says where settings are")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_window_at_rest_ends_by_a_signal(display, tmp_path, blobs, number):
+def test_signal_ends_an_idle_window(display, tmp_path, blobs, number):
     process = subprocess.Popen(
         [sys.executable, "-m", "langsplat_viewer", blobs],
         env=surroundings(display) | {"XDG_CONFIG_HOME": str(tmp_path)},
@@ -75,7 +75,7 @@ def test_a_window_at_rest_ends_by_a_signal(display, tmp_path, blobs, number):
 
 @pytest.mark.long
 @pytest.mark.skipif(shutil.which("nvidia-smi") is not None, reason="needs a machine without CUDA")
-def test_a_backend_that_is_not_there_ends_before_a_window(display, tmp_path, blobs):
+def test_absent_backend_is_refused_before_a_window(display, tmp_path, blobs):
     done = subprocess.run(
         [sys.executable, "-m", "langsplat_viewer", blobs, "--fresh", "--backend", "cuda"],
         env=surroundings(display),
@@ -90,7 +90,7 @@ def test_a_backend_that_is_not_there_ends_before_a_window(display, tmp_path, blo
 
 
 @pytest.mark.long
-def test_pictures_are_coarse_while_moving_and_sharp_afterwards(display, tmp_path):
+def test_images_are_coarse_while_moving_only(display, tmp_path):
     options = ["--scene", str(DEMO), "--count", "0", "--seconds", "2", "--size", "860", "620", "--slow"]
     seen = json.loads(run(display, tmp_path, *options))
     assert len(seen["sharp_after"]) == 3
@@ -101,7 +101,7 @@ def test_pictures_are_coarse_while_moving_and_sharp_afterwards(display, tmp_path
 
 
 @pytest.mark.long
-def test_the_window_is_not_heavier_than_it_has_to_be():
+def test_window_memory_stays_small():
     heavy = ("torch", "transformers", "pycolmap", "open3d", "skimage", "matplotlib")
     script = (
         f"import sys, langsplat_viewer.window\nprint([name for name in {heavy!r} if name in sys.modules])"
@@ -185,7 +185,7 @@ def folder(tmp_path: Path) -> Path:
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="reads /proc and libGL.so")
 @pytest.mark.parametrize(("backend", "actions"), [("opengl", 2), ("opengl", 20), ("cpu", 20)])
-def test_a_hundred_scenes_and_actions_in_each(
+def test_hundred_scenes_leak_nothing(
     backend: str, actions: int, display: str, folder: Path, measured: Measure
 ):
     arguments = ["-m", "tests.viewer.soak_driver", backend, str(folder), str(actions)]

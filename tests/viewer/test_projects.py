@@ -70,7 +70,7 @@ def again(saved):
     made.worker.close()
 
 
-def test_everything_comes_back(opened, saved, again):
+def test_project_restores_the_whole_session(opened, saved, again):
     before, after = opened.state, again.state
     assert errors(again) == []
     for place in range(4):
@@ -94,7 +94,7 @@ def test_everything_comes_back(opened, saved, again):
     assert projects.save_project(again, Path("/nowhere")) == saved  # where it came from
 
 
-def test_a_project_without_its_scene_or_a_window_is_refused(saved, opened, run_viewer):
+def test_project_without_scene_or_window_is_refused(saved, opened, run_viewer):
     code, _, problems = run_viewer(str(saved), "--headless", "--out", "a.png")
     assert code == 2
     assert "project" in problems[0]
@@ -104,7 +104,7 @@ def test_a_project_without_its_scene_or_a_window_is_refused(saved, opened, run_v
     assert opened.state.scene is not None
 
 
-def test_other_programs_find_the_answers_in_it(opened, saved):
+def test_project_states_the_answers_for_other_programs(opened, saved):
     answers = {answer["phrase"]: answer for answer in json.loads(saved.read_text())["answers"]}
     assert answers["mug"]["verdict"] == "found"
     np.testing.assert_allclose(answers["mug"]["place"], CENTRES[0], atol=0.25)
@@ -119,7 +119,7 @@ def test_other_programs_find_the_answers_in_it(opened, saved):
         assert bool(answers[query.phrase]["notes"]) == inside
 
 
-def test_a_scene_that_has_changed_keeps_its_questions_alone(saved, viewer, monkeypatch):
+def test_project_of_a_changed_scene_restores_only_queries(saved, viewer, monkeypatch):
     smaller = SCENES["blobs.ply"].take(np.arange(240))
     monkeypatch.setitem(SCENES, "blobs.ply", smaller)
     act(browsing.open_project, viewer, saved)
@@ -249,7 +249,7 @@ def places(value, way=()):
             yield from places(inner, (*way, key))
 
 
-def test_notes_are_pinned_written_and_taken_off(opened):
+def test_notes_are_pinned_edited_and_removed(opened):
     projects.toggle_pinning(opened)
     projects.pin_at(opened, 0.95, 0.5)  # nothing is there
     assert opened.state.session.notes == ()
@@ -272,7 +272,7 @@ def test_notes_are_pinned_written_and_taken_off(opened):
 
 
 @pytest.mark.parametrize("leave", [projects.save_and_leave, projects.end])
-def test_notes_are_asked_about_before_the_window_closes(opened, tmp_path, leave):
+def test_unsaved_notes_are_asked_about_before_closing(opened, tmp_path, leave):
     projects.pin_at(opened, 0.5, 0.5)
     assert not selecting.may_close(opened)
     selecting.stay(opened)
@@ -287,7 +287,7 @@ def test_notes_are_asked_about_before_the_window_closes(opened, tmp_path, leave)
     assert selecting.may_close(opened)
 
 
-def test_notes_are_there_again_after_another_scene(opened):
+def test_notes_return_with_their_scene(opened):
     projects.pin_at(opened, 0.5, 0.5)
     notes = opened.state.session.notes
     opening.add_scenes(opened, [Path("blobs.ply"), Path("plain.ply")])
@@ -299,7 +299,7 @@ def test_notes_are_there_again_after_another_scene(opened):
     assert opened.state.has_unsaved_notes
 
 
-def test_a_note_is_pinned_to_what_is_selected(opened):
+def test_note_is_pinned_to_the_selection(opened):
     projects.pin_to_selection(opened)
     assert "select something" in errors(opened)[-1]
     selecting.take(opened, blob("book"))

@@ -34,7 +34,7 @@ from tests.support.windowless import (
 )
 
 
-def test_a_query_is_answered_and_shown(opened):
+def test_query_is_answered_and_shown(opened):
     queries.ask(opened, "  mug ")
     assert answer(opened).pending
     settle(opened)
@@ -51,7 +51,7 @@ def test_a_query_is_answered_and_shown(opened):
     assert pane.ranges == (result(opened).heat_range,)
 
 
-def test_a_correction_is_offered_and_takes_the_place_of_the_typo(opened):
+def test_correction_replaces_the_typo(opened):
     ask(opened, "red plamt")
     assert queries.offers(opened, "") == ("did you mean", ())  # "red" is like no word
     ask(opened, "plamt")
@@ -65,7 +65,7 @@ def test_a_correction_is_offered_and_takes_the_place_of_the_typo(opened):
     assert opened.state.session.queries[1].slot == 0
 
 
-def test_commas_separate_searches_and_quotes_are_no_part_of_them(opened):
+def test_commas_separate_queries_and_quotes_are_dropped(opened):
     ask(opened, "   ", '"mug", plant; book, not mug')
     assert phrases(opened) == ["mug", "plant", "book, not mug"]
     ask(opened, " Mug ")  # again
@@ -76,14 +76,14 @@ def test_commas_separate_searches_and_quotes_are_no_part_of_them(opened):
     assert "names nothing" in answer(opened, -1).problem or "names nothing" in errors(opened)[-1]
 
 
-def test_earlier_phrases_come_back_by_the_arrows(opened):
+def test_arrows_recall_earlier_phrases(opened):
     assert queries.recall(opened, -1) == ""
     for text in ("mug", "book", "Mug"):
         queries.ask(opened, text)
     assert [queries.recall(opened, step) for step in (-1, -1, -1, 1, 1)] == ["Mug", "book", "book", "Mug", ""]
 
 
-def test_examples_are_offered_until_the_first_search_and_each_is_found(viewer):
+def test_examples_are_offered_before_the_first_query(viewer):
     open_scene(viewer, "book.ply")
     assert queries.offers(viewer, "") == ("try", ())
     queries.prepare_suggestions(viewer)
@@ -101,7 +101,7 @@ def test_examples_are_offered_until_the_first_search_and_each_is_found(viewer):
     assert queries.offers(viewer, "") == ("try", ())
 
 
-def test_hiding_keeps_the_colours_of_the_others_and_a_fourth_takes_that_of_the_longest_shown(opened):
+def test_fourth_query_takes_the_colour_of_the_oldest(opened):
     ask(opened, "mug", "book")
     queries.hide(opened, "mug")
     (pane,) = opened.state.panes()
@@ -122,7 +122,7 @@ def test_hiding_keeps_the_colours_of_the_others_and_a_fourth_takes_that_of_the_l
     assert phrases(opened) == ["book", "plant", "mug or book"]
 
 
-def test_queries_are_combined_as_the_grammar_reads_them(opened):
+def test_queries_are_combined_by_the_grammar(opened):
     ask(opened, "mug", "book")
     for join in queries.JOINS:
         queries.ask_combined(opened, "mug", join, "book")
@@ -142,7 +142,7 @@ def test_search_box_takes_the_keyboard_once(opened):
 
 
 @pytest.mark.parametrize(("logit", "verdict"), [(9.0, "found"), (1.0, "weak match"), (-3.0, "not here")])
-def test_a_calibrated_scene_gives_verdicts_with_probability(viewer, monkeypatch, logit, verdict):
+def test_calibrated_scene_gives_probabilities(viewer, monkeypatch, logit, verdict):
     sure = replace(language(), reading=Reading(calibration=calibrated_for("mug", logit)))
     monkeypatch.setitem(SCENES, "sure.ply", replace(blob_scene(), language=sure))
     open_scene(viewer, "sure.ply")
@@ -157,7 +157,7 @@ def test_a_calibrated_scene_gives_verdicts_with_probability(viewer, monkeypatch,
 # Evidence.
 
 
-def test_an_answer_is_explained_by_what_training_kept(opened, tmp_path, monkeypatch):
+def test_answer_is_explained_by_kept_photographs(opened, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     ask(opened, "book")
     (query,) = opened.state.session.queries
@@ -176,7 +176,7 @@ def test_an_answer_is_explained_by_what_training_kept(opened, tmp_path, monkeypa
 # Own cuts, canonical phrases and sets of queries, without a window.
 
 
-def test_an_answer_ends_where_one_says_and_can_end_by_itself_again(asked):
+def test_threshold_is_set_and_reset(asked):
     automatic = result(asked)
     assert automatic.own_cut is None
     assert 0 < automatic.members.sum() < 360
@@ -193,7 +193,7 @@ def test_an_answer_ends_where_one_says_and_can_end_by_itself_again(asked):
     assert result(asked) is automatic
 
 
-def test_a_cut_is_undone_in_one_step_and_outlives_another_level(asked):
+def test_threshold_is_one_step_and_outlives_the_level(asked):
     automatic = result(asked)
     queries.set_cut(asked, "mug", 0.6)
     for value in (0.61, 0.62):  # the slider moves on
@@ -209,7 +209,7 @@ def test_a_cut_is_undone_in_one_step_and_outlives_another_level(asked):
     assert result(asked).own_cut == 0.62
 
 
-def test_everything_can_be_compared_with_other_phrases(asked):
+def test_canonical_phrases_are_replaced_and_restored(asked):
     before = result(asked)
     act(queries.set_canonical, asked, ("book", "plant"))
     assert asked.state.session.canonical == ("book", "plant")
@@ -226,7 +226,7 @@ def test_everything_can_be_compared_with_other_phrases(asked):
 
 
 @pytest.mark.parametrize("dropped", [lambda path: [path], lambda path: [path, Path("blobs.ply")]])
-def test_a_set_of_queries_is_asked_again_alone_or_with_its_scene(asked, tmp_path, dropped):
+def test_query_set_is_asked_alone_or_with_its_scene(asked, tmp_path, dropped):
     queries.set_cut(asked, "mug", 0.7)
     ask(asked, "plant")
     queries.hide(asked, "plant")
@@ -244,7 +244,7 @@ def test_a_set_of_queries_is_asked_again_alone_or_with_its_scene(asked, tmp_path
     assert result(asked, 0).own_cut == 0.7
 
 
-def test_nothing_to_save_and_nothing_to_ask_of(viewer, opened, tmp_path):
+def test_query_set_without_queries_or_field_says_why(viewer, opened, tmp_path):
     assert queries.save_queries(opened, tmp_path) is None
     queries.load_queries(opened, tmp_path / "gone.queries.json")
     assert "gone.queries.json" in errors(opened)[-1]
@@ -280,7 +280,7 @@ GOOD = {"format": "langsplat-queries", "queries": [{"phrase": "mug"}]}
         {"canonical": [""]},
     ],
 )
-def test_a_broken_set_is_one_line(tmp_path, change):
+def test_damaged_query_set_is_refused_in_one_line(tmp_path, change):
     path = tmp_path / "a.queries.json"
     path.write_text(json.dumps(GOOD))
     assert [query.phrase for query in read_queries(path).queries] == ["mug"]
@@ -290,7 +290,7 @@ def test_a_broken_set_is_one_line(tmp_path, change):
     assert str(caught.value).isprintable()
 
 
-def test_the_histogram_counts_every_gaussian(asked):
+def test_relevancy_histogram_counts_every_gaussian(asked):
     low, high, counts = histogram(result(asked, 0))
     even = result(asked, 0).even
     assert (low, high) == (even.min(), max(even.max(), low + 1e-3))
@@ -308,7 +308,7 @@ def test_the_histogram_counts_every_gaussian(asked):
         (ZeroDivisionError("deep\ninside"), "internal error: ZeroDivisionError: deep inside"),
     ],
 )
-def test_an_encoder_that_fails_is_one_line_and_a_phrasebook_needs_none(viewer, error, said):
+def test_failing_encoder_is_one_line_and_phrasebook_needs_none(viewer, error, said):
     def broken(encoder_id: str):
         raise error
 
@@ -320,7 +320,7 @@ def test_an_encoder_that_fails_is_one_line_and_a_phrasebook_needs_none(viewer, e
 
 
 @pytest.mark.parametrize("encoder_id", ["demo", "~", "somebody/some-model"])
-def test_a_local_encoder_is_loaded_while_the_user_looks_round(viewer, encoder_id):
+def test_local_encoder_is_loaded_after_opening(viewer, encoder_id):
     """A hub id may mean a download: it waits for a phrase."""
     asked = []
     viewer.services = Services(load, lambda name: asked.append(name) or FakeEncoder(), encoder_id)

@@ -15,7 +15,7 @@ from langsplat_viewer.actions import editing, opening, queries, selecting, setti
 from langsplat_viewer.actions.selecting import take
 from langsplat_viewer.camera.controls import from_camera
 from langsplat_viewer.marks import Drawn, Stroke, outlines
-from langsplat_viewer.state import Answer
+from langsplat_viewer.state import QueryAnswer
 from tests.support.fakes import CENTRES, COLOURS, PER_BLOB
 from tests.support.windowless import (
     SCENES,
@@ -41,7 +41,7 @@ def searched(opened):
     return opened
 
 
-def test_what_is_hidden_or_deleted_is_never_selected(opened):
+def test_hidden_and_deleted_are_never_selected(opened):
     for action, expected in (
         (selecting.select_all, ("mug book plant", "", "")),
         (selecting.select_none, ("", "", "")),
@@ -67,14 +67,14 @@ def test_what_is_hidden_or_deleted_is_never_selected(opened):
     ("mode", "selected"),
     [("replace", "book plant"), ("add", "mug book plant"), ("remove", "mug"), ("intersect", "book")],
 )
-def test_what_is_found_is_combined_by_the_mode(opened, mode, selected):
+def test_selection_is_combined_by_the_mode(opened, mode, selected):
     take(opened, blob("mug") | blob("book"))
     selecting.set_tools(opened, mode=mode)
     take(opened, blob("book") | blob("plant"))
     assert marked(opened)[0] == selected
 
 
-def test_every_change_is_one_step_back_and_forth(opened):
+def test_each_change_of_marks_is_one_step(opened):
     take(opened, blob("mug"))
     selecting.hide_selected(opened)
     take(opened, blob("book"))
@@ -91,7 +91,7 @@ def test_every_change_is_one_step_back_and_forth(opened):
         assert marked(opened) == state
 
 
-def test_what_changes_nothing_is_no_step(opened):
+def test_change_without_effect_is_no_step(opened):
     selecting.select_none(opened)
     selecting.show_hidden(opened)
     take(opened, blob("mug"))
@@ -102,7 +102,7 @@ def test_what_changes_nothing_is_no_step(opened):
     assert len(opened.history.past) == 1
 
 
-def test_what_the_search_found_or_did_not(searched):
+def test_answers_and_instances_are_selected(searched):
     selecting.select_query(searched)
     assert marked(searched)[0] == "book"
     ask(searched, "mug")
@@ -114,7 +114,7 @@ def test_what_the_search_found_or_did_not(searched):
     selecting.select_none(searched)
     queries.remove(searched, "mug")
     absent = replace(result(searched), judgement=result(searched).judgement.absent)
-    searched.state.answers["book"] = Answer(absent)
+    searched.state.answers["book"] = QueryAnswer(absent)
     selecting.select_query(searched)
     assert "'book' is not here" in searched.state.messages[-1].text
     queries.remove(searched, "book")
@@ -139,7 +139,7 @@ def test_growing_and_shrinking_follow_the_surface(opened):
     assert (marks_of(opened).selected == grown).all()
 
 
-def test_what_is_found_too_late_is_not_taken(opened):
+def test_late_result_of_another_scene_is_dropped(opened):
     take(opened, blob("mug"))
     selecting.grow_selection(opened)
     opened.state.scene = None  # another one is being shown
@@ -147,7 +147,7 @@ def test_what_is_found_too_late_is_not_taken(opened):
     assert marked(opened)[0] == "mug"
 
 
-def test_another_scene_has_no_marks_but_the_tool_stays(opened):
+def test_next_scene_has_no_marks_and_keeps_the_tool(opened):
     take(opened, blob("mug"))
     selecting.hide_selected(opened)
     selecting.use_tool(opened, "lasso")
@@ -197,7 +197,7 @@ def corners(viewer, centre, half: float = 0.58) -> list[tuple[float, float]]:
     return [place(viewer, centre + half * np.array([sign, sign, 0])) for sign in (-1, 1)]
 
 
-def test_a_stroke_selects_what_it_encloses_or_sweeps_over_and_is_undone(front):
+def test_stroke_selects_what_it_encloses(front):
     assert draw(front, "rectangle", corners(front, CENTRES[0])) == "mug"
     assert draw(front, "rectangle", corners(front, CENTRES[2])[::-1], "add") == "mug plant"
     editing.undo(front)
@@ -211,7 +211,7 @@ def test_a_stroke_selects_what_it_encloses_or_sweeps_over_and_is_undone(front):
 
 
 @pytest.mark.parametrize("tool", ["sphere", "box"])
-def test_a_body_is_as_large_as_the_drag_or_the_reach(front, tool, monkeypatch):
+def test_sphere_and_box_are_as_large_as_the_drag(front, tool, monkeypatch):
     monkeypatch.setattr(FakeSurface, "point_at", lambda self, u, v: CENTRES[2])
     assert draw(front, tool, [place(front, CENTRES[2]), place(front, CENTRES[2] + [0.7, 0, 0])]) == "plant"
     draw(front, tool, [place(front, CENTRES[2])])  # a click
@@ -222,7 +222,7 @@ def test_a_body_is_as_large_as_the_drag_or_the_reach(front, tool, monkeypatch):
 
 
 @pytest.mark.parametrize("perspective", [True, False])
-def test_what_lies_behind_something_is_left_out_unless_all_is_wanted(front, monkeypatch, perspective):
+def test_stroke_leaves_out_occluded_gaussians(front, monkeypatch, perspective):
     """Depths count from the eye, with perspective and without."""
     if not perspective:
         viewpoint.toggle_orthographic(front)
@@ -236,14 +236,14 @@ def test_what_lies_behind_something_is_left_out_unless_all_is_wanted(front, monk
     assert 20 < in_front.sum() < 100
 
 
-def test_a_click_selects_the_thing_at_the_level_of_the_queries(front, monkeypatch):
+def test_click_selects_the_thing_at_the_chosen_level(front, monkeypatch):
     monkeypatch.setattr(FakeSurface, "point_at", lambda self, u, v: CENTRES[1])
     assert draw(front, "thing", [(0.5, 0.5)]) == "book"
     editing.undo(front)
     assert marked(front)[0] == ""
 
 
-def test_a_click_on_nothing_and_without_a_field(front, monkeypatch):
+def test_click_without_surface_or_field_says_why(front, monkeypatch):
     draw(front, "sphere", [(0.95, 0.5)])  # where the picture is empty
     assert "nothing under the cursor" in front.state.messages[-1].text
     front.state.scene = type(front.state.scene)(front.state.scene.gaussians)
@@ -252,7 +252,7 @@ def test_a_click_on_nothing_and_without_a_field(front, monkeypatch):
     assert marked(front) == ("", "", "")
 
 
-def test_escape_gives_up_the_stroke_then_the_tool_and_help_before_both(front):
+def test_escape_closes_help_then_stroke_then_tool(front):
     selecting.use_tool(front, "lasso")
     selecting.begin_stroke(front, 0.1, 0.1)
     front.state.show_help = True
@@ -273,7 +273,7 @@ def drawn(tool, path, centre=None) -> Drawn:
     return Drawn(tool, Stroke(tuple(path), centre), FRONT, 0.03, 0.5)
 
 
-def test_outlines_are_what_is_enclosed():
+def test_outlines_follow_the_stroke():
     (rectangle,) = outlines(drawn("rectangle", [(0.2, 0.3), (0.6, 0.5)]))
     assert rectangle.tolist() == [[0.2, 0.3], [0.6, 0.3], [0.6, 0.5], [0.2, 0.5], [0.2, 0.3]]
     (lasso,) = outlines(drawn("lasso", [(0.2, 0.3), (0.6, 0.5), (0.1, 0.9)]))
@@ -283,7 +283,7 @@ def test_outlines_are_what_is_enclosed():
     assert outlines(drawn("thing", [(0.2, 0.3)])) == []
 
 
-def test_the_circle_of_a_sphere_goes_through_the_mouse():
+def test_sphere_outline_goes_through_the_mouse():
     end = (0.6, 0.5)
     (circle,) = outlines(drawn("sphere", [(0.5, 0.5), end], (0.0, 0.0, 0.0)))
     np.testing.assert_allclose(np.abs(circle - end).max(1).min(), 0, atol=1e-9)
@@ -310,7 +310,7 @@ def kept_in(folder: Path) -> int:
     return len(load_scene(folder / "blobs-edited-001.ply").gaussians)
 
 
-def test_the_selection_and_the_rest_are_scenes_with_their_field(pruned, tmp_path):
+def test_export_writes_parts_with_their_field(pruned, tmp_path):
     take(pruned, blob("mug"))
     for part, word in (("selection", "mug"), ("rest", "book")):
         act(selecting.export, pruned, tmp_path, part)
@@ -322,7 +322,7 @@ def test_the_selection_and_the_rest_are_scenes_with_their_field(pruned, tmp_path
     assert pruned.state.is_unsaved  # neither is the scene
 
 
-def test_points_have_their_colours(opened, tmp_path):
+def test_exported_points_have_their_colours(opened, tmp_path):
     take(opened, blob("mug"))
     act(selecting.export, opened, tmp_path, "selection", as_points=True)
     assert names_in(tmp_path) == ["blobs-selection-points-001.ply"]
@@ -331,7 +331,7 @@ def test_points_have_their_colours(opened, tmp_path):
     np.testing.assert_allclose([table["red"][0], table["blue"][0]], 255 * COLOURS[0, [0, 2]], atol=1)
 
 
-def test_nothing_is_ever_written_over(opened, tmp_path):
+def test_export_never_overwrites(opened, tmp_path):
     take(opened, blob("mug"))
     taken = tmp_path / "blobs-selection-001.langsplat.safetensors"  # what would belong to the first name
     taken.write_text("precious")
@@ -344,7 +344,7 @@ def test_nothing_is_ever_written_over(opened, tmp_path):
     assert written == ["blobs-selection-002.ply", "blobs-selection-003.ply"]
 
 
-def test_what_cannot_be_written_is_said(opened, tmp_path):
+def test_failed_export_says_why(opened, tmp_path):
     selecting.export(opened, tmp_path, "selection")
     assert "nothing is selected" in opened.state.messages[-1].text
     selecting.select_all(opened)
@@ -356,7 +356,7 @@ def test_what_cannot_be_written_is_said(opened, tmp_path):
     assert names_in(tmp_path) == ["file"]
 
 
-def test_deleting_is_unsaved_until_the_scene_is_saved(pruned, tmp_path):
+def test_deletion_is_unsaved_until_exported(pruned, tmp_path):
     for action, unsaved in (
         (editing.undo, False),
         (editing.redo, True),
@@ -369,7 +369,7 @@ def test_deleting_is_unsaved_until_the_scene_is_saved(pruned, tmp_path):
     assert kept_in(tmp_path) == 240
 
 
-def test_another_scene_waits_for_the_answer(pruned, tmp_path):
+def test_opening_waits_for_the_question(pruned, tmp_path):
     for reply in (selecting.stay, settings.escape, selecting.discard_and_leave):
         opening.open_scene(pruned, Path("plain.ply"))
         assert pruned.state.opening is None
@@ -382,14 +382,14 @@ def test_another_scene_waits_for_the_answer(pruned, tmp_path):
     assert names_in(tmp_path) == []
 
 
-def test_a_broken_scene_after_discarding_loses_nothing(pruned):
+def test_broken_scene_after_discarding_keeps_edits(pruned):
     opening.open_scene(pruned, Path("broken.ply"))
     act(selecting.discard_and_leave, pruned)
     assert marked(pruned) == ("", "", "plant")
     assert pruned.state.is_unsaved
 
 
-def test_saving_comes_before_what_waited(pruned, tmp_path):
+def test_leaving_continues_after_saving(pruned, tmp_path):
     then = []
     opening.open_scene(pruned, Path("plain.ply"), then.append)
     act(selecting.save_and_leave, pruned, tmp_path)
@@ -399,7 +399,7 @@ def test_saving_comes_before_what_waited(pruned, tmp_path):
     assert kept_in(tmp_path) == 240
 
 
-def test_where_saving_fails_nothing_is_left(pruned, tmp_path):
+def test_failed_saving_stays_in_the_scene(pruned, tmp_path):
     selecting.quit_viewer(pruned)
     (tmp_path / "file").write_text("")
     act(selecting.save_and_leave, pruned, tmp_path / "file")
@@ -408,7 +408,7 @@ def test_where_saving_fails_nothing_is_left(pruned, tmp_path):
     assert pruned.state.is_unsaved
 
 
-def test_a_process_that_has_to_end_saves_what_is_not(pruned, tmp_path):
+def test_ending_process_saves_unsaved_edits(pruned, tmp_path):
     selecting.end(pruned, tmp_path)
     assert not pruned.state.may_close
     settle(pruned)
@@ -416,7 +416,7 @@ def test_a_process_that_has_to_end_saves_what_is_not(pruned, tmp_path):
     assert kept_in(tmp_path) == 240
 
 
-def test_what_is_named_is_found_by_its_name_and_kept_where_it_is_saved(opened, tmp_path):
+def test_taught_name_is_found_and_saved(opened, tmp_path):
     take(opened, blob("plant"))
     act(queries.name_selection, opened, "grandma's mug")
     assert phrases(opened) == ["grandma's mug"]
@@ -427,7 +427,7 @@ def test_what_is_named_is_found_by_its_name_and_kept_where_it_is_saved(opened, t
     assert errors(opened) == []
 
 
-def test_what_cannot_be_a_name_is_said(opened):
+def test_unusable_name_says_why(opened):
     queries.name_selection(opened, "cup")
     assert "nothing is selected" in opened.state.messages[-1].text
     take(opened, blob("plant"))
@@ -439,7 +439,7 @@ def test_what_cannot_be_a_name_is_said(opened):
 # By numbers.
 
 
-def test_values_in_a_range_are_selected_and_nothing_that_is_hidden(opened):
+def test_range_of_values_selects_shown_gaussians(opened):
     selecting.set_tools(opened, measure="relevancy")  # of an answer: there is none
     assert selecting.values_shown(opened) is None
     selecting.brush_values(opened, 0.5)
@@ -474,7 +474,7 @@ def test_values_in_a_range_are_selected_and_nothing_that_is_hidden(opened):
 
 
 @pytest.mark.parametrize("measure", marks.MEASURES)
-def test_a_histogram_leaves_out_what_is_no_number(measure):
+def test_histogram_leaves_out_nan(measure):
     scene = SCENES["blobs.ply"]
     broken = scene.gaussians.means.copy()
     broken[0], broken[1] = np.nan, np.inf

@@ -66,7 +66,7 @@ def finish(viewer, seconds: float = 20.0) -> None:
     settle(viewer)
 
 
-def test_a_folder_of_photographs_becomes_a_scene_that_opens(viewer, folder, begin):
+def test_training_opens_its_scene(viewer, folder, begin):
     browsing.open_dropped(viewer, [folder])
     form = viewer.state.training_form
     assert (form.dataset, form.out) == (str(folder), str(folder.with_suffix(".ply")))
@@ -79,7 +79,7 @@ def test_a_folder_of_photographs_becomes_a_scene_that_opens(viewer, folder, begi
     assert viewer.state.scene is SCENES["blobs.ply"]
 
 
-def test_what_speaks_against_the_scene_is_said(viewer, folder, begin):
+def test_quality_warnings_are_said(viewer, folder, begin):
     warnings = [
         "held-out photographs are reproduced at 9.1 dB, below 16: take more",
         "two groups",
@@ -99,14 +99,14 @@ def test_what_speaks_against_the_scene_is_said(viewer, folder, begin):
     assert viewer.state.warnings == ()
 
 
-def test_what_goes_wrong_is_said(viewer, begin):
+def test_failed_training_says_why(viewer, begin):
     begin(BAD)
     finish(viewer)
     assert errors(viewer) == ["langsplat: photos: none can be located"]
     assert viewer.state.scene is None
 
 
-def test_it_can_be_stopped_and_one_is_enough(viewer, begin):
+def test_training_is_stopped_and_runs_once(viewer, begin):
     begin(SLOW)
     browsing.start_training(viewer)
     assert "under way" in errors(viewer)[-1]
@@ -119,7 +119,7 @@ def test_it_can_be_stopped_and_one_is_enough(viewer, begin):
     assert "goes on" in viewer.state.messages[-1].text
 
 
-def test_the_gaussians_can_be_looked_at_before_the_end(viewer, folder, begin, monkeypatch):
+def test_gaussians_are_shown_before_the_end(viewer, folder, begin, monkeypatch):
     begin(SLOW)
     work = folder.with_name("photos.work")
     work.mkdir()
@@ -131,7 +131,7 @@ def test_the_gaussians_can_be_looked_at_before_the_end(viewer, folder, begin, mo
 
 
 @pytest.mark.parametrize("dataset", ["", "  ", "gone", "."])
-def test_a_folder_without_photographs_is_said(viewer, tmp_path, monkeypatch, dataset):
+def test_folder_without_photographs_is_refused(viewer, tmp_path, monkeypatch, dataset):
     monkeypatch.chdir(tmp_path)
     viewer.state.training_form = replace(viewer.state.training_form, dataset=dataset)
     browsing.start_training(viewer)
@@ -139,7 +139,7 @@ def test_a_folder_without_photographs_is_said(viewer, tmp_path, monkeypatch, dat
     assert viewer.training is None
 
 
-def test_the_command_is_one_that_the_program_understands():
+def test_training_command_is_parsed_by_the_program():
     request = TrainingRequest(Path("photos"), Path("s.ply"), "quick", "demo")
     words = command(request)
     assert words[1:3] == ["-m", "langsplat_core"]
@@ -149,7 +149,7 @@ def test_the_command_is_one_that_the_program_understands():
     assert parsed.config.radiance.checkpoint_every == PREVIEW_EVERY
 
 
-def test_what_is_no_progress_is_kept_as_words():
+def test_other_output_is_kept_as_words():
     progress = TrainingProgress()
     for line in ("plain words\n", '{"stage": 3}', '"text"', "", "[1]", '{"stage": "a", "fraction": 0.5}'):
         progress.hear(line)
@@ -160,7 +160,7 @@ def test_what_is_no_progress_is_kept_as_words():
     assert len(progress.said) < 30
 
 
-def test_the_loss_is_heard_once_for_every_time_that_it_is_said():
+def test_loss_is_heard_once_per_report():
     progress = TrainingProgress()
     for fraction, loss in ((0.0, {}), (0.1, {"loss": 0.25}), (0.11, {"loss": 0.25}), (0.2, {"loss": 0.125})):
         progress.hear(json.dumps({"stage": "training Gaussians", "fraction": fraction, "metrics": loss}))
@@ -180,7 +180,7 @@ def checkpoint(folder: Path, scene: Scene) -> Path:
     return path
 
 
-def test_gaussians_in_training_are_looked_at_and_followed(viewer, folder, begin):
+def test_checkpoints_are_shown_and_followed(viewer, folder, begin):
     viewer.services = replace(viewer.services, load_scene=load_scene)
     begin(SLOW)
     whole = blob_scene()
@@ -211,7 +211,7 @@ def test_gaussians_in_training_are_looked_at_and_followed(viewer, folder, begin)
 
 
 @pytest.mark.long
-def test_a_checkpoint_of_training_itself_is_read(tmp_path):
+def test_checkpoint_of_the_trainer_is_read(tmp_path):
     import torch
 
     from langsplat_core.training.radiance.state import save_checkpoint, start

@@ -31,7 +31,7 @@ def means(viewer) -> np.ndarray:
     return viewer.state.scene.gaussians.means
 
 
-def test_the_selection_moves_alone_and_is_found_where_it_went(opened):
+def test_transform_moves_only_the_selection(opened):
     chosen, before = selected_mug(opened), means(opened)
     place, cameras = result(opened, 0).place, opened.state.scene.cameras
     act(editing.transform, opened, moving(STEP))
@@ -53,7 +53,7 @@ def test_the_selection_moves_alone_and_is_found_where_it_went(opened):
     assert opened.state.scene.language is None
 
 
-def test_the_whole_scene_takes_its_cameras_along(opened):
+def test_transform_of_the_scene_moves_its_cameras(opened):
     up, before = opened.state.extent.up, means(opened)
     eyes = [camera.position for camera in opened.state.scene.cameras]
     to = rotating(AXES["z"], 90).then(scaling(3)).then(moving(STEP))
@@ -64,7 +64,7 @@ def test_the_whole_scene_takes_its_cameras_along(opened):
     np.testing.assert_allclose(opened.state.extent.up, to.rotation @ up, atol=1e-6)
 
 
-def test_undone_exactly_and_done_again(opened):
+def test_transforms_are_undone_exactly(opened):
     chosen, first = selected_mug(opened), means(opened)
     place = result(opened, 0).place
     editing.transform(opened, rotating(AXES["x"], 33).about(MUG))
@@ -90,7 +90,7 @@ def test_undone_exactly_and_done_again(opened):
     np.testing.assert_allclose(means(opened), last, atol=1e-5)
 
 
-def test_a_held_gizmo_shows_what_release_does(opened):
+def test_held_gizmo_previews_the_transform(opened):
     chosen = selected_mug(opened)
     before, shown = means(opened), opened.state.request((32, 24))
     editing.preview(opened, moving(STEP))
@@ -106,7 +106,7 @@ def test_a_held_gizmo_shows_what_release_does(opened):
     assert opened.state.request((32, 24)).scene.source is opened.state.scene
 
 
-def test_what_is_saved_is_what_is_seen(opened, tmp_path):
+def test_transformed_scene_is_saved_as_seen(opened, tmp_path):
     selected_mug(opened)
     editing.transform(opened, moving(STEP))
     act(selecting.export, opened, tmp_path, "edited")
@@ -119,7 +119,7 @@ def test_what_is_saved_is_what_is_seen(opened, tmp_path):
     assert opened.state.leaving is not None
 
 
-def test_cropped_to_a_box_and_undone(opened):
+def test_crop_deletes_outside_the_box_and_is_undone(opened):
     chosen = selected_mug(opened)
     editing.fill_box(opened)
     editing.crop(opened)
@@ -134,7 +134,7 @@ def test_cropped_to_a_box_and_undone(opened):
     assert opened.state.marks.kept.all()
 
 
-def test_a_clip_follows_its_box_and_is_undone(opened):
+def test_clip_follows_its_box_and_is_undone(opened):
     chosen = selected_mug(opened)
     editing.fill_box(opened)
     editing.clip(opened, True)
@@ -152,7 +152,7 @@ def test_a_clip_follows_its_box_and_is_undone(opened):
     assert opened.state.marks.shown.all()
 
 
-def test_the_numbers_of_the_panel(opened):
+def test_panel_numbers_transform_about_the_middle(opened):
     """Scaled and rotated about the middle of the selection, then moved; then the fields are neutral again."""
     before = opened.state.scene
     refused = (EditForm(scale=0), EditForm(scale=-1), EditForm(move=(1e39, 0.0, 0.0)))
@@ -174,7 +174,7 @@ def test_the_numbers_of_the_panel(opened):
     assert opened.state.edit_form == EditForm()
 
 
-def test_without_a_scene_nothing_happens(viewer):
+def test_transforms_without_a_scene_do_nothing(viewer):
     for action in (editing.apply_form, editing.crop, editing.fill_box):
         action(viewer)
     editing.preview(viewer, moving(STEP))
@@ -182,7 +182,7 @@ def test_without_a_scene_nothing_happens(viewer):
 
 
 @pytest.mark.parametrize("perspective", [True, False])
-def test_the_gizmo_lies_where_the_camera_sees_it(perspective):
+def test_gizmo_matrices_agree_with_the_camera(perspective):
     camera = random_camera(3)
     camera = camera if perspective else without_perspective(camera)
     points = np.random.default_rng(0).normal(scale=0.3, size=(20, 3))
@@ -195,7 +195,7 @@ def test_the_gizmo_lies_where_the_camera_sees_it(perspective):
     assert (np.abs(depth) < 1).all()
 
 
-def test_what_a_drag_means():
+def test_gizmo_drags_become_similarities():
     box = np.diag([2.0, -4.0, 6.0, 1.0])  # a handle was dragged beyond the opposite one
     box[:3, 3] = 1.0, 2.0, 3.0
     assert box_of(box) == ((0.0, 0.0, 0.0), (2.0, 4.0, 6.0))

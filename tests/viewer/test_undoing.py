@@ -17,7 +17,7 @@ from langsplat_viewer.viewer import GESTURE, MOST_STEPS
 from tests.support.windowless import act, answer, ask, open_scene, phrases, result, settle
 
 
-def test_a_query_is_undone_and_done_again(opened):
+def test_undo_and_redo_restore_queries(opened):
     ask(opened, "mug", "book")
     editing.undo(opened)
     assert phrases(opened) == ["mug"]
@@ -36,7 +36,7 @@ def test_a_query_is_undone_and_done_again(opened):
     assert "nothing to redo" in opened.state.messages[-1].text
 
 
-def test_a_removed_query_comes_back_with_its_answer_and_colour(opened):
+def test_undo_restores_a_removed_query_with_its_colour(opened):
     ask(opened, "mug", "book")
     queries.set_cut(opened, "mug", 0.6)
     mug, count = opened.state.session.queries[0], result(opened, 0).members.sum()
@@ -48,7 +48,7 @@ def test_a_removed_query_comes_back_with_its_answer_and_colour(opened):
 
 
 @pytest.mark.parametrize("leave", [lambda v: queries.remove(v, phrases(v)[-1]), editing.undo])
-def test_history_keeps_no_answers_of_queries_that_are_gone(opened, leave):
+def test_history_keeps_no_answers_of_removed_queries(opened, leave):
     """Each has a number for every Gaussian and level."""
     ask(opened, "mug")
     stays, gone = result(opened, 0), []
@@ -66,7 +66,7 @@ def test_history_keeps_no_answers_of_queries_that_are_gone(opened, leave):
     assert result(opened, -1).found
 
 
-def test_an_answer_that_comes_after_its_query_was_taken_off_is_dropped(opened):
+def test_late_answer_of_a_removed_query_is_dropped(opened):
     queries.ask(opened, "mug")
     act(queries.remove, opened, "mug")
     assert opened.state.answers == {}
@@ -76,7 +76,7 @@ def test_an_answer_that_comes_after_its_query_was_taken_off_is_dropped(opened):
     assert result(opened).found
 
 
-def test_answers_come_back_at_their_level_and_another_scene_has_no_history(opened):
+def test_undo_restores_the_level_and_ends_with_the_scene(opened):
     ask(opened, "mug")
     queries.hide(opened, "mug")
     act(queries.set_level, opened, "part")
@@ -111,7 +111,7 @@ SETTINGS = {
 
 
 @pytest.mark.parametrize("name", SETTINGS)
-def test_a_setting_of_what_is_seen_is_undone_in_one_step(opened, name):
+def test_setting_is_undone_in_one_step(opened, name):
     before = opened.state.session
     SETTINGS[name](opened)
     after = opened.state.session
@@ -134,7 +134,7 @@ def slide(viewer, seconds: float, dim: float) -> None:
     settings.set_picture(viewer, replace(viewer.state.session.picture, dim=dim))
 
 
-def test_a_slider_that_is_moved_is_one_step_and_another_time_another(opened):
+def test_slider_gesture_is_one_step(opened):
     for frame in range(10):
         slide(opened, 5 + 0.1 * frame, 0.4 - 0.01 * frame)
     assert len(opened.history.past) == 1
@@ -149,7 +149,7 @@ def test_a_slider_that_is_moved_is_one_step_and_another_time_another(opened):
     assert opened.state.session.picture.dim == 0.45
 
 
-def test_an_undone_setting_leaves_the_marks_the_same_objects(opened):
+def test_undo_of_a_setting_keeps_the_same_mask_objects(opened):
     """Else the scene would be made anew for every slider."""
     selecting.select_all(opened)
     settings.toggle_wipe(opened)
@@ -171,7 +171,7 @@ def changed(marks: Marks, rng: np.random.Generator, step: int) -> Marks:
     return replace(marks, selected=(rng.uniform(size=len(marks.selected)) < 0.02) & marks.shown)
 
 
-def test_a_hundred_changes_of_a_million_gaussians_take_little_memory(viewer):
+def test_history_of_a_million_gaussians_takes_little_memory(viewer):
     """At random, so that nothing could be shared."""
     count, rng = 1_000_000, np.random.default_rng(0)
     viewer.state.marks = unmarked(count)

@@ -26,7 +26,7 @@ from langsplat_viewer.files.projects import QUERIES, read_queries, write_queries
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.output import free_name
 from langsplat_viewer.session import Query
-from langsplat_viewer.state import Answer, EvidenceSheet
+from langsplat_viewer.state import EvidenceSheet, QueryAnswer
 from langsplat_viewer.viewer import Viewer
 
 MOST_THINGS = 20  # instances of one answer
@@ -74,17 +74,17 @@ def answer(viewer: Viewer, phrase: str, then_show: bool = False) -> None:
         return
     viewpoint = None if state.view is None else state.view.camera(*state.size)
 
-    def work(progress: Progress) -> Answer:
+    def work(progress: Progress) -> QueryAnswer:
         began = perf_counter()
         try:
             composed = run_phrase(engine, phrase, level, viewpoint, progress)
         except UnknownWordError as error:
-            return Answer(problem=str(error), meant=corrected(phrase, error.near) or "")
+            return QueryAnswer(problem=str(error), meant=corrected(phrase, error.near) or "")
         reading = "" if isinstance(composed.tree, Atom) else composed.reading
         milliseconds = 1e3 * (perf_counter() - began)
-        return Answer(composed.answer, (), reading, heads(composed.tree), milliseconds=milliseconds)
+        return QueryAnswer(composed.answer, (), reading, heads(composed.tree), milliseconds=milliseconds)
 
-    def done(found: Answer) -> None:
+    def done(found: QueryAnswer) -> None:
         result = found.result
         if phrase not in state.answers:  # it was taken off meanwhile
             return
@@ -103,9 +103,9 @@ def answer(viewer: Viewer, phrase: str, then_show: bool = False) -> None:
             )
 
     def failed(reason: str) -> None:
-        done(Answer(problem=reason))
+        done(QueryAnswer(problem=reason))
 
-    state.answers[phrase] = replace(state.answers.get(phrase, Answer()), pending=True)
+    state.answers[phrase] = replace(state.answers.get(phrase, QueryAnswer()), pending=True)
     viewer.run(f"searching '{phrase}'", work, done, failed)
 
 
