@@ -118,20 +118,8 @@ class QueryScene:
         if self.json:
             print_json(answers)
             return
-        for answer, lines in zip(answers, tables, strict=True):
-            verdict, reading = answer["verdict"], answer["reading"]
-            if answer["probability"] is not None:
-                verdict += f" ({100 * answer['probability']:.0f} %)"
-            if answer["count"]["most"] > 1 or (not answer["found"] and answer["count"]["most"]):
-                verdict += f", {_counted(**answer['count'])}"
-            place = "-" if answer["place"] is None else f"{unit.format(answer['place'])} {unit.name}"
-            print(
-                f"{answer['phrase']}: {verdict}, score {answer['score']:.3f} at level {answer['level']}, "
-                f"place {place}, pixel {answer['pixel']}",
-                *([] if reading is None else [f"  read as: {reading}"]),
-                *lines,
-                sep="\n",
-            )
+        for answer, table in zip(answers, tables, strict=True):
+            print(*_lines(answer, unit), *table, sep="\n")
         print(f"answers: {engine.basis.long}")
 
     def _check(self) -> None:
@@ -296,8 +284,20 @@ def _answer(
     return answer
 
 
-def _counted(best: int, least: int, most: int) -> str:
-    return f"{best} of them" if least == most else f"{best} of them ({least} to {most})"
+def _lines(answer: dict[str, Any], unit: "Unit") -> list[str]:
+    """Return an answer as text: its verdict and where it is, then how the phrase was read."""
+    verdict, reading, count = answer["verdict"], answer["reading"], answer["count"]
+    best, least, most = count["best"], count["least"], count["most"]
+    if answer["probability"] is not None:
+        verdict += f" ({100 * answer['probability']:.0f} %)"
+    if most > 1 or (most and not answer["found"]):
+        verdict += f", {best} of them" + ("" if least == most else f" ({least} to {most})")
+    place = "-" if answer["place"] is None else f"{unit.format(answer['place'])} {unit.name}"
+    said = (
+        f"{answer['phrase']}: {verdict}, score {answer['score']:.3f} at level {answer['level']}, "
+        f"place {place}, pixel {answer['pixel']}"
+    )
+    return [said] if reading is None else [said, f"  read as: {reading}"]
 
 
 # `langsplat select`.

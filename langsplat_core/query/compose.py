@@ -249,7 +249,7 @@ def check_phrase(
 
 
 def _check_viewpoint(tree: Phrase, viewpoint: Camera | None) -> None:
-    """InputError for the first word in the tree that only a viewer can say, if there is none."""
+    """Raise InputError for the first word in the tree that only a viewer can say, if there is none."""
     match tree:
         case Relation(kind) | Superlative(kind):
             free = isinstance(tree, Superlative) and kind in ("nearest", "farthest") and tree.anchor is None

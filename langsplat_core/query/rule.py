@@ -38,7 +38,7 @@ class Rule:
     reach: float = 0.45  # of the best fit: a region that fits less by this or less belongs to the answer,
     nearest: float = 0.15  # by this at least,
     farthest: float = 1.0  # and by this at most
-    nothing: float = float(logit(np.array(2 * NARROWEST)))  # fit; what fits less has no meaning
+    nothing: float = float(logit(np.array(2 * NARROWEST)))  # fit; what fits less has no feature behind it
     smallest: int = SMALLEST  # Gaussians; smaller regions are crumbs and count where there is nothing else
     narrowest: float = NARROWEST  # distance of a relevancy from 0 and 1; least spread
     floor: float = FLOOR  # relevancy at which a heat map begins
@@ -94,7 +94,7 @@ class RegionTable:
 def region_fits(table: RegionTable, own: Array) -> Array:
     """Return the (R, ...) fits of regions, each mixed with the fit of its best part.
 
-    own: (R, ...) fits of the mean relevancy of each region's Gaussians. Parts without a meaning, and crumbs,
+    own: (R, ...) fits of the mean relevancy of each region's Gaussians. Parts that fit nothing, and crumbs,
     say nothing; a region without parts is its own part.
     """
     telling = ((own > RULE.nothing).T & table.solid).T
@@ -107,7 +107,7 @@ def region_fits(table: RegionTable, own: Array) -> Array:
 
 
 def region_relevancies(fits: Array) -> Array:
-    """Return the relevancies that fits stand for, 0 for what has no meaning."""
+    """Return the relevancies that fits stand for, 0 for what fits nothing."""
     return np.where(fits > RULE.nothing, sigmoid(fits), 0)
 
 

@@ -40,7 +40,7 @@ class WordSpace:
 
     basis: Array  # (W, D) float32 orthonormal
     centres: Array  # (3, W) mean over the regions of each level
-    regions: tuple[Array, ...]  # (R, W) of each level, unit; zero for one without a meaning
+    regions: tuple[Array, ...]  # (R, W) of each level, unit; zero for one without features
     rival: float  # in [0, 1], see above; 0 where there is nothing to compare
 
 
@@ -87,7 +87,7 @@ def shown(
 ) -> TaughtWord:
     """Return the word for `members` (N,) bool at a level (index into LEVELS).
 
-    Raises InputError where they mean nothing, or nothing that tells them from the rest of the scene.
+    Raises InputError where they have no features, or none that tell them from the rest of the scene.
     """
     sets = np.where(members, 0, -1)
     (mean,), (known,) = _means(field, space.basis, level, sets, regions.weights, 1)

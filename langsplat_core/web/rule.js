@@ -30,7 +30,7 @@ function regionFits(rule, regions, own) {
   });
 }
 
-// Relevancies that fits stand for, 0 for what has no meaning.
+// Relevancies that fits stand for, 0 for what fits nothing.
 function regionRelevancies(rule, fits) {
   return fits.map((fit) => (fit > rule.nothing ? sigmoid(fit) : 0));
 }

@@ -3,7 +3,7 @@
 The answer to a phrase in a scene rests on the mean relevancies of its regions, which are mixtures of the
 relevancies of few codewords. So the index keeps, of every scene, its codewords in 8 bits, how each is read
 (zero and rate), the codewords of every region with their shares, and the fits of everyday phrases by chance.
-From these the fits and the verdict of `answers.by_regions` are computed without opening the scene, up to the
+From these the fits and the verdict of `query.rule` are computed without opening the scene, up to the
 rounding of codewords. The scenes that answer best are then opened and asked by `QueryEngine`.
 
 The index is a safetensors file: the scenes as JSON in its metadata, and for each group of scenes of one
