@@ -79,9 +79,9 @@ def test_rematch_keeps_cameras_mark_and_extras(tmp_path):
 def checkpoints(tmp_path: Path) -> list[Path]:
     """Of Occam's LGS, three levels of vectors as long as the demo encoder's."""
     g, rng = random_gaussians(20, sh_degree=1), np.random.default_rng(0)
-    meanings = unit(rng.normal(size=(5, load_text_encoder("demo").dim))).astype(np.float32)
+    features = unit(rng.normal(size=(5, load_text_encoder("demo").dim))).astype(np.float32)
     return [
-        save_model(tmp_path / f"chkpnt_langfeat_{level}.pth", g, tensor(meanings[rng.integers(0, 5, 20)]))
+        save_model(tmp_path / f"chkpnt_langfeat_{level}.pth", g, tensor(features[rng.integers(0, 5, 20)]))
         for level in (1, 2, 3)
     ]
 

@@ -1,4 +1,4 @@
-"""Scenes of other methods as scenes of this one: their meanings in a codec, with what a query needs beside.
+"""Scenes of other methods as scenes of this one: a codec for their vectors, and what a query needs.
 
 Latents of LangSplat's autoencoder are kept with it. Vectors of CLIP's own space go into a codec fitted to a
 sample of them, a codebook unless asked otherwise; clusters that have a vector each are a codebook already.
@@ -52,12 +52,12 @@ def import_scene(
     config: CodecConfig | None = None,
     progress: Progress = silent,
 ) -> tuple[Scene, ImportReport]:
-    """Return the scene with its language field; without one where `foreign` has no meanings.
+    """Return the scene with its language field; without one where `foreign` has no features.
 
     `encoder_id` is the text encoder of the space that the method's vectors are in, by default that of
-    LangSplat; `phrases` are stored encoded. A Gaussian's confidence is 1 where it has a meaning, else 0.
+    LangSplat; `phrases` are stored encoded. A Gaussian's confidence is 1 where it has a feature, else 0.
     Raises EncoderError where the encoder cannot be loaded, InputError where its vectors have another length
-    or no Gaussian has a meaning, FormatError for features that are not finite.
+    or no Gaussian has a feature, FormatError for features that are not finite.
     """
     config = config or CodebookConfig()
     check_settings(config, "--codec.")

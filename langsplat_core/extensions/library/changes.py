@@ -43,7 +43,7 @@ LEAST = 100  # Gaussians of a node: of fewer, at the fringe of what was photogra
 LEAST_PIXELS = 50.0  # that a node covers, of an image in which it is seen
 EMPTY = 0.05  # alpha below which nothing is there
 SIDE = 400  # pixels: the longer side of these images
-ALIKE = 0.8  # cosine of meanings, from the scene's mean, of one thing in two places
+ALIKE = 0.8  # cosine of language features, from the scene's mean, of one thing in two places
 SHADE = 25.0  # distance of its mean colours at most
 GROWN = 1.7  # ratio of its sizes at most
 TOUCHING = 0.25  # of the larger one's diagonal: pieces so near each other, and alike, are of one thing
@@ -263,9 +263,9 @@ def _meanings(engine: QueryEngine) -> tuple[Array, Array, Array]:
 
 
 def _piece(
-    engine: QueryEngine, evidence: Array, into: Array, rows: Array, meanings: tuple[Array, Array, Array]
+    engine: QueryEngine, evidence: Array, into: Array, rows: Array, features: tuple[Array, Array, Array]
 ) -> _Piece:
-    vectors, number, areas = meanings
+    vectors, number, areas = features
     known = rows[number[rows] >= 0]
     mean = np.bincount(number[known], areas[known], minlength=len(vectors)) @ vectors
     gone, kept, coloured, _, *looks = evidence[rows].sum(0)
@@ -289,7 +289,7 @@ def _together(
     evidence: Array,
     into: Array,
     pieces: list[_Piece],
-    meanings: tuple[Array, Array, Array],
+    features: tuple[Array, Array, Array],
 ) -> list[_Piece]:
     """Pieces of one thing as one: they meet, mean the same, and have changed in the same way."""
     pieces = sorted(pieces, key=lambda piece: -len(piece.rows))
@@ -299,7 +299,7 @@ def _together(
             alike = float(piece.meaning @ other.meaning) >= ALIKE and piece.is_absent == other.is_absent
             if alike and _meet(piece.box, other.box):
                 rows = np.union1d(piece.rows, other.rows)
-                kept[place] = _piece(engine, evidence, into, rows, meanings)
+                kept[place] = _piece(engine, evidence, into, rows, features)
                 break
         else:
             kept.append(piece)

@@ -63,7 +63,7 @@ class Answered:
     unread: tuple[tuple[str, str], ...] = ()  # scenes that could not be opened, and why
 
     def count(self, verdict: Outcome) -> int:
-        """Number of scenes with this verdict."""
+        """Return the number of scenes with this verdict."""
         return sum(hit.verdict == verdict for hit in self.hits)
 
 

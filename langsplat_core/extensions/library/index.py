@@ -404,8 +404,10 @@ def _dot(row: Array, vector: Array) -> np.float32:
 def _region_means(
     first: int, last: int, vector: Array, columns: Columns, starts: Array, means: Array, sound: Array
 ) -> None:
-    """Add to `means` (R,), of scenes [first, last), the mean relevancy of every region; of a scene with a
-    number out of place set `sound` (S,) to False."""
+    """Add to `means` (R,), of scenes [first, last), the mean relevancy of every region.
+
+    Of a scene with a number out of place, set `sound` (S,) to False.
+    """
     for scene in range(first, last):
         k, m, r = starts[scene]
         last_k, last_m, last_r = starts[scene + 1]

@@ -35,9 +35,9 @@ pytestmark = pytest.mark.long
 N, D = 60, 24
 G = random_gaussians(N, sh_degree=2)
 rng = np.random.default_rng(5)
-MEANINGS = unit(rng.normal(size=(7, D))).astype(np.float32)
+FEATURES = unit(rng.normal(size=(7, D))).astype(np.float32)
 CHOICE = rng.integers(0, 7, (3, N))
-VECTORS = (MEANINGS[CHOICE] * rng.uniform(0.1, 9, (3, N, 1))).astype(np.float32)  # of any length
+VECTORS = (FEATURES[CHOICE] * rng.uniform(0.1, 9, (3, N, 1))).astype(np.float32)  # of any length
 VECTORS[:, ::9] = 0  # never seen
 SEEN = np.ones(N, bool)
 SEEN[::9] = False
@@ -73,7 +73,7 @@ def test_few_meanings_become_a_codebook_of_them(tmp_path, clip):
     np.testing.assert_array_equal(field.confidence, np.tile(SEEN.astype(np.float32), (3, 1)))
     for level in range(3):
         # codewords are float16 numbers
-        np.testing.assert_allclose(decoded(field, level)[SEEN], MEANINGS[CHOICE[level]][SEEN], atol=5e-4)
+        np.testing.assert_allclose(decoded(field, level)[SEEN], FEATURES[CHOICE[level]][SEEN], atol=5e-4)
     encoder = load_text_encoder(clip)
     np.testing.assert_array_equal(field.canonical, encoder.encode_texts(list(CANONICAL_PHRASES)))
     assert list(field.phrasebook) == ["red mug"]
@@ -90,7 +90,7 @@ def test_many_meanings_are_kept_within_the_stated_error(tmp_path, clip):
     """The error that is stated is of a few Gaussians that the codec was not fitted to; here of all."""
     n = 900
     g = random_gaussians(n)
-    vectors = unit(MEANINGS[rng.integers(0, 7, n)] + rng.normal(scale=0.02, size=(n, D))).astype(np.float32)
+    vectors = unit(FEATURES[rng.integers(0, 7, n)] + rng.normal(scale=0.02, size=(n, D))).astype(np.float32)
     path = save_model(tmp_path / "a_3.pth", g, tensor(vectors))
     config = CodebookConfig(max_relevancy_error=0.02)
     scene, report = import_scene(read_foreign([path]), clip, (), config)
@@ -110,7 +110,7 @@ def test_many_meanings_are_kept_within_the_stated_error(tmp_path, clip):
 def langsplat(folder: Path) -> tuple[list[Path], Array, torch.nn.Module]:
     network = autoencoder(D)
     with torch.no_grad():
-        latents = np.stack([network.encode(torch.from_numpy(MEANINGS[CHOICE[i]])).numpy() for i in range(3)])
+        latents = np.stack([network.encode(torch.from_numpy(FEATURES[CHOICE[i]])).numpy() for i in range(3)])
     latents = np.where(SEEN[:, None], latents * 0.4, 0).astype(np.float32)  # not normalised, as trained
     paths = [save_model(folder / f"a_{i + 1}" / "chkpnt30000.pth", G, tensor(latents[i])) for i in range(3)]
     torch.save(network.state_dict(), folder / "best_ckpt.pth")
@@ -140,8 +140,8 @@ def test_langsplat_there_and_back(tmp_path, clip):
     for name, array in first.codec.tensors().items():
         np.testing.assert_allclose(second.codec.tensors()[name], array, rtol=1e-6, atol=1e-7)
     with torch.no_grad():
-        theirs = network.eval().encode(torch.from_numpy(MEANINGS)).numpy()
-    np.testing.assert_allclose(theirs, first.codec.encode(MEANINGS), atol=1e-5)
+        theirs = network.eval().encode(torch.from_numpy(FEATURES)).numpy()
+    np.testing.assert_allclose(theirs, first.codec.encode(FEATURES), atol=1e-5)
 
 
 def test_occam_there_and_back(tmp_path, clip):
