@@ -14,7 +14,7 @@ from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
 from langsplat_core.errors import InputError
 from langsplat_core.pipeline.language_field import StoredViews
-from langsplat_core.pipeline.stages import LOCK, ProcessGroup, join_processes, sole_use
+from langsplat_core.pipeline.stages import LOCK, ProcessGroup, join_processes, sole_use, stage_key
 from tests.support.scenes import make_views
 from tests.support.tiny_models import tiny_room, tiny_sam
 
@@ -24,6 +24,17 @@ HOLD = (
     "import sys, time\nfrom pathlib import Path\nfrom langsplat_core.pipeline.stages import sole_use\n"
     "with sole_use(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)\n"
 )
+
+
+def test_stage_key_names_stage_version_and_inputs() -> None:
+    keys = {
+        stage_key("lift", 2, "a"),
+        stage_key("lift", 3, "a"),
+        stage_key("fit", 2, "a"),
+        stage_key("lift", 2, "b"),
+    }
+    assert len(keys) == 4
+    assert stage_key("lift", 2, "a") in keys
 
 
 def test_lock_names_its_owner_and_expires_with_it(tmp_path: Path) -> None:

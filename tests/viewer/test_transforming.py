@@ -134,6 +134,15 @@ def test_crop_deletes_outside_the_box_and_is_undone(opened):
     assert opened.state.marks.kept.all()
 
 
+def test_cropping_keeps_earlier_deletions(opened):
+    chosen = selected_mug(opened)
+    selecting.delete_selected(opened)
+    selecting.select_all(opened)
+    opened.state.edit_form = EditForm(low=(-50.0, -50, -50), high=(50.0, 50, 50))
+    editing.crop(opened)
+    np.testing.assert_array_equal(opened.state.marks.deleted, chosen)
+
+
 def test_clip_follows_its_box_and_is_undone(opened):
     chosen = selected_mug(opened)
     editing.fill_box(opened)
