@@ -39,7 +39,7 @@ from langsplat_viewer.files.preferences import (
 from langsplat_viewer.files.projects import PROJECTS, Shelf
 from langsplat_viewer.jobs import give_memory_back, on_signals, one_line, share_one_heap
 from langsplat_viewer.options import chosen_camera, latent_level
-from langsplat_viewer.panels import layout, navigation, outline, overlays, ui
+from langsplat_viewer.panels import layout, menus, navigation, outline, overlays, ui
 from langsplat_viewer.panels.navigation import Keyboard
 from langsplat_viewer.rendering.renderer import Backend, GlRenderer
 from langsplat_viewer.viewer import Services, Viewer
@@ -254,7 +254,7 @@ class Window:
         params.callbacks.default_icon_font = hello_imgui.DefaultIconFont.font_awesome6
         params.callbacks.load_additional_fonts = ui.load_fonts
         params.callbacks.setup_imgui_style = self._workspace.style
-        params.callbacks.show_menus = lambda: layout.draw_menus(self.viewer)
+        params.callbacks.show_menus = lambda: menus.draw_menus(self.viewer)
         params.callbacks.post_init = self._start
         params.callbacks.pre_new_frame = self.keyboard.feed
         params.callbacks.show_gui = self._gui

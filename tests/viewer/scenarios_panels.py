@@ -21,7 +21,8 @@ from langsplat_viewer.actions import browsing, filming, opening, selecting, sett
 from langsplat_viewer.commands import COMMANDS
 from langsplat_viewer.files.preferences import with_recent
 from langsplat_viewer.files.projects import read_flight
-from langsplat_viewer.panels.layout import all_panels, button_label
+from langsplat_viewer.panels.layout import all_panels
+from langsplat_viewer.panels.menus import button_label
 from langsplat_viewer.panels.ui import scene_area
 from tests.support.fakes import CENTRES, PER_BLOB, as_trained, blob_scene, cameras, named_scene
 

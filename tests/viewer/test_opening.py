@@ -14,7 +14,7 @@ from langsplat_viewer.actions import browsing, editing, filming, opening, querie
 from langsplat_viewer.camera.controls import default_view, extent_of, orbit
 from langsplat_viewer.files.disk import MOST_LISTED, FolderEntry, Watch, list_folder, stamps
 from langsplat_viewer.options import say_compiling
-from langsplat_viewer.panels.scene import has_several
+from langsplat_viewer.panels.files import has_several
 from langsplat_viewer.rendering.request import UNCLIPPED, Clip
 from tests.support.fakes import blob_scene
 from tests.support.windowless import SCENES, act, ask, errors, go, open_scene, result, settle

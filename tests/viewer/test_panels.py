@@ -12,7 +12,7 @@ from langsplat_viewer import panels
 from langsplat_viewer.actions import queries, settings, viewpoint
 from langsplat_viewer.commands import COMMANDS, PANEL_TITLES, matching
 from langsplat_viewer.files import preferences
-from langsplat_viewer.panels import layout, ui
+from langsplat_viewer.panels import menus, ui
 from langsplat_viewer.panels.layout import all_panels
 from langsplat_viewer.panels.navigation import chord
 from langsplat_viewer.panels.ui import elided
@@ -216,7 +216,7 @@ def test_a_system_without_fonts_is_no_error(monkeypatch, platform):
 
 @pytest.mark.parametrize(("room", "columns"), [(1000.0, 1), (125.0, 2), (60.0, 3), (10.0, 6)])
 def test_buttons_of_the_toolbar_stay_apart_and_inside(room, columns):
-    places = layout.toolbar_places([1, 3, 2], room, 20.0, 5.0)
+    places = menus.toolbar_places([1, 3, 2], room, 20.0, 5.0)
     assert len(set(places)) == 6
     assert len({x for x, _ in places}) == columns
     assert all(y + 20 <= max(room, 20) for _, y in places)

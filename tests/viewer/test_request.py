@@ -20,8 +20,8 @@ from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.commands import BUTTONS, COMMANDS, OVERLAY_TITLES, matching
 from langsplat_viewer.files.preferences import FILE_NAME, load_preferences, save_preferences
 from langsplat_viewer.marks import Marks
+from langsplat_viewer.panels.display import compared_name
 from langsplat_viewer.panels.overlays import STEPS, bar_colours
-from langsplat_viewer.panels.view import compared_name
 from langsplat_viewer.rendering.renderer import ArrayRenderer, GlRenderer, Inputs
 from langsplat_viewer.rendering.request import (
     AT_RANGE,
@@ -110,7 +110,7 @@ def test_screen_file_film_and_reference_agree(gl, opened, tmp_path, mode, backen
     filming.set_turning(opened, True)
     filming.set_path_seconds(opened, 1.0)
     opened.state.record.fps = 2.0
-    opened.state.record.film_typed = "film"
+    opened.state.record.film_file = "film"
     filming.save_film(opened, tmp_path)
     recorded(opened)
     images["film"] = image(tmp_path / "film" / output.frame_name(0))

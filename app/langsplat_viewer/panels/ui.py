@@ -343,6 +343,25 @@ def fitting(width_em: float, height_em: float) -> ImVec2:
     return ImVec2(min(size.x, MOST_OVER * room.x), min(size.y, MOST_OVER * room.y))
 
 
+def ask_for_popup(title: str, is_wanted: bool) -> None:
+    """Have the popup `title` opened in the middle of the window, if it `is_wanted` and not open."""
+    if is_wanted and not imgui.is_popup_open(title):
+        imgui.open_popup(title)
+    centre = imgui.get_main_viewport().get_center()
+    imgui.set_next_window_pos(centre, imgui.Cond_.appearing, ImVec2(0.5, 0.5))
+
+
+UNITS = ("bytes", "kB", "MB", "GB", "TB")
+
+
+def in_words(size: float) -> str:
+    """Bytes as people read them: "1.4 MB"."""
+    unit = 0
+    while size >= 1000 and unit + 1 < len(UNITS):
+        size, unit = size / 1000, unit + 1
+    return f"{size:.0f} {UNITS[unit]}" if unit == 0 or size >= 100 else f"{size:.1f} {UNITS[unit]}"
+
+
 def elided(text: str, room: float, width_of: Callable[[str], float] = width_of) -> str:
     """Return `text` in one line, cut with "..." where it is wider than `room`."""
     text = " ".join(text.splitlines())

@@ -1,0 +1,236 @@
+"""What is made from the table of commands: menus, toolbar, palette of commands and help."""
+
+from collections.abc import Sequence
+from itertools import groupby
+from pathlib import Path
+
+from imgui_bundle import ImVec2, ImVec4, hello_imgui, icons_fontawesome_6, imgui
+
+from langsplat_core import __version__
+from langsplat_viewer.actions import browsing, settings
+from langsplat_viewer.commands import COMMANDS, HELD, LETTERS_MENU, MENUS, Command, in_menu, matching
+from langsplat_viewer.panels import ui
+from langsplat_viewer.viewer import Viewer
+
+
+def draw_menus(viewer: Viewer) -> None:
+    for menu in MENUS:
+        if imgui.begin_menu(menu):
+            first, *others = in_menu(menu)
+            _items(viewer, [first])
+            if menu == "File":
+                _recent(viewer)
+            _items(viewer, others)
+            if menu == "Window":
+                _panels()
+                if imgui.begin_menu(LETTERS_MENU):
+                    _items(viewer, in_menu(LETTERS_MENU))
+                    imgui.end_menu()
+            imgui.end_menu()
+
+
+def _items(viewer: Viewer, commands: list[Command]) -> None:
+    for command in commands:
+        if command.apart:
+            imgui.separator()
+        title = command.does[0].upper() + command.does[1:]
+        is_on = command.is_on is not None and command.is_on(viewer)
+        if imgui.menu_item(title, ", ".join(command.keys[:1]), is_on)[0]:
+            command.act(viewer)
+
+
+def _recent(viewer: Viewer) -> None:
+    recent = viewer.state.preferences.recent
+    if imgui.begin_menu("Open recent", bool(recent)):
+        for number, path in enumerate(recent):
+            name = Path(path)
+            if imgui.menu_item(f"{name.parent.name}/{name.name}##{number}", "", False)[0]:
+                browsing.open_recent(viewer, path)
+            if imgui.is_item_hovered():
+                imgui.set_tooltip(path)
+        imgui.end_menu()
+
+
+def _panels() -> None:
+    imgui.separator()
+    docking = hello_imgui.get_runner_params().docking_params
+    for window in docking.dockable_windows:
+        _, window.is_visible = imgui.menu_item(window.label, "", window.is_visible)
+    imgui.separator()
+
+
+# The toolbar: commands that have an icon, in a strip at the left edge of the scene.
+
+GROUPS = [list(group) for _, group in groupby((c for c in COMMANDS if c.icon), lambda c: c.menu)]
+SIDE_EM, GROUP_GAP_EM, MARGIN_EM = 1.75, 0.3, 0.3  # of a button, between groups, around them
+OPACITY = 0.95  # of a button
+MOST_OF_SCENE = 0.4  # of the scene's width
+
+
+def draw_toolbar(viewer: Viewer, area: ui.Area) -> None:
+    """A column of buttons between the titles of images and what is written at their foot, further ones where
+    the scene is low; none where it is too narrow for them."""
+    if viewer.state.scene is None or not viewer.state.show_panel:
+        return
+    side, gap, margin = (float(hello_imgui.em_size(size)) for size in (SIDE_EM, GROUP_GAP_EM, MARGIN_EM))
+    top = area.top + side
+    places = toolbar_places([len(group) for group in GROUPS], area.height - 2 * side - 2 * margin, side, gap)
+    width, height = (max(place[axis] for place in places) + side + 2 * margin for axis in (0, 1))
+    if width > MOST_OF_SCENE * area.width:
+        return
+    imgui.set_next_window_pos(ImVec2(area.left, top))
+    imgui.set_next_window_size(ImVec2(width, height))
+    imgui.set_next_window_bg_alpha(0.0)
+    imgui.push_style_var(imgui.StyleVar_.window_padding, ImVec2(margin, margin))
+    imgui.begin("toolbar", None, ui.OVER | ui.FIXED)
+    for command, (x, y) in zip((c for group in GROUPS for c in group), places, strict=True):
+        imgui.set_cursor_pos(ImVec2(margin + x, margin + y))
+        _tool_button(viewer, command, side)
+    imgui.end()
+    imgui.pop_style_var()
+
+
+def toolbar_places(sizes: list[int], room: float, side: float, gap: float) -> list[tuple[float, float]]:
+    """Places (x, y) of the buttons of groups of `sizes`, in columns not higher than `room`; a group begins a
+    new column where it does not fit into the rest of the last one."""
+    places: list[tuple[float, float]] = []
+    x = y = 0.0
+    for size in sizes:
+        if places and y + size * side > room:
+            x, y = x + side, 0.0
+        for _ in range(size):
+            if y and y + side > room:
+                x, y = x + side, 0.0
+            places.append((x, y))
+            y += side
+        y += gap
+    return places
+
+
+def _tool_button(viewer: Viewer, command: Command, side: float) -> None:
+    lit = command.is_on is not None and command.is_on(viewer)
+    colour = imgui.get_style_color_vec4(imgui.Col_.button_active if lit else imgui.Col_.window_bg)
+    imgui.push_style_color(imgui.Col_.button, ImVec4(colour.x, colour.y, colour.z, OPACITY))
+    if imgui.button(button_label(command), ImVec2(side, side)):
+        command.act(viewer)
+    imgui.pop_style_color()
+    keys = f" ({command.keys[0]})" if command.keys else ""
+    ui.tip(command.does[0].upper() + command.does[1:] + keys)
+
+
+def button_label(command: Command) -> str:
+    """Return the label of a command's button: its icon, and an id that no other command has."""
+    return f"{getattr(icons_fontawesome_6, f'ICON_FA_{command.icon}')}##{command.does}"
+
+
+# The command palette: the project's own, since that of imgui-bundle shows no keys, sorts by name and does not
+# grow with the text.
+
+WIDTH_EM, HEIGHT_EM = 26.0, 20.0
+GAP_EM = 0.6  # from the keys to the scrollbar
+
+
+def draw_palette(viewer: Viewer) -> None:
+    """Draw the palette: a box and the commands that match; Enter does the first, Esc closes."""
+    if not viewer.state.show_palette:
+        return
+    top = imgui.get_main_viewport().get_center()
+    imgui.set_next_window_pos(ImVec2(top.x, 0.15 * top.y), imgui.Cond_.always, ImVec2(0.5, 0))
+    imgui.set_next_window_size(ui.fitting(WIDTH_EM, HEIGHT_EM))
+    imgui.set_next_window_bg_alpha(1.0)
+    flags = imgui.WindowFlags_.no_title_bar | imgui.WindowFlags_.no_resize | imgui.WindowFlags_.no_collapse
+    imgui.begin("Commands", None, flags)
+    if imgui.is_window_appearing():
+        viewer.state.drafts.pop("##command", None)
+        imgui.set_keyboard_focus_here()
+    drafts = viewer.state.drafts
+    entered, typed = ui.box("##command", "what to do", drafts.get("##command", ""))
+    typing, drafts["##command"] = imgui.is_item_active(), typed
+    found = matching(typed, viewer.state.preferences.recent)
+    chosen = found[0] if entered and found else _clicked(found, typing)
+    left = not imgui.is_window_focused(imgui.FocusedFlags_.root_and_child_windows)
+    escaped = imgui.is_key_pressed(imgui.Key.escape)
+    imgui.end()
+    if chosen is not None or escaped or (left and not imgui.is_window_appearing()):
+        settings.show_palette(viewer, False)
+    if chosen is not None:
+        chosen.act(viewer)
+
+
+def _clicked(found: list[Command], typing: bool) -> Command | None:
+    """The list; the command that was clicked, or chosen by the arrows and Enter."""
+    chosen = None
+    if imgui.begin_child("found", child_flags=imgui.ChildFlags_.nav_flattened):
+        if not found:
+            imgui.text_colored(ui.muted(), "no command has these words")
+        right = imgui.get_content_region_avail().x - hello_imgui.em_size(GAP_EM)
+        for place, command in enumerate(found):  # Enter does the one that is lit
+            if imgui.selectable(command.does, place == 0 and typing)[0]:
+                chosen = command
+            keys = ", ".join(command.keys)
+            imgui.same_line(right - imgui.calc_text_size(keys).x)
+            imgui.text_colored(ui.muted(), keys)
+    imgui.end_child()
+    return chosen
+
+
+# Help: first steps, and the list of keys.
+
+KEYS_EM, DOES_EM = 13.0, 26.0  # widths of the columns
+FIRST_STEPS = (
+    ("Look", "Drag turns the view, the right button moves it, the wheel goes nearer; double click what to "
+     "turn around. R leads back."),
+    ("Search", "Type into the box and press Enter: 'red mug', 'handle of the mug', 'book on the table', "
+     "'three books', 'toy, not teddy bear'. Tab completes, arrow up recalls."),
+    ("What is here", "The panel Outline, in the menu Window, lists what the scene holds; a right click on a "
+     "thing names it, hides it, or finds more like it."),
+    ("Found, weak match, not here", "What the scene says of a phrase. Only what may be there is painted, "
+     "and a weak match no hotter than half."),
+    ("Relevancy", "From 0 to 1: how much nearer a place is to the phrase than to the everyday words under "
+     "'Compared with'; 0.5 is neither. The answer 'ends at' a relevancy: what has less is no part of it. The "
+     "slider moves that end, Auto gives the answer's own back."),
+    ("Subpart, part, whole", "How finely things are divided: the handle, the cup, the cup with its saucer. "
+     "'auto' takes the level that answers best."),
+    ("Displays", "The strip at the left edge: colours, depth, heat map, segmentation, the latent language "
+     "field as colours, the tree of parts; two side by side."),
+    ("Select", "Click a thing with the pointing hand, draw around it, or take what the search found; then "
+     "hide, name, measure, move or save it."),
+    ("Everything else", "Ctrl + Shift + P finds every command by its words. Without a mouse: Ctrl + Tab goes "
+     "to the next panel, Tab and arrows travel in it."),
+)  # fmt: skip
+
+
+def draw_help(viewer: Viewer) -> None:
+    if not viewer.state.show_help:
+        return
+    flags = imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_collapse
+    area, room = ui.scene_area(), imgui.get_main_viewport().work_size
+    half = hello_imgui.em_size(KEYS_EM + DOES_EM + 4) / 2
+    centre = ImVec2(min(area.left + area.width / 2, room.x - half), area.top + area.height / 2)
+    imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(room.x, ui.MOST_OVER * room.y))
+    imgui.set_next_window_pos(centre, imgui.Cond_.always, ImVec2(0.5, 0.5))
+    imgui.set_next_window_bg_alpha(1.0)
+    _, still_open = imgui.begin("Help", True, flags)
+    settings.put(viewer.state, show_help=bool(still_open))
+    imgui.text_disabled(f"LangSplat viewer {__version__}; documentation: docs/README.md of its source")
+    if imgui.begin_tab_bar("pages"):
+        keys = [(", ".join(command.keys), command.does) for command in COMMANDS if command.keys]
+        for title, rows in (("First steps", FIRST_STEPS), ("Keys", (*HELD, *keys))):
+            if imgui.begin_tab_item(title)[0]:
+                _table(rows)
+                imgui.end_tab_item()
+        imgui.end_tab_bar()
+    imgui.end()
+
+
+def _table(rows: Sequence[tuple[str, str]]) -> None:
+    if imgui.begin_table("rows", 2):
+        imgui.table_setup_column("what", imgui.TableColumnFlags_.width_fixed, hello_imgui.em_size(KEYS_EM))
+        imgui.table_setup_column("does", imgui.TableColumnFlags_.width_fixed, hello_imgui.em_size(DOES_EM))
+        for what, does in rows:
+            imgui.table_next_row()
+            imgui.table_next_column()
+            imgui.text_unformatted(what)
+            imgui.table_next_column()
+            ui.small_wrapped(does, ui.muted())
+        imgui.end_table()
