@@ -97,9 +97,9 @@ def _theme(theme: Theme) -> Command:
     )
 
 
-def _letters(scale: float) -> Command:
+def _text_size(scale: float) -> Command:
     return Command(
-        f"letters of {100 * scale:.0f} %",
+        f"text size {100 * scale:.0f} %",
         lambda viewer: settings.prefer(viewer, ui_scale=scale),
         is_on=lambda viewer: abs(viewer.state.preferences.ui_scale - scale) < 1e-6,
     )
@@ -160,7 +160,7 @@ PANEL_TITLES = (
     *("Train", "Record", "Bookmarks", "Messages", "Overlays", "Notes", "Timing"),
     *registry.references("panels"),
 )
-LETTERS_MENU = "Size of letters"  # in the menu Window
+TEXT_SIZE_MENU = "Text size"  # in the menu Window
 TOOL_ICONS: dict[Tool, str] = {
     "thing": "HAND_POINTER",
     "rectangle": "VECTOR_SQUARE",
@@ -285,7 +285,7 @@ BY_MENU: dict[str, tuple[Command, ...]] = {
         Command("previous training camera", lambda v: viewpoint.step_camera(v, -1), (",",), True, apart=True),
         Command("next training camera", lambda v: viewpoint.step_camera(v, 1), (".",), True),
         Command("level the horizon", lambda viewer: viewpoint.move(viewer, level), apart=True),
-        Command("take the picture's up as the world's", lambda viewer: viewpoint.move(viewer, adopt_up)),
+        Command("align the up axis with the picture", lambda viewer: viewpoint.move(viewer, adopt_up)),
         *(_side(side, key) for side, key in SIDE_KEYS),
         Command("orthographic view, and back", viewpoint.toggle_orthographic, ("O", "Keypad5"), apart=True),
         Command(
@@ -299,10 +299,10 @@ BY_MENU: dict[str, tuple[Command, ...]] = {
     ),
     "Window": (
         Command("hide or show the panels", settings.toggle_panel, ("F11",)),
-        Command("panels as at first", settings.reset_panels, apart=True),
+        Command("reset the layout", settings.reset_panels, apart=True),
         *(_theme(theme) for theme in THEMES),
     ),
-    LETTERS_MENU: tuple(_letters(scale) for scale in UI_SCALES),
+    TEXT_SIZE_MENU: tuple(_text_size(scale) for scale in UI_SCALES),
     "": tuple(_panel(title) for title in PANEL_TITLES),
     "Help": (
         Command("find a command", settings.toggle_palette, ("Ctrl+Shift+P",)),

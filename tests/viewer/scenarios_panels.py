@@ -435,7 +435,7 @@ def arrange_panels(s: Any) -> None:
     s.type("mug", frames=3)
     assert s.state.drafts["##phrase"] == "mug"  # the panel is open again, and its box has the keyboard
     s.key("escape", frames=1)
-    s.menu("Window", "Panels as at first")
+    s.menu("Window", "Reset the layout")
     for title in ("Scene", "Display", "Camera", "Messages"):
         if not s.ctx.item_exists(f"//{title}"):
             s.menu("Window", title)
@@ -486,7 +486,7 @@ def travel_by_keys(s: Any) -> None:
     assert s.state.show_panel
     for words, done in (
         ("light theme", lambda: s.state.preferences.theme == "light"),
-        ("letters of 125", lambda: s.state.preferences.ui_scale == 1.25),
+        ("text size 125", lambda: s.state.preferences.ui_scale == 1.25),
         ("open plain", lambda: s.state.path.name == "plain.ply"),
     ):
         if words == "open plain":

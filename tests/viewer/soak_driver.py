@@ -38,7 +38,7 @@ MARKS = (10, *range(20, 101, 20))  # after so many scenes it is said what is hel
 PHRASES = ("mug", "book", "plant", "mug or plant", "book, plant", "sofa", "mug left of plant")
 # These wait for a person, draw for minutes, or end it.
 LEFT_OUT = ("save a film of the path", "quit")
-TOO_LARGE = ("letters of 250 %", "letters of 300 %")  # for the window
+TOO_LARGE = ("text size 250 %", "text size 300 %")  # for the window
 MOST_NAMES = 20_000  # of OpenGL objects that are looked at; drivers give the lowest that is free
 
 

@@ -347,7 +347,7 @@ def test_overlays_and_colour_map_have_commands_and_are_remembered(opened, tmp_pa
     settings.toggle_overlay(opened, "cube")
     assert opened.state.session.overlays == tuple(name for name in OVERLAYS if name != "cube")
     (tmp_path / FILE_NAME).write_text('{"colour_map": "rainbow"}')
-    with pytest.raises(InputError, match=r"rainbow.*viridis"):
+    with pytest.raises(InputError, match="rainbow"):
         load_preferences(tmp_path)
 
 

@@ -31,7 +31,7 @@ def draw(viewer: Viewer) -> None:
         picture = replace(picture, heat_opacity=ui.slider("Heat opacity", picture.heat_opacity, (0.0, 1.0)))
         picture = replace(picture, heat_scale=_heat_scale(viewer))
     if needs_query:
-        picture = replace(picture, dim=ui.slider("Rest dimmed to", picture.dim, (0.0, 1.0)))
+        picture = replace(picture, dim=ui.slider("Background brightness", picture.dim, (0.0, 1.0)))
     if any(pane.row.uses_map for pane in viewer.state.panes()):
         names = list(COLOUR_MAPS)
         ui.leave_room("Colour map", WIDTH_EM)
@@ -112,8 +112,8 @@ def _compared(viewer: Viewer) -> None:
     shown = {"off": "nothing", "levels": "three levels", "wipe": compared_name(second)}.get(split.mode, "")
     if viewer.beside is not None and viewer.beside.state.path is not None:
         shown = viewer.beside.state.path.name
-    ui.leave_room("Beside it", WIDTH_EM)
-    if not imgui.begin_combo("Beside it", shown):
+    ui.leave_room("Compare with", WIDTH_EM)
+    if not imgui.begin_combo("Compare with", shown):
         return
     if imgui.selectable("nothing", split.mode == "off")[0]:
         settings.set_split(viewer, "off")

@@ -8,7 +8,7 @@ from imgui_bundle import ImVec2, ImVec4, hello_imgui, icons_fontawesome_6, imgui
 
 from langsplat_core import __version__
 from langsplat_viewer.actions import browsing, settings
-from langsplat_viewer.commands import COMMANDS, HELD, LETTERS_MENU, MENUS, Command, in_menu, matching
+from langsplat_viewer.commands import COMMANDS, HELD, MENUS, TEXT_SIZE_MENU, Command, in_menu, matching
 from langsplat_viewer.panels import ui
 from langsplat_viewer.viewer import Viewer
 
@@ -23,8 +23,8 @@ def draw_menus(viewer: Viewer) -> None:
             _items(viewer, others)
             if menu == "Window":
                 _panels()
-                if imgui.begin_menu(LETTERS_MENU):
-                    _items(viewer, in_menu(LETTERS_MENU))
+                if imgui.begin_menu(TEXT_SIZE_MENU):
+                    _items(viewer, in_menu(TEXT_SIZE_MENU))
                     imgui.end_menu()
             imgui.end_menu()
 
@@ -187,7 +187,7 @@ FIRST_STEPS = (
     ("Found, weak match, not here", "What the scene says of a phrase. Only what may be there is painted, "
      "and a weak match no hotter than half."),
     ("Relevancy", "From 0 to 1: how much nearer a place is to the phrase than to the everyday words under "
-     "'Compared with'; 0.5 is neither. The answer 'ends at' a relevancy: what has less is no part of it. The "
+     "'Compared with'; 0.5 is neither. Its 'threshold' is a relevancy: what has less is no part of it. The "
      "slider moves that end, Auto gives the answer's own back."),
     ("Subpart, part, whole", "How finely things are divided: the handle, the cup, the cup with its saucer. "
      "'auto' takes the level that answers best."),

@@ -98,7 +98,7 @@ def _cut(viewer: Viewer, query: Query, result: QueryResult) -> None:
     imgui.get_window_draw_list().add_line(ImVec2(x, corner.y), ImVec2(x, corner.y + size.y), colour, 2.0)
     own = result.own_cut is not None
     imgui.set_next_item_width(ui.beside_button("Auto") if own else -1)
-    changed, value = imgui.slider_float("##cut", result.cut, low, high, "ends at %.3f")
+    changed, value = imgui.slider_float("##cut", result.cut, low, high, "threshold %.3f")
     ui.tip(
         "What is less relevant than this is no part of the answer; one set by hand stays, whatever the level"
     )
@@ -194,7 +194,7 @@ def _verdict(viewer: Viewer, query: Query) -> None:
     if answer.pending:
         imgui.text_colored(ui.muted(), "...")
     elif answer.problem:
-        imgui.text_colored(ui.bad(), "not asked")
+        imgui.text_colored(ui.bad(), "unknown")
     elif result is not None:
         imgui.text_colored(ui.good() if result.found else ui.muted(), result.verdict)
         probability = result.probability

@@ -29,7 +29,7 @@ def draw_camera(viewer: Viewer) -> None:
         viewpoint.frame_scene(viewer)
     if ui.button("Horizon", "Turn the picture until the horizon is level"):
         viewpoint.move(viewer, level)
-    if ui.next_button("Up is up", "Take what is up in the picture as the world's up"):
+    if ui.next_button("Align up", "Take the picture's up as the world's up axis"):
         viewpoint.move(viewer, adopt_up)
     if state.view is not None:
         _projection(viewer, state.view)
