@@ -44,7 +44,7 @@ def small_package(folder: Path) -> Path:
 
 
 @pytest.mark.long
-def test_processes_that_begin_at_once_compile_once_and_see_a_change_in_another_files_helper(
+def test_processes_compile_once_and_notice_changed_helpers(
     tmp_path: Path,
 ) -> None:
     package = small_package(tmp_path)
@@ -64,7 +64,7 @@ def test_processes_that_begin_at_once_compile_once_and_see_a_change_in_another_f
     assert len(list(package.rglob("*.nbc"))) == 1  # the code of the older sources is gone
 
 
-def test_the_key_follows_imports_and_nothing_else(tmp_path: Path) -> None:
+def test_digest_follows_the_imports_of_a_kernel(tmp_path: Path) -> None:
     lonely = tmp_path / "lonely.py"
     lonely.write_text("import numpy\n")
     before = digest_of_sources(lonely)
@@ -77,7 +77,7 @@ def test_the_key_follows_imports_and_nothing_else(tmp_path: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("home", ["/proc", "closed"])
-def test_without_a_place_to_keep_them_kernels_are_compiled_for_the_run(home: str, tmp_path: Path) -> None:
+def test_kernels_compile_without_a_writable_folder(home: str, tmp_path: Path) -> None:
     """With neither the package's folder nor a home to write to."""
     package, closed = small_package(tmp_path), tmp_path / "closed"
     closed.mkdir()
@@ -111,7 +111,7 @@ def test_pieces_cover_a_range_once() -> None:
         assert (out == 1).all()
 
 
-def test_a_full_disk_keeps_no_machine_code_and_stops_nothing(
+def test_kernels_run_on_a_full_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))

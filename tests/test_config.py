@@ -61,9 +61,7 @@ def shaped(like: Any, value: Any) -> Any:
 
 
 @pytest.mark.parametrize(("name", "setting"), SETTINGS, ids=lambda part: getattr(part, "option", part))
-def test_every_number_has_a_range_outside_of_which_it_is_refused_by_name(
-    name: str, setting: config.Setting
-) -> None:
+def test_numbers_outside_their_range_are_refused_by_name(name: str, setting: config.Setting) -> None:
     assert setting.range is not None, f"{name}: write Annotated[..., Range(...)] beside {setting.option}"
     assert np.isfinite([setting.range.low, setting.range.high]).all()
     check_settings(CONFIGS[name]())
@@ -107,7 +105,7 @@ def test_the_command_line_names_the_option_as_typed(
     assert list(tmp_path.iterdir()) == []  # nothing was begun
 
 
-def test_python_is_refused_alike(tmp_path: Path) -> None:
+def test_python_callers_are_refused_alike(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^--codec\.batch "):
         train_scene(tmp_path / "absent", tmp_path / "s.ply", TrainConfig(codec=AutoencoderConfig(batch=1)))
     assert list(tmp_path.iterdir()) == []
@@ -122,7 +120,7 @@ class Sample:
     switch: bool = False
 
 
-def test_values_inside_pass_whatever_their_kind_and_a_field_without_a_range_is_seen() -> None:
+def test_values_inside_their_range_pass() -> None:
     found = {setting.option: setting.range for setting in numeric_settings(Sample())}
     assert found["--plain"] is None
     assert list(found) == ["--plain", "--length", "--pair"]
@@ -159,7 +157,7 @@ def test_every_spelling_of_an_option_takes_its_value_both_ways(name: str) -> Non
         assert trained(spelling, "0.002").config.codec.max_relevancy_error == 0.002
 
 
-def test_the_example_of_the_docs(tmp_path: Path) -> None:
+def test_the_example_of_the_docs_is_read(tmp_path: Path) -> None:
     (example,) = PAGE.read_text().split("```toml\n")[1:]
     found = trained(file=tmp_path / "train.toml", text=example.partition("```")[0])
     config = found.config
@@ -211,5 +209,7 @@ def test_a_file_that_cannot_be_used_is_named_with_its_key(
 
 
 @pytest.mark.parametrize("name", ["absent.toml", "."])
-def test_a_file_that_cannot_be_read(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unreadable_config_files_are_refused(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert str(tmp_path / name) in refusal(capsys, *WORDS, "--config", tmp_path / name)

@@ -78,7 +78,7 @@ def test_laps_of_one_name_are_summed():
     assert set(laps) == {"a", "b"}
 
 
-def test_a_device_is_waited_for_only_where_somebody_watches():
+def test_laps_wait_for_the_device_only_when_watched():
     with lap("a", lambda: pytest.fail("waited")):
         pass
     with watched() as laps, lap("a", lambda: time.sleep(0.01)):
@@ -96,7 +96,7 @@ def test_other_threads_are_not_watched():
     assert laps == {}
 
 
-def test_an_error_passes_and_the_watch_ends():
+def test_an_error_ends_the_watch():
     with pytest.raises(ValueError, match="oh"), watched(), lap("a"):
         raise ValueError("oh")
     with watched() as laps:
@@ -133,7 +133,7 @@ def test_bars_of_finished_stages_are_full(stopped: bool, capsys: pytest.CaptureF
     assert shares == (["100%", "30%"] if stopped else ["100%"] * 2)
 
 
-def test_a_part_reports_within_the_whole():
+def test_progress_of_a_part_stays_within_its_share():
     reports: list[Report] = []
     whole = Progress(reports.append)
     whole.part(1, 4)("inner", 0.5, "b", loss=1.0)

@@ -45,7 +45,7 @@ def channels(display: Display = "rgb", value: float = 0.9, alpha: float = 1.0) -
     return Channels(np.full((4, 5, 3), 0.5 * alpha), np.full((4, 5), alpha), extra)
 
 
-def test_the_table_has_exactly_the_displays_that_the_settings_know():
+def test_displays_are_those_of_the_settings():
     assert set(DISPLAYS) == set(get_args(Display))
     assert all(name == row.name for name, row in DISPLAYS.items())
     assert len({row.label for row in DISPLAYS.values()}) == len(DISPLAYS)
@@ -53,7 +53,7 @@ def test_the_table_has_exactly_the_displays_that_the_settings_know():
 
 
 @pytest.mark.parametrize(("channel", "ranges"), [(relevancies, heat_ranges), (members, member_ranges)])
-def test_nothing_is_painted_of_what_is_not_here(channel, ranges):
+def test_absent_answers_paint_nothing(channel, ranges):
     assert channel(Subject(360, answers=(ABSENT,))) is None
     values = channel(Subject(360, answers=(ABSENT, FOUND)))
     assert not values[:, 0].any()
@@ -69,7 +69,7 @@ def test_a_weak_match_is_never_hotter_than_half():
     assert member_ranges((FOUND, WEAK)) == ((0.0, 1.0), (0.0, 2.0))
 
 
-def test_a_heat_map_shows_relevancy_at_a_level_and_a_segmentation_members():
+def test_heat_shows_relevancy_and_segments_show_members():
     assert_allclose(members(Subject(360, answers=(FOUND,)))[:, 0], FOUND.members)
     for level, shown in ((None, 2), (0, 0), (1, 1)):
         got = relevancies(Subject(360, answers=(FOUND,), level=level))
@@ -107,7 +107,7 @@ def test_uncovered_pixels_are_never_relevant():
     assert (faint == dark).all()
 
 
-def test_heat_starts_at_the_lower_end_of_its_range_and_saturates_at_the_upper():
+def test_heat_spans_its_range():
     below = compose(channels("relevancy", 0.49), HEAT, RANGES)
     assert below[0, 0].tolist() == [round(255 * 0.5 * PICTURE.dim)] * 3
     assert_allclose(
@@ -133,13 +133,13 @@ def test_every_colour_map_that_can_be_chosen_has_a_table():
 
 
 @pytest.mark.parametrize("name", ["viridis", "cividis", "magma", "grey"])
-def test_what_is_hotter_is_brighter_where_colours_may_not_be_told_apart(name):
+def test_colour_maps_for_the_colour_blind_brighten(name):
     luminance = COLOUR_MAPS[name] / 255.0 @ (0.2126, 0.7152, 0.0722)
     assert (np.diff(luminance[::8]) > 0).all()
 
 
 @pytest.mark.parametrize("display", DISPLAYS)
-def test_a_transparent_picture_over_its_background_is_the_opaque_one(display):
+def test_transparent_images_over_a_background_are_opaque_ones(display):
     """Colours that are not premultiplied, as PNG has them: laid over a background they give what is drawn
     there, where the display draws the scene's own colours or latents."""
     picture = replace(PICTURE, display=display, background=(0.2, 0.5, 0.9))
@@ -176,7 +176,7 @@ def test_latent_colours_for_any_dimension(d):
     assert np.ptp(colours[:, :10]) > 0.5
 
 
-def test_nodes_have_colours_of_their_own_and_what_is_in_none_is_grey():
+def test_nodes_have_their_own_colours_and_others_are_grey():
     field = random_field(6)
     assert nodes(Subject(6, field, level=0)) is None  # keeps no tree
     tree = chain_of_levels(np.array([0, 1, 1, -1, 2, 0], np.int32))

@@ -49,7 +49,7 @@ def assert_same_picture(gaussians, camera, settings=INRIA, channels=3, atol=2e-5
 @pytest.mark.parametrize("channels", [1, 2, 5, 32, 40])
 @pytest.mark.parametrize("distance", [0.6, 3.0])  # 0.6: in the scene, Gaussians behind, beside and around
 @pytest.mark.parametrize("settings", [INRIA, GSPLAT])
-def test_pictures_are_the_references(channels, distance, settings):
+def test_images_equal_the_reference(channels, distance, settings):
     gaussians, camera = random_gaussians(150, 8 + channels), random_camera(8, distance=distance)
     assert assert_same_picture(gaussians, camera, settings, channels).max() > 0.1
 
@@ -83,7 +83,7 @@ def test_radii_are_positive_exactly_where_something_is_drawn():
     np.testing.assert_allclose(view.radii[view.radii > 0], extents[view.radii > 0], rtol=1e-5)
 
 
-def test_arrays_of_any_make():
+def test_arrays_of_any_type_and_layout_are_taken():
     """Doubles, strided and read-only arrays (as memory-mapped files give) mean the same."""
     gaussians, camera = random_gaussians(50, 26), random_camera(26)
     x = random_values(50, 3)
@@ -141,7 +141,7 @@ def test_memory_is_used_again_once_nothing_lies_in_it():
     assert memory.empty((40_000, 4), np.float64).ctypes.data == place
 
 
-def test_rows_are_sieved_by_their_sizes_without_a_trace():
+def test_culling_by_size_changes_no_image():
     """A second view knows the rows' sizes and leaves out what cannot be seen before it is projected."""
     gaussians, camera = random_gaussians(500, 31, radius=3.0), random_camera(31)
     turned = random_camera(32)
@@ -172,7 +172,7 @@ def test_depth_order_is_a_stable_sort():
 
 
 @pytest.mark.parametrize("degree", range(4))
-def test_colours_and_their_gradient(degree):
+def test_colours_and_gradients_equal_the_reference(degree):
     gaussians, eye = random_gaussians(200, 22, degree), np.array([0.3, -2.0, 0.5])
     gaussians = replace(gaussians, sh=2 * gaussians.sh)
     sh, means = gaussians.sh.astype(np.float64), gaussians.means.astype(np.float64)
@@ -245,7 +245,7 @@ MAPS = [
 
 @pytest.mark.parametrize("rasterizer", [CPU, REFERENCE], ids=["in one walk", "label by label"])
 @pytest.mark.parametrize("maps", MAPS)
-def test_weights_are_those_of_the_reference(maps: Array, rasterizer: LiftingRasterizer) -> None:
+def test_label_weights_equal_the_reference(maps: Array, rasterizer: LiftingRasterizer) -> None:
     count = int(maps.max()) + 1
     gaussians, camera = random_gaussians(60, 3), random_camera(1, maps.shape[2], maps.shape[1])
     got = rasterizer.view(gaussians, camera).gather_labels(maps, count)
@@ -257,7 +257,7 @@ def test_weights_are_those_of_the_reference(maps: Array, rasterizer: LiftingRast
     assert (got.data > 0).all()
 
 
-def test_no_labels_no_gaussians_and_none_in_sight():
+def test_empty_labels_and_scenes_have_no_weights():
     gaussians, camera = random_gaussians(20, 5), random_camera(3)
     view, some = CPU.view(gaussians, camera), label_maps(1)
     assert view.gather_labels(some * 0 - 1, 4).nnz == 0
@@ -267,7 +267,7 @@ def test_no_labels_no_gaussians_and_none_in_sight():
     assert CPU.view(behind, camera).gather_labels(some, 1).nnz == 0
 
 
-def test_light_pairs_are_left_out_and_rows_stay_in_place():
+def test_small_weights_are_left_out_and_rows_keep_their_place():
     broken, camera, maps = random_gaussians(80, 6), random_camera(4), label_maps(6)
     broken.means[7] = np.nan
     whole = CPU.view(broken, camera).gather_labels(maps, 6)

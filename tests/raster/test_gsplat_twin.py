@@ -32,7 +32,9 @@ SETTINGS = [INRIA, GSPLAT, replace(INRIA, antialiased=True), replace(INRIA, far=
 @pytest.mark.parametrize("settings", SETTINGS)
 @pytest.mark.parametrize("channels", [1, 3, 6, 35])  # as they are, padded, and in two chunks
 @pytest.mark.parametrize("orthographic", [False, True])
-def test_a_picture_is_the_references(settings: RasterSettings, channels: int, orthographic: bool) -> None:
+def test_images_of_cuda_equal_the_reference(
+    settings: RasterSettings, channels: int, orthographic: bool
+) -> None:
     gaussians, camera = random_gaussians(60, channels), random_camera(channels, 41, 30)
     camera = without_perspective(camera) if orthographic else camera
     values = np.random.default_rng(0).random((60, channels))
@@ -58,7 +60,7 @@ def test_gather_is_the_adjoint_and_contributions_its_sums() -> None:
     assert sums.max() > 1
 
 
-def test_masks_lift_as_on_the_cpu() -> None:
+def test_masks_lift_on_cuda_as_on_the_cpu() -> None:
     gaussians, views = random_gaussians(25, 3), make_views()
     settings = gsplat.drawn_settings(INRIA)
     on = {name: load_lifting_rasterizer(name) for name in ("cpu", "cuda")}
@@ -83,7 +85,7 @@ def gradients(
 
 @pytest.mark.parametrize(("degree", "orthographic"), [(0, False), (1, False), (3, False), (0, True)])
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_gradients_are_the_cpus(degree: int, orthographic: bool, antialiased: bool) -> None:
+def test_gradients_of_cuda_equal_the_cpus(degree: int, orthographic: bool, antialiased: bool) -> None:
     """Those through the directions of view too; a picture in which nothing lies at a cut-off."""
     settings = replace(gsplat.drawn_settings(INRIA), antialiased=antialiased)
     camera = random_camera(5, 41, 30)
@@ -109,7 +111,7 @@ def capture() -> Capture:
     return Capture(cameras, images, truth.means.astype(np.float64), np.full((60, 3), 128, np.uint8))
 
 
-def test_training_ends_where_the_cpus_does() -> None:
+def test_training_on_cuda_ends_where_the_cpu_does() -> None:
     config = RadianceConfig(
         steps=12, reference_steps=12, sh_degree=1, sh_degree_every=5, densify_from=3, densify_until=10,
         densify_every=4, max_gaussians=1_200,
@@ -123,7 +125,7 @@ def test_training_ends_where_the_cpus_does() -> None:
     assert min(scores) > 10
 
 
-def test_a_kernel_that_fails_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failing_kernel_is_reported_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object) -> None:
         raise RuntimeError("Error building extension 'gsplat_cuda'\nand a thousand lines")
 

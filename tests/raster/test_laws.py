@@ -68,7 +68,7 @@ def slow(request: pytest.FixtureRequest) -> bool:
 
 
 @pytest.mark.long
-def test_finite_and_between_0_and_1(backend: Backend, slow: bool) -> None:
+def test_images_are_finite_and_alpha_is_in_0_to_1(backend: Backend, slow: bool) -> None:
     """Values in [0, 1] give an image in [0, alpha], and the weights of a pixel add up to alpha."""
 
     def law(case: Drawn) -> None:
@@ -85,7 +85,7 @@ def test_finite_and_between_0_and_1(backend: Backend, slow: bool) -> None:
     over_random_cases(law, slow)
 
 
-def test_linear(backend: Backend, slow: bool) -> None:
+def test_splat_is_linear(backend: Backend, slow: bool) -> None:
     """W (2 x - 3 y) = 2 W x - 3 W y."""
     atol = {"reference": 1e-12, "opengl-half": 2.5e-2}.get(backend.name, 1e-5)
 
@@ -98,7 +98,7 @@ def test_linear(backend: Backend, slow: bool) -> None:
     over_random_cases(law, slow)
 
 
-def test_adjoint(backend: Backend, slow: bool) -> None:
+def test_gather_is_the_adjoint_of_splat(backend: Backend, slow: bool) -> None:
     """<W x, y> = <x, W^T y>."""
     if backend.name.startswith("opengl"):
         pytest.skip("it has no adjoint")
@@ -123,7 +123,7 @@ def off(seen: Seen) -> tuple[Array, Array]:
     return error, reference.cut_off_band(backend.band)
 
 
-def test_equal_to_the_reference(fast_backend: Backend, slow: bool) -> None:
+def test_images_and_depths_equal_the_reference(fast_backend: Backend, slow: bool) -> None:
     """Away from cut-offs, within the backend's promise."""
     flipped = pixels = 0
 
@@ -157,7 +157,7 @@ def test_gradients_are_finite(slow: bool) -> None:
     over_random_cases(law, slow)
 
 
-def test_without_perspective_a_step_along_the_view_changes_nothing(backend: Backend) -> None:
+def test_orthographic_images_ignore_steps_along_the_view(backend: Backend) -> None:
     """Colours that depend on the view too; a step moves no Gaussian behind the camera."""
     gaussians, camera = random_gaussians(60, 3, sh_degree=3), without_perspective(random_camera(5, 41, 30))
     step = np.eye(4)
@@ -271,13 +271,13 @@ def check_gradients(seen: Seen) -> None:
 
 
 @pytest.mark.parametrize("case", NAMED)
-def test_hard_case(case: Case, backend: Backend, measured: Measure) -> None:
+def test_hard_cases_equal_the_reference(case: Case, backend: Backend, measured: Measure) -> None:
     case.check(run_case(case, case.build(), backend, measured))
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("case", NAMED)
-def test_hard_case_antialiased(case: Case, backend: Backend, measured: Measure) -> None:
+def test_antialiased_hard_cases_equal_the_reference(case: Case, backend: Backend, measured: Measure) -> None:
     """What holds for every case, with Mip-Splatting's compensation."""
     drawing = case.build()
     settings = replace(drawing.settings, antialiased=True)
@@ -285,7 +285,7 @@ def test_hard_case_antialiased(case: Case, backend: Backend, measured: Measure) 
 
 
 @pytest.mark.parametrize("coefficient", [1e20, 1e10, 7e4])
-def test_colours_that_overflow(backend: Backend, coefficient: float) -> None:
+def test_colours_that_overflow_are_dropped(backend: Backend, coefficient: float) -> None:
     """Finite, 0 where they would be negative, and no gradient there."""
     drawing = altered("sh", ROW, coefficient * np.array([1.0, -1.0, 0.0]), sh_degree=3)
     sh, means, eye = drawing.gaussians.sh, drawing.gaussians.means, drawing.camera.position
@@ -309,7 +309,7 @@ def test_colours_that_overflow(backend: Backend, coefficient: float) -> None:
             np.testing.assert_allclose(image, reference, atol=1e-4 * want.max())
 
 
-def test_dropped_rows_are_told_by_reason() -> None:
+def test_dropped_rows_are_counted_by_reason() -> None:
     """One sentence per reason; a row with several faults counts once."""
     broken = crowd().gaussians
     broken.means[:2], broken.quats_wxyz[1:5], broken.opacity_logits[4:6] = np.nan, 0, np.nan
@@ -343,12 +343,12 @@ def test_results_do_not_depend_on_the_number_of_threads(case: Case) -> None:
 
 
 @pytest.mark.slow
-def test_huge_image(backend: Backend, measured: Measure) -> None:
+def test_huge_images_are_drawn(backend: Backend, measured: Measure) -> None:
     HUGE_IMAGE.check(run_case(HUGE_IMAGE, HUGE_IMAGE.build(), backend, measured))
 
 
 @pytest.mark.slow
-def test_more_intersections_than_an_int32_holds() -> None:
+def test_too_many_tile_intersections_are_refused() -> None:
     """17000 Gaussians that fill 129600 tiles each: one line, before any memory is asked for."""
     gaussians = balls(np.linspace(2.0, 3.0, 17_000), 0.1, 1e6)
     with pytest.raises(BackendError, match="smaller"):

@@ -98,7 +98,7 @@ def test_order_is_that_of_a_stable_sort(gl, sorter, name):
 @pytest.mark.parametrize(
     ("near", "far"), [(0.2, np.inf), (0.5, 0.75), (0.5, 0.5), (2.0, np.inf), (-1.0, 0.25)]
 )
-def test_what_is_cut_away_is_not_drawn(gl, sorter, near, far):
+def test_gaussians_beyond_near_and_far_are_not_drawn(gl, sorter, near, far):
     check_depths(gl, sorter, np.random.default_rng(1).integers(0, 9, 3000) / 8, near, far)
 
 
@@ -114,7 +114,7 @@ def test_depths_round_as_numpy_rounds_them(gl, sorter):
 
 
 @pytest.mark.long
-def test_a_million_points(gl, sorter):
+def test_a_million_points_are_sorted(gl, sorter):
     check_depths(gl, sorter, np.random.default_rng(2).normal(size=1_000_000).astype(np.float32), near=0.2)
 
 
@@ -127,7 +127,7 @@ def both(gl, sorter):
         rasterizer.release()
 
 
-def test_pictures_do_not_depend_on_who_sorts(gl, both):
+def test_images_do_not_depend_on_the_sorter(gl, both):
     first, second = random_gaussians(900, 1, sh_degree=1), random_gaussians(40, 2)
     twice = first.take(np.concatenate([np.arange(900), np.arange(900)[::-1]]))  # ties everywhere
     cases = [(first, random_camera(1)), (twice, random_camera(2)), (second, random_camera(1, distance=1.2))]
@@ -167,7 +167,7 @@ def refuse(*_: object) -> None:
     ("of", "name", "made"),
     [(SortBuffers, "order", lambda b: np.arange(b.count, dtype=np.int32)), (DepthSorter, "__init__", refuse)],
 )
-def test_a_driver_that_sorts_wrongly_or_cannot_compile_it_is_not_used(gl, monkeypatch, of, name, made):
+def test_a_driver_that_fails_at_sorting_is_not_used(gl, monkeypatch, of, name, made):
     monkeypatch.setattr(of, name, made)
     assert working_sorter(gl) is None
     with pytest.raises(BackendError, match="cannot sort"):
@@ -175,7 +175,7 @@ def test_a_driver_that_sorts_wrongly_or_cannot_compile_it_is_not_used(gl, monkey
 
 
 @pytest.mark.parametrize("software", [True, False])
-def test_a_software_driver_leaves_it_to_numpy(gl, sorter, monkeypatch, software):
+def test_numpy_sorts_on_a_software_driver(gl, sorter, monkeypatch, software):
     monkeypatch.setattr(scene_textures, "is_software", lambda _: software)
     found = chosen_sorter(gl, "auto")
     assert (found is None) == software
@@ -242,12 +242,12 @@ AGREEING = [
 
 
 @pytest.mark.parametrize("case", AGREEING)
-def test_pictures_are_the_references(gl, raster, case):
+def test_images_equal_the_reference(gl, raster, case):
     agree(raster, *case)
 
 
 @pytest.mark.parametrize("channels", [0, 1, 3, 4, 12, 13, 26])
-def test_any_number_of_channels(gl, raster, channels):
+def test_any_number_of_channels_is_splatted(gl, raster, channels):
     agree(raster, random_gaussians(40), random_camera(), channels=channels)
 
 
@@ -297,7 +297,7 @@ def test_median_depth_of_one_pixel(gl, raster):
         assert covered == pytest.approx(alpha[row, column], abs=1e-5)
 
 
-def test_in_place_of_a_median_image_stands_the_mean_where_half_is_stopped(gl, raster):
+def test_median_image_falls_back_to_the_mean(gl, raster):
     view = raster.view(random_gaussians(60), random_camera())
     _, alpha = view.splat(random_values(60, 1))
     np.testing.assert_array_equal(view.median_depth(), np.where(alpha >= 0.5, view.depth(), 0))
@@ -309,7 +309,7 @@ def test_an_image_beyond_the_driver_is_refused(gl, raster):
         raster.view(random_gaussians(3), camera)
 
 
-def test_a_context_that_is_not_current_is_one_line(gl_session, raster):
+def test_a_context_of_another_thread_is_reported_in_one_line(gl_session, raster):
     with gl_session:
         pass  # and none is current afterwards
     with pytest.raises(BackendError, match="not current"):
@@ -365,7 +365,7 @@ def test_opengl_4_1_is_enough_and_sorts_with_numpy(gl):
     assert run.stdout.split() == ["True", "None", "GL_NO_ERROR"], run.stderr
 
 
-def test_an_absent_driver_is_one_line(monkeypatch):
+def test_a_missing_driver_is_reported_in_one_line(monkeypatch):
     def fail(**_):
         raise Exception("libEGL.so not loaded")
 

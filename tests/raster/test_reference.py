@@ -127,7 +127,7 @@ def test_a_rigid_motion_of_world_and_camera_changes_nothing():
     np.testing.assert_allclose(RASTER.view(g, camera).splat(x)[0], image, atol=1e-12)
 
 
-def test_antialiasing_lowers_the_opacity_of_small_footprints_only():
+def test_antialiasing_fades_small_footprints_only():
     small, large = (
         RASTER.view(balls([3.0], [0.8], scale), AXIS, replace(INRIA, antialiased=True)).footprints
         for scale in (0.005, 2.0)

@@ -36,7 +36,7 @@ def test_the_example_in_the_docstring_runs():
 
 
 @either
-def test_a_picture_is_project_colours_and_splat(backend: str) -> None:
+def test_render_projects_colours_and_splats(backend: str) -> None:
     values = random_values(80, 2)
     picture = render(Scene(G), CAMERA, values, backend=backend)
     view = load_rasterizer("reference").view(G, CAMERA)
@@ -60,7 +60,7 @@ def test_the_scenes_antialiasing_and_the_profile_apply():
 
 
 @either
-def test_an_image_of_more_pixels_than_the_photographs_shows_what_they_showed(backend: str) -> None:
+def test_larger_images_show_what_photographs_showed(backend: str) -> None:
     """Gaussians thinner than a pixel are all dilation: an image four times as large has as much of it."""
     thin = replace(
         G, log_scales=np.full_like(G.log_scales, -9.0), sh=G.sh[:, :1], opacity_logits=G.opacity_logits + 9
@@ -81,7 +81,7 @@ def test_an_image_of_more_pixels_than_the_photographs_shows_what_they_showed(bac
 
 
 @pytest.mark.parametrize("factor", [1e-30, 1e-3, 0.1])
-def test_cameras_of_no_lens_do_not_spread_gaussians_over_the_image(factor: float) -> None:
+def test_impossible_focal_lengths_do_not_dilate(factor: float) -> None:
     wrong = replace(CAMERA, fx=CAMERA.fx * factor, fy=CAMERA.fy * factor)
     assert Scene(G, cameras=(wrong,)).raster_settings().focal is None
     settings = replace(INRIA, focal=wrong.fx)
@@ -106,7 +106,7 @@ def test_a_view_is_formed_as_the_scene_was_trained(backend):
     assert np.abs(drawn - rasterizer.view(G, camera).splat(x)[0]).max() > 0.01
 
 
-def test_what_cannot_draw_or_lift_is_said():
+def test_backends_that_cannot_draw_or_lift_are_refused():
     with pytest.raises(InputError, match="choose one of reference, cpu, opengl, cuda"):
         render(Scene(G), CAMERA, backend="vulkan")
     with pytest.raises(BackendError, match="--backend cpu"):
@@ -127,7 +127,9 @@ def test_every_public_name_is_there():
 # A camera may ask for any number of pixels: what memory cannot hold is refused before it is allocated.
 
 
-def test_a_camera_file_of_65536_x_65536(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_image_beyond_memory_is_refused_before_allocation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(protocol, "memory_bytes", lambda: 64e9)
     write_cameras(tmp_path / "view.json", (replace(random_camera(2), width=65_536, height=65_536),))
     (camera,) = read_cameras(tmp_path / "view.json")
@@ -150,7 +152,7 @@ def view_from(distance: float):
 @pytest.mark.parametrize("orthographic", [False, True])
 @pytest.mark.parametrize("distance", [3.0, 0.8])  # outside, and amid them: some behind, some at the edge
 @either
-def test_the_row_of_w(backend, distance, orthographic):
+def test_pixel_weights_are_a_row_of_w(backend, distance, orthographic):
     gaussians = random_gaussians(400, 3, scale_range=(0.005, 0.5))
     camera, rasterizer = view_from(distance), load_lifting_rasterizer(backend)
     camera = without_perspective(camera) if orthographic else camera
@@ -165,7 +167,7 @@ def test_the_row_of_w(backend, distance, orthographic):
         np.testing.assert_allclose(got, truth.gather(image)[:, 0], atol=2e-5)
 
 
-def test_few_are_projected_and_invalid_ones_are_not():
+def test_pixel_weights_project_few_and_no_invalid_rows():
     gaussians = random_gaussians(2000, 4, scale_range=(0.005, 0.02))
     broken = replace(gaussians, means=np.where(np.arange(2000)[:, None] == 5, np.nan, gaussians.means))
     seen = []

@@ -118,7 +118,7 @@ def test_points_in_the_image_are_told_apart() -> None:
     assert seen.tolist() == [True, True, False, False, False, False, False]
 
 
-def test_copies_become_one():
+def test_merge_joins_copies():
     """Exactly: same place, same shape, the opacity of all four one behind the other."""
     one = random_gaussians(1, sh_degree=1, scale_range=(0.1, 0.4))
     found = merged(replace(one.take(np.zeros(GROUP, int)), opacity_logits=logit(np.full(GROUP, 0.3))))
@@ -130,7 +130,7 @@ def test_copies_become_one():
     np.testing.assert_allclose(found.weights.toarray(), 1 / GROUP)
 
 
-def test_a_row_of_neighbours_becomes_a_longer_one():
+def test_merge_joins_neighbours_into_a_longer_one():
     """Mean and covariance are those of the mixture."""
     x = np.array([-0.12, -0.04, 0.04, 0.12])
     found = merged(balls(np.zeros(GROUP), 0.5, 0.2, x)).gaussians
@@ -140,7 +140,7 @@ def test_a_row_of_neighbours_becomes_a_longer_one():
     np.testing.assert_allclose(covariances(found)[0], expected, atol=1e-7)
 
 
-def test_what_lies_apart_is_left_as_it_is():
+def test_merge_keeps_distant_gaussians():
     apart = random_gaussians(81, scale_range=(1e-3, 2e-3))
     found = merged(apart)
     rows = found.weights.indices.reshape(-1, GROUP)[:, 0]
@@ -156,7 +156,7 @@ def dense() -> Gaussians:
     return replace(many, means=many.means + steps)
 
 
-def test_a_dense_scene_shrinks_and_looks_alike(dense):
+def test_merge_shrinks_a_dense_scene_that_looks_alike(dense):
     found = merged(dense)
     assert 1600 / GROUP <= len(found.gaussians) < 800
     assert found.gaussians.valid().all()
@@ -172,7 +172,7 @@ def test_a_dense_scene_shrinks_and_looks_alike(dense):
     assert sorted(entries.col[entries.data > 0]) == list(range(1600))  # every row counts once
 
 
-def test_blocks_do_not_show(dense, monkeypatch):
+def test_merge_does_not_depend_on_blocks(dense, monkeypatch):
     whole = merged(dense).gaussians
     monkeypatch.setattr("langsplat_core.scene.gaussians.BLOCK", 37)
     blocks = merged(dense).gaussians
@@ -181,7 +181,7 @@ def test_blocks_do_not_show(dense, monkeypatch):
         np.testing.assert_array_equal(getattr(whole, name), getattr(blocks, name))
 
 
-def test_what_cannot_be_drawn_is_left_out():
+def test_merge_leaves_out_invalid_rows():
     broken = random_gaussians(11)
     broken.means[3] = np.nan
     broken.quats_wxyz[7] = 0
@@ -191,14 +191,14 @@ def test_what_cannot_be_drawn_is_left_out():
 
 
 @pytest.mark.parametrize("count", [0, 1, 3, 4, 5])
-def test_any_number_of_gaussians(count):
+def test_merge_takes_any_number_of_gaussians(count):
     found = merged(random_gaussians(count))
     assert len(found.gaussians) == found.weights.shape[0] <= count
     values = found.values(np.ones((count, 2)))
     np.testing.assert_allclose(values, np.ones((len(found.gaussians), 2)), rtol=1e-6)
 
 
-def test_extremes_stay_drawable():
+def test_merged_extremes_are_drawable():
     """Flat axes, points, the largest scales and full opacity."""
     hard = random_gaussians(16)
     hard.log_scales[:4, 0] = -np.inf
@@ -211,7 +211,7 @@ def test_extremes_stay_drawable():
     assert found.gaussians.valid().all()
 
 
-def test_it_stops_when_told_to(dense):
+def test_merge_can_be_cancelled(dense):
     def stop(label: str, fraction: float) -> None:
         raise Cancelled
 
@@ -248,7 +248,7 @@ def test_quotes_and_punctuation_are_no_part_of_a_phrase(key, text):
          ["mug", "red book", "plate, not red plate", "the cup, but not my cup"]),
     ],
 )  # fmt: skip
-def test_phrases_in_a_line_are_separated_and_keep_capitals_and_commas(text, shown):
+def test_phrases_in_a_line_are_separated(text, shown):
     assert split_phrases(text) == shown
     if len(shown) == 1:
         assert tidy(text) == shown[0]
@@ -267,7 +267,7 @@ def test_a_tidy_phrase_stays_as_it_is(text):
 N = 20
 
 
-def test_a_probability_is_the_logistic_of_whole_and_the_better_finer_margin():
+def test_probability_is_the_logistic_of_two_margins():
     odds = Odds(-1.0, 18.0, 3.0)
     for fits in ((0.1, -0.2, 0.3), (-0.2, 0.1, 0.3), (-5.0, -4.0, -9.0)):
         logit = -1 + 18 * fits[2] + 3 * max(fits[:2])
@@ -317,12 +317,12 @@ def test_nodes_are_nested_sets():
         {"votes": np.zeros((7, 3), np.uint16)},
     ],
 )
-def test_what_is_no_tree_is_refused(changed):
+def test_malformed_trees_are_refused(changed):
     with pytest.raises((ValueError, TypeError)):
         replace(TREE, **changed)
 
 
-def test_a_field_has_a_leaf_for_every_gaussian_and_taking_rows_takes_them():
+def test_taking_rows_of_a_field_takes_their_leaves():
     with pytest.raises(ValueError, match="leaves"):
         replace(random_field(N), tree=TREE)
     field = replace(random_field(len(LEAVES)), tree=TREE)
@@ -390,7 +390,7 @@ def test_transforms_compose_and_lead_back():
     assert rotating(AXES["x"], -360).is_identity
 
 
-def test_a_quaternion_of_every_rotation():
+def test_every_rotation_has_its_quaternion():
     quats = unit(np.random.default_rng(5).normal(size=(300, 4)))
     for quat, matrix in zip(quats, rotation_matrices(quats), strict=True):
         np.testing.assert_allclose(rotation_quaternion(matrix), quat * np.sign(quat[0]), atol=1e-12)
@@ -422,7 +422,7 @@ def test_a_matrix_that_is_no_similarity_is_refused(matrix, reason: str) -> None:
         similarity(matrix)
 
 
-def test_numbers_that_leave_nothing_are_refused():
+def test_transforms_beyond_float32_are_refused():
     for make in (
         *(lambda factor=factor: scaling(factor) for factor in (0, -1, np.inf)),
         lambda: moving(np.array([np.nan, 0, 0])),
@@ -436,7 +436,7 @@ def test_numbers_that_leave_nothing_are_refused():
             make()
 
 
-def test_rows_that_cannot_be_drawn_stay_so():
+def test_invalid_rows_stay_invalid_when_transformed():
     """Zero quaternions, flat axes, places that are not finite: as they were, and no warning."""
     gaussians = random_gaussians(6, sh_degree=3)
     gaussians.quats_wxyz[0] = 0
@@ -450,7 +450,7 @@ def test_rows_that_cannot_be_drawn_stay_so():
     assert (moved.quats_wxyz[0] == 0).all()
 
 
-def test_companions_go_along():
+def test_cameras_and_scale_are_transformed_along():
     """The language field is the same object, cameras move, a metre stays a metre."""
     scene = Scene(random_gaussians(9), random_field(9), (random_camera(),), metres_per_unit=0.5)
     moved = transform_scene(replace(scene, extras={"age": np.arange(9.0)}), TO)
@@ -463,7 +463,7 @@ def test_companions_go_along():
 
 
 @pytest.mark.parametrize("chosen", [[], [4], range(9)])
-def test_a_part_moves_alone(chosen) -> None:
+def test_selected_gaussians_are_transformed_alone(chosen) -> None:
     gaussians, selected = random_gaussians(9, sh_degree=2), np.isin(np.arange(9), list(chosen))
     moved, whole = transform_rows(gaussians, selected, TO), transform_gaussians(gaussians, TO)
     assert_same(moved.take(~selected), gaussians.take(~selected))
