@@ -104,6 +104,30 @@ def test_elsewhere_keeps_the_rows_it_does_not_run(tmp_path: Path, monkeypatch: p
     assert "-n 2 --dist loadfile tests/a tests/b" in (tmp_path / "out" / "row1.txt").read_text()
 
 
+def test_seeded_faults_stand_once_in_their_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    module = script("seeded_bugs", monkeypatch)
+    faults = module.load_faults()
+    assert len(faults) == 40
+    assert [fault.name for fault in faults if fault.occurrences(module.ROOT) != 1] == []
+    tests = {module.ROOT / "tests" / name for fault in faults for name in fault.tests.split()}
+    assert [path for path in tests if not path.exists()] == []
+
+
+def test_sizes_fail_above_a_budget(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    module = script("sizes", monkeypatch)
+    monkeypatch.setattr(module, "ROOT", tmp_path)
+    subprocess.run(["git", "init", "--quiet", tmp_path], check=True)
+    (tmp_path / "a.py").write_text("1\n2\n3\n")
+    (tmp_path / "untracked.py").write_text("1\n")
+    subprocess.run(["git", "-C", tmp_path, "add", "a.py"], check=True)
+    for budget, code in ((3, 0), (2, 1)):
+        (tmp_path / "CONTRIBUTING.md").write_text(f"| room | `*.py` | {budget} lines |\n")
+        assert module.main() == code
+    assert "above its budget" in capsys.readouterr().out
+
+
 # `make gpu`.
 
 

@@ -53,6 +53,8 @@ def test_what_is_there_is_found_in_metres_and_what_is_not_is_said_so(folder):
     assert door.count("mug", "a.ply")["least"] >= 1
     apart = door.distance("mug", "book", "a.ply")
     assert 0 < apart["distance"] < 2 * np.linalg.norm(middle(0) - middle(1))
+    without_metres = door.distance("mug", "book", os.path.join("blind", "b.ply"))
+    assert apart["distance"] == pytest.approx(2 * without_metres["distance"])
     with pytest.raises(InputError, match=r"is not among these 2: a\.ply"):
         door.find("mug", "../a.ply")
     with pytest.raises(InputError, match="is not among these 2"):
