@@ -206,7 +206,9 @@ class Viewer:
     pivot: tuple[Scene, Array, Array] | None = None  # of what is selected in which scene, a point (3,)
     out_of_sight: tuple[OutlineView, Marks, Array] | None = None  # nodes with nothing shown, of which
     beside: "Viewer | None" = None  # of a second scene, seen and asked as this one is
-    followed: OrbitCamera | None = None  # the view of the first scene that this second one was given last
+    # view and session of the first scene that this second one was given last
+    followed: OrbitCamera | None = None
+    mirrored: Session | None = None
     surface: ShownImage | None = None
     training: Training | None = None  # under way
     clock: float = 0.0  # seconds, as of the last frame

@@ -466,6 +466,15 @@ def test_second_scene_follows_view_and_queries(two):
     assert [(query.phrase, query.slot) for query in other.session.queries] == [("mug", None)]
 
 
+def test_second_scene_encodes_canonical_phrases_once(two):
+    labels, submit = [], two.beside.worker.submit
+    two.beside.worker.submit = lambda label, *rest: labels.append(label) or submit(label, *rest)
+    act(queries.set_canonical, two, ("book",))
+    for _ in range(5):
+        opening.follow_beside(two)
+    assert labels.count("encoding canonical phrases") == 1
+
+
 def test_second_scene_without_field_shows_colours_or_says_why(two):
     for name in ("plain.ply", "broken.ply"):
         assert errors(two) == []

@@ -365,8 +365,11 @@ def follow_beside(viewer: Viewer) -> None:
         return
     if beside.followed is not state.view:
         other.view, beside.followed = linked(state.view, state.extent, other.extent), state.view
-    session = _mirrored(state, other)
-    if session != other.session:
+    session, before = _mirrored(state, other), beside.mirrored
+    if session != before:
+        beside.mirrored = session
+        if before is not None and before.canonical == session.canonical:  # the same are not encoded again
+            session = replace(session, canonical=other.session.canonical)
         take_session(beside, session)
 
 
