@@ -142,6 +142,18 @@ def test_training_learns_the_scene() -> None:
 
 
 @pytest.mark.long
+def test_reported_losses_are_means_over_shares_of_the_run() -> None:
+    reports: list[Report] = []
+    config = replace(SHORT, steps=400, max_gaussians=64, few_views=0, exposure="off", transients="off")
+    small = capture().shrunk(range(6), 12)
+    train_radiance(small, config, [0, 1], progress=Progress(reports.append))
+    losses = [report.metrics.get("loss") for report in reports]
+    assert losses[0] is None
+    assert losses[1:-1:2] == losses[2::2]  # a new one every other step: of 400 steps, each 200th
+    assert len(set(losses)) > 190
+
+
+@pytest.mark.long
 def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path: Path) -> None:
     straight_path, path = tmp_path / "straight.safetensors", tmp_path / "resumed.safetensors"
     straight = train_radiance(capture(), SHORT, [0, 1, 2], straight_path)
@@ -192,6 +204,13 @@ def test_empty_views_do_not_disturb_training() -> None:
     blind = replace(capture(), cameras=(away, *capture().cameras[1:]))
     trained = train_radiance(blind, replace(SHORT, steps=12), [0, 1])
     assert len(trained) > 100
+    assert trained.valid().all()
+
+
+def test_fully_masked_photographs_get_no_exposure() -> None:
+    nothing = np.zeros(SIZE[::-1], bool)
+    masked = replace(capture(), masks=(None, None, nothing, None, None, None))
+    trained = train_radiance(masked, replace(SHORT, steps=9, exposure="on"), [0, 1, 2])
     assert trained.valid().all()
 
 
