@@ -28,7 +28,7 @@ from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, QUERY_COLOURS
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query import grammar, taught
+from langsplat_core.query import nouns, taught
 from langsplat_core.query.engine import QueryEngine, TextEncoder, no_field
 from langsplat_core.query.instances import BOXED, oriented_box
 from langsplat_core.query.regions import place_of
@@ -227,7 +227,7 @@ def language_tables(
         "bars": bars,
         "calibration": None if engine.calibration is None else asdict(engine.calibration),
         "rule": RULE.as_json() | {"least_likeness": [-taught.HEAT, -1 / taught.UNIT]},
-        "grammar": _words_of_grammar(),
+        "grammar": _word_lists(),
         "examples": suggested.examples,
         "phrases": suggested.phrases,
     }
@@ -241,10 +241,10 @@ def language_tables(
     return numbers | words, tensors | own
 
 
-def _words_of_grammar() -> dict[str, list[str]]:
+def _word_lists() -> dict[str, list[str]]:
     """Return the word lists by which a part is told from a thing, sorted."""
     names = ("ARTICLES", "STOP_WORDS", "ADJECTIVES", "PARTS")
-    return {name.lower(): sorted(getattr(grammar, name)) for name in names}
+    return {name.lower(): sorted(getattr(nouns, name)) for name in names}
 
 
 def _region_tables(engine: QueryEngine) -> dict[str, Array]:

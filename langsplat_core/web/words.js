@@ -1,4 +1,4 @@
-// Phrases as they are written: the twin of scene/language.py and of the word lists of query/grammar.py.
+// Phrases as they are written: the twin of scene/language.py and of query/nouns.py.
 
 // [page]
 const APOSTROPHES = /[’‘ʼ′＇´`]/gu;
