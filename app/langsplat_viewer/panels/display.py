@@ -20,6 +20,7 @@ BACKDROPS = {(grey, grey, grey): name for name, grey in (("Black", 0.0), ("Grey"
 
 
 def draw(viewer: Viewer) -> None:
+    """Draw the panel "Display": what is shown, and how."""
     for _, group in groupby(DISPLAYS.values(), lambda row: row.name if row.by_level else row.needs_query):
         _display_line(viewer, tuple(group))
     _compared(viewer)
@@ -89,7 +90,7 @@ def _backdrop(background: tuple[float, float, float]) -> tuple[float, float, flo
 
 
 def _display_line(viewer: Viewer, rows: tuple[DisplayRow, ...]) -> None:
-    """Displays that need the same, beside each other; one that has several buttons is named before them."""
+    """Draw displays that need the same beside each other, named first where one has several buttons."""
     state = viewer.state
     buttons = [button for row in rows for button in buttons_of(row)]
     if len(buttons) > len(rows):

@@ -45,6 +45,7 @@ def draw_browser(viewer: Viewer) -> None:
 
 
 def has_several(listing: Listing) -> bool:
+    """Return whether the folder holds more than one scene."""
     return sum(entry.is_file and format_of(entry.path) is not None for entry in listing.entries) > 1
 
 

@@ -64,7 +64,7 @@ def all_panels() -> tuple[Panel, ...]:
 
 
 def params(viewer: Viewer, width: float) -> hello_imgui.DockingParams:
-    """The docks of a window `width` units wide, and the panels in them, for hello_imgui to draw."""
+    """Return the docks of a window `width` units wide, and the panels in them, for hello_imgui to draw."""
     docking = hello_imgui.DockingParams()
     share = min(COLUMN * viewer.state.preferences.ui_scale / width, MOST_SHARE)
     docking.docking_splits = [
@@ -126,7 +126,7 @@ class Column:
 
 
 def _column() -> imgui.internal.DockNode | None:
-    """The node of the docks beside the scene, as long as it lies there."""
+    """Return the node of the docks beside the scene, as long as it lies there."""
     docking = hello_imgui.get_runner_params().docking_params
     root = docking.dock_space_id_from_name(ui.MAIN_DOCK)
     node = imgui.internal.dock_builder_get_node(docking.dock_space_id_from_name(LEFT) or 0)
@@ -159,6 +159,7 @@ class Hiding:
 
 
 def draw_over(viewer: Viewer) -> None:
+    """Draw what lies over the scene: legends, tools, questions, the file browser, help and palette."""
     area = ui.scene_area()
     said = _said(viewer)
     if said:

@@ -14,6 +14,7 @@ from langsplat_viewer.viewer import Viewer
 
 
 def draw_menus(viewer: Viewer) -> None:
+    """Draw the menus, for hello_imgui."""
     for menu in MENUS:
         if imgui.begin_menu(menu):
             first, *others = in_menu(menu)
@@ -68,8 +69,11 @@ MOST_OF_SCENE = 0.4  # of the scene's width
 
 
 def draw_toolbar(viewer: Viewer, area: ui.Area) -> None:
-    """A column of buttons between the titles of images and what is written at their foot, further ones where
-    the scene is low; none where it is too narrow for them."""
+    """Draw a column of buttons over the scene's left edge.
+
+    It lies between the titles of images and what is written at their foot; there are further columns where
+    the scene is low, and none where it is too narrow for them.
+    """
     if viewer.state.scene is None or not viewer.state.show_panel:
         return
     side, gap, margin = (float(hello_imgui.em_size(size)) for size in (SIDE_EM, GROUP_GAP_EM, MARGIN_EM))
@@ -91,8 +95,10 @@ def draw_toolbar(viewer: Viewer, area: ui.Area) -> None:
 
 
 def toolbar_places(sizes: list[int], room: float, side: float, gap: float) -> list[tuple[float, float]]:
-    """Places (x, y) of the buttons of groups of `sizes`, in columns not higher than `room`; a group begins a
-    new column where it does not fit into the rest of the last one."""
+    """Return the places (x, y) of the buttons of groups of `sizes`, in columns not higher than `room`.
+
+    A group begins a new column where it does not fit into the rest of the last one.
+    """
     places: list[tuple[float, float]] = []
     x = y = 0.0
     for size in sizes:
@@ -158,7 +164,7 @@ def draw_palette(viewer: Viewer) -> None:
 
 
 def _clicked(found: list[Command], typing: bool) -> Command | None:
-    """The list; the command that was clicked, or chosen by the arrows and Enter."""
+    """Draw the list; return the command that was clicked, or chosen by the arrows and Enter."""
     chosen = None
     if imgui.begin_child("found", child_flags=imgui.ChildFlags_.nav_flattened):
         if not found:
@@ -201,6 +207,7 @@ FIRST_STEPS = (
 
 
 def draw_help(viewer: Viewer) -> None:
+    """Draw the help: first steps, and the list of keys."""
     if not viewer.state.show_help:
         return
     flags = imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_collapse

@@ -10,6 +10,7 @@ from langsplat_viewer.viewer import Viewer
 
 
 def draw_overlays(viewer: Viewer) -> None:
+    """Draw the panel "Overlays": what is drawn over the image, and the ruler."""
     state = viewer.state
     for name, title in OVERLAY_TITLES.items():
         if imgui.checkbox(title.capitalize(), name in state.session.overlays)[0]:

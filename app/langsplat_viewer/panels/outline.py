@@ -1,5 +1,4 @@
-"""The panel "Outline", the menu of a thing that is clicked with the right button, and the legend of displays
-that have a colour for each thing."""
+"""The panel "Outline", the menu of a thing that is clicked, and the legend of things in colours."""
 
 from typing import Any
 
@@ -169,7 +168,7 @@ def _swatch(colour: tuple[float, float, float], side: float) -> None:
 
 
 def _drop(viewer: Viewer, onto: int | NodeGroup) -> None:
-    """A row that is dropped here is grouped with this."""
+    """Group a row that is dropped on the last item with what that is."""
     if imgui.begin_drag_drop_target():
         payload = imgui.accept_drag_drop_payload_py_id(DRAGGED)
         if payload is not None:
@@ -218,7 +217,7 @@ def _things_menu(viewer: Viewer, target: Target) -> None:
 
 
 def _named(label: str, hint: str, text: str) -> str:
-    """A box for a name; the name once it is entered, else ""."""
+    """Draw a box for a name; return the name once it is entered, else ""."""
     entered, typed = ui.box(label, hint, text, hello_imgui.em_size(11))
     return typed.strip() if entered else ""
 

@@ -19,6 +19,7 @@ BAR = (
 
 
 def draw_changed(viewer: Viewer, area: ui.Area) -> None:
+    """Draw the bar of a file that has changed."""
     state = viewer.state
     if not viewer.watch.changed or state.path is None or state.opening is not None:
         return

@@ -31,7 +31,7 @@ def draw(viewer: Viewer) -> None:
 
 
 def _list(viewer: Viewer) -> None:
-    """The scenes to switch between; the folder is named too where two have one name."""
+    """Draw the scenes to switch between; the folder is named too where two have one name."""
     state = viewer.state
     imgui.separator_text("Scenes")
     if imgui.begin_child("scenes"):

@@ -113,7 +113,7 @@ def _cut(viewer: Viewer, query: Query, result: QueryResult) -> None:
 
 @lru_cache(maxsize=8)
 def histogram(result: QueryResult) -> tuple[float, float, Array]:
-    """The relevancies of an answer, as `marks.counted` has them."""
+    """Return the relevancies of an answer, as `marks.counted` has them."""
     return counted(result.even, 1e-3)
 
 
@@ -125,8 +125,10 @@ HIDDEN = (0.25, 0.25, 0.25)
 
 
 def _answers(viewer: Viewer) -> None:
-    """The list, newest first, which grows when something is asked and not when an answer arrives; and below
-    it the chosen query."""
+    """Draw the list, newest first, and below it the chosen query.
+
+    It grows when something is asked and not when an answer arrives.
+    """
     row = imgui.get_frame_height_with_spacing()
     listed = viewer.state.session.queries
     rows = rows_shown(len(listed), imgui.get_content_region_avail().y / row)
@@ -238,7 +240,7 @@ def _details(viewer: Viewer, query: Query) -> None:
 
 
 def _combine(viewer: Viewer, query: Query) -> None:
-    """A menu of the other queries, to search for what both, either or only this one finds."""
+    """Draw a menu of the other queries, to search for what both, either or only this one finds."""
     others = [other for other in viewer.state.session.queries if other.phrase != query.phrase]
     if ui.button(
         "Combine", "Search for this and, or, without another query of the list", enabled=bool(others)

@@ -141,7 +141,7 @@ HISTOGRAM_EM = 3.0
 
 
 def _values(viewer: Viewer) -> None:
-    """A histogram of a number that every Gaussian has; a drag over it selects those in its range."""
+    """Draw a histogram of a number that every Gaussian has; a drag over it selects those in its range."""
     if not imgui.collapsing_header("By numbers"):
         return
     tools = viewer.state.tools
@@ -222,7 +222,7 @@ def handle_stroke(viewer: Viewer, area: ui.Area) -> None:
 
 
 def held_mode() -> Mode | None:
-    """The mode that keys ask for; None: the one that is set."""
+    """Return the mode that keys ask for; None: the one that is set."""
     io = imgui.get_io()
     if io.key_shift and io.key_ctrl:
         return "intersect"
@@ -257,7 +257,7 @@ def _on_screen(line: Array, area: ui.Area) -> list[Any]:
 
 
 def _stripe(paint: Any, points: list[Any], radius: float) -> None:
-    """The way of the brush, as wide as it is; of a click a disk."""
+    """Draw the way of the brush, as wide as it is; of a click a disk."""
     if len(points) == 1:
         paint.add_circle_filled(points[0], radius, _colour(PAINT))
     else:
@@ -399,7 +399,7 @@ def _handles(viewer: Viewer, seen: tuple[Any, Any], kind: str, centre: Array) ->
 
 
 def _box_handles(viewer: Viewer, seen: tuple[Any, Any]) -> None:
-    """The box of the panel with handles on its corners and edges; on release the clip follows."""
+    """Draw the box of the panel with handles on its corners and edges; on release the clip follows."""
     form, unit = viewer.state.edit_form, gizmo.Matrix6([-0.5, -0.5, -0.5, 0.5, 0.5, 0.5])
     corners = np.array([form.low, form.high])
     matrix = np.diag([*np.maximum(np.ptp(corners, axis=0), 1e-6), 1.0])
@@ -421,8 +421,10 @@ def box_of(matrix: Array) -> tuple[Point, Point]:
 
 
 def dragged(start: Array, now: Array) -> Similarity:
-    """The similarity that leads from one (4, 4) matrix to another; of unlike scales the one that changed the
-    most. Raises InputError where there is none."""
+    """Return the similarity that leads from one (4, 4) matrix to another.
+
+    Of unlike scales the one that changed the most. Raises InputError where there is none.
+    """
     change = now @ np.linalg.inv(start)
     scales = np.linalg.norm(now[:3, :3], axis=0) / np.linalg.norm(start[:3, :3], axis=0)
     if np.ptp(scales) < 1e-5:

@@ -19,6 +19,7 @@ PRESETS: dict[TrainPreset, str] = {
 
 
 def draw(viewer: Viewer) -> None:
+    """Draw the panel "Train": its form, or the training under way."""
     process = viewer.training
     if process is None:
         _form(viewer)

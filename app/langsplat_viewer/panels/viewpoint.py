@@ -17,6 +17,7 @@ CUT_RANGE = (0.01, 20.0)  # of the scene's radius, the least and most that a cut
 
 
 def draw_camera(viewer: Viewer) -> None:
+    """Draw the panel "Camera"."""
     state = viewer.state
     imgui.begin_disabled(state.view is None)
     if state.scene is not None and state.scene.cameras:
@@ -149,7 +150,7 @@ def _duration(viewer: Viewer) -> None:
 
 
 def _number(label: str, value: float, step: float) -> float | None:
-    """A time to type or to step; the new one once it is entered."""
+    """Draw a time to type or to step; return the new one once it is entered."""
     imgui.set_next_item_width(hello_imgui.em_size(NUMBER_EM))
     flags = imgui.InputTextFlags_.enter_returns_true
     changed, new = imgui.input_float(label, value, step, 5 * step, "%.2f s", flags)
