@@ -105,7 +105,7 @@ def is_quiet() -> bool:
     return log.getEffectiveLevel() >= logging.ERROR
 
 
-class Cancelled(Exception):
+class WorkCancelledError(Exception):
     """Raised by a `Progress` to stop the work; what was stored so far stays valid."""
 
 

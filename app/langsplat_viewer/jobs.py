@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 from langsplat_core.errors import LangSplatError
 from langsplat_core.interrupts import handled
-from langsplat_core.progress import Cancelled, Progress, Report
+from langsplat_core.progress import Progress, Report, WorkCancelledError
 
 _ARENA_MAX = -8  # M_ARENA_MAX of malloc.h
 
@@ -89,9 +89,9 @@ class Job:
     reported: float = 0.0  # when, seconds
 
     def report(self, report: Report) -> None:
-        """Take a report of the work; raises Cancelled once the job is cancelled."""
+        """Take a report of the work; raises WorkCancelledError once the job is cancelled."""
         if self.stopped.is_set():
-            raise Cancelled
+            raise WorkCancelledError
         self.reached = report
         now = time.monotonic()
         if now - self.reported >= REPORT_EVERY:

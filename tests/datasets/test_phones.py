@@ -14,7 +14,7 @@ from langsplat_core.datasets.photos import read_photo
 from langsplat_core.datasets.video import extract_frames, kept_frames, sharpness
 from langsplat_core.errors import FormatError, InputError, LangSplatError
 from langsplat_core.io.hostile import PictureError, is_video
-from langsplat_core.progress import Cancelled
+from langsplat_core.progress import WorkCancelledError
 from tests.support.processes import stop_at
 
 av = pytest.importorskip("av")
@@ -75,7 +75,7 @@ def test_sharpness_falls_with_blur_and_stands_tiny_images():
 
 def test_work_folder_keeps_whole_sets_of_frames_alone(clip: Path, tmp_path: Path) -> None:
     work = tmp_path / "work"
-    with pytest.raises(Cancelled):
+    with pytest.raises(WorkCancelledError):
         kept_frames(clip, 6, work, stop_at("taking photographs out of the video"))
     assert not list(work.iterdir())
     folder = kept_frames(clip, 6, work)

@@ -28,7 +28,7 @@ from langsplat_core.datasets.photos import find_photos
 from langsplat_core.datasets.sfm import pairs_by_name
 from langsplat_core.datasets.workspace import ROOM, run_apart
 from langsplat_core.errors import InputError
-from langsplat_core.progress import Cancelled, Progress, Report, silent
+from langsplat_core.progress import Progress, Report, WorkCancelledError, silent
 from langsplat_core.scene import Camera, look_at
 from tests.support.photographs import colmap_reconstruction, distance_to_room, photograph, poses, write_photos
 from tests.support.processes import files_of_at_most, in_this_process, small_disk, stop_at
@@ -112,7 +112,7 @@ def located(
     features were found, and then repeated."""
     work = tmp_path_factory.mktemp("work")
 
-    with pytest.raises(Cancelled):
+    with pytest.raises(WorkCancelledError):
         load_capture(photos, CONFIG, work, stop_at("matching photographs"))
 
     labels: list[str] = []
@@ -314,7 +314,7 @@ def test_copies_are_upright_and_keep_the_focal_length(tmp_path: Path) -> None:
     for index in range(3):
         Image.linear_gradient("L").resize((90, 60)).convert("RGB").save(tmp_path / f"{index}.jpg", exif=exif)
 
-    with pytest.raises(Cancelled):
+    with pytest.raises(WorkCancelledError):
         load_capture(tmp_path, CONFIG, tmp_path / "work", stop_at("finding features"))
     (stage,) = (tmp_path / "work").glob("sfm-*")
     camera = pycolmap.infer_camera_from_image(stage / "images/00000.jpg")
@@ -370,7 +370,7 @@ def matched(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The street's workspace before it is mapped."""
     work = tmp_path_factory.mktemp("matched")
 
-    with pytest.raises(Cancelled):
+    with pytest.raises(WorkCancelledError):
         load_capture(street, SMALL, work, stop_at("locating cameras"))
     (workspace,) = work.glob("sfm-*")
     return workspace
@@ -600,7 +600,7 @@ def test_colmap_starts_from_the_exif_focal_length(tmp_path: Path) -> None:
     for index in range(3):
         photo(tmp_path / f"{index}.jpg", {FOCAL_TAG: 18.0, PLANE_X: 4000 / 22.3 * 25.4, WIDTH: 4000})
 
-    with pytest.raises(Cancelled):
+    with pytest.raises(WorkCancelledError):
         load_capture(tmp_path, DatasetConfig(), tmp_path / "work", stop_at("matching photographs"))
     (stage,) = (tmp_path / "work").glob("sfm-*")
     with pycolmap.Database.open(stage / "database.db") as database:

@@ -14,7 +14,7 @@ import pytest
 from langsplat_core.errors import FormatError
 from langsplat_core.io import apart
 from langsplat_core.io.hostile import PictureError
-from langsplat_core.progress import Cancelled, Progress, Report, silent
+from langsplat_core.progress import Progress, Report, WorkCancelledError, silent
 
 log = logging.getLogger("langsplat")
 
@@ -65,7 +65,9 @@ def test_results_progress_and_messages_come_back(caplog: pytest.LogCaptureFixtur
     assert caplog.messages == ["3 is halved"]
 
 
-@pytest.mark.parametrize("error", [FormatError("no model"), OSError(28, "No space left", "/a"), Cancelled()])
+@pytest.mark.parametrize(
+    "error", [FormatError("no model"), OSError(28, "No space left", "/a"), WorkCancelledError()]
+)
 def test_errors_of_the_process_are_raised(error: Exception) -> None:
     with pytest.raises(type(error)) as caught:
         apart.run(fail, error, progress=silent)
@@ -75,10 +77,10 @@ def test_errors_of_the_process_are_raised(error: Exception) -> None:
 
 def test_unpicklable_errors_keep_their_message() -> None:
     with pytest.raises(RuntimeError, match=r"PictureError: a\.png: not a readable picture \(cut off\)"):
-        apart.run(fail, _Unpacked(), progress=silent)
+        apart.run(fail, _UnpackedError(), progress=silent)
 
 
-class _Unpacked(Exception):
+class _UnpackedError(Exception):
     """Becomes, where it is raised, an error that cannot be unpickled."""
 
     def __reduce__(self) -> tuple[type, tuple[str, str]]:
@@ -97,9 +99,9 @@ def test_a_process_that_ends_early_is_an_error(number: int, said: str) -> None:
 
 def test_cancelled_work_ends_at_once(tmp_path: Path) -> None:
     def stop(_: Report) -> None:
-        raise Cancelled
+        raise WorkCancelledError
 
-    with pytest.raises(Cancelled):
+    with pytest.raises(WorkCancelledError):
         apart.run(wait, tmp_path / "pid", progress=Progress(stop))
     assert not is_alive(int((tmp_path / "pid").read_text()))
 

@@ -33,7 +33,7 @@ from assets.making.vocabulary import RegionLabel, phrase_book
 from assets.making.world import World
 from langsplat_core.errors import EncoderError
 from langsplat_core.io.scenes import load_scene
-from langsplat_core.progress import Cancelled, Progress, Report
+from langsplat_core.progress import Progress, Report, WorkCancelledError
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import CANONICAL_PHRASES, Camera, Scene
@@ -159,9 +159,9 @@ def test_interrupted_training_goes_on_and_answers(monkeypatch, few_crops, tmp_pa
 
     def interrupt(at: Report) -> None:
         if at.fraction > 0.7:
-            raise Cancelled
+            raise WorkCancelledError
 
-    with pytest.raises(Cancelled):
+    with pytest.raises(WorkCancelledError):
         train_encoder(tmp_path, config, Progress(interrupt))
     seen = []
     figures = train_encoder(tmp_path, config, Progress(lambda at: seen.append(at.fraction)))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from langsplat_core.pipeline.agreement import STAGE, agreed_features
-from langsplat_core.progress import Cancelled, Progress, Report, silent
+from langsplat_core.progress import Progress, Report, WorkCancelledError, silent
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.render import render
 from langsplat_core.semantics.store import ImageFeatures
@@ -67,11 +67,11 @@ def test_an_interrupted_run_goes_on_where_it_stopped(room, tmp_path):
 
     def stop(at: Report) -> None:
         if at.stage == STAGE and at.fraction >= 0.5:
-            raise Cancelled
+            raise WorkCancelledError
 
     scene = gaussians, views, photographs
     first, second, whole = MeanColour(), MeanColour(), MeanColour()
-    with pytest.raises(Cancelled):
+    with pytest.raises(WorkCancelledError):
         agreed_features(*scene, first, CpuRasterizer(), tmp_path / "a", Progress(stop))
     resumed = agreed_features(*scene, second, CpuRasterizer(), tmp_path / "a", silent)
     at_once = agreed_features(*scene, whole, CpuRasterizer(), tmp_path / "b", silent)

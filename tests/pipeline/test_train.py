@@ -28,7 +28,7 @@ from langsplat_core.io.ply import write_metres
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.pipeline import language_field, radiance
 from langsplat_core.pipeline.train import train_scene
-from langsplat_core.progress import Cancelled, Progress, Report
+from langsplat_core.progress import Progress, Report, WorkCancelledError
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.semantics import regions
 from langsplat_core.semantics.masks import LevelMasks, MaskSource
@@ -200,7 +200,7 @@ def test_every_lifting_mode_trains(room, tmp_path, mode):
 )
 def test_an_interrupted_run_leaves_no_scene_and_resumes(room, tmp_path, stage):
     out = tmp_path / "scene.ply"
-    with pytest.raises(Cancelled):
+    with pytest.raises(WorkCancelledError):
         train_scene(room, out, tiny_settings(room), progress=stop_at(stage))
     assert not list(tmp_path.glob("*.ply"))
     assert not list(tmp_path.glob("*.safetensors"))
@@ -316,7 +316,7 @@ def scene_in(folder: Path) -> dict[str, bytes]:
 
 def interrupted(room: Path, folder: Path, config: TrainConfig) -> None:
     """A training that ends when most of its steps are done, with a checkpoint."""
-    with pytest.raises(Cancelled):
+    with pytest.raises(WorkCancelledError):
         train_scene(room, folder / "scene.ply", config, progress=stop_at("training Gaussians", 0.75))
     assert list((folder / "scene.work").glob("*.checkpoint.safetensors"))
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from langsplat_core import render
 from langsplat_core.arrays import logit, psnr, rotation_matrices, sigmoid, unit
 from langsplat_core.errors import InputError
-from langsplat_core.progress import Cancelled
+from langsplat_core.progress import WorkCancelledError
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import NO_NODE, Camera, Gaussians, Odds, Scene, Tree
 from langsplat_core.scene.gaussians import GROUP, merged
@@ -213,9 +213,9 @@ def test_merged_extremes_are_drawable():
 
 def test_merge_can_be_cancelled(dense):
     def stop(label: str, fraction: float) -> None:
-        raise Cancelled
+        raise WorkCancelledError
 
-    with pytest.raises(Cancelled):
+    with pytest.raises(WorkCancelledError):
         merged(dense, stop)
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from langsplat_core.arrays import unit
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.progress import Cancelled, Progress, Report, silent
+from langsplat_core.progress import Progress, Report, WorkCancelledError, silent
 from langsplat_core.semantics.masks import LevelMasks, MaskSource
 from langsplat_core.semantics.regions import (
     describe_capture,
@@ -234,9 +234,9 @@ def test_an_interrupted_run_continues_where_it_stopped(tmp_path: Path) -> None:
 
     def stop_at_c(at: Report) -> None:
         if at.note == "c" and at.fraction > 0.5:  # while its masks are being found
-            raise Cancelled
+            raise WorkCancelledError
 
-    with pytest.raises(Cancelled):
+    with pytest.raises(WorkCancelledError):
         describe_capture(IMAGES, NAMES, source, encoder, store, Progress(stop_at_c))
     assert [store.has(name) for name in NAMES] == [True, True, False, False]
     assert len(list(tmp_path.iterdir())) == 2  # and nothing half written

@@ -19,7 +19,7 @@ import pytest
 
 from langsplat_core.arrays import Array
 from langsplat_core.io import apart
-from langsplat_core.progress import Cancelled, Progress, Report
+from langsplat_core.progress import Progress, Report, WorkCancelledError
 from langsplat_core.scene import Camera
 
 PR_CAPBSET_DROP, CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH = 24, 1, 2  # linux/prctl.h, linux/capability.h
@@ -62,7 +62,7 @@ def stop_at(stage: str, fraction: float = 0.0) -> Progress:
 
     def show(at: Report) -> None:
         if at.stage.startswith(stage) and at.fraction >= fraction:
-            raise Cancelled
+            raise WorkCancelledError
 
     return Progress(show)
 

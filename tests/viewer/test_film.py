@@ -11,7 +11,7 @@ from PIL import Image
 from langsplat_core.config import PictureConfig
 from langsplat_core.errors import InputError
 from langsplat_core.io.scenes import save_scene
-from langsplat_core.progress import Cancelled, Progress, Report
+from langsplat_core.progress import Progress, Report, WorkCancelledError
 from langsplat_viewer import output
 from langsplat_viewer.camera.controls import extent_of
 from langsplat_viewer.camera.flight import Flight, Keyframe
@@ -71,11 +71,11 @@ def test_a_film_is_a_folder_of_pictures(viewer, folder):
 
 def stop(at: Report) -> None:
     if at.fraction > 0.5:
-        raise Cancelled
+        raise WorkCancelledError
 
 
 def test_a_folder_is_filled_where_it_was_left(folder):
-    with pytest.raises(Cancelled):
+    with pytest.raises(WorkCancelledError):
         make_film(shot(), folder / "film", Progress(stop))
     assert sorted(path.name for path in (folder / "film").iterdir()) == ["film.json", *FRAMES[:3]]
     before = (folder / "film" / FRAMES[1]).stat().st_mtime_ns
@@ -139,7 +139,7 @@ def test_a_video_has_the_images_at_their_rate(viewer, folder):
     assert len(images) == 5
     expected = render_image(request().seen_by(shot().cameras[4]), "cpu")
     assert np.abs(images[4] - expected).mean() < 6  # colours of 2 x 2 pixels are one
-    with pytest.raises(Cancelled):  # a stopped video leaves nothing
+    with pytest.raises(WorkCancelledError):  # a stopped video leaves nothing
         make_film(shot(), folder / "b.mp4", Progress(stop))
     assert [path.name for path in folder.iterdir() if path.suffix == ".mp4"] == ["a.mp4"]
 

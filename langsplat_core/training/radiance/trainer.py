@@ -21,7 +21,7 @@ from langsplat_core.config import INRIA, RadianceConfig, check_settings
 from langsplat_core.datasets.capture import Capture, shrunk_view
 from langsplat_core.errors import InputError
 from langsplat_core.interrupts import Terminated, handled
-from langsplat_core.progress import Cancelled, Progress, silent
+from langsplat_core.progress import Progress, WorkCancelledError, silent
 from langsplat_core.scene import Camera, Gaussians
 from langsplat_core.training import one_torch_thread
 from langsplat_core.training.radiance.density import (
@@ -171,8 +171,8 @@ def train_radiance(
     """Fit Gaussians to the photographs at `train_indices`; return those that can be seen.
 
     With a `checkpoint` path the run continues from that file if it exists, and writes it every
-    `config.checkpoint_every` steps, at the end, and when it is interrupted (Ctrl-C, or `Cancelled` from
-    `progress`). Raises InputError when a setting is out of its range, there is nothing to train on or the
+    `config.checkpoint_every` steps, at the end, and when it is interrupted (Ctrl-C, or an error
+    of `progress`). Raises InputError when a setting is out of its range, there is nothing to train on or the
     checkpoint belongs to another run, BackendError when the chosen backend does not work.
     """
     check_settings(config, "--radiance.")
@@ -211,7 +211,7 @@ def train_radiance(
                     raise Terminated if signal.SIGTERM in signals else KeyboardInterrupt
                 if checkpoint and (state.step % config.checkpoint_every == 0 or state.step == config.steps):
                     save_checkpoint(checkpoint, state, made_from)
-        except (KeyboardInterrupt, Cancelled):
+        except (KeyboardInterrupt, WorkCancelledError):
             if checkpoint:
                 save_checkpoint(checkpoint, state, made_from)
             raise

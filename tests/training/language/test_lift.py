@@ -9,7 +9,7 @@ from scipy.sparse import csr_matrix
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.config import LiftConfig
-from langsplat_core.progress import Cancelled
+from langsplat_core.progress import WorkCancelledError
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera, LinearCodec
@@ -201,5 +201,5 @@ def test_gradient_lift_is_deterministic_and_interruptible():
     np.testing.assert_array_equal(one, two)
     other = lift_by_gradient(cpu, GAUSSIANS, pairs, CODEC, replace(SHORT, seed=1))[0]
     assert not np.array_equal(one, other)
-    with pytest.raises(Cancelled):
+    with pytest.raises(WorkCancelledError):
         lift_by_gradient(cpu, GAUSSIANS, pairs, CODEC, SHORT, progress=stop_at("training language features"))

@@ -12,7 +12,7 @@ from langsplat_core import config as settings
 from langsplat_core.arrays import ViewScore, psnr
 from langsplat_core.config import GOOD, QUICK, RadianceBudget, RadianceConfig, TrainConfig, with_preset
 from langsplat_core.datasets.capture import Capture
-from langsplat_core.progress import Cancelled, Progress, Report
+from langsplat_core.progress import Progress, Report, WorkCancelledError
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Gaussians, Scene, look_at
 from langsplat_core.training.radiance import rehearsal
@@ -181,13 +181,13 @@ def test_an_interrupted_rehearsal_ends_as_an_uninterrupted_one(
     def stop(at: Report) -> None:
         reports.append(at)
         if at.stage == rehearsal.STAGE and at.fraction > 0.25:
-            raise Cancelled
+            raise WorkCancelledError
 
     path = tmp_path / "rehearsal.safetensors"
     straight = rehearse(capture(), SHORT, range(VIEWS))
     assert len(straight) == 2
     assert 1 <= len(straight[0]) == len(straight[1]) <= 3
-    with pytest.raises(Cancelled):
+    with pytest.raises(WorkCancelledError):
         rehearse(capture(), replace(SHORT, rehearsed_views=50), range(VIEWS), path, Progress(stop))
     assert len(checkpoints_of(path)) > 1
     assert {report.stage for report in reports} == {rehearsal.STAGE}

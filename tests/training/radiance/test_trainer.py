@@ -15,7 +15,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import INRIA, RadianceConfig
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import BackendError, InputError
-from langsplat_core.progress import Cancelled, Progress, Report
+from langsplat_core.progress import Progress, Report, WorkCancelledError
 from langsplat_core.scene import Gaussians, look_at
 from langsplat_core.training.radiance.differentiable import CpuRenderer, renderer_for
 from langsplat_core.training.radiance.scores import evaluate_views
@@ -158,7 +158,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path: Path) -> None:
     straight_path, path = tmp_path / "straight.safetensors", tmp_path / "resumed.safetensors"
     straight = train_radiance(capture(), SHORT, [0, 1, 2], straight_path)
 
-    with pytest.raises(Cancelled):
+    with pytest.raises(WorkCancelledError):
         train_radiance(capture(), SHORT, [0, 1, 2], path, stop_at("training", 0.5))
     steps: list[int] = []
     resumed = train_radiance(capture(), SHORT, [0, 1, 2], path, steps_into(steps))
