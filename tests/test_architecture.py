@@ -4,6 +4,7 @@ import ast
 import graphlib
 import subprocess
 import sys
+from collections import Counter
 from functools import cache
 from itertools import chain
 from pathlib import Path
@@ -144,6 +145,13 @@ def test_imports_form_no_circle() -> None:
         known = {name if name in files else name.rpartition(".")[0] for name in names}
         graph[module] = known & set(files) - {module}
     graphlib.TopologicalSorter(graph).prepare()  # CycleError names the modules
+
+
+def test_public_classes_have_names_of_their_own() -> None:
+    product = [path for path in SOURCES if path.relative_to(ROOT).parts[0] in ("langsplat_core", "app")]
+    classes = [node.name for path in product for node in ast.parse(path.read_text()).body
+               if isinstance(node, ast.ClassDef) and not node.name.startswith("_")]  # fmt: skip
+    assert [name for name, count in Counter(classes).items() if count > 1] == []
 
 
 def test_every_module_has_a_layer():

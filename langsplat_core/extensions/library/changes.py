@@ -228,7 +228,7 @@ def _pieces(engine: QueryEngine, evidence: Array, into: Array) -> list[_Piece]:
     tree, members = engine.tree, engine.tree.gaussians()
     changed: list[int] = []
     inside = np.zeros(tree.count, bool)
-    whole = _meanings(engine)
+    whole = _codewords_seen(engine)
     for node in range(tree.count - 1, -1, -1):  # parents first
         parent = tree.parents[node]
         if parent >= 0 and inside[parent]:
@@ -248,7 +248,7 @@ def _has_changed(evidence: Array) -> bool:
     return bool(enough and gone + coloured >= least * (gone + kept))
 
 
-def _meanings(engine: QueryEngine) -> tuple[Array, Array, Array]:
+def _codewords_seen(engine: QueryEngine) -> tuple[Array, Array, Array]:
     """(U, D) vectors of distinct codewords, from the mean of the scene.
 
     Their (N,) number at level whole, -1 for none; and the (N,) areas of Gaussians.

@@ -63,7 +63,7 @@ def decoded(field: LanguageField, level: int) -> Array:
     return field.codec.decode(field.latents[level])
 
 
-def test_few_meanings_become_a_codebook_of_them(tmp_path, clip):
+def test_few_vectors_become_a_codebook_of_them(tmp_path, clip):
     scene, report = import_scene(read_foreign(occam(tmp_path)), clip, ("red mug", "Red mug "))
     field = scene.language
     assert field is not None
@@ -86,7 +86,7 @@ def test_few_meanings_become_a_codebook_of_them(tmp_path, clip):
     np.testing.assert_array_equal(read.latents, field.latents)
 
 
-def test_many_meanings_are_kept_within_the_stated_error(tmp_path, clip):
+def test_many_vectors_keep_the_stated_error(tmp_path, clip):
     """The error that is stated is of a few Gaussians that the codec was not fitted to; here of all."""
     n = 900
     g = random_gaussians(n)
