@@ -6,7 +6,7 @@ not.
 
 from collections.abc import Callable
 from concurrent.futures import wait
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -246,14 +246,6 @@ COMPANIONS = (sidecar.SUFFIX, cameras.SUFFIX)
 LONGEST_WAIT = 60.0  # seconds that a window which is closed waits for what is being written
 
 
-@dataclass(frozen=True)
-class Written:
-    """A file that was made."""
-
-    path: Path
-    count: int  # Gaussians, or points
-
-
 def export(
     viewer: Viewer,
     folder: Path,
@@ -281,12 +273,13 @@ def export(
         return
     stem = f"{state.path.stem if state.path else 'scene'}-{part}{'-points' if as_points else ''}"
 
-    def work(progress: Progress) -> Written:
+    def work(progress: Progress) -> tuple[Path, int]:
         return _write(replace(scene, language=field), rows, folder, stem, as_points)
 
-    def done(written: Written) -> None:
+    def done(written: tuple[Path, int]) -> None:
+        path, count = written
         kind = "points" if as_points else "Gaussians"
-        state.say(f"saved {written.path}: {written.count:,} {kind}")
+        state.say(f"saved {path}: {count:,} {kind}")
         if part == "edited" and not as_points and state.scene is scene:
             state.saved = replace(state.saved, marks=session.marks, moves=session.moves)
         then(viewer)
@@ -297,12 +290,12 @@ def export(
     state.writing = viewer.run(f"saving the {part}", work, done, failed).future
 
 
-def _write(scene: Scene, rows: Array, folder: Path, stem: str, as_points: bool) -> Written:
+def _write(scene: Scene, rows: Array, folder: Path, stem: str, as_points: bool) -> tuple[Path, int]:
     path = free_name(folder, stem, ".ply", () if as_points else COMPANIONS)
     if as_points:
-        return Written(path, write_points(path, scene.gaussians.take(rows)))
+        return path, write_points(path, scene.gaussians.take(rows))
     save_scene(path, replace(scene.take(rows), path=path))
-    return Written(path, len(rows))
+    return path, len(rows)
 
 
 def finish_writing(viewer: Viewer) -> None:
