@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from langsplat_core.errors import InputError
 from langsplat_viewer.camera import flight
 from langsplat_viewer.camera.controls import extent_of, from_camera, orbit
-from langsplat_viewer.camera.flight import Flight, Keyframe, Pose, pose_at
+from langsplat_viewer.camera.flight import Flight, Keyframe, Pose, pose_at, tangents
 from langsplat_viewer.files.projects import MOST_KEYFRAMES, read_flight, write_flight
 from tests.support.fakes import blob_scene
 
@@ -256,3 +256,10 @@ def test_damaged_files_are_refused_or_read_never_worse(tmp_path):
         for pose in flight.poses(np.linspace(0, 2, 5)):
             assert np.isfinite(pose.position).all()
     assert refused > 200
+
+
+def test_tangents_of_uneven_keyframes_are_those_of_a_parabola():
+    times, start, speed, bend = np.array([0.0, 1.0, 3.0, 3.5]), *np.random.default_rng(1).normal(size=(3, 3))
+    places = start + times[:, None] * speed + times[:, None] ** 2 * bend
+    found = tangents(times, np.diff(places, axis=0), 1e-9)
+    assert_allclose(found[1:-1], (speed + 2 * times[:, None] * bend)[1:-1])
