@@ -61,6 +61,8 @@ check: $(STAMP) $(NPM)/.installed  ## rules and format of Python and of the page
 	$(BIN)/mypy
 	$(PRETTIER) --check $(PAGE)
 	$(BIN)/node $(NPM)/eslint/bin/eslint.js --config $(WEB)/eslint.config.js langsplat_core/web
+	$(BIN)/codespell $$(git ls-files '*.py' '*.js' '*.glsl' '*.css' '*.html' '*.md' Makefile)
+	$(BIN)/python packaging/sizes.py
 
 sizes: $(STAMP)  ## lines of every room beside its budget (CONTRIBUTING.md)
 	$(BIN)/python packaging/sizes.py

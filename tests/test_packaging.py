@@ -123,7 +123,7 @@ def test_sizes_fail_above_a_budget(
     (tmp_path / "untracked.py").write_text("1\n")
     subprocess.run(["git", "-C", tmp_path, "add", "a.py"], check=True)
     for budget, code in ((3, 0), (2, 1)):
-        (tmp_path / "CONTRIBUTING.md").write_text(f"| room | `*.py` | {budget} lines |\n")
+        (tmp_path / "CONTRIBUTING.md").write_text(f"| room | `*.py` | {budget} lines | 1 |\n")
         assert module.main() == code
     assert "above its budget" in capsys.readouterr().out
 
