@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from langsplat_core import config as settings
 from langsplat_core.arrays import ViewScore, psnr
 from langsplat_core.config import GOOD, QUICK, RadianceBudget, RadianceConfig, TrainConfig, with_preset
 from langsplat_core.datasets.capture import Capture
@@ -175,7 +174,7 @@ def test_small_scores_compare_shrunk_images() -> None:
 def test_an_interrupted_rehearsal_ends_as_an_uninterrupted_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(settings, "QUICK", RadianceBudget(320, 12, 30_000, 1))
+    monkeypatch.setattr(rehearsal, "QUICK", RadianceBudget(320, 12, 30_000, 1))
     reports: list[Report] = []
 
     def stop(at: Report) -> None:
