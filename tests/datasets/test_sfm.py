@@ -163,7 +163,7 @@ def test_photographs_left_out_are_warned_of(located) -> None:  # type: ignore[no
     assert "cannot be read: aa_broken.jpg" in lost
 
 
-def test_a_second_run_computes_nothing(
+def test_repeated_reconstruction_computes_nothing(
     photos: Path,
     located,  # type: ignore[no-untyped-def]
     monkeypatch: pytest.MonkeyPatch,

@@ -224,7 +224,7 @@ def test_numbers_beyond_an_integer_column_give_no_warning(tmp_path, recwarn):
         ("a", "?"),
     ],
 )
-def test_what_no_header_can_hold_is_refused(tmp_path, name, dtype):
+def test_writer_refuses_what_no_header_can_hold(tmp_path, name, dtype):
     with pytest.raises(InputError):
         write_ply(tmp_path / "a.ply", random_gaussians(1), comments=("x\nend_header",))
     with pytest.raises(InputError):

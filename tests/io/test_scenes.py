@@ -181,7 +181,7 @@ def test_cameras_of_an_inria_model_are_found(tmp_path):
     assert len(load_scene(path).cameras) == 3
 
 
-def test_what_is_no_scene_is_refused(tmp_path):
+def test_loader_refuses_what_is_no_scene(tmp_path):
     (tmp_path / "a.obj").write_bytes(b"x")
     with pytest.raises(InputError, match=r"a\.obj: not a scene of a known kind; supported: \.ply, .*\.sog"):
         load_scene(tmp_path / "a.obj")

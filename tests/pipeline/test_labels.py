@@ -61,7 +61,7 @@ def test_labels_are_those_of_the_tree_and_its_words(tmp_path):
     assert nodes[0]["word"] == WORDS[1]
 
 
-def test_nothing_is_left_where_a_file_cannot_be_written(tmp_path):
+def test_no_labels_are_left_where_the_scene_cannot_be_written(tmp_path):
     (tmp_path / "out.labels.json").mkdir()
     with pytest.raises(InputError, match=r"out\.labels\.json: is a folder"):
         export_labels(describer(labelled_scene()), tmp_path / "out.ply")

@@ -336,7 +336,7 @@ def test_changed_options_after_an_interruption_start_fresh_stages(room: Path, tm
     retrained(room, tmp_path, replace(config, radiance=radiance, dataset=dataset))
 
 
-def test_changed_photographs_after_an_interruption_start_fresh_stages(room: Path, tmp_path: Path) -> None:
+def test_changed_photographs_start_fresh_stages(room: Path, tmp_path: Path) -> None:
     data = tmp_path / "data"
     shutil.copytree(room, data)
     interrupted(data, tmp_path, tiny_settings(room))

@@ -108,7 +108,7 @@ def test_degenerate_pictures_work(shape: tuple[int, int], noise: bool) -> None:
         assert maps[2].max() - maps[1].max() == 1  # one colour is one region
 
 
-def test_merging_follows_the_cheapest_pair_and_keeps_neighbours_right() -> None:
+def test_merging_follows_the_cheapest_pair() -> None:
     labels = np.repeat(np.arange(4), 5)[None].repeat(6, axis=0)  # four stripes
     colours = np.zeros((6, 20, 3))
     colours[..., 1] = np.array([0.0, 1.0, 30.0, 90.0])[labels]

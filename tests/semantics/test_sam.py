@@ -185,7 +185,7 @@ class Seen:
         return logits
 
 
-def test_crops_find_small_things_and_win_where_both_see_a_thing_whole() -> None:
+def test_crops_find_small_things_and_win_over_the_whole_image() -> None:
     image = np.zeros((200, 200, 3), np.uint8)  # crops of 134 px begin at 0 and 66
     small, across, both = np.s_[30:40, 30:40], np.s_[70:130, 70:130], np.s_[25:65, 140:180]
     for colour, place in enumerate((small, across, both), start=1):

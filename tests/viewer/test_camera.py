@@ -65,7 +65,7 @@ def test_there_and_back(view, there, back):
     assert_same(back(moved), view)
 
 
-def test_a_thousand_small_drags_keep_a_rotation_about_the_up_that_was_adopted(view):
+def test_thousand_small_drags_keep_a_rotation_about_up(view):
     rolled = controls.adopt_up(controls.roll(view, math.pi / 2))  # what is up in the picture
     assert_allclose(rolled.up, -rolled.rotation[1])
     assert_same(controls.orbit(controls.orbit(rolled, 0.5, 0.1), -0.5, -0.1), rolled)
@@ -160,7 +160,7 @@ def test_default_view_shows_the_scene_upright(view):
     assert view.elevation < 0  # looks down a little
 
 
-def test_a_camera_that_looks_away_still_has_a_target_ahead_and_an_empty_scene_a_view():
+def test_camera_that_looks_away_has_a_target_ahead():
     scene = blob_scene()
     away = scene.cameras[0].world_to_camera.copy()
     away[[0, 2]] *= -1  # turned by 180 degrees about its vertical axis
@@ -239,7 +239,7 @@ def test_the_hand_stops_a_glide(opened):
 @pytest.mark.parametrize(
     ("size", "orthographic"), [((160, 120), False), ((90, 300), False), ((160, 120), True)]
 )
-def test_a_scene_without_cameras_opens_and_returns_to_a_view_of_everything(viewer, size, orthographic):
+def test_scene_without_cameras_opens_with_all_in_view(viewer, size, orthographic):
     settings.resize(viewer, *size)
     open_scene(viewer, "bare.ply")
     assert share_seen(viewer, size) >= 0.99
@@ -275,7 +275,7 @@ def test_zooming_out_ends_while_the_scene_is_still_seen(opened):
     assert opened.state.view.distance < extent.farthest
 
 
-def test_focus_goes_as_near_as_the_thing_is_small_and_for_a_huge_one_stays_in_the_room(opened):
+def test_focus_distance_follows_the_size_of_the_thing(opened):
     ask(opened, "mug")
     found, distances = result(opened), []
     place, box = found.place, found.box

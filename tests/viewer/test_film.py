@@ -159,7 +159,7 @@ def test_a_video_that_cannot_be_written_is_one_line(folder):
     assert not [path for path in folder.iterdir() if path.name.startswith(".a")]
 
 
-def test_pictures_of_nothing_are_counted_and_a_film_of_nothing_is_refused(folder):
+def test_film_of_nothing_is_refused(folder):
     with pytest.raises(InputError, match="no picture of the film shows anything"):
         make_film(shot(away=1.0), folder / "a.gif")
     assert not (folder / "a.gif").exists()
@@ -193,7 +193,7 @@ def test_impossible_options_are_one_line(viewer, folder, arguments, reason):
     assert sorted(folder.rglob("*")) == before
 
 
-def test_a_turntable_without_perspective_begins_with_the_same_picture(viewer, folder):
+def test_orthographic_turntable_begins_with_the_shown_view(viewer, folder):
     arguments = ["--orthographic", "3", "--size", "64x48", "--query", "plant", "--display", "rgb"]
     for more in (["--turntable", "1", "--fps", "4", "--out", "film"], ["--out", "still.png"]):
         assert viewer("blobs.ply", *arguments, *more)[0] == 0

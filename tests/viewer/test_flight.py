@@ -54,7 +54,7 @@ def assert_same(got: Pose, wanted: Pose) -> None:
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 8])
-def test_it_passes_through_its_keyframes_and_stands_still_before_and_after(count):
+def test_path_passes_through_its_keyframes(count):
     keys = random_flight(count, count).keyframes
     times = [keys[0].seconds - 5, *[k.seconds for k in keys], keys[-1].seconds + 9]
     found = Flight(keys).poses(np.array(times))
@@ -98,7 +98,7 @@ def test_an_even_turn_stays_even_and_agrees_with_scipys_spline():
         assert_allclose(pose_at(flight, t).rotation, turned(*(0.7 * t * axis)), atol=1e-12)
 
 
-def test_it_rests_between_equal_keyframes():
+def test_path_rests_between_equal_keyframes():
     """A plain spline would swing beyond and back."""
     there = ((1, 2, 3), (0, 0.5, 0), 40)
     flight = Flight((key(0), key(1, *there), key(4, *there), key(5, (2, 2, 2), (0.3, 0, 0))))

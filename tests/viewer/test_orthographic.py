@@ -46,7 +46,7 @@ def test_the_camera_is_orthographic():
 
 
 @pytest.mark.parametrize("backend", ["opengl", "cpu"])
-def test_what_is_clicked_is_where_it_is(gl, backend):
+def test_clicked_point_lies_on_the_surface(gl, backend):
     """By the depth of one pixel, and by that of all of them."""
     camera = FLAT.camera(320, 240)
     renderer, request = GlRenderer(gl, backend, "half"), plain_request(BLOBS, camera, PictureConfig())
@@ -85,7 +85,7 @@ def test_a_span_is_what_the_shorter_side_shows():
     assert_allclose(again.camera(640, 480).world_to_camera, camera.world_to_camera, atol=1e-9)
 
 
-def test_what_lies_behind_the_eye_is_left_out_and_cuts_count_from_the_eye():
+def test_orthographic_view_leaves_out_what_is_behind_the_eye():
     inside = replace(FLAT, target=FLAT.target - 0.2 * FLAT.rotation[2], distance=0.2)  # among the blobs
     camera = inside.camera(*SIZE)
     _, z = exact(inside, MEANS)
@@ -214,7 +214,7 @@ def test_keyframes_and_bookmarks_bring_their_own(flat, tmp_path):
     assert flat.state.view.orthographic
 
 
-def test_what_is_under_the_cursor_is_said_to_be_as_far_as_from_the_eye(flat):
+def test_distance_under_the_cursor_counts_from_the_eye(flat):
     x, y = flat.state.view.camera(160, 120).project(CENTRES[1:2])[0][0]
     viewpoint.toggle_pointing(flat)
     for _ in range(2):

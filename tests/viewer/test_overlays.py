@@ -247,7 +247,7 @@ def rest(viewer, pixel, seconds: float = 0.5) -> None:
     settle(viewer)
 
 
-def test_it_is_said_once_the_mouse_rests(pointing):
+def test_tooltip_appears_when_the_mouse_stops(pointing):
     rest(pointing, at(pointing, 0), seconds=0.05)
     assert pointing.state.hover.found is None
     rest(pointing, at(pointing, 0))
@@ -261,7 +261,7 @@ def test_it_is_said_once_the_mouse_rests(pointing):
     assert (first[:5], "away" in last) == ("mug: ", True)
 
 
-def test_it_is_forgotten_when_the_mouse_or_the_camera_moves(pointing):
+def test_tooltip_disappears_when_mouse_or_camera_moves(pointing):
     rest(pointing, at(pointing, 0))
     viewpoint.hover(pointing, (3, 4))
     assert pointing.state.hover.found is None
@@ -294,7 +294,7 @@ def photograph(path: Path, size=(160, 120), **options) -> Path:
 
 
 @pytest.mark.parametrize("place", ["scene/images", "scene", "images", "."])
-def test_it_is_found_where_photographs_usually_lie(tmp_path, place):
+def test_photograph_is_found_in_the_usual_folders(tmp_path, place):
     wanted = photograph(tmp_path / place / "photo_0.JPG")
     photograph(tmp_path / place / "photo_01.jpg")
     assert find_photograph("photo_0", tmp_path / "scene.ply", "") == wanted
@@ -315,7 +315,7 @@ def test_where_there_is_none_the_reason_says_where_it_was_looked_for(tmp_path, f
         find_photograph("", tmp_path / "scene.ply", chosen)
 
 
-def test_a_large_one_is_shrunk_one_on_its_side_turned_one_of_another_shape_refused(tmp_path):
+def test_photograph_is_shrunk_turned_or_refused(tmp_path):
     image = read_photograph(photograph(tmp_path / "a.jpg", (4000, 3000)), CAMERA)
     assert image.shape == (LONGEST_SIDE * 3 // 4, LONGEST_SIDE, 3)
     np.testing.assert_allclose(image.mean((0, 1)), (200, 100, 50), atol=2)
@@ -347,7 +347,7 @@ def test_every_kind_of_pixel_becomes_three_bytes(tmp_path, mode):
     np.testing.assert_allclose(image, 200, atol=1)
 
 
-def test_it_lies_where_its_camera_saw_it(opened):
+def test_photograph_lies_where_its_camera_saw_it(opened):
     go(viewpoint.go_to_camera, opened, 1)
     camera = opened.state.scene.cameras[1]
     shown = opened.state.view.camera(500, 300)
@@ -373,7 +373,7 @@ def stand(viewer, index: int) -> None:
     act(opening.fetch_photograph, viewer)
 
 
-def test_it_is_read_once_it_is_wanted_and_only_at_its_camera(beside_photograph):
+def test_photograph_is_read_when_its_camera_is_shown(beside_photograph):
     stand(beside_photograph, 1)
     assert beside_photograph.state.photograph is None
     beside_photograph.change(fade=1.0)

@@ -66,7 +66,7 @@ def test_panels_write_no_state():
 # The table of commands: keys, help and palette are made from it.
 
 
-def test_every_key_does_one_thing_and_is_understood_and_letters_are_plain():
+def test_every_key_is_bound_to_one_command():
     keys = [key for command in COMMANDS for key in command.keys]
     assert len(set(keys)) == len(keys)
     for key in keys:
@@ -91,7 +91,7 @@ def test_every_panel_can_be_opened_by_a_command(viewer):
     assert matching("make coffee") == []
 
 
-def test_every_command_does_something_sensible_before_a_scene_is_open(viewer, tmp_path, monkeypatch):
+def test_every_command_runs_without_a_scene(viewer, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for command in COMMANDS:
         command.act(viewer)
@@ -101,14 +101,14 @@ def test_every_command_does_something_sensible_before_a_scene_is_open(viewer, tm
 # What is shown and how; messages; the worker.
 
 
-def test_messages_do_not_grow_without_end_and_repeated_ones_are_said_once(viewer):
+def test_messages_are_bounded_and_not_repeated(viewer):
     for number in [*range(3 * MAX_MESSAGES), 3 * MAX_MESSAGES - 1]:
         viewer.state.say(f"message {number}")
     numbers = [int(message.text.split()[1]) for message in viewer.state.messages]
     assert numbers == list(range(2 * MAX_MESSAGES, 3 * MAX_MESSAGES))
 
 
-def test_worker_delivers_in_order_wakes_the_window_and_names_user_errors_plainly(viewer):
+def test_worker_delivers_in_order_and_wakes_the_window(viewer):
     seen, woken = [], []
     viewer.worker.wake = lambda: woken.append(viewer.worker.is_running)
 

@@ -63,7 +63,7 @@ def test_a_played_path_goes_through_its_keyframes(opened):
     assert opened.state.record.at == 4
 
 
-def test_playing_goes_on_where_it_was_stopped_a_loop_begins_again_and_a_drag_ends_it(opened):
+def test_playing_resumes_loops_and_ends_with_a_drag(opened):
     views = record_three(opened)
     opened.state.record.loops = True
     viewpoint.scrub(opened, 1.0)
@@ -141,7 +141,7 @@ def test_a_path_is_saved_loaded_and_dropped(opened, folder):
     assert opened.state.record.size == (640, 1)
 
 
-def test_what_cannot_be_done_is_said(viewer, opened, folder):
+def test_impossible_recordings_are_refused_in_a_line(viewer, opened, folder):
     viewpoint.toggle_playing(opened)
     filming.save_film(opened, folder)
     filming.save_path(opened, folder)
@@ -246,7 +246,7 @@ def test_the_command_on_the_clipboard_draws_the_same_picture(opened, folder, run
     assert errors(opened) == []
 
 
-def test_what_the_command_cannot_say_is_said(opened, folder):
+def test_copied_command_names_what_it_lacks(opened, folder):
     opened.change(splats=Splats(0.5))
     settings.toggle_wipe(opened)
     filming.copy_command(opened, folder)

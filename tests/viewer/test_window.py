@@ -52,7 +52,7 @@ def test_window(scenario: str, cast: Cast, folder: Path):
 
 
 @pytest.mark.long
-def test_what_was_arranged_is_found_again(cast: Cast, folder: Path):
+def test_layout_is_remembered(cast: Cast, folder: Path):
     drive("leave_settings", cast, folder)
     drive("find_settings", cast, folder)
 

@@ -45,7 +45,7 @@ def test_scenes_of_a_folder_are_those_that_can_be_searched(folder, tmp_path):
         scene_files(tmp_path)
 
 
-def test_what_is_there_is_found_in_metres_and_what_is_not_is_said_so(folder):
+def test_find_answers_in_metres_and_says_what_is_absent(folder):
     door = Door(scene_files(folder))
     answer = door.find("mug", "a.ply")
     assert (answer["verdict"], answer["unit"]) == ("found", "m")
@@ -97,5 +97,5 @@ def test_a_client_asks_over_standard_input_and_output(folder):
     assert before == {path: path.read_bytes() for path in folder.rglob("*.*") if path.is_file()}
 
 
-def test_it_is_said_how_to_speak(folder, capsys):
+def test_serve_names_its_protocol_option(folder, capsys):
     assert "--mcp" in refusal(capsys, "serve", folder / "a.ply")

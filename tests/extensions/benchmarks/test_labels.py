@@ -35,7 +35,7 @@ def only_scene(benchmark):
     return scene
 
 
-def test_polygons_of_one_category_are_joined_and_dots_belong_to_names(lerf):
+def test_polygons_of_one_category_are_joined(lerf):
     scene = only_scene(read_lerf_ovs(lerf))
     assert [frame.name for frame in scene.frames] == ["frame.00041", "frame_00002"]
     assert scene.left_out == ("frame_00002: nothing (no outline)",)

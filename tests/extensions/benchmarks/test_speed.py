@@ -99,7 +99,7 @@ def test_a_tiny_run_writes_three_sane_files(tmp_path):
 
 
 @pytest.mark.long
-def test_what_would_take_too_long_is_named(tmp_path):
+def test_operations_beyond_the_limit_are_named(tmp_path):
     plan = RasterBenchConfig((60, 4000), ((40, 30),), 60, (1,), limit=1e-9)
     report = run_plan(plan)
     assert {r.milliseconds is None for r in report.rows if r.gaussians == 60} == {False}

@@ -53,7 +53,7 @@ def test_floor_walls_and_up_are_found(seed, there):
         assert wall.heights(there.translation[None])[0] == pytest.approx(there.scale * WALL, rel=0.1)
 
 
-def test_what_has_no_floor_has_the_cameras_up_and_its_lowest_surface():
+def test_scene_without_floor_takes_the_up_of_its_cameras():
     scene = box_room()
     ball = unit(np.random.default_rng(0).normal(size=(len(scene.gaussians), 3)))
     floating = replace(scene, gaussians=replace(scene.gaussians, means=ball))
@@ -148,7 +148,7 @@ def scene(seed: int, name: str, degree: int = 1) -> Scene:
     return Scene(random_gaussians(N, seed, sh_degree=degree), field, cameras)
 
 
-def test_what_both_have_is_there():
+def test_merge_keeps_what_both_scenes_have():
     a, b = scene(0, "mug"), scene(5, "vase", degree=3)
     both = merge(a, b)
     assert len(both.gaussians) == 2 * N
@@ -186,7 +186,7 @@ def test_a_scene_without_a_field_gets_no_meaning():
     assert merge(plain, plain).language is None
 
 
-def test_what_cannot_be_one_is_refused():
+def test_merge_refuses_scenes_of_two_encoders():
     a, b = scene(0, "mug"), scene(5, "vase")
     with pytest.raises(InputError, match="two text encoders"):
         merge(a, replace(b, language=replace(b.language, encoder_id="another")))

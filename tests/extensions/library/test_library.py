@@ -246,7 +246,7 @@ def noisy(scene: Scene, seed: int = 5) -> Scene:
     return with_gaussians(scene, means=means, sh=g.sh + rng.normal(scale=0.05, size=g.sh.shape))
 
 
-def test_nothing_changed_is_said_of_the_same_of_noise_and_of_another_exposure(scene):
+def test_noise_and_exposure_are_no_changes(scene):
     darker = with_gaussians(scene, sh=scene.gaussians.sh - 0.9)
     assert compared(scene, scene) == compared(scene, noisy(scene)) == compared(scene, darker) == ()
 
@@ -307,7 +307,7 @@ def test_another_frame_and_scale_change_nothing(scene):
     np.testing.assert_allclose(change.centre, CENTRES[0], atol=0.1)
 
 
-def test_what_cannot_be_compared_is_said(scene):
+def test_scenes_that_cannot_be_compared_are_refused(scene):
     blind = replace(scene, cameras=())
     with pytest.raises(InputError, match="cameras"):
         compared(blind, blind)
