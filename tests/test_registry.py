@@ -5,7 +5,6 @@ import os
 import shutil
 import subprocess
 import sys
-from importlib.metadata import entry_points
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from langsplat_core.scene import Scene
 from tests.support.scenes import random_gaussians
 
 EXAMPLE = Path(__file__).parents[1] / "docs" / "examples" / "05_write_an_extension"
-OWN = sorted(point.name for point in entry_points(group=registry.GROUP))
+OWN = sorted(registry.extensions())
 
 
 def langsplat(site: Path, *words: object) -> subprocess.CompletedProcess[str]:

@@ -86,7 +86,6 @@ try() {
   echo "${COMPREPLY[@]}"
 }
 try langsplat q
-try langsplat bench r
 try langsplat train --max
 try langsplat train --preset g
 """
@@ -99,7 +98,7 @@ def test_bash_completes_commands_options_and_choices(capsys):
     script = capsys.readouterr().out
     terminal = {**os.environ, "LC_ALL": "C.UTF-8", "PYTHONUTF8": "1"}  # of others tyro's scripts know nothing
     said = subprocess.check_output(["bash", "-c", COMPLETE], input=script, encoding="utf-8", env=terminal)
-    assert said.splitlines() == ["query", "raster", "--max-relevancy-error", "good"]
+    assert said.splitlines() == ["query", "--max-relevancy-error", "good"]
 
 
 def test_doctor_names_opengl_and_encoder(capsys):
@@ -129,14 +128,8 @@ WRITING = [
     "train d --out s.ply --work {}",
     "select s.ply cup --out {}.ply",
     "convert s.ply {}.ply",
-    "convert s.ply {} --to langsplat",
     "compact s.ply --out {}.ply",
     "demo --out {}",
-    "eval lerf-ovs s.ply d --json {}.json",
-    "eval 3d-ovs s.ply d --pictures {}",
-    "eval scannet s.ply d --json {}.json",
-    "bench raster --out {}",
-    "bench query s.ply --out {}",
 ]
 
 

@@ -30,7 +30,7 @@ from langsplat_core.extensions.benchmarks.query_speed import (
 from langsplat_core.extensions.benchmarks.raster_speed import plot, run_plan, sweep
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import CodebookCodec, LanguageField, Scene
-from tests.support.commands import run
+from tests.support.commands import refusal, run
 from tests.support.fakes import DIM, PER_BLOB, FakeEncoder, axis, blob_scene
 from tests.support.file_samples import random_codec
 from tests.support.scenes import random_camera, random_gaussians, random_values
@@ -203,3 +203,15 @@ def test_members_of_a_group_are_named_and_take_verbosity_anywhere() -> None:
 def test_every_number_of_a_command_has_a_range(words: list[str]) -> None:
     command = parse(words)
     assert [setting.option for setting in numeric_settings(command) if setting.range is None] == []
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        *("eval lerf-ovs s.ply d --json /proc/x.json", "eval 3d-ovs s.ply d --pictures /proc/x"),
+        *("eval scannet s.ply d --json /proc/x.json", "bench raster --out /proc/x"),
+        "bench query s.ply --out /proc/x",
+    ],
+)
+def test_commands_try_the_place_to_write_first(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "system's own" in refusal(capsys, *words.split())
