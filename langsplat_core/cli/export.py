@@ -152,7 +152,7 @@ class Convert:
             raise InputError(f"--to {self.to}: choose one of {', '.join(('scene', *exporters))}")
         exporter: Exporter = registry.part("exporters", self.to)
         check_output_folder(self.out)
-        request = ExportRequest(self.source, lambda: replace(self._read(), path=self.source), self.out)
+        request = ExportRequest(self.sources, lambda: replace(self._read(), path=self.source), self.out)
         with TerminalProgress() as progress:
             lines = exporter.write(request, progress)
         print(*lines, sep="\n")

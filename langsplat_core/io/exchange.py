@@ -32,8 +32,8 @@ class Importer:
 class ExportRequest:
     """A scene to be written for another program."""
 
-    source: Path  # file or folder that the command line named
-    load: Callable[[], Scene]  # reads `source` as a scene
+    sources: tuple[Path, ...]  # files or folders that the command line named, one at least
+    load: Callable[[], Scene]  # reads `sources` as a scene
     out: Path  # folder to write, which can be written to
 
 

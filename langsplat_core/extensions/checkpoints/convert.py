@@ -31,7 +31,7 @@ def _import(request: ImportRequest, progress: Progress) -> tuple[Scene, tuple[st
 def _export_langsplat(request: ExportRequest, progress: Progress) -> tuple[str, ...]:
     from langsplat_core.extensions.checkpoints.exporting import export_langsplat
 
-    return tuple(map(str, export_langsplat(request.load(), request.out, request.source.stem)))
+    return tuple(map(str, export_langsplat(request.load(), request.out, request.sources[0].stem)))
 
 
 def _export_occam(request: ExportRequest, progress: Progress) -> tuple[str, ...]:
@@ -48,8 +48,8 @@ def _export_features(request: ExportRequest, progress: Progress) -> tuple[str, .
     )
     from langsplat_core.semantics.store import FeatureStore
 
-    folder = request.source
-    if not folder.is_dir():
+    folder = request.sources[0]
+    if len(request.sources) > 1 or not folder.is_dir():
         raise InputError(f"{folder}: --to features reads one folder of masks and vectors of photographs")
     if langsplat_stems(folder):
         count = features_from_langsplat(folder, FeatureStore(request.out), progress)

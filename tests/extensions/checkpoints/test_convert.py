@@ -70,7 +70,8 @@ def test_features_are_converted_both_ways(tmp_path):
     assert run("convert", tmp_path / "features", tmp_path / "language_features", "--to", "features") == 0
     assert run("convert", tmp_path / "language_features", tmp_path / "back", "--to", "features") == 0
     np.testing.assert_array_equal(FeatureStore(tmp_path / "back").load("a").labels, labels)
-    assert run("convert", tmp_path / "nothing", tmp_path / "back", "--to", "features") == 2
+    for sources in ([tmp_path / "nothing"], [tmp_path / "features", tmp_path / "language_features"]):
+        assert run("convert", *sources, tmp_path / "back", "--to", "features") == 2
 
 
 @pytest.mark.parametrize(
