@@ -18,7 +18,8 @@ from PIL import Image
 
 from assets.making.__main__ import parse as parse_making
 from langsplat_core.cli.app import parse
-from langsplat_core.cli.run import Runnable, main
+from langsplat_core.cli.arguments import Runnable
+from langsplat_core.cli.run import main
 from langsplat_core.io.scenes import load_scene
 from langsplat_viewer.program import parse as parse_viewer
 from tests.benchmarks.__main__ import parse as parse_benchmarks

@@ -11,7 +11,8 @@ from typing import Annotated
 import tyro
 
 from assets.making.config import EncoderConfig, LabelLayout, Size, Tier
-from langsplat_core.cli.run import OutFile, OutFolder, Runnable, main, parsed
+from langsplat_core.cli.arguments import OutFile, OutFolder, Runnable
+from langsplat_core.cli.run import main, parsed
 from langsplat_core.config import Count, Seed
 from langsplat_core.progress import TerminalProgress
 

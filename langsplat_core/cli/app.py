@@ -12,7 +12,8 @@ from typing import Annotated, Any, Union
 import tyro
 
 from langsplat_core import registry
-from langsplat_core.cli.run import Runnable, main, parsed, with_codec
+from langsplat_core.cli.arguments import Runnable, with_codec
+from langsplat_core.cli.run import main, parsed
 from langsplat_core.errors import InputError
 
 FLAGS = ("-q", "--quiet", "-v", "--verbose")  # may precede a command

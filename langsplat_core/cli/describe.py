@@ -13,19 +13,9 @@ import numpy as np
 import tyro
 from rich.table import Table
 
-from langsplat_core.cli.query import (
-    WIDTH,
-    Level,
-    Unit,
-    basis_fields,
-    chosen_instances,
-    found_answer,
-    instance_fields,
-    pixel_in,
-    pointed,
-    unit_of,
-)
-from langsplat_core.cli.run import EncoderOption, OutputConsole, TrainedScene, print_json
+from langsplat_core.cli.answers import Unit, basis_fields, pixel_in, pointed, unit_of
+from langsplat_core.cli.arguments import EncoderOption, Level, TrainedScene
+from langsplat_core.cli.run import OutputConsole, print_json
 from langsplat_core.config import Count, CountOrZero
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io import sidecar as files
@@ -43,22 +33,18 @@ from langsplat_core.scene.language import phrase_key
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.semantics.vocabulary import read_vocabulary
 
+WIDTH = 118  # characters of a table that is not written to a terminal
+
 
 @dataclass(frozen=True)
 class Describe:
-    """Name what is here: in a pixel, in an instance of a phrase, of a Gaussian, or in the whole scene."""
+    """Name what is in a pixel, or in the whole scene."""
 
     scene: TrainedScene
     camera: Annotated[CountOrZero, tyro.conf.arg(metavar="INDEX")] = 0
     """Training view in which --pixel is meant."""
     pixel: Annotated[tuple[CountOrZero, CountOrZero] | None, tyro.conf.arg(metavar="X Y")] = None
     """Column and row, counted from the top left pixel, 0 0."""
-    gaussian: Annotated[CountOrZero | None, tyro.conf.arg(metavar="NUMBER")] = None
-    """One Gaussian, by its row in the file, from 0."""
-    phrase: Annotated[str | None, tyro.conf.arg(metavar="TEXT")] = None
-    """A thing that this phrase finds."""
-    instance: Annotated[Count, tyro.conf.arg(metavar="NUMBER")] = 1
-    """Which of the things that --phrase finds, as `langsplat query` lists them; the best is 1."""
     level: Level | None = None
     """This semantic level alone."""
     outline: bool = False
@@ -91,7 +77,7 @@ class Describe:
             return
         if self.outline:
             print(*outline_lines(answer["outline"], unit_of(scene)), sep="\n")
-        elif self._everything:
+        elif self.pixel is None:
             _print_inventory(answer["inventory"])
         else:
             _print_words(answer["levels"])
@@ -103,72 +89,47 @@ class Describe:
                 f"the encoder was never taught their words ({names})"
             )
 
-    @property
-    def _everything(self) -> bool:
-        return self._asked_of == []
-
-    @property
-    def _asked_of(self) -> list[str]:
-        """The options given that name a place."""
-        given = {"--pixel": self.pixel, "--gaussian": self.gaussian, "--phrase": self.phrase}
-        return [option for option, value in given.items() if value is not None]
-
     def _check(self, scene: Scene) -> None:
         """InputError for arguments that do not go with the scene or each other, before anything is loaded."""
-        if self.outline and (self._asked_of or self.level is not None):
+        narrowed = self.pixel is not None or self.level is not None
+        if self.outline and narrowed:
             raise InputError(
                 "--outline is of the whole scene, at all levels; leave out what else is asked for"
             )
         if self.labels is not None:
-            self._check_labels(self.labels)
-        if len(self._asked_of) > 1:
-            raise InputError(f"{' and '.join(self._asked_of)} are several questions; ask one of them")
-        if self.phrase is None and self.instance != 1:
-            raise InputError(f"--instance {self.instance} needs a --phrase that finds it")
-        count = len(scene.gaussians)
-        if self.gaussian is not None and not 0 <= self.gaussian < count:
-            raise InputError(f"--gaussian {self.gaussian}: the scene has Gaussians 0 to {count - 1}")
+            if self.outline or self.json or narrowed:
+                raise InputError("--labels writes files of the whole scene; leave out what else is asked for")
+            if self.labels.suffix.lower() != ".ply":
+                raise InputError(f"{self.labels}: labels are properties of a .ply; choose such a name")
+            check_writable(self.labels)
         if self.pixel is None:
             if self.camera != 0:
                 raise InputError(f"--camera {self.camera} needs a --pixel X Y in it")
             return
         if not scene.cameras:
-            raise InputError(f"{self.scene}: has no cameras, so --pixel means nothing; ask by --gaussian")
+            raise InputError(f"{self.scene}: has no cameras, so --pixel means nothing")
         pixel_in(scene, self.camera, self.pixel, "--pixel {} {}".format(*self.pixel))
 
-    def _check_labels(self, out: Path) -> None:
-        if self.outline or self.json or self._asked_of or self.level is not None:
-            raise InputError("--labels writes files of the whole scene; leave out what else is asked for")
-        if out.suffix.lower() != ".ply":
-            raise InputError(f"{out}: labels are properties of a .ply; choose such a name")
-        check_writable(out)
-
     def _described(self, describer: Describer, progress: Progress) -> dict[str, Any]:
-        """Return the inventory, or the words of the place that is asked for, ready for JSON."""
+        """Return the outline, the inventory, or the words of a pixel, ready for JSON."""
         engine = describer.engine
         sure = engine.basis.calibration is not None
-        asked = {"asked": len(describer.words[0].phrases), "left_out": len(describer.left_out)}
+        asked: dict[str, Any] = {
+            "asked": len(describer.words[0].phrases),
+            "left_out": len(describer.left_out),
+        }
         if self.outline:
             return asked | {"outline": outline_of(describer)}
         found: Sequence[LevelWords | InventoryEntry]
-        place: dict[str, Any] = {}
-        if self.pixel is not None:
+        if self.pixel is None:
+            found = scene_inventory(describer, progress)
+        else:
             camera = engine.scene.cameras[self.camera]
             at = look_at_pixel(load_lifting_rasterizer("cpu"), describer, camera, self.pixel, top=self.top)
             found = describer.at_gaussians(np.zeros(0, np.int64)) if at is None else at.words
-            place = {"camera": self.camera, "view": camera.name, "pixel": list(self.pixel)}
-        elif self.phrase is not None:
-            instances = engine.instances(found_answer(engine, self.phrase, "auto"))
-            thing = chosen_instances(instances, [self.instance])[0]
-            found = describer.at_gaussians(thing.members, top=self.top)
-            place = {"phrase": self.phrase, "thing": instance_fields(thing, self.instance)}
-        elif self.gaussian is not None:
-            found = describer.at_gaussians(np.array([self.gaussian]), np.ones(1), self.top)
-            place = {"gaussian": self.gaussian}
-        else:
-            found = scene_inventory(describer, progress)
+            asked |= {"camera": self.camera, "view": camera.name, "pixel": list(self.pixel)}
         wanted = [_plain(one, sure) for one in found if self.level in (None, LEVELS[one.level])]
-        return place | asked | {"inventory" if self._everything else "levels": wanted}
+        return asked | {"inventory" if self.pixel is None else "levels": wanted}
 
 
 def _plain(value: Any, sure: bool) -> Any:

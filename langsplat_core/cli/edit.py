@@ -13,7 +13,8 @@ import tyro
 from rich.table import Table
 
 from langsplat_core.arrays import Array
-from langsplat_core.cli.run import AnyScene, OutFile, OutputConsole, WrittenScene, print_json
+from langsplat_core.cli.arguments import AnyScene, OutFile, WrittenScene
+from langsplat_core.cli.run import OutputConsole, print_json
 from langsplat_core.config import CleanConfig, CompactConfig, Positive, Range
 from langsplat_core.errors import InputError
 from langsplat_core.io.ply import write_metres

@@ -7,8 +7,7 @@ from typing import Annotated
 import tyro
 
 from langsplat_core import registry
-from langsplat_core.cli.query import Level
-from langsplat_core.cli.run import AnyScene, EncoderOption
+from langsplat_core.cli.arguments import AnyScene, EncoderOption, Level
 from langsplat_core.config import CodebookConfig, CodecConfig
 from langsplat_core.errors import InputError
 from langsplat_core.io.exchange import Exporter, ExportRequest, Importer, ImportRequest

@@ -17,27 +17,18 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import MISSING, dataclass, fields, make_dataclass
-from itertools import pairwise
-from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from dataclasses import dataclass, make_dataclass
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
 from rich.console import Console
 
 from langsplat_core import __version__
-from langsplat_core.config import (
-    CODEC_CONFIGS,
-    CodecConfig,
-    Positive,
-    annotations,
-    check_settings,
-    named_values,
-)
+from langsplat_core.cli.arguments import Runnable, check_arguments
 from langsplat_core.errors import InputError, LangSplatError, optional_imports, printable_line
 from langsplat_core.interrupts import SAID, Terminated, raised
-from langsplat_core.io.files import NO_ROOM, check_output_file, check_output_folder, shown
+from langsplat_core.io.files import NO_ROOM, shown
 
 log = logging.getLogger("langsplat")
 COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
@@ -70,45 +61,6 @@ class _OneLine(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         return printable_line(record.getMessage(), 2000)
-
-
-class Runnable(Protocol):
-    """Parsed arguments of a command, with the work that they ask for."""
-
-    def run(self) -> None:
-        """Do the work; raise LangSplatError for what a user can mend."""
-
-
-def named(args: Sequence[str], option: str) -> str:
-    """Return the last value that `args` give for an option; "" where they give none."""
-    values = [
-        after if word == option else word.partition("=")[2]
-        for word, after in pairwise([*args, ""])
-        if word.partition("=")[0] == option
-    ]
-    return values[-1] if values else ""
-
-
-def codec_settings(args: Sequence[str], default: CodecConfig) -> CodecConfig:
-    """Return the default settings of the codec that `args` choose by `--codec.kind`.
-
-    That is `default` itself where it is of that kind or none is chosen. InputError for an unknown kind.
-    """
-    kind = named(args, "--codec.kind") or default.kind
-    if kind not in CODEC_CONFIGS:
-        raise InputError(f"--codec.kind {kind}: choose one of {', '.join(CODEC_CONFIGS)}")
-    return default if kind == default.kind else CODEC_CONFIGS[kind]()
-
-
-def with_codec(command: type[Runnable], args: Sequence[str]) -> type[Runnable]:
-    """`command` with the settings of the codec that `args` choose, where it has a field `codec`."""
-    entry: Any = next((entry for entry in fields(command) if entry.name == "codec"), None)  # type: ignore[arg-type]
-    if entry is None:
-        return command
-    default = entry.default_factory() if entry.default is MISSING else entry.default
-    chosen = ("codec", CodecConfig, codec_settings(args, default))
-    names = {"__doc__": command.__doc__}
-    return make_dataclass(command.__name__, [chosen], bases=(command,), frozen=True, namespace=names)
 
 
 def one_line(box: str) -> str:
@@ -267,53 +219,3 @@ class OutputConsole(Console):
     def on_broken_pipe(self) -> None:
         """Raise BrokenPipeError, as `print` does."""
         raise BrokenPipeError
-
-
-@dataclass(frozen=True)
-class OutputPath:
-    """Marks an argument that names what is written, so that it can be tried before the work."""
-
-    kind: Literal["file", "folder"]
-
-
-OutFile = Annotated[Path, OutputPath("file")]
-OutFolder = Annotated[Path, OutputPath("folder")]
-
-# Arguments that several commands have.
-_trained = tyro.conf.arg(help="A trained scene, *.ply with its language field beside it.")
-_taught = "Your own words, as `langsplat teach --into FILE` writes them, beside those of the scene."
-_encoder = tyro.conf.arg(help="Text encoder folder or hub id, in place of the one the scene names.")
-AnyScene = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="Any readable scene.")]
-TrainedScene = Annotated[tyro.conf.Positional[Path], _trained]
-WrittenScene = Annotated[
-    tyro.conf.Positional[Path], tyro.conf.arg(help="Scene to write: .ply, .spz or .splat.")
-]
-EncoderOption = Annotated[str, _encoder]
-JsonOption = Annotated[bool, tyro.conf.arg(help="Print JSON, lengths in world units.")]
-ScaleOption = Annotated[
-    Positive | None, tyro.conf.arg(help="Metres per world unit, in place of what the scene says.")
-]
-WordsOption = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help=_taught)]
-
-
-def check_arguments(command: object) -> None:
-    """Raise InputError for the first argument of a command, a dataclass, that it cannot work with.
-
-    That is a number outside of its range, a text that is not UTF-8, or a place that cannot be written to.
-    """
-    check_settings(command)
-    for option, value, hint in named_values(command):
-        for text in value if isinstance(value, tuple) else (value,):
-            if isinstance(text, str):
-                _check_text(option, text)
-        written = next((part for part in annotations(hint) if isinstance(part, OutputPath)), None)
-        if written is not None and value is not None:
-            (check_output_file if written.kind == "file" else check_output_folder)(value)
-
-
-def _check_text(option: str, text: str) -> None:
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        plain = text[:40].encode("utf-8", "backslashreplace").decode()
-        raise InputError(f"{option} {plain}: is not UTF-8; use a terminal that is set to UTF-8") from None

@@ -16,7 +16,8 @@ from rich.table import Table
 from rich.text import Text
 
 from langsplat_core import __version__
-from langsplat_core.cli.run import AnyScene, OutFolder, OutputConsole, print_json
+from langsplat_core.cli.arguments import AnyScene, OutFolder
+from langsplat_core.cli.run import OutputConsole, print_json
 from langsplat_core.errors import EXTRAS, BackendError, LangSplatError, remedy
 from langsplat_core.io.scenes import (
     load_scene,

@@ -12,7 +12,8 @@ from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
-from langsplat_core.cli.run import OutFile, OutFolder, codec_settings, named, one_line
+from langsplat_core.cli.arguments import OutFile, OutFolder, codec_settings, named
+from langsplat_core.cli.run import one_line
 from langsplat_core.config import (
     PAPER,
     DatasetConfig,

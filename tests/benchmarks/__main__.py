@@ -3,7 +3,8 @@
 import sys
 from typing import Union
 
-from langsplat_core.cli.run import Runnable, main, parsed, with_codec
+from langsplat_core.cli.arguments import Runnable, with_codec
+from langsplat_core.cli.run import main, parsed
 from tests.benchmarks.answers import Rooms, Verdicts
 from tests.benchmarks.few import Few
 from tests.benchmarks.geometry import Clean, Maps, Meshes

@@ -21,7 +21,7 @@ from assets.making.objects import EVERYTHING
 from assets.making.truth import PHRASE_KINDS, Region, read_truth
 from assets.making.vocabulary import part_words
 from langsplat_core.arrays import Array
-from langsplat_core.cli.run import OutFile
+from langsplat_core.cli.arguments import OutFile
 from langsplat_core.config import (
     AutoencoderConfig,
     CodebookConfig,

@@ -24,7 +24,7 @@ from assets.making.objects import EVERYTHING
 from assets.making.scene import SEED
 from assets.making.truth import Truth, TruthMasks, read_truth
 from langsplat_core.arrays import Array
-from langsplat_core.cli.run import OutFolder
+from langsplat_core.cli.arguments import OutFolder
 from langsplat_core.config import (
     ClipConfig,
     CodebookConfig,

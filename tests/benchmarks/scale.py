@@ -26,7 +26,7 @@ import tyro
 from PIL import Image
 
 from langsplat_core.arrays import Array, psnr, sigmoid, unit
-from langsplat_core.cli.run import OutFolder
+from langsplat_core.cli.arguments import OutFolder
 from langsplat_core.config import Count, CountOrZero, PictureConfig
 from langsplat_core.display.composing import compose_upwards
 from langsplat_core.display.displays import Channels

@@ -346,15 +346,8 @@ def test_inventory_is_printed_as_table_and_json(described, capsys):
     assert answers(capsys, *words, "--level", "subpart")["inventory"] == []
 
 
-def test_describe_names_a_gaussian_a_thing_and_a_pixel(described, capsys):
+def test_describe_names_a_pixel(described, capsys):
     words = ("describe", "named.ply", "--vocabulary", "list.txt")
-    found = answers(capsys, *words, "--gaussian", "0", "--level", "whole")
-    assert found["gaussian"] == 0
-    (level,) = found["levels"]
-    assert (level["words"][0]["phrase"], level["known"]) == ("mug", 1)
-    found = answers(capsys, *words, "--phrase", "book", "--level", "whole")
-    assert found["phrase"] == found["levels"][0]["words"][0]["phrase"] == "book"
-    assert found["thing"]["gaussians"] > 50
     column, row = named_scene().cameras[1].project(named_scene().gaussians.means[:1])[0].astype(int)[0]
     said = lines(capsys, *words, "--camera", "1", "--pixel", str(column), str(row), "--top", "2")
     assert any(line.startswith("whole    mug") for line in said)
@@ -386,13 +379,8 @@ def test_describe_names_a_gaussian_a_thing_and_a_pixel(described, capsys):
         ("select plain.ply mug", "no language field"),
         ("describe named.ply --camera 3 --pixel 1 1", "--camera 3: the scene has cameras 0 to 2"),
         ("describe named.ply --pixel 160 1", "--pixel 160 1: camera 0 has columns 0 to 159"),
-        ("describe named.ply --gaussian 360", "--gaussian 360: the scene has Gaussians 0 to 359"),
-        ("describe named.ply --phrase mug --pixel 1 1", "ask one of them"),
-        ("describe named.ply --instance 2", "--instance 2 needs a --phrase"),
-        ("describe named.ply --phrase mug --instance 9", "--instance 9: there are 1"),
-        ("describe named.ply --phrase wall", "'wall' was not found"),
         ("describe named.ply --camera 1", "needs a --pixel X Y"),
-        ("describe named.ply --outline --gaussian 3", "--outline is of the whole scene"),
+        ("describe named.ply --outline --level part", "--outline is of the whole scene"),
         ("describe named.ply --vocabulary empty.txt", "empty.txt: the vocabulary is empty"),
         ("describe named.ply --vocabulary bad.txt", "bad.txt, line 2"),
         ("describe named.ply --vocabulary sofas.txt", "knows none of the vocabulary's 1 phrases"),

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from langsplat_core import Gaussians, Scene, load_scene
-from langsplat_core.cli.run import AnyScene
+from langsplat_core.cli.arguments import AnyScene
 from langsplat_core.errors import FormatError
 from langsplat_core.io.scenes import SceneFormat
 from langsplat_core.registry import Extension

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from langsplat_core.cli.run import EncoderOption, OutFile, OutFolder
+from langsplat_core.cli.arguments import EncoderOption, OutFile, OutFolder
 from langsplat_core.config import ClipConfig, MaskConfig, TrainConfig, TrainPreset, with_preset
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.benchmarks.config import QueryBenchConfig, RasterBenchConfig
