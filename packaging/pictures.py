@@ -85,15 +85,12 @@ def _outlined(ctx: Any, window: Window) -> None:
     things = [
         node for name, node in named.items() if name.split(" or ")[0] in ("hamburger", "laptop", "present")
     ]
-    outline.group(viewer, things[1], things[0])
-    outline.group(viewer, things[2], viewer.state.session.things.groups[0])
-    outline.rename_group(viewer, viewer.state.session.things.groups[0], "on the table")
-    outline.toggle_lock(viewer, things[0])
+    outline.hide(viewer, things[0])
     settings.set_display(viewer, "latent", 2)
     ctx.yield_(10)
 
 
-def _clipped(ctx: Any, window: Window) -> None:
+def _boxed(ctx: Any, window: Window) -> None:
     viewer = window.viewer
     selecting.select_query(viewer)
     settings.open_panel(viewer, "Transform")
@@ -101,7 +98,6 @@ def _clipped(ctx: Any, window: Window) -> None:
     selecting.select_none(viewer)
     settings.set_display(viewer, "rgb")
     viewer.state.edit_form = replace(viewer.state.edit_form, gizmo="box")
-    editing.clip(viewer, True)
 
 
 def _noted(ctx: Any, window: Window) -> None:
@@ -235,7 +231,7 @@ WINDOWS: dict[str, tuple[tuple[str, ...], Act]] = {
     "select.jpg": (("teddy bear",), _selected),
     "transform.jpg": (("teddy bear",), _transformed),
     "outline.jpg": (("teddy bear",), _outlined),
-    "clip.jpg": (("teddy bear",), _clipped),
+    "crop.jpg": (("teddy bear",), _boxed),
     "notes.jpg": (("teddy bear",), _noted),
     "beside.jpg": (("teddy bear", "toy"), _beside),
     "side_by_side.jpg": (("teddy bear",), _side_by_side),

@@ -191,7 +191,6 @@ BY_MENU: dict[str, tuple[Command, ...]] = {
         Command("save the view", filming.save_view),
         Command("save the project", projects.save_project, ("Ctrl+Shift+S",)),
         Command("save the queries", queries.save_queries),
-        Command("copy the command of this picture", filming.copy_command, ("Ctrl+Shift+C",)),
         Command("save a picture of the size of the film", filming.save_sized_picture),
         Command("save a film of the path", filming.save_film),
         Command("save the camera path", filming.save_path),

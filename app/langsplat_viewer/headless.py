@@ -89,7 +89,7 @@ def draw(options: ViewerOptions, path: Path, services: Services, progress: Progr
         camera,
         options.picture,
         level=latent_level(options.level),
-        answers=_by_colour(results, options.colour),
+        answers=results[-MAX_QUERIES:],  # as in the window, where a fourth takes the oldest one's colour
         clip=options.clip,
     )
     if options.backend in ("auto", "cpu"):
@@ -130,9 +130,6 @@ def _answers(
 ) -> tuple[QueryResult, ...]:
     """Return the answers to the queries, in their order, cut where the options say so."""
     phrases = [phrase for text in options.query for phrase in split_phrases(text) or [text]]
-    colours = options.colour
-    if colours and (len(colours) != len(phrases) or len(set(colours)) != len(phrases)):
-        raise InputError(f"--colour {colours[0]}: give each --query a colour of its own, or none any")
     if options.cut and len(options.cut) != len(phrases):
         raise InputError(f"--cut {options.cut[0]:g}: give each --query a cut, 0 for its own, or none any")
     if options.canonical:
@@ -148,18 +145,6 @@ def _answers(
         return results
     pairs = zip(results, options.cut, strict=True)
     return tuple(recut(result, cut) if cut > 0 else result for result, cut in pairs)
-
-
-def _by_colour(results: Sequence[QueryResult], colours: tuple[int, ...]) -> tuple[QueryResult | None, ...]:
-    """Return the answers by colour.
-
-    Without `colours` they come in their order, the last ones only, as in the window, where a fourth query
-    takes the oldest one's colour.
-    """
-    if not colours:
-        return tuple(results[-MAX_QUERIES:])
-    by_colour = dict(zip(colours, results, strict=True))
-    return tuple(by_colour.get(number) for number in range(1, max(colours) + 1))
 
 
 def _turn(scene: Scene, camera: Camera, results: Sequence[QueryResult], options: ViewerOptions) -> Motion:

@@ -20,7 +20,7 @@ from langsplat_core.config import (
     Range,
     Share,
 )
-from langsplat_core.display.displays import DISPLAYS, MAX_QUERIES
+from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.errors import InputError
 from langsplat_core.io.cameras import read_cameras
 from langsplat_core.io.scenes import format_of, load_scene
@@ -40,7 +40,6 @@ Seconds = Annotated[float, Range(0.1, 36_000.0)]
 PicturesPerSecond = Annotated[float, Range(0.1, 240.0)]
 Span = Annotated[float, Range(*SPAN_LIMITS)]
 Cuts = tuple[Share, ...]
-Colours = tuple[Annotated[int, Range(1, MAX_QUERIES)], ...]
 
 
 @dataclass(frozen=True)
@@ -55,8 +54,6 @@ class ViewerOptions:
     """Semantic level of the search; auto takes the one that answers best."""
     display: DisplayChoice = "auto"
     """What is shown; auto is relevancy with a query, else rgb."""
-    colour: Annotated[tyro.conf.UseAppendAction[Colours], tyro.conf.arg(metavar="N")] = ()
-    """Without a window: colour of a query, 1 to 3; repeat it for each --query (default: in their order)."""
     cut: Annotated[tyro.conf.UseAppendAction[Cuts], tyro.conf.arg(metavar="RELEVANCY")] = ()
     """Without a window: relevancy from 0 to 1 at which an answer ends, 0 where it ends by itself; repeat it
     for each --query."""

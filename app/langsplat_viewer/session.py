@@ -140,31 +140,14 @@ class Note:
 
 
 @dataclass(frozen=True)
-class NodeGroup:
-    """Things that belong together."""
-
-    name: Name
-    nodes: Annotated[tuple[Node, ...], Meta(min_length=1)]
-
-
-@dataclass(frozen=True)
 class Things:
-    """Names, groups and locks that a user gave to nodes of the scene's tree."""
+    """What a user gave to nodes of the scene's tree."""
 
     names: Mapping[Node, Name] = field(default_factory=dict)
-    groups: tuple[NodeGroup, ...] = ()
-    locked: frozenset[Node] = frozenset()
 
     def known(self, count: int) -> "Things":
         """Return those of the first `count` nodes."""
-        inside = [
-            replace(g, nodes=tuple(n for n in dict.fromkeys(g.nodes) if n < count)) for g in self.groups
-        ]
-        return Things(
-            {node: name for node, name in self.names.items() if node < count},
-            tuple(group for group in inside if group.nodes),
-            frozenset(node for node in self.locked if node < count),
-        )
+        return Things({node: name for node, name in self.names.items() if node < count})
 
 
 @dataclass(frozen=True)
@@ -203,16 +186,6 @@ class Session:
     split: Split = field(default_factory=Split)
     splats: Splats = field(default_factory=Splats)
     clip: Clip = field(default_factory=Clip)
-    fade: Annotated[
-        float,
-        Meta(
-            ge=0,
-            le=1,
-            title="Photograph",
-            description="Lay the photograph of the training camera over the picture",
-            extra={"panel": "Camera"},
-        ),
-    ] = 0.0
     overlays: tuple[Overlay, ...] = ()  # what lies over the scene
 
     # what was asked
@@ -271,7 +244,6 @@ class Session:
             latent_level=self.latent_level,
             split=self.split,
             splats=self.splats,
-            fade=self.fade,
             overlays=self.overlays,
             level=self.level,
             bookmarks=bookmarks,

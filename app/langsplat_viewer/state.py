@@ -23,7 +23,7 @@ from langsplat_core.scene import Camera, Scene
 from langsplat_core.scene.tree import Tree
 from langsplat_viewer.camera.controls import Extent, OrbitCamera
 from langsplat_viewer.camera.flight import Flight, Keyframe
-from langsplat_viewer.files.disk import Listing, Photograph
+from langsplat_viewer.files.disk import Listing
 from langsplat_viewer.files.preferences import Preferences
 from langsplat_viewer.marks import Marks, Measure, Mode, Stroke, Tool, unmarked
 from langsplat_viewer.rendering.request import EditedScene, Pane, RenderRequest, edited_scene, panes
@@ -90,8 +90,6 @@ class Recording:
     size: tuple[int, int] = (1280, 720)  # of films, and of images that are no screenshots, pixels
     fps: float = 30.0
     film_file: str = ""  # where the film goes; empty: a new name
-    path_file: str = ""  # where the path goes, and came from; empty: a new name
-    clipboard: str = ""  # put there at the next frame
 
 
 @lru_cache(maxsize=2)
@@ -255,8 +253,6 @@ class EditForm:
     scale: float = 1.0
     low: Point = (-1.0, -1.0, -1.0)  # two opposite corners of the box that is cropped to
     high: Point = (1.0, 1.0, 1.0)
-    clips: bool = False  # what lies outside it is hidden
-    clipped: tuple[Point, Point] | None = None  # the box that it was last done for
 
 
 # The state as one dataclass.
@@ -279,14 +275,12 @@ class SceneState:
     # what follows from the session
     opened: Scene | None = None  # the scene as its file has it, once something was transformed
     marks: Marks = field(default_factory=lambda: unmarked(0))
-    locked: Array = field(default_factory=lambda: np.zeros(0, bool))  # (N,) what tools leave alone
     answers: dict[str, QueryAnswer] = field(default_factory=dict)  # by phrase
 
     view: OrbitCamera | None = None
     glide: Glide | None = None
     opening_camera: Camera | None = None  # what R returns to, where that is not the scene's own choice
     camera_index: int | None = None  # training camera last jumped to
-    photograph: Photograph | None = None  # that was looked for last
     moving: tuple[Move, Scene] | None = None  # what a gizmo that is held does, and what is seen of it
     record: Recording = field(default_factory=Recording)
     hover: Hover | None = None
@@ -315,7 +309,7 @@ class SceneState:
 
     @property
     def has_unsaved_notes(self) -> bool:
-        """True where no project has the notes, names, groups and locks that there are."""
+        """True where no project has the notes and names that there are."""
         session, saved = self.session, self.saved
         return (session.things, session.notes) != (saved.things, saved.notes)
 

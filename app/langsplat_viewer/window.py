@@ -213,7 +213,7 @@ class Window:
         self._workspace = Workspace(request.settings, self.viewer)
         self._canvas: Canvas | None = None
         self._menu = outline.ThingsMenu()
-        self._photograph, self._evidence = ui.Picture(), ui.Picture()
+        self._evidence = ui.Picture()
         self._screen: moderngl.Framebuffer | None = None
         self._second: Canvas | None = None  # of the scene beside it
         self.unfinished = False  # a finer image is due
@@ -354,7 +354,6 @@ class Window:
         viewpoint.tick(viewer, imgui.get_time())
         opening.follow_beside(viewer)
         browsing.watch_training(viewer)
-        opening.fetch_photograph(viewer)
         navigation.muted_until_clicked(viewer)  # hello_imgui draws the panels after this
         self._hiding.apply(viewer)
         self._column.apply(viewer)
@@ -446,7 +445,6 @@ class Window:
         self._screen.use()
         self._screen.color_mask = True, True, True, True  # a mask left set would colour the panels
         overlays.draw_pictures(viewer, area, textures)
-        overlays.draw_photograph(viewer, area, self._photograph)
         overlays.draw_lines(viewer, area)
         state.timing.wanted = False  # the panel says so again, if it is still seen
 

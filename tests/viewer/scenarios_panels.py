@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from tests.support.windowless import answer, result
 
@@ -17,7 +16,7 @@ from langsplat_core.extensions.library import panel as library_panel
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_viewer import viewer as training
-from langsplat_viewer.actions import browsing, filming, opening, selecting, settings, viewpoint
+from langsplat_viewer.actions import browsing, filming, selecting, settings
 from langsplat_viewer.commands import COMMANDS
 from langsplat_viewer.files.preferences import with_recent
 from langsplat_viewer.files.projects import read_flight
@@ -43,36 +42,6 @@ def reload_what_changed(s: Any) -> None:
     assert not s.ctx.item_exists("//changed/Reload")
     hot = s.at(s.shot("reloaded"), CENTRES[0])
     assert hot[0] > hot[2] + 60
-
-
-def fade_in_a_photograph(s: Any) -> None:
-    """The slider lays it over the picture where the camera saw it; elsewhere there is none."""
-    viewer, folder = s.viewer, s.folder / "elsewhere"
-    folder.mkdir()
-    colours = np.full((240, 320, 3), (250, 120, 10), np.uint8)
-    colours[:, 160:] = (20, 60, 240)
-    Image.fromarray(colours).save(folder / "photo_1.png")
-    s.open_panel("Camera", frames=1)
-    viewpoint.go_to_camera(viewer, 1)
-    plain = s.shot("plain")
-    viewer.change(fade=1.0)
-    s.settle()
-    assert "no photograph 'photo_1'" in s.state.photograph.reason
-    assert (s.shot("none")[100:500, 400:] == plain[100:500, 400:]).all()
-    s.click("//Camera/Folder of photographs ...", frames=4)
-    s.click("//**/elsewhere\\/")
-    s.ctx.item_click("//**/Take this folder")
-    s.until(lambda: s.state.photograph.image is not None)
-    assert list(s.state.preferences.photographs.values()) == [str(folder.absolute())]
-    area, shot = scene_area(), s.shot("photograph")
-    middle, quarter = int(area.top + area.height / 2), int(area.width / 4)
-    left, right = (middle, int(area.left) + quarter), (middle, int(area.left) + 3 * quarter)
-    np.testing.assert_allclose([shot[left], shot[right]], [(250, 120, 10), (20, 60, 240)], atol=3)
-    assert (shot == plain)[int(area.top) + 30, left[1]].all()
-    viewer.change(fade=0.5)
-    np.testing.assert_allclose(s.shot("half")[left], (shot[left] + plain[left]) / 2, atol=4)
-    s.drag((600, 300), (656, 279))
-    assert opening.photograph_here(s.state) is None
 
 
 def see_the_evidence(s: Any) -> None:
@@ -105,9 +74,6 @@ def switch_between_scenes(s: Any) -> None:
     s.key("Ctrl+page_up", frames=1)
     s.shows("blobs.ply")
     assert s.state.view is view
-    s.key("Ctrl+O")
-    s.click("//**/Open all scenes here")
-    assert s.state.path.name == "blobs.ply"
 
 
 def search_a_library(s: Any) -> None:
@@ -201,11 +167,11 @@ def large_letters(s: Any) -> None:
 
 
 def use_the_outline(s: Any) -> None:
-    """Rows are clicked, hidden, locked and dragged onto each other; the menu of a thing names it."""
+    """Rows are clicked and hidden; the menu of a thing names it."""
     s.search("mug")
     s.open_panel("Outline", frames=1)
     s.until(lambda: s.state.outline is not None and len(s.state.outline.roots) > 0)
-    first, second = (row.node for row in s.state.outline.roots[:2])
+    first = s.state.outline.roots[0].node
     row = f"//**/node {first}/###"
     s.click(f"{row}row")
     chosen = s.state.marks.selected
@@ -213,15 +179,6 @@ def use_the_outline(s: Any) -> None:
     s.click(f"{row}eye")
     assert (s.state.marks.hidden == chosen).all()
     s.click(f"{row}eye")
-    s.click(f"{row}lock")
-    assert s.state.session.things.locked == {first}
-    s.ctx.item_drag_and_drop(f"{row}row", f"//**/node {second}/###row")
-    s.settle()
-    (group,) = s.state.session.things.groups
-    assert group.nodes == (second, first)
-    for _ in range(2):
-        s.key("Ctrl+Z")
-    assert (s.state.session.things.locked, s.state.session.things.groups) == (set(), ())
 
     use_the_outline_by_keys(s, first)
     s.key("R")
@@ -236,18 +193,18 @@ def use_the_outline(s: Any) -> None:
 
 
 def use_the_outline_by_keys(s: Any, node: int) -> None:
-    """From the filter down to a row: Enter looks at the thing, the menu key groups it."""
+    """From the filter down to a row: Enter looks at the thing, the menu key opens what can be done."""
     s.open_panel("Outline", frames=1)
     selecting.select_none(s.viewer)
     s.ctx.item_click("//**/##filter")
     s.key("down_arrow", frames=2)
     s.key("enter")
     assert (s.state.marks.selected == s.state.outline.tree.members(node)).all()
+    selecting.select_none(s.viewer)
     s.key("menu", frames=3)
-    s.key("up_arrow", frames=2)  # to the last
-    s.key("enter", frames=3)
-    assert [group.nodes for group in s.state.session.things.groups] == [(node,)]
-    s.key("Ctrl+Z")
+    s.key("down_arrow", frames=2)
+    s.key("enter")
+    assert (s.state.marks.selected == s.state.outline.tree.members(node)).all()
 
 
 # The panel "Record", bookmarks, sides.
@@ -297,7 +254,7 @@ def record_and_play(s: Any) -> None:
 
 
 def mark_and_return(s: Any) -> None:
-    """A bookmark by its key, the sides by theirs, the command on the clipboard."""
+    """A bookmark by its key, the sides by theirs."""
     s.key("Ctrl+B", frames=2)
     start = s.state.view
     s.key("keypad7")
@@ -309,8 +266,6 @@ def mark_and_return(s: Any) -> None:
     s.enter("by the key of k", frames=2)
     assert [mark.name for mark in s.state.session.bookmarks] == ["view 1", "by the key of k"]
     assert s.state.session.keyframes == ()
-    s.key("Ctrl+Shift+C", frames=3)
-    assert imgui.get_clipboard_text().startswith("langsplat-viewer ")
 
 
 # Keys, palette, toolbar, and where panels lie.
@@ -382,7 +337,7 @@ def use_shortcuts(s: Any) -> None:
 
 
 def use_the_toolbar(s: Any) -> None:
-    """Every icon does what its command does, and is lit where that is on; queries are combined by a menu."""
+    """Every icon does what its command does, and is lit where that is on."""
     labels = {row.does: button_label(row).replace("/", "\\/") for row in COMMANDS if row.icon}
     icons = {does: f"//toolbar/{label}" for does, label in labels.items()}
     for does, icon in icons.items():
@@ -393,11 +348,6 @@ def use_the_toolbar(s: Any) -> None:
     s.ctx.item_click(icons["select with no tool: the left button turns the view"])
     for phrase in ("mug", "book"):
         s.search(phrase)
-    s.ctx.item_click("//**/mug##phrase of list")
-    s.click("//Search/Combine", frames=2)
-    s.click("//$FOCUSED/or", frames=2)
-    s.click("//**/book##other")
-    assert [query.phrase for query in s.state.session.queries] == ["mug", "book", "mug or book"]
     s.click("//**/Fixed heat scale", frames=2)
     lows, highs = zip(*(found.heat_range for found in s.state.shown_results()), strict=True)
     assert s.state.session.picture.heat_scale == (min(lows), max(highs))

@@ -338,16 +338,14 @@ def drag_the_gizmo(s: Any) -> None:
     assert not s.state.is_unsaved
 
 
-def clip_and_brush(s: Any) -> None:
-    """A corner of the clipping box is dragged, and what it then leaves out is hidden; a drag over the
-    histogram of distances selects those between."""
+def crop_box_and_brush(s: Any) -> None:
+    """A corner of the box is dragged, and what lies outside is cropped; a drag over the histogram of
+    distances selects those between."""
     viewer = s.viewer
     s.open_panel("Transform", frames=1)
     editing.fill_box(viewer)
     s.ctx.yield_(2)
     s.ctx.item_click("//Transform/Box##gizmo")
-    s.click("//Transform/Clip")
-    assert s.state.marks.shown.all()
     form, means = s.state.edit_form, s.state.scene.gaussians.means
     middle = np.array(s.on_screen(np.mean([form.low, form.high], 0)))
     for corner in product(*zip(form.low, form.high, strict=True)):
@@ -357,11 +355,11 @@ def clip_and_brush(s: Any) -> None:
             break
     low, high = s.state.edit_form.low, s.state.edit_form.high
     inside = ((means >= low) & (means <= high)).all(1)
+    s.click("//Transform/Crop")
     np.testing.assert_array_equal(s.state.marks.shown, inside)
     assert 0 < inside.sum() < len(means)
-    s.ctx.item_click("//Transform/Clip")
+    s.key("Ctrl+Z")
     s.ctx.item_click("//Transform/No gizmo##gizmo")
-    assert s.state.marks.shown.all()
     brush_numbers(s)
 
 

@@ -53,7 +53,6 @@ def test_canvas_draws_only_changes_and_is_then_still(gl, shown):
     assert not canvas.update(shown.state, 0.0)
     assert sizes(renderer) == [(200, 120)]
     settings.set_picture(shown, replace(shown.state.session.picture, transparent=True))
-    shown.change(fade=0.5)
     for second in range(1, 5):
         assert not canvas.update(shown.state, float(second))
     assert (canvas.phase, sizes(renderer)) == ("still", [])

@@ -182,7 +182,6 @@ def test_film_of_nothing_is_refused(folder):
         (["--turntable", "3", "--fps", "0", "--out", "a.gif"], "--fps 0"),
         (["--turntable", "36000", "--fps", "240", "--out", "a.gif"], "lower --fps"),
         (["--turntable", "1", "--out", "blobs.ply/film"], "is a file"),
-        (["--colour", "1", "--colour", "1", "--query", "mug", "--out", "a.png"], "--colour 1"),
     ],
 )
 def test_impossible_options_are_one_line(viewer, folder, arguments, reason):

@@ -14,7 +14,6 @@ from langsplat_viewer.actions import browsing, editing, filming, opening, querie
 from langsplat_viewer.camera.controls import default_view, extent_of, orbit
 from langsplat_viewer.files.disk import MOST_LISTED, FolderEntry, Watch, list_folder, stamps
 from langsplat_viewer.options import say_compiling
-from langsplat_viewer.panels.files import has_several
 from langsplat_viewer.rendering.request import UNCLIPPED, Clip
 from tests.support.fakes import blob_scene
 from tests.support.windowless import SCENES, act, ask, errors, go, open_scene, result, settle
@@ -180,20 +179,6 @@ def test_scene_is_removed_from_the_list(three):
     assert three.visits == {}
     act(opening.step_scene, three, 1)
     assert three.state.path == BARE
-
-
-def test_folder_opens_all_its_scenes(viewer, tmp_path):
-    for name in ("blobs.ply", "plain.ply", "a.queries.json"):
-        (tmp_path / name).write_bytes(b"")
-    (tmp_path / "folder").mkdir()
-    viewer.state.browser = list_folder(tmp_path)
-    assert has_several(viewer.state.browser)
-    act(browsing.open_all, viewer)
-    assert viewer.state.browser is None
-    assert viewer.state.scenes == (tmp_path / "blobs.ply", tmp_path / "plain.ply")
-    assert viewer.state.path.name == "blobs.ply"
-    (tmp_path / "plain.ply").unlink()
-    assert not has_several(list_folder(tmp_path))
 
 
 # The file browser, without a window.

@@ -9,7 +9,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from langsplat_core.config import PictureConfig
 from langsplat_core.scene import LEVELS
 from langsplat_viewer.actions import filming, settings, viewpoint
-from langsplat_viewer.actions.opening import standing_at
 from langsplat_viewer.camera import controls
 from langsplat_viewer.camera.controls import OrbitCamera, from_side, spanning, with_projection
 from langsplat_viewer.camera.flight import Flight, Keyframe, camera_of, pose_at, pose_of
@@ -168,9 +167,6 @@ def test_moving_keeps_it(flat, move):
 def test_a_training_camera_is_seen_with_perspective(flat):
     go(viewpoint.go_to_camera, flat, 1)
     assert flat.state.view.orthographic is False
-    assert standing_at(flat.state) is not None
-    viewpoint.toggle_orthographic(flat)
-    assert standing_at(flat.state) is None  # its photograph would not fit
 
 
 def test_a_double_click_keeps_the_scale(flat):

@@ -1,4 +1,4 @@
-"""The outline: the tree in words, what is done with its rows, and what stays locked."""
+"""The outline: the tree in words, and what is done with its rows."""
 
 import json
 from dataclasses import replace
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from langsplat_viewer.actions import browsing, editing, opening, outline, projects, selecting, settings
+from langsplat_viewer.actions import browsing, editing, opening, outline, projects, settings
 from langsplat_viewer.actions.selecting import take
 from langsplat_viewer.session import Things
 from tests.support.fakes import CENTRES, blob_scene
@@ -76,28 +76,6 @@ def test_hidden_row_keeps_the_selection(outlined, nodes):
     assert outline.hidden_nodes(outlined)[mug]
 
 
-def test_locked_thing_is_left_alone(outlined, nodes):
-    mug = nodes[0]
-    take(outlined, blob("mug") | blob("book"))
-    outline.toggle_lock(outlined, mug)
-    assert marked(outlined)[0] == "book"
-    selecting.select_all(outlined)
-    assert marked(outlined)[0] == "book plant"
-    take(outlined, blob("book"))
-    selecting.isolate_selected(outlined)
-    assert marked(outlined)[1] == "plant"
-    selecting.show_hidden(outlined)
-    act(outline.hide, outlined, mug)
-    assert marked(outlined)[1] == ""
-    editing.fill_box(outlined)
-    editing.crop(outlined)
-    assert "mug" not in marked(outlined)[2]
-    editing.undo(outlined)
-    outline.toggle_lock(outlined, mug)
-    selecting.select_all(outlined)
-    assert marked(outlined)[0] == "mug book plant"
-
-
 def test_given_name_is_taught_and_filtered(outlined):
     mug = row_of(outlined, "mug")
     act(outline.give_name, outlined, mug.node, "  grandma's cup ")
@@ -108,8 +86,7 @@ def test_given_name_is_taught_and_filtered(outlined):
     assert [row.node for row in rows] == [mug.node]
     assert list(outline.filtered(outlined, outlined.state.outline.roots, "zebra")) == []
     book = row_of(outlined, "book").node
-    outline.toggle_lock(outlined, book)
-    act(outline.give_name, outlined, book, "the atlas")  # also of what no tool takes
+    act(outline.give_name, outlined, book, "the atlas")
     assert outlined.engine.taught.keys() == {"grandma's cup", "the atlas"}
     act(outline.give_name, outlined, book, "of")  # which names nothing
     assert outlined.state.session.things.names[book] == "the atlas"
@@ -118,80 +95,28 @@ def test_given_name_is_taught_and_filtered(outlined):
     assert errors(outlined) == []
 
 
-def test_groups_are_made_renamed_and_dissolved(outlined, nodes):
-    mug, book, plant = nodes
-    outline.group(outlined, mug, book)
-    (group,) = outlined.state.session.things.groups
-    assert group.nodes == (book, mug)
-    outline.group(outlined, plant, group)
-    outline.rename_group(outlined, outlined.state.session.things.groups[0], "on the table")
-    (group,) = outlined.state.session.things.groups
-    assert (group.name, group.nodes) == ("on the table", (book, mug, plant))
-    other = replace(group, name="other", nodes=(plant,))
-    outlined.put(things=Things(groups=(group, other)))
-    outline.rename_group(outlined, other, "on the table")
-    assert "already" in errors(outlined)[-1]
-    outlined.put(things=Things(groups=(group,)))
-    outline.select_group(outlined, group)
-    assert marked(outlined)[0] == "mug book plant"
-    outline.ungroup(outlined, mug)
-    assert outlined.state.session.things.groups[0].nodes == (book, plant)
-    editing.undo(outlined)
-    assert outlined.state.session.things.groups[0].nodes == (book, mug, plant)
-    for node in (mug, book, plant):
-        outline.ungroup(outlined, node)
-    assert outlined.state.session.things.groups == ()
-    outline.group(outlined, mug, None)
-    outline.group(outlined, mug, None)  # out of the first, which is then empty
-    assert [group.nodes for group in outlined.state.session.things.groups] == [(mug,)]
-    outline.ungroup(outlined, mug)
-    outline.group(outlined, mug, mug)
-    assert outlined.state.session.things.groups == ()
-
-
 @pytest.mark.parametrize("field", [True, False])
-def test_project_keeps_names_groups_and_locks_of_known_nodes(outlined, nodes, tmp_path, monkeypatch, field):
+def test_project_keeps_names_of_known_nodes(outlined, nodes, tmp_path, monkeypatch, field):
     """As after training anew, or for a scene whose field is gone."""
     monkeypatch.chdir(tmp_path)
     Path("tree.ply").touch()
-    mug, book, _ = nodes
-    outline.group(outlined, mug, book)
-    outline.toggle_lock(outlined, mug)
-    act(outline.give_name, outlined, book, "the atlas")
+    act(outline.give_name, outlined, nodes[1], "the atlas")
     things, path = outlined.state.session.things, projects.save_project(outlined, tmp_path)
     open_scene(outlined, "plain.ply")
     assert outlined.state.session.things != things
     act(browsing.open_project, outlined, path)
     assert outlined.state.session.things == things
-    selecting.select_all(outlined)
-    assert marked(outlined)[0] == "book plant"
     top = json.loads(path.read_text())
-    odd = [mug, 10**9, 10**9, mug]
-    groups = [{"name": "a", "nodes": odd}, {"name": "b", "nodes": [10**9]}]
-    names = {10**9: "ghost", mug: "cup"}
-    top["session"]["things"] = {"names": names, "groups": groups, "locked": odd}
+    top["session"]["things"]["names"][10**9] = "ghost"
     path.write_text(json.dumps(top))
     if not field:
         monkeypatch.setitem(SCENES, "tree.ply", replace(SCENES["tree.ply"], language=None))
     act(browsing.open_project, outlined, path)
-    things = outlined.state.session.things
-    selecting.select_all(outlined)
-    if field:
-        assert (things.names, things.locked, things.groups[0].nodes) == ({mug: "cup"}, {mug}, (mug,))
-        assert marked(outlined)[0] == "book plant"
-        outline.select_group(outlined, things.groups[0])
-    else:
-        assert things == Things()
-        assert marked(outlined)[0] == "mug book plant"
+    assert outlined.state.session.things == (things if field else Things())
 
 
-def test_retrained_scene_drops_unknown_locks(outlined, monkeypatch):
-    """Its tree is another: what was locked by the number of a node is not."""
-    outline.toggle_lock(outlined, row_of(outlined, "mug").node)
-    outlined.put(things=Things(locked=frozenset({10**6})))
-    act(opening.reload, outlined)
-    assert outlined.state.session.things.locked == frozenset()
-    outline.toggle_lock(outlined, 0)  # of another number of Gaussians
+def test_scene_of_other_gaussians_drops_names(outlined, monkeypatch):
+    outlined.put(things=Things({0: "cup"}))
     monkeypatch.setitem(SCENES, "tree.ply", with_tree(SCENES["tree.ply"].take(np.arange(300))))
     act(opening.reload, outlined)
     assert outlined.state.session.things == Things()

@@ -3,27 +3,22 @@
 import math
 from dataclasses import replace
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
-from langsplat_core.errors import InputError
 from langsplat_core.query import instances
 from langsplat_core.query.describe import Describer, look_at_pixel
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import look_at
-from langsplat_viewer.actions import browsing, opening, settings, viewpoint
+from langsplat_viewer.actions import settings, viewpoint
 from langsplat_viewer.camera import overlays
 from langsplat_viewer.camera.controls import default_view, extent_of, frame_of, from_side, orbit
 from langsplat_viewer.camera.overlays import FACES, PlacedText, face_at, facing, placed, visible_faces
-from langsplat_viewer.files.disk import LONGEST_SIDE, corners, find_photograph, read_photograph
-from langsplat_viewer.files.preferences import load_preferences, save_preferences
 from langsplat_viewer.panels.overlays import pointed_figures, said
 from tests.support.fakes import CENTRES, FakeEncoder, blob_scene, cameras
-from tests.support.windowless import act, ask, errors, go, open_scene, settle
+from tests.support.windowless import ask, errors, open_scene, settle
 
 SIZE = (120, 80)
 NEAR = 0.05
@@ -280,129 +275,3 @@ def test_tooltip_disappears_when_mouse_or_camera_moves(pointing):
     viewpoint.toggle_pointing(pointing)
     assert not pointing.state.pointing
     assert "langsplat train" in errors(pointing)[-1]
-
-
-# The photograph of a training camera, without a window.
-
-CAMERA = cameras()[0]  # of 160 x 120 pixels
-
-
-def photograph(path: Path, size=(160, 120), **options) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.new("RGB", size, (200, 100, 50)).save(path, **options)
-    return path
-
-
-@pytest.mark.parametrize("place", ["scene/images", "scene", "images", "."])
-def test_photograph_is_found_in_the_usual_folders(tmp_path, place):
-    wanted = photograph(tmp_path / place / "photo_0.JPG")
-    photograph(tmp_path / place / "photo_01.jpg")
-    assert find_photograph("photo_0", tmp_path / "scene.ply", "") == wanted
-    chosen = photograph(tmp_path / "photos" / "left" / "photo_0.png")
-    for name in ("photo_0", "left/photo_0", "left_photo_0"):  # in a chosen folder and those in it
-        assert find_photograph(name, tmp_path / "scene.ply", str(tmp_path / "photos")) == chosen
-
-
-@pytest.mark.parametrize("folder", ["", "away", "file.txt"])
-def test_where_there_is_none_the_reason_says_where_it_was_looked_for(tmp_path, folder):
-    (tmp_path / "file.txt").write_text("b")
-    (tmp_path / "b.txt").write_text("no photograph")
-    chosen = str(tmp_path / folder) if folder else ""
-    with pytest.raises(InputError, match="no photograph 'b' in ") as caught:
-        find_photograph("b", tmp_path / "scene.ply", chosen)
-    assert str(tmp_path) in str(caught.value)
-    with pytest.raises(InputError, match="does not name"):
-        find_photograph("", tmp_path / "scene.ply", chosen)
-
-
-def test_photograph_is_shrunk_turned_or_refused(tmp_path):
-    image = read_photograph(photograph(tmp_path / "a.jpg", (4000, 3000)), CAMERA)
-    assert image.shape == (LONGEST_SIDE * 3 // 4, LONGEST_SIDE, 3)
-    np.testing.assert_allclose(image.mean((0, 1)), (200, 100, 50), atol=2)
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    assert read_photograph(photograph(tmp_path / "a.jpg", (120, 160), exif=exif), CAMERA).shape == (
-        120,
-        160,
-        3,
-    )
-    kept = replace(CAMERA, width=120, height=160)
-    assert read_photograph(tmp_path / "a.jpg", kept).shape == (160, 120, 3)  # it fits as it is
-    with pytest.raises(InputError, match="100x100 pixels, its camera 160x120"):
-        read_photograph(photograph(tmp_path / "a.png", (100, 100)), CAMERA)
-    (tmp_path / "b.png").write_bytes(b"no picture")
-    with pytest.raises(InputError, match=r"b\.png"):
-        read_photograph(tmp_path / "b.png", CAMERA)
-
-
-@pytest.mark.parametrize("mode", ["L", "RGBA", "P", "I;16"])
-def test_every_kind_of_pixel_becomes_three_bytes(tmp_path, mode):
-    if mode == "I;16":
-        picture = Image.fromarray(np.full((120, 160), 200 * 256, np.uint16))
-    else:
-        picture = Image.fromarray(np.full((120, 160), 200, np.uint8)).convert(mode)
-    picture.save(tmp_path / "a.png")
-    image = read_photograph(tmp_path / "a.png", CAMERA)
-    assert (image.shape, image.dtype) == ((120, 160, 3), np.uint8)
-    np.testing.assert_allclose(image, 200, atol=1)
-
-
-def test_photograph_lies_where_its_camera_saw_it(opened):
-    go(viewpoint.go_to_camera, opened, 1)
-    camera = opened.state.scene.cameras[1]
-    shown = opened.state.view.camera(500, 300)
-    left, top, right, bottom = corners(camera, shown)
-    point = np.array([[0.3, 0.2, 0.1]])
-    (there,), _ = camera.project(point)
-    (here,), _ = shown.project(point)
-    place = (left + there[0] * (right - left) / 160, top + there[1] * (bottom - top) / 120)
-    np.testing.assert_allclose(place, here, atol=1e-6)
-    assert bottom - top == pytest.approx(300)
-
-
-@pytest.fixture
-def beside_photograph(opened, tmp_path):
-    """A scene that lies beside the photograph of its second camera."""
-    opened.state.path = tmp_path / "blobs.ply"
-    photograph(tmp_path / "images" / "photo_1.png")
-    return opened
-
-
-def stand(viewer, index: int) -> None:
-    go(viewpoint.go_to_camera, viewer, index)
-    act(opening.fetch_photograph, viewer)
-
-
-def test_photograph_is_read_when_its_camera_is_shown(beside_photograph):
-    stand(beside_photograph, 1)
-    assert beside_photograph.state.photograph is None
-    beside_photograph.change(fade=1.0)
-    stand(beside_photograph, 1)
-    found = opening.photograph_here(beside_photograph.state)
-    assert found.image.shape == (120, 160, 3)
-    stand(beside_photograph, 1)
-    assert opening.photograph_here(beside_photograph.state) is found  # not read again
-    viewpoint.zoom_by(beside_photograph, 1.1)
-    assert opening.photograph_here(beside_photograph.state) is None
-    stand(beside_photograph, 2)
-    here = opening.photograph_here(beside_photograph.state)
-    assert here.image is None
-    assert "no photograph 'photo_2'" in here.reason
-
-
-def test_a_chosen_folder_is_looked_into_and_remembered(beside_photograph, tmp_path):
-    photograph(tmp_path / "away" / "deep" / "photo_2.jpg")
-    beside_photograph.change(fade=1.0)
-    stand(beside_photograph, 2)
-    browsing.ask_for_photographs(beside_photograph)
-    assert beside_photograph.state.picks_folder
-    browsing.choose_folder(beside_photograph, tmp_path / "away")
-    assert beside_photograph.state.browser is None
-    stand(beside_photograph, 2)
-    assert opening.photograph_here(beside_photograph.state).image.shape == (120, 160, 3)
-    save_preferences(tmp_path / "settings", beside_photograph.state.preferences)
-    assert load_preferences(tmp_path / "settings").photographs == {
-        str(tmp_path / "blobs.ply"): str(tmp_path / "away")
-    }
-    browsing.ask_for_file(beside_photograph)
-    assert not beside_photograph.state.picks_folder

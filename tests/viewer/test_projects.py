@@ -28,7 +28,7 @@ from langsplat_viewer.camera.controls import orbit
 from langsplat_viewer.files.preferences import Preferences, load_preferences
 from langsplat_viewer.files.projects import Shelf, read_flight, read_project, read_queries
 from langsplat_viewer.rendering.request import Clip
-from langsplat_viewer.session import NodeGroup, Note, Query, Things
+from langsplat_viewer.session import Note, Query, Things
 from langsplat_viewer.viewer import Services, Viewer
 from tests.support.fakes import CENTRES, FakeEncoder
 from tests.support.windowless import SCENES, FakeSurface, act, ask, blob, errors, load, marked, result
@@ -138,7 +138,7 @@ def test_project_of_version_1_opens_and_means_the_same(viewer, tmp_path, monkeyp
     path.write_bytes((SAVED / path.name).read_bytes())
     settings.toggle_overlay(viewer, "grid")
     act(browsing.open_file, viewer, path)
-    assert errors(viewer) == []
+    assert errors(viewer) == ["groups and locks of the outline are left out: this version has none"]
     state, session = viewer.state, viewer.state.session
     assert session.queries == (
         Query("mug"),
@@ -163,9 +163,7 @@ def test_project_of_version_1_opens_and_means_the_same(viewer, tmp_path, monkeyp
 
 def test_other_files_of_version_1_open_and_mean_the_same(viewer):
     project = read_project(SAVED / "version1.langsplat")
-    assert project.session.things == Things(
-        {3: "the atlas"}, (NodeGroup("on the table", (1, 2)),), frozenset({4})
-    )
+    assert project.session.things == Things({3: "the atlas"})
     asked = read_queries(SAVED / "version1.queries.json")
     assert [(q.phrase, q.cut, q.shown) for q in asked.queries][1:3] == [
         ("book", 0.6, True),
@@ -186,7 +184,6 @@ def test_other_files_of_version_1_open_and_mean_the_same(viewer):
         ("Search", "Notes"),
         "viridis",
         ("things", "grid"),
-        {"/scenes/blobs.ply": "/photographs"},
     )
 
 
@@ -225,7 +222,6 @@ def test_project_with_impossible_values_is_refused(saved):
     packed = [b64encode(content).decode() for content in raw]
     changes = [
         *({"marks": {"hidden": bits}} for bits in ("&&&", *packed, 7)),
-        {"things": {"groups": [{"name": "a", "nodes": [1]}] * 2}},
         {"clip": {"near": 2.0, "far": 1.0}},
         {"picture": {"heat_scale": [0.9, 0.1]}},
         {"picture": {"dim": 7.0}},

@@ -122,17 +122,6 @@ def test_fourth_query_takes_the_colour_of_the_oldest(opened):
     assert phrases(opened) == ["book", "plant", "mug or book"]
 
 
-def test_queries_are_combined_by_the_grammar(opened):
-    ask(opened, "mug", "book")
-    for join in queries.JOINS:
-        queries.ask_combined(opened, "mug", join, "book")
-    settle(opened)
-    mug, _, both, either, only = (result(opened, place) for place in range(5))
-    assert [found.found for found in (both, either, only)] == [True] * 3
-    assert either.members.sum() == 240 > only.members.sum() == 120
-    assert (only.members == mug.members).all()
-
-
 def test_search_box_takes_the_keyboard_once(opened):
     opened.state.show_panel = False
     queries.focus_search(opened)

@@ -1,7 +1,5 @@
-"""Camera paths, films, saved images and commands, as actions of the window."""
+"""Camera paths, films and saved images, as actions of the window."""
 
-import shlex
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,18 +7,14 @@ import pytest
 from numpy.testing import assert_allclose
 from PIL import Image
 
-from langsplat_core.config import PictureConfig
 from langsplat_core.io.cameras import read_cameras
-from langsplat_core.io.scenes import save_scene
 from langsplat_viewer import output
-from langsplat_viewer.actions import browsing, editing, filming, queries, settings, viewpoint
+from langsplat_viewer.actions import browsing, editing, filming, queries, viewpoint
 from langsplat_viewer.camera.controls import orbit, zoom
 from langsplat_viewer.files.projects import read_flight
 from langsplat_viewer.rendering.renderer import render_image
-from langsplat_viewer.rendering.request import Clip, Splats
 from langsplat_viewer.viewer import Viewer
-from tests.support.fakes import blob_scene
-from tests.support.windowless import act, ask, errors, open_scene, recorded, result
+from tests.support.windowless import errors, open_scene, recorded
 
 
 def turn(viewer: Viewer, yaw: float) -> None:
@@ -131,8 +125,7 @@ def test_a_path_is_saved_loaded_and_dropped(opened, folder):
     assert times(opened) == [0, 2, 4]
     assert opened.state.wanted_panel == "Record"
     (folder / "bad.path.json").write_text("{}")
-    opened.state.record.path_file = "bad.path.json"
-    filming.load_path_file(opened, folder)
+    filming.load_path(opened, folder / "bad.path.json")
     assert "no camera path" in errors(opened)[-1]
     assert times(opened) == [0, 2, 4]
     filming.set_film_size(opened, 640, 0)
@@ -145,12 +138,11 @@ def test_impossible_recordings_are_refused_in_a_line(viewer, opened, folder):
     viewpoint.toggle_playing(opened)
     filming.save_film(opened, folder)
     filming.save_path(opened, folder)
-    filming.load_path_file(opened, folder)
     record_three(opened)
     opened.state.record.film_file = "film.avi"
     filming.save_film(opened, folder)
-    wanted = ["two keyframes", "needs a path", "needs a keyframe", "type the name", "a film is .mp4"]
-    assert [reason in text for reason, text in zip(wanted, errors(opened), strict=True)] == [True] * 5
+    wanted = ["two keyframes", "needs a path", "needs a keyframe", "a film is .mp4"]
+    assert [reason in text for reason, text in zip(wanted, errors(opened), strict=True)] == [True] * 4
     assert list(folder.iterdir()) == []
 
 
@@ -179,81 +171,6 @@ def test_a_film_can_be_stopped(opened, folder):
     opened.recorder.close(10.0)
     assert len(list(folder.glob("blobs-film-001/*.png"))) < 121
     assert not list(folder.glob("**/.*"))
-
-
-def see_depth(viewer) -> None:
-    settings.set_display(viewer, "depth")
-    settings.set_colour_map(viewer, "viridis")
-
-
-def cut_by_hand(viewer) -> None:
-    settings.set_display(viewer, "segmentation")
-    found = result(viewer, 1)
-    queries.set_cut(viewer, found.phrase, float(np.median(found.even[found.members])))
-
-
-def look_flat(viewer) -> None:
-    """In a tall window, and with a cut, which counts from the eye."""
-    settings.resize(viewer, 130, 200)
-    viewpoint.toggle_orthographic(viewer)
-    viewpoint.zoom_by(viewer, 0.8)
-    settings.set_clip(viewer, Clip(3.9, 4.3))
-
-
-SLIDERS = PictureConfig(display="relevancy", heat_opacity=0.3, dim=0.9)
-LOOKS = {  # whether after a search, and what is set then
-    "training camera": (False, lambda viewer: None),
-    "elsewhere": (False, lambda viewer: turn(viewer, 0.2)),
-    "orthographic": (False, look_flat),
-    "depth": (False, see_depth),
-    "clip": (False, lambda viewer: settings.set_clip(viewer, Clip(4.4, 5.1))),
-    "latent": (False, lambda viewer: settings.set_display(viewer, "latent", 1)),
-    "queries": (True, lambda viewer: None),
-    "colours": (True, lambda viewer: queries.hide(viewer, viewer.state.session.queries[0])),
-    "sliders": (True, lambda viewer: settings.set_picture(viewer, SLIDERS)),
-    "scale": (True, lambda viewer: settings.set_picture(viewer, replace(SLIDERS, heat_scale=(0.4, 0.9)))),
-    "cuts": (True, cut_by_hand),
-    "canonical": (True, lambda viewer: act(queries.set_canonical, viewer, ("book", "plant"))),
-}
-
-
-@pytest.mark.parametrize("case", LOOKS)
-def test_the_command_on_the_clipboard_draws_the_same_picture(opened, folder, run_viewer, case):
-    path = folder / "with a space" / "blobs.ply"
-    save_scene(path, blob_scene(phrasebook=True))
-    opened.state.path = path
-    settings.resize(opened, 200, 130)
-    searched, set_it = LOOKS[case]
-    if case != "training camera":
-        turn(opened, 0.2)
-    if searched:
-        ask(opened, "mug", "plant", "book")
-    set_it(opened)
-    command = filming.copy_command(opened, folder)
-    assert [
-        settings.take(opened.state.record, "clipboard"),
-        settings.take(opened.state.record, "clipboard"),
-    ] == [command, ""]
-    written = [path.suffix for path in folder.iterdir() if path.is_file()]
-    assert written == ([] if case == "training camera" else [".json"])
-    expected = render_image(opened.state.request(), "cpu")
-    words = shlex.split(command)
-    code, _, problems = run_viewer(*words[1:], "--backend", "cpu")
-    assert (code, problems) == (0, [])
-    image = np.asarray(Image.open(words[words.index("--out") + 1]))
-    assert_allclose(image.astype(int), expected.astype(int), atol=2)
-    assert expected.std() > 5
-    assert errors(opened) == []
-
-
-def test_copied_command_names_what_it_lacks(opened, folder):
-    opened.change(splats=Splats(0.5))
-    settings.toggle_wipe(opened)
-    filming.copy_command(opened, folder)
-    (said,) = errors(opened)
-    assert "the size of splats" in said
-    assert "the picture beside it" in said
-    assert "backdrop" not in said
 
 
 # Images and views to files.

@@ -152,7 +152,6 @@ UNSEEN = {
     "tool": lambda v: selecting.use_tool(v, "brush"),
     "word": lambda v: setattr(v.state, "typed", "plant"),
     "chosen query": lambda v: v.put(chosen=""),
-    "photograph": lambda v: v.change(fade=0.5),
     "saved without background": lambda v: settings.set_picture(
         v, replace(v.state.session.picture, transparent=True)
     ),

@@ -138,27 +138,9 @@ def test_cropping_keeps_earlier_deletions(opened):
     chosen = selected_mug(opened)
     selecting.delete_selected(opened)
     selecting.select_all(opened)
-    opened.state.edit_form = EditForm(low=(-50.0, -50, -50), high=(50.0, 50, 50))
+    editing.set_box(opened, (-50.0, -50, -50), (50.0, 50, 50))
     editing.crop(opened)
     np.testing.assert_array_equal(opened.state.marks.deleted, chosen)
-
-
-def test_clip_follows_its_box_and_is_undone(opened):
-    chosen = selected_mug(opened)
-    editing.fill_box(opened)
-    editing.clip(opened, True)
-    marks = opened.state.marks
-    assert marks.shown[chosen].all()
-    assert 0 < marks.hidden.sum() < len(chosen)
-    assert not marks.deleted.any()
-    editing.set_box(opened, (-9.0, -9.0, -9.0), (9.0, 9.0, 9.0))
-    editing.follow_box(opened)
-    assert opened.state.marks.shown.all()
-    editing.undo(opened)
-    editing.follow_box(opened)  # the box has not moved since: nothing is hidden or shown again
-    assert opened.state.marks.hidden.any()
-    editing.clip(opened, False)
-    assert opened.state.marks.shown.all()
 
 
 def test_panel_numbers_transform_about_the_middle(opened):

@@ -105,7 +105,6 @@ SETTINGS = {
     "cut": lambda v: settings.set_clip(v, Clip(1.0, 2.0)),
     "overlay": lambda v: settings.toggle_overlay(v, "grid"),
     "backdrop": lambda v: settings.set_picture(v, replace(v.state.session.picture, transparent=True)),
-    "photograph": lambda v: v.change(fade=0.5),
     "latents": lambda v: settings.set_display(v, "latent", 1),
 }
 

@@ -19,8 +19,8 @@ SCENARIOS = [
     "look_at_nothing", "look_from_the_broad_side", "record_and_play", "mark_and_return",
     "close_while_opening", "split_the_view", "draw_over_the_scene", "look_without_perspective",
     "name_what_is_close", "reload_what_changed", "watch_a_training", "switch_between_scenes",
-    "search_a_library", "time_the_steps", "fade_in_a_photograph", "see_the_evidence", "large_letters",
-    "use_the_toolbar", "clip_and_brush", "pin_a_note", "use_the_outline", "compare_two_scenes",
+    "search_a_library", "time_the_steps", "see_the_evidence", "large_letters",
+    "use_the_toolbar", "crop_box_and_brush", "pin_a_note", "use_the_outline", "compare_two_scenes",
 ]  # fmt: skip
 
 

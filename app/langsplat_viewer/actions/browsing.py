@@ -12,18 +12,11 @@ from langsplat_core.io.scenes import format_of
 from langsplat_core.pipeline.report import work_folder
 from langsplat_viewer.actions import projects
 from langsplat_viewer.actions.filming import load_path
-from langsplat_viewer.actions.opening import (
-    add_scenes,
-    open_beside,
-    open_scene,
-    photograph_folder,
-    reload,
-)
+from langsplat_viewer.actions.opening import add_scenes, open_beside, open_scene, reload
 from langsplat_viewer.actions.queries import load_queries
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.files import disk
 from langsplat_viewer.files.disk import FolderEntry, Stamps, list_folder
-from langsplat_viewer.files.preferences import with_photographs
 from langsplat_viewer.files.projects import PATHS, PROJECTS, QUERIES, read_project, scene_of
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.state import FolderChoice
@@ -140,18 +133,6 @@ def choose_photographs(viewer: Viewer, folder: Path) -> None:
     viewer.state.training_form = replace(form, dataset=str(folder), out=out)
 
 
-def open_all(viewer: Viewer) -> None:
-    """List the scenes of the folder that the browser shows, and open the first."""
-    listing = viewer.state.browser
-    if listing is not None:
-        paths = [entry.path for entry in listing.entries if entry.is_file and format_of(entry.path)]
-        if paths:
-            add_scenes(viewer, paths)
-            viewer.state.browser = None
-            open_scene(viewer, paths[0])
-        open_panel(viewer, "Scene")
-
-
 def _ask_sets(viewer: Viewer, sets: Sequence[Path]) -> None:
     for path in sets:
         open_file(viewer, path)
@@ -177,20 +158,6 @@ def _is_plain_folder(path: Path) -> bool:
         return path.is_dir() and format_of(path) is None
     except OSError:  # a name that no file system takes: opening it says so
         return False
-
-
-def ask_for_photographs(viewer: Viewer) -> None:
-    """Open the browser to choose the folder that has the photographs of the scene."""
-    state = viewer.state
-    if state.path is not None:
-        browse(viewer, Path(photograph_folder(viewer) or state.path.parent).absolute())
-        state.picks_folder = FolderChoice("Folder of the photographs", _take_photographs)
-
-
-def _take_photographs(viewer: Viewer, folder: Path) -> None:
-    state = viewer.state
-    if state.path is not None:
-        state.preferences = with_photographs(state.preferences, state.path.absolute(), folder.absolute())
 
 
 # Training a scene from photographs, in a process of its own.

@@ -13,9 +13,8 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import LangSplatError
 from langsplat_core.query.selection import in_box
 from langsplat_core.scene.transform import AXES, Similarity, moving, rotating, scaling
-from langsplat_viewer.actions.outline import apply_locks
 from langsplat_viewer.actions.queries import ask_again, ask_unanswered, forget_unlisted, set_canonical
-from langsplat_viewer.actions.selecting import has_scene, mark, set_tools, show_hidden
+from langsplat_viewer.actions.selecting import has_scene, mark, set_tools
 from langsplat_viewer.camera.controls import extent_of
 from langsplat_viewer.session import Move, Point, Session, pack
 from langsplat_viewer.state import EditForm, Gizmo
@@ -126,7 +125,6 @@ def fill_box(viewer: Viewer) -> None:
         means = state.scene.gaussians.means[chosen].astype(np.float64)
         low, high = (tuple(corner.tolist()) for corner in (means.min(0), means.max(0)))
         viewer.state.edit_form = replace(state.edit_form, low=low, high=high)
-        follow_box(viewer)
 
 
 def set_box(viewer: Viewer, low: Point, high: Point) -> None:
@@ -135,12 +133,12 @@ def set_box(viewer: Viewer, low: Point, high: Point) -> None:
 
 
 def _inside(viewer: Viewer) -> Array | None:
-    """(N,) what lies inside the box, or is locked; None, and said why, where that is nothing."""
+    """(N,) what lies inside the box; None, and said why, where that is nothing."""
     state, form = viewer.state, viewer.state.edit_form
     if not has_scene(viewer) or state.scene is None:
         return None
     corners = np.array([form.low, form.high])
-    inside = in_box(state.scene.gaussians.means, corners.min(0), corners.max(0)) | state.locked
+    inside = in_box(state.scene.gaussians.means, corners.min(0), corners.max(0))
     if not (inside & state.marks.kept).any():
         viewer.say_error("the box holds nothing: set its corners around something, or press Fit")
         return None
@@ -152,26 +150,6 @@ def crop(viewer: Viewer) -> None:
     inside, marks = _inside(viewer), viewer.state.marks
     if inside is not None:
         mark(viewer, replace(marks, selected=marks.selected & inside, deleted=marks.deleted | ~inside))
-
-
-def clip(viewer: Viewer, on: bool) -> None:
-    """Hide what lies outside the box from now on, or show again all that is hidden."""
-    viewer.state.edit_form = replace(viewer.state.edit_form, clips=on, clipped=None)
-    if on:
-        follow_box(viewer)
-    else:
-        show_hidden(viewer)
-
-
-def follow_box(viewer: Viewer) -> None:
-    """Hide what lies outside the box where it clips and has changed."""
-    form, marks = viewer.state.edit_form, viewer.state.marks
-    if not form.clips or viewer.state.scene is None or form.clipped == (form.low, form.high):
-        return
-    viewer.state.edit_form = replace(form, clipped=(form.low, form.high))
-    inside = _inside(viewer)
-    if inside is not None:
-        mark(viewer, replace(marks, selected=marks.selected & inside, hidden=marks.kept & ~inside))
 
 
 # Undo and redo. The camera is not undone: its reset leads back.
@@ -199,7 +177,7 @@ def _step(viewer: Viewer, there: list[Session], back: list[Session], otherwise: 
 def adopt(viewer: Viewer, session: Session) -> None:
     """Take another session of the scene that is shown.
 
-    What follows from it is brought in line: masks, locks, the transformed scene, answers. Raises InputError
+    What follows from it is brought in line: masks, the transformed scene, answers. Raises InputError
     where a transform leads too far.
     """
     state, before = viewer.state, viewer.state.session
@@ -208,8 +186,6 @@ def adopt(viewer: Viewer, session: Session) -> None:
     state.marks = session.marks.masks(before.marks, state.marks)
     state.session = replace(session, canonical=before.canonical)  # until the engine compares with others
     forget_unlisted(viewer)
-    if session.things.locked != before.things.locked:
-        apply_locks(viewer)
     if session.moves != before.moves:
         viewer.put(canonical=session.canonical)
         place(viewer)

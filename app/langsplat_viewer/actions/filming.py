@@ -1,24 +1,15 @@
-"""The camera path and its keyframes; films, images of any size, and images as commands."""
+"""The camera path and its keyframes; films, and images of any size."""
 
-import math
-import os
-import shlex
-import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
-from langsplat_core.config import PictureConfig
-from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.errors import InputError, LangSplatError
 from langsplat_core.io.cameras import write_cameras
 from langsplat_core.progress import Progress
-from langsplat_core.scene import LEVELS
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.actions.viewpoint import glide_to, leave_path, path_seconds
-from langsplat_viewer.camera.controls import from_camera, with_projection
+from langsplat_viewer.camera.controls import with_projection
 from langsplat_viewer.camera.flight import (
     LONGEST,
     SAME_TIME,
@@ -44,8 +35,7 @@ from langsplat_viewer.output import (
     save_png,
 )
 from langsplat_viewer.rendering.renderer import open_renderer
-from langsplat_viewer.rendering.request import Splats
-from langsplat_viewer.state import SPACING, ViewerState, flight_of
+from langsplat_viewer.state import SPACING, flight_of
 from langsplat_viewer.viewer import Viewer
 
 
@@ -160,18 +150,14 @@ def set_turning(viewer: Viewer, turns: bool) -> None:
 
 
 def save_path(viewer: Viewer, folder: Path = Path()) -> Path | None:
-    """Save the path to the typed file, or to a new one in `folder`; None where that failed."""
-    state, record = viewer.state, viewer.state.record
+    """Save the path to a new file in `folder`; None where that failed."""
+    state = viewer.state
     if not state.session.keyframes:
         viewer.say_error("a path to save needs a keyframe: add one at the current view")
         return None
-    stem = state.path.stem if state.path else "camera"
-    typed = record.path_file.strip()
-    path = folder.absolute() / typed if typed else free_name(folder, stem, PATHS)
+    path = free_name(folder, state.path.stem if state.path else "camera", PATHS)
     more = "; langsplat-viewer --headless --path makes a film of it"
-    saved = viewer.save(path, lambda: write_flight(path, flight_of(state.session.keyframes)), more)
-    record.path_file = record.path_file if saved is None else str(path)
-    return saved
+    return viewer.save(path, lambda: write_flight(path, flight_of(state.session.keyframes)), more)
 
 
 def load_path(viewer: Viewer, path: Path) -> None:
@@ -184,21 +170,12 @@ def load_path(viewer: Viewer, path: Path) -> None:
     record = viewer.state.record
     record.turns = False
     _set(viewer, flight.keyframes, None)
-    record.at, record.path_file = 0.0, str(path)
+    record.at = 0.0
     open_panel(viewer, "Record")
     viewer.state.say(f"{path.name}: {len(flight.keyframes)} keyframes, {flight.seconds:.1f} s")
 
 
-def load_path_file(viewer: Viewer, folder: Path = Path()) -> None:
-    """Take the path of the file that the panel names."""
-    typed = viewer.state.record.path_file.strip()
-    if typed:
-        load_path(viewer, folder.absolute() / typed)
-    else:
-        viewer.say_error("type the name of a file with a path first")
-
-
-# Films and images of any size, drawn by the CPU on a thread of their own; images as commands.
+# Films and images of any size, drawn by the CPU on a thread of their own.
 
 
 def set_film_size(viewer: Viewer, width: int, height: int) -> None:
@@ -275,95 +252,3 @@ def cancel_film(viewer: Viewer) -> None:
 
 def _submit(viewer: Viewer, label: str, work: Callable[[Progress], str]) -> None:
     viewer.recorder.submit(label, work, viewer.state.say, viewer.say_error)
-
-
-def copy_command(viewer: Viewer, folder: Path = Path()) -> str:
-    """Put the command that draws this image without a window on the clipboard, and return it.
-
-    "" where that failed. A view that is no training camera's is saved to a file in `folder` first.
-    """
-    state = viewer.state
-    if state.view is None or state.path is None:
-        viewer.say_error("open a scene first, then copy the command of its picture")
-        return ""
-    camera = _training_camera(state)
-    if camera is None:
-        saved = save_view(viewer, folder)
-        if saved is None:
-            return ""
-        camera = str(saved.absolute())
-    words = ["langsplat-viewer", str(state.path.absolute()), "--headless", "--camera", camera]
-    if state.view.orthographic:
-        words += ["--orthographic", repr(float(state.view.span_in(*state.size)))]
-    words += ["--size", "{}x{}".format(*state.size), *_display_words(state), *_look_words(state)]
-    if viewer.services.encoder_id:
-        words += ["--encoder", viewer.services.encoder_id]
-    words += ["--out", f"{state.path.stem}.png"]
-    state.record.clipboard = subprocess.list2cmdline(words) if os.name == "nt" else shlex.join(words)
-    state.say(f"on the clipboard: {state.record.clipboard}")
-    return state.record.clipboard
-
-
-def _training_camera(state: ViewerState) -> str | None:
-    """Return the number of the training camera whose view it is, exactly, with perspective or without."""
-    if state.view is None or state.scene is None or state.extent is None:
-        return None
-    here = with_projection(state.view, orthographic=False).camera(*state.size)
-    for number, own in enumerate(state.scene.cameras):
-        there = from_camera(own, state.extent).camera(*state.size)
-        same = np.allclose(there.world_to_camera, here.world_to_camera, rtol=0, atol=1e-9)
-        if same and there.intrinsics == here.intrinsics:
-            return str(number)
-    return None
-
-
-def _display_words(state: ViewerState) -> list[str]:
-    """Return what is shown as options; queries only where the display shows them."""
-    row, picture = DISPLAYS[state.session.picture.display], state.session.picture
-    words = ["--display", picture.display]
-    if row.by_level:
-        words += ["--level", LEVELS[state.session.latent_level]]
-    shown = [(slot, query) for slot, query in enumerate(state.shown()) if query is not None]
-    if not row.needs_query:
-        return words
-    if not shown:  # as the window shows it: plain colours
-        return ["--display", "rgb"]
-    words += ["--level", state.session.level]
-    for slot, query in shown:
-        words += ["--query", query.phrase, "--colour", str(slot + 1)]
-    for option, value, usual in (
-        ("--heat-opacity", picture.heat_opacity, PictureConfig.heat_opacity),
-        ("--dim", picture.dim, PictureConfig.dim),
-    ):
-        if value != usual:
-            words += [option, repr(value)]
-    if picture.heat_scale is not None:
-        words += ["--heat-scale", *map(repr, picture.heat_scale)]
-    if any(query.cut is not None for _, query in shown):
-        words += [word for _, query in shown for word in ("--cut", repr(float(query.cut or 0.0)))]
-    if state.session.canonical:
-        words += ["--canonical", ", ".join(state.session.canonical)]
-    return words
-
-
-def _look_words(state: ViewerState) -> list[str]:
-    """Return how it is shown as options; say what has none."""
-    clip, picture = state.session.clip, state.session.picture
-    words = []
-    if picture.colour_map != PictureConfig.colour_map:
-        words += ["--colour-map", picture.colour_map]
-    if clip.near > 0:
-        words += ["--near-cut", repr(clip.near)]
-    if not math.isinf(clip.far):
-        words += ["--far-cut", repr(clip.far)]
-    marks = state.marks
-    left_out = {
-        "what is hidden or selected": not marks.shown.all() or bool(marks.selected.any()),
-        "the size of splats and their SH degree": state.session.splats != Splats(),
-        "the backdrop": picture.background != PictureConfig.background,
-        "the picture beside it": state.session.split.mode != "off",
-    }
-    names = ", ".join(name for name, is_there in left_out.items() if is_there)
-    if names:
-        state.say(f"no option of the command says {names}: it draws without", is_error=True)
-    return words

@@ -1,4 +1,4 @@
-"""Opening scenes: read, shown, listed, returned to; their photographs; a second scene beside the first."""
+"""Opening scenes: read, shown, listed, returned to; a second scene beside the first."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from langsplat_core.arrays import Array
 from langsplat_core.compiled import is_compiled
 from langsplat_core.display.displays import DISPLAYS, latent_colours
 from langsplat_core.errors import InputError
@@ -14,15 +13,14 @@ from langsplat_core.io.scenes import scene_files
 from langsplat_core.pipeline.report import stated_warnings
 from langsplat_core.progress import Progress
 from langsplat_core.query.engine import no_field
-from langsplat_core.scene import Camera, Scene, surface
+from langsplat_core.scene import Scene, surface
 from langsplat_viewer.actions import viewpoint
 from langsplat_viewer.actions.editing import adopt
 from langsplat_viewer.actions.selecting import leave
 from langsplat_viewer.actions.settings import set_split
 from langsplat_viewer.actions.viewpoint import opening_view, read_bookmarks
 from langsplat_viewer.camera.controls import Extent, OrbitCamera, extent_of
-from langsplat_viewer.files import disk
-from langsplat_viewer.files.disk import Photograph, Stamps, stamps
+from langsplat_viewer.files.disk import Stamps, stamps
 from langsplat_viewer.files.preferences import with_recent
 from langsplat_viewer.marks import unmarked
 from langsplat_viewer.rendering.request import Split, why_undrawable
@@ -88,9 +86,6 @@ def cancel(viewer: Viewer) -> None:
     """Drop what the worker does and is to do."""
     viewer.worker.cancel()
     viewer.state.opening = None
-    photograph = viewer.state.photograph
-    if photograph is not None and photograph.image is None and not photograph.reason:
-        viewer.state.photograph = replace(photograph, reason="cancelled")
     state = viewer.state
     for query in state.session.queries:
         answer = state.answer(query)
@@ -116,7 +111,6 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
         warnings=opened.warnings,
         nothing=why_undrawable(scene.gaussians),
         marks=unmarked(len(scene.gaussians)),
-        locked=np.zeros(len(scene.gaussians), bool),
         camera_index=0 if scene.cameras else None,
         record=Recording(size=state.record.size, fps=state.record.fps),
     )
@@ -265,66 +259,6 @@ def unlist_scene(viewer: Viewer, path: Path) -> None:
     """Take a scene off the list, and forget its visit; the scene that is shown stays."""
     viewer.state.scenes = tuple(other for other in viewer.state.scenes if other != path)
     viewer.visits.pop(path, None)
-
-
-# The photograph of the training camera at which the view stands, laid over the image.
-
-SAME = 1e-6  # of the scene's radius, and of a rotation: nearer is the same place
-
-
-def standing_at(state: ViewerState) -> Camera | None:
-    """Return the training camera whose pose the view has; None elsewhere, and without perspective."""
-    scene, view, index = state.scene, state.view, state.camera_index
-    if (
-        scene is None
-        or view is None
-        or view.orthographic
-        or state.extent is None
-        or index is None
-        or state.glide is not None
-    ):
-        return None
-    camera = scene.cameras[index]
-    is_there = np.abs(view.eye - camera.position).max() <= SAME * state.extent.radius
-    return camera if is_there and np.abs(view.rotation - camera.rotation).max() <= SAME else None
-
-
-def photograph_here(state: ViewerState) -> Photograph | None:
-    """Return the photograph of the camera at which the view stands, as far as it was looked for."""
-    photograph = state.photograph
-    return photograph if photograph is not None and photograph.camera is standing_at(state) else None
-
-
-def fetch_photograph(viewer: Viewer) -> None:
-    """Have the worker look for a photograph that is wanted and was not looked for; called once per frame."""
-    state = viewer.state
-    camera = standing_at(state) if state.session.fade > 0 else None
-    if camera is None or state.path is None:
-        return
-    path, folder = state.path, photograph_folder(viewer)
-    before = state.photograph
-    if before is not None and before.camera is camera and before.folder == folder:
-        return
-    wanted = state.photograph = Photograph(camera, folder)
-
-    def work(progress: Progress) -> Array:
-        return disk.read_photograph(disk.find_photograph(camera.name, path, folder), camera)
-
-    def done(image: Array) -> None:
-        if state.photograph is wanted:
-            state.photograph = replace(wanted, image=image)
-
-    def failed(reason: str) -> None:
-        if state.photograph is wanted:
-            state.photograph = replace(wanted, reason=reason)
-
-    viewer.run(f"reading the photograph {camera.name}", work, done, failed)
-
-
-def photograph_folder(viewer: Viewer) -> str:
-    """Return the folder of the photographs of this scene that was chosen, "" for none."""
-    path = viewer.state.path
-    return "" if path is None else viewer.state.preferences.photographs.get(str(path.absolute()), "")
 
 
 # A second scene, or the same by another encoder or method, right of a line across the image: a viewer of its

@@ -1,7 +1,4 @@
-"""The outline: the scene's tree in words, with names, groups and locks of one's own.
-
-And what can be done with a thing, a row of it or what is clicked in the scene.
-"""
+"""The outline: the scene's tree in words, and what can be done with a thing of it or one that is clicked."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
@@ -18,9 +15,8 @@ from langsplat_core.query.selection import at_point
 from langsplat_core.scene import LEVELS, NO_NODE
 from langsplat_core.scene.language import tidy
 from langsplat_viewer.actions.queries import teach
-from langsplat_viewer.actions.selecting import mark, put_marks, select_alike, take
+from langsplat_viewer.actions.selecting import mark, select_alike, take
 from langsplat_viewer.actions.viewpoint import focus_on
-from langsplat_viewer.session import NodeGroup
 from langsplat_viewer.state import OutlineView
 from langsplat_viewer.viewer import Viewer
 
@@ -198,7 +194,7 @@ def hide(viewer: Viewer, target: Target) -> None:
 
     def act(members: Array) -> None:
         marks = viewer.state.marks
-        hidden = marks.hidden | (members & ~viewer.state.locked)
+        hidden = marks.hidden | members
         mark(viewer, replace(marks, selected=marks.selected & ~hidden, hidden=hidden))
 
     with_thing(viewer, target, act)
@@ -226,73 +222,3 @@ def give_name(viewer: Viewer, target: Target, name: str) -> None:
             viewer.change(things=replace(things, names={**things.names, target: name}))
 
     with_thing(viewer, target, lambda members: teach(viewer, name, members, done))
-
-
-# Locks and groups.
-
-
-def toggle_lock(viewer: Viewer, node: int) -> None:
-    """Lock a thing: nothing selects, hides or deletes it; or unlock it."""
-    state = viewer.state
-    if state.outline is not None and state.outline.tree is not None:
-        things = state.session.things
-        viewer.change(things=replace(things, locked=things.locked ^ {node}))
-        apply_locks(viewer)
-        if (state.marks.selected & state.locked).any():
-            put_marks(viewer, replace(state.marks, selected=state.marks.selected & ~state.locked))
-
-
-def apply_locks(viewer: Viewer) -> None:
-    """Have the tools know what is locked."""
-    state, engine = viewer.state, viewer.engine
-    if engine is None or state.scene is None:
-        return
-    state.locked = np.zeros(len(state.scene.gaussians), bool)
-    for node in state.session.things.locked:
-        state.locked |= engine.tree.members(node)
-
-
-def group(viewer: Viewer, node: int, onto: int | NodeGroup | None) -> None:
-    """Put a thing into a group, or into a new one, with the node `onto` where that is given."""
-    things = viewer.state.session.things
-    others = tuple(g for g in (_without(g, node) for g in things.groups) if g is not None)
-    if isinstance(onto, NodeGroup):
-        new = tuple(replace(g, nodes=(*g.nodes, node)) if g.name == onto.name else g for g in others)
-    elif onto == node:
-        return
-    else:
-        taken = {g.name for g in things.groups}
-        name = next(f"group {k}" for k in range(1, len(taken) + 2) if f"group {k}" not in taken)
-        new = (*others, NodeGroup(name, (node,) if onto is None else (onto, node)))
-    viewer.change(things=replace(things, groups=new))
-
-
-def _without(group: NodeGroup, node: int) -> NodeGroup | None:
-    left = tuple(other for other in group.nodes if other != node)
-    return replace(group, nodes=left) if left else None
-
-
-def ungroup(viewer: Viewer, node: int) -> None:
-    """Take a thing out of its group."""
-    things = viewer.state.session.things
-    left = (_without(g, node) for g in things.groups)
-    viewer.change(things=replace(things, groups=tuple(g for g in left if g is not None)))
-
-
-def rename_group(viewer: Viewer, old: NodeGroup, name: str) -> None:
-    """Give a group another name, that no other has."""
-    things, name = viewer.state.session.things, tidy(name)
-    if name in {g.name for g in things.groups if g is not old}:
-        viewer.say_error(f"there is a group '{name}' already")
-    elif name:
-        groups = tuple(replace(g, name=name) if g is old else g for g in things.groups)
-        viewer.change(things=replace(things, groups=groups))
-
-
-def select_group(viewer: Viewer, group: NodeGroup) -> None:
-    """Select all things of a group."""
-    engine = viewer.engine
-    if engine is None:
-        return
-    members = np.any([engine.tree.members(node) for node in group.nodes], axis=0)
-    take(viewer, members, "replace")

@@ -155,7 +155,7 @@ def restore(viewer: Viewer, project: Project, path: Path) -> None:
     now = state.session
     session = replace(session, bookmarks=session.bookmarks or now.bookmarks)
     if project.version == 1:  # which had no other settings
-        session = replace(session, split=now.split, splats=now.splats, fade=now.fade, overlays=now.overlays)
+        session = replace(session, split=now.split, splats=now.splats, overlays=now.overlays)
     edits = (session.marks, session.moves, session.things)
     if len(state.scene.gaussians) != project.gaussians:
         session = replace(session, marks=Marked(), moves=(), things=Things())
@@ -167,6 +167,8 @@ def restore(viewer: Viewer, project: Project, path: Path) -> None:
     except LangSplatError as error:
         viewer.say_error(f"{path}: its transforms are left out: {one_line(error)}")
         take_session(viewer, replace(session, moves=()))
+    if project.has_groups:
+        viewer.say_error("groups and locks of the outline are left out: this version has none")
     assert state.extent is not None
     view = bookmarked_view(project.view, state.extent)
     state.view = view if project.intrinsics is None else replace(view, intrinsics=project.intrinsics)

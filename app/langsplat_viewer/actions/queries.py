@@ -144,14 +144,6 @@ def forget_unlisted(viewer: Viewer) -> None:
     state.answers = {phrase: known for phrase, known in state.answers.items() if phrase in listed}
 
 
-JOINS = {"and": "{} and {}", "or": "{} or {}", "without": "{}, not {}"}  # as the grammar reads them
-
-
-def ask_combined(viewer: Viewer, first: str, join: str, second: str) -> None:
-    """Search for two phrases at once, joined by one of `JOINS`."""
-    ask_one(viewer, JOINS[join].format(first, second))
-
-
 def focus_search(viewer: Viewer) -> None:
     """Have the search box take the keyboard; where there is nothing to search, what is typed goes nowhere."""
     open_panel(viewer, "Search")

@@ -49,7 +49,7 @@ def put_marks(viewer: Viewer, marks: Marks) -> None:
 def take(viewer: Viewer, found: Array, mode: Mode | None = None) -> None:
     """Combine the selection with `found` (N,) bool; `mode` in place of the one that is set."""
     state = viewer.state
-    mark(viewer, marks.combined(state.marks, found & ~state.locked, mode or state.tools.mode))
+    mark(viewer, marks.combined(state.marks, found, mode or state.tools.mode))
 
 
 def has_scene(viewer: Viewer) -> bool:
@@ -96,8 +96,8 @@ def hide_selected(viewer: Viewer) -> None:
 def isolate_selected(viewer: Viewer) -> None:
     """Hide everything that is not selected."""
     if has_selection(viewer):
-        marks, locked = viewer.state.marks, viewer.state.locked
-        mark(viewer, replace(marks, hidden=marks.kept & ~(marks.selected | locked)))
+        marks = viewer.state.marks
+        mark(viewer, replace(marks, hidden=marks.kept & ~marks.selected))
 
 
 def show_hidden(viewer: Viewer) -> None:

@@ -1,23 +1,19 @@
-"""What lies around a scene on the disk: folders, photographs, files that change, a training's checkpoints."""
+"""What lies around a scene on the disk: folders, files that change, a training's checkpoints."""
 
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import islice
-from pathlib import Path, PurePath
+from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageOps
 from safetensors import SafetensorError, safe_open
 
-from langsplat_core.arrays import Array
-from langsplat_core.errors import InputError, printable_line
+from langsplat_core.errors import InputError
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.hostile import PHOTO_SUFFIXES, opened
 from langsplat_core.io.ply import write_ply
 from langsplat_core.io.scenes import format_of
 from langsplat_core.pipeline.report import work_folder
-from langsplat_core.scene import Camera, Gaussians
+from langsplat_core.scene import Gaussians
 from langsplat_viewer.files.projects import PATHS, PROJECTS, QUERIES
 
 # Folders of the file browser.
@@ -66,97 +62,6 @@ def _entry(path: Path) -> FolderEntry | None:
     except OSError:  # it may not be looked at
         pass
     return None
-
-
-# Photographs of training cameras.
-
-LONGEST_SIDE = 2048  # pixels of what is kept: more than an area of a window has
-MOST_FILES = 20_000  # of a folder that are looked at
-ASPECT_TOLERANCE = 0.02  # shrunk copies round their sizes
-
-
-@dataclass(frozen=True, eq=False)
-class Photograph:
-    """The photograph of one camera, or the reason why there is none."""
-
-    camera: Camera
-    folder: str  # that was chosen when it was looked for, "" for none
-    image: Array | None = (
-        None  # (H, W, 3) uint8, row 0 on top; None while it is read_photograph and without one
-    )
-    reason: str = ""
-
-
-def places(scene: Path) -> tuple[Path, ...]:
-    """Folders in which the photographs of a scene usually lie."""
-    trained_from = scene.with_suffix("")  # as the panel "Train" names a scene
-    beside = scene.parent
-    return trained_from / "images", trained_from, beside / "images", beside
-
-
-def find_photograph(name: str, scene: Path, folder: str) -> Path:
-    """Return the path of the photograph of the camera `name`.
-
-    It is looked for in the chosen `folder` and the folders in it, or where photographs usually lie.
-    InputError where it is in none of them.
-    """
-    if not name:
-        raise InputError("this camera does not name its photograph")
-    looked_in = (Path(folder),) if folder else places(scene)
-    for place in looked_in:
-        paths = place.rglob("*") if folder else place.glob("*")
-        try:
-            photographs = [p for p in islice(paths, MOST_FILES) if p.suffix.lower() in PHOTO_SUFFIXES]
-        except OSError:  # it may not be looked into
-            continue
-        found = [path for path in sorted(photographs) if name in _names(path.relative_to(place))]
-        if found:
-            return found[0]
-    where = folder or f"{scene.parent} and its folders images and {scene.stem}"
-    raise InputError(f"no photograph '{printable_line(name, 60)}' in {where}")
-
-
-def _names(path: PurePath) -> set[str]:
-    """Return the names that a camera of this photograph may have.
-
-    Training names cameras by the stem, where two have the same by the path.
-    """
-    whole = path.with_suffix("").as_posix()
-    return {path.stem, whole, whole.replace("/", "_")}
-
-
-def read_photograph(path: Path, camera: Camera) -> Array:
-    """Return a photograph as (H, W, 3) uint8, at most `LONGEST_SIDE` pixels long.
-
-    It is turned as its EXIF data ask where only that fits the camera. Raises InputError.
-    """
-    with opened(path) as stored:
-        stored.draft("RGB", (LONGEST_SIDE, LONGEST_SIDE))
-        picture: Image.Image = stored
-        if not _fits(picture.size, camera):
-            picture = ImageOps.exif_transpose(picture)
-        if not _fits(picture.size, camera):
-            width, height = picture.size
-            raise InputError(
-                f"{path} has {width}x{height} pixels, its camera {camera.width}x{camera.height}: "
-                "another shape"
-            )
-        if picture.mode.startswith("I"):  # 16 bits; Pillow's own conversion would clip
-            picture = Image.fromarray((np.asarray(picture) >> 8).astype(np.uint8))
-        picture = picture.convert("RGB")
-        picture.thumbnail((LONGEST_SIDE, LONGEST_SIDE))
-        return np.asarray(picture)
-
-
-def _fits(size: tuple[int, int], camera: Camera) -> bool:
-    return abs(size[0] * camera.height / (size[1] * camera.width) - 1) < ASPECT_TOLERANCE
-
-
-def corners(camera: Camera, shown: Camera) -> tuple[float, float, float, float]:
-    """Left, top, right, bottom of a photograph in the image of another camera of the same pose, pixels."""
-    x, y = shown.fx / camera.fx, shown.fy / camera.fy
-    left, top = shown.cx - camera.cx * x, shown.cy - camera.cy * y
-    return left, top, left + camera.width * x, top + camera.height * y
 
 
 # A scene's files that change while it is shown. A thread of its own looks about once a second, so that the

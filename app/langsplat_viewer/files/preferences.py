@@ -3,7 +3,7 @@
 A field that is added here is kept, and what has a title gets its widget in the panel that is named with it.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
@@ -21,7 +21,6 @@ THEMES: tuple[Theme, ...] = get_args(Theme)
 SCALES = (0.75, 3.0)  # least and largest size of letters and widgets
 DESIGNED = 1080  # window units: the height of the screen that a scale of 1 is made for
 MOST_RECENT = 12
-MOST_FOLDERS = 100  # scenes whose folder of photographs is remembered
 FILE_NAME, LAYOUT_NAME = "preferences.json", "layout.ini"
 LARGEST = 1_000_000  # bytes of the file
 CAMERA = {"panel": "Camera"}
@@ -37,7 +36,6 @@ class Preferences:
     panels: tuple[str, ...] | None = None  # titles of those that are open; None: those that are at first
     colour_map: ColourMap = "turbo"  # that a session begins with
     overlays: tuple[str, ...] = ()  # that a session begins with
-    photographs: dict[str, str] = field(default_factory=dict)  # scene -> folder; the latest chosen last
     fly_speed: Annotated[
         float,
         Meta(ge=0.05, le=4, title="Fly speed", description="Scene radii per second", extra=CAMERA),
@@ -92,10 +90,3 @@ def with_recent(preferences: Preferences, path: Path) -> Preferences:
     name = str(path)
     others = tuple(other for other in preferences.recent if other != name)
     return replace(preferences, recent=(name, *others)[:MOST_RECENT])
-
-
-def with_photographs(preferences: Preferences, scene: Path, folder: Path) -> Preferences:
-    """Return the preferences with `folder` as the one that has the photographs of `scene`."""
-    others = {path: kept for path, kept in preferences.photographs.items() if path != str(scene)}
-    latest = list(others.items())[1 - MOST_FOLDERS :]
-    return replace(preferences, photographs={**dict(latest), str(scene): str(folder)})

@@ -274,7 +274,7 @@ PROJECTS = ".langsplat"  # suffix of project files
 FORMAT, VERSION = "langsplat-project", 2
 
 
-class Project(msgspec.Struct):
+class Project(msgspec.Struct, omit_defaults=True):
     """The content of a project file."""
 
     scene: Annotated[str, Meta(pattern=r"\A[^\0]+\Z", max_length=4096)]
@@ -284,6 +284,7 @@ class Project(msgspec.Struct):
     intrinsics: Intrinsics | None = None  # of the view, where the field of view does not say all
     panels: Annotated[tuple[str, ...], Meta(max_length=100)] = ()
     version: int = VERSION
+    has_groups: bool = False  # things in groups, or locked, which earlier versions had
 
     @property
     def path(self) -> Path:
@@ -295,7 +296,7 @@ def write_project(path: Path, project: Project, answers: list[dict[str, Any]]) -
     """Write a project, whole or not at all."""
     folder, scene = path.absolute().parent, project.path
     named = scene.relative_to(folder).as_posix() if scene.is_relative_to(folder) else str(scene)
-    content = {"format": FORMAT, **_plain(project), "scene": named, "answers": answers}
+    content = {"format": FORMAT, "version": VERSION, **_plain(project), "scene": named, "answers": answers}
     _write(path, content)
 
 
@@ -314,6 +315,8 @@ def read_project(path: Path) -> Project:
         if project.intrinsics is not None:
             _check_pose(replace(project.view.pose, fov_degrees=project.intrinsics.fov_degrees))
         project.session = _checked(project.session)
+        things = top["session"].get("things", {})
+        project.has_groups = bool(things.get("groups") or things.get("locked"))
         project.scene = os.path.abspath(path.parent / project.scene)
         return project
 
@@ -335,13 +338,10 @@ def _checked(session: Session) -> Session:
     for bookmark in session.bookmarks:
         _check_pose(bookmark.pose)
     things = session.things
-    groups = tuple(replace(group, name=_line(group.name)) for group in things.groups)
-    if len({group.name for group in groups}) < len(groups):
-        raise ValueError("two groups of one name")
     return replace(
         session,
         moves=tuple(replace(move, to=similarity(move.to.matrix)) for move in session.moves),
-        things=replace(things, names={n: _line(name) for n, name in things.names.items()}, groups=groups),
+        things=replace(things, names={n: _line(name) for n, name in things.names.items()}),
         notes=tuple(replace(note, text=_line(note.text)) for note in session.notes),
         bookmarks=tuple(replace(mark, name=_line(mark.name)) for mark in session.bookmarks),
     )

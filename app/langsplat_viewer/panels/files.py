@@ -8,7 +8,6 @@ from pathlib import Path
 
 from imgui_bundle import ImVec2, imgui
 
-from langsplat_core.io.scenes import format_of
 from langsplat_viewer.actions import browsing, settings
 from langsplat_viewer.files.disk import FolderEntry, Listing
 from langsplat_viewer.panels import ui
@@ -32,21 +31,13 @@ def draw_browser(viewer: Viewer) -> None:
         _path_box(viewer)
         _above(viewer, listing.folder)
         _entries(viewer, listing)
-        if viewer.state.picks_folder:
-            if imgui.button("Take this folder"):
-                browsing.choose_folder(viewer, listing.folder)
-        elif has_several(listing) and imgui.button("Open all scenes here"):
-            browsing.open_all(viewer)
+        if viewer.state.picks_folder and imgui.button("Take this folder"):
+            browsing.choose_folder(viewer, listing.folder)
     if not stays or imgui.is_key_pressed(imgui.Key.escape):
         settings.put(viewer.state, browser=None)
     if viewer.state.browser is None:
         imgui.close_current_popup()
     imgui.end_popup()
-
-
-def has_several(listing: Listing) -> bool:
-    """Return whether the folder holds more than one scene."""
-    return sum(entry.is_file and format_of(entry.path) is not None for entry in listing.entries) > 1
 
 
 def _path_box(viewer: Viewer) -> None:
@@ -75,7 +66,7 @@ def _entries(viewer: Viewer, listing: Listing) -> None:
     recent = () if picks else viewer.state.preferences.recent
     lines = min(len(recent), 4) + 1 if recent else 0
     below = lines * imgui.get_text_line_height_with_spacing() + 8 * bool(recent)
-    below += imgui.get_frame_height_with_spacing() * (bool(picks) or has_several(listing))
+    below += imgui.get_frame_height_with_spacing() * bool(picks)
     if imgui.begin_child("entries", ImVec2(0, -below), imgui.ChildFlags_.borders):
         if listing.problem:
             ui.small_wrapped(listing.problem, ui.bad())
@@ -88,8 +79,7 @@ def _entries(viewer: Viewer, listing: Listing) -> None:
     imgui.end_child()
     if recent:
         imgui.text_colored(ui.muted(), "Recent")
-        foot = imgui.get_frame_height_with_spacing() * has_several(listing)
-        if imgui.begin_child("recent", ImVec2(0, -foot)):
+        if imgui.begin_child("recent"):
             for path in recent:
                 if imgui.selectable(f"{path}##recent", False)[0]:
                     browsing.open_recent(viewer, path)

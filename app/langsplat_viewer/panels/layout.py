@@ -176,9 +176,6 @@ def draw_over(viewer: Viewer) -> None:
     menus.draw_toolbar(viewer, area)
     questions.draw_changed(viewer, area)
     questions.draw_unsaved(viewer)
-    copied = settings.take(viewer.state.record, "clipboard")
-    if copied:
-        imgui.set_clipboard_text(copied)
     files.draw_browser(viewer)
     menus.draw_help(viewer)
     menus.draw_palette(viewer)

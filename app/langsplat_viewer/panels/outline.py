@@ -11,17 +11,14 @@ from langsplat_viewer.actions import outline
 from langsplat_viewer.actions.outline import Target
 from langsplat_viewer.panels import ui
 from langsplat_viewer.panels.overlays import STILL, begin_legend
-from langsplat_viewer.session import NodeGroup
-from langsplat_viewer.state import OutlineView
 from langsplat_viewer.viewer import Viewer
 
-DRAGGED = "node of the outline"
 LEGEND_ROWS, LEGEND_EM = 8, 9.0
 MENU = "menu of a thing"
 
 
 def draw(viewer: Viewer) -> None:
-    """Draw the panel "Outline": a box that filters, groups, and the tree."""
+    """Draw the panel "Outline": a box that filters, and the tree."""
     view = outline.wanted(viewer)
     if view is None or view.problem:
         ui.small_wrapped(view.problem if view else "open a scene with a language field", ui.muted())
@@ -31,36 +28,12 @@ def draw(viewer: Viewer) -> None:
     _, typed = imgui.input_text_with_hint("##filter", "filter", drafts.get("##filter", ""))
     drafts["##filter"] = typed
     if imgui.begin_child("rows", child_flags=imgui.ChildFlags_.nav_flattened):
-        for group in viewer.state.session.things.groups:
-            _group(viewer, view, group)
-        inside = {node for group in viewer.state.session.things.groups for node in group.nodes}
         for row in outline.filtered(viewer, view.roots, typed):
-            if row.node not in inside or typed:
-                _row(viewer, row)
+            _row(viewer, row)
     imgui.end_child()
 
 
-def _group(viewer: Viewer, view: OutlineView, group: NodeGroup) -> None:
-    imgui.push_id(group.name)
-    imgui.set_next_item_open(True, imgui.Cond_.once)
-    flags = imgui.TreeNodeFlags_.open_on_arrow | imgui.TreeNodeFlags_.span_avail_width
-    opened = imgui.tree_node_ex(f"{group.name}##group", flags)
-    if _chosen("group"):
-        outline.select_group(viewer, group)
-    _drop(viewer, group)
-    if imgui.begin_popup_context_item("group"):
-        name = _named("##rename", "another name", group.name)
-        if name:
-            outline.rename_group(viewer, group, name)
-        imgui.end_popup()
-    if opened:
-        for row in [row for node in group.nodes if (row := view.row(node)) is not None]:
-            _row(viewer, row, in_group=True)
-        imgui.tree_pop()
-    imgui.pop_id()
-
-
-def _row(viewer: Viewer, row: Outline, *, in_group: bool = False) -> None:
+def _row(viewer: Viewer, row: Outline) -> None:
     imgui.push_id(f"node {row.node}")
     side, spacing = imgui.get_frame_height(), imgui.get_style().item_spacing.x
     right = imgui.get_cursor_pos_x() + imgui.get_content_region_avail().x
@@ -71,7 +44,7 @@ def _row(viewer: Viewer, row: Outline, *, in_group: bool = False) -> None:
     name, sure = outline.name_of(viewer, row), ""
     if row.word and row.node not in viewer.state.session.things.names:
         sure = f" {100 * row.word.probability:.0f} %"
-    taken = (2 if colour is None else 3) * (side + spacing)
+    taken = (1 if colour is None else 2) * (side + spacing)
     room = imgui.get_content_region_avail().x - taken - imgui.get_tree_node_to_label_spacing()
     label = ui.elided(name + sure, room)
     imgui.align_text_to_frame_padding()
@@ -79,14 +52,8 @@ def _row(viewer: Viewer, row: Outline, *, in_group: bool = False) -> None:
     if _chosen("thing"):
         outline.visit(viewer, row.node)
     _about(row, name)
-    if imgui.begin_drag_drop_source():
-        imgui.set_drag_drop_payload_py_id(DRAGGED, row.node)
-        imgui.text(name)
-        imgui.end_drag_drop_source()
-    _drop(viewer, row.node)
     if imgui.begin_popup_context_item("thing"):
         _things_menu(viewer, row.node)
-        _group_menu(viewer, row.node, in_group)
         imgui.end_popup()
     left = room - ui.width_of(label) - 2 * spacing
     texts = (f"{row.count:,}   {_sides(row)}", f"{row.count:,}")
@@ -95,9 +62,9 @@ def _row(viewer: Viewer, row: Outline, *, in_group: bool = False) -> None:
         imgui.same_line(right - taken - ui.width_of(said))
         imgui.text_colored(ui.muted(), said)
     if colour is not None:
-        imgui.same_line(right - 3 * side - 2 * spacing)
+        imgui.same_line(right - 2 * side - spacing)
         _swatch(colour, side)
-    _switches(viewer, row.node, right, side)
+    _eye(viewer, row.node, right - side, side)
     imgui.pop_id()
     if opened:
         imgui.indent()
@@ -120,16 +87,6 @@ def _chosen(menu: str) -> bool:
     return imgui.is_item_clicked() and not imgui.is_item_toggled_open()
 
 
-def _group_menu(viewer: Viewer, node: int, in_group: bool) -> None:
-    if imgui.menu_item("Into a new group", "", False)[0]:
-        outline.group(viewer, node, None)
-    for group in viewer.state.session.things.groups:
-        if node not in group.nodes and imgui.menu_item(f"Into '{group.name}'", "", False)[0]:
-            outline.group(viewer, node, group)
-    if in_group and imgui.menu_item("Out of the group", "", False)[0]:
-        outline.ungroup(viewer, node)
-
-
 def _about(row: Outline, name: str) -> None:
     outlined = f"outlined in {row.votes[0]} of {sum(row.votes)} photographs"
     ui.tip(f"{name}: {row.count:,} Gaussians, {_sides(row)} world units, {outlined}")
@@ -139,41 +96,23 @@ def _sides(row: Outline) -> str:
     return " x ".join(f"{side:.2g}" for side in row.size)
 
 
-def _switches(viewer: Viewer, node: int, right: float, side: float) -> None:
-    hidden, locked = bool(outline.hidden_nodes(viewer)[node]), node in viewer.state.session.things.locked
-    imgui.same_line(right - 2 * side - imgui.get_style().item_spacing.x)
-    if _icon(f"{icons.ICON_FA_EYE_SLASH if hidden else icons.ICON_FA_EYE}###eye", side, lit=not hidden):
-        (outline.show if hidden else outline.hide)(viewer, node)
-    ui.tip("Show it again" if hidden else "Hide it")
-    imgui.same_line(right - side)
-    if _icon(f"{icons.ICON_FA_LOCK if locked else icons.ICON_FA_LOCK_OPEN}###lock", side, lit=locked):
-        outline.toggle_lock(viewer, node)
-    ui.tip("Locked: no tool selects, hides or deletes it" if locked else "Lock it")
-
-
-def _icon(label: str, side: float, *, lit: bool) -> bool:
+def _eye(viewer: Viewer, node: int, left: float, side: float) -> None:
+    """Draw the button that hides a node or shows it again."""
+    hidden = bool(outline.hidden_nodes(viewer)[node])
+    imgui.same_line(left)
     imgui.push_style_color(imgui.Col_.button, ImVec4(0, 0, 0, 0))
-    text = imgui.get_style_color_vec4(imgui.Col_.text) if lit else ui.muted()
-    imgui.push_style_color(imgui.Col_.text, ImVec4(text.x, text.y, text.z, 1.0 if lit else 0.45))
-    imgui.push_style_var(imgui.StyleVar_.frame_padding, ImVec2(0, 0))  # open locks are wide
-    clicked = bool(imgui.button(label, ImVec2(side, side)))
-    imgui.pop_style_var()
+    text = ui.muted() if hidden else imgui.get_style_color_vec4(imgui.Col_.text)
+    imgui.push_style_color(imgui.Col_.text, ImVec4(text.x, text.y, text.z, 0.45 if hidden else 1.0))
+    icon = icons.ICON_FA_EYE_SLASH if hidden else icons.ICON_FA_EYE
+    if imgui.button(f"{icon}###eye", ImVec2(side, side)):
+        (outline.show if hidden else outline.hide)(viewer, node)
     imgui.pop_style_color(2)
-    return clicked
+    ui.tip("Show it again" if hidden else "Hide it")
 
 
 def _swatch(colour: tuple[float, float, float], side: float) -> None:
     flags = imgui.ColorEditFlags_.no_tooltip | imgui.ColorEditFlags_.no_picker
     imgui.color_button("##colour", ImVec4(*colour, 1.0), flags, ImVec2(side, side))
-
-
-def _drop(viewer: Viewer, onto: int | NodeGroup) -> None:
-    """Group a row that is dropped on the last item with what that is."""
-    if imgui.begin_drag_drop_target():
-        payload = imgui.accept_drag_drop_payload_py_id(DRAGGED)
-        if payload is not None:
-            outline.group(viewer, int(payload.data_id), onto)
-        imgui.end_drag_drop_target()
 
 
 # The menu of a thing.

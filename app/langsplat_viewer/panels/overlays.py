@@ -13,11 +13,10 @@ from langsplat_core.config import ColourMap
 from langsplat_core.display.displays import QUERY_COLOURS, STRENGTH, mapped, painted
 from langsplat_core.query.describe import LevelWords
 from langsplat_core.scene import LEVELS, Camera
-from langsplat_viewer.actions import opening, projects, settings, viewpoint
+from langsplat_viewer.actions import projects, settings, viewpoint
 from langsplat_viewer.camera import overlays
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.camera.overlays import Face, PlacedText, face_at, placed, visible_faces, world_axes
-from langsplat_viewer.files.disk import corners
 from langsplat_viewer.panels import ui
 from langsplat_viewer.state import Hover
 from langsplat_viewer.viewer import Viewer
@@ -118,8 +117,7 @@ def draw_grip(viewer: Viewer, area: ui.Area) -> None:
     imgui.pop_style_var(2)
 
 
-# The photograph of a training camera.
-
+# What an answer stands on.
 
 EVIDENCE_EM = 50.0, 34.0  # size of the window at first
 
@@ -139,22 +137,6 @@ def draw_evidence(viewer: Viewer, picture: ui.Picture) -> None:
     imgui.end()
     if not still_open:
         settings.put(viewer.state, evidence=None)
-
-
-def draw_photograph(viewer: Viewer, area: ui.Area, picture: ui.Picture) -> None:
-    """Draw the photograph of the camera at which one stands, over every image in the area."""
-    state, photograph = viewer.state, opening.photograph_here(viewer.state)
-    if state.session.fade == 0 or photograph is None or photograph.image is None or state.view is None:
-        return
-    reference = imgui.ImTextureRef(picture.texture(photograph.image).glo)
-    paint = imgui.get_background_draw_list()
-    tint = imgui.get_color_u32((1.0, 1.0, 1.0, state.session.fade))
-    for part in area.columns(state.session.split.columns):
-        left, top, right, bottom = corners(photograph.camera, state.view.camera(*part.size))
-        low, high = ImVec2(part.left + left, part.top + top), ImVec2(part.left + right, part.top + bottom)
-        paint.push_clip_rect(*part.corners, True)
-        paint.add_image(reference, low, high, ImVec2(0, 0), ImVec2(1, 1), tint)
-        paint.pop_clip_rect()
 
 
 # Lines: training cameras, boxes of instances, ground grid, ruler; and the clicks on them.

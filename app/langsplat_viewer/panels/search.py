@@ -217,8 +217,6 @@ def _details(viewer: Viewer, query: Query) -> None:
         enabled=result is not None,
     ):
         queries.explain(viewer, query)
-    imgui.same_line()
-    _combine(viewer, query)
     if place is not None:
         imgui.text_colored(ui.muted(), "at " + "  ".join(f"{v:.2f}" for v in place))
         ui.tip("Where it is relevant most; world units")
@@ -237,24 +235,6 @@ def _details(viewer: Viewer, query: Query) -> None:
                 imgui.text_colored(ui.muted(), text)
             ui.tip(f"The best relevancy at the level '{name}'; the brighter one answers")
         _cut(viewer, query, result)
-
-
-def _combine(viewer: Viewer, query: Query) -> None:
-    """Draw a menu of the other queries, to search for what both, either or only this one finds."""
-    others = [other for other in viewer.state.session.queries if other.phrase != query.phrase]
-    if ui.button(
-        "Combine", "Search for this and, or, without another query of the list", enabled=bool(others)
-    ):
-        imgui.open_popup("combine")
-    if not imgui.begin_popup("combine"):
-        return
-    for join in queries.JOINS:
-        if imgui.begin_menu(join):
-            for other in others:
-                if imgui.menu_item(f"{other.phrase}##other", "", False)[0]:
-                    queries.ask_combined(viewer, query.phrase, join, other.phrase)
-            imgui.end_menu()
-    imgui.end_popup()
 
 
 # The panel.

@@ -313,11 +313,6 @@ def draw_transform(viewer: Viewer) -> None:
         editing.fill_box(viewer)
     if ui.next_button("Crop", "Delete what lies outside the box; the file stays as it is"):
         editing.crop(viewer)
-    ui.beside_boxed("Clip")
-    changed, clips = imgui.checkbox("Clip", state.edit_form.clips)
-    if changed:
-        editing.clip(viewer, clips)
-    ui.tip("Hide what lies outside the box, and follow its handles")
     imgui.end_disabled()
 
 
@@ -335,7 +330,6 @@ def _crop_box(viewer: Viewer) -> None:
     high = _three("To", form.high, "The opposite corner")
     if (low, high) != (form.low, form.high):
         editing.set_box(viewer, low, high)
-        editing.follow_box(viewer)
 
 
 def _three(label: str, values: Point, what: str) -> Point:
@@ -399,7 +393,7 @@ def _handles(viewer: Viewer, seen: tuple[Any, Any], kind: str, centre: Array) ->
 
 
 def _box_handles(viewer: Viewer, seen: tuple[Any, Any]) -> None:
-    """Draw the box of the panel with handles on its corners and edges; on release the clip follows."""
+    """Draw the box of the panel with handles on its corners and edges."""
     form, unit = viewer.state.edit_form, gizmo.Matrix6([-0.5, -0.5, -0.5, 0.5, 0.5, 0.5])
     corners = np.array([form.low, form.high])
     matrix = np.diag([*np.maximum(np.ptp(corners, axis=0), 1e-6), 1.0])
@@ -409,8 +403,6 @@ def _box_handles(viewer: Viewer, seen: tuple[Any, Any]) -> None:
     if gizmo.manipulate(*seen, operation, mode, edited, local_bounds=unit):
         low, high = box_of(np.array(edited.values).reshape(4, 4).T)
         editing.set_box(viewer, low, high)
-    elif not gizmo.is_using():
-        editing.follow_box(viewer)
 
 
 def box_of(matrix: Array) -> tuple[Point, Point]:

@@ -4,7 +4,7 @@ import math
 
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
-from langsplat_viewer.actions import browsing, filming, opening, settings, viewpoint
+from langsplat_viewer.actions import filming, settings, viewpoint
 from langsplat_viewer.camera.controls import FOV_RANGE, OrbitCamera, adopt_up, level, with_fov
 from langsplat_viewer.camera.flight import Keyframe
 from langsplat_viewer.commands import with_key
@@ -35,6 +35,7 @@ def draw_camera(viewer: Viewer) -> None:
     if state.view is not None:
         _projection(viewer, state.view)
     _cuts(viewer)
+    viewer.change("settings", **ui.draw_fields(state.session, "Camera"))
     settings.prefer(viewer, **ui.draw_fields(state.preferences, "Camera"))
     imgui.end_disabled()
 
@@ -87,16 +88,6 @@ def _training_cameras(viewer: Viewer) -> None:
     ui.tip("Training cameras: stand where a photograph was taken")
     if changed and index != state.camera_index:
         viewpoint.go_to_camera(viewer, index)
-    viewer.change("fade", **ui.draw_fields(state.session, "Camera"))
-    if state.session.fade == 0:
-        return
-    photograph = opening.photograph_here(state)
-    if photograph is None:
-        ui.small_wrapped("stand at a training camera to see its photograph", ui.muted())
-    elif photograph.reason:
-        ui.small_wrapped(photograph.reason, ui.muted())
-        if imgui.button("Folder of photographs ..."):
-            browsing.ask_for_photographs(viewer)
 
 
 # The panel "Record": keyframes of the camera path, playing it, films of it.
@@ -181,13 +172,8 @@ def _keyframes(viewer: Viewer) -> None:
             imgui.pop_id()
     imgui.end_child()
     _chosen(viewer, record.chosen)
-    ui.leave_room("", NUMBER_EM + 2)
-    _, typed = imgui.input_text_with_hint("##path file", "file.path.json", record.path_file)
-    settings.put(record, path_file=typed)
-    if ui.next_button("Save path"):
+    if ui.button("Save path", "A new file; dropped onto the window, it comes back"):
         filming.save_path(viewer)
-    if ui.next_button("Load"):
-        filming.load_path_file(viewer)
 
 
 def _chosen(viewer: Viewer, key: Keyframe | None) -> None:
@@ -228,8 +214,6 @@ def _films(viewer: Viewer) -> None:
         filming.save_film(viewer)
     if ui.next_button("Save picture##sized", "What is shown now, in this size"):
         filming.save_sized_picture(viewer)
-    if ui.next_button("Copy as command", "The command that draws this picture without a window"):
-        filming.copy_command(viewer)
 
 
 # The panel "Bookmarks".
