@@ -45,7 +45,7 @@ class Capture:
     colours: Array  # (M, 3) uint8
     metres_per_unit: float | None = None  # > 0, how long a unit of its world is; None: unknown
     photos: tuple[Photo, ...] = ()  # the files, in the same order; none for images made otherwise
-    drawn: bool = False  # by `assets.making`, where encoders are calibrated, see `scene.Reading.elsewhere`
+    drawn: bool = False  # by `assets.making`, where encoders are calibrated
     masks: tuple[Array | None, ...] = ()  # (H, W) bool each, pixels that count; None: all; (): no masks
     matches: Matches | None = None  # of all photographs, where cameras came from structure from motion
 

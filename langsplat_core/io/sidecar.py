@@ -38,8 +38,8 @@ executed). Version 3, for N Gaussians, CLIP vectors of D numbers, P phrases and 
     phrases          JSON list of the P phrases
     temperature      of the softmax that reads this encoder's cosines, decimal
     found            relevancy from which a phrase counts as present, decimal
-    odds             JSON: a list of numbers for each of the three `Odds` of `scene.Calibration`; absent where
-                     the encoder has none ("calibration" of older files is of another scale, and is not read)
+    odds             JSON: a list of numbers for each `PlattScaling` of `scene.Calibration`; absent where
+                     there is none ("calibration" of older files is of another scale, and is not read)
     taught           JSON: of each taught word a list of its name, its level (0, 1, 2) and the number of its
                      examples; absent where there are none
 
@@ -81,8 +81,7 @@ from langsplat_core.scene import (
     NO_NODE,
     Calibration,
     LanguageField,
-    Odds,
-    Reading,
+    PlattScaling,
     TaughtWord,
     Tree,
     codec_from_tensors,
@@ -210,11 +209,7 @@ def _field(tensors: dict[str, Array], metadata: dict[str, str], path: Path) -> L
     vectors = tensors.get("phrasebook", np.zeros((0, codec.vector_dim), np.float32))
     check_array("phrasebook", vectors, (len(phrases), codec.vector_dim))
     check_array("canonical", tensors["canonical"], (len(CANONICAL_PHRASES), codec.vector_dim))
-    reading = Reading()
-    if metadata["version"] != "1":
-        reading = Reading(
-            float(metadata["temperature"]), float(metadata["found"]), _calibration(metadata, path)
-        )
+    read = {name: float(metadata[name]) for name in ("temperature", "found") if metadata["version"] != "1"}
     return LanguageField(
         codec.from_file(tensors),
         tensors["confidence"],
@@ -222,10 +217,11 @@ def _field(tensors: dict[str, Array], metadata: dict[str, str], path: Path) -> L
         tensors["canonical"],
         metadata["encoder"],
         dict(zip(phrases, vectors, strict=True)),
-        reading,
-        _tree(tensors),
-        tensors.get("everyday"),
-        _taught(tensors, metadata, path),
+        **read,
+        calibration=_calibration(metadata, path),
+        tree=_tree(tensors),
+        everyday=tensors.get("everyday"),
+        taught=_taught(tensors, metadata, path),
     )
 
 
@@ -258,7 +254,7 @@ def _calibration(metadata: dict[str, str], path: Path) -> Calibration | None:
     odds = _listed(metadata, "odds", path, four, "lists of four numbers")
     if len(odds) != len(fields(Calibration)):
         raise malformed(path, f"the header's 'odds' are {len(odds)}; expected {len(fields(Calibration))}")
-    return Calibration(*(Odds(*numbers) for numbers in odds))
+    return Calibration(*(PlattScaling(*numbers) for numbers in odds))
 
 
 def _taught(tensors: dict[str, Array], metadata: dict[str, str], path: Path) -> tuple[TaughtWord, ...]:
@@ -361,12 +357,12 @@ def write_language(path: Path | str, field: LanguageField, means: Array) -> None
         "gaussians": str(len(field)),
         "means_blake2b": means_checksum(means),
         "phrases": json.dumps(list(field.phrasebook), ensure_ascii=False),
-        "temperature": repr(field.reading.temperature),
-        "found": repr(field.reading.found),
+        "temperature": repr(field.temperature),
+        "found": repr(field.found),
         **stated,
     }
-    if field.reading.calibration is not None:
-        odds = astuple(field.reading.calibration)
+    if field.calibration is not None:
+        odds = astuple(field.calibration)
         metadata["odds"] = json.dumps([[float(n) for n in numbers] for numbers in odds])
     with atomic_path(path) as temporary:
         save_tensors(temporary, tensors, metadata)

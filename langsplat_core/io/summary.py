@@ -164,6 +164,6 @@ def _language(field: LanguageField) -> LanguageSummary:
         nodes=None
         if field.tree is None
         else tuple(int((field.tree.levels == level).sum()) for level in range(3)),
-        calibrated=field.reading.calibration is not None,
+        calibrated=field.calibration is not None,
         bytes=sum(array.nbytes for array in _arrays(field)),
     )

@@ -358,6 +358,8 @@ def field_of(
         canonical=encoder.encode_texts(list(CANONICAL_PHRASES)),
         encoder_id=encoder.id,
         phrasebook=dict(zip(names, encoder.encode_texts(names), strict=True)),
-        reading=encoder.reading,
+        temperature=encoder.temperature,
+        found=encoder.found,
+        calibration=encoder.calibration,
         everyday=everyday_vectors(encoder),
     )

@@ -129,7 +129,7 @@ def _train(run: _Run, masks_of: Callable[[Capture], MaskSource] | None, given: S
     with run.timed("language field"):
         language, codec_report = language_field(gaussians, views, encoder, config, *shared)
         if not capture.drawn:
-            language = replace(language, reading=language.reading.elsewhere)
+            language = replace(language, calibration=None)  # which holds in drawn rooms alone
 
     if processes.is_main:
         with run.timed("saving and held-out views"):

@@ -122,7 +122,7 @@ class QueryEngine:
     def scale(self) -> Scale:
         """Scale that turns cosines into relevancies."""
         field = self.field
-        return Scale(field.canonical, self._everyday, field.reading.temperature)
+        return Scale(field.canonical, self._everyday, field.temperature)
 
     @property
     def calibration(self) -> Calibration | None:
@@ -131,7 +131,7 @@ class QueryEngine:
         Nor has it one with other canonical phrases than those that it was fitted with.
         """
         usual = self._canonical is None and self.rule == "regions"
-        return self.field.reading.calibration if usual else None
+        return self.field.calibration if usual else None
 
     @property
     def basis(self) -> Basis:
@@ -141,13 +141,13 @@ class QueryEngine:
         name, calibration = field.encoder_id, None
         if name == DEMO:
             name = "demo encoder"
-        guesses = field.encoder_id == DEMO and field.reading.calibration is None
+        guesses = field.encoder_id == DEMO and field.calibration is None
         if guesses:
             short, long = f"{name}, made for drawn rooms: guesses here", DEMO_ELSEWHERE
         elif everyday is None:
             short = f"{name}, as published: no everyday phrases to compare with"
-            long = f"{short}. Found is a relevancy of {field.reading.found:g} or more, without percentages"
-        elif field.reading.calibration is None or self._canonical is not None:
+            long = f"{short}. Found is a relevancy of {field.found:g} or more, without percentages"
+        elif field.calibration is None or self._canonical is not None:
             short = f"{name}, no calibration here: found is more than by chance"
             long = (
                 f"{short}. Of phrases that name nothing in the scene, 19 in 20 are not found. Percentages "
@@ -388,7 +388,7 @@ class QueryEngine:
 
     def _answer(self, phrase: str, relevancy: Array, level: LevelChoice) -> QueryResult:
         if self._bars is None:
-            found = self.field.reading.found
+            found = self.field.found
             return by_peak(phrase, relevancy, self.surface, self.scale, found, level)
         means, judged = self.scene.gaussians.means, (self.scale, self._bars, self.calibration)
         return by_regions(phrase, relevancy, means, self.regions, *judged, level)

@@ -37,7 +37,7 @@ def decoded_relevancy(
     blended, alpha = view.splat(field.latents[level])
     height, width, d = blended.shape
     flat = np.where(alpha[..., None] > alpha_gate, blended, 0).reshape(-1, d)
-    values = latent_relevancy(field.codec, flat, phrases, field.canonical, field.reading.temperature)
+    values = latent_relevancy(field.codec, flat, phrases, field.canonical, field.temperature)
     return values.reshape(height, width, len(phrases))
 
 

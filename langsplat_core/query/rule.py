@@ -235,12 +235,12 @@ def judge(
         margin = excess(fits, bars, sought, level)
         return Verdict(margin >= 0, "chance", margin)
     alone = calibration.thing if sought == "thing" else calibration.part
-    odds = calibration.inside if sought == "inside" else alone
-    probability = odds.probability(fits)
-    margin = float(logit(np.array(probability)) - logit(np.array(min(odds.found, 1 - RULE.narrowest))))
+    scaling = calibration.inside if sought == "inside" else alone
+    probability = scaling.probability(fits)
+    margin = float(logit(np.array(probability)) - logit(np.array(min(scaling.found, 1 - RULE.narrowest))))
     # It may be there, but what the wanted level shows is nearer to other phrases.
     shown = level == "auto" or sought == "inside" or fits[LEVELS.index(level)] >= 0
-    return Verdict(shown and probability >= odds.found, "calibration", margin, probability)
+    return Verdict(shown and probability >= scaling.found, "calibration", margin, probability)
 
 
 # The answer in one scene.

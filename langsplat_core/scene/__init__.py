@@ -9,8 +9,7 @@ from langsplat_core.scene.language import (
     Calibration,
     Fits,
     LanguageField,
-    Odds,
-    Reading,
+    PlattScaling,
     TaughtWord,
 )
 from langsplat_core.scene.scene import Scene
@@ -32,8 +31,7 @@ __all__ = [
     "Intrinsics",
     "LanguageField",
     "LinearCodec",
-    "Odds",
-    "Reading",
+    "PlattScaling",
     "Scene",
     "TaughtWord",
     "Tree",

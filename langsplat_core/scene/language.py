@@ -71,15 +71,15 @@ def _bare(word: str) -> str:
     return word[first:last] + ("'" if owns else "")
 
 
-# How the cosines of one text encoder are read, and what they say about whether a thing is there at all.
+# Calibration of one text encoder's cosines: how probable it is that what is asked for is there at all.
 
 LARGEST = 1e6  # number of a calibration: cosines are rounded to 1e-7
 Fits = tuple[float, float, float]  # of each level, the best, see `semantics.relevancy.Scale.fit`
 
 
 @dataclass(frozen=True)
-class Odds:
-    """A logistic function of the best fits of an answer (Platt 1999).
+class PlattScaling:
+    """Platt scaling (Platt 1999): the probability as a logistic function of the best fits of an answer.
 
     ``probability = sigmoid(constant + whole * fit of whole things + finer * the better one of the finer
     levels)``, present and absent being as likely beforehand.
@@ -107,32 +107,11 @@ class Odds:
 
 @dataclass(frozen=True)
 class Calibration:
-    """The odds of the three ways in which something is looked for: fits of each have another spread."""
+    """Platt scaling for each of the three ways in which something is looked for: their fits differ."""
 
-    thing: Odds  # "mug": anything, among all that there is
-    part: Odds  # "handle": a part of whatever has one
-    inside: Odds  # "handle of the mug": a part, among what is on a thing that is there
-
-
-@dataclass(frozen=True)
-class Reading:
-    """Calibration of one text encoder's cosines, whose scale differs between encoders."""
-
-    temperature: float = 10.0  # of the softmax; 10 in the public code of LERF and LangSplat, for CLIP
-    found: float = 0.6  # peak relevancy, as published, from which a phrase counts as present
-    calibration: Calibration | None = None  # in drawn rooms, the only ones whose truth is known
-
-    @property
-    def elsewhere(self) -> "Reading":
-        """The same for scenes other than drawn rooms: no probability is known to hold there."""
-        return replace(self, calibration=None)
-
-    def __post_init__(self) -> None:
-        if not (0 < self.temperature <= LARGEST and 0 <= self.found <= 1):
-            raise ValueError(
-                f"reading: temperature {self.temperature} and found {self.found}; expected a positive number "
-                f"up to {LARGEST:g} and one in [0, 1]"
-            )
+    thing: PlattScaling  # "mug": anything, among all that there is
+    part: PlattScaling  # "handle": a part of whatever has one
+    inside: PlattScaling  # "handle of the mug": a part, among what is on a thing that is there
 
 
 # The language field: what every Gaussian means, at three levels.
@@ -181,7 +160,9 @@ class LanguageField:
     canonical: Array  # (C, D) float32 unit text vectors, of CANONICAL_PHRASES unless a query chose others
     encoder_id: str  # hub id or folder of the text encoder, e.g. "demo"
     phrasebook: Mapping[str, Array] = field(default_factory=dict)  # `phrase_key` -> (D,) unit vector
-    reading: Reading = field(default_factory=Reading)
+    temperature: float = 10.0  # of the softmax over cosines; 10 in the code of LERF and LangSplat, for CLIP
+    found: float = 0.6  # peak relevancy, as published, from which a phrase counts as present
+    calibration: Calibration | None = None  # None: no probability is known to hold here
     tree: Tree | None = None  # of N Gaussians; of wholes alone where nothing but these was kept
     everyday: Array | None = None  # (V, D) float32 unit vectors of phrases most of which name nothing here
     taught: tuple[TaughtWord, ...] = ()  # no two of one key
@@ -194,6 +175,11 @@ class LanguageField:
         check_array("canonical", self.canonical, ("C", big), dtype=np.float32)
         if len(self.canonical) == 0:
             raise ValueError("canonical: a phrase is compared with one other at least")
+        if not (0 < self.temperature <= LARGEST and 0 <= self.found <= 1):
+            raise ValueError(
+                f"temperature {self.temperature} and found {self.found}; expected a positive number up to "
+                f"{LARGEST:g} and one in [0, 1]"
+            )
         if self.tree is not None:
             check_array("leaves", self.tree.leaves, ("N",), dims)
         if self.everyday is not None:

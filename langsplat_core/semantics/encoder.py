@@ -16,7 +16,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import EncoderError, InputError, UnknownWordError
-from langsplat_core.scene import Calibration, Odds, Reading
+from langsplat_core.scene import Calibration, LanguageField, PlattScaling
 from langsplat_core.semantics.weights import OPEN_CLIP_CONFIG, Weights, asking_errors
 
 # Phrases as rows of token numbers of one length, by the tokenizer.json that lies beside the weights. The file
@@ -140,7 +140,7 @@ def _stated(weights: Weights, name: str, role: str) -> str | None:
 
 OPEN_MODEL = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
 VOCABULARY = "vocabulary.txt"  # beside the weights: the only words the encoder was taught, one per line
-READING = "reading.json"  # beside the weights, optional: fields of `scene.Reading`, but for the temperature
+READING = "reading.json"  # beside the weights, optional: `found` and `calibration` of `scene.LanguageField`
 WORD = re.compile(r"[^\W_]+(?:'[^\W_]+)?")
 EXAMPLES = 12  # known words to name where a phrase has an unknown one
 SUGGESTIONS = 2  # known words offered for an unknown one
@@ -202,7 +202,7 @@ class PhraseEncoder:
         self.id = weights.id  # hub id or folder as it was asked for; "demo" for the bundled encoder
         self.tower = tower
         self.words = _vocabulary(weights.folder)
-        self.reading = _reading(weights, tower.temperature)  # how its cosines are read, as a scene stores it
+        self.found, self.calibration = _calibration(weights)  # as a scene stores them
 
     @property
     def dim(self) -> int:
@@ -305,17 +305,20 @@ def inferred(forward: Callable[[], Any]) -> Array:
     return values
 
 
-def _reading(weights: Weights, temperature: float) -> Reading:
+def _calibration(weights: Weights) -> tuple[float, Calibration | None]:
     path = weights.folder / READING
     if not path.is_file():
-        return Reading(temperature)
+        return LanguageField.found, None
     try:
         stated = json.loads(path.read_text(encoding="utf-8"))
         if unknown := set(stated) - {"found", "calibration"}:
             raise ValueError(f"unknown: {', '.join(sorted(unknown))}")
-        odds = {name: Odds(**numbers) for name, numbers in stated.get("calibration", {}).items()}
-        calibration = Calibration(**odds) if "calibration" in stated else None
-        return Reading(temperature, float(stated.get("found", Reading.found)), calibration)
+        found = float(stated.get("found", LanguageField.found))
+        if not 0 <= found <= 1:
+            raise ValueError(f"found: {found}")
+        if "calibration" not in stated:
+            return found, None
+        return found, Calibration(**{name: PlattScaling(**n) for name, n in stated["calibration"].items()})
     except (OSError, ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise EncoderError(
             f'{weights.id}: {READING} is not {{"found": 0 to 1, "calibration": {{"thing": ODDS, '

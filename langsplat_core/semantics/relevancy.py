@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from langsplat_core.arrays import Array, sigmoid
-from langsplat_core.scene import Codec, Reading
+from langsplat_core.scene import Codec, LanguageField
 
 FLOOR = 0.5  # no closer to the phrase than to the closest of "object", "things", "stuff", "texture"
 MIN_HEAT_SPAN = 0.1  # a peak closer than this to the floor is not stretched to full heat
@@ -38,14 +38,18 @@ def relevancy_of(cosines: Array, zero: Array, rate: Array | float) -> Array:
 
 
 def relevancy(
-    vectors: Array, phrases: Array, canonical: Array, temperature: float = Reading.temperature
+    vectors: Array, phrases: Array, canonical: Array, temperature: float = LanguageField.temperature
 ) -> Array:
     """(M, D) unit vectors, (Q, D) unit phrase vectors, (C, D) unit canonical vectors -> (M, Q) in (0, 1)."""
     return relevancy_of(vectors @ phrases.T, (vectors @ canonical.T).max(1, keepdims=True), temperature)
 
 
 def latent_relevancy(
-    codec: Codec, latents: Array, phrases: Array, canonical: Array, temperature: float = Reading.temperature
+    codec: Codec,
+    latents: Array,
+    phrases: Array,
+    canonical: Array,
+    temperature: float = LanguageField.temperature,
 ) -> Array:
     """Return the (M, Q) relevancy of what (M, d) latents stand for, exact, in bounded memory.
 

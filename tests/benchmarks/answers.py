@@ -43,7 +43,7 @@ from langsplat_core.query.engine import QueryEngine, no_field
 from langsplat_core.query.nouns import PARTS, forms, is_part
 from langsplat_core.query.rule import RULE
 from langsplat_core.raster import load_rasterizer
-from langsplat_core.scene import Calibration, Fits, Odds
+from langsplat_core.scene import Calibration, Fits, PlattScaling
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.training.radiance.scores import evaluate_views
 from tests.benchmarks.room import HOLD_OUT, InRooms, MaskOrigin, Room, Seeds, Variant, publish
@@ -361,14 +361,14 @@ def _uncalled(words: Iterable[str], called: AbstractSet[str]) -> list[str]:
 
 
 def fit_calibration(rows: Sequence[Verdict]) -> Calibration:
-    """Odds of all kinds of phrases. Raises as `fit_odds` does."""
+    """Platt scaling of all kinds of phrases. Raises as `fit_odds` does."""
     return Calibration(
         **{name: fit_odds(fits_of(rows, there), fits_of(rows, not_)) for name, (there, not_) in PAIRS.items()}
     )
 
 
-def fit_odds(present: Array, absent: Array) -> Odds:
-    """Odds from fits (P, 3) of things that are there and (A, 3) of things that are not, which weigh the same.
+def fit_odds(present: Array, absent: Array) -> PlattScaling:
+    """Fit to (P, 3) fits of things that are there and (A, 3) of things that are not, which weigh the same.
 
     Raises InputError where there are fewer than ten of either, or the fits do not tell them apart.
     """
@@ -390,7 +390,7 @@ def fit_odds(present: Array, absent: Array) -> Odds:
     constant, whole, finer = minimize(loss, np.array([0.0, 10.0, 0.0]), method="BFGS").x.round(3)
     if whole + finer <= 0:
         raise InputError("what is there has no larger fits than what is not: nothing to calibrate")
-    plain = Odds(float(constant), float(whole), float(finer))
+    plain = PlattScaling(float(constant), float(whole), float(finer))
     said = [plain.probability((m[0], m[1], m[2])) for m in absent.tolist()]
     highest = float(np.quantile(said, REJECTED, method="higher"))
     return replace(plain, found=float(np.ceil(1000 * max(highest, RULE.weak_probability)) / 1000))

@@ -31,7 +31,7 @@ from langsplat_core.io.hostile import read_npy
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import TextEncoder
 from langsplat_core.raster.protocol import LiftingRasterizer
-from langsplat_core.scene import LEVELS, Camera, Gaussians, Reading
+from langsplat_core.scene import LEVELS, Calibration, Camera, Gaussians, LanguageField
 from langsplat_core.scene.language import phrase_key
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language.mask_weights import MaskGroups, find_mask_weights
@@ -167,7 +167,8 @@ class ClipGeometry:
     alike: float = 0.65  # cosine of images of different things
     # (V, 512) or (512, V) .npy of text vectors; names in a .txt beside it that begins alike
     vectors: Path | None = None
-    reading: Reading = field(default_factory=Reading)
+    found: float = LanguageField.found
+    calibration: Calibration | None = None
     image_size: int = 8  # of images that nobody looks at
     _contents: dict[str, Array] = field(default_factory=dict, init=False, repr=False)
 
@@ -199,7 +200,7 @@ class ClipGeometry:
     @property
     def temperature(self) -> float:
         """Temperature of relevancy, CLIP's."""
-        return self.reading.temperature
+        return LanguageField.temperature
 
     @property
     def _strength(self) -> float:

@@ -17,7 +17,7 @@ from langsplat_core.query.grammar import Atom
 from langsplat_core.query.grammar import parse as parse_phrase
 from langsplat_core.query.inventory import InventoryEntry, Spot
 from langsplat_core.query.relations import upright, viewpoint
-from langsplat_core.scene import Calibration, Odds, look_at
+from langsplat_core.scene import Calibration, PlattScaling, look_at
 from tests.benchmarks import answers
 from tests.benchmarks.__main__ import parse
 from tests.benchmarks.answers import (
@@ -37,7 +37,7 @@ from tests.benchmarks.room import InRooms
 from tests.benchmarks.scale import errors
 from tests.support.scenes import random_camera, random_gaussians
 
-TRUE = Odds(-1.0, 18.0, 6.0)
+TRUE = PlattScaling(-1.0, 18.0, 6.0)
 
 
 def logistic(count: int, seed: int = 0) -> tuple[Array, Array]:
@@ -81,11 +81,11 @@ def test_fit_refuses_too_little_and_reversed_evidence():
 
 def test_written_calibration_keeps_other_settings(tmp_path):
     path = tmp_path / "reading.json"
-    calibration = Calibration(TRUE, Odds(0, 0, 1), replace(TRUE, found=0.8))
+    calibration = Calibration(TRUE, PlattScaling(0, 0, 1), replace(TRUE, found=0.8))
     path.write_text('{"found": 0.73, "calibration": {"constant": 9}}')
     write_calibration(path, calibration)
     stated = json.loads(path.read_text())
-    odds = {name: Odds(**numbers) for name, numbers in stated["calibration"].items()}
+    odds = {name: PlattScaling(**numbers) for name, numbers in stated["calibration"].items()}
     assert (stated["found"], Calibration(**odds)) == (0.73, calibration)
 
 
@@ -149,7 +149,7 @@ def test_verdicts_write_tables_and_a_calibration(tmp_path, monkeypatch):
     assert (stored["settings"]["seeds"], len(stored["rows"])) == ([301], len(rows))
     assert verdict_table(rows) in (out / "verdicts.md").read_text()
     stated = json.loads(reading.read_text())["calibration"]
-    assert all(10 < Odds(**stated[name]).whole < 30 for name in PAIRS)
+    assert all(10 < PlattScaling(**stated[name]).whole < 30 for name in PAIRS)
 
 
 def test_altered_room_keeps_all_but_eight_things():

@@ -16,7 +16,7 @@ from langsplat_core.cli.edit import SetScale
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.scene import Reading, Scene
+from langsplat_core.scene import Scene
 from langsplat_core.semantics.encoder import OPEN_MODEL
 from tests.support.commands import refusal, run
 from tests.support.fakes import (
@@ -169,7 +169,7 @@ def test_query_lists_the_instances(folder, capsys):
     [(9.0, "found", 1.0), (1.0, "weak match", 0.73), (-3.0, "not here", 0.05)],
 )
 def test_query_prints_the_probability(folder, capsys, logit, verdict, probability):
-    save_fake(reading=Reading(calibration=calibrated_for("book", logit)))
+    save_fake(calibration=calibrated_for("book", logit))
     (answer,) = answers(capsys, "query", "b.ply", "book")
     assert answer["probability"] == pytest.approx(probability, abs=0.01)
     percent = f"{100 * answer['probability']:.0f}"

@@ -27,7 +27,7 @@ from langsplat_core.io.sidecar import SUFFIX as SIDECAR
 from langsplat_core.io.sidecar import write_language
 from langsplat_core.io.summary import disk_bytes, duplicates, summarise
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.scene import NO_NODE, Calibration, Odds, Reading, Scene
+from langsplat_core.scene import NO_NODE, Calibration, PlattScaling, Scene
 from langsplat_core.scene.gaussians import join_gaussians
 from langsplat_core.scene.tree import tree_of_wholes
 from tests.support.comparing import assert_refused, assert_same_extras, assert_same_field
@@ -348,8 +348,8 @@ def test_disk_bytes_of_a_folder_are_those_of_its_files(real_data):
 def test_summary_counts_nodes():
     field = random_field(40)
     tree = tree_of_wholes(np.array([1, 1, 0, NO_NODE] * 10))
-    sure = Reading(calibration=Calibration(*[Odds(0, 1, 0)] * 3))
-    fields = field, replace(field, tree=tree, reading=sure)
+    sure = Calibration(*[PlattScaling(0, 1, 0)] * 3)
+    fields = field, replace(field, tree=tree, calibration=sure)
     plain, named = (summarise(Scene(random_gaussians(40), made)) for made in fields)
     assert (plain.language.nodes, named.language.nodes) == (None, (0, 0, 2))
     assert (plain.language.calibrated, named.language.calibrated) == (False, True)

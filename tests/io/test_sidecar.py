@@ -30,8 +30,7 @@ from langsplat_core.scene import (
     Calibration,
     CodebookCodec,
     LanguageField,
-    Odds,
-    Reading,
+    PlattScaling,
     TaughtWord,
     Tree,
 )
@@ -40,7 +39,9 @@ from tests.support.file_samples import random_field
 from tests.support.scenes import random_gaussians
 
 N = 60
-CALIBRATION = Calibration(Odds(-0.25, 18.548, 2.7, 0.62), Odds(0.5, 2.25, 15.5), Odds(0.75, -0.5, 9.25, 0.5))
+CALIBRATION = Calibration(
+    PlattScaling(-0.25, 18.548, 2.7, 0.62), PlattScaling(0.5, 2.25, 15.5), PlattScaling(0.75, -0.5, 9.25, 0.5)
+)
 
 AXES = np.eye(3, 16, dtype=np.float32)
 TAUGHT = (
@@ -55,7 +56,7 @@ def full_field(kind: str = "autoencoder", calibration: Calibration | None = CALI
     parents = np.array([9, 9, 9, 10, 10, 10, 10, 10, 10, NO_NODE, NO_NODE], np.int32)
     levels = np.array([0] * 9 + [1, 2], np.uint8)
     tree = Tree(leaves, parents, levels, np.arange(22, dtype=np.uint16).reshape(11, 2))
-    made = replace(random_field(N, kind), tree=tree, reading=Reading(11.7, 0.73, calibration))
+    made = replace(random_field(N, kind), tree=tree, temperature=11.7, found=0.73, calibration=calibration)
     return replace(made, taught=TAUGHT)
 
 
@@ -303,7 +304,8 @@ def test_files_without_tree_and_odds_are_read(sidecar, means):
     change(sidecar, **NO_TREE, everyday=None)
     says(odds=None, calibration="[-0.25, 18.5, 2.75, 0.625]")(sidecar)  # of another scale: not read
     field = read_language(sidecar, means)
-    assert (field.tree, field.everyday, field.reading) == (None, None, Reading(11.7, 0.73))
+    assert (field.tree, field.everyday, field.calibration) == (None, None, None)
+    assert (field.temperature, field.found) == (11.7, 0.73)
     assert rematch_language(sidecar, means[:9]).tree is None
 
 

@@ -61,7 +61,7 @@ def test_training_keeps_a_calibration_for_drawn_rooms_alone(room, tmp_path):
         (data / "transforms.json").write_text(json.dumps({**frames, "drawn": drawn}))
         train_scene(data, tmp_path / "scene.ply", tiny_settings(data))
         field = load_scene(tmp_path / "scene.ply").language
-        made.append((field.reading.found, field.reading.calibration is not None, load_file(sidecar)))
+        made.append((field.found, field.calibration is not None, load_file(sidecar)))
     assert [(found, kept) for found, kept, _ in made] == [(0.7, True), (0.7, False)]
     for name, tensor in made[0][2].items():
         np.testing.assert_array_equal(tensor, made[1][2][name])

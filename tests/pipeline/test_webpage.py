@@ -240,7 +240,7 @@ def no_encoder(name: str) -> Any:
 def without_encoder(demo: Scene, **field: Any) -> tuple[Scene, QueryEngine]:
     """The bundled scene with an encoder that is not here, and no calibration."""
     assert demo.language is not None
-    own = replace(demo.language, reading=demo.language.reading.elsewhere, encoder_id="elsewhere", **field)
+    own = replace(demo.language, calibration=None, encoder_id="elsewhere", **field)
     scene = replace(demo, language=own)
     return scene, QueryEngine(scene, no_encoder)
 

@@ -13,7 +13,7 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.nouns import Named
 from langsplat_core.query.regions import Regions, build_regions, chance_in
 from langsplat_core.query.rule import RULE, Bar, bars_of, excess, region_fits
-from langsplat_core.scene import LEVELS, NO_NODE, Calibration, Gaussians, LanguageField, Odds, Reading, Scene
+from langsplat_core.scene import LEVELS, NO_NODE, Calibration, Gaussians, LanguageField, PlattScaling, Scene
 from langsplat_core.scene.surface import SMALLEST, Surface, build_surface
 from langsplat_core.semantics.relevancy import FLOOR, Scale
 from tests.support.fakes import CENTRES, PER_BLOB, FakeEncoder, blob_scene, blobs, language
@@ -21,12 +21,12 @@ from tests.support.file_samples import random_field
 from tests.support.scenes import chain_of_levels, random_gaussians, regions_of
 
 RULES = ("regions", "peak")
-SURE = Calibration(*[Odds(constant=0.0, whole=20.0, finer=2.0, found=0.8)] * 3)
+SURE = Calibration(*[PlattScaling(constant=0.0, whole=20.0, finer=2.0, found=0.8)] * 3)
 
 
 def calibrated(calibration: Calibration | None) -> QueryEngine:
     scene = blob_scene()
-    field = replace(language(), reading=Reading(calibration=calibration))
+    field = replace(language(), calibration=calibration)
     return QueryEngine(replace(scene, language=field), lambda _: FakeEncoder())
 
 
@@ -34,10 +34,10 @@ def asked(
     relevancy, gaussians: Gaussians, field: LanguageField, rule: str, level="auto", phrase="x"
 ) -> QueryResult:
     surface = build_surface(gaussians)
-    scale = Scale(field.canonical, field.everyday, field.reading.temperature)
+    scale = Scale(field.canonical, field.everyday, field.temperature)
     if rule == "peak":
-        return by_peak(phrase, relevancy, surface, scale, field.reading.found, level)
-    regions, calibration = regions_of(Scene(gaussians, field), surface), field.reading.calibration
+        return by_peak(phrase, relevancy, surface, scale, field.found, level)
+    regions, calibration = regions_of(Scene(gaussians, field), surface), field.calibration
     by_chance = bars_of(chance_in(field, regions, replace(scale, everyday=field.everyday[:9])))
     return by_regions(phrase, relevancy, gaussians.means, regions, scale, by_chance, calibration, level)
 
@@ -99,8 +99,8 @@ def test_place_ignores_crumbs():
 def test_calibrated_verdict_follows_the_probability(below, verdict):
     """`below`: what the odds of the book's whole lie above those that are even by, as a logit, less 1."""
     fit = calibrated(None).run("book").fits[2]
-    odds = Odds(1 + below - 2 * fit, whole=2.0, finer=0.0, found=sigmoid(np.array(1.0)).item())
-    never = Odds(-99.0, whole=2.0, finer=0.01)
+    odds = PlattScaling(1 + below - 2 * fit, whole=2.0, finer=0.0, found=sigmoid(np.array(1.0)).item())
+    never = PlattScaling(-99.0, whole=2.0, finer=0.01)
     result = calibrated(Calibration(odds, never, never)).run("book")
     assert result.probability == pytest.approx(1 / (1 + np.exp(-(1 + below))))
     assert (result.found, result.verdict) == (verdict == "found", verdict)
@@ -110,8 +110,8 @@ def test_part_asked_for_alone_has_its_own_calibration():
     gaussians, field = random_gaussians(300), random_field(300, "codebook")
     relevancy = np.full((3, 300), 0.4, np.float32)
     relevancy[1, :100] = 0.8  # among the parts it is there, among wholes it is not
-    calibration = Calibration(Odds(0, 20, 0), Odds(0, 0, 20), Odds(-99, 1, 1))
-    field = replace(field, reading=Reading(calibration=calibration))
+    calibration = Calibration(PlattScaling(0, 20, 0), PlattScaling(0, 0, 20), PlattScaling(-99, 1, 1))
+    field = replace(field, calibration=calibration)
     part, thing = (asked(relevancy, gaussians, field, "regions", phrase=text) for text in ("handle", "mug"))
     assert part.fits == thing.fits
     assert part.probability == pytest.approx(sigmoid(np.array(20 * max(part.fits[:2]))))
@@ -133,7 +133,7 @@ def test_probability_does_not_depend_on_the_level():
 
 def test_peak_rule_finds_by_the_best_relevancy():
     for found, says in ((0.6, True), (0.9999, True), (1.0, False)):
-        scene = replace(blob_scene(), language=replace(language(), reading=Reading(found=found)))
+        scene = replace(blob_scene(), language=replace(language(), found=found))
         result = QueryEngine(scene, lambda _: FakeEncoder(), rule="peak").run("mug")
         assert (result.found, result.verdict) == (says, "found" if says else "not here")
 
@@ -154,7 +154,7 @@ def test_negative_fits_give_no_answer(rule):
 @pytest.mark.parametrize("calibration", [None, SURE])
 @pytest.mark.parametrize("count", [0, 1, 150])
 def test_scenes_without_features_give_finite_answers(rule, calibration, count):
-    field = replace(random_field(count), reading=Reading(calibration=calibration))
+    field = replace(random_field(count), calibration=calibration)
     if count > 1:
         field = replace(field, latents=0 * field.latents, confidence=0 * field.confidence)
     result = QueryEngine(Scene(random_gaussians(count), field), rule=rule).run("red mug")
@@ -217,7 +217,7 @@ def test_excess_is_counted_from_the_bars(named, level):
 
 
 def test_peak_rule_answers_without_everyday_phrases():
-    field = replace(language(), everyday=None, reading=Reading(found=0.6))
+    field = replace(language(), everyday=None, found=0.6)
     scene = replace(blob_scene(), language=field)
     engine = QueryEngine(scene, lambda _: FakeEncoder())  # which knows too few of them
     assert (engine.rule, engine.chance, engine.calibration) == ("peak", None, None)

@@ -30,8 +30,7 @@ from langsplat_core.scene import (
     Calibration,
     LanguageField,
     LinearCodec,
-    Odds,
-    Reading,
+    PlattScaling,
     Scene,
 )
 from langsplat_core.scene.codec import CodebookCodec
@@ -255,29 +254,29 @@ def test_twelve_threads_share_engine_and_rasterizer() -> None:
 
 # What an answer is said to stand on.
 
-CALIBRATED = Reading(calibration=Calibration(*[Odds(0, 1, 1)] * 3))
+CALIBRATED = Calibration(*[PlattScaling(0, 1, 1)] * 3)
 # Far from what is in the scene, so that that is found clearly.
 FAR = np.where(np.arange(DIM) < len(WORDS), 0.5, 1)
 EVERYDAY = unit((FAR * np.random.default_rng(4).normal(size=(FEWEST, DIM))).astype(np.float32))
 
 
-def scene_of(encoder: str, reading: Reading, *, everyday: bool = True) -> Scene:
+def scene_of(encoder: str, calibration: Calibration | None = None, *, everyday: bool = True) -> Scene:
     scene, vectors = named_scene(), EVERYDAY if everyday else None
-    field = replace(scene.language, encoder_id=encoder, reading=reading, everyday=vectors)
+    field = replace(scene.language, encoder_id=encoder, calibration=calibration, everyday=vectors)
     return replace(scene, language=field)
 
 
 @pytest.mark.parametrize("encoder", [DEMO, "lab/clip"])
-@pytest.mark.parametrize("reading", [CALIBRATED, Reading()])
+@pytest.mark.parametrize("calibration", [CALIBRATED, None])
 @pytest.mark.parametrize("everyday", [True, False])
-def test_basis_names_a_calibration_where_there_is_one(encoder, reading, everyday):
-    engine = QueryEngine(scene_of(encoder, reading, everyday=everyday))
+def test_basis_names_a_calibration_where_there_is_one(encoder, calibration, everyday):
+    engine = QueryEngine(scene_of(encoder, calibration, everyday=everyday))
     before = engine.basis  # known before anything is asked, without loading an encoder
     answer = engine.run("mug")
     assert engine.basis == before
     assert (before.calibration is not None) == (answer.probability is not None)
     assert before.encoder == encoder
-    assert before.guesses == (encoder == DEMO and reading == Reading())
+    assert before.guesses == (encoder == DEMO and calibration is None)
     assert (OPEN_MODEL in before.long) == before.guesses
     engine.compare_with(["plant"])
     assert engine.run("mug").probability is None
@@ -285,8 +284,8 @@ def test_basis_names_a_calibration_where_there_is_one(encoder, reading, everyday
 
 
 def test_basis_tells_rules_apart():
-    demo, clip = scene_of(DEMO, CALIBRATED), scene_of("lab/clip", Reading())
-    guessed, published = scene_of(DEMO, Reading()), scene_of("lab/clip", Reading(), everyday=False)
+    demo, clip = scene_of(DEMO, CALIBRATED), scene_of("lab/clip")
+    guessed, published = scene_of(DEMO), scene_of("lab/clip", everyday=False)
     said = [QueryEngine(scene).basis for scene in (demo, clip, guessed, published)]
     assert len({basis.short for basis in said}) == len({basis.long for basis in said}) == 4
 
@@ -304,14 +303,14 @@ class Speaker(FakeEncoder):
 
 
 def test_everyday_phrases_of_the_encoder_are_used_once_loaded():
-    engine = QueryEngine(scene_of("lab/clip", Reading(), everyday=False), lambda _: Speaker())
+    engine = QueryEngine(scene_of("lab/clip", everyday=False), lambda _: Speaker())
     published = engine.basis
     assert engine.run("mug").judgement.reached == "chance"
     assert engine.basis.short != published.short
 
 
 def test_combined_answers_take_the_weakest_margin():
-    scene = scene_of("lab/clip", Reading())
+    scene = scene_of("lab/clip")
     book = scene.language.phrasebook | {"handle": axis(3)}
     engine = QueryEngine(replace(scene, language=replace(scene.language, phrasebook=book)))
     parts = [engine.run(text) for text in ("mug", "wall")]
@@ -333,7 +332,7 @@ def test_combined_answers_take_the_weakest_margin():
 
 
 def scale_of(field: LanguageField, chance: bool) -> Scale:
-    return Scale(field.canonical, field.everyday if chance else None, field.reading.temperature)
+    return Scale(field.canonical, field.everyday if chance else None, field.temperature)
 
 
 def plain_relevancy(vector: Array, phrase: Array, scale: Scale) -> float:
@@ -352,7 +351,7 @@ def plain_relevancy(vector: Array, phrase: Array, scale: Scale) -> float:
 @pytest.mark.parametrize("exact", [False, True])
 @pytest.mark.parametrize("chance", [False, True])
 def test_every_lookup_finds_the_relevancy_of_its_latents(kind, temperature, exact, chance):
-    field = replace(random_field(300, kind), reading=Reading(temperature))
+    field = replace(random_field(300, kind), temperature=temperature)
     field.confidence[1, 5:20] = 0
     scale = scale_of(field, chance)
     phrase = unit(np.random.default_rng(3).normal(size=field.codec.vector_dim)).astype(np.float32)

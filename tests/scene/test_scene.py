@@ -12,7 +12,7 @@ from langsplat_core.arrays import logit, psnr, rotation_matrices, sigmoid, unit
 from langsplat_core.errors import InputError
 from langsplat_core.progress import WorkCancelledError
 from langsplat_core.raster.reference import ReferenceRasterizer
-from langsplat_core.scene import NO_NODE, Camera, Gaussians, Odds, Scene, Tree
+from langsplat_core.scene import NO_NODE, Camera, Gaussians, PlattScaling, Scene, Tree
 from langsplat_core.scene.gaussians import GROUP, merged
 from langsplat_core.scene.language import phrase_key, split_phrases, tidy, tokens
 from langsplat_core.scene.transform import (
@@ -268,7 +268,7 @@ N = 20
 
 
 def test_probability_is_the_logistic_of_two_margins():
-    odds = Odds(-1.0, 18.0, 3.0)
+    odds = PlattScaling(-1.0, 18.0, 3.0)
     for fits in ((0.1, -0.2, 0.3), (-0.2, 0.1, 0.3), (-5.0, -4.0, -9.0)):
         logit = -1 + 18 * fits[2] + 3 * max(fits[:2])
         assert odds.probability(fits) == pytest.approx(1 / (1 + np.exp(-logit)))
@@ -284,7 +284,7 @@ def test_probability_is_the_logistic_of_two_margins():
 )  # fmt: skip
 def test_odds_rise_with_fits(numbers):
     with pytest.raises(ValueError, match=r"numbers up to 1e\+06, rising with fits"):
-        Odds(*numbers)
+        PlattScaling(*numbers)
 
 
 LEAVES = np.array([0, 0, 1, 2, 2, NO_NODE, 3], np.int32)  # two subparts of a part of a whole; another whole

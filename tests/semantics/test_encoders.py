@@ -21,7 +21,7 @@ from transformers import CLIPModel, CLIPTokenizerFast, PreTrainedTokenizerFast, 
 
 from langsplat_core.arrays import unit
 from langsplat_core.errors import EncoderError, InputError
-from langsplat_core.scene import Calibration, Odds, Reading
+from langsplat_core.scene import Calibration, PlattScaling
 from langsplat_core.semantics import clip_plain, encoders
 from langsplat_core.semantics.clip_plain import PlainClipText, plain_text_tower, read_pair_tokenizer
 from langsplat_core.semantics.encoders import ClipText, clip_text, load_encoder, load_text_encoder
@@ -116,20 +116,25 @@ def test_weights_of_another_model_are_refused(tmp_path: Path) -> None:
         load_encoder(str(tmp_path), "cpu")
 
 
+def said(encoder):
+    return encoder.temperature, encoder.found, encoder.calibration
+
+
 def test_reading_json_is_read_beside_the_weights(tmp_path):
     tiny_clip(tmp_path)
     odds = {"constant": -1, "whole": 18.5, "finer": 2.5, "found": 0.7}
     stated = {"thing": odds, "part": {"constant": 0, "whole": 0, "finer": 9}, "inside": odds}
     (tmp_path / "reading.json").write_text("{}")
-    assert load_text_encoder(str(tmp_path)).reading == Reading(10.0, 0.6)
+    assert said(load_text_encoder(str(tmp_path))) == (10.0, 0.6, None)
     (tmp_path / "reading.json").write_text(json.dumps({"calibration": stated}))
-    want = Reading(10.0, 0.6, Calibration(Odds(-1, 18.5, 2.5, 0.7), Odds(0, 0, 9), Odds(-1, 18.5, 2.5, 0.7)))
-    assert load_text_encoder(str(tmp_path)).reading == want
-    assert load_encoder(str(tmp_path), "cpu").reading == want
+    both = PlattScaling(-1, 18.5, 2.5, 0.7)
+    want = 10.0, 0.6, Calibration(both, PlattScaling(0, 0, 9), both)
+    assert said(load_text_encoder(str(tmp_path))) == said(load_encoder(str(tmp_path), "cpu")) == want
     odds.pop("found")
     (tmp_path / "reading.json").write_text(json.dumps({"found": 0.8, "calibration": stated}))
-    reading = load_text_encoder(str(tmp_path)).reading
-    assert reading == Reading(10.0, 0.8, Calibration(Odds(-1, 18.5, 2.5), Odds(0, 0, 9), Odds(-1, 18.5, 2.5)))
+    both = PlattScaling(-1, 18.5, 2.5)
+    want = 10.0, 0.8, Calibration(both, PlattScaling(0, 0, 9), both)
+    assert said(load_text_encoder(str(tmp_path))) == want
 
 
 ODDS = '{"constant": 0, "whole": 1, "finer": 0}'

@@ -79,7 +79,7 @@ def assert_same_tree(got: Tree, want: Tree) -> None:
 
 def assert_same_field(got: LanguageField, want: LanguageField) -> None:
     """Bit for bit: a saved scene must answer exactly like the one in memory."""
-    for name in ("encoder_id", "reading", "codec.kind"):
+    for name in ("encoder_id", "temperature", "found", "calibration", "codec.kind"):
         assert attrgetter(name)(got) == attrgetter(name)(want)
     for part in (_parts, lambda field: field.codec.tensors(), lambda field: field.phrasebook):
         assert_same_extras(part(got), part(want))

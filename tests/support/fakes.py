@@ -20,8 +20,7 @@ from langsplat_core.scene import (
     Gaussians,
     LanguageField,
     LinearCodec,
-    Odds,
-    Reading,
+    PlattScaling,
     Scene,
     look_at,
 )
@@ -113,7 +112,7 @@ class FakeEncoder:
 def calibrated_for(phrase: str, logit_of_whole: float) -> Calibration:
     """With which `phrase`, asked of the blobs, has a probability of sigmoid(logit_of_whole)."""
     fits = QueryEngine(blob_scene(), lambda _: FakeEncoder()).run(phrase).fits
-    return Calibration(*[Odds(logit_of_whole - 8 * fits[2], whole=8.0, finer=0.0)] * 3)
+    return Calibration(*[PlattScaling(logit_of_whole - 8 * fits[2], whole=8.0, finer=0.0)] * 3)
 
 
 NAMES = (*WORDS, "wall")  # "wall" is nowhere in the scene
@@ -210,7 +209,7 @@ def laid_table(phrasebook: dict[str, Array] | None = None) -> tuple[Scene, dict[
     confidence[0] = 0  # no subparts were outlined
     field = LanguageField(
         latents, confidence, LinearCodec(np.eye(DIM, dtype=np.float32)), np.tile(axis(6), (4, 1)), "plain",
-        phrasebook or {}, Reading(temperature=TEMPERATURE), everyday=everyday_about(np.eye(DIM)[6], SPREAD),
+        phrasebook or {}, temperature=TEMPERATURE, everyday=everyday_about(np.eye(DIM)[6], SPREAD),
     )  # fmt: skip
     masks = {block.name: owners == number for number, block in enumerate(BLOCKS)}
     return Scene(gaussians, field, (front_camera(),)), masks

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 from langsplat_core.display.displays import NO_HEAT, Subject, relevancies
 from langsplat_core.errors import EncoderError, InputError
-from langsplat_core.scene import CANONICAL_PHRASES, Reading
+from langsplat_core.scene import CANONICAL_PHRASES
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_viewer.actions import browsing, editing, queries, settings
 from langsplat_viewer.files.projects import read_queries, write_queries
@@ -132,7 +132,7 @@ def test_search_box_takes_the_keyboard_once(opened):
 
 @pytest.mark.parametrize(("logit", "verdict"), [(9.0, "found"), (1.0, "weak match"), (-3.0, "not here")])
 def test_calibrated_scene_gives_probabilities(viewer, monkeypatch, logit, verdict):
-    sure = replace(language(), reading=Reading(calibration=calibrated_for("mug", logit)))
+    sure = replace(language(), calibration=calibrated_for("mug", logit))
     monkeypatch.setitem(SCENES, "sure.ply", replace(blob_scene(), language=sure))
     open_scene(viewer, "sure.ply")
     ask(viewer, "mug")

@@ -150,7 +150,7 @@ def _paper(scene: Scene, field: LanguageField, camera: Camera, asked: _Asked) ->
     )
     decoding = max(both - blending, 0.0)
     decoded = field.codec.decode(field.codec.encode(asked.codewords))
-    published = Scale(field.canonical, None, field.reading.temperature)
+    published = Scale(field.canonical, None, field.temperature)
     exact = [_exact(asked, decoded, published, row) for row in range(len(asked.texts))]
     truth = [_exact(asked, asked.codewords, published, row) for row in range(len(asked.texts))]
     return QueryCost(

@@ -76,7 +76,7 @@ def import_scene(
     subpart, part, whole = confidence.mean(1).tolist() if confidence.size else (0.0, 0.0, 0.0)
     shares = (subpart, part, whole)
     report = ImportReport(foreign.method, codec.kind, codec.size, shares, loss, foreign.notes)
-    return replace(foreign.scene, language=replace(field, reading=encoder.reading.elsewhere)), report
+    return replace(foreign.scene, language=replace(field, calibration=None)), report
 
 
 def _first_path(foreign: ForeignScene) -> object:

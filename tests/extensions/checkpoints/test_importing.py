@@ -69,7 +69,7 @@ def test_few_vectors_become_a_codebook_of_them(tmp_path, clip):
     assert field is not None
     assert_same(scene.gaussians, G)
     assert (report.codec, report.codec_size) == ("codebook", 7)
-    assert field.reading.calibration is None  # the encoder's is of drawn rooms
+    assert field.calibration is None  # the encoder's is of drawn rooms
     np.testing.assert_array_equal(field.confidence, np.tile(SEEN.astype(np.float32), (3, 1)))
     for level in range(3):
         # codewords are float16 numbers
@@ -77,7 +77,7 @@ def test_few_vectors_become_a_codebook_of_them(tmp_path, clip):
     encoder = load_text_encoder(clip)
     np.testing.assert_array_equal(field.canonical, encoder.encode_texts(list(CANONICAL_PHRASES)))
     assert list(field.phrasebook) == ["red mug"]
-    assert (field.encoder_id, field.reading.temperature) == (clip, encoder.temperature)
+    assert (field.encoder_id, field.temperature) == (clip, encoder.temperature)
     assert report.loss is not None
     assert report.loss.error_mean < 1e-3
     save_scene(tmp_path / "a.ply", scene)
