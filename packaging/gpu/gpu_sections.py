@@ -35,17 +35,17 @@ from langsplat_core.arrays import Array, unit
 from langsplat_core.config import INRIA, RadianceConfig
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import BackendError
-from langsplat_core.extensions.benchmarks.measure import (
+from langsplat_core.extensions.benchmarks.raster_speed import (
     Case,
     Foresight,
     default_camera,
+    describe_machine,
     label_maps,
     random_scene,
     reference_windows,
     warm_up,
 )
-from langsplat_core.extensions.benchmarks.measure import measure as measure_backend
-from langsplat_core.extensions.benchmarks.raster_speed import describe_machine
+from langsplat_core.extensions.benchmarks.raster_speed import measure as measure_backend
 from langsplat_core.extensions.benchmarks.raster_speed import table as speed_table
 from langsplat_core.io.files import atomic_path
 from langsplat_core.raster import gsplat, load_lifting_rasterizer, load_rasterizer

@@ -33,7 +33,7 @@ from langsplat_core.config import (
 )
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import InputError
-from langsplat_core.extensions.benchmarks.measure import markdown
+from langsplat_core.extensions.benchmarks.report import markdown
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import Progress, TerminalProgress, silent

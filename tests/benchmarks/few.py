@@ -21,7 +21,7 @@ from langsplat_core.config import (
 )
 from langsplat_core.datasets import Capture, load_capture
 from langsplat_core.datasets.holdout import split
-from langsplat_core.extensions.benchmarks.measure import markdown
+from langsplat_core.extensions.benchmarks.report import markdown
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Scene

@@ -17,7 +17,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
-from langsplat_core.extensions.benchmarks.config import peak_memory
+from langsplat_core.extensions.benchmarks.raster_speed import peak_memory
 
 
 def in_fresh_interpreter(*words: object) -> dict[str, Any]:

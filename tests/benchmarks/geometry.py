@@ -13,7 +13,7 @@ from langsplat_core.arrays import Array, logit, sigmoid
 from langsplat_core.compaction.clean import clean, find_floaters
 from langsplat_core.compaction.views import Views, choose_views, mean_psnr
 from langsplat_core.config import CleanConfig
-from langsplat_core.extensions.benchmarks.measure import markdown
+from langsplat_core.extensions.benchmarks.report import markdown
 from langsplat_core.extensions.geometry.mesh import fuse
 from langsplat_core.extensions.geometry.occupancy import find_occupancy, floor_map, map_axes
 from langsplat_core.extensions.geometry.planes import find_room

@@ -22,7 +22,7 @@ from assets.making.objects import BRIGHT, TABLE_TOP
 from assets.making.world import ENLARGED, Placed, StandingArea, assemble, footprint, furnished
 from langsplat_core.arrays import Array, unit
 from langsplat_core.config import CountOrZero
-from langsplat_core.extensions.benchmarks.measure import markdown
+from langsplat_core.extensions.benchmarks.report import markdown
 from langsplat_core.extensions.library.changes import Change, changes
 from langsplat_core.extensions.library.finding import rank
 from langsplat_core.extensions.library.index import (

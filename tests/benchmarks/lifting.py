@@ -22,7 +22,7 @@ from langsplat_core.config import (
     LinearConfig,
 )
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.extensions.benchmarks.measure import markdown
+from langsplat_core.extensions.benchmarks.report import markdown
 from langsplat_core.training.language.codec_fit import CodecReport
 from tests.benchmarks.room import InRooms, MaskOrigin, Room, Variant, publish
 from tests.benchmarks.scoring import (

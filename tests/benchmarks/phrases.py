@@ -15,8 +15,7 @@ from assets.making.truth import Region, Truth
 from assets.making.vocabulary import CATEGORIES, colour_words, object_words
 from assets.making.world import World
 from langsplat_core.arrays import Array
-from langsplat_core.extensions.benchmarks.measure import markdown
-from langsplat_core.extensions.benchmarks.report import intersection_over_union
+from langsplat_core.extensions.benchmarks.report import intersection_over_union, markdown
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.describe import Describer

@@ -44,7 +44,7 @@ from langsplat_core.config import (
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import InputError
-from langsplat_core.extensions.benchmarks.commands import write_report
+from langsplat_core.extensions.benchmarks.report import write_report
 from langsplat_core.io.hostile import write_npy
 from langsplat_core.io.sidecar import means_checksum
 from langsplat_core.pipeline.agreement import agreed_features

@@ -31,9 +31,9 @@ from langsplat_core.config import Count, CountOrZero, PictureConfig
 from langsplat_core.display.composing import compose_upwards
 from langsplat_core.display.displays import Channels
 from langsplat_core.errors import InputError
-from langsplat_core.extensions.benchmarks.config import Size, peak_memory, resident_memory, restart_peak
-from langsplat_core.extensions.benchmarks.measure import markdown
 from langsplat_core.extensions.benchmarks.query_speed import repeated
+from langsplat_core.extensions.benchmarks.raster_speed import Size, peak_memory, resident_memory, restart_peak
+from langsplat_core.extensions.benchmarks.report import markdown
 from langsplat_core.io.ply import write_ply
 from langsplat_core.io.scenes import formats, load_scene, save_scene
 from langsplat_core.progress import Progress, TerminalProgress, lap, silent, watched

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from langsplat_core.errors import InputError, printable_line
-from langsplat_core.extensions.benchmarks.config import peak_memory, restart_peak
+from langsplat_core.extensions.benchmarks.raster_speed import peak_memory, restart_peak
 
 HEADER = 600  # bytes at the beginning in which half of the mutations fall
 INTEGERS = (0, 1, -1, *(2**k + d for k in (7, 8, 15, 16, 24, 31, 32, 53, 63) for d in (-1, 0)))

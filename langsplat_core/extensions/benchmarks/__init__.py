@@ -2,17 +2,16 @@
 
 from langsplat_core.registry import Extension
 
-_COMMANDS = "langsplat_core.extensions.benchmarks.commands"
+_HERE = "langsplat_core.extensions.benchmarks"
 EXTENSION = Extension(
     groups={
         "eval": "Measure a scene against ground truth.",
         "bench": "Measure speed against error in one run.",
     },
     commands={
-        "eval lerf-ovs": f"{_COMMANDS}:EvalLerfOvs",
-        "eval 3d-ovs": f"{_COMMANDS}:EvalOvs3d",
-        "eval scannet": f"{_COMMANDS}:EvalScanNet",
-        "bench raster": f"{_COMMANDS}:BenchRaster",
-        "bench query": f"{_COMMANDS}:BenchQuery",
+        "eval lerf-ovs": f"{_HERE}.commands:EvalLerfOvs",
+        "eval 3d-ovs": f"{_HERE}.commands:EvalOvs3d",
+        "bench raster": f"{_HERE}.raster_speed:BenchRaster",
+        "bench query": f"{_HERE}.query_speed:BenchQuery",
     },
 )

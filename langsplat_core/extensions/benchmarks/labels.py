@@ -3,8 +3,9 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 from PIL import Image, ImageDraw
 
@@ -24,10 +25,7 @@ class Outlines:
     polygons: tuple[Array, ...]  # (K, 2) float x, y each, K >= 3
 
     def draw(self, size: Size) -> Array:
-        """Return the mask on a grid of `size`, (H, W) bool.
-
-        True is above half of 255, or above 0 where the file holds no more than 0 and 1.
-        """
+        """Return the mask on a grid of `size`, (H, W) bool."""
         canvas = Image.new("L", self.size)
         brush = ImageDraw.Draw(canvas)
         for polygon in self.polygons:
@@ -139,8 +137,24 @@ def photograph_of(folder: Path, name: str) -> Path | None:
 # polygons.
 
 LIMIT = 2**26  # bytes of a label file; real ones have some hundred kilobytes
-MAX_SIDE = 20_000  # px of a label's grid
 WANTED = "expected label/<scene>/<frame>.json in it, or one scene's folder of those"
+_Side = Annotated[int, msgspec.Meta(gt=0, le=20_000)]  # px of a label's grid
+
+
+class _Info(msgspec.Struct):
+    width: _Side
+    height: _Side
+
+
+class _Object(msgspec.Struct):
+    category: Annotated[str, msgspec.Meta(pattern=r"\S")]
+    segmentation: list[tuple[float, float]] = []
+    bbox: Any = None
+
+
+class _LabelFile(msgspec.Struct):
+    info: _Info
+    objects: list[_Object]
 
 
 def read_lerf_ovs(folder: Path) -> Benchmark:
@@ -156,7 +170,7 @@ def read_lerf_ovs(folder: Path) -> Benchmark:
         found = {name: pair for name, pair in folders.items() if any(pair[0].glob("*.json"))}
     elif (folder.parent / "label" / folder.name).is_dir():
         found = {folder.name: (folder.parent / "label" / folder.name, folder)}
-    elif _holds_labels(folder):
+    elif folder.resolve().parent.name == "label":
         found = {folder.name: (folder, folder.parent.parent / folder.name)}
     else:
         found = {}
@@ -165,14 +179,6 @@ def read_lerf_ovs(folder: Path) -> Benchmark:
         hint = "it looks like 3D-OVS: use `langsplat eval 3d-ovs`; " if other else ""
         raise InputError(f"{folder}: not in the layout of LERF-OVS; {hint}{WANTED}")
     return Benchmark("lerf-ovs", {name: _read_scene(name, *pair) for name, pair in found.items()})
-
-
-def _holds_labels(folder: Path) -> bool:
-    first = min((path for path in folder.glob("*.json") if path.name != "transforms.json"), default=None)
-    if first is None:
-        return False
-    content = read_json_file(first, LIMIT)
-    return isinstance(content, dict) and "objects" in content
 
 
 def _read_scene(name: str, labels: Path, dataset: Path) -> LabelledScene:
@@ -188,19 +194,21 @@ def _read_scene(name: str, labels: Path, dataset: Path) -> LabelledScene:
 
 def _read_frame(path: Path, dataset: Path) -> tuple[Frame, list[str]]:
     """Return the frame, and the categories of it that have no polygon with an inside."""
-    content = read_json_file(path, LIMIT)
-    size = _size(content, path)
-    objects = content.get("objects")
-    if not isinstance(objects, list):
-        raise FormatError(f'{path}: no list of "objects"; it is not a label file of LERF-OVS')
+    try:
+        content = msgspec.convert(read_json_file(path, LIMIT), _LabelFile)
+    except msgspec.ValidationError as error:
+        raise FormatError(f"{path}: no label file of LERF-OVS: {error}") from None
+    size = content.info.width, content.info.height
     polygons: dict[str, list[Array]] = {}
     boxes: dict[str, list[Array]] = {}
-    for number, item in enumerate(objects):
-        phrase, polygon = _object(item, f"{path}: object {number}")
+    for number, item in enumerate(content.objects):
+        phrase, corners = item.category.strip(), np.array(item.segmentation, np.float64).reshape(-1, 2)
+        if not (np.abs(corners) <= 10 * max(size)).all():  # NaN fails too
+            raise FormatError(f"{path}: object {number} has corners far outside of the image")
         polygons.setdefault(phrase, [])
-        if len(polygon) >= 3:
-            polygons[phrase].append(polygon)
-            boxes.setdefault(phrase, []).append(_box(item.get("bbox"), polygon))
+        if len(corners) >= 3:
+            polygons[phrase].append(corners)
+            boxes.setdefault(phrase, []).append(_box(item.bbox, corners))
     labels = tuple(
         LabelledPhrase(phrase, Outlines(size, tuple(outlines)), np.stack(boxes[phrase]))
         for phrase, outlines in polygons.items()
@@ -211,46 +219,13 @@ def _read_frame(path: Path, dataset: Path) -> tuple[Frame, list[str]]:
     return Frame(path.stem, size, labels, photograph), without
 
 
-def _size(content: Any, path: Path) -> Size:
-    info = content.get("info") if isinstance(content, dict) else None
-    width, height = (info.get("width"), info.get("height")) if isinstance(info, dict) else (0, 0)
-    if not (_is_side(width) and _is_side(height)):
-        raise FormatError(
-            f'{path}: no "info" with width and height in pixels; it is not a label file of LERF-OVS'
-        )
-    return width, height
-
-
-def _is_side(value: Any) -> TypeGuard[int]:
-    return isinstance(value, int) and 0 < value <= MAX_SIDE
-
-
-def _object(item: Any, where: str) -> tuple[str, Array]:
-    """Category of a labelled object, and (K, 2) corners of its polygon."""
-    if (
-        not isinstance(item, dict)
-        or not isinstance(item.get("category"), str)
-        or not item["category"].strip()
-    ):
-        raise FormatError(f'{where} has no "category"')
-    try:
-        corners = np.array(item.get("segmentation", []), np.float64).reshape(-1, 2)
-    except (TypeError, ValueError):
-        raise FormatError(f'{where}: "segmentation" is not one polygon [[x, y], ...]') from None
-    if not (np.abs(corners) <= 10 * MAX_SIDE).all():  # NaN fails too
-        raise FormatError(f'{where}: "segmentation" has corners far outside of any image')
-    return item["category"].strip(), corners
-
-
 def _box(stored: Any, polygon: Array) -> Array:
     """(4,) the label's box, the polygon's own where there is none."""
     try:
-        box = np.array(stored, np.float64)
-    except (TypeError, ValueError):
-        box = np.empty(0)
-    if box.shape == (4,) and np.isfinite(box).all():
-        return box
-    return np.concatenate([polygon.min(0), polygon.max(0)])
+        box = np.array(msgspec.convert(stored, tuple[float, float, float, float]))
+    except msgspec.ValidationError:
+        box = np.full(4, np.nan)
+    return box if np.isfinite(box).all() else np.concatenate([polygon.min(0), polygon.max(0)])
 
 
 # 3D-OVS (Liu et al. 2023): one mask image per view and class.
@@ -283,23 +258,23 @@ def _is_scene(folder: Path) -> bool:
 
 
 def _read_ovs3d_scene(folder: Path) -> LabelledScene:
-    classes = read_classes(folder / "segmentations" / "classes.txt")
-    views = sorted(path for path in (folder / "segmentations").iterdir() if path.is_dir())
-    stray = [
-        f"{view.name}: {path.stem} (not in classes.txt)"
-        for view in views
-        for path in sorted(view.glob("*.png"))
-        if path.stem not in classes
-    ]
-    frames = [_read_ovs3d_frame(folder, view, classes) for view in views]
-    labelled = tuple(frame for frame in frames if frame.labels)
-    if not labelled:
+    classes = _classes(folder / "segmentations" / "classes.txt")
+    stray, frames = [], []
+    for view in sorted(path for path in (folder / "segmentations").iterdir() if path.is_dir()):
+        files = {path.stem: path for path in sorted(view.glob("*.png"))}
+        stray += [f"{view.name}: {name} (not in classes.txt)" for name in files if name not in classes]
+        labels = tuple(LabelledPhrase(name, MaskFile(files[name]), None) for name in classes if name in files)
+        if labels:
+            photograph = photograph_of(folder / "images", view.name)
+            grid = picture_size(photograph or files[labels[0].phrase])
+            frames.append(Frame(view.name, grid, labels, photograph))
+    if not frames:
         raise FormatError(f"{folder / 'segmentations'}: no <view>/<class>.png for any line of classes.txt")
-    return LabelledScene(folder.resolve().name, labelled, folder, tuple(stray))
+    return LabelledScene(folder.resolve().name, tuple(frames), folder, tuple(stray))
 
 
-def read_classes(path: Path) -> tuple[str, ...]:
-    """One class a line, each once; FormatError where there is none or the file is no text."""
+def _classes(path: Path) -> tuple[str, ...]:
+    """One class a line, each once."""
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError:
@@ -308,11 +283,3 @@ def read_classes(path: Path) -> tuple[str, ...]:
     if not classes:
         raise FormatError(f"{path}: is empty; expected one class a line")
     return classes
-
-
-def _read_ovs3d_frame(folder: Path, view: Path, classes: tuple[str, ...]) -> Frame:
-    files = {name: view / f"{name}.png" for name in classes if (view / f"{name}.png").is_file()}
-    photograph = photograph_of(folder / "images", view.name)
-    grid = photograph or next(iter(files.values()), None)
-    labels = tuple(LabelledPhrase(name, MaskFile(path), None) for name, path in files.items())
-    return Frame(view.name, (1, 1) if grid is None else picture_size(grid), labels, photograph)

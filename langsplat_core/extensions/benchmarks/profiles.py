@@ -7,7 +7,7 @@ here depends on a label: a profile is chosen by name, and no threshold is search
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
@@ -31,7 +31,6 @@ Border = Literal["mirror", "inside"]  # cv2's reflect101; the mean of what lies 
 LevelRule = Literal["peak", "inside"]  # the highest map; the highest mean inside its own mask
 # "clipped": LangSplat's loop, which never counts the last row and column; "inside": V2's.
 Vote = Literal["none", "clipped", "inside"]
-Benchmark = Literal["lerf-ovs", "3d-ovs"]
 LerfProtocol = Literal["langsplat-code", "langsplat-paper", "langsplat-v2", "direct-3d", "ours"]
 OvsProtocol = Literal["langsplat-paper", "direct-3d", "ours"]
 
@@ -79,9 +78,6 @@ class Profile:
     max_rows: int = 1080  # higher images are scored at this height, as LangSplat's loader shrinks them
 
 
-_CODE = MapRule(30, 0.5, "mirror", "peak", True, 0.7, "clipped", 7, 30, True)
-_LERF_PAPER = MapRule(20, 0.0, "mirror", "peak", True, 0.7, "none", 1, 20, False)
-_OVS_PAPER = MapRule(1, 1.0, "mirror", "inside", False, 0.4, "none", 1, 20, False)
 _DIRECT = Profile(
     "direct-3d",
     "OpenGaussian's protocol: Gaussians are selected by the phrase, drawn alone, and the image is cut; of "
@@ -98,13 +94,13 @@ LERF_PROFILES: Mapping[LerfProtocol, Profile] = MappingProxyType(
             "langsplat-code",
             "LangSplat's public evaluator: (filter 30 + raw) / 2, level by the peak before min-max, min-max "
             "above 0.7, 7x7 majority; place: all highest pixels of the filtered map",
-            _CODE,
+            MapRule(30, 0.5, "mirror", "peak", True, 0.7, "clipped", 7, 30, True),
         ),
         "langsplat-paper": Profile(
             "langsplat-paper",
             "LangSplat's text: filter 20, level and place by the filtered peak; the text gives no cut for "
             "LERF-OVS: min-max above 0.7 as its code, without the vote",
-            _LERF_PAPER,
+            MapRule(20, 0.0, "mirror", "peak", True, 0.7, "none", 1, 20, False),
         ),
         "langsplat-v2": Profile(
             "langsplat-v2",
@@ -122,7 +118,7 @@ OVS_PROFILES: Mapping[OvsProtocol, Profile] = MappingProxyType(
             "langsplat-paper",
             "LangSplat's appendix: absolute 0.4, the level whose mask has the highest mean relevancy, no "
             "filter; its code for 3D-OVS was never released",
-            _OVS_PAPER,
+            MapRule(1, 1.0, "mirror", "inside", False, 0.4, "none", 1, 20, False),
         ),
         "direct-3d": _DIRECT,
         "ours": _OURS,
@@ -130,9 +126,7 @@ OVS_PROFILES: Mapping[OvsProtocol, Profile] = MappingProxyType(
 )
 
 
-# From relevancy maps or images of selected Gaussians to a mask and a place, as a profile says.
-#
-# Everything here is given maps and constants, never a label.
+# From relevancy maps or images of selected Gaussians to a mask and a place; nothing here is given a label.
 
 TINY = 1e-9  # added to the range that a map is divided by, as in LangSplat's code: a flat map is 0
 
@@ -154,10 +148,11 @@ def read_maps(maps: Array, rule: MapRule) -> Prediction:
         (1 - rule.raw_share) * mean_filtered(level, rule.window, rule.border) + rule.raw_share * level
         for level in maps
     ]
-    if rule.level == "peak":
-        chosen = int(np.argmax([values.max() for values in blended]))
-    else:
-        chosen = int(np.argmax([_mean_inside(values, rule.threshold) for values in blended]))
+    heights = [values.max() for values in blended]
+    if rule.level == "inside":  # -1, below every relevancy, where nothing is inside
+        heights = [values[values > rule.threshold].mean() if high > rule.threshold else -1.0
+                   for values, high in zip(blended, heights, strict=True)]  # fmt: skip
+    chosen = int(np.argmax(heights))
     values = blended[chosen]
     if rule.min_max:
         values = values - values.min()
@@ -175,12 +170,6 @@ def peak_pixels(maps: Array, rule: MapRule) -> Array:
     best = smooth[int(np.argmax([values.max() for values in smooth]))]
     pixels = np.argwhere(best == best.max())[:, ::-1]
     return pixels if rule.ties else pixels[:1]
-
-
-def _mean_inside(values: Array, threshold: float) -> float:
-    """Return the mean of the values above the threshold; -1, below every relevancy, where there are none."""
-    inside = values[values > threshold]
-    return float(inside.mean()) if len(inside) else -1.0
 
 
 def mean_filtered(values: Array, window: int, border: Border) -> Array:
@@ -238,9 +227,8 @@ def own_prediction(view: View, result: QueryResult, rule: OwnRule) -> Prediction
 # Who answers: a scene of ours, or a folder of relevancy maps and masks that another system rendered. Neither
 # sees a label.
 #
-#     <view>/<phrase>.npy                  float (L, H, W) or (H, W) relevancy; L levels, at most three
-#     <view>/<phrase>.<level>.npy|.png     or one file per level: subpart, part, whole; any of them
-#     <view>/<phrase>.png                  a single map; for protocol direct-3d the drawn silhouette instead
+#     <view>/<phrase>.npy     float (L, H, W) or (H, W) relevancy; L levels, at most three
+#     <view>/<phrase>.png     a single map; for protocol direct-3d the drawn silhouette instead
 #
 # A PNG of 8 or 16 bits holds relevancy from 0 to 1. A "/" in a phrase is "_" in its file's name. Maps of one
 # phrase have one size; it need not be the labels', whose masks are then brought to it.
@@ -251,38 +239,11 @@ def file_name(phrase: str) -> str:
     return phrase.replace("/", "_")
 
 
-def read_relevancy(folder: Path, phrase: str) -> tuple[Array, tuple[int, ...]] | None:
-    """Return the (L, H, W) float64 maps of `phrase` in a view's `folder` and their levels.
-
-    Levels are indices into LEVELS. None where there is no map; FormatError for a damaged one.
-    """
-    name = file_name(phrase)
-    whole = _existing(folder, name)
-    if whole is not None:
-        maps = _read(whole)
-        maps = maps[None] if maps.ndim == 2 else maps
-        return maps, tuple(range(len(maps)))
-    files = {level: _existing(folder, f"{name}.{word}") for level, word in enumerate(LEVELS)}
-    there = {level: path for level, path in files.items() if path is not None}
-    if not there:
-        return None
-    singles = {path: _read(path) for path in there.values()}
-    first = next(iter(singles.values()))
-    for path, values in singles.items():
-        if values.ndim != 2 or values.shape != first.shape:
-            raise FormatError(
-                f"{path}: shape {values.shape}; the levels of one phrase are (H, W) of one size"
-            )
-    return np.stack(list(singles.values())), tuple(there)
-
-
-def _existing(folder: Path, name: str) -> Path | None:
-    return next((path for s in (".npy", ".png") if (path := folder / f"{name}{s}").is_file()), None)
-
-
-def _read(path: Path) -> Array:
+def _read_relevancy(path: Path) -> Array:
+    """(L, H, W) float64 maps in a file; FormatError for a damaged one."""
     values = read_npy(path) if path.suffix == ".npy" else _image(path)
-    if values.ndim not in (2, 3) or 0 in values.shape or (values.ndim == 3 and len(values) > len(LEVELS)):
+    values = values[None] if values.ndim == 2 else values
+    if values.ndim != 3 or 0 in values.shape or len(values) > len(LEVELS):
         raise FormatError(
             f"{path}: shape {values.shape}; expected (H, W), or (L, H, W) with at most 3 levels"
         )
@@ -299,8 +260,6 @@ def _image(path: Path) -> Array:
         return np.asarray(image.convert("L"), np.float64) / 255
 
 
-NO_VIEW = "no camera of that name"
-NO_MAP = "no map"
 TOGETHER = 10  # phrases splatted in one pass, three channels each
 
 
@@ -321,7 +280,7 @@ class SceneSource:
     def answers(self, frame: str, size: Size, phrases: Sequence[str]) -> Mapping[str, Prediction | str]:
         """Return the answer to each phrase in the view `frame`, drawn at `size`, or why there is none."""
         if frame not in self.cameras:
-            return dict.fromkeys(phrases, NO_VIEW)
+            return dict.fromkeys(phrases, "no camera of that name")
         camera = self.cameras[frame]
         check_same_image(frame, (camera.width, camera.height), size)
         camera = camera.resized(*size)
@@ -337,32 +296,26 @@ class SceneSource:
         return found
 
     def _predictions(self, camera: Camera, phrases: Sequence[str]) -> list[Prediction]:
-        rule, scene = self.profile.rule, self.engine.scene
-        view = view_of(scene, camera)
+        rule, scene, engine = self.profile.rule, self.engine.scene, self.engine
+        view, gate, count = view_of(scene, camera), PictureConfig().alpha_gate, len(LEVELS)
         if isinstance(rule, MapRule) and self.paper_order:
-            return [read_maps(maps, rule) for maps in self._decoded(view, phrases)]
-        results = self.engine.run_many(phrases)
+            vectors = engine.text_vectors(phrases)
+            levels = [decoded_relevancy(view, engine.field, k, vectors, gate) for k in range(count)]
+            return [read_maps(maps, rule) for maps in np.moveaxis(np.stack(levels), 3, 0)]
+        results = engine.run_many(phrases)
         if isinstance(rule, OwnRule):
             return [own_prediction(view, result, rule) for result in results]
         if isinstance(rule, SilhouetteRule):
             return [Prediction(self._silhouette(camera, result, rule), result.level) for result in results]
         values = np.concatenate([result.relevancy for result in results]).T
-        maps = np.moveaxis(splatted_relevancy(view, values, PictureConfig().alpha_gate), 2, 0)
-        return [read_maps(maps[row : row + len(LEVELS)], rule) for row in range(0, len(maps), len(LEVELS))]
-
-    def _decoded(self, view: View, phrases: Sequence[str]) -> Array:
-        """(Q, 3, H, W) relevancy in the paper's order: latents blended, every pixel decoded."""
-        vectors = np.stack([self.engine.text_vector(phrase) for phrase in phrases])
-        gate = PictureConfig().alpha_gate
-        levels = [decoded_relevancy(view, self.engine.field, k, vectors, gate) for k in range(len(LEVELS))]
-        return np.moveaxis(np.stack(levels), 3, 0)
+        maps = np.moveaxis(splatted_relevancy(view, values, gate), 2, 0)
+        return [read_maps(maps[row : row + count], rule) for row in range(0, len(maps), count)]
 
     def _silhouette(self, camera: Camera, result: QueryResult, rule: SilhouetteRule) -> Array:
         """Return the mask of the answer's Gaussians drawn alone, as if nothing stood before them."""
-        scene = self.engine.scene
         if not result.members.any():
             return np.zeros((camera.height, camera.width), bool)
-        drawn = render(scene.take(result.members), camera)
+        drawn = render(self.engine.scene.take(result.members), camera)
         return read_silhouette(drawn.colours, drawn.alpha, rule)
 
 
@@ -381,15 +334,14 @@ class MapSource:
         return {phrase: self._answer(self.folder / frame, phrase) for phrase in phrases}
 
     def _answer(self, folder: Path, phrase: str) -> Prediction | str:
+        drawn = isinstance(self.rule, SilhouetteRule)
+        files = (folder / f"{file_name(phrase)}{suffix}" for suffix in (".npy", ".png")[drawn:])
+        path = next((path for path in files if path.is_file()), None)
+        if path is None:
+            return "no map"
         if isinstance(self.rule, SilhouetteRule):
-            path = folder / f"{file_name(phrase)}.png"
-            return Prediction(read_grey(path) > self.rule.grey) if path.is_file() else NO_MAP
-        found = read_relevancy(folder, phrase)
-        if found is None:
-            return NO_MAP
-        maps, levels = found
-        answer = read_maps(maps, self.rule)
-        return replace(answer, level=levels[answer.level or 0])
+            return Prediction(read_grey(path) > self.rule.grey)
+        return read_maps(_read_relevancy(path), self.rule)
 
 
 Source = SceneSource | MapSource

@@ -9,29 +9,67 @@ image then blends one number per Gaussian.
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
+import tyro
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import AutoencoderConfig, PictureConfig
+from langsplat_core.cli.arguments import OutFolder
+from langsplat_core.config import AutoencoderConfig, Count, CountOrZero, PictureConfig
 from langsplat_core.errors import InputError
-from langsplat_core.extensions.benchmarks.config import QueryBenchConfig
-from langsplat_core.extensions.benchmarks.measure import markdown
-from langsplat_core.progress import Progress, silent
-from langsplat_core.query.engine import QueryEngine, TextEncoder
+from langsplat_core.extensions.benchmarks.raster_speed import Size
+from langsplat_core.extensions.benchmarks.report import markdown, write_report
+from langsplat_core.progress import Progress, TerminalProgress, silent
+from langsplat_core.query.engine import QueryEngine, TextEncoder, searchable
 from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
 from langsplat_core.raster.protocol import View
 from langsplat_core.raster.render import view_of
 from langsplat_core.scene import LEVELS, Camera, Codec, LanguageField, Scene
+from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.semantics.relevancy import Scale, relevancy_of
 from langsplat_core.semantics.vocabulary import everyday_phrases
-from langsplat_core.training.language.codec_fit import train_autoencoder
 
 GATE = PictureConfig().alpha_gate
-PAPER = "paper's order"
+
+
+@dataclass(frozen=True)
+class BenchQuery:
+    """Time phrases, cameras and frames on one scene in the paper's order and in ours, beside the error.
+
+    The paper's order, a table and a codebook are compared by the error of relevancy. Some minutes, nearly all
+    of them the paper's order.
+    """
+
+    scene: tyro.conf.Positional[Path]
+    """A scene with a codebook, and its cameras beside it."""
+    size: Size = (1440, 1080)
+    """Width and height of the image, pixels; that of the paper's figures."""
+    count: CountOrZero = 0
+    """Gaussians; the scene's are repeated, each beside itself, until there are so many. 0: as they are."""
+    phrases: Count = 8
+    """Phrases that errors are averaged and times taken over; the paper's order is timed with one."""
+    together: Count = 100
+    """Phrases that are asked at once, and one by one."""
+    repeats: Count = 5
+    """Timings of a view and an image, of which the median is taken."""
+    codec_steps: Count = 3_000
+    """Training steps of the autoencoder that stands beside the codebook."""
+    out: OutFolder = Path("bench_out")
+    """Folder for query.md and query.json."""
+
+    def run(self) -> None:
+        scene = searchable(self.scene)
+        assert scene.language is not None
+        encoder = load_text_encoder(scene.language.encoder_id)
+        with TerminalProgress() as progress:
+            report = measure_queries(scene, encoder, self, progress)
+        table = query_table(report)
+        write_report(self.out, "query", table, {"config": asdict(self), "report": asdict(report)})
+        print(table)
 
 
 @dataclass(frozen=True)
@@ -79,22 +117,34 @@ class _Asked:
     known: Array  # (3, N)
     codewords: Array  # (K, D)
 
+    def exact(self, codewords: Array, scale: Scale) -> list[Array]:
+        """Relevancies of each phrase at all Gaussians with a meaning, in float64."""
+        doubles = codewords.astype(np.float64)
+        zero, rate = scale.of(doubles @ scale.texts.T)
+        rows = (relevancy_of(doubles @ vector, zero, rate) for vector in self.vectors.astype(np.float64))
+        return [np.asarray(row[self.codes[self.known]]) for row in rows]
+
 
 def measure_queries(
-    scene: Scene, encoder: TextEncoder, config: QueryBenchConfig, progress: Progress = silent
+    scene: Scene, encoder: TextEncoder, config: BenchQuery, progress: Progress = silent
 ) -> QueryReport:
     """`scene` must have a codebook and a camera; InputError otherwise. The paper's order takes minutes."""
+    from langsplat_core.training.language.codec_fit import train_autoencoder  # imports torch
+
     if scene.language is None or scene.language.codec.blends or not scene.cameras:
         raise InputError("bench query needs a scene with a codebook and training cameras")
-    if config.count:
-        scene = repeated(scene, config.count)
+    scene = repeated(scene, config.count) if config.count else scene
     field = scene.language
     assert field is not None
     words = everyday_phrases(encoder.unknown_words)
     engine = QueryEngine(scene, lambda _: encoder)
     progress("finding surface and regions", 0.0)
     surface, regions = _seconds(lambda: engine.surface), _seconds(lambda: engine.regions)
-    alone, together = _batched(engine, words[: config.together], progress)
+    progress("asking one by one and all at once", 0.1)
+    texts = words[: config.together]
+    engine.run_many(texts[:2])
+    alone = _seconds(lambda: [engine.run(text) for text in texts]) / len(texts)
+    together = _seconds(lambda: engine.run_many(texts)) / len(texts)
     texts = words[: config.phrases]
     codewords = field.codec.decode(np.arange(field.codec.size, dtype=np.uint16)[:, None])
     asked = _Asked(texts, engine.text_vectors(texts), field.latents[..., 0], field.known, codewords)
@@ -103,21 +153,19 @@ def measure_queries(
     by_cells = QueryEngine(replace(scene, language=encoded), lambda _: encoder)
     camera = scene.cameras[0].resized(*config.size)
     progress("the paper's order", 0.3)
-    costs = [
+    costs = (
         _paper(scene, encoded, camera, asked),
-        _ours("cells", by_cells, camera, asked, config.repeats, fitted),
-        _ours("codebook", engine, camera, asked, config.repeats, None),
-    ]
+        _ours("cells", by_cells, camera, asked, config.repeats),
+        _ours("codebook", engine, camera, asked, config.repeats),
+    )
     progress("asking", 1.0)
-    sizes = len(scene.gaussians), config.size
-    asked_many = min(len(words), config.together)
-    return QueryReport(*sizes, surface, regions, tuple(costs), asked_many, alone, together)
+    count = min(len(words), config.together)
+    return QueryReport(len(scene.gaussians), config.size, surface, regions, costs, count, alone, together)
 
 
 def repeated(scene: Scene, count: int) -> Scene:
     """`count` Gaussians: the scene's over and over, each moved by a random step of its own size."""
-    rows = np.resize(np.arange(len(scene.gaussians)), count)
-    larger = scene.take(rows)
+    larger = scene.take(np.resize(np.arange(len(scene.gaussians)), count))
     gaussians = larger.gaussians
     steps = np.random.default_rng(0).normal(size=(count, 3)) * np.exp(gaussians.log_scales)
     return replace(larger, gaussians=replace(gaussians, means=gaussians.means + steps))
@@ -130,45 +178,26 @@ def with_codec(field: LanguageField, codec: Codec) -> LanguageField:
     return replace(field, latents=np.where(field.known[..., None], latents, 0), codec=codec)
 
 
-def _batched(engine: QueryEngine, texts: Sequence[str], progress: Progress) -> tuple[float, float]:
-    """Seconds per phrase, encoding included, when asked one by one and all at once."""
-    engine.run_many(texts[:2])
-    progress("asking one by one and all at once", 0.1)
-    alone = _seconds(lambda: [engine.run(text) for text in texts])
-    return alone / len(texts), _seconds(lambda: engine.run_many(texts)) / len(texts)
-
-
 def _paper(scene: Scene, field: LanguageField, camera: Camera, asked: _Asked) -> QueryCost:
     """Costs of the paper's order of work. Decoding is measured once: it takes a minute and more."""
     view_of(scene, camera).splat(field.latents[0])
     views: list[View] = []
-    camera_seconds = _seconds(lambda: views.append(view_of(scene, camera)))
+    seen = _seconds(lambda: views.append(view_of(scene, camera)))
     blending = _seconds(lambda: [views[0].splat(latents) for latents in field.latents])
     vectors = asked.vectors[:1]
     both = _seconds(
         lambda: [decoded_relevancy(views[0], field, level, vectors, GATE) for level in range(len(LEVELS))]
     )
     decoding = max(both - blending, 0.0)
-    decoded = field.codec.decode(field.codec.encode(asked.codewords))
     published = Scale(field.canonical, None, field.temperature)
-    exact = [_exact(asked, decoded, published, row) for row in range(len(asked.texts))]
-    truth = [_exact(asked, asked.codewords, published, row) for row in range(len(asked.texts))]
-    return QueryCost(
-        PAPER,
-        answer=decoding,
-        shown=decoding,
-        camera=camera_seconds + blending,
-        frame=camera_seconds + both,
-        lookup=RelevancyError(0.0, 0.0),  # it decodes
-        codec=_error(exact, truth),
-    )
+    decoded = field.codec.decode(field.codec.encode(asked.codewords))
+    error = _error(asked.exact(decoded, published), asked.exact(asked.codewords, published))
+    none = RelevancyError(0.0, 0.0)  # it decodes
+    return QueryCost("paper's order", decoding, decoding, seen + blending, seen + both, none, error)
 
 
-def _ours(
-    way: str, engine: QueryEngine, camera: Camera, asked: _Asked, repeats: int, codec: Codec | None
-) -> QueryCost:
-    """codec: by which the codewords were encoded; None: they are what the field has."""
-    scene = engine.scene
+def _ours(way: str, engine: QueryEngine, camera: Camera, asked: _Asked, repeats: int) -> QueryCost:
+    scene, codec = engine.scene, engine.field.codec
     result = engine.run(asked.texts[0], vector=asked.vectors[0])  # what is built once is built now
     found = [engine.relevancy(vector)[asked.known] for vector in asked.vectors]
     pairs = list(zip(asked.texts, asked.vectors, strict=True)) * repeats
@@ -179,35 +208,14 @@ def _ours(
     image = median(
         _seconds(lambda: splatted_relevancy(view, result.even[:, None], GATE)) for _ in range(repeats)
     )
-    decoded = asked.codewords if codec is None else codec.decode(codec.encode(asked.codewords))
-    exact, truth = (
-        [_exact(asked, vectors, engine.scale, row) for row in range(len(asked.texts))]
-        for vectors in (decoded, asked.codewords)
-    )
-    return QueryCost(
-        way,
-        answer=answer,
-        shown=answer + image,
-        camera=seen,
-        frame=seen + image,
-        lookup=_error(found, exact),
-        codec=_error(found, truth),
-    )
-
-
-def _exact(asked: _Asked, vectors: Array, scale: Scale, row: int) -> Array:
-    """Relevancy of phrase `row` at all Gaussians with a meaning, in float64; vectors: (K, D) of the codes."""
-    doubles = vectors.astype(np.float64)
-    zero, rate = scale.of(doubles @ scale.texts.T)
-    values = relevancy_of(doubles @ asked.vectors[row].astype(np.float64), zero, rate)
-    return np.asarray(values[asked.codes[asked.known]])
+    decoded = codec.decode(codec.encode(asked.codewords)) if codec.blends else asked.codewords
+    errors = (_error(found, asked.exact(each, engine.scale)) for each in (decoded, asked.codewords))
+    return QueryCost(way, answer, answer + image, seen, seen + image, *errors)
 
 
 def _error(got: Sequence[Array], want: Sequence[Array]) -> RelevancyError:
     apart = np.abs(np.concatenate(got).astype(np.float64) - np.concatenate(want))
-    if not len(apart):
-        return RelevancyError(0.0, 0.0)
-    return RelevancyError(float(apart.mean()), float(np.quantile(apart, 0.99)))
+    return RelevancyError(*map(float, (apart.mean(), np.quantile(apart, 0.99)) if len(apart) else (0, 0)))
 
 
 def _seconds(work: Callable[[], Any]) -> float:

@@ -1,51 +1,163 @@
-"""The rasterizer benchmark (`langsplat bench raster`): every backend that loads here, tables and plot."""
+"""The rasterizer benchmark (`langsplat bench raster`): time, error and memory of every operation, in one run.
 
+* Time: median of the calls that fit into 0.3 seconds (at least three), after a first call that is not
+  counted. A call of more than two seconds is measured once.
+* Error: against the float64 reference (`ReferenceWindows`), from a call of its own.
+* Memory: how far the process's resident set rises at its highest during the first call, with the heap's
+  free pages given back before. It counts everything: arrays of NumPy, PyTorch's, kernels' own, and what a
+  software OpenGL driver holds. Linux only; elsewhere unknown.
+"""
+
+import ctypes
 import os
 import platform
+import re
+import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import scipy.sparse
 
+from langsplat_core.arrays import Array
+from langsplat_core.cli.arguments import OutFolder
+from langsplat_core.config import INRIA, Count, Positive, Range, RasterSettings
 from langsplat_core.errors import BackendError
-from langsplat_core.extensions.benchmarks.config import RasterBenchConfig
-from langsplat_core.extensions.benchmarks.measure import (
-    Case,
-    Foresight,
-    Measurement,
-    default_camera,
-    markdown,
-    measure,
-    random_scene,
-    reference_windows,
-    warm_up,
-)
+from langsplat_core.extensions.benchmarks.report import markdown, write_report
 from langsplat_core.io.scenes import load_scene
-from langsplat_core.progress import Progress, silent
+from langsplat_core.progress import Progress, TerminalProgress, silent
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.opengl.scene_textures import create_egl_context
-from langsplat_core.raster.protocol import Rasterizer
+from langsplat_core.raster.protocol import LiftingView, Rasterizer
+from langsplat_core.raster.reference import Footprints, ReferenceView, project, rim
+from langsplat_core.scene import Camera, Gaussians, look_at
 
-SceneSize = tuple[int, tuple[int, int]]  # Gaussians, (width, height)
+Pixels = Annotated[int, Range(1, 65_536)]
+Size = tuple[Pixels, Pixels]  # width and height of an image
+Channels = Annotated[int, Range(1, 4_096)]  # values per Gaussian
+GRIDS = ((16, 12), (8, 6), (4, 3))  # cells of subparts, parts and wholes: 252 labels in all
+WINDOW = 64  # pixels a side
+_PLACES = ((0.5, 0.5), (0.3, 0.42), (0.64, 0.7))  # centres of the windows, as fractions of the image
+_BAND = 1e-3  # relative distance to a cut-off; float32 footprints of a GPU are within about 3e-4 of it
+_FLIP = 2e-5  # an error in the band is a flip if larger than this and than twice all others
+_STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 _NOTES = """- The size with most scenes and the most channels; every other measurement is in raster.json.
 - ms: median of the calls after the first.
 - frame: project + splat with a camera that has moved since the last frame.
 - labels: W^T onehot of label maps with 252 regions at three levels; `channels` plays no part.
 - MiB: rise of the process's resident set at its highest during the first call.
-- Errors: against the float64 reference on three windows of 64x64 pixels, values in [0, 1).
+- Errors: against the float64 reference on three windows of 64x64 pixels, values in [0, 1); of `backward`,
+  that of the derivatives by the values.
 - Cut-offs are an alpha of 1/255 and a transmittance of 1e-4. A pixel within 0.1 % of one may come out on its
   other side: a flip, counted where its error exceeds all others. gather is compared without such
   pixels.
 """
 
 
-def quick_plan(plan: RasterBenchConfig) -> RasterBenchConfig:
-    """Return a smaller plan, which takes about a minute on two cores."""
-    counts, sizes = (3_000, 10_000, 31_000), ((160, 120), (320, 240), (640, 480))
-    return replace(plan, counts=counts, sizes=sizes, pivot=10_000, limit=min(plan.limit, 3.0))
+@dataclass(frozen=True)
+class BenchRaster:
+    """Time, error and memory of every rasterizer that loads here, in one run; takes some minutes."""
+
+    quick: bool = False
+    """Fewer and smaller scenes, in about a minute; --counts and --sizes are then not read."""
+    counts: tuple[Count, ...] = (10_000, 31_000, 100_000, 200_000, 1_000_000)
+    """Sizes of the random scenes, drawn at the middle one of --sizes."""
+    sizes: Annotated[tuple[Size, ...], Range(1, 65_536, some=True)] = ((320, 240), (640, 480), (960, 720))
+    """Widths and heights of the image, pixels; all are drawn with --pivot Gaussians."""
+    pivot: Count = 200_000
+    """Gaussians of the random scene that is drawn at every size."""
+    channels: Annotated[tuple[Channels, ...], Range(1, 4_096, some=True)] = (3, 12)
+    """Values per Gaussian."""
+    scenes: tuple[Path, ...] = ()
+    """Real scenes to measure beside the random ones, from their first camera, else one that frames them."""
+    limit: Positive = 60.0
+    """Seconds that a single call may be expected to take; what would take longer is named and left out."""
+    out: OutFolder = Path("bench_out")
+    """Folder for raster.md, raster.json and raster.png."""
+
+    def run(self) -> None:
+        plan = self
+        if self.quick:
+            counts, sizes = (3_000, 10_000, 31_000), ((160, 120), (320, 240), (640, 480))
+            plan = replace(self, counts=counts, sizes=sizes, pivot=10_000, limit=min(self.limit, 3.0))
+        with TerminalProgress() as progress:
+            report = run_plan(plan, progress, self._keep)
+        self._keep(report)
+        print(report.text)
+
+    def _keep(self, report: "RasterReport") -> None:
+        figures = {"machine": report.machine, "measurements": [asdict(row) for row in report.rows]}
+        write_report(self.out, "raster", report.text, figures, lambda path: plot(report.rows, path))
+
+
+# Memory of this process, as Linux tells it. Not getrusage: its maximum is inherited from the parent process.
+
+
+def resident_memory() -> int | None:
+    """Bytes of this process now; None where the system does not tell."""
+    return _status("VmRSS")
+
+
+def peak_memory() -> int | None:
+    """Most bytes of this process since it began or since `restart_peak`."""
+    return _status("VmHWM")
+
+
+def restart_peak() -> int | None:
+    """Give free pages back and forget the peak; returns the bytes now, None where that cannot be done."""
+    if not _CLEAR.exists():
+        return None
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc has it
+    try:
+        if trim is not None:
+            trim(0)
+        _CLEAR.write_text("5")
+    except OSError:
+        return None
+    return resident_memory()
+
+
+def _status(key: str) -> int | None:
+    try:
+        found = re.search(rf"{key}:\s*(\d+) kB", _STATUS.read_text())
+    except OSError:
+        return None
+    return int(found[1]) * 1024 if found else None
+
+
+# One run.
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A scene and the camera that sees it."""
+
+    scene: str  # "random", or the name of a file
+    gaussians: Gaussians
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One backend doing one operation."""
+
+    scene: str
+    gaussians: int
+    width: int
+    height: int
+    channels: int
+    operation: str
+    backend: str
+    milliseconds: float | None = None  # median; None: not run, see `note`
+    peak_mib: float | None = None  # rise of the resident set; None: unknown
+    largest_error: float | None = None  # None: not compared
+    error_off_cuts: float | None = None  # away from cut-offs
+    flips: int | None = None  # pixels near a cut-off that came out on its other side
+    note: str = ""
 
 
 @dataclass(frozen=True)
@@ -57,25 +169,15 @@ class RasterReport:
 
     @property
     def text(self) -> str:
-        """The machine and a selection of the measurements, as Markdown."""
-        return "\n".join([
-            "# Rasterizers: time against error\n",
-            "\n".join(f"- {name}: {value}" for name, value in self.machine.items()) + "\n",
-            table(_selection(self.rows)),
-            _NOTES,
-        ])  # fmt: skip
-
-    @property
-    def figures(self) -> dict[str, Any]:
-        """All figures, for JSON."""
-        return {
-            "machine": self.machine,
-            "measurements": [asdict(row) for row in self.rows],
-        }
+        """The machine and the rows of one image size with the most channels, as Markdown."""
+        size, most = _busiest(self.rows), max((row.channels for row in self.rows), default=0)
+        chosen = [row for row in self.rows if (row.width, row.height) == size and row.channels == most]
+        machine = "".join(f"- {name}: {value}\n" for name, value in self.machine.items())
+        return f"# Rasterizers: time against error\n\n{machine}\n{table(chosen)}\n{_NOTES}"
 
 
 def run_plan(
-    plan: RasterBenchConfig,
+    plan: BenchRaster,
     progress: Progress = silent,
     keep: Callable[[RasterReport], None] = lambda _: None,
 ) -> RasterReport:
@@ -104,7 +206,9 @@ def run_plan(
     return RasterReport(machine, rows)
 
 
-def sweep(counts: tuple[int, ...], sizes: tuple[tuple[int, int], ...], pivot: int) -> list[SceneSize]:
+def sweep(
+    counts: tuple[int, ...], sizes: tuple[tuple[int, int], ...], pivot: int
+) -> list[tuple[int, tuple[int, int]]]:
     """Return the numbers of Gaussians and image sizes of the random scenes, small ones first.
 
     They are every count at the middle size, and every size at `pivot` Gaussians. The time of large ones is
@@ -115,7 +219,7 @@ def sweep(counts: tuple[int, ...], sizes: tuple[tuple[int, int], ...], pivot: in
     return sorted(pairs, key=lambda pair: (pair[0], pair[1][0] * pair[1][1]))
 
 
-def _cases(plan: RasterBenchConfig, pairs: list[SceneSize]) -> Iterator[Case]:
+def _cases(plan: BenchRaster, pairs: list[tuple[int, tuple[int, int]]]) -> Iterator[Case]:
     for count, size in pairs:
         yield Case("random", random_scene(count), default_camera(*size))
     for path in plan.scenes:
@@ -123,6 +227,27 @@ def _cases(plan: RasterBenchConfig, pairs: list[SceneSize]) -> Iterator[Case]:
         size = sorted(plan.sizes)[len(plan.sizes) // 2]
         camera = scene.cameras[0] if scene.cameras else scene.framing_camera(size)
         yield Case(path.name, scene.gaussians, camera.resized(*size))
+
+
+def random_scene(count: int) -> Gaussians:
+    """`count` small Gaussians in a unit ball, sized so that the image's coverage does not grow with it."""
+    generator = np.random.default_rng(0)
+    directions = generator.normal(size=(count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    radius = generator.uniform(0, 1, (count, 1)) ** (1 / 3)
+    size = 0.6 * count ** (-1 / 3)
+    return Gaussians(
+        means=directions * radius,
+        log_scales=np.log(size * np.exp(generator.normal(-1.0, 0.5, (count, 3)))),
+        quats_wxyz=generator.normal(size=(count, 4)),
+        opacity_logits=generator.normal(0.0, 1.5, count),
+        sh=generator.normal(0, 0.5, (count, 1, 3)),
+    )
+
+
+def default_camera(width: int, height: int) -> Camera:
+    """Return a camera that sees the whole ball of `random_scene`."""
+    return look_at(np.array([0.0, 0.0, -2.6]), np.zeros(3), np.array([0.0, -1.0, 0.0]), (width, height))
 
 
 def _backends(machine: dict[str, object]) -> list[Rasterizer]:
@@ -153,11 +278,291 @@ def describe_machine() -> dict[str, object]:
 
 def _processor() -> str:
     info = Path("/proc/cpuinfo")
-    if info.exists():
-        for line in info.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
+    lines = info.read_text().splitlines() if info.exists() else []
+    named = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(named, platform.processor() or platform.machine())
+
+
+# One backend on one case.
+
+
+class Foresight:
+    """Expected seconds of operations: time grows with the overlaps of footprints and tiles."""
+
+    def __init__(self, limit_s: float) -> None:
+        self.limit_s = limit_s
+        self.rates: dict[tuple[str, str, int], float] = {}  # seconds per overlap
+
+
+def warm_up(backends: Sequence[Rasterizer], channels: Sequence[int]) -> None:
+    """Compile and load everything on a tiny scene, so that no measurement contains it."""
+    case = Case("random", random_scene(200), default_camera(40, 30))
+    for backend in backends:
+        for count in channels:
+            for _, call, _ in _operations(backend, case, count):
+                call()
+
+
+def measure(
+    backend: Rasterizer, case: Case, channels: int, exact: "ReferenceWindows", foresight: Foresight
+) -> Iterator[Measurement]:
+    """Time every operation of `backend` on one case."""
+    drawn = exact.footprints.opacities > 0
+    overlaps = int(np.prod(2 * exact.footprints.extents_px / 16 + 1, axis=1)[drawn].sum())
+    shape = case.scene, len(case.gaussians), case.camera.width, case.camera.height, channels
+    name = f"{backend.name} {getattr(backend, 'precision', '')}".strip()
+    for operation, call, error_of in _operations(backend, case, channels):
+        row = Measurement(*shape, operation, name)
+        key = name, operation, channels
+        expected = foresight.rates.get(key, 0.0) * overlaps
+        if expected > foresight.limit_s:
+            yield replace(row, note=f"not run: about {expected:.0f} s expected")
+            continue
+        seconds, peak = _timed(call)
+        foresight.rates[key] = seconds / max(overlaps, 1)
+        row = replace(row, milliseconds=1e3 * seconds, peak_mib=peak)
+        if error_of is not None:
+            error = error_of(exact)
+            row = replace(row, largest_error=error.largest, error_off_cuts=error.off_cuts, flips=error.flips)
+        yield row
+
+
+# Name, what is timed, and its error where one is known.
+_Operation = tuple[str, Callable[[], Any], "Callable[[ReferenceWindows], Error] | None"]
+
+
+def _operations(backend: Rasterizer, case: Case, channels: int) -> Iterator[_Operation]:
+    """Yield the operations that `backend` has, on values in [0, 1) and an image in [-1, 1)."""
+    generator, camera = np.random.default_rng(1), case.camera
+    values = generator.random((len(case.gaussians), channels), np.float32)
+    image = 2 * generator.random((camera.height, camera.width, channels), np.float32) - 1
+    ahead = camera.world_to_camera.copy()
+    ahead[2, 3] -= 1e-3
+    cameras, turn = (camera, replace(camera, world_to_camera=ahead)), iter(range(sys.maxsize))
+
+    def frame() -> Array:
+        # The camera moves: a backend that keeps the last order must sort again.
+        return backend.view(case.gaussians, cameras[next(turn) % 2]).splat(values)[0]
+
+    def by_values(exact: "ReferenceWindows") -> Error:
+        masked = exact.masked(image)
+        return exact.gather_error(view.backward(values, masked).values, masked)
+
+    if backend.name != "opengl":  # projects in its first draw
+        yield "project", lambda: backend.view(case.gaussians, camera), None
+    yield "frame", frame, None
+    view: Any = backend.view(case.gaussians, camera)
+    yield from _linear(view, values, image, "")
+    if hasattr(view, "backward"):
+        yield "backward", lambda: view.backward(values, image), by_values
+    if isinstance(view, LiftingView):
+        yield _labels(view, camera)
+        if view.frozen() is not view:
+            yield "freeze", view.frozen, None
+            yield from _linear(view.frozen(), values, image, "frozen ")
+
+
+def _linear(view: Any, values: Array, image: Array, prefix: str) -> Iterator[_Operation]:
+    """Yield the operation `splat` and, where the view has it, `gather`."""
+
+    def gathered(exact: "ReferenceWindows") -> Error:
+        masked = exact.masked(image)
+        return exact.gather_error(view.gather(masked), masked)
+
+    yield (
+        f"{prefix}splat",
+        lambda: view.splat(values),
+        lambda exact: exact.splat_error(view.splat(values)[0], values),
+    )
+    if hasattr(view, "gather"):
+        yield f"{prefix}gather", lambda: view.gather(image), gathered
+
+
+def _labels(view: LiftingView, camera: Camera) -> _Operation:
+    """Gathering of label maps of three levels (`GRIDS`), with as many regions as a segmenter finds."""
+    maps, count = label_maps(camera)
+
+    def error(exact: "ReferenceWindows") -> Error:
+        compared = exact.masked(np.ones((camera.height, camera.width, 1), np.float32))[..., 0] > 0
+        kept = np.where(compared, maps, -1)
+        image = np.stack([(kept == label).any(0) for label in range(count)], -1).astype(np.float32)
+        return exact.gather_error(view.gather_labels(kept, count).toarray(), image)
+
+    return "labels", lambda: view.gather_labels(maps, count), error
+
+
+def label_maps(camera: Camera) -> tuple[Array, int]:
+    """(3, H, W) int32 labels of three grids of cells, and how many labels there are."""
+    row, column = np.mgrid[: camera.height, : camera.width]
+    maps, first = [], 0
+    for across, down in GRIDS:
+        cell = row * down // camera.height * across + column * across // camera.width
+        maps.append(first + cell)
+        first += across * down
+    return np.stack(maps).astype(np.int32), first
+
+
+def _timed(call: Callable[[], Any]) -> tuple[float, float | None]:
+    """Return the median seconds of a call, and the first one's rise of the resident set in MiB."""
+    times: list[float] = []
+    before, peak = restart_peak(), None
+    while len(times) < 4 or (len(times) < 16 and sum(times[1:]) < 0.3):
+        start = time.perf_counter()
+        kept = call()
+        times.append(time.perf_counter() - start)
+        if len(times) == 1:
+            highest = peak_memory()
+            peak = None if before is None or highest is None else max(highest - before, 0) / 2**20
+        del kept
+        if times[0] > 2.0:
+            return times[0], peak
+    return float(np.median(times[1:])), peak
+
+
+# The reference.
+
+
+@dataclass(frozen=True)
+class Error:
+    """Differences from the reference."""
+
+    largest: float  # over all pixels compared
+    off_cuts: float  # over those where no cut-off is near
+    flips: int  # pixels near a cut-off that came out on its other side
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceWindow:
+    """Part of an image and its exact blending weights."""
+
+    at: tuple[slice, slice]  # rows and columns of the image
+    weights: scipy.sparse.csr_array  # (pixels, K) alpha_i T_i, K = len(ReferenceWindows.rows)
+    band: Array  # (h, w) bool: pixels near a cut-off
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceWindows:
+    """The float64 reference on three small windows of one view of N Gaussians, which may be millions.
+
+    The reference draws Gaussians one by one, so a whole image of a million of them takes minutes. A window's
+    pixels depend only on the Gaussians that reach into it; projected by the whole image's camera (as the
+    Jacobian's clamp depends on the image's size) and shifted, they give exactly the pixels of the whole.
+
+    Pixels where rounding may decide a cut-off (an alpha of just 1/255, a transmittance of just 1e-4) are the
+    *band*: there one flip outweighs every other error, so flips are counted and the error is stated without
+    them.
+    """
+
+    footprints: Footprints  # of all N
+    rows: Array  # (K,) ascending: the Gaussians that reach into a window
+    windows: tuple[ReferenceWindow, ...]
+
+    def splat(self, values: Array) -> list[Array]:
+        """(N, C) -> each window's (h, w, C) image, float64."""
+        x = values[self.rows].astype(np.float64)
+        return [(w.weights @ x).reshape(*w.band.shape, -1) for w in self.windows]
+
+    def splat_error(self, image: Array, values: Array) -> Error:
+        """Error of the (H, W, C) `image` that a backend made from `values`."""
+        errors = [
+            np.abs(image[window.at] - want).max(-1, initial=0)
+            for window, want in zip(self.windows, self.splat(values), strict=True)
+        ]
+        pairs = list(zip(errors, self.windows, strict=True))
+        off = max(float(error[~window.band].max(initial=0)) for error, window in pairs)
+        flips = sum(int((error[window.band] > max(_FLIP, 2 * off)).sum()) for error, window in pairs)
+        return Error(max(float(error.max()) for error in errors), off, flips)
+
+    def masked(self, image: Array) -> Array:
+        """Return `image` with 0 outside the windows and in their bands.
+
+        This is what a backend must gather to be compared: a window knows nothing of the pixels outside.
+        """
+        kept = np.zeros_like(image)
+        for window in self.windows:
+            kept[window.at] = image[window.at] * ~window.band[..., None]
+        return kept
+
+    def gather(self, masked: Array) -> Array:
+        """(H, W, C) image from `masked` -> (K, C) values of the Gaussians `rows`, float64; others get 0."""
+        # Windows may overlap: every pixel counts once.
+        left = masked.astype(np.float64)
+        total = np.zeros((len(self.rows), masked.shape[2]))
+        for window in self.windows:
+            total += window.weights.T @ left[window.at].reshape(-1, masked.shape[2])
+            left[window.at] = 0
+        return total
+
+    def gather_error(self, values: Array, masked: Array) -> Error:
+        """Error of the (N, C) `values` that a backend gathered from `masked`; off the cut-offs alone."""
+        want = np.zeros(values.shape)
+        want[self.rows] = self.gather(masked)
+        off = float(np.abs(values - want).max(initial=0))
+        return Error(off, off, 0)
+
+
+def reference_windows(
+    gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA
+) -> ReferenceWindows:
+    """Draw the windows with the reference; about 0.1 ms for each Gaussian that reaches into one."""
+    footprints = project(gaussians, camera, settings)
+    places = [_place(camera, fraction) for fraction in _PLACES]
+    reaching = [np.flatnonzero(_reaches(footprints, settings, at)) for at in places]
+    rows = np.unique(np.concatenate(reaching))
+    windows = []
+    for at, mine in zip(places, reaching, strict=True):
+        columns = (len(rows), np.searchsorted(rows, mine))
+        windows.append(_window(_take(footprints, mine), camera, settings, at, columns))
+    return ReferenceWindows(footprints, rows, tuple(windows))
+
+
+def _reaches(footprints: Footprints, settings: RasterSettings, at: tuple[slice, slice]) -> Array:
+    """(N,) bool: drawn, and not wholly outside the window."""
+    rows, columns = at
+    reach = rim(footprints, settings, _BAND)
+    low, high = footprints.means_px - reach, footprints.means_px + reach
+    inside = (high > (columns.start, rows.start)) & (low < (columns.stop, rows.stop))
+    return inside.all(1) & (footprints.opacities > 0)
+
+
+def _take(f: Footprints, rows: Array) -> Footprints:
+    return Footprints(f.means_px[rows], f.depths[rows], f.conics[rows], f.extents_px[rows], f.opacities[rows])
+
+
+def _place(camera: Camera, fraction: tuple[float, float]) -> tuple[slice, slice]:
+    slices = []
+    for size, part in ((camera.height, fraction[1]), (camera.width, fraction[0])):
+        start = min(max(round(size * part) - WINDOW // 2, 0), max(size - WINDOW, 0))
+        slices.append(slice(start, min(start + WINDOW, size)))
+    return slices[0], slices[1]
+
+
+def _window(
+    footprints: Footprints,
+    camera: Camera,
+    settings: RasterSettings,
+    at: tuple[slice, slice],
+    place: tuple[int, Array],
+) -> ReferenceWindow:
+    """`place`: how many columns the matrix has, and the column of each footprint."""
+    count, where_to = place
+    rows, columns = at
+    height, width = rows.stop - rows.start, columns.stop - columns.start
+    moved = replace(footprints, means_px=footprints.means_px - (columns.start, rows.start))
+    view = ReferenceView(moved, replace(camera, width=width, height=height), settings, dropped=0)
+    pixels = np.arange(height * width).reshape(height, width)
+    indices, where, weights = [np.empty(0, int)], [np.empty(0, int)], [np.empty(0)]
+    for step in view.steps():
+        hit = step.weights > 0
+        where.append(pixels[step.window][hit])
+        weights.append(step.weights[hit])
+        indices.append(np.full(len(where[-1]), where_to[step.index]))
+    entries = (np.concatenate(weights), (np.concatenate(where), np.concatenate(indices)))
+    matrix = scipy.sparse.csr_array(entries, shape=(height * width, count))
+    return ReferenceWindow(at, matrix, view.cut_off_band(_BAND))
+
+
+# Table and plot.
 
 
 def table(rows: Sequence[Measurement]) -> str:
@@ -174,93 +579,47 @@ def table(rows: Sequence[Measurement]) -> str:
     )
 
 
-def _selection(rows: Sequence[Measurement]) -> list[Measurement]:
-    """Return the rows of the most measured image size, with the most channels."""
-    size, channels = _busiest(rows), max((r.channels for r in rows), default=0)
-    return [r for r in rows if (r.width, r.height) == size and r.channels == channels]
-
-
 def _cell(value: float | None, form: str) -> str:
     return "-" if value is None else format(value, form)
 
 
-_COLOURS = {"cpu": "#0072b2", "opengl half": "#d55e00", "opengl single": "#e69f00"}
-_COMPARED = {"splat": "splat: pixels", "gather": "gather: values", "frozen": "frozen (triangles: gathered)"}
-_ORDER = ("project", "frame", "splat", "gather", "backward", "freeze", "frozen splat", "frozen gather")
-
-
 def plot(rows: Sequence[Measurement], path: Path) -> None:
-    """Two lines of panels: milliseconds over Gaussians, at the size with most counts.
+    """Draw milliseconds over Gaussians, a panel an operation, at the size with most counts.
 
-    Solid for the fewest, dashed for the most channels. Third line: error against time of everything compared.
+    Solid for the fewest, dashed for the most channels. The last panel is the error away from cut-offs over
+    milliseconds, of all cases.
     """
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
-    from matplotlib.lines import Line2D
 
-    random = [r for r in rows if r.scene == "random" and r.milliseconds is not None]
-    size = _busiest(random)
-    here = [r for r in random if (r.width, r.height) == size]
-    channels = sorted({r.channels for r in rows})
-    styles = {channels[0]: "-"} | ({channels[-1]: "--"} if len(channels) > 1 else {})
+    size = _busiest(rows)
+    here = [r for r in rows if r.milliseconds and r.scene == "random" and (r.width, r.height) == size]
+    operations = list(dict.fromkeys(r.operation for r in here))
     backends = list(dict.fromkeys(r.backend for r in rows))
-    colours = {name: _COLOURS.get(name, f"C{n}") for n, name in enumerate(backends)}
+    ends = sorted({r.channels for r in rows})
     figure, grid = pyplot.subplots(3, 4, figsize=(13, 10), layout="constrained", squeeze=False)
-    operations = [name for name in _ORDER if any(r.operation == name for r in here)]
-    panels = [panel for line in grid[:2] for panel in line]
-    for panel in panels[len(operations) :]:
+    for panel in grid.flat[len(operations) : -1]:
         panel.axis("off")
-    for panel, operation in zip(panels, operations, strict=False):
-        _times(panel, [r for r in here if r.operation == operation], colours, styles)
-        panel.set_title(operation)
-    for panel, kind in zip(grid[2], _COMPARED, strict=False):
-        _errors(panel, kind, rows, colours)
-    grid[2][-1].axis("off")
-    handles = [Line2D([], [], color=colours[name], marker="o", label=name) for name in backends]
-    handles += [Line2D([], [], color="black", ls=s, label=f"{c} channels") for c, s in styles.items()]
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
-    where = f"at {size[0]}x{size[1]} pixels" if size else "(none)"
-    figure.suptitle(f"Time of random scenes {where}; error away from cut-offs against time, all cases")
+    for panel, operation in zip(grid.flat, operations, strict=False):
+        for number, backend in enumerate(backends):
+            for channels, style in ((ends[0], "-"), (ends[-1], "--")):
+                key = operation, backend, channels
+                line = [r for r in here if (r.operation, r.backend, r.channels) == key]
+                points = np.array(sorted((r.gaussians, r.milliseconds) for r in line)).reshape(-1, 2)
+                panel.plot(*points.T, style, color=f"C{number}", marker="o")
+        panel.set(title=operation, xlabel="Gaussians", ylabel="ms", xscale="log", yscale="log")
+    for number, backend in enumerate(backends):
+        compared = [
+            r for r in rows if r.backend == backend and r.milliseconds and r.error_off_cuts is not None
+        ]
+        errors = [max(r.error_off_cuts or 0, 1e-9) for r in compared]
+        grid[-1][-1].plot([r.milliseconds for r in compared], errors, "o", color=f"C{number}", label=backend)
+    grid[-1][-1].set(title="error", xlabel="ms", ylabel="largest error", xscale="log", yscale="log")
+    figure.legend(loc="outside lower center", ncols=len(backends), frameon=False)
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
-
-
-def _times(panel: Any, rows: Sequence[Measurement], colours: dict[str, str], styles: dict[int, str]) -> None:
-    for backend, colour in colours.items():
-        for channels, style in styles.items():
-            chosen = [r for r in rows if (r.backend, r.channels) == (backend, channels)]
-            chosen.sort(key=lambda r: r.gaussians)
-            times = [r.milliseconds for r in chosen]
-            panel.plot([r.gaussians for r in chosen], times, style, color=colour, marker="o", ms=4, lw=1.4)
-    panel.set(xlabel="Gaussians", ylabel="ms")
-    _log_axes(panel, [r.gaussians for r in rows], [r.milliseconds or 1 for r in rows])
-
-
-def _errors(panel: Any, kind: str, rows: Sequence[Measurement], colours: dict[str, str]) -> None:
-    """Plot the error away from cut-offs over time; triangles are gathers."""
-    chosen = [r for r in rows if r.operation.startswith(kind) and r.error_off_cuts is not None]
-    errors = [max(r.error_off_cuts or 0, 1e-9) for r in chosen]
-    times = [r.milliseconds or 1 for r in chosen]
-    for r, x, y in zip(chosen, times, errors, strict=True):
-        mark = "^" if r.operation.endswith("gather") else "o"
-        panel.plot(x, y, mark, color=colours[r.backend], alpha=0.7)
-    panel.set(title=_COMPARED[kind], xlabel="ms", ylabel="largest error")
-    _log_axes(panel, times, errors)
-
-
-def _log_axes(panel: Any, x: Sequence[float], y: Sequence[float]) -> None:
-    """Make both axes logarithmic, between powers of ten that alone are labelled."""
-    from matplotlib.ticker import NullFormatter
-
-    panel.set(xscale="log", yscale="log")
-    for axis, limit, values in ((panel.xaxis, panel.set_xlim, x), (panel.yaxis, panel.set_ylim, y)):
-        axis.set_minor_formatter(NullFormatter())
-        if values:
-            low, high = np.floor(np.log10(min(values) / 1.1)), np.ceil(np.log10(max(values) * 1.1))
-            limit(10.0**low, 10.0**high)
-    panel.grid(True, alpha=0.3)
 
 
 def _busiest(rows: Sequence[Measurement]) -> tuple[int, int] | None:

@@ -1,10 +1,11 @@
 """Every labelled query against its answer: scores, their means, tables, JSON and images."""
 
+import json
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -42,6 +43,25 @@ from langsplat_core.query.engine import LoadEncoder, QueryEngine, searchable
 from langsplat_core.scene import LEVELS, Camera
 
 
+def write_report(
+    out: Path, name: str, text: str, figures: Any, plot: Callable[[Path], None] | None = None
+) -> None:
+    """Write `name`.md, .json and, with `plot`, .png into the folder `out`, each whole or not at all."""
+    with atomic_path(out / f"{name}.md") as path:
+        path.write_text(text, encoding="utf-8")
+    with atomic_path(out / f"{name}.json") as path:
+        path.write_text(json.dumps(figures, indent=1, default=str), encoding="utf-8")
+    if plot is not None:
+        with atomic_path(out / f"{name}.png") as path:
+            plot(path)
+
+
+def markdown(head: Sequence[str], rows: Iterable[Iterable[object]]) -> str:
+    """Return a Markdown table that ends with a newline."""
+    lines = ["| " + " | ".join(map(str, line)) + " |\n" for line in (head, *rows)]
+    return "".join([lines[0], "|" + "---|" * len(head) + "\n", *lines[1:]])
+
+
 def intersection_over_union(found: Array, truth: Array) -> float:
     """Return the intersection over union of two (H, W) boolean masks; 1 where both are empty."""
     union = np.logical_or(found, truth).sum()
@@ -50,11 +70,7 @@ def intersection_over_union(found: Array, truth: Array) -> float:
 
 # The image: photograph, mask that was found, the label's outline and boxes, the place.
 
-FOUND = np.array([250, 115, 25])  # tint of the mask
 TRUTH = (60, 220, 90)  # the label's outline and boxes
-PLACE = (40, 130, 255)
-OPACITY = 0.55
-MAX_MARKS = 100  # of a flat map every pixel is a peak
 
 
 def write_image(folder: Path, frame: Frame, label: LabelledPhrase, answer: Prediction, truth: Array) -> None:
@@ -63,7 +79,7 @@ def write_image(folder: Path, frame: Frame, label: LabelledPhrase, answer: Predi
     photo = np.zeros((rows, columns, 3))
     if frame.photograph is not None:
         photo = np.asarray(read_photo(frame.photograph, upright=False).resize((columns, rows)), np.float64)
-    photo = np.where(answer.mask[..., None], (1 - OPACITY) * photo + OPACITY * FOUND, photo)
+    photo = np.where(answer.mask[..., None], 0.45 * photo + 0.55 * np.array([250, 115, 25]), photo)
     photo[truth & ~binary_erosion(truth)] = TRUTH
     canvas = Image.fromarray(photo.astype(np.uint8))
     brush = ImageDraw.Draw(canvas)
@@ -71,8 +87,8 @@ def write_image(folder: Path, frame: Frame, label: LabelledPhrase, answer: Predi
     for box in [] if label.boxes is None else label.boxes * scale:
         corners = np.concatenate([np.minimum(box[:2], box[2:]), np.maximum(box[:2], box[2:])])
         brush.rectangle([float(value) for value in corners], outline=TRUTH)
-    for column, row in answer.peaks[:MAX_MARKS]:
-        brush.ellipse([column - 4, row - 4, column + 4, row + 4], outline=PLACE, width=2)
+    for column, row in answer.peaks[:100]:  # of a flat map every pixel is a peak
+        brush.ellipse([column - 4, row - 4, column + 4, row + 4], outline=(40, 130, 255), width=2)
     with atomic_path(folder / frame.name / f"{file_name(label.phrase)}.png") as path:
         canvas.save(path, "PNG")
 
@@ -95,25 +111,17 @@ class QueryScore:
     grid: Size = (0, 0)  # width and height that were scored
 
 
-@dataclass(frozen=True)
-class SceneScores:
-    """The scores of all queries of a scene."""
-
-    queries: tuple[QueryScore, ...]
-    left_out: tuple[str, ...]  # labels that cannot be asked, each "frame: phrase (why)"
-
-
 def score_scene(
     labelled: LabelledScene,
     source: Source,
     profile: Profile,
     pictures: Path | None = None,
     progress: Progress = silent,
-) -> SceneScores:
-    """Score every query of a scene; `pictures`: a folder for one image per answer.
+) -> tuple[list[QueryScore], list[str]]:
+    """Return the scores of every query of a scene, and the labels that cannot be asked, with the reason.
 
-    A frame's answers are complete, cut and all, before any mask of it is drawn. Raises InputError where a map
-    has another shape than the labelled image.
+    pictures: a folder for one image per answer. A frame's answers are complete, cut and all, before any mask
+    of it is drawn. Raises InputError where a map has another shape than the labelled image.
     """
     scores: list[QueryScore] = []
     left_out = list(labelled.left_out)
@@ -122,18 +130,34 @@ def score_scene(
             frame.name, scored_size(frame.size, profile.max_rows), [label.phrase for label in frame.labels]
         )
         for label in frame.labels:
-            answer = answers[label.phrase]
-            size = _grid(answer, frame)
+            answer, size = answers[label.phrase], frame.size
+            if not isinstance(answer, str):
+                size = answer.mask.shape[1], answer.mask.shape[0]
+                check_same_image(frame.name, size, frame.size)
             truth = label.truth.draw(size)
             if not truth.any():
                 left_out.append(f"{frame.name}: {label.phrase} (empty mask)")
                 continue
-            score = _score(labelled.name, frame, label, answer, truth, profile)
-            scores.append(replace(score, trained_on=source.trained_on(frame.name), grid=size))
-            if pictures is not None and not isinstance(answer, str):
-                write_image(pictures / labelled.name, frame, label, answer, truth)
+            placed = label.boxes is not None and not isinstance(profile.rule, SilhouetteRule)
+            score = QueryScore(
+                *(labelled.name, frame.name, label.phrase, 0.0, False if placed else None),
+                trained_on=source.trained_on(frame.name),
+                grid=size,
+            )
+            if isinstance(answer, str):
+                score = replace(score, unanswered=answer)
+            else:
+                score = replace(
+                    score,
+                    iou=intersection_over_union(answer.mask, truth),
+                    hit=inside_any_box(answer.peaks, label.boxes, frame.size, size) if placed else None,
+                    level="" if answer.level is None else LEVELS[answer.level],
+                )
+                if pictures is not None:
+                    write_image(pictures / labelled.name, frame, label, answer, truth)
+            scores.append(score)
         progress("asking phrases", (done + 1) / len(labelled.frames), labelled.name)
-    return SceneScores(tuple(scores), tuple(left_out))
+    return scores, left_out
 
 
 def scored_size(size: Size, max_rows: int) -> Size:
@@ -142,45 +166,17 @@ def scored_size(size: Size, max_rows: int) -> Size:
     return size if height <= max_rows else (max(1, int(width * max_rows / height)), max_rows)
 
 
-def _grid(answer: Prediction | str, frame: Frame) -> Size:
-    if isinstance(answer, str):
-        return frame.size
-    rows, columns = answer.mask.shape
-    check_same_image(frame.name, (columns, rows), frame.size)
-    return columns, rows
-
-
-def _score(
-    scene: str, frame: Frame, label: LabelledPhrase, answer: Prediction | str, truth: Array, profile: Profile
-) -> QueryScore:
-    placed = label.boxes is not None and not isinstance(profile.rule, SilhouetteRule)
-    if isinstance(answer, str):
-        return QueryScore(scene, frame.name, label.phrase, 0.0, False if placed else None, unanswered=answer)
-    hit = inside_any_box(answer.peaks, label.boxes, frame.size, truth.shape) if placed else None
-    level = "" if answer.level is None else LEVELS[answer.level]
-    return QueryScore(
-        scene, frame.name, label.phrase, intersection_over_union(answer.mask, truth), hit, level
-    )
-
-
-def inside_any_box(peaks: Array, boxes: Array | None, size: Size, shape: tuple[int, ...]) -> bool:
+def inside_any_box(peaks: Array, boxes: Array | None, size: Size, grid: Size) -> bool:
     """Return True where any of the (P, 2) peaks lies in any of the (B, 4) boxes, borders included.
 
-    peaks: column and row on a grid of `shape` (rows, columns); boxes: on the label's grid of `size`.
+    peaks: column and row on `grid` (width, height); boxes: on the label's grid of `size`.
     """
     if boxes is None or not len(peaks):
         return False
-    scale = np.array([shape[1] / size[0], shape[0] / size[1]])
-    low, high = np.minimum(boxes[:, :2], boxes[:, 2:]) * scale, np.maximum(boxes[:, :2], boxes[:, 2:]) * scale
+    scaled = boxes * np.tile(np.divide(grid, size), 2)
+    low, high = np.minimum(scaled[:, :2], scaled[:, 2:]), np.maximum(scaled[:, :2], scaled[:, 2:])
     inside = (peaks[:, None] >= low) & (peaks[:, None] <= high)
     return bool(inside.all(-1).any())
-
-
-ACCURACY_AT = (0.25, 0.5)  # IoU strictly above
-FIXED = (
-    "every constant of the protocol was fixed before a label was read; none was chosen or tuned by the labels"
-)
-COUNTED = "a query without an answer counts as wrong: IoU 0, no place"
 
 
 # Means of scores, and their report.
@@ -204,40 +200,28 @@ class BenchmarkReport:
     benchmark: str
     profile: Profile
     subject: str  # the scene or maps that were scored, and how
-    scenes: dict[str, SceneScores]
+    queries: tuple[QueryScore, ...]
+    left_out: tuple[str, ...]  # labels that cannot be asked, each "frame: phrase (why)"
 
     @property
-    def queries(self) -> list[QueryScore]:
-        """Queries of all scenes."""
-        return [query for scores in self.scenes.values() for query in scores.queries]
+    def scenes(self) -> list[str]:
+        """Names of the scenes."""
+        return list(dict.fromkeys(query.scene for query in self.queries))
 
 
-def means(queries: Sequence[QueryScore]) -> Means:
-    """Mean scores over queries; zeros where there are none."""
-    ious = np.array([query.iou for query in queries])
-    hits = [query.hit for query in queries if query.hit is not None]
-    if not len(ious):
+def means(queries: Sequence[QueryScore], group: Callable[[QueryScore], Hashable] = id) -> Means:
+    """Return the mean of the means of groups of queries, each group with the same weight.
+
+    By default each query is a group; zeros where there are none.
+    """
+    groups: dict[Hashable, list[tuple[float, ...]]] = {}
+    for one in queries:
+        shares = one.iou, np.nan if one.hit is None else one.hit, one.iou > 0.25, one.iou > 0.5
+        groups.setdefault(group(one), []).append(shares)
+    if not groups:
         return Means(0, 0.0, None, 0.0, 0.0)
-    above = [float((ious > least).mean()) for least in ACCURACY_AT]
-    return Means(len(ious), float(ious.mean()), float(np.mean(hits)) if hits else None, above[0], above[1])
-
-
-def macro(queries: Sequence[QueryScore], group: Callable[[QueryScore], object]) -> Means:
-    """Return the mean of the groups' means, each group with the same weight."""
-    groups: dict[object, list[QueryScore]] = {}
-    for query in queries:
-        groups.setdefault(group(query), []).append(query)
-    rows = [means(members) for members in groups.values()]
-    if not rows:
-        return means(())
-    places = [row.localisation for row in rows if row.localisation is not None]
-    return Means(
-        len(queries),
-        float(np.mean([row.iou for row in rows])),
-        float(np.mean(places)) if places else None,
-        float(np.mean([row.accuracy_25 for row in rows])),
-        float(np.mean([row.accuracy_50 for row in rows])),
-    )
+    iou, place, above, high = np.mean([np.mean(rows, axis=0) for rows in groups.values()], axis=0).tolist()
+    return Means(len(queries), iou, None if np.isnan(place) else place, above, high)
 
 
 def summary(report: BenchmarkReport) -> dict[str, Means]:
@@ -247,9 +231,9 @@ def summary(report: BenchmarkReport) -> dict[str, Means]:
     they differ.
     """
     queries = report.queries
-    rows = {name: means(scores.queries) for name, scores in report.scenes.items()}
-    rows["macro, mean of scenes"] = macro(queries, lambda query: query.scene)
-    rows["macro, mean of frames"] = macro(queries, lambda query: (query.scene, query.frame))
+    rows = {name: means([one for one in queries if one.scene == name]) for name in report.scenes}
+    rows["macro, mean of scenes"] = means(queries, lambda query: query.scene)
+    rows["macro, mean of frames"] = means(queries, lambda query: (query.scene, query.frame))
     rows["micro, mean of queries"] = means(queries)
     answered = [query for query in queries if not query.unanswered]
     if len(answered) < len(queries):
@@ -262,15 +246,16 @@ def summary(report: BenchmarkReport) -> dict[str, Means]:
 
 def table(report: BenchmarkReport) -> str:
     """Return the means as a Markdown table, with notes below it."""
-    lines = [
-        "| | queries | mIoU % | localisation % | mAcc@0.25 % | mAcc@0.5 % |",
-        "|---|---|---|---|---|---|",
-    ]
-    for name, row in summary(report).items():
-        shares = (row.iou, row.localisation, row.accuracy_25, row.accuracy_50)
-        cells = ["-" if share is None else f"{100 * share:.1f}" for share in shares]
-        lines.append(f"| {name} | {row.queries} | {' | '.join(cells)} |")
-    return "\n".join([*lines, "", *notes(report)])
+    rows = (
+        (name, row.queries, *map(_percent, (row.iou, row.localisation, row.accuracy_25, row.accuracy_50)))
+        for name, row in summary(report).items()
+    )
+    head = ("", "queries", "mIoU %", "localisation %", "mAcc@0.25 %", "mAcc@0.5 %")
+    return "\n".join([markdown(head, rows), *notes(report)])
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.1f}"
 
 
 def notes(report: BenchmarkReport) -> list[str]:
@@ -279,23 +264,23 @@ def notes(report: BenchmarkReport) -> list[str]:
     lines = [
         f"{report.benchmark}, protocol {report.profile.name}: {report.profile.source}",
         f"scored: {report.subject}",
-        f"{FIXED}; a frame's answers are cut before its masks are drawn",
+        "every constant of the protocol was fixed before a label was read; none was chosen or tuned by the "
+        "labels; a frame's answers are cut before its masks are drawn",
     ]
     reasons = dict.fromkeys(query.unanswered for query in queries if query.unanswered)
     for reason in reasons:
         names = [f"{query.frame}: {query.phrase}" for query in queries if query.unanswered == reason]
         lines.append(f"not answered ({reason}), {len(names)} queries: {shortened(names)}")
     if reasons:
-        lines.append(COUNTED)
+        lines.append("a query without an answer counts as wrong: IoU 0, no place")
     frames = {(query.scene, query.frame): query.trained_on for query in queries}
     trained = [frame for (_, frame), was in frames.items() if was]
     if trained:
         lines.append(
             f"{len(trained)} of {len(frames)} labelled frames are training views: {shortened(trained)}"
         )
-    left_out = [name for scores in report.scenes.values() for name in scores.left_out]
-    if left_out:
-        lines.append(f"{len(left_out)} labels left out: {shortened(left_out)}")
+    if report.left_out:
+        lines.append(f"{len(report.left_out)} labels left out: {shortened(report.left_out)}")
     return lines
 
 
@@ -308,7 +293,7 @@ def save_json(path: Path, report: BenchmarkReport) -> None:
         "notes": notes(report),
         "means": {name: asdict(row) for name, row in summary(report).items()},
         "queries": [asdict(query) for query in report.queries],
-        "left_out": {name: list(scores.left_out) for name, scores in report.scenes.items()},
+        "left_out": report.left_out,
     }
     write_json(path, content)
 
@@ -319,90 +304,49 @@ def save_json(path: Path, report: BenchmarkReport) -> None:
 # LangSplatV2 (NeurIPS 2025) and Occam's LGS (BMVC 2025) as later papers repeat them. Figures of other
 # machines, masks and trainings: to see where one stands, not to rank by a point.
 
-Row = Mapping[str, tuple[float, float | None]]  # scene -> mIoU and localisation
-
-
-_LERF_OVS = """
+_PUBLISHED = {
+    "lerf-ovs": """
               figurines  teatime    ramen      waldo_kitchen
 LERF          38.6/75.0  45.0/84.8  28.2/62.0  37.9/72.7
 LangSplat     44.7/80.4  65.1/88.1  51.2/73.2  44.5/95.5
 LangSplatV2   56.4/82.1  72.2/93.2  51.8/74.7  59.1/95.5
 Occam's_LGS   58.6/80.4  70.2/93.2  51.0/74.7  65.3/81.8
-"""
-_OVS_3D = """
+""",
+    "3d-ovs": """
               bed   bench  room  sofa  lawn
 LERF          73.5  53.2   46.6  27.0  73.7
 3D-OVS        89.5  89.3   92.8  74.0  88.2
 LangSplat     92.5  94.2   94.1  90.0  96.1
 N2F2          93.8  92.6   93.5  92.1  96.3
-"""
-
-
-def _rows(table: str) -> Mapping[str, Row]:
-    """Parse a table as above: method -> column -> pair of figures."""
-    head, *lines = table.strip().splitlines()
-    return {
-        name.replace("_", " "): dict(zip(head.split(), map(_pair, cells), strict=True))
-        for name, *cells in (line.split() for line in lines)
-    }
-
-
-def _pair(cell: str) -> tuple[float, float | None]:
-    iou, _, place = cell.partition("/")
-    return float(iou), float(place) if place else None
-
-
-PUBLISHED: Mapping[str, Mapping[str, Row]] = MappingProxyType(
-    {"lerf-ovs": _rows(_LERF_OVS), "3d-ovs": _rows(_OVS_3D)}
-)
+""",
+}
 
 
 def beside_published(report: BenchmarkReport) -> str:
-    """Markdown: a column per scene of the report that others published too, and their mean.
+    """Return a Markdown table of the report's scenes that others published too, and of their figures.
 
-    A row for the report, and one for each of them. "" where there is no such scene.
+    It is "" where there is no such scene.
     """
-    others = PUBLISHED.get(report.benchmark, {})
-    scenes = [name for name in report.scenes if any(name in row for row in others.values())]
+    head, *lines = (line.split() for line in _PUBLISHED[report.benchmark].strip().splitlines())
+    scenes, rows = [name for name in head if name in report.scenes], summary(report)
     if not scenes:
         return ""
-    means = summary(report)
-    own = {name: (means[name].iou, means[name].localisation) for name in scenes}
-    ours = {name: (100 * iou, None if place is None else 100 * place) for name, (iou, place) in own.items()}
-    lines = [
-        f"| mIoU % / localisation % | {' | '.join(scenes)} | mean |",
-        "|---|" + "---|" * (len(scenes) + 1),
-    ]
-    for method, row in {"this scene": ours, **others}.items():
-        shared = [row[name] for name in scenes if name in row]
-        mean = _mean([pair[0] for pair in shared]), _mean([pair[1] for pair in shared])
-        cells = [_cell(row.get(name)) for name in scenes]
-        lines.append(
-            f"| {method} | {' | '.join(cells)} | {_cell(mean if len(shared) == len(scenes) else None)} |"
-        )
-    return "\n".join(lines)
-
-
-def _mean(values: list[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return sum(known) / len(known) if values and len(known) == len(values) else None
-
-
-def _cell(pair: tuple[float | None, float | None] | None) -> str:
-    if pair is None or pair[0] is None:
-        return "-"
-    return f"{pair[0]:.1f}" if pair[1] is None else f"{pair[0]:.1f} / {pair[1]:.1f}"
+    own = {name: (rows[name].iou, rows[name].localisation) for name in scenes}
+    ours = ["/".join(_percent(share) for share in own[name] if share is not None) for name in scenes]
+    others = (
+        (method.replace("_", " "), *(cells[head.index(name)] for name in scenes)) for method, *cells in lines
+    )
+    return markdown(("mIoU % / localisation %", *scenes), [("this scene", *ours), *others])
 
 
 # A benchmark's labels, and whoever answers them, brought together by names.
 
 log = logging.getLogger("langsplat")
-FULL_SIZE = 100_000  # px: photographs are read for their cameras alone and not shrunk
 
 
 @dataclass(frozen=True)
 class Evaluated:
-    """Evaluated of a measurement: exactly one of `scene` and `maps` is set."""
+    """What is measured: exactly one of `scene` and `maps` is set."""
 
     scene: Path | None = None  # a scene file, or a folder of <benchmark's scene>.ply
     maps: Path | None = None  # <view>/<phrase>..., or <benchmark's scene>/<view>/<phrase>...
@@ -428,8 +372,8 @@ def run_benchmark(
         raise InputError(
             "--paper-order is for a scene under a protocol that reads relevancy maps; leave it out"
         )
-    names = chosen_scenes(list(benchmark.scenes), only, subject)
-    scores = {}
+    names = _chosen_scenes(list(benchmark.scenes), only, subject)
+    queries, left_out = list[QueryScore](), list[str]()
     for name in names:
         labelled = benchmark.scenes[name]
         source = (
@@ -437,12 +381,15 @@ def run_benchmark(
             if subject.maps is not None
             else _scene_source(labelled, profile, subject, load_encoder, progress)
         )
-        scores[name] = score_scene(labelled, source, profile, pictures, progress)
+        scores, without = score_scene(labelled, source, profile, pictures, progress)
+        queries += scores
+        left_out += without
     order = ", latents blended and every pixel decoded (the paper's order)" if subject.paper_order else ""
-    return BenchmarkReport(benchmark.name, profile, f"{subject.scene or subject.maps}{order}", scores)
+    said = f"{subject.scene or subject.maps}{order}"
+    return BenchmarkReport(benchmark.name, profile, said, tuple(queries), tuple(left_out))
 
 
-def chosen_scenes(labelled: Sequence[str], only: Sequence[str], subject: Evaluated) -> list[str]:
+def _chosen_scenes(labelled: Sequence[str], only: Sequence[str], subject: Evaluated) -> list[str]:
     """Return the names of the `labelled` scenes to score.
 
     These are `only`, or the one that a scene file is named after where several could be meant. Raises
@@ -460,17 +407,6 @@ def chosen_scenes(labelled: Sequence[str], only: Sequence[str], subject: Evaluat
     return [subject.scene.stem]
 
 
-def open_scene(
-    subject: Evaluated, name: str, load_encoder: LoadEncoder, rule: AnswerRule = "regions"
-) -> QueryEngine:
-    """Return the scene of `subject` that belongs to the labelled scene `name`, to be asked."""
-    assert subject.scene is not None
-    path = subject.scene / f"{name}.ply" if subject.scene.is_dir() else subject.scene
-    if not path.exists():
-        raise InputError(f"{path}: no such scene; leave {name} out with --only, or name the right folder")
-    return QueryEngine(searchable(path), load_encoder, encoder_id=subject.encoder, rule=rule)
-
-
 def _scene_source(
     labelled: LabelledScene,
     profile: Profile,
@@ -478,9 +414,15 @@ def _scene_source(
     load_encoder: LoadEncoder,
     progress: Progress,
 ) -> SceneSource:
+    assert subject.scene is not None
+    path = subject.scene / f"{labelled.name}.ply" if subject.scene.is_dir() else subject.scene
+    if not path.exists():
+        raise InputError(
+            f"{path}: no such scene; leave {labelled.name} out with --only, or name the right folder"
+        )
     # Published maps are read as published.
     rule: AnswerRule = "peak" if isinstance(profile.rule, MapRule) else "regions"
-    engine = open_scene(subject, labelled.name, load_encoder, rule)
+    engine = QueryEngine(searchable(path), load_encoder, encoder_id=subject.encoder, rule=rule)
     own = {without_suffix(camera.name): camera for camera in engine.scene.cameras}
     others = _other_cameras(own, labelled, progress)
     # With no name in common the scene's views are named by another rule: nothing is known of training.
@@ -527,8 +469,8 @@ def _other_cameras(
 
 
 def _dataset_cameras(folder: Path, progress: Progress) -> tuple[Camera, ...]:
-    """Return the cameras that came with a dataset; none where it has none."""
+    """Return the cameras that came with a dataset; none where it has none. Photographs are not shrunk."""
     if (folder / "transforms.json").is_file():
-        return load_nerfstudio(folder / "transforms.json", FULL_SIZE, progress).cameras
+        return load_nerfstudio(folder / "transforms.json", 100_000, progress).cameras
     model = find_model(folder)
-    return () if model is None else load_colmap(folder, model, FULL_SIZE, progress).cameras
+    return () if model is None else load_colmap(folder, model, 100_000, progress).cameras

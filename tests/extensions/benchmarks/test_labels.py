@@ -1,22 +1,24 @@
-"""Label folders and ScanNet's vertices, with what goes wrong in them."""
+"""Labels of both benchmarks: folders by hand with what goes wrong in them, and rooms drawn in the layouts."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
-from plyfile import PlyData, PlyElement
+from scipy.ndimage import gaussian_filter
 
+from assets.making import dataset
+from assets.making.dataset import MIN_PIXELS, outlines, write_labelled
+from assets.making.truth import read_truth
+from langsplat_core.cli.app import parse
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.extensions.benchmarks import scannet
-from langsplat_core.extensions.benchmarks.labels import read_3d_ovs, read_lerf_ovs, without_suffix
-from langsplat_core.extensions.benchmarks.report import Evaluated
-from langsplat_core.extensions.benchmarks.scannet import NYU40, read_points, read_scannet, run_scannet
-from langsplat_core.io.scenes import save_scene
-from langsplat_core.query.engine import QueryEngine
-from langsplat_core.scene import Scene
-from tests.support.fakes import CENTRES, axis, blobs, language
+from langsplat_core.extensions.benchmarks.labels import (
+    Outlines,
+    read_3d_ovs,
+    read_lerf_ovs,
+    without_suffix,
+)
+from langsplat_core.progress import silent
 from tests.support.photographs import SIZE, block, lerf_frame, ovs_view, rectangle
 
 
@@ -63,26 +65,24 @@ def test_a_polygon_of_fractions_and_one_that_leaves_the_picture(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    "change",
     [
-        (lambda c: c.pop("objects"), "objects"),
-        (lambda c: c.pop("info"), "width"),
-        (lambda c: c["info"].update(width="40"), "width"),
-        (lambda c: c["info"].update(height=10**9), "width"),
-        (lambda c: c["objects"][0].pop("category"), "category"),
-        (lambda c: c["objects"][0].update(segmentation=[[1, 2], [3]]), "polygon"),
-        (lambda c: c["objects"][0].update(segmentation="here"), "polygon"),
-        (lambda c: c["objects"][0].update(segmentation=[[1, 2], [float("nan"), 3], [4, 4]]), "corners"),
-        (lambda c: c.update(objects={}), "objects"),
-        (lambda c: c.update(objects=[]), "label nothing"),
+        lambda c: c.pop("objects"),
+        lambda c: c.pop("info"),
+        lambda c: c["info"].update(width="40"),
+        lambda c: c["info"].update(height=10**9),
+        lambda c: c["objects"][0].update(category=" "),
+        lambda c: c["objects"][0].update(segmentation=[[1, 2], [3]]),
+        lambda c: c["objects"][0].update(segmentation=[[1, 2], [float("nan"), 3], [4, 4]]),
+        lambda c: c.update(objects=[]),
     ],
 )
-def test_a_broken_label_file_is_named(tmp_path, change, message):
+def test_a_broken_label_file_is_named(tmp_path, change):
     path = lerf_frame(tmp_path / "label" / "a", "b", [("mug", rectangle(1, 1, 4, 4))])
     content = json.loads(path.read_text())
     change(content)
     path.write_text(json.dumps(content))
-    with pytest.raises(FormatError, match=message) as error:
+    with pytest.raises(FormatError) as error:
         read_lerf_ovs(tmp_path)
     assert str(path.parent) in str(error.value)
 
@@ -142,105 +142,70 @@ def test_no_layout_at_all(read, tmp_path):
         read(tmp_path)
 
 
-# ScanNet's labelled vertices, and answers whose scores are known by construction.
+# Rooms drawn in both layouts, read and scored as the benchmarks are.
 
-NAME = "scene0000_00"
-
-
-def write_vertices(folder, table):
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{NAME}_vh_clean_2.labels.ply"
-    PlyData([PlyElement.describe(table, "vertex")]).write(str(path))
-    return path
+SEED, VIEWS, DRAWN = 2, 9, (160, 120)  # the room of the bundled scene
 
 
-def write_labels(folder, positions, labels):
-    table = np.zeros(len(labels), [("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("label", "u2")])
-    table["x"], table["y"], table["z"] = np.transpose(positions)
-    table["label"] = labels
-    return write_vertices(folder, table)
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("sigma", [0.0, 0.7, 2.0])
+def test_polygons_reproduce_the_mask(seed, sigma):
+    """Pieces, holes, islands in holes, single pixels, diagonal lines, the picture's border."""
+    values = gaussian_filter(np.random.default_rng(seed).normal(size=(40, 50)), sigma)
+    mask = values > np.quantile(values, 0.35 if seed % 2 else 0.6)
+    polygons = outlines(mask)
+    assert all(len(polygon) >= 3 for polygon in polygons)
+    size = (mask.shape[1], mask.shape[0])
+    drawn = Outlines(size, tuple(polygon.astype(float) for polygon in polygons)).draw(size)
+    np.testing.assert_array_equal(drawn, mask)
 
 
-@pytest.fixture
-def labelled(tmp_path):
-    """Ten vertices: 4 walls, 3 beds, 2 pictures, and one that nobody labelled."""
-    labels = [NYU40["wall"]] * 4 + [NYU40["bed"]] * 3 + [NYU40["picture"]] * 2 + [0]
-    write_labels(tmp_path / "data" / NAME, np.zeros((10, 3)), labels)
-    return tmp_path
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory):
+    """The same room in both layouts, in plain light."""
+    out = tmp_path_factory.mktemp("rooms")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dataset, "LIGHT_SAMPLES", 2)
+        patch.setattr(dataset, "LIGHT_CELL", 0.0)
+        for layout in ("lerf-ovs", "3d-ovs"):
+            write_labelled(out / layout, layout, SEED, VIEWS, DRAWN, silent)
+    return out
 
 
-def run(tmp_path, ids, **more):
-    (tmp_path / "maps").mkdir(exist_ok=True)
-    np.save(tmp_path / "maps" / f"{NAME}.npy", np.asarray(ids))
-    return run_scannet(read_scannet(tmp_path / "data"), Evaluated(maps=tmp_path / "maps"), None, **more)
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("layout", "read", "kinds", "names"),
+    [
+        ("lerf-ovs", read_lerf_ovs, ("object", "colour+object", "part"), ["frame_00001", "frame_00009"]),
+        ("3d-ovs", read_3d_ovs, ("object",), ["00", "08"]),
+    ],
+)
+def test_labels_state_the_truth_of_their_view(rooms, layout, read, kinds, names):
+    (scene,) = read(rooms / layout).scenes.values()
+    assert [frame.name for frame in scene.frames] == names
+    truth, several = read_truth(scene.dataset), 0
+    for frame in scene.frames:
+        labels = truth.labels(frame.name)
+        masks = {p.text: np.isin(labels, p.ids).any(0) for p in truth.phrases if p.kind in kinds}
+        masks = {text: mask for text, mask in masks.items() if mask.sum() >= MIN_PIXELS}
+        assert {label.phrase for label in frame.labels} == set(masks)
+        for label in frame.labels:
+            np.testing.assert_array_equal(label.truth.draw(DRAWN), masks[label.phrase])
+            several += layout == "lerf-ovs" and len(label.boxes) > 1
+    assert several > 5 or layout == "3d-ovs"
 
 
-def test_means_over_the_classes_that_are_there(labelled):
-    wall, bed, picture = (NYU40[name] for name in ("wall", "bed", "picture"))
-    # 3 of 4 walls right, all beds, one of which more on a wall; 1 of 2 pictures; the unlabelled one anything
-    report = run(labelled, [wall, wall, wall, bed, bed, bed, bed, picture, 0, wall])
-    nineteen, fifteen, ten = report.scores
-    assert (nineteen.classes, nineteen.present, nineteen.points) == (19, 3, 9)
-    iou, accuracy = (3 / 4 + 3 / 4 + 1 / 2) / 3, (3 / 4 + 1 + 1 / 2) / 3
-    assert (nineteen.iou, nineteen.accuracy) == pytest.approx((iou, accuracy))
-    for score, classes in ((fifteen, 15), (ten, 10)):  # without pictures
-        assert (score.classes, score.present, score.points) == (classes, 2, 7)
-        assert (score.iou, score.accuracy) == pytest.approx((3 / 4, 7 / 8))
-    assert "| macro, mean of scenes | 19 |" in scannet.point_table(report)
-    assert "fixed before a label was read" in scannet.point_table(report)
-
-
-def test_json_and_nested_class_sets(labelled, tmp_path):
-    scannet.save_point_json(tmp_path / "out.json", run(labelled, np.full(10, 1)))
-    said = json.loads((tmp_path / "out.json").read_text())
-    assert said["scores"][0]["accuracy"] == pytest.approx(1 / 3)
-    nineteen, fifteen, ten = (set(names) for names in scannet.CLASS_SETS)
-    assert [len(nineteen), len(fifteen), len(ten)] == [19, 15, 10]
-    assert ten < fifteen < nineteen
-
-
-def test_vertices_take_the_nearest_meaning(tmp_path):
-    """The blobs are called wall, floor and bed; vertices stand near their middles."""
-    known = {name: axis(3) for name in NYU40} | {"wall": axis(0), "floor": axis(1), "bed": axis(2)}
-    field = replace(language(), phrasebook=known)
-    field.confidence[1] = 0  # at part level all blobs are alike
-    save_scene(tmp_path / f"{NAME}.ply", Scene(blobs(), field))
-    positions = np.repeat(CENTRES, 2, 0) + 0.01
-    names = ["wall", "wall", "floor", "floor", "bed", "sofa"]  # the last is called bed
-    write_labels(tmp_path / "data", positions, [NYU40[name] for name in names])
-    report = run_scannet(read_scannet(tmp_path / "data"), Evaluated(scene=tmp_path), None)
-    score = report.scores[0]
-    assert (score.iou, score.accuracy) == pytest.approx(((1 + 1 + 1 / 2 + 0) / 4, 3 / 4))
-
-
-def test_words_that_the_encoder_lacks_are_wrong_everywhere(tmp_path):
-    class Half:
-        def encode_texts(self, texts):
-            return np.stack([axis(3) for _ in texts])
-
-        def unknown_words(self, text):
-            return ("bathtub",) if text == "bathtub" else ()
-
-    engine = QueryEngine(Scene(blobs(), language()), lambda _: Half())
-    path = write_labels(tmp_path, CENTRES, [NYU40["bathtub"]] * 3)
-    found, unknown = scannet.scene_classes(engine, read_points(path, NAME))
-    assert unknown == ("bathtub",)
-    assert not any((ids == NYU40["bathtub"]).any() for ids in found)
-
-
-@pytest.mark.parametrize("ids", [np.zeros(9, int), np.zeros(10), np.zeros((2, 10), int)])
-def test_maps_of_another_length(labelled, ids):
-    with pytest.raises(FormatError, match="one per vertex"):
-        run(labelled, ids)
-
-
-def test_other_layouts(labelled, tmp_path):
-    with pytest.raises(InputError, match="not in the layout of ScanNet"):
-        read_scannet(tmp_path / "absent")
-    path = write_vertices(tmp_path, np.zeros(3, [("x", "f4"), ("y", "f4"), ("z", "f4")]))
-    with pytest.raises(FormatError, match="lack x, y, z or label"):
-        read_points(path, NAME)
-    with pytest.raises(InputError, match="--only other"):
-        run(labelled, np.zeros(10, int), only=("other",))
-    with pytest.raises(InputError, match="no such file"):
-        run_scannet(read_scannet(labelled / "data"), Evaluated(maps=tmp_path / "nothing"), None)
+@pytest.mark.long
+@pytest.mark.parametrize(("layout", "protocol"), [("lerf-ovs", "langsplat-code"), ("3d-ovs", "ours")])
+def test_eval_scores_the_bundled_scene_on_a_written_set(rooms, tmp_path, capsys, layout, protocol):
+    """The bundled scene shows the same room; it has never seen these views, whose cameras the dataset has."""
+    out = tmp_path / "out.json"
+    words = ["eval", layout, "assets/demo/scene.ply", str(rooms / layout), "--protocol", protocol]
+    parse([*words, "--json", str(out), "--pictures", str(tmp_path / "pictures")]).run()
+    content = json.loads(out.read_text())
+    micro = content["means"]["micro, mean of queries"]
+    assert micro["queries"] == len(content["queries"]) > 20
+    assert micro["iou"] > 0.4
+    assert "macro, mean of frames" in capsys.readouterr().out
+    assert len(list((tmp_path / "pictures").rglob("*.png"))) == micro["queries"]

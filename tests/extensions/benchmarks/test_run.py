@@ -10,7 +10,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 from PIL import Image
 
 from langsplat_core.errors import InputError
-from langsplat_core.extensions.benchmarks import commands as evaluate
 from langsplat_core.extensions.benchmarks import profiles
 from langsplat_core.extensions.benchmarks.labels import read_3d_ovs, read_lerf_ovs
 from langsplat_core.extensions.benchmarks.profiles import (
@@ -35,7 +34,6 @@ from langsplat_core.scene import Scene
 from tests.support.commands import refusal, run
 from tests.support.fakes import PER_BLOB, WORDS, FakeEncoder, blob_scene, cameras
 from tests.support.photographs import SIZE, block, lerf_frame, mask_map, ovs_view, rectangle, silhouette
-from tests.support.tiny_models import tiny_room, tiny_settings
 
 CODE_RULE = LERF_PROFILES["langsplat-code"].rule
 PLAIN_RULE = MapRule(1, 1.0, "mirror", "peak", True, 0.7, "none", 1, 1, False)
@@ -183,9 +181,9 @@ def test_macro_and_micro_means_and_all_figures_as_json(two_scenes, tmp_path):
 
 def test_one_scene_alone(two_scenes):
     data, maps = two_scenes
-    assert list(of_maps(data, maps, only=("b",)).scenes) == ["b"]
+    assert of_maps(data, maps, only=("b",)).scenes == ["b"]
     alone = of_maps(data / "label" / "a", maps / "a")  # its own folders, without the name
-    assert list(alone.scenes) == ["a"]
+    assert alone.scenes == ["a"]
     with pytest.raises(InputError, match=r"--only c: .*a, b"):
         of_maps(data, maps, only=("c",))
 
@@ -222,22 +220,18 @@ def test_maps_are_scored_on_their_own_grid(tmp_path):
         of_maps(tmp_path, tmp_path / "maps", PLAIN)
 
 
-@pytest.mark.parametrize("kind", ["npy per level", "png per level", "16 bit", "one array"])
+@pytest.mark.parametrize("kind", ["8 bit", "16 bit", "levels"])
 def test_kinds_of_maps(tmp_path, kind):
     lerf_frame(tmp_path / "label" / "a", "one", [("mug", rectangle(0, 0, 9, 9))])
-    folder = tmp_path / "maps" / "one"
-    mask_map(folder, "mug.part", 0.4 * block(20, 20, 30, 29))
-    mask_map(folder, "mug.whole", 0.8 * block(0, 0, 9, 9))
-    part, whole = (np.load(folder / f"mug.{level}.npy") for level in ("part", "whole"))
-    if kind == "one array":
-        np.save(folder / "mug.npy", np.stack([0 * part, part, whole]))
-    elif kind != "npy per level":
-        for level, values in (("part", part), ("whole", whole)):
-            (folder / f"mug.{level}.npy").unlink()
-            top, dtype = (65535, np.uint16) if kind == "16 bit" else (255, np.uint8)
-            Image.fromarray(np.rint(top * values).astype(dtype)).save(folder / f"mug.{level}.png")
+    part, whole = 0.4 * block(20, 20, 30, 29), 0.8 * block(0, 0, 9, 9)
+    if kind == "levels":
+        mask_map(tmp_path / "maps" / "one", "mug", np.stack([0 * part, part, whole]))
+    else:
+        top, dtype = (65535, np.uint16) if kind == "16 bit" else (255, np.uint8)
+        (tmp_path / "maps" / "one").mkdir(parents=True)
+        Image.fromarray(np.rint(top * whole).astype(dtype)).save(tmp_path / "maps" / "one" / "mug.png")
     (query,) = of_maps(tmp_path, tmp_path / "maps", PLAIN).queries
-    assert (query.level, query.iou, query.hit) == ("whole", 1.0, True)
+    assert (query.level, query.iou, query.hit) == ("whole" if kind == "levels" else "subpart", 1.0, True)
 
 
 def test_maps_that_do_not_fit(two_scenes, tmp_path):
@@ -256,11 +250,11 @@ def test_maps_that_do_not_fit(two_scenes, tmp_path):
 def test_boxes_have_their_borders_inside():
     boxes = np.array([[10.0, 10, 20, 20], [30, 5, 25, 0]])  # the second with its corners exchanged
     peaks = np.array([[20, 20], [21, 20], [25, 5], [24, 5]])
-    hits = [inside_any_box(peak[None], boxes, SIZE, (30, 40)) for peak in peaks]
+    hits = [inside_any_box(peak[None], boxes, SIZE, (40, 30)) for peak in peaks]
     assert hits == [True, False, True, False]
-    assert inside_any_box(peaks, boxes, SIZE, (30, 40))
-    assert inside_any_box(np.array([[40, 40]]), boxes, SIZE, (60, 80))
-    assert not inside_any_box(np.empty((0, 2), int), boxes, SIZE, (30, 40))
+    assert inside_any_box(peaks, boxes, SIZE, (40, 30))
+    assert inside_any_box(np.array([[40, 40]]), boxes, SIZE, (80, 60))
+    assert not inside_any_box(np.empty((0, 2), int), boxes, SIZE, (40, 30))
     assert scored_size((4032, 3024), 1080) == (1440, 1080)  # a grid with too many rows is shrunk
     assert scored_size((988, 731), 1080) == (988, 731)
 
@@ -367,7 +361,7 @@ def test_scenes_and_labels_that_do_not_fit(blobs_on_disk):
     refused("no language field", tmp_path / "data")
 
 
-# `langsplat eval lerf-ovs`, `3d-ovs` and `scannet`: arguments, and one line for what is wrong with them.
+# `langsplat eval lerf-ovs` and `3d-ovs`: arguments, and one line for what is wrong with them.
 
 
 @pytest.fixture
@@ -395,34 +389,11 @@ def test_maps_of_another_system(data, capsys, protocol):
         (("lerf-ovs", "scene.ply", "data"), "no such scene"),
         (("lerf-ovs", "data", "--maps", "maps", "--paper-order"), "leave it out"),
         (("lerf-ovs", "absent", "--maps", "maps"), "no such folder"),
-        (("lerf-ovs", "scene.ply", "data", "--train"), "give the benchmark's folder alone"),
-        (("lerf-ovs", "data", "--train", "--clip.model", "demo", "--masks.source", "graph"), "a: "),
         (("3d-ovs", "data", "--maps", "maps"), "use `langsplat eval lerf-ovs`"),
         (("3d-ovs", "data", "--maps", "maps", "--protocol", "langsplat-code"), "invalid choice"),
-        (("scannet", "data", "--maps", "maps"), "not in the layout of ScanNet"),
         (("lerf-ovs", "data", "--maps", "data"), "no folder is named after a labelled frame"),
     ],
 )
 def test_bad_arguments_are_one_line(data, monkeypatch, capsys, words, message):
     monkeypatch.chdir(data)
     assert message in refusal(capsys, "eval", *words)
-
-
-def test_scenes_are_trained_first(tmp_path, capsys, monkeypatch):
-    """In LERF-OVS's layout; one scene cannot be trained, which is said after the table of the other."""
-    monkeypatch.setattr(
-        evaluate, "with_preset", lambda config, _: replace(tiny_settings(room), masks=config.masks)
-    )
-    room = tiny_room(tmp_path / "data" / "ramen")
-    box = rectangle(0, 0, 63, 47)
-    lerf_frame(tmp_path / "data" / "label" / "ramen", "photo_0", [("mug", box)], (64, 48))
-    lerf_frame(tmp_path / "data" / "label" / "teatime", "photo_0", [("mug", box)], (64, 48))
-    out = ("--out", tmp_path / "scenes")
-    words = ("lerf-ovs", tmp_path / "data", "--train", *out, "--masks.source", "graph")
-    assert run("eval", *words) == 2
-    said = capsys.readouterr()
-    assert "| LangSplat | 51.2 / 73.2 | 51.2 / 73.2 |" in said.out  # beside what others published
-    assert "teatime" in said.err.strip().splitlines()[-1]
-    made = (tmp_path / "scenes" / "ramen.ply").stat().st_mtime_ns
-    assert run("eval", *words, "--only", "ramen") == 0
-    assert (tmp_path / "scenes" / "ramen.ply").stat().st_mtime_ns == made  # it is there already
