@@ -20,7 +20,7 @@ from langsplat_core.query.instances import Instance
 from langsplat_core.query.outline import Outline
 from langsplat_core.query.suggestions import Suggestions
 from langsplat_core.scene import Camera, Scene
-from langsplat_core.scene.tree import Tree
+from langsplat_core.scene.language import Tree
 from langsplat_viewer.camera.controls import Extent, OrbitCamera
 from langsplat_viewer.camera.flight import Flight, Keyframe
 from langsplat_viewer.files.disk import Listing

@@ -86,8 +86,7 @@ from langsplat_core.scene import (
     Tree,
     codec_from_tensors,
 )
-from langsplat_core.scene.language import MOST_SHOWN
-from langsplat_core.scene.tree import tree_of_wholes
+from langsplat_core.scene.language import MOST_SHOWN, tree_of_wholes
 
 FORMAT, VERSION = "langsplat", "3"
 WORDS_FORMAT, WORDS_VERSION = "langsplat words", "1"

@@ -22,9 +22,8 @@ from langsplat_core.query.regions import Regions, build_regions, chance_in
 from langsplat_core.query.rule import Bars, Chance, bars_of
 from langsplat_core.query.taught import WordSpace, build_word_space, by_showing, compared, shown
 from langsplat_core.scene import CANONICAL_PHRASES, LEVELS, Calibration, LanguageField, Scene, TaughtWord
-from langsplat_core.scene.language import LONGEST_NAME, MOST_SHOWN, phrase_key, split_phrases, tidy
+from langsplat_core.scene.language import LONGEST_NAME, MOST_SHOWN, Tree, phrase_key, split_phrases, tidy
 from langsplat_core.scene.surface import Surface, build_surface, build_tree, surface_weights
-from langsplat_core.scene.tree import Tree
 from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE
 from langsplat_core.semantics.relevancy import Scale, relevancy_of
 from langsplat_core.semantics.vocabulary import FEWEST, TextEncoder, everyday_vectors

@@ -10,8 +10,8 @@ from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.compiled import plain
 from langsplat_core.errors import InputError
 from langsplat_core.scene import Gaussians
+from langsplat_core.scene.language import NO_NODE
 from langsplat_core.scene.surface import Surface
-from langsplat_core.scene.tree import NO_NODE
 
 INNER = (0.02, 0.98)  # a box holds the points between these quantiles of each coordinate: strays do not count
 TURNED = 256  # points, at most, that the box is turned by

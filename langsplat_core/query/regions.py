@@ -12,7 +12,7 @@ from langsplat_core.compiled import kernel, plain, shared_workers
 from langsplat_core.query.instances import axis_aligned_box
 from langsplat_core.query.rule import RULE, Chance, RegionTable, region_fits
 from langsplat_core.scene import LEVELS, LanguageField
-from langsplat_core.scene.tree import Tree
+from langsplat_core.scene.language import Tree
 from langsplat_core.semantics.relevancy import Scale, relevancy_of
 
 PIECES = 4  # that a level is summed in, so that more than three cores have work

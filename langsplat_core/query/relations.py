@@ -10,8 +10,8 @@ from langsplat_core.arrays import Array, across
 from langsplat_core.query.grammar import Extreme, Side
 from langsplat_core.query.instances import axis_aligned_box, told_apart
 from langsplat_core.scene import LEVELS, Camera
+from langsplat_core.scene.language import Tree
 from langsplat_core.scene.surface import Surface
-from langsplat_core.scene.tree import Tree
 
 WHOLE = LEVELS.index("whole")
 FEWEST = 8  # Gaussians; what has fewer is a speck

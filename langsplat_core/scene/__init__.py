@@ -1,19 +1,19 @@
 """The nouns of the project: plain typed data, no behaviour that needs a device or a file."""
 
-from langsplat_core.scene.camera import FARTHEST, Camera, Intrinsics, look_at
 from langsplat_core.scene.codec import AutoencoderCodec, CodebookCodec, Codec, LinearCodec, codec_from_tensors
 from langsplat_core.scene.gaussians import SH_COUNTS, Gaussians
 from langsplat_core.scene.language import (
     CANONICAL_PHRASES,
     LEVELS,
+    NO_NODE,
     Calibration,
     Fits,
     LanguageField,
     PlattScaling,
     TaughtWord,
+    Tree,
 )
-from langsplat_core.scene.scene import Scene
-from langsplat_core.scene.tree import NO_NODE, Tree
+from langsplat_core.scene.scene import FARTHEST, Camera, Intrinsics, Scene, look_at
 
 __all__ = [
     "CANONICAL_PHRASES",

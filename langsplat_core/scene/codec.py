@@ -1,7 +1,6 @@
-"""Codecs: how a Gaussian keeps a CLIP vector.
+"""Codecs: how a Gaussian keeps a CLIP vector: unit vectors of D numbers to latents of d numbers and back.
 
-A codec maps unit vectors of D numbers to latents of d numbers and back, in plain NumPy, so that a scene can
-be opened and searched without torch; codecs are fitted in `training.language.codec_fit`. Callers ask a codec
+They are fitted in `training.language.codec_fit`, and used in plain NumPy, without torch. Callers ask a codec
 for what they need (`cosines`, `distances`, `unique`) and never which kind it is.
 """
 
@@ -53,11 +52,6 @@ class Codec(ABC):
         """True where latents are unit vectors of 3 numbers, over which cosines with a text are smooth."""
         return False
 
-    @property
-    def networks(self) -> tuple[Layers, Layers] | None:
-        """Encoder and decoder where these are linear layers with ReLU between them."""
-        return None
-
     @abstractmethod
     def encode(self, vectors: Array) -> Array:
         """(M, D) unit CLIP vectors -> (M, d) latents of the codec's type."""
@@ -68,10 +62,7 @@ class Codec(ABC):
 
     @abstractmethod
     def cosines(self, latents: Array, vectors: Array) -> Array:
-        """(M, d) latents of any length, (Q, D) unit vectors -> (M, Q) float32 cosines of both, decoded.
-
-        A blended latent is shorter than 1 but keeps its direction; zero gives zeros.
-        """
+        """(M, d) latents of any length, (Q, D) unit vectors -> (M, Q) float32 cosines; zero gives zeros."""
 
     @abstractmethod
     def tensors(self) -> dict[str, Array]:
@@ -80,7 +71,7 @@ class Codec(ABC):
     @classmethod
     @abstractmethod
     def from_tensors(cls, tensors: dict[str, Array]) -> Self:
-        """Return the inverse of `tensors`; ValueError if they do not belong together."""
+        """Return the inverse of `tensors`; KeyError or ValueError where they do not belong together."""
 
     def to_file(self, latents: Array) -> dict[str, Array]:
         """(3, N, d) latents as the named tensor of the scene file."""
@@ -100,17 +91,11 @@ class Codec(ABC):
         return known
 
     def unique(self, latents: Array) -> tuple[Array, Array]:
-        """(M, d) latents -> (U, d) distinct ones and the (M,) int64 index of each latent among them.
-
-        Where latents hardly ever repeat, these are the latents themselves.
-        """
+        """(M, d) latents -> (U, d) ones, distinct where they repeat, and (M,) int64 index of each in them."""
         return latents, np.arange(len(latents))
 
     def directions(self, latents: Array) -> Array:
-        """(M, d) latents -> (M, c) float32 unit vectors; zero for a latent without a meaning.
-
-        Their cosines are those of the decoded latents, or close to them.
-        """
+        """(M, d) latents -> (M, c) float32 unit vectors, or zero, with about the cosines of the decoded."""
         return _directions(latents)[0]
 
     def distances(self, latents: Array, first: Array, second: Array) -> Array:
@@ -126,19 +111,13 @@ class Codec(ABC):
         return found
 
     def spread(self, latents: Array) -> float:
-        """Return the mean distance between two of (M, d) latents, M >= 1.
-
-        It is 1 minus the squared length of their mean direction.
-        """
+        """Return the mean distance between two of (M, d) latents: 1 - |mean direction|^2."""
         distinct, of = self.unique(latents)
         mean = np.bincount(of, minlength=len(distinct)) @ self.directions(distinct) / len(latents)
         return max(1 - float(mean @ mean), 0.0)
 
     def colours(self, latents: Array, weights: Array) -> Array:
-        """(M, d) latents -> (M, 3) float32 colours in [0, 1]; near vectors have near ones.
-
-        weights: (M,) >= 0, how often each occurs.
-        """
+        """(M, d) latents, (M,) how often each occurs -> (M, 3) float32 in [0, 1], near for near vectors."""
         return principal_colours(latents, weights)
 
 
@@ -183,17 +162,12 @@ class LinearCodec(Codec):
 
     @classmethod
     def from_tensors(cls, tensors: dict[str, Array]) -> "LinearCodec":
-        if "basis" not in tensors:
-            raise ValueError("linear codec without its basis")
         return cls(tensors["basis"])
 
 
 @dataclass(frozen=True, eq=False)
 class AutoencoderCodec(Codec):
-    """The scene-wise autoencoder of LangSplat (section 3.2 of the paper).
-
-    Linear layers with ReLU between them, batch normalisation folded in; latents have length 1.
-    """
+    """LangSplat's autoencoder (section 3.2 of the paper): linear layers with ReLU between; unit latents."""
 
     encoder: Layers
     decoder: Layers
@@ -208,7 +182,7 @@ class AutoencoderCodec(Codec):
                 width = weight.shape[0]
         if self.encoder[-1][0].shape[0] != self.latent_dim or self.decoder[-1][0].shape[0] != self.vector_dim:
             raise ValueError("codec: the decoder does not mirror the encoder's widths")
-        largest = max(_largest(self.encoder), _largest(self.decoder))
+        largest = max(map(_largest, (self.encoder, self.decoder)))
         if LARGEST_SUM < largest < math.inf:  # what is not finite is named by whoever read it
             raise ValueError(f"codec: the weights add up to {largest:.0e}; at most {LARGEST_SUM:.0e} is used")
 
@@ -223,10 +197,6 @@ class AutoencoderCodec(Codec):
     @property
     def spherical(self) -> bool:
         return self.latent_dim == 3
-
-    @property
-    def networks(self) -> tuple[Layers, Layers]:
-        return self.encoder, self.decoder
 
     def encode(self, vectors: Array) -> Array:
         return unit(_run(self.encoder, np.asarray(vectors, np.float32)))
@@ -255,8 +225,7 @@ def _largest(layers: Layers) -> float:
     """Return a bound of all numbers that the layers make of a vector of length 1."""
     bound = 1.0
     for weight, bias in layers:
-        sums = np.abs(weight).sum(1, dtype=np.float64) * bound + np.abs(bias)
-        bound = float(sums.max(initial=0))
+        bound = float((np.abs(weight).sum(1, dtype=np.float64) * bound + np.abs(bias)).max(initial=0))
     return bound
 
 
@@ -270,23 +239,13 @@ def _run(layers: Layers, x: Array) -> Array:
 
 
 def _layers(tensors: dict[str, Array], part: str) -> Layers:
-    count = sum(name.startswith(f"{part}.") for name in tensors) // 2
-    try:
-        layers = tuple((tensors[f"{part}.{i}.weight"], tensors[f"{part}.{i}.bias"]) for i in range(count))
-    except KeyError as error:
-        raise ValueError(f"autoencoder codec without {error.args[0]}") from None
-    if not layers:
-        raise ValueError(f"autoencoder codec without its {part}")
-    return layers
+    count = max(sum(name.startswith(f"{part}.") for name in tensors) // 2, 1)
+    return tuple((tensors[f"{part}.{i}.weight"], tensors[f"{part}.{i}.bias"]) for i in range(count))
 
 
 @dataclass(frozen=True, eq=False)
 class CodebookCodec(Codec):
-    """K unit vectors in CLIP space; a latent is the number of one of them, and blended numbers mean nothing.
-
-    A scene means a countable number of things. A phrase costs one (K, D) product and a fetch per Gaussian,
-    and what is fetched is an exact cosine with a vector of CLIP's own space.
-    """
+    """K unit vectors in CLIP space; a latent is the number of one, and blended numbers mean nothing."""
 
     vectors: Array  # (K, D) float32 unit vectors, 1 <= K <= LARGEST
     palette: Array  # (K, 3) float32 in [0, 1]; near codewords have near colours
@@ -338,9 +297,7 @@ class CodebookCodec(Codec):
 
     def check(self, latents: Array) -> None:
         if latents.max(initial=0) >= len(self.vectors):
-            raise ValueError(
-                f"latents: {latents.max()} is not the number of one of {len(self.vectors)} codewords"
-            )
+            raise ValueError(f"latents: number {latents.max()} of {len(self.vectors)} codewords")
 
     def known(self, latents: Array) -> Array:
         return np.ones(len(latents), bool)
@@ -361,45 +318,28 @@ class CodebookCodec(Codec):
 
     @classmethod
     def from_tensors(cls, tensors: dict[str, Array]) -> "CodebookCodec":
-        missing = {"vectors", "colours"} - set(tensors)
-        if missing:
-            raise ValueError(f"codebook codec without its {' and '.join(sorted(missing))}")
         return cls(tensors["vectors"], tensors["colours"])
 
 
 def principal_colours(vectors: Array, weights: Array) -> Array:
     """(K, c) vectors -> (K, 3) float32 colours in [0, 1], near ones for near vectors.
 
-    Their first three principal axes, each stretched between its 2 % and 98 % quantiles; an axis that is
-    missing or flat is grey.
-
-    weights: (K,) >= 0, how often each occurs; the axes and quantiles are those of what occurs.
+    Their first three principal axes, each between its 2 % and 98 % quantiles; an axis that is missing or flat
+    is grey. weights: (K,) >= 0, how often each occurs; axes and quantiles are those of what occurs.
     """
+    axes, colours = vectors.astype(np.float64), np.full((len(vectors), 3), 0.5, np.float32)
     if vectors.shape[1] != 3:
-        vectors = _principal(vectors.astype(np.float64), weights)
-    return stretched(vectors, weights)
-
-
-def stretched(axes: Array, weights: Array) -> Array:
-    """(K, 3) numbers -> (K, 3) float32 in [0, 1], every axis between its weighted 2 % and 98 % quantiles."""
-    colours = np.full(axes.shape, 0.5)
+        centred = axes - (weights @ axes) / max(float(weights.sum()), 1e-30)
+        _, principal = np.linalg.eigh(
+            (centred * weights[:, None]).T @ centred + 1e-12 * np.eye(axes.shape[1])
+        )
+        axes = centred @ principal[:, ::-1][:, :3]
     occurs = np.flatnonzero(weights > 0)
-    if len(occurs) == 0:
-        return colours.astype(np.float32)
-    for axis in range(3):
-        values = axes[:, axis].astype(np.float64)
+    for axis, values in enumerate(axes.T if len(occurs) else ()):
         low, high = _quantiles(values[occurs], weights[occurs])
         if high - low > 1e-6:
             colours[:, axis] = np.clip((values - low) / (high - low), 0, 1)
-    return colours.astype(np.float32)
-
-
-def _principal(vectors: Array, weights: Array) -> Array:
-    total = max(float(weights.sum()), 1e-30)
-    centred = vectors - (weights @ vectors) / total
-    _, axes = np.linalg.eigh((centred * weights[:, None]).T @ centred + 1e-12 * np.eye(vectors.shape[1]))
-    projected = centred @ axes[:, ::-1][:, :3]
-    return np.pad(projected, ((0, 0), (0, 3 - projected.shape[1])))
+    return colours
 
 
 def _quantiles(values: Array, weights: Array) -> tuple[float, float]:
@@ -417,7 +357,8 @@ KINDS: Mapping[str, type[Codec]] = MappingProxyType(
 def codec_from_tensors(kind: str, tensors: dict[str, Array]) -> Codec:
     """Rebuild a codec from its kind and named weights; ValueError if they do not belong together."""
     if kind not in KINDS:
-        raise ValueError(
-            f"unknown codec kind {quoted(kind)}; this version knows {', '.join(map(repr, KINDS))}"
-        )
-    return KINDS[kind].from_tensors(tensors)
+        raise ValueError(f"unknown codec kind {quoted(kind)}; known are {', '.join(map(repr, KINDS))}")
+    try:
+        return KINDS[kind].from_tensors(tensors)
+    except KeyError as error:
+        raise ValueError(f"{kind} codec without its {error.args[0]}") from None

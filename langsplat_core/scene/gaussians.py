@@ -1,12 +1,10 @@
-"""The Gaussians of a scene, stored as the INRIA PLY stores them: raw, not activated.
-
-And fewer, larger ones that look much the same.
-"""
+"""The Gaussians of a scene, raw as in the INRIA PLY, and fewer, larger ones that look much the same."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, NamedTuple
-from weakref import WeakKeyDictionary
+from functools import cached_property
+from math import isqrt
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,11 +20,7 @@ LARGEST_COEFFICIENT = 1e20  # of the spherical harmonics: sums of sixteen and th
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """N anisotropic Gaussians as a structure of float32 arrays, which are not changed any more.
-
-    Rows may be invalid (NaN, zero quaternion): backends drop and count them, nothing here repairs them
-    silently.
-    """
+    """N anisotropic Gaussians as float32 arrays. Invalid rows stay: backends drop and count them."""
 
     means: Array  # (N, 3) world units
     log_scales: Array  # (N, 3) natural logarithm of world units; -inf is a flat axis
@@ -52,33 +46,27 @@ class Gaussians:
     @property
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics, 0 to 3."""
-        return {count: degree for degree, count in SH_COUNTS.items()}[self.sh.shape[1]]
+        return isqrt(self.sh.shape[1]) - 1
 
     def take(self, rows: Array) -> "Gaussians":
         """Return the Gaussians at `rows`: indices or a boolean mask of length N."""
         return Gaussians(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def valid(self) -> Array:
-        """(N,) True where a row can be drawn.
+        """(N,) True where a row can be drawn, see `invalid_rows` for why it cannot."""
+        return self._usable.copy()
 
-        Its mean is finite, its quaternion finite and not zero, scales and colours are not NaN or so large
-        that they overflow, its opacity is not NaN.
-        """
-        usable = _VALID.get(self)
-        if usable is None:
-            usable = np.ones(len(self), bool)
-            for _, sound in self._requirements():
-                usable &= sound
-            _VALID[self] = usable
-        return usable.copy()
+    @cached_property
+    def _usable(self) -> Array:
+        usable = np.ones(len(self), bool)
+        for _, sound in self._requirements():
+            usable &= sound
+        return usable
 
     def invalid_rows(self) -> dict[str, int]:
-        """Why rows are not valid: reason -> count, for those reasons that occur.
-
-        A row counts once, under its first reason, so that the counts add up to the rows dropped.
-        """
+        """Return why rows are not valid: reason -> count. A row counts once, under its first reason."""
         counts: dict[str, int] = {}
-        if self.valid().all():
+        if self._usable.all():
             return counts
         unexplained = np.ones(len(self), bool)
         for reason, sound in self._requirements():
@@ -103,9 +91,6 @@ class Gaussians:
         )
 
 
-_VALID: WeakKeyDictionary[Gaussians, Array] = WeakKeyDictionary()  # what was found, as it is asked for often
-
-
 def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
     """Return the Gaussians of all `parts`, in order; harmonics of lower degrees are filled up with zeros."""
     if not parts:
@@ -121,11 +106,9 @@ def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
     return Gaussians(**{name: np.concatenate(column) for name, column in columns.items()})
 
 
-# A scene with fewer and larger Gaussians that looks much the same: for images that have to be fast.
-#
-# Neighbours are merged four at a time where together they are about one blob: mean and covariance become
-# those of the mixture, weighted by opacity times area, and the optical depth is kept. The rest stays as it
-# is.
+# Fewer and larger Gaussians, for images that have to be fast. Neighbours are merged four at a time where
+# together they are about one blob: mean and covariance become those of the mixture, weighted by opacity times
+# area, and the optical depth is kept.
 
 GROUP = 4  # that become one
 SPREAD = 2.0  # the largest ratio of the variance of the mixture to that of its members
@@ -133,8 +116,10 @@ BLOCK = 1 << 15  # groups handled at a time, some 40 MB
 _OPAQUE = 0.999  # more would be an infinite optical depth
 _TINY = 1e-30
 _GRID_BITS = 20  # of each coordinate on the curve that orders the Gaussians
-_CURVE = ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3))
-_SPACED = (*_CURVE, (2, 0x1249249249249249))  # shifts and masks that put two free bits behind every bit
+_SPACED = (  # shifts and masks that put two free bits behind every bit
+    *((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F)),
+    *((4, 0x10C30C30C30C30C3), (2, 0x1249249249249249)),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,19 +134,12 @@ class Merged:
         return None if values is None else self.weights @ np.asarray(values, np.float32)
 
 
-class _Part(NamedTuple):
-    """Merged Gaussians of some groups."""
-
-    gaussians: Gaussians
-    sources: Array  # (m, GROUP) rows of the original; only the first counts where its weight is 1
-    weights: Array  # (m, GROUP)
+# Gaussians, (m, GROUP) rows of the original that each is made of, and (m, GROUP) weights of these.
+_Part = tuple[Gaussians, Array, Array]
 
 
 def merged(gaussians: Gaussians, progress: Progress = silent) -> Merged:
-    """Return a quarter to all of the drawable rows, in another order.
-
-    Rows that are not valid are left out.
-    """
+    """Return what stands for the valid rows: a quarter as many, up to all of them, in another order."""
     rows = np.flatnonzero(gaussians.valid())
     rows = rows[np.argsort(along_curve(gaussians.means[rows]))]
     grouped = rows[: len(rows) // GROUP * GROUP].reshape(-1, GROUP)
@@ -169,14 +147,13 @@ def merged(gaussians: Gaussians, progress: Progress = silent) -> Merged:
     for start in range(0, len(grouped), BLOCK):
         progress("merging", start / len(grouped))
         parts += _merge(gaussians, grouped[start : start + BLOCK])
-    weights = np.concatenate([part.weights for part in parts])
-    sources = np.concatenate([part.sources for part in parts])
-    starts = np.arange(0, weights.size + 1, GROUP)
-    shape = (len(weights), len(gaussians))
+    found, sources, weights = zip(*parts, strict=True)
+    entries = np.concatenate(weights).astype(np.float32).ravel(), np.concatenate(sources).ravel()
+    starts = np.arange(0, len(entries[0]) + 1, GROUP)
     from scipy import sparse  # here, since every program that opens a scene imports this module
 
-    matrix = sparse.csr_matrix((weights.astype(np.float32).ravel(), sources.ravel(), starts), shape=shape)
-    return Merged(join_gaussians([part.gaussians for part in parts]), matrix)
+    matrix = sparse.csr_matrix((*entries, starts), shape=(len(starts) - 1, len(gaussians)))
+    return Merged(join_gaussians(found), matrix)
 
 
 def along_curve(points: Array) -> Array:
@@ -198,7 +175,7 @@ def along_curve(points: Array) -> Array:
 def _kept(gaussians: Gaussians, rows: Array) -> _Part:
     weights = np.zeros((len(rows), GROUP))
     weights[:, 0] = 1
-    return _Part(gaussians.take(rows), np.repeat(rows[:, None], GROUP, 1), weights)
+    return gaussians.take(rows), np.repeat(rows[:, None], GROUP, 1), weights
 
 
 def _area(scales: Array) -> Array:
@@ -227,7 +204,7 @@ def _merge(gaussians: Gaussians, rows: Array) -> Iterator[_Part]:
     log_scales, quats, area = _ellipsoids(covariance[alike])
     opacity = np.clip(1 - np.exp(-depths[alike] / np.maximum(area, _TINY)), 0, _OPAQUE)
     blobs = Gaussians(mean[alike], log_scales, quats, logit(opacity), sh[alike])
-    yield _Part(blobs, rows[alike], weights[alike])
+    yield blobs, rows[alike], weights[alike]
     yield _kept(gaussians, rows[~alike].ravel())
 
 

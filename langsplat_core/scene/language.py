@@ -1,37 +1,31 @@
-"""Phrases as they are written, calibration of an encoder, and the language field of a scene.
+"""The language field of a scene: what every Gaussian means, the tree of things, and calibration.
 
-Quotes and punctuation around words are marks of writing and no part of a phrase: an encoder that met them
-would answer another question, and the demo encoder's tokenizer would end the phrase there.
+First, phrases as they are written. Quotes and punctuation around words are no part of a phrase: an encoder
+that met them would answer another question, and the demo encoder's tokenizer would end the phrase there.
 """
 
 import re
 import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 
 from langsplat_core.arrays import Array, check_array, sigmoid
 from langsplat_core.scene.codec import Codec
-from langsplat_core.scene.tree import Tree
 
 _SEPARATE = re.compile(r"[;\n]|,(?!\s*(?:(?:but|and)\s+)?(?:not|without|except)\b)", re.IGNORECASE)
 _APOSTROPHES = str.maketrans(dict.fromkeys("’‘ʼ′＇´`", "'"))
 
 
 def split_phrases(text: str) -> list[str]:
-    """Return the phrases in a line, tidy, separated by ";" or ","; "mug, not red" is one.
-
-    Empty ones are left out.
-    """
+    """Return the phrases in a line, tidy, separated by ";" or ","; "mug, not red" is one, and "" is none."""
     return [part for part in (tidy(part) for part in _SEPARATE.split(text)) if part]
 
 
 def tidy(text: str) -> str:
-    """Return a phrase as it is shown: words without quotes and punctuation around them, single spaces.
-
-    Commas stay behind their words.
-    """
+    """Return a phrase as it is shown: bare words and single spaces, commas behind their words."""
     return " ".join(tokens(text)).replace(" ,", ",").lstrip(", ")
 
 
@@ -69,6 +63,109 @@ def _bare(word: str) -> str:
         return ""
     owns = word[last : last + 1] == "'" and first == 0 and word[last - 1] == "s"
     return word[first:last] + ("'" if owns else "")
+
+
+# The tree of a scene: wholes with their parts and these with their subparts. Gaussians vary, things do not:
+# an answer of whole nodes has the borders of things and no speckles, and its peak is a mean over a patch.
+
+LEVELS = ("subpart", "part", "whole")  # index 0, 1, 2 wherever a level axis appears
+NO_NODE = -1
+
+
+@dataclass(frozen=True, eq=False)
+class Tree:
+    """K nodes, each a set of Gaussians within its parent's. Children come before their parents."""
+
+    leaves: Array  # (N,) int32 smallest node that each Gaussian is in; NO_NODE for those in none
+    parents: Array  # (K,) int32 node that each is part of, a later one; NO_NODE for what is part of none
+    levels: Array  # (K,) uint8 index into LEVELS of what a node means; never above its parent's
+    # (K, 2) uint16 photographs with a mask of just this node, and those that show it without one
+    votes: Array
+
+    def __post_init__(self) -> None:
+        check_array("leaves", self.leaves, ("N",), dtype=np.int32)
+        dims = check_array("parents", self.parents, ("K",), dtype=np.int32)
+        check_array("levels", self.levels, ("K",), dims, dtype=np.uint8)
+        check_array("votes", self.votes, ("K", 2), dims, dtype=np.uint16)
+        count, numbers = len(self.parents), np.arange(len(self.parents))
+        if ((self.leaves < NO_NODE) | (self.leaves >= count)).any():
+            raise ValueError(f"tree: leaves outside the {count} nodes")
+        parents, child = self.parents, self.parents != NO_NODE
+        if (parents[child] <= numbers[child]).any() or (parents >= count).any() or (parents < NO_NODE).any():
+            raise ValueError("tree: every parent must be a later node")
+        if (self.levels >= len(LEVELS)).any() or (self.levels[child] > self.levels[parents[child]]).any():
+            raise ValueError("tree: levels must be 0, 1 or 2 and not above the parent's")
+
+    @property
+    def complete(self) -> bool:
+        """False for a tree of wholes without parts."""
+        return bool((self.levels < len(LEVELS) - 1).any()) or self.count == 0
+
+    @property
+    def count(self) -> int:
+        """Number K of nodes."""
+        return len(self.parents)
+
+    def at(self, level: int) -> Array:
+        """(N,) int32 largest node of at most `level` of each Gaussian, else its smallest; or NO_NODE."""
+        owners = np.arange(self.count + 1, dtype=np.int32)
+        owners[-1] = NO_NODE
+        for node in range(self.count - 1, -1, -1):
+            parent = self.parents[node]
+            if parent != NO_NODE and self.levels[parent] <= level:
+                owners[node] = owners[parent]
+        return owners[self.leaves]
+
+    def voted(self, level: int) -> Array:
+        """`at` a level, NO_NODE where no mask voted for that node."""
+        at = self.at(level)
+        votes = np.append(self.votes[:, 0] > 0, False)
+        return np.where(votes[at], at, np.int32(NO_NODE))
+
+    def members(self, node: int) -> Array:
+        """(N,) bool: the Gaussians of a node, those of its descendants included."""
+        inside = np.zeros(self.count + 1, bool)  # the last: in no node
+        inside[node] = True
+        for other in range(node - 1, -1, -1):
+            inside[other] = self.parents[other] != NO_NODE and inside[self.parents[other]]
+        return np.asarray(inside[self.leaves])
+
+    def gaussians(self) -> list[Array]:
+        """Return the Gaussians of each node, ascending."""
+        order = np.argsort(self.leaves, kind="stable")
+        firsts = np.searchsorted(self.leaves[order], np.arange(self.count + 1))
+        found = [order[a:b] for a, b in pairwise(firsts)]
+        for node, parent in enumerate(self.parents):
+            if parent != NO_NODE:
+                found[parent] = np.union1d(found[parent], found[node])
+        return found
+
+    def things(self) -> Array:
+        """(3, N) int32 nodes of each level that masks voted for, see `build_tree`."""
+        levels = np.append(self.levels, len(LEVELS))
+        voted = [self.voted(level) for level in range(len(LEVELS))]
+        return np.stack([np.where(levels[row] == level, row, NO_NODE) for level, row in enumerate(voted)])
+
+    def voted_by(self, things: Array) -> "Tree":
+        """Return the tree with a vote for each node that is mostly of `things`, see `build_tree`.
+
+        For scenes that do not know how many photographs said so.
+        """
+        votes = np.zeros((self.count, 2), np.uint16)
+        for level, row in enumerate(things):
+            at = self.at(level)
+            inside = at != NO_NODE
+            shares = np.bincount(at[inside], row[inside] != NO_NODE, self.count)
+            votes[2 * shares > np.bincount(at[inside], minlength=self.count), 0] = 1
+        return replace(self, votes=votes)
+
+
+def tree_of_wholes(things: Array) -> Tree:
+    """Return the tree of things alone: (N,) number, from 0, of each Gaussian's thing, NO_NODE for none."""
+    count = int(things.max(initial=NO_NODE)) + 1
+    votes = np.tile(np.array([1, 0], np.uint16), (count, 1))
+    parents, levels = np.full(count, NO_NODE, np.int32), np.full(count, 2, np.uint8)
+    return Tree(things.astype(np.int32), parents, levels, votes)
 
 
 # Calibration of one text encoder's cosines: how probable it is that what is asked for is there at all.
@@ -116,7 +213,6 @@ class Calibration:
 
 # The language field: what every Gaussian means, at three levels.
 
-LEVELS = ("subpart", "part", "whole")  # index 0, 1, 2 wherever a level axis appears
 CANONICAL_PHRASES = ("object", "things", "stuff", "texture")  # LERF's negatives, used by LangSplat
 MOST_SHOWN = 8  # examples of a taught word; the more there are, the more is like one of them by chance
 LONGEST_NAME = 80  # characters
@@ -209,5 +305,5 @@ class LanguageField:
             self,
             latents=self.latents[:, rows],
             confidence=self.confidence[:, rows],
-            tree=None if self.tree is None else self.tree.take(rows),
+            tree=None if self.tree is None else replace(self.tree, leaves=self.tree.leaves[rows]),
         )

@@ -1,8 +1,7 @@
-"""The surface that Gaussians lie on, as the nearest neighbours of each.
+"""The surface that Gaussians lie on, as the nearest neighbours of each, and its patches: the scene's tree.
 
-Values are smoothed over it, what is connected is found along it, and it is divided into patches, the nodes of
-the scene's tree. Connected parts are found by an own breadth-first search: those of an answer are a few of
-all Gaussians, and cutting their graph out for `scipy.sparse.csgraph` takes ten times as long.
+Connected parts are found by an own breadth-first search: those of an answer are a few of all Gaussians, and
+cutting their graph out for `scipy.sparse.csgraph` takes ten times as long.
 """
 
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.compiled import kernel, plain, shared_workers
 from langsplat_core.scene.codec import Codec
 from langsplat_core.scene.gaussians import Gaussians
-from langsplat_core.scene.tree import LEVEL_COUNT, NO_NODE, Tree
+from langsplat_core.scene.language import LEVELS, NO_NODE, Tree
 
 NEIGHBOURS = 16
 FAINTEST = 1e-3  # weight of a Gaussian whose opacity is less, so that no mean divides by nothing
@@ -45,9 +44,8 @@ class Surface:
     def smooth(self, values: Array, numbers: Array | None = None) -> Array:
         """(N,) float32 values of all Gaussians -> (K,) float32 opacity-weighted means over neighbourhoods.
 
-        numbers: (K,) whose neighbourhoods, by default those of all M.
-        The 3D counterpart of the mean filter that the paper applies to a relevancy map before it takes the
-        peak (section 4.1, "implementation details"): one stray Gaussian decides nothing.
+        numbers: (K,) whose neighbourhoods, by default those of all M. In 3D what the paper's mean filter is
+        in an image (section 4.1, "implementation details"): one stray Gaussian decides nothing.
         """
         chosen = np.arange(len(self.rows)) if numbers is None else numbers
         smoothed = np.empty(len(chosen), np.float32)
@@ -69,10 +67,7 @@ class Surface:
 
 
 def surface_weights(gaussians: Gaussians, min_opacity: float = 0.1) -> Array:
-    """(N,) float32 opacity of what the surface consists of, 0 for all others.
-
-    These are the valid Gaussians with at least `min_opacity`, or all valid ones if none has.
-    """
+    """(N,) float32 opacity of valid Gaussians with `min_opacity`, of all if none has it; else 0."""
     valid = gaussians.valid()
     opacity = np.where(valid, sigmoid(gaussians.opacity_logits.astype(np.float64)), 0)
     counts = opacity >= min_opacity
@@ -81,13 +76,13 @@ def surface_weights(gaussians: Gaussians, min_opacity: float = 0.1) -> Array:
 
 
 def build_surface(gaussians: Gaussians, min_opacity: float = 0.1) -> Surface:
-    """Surface of all valid Gaussians with at least `min_opacity` (of all valid ones if none has)."""
+    """Return the surface of what `surface_weights` counts."""
     valid, every = gaussians.valid(), surface_weights(gaussians, min_opacity)
     rows = np.flatnonzero(every)
     k = min(NEIGHBOURS, len(rows))
     if k == 0:
         nothing = np.zeros((0, 1), np.int32), np.zeros(0, np.float32), csr_matrix((0, 0), dtype=bool)
-        return Surface(rows, np.zeros((0, 3)), *nothing, np.full(len(gaussians), -1, np.int32))
+        return Surface(rows, np.zeros((0, 3)), *nothing, np.full(len(valid), -1, np.int32))
     rows = rows[cKDTree(gaussians.means[rows].astype(np.float64)).indices]  # leaf by leaf: near ones meet
     positions = gaussians.means[rows].astype(np.float64)
     tree = cKDTree(positions)
@@ -109,10 +104,9 @@ def build_surface(gaussians: Gaussians, min_opacity: float = 0.1) -> Surface:
 
 
 def surface_areas(gaussians: Gaussians) -> Array:
-    """(N,) float64 area that each Gaussian covers, world units squared, 0 for invalid rows.
+    """(N,) float64 opacity times the two longest axes of each Gaussian, world units^2, 0 for invalid rows.
 
-    Opacity times its two longest axes (one standard deviation each). What is larger than 99 % of them counts
-    as that: a veil of a few huge Gaussians is no surface.
+    Cut at the 99 % quantile: a veil of a few huge Gaussians is no surface.
     """
     valid = gaussians.valid()
     scales = np.sort(np.where(valid[:, None], gaussians.log_scales, -np.inf).astype(np.float64), axis=1)
@@ -179,6 +173,17 @@ def _search(indptr: Array, indices: Array, seeds: Array, waiting: Array) -> tupl
     return order[:found], starts[1:parts]
 
 
+# The tree of a scene: patches that mean the same at a level. Wholes are found first, parts within each, then
+# subparts within these. What masks of many photographs say is one thing stays one whole, since the encoder
+# may see its front and its back differently; their borders count at all levels.
+
+SCALE = 6.8  # of the criterion, in typical steps times Gaussians: larger prefers larger patches
+SMALLEST = 10  # Gaussians; smaller patches join the neighbour that means the most similar
+BORDER = 0.6  # added to the step between two things, in typical steps
+UNKNOWN = 2.0  # step between a Gaussian with a meaning and one without: as much as between opposites
+STEPS = 65_535 / (UNKNOWN + 2 * BORDER)  # of 1 - cosine that are told apart: 16 bits sort in linear time
+
+
 def divide(surface: Surface, steps: Array, order: Array, scale: float, smallest: int) -> Array:
     """Return the (M,) int32 number, from 0, of the patch of each Gaussian of a surface.
 
@@ -225,28 +230,16 @@ def merge_patches(
     return parent
 
 
-# The tree of a scene: patches that mean the same at a level, by the criterion of `divide`. Wholes are found
-# first, parts within each, then subparts within these. What masks of many photographs say is one thing stays
-# one whole, since the encoder may see its front and its back differently; their borders count at all levels.
-
-SCALE = 6.8  # of the criterion, in typical steps times Gaussians: larger prefers larger patches
-SMALLEST = 10  # Gaussians; smaller patches join the neighbour that means the most similar
-BORDER = 0.6  # added to the step between two things, in typical steps
-UNKNOWN = 2.0  # step between a Gaussian with a meaning and one without: as much as between opposites
-STEPS = 65_535 / (UNKNOWN + 2 * BORDER)  # of 1 - cosine that are told apart: 16 bits sort in linear time
-
-
 def build_tree(
     surface: Surface, codec: Codec, latents: Array, known: Array, things: Array | None = None
 ) -> Tree:
-    """Return the tree of a scene, without votes.
+    """Return the tree of (3, N, d) latents, `known` (3, N) bool, without votes.
 
-    latents: (3, N, d); known: (3, N) bool; things: (3, N) int32 number, from 0, of what masks of many
-    photographs say is one, at each level, NO_NODE for none.
+    things: (3, N) int32 number, from 0, of what masks say is one at each level, NO_NODE for none.
     """
     above: Array | None = None  # (M,) node of the level above
     of: list[Array] = []
-    for level in range(LEVEL_COUNT - 1, -1, -1):
+    for level in range(len(LEVELS) - 1, -1, -1):
         own = latents[level, surface.rows], known[level, surface.rows]
         told = np.full(len(surface.rows), NO_NODE) if things is None else things[level, surface.rows]
         above = _divided(surface, codec, *own, above, told)
@@ -254,39 +247,28 @@ def build_tree(
     counts = [int(row.max(initial=-1)) + 1 for row in of]
     firsts = np.cumsum([0, *counts])
     parents = np.full(firsts[-1], NO_NODE, np.int32)
-    for level in range(LEVEL_COUNT - 1):
+    for level in range(len(LEVELS) - 1):
         parents[firsts[level] + of[level]] = firsts[level + 1] + of[level + 1]
-    leaves = np.full(len(surface.anchors), NO_NODE, np.int32)
-    near = surface.anchors >= 0
-    leaves[near] = of[0][surface.anchors[near]]
-    levels = np.repeat(np.arange(LEVEL_COUNT, dtype=np.uint8), counts)
+    leaves = np.append(of[0], np.int32(NO_NODE))[surface.anchors]  # an anchor of -1 is none
+    levels = np.repeat(np.arange(len(LEVELS), dtype=np.uint8), counts)
     return Tree(leaves, parents, levels, np.zeros((len(levels), 2), np.uint16))
 
 
 def _divided(
     surface: Surface, codec: Codec, latents: Array, known: Array, above: Array | None, things: Array
 ) -> Array:
-    """(M,) int32 number, from 0, of the patch of each Gaussian at one level.
-
-    There are borders between `things` (M,). Without a level `above` (M,) what is of one thing is one, else
-    patches are within those above.
-    """
+    """(M,) int32 number, from 0, of the patch of each Gaussian at one level, within those `above` (M,)."""
     a, b = surface.ends
-    steps = _steps(codec, latents, known, a, b)
+    # 1 - cosine between what the two ends of each link mean.
+    both, neither = known[a] & known[b], ~known[a] & ~known[b]
+    steps = np.where(both, codec.distances(latents, a, b), np.where(neither, 0.0, UNKNOWN)).clip(0, UNKNOWN)
     # Between two Gaussians drawn by chance, on average: what is far in this encoder's space.
     typical = codec.spread(latents[known]) if known.any() else 1.0
     told = (things[a] != NO_NODE) & (things[b] != NO_NODE)
-    within = 0 if above is None else steps
+    within = 0 if above is None else steps  # a thing is one whole
     steps = np.where(told, np.where(things[a] == things[b], within, steps + BORDER * typical), steps)
     ranks = np.round(steps * STEPS).astype(np.uint16)
     order = np.argsort(ranks, kind="stable").astype(np.int32)
     if above is not None:
         order = order[above[a[order]] == above[b[order]]]
     return divide(surface, steps, order, SCALE * typical, SMALLEST)
-
-
-def _steps(codec: Codec, latents: Array, known: Array, a: Array, b: Array) -> Array:
-    """(E,) 1 - cosine between what the two ends of each link mean, in [0, 2]."""
-    steps = codec.distances(latents, a, b)
-    both, neither = known[a] & known[b], ~known[a] & ~known[b]
-    return np.asarray(np.where(both, steps, np.where(neither, 0.0, UNKNOWN)).clip(0, UNKNOWN))

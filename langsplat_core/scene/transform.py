@@ -2,15 +2,13 @@
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
 from langsplat_core.arrays import Array, across, unit
 from langsplat_core.errors import InputError
-from langsplat_core.scene.camera import FARTHEST, Camera
 from langsplat_core.scene.gaussians import SH_COUNTS, Gaussians
-from langsplat_core.scene.scene import Scene
+from langsplat_core.scene.scene import FARTHEST, Camera, Scene
 
 SHEAR = 1e-4  # of a matrix over its scale, against a rotation: more is another shape, not another place
 AXES = {name: np.eye(3)[place] for place, name in enumerate("xyz")}
@@ -38,22 +36,21 @@ class Similarity:
         matrix[:3, :3], matrix[:3, 3] = self.scale * self.rotation, self.translation
         return matrix
 
-    @cached_property
+    @property
     def is_identity(self) -> bool:
         """True where the map leaves every point where it is."""
         return bool((self.matrix == np.eye(4)).all())
 
     def points(self, points: Array) -> Array:
-        """(N, 3) points -> (N, 3) float64 images of them."""
+        """(..., 3) points -> (..., 3) float64 images of them."""
         with np.errstate(invalid="ignore", over="ignore"):
             moved: Array = np.asarray(points, np.float64) @ (self.scale * self.rotation.T) + self.translation
         return moved
 
     def then(self, other: "Similarity") -> "Similarity":
         """Return this map followed by `other`."""
-        return Similarity(
-            other.rotation @ self.rotation, other.points(self.translation[None])[0], self.scale * other.scale
-        )
+        shift = other.points(self.translation)
+        return Similarity(other.rotation @ self.rotation, shift, self.scale * other.scale)
 
     def inverse(self) -> "Similarity":
         """Return the inverse map."""
@@ -72,11 +69,11 @@ class Similarity:
         return turned
 
     def camera(self, camera: Camera) -> Camera:
-        """Return `camera` moved along: it sees the transformed world as it saw the world.
+        """Return `camera` moved along, which sees the transformed world as it saw the world.
 
-        Depths are times the scale. InputError where it would lie farther out than a camera file may say.
+        InputError where it would lie farther out than a camera file may say.
         """
-        position = self.points(camera.position[None])[0]
+        position = self.points(camera.position)
         if np.abs(position).max() > FARTHEST:
             raise InputError(f"a camera would lie more than {FARTHEST:g} units from the origin; move by less")
         pose = np.eye(4)
@@ -100,18 +97,13 @@ def scaling(factor: float) -> Similarity:
 
 
 def rotating(axis: Array, degrees: float) -> Similarity:
-    """Return the right-handed rotation about `axis` (3,) through the origin.
-
-    Of quarter turns about an axis of the world, exactly.
-    """
+    """Return the right-handed rotation about `axis` (3,) through the origin, exact for quarter turns."""
     if not (np.isfinite(axis).all() and np.linalg.norm(axis) > 1e-12 and math.isfinite(degrees)):
         raise InputError("a rotation about no direction; give an axis that is not zero and finite degrees")
     x, y, z = unit(np.asarray(axis, np.float64), 1e-300)
-    quarter = degrees % 360 / 90
-    if quarter == int(quarter):
-        cosine, sine = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(quarter) % 4]
-    else:
-        cosine, sine = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    cosine, sine = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    if degrees % 90 == 0:
+        cosine, sine = round(cosine), round(sine)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     rotation = np.eye(3) + sine * cross + (1 - cosine) * cross @ cross  # Rodrigues
     return Similarity(rotation, np.zeros(3))
@@ -142,8 +134,7 @@ def similarity(matrix: Array) -> Similarity:
     determinant = float(np.linalg.det(linear))
     if determinant < 0:
         raise InputError("the matrix mirrors the scene, which Gaussians cannot follow; negate one axis of it")
-    scale = determinant ** (1 / 3)
-    if not scale > 1e-12:
+    if (scale := determinant ** (1 / 3)) <= 1e-12:
         raise InputError("the matrix makes the scene flat; its scale must be above 0")
     left, _, right = np.linalg.svd(linear / scale)
     rotation = left @ right
@@ -170,8 +161,7 @@ def transform_gaussians(gaussians: Gaussians, to: Similarity) -> Gaussians:
             gaussians.opacity_logits,
             rotated_harmonics(gaussians.sh, to.rotation),
         )
-    lost = int((gaussians.valid() & ~moved.valid()).sum())
-    if lost:
+    if lost := int((gaussians.valid() & ~moved.valid()).sum()):
         raise InputError(f"{lost} Gaussians would lie or reach beyond what float32 holds; move by less")
     return moved
 
@@ -186,10 +176,7 @@ def transform_rows(gaussians: Gaussians, selected: Array, to: Similarity) -> Gau
 
 
 def transform_scene(scene: Scene, to: Similarity, selected: Array | None = None) -> Scene:
-    """Return the whole scene transformed with its cameras and its metres per unit.
-
-    Or the `selected` (N,) bool of its Gaussians alone, where the rest and the cameras stay.
-    """
+    """Return the scene with its cameras and metres per unit transformed, or `selected` (N,) bool alone."""
     if to.is_identity:
         return scene
     if selected is not None:
@@ -240,9 +227,8 @@ def sh_basis(directions: Array, count: int) -> Array:
 
 
 def sh_rotations(rotation: Array, degree: int) -> list[Array]:
-    """Return the (2l + 1, 2l + 1) float64 orthogonal matrix of each degree l = 0 to `degree`.
+    """Return the (2l + 1, 2l + 1) float64 matrix that rotates the coefficients of each degree l <= `degree`.
 
-    It turns the coefficients of a function into those of the function rotated along.
     The rotated function is f'(d) = f(R^T d), and each degree is closed under rotations, so that its matrix
     solves B(d) M = B(R^T d) for directions d that determine it (Wigner's matrices of the real basis).
     """
@@ -257,7 +243,7 @@ def sh_rotations(rotation: Array, degree: int) -> list[Array]:
 
 def rotated_harmonics(sh: Array, rotation: Array) -> Array:
     """(N, K, 3) coefficients -> float32 coefficients of the same colours seen from rotated directions."""
-    degree = {count: degree for degree, count in SH_COUNTS.items()}[sh.shape[1]]
+    degree = math.isqrt(sh.shape[1]) - 1
     if degree == 0 or (rotation == np.eye(3)).all():
         return sh
     turned = sh.copy()

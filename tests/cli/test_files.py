@@ -16,7 +16,7 @@ from langsplat_core.io.sidecar import SUFFIX as SIDECAR
 from langsplat_core.io.sidecar import write_language
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Gaussians, Scene, TaughtWord
-from langsplat_core.scene.tree import tree_of_wholes
+from langsplat_core.scene.language import tree_of_wholes
 from tests.support.backends import Measure
 from tests.support.commands import refusal, run
 from tests.support.comparing import assert_same_extras

@@ -32,8 +32,8 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera, Gaussians, Scene, look_at
 from langsplat_core.scene.gaussians import join_gaussians
+from langsplat_core.scene.language import tree_of_wholes
 from langsplat_core.scene.transform import moving, scaling, transform_scene
-from langsplat_core.scene.tree import tree_of_wholes
 from tests.support.file_samples import random_field
 from tests.support.hard_cases import balls
 from tests.support.scenes import random_gaussians

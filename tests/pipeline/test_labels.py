@@ -12,7 +12,7 @@ from langsplat_core.pipeline.labels import export_labels
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import NO_NODE, Scene
-from langsplat_core.scene.tree import Tree
+from langsplat_core.scene.language import Tree
 from tests.support.fakes import CENTRES, NAMES, PER_BLOB, WORDS, FakeEncoder, named_scene
 
 LOOSE = 7  # Gaussians of the last blob that are in no node

@@ -13,9 +13,8 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import Atom, Both, Counted, Inside, Relation, Superlative, Union, Without
 from langsplat_core.query.relations import Body, body, most, separate, stands, upright, viewpoint
 from langsplat_core.scene import NO_NODE, look_at
-from langsplat_core.scene.language import split_phrases
+from langsplat_core.scene.language import split_phrases, tree_of_wholes
 from langsplat_core.scene.surface import build_surface
-from langsplat_core.scene.tree import tree_of_wholes
 from tests.support.fakes import UP, PlainEncoder, front_camera, laid_table, meaning
 
 MUG, BOOK, DESK = Atom("mug"), Atom("book"), Atom("table")

@@ -13,8 +13,7 @@ from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import NO_NODE, LanguageField, Scene, TaughtWord, Tree
 from langsplat_core.scene.codec import CodebookCodec
-from langsplat_core.scene.language import LONGEST_NAME, MOST_SHOWN
-from langsplat_core.scene.tree import tree_of_wholes
+from langsplat_core.scene.language import LONGEST_NAME, MOST_SHOWN, tree_of_wholes
 from tests.support.fakes import FakeEncoder
 from tests.support.scenes import unturned_gaussians
 

@@ -12,8 +12,8 @@ from langsplat_core.arrays import Array, logit, rotation_matrices, unit
 from langsplat_core.query.regions import Regions, build_regions
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians, LanguageField, LinearCodec, Scene, look_at
+from langsplat_core.scene.language import Tree
 from langsplat_core.scene.surface import Surface, build_surface, build_tree, surface_weights
-from langsplat_core.scene.tree import Tree
 from langsplat_core.semantics.store import ImageFeatures
 
 

@@ -26,7 +26,7 @@ from langsplat_core.query.engine import QueryEngine, searchable
 from langsplat_core.query.relations import body, gap, separate, upright
 from langsplat_core.raster.render import render
 from langsplat_core.scene import LEVELS, Camera, Scene
-from langsplat_core.scene.camera import look_at
+from langsplat_core.scene.scene import look_at
 from langsplat_core.semantics.encoders import load_text_encoder
 
 if TYPE_CHECKING:

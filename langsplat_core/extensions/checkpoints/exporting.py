@@ -13,7 +13,7 @@ from langsplat_core.extensions.checkpoints.langsplat_files import (
     write_features,
 )
 from langsplat_core.progress import Progress, silent
-from langsplat_core.scene import LEVELS, LanguageField, Scene
+from langsplat_core.scene import LEVELS, AutoencoderCodec, LanguageField, Scene
 from langsplat_core.semantics.store import SUFFIX, FeatureStore, ImageFeatures
 
 LANGSPLAT_LATENT = 3  # numbers per Gaussian that its rasterizer is compiled for
@@ -29,7 +29,7 @@ def export_langsplat(scene: Scene, folder: Path, name: str) -> list[Path]:
     """
     language = _language(scene)
     codec = language.codec
-    if codec.networks is None or codec.latent_dim != LANGSPLAT_LATENT:
+    if not isinstance(codec, AutoencoderCodec) or codec.latent_dim != LANGSPLAT_LATENT:
         raise InputError(
             f"{scene.path}: its codec, {codec.kind} of {codec.size}, is not "
             "LangSplat's autoencoder of 3 numbers; write vectors by --to occam, or train with "
@@ -39,7 +39,7 @@ def export_langsplat(scene: Scene, folder: Path, name: str) -> list[Path]:
     written = [folder / f"{name}_{level + 1}" / "chkpnt30000.pth" for level in range(len(LEVELS))]
     for level, path in enumerate(written):
         write_checkpoint(path, scene.gaussians, latents[level])
-    write_autoencoder(folder / "best_ckpt.pth", *codec.networks)
+    write_autoencoder(folder / "best_ckpt.pth", codec.encoder, codec.decoder)
     return [*written, folder / "best_ckpt.pth"]
 
 

@@ -9,7 +9,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.scene import LanguageField, Scene, Tree
 from langsplat_core.scene.codec import LARGEST, CodebookCodec, Codec, principal_colours
 from langsplat_core.scene.gaussians import join_gaussians
-from langsplat_core.scene.tree import NO_NODE
+from langsplat_core.scene.language import NO_NODE
 
 
 def merge(first: Scene, second: Scene) -> Scene:

@@ -10,6 +10,7 @@ from langsplat_core.extensions.checkpoints.langsplat_files import (
     write_checkpoint,
     write_features,
 )
+from langsplat_core.scene import AutoencoderCodec
 from tests.support.file_samples import random_codec
 from tests.support.scenes import random_gaussians
 from tests.support.writing import Captured, Write, check_full_disk, check_small_disk
@@ -25,9 +26,15 @@ def features(count: int, side: int) -> Write:
     return lambda folder: write_features(folder, "a", vectors, labels)
 
 
+def autoencoder(folder: Path) -> object:
+    codec = random_codec("autoencoder")
+    assert isinstance(codec, AutoencoderCodec)
+    return write_autoencoder(folder / "a.pth", codec.encoder, codec.decoder)
+
+
 WRITERS: dict[str, Write] = {
     "checkpoint": checkpoint(40),
-    "autoencoder": lambda folder: write_autoencoder(folder / "a.pth", *random_codec("autoencoder").networks),  # type: ignore[misc]
+    "autoencoder": autoencoder,
     "features": features(2, 8),
 }
 FILLED: dict[str, Write] = {

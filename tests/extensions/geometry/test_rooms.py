@@ -19,8 +19,8 @@ from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.reference import ReferenceRasterizer, colours
 from langsplat_core.scene import NO_NODE, Scene, TaughtWord
+from langsplat_core.scene.language import tree_of_wholes
 from langsplat_core.scene.transform import IDENTITY, Similarity, moving, transform_scene
-from langsplat_core.scene.tree import tree_of_wholes
 from tests.support.commands import refusal, run
 from tests.support.fakes import FakeEncoder, blob_scene
 from tests.support.file_samples import random_field

@@ -19,8 +19,8 @@ from langsplat_core.scene import (
     codec_from_tensors,
 )
 from langsplat_core.scene.codec import KINDS, CodebookCodec, principal_colours
+from langsplat_core.scene.language import tree_of_wholes
 from langsplat_core.scene.surface import build_surface
-from langsplat_core.scene.tree import tree_of_wholes
 from langsplat_core.semantics.relevancy import Scale
 from langsplat_core.training.language import codec_fit
 from langsplat_core.training.language.codec_fit import codec_report, fit_codebook, fit_codec, rounded
@@ -117,7 +117,7 @@ def test_latents_have_distances_and_colours(codec: Codec) -> None:
 
 
 def test_broken_tensors_are_named() -> None:
-    told = {"linear": "basis", "autoencoder": "encoder", "codebook": "colours and vectors"}
+    told = {"linear": "basis", "autoencoder": "encoder", "codebook": "vectors"}
     for kind, missing in (*told.items(), ("vq", "unknown codec kind")):
         with pytest.raises(ValueError, match=missing):
             codec_from_tensors(kind, {})
