@@ -30,7 +30,7 @@ from langsplat_viewer.actions import (
     viewpoint,
 )
 from langsplat_viewer.options import scene_path, services
-from langsplat_viewer.rendering.renderer import GlRenderer
+from langsplat_viewer.rendering.renderer import renderer_for
 from langsplat_viewer.state import TrainingForm
 from langsplat_viewer.window import Window, WindowRequest
 
@@ -197,12 +197,6 @@ def _film(ctx: Any, window: Window) -> None:
     viewpoint.scrub(viewer, 2.5)
 
 
-def _timed(ctx: Any, window: Window) -> None:
-    viewer = window.viewer
-    settings.open_panel(viewer, "Timing")
-    ctx.yield_(30)
-
-
 def _trained(ctx: Any, window: Window) -> None:
     """Return a room of a dozen photographs, in the midst of its training."""
     viewer, folder = window.viewer, Path(tempfile.mkdtemp())
@@ -243,7 +237,6 @@ WINDOWS: dict[str, tuple[tuple[str, ...], Act]] = {
     "overlays.jpg": (("teddy bear",), _overlays),
     "orthographic.jpg": (("teddy bear",), _orthographic),
     "film.jpg": (("teddy bear",), _film),
-    "timing.jpg": (("teddy bear",), _timed),
     "training.jpg": (("teddy bear",), _trained),
 }
 
@@ -257,7 +250,7 @@ def window_picture(path: Path, queries: tuple[str, ...], act: Act) -> None:
         size=(1280, 800),
         camera=CAMERA,
     )
-    window = Window(request, services(""), GlRenderer)
+    window = Window(request, services(""), renderer_for)
     window.idles = False
     whole = path.with_suffix(".whole.png")
 

@@ -10,33 +10,27 @@ Needs a GL context but no window. It is in one of three phases:
 """
 
 import time
-from collections.abc import Callable, Mapping
-from contextlib import nullcontext, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Generic, Literal, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 import moderngl
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import BackendError
-from langsplat_core.progress import Progress, watched
+from langsplat_core.progress import Progress
 from langsplat_core.scene.gaussians import Merged, merged
 from langsplat_viewer.actions import editing, selecting, viewpoint
-from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.commands import with_key
 from langsplat_viewer.jobs import Worker
-from langsplat_viewer.rendering.renderer import GlRenderer, Layers
+from langsplat_viewer.rendering.renderer import Layers, Renderer
 from langsplat_viewer.rendering.request import UNCLIPPED, RenderRequest, why_nothing, why_undrawable
 from langsplat_viewer.state import FrameStats, ViewerState
 
 REST_SECONDS = 0.07  # without a move, after which the camera rests
 MOVING_BUDGET = 25.0  # milliseconds of an image: with the panels, some thirty a second
 KEPT_SIZES = 3  # of images: the full one and two coarse ones
-NOTHING_LEFT = "all of the scene is hidden or deleted"
-NOTHING_BETWEEN = "nothing of the scene in this picture lies between the cuts: move them in the panel Camera"
-
-Phase = Literal["moving", "settling", "still"]
-Key = tuple[int, int, int]  # which pane, width, height
 
 
 @dataclass(frozen=True)
@@ -48,15 +42,9 @@ class Detail:
 
 
 FULL = Detail()
-
-
-@dataclass(frozen=True)
-class Timed:
-    """Layers that another thread rasterized, and the time of that."""
-
-    layers: Layers
-    milliseconds: float
-    laps: Mapping[str, float]  # see `langsplat_core.progress`
+PLAIN = (FULL, Detail(0.5), Detail(0.25))
+# Merged at half the resolution is nearer to the full image than all of it at a quarter, and cheaper.
+WITH_MERGED = (FULL, Detail(0.5), Detail(0.5, merged=True), Detail(0.25, merged=True))
 
 
 class Canvas:
@@ -65,24 +53,22 @@ class Canvas:
     def __init__(
         self,
         ctx: moderngl.Context,
-        renderer: GlRenderer,
+        renderer: Renderer[Any],
         clock: Callable[[], float] = time.perf_counter,
         budget: float = MOVING_BUDGET,
     ) -> None:
         """`clock`, in seconds, times the images; `budget`: milliseconds that one may take while it moves."""
         self._ctx, self._renderer, self._clock = ctx, renderer, clock
-        self._merges = renderer.backend == "cpu"  # a graphics device draws large scenes as they are
+        self.backend = renderer.backend
         self._merger: Latest[Merged] = Latest()
-        self._background: Latest[Timed] = Latest()
+        self._background: Latest[tuple[Layers[Any], float]] = Latest()  # and the milliseconds it took
         self._resolution = AdaptiveResolution(budget)
-        self._targets: dict[Key, moderngl.Framebuffer] = {}  # the latest used last
-        self.phase: Phase = "still"
-        self._view: OrbitCamera | None = None
-        self._moving: object = None  # what a gizmo does
-        self._moved = -1e9  # when the view last changed, seconds
+        self._kept: dict[tuple[int, int, int], moderngl.Texture] = {}  # by pane, width, height
+        self.phase: Literal["moving", "settling", "still"] = "still"
+        self._pose: tuple[object, object] = (None, None)  # the view, and what a gizmo does
+        self._moved = -1e9  # when that last changed, seconds
         self._wanted: tuple[RenderRequest, Detail] | None = None  # what was drawn last, if only in vain
         self._drawn: RenderRequest | None = None  # the same at its level of detail
-        self._timed = False  # the steps of drawing are measured
         self._unsure = False  # whether the image shows anything is not known yet
         # One for each pane; RGBA8, first row at the bottom, as GL has it.
         self.textures: tuple[moderngl.Texture, ...] = ()
@@ -97,13 +83,12 @@ class Canvas:
             self._background.drop()
             self.phase = "still"
             return False
-        if state.view is not self._view or state.moving is not self._moving:
-            self._moved = now if self._view is not None else self._moved
-            self._view, self._moving = state.view, state.moving
+        pose, before = (state.view, state.moving), self._pose
+        if pose[0] is not before[0] or pose[1] is not before[1]:
+            self._pose, self._moved = pose, now if before[0] is not None else self._moved
         moving = now - self._moved < REST_SECONDS
         request = state.request().without_line()
         self._resolution.expect(len(state.scene.gaussians))
-        self._begin_timing(state, moving)
         if moving:
             self._background.drop()
             self._follow(state, request)
@@ -113,7 +98,9 @@ class Canvas:
         self.phase = "moving" if moving else "still" if is_full else "settling"
         if self.phase == "still":
             self._background.drop()
-            self._explain_nothing(state)
+            if self._unsure and self._drawn is not None:  # asked once: it reads the image back
+                self._unsure = False
+                state.nothing = _why_nothing(self._drawn) if self._renderer.shows_nothing() else ""
         return self.phase != "still"
 
     def _follow(self, state: ViewerState, request: RenderRequest) -> None:
@@ -123,7 +110,9 @@ class Canvas:
                 self._draw(state, request)
         elif self._changes(request):
             fewer = self._merged(request)
-            self._draw(state, request, self._resolution.finest(fewer is not None), fewer)
+            self._draw(
+                state, request, self._resolution.finest(PLAIN if fewer is None else WITH_MERGED), fewer
+            )
 
     def _settle(self, state: ViewerState, request: RenderRequest) -> None:
         """Draw the full image of a camera that rests.
@@ -137,7 +126,7 @@ class Canvas:
             self._draw(state, request)
             return
         key, work = ahead
-        self._background.want(key, lambda report: _timed(work, report, self._clock))
+        self._background.want(key, lambda report: self._timed(work, report))
         try:
             made = self._background.made(key)
         except BackendError:
@@ -146,11 +135,18 @@ class Canvas:
             raise
         if made is not None:
             self._background.drop()
-            self._draw(state, request, made=made)
+            self._renderer.take(made[0])
+            self._draw(state, request, earlier=made[1])
         elif state.preferences.coarse_while_moving and self._changes(request):
-            fewer, detail = self._merged(request), self._resolution.stand_in()
-            if fewer is not None and detail is not None:
+            fewer = self._merged(request)
+            detail = self._resolution.finest(WITH_MERGED[2:])
+            if fewer is not None and self._resolution.is_quick(detail):
                 self._draw(state, request, detail, fewer)
+
+    def _timed(self, work: Callable[[Progress], Layers[Any]], report: Progress) -> tuple[Layers[Any], float]:
+        began = self._clock()
+        layers = work(report)
+        return layers, 1e3 * (self._clock() - began)
 
     def _changes(self, request: RenderRequest) -> bool:
         """Return whether the image on screen is of another request, at any level of detail."""
@@ -167,72 +163,42 @@ class Canvas:
         request: RenderRequest,
         detail: Detail = FULL,
         fewer: Merged | None = None,
-        made: Timed | None = None,
+        earlier: float = 0.0,
     ) -> None:
-        """Draw an image and show it; `made`: its layers, where another thread has rasterized them."""
+        """Draw an image and show it; `earlier`: milliseconds that its layers took on another thread."""
         drawn = request.reduced(detail.scale, fewer if detail.merged else None)
         before = self._drawn
         if before is not None and before.scene.source is not request.scene.source:
             self._merger.drop()  # of another scene
         self._wanted, self._drawn = (request, detail), drawn  # also where it fails: it is not tried again
         camera = drawn.camera
-        targets = self._framebuffers(camera.width, camera.height, len(drawn.panes))
+        textures = self._targets(camera.width, camera.height, len(drawn.panes))
         began = self._clock()
-        with watched() if state.timing.wanted else nullcontext(dict[str, float]()) as laps:
-            if made is not None:
-                self._renderer.take(made.layers)
-            self._renderer.draw(drawn, targets)
+        self._renderer.draw(drawn, textures)
         self._ctx.finish()
-        milliseconds = 1e3 * (self._clock() - began)
-        if made is not None:
-            milliseconds, laps = milliseconds + made.milliseconds, {**made.laps, **laps}
-        if state.timing.wanted and detail == FULL:
-            for name, taken in (*laps.items(), ("picture", milliseconds)):
-                state.timing.add(name, taken)
+        milliseconds = 1e3 * (self._clock() - began) + earlier
         if before is None or drawn.projection != before.projection:
             self._resolution.drew(detail, milliseconds)
-        if self._merges and self._resolution.is_slow:
+        if self.backend == "cpu" and self._resolution.is_slow:  # a device draws them as they are
             gaussians = request.gaussians
             self._merger.want(gaussians, lambda report: merged(gaussians, report))
-        self.textures = tuple(_texture_of(target) for target in targets)
+        self.textures = textures
         state.stats = FrameStats(milliseconds, camera.width, camera.height, detail.scale, detail.merged)
         state.nothing, self._unsure = "", True
 
-    def _framebuffers(self, width: int, height: int, panes: int) -> list[moderngl.Framebuffer]:
+    def _targets(self, width: int, height: int, panes: int) -> tuple[moderngl.Texture, ...]:
         """Return one for each pane; those of the last few sizes are kept: moving alternates between two."""
-        for key in [(place, width, height) for place in range(panes)]:
-            target = self._targets.pop(key, None)
-            while target is None and len(self._targets) >= KEPT_SIZES * panes:
-                _release(self._targets.pop(next(iter(self._targets))))
-            if target is None:
+        found = {(pane, width, height): self._kept.pop((pane, width, height), None) for pane in range(panes)}
+        while len(self._kept) > (KEPT_SIZES - 1) * panes:
+            self._kept.pop(next(iter(self._kept))).release()
+        for key, texture in found.items():
+            if texture is None:
                 texture = self._ctx.texture((width, height), 4)
                 texture.repeat_x = texture.repeat_y = False
-                target = self._ctx.framebuffer([texture])
-            self._targets[key] = target
-        return list(self._targets.values())[-panes:]
-
-    def _begin_timing(self, state: ViewerState, moving: bool) -> None:
-        """At the first frame whose steps are measured, forget what would take no time: once it rests."""
-        if moving and state.timing.wanted:
-            return
-        if state.timing.wanted and not self._timed:
-            self._wanted = None
-            self._renderer.forget()
-        self._timed = state.timing.wanted
-
-    def _explain_nothing(self, state: ViewerState) -> None:
-        """Say why an image shows nothing; asked once, at rest, since it reads the image back."""
-        if self._unsure and self._drawn is not None:
-            self._unsure = False
-            if self._renderer.shows_nothing():
-                state.nothing = _why_nothing(self._drawn)
+            self._kept[key] = texture
+        return tuple(self._kept[key] for key in found)
 
     # What others see of it.
-
-    @property
-    def backend(self) -> str:
-        """Name of the rasterizer."""
-        return self._renderer.backend
 
     def point_at(self, u: float, v: float) -> Array | None:
         """Return the (3,) world point of the surface at a place in the image, fractions from the top left."""
@@ -244,11 +210,11 @@ class Canvas:
         return None if depth is None else camera.unproject(pixel, depth)
 
     def depths(self) -> Array | None:
-        """Return the (H, W) camera z of the surface all over the image, see `Surface.depths`."""
+        """Return the (H, W) camera z of the surface all over the image, see `ShownImage.depths`."""
         return None if self._drawn is None else self._renderer.depth_map(self._drawn)
 
     def capture(self, request: RenderRequest) -> Array:
-        """Return the image of a request, see `Surface.capture`."""
+        """Return the image of a request, see `ShownImage.capture`."""
         return self._renderer.read(request)
 
     @property
@@ -272,57 +238,30 @@ class Canvas:
 
     def release(self) -> None:
         """Give device memory back; the canvas cannot be used afterwards."""
-        for target in self._targets.values():
-            _release(target)
+        for texture in self._kept.values():
+            texture.release()
         self._renderer.release()
-
-
-def _texture_of(target: moderngl.Framebuffer) -> moderngl.Texture:
-    (texture,) = target.color_attachments
-    assert isinstance(texture, moderngl.Texture)
-    return texture
-
-
-def _release(target: moderngl.Framebuffer) -> None:
-    texture = _texture_of(target)
-    target.release()
-    texture.release()
-
-
-def _timed(work: Callable[[Progress], Layers], report: Progress, clock: Callable[[], float]) -> Timed:
-    began = clock()
-    with watched() as laps:
-        layers = work(report)
-    return Timed(layers, 1e3 * (clock() - began), laps)
 
 
 def _why_nothing(request: RenderRequest) -> str:
     gaussians = request.scene.scene.gaussians
     if len(request.scene.source.gaussians) and not len(gaussians):
         shown = with_key("show what is hidden", selecting.show_hidden)
-        return f"{NOTHING_LEFT}: {shown}, or {with_key('undo', editing.undo)}"
+        return f"all of the scene is hidden or deleted: {shown}, or {with_key('undo', editing.undo)}"
     if request.clip != UNCLIPPED and gaussians.valid().any():
-        return NOTHING_BETWEEN
-    reason = why_nothing(gaussians, request.camera)
-    elsewhere = not why_undrawable(gaussians)  # another view would show something
+        return "nothing of the scene in this picture lies between the cuts: move them in the panel Camera"
     back = with_key("return to the opening view", viewpoint.reset_view)
-    return f"{reason}: {back}" if elsewhere else reason
-
-
-# Adaptive resolution: the level of detail while the camera moves, learned from the times of earlier images.
-
-PLAIN = (FULL, Detail(0.5), Detail(0.25))
-# Merged at half the resolution is nearer to the full image than all of it at a quarter, and cheaper.
-WITH_MERGED = (FULL, Detail(0.5), Detail(0.5, merged=True), Detail(0.25, merged=True))
+    reason = why_nothing(gaussians, request.camera)
+    return reason if why_undrawable(gaussians) else f"{reason}: {back}"
 
 
 class AdaptiveResolution:
-    """Chooses the level of detail whose image is expected within a budget of time."""
+    """Chooses the level of detail while the camera moves, learned from the times of earlier images."""
 
     def __init__(self, budget: float = MOVING_BUDGET) -> None:
-        """`budget` in milliseconds."""
+        """`budget` in milliseconds of an image."""
         self._budget = budget
-        self._count = 1
+        self._count = 1  # Gaussians
         self._each = 4e-4  # milliseconds of a full image for each Gaussian; a guess before one was drawn
         self._shares: dict[Detail, float] = {}  # of the full image's time, measured
 
@@ -333,7 +272,15 @@ class AdaptiveResolution:
     @property
     def is_slow(self) -> bool:
         """True where full images are too slow to follow a movement."""
-        return not self._is_within_budget(FULL)
+        return not self.is_quick(FULL)
+
+    def is_quick(self, detail: Detail) -> bool:
+        """Return whether an image is expected within the budget."""
+        return self._each * self._count * self._share(detail) <= self._budget
+
+    def finest(self, levels: tuple[Detail, ...]) -> Detail:
+        """Return the first of `levels` that is expected within the budget, else the last one."""
+        return next(filter(self.is_quick, levels), levels[-1])
 
     def drew(self, detail: Detail, milliseconds: float) -> None:
         """Learn from the time of an image."""
@@ -344,29 +291,12 @@ class AdaptiveResolution:
         elif self._each > 0:
             self._shares[detail] = (self._share(detail) + milliseconds / (self._each * self._count)) / 2
 
-    def finest(self, has_merged: bool) -> Detail:
-        """Return the finest level expected within the budget, or the coarsest of all."""
-        levels = WITH_MERGED if has_merged else PLAIN
-        return next(filter(self._is_within_budget, levels), levels[-1])
-
-    def stand_in(self) -> Detail | None:
-        """Return the finest of merged Gaussians that is expected within the budget, if there is one.
-
-        All of the Gaussians are projected for few pixels, too.
-        """
-        return next(filter(self._is_within_budget, (detail for detail in WITH_MERGED if detail.merged)), None)
-
-    def _is_within_budget(self, detail: Detail) -> bool:
-        return self._each * self._count * self._share(detail) <= self._budget
-
     def _share(self, detail: Detail) -> float:
         """Return the time as a share of a full image's; guessed, a quarter where four are drawn as one."""
         if detail == FULL:
             return 1.0
         return self._shares.get(detail, detail.scale**2 * (0.25 if detail.merged else 1))
 
-
-# Other threads: one rasterizes the full image of a large scene, one merges its Gaussians.
 
 M = TypeVar("M")
 

@@ -144,7 +144,7 @@ def _side(side: Side, key: str) -> Command:
 OVERLAY_TITLES: dict[Overlay, str] = {
     "things": "boxes of what was found",
     "cameras": "training cameras",
-    "cube": "view cube",
+    "cube": "axes",
     "grid": "ground grid",
 }
 SIDE_KEYS: tuple[tuple[Side, str], ...] = (
@@ -157,7 +157,7 @@ SIDE_KEYS: tuple[tuple[Side, str], ...] = (
 )
 PANEL_TITLES = (
     *("Search", "Display", "Camera", "Scene", "Outline", "Select", "Transform"),
-    *("Train", "Record", "Bookmarks", "Messages", "Overlays", "Notes", "Timing"),
+    *("Train", "Record", "Bookmarks", "Messages", "Overlays", "Notes"),
     *registry.references("panels"),
 )
 TEXT_SIZE_MENU = "Text size"  # in the menu Window
@@ -287,11 +287,6 @@ BY_MENU: dict[str, tuple[Command, ...]] = {
         Command("align the up axis with the picture", lambda viewer: viewpoint.move(viewer, adopt_up)),
         *(_side(side, key) for side, key in SIDE_KEYS),
         Command("orthographic view, and back", viewpoint.toggle_orthographic, ("O", "Keypad5"), apart=True),
-        Command(
-            "walk in place of flying, and back",
-            viewpoint.toggle_walking,
-            is_on=lambda v: v.state.preferences.walks,
-        ),
         Command("bookmark this view", viewpoint.add_bookmark, ("Ctrl+B",), apart=True),
         Command("add a keyframe here", filming.add_keyframe, ("K",)),
         Command("play the camera path, or stop", viewpoint.toggle_playing, ("Shift+K",)),

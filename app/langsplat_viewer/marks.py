@@ -17,70 +17,7 @@ from langsplat_core.query.selection import (
     on_surface,
     project,
 )
-from langsplat_core.scene import Camera, Scene
-
-# Numbers of Gaussians that a range of selects.
-
-Measure = Literal["opacity", "size", "distance", "relevancy"]
-MEASURES: tuple[Measure, ...] = get_args(Measure)
-LOGARITHMIC: tuple[Measure, ...] = ("size", "distance")
-BINS = 64
-
-
-@dataclass(frozen=True, eq=False)
-class Histogram:
-    """How many Gaussians have which value, in `BINS` equal steps between two values."""
-
-    values: Array  # (N,) float64, logarithms to base 10 of those of LOGARITHMIC; NaN where there is none
-    low: float
-    high: float
-    counts: Array  # (BINS,) float32, log(1 + n)
-
-    def between(self, start: float, stop: float) -> Array:
-        """(N,) bool: values between two fractions of the range, in either order."""
-        low, high = (self.low + part * (self.high - self.low) for part in sorted((start, stop)))
-        with np.errstate(invalid="ignore"):
-            found: Array = (self.values >= low) & (self.values <= high)
-            return found
-
-
-def measured(scene: Scene, measure: Measure, eye: Array, relevancy: Array | None = None) -> Array | None:
-    """Return (N,) float64 values of a scene's Gaussians as `Histogram` has them.
-
-    Opacity 0 to 1, size (the longest axis's standard deviation) and distance from `eye` (3,) in world units,
-    and the relevancy of an answer; None for relevancy without one.
-    """
-    gaussians = scene.gaussians
-    with np.errstate(all="ignore"):
-        match measure:
-            case "opacity":
-                return np.asarray(1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64))))
-            case "size":
-                return np.asarray(gaussians.log_scales.max(1).astype(np.float64) / math.log(10))
-            case "distance":
-                away = np.linalg.norm(gaussians.means.astype(np.float64) - eye, axis=1)
-                return np.asarray(np.log10(np.maximum(away, 1e-12)))
-            case _:
-                return None if relevancy is None else relevancy.astype(np.float64)
-
-
-def counted(values: Array, least: float) -> tuple[float, float, Array]:
-    """Return lowest and highest of the finite ones of (N,) values, and the counts of the steps between.
-
-    The two are at least `least` apart; the counts are (BINS,) float32 log(1 + n).
-    """
-    finite = values[np.isfinite(values)]
-    low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
-    high = max(high, low + least)
-    counts, _ = np.histogram(finite, BINS, (low, high))
-    return low, high, np.log1p(counts).astype(np.float32)
-
-
-def histogram(values: Array, shown: Array) -> Histogram:
-    """Return the histogram of (N,) values that are finite and `shown` (N,) bool."""
-    values = np.where(shown & np.isfinite(values), values, np.nan)
-    return Histogram(values, *counted(values, 1e-6))
-
+from langsplat_core.scene import Camera
 
 # The scene itself is never changed: deleting marks, and what is marked is left out of images and of what is
 # saved. So everything can be undone, and an answer's numbers per Gaussian keep their places.

@@ -14,6 +14,7 @@ from fractions import Fraction
 from importlib.util import find_spec
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import moderngl
 import numpy as np
@@ -26,7 +27,7 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import Camera
 from langsplat_viewer.camera.controls import Extent
 from langsplat_viewer.camera.flight import Motion, camera_of, frame_times
-from langsplat_viewer.rendering.renderer import ArrayRenderer, Backend, GlRenderer, Inputs, open_renderer
+from langsplat_viewer.rendering.renderer import Backend, Inputs, Renderer, open_renderer
 from langsplat_viewer.rendering.request import RenderRequest, why_nothing
 
 VIDEO, ANIMATIONS = ".mp4", (".webp", ".gif")
@@ -50,7 +51,7 @@ def save_png(path: Path, image: Array) -> None:
         Image.fromarray(image).save(temporary, format="PNG")
 
 
-def draw_something(request: RenderRequest, renderer: ArrayRenderer | GlRenderer) -> Array:
+def draw_something(request: RenderRequest, renderer: Renderer[Any]) -> Array:
     """Return the (H, W, 3) or (H, W, 4) uint8 image. InputError where it shows nothing of the scene."""
     image = renderer.read(request)
     if renderer.shows_nothing():

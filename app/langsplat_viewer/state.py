@@ -1,13 +1,10 @@
 """The viewer's state: the session, what follows from it, and what the window shows beside the scene."""
 
-import os
-from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from statistics import median
 from typing import Any, Literal
 
 import numpy as np
@@ -25,50 +22,9 @@ from langsplat_viewer.camera.controls import Extent, OrbitCamera
 from langsplat_viewer.camera.flight import Flight, Keyframe
 from langsplat_viewer.files.disk import Listing
 from langsplat_viewer.files.preferences import Preferences
-from langsplat_viewer.marks import Marks, Measure, Mode, Stroke, Tool, unmarked
+from langsplat_viewer.marks import Marks, Mode, Stroke, Tool, unmarked
 from langsplat_viewer.rendering.request import EditedScene, Pane, RenderRequest, edited_scene, panes
 from langsplat_viewer.session import Move, Note, Point, Query, Session
-
-# Times of the steps of drawing: the panel "Timing".
-
-KEPT = 31  # measurements of which the median is told
-STEPS = {  # names of laps, and what they are called; in the order of the panel
-    "projection": "Projection",
-    "sort": "Sort",
-    "tiles": "Tiles",
-    "colours": "Colours",
-    "blend": "Blend",
-    "upload": "Upload",
-    "compose": "Compose",
-    "picture": "Picture, all of it",
-    "panels": "Panels",
-    "search": "Search",
-}
-
-
-@dataclass(eq=False)
-class Timing:
-    """Times of the last images, for the panel."""
-
-    wanted: bool = False  # this frame is measured: the panel is seen
-    laps: dict[str, deque[float]] = field(default_factory=dict)  # milliseconds by the names of STEPS
-
-    def add(self, name: str, milliseconds: float) -> None:
-        self.laps.setdefault(name, deque(maxlen=KEPT)).append(milliseconds)
-
-    def medians(self) -> list[tuple[str, float]]:
-        """Return the steps measured, in words, and the median of its last measurements in milliseconds."""
-        return [(title, median(self.laps[name])) for name, title in STEPS.items() if self.laps.get(name)]
-
-
-def memory_bytes() -> int | None:
-    """Return the bytes that this process holds in memory; None where the system does not tell."""
-    try:
-        resident = Path("/proc/self/statm").read_text(encoding="ascii").split()[1]
-    except OSError:
-        return None
-    return int(resident) * os.sysconf("SC_PAGE_SIZE")
-
 
 # Camera path and film: the panel "Record".
 
@@ -115,7 +71,6 @@ class QueryAnswer:
     problem: str = ""  # why it has no result, one line
     meant: str = ""  # the phrase with its unknown words replaced by known ones, where there are such
     pending: bool = False
-    milliseconds: float = 0.0  # that the search took
     _cuts: dict[float, QueryResult] = field(default_factory=dict)  # the last one that was wanted
 
     def at(self, cut: float | None) -> QueryResult | None:
@@ -137,8 +92,6 @@ class Tools:
     brush: float = 0.03  # radius, of the image's height, within BRUSHES
     reach: float = 0.05  # how far growing goes, and how large a sphere of one click is; of the scene's radius
     only_visible: bool = True  # rectangle, lasso and brush leave out what lies behind something
-    measure: Measure = "opacity"  # whose histogram is shown
-    brushed: tuple[float, float] | None = None  # of it, where the mouse went down and is, fractions
     stroke: Stroke | None = None
 
 
@@ -337,7 +290,6 @@ class ViewerState(SceneState):
     edit_form: EditForm = field(default_factory=EditForm)
     drafts: dict[str, str] = field(default_factory=dict)  # half-typed texts of the panels, by their boxes
     messages: list[Message] = field(default_factory=list)
-    timing: Timing = field(default_factory=Timing)
     stats: FrameStats = field(default_factory=FrameStats)
     backend: str = ""
     size: tuple[int, int] = (1, 1)  # pixels of the scene's area
@@ -352,7 +304,6 @@ class ViewerState(SceneState):
     picks_beside: bool = False  # it chooses a scene to be shown beside this one
     extension_panels: dict[str, Any] = field(default_factory=dict)  # title -> what an extension's panel keeps
     preferences: Preferences = field(default_factory=Preferences)
-    letters_muted: bool = False  # letters are no keys: they were meant for a box that cannot be typed in
 
     def begin(self, fresh: SceneState) -> None:
         """Show another scene: all that belongs to the one before is gone."""

@@ -22,7 +22,7 @@ from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.files.disk import Stamps, Watch
 from langsplat_viewer.files.projects import Shelf
 from langsplat_viewer.jobs import Job, Worker, one_line
-from langsplat_viewer.marks import Histogram, Marks
+from langsplat_viewer.marks import Marks
 from langsplat_viewer.rendering.request import RenderRequest
 from langsplat_viewer.session import Session
 from langsplat_viewer.state import OutlineView, ViewerState
@@ -202,7 +202,6 @@ class Viewer:
     history: History = field(default_factory=History)
     engine: QueryEngine | None = None  # of the scene shown; asked on the worker only
     describer: Describer | None = None  # of the same scene, once it was needed
-    histogram: tuple[tuple[object, ...], Histogram | None] | None = None  # the last one, and what it is of
     pivot: tuple[Scene, Array, Array] | None = None  # of what is selected in which scene, a point (3,)
     out_of_sight: tuple[OutlineView, Marks, Array] | None = None  # nodes with nothing shown, of which
     beside: "Viewer | None" = None  # of a second scene, seen and asked as this one is

@@ -3,11 +3,11 @@
 import os
 import signal
 import sys
-import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from imgui_bundle import ImVec4, hello_imgui, imgui, immapp  # isort: skip
 from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip  (before glfw, else there are two)
@@ -41,7 +41,7 @@ from langsplat_viewer.jobs import give_memory_back, on_signals, one_line, share_
 from langsplat_viewer.options import chosen_camera, latent_level
 from langsplat_viewer.panels import layout, menus, navigation, outline, overlays, ui
 from langsplat_viewer.panels.navigation import Keyboard
-from langsplat_viewer.rendering.renderer import Backend, GlRenderer
+from langsplat_viewer.rendering.renderer import Backend, Renderer, renderer_for
 from langsplat_viewer.viewer import Services, Viewer
 
 # 4.3 sorts splats, 4.1 draws them on every system; 3.3 still shows the CPU's images.
@@ -165,7 +165,7 @@ DRAW_ERRORS = (
 
 RECORDER_PATIENCE = 5.0  # seconds for a film that is being drawn to leave nothing half written
 
-MakeRenderer = Callable[[moderngl.Context], GlRenderer]
+MakeRenderer = Callable[[moderngl.Context], Renderer[Any]]
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,7 @@ class WindowRequest:
 def open_window(request: WindowRequest, services: Services) -> None:
     """Run until the window is closed. Raises BackendError where there is no display or no OpenGL."""
     share_one_heap()
-    window = Window(request, services, lambda ctx: GlRenderer(ctx, request.backend))
+    window = Window(request, services, lambda ctx: renderer_for(ctx, request.backend))
     with on_signals(glfw.post_empty_event) as window.signals:
         immapp.run(window.params())
     if window.failure is not None:
@@ -220,7 +220,6 @@ class Window:
         self.signals: list[int] = []  # that the process got
         self._obeyed = 0  # of them
         self.idles = True  # False for scripts that drive the window and count on its next frame
-        self._began = 0.0  # this frame, seconds
         self._frames = AWAKE_FRAMES  # to be drawn whatever happens
         self._last: tuple[object, ...] = ()  # what was there in the last frame
         self._tidied: tuple[int, int] = (0, 0)  # news after which memory was given back
@@ -349,12 +348,10 @@ class Window:
             self._obey()
         if viewer.state.may_close:
             hello_imgui.get_runner_params().app_shall_exit = True
-        self._began = time.perf_counter()
         viewer.take_results()
         viewpoint.tick(viewer, imgui.get_time())
         opening.follow_beside(viewer)
         browsing.watch_training(viewer)
-        navigation.muted_until_clicked(viewer)  # hello_imgui draws the panels after this
         self._hiding.apply(viewer)
         self._column.apply(viewer)
         layout.show_wanted(viewer)
@@ -430,8 +427,6 @@ class Window:
         scale = imgui.get_io().display_framebuffer_scale
         settings.resize(viewer, round(area.width * scale.x), round(area.height * scale.y))
         canvas, state = self._canvas, viewer.state
-        if state.timing.wanted:
-            state.timing.add("panels", 1e3 * (time.perf_counter() - self._began))
         if canvas is None or self._screen is None or self.is_minimised():
             self._set_idling()
             return
@@ -446,7 +441,6 @@ class Window:
         self._screen.color_mask = True, True, True, True  # a mask left set would colour the panels
         overlays.draw_pictures(viewer, area, textures)
         overlays.draw_lines(viewer, area)
-        state.timing.wanted = False  # the panel says so again, if it is still seen
 
     def _may_close(self) -> bool:
         glfw.post_empty_event()  # where there is a question, it is drawn now

@@ -2,8 +2,8 @@
 
 * load: a large PLY, read by this program and by plyfile, into the same five arrays. The file has just been
   written, so it is in the system's cache.
-* moving: the coarse images that the viewer draws while the camera moves, step by step as its panel Timing
-  has them, beside their distance from the full one.
+* moving: the coarse images that the viewer draws while the camera moves, step by step,
+  beside their distance from the full one.
 * endurance: one process, a scene made large, large images and many phrases.
 
 The report `formats`: what writing a scene in each format and reading it back changes.
@@ -45,7 +45,6 @@ from langsplat_core.scene.gaussians import merged
 from langsplat_core.scene.transform import C0
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.semantics.vocabulary import ADJECTIVES, NOUNS
-from langsplat_viewer.state import STEPS
 from tests.benchmarks.fresh import in_fresh_interpreter
 from tests.benchmarks.room import publish
 
@@ -159,7 +158,7 @@ class MovingCost:
     processor: float  # milliseconds, all threads together
     psnr: float  # dB, to the full image; 100 for itself
     error: float  # mean absolute difference, values in [0, 1]
-    steps: Mapping[str, float]  # milliseconds, as the panel Timing has them
+    steps: Mapping[str, float]  # milliseconds
 
 
 def measure_moving(command: Scale, progress: Progress = silent) -> list[MovingCost]:
@@ -219,8 +218,7 @@ def moving_table(costs: Sequence[MovingCost]) -> str:
         for cost in costs
     )
     head = ("resolution", "Gaussians", "image, ms", "a second", "processor, ms", "PSNR, dB", "mean error")
-    steps = [STEPS[step].lower() for step in costs[0].steps]
-    return markdown([*head, *steps], lines)
+    return markdown([*head, *costs[0].steps], lines)
 
 
 @dataclass(frozen=True)

@@ -54,9 +54,6 @@ class FakeRenderer:
     def clock(self) -> float:
         return self.now
 
-    def forget(self) -> None:
-        pass
-
     def ahead(self, request: RenderRequest) -> None:
         return None
 
@@ -64,7 +61,7 @@ class FakeRenderer:
         self.drawn.append(request)
         self.now += self.seconds if request.merged is None else self.seconds_merged
         for target in targets:
-            target.clear(1.0, 0.0, 0.0, 1.0)
+            target.write(bytes((255, 0, 0, 255)) * target.width * target.height)
 
     def shows_nothing(self) -> bool:
         return self.nothing

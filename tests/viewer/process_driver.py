@@ -28,13 +28,14 @@ from imgui_bundle.glfw_utils import glfw_window_hello_imgui
 import glfw  # isort: skip
 from langsplat_core.extensions.benchmarks.query_speed import repeated
 from langsplat_core.io.scenes import load_scene
+from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions import viewpoint
 from langsplat_viewer.camera.controls import orbit
 from langsplat_viewer.panels.navigation import Event
-from langsplat_viewer.rendering.renderer import GlRenderer
+from langsplat_viewer.rendering.renderer import ArrayRenderer, renderer_for
 from langsplat_viewer.viewer import Services
-from langsplat_viewer.window import Window, WindowRequest, open_window
+from langsplat_viewer.window import MakeRenderer, Window, WindowRequest, open_window
 from tests.support.fakes import FakeEncoder
 
 DEMO = Path(__file__).parents[2] / "assets" / "demo" / "scene.ply"
@@ -59,7 +60,7 @@ class Orbiting:
     cpu_to_sharp: list[float] = field(default_factory=list)
 
 
-class AtOnce(GlRenderer):
+class AtOnce(ArrayRenderer):
     """Leaves nothing to other threads."""
 
     def ahead(self, *_: object) -> None:
@@ -139,7 +140,7 @@ def ride(
     count: int,
     seconds: float,
     size: tuple[int, int],
-    renderer: type[GlRenderer] = GlRenderer,
+    renderer: MakeRenderer = renderer_for,
     **request: float,
 ) -> Orbiting:
     def load(path: Path) -> Scene:
@@ -187,7 +188,7 @@ def close() -> None:
 
 def window_of(path: Path) -> Window:
     services = Services(load_scene, lambda encoder_id: FakeEncoder())
-    return Window(WindowRequest(path, size=(860, 620)), services, lambda ctx: GlRenderer(ctx, "opengl"))
+    return Window(WindowRequest(path, size=(860, 620)), services, lambda ctx: renderer_for(ctx, "opengl"))
 
 
 def idle(path: Path) -> None:
@@ -318,7 +319,7 @@ if __name__ == "__main__":
     elif asked.leave:
         leave(asked.leave)
     else:
-        renderer = AtOnce if asked.at_once else GlRenderer
+        renderer = (lambda ctx: AtOnce(load_rasterizer("cpu"))) if asked.at_once else renderer_for
         more = {"moving_budget": 0.0} if asked.slow else {}
         seen = ride(asked.scene, asked.count, asked.seconds, tuple(asked.size), renderer, **more)
         print(json.dumps(asdict(seen)))

@@ -14,9 +14,9 @@ from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
 import glfw  # isort: skip
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_viewer.actions import browsing, editing, opening, selecting, settings, viewpoint
-from langsplat_viewer.camera.overlays import PlacedText, visible_faces
+from langsplat_viewer.camera.controls import from_side
+from langsplat_viewer.camera.overlays import PlacedText
 from langsplat_viewer.panels import overlays, select
-from langsplat_viewer.panels.overlays import EDGE
 from langsplat_viewer.panels.ui import Area, scene_area
 from langsplat_viewer.rendering.request import TINT
 from langsplat_viewer.state import EditForm
@@ -36,34 +36,34 @@ def split_the_view(s: Any) -> None:
     assert np.abs(s.at(both, PLANT) - s.at(rgb, PLANT)).max() > 40  # depth
 
     middle, y = area.left + area.width / 2, area.top + 0.8 * area.height
-    drawn = s.renderer.count
+    drawn = s.drawn
     s.drag((middle, y), (area.left + 0.9 * area.width, y))
     assert abs(s.state.session.split.at - 0.9) < 0.02
     assert s.state.view is before
-    assert s.renderer.count == drawn
+    assert s.drawn == drawn
     np.testing.assert_allclose(s.at(s.shot("wiped"), PLANT), s.at(rgb, PLANT), atol=2)
 
     s.drag((middle, y), (middle + 40, y))  # beside the line the camera turns as ever
     assert s.state.view is not before
     s.menu("View", "Three levels side by side")
     levels = s.shot("levels")
-    assert s.renderer.count > drawn
+    assert s.drawn > drawn
     thirds = [levels[250:400, int(area.left + (i + 0.5) * area.width / 3)] for i in range(3)]
     assert np.abs(thirds[0] - thirds[2]).max() > 30
     s.draws_nothing()
 
 
 def draw_over_the_scene(s: Any) -> None:
-    """The cube turns the view, a click on a camera stands there, two clicks measure."""
-    s.menu("View", "Show or hide the view cube")
+    """The end of an axis turns the view, a click on a camera stands there, two clicks measure."""
+    s.menu("View", "Show or hide the axes")
     s.menu("View", "Show or hide the training cameras")
     area, before = scene_area(), s.state.view
-    side = s.ctx.item_info("//view cube/cube").rect_full
-    assert side.max.x <= area.left + area.width + 1
-    name, place = next(face for face in faces_on_screen(s, side) if face[0] == "front")
-    s.click_at(place)
-    assert s.state.view is not before
-    assert [face[0] for face in faces_on_screen(s, side)] == [name]
+    corner = s.ctx.item_info("//axes/sides").rect_full
+    assert corner.max.x <= area.left + area.width + 1
+    forward = from_side(before, "top").rotation[2]
+    end = -before.rotation[:2] @ forward * overlays.REACH_OF_ENDS * (corner.max.x - corner.min.x)
+    s.click_at(((corner.min.x + corner.max.x) / 2 + end[0], (corner.min.y + corner.max.y) / 2 + end[1]))
+    np.testing.assert_allclose(s.state.view.rotation[2], forward, atol=1e-6)
 
     turn_the_wheel(s, 8)  # until all cameras are in the picture
     camera = s.state.scene.cameras[2]
@@ -90,31 +90,6 @@ def draw_over_the_scene(s: Any) -> None:
     s.draws_nothing()
     s.key("escape", frames=2)
     assert not s.state.session.ruler.measures
-
-
-def time_the_steps(s: Any) -> None:
-    """The panel tells medians while it is seen."""
-    s.open_panel("Timing", frames=3)
-    for key in "21":
-        s.key(key)
-    s.search("mug")
-    told = dict(s.state.timing.medians())
-    assert {"Blend", "Picture, all of it", "Panels", "Search"} <= set(told)
-    assert len(s.state.timing.laps["panels"]) > 2
-    s.menu("Window", "Timing")
-    drawn = len(s.state.timing.laps["blend"])
-    s.key("2")
-    assert len(s.state.timing.laps["blend"]) == drawn
-
-
-def faces_on_screen(s: Any, side: Any) -> list[tuple[str, tuple[float, float]]]:
-    """Name and middle of each face of the cube that is seen, in the window."""
-    middle = np.array([side.min.x + side.max.x, side.min.y + side.max.y]) / 2
-    places = {
-        face.name: middle + EDGE * (side.max.x - side.min.x) * np.array(face.centre)
-        for face in visible_faces(s.state.view)
-    }
-    return [(name, tuple(map(float, place))) for name, place in places.items()]
 
 
 def turn_the_wheel(s: Any, times: int) -> None:
@@ -338,9 +313,8 @@ def drag_the_gizmo(s: Any) -> None:
     assert not s.state.is_unsaved
 
 
-def crop_box_and_brush(s: Any) -> None:
-    """A corner of the box is dragged, and what lies outside is cropped; a drag over the histogram of
-    distances selects those between."""
+def drag_the_crop_box(s: Any) -> None:
+    """A corner of the box is dragged, and what lies outside is cropped."""
     viewer = s.viewer
     s.open_panel("Transform", frames=1)
     editing.fill_box(viewer)
@@ -360,26 +334,7 @@ def crop_box_and_brush(s: Any) -> None:
     assert 0 < inside.sum() < len(means)
     s.key("Ctrl+Z")
     s.ctx.item_click("//Transform/No gizmo##gizmo")
-    brush_numbers(s)
-
-
-def brush_numbers(s: Any) -> None:
-    """By a drag, and by two numbers that are typed."""
-    s.open_panel("Select")
-    s.ctx.item_click("//Select/By numbers")
-    s.click("//Select/Distance", frames=2)
-    place = s.ctx.item_info("//Select/brush values").rect_full
-    y = place.min.y + 5
-    s.drag((place.min.x + 1, y), ((place.min.x + place.max.x) / 2, y))
-    away = np.linalg.norm(s.state.scene.gaussians.means - s.state.view.eye, axis=1)
-    chosen = s.state.marks.selected
-    assert 0 < chosen.sum() < len(away)
-    between = (away >= away[chosen].min()) & (away <= away[chosen].max())
-    np.testing.assert_array_equal(chosen, between)
-    s.ctx.item_click("//Select/Opacity")
-    s.ctx.item_click("//Select/##range")
-    s.enter("0 1", frames=2)
-    assert s.state.marks.selected.all()
+    assert s.state.marks.shown.all()
 
 
 def compare_two_scenes(s: Any) -> None:

@@ -19,6 +19,7 @@ from pathlib import Path
 
 from imgui_bundle import hello_imgui  # isort: skip
 import moderngl
+import psutil
 
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import QueryEngine
@@ -27,9 +28,8 @@ from langsplat_viewer.actions import browsing, editing, opening, queries, settin
 from langsplat_viewer.commands import COMMANDS
 from langsplat_viewer.jobs import give_memory_back
 from langsplat_viewer.panels.layout import all_panels
-from langsplat_viewer.rendering.renderer import Backend, GlRenderer
+from langsplat_viewer.rendering.renderer import Backend, Renderer, renderer_for
 from langsplat_viewer.rendering.request import Clip, Splats
-from langsplat_viewer.state import memory_bytes
 from tests.viewer.window_driver import Session
 
 SCENES = ("blobs.ply", "plain.ply", "many.ply", "bare.ply", "few.ply")
@@ -69,8 +69,8 @@ class SoakSession(Session):
         self._wanted: Callable[[], object] | None = None  # at the next frame
         super().__init__(folder, SCENES[0], backend=backend)
 
-    def _make_renderer(self, ctx: moderngl.Context) -> GlRenderer:
-        return GlRenderer(ctx, self.backend)
+    def _make_renderer(self, ctx: moderngl.Context) -> Renderer:
+        return renderer_for(ctx, self.backend)
 
     def params(self) -> hello_imgui.RunnerParams:
         params = super().params()
@@ -198,7 +198,7 @@ class Soak:
         found: dict[str, object] = {}
 
         self.s.do(lambda: found.update(self.count_gl()))
-        return {"MB": round((memory_bytes() or 0) / 1e6, 1)} | alive | found
+        return {"MB": round(psutil.Process().memory_info().rss / 1e6, 1)} | alive | found
 
 
 if __name__ == "__main__":

@@ -434,19 +434,3 @@ def test_the_six_sides(up):
     # From above, what is away from the front is up in the picture; from below it is down.
     assert_allclose(-seen["top"].rotation[1], ahead["front"], atol=1e-12)
     assert_allclose(seen["bottom"].rotation[1], ahead["front"], atol=1e-12)
-
-
-@pytest.mark.parametrize("pitch", [0.0, 0.7, -1.2])
-def test_walking_keeps_the_height_of_the_eye(pitch):
-    view = controls.look(view_with_up((0, -1, 0)), 0.5, pitch)
-    ahead = controls.walk(view, 0, 0, 2.0)
-    step = ahead.eye - view.eye
-    assert step @ view.up == pytest.approx(0, abs=1e-12)
-    assert np.linalg.norm(step) == pytest.approx(2)
-    assert step @ view.rotation[2] > 0
-    assert_allclose(controls.walk(view, 1, 0, 0).eye - view.eye, view.rotation[0], atol=1e-9)
-    assert_allclose(controls.walk(view, 0, 3, 0).eye - view.eye, 3 * view.up, atol=1e-12)
-    for side in ("top", "bottom"):  # while looking down one goes where the picture's top points
-        down = controls.from_side(view, side)
-        step = controls.walk(down, 0, 0, 1.0).eye - down.eye
-        assert_allclose(step, controls.from_side(down, "front").rotation[2], atol=1e-9)

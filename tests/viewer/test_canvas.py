@@ -17,8 +17,17 @@ from langsplat_core.errors import BackendError
 from langsplat_core.raster import load_rasterizer
 from langsplat_viewer.actions import editing, selecting, settings, viewpoint
 from langsplat_viewer.camera.controls import orbit
-from langsplat_viewer.canvas import FULL, MOVING_BUDGET, REST_SECONDS, AdaptiveResolution, Canvas, Detail
-from langsplat_viewer.rendering.renderer import GlRenderer
+from langsplat_viewer.canvas import (
+    FULL,
+    MOVING_BUDGET,
+    PLAIN,
+    REST_SECONDS,
+    WITH_MERGED,
+    AdaptiveResolution,
+    Canvas,
+    Detail,
+)
+from langsplat_viewer.rendering.renderer import ArrayRenderer, renderer_for
 from langsplat_viewer.rendering.request import Clip, Splats
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
@@ -100,7 +109,7 @@ def test_point_at_is_the_surface_in_the_last_image(gl, shown):
 
 
 def test_canvas_draws_several_panes_and_no_line(gl, opened):
-    renderer = GlRenderer(gl, "cpu")
+    renderer = renderer_for(gl, "cpu")
     canvas, state = Canvas(gl, renderer), opened.state
     settings.resize(opened, 60, 40)
     drawn, original = [], renderer.draw
@@ -124,7 +133,7 @@ def test_canvas_draws_several_panes_and_no_line(gl, opened):
 
 
 def test_point_at_finds_the_surface_in_every_column(gl, opened):
-    canvas = Canvas(gl, GlRenderer(gl, "cpu"))
+    canvas = Canvas(gl, renderer_for(gl, "cpu"))
     settings.resize(opened, 240, 120)
     settings.toggle_levels(opened)
     rest(canvas, opened.state, 1.0)
@@ -261,7 +270,7 @@ def until(condition: Callable[[], bool]) -> None:
 @pytest.fixture
 def canvas(gl: moderngl.Context, gated: Gated, asked: Viewer) -> Iterator[Canvas]:
     """Nothing is drawn yet; every image is held to be slow."""
-    renderer = GlRenderer(gl, gated)
+    renderer = ArrayRenderer(gated)
     asked.surface = made = Canvas(gl, renderer, slow_clock(), budget=0.0)
     yield made
     gated.gate.set()
@@ -281,7 +290,7 @@ def begun(canvas: Canvas, asked: Viewer, gated: Gated) -> Canvas:
 def assert_rests_as_drawn_anew(gl: moderngl.Context, canvas: Canvas, viewer: Viewer, now: float) -> None:
     """The full image comes, and is that of another renderer."""
     rest(canvas, viewer.state, now)
-    renderer, (shown,) = GlRenderer(gl, "cpu"), on_screen(canvas)
+    renderer, (shown,) = renderer_for(gl, "cpu"), on_screen(canvas)
     np.testing.assert_array_equal(shown, renderer.read(viewer.state.request()))
     renderer.release()
 
@@ -357,7 +366,7 @@ def test_an_error_is_raised_once_and_the_next_request_drawn(gl, asked, canvas, g
 
 
 def test_merged_gaussians_stand_in_for_the_full_image(gl, asked, gated):
-    renderer = GlRenderer(gl, gated)
+    renderer = ArrayRenderer(gated)
     canvas = Canvas(gl, renderer, slow_clock(), budget=50.0)
     gated.gate.set()
     rest(canvas, asked.state, 0.0)
@@ -419,23 +428,18 @@ def after(*images: tuple[Detail, float]) -> AdaptiveResolution:
 
 
 @pytest.mark.parametrize(
-    ("full_ms", "plain", "with_merged", "stand_in"),
+    ("full_ms", "plain", "with_merged"),
     [
-        (0, FULL, FULL, MERGED),
-        (MOVING_BUDGET, FULL, FULL, MERGED),
-        (3 * MOVING_BUDGET, HALF, HALF, MERGED),
-        (12 * MOVING_BUDGET, QUARTER, MERGED, MERGED),
-        (1000, QUARTER, COARSEST, COARSEST),
-        (1e5, QUARTER, COARSEST, None),
+        (0, FULL, FULL),
+        (MOVING_BUDGET, FULL, FULL),
+        (3 * MOVING_BUDGET, HALF, HALF),
+        (12 * MOVING_BUDGET, QUARTER, MERGED),
+        (1000, QUARTER, COARSEST),
     ],
 )
-def test_the_first_level_of_detail_is_guessed(full_ms, plain, with_merged, stand_in):
+def test_the_first_level_of_detail_is_guessed(full_ms, plain, with_merged):
     resolution = after((FULL, full_ms))
-    assert (resolution.finest(False), resolution.finest(True), resolution.stand_in()) == (
-        plain,
-        with_merged,
-        stand_in,
-    )
+    assert (resolution.finest(PLAIN), resolution.finest(WITH_MERGED)) == (plain, with_merged)
     assert resolution.is_slow == (full_ms > MOVING_BUDGET)
 
 
@@ -451,7 +455,7 @@ def test_the_first_level_of_detail_is_guessed(full_ms, plain, with_merged, stand
     ],
 )
 def test_measured_times_choose_the_level_of_detail(images, detail):
-    assert after(*images).finest(True) == detail
+    assert after(*images).finest(WITH_MERGED) == detail
 
 
 def test_times_of_other_scenes_follow_from_their_size():
@@ -462,6 +466,6 @@ def test_times_of_other_scenes_follow_from_their_size():
     assert resolution.is_slow
     resolution.drew(FULL, 500)
     resolution.expect(100_000)
-    assert resolution.finest(False) == HALF
+    assert resolution.finest(PLAIN) == HALF
     resolution.expect(50_000)
-    assert resolution.finest(False) == FULL
+    assert resolution.finest(PLAIN) == FULL

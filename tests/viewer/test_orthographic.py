@@ -14,7 +14,7 @@ from langsplat_viewer.camera.controls import OrbitCamera, from_side, spanning, w
 from langsplat_viewer.camera.flight import Flight, Keyframe, camera_of, pose_at, pose_of
 from langsplat_viewer.files.projects import Shelf
 from langsplat_viewer.panels.overlays import pointed_figures
-from langsplat_viewer.rendering.renderer import GlRenderer
+from langsplat_viewer.rendering.renderer import renderer_for
 from langsplat_viewer.rendering.request import Clip, depth_range, image_formation, plain_request, why_nothing
 from langsplat_viewer.state import GLIDE_SECONDS
 from langsplat_viewer.viewer import Viewer
@@ -48,7 +48,7 @@ def test_the_camera_is_orthographic():
 def test_clicked_point_lies_on_the_surface(gl, backend):
     """By the depth of one pixel, and by that of all of them."""
     camera = FLAT.camera(320, 240)
-    renderer, request = GlRenderer(gl, backend, "half"), plain_request(BLOBS, camera, PictureConfig())
+    renderer, request = renderer_for(gl, backend), plain_request(BLOBS, camera, PictureConfig())
     for centre in CENTRES:
         x, y = np.floor(camera.project(centre[None])[0][0]) + 0.5
         for depth in (renderer.depth_at(request, x, y), renderer.depth_map(request)[int(y), int(x)]):
@@ -151,7 +151,7 @@ def flat(opened: Viewer) -> Viewer:
         viewpoint.frame_scene,
         viewpoint.focus_result,
         lambda viewer: viewpoint.look_from(viewer, "top"),
-        lambda viewer: settings.turn_to_face(viewer, "left"),
+        lambda viewer: viewpoint.look_from(viewer, "left"),
         lambda viewer: viewpoint.focus_pixel(viewer, 0.5, 0.5),
         lambda viewer: viewpoint.zoom_by(viewer, 0.5),
     ],

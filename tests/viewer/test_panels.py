@@ -9,7 +9,7 @@ from matplotlib.ft2font import FT2Font
 
 from langsplat_core.errors import InputError
 from langsplat_viewer import panels
-from langsplat_viewer.actions import queries, settings, viewpoint
+from langsplat_viewer.actions import settings, viewpoint
 from langsplat_viewer.commands import COMMANDS, PANEL_TITLES, matching
 from langsplat_viewer.files import preferences
 from langsplat_viewer.panels import menus, ui
@@ -185,11 +185,6 @@ def test_a_file_that_makes_no_sense_is_one_line(tmp_path, text):
 
 
 def test_letters_recent_scenes_and_looks_stay_within_limits(viewer):
-    queries.focus_search(viewer)  # a box that is not there: letters meant for it are no keys
-    assert viewer.state.letters_muted
-    assert "open a scene" in viewer.state.messages[-1].text
-    settings.escape(viewer)
-    assert not viewer.state.letters_muted
     wanted = preferences.Preferences()
     most = preferences.MOST_RECENT
     for number in (*range(most + 3), 5):

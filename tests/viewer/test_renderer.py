@@ -15,14 +15,15 @@ from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, Channels
 from langsplat_core.io.ply import write_ply
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.raster import load_rasterizer
+from langsplat_core.raster.opengl.rasterizer import GlRasterizer
 from langsplat_core.raster.protocol import farthest
 from langsplat_core.raster.reference import ReferenceRasterizer, colours
 from langsplat_core.scene import Camera, Gaussians, Scene, look_at
 from langsplat_viewer.actions import selecting, settings, viewpoint
 from langsplat_viewer.camera.controls import default_view, extent_of, from_camera
-from langsplat_viewer.canvas import NOTHING_BETWEEN, Canvas
+from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.rendering import renderer as renderers
-from langsplat_viewer.rendering.renderer import ArrayRenderer, GlRenderer, render_image
+from langsplat_viewer.rendering.renderer import ArrayRenderer, GlRenderer, render_image, renderer_for
 from langsplat_viewer.rendering.request import (
     UNCLIPPED,
     Clip,
@@ -54,7 +55,7 @@ def request_for(display: str = "rgb", queries: int = 2, **more) -> RenderRequest
 
 @pytest.fixture(params=["opengl", "cpu"])
 def renderer(gl, request):
-    made = GlRenderer(gl, request.param, "single")
+    made = renderer_for(gl, request.param)
     yield made
     made.release()
 
@@ -97,6 +98,36 @@ class DrawnAlready:
         return self.image, self.alpha
 
 
+class OnDevice:
+    """The same with textures, as the rasterizer on a graphics device has them: alpha last."""
+
+    name = "opengl"
+
+    def __init__(self, ctx, made: DrawnAlready) -> None:
+        self.ctx, self.made, self.view = ctx, made, made.view
+
+    def scene(self, gaussians: Gaussians) -> "OnDevice":
+        return self
+
+    def upload(self, values: Array) -> object:
+        return self.ctx.texture((1, 1), 4)
+
+    def draw(self, view: object, sources: list, with_depth: bool):
+        image, alpha = self.made.image, self.made.alpha[..., None]
+        textures, parts = [], [image[..., :3], image[..., 3:]][: len(sources) + with_depth]
+        for part, components in zip(parts, (4, 2 if with_depth else 4), strict=False):
+            padded = np.zeros((*alpha.shape[:2], components), np.float32)
+            padded[..., : part.shape[2]] = part
+            padded[..., -1:] = alpha
+            texture = self.ctx.texture(alpha.shape[1::-1], components, padded.tobytes(), dtype="f4")
+            texture.repeat_x = texture.repeat_y = False
+            textures.append(texture)
+        return textures
+
+    def release(self) -> None:
+        pass
+
+
 SHOWN = [(display, queries, {}) for display in DISPLAYS for queries in (1, 2, 3)]
 SHOWN += [(display, 1, {"transparent": True}) for display in DISPLAYS]
 SHOWN += [(display, 1, {"colour_map": name}) for display in ("relevancy", "depth") for name in COLOUR_MAPS]
@@ -109,7 +140,7 @@ def test_the_shader_composes_as_the_kernel_does(gl, display, queries, more):
     request = request_for(display, queries)
     request = replace(request, camera=CAMERA.resized(50, 40), width=50)
     request = replace(request, picture=replace(request.picture, **settings))
-    renderer = GlRenderer(gl, rasterizer, uploads=True)
+    renderer = GlRenderer(gl, OnDevice(gl, rasterizer))
     got, expected = renderer.read(request), ArrayRenderer(rasterizer).read(request)
     renderer.release()
     assert got.shape == expected.shape == (40, 50, 4 if more.get("transparent") else 3)
@@ -165,13 +196,12 @@ def test_a_missing_channel_shows_the_plain_colours(renderer):
 def passes(monkeypatch):
     """Notes each pass of a rasterizer."""
     made = []
-    for source in (renderers.DeviceLayers, renderers.UploadedLayers):
 
-        def noting(*arguments, method=source.rasterize):
-            made.append(arguments)
-            return method(*arguments)
+    def noting(method):
+        return lambda *arguments, **options: (made.append(arguments), method(*arguments, **options))[1]
 
-        monkeypatch.setattr(source, "rasterize", noting)
+    monkeypatch.setattr(GlRasterizer, "draw", noting(GlRasterizer.draw))
+    monkeypatch.setattr(renderers, "splat_colours", noting(renderers.splat_colours))
     return made
 
 
@@ -227,14 +257,16 @@ FRONT = Camera(64, 48, 60.0, 60.0, 32.0, 24.0, np.eye(4))
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="asks libGL.so.1")
 def test_drawing_restores_the_gl_state(gl, renderer):
-    target = gl.framebuffer([gl.texture((CAMERA.width, CAMERA.height), 4)])
-    target.use()
+    target = gl.texture((CAMERA.width, CAMERA.height), 4)
+    bound = gl.framebuffer([gl.texture((CAMERA.width, CAMERA.height), 4)])
+    bound.use()
     gl.enable_only(0)
     gl.blend_func = 0x0302, 0x0303  # source alpha, 1 - source alpha
     before = gl_state()
     renderer.draw(request_for("relevancy"), [target])
     np.testing.assert_array_equal(gl_state(), before)
     gl.detect_framebuffer(0).use()
+    bound.release()
     target.release()
 
 
@@ -421,12 +453,13 @@ def beside(opened):
 
 
 def test_canvas_says_that_the_clip_leaves_nothing(gl, beside):
-    renderer = GlRenderer(gl, "cpu")
+    renderer = renderer_for(gl, "cpu")
     canvas, state = Canvas(gl, renderer), beside.state
-    for clip, nothing in ((BOOK_ALONE, ""), (Clip(20.0, 30.0), NOTHING_BETWEEN), (UNCLIPPED, "")):
+    for clip, nothing in ((BOOK_ALONE, ""), (Clip(20.0, 30.0), "between the cuts"), (UNCLIPPED, "")):
         settings.set_clip(beside, clip)
         rest(canvas, state, 1.0)
-        assert state.nothing == nothing
+        assert nothing in state.nothing
+        assert bool(nothing) == bool(state.nothing)
         if clip == BOOK_ALONE:
             assert on_screen(canvas)[0][60, 80].argmax() == 1
             assert abs(canvas.point_at(0.5, 0.5)[0] - CENTRES[1][0]) < 0.6  # of the surface that is seen
@@ -446,7 +479,7 @@ def test_an_outline_selects_nothing_that_is_clipped(beside):
 
 
 def test_auto_takes_the_cpu_where_the_driver_is_software(gl):
-    renderer = GlRenderer(gl)
+    renderer = renderer_for(gl)
     assert renderer.backend == ("opengl" if renderers.suits_opengl(gl) else "cpu")
     renderer.release()
 
@@ -456,7 +489,7 @@ import moderngl, sys
 from langsplat_core.config import PictureConfig
 from langsplat_core.errors import BackendError
 from langsplat_core.scene import Scene
-from langsplat_viewer.rendering.renderer import GlRenderer, render_image
+from langsplat_viewer.rendering.renderer import renderer_for, render_image
 from langsplat_viewer.rendering.request import plain_request
 from tests.support.scenes import random_camera, random_gaussians
 request = plain_request(Scene(random_gaussians(20)), random_camera(), PictureConfig())
@@ -464,10 +497,10 @@ request = plain_request(Scene(random_gaussians(20)), random_camera(), PictureCon
 OLD_DRIVER = """
 ctx = moderngl.create_context(standalone=True, backend="egl", require=330)
 assert ctx.version_code == 330, ctx.version_code
-renderer = GlRenderer(ctx)
+renderer = renderer_for(ctx)
 print(renderer.backend, renderer.read(request).any(), ctx.error)
 try:
-    GlRenderer(ctx, "opengl")
+    renderer_for(ctx, "opengl")
 except BackendError as error:
     print(error)
 """

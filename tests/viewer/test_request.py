@@ -9,7 +9,6 @@ from PIL import Image
 
 from langsplat_core.config import PictureConfig
 from langsplat_core.errors import InputError
-from langsplat_core.raster.opengl.scene_textures import is_software
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Scene
@@ -22,7 +21,7 @@ from langsplat_viewer.files.preferences import FILE_NAME, load_preferences, save
 from langsplat_viewer.marks import Marks
 from langsplat_viewer.panels.display import compared_name
 from langsplat_viewer.panels.overlays import STEPS, bar_colours
-from langsplat_viewer.rendering.renderer import ArrayRenderer, GlRenderer, Inputs
+from langsplat_viewer.rendering.renderer import ArrayRenderer, Inputs, renderer_for
 from langsplat_viewer.rendering.request import (
     AT_RANGE,
     TINT,
@@ -36,7 +35,6 @@ from langsplat_viewer.rendering.request import (
     with_splats,
 )
 from langsplat_viewer.session import OVERLAYS, Ruler
-from langsplat_viewer.state import KEPT, Timing
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene, cameras
 from tests.support.scenes import random_gaussians
@@ -87,7 +85,7 @@ def image(path: Path) -> np.ndarray:
 def test_screen_file_film_and_reference_agree(gl, opened, tmp_path, mode, backend):
     """Nothing that is hidden or deleted comes back, in whatever way an image is made."""
     edit_everything(opened, mode)
-    state, renderer = opened.state, GlRenderer(gl, backend, "single")
+    state, renderer = opened.state, renderer_for(gl, backend)
     opened.surface = canvas = Canvas(gl, renderer)
     state.backend = renderer.backend
     request = state.request()
@@ -125,7 +123,7 @@ def test_screen_file_film_and_reference_agree(gl, opened, tmp_path, mode, backen
 
 
 def test_images_are_saved_without_background_if_so_chosen(gl, opened, tmp_path):
-    opened.surface = Canvas(gl, GlRenderer(gl, "cpu"))
+    opened.surface = Canvas(gl, renderer_for(gl, "cpu"))
     settings.resize(opened, 40, 30)
     filming.set_film_size(opened, 40, 30)
     assert image(filming.save_picture(opened, tmp_path)).shape == (30, 40, 3)
@@ -179,7 +177,7 @@ def test_equal_requests_have_the_same_channels(asked):
 @pytest.mark.parametrize("backend", ["opengl", "cpu"])
 @pytest.mark.parametrize("name", SEEN)
 def test_kept_layers_give_the_image_of_a_new_renderer(gl, asked, name, backend):
-    kept, fresh = GlRenderer(gl, backend), GlRenderer(gl, backend)
+    kept, fresh = renderer_for(gl, backend), renderer_for(gl, backend)
     canvas, before = Canvas(gl, kept), asked.state.request()
     assert asked.state.request() == before
     canvas.update(asked.state, 0.0)
@@ -367,54 +365,3 @@ def test_two_clicks_measure_and_a_third_begins_anew(opened):
         settings.measure_at(opened, 0.5, 0.5)
         end(opened)
         assert opened.state.session.ruler == Ruler()
-
-
-# Times of the steps.
-
-
-def test_the_median_of_the_last_measurements_is_told():
-    timing = Timing()
-    for value in (1000.0, *range(KEPT)):
-        timing.add("sort", value)
-    timing.add("blend", 2.0)
-    assert timing.medians() == [("Sort", (KEPT - 1) / 2), ("Blend", 2.0)]
-
-
-@pytest.fixture(params=["cpu", "opengl"])
-def drawn(gl, opened, request):
-    """A viewer with a real picture."""
-    renderer = GlRenderer(gl, request.param, "single")
-    opened.surface = canvas = Canvas(gl, renderer)
-    opened.state.backend = renderer.backend
-    settings.resize(opened, 400, 300)
-    rest(canvas, opened.state, 0.0)
-    yield opened
-    renderer.release()
-
-
-def test_steps_are_measured_while_the_panel_is_seen(gl, drawn):
-    assert drawn.state.timing.medians() == []
-    drawn.state.timing.wanted = True
-    settings.prefer(drawn, coarse_while_moving=False)
-    go(viewpoint.look_from, drawn, "left")
-    rest(drawn.surface, drawn.state, 10.0)
-    laps, steps = drawn.state.timing.laps, {"projection", "sort", "blend", "compose"}
-    if drawn.state.backend == "cpu":
-        steps |= {"tiles", "colours"} if is_software(gl) else {"tiles", "colours", "upload"}
-    assert laps.keys() == steps | {"picture"}
-    assert sum(laps[name][0] for name in steps) <= laps["picture"][0]
-
-
-def test_opening_the_panel_measures_one_image(drawn):
-    """All of its steps, though nothing has changed; once."""
-    for now in (10.0, 11.0):
-        drawn.state.timing.wanted = True
-        rest(drawn.surface, drawn.state, now)
-        counts = {name: len(measured) for name, measured in drawn.state.timing.laps.items()}
-        assert counts.keys() >= {"projection", "sort", "blend", "compose", "picture"}
-        assert set(counts.values()) == {1}
-    drawn.state.timing.wanted = False  # closed, and opened again
-    rest(drawn.surface, drawn.state, 12.0)
-    drawn.state.timing.wanted = True
-    rest(drawn.surface, drawn.state, 13.0)
-    assert {len(measured) for measured in drawn.state.timing.laps.values()} == {2}

@@ -10,7 +10,6 @@ from plyfile import PlyData
 
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.scene import look_at
-from langsplat_viewer import marks
 from langsplat_viewer.actions import editing, opening, queries, selecting, settings, viewpoint
 from langsplat_viewer.actions.selecting import take
 from langsplat_viewer.camera.controls import from_camera
@@ -434,56 +433,3 @@ def test_unusable_name_says_why(opened):
     act(queries.name_selection, opened, "the")
     assert "'the' cannot be a name" in errors(opened)[-1]
     assert opened.state.session.queries == ()
-
-
-# By numbers.
-
-
-def test_range_of_values_selects_shown_gaussians(opened):
-    selecting.set_tools(opened, measure="relevancy")  # of an answer: there is none
-    assert selecting.values_shown(opened) is None
-    selecting.brush_values(opened, 0.5)
-    selecting.end_brush(opened)
-    assert marked(opened) == ("", "", "")
-    ask(opened, "book")
-    means = opened.state.scene.gaussians.means.astype(np.float64)
-    away = np.linalg.norm(means - opened.state.view.eye, axis=1)
-    take(opened, away < np.median(away))
-    selecting.hide_selected(opened)
-    selecting.set_tools(opened, measure="distance")
-    found = selecting.values_shown(opened)
-    assert found is selecting.values_shown(opened)
-    assert found.counts.sum() > 0
-    ends = 10 ** np.array([found.low, found.high])
-    np.testing.assert_allclose(ends, [np.median(away), away.max()], rtol=0.2)
-    selecting.brush_values(opened, 0.5)
-    selecting.brush_values(opened, -3.0)  # the mouse is outside
-    selecting.end_brush(opened)
-    cut = 10 ** ((found.low + found.high) / 2)
-    chosen = opened.state.marks.selected
-    np.testing.assert_array_equal(chosen, (away >= np.median(away)) & (away <= cut))
-    selecting.select_none(opened)
-    selecting.select_range(opened, f"{10**found.low:.9g} to {cut:.9g}")
-    assert (opened.state.marks.selected != chosen).sum() <= 2  # at the ends
-    for text in ("0.5", "near to far", ""):
-        selecting.select_range(opened, text)
-        assert "two numbers" in errors(opened)[-1]
-    viewpoint.frame_scene(opened)
-    selecting.set_tools(opened, measure="relevancy")
-    assert selecting.values_shown(opened).high == pytest.approx(result(opened, 0).even.max())
-
-
-@pytest.mark.parametrize("measure", marks.MEASURES)
-def test_histogram_leaves_out_nan(measure):
-    scene = SCENES["blobs.ply"]
-    broken = scene.gaussians.means.copy()
-    broken[0], broken[1] = np.nan, np.inf
-    logits = np.full(len(broken), np.inf, np.float32)
-    odd = replace(scene, gaussians=replace(scene.gaussians, means=broken, opacity_logits=logits))
-    values = marks.measured(odd, measure, np.zeros(3), np.full(len(broken), np.nan))
-    found = marks.histogram(values, np.ones(len(broken), bool))
-    assert np.isfinite([found.low, found.high]).all()
-    assert found.low < found.high
-    counted = np.expm1(found.counts.astype(np.float64)).sum()
-    assert counted == pytest.approx(np.isfinite(values).sum(), abs=0.01)
-    assert found.between(1.0, 0.0).sum() == np.isfinite(values).sum()

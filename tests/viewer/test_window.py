@@ -15,12 +15,12 @@ from tests.support.processes import Cast
 SCENARIOS = [
     "look_and_search", "without_field", "from_the_command_line", "broken_renderer", "use_shortcuts",
     "arrange_panels", "many_queries", "select_with_the_mouse", "outline_and_rest", "name_what_is_clicked",
-    "ask_before_leaving", "drag_the_gizmo", "type_while_opening", "travel_by_keys", "end_by_signals",
+    "ask_before_leaving", "drag_the_gizmo", "travel_by_keys", "end_by_signals",
     "look_at_nothing", "look_from_the_broad_side", "record_and_play", "mark_and_return",
     "close_while_opening", "split_the_view", "draw_over_the_scene", "look_without_perspective",
     "name_what_is_close", "reload_what_changed", "watch_a_training", "switch_between_scenes",
-    "search_a_library", "time_the_steps", "see_the_evidence", "large_letters",
-    "use_the_toolbar", "crop_box_and_brush", "pin_a_note", "use_the_outline", "compare_two_scenes",
+    "search_a_library", "see_the_evidence", "large_letters",
+    "use_the_toolbar", "drag_the_crop_box", "pin_a_note", "use_the_outline", "compare_two_scenes",
 ]  # fmt: skip
 
 

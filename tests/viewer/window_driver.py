@@ -27,7 +27,7 @@ from langsplat_core.io.scenes import load_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions import selecting, settings
 from langsplat_viewer.panels.ui import scene_area
-from langsplat_viewer.rendering.renderer import Backend, GlRenderer
+from langsplat_viewer.rendering.renderer import Backend, Renderer, renderer_for
 from langsplat_viewer.viewer import Services, Viewer
 from langsplat_viewer.window import Window, WindowRequest
 from tests.support.fakes import CENTRES, FakeEncoder
@@ -36,18 +36,6 @@ from tests.viewer import scenarios_panels, scenarios_scene
 
 MUG, BOOK, PLANT = CENTRES
 PATIENCE = 240.0  # seconds: other tests may have the cores
-
-
-class CountingRenderer(GlRenderer):
-    """Counts the pictures it draws."""
-
-    def __init__(self, ctx, backend: Backend) -> None:
-        super().__init__(ctx, backend)
-        self.count = 0
-
-    def draw(self, request, targets) -> None:
-        self.count += len(targets)
-        super().draw(request, targets)
 
 
 class Session:
@@ -67,7 +55,7 @@ class Session:
     ) -> None:
         self.folder, self.backend = folder, backend
         self.is_slow = load is not load_scene  # the scenario begins while the scene is read
-        self.renderer: CountingRenderer | None = None
+        self.drawn = 0  # pictures
         services = Services(load, lambda encoder_id: FakeEncoder())
         self.window = Window(
             WindowRequest(folder / scene, size=size, **request), services, self._make_renderer
@@ -75,9 +63,16 @@ class Session:
         self.window.idles = False
         self.state = self.window.viewer.state
 
-    def _make_renderer(self, ctx) -> CountingRenderer:
-        self.renderer = CountingRenderer(ctx, self.backend)
-        return self.renderer
+    def _make_renderer(self, ctx) -> Renderer:
+        self.renderer = renderer = renderer_for(ctx, self.backend)
+        draw = renderer.draw
+
+        def counted(request, targets) -> None:
+            self.drawn += len(targets)
+            draw(request, targets)
+
+        renderer.draw = counted
+        return renderer
 
     def run(self, test: Callable[["Session"], None]) -> None:
         def body(ctx) -> None:
@@ -142,9 +137,9 @@ class Session:
 
     def draws_nothing(self) -> None:
         """A picture is drawn again only when something changed."""
-        drawn = self.renderer.count
+        drawn = self.drawn
         self.ctx.yield_(20)
-        assert self.renderer.count == drawn
+        assert self.drawn == drawn
 
     def rest(self, frames: int) -> None:
         """Let so many frames pass, or, for 0, wait until it is settled."""
@@ -391,11 +386,11 @@ def broken_renderer(s: Session) -> None:
     def fail(*args, **kwargs) -> None:
         raise BackendError("the driver gave up; use --backend cpu")
 
-    s.renderer.draw = fail
+    draw, s.renderer.draw = s.renderer.draw, fail
     s.key("2")
     s.ctx.yield_(20)
     assert s.state.messages[-1].text == "the driver gave up; use --backend cpu"
-    del s.renderer.draw
+    s.renderer.draw = draw
     s.key("3", frames=1)
     assert s.shot("mended")[:, 400:].max() > 100
 
@@ -416,22 +411,6 @@ def close_while_opening(s: Session) -> None:
     s.ctx.item_click("//**/Cancel")
     assert s.viewer.worker.current is None
     Timer(1.0, READ_ON.set).start()  # when the window is closed
-
-
-def type_while_opening(s: Session) -> None:
-    """A word meant for the box that cannot be typed in yet is no row of keys."""
-    assert s.state.scene is None
-    box = s.ctx.item_info("//**/##phrase").rect_full
-    s.click_at((box.min.x + 20, (box.min.y + box.max.y) / 2), frames=2)
-    assert s.state.letters_muted
-    for key in ("P", "tab", "F"):
-        s.key(key, frames=2)
-    assert s.state.show_panel
-    assert not any("picture" in message.text for message in s.state.messages)
-    s.click_at((600, 400), frames=2)
-    assert not s.state.letters_muted
-    READ_ON.set()
-    s.wait(lambda: s.state.scene is not None)
 
 
 def look_from_the_broad_side(s: Session) -> None:
@@ -484,7 +463,6 @@ OPENED = {  # scene and request of the scenarios that do not just open "blobs.pl
     "from_the_command_line": ("blobs.ply", ASKED),
     "leave_settings": ("blobs.ply", {"settings": Path("settings")}),
     "find_settings": ("blobs.ply", {"settings": Path("settings")}),
-    "type_while_opening": ("blobs.ply", {"load": slow_load}),
     "close_while_opening": ("blobs.ply", {"load": slow_load}),
     "look_from_the_broad_side": ("wide.ply", {}),
     "look_at_nothing": ("nothing.ply", {}),

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from time import perf_counter
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
@@ -75,14 +74,12 @@ def answer(viewer: Viewer, phrase: str, then_show: bool = False) -> None:
     viewpoint = None if state.view is None else state.view.camera(*state.size)
 
     def work(progress: Progress) -> QueryAnswer:
-        began = perf_counter()
         try:
             composed = run_phrase(engine, phrase, level, viewpoint, progress)
         except UnknownWordError as error:
             return QueryAnswer(problem=str(error), meant=corrected(phrase, error.near) or "")
         reading = "" if isinstance(composed.tree, Atom) else composed.reading
-        milliseconds = 1e3 * (perf_counter() - began)
-        return QueryAnswer(composed.answer, (), reading, heads(composed.tree), milliseconds=milliseconds)
+        return QueryAnswer(composed.answer, (), reading, heads(composed.tree))
 
     def done(found: QueryAnswer) -> None:
         result = found.result
@@ -92,7 +89,6 @@ def answer(viewer: Viewer, phrase: str, then_show: bool = False) -> None:
         if result is None:
             viewer.say_error(found.problem)
             return
-        state.timing.add("search", found.milliseconds)
         if then_show:
             _show_answer(viewer, phrase, result)
         if result.found:
@@ -145,12 +141,11 @@ def forget_unlisted(viewer: Viewer) -> None:
 
 
 def focus_search(viewer: Viewer) -> None:
-    """Have the search box take the keyboard; where there is nothing to search, what is typed goes nowhere."""
+    """Have the search box take the keyboard; say so where there is nothing to search."""
     open_panel(viewer, "Search")
     scene = viewer.state.scene
     if scene is None or scene.language is None:
         viewer.say_error("open a scene first, then search it" if scene is None else no_field(scene))
-        viewer.state.letters_muted = True
     else:
         viewer.state.focus_input = viewer.state.awaits_keyboard = True
 

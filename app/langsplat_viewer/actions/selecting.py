@@ -189,56 +189,6 @@ def use_tool(viewer: Viewer, tool: Tool | None) -> None:
     set_tools(viewer, tool=tool, stroke=None)
 
 
-# Brushing over a histogram of the Gaussians' numbers.
-
-
-def values_shown(viewer: Viewer) -> marks.Histogram | None:
-    """Return the histogram of the chosen numbers, of what is shown; None where there are none of them."""
-    state, query = viewer.state, chosen_query(viewer)
-    if state.scene is None or state.view is None:
-        return None
-    measure, marked = state.tools.measure, state.marks
-    result = None if query is None else state.result(query)
-    relevancy = None if result is None else result.even
-    view = state.view if measure == "distance" else None
-    of = (state.scene, measure, relevancy, view, marked.hidden, marked.deleted)
-    kept = viewer.histogram
-    if kept is None or any(part is not before for part, before in zip(of, kept[0], strict=True)):
-        values = marks.measured(state.scene, measure, state.view.eye, relevancy)
-        viewer.histogram = of, None if values is None else marks.histogram(values, marked.shown)
-    return None if viewer.histogram is None else viewer.histogram[1]
-
-
-def brush_values(viewer: Viewer, at: float) -> None:
-    """Return the mouse is held at a fraction `at` of the histogram's range."""
-    brushed, at = viewer.state.tools.brushed, min(max(at, 0.0), 1.0)
-    set_tools(viewer, brushed=(at if brushed is None else brushed[0], at))
-
-
-def end_brush(viewer: Viewer, mode: Mode | None = None) -> None:
-    """Return the button goes up: select what has values in the range that was brushed."""
-    brushed, found = viewer.state.tools.brushed, values_shown(viewer)
-    set_tools(viewer, brushed=None)
-    if brushed is not None and found is not None:
-        take(viewer, found.between(*brushed), mode)
-
-
-def select_range(viewer: Viewer, text: str) -> None:
-    """Select what has values between two numbers that were typed, "0.5 to 0.9"."""
-    found = values_shown(viewer)
-    try:
-        ends = np.array([float(word) for word in text.split() if word != "to"])
-    except ValueError:
-        ends = np.zeros(0)
-    if found is None or len(ends) != 2:
-        viewer.say_error(f"'{text}' is not two numbers, such as 0.5 to 0.9")
-        return
-    if viewer.state.tools.measure in marks.LOGARITHMIC:
-        ends = np.log10(np.maximum(ends, 1e-30))
-    start, stop = (ends - found.low) / (found.high - found.low)
-    take(viewer, found.between(start, stop))
-
-
 # Writing what is selected, the rest, or the scene without what was deleted: to new files, never over old.
 
 Part = Literal["selection", "rest", "edited"]

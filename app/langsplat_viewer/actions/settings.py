@@ -7,15 +7,13 @@ from langsplat_core.config import ColourMap, Display, PictureConfig
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.query.engine import no_field
 from langsplat_viewer.actions.selecting import leave_tool, stay
-from langsplat_viewer.actions.viewpoint import glide_to
-from langsplat_viewer.camera.overlays import facing
 from langsplat_viewer.rendering.request import AT_RANGE, Clip, SplitMode
 from langsplat_viewer.session import OVERLAYS, Overlay, Ruler
-from langsplat_viewer.state import Recording, Timing, ViewerState
+from langsplat_viewer.state import Recording, ViewerState
 from langsplat_viewer.viewer import Viewer
 
 
-def put(part: ViewerState | Recording | Timing, **values: object) -> None:
+def put(part: ViewerState | Recording, **values: object) -> None:
     """Take what was typed or switched, where nothing follows from it.
 
     `values` are fields of the state or a part of it, by name. Panels write nothing themselves.
@@ -115,12 +113,6 @@ def toggle_overlay(viewer: Viewer, overlay: Overlay) -> None:
     viewer.change(overlays=tuple(name for name in OVERLAYS if name in kept))
 
 
-def turn_to_face(viewer: Viewer, face: str) -> None:
-    """Look straight at one face of the view cube, by its name in `camera.overlays.FACES`."""
-    if viewer.state.view is not None:
-        glide_to(viewer, facing(viewer.state.view, face))
-
-
 def measure(viewer: Viewer, on: bool) -> None:
     """Set whether clicks on the scene set the points of the ruler; what was measured goes when it ends."""
     if on != viewer.state.session.ruler.measures:
@@ -202,10 +194,10 @@ def toggle_palette(viewer: Viewer) -> None:
 
 
 def escape(viewer: Viewer) -> None:
-    """Close what lies over the scene, and let letters be keys again; where nothing did, leave the tool."""
+    """Close what lies over the scene; where nothing did, leave the tool."""
     state = viewer.state
     lay_over = state.show_help or state.show_palette or state.browser or state.leaving
-    state.show_help = state.pins_notes = state.letters_muted = False
+    state.show_help = state.pins_notes = False
     show_palette(viewer, False)
     measure(viewer, False)
     state.browser = None

@@ -216,13 +216,6 @@ def toggle_orthographic(viewer: Viewer) -> None:
     set_orthographic(viewer, viewer.state.view is not None and not viewer.state.view.orthographic)
 
 
-def toggle_walking(viewer: Viewer) -> None:
-    """Have the keys that fly ahead keep the height of the eye, or no longer."""
-    walks = not viewer.state.preferences.walks
-    viewer.state.preferences = replace(viewer.state.preferences, walks=walks)
-    viewer.state.say("W A S D walk at one height" if walks else "W A S D fly")
-
-
 def go_to_camera(viewer: Viewer, index: int) -> None:
     """Stand where a training photograph was taken; indices beyond the ends wrap round."""
     scene, extent = viewer.state.scene, viewer.state.extent

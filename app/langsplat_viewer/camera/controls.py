@@ -246,20 +246,6 @@ def fly(view: OrbitCamera, right: float, up: float, forward: float) -> OrbitCame
     return replace(view, target=view.target + step)
 
 
-def walk(view: OrbitCamera, right: float, up: float, forward: float) -> OrbitCamera:
-    """Move as `fly` does, but ahead is level.
-
-    Who looks straight up or down goes where the image's top or foot points.
-    """
-    ahead = view.rotation[2] - (view.rotation[2] @ view.up) * view.up
-    if np.linalg.norm(ahead) < 1e-3:
-        ahead = -view.rotation[1] if view.elevation < 0 else view.rotation[1]
-        ahead = ahead - (ahead @ view.up) * view.up
-    ahead = ahead / np.linalg.norm(ahead)
-    step = right * np.cross(ahead, view.up) + up * view.up + forward * ahead
-    return replace(view, target=view.target + step)
-
-
 def frame_of(up: Array) -> Array:
     """Return the (3, 3) rows right, up and front of a world whose up is `up` (3,) unit.
 

@@ -1,4 +1,4 @@
-"""Overlays as plain maths in float64: labels, lines, ground grid and view cube. No window."""
+"""Overlays as plain maths in float64: labels, lines and ground grid. No window."""
 
 import math
 from collections.abc import Sequence
@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.scene import Camera, look_at
-from langsplat_viewer.camera.controls import Extent, OrbitCamera, frame_of, weighted_quantile
+from langsplat_core.scene import Camera
+from langsplat_viewer.camera.controls import Extent, frame_of, weighted_quantile
 
 
 @dataclass(frozen=True)
@@ -29,31 +29,17 @@ class PlacedText:
 def placed(labels: Sequence[PlacedText], size: tuple[float, float]) -> list[PlacedText]:
     """Return the labels, none over another, in an image of `size` (width, height).
 
-    Each one goes straight up until it is free of those before it, where the image ends straight down; where
-    there is no room it stays.
-
-    A label depends on those before it alone and in always the same way: it moves with its thing, and jumps
-    only where it meets another or parts from it.
+    Each one goes straight up until it is free of those before it; where there is no room it stays. So it
+    moves with its thing, and jumps only where it meets another or parts from it.
     """
     found: list[PlacedText] = []
     for label in labels:
         x = max(min(label.x, size[0] - label.width), 0.0)
-        y = max(min(label.y, size[1] - label.height), 0.0)
-        inside = PlacedText(x, y, label.width, label.height)
-        free = _moved(inside, found, up=True) or _moved(inside, found, up=False)
-        found.append(inside if free is None or free.y + free.height > size[1] else free)
+        free = inside = replace(label, x=x, y=max(min(label.y, size[1] - label.height), 0.0))
+        while free.y >= 0 and (met := next((other for other in found if free.covers(other)), None)):
+            free = replace(free, y=met.y - free.height)
+        found.append(free if free.y >= 0 else inside)
     return found
-
-
-def _moved(label: PlacedText, others: Sequence[PlacedText], *, up: bool) -> PlacedText | None:
-    """Move a label up or down as far as it must; None beyond the upper edge of the image."""
-    while label.y >= 0:
-        met = next((other for other in others if label.covers(other)), None)
-        if met is None:
-            return label
-        y = met.y - label.height if up else met.y + met.height
-        label = PlacedText(label.x, y, label.width, label.height)
-    return None
 
 
 # Lines: where they are in the world, and where on screen.
@@ -185,72 +171,3 @@ def ground_grid(extent: Extent, up: Array, metres_per_unit: float | None) -> Gri
 
 def _multiples(low: float, high: float, spacing: float) -> Array:
     return spacing * np.arange(math.floor(low / spacing), math.ceil(high / spacing) + 1)
-
-
-# The view cube.
-
-# Name of a face -> its normal in the axes right, up and front.
-FACES: dict[str, tuple[int, int, int]] = {
-    "right": (1, 0, 0),
-    "left": (-1, 0, 0),
-    "top": (0, 1, 0),
-    "bottom": (0, -1, 0),
-    "front": (0, 0, 1),
-    "back": (0, 0, -1),
-}
-
-
-@dataclass(frozen=True, eq=False)
-class Face:
-    """One side of the cube that can be seen."""
-
-    name: str
-    corners: Array  # (4, 2) in order around it, x right and y down; the cube has edges of length 2
-    centre: Array  # (2,)
-    towards: float  # in (0, 1]: how much it faces the eye
-
-
-def visible_faces(view: OrbitCamera) -> tuple[Face, ...]:
-    """Return the one to three sides that face the eye, without perspective."""
-    to_screen = view.rotation @ frame_of(view.up).T
-    faces = []
-    for name, normal in FACES.items():
-        middle = to_screen @ np.array(normal, float)
-        if middle[2] < -1e-9:
-            first, second = (np.roll(np.abs(normal), shift) for shift in (1, 2))
-            signs = ((1, 1), (1, -1), (-1, -1), (-1, 1))
-            corners = np.array([normal + a * first + b * second for a, b in signs], float) @ to_screen.T
-            faces.append(Face(name, corners[:, :2], middle[:2], -float(middle[2])))
-    return tuple(faces)
-
-
-def face_at(faces: Sequence[Face], point: tuple[float, float]) -> str:
-    """Return the name of the face at a place in the cube's own units; "" beside the cube."""
-    for face in faces:
-        edges = np.roll(face.corners, -1, 0) - face.corners
-        to_point = np.asarray(point) - face.corners
-        sides = edges[:, 0] * to_point[:, 1] - edges[:, 1] * to_point[:, 0]
-        if (sides >= 0).all() or (sides <= 0).all():
-            return face.name
-    return ""
-
-
-def facing(view: OrbitCamera, name: str) -> OrbitCamera:
-    """Return the view that sees the face `name` from straight ahead.
-
-    It turns around the same target at the same distance. The world's up is up; from above and below the axis
-    that is nearest to the image's up now.
-    """
-    frame = frame_of(view.up)
-    normal = np.array(FACES[name], float) @ frame
-    up = view.up
-    if name in ("top", "bottom"):
-        level = np.concatenate([frame[[0, 2]], -frame[[0, 2]]])
-        up = level[int((level @ -view.rotation[1]).argmax())]
-    seen = look_at(view.target + view.distance * normal, view.target, up, (1, 1))
-    return replace(view, rotation=seen.rotation)
-
-
-def world_axes(view: OrbitCamera) -> Array:
-    """(3, 3) where the world's x, y and z point on screen: right, down and away from the eye."""
-    return view.rotation.T.copy()

@@ -40,9 +40,6 @@ class Preferences:
         float,
         Meta(ge=0.05, le=4, title="Fly speed", description="Scene radii per second", extra=CAMERA),
     ] = 0.5
-    walks: Annotated[
-        bool, Meta(title="Walk", description="W A S D keep the height of the eye", extra=CAMERA)
-    ] = False
     coarse_while_moving: Annotated[
         bool,
         Meta(

@@ -54,7 +54,6 @@ CORE_PANELS: tuple[Panel, ...] = (
     Panel("Messages", FOOT, status.draw_messages),
     Panel("Overlays", MIDDLE, notes.draw_overlays, is_open=False),
     Panel("Notes", MIDDLE, notes.draw_notes, is_open=False),
-    Panel("Timing", MIDDLE, status.draw_timing, is_open=False),
 )
 
 
@@ -172,7 +171,7 @@ def draw_over(viewer: Viewer) -> None:
         select.draw_hint(viewer, area)
         select.draw_gizmo(viewer, area)
     overlays.draw_grip(viewer, area)
-    overlays.draw_cube(viewer, area)
+    overlays.draw_axes(viewer, area)
     menus.draw_toolbar(viewer, area)
     questions.draw_changed(viewer, area)
     questions.draw_unsaved(viewer)

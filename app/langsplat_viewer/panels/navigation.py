@@ -11,7 +11,7 @@ from functools import cache
 
 from imgui_bundle import imgui
 
-from langsplat_viewer.actions import settings, viewpoint
+from langsplat_viewer.actions import viewpoint
 from langsplat_viewer.camera import controls
 from langsplat_viewer.commands import COMMANDS, Command
 from langsplat_viewer.panels import select, ui
@@ -185,16 +185,16 @@ def chord(text: str) -> Chord:
 
 def handle_keys(viewer: Viewer) -> None:
     """Run the commands whose keys were pressed in this frame."""
-    state, typing = viewer.state, imgui.get_io().want_text_input
+    typing = imgui.get_io().want_text_input
     for command in COMMANDS:
-        if any(_pressed(chord(text), command, typing, state.letters_muted) for text in command.keys):
+        if any(_pressed(chord(text), command, typing) for text in command.keys):
             command.act(viewer)
             return
 
 
-def _pressed(wanted: Chord, command: Command, typing: bool, muted: bool) -> bool:
+def _pressed(wanted: Chord, command: Command, typing: bool) -> bool:
     io = imgui.get_io()
-    if (typing and (wanted.is_plain or command.is_edit)) or (muted and wanted.is_plain):
+    if typing and (wanted.is_plain or command.is_edit):
         return False
     if wanted.key is None:
         return not io.key_ctrl and wanted.character in map(chr, io.input_queue_characters)
@@ -202,12 +202,6 @@ def _pressed(wanted: Chord, command: Command, typing: bool, muted: bool) -> bool
     if io.key_super or held != (wanted.ctrl, wanted.shift, wanted.alt):
         return False
     return imgui.is_key_pressed(wanted.key, command.repeats)
-
-
-def muted_until_clicked(viewer: Viewer) -> None:
-    """Letters are keys again once something is clicked; to be called before the panels are drawn."""
-    if imgui.is_mouse_clicked(imgui.MouseButton_.left):
-        settings.put(viewer.state, letters_muted=False)
 
 
 # Mouse and held keys over the scene.
@@ -227,8 +221,7 @@ def handle(viewer: Viewer, area: ui.Area) -> None:
         _mouse(viewer, area)
     viewpoint.hover(viewer, _pixel(area))
     handle_keys(viewer)
-    letters = not (io.want_text_input or io.key_ctrl or viewer.state.letters_muted)
-    if viewer.state.view is not None and letters:
+    if viewer.state.view is not None and not (io.want_text_input or io.key_ctrl):
         _fly(viewer)
 
 
@@ -285,8 +278,7 @@ def _fly(viewer: Viewer) -> None:
     if right or up or ahead:
         factor = 4.0 if io.key_shift else 0.25 if io.key_alt else 1.0
         step = factor * viewer.state.preferences.fly_speed * extent.radius * seconds
-        go = controls.walk if viewer.state.preferences.walks else controls.fly
-        viewpoint.move(viewer, lambda view: go(view, right * step, up * step, ahead * step))
+        viewpoint.move(viewer, lambda view: controls.fly(view, right * step, up * step, ahead * step))
     turn = held(key.right_bracket, key.left_bracket)
     if turn:
         viewpoint.move(viewer, lambda view: controls.roll(view, turn * ROLL_SPEED * seconds))

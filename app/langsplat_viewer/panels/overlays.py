@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, get_args
 
 import moderngl
 import numpy as np
@@ -15,8 +15,8 @@ from langsplat_core.query.describe import LevelWords
 from langsplat_core.scene import LEVELS, Camera
 from langsplat_viewer.actions import projects, settings, viewpoint
 from langsplat_viewer.camera import overlays
-from langsplat_viewer.camera.controls import OrbitCamera
-from langsplat_viewer.camera.overlays import Face, PlacedText, face_at, placed, visible_faces, world_axes
+from langsplat_viewer.camera.controls import Side, from_side
+from langsplat_viewer.camera.overlays import PlacedText, placed
 from langsplat_viewer.panels import ui
 from langsplat_viewer.state import Hover
 from langsplat_viewer.viewer import Viewer
@@ -265,19 +265,15 @@ def _things(viewer: Viewer, area: ui.Area, camera: Camera, least: float) -> None
 
 
 def _names(named: list[Named], area: ui.Area) -> None:
-    """Write the phrases above the highest corners of their boxes.
-
-    A line leads to those that had to make room.
-    """
+    """Write the phrases above the highest corners of their boxes, with a line to those that made room."""
     line, edge, paint = imgui.get_text_line_height(), shade_edge(), imgui.get_background_draw_list()
-    room = (area.width, area.height)
     wanted = []
     for name in named:
         (x, y), size = name.corner, imgui.calc_text_size(name.text)
         wanted.append(PlacedText(x + 4 - edge, y - 1.4 * line - edge, size.x + 2 * edge, size.y + 2 * edge))
-    found = placed(wanted, room)
+    found = placed(wanted, (area.width, area.height))
     for name, alone, label in zip(named, wanted, found, strict=True):
-        if abs(label.y - placed([alone], room)[0].y) > label.height / 2:
+        if label.y < alone.y - label.height / 2:
             start = ImVec2(area.left + name.corner[0], area.top + name.corner[1])
             end = ImVec2(area.left + label.x, area.top + label.y + label.height / 2)
             paint.add_line(start, end, imgui.get_color_u32(name.colour), 1.5)
@@ -470,68 +466,47 @@ def pointed_figures(hover: Hover) -> list[str]:
     return [*lines, f"at {x:.2f}  {y:.2f}  {z:.2f}, {hover.found.depth:.2f} away"]
 
 
-# The view cube; a click on a face turns the view there. ImGuizmo's takes y as up and names no side; its
-# documentation warns of a patent.
+# Axes over the image's corner; a click on the end of one turns the view there. ImGuizmo's cube takes y as up
+# and names no side; its documentation warns of a patent.
 
-SIDE_EM = 7.0  # of the corner that it takes
-EDGE = 0.24  # of that side, half the cube's edge: its corners reach 1.73 times as far
-AXIS = 1.62  # length of the world's axes in the cube's units
-AXES = (("x", (0.93, 0.33, 0.31)), ("y", (0.45, 0.78, 0.30)), ("z", (0.36, 0.60, 0.98)))
-LIT, DARK, HOVERED_FACE = 0.80, 0.45, (0.98, 0.78, 0.35)
-INK = (0.08, 0.08, 0.10)
+SIDE_EM = 7.0  # of the corner that they take
+REACH_OF_ENDS, REACH_OF_AXES = 0.40, 0.26  # of that side, from the middle
+AXES = (("x", (0.93, 0.33, 0.31)), ("y", (0.45, 0.78, 0.30)), ("z", (0.36, 0.60, 0.98)))  # the world's
+GREY, LIT = (0.75, 0.75, 0.75), (0.98, 0.78, 0.35)
 
 
-def draw_cube(viewer: Viewer, area: ui.Area) -> None:
-    """Draw the view cube over the image's corner; a click on a face turns the view there."""
+def draw_axes(viewer: Viewer, area: ui.Area) -> None:
+    """Draw the world's axes, and the sides that a scene can be looked at from."""
     view = viewer.state.view
-    if view is None or "cube" not in viewer.state.session.overlays:
+    if view is None or "cube" not in viewer.state.session.overlays:  # as files call them
         return
     side = min(hello_imgui.em_size(SIDE_EM), area.width, area.height)
-    corner = ImVec2(area.left + area.width - side, area.top)
+    corner = np.array([area.left + area.width - side, area.top])
     imgui.push_style_var(imgui.StyleVar_.window_padding, ImVec2(0, 0))
-    imgui.set_next_window_pos(corner)
+    imgui.set_next_window_pos(ImVec2(*corner))
     imgui.set_next_window_size(ImVec2(side, side))
-    imgui.begin("view cube", None, UNMOVED)
-    pressed = imgui.invisible_button("cube", ImVec2(side, side))
-    middle, scale = (corner.x + side / 2, corner.y + side / 2), EDGE * side
-    mouse, faces = imgui.get_io().mouse_pos, visible_faces(view)
-    place = ((mouse.x - middle[0]) / scale, (mouse.y - middle[1]) / scale)
-    under = face_at(faces, place) if imgui.is_item_hovered() else ""
-    _axes(view, middle, scale, behind=True)
-    for face in faces:
-        _face(face, middle, scale, face.name == under)
-    _axes(view, middle, scale, behind=False)
+    imgui.begin("axes", None, UNMOVED)
+    pressed = imgui.invisible_button("sides", ImVec2(side, side))
+    paint, middle = imgui.get_window_draw_list(), corner + side / 2
+    for (letter, paint_of), axis in zip(AXES, view.rotation.T, strict=True):
+        end = middle + REACH_OF_AXES * side * axis[:2]
+        paint.add_line(ImVec2(*middle), ImVec2(*end), _faded(paint_of, 1.0), 2.0)
+        paint.add_text(ImVec2(*end), _faded(paint_of, 1.0), letter)
+    radius, mouse = 0.3 * imgui.get_text_line_height(), imgui.get_io().mouse_pos
+    ends = {name: view.rotation @ -from_side(view, name).rotation[2] for name in get_args(Side)}
+    under: Side | None = None
+    for name, end in sorted(ends.items(), key=lambda item: -item[1][2]):  # the nearest one last
+        x, y = middle + REACH_OF_ENDS * side * end[:2]
+        hovered = imgui.is_item_hovered() and np.hypot(mouse.x - x, mouse.y - y) < 2 * radius
+        under = name if hovered else under
+        colour = _faded(LIT if hovered else GREY, 0.95 if end[2] < 0.1 else 0.4)
+        paint.add_circle_filled(ImVec2(x, y), radius, colour)
+        if end[2] < 0.1:
+            paint.add_text(ImVec2(x - ui.width_of(name) / 2, y + radius), colour, name)
     imgui.end()
     imgui.pop_style_var()
-    if pressed and under:
-        settings.turn_to_face(viewer, under)
-
-
-def _face(face: Face, middle: tuple[float, float], scale: float, hovered: bool) -> None:
-    paint = imgui.get_window_draw_list()
-    corners: list[Any] = [_on_cube(corner, middle, scale) for corner in face.corners]  # of imgui's own union
-    grey = DARK + (LIT - DARK) * face.towards
-    paint.add_convex_poly_filled(corners, _faded(HOVERED_FACE if hovered else (grey, grey, grey), 0.92))
-    paint.add_polyline(corners, _faded(INK, 0.7), 1.0, imgui.ImDrawFlags_.closed)
-    if face.towards > 0.45:
-        size, centre = imgui.calc_text_size(face.name), _on_cube(face.centre, middle, scale)
-        paint.add_text(ImVec2(centre.x - size.x / 2, centre.y - size.y / 2), _faded(INK, 1.0), face.name)
-
-
-def _axes(view: OrbitCamera, middle: tuple[float, float], scale: float, *, behind: bool) -> None:
-    """Draw the world's own axes, from the middle of the cube; those that point away lie behind it."""
-    paint = imgui.get_window_draw_list()
-    for (name, colour), axis in zip(AXES, world_axes(view), strict=True):
-        if (axis[2] > 0) == behind:
-            start, end = (
-                _on_cube(reach * axis[:2], middle, scale) for reach in (0.0 if behind else 1.0, AXIS)
-            )
-            paint.add_line(start, end, _faded(colour, 1.0), 2.0)
-            paint.add_text(ImVec2(end.x + 2, end.y - 8), _faded(colour, 1.0), name)
-
-
-def _on_cube(place: Array, middle: tuple[float, float], scale: float) -> ImVec2:
-    return ImVec2(middle[0] + scale * float(place[0]), middle[1] + scale * float(place[1]))
+    if pressed and under is not None:
+        viewpoint.look_from(viewer, under)
 
 
 def _faded(colour: Iterable[float], alpha: float) -> int:

@@ -4,6 +4,7 @@ import math
 from functools import lru_cache
 from typing import get_args
 
+import numpy as np
 from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
 
 from langsplat_core.arrays import Array
@@ -14,7 +15,6 @@ from langsplat_core.query.engine import no_field
 from langsplat_core.scene import CANONICAL_PHRASES, LEVELS
 from langsplat_core.scene.language import split_phrases
 from langsplat_viewer.actions import queries, settings, viewpoint
-from langsplat_viewer.marks import counted
 from langsplat_viewer.panels import ui
 from langsplat_viewer.panels.overlays import bar_colours, draw_bar
 from langsplat_viewer.session import Query
@@ -82,7 +82,7 @@ def _offer_buttons(viewer: Viewer, title: str, phrases: tuple[str, ...]) -> None
 
 # The threshold of an answer: a histogram of its relevancies, and a slider over it.
 
-HISTOGRAM_EM = 3.0
+HISTOGRAM_EM, BINS = 3.0, 64
 
 
 def _cut(viewer: Viewer, query: Query, result: QueryResult) -> None:
@@ -113,8 +113,11 @@ def _cut(viewer: Viewer, query: Query, result: QueryResult) -> None:
 
 @lru_cache(maxsize=8)
 def histogram(result: QueryResult) -> tuple[float, float, Array]:
-    """Return the relevancies of an answer, as `marks.counted` has them."""
-    return counted(result.even, 1e-3)
+    """Return lowest and highest relevancy of an answer, and (BINS,) float32 log(1 + n) of those between."""
+    values = result.even[np.isfinite(result.even)]
+    low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
+    high = max(high, low + 1e-3)
+    return low, high, np.log1p(np.histogram(values, BINS, (low, high))[0]).astype(np.float32)
 
 
 # The list of queries.
@@ -252,12 +255,7 @@ def draw(viewer: Viewer) -> None:
         ui.small_wrapped(no_field(scene), ui.muted())
         return
     imgui.begin_disabled(scene is None)
-    imgui.begin_group()
     _box(viewer)
-    imgui.end_group()
-    hovered = imgui.is_item_hovered(imgui.HoveredFlags_.allow_when_disabled)
-    if scene is None and hovered and imgui.is_mouse_clicked(imgui.MouseButton_.left):
-        settings.put(viewer.state, letters_muted=True)  # what is typed now was meant for the box
     _level(viewer)
     imgui.end_disabled()
     if viewer.engine is not None:

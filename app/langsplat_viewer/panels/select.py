@@ -74,7 +74,6 @@ def draw(viewer: Viewer) -> None:
     selecting.set_tools(viewer, reach=reach)
     _name(viewer)
     imgui.separator()
-    _values(viewer)
     _buttons(viewer, FATES)
     imgui.separator()
     imgui.align_text_to_frame_padding()
@@ -135,50 +134,6 @@ def _name(viewer: Viewer) -> None:
     if name is not None:
         queries.name_selection(viewer, name)
     ui.tip("Searching for the name finds this, and what is like it")
-
-
-HISTOGRAM_EM = 3.0
-
-
-def _values(viewer: Viewer) -> None:
-    """Draw a histogram of a number that every Gaussian has; a drag over it selects those in its range."""
-    if not imgui.collapsing_header("By numbers"):
-        return
-    tools = viewer.state.tools
-    measure = ui.radio({name: name.capitalize() for name in marks.MEASURES}, tools.measure)
-    if measure != tools.measure:
-        selecting.set_tools(viewer, measure=measure, brushed=None)
-    found = selecting.values_shown(viewer)
-    if found is None:
-        ui.small_wrapped("search for something first", ui.muted())
-        return
-    size = ImVec2(imgui.get_content_region_avail().x, hello_imgui.em_size(HISTOGRAM_EM))
-    corner = imgui.get_cursor_screen_pos()
-    imgui.set_next_item_allow_overlap()
-    imgui.plot_histogram("##values", found.counts, graph_size=size)
-    imgui.set_cursor_screen_pos(corner)
-    imgui.invisible_button("brush values", size)
-    at = (imgui.get_io().mouse_pos.x - corner.x) / size.x
-    if imgui.is_item_active():
-        selecting.brush_values(viewer, at)
-    elif tools.brushed is not None:
-        selecting.end_brush(viewer, held_mode())
-    brushed = viewer.state.tools.brushed
-    if brushed is not None:
-        left, right = (corner.x + part * size.x for part in sorted(brushed))
-        paint = imgui.get_window_draw_list()
-        paint.add_rect_filled(ImVec2(left, corner.y), ImVec2(right, corner.y + size.y), _colour(PAINT))
-    start, stop = sorted(brushed) if brushed else (0.0, 1.0)
-    hint = f"{_value(viewer, found, start)} to {_value(viewer, found, stop)}"
-    entered, typed = ui.box("##range", hint, "")
-    if entered:
-        selecting.select_range(viewer, typed)
-    ui.tip("Drag over the histogram, or type two numbers; Shift adds, Ctrl removes, both intersect")
-
-
-def _value(viewer: Viewer, found: marks.Histogram, part: float) -> str:
-    value = found.low + part * (found.high - found.low)
-    return f"{10**value if viewer.state.tools.measure in marks.LOGARITHMIC else value:.3g}"
 
 
 def _buttons(viewer: Viewer, verbs: Sequence[Verb]) -> None:

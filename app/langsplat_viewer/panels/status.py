@@ -1,13 +1,10 @@
-"""The panels "Messages" and "Timing"."""
+"""The panel "Messages"."""
 
 from imgui_bundle import ImVec2, imgui
 
-from langsplat_viewer.actions import opening, settings
+from langsplat_viewer.actions import opening
 from langsplat_viewer.panels import ui
-from langsplat_viewer.state import memory_bytes
 from langsplat_viewer.viewer import Viewer
-
-# The panel "Messages".
 
 LEAST_LINES = 2  # of messages, however low the panel is
 
@@ -33,25 +30,3 @@ def figures(viewer: Viewer) -> str:
         parts += [f"{stats.milliseconds:.0f} ms", f"{stats.width} x {stats.height}"]
     parts += [f"{selected:,} selected"] if selected else []
     return "   ".join(part for part in parts if part)
-
-
-# The panel "Timing".
-
-
-def draw_timing(viewer: Viewer) -> None:
-    """Draw the panel "Timing": medians of the last images, and memory."""
-    settings.put(viewer.state.timing, wanted=True)
-    rows = [(title, f"{milliseconds:.1f} ms") for title, milliseconds in viewer.state.timing.medians()]
-    memory = memory_bytes()
-    if memory is not None:
-        rows.append(("Memory", ui.in_words(memory)))
-    if imgui.begin_table("timing", 2):
-        imgui.table_setup_column("step", imgui.TableColumnFlags_.width_stretch, 5)
-        imgui.table_setup_column("time", imgui.TableColumnFlags_.width_stretch, 4)
-        for title, text in rows:
-            imgui.table_next_row()
-            imgui.table_next_column()
-            imgui.text(title)
-            imgui.table_next_column()
-            imgui.text_colored(ui.muted(), text)
-        imgui.end_table()
