@@ -15,8 +15,7 @@ from langsplat_core.semantics.store import ImageFeatures
 from langsplat_viewer.actions import browsing, editing, queries, settings
 from langsplat_viewer.files.projects import read_queries, write_queries
 from langsplat_viewer.headless import answer_line
-from langsplat_viewer.marks import BINS
-from langsplat_viewer.panels.search import hint, histogram
+from langsplat_viewer.panels.search import BINS, hint, histogram
 from langsplat_viewer.session import Query, Session
 from langsplat_viewer.viewer import Services
 from tests.support.fakes import CENTRES, FakeEncoder, as_trained, axis, blob_scene, calibrated_for, language
