@@ -14,8 +14,7 @@ from langsplat_core.config import TrainPreset
 from langsplat_core.query.answers import QueryResult, recut
 from langsplat_core.query.describe import Pointed
 from langsplat_core.query.instances import Instance
-from langsplat_core.query.outline import Outline
-from langsplat_core.query.suggestions import Suggestions
+from langsplat_core.query.inventory import Outline, Suggestions
 from langsplat_core.scene import Camera, Scene
 from langsplat_core.scene.language import Tree
 from langsplat_viewer.camera.controls import Extent, OrbitCamera

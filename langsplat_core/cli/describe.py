@@ -25,8 +25,7 @@ from langsplat_core.pipeline.labels import export_labels
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.describe import Describer, LevelWords, look_at_pixel
 from langsplat_core.query.engine import QueryEngine, check_words, searchable
-from langsplat_core.query.inventory import InventoryEntry, scene_inventory
-from langsplat_core.query.outline import scene_outline
+from langsplat_core.query.inventory import InventoryEntry, scene_inventory, scene_outline
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import LEVELS, LanguageField, Scene, TaughtWord
 from langsplat_core.scene.language import phrase_key

@@ -52,7 +52,7 @@ from langsplat_core.query.compose import Number, check_phrase, count_things, joi
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder, searchable
 from langsplat_core.query.grammar import Atom, Counted, Phrase, heads, unparse
 from langsplat_core.query.instances import Instance, hull
-from langsplat_core.query.pixels import decoded_relevancy, peak_pixel, splatted_relevancy
+from langsplat_core.query.lookup import decoded_relevancy, peak_pixel, splatted_relevancy
 from langsplat_core.query.selection import grow, of_rows, shrink
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.render import view_of

@@ -9,10 +9,9 @@ import numpy as np
 
 from langsplat_core.io.files import atomic_path, check_output_file
 from langsplat_core.io.scenes import check_writable, save_scene
-from langsplat_core.query.describe import Describer
+from langsplat_core.query.describe import OR, Describer
 from langsplat_core.query.instances import axis_aligned_box
-from langsplat_core.query.outline import Outline, scene_outline
-from langsplat_core.query.word_scores import OR
+from langsplat_core.query.inventory import Outline, scene_outline
 from langsplat_core.scene import LEVELS, NO_NODE
 
 

@@ -28,12 +28,12 @@ from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, QUERY_COLOURS
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query import nouns, taught
+from langsplat_core.query import grammar, taught
 from langsplat_core.query.engine import QueryEngine, TextEncoder, no_field
 from langsplat_core.query.instances import BOXED, oriented_box
+from langsplat_core.query.inventory import suggest
 from langsplat_core.query.regions import place_of
 from langsplat_core.query.rule import RULE, bars_of
-from langsplat_core.query.suggestions import suggest
 from langsplat_core.raster.opengl.shaders import WEB, shader, splat_shaders
 from langsplat_core.scene import LEVELS, Camera, Gaussians, Scene
 from langsplat_core.scene.gaussians import along_curve
@@ -244,7 +244,7 @@ def language_tables(
 def _word_lists() -> dict[str, list[str]]:
     """Return the word lists by which a part is told from a thing, sorted."""
     names = ("ARTICLES", "STOP_WORDS", "ADJECTIVES", "PARTS")
-    return {name.lower(): sorted(getattr(nouns, name)) for name in names}
+    return {name.lower(): sorted(getattr(grammar, name)) for name in names}
 
 
 def _region_tables(engine: QueryEngine) -> dict[str, Array]:

@@ -8,8 +8,8 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.compiled import plain
 from langsplat_core.config import LevelChoice
+from langsplat_core.query.grammar import named
 from langsplat_core.query.instances import axis_aligned_box
-from langsplat_core.query.nouns import named
 from langsplat_core.query.regions import Regions, place_of
 from langsplat_core.query.rule import (
     Bars,

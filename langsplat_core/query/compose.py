@@ -23,10 +23,10 @@ from langsplat_core.query.grammar import (
     Without,
     atoms,
     children,
+    named,
     parse,
     unparse,
 )
-from langsplat_core.query.nouns import named
 from langsplat_core.query.relations import WHOLE, Body, body, most, separate, stands, upright, viewpoint
 from langsplat_core.query.rule import RULE, combined, judge, triple
 from langsplat_core.scene import LEVELS, Camera

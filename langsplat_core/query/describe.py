@@ -1,7 +1,19 @@
-"""Reverse queries: the most probable words for Gaussians, and for the surface under a pixel."""
+"""Vocabularies as numbers: how probable each of many words is for a language feature.
+
+    p(word | x)  =  softmax over words of  scale * (cos(x, word) - hub(word) / 2)
+
+The hub of a word is its mean cosine with the features of the scene that are nearest to it. Some words lie
+near every image and would be the answer everywhere ("hubs"); what is left of the cosine says how much
+better a word fits here than where it fits anyway. It is cross-domain similarity local scaling ("Word
+translation without parallel data", Conneau et al. 2018, equation 3): 2 cos(x, w) - hub(w) - hub(x), halved,
+and without hub(x), which all words have in common.
+
+The canonical phrases ("object", "things", "stuff", "texture") compete too: their share is the chance that no
+word of the vocabulary fits.
+"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -12,12 +24,146 @@ from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.word_scores import Word, WordScores, build_attributes, build_words
 from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.raster.render import pixel_weights
-from langsplat_core.scene import LEVELS, Camera
+from langsplat_core.scene import LEVELS, Camera, Codec, LanguageField
 from langsplat_core.scene.surface import surface_areas
 from langsplat_core.semantics.vocabulary import Bundled, bundled_vocabulary
+
+# Logits per spread of phrases' cosines with a feature: a probability is then right about so often, with the
+# bundled encoder and with the geometry of CLIP (rooms 201 to 203, docs/searching.md).
+WORD_SCALE = 6.0
+ATTRIBUTE_SCALE = 3.4
+NEAREST = 10  # features that make a word's hub, as in the paper
+BANK = 4096  # features that are looked at for it, of codebooks; of other codecs fewer, since none is distinct
+SAMPLES = 512
+NARROWEST = 1e-6  # spread; words that are all the same have none
+LIKELY = 0.5  # probability from which a word is said
+OR = " or "  # between words for one thing
+CELLS = 8_000_000  # numbers of a block of features times words: 32 MB
+
+
+@dataclass(frozen=True)
+class Word:
+    """A phrase and how probable it is, among its vocabulary."""
+
+    phrase: str
+    probability: float  # in [0, 1]
+
+
+@dataclass(frozen=True, eq=False)
+class WordScores:
+    """A vocabulary as numbers: everything about it that does not depend on the place that is asked for."""
+
+    phrases: tuple[str, ...]  # V
+    vectors: Array  # (V + C, D) float32 unit; the last C stand for "none of these"
+    hubs: Array  # (V + C,) float32, taken half
+    scale: float  # of the softmax
+
+    def vector(self, phrase: str) -> Array:
+        """Return the (D,) unit vector of one of the phrases."""
+        return self.vectors[self.phrases.index(phrase)]
+
+    def take(self, chosen: Array) -> "WordScores":
+        """Return the scores of the phrases for which `chosen` (V,) bool is True; the canonical ones stay."""
+        rows = np.append(chosen, np.ones(len(self.vectors) - len(chosen), bool))
+        phrases = tuple(phrase for phrase, kept in zip(self.phrases, chosen, strict=True) if kept)
+        return replace(self, phrases=phrases, vectors=self.vectors[rows], hubs=self.hubs[rows])
+
+    def probabilities(self, codec: Codec, latents: Array) -> Array:
+        """Return (M, V + C) float32 probabilities for (M, d) latents, each row adding up to 1."""
+        logits = np.float32(self.scale) * (codec.cosines(latents, self.vectors) - self.hubs / 2)
+        shares = np.exp(logits - logits.max(1, keepdims=True))
+        return shares / shares.sum(1, keepdims=True)
+
+    def mixture(self, codec: Codec, latents: Array, weights: Array) -> Array:
+        """Return the (V + C,) float64 mean of the probabilities for (M, d) latents, weighted by (M,).
+
+        Weights are >= 0, not all zero. Answers are blended, never features: between two things lies a third.
+        """
+        latents, of = codec.unique(latents)
+        weights = np.bincount(of, weights, minlength=len(latents))
+        total = np.zeros(len(self.vectors))
+        for part in self._blocks(len(latents)):
+            total += weights[part] @ self.probabilities(codec, latents[part])
+        return total / total.sum()
+
+    def best(self, codec: Codec, latents: Array, count: int) -> tuple[Array, Array]:
+        """Return the (M, count) numbers of the most probable phrases, the best first.
+
+        Beside them their (M, count) float32 probabilities; fewer columns where the vocabulary has fewer.
+        latents: (M, d).
+        """
+        count = min(count, len(self.phrases))
+        if count == 0:
+            return np.empty((len(latents), 0), np.int32), np.empty((len(latents), 0), np.float32)
+        words = np.empty((len(latents), count), np.int32)
+        shares = np.empty((len(latents), count), np.float32)
+        for part in self._blocks(len(latents)):
+            found = self.probabilities(codec, latents[part])[:, : len(self.phrases)]
+            some = np.argpartition(-found, count - 1, axis=1)[:, :count]
+            order = np.argsort(-np.take_along_axis(found, some, 1), axis=1, kind="stable")
+            words[part] = np.take_along_axis(some, order, 1)
+            shares[part] = np.take_along_axis(found, words[part], 1)
+        return words, shares
+
+    def _blocks(self, count: int) -> list[slice]:
+        rows = max(1, CELLS // len(self.vectors))
+        return [slice(start, start + rows) for start in range(0, count, rows)]
+
+
+def likely_name(words: Sequence[Word]) -> Word | None:
+    """Return the best word, or as many as are `LIKELY` together: "mug or cup"; None where all are not."""
+    for count in range(1, len(words) + 1):
+        probability = sum(word.probability for word in words[:count])
+        if probability >= LIKELY:
+            return Word(OR.join(word.phrase for word in words[:count]), probability)
+    return None
+
+
+def build_words(field: LanguageField, phrases: tuple[str, ...], vectors: Array) -> WordScores:
+    """Return scores of names of things, from V phrases and their (V, D) unit vectors."""
+    every = np.concatenate([vectors, field.canonical]).astype(np.float32)
+    bank = field_features(field)
+    return WordScores(phrases, every, hubs(every, bank), WORD_SCALE / _spread(field, vectors, bank))
+
+
+def build_attributes(field: LanguageField, phrases: tuple[str, ...], vectors: Array) -> WordScores:
+    """Return scores of words of which a thing has one, such as colours, from V phrases and (V, D) vectors.
+
+    Few and all of one kind, they are no hubs.
+    """
+    scale = ATTRIBUTE_SCALE / _spread(field, vectors, field_features(field))
+    return WordScores(phrases, vectors.astype(np.float32), np.zeros(len(vectors), np.float32), scale)
+
+
+def _spread(field: LanguageField, vectors: Array, bank: Array) -> float:
+    """Return the median, over features, of the spread of everyday phrases' cosines, else of the words'."""
+    texts = vectors if field.everyday is None else field.everyday
+    spreads = (bank @ texts.T).std(1) if len(bank) and len(texts) > 1 else np.ones(1)
+    return max(float(np.median(spreads)), NARROWEST)
+
+
+def field_features(field: LanguageField) -> Array:
+    """Return (B, D) float32 unit vectors that the scene's Gaussians have.
+
+    Every codeword that one of them has, or the features of evenly spread Gaussians where there are no
+    codewords.
+    """
+    latents, _ = field.codec.unique(field.latents[field.known])
+    most = SAMPLES if field.codec.blends else BANK  # latents that are no numbers are all distinct features
+    chosen = np.unique(np.linspace(0, len(latents) - 1, min(most, len(latents))).astype(np.int64))
+    return field.codec.decode(latents[chosen])
+
+
+def hubs(vectors: Array, bank: Array) -> Array:
+    """Return the (V,) float32 mean cosines of (V, D) words with the nearest of (B, D) features."""
+    count = min(NEAREST, len(bank))
+    if count == 0:
+        return np.zeros(len(vectors), np.float32)
+    near = np.partition(vectors @ bank.T, len(bank) - count, axis=1)[:, -count:]
+    return near.mean(1, dtype=np.float64).astype(np.float32)
+
 
 CERTAIN = 0.5  # probability from which a colour or material is said
 ATTRIBUTES: tuple[Bundled, ...] = ("colours", "materials")

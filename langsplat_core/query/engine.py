@@ -15,9 +15,9 @@ from langsplat_core.io.scenes import load_scene
 from langsplat_core.io.sidecar import SUFFIX, Words
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import AnswerRule, QueryResult, by_peak, by_regions
+from langsplat_core.query.grammar import STOP_WORDS, check_names, only
 from langsplat_core.query.instances import Instance, find_instances
 from langsplat_core.query.lookup import Lookup, through_cells
-from langsplat_core.query.nouns import STOP_WORDS, check_names, only
 from langsplat_core.query.regions import Regions, build_regions, chance_in
 from langsplat_core.query.rule import Bars, Chance, bars_of
 from langsplat_core.query.taught import WordSpace, build_word_space, by_showing, compared, shown

@@ -5,19 +5,23 @@ are candidates; those that claim the same features are one thing by two names ("
 listed was asked for, as a phrase, and found where it was claimed.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import get_args
 
 import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
+from langsplat_core.errors import LangSplatError
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.describe import Describer
-from langsplat_core.query.instances import axis_aligned_box
-from langsplat_core.query.word_scores import LIKELY, Word, WordScores
-from langsplat_core.scene import LEVELS, Codec
+from langsplat_core.query.compose import run_phrase
+from langsplat_core.query.describe import LIKELY, OR, Describer, Word, WordScores, likely_name
+from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.instances import axis_aligned_box, oriented_box
+from langsplat_core.scene import LEVELS, NO_NODE, Codec
+from langsplat_core.scene.language import phrase_key
 from langsplat_core.scene.surface import Surface
 from langsplat_core.semantics.relevancy import FLOOR
 
@@ -182,3 +186,136 @@ def _spot(describer: Describer, level: int, rows: Array) -> Spot:
         colour=colour,
         material=material,
     )
+
+
+LEAST_SHARE = 5e-4  # of the scene's surface that a node must have to be listed
+LEAST_COUNT = 12  # Gaussians that it must have
+NAMES = 3  # words, at most, that a node is called by
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """A node of the scene's tree in words, with its parts."""
+
+    node: int  # number in the tree
+    level: int  # index into LEVELS
+    word: Word | None  # the best name; None where nothing of the vocabulary is likely
+    count: int  # Gaussians
+    share: float  # of the scene's surface, in [0, 1]
+    centre: Array  # (3,) world units
+    size: Array  # (3,) sides of the oriented box, longest first, world units
+    votes: tuple[int, int]  # photographs with a mask of just this, and those that show it without one
+    parts: tuple["Outline", ...]  # the largest first
+
+
+def scene_outline(describer: Describer, least: float = LEAST_SHARE) -> tuple[Outline, ...]:
+    """Return the scene's tree, wholes with the largest surface first.
+
+    Left out are nodes of less than `least` of the scene's surface, and parts that say nothing new: without a
+    word, or with that of what they are in; their own parts take their place.
+    """
+    tree, members, areas = describer.engine.tree, describer.engine.tree.gaussians(), describer.areas
+    every = max(float(areas.sum()), 1e-300)
+    totals = np.array([areas[rows].sum() for rows in members]) / every
+    large = [node for node, rows in enumerate(members) if totals[node] >= least and len(rows) >= LEAST_COUNT]
+    large.sort(key=lambda node: -totals[node])
+    parts: dict[int, list[int]] = {}
+    for node in large:
+        parts.setdefault(int(tree.parents[node]), []).append(node)
+
+    def name_of(node: int) -> Word | None:
+        rows, level = members[node], int(tree.levels[node])
+        weights = np.maximum(areas[rows], 1e-300)
+        return likely_name(describer.at_level(level, rows, weights, NAMES).words)
+
+    def below(node: int, word: Word | None) -> Iterator[Outline]:
+        for part in parts.get(node, []):
+            own = name_of(part)
+            if own is None or (word is not None and own.phrase.split(OR)[0] in word.phrase.split(OR)):
+                yield from below(part, word)
+            else:
+                yield shown(part, own)
+
+    def shown(node: int, word: Word | None) -> Outline:
+        rows = members[node]
+        weights = np.maximum(areas[rows], 1e-300)
+        positions = describer.engine.scene.gaussians.means[rows].astype(np.float64)
+        return Outline(
+            node=node,
+            level=int(tree.levels[node]),
+            word=word,
+            count=len(rows),
+            share=float(totals[node]),
+            centre=weights @ positions / weights.sum(),
+            size=2 * oriented_box(positions).half_extents,
+            votes=(int(tree.votes[node, 0]), int(tree.votes[node, 1])),
+            parts=tuple(sorted(below(node, word), key=lambda part: -part.share)),
+        )
+
+    return tuple(shown(node, name_of(node)) for node in parts.get(NO_NODE, []))
+
+
+EXAMPLES = 6
+TRIES = 4  # candidates that are asked for each example wanted
+
+
+@dataclass(frozen=True)
+class Suggestions:
+    """Examples and phrases for someone who does not know a scene."""
+
+    examples: tuple[str, ...] = ()  # each is found in the scene
+    phrases: tuple[str, ...] = ()  # that its encoder or its phrasebook knows, what is in the scene first
+
+
+def suggest(engine: QueryEngine, at_most: int = EXAMPLES, progress: Progress = silent) -> Suggestions:
+    """Return examples for a scene, from its inventory and phrasebook, each asked and found.
+
+    There are none where nothing can be asked. This takes seconds: keep what it returns.
+    """
+    book = tuple(engine.field.phrasebook)
+    here: tuple[str, ...] = ()
+    taught: tuple[str, ...] = ()
+    try:
+        describer = Describer(engine, progress=progress)
+        taught = describer.words[0].phrases
+        entries = sorted(scene_inventory(describer, progress), key=lambda entry: -entry.probability)
+        here = tuple(entry.phrase for entry in entries)
+    except LangSplatError:  # no encoder here, or one that knows none of the words: the phrasebook is left
+        pass
+    candidates = tuple(dict.fromkeys((*here, *book)))
+    found = (phrase for phrase in candidates[: TRIES * at_most] if _is_found(engine, phrase))
+    return Suggestions(tuple(islice(found, at_most)), tuple(dict.fromkeys((*candidates, *taught))))
+
+
+def _is_found(engine: QueryEngine, phrase: str) -> bool:
+    try:
+        return run_phrase(engine, phrase).answer.found
+    except LangSplatError:  # "of", in someone's phrasebook
+        return False
+
+
+def completions(text: str, phrases: Sequence[str], at_most: int = 6) -> list[str]:
+    """Return phrases that go on from what was typed, in the order of `phrases`.
+
+    First come those that begin with all of it, then what was typed with its last word completed; nothing
+    where no text is, or a word has ended.
+    """
+    typed = phrase_key(text)
+    if not typed or text[-1:].isspace():
+        return []
+    begun, _, last = typed.rpartition(" ")
+    whole = [phrase for phrase in phrases if phrase.startswith(typed) and phrase != typed]
+    words = dict.fromkeys(word for phrase in phrases for word in phrase.split() if word.startswith(last))
+    ended = [f"{begun} {word}" for word in words if word != last] if begun else []
+    return list(dict.fromkeys((*whole, *ended)))[:at_most]
+
+
+def corrected(text: str, near: Mapping[str, Sequence[str]]) -> str | None:
+    """Return `text` with every unknown word replaced by the nearest known one; None where one has none.
+
+    near: as of `UnknownWordError`.
+    """
+    if not all(near.values()):
+        return None
+    words = phrase_key(text).split(" ")
+    return " ".join(near[word][0] if near.get(word) else word for word in words)

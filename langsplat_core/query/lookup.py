@@ -1,4 +1,4 @@
-"""The relevancies of a phrase at every Gaussian: each distinct feature is compared once, then fetched.
+"""Relevancies of a phrase at every Gaussian and pixel: each distinct feature is compared once.
 
 A scene with a codebook has few distinct features. Latents of three numbers, as LangSplat's autoencoder makes,
 are unit vectors that hardly ever repeat; they are read through a codebook of cells of their sphere, which is
@@ -12,10 +12,14 @@ import numpy as np
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.compiled import kernel, shared_workers
+from langsplat_core.display.displays import gated_mean
+from langsplat_core.errors import InputError
+from langsplat_core.raster.protocol import View
 from langsplat_core.scene import CodebookCodec, LanguageField
-from langsplat_core.semantics.relevancy import Scale, relevancy_of
+from langsplat_core.semantics.relevancy import Scale, latent_relevancy, relevancy_of
 
 CELLS = 32_768  # of the sphere, at most: twice as many halve the squared error, and take twice the time
+FINEST = 4096  # cells per side of the octahedral map
 CHUNK = 16_384  # latents decoded and compared at a time: 32 MB at 512 numbers
 TOGETHER = 16  # phrases compared with every feature at a time: 4 bytes each per feature
 
@@ -33,9 +37,8 @@ class Lookup:
         self._zero, self._rate = np.empty(count, np.float32), np.empty(count, np.float32)
         for start in range(0, count, CHUNK):
             part = slice(start, start + CHUNK)
-            self._zero[part], self._rate[part] = scale.of(
-                self._codec.cosines(self._latents[part], scale.texts)
-            )
+            cosines = self._codec.cosines(self._latents[part], scale.texts)
+            self._zero[part], self._rate[part] = scale.of(cosines)
 
     def relevancies(self, phrases: Array) -> Iterator[Array]:
         """Yield of (Q, D) unit phrase vectors each one's (3 N,) float32 relevancies, 0 without a feature."""
@@ -47,8 +50,7 @@ class Lookup:
             for start in range(0, len(self._latents), step):
                 part = slice(start, min(start + step, len(self._latents)))
                 cosines = self._codec.cosines(self._latents[part], some)
-                zero, rate = self._zero[part, None], self._rate[part, None]
-                values[:, part] = relevancy_of(cosines, zero, rate).T
+                values[:, part] = relevancy_of(cosines, self._zero[part, None], self._rate[part, None]).T
             for row in values:
                 found = np.empty(len(self._of), np.float32)
                 shared_workers().run(_fetch, len(found), row, self._of, found)
@@ -60,13 +62,6 @@ def _fetch(first: int, last: int, values: Array, codes: Array, found: Array) -> 
     """Fill rows [first, last) of `found` (3 N,)."""
     for i in range(first, last):
         found[i] = values[codes[i]]
-
-
-# Cells of the sphere: squares of an octahedral map, as small as leave at most `CELLS` that some latent lies
-# in, each read as the mean of the latents in it. Relevancies change smoothly over the sphere, so that the
-# error falls with the side of a cell.
-
-FINEST = 4096  # cells per side of the map
 
 
 def through_cells(field: LanguageField) -> LanguageField:
@@ -84,15 +79,20 @@ def through_cells(field: LanguageField) -> LanguageField:
 
 
 def sphere_cells(latents: Array, most: int = CELLS) -> tuple[Array, Array]:
-    """Divide (M, 3) latents, none of them zero, among at most `most` cells, M and most >= 1.
+    """Divide (M, 3) non-zero latents among at most `most` cells: (M,) numbers, (K, 3) float32 unit centres.
 
-    Returns the (M,) number of each latent's cell and the (K, 3) float32 unit centres of the cells. Where
-    there are no more latents than cells, each is a cell of its own.
+    A cell is a square of an octahedral map, as small as leaves at most `most` that some latent lies in, and
+    its centre the mean of these. Few latents are a cell each. Relevancies change smoothly over the sphere, so
+    that their error falls with the side of a cell.
     """
     directions = unit(latents.astype(np.float64), 1e-30)
     if len(directions) <= most:
         return np.arange(len(directions)), directions.astype(np.float32)
-    square = sphere_to_octahedral(directions)
+    # The sphere is projected onto an octahedron, whose lower half is folded out into the square's corners.
+    scaled = directions / np.abs(directions).sum(-1, keepdims=True)
+    upper, z = scaled[:, :2], scaled[:, 2:]
+    lower = (1 - np.abs(upper[:, ::-1])) * np.where(upper >= 0, 1, -1)
+    square = (np.where(z < 0, lower, upper) + 1) / 2
 
     def numbers(side: int) -> Array:
         columns, rows = np.minimum((square * side).astype(np.int64), side - 1).T
@@ -112,12 +112,43 @@ def sphere_cells(latents: Array, most: int = CELLS) -> tuple[Array, Array]:
     return cells, unit(sums, 1e-30).astype(np.float32)
 
 
-def sphere_to_octahedral(vectors: Array) -> Array:
-    """Return the (..., 2) places in [0, 1]^2 of (..., 3) non-zero vectors.
+# Pixels: relevancies of Gaussians are blended, one linear channel per phrase (ours); or latents are blended
+# and then decoded (the paper's order, section 3.4). Both are gated by alpha, because the zero latent of an
+# uncovered pixel decodes to a confident something.
 
-    The sphere is projected onto an octahedron, whose lower half is folded out into the square's corners.
+
+def splatted_relevancy(view: View, relevancy: Array, alpha_gate: float) -> Array:
+    """Return (H, W, Q) relevancy in [0, 1] of pixels from (N, Q) of Gaussians; 0 under the gate."""
+    total, alpha = view.splat(np.asarray(relevancy, np.float32))
+    return gated_mean(total, alpha, alpha_gate)
+
+
+def decoded_relevancy(
+    view: View, field: LanguageField, level: int, phrases: Array, alpha_gate: float
+) -> Array:
+    """Return (H, W, Q) relevancy of the decoded pixel latents for (Q, D) phrase vectors: the paper's order.
+
+    Raises InputError for a codebook, whose numbers cannot be blended.
     """
-    scaled = vectors / np.abs(vectors).sum(-1, keepdims=True)
-    upper, z = scaled[..., :2], scaled[..., 2:]
-    lower = (1 - np.abs(upper[..., ::-1])) * np.where(upper >= 0, 1, -1)
-    return (np.where(z < 0, lower, upper) + 1) / 2
+    if not field.codec.blends:
+        raise InputError(
+            f"the paper's order blends latents, and this scene has a {field.codec.kind}; train one with "
+            "`--codec.kind autoencoder`"
+        )
+    blended, alpha = view.splat(field.latents[level])
+    latents = np.where(alpha[..., None] > alpha_gate, blended, 0).reshape(-1, blended.shape[2])
+    values = latent_relevancy(field.codec, latents, phrases, field.canonical, field.temperature)
+    return values.reshape(*alpha.shape, len(phrases))
+
+
+def peak_pixel(relevancy: Array, window: int) -> tuple[int, int, float]:
+    """Return the peak (column, row, value) of a (H, W) map after a mean filter of `window` px.
+
+    The paper's window is 20. It never exceeds the image; borders repeat the edge pixels.
+    """
+    from scipy.ndimage import uniform_filter  # here, since the window, which needs none, imports this module
+
+    window = max(1, min(window, *relevancy.shape))
+    smooth = uniform_filter(np.asarray(relevancy, np.float64), size=window, mode="nearest")
+    row, column = np.unravel_index(int(smooth.argmax()), smooth.shape)
+    return int(column), int(row), float(smooth[row, column])

@@ -15,7 +15,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array, logit, sigmoid
 from langsplat_core.config import LevelChoice
-from langsplat_core.query.nouns import Named
+from langsplat_core.query.grammar import Named
 from langsplat_core.scene import LEVELS, Calibration, Fits
 from langsplat_core.scene.surface import SMALLEST
 from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, NARROWEST, fit_of

@@ -170,7 +170,7 @@ class Language {
     return colours;
   }
 
-  // Phrases that go on from what was typed (query/suggestions.py, completions).
+  // Phrases that go on from what was typed (query/inventory.py, completions).
   completions(text, most = 7) {
     const typed = phraseKey(text);
     if (!typed || /\s$/.test(text)) {

@@ -1,4 +1,4 @@
-// Phrases as they are written: the twin of scene/language.py and of query/nouns.py.
+// Phrases as they are written: the twin of scene/language.py and of query/grammar.py.
 
 // [page]
 const APOSTROPHES = /[’‘ʼ′＇´`]/gu;

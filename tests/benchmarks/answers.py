@@ -40,7 +40,7 @@ from langsplat_core.progress import Progress, TerminalProgress, silent
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine, no_field
-from langsplat_core.query.nouns import PARTS, forms, is_part
+from langsplat_core.query.grammar import PARTS, forms, is_part
 from langsplat_core.query.rule import RULE
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import Calibration, Fits, PlattScaling

@@ -37,7 +37,7 @@ from langsplat_core.extensions.library.index import (
     write_library,
 )
 from langsplat_core.io.scenes import save_scene
-from langsplat_core.query.nouns import named
+from langsplat_core.query.grammar import named
 from langsplat_core.query.rule import Bar, judge, triple
 from langsplat_core.raster import load_lifting_rasterizer
 from tests.benchmarks.room import InRooms, MaskOrigin, Room, Variant, publish

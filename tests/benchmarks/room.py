@@ -54,7 +54,7 @@ from langsplat_core.pipeline.stages import stage_key
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.answers import AnswerRule
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
+from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.scene import LEVELS, Camera, Gaussians, LanguageField, Scene
 from langsplat_core.semantics.encoder import Encoder

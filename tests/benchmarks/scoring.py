@@ -23,7 +23,7 @@ from langsplat_core.extensions.benchmarks.report import intersection_over_union
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import SPAN, QueryResult
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.pixels import decoded_relevancy, peak_pixel, splatted_relevancy
+from langsplat_core.query.lookup import decoded_relevancy, peak_pixel, splatted_relevancy
 from langsplat_core.query.regions import Regions
 from langsplat_core.raster.protocol import Rasterizer, View
 from langsplat_core.raster.render import view_of

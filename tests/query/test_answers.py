@@ -10,7 +10,7 @@ from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.query import regions as module
 from langsplat_core.query.answers import QueryResult, by_peak, by_regions
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.nouns import Named
+from langsplat_core.query.grammar import Named
 from langsplat_core.query.regions import Regions, build_regions, chance_in
 from langsplat_core.query.rule import RULE, Bar, bars_of, excess, region_fits
 from langsplat_core.scene import LEVELS, NO_NODE, Calibration, Gaussians, LanguageField, PlattScaling, Scene

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import EncoderError, InputError
-from langsplat_core.query import grammar, nouns
+from langsplat_core.query import grammar
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import Atom, Both, Counted, Inside, Relation, Superlative, Union, Without
@@ -94,7 +94,7 @@ def test_long_text_is_refused():
     + [("Chairs", "Chair"), ("scissors", "scissors"), ("cactus", "cactus"), ("benches", "bench")],
 )
 def test_counted_things_are_asked_in_the_singular(plural, one):
-    assert nouns.singular(plural) == one
+    assert grammar.singular(plural) == one
 
 
 def test_unparse_shows_the_structure():
@@ -138,7 +138,7 @@ NAMED = {
 
 @pytest.mark.parametrize("what", NAMED)
 def test_part_word_at_the_end_names_a_part_of_a_thing(what):
-    assert {nouns.named(phrase) for phrase in NAMED[what]} == {what}
+    assert {grammar.named(phrase) for phrase in NAMED[what]} == {what}
 
 
 # Phrases with structure on a laid table, where every Gaussian's meaning is known.

@@ -6,12 +6,18 @@ import numpy as np
 import pytest
 
 from langsplat_core.arrays import Array, unit
-from langsplat_core.query import describe, word_scores
-from langsplat_core.query.describe import Describer, look_at_pixel
+from langsplat_core.query import describe
+from langsplat_core.query.describe import (
+    Describer,
+    WordScores,
+    build_attributes,
+    build_words,
+    field_features,
+    hubs,
+    look_at_pixel,
+)
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.inventory import same_things, scene_inventory
-from langsplat_core.query.suggestions import completions, corrected, suggest
-from langsplat_core.query.word_scores import WordScores, build_attributes, build_words, field_features, hubs
+from langsplat_core.query.inventory import completions, corrected, same_things, scene_inventory, suggest
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import LanguageField, LinearCodec, Scene
 from langsplat_core.scene.codec import CodebookCodec
@@ -204,9 +210,9 @@ def plain_probabilities(made: LanguageField, vectors: Array, latents: Array, ban
     hub = []
     for word in every:
         cosines = sorted((float(word @ meaning) for meaning in bank.astype(np.float64)), reverse=True)
-        hub.append(np.mean(cosines[: word_scores.NEAREST]))
+        hub.append(np.mean(cosines[: describe.NEAREST]))
     spreads = [np.std([float(word @ meaning) for word in every[: len(vectors)]]) for meaning in bank]
-    rows, scale = [], word_scores.WORD_SCALE / np.median(spreads)
+    rows, scale = [], describe.WORD_SCALE / np.median(spreads)
     for vector in made.codec.decode(latents).astype(np.float64):
         fits = np.array([scale * (vector @ word - own / 2) for word, own in zip(every, hub, strict=True)])
         shares = np.exp(fits - fits.max())
@@ -216,7 +222,7 @@ def plain_probabilities(made: LanguageField, vectors: Array, latents: Array, ban
 
 @pytest.mark.parametrize("kind", ["codebook", "linear"])
 def test_probabilities_and_mixtures_are_those_of_the_formula(kind, monkeypatch):
-    monkeypatch.setattr(word_scores, "CELLS", 7 * (V + 4))  # several blocks
+    monkeypatch.setattr(describe, "CELLS", 7 * (V + 4))  # several blocks
     made = field(kind)
     names, vectors = phrases()
     words = build_words(made, names, vectors)

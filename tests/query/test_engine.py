@@ -19,8 +19,14 @@ from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.errors import EncoderError, InputError, UnknownWordError
 from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.lookup import Lookup, sphere_cells, through_cells
-from langsplat_core.query.pixels import decoded_relevancy, peak_pixel, splatted_relevancy
+from langsplat_core.query.lookup import (
+    Lookup,
+    decoded_relevancy,
+    peak_pixel,
+    sphere_cells,
+    splatted_relevancy,
+    through_cells,
+)
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.raster.render import render

@@ -10,7 +10,7 @@ from langsplat_core.display.displays import Subject, latent_colours, nodes
 from langsplat_core.progress import Progress
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.instances import axis_aligned_box
-from langsplat_core.query.outline import Outline, scene_outline
+from langsplat_core.query.inventory import Outline, scene_outline
 from langsplat_core.query.selection import at_point
 from langsplat_core.scene import LEVELS, NO_NODE
 from langsplat_core.scene.language import tidy

@@ -15,7 +15,7 @@ from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine, no_field
 from langsplat_core.query.grammar import Atom, heads
 from langsplat_core.query.instances import Instance
-from langsplat_core.query.suggestions import Suggestions, completions, corrected, suggest
+from langsplat_core.query.inventory import Suggestions, completions, corrected, suggest
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import TaughtWord
 from langsplat_core.scene.language import phrase_key, split_phrases

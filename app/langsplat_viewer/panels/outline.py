@@ -5,8 +5,8 @@ from typing import Any
 from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
 from imgui_bundle import icons_fontawesome_6 as icons
 
-from langsplat_core.query.outline import Outline
-from langsplat_core.query.word_scores import OR
+from langsplat_core.query.describe import OR
+from langsplat_core.query.inventory import Outline
 from langsplat_viewer.actions import outline
 from langsplat_viewer.actions.outline import Target
 from langsplat_viewer.panels import ui

@@ -22,7 +22,7 @@ from langsplat_core.extensions.benchmarks.labels import Size, check_same_image, 
 from langsplat_core.io.hostile import opened, read_npy
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.pixels import decoded_relevancy, peak_pixel, splatted_relevancy
+from langsplat_core.query.lookup import decoded_relevancy, peak_pixel, splatted_relevancy
 from langsplat_core.raster.protocol import View
 from langsplat_core.raster.render import render, view_of
 from langsplat_core.scene import LEVELS, Camera

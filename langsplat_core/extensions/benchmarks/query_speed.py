@@ -25,7 +25,7 @@ from langsplat_core.extensions.benchmarks.raster_speed import Size
 from langsplat_core.extensions.benchmarks.report import markdown, write_report
 from langsplat_core.progress import Progress, TerminalProgress, silent
 from langsplat_core.query.engine import QueryEngine, TextEncoder, searchable
-from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
+from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
 from langsplat_core.raster.protocol import View
 from langsplat_core.raster.render import view_of
 from langsplat_core.scene import LEVELS, Camera, Codec, LanguageField, Scene

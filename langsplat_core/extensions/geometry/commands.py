@@ -34,7 +34,7 @@ from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import QueryEngine, searchable
-from langsplat_core.query.outline import scene_outline
+from langsplat_core.query.inventory import scene_outline
 from langsplat_core.scene import LEVELS, NO_NODE, Scene
 from langsplat_core.scene.surface import surface_weights
 from langsplat_core.scene.transform import Similarity, similarity, transform_scene

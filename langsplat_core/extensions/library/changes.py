@@ -18,11 +18,10 @@ import numpy as np
 from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.describe import Describer
+from langsplat_core.query.describe import Describer, likely_name
 from langsplat_core.query.engine import QueryEngine, same_vectors
 from langsplat_core.query.instances import axis_aligned_box
-from langsplat_core.query.outline import NAMES
-from langsplat_core.query.word_scores import likely_name
+from langsplat_core.query.inventory import NAMES
 from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.raster.render import splat_colours, view_of
 from langsplat_core.scene import LEVELS, Camera, Scene

@@ -16,8 +16,7 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import LoadEncoder, QueryEngine
-from langsplat_core.query.grammar import heads, parse
-from langsplat_core.query.nouns import named
+from langsplat_core.query.grammar import heads, named, parse
 from langsplat_core.query.rule import Outcome, Verdict, judge, triple
 from langsplat_core.scene import LEVELS, LanguageField, Scene
 from langsplat_core.scene.codec import LinearCodec

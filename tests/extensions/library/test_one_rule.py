@@ -14,7 +14,7 @@ from langsplat_core.extensions.library.index import digest, fits_in, read_librar
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.pipeline.webpage import write_page
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.nouns import named
+from langsplat_core.query.grammar import named
 from langsplat_core.query.rule import judge, triple
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.semantics.vocabulary import bundled_vocabulary
