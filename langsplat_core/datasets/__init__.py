@@ -5,13 +5,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from langsplat_core.config import DatasetConfig, check_settings
-from langsplat_core.datasets.capture import Capture, metres_of
+from langsplat_core.datasets.capture import Capture, metres_of, split_views
 from langsplat_core.datasets.colmap import find_model, load_colmap
-from langsplat_core.datasets.holdout import split
-from langsplat_core.datasets.known_poses import add_points
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.datasets.photos import photo_folder
-from langsplat_core.datasets.sfm import load_photos
+from langsplat_core.datasets.sfm import add_points, load_photos
 from langsplat_core.datasets.video import kept_frames
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import shown
@@ -41,7 +39,7 @@ def load_capture(path: Path, config: DatasetConfig, work: Path, progress: Progre
     capture = replace(capture, metres_per_unit=metres)
     if len(capture.points):
         return capture
-    return add_points(capture, split(capture, config)[0], work, progress)
+    return add_points(capture, split_views(capture, config)[0], work, progress)
 
 
 def load_photographs(path: Path, config: DatasetConfig, work: Path, progress: Progress = silent) -> Capture:
@@ -51,24 +49,17 @@ def load_photographs(path: Path, config: DatasetConfig, work: Path, progress: Pr
     if not os.path.exists(path):  # unlike Path.exists, also no for names that no file system could hold
         raise InputError(f"{shown(path)} does not exist; expected {ACCEPTED}")
     try:
-        return _load(path, config, work, progress)
+        frames = path if path.is_file() and path.suffix.lower() == ".json" else path / "transforms.json"
+        if frames.is_file():
+            return load_nerfstudio(frames, config.max_side, progress)
+        model = find_model(path)
+        if model is not None:
+            return load_colmap(path, model, config.max_side, progress)
+        if is_video(path):
+            path = kept_frames(path, config.frames, work, progress)
+        photos = photo_folder(path)
+        if photos is None:
+            raise InputError(f"{path} is no dataset; expected {ACCEPTED}")
+        return load_photos(photos, config.max_side, config.allow_few_cameras, work, progress)
     except PermissionError as error:
         raise InputError(f"{error.filename}: may not be read ({error.strerror}); see to its rights") from None
-
-
-def _load(path: Path, config: DatasetConfig, work: Path, progress: Progress) -> Capture:
-    max_side = config.max_side
-    frames = path / "transforms.json"
-    if path.is_file() and path.suffix.lower() == ".json":
-        return load_nerfstudio(path, max_side, progress)
-    if frames.is_file():
-        return load_nerfstudio(frames, max_side, progress)
-    model = find_model(path)
-    if model is not None:
-        return load_colmap(path, model, max_side, progress)
-    if is_video(path):
-        path = kept_frames(path, config.frames, work, progress)
-    photos = photo_folder(path)
-    if photos is None:
-        raise InputError(f"{path} is no dataset; expected {ACCEPTED}")
-    return load_photos(photos, max_side, config.allow_few_cameras, work, progress)

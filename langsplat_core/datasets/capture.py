@@ -1,4 +1,8 @@
-"""Captures: photographs with known cameras, as every loader returns them, and the length of their unit."""
+"""Captures: photographs with known cameras, as every loader returns them.
+
+Beside them what follows from both: which views are held out, the length of a unit, and points where the
+cameras look.
+"""
 
 import hashlib
 import logging
@@ -12,9 +16,9 @@ from PIL import Image
 from scipy.spatial.distance import pdist
 
 from langsplat_core.arrays import Array, check_array
-from langsplat_core.datasets.exif import place
-from langsplat_core.datasets.matches import Matches
-from langsplat_core.datasets.photos import WORKERS, Photo, View, developer
+from langsplat_core.config import DatasetConfig
+from langsplat_core.datasets.photos import WORKERS, Photo, View, developer, place
+from langsplat_core.datasets.workspace import Matches
 from langsplat_core.errors import InputError
 from langsplat_core.io.hostile import PictureError
 from langsplat_core.scene import Camera
@@ -22,17 +26,6 @@ from langsplat_core.scene import Camera
 DECIMALS = 9  # of world units: what a digest tells apart, far above rounding and far below a pixel
 
 log = logging.getLogger("langsplat")
-
-
-def warn_of_lost_points(good: Array, source: str) -> None:
-    """Warn where most of the points of `source` had to be left out; good: (M,) bool, those that were not."""
-    if 2 * good.sum() < len(good):
-        log.warning(
-            "%d of the %d points of %s are damaged or badly located and are left out; was it written whole?",
-            len(good) - good.sum(),
-            len(good),
-            source,
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,19 +141,94 @@ def shrunk_view(camera: Camera, image: Array, mask: Array | None, size: tuple[in
     Area averages differ from that by a PSNR of 31 to 42 dB, which the scores of good renders would feel. A
     pixel counts where all it is made of count.
     """
-
-    def resized(values: Array, by: Image.Resampling) -> Array:
-        return np.asarray(Image.fromarray(values).resize(size, by))
-
-    counts = None if mask is None else np.where(mask, np.uint8(255), np.uint8(0))
-    counted = None if counts is None else resized(counts, Image.Resampling.BOX) == 255
-    return camera.resized(*size), resized(image, Image.Resampling.LANCZOS), counted
+    shrunk = np.asarray(Image.fromarray(image).resize(size, Image.Resampling.LANCZOS))
+    if mask is not None:
+        grey = Image.fromarray(np.where(mask, np.uint8(255), np.uint8(0)))
+        mask = np.asarray(grey.resize(size, Image.Resampling.BOX)) == 255
+    return camera.resized(*size), shrunk, mask
 
 
 def _rounded(values: Array) -> Array:
     """Return float64 values rounded to `DECIMALS`, without a negative zero."""
     rounded: Array = np.round(values.astype(np.float64), DECIMALS) + 0.0
     return rounded
+
+
+def warn_of_lost_points(good: Array, source: str) -> None:
+    """Warn where most of the points of `source` had to be left out; good: (M,) bool, those that were not."""
+    if 2 * good.sum() < len(good):
+        log.warning(
+            "%d of the %d points of %s are damaged or badly located and are left out; was it written whole?",
+            len(good) - good.sum(),
+            len(good),
+            source,
+        )
+
+
+# Views that are held out from training, to measure it on.
+
+FEWEST_VIEWS = 6  # below, every photograph is needed for training, and nothing is measured
+NEIGHBOURS = 4  # a view is surrounded where it lies in the middle of so many nearest training views
+RADIAN = 2.0  # typical steps between cameras that a turn by a radian counts for
+
+
+def split_views(capture: Capture, config: DatasetConfig) -> tuple[list[int], list[int]]:
+    """Return indices of (training, held-out) views, about one in ``config.test_every``."""
+    if config.hold_out == "every":
+        return capture.split(config.test_every)
+    held_out = surrounded_views(capture.cameras, config.test_every)
+    return [index for index in range(len(capture)) if index not in held_out], held_out
+
+
+def surrounded_views(cameras: Sequence[Camera], every: int, beside: Sequence[int] = ()) -> list[int]:
+    """Return indices of one view in `every`, in ascending order, of which each lies among training views.
+
+    Those at the ends of a walk show what no other photograph does, and tell nothing of the training. One
+    after the other that view is taken which lies best in the middle of its nearest training views, by place
+    and direction, measured by how far those are away. Its own nearest ones are then left to training, so that
+    the views come from all over the capture. None of fewer than `FEWEST_VIEWS`, and none of those `beside`.
+    """
+    count = len(cameras)
+    if every < 2 or count < FEWEST_VIEWS:
+        return []
+    stands = _stands(cameras)
+    apart = np.linalg.norm(stands[:, None] - stands[None], axis=2)
+    found: list[int] = []
+    free = np.ones(count, bool)  # that may be held out
+    free[list(beside)] = False
+    for _ in range(max(1, round(count / every))):
+        training = np.setdiff1d(np.arange(count), found)
+        lean = {int(index): _lean(stands, apart, training, index) for index in training if free[index]}
+        if not lean:
+            break
+        best = min(lean, key=lambda index: lean[index])
+        found.append(best)
+        free[np.argsort(apart[best], kind="stable")[: 1 + every // 2]] = False
+    return sorted(found)
+
+
+def _stands(cameras: Sequence[Camera]) -> Array:
+    """Return (M, 6) place and direction of every camera, in typical steps from one camera to the next.
+
+    Rounded, as another processor's last digits must not choose other views.
+    """
+    places = np.array([camera.position for camera in cameras])
+    directions = np.array([camera.rotation[2] for camera in cameras])
+    gaps = np.linalg.norm(places[:, None] - places[None], axis=2)
+    np.fill_diagonal(gaps, np.inf)
+    step = float(np.median(gaps.min(1))) or 1.0  # cameras in one place have none
+    return np.round(np.concatenate([places / step, RADIAN * directions], axis=1), DECIMALS)
+
+
+def _lean(stands: Array, apart: Array, training: Array, index: int) -> float:
+    """Return how far view `index` is from the middle of its nearest training views, over how far those are.
+
+    It is 0 in the middle, about 1 beside them.
+    """
+    others = training[training != index]
+    nearest = others[np.argsort(apart[index, others], kind="stable")[:NEIGHBOURS]]
+    offset = np.linalg.norm(stands[nearest].mean(0) - stands[index])
+    return round(float(offset / max(apart[index, nearest].mean(), 1e-9)), 6)
 
 
 # The length of a unit of a capture's world, by the places (GPS) that its photographs name.
@@ -170,9 +238,7 @@ def _rounded(values: Array) -> Array:
 # tells.
 
 FEWEST_PLACES = 5  # photographs that name one
-FAR = 0.5  # of the longest distance between two cameras: pairs that count
-MOST_SPREAD = 0.2  # of the median: by which half of the far pairs may differ from each other
-_EQUATOR, _FLATTENED = 6_378_137.0, 6.694_379_990_14e-3  # of WGS 84: radius in metres, squared eccentricity
+EARTH = 6_371_009.0  # metres, its mean radius; off by 0.6 % where it is flattest
 
 
 def metres_of(capture: Capture) -> float | None:
@@ -191,28 +257,82 @@ def metres_of(capture: Capture) -> float | None:
 
 
 def metres_per_unit(eyes: Array, places: Array) -> float | None:
-    """Return the median ratio of distances between places to those between cameras, over far pairs.
+    """Return the median ratio of distances between places to those between cameras.
 
-    eyes: (K, 3) camera positions; places: (K, 2) latitudes and longitudes, degrees. None where a quarter and
-    three quarters of the pairs differ by more than `MOST_SPREAD`. Heights are left out, as most cameras know
-    them badly: for a climb as steep as a stair that is an eighth too little.
+    It is that over pairs which are at least half as far apart as the farthest ones. eyes: (K, 3) camera
+    positions; places: (K, 2) latitudes and longitudes, degrees. None where the middle half of the ratios
+    spans more than a fifth of the median. Heights are left out, as most cameras know them badly: for a climb
+    as steep as a stair that is an eighth too little.
     """
     apart = pdist(eyes)
-    far = apart >= FAR * apart.max(initial=0)
     if not apart.any():
         return None
-    low, middle, high = np.quantile(pdist(on_the_ground(places))[far] / apart[far], [0.25, 0.5, 0.75])
-    sure = middle > 0 and high - low <= MOST_SPREAD * middle
-    return float(middle) if sure else None
-
-
-def on_the_ground(places: Array) -> Array:
-    """Return (K, 2) metres to the east and north of the first of (K, 2) latitudes and longitudes, degrees.
-
-    For places within some kilometres, away from the poles.
-    """
+    far = apart >= apart.max() / 2
     latitude, longitude = np.radians(places).T
-    bend = 1 - _FLATTENED * np.sin(latitude[0]) ** 2
-    north = _EQUATOR * (1 - _FLATTENED) / bend**1.5 * (latitude - latitude[0])
-    turn = (longitude - longitude[0] + math.pi) % (2 * math.pi) - math.pi  # also over the date line
-    return np.stack([_EQUATOR / math.sqrt(bend) * math.cos(latitude[0]) * turn, north], 1)
+    east = (longitude - longitude[0] + math.pi) % (2 * math.pi) - math.pi  # also over the date line
+    ground = EARTH * np.stack([math.cos(latitude[0]) * east, latitude], 1)
+    low, middle, high = np.quantile(pdist(ground)[far] / apart[far], [0.25, 0.5, 0.75])
+    return float(middle) if middle > 0 and high - low <= middle / 5 else None
+
+
+# Points where the cameras look, for want of better ones.
+
+TELLING_POINTS = 50  # from this many known points on, depths follow theirs
+
+
+def look_distance(cameras: Sequence[Camera]) -> float:
+    """Return the typical distance from the cameras to the place they look at, world units, > 0.
+
+    That place is nearest to all optical axes in the least-squares sense; a small pull to the cameras' own
+    mean keeps parallel axes from running to infinity.
+    """
+    positions = np.array([camera.position for camera in cameras])
+    axes = np.array([camera.rotation[2] for camera in cameras])
+    spread = max(float(np.linalg.norm(positions - positions.mean(0), axis=1).max()), 1e-3)
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    pull = 1e-3 * np.eye(3)
+    centre = np.linalg.solve(
+        across.mean(0) + pull,
+        np.einsum("nij,nj->i", across, positions) / len(axes) + pull @ positions.mean(0),
+    )
+    distance = float(np.median(((centre - positions) * axes).sum(1)))
+    return distance if distance > 0.1 * spread else 2 * spread
+
+
+def random_points(
+    count: int,
+    known: Array,
+    cameras: Sequence[Camera],
+    images: Sequence[Array],
+    rng: np.random.Generator,
+    masks: Sequence[Array | None] = (),
+) -> tuple[Array, Array]:
+    """Draw (count, 3) points in the cameras' view volume, with the (count, 3) uint8 colours of their pixels.
+
+    images: (H, W, 3) uint8, one per camera; masks: (H, W) bool each, pixels that count; known: (M, 3) points
+    whose depths tell where the scene is, M may be 0. Depths are uniform in 1/z, so that near and far are
+    equally dense in the images. Twice as many are drawn and those in sight of at least half the cameras
+    preferred: one view alone teaches no depth.
+    """
+    near, far = 0.3 * look_distance(cameras), 3 * look_distance(cameras)
+    if len(known) >= TELLING_POINTS:
+        seen = [camera.project(known) for camera in cameras]
+        depths = [z[camera.in_image(pixels, z)] for camera, (pixels, z) in zip(cameras, seen, strict=True)]
+        near, far = (float(z) for z in np.quantile(np.concatenate(depths), (0.02, 0.98)))
+    drawn = np.zeros((2 * count, 3))
+    colours = np.zeros((2 * count, 3), np.uint8)
+    owner = rng.integers(len(cameras), size=2 * count)
+    for index, camera in enumerate(cameras):
+        rows = np.flatnonzero(owner == index)
+        x = rng.uniform(0, camera.width, len(rows))
+        y = rng.uniform(0, camera.height, len(rows))
+        mask = masks[index] if masks else None
+        if mask is not None and mask.any():
+            at = np.divmod(rng.choice(np.flatnonzero(mask), len(rows)), camera.width)
+            y, x = (whole + part % 1 for whole, part in zip(at, (y, x), strict=True))
+        z = 1 / rng.uniform(1 / far, 1 / near, len(rows))
+        drawn[rows] = camera.unproject(np.stack([x, y], -1), z)
+        colours[rows] = images[index][y.astype(int), x.astype(int)]
+    shared = np.sum([camera.in_image(*camera.project(drawn)) for camera in cameras], axis=0)
+    best = np.argsort(shared < len(cameras) / 2, kind="stable")[:count]
+    return drawn[best], colours[best]

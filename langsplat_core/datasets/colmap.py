@@ -9,7 +9,7 @@ frames (COLMAP >= 3.12) add nothing here, because images.bin still carries every
 import logging
 import os
 import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -19,68 +19,37 @@ import numpy as np
 
 from langsplat_core.arrays import Array, rotation_matrices
 from langsplat_core.datasets.capture import Capture, warn_of_lost_points
-from langsplat_core.datasets.intrinsics import (
-    BrownDistortion,
-    ColmapDistortion,
-    Distortion,
-    FisheyeDistortion,
-    PhotoIntrinsics,
-)
+from langsplat_core.datasets.intrinsics import BrownDistortion, FisheyeDistortion, PhotoIntrinsics
 from langsplat_core.datasets.photos import Photo, develop, find_photos, mask_beside
 from langsplat_core.errors import FormatError, InputError, printable_line, shortened
 from langsplat_core.io.files import shown
 from langsplat_core.progress import Progress
 from langsplat_core.scene import FARTHEST
 
-# COLMAP's mapper drops points above 4 px itself, so only models that were made otherwise lose any here.
-MAX_POINT_ERROR = 4.0  # pixels
-CAMERA_MODELS = MappingProxyType({  # id -> name and parameters, in file order
-    0: ("SIMPLE_PINHOLE", "f cx cy"),
-    1: ("PINHOLE", "fx fy cx cy"),
-    2: ("SIMPLE_RADIAL", "f cx cy k1"),
-    3: ("RADIAL", "f cx cy k1 k2"),
-    4: ("OPENCV", "fx fy cx cy k1 k2 p1 p2"),
-    5: ("OPENCV_FISHEYE", "fx fy cx cy k1 k2 k3 k4"),
-    6: ("FULL_OPENCV", "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
-    7: ("FOV", "fx fy cx cy omega"),
-    8: ("SIMPLE_RADIAL_FISHEYE", "f cx cy k1"),
-    9: ("RADIAL_FISHEYE", "f cx cy k1 k2"),
-    10: ("THIN_PRISM_FISHEYE", "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1"),
-    11: ("RAD_TAN_THIN_PRISM_FISHEYE", "fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3"),
-    12: ("SIMPLE_DIVISION", "f cx cy k"),
-    13: ("DIVISION", "fx fy cx cy k"),
-    14: ("SIMPLE_FISHEYE", "f cx cy"),
-    15: ("FISHEYE", "fx fy cx cy"),
-    16: ("EUCM", "fx fy cx cy alpha beta"),
+# Lenses by their numbers: name, formula, and parameters in file order; f stands for both fx and fy.
+LENSES = MappingProxyType({
+    0: ("SIMPLE_PINHOLE", BrownDistortion, "f cx cy"),
+    1: ("PINHOLE", BrownDistortion, "fx fy cx cy"),
+    2: ("SIMPLE_RADIAL", BrownDistortion, "f cx cy k1"),
+    3: ("RADIAL", BrownDistortion, "f cx cy k1 k2"),
+    4: ("OPENCV", BrownDistortion, "fx fy cx cy k1 k2 p1 p2"),
+    5: ("OPENCV_FISHEYE", FisheyeDistortion, "fx fy cx cy k1 k2 k3 k4"),
+    6: ("FULL_OPENCV", BrownDistortion, "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
+    8: ("SIMPLE_RADIAL_FISHEYE", FisheyeDistortion, "f cx cy k1"),
+    9: ("RADIAL_FISHEYE", FisheyeDistortion, "f cx cy k1 k2"),
+    14: ("SIMPLE_FISHEYE", FisheyeDistortion, "f cx cy"),
+    15: ("FISHEYE", FisheyeDistortion, "fx fy cx cy"),
 })  # fmt: skip
-_PARAMETERS = dict(CAMERA_MODELS.values())
-_BROWN = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-_FISHEYE = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
+
+# Records of the binary files, each of which begins with their number. An image goes on with its name, a zero
+# byte, and the number of its observations of 24 bytes; a point with `track` observations of 8 bytes.
+CAMERA = np.dtype([("id", "<i4"), ("lens", "<i4"), ("width", "<u8"), ("height", "<u8")])
+IMAGE = np.dtype([("id", "<i4"), ("pose", "<f8", 7), ("camera", "<i4")])
+POINT = np.dtype([
+    ("id", "<u8"), ("position", "<f8", 3), ("colour", "u1", 3), ("error", "<f8"), ("track", "<u8"),
+])  # fmt: skip
 
 log = logging.getLogger("langsplat")
-
-
-@dataclass(frozen=True)
-class ModelCamera:
-    """A camera of a model; ValueError where no camera has such numbers."""
-
-    model: str  # name in CAMERA_MODELS
-    width: int
-    height: int
-    params: tuple[float, ...]
-
-    def __post_init__(self) -> None:
-        if len(self.params) != len(_PARAMETERS.get(self.model, "").split()):
-            raise ValueError(f"{len(self.params)} parameters do not make a {self.model} camera")
-        if not (self.width > 0 and self.height > 0 and np.isfinite(self.params).all()):
-            raise ValueError(f"a {self.model} camera of {self.width}x{self.height} pixels, {self.params}")
-
-    def named(self) -> dict[str, float]:
-        """Return parameters by name; a single focal length appears as both fx and fy."""
-        values = dict(zip(_PARAMETERS[self.model].split(), self.params, strict=True))
-        if "f" in values:
-            values["fx"] = values["fy"] = values.pop("f")
-        return values
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,47 +65,38 @@ class ModelImage:
 class SparseModel:
     """Content of a COLMAP model."""
 
-    cameras: dict[int, ModelCamera]
+    lenses: dict[int, PhotoIntrinsics]  # by the number of the camera
     images: list[ModelImage]
-    points: Array  # (M, 3) float64 world units
-    colours: Array  # (M, 3) uint8
-    errors: Array  # (M,) float64 mean reprojection error, pixels; -1 where unknown
-    track_lengths: Array  # (M,) int64 how many images see the point; 0 where unknown
+    # (M,) of POINT: position in world units, mean reprojection error in pixels (-1 where unknown), number of
+    # images that see the point (0 where unknown)
+    points: Array
 
 
 def has_model(folder: Path) -> bool:
     """Return True where cameras and images lie in `folder`, both binary or both text."""
-    return any(
-        all((folder / f"{part}{suffix}").is_file() for part in ("cameras", "images"))
-        for suffix in (".bin", ".txt")
-    )
+    return _suffix(folder) is not None
 
 
-def read_images(folder: Path) -> list[ModelImage]:
-    """Return the images of the model in `folder` alone. FormatError where they are damaged."""
-    images: list[ModelImage] = _content(_file(folder, "images"))
-    return images
+def _suffix(folder: Path) -> str | None:
+    parts = ("cameras", "images")
+    kinds = (".bin", ".txt")
+    return next((k for k in kinds if all((folder / f"{part}{k}").is_file() for part in parts)), None)
 
 
 def read_model(folder: Path) -> SparseModel:
     """Return the model in `folder`; binary is preferred. FormatError names the file that is broken."""
-    cameras, images = _content(_file(folder, "cameras")), read_images(folder)
+    suffix = _suffix(folder)
+    if suffix is None:
+        raise InputError(f"{folder} holds no cameras.bin and images.bin (or .txt)")
+    lenses, images = _content(folder / f"cameras{suffix}"), _content(folder / f"images{suffix}")
     for image in images:
-        if image.camera_id not in cameras:
+        if image.camera_id not in lenses:
             raise FormatError(
-                f"{_file(folder, 'images')}: {printable_line(image.name, 80)} was taken with camera "
+                f"{folder / f'images{suffix}'}: {printable_line(image.name, 80)} was taken with camera "
                 f"{printable_line(image.camera_id, 40)}, which the model lacks; export the model again"
             )
-    points = _file(folder, "points3D")
-    return SparseModel(cameras, images, *(_content(points) if points.is_file() else _points(())))
-
-
-def _file(folder: Path, part: str) -> Path:
-    """Return the file of a part of the model in `folder`."""
-    if not has_model(folder):
-        raise InputError(f"{folder} holds no cameras.bin and images.bin (or .txt)")
-    is_binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
-    return folder / f"{part}{'.bin' if is_binary else '.txt'}"
+    points = folder / f"points3D{suffix}"
+    return SparseModel(lenses, images, _content(points) if points.is_file() else np.zeros(0, POINT))
 
 
 def _content(path: Path) -> Any:
@@ -145,15 +105,31 @@ def _content(path: Path) -> Any:
         return _READERS[path.name](path.read_bytes())
     except (struct.error, ValueError, IndexError, OverflowError) as error:
         raise FormatError(
-            f"{path} is no readable COLMAP file ({printable_line(error, 120)}); export the model again"
+            f"{path} is no readable COLMAP file ({printable_line(error, 160)}); export the model again"
         ) from None
 
 
-def _image(name: str, camera_id: int, pose: list[float]) -> ModelImage:
+def lens_of(name: str, width: int, height: int, parameters: Array) -> PhotoIntrinsics:
+    """Return the lens of a camera of a model; ValueError where none has such numbers, or it is not read."""
+    found = next((row for row in LENSES.values() if row[0] == name), None)
+    if found is None:
+        raise ValueError(
+            f"{printable_line(name, 40)} is no camera that is read here; undistort the photographs with "
+            "`colmap image_undistorter`"
+        )
+    _, formula, keys = found
+    values = dict(zip(keys.split(), map(float, parameters), strict=True))
+    if not np.isfinite(parameters).all():
+        raise ValueError(f"a {name} camera with {values}")
+    fx = values.pop("f" if "f" in values else "fx")
+    fy, cx, cy = values.pop("fy", fx), values.pop("cx"), values.pop("cy")
+    return PhotoIntrinsics(width, height, fx, fy, cx, cy, formula(**values))
+
+
+def _image(name: str, camera_id: int, pose: Array) -> ModelImage:
     """Return the image of a pose, which is a quaternion wxyz of any length and a translation."""
-    quaternion, translation = np.array(pose[:4]), np.array(pose[4:])
-    largest = np.abs(quaternion).max()
-    if not ((np.abs(translation) <= FARTHEST).all() and 1e-9 < largest < 1e9):
+    quaternion, translation = pose[:4], pose[4:]
+    if not ((np.abs(translation) <= FARTHEST).all() and 1e-9 < np.abs(quaternion).max() < 1e9):
         raise ValueError(f"image {name} has an impossible pose")
     matrix = np.eye(4)
     matrix[:3, :3] = rotation_matrices(quaternion[None])[0]
@@ -161,54 +137,47 @@ def _image(name: str, camera_id: int, pose: list[float]) -> ModelImage:
     return ModelImage(name, camera_id, matrix)
 
 
-def _points(rows: Iterable[tuple[Any, Any, float, int]]) -> tuple[Array, Array, Array, Array]:
-    """Return the arrays of rows of position, colour, error and track length."""
-    positions, colours, errors, tracks = [list(column) for column in zip(*rows, strict=True)] or [[]] * 4
-    return (
-        np.array(positions, np.float64).reshape(-1, 3),
-        np.array(colours, np.uint8).reshape(-1, 3),
-        np.array(errors, np.float64),
-        np.array(tracks, np.int64),
-    )
+# Binary files: a number, and as many records.
 
 
-# Binary files: a count, and rows; a count too large ends in struct.error at the end of the data.
-
-
-def _binary_cameras(data: bytes) -> dict[int, ModelCamera]:
-    offset, cameras = 8, {}
+def _records(data: bytes, kind: Any, rest: Callable[[Any, int], int]) -> Iterator[tuple[Any, bytes]]:
+    """Yield every record with the bytes behind it; rest: how many, by the record and where it ends."""
+    end = 8
     for _ in range(*struct.unpack_from("<Q", data)):
-        camera_id, model_id, width, height = struct.unpack_from("<iiQQ", data, offset)
-        if model_id not in CAMERA_MODELS:
-            raise ValueError(f"camera model number {model_id} is unknown or not a pinhole with a lens")
-        model, keys = CAMERA_MODELS[model_id]
-        params = struct.unpack_from(f"<{len(keys.split())}d", data, offset + 24)
-        cameras[camera_id] = ModelCamera(model, width, height, params)
-        offset += 24 + 8 * len(params)
-    return cameras
+        record = np.frombuffer(data, kind, 1, end)[0]
+        begin = end + kind.itemsize
+        end = begin + rest(record, begin)
+        if end > len(data):
+            raise ValueError("the file ends inside a record")
+        yield record, data[begin:end]
 
 
-def _binary_images(data: bytes) -> Iterator[ModelImage]:
-    offset = 8
-    for _ in range(*struct.unpack_from("<Q", data)):
-        _, *pose, camera_id = struct.unpack_from("<i7di", data, offset)
-        end = data.index(b"\0", offset + 64)
-        name = data[offset + 64 : end].decode()
-        (observations,) = struct.unpack_from("<Q", data, end + 1)
-        offset = end + 9 + 24 * observations
-        if offset > len(data):
-            raise ValueError(f"the file ends inside image {name}")
-        yield _image(name, camera_id, pose)
+def _binary_cameras(data: bytes) -> dict[int, PhotoIntrinsics]:
+    def row(camera: Any) -> tuple[str, Any, str]:
+        return LENSES.get(int(camera["lens"]), (f"number {camera['lens']}", None, ""))
+
+    return {
+        int(camera["id"]): lens_of(
+            row(camera)[0], int(camera["width"]), int(camera["height"]), np.frombuffer(parameters)
+        )
+        for camera, parameters in _records(data, CAMERA, lambda camera, _: 8 * len(row(camera)[2].split()))
+    }
 
 
-def _binary_points(data: bytes) -> Iterator[tuple[Any, Any, float, int]]:
-    offset = 8
-    for _ in range(*struct.unpack_from("<Q", data)):
-        _, x, y, z, r, g, b, error, track = struct.unpack_from("<Q3d3BdQ", data, offset)
-        offset += 51 + 8 * track
-        if offset > len(data):
-            raise ValueError("the file ends inside a point")
-        yield (x, y, z), (r, g, b), error, track
+def _binary_images(data: bytes) -> list[ModelImage]:
+    def rest(_: Any, begin: int) -> int:
+        end = data.index(b"\0", begin) + 1
+        return int(end + 8 + 24 * struct.unpack_from("<Q", data, end)[0] - begin)
+
+    return [
+        _image(behind.partition(b"\0")[0].decode(), int(image["camera"]), image["pose"])
+        for image, behind in _records(data, IMAGE, rest)
+    ]
+
+
+def _binary_points(data: bytes) -> Array:
+    points = _records(data, POINT, lambda point, _: 8 * int(point["track"]))
+    return np.array([point for point, _ in points], POINT)
 
 
 # Text files: a line for each row, after comments.
@@ -218,37 +187,40 @@ def _lines(data: bytes) -> list[str]:
     return [line.strip() for line in data.decode().splitlines() if not line.startswith("#")]
 
 
-def _text_cameras(data: bytes) -> dict[int, ModelCamera]:
-    cameras = {}
+def _text_cameras(data: bytes) -> dict[int, PhotoIntrinsics]:
+    lenses = {}
     for line in filter(None, _lines(data)):
-        camera_id, model, width, height, *params = line.split()
-        cameras[int(camera_id)] = ModelCamera(model, int(width), int(height), tuple(map(float, params)))
-    return cameras
+        camera_id, name, width, height, *parameters = line.split()
+        lenses[int(camera_id)] = lens_of(name, int(width), int(height), np.array(parameters, np.float64))
+    return lenses
 
 
-def _text_images(data: bytes) -> Iterator[ModelImage]:
-    lines = _lines(data)
-    while lines and not lines[-1]:
-        lines.pop()
-    for line in lines[::2]:  # every second line lists 2D points, and may be empty
+def _text_images(data: bytes) -> list[ModelImage]:
+    images = []
+    for line in "\n".join(_lines(data)).rstrip().split("\n")[::2]:  # every second one lists 2D points
         _, *pose, camera_id, name = line.split(maxsplit=9)
-        yield _image(name, int(camera_id), list(map(float, pose)))
+        images.append(_image(name, int(camera_id), np.array(pose, np.float64)))
+    return images
 
 
-def _text_points(data: bytes) -> Iterator[tuple[Any, Any, float, int]]:
-    for line in filter(None, _lines(data)):
-        fields = line.split()
-        position, colour = list(map(float, fields[1:4])), list(map(int, fields[4:7]))
-        yield position, colour, float(fields[7]), len(fields[8:]) // 2
+def _text_points(data: bytes) -> Array:
+    rows = [line.split() for line in _lines(data) if line]
+    return np.array(
+        [
+            (0, list(map(float, row[1:4])), list(map(int, row[4:7])), float(row[7]), len(row[8:]) // 2)
+            for row in rows
+        ],
+        POINT,
+    )
 
 
 _READERS: dict[str, Callable[[bytes], Any]] = {
     "cameras.bin": _binary_cameras,
     "cameras.txt": _text_cameras,
-    "images.bin": lambda data: list(_binary_images(data)),
-    "images.txt": lambda data: list(_text_images(data)),
-    "points3D.bin": lambda data: _points(_binary_points(data)),
-    "points3D.txt": lambda data: _points(_text_points(data)),
+    "images.bin": _binary_images,
+    "images.txt": _text_images,
+    "points3D.bin": _binary_points,
+    "points3D.txt": _text_points,
 }
 
 
@@ -266,41 +238,22 @@ def find_model(folder: Path) -> Path | None:
     found = [f for f in inside if has_model(f)]
     if len(found) < 2:
         return next((f for f in (*found, sparse) if has_model(f)), None)
-    counts = [_photographs_of(f) for f in found]
-    best = found[counts.index(max(counts))]
-    if max(counts):
-        each = ", ".join(f"{f.name}: {count}" for f, count in zip(found[:5], counts, strict=False))
-        log.warning(
-            "%s has %d models; %s is taken, which has most photographs (%s%s)",
-            shown(sparse),
-            len(found),
-            printable_line(best.name, 60),
-            printable_line(each, 200),
-            ", ..." if len(found) > 5 else "",
-        )
+    best = max(found, key=_photographs_of)
+    log.warning(
+        "%s has %d models; %s is taken, which has most photographs",
+        shown(sparse),
+        len(found),
+        printable_line(best.name, 60),
+    )
     return best
 
 
 def _photographs_of(model_folder: Path) -> int:
     """Return the number of photographs with a camera in a model; 0 if it is damaged."""
     try:
-        return len({image.name for image in read_images(model_folder)})
+        return len({image.name for image in _content(model_folder / f"images{_suffix(model_folder)}")})
     except FormatError:
         return 0
-
-
-def intrinsics_of(camera: ModelCamera) -> PhotoIntrinsics:
-    """Return the intrinsics of a COLMAP camera; ValueError if its focal length is impossible."""
-    rest = camera.named()
-    fx, fy, cx, cy = (rest.pop(key) for key in ("fx", "fy", "cx", "cy"))
-    distortion: Distortion
-    if camera.model in _BROWN:
-        distortion = BrownDistortion(**rest)
-    elif camera.model in _FISHEYE:
-        distortion = FisheyeDistortion(**rest)
-    else:
-        distortion = ColmapDistortion(camera.model, camera.params, fx, fy, cx, cy)
-    return PhotoIntrinsics(camera.width, camera.height, fx, fy, cx, cy, distortion)
 
 
 def load_colmap(folder: Path, model_folder: Path, max_side: int, progress: Progress) -> Capture:
@@ -308,10 +261,11 @@ def load_colmap(folder: Path, model_folder: Path, max_side: int, progress: Progr
     model = read_model(model_folder)
     # Without a folder of their own, photographs lie in the dataset's.
     images = folder / "images" if (folder / "images").is_dir() or not model.images else folder
-    photos = located_photos(model, images, model_folder)
+    photos = located_photos(model, images)
     # os.path.isfile, unlike Path.is_file, also says no to names that no file system could hold.
-    missing = {photo.label for photo in photos if not os.path.isfile(photo.path)}
-    if missing and len(missing) == len(photos):
+    there = [photo for photo in photos if os.path.isfile(photo.path)]
+    missing = len(photos) - len(there)
+    if photos and not there:
         raise InputError(
             f"{shown(model_folder)}: none of its {len(photos)} photographs exists "
             f"(first: {printable_line(photos[0].label, 60)}); put them into {shown(folder / 'images')}"
@@ -319,11 +273,10 @@ def load_colmap(folder: Path, model_folder: Path, max_side: int, progress: Progr
     if missing:
         log.warning(
             "%d of %d photographs of the model do not exist and are left out: %s",
-            len(missing),
+            missing,
             len(photos),
-            shortened(missing),
+            shortened({photo.label for photo in photos} - {photo.label for photo in there}),
         )
-    there = [photo for photo in photos if photo.label not in missing]
     present = len(find_photos(images))
     if 2 * len(there) < present:
         log.warning(
@@ -336,16 +289,10 @@ def load_colmap(folder: Path, model_folder: Path, max_side: int, progress: Progr
     return Capture(cameras, pixels, *good_points(model), photos=files, masks=masks)
 
 
-def located_photos(model: SparseModel, folder: Path, source: Path) -> list[Photo]:
-    """Return the model's images as photographs in `folder`; FormatError names `source` for a bad camera."""
-    lenses = {}
-    for camera_id, camera in model.cameras.items():
-        try:
-            lenses[camera_id] = intrinsics_of(camera)
-        except ValueError as error:
-            raise FormatError(f"{source}: camera {camera_id}: {error}; export the model again") from None
+def located_photos(model: SparseModel, folder: Path) -> list[Photo]:
+    """Return the model's images as photographs in `folder`, each name once."""
     return [
-        Photo(path, name, lenses[image.camera_id], image.world_to_camera, mask=mask_beside(path))
+        Photo(path, name, model.lenses[image.camera_id], image.world_to_camera, mask=mask_beside(path))
         for name, image in {image.name: image for image in model.images}.items()
         for path in (folder / name,)
     ]
@@ -354,11 +301,10 @@ def located_photos(model: SparseModel, folder: Path, source: Path) -> list[Photo
 def good_points(model: SparseModel) -> tuple[Array, Array]:
     """Return (M, 3) points and (M, 3) colours without those that are plainly wrong.
 
-    These are not finite, seen by a single image, or reprojected more than `MAX_POINT_ERROR` off. Unknown
-    errors and tracks count as good.
+    These are not finite, seen by a single image, or reprojected more than 4 pixels off, as COLMAP's mapper
+    would not leave them. Unknown errors and tracks count as good.
     """
-    good = np.isfinite(model.points).all(1)
-    good &= ~(model.errors > MAX_POINT_ERROR)
-    good &= model.track_lengths != 1
+    points = model.points
+    good = np.isfinite(points["position"]).all(1) & ~(points["error"] > 4) & (points["track"] != 1)
     warn_of_lost_points(good, "the COLMAP model")
-    return model.points[good], model.colours[good]
+    return points["position"][good], points["colour"][good]

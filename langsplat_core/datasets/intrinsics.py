@@ -6,12 +6,7 @@ at +0.5. Formulas: OpenCV's "Camera Calibration and 3D Reconstruction" and "Fish
 Everything here is float64; it is the reference that resampling follows.
 """
 
-import signal
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from PIL import Image
@@ -21,30 +16,10 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.scene import Camera, Intrinsics
 
-# What no photograph exceeds; numbers of damaged files would overflow in what is computed from them.
-MOST_SIDE = 1 << 20  # pixels
-FOCAL_RANGE = (1e-3, 1e5)  # in lengths of the longer side; a telescope of 100 m on a 36 mm sensor has 3000
-MOST_SHIFT = 1e3  # of the principal point, in lengths of the longer side
-
-
-class Distortion(Protocol):
-    """Map from (N, 2) normalised to (N, 2) distorted coordinates, float64.
-
-    Hashable, so that photographs taken with one lens share what is computed from it.
-    """
-
-    def __call__(self, xy: Array) -> Array:
-        """Return distorted coordinates."""
-
-    def __hash__(self) -> int: ...
-
 
 @dataclass(frozen=True)
 class BrownDistortion:
-    """Radial (rational, k1 to k6) and decentring (p1, p2) distortion of ordinary lenses.
-
-    COLMAP's SIMPLE_RADIAL, RADIAL, OPENCV and FULL_OPENCV.
-    """
+    """Radial (rational, k1 to k6) and decentring (p1, p2) distortion of ordinary lenses."""
 
     k1: float = 0.0
     k2: float = 0.0
@@ -56,7 +31,7 @@ class BrownDistortion:
     k6: float = 0.0
 
     def __call__(self, xy: Array) -> Array:
-        """Return (N, 2) distorted coordinates."""
+        """(N, 2) normalised -> (N, 2) distorted coordinates, float64."""
         x, y = xy[:, 0], xy[:, 1]
         r2 = x * x + y * y
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
@@ -68,10 +43,7 @@ class BrownDistortion:
 
 @dataclass(frozen=True)
 class FisheyeDistortion:
-    """Equidistant projection with a polynomial in the angle from the axis.
-
-    COLMAP's OPENCV_FISHEYE, SIMPLE_RADIAL_FISHEYE and RADIAL_FISHEYE.
-    """
+    """Equidistant projection with a polynomial in the angle from the axis."""
 
     k1: float = 0.0
     k2: float = 0.0
@@ -79,7 +51,7 @@ class FisheyeDistortion:
     k4: float = 0.0
 
     def __call__(self, xy: Array) -> Array:
-        """Return (N, 2) distorted coordinates."""
+        """(N, 2) normalised -> (N, 2) distorted coordinates, float64."""
         r = np.linalg.norm(xy, axis=-1)
         theta = np.arctan(r)
         t2 = theta * theta
@@ -88,41 +60,7 @@ class FisheyeDistortion:
         return xy * scale[:, None]
 
 
-@contextmanager
-def signals_kept() -> Iterator[None]:
-    """Keep the handlers of signals that pycolmap's logging library replaces when it is imported.
-
-    Its own print a stack trace and kill the process. Python sets handlers in the main thread alone.
-    """
-    yield
-    if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGTERM, signal.SIGABRT):
-            signal.signal(number, signal.getsignal(number) or signal.SIG_DFL)
-
-
-@dataclass(frozen=True)
-class ColmapDistortion:
-    """Any other of COLMAP's models, evaluated by pycolmap itself."""
-
-    model: str  # COLMAP's name, e.g. THIN_PRISM_FISHEYE
-    params: tuple[float, ...]  # as in the model file; the first four are fx, fy, cx, cy or two/three thereof
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-
-    def __post_init__(self) -> None:
-        with signals_kept():  # here, as threads call the lens
-            import pycolmap  # noqa: F401
-
-    def __call__(self, xy: Array) -> Array:
-        """Return (N, 2) distorted coordinates."""
-        import pycolmap
-
-        # The size plays no part in these models, but pycolmap asks for one.
-        camera = pycolmap.Camera(model=self.model, width=1, height=1, params=np.array(self.params))
-        rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
-        return (np.asarray(camera.img_from_cam(rays)) - (self.cx, self.cy)) / (self.fx, self.fy)
+Distortion = BrownDistortion | FisheyeDistortion
 
 
 @dataclass(frozen=True)
@@ -135,18 +73,15 @@ class PhotoIntrinsics(Intrinsics):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        side = max(self.width, self.height)
-        least, most = FOCAL_RANGE
-        if side > MOST_SIDE:
-            raise ValueError(f"a photograph of more than {MOST_SIDE} pixels a side")
-        if not least * side <= min(self.fx, self.fy) <= max(self.fx, self.fy) <= most * side:
-            raise ValueError(
-                f"focal lengths {self.fx:g} and {self.fy:g} for {side} pixels; none has such a lens"
-            )
-        if max(abs(self.cx), abs(self.cy)) > MOST_SHIFT * side:
-            raise ValueError(
-                f"the principal point ({self.cx:g}, {self.cy:g}) is far outside of the photograph"
-            )
+        # What no photograph exceeds; numbers of damaged files would overflow in what is computed from them. A
+        # telescope of 100 m has a focal length of 3000 sides of a 36 mm sensor.
+        side, shift = max(self.width, self.height), max(abs(self.cx), abs(self.cy))
+        if side > 1 << 20:
+            raise ValueError(f"a photograph of {side} pixels a side; at most {1 << 20} are read")
+        if not 1e-3 * side <= min(self.fx, self.fy) <= max(self.fx, self.fy) <= 1e5 * side:
+            raise ValueError(f"focal lengths {self.fx:g} and {self.fy:g} for {side} pixels, as of no lens")
+        if shift > 1e3 * side:
+            raise ValueError(f"the principal point ({self.cx:g}, {self.cy:g}) is far outside")
         if self.distortion == BrownDistortion():  # all zero, as many files write a pinhole
             object.__setattr__(self, "distortion", None)
 
@@ -164,8 +99,6 @@ class PhotoIntrinsics(Intrinsics):
 # From a lens to a pinhole: the inverse of a distortion, the choice of pinhole, and the resampling.
 
 MAX_HALF_ANGLE = np.radians(65)  # from the axis; a pinhole image stretches without bound towards 90
-BORDER_SAMPLES = 64  # per side of the photograph
-NEWTON_STEPS = 30
 
 
 def _radial_profile(distortion: Distortion) -> tuple[Array, Array]:
@@ -207,7 +140,7 @@ def undistorted_points(distortion: Distortion, distorted: Array) -> Array:
     direction = distorted / np.maximum(length, 1e-12)[:, None]
     xy = direction * np.interp(length, profile, radii)[:, None]
     limit = radii[-1]
-    for _ in range(NEWTON_STEPS):
+    for _ in range(30):
         step = np.linalg.solve(_jacobian(distortion, xy), (distortion(xy) - distorted)[:, :, None])[:, :, 0]
         # A short step cannot leap over a fold; the radius cannot leave the invertible disc.
         step *= np.minimum(1, 0.2 * limit / np.maximum(np.linalg.norm(step, axis=-1), 1e-300))[:, None]
@@ -246,29 +179,22 @@ def pinhole_for(intrinsics: PhotoIntrinsics, max_side: int) -> Camera:
 def _inner_rectangle(intrinsics: PhotoIntrinsics) -> tuple[float, float, float, float]:
     """Return normalised left, top, right, bottom of a rectangle wholly inside the undistorted outline."""
     assert intrinsics.distortion is not None
-    t = np.linspace(0, 1, BORDER_SAMPLES)
+    t = np.linspace(0, 1, 64)
     zero, one = np.zeros_like(t), np.ones_like(t)
     sides = np.stack([np.stack(side, -1) for side in ((zero, t), (t, zero), (one, t), (t, one))])
     pixels = sides.reshape(-1, 2) * (intrinsics.width, intrinsics.height)
     distorted = (pixels - (intrinsics.cx, intrinsics.cy)) / (intrinsics.fx, intrinsics.fy)
     try:
-        xy = undistorted_points(intrinsics.distortion, distorted).reshape(4, -1, 2)
+        left, top, right, bottom = undistorted_points(intrinsics.distortion, distorted).reshape(4, -1, 2)
     except (ValueError, np.linalg.LinAlgError) as error:
         raise InputError(f"{intrinsics}: {error}; calibrate it again") from None
-    left, top, right, bottom = xy
-    return (
-        float(left[:, 0].max()),
-        float(top[:, 1].max()),
-        float(right[:, 0].min()),
-        float(bottom[:, 1].min()),
-    )
+    most, least = (left[:, 0].max(), top[:, 1].max()), (right[:, 0].min(), bottom[:, 1].min())
+    return float(most[0]), float(most[1]), float(least[0]), float(least[1])
 
 
 def source_positions(intrinsics: PhotoIntrinsics, camera: Camera) -> Array:
     """(H, W, 2) float64 position in the photograph of the centre of each of the camera's pixels."""
-    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
-    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
-    grid = np.stack(np.meshgrid(x, y), -1)
+    grid = (camera.pixel_centres() - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
     return intrinsics.pixels(grid.reshape(-1, 2)).reshape(grid.shape)
 
 
@@ -281,14 +207,13 @@ def resample(
     None for a lens without distortion. The photograph is first shrunk to the camera's magnification by an
     area-weighted filter, so that the interpolation (cubic spline) that follows neither aliases nor blurs.
     """
+    size = camera.width, camera.height
+    if positions is not None:
+        scale = min(camera.fx / intrinsics.fx, 1.0)
+        size = max(1, round(intrinsics.width * scale)), max(1, round(intrinsics.height * scale))
+    pixels = np.asarray(photo if photo.size == size else photo.resize(size, Image.Resampling.LANCZOS))
     if positions is None:
-        size = (camera.width, camera.height)
-        return np.asarray(photo if photo.size == size else photo.resize(size, Image.Resampling.LANCZOS))
-    scale = camera.fx / intrinsics.fx
-    if scale < 1:
-        size = (max(1, round(intrinsics.width * scale)), max(1, round(intrinsics.height * scale)))
-        photo = photo.resize(size, Image.Resampling.LANCZOS)
-    pixels = np.asarray(photo)
+        return pixels
     # Array index i holds the pixel whose centre is at i + 0.5.
     rows = positions[..., 1] * (pixels.shape[0] / intrinsics.height) - 0.5
     columns = positions[..., 0] * (pixels.shape[1] / intrinsics.width) - 0.5

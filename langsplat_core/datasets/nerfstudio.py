@@ -35,9 +35,7 @@ Json = dict[str, Any]
 def load_nerfstudio(file: Path, max_side: int, progress: Progress) -> Capture:
     """Return the photographs and cameras that `file` lists; points only if it names a PLY."""
     top = read_json_file(file, JSON_LIMIT)
-    if not isinstance(top, dict):
-        raise FormatError(f"{file} is not a nerfstudio dataset: expected an object at the top")
-    frames = top.get("frames")
+    frames = top.get("frames") if isinstance(top, dict) else None
     if not isinstance(frames, list) or not frames:
         raise FormatError(f'{file} has no list of "frames"; it is not a nerfstudio dataset')
     photos: dict[str, Photo] = {}
@@ -57,41 +55,21 @@ def load_nerfstudio(file: Path, max_side: int, progress: Progress) -> Capture:
             photos[label] = Photo(path, label, _lens({**top, **frame}, size), _pose(frame), mask=mask)
         except ValueError as error:
             raise FormatError(f"{where} ({printable_line(label, 60)}): {error}") from None
-    _report_missing(file, missing, len(frames))
+    if missing:
+        lost = f"{len(missing)} of {len(frames)} photographs in {file.name} cannot be opened"
+        if not photos:
+            raise InputError(f"{file}: {lost}: {shortened(missing)}; its paths begin at its folder")
+        log.warning("%s and are left out: %s", lost, shortened(missing))
+    try:  # a key of our own: nerfstudio's files do not state it
+        metres = _number(top, "metres_per_unit") if top.get("metres_per_unit") is not None else None
+        if metres is not None and metres <= 0:
+            raise ValueError(f'"metres_per_unit" must be above 0, got {metres:g}')
+    except ValueError as error:
+        raise FormatError(f"{file}: {error}") from None
     cameras, images, files, masks = develop(list(photos.values()), max_side, progress)
     points, colours = _points(file, top.get("ply_file_path"))
     drawn = top.get("drawn") is True  # ours, of `python -m assets.making dataset`
-    return Capture(cameras, images, points, colours, _metres_per_unit(file, top), files, drawn, masks)
-
-
-def _metres_per_unit(file: Path, top: Json) -> float | None:
-    """Return the length of a unit, a key of our own: nerfstudio's files do not state it."""
-    if top.get("metres_per_unit") is None:
-        return None
-    try:
-        metres = _number(top, "metres_per_unit")
-    except ValueError as error:
-        raise FormatError(f"{file}: {error}") from None
-    if metres <= 0:
-        raise FormatError(f'{file}: "metres_per_unit" must be above 0, got {metres:g}')
-    return metres
-
-
-def _report_missing(file: Path, missing: list[str], total: int) -> None:
-    if len(missing) == total:
-        raise InputError(
-            f"none of the {total} photographs listed in {file} can be opened "
-            f"(first: {printable_line(missing[0], 80)}); "
-            "paths in it are relative to its folder"
-        )
-    if missing:
-        log.warning(
-            "%d of %d photographs in %s do not exist or cannot be opened and are left out: %s",
-            len(missing),
-            total,
-            file.name,
-            shortened(missing),
-        )
+    return Capture(cameras, images, points, colours, metres, files, drawn, masks)
 
 
 def _photo_file(folder: Path, label: str) -> Path | None:
@@ -131,15 +109,9 @@ def _lens(values: Json, size: tuple[int, int]) -> PhotoIntrinsics:
     """Return the lens of merged top-level and per-frame values; `size` counts where they give none."""
     width, height = (round(_number(values, key, default)) for key, default in zip("wh", size, strict=True))
     fx = _focal(values, "x", width, None)
-    return PhotoIntrinsics(
-        width,
-        height,
-        fx,
-        _focal(values, "y", height, fx),
-        _number(values, "cx", width / 2),
-        _number(values, "cy", height / 2),
-        _distortion(values),
-    )
+    fy = _focal(values, "y", height, fx)
+    cx, cy = _number(values, "cx", width / 2), _number(values, "cy", height / 2)
+    return PhotoIntrinsics(width, height, fx, fy, cx, cy, _distortion(values))
 
 
 def _focal(values: Json, axis: str, side: int, default: float | None) -> float:

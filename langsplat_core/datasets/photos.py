@@ -1,6 +1,7 @@
 """Photographs on disk: finding them, reading them whatever their kind, and resampling them to pinholes."""
 
 import logging
+import math
 import os
 import tempfile
 from collections.abc import Callable, Sequence
@@ -8,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageOps
@@ -38,30 +40,7 @@ class Photo:
     mask: Path | None = None  # an image of the same shape, black where the photograph does not count
 
 
-class Album:
-    """Images in bounded memory.
-
-    Beyond a limit they lie in files without a name in the temporary folder (`TMPDIR`), which the system reads
-    in where they are used and which end with the process.
-    """
-
-    def __init__(self, in_memory: int = 512_000_000) -> None:
-        """in_memory: bytes of images that are held there."""
-        self._left = in_memory
-
-    def keep(self, image: Array) -> Array:
-        """Return the same (H, W, 3) uint8 image, in memory as long as there is room, else in a file."""
-        self._left -= image.nbytes
-        if self._left >= 0:
-            return image
-        try:
-            with tempfile.TemporaryFile(prefix="langsplat-") as file:
-                # Written, not mapped and filled: on a full disk that would kill the process without a word.
-                file.write(np.ascontiguousarray(image).data)
-                file.flush()
-                return np.memmap(file, np.uint8, "c", shape=image.shape)
-        except OSError as error:
-            raise OSError(error.errno, error.strerror, tempfile.gettempdir()) from error
+# Finding them.
 
 
 def find_photos(folder: Path) -> list[Path]:
@@ -98,8 +77,7 @@ def mask_beside(photo: Path) -> Path | None:
     That is masks/NAME.jpg.png or masks/NAME.png, in the photograph's folder or beside that.
     """
     folders = (photo.parent / "masks", photo.parent.parent / "masks")
-    names = (f"{photo.name}.png", f"{photo.stem}.png")
-    candidates = (folder / name for folder in folders for name in names)
+    candidates = (folder / name for folder in folders for name in (f"{photo.name}.png", f"{photo.stem}.png"))
     # os.path.isfile, unlike Path.is_file, also says no to names that no file system could hold.
     return next((path for path in candidates if path != photo and os.path.isfile(path)), None)
 
@@ -107,12 +85,74 @@ def mask_beside(photo: Path) -> Path | None:
 def unique_names(labels: Sequence[str]) -> list[str]:
     """Return file stems where those differ, else paths with "_" for "/" and for the suffix's dot."""
     stems = [PurePosixPath(label).stem for label in labels]
-    if len(set(stems)) == len(stems):
-        return stems
     paths = [str(PurePosixPath(label).with_suffix("")).replace("/", "_") for label in labels]
-    if len(set(paths)) == len(paths):
-        return paths
+    for names in (stems, paths):
+        if len(set(names)) == len(names):
+            return names
     return [label.replace("/", "_").replace(".", "_") for label in labels]
+
+
+# EXIF data: the focal length, as COLMAP learns of it, and the place (GPS).
+
+EXIF_IFD, GPS_IFD = 0x8769, 0x8825
+_MAKER, _MODEL = 0x010F, 0x0110
+_FOCAL, _FOCAL_ON_FILM = 0x920A, 0xA405  # mm; mm of a lens with the same view on film of 36 x 24 mm
+_PLANE_X, _PLANE_UNIT, _WIDTH = 0xA20E, 0xA210, 0xA002  # pixels per unit on the sensor; the unit; pixels
+_MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0}  # of the unit
+
+
+def optics(path: Path) -> Image.Exif:
+    """Return EXIF data that tell the focal length alone.
+
+    Other tags, orientation first of all, would be wrong for a copy of the photograph. Where a camera gives
+    pixels per inch of its sensor instead of the length on film, that is worked out: COLMAP compares those
+    with the size of the image, which is another for a copy.
+    """
+    kept = Image.Exif()
+    try:
+        with opened(path) as image:
+            source = image.getexif()
+            kept.update({tag: source[tag] for tag in (_MAKER, _MODEL) if tag in source})
+            inner = source.get_ifd(EXIF_IFD)
+            lens = {tag: inner[tag] for tag in (_FOCAL, _FOCAL_ON_FILM) if tag in inner}
+            if not lens.get(_FOCAL_ON_FILM):
+                lens |= _on_film(inner, image.size)
+            kept.get_ifd(EXIF_IFD).update(lens)
+            kept.tobytes()
+    except PictureError:
+        return Image.Exif()
+    return kept
+
+
+def _on_film(inner: dict[int, Any], size: tuple[int, int]) -> dict[int, int]:
+    """Return the focal length on film of an image of `size`, from the one on a sensor of known pixels."""
+    try:
+        width = inner.get(_WIDTH, size[0]) * _MILLIMETRES[inner.get(_PLANE_UNIT, 2)] / inner[_PLANE_X]
+        diagonal = width * math.hypot(*size) / size[0]
+        length = float(inner[_FOCAL] / diagonal * math.hypot(36, 24))
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):  # absent, or not what the standard says
+        return {}
+    return {_FOCAL_ON_FILM: round(length)} if 1 <= length <= 5_000 else {}  # mm, of any lens that is sold
+
+
+def place(path: Path) -> tuple[float, float]:
+    """Return latitude and longitude of a photograph, degrees, north and east positive; NaN without them."""
+    try:
+        with opened(path) as image:
+            # What stands behind a PNG's pixels is read by decoding them all.
+            tags = image.getexif().get_ifd(GPS_IFD) if image.format != "PNG" or "exif" in image.info else {}
+            latitude, longitude = (
+                sum(float(part) / 60**power for power, part in enumerate(tags[tag])) * signs[tags[tag - 1]]
+                for tag, signs in ((2, {"N": 1, "S": -1}), (4, {"E": 1, "W": -1}))
+            )
+    # Absent, or not what the standard says.
+    except (PictureError, KeyError, TypeError, ValueError, ZeroDivisionError):
+        return math.nan, math.nan
+    known = abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude, longitude) != (0, 0)
+    return (latitude, longitude) if known else (math.nan, math.nan)
+
+
+# Reading them.
 
 
 def read_photo(path: Path, upright: bool) -> Image.Image:
@@ -163,10 +203,8 @@ def _read_for(photo: Photo) -> tuple[Image.Image, PhotoIntrinsics]:
 
 def _fits(size: tuple[int, int], intrinsics: PhotoIntrinsics) -> bool:
     ratio = (size[0] * intrinsics.height) / (size[1] * intrinsics.width)
-    return (
-        abs(ratio - 1) < ASPECT_TOLERANCE
-        or max(abs(size[0] - intrinsics.width), abs(size[1] - intrinsics.height)) <= 1
-    )
+    off = max(abs(size[0] - intrinsics.width), abs(size[1] - intrinsics.height))
+    return abs(ratio - 1) < ASPECT_TOLERANCE or off <= 1
 
 
 def _read_mask(path: Path, size: tuple[int, int]) -> Image.Image:
@@ -207,6 +245,32 @@ def developer(max_side: int) -> Callable[[Photo], View]:
         return camera, pixels, np.asarray(mask[..., 0] >= 128)
 
     return view
+
+
+class Album:
+    """Images in bounded memory.
+
+    Beyond a limit they lie in files without a name in the temporary folder (`TMPDIR`), which the system reads
+    in where they are used and which end with the process.
+    """
+
+    def __init__(self, in_memory: int = 512_000_000) -> None:
+        """in_memory: bytes of images that are held there."""
+        self._left = in_memory
+
+    def keep(self, image: Array) -> Array:
+        """Return the same (H, W, 3) uint8 image, in memory as long as there is room, else in a file."""
+        self._left -= image.nbytes
+        if self._left >= 0:
+            return image
+        try:
+            with tempfile.TemporaryFile(prefix="langsplat-") as file:
+                # Written, not mapped and filled: on a full disk that would kill the process without a word.
+                file.write(np.ascontiguousarray(image).data)
+                file.flush()
+                return np.memmap(file, np.uint8, "c", shape=image.shape)
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, tempfile.gettempdir()) from error
 
 
 def develop(

@@ -12,26 +12,27 @@ import itertools
 import json
 import math
 import shutil
-from collections.abc import Callable, Collection, Iterable, Sequence
+import signal
+import threading
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
+import pycolmap
 
 from langsplat_core.datasets.colmap import read_model
-from langsplat_core.datasets.intrinsics import signals_kept
-from langsplat_core.datasets.matches import FEWEST_MATCHES, MATCHES
-from langsplat_core.datasets.workspace import MASKS, CameraGroup, Pair, disk_full
+from langsplat_core.datasets.workspace import FEWEST_MATCHES, MASKS, MATCHES, CameraGroup, Pair, disk_full
 from langsplat_core.errors import FormatError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera
 
-with signals_kept():
-    import pycolmap
-
 pycolmap.logging.minloglevel = 3  # where it aborts, its reason is the last thing it says
+if threading.current_thread() is threading.main_thread():  # Python sets handlers there alone
+    for _number in (signal.SIGTERM, signal.SIGABRT):  # its logging library's own print a stack trace
+        signal.signal(_number, signal.getsignal(_number) or signal.SIG_DFL)
 
 FEATURES = 8192  # per photograph
 SMALL_SIDE = 1000  # px; smaller photographs are doubled before features are sought, as SIFT proposes
@@ -41,77 +42,67 @@ MATCH_BATCH = 64  # pairs per step
 Model: TypeAlias = pycolmap.Reconstruction
 
 
+def opened(folder: Path) -> Any:
+    """Return the database of a workspace, opened, as a context manager."""
+    return pycolmap.Database.open(folder / "database.db")
+
+
 def extract_features(folder: Path, groups: Sequence[CameraGroup], progress: Progress) -> None:
     """Put SIFT features of every photograph of `groups` into the database; those it has are kept."""
-    database, images = folder / "database.db", folder / "images"
-    total, done = sum(len(group.names) for group in groups), 0
+    paths = {"database_path": folder / "database.db", "image_path": folder / "images"}
+    readers = []
     # Rows first, in the order of the names: extraction on several threads would number photographs as it
     # happens, and what follows depends on the numbers.
     for group in groups:
-        with pycolmap.Database.open(database) as opened:
-            known = {image.name: image.camera_id for image in opened.read_all_images()}
+        with opened(folder) as database:
+            known = {image.name: image.camera_id for image in database.read_all_images()}
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model, reader.camera_params = group.model, group.params
+        reader.existing_camera_id = known.get(group.names[0], -1)  # -1: a new camera
+        if (folder / MASKS).is_dir():
+            reader.mask_path = folder / MASKS
+        readers.append(reader)
         lacking = [name for name in group.names if name not in known]
         if lacking:
-            pycolmap.import_images(
-                database_path=database,
-                image_path=images,
-                camera_mode=pycolmap.CameraMode.SINGLE,
-                image_names=lacking,
-                options=_reader(group, known.get(group.names[0], -1), images.with_name(MASKS)),
-            )
-    for group in groups:
+            mode = pycolmap.CameraMode.SINGLE
+            pycolmap.import_images(**paths, camera_mode=mode, image_names=lacking, options=reader)
+    with opened(folder) as database:
+        rows = {image.name: image for image in database.read_all_images()}
+        lacking = [name for name, row in rows.items() if not database.exists_keypoints(row.image_id)]
+    total, done = sum(len(group.names) for group in groups), 0
+    for group, reader in zip(groups, readers, strict=True):
+        reader.existing_camera_id = rows[group.names[0]].camera_id
+        options = pycolmap.FeatureExtractionOptions()
+        options.sift.max_num_features = FEATURES
+        options.sift.first_octave = -1 if group.side <= SMALL_SIDE else 0
         for start in range(0, len(group.names), EXTRACT_BATCH):
             progress("finding features", done / total)
             names = group.names[start : start + EXTRACT_BATCH]
-            _extract(database, images, group, names)
             done += len(names)
+            if missing := [name for name in names if name in lacking]:
+                pycolmap.extract_features(
+                    **paths,
+                    image_names=missing,
+                    camera_mode=pycolmap.CameraMode.SINGLE,
+                    reader_options=reader,
+                    extraction_options=options,
+                    device=pycolmap.Device.cpu,
+                )
     progress("finding features", 1.0)
-
-
-def _reader(group: CameraGroup, camera_id: int, masks: Path) -> "pycolmap.ImageReaderOptions":
-    """Return options to take in photographs of a group; with -1 COLMAP makes a new camera for them."""
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = group.model
-    reader.camera_params = group.params
-    reader.existing_camera_id = camera_id
-    if masks.is_dir():
-        reader.mask_path = masks
-    return reader
-
-
-def _extract(database: Path, images: Path, group: CameraGroup, names: Sequence[str]) -> None:
-    with pycolmap.Database.open(database) as opened:
-        known = {image.name: image for image in opened.read_all_images()}
-        lacking = [n for n in names if n not in known or not opened.exists_keypoints(known[n].image_id)]
-    if not lacking:
-        return
-    options = pycolmap.FeatureExtractionOptions()
-    options.sift.max_num_features = FEATURES
-    options.sift.first_octave = -1 if group.side <= SMALL_SIDE else 0
-    pycolmap.extract_features(
-        database_path=database,
-        image_path=images,
-        image_names=lacking,
-        camera_mode=pycolmap.CameraMode.SINGLE,
-        reader_options=_reader(group, known[group.names[0]].camera_id, images.with_name(MASKS)),
-        extraction_options=options,
-        device=pycolmap.Device.cpu,
-    )
 
 
 def match_features(folder: Path, pairs: Sequence[Pair], progress: Progress) -> None:
     """Match and verify `pairs` into the database; pairs it has are kept."""
-    with pycolmap.Database.open(folder / "database.db") as opened:
-        ids = {image.name: image.image_id for image in opened.read_all_images()}
-        lacking = [(a, b) for a, b in pairs if not opened.exists_two_view_geometry(ids[a], ids[b])]
+    with opened(folder) as database:
+        ids = {image.name: image.image_id for image in database.read_all_images()}
+        lacking = [(a, b) for a, b in pairs if not database.exists_two_view_geometry(ids[a], ids[b])]
     done = len(pairs) - len(lacking)
     for start in range(0, len(lacking), MATCH_BATCH):
         progress("matching photographs", (done + start) / len(pairs))
         batch = lacking[start : start + MATCH_BATCH]
-        listing = folder / "pairs.txt"
-        listing.write_text("".join(f"{first} {second}\n" for first, second in batch))
         pairing = pycolmap.ImportedPairingOptions()
-        pairing.match_list_path = listing
+        pairing.match_list_path = folder / "pairs.txt"
+        pairing.match_list_path.write_text("".join(f"{first} {second}\n" for first, second in batch))
         verification = pycolmap.TwoViewGeometryOptions()
         verification.ransac.random_seed = 0
         pycolmap.match_image_pairs(
@@ -126,7 +117,7 @@ def match_features(folder: Path, pairs: Sequence[Pair], progress: Progress) -> N
 def triangulate(folder: Path, names: Sequence[str], cameras: Sequence[Camera]) -> None:
     """Write points from matched features and known pinhole cameras, which stay fixed, to ``sparse``."""
     model = Model()
-    with pycolmap.Database.open(folder / "database.db") as database:
+    with opened(folder) as database:
         for name, camera in zip(names, cameras, strict=True):
             row = database.read_image_with_name(name)
             if row.camera_id not in model.cameras:
@@ -137,19 +128,23 @@ def triangulate(folder: Path, names: Sequence[str], cameras: Sequence[Camera]) -
     attempts = folder / "attempts"
     attempts.mkdir(exist_ok=True)
     result = pycolmap.triangulate_points(
-        reconstruction=model,
-        database_path=folder / "database.db",
-        image_path=folder / "images",
-        output_path=attempts,
-        options=_repeatable(pycolmap.IncrementalPipelineOptions()),
+        reconstruction=model, **_paths(folder, attempts), options=_repeatable()
     )
     store_model(result, folder)
 
 
-def _repeatable(options: "pycolmap.IncrementalPipelineOptions") -> "pycolmap.IncrementalPipelineOptions":
-    """Set seeds, and one thread: sums of several threads differ from run to run."""
-    options.random_seed = 0
-    options.triangulation.random_seed = 0
+def _paths(folder: Path, attempts: Path) -> dict[str, Path]:
+    return {
+        "database_path": folder / "database.db",
+        "image_path": folder / "images",
+        "output_path": attempts,
+    }
+
+
+def _repeatable() -> "pycolmap.IncrementalPipelineOptions":
+    """Return options with seeds, and one thread: sums of several threads differ from run to run."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = options.triangulation.random_seed = 0
     options.num_threads = 1
     return options
 
@@ -208,7 +203,8 @@ def map_cameras(folder: Path, count: int, progress: Progress) -> None:
     for number, mapper in enumerate(MAPPERS):
         attempts = folder / "attempts" / str(number)
         attempts.mkdir(parents=True, exist_ok=True)
-        models = list(mapper(folder, attempts, _counted(count, progress)))
+        progress("locating cameras", 0.0)
+        models = list(mapper(folder, attempts, partial(_placed, itertools.count(1), count, progress)))
         lost = [model for model in models if is_astray(model, folder)]
         best = best_model(best, (model for model in models if model not in lost))
         astray = best_model(astray, lost)
@@ -222,11 +218,8 @@ def map_cameras(folder: Path, count: int, progress: Progress) -> None:
     progress("locating cameras", 1.0)
 
 
-def _counted(count: int, progress: Progress) -> Callable[[], None]:
-    """Report that the work begins, and return what is to be called for every photograph that is placed."""
-    progress("locating cameras", 0.0)
-    placed = itertools.count(1)
-    return lambda: progress("locating cameras", min(next(placed) / count, 0.99))
+def _placed(places: Iterator[int], count: int, progress: Progress) -> None:
+    progress("locating cameras", min(next(places) / count, 0.99))
 
 
 def is_astray(model: Model, folder: Path) -> bool:
@@ -234,7 +227,7 @@ def is_astray(model: Model, folder: Path) -> bool:
 
     On a walk as on rails another focal length explains the photographs as well, in a world of another depth.
     """
-    with pycolmap.Database.open(folder / "database.db") as database:
+    with opened(folder) as database:
         before = {camera.camera_id: camera for camera in database.read_all_cameras()}
     return any(
         abs(math.log(camera.mean_focal_length() / before[number].mean_focal_length()))
@@ -283,24 +276,18 @@ def _incremental(
     those which no EXIF data say stay a normal lens's. What lies far ahead looks much the same from any
     distance through another lens.
     """
-    known = False
-    if focal != "refined":
-        with pycolmap.Database.open(folder / "database.db") as database:
-            known = all(camera.has_prior_focal_length for camera in database.read_all_cameras())
+    with opened(folder) as database:
+        known = all(camera.has_prior_focal_length for camera in database.read_all_cameras())
     if focal == "guessed" and known:  # as with "of EXIF"
         return []
-    options = _repeatable(pycolmap.IncrementalPipelineOptions())
+    options = _repeatable()
     options.min_model_size = 3
     options.max_num_models = 5
     options.mapper.mergedict(limits)
-    if known or focal == "guessed":
+    if focal == "guessed" or (focal == "of EXIF" and known):
         options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = False
     models: dict[int, Model] = pycolmap.incremental_mapping(
-        database_path=folder / "database.db",
-        image_path=folder / "images",
-        output_path=attempts,
-        options=options,
-        next_image_callback=advance,
+        **_paths(folder, attempts), options=options, next_image_callback=advance
     )
     return models.values()
 
@@ -313,14 +300,8 @@ def _all_at_once(folder: Path, attempts: Path, advance: Callable[[], None]) -> C
     stages = mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation
     for seeded in (options, mapper, *stages):
         seeded.random_seed = 0
-    mapper.global_positioning.use_gpu = False
-    mapper.bundle_adjustment.ceres.use_gpu = False
-    models: dict[int, Model] = pycolmap.global_mapping(
-        database_path=folder / "database.db",
-        image_path=folder / "images",
-        output_path=attempts,
-        options=options,
-    )
+    mapper.global_positioning.use_gpu = mapper.bundle_adjustment.ceres.use_gpu = False
+    models: dict[int, Model] = pycolmap.global_mapping(**_paths(folder, attempts), options=options)
     return models.values()
 
 
@@ -335,7 +316,7 @@ MAPPERS: tuple[Callable[[Path, Path, Callable[[], None]], Collection[Model]], ..
 
 def keep_matches(folder: Path) -> None:
     """Write what `read_matches` reads: the database does not outlive the model."""
-    with pycolmap.Database.open(folder / "database.db") as database:
+    with opened(folder) as database:
         names = {image.image_id: image.name for image in database.read_all_images()}
         features = {name: database.num_keypoints_for_image(number) for number, name in names.items()}
         pairs, inliers = database.read_two_view_geometry_num_inliers()

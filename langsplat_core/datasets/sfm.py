@@ -1,28 +1,49 @@
-"""Cameras of a plain folder of photographs, by structure from motion in a process of its own."""
+"""Cameras of a plain folder of photographs, and points for cameras that came without any.
+
+Both by structure from motion in a process of its own (`reconstruction`), kept in ``work/sfm-*``.
+"""
 
 import hashlib
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 from PIL import Image
 
-from langsplat_core.datasets.capture import Capture
+from langsplat_core.arrays import Array
+from langsplat_core.datasets.capture import Capture, random_points
 from langsplat_core.datasets.colmap import good_points, has_model, located_photos, read_model
-from langsplat_core.datasets.exif import EXIF_IFD, optics
-from langsplat_core.datasets.matches import Matches, NotLocatedError, read_matches
-from langsplat_core.datasets.photos import Photo, develop, find_photos, mask_beside, read_photo
-from langsplat_core.datasets.workspace import FAILURES, MASKS, CameraGroup, Pair, open_workspace, run_apart
+from langsplat_core.datasets.photos import (
+    EXIF_IFD,
+    develop,
+    developer,
+    find_photos,
+    mask_beside,
+    optics,
+    read_photo,
+)
+from langsplat_core.datasets.workspace import (
+    FAILURES,
+    MASKS,
+    CameraGroup,
+    Matches,
+    NotLocatedError,
+    Pair,
+    open_workspace,
+    read_matches,
+    run_apart,
+)
 from langsplat_core.errors import InputError, shortened
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import PictureError, opened
 from langsplat_core.progress import Progress
+from langsplat_core.scene import Camera
 
-SFM_SIDE = 1600  # px, longer side of the copies that features are sought in
+SIDE = 1600  # px, longer side of the images that features are sought in
 MIN_PHOTOS = 3
 FEWEST = 0.5  # share of the photographs: a scene of fewer is not of what was photographed
-EXHAUSTIVE_LIMIT = 80  # photographs; beyond, matching every pair costs too much
-SEQUENTIAL_OVERLAP = 10  # neighbours in name order that each photograph is matched with
 
 log = logging.getLogger("langsplat")
 
@@ -39,7 +60,7 @@ def load_photos(
         )
     contents = [(path.name, _content(path)) for path in paths]
     masked = [(path.name, _content(mask)) for path in paths if (mask := mask_beside(path))]
-    workspace = open_workspace(work, ["photographs", 4, SFM_SIDE, contents, *([masked] if masked else [])])
+    workspace = open_workspace(work, ["photographs", 4, SIDE, contents, *([masked] if masked else [])])
     files = numbered(paths)
     if not has_model(workspace / "sparse"):
         try:
@@ -65,12 +86,12 @@ def load_photos(
             "%d of %d photographs could not be located and are left out (%s); %s",
             len(files) - found,
             len(files),
-            _listed(lost),
+            _listed(lost, 5),
             matches.advice(),
         )
     photos = [
-        Photo(path, path.name, copy.intrinsics, copy.world_to_camera, upright=True, mask=mask_beside(path))
-        for copy in located_photos(model, workspace / "images", workspace / "sparse")
+        replace(copy, path=path, label=path.name, upright=True, mask=mask_beside(path))
+        for copy in located_photos(model, workspace / "images")
         for path in (files[copy.label],)
     ]
     cameras, images, kept, masks = develop(photos, max_side, progress)
@@ -109,7 +130,7 @@ def _left_out(matches: Matches, contents: Sequence[tuple[str, str]]) -> dict[str
     return groups
 
 
-def _listed(lost: dict[str, list[str]], limit: int = 5) -> str:
+def _listed(lost: dict[str, list[str]], limit: int) -> str:
     """Return ``no features: a.jpg, b.jpg; no matches with any other: c.jpg``."""
     return "; ".join(f"{reason}: {shortened(names, limit)}" for reason, names in lost.items())
 
@@ -145,15 +166,17 @@ def _small_copies(folder: Path, files: dict[str, Path], progress: Progress) -> l
         try:
             if not (folder / name).is_file():
                 image = read_photo(path, upright=True)
-                image.thumbnail((SFM_SIDE, SFM_SIDE), Image.Resampling.LANCZOS)
+                image.thumbnail((SIDE, SIDE), Image.Resampling.LANCZOS)
                 with atomic_path(folder / name) as temporary:
                     image.save(temporary, quality=95, exif=optics(path))
-            if any_masks:
-                _write_mask(mask_beside(path), folder / name, folder.with_name(MASKS) / f"{name}.png")
             with opened(folder / name) as copy:
-                exif = copy.getexif()
+                exif, size = copy.getexif(), copy.size
                 lens = str(dict(exif) | dict(exif.get_ifd(EXIF_IFD)))
-                members.setdefault((copy.size, lens), []).append(name)
+            if any_masks:
+                mask = mask_beside(path)
+                counted = Image.new("L", size, 255) if mask is None else read_photo(mask, False).convert("L")
+                _write_mask(folder, name, counted.resize(size, Image.Resampling.NEAREST))
+            members.setdefault((size, lens), []).append(name)
         except PictureError as error:
             broken.append(f"{path.name} ({error.reason})")
     progress("preparing photographs", 1.0)
@@ -167,30 +190,124 @@ def _small_copies(folder: Path, files: dict[str, Path], progress: Progress) -> l
     ]
 
 
-def _write_mask(mask: Path | None, copy: Path, out: Path) -> None:
-    """Write a mask as COLMAP reads it, as large as the copy of its photograph, unless it is there.
+def _write_mask(images: Path, name: str, mask: Image.Image) -> None:
+    """Write the mask of an image of a workspace as COLMAP reads it.
 
-    It is white for a photograph without one: where some have a mask, COLMAP finds nothing in those that have
-    none.
+    Where some have a mask, COLMAP finds nothing in images that have none: theirs is white.
     """
-    if out.is_file():
-        return
-    with opened(copy) as image:
-        white = Image.new("L", image.size, 255)
-    counted = white if mask is None else read_photo(mask, upright=False).convert("L")
-    out.parent.mkdir(exist_ok=True)
-    with atomic_path(out) as temporary:
-        counted.resize(white.size, Image.Resampling.NEAREST).save(temporary)
+    path = images.with_name(MASKS) / f"{name}.png"
+    path.parent.mkdir(exist_ok=True)
+    with atomic_path(path) as temporary:
+        mask.save(temporary)
 
 
 def pairs_by_name(names: Sequence[str]) -> list[Pair]:
-    """Return every pair of up to `EXHAUSTIVE_LIMIT` photographs.
+    """Return every pair of up to 80 photographs; of more, all would cost too much.
 
-    Of more, each is paired with its next neighbours in name order and with those at distances 16, 32, 64 ...,
+    Then each is paired with its next 10 neighbours in name order and with those at distances 16, 32, 64 ...,
     which closes loops.
     """
     count = len(names)
-    if count <= EXHAUSTIVE_LIMIT:
-        return [(names[i], names[j]) for i in range(count) for j in range(i + 1, count)]
-    steps = [*range(1, SEQUENTIAL_OVERLAP + 1), *(1 << k for k in range(4, count.bit_length()))]
+    steps = [*range(1, 11), *(1 << k for k in range(4, count.bit_length()))]
+    if count <= 80:
+        steps = list(range(1, count))
     return [(names[i], names[i + step]) for i in range(count) for step in steps if i + step < count]
+
+
+# Points for datasets that bring cameras but no points: triangulated, or at the worst random.
+
+MIN_POINTS = 100
+RANDOM_POINTS = 20_000
+NEIGHBOURS = 12  # views that each view is matched with
+MAX_ANGLE = 75.0  # degrees between the axes of views that are matched
+
+
+def add_points(capture: Capture, views: Sequence[int], work: Path, progress: Progress) -> Capture:
+    """Return the capture with points in its own world, from the photographs at `views`.
+
+    They are triangulated (kept in ``work/sfm-*``), or random ones in front of the cameras when fewer than
+    `MIN_POINTS` can be.
+    """
+    points, colours = _triangulated(capture, views, work, progress)
+    if len(points) < MIN_POINTS:
+        log.warning(
+            "only %d points could be triangulated; starting from %d random ones", len(points), RANDOM_POINTS
+        )
+        generator = np.random.default_rng(0)
+        cameras, images = [capture.cameras[i] for i in views], [capture.images[i] for i in views]
+        masks = [capture.mask(i) for i in views]
+        points, colours = random_points(RANDOM_POINTS, points, cameras, images, generator, masks)
+    return replace(capture, points=points, colours=colours)
+
+
+def _triangulated(
+    capture: Capture, views: Sequence[int], work: Path, progress: Progress
+) -> tuple[Array, Array]:
+    workspace = open_workspace(work, ["known poses", 3, SIDE, capture.digest(views)])
+    try:
+        if not has_model(workspace / "sparse"):
+            names = [f"{index:05d}.png" for index in range(len(views))]
+            cameras = _write_images(workspace / "images", names, capture, views, progress)
+            run_apart(
+                _match_and_triangulate, workspace, names, cameras, workspace=workspace, progress=progress
+            )
+        return good_points(read_model(workspace / "sparse"))
+    except (*FAILURES, InputError) as error:
+        log.warning("points could not be triangulated: %s", str(error).splitlines()[0])
+        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+
+
+def _match_and_triangulate(
+    workspace: Path, names: Sequence[str], cameras: Sequence[Camera], progress: Progress
+) -> None:
+    """Write points from the images of a workspace; in the process of its own."""
+    from langsplat_core.datasets.reconstruction import extract_features, match_features, triangulate
+
+    members: dict[tuple[str, int], list[str]] = {}
+    for name, camera in zip(names, cameras, strict=True):
+        params = ",".join(repr(float(value)) for value in (camera.fx, camera.fy, camera.cx, camera.cy))
+        members.setdefault((params, max(camera.width, camera.height)), []).append(name)
+    groups = [CameraGroup(tuple(group), "PINHOLE", params, side) for (params, side), group in members.items()]
+    extract_features(workspace, groups, progress)
+    pairs = [(names[i], names[j]) for i, j in neighbouring_views(cameras)]
+    match_features(workspace, pairs, progress)
+    progress("triangulating points", 0.0)
+    triangulate(workspace, names, cameras)
+    progress("triangulating points", 1.0)
+
+
+def _write_images(
+    folder: Path, names: Sequence[str], capture: Capture, views: Sequence[int], progress: Progress
+) -> tuple[Camera, ...]:
+    """Write images to seek features in, one after the other, and return their cameras.
+
+    They are made from the files again, larger than what is trained on: small images lack the details that
+    features are found at.
+    """
+    enlarge = developer(SIDE)
+    cameras = []
+    for count, (name, index) in enumerate(zip(names, views, strict=True)):
+        progress("preparing photographs", count / len(views))
+        camera, image, mask = capture.cameras[index], capture.images[index], capture.mask(index)
+        if capture.photos:
+            camera, image, mask = enlarge(capture.photos[index])
+        Image.fromarray(image).save(folder / name, compress_level=1)
+        if capture.masks:
+            counted = np.ones(image.shape[:2], bool) if mask is None else mask
+            _write_mask(folder, name, Image.fromarray(counted))
+        cameras.append(camera)
+    progress("preparing photographs", 1.0)
+    return tuple(cameras)
+
+
+def neighbouring_views(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
+    """Return pairs (i < j) to match: every view with the nearest `NEIGHBOURS` that look a similar way."""
+    centres = np.array([camera.position for camera in cameras])
+    axes = np.array([camera.rotation[2] for camera in cameras])
+    distance = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
+    distance[axes @ axes.T < np.cos(np.radians(MAX_ANGLE))] = np.inf
+    np.fill_diagonal(distance, np.inf)
+    nearest = np.argsort(distance, axis=1, kind="stable")[:, :NEIGHBOURS].tolist()
+    return sorted(
+        {(min(i, j), max(i, j)) for i, row in enumerate(nearest) for j in row if np.isfinite(distance[i, j])}
+    )

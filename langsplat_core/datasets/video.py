@@ -5,22 +5,17 @@ import hashlib
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from langsplat_core.arrays import Array
-from langsplat_core.errors import FormatError, InputError, optional_imports
+from langsplat_core.errors import FormatError, InputError, optional_imports, printable_line
 from langsplat_core.io.files import shown
 from langsplat_core.io.hostile import MOST_PIXELS, open_for_reading
 from langsplat_core.progress import Progress, silent
 
-if TYPE_CHECKING:
-    import av.container
-
-SHARPNESS_WIDTH = 640  # px, at which images are compared: below noise, above motion blur
-QUALITY = 95  # of the JPEG files
 FEWEST = 3  # images, of which cameras can be found
 
 
@@ -58,21 +53,19 @@ def extract_frames(video: Path, out: Path, count: int, progress: Progress = sile
         if out.is_dir():
             out.rmdir()
         unfinished.rename(out)
-    except (av.FFmpegError, OSError) as error:
-        sought_too_far = error.errno == errno.EINVAL
-        if not isinstance(error, av.FFmpegError) and not sought_too_far:
-            raise
-        raise FormatError(
-            f"{shown(video)}: not a readable video ({error.strerror or error}); copy it again"
-        ) from None
-    except (IndexError, ValueError, MemoryError) as error:  # no stream of images, or sizes that cannot be
-        raise FormatError(f"{shown(video)}: not a readable video ({str(error)[:80]})") from None
+    # Damaged data, no stream of images, sizes that cannot be, or a place to read at that cannot be.
+    except (av.FFmpegError, OSError, IndexError, ValueError, MemoryError) as error:
+        plain = isinstance(error, OSError) and not isinstance(error, av.FFmpegError)
+        if plain and getattr(error, "errno", 0) != errno.EINVAL:
+            raise  # of the disk
+        reason = printable_line(error, 80)
+        raise FormatError(f"{shown(video)}: not a readable video ({reason}); copy it again") from None
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
     return sorted(out.iterdir())
 
 
-def _write(container: "av.container.InputContainer", folder: Path, count: int, progress: Progress) -> int:
+def _write(container: Any, folder: Path, count: int, progress: Progress) -> int:
     """Write the sharpest images of an opened video; return their number."""
     stream = container.streams.video[0]
     stream.thread_type = "AUTO"
@@ -99,7 +92,7 @@ def _write(container: "av.container.InputContainer", folder: Path, count: int, p
     return len(list(folder.iterdir()))
 
 
-def _decoded(container: "av.container.InputContainer", stream: Any) -> Iterator[Any]:
+def _decoded(container: Any, stream: Any) -> Iterator[Any]:
     """Yield every image that can be decoded: a recording that broke off has a last one that cannot."""
     import av
 
@@ -111,19 +104,18 @@ def _decoded(container: "av.container.InputContainer", stream: Any) -> Iterator[
 
 
 def sharpness(frame: Any) -> float:
-    """Return the variance of the Laplacian of the grey image, at `SHARPNESS_WIDTH`."""
-    width = min(SHARPNESS_WIDTH, frame.width)
+    """Return the variance of the Laplacian of the grey image, 640 px wide: below noise, above blur."""
+    width = min(640, frame.width)
     height = max(1, round(frame.height * width / frame.width))
     grey: Array = frame.reformat(width=width, height=height, format="gray").to_ndarray().astype(np.float32)
     if min(grey.shape) < 3:
         return 0.0
-    inner = grey[1:-1, 1:-1]
     around = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:]
-    return float((around - 4 * inner).var())
+    return float((around - 4 * grey[1:-1, 1:-1]).var())
 
 
 def _save(frame: Any, folder: Path) -> None:
     """Write an image, turned as it is shown, under the next number."""
     upright = np.rot90(frame.to_ndarray(format="rgb24"), round(frame.rotation / 90))
     name = f"frame_{len(list(folder.iterdir())) + 1:04d}.jpg"
-    Image.fromarray(np.ascontiguousarray(upright)).save(folder / name, quality=QUALITY)
+    Image.fromarray(np.ascontiguousarray(upright)).save(folder / name, quality=95)

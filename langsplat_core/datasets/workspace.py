@@ -1,7 +1,8 @@
 """Workspaces of structure from motion: folders in the work folder, filled by processes of their own.
 
 A workspace holds small copies of the photographs (``images``), COLMAP's ``database.db`` and, in the end, the
-model (``sparse``). It is named by a digest of all that it is made from, and taken up again by a later run.
+model (``sparse``) and the graph of matches (``matches.json``). It is named by a digest of all that it is made
+from, and taken up again by a later run.
 """
 
 import errno
@@ -9,15 +10,22 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from langsplat_core.errors import InputError, printable_line, shortened
 from langsplat_core.io import apart
 from langsplat_core.progress import Progress
 
 MASKS = "masks"  # in the workspace: black where no features are wanted
+MATCHES = "matches.json"  # features and pairs
 FAILURES = (RuntimeError, ValueError, IndexError)  # what pycolmap raises
 ROOM = 64_000_000  # bytes that a step may want: 8 photographs of 8192 features take 20 MB, with the journal
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # sums of several differ from run to run
@@ -60,3 +68,125 @@ def run_apart(function: Callable[..., Any], *arguments: Any, workspace: Path, pr
 def disk_full(folder: Path) -> OSError:
     """Return the error of a disk without room."""
     return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
+
+
+# The graph of the photographs that share verified matches: groups, and the gaps between them.
+
+FEWEST_MATCHES = 15  # that COLMAP's mapper works with
+FEWEST_FEATURES = 50  # fewer rarely give `FEWEST_MATCHES`
+MOST_TOLD = 3  # groups and gaps in a message
+
+
+@dataclass(frozen=True)
+class Matches:
+    """The graph of matches of all photographs of a dataset, located or not, in name order."""
+
+    names: tuple[str, ...]  # file names
+    features: tuple[int, ...]  # of each; -1 where the file could not be read
+    pairs: tuple[tuple[int, int, int], ...]  # rows of two photographs, and their verified matches
+    located: frozenset[int]  # rows of those that have a camera
+
+    @cached_property
+    def shared(self) -> dict[tuple[int, int], int]:
+        """Number of verified matches of each pair of rows, the smaller row first."""
+        return {(min(a, b), max(a, b)): count for a, b, count in self.pairs}
+
+    @cached_property
+    def groups(self) -> list[list[int]]:
+        """Rows in groups: the located ones, then what matches join among the others, larger ones first."""
+        count = len(self.names)
+        joins = [(a, b) for a, b, n in self.pairs if n >= FEWEST_MATCHES and not self.located & {a, b}]
+        rows, columns = np.array(joins, int).reshape(-1, 2).T
+        graph = coo_array((np.ones(len(rows), bool), (rows, columns)), (count, count))
+        _, labels = connected_components(graph, directed=False)
+        found: dict[int, list[int]] = {}
+        for row in range(count):
+            if row not in self.located:
+                found.setdefault(int(labels[row]), []).append(row)
+        others = sorted(found.values(), key=len, reverse=True)
+        return [sorted(self.located), *others] if self.located else others
+
+    def why(self, row: int) -> str:
+        """Return the reason why a photograph has no camera."""
+        if self.features[row] < 0:
+            return "cannot be read"
+        if self.features[row] < FEWEST_FEATURES:
+            return "too few features (plain, dark, blurred or tiny)"
+        neighbours = {
+            a + b - row for (a, b), count in self.shared.items() if row in (a, b) and count >= FEWEST_MATCHES
+        }
+        if not neighbours:
+            return "no matches with any other"
+        if self.located and not neighbours & self.located:
+            return "matches only others that have no camera"
+        return "matched, but from one and the same place, or without enough overlap"
+
+    def gaps(self) -> list[tuple[int, int]]:
+        """Return pairs of rows between which more photographs would join one more group to those before.
+
+        Of two groups that is the pair that shares most, or the neighbours in name order where none shares
+        enough. At most `MOST_TOLD`; photographs without features have no part in them.
+        """
+        useful = [[row for row in group if self.features[row] >= FEWEST_FEATURES] for group in self.groups]
+        joined, *apart = [group for group in useful if group] or [[]]
+        found: list[tuple[int, int]] = []
+
+        def width(pair: tuple[int, int]) -> tuple[int, int]:
+            shared = self.shared.get(pair, 0)
+            return (-shared if shared >= FEWEST_MATCHES else 0), pair[1] - pair[0]
+
+        while joined and apart and len(found) < MOST_TOLD:
+            across = ((min(a, b), max(a, b)) for a in joined for group in apart for b in group)
+            gap = min(across, key=width)
+            found.append(gap)
+            new = next(group for group in apart if set(gap) & set(group))
+            joined, apart = joined + new, [group for group in apart if group is not new]
+        return found
+
+    def joined(self) -> str:
+        """Return the groups that matches join, in words; empty where there are none."""
+        large = [self._listed(group) for group in self.groups if len(group) > 1][:MOST_TOLD]
+        return f"matches join {', '.join(large)}; " if large else ""
+
+    def advice(self) -> str:
+        """Return advice in words where to take more photographs."""
+        between = [
+            f"between {self._name(a)} and {self._name(b)} ({self.shared.get((a, b), 0) or 'no'} matches)"
+            for a, b in self.gaps()
+        ]
+        if between:
+            return f"take more photographs {', '.join(between)}"
+        if self.joined() and not self.located:
+            return "they all match, but nothing tells depth: step aside between photographs, do not only turn"
+        return "take more photographs, each sharing at least two thirds of its view with the next"
+
+    def _listed(self, group: list[int]) -> str:
+        if group == list(range(group[0], group[-1] + 1)) and len(group) > 2:
+            return f"{self._name(group[0])} to {self._name(group[-1])} ({len(group)})"
+        return shortened((self._name(row) for row in group), 3, 100)
+
+    def _name(self, row: int) -> str:
+        return printable_line(self.names[row], 30)
+
+
+class NotLocatedError(InputError):
+    """Too few photographs could be located; `matches` says why."""
+
+    def __init__(self, message: str, matches: Matches) -> None:
+        self.matches = matches
+        super().__init__(message)
+
+
+def read_matches(folder: Path, files: dict[str, Path], located: Collection[str]) -> Matches:
+    """Return the graph of matches of a workspace.
+
+    files: photographs by their names there, see `sfm.numbered`; located: names of those that have a camera
+    """
+    kept = json.loads((folder / MATCHES).read_text())
+    row = {name: index for index, name in enumerate(files)}
+    return Matches(
+        names=tuple(path.name for path in files.values()),
+        features=tuple(kept["features"].get(name, -1) for name in files),
+        pairs=tuple((row[a], row[b], count) for a, b, count in kept["pairs"]),
+        located=frozenset(row[name] for name in located),
+    )

@@ -16,7 +16,7 @@ from PIL import Image
 
 from langsplat_core.arrays import Array, ViewScore, sigmoid
 from langsplat_core.datasets.capture import Capture
-from langsplat_core.datasets.matches import FEWEST_MATCHES, Matches, NotLocatedError
+from langsplat_core.datasets.workspace import FEWEST_MATCHES, Matches, NotLocatedError
 from langsplat_core.errors import printable_line
 from langsplat_core.io.files import atomic_path
 from langsplat_core.pipeline.report import PAGE, TrainReport, camera_groups, rehearsals_in_words, write_report

@@ -15,9 +15,8 @@ import numpy as np
 
 from langsplat_core.config import QUICK, TrainConfig, check_settings
 from langsplat_core.datasets import load_capture
-from langsplat_core.datasets.capture import Capture
-from langsplat_core.datasets.holdout import split
-from langsplat_core.datasets.matches import NotLocatedError
+from langsplat_core.datasets.capture import Capture, split_views
+from langsplat_core.datasets.workspace import NotLocatedError
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import check_output_folder, shown
 from langsplat_core.io.scenes import check_writable, load_scene, save_scene
@@ -104,7 +103,7 @@ def _train(run: _Run, masks_of: Callable[[Capture], MaskSource] | None, given: S
         named_source = None if masks_of else load_mask_source(config.masks, config.clip.device)
         # One process solves for cameras, the others find them in the work folder.
         capture = processes.once(lambda: _photographs(run))
-        train, held_out = split(capture, config.dataset)
+        train, held_out = split_views(capture, config.dataset)
     mask_source = named_source or masks_of(capture)  # type: ignore[misc]  # one of them is there
     log.info("masks: %s, encoder: %s", mask_source.name, encoder.id)
     if encoder.id == DEMO and not capture.drawn:

@@ -14,7 +14,7 @@ from assets.making.render import Light, RenderedView, Renderer
 from assets.making.shapes import ball, cylinder, pillow, rotation_about
 from assets.making.world import ENLARGED, Placed, assemble, bounds, furnished
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.holdout import chosen
+from langsplat_core.datasets.capture import surrounded_views
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera, look_at
 
@@ -44,12 +44,12 @@ def draw_capture(
     folder: Path, kind: Kind, seed: int, people: bool, test_every: int, progress: Progress
 ) -> None:
     """Write photographs with known cameras and no points, unless they lie in `folder`. people: one to three
-    in most of those that `holdout.chosen` leaves to training."""
+    in most of those that `surrounded_views` leaves to training."""
     if (folder / "transforms.json").exists():
         return
     place = _street(seed) if kind == "walk" else _room(seed)
     renderer = Renderer(assemble(place.things), place.light, samples=16, cell=0.01)
-    kit, held_out = Kit(np.random.default_rng((seed, 41))), chosen(place.cameras, test_every)
+    kit, held_out = Kit(np.random.default_rng((seed, 41))), surrounded_views(place.cameras, test_every)
     (folder / "images").mkdir(parents=True, exist_ok=True)
     for number, camera in enumerate(place.cameras):
         progress("drawing photographs", number / VIEWS)

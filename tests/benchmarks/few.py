@@ -20,7 +20,7 @@ from langsplat_core.config import (
     with_preset,
 )
 from langsplat_core.datasets import Capture, load_capture
-from langsplat_core.datasets.holdout import split
+from langsplat_core.datasets.capture import split_views
 from langsplat_core.extensions.benchmarks.report import markdown
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.raster.render import render
@@ -111,7 +111,7 @@ class Few:
         if self.views:
             rows = np.unique(np.linspace(0, len(capture) - 1, self.views).round().astype(int))
             capture = _subset(capture, [int(row) for row in rows])
-        train, held_out = split(capture, config)
+        train, held_out = split_views(capture, config)
         if not held_out:
             held_out = [len(capture) // 2]
             train = [row for row in train if row not in held_out]

@@ -267,8 +267,7 @@ def test_a_signal_ends_a_command_in_a_line(number: int, said: str, tmp_path: Pat
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # which a shell's background ignores
         "from dataclasses import dataclass\n"
         "@dataclass\nclass Waits:\n    def run(self):\n"
-        "        from langsplat_core.datasets.intrinsics import signals_kept\n"
-        "        with signals_kept():\n            import pycolmap\n"
+        "        import langsplat_core.datasets.reconstruction\n"
         "        print('ready', flush=True)\n        time.sleep(60)\n"
         "sys.exit(main('langsplat', Waits))\n"
     )

@@ -16,7 +16,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.colmap import find_model, good_points, read_model
-from langsplat_core.datasets.intrinsics import BrownDistortion, FisheyeDistortion, PhotoIntrinsics
+from langsplat_core.datasets.intrinsics import BrownDistortion, PhotoIntrinsics
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.progress import Progress, silent
@@ -64,27 +64,10 @@ def test_a_model_reads_as_pycolmap_reads_it(tmp_path: Path, form: str) -> None:
     for image in ours.images:
         want = theirs.find_image_with_name(image.name).cam_from_world().matrix()
         np.testing.assert_allclose(image.world_to_camera[:3], want, atol=1e-12)
-    camera = ours.cameras[1]
-    assert (camera.model, camera.width, camera.height) == ("OPENCV", 200, 150)
-    assert camera.params == pytest.approx(PARAMS)
+    assert ours.lenses == {1: LENS}
     points = [theirs.points3D[key] for key in sorted(theirs.points3D)]
-    np.testing.assert_allclose(ours.points, [p.xyz for p in points])
-    np.testing.assert_array_equal(ours.colours, [p.color for p in points])
-
-
-@pytest.mark.skipif(not BANANA.is_dir(), reason="real data absent")
-@pytest.mark.parametrize("folder", ["sparse", "sparse_text"])
-def test_a_real_model_reads_as_pycolmap_reads_it(folder: str) -> None:
-    ours, theirs = read_model(BANANA / folder), pycolmap.Reconstruction(BANANA / folder)
-    points = [theirs.points3D[key] for key in sorted(theirs.points3D)]
-    order = np.lexsort(ours.points.T)
-    want = np.array([p.xyz for p in points])
-    np.testing.assert_allclose(ours.points[order], want[np.lexsort(want.T)], rtol=1e-9)
-    assert sorted(ours.track_lengths) == sorted(p.track.length() for p in points)
-    assert ours.errors.mean() == pytest.approx(np.mean([p.error for p in points]))
-    for image in ours.images:
-        pose = theirs.find_image_with_name(image.name).cam_from_world().matrix()
-        np.testing.assert_allclose(image.world_to_camera[:3], pose, atol=1e-9)
+    np.testing.assert_allclose(ours.points["position"], [p.xyz for p in points])
+    np.testing.assert_array_equal(ours.points["colour"], [p.color for p in points])
 
 
 @pytest.mark.parametrize(("form", "subfolder"), [("bin", "sparse/0"), ("txt", "sparse")])
@@ -108,7 +91,7 @@ def test_the_model_with_most_photographs_is_taken(tmp_path: Path, caplog: pytest
     with caplog.at_level(logging.WARNING, "langsplat"):
         assert len(load_capture(tmp_path, WHOLE, tmp_path / "work")) == 4
     (said,) = [record.getMessage() for record in caplog.records if "models" in record.getMessage()]
-    assert "4 models; 1 is taken, which has most photographs (0: 2, 1: 4, 2: 4, 10: 3)" in said
+    assert "4 models; 1 is taken" in said
 
     images = tmp_path / "sparse/1/images.bin"
     images.write_bytes(images.read_bytes()[:100])
@@ -265,14 +248,6 @@ def test_pictures_are_what_the_cameras_see(tmp_path: Path) -> None:
         assert psnr(image, pinhole_picture(camera, 3)) > 33  # 26 when half a pixel off
 
 
-def test_a_fisheye_lens(tmp_path: Path) -> None:
-    intrinsics = PhotoIntrinsics(160, 120, 120.0, 120.0, 80.0, 60.0, FisheyeDistortion(0.02, -0.01))
-    top = {"w": 160, "h": 120, "fl_x": 120.0, "fl_y": 120.0, "cx": 80.0, "cy": 60.0, "k1": 0.02, "k2": -0.01}
-    write_transforms(tmp_path, {**top, "camera_model": "OPENCV_FISHEYE"}, intrinsics)
-    capture = load(tmp_path)
-    assert psnr(capture.images[1], pinhole_picture(capture.cameras[1], 3)) > 33
-
-
 def test_intrinsics_from_the_field_of_view_and_the_file(tmp_path: Path) -> None:
     intrinsics = PhotoIntrinsics(160, 120, 140.0, 140.0, 80.0, 60.0)
     write_transforms(tmp_path, {"camera_angle_x": 2 * np.arctan(80 / 140.0)}, intrinsics)
@@ -337,15 +312,6 @@ def test_applied_transform_changes_neither_points_nor_poses(tmp_path: Path) -> N
     np.testing.assert_allclose(capture.cameras[0].world_to_camera, poses(3)[0], atol=1e-9)
 
 
-def test_a_missing_cloud_is_named_in_short(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    write_transforms(tmp_path, {**GLOBAL, "ply_file_path": "a" * 2000 + ".ply"})
-    with caplog.at_level(logging.WARNING, "langsplat"):
-        assert len(load(tmp_path).points) == 0
-    (said,) = (record.getMessage() for record in caplog.records if "do not exist" in record.getMessage())
-    assert "aaa" in said
-    assert len(said) < 300
-
-
 def test_colours_may_be_fractions_or_absent(tmp_path: Path) -> None:
     write_transforms(tmp_path, {**GLOBAL, "ply_file_path": "cloud.ply"})
     xyz = {axis: np.ones(2, np.float64) for axis in "xyz"}
@@ -378,7 +344,7 @@ def test_transparent_photographs_lie_over_black(tmp_path: Path) -> None:
         ({"transform_matrix": [[10**400] * 4] * 4}, "transform_matrix"),
         ({"transform_matrix": [[1, 0, 0, 1e300], [0, 1, 0, 0], [0, 0, 1, 0]]}, "transform_matrix"),
         ({"fl_x": "wide"}, "fl_x"),
-        ({"fl_x": 1e-9}, "none has such a lens"),
+        ({"fl_x": 1e-9}, "as of no lens"),
         ({"cx": 1e14}, "far outside"),
         ({"w": 1e9, "h": 1e9}, "pixels a side"),
         ({"w": 0}, "pixels"),
@@ -437,17 +403,6 @@ def test_unknown_datasets_are_refused_with_known_kinds(tmp_path: Path) -> None:
     (tmp_path / "photo.jpg" / "inner").mkdir(parents=True)  # a folder that is called like a photograph
     for name in ("absent", "empty", "scene.ply", "photo.jpg", "."):
         assert "transforms.json" in refuse(tmp_path / name, tmp_path / "work")
-
-
-def test_half_a_colmap_model_is_no_model(tmp_path: Path) -> None:
-    (write_colmap(tmp_path) / "cameras.bin").unlink()
-    assert "2 photographs" in refuse(tmp_path, tmp_path / "work")  # taken for a plain folder of photographs
-
-
-def test_a_useless_size_is_refused(tmp_path: Path) -> None:
-    write_colmap(tmp_path)
-    with pytest.raises(InputError, match=r"--dataset\.max-side"):
-        load_capture(tmp_path, DatasetConfig(max_side=3), tmp_path / "work")
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])

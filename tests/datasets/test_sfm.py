@@ -1,10 +1,8 @@
 """Structure from motion and triangulation, in a textured room and in a street, and EXIF focal lengths."""
 
-import ctypes
 import logging
 import os
 import shutil
-import sys
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache
@@ -20,17 +18,21 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets import load_capture, reconstruction, sfm
 from langsplat_core.datasets.capture import Capture
-from langsplat_core.datasets.exif import optics
 from langsplat_core.datasets.intrinsics import BrownDistortion, PhotoIntrinsics
-from langsplat_core.datasets.known_poses import add_points, neighbouring_views
-from langsplat_core.datasets.matches import read_matches
 from langsplat_core.datasets.photos import find_photos
-from langsplat_core.datasets.sfm import pairs_by_name
-from langsplat_core.datasets.workspace import ROOM, run_apart
+from langsplat_core.datasets.sfm import add_points, neighbouring_views, pairs_by_name
+from langsplat_core.datasets.workspace import ROOM, Matches, read_matches
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, Report, WorkCancelledError, silent
 from langsplat_core.scene import Camera, look_at
-from tests.support.photographs import colmap_reconstruction, distance_to_room, photograph, poses, write_photos
+from tests.support.photographs import (
+    colmap_reconstruction,
+    distance_to_room,
+    mask_file,
+    photograph,
+    poses,
+    write_photos,
+)
 from tests.support.processes import files_of_at_most, in_this_process, small_disk, stop_at
 
 # A walk straight ahead between two walls: what structure from motion finds hardest to begin with.
@@ -195,23 +197,6 @@ def test_cameras_are_the_same_byte_for_byte(
         assert (theirs / "sparse" / path.name).read_bytes() == path.read_bytes()
 
 
-def test_changed_photographs_are_computed_again(
-    photos: Path,
-    located,  # type: ignore[no-untyped-def]
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    dataset, work = tmp_path / "dataset", tmp_path / "work"
-    dataset.mkdir()
-    for photo in (photos / "images").glob("*.png"):
-        shutil.copy(photo, dataset)
-    shutil.copytree(located[1], work)
-    in_this_process(monkeypatch)
-    monkeypatch.setattr(pycolmap, "extract_features", _never)
-    with pytest.raises(AssertionError, match="computed again"):
-        load_capture(dataset, CONFIG, work)
-
-
 def known(count: int = VIEWS, size: tuple[int, int] = (320, 240)) -> Capture:
     """The room through pinholes at the true poses, without points."""
     intrinsics = PhotoIntrinsics(*size, 300.0, 300.0, size[0] / 2, size[1] / 2)
@@ -325,16 +310,6 @@ def test_copies_are_upright_and_keep_the_focal_length(tmp_path: Path) -> None:
         assert copy.getexif().get(0x0112, 1) == 1
 
 
-def test_photographs_that_do_not_overlap_say_so(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    for index in range(3):
-        Image.fromarray(rng.integers(0, 256, (120, 160, 3), dtype=np.uint8)).save(tmp_path / f"{index}.png")
-    with pytest.raises(InputError, match="of 3 photographs could be located") as caught:
-        load_capture(tmp_path, CONFIG, tmp_path / "work")
-    assert "(no matches with any other: 0.png, 1.png, 2.png)" in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
 def test_messages_say_why_a_photograph_has_no_camera(tmp_path: Path) -> None:
     """Black, tiny, alone, and one view taken three times."""
     (name,) = write_photos(tmp_path, LENS, poses(1))
@@ -348,7 +323,7 @@ def test_messages_say_why_a_photograph_has_no_camera(tmp_path: Path) -> None:
     message = str(caught.value)
     assert "from one and the same place, or without enough overlap: a.png" in message
     assert "the same picture as a.png: b.png, c.png" in message
-    assert "no features (nothing but plain areas, or blurred): black.png, tiny.png" in message
+    assert "too few features (plain, dark, blurred or tiny): black.png, tiny.png" in message
 
 
 # Structure from motion that has to try several ways, and what is done where it finds too little.
@@ -415,39 +390,22 @@ def synthetic(images: int, points: int) -> "pycolmap.Reconstruction":
     return pycolmap.synthesize_dataset(options)
 
 
-def test_the_model_with_most_well_held_photographs_is_kept() -> None:
-    small, large = synthetic(4, 100), synthetic(6, 100)
-    assert reconstruction.best_model(None, [small, large]) is large
-    again = pycolmap.Reconstruction(large)
-    assert reconstruction.best_model(large, [small, again]) is large  # equal: the earlier way
-    wobbly = synthetic(7, reconstruction.FEWEST_POINTS - 1)  # all of its cameras are guesses
-    assert reconstruction.best_model(large, [wobbly]) is large
-    assert reconstruction.best_model(None, [wobbly]) is None
+def erring(images: int, error: float = 1.0, points: int = 100) -> "pycolmap.Reconstruction":
+    model = synthetic(images, points)
+    for point in model.points3D.values():
+        point.error = error
+    return model
 
 
-def test_best_model_keeps_the_first_of_equals() -> None:
-    def erring(images: int, error: float) -> "pycolmap.Reconstruction":
-        model = synthetic(images, 100)
-        for point in model.points3D.values():
-            point.error = error
-        return model
-
-    first, better, more = erring(6, 1.0), erring(6, 0.94), erring(7, 2.0)
-    assert reconstruction.best_model(first, [erring(6, 0.96)]) is first
+def test_best_model_has_most_well_held_photographs_then_least_error() -> None:
+    first, better, more = erring(6), erring(6, 0.94), erring(7, 2.0)
+    assert reconstruction.best_model(None, [erring(4), first]) is first
+    assert reconstruction.best_model(first, [erring(6, 0.96)]) is first  # as good: the earlier way
     assert reconstruction.best_model(None, [first, erring(6, 0.96), better]) is better
     assert reconstruction.best_model(None, [better, more, first]) is more
-
-
-def threads_of_pycolmap(_: Progress) -> list[int]:
-    """Threads that the OpenMP library of pycolmap's wheel would use."""
-    maps = Path("/proc/self/maps").read_text().splitlines()
-    libraries = {line.split()[-1] for line in maps if "pycolmap.libs/libgomp" in line}
-    return [ctypes.CDLL(path).omp_get_max_threads() for path in libraries]
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_structure_from_motion_runs_pycolmap_on_one_thread(tmp_path: Path) -> None:
-    assert run_apart(threads_of_pycolmap, workspace=tmp_path, progress=silent) == [1]
+    wobbly = erring(8, points=reconstruction.FEWEST_POINTS - 1)  # all of its cameras are guesses
+    assert reconstruction.best_model(more, [wobbly]) is more
+    assert reconstruction.best_model(None, [wobbly]) is None
 
 
 @pytest.mark.parametrize(("prior", "focal", "lost"), [
@@ -494,27 +452,6 @@ def test_fewer_than_half_located_is_refused_unless_allowed(mostly_noise: Path, t
     assert [len(group) for group in matches.groups] == [4, 1, 1, 1, 1, 1]
 
 
-def test_two_located_views_are_refused(
-    mostly_noise: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """COLMAP may end with a first pair that nothing else was added to."""
-    for path in find_photos(mostly_noise)[-4:]:  # the room's
-        (tmp_path / path.name).symlink_to(path)
-
-    def gives_up(folder: Path, count: int, progress: object) -> None:
-        model = synthetic(2, 100)
-        for number, image in sorted(model.images.items()):
-            image.name = f"{number - 1:05d}.jpg"
-        reconstruction.keep_matches(folder)
-        reconstruction.store_model(model, folder)
-
-    in_this_process(monkeypatch)
-    monkeypatch.setattr(reconstruction, "map_cameras", gives_up)
-    for _ in range(2):
-        with pytest.raises(InputError, match="only 2 of 4 photographs"):
-            load_capture(tmp_path, SMALL, tmp_path / "work")
-
-
 @pytest.mark.parametrize("label", ["finding features", "matching photographs", "locating cameras"])
 def test_a_disk_that_fills_up_is_an_error_of_the_disk(label: str, mostly_noise: Path, tmp_path: Path) -> None:
     """pycolmap then aborts, or raises, wherever it is."""
@@ -550,62 +487,65 @@ def test_truncated_models_are_not_kept(tmp_path: Path) -> None:
     assert (tmp_path / "sparse").is_dir()
 
 
-# The lens of a photograph, as COLMAP learns of it from our smaller copy.
-
-FOCAL_TAG, ON_FILM, PLANE_X, PLANE_UNIT, WIDTH = 0x920A, 0xA405, 0xA20E, 0xA210, 0xA002
+# The graph of matches: its groups, where photographs are missing, and how that is said.
 
 
-def photo(path: Path, tags: dict[int, float], size: tuple[int, int] = (2000, 1500)) -> Path:
-    exif = Image.Exif()
-    exif[0x010F] = "Maker"
-    exif.get_ifd(0x8769).update(tags)
-    exif.get_ifd(0x8825).update({1: "N", 2: (47.0, 22.0, 0.0), 3: "E", 4: (8.0, 32.0, 0.0)})  # a place
-    Image.linear_gradient("L").resize(size).convert("RGB").save(path, exif=exif)
-    return path
+def graph(count: int, pairs: list[tuple[int, int, int]], located=(), features: int = 900) -> Matches:
+    names = tuple(f"IMG_{number:02d}.jpg" for number in range(count))
+    return Matches(names, (features,) * count, tuple(pairs), frozenset(located))
 
 
-def on_film(path: Path) -> float | None:
-    return optics(path).get_ifd(0x8769).get(ON_FILM)
+def chain(rows: range, shared: int = 100) -> list[tuple[int, int, int]]:
+    return [(a, a + 1, shared) for a in rows[:-1]]
 
 
-@pytest.mark.parametrize(("unit", "millimetres"), [(2, 25.4), (3, 10.0), (4, 1.0), (None, 25.4)])
-def test_focal_length_follows_from_pixels_per_inch(
-    unit: int | None, millimetres: float, tmp_path: Path
-) -> None:
-    """A sensor 22.3 mm wide, of 4 to 3, 4000 pixels; the file was made smaller since."""
-    tags: dict[int, float] = {FOCAL_TAG: 18.0, PLANE_X: 4000 / 22.3 * millimetres, WIDTH: 4000}
-    if unit is not None:
-        tags[PLANE_UNIT] = unit
-    expected = 18 / (22.3 * 1.25) * np.hypot(36, 24)
-    assert on_film(photo(tmp_path / "a.jpg", tags)) == round(expected)
+def test_groups_and_the_gaps_between_them():
+    matches = graph(12, chain(range(5)) + chain(range(5, 9)) + chain(range(9, 12)) + [(8, 9, 7)], range(5, 9))
+    assert matches.groups == [[5, 6, 7, 8], [0, 1, 2, 3, 4], [9, 10, 11]]
+    assert matches.gaps() == [(4, 5), (8, 9)]
+    assert matches.joined() == (
+        "matches join IMG_05.jpg to IMG_08.jpg (4), IMG_00.jpg to IMG_04.jpg (5), "
+        "IMG_09.jpg to IMG_11.jpg (3); "
+    )
+    assert matches.advice() == (
+        "take more photographs between IMG_04.jpg and IMG_05.jpg (no matches), "
+        "between IMG_08.jpg and IMG_09.jpg (7 matches)"
+    )
+    assert matches.why(4) == "matches only others that have no camera"
 
 
-@pytest.mark.parametrize(
-    "tags",
-    [
-        {},
-        {FOCAL_TAG: 18.0},
-        {FOCAL_TAG: 18.0, PLANE_X: 0.0},
-        {FOCAL_TAG: 0.0, PLANE_X: 4500.0},
-        {FOCAL_TAG: 18.0, PLANE_X: 4500.0, PLANE_UNIT: 77},
-        {FOCAL_TAG: 1e6, PLANE_X: 1e9},
-    ],
-)
-def test_implausible_exif_lenses_are_left_out(tags: dict[int, float], tmp_path: Path) -> None:
-    assert on_film(photo(tmp_path / "a.jpg", tags)) is None
+def test_gaps_join_photographs_where_they_match_most():
+    matches = graph(5, chain(range(4)) + [(1, 4, 20), (2, 4, 31), (3, 4, 3)], range(4))
+    assert matches.gaps() == [(2, 4)]
+    assert "without enough overlap" in matches.why(4)
 
 
-def test_colmap_starts_from_the_exif_focal_length(tmp_path: Path) -> None:
-    """The database's camera, of photographs that were shrunk; where they were taken is not passed on."""
-    for index in range(3):
-        photo(tmp_path / f"{index}.jpg", {FOCAL_TAG: 18.0, PLANE_X: 4000 / 22.3 * 25.4, WIDTH: 4000})
+def test_all_from_one_place_are_told_to_step_aside():
+    assert "step aside" in graph(4, chain(range(4))).advice()
+    assert graph(4, chain(range(4)), range(4)).gaps() == []
 
-    with pytest.raises(WorkCancelledError):
-        load_capture(tmp_path, DatasetConfig(), tmp_path / "work", stop_at("matching photographs"))
-    (stage,) = (tmp_path / "work").glob("sfm-*")
-    with pycolmap.Database.open(stage / "database.db") as database:
-        (camera,) = database.read_all_cameras()
-        assert database.num_pose_priors() == 0
-    assert (camera.width, camera.height) == (1600, 1200)
-    assert camera.has_prior_focal_length
-    assert camera.focal_length == pytest.approx(18 / 22.3 * 1600, rel=0.02)  # whole millimetres
+
+@pytest.mark.parametrize("features", [0, 20, -1])
+def test_blank_photographs_are_no_gap(features: int):
+    matches = graph(4, [], features=features)
+    assert matches.gaps() == []
+    assert "two thirds" in matches.advice()
+    assert matches.why(0) != graph(4, []).why(0)
+
+
+def test_long_names_of_files_stay_short_in_a_message():
+    long = Matches(("a" * 200 + ".jpg", "b.jpg"), (900, 900), (), frozenset({0}))
+    assert len(long.advice()) < 120
+
+
+def test_no_feature_is_sought_where_a_mask_is_black(tmp_path: Path) -> None:
+    photos, work = tmp_path / "photos", tmp_path / "work"
+    write_photos(photos, LENS.regridded(240, 180), poses(3))
+    left = np.zeros((90, 120), bool)
+    left[:, :60] = True
+    mask_file(photos / "masks/view_1.png.png", left)
+    (work / "images").mkdir(parents=True)
+    assert sfm.match_photos(work, sfm.numbered(find_photos(photos)), silent) == 3
+    with pycolmap.Database.open(work / "database.db") as database:
+        ends = [database.read_keypoints(number)[:, 0].max() for number in (1, 2, 3)]
+    assert ends[1] < 121 < min(ends[0], ends[2])

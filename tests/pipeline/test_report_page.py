@@ -11,7 +11,7 @@ from PIL import Image
 from langsplat_core.arrays import ViewScore
 from langsplat_core.config import TrainConfig
 from langsplat_core.datasets.capture import Capture
-from langsplat_core.datasets.matches import Matches, NotLocatedError
+from langsplat_core.datasets.workspace import Matches, NotLocatedError
 from langsplat_core.errors import InputError
 from langsplat_core.pipeline.report import PAGE, TrainReport, read_report
 from langsplat_core.pipeline.report_page import MOST_VIEWS, from_all_over, write_refusal, write_reports

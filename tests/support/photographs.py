@@ -144,6 +144,13 @@ def write_picture(path: Path, size: tuple[int, int] = (40, 30), seed: int = 0) -
     Image.fromarray(pixels).save(path)
 
 
+def mask_file(path: Path, mask: Array) -> Path:
+    """White where a photograph counts."""
+    path.parent.mkdir(exist_ok=True)
+    Image.fromarray(np.where(mask, np.uint8(255), np.uint8(0))).save(path)
+    return path
+
+
 def write_colmap(folder: Path, form: str = "bin") -> Path:
     """Two photographs and a model with three points; returns the model's folder."""
     names = ["a.png", "b.png"]

@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from langsplat_core.config import GOOD, INRIA, QUICK, RadianceBudget, RadianceConfig
-from langsplat_core.datasets.capture import Capture
-from langsplat_core.datasets.holdout import chosen
+from langsplat_core.datasets.capture import Capture, surrounded_views
 from langsplat_core.progress import Progress, Report, silent
 from langsplat_core.scene import Camera, Gaussians
 from langsplat_core.training.radiance.scores import evaluate_views
@@ -115,7 +114,7 @@ def _held_out(cameras: Sequence[Camera]) -> list[list[int]]:
     """
     views: list[list[int]] = []
     while sum(map(len, views)) < 3:
-        more = chosen(cameras, 8, [index for taken in views for index in taken])
+        more = surrounded_views(cameras, 8, [index for taken in views for index in taken])
         if not more:
             break
         views.append(more)

@@ -17,8 +17,7 @@ from torch.optim.adam import adam
 
 from langsplat_core.arrays import Array, logit
 from langsplat_core.config import RadianceConfig
-from langsplat_core.datasets.capture import Capture
-from langsplat_core.datasets.known_poses import TELLING_POINTS, random_points
+from langsplat_core.datasets.capture import TELLING_POINTS, Capture, random_points
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians

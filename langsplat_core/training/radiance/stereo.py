@@ -18,8 +18,7 @@ from scipy.ndimage import minimum_filter
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.compiled import helper, kernel, shared_workers
-from langsplat_core.datasets.capture import Capture
-from langsplat_core.datasets.known_poses import TELLING_POINTS, look_distance
+from langsplat_core.datasets.capture import TELLING_POINTS, Capture, look_distance
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import Camera
 
