@@ -10,9 +10,12 @@ from langsplat_core import registry
 from langsplat_core.cli.arguments import AnyScene, EncoderOption, Level
 from langsplat_core.config import CodebookConfig, CodecConfig
 from langsplat_core.errors import InputError
-from langsplat_core.io.exchange import Exporter, ExportRequest, Importer, ImportRequest
 from langsplat_core.io.files import check_output_file, check_output_folder
 from langsplat_core.io.scenes import (
+    Exporter,
+    ExportRequest,
+    Importer,
+    ImportRequest,
     check_keeps,
     check_writable,
     load_scene,

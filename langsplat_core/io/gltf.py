@@ -26,7 +26,7 @@ from langsplat_core.arrays import Array, logit, rotation_matrices, sigmoid, unit
 from langsplat_core.errors import InputError, malformed, quoted
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import decode_json, is_plain_name, open_for_reading
-from langsplat_core.io.packing import coefficient_signs, quaternion_signs, to_bytes
+from langsplat_core.io.quantised import coefficient_signs, quaternion_signs, to_bytes
 from langsplat_core.io.spz import decode_spz
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
 from langsplat_core.scene.gaussians import join_gaussians

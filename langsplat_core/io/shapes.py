@@ -10,8 +10,8 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.gltf import BufferWriter, write_glb
-from langsplat_core.io.packing import to_bytes
-from langsplat_core.io.ply_table import write_table
+from langsplat_core.io.ply import write_table
+from langsplat_core.io.quantised import to_bytes
 from langsplat_core.scene import Gaussians, Scene
 from langsplat_core.scene.transform import AXES, C0, scaling, turning
 

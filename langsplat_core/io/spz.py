@@ -25,7 +25,7 @@ from langsplat_core.arrays import Array, logit, sigmoid
 from langsplat_core.errors import InputError, malformed
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import open_for_reading
-from langsplat_core.io.packing import (
+from langsplat_core.io.quantised import (
     coefficient_signs,
     quaternion_signs,
     smallest_three,

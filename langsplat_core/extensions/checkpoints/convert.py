@@ -6,7 +6,7 @@ import numpy as np
 
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.checkpoints.langsplat_files import write_autoencoder, write_checkpoint
-from langsplat_core.io.exchange import Exporter, ExportRequest, Importer, ImportRequest
+from langsplat_core.io.scenes import Exporter, ExportRequest, Importer, ImportRequest
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import LEVELS, AutoencoderCodec, LanguageField, Scene
 
