@@ -87,8 +87,7 @@ from langsplat_core.scene import (
     Tree,
     codec_from_tensors,
 )
-from langsplat_core.scene.language import MOST_SHOWN
-from langsplat_core.scene.tree import tree_of_wholes
+from langsplat_core.scene.language import MOST_SHOWN, tree_of_wholes
 
 SUFFIX = ".langsplat.safetensors"
 CODEC = "codec."

@@ -28,7 +28,7 @@ from langsplat_core.io.sidecar import write_language
 from langsplat_core.io.summary import disk_bytes, summarise
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import NO_NODE, Calibration, PlattScaling, Scene
-from langsplat_core.scene.tree import tree_of_wholes
+from langsplat_core.scene.language import tree_of_wholes
 from tests.support.comparing import assert_refused, assert_same_extras, assert_same_field
 from tests.support.fakes import blob_scene
 from tests.support.file_samples import compressed_ply, random_field, sog_files, write_folder
