@@ -18,17 +18,7 @@ from langsplat_core.extensions.benchmarks.query_speed import with_codec
 from langsplat_core.io.hostile import opened
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.training.language.codec_fit import train_autoencoder
-from langsplat_viewer.actions import (
-    browsing,
-    editing,
-    filming,
-    opening,
-    outline,
-    projects,
-    selecting,
-    settings,
-    viewpoint,
-)
+from langsplat_viewer.actions import editing, opening, outline, settings, viewpoint
 from langsplat_viewer.options import scene_path, services
 from langsplat_viewer.rendering.renderer import renderer_for
 from langsplat_viewer.state import TrainingForm
@@ -72,7 +62,7 @@ def _under_the_cursor(ctx: Any, window: Window) -> None:
 def _selected(ctx: Any, window: Window) -> None:
     viewer = window.viewer
     settings.open_panel(viewer, "Select")
-    selecting.select_query(viewer)
+    editing.select_query(viewer)
     settings.set_display(viewer, "rgb")
 
 
@@ -92,10 +82,10 @@ def _outlined(ctx: Any, window: Window) -> None:
 
 def _boxed(ctx: Any, window: Window) -> None:
     viewer = window.viewer
-    selecting.select_query(viewer)
+    editing.select_query(viewer)
     settings.open_panel(viewer, "Transform")
     editing.fill_box(viewer)
-    selecting.select_none(viewer)
+    editing.select_none(viewer)
     settings.set_display(viewer, "rgb")
     viewer.state.edit_form = replace(viewer.state.edit_form, gizmo="box")
 
@@ -104,8 +94,8 @@ def _noted(ctx: Any, window: Window) -> None:
     viewer = window.viewer
     settings.open_panel(viewer, "Notes")
     for place, text in (((0.37, 0.36), "a gift of 1987"), ((0.62, 0.55), "eaten by the children")):
-        projects.pin_at(viewer, *place)
-        projects.write_note(viewer, viewer.state.session.notes[-1], text)
+        settings.pin_at(viewer, *place)
+        settings.write_note(viewer, viewer.state.session.notes[-1], text)
 
 
 def _beside(ctx: Any, window: Window) -> None:
@@ -139,7 +129,7 @@ def _side_by_side(ctx: Any, window: Window) -> None:
 
 
 def _palette(ctx: Any, window: Window) -> None:
-    settings.show_palette(window.viewer, True)
+    settings.toggle_palette(window.viewer)
     ctx.yield_(2)
     window.viewer.state.drafts["##command"] = "sel"
 
@@ -147,7 +137,7 @@ def _palette(ctx: Any, window: Window) -> None:
 def _light(ctx: Any, window: Window) -> None:
     viewer = window.viewer
     settings.prefer(viewer, theme="light")
-    settings.set_colour_map(viewer, "cividis")
+    settings.set_picture(viewer, replace(viewer.state.session.picture, colour_map="cividis"))
 
 
 def _three_levels(ctx: Any, window: Window) -> None:
@@ -168,7 +158,7 @@ def _overlays(ctx: Any, window: Window) -> None:
     settings.set_display(viewer, "rgb")
     viewpoint.step_camera(viewer, 6)
     viewpoint.zoom_by(viewer, 2.2)
-    settings.measure(viewer, True)
+    settings.toggle_measuring(viewer)
     ctx.yield_(30)
     for place in ((0.35, 0.55), (0.6, 0.62)):
         settings.measure_at(viewer, *place)
@@ -193,7 +183,7 @@ def _film(ctx: Any, window: Window) -> None:
     for _ in range(4):
         viewpoint.step_camera(viewer, 2)
         _settled(ctx, window)
-        filming.add_keyframe(viewer)
+        viewpoint.add_keyframe(viewer)
     viewpoint.scrub(viewer, 2.5)
 
 
@@ -204,7 +194,7 @@ def _trained(ctx: Any, window: Window) -> None:
     subprocess.run([sys.executable, "-m", "assets.making", *room], check=True)
     settings.open_panel(viewer, "Train")
     viewer.state.training_form = TrainingForm(str(folder / "room"), str(folder / "room.ply"), "quick")
-    browsing.start_training(viewer)
+    opening.start_training(viewer)
     process = viewer.training
     assert process is not None
     while process.exit_code is None and len(process.progress.losses) < 120:

@@ -25,10 +25,9 @@ from langsplat_core.pipeline.stages import kept, kept_array
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures
 from langsplat_core.training.radiance.state import save_checkpoint
-from langsplat_viewer.files.preferences import Preferences, save_preferences
-from langsplat_viewer.files.projects import Bookmark, Shelf, write_flight, write_queries
+from langsplat_viewer.files.projects import Bookmark, Shelf, save_preferences, write_flight, write_queries
 from langsplat_viewer.output import Film, save_png, write_film
-from langsplat_viewer.session import Query, Session
+from langsplat_viewer.session import Preferences, Query, Session
 from tests.support.file_samples import random_field
 from tests.support.processes import bound_by_permissions, files_of_at_most
 from tests.support.scenes import random_camera, random_gaussians
@@ -113,6 +112,7 @@ def test_folders_without_permission_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["a" * 251 + ".ply", "é" * 125 + ".ply", "a." + "b" * 253, "." + "c" * 254])
 def test_the_longest_names_are_written(name: str, tmp_path: Path) -> None:
+    assert len(name.encode()) <= files.name_max(tmp_path)
     with atomic_path(tmp_path / name) as temporary:
         temporary.write_text("whole")
         assert len(Path(name).suffix) not in range(1, 65) or temporary.suffix == Path(name).suffix

@@ -21,7 +21,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import BackendError
 from langsplat_core.progress import Progress
 from langsplat_core.scene.gaussians import Merged, merged
-from langsplat_viewer.actions import editing, selecting, viewpoint
+from langsplat_viewer.actions import editing, viewpoint
 from langsplat_viewer.commands import with_key
 from langsplat_viewer.jobs import Worker
 from langsplat_viewer.rendering.renderer import Layers, Renderer
@@ -246,7 +246,7 @@ class Canvas:
 def _why_nothing(request: RenderRequest) -> str:
     gaussians = request.scene.scene.gaussians
     if len(request.scene.source.gaussians) and not len(gaussians):
-        shown = with_key("show what is hidden", selecting.show_hidden)
+        shown = with_key("show what is hidden", editing.show_hidden)
         return f"all of the scene is hidden or deleted: {shown}, or {with_key('undo', editing.undo)}"
     if request.clip != UNCLIPPED and gaussians.valid().any():
         return "nothing of the scene in this picture lies between the cuts: move them in the panel Camera"

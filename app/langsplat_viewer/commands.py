@@ -4,29 +4,19 @@ The menus, the keys, the list of keys and the list of commands are made from it.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 from langsplat_core import registry
 from langsplat_core.config import Display
 from langsplat_core.display.displays import DISPLAYS, DisplayRow
 from langsplat_core.scene import LEVELS
-from langsplat_viewer.actions import (
-    browsing,
-    editing,
-    filming,
-    opening,
-    projects,
-    queries,
-    selecting,
-    settings,
-    viewpoint,
-)
-from langsplat_viewer.actions.selecting import Part
+from langsplat_viewer.actions import editing, opening, queries, saving, settings, viewpoint
+from langsplat_viewer.actions.saving import Part
 from langsplat_viewer.camera.controls import Side, adopt_up, level
-from langsplat_viewer.files.preferences import THEMES, Theme
 from langsplat_viewer.marks import TOOLS, Tool
-from langsplat_viewer.session import Overlay
+from langsplat_viewer.session import THEMES, Overlay, Theme
 from langsplat_viewer.state import ViewerState
 from langsplat_viewer.viewer import Viewer
 
@@ -67,7 +57,6 @@ class Command:
     is_on: Callable[[Viewer], bool] | None = None  # for a check mark in the menu
     apart: bool = False  # a line is above it in the menu
     icon: str = ""  # on the toolbar, a name of Font Awesome 6 without its "ICON_FA_"
-    menu: str = ""  # one of MENUS; without one it is found in the list of commands alone
 
 
 def is_shown(state: ViewerState, button: Button) -> bool:
@@ -89,6 +78,15 @@ def _display(button: Button, number: int) -> Command:
     )
 
 
+def _flip(viewer: Viewer, switch: str) -> None:
+    """Turn a switch of the state over."""
+    settings.put(viewer.state, **{switch: not getattr(viewer.state, switch)})
+
+
+def _reset_layout(viewer: Viewer) -> None:
+    settings.put(viewer.state, show_panel=True, resets_panels=True)
+
+
 def _theme(theme: Theme) -> Command:
     return Command(
         f"{theme} theme",
@@ -97,17 +95,8 @@ def _theme(theme: Theme) -> Command:
     )
 
 
-def _text_size(scale: float) -> Command:
-    return Command(
-        f"text size {100 * scale:.0f} %",
-        lambda viewer: settings.prefer(viewer, ui_scale=scale),
-        is_on=lambda viewer: abs(viewer.state.preferences.ui_scale - scale) < 1e-6,
-    )
-
-
-def _recent(path: str) -> Command:
-    name = Path(path)
-    return Command(f"open {name.parent.name}/{name.name}", lambda viewer: browsing.open_recent(viewer, path))
+def _recent(path: Path) -> Command:
+    return Command(f"open {path.parent.name}/{path.name}", lambda viewer: opening.open_file(viewer, path))
 
 
 def _panel(title: str) -> Command:
@@ -126,14 +115,14 @@ def _overlay(name: Overlay, title: str) -> Command:
 def _tool(tool: Tool) -> Command:
     return Command(
         f"select: {tool}",
-        lambda viewer: selecting.use_tool(viewer, tool),
+        lambda viewer: editing.use_tool(viewer, tool),
         is_on=lambda viewer: viewer.state.tools.tool == tool,
         icon=TOOL_ICONS[tool],
     )
 
 
 def _export(does: str, part: Part, as_points: bool = False) -> Command:
-    return Command(does, lambda viewer: selecting.export(viewer, Path.cwd(), part, as_points=as_points))
+    return Command(does, lambda viewer: saving.export(viewer, Path.cwd(), part, as_points=as_points))
 
 
 def _side(side: Side, key: str) -> Command:
@@ -160,7 +149,6 @@ PANEL_TITLES = (
     *("Train", "Record", "Bookmarks", "Messages", "Overlays", "Notes"),
     *registry.references("panels"),
 )
-TEXT_SIZE_MENU = "Text size"  # in the menu Window
 TOOL_ICONS: dict[Tool, str] = {
     "thing": "HAND_POINTER",
     "rectangle": "VECTOR_SQUARE",
@@ -177,24 +165,23 @@ DISPLAY_ICONS: dict[Display, str] = {
     "tree": "SITEMAP",
     "depth": "MOUNTAIN",
 }
-UI_SCALES = (0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0)
 MENUS = ("File", "Edit", "Select", "View", "Camera", "Window", "Help")
 
-BY_MENU: dict[str, tuple[Command, ...]] = {
+BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list of commands alone
     "File": (
-        Command("open a scene", browsing.ask_for_file, ("Ctrl+O",)),
+        Command("open a scene", opening.ask_for_file, ("Ctrl+O",)),
         Command("reload the scene", opening.reload, ("F5",), apart=True),
         Command("next scene of the list", lambda v: opening.step_scene(v, 1), ("Ctrl+PageDown",)),
         Command("previous scene of the list", lambda v: opening.step_scene(v, -1), ("Ctrl+PageUp",)),
         Command("train a scene", lambda viewer: settings.open_panel(viewer, "Train"), apart=True),
-        Command("save a picture", filming.save_picture, ("Ctrl+S", "P"), icon="CAMERA", apart=True),
-        Command("save the view", filming.save_view),
-        Command("save the project", projects.save_project, ("Ctrl+Shift+S",)),
+        Command("save a picture", saving.save_picture, ("Ctrl+S", "P"), icon="CAMERA", apart=True),
+        Command("save the view", saving.save_view),
+        Command("save the project", saving.save_project, ("Ctrl+Shift+S",)),
         Command("save the queries", queries.save_queries),
-        Command("save a picture of the size of the film", filming.save_sized_picture),
-        Command("save a film of the path", filming.save_film),
-        Command("save the camera path", filming.save_path),
-        Command("quit", selecting.quit_viewer, ("Ctrl+Q",), apart=True),
+        Command("save a picture of the size of the film", saving.save_sized_picture),
+        Command("save a film of the path", saving.save_film),
+        Command("save the camera path", saving.save_path),
+        Command("quit", saving.quit_viewer, ("Ctrl+Q",), apart=True),
     ),
     "Edit": (
         Command("search", queries.focus_search, ("Ctrl+F", "/")),
@@ -211,25 +198,25 @@ BY_MENU: dict[str, tuple[Command, ...]] = {
         ),
     ),
     "Select": (
-        Command("select everything", selecting.select_all, ("Ctrl+A",), is_edit=True),
-        Command("select nothing", selecting.select_none, ("Ctrl+D", "Ctrl+Shift+A"), is_edit=True),
-        Command("invert the selection", selecting.invert_selection, ("Ctrl+I",), is_edit=True),
-        Command("select what the search found", selecting.select_query, apart=True),
-        Command("select everything like the selection", selecting.select_alike),
-        Command("grow the selection", selecting.grow_selection),
-        Command("shrink the selection", selecting.shrink_selection),
+        Command("select everything", editing.select_all, ("Ctrl+A",), is_edit=True),
+        Command("select nothing", editing.select_none, ("Ctrl+D", "Ctrl+Shift+A"), is_edit=True),
+        Command("invert the selection", editing.invert_selection, ("Ctrl+I",), is_edit=True),
+        Command("select what the search found", editing.select_query, apart=True),
+        Command("select everything like the selection", editing.select_alike),
+        Command("grow the selection", editing.grow_selection),
+        Command("shrink the selection", editing.shrink_selection),
         Command(
             "select with no tool: the left button turns the view",
-            selecting.leave_tool,
+            lambda viewer: editing.use_tool(viewer, None),
             is_on=lambda viewer: viewer.state.tools.tool is None,
             icon="HAND",
             apart=True,
         ),
         *(_tool(tool) for tool in TOOLS),
-        Command("hide the selection", selecting.hide_selected, ("H",), apart=True),
-        Command("isolate the selection", selecting.isolate_selected, ("Shift+H",)),
-        Command("show all that is hidden", selecting.show_hidden, ("U", "Alt+H")),
-        Command("delete the selection", selecting.delete_selected, ("Delete",)),
+        Command("hide the selection", editing.hide_selected, ("H",), apart=True),
+        Command("isolate the selection", editing.isolate_selected, ("Shift+H",)),
+        Command("show all that is hidden", editing.show_hidden, ("U", "Alt+H")),
+        Command("delete the selection", editing.delete_selected, ("Delete",)),
         _export("save the selection", "selection"),
         _export("save the selection as points", "selection", as_points=True),
         _export("save the rest", "rest"),
@@ -258,7 +245,7 @@ BY_MENU: dict[str, tuple[Command, ...]] = {
             is_on=lambda viewer: viewer.state.session.split.mode == "levels",
             icon="LAYER_GROUP",
         ),
-        Command("compare with another scene", browsing.ask_for_beside),
+        Command("compare with another scene", opening.ask_for_beside),
         *(_overlay(name, title) for name, title in OVERLAY_TITLES.items()),
         Command(
             "measure a distance",
@@ -270,12 +257,12 @@ BY_MENU: dict[str, tuple[Command, ...]] = {
         ),
         Command(
             "pin a note to what is clicked",
-            projects.toggle_pinning,
+            settings.toggle_pinning,
             ("N",),
             is_on=lambda viewer: viewer.state.pins_notes,
             icon="NOTE_STICKY",
         ),
-        Command("pin a note to the selection", projects.pin_to_selection),
+        Command("pin a note to the selection", settings.pin_to_selection),
     ),
     "Camera": (
         Command("return to the opening view", viewpoint.reset_view, ("R", "Home"), icon="HOUSE"),
@@ -288,23 +275,24 @@ BY_MENU: dict[str, tuple[Command, ...]] = {
         *(_side(side, key) for side, key in SIDE_KEYS),
         Command("orthographic view, and back", viewpoint.toggle_orthographic, ("O", "Keypad5"), apart=True),
         Command("bookmark this view", viewpoint.add_bookmark, ("Ctrl+B",), apart=True),
-        Command("add a keyframe here", filming.add_keyframe, ("K",)),
+        Command("add a keyframe here", viewpoint.add_keyframe, ("K",)),
         Command("play the camera path, or stop", viewpoint.toggle_playing, ("Shift+K",)),
     ),
     "Window": (
-        Command("hide or show the panels", settings.toggle_panel, ("F11",)),
-        Command("reset the layout", settings.reset_panels, apart=True),
+        Command("hide or show the panels", lambda v: _flip(v, "show_panel"), ("F11",)),
+        Command("reset the layout", _reset_layout, apart=True),
         *(_theme(theme) for theme in THEMES),
+        Command("larger text", lambda v: settings.scale_text(v, 0.25), apart=True),
+        Command("smaller text", lambda v: settings.scale_text(v, -0.25)),
     ),
-    TEXT_SIZE_MENU: tuple(_text_size(scale) for scale in UI_SCALES),
     "": tuple(_panel(title) for title in PANEL_TITLES),
     "Help": (
         Command("find a command", settings.toggle_palette, ("Ctrl+Shift+P",)),
-        Command("first steps, and list of keys", settings.toggle_help, ("F1", "?")),
+        Command("first steps, and list of keys", lambda v: _flip(v, "show_help"), ("F1", "?")),
     ),
 }
 COMMANDS: tuple[Command, ...] = (
-    *(replace(command, menu=menu) for menu, commands in BY_MENU.items() for command in commands),
+    *chain(*BY_MENU.values()),
     Command("close what lies over the scene", settings.escape, ("Esc",)),
 )
 
@@ -336,10 +324,5 @@ def matching(text: str, recent: Sequence[str] = ()) -> list[Command]:
 
     `recent` scenes are some.
     """
-    words, commands = text.lower().split(), (*COMMANDS, *map(_recent, recent))
+    words, commands = text.lower().split(), (*COMMANDS, *map(_recent, map(Path, recent)))
     return [command for command in commands if all(word in command.does.lower() for word in words)]
-
-
-def in_menu(menu: str) -> list[Command]:
-    """Return the commands of one of MENUS, in their order."""
-    return [command for command in COMMANDS if command.menu == menu]

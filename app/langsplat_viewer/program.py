@@ -9,8 +9,7 @@ from pathlib import Path
 from langsplat_core.cli.run import main, parsed
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, TerminalProgress, silent
-from langsplat_viewer.files.preferences import preferences_folder
-from langsplat_viewer.files.projects import PROJECTS
+from langsplat_viewer.files.projects import PROJECTS, preferences_folder
 from langsplat_viewer.options import ViewerOptions, camera_file, scene_path, services
 
 

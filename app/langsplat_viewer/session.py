@@ -1,21 +1,23 @@
-"""The session: what is shown, asked, selected, edited, named and bookmarked in a scene, as one frozen tree.
+"""The session: what is shown, asked, selected, edited, named and bookmarked in a scene; and the preferences.
 
 Undo goes back to earlier sessions, a scene that was left is found again by its session, and project files
-hold one. So a field that is added here is undone and saved. The bounds beside the types hold for files and
-widgets; what has a title gets its widget in the panel that is named with it.
+hold one. So a field that is added to `Session` is undone and saved, and one of `Preferences` outlives the
+window. The bounds beside the types hold for files and widgets; what has a title gets its widget in the panel
+that is named with it.
 """
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Annotated, Literal, get_args
 
 import numpy as np
 from msgspec import Meta
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import LevelChoice, PictureConfig
-from langsplat_core.display.displays import MAX_QUERIES
+from langsplat_core.config import ColourMap, LevelChoice, PictureConfig
+from langsplat_core.display.displays import DISPLAYS, MAX_QUERIES
 from langsplat_core.scene import FARTHEST, LEVELS, Scene
 from langsplat_core.scene.transform import Similarity, transform_scene
 from langsplat_viewer.camera.flight import Keyframe, Pose
@@ -35,6 +37,7 @@ Node = Annotated[int, Meta(ge=0, lt=2**31)]  # of the scene's tree
 Level = Annotated[int, Meta(ge=0, lt=len(LEVELS))]  # index into LEVELS
 Overlay = Literal["things", "cameras", "cube", "grid"]
 OVERLAYS: tuple[Overlay, ...] = get_args(Overlay)
+IN_CAMERA = {"panel": "Camera"}  # where a setting has its widget
 
 
 # Marks and transforms. Of masks a session keeps bits, an eighth of their size: histories hold a hundred.
@@ -232,6 +235,13 @@ class Session:
             phrase, slot=slot, shown_since=1 + max((q.shown_since for q in shown), default=0)
         )
 
+    def answering(self, phrase: str, painted: bool) -> "Session":
+        """Return the session with a display of answers, and a query shown where something is painted."""
+        session = self.showing(phrase) if painted else self
+        if DISPLAYS[self.picture.display].needs_query:
+            return session
+        return replace(session, picture=replace(self.picture, display="relevancy"))
+
     def undone(self, now: "Session") -> "Session":
         """Return this earlier session with what is never undone as it is `now`."""
         ruler = now.ruler if now.moves == self.moves else replace(now.ruler, points=())
@@ -269,3 +279,40 @@ class Session:
             keyframes=self.keyframes,
             ruler=self.ruler,
         )
+
+
+# Preferences, kept in the platform's folder for settings.
+
+Theme = Literal["dark", "light"]
+THEMES: tuple[Theme, ...] = get_args(Theme)
+SCALES = (0.75, 3.0)  # least and largest size of letters and widgets
+MOST_RECENT = 12
+
+
+@dataclass(frozen=True)
+class Preferences:
+    """The settings that outlive a window."""
+
+    theme: Theme = "dark"
+    ui_scale: Annotated[float, Meta(ge=SCALES[0], le=SCALES[1])] = 1.0  # of letters and widgets
+    recent: tuple[str, ...] = ()  # scenes that were opened, the latest first
+    panels: tuple[str, ...] | None = None  # titles of those that are open; None: those that are at first
+    colour_map: ColourMap = "turbo"  # that a session begins with
+    overlays: tuple[str, ...] = ()  # that a session begins with
+    fly_speed: Annotated[
+        float,
+        Meta(ge=0.05, le=4, title="Fly speed", description="Scene radii per second", extra=IN_CAMERA),
+    ] = 0.5
+    coarse_while_moving: Annotated[
+        bool,
+        Meta(
+            title="Coarse while moving",
+            description="Where drawing is slow: fewer pixels and merged Gaussians while the camera moves",
+            extra=IN_CAMERA,
+        ),
+    ] = True
+
+    def with_recent(self, path: Path) -> "Preferences":
+        """Return the preferences with `path` as what was opened last."""
+        others = (other for other in self.recent if other != str(path))
+        return replace(self, recent=(str(path), *others)[:MOST_RECENT])

@@ -20,10 +20,9 @@ from langsplat_core.scene.language import Tree
 from langsplat_viewer.camera.controls import Extent, OrbitCamera
 from langsplat_viewer.camera.flight import Flight, Keyframe
 from langsplat_viewer.files.disk import Listing
-from langsplat_viewer.files.preferences import Preferences
 from langsplat_viewer.marks import Marks, Mode, Stroke, Tool, unmarked
 from langsplat_viewer.rendering.request import EditedScene, Pane, RenderRequest, edited_scene, panes
-from langsplat_viewer.session import Move, Note, Point, Query, Session
+from langsplat_viewer.session import Move, Note, Point, Preferences, Query, Session
 
 # Camera path and film: the panel "Record".
 
@@ -112,11 +111,12 @@ class EvidenceSheet:
 
 
 @dataclass(frozen=True)
-class FolderChoice:
-    """A folder that the file browser asks for."""
+class FileChoice:
+    """A file or folder that the file browser asks for."""
 
     title: str  # of the browser
-    then: Callable[[Any, Path], None]  # is given the Viewer and the folder that was taken
+    then: Callable[[Any, Path], None] = lambda viewer, path: None  # what is done with it in a `Viewer`
+    is_folder: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,6 +217,7 @@ class SceneState:
     session: Session = field(default_factory=Session)
     saved: Session = field(default_factory=Session)  # as a project or an exported scene last had it
     project: Path | None = None  # the file that it is saved to again
+    count: int = 0  # Gaussians
 
     scene: Scene | None = None
     path: Path | None = None
@@ -242,6 +243,11 @@ class SceneState:
     suggestions: Suggestions = field(default_factory=Suggestions)
     suggestions_of: Scene | None = None  # the scene for which they were looked for
     _edited: EditedScene | None = None  # of the last request
+
+    def visit(self) -> "SceneState":
+        """Return what is kept of a scene that is left, to be found again: no arrays."""
+        names = ("session", "saved", "project", "count", "view", "opening_camera", "camera_index")
+        return SceneState(**{name: getattr(self, name) for name in names})
 
     @property
     def has_field(self) -> bool:
@@ -299,8 +305,7 @@ class ViewerState(SceneState):
     resets_panels: bool = False  # at the next frame
     shows_panels: tuple[str, ...] = ()  # titles of those that alone are open from now on; (): as they are
     browser: Listing | None = None  # the folder that the file browser shows, while it is open
-    picks_folder: FolderChoice | None = None  # that it is open for; None: a scene
-    picks_beside: bool = False  # it chooses a scene to be shown beside this one
+    choice: FileChoice = FileChoice("")  # that it is open for
     extension_panels: dict[str, Any] = field(default_factory=dict)  # title -> what an extension's panel keeps
     preferences: Preferences = field(default_factory=Preferences)
 

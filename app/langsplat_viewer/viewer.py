@@ -15,8 +15,8 @@ from langsplat_core.config import TrainPreset
 from langsplat_core.errors import LangSplatError, printable_line
 from langsplat_core.progress import Progress, Report
 from langsplat_core.query.describe import Describer
-from langsplat_core.query.engine import LoadEncoder, QueryEngine
-from langsplat_core.scene import Camera, Scene
+from langsplat_core.query.engine import LoadEncoder, QueryEngine, no_field
+from langsplat_core.scene import LanguageField, Scene
 from langsplat_core.semantics.encoders import DEMO
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.files.disk import Stamps, Watch
@@ -24,8 +24,8 @@ from langsplat_viewer.files.projects import Shelf
 from langsplat_viewer.jobs import Job, Worker, one_line
 from langsplat_viewer.marks import Marks
 from langsplat_viewer.rendering.request import RenderRequest
-from langsplat_viewer.session import Session
-from langsplat_viewer.state import OutlineView, ViewerState
+from langsplat_viewer.session import Point, Session
+from langsplat_viewer.state import OutlineView, SceneState, ViewerState
 
 PREVIEW_EVERY = 100  # steps between the checkpoints that can be looked at
 KEPT = 20  # lines of what it says that are kept
@@ -128,19 +128,6 @@ class Training:
             self.process.kill()
 
 
-@dataclass(frozen=True, eq=False)
-class Visit:
-    """A scene that was left, as it is found again."""
-
-    session: Session
-    saved: Session
-    project: Path | None
-    view: OrbitCamera | None
-    opening_camera: Camera | None
-    camera_index: int | None
-    count: int  # Gaussians
-
-
 T = TypeVar("T")
 
 
@@ -197,7 +184,7 @@ class Viewer:
     worker: Worker = field(default_factory=Worker)
     recorder: Worker = field(default_factory=Worker)  # films: minutes, while one looks and searches on
     watch: Watch = field(default_factory=Watch)  # over the files of the scene shown
-    visits: dict[Path, Visit] = field(default_factory=dict)  # of scenes that were left
+    visits: dict[Path, SceneState] = field(default_factory=dict)  # of scenes that were left, see `visit`
     shelf: Shelf = field(default_factory=Shelf)
     history: History = field(default_factory=History)
     engine: QueryEngine | None = None  # of the scene shown; asked on the worker only
@@ -247,6 +234,37 @@ class Viewer:
         `take_results` then calls `done` with its result, or `failed` with the reason, by default `say_error`.
         """
         return self.worker.submit(label, work, done, failed or self.say_error)
+
+    def searchable(self) -> QueryEngine | None:
+        """Return the engine of a scene that can be searched; where there is none say why."""
+        scene = self.state.scene
+        if scene is None:
+            self.say_error("open a scene first, then search it")
+        elif scene.language is None:
+            self.say_error(no_field(scene))
+        return self.engine if self.state.has_field else None
+
+    @property
+    def language(self) -> LanguageField | None:
+        """The language field of the scene shown, with what was taught since."""
+        field = None if self.state.scene is None else self.state.scene.language
+        if field is None or self.engine is None:
+            return field
+        return replace(field, taught=tuple(self.engine.taught.values()))
+
+    def describing(self, engine: QueryEngine, progress: Progress) -> Describer:
+        """Return the describer of an engine, made once; on the worker only."""
+        kept = self.describer
+        return kept if kept is not None and kept.engine is engine else Describer(engine, progress=progress)
+
+    def point_at(self, u: float, v: float, to: str) -> Point | None:
+        """Return the surface's point at fractions of the scene's area; say what cannot be done without."""
+        point = None if self.surface is None else self.surface.point_at(u, v)
+        if point is None:
+            self.state.say(f"nothing under the cursor to {to}")
+            return None
+        x, y, z = (float(part) for part in point)
+        return x, y, z
 
     @property
     def encoder_id(self) -> str:

@@ -16,32 +16,24 @@ import moderngl
 
 from langsplat_core.config import LevelChoice, PictureConfig
 from langsplat_core.errors import BackendError, InputError, LangSplatError
-from langsplat_viewer.actions import (
-    browsing,
-    filming,
-    opening,
-    projects,
-    queries,
-    selecting,
-    settings,
-    viewpoint,
-)
+from langsplat_viewer.actions import opening, queries, saving, settings, viewpoint
 from langsplat_viewer.camera.controls import spanning
 from langsplat_viewer.canvas import MOVING_BUDGET, Canvas
-from langsplat_viewer.files.preferences import (
+from langsplat_viewer.files.projects import (
     FILE_NAME,
     LAYOUT_NAME,
-    Preferences,
+    PROJECTS,
+    Shelf,
     fitting_scale,
     load_preferences,
     save_preferences,
 )
-from langsplat_viewer.files.projects import PROJECTS, Shelf
 from langsplat_viewer.jobs import give_memory_back, on_signals, one_line, share_one_heap
 from langsplat_viewer.options import chosen_camera, latent_level
 from langsplat_viewer.panels import layout, menus, navigation, outline, overlays, ui
 from langsplat_viewer.panels.navigation import Keyboard
 from langsplat_viewer.rendering.renderer import Backend, Renderer, renderer_for
+from langsplat_viewer.session import Preferences
 from langsplat_viewer.viewer import Services, Viewer
 
 # 4.3 sorts splats, 4.1 draws them on every system; 3.3 still shows the CPU's images.
@@ -209,7 +201,7 @@ class Window:
         self._request = request
         self._make_renderer = make_renderer
         self.keyboard = Keyboard(self.viewer.state)
-        self._docks = layout.Docks()
+        self._hiding, self._column = layout.Hiding(), layout.Column()
         self._workspace = Workspace(request.settings, self.viewer)
         self._canvas: Canvas | None = None
         self._menu = outline.ThingsMenu()
@@ -282,7 +274,7 @@ class Window:
         self.keyboard.listen(glfw_window_hello_imgui())
         settings.open_panel(self.viewer, "Search")  # before what was left over it the last time
         if self._request.path.name.endswith(PROJECTS):  # which says itself how it is looked at
-            browsing.open_project(self.viewer, self._request.path, self._ask)
+            opening.open_project(self.viewer, self._request.path, self._ask)
         else:
             opening.open_scene(self.viewer, self._request.path, self._first_view)
 
@@ -326,7 +318,7 @@ class Window:
         given = {name: getattr(wanted, name) for name in ("heat_opacity", "dim", "heat_scale")}
         settings.set_picture(viewer, replace(state.session.picture, **given))
         if request.path_file is not None:
-            filming.load_path(viewer, request.path_file)
+            viewpoint.load_path(viewer, request.path_file)
         queries.set_level(viewer, request.level)
         self._ask(viewer)
         if request.beside is not None:
@@ -334,7 +326,7 @@ class Window:
         settings.set_display(viewer, wanted.display, latent_level(request.level))
 
     def drop(self, paths: list[str]) -> None:
-        browsing.open_dropped(self.viewer, [Path(path) for path in paths])
+        opening.open_dropped(self.viewer, [Path(path) for path in paths])
 
     def _dropped(self, window: object, paths: list[str]) -> None:
         self.drop(paths)
@@ -351,8 +343,10 @@ class Window:
         viewer.take_results()
         viewpoint.tick(viewer, imgui.get_time())
         opening.follow_beside(viewer)
-        browsing.watch_training(viewer)
-        self._docks.apply(viewer)
+        opening.watch_training(viewer)
+        self._hiding.apply(viewer)
+        self._column.apply(viewer)
+        layout.show_wanted(viewer)
         self._title()
         self._workspace.update()
 
@@ -360,11 +354,11 @@ class Window:
         """Obey the last signal: Ctrl + C asks what to save, SIGTERM saves it, a second one ends at once."""
         self._obeyed, number = len(self.signals), self.signals[-1]
         if self._obeyed > 1:
-            selecting.end_at_once(self.viewer)
+            saving.end_at_once(self.viewer)
         elif number == signal.SIGTERM:
-            projects.end(self.viewer)
+            saving.end(self.viewer)
         else:
-            selecting.quit_viewer(self.viewer)
+            saving.quit_viewer(self.viewer)
             if not self.viewer.state.may_close:
                 print("asked in the window; Ctrl + C again ends at once", file=sys.stderr)
 
@@ -442,10 +436,10 @@ class Window:
 
     def _may_close(self) -> bool:
         glfw.post_empty_event()  # where there is a question, it is drawn now
-        return selecting.may_close(self.viewer)
+        return saving.may_close(self.viewer)
 
     def _stop(self) -> None:
-        selecting.finish_writing(self.viewer)
+        saving.finish_writing(self.viewer)
         self._workspace.update()
         self.viewer.watch.close()
         for canvas in self._canvases:

@@ -9,7 +9,7 @@ import numpy as np
 
 from langsplat_core.errors import FormatError
 from langsplat_core.scene import Scene
-from langsplat_viewer.actions import opening, queries, selecting, settings, viewpoint
+from langsplat_viewer.actions import editing, opening, queries, settings, viewpoint
 from langsplat_viewer.camera.controls import extent_of, from_camera, orbit
 from langsplat_viewer.camera.flight import Flight, Keyframe, pose_of
 from langsplat_viewer.canvas import Canvas
@@ -156,7 +156,7 @@ CHANGES = {  # of what is seen, after a search
     "hidden query": lambda v: queries.hide(v, v.state.session.queries[0].phrase),
     "splats": lambda v: v.change(splats=Splats(0.5)),
     "near cut": lambda v: settings.set_clip(v, Clip(1.0)),
-    "marks": selecting.select_all,
+    "marks": editing.select_all,
     "size": lambda v: settings.resize(v, 100, 80),
     "view": lambda v: viewpoint.look_from(v, "left"),
 }
@@ -191,7 +191,7 @@ def put_marks(viewer: Viewer, **masks: np.ndarray) -> None:
     """Mark nothing but the (N,) `selected`, `hidden` and `deleted` that are given."""
     assert viewer.state.scene is not None
     marks = replace(unmarked(len(viewer.state.scene.gaussians)), **masks)
-    selecting.put_marks(viewer, marks)
+    editing.put_marks(viewer, marks)
 
 
 def names(rows: np.ndarray) -> str:

@@ -16,9 +16,8 @@ from langsplat_core.extensions.library import panel as library_panel
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_viewer import viewer as training
-from langsplat_viewer.actions import browsing, filming, selecting, settings
+from langsplat_viewer.actions import editing, opening, settings, viewpoint
 from langsplat_viewer.commands import COMMANDS
-from langsplat_viewer.files.preferences import with_recent
 from langsplat_viewer.files.projects import read_flight
 from langsplat_viewer.panels.layout import all_panels
 from langsplat_viewer.panels.menus import button_label
@@ -68,7 +67,7 @@ def switch_between_scenes(s: Any) -> None:
     assert [path.name for path in s.state.scenes] == ["blobs.ply", "plain.ply"]
     s.drag((600, 300), (656, 279))
     view = s.state.view
-    s.ctx.item_click("//**/plain.ply##scenes")
+    s.ctx.item_click("//**/plain.ply##scene")
     s.shows("plain.ply")
     assert s.state.view is not view
     s.key("Ctrl+page_up", frames=1)
@@ -84,7 +83,7 @@ def search_a_library(s: Any) -> None:
     save_scene(s.folder / "deep" / "mug.ply", replace(fewer, cameras=cameras()))
     s.open_panel("Library", frames=3)
     s.click("//Library/Folder ...", frames=4)
-    browsing.open_typed(viewer, "deep")
+    opening.open_typed(viewer, "deep")
     s.ctx.yield_(3)
     s.ctx.item_click("//**/Take this folder")
     s.until(lambda: library_panel.library_view(viewer) is not None)
@@ -116,7 +115,7 @@ def watch_a_training(s: Any) -> None:
     for number in range(3):
         (photographs / f"{number}.jpg").write_bytes(b"")
     training.command = lambda request: [sys.executable, "-c", TRAINS]
-    browsing.choose_photographs(viewer, photographs)
+    opening.choose_photographs(viewer, photographs)
     s.open_panel("Train", frames=3)
     s.ctx.item_click("//Train/Train")
     s.wait(lambda: viewer.training is not None and len(viewer.training.progress.losses) > 50)
@@ -150,9 +149,9 @@ def large_letters(s: Any) -> None:
         for item in map(items.get_by_index, range(items.get_size())):
             assert item.rect_full.max.x <= item.window.inner_rect.max.x + 1, panel.title
     for scale, show, name in (
-        (2.0, settings.toggle_help, "Help"),
+        (2.0, lambda viewer: settings.put(viewer.state, show_help=True), "Help"),
         (3.0, settings.toggle_palette, "Commands"),
-        (3.0, browsing.ask_for_file, "Open a scene"),
+        (3.0, opening.ask_for_file, "Open a scene"),
     ):
         settings.prefer(s.viewer, ui_scale=scale)
         show(s.viewer)
@@ -195,12 +194,12 @@ def use_the_outline(s: Any) -> None:
 def use_the_outline_by_keys(s: Any, node: int) -> None:
     """From the filter down to a row: Enter looks at the thing, the menu key opens what can be done."""
     s.open_panel("Outline", frames=1)
-    selecting.select_none(s.viewer)
+    editing.select_none(s.viewer)
     s.ctx.item_click("//**/##filter")
     s.key("down_arrow", frames=2)
     s.key("enter")
     assert (s.state.marks.selected == s.state.outline.tree.members(node)).all()
-    selecting.select_none(s.viewer)
+    editing.select_none(s.viewer)
     s.key("menu", frames=3)
     s.key("down_arrow", frames=2)
     s.key("enter")
@@ -224,18 +223,18 @@ def record_and_play(s: Any) -> None:
     s.key("Ctrl+Z", frames=2)
     assert len(s.state.session.keyframes) == 3
 
-    filming.set_path_seconds(s.viewer, 60.0)  # longer than a frame may take
+    viewpoint.set_path_seconds(s.viewer, 60.0)  # longer than a frame may take
     start = s.shot("start")
     s.ctx.item_click("//Record/Play##path")
     s.wait(lambda: 0.2 < record.at < 60.0)
     moving = s.state.view
-    filming.set_path_seconds(s.viewer, 1.0)
+    viewpoint.set_path_seconds(s.viewer, 1.0)
     s.ctx.item_click("//Record/Play##path")
     s.wait(lambda: record.began is None)
     assert record.at == 1.0
     np.testing.assert_allclose(s.state.view.eye, last.eye, atol=1e-6)
     assert np.abs(moving.eye - last.eye).max() > 1e-3
-    filming.set_path_seconds(s.viewer, 60.0)
+    viewpoint.set_path_seconds(s.viewer, 60.0)
     s.key("Shift+K", frames=1)  # from the start again
     s.wait(lambda: 0 < record.at < 59.0)
     s.drag((600, 300), (620, 310))  # the hand is stronger
@@ -244,8 +243,8 @@ def record_and_play(s: Any) -> None:
 
     s.click("//Record/Save path", frames=2)
     assert len(read_flight(s.folder / "blobs-001.path.json").keyframes) == 3
-    filming.set_path_seconds(s.viewer, 1.0)
-    filming.set_film_size(s.viewer, 32, 24)
+    viewpoint.set_path_seconds(s.viewer, 1.0)
+    settings.put(s.viewer.state.record, size=(32, 24))
     s.viewer.state.record.fps = 4.0
     s.viewer.state.record.film_file = "film"
     s.ctx.item_click("//Record/Save film")
@@ -260,7 +259,7 @@ def mark_and_return(s: Any) -> None:
     s.key("keypad7")
     np.testing.assert_allclose(s.state.view.rotation[2], -start.up, atol=1e-6)
     s.open_panel("Bookmarks", frames=4)
-    s.click("//**/view 1##bookmarks")
+    s.click("//**/view 1##bookmark")
     np.testing.assert_allclose(s.state.view.rotation, start.rotation, atol=1e-6)
     s.ctx.item_click("//**/##bookmark")
     s.enter("by the key of k", frames=2)
@@ -436,11 +435,11 @@ def travel_by_keys(s: Any) -> None:
     assert s.state.show_panel
     for words, done in (
         ("light theme", lambda: s.state.preferences.theme == "light"),
-        ("text size 125", lambda: s.state.preferences.ui_scale == 1.25),
+        ("larger text", lambda: s.state.preferences.ui_scale == 1.25),
         ("open plain", lambda: s.state.path.name == "plain.ply"),
     ):
         if words == "open plain":
-            s.state.preferences = with_recent(s.state.preferences, s.folder / "plain.ply")
+            s.state.preferences = s.state.preferences.with_recent(s.folder / "plain.ply")
         s.key("Ctrl+Shift+P", frames=3)
         s.ctx.key_chars_append_enter(words)
         s.until(done)

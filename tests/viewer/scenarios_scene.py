@@ -13,7 +13,7 @@ from imgui_bundle import hello_imgui, imgui  # isort: skip
 from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
 import glfw  # isort: skip
 from langsplat_core.io.scenes import load_scene, save_scene
-from langsplat_viewer.actions import browsing, editing, opening, selecting, settings, viewpoint
+from langsplat_viewer.actions import editing, opening, settings, viewpoint
 from langsplat_viewer.camera.controls import from_side
 from langsplat_viewer.camera.overlays import PlacedText
 from langsplat_viewer.panels import overlays, select
@@ -262,7 +262,7 @@ def name_what_is_clicked(s: Any) -> None:
     s.enter("grandma's mug")
     assert s.state.session.chosen == "grandma's mug"
     np.testing.assert_array_equal(result(s).members, s.state.marks.selected)
-    s.click("//**/More like it")
+    s.click("//**/More like it##verb")
     assert marked(s.viewer)[0] == "plant"
 
 
@@ -272,7 +272,7 @@ def drag_the_gizmo(s: Any) -> None:
     viewer, before = s.viewer, s.state.scene.gaussians.means.copy()
     rgb = s.shot("rgb")
     s.search("mug")
-    selecting.select_query(viewer)
+    editing.select_query(viewer)
     settings.set_display(viewer, "rgb")
     s.open_panel("Transform", frames=1)
     s.key("G")
@@ -293,7 +293,7 @@ def drag_the_gizmo(s: Any) -> None:
     assert np.ptp(moved[chosen], axis=0).max() < 1e-5
     went = s.on_screen(editing.pivot(viewer))
     np.testing.assert_allclose(went, (x + 60, y - 120), atol=3)
-    selecting.select_none(viewer)
+    editing.select_none(viewer)
     for _ in range(4):  # off again
         s.key("G", frames=1)
     shot = s.shot("moved")
@@ -384,5 +384,5 @@ def pin_a_note(s: Any) -> None:
     for left in (1, 0):
         s.key("Ctrl+Z")
         assert len(s.state.session.notes) == left
-    browsing.open_file(s.viewer, s.folder / "blobs-001.langsplat")
+    opening.open_file(s.viewer, s.folder / "blobs-001.langsplat")
     s.until(lambda: s.state.session.notes == (note,))

@@ -24,7 +24,7 @@ import psutil
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import Scene
-from langsplat_viewer.actions import browsing, editing, opening, queries, settings
+from langsplat_viewer.actions import editing, opening, queries, settings
 from langsplat_viewer.commands import COMMANDS
 from langsplat_viewer.jobs import give_memory_back
 from langsplat_viewer.panels.layout import all_panels
@@ -120,7 +120,7 @@ class Soak:
         if way == "dropped":
             self.s.do(lambda: self.s.window.drop([str(path)]))
         elif way == "browsed":
-            self.s.do(lambda: browsing.ask_for_file(self.viewer))
+            self.s.do(lambda: opening.ask_for_file(self.viewer))
             self.s.ctx.yield_(3)
             self.s.ctx.item_click(f"//**/{name}")
         else:

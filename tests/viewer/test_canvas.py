@@ -15,7 +15,7 @@ import pytest
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.errors import BackendError
 from langsplat_core.raster import load_rasterizer
-from langsplat_viewer.actions import editing, selecting, settings, viewpoint
+from langsplat_viewer.actions import editing, settings, viewpoint
 from langsplat_viewer.camera.controls import orbit
 from langsplat_viewer.canvas import (
     FULL,
@@ -312,8 +312,8 @@ def test_another_thread_projects_the_full_image(gl, asked, begun, gated):
 STALE = {
     **CHANGES,
     "undone camera": lambda v: (viewpoint.look_from(v, "left"), viewpoint.reset_view(v)),
-    "deleted": lambda v: (selecting.select_all(v), selecting.delete_selected(v)),
-    "undone": lambda v: (selecting.select_all(v), selecting.delete_selected(v), editing.undo(v)),
+    "deleted": lambda v: (editing.select_all(v), editing.delete_selected(v)),
+    "undone": lambda v: (editing.select_all(v), editing.delete_selected(v), editing.undo(v)),
     "scene": lambda v: setattr(v.state, "scene", replace(v.state.scene)),
 }
 

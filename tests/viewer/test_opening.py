@@ -10,9 +10,9 @@ import pytest
 
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.scene import Scene
-from langsplat_viewer.actions import browsing, editing, filming, opening, queries, settings, viewpoint
+from langsplat_viewer.actions import editing, opening, queries, settings, viewpoint
 from langsplat_viewer.camera.controls import default_view, extent_of, orbit
-from langsplat_viewer.files.disk import MOST_LISTED, FolderEntry, Watch, list_folder, stamps
+from langsplat_viewer.files.disk import MOST_LISTED, Watch, list_folder, stamps
 from langsplat_viewer.options import say_compiling
 from langsplat_viewer.rendering.request import UNCLIPPED, Clip
 from tests.support.fakes import blob_scene
@@ -88,7 +88,7 @@ def test_scene_with_broken_companions_opens_and_says_why(tmp_path, viewer):
     ],
 )
 def test_dropping_opens_the_scene_and_names_other_files(viewer, names, opened_name, said):
-    act(browsing.open_dropped, viewer, [Path(name) for name in names])
+    act(opening.open_dropped, viewer, [Path(name) for name in names])
     assert viewer.state.path.name == opened_name
     assert [path.name for path in viewer.state.scenes] == [opened_name]
     assert errors(viewer) == ([said] if said else [])
@@ -120,7 +120,7 @@ def test_first_run_says_that_it_compiles(viewer, monkeypatch):
 @pytest.fixture
 def three(viewer):
     """Three scenes were dropped; the first is shown."""
-    act(browsing.open_dropped, viewer, [Path("blobs.ply"), Path("plain.ply"), Path("bare.ply")])
+    act(opening.open_dropped, viewer, [Path("blobs.ply"), Path("plain.ply"), Path("bare.ply")])
     return viewer
 
 
@@ -143,7 +143,7 @@ def test_scene_returns_with_its_camera_and_queries(three):
     queries.set_cut(three, "book", 0.7)
     go(viewpoint.go_to_camera, three, 2)
     settings.set_clip(three, Clip(1.0, 9.0))
-    filming.add_keyframe(three)
+    viewpoint.add_keyframe(three)
     view = three.state.view
     act(opening.switch_scene, three, BARE)
     assert three.state.scene is SCENES["bare.ply"]
@@ -216,15 +216,15 @@ def test_listing_of_a_crowded_folder_is_cut(tmp_path, monkeypatch):
 
 
 def test_browser_enters_folders_and_opens_scenes(viewer, folder):
-    browsing.ask_for_file(viewer)
+    opening.ask_for_file(viewer)
     assert viewer.state.browser.folder == folder
-    browsing.choose(viewer, FolderEntry(folder / "B folder", is_file=False))
+    opening.browse(viewer, folder / "B folder")
     assert viewer.state.browser.folder == folder / "B folder"
-    browsing.browse(viewer, folder)
-    act(browsing.choose, viewer, FolderEntry(folder / "blobs.ply", is_file=True))
+    opening.browse(viewer, folder)
+    act(opening.choose, viewer, folder / "blobs.ply")
     assert viewer.state.browser is None
     assert viewer.state.scene is SCENES["blobs.ply"]
-    browsing.ask_for_file(viewer)
+    opening.ask_for_file(viewer)
     assert viewer.state.browser.folder == folder  # that of the scene
     settings.escape(viewer)
     assert viewer.state.browser is None
@@ -232,25 +232,25 @@ def test_browser_enters_folders_and_opens_scenes(viewer, folder):
 
 def enter(viewer, typed: str) -> None:
     """Type a path in the browser, and open it."""
-    act(browsing.open_typed, viewer, typed)
+    act(opening.open_typed, viewer, typed)
 
 
 @pytest.mark.parametrize("typed", [" blobs.ply ", "B folder/../blobs.ply"])
 def test_typed_path_is_opened(viewer, folder, typed):
-    browsing.ask_for_file(viewer)
+    opening.ask_for_file(viewer)
     for nothing in ("", "  "):
         enter(viewer, nothing)
         assert viewer.state.browser is not None
     enter(viewer, "B folder")
     assert viewer.state.browser.folder == folder / "B folder"
-    browsing.browse(viewer, folder)
+    opening.browse(viewer, folder)
     enter(viewer, typed)
     assert viewer.state.scene is SCENES["blobs.ply"]
 
 
 @pytest.mark.parametrize("typed", ["gone.ply", "x" * 5000, "~nobody-of-this-name/a.ply"])
 def test_typed_path_that_does_not_exist_is_one_error(viewer, folder, typed):
-    browsing.ask_for_file(viewer)
+    opening.ask_for_file(viewer)
     enter(viewer, typed)
     assert len(errors(viewer)) == 1
 
@@ -261,7 +261,7 @@ def test_recent_scenes_are_listed_latest_first(viewer):
     recent = viewer.state.preferences.recent
     assert [Path(path).name for path in recent] == ["blobs.ply", "plain.ply"]
     assert all(Path(path).is_absolute() for path in recent)
-    act(browsing.open_recent, viewer, recent[1])
+    act(opening.open_file, viewer, Path(recent[1]))
     assert viewer.state.scene is SCENES["plain.ply"]
 
 
@@ -321,7 +321,7 @@ def test_reload_keeps_camera_queries_and_settings(shown):
     shown.put(chosen="mug")
     viewpoint.go_to_camera(shown, 1)
     viewpoint.tick(shown, shown.clock + 10)
-    filming.add_keyframe(shown)
+    viewpoint.add_keyframe(shown)
     shown.change(splats=replace(shown.state.session.splats, size=0.5))
     settings.set_picture(shown, replace(shown.state.session.picture, dim=0.1))
     view, before = shown.state.view, shown.state.scene

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from langsplat_core.config import PictureConfig
 from langsplat_core.scene import LEVELS
-from langsplat_viewer.actions import filming, settings, viewpoint
+from langsplat_viewer.actions import settings, viewpoint
 from langsplat_viewer.camera import controls
 from langsplat_viewer.camera.controls import OrbitCamera, from_side, spanning, with_projection
 from langsplat_viewer.camera.flight import Flight, Keyframe, camera_of, pose_at, pose_of
@@ -192,13 +192,13 @@ def test_keyframes_and_bookmarks_bring_their_own(flat, tmp_path):
     viewpoint.zoom_by(flat, 0.4)
     first = flat.state.view
     for name in ("flat", "deep"):
-        filming.add_keyframe(flat)
+        viewpoint.add_keyframe(flat)
         viewpoint.add_bookmark(flat, name)
         viewpoint.toggle_orthographic(flat)
         viewpoint.zoom_by(flat, 2.0)
     for back, kept in (
         (viewpoint.go_to_bookmark, flat.shelf.read(flat.state.path)),
-        (filming.choose_keyframe, flat.state.session.keyframes),
+        (viewpoint.choose_keyframe, flat.state.session.keyframes),
     ):
         go(back, flat, kept[0])
         assert flat.state.view.orthographic

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from langsplat_viewer.actions import browsing, editing, opening, outline, projects, settings
-from langsplat_viewer.actions.selecting import take
+from langsplat_viewer.actions import editing, opening, outline, saving, settings
+from langsplat_viewer.actions.editing import take
 from langsplat_viewer.session import Things
 from tests.support.fakes import CENTRES, blob_scene
 from tests.support.scenes import with_tree
@@ -101,17 +101,17 @@ def test_project_keeps_names_of_known_nodes(outlined, nodes, tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     Path("tree.ply").touch()
     act(outline.give_name, outlined, nodes[1], "the atlas")
-    things, path = outlined.state.session.things, projects.save_project(outlined, tmp_path)
+    things, path = outlined.state.session.things, saving.save_project(outlined, tmp_path)
     open_scene(outlined, "plain.ply")
     assert outlined.state.session.things != things
-    act(browsing.open_project, outlined, path)
+    act(opening.open_project, outlined, path)
     assert outlined.state.session.things == things
     top = json.loads(path.read_text())
     top["session"]["things"]["names"][10**9] = "ghost"
     path.write_text(json.dumps(top))
     if not field:
         monkeypatch.setitem(SCENES, "tree.ply", replace(SCENES["tree.ply"], language=None))
-    act(browsing.open_project, outlined, path)
+    act(opening.open_project, outlined, path)
     assert outlined.state.session.things == (things if field else Things())
 
 

@@ -11,11 +11,12 @@ from langsplat_core.errors import InputError
 from langsplat_viewer import panels
 from langsplat_viewer.actions import settings, viewpoint
 from langsplat_viewer.commands import COMMANDS, PANEL_TITLES, matching
-from langsplat_viewer.files import preferences
-from langsplat_viewer.panels import ui
+from langsplat_viewer.files.projects import FILE_NAME, load_preferences, save_preferences
+from langsplat_viewer.panels import menus, ui
 from langsplat_viewer.panels.layout import all_panels
 from langsplat_viewer.panels.navigation import chord
 from langsplat_viewer.panels.ui import elided
+from langsplat_viewer.session import MOST_RECENT, Preferences
 from langsplat_viewer.state import MAX_MESSAGES
 from tests.support.windowless import settle
 
@@ -150,10 +151,10 @@ def test_long_lines_are_cut_where_they_fit():
 
 
 def test_they_come_back_as_they_were(tmp_path):
-    assert preferences.load_preferences(tmp_path / "none") == preferences.Preferences()
-    kept = preferences.Preferences("light", 1.5, ("/a/b.ply", "/ü.ply"), ("Search",))
-    preferences.save_preferences(tmp_path / "new" / "folder", kept)
-    assert preferences.load_preferences(tmp_path / "new" / "folder") == kept
+    assert load_preferences(tmp_path / "none") == Preferences()
+    kept = Preferences("light", 1.5, ("/a/b.ply", "/ü.ply"), ("Search",))
+    save_preferences(tmp_path / "new" / "folder", kept)
+    assert load_preferences(tmp_path / "new" / "folder") == kept
 
 
 @pytest.mark.parametrize(
@@ -177,18 +178,18 @@ def test_they_come_back_as_they_were(tmp_path):
     ],
 )
 def test_a_file_that_makes_no_sense_is_one_line(tmp_path, text):
-    (tmp_path / preferences.FILE_NAME).write_bytes(text.encode("latin-1"))
-    with pytest.raises(InputError, match=preferences.FILE_NAME) as caught:
-        preferences.load_preferences(tmp_path)
+    (tmp_path / FILE_NAME).write_bytes(text.encode("latin-1"))
+    with pytest.raises(InputError, match=FILE_NAME) as caught:
+        load_preferences(tmp_path)
     assert str(caught.value).isprintable()
     assert len(str(caught.value)) < 300
 
 
 def test_letters_recent_scenes_and_looks_stay_within_limits(viewer):
-    wanted = preferences.Preferences()
-    most = preferences.MOST_RECENT
+    wanted = Preferences()
+    most = MOST_RECENT
     for number in (*range(most + 3), 5):
-        wanted = preferences.with_recent(wanted, Path(f"/{number}.ply"))
+        wanted = wanted.with_recent(Path(f"/{number}.ply"))
     assert len(wanted.recent) == most
     assert wanted.recent[:2] == ("/5.ply", f"/{most + 2}.ply")
 
@@ -200,3 +201,18 @@ def test_the_first_fallback_has_the_scripts_that_it_is_there_for():
     letters = FT2Font(ui.fallbacks()[0]).get_charmap()
     for text in ("жук", "κούπα", "čaj żółć", "ספל", "كوب", "→ ≥ ✓"):
         assert all(ord(letter) in letters for letter in text if letter != " "), text
+
+
+@pytest.mark.parametrize("platform", ["linux", "darwin", "win32", "emscripten"])
+def test_a_system_without_fonts_is_no_error(monkeypatch, platform):
+    monkeypatch.setattr(ui.sys, "platform", platform)
+    monkeypatch.setattr(ui, "FOLDERS", {})
+    assert [path.name for path in ui.fallbacks()] == ["DejaVuSans.ttf", "NotoEmoji-Regular.ttf"]
+
+
+@pytest.mark.parametrize(("room", "columns"), [(1000.0, 1), (125.0, 2), (60.0, 3), (10.0, 6)])
+def test_buttons_of_the_toolbar_stay_apart_and_inside(room, columns):
+    places = menus.toolbar_places([1, 3, 2], room, 20.0, 5.0)
+    assert len(set(places)) == 6
+    assert len({x for x, _ in places}) == columns
+    assert all(y + 20 <= max(room, 20) for _, y in places)

@@ -13,22 +13,11 @@ import pytest
 from langsplat_core.config import PictureConfig
 from langsplat_core.errors import LangSplatError
 from langsplat_core.scene.transform import moving
-from langsplat_viewer.actions import (
-    browsing,
-    editing,
-    filming,
-    opening,
-    projects,
-    queries,
-    selecting,
-    settings,
-    viewpoint,
-)
+from langsplat_viewer.actions import editing, opening, queries, saving, settings, viewpoint
 from langsplat_viewer.camera.controls import orbit
-from langsplat_viewer.files.preferences import Preferences, load_preferences
-from langsplat_viewer.files.projects import Shelf, read_flight, read_project, read_queries
+from langsplat_viewer.files.projects import Shelf, load_preferences, read_flight, read_project, read_queries
 from langsplat_viewer.rendering.request import Clip
-from langsplat_viewer.session import Note, Query, Things
+from langsplat_viewer.session import Note, Preferences, Query, Things
 from langsplat_viewer.viewer import Services, Viewer
 from tests.support.fakes import CENTRES, FakeEncoder
 from tests.support.windowless import SCENES, FakeSurface, act, ask, blob, errors, load, marked, result
@@ -42,20 +31,20 @@ def saved(opened, tmp_path, monkeypatch) -> Path:
     ask(opened, "mug", "book", "plant", "mug or book")
     queries.set_cut(opened, "book", 0.6)
     queries.hide(opened, "plant")
-    selecting.take(opened, blob("plant"))
+    editing.take(opened, blob("plant"))
     act(editing.transform, opened, moving(np.array([0.0, 1.0, 0.0])))
-    selecting.hide_selected(opened)
-    selecting.take(opened, blob("book"))
+    editing.hide_selected(opened)
+    editing.take(opened, blob("book"))
     looks = replace(opened.state.session.picture, dim=0.7, heat_scale=(0.4, 0.9), colour_map="magma")
     settings.set_picture(opened, looks)
     settings.set_clip(opened, Clip(0.5, 40.0))
     viewpoint.move(opened, lambda view: orbit(view, 0.3, 0.1))
-    filming.add_keyframe(opened)
-    projects.toggle_pinning(opened)
-    projects.pin_at(opened, 0.5, 0.5)
-    projects.write_note(opened, opened.state.session.notes[0], 'a "note" <b>of</b> 1987')
+    viewpoint.add_keyframe(opened)
+    settings.toggle_pinning(opened)
+    settings.pin_at(opened, 0.5, 0.5)
+    settings.write_note(opened, opened.state.session.notes[0], 'a "note" <b>of</b> 1987')
     opened.state.preferences = replace(opened.state.preferences, panels=("Search", "Notes"))
-    path = projects.save_project(opened, tmp_path)
+    path = saving.save_project(opened, tmp_path)
     assert path is not None
     assert path.name == "blobs-001.langsplat"
     return path
@@ -65,7 +54,7 @@ def saved(opened, tmp_path, monkeypatch) -> Path:
 def again(saved):
     """Another viewer with the project open."""
     made = Viewer(Services(load, lambda encoder_id: FakeEncoder()), surface=FakeSurface())
-    act(browsing.open_file, made, saved)
+    act(opening.open_file, made, saved)
     yield made
     made.worker.close()
 
@@ -89,9 +78,9 @@ def test_project_restores_the_whole_session(opened, saved, again):
     assert not after.is_unsaved
     assert (before.preferences.recent[0], after.preferences.recent[0]) == (str(saved), str(saved))
     queries.remove_all(again)
-    act(browsing.open_recent, again, str(saved))
+    act(opening.open_file, again, saved)
     assert len(after.session.queries) == 4
-    assert projects.save_project(again, Path("/nowhere")) == saved  # where it came from
+    assert saving.save_project(again, Path("/nowhere")) == saved  # where it came from
 
 
 def test_project_without_scene_or_window_is_refused(saved, opened, run_viewer):
@@ -99,7 +88,7 @@ def test_project_without_scene_or_window_is_refused(saved, opened, run_viewer):
     assert code == 2
     assert "project" in problems[0]
     Path("blobs.ply").unlink()
-    browsing.open_dropped(opened, [saved])
+    opening.open_dropped(opened, [saved])
     assert "not there" in errors(opened)[-1]
     assert opened.state.scene is not None
 
@@ -122,7 +111,7 @@ def test_project_states_the_answers_for_other_programs(opened, saved):
 def test_project_of_a_changed_scene_restores_only_queries(saved, viewer, monkeypatch):
     smaller = SCENES["blobs.ply"].take(np.arange(240))
     monkeypatch.setitem(SCENES, "blobs.ply", smaller)
-    act(browsing.open_project, viewer, saved)
+    act(opening.open_project, viewer, saved)
     assert len(viewer.state.session.queries) == 4
     assert not viewer.state.marks.selected.any()
     assert any("has changed" in text for text in errors(viewer))
@@ -137,7 +126,7 @@ def test_project_of_version_1_opens_and_means_the_same(viewer, tmp_path, monkeyp
     path = tmp_path / "version1.langsplat"
     path.write_bytes((SAVED / path.name).read_bytes())
     settings.toggle_overlay(viewer, "grid")
-    act(browsing.open_file, viewer, path)
+    act(opening.open_file, viewer, path)
     assert errors(viewer) == ["groups and locks of the outline are left out: this version has none"]
     state, session = viewer.state, viewer.state.session
     assert session.queries == (
@@ -246,17 +235,17 @@ def places(value, way=()):
 
 
 def test_notes_are_pinned_edited_and_removed(opened):
-    projects.toggle_pinning(opened)
-    projects.pin_at(opened, 0.95, 0.5)  # nothing is there
+    settings.toggle_pinning(opened)
+    settings.pin_at(opened, 0.95, 0.5)  # nothing is there
     assert opened.state.session.notes == ()
     assert opened.state.pins_notes
-    projects.pin_at(opened, 0.5, 0.5)
+    settings.pin_at(opened, 0.5, 0.5)
     assert not opened.state.pins_notes
     (note,) = opened.state.session.notes
-    projects.write_note(opened, note, "x" * 9000)
+    settings.write_note(opened, note, "x" * 9000)
     assert len(opened.state.session.notes[0].text) == 500
     settings.escape(opened)
-    projects.remove_note(opened, opened.state.session.notes[0])
+    settings.remove_note(opened, opened.state.session.notes[0])
     assert opened.state.session.notes == ()
     editing.undo(opened)
     assert [len(note.text) for note in opened.state.session.notes] == [500]
@@ -267,24 +256,24 @@ def test_notes_are_pinned_edited_and_removed(opened):
     assert opened.state.session.notes == ()
 
 
-@pytest.mark.parametrize("leave", [projects.save_and_leave, projects.end])
+@pytest.mark.parametrize("leave", [saving.save_project_and_leave, saving.end])
 def test_unsaved_notes_are_asked_about_before_closing(opened, tmp_path, leave):
-    projects.pin_at(opened, 0.5, 0.5)
-    assert not selecting.may_close(opened)
-    selecting.stay(opened)
+    settings.pin_at(opened, 0.5, 0.5)
+    assert not saving.may_close(opened)
+    settings.escape(opened)
     editing.undo(opened)
-    assert selecting.may_close(opened)
+    assert saving.may_close(opened)
     opened.state.may_close = False
     editing.redo(opened)
-    assert not selecting.may_close(opened)
+    assert not saving.may_close(opened)
     leave(opened, tmp_path)
     assert opened.state.may_close
     assert len(read_project(tmp_path / "blobs-001.langsplat").session.notes) == 1
-    assert selecting.may_close(opened)
+    assert saving.may_close(opened)
 
 
 def test_notes_return_with_their_scene(opened):
-    projects.pin_at(opened, 0.5, 0.5)
+    settings.pin_at(opened, 0.5, 0.5)
     notes = opened.state.session.notes
     opening.add_scenes(opened, [Path("blobs.ply"), Path("plain.ply")])
     for step, there in ((1, ()), (-1, notes)):
@@ -296,13 +285,10 @@ def test_notes_return_with_their_scene(opened):
 
 
 def test_note_is_pinned_to_the_selection(opened):
-    projects.pin_to_selection(opened)
+    settings.pin_to_selection(opened)
     assert "select something" in errors(opened)[-1]
-    selecting.take(opened, blob("book"))
-    projects.pin_to_selection(opened)
+    editing.take(opened, blob("book"))
+    settings.pin_to_selection(opened)
     np.testing.assert_allclose(opened.state.session.notes[0].at, CENTRES[1], atol=0.1)
     assert settings.take(opened.state, "wanted_panel") == "Notes"
-    assert [projects.take_fresh_note(opened, opened.state.session.notes[0]) for _ in range(2)] == [
-        True,
-        False,
-    ]
+    assert opened.state.fresh_note is opened.state.session.notes[0]

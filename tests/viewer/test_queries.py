@@ -12,7 +12,7 @@ from langsplat_core.display.displays import NO_HEAT, Subject, relevancies
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.scene import CANONICAL_PHRASES
 from langsplat_core.semantics.store import ImageFeatures
-from langsplat_viewer.actions import browsing, editing, queries, settings
+from langsplat_viewer.actions import editing, opening, queries, settings
 from langsplat_viewer.files.projects import read_queries, write_queries
 from langsplat_viewer.headless import answer_line
 from langsplat_viewer.panels.search import BINS, hint, histogram
@@ -224,7 +224,7 @@ def test_query_set_is_asked_alone_or_with_its_scene(asked, tmp_path, dropped):
     assert path.name == "blobs-001.queries.json"
     open_scene(asked, "blobs.ply")
     assert (asked.state.session.queries, asked.state.session.canonical) == ((), ())
-    act(browsing.open_dropped, asked, dropped(path))
+    act(opening.open_dropped, asked, dropped(path))
     found = [(query.phrase, query.cut, query.slot is None) for query in asked.state.session.queries]
     assert found == [("mug", 0.7, False), ("plant", None, True)]
     assert asked.state.session.canonical == ("book",)

@@ -19,7 +19,7 @@ from langsplat_core.raster.opengl.rasterizer import GlRasterizer
 from langsplat_core.raster.protocol import farthest
 from langsplat_core.raster.reference import ReferenceRasterizer, colours
 from langsplat_core.scene import Camera, Gaussians, Scene, look_at
-from langsplat_viewer.actions import selecting, settings, viewpoint
+from langsplat_viewer.actions import editing, settings, viewpoint
 from langsplat_viewer.camera.controls import default_view, extent_of, from_camera
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.rendering import renderer as renderers
@@ -467,11 +467,11 @@ def test_canvas_says_that_the_clip_leaves_nothing(gl, beside):
 
 
 def test_an_outline_selects_nothing_that_is_clipped(beside):
-    selecting.use_tool(beside, "rectangle")
+    editing.use_tool(beside, "rectangle")
     settings.set_clip(beside, BOOK_ALONE)
-    selecting.begin_stroke(beside, 0.0, 0.0)
-    selecting.extend_stroke(beside, 1.0, 1.0)
-    selecting.end_stroke(beside)
+    editing.begin_stroke(beside, 0.0, 0.0)
+    editing.extend_stroke(beside, 1.0, 1.0)
+    editing.end_stroke(beside)
     assert marked(beside)[0] == "book"
 
 

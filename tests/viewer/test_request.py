@@ -13,11 +13,11 @@ from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Scene
 from langsplat_viewer import output
-from langsplat_viewer.actions import filming, queries, selecting, settings, viewpoint
-from langsplat_viewer.actions.selecting import mark
+from langsplat_viewer.actions import editing, queries, saving, settings, viewpoint
+from langsplat_viewer.actions.editing import mark
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.commands import BUTTONS, COMMANDS, OVERLAY_TITLES, matching
-from langsplat_viewer.files.preferences import FILE_NAME, load_preferences, save_preferences
+from langsplat_viewer.files.projects import FILE_NAME, load_preferences, save_preferences
 from langsplat_viewer.marks import Marks
 from langsplat_viewer.panels.display import compared_name
 from langsplat_viewer.panels.overlays import STEPS, bar_colours
@@ -70,7 +70,7 @@ def edit_everything(viewer: Viewer, mode: str) -> None:
     settings.set_clip(viewer, Clip(0.5, 6.5))
     heat = {"heat_opacity": 0.6, "dim": 0.7, "threshold": 0.3, "heat_scale": (0.1, 0.8)}
     settings.set_picture(viewer, PictureConfig(**heat, alpha_gate=0.2, background=(0.1, 0.6, 0.3)))
-    settings.set_colour_map(viewer, "viridis")
+    settings.set_picture(viewer, replace(viewer.state.session.picture, colour_map="viridis"))
     settings.set_display(viewer, "relevancy", 1)
     split = Split(mode, second="segmentation", second_level=0, at=0.4)
     viewer.change(split=split)
@@ -100,16 +100,16 @@ def test_screen_file_film_and_reference_agree(gl, opened, tmp_path, mode, backen
 
     rest(canvas, state, 1.0)
     screen = state.session.split.joined(on_screen(canvas), state.size[0]).astype(int)
-    images = {"screen": screen, "saved": image(filming.save_picture(opened, tmp_path))}
-    filming.set_film_size(opened, *state.size)
-    filming.save_sized_picture(opened, tmp_path)
+    images = {"screen": screen, "saved": image(saving.save_picture(opened, tmp_path))}
+    settings.put(opened.state.record, size=state.size)
+    saving.save_sized_picture(opened, tmp_path)
     recorded(opened)
     images["sized"] = image(tmp_path / "blobs-160x120-001.png")
-    filming.set_turning(opened, True)
-    filming.set_path_seconds(opened, 1.0)
+    viewpoint.set_turning(opened, True)
+    viewpoint.set_path_seconds(opened, 1.0)
     opened.state.record.fps = 2.0
     opened.state.record.film_file = "film"
-    filming.save_film(opened, tmp_path)
+    saving.save_film(opened, tmp_path)
     recorded(opened)
     images["film"] = image(tmp_path / "film" / output.frame_name(0))
     expected = ArrayRenderer(ReferenceRasterizer()).read(request).astype(int)
@@ -125,11 +125,11 @@ def test_screen_file_film_and_reference_agree(gl, opened, tmp_path, mode, backen
 def test_images_are_saved_without_background_if_so_chosen(gl, opened, tmp_path):
     opened.surface = Canvas(gl, renderer_for(gl, "cpu"))
     settings.resize(opened, 40, 30)
-    filming.set_film_size(opened, 40, 30)
-    assert image(filming.save_picture(opened, tmp_path)).shape == (30, 40, 3)
+    settings.put(opened.state.record, size=(40, 30))
+    assert image(saving.save_picture(opened, tmp_path)).shape == (30, 40, 3)
     settings.set_picture(opened, replace(opened.state.session.picture, transparent=True))
-    saved = image(filming.save_picture(opened, tmp_path))
-    filming.save_sized_picture(opened, tmp_path)
+    saved = image(saving.save_picture(opened, tmp_path))
+    saving.save_sized_picture(opened, tmp_path)
     recorded(opened)
     assert saved.shape == (30, 40, 4)
     np.testing.assert_allclose(image(tmp_path / "blobs-40x30-001.png"), saved, atol=1)
@@ -147,7 +147,7 @@ SEEN = {
 UNSEEN = {
     "line": lambda v: settings.move_line(v, 0.3),  # the window draws it
     "ruler": settings.toggle_measuring,
-    "tool": lambda v: selecting.use_tool(v, "brush"),
+    "tool": lambda v: editing.use_tool(v, "brush"),
     "word": lambda v: setattr(v.state, "typed", "plant"),
     "chosen query": lambda v: v.put(chosen=""),
     "saved without background": lambda v: settings.set_picture(
@@ -336,7 +336,7 @@ def test_overlays_and_colour_map_have_commands_and_are_remembered(opened, tmp_pa
         if name not in opened.state.session.overlays:
             command.act(opened)
     assert opened.state.session.overlays == OVERLAYS
-    settings.set_colour_map(opened, "cividis")
+    settings.set_picture(opened, replace(opened.state.session.picture, colour_map="cividis"))
     assert opened.state.request().picture.colour_map == "cividis"
     settings.keep_preferences(opened)
     save_preferences(tmp_path, opened.state.preferences)
@@ -360,8 +360,9 @@ def test_two_clicks_measure_and_a_third_begins_anew(opened):
     settings.measure_at(opened, 0.6, 0.6)
     assert opened.state.session.ruler.length is None
     assert len(opened.state.session.ruler.points) == 1
+    settings.escape(opened)
     for end in (settings.escape, lambda viewer: open_scene(viewer, "plain.ply")):
-        settings.measure(opened, True)
+        settings.toggle_measuring(opened)
         settings.measure_at(opened, 0.5, 0.5)
         end(opened)
         assert opened.state.session.ruler == Ruler()

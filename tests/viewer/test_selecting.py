@@ -10,8 +10,8 @@ from plyfile import PlyData
 
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.scene import look_at
-from langsplat_viewer.actions import editing, opening, queries, selecting, settings, viewpoint
-from langsplat_viewer.actions.selecting import take
+from langsplat_viewer.actions import editing, opening, queries, saving, settings, viewpoint
+from langsplat_viewer.actions.editing import take
 from langsplat_viewer.camera.controls import from_camera
 from langsplat_viewer.marks import Drawn, Stroke, outlines
 from langsplat_viewer.state import QueryAnswer
@@ -42,21 +42,21 @@ def searched(opened):
 
 def test_hidden_and_deleted_are_never_selected(opened):
     for action, expected in (
-        (selecting.select_all, ("mug book plant", "", "")),
-        (selecting.select_none, ("", "", "")),
+        (editing.select_all, ("mug book plant", "", "")),
+        (editing.select_none, ("", "", "")),
         (partial(take, found=blob("book")), ("book", "", "")),
-        (selecting.invert_selection, ("mug plant", "", "")),
+        (editing.invert_selection, ("mug plant", "", "")),
         (partial(take, found=blob("mug")), ("mug", "", "")),
-        (selecting.select_alike, ("mug", "", "")),
-        (selecting.hide_selected, ("", "mug", "")),
+        (editing.select_alike, ("mug", "", "")),
+        (editing.hide_selected, ("", "mug", "")),
         (partial(take, found=blob("plant")), ("plant", "mug", "")),
-        (selecting.delete_selected, ("", "mug", "plant")),
-        (selecting.select_all, ("book", "mug", "plant")),
-        (selecting.invert_selection, ("", "mug", "plant")),
-        (selecting.show_hidden, ("", "", "plant")),
-        (selecting.select_all, ("mug book", "", "plant")),
+        (editing.delete_selected, ("", "mug", "plant")),
+        (editing.select_all, ("book", "mug", "plant")),
+        (editing.invert_selection, ("", "mug", "plant")),
+        (editing.show_hidden, ("", "", "plant")),
+        (editing.select_all, ("mug book", "", "plant")),
         (partial(take, found=blob("mug")), ("mug", "", "plant")),
-        (selecting.isolate_selected, ("mug", "book", "plant")),
+        (editing.isolate_selected, ("mug", "book", "plant")),
     ):
         act(action, opened)
         assert marked(opened) == expected, action
@@ -68,17 +68,17 @@ def test_hidden_and_deleted_are_never_selected(opened):
 )
 def test_selection_is_combined_by_the_mode(opened, mode, selected):
     take(opened, blob("mug") | blob("book"))
-    selecting.set_tools(opened, mode=mode)
+    editing.set_tools(opened, mode=mode)
     take(opened, blob("book") | blob("plant"))
     assert marked(opened)[0] == selected
 
 
 def test_each_change_of_marks_is_one_step(opened):
     take(opened, blob("mug"))
-    selecting.hide_selected(opened)
+    editing.hide_selected(opened)
     take(opened, blob("book"))
-    selecting.delete_selected(opened)
-    selecting.show_hidden(opened)
+    editing.delete_selected(opened)
+    editing.show_hidden(opened)
     states = [("", "", "book"), ("", "mug", "book"), ("book", "mug", ""), ("", "mug", ""), ("mug", "", "")]
     states.append(("", "", ""))
     assert marked(opened) == states[0]
@@ -91,33 +91,33 @@ def test_each_change_of_marks_is_one_step(opened):
 
 
 def test_change_without_effect_is_no_step(opened):
-    selecting.select_none(opened)
-    selecting.show_hidden(opened)
+    editing.select_none(opened)
+    editing.show_hidden(opened)
     take(opened, blob("mug"))
     take(opened, blob("mug"))
     assert len(opened.history.past) == 1
-    selecting.use_tool(opened, "brush")
-    selecting.set_tools(opened, brush=0.1)
+    editing.use_tool(opened, "brush")
+    editing.set_tools(opened, brush=0.1)
     assert len(opened.history.past) == 1
 
 
 def test_answers_and_instances_are_selected(searched):
-    selecting.select_query(searched)
+    editing.select_query(searched)
     assert marked(searched)[0] == "book"
     ask(searched, "mug")
-    selecting.select_query(searched, mode="add")
+    editing.select_query(searched, mode="add")
     assert marked(searched)[0] == "mug book"
     (thing,) = answer(searched, 0).things
-    selecting.select_thing(searched, thing)
+    editing.select_thing(searched, thing)
     np.testing.assert_array_equal(np.flatnonzero(marks_of(searched).selected), thing.members)
-    selecting.select_none(searched)
+    editing.select_none(searched)
     queries.remove(searched, "mug")
     absent = replace(result(searched), judgement=result(searched).judgement.absent)
     searched.state.answers["book"] = QueryAnswer(absent)
-    selecting.select_query(searched)
+    editing.select_query(searched)
     assert "'book' is not here" in searched.state.messages[-1].text
     queries.remove(searched, "book")
-    selecting.select_query(searched)
+    editing.select_query(searched)
     assert "search for something first" in searched.state.messages[-1].text
     assert marked(searched) == ("", "", "")
 
@@ -126,13 +126,13 @@ def test_growing_and_shrinking_follow_the_surface(opened):
     means = opened.state.scene.gaussians.means
     core = np.linalg.norm(means, axis=1) < 0.15
     take(opened, core)
-    selecting.set_tools(opened, reach=0.15)
-    act(selecting.grow_selection, opened)
+    editing.set_tools(opened, reach=0.15)
+    act(editing.grow_selection, opened)
     grown = marks_of(opened).selected.copy()
     assert core.sum() < grown.sum()
     assert (grown >= core).all()
     assert not (grown & ~blob("book")).any()  # the others are not on its surface
-    act(selecting.shrink_selection, opened)
+    act(editing.shrink_selection, opened)
     assert marks_of(opened).selected.sum() < grown.sum()
     editing.undo(opened)
     assert (marks_of(opened).selected == grown).all()
@@ -140,7 +140,7 @@ def test_growing_and_shrinking_follow_the_surface(opened):
 
 def test_late_result_of_another_scene_is_dropped(opened):
     take(opened, blob("mug"))
-    selecting.grow_selection(opened)
+    editing.grow_selection(opened)
     opened.state.scene = None  # another one is being shown
     settle(opened)
     assert marked(opened)[0] == "mug"
@@ -148,9 +148,9 @@ def test_late_result_of_another_scene_is_dropped(opened):
 
 def test_next_scene_has_no_marks_and_keeps_the_tool(opened):
     take(opened, blob("mug"))
-    selecting.hide_selected(opened)
-    selecting.use_tool(opened, "lasso")
-    selecting.set_tools(opened, mode="add")
+    editing.hide_selected(opened)
+    editing.use_tool(opened, "lasso")
+    editing.set_tools(opened, mode="add")
     open_scene(opened, "plain.ply")
     assert marked(opened) == ("", "", "")
     assert (opened.state.tools.tool, opened.state.tools.mode) == ("lasso", "add")
@@ -184,11 +184,11 @@ def around(viewer, centre, radius: float = 0.58) -> list[tuple[float, float]]:
 
 def draw(viewer, tool, places, mode=None) -> str:
     """A stroke of a tool, when all that it began is done; returns what is selected."""
-    selecting.use_tool(viewer, tool)
-    selecting.begin_stroke(viewer, *places[0])
+    editing.use_tool(viewer, tool)
+    editing.begin_stroke(viewer, *places[0])
     for u, v in places[1:]:
-        selecting.extend_stroke(viewer, u, v)
-    act(selecting.end_stroke, viewer, mode)
+        editing.extend_stroke(viewer, u, v)
+    act(editing.end_stroke, viewer, mode)
     return marked(viewer)[0]
 
 
@@ -202,9 +202,9 @@ def test_stroke_selects_what_it_encloses(front):
     editing.undo(front)
     assert marked(front)[0] == "mug"
     assert draw(front, "lasso", around(front, CENTRES[1])) == "book"
-    selecting.set_tools(front, brush=0.12)
+    editing.set_tools(front, brush=0.12)
     assert draw(front, "brush", [place(front, CENTRES[0]), place(front, CENTRES[1])]) == "mug book"
-    selecting.set_tools(front, brush=0.01)
+    editing.set_tools(front, brush=0.01)
     draw(front, "brush", [place(front, CENTRES[2])])
     assert 0 < marks_of(front).selected.sum() < PER_BLOB
 
@@ -216,7 +216,7 @@ def test_sphere_and_box_are_as_large_as_the_drag(front, tool, monkeypatch):
     draw(front, tool, [place(front, CENTRES[2])])  # a click
     offsets = np.abs(front.state.scene.gaussians.means - CENTRES[2])
     far = np.linalg.norm(offsets, axis=1) if tool == "sphere" else offsets.max(1)
-    np.testing.assert_array_equal(marks_of(front).selected, far <= selecting.reach(front))
+    np.testing.assert_array_equal(marks_of(front).selected, far <= editing.reach(front))
     assert marks_of(front).selected.any()
 
 
@@ -229,7 +229,7 @@ def test_stroke_leaves_out_occluded_gaussians(front, monkeypatch, perspective):
     draw(front, "rectangle", corners(front, CENTRES[1]))
     z = front.state.scene.gaussians.means[:, 2]
     in_front = marks_of(front).selected
-    selecting.set_tools(front, only_visible=False)
+    editing.set_tools(front, only_visible=False)
     assert draw(front, "rectangle", corners(front, CENTRES[1])) == "book"
     np.testing.assert_array_equal(in_front, marks_of(front).selected & (z + 5 <= 4.95 * 1.03))
     assert 20 < in_front.sum() < 100
@@ -252,14 +252,14 @@ def test_click_without_surface_or_field_says_why(front, monkeypatch):
 
 
 def test_escape_closes_help_then_stroke_then_tool(front):
-    selecting.use_tool(front, "lasso")
-    selecting.begin_stroke(front, 0.1, 0.1)
+    editing.use_tool(front, "lasso")
+    editing.begin_stroke(front, 0.1, 0.1)
     front.state.show_help = True
     settings.escape(front)
     assert front.state.tools.stroke is not None
     settings.escape(front)
     assert (front.state.tools.stroke, front.state.tools.tool) == (None, "lasso")
-    selecting.end_stroke(front)  # of nothing
+    editing.end_stroke(front)  # of nothing
     settings.escape(front)
     assert front.state.tools.tool is None
     assert marked(front) == ("", "", "")
@@ -300,7 +300,7 @@ def names_in(folder: Path) -> list[str]:
 def pruned(opened):
     """The plant is deleted."""
     take(opened, blob("plant"))
-    selecting.delete_selected(opened)
+    editing.delete_selected(opened)
     return opened
 
 
@@ -312,7 +312,7 @@ def kept_in(folder: Path) -> int:
 def test_export_writes_parts_with_their_field(pruned, tmp_path):
     take(pruned, blob("mug"))
     for part, word in (("selection", "mug"), ("rest", "book")):
-        act(selecting.export, pruned, tmp_path, part)
+        act(saving.export, pruned, tmp_path, part)
         path = tmp_path / f"blobs-{part}-001.ply"
         assert f"saved {path}: 120 Gaussians" == pruned.state.messages[-1].text
         written, means = load_scene(path), SCENES["blobs.ply"].gaussians.means
@@ -323,7 +323,7 @@ def test_export_writes_parts_with_their_field(pruned, tmp_path):
 
 def test_exported_points_have_their_colours(opened, tmp_path):
     take(opened, blob("mug"))
-    act(selecting.export, opened, tmp_path, "selection", as_points=True)
+    act(saving.export, opened, tmp_path, "selection", as_points=True)
     assert names_in(tmp_path) == ["blobs-selection-points-001.ply"]
     table = PlyData.read(tmp_path / "blobs-selection-points-001.ply")["vertex"]
     assert len(table) == 120
@@ -334,23 +334,23 @@ def test_export_never_overwrites(opened, tmp_path):
     take(opened, blob("mug"))
     taken = tmp_path / "blobs-selection-001.langsplat.safetensors"  # what would belong to the first name
     taken.write_text("precious")
-    selecting.finish_writing(opened)  # nothing is
+    saving.finish_writing(opened)  # nothing is
     for _ in range(2):  # both are asked for before either is written
-        selecting.export(opened, tmp_path, "selection")
-    selecting.finish_writing(opened)  # waits for both
+        saving.export(opened, tmp_path, "selection")
+    saving.finish_writing(opened)  # waits for both
     assert taken.read_text() == "precious"
     written = [name for name in names_in(tmp_path) if name.endswith(".ply")]
     assert written == ["blobs-selection-002.ply", "blobs-selection-003.ply"]
 
 
 def test_failed_export_says_why(opened, tmp_path):
-    selecting.export(opened, tmp_path, "selection")
+    saving.export(opened, tmp_path, "selection")
     assert "nothing is selected" in opened.state.messages[-1].text
-    selecting.select_all(opened)
-    selecting.export(opened, tmp_path, "rest")
+    editing.select_all(opened)
+    saving.export(opened, tmp_path, "rest")
     assert "the rest holds no Gaussians" in errors(opened)[-1]
     (tmp_path / "file").write_text("")
-    act(selecting.export, opened, tmp_path / "file", "selection")
+    act(saving.export, opened, tmp_path / "file", "selection")
     assert errors(opened)[-1].startswith("not saved: ")
     assert names_in(tmp_path) == ["file"]
 
@@ -359,9 +359,9 @@ def test_deletion_is_unsaved_until_exported(pruned, tmp_path):
     for action, unsaved in (
         (editing.undo, False),
         (editing.redo, True),
-        (partial(selecting.export, folder=tmp_path, part="edited"), False),
+        (partial(saving.export, folder=tmp_path, part="edited"), False),
         (partial(take, found=blob("mug")), False),
-        (selecting.delete_selected, True),
+        (editing.delete_selected, True),
     ):
         act(action, pruned)
         assert pruned.state.is_unsaved == unsaved, action
@@ -369,13 +369,13 @@ def test_deletion_is_unsaved_until_exported(pruned, tmp_path):
 
 
 def test_opening_waits_for_the_question(pruned, tmp_path):
-    for reply in (selecting.stay, settings.escape, selecting.discard_and_leave):
+    for reply in (settings.escape, saving.go_on):
         opening.open_scene(pruned, Path("plain.ply"))
         assert pruned.state.opening is None
         assert pruned.state.leaving.to == "plain.ply is opened"
         assert marked(pruned) == ("", "", "plant")
         act(reply, pruned)
-        left = reply is selecting.discard_and_leave
+        left = reply is saving.go_on
         assert pruned.state.leaving is None
         assert pruned.state.path.name == ("plain.ply" if left else "blobs.ply")
     assert names_in(tmp_path) == []
@@ -383,7 +383,7 @@ def test_opening_waits_for_the_question(pruned, tmp_path):
 
 def test_broken_scene_after_discarding_keeps_edits(pruned):
     opening.open_scene(pruned, Path("broken.ply"))
-    act(selecting.discard_and_leave, pruned)
+    act(saving.go_on, pruned)
     assert marked(pruned) == ("", "", "plant")
     assert pruned.state.is_unsaved
 
@@ -391,7 +391,7 @@ def test_broken_scene_after_discarding_keeps_edits(pruned):
 def test_leaving_continues_after_saving(pruned, tmp_path):
     then = []
     opening.open_scene(pruned, Path("plain.ply"), then.append)
-    act(selecting.save_and_leave, pruned, tmp_path)
+    act(saving.save_and_leave, pruned, tmp_path)
     settle(pruned)
     assert then == [pruned]
     assert pruned.state.path.name == "plain.ply"
@@ -399,16 +399,16 @@ def test_leaving_continues_after_saving(pruned, tmp_path):
 
 
 def test_failed_saving_stays_in_the_scene(pruned, tmp_path):
-    selecting.quit_viewer(pruned)
+    saving.quit_viewer(pruned)
     (tmp_path / "file").write_text("")
-    act(selecting.save_and_leave, pruned, tmp_path / "file")
+    act(saving.save_and_leave, pruned, tmp_path / "file")
     assert "not saved" in errors(pruned)[-1]
     assert not pruned.state.may_close
     assert pruned.state.is_unsaved
 
 
 def test_ending_process_saves_unsaved_edits(pruned, tmp_path):
-    selecting.end(pruned, tmp_path)
+    saving.end(pruned, tmp_path)
     assert not pruned.state.may_close
     settle(pruned)
     assert pruned.state.may_close
@@ -417,19 +417,19 @@ def test_ending_process_saves_unsaved_edits(pruned, tmp_path):
 
 def test_taught_name_is_found_and_saved(opened, tmp_path):
     take(opened, blob("plant"))
-    act(queries.name_selection, opened, "grandma's mug")
+    act(editing.name_selection, opened, "grandma's mug")
     assert phrases(opened) == ["grandma's mug"]
     np.testing.assert_array_equal(result(opened).members, blob("plant"))
-    act(selecting.export, opened, tmp_path, "edited")
+    act(saving.export, opened, tmp_path, "edited")
     (saved,) = tmp_path.glob("*.ply")
     assert [word.name for word in load_scene(saved).language.taught] == ["grandma's mug"]
     assert errors(opened) == []
 
 
 def test_unusable_name_says_why(opened):
-    queries.name_selection(opened, "cup")
+    editing.name_selection(opened, "cup")
     assert "nothing is selected" in opened.state.messages[-1].text
     take(opened, blob("plant"))
-    act(queries.name_selection, opened, "the")
+    act(editing.name_selection, opened, "the")
     assert "'the' cannot be a name" in errors(opened)[-1]
     assert opened.state.session.queries == ()

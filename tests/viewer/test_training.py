@@ -17,7 +17,7 @@ from langsplat_core.io.scenes import load_scene
 from langsplat_core.pipeline.report import REPORT
 from langsplat_core.scene import Scene
 from langsplat_viewer import viewer as training_process
-from langsplat_viewer.actions import browsing, settings, viewpoint
+from langsplat_viewer.actions import opening, settings, viewpoint
 from langsplat_viewer.files.disk import IN_TRAINING, PREVIEW, write_preview
 from langsplat_viewer.viewer import PREVIEW_EVERY, TrainingProgress, TrainingRequest, command
 from tests.support.fakes import blob_scene
@@ -50,9 +50,9 @@ def begin(viewer, folder, monkeypatch) -> Callable[..., None]:
 
     def start(script: str, out: str = "photos.ply") -> None:
         monkeypatch.setattr(training_process, "command", lambda request: [sys.executable, "-c", script])
-        browsing.choose_photographs(viewer, folder)
+        opening.choose_photographs(viewer, folder)
         viewer.state.training_form = replace(viewer.state.training_form, out=str(folder.with_name(out)))
-        browsing.start_training(viewer)
+        opening.start_training(viewer)
 
     return start
 
@@ -60,14 +60,14 @@ def begin(viewer, folder, monkeypatch) -> Callable[..., None]:
 def finish(viewer, seconds: float = 20.0) -> None:
     end = time.monotonic() + seconds
     while viewer.training is not None and time.monotonic() < end:
-        browsing.watch_training(viewer)
+        opening.watch_training(viewer)
         time.sleep(0.02)
     assert viewer.training is None
     settle(viewer)
 
 
 def test_training_opens_its_scene(viewer, folder, begin):
-    browsing.open_dropped(viewer, [folder])
+    opening.open_dropped(viewer, [folder])
     form = viewer.state.training_form
     assert (form.dataset, form.out) == (str(folder), str(folder.with_suffix(".ply")))
     assert settings.take(viewer.state, "wanted_panel") == "Train"
@@ -108,12 +108,12 @@ def test_failed_training_says_why(viewer, begin):
 
 def test_training_is_stopped_and_runs_once(viewer, begin):
     begin(SLOW)
-    browsing.start_training(viewer)
+    opening.start_training(viewer)
     assert "under way" in errors(viewer)[-1]
-    browsing.look_at_training(viewer)
+    opening.look_at_training(viewer)
     assert "no Gaussians to look at yet" in viewer.state.messages[-1].text
     process = viewer.training.process
-    browsing.stop_training(viewer)
+    viewer.training.interrupt()
     finish(viewer)
     assert process.returncode == -signal.SIGTERM
     assert "goes on" in viewer.state.messages[-1].text
@@ -125,7 +125,7 @@ def test_gaussians_are_shown_before_the_end(viewer, folder, begin, monkeypatch):
     work.mkdir()
     (work / "radiance-0.ply").write_bytes(b"")
     monkeypatch.setitem(SCENES, "radiance-0.ply", SCENES["plain.ply"])
-    act(browsing.look_at_training, viewer)
+    act(opening.look_at_training, viewer)
     viewer.training.end()
     assert viewer.state.scene is SCENES["plain.ply"]
 
@@ -134,7 +134,7 @@ def test_gaussians_are_shown_before_the_end(viewer, folder, begin, monkeypatch):
 def test_folder_without_photographs_is_refused(viewer, tmp_path, monkeypatch, dataset):
     monkeypatch.chdir(tmp_path)
     viewer.state.training_form = replace(viewer.state.training_form, dataset=dataset)
-    browsing.start_training(viewer)
+    opening.start_training(viewer)
     assert "no photographs" in errors(viewer)[-1]
     assert viewer.training is None
 
@@ -186,24 +186,24 @@ def test_checkpoints_are_shown_and_followed(viewer, folder, begin):
     whole = blob_scene()
     path = checkpoint(folder.parent, whole)
     path.write_bytes(path.read_bytes()[:100])  # damaged
-    act(browsing.look_at_training, viewer)
+    act(opening.look_at_training, viewer)
     assert "no Gaussians in training" in errors(viewer)[-1]
     assert viewer.state.scene is None
     viewer.state.messages.clear()
 
     checkpoint(folder.parent, whole.take(np.arange(0, 360, 2)))
-    act(browsing.look_at_training, viewer)
+    act(opening.look_at_training, viewer)
     assert viewer.state.path == folder.parent / "photos.work" / PREVIEW
     seen = viewer.state.scene.gaussians
     assert (len(seen), seen.sh_degree) == (180, 1)
     np.testing.assert_array_equal(seen.means, whole.gaussians.means[::2])
     viewpoint.zoom_by(viewer, 1.5)
     view = viewer.state.view
-    browsing.watch_training(viewer)
+    opening.watch_training(viewer)
     assert viewer.worker.current is None  # nothing new
 
     checkpoint(folder.parent, whole)
-    act(browsing.watch_training, viewer)
+    act(opening.watch_training, viewer)
     assert len(viewer.state.scene.gaussians) == 360
     assert viewer.state.view is view
     assert errors(viewer) == []

@@ -8,7 +8,7 @@ import pytest
 from langsplat_core.errors import InputError
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.scene.transform import AXES, IDENTITY, moving, rotating, scaling
-from langsplat_viewer.actions import editing, opening, queries, selecting
+from langsplat_viewer.actions import editing, opening, saving
 from langsplat_viewer.panels.select import box_of, dragged, gl_matrices
 from langsplat_viewer.state import EditForm
 from tests.support.fakes import CENTRES
@@ -21,7 +21,7 @@ STEP = np.array([0.0, 2.0, -1.0])
 
 def selected_mug(viewer) -> np.ndarray:
     ask(viewer, "mug")
-    selecting.select_query(viewer)
+    editing.select_query(viewer)
     chosen: np.ndarray = viewer.state.marks.selected
     assert 0 < chosen.sum() < len(chosen)
     return chosen
@@ -40,7 +40,7 @@ def test_transform_moves_only_the_selection(opened):
     assert opened.state.scene.cameras is cameras
     np.testing.assert_allclose(result(opened, 0).place, place + STEP, atol=1e-4)
     np.testing.assert_array_equal(opened.state.marks.selected, chosen)
-    act(queries.name_selection, opened, "trophy")  # what is taught goes along
+    act(editing.name_selection, opened, "trophy")  # what is taught goes along
     act(editing.transform, opened, moving(STEP))
     assert opened.engine.is_taught("trophy")
     assert [word.name for word in opened.state.scene.language.taught] == ["trophy"]
@@ -69,7 +69,7 @@ def test_transforms_are_undone_exactly(opened):
     place = result(opened, 0).place
     editing.transform(opened, rotating(AXES["x"], 33).about(MUG))
     editing.transform(opened, moving(STEP))
-    selecting.select_none(opened)
+    editing.select_none(opened)
     act(editing.transform, opened, scaling(0.5))
     last = means(opened)
     for _ in range(4):
@@ -109,7 +109,7 @@ def test_held_gizmo_previews_the_transform(opened):
 def test_transformed_scene_is_saved_as_seen(opened, tmp_path):
     selected_mug(opened)
     editing.transform(opened, moving(STEP))
-    act(selecting.export, opened, tmp_path, "edited")
+    act(saving.export, opened, tmp_path, "edited")
     made = load_scene(next(tmp_path.glob("*.ply")))
     np.testing.assert_array_equal(made.gaussians.means, means(opened))
     assert made.language is not None
@@ -136,8 +136,8 @@ def test_crop_deletes_outside_the_box_and_is_undone(opened):
 
 def test_cropping_keeps_earlier_deletions(opened):
     chosen = selected_mug(opened)
-    selecting.delete_selected(opened)
-    selecting.select_all(opened)
+    editing.delete_selected(opened)
+    editing.select_all(opened)
     editing.set_box(opened, (-50.0, -50, -50), (50.0, 50, 50))
     editing.crop(opened)
     np.testing.assert_array_equal(opened.state.marks.deleted, chosen)

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from langsplat_viewer.actions import editing, queries, selecting, settings
-from langsplat_viewer.actions.selecting import mark
+from langsplat_viewer.actions import editing, queries, settings
+from langsplat_viewer.actions.editing import mark
 from langsplat_viewer.marks import Marks, hiding, unmarked
 from langsplat_viewer.rendering.request import Clip, Splats
 from langsplat_viewer.session import Query, Ruler
@@ -97,7 +97,7 @@ SETTINGS = {
         v, replace(v.state.session.picture, dim=0.2, background=(1.0, 1.0, 1.0))
     ),
     "display": lambda v: settings.set_display(v, "depth"),
-    "colour map": lambda v: settings.set_colour_map(v, "viridis"),
+    "colour map": lambda v: settings.set_picture(v, replace(v.state.session.picture, colour_map="viridis")),
     "wipe": settings.toggle_wipe,
     "levels": settings.toggle_levels,
     "line": lambda v: settings.move_line(v, 0.3),
@@ -118,7 +118,7 @@ def test_setting_is_undone_in_one_step(opened, name):
     if name not in ("wipe", "levels", "overlay"):  # which would go back
         SETTINGS[name](opened)  # changes nothing, and is no step
     assert len(opened.history.past) == 1
-    settings.measure(opened, True)  # is never undone
+    settings.toggle_measuring(opened)  # is never undone
     SETTINGS["wipe" if name == "levels" else "levels"](opened)
     for wanted in (after, before):
         editing.undo(opened)
@@ -150,13 +150,13 @@ def test_slider_gesture_is_one_step(opened):
 
 def test_undo_of_a_setting_keeps_the_same_mask_objects(opened):
     """Else the scene would be made anew for every slider."""
-    selecting.select_all(opened)
+    editing.select_all(opened)
     settings.toggle_wipe(opened)
     marks = opened.state.marks
     editing.undo(opened)
     editing.redo(opened)
     assert opened.state.marks is marks
-    selecting.hide_selected(opened)
+    editing.hide_selected(opened)
     hidden = opened.state.marks.hidden
     mark(opened, replace(opened.state.marks, selected=~hidden | True))
     editing.undo(opened)

@@ -25,7 +25,7 @@ from langsplat_core.display.displays import QUERY_COLOURS
 from langsplat_core.errors import BackendError
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.scene import Scene
-from langsplat_viewer.actions import selecting, settings
+from langsplat_viewer.actions import saving, settings
 from langsplat_viewer.panels.ui import scene_area
 from langsplat_viewer.rendering.renderer import Backend, Renderer, renderer_for
 from langsplat_viewer.viewer import Services, Viewer
@@ -425,7 +425,7 @@ def look_from_the_broad_side(s: Session) -> None:
 def end_by_signals(s: Session) -> None:
     """What is not saved is asked about, and a film is waited for."""
     s.viewer.recorder.submit("a film", slow_film, print, print)
-    selecting.quit_viewer(s.viewer)
+    saving.quit_viewer(s.viewer)
     s.until(lambda: s.state.leaving is not None)
     s.click("//**/Stay", frames=2)
     assert not s.state.may_close

@@ -1,24 +1,256 @@
-"""Transforms of the scene or of the selection, cropping to a box; undo and redo of every edit.
+"""Selection, hiding and deleting, by verbs, answers and tools of the mouse; transforms and crops; undo.
 
-The scene that is shown is made anew from the one that was opened, by all transforms so far, so that undoing
-them all gives exactly what was there.
+Every change of what is selected, hidden, deleted or moved is one step that can be undone; the settings of
+tools are not. The scene that is shown is made anew from the one that was opened, by all transforms so far, so
+that undoing them all gives exactly what was there.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import LangSplatError
-from langsplat_core.query.selection import in_box
+from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.instances import Instance
+from langsplat_core.query.selection import at_point, grow, in_box, of_rows, shrink
+from langsplat_core.scene import LEVELS
 from langsplat_core.scene.transform import AXES, Similarity, moving, rotating, scaling
-from langsplat_viewer.actions.queries import ask_again, ask_unanswered, forget_unlisted, set_canonical
-from langsplat_viewer.actions.selecting import has_scene, mark, set_tools
+from langsplat_viewer import marks
+from langsplat_viewer.actions.queries import ask_again, ask_unanswered, forget_unlisted, set_canonical, teach
 from langsplat_viewer.camera.controls import extent_of
-from langsplat_viewer.session import Move, Point, Session, pack
+from langsplat_viewer.marks import Drawn, Marks, Mode, Stroke, Tool
+from langsplat_viewer.rendering.request import UNCLIPPED
+from langsplat_viewer.session import Move, Point, Query, Session, pack
 from langsplat_viewer.state import EditForm, Gizmo
 from langsplat_viewer.viewer import Viewer
+
+
+def mark(viewer: Viewer, marks: Marks) -> None:
+    """Take other marks, unless they mark the same."""
+    if not marks.same(viewer.state.marks):
+        viewer.remember()
+        put_marks(viewer, marks)
+
+
+def put_marks(viewer: Viewer, marks: Marks) -> None:
+    """Take other marks without a step of its own to undo."""
+    state = viewer.state
+    viewer.put(marks=state.session.marks.of(marks, state.marks))
+    state.marks = marks
+
+
+def take(viewer: Viewer, found: Array, mode: Mode | None = None) -> None:
+    """Combine the selection with `found` (N,) bool; `mode` in place of the one that is set."""
+    state = viewer.state
+    mark(viewer, marks.combined(state.marks, found, mode or state.tools.mode))
+
+
+def has_scene(viewer: Viewer) -> bool:
+    """Return whether a scene is open; say so where none is."""
+    if viewer.state.scene is None:
+        viewer.say_error("open a scene first, then select in it")
+    return viewer.state.scene is not None
+
+
+def has_selection(viewer: Viewer) -> bool:
+    """Return whether something is selected; say so where nothing is."""
+    if not has_scene(viewer):
+        return False
+    some = bool(viewer.state.marks.selected.any())
+    if not some:
+        viewer.state.say("nothing is selected: choose a tool, or an answer of the search")
+    return some
+
+
+# Verbs.
+
+
+Action = Callable[[Viewer], None]
+
+
+def _verb(change: Callable[[Marks], Marks], needs: Callable[[Viewer], bool] = has_selection) -> Action:
+    """Return the action that changes the marks, where there is what it `needs`."""
+
+    def act(viewer: Viewer) -> None:
+        if needs(viewer):
+            mark(viewer, change(viewer.state.marks))
+
+    return act
+
+
+def _nothing(marks: Marks) -> Array:
+    return np.zeros_like(marks.selected)
+
+
+select_all = _verb(lambda marks: replace(marks, selected=marks.shown), has_scene)
+select_none = _verb(lambda marks: replace(marks, selected=_nothing(marks)), has_scene)
+invert_selection = _verb(lambda marks: replace(marks, selected=marks.shown & ~marks.selected), has_scene)
+hide_selected = _verb(marks.hiding)
+isolate_selected = _verb(lambda marks: replace(marks, hidden=marks.kept & ~marks.selected))
+show_hidden = _verb(lambda marks: replace(marks, hidden=_nothing(marks)), has_scene)
+# The file that was opened stays as it is.
+delete_selected = _verb(lambda marks: Marks(_nothing(marks), marks.hidden, marks.deleted | marks.selected))
+
+
+def find(viewer: Viewer, label: str, work: Callable[[QueryEngine], Array], mode: Mode | None) -> None:
+    """Have the worker find (N,) bool with the scene's engine, and take it."""
+    engine, scene = viewer.engine, viewer.state.scene
+    if engine is None:
+        return
+
+    def done(found: Array) -> None:
+        if viewer.state.scene is scene:
+            take(viewer, found, mode)
+
+    viewer.run(f"{label} the selection", lambda progress: work(engine), done)
+
+
+def reach(viewer: Viewer) -> float:
+    """Return how far growing and shrinking go at a time, world units."""
+    extent = viewer.state.extent
+    return viewer.state.tools.reach * (0.0 if extent is None else extent.radius)
+
+
+def grow_selection(viewer: Viewer) -> None:
+    """Add what is within reach along the surface."""
+    if has_selection(viewer):
+        selected, distance = viewer.state.marks.selected, reach(viewer)
+        find(viewer, "growing", lambda engine: grow(engine.surface, selected, distance), "add")
+
+
+def shrink_selection(viewer: Viewer) -> None:
+    """Leave out what is within reach of something else along the surface."""
+    if has_selection(viewer):
+        selected, distance = viewer.state.marks.selected, reach(viewer)
+        find(viewer, "shrinking", lambda engine: shrink(engine.surface, selected, distance), "intersect")
+
+
+def select_alike(viewer: Viewer) -> None:
+    """Select everything that is like what is selected, wherever it is, by `QueryEngine.like`."""
+    if has_selection(viewer):
+        selected = viewer.state.marks.selected
+        find(viewer, "looking for more like", lambda engine: engine.like(selected).members, "replace")
+
+
+def name_selection(viewer: Viewer, name: str) -> None:
+    """Teach a name by what is selected."""
+    if has_selection(viewer):
+        teach(viewer, name, viewer.state.marks.selected)
+
+
+def chosen_query(viewer: Viewer) -> Query | None:
+    """Return the query whose details are shown, else the latest; None without one."""
+    state = viewer.state
+    return state.chosen_query or (state.session.queries[-1] if state.session.queries else None)
+
+
+def select_query(viewer: Viewer, query: Query | None = None, mode: Mode | None = None) -> None:
+    """Select the members of an answer, by default that of `chosen_query`."""
+    query = query or chosen_query(viewer)
+    result = None if query is None else viewer.state.result(query)
+    if not has_scene(viewer):
+        return
+    if query is None or result is None:
+        viewer.state.say("search for something first, then select what was found")
+    elif result.verdict == "not here":
+        viewer.state.say(f"'{query.phrase}' is not here: nothing to select")
+    else:
+        take(viewer, result.members, mode)
+
+
+def select_thing(viewer: Viewer, thing: Instance, mode: Mode | None = None) -> None:
+    """Select one instance of an answer."""
+    if has_scene(viewer):
+        take(viewer, of_rows(thing.members, len(viewer.state.marks.selected)), mode)
+
+
+# Tools of the mouse: a stroke begins, goes on and ends; (u, v) are fractions of the scene's area.
+
+STEP = 0.002  # of the image: places nearer to each other are one
+LONGEST = 4000  # places of a stroke that are kept
+
+
+def set_tools(viewer: Viewer, **values: Any) -> None:
+    """Change how the mouse selects: fields of `Tools`."""
+    viewer.state.tools = replace(viewer.state.tools, **values)
+
+
+def use_tool(viewer: Viewer, tool: Tool | None) -> None:
+    """Choose the tool of the left button; None: a drag turns the camera again."""
+    set_tools(viewer, tool=tool, stroke=None)
+
+
+def begin_stroke(viewer: Viewer, u: float, v: float) -> None:
+    """Begin at a place; a sphere and a box are drawn around the surface that lies there."""
+    state = viewer.state
+    tool, centre = state.tools.tool, None
+    if tool is None or state.scene is None or state.view is None:
+        return
+    if tool not in marks.ON_SCREEN:
+        centre = viewer.point_at(u, v, "select")
+        if centre is None:
+            return
+    state.glide = None
+    set_tools(viewer, stroke=Stroke(((u, v),), centre))
+
+
+def extend_stroke(viewer: Viewer, u: float, v: float) -> None:
+    """Add a place (u, v) to the stroke under way."""
+    stroke = viewer.state.tools.stroke
+    if stroke is None:
+        return
+    (last_u, last_v), moved = stroke.path[-1], stroke.path
+    if max(abs(u - last_u), abs(v - last_v)) >= STEP and len(moved) < LONGEST:
+        set_tools(viewer, stroke=replace(stroke, path=(*moved, (u, v))))
+
+
+def end_stroke(viewer: Viewer, mode: Mode | None = None) -> None:
+    """Select what the stroke encloses; `mode` in place of the one that is set."""
+    state, drawn = viewer.state, drawn_stroke(viewer)
+    if drawn is None or state.scene is None:
+        return
+    set_tools(viewer, stroke=None)
+    if drawn.tool == "thing":
+        _select_under(viewer, drawn.centre, mode)
+        return
+    on_screen = drawn.tool in marks.ON_SCREEN
+    wanted = state.tools.only_visible and on_screen and viewer.surface is not None
+    depths = viewer.surface.depths() if wanted and viewer.surface is not None else None
+    means, clip = state.scene.gaussians.means, state.session.clip
+    found = marks.caught(drawn, means, depths)
+    if clip != UNCLIPPED and on_screen:  # what is not drawn lies under no outline
+        found &= clip.keeps(means @ drawn.camera.rotation[2] + drawn.camera.world_to_camera[2, 3])
+    take(viewer, found, mode)
+
+
+def drawn_stroke(viewer: Viewer) -> Drawn | None:
+    """Return the stroke under way, in the image as it is; None without one."""
+    state = viewer.state
+    tool, stroke = state.tools.tool, state.tools.stroke
+    if tool is None or stroke is None or state.view is None:
+        return None
+    return Drawn(tool, stroke, state.view.camera(*state.size), state.tools.brush, reach(viewer))
+
+
+def _select_under(viewer: Viewer, centre: Array, mode: Mode | None) -> None:
+    """Select the thing at a place (3,), or the part of it if that is the level of the queries."""
+    state = viewer.state
+    if not state.has_field:
+        viewer.say_error("without a language field no things are known: use a brush, sphere or box")
+        return
+    level = LEVELS.index("whole" if state.session.level == "auto" else state.session.level)
+    find(
+        viewer,
+        "finding the thing for",
+        lambda engine: at_point(engine.surface, engine.regions, level, centre),
+        mode,
+    )
+
+
+# Transforms of the selection, else of the scene.
 
 
 def next_gizmo(viewer: Viewer) -> None:
@@ -81,13 +313,10 @@ def place(viewer: Viewer) -> None:
     state = viewer.state
     if state.scene is None:
         return
-    opened = state.opened or state.scene
-    scene, field = opened, state.scene.language
+    scene = opened = state.opened or state.scene
     for move in state.session.moves:
         scene = move.applied(scene)
-    if field is not None and viewer.engine is not None:
-        field = replace(field, taught=tuple(viewer.engine.taught.values()))
-    scene = replace(scene, language=field)
+    scene = replace(scene, language=viewer.language)
     state.opened, state.scene, state.extent, state.moving = opened, scene, extent_of(scene), None
     viewer.engine, viewer.describer = viewer.services.engine(scene), None
     if state.session.canonical:
@@ -114,42 +343,37 @@ def apply_form(viewer: Viewer) -> None:
     viewer.state.edit_form = replace(form, move=EditForm.move, rotate=EditForm.rotate, scale=EditForm.scale)
 
 
+# Cropping to the box of the panel.
+
+
+def set_box(viewer: Viewer, low: Point, high: Point) -> None:
+    """Set two opposite corners of the box."""
+    viewer.state.edit_form = replace(viewer.state.edit_form, low=low, high=high)
+
+
 def fill_box(viewer: Viewer) -> None:
-    """Set the box of the panel around the selection, or without one around everything that is shown."""
-    state = viewer.state
+    """Set the box around the selection, or without one around everything that is shown."""
+    state, marks = viewer.state, viewer.state.marks
     if state.scene is None:
         return
-    marks = state.marks
     chosen = (marks.selected if marks.selected.any() else marks.shown) & state.scene.gaussians.valid()
     if chosen.any():
         means = state.scene.gaussians.means[chosen].astype(np.float64)
         low, high = (tuple(corner.tolist()) for corner in (means.min(0), means.max(0)))
-        viewer.state.edit_form = replace(state.edit_form, low=low, high=high)
-
-
-def set_box(viewer: Viewer, low: Point, high: Point) -> None:
-    """Set two opposite corners of the crop box."""
-    viewer.state.edit_form = replace(viewer.state.edit_form, low=low, high=high)
-
-
-def _inside(viewer: Viewer) -> Array | None:
-    """(N,) what lies inside the box; None, and said why, where that is nothing."""
-    state, form = viewer.state, viewer.state.edit_form
-    if not has_scene(viewer) or state.scene is None:
-        return None
-    corners = np.array([form.low, form.high])
-    inside = in_box(state.scene.gaussians.means, corners.min(0), corners.max(0))
-    if not (inside & state.marks.kept).any():
-        viewer.say_error("the box holds nothing: set its corners around something, or press Fit")
-        return None
-    return inside
+        set_box(viewer, low, high)
 
 
 def crop(viewer: Viewer) -> None:
     """Delete what lies outside the box of the panel; refused where nothing lies inside."""
-    inside, marks = _inside(viewer), viewer.state.marks
-    if inside is not None:
+    state, form, marks = viewer.state, viewer.state.edit_form, viewer.state.marks
+    if not has_scene(viewer) or state.scene is None:
+        return
+    corners = np.array([form.low, form.high])
+    inside = in_box(state.scene.gaussians.means, corners.min(0), corners.max(0))
+    if (inside & marks.kept).any():
         mark(viewer, replace(marks, selected=marks.selected & inside, deleted=marks.deleted | ~inside))
+    else:
+        viewer.say_error("the box holds nothing: set its corners around something, or press Fit")
 
 
 # Undo and redo. The camera is not undone: its reset leads back.
@@ -177,8 +401,8 @@ def _step(viewer: Viewer, there: list[Session], back: list[Session], otherwise: 
 def adopt(viewer: Viewer, session: Session) -> None:
     """Take another session of the scene that is shown.
 
-    What follows from it is brought in line: masks, the transformed scene, answers. Raises InputError
-    where a transform leads too far.
+    What follows from it is brought in line: masks, the transformed scene, answers. Raises InputError where a
+    transform leads too far.
     """
     state, before = viewer.state, viewer.state.session
     set_tools(viewer, stroke=None)

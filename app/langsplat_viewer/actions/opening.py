@@ -1,5 +1,6 @@
-"""Opening scenes: read, shown, listed, returned to; a second scene beside the first."""
+"""Opening scenes: from files, dropped, listed, returned to, trained; and a second one beside the first."""
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -7,26 +8,30 @@ from pathlib import Path
 import numpy as np
 
 from langsplat_core.compiled import is_compiled
+from langsplat_core.datasets.photos import count_photographs
 from langsplat_core.display.displays import DISPLAYS, latent_colours
-from langsplat_core.errors import InputError
-from langsplat_core.io.scenes import scene_files
-from langsplat_core.pipeline.report import stated_warnings
+from langsplat_core.errors import InputError, LangSplatError
+from langsplat_core.io import cameras, sidecar
+from langsplat_core.io.scenes import format_of, scene_files
+from langsplat_core.pipeline.report import stated_warnings, work_folder
 from langsplat_core.progress import Progress
 from langsplat_core.query.engine import no_field
 from langsplat_core.scene import Scene, surface
 from langsplat_viewer.actions import viewpoint
 from langsplat_viewer.actions.editing import adopt
-from langsplat_viewer.actions.selecting import leave
-from langsplat_viewer.actions.settings import set_split
-from langsplat_viewer.actions.viewpoint import opening_view, read_bookmarks
+from langsplat_viewer.actions.queries import load_queries
+from langsplat_viewer.actions.saving import leave
+from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.camera.controls import Extent, OrbitCamera, extent_of
+from langsplat_viewer.files import disk
 from langsplat_viewer.files.disk import Stamps, stamps
-from langsplat_viewer.files.preferences import with_recent
+from langsplat_viewer.files.projects import PATHS, PROJECTS, QUERIES, Project, read_project
+from langsplat_viewer.jobs import one_line
 from langsplat_viewer.marks import unmarked
 from langsplat_viewer.rendering.request import Split, why_undrawable
-from langsplat_viewer.session import Query, Session, Things
-from langsplat_viewer.state import Recording, SceneState, ViewerState
-from langsplat_viewer.viewer import History, Viewer, Visit
+from langsplat_viewer.session import Marked, Query, Session, Things
+from langsplat_viewer.state import FileChoice, Recording, SceneState, ViewerState
+from langsplat_viewer.viewer import History, Training, TrainingRequest, Viewer
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,17 +81,14 @@ def open_scene(
         viewer.state.opening = path
         viewer.run(f"opening {path.name}", load, done, failed)
 
-    if viewer.state.is_unsaved:
-        leave(viewer, begin, f"{path.name} is opened")
-    else:
-        begin(viewer)
+    leave(viewer, begin, f"{path.name} is opened")
 
 
 def cancel(viewer: Viewer) -> None:
     """Drop what the worker does and is to do."""
-    viewer.worker.cancel()
-    viewer.state.opening = None
     state = viewer.state
+    viewer.worker.cancel()
+    state.opening = None
     for query in state.session.queries:
         answer = state.answer(query)
         if answer.pending:
@@ -95,47 +97,45 @@ def cancel(viewer: Viewer) -> None:
 
 
 def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
-    state, scene = viewer.state, opened.scene
+    state, scene, field = viewer.state, opened.scene, opened.scene.language
     if state.path is not None:
-        viewer.visits[state.path.absolute()] = _visit(state)
-    session = state.session.of_next_scene(read_bookmarks(viewer, path))
-    if scene.language is None:
+        viewer.visits[state.path.absolute()] = state.visit()
+    session = state.session.of_next_scene(viewpoint.read_bookmarks(viewer, path))
+    if field is None:
         state.pointing = False
         session = _without_field(session)
-    fresh = SceneState(
-        session=session,
-        saved=session,
-        scene=scene,
-        path=path,
-        extent=opened.extent,
-        warnings=opened.warnings,
-        nothing=why_undrawable(scene.gaussians),
-        marks=unmarked(len(scene.gaussians)),
-        camera_index=0 if scene.cameras else None,
-        record=Recording(size=state.record.size, fps=state.record.fps),
+    state.begin(
+        SceneState(
+            session=session,
+            saved=session,
+            count=len(scene.gaussians),
+            scene=scene,
+            path=path,
+            extent=opened.extent,
+            warnings=opened.warnings,
+            nothing=why_undrawable(scene.gaussians),
+            marks=unmarked(len(scene.gaussians)),
+            camera_index=0 if scene.cameras else None,
+            record=Recording(size=state.record.size, fps=state.record.fps),
+        )
     )
-    state.begin(fresh)
-    state.view, state.opening, state.leaving = opening_view(viewer), None, None
+    state.view, state.opening, state.leaving = viewpoint.opening_view(viewer), None, None
     state.tools = replace(state.tools, stroke=None)
     add_scenes(viewer, [path])
-    state.preferences = with_recent(state.preferences, path.absolute())
+    state.preferences = state.preferences.with_recent(path.absolute())
     viewer.engine, viewer.describer = viewer.services.engine(scene), None
     viewer.watch.begin(opened.read)
     viewer.history = History()
     _say_opened(viewer, path, opened)
-    if scene.language is not None:
-        field = scene.language
+    if field is not None:
         viewer.run("preparing latent colours", lambda progress: latent_colours(field))  # none is needed yet
-        _compile_search(viewer)
-        if viewer.has_encoder_here:  # while the user looks round
-            viewer.run("loading the text encoder", viewer.engine.load_encoder)
+        _prepare_search(viewer)
 
 
 def _without_field(session: Session) -> Session:
     """Return the session of a scene that cannot be searched."""
-    if not DISPLAYS[session.picture.display].needs_field:
-        return replace(session, queries=(), canonical=())
-    return replace(session, queries=(), canonical=(), picture=replace(session.picture, display="rgb"))
+    display = "rgb" if DISPLAYS[session.picture.display].needs_field else session.picture.display
+    return replace(session, queries=(), canonical=(), picture=replace(session.picture, display=display))
 
 
 def _say_opened(viewer: Viewer, path: Path, opened: _Opened) -> None:
@@ -143,39 +143,27 @@ def _say_opened(viewer: Viewer, path: Path, opened: _Opened) -> None:
     reasons = ", ".join(f"{count:,} with {reason}" for reason, count in opened.unusable.items())
     not_drawn = f"; not drawn: {reasons}" if reasons else ""
     viewer.state.say(f"{path.name}: {len(scene.gaussians):,} Gaussians{not_drawn}")
-    for reason in scene.unread:
-        viewer.say_error(f"opened without what lies beside it: {reason}")
-    for warning in opened.warnings:
-        viewer.say_error(warning)
+    for reason in (*(f"opened without what lies beside it: {why}" for why in scene.unread), *opened.warnings):
+        viewer.say_error(reason)
     if scene.language is None:
         viewer.state.say(no_field(scene))
 
 
-def _compile_search(viewer: Viewer) -> None:
+def _prepare_search(viewer: Viewer) -> None:
+    """Have the worker do what the first search needs, while the user looks round."""
     engine = viewer.engine
-    if engine is None or is_compiled(surface.merge_patches):
-        return
-    viewer.run(
-        "compiling the search kernels, once per installation (half a minute)", lambda progress: engine.regions
-    )
+    assert engine is not None
+    if not is_compiled(surface.merge_patches):
+        label = "compiling the search kernels, once per installation (half a minute)"
+        viewer.run(label, lambda progress: engine.regions)
+    if viewer.has_encoder_here:
+        viewer.run("loading the text encoder", engine.load_encoder)
 
 
 # Visits: a scene that was shown before is found again as it was left.
 
 
-def _visit(state: ViewerState) -> Visit:
-    return Visit(
-        state.session,
-        state.saved,
-        state.project,
-        state.view,
-        state.opening_camera,
-        state.camera_index,
-        0 if state.scene is None else len(state.scene.gaussians),
-    )
-
-
-def return_to(viewer: Viewer, visit: Visit) -> None:
+def return_to(viewer: Viewer, visit: SceneState) -> None:
     """Find the scene that was just opened again as it was left; what was asked is asked anew."""
     state = viewer.state
     if state.scene is None:
@@ -186,18 +174,16 @@ def return_to(viewer: Viewer, visit: Visit) -> None:
     session, saved = visit.session.found_again(now=state.session), visit.saved
     state.saved = replace(state.session, things=saved.things, notes=saved.notes)
     state.project = visit.project
-    things = session.things if visit.count == len(state.scene.gaussians) else Things()
-    take_session(viewer, replace(session, things=things))
+    take_session(viewer, session if visit.count == state.count else replace(session, things=Things()))
 
 
 def take_session(viewer: Viewer, session: Session) -> None:
     """Adopt a session of an earlier time, as far as the scene that is shown has what it speaks of."""
-    engine, things = viewer.engine, session.things
-    if viewer.state.has_field and engine is not None:
-        known = things.known(engine.tree.count) if things != Things() else things
-        adopt(viewer, replace(session, things=known))
-    else:
-        adopt(viewer, replace(_without_field(session), things=Things()))
+    if viewer.engine is None or not viewer.state.has_field:
+        session = replace(_without_field(session), things=Things())
+    elif session.things.names:
+        session = replace(session, things=session.things.known(viewer.engine.tree.count))
+    adopt(viewer, session)
 
 
 def reload(viewer: Viewer) -> None:
@@ -226,9 +212,8 @@ MOST = 100  # scenes that are listed
 
 def add_scenes(viewer: Viewer, paths: Sequence[Path]) -> None:
     """List scenes, after those that are listed already."""
-    listed = viewer.state.scenes
-    new = dict.fromkeys(path.absolute() for path in paths)
-    viewer.state.scenes = (*listed, *(path for path in new if path not in listed))[:MOST]
+    listed = dict.fromkeys((*viewer.state.scenes, *(path.absolute() for path in paths)))
+    viewer.state.scenes = tuple(listed)[:MOST]
 
 
 def switch_scene(viewer: Viewer, path: Path) -> None:
@@ -245,20 +230,254 @@ def switch_scene(viewer: Viewer, path: Path) -> None:
 
 
 def step_scene(viewer: Viewer, by: int) -> None:
-    """Return the next (1) or previous (-1) of the list, beyond its ends from the other one."""
-    state = viewer.state
-    others = [path for path in state.scenes if state.path is None or path != state.path.absolute()]
-    if not others:
+    """Show the next (1) or previous (-1) scene of the list, beyond its ends from the other one."""
+    scenes, path = viewer.state.scenes, viewer.state.path
+    if len(scenes) < 2:
         viewer.say_error("no other scene is listed: drop several, or open another")
         return
-    here = state.scenes.index(state.path.absolute()) if state.path and len(others) < len(state.scenes) else -1
-    switch_scene(viewer, state.scenes[(here + by) % len(state.scenes)])
+    here = scenes.index(path.absolute()) if path is not None and path.absolute() in scenes else -1
+    switch_scene(viewer, scenes[(here + by) % len(scenes)])
 
 
 def unlist_scene(viewer: Viewer, path: Path) -> None:
     """Take a scene off the list, and forget its visit; the scene that is shown stays."""
     viewer.state.scenes = tuple(other for other in viewer.state.scenes if other != path)
     viewer.visits.pop(path, None)
+
+
+# The file browser, typed paths, files dropped onto the window, and recent scenes.
+
+COMPANIONS = (cameras.SUFFIX, sidecar.SUFFIX)  # files beside a scene, read with it
+NAMED = 3  # files that a message names
+
+
+def ask_for(viewer: Viewer, choice: FileChoice) -> None:
+    """Open the browser, in the folder of the scene that is shown, to choose a file or a folder."""
+    path = viewer.state.path
+    viewer.state.choice = choice
+    browse(viewer, (Path.cwd() if path is None else path.parent).absolute())
+
+
+def ask_for_file(viewer: Viewer) -> None:
+    """Open the browser to choose what is opened."""
+    ask_for(viewer, FileChoice("Open a scene", open_file))
+
+
+def ask_for_beside(viewer: Viewer) -> None:
+    """Open the browser to choose a scene to show beside this one."""
+    ask_for(viewer, FileChoice("Scene to compare with", open_beside))
+
+
+def browse(viewer: Viewer, folder: Path) -> None:
+    """Show a folder in the browser."""
+    viewer.state.browser = disk.list_folder(folder)
+
+
+def choose(viewer: Viewer, path: Path) -> None:
+    """Close the browser, and do what it was opened for."""
+    viewer.state.browser = None
+    viewer.state.choice.then(viewer, path)
+
+
+def open_typed(viewer: Viewer, text: str) -> None:
+    """Go to the folder, or open the scene, of a path: from the folder shown where it is relative."""
+    text, listing = text.strip(), viewer.state.browser
+    if not text:
+        return
+    path = (listing.folder if listing else Path.cwd()) / os.path.expanduser(text)
+    (browse if viewer.state.choice.is_folder or _is_plain_folder(path) else choose)(viewer, path)
+
+
+def _is_plain_folder(path: Path) -> bool:
+    try:
+        return path.is_dir() and format_of(path) is None
+    except OSError:  # a name that no file system takes: opening it says so
+        return False
+
+
+def open_file(viewer: Viewer, path: Path) -> None:
+    """Open a scene or a project, ask a set of queries, or take a camera path."""
+    viewer.state.browser = None
+    if path.name.endswith(PROJECTS):
+        open_project(viewer, path)
+    elif path.name.endswith(QUERIES):
+        load_queries(viewer, path)
+    elif path.name.endswith(PATHS):
+        viewpoint.load_path(viewer, path)
+    else:
+        open_scene(viewer, path)
+
+
+def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
+    """Open what was dropped onto the window.
+
+    Of scenes the first is opened and all are listed; then sets of queries are asked and paths taken. What
+    belongs to a scene lies beside it. A folder of photographs is offered for training. What is none of these
+    is said.
+    """
+    if len(paths) == 1 and _is_plain_folder(paths[0]) and count_photographs(paths[0]):
+        choose_photographs(viewer, paths[0])
+        open_panel(viewer, "Train")
+        return
+    sets = [path for path in paths if path.name.endswith((QUERIES, PATHS, PROJECTS))]
+    files = [path for path in paths if path not in sets]
+
+    def open_sets(viewer: Viewer) -> None:
+        for path in sets:
+            open_file(viewer, path)
+
+    scenes = [path for path in files if not path.name.endswith(COMPANIONS)] or files
+    known = [path for path in scenes if format_of(path)] or scenes[:1]
+    others = [path.name for path in scenes if path not in known]
+    if others:
+        more = f" and {len(others) - NAMED} more" if len(others) > NAMED else ""
+        viewer.say_error(f"not opened: {', '.join(others[:NAMED])}{more}")
+    add_scenes(viewer, known)
+    if len(known) > 1:
+        viewer.state.say(f"{len(known)} scenes: the panel Scene lists them")
+        open_panel(viewer, "Scene")
+    if known:
+        open_scene(viewer, known[0], open_sets)
+    else:
+        open_sets(viewer)
+
+
+# Projects: a scene with its session.
+
+
+def open_project(viewer: Viewer, path: Path, then: Callable[[Viewer], None] = lambda viewer: None) -> None:
+    """Open the scene of a project, and have in it what the project holds; `then` runs once it is there."""
+    try:
+        project = read_project(path)
+        if not Path(project.scene).exists():
+            remedy = "move it back, or mend its path"
+            raise InputError(f"{project.scene}: the project's scene is not there; {remedy}")
+    except InputError as error:
+        viewer.say_error(one_line(error))
+        return
+
+    def restore(viewer: Viewer) -> None:
+        _restore(viewer, project, path.absolute())
+        then(viewer)
+
+    open_scene(viewer, Path(project.scene), restore)
+
+
+def _restore(viewer: Viewer, project: Project, path: Path) -> None:
+    state, now, session = viewer.state, viewer.state.session, project.session
+    assert state.extent is not None
+    session = replace(session, bookmarks=session.bookmarks or now.bookmarks)
+    if project.version == 1:  # which had no other settings
+        session = replace(session, split=now.split, splats=now.splats, overlays=now.overlays)
+    if project.has_groups:
+        viewer.say_error("groups and locks of the outline are left out: this version has none")
+    if state.count != project.gaussians:
+        unedited = replace(session, marks=Marked(), moves=(), things=Things())
+        if unedited != session:
+            what = "what was selected, hidden, moved and named is left out"
+            viewer.say_error(f"the scene has changed since: {what}")
+        session = unedited
+    try:
+        take_session(viewer, session)
+    except LangSplatError as error:
+        viewer.say_error(f"{path}: its transforms are left out: {one_line(error)}")
+        take_session(viewer, replace(session, moves=()))
+    view = viewpoint.bookmarked_view(project.view, state.extent)
+    state.view = view if project.intrinsics is None else replace(view, intrinsics=project.intrinsics)
+    state.saved, state.project = state.session, path
+    state.preferences = state.preferences.with_recent(path)
+    if project.panels:
+        state.preferences = replace(state.preferences, panels=project.panels)
+        state.shows_panels = project.panels
+
+
+# Training a scene from photographs, in a process of its own.
+
+WARNING = "warning: "  # before each warning that `langsplat train` ends with
+
+
+def ask_for_dataset(viewer: Viewer) -> None:
+    """Open the browser to choose the photographs to train on."""
+    ask_for(viewer, FileChoice("Photographs to train on", choose_photographs, is_folder=True))
+
+
+def choose_photographs(viewer: Viewer, folder: Path) -> None:
+    """Take a folder of photographs, and a name beside it for the scene."""
+    form = viewer.state.training_form
+    out = form.out or str(folder.with_name(f"{folder.name or 'scene'}.ply"))
+    viewer.state.training_form = replace(form, dataset=str(folder), out=out)
+
+
+def start_training(viewer: Viewer) -> None:
+    """Train, or go on with what was interrupted: the same photographs and name continue."""
+    form, typed = viewer.state.training_form, viewer.state.training_form.dataset.strip()
+    if viewer.training is not None and viewer.training.exit_code is None:
+        viewer.say_error("a training is under way; stop it first")
+        return
+    dataset = Path(typed).expanduser()
+    out = Path(form.out.strip() or f"{dataset}.ply").expanduser()
+    photographs = count_photographs(dataset)
+    if not typed or photographs == 0:
+        viewer.say_error(f"no photographs in '{typed}'; name a folder that has some")
+        return
+    request = TrainingRequest(dataset, out, form.preset, form.encoder.strip() or "demo")
+    try:
+        viewer.training = Training(request, viewer.worker.wake)
+    except OSError as error:
+        viewer.say_error(f"training cannot be started ({one_line(error)})")
+        return
+    viewer.state.say(f"training {out.name} from {photographs} photographs")
+
+
+def look_at_training(viewer: Viewer) -> None:
+    """Open the Gaussians of a training under way, before they have a language field.
+
+    While they are still trained, as they were at the last checkpoint, and from then on at the next ones.
+    """
+    training = viewer.training
+    if training is None:
+        return
+    written = disk.newest(training.request.out)
+    if not written:
+        viewer.state.say("there are no Gaussians to look at yet")
+        return
+    ((path, _),) = written
+    if not path.name.endswith(disk.IN_TRAINING):
+        open_scene(viewer, path)
+        return
+
+    def done(preview: Path) -> None:
+        if viewer.state.path == preview:  # in place of the checkpoint before
+            reload(viewer)
+        else:
+            open_scene(viewer, preview)
+
+    training.previewed = written
+    viewer.run("reading the Gaussians so far", lambda progress: disk.write_preview(path), done)
+
+
+def watch_training(viewer: Viewer) -> None:
+    """Open the scene when its training is finished, or say why there is none; once per frame."""
+    training, state = viewer.training, viewer.state
+    if training is None:
+        return
+    if training.exit_code is None:
+        follows = state.path == work_folder(training.request.out) / disk.PREVIEW
+        if follows and viewer.worker.current is None:
+            written = disk.newest(training.request.out)
+            if written and written != training.previewed and written[0][0].name.endswith(disk.IN_TRAINING):
+                look_at_training(viewer)
+        return
+    viewer.training = None
+    if training.exit_code == 0:
+        told = [line for line in training.progress.said if not line.startswith(WARNING)]
+        for line in told[-3:]:  # what speaks against the scene is said with it, from its report
+            state.say(line)
+        open_scene(viewer, training.request.out)
+    elif training.interrupted:
+        state.say("training stopped; Train goes on where it was")
+    else:
+        viewer.say_error((training.progress.said or ["no reason given"])[-1])
 
 
 # A second scene, or the same by another encoder or method, right of a line across the image: a viewer of its
@@ -274,7 +493,7 @@ def open_beside(viewer: Viewer, path: Path) -> None:
     if viewer.beside is not None:
         viewer.beside.worker.close()
     viewer.beside = beside
-    set_split(viewer, "scenes")
+    viewer.change(split=replace(viewer.state.session.split, mode="scenes"))
     open_scene(beside, path)
 
 

@@ -14,8 +14,8 @@ from langsplat_core.query.inventory import Outline, scene_outline
 from langsplat_core.query.selection import at_point
 from langsplat_core.scene import LEVELS, NO_NODE
 from langsplat_core.scene.language import tidy
+from langsplat_viewer.actions.editing import mark, select_alike, take
 from langsplat_viewer.actions.queries import teach
-from langsplat_viewer.actions.selecting import mark, select_alike, take
 from langsplat_viewer.actions.viewpoint import focus_on
 from langsplat_viewer.state import OutlineView
 from langsplat_viewer.viewer import Viewer
@@ -45,9 +45,7 @@ def _find(viewer: Viewer) -> None:
     assert engine is not None
 
     def work(progress: Progress) -> tuple[Describer, OutlineView]:
-        describer = viewer.describer
-        if describer is None or describer.engine is not engine:
-            describer = Describer(engine, progress=progress)
+        describer = viewer.describing(engine, progress)
         progress("looking for what is here", 0.5)
         roots = scene_outline(describer)
         tree = engine.tree
@@ -143,9 +141,8 @@ def in_view(viewer: Viewer) -> list[Outline]:
 
 def with_thing(viewer: Viewer, target: Target, act: Callable[[Array], None]) -> None:
     """Have the worker find (N,) bool of a thing, and then `act` with it."""
-    engine, scene, level = viewer.engine, viewer.state.scene, viewer.state.session.level
-    if engine is None or scene is None or scene.language is None:
-        viewer.say_error("things are known where there is a language field")
+    engine, scene, level = viewer.searchable(), viewer.state.scene, viewer.state.session.level
+    if engine is None:
         return
 
     def work(progress: Progress) -> Array:

@@ -6,20 +6,18 @@ from pathlib import Path
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
-from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.errors import InputError, UnknownWordError
 from langsplat_core.pipeline.evidence import draw_evidence, find_evidence, kept_features, kept_photographs
 from langsplat_core.progress import Progress
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import run_phrase
-from langsplat_core.query.engine import QueryEngine, no_field
+from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import Atom, heads
 from langsplat_core.query.instances import Instance
 from langsplat_core.query.inventory import Suggestions, completions, corrected, suggest
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import TaughtWord
 from langsplat_core.scene.language import phrase_key, split_phrases
-from langsplat_viewer.actions.selecting import has_selection
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.files.projects import QUERIES, read_queries, write_queries
 from langsplat_viewer.jobs import one_line
@@ -46,11 +44,7 @@ def ask_one(viewer: Viewer, phrase: str, *, cut: float | None = None, then_show:
     cut: a threshold in place of the answer's own; then_show: give it a colour if it may be there.
     """
     state, key = viewer.state, phrase_key(phrase)
-    if state.scene is None or viewer.engine is None:
-        viewer.say_error("open a scene first, then search it")
-        return
-    if state.scene.language is None:
-        viewer.say_error(no_field(state.scene))
+    if viewer.searchable() is None:
         return
     viewer.remember()
     queries = state.session.queries
@@ -82,21 +76,16 @@ def answer(viewer: Viewer, phrase: str, then_show: bool = False) -> None:
         return QueryAnswer(composed.answer, (), reading, heads(composed.tree))
 
     def done(found: QueryAnswer) -> None:
-        result = found.result
         if phrase not in state.answers:  # it was taken off meanwhile
             return
         state.answers[phrase] = found
-        if result is None:
+        if found.result is None:
             viewer.say_error(found.problem)
             return
         if then_show:
-            _show_answer(viewer, phrase, result)
-        if result.found:
-            viewer.run(
-                "telling instances apart",
-                lambda progress: engine.instances(result, MOST_THINGS),
-                lambda things: _tell_apart(viewer, phrase, result, things),
-            )
+            state.session = state.session.answering(phrase, painted=found.result.verdict != "not here")
+        if found.result.found:
+            _tell_apart(viewer, engine, phrase, found.result)
 
     def failed(reason: str) -> None:
         done(QueryAnswer(problem=reason))
@@ -105,19 +94,14 @@ def answer(viewer: Viewer, phrase: str, then_show: bool = False) -> None:
     viewer.run(f"searching '{phrase}'", work, done, failed)
 
 
-def _show_answer(viewer: Viewer, phrase: str, result: QueryResult) -> None:
-    session = viewer.state.session
-    if result.verdict != "not here":  # nothing is painted for it
-        session = session.showing(phrase)
-    if not DISPLAYS[session.picture.display].needs_query:
-        session = replace(session, picture=replace(session.picture, display="relevancy"))
-    viewer.state.session = session
-
-
-def _tell_apart(viewer: Viewer, phrase: str, result: QueryResult, things: tuple[Instance, ...]) -> None:
+def _tell_apart(viewer: Viewer, engine: QueryEngine, phrase: str, result: QueryResult) -> None:
     answers = viewer.state.answers
-    if phrase in answers and answers[phrase].result is result:
-        answers[phrase] = replace(answers[phrase], things=things)
+
+    def done(things: tuple[Instance, ...]) -> None:
+        if phrase in answers and answers[phrase].result is result:
+            answers[phrase] = replace(answers[phrase], things=things)
+
+    viewer.run("telling instances apart", lambda progress: engine.instances(result, MOST_THINGS), done)
 
 
 def ask_again(viewer: Viewer) -> None:
@@ -143,10 +127,7 @@ def forget_unlisted(viewer: Viewer) -> None:
 def focus_search(viewer: Viewer) -> None:
     """Have the search box take the keyboard; say so where there is nothing to search."""
     open_panel(viewer, "Search")
-    scene = viewer.state.scene
-    if scene is None or scene.language is None:
-        viewer.say_error("open a scene first, then search it" if scene is None else no_field(scene))
-    else:
+    if viewer.searchable() is not None:
         viewer.state.focus_input = viewer.state.awaits_keyboard = True
 
 
@@ -154,7 +135,7 @@ def focus_search(viewer: Viewer) -> None:
 
 
 def teach(viewer: Viewer, name: str, members: Array, done: Callable[[str], None] = lambda name: None) -> None:
-    """Have the worker teach a name by what (N,) bool mean, and search for it.
+    """Have the worker teach a name by the language of (N,) bool, and search for it.
 
     What is saved from now on keeps it. `done` gets the name, if the scene is still there.
     """
@@ -169,12 +150,6 @@ def teach(viewer: Viewer, name: str, members: Array, done: Callable[[str], None]
             ask_one(viewer, word.name)
 
     viewer.run(f"teaching '{name}'", lambda progress: engine.teach(name, members), taught)
-
-
-def name_selection(viewer: Viewer, name: str) -> None:
-    """Teach a name by what is selected."""
-    if has_selection(viewer):
-        teach(viewer, name, viewer.state.marks.selected)
 
 
 # The list of queries.
@@ -228,9 +203,8 @@ def set_cut(viewer: Viewer, phrase: str, cut: float | None, *, is_new: bool = Tr
 
 def set_canonical(viewer: Viewer, phrases: tuple[str, ...]) -> None:
     """Compare everything with other canonical phrases; none: with the scene's own again."""
-    engine, state, before = viewer.engine, viewer.state, viewer.state.session.canonical
-    if engine is None or not state.has_field:
-        viewer.say_error("open a scene with a language field first")
+    engine, state, before = viewer.searchable(), viewer.state, viewer.state.session.canonical
+    if engine is None:
         return
 
     def work(progress: Progress) -> tuple[str, ...]:
@@ -297,8 +271,7 @@ def load_queries(viewer: Viewer, path: Path) -> None:
     except InputError as error:
         viewer.say_error(one_line(error))
         return
-    if not viewer.state.has_field:
-        viewer.say_error(f"{path.name}: open a scene that can be searched first")
+    if viewer.searchable() is None:
         return
     if wanted.canonical != viewer.state.session.canonical:
         set_canonical(viewer, wanted.canonical)
@@ -342,12 +315,6 @@ def offers(viewer: Viewer, typed: str) -> tuple[str, tuple[str, ...]]:
         return "try", state.suggestions.examples
     meant = state.answer(queries[-1]).meant
     return "did you mean", (meant,) if meant else ()
-
-
-def completion(viewer: Viewer, typed: str) -> str:
-    """Return the phrase that goes on from what is typed, "" for none."""
-    phrases = offers(viewer, typed)[1] if typed.strip() else ()
-    return phrases[0] if phrases else ""
 
 
 def ask_offered(viewer: Viewer, phrase: str) -> None:

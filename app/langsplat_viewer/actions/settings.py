@@ -1,14 +1,15 @@
-"""Settings of what is shown and how: displays side by side, overlays, the ruler; which panels are seen."""
+"""What is shown and how: displays side by side, overlays, ruler and notes; preferences and panels."""
 
 from dataclasses import fields, replace
 from typing import Any
 
-from langsplat_core.config import ColourMap, Display, PictureConfig
+import numpy as np
+
+from langsplat_core.config import Display, PictureConfig
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.query.engine import no_field
-from langsplat_viewer.actions.selecting import leave_tool, stay
 from langsplat_viewer.rendering.request import AT_RANGE, Clip, SplitMode
-from langsplat_viewer.session import OVERLAYS, Overlay, Ruler
+from langsplat_viewer.session import LONGEST_NOTE, MOST_NOTES, OVERLAYS, SCALES, Note, Overlay, Point, Ruler
 from langsplat_viewer.state import Recording, ViewerState
 from langsplat_viewer.viewer import Viewer
 
@@ -23,11 +24,14 @@ def put(part: ViewerState | Recording, **values: object) -> None:
         setattr(part, name, value)
 
 
-def take(part: ViewerState | Recording, name: str) -> Any:
+def take(part: ViewerState, name: str) -> Any:
     """Return a field that is wanted for one frame, and empty it."""
     value = getattr(part, name)
     setattr(part, name, type(value)())
     return value
+
+
+# The display, and several side by side.
 
 
 def set_display(viewer: Viewer, display: Display, latent_level: int | None = None) -> None:
@@ -45,18 +49,10 @@ def set_picture(viewer: Viewer, picture: PictureConfig) -> None:
     viewer.change(" ".join(changed), picture=picture)
 
 
-def set_colour_map(viewer: Viewer, colour_map: ColourMap) -> None:
-    """Set the colours of relevancy and depth."""
-    viewer.change(picture=replace(viewer.state.session.picture, colour_map=colour_map))
-
-
 def set_clip(viewer: Viewer, clip: Clip) -> None:
     """Set between which depths Gaussians are drawn; the far one stays the farther."""
     near = max(clip.near, 0.0)
     viewer.change("clip", clip=Clip(near, max(clip.far, near)))
-
-
-# Several displays side by side.
 
 
 def compare_with(viewer: Viewer, display: Display, latent_level: int | None = None) -> None:
@@ -69,7 +65,8 @@ def compare_with(viewer: Viewer, display: Display, latent_level: int | None = No
 
 def set_split(viewer: Viewer, mode: SplitMode) -> None:
     """Choose how the scene's area is divided."""
-    viewer.change(split=replace(viewer.state.session.split, mode=mode))
+    if mode != "levels" or _can_show(viewer, needs_field=True):
+        viewer.change(split=replace(viewer.state.session.split, mode=mode))
 
 
 def toggle_wipe(viewer: Viewer) -> None:
@@ -83,10 +80,7 @@ def toggle_wipe(viewer: Viewer) -> None:
 
 def toggle_levels(viewer: Viewer) -> None:
     """Show the three levels side by side, or one image."""
-    if viewer.state.session.split.mode == "levels":
-        set_split(viewer, "off")
-    elif _can_show(viewer, needs_field=True):
-        set_split(viewer, "levels")
+    set_split(viewer, "off" if viewer.state.session.split.mode == "levels" else "levels")
 
 
 def move_line(viewer: Viewer, at: float) -> None:
@@ -104,7 +98,7 @@ def _can_show(viewer: Viewer, needs_field: bool) -> bool:
     return True
 
 
-# Overlays, and the ruler.
+# Overlays, the ruler, and notes that are pinned to places.
 
 
 def toggle_overlay(viewer: Viewer, overlay: Overlay) -> None:
@@ -113,25 +107,65 @@ def toggle_overlay(viewer: Viewer, overlay: Overlay) -> None:
     viewer.change(overlays=tuple(name for name in OVERLAYS if name in kept))
 
 
-def measure(viewer: Viewer, on: bool) -> None:
-    """Set whether clicks on the scene set the points of the ruler; what was measured goes when it ends."""
-    if on != viewer.state.session.ruler.measures:
-        viewer.put(ruler=Ruler(on))
-
-
 def toggle_measuring(viewer: Viewer) -> None:
-    """Begin to measure, or end it."""
-    measure(viewer, not viewer.state.session.ruler.measures)
+    """Have clicks on the scene set the points of the ruler, or no longer: what was measured goes."""
+    viewer.put(ruler=Ruler(not viewer.state.session.ruler.measures))
 
 
 def measure_at(viewer: Viewer, u: float, v: float) -> None:
     """Set a point of the ruler on the surface; (u, v) are fractions of the scene's area."""
-    point = None if viewer.surface is None else viewer.surface.point_at(u, v)
-    if point is None:
-        viewer.state.say("nothing under the cursor to measure from")
+    point = viewer.point_at(u, v, "measure from")
+    if point is not None:
+        viewer.put(ruler=viewer.state.session.ruler.with_point(point))
+
+
+def toggle_pinning(viewer: Viewer) -> None:
+    """Have a click on the scene pin a note there, or no longer."""
+    viewer.state.pins_notes = not viewer.state.pins_notes
+    viewer.put(ruler=Ruler())
+    if viewer.state.pins_notes:
+        open_panel(viewer, "Notes")
+
+
+def pin_at(viewer: Viewer, u: float, v: float) -> None:
+    """Pin a note to the surface; (u, v) are fractions of the scene's area."""
+    point = viewer.point_at(u, v, "pin a note to")
+    if point is not None:
+        _pin(viewer, point)
+
+
+def pin_to_selection(viewer: Viewer) -> None:
+    """Pin a note to the middle of what is selected."""
+    state, chosen = viewer.state, viewer.state.marks.selected
+    if state.scene is None or not chosen.any():
+        viewer.say_error("select something first, then pin a note to it")
         return
-    x, y, z = (float(part) for part in point)
-    viewer.put(ruler=viewer.state.session.ruler.with_point((x, y, z)))
+    means = state.scene.gaussians.means[chosen].astype(np.float64)
+    x, y, z = means[np.argmin(((means - np.median(means, axis=0)) ** 2).sum(1))].tolist()
+    _pin(viewer, (x, y, z))
+
+
+def _pin(viewer: Viewer, point: Point) -> None:
+    state, notes = viewer.state, viewer.state.session.notes
+    if len(notes) >= MOST_NOTES:
+        viewer.say_error("no room for more notes")
+        return
+    state.fresh_note = Note(f"note {len(notes) + 1}", point)
+    viewer.change(notes=(*notes, state.fresh_note))
+    state.pins_notes, state.awaits_keyboard = False, True
+    open_panel(viewer, "Notes")
+
+
+def write_note(viewer: Viewer, note: Note, text: str) -> None:
+    """Change the text of a note."""
+    changed = replace(note, text=text[:LONGEST_NOTE])
+    notes = tuple(changed if other is note else other for other in viewer.state.session.notes)
+    viewer.change(f"note at {note.at}", notes=notes)
+
+
+def remove_note(viewer: Viewer, note: Note) -> None:
+    """Take a note off."""
+    viewer.change(notes=tuple(other for other in viewer.state.session.notes if other is not note))
 
 
 # The window: preferences and panels.
@@ -157,14 +191,15 @@ def take_preferences(viewer: Viewer) -> None:
     viewer.put(picture=replace(picture, colour_map=kept.colour_map), overlays=overlays)
 
 
+def scale_text(viewer: Viewer, by: float) -> None:
+    """Make letters and widgets larger or smaller."""
+    low, high = SCALES
+    prefer(viewer, ui_scale=min(max(viewer.state.preferences.ui_scale + by, low), high))
+
+
 def resize(viewer: Viewer, width: int, height: int) -> None:
     """Take the size of the scene's area of the window, pixels."""
     viewer.state.size = (max(1, width), max(1, height))
-
-
-def toggle_panel(viewer: Viewer) -> None:
-    """Hide all panels, or bring them back."""
-    viewer.state.show_panel = not viewer.state.show_panel
 
 
 def open_panel(viewer: Viewer, title: str) -> None:
@@ -172,35 +207,19 @@ def open_panel(viewer: Viewer, title: str) -> None:
     viewer.state.show_panel, viewer.state.wanted_panel = True, title
 
 
-def reset_panels(viewer: Viewer) -> None:
-    """Put the panels where they are at first."""
-    viewer.state.show_panel = viewer.state.resets_panels = True
-
-
-def toggle_help(viewer: Viewer) -> None:
-    """Show or close the help."""
-    viewer.state.show_help = not viewer.state.show_help
-
-
-def show_palette(viewer: Viewer, shown: bool) -> None:
-    """Set whether the list of everything that can be done is there."""
-    viewer.state.show_palette = shown
-    viewer.state.awaits_keyboard |= shown
-
-
 def toggle_palette(viewer: Viewer) -> None:
-    """Show or close the list of commands."""
-    show_palette(viewer, not viewer.state.show_palette)
+    """Show or close the list of everything that can be done."""
+    viewer.state.show_palette = not viewer.state.show_palette
+    viewer.state.awaits_keyboard |= viewer.state.show_palette
 
 
 def escape(viewer: Viewer) -> None:
-    """Close what lies over the scene; where nothing did, leave the tool."""
-    state = viewer.state
+    """Close what lies over the scene; where nothing does leave the stroke, else the tool."""
+    state, tools = viewer.state, viewer.state.tools
     lay_over = state.show_help or state.show_palette or state.browser or state.leaving
-    state.show_help = state.pins_notes = False
-    show_palette(viewer, False)
-    measure(viewer, False)
-    state.browser = None
-    stay(viewer)
+    state.show_help = state.show_palette = state.pins_notes = False
+    state.browser = state.leaving = None
+    if state.session.ruler.measures:
+        toggle_measuring(viewer)
     if not lay_over:
-        leave_tool(viewer)
+        state.tools = replace(tools, stroke=None, tool=tools.tool if tools.stroke else None)

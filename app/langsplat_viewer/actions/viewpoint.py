@@ -1,4 +1,4 @@
-"""The viewpoint: camera moves, the camera path as it is played, the cursor, bookmarks."""
+"""The viewpoint: camera moves, the camera path and its keyframes, the cursor, bookmarks."""
 
 import math
 from collections.abc import Callable
@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.errors import InputError, printable_line
+from langsplat_core.errors import InputError, LangSplatError, printable_line
 from langsplat_core.progress import Progress
 from langsplat_core.query.describe import Describer, Pointed, look_at_pixel
 from langsplat_core.query.engine import no_field
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Camera
+from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.camera.controls import (
     Extent,
     OrbitCamera,
@@ -29,12 +30,181 @@ from langsplat_viewer.camera.controls import (
     with_projection,
     zoom,
 )
-from langsplat_viewer.camera.flight import pose_at, pose_of, view_of
+from langsplat_viewer.camera.flight import (
+    LONGEST,
+    SAME_TIME,
+    Keyframe,
+    Motion,
+    pose_at,
+    pose_of,
+    stretched,
+    turntable,
+    view_of,
+    with_keyframe,
+)
+from langsplat_viewer.files.projects import MOST_KEYFRAMES, read_flight
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.rendering.request import image_formation
 from langsplat_viewer.session import LONGEST_NAME, MOST_BOOKMARKS, Bookmark, Query
-from langsplat_viewer.state import GLIDE_SECONDS, Glide, Hover, flight_of
+from langsplat_viewer.state import GLIDE_SECONDS, SPACING, Glide, Hover, flight_of
 from langsplat_viewer.viewer import Viewer
+
+# Camera moves, at once or gliding from view to view.
+
+NEAREST = 0.004  # of the scene's radius: the closest that the eye comes to its centre of turning
+
+
+def tick(viewer: Viewer, now: float) -> None:
+    """Begin a frame at `now` seconds: move a gliding camera, or one that plays a path, on."""
+    viewer.clock = now
+    glide = viewer.state.glide
+    if glide is not None:
+        t = (now - glide.began) / GLIDE_SECONDS
+        viewer.state.view = between(glide.start, glide.end, t)
+        if t >= 1:
+            viewer.state.glide = None
+    _play(viewer)
+
+
+def move(viewer: Viewer, step: Callable[[OrbitCamera], OrbitCamera]) -> None:
+    """Apply one of the functions of `controls` at once; it ends a glide."""
+    if viewer.state.view is not None:
+        _leave_path(viewer)
+        viewer.state.view, viewer.state.glide = step(viewer.state.view), None
+
+
+def glide_to(viewer: Viewer, end: OrbitCamera) -> None:
+    """Send the camera to a view."""
+    if viewer.state.view is not None:
+        _leave_path(viewer)
+        viewer.state.glide = Glide(viewer.state.view, end, viewer.clock)
+
+
+def open_at(viewer: Viewer, camera: Camera) -> None:
+    """Take a camera's view at once; it is the opening view from now on."""
+    extent, scene = viewer.state.extent, viewer.state.scene
+    if extent is not None and scene is not None:
+        same = [np.array_equal(own.world_to_camera, camera.world_to_camera) for own in scene.cameras]
+        viewer.state.camera_index = same.index(True) if any(same) else None
+        viewer.state.opening_camera = camera
+        move(viewer, lambda view: from_camera(camera, extent))
+
+
+def zoom_by(viewer: Viewer, factor: float) -> None:
+    """Multiply the distance to the centre of turning, within what the scene's size makes sensible."""
+    extent = viewer.state.extent
+    if extent is not None:
+        nearest, farthest = NEAREST * extent.radius, extent.farthest
+        move(viewer, lambda view: zoom(view, factor, nearest, farthest))
+
+
+def opening_view(viewer: Viewer) -> OrbitCamera | None:
+    """Return the first view of a scene, None without a scene.
+
+    It is that of the camera that was asked for, else of the first training camera, else of everything in the
+    window as it is now.
+    """
+    state = viewer.state
+    if state.scene is None or state.extent is None:
+        return None
+    if state.opening_camera is not None:
+        return from_camera(state.opening_camera, state.extent)
+    return default_view(state.scene, state.extent, state.size)
+
+
+def reset_view(viewer: Viewer) -> None:
+    """Return to the opening view, in the projection of now."""
+    view, state = opening_view(viewer), viewer.state
+    if view is None or state.scene is None or state.extent is None:
+        return
+    if state.view is not None and state.view.orthographic:
+        view = with_projection(view, orthographic=True)
+        if state.opening_camera is None and not state.scene.cameras:
+            view = frame_all(view, state.extent, state.size)
+    glide_to(viewer, view)
+
+
+def frame_scene(viewer: Viewer) -> None:
+    """Show the whole scene, from the side that it is seen from now."""
+    state = viewer.state
+    if state.view is not None and state.extent is not None:
+        glide_to(viewer, frame_all(state.view, state.extent, state.size))
+
+
+def look_from(viewer: Viewer, side: Side) -> None:
+    """Look at what the view turns around along one of the world's axes, from as far as now."""
+    if viewer.state.view is not None:
+        glide_to(viewer, from_side(viewer.state.view, side))
+
+
+def toggle_orthographic(viewer: Viewer) -> None:
+    """Look without perspective, or with it again; a glide under way goes on."""
+    state = viewer.state
+    if state.view is not None:
+        orthographic, glide = not state.view.orthographic, state.glide
+        move(viewer, lambda view: with_projection(view, orthographic))
+        if glide is not None:
+            state.glide = replace(glide, end=with_projection(glide.end, orthographic))
+
+
+def go_to_camera(viewer: Viewer, index: int) -> None:
+    """Stand where a training photograph was taken; indices beyond the ends wrap round."""
+    scene, extent = viewer.state.scene, viewer.state.extent
+    if scene is None or extent is None:
+        return
+    if not scene.cameras:
+        viewer.say_error("this scene has no training cameras (no .cameras.json beside it)")
+        return
+    viewer.state.camera_index = index % len(scene.cameras)
+    glide_to(viewer, from_camera(scene.cameras[viewer.state.camera_index], extent))
+
+
+def step_camera(viewer: Viewer, by: int) -> None:
+    """Go to the next (1) or previous (-1) training camera."""
+    go_to_camera(viewer, (viewer.state.camera_index or 0) + by)
+
+
+def focus_result(viewer: Viewer, query: Query | None = None) -> None:
+    """Bring a query's place to the centre, as near as the thing is small.
+
+    Without `query` the latest one shown that was found; without any the whole scene.
+    """
+    state = viewer.state
+    shown = state.session.in_order_of_showing() if query is None else [query]
+    results = [result for query in shown if (result := state.result(query)) is not None]
+    found = [result for result in results if result.found or query is not None]
+    if found and found[-1].place is not None:
+        focus_on(viewer, found[-1].place, found[-1].box)
+    else:
+        frame_scene(viewer)
+
+
+def focus_on(viewer: Viewer, place: Array, box: Array | None) -> None:
+    """Bring a thing at `place` (3,) in `box` (2, 3) to the centre, as near as it is small.
+
+    It is no farther back than the eye or the opening view are now, which in a room would be behind its wall.
+    """
+    view, extent, home = viewer.state.view, viewer.state.extent, opening_view(viewer)
+    if view is None or extent is None or home is None:
+        return
+    if box is None:
+        box = np.stack([place, place + 0.1 * extent.radius])
+    most = max(float(np.linalg.norm(place - view.eye)), home.distance)
+    distance = min(max(holding_distance(view, box), NEAREST * extent.radius), most)
+    glide_to(viewer, focus(view, place, distance))
+
+
+def focus_pixel(viewer: Viewer, u: float, v: float) -> None:
+    """Turn around the surface under the cursor from now on; (u, v) are fractions of the scene's area."""
+    view = viewer.state.view
+    point = None if view is None else viewer.point_at(u, v, "turn around")
+    if view is not None and point is not None:
+        # The eye stays, but without perspective the size of things does.
+        depth = None if view.orthographic else float((np.array(point) - view.eye) @ view.rotation[2])
+        glide_to(viewer, focus(view, np.array(point), depth))
+
+
+# The camera path as it is played.
 
 
 def path_seconds(viewer: Viewer) -> float:
@@ -43,6 +213,16 @@ def path_seconds(viewer: Viewer) -> float:
     if record.turns:
         return record.turn_seconds
     return keyframes[-1].seconds if keyframes else 0.0
+
+
+def path_motion(viewer: Viewer) -> Motion | None:
+    """Return the path that is filmed; None without one."""
+    state, record = viewer.state, viewer.state.record
+    if state.view is None or path_seconds(viewer) <= 0:
+        return None
+    if record.turns:
+        return turntable(record.turn_from or state.view, record.turn_seconds)
+    return flight_of(state.session.keyframes)
 
 
 def toggle_playing(viewer: Viewer) -> None:
@@ -71,7 +251,7 @@ def scrub(viewer: Viewer, seconds: float) -> None:
     _show(viewer, min(max(seconds, 0.0), path_seconds(viewer)))
 
 
-def advance(viewer: Viewer) -> None:
+def _play(viewer: Viewer) -> None:
     """Move a played path on to the viewer's clock; at its end it stops, or begins again."""
     record = viewer.state.record
     if record.began is None:
@@ -88,201 +268,116 @@ def advance(viewer: Viewer) -> None:
     _show(viewer, min(at, seconds))
 
 
-def leave_path(viewer: Viewer) -> None:
-    """Return the view goes elsewhere: nothing is played any more, and a turn begins anew from there."""
-    viewer.state.record.began = None
-    if viewer.state.record.turn_from is not None:
-        viewer.state.record.turn_from, viewer.state.record.at = None, 0.0
+def _leave_path(viewer: Viewer) -> None:
+    """Have the view go elsewhere: nothing is played any more, and a turn begins anew from there."""
+    record = viewer.state.record
+    record.began = None
+    if record.turn_from is not None:
+        record.turn_from, record.at = None, 0.0
 
 
 def _show(viewer: Viewer, seconds: float) -> None:
-    viewer.state.record.at = seconds
-    viewer.state.view = _view_at(viewer, seconds)
-
-
-def _view_at(viewer: Viewer, seconds: float) -> OrbitCamera | None:
     state, record = viewer.state, viewer.state.record
+    record.at = seconds
     if record.turns and record.turn_from is not None:
-        return orbit(record.turn_from, 2 * math.pi * seconds / record.turn_seconds, 0)
-    if state.extent is None or not state.session.keyframes:
-        return state.view
-    return view_of(pose_at(flight_of(state.session.keyframes), seconds), state.extent)
+        state.view = orbit(record.turn_from, 2 * math.pi * seconds / record.turn_seconds, 0)
+    elif state.extent is not None and state.session.keyframes:
+        state.view = view_of(pose_at(flight_of(state.session.keyframes), seconds), state.extent)
 
 
-# Camera moves, at once or gliding from view to view.
-
-NEAREST = 0.004  # of the scene's radius: the closest that the eye comes to its centre of turning
+# Keyframes of the path.
 
 
-def tick(viewer: Viewer, now: float) -> None:
-    """Begin a frame at `now` seconds: move a gliding camera, or one that plays a path, on."""
-    viewer.clock = now
-    glide = viewer.state.glide
-    if glide is not None:
-        t = (now - glide.began) / GLIDE_SECONDS
-        viewer.state.view = between(glide.start, glide.end, t)
-        if t >= 1:
-            viewer.state.glide = None
-    advance(viewer)
+def add_keyframe(viewer: Viewer) -> None:
+    """Add the current view as a keyframe, some seconds after the last one."""
+    state, record = viewer.state, viewer.state.record
+    if state.view is None:
+        viewer.say_error("open a scene first, then record a path in it")
+        return
+    keyframes = state.session.keyframes
+    last = keyframes[-1].seconds + SPACING if keyframes else 0.0
+    if last > LONGEST or len(keyframes) >= MOST_KEYFRAMES:
+        viewer.say_error(f"a path has at most {MOST_KEYFRAMES} keyframes and {LONGEST:.0f} seconds")
+        return
+    added = Keyframe(last, pose_of(state.view))
+    record.turns = False
+    _set_path(viewer, (*keyframes, added), added)
+    state.say(f"keyframe {len(keyframes) + 1} at {added.seconds:.1f} s")
 
 
-def move(viewer: Viewer, step: Callable[[OrbitCamera], OrbitCamera]) -> None:
-    """Apply one of the functions of `controls` at once; it ends a glide."""
+def choose_keyframe(viewer: Viewer, key: Keyframe) -> None:
+    """Go to a keyframe."""
+    state, record = viewer.state, viewer.state.record
+    if state.extent is not None:
+        glide_to(viewer, view_of(key.pose, state.extent))
+        record.chosen, record.at = key, key.seconds
+
+
+def delete_keyframe(viewer: Viewer, key: Keyframe) -> None:
+    """Take a keyframe off the path; the others keep their times."""
+    _set_path(viewer, tuple(other for other in viewer.state.session.keyframes if other is not key), None)
+
+
+def move_keyframe(viewer: Viewer, key: Keyframe, seconds: float) -> None:
+    """Move a keyframe to another time, or beside a keyframe that has that time."""
+    others = tuple(other for other in viewer.state.session.keyframes if other is not key)
+    seconds = min(max(seconds, 0.0), LONGEST)
+    while any(abs(other.seconds - seconds) < SAME_TIME for other in others):
+        seconds += 0.01
+    moved = replace(key, seconds=seconds)
+    _set_path(viewer, with_keyframe(others, moved), moved)
+
+
+def replace_keyframe(viewer: Viewer, key: Keyframe) -> None:
+    """Put the current view in the place of a keyframe."""
     if viewer.state.view is not None:
-        leave_path(viewer)
-        viewer.state.view, viewer.state.glide = step(viewer.state.view), None
+        new = replace(key, pose=pose_of(viewer.state.view))
+        _set_path(viewer, with_keyframe(viewer.state.session.keyframes, new), new)
 
 
-def open_at(viewer: Viewer, camera: Camera) -> None:
-    """Take a camera's view at once; it is the opening view from now on."""
-    extent, scene = viewer.state.extent, viewer.state.scene
-    if extent is not None and scene is not None:
-        same = [np.array_equal(own.world_to_camera, camera.world_to_camera) for own in scene.cameras]
-        viewer.state.camera_index = same.index(True) if any(same) else None
-        viewer.state.opening_camera = camera
-        move(viewer, lambda view: from_camera(camera, extent))
+def set_path_seconds(viewer: Viewer, seconds: float) -> None:
+    """Set how long the path, or the turn, takes."""
+    record, keyframes = viewer.state.record, viewer.state.session.keyframes
+    seconds = min(max(seconds, 0.1), LONGEST)
+    if record.turns:
+        record.at *= seconds / record.turn_seconds
+        record.turn_seconds = seconds
+    elif path_seconds(viewer) > 0:
+        _set_path(viewer, stretched(keyframes, max(seconds, len(keyframes) * SAME_TIME)), None)
 
 
-def glide_to(viewer: Viewer, end: OrbitCamera) -> None:
-    """Send the camera to a view."""
-    if viewer.state.view is not None:
-        leave_path(viewer)
-        viewer.state.glide = Glide(viewer.state.view, end, viewer.clock)
+def clear_path(viewer: Viewer) -> None:
+    """Take all keyframes off the path."""
+    if viewer.state.session.keyframes:
+        _set_path(viewer, (), None)
 
 
-def zoom_by(viewer: Viewer, factor: float) -> None:
-    """Multiply the distance to the centre of turning, within what the scene's size makes sensible."""
-    extent = viewer.state.extent
-    if extent is not None:
-        nearest, farthest = NEAREST * extent.radius, extent.farthest
-        move(viewer, lambda view: zoom(view, factor, nearest, farthest))
+def _set_path(viewer: Viewer, keyframes: tuple[Keyframe, ...], chosen: Keyframe | None) -> None:
+    _leave_path(viewer)
+    viewer.change(keyframes=keyframes)
+    record = viewer.state.record
+    record.chosen = chosen
+    record.at = chosen.seconds if chosen is not None else min(record.at, path_seconds(viewer))
 
 
-def opening_view(viewer: Viewer) -> OrbitCamera | None:
-    """Return the first view of a scene, None without a scene.
-
-    It is that of the camera that was asked for, else of the first training camera, else of everything in the
-    window as it is now.
-    """
-    state = viewer.state
-    if state.scene is None or state.extent is None:
-        return None
-    if state.opening_camera is not None:
-        return from_camera(state.opening_camera, state.extent)
-    return default_view(state.scene, state.extent, state.size)
+def set_turning(viewer: Viewer, turns: bool) -> None:
+    """Have the path go once around what the view turns around, in place of the keyframes."""
+    _leave_path(viewer)
+    viewer.state.record.turns, viewer.state.record.at = turns, 0.0
 
 
-def reset_view(viewer: Viewer) -> None:
-    """Return to the opening view, in the projection of now."""
-    view, extent = opening_view(viewer), viewer.state.extent
-    if view is None or extent is None:
+def load_path(viewer: Viewer, path: Path) -> None:
+    """Take the path of a file in place of the one that is there."""
+    try:
+        flight = read_flight(path)
+    except LangSplatError as error:
+        viewer.say_error(str(error))
         return
-    if viewer.state.view is not None and viewer.state.view.orthographic:
-        view, scene = with_projection(view, orthographic=True), viewer.state.scene
-        if viewer.state.opening_camera is None and scene is not None and not scene.cameras:
-            view = frame_all(view, extent, viewer.state.size)
-    glide_to(viewer, view)
-
-
-def frame_scene(viewer: Viewer) -> None:
-    """Show the whole scene, from the side that it is seen from now."""
-    state = viewer.state
-    if state.view is not None and state.extent is not None:
-        glide_to(viewer, frame_all(state.view, state.extent, state.size))
-
-
-def look_from(viewer: Viewer, side: Side) -> None:
-    """Look at what the view turns around along one of the world's axes, from as far as now."""
-    if viewer.state.view is not None:
-        glide_to(viewer, from_side(viewer.state.view, side))
-
-
-def set_orthographic(viewer: Viewer, orthographic: bool) -> None:
-    """Look without perspective, or with it again; a glide under way goes on."""
-    state = viewer.state
-    view, extent, glide = state.view, state.extent, state.glide
-    if view is None or extent is None or view.orthographic == orthographic:
-        return
-
-    def turned(view: OrbitCamera) -> OrbitCamera:
-        return with_projection(view, orthographic)
-
-    move(viewer, turned)
-    state.glide = None if glide is None else replace(glide, end=turned(glide.end))
-
-
-def toggle_orthographic(viewer: Viewer) -> None:
-    """Look without perspective, or with it again."""
-    set_orthographic(viewer, viewer.state.view is not None and not viewer.state.view.orthographic)
-
-
-def go_to_camera(viewer: Viewer, index: int) -> None:
-    """Stand where a training photograph was taken; indices beyond the ends wrap round."""
-    scene, extent = viewer.state.scene, viewer.state.extent
-    if scene is None or extent is None:
-        return
-    if not scene.cameras:
-        viewer.say_error("this scene has no training cameras (no .cameras.json beside it)")
-        return
-    viewer.state.camera_index = index % len(scene.cameras)
-    glide_to(viewer, from_camera(scene.cameras[viewer.state.camera_index], extent))
-
-
-def step_camera(viewer: Viewer, by: int) -> None:
-    """Return the next (1) or previous (-1) training camera."""
-    go_to_camera(viewer, (viewer.state.camera_index or 0) + by)
-
-
-def focus_result(viewer: Viewer, query: Query | None = None) -> None:
-    """Bring a query's place to the centre, as near as the thing is small.
-
-    Without `query` the latest one shown that was found; without any the whole scene.
-    """
-    state = viewer.state
-    if state.extent is None or state.view is None:
-        return
-    shown = state.session.in_order_of_showing() if query is None else [query]
-    results = [result for query in shown if (result := state.result(query)) is not None]
-    found = [result for result in results if result.found or query is not None]
-    if found and found[-1].place is not None:
-        focus_on(viewer, found[-1].place, found[-1].box)
-    else:
-        frame_scene(viewer)
-
-
-def focus_on(viewer: Viewer, place: Array, box: Array | None) -> None:
-    """Bring a thing at `place` (3,) in `box` (2, 3) to the centre, as near as it is small."""
-    if viewer.state.view is not None and viewer.state.extent is not None:
-        glide_to(viewer, focus(viewer.state.view, place, _distance_for(viewer, place, box)))
-
-
-def _distance_for(viewer: Viewer, place: Array, box: Array | None) -> float:
-    """Return the distance from which a thing at `place` (3,) in `box` (2, 3) is seen, world units.
-
-    It is no farther back than the eye or the opening view are now, which in a room would be behind its wall.
-    """
-    view, extent, home = viewer.state.view, viewer.state.extent, opening_view(viewer)
-    assert view is not None
-    assert extent is not None
-    assert home is not None
-    if box is None:
-        box = np.stack([place, place + 0.1 * extent.radius])
-    most = max(float(np.linalg.norm(place - view.eye)), home.distance)
-    return min(max(holding_distance(view, box), NEAREST * extent.radius), most)
-
-
-def focus_pixel(viewer: Viewer, u: float, v: float) -> None:
-    """Turn around the surface under the cursor from now on; (u, v) are fractions of the scene's area."""
-    if viewer.surface is None or viewer.state.view is None:
-        return
-    point = viewer.surface.point_at(u, v)
-    if point is None:
-        viewer.state.say("nothing under the cursor to turn around")
-        return
-    view = viewer.state.view
-    # The eye stays, but without perspective the size of things does.
-    depth = None if view.orthographic else float((point - view.eye) @ view.rotation[2])
-    glide_to(viewer, focus(view, point, depth))
+    viewer.state.record.turns = False
+    _set_path(viewer, flight.keyframes, None)
+    viewer.state.record.at = 0.0
+    open_panel(viewer, "Record")
+    viewer.state.say(f"{path.name}: {len(flight.keyframes)} keyframes, {flight.seconds:.1f} s")
 
 
 # The cursor: what lies under it while it rests.
@@ -304,17 +399,11 @@ def hover(viewer: Viewer, pixel: tuple[int, int] | None) -> None:
 
     None: elsewhere, or it drags. What lies there is asked once the mouse and the camera rest.
     """
-    state = viewer.state
-    if not state.pointing or state.view is None or pixel is None:
+    state, before, (width, height) = viewer.state, viewer.state.hover, viewer.state.size
+    inside = pixel is not None and 0 <= pixel[0] < width and 0 <= pixel[1] < height
+    if not state.pointing or state.view is None or pixel is None or not inside:
         state.hover = None
-        return
-    width, height = state.size
-    if not (0 <= pixel[0] < width and 0 <= pixel[1] < height):
-        state.hover = None
-        return
-    before = state.hover
-    same = before is not None and (before.pixel, before.view) == (pixel, state.view)
-    if not same or before is None:
+    elif before is None or (before.pixel, before.view) != (pixel, state.view):
         state.hover = Hover(pixel, state.view, viewer.clock)
     elif not before.asked and viewer.clock - before.since >= REST_SECONDS and viewer.worker.current is None:
         before.asked = True
@@ -331,13 +420,8 @@ def _ask(viewer: Viewer, place: Hover) -> None:
     results = [result for result in viewer.state.shown_results() if result is not None]
 
     def work(progress: Progress) -> tuple[Describer, Pointed | None]:
-        describer = viewer.describer
-        if describer is None or describer.engine is not engine:
-            describer = Describer(engine, progress=progress)
-        rasterizer = load_lifting_rasterizer("cpu")
-        return describer, look_at_pixel(
-            rasterizer, describer, camera, place.pixel, results, settings=settings
-        )
+        describer, cpu = viewer.describing(engine, progress), load_lifting_rasterizer("cpu")
+        return describer, look_at_pixel(cpu, describer, camera, place.pixel, results, settings=settings)
 
     def done(found: tuple[Describer, Pointed | None]) -> None:
         viewer.describer, place.found = found
@@ -351,16 +435,13 @@ def _ask(viewer: Viewer, place: Hover) -> None:
 
 def add_bookmark(viewer: Viewer, name: str = "") -> None:
     """Keep the current view; in place of one of the same name. Without a name it gets a number."""
-    state = viewer.state
+    state, kept = viewer.state, viewer.state.session.bookmarks
     if state.view is None:
         viewer.say_error("open a scene first, then bookmark a view of it")
         return
-    kept = state.session.bookmarks
     if not name.strip():
-        number = len(kept) + 1
-        while f"view {number}" in {bookmark.name for bookmark in kept}:
-            number += 1
-        name = f"view {number}"
+        taken, number = {bookmark.name for bookmark in kept}, len(kept) + 1
+        name = next(f"view {n}" for n in range(number, 2 * number) if f"view {n}" not in taken)
     added = Bookmark(printable_line(name, LONGEST_NAME), pose_of(state.view), state.view.distance)
     others = tuple(bookmark for bookmark in kept if bookmark.name != added.name)
     if len(others) >= MOST_BOOKMARKS:

@@ -1,4 +1,4 @@
-"""Files that a user saves, as JSON: camera paths, bookmarks, query sets and projects.
+"""Files of a user, as JSON: camera paths, bookmarks, query sets, projects and preferences.
 
 What they hold are parts of a `Session`, which msgspec turns into JSON and back; what its types do not say is
 checked here. Nothing in a file becomes a path, an array or a call that was not checked before.
@@ -17,17 +17,28 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
+import platformdirs
 from msgspec import Meta
 
 from langsplat_core.config import LevelChoice, check_settings
 from langsplat_core.errors import FormatError, InputError, printable_line, quoted
-from langsplat_core.io.cameras import is_rotation
+from langsplat_core.io.cameras import is_rotation, numbers
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import read_json_file
 from langsplat_core.scene import FARTHEST, Intrinsics
 from langsplat_core.scene.transform import similarity
 from langsplat_viewer.camera.flight import FOV_LIMITS, LONGEST, SAME_TIME, SPAN_LIMITS, Flight, Keyframe, Pose
-from langsplat_viewer.session import LONGEST_NOTE, MOST_BOOKMARKS, SLOTS, Bits, Bookmark, Phrase, Session
+from langsplat_viewer.session import (
+    LONGEST_NOTE,
+    MOST_BOOKMARKS,
+    SCALES,
+    SLOTS,
+    Bits,
+    Bookmark,
+    Phrase,
+    Preferences,
+    Session,
+)
 
 T = TypeVar("T")
 SIZE_LIMIT = 64 * 1024 * 1024  # bytes of any of these files
@@ -112,7 +123,7 @@ def _flat(entry: dict[str, Any]) -> dict[str, Any]:
 
 def _nested(entry: Any) -> dict[str, Any]:
     pose = {name: entry[name] for name in POSE if name in entry}
-    rotation = np.transpose(pose["rotation"]).tolist()
+    rotation = numbers(pose, "rotation", (3, 3), "a pose").T.tolist()
     return {**{k: v for k, v in entry.items() if k not in POSE}, "pose": {**pose, "rotation": rotation}}
 
 
@@ -286,15 +297,10 @@ class Project(msgspec.Struct, omit_defaults=True):
     version: int = VERSION
     has_groups: bool = False  # things in groups, or locked, which earlier versions had
 
-    @property
-    def path(self) -> Path:
-        """Absolute path of the scene."""
-        return Path(self.scene)
-
 
 def write_project(path: Path, project: Project, answers: list[dict[str, Any]]) -> None:
     """Write a project, whole or not at all."""
-    folder, scene = path.absolute().parent, project.path
+    folder, scene = path.absolute().parent, Path(project.scene)
     named = scene.relative_to(folder).as_posix() if scene.is_relative_to(folder) else str(scene)
     content = {"format": FORMAT, "version": VERSION, **_plain(project), "scene": named, "answers": answers}
     _write(path, content)
@@ -377,14 +383,48 @@ def _from_version_1(top: dict[str, Any]) -> dict[str, Any]:
         "notes": top["notes"],
         "ruler": {"points": top["ruler"]},
         "marks": top["marks"],
-        "moves": [{"to": _plain(similarity(move["matrix"])), "of": move["of"]} for move in top["moves"]],
+        "moves": [
+            {"to": _plain(similarity(numbers(move, "matrix", (4, 4), "move"))), "of": move["of"]}
+            for move in top["moves"]
+        ],
         "things": {**top["things"], "names": dict(top["things"]["names"])},
     }
     return {**top, "view": _nested(top["view"]), "session": session}
 
 
-def scene_of(project: Project) -> Path:
-    """Return the path of a project's scene. InputError where no file is there any more."""
-    if not project.path.exists():
-        raise InputError(f"{project.path}: the project's scene is not there; move it back, or mend its path")
-    return project.path
+# Preferences, and where they are kept.
+
+FILE_NAME, LAYOUT_NAME = "preferences.json", "layout.ini"
+DESIGNED = 1080  # window units: the height of the screen that a scale of 1 is made for
+
+
+def preferences_folder() -> Path:
+    """Return the folder of the preferences; it need not exist."""
+    return Path(platformdirs.user_config_path("langsplat-viewer", appauthor=False))
+
+
+def fitting_scale(height: float) -> float:
+    """Return the size of letters for a screen `height` units high: at 1080 that of the design."""
+    return float(np.clip(round(4 * height / DESIGNED) / 4, 1.0, SCALES[1]))
+
+
+def load_preferences(folder: Path, at_first: Preferences | None = None) -> Preferences:
+    """Read the preferences in `folder`, `at_first` or the defaults where there are none.
+
+    InputError where the file makes no sense.
+    """
+    path = folder / FILE_NAME
+    try:
+        return msgspec.json.decode(path.read_bytes()[:1_000_000], type=Preferences)
+    except FileNotFoundError:
+        return at_first or Preferences()
+    except (OSError, ValueError, RecursionError) as error:
+        reason = printable_line(getattr(error, "strerror", None) or error, 120)
+        raise InputError(f"{path}: {reason}; the defaults are used; mend or delete it") from None
+
+
+def save_preferences(folder: Path, preferences: Preferences) -> None:
+    """Write the preferences, whole or not at all. OSError where the folder cannot be written."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with atomic_path(folder / FILE_NAME) as temporary:
+        temporary.write_bytes(msgspec.json.format(msgspec.json.encode(preferences), indent=1))

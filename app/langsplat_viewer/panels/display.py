@@ -8,7 +8,7 @@ from imgui_bundle import imgui
 from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, DisplayRow
 from langsplat_core.query.answers import FLOOR
 from langsplat_core.scene import LEVELS
-from langsplat_viewer.actions import browsing, settings
+from langsplat_viewer.actions import opening, settings
 from langsplat_viewer.commands import BUTTONS, Button, buttons_of, is_shown
 from langsplat_viewer.panels import ui
 from langsplat_viewer.rendering.request import MOST_DEGREE, SIZE_RANGE, Splats
@@ -38,8 +38,7 @@ def draw(viewer: Viewer) -> None:
         ui.leave_room("Colour map", WIDTH_EM)
         changed, chosen = imgui.combo("Colour map", names.index(picture.colour_map), list(names))
         if changed:
-            settings.set_colour_map(viewer, names[chosen])
-    picture = replace(picture, colour_map=viewer.state.session.picture.colour_map)
+            picture = replace(picture, colour_map=names[chosen])
     picture = replace(picture, background=_backdrop(picture.background))
     ui.tip("What shows where the scene is not")
     picture = replace(picture, transparent=imgui.checkbox("Save without backdrop", picture.transparent)[1])
@@ -124,11 +123,11 @@ def _compared(viewer: Viewer) -> None:
             settings.compare_with(viewer, button.display, button.latent_level)
         imgui.end_disabled()
     imgui.begin_disabled(state.lacks_field)
-    if imgui.selectable("three levels", split.mode == "levels")[0] and split.mode != "levels":
-        settings.toggle_levels(viewer)
+    if imgui.selectable("three levels", split.mode == "levels")[0]:
+        settings.set_split(viewer, "levels")
     imgui.end_disabled()
     if imgui.selectable("another scene ...", split.mode == "scenes")[0]:
-        browsing.ask_for_beside(viewer)
+        opening.ask_for_beside(viewer)
     imgui.end_combo()
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 from imgui_bundle import ImVec2, ImVec4, hello_imgui, icons_fontawesome_6, imgui
 
 from langsplat_core import __version__
-from langsplat_viewer.actions import browsing, settings
-from langsplat_viewer.commands import COMMANDS, HELD, MENUS, TEXT_SIZE_MENU, Command, in_menu, matching
+from langsplat_viewer.actions import opening, settings
+from langsplat_viewer.commands import BY_MENU, COMMANDS, HELD, MENUS, Command, matching
 from langsplat_viewer.panels import ui
 from langsplat_viewer.viewer import Viewer
 
@@ -16,16 +16,13 @@ def draw_menus(viewer: Viewer) -> None:
     """Draw the menus, for hello_imgui."""
     for menu in MENUS:
         if imgui.begin_menu(menu):
-            first, *others = in_menu(menu)
+            first, *others = BY_MENU[menu]
             _items(viewer, [first])
             if menu == "File":
                 _recent(viewer)
             _items(viewer, others)
             if menu == "Window":
                 _panels()
-                if imgui.begin_menu(TEXT_SIZE_MENU):
-                    _items(viewer, in_menu(TEXT_SIZE_MENU))
-                    imgui.end_menu()
             imgui.end_menu()
 
 
@@ -45,7 +42,7 @@ def _recent(viewer: Viewer) -> None:
         for number, path in enumerate(recent):
             name = Path(path)
             if imgui.menu_item(f"{name.parent.name}/{name.name}##{number}", "", False)[0]:
-                browsing.open_recent(viewer, path)
+                opening.open_file(viewer, name)
             if imgui.is_item_hovered():
                 imgui.set_tooltip(path)
         imgui.end_menu()
@@ -61,36 +58,55 @@ def _panels() -> None:
 
 # The toolbar: commands that have an icon, in a strip at the left edge of the scene.
 
-TOOLS = [command for command in COMMANDS if command.icon]
-SIDE_EM, GAP_EM, MARGIN_EM = 1.75, 0.3, 0.3  # of a button, between menus, around them
+GROUPS = [group for menu in MENUS if (group := [command for command in BY_MENU[menu] if command.icon])]
+SIDE_EM, GROUP_GAP_EM, MARGIN_EM = 1.75, 0.3, 0.3  # of a button, between groups, around them
 OPACITY = 0.95  # of a button
+MOST_OF_SCENE = 0.4  # of the scene's width
 
 
 def draw_toolbar(viewer: Viewer, area: ui.Area) -> None:
-    """Draw a column of buttons over the scene's left edge, smaller ones where the scene is low.
+    """Draw a column of buttons over the scene's left edge.
 
-    It lies between the titles of images and what is written at their foot.
+    It lies between the titles of images and what is written at their foot; there are further columns where
+    the scene is low, and none where it is too narrow for them.
     """
     if viewer.state.scene is None or not viewer.state.show_panel:
         return
-    top, gap, margin = (float(hello_imgui.em_size(size)) for size in (SIDE_EM, GAP_EM, MARGIN_EM))
-    gaps = len({command.menu for command in TOOLS}) * gap
-    side = min(top, (area.height - 2 * top - 2 * margin - gaps) / len(TOOLS))
-    if side < top / 3:
+    side, gap, margin = (float(hello_imgui.em_size(size)) for size in (SIDE_EM, GROUP_GAP_EM, MARGIN_EM))
+    top = area.top + side
+    places = toolbar_places([len(group) for group in GROUPS], area.height - 2 * side - 2 * margin, side, gap)
+    width, height = (max(place[axis] for place in places) + side + 2 * margin for axis in (0, 1))
+    if width > MOST_OF_SCENE * area.width:
         return
-    imgui.set_next_window_pos(ImVec2(area.left, area.top + top))
-    imgui.set_next_window_size(ImVec2(side + 2 * margin, len(TOOLS) * side + gaps + 2 * margin))
+    imgui.set_next_window_pos(ImVec2(area.left, top))
+    imgui.set_next_window_size(ImVec2(width, height))
     imgui.set_next_window_bg_alpha(0.0)
     imgui.push_style_var(imgui.StyleVar_.window_padding, ImVec2(margin, margin))
-    imgui.push_style_var(imgui.StyleVar_.item_spacing, ImVec2(0, 0))
-    imgui.push_style_var(imgui.StyleVar_.frame_padding, ImVec2(0, 0))
     imgui.begin("toolbar", None, ui.OVER | ui.FIXED)
-    for before, command in zip([TOOLS[0], *TOOLS], TOOLS, strict=False):
-        if before.menu != command.menu:
-            imgui.dummy(ImVec2(side, gap))
+    for command, (x, y) in zip((c for group in GROUPS for c in group), places, strict=True):
+        imgui.set_cursor_pos(ImVec2(margin + x, margin + y))
         _tool_button(viewer, command, side)
     imgui.end()
-    imgui.pop_style_var(3)
+    imgui.pop_style_var()
+
+
+def toolbar_places(sizes: list[int], room: float, side: float, gap: float) -> list[tuple[float, float]]:
+    """Return the places (x, y) of the buttons of groups of `sizes`, in columns not higher than `room`.
+
+    A group begins a new column where it does not fit into the rest of the last one.
+    """
+    places: list[tuple[float, float]] = []
+    x = y = 0.0
+    for size in sizes:
+        if places and y + size * side > room:
+            x, y = x + side, 0.0
+        for _ in range(size):
+            if y and y + side > room:
+                x, y = x + side, 0.0
+            places.append((x, y))
+            y += side
+        y += gap
+    return places
 
 
 def _tool_button(viewer: Viewer, command: Command, side: float) -> None:
@@ -113,6 +129,7 @@ def button_label(command: Command) -> str:
 # grow with the text.
 
 WIDTH_EM, HEIGHT_EM = 26.0, 20.0
+GAP_EM = 0.6  # from the keys to the scrollbar
 
 
 def draw_palette(viewer: Viewer) -> None:
@@ -137,7 +154,7 @@ def draw_palette(viewer: Viewer) -> None:
     escaped = imgui.is_key_pressed(imgui.Key.escape)
     imgui.end()
     if chosen is not None or escaped or (left and not imgui.is_window_appearing()):
-        settings.show_palette(viewer, False)
+        settings.put(viewer.state, show_palette=False)
     if chosen is not None:
         chosen.act(viewer)
 
@@ -148,7 +165,7 @@ def _clicked(found: list[Command], typing: bool) -> Command | None:
     if imgui.begin_child("found", child_flags=imgui.ChildFlags_.nav_flattened):
         if not found:
             imgui.text_colored(ui.muted(), "no command has these words")
-        right = imgui.get_content_region_avail().x - hello_imgui.em_size(0.6)  # to the scrollbar
+        right = imgui.get_content_region_avail().x - hello_imgui.em_size(GAP_EM)
         for place, command in enumerate(found):  # Enter does the one that is lit
             if imgui.selectable(command.does, place == 0 and typing)[0]:
                 chosen = command

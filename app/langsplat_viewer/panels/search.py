@@ -32,7 +32,8 @@ def _box(viewer: Viewer) -> None:
         imgui.set_keyboard_focus_here()
     flags = imgui.InputTextFlags_.enter_returns_true | imgui.InputTextFlags_.callback_history
     drafts, label = viewer.state.drafts, "##phrase"
-    completion = queries.completion(viewer, drafts.get(label, ""))
+    typed = drafts.get(label, "")
+    completion = next(iter(queries.offers(viewer, typed)[1]), "") if typed.strip() else ""
     if completion:
         flags |= imgui.InputTextFlags_.callback_completion  # else Tab goes on to the next widget
 
@@ -44,7 +45,6 @@ def _box(viewer: Viewer) -> None:
         data.insert_chars(0, text)
         return 0
 
-    typed = drafts.get(label, "")
     entered, drafts[label] = imgui.input_text_with_hint(label, hint(viewer), typed, flags, recalled)
     imgui.same_line()
     if imgui.button("Search") or entered:

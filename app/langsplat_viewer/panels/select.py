@@ -1,5 +1,6 @@
 """The panels "Select" and "Transform", and the strokes of tools and the gizmo over the scene."""
 
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,8 @@ from langsplat_core.errors import LangSplatError
 from langsplat_core.scene import Camera
 from langsplat_core.scene.transform import Similarity, moving, scaling, similarity
 from langsplat_viewer import marks
-from langsplat_viewer.actions import editing, queries, selecting, settings
+from langsplat_viewer.actions import editing, saving, settings
+from langsplat_viewer.commands import with_key
 from langsplat_viewer.marks import BRUSHES, MODES, REACHES, TOOLS, Marks, Mode, Tool
 from langsplat_viewer.panels import ui
 from langsplat_viewer.panels.overlays import say
@@ -22,36 +24,37 @@ from langsplat_viewer.session import Point
 from langsplat_viewer.state import EditForm, Gizmo
 from langsplat_viewer.viewer import Viewer
 
-CHANGES: tuple[ui.Verb, ...] = (
-    ("All", selecting.select_all, "Everything that is shown"),
-    ("None", selecting.select_none, "Nothing"),
-    ("Invert", selecting.invert_selection, "What was not selected"),
-    ("Grow", selecting.grow_selection, "And what is within reach along the surface"),
-    ("Shrink", selecting.shrink_selection, "Without what is within reach of the rest"),
-    ("More like it", selecting.select_alike, "Everything that is like what is selected, and that too"),
+Verb = tuple[str, Callable[[Viewer], object], str]  # button, action, tip
+CHANGES: tuple[Verb, ...] = (
+    ("All", editing.select_all, "Everything that is shown"),
+    ("None", editing.select_none, "Nothing"),
+    ("Invert", editing.invert_selection, "What was not selected"),
+    ("Grow", editing.grow_selection, "And what is within reach along the surface"),
+    ("Shrink", editing.shrink_selection, "Without what is within reach of the rest"),
+    ("More like it", editing.select_alike, "Everything that is like what is selected, and that too"),
 )
-FATES: tuple[ui.Verb, ...] = (
-    ("Hide", selecting.hide_selected, "Out of the picture"),
-    ("Isolate", selecting.isolate_selected, "Everything else out of the picture"),
-    ("Show all", selecting.show_hidden, "Everything that was hidden"),
-    ("Delete", selecting.delete_selected, "Out of the scene; its file stays as it is"),
+FATES: tuple[Verb, ...] = (
+    ("Hide", editing.hide_selected, "Out of the picture"),
+    ("Isolate", editing.isolate_selected, "Everything else out of the picture"),
+    ("Show all", editing.show_hidden, "Everything that was hidden"),
+    ("Delete", editing.delete_selected, "Out of the scene; its file stays as it is"),
 )
 OF_SELECTED = {
     *("None", "Grow", "Shrink", "More like it"),
     *("Hide", "Isolate", "Delete"),
     *("Selection", "Rest", "Points"),
 }
-FILES: tuple[ui.Verb, ...] = (
-    ("Selection", lambda viewer: selecting.export(viewer, Path.cwd(), "selection"), "A PLY with its field"),
-    ("Rest", lambda viewer: selecting.export(viewer, Path.cwd(), "rest"), "Everything else as a PLY"),
+FILES: tuple[Verb, ...] = (
+    ("Selection", lambda viewer: saving.export(viewer, Path.cwd(), "selection"), "A PLY with its field"),
+    ("Rest", lambda viewer: saving.export(viewer, Path.cwd(), "rest"), "Everything else as a PLY"),
     (
         "Points",
-        lambda viewer: selecting.export(viewer, Path.cwd(), "selection", as_points=True),
+        lambda viewer: saving.export(viewer, Path.cwd(), "selection", as_points=True),
         "The selection as a point cloud",
     ),
     (
         "Scene",
-        lambda viewer: selecting.export(viewer, Path.cwd(), "edited"),
+        lambda viewer: saving.export(viewer, Path.cwd(), "edited"),
         "The scene without what was deleted, as a new PLY",
     ),
 )
@@ -61,23 +64,22 @@ def draw(viewer: Viewer) -> None:
     """Draw the panel "Select": counts, tools, the search, verbs, files."""
     imgui.begin_disabled(viewer.state.scene is None)
     ui.small_wrapped(counts(viewer.state.marks), ui.muted())
-    disabled = () if viewer.state.marks.selected.any() else OF_SELECTED
     _tools(viewer)
     _found(viewer)
     imgui.separator()
-    ui.verbs(viewer, CHANGES, disabled)
+    _buttons(viewer, CHANGES)
     reach = ui.slider(
         "Reach", viewer.state.tools.reach, REACHES, "%.3f of the scene", logarithmic=True, ems=12
     )
-    selecting.set_tools(viewer, reach=reach)
+    editing.set_tools(viewer, reach=reach)
     _name(viewer)
     imgui.separator()
-    ui.verbs(viewer, FATES, disabled)
+    _buttons(viewer, FATES)
     imgui.separator()
     imgui.align_text_to_frame_padding()
     imgui.text("Save")
     imgui.same_line()
-    ui.verbs(viewer, FILES, disabled)
+    _buttons(viewer, FILES)
     imgui.end_disabled()
 
 
@@ -96,25 +98,25 @@ def _tools(viewer: Viewer) -> None:
         colour = imgui.Col_.button_active if active else imgui.Col_.button
         imgui.push_style_color(imgui.Col_.button, imgui.get_style_color_vec4(colour))
         if imgui.button(f"{tool.capitalize()}##tool"):
-            selecting.use_tool(viewer, None if active else tool)
+            editing.use_tool(viewer, None if active else tool)
         imgui.pop_style_color()
     mode = ui.radio({mode: mode.capitalize() for mode in MODES}, tools.mode)
     _, only = imgui.checkbox("Only what is visible", tools.only_visible)
-    selecting.set_tools(viewer, mode=mode, only_visible=only)
+    editing.set_tools(viewer, mode=mode, only_visible=only)
     ui.tip("Rectangle, lasso and brush leave out what lies behind something")
     if viewer.state.tools.tool == "brush":
         brush = ui.slider("Brush", tools.brush, BRUSHES, "%.3f of the height", logarithmic=True, ems=12)
-        selecting.set_tools(viewer, brush=brush)
+        editing.set_tools(viewer, brush=brush)
 
 
 def _found(viewer: Viewer) -> None:
-    query = selecting.chosen_query(viewer)
+    query = editing.chosen_query(viewer)
     result = None if query is None else viewer.state.result(query)
     if query is None or result is None:
         return
     name = ui.elided(query.phrase, imgui.get_content_region_avail().x - hello_imgui.em_size(4))
     if ui.button(f"Found: {name}##found", "Select what the search has found"):
-        selecting.select_query(viewer, query)
+        editing.select_query(viewer, query)
     things = viewer.state.answer(query).things
     if result.verdict == "not here" or len(things) < 2:
         return
@@ -123,15 +125,24 @@ def _found(viewer: Viewer) -> None:
             f"{number}##thing",
             f"{thing.count:,} Gaussians, {100 * thing.share:.0f} % of the answer, score {thing.score:.2f}",
         ):
-            selecting.select_thing(viewer, thing)
+            editing.select_thing(viewer, thing)
 
 
 def _name(viewer: Viewer) -> None:
     """Draw the box for a name by which what is selected is found from now on."""
     name = ui.kept_box(viewer, "##name", "a name for what is selected", "Name it")
     if name is not None:
-        queries.name_selection(viewer, name)
+        editing.name_selection(viewer, name)
     ui.tip("Searching for the name finds this, and what is like it")
+
+
+def _buttons(viewer: Viewer, verbs: Sequence[Verb]) -> None:
+    nothing = not viewer.state.marks.selected.any()
+    for place, (name, act, what) in enumerate(verbs):
+        if place:
+            ui.beside(name)
+        if ui.button(f"{name}##verb", with_key(what, act), enabled=not (nothing and name in OF_SELECTED)):
+            act(viewer)
 
 
 # Strokes: the left button while a tool selects.
@@ -157,12 +168,12 @@ def handle_stroke(viewer: Viewer, area: ui.Area) -> None:
     place = area.fraction(io.mouse_pos.x, io.mouse_pos.y)
     if tools.stroke is None:
         if imgui.is_mouse_clicked(imgui.MouseButton_.left) and not io.want_capture_mouse:
-            selecting.begin_stroke(viewer, *place)
+            editing.begin_stroke(viewer, *place)
     elif imgui.is_mouse_down(imgui.MouseButton_.left):
-        selecting.extend_stroke(viewer, *place)
+        editing.extend_stroke(viewer, *place)
     else:
-        selecting.extend_stroke(viewer, *place)
-        selecting.end_stroke(viewer, held_mode())
+        editing.extend_stroke(viewer, *place)
+        editing.end_stroke(viewer, held_mode())
 
 
 def held_mode() -> Mode | None:
@@ -180,7 +191,7 @@ def draw_stroke(viewer: Viewer, area: ui.Area) -> None:
         return
     paint = imgui.get_foreground_draw_list()
     paint.push_clip_rect(*area.corners)
-    drawn, radius = selecting.drawn_stroke(viewer), tools.brush * area.height
+    drawn, radius = editing.drawn_stroke(viewer), tools.brush * area.height
     for line in marks.outlines(drawn) if drawn is not None else []:
         points = _on_screen(line, area)
         if tools.tool == "brush":

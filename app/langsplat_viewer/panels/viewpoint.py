@@ -1,15 +1,14 @@
 """The panels "Camera", "Record" and "Bookmarks"."""
 
 import math
-from collections.abc import Sequence
 
-from imgui_bundle import hello_imgui, imgui
+from imgui_bundle import ImVec2, hello_imgui, imgui
 
-from langsplat_core.scene import Camera
-from langsplat_viewer.actions import filming, settings, viewpoint
+from langsplat_viewer.actions import saving, settings, viewpoint
 from langsplat_viewer.camera.controls import FOV_RANGE, OrbitCamera, adopt_up, level, with_fov
 from langsplat_viewer.camera.flight import Keyframe
 from langsplat_viewer.commands import with_key
+from langsplat_viewer.options import MAX_SIDE
 from langsplat_viewer.panels import ui
 from langsplat_viewer.rendering.request import Clip
 from langsplat_viewer.state import FPS_CHOICES
@@ -18,26 +17,25 @@ from langsplat_viewer.viewer import Viewer
 CUT_RANGE = (0.01, 20.0)  # of the scene's radius, the least and most that a cut can be chosen
 
 
-VIEWS: tuple[ui.Verb, ...] = (
-    ("Reset", viewpoint.reset_view, "Return to the opening view"),
-    ("Focus", viewpoint.focus_result, "Go to the latest answer"),
-    ("Frame all", viewpoint.frame_scene, "Show the whole scene from this side"),
-    ("Horizon", lambda viewer: viewpoint.move(viewer, level), "Turn the picture until the horizon is level"),
-    ("Align up", lambda viewer: viewpoint.move(viewer, adopt_up), "Take the picture's up as the world's up"),
-)
-
-
 def draw_camera(viewer: Viewer) -> None:
     """Draw the panel "Camera"."""
     state = viewer.state
     imgui.begin_disabled(state.view is None)
     if state.scene is not None and state.scene.cameras:
-        _training_cameras(viewer, state.scene.cameras)
-    ui.verbs(viewer, VIEWS)
+        _training_cameras(viewer)
+    if ui.button(with_key("Reset", viewpoint.reset_view), "Return to the opening view"):
+        viewpoint.reset_view(viewer)
+    if ui.next_button(with_key("Focus", viewpoint.focus_result)):
+        viewpoint.focus_result(viewer)
+    if ui.next_button("Frame all", with_key("Show the whole scene from this side", viewpoint.frame_scene)):
+        viewpoint.frame_scene(viewer)
+    if ui.button("Horizon", "Turn the picture until the horizon is level"):
+        viewpoint.move(viewer, level)
+    if ui.next_button("Align up", "Take the picture's up as the world's up axis"):
+        viewpoint.move(viewer, adopt_up)
     if state.view is not None:
         _projection(viewer, state.view)
-    if state.extent is not None:
-        _cuts(viewer, state.extent.radius)
+    _cuts(viewer)
     viewer.change("settings", **ui.draw_fields(state.session, "Camera"))
     settings.prefer(viewer, **ui.draw_fields(state.preferences, "Camera"))
     imgui.end_disabled()
@@ -46,8 +44,9 @@ def draw_camera(viewer: Viewer) -> None:
 def _projection(viewer: Viewer, view: OrbitCamera) -> None:
     """With perspective or without; the field of view is one of perspective."""
     text = with_key("Orthographic", viewpoint.toggle_orthographic)
-    _, orthographic = imgui.checkbox(f"{text}###orthographic", view.orthographic)
-    viewpoint.set_orthographic(viewer, orthographic)
+    changed, orthographic = imgui.checkbox(f"{text}###orthographic", view.orthographic)
+    if changed:
+        viewpoint.toggle_orthographic(viewer)
     ui.tip("No perspective: what is parallel looks parallel; the wheel changes the scale")
     before = view.intrinsics.fov_degrees
     imgui.begin_disabled(orthographic)
@@ -57,41 +56,46 @@ def _projection(viewer: Viewer, view: OrbitCamera) -> None:
         viewpoint.move(viewer, lambda view: with_fov(view, fov))
 
 
-def _cuts(viewer: Viewer, radius: float) -> None:
+def _cuts(viewer: Viewer) -> None:
     """Near and far cut; at the ends of their sliders there is none."""
-    clip, (low, high) = viewer.state.session.clip, (part * radius for part in CUT_RANGE)
+    extent, clip = viewer.state.extent, viewer.state.session.clip
+    if extent is None:
+        return
+    low, high = limits = CUT_RANGE[0] * extent.radius, CUT_RANGE[1] * extent.radius
     text = "%.3g" if clip.near else "off"
-    near = ui.slider("Near cut", max(clip.near, low), (low, high), text, logarithmic=True)
+    near = ui.slider("Near cut", max(clip.near, low), limits, text, logarithmic=True)
     ui.tip("Nearer than this nothing is drawn, to look into things; world units")
     text = "%.3g" if clip.far < high else "off"
-    far = ui.slider("Far cut", min(clip.far, high), (low, high), text, logarithmic=True)
+    far = ui.slider("Far cut", min(clip.far, high), limits, text, logarithmic=True)
     ui.tip("Farther than this nothing is drawn; world units")
     clip = Clip(0.0 if near < 1.001 * low else near, math.inf if far > 0.999 * high else far)
     settings.set_clip(viewer, clip)
 
 
-def _training_cameras(viewer: Viewer, cameras: Sequence[Camera]) -> None:
-    for by, label, direction in ((-1, "##previous", imgui.Dir.left), (1, "##next", imgui.Dir.right)):
-        if imgui.arrow_button(label, direction):
-            viewpoint.step_camera(viewer, by)
-        imgui.same_line()
-    index = viewer.state.camera_index or 0
+def _training_cameras(viewer: Viewer) -> None:
+    state = viewer.state
+    assert state.scene is not None
+    if imgui.arrow_button("##previous", imgui.Dir.left):
+        viewpoint.step_camera(viewer, -1)
+    imgui.same_line()
+    if imgui.arrow_button("##next", imgui.Dir.right):
+        viewpoint.step_camera(viewer, 1)
+    imgui.same_line()
+    index = state.camera_index or 0
     imgui.set_next_item_width(-1)
-    name = cameras[index].name.replace("%", "%%")
-    changed, wanted = imgui.slider_int("##camera", index, 0, len(cameras) - 1, f"camera %d  {name}")
+    name = state.scene.cameras[index].name.replace("%", "%%")
+    changed, index = imgui.slider_int(
+        "##camera", index, 0, len(state.scene.cameras) - 1, f"camera %d  {name}"
+    )
     ui.tip("Training cameras: stand where a photograph was taken")
-    if changed and wanted != viewer.state.camera_index:
-        viewpoint.go_to_camera(viewer, wanted)
+    if changed and index != state.camera_index:
+        viewpoint.go_to_camera(viewer, index)
 
 
 # The panel "Record": keyframes of the camera path, playing it, films of it.
 
 ROWS = 3.5  # of the list: the half one says that there are more
 NUMBER_EM, FPS_EM = 7.5, 4.5
-FILMS: tuple[ui.Verb, ...] = (
-    ("Save film", filming.save_film, ""),
-    ("Save picture##sized", filming.save_sized_picture, "What is shown now, in this size"),
-)
 
 
 def draw_record(viewer: Viewer) -> None:
@@ -99,7 +103,7 @@ def draw_record(viewer: Viewer) -> None:
     record = viewer.state.record
     turns = ui.radio({False: "Keyframes", True: "Turntable"}, record.turns)
     if turns != record.turns:
-        filming.set_turning(viewer, turns)
+        viewpoint.set_turning(viewer, turns)
     ui.tip("Once around what the view turns around; F makes that the latest result")
     imgui.begin_disabled(viewer.state.view is None)
     _play(viewer)
@@ -114,10 +118,12 @@ def draw_record(viewer: Viewer) -> None:
 def _play(viewer: Viewer) -> None:
     record, seconds = viewer.state.record, viewpoint.path_seconds(viewer)
     imgui.begin_disabled(seconds <= 0)
-    label = "Stop##path" if record.began is not None else "Play##path"
-    ui.verbs(viewer, [(label, viewpoint.toggle_playing, "Play")])
+    if ui.button(
+        "Stop##path" if record.began is not None else "Play##path", with_key("Play", viewpoint.toggle_playing)
+    ):
+        viewpoint.toggle_playing(viewer)
     imgui.same_line()
-    loop = ui.width_of("Loop") + imgui.get_frame_height() + 2 * imgui.get_style().item_spacing.x
+    loop = imgui.calc_text_size("Loop").x + imgui.get_frame_height() + 2 * imgui.get_style().item_spacing.x
     imgui.set_next_item_width(-loop)
     changed, at = imgui.slider_float("##at", record.at, 0.0, max(seconds, 1e-3), "%.2f s")
     if changed:
@@ -132,7 +138,7 @@ def _duration(viewer: Viewer) -> None:
     imgui.begin_disabled(seconds <= 0)
     wanted = _number("Duration", seconds, 1.0)
     if wanted is not None:
-        filming.set_path_seconds(viewer, wanted)
+        viewpoint.set_path_seconds(viewer, wanted)
     imgui.end_disabled()
 
 
@@ -146,31 +152,39 @@ def _number(label: str, value: float, step: float) -> float | None:
 
 def _keyframes(viewer: Viewer) -> None:
     record, keyframes = viewer.state.record, viewer.state.session.keyframes
-    edits = ("Add keyframe", filming.add_keyframe, "The current view"), ("Clear", filming.clear_path, "")
-    ui.verbs(viewer, edits, () if keyframes else ("Clear",))
+    if ui.button("Add keyframe", with_key("The current view", viewpoint.add_keyframe)):
+        viewpoint.add_keyframe(viewer)
+    if ui.next_button("Clear", enabled=bool(keyframes)):
+        viewpoint.clear_path(viewer)
     ui.beside("Duration", hello_imgui.em_size(NUMBER_EM))
     _duration(viewer)
-    rows = [
-        ui.Row(f"{number}   {key.seconds:.2f} s", key is record.chosen)
-        for number, key in enumerate(keyframes, 1)
-    ]
-    empty = "Add the current view; the path goes smoothly from one to the next"
-    clicked, gone = ui.listed("keyframes", rows, empty, ROWS)
-    if clicked is not None:
-        filming.choose_keyframe(viewer, keyframes[clicked])
-    if gone is not None:
-        filming.delete_keyframe(viewer, keyframes[gone])
+    height = ROWS * imgui.get_frame_height_with_spacing()
+    if imgui.begin_child("keyframes", ImVec2(0, height), imgui.ChildFlags_.borders):
+        if not keyframes:
+            ui.small_wrapped("Add the current view; the path goes smoothly from one to the next", ui.muted())
+        for number, key in enumerate(keyframes, 1):
+            imgui.push_id(number)
+            text = f"{number}   {key.seconds:.2f} s"
+            clicked, gone = ui.row(text, "keyframe", key is record.chosen)
+            ui.tip("Take it off the path")
+            if clicked:
+                viewpoint.choose_keyframe(viewer, key)
+            if gone:
+                viewpoint.delete_keyframe(viewer, key)
+            imgui.pop_id()
+    imgui.end_child()
     _chosen(viewer, record.chosen)
-    ui.verbs(viewer, [("Save path", filming.save_path, "A new file; dropped onto the window, it comes back")])
+    if ui.button("Save path", "A new file; dropped onto the window, it comes back"):
+        saving.save_path(viewer)
 
 
 def _chosen(viewer: Viewer, key: Keyframe | None) -> None:
     imgui.begin_disabled(key is None)
     seconds = _number("##time of the keyframe", 0.0 if key is None else key.seconds, 0.5)
     if seconds is not None and key is not None:
-        filming.move_keyframe(viewer, key, seconds)
+        viewpoint.move_keyframe(viewer, key, seconds)
     if ui.next_button("Set to this view") and key is not None:
-        filming.replace_keyframe(viewer, key)
+        viewpoint.replace_keyframe(viewer, key)
     ui.tip("Put the current view in its place")
     imgui.end_disabled()
 
@@ -181,7 +195,8 @@ def _films(viewer: Viewer) -> None:
     imgui.set_next_item_width(hello_imgui.em_size(NUMBER_EM))
     changed, size = imgui.input_int2("Size", list(record.size))
     if changed:
-        filming.set_film_size(viewer, *size)
+        width, height = (min(max(side, 1), MAX_SIDE) for side in size)
+        settings.put(record, size=(width, height))
     ui.beside("fps", hello_imgui.em_size(FPS_EM))
     imgui.set_next_item_width(hello_imgui.em_size(FPS_EM))
     if imgui.begin_combo("fps", f"{record.fps:g}"):
@@ -196,9 +211,12 @@ def _films(viewer: Viewer) -> None:
     work = viewer.recorder.current
     if work is not None:
         if ui.stoppable(*work, tag="film"):
-            filming.cancel_film(viewer)
+            saving.cancel_film(viewer)
         return
-    ui.verbs(viewer, FILMS)
+    if imgui.button("Save film"):
+        saving.save_film(viewer)
+    if ui.next_button("Save picture##sized", "What is shown now, in this size"):
+        saving.save_sized_picture(viewer)
 
 
 # The panel "Bookmarks".
@@ -208,14 +226,21 @@ def draw_bookmarks(viewer: Viewer) -> None:
     """Draw the panel "Bookmarks": a box for a name, and the list."""
     state = viewer.state
     imgui.begin_disabled(state.view is None)
-    name = ui.kept_box(viewer, "##bookmark", "name of this view", "Keep")
+    hint = "name of this view"
+    name = ui.kept_box(viewer, "##bookmark", hint, "Keep")
     if name is not None:
         viewpoint.add_bookmark(viewer, name)
     imgui.end_disabled()
-    bookmarks, words = state.session.bookmarks, "views that you keep are listed here"
-    rows = [ui.Row(bookmark.name) for bookmark in bookmarks]
-    clicked, gone = ui.listed("bookmarks", rows, with_key(words, viewpoint.add_bookmark))
-    if clicked is not None:
-        viewpoint.go_to_bookmark(viewer, bookmarks[clicked])
-    if gone is not None:
-        viewpoint.delete_bookmark(viewer, bookmarks[gone])
+    if imgui.begin_child("bookmarks"):
+        if not state.session.bookmarks:
+            words = "views that you keep are listed here"
+            ui.small_wrapped(with_key(words, viewpoint.add_bookmark), ui.muted())
+        for number, bookmark in enumerate(state.session.bookmarks):
+            imgui.push_id(number)
+            clicked, gone = ui.row(bookmark.name, "bookmark", False)
+            if clicked:
+                viewpoint.go_to_bookmark(viewer, bookmark)
+            if gone:
+                viewpoint.delete_bookmark(viewer, bookmark)
+            imgui.pop_id()
+    imgui.end_child()

@@ -15,13 +15,12 @@ from langsplat_core.extensions.library.index import THUMBNAIL, Library, update_l
 from langsplat_core.progress import Progress
 from langsplat_core.query.engine import LoadEncoder
 from langsplat_core.query.rule import Verdict
-from langsplat_viewer.actions.browsing import ask_for_folder
-from langsplat_viewer.actions.opening import open_scene
+from langsplat_viewer.actions.opening import ask_for, open_scene
 from langsplat_viewer.actions.queries import ask
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.panels import ui
 from langsplat_viewer.panels.layout import MIDDLE, Panel
-from langsplat_viewer.state import FolderChoice
+from langsplat_viewer.state import FileChoice
 from langsplat_viewer.viewer import Viewer
 
 TITLE = "Library"
@@ -110,7 +109,7 @@ def draw_library(viewer: Viewer) -> None:
     if ui.button(
         "Folder ...", "Search all scenes of a folder and the folders in it. An index of them is kept there"
     ):
-        ask_for_folder(viewer, FolderChoice("Folder of scenes", open_library))
+        ask_for(viewer, FileChoice("Folder of scenes", open_library, is_folder=True))
     if view is None:
         return
     imgui.same_line()

@@ -1,0 +1,319 @@
+"""What is written: pictures, views and films, parts of the scene, projects; and the question before leaving.
+
+Everything goes to new files, never over old ones, but a project to the file that it came from.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import wait
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from langsplat_core.arrays import Array
+from langsplat_core.errors import InputError
+from langsplat_core.io import cameras, sidecar
+from langsplat_core.io.cameras import write_cameras
+from langsplat_core.io.scenes import save_scene
+from langsplat_core.io.shapes import write_points
+from langsplat_core.progress import Progress
+from langsplat_core.scene import Scene
+from langsplat_viewer.actions.editing import has_scene, has_selection
+from langsplat_viewer.actions.viewpoint import path_motion
+from langsplat_viewer.camera.controls import with_projection
+from langsplat_viewer.camera.flight import pose_of
+from langsplat_viewer.files.projects import PATHS, PROJECTS, Project, write_flight, write_project
+from langsplat_viewer.options import say_compiling
+from langsplat_viewer.output import (
+    VIDEO,
+    Shot,
+    cameras_of,
+    check_film,
+    draw_something,
+    free_name,
+    has_video,
+    make_film,
+    save_png,
+)
+from langsplat_viewer.rendering.renderer import open_renderer
+from langsplat_viewer.session import Bookmark, Note, Query
+from langsplat_viewer.state import Leaving, ViewerState, flight_of
+from langsplat_viewer.viewer import Viewer
+
+
+def _new_file(viewer: Viewer, folder: Path, suffix: str, more: str = "") -> Path:
+    """Return a free name in `folder`, after the scene's."""
+    path = viewer.state.path
+    return free_name(folder, f"{'scene' if path is None else path.stem}{more}", suffix)
+
+
+# Pictures, views and paths.
+
+
+def save_picture(viewer: Viewer, folder: Path = Path()) -> Path | None:
+    """Save the scene as shown to a new PNG in `folder`; returns its path, None if that failed."""
+    state = viewer.state
+    if viewer.surface is None or state.scene is None or state.view is None:
+        viewer.say_error("open a scene first, then save a picture of it")
+        return None
+    path = _new_file(viewer, folder, ".png")
+    surface, other, transparent = viewer.surface, viewer.beside, state.session.picture.transparent
+
+    def write() -> None:
+        images = [surface.capture(state.request(transparent=transparent))]
+        if other is not None and other.surface is not None and other.state.scene is not None:
+            images.append(other.surface.capture(other.state.request(transparent=transparent)))
+        save_png(path, state.session.split.joined(images, images[0].shape[1]))
+
+    return viewer.save(path, write)
+
+
+def save_sized_picture(viewer: Viewer, folder: Path = Path()) -> None:
+    """Have the scene as shown drawn in the size of a film and saved under a new name in `folder`."""
+    state, (width, height) = viewer.state, viewer.state.record.size
+    if state.view is None:
+        viewer.say_error("open a scene first, then save a picture of it")
+        return
+    request = state.request((width, height), state.session.picture.transparent)
+
+    def work(progress: Progress) -> str:
+        say_compiling(progress)
+        path = _new_file(viewer, folder, ".png", f"-{width}x{height}")
+        with open_renderer("cpu") as renderer:
+            save_png(path, draw_something(request, renderer))
+        return f"saved {path}"
+
+    viewer.recorder.submit(f"picture of {width} x {height}", work, state.say, viewer.say_error)
+
+
+def save_view(viewer: Viewer, folder: Path = Path()) -> Path | None:
+    """Save the camera, in perspective, to a new file that `--camera` reads; its path, None if that failed."""
+    state = viewer.state
+    if state.view is None:
+        viewer.say_error("open a scene first, then save a view of it")
+        return None
+    path = _new_file(viewer, folder, ".json", "-view")
+    camera = with_projection(state.view, orthographic=False).camera(*state.size)
+    span = f" --orthographic {state.view.span_in(*state.size):.6g}" if state.view.orthographic else ""
+    more = f"; show it again with --camera {path.name}{span}"
+    return viewer.save(path, lambda: write_cameras(path, (camera,)), more)
+
+
+def save_path(viewer: Viewer, folder: Path = Path()) -> Path | None:
+    """Save the camera path to a new file in `folder`; None where that failed."""
+    keyframes = viewer.state.session.keyframes
+    if not keyframes:
+        viewer.say_error("a path to save needs a keyframe: add one at the current view")
+        return None
+    path = _new_file(viewer, folder, PATHS)
+    more = "; langsplat-viewer --headless --path makes a film of it"
+    return viewer.save(path, lambda: write_flight(path, flight_of(keyframes)), more)
+
+
+# Films, drawn by the CPU on a thread of their own.
+
+
+def save_film(viewer: Viewer, folder: Path = Path()) -> None:
+    """Have a film made along the path, to the typed place or to a new name in `folder`."""
+    state, record, motion = viewer.state, viewer.state.record, path_motion(viewer)
+    if motion is None or state.extent is None:
+        viewer.say_error("a film needs a path: add a keyframe, or choose a turntable")
+        return
+    typed, request = record.film_file.strip(), state.request(record.size)
+    try:
+        new = folder.absolute() / typed
+        if not typed:
+            new = _new_file(viewer, folder, VIDEO if has_video() else "", "-film")
+        out = check_film(new, record.size)
+        shot = Shot(request, cameras_of(motion, state.extent, record.fps, record.size), record.fps, "cpu")
+    except (InputError, OSError) as error:
+        viewer.say_error(f"no film: {error}")
+        return
+
+    def work(progress: Progress) -> str:
+        say_compiling(progress)
+        return "; ".join(make_film(shot, out, progress))
+
+    viewer.recorder.submit(f"film {out.name}", work, state.say, viewer.say_error)
+
+
+def cancel_film(viewer: Viewer) -> None:
+    """Stop what is being drawn."""
+    viewer.recorder.cancel()
+    viewer.state.say("film stopped")
+
+
+# The selection, the rest, or the scene without what was deleted.
+
+Part = Literal["selection", "rest", "edited"]
+COMPANIONS = (sidecar.SUFFIX, cameras.SUFFIX)
+LONGEST_WAIT = 60.0  # seconds that a window which is closed waits for what is being written
+
+
+def export(
+    viewer: Viewer,
+    folder: Path,
+    part: Part,
+    as_points: bool = False,
+    then: Callable[[Viewer], None] = lambda viewer: None,
+) -> None:
+    """Have the worker write a part of the scene to a new file in `folder`.
+
+    It is a PLY with its language field and cameras, or a point cloud. `then` runs once it is written; if that
+    fails the reason is said.
+    """
+    if not (has_scene(viewer) if part == "edited" else has_selection(viewer)):
+        return
+    state, marks, session = viewer.state, viewer.state.marks, viewer.state.session
+    assert state.scene is not None
+    shown, scene = state.scene, replace(state.scene, language=viewer.language)
+    parts = {"selection": marks.selected, "rest": marks.kept & ~marks.selected, "edited": marks.kept}
+    rows = np.flatnonzero(parts[part])
+    if len(rows) == 0:
+        viewer.say_error(f"the {part} holds no Gaussians: nothing to write")
+        return
+    stem = f"{state.path.stem if state.path else 'scene'}-{part}{'-points' if as_points else ''}"
+
+    def done(written: tuple[Path, int]) -> None:
+        path, count = written
+        state.say(f"saved {path}: {count:,} {'points' if as_points else 'Gaussians'}")
+        if part == "edited" and not as_points and state.scene is shown:
+            state.saved = replace(state.saved, marks=session.marks, moves=session.moves)
+        then(viewer)
+
+    state.writing = viewer.run(
+        f"saving the {part}",
+        lambda progress: _write(scene, rows, folder, stem, as_points),
+        done,
+        lambda reason: viewer.say_error(f"not saved: {reason}"),
+    ).future
+
+
+def _write(scene: Scene, rows: Array, folder: Path, stem: str, as_points: bool) -> tuple[Path, int]:
+    path = free_name(folder, stem, ".ply", () if as_points else COMPANIONS)
+    if as_points:
+        return path, write_points(path, scene.gaussians.take(rows))
+    save_scene(path, replace(scene.take(rows), path=path))
+    return path, len(rows)
+
+
+def finish_writing(viewer: Viewer) -> None:
+    """Wait until what is being written is there: the window closes, and the worker's thread ends with it."""
+    if viewer.state.writing is not None:
+        wait([viewer.state.writing], LONGEST_WAIT)
+
+
+# Projects.
+
+
+def save_project(viewer: Viewer, folder: Path = Path()) -> Path | None:
+    """Save the project to the file that it came from, or to a new one in `folder`; None where that failed."""
+    state = viewer.state
+    if state.scene is None or state.path is None or state.view is None:
+        viewer.say_error("open a scene first, then save the project")
+        return None
+    path = state.project or _new_file(viewer, folder, PROJECTS)
+    project = Project(
+        scene=str(state.path.absolute()),
+        gaussians=len(state.scene.gaussians),
+        view=Bookmark("view", pose_of(state.view), state.view.distance),
+        session=state.session,
+        intrinsics=state.view.intrinsics,
+        panels=state.preferences.panels or (),
+    )
+    answers = [_answer(state, query) for query in state.session.queries]
+    if viewer.save(path, lambda: write_project(path, project, answers)) is None:
+        return None
+    state.project, state.saved = path, state.session
+    state.preferences = state.preferences.with_recent(path)
+    return path
+
+
+def _answer(state: ViewerState, query: Query) -> dict[str, Any]:
+    """Return the answer to a query as a project keeps it, for other programs."""
+    answer, result, scene = state.answer(query), state.result(query), state.scene
+    if result is None or scene is None:
+        return {"phrase": query.phrase, "problem": answer.problem}
+    inside = [note.text for note in state.session.notes if result.members[_nearest(scene, note)]]
+    return {
+        "phrase": query.phrase,
+        "verdict": result.verdict,
+        "probability": result.probability,
+        "place": None if result.place is None else [float(part) for part in result.place],
+        "gaussians": int(result.members.sum()),
+        "boxes": [thing.box.tolist() for thing in answer.things],
+        "notes": inside,
+    }
+
+
+def _nearest(scene: Scene, note: Note) -> int:
+    """Return the Gaussian whose centre is nearest to a note."""
+    with np.errstate(all="ignore"):
+        away = ((scene.gaussians.means.astype(np.float64) - np.array(note.at)) ** 2).sum(1)
+    return int(np.nanargmin(np.where(np.isfinite(away), away, np.inf)))
+
+
+# Another scene, or none: what was deleted and not saved is asked about first.
+
+
+def leave(viewer: Viewer, then: Callable[[Viewer], None], to: str, loses_more: bool = False) -> None:
+    """Do `then`: at once if nothing is lost by it, else when that was answered; `to` says what it is."""
+    if viewer.state.is_unsaved or loses_more:
+        viewer.state.leaving = Leaving(then, to)
+    else:
+        then(viewer)
+
+
+def quit_viewer(viewer: Viewer) -> None:
+    """Close the window; ask first where something would be lost."""
+    leave(viewer, _close, "the window closes", viewer.state.has_unsaved_notes)
+
+
+def may_close(viewer: Viewer) -> bool:
+    """Return whether the window may close now; where not, ask."""
+    if not viewer.state.may_close:
+        quit_viewer(viewer)
+    return viewer.state.may_close
+
+
+def _close(viewer: Viewer) -> None:
+    if viewer.recorder.current is not None:
+        viewer.state.leaving = Leaving(_close, "the window closes", film=True)
+    else:
+        end_at_once(viewer)
+
+
+def end_at_once(viewer: Viewer) -> None:
+    """Close, whatever is lost."""
+    viewer.state.leaving, viewer.state.may_close = None, True
+
+
+def end(viewer: Viewer, folder: Path = Path()) -> None:
+    """Close without a question: what would be lost is first written to new files in `folder`."""
+    if viewer.state.has_unsaved_notes:
+        save_project(viewer, folder)
+    if viewer.state.is_unsaved:
+        export(viewer, folder, "edited", then=end_at_once)
+    else:
+        end_at_once(viewer)
+
+
+def go_on(viewer: Viewer) -> None:
+    """Do what waited for an answer, whatever is lost."""
+    leaving, viewer.state.leaving = viewer.state.leaving, None
+    if leaving is not None:
+        leaving.then(viewer)
+
+
+def save_and_leave(viewer: Viewer, folder: Path = Path()) -> None:
+    """Write the scene without what was deleted to a new file in `folder`, and go on once it is there."""
+    leaving, viewer.state.leaving = viewer.state.leaving, None
+    if leaving is not None:
+        export(viewer, folder, "edited", then=leaving.then)
+
+
+def save_project_and_leave(viewer: Viewer, folder: Path = Path()) -> None:
+    """Save the project and go on; where it cannot be saved one stays."""
+    if save_project(viewer, folder) is not None:
+        go_on(viewer)
