@@ -409,13 +409,6 @@ class BudgetConfig:
 
 
 @dataclass(frozen=True)
-class CompactConfig(BudgetConfig):
-    """Settings of `langsplat compact`: the error allowed, and the views it is measured on."""
-
-    phrases: tuple[str, ...] = ()  # asked before and after, beside those in the scene's phrasebook
-
-
-@dataclass(frozen=True)
 class CleanConfig(BudgetConfig):
     """Settings of `langsplat clean`: the error allowed, its views, and what may be a floater."""
 

@@ -10,8 +10,8 @@ from assets.making.dataset import write_dataset
 from assets.making.truth import TruthMasks, read_truth
 from langsplat_core.compaction.compact import compact_scene
 from langsplat_core.config import (
+    BudgetConfig,
     ClipConfig,
-    CompactConfig,
     DatasetConfig,
     MaskConfig,
     RadianceConfig,
@@ -57,6 +57,6 @@ def build_scene(out: Path, gaussians: Path | None = None, progress: Progress = s
     )
     if gaussians:
         return f"{made.gaussians} Gaussians of {gaussians}, {made.codec} of {made.codec_size}"
-    report = compact_scene(trained, out, CompactConfig(max_psnr_loss=MAX_LOSS), photographs, progress)
+    report = compact_scene(trained, out, BudgetConfig(max_psnr_loss=MAX_LOSS), photographs, progress)
     kept, before = report.after, report.before.gaussians
     return f"{kept.gaussians} Gaussians of {before} trained, held-out {kept.psnr:.2f} dB"

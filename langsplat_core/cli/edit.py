@@ -15,7 +15,7 @@ from rich.table import Table
 from langsplat_core.arrays import Array
 from langsplat_core.cli.arguments import AnyScene, OutFile, WrittenScene
 from langsplat_core.cli.run import OutputConsole, print_json
-from langsplat_core.config import CleanConfig, CompactConfig, Positive, Range
+from langsplat_core.config import BudgetConfig, CleanConfig, Positive, Range
 from langsplat_core.errors import InputError
 from langsplat_core.io.ply import write_metres
 from langsplat_core.io.scenes import (
@@ -203,7 +203,7 @@ class Compact:
     """Dataset the scene was trained on: the loss is then measured against its photographs."""
     json: bool = False
     """Print JSON."""
-    config: Annotated[CompactConfig, tyro.conf.arg(name="")] = field(default_factory=CompactConfig)
+    config: Annotated[BudgetConfig, tyro.conf.arg(name="")] = field(default_factory=BudgetConfig)
 
     def run(self) -> None:
         from langsplat_core.compaction.compact import compact_scene
@@ -249,9 +249,6 @@ def _notes(report: "CompactReport") -> list[str]:
         f"views: {report.ranking_views} ranked the Gaussians, {report.measuring_views} others measured; "
         f"{report.views_from}",
     ]
-    for answer in report.answers:
-        place = "no place" if answer.moved is None else f"place moved by {answer.moved:.3g}"
-        lines.append(f"{answer.phrase}: {'same answer' if answer.same else 'ANOTHER ANSWER'}, {place}")
     return lines
 
 

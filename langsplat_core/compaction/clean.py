@@ -12,20 +12,21 @@ five programs, 0.8 to 1.4 % of the Gaussians are in regions that 1.25 extents le
 its centre lies before the surface that is seen through it (the median depth). Veils are found
 first and are no part of regions, which they would bridge.
 
-**Visibility.** What contributes the least to any view (`views.contributions`) goes first, as many as the
+**Visibility.** What contributes the least to any view (`compact.contributions`) goes first, as many as the
 loss, measured on other views, allows.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from langsplat_core.arrays import Array, rotation_matrices
-from langsplat_core.compaction.views import (
-    MeasuringView,
+from langsplat_core.compaction.compact import (
     Views,
     choose_views,
     contributions,
@@ -170,12 +171,19 @@ def clean(
     found = find_floaters(scene, views.ranking, config.region, progress)
     cost = contributions(scene, views.ranking, progress)
     suspects = np.flatnonzero(found.suspicion)
-    trial = _Trial(scene, measured, config, progress)
+    keep = np.ones(len(valid), bool)
+
+    def losses() -> Array:
+        return psnr_losses(scene.take(keep), measured, config.assumed_psnr)
+
+    trial = _Trial(keep, losses, config.max_psnr_loss, progress)
     if views.photographs[0] is None:
         _by_change(trial, suspects[np.argsort(cost[suspects], kind="stable")])
     else:
-        _by_photographs(trial, suspects[np.lexsort((cost[suspects], -found.suspicion[suspects]))])
-    losses, keep = trial.losses(), trial.keep & valid
+        order = suspects[np.lexsort((cost[suspects], -found.suspicion[suspects]))]
+        _by_photographs(trial, order, scene.gaussians.means)
+    lost = losses()
+    keep &= valid
     gone = valid & ~keep
     report = CleanReport(
         gaussians=len(keep),
@@ -184,8 +192,8 @@ def clean(
         free_space=int((gone & ~found.region).sum()),
         kept=int((found.suspicion[keep] > 0).sum()),
         budget=config.max_psnr_loss,
-        loss=float(losses.mean()),
-        worst_loss=float(losses.max()),
+        loss=float(lost.mean()),
+        worst_loss=float(lost.max()),
         psnr_before=mean_psnr(scene, measured),
         psnr_after=mean_psnr(scene.take(keep), measured),
         assumed_psnr=config.assumed_psnr if views.photographs[0] is None else None,
@@ -195,21 +203,11 @@ def clean(
     return keep, report
 
 
-@dataclass(eq=False)
-class _Trial:
-    """A scene of N Gaussians without some of them, measured."""
-
-    scene: Scene
-    measured: list[MeasuringView]
-    config: CleanConfig
+class _Trial(NamedTuple):
+    keep: Array  # (N,) bool, changed in place
+    losses: Callable[[], Array]  # (V,) dB that the measuring views lose without the rest
+    budget: float
     progress: Progress
-
-    def __post_init__(self) -> None:
-        self.keep = np.ones(len(self.scene.gaussians), bool)
-
-    def losses(self) -> Array:
-        """(V,) dB that the measuring views lose with what is removed so far."""
-        return psnr_losses(self.scene.take(self.keep), self.measured, self.config.assumed_psnr)
 
 
 def _by_change(trial: _Trial, rising: Array) -> None:
@@ -218,7 +216,7 @@ def _by_change(trial: _Trial, rising: Array) -> None:
     middle = len(rising)  # first all of them
     while middle > low:
         trial.keep[rising] = np.arange(len(rising)) >= middle
-        if trial.losses().mean() <= trial.config.max_psnr_loss:
+        if trial.losses().mean() <= trial.budget:
             low = middle
         else:
             high = middle
@@ -227,7 +225,7 @@ def _by_change(trial: _Trial, rising: Array) -> None:
     trial.keep[rising] = np.arange(len(rising)) >= low
 
 
-def _by_photographs(trial: _Trial, order: Array) -> None:
+def _by_photographs(trial: _Trial, order: Array, means: Array) -> None:
     """Remove what photographs do not miss, and as many more as the budget allows.
 
     Groups of `order` are removed one after the other. What a group adds to the mean loss, and the standard
@@ -236,8 +234,8 @@ def _by_photographs(trial: _Trial, order: Array) -> None:
     What was removed while others still hid its worth is found last: what lies together is measured again
     without all others, and the dearest come back until the rest is within the budget.
     """
-    keep, budget = trial.keep, trial.config.max_psnr_loss
-    losses, spent, done = np.zeros(len(trial.measured)), 0.0, 0
+    keep, budget = trial.keep, trial.budget
+    losses, spent, done = np.zeros(1), 0.0, 0  # nothing is lost in any view
     resolution = 96  # groups are halved down to this fraction of the floaters
     least = max(len(order) // resolution, 1)
     waiting = [group for group in np.array_split(order, 12) if len(group)][::-1]
@@ -256,7 +254,7 @@ def _by_photographs(trial: _Trial, order: Array) -> None:
         done += len(group)
         trial.progress("removing within the budget", done / len(order))
     rows = np.flatnonzero(~keep)
-    rows = rows[np.argsort(along_curve(trial.scene.gaussians.means[rows]))]
+    rows = rows[np.argsort(along_curve(means[rows]))]
     gone = [group for group in np.array_split(rows, resolution) if len(group)]
     costs = np.zeros(len(gone))
     for index, group in enumerate(gone):

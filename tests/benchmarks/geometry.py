@@ -11,7 +11,7 @@ from assets.making.dataset import photographed_room
 from assets.making.objects.furniture import TABLE_HEIGHT
 from langsplat_core.arrays import Array, logit, sigmoid
 from langsplat_core.compaction.clean import clean, find_floaters
-from langsplat_core.compaction.views import Views, choose_views, mean_psnr
+from langsplat_core.compaction.compact import Views, choose_views, mean_psnr
 from langsplat_core.config import CleanConfig
 from langsplat_core.extensions.benchmarks.report import markdown
 from langsplat_core.extensions.geometry.mesh import fuse
