@@ -24,7 +24,6 @@ from langsplat_core.arrays import Array, unit
 from langsplat_core.config import CountOrZero
 from langsplat_core.extensions.benchmarks.report import markdown
 from langsplat_core.extensions.library.changes import Change, changes
-from langsplat_core.extensions.library.finding import rank
 from langsplat_core.extensions.library.index import (
     KINDS,
     THUMBNAIL,
@@ -33,6 +32,7 @@ from langsplat_core.extensions.library.index import (
     Listed,
     digest,
     fits_in,
+    rank,
     read_library,
     write_library,
 )

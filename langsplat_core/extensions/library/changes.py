@@ -75,16 +75,10 @@ class _Piece:
     gone: float  # pixels
     coloured: float
     kept: float
-    seen: int  # images
     colour: Array  # (3,) mean L*a*b* as rendered
     other: Array  # (3,) the other scene's at its kept pixels
     meaning: Array  # (D,) unit, from the scene's mean
     points: Array  # (M, 3) in the first scene's frame
-
-    @property
-    def share(self) -> float:
-        """Share of its pixels that changed, in [0, 1]."""
-        return (self.gone + self.coloured) / max(self.gone + self.kept, 1e-9)
 
     @property
     def is_absent(self) -> bool:
@@ -95,10 +89,6 @@ class _Piece:
     def box(self) -> Array:
         """(2, 3) corners."""
         return axis_aligned_box(self.points)
-
-    @property
-    def size(self) -> float:
-        return float(np.linalg.norm(self.box[1] - self.box[0]))
 
 
 def changes(
@@ -224,19 +214,28 @@ def colour_term(lab: Array) -> str:
 
 
 def _pieces(engine: QueryEngine, evidence: Array, into: Array) -> list[_Piece]:
+    """Pieces that changed. Those of one thing are one: they meet, mean the same, and changed alike."""
     tree, members = engine.tree, engine.tree.gaussians()
-    changed: list[int] = []
     inside = np.zeros(tree.count, bool)
-    whole = _codewords_seen(engine)
+    features = _codewords_seen(engine)
+    made: list[_Piece] = []
     for node in range(tree.count - 1, -1, -1):  # parents first
         parent = tree.parents[node]
-        if parent >= 0 and inside[parent]:
-            inside[node] = True
-        elif _has_changed(evidence[members[node]]):
-            inside[node] = True
-            changed.append(node)
-    made = [_piece(engine, evidence, into, members[node], whole) for node in changed]
-    return _together(engine, evidence, into, made, whole)
+        within = parent >= 0 and bool(inside[parent])
+        inside[node] = within or _has_changed(evidence[members[node]])
+        if inside[node] and not within:
+            made.append(_piece(engine, evidence, into, members[node], features))
+    kept: list[_Piece] = []
+    for piece in sorted(made, key=lambda piece: -len(piece.rows)):
+        for place, other in enumerate(kept):
+            alike = float(piece.meaning @ other.meaning) >= ALIKE and piece.is_absent == other.is_absent
+            if alike and _meet(piece.box, other.box):
+                rows = np.union1d(piece.rows, other.rows)
+                kept[place] = _piece(engine, evidence, into, rows, features)
+                break
+        else:
+            kept.append(piece)
+    return kept
 
 
 def _has_changed(evidence: Array) -> bool:
@@ -275,34 +274,11 @@ def _piece(
         gone=float(gone),
         coloured=float(coloured),
         kept=float(kept),
-        seen=int(evidence[rows, 3].max(initial=0)),
         colour=colour,
         other=other,
         meaning=unit(mean[None])[0] if len(known) else np.zeros(vectors.shape[1]),
         points=means @ into[:3, :3].T + into[:3, 3],
     )
-
-
-def _together(
-    engine: QueryEngine,
-    evidence: Array,
-    into: Array,
-    pieces: list[_Piece],
-    features: tuple[Array, Array, Array],
-) -> list[_Piece]:
-    """Pieces of one thing as one: they meet, mean the same, and have changed in the same way."""
-    pieces = sorted(pieces, key=lambda piece: -len(piece.rows))
-    kept: list[_Piece] = []
-    for piece in pieces:
-        for place, other in enumerate(kept):
-            alike = float(piece.meaning @ other.meaning) >= ALIKE and piece.is_absent == other.is_absent
-            if alike and _meet(piece.box, other.box):
-                rows = np.union1d(piece.rows, other.rows)
-                kept[place] = _piece(engine, evidence, into, rows, features)
-                break
-        else:
-            kept.append(piece)
-    return kept
 
 
 def _meet(one: Array, other: Array) -> bool:
@@ -318,8 +294,8 @@ def _matched(lost: list[_Piece], new: list[_Piece], comparable: bool) -> list[tu
         for now in new:
             alike = float(old.meaning @ now.meaning) if comparable else 1.0
             shade = float(np.linalg.norm((old.colour - now.colour) * (0.5, 1, 1)))
-            ratio = max(old.size, now.size) / max(min(old.size, now.size), 1e-9)
-            if alike >= ALIKE and shade <= SHADE and ratio <= GROWN:
+            small, large = sorted(float(np.linalg.norm(np.ptp(each.box, axis=0))) for each in (old, now))
+            if alike >= ALIKE and shade <= SHADE and large <= GROWN * max(small, 1e-9):
                 pairs.append((alike - shade / SHADE, old, now))
     found: list[tuple[_Piece, _Piece]] = []
     for _, old, now in sorted(pairs, key=lambda pair: -pair[0]):
@@ -329,14 +305,14 @@ def _matched(lost: list[_Piece], new: list[_Piece], comparable: bool) -> list[tu
 
 
 def _change(kind: Kind, piece: _Piece, scene: int, describers: tuple[Describer, Describer] | None) -> Change:
-    name = None if describers is None else _name(describers[scene], piece.rows)
-    centre = piece.points.mean(0)
+    name = None
+    if describers is not None:
+        name = likely_name(describers[scene].at_gaussians(piece.rows, top=NAMES)[-1].words)
     colours = (colour_term(piece.colour), colour_term(piece.other)) if kind == "recoloured" else None
     pixels = piece.gone + piece.kept
-    return Change(kind, name, centre, piece.box, colours=colours, share=piece.share, pixels=pixels)
-
-
-def _name(describer: Describer, rows: Array) -> str | None:
-    """Return the likeliest name of the Gaussians `rows` as one whole."""
-    name = likely_name(describer.at_gaussians(rows, top=NAMES)[-1].words)
-    return None if name is None else name.phrase
+    return Change(
+        *(kind, None if name is None else name.phrase, piece.points.mean(0), piece.box),
+        colours=colours,
+        share=(piece.gone + piece.coloured) / max(pixels, 1e-9),
+        pixels=pixels,
+    )

@@ -3,14 +3,14 @@
 import html
 import sys
 from base64 import b64encode
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 
 from langsplat_core.cli.answers import Unit, unit_of
 from langsplat_core.cli.arguments import EncoderOption, JsonOption, OutFile, TrainedScene
@@ -20,8 +20,7 @@ from langsplat_core.config import CountOrZero, Positive
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.extensions.geometry.commands import read_transform, registered
 from langsplat_core.extensions.library.changes import Change, changes
-from langsplat_core.extensions.library.finding import PICTURE, Answered, Hit, find
-from langsplat_core.extensions.library.index import Library, update_library
+from langsplat_core.extensions.library.index import Answered, Hit, Library, find, update_library
 from langsplat_core.io.files import atomic_path
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.describe import Describer
@@ -30,8 +29,6 @@ from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import LEVELS
 from langsplat_core.scene.language import split_phrases
 from langsplat_core.semantics.encoders import load_text_encoder
-
-COLUMNS, CAPTION, GAP = 4, 44, 8  # of a sheet: pictures in a row; pixels below one, and between them
 
 
 @dataclass(frozen=True)
@@ -48,51 +45,50 @@ class Find:
     all: bool = False
     """List also the scenes where it was not found."""
     sheet: OutFile | None = None
-    """Write pictures of the answers here, *.html or *.png."""
+    """Write pictures of the answers here, one HTML file."""
     index: OutFile | None = None
     """File of the index (default: .langsplat-library in the folder)."""
-    rebuild: bool = False
-    """Read every scene again, whatever the index says."""
     encoder: EncoderOption = ""
     json: JsonOption = False
 
     def run(self) -> None:
         if len(self.words) < 2:
             raise InputError("give phrases and a folder; for example: langsplat find 'red mug' scans")
-        if self.sheet is not None and self.sheet.suffix.lower() not in (".html", ".png"):
-            raise InputError(f"--sheet {self.sheet}: name an .html or a .png file")
+        if self.sheet is not None and self.sheet.suffix.lower() != ".html":
+            raise InputError(f"--sheet {self.sheet}: name an .html file")
         phrases = [phrase for text in self.words[:-1] for phrase in split_phrases(text) or [text]]
         load = once(load_text_encoder, self.encoder)
         with TerminalProgress() as progress:
-            library = update_library(Path(self.words[-1]), self.index, load, progress, self.rebuild)
+            library = update_library(Path(self.words[-1]), self.index, load, progress)
             answers = [each for phrase in phrases for each in find(library, phrase, load, self.top, progress)]
         if all(each.problem for each in answers):
             raise InputError("; ".join(dict.fromkeys(each.problem for each in answers)))
-        listed = [(each, self._listed(each)) for each in answers]
+        listed = [
+            (each, [hit for hit in each.hits if self.all or hit.verdict != "not here"]) for each in answers
+        ]
         if self.sheet is not None:
-            _write_sheet(self.sheet, listed, library)
+            with atomic_path(self.sheet) as path:
+                path.write_text(_html(listed, library), encoding="utf-8")
         if self.json:
             print_json([_fields(each, hits, library) for each, hits in listed])
             return
         for each, hits in listed:
-            print("\n".join(_lines(each, hits, library)))
+            print(_heading(each))
+            for hit in hits:
+                print(f"  {_name(hit, library)}: {_said(hit)}")
+            for name, reason in each.unread:
+                print(f"  {name}: not asked: {reason}")
         for scene in library.unread:
             print(f"langsplat: not searched: {scene.path}: {scene.unread}", file=sys.stderr)
-
-    def _listed(self, answered: Answered) -> list[Hit]:
-        return [hit for hit in answered.hits if self.all or hit.verdict != "not here"]
 
 
 def _said(hit: Hit) -> str:
     sure = "" if hit.probability is None else f" ({100 * hit.probability:.0f} %)"
-    return f"{hit.verdict}{sure}"
-
-
-def _place(hit: Hit) -> str:
-    if hit.answer is None or hit.answer.place is None:
-        return "place not looked for" if hit.answer is None else "place -"
-    unit = unit_of(hit)
-    return f"place {unit.format(hit.answer.place)} {unit.name}"
+    place = "place not looked for" if hit.answer is None else "place -"
+    if hit.answer is not None and hit.answer.place is not None:
+        unit = unit_of(hit)
+        place = f"place {unit.format(hit.answer.place)} {unit.name}"
+    return f"{hit.verdict}{sure}, {place}"
 
 
 def _name(hit: Hit, library: Library) -> str:
@@ -105,14 +101,6 @@ def _heading(answered: Answered) -> str:
     return f"{answered.phrase} ({answered.encoder_id}): " + (
         answered.problem or counts + (f", a weak match in {weak}" if weak else "")
     )
-
-
-def _lines(answered: Answered, hits: Sequence[Hit], library: Library) -> Iterator[str]:
-    yield _heading(answered)
-    for hit in hits:
-        yield f"  {_name(hit, library)}: {_said(hit)}, {_place(hit)}"
-    for name, reason in answered.unread:
-        yield f"  {name}: not asked: {reason}"
 
 
 def _fields(answered: Answered, hits: Sequence[Hit], library: Library) -> dict[str, Any]:
@@ -129,30 +117,20 @@ def _fields(answered: Answered, hits: Sequence[Hit], library: Library) -> dict[s
 
 
 def _hit_fields(hit: Hit, library: Library) -> dict[str, Any]:
+    own = ("verdict", "probability", "margin", "metres_per_unit")
     answer = hit.answer
     return {
         "scene": _name(hit, library),
-        "verdict": hit.verdict,
-        "probability": hit.probability,
-        "margin": hit.margin,
+        **{name: getattr(hit, name) for name in own},
         "exact": answer is not None,
         "level": None if answer is None else LEVELS[answer.level],
         "place": None if answer is None else answer.place,
         "box": None if answer is None else answer.box,
-        "metres_per_unit": hit.metres_per_unit,
     }
 
 
-def _write_sheet(path: Path, listed: Sequence[tuple[Answered, list[Hit]]], library: Library) -> None:
-    """Return the answers that have pictures, under the headings of their phrases."""
-    with atomic_path(path) as temporary:
-        if path.suffix.lower() == ".html":
-            temporary.write_text(_html(listed, library), encoding="utf-8")
-        else:
-            _image(listed, library).save(temporary, "PNG")
-
-
 def _html(listed: Sequence[tuple[Answered, list[Hit]]], library: Library) -> str:
+    """Return the answers that have pictures, under the headings of their phrases."""
     parts = ["<!doctype html><meta charset='utf-8'><title>langsplat find</title>"]
     parts += ["<style>body{font:14px sans-serif}figure{display:inline-block;margin:4px}</style>"]
     for answered, hits in listed:
@@ -163,32 +141,12 @@ def _html(listed: Sequence[tuple[Answered, list[Hit]]], library: Library) -> str
             packed = BytesIO()
             Image.fromarray(hit.picture).save(packed, "PNG")
             name = html.escape(_name(hit, library))
-            says = html.escape(f"{_said(hit)}, {_place(hit)}")
+            says = html.escape(_said(hit))
             source = f"data:image/png;base64,{b64encode(packed.getvalue()).decode()}"
             parts.append(
                 f"<figure><img alt='{name}' src='{source}'><figcaption>{name}<br>{says}</figcaption></figure>"
             )
     return "\n".join(parts) + "\n"
-
-
-def _image(listed: Sequence[tuple[Answered, list[Hit]]], library: Library) -> Image.Image:
-    (width, height), font = PICTURE, ImageFont.load_default(13)
-    drawn = [(answered, [hit for hit in hits if hit.picture is not None]) for answered, hits in listed]
-    rows = sum(-(-len(hits) // COLUMNS) for _, hits in drawn)
-    total = len(drawn) * CAPTION // 2 + rows * (height + CAPTION) + GAP
-    sheet = Image.new("RGB", (GAP + COLUMNS * (width + GAP), total), "white")
-    brush, top = ImageDraw.Draw(sheet), GAP
-    for answered, hits in drawn:
-        brush.text((GAP, top), _heading(answered), "black", ImageFont.load_default(16))
-        top += CAPTION // 2
-        for at, hit in enumerate(hits):
-            assert hit.picture is not None
-            corner = GAP + at % COLUMNS * (width + GAP), top + at // COLUMNS * (height + CAPTION)
-            sheet.paste(Image.fromarray(hit.picture), corner)
-            says = f"{_name(hit, library)}\n{_said(hit)}\n{_place(hit)}"
-            brush.text((corner[0], corner[1] + height), says, "black", font, spacing=1)
-        top += -(-len(hits) // COLUMNS) * (height + CAPTION)
-    return sheet
 
 
 @dataclass(frozen=True)

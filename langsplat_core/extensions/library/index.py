@@ -1,4 +1,4 @@
-"""Search over all scenes of a folder, by an index of their codebooks.
+"""Search over all scenes of a folder: ranked by an index of their codebooks, the best ones asked exactly.
 
 The answer to a phrase in a scene rests on the mean relevancies of its regions, which are mixtures of the
 relevancies of few codewords. So the index keeps, of every scene, its codewords in 8 bits, how each is read
@@ -10,11 +10,13 @@ The index is a safetensors file: the scenes as JSON in its metadata, and for eac
 encoder, `N.`, its canonical vectors, the `Columns` of all its scenes and their thumbnails.
 """
 
+import logging
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from itertools import accumulate
+from itertools import accumulate, chain
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -29,29 +31,40 @@ from langsplat_core.compiled import helper, kernel, shared_workers
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.composing import compose
 from langsplat_core.display.displays import Channels
-from langsplat_core.errors import FormatError, InputError, LangSplatError, printable_line
+from langsplat_core.errors import EncoderError, FormatError, InputError, LangSplatError, printable_line
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import exists, open_for_reading
 from langsplat_core.io.scenes import companion_path, format_of, load_scene, scene_files
-from langsplat_core.io.sidecar import SUFFIX
+from langsplat_core.io.sidecar import SUFFIX, read_stored
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult
+from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, same_vectors
+from langsplat_core.query.grammar import heads, named, parse
 from langsplat_core.query.rule import (
     Bars,
+    Outcome,
     RegionTable,
+    Verdict,
     bars_of,
     best_relevancies,
+    judge,
     region_fits,
     region_relevancies,
+    triple,
 )
 from langsplat_core.raster.render import render
-from langsplat_core.scene import LEVELS, Calibration, Camera, Scene
+from langsplat_core.scene import LEVELS, Calibration, Camera, LanguageField, Scene
+from langsplat_core.scene.codec import LinearCodec
+from langsplat_core.scene.gaussians import join_gaussians
+from langsplat_core.scene.language import phrase_key
 from langsplat_core.semantics.relevancy import fit_of
 
+log = logging.getLogger("langsplat")
 INDEX = ".langsplat-library"  # its name in the folder
 SCENES = "scenes"  # key of the metadata
 THUMBNAIL = (96, 72)  # width and height, pixels, of the picture that the index keeps of a scene
+PICTURE = (320, 240)  # and of the picture of an answer
 Whole = Annotated[int, msgspec.Meta(ge=0, lt=2**62)]
 
 
@@ -251,19 +264,21 @@ def update_library(
     index: Path | None = None,
     load_encoder: LoadEncoder | None = None,
     progress: Progress = silent,
-    rebuild: bool = False,
 ) -> Library:
     """Return the library of a folder, with new and changed scenes read again.
 
-    The index is written where anything is different; an interrupted call keeps what it had read. rebuild:
-    every scene is read, whatever the index says. Raises InputError without scenes and FormatError for an
-    index that is none.
+    The index is written where anything is different; an interrupted call keeps what it had read. A damaged
+    index costs a warning, and is made again. Raises InputError without scenes.
     """
     index = folder / INDEX if index is None else index
     paths = {path.relative_to(folder).as_posix(): path for path in scenes_in(folder)}
     if not paths:
         raise InputError(f"{folder}: no scene with a language field in it; `langsplat train` makes them")
-    old = read_library(index, folder) if exists(index) and not rebuild else Library(folder, ())
+    old = Library(folder, ())
+    try:
+        old = read_library(index, folder) if exists(index) else old
+    except FormatError as error:
+        log.warning("%s", error)
     stamps = {name: stamp_of(path) for name, path in paths.items()}
     kept = {
         each.listed.path: each for each in _digests(old) if stamps.get(each.listed.path) == each.listed.stamp
@@ -308,7 +323,10 @@ def write_library(index: Path, digests: Sequence[Digest]) -> None:
     groups: list[list[Digest]] = []
     for each in digests:
         if each.canonical is not None:
-            alike = [members for members in groups if _same_encoder(members[0], each)]
+            alike = [
+                members for members in groups if members[0].encoder_id == each.encoder_id
+                and same_vectors(np.asarray(members[0].canonical), each.canonical)
+            ]  # fmt: skip
             groups += [] if alike else [[]]
             (alike or groups)[-1].append(each)
     tensors = dict[str, Array]()
@@ -329,12 +347,6 @@ def write_library(index: Path, digests: Sequence[Digest]) -> None:
         save_file(tensors, temporary, {SCENES: msgspec.json.encode(stated).decode()})
 
 
-def _same_encoder(one: Digest, other: Digest) -> bool:
-    assert one.canonical is not None
-    assert other.canonical is not None
-    return one.encoder_id == other.encoder_id and same_vectors(one.canonical, other.canonical)
-
-
 def read_library(index: Path, folder: Path) -> Library:
     """Return the library that an index describes.
 
@@ -351,7 +363,9 @@ def read_library(index: Path, folder: Path) -> Library:
                 pictures |= {scene.path: picture for scene, picture in zip(scenes, shown, strict=True)}
     except (SafetensorError, msgspec.MsgspecError, ValueError) as error:
         why = printable_line(error, 80)
-        raise FormatError(f"{index}: no index of scenes ({why}); remove it, and it is made again") from None
+        raise FormatError(
+            f"{index}: no index of scenes ({why}); it is made again by the next search"
+        ) from None
     return Library(folder, tuple(groups), stated.unread, pictures)
 
 
@@ -426,6 +440,138 @@ def _region_means(
                 sound[scene] = False
 
 
+# A phrase in all scenes of a library.
+
+
+@dataclass(frozen=True, eq=False)
+class Hit:
+    """The answer of one scene to a phrase."""
+
+    path: Path
+    judgement: Verdict
+    answer: QueryResult | None = None  # None where only the index was asked
+    metres_per_unit: float | None = None
+    picture: Array | None = None  # (H, W, 3) uint8, the answer as a heat map
+
+    @property
+    def verdict(self) -> Outcome:
+        """The verdict in words."""
+        return self.judgement.outcome
+
+    @property
+    def margin(self) -> float:
+        """How certain the answer is, 0 where it begins to count as found, see `Verdict`."""
+        return self.judgement.margin
+
+    @property
+    def probability(self) -> float | None:
+        """The probability that it is there at all; None where nothing is calibrated."""
+        return self.judgement.probability
+
+
+@dataclass(frozen=True, eq=False)
+class Answered:
+    """The answers of all scenes of one encoder to a phrase."""
+
+    phrase: str
+    encoder_id: str
+    hits: tuple[Hit, ...]  # those asked exactly first, by margin; then the others
+    problem: str = ""  # why nothing was asked
+    unread: tuple[tuple[str, str], ...] = ()  # scenes that could not be opened, and why
+
+    def count(self, verdict: Outcome) -> int:
+        """Return the number of scenes with this verdict."""
+        return sum(hit.verdict == verdict for hit in self.hits)
+
+
+def find(
+    library: Library,
+    phrase: str,
+    load_encoder: LoadEncoder | None,
+    at_most: int = 20,
+    progress: Progress = silent,
+) -> list[Answered]:
+    """Return a phrase in every scene, group by group, the most certain answers first.
+
+    The first `at_most` scenes of a group that answer are opened and asked exactly; the verdicts of the others
+    are those of the index.
+    """
+    return [_ask_group(library, group, phrase, load_encoder, at_most, progress) for group in library.groups]
+
+
+def _ask_group(
+    library: Library,
+    group: EncoderGroup,
+    phrase: str,
+    load_encoder: LoadEncoder | None,
+    at_most: int,
+    progress: Progress,
+) -> Answered:
+    key, taught = phrase_key(phrase), {name for scene in group.scenes for name in scene.taught}
+    try:
+        texts = heads(parse(phrase, taught))
+        vectors = {text: _vector(library, group, text, load_encoder) for text in texts}
+    except EncoderError as error:
+        if key not in taught:
+            return Answered(phrase, group.encoder_id, (), str(error))
+        vectors = {}
+    rough = zip(group.scenes, rank(group, vectors), strict=True)
+    hits = {scene.path: Hit(library.folder / scene.path, verdict) for scene, verdict in rough}
+    must = {scene.path for scene in group.scenes if not scene.is_indexed or key in scene.taught}
+    exact: dict[str, Hit] = {}
+    unread: list[tuple[str, str]] = []
+    for name in sorted(hits, key=lambda name: (name not in must, -hits[name].margin)):
+        answers = sum(hit.verdict != "not here" for hit in exact.values())
+        if name not in must and (hits[name].verdict == "not here" or answers >= at_most):
+            break
+        progress(f"asking '{phrase}'", answers / max(at_most, 1), name)
+        try:
+            scene = load_scene(hits[name].path)
+            answer = run_phrase(QueryEngine(scene, load_encoder), phrase).answer
+            picture = draw(scene, PICTURE, answer)
+        except LangSplatError as error:
+            unread.append((name, str(error)))
+            del hits[name]
+            continue
+        exact[name] = Hit(hits[name].path, answer.judgement, answer, scene.metres_per_unit, picture)
+    found = [hit for hit in exact.values() if hit.verdict != "not here"]
+    others = [hit for hit in (hits | exact).values() if hit not in found]
+    ordered = (sorted(some, key=lambda hit: -hit.margin) for some in (found, others))
+    return Answered(phrase, group.encoder_id, tuple(chain(*ordered)), unread=tuple(unread))
+
+
+def rank(group: EncoderGroup, vectors: Mapping[str, Array]) -> list[Verdict]:
+    """Return the verdict on every scene by the index alone: on the best of some phrases."""
+    best = [Verdict(False, "chance", -math.inf)] * len(group.scenes)
+    for text, vector in vectors.items():
+        for row, (scene, fits) in enumerate(zip(group.scenes, fits_in(group, vector), strict=True)):
+            if scene.is_indexed:
+                verdict = judge(triple(fits), named(text), "auto", scene.bars, scene.calibration)
+                best[row] = max(best[row], verdict, key=lambda found: found.margin)
+    return best
+
+
+def _vector(library: Library, group: EncoderGroup, text: str, load_encoder: LoadEncoder | None) -> Array:
+    """Return the (D,) unit vector of a phrase.
+
+    It is the encoder's, checked against the group's canonical vectors, else that of the first phrasebook that
+    has it. Raises EncoderError and, for no phrase, InputError.
+    """
+    dim = group.canonical.shape[1]
+    codec = LinearCodec(np.eye(1, dim, dtype=np.float32))
+    none = np.zeros((len(LEVELS), 0, 1), np.float32), np.zeros((len(LEVELS), 0), np.float32)
+    field = LanguageField(*none, codec, group.canonical, group.encoder_id)
+    try:
+        return QueryEngine(Scene(join_gaussians([]), field), load_encoder).text_vector(text)
+    except EncoderError:
+        for scene in group.scenes:
+            if scene.phrases:
+                book = read_stored(companion_path(library.folder / scene.path, SUFFIX)).field.phrasebook
+                if phrase_key(text) in book:
+                    return book[phrase_key(text)]
+        raise
+
+
 # Pictures.
 
 
@@ -435,24 +581,20 @@ def draw(scene: Scene, size: tuple[int, int], answer: QueryResult | None = None)
     With an answer from the training camera nearest to its place that has it in its image, with the answer as
     a heat map.
     """
+    fitted = [camera.with_intrinsics(camera.intrinsics.fitted(*size)) for camera in scene.cameras]
+    camera = fitted[0] if fitted else scene.framing_camera(size)
     if answer is None:
-        drawn = render(scene, _camera(scene, size, None))
+        drawn = render(scene, camera)
         return compose(Channels(drawn.colours, drawn.alpha), PictureConfig())
-    drawn = render(scene, _camera(scene, size, answer), (answer.even * answer.members)[:, None])
+    if answer.place is not None:
+        camera = min(fitted, key=partial(_away, place=answer.place), default=camera)
+    drawn = render(scene, camera, (answer.even * answer.members)[:, None])
     heat = Channels(drawn.colours, drawn.alpha, drawn.values)
     return compose(heat, PictureConfig(display="relevancy"), (answer.heat_range,))
 
 
-def _camera(scene: Scene, size: tuple[int, int], answer: QueryResult | None) -> Camera:
-    if not scene.cameras:
-        return scene.framing_camera(size)
-    fitted = [camera.with_intrinsics(camera.intrinsics.fitted(*size)) for camera in scene.cameras]
-    if answer is None or answer.place is None:
-        return fitted[0]
-
-    def away(camera: Camera) -> float:
-        pixels, depth = camera.project(answer.place[None])  # type: ignore[index]
-        inside = (np.abs(pixels[0] / size - 0.5) < 0.4).all() and depth[0] > 0
-        return float(np.linalg.norm(camera.position - answer.place)) + (0 if inside else 1e9)
-
-    return min(fitted, key=away)
+def _away(camera: Camera, place: Array) -> float:
+    """Return the distance of a place (3,) from a camera; far more where it is not well within its image."""
+    pixels, depth = camera.project(place[None])
+    inside = (np.abs(pixels[0] / (camera.width, camera.height) - 0.5) < 0.4).all() and depth[0] > 0
+    return float(np.linalg.norm(camera.position - place)) + (0 if inside else 1e9)

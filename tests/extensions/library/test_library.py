@@ -13,23 +13,25 @@ from safetensors.numpy import load_file, save_file
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import EncoderError, FormatError, InputError
-from langsplat_core.extensions.library import index as module
+from langsplat_core.extensions.library import commands as library_commands
 from langsplat_core.extensions.library.changes import Change, changes, colour_term, to_lab
-from langsplat_core.extensions.library.finding import find
 from langsplat_core.extensions.library.index import (
     INDEX,
     SCENES,
+    find,
     fits_in,
     read_library,
     scenes_in,
     update_library,
 )
 from langsplat_core.io.scenes import load_scene, save_scene
+from langsplat_core.progress import Progress, Report
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.rule import judge, triple
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Gaussians, Scene
+from tests.support.commands import refusal, run
 from tests.support.comparing import FIELDS
 from tests.support.fakes import CENTRES, NAMES, PER_BLOB, WORDS, FakeEncoder, axis, named_scene
 from tests.support.scenes import unturned_gaussians
@@ -93,17 +95,19 @@ def test_the_best_scenes_come_first_and_with_a_place(folder):
     assert answered.hits[2].answer is None
 
 
-def test_only_what_has_changed_is_read_again(folder, monkeypatch):
+def test_only_what_has_changed_is_read_again(folder):
     first = update_library(folder, load_encoder=load)
     read: list[str] = []
-    whole = module.digest
-    monkeypatch.setattr(module, "digest", lambda path, name, _: read.append(name) or whole(path, name, load))
-    again = update_library(folder, load_encoder=load)
+
+    def note(report: Report) -> None:
+        read.extend([report.note] if report.note else [])
+
+    again = update_library(folder, load_encoder=load, progress=Progress(note))
     assert read == []
     assert [scene.path for scene in again.scenes] == [scene.path for scene in first.scenes]
     save_scene(folder / "all.ply", without(named_scene(), MUG))
     (folder / "linear.spz.langsplat.safetensors").unlink()
-    third = update_library(folder, load_encoder=load)
+    third = update_library(folder, load_encoder=load, progress=Progress(note))
     assert read == ["all.ply"]
     assert [scene.path for scene in third.scenes] == ["all.ply", "deep/few.ply"]
     assert {hit.path.name: hit.verdict for hit in find(third, "mug", load)[0].hits} == {
@@ -118,7 +122,7 @@ def test_an_interrupted_update_keeps_what_was_read(folder):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        update_library(folder, load_encoder=load, progress=module.Progress(stop))
+        update_library(folder, load_encoder=load, progress=Progress(stop))
     assert len(read_library(folder / INDEX, folder).scenes) == 2
 
 
@@ -178,7 +182,7 @@ def test_index_with_a_false_statement_is_refused(folder, name):
     content, tensors = stated(index), load_file(index)
     STATEMENTS[name](content["groups"][0][1][0])
     save_file(tensors, index, {SCENES: json.dumps(content)})
-    with pytest.raises(FormatError, match="remove it"):
+    with pytest.raises(FormatError, match="made again"):
         read_library(index, folder)
 
 
@@ -189,18 +193,18 @@ def test_index_with_arrays_of_other_sizes_is_refused(folder, name):
     text = json.dumps(stated(index))
     for values in (tensors[f"0.{name}"][..., :-1], tensors[f"0.{name}"].astype(np.float64)):
         save_file(tensors | {f"0.{name}": np.ascontiguousarray(values)}, index, {SCENES: text})
-        with pytest.raises(FormatError, match="remove it"):
+        with pytest.raises(FormatError, match="made again"):
             read_library(index, folder)
 
 
-def test_damaged_index_is_refused_until_it_is_made_again(folder):
+def test_damaged_index_is_made_again_with_a_warning(folder, caplog):
     update_library(folder, load_encoder=load)
     whole = (folder / INDEX).read_bytes()
     for damaged in (b"", b"LSLIB\x00\x00\x01" + bytes(8), whole[:-8], whole + bytes(8)):
         (folder / INDEX).write_bytes(damaged)
-        with pytest.raises(FormatError):
-            update_library(folder, load_encoder=load)
-    assert len(update_library(folder, load_encoder=load, rebuild=True).scenes) == 3
+        caplog.clear()
+        assert len(update_library(folder, load_encoder=load).scenes) == 3
+        assert caplog.text.count(INDEX) == 1
 
 
 @pytest.mark.parametrize("column", ["words", "regions", "parents"])
@@ -324,3 +328,82 @@ def test_colours_are_those_of_cie():
     np.testing.assert_allclose(red, (53.2, 80.1, 67.2), atol=0.2)  # of sRGB's red, D65
     for colour, term in (((0.1, 0.3, 0.9), "blue"), ((0.95, 0.9, 0.3), "yellow")):
         assert colour_term(to_lab(np.array(colour))) == term
+
+
+# `langsplat find` and `langsplat changes`.
+
+
+@pytest.fixture
+def scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working folder; in "scans" a scene with mug, book and plant, and one without the mug."""
+    (tmp_path / "scans" / "<b>&").mkdir(parents=True)
+    save_scene(tmp_path / "scans" / "whole.ply", named_scene())
+    fewer = named_scene().take(np.arange(PER_BLOB, 3 * PER_BLOB))
+    save_scene(tmp_path / "scans" / "<b>&" / "fewer.ply", fewer)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(library_commands, "load_text_encoder", lambda name: FakeEncoder())
+    return tmp_path
+
+
+def test_find_lists_the_scenes_that_have_it(scans, capsys):
+    assert run("find", "mug", "book", "scans", "--json") == 0
+    mug, book = json.loads(capsys.readouterr().out)
+    assert (mug["phrase"], mug["found"], mug["not_here"]) == ("mug", 1, 1)
+    assert [scene["scene"] for scene in mug["scenes"]] == ["whole.ply"]
+    np.testing.assert_allclose(mug["scenes"][0]["place"], (-1.2, 0, 0), atol=0.2)
+    assert book["found"] == 2
+    assert run("find", "mug", "scans", "--all") == 0
+    text = capsys.readouterr().out
+    assert "found in 1 of 2 scenes" in text
+    assert "fewer.ply: not here" in text
+
+
+def test_sheets_show_every_answer_and_escape_names(scans):
+    assert run("find", "book", "scans", "--sheet", "sheet.html") == 0
+    text = (scans / "sheet.html").read_text()
+    assert text.count("<img") == 2
+    assert "&lt;b&gt;&amp;/fewer.ply" in text
+    assert "<b>" not in text
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["mug"], "phrases and a folder"),
+        (["mug", "elsewhere"], "no such folder"),
+        (["mug", "scans", "--sheet", "sheet.txt"], ".html"),
+        (["the", "scans"], "the"),
+    ],
+)
+def test_find_says_what_is_wrong_in_a_line(scans, capsys, words, said):
+    assert said in refusal(capsys, "find", *words)
+    assert not (scans / "sheet.txt").exists()
+
+
+def test_changes_are_said_in_words_and_in_json(scans, capsys):
+    pair = "scans/whole.ply", "scans/<b>&/fewer.ply"
+    assert run("changes", *pair) == 0
+    assert capsys.readouterr().out.startswith("gone: ")
+    assert run("changes", pair[0], pair[0]) == 0
+    assert capsys.readouterr().out.strip() == "nothing changed"
+    scene = named_scene()
+    sh = scene.gaussians.sh.copy()
+    sh[:PER_BLOB] = sh[2 * PER_BLOB :]
+    save_scene(scans / "painted.ply", replace(scene, gaussians=replace(scene.gaussians, sh=sh)))
+    assert run("changes", pair[0], "painted.ply") == 0
+    assert "red to blue" in capsys.readouterr().out
+    (scans / "placed.json").write_text(json.dumps({"matrix": np.eye(4).tolist()}))
+    assert run("changes", pair[0], "painted.ply", "--transform", "placed.json", "--json") == 0
+    (change,) = json.loads(capsys.readouterr().out)["changes"]
+    assert (change["kind"], change["colours"]) == ("recoloured", ["red", "blue"])
+    both = "--transform", "placed.json", "--register"
+    assert "leave one of them out" in refusal(capsys, "changes", pair[0], "painted.ply", *both)
+
+
+@pytest.mark.parametrize(
+    "text", ["[[1]]", "{}", "[[1, 2], [3]]", '"x"', "[" * 50, '{"matrix": [[0,0,0,0]]}', '{"matrix": 3}']
+)
+def test_a_transform_that_is_none_is_refused(scans, capsys, text):
+    (scans / "placed.json").write_text(text)
+    words = "scans/whole.ply", "scans/whole.ply", "--transform", "placed.json"
+    assert "placed.json" in refusal(capsys, "changes", *words)
