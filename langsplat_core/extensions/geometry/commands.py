@@ -1,8 +1,8 @@
-"""`langsplat mesh`, `register` and `merge`: surfaces as triangles, and two scenes of one place."""
+"""`langsplat mesh`, `register`, `merge` and `map`: triangles, two scenes of one place, what a robot needs."""
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 import tyro
@@ -13,7 +13,6 @@ from langsplat_core.cli.answers import found_answer, unit_of
 from langsplat_core.cli.arguments import AnyScene, EncoderOption, OutFile, OutFolder
 from langsplat_core.config import Count, LevelChoice, Positive
 from langsplat_core.errors import EncoderError, InputError, optional_imports
-from langsplat_core.extensions.geometry.merge import merge
 from langsplat_core.extensions.geometry.occupancy import (
     FloorMap,
     Occupancy,
@@ -24,12 +23,12 @@ from langsplat_core.extensions.geometry.occupancy import (
     map_axes,
     reachable,
 )
+from langsplat_core.extensions.geometry.registration import TRUSTED, Registration, merge, register
 from langsplat_core.io.cameras import numbers
 from langsplat_core.io.files import atomic_path, write_json
 from langsplat_core.io.hostile import read_json_file
-from langsplat_core.io.ply_table import write_table
 from langsplat_core.io.scenes import check_keeps, check_writable, load_scene, save_scene
-from langsplat_core.io.shapes import MESH_SUFFIXES, RGB, check_suffix, gltf_axes, write_meshes
+from langsplat_core.io.shapes import MESH_SUFFIXES, check_suffix, gltf_axes, write_meshes
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.describe import Describer
@@ -39,9 +38,6 @@ from langsplat_core.scene import LEVELS, NO_NODE, Scene
 from langsplat_core.scene.surface import surface_weights
 from langsplat_core.scene.transform import Similarity, similarity, transform_scene
 from langsplat_core.semantics.encoders import load_text_encoder
-
-if TYPE_CHECKING:
-    from langsplat_core.extensions.geometry.registration import Registration
 
 TRANSFORM_LIMIT = 1 << 20  # bytes of a file with a matrix
 
@@ -167,10 +163,8 @@ class Merge:
         print(f"{self.out}: {len(scene.gaussians)} Gaussians, {len(scene.cameras)} cameras; {said}")
 
 
-def registered(moving: Scene, fixed: Scene, scaled: bool, progress: Progress) -> "Registration":
+def registered(moving: Scene, fixed: Scene, scaled: bool, progress: Progress) -> Registration:
     """How a scene lies in the axes of another; InputError unless renderings confirm it."""
-    from langsplat_core.extensions.geometry.registration import TRUSTED, register
-
     found = register(moving, fixed, scaled, progress=progress)
     if not found.trusted:
         hint = "" if scaled else ", and give --scaled where their units differ"
@@ -206,8 +200,8 @@ NO_SCALE = (
 class Map:
     """Write what a robot needs to know of a scene: maps, labelled voxels and poses.
 
-    There is an occupancy grid as Nav2 reads it (map.pgm, map.yaml), labelled voxels (voxels.npz, voxels.ply),
-    a collider (collider.obj), and poses in front of things (goals.json).
+    There is an occupancy grid as Nav2 reads it (map.pgm, map.yaml), labelled voxels (voxels.npz), a
+    collider (collider.obj), and poses in front of things (goals.json).
     """
 
     scene: tyro.conf.Positional[Path]
@@ -242,7 +236,6 @@ class Map:
         engine = None
         if scene.language is not None:
             engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
-        if engine is not None:
             for phrase in self.goal:
                 check_phrase(engine, phrase, scene.cameras[0] if scene.cameras else None)
         with TerminalProgress() as progress:
@@ -252,7 +245,7 @@ class Map:
             self.out.mkdir(parents=True, exist_ok=True)
             write_grid(self.out, plan)
             write_collider(self.out / "collider.obj", occupancy)
-            write_voxels(self.out, occupancy, scene, engine, progress)
+            write_voxels(self.out / "voxels.npz", occupancy, scene, engine, progress)
         floor = (
             "" if room.floor is not None else " (no floor was found: the ground is nearly the lowest surface)"
         )
@@ -261,33 +254,28 @@ class Map:
             f"{100 * plan.free.mean():.0f} % free, {100 * plan.occupied.mean():.0f} % occupied, "
             f"{metres:g} m per unit{floor}"
         )
-        self._write_goals(plan, occupancy, engine)
+        if engine is not None and self.goal:
+            self._write_goals(plan, occupancy, engine)
 
-    def _write_goals(self, plan: FloorMap, occupancy: Occupancy, engine: QueryEngine | None) -> None:
+    def _write_goals(self, plan: FloorMap, occupancy: Occupancy, engine: QueryEngine) -> None:
         answers, missing = [], []
-        if self.goal:
-            (self.out / "goals.json").unlink(missing_ok=True)
-            where = reachable(plan, self.robot_radius, self.start)
+        (self.out / "goals.json").unlink(missing_ok=True)
+        where = reachable(plan, self.robot_radius, self.start)
+        scene = engine.scene
+        solid = surface_weights(scene.gaussians) > 0
         for phrase in self.goal:
-            assert engine is not None
-            result = run_phrase(engine, phrase, viewpoint=engine.scene.cameras[0]).answer
-            points = engine.scene.gaussians.means[
-                result.members & (surface_weights(engine.scene.gaussians) > 0)
-            ]
+            result = run_phrase(engine, phrase, viewpoint=scene.cameras[0]).answer
+            points = occupancy.metres(scene.gaussians.means[result.members & solid])
             goal = None
             if result.found and len(points):
-                on_map = points @ occupancy.to_map[:3, :3].T + occupancy.to_map[:3, 3]
-                goal = find_goal(plan, where, on_map[:, :2], self.robot_radius + self.resolution)
+                goal = find_goal(plan, where, points[:, :2], self.robot_radius + self.resolution)
             if goal is None:
-                missing.append(
-                    f"'{phrase}': {result.verdict}" if not result.found else f"'{phrase}': no free pose"
-                )
+                missing.append(f"'{phrase}': {'no free pose' if result.found else result.verdict}")
                 continue
             answers.append({"phrase": phrase, **asdict(goal), "probability": result.probability})
             pose = f"x {goal.x:.2f} y {goal.y:.2f} m, yaw {goal.yaw:.2f}"
             print(f"{phrase}: {pose}, {goal.distance:.2f} m from it")
-        if self.goal:
-            write_json(self.out / "goals.json", answers)
+        write_json(self.out / "goals.json", answers)
         if missing:
             raise InputError(f"no goal for {'; '.join(missing)}")
 
@@ -314,12 +302,9 @@ def write_collider(path: Path, occupancy: Occupancy) -> None:
 
 
 def write_voxels(
-    folder: Path, occupancy: Occupancy, scene: Scene, engine: QueryEngine | None, progress: Progress
+    path: Path, occupancy: Occupancy, scene: Scene, engine: QueryEngine | None, progress: Progress
 ) -> None:
-    """Write the occupied voxels as `voxels.npz` and `voxels.ply`.
-
-    Each has the number of the whole of the scene's tree that it is in, and the word of that.
-    """
+    """Write the occupied voxels, each with the whole of the tree that it is in and the word of that."""
     cells = np.argwhere(occupancy.occupied)
     nodes, words = np.full(len(cells), NO_NODE), {}
     if engine is not None:
@@ -331,17 +316,12 @@ def write_voxels(
             outline = ()
         words = {int(one.node): "" if one.word is None else one.word.phrase for one in outline}
     names = np.array([words.get(int(node), "") for node in nodes], str)
-    with atomic_path(folder / "voxels.npz") as path:
+    with atomic_path(path) as temporary:
         np.savez_compressed(
-            path, cells=cells.astype(np.int32), origin=occupancy.origin, resolution=occupancy.resolution,
+            temporary, cells=cells.astype(np.int32), origin=occupancy.origin, resolution=occupancy.resolution,
             to_map=occupancy.to_map, nodes=nodes.astype(np.int32), words=names,
             hits=occupancy.hits[tuple(cells.T)], passes=occupancy.passes[tuple(cells.T)],
         )  # fmt: skip
-    centres = occupancy.origin + (cells + 0.5) * occupancy.resolution
-    colours = np.random.default_rng(0).integers(40, 256, (int(nodes.max(initial=0)) + 2, 3))
-    columns = dict(zip("xyz", centres.astype(np.float32).T, strict=True)) | {"node": nodes.astype(np.int32)}
-    columns |= zip(RGB, colours[nodes].astype(np.uint8).T, strict=True)
-    write_table(folder / "voxels.ply", columns)
 
 
 def _nodes(occupancy: Occupancy, scene: Scene, engine: QueryEngine, cells: Array) -> Array:
@@ -352,7 +332,7 @@ def _nodes(occupancy: Occupancy, scene: Scene, engine: QueryEngine, cells: Array
     rows = np.flatnonzero((surface_weights(scene.gaussians) > 0) & (whole != NO_NODE))
     if len(rows) == 0:
         return np.full(len(cells), NO_NODE)
-    means = scene.gaussians.means[rows] @ occupancy.to_map[:3, :3].T + occupancy.to_map[:3, 3]
+    means = occupancy.metres(scene.gaussians.means[rows])
     centres = occupancy.origin + (cells + 0.5) * occupancy.resolution
     gaps, nearest = cKDTree(means).query(centres, distance_upper_bound=4 * occupancy.resolution, workers=-1)
     return np.append(whole[rows], NO_NODE)[np.where(np.isfinite(gaps), nearest, len(rows))]

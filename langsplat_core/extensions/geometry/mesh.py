@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from langsplat_core.arrays import Array, rotation_matrices, unit
 from langsplat_core.errors import InputError
-from langsplat_core.extensions.geometry.points import cloud
+from langsplat_core.extensions.geometry.planes import cloud
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.render import splat_colours, view_of

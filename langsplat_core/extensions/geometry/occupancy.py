@@ -5,6 +5,7 @@ no ray passed or met is unknown.
 """
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from scipy import ndimage
@@ -47,9 +48,13 @@ class Occupancy:
         """(X, Y, Z) bool, the voxels that some ray reaches."""
         return np.asarray((self.hits > 0) | (self.passes > 0))
 
+    def metres(self, points: Array) -> Array:
+        """(P, 3) world points -> (P, 3) in the axes of the map."""
+        return _moved(points, self.to_map)
+
     def voxels(self, points: Array) -> Array:
         """(P, 3) world points -> (P, 3) int64 voxels, perhaps outside of the grid."""
-        return np.floor((_moved(points, self.to_map) - self.origin) / self.resolution).astype(np.int64)
+        return np.floor((self.metres(points) - self.origin) / self.resolution).astype(np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,20 +253,13 @@ def collider(occupancy: Occupancy) -> tuple[Array, Array]:
     Seen from outside, corners run counterclockwise.
     """
     solid = np.pad(occupancy.occupied, 1)
-    corners, squares = [], []
-    count = 0
-    for axis in range(3):
-        first, second = (axis + 1) % 3, (axis + 2) % 3
-        for side in (0, 1):
-            outside = np.roll(solid, 1 if side == 0 else -1, axis)
-            cells = np.argwhere(solid & ~outside) - 1
-            loop = [(0, 0), (1, 0), (1, 1), (0, 1)] if side == 1 else [(0, 0), (0, 1), (1, 1), (1, 0)]
-            square = np.repeat(cells[:, None], 4, axis=1)
-            square[:, :, axis] += side
-            square[:, :, first] += [one for one, _ in loop]
-            square[:, :, second] += [other for _, other in loop]
-            corners.append(square.reshape(-1, 3))
-            squares.append(count + np.arange(4 * len(cells)).reshape(-1, 4))
-            count += 4 * len(cells)
+    loop = np.array([(0, 0), (1, 0), (1, 1), (0, 1)])  # counterclockwise from above
+    corners = []
+    for axis, side in product(range(3), (0, 1)):
+        cells = np.argwhere(solid & ~np.roll(solid, 1 - 2 * side, axis)) - 1
+        square = np.repeat(cells[:, None], 4, axis=1)
+        square[:, :, axis] += side
+        square[:, :, [(axis + 1) % 3, (axis + 2) % 3]] += loop if side else loop[:, ::-1]
+        corners.append(square.reshape(-1, 3))
     every, which = np.unique(np.concatenate(corners), axis=0, return_inverse=True)
-    return occupancy.origin + every * occupancy.resolution, which.reshape(-1)[np.concatenate(squares)]
+    return occupancy.origin + every * occupancy.resolution, which.reshape(-1, 4)

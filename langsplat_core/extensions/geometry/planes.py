@@ -1,22 +1,56 @@
-"""Floor and walls of a scene: planes in its surface, by RANSAC (Open3D), and what they say about up."""
+"""Points spread evenly over a scene's surface, and its floor: planes in them, by RANSAC (Open3D)."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from langsplat_core.arrays import Array
-from langsplat_core.extensions.geometry.points import cloud, sample_surface
-from langsplat_core.scene import Scene
+from langsplat_core.arrays import Array, rotation_matrices, unit
+from langsplat_core.errors import InputError
+from langsplat_core.scene import Gaussians, Scene
+from langsplat_core.scene.surface import surface_areas, surface_weights
 
+if TYPE_CHECKING:
+    from open3d.geometry import PointCloud
+
+FEWEST = 100  # Gaussians: fewer have no surface to speak of
 SAMPLES = 30_000  # points of the surface
 NEAR = 0.02  # of the scene's radius: how far from a plane its points lie
-MOST = 8  # planes that are looked for
 LEAST = 0.02  # of the surface: what is less is no plane of a room
-ITERATIONS = 1_000  # of RANSAC, a plane
-LEVEL, UPRIGHT = 0.9, 0.5  # cosine with up of the normals of a floor, at least, and of a wall, at most
-STRETCH = 20.0  # of heights, while walls are looked for: a level slab through furniture has few points then
+LEVEL = 0.9  # cosine with up of the normals of a floor, at least
 BELOW = 0.05  # of the surface, that may lie below the floor: what shines through it, and floaters
-APART = 0.15  # of the scene's radius: nearer than this, two parallel walls are one that is not sharp
+
+
+def sample_surface(gaussians: Gaussians, count: int, seed: int = 0) -> tuple[Array, Array]:
+    """Return (count, 3) float64 points on the surface, as many on equal areas, and their unit normals.
+
+    Normals, (count, 3), are of either sign. A Gaussian is a disc across its shortest axis, with the density
+    of its two longest ones; one of a wall counts as many times as it covers. Raises InputError for a scene
+    with less than `FEWEST` opaque Gaussians.
+    """
+    rows = np.flatnonzero(surface_weights(gaussians) > 0)
+    areas = surface_areas(gaussians)[rows]
+    if len(rows) < FEWEST or not areas.sum() > 0:
+        raise InputError(f"{len(rows)} opaque Gaussians have no surface; at least {FEWEST} are needed")
+    rng = np.random.default_rng(seed)
+    chosen = rows[rng.choice(len(rows), count, p=areas / areas.sum())]
+    axes = rotation_matrices(gaussians.quats_wxyz[chosen].astype(np.float64))  # columns
+    lengths = np.exp(gaussians.log_scales[chosen].astype(np.float64).clip(max=np.log(np.sqrt(areas.max()))))
+    shortest = lengths.argmin(1)
+    steps = lengths * rng.normal(size=(count, 3))
+    steps[np.arange(count), shortest] = 0
+    points = gaussians.means[chosen] + np.einsum("nij,nj->ni", axes, steps)
+    return points, unit(axes[np.arange(count), :, shortest])
+
+
+def cloud(points: Array, normals: Array | None = None) -> "PointCloud":
+    """(P, 3) points, with (P, 3) normals where there are such, as Open3D has them."""
+    import open3d
+
+    made = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+    if normals is not None:
+        made.normals = open3d.utility.Vector3dVector(normals)
+    return made
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +73,6 @@ class Room:
     up: Array  # (3,) unit: the floor's normal; the scene's own up where there is no floor
     ground: float  # height of the floor along `up`, world units; without one of nearly the lowest surface
     floor: Plane | None  # its normal points up
-    walls: tuple[Plane, ...]  # the largest first; their normals point to the middle of the scene
 
 
 def find_planes(points: Array, near: float, least: float, seed: int = 0) -> list[Plane]:
@@ -53,8 +86,8 @@ def find_planes(points: Array, near: float, least: float, seed: int = 0) -> list
     found: list[Plane] = []
     left = points
     open3d.utility.random.seed(seed)
-    while len(found) < MOST and len(left) >= max(least, 3):
-        (*normal, d), inside = cloud(left).segment_plane(near, 3, ITERATIONS, 1.0)
+    while len(found) < 8 and len(left) >= max(least, 3):
+        (*normal, d), inside = cloud(left).segment_plane(near, 3, 1_000, 1.0)
         if len(inside) < least:
             break
         length = float(np.linalg.norm(normal))
@@ -64,41 +97,17 @@ def find_planes(points: Array, near: float, least: float, seed: int = 0) -> list
 
 
 def find_room(scene: Scene, seed: int = 0) -> Room:
-    """Floor, walls and up of a scene.
+    """Return floor and up of a scene.
 
     The floor is the largest level plane with hardly any surface below it. Raises InputError for a scene
     without a surface.
     """
     points, normals = sample_surface(scene.gaussians, SAMPLES, seed)
-    centre, radius = scene.bounds()
-    up, near, least = scene.up(), NEAR * radius, LEAST * len(points)
-    along = np.abs(normals @ up)
-    level = [_facing(plane, up) for plane in find_planes(points[along >= LEVEL], near, least, seed)]
-    floor = next((one for one in level if (one.heights(points) < -2 * near).mean() <= BELOW), None)
-    if floor is not None:
-        up = floor.normal
-        floor = replace(floor, share=floor.share * float((along >= LEVEL).mean()))
-    ground = floor.offset if floor is not None else float(np.quantile(points @ up, BELOW))
-    stretch = np.eye(3) + (STRETCH - 1) * np.outer(up, up)
-    upright = points[along <= UPRIGHT]
-    walls: list[Plane] = []
-    for plane in find_planes(upright @ stretch, near, least, seed):
-        normal = plane.normal - (plane.normal @ up) * up
-        length, share = float(np.linalg.norm(normal)), plane.share * len(upright) / len(points)
-        inner = _facing(Plane(normal / length, plane.offset / length, share), centre, plane.offset / length)
-        if not any(
-            one.normal @ inner.normal > LEVEL and abs(one.offset - inner.offset) < APART * radius
-            for one in walls
-        ):
-            walls.append(inner)
-    return Room(up, ground, floor, tuple(walls))
-
-
-def _facing(plane: Plane, towards: Array, offset: float = 0.0) -> Plane:
-    """Return the plane with its normal on the side of `towards`, a (3,) direction.
-
-    `towards` may also be a point with the plane's own offset.
-    """
-    if towards @ plane.normal >= offset:
-        return plane
-    return Plane(-plane.normal, -plane.offset, plane.share)
+    up, near = scene.up(), NEAR * scene.bounds()[1]
+    level = np.abs(normals @ up) >= LEVEL
+    for plane in find_planes(points[level], near, LEAST * len(points), seed):
+        sign = 1 if plane.normal @ up >= 0 else -1
+        floor = Plane(sign * plane.normal, sign * plane.offset, plane.share * float(level.mean()))
+        if (floor.heights(points) < -2 * near).mean() <= BELOW:
+            return Room(floor.normal, floor.offset, floor)
+    return Room(up, float(np.quantile(points @ up, BELOW)), None)

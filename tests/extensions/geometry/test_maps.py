@@ -30,7 +30,7 @@ from tests.support.fakes import named_scene
 from tests.support.scenes import FLOOR, WALL, box_room
 
 COARSE = "--resolution", 0.1, "--step", 0.15
-ROOM = Room(np.array([0.0, 0.0, 1.0]), FLOOR, None, ())
+ROOM = Room(np.array([0.0, 0.0, 1.0]), FLOOR, None)
 
 
 def reference_trace(eye: Array, ends: Array, shape: tuple[int, int, int]) -> tuple[Array, Array]:
@@ -74,11 +74,11 @@ def test_rays_along_an_axis_and_of_no_length_end():
 
 def test_axes_of_a_map_are_metres_with_the_ground_at_nought():
     up = np.array([0.6, 0.0, 0.8])
-    matrix = map_axes(Room(up, 2.0, None, ()), 3.0)
+    matrix = map_axes(Room(up, 2.0, None), 3.0)
     np.testing.assert_allclose(matrix[:3, :3] @ matrix[:3, :3].T, 9 * np.eye(3), atol=1e-12)
     assert np.linalg.det(matrix[:3, :3]) == pytest.approx(27)
     np.testing.assert_allclose(matrix[:3, :3] @ (2.0 * up) + matrix[:3, 3], [0, 0, 0], atol=1e-12)
-    sideways = map_axes(Room(np.array([1.0, 0, 0]), 0.0, None, ()), 1.0)
+    sideways = map_axes(Room(np.array([1.0, 0, 0]), 0.0, None), 1.0)
     assert np.isfinite(sideways).all()
 
 

@@ -10,11 +10,8 @@ from scipy.spatial.transform import Rotation
 from langsplat_core.arrays import Array, unit
 from langsplat_core.config import INRIA
 from langsplat_core.errors import InputError
-from langsplat_core.extensions.geometry import registration
-from langsplat_core.extensions.geometry.merge import merge
-from langsplat_core.extensions.geometry.planes import find_room
-from langsplat_core.extensions.geometry.points import FEWEST, sample_surface
-from langsplat_core.extensions.geometry.registration import agreement, quarter_turns, register
+from langsplat_core.extensions.geometry.planes import FEWEST, find_room, sample_surface
+from langsplat_core.extensions.geometry.registration import agreement, merge, quarter_turns, register
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.reference import ReferenceRasterizer, colours
@@ -39,18 +36,13 @@ def degrees_apart(one: Array, other: Array) -> float:
 
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("there", [IDENTITY, similarity((0.2, -0.1, 0.7), (3.0, -1.0, 5.0), 2.0)])
-def test_floor_walls_and_up_are_found(seed, there):
+def test_floor_and_up_are_found(seed, there):
     room = find_room(transform_scene(box_room(seed), there))
-    *across, up = there.rotation.T
+    up = there.rotation[:, 2]
     assert degrees_apart(room.up, up) < 2
     assert room.floor is not None
     ground = there.scale * FLOOR + there.translation @ up
     assert room.ground == pytest.approx(ground, abs=0.03 * there.scale * WALL)
-    assert len(room.walls) == 4
-    for normal in (sign * axis for axis in across for sign in (1, -1)):
-        assert min(degrees_apart(wall.normal, normal) for wall in room.walls) < 4
-    for wall in room.walls:
-        assert wall.heights(there.translation[None])[0] == pytest.approx(there.scale * WALL, rel=0.1)
 
 
 def test_scene_without_floor_takes_the_up_of_its_cameras():
@@ -80,13 +72,8 @@ def test_a_scene_without_a_surface_is_refused():
             find()
 
 
-@pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registration, "SAMPLES", 20_000)
-
-
 @pytest.mark.parametrize(("scale", "scaled"), [(1.0, False), (3.0, True)])
-def test_a_capture_is_laid_onto_another(quick, scale, scaled):
+def test_a_capture_is_laid_onto_another(scale, scaled):
     there = similarity((0.4, -0.3, 1.2), (2.0, 1.0, -3.0), scale)
     fixed = box_room(2)
     found = register(transform_scene(fixed, there), fixed, scaled)
@@ -108,7 +95,7 @@ def test_quarter_turns_are_rotations_about_the_middle():
     assert np.trace(turns[1][:3, :3]) == pytest.approx(1)
 
 
-def test_metres_decide_the_scale(quick):
+def test_metres_decide_the_scale():
     there = similarity((0, 0, 0.5), (0.0, 1.0, 0.0), 3.0)
     fixed = replace(box_room(2), metres_per_unit=1.0)
     found = register(transform_scene(fixed, there), fixed)  # of 1 / 3 metres per unit
@@ -123,16 +110,6 @@ def test_agreement_tells_a_place_from_another():
     assert agreement(elsewhere, fixed, back.matrix) > 0.95
     assert agreement(elsewhere, fixed, similarity((0, 0, 0.3), (0.6, 0, 0.4)).then(back).matrix) < 0.7
     assert agreement(elsewhere, fixed, np.eye(4)) < 0.7
-
-
-def test_a_camera_moved_along_sees_the_same_points():
-    there = similarity((0.4, -0.3, 1.2), (2.0, 1.0, -3.0), 2.5)
-    camera = box_room().cameras[0]
-    other = there.inverse().camera(camera)
-    points = np.random.default_rng(0).normal(size=(50, 3))
-    pixels, depths = camera.project(there.points(points))
-    np.testing.assert_allclose(other.project(points)[0], pixels, rtol=1e-9)
-    np.testing.assert_allclose(there.scale * other.project(points)[1], depths, rtol=1e-9)
 
 
 # Two scenes as one.
