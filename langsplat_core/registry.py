@@ -33,8 +33,8 @@ class Extension:
     commands: References = field(default_factory=dict)  # "mesh" or "bench raster" -> dataclass with `run`
     groups: References = field(default_factory=dict)  # "bench" -> what its commands do, a sentence for --help
     formats: References = field(default_factory=dict)  # ".xyz" -> io.scenes.SceneFormat
-    importers: References = field(default_factory=dict)  # method -> io.exchange.Importer
-    exporters: References = field(default_factory=dict)  # word of `convert --to` -> io.exchange.Exporter
+    importers: References = field(default_factory=dict)  # method -> io.scenes.Importer
+    exporters: References = field(default_factory=dict)  # word of `convert --to` -> io.scenes.Exporter
     encoders: References = field(
         default_factory=dict
     )  # `model_type` of config.json -> semantics.encoder.Family

@@ -16,7 +16,7 @@ from assets.making.world import World, build_room
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.ply_table import write_table
+from langsplat_core.io.ply import write_table
 from langsplat_core.progress import Progress
 from langsplat_core.scene import LEVELS, Camera, look_at
 

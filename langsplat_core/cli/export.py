@@ -10,9 +10,12 @@ from langsplat_core import registry
 from langsplat_core.cli.arguments import AnyScene, EncoderOption, Level
 from langsplat_core.config import CodebookConfig, CodecConfig
 from langsplat_core.errors import InputError
-from langsplat_core.io.exchange import Exporter, ExportRequest, Importer, ImportRequest
 from langsplat_core.io.files import check_output_file, check_output_folder
 from langsplat_core.io.scenes import (
+    Exporter,
+    ExportRequest,
+    Importer,
+    ImportRequest,
     check_keeps,
     check_writable,
     load_scene,
@@ -79,10 +82,9 @@ class Convert:
     rematch: Path | None = None
     """A language sidecar (*.langsplat.safetensors) made before the Gaussians were edited: its field is
     carried over to the Gaussians of SOURCE by nearest position."""
-    to: Annotated[str, tyro.conf.arg(metavar="scene|langsplat|occam|features")] = "scene"
+    to: Annotated[str, tyro.conf.arg(metavar="scene|langsplat|occam")] = "scene"
     """langsplat: a folder with LangSplat's three checkpoints and its autoencoder. occam: with Occam's LGS's
-    three checkpoints of whole vectors. features: a folder of masks and vectors of photographs, `features` of
-    a training's work folder as LangSplat's language_features, or the other way."""
+    three checkpoints of whole vectors."""
     encoder: str | None = None
     """Text encoder of the checkpoints' vectors: hub id, folder or "demo" (default: LangSplat's OpenCLIP,
     laion/CLIP-ViT-B-16-laion2B-s34B-b88K). With a single .ply: its semantic_* are read."""

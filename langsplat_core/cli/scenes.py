@@ -8,7 +8,6 @@ import subprocess
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from itertools import accumulate
 from pathlib import Path
 from types import MappingProxyType
 
@@ -19,10 +18,8 @@ from langsplat_core import __version__
 from langsplat_core.cli.arguments import AnyScene, OutFolder
 from langsplat_core.cli.run import OutputConsole, print_json
 from langsplat_core.errors import EXTRAS, BackendError, LangSplatError, remedy
-from langsplat_core.io.scenes import (
-    load_scene,
-)
-from langsplat_core.io.summary import NEEDLE, OPACITY_EDGES, SceneSummary, disk_bytes, summarise
+from langsplat_core.io.scenes import load_scene
+from langsplat_core.io.summary import SceneSummary, disk_bytes, summarise
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.semantics.encoder import OPEN_MODEL
 from langsplat_core.semantics.encoders import load_text_encoder
@@ -62,19 +59,12 @@ def _lines(a: SceneSummary) -> list[tuple[str, str]]:
     """Rows of the report: a name, and a value for people."""
     reasons = "".join(f"; {count} {reason}" for reason, count in a.invalid.items())
     low, high = (" ".join(f"{value:.3g}" for value in corner) for corner in a.bounds)
-    median, most, largest = ("infinite" if ratio is None else f"{ratio:.3g}" for ratio in a.anisotropy)
-    hidden, *shares = accumulate(a.opacity_shares)  # of the Gaussians below each edge
-    energy = " + ".join(f"{100 * share:.3g} %" for share in a.sh_energy)
-    below = [f"{_percent(s)} < {edge:g}" for s, edge in zip(shares, OPACITY_EDGES[2:-1], strict=False)]
     lines = [
         ("in memory", f"{a.memory_bytes / 1e6:.2f} MB"),
         ("Gaussians", f"{a.gaussians:,}"),
         ("invalid rows", f"{a.invalid_rows}{reasons}"),
-        ("duplicates", f"{a.duplicates}"),
         ("bounds (1-99 %)", f"{low}  to  {high}"),
-        ("opacity", ", ".join([f"{_percent(hidden)} never drawn", *below])),
-        ("anisotropy", f"median {median}, 99 % {most}, largest {largest}; {a.needles} > {NEEDLE:g}"),
-        ("SH degree", f"{a.sh_degree}; energy by degree {energy}"),
+        ("SH degree", f"{a.sh_degree}"),
         ("antialiased", "yes (Mip-Splatting)" if a.antialiased else "no"),
         ("scale", f"{a.metres_per_unit:g} m per unit" if a.metres_per_unit else "unknown: `langsplat scale`"),
         ("extra properties", ", ".join(a.extras) or "none"),
@@ -83,7 +73,7 @@ def _lines(a: SceneSummary) -> list[tuple[str, str]]:
     field = a.language
     if field is None:
         return [*lines, ("language field", "none")]
-    observed = ", ".join(f"{name} {_percent(share)}" for name, share in field.observed.items())
+    observed = ", ".join(f"{name} {100 * share:.1f} %" for name, share in field.observed.items())
     return [
         *lines,
         ("language field", f"codec {field.codec} of {field.size}; {field.bytes / 1e6:.2f} MB in memory"),
@@ -96,10 +86,6 @@ def _lines(a: SceneSummary) -> list[tuple[str, str]]:
             "none" if field.nodes is None else f"{', '.join(map(str, field.nodes))} nodes at the levels",
         ),
     ]
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.1f} %"
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from langsplat_core.datasets.intrinsics import BrownDistortion, Distortion, Fish
 from langsplat_core.datasets.photos import Photo, develop, mask_beside
 from langsplat_core.errors import FormatError, InputError, printable_line, quoted, shortened
 from langsplat_core.io.hostile import PHOTO_SUFFIXES, PictureError, picture_size, read_json_file
-from langsplat_core.io.ply_table import read_cloud
+from langsplat_core.io.ply import read_cloud
 from langsplat_core.progress import Progress
 from langsplat_core.scene import FARTHEST
 

@@ -7,7 +7,7 @@ import re
 import stat
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -18,11 +18,7 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-NAME_MAX, PATH_MAX = 255, 4_096  # bytes, where the system does not say
-LONGEST_SUFFIX = 64  # bytes of a suffix that a temporary name keeps
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # where a disk is full, or broken
-# Where files are none: what is written there is read by the system or by nobody, and is gone afterwards.
-_SYSTEM, _MEMORY = ("/proc", "/sys", "/dev"), "/dev/shm"
 _UMASK = os.umask(0o077)
 os.umask(_UMASK)  # the only way to ask is to change it
 
@@ -36,7 +32,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    suffix = target.suffix if len(os.fsencode(target.suffix)) <= LONGEST_SUFFIX else ""
+    suffix = target.suffix if len(os.fsencode(target.suffix)) <= 64 else ""  # else the name may be too long
     handle, name = tempfile.mkstemp(prefix=".writing-", suffix=suffix, dir=target.parent)
     os.close(handle)
     temporary = Path(name)
@@ -60,23 +56,18 @@ def write_json(path: Path, content: object) -> None:
 
 
 @contextmanager
-def turns(folder: Path) -> Iterator[Callable[[], None]]:
-    """Yield a function that waits for a turn at the files of `folder`, which lasts to the end of the block.
+def locked(folder: Path) -> Iterator[None]:
+    """Wait until nobody else, in this process or others, is in such a block of the same `folder`.
 
-    Of all who wait, in this process or others, one at a time has it; where there are no locks, all have it.
+    Where there are no locks, or the folder may not be read, all go on at once.
     """
     handle = -1
     if fcntl is not None:
-        with suppress(OSError):  # a folder that may not be read
+        with suppress(OSError):
             handle = os.open(folder, os.O_RDONLY)
-
-    def wait() -> None:
-        if handle >= 0:
-            with suppress(OSError):  # a file system that knows no locks
-                fcntl.flock(handle, fcntl.LOCK_EX)
-
+            fcntl.flock(handle, fcntl.LOCK_EX)
     try:
-        yield wait
+        yield
     finally:
         if handle >= 0:
             os.close(handle)
@@ -102,14 +93,6 @@ def _no_room(error: Exception, temporary: Path) -> OSError | None:
     return None
 
 
-def name_max(folder: Path) -> int:
-    """Bytes that the file system of an existing `folder` takes for one name."""
-    try:
-        return os.pathconf(folder, "PC_NAME_MAX")
-    except (AttributeError, OSError, ValueError):  # Windows has none; not every file system answers
-        return NAME_MAX
-
-
 def check_output_file(path: Path | str) -> None:
     """Raise InputError, in one line, where no file can be written at `path`.
 
@@ -117,17 +100,11 @@ def check_output_file(path: Path | str) -> None:
     folders, or where one may not write. Folders that are missing will be made; nothing is left behind by the
     check.
     """
-    target = Path(path)
-    folder = _existing_folder(target)
-    try:
-        mode = os.stat(target).st_mode  # once: another process may replace the file meanwhile
-    except (OSError, ValueError):
-        mode = stat.S_IFREG  # none there, or no name for one, which writing will say
+    mode = _checked(Path(path))
     if stat.S_ISDIR(mode):
         raise InputError(f"{shown(path)}: is a folder; name a file in it")
-    if not stat.S_ISREG(mode):
+    if mode and not stat.S_ISREG(mode):
         raise InputError(f"{shown(path)}: is no ordinary file; choose another name")
-    _try_writing(target, folder)
 
 
 def check_output_folder(path: Path | str) -> None:
@@ -135,11 +112,9 @@ def check_output_folder(path: Path | str) -> None:
 
     It may be missing yet; see `check_output_file`.
     """
-    target = Path(path)
-    folder = _existing_folder(target)
-    if os.path.lexists(target) and not os.path.isdir(target):
+    mode = _checked(Path(path))
+    if mode and not stat.S_ISDIR(mode):
         raise InputError(f"{shown(path)}: is a file; name a folder")
-    _try_writing(target, folder)
 
 
 def shown(path: Path | str) -> str:
@@ -148,46 +123,35 @@ def shown(path: Path | str) -> str:
     return text if len(text) <= 100 else f"{text[:50]}...{text[-47:]}"
 
 
-def _existing_folder(target: Path) -> Path:
-    """Return the nearest folder above `target` that exists.
-
-    InputError for names that it cannot hold.
-    """
-    try:
-        size = len(str(target).encode())
-    except UnicodeEncodeError:
-        raise InputError(f"{shown(target)}: the name is not UTF-8; choose another") from None
+def _checked(target: Path) -> int:
+    """Return the mode of what is at `target`, 0 for nothing; InputError where nothing can be written."""
     try:
         os.fsencode(target)
+        str(target).encode()
+        mode = _mode(target)
+        folder = next(above for above in Path(os.path.abspath(target)).parents if os.path.lexists(above))
+        for part in Path(os.path.abspath(target)).relative_to(folder).parts:
+            _mode(folder / part)  # whether the file system takes the name
     except UnicodeEncodeError:
         raise InputError(
             f"{shown(target)}: names here are {sys.getfilesystemencoding()} (language settings), which lacks "
             "some of these letters; choose another name"
         ) from None
-    if "\0" in str(target):
-        raise InputError(f"{shown(target)!r}: no name can hold a zero byte; choose another")
-    whole = Path(os.path.abspath(target))
-    if size > PATH_MAX // 2:  # companions and temporary files need room too
-        raise InputError(f"{shown(target)}: a path of {size} bytes; choose a shorter one")
-    folder = next((above for above in whole.parents if os.path.lexists(above)), Path(whole.anchor))
+    except ValueError:
+        raise InputError(f"{shown(target)!r}: no name can hold a zero byte; choose another") from None
+    except OSError as error:
+        raise InputError(f"{shown(target)}: cannot be written ({error.strerror}); choose another") from None
     if not os.path.isdir(folder):
         raise InputError(f"{shown(target)}: {shown(folder)} is a file, not a folder; choose another name")
-    longest = max(whole.relative_to(folder).parts, key=lambda part: len(part.encode()), default="")
-    if len(longest.encode()) > name_max(folder):
-        raise InputError(
-            f"{shown(target)}: a name of {len(longest.encode())} bytes; this file system takes "
-            f"{name_max(folder)}, choose a shorter one"
-        )
-    return folder
-
-
-def _try_writing(target: Path, folder: Path) -> None:
-    real = os.path.realpath(target)
-    if any(_below(real, place) for place in _SYSTEM) and not _below(real, _MEMORY):
+    # Where files are none: what is written there is read by the system or by nobody, and is gone afterwards.
+    real = Path(os.path.realpath(target))
+    if any(real.is_relative_to(place) for place in ("/proc", "/sys", "/dev")) and not real.is_relative_to(
+        "/dev/shm"
+    ):
         raise InputError(f"{shown(target)}: lies in a folder of the system's own; choose another")
     try:
-        with tempfile.TemporaryFile(dir=target if os.path.isdir(target) else folder):
-            pass
+        with tempfile.TemporaryFile(dir=target if stat.S_ISDIR(mode) else folder):
+            return mode
     except OSError as error:
         raise InputError(
             f"{shown(target)}: nothing can be written into {shown(folder)} ({error.strerror}); "
@@ -195,5 +159,9 @@ def _try_writing(target: Path, folder: Path) -> None:
         ) from None
 
 
-def _below(path: str, folder: str) -> bool:
-    return path == folder or path.startswith(folder + os.sep)
+def _mode(path: Path) -> int:
+    """Return the mode of what is at `path`, 0 for nothing; OSError for a name that cannot be."""
+    try:
+        return os.stat(path).st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return 0

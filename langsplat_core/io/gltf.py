@@ -16,7 +16,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO
+from typing import Annotated, Any
 from urllib.parse import unquote
 
 import numpy as np
@@ -25,12 +25,12 @@ from msgspec import Meta, Struct
 from langsplat_core.arrays import Array, logit, rotation_matrices, sigmoid, unit
 from langsplat_core.errors import InputError, malformed, quoted
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.hostile import decode_json, is_plain_name, open_for_reading
-from langsplat_core.io.packing import coefficient_signs, quaternion_signs, to_bytes
+from langsplat_core.io.hostile import decode_json, is_plain_name, read_file
+from langsplat_core.io.quantised import coefficient_signs, quaternion_signs, to_bytes
 from langsplat_core.io.spz import decode_spz
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
 from langsplat_core.scene.gaussians import join_gaussians
-from langsplat_core.scene.transform import C0, Similarity, similarity, transform_gaussians
+from langsplat_core.scene.transform import C0, similarity, transform_gaussians
 
 EXTENSION = "KHR_gaussian_splatting"
 PACKED = (f"{EXTENSION}_compression_spz_2", f"{EXTENSION}_compression_spz")
@@ -152,13 +152,15 @@ def _turned(gaussians: Gaussians) -> Gaussians:
 def _parts(file: "_File") -> Iterator[Gaussians]:
     """Yield the Gaussians of every primitive that has some, placed by their nodes, along glTF's axes."""
     left = file.size  # bytes that are not shown yet: an honest file has no need to show one again and again
-    for place, primitive, splatting in _placed(file):
+    for matrix, primitive in _placed(file):
+        splatting = primitive.extensions[EXTENSION]
         if primitive.mode != POINTS:
             raise malformed(file.path, "Gaussians in a primitive that is not of points")
         if splatting.color_space != SRGB:
             raise malformed(file.path, f"colours are not {SRGB} but {quoted(splatting.color_space)}")
-        views = [found.buffer_view for name, found in splatting.extensions.items() if name in PACKED]
-        packed = views[0] if views else None
+        packed = next(
+            (found.buffer_view for name, found in splatting.extensions.items() if name in PACKED), None
+        )
         data = b"" if packed is None else file.view(packed)[0]
         count = 0 if packed is not None else file.content.accessors[primitive.attributes["POSITION"]].count
         left -= len(data) + LEAST_ROW * count
@@ -169,33 +171,28 @@ def _parts(file: "_File") -> Iterator[Gaussians]:
         else:
             gaussians = _gaussians(file, primitive.attributes, count)
         try:
+            place = similarity(matrix)
             yield gaussians if place.is_identity else transform_gaussians(gaussians, place)
         except InputError as error:
             raise malformed(file.path, str(error)) from None
 
 
-def _placed(file: "_File") -> Iterator[tuple[Similarity, _Primitive, _Splatting]]:
-    """Yield the primitives with Gaussians and where they are. Every node has one parent at most."""
+def _placed(file: "_File") -> Iterator[tuple[Array, _Primitive]]:
+    """Yield the primitives with Gaussians and the matrix of their place. A node has one parent at most."""
     content = file.content
     roots = content.scenes[content.scene].nodes if content.scenes else range(len(content.nodes))
     waiting = [(root, np.eye(4)) for root in reversed(roots)]
     seen: set[int] = set()
     while waiting:
         number, above = waiting.pop()
-        if number in seen:
-            raise malformed(file.path, f"node {number} is in two places or within itself")
+        if number in seen or len(waiting) > MOST_NODES:
+            raise malformed(file.path, f"node {number} is in two places, within itself or one of too many")
         seen.add(number)
         node = content.nodes[number]
         matrix = above @ _matrix(node)
-        for primitive in () if node.mesh is None else content.meshes[node.mesh].primitives:
-            if EXTENSION in primitive.extensions:
-                try:
-                    yield similarity(matrix), primitive, primitive.extensions[EXTENSION]
-                except InputError as error:
-                    raise malformed(file.path, f"node {number}: {error}") from None
+        primitives = () if node.mesh is None else content.meshes[node.mesh].primitives
+        yield from ((matrix, primitive) for primitive in primitives if EXTENSION in primitive.extensions)
         waiting += [(child, matrix) for child in reversed(node.children)]
-        if len(waiting) > MOST_NODES:
-            raise malformed(file.path, f"more than {MOST_NODES} nodes in its tree")
 
 
 def _matrix(node: _Node) -> Array:
@@ -233,42 +230,24 @@ class _File:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        file, self.size = open_for_reading(path)
-        with file:
-            start = file.read(12)
-            if start[:4] == MAGIC:
-                text, self._binary = self._chunks(start, memoryview(file.read()))
-            else:
-                if self.size > 2**31:
-                    raise malformed(path, f"{self.size} bytes of JSON", "write it as .glb")
-                text, self._binary = start + file.read(), memoryview(b"")
-        head = decode_json(text, _Head, path)
+        text = memoryview(read_file(path, 2**32))
+        self.size, self._binary = len(text), text[:0]
+        self._buffers: dict[int, bytes | memoryview] = {}
+        if text[:4] == MAGIC:  # then version, length; size and kind of a chunk; JSON; the same of the buffer
+            end = 20 + int.from_bytes(text[12:16], "little")
+            if text[4:8] != b"\2\0\0\0" or text[16:20] != JSON_CHUNK or end - 20 > JSON_LIMIT:
+                raise malformed(path, f"does not begin with a chunk of JSON of at most {JSON_LIMIT} bytes")
+            size = int.from_bytes(text[end : end + 4], "little")
+            self._binary = text[end + 8 :][: size if text[end + 4 : end + 8] == BINARY_CHUNK else 0]
+            text = text[20:end]
+        head = decode_json(bytes(text), _Head, path)
         version = head.asset.get("version")
         if str(version)[:2] != "2.":
             raise malformed(path, f"glTF version {quoted(version)}; only 2 is read", "export it as glTF 2.0")
         for name in head.extensions_required:
             if name not in KNOWN:
                 raise malformed(path, f"needs {quoted(name)}, which is not read", "export it without")
-        self.content = decode_json(text, _Content, path)
-        self._buffers: dict[int, bytes | memoryview] = {}
-
-    def _chunks(self, start: bytes, rest: memoryview) -> tuple[bytes, memoryview]:
-        """Return the JSON and the binary chunk of a .glb."""
-        version, length = struct.unpack("<II", start[4:]) if len(start) == 12 else (0, 0)
-        if version != 2 or length > self.size:
-            raise malformed(self.path, f"a .glb of version {version} and {length} bytes, found {self.size}")
-        found: list[tuple[bytes, memoryview]] = []
-        at = 0
-        while at + 8 <= length - 12 and len(found) < 2:
-            size, kind = struct.unpack_from("<I4s", rest, at)
-            if at + 8 + size > len(rest):
-                raise malformed(self.path, f"truncated: a chunk of {size} bytes does not fit")
-            found.append((kind, rest[at + 8 : at + 8 + size]))
-            at += 8 + size
-        if not found or found[0][0] != JSON_CHUNK or len(found[0][1]) > JSON_LIMIT:
-            raise malformed(self.path, f"does not begin with a chunk of JSON of at most {JSON_LIMIT} bytes")
-        binary = found[1][1] if len(found) == 2 and found[1][0] == BINARY_CHUNK else rest[:0]
-        return bytes(found[0][1]), binary
+        self.content = decode_json(bytes(text), _Content, path)
 
     def accessor(self, index: int, width: int, count: int, name: str) -> Array:
         """Return the (count, width) float32 values of an accessor."""
@@ -299,21 +278,19 @@ class _File:
     def _buffer(self, index: int) -> bytes | memoryview:
         if index not in self._buffers:
             uri = self.content.buffers[index].get("uri")
+            scheme, _, data = str(uri).partition(";base64,")
             if uri is None and index == 0:
                 self._buffers[index] = self._binary
-            elif isinstance(uri, str) and uri.startswith("data:"):
+            elif scheme.startswith("data:"):
                 try:
-                    self._buffers[index] = base64.b64decode(uri.partition(";base64,")[2], validate=True)
+                    self._buffers[index] = base64.b64decode(data, validate=True)
                 except ValueError:
                     raise malformed(self.path, f"buffer {index} is not base64") from None
+            elif is_plain_name(name := unquote(str(uri))):
+                self._buffers[index] = read_file(self.path.parent / name, 2**40)
+                self.size += len(self._buffers[index])
             else:
-                name = unquote(uri) if isinstance(uri, str) else ""
-                if not is_plain_name(name):
-                    raise malformed(self.path, f"buffer {quoted(uri)} is no plain file name")
-                file, size = open_for_reading(self.path.parent / name)
-                with file:
-                    self.size += size
-                    self._buffers[index] = file.read()
+                raise malformed(self.path, f"buffer {quoted(uri)} is no plain file name")
         return self._buffers[index]
 
 
@@ -324,42 +301,28 @@ def write_gltf(path: Path | str, gaussians: Gaussians) -> None:
     points of the base colour in programs that do not know the extension. A row that cannot be drawn is
     written with opacity 0. Raises InputError for more than a .glb can hold, 4 GiB.
     """
-    path = Path(path)
-    buffer, columns = BufferWriter(), _columns(gaussians) if len(gaussians) else {}
-    attributes = {name: buffer.add(values, name == "POSITION") for name, values in columns.items()}
-    content: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "langsplat-viewer"},
-        "extensionsUsed": [EXTENSION],
-        "scene": 0,
-        "scenes": [{}],
-    }
-    if columns:
+    file = GltfWriter(EXTENSION)
+    if len(gaussians):
         says = {"kernel": "ellipse", "colorSpace": SRGB}
         says |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
-        primitive = {"attributes": attributes, "mode": POINTS, "extensions": {EXTENSION: says}}
-        content |= {
-            "scenes": [{"nodes": [0]}],
-            "nodes": [{"mesh": 0}],
-            "meshes": [{"primitives": [primitive]}],
-        } | buffer.content()
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        if path.suffix.lower() == ".gltf":
-            if columns:
-                data = base64.b64encode(b"".join(buffer.blocks)).decode()
-                content["buffers"][0]["uri"] = f"data:application/octet-stream;base64,{data}"
-            file.write(json.dumps(content).encode())
-            return
-        write_glb(file, content, buffer, path)
+        columns = _columns(gaussians).items()
+        attributes = {name: file.add(values, name == "POSITION") for name, values in columns}
+        file.add_mesh({"attributes": attributes, "mode": POINTS, "extensions": {EXTENSION: says}})
+    file.write(Path(path))
 
 
-class BufferWriter:
-    """The one buffer of a glTF file that is written, and the accessors into it."""
+class GltfWriter:
+    """A glTF file that is made: its nodes, each with a mesh, and their one buffer."""
 
-    def __init__(self) -> None:
-        self.blocks: list[memoryview] = []
-        self.size = 0  # bytes, always a multiple of four
-        self._accessors: list[dict[str, Any]] = []
-        self._views: list[dict[str, Any]] = []
+    def __init__(self, extension: str) -> None:
+        self._content: dict[str, Any] = {
+            "asset": {"version": "2.0", "generator": "langsplat-viewer"},
+            "extensionsUsed": [extension],
+            "scene": 0,
+            "scenes": [{}],
+        }
+        self._blocks: list[memoryview] = []
+        self._size = 0  # bytes, always a multiple of four
 
     def add(self, values: Array, bounded: bool = False) -> int:
         """Append (N,) or (N, k) values, N > 0, and return the index of their accessor.
@@ -367,37 +330,48 @@ class BufferWriter:
         Small integers are fractions of their largest; `bounded` states least and greatest values.
         """
         block = np.ascontiguousarray(values)
+        views, accessors = (self._content.setdefault(key, []) for key in ("bufferViews", "accessors"))
         code = next(code for code, kind in COMPONENTS.items() if np.dtype(kind) == block.dtype)
-        shape = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[block[0].size]
-        about = {"bufferView": len(self._views), "componentType": code, "count": len(block), "type": shape}
+        shape = next(shape for shape, width in WIDTHS.items() if width == block[0].size)
+        about = {"bufferView": len(views), "componentType": code, "count": len(block), "type": shape}
         if block.dtype.itemsize < 4:
             about["normalized"] = True
         if bounded:
             about |= {"min": block.min(0).tolist(), "max": block.max(0).tolist()}
         target = 34963 if block.dtype == np.uint32 else 34962  # indices, attributes
-        view = {"buffer": 0, "byteOffset": self.size, "byteLength": block.nbytes, "target": target}
-        self._accessors.append(about)
-        self._views.append(view)
-        self.blocks.append(block.data.cast("B"))
-        self.size += block.nbytes
-        return len(self._accessors) - 1
+        views.append({"buffer": 0, "byteOffset": self._size, "byteLength": block.nbytes, "target": target})
+        accessors.append(about)
+        self._blocks.append(block.data.cast("B"))
+        self._size += block.nbytes
+        return len(accessors) - 1
 
-    def content(self) -> dict[str, Any]:
-        """Return the entries of the JSON that describe the buffer."""
-        buffers = [{"byteLength": self.size}]
-        return {"accessors": self._accessors, "bufferViews": self._views, "buffers": buffers}
+    def add_mesh(self, primitive: dict[str, Any], **more: Any) -> None:
+        """Add a node with `more` entries, and its mesh of one primitive."""
+        nodes, meshes = (self._content.setdefault(key, []) for key in ("nodes", "meshes"))
+        meshes.append({"primitives": [primitive]})
+        nodes.append({"mesh": len(nodes), **more})
+        self._content["scenes"] = [{"nodes": list(range(len(nodes)))}]
 
-
-def write_glb(file: BinaryIO, content: dict[str, Any], buffer: BufferWriter, path: Path) -> None:
-    """Write a .glb; InputError, naming `path`, for more than one can hold."""
-    text = json.dumps(content).encode()
-    text += b" " * (-len(text) % 4)
-    binary = struct.pack("<I", buffer.size) + BINARY_CHUNK if buffer.size else b""
-    whole = 20 + len(text) + len(binary) + buffer.size
-    if whole >= 2**32:
-        raise InputError(f"{path}: {whole} bytes are more than a .glb can hold; write .spz or .sog")
-    file.write(MAGIC + struct.pack("<III", 2, whole, len(text)) + JSON_CHUNK + text + binary)
-    file.writelines(buffer.blocks)
+    def write(self, path: Path, **more: Any) -> None:
+        """Write a .gltf, or else a .glb, atomically, with `more` entries; InputError beyond 4 GiB."""
+        content = self._content | more
+        if self._size:
+            content["buffers"] = [{"byteLength": self._size}]
+        with atomic_path(path) as temporary, temporary.open("wb") as file:
+            if path.suffix.lower() == ".gltf":
+                if self._size:
+                    data = base64.b64encode(b"".join(self._blocks)).decode()
+                    content["buffers"][0]["uri"] = f"data:application/octet-stream;base64,{data}"
+                file.write(json.dumps(content).encode())
+                return
+            text = json.dumps(content).encode()
+            text += b" " * (-len(text) % 4)
+            binary = struct.pack("<I", self._size) + BINARY_CHUNK if self._size else b""
+            whole = 20 + len(text) + len(binary) + self._size
+            if whole >= 2**32:
+                raise InputError(f"{path}: {whole} bytes are more than a .glb can hold; write .spz or .sog")
+            file.write(MAGIC + struct.pack("<III", 2, whole, len(text)) + JSON_CHUNK + text + binary)
+            file.writelines(self._blocks)
 
 
 def _columns(gaussians: Gaussians) -> dict[str, Array]:

@@ -32,10 +32,9 @@ from langsplat_core.errors import (
 )
 from langsplat_core.io.files import atomic_path
 
-# ---- .npy and .npz: plain numbers or texts, read without pickles and without belief in their headers ----
-
 T = TypeVar("T")
-MEMBER_LIMIT = 2**31  # bytes of one array in an .npz: packed ones may be a thousand times their file
+
+# ---- .npy and .npz: plain numbers or texts, read without pickles and without belief in their headers ----
 
 
 def write_npy(path: Path, array: Array) -> None:
@@ -65,7 +64,7 @@ def read_npz(path: Path) -> dict[str, Array]:
     arrays = {}
     with opened_archive(path, ".npz file") as archive:
         for member in archive.names:
-            data = archive.read(member, MEMBER_LIMIT)
+            data = archive.read(member, 2**31)
             name = member.removesuffix(".npy")
             arrays[name] = _parse(io.BytesIO(data), len(data), f"{path}: {quoted(name, 60)}")
     return arrays
@@ -87,15 +86,11 @@ def _parse(file: BinaryIO, size: int, name: str) -> Array:
     if math.prod(shape) * dtype.itemsize != left:
         raise malformed(name, f"truncated or damaged: shape {quoted(shape)} does not fit its {left} bytes")
     data = np.frombuffer(file.read(), dtype)
-    if dtype.kind == "U" and data.size and not _is_text(data):
-        raise malformed(name, "holds a text that is not Unicode")
+    if dtype.kind == "U" and data.size:
+        codes = data.view(data.dtype.byteorder.replace("|", "=") + "u4")
+        if ((codes >= 0xD800) & (codes <= 0xDFFF) | (codes > 0x10FFFF)).any():  # NumPy raises SystemError
+            raise malformed(name, "holds a text that is not Unicode")
     return data.reshape(shape, order="F" if in_columns else "C")
-
-
-def _is_text(data: Array) -> bool:
-    """Return whether every code point of a text array exists; NumPy raises SystemError over others."""
-    codes = data.view(data.dtype.byteorder.replace("|", "=") + "u4")
-    return bool(((codes < 0xD800) | (codes > 0xDFFF) & (codes <= 0x10FFFF)).all())
 
 
 # ---- opening a file and JSON, with every way it can fail as one line for the user ----
@@ -135,32 +130,33 @@ def exists(path: Path) -> bool:
         return False
 
 
-def read_json_file(path: Path, limit: int) -> Any:
-    """Return the value in a JSON file of at most `limit` bytes. Raises InputError and FormatError."""
+def read_file(path: Path, limit: int) -> bytes:
+    """Return the content of a file of at most `limit` bytes. Raises InputError and FormatError."""
     file, size = open_for_reading(path)
     with file:
         if size > limit:
             raise malformed(path, f"{size} bytes, but a file of this kind never exceeds {limit}")
-        return parse_json(file.read(size), path)
+        return file.read(size)
 
 
-def parse_json(text: bytes, path: Path) -> Any:
-    """Return the value of a JSON text; FormatError for bad syntax, bad UTF-8, endless nesting or digits."""
-    try:
-        return json.loads(text)
-    except RecursionError:
-        raise malformed(path, "not readable as JSON (nested too deeply)") from None
-    except ValueError as error:
-        raise malformed(path, f"not readable as JSON ({str(error)[:80]})") from None
+def read_json_file(path: Path, limit: int) -> Any:
+    """Return the value in a JSON file of at most `limit` bytes. Raises InputError and FormatError."""
+    with _as_json(path):
+        return json.loads(read_file(path, limit))
 
 
 def decode_json(text: bytes, kind: type[T], path: Path) -> T:
     """Return the value of a JSON text, which has to fit the msgspec structure `kind`; FormatError."""
+    with _as_json(path):
+        return msgspec.json.decode(text.decode(json.detect_encoding(text)), type=kind)
+
+
+@contextmanager
+def _as_json(path: Path) -> Iterator[None]:
+    """Turn what bad syntax, endless nesting and digits, and unfitting values raise into FormatError."""
     try:
-        return msgspec.json.decode(text, type=kind)
-    except RecursionError:
-        raise malformed(path, "not readable as JSON (nested too deeply)") from None
-    except ValueError as error:
+        yield
+    except (RecursionError, ValueError) as error:
         raise malformed(path, f"not readable as JSON ({printable_line(error, 100)})") from None
 
 
@@ -169,8 +165,6 @@ def decode_json(text: bytes, kind: type[T], path: Path) -> T:
 # `zipfile` lets through what its decompressors and its own parsing meet in damaged archives (LZMAError,
 # IndexError, struct.error, NotImplementedError, zlib.error ...), so every exception here means an unreadable
 # archive. Only stored and deflated members are unpacked: no format that is read here uses other methods.
-
-METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
 class Archive:
@@ -194,7 +188,7 @@ class Archive:
             info = self._archive.getinfo(name)
         except KeyError:
             raise malformed(self.path, f"has no {quoted(name, 60)} inside") from None
-        if info.compress_type not in METHODS:
+        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             what = f"{quoted(name, 60)} inside is packed by method {info.compress_type}"
             raise malformed(self.path, what, "pack the archive again with deflate")
         with self._archive.open(info) as member:
@@ -243,6 +237,8 @@ MOST_PIXELS = 178_000_000  # of any image: 0.7 GB once decoded. The largest came
 # Declared pixels beyond these need a file of a fitting size: photographs keep 2 to 100 pixels a byte, what is
 # made to exhaust memory a million. The decoders of WebP and AVIF hold two more copies of the image.
 FREE_PIXELS, FREE_PIXELS_COPIED, PIXELS_PER_BYTE = 16_000_000, 8_000_000, 128
+# What these say is wrong with the file; what others say, such as IndexError, with Pillow's handling of it
+TELLING = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
 
 
 class PictureError(FormatError):
@@ -274,29 +270,32 @@ def opened(
     with file:
         try:
             lacking = _lacks_heif(file)
+            known = KINDS + ("AVIF",) * bool(features.check("avif")) + ("HEIF",) * ("HEIF" in Image.OPEN)
             # Image.open looks at the first bytes only to choose the kind; the name's ending plays no part
-            with Image.open(file, formats=kinds or readable_kinds()) as picture:
-                _check_size(name, picture, size)
+            with Image.open(file, formats=kinds or known) as picture:
+                free = FREE_PIXELS_COPIED if picture.format in ("WEBP", "AVIF", "HEIF") else FREE_PIXELS
+                most = min(MOST_PIXELS, free + PIXELS_PER_BYTE * size)
+                if picture.width * picture.height > most:
+                    declared = f"declares {picture.width}x{picture.height} pixels; at most {most // 10**6}"
+                    raise PictureError(name, f"{declared} million are read from a file of {size} bytes")
                 yield picture
         except LangSplatError:
             raise
         except Image.UnidentifiedImageError:
-            read = ", ".join(kinds or readable_kinds())
             if lacking and not kinds:
                 raise PictureError(name, f"HEIC needs pillow-heif: {remedy('pillow_heif')}") from None
+            read = ", ".join(kinds or known)
             raise PictureError(name, f"the content is none of {read}, or damaged") from None
         except Exception as error:  # noqa: BLE001  any at all, see the top of this file
-            raise PictureError(name, _reason(error)) from None
+            text = printable_line(error, 80)
+            telling = text and isinstance(error, TELLING)
+            reason = text if telling else f"damaged: {text or type(error).__name__}"
+            raise PictureError(name, reason) from None
 
 
 def is_video(path: Path) -> bool:
     """Return whether a file's name ends as a video's."""
     return path.suffix.lower() in VIDEO_SUFFIXES and not path.is_dir()
-
-
-def readable_kinds() -> tuple[str, ...]:
-    """Return Pillow's names of the kinds that are read on this machine."""
-    return KINDS + ("AVIF",) * bool(features.check("avif")) + ("HEIF",) * ("HEIF" in Image.OPEN)
 
 
 def _lacks_heif(file: BinaryIO) -> bool:
@@ -317,23 +316,3 @@ def picture_size(path: Path) -> tuple[int, int]:
     """Return (width, height) in pixels as the header declares them. Raises PictureError."""
     with opened(path) as picture:
         return picture.size
-
-
-def _check_size(name: str, picture: Image.Image, file_size: int) -> None:
-    free = FREE_PIXELS_COPIED if picture.format in ("WEBP", "AVIF", "HEIF") else FREE_PIXELS
-    most = min(MOST_PIXELS, free + PIXELS_PER_BYTE * file_size)
-    if picture.width * picture.height > most:
-        raise PictureError(
-            name,
-            f"declares {picture.width}x{picture.height} pixels; at most {most // 10**6} million are read "
-            f"from a file of {file_size} bytes",
-        )
-
-
-def _reason(error: Exception) -> str:
-    if isinstance(error, Image.DecompressionBombError):
-        return f"declares more than {MOST_PIXELS // 10**6} million pixels"
-    text = printable_line(error, 80)
-    # these say what is wrong with the file; others, such as IndexError, with Pillow's handling of it
-    telling = isinstance(error, OSError | SyntaxError | ValueError) and text
-    return text if telling else f"damaged: {text or type(error).__name__}"

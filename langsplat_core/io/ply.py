@@ -1,11 +1,13 @@
-"""3D Gaussian scenes as PLY: INRIA's layout, and SuperSplat's compressed one.
+"""PLY files: tables in any encoding, clouds of points, and 3D Gaussian scenes in two layouts.
 
-INRIA's is read in all its variants and written in its plain form.
+Our own in place of plyfile, which takes six times as long for a large scene and three times the memory
+(`python -m tests.benchmarks scale --only load`): rows are streamed into the arrays that are kept.
 
-One element `vertex`, one row per Gaussian. As written: binary little endian, float32, in order
-``x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3``. Opacities are logits, scales natural
-logarithms, rotations quaternions w x y z. There are 0, 9, 24 or 45 `f_rest` (SH degree 0 to 3), channel
-after channel: all coefficients of red, then of green, then of blue. Normals are zeros that nobody reads.
+INRIA's layout is read in all its variants and written in its plain form: one element `vertex`, one row per
+Gaussian, binary little endian, float32, in order ``x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2
+rot_0..3``. Opacities are logits, scales natural logarithms, rotations quaternions w x y z. There are 0, 9, 24
+or 45 `f_rest` (SH degree 0 to 3), channel after channel: all coefficients of red, then of green, then of
+blue. Normals are zeros that nobody reads.
 
 As read: the properties in any order and of any scalar type, any byte order, ascii, LF or CR LF in the
 header, without normals, with further elements (ignored) and properties (kept as `Scene.extras`). Rows are
@@ -19,19 +21,295 @@ last one counts:
 """
 
 import math
+import re
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
+from threading import Lock
+from typing import BinaryIO
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from langsplat_core.arrays import Array, logit
-from langsplat_core.errors import InputError, malformed
+from langsplat_core.errors import InputError, malformed, printable_line, quoted
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.packing import smallest_three
-from langsplat_core.io.ply_table import TYPE_NAMES, PlyElement, PlyFile, is_name, open_ply, write_table
+from langsplat_core.io.hostile import open_for_reading
+from langsplat_core.io.quantised import smallest_three
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
 from langsplat_core.scene.transform import C0
+
+# ---- tables ----
+
+HEADER_LIMIT = 64 * 1024  # bytes; a real header of 62 properties takes about 1.5 KiB
+NAME_LIMIT = 64  # characters; the longest of known programs has 17
+CHUNK_ROWS = 2048  # about 0.5 MB of a degree-3 scene: the columns are then picked out of the cache
+BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+TYPE_NAMES = {  # NumPy code -> names, the first of which is written
+    "i1": ("char", "int8"), "u1": ("uchar", "uint8"), "i2": ("short", "int16"), "u2": ("ushort", "uint16"),
+    "i4": ("int", "int32"), "u4": ("uint", "uint32"), "f4": ("float", "float32"), "f8": ("double", "float64"),
+}  # fmt: skip
+_TYPES = {name: code for code, names in TYPE_NAMES.items() for name in names}
+
+
+@dataclass
+class PlyElement:
+    """A table of the file."""
+
+    name: str
+    count: int  # rows
+    numbers: dict[str, str] = field(default_factory=dict)  # property -> NumPy code without byte order
+    lists: dict[str, str] = field(default_factory=dict)  # of properties that are lists: code of the length
+
+    def row(self, byte_order: str) -> np.dtype[np.void]:
+        """Return the type of a binary row in which every list is empty."""
+        kinds = {**self.numbers, **self.lists}
+        return np.dtype([(name, byte_order + code) for name, code in kinds.items()])
+
+
+class PlyFile:
+    """An open PLY file.
+
+    Every size is checked against the file before anything is allocated, so that a header which claims 10^12
+    rows costs nothing. All methods raise FormatError.
+    """
+
+    def __init__(self, file: BinaryIO, size: int, path: Path) -> None:
+        """Parse the header at the beginning of `file`, of `size` bytes; `path` is for messages."""
+        self.path = path
+        self.comments: list[str] = []
+        self.elements: dict[str, PlyElement] = {}
+        self._file, self._size = file, size
+        head = file.read(HEADER_LIMIT)
+        if head[:4] not in (b"ply\n", b"ply\r"):
+            raise malformed(path, "is not a PLY file (it does not begin with the line 'ply')")
+        end = re.search(rb"\n[ \t]*end_header[ \t\r]*\n", head)
+        if end is None:
+            raise malformed(path, f"truncated: no 'end_header' line in the first {len(head)} bytes")
+        self.header_size = end.end()  # bytes
+        self._format = ""
+        for line in head[: end.start()].decode("utf-8", "replace").split("\n")[1:]:
+            if not self._parse(line.strip()):
+                what = f"header line {quoted(line.strip(), 60)} is not understood, or declares a name twice"
+                raise malformed(path, what)
+        if not self._format:
+            raise malformed(path, "the header has no 'format' line")
+        self._order = BYTE_ORDERS[self._format]  # "<" or ">"; empty of ascii
+
+    def _parse(self, line: str) -> bool:
+        last = next(reversed(self.elements.values()), PlyElement("", 0))
+        match line.split():
+            case []:
+                pass
+            case ["comment" | "obj_info" as keyword, *_]:
+                self.comments.append(line.removeprefix(keyword).strip())
+            case ["format", name, *_] if name in BYTE_ORDERS:
+                self._format = name
+            # isdecimal refuses signs, and twenty digits are far beyond any file (int() of a million is slow)
+            case ["element", name, count] if (
+                is_name(name) and name not in self.elements and count.isdecimal() and len(count) <= 20
+            ):
+                self.elements[name] = PlyElement(name, int(count))
+            case ["property", *length, kind, name] if (
+                last.name and kind in _TYPES and is_name(name) and name not in last.numbers
+            ):
+                last.numbers[name] = _TYPES[kind]
+                match length:
+                    case []:
+                        pass
+                    case ["list", code] if _TYPES.get(code, "f")[0] != "f":
+                        last.lists[name] = _TYPES[code]
+                    case _:
+                        return False
+            case _:
+                return False
+        return True
+
+    @property
+    def vertex(self) -> PlyElement:
+        """The element of points and Gaussians."""
+        if "vertex" not in self.elements:
+            raise malformed(self.path, "has no element 'vertex'", "is it a scene or a point cloud?")
+        return self.elements["vertex"]
+
+    def read(self, element: PlyElement, *groups: tuple[Sequence[str], DTypeLike]) -> list[Array]:
+        """Return a (rows, names) table for each group of properties, of the type given with it.
+
+        Beside the tables only a chunk a thread is held. A number beyond its type becomes infinite or, in an
+        integer, arbitrary. FormatError for an element without these properties, or with lists.
+        """
+        absent = [name for names, _ in groups for name in names if name not in element.numbers]
+        if absent or element.lists:
+            lacks = f"has no number {absent[0]!r}" if absent else "has a list"
+            raise malformed(self.path, f"element {element.name} {lacks}; expected numbers")
+        self._seek(element)
+        tables = [np.empty((element.count, len(names)), dtype) for names, dtype in groups]
+        order = list(element.numbers)
+        indices = [np.array([order.index(name) for name in names], np.intp) for names, _ in groups]
+        chunks, taking = self._chunks(element), Lock()
+
+        def work(_: int) -> None:
+            while True:
+                with taking:
+                    start, rows = next(chunks, (0, None))
+                if rows is None:
+                    return
+                kinds = {rows.dtype[name] for name in order}
+                kind = kinds.pop() if len(kinds) == 1 else None
+                with np.errstate(over="ignore", invalid="ignore"):  # which holds for the calling thread only
+                    for (names, _dtype), picked, table in zip(groups, indices, tables, strict=True):
+                        part = table[start : start + len(rows)]
+                        if kind is not None and kind == part.dtype:  # half the time per number
+                            # `clip` lets NumPy write into the table directly; no index is out of range
+                            grid = rows.view(kind).reshape(len(rows), -1)
+                            np.take(grid, picked, axis=1, out=part, mode="clip")
+                            continue
+                        for index, name in enumerate(names):
+                            part[:, index] = rows[name]
+
+        # Two, which NumPy lets run at once: one core does not use the whole bandwidth of the memory.
+        with ThreadPoolExecutor(2) as pool:
+            list(pool.map(work, range(2)))
+        return tables
+
+    def _seek(self, wanted: PlyElement) -> None:
+        """Go to the first row of `wanted`, which the file has room for."""
+        self._file.seek(self.header_size)
+        for element in self.elements.values():
+            left, least = self._size - self._file.tell(), element.row(self._order).itemsize
+            if not self._order:  # a character and a separator a number; the file's last needs none
+                left, least = left + 1, 2 * max(len(element.numbers), 1)
+            if element.count * least > left:
+                needs = f"{element.count} rows of element {element.name} need {element.count * least} bytes"
+                raise malformed(self.path, f"truncated: {needs} at least, the file has {left} left")
+            if element is wanted:
+                return
+            if not self._order:
+                lines = (line for line in self._file if line.strip())
+                if sum(1 for _ in islice(lines, element.count)) < element.count:
+                    raise malformed(self.path, f"truncated: it ends in element {element.name}")
+            elif element.lists:
+                self._skip_lists(element)
+            else:
+                self._file.seek(element.count * least, 1)
+
+    def _skip_lists(self, element: PlyElement) -> None:
+        """Walk the rows one by one: only their own lengths tell where they end."""
+        for _ in range(element.count):
+            for name, code in element.numbers.items():
+                step = np.dtype(code).itemsize
+                if name in element.lists:
+                    length = np.dtype(self._order + element.lists[name])
+                    step *= int(np.frombuffer(self._exactly(length.itemsize), length)[0])
+                if step < 0:
+                    raise malformed(self.path, f"a list of element {element.name} has a negative length")
+                self._file.seek(step, 1)
+
+    def _exactly(self, size: int) -> bytes:
+        data = self._file.read(size)
+        if len(data) < size:
+            raise malformed(self.path, f"truncated: {size - len(data)} bytes are missing")
+        return data
+
+    def _chunks(self, element: PlyElement) -> Iterator[tuple[int, Array]]:
+        """Yield (index of the first row, structured rows) of an element without lists, from its first on."""
+        dtype = element.row(self._order)
+        for start in range(0, element.count, CHUNK_ROWS):
+            count = min(CHUNK_ROWS, element.count - start)
+            if self._order:
+                yield start, np.frombuffer(self._exactly(count * dtype.itemsize), dtype)
+            else:
+                yield start, self._ascii_rows(element, start, count)
+
+    def _ascii_rows(self, element: PlyElement, start: int, count: int) -> Array:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # "input contained no data": reported below
+                rows = np.loadtxt(self._file, comments=None, max_rows=count, ndmin=2, encoding="latin-1")
+        except ValueError as error:  # NumPy tells its own options too
+            what = f"unreadable row near {start} of {element.name}: {printable_line(error, 80)}"
+            raise malformed(self.path, what) from None
+        if rows.shape != (count, len(element.numbers)):
+            found = f"{len(rows)} rows of {rows.shape[1]} values from row {start} of {element.name} on"
+            raise malformed(self.path, f"{found}; expected {count} of {len(element.numbers)}")
+        # float64 holds every type of a PLY exactly
+        return np.ascontiguousarray(rows).view([(name, "f8") for name in element.numbers])[:, 0]
+
+
+@contextmanager
+def open_ply(path: Path) -> Iterator[PlyFile]:
+    """Open a PLY file. Raises InputError where it cannot be opened, FormatError where it breaks a rule."""
+    file, size = open_for_reading(path)
+    with file:
+        yield PlyFile(file, size, path)
+
+
+def is_name(word: str) -> bool:
+    """Return whether an element or property may be called so: names are shown in messages, in one line."""
+    return word.isprintable() and word.split() == [word] and len(word) <= NAME_LIMIT
+
+
+def write_table(
+    path: Path | str,
+    columns: Mapping[str, Array],
+    faces: Array | None = None,
+    comments: Sequence[str] = (),
+) -> None:
+    """Write a binary little-endian PLY, atomically.
+
+    columns: of the element `vertex`, name -> (N,) of a type in `TYPE_NAMES`. faces: (F, 3) numbers of
+    vertices. comments: of one line each.
+    """
+    count = len(next(iter(columns.values())))
+    kinds = {name: column.dtype.str[1:] for name, column in columns.items()}
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
+    header += [f"element vertex {count}"]
+    header += [f"property {TYPE_NAMES[kind][0]} {name}" for name, kind in kinds.items()]
+    if faces is not None:
+        header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        file.write("\n".join([*header, "end_header\n"]).encode())
+        for start in range(0, count, CHUNK_ROWS):
+            rows = np.empty(min(CHUNK_ROWS, count - start), [(name, "<" + kinds[name]) for name in columns])
+            for name, column in columns.items():
+                rows[name] = column[start : start + len(rows)]
+            file.write(rows.tobytes())
+        if faces is not None:
+            corners = np.empty(len(faces), [("count", "u1"), ("vertex_indices", "<i4", (3,))])
+            corners["count"], corners["vertex_indices"] = 3, faces
+            file.write(corners.tobytes())
+
+
+# ---- coloured points, as structure from motion and scanners write them ----
+
+CHANNELS = ("red", "green", "blue")
+GREY = 128  # of points without colours
+
+
+def read_cloud(path: Path) -> tuple[Array, Array]:
+    """Return (M, 3) float64 positions and (M, 3) uint8 colours of the element `vertex`.
+
+    A position may be infinite or NaN. Colours are whole numbers from 0 to 255, or floats from 0 to 1; what
+    lies beyond is clipped. Raises InputError when the file cannot be opened and FormatError when it breaks a
+    rule of the format.
+    """
+    with open_ply(path) as ply:
+        vertex = ply.vertex
+        coloured = all(channel in vertex.numbers for channel in CHANNELS)
+        points, shades = ply.read(vertex, (POSITION, "f8"), (CHANNELS * coloured, "f8"))
+    if not coloured:
+        shades = np.full(points.shape, GREY)
+    scale = 255 if coloured and vertex.numbers["red"].startswith("f") else 1
+    # clipped first, so that nothing overflows; NaN becomes black
+    return points, np.rint(np.clip(np.nan_to_num(shades), 0, 255 / scale) * scale).astype(np.uint8)
+
+
+# ---- Gaussians, in INRIA's layout ----
 
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")  # zeros that nobody reads
@@ -40,7 +318,6 @@ SCALE = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 REST_COUNTS = {3 * (count - 1): degree for degree, count in SH_COUNTS.items()}  # f_rest_* -> SH degree
 METRES = "metres_per_unit"
-COMMENT = "SplatRenderMode: mip"  # the commonest spelling, which `save_scene` writes
 
 
 def read_ply(path: Path | str) -> Gaussians:
@@ -55,44 +332,46 @@ def read_ply_scene(path: Path | str) -> Scene:
     its own type. Raises InputError when the file cannot be opened and FormatError when it breaks a rule of
     the format or holds no Gaussians.
     """
-    path = Path(path)
-    with open_ply(path) as ply:
-        vertex = ply.elements.get("vertex")
-        if vertex is None:
-            raise malformed(path, "has no element 'vertex'", "is it a 3D Gaussian scene?")
+    with open_ply(Path(path)) as ply:
         extras: dict[str, Array] = {}
-        if "chunk" in ply.elements and not vertex.numbers.keys().isdisjoint(PACKED):
-            gaussians = _read_compressed(ply, vertex)
+        if "chunk" in ply.elements and not ply.vertex.numbers.keys().isdisjoint(PACKED):
+            gaussians = _read_compressed(ply, ply.vertex)
         else:
-            gaussians, extras = _read_plain(ply, vertex)
-    antialiased, metres = antialiased_by_comments(ply.comments), metres_by_comments(ply.comments)
+            gaussians, extras = _read_plain(ply, ply.vertex)
+    antialiased, metres = _said(ply.comments)
     return Scene(gaussians, antialiased=antialiased, extras=extras, metres_per_unit=metres)
 
 
 def _read_plain(ply: PlyFile, vertex: PlyElement) -> tuple[Gaussians, dict[str, Array]]:
-    higher = _rest_count(ply.path, vertex) // 3  # coefficients of a channel beside the constant one
+    needed = (*BASE_COLOUR, "opacity", *SCALE, *ROTATION)
+    if vertex.numbers.keys().isdisjoint(needed):
+        what = "a mesh or point cloud, not a 3D Gaussian scene: it has no f_dc, opacity, scale and rot"
+        raise malformed(ply.path, what, "train a scene with 'langsplat train'")
+    count = sum(name.startswith("f_rest_") for name in vertex.numbers)
+    if count not in REST_COUNTS:
+        raise malformed(ply.path, f"{count} properties f_rest_*; expected 0, 9, 24 or 45 (SH degree 0-3)")
+    higher = count // 3  # coefficients of a channel beside the constant one
     by_coefficient = [f"f_rest_{k + channel * higher}" for k in range(higher) for channel in range(3)]
     layout = (POSITION, SCALE, ROTATION, ("opacity",), (*BASE_COLOUR, *by_coefficient))
-    known = {*NORMAL}.union(*layout)
-    tables, extras = ply.read(vertex, layout, [name for name in vertex.numbers if name not in known])
-    means, log_scales, quats_wxyz, opacities, sh = tables
+    others = [name for name in vertex.numbers if name not in {*NORMAL}.union(*layout)]
+    tables = ply.read(
+        vertex,
+        *((names, "f4") for names in layout),
+        *(((name,), vertex.numbers[name]) for name in others),
+    )
+    means, log_scales, quats_wxyz, opacities, sh, *kept = tables
     sh = sh.reshape(vertex.count, 1 + higher, 3)
+    extras = {name: table[:, 0] for name, table in zip(others, kept, strict=True)}
     return Gaussians(means, log_scales, quats_wxyz, opacities[:, 0], sh), extras
 
 
-def _rest_count(path: Path, vertex: PlyElement) -> int:
-    """Require the properties of a Gaussian; return the number of its `f_rest_*`."""
-    needed = (*POSITION, *BASE_COLOUR, "opacity", *SCALE, *ROTATION)
-    if vertex.numbers.keys().isdisjoint(needed[3:]):
-        what = "a mesh or point cloud, not a 3D Gaussian scene: it has no f_dc, opacity, scale and rot"
-        raise malformed(path, what, "train a scene with 'langsplat train'")
-    count = sum(name.startswith("f_rest_") for name in vertex.numbers)
-    if count not in REST_COUNTS:
-        raise malformed(path, f"{count} properties f_rest_*; expected 0, 9, 24 or 45 (SH degree 0-3)")
-    for name in (*needed, *(f"f_rest_{index}" for index in range(count))):
-        if name not in vertex.numbers:
-            raise malformed(path, f"property {name!r} is missing; every Gaussian needs it")
-    return count
+def write_ply_scene(path: Path, scene: Scene) -> None:
+    """Write the Gaussians of a scene and all that a PLY tells of them beside; see `write_ply`."""
+    # The commonest spelling of four
+    comments = ["SplatRenderMode: mip"] if scene.antialiased else []
+    if scene.metres_per_unit is not None:
+        comments.append(f"{METRES} {float(scene.metres_per_unit)!r}")
+    write_ply(path, scene.gaussians, tuple(comments), scene.extras)
 
 
 def write_ply(
@@ -127,40 +406,24 @@ def write_ply(
     write_table(path, columns, comments=comments)
 
 
-# ---- comments ----
-
-
-def antialiased_by_comments(comments: Iterable[str]) -> bool:
-    """Return whether a header's comments say that its scene was trained with Mip-Splatting's compensation."""
-    said = False
-    for comment in comments:
-        match comment.lower().replace(":", " ").split():
-            case ["splatrendermode", mode, *_]:
-                said = mode == "mip"
-            case ["antialiased", value]:
-                said = value == "1"
-            case ["train_flags", *flags]:
-                said = "antialiasing" in flags
-    return said
-
-
-def metres_comment(metres_per_unit: float) -> str:
-    """Return the comment that states the length of the world's unit."""
-    return f"{METRES} {float(metres_per_unit)!r}"
-
-
-def metres_by_comments(comments: Iterable[str]) -> float | None:
-    """Return metres per world unit, > 0 and finite, as the header's comments say; None where they do not."""
-    found = None
+def _said(comments: Sequence[str]) -> tuple[bool, float | None]:
+    """Return whether to draw antialiased, and metres per unit where that is a positive number."""
+    antialiased, metres = False, None
     for comment in comments:
         match comment.replace(":", " ").split():
             case [key, text] if key == METRES:
                 try:
-                    value = float(text)
+                    metres = float(text) if 0 < float(text) < math.inf else None
                 except ValueError:
-                    value = math.nan
-                found = value if 0 < value < math.inf else None
-    return found
+                    metres = None
+        match comment.lower().replace(":", " ").split():
+            case ["splatrendermode", mode, *_]:
+                antialiased = mode == "mip"
+            case ["antialiased", value]:
+                antialiased = value == "1"
+            case ["train_flags", *flags]:
+                antialiased = "antialiasing" in flags
+    return antialiased, metres
 
 
 def write_metres(path: Path | str, metres_per_unit: float) -> None:
@@ -181,11 +444,11 @@ def write_metres(path: Path | str, metres_per_unit: float) -> None:
         end = b"\r\n" if last.endswith(b"\r\n") else b"\n"
         ours = [b"comment", METRES.encode()]
         out.writelines(line for line in lines if line.replace(b":", b" ").split()[:2] != ours)
-        out.write(b"comment " + metres_comment(metres_per_unit).encode() + end + last)
+        out.write(f"comment {METRES} {float(metres_per_unit)!r}".encode() + end + last)
         shutil.copyfileobj(file, out)
 
 
-# ---- the compressed PLY of SuperSplat and splat-transform ----
+# ---- Gaussians, in the compressed layout of SuperSplat and splat-transform ----
 #
 # Three elements. `chunk`: for every 256 Gaussians the least and greatest position, logarithm of scale and,
 # in files of 18 columns, base colour. `vertex`: four uint32 per Gaussian,
@@ -202,10 +465,11 @@ def write_metres(path: Path | str, metres_per_unit: float) -> None:
 # Source of the layout: the public writer in PlayCanvas' splat-transform; the code here is our own.
 
 CHUNK_SIZE = 256
-POSITION_BOUNDS = ("min_x", "min_y", "min_z", "max_x", "max_y", "max_z")
-SCALE_BOUNDS = ("min_scale_x", "min_scale_y", "min_scale_z", "max_scale_x", "max_scale_y", "max_scale_z")
-COLOUR_BOUNDS = ("min_r", "min_g", "min_b", "max_r", "max_g", "max_b")
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+_BOUNDS = [
+    [f"{end}_{part}{axis}" for end in ("min", "max") for axis in axes]
+    for part, axes in (("", "xyz"), ("scale_", "xyz"), ("", "rgb"))
+]
 
 # Code c stands for the middle of its 1/256 interval, but the two ends are exact (-4 and 4).
 _SH_VALUES = ((np.arange(256) + 0.5) / 256 - 0.5) * 8
@@ -213,56 +477,50 @@ _SH_VALUES[[0, 255]] = -4, 4
 
 
 def _read_compressed(ply: PlyFile, vertex: PlyElement) -> Gaussians:
-    path, chunk = ply.path, ply.elements["chunk"]
+    chunk = ply.elements["chunk"]
     if chunk.count * CHUNK_SIZE < vertex.count:
         what = f"{chunk.count} chunks for {vertex.count} Gaussians; expected one for every {CHUNK_SIZE}"
-        raise malformed(path, what)
-    colours = (COLOUR_BOUNDS,) if COLOUR_BOUNDS[0] in chunk.numbers else ()
-    bounds, _ = ply.read(chunk, (POSITION_BOUNDS, SCALE_BOUNDS, *colours), dtype=np.float64)
-    packed = _codes(ply, vertex, PACKED, np.uint32)
-    rest = _read_rest(ply, vertex.count)
-    position, rotation, scale, colour = packed.T
-    rgba = np.stack([colour >> shift & 255 for shift in (24, 16, 8, 0)], axis=1) / 255
-    three = np.stack([rotation >> shift & 1023 for shift in (20, 10, 0)], axis=1) / 1023
+        raise malformed(ply.path, what)
+    coloured = _BOUNDS[2][0] in chunk.numbers  # else of the range 0 to 1
+    bounds = ply.read(chunk, *((names, "f8") for names in _BOUNDS[: 2 + coloured]))
+    position, rotation, scale, colour = _codes(ply, vertex, PACKED, "u4").T
+    rest = np.zeros((vertex.count, 3, 0))
+    element = ply.elements.get("sh")
+    if element is not None and element.numbers:
+        width = len(element.numbers)
+        if element.count != vertex.count or width not in REST_COUNTS:
+            what = f"element sh has {element.count} rows of {width}"
+            raise malformed(ply.path, f"{what}; expected {vertex.count} rows of 9, 24 or 45")
+        codes = _codes(ply, element, [f"f_rest_{index}" for index in range(width)], "u1")
+        rest = _SH_VALUES[codes].reshape(vertex.count, 3, width // 3)
     of_chunk = np.arange(vertex.count) // CHUNK_SIZE
 
     def between(table: Array, fractions: Array) -> Array:
         least, greatest = table[of_chunk, :3], table[of_chunk, 3:]
         return least * (1 - fractions) + greatest * fractions
 
+    three, rgba = _fractions(rotation, 2, 10, 10, 10)[:, 1:], _fractions(colour, 8, 8, 8, 8)
     with np.errstate(invalid="ignore", over="ignore"):  # infinite bounds make rows that are dropped later
-        rgb = between(bounds[2], rgba[:, :3]) if colours else rgba[:, :3]
+        rgb = between(bounds[2], rgba[:, :3]) if coloured else rgba[:, :3]
+        base = ((rgb - 0.5) / C0)[:, None]
         return Gaussians(
-            means=between(bounds[0], _fractions_11_10_11(position)),
-            log_scales=between(bounds[1], _fractions_11_10_11(scale)),
+            means=between(bounds[0], _fractions(position, 11, 10, 11)),
+            log_scales=between(bounds[1], _fractions(scale, 11, 10, 11)),
             quats_wxyz=smallest_three((three - 0.5) * np.sqrt(2), rotation >> 30),
             opacity_logits=logit(rgba[:, 3]),
-            sh=np.concatenate([((rgb - 0.5) / C0)[:, None], rest], axis=1),
+            sh=np.concatenate([base, rest.transpose(0, 2, 1)], axis=1),
         )
 
 
-def _read_rest(ply: PlyFile, count: int) -> Array:
-    """(N, K - 1, 3) coefficients; K = 1 without the element `sh`."""
-    element = ply.elements.get("sh")
-    if element is None or not element.numbers:
-        return np.zeros((count, 0, 3))
-    width = len(element.numbers)
-    if element.count != count or width not in REST_COUNTS:
-        what = f"element sh has {element.count} rows of {width}; expected {count} rows of 9, 24 or 45"
-        raise malformed(ply.path, what)
-    codes = _codes(ply, element, [f"f_rest_{index}" for index in range(width)], np.uint8)
-    return _SH_VALUES[codes].reshape(count, 3, width // 3).transpose(0, 2, 1)
+def _codes(ply: PlyFile, element: PlyElement, names: Sequence[str], kind: str) -> Array:
+    """(rows, names) whole numbers, which the file must hold as such."""
+    others = [name for name in names if element.numbers.get(name, kind) != kind]
+    if others:
+        raise malformed(ply.path, f"{others[0]!r} is not of the type {TYPE_NAMES[kind][0]}")
+    return ply.read(element, (names, kind))[0]
 
 
-def _codes(ply: PlyFile, element: PlyElement, names: Sequence[str], kind: type[np.unsignedinteger]) -> Array:
-    """(rows, names) whole numbers of a type, which the file may hold as numbers of another."""
-    (table,), _ = ply.read(element, [names], dtype=np.float64)
-    if not ((table >= 0) & (table <= np.iinfo(kind).max)).all():  # NaN compares False
-        what = f"element {element.name} holds numbers beyond those of {np.dtype(kind)}"
-        raise malformed(ply.path, what)
-    return table.astype(kind)
-
-
-def _fractions_11_10_11(packed: Array) -> Array:
-    """(N,) uint32 of 11, 10 and 11 bits -> (N, 3) fractions in [0, 1]."""
-    return np.stack([(packed >> 21) / 2047, (packed >> 11 & 1023) / 1023, (packed & 2047) / 2047], axis=1)
+def _fractions(packed: Array, *bits: int) -> Array:
+    """(N,) uint32 of fields of so many bits, the first on top -> (N, fields) fractions in [0, 1]."""
+    most = 2 ** np.array(bits) - 1
+    return (packed[:, None] >> 32 - np.cumsum(bits) & most) / most

@@ -18,24 +18,24 @@ from pathlib import Path
 import numpy as np
 
 from langsplat_core import registry
+from langsplat_core.config import CodecConfig
 from langsplat_core.errors import InputError
 from langsplat_core.io import cameras as camera_files
-from langsplat_core.io import ply
 from langsplat_core.io import sidecar as language_files
-from langsplat_core.io.cameras import read_cameras, write_cameras
-from langsplat_core.io.files import atomic_path, check_output_file, shown, turns
+from langsplat_core.io.files import atomic_path, check_output_file, locked, shown
 from langsplat_core.io.gltf import read_gltf_scene, write_gltf
 from langsplat_core.io.hostile import exists
-from langsplat_core.io.ply import metres_comment, read_ply_scene, write_ply
-from langsplat_core.io.sidecar import read_language, write_language
-from langsplat_core.io.sog import LOD_NAME, META_NAME, read_sog_scene, write_sog
-from langsplat_core.io.splat import read_ksplat, read_splat, write_splat
+from langsplat_core.io.ply import read_ply_scene, write_ply_scene
+from langsplat_core.io.quantised import read_splat, write_splat
+from langsplat_core.io.sog import META_NAME, read_sog_scene, write_sog
 from langsplat_core.io.spz import read_spz_scene, write_spz
+from langsplat_core.progress import Progress
 from langsplat_core.scene import Gaussians, Scene
 
 log = logging.getLogger("langsplat")
 
-LOOKED_AT = 4096  # rows of a large scene, evenly taken, that tell whether most can be drawn
+# Parts of a scene that a format may be unable to hold; without "precision" numbers are rounded
+LOSSES = ("precision", "view dependence", "antialiasing", "metres per unit", "extra properties")
 
 
 @dataclass(frozen=True)
@@ -47,23 +47,23 @@ class SceneFormat:
     write: Callable[[Path, Scene], None] | None = None  # None: read only
     loses: tuple[str, ...] = ()  # what a written file cannot hold, in words of `LOSSES`
     own_companions: bool = False  # companions keep the suffix: `a.spz.langsplat.safetensors`
-    folder_files: tuple[str, ...] = ()  # a folder with one of these in it is a scene too, and so is the file
+    folder_file: str = ""  # a folder with this file in it is a scene too, and so is the file
     mime: str = "model/x-gaussian-splat"
 
 
-# Parts of a scene that a format may be unable to hold; without "precision" numbers are rounded
-LOSSES = ("precision", "view dependence", "antialiasing", "metres per unit", "extra properties")
-
-
-def _write_ply(path: Path, scene: Scene) -> None:
-    comments = [ply.COMMENT] if scene.antialiased else []
-    if scene.metres_per_unit is not None:
-        comments.append(metres_comment(scene.metres_per_unit))
-    write_ply(path, scene.gaussians, tuple(comments), scene.extras)
+def _gltf(suffix: str, mime: str) -> SceneFormat:
+    return SceneFormat(
+        suffix,
+        read_gltf_scene,
+        lambda path, scene: write_gltf(path, scene.gaussians),
+        loses=("precision", "antialiasing", "metres per unit", "extra properties"),
+        own_companions=True,
+        mime=mime,
+    )
 
 
 CORE_FORMATS = (
-    SceneFormat(".ply", read_ply_scene, _write_ply, mime="model/x-ply"),  # plain and compressed
+    SceneFormat(".ply", read_ply_scene, write_ply_scene, mime="model/x-ply"),  # plain and compressed
     SceneFormat(
         ".spz",
         read_spz_scene,
@@ -78,26 +78,16 @@ CORE_FORMATS = (
         loses=LOSSES,
         own_companions=True,
     ),
-    SceneFormat(".ksplat", lambda path: Scene(read_ksplat(path)), own_companions=True),
     SceneFormat(
         ".sog",
         read_sog_scene,
         lambda path, scene: write_sog(path, scene.gaussians, scene.antialiased),
         loses=("precision", "metres per unit", "extra properties"),
         own_companions=True,
-        folder_files=(META_NAME, LOD_NAME),
+        folder_file=META_NAME,
     ),
-    *(
-        SceneFormat(
-            suffix,
-            read_gltf_scene,
-            lambda path, scene: write_gltf(path, scene.gaussians),
-            loses=("precision", "antialiasing", "metres per unit", "extra properties"),
-            own_companions=True,
-            mime=mime,
-        )
-        for suffix, mime in ((".glb", "model/gltf-binary"), (".gltf", "model/gltf+json"))
-    ),
+    _gltf(".glb", "model/gltf-binary"),
+    _gltf(".gltf", "model/gltf+json"),
 )
 
 
@@ -111,22 +101,18 @@ def writable_suffixes() -> tuple[str, ...]:
     return tuple(row.suffix for row in formats() if row.write is not None)
 
 
-def supported_kinds() -> str:
-    """Return what can be opened, in words: suffixes, and folders by the files in them."""
-    suffixes = [row.suffix for row in formats()]
-    folders = [f"a folder with {name} or that file" for row in formats() for name in row.folder_files]
-    return ", ".join(suffixes + folders)
-
-
 def format_of(path: Path) -> SceneFormat | None:
     """Return the format that `path` is named as, or, for a folder, has the file of; None for no scene."""
     folder = os.path.isdir(path)  # which a name too long is not
     for row in formats():
         if not folder and path.suffix.lower() == row.suffix:
             return row
-        if any(path.name == name or exists(path / name) for name in row.folder_files):
+        if row.folder_file and (path.name == row.folder_file or exists(path / row.folder_file)):
             return row
     return None
+
+
+# ---- reading ----
 
 
 def load_gaussians(path: Path | str) -> Gaussians:
@@ -135,7 +121,7 @@ def load_gaussians(path: Path | str) -> Gaussians:
     Raises InputError for what cannot be opened or is of no supported kind, FormatError for what breaks
     the rules of its format.
     """
-    return _read_scene(Path(path)).gaussians
+    return _read(Path(path)).gaussians
 
 
 def load_scene(path: Path | str) -> Scene:
@@ -151,7 +137,7 @@ def load_scene(path: Path | str) -> Scene:
     if not exists(sidecar):
         return scene
     try:
-        return replace(scene, language=read_language(sidecar, scene.gaussians.means))
+        return replace(scene, language=language_files.read_language(sidecar, scene.gaussians.means))
     except InputError as error:
         return replace(scene, unread=(*scene.unread, str(error)))
 
@@ -159,19 +145,29 @@ def load_scene(path: Path | str) -> Scene:
 def load_without_language(path: Path | str) -> Scene:
     """Return a scene as `load_scene` does, but without the language field, which is not even looked at."""
     path = Path(path)
-    scene, cameras = replace(_read_scene(path), path=path), _cameras_path(path)
+    scene, cameras = replace(_read(path), path=path), _cameras_path(path)
     if not exists(cameras):
         return scene
     try:
-        return replace(scene, cameras=read_cameras(cameras))
+        return replace(scene, cameras=camera_files.read_cameras(cameras))
     except InputError as error:
         log.warning("opened without its cameras: %s", error)
         return replace(scene, unread=(str(error),))
 
 
-def _read_scene(path: Path) -> Scene:
+def _read(path: Path) -> Scene:
     """Read the scene's own file; warn where most of it cannot be drawn."""
-    scene = _read_by_kind(path)
+    if not exists(path):
+        raise InputError(f"{path}: no such file; check the spelling and the folder")
+    row = format_of(path)
+    if row is None and path.is_dir():
+        inside = sorted(path.glob("**/*.ply"))
+        hint = f"; perhaps {inside[-1]}" if inside else ""
+        raise InputError(f"{path}: a folder without {META_NAME} is not a scene{hint}")
+    if row is None:
+        kinds = ", ".join(row.suffix for row in formats())
+        raise InputError(f"{path}: not a scene of a known kind; supported: {kinds}, {META_NAME}")
+    scene = row.read(path)
     log.debug("%s: %d Gaussians", path, len(scene.gaussians))
     warn_of_undrawable(path, scene.gaussians)
     return scene
@@ -180,7 +176,7 @@ def _read_scene(path: Path) -> Scene:
 def warn_of_undrawable(path: Path, gaussians: Gaussians) -> None:
     """Log a warning where most of the Gaussians that were read from `path` cannot be drawn."""
     count = len(gaussians)
-    looked_at = gaussians.take(np.arange(0, count, max(1, count // LOOKED_AT)))
+    looked_at = gaussians.take(np.arange(0, count, max(1, count // 4096)))  # enough to tell, evenly taken
     if 2 * looked_at.valid().sum() < len(looked_at):
         reasons = looked_at.invalid_rows()
         share = sum(reasons.values()) / len(looked_at)
@@ -188,25 +184,18 @@ def warn_of_undrawable(path: Path, gaussians: Gaussians) -> None:
         log.warning("%s: %s; is the file damaged?", path, told)
 
 
-def _read_by_kind(path: Path) -> Scene:
-    if not exists(path):
-        raise InputError(f"{path}: no such file; check the spelling and the folder")
-    row = format_of(path)
-    if row is not None:
-        return row.read(path)
-    if path.is_dir():
-        inside = sorted(path.glob("**/*.ply"))
-        hint = f"; perhaps {inside[-1]}" if inside else ""
-        raise InputError(f"{path}: a folder without {META_NAME} is not a scene{hint}")
-    raise InputError(f"{path}: not a scene of a known kind; supported: {supported_kinds()}")
+# ---- writing ----
 
 
-def check_writable(path: Path | str) -> None:
+def check_writable(path: Path | str) -> SceneFormat:
     """Raise InputError unless `save_scene` can write a scene of this name and its companions there."""
-    _writable(Path(path))
-    check_output_file(path)
-    for suffix in (language_files.SUFFIX, camera_files.SUFFIX):
-        check_output_file(companion_path(path, suffix))
+    path = Path(path)
+    for row in formats():
+        if row.suffix == path.suffix.lower() and row.write is not None:
+            for file in (path, *_companions(path)):
+                check_output_file(file)
+            return row
+    raise InputError(f"{path}: scenes are written as {', '.join(writable_suffixes())}; choose such a name")
 
 
 def check_keeps(out: Path, *sources: Path) -> None:
@@ -215,18 +204,9 @@ def check_keeps(out: Path, *sources: Path) -> None:
     That goes for what lies beside a source, and for the companions of a scene `out`.
     """
     read = {file.resolve() for source in sources for file in (source, *scene_files(source))}
-    companions = [companion_path(out, suffix) for suffix in (language_files.SUFFIX, camera_files.SUFFIX)]
-    scene = any(row.write is not None and out.suffix.lower() == row.suffix for row in formats())
-    for path in (out, *(companions if scene else ())):
-        if path.resolve() in read:
-            raise InputError(f"{shown(path)}: would replace the original scene; choose another name")
-
-
-def _writable(path: Path) -> SceneFormat:
-    for row in formats():
-        if row.suffix == path.suffix.lower() and row.write is not None:
-            return row
-    raise InputError(f"{path}: scenes are written as {', '.join(writable_suffixes())}; choose such a name")
+    companions = _companions(out) if out.suffix.lower() in writable_suffixes() else ()
+    if any(path.resolve() in read for path in (out, *companions)):
+        raise InputError(f"{shown(out)}: would replace the original scene; choose another name")
 
 
 def save_scene(path: Path | str, scene: Scene) -> None:
@@ -243,14 +223,14 @@ def save_scene(path: Path | str, scene: Scene) -> None:
         raise InputError(
             f"not written without what lies beside it; mend or remove it first: {scene.unread[0]}"
         )
-    check_writable(path)
-    row = _writable(path)
+    row = check_writable(path)
     assert row.write is not None
-    sidecar, cameras = companion_path(path, language_files.SUFFIX), companion_path(path, camera_files.SUFFIX)
+    sidecar, cameras = _companions(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with turns(path.parent) as wait, ExitStack() as renames:  # made in the reverse order of these lines
+    # Locked, else the files of two who write one scene at once could end up side by side.
+    with locked(path.parent), ExitStack() as renames:  # made in the reverse order of these lines
         if scene.cameras:
-            write_cameras(renames.enter_context(atomic_path(cameras)), scene.cameras)
+            camera_files.write_cameras(renames.enter_context(atomic_path(cameras)), scene.cameras)
         new_sidecar = None if scene.language is None else renames.enter_context(atomic_path(sidecar))
         new_file = renames.enter_context(atomic_path(path))
         row.write(new_file, scene)
@@ -258,20 +238,22 @@ def save_scene(path: Path | str, scene: Scene) -> None:
             # The sidecar belongs to the positions as a reader finds them, rounded in some formats.
             rounded = "precision" in row.loses
             means = load_gaussians(new_file).means if rounded else scene.gaussians.means
-            write_language(new_sidecar, scene.language, means)
-        wait()  # else the files of two who write one scene at once could end up side by side
+            language_files.write_language(new_sidecar, scene.language, means)
         for companion in (sidecar, cameras):
             companion.unlink(missing_ok=True)
+
+
+# ---- the files of a scene ----
 
 
 def companion_path(scene: Path | str, suffix: str) -> Path:
     """Return where the companion of a scene that ends in `suffix` lies: `a/b.ply` -> `a/b<suffix>`.
 
-    A SOG folder `a/b` (or `a/b/meta.json`) -> `a/b<suffix>`, beside the folder; `a/b.spz`, .sog, .splat or
-    .ksplat -> `a/b.spz<suffix>` and so on.
+    A SOG folder `a/b` (or `a/b/meta.json`) -> `a/b<suffix>`, beside the folder; `a/b.spz`, .sog or
+    .splat -> `a/b.spz<suffix>` and so on.
     """
     scene = Path(scene)
-    if any(scene.name in row.folder_files for row in formats()):
+    if any(scene.name == row.folder_file for row in formats()):
         scene = scene.parent
     row = None if os.path.isdir(scene) else format_of(scene)  # which a name too long is not
     if row is not None:
@@ -283,18 +265,19 @@ def companion_path(scene: Path | str, suffix: str) -> Path:
 def scene_files(path: Path | str) -> tuple[Path, ...]:
     """Return the files that `load_scene` reads, whether they are there or not.
 
-    The scene's own are first (of a SOG folder its meta.json or lod-meta.json, then images), then language
-    field and cameras.
+    The scene's own are first (of a SOG folder its meta.json, then images), then language field and cameras.
     """
     path = Path(path)
     own: tuple[Path, ...] = (path,)
-    folder = path if os.path.isdir(path) else path.parent  # which a name too long is not
-    if os.path.isdir(path) or path.name in (META_NAME, LOD_NAME):
-        streamed = path.name == LOD_NAME or (path.name != META_NAME and not exists(folder / META_NAME))
-        streamed = streamed and exists(folder / LOD_NAME)
-        own = (folder / (LOD_NAME if streamed else META_NAME), *sorted(folder.glob("*.webp")))
-        own += tuple(sorted(folder.glob("*/*"))) if streamed else ()
+    if os.path.isdir(path) or path.name == META_NAME:  # which a name too long is not
+        folder = path if os.path.isdir(path) else path.parent
+        own = (folder / META_NAME, *sorted(folder.glob("*.webp")))
     return (*own, companion_path(path, language_files.SUFFIX), _cameras_path(path))
+
+
+def _companions(path: Path) -> tuple[Path, Path]:
+    """Sidecar and cameras of a scene."""
+    return companion_path(path, language_files.SUFFIX), companion_path(path, camera_files.SUFFIX)
 
 
 def _cameras_path(scene: Path) -> Path:
@@ -302,3 +285,42 @@ def _cameras_path(scene: Path) -> Path:
     if not exists(beside) and scene.name == "point_cloud.ply":
         return scene.parent.parent.parent / "cameras.json"
     return beside
+
+
+# ---- scenes of other programs that are no single file: what an extension adds to `langsplat convert` ----
+
+
+@dataclass(frozen=True)
+class ImportRequest:
+    """Files that another method has of one scene, and what they do not say themselves."""
+
+    paths: tuple[Path, ...]
+    encoder: str | None  # hub id or folder of the text encoder of the vectors; None: the method's own
+    levels: tuple[str, ...]  # of the files with features, in their order; empty: files and folders tell
+    phrases: tuple[str, ...]  # are stored encoded
+    codec: CodecConfig  # for whole vectors
+
+
+@dataclass(frozen=True)
+class Importer:
+    """A reader of files that another method has of a scene."""
+
+    suffixes: tuple[str, ...]  # lower case, of files that no format of scenes has
+    read: Callable[[ImportRequest, Progress], tuple[Scene, tuple[str, ...]]]  # with lines to print
+
+
+@dataclass(frozen=True)
+class ExportRequest:
+    """A scene to be written for another program."""
+
+    sources: tuple[Path, ...]  # files or folders that the command line named, one at least
+    load: Callable[[], Scene]  # reads `sources` as a scene
+    out: Path  # folder to write, which can be written to
+
+
+@dataclass(frozen=True)
+class Exporter:
+    """A writer of files for another program: a word of `langsplat convert --to`."""
+
+    about: str  # what is written, a sentence
+    write: Callable[[ExportRequest, Progress], tuple[str, ...]]  # returns lines to print

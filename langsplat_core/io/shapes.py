@@ -2,22 +2,23 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import BinaryIO, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.gltf import BufferWriter, write_glb
-from langsplat_core.io.packing import to_bytes
-from langsplat_core.io.ply_table import write_table
+from langsplat_core.io.gltf import GltfWriter
+from langsplat_core.io.ply import write_table
+from langsplat_core.io.quantised import to_bytes
 from langsplat_core.scene import Gaussians, Scene
 from langsplat_core.scene.transform import AXES, C0, scaling, turning
 
 POINT_SUFFIXES = (".ply",)
 MESH_SUFFIXES = (".ply", ".obj", ".glb")
 RGB = ("red", "green", "blue")
+UNLIT = "KHR_materials_unlit"
 
 
 class MeshLike(Protocol):
@@ -67,15 +68,14 @@ def write_meshes(path: Path | str, meshes: Sequence[MeshLike], to_gltf: Array | 
     nothing else is moved.
     """
     path = check_suffix(path, MESH_SUFFIXES)
-    with atomic_path(path) as temporary:
-        if path.suffix.lower() == ".obj":
+    if path.suffix.lower() == ".obj":
+        with atomic_path(path) as temporary:
             temporary.write_text(_obj(meshes), encoding="utf-8")
-        elif path.suffix.lower() == ".glb":
-            with temporary.open("wb") as file:
-                _write_glb(file, path, meshes, np.eye(4) if to_gltf is None else to_gltf)
-        else:
-            columns, faces = _joined(meshes)
-            write_table(temporary, columns, faces)
+    elif path.suffix.lower() == ".glb":
+        unlit = {"doubleSided": True, "extensions": {UNLIT: {}}}
+        _gltf(meshes, np.eye(4) if to_gltf is None else to_gltf).write(path, materials=[unlit])
+    else:
+        write_table(path, *_joined(meshes))
 
 
 def gltf_axes(scene: Scene) -> Array:
@@ -114,29 +114,18 @@ def _joined(meshes: Sequence[MeshLike]) -> tuple[dict[str, Array], Array]:
     return columns, np.concatenate(faces)
 
 
-def _write_glb(file: BinaryIO, path: Path, meshes: Sequence[MeshLike], to_gltf: Array) -> None:
+def _gltf(meshes: Sequence[MeshLike], to_gltf: Array) -> GltfWriter:
     """Colours are light as it was photographed, so the material is unlit, and linear."""
-    buffer, shapes, nodes = BufferWriter(), [], []
-    for number, mesh in enumerate(meshes):
+    file = GltfWriter(UNLIT)
+    for mesh in meshes:
         display = np.broadcast_to(mesh.colour, mesh.vertices.shape)
         linear = np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
         light = np.column_stack([linear, np.ones(len(linear))])
         attributes = {
-            "POSITION": buffer.add(mesh.vertices.astype("<f4"), bounded=True),
-            "COLOR_0": buffer.add(np.rint(65_535 * light).astype("<u2")),
+            "POSITION": file.add(mesh.vertices.astype("<f4"), bounded=True),
+            "COLOR_0": file.add(np.rint(65_535 * light).astype("<u2")),
         }
-        corners = buffer.add(mesh.triangles.reshape(-1).astype("<u4"))
+        corners = file.add(mesh.triangles.reshape(-1).astype("<u4"))
         primitive = {"attributes": attributes, "indices": corners, "material": 0}
-        shapes.append({"name": mesh.name, "primitives": [primitive]})
-        nodes.append({"name": mesh.name, "mesh": number, "matrix": to_gltf.T.reshape(-1).tolist()})
-    unlit = "KHR_materials_unlit"
-    content = {
-        "asset": {"version": "2.0", "generator": "langsplat"},
-        "extensionsUsed": [unlit],
-        "scene": 0,
-        "scenes": [{"nodes": list(range(len(nodes)))}],
-        "nodes": nodes,
-        "meshes": shapes,
-        "materials": [{"doubleSided": True, "extensions": {unlit: {}}}],
-    }
-    write_glb(file, content | buffer.content(), buffer, path)
+        file.add_mesh(primitive, name=mesh.name, matrix=to_gltf.T.reshape(-1).tolist())
+    return file

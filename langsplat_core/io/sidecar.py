@@ -60,13 +60,14 @@ import hashlib
 import json
 import math
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import DTypeLike
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
@@ -74,7 +75,7 @@ from safetensors.numpy import save_file
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.errors import malformed, printable_line, quoted
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.hostile import open_for_reading, parse_json
+from langsplat_core.io.hostile import decode_json, open_for_reading
 from langsplat_core.scene import (
     CANONICAL_PHRASES,
     LEVELS,
@@ -88,15 +89,24 @@ from langsplat_core.scene import (
 )
 from langsplat_core.scene.language import MOST_SHOWN, tree_of_wholes
 
-FORMAT, VERSION = "langsplat", "3"
-WORDS_FORMAT, WORDS_VERSION = "langsplat words", "1"
-CODEC = "codec."
 SUFFIX = ".langsplat.safetensors"
-UPDATE = "update this program"
-_KEYS = ("encoder", "levels", "codec", "d", "gaussians", "means_blake2b", "phrases")
-_KEYS_OF = {"1": _KEYS, "2": (*_KEYS, "temperature", "found"), "3": (*_KEYS, "temperature", "found")}
-# Largest numbers: of a vector whose length is about 1 no number is 10.
-_MOST = {"confidence": 1e12, "latents": 1e3, "corners": math.inf}
+CODEC = "codec."
+# Formats: name in the metadata, versions that are read, the last of which is written, and what it is in words
+_Format = tuple[str, tuple[str, ...], str]
+FIELD: _Format = ("langsplat", ("1", "2", "3"), "a language field")
+WORDS: _Format = ("langsplat words", ("1",), "taught words")
+
+_Odds = tuple[float, float, float, float]
+_Count = Annotated[int, Meta(ge=1, le=MOST_SHOWN)]
+_PARSED: Mapping[str, Any] = {  # metadata that are JSON
+    "d": int,
+    "gaussians": int,
+    "phrases": list[str],
+    "temperature": float,
+    "found": float,
+    "odds": tuple[_Odds, _Odds, _Odds],
+    "taught": list[tuple[str, int, _Count]],
+}
 _KINDS = {  # types of tensors that hold no floating-point numbers
     "codes": ("U16",),
     "things": ("U16",),
@@ -106,6 +116,8 @@ _KINDS = {  # types of tensors that hold no floating-point numbers
     "tree.levels": ("U8",),
     "tree.votes": ("U16",),
 }
+# Largest numbers: of a vector whose length is about 1 no number is 10.
+_MOST = {"confidence": 1e12, "latents": 1e3, "corners": math.inf}
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,15 +135,24 @@ def read_stored(path: Path) -> Stored:
 
     Raises InputError when it cannot be opened and FormatError when it breaks a rule of the layout.
     """
-    tensors, metadata = _read_tensors(path, _check_metadata)
     with _faults(path):
-        field = _field(tensors, metadata, path)
-        means, precision = _means(tensors, len(field))
-    if (metadata["d"], metadata["gaussians"]) != (str(field.codec.latent_dim), str(len(field))):
-        raise malformed(path, "the header's d or number of Gaussians is not that of the tensors")
-    if (field.confidence < 0).any():
-        raise malformed(path, "tensor 'confidence' holds negative numbers")
-    return Stored(field, means, precision, metadata["means_blake2b"])
+        tensors, about = _read(path, FIELD)
+        if about["levels"] != ",".join(LEVELS):
+            raise ValueError(f"levels {quoted(about['levels'])}; expected {','.join(LEVELS)!r}")
+        if "means" in tensors:  # of version 1
+            tensors["positions"], tensors["corners"] = pack_positions(tensors["means"])
+        if "things" in tensors:  # of version 2
+            tensors |= _tree_tensors(tree_of_wholes(_signed(tensors["things"])))
+        field = _field(tensors, about)
+        if (about["d"], about["gaussians"]) != (field.codec.latent_dim, len(field)):
+            raise ValueError("the header's d or number of Gaussians is not that of the tensors")
+        if (field.confidence < 0).any():
+            raise ValueError("tensor 'confidence' holds negative numbers")
+        positions, corners = tensors["positions"], tensors["corners"]
+        check_array("positions", positions, (len(field),))
+        check_array("corners", corners, (2, 3))
+        means = unpack_positions(positions, corners)
+        return Stored(field, means, position_step(corners), about["means_blake2b"])
 
 
 @contextmanager
@@ -140,131 +161,86 @@ def _faults(path: Path) -> Iterator[None]:
     try:
         yield
     except KeyError as missing:
-        raise malformed(path, f"tensor {missing} is missing") from None
+        raise malformed(path, f"{missing} is missing") from None
+    except SafetensorError as error:
+        raise malformed(path, f"not a whole safetensors file ({printable_line(error, 80)})") from None
     except (ValueError, TypeError, IndexError) as error:
         raise malformed(path, str(error)) from None
 
 
-def _read_tensors(
-    path: Path, check: Callable[[dict[str, str], Path], None]
-) -> tuple[dict[str, Array], dict[str, str]]:
-    """Tensors, floats as float32, and metadata, which `check` raises FormatError for."""
+def _read(path: Path, kind: _Format) -> tuple[dict[str, Array], dict[str, Any]]:
+    """Tensors of a file of this kind, floats as float32, and metadata."""
     open_for_reading(path)[0].close()  # the same messages for a missing file as everywhere
+    name, versions, what = kind
     tensors = {}
-    try:
-        with safe_open(path, framework="numpy") as file:
-            metadata = file.metadata() or {}
-            check(metadata, path)
-            for name in file.keys():  # noqa: SIM118 (not a dictionary)
-                kind, wanted = file.get_slice(name).get_dtype(), _KINDS.get(name, ("F32", "F16"))
-                if kind not in wanted:
-                    what = f"tensor {quoted(name)} is {kind}; expected {' or '.join(wanted)}"
-                    raise malformed(path, what)
-                tensor = file.get_tensor(name)
-                tensors[name] = tensor if name in _KINDS else tensor.astype(np.float32)
-    except SafetensorError as error:
-        raise malformed(path, f"not a whole safetensors file ({printable_line(error, 80)})") from None
-    for name, tensor in tensors.items():
-        _check_numbers(name, tensor, path)
-    return tensors, metadata
+    with safe_open(path, framework="numpy") as file:
+        about: dict[str, Any] = file.metadata() or {}
+        if about.get("format") != name:
+            raise ValueError(f"a safetensors file, but not of {what}")
+        if about.get("version") not in versions:
+            found = f"version {quoted(about.get('version'))} of {what}"
+            raise malformed(path, f"{found}; this program reads {' and '.join(versions)}", "update it")
+        about |= {
+            key: decode_json(about[key].encode(), kind, path) for key, kind in _PARSED.items() if key in about
+        }
+        for name in file.keys():  # noqa: SIM118 (not a dictionary)
+            found, wanted = file.get_slice(name).get_dtype(), _KINDS.get(name, ("F32", "F16"))
+            if found not in wanted:
+                raise ValueError(f"tensor {quoted(name)} is {found}; expected {' or '.join(wanted)}")
+            tensor = file.get_tensor(name)
+            tensors[name] = tensor if name in _KINDS else _bounded(name, tensor.astype(np.float32))
+    return tensors, about
 
 
-def _check_numbers(name: str, tensor: Array, path: Path) -> None:
-    """FormatError for numbers that the layout above has no room for, and that overflow when they are used."""
-    layers = name.startswith((f"{CODEC}encoder.", f"{CODEC}decoder."))  # which the codec bounds itself
-    if name == "means" or tensor.dtype != np.float32:
-        return
+def _bounded(name: str, tensor: Array) -> Array:
+    """Return a tensor of numbers that the layout above has room for, and that do not overflow when used."""
+    if name == "means":  # as they were in the PLY
+        return tensor
     if not np.isfinite(tensor).all():
-        raise malformed(path, f"tensor {quoted(name)} holds numbers that are not finite")
+        raise ValueError(f"tensor {quoted(name)} holds numbers that are not finite")
+    layers = name.startswith((f"{CODEC}encoder.", f"{CODEC}decoder."))  # which the codec bounds itself
     largest, most = np.abs(tensor).max(initial=0), math.inf if layers else _MOST.get(name, 10.0)
     if largest > most:
-        raise malformed(path, f"tensor {quoted(name)} holds {largest:g}; expected numbers up to {most:g}")
+        raise ValueError(f"tensor {quoted(name)} holds {largest:g}; expected numbers up to {most:g}")
+    return tensor
 
 
-def _check_metadata(metadata: dict[str, str], path: Path) -> None:
-    if metadata.get("format") != FORMAT:
-        raise malformed(path, "a safetensors file, but not a language field of this program")
-    version = metadata.get("version", "")
-    if version not in _KEYS_OF:
-        known = " and ".join(_KEYS_OF)
-        what = f"language format version {quoted(version)}; this program reads {known}"
-        raise malformed(path, what, UPDATE)
-    for key in _KEYS_OF[version]:
-        if key not in metadata:
-            raise malformed(path, f"the header has no {key!r}")
-    if metadata["levels"] != ",".join(LEVELS):
-        what = f"levels {quoted(metadata['levels'], 60)}; expected {','.join(LEVELS)!r}"
-        raise malformed(path, what)
-
-
-def _field(tensors: dict[str, Array], metadata: dict[str, str], path: Path) -> LanguageField:
+def _field(tensors: dict[str, Array], about: dict[str, Any]) -> LanguageField:
     codec = codec_from_tensors(
-        metadata["codec"],
+        about["codec"],
         {name.removeprefix(CODEC): t for name, t in tensors.items() if name.startswith(CODEC)},
     )
-    phrases = _listed(metadata, "phrases", path, lambda phrase: isinstance(phrase, str), "texts")
+    phrases = about["phrases"]
     if len(set(phrases)) != len(phrases):
-        raise malformed(path, "the header's 'phrases' name one phrase twice")
+        raise ValueError("the header's 'phrases' name one phrase twice")
     vectors = tensors.get("phrasebook", np.zeros((0, codec.vector_dim), np.float32))
     check_array("phrasebook", vectors, (len(phrases), codec.vector_dim))
     check_array("canonical", tensors["canonical"], (len(CANONICAL_PHRASES), codec.vector_dim))
-    read = {name: float(metadata[name]) for name in ("temperature", "found") if metadata["version"] != "1"}
+    odds = about.get("odds")
+    known = {key: about[key] for key in ("temperature", "found") if key in about}
+    tree = None
+    if "tree.leaves" in tensors:
+        leaves, parents = _signed(tensors["tree.leaves"]), _signed(tensors["tree.parents"])
+        tree = Tree(leaves, parents, tensors["tree.levels"], tensors["tree.votes"])
     return LanguageField(
         codec.from_file(tensors),
         tensors["confidence"],
         codec,
         tensors["canonical"],
-        metadata["encoder"],
+        about["encoder"],
         dict(zip(phrases, vectors, strict=True)),
-        **read,
-        calibration=_calibration(metadata, path),
-        tree=_tree(tensors),
+        **known,
+        calibration=odds and Calibration(*(PlattScaling(*numbers) for numbers in odds)),
+        tree=tree,
         everyday=tensors.get("everyday"),
-        taught=_taught(tensors, metadata, path),
+        taught=_taught(tensors, about),
     )
 
 
-def _tree(tensors: dict[str, Array]) -> Tree | None:
-    if "things" in tensors:
-        return tree_of_wholes(_signed(tensors["things"]))
-    if "tree.leaves" not in tensors:
-        return None
-    leaves, parents = _signed(tensors["tree.leaves"]), _signed(tensors["tree.parents"])
-    return Tree(leaves, parents, tensors["tree.levels"], tensors["tree.votes"])
-
-
-def _listed(
-    metadata: dict[str, str], key: str, path: Path, suits: Callable[[Any], bool], expected: str
-) -> list[Any]:
-    """Return the JSON list under `key`, whose every entry `suits`."""
-    found = parse_json(metadata[key].encode(), path)
-    if not isinstance(found, list) or not all(map(suits, found)):
-        raise malformed(path, f"the header's {key!r} is not a list of {expected}")
-    return found
-
-
-def _calibration(metadata: dict[str, str], path: Path) -> Calibration | None:
-    if "odds" not in metadata:
-        return None
-
-    def four(numbers: Any) -> bool:
-        return isinstance(numbers, list) and [*map(type, numbers)] == [float] * 4
-
-    odds = _listed(metadata, "odds", path, four, "lists of four numbers")
-    if len(odds) != len(fields(Calibration)):
-        raise malformed(path, f"the header's 'odds' are {len(odds)}; expected {len(fields(Calibration))}")
-    return Calibration(*(PlattScaling(*numbers) for numbers in odds))
-
-
-def _taught(tensors: dict[str, Array], metadata: dict[str, str], path: Path) -> tuple[TaughtWord, ...]:
-    if "taught" not in metadata:
+def _taught(tensors: dict[str, Array], about: dict[str, Any]) -> tuple[TaughtWord, ...]:
+    stated = about.get("taught", [])
+    if not stated:
         return ()
-
-    def sound(word: Any) -> bool:
-        kinds = [*map(type, word)] if isinstance(word, list) else []
-        return kinds == [str, int, int] and 0 < word[2] <= MOST_SHOWN
-
-    stated = _listed(metadata, "taught", path, sound, "names, levels and counts")
     vectors, rivals = tensors["taught"], tensors["taught.rivals"]
     check_array("taught", vectors, (sum(count for *_, count in stated), "D"))
     check_array("taught.rivals", rivals, (len(vectors),))
@@ -283,6 +259,16 @@ def _taught_parts(words: Sequence[TaughtWord]) -> tuple[dict[str, Array], dict[s
     return {"taught": _narrow(vectors), "taught.rivals": _narrow(rivals)}, texts
 
 
+def _tree_tensors(tree: Tree) -> dict[str, Array]:
+    few = tree.count < np.iinfo(np.uint16).max
+    return {
+        "tree.leaves": _unsigned(tree.leaves, np.uint16 if few else np.uint32),
+        "tree.parents": _unsigned(tree.parents, np.uint32),
+        "tree.levels": tree.levels,
+        "tree.votes": tree.votes,
+    }
+
+
 def _signed(numbers: Array) -> Array:
     """Numbers as int32, the largest of their type as NO_NODE."""
     none = np.iinfo(numbers.dtype).max
@@ -293,31 +279,22 @@ def _unsigned(numbers: Array, kind: DTypeLike) -> Array:
     return np.where(numbers == NO_NODE, np.iinfo(kind).max, numbers).astype(kind)
 
 
-def _means(tensors: dict[str, Array], count: int) -> tuple[Array, float]:
-    """Positions of the Gaussians, and how precise they are."""
-    if "means" in tensors:  # of version 1
-        check_array("means", tensors["means"], (count, 3))
-        return tensors["means"], 0.0
-    positions, corners = tensors["positions"], tensors["corners"]
-    check_array("positions", positions, (count,))
-    check_array("corners", corners, (2, 3))
-    return unpack_positions(positions, corners), position_step(corners)
-
-
-def save_tensors(path: Path, tensors: dict[str, Array], metadata: dict[str, str]) -> None:
-    """Write a safetensors file that is the same, byte for byte, whenever its content is.
+def _save(path: Path | str, kind: _Format, tensors: dict[str, Array], about: dict[str, str]) -> None:
+    """Write a safetensors file, atomically: the same, byte for byte, whenever its content is.
 
     The library writes the metadata in an order of its own, another one each time; here they are sorted.
     """
-    save_file({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}, path, metadata)
-    with open(path, "r+b") as file:
-        (size,) = struct.unpack("<Q", file.read(8))
-        header = json.loads(file.read(size))
-        header["__metadata__"] = dict(sorted(metadata.items()))
-        text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
-        if len(text) <= size:  # always, unless the library begins to write JSON in another way
-            file.seek(8)
-            file.write(text.ljust(size))
+    about = {"format": kind[0], "version": kind[1][-1], **about}
+    with atomic_path(path) as temporary:
+        tensors = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
+        save_file(tensors, temporary, about)
+        with open(temporary, "r+b") as file:
+            (size,) = struct.unpack("<Q", file.read(8))
+            header = json.loads(file.read(size)) | {"__metadata__": dict(sorted(about.items()))}
+            text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+            if len(text) <= size:  # always, unless the library begins to write JSON in another way
+                file.seek(8)
+                file.write(text.ljust(size))
 
 
 def means_checksum(means: Array) -> str:
@@ -342,13 +319,8 @@ def write_language(path: Path | str, field: LanguageField, means: Array) -> None
     tensors = {name: _narrow(tensor) for name, tensor in floats.items()} | taught
     tensors |= {"positions": positions, "corners": corners}
     if field.tree is not None:
-        few = field.tree.count < np.iinfo(np.uint16).max
-        tensors["tree.leaves"] = _unsigned(field.tree.leaves, np.uint16 if few else np.uint32)
-        tensors["tree.parents"] = _unsigned(field.tree.parents, np.uint32)
-        tensors |= {"tree.levels": field.tree.levels, "tree.votes": field.tree.votes}
-    metadata = {
-        "format": FORMAT,
-        "version": VERSION,
+        tensors |= _tree_tensors(field.tree)
+    about = {
         "encoder": field.encoder_id,
         "levels": ",".join(LEVELS),
         "codec": field.codec.kind,
@@ -361,10 +333,8 @@ def write_language(path: Path | str, field: LanguageField, means: Array) -> None
         **stated,
     }
     if field.calibration is not None:
-        odds = astuple(field.calibration)
-        metadata["odds"] = json.dumps([[float(n) for n in numbers] for numbers in odds])
-    with atomic_path(path) as temporary:
-        save_tensors(temporary, tensors, metadata)
+        about["odds"] = json.dumps(astuple(field.calibration), default=float)
+    _save(path, FIELD, tensors, about)
 
 
 @dataclass(frozen=True, eq=False)
@@ -379,33 +349,21 @@ class Words:
 def write_words(path: Path | str, words: Words) -> None:
     """Write taught words as a file of a user's own, atomically."""
     taught, stated = _taught_parts(words.words)
-    metadata = {"format": WORDS_FORMAT, "version": WORDS_VERSION, "encoder": words.encoder_id, **stated}
-    with atomic_path(path) as temporary:
-        save_tensors(temporary, {"canonical": words.canonical, **taught}, metadata)
+    _save(path, WORDS, {"canonical": words.canonical, **taught}, {"encoder": words.encoder_id, **stated})
 
 
 def read_words(path: Path | str) -> Words:
     """Return the taught words in a file of `write_words`. Raises as `read_stored` does."""
     path = Path(path)
-    tensors, metadata = _read_tensors(path, _check_words)
     with _faults(path):
-        canonical, words = tensors["canonical"], _taught(tensors, metadata, path)
-        dims = check_array("canonical", canonical, (len(CANONICAL_PHRASES), "D"))
+        tensors, about = _read(path, WORDS)
+        words = _taught(tensors, about)
+        dims = check_array("canonical", tensors["canonical"], (len(CANONICAL_PHRASES), "D"))
         for word in words:
-            check_array("taught", word.vectors, ("T", "D"), {"D": dims["D"]})
-    if len({word.key for word in words}) != len(words):
-        raise malformed(path, "two taught words have one name")
-    return Words(metadata["encoder"], canonical, words)
-
-
-def _check_words(metadata: dict[str, str], path: Path) -> None:
-    if metadata.get("format") != WORDS_FORMAT or "encoder" not in metadata:
-        what = "a safetensors file, but not of taught words"
-        raise malformed(path, what, "`langsplat teach` makes one")
-    if metadata.get("version") != WORDS_VERSION:
-        version = quoted(metadata.get("version"))
-        what = f"version {version} of taught words; this program reads {WORDS_VERSION}"
-        raise malformed(path, what, UPDATE)
+            check_array("taught", word.vectors, ("T", "D"), dims)
+        if len({word.key for word in words}) != len(words):
+            raise ValueError("two taught words have one name")
+        return Words(about["encoder"], tensors["canonical"], words)
 
 
 def _narrow(tensor: Array) -> Array:

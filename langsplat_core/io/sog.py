@@ -12,10 +12,6 @@ by row, belongs to Gaussian i:
     shN, optional        files[1]: 16-bit number of a palette entry; files[0]: the palette, 64 entries a
                          row, one pixel per coefficient, rgb: indices into `codebook`
 
-A streamed scene is a folder of such folders with `lod-meta.json`: `filenames` of their meta files, and a
-`tree` of boxes whose leaves name, for each level of detail ("0" is the finest), a `file` and the rows from
-`offset`, `count` of them, in it. `environment` may name one more, of what lies around.
-
 Opacities of 0 and 1 become logits of -infinity and +infinity. `model: "antialiased"`, in older files
 `antialias: true`, says that the Gaussians were trained with Mip-Splatting's compensation. Source:
 PlayCanvas' public specification.
@@ -35,20 +31,11 @@ from PIL import Image
 from langsplat_core.arrays import Array, logit, sigmoid
 from langsplat_core.errors import malformed, quoted
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.hostile import (
-    decode_json,
-    exists,
-    is_plain_name,
-    open_for_reading,
-    opened,
-    opened_archive,
-)
-from langsplat_core.io.packing import smallest_three, to_bytes, without_largest
+from langsplat_core.io.hostile import decode_json, is_plain_name, opened, opened_archive, read_file
+from langsplat_core.io.quantised import smallest_three, to_bytes, without_largest
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
-from langsplat_core.scene.gaussians import join_gaussians
 
-META_NAME, LOD_NAME = "meta.json", "lod-meta.json"
-LOD_LIMIT = 16 << 20  # bytes of lod-meta.json; a leaf, of some thousand Gaussians, has 300
+META_NAME = "meta.json"
 META_LIMIT = 1024 * 1024  # bytes; a real one has three codebooks, 15 kB
 PALETTE_ROW, PALETTE_ROWS = 64, 1024  # entries a row, most rows
 IMAGE_LIMIT = 1 << 30  # bytes of one image file
@@ -60,7 +47,7 @@ SLACK_PIXELS = 65536
 Fetch = Callable[[str, int], bytes]  # (file name, most bytes) -> content
 
 
-# What is read of `meta.json` and `lod-meta.json`.
+# What is read of `meta.json`.
 
 Number = Annotated[float, Meta(ge=-1e30, le=1e30)]
 Whole = Annotated[int, Meta(ge=0, le=2**32)]
@@ -106,98 +93,21 @@ class _Meta(Struct, rename={"higher": "shN"}):
     antialias: Any = None
 
 
-class _Place(Struct):
-    file: Whole
-    offset: Whole
-    count: Whole
-
-
-class _Node(Struct):
-    children: list["_Node"] = []
-    lods: dict[int, _Place] = {}
-
-
-class _Streamed(Struct):
-    filenames: list[str]
-    tree: _Node
-    environment: str | None = None
-
-
 def read_sog_scene(path: Path | str) -> Scene:
     """Return the Gaussians of a SOG folder, its `meta.json` or a `.sog` file.
 
-    The scene says whether they are to be drawn antialiased. Of a streamed scene (`lod-meta.json`) all of the
-    finest level is read.
-
-    Raises InputError when a file cannot be opened and FormatError when it breaks a rule of the format.
+    The scene says whether they are to be drawn antialiased. Raises InputError when a file cannot be opened
+    and FormatError when it breaks a rule of the format.
     """
     path = Path(path)
-    if path.name == LOD_NAME or (path.is_dir() and exists(path / LOD_NAME) and not exists(path / META_NAME)):
-        return _read_streamed(path / LOD_NAME if path.is_dir() else path)
     if path.is_dir():
-        return _decode(_folder_reader(path), path / META_NAME)
+        path = path / META_NAME
     if path.suffix.lower() == ".json":
-        return _decode(_folder_reader(path.parent), path)
+        return _decode(lambda name, limit: read_file(path.parent / name, limit), path)
     with opened_archive(path, "SOG archive") as archive:
         # The images are compressed already, so a member far larger than its archive is a trap.
         most = 16 * archive.size + META_LIMIT
         return _decode(lambda name, limit: archive.read(name, min(limit, most)), path / META_NAME)
-
-
-def _read_streamed(path: Path) -> Scene:
-    content = decode_json(_folder_reader(path.parent)(path.name, LOD_LIMIT), _Streamed, path)
-    ranges = _finest_ranges(content.tree)
-    try:
-        files = {number: _inside(path, content.filenames[number]) for number in ranges}
-        around = [] if content.environment is None else [_inside(path, content.environment)]
-    except LookupError:
-        raise malformed(path, "its tree names files that it lacks") from None
-    if len({*files.values(), *around}) < len(files) + len(around):
-        raise malformed(path, "a file is named twice")
-    parts, antialiased = [], False
-    for number, file in files.items():
-        scene = read_sog_scene(file)
-        count, rows = len(scene.gaussians), ranges[number]
-        if sum(length for _, length in rows) > count or any(at + length > count for at, length in rows):
-            raise malformed(path, f"asks for more than the {count} Gaussians of {file.name}")
-        parts += [scene.gaussians.take(np.arange(at, at + length)) for at, length in rows]
-        antialiased |= scene.antialiased
-    parts += [read_sog_scene(file).gaussians for file in around]
-    return Scene(join_gaussians(parts), antialiased=antialiased)
-
-
-def _finest_ranges(tree: _Node) -> dict[int, list[tuple[int, int]]]:
-    """File -> (offset, count) of the rows of the finest level, in the order of the tree."""
-    waiting, leaves = [tree], []
-    while waiting:
-        node = waiting.pop()
-        waiting += reversed(node.children)
-        leaves.append(node.lods)
-    finest = min((level for leaf in leaves for level in leaf), default=0)
-    ranges: dict[int, list[tuple[int, int]]] = {}
-    for place in (leaf[finest] for leaf in leaves if finest in leaf):
-        ranges.setdefault(place.file, []).append((place.offset, place.count))
-    return ranges
-
-
-def _inside(path: Path, name: str) -> Path:
-    """Return where a SOG lies, beside `path` or in a folder there: a path could lead out of it."""
-    parts = name.split("/")
-    sog = parts[-1] == META_NAME or parts[-1].endswith(".sog")
-    if not sog or len(parts) > 2 or not all(map(is_plain_name, parts)):
-        raise malformed(path, f"{quoted(name)} is no SOG in the scene's folder")
-    return path.parent.joinpath(*parts)
-
-
-def _folder_reader(folder: Path) -> Fetch:
-    def fetch(name: str, limit: int) -> bytes:
-        file, size = open_for_reading(folder / name)
-        with file:
-            if size > limit:
-                raise malformed(folder / name, f"{size} bytes; expected at most {limit}")
-            return file.read(size)
-
-    return fetch
 
 
 def _decode(fetch: Fetch, meta_path: Path) -> Scene:

@@ -1,7 +1,7 @@
 """The .spz file of Niantic: its container, one block of bytes per attribute, and quantised Gaussians in it.
 
 Versions 1 to 3 are one gzip stream (a few tools write it without gzip) of a 16-byte header and the blocks
-in the order of `widths`. Version 4 is a header of 32 bytes, extension records up to the byte that the
+in the order of `_Header.widths`. Version 4 is a header of 32 bytes, extension records up to the byte that the
 header names, a table of (compressed, whole) sizes as uint64, and one Zstandard frame per block. In
 versions 2 and 3 extension records lie behind the last block. A record is a uint32 type, a uint32 length
 and so many bytes; the only one that changes how a file is to be read is the axes', an index into
@@ -15,9 +15,9 @@ import gzip
 import io
 import struct
 import zlib
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from langsplat_core.arrays import Array, logit, sigmoid
 from langsplat_core.errors import InputError, malformed
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import open_for_reading
-from langsplat_core.io.packing import (
+from langsplat_core.io.quantised import (
     coefficient_signs,
     quaternion_signs,
     smallest_three,
@@ -35,7 +35,6 @@ from langsplat_core.io.packing import (
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
 
 MAGIC, GZIP_MAGIC = b"NGSP", b"\x1f\x8b"
-HEADER_SIZE, HEADER_SIZE_4 = 16, 32
 ANTIALIASED, EXTENDED = 0x1, 0x2  # flags
 AXES_RECORD, AXES_RUB = 0xADBE0003, 4
 SPZ_SH_COUNTS = (1, 4, 9, 16, 25)  # of degree 0 to 4, the base colour included
@@ -43,10 +42,14 @@ SPZ_SH_COUNTS = (1, 4, 9, 16, 25)  # of degree 0 to 4, the base colour included
 # exhaust memory.
 BYTES_PER_BYTE = 64
 SLACK = 1024 * 1024  # bytes, for small files of equal Gaussians, and for records behind them
+_HEADER = struct.Struct("<4sIIBBBB")
 
 
 @dataclass(frozen=True)
 class _Header:
+    """The first 16 bytes of a file, unzipped."""
+
+    magic: bytes
     version: int  # 1 to 4
     count: int  # Gaussians
     sh_degree: int  # 0 to 4
@@ -54,9 +57,21 @@ class _Header:
     flags: int
     streams: int  # of version 4
 
+    @property
+    def widths(self) -> dict[str, int]:
+        """Attribute -> bytes of one Gaussian, in the order of the file."""
+        return {
+            "positions": 6 if self.version == 1 else 9,
+            "alphas": 1,
+            "colours": 3,
+            "scales": 3,
+            "rotations": 3 if self.version < 3 else 4,
+            "sh": 3 * (SPZ_SH_COUNTS[self.sh_degree] - 1),
+        }
+
 
 @dataclass(frozen=True, eq=False)
-class Packed:
+class _Packed:
     """The content of a .spz file, unpacked but still quantised."""
 
     header: _Header
@@ -64,108 +79,74 @@ class Packed:
     blocks: dict[str, Array]  # attribute -> (N, bytes of one Gaussian) uint8
 
 
-def widths(version: int, sh_degree: int) -> dict[str, int]:
-    """Return attribute -> bytes of one Gaussian, in the order of the file."""
-    return {
-        "positions": 6 if version == 1 else 9,
-        "alphas": 1,
-        "colours": 3,
-        "scales": 3,
-        "rotations": 3 if version < 3 else 4,
-        "sh": 3 * (SPZ_SH_COUNTS[sh_degree] - 1),
-    }
-
-
-def _read_packed(file: BinaryIO, size: int, path: Path) -> Packed:
-    start = file.read(8)
+def _read_packed(file: BinaryIO, size: int, path: Path) -> _Packed:
+    """Read a file of `size` bytes; what it can honestly hold is known before anything is unpacked."""
+    zipped = file.read(2) == GZIP_MAGIC
     file.seek(0)
-    if start.startswith(GZIP_MAGIC):
-        try:
-            with gzip.GzipFile(fileobj=file) as unzipped:
-                return _read_one_stream(unzipped, BYTES_PER_BYTE * size + SLACK, path)  # type: ignore[arg-type]
-        except (OSError, EOFError, zlib.error) as error:
-            raise malformed(path, f"not a whole gzip stream ({str(error)[:80]})", "fetch it again") from None
-    if start == MAGIC + b"\x04\0\0\0":
-        return _read_streams(file, size, path)
-    return _read_one_stream(file, size, path)
-
-
-def _header(data: bytes, path: Path) -> _Header:
-    if len(data) < HEADER_SIZE or not data.startswith(MAGIC):
-        raise malformed(path, f"not an .spz file: neither it nor what is zipped begins with {MAGIC.decode()}")
-    header = _Header(*struct.unpack_from("<IIBBBB", data, 4))
-    if not 1 <= header.version <= 4 or header.sh_degree >= len(SPZ_SH_COUNTS):
-        what = f".spz version {header.version}, SH degree {header.sh_degree}"
-        raise malformed(path, what, "only versions 1 to 4 of degree 0 to 4 are read: export the scene again")
-    return header
-
-
-def _read_one_stream(file: BinaryIO, limit: int, path: Path) -> Packed:
-    """Versions 1 to 3, unzipped; `limit` is the most bytes that the stream can honestly have."""
-    header = _header(file.read(HEADER_SIZE), path)
-    sizes = [header.count * width for width in widths(header.version, header.sh_degree).values()]
-    if HEADER_SIZE + sum(sizes) > limit:
-        what = f"{header.count} Gaussians need {sum(sizes)} bytes, the file can hold {limit}"
-        raise malformed(path, f"truncated: {what}")
-    blocks = [file.read(size) for size in sizes]
-    if sum(map(len, blocks)) < sum(sizes):
-        raise malformed(path, f"truncated: {header.count} Gaussians need {sum(sizes)} bytes")
-    behind = file.read(SLACK + 1)  # to the end, where gzip checks its sum
-    if len(behind) > SLACK:
-        raise malformed(path, "too many bytes behind its Gaussians")
-    return _packed(header, behind, blocks, path)
-
-
-def _packed(header: _Header, records: bytes, blocks: list[bytes], path: Path) -> Packed:
-    named = zip(widths(header.version, header.sh_degree).items(), blocks, strict=True)
+    limit = BYTES_PER_BYTE * size + SLACK if zipped else size
+    stream: Any = gzip.GzipFile(fileobj=file) if zipped else file
+    try:
+        start = stream.read(_HEADER.size)
+        if len(start) < _HEADER.size or not start.startswith(MAGIC):
+            what = f"neither it nor what is zipped begins with {MAGIC.decode()}"
+            raise malformed(path, f"not an .spz file: {what}")
+        header = _Header(*_HEADER.unpack(start))
+        if not 1 <= header.version <= 4 or header.sh_degree >= len(SPZ_SH_COUNTS):
+            what = f".spz version {header.version}, SH degree {header.sh_degree}"
+            raise malformed(path, what, "only versions 1 to 4 of degree 0 to 4 are read: export it again")
+        sizes = [header.count * width for width in header.widths.values()]
+        if header.version == 4:
+            blocks, records = _read_streams(file, size, header, sizes, path)
+        elif sum(sizes) > limit:
+            what = f"{header.count} Gaussians need {sum(sizes)} bytes, the file can hold {limit}"
+            raise malformed(path, f"truncated: {what}")
+        else:
+            blocks = [stream.read(size) for size in sizes]
+            records = stream.read(SLACK + 1)  # to the end, where gzip checks its sum
+    except (OSError, EOFError, zlib.error) as error:
+        raise malformed(path, f"not a whole gzip stream ({str(error)[:80]})", "fetch it again") from None
+    if [*map(len, blocks)] != sizes or len(records) > SLACK:
+        raise malformed(path, f"truncated, or too long for its {header.count} Gaussians")
+    named = zip(header.widths.items(), blocks, strict=True)
     arrays = {name: np.frombuffer(b, np.uint8).reshape(header.count, width) for (name, width), b in named}
-    return Packed(header, _axes(records if header.flags & EXTENDED else b"", path), arrays)
+    return _Packed(header, _axes(records if header.flags & EXTENDED else b"", path), arrays)
 
 
-def _read_streams(file: BinaryIO, file_size: int, path: Path) -> Packed:
-    """Read version 4: a table of sizes, then one Zstandard frame per block."""
-    start = file.read(HEADER_SIZE_4)
-    header = _header(start, path)
-    if len(start) < HEADER_SIZE_4:
-        raise malformed(path, f"truncated: an .spz of version 4 has a header of {HEADER_SIZE_4} bytes")
-    table_at = struct.unpack_from("<I", start, 16)[0]
-    records_size = table_at - HEADER_SIZE_4
-    if not 0 <= records_size <= file_size:
-        raise malformed(path, f"its table at byte {table_at} of {file_size}")
-    records = file.read(records_size)
-    sizes = [header.count * width for width in widths(4, header.sh_degree).values()]
-    stored = [size for size in sizes if size]  # blocks without a byte have no stream
-    data = file.read(16 * header.streams)
-    if len(data) < 16 * header.streams:
-        raise malformed(path, f"truncated: {16 * header.streams - len(data)} bytes are missing")
-    table = np.frombuffer(data, "<u8").reshape(-1, 2).tolist()
-    if [whole for _, whole in table if whole] != stored:
+def _read_streams(
+    file: BinaryIO, size: int, header: _Header, wholes: list[int], path: Path
+) -> tuple[list[bytes], bytes]:
+    """Read version 4 behind its first 16 bytes: blocks of `wholes` bytes, and records."""
+    content = file.read(size)
+    (table_at,) = struct.unpack_from("<I", content.ljust(4))
+    records, table = content[16 : table_at - 16], content[max(table_at - 16, 16) :][: 16 * header.streams]
+    at = table_at - 16 + len(table)
+    if table_at < 32 or len(table) < 16 * header.streams:
+        raise malformed(path, f"truncated: its table at byte {table_at} of {size}")
+    entries = np.frombuffer(table, "<u8").reshape(-1, 2).tolist()
+    stored = [whole for whole in wholes if whole]  # blocks without a byte have no stream
+    if [whole for _, whole in entries if whole] != stored:
         raise malformed(path, f"the sizes in its table are not those of {header.count} Gaussians")
-    if sum(stored) > BYTES_PER_BYTE * file_size + SLACK:
-        raise malformed(path, f"{sum(stored)} bytes cannot be in a file of {file_size}")
-    left = file_size - file.tell()
-    if sum(zipped for zipped, _ in table) > left:
-        raise malformed(path, f"truncated: its streams do not fit into the {left} bytes behind its table")
-    streams = iter([_unpacked(file.read(zipped), whole, path) for zipped, whole in table if whole])
-    blocks = [next(streams) if size else b"" for size in sizes]
-    return _packed(header, records, blocks, path)
+    if sum(stored) > BYTES_PER_BYTE * size + SLACK or at + sum(zipped for zipped, _ in entries) > len(
+        content
+    ):
+        raise malformed(path, f"truncated: its streams do not fit into {size} bytes")
+    streams = []
+    for zipped, whole in entries:
+        if whole:
+            streams.append(_unpacked(content[at : at + zipped], whole, path))
+        at += zipped
+    return [streams.pop(0) if whole else b"" for whole in wholes], records
 
 
 def _unpacked(data: bytes, size: int, path: Path) -> bytes:
-    """Return the content of a Zstandard frame, which holds exactly `size` bytes.
-
-    Never more than one byte beyond them is unpacked.
-    """
+    """Return the content of a Zstandard frame; never more than a byte beyond `size` is unpacked."""
     import zstandard  # needed by version 4 alone
 
     try:
         with zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(data) as reader:
-            out = reader.read(size + 1)
+            return bytes(reader.read(size + 1))
     except zstandard.ZstdError as error:
         raise malformed(path, f"a stream cannot be unpacked ({str(error)[:80]})") from None
-    if len(out) != size:
-        raise malformed(path, f"a stream holds fewer or more than the {size} bytes of the table")
-    return bytes(out)
 
 
 def _axes(records: bytes, path: Path) -> int:
@@ -228,7 +209,7 @@ def decode_spz(data: bytes, path: Path) -> Scene:
     return _scene(_read_packed(io.BytesIO(data), len(data), path))
 
 
-def _scene(packed: Packed) -> Scene:
+def _scene(packed: _Packed) -> Scene:
     blocks, signs = packed.blocks, _signs_to_rdf(packed.axes)
     count, degree = len(blocks["alphas"]), min(packed.header.sh_degree, 3)
     rest = blocks["sh"].reshape(count, blocks["sh"].shape[1] // 3, 3)[:, : SH_COUNTS[degree] - 1]
@@ -269,16 +250,15 @@ def write_spz(path: Path | str, gaussians: Gaussians, antialiased: bool = False)
         "rotations": _rotation_codes(drawn.quats_wxyz * quaternion_signs(signs)),
         "sh": to_bytes(rest.reshape(len(rest), 3 * rest.shape[1]) * 128 + 128),
     }
-    numbers = (3, len(valid), gaussians.sh_degree, bits, ANTIALIASED if antialiased else 0, 0)
-    content = [MAGIC, struct.pack("<IIBBBB", *numbers)]
-    for name in widths(3, gaussians.sh_degree):
-        block = np.zeros((len(valid), coded[name].shape[1]), np.uint8)
+    flags = ANTIALIASED if antialiased else 0
+    header = _Header(MAGIC, 3, len(valid), gaussians.sh_degree, bits, flags, 0)
+    content = [_HEADER.pack(*astuple(header))]
+    for name, width in header.widths.items():
+        block = np.zeros((len(valid), width), np.uint8)
         block[valid] = coded[name]
         content.append(block.tobytes())
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(
-            gzip.compress(b"".join(content), mtime=0)
-        )  # mtime: the same scene, the same bytes
+    with atomic_path(path) as temporary:  # without a time: the same scene, the same bytes
+        temporary.write_bytes(gzip.compress(b"".join(content), mtime=0))
 
 
 def _fractional_bits(drawn: Gaussians, path: Path) -> int:
@@ -299,21 +279,17 @@ def _fractional_bits(drawn: Gaussians, path: Path) -> int:
     return max(0, min(most, max(FRACTIONAL_BITS, least + 4), 30))
 
 
-def _positions(packed: Packed) -> Array:
+def _positions(packed: _Packed) -> Array:
     """(N, 3) positions along the axes of the file."""
     data = packed.blocks["positions"]
     if packed.header.version == 1:
         return np.ascontiguousarray(data).view("<f2").astype(np.float32)
-    parts = data.reshape(len(data), 3, 3)
-    codes = (
-        parts[..., 0]
-        | parts[..., 1].astype(np.int32) << 8
-        | parts[..., 2].astype(np.int8).astype(np.int32) << 16
-    )
+    # 24 bits each: with a byte of zeros below them they are 256 times as much, in 32
+    codes = np.pad(data.reshape(len(data), 3, 3), ((0, 0), (0, 0), (1, 0))).view("<i4")[..., 0] >> 8
     return codes / 2.0**packed.header.fractional_bits
 
 
-def _rotations(packed: Packed) -> Array:
+def _rotations(packed: _Packed) -> Array:
     """(N, 4) unit quaternions w x y z."""
     data = packed.blocks["rotations"]
     if packed.header.version < 3:

@@ -1,4 +1,4 @@
-"""Formats that round: .splat, .ksplat, .spz and SOG, each against an encoder of the tests' own; what is
+"""Formats that round: .splat, .spz and SOG, each against an encoder of the tests' own; what is
 written, and what another program reads."""
 
 import gzip
@@ -15,18 +15,15 @@ from scipy.spatial import cKDTree
 from langsplat_core.arrays import rotation_matrices, sigmoid, unit
 from langsplat_core.errors import InputError
 from langsplat_core.io import sog
-from langsplat_core.io.ply import write_ply
-from langsplat_core.io.scenes import load_gaussians, load_scene, scene_files
+from langsplat_core.io.quantised import read_splat, write_splat
+from langsplat_core.io.scenes import load_gaussians, load_scene
 from langsplat_core.io.sog import write_sog
-from langsplat_core.io.splat import read_ksplat, read_splat, write_splat
 from langsplat_core.io.spz import read_spz_scene, write_spz
 from langsplat_core.raster.reference import colours
 from langsplat_core.scene import Gaussians
-from langsplat_core.scene.gaussians import join_gaussians
 from tests.support.comparing import assert_refused
 from tests.support.file_samples import (
     C0,
-    ksplat_bytes,
     sog_files,
     splat_bytes,
     spz_bytes,
@@ -35,7 +32,7 @@ from tests.support.file_samples import (
 )
 from tests.support.scenes import covariances, random_gaussians
 
-# ---- .splat and .ksplat ----
+# ---- .splat ----
 
 
 def rotation_error(got: Gaussians, want: Gaussians) -> float:
@@ -83,39 +80,7 @@ def test_splat_keeps_rows_that_cannot_be_drawn(tmp_path):
 
 
 WANT = random_gaussians(30, sh_degree=1)
-SPLAT, KSPLAT = splat_bytes(WANT), ksplat_bytes([WANT], 2)
-
-
-@pytest.mark.parametrize("level", range(3))
-@pytest.mark.parametrize("degree", range(4))
-def test_ksplat_is_exact_to_the_quantisation(put, level, degree):
-    want = random_gaussians(61, sh_degree=degree)
-    got = read_ksplat(put(ksplat_bytes([want], level), "a.ksplat"))
-    assert len(got) == 61
-    assert got.sh_degree == degree
-    # Half a code of 2.5 / 32767; float16 has 11 bits
-    assert np.abs(got.means - want.means).max() <= (0.51 * 2.5 / 32767 if level else 0)
-    assert np.abs(got.log_scales - want.log_scales).max() <= (2**-11 if level else 1e-6)
-    assert rotation_error(got, want) <= (4 * 2**-12 * 2 if level else 1e-5)
-    check_bytes(got, want)
-    rest = np.clip(want.sh[:, 1:], -1.5, 1.5) if level == 2 else want.sh[:, 1:]
-    assert np.abs(got.sh[:, 1:] - rest).max(initial=0) <= (0, 2**-11, 0.51 * 3 / 255)[level]
-
-
-def test_ksplat_sections_of_several_degrees_are_joined(put):
-    parts = [random_gaussians(30, sh_degree=1), random_gaussians(19, 1, sh_degree=2)]
-    got = read_ksplat(put(ksplat_bytes(parts, 0), "a.ksplat"))
-    want = join_gaussians(parts)  # the lower degree filled up by zeros
-    np.testing.assert_array_equal(got.means, want.means)
-    np.testing.assert_array_equal(got.sh[:, 1:], want.sh[:, 1:])
-
-
-def test_ksplat_zeros_mean_defaults(put):
-    """The range of codes and the bounds of coefficients may be left 0."""
-    plain = read_ksplat(put(KSPLAT, "a.ksplat"))
-    got = read_ksplat(put(patched(patched(KSPLAT, 36, "<Q", 0), 4096 + 24, "<I", 0), "a.ksplat"))
-    np.testing.assert_array_equal(got.means, plain.means)
-    np.testing.assert_array_equal(got.sh, plain.sh)
+SPLAT = splat_bytes(WANT)
 
 
 def patched(content: bytes, at: int, code: str, value: int) -> bytes:
@@ -125,16 +90,10 @@ def patched(content: bytes, at: int, code: str, value: int) -> bytes:
     return bytes(changed)
 
 
-def test_real_splats_agree(real_data):
-    folder = real_data / "formats" / "splat"
-    splat, ksplat = read_splat(folder / "minimal.splat"), read_ksplat(folder / "minimal.ksplat")
-    assert len(splat) == 4
+def test_a_real_splat_is_read(real_data):
+    splat = read_splat(real_data / "formats" / "splat" / "minimal.splat")
     assert splat.valid().all()
     np.testing.assert_allclose(splat.means, [[-1, 0, -1], [0, 0, -1], [-1, 0, 0], [0, 0, 0]])
-    np.testing.assert_array_equal(ksplat.means, splat.means)
-    np.testing.assert_array_equal(ksplat.sh, splat.sh)
-    np.testing.assert_array_equal(ksplat.opacity_logits, splat.opacity_logits)
-    np.testing.assert_allclose(covariances(ksplat), covariances(splat), atol=1e-8)
 
 
 # ---- .spz ----
@@ -330,16 +289,6 @@ AXES_9 = spz_bytes(WANT, 4, flags=2, records=struct.pack("<III", 0xADBE0003, 4, 
 MOST = 2**32 - 1
 MALFORMED = {  # what a file with this ending holds
     "a.splat": (b"", SPLAT[:-1], SPLAT + b"\0", np.random.default_rng(0).bytes(3200)),
-    "a.ksplat": (
-        *(KSPLAT[:4000], KSPLAT[:-400]),
-        *(
-            patched(KSPLAT, *change)
-            for change in ((0, "B", 1), (20, "<H", 3), (4, "<I", MOST), (16, "<I", MOST))
-        ),
-        *(patched(KSPLAT, 4096 + at, "<I", MOST) for at in (4, 12, 36)),  # places, buckets, partial buckets
-        *(patched(KSPLAT, 4096 + at, "<I", value) for at, value in ((4, 29), (12, 0), (20, 8), (40, 4))),
-        patched(KSPLAT, 5120, "<I", 0),  # a partial bucket of none
-    ),
     "a.spz": (
         *(b"words of no meaning, none", gzip.compress(b"words of no meaning")),
         *(patched(SPZ, *change) for change in ((4, "<I", 0), (4, "<I", 5), (12, "B", 5))),
@@ -403,7 +352,7 @@ def test_real_sogs_are_read(real_data, name, count):
     assert np.median(np.abs((normals * axes[:, 2]).sum(1))[flat]) > 0.95
 
 
-# ---- SOG, written; streamed scenes, read ----
+# ---- SOG, written ----
 
 
 def written(tmp_path, gaussians: Gaussians) -> Gaussians:
@@ -476,70 +425,3 @@ def test_splat_transform_reads_the_same_sog(tmp_path, splat_transform):
         np.testing.assert_allclose(getattr(theirs, name), getattr(mine, name), rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(sigmoid(theirs.opacity_logits), sigmoid(mine.opacity_logits), atol=1e-6)
     assert angles(mine, theirs).max() < 0.05
-
-
-PARTS = [random_gaussians(count, seed=count, sh_degree=1) for count in (30, 40, 50)]
-
-
-def streamed(folder, change=lambda content: None):
-    """A streamed scene: each of `PARTS` a leaf of the finest level, in two files; a coarse row."""
-    for name, some in {"0_0": PARTS[:2], "0_1": PARTS[2:], "1_0": [PARTS[0].take([0])]}.items():
-        write_sog(folder / "packed.sog", join_gaussians(some))
-        zipfile.ZipFile(folder / "packed.sog").extractall(folder / name)
-    (folder / "packed.sog").unlink()
-    places = ((0, 0, 30), (0, 30, 40), (2, 0, 50), (1, 0, 1))
-    first, *others, coarse = (dict(zip(("file", "offset", "count"), at, strict=True)) for at in places)
-    finest = {"children": [{"lods": {"0": place}} for place in others]}
-    content = {"version": 1, "lodLevels": 2, "filenames": ["0_0/meta.json", "1_0/meta.json", "0_1/meta.json"]}
-    content["tree"] = {"children": [{"lods": {"0": first, "1": coarse}}, finest]}
-    change(content)
-    (folder / "lod-meta.json").write_text(json.dumps(content))
-    return folder
-
-
-def test_streamed_scenes_are_read_at_the_finest_level(tmp_path):
-    folder = streamed(tmp_path)
-    for path in (folder, folder / "lod-meta.json"):
-        got = load_gaussians(path)
-        assert len(got) == 120
-        assert np.abs(got.means - join_gaussians(PARTS).means).max() < 1e-3  # in the order of the tree
-    files = scene_files(folder)
-    assert files[0] == folder / "lod-meta.json"
-    assert {path.parent.name for path in files if path.suffix == ".webp"} == {"0_0", "0_1", "1_0"}
-
-    def surroundings(content: dict) -> None:
-        content["filenames"][1] = "none/meta.json"  # of the coarse level, which is not asked for
-        content["environment"] = "1_0/meta.json"
-
-    assert len(load_gaussians(streamed(tmp_path, surroundings))) == 121
-
-
-MALFORMED_STREAMS = {
-    "a path": lambda c: c["filenames"].__setitem__(0, "../x/meta.json"),
-    "a missing file": lambda c: c["filenames"].__setitem__(0, "3_0/meta.json"),
-    "itself": lambda c: c["filenames"].__setitem__(0, "lod-meta.json"),
-    "a file twice": lambda c: c["filenames"].__setitem__(2, "0_0/meta.json"),
-    "rows beyond the end": lambda c: c["tree"]["children"][0]["lods"]["0"].update(count=71),
-    "rows again and again": lambda c: c["tree"]["children"].extend([c["tree"]["children"][0]] * 99),
-    "negative rows": lambda c: c["tree"]["children"][0]["lods"]["0"].update(offset=-1),
-    "no tree": lambda c: c.pop("tree"),
-    "a tree of numbers": lambda c: c["tree"].update(children=[1]),
-}
-
-
-@pytest.mark.parametrize("name", MALFORMED_STREAMS)
-def test_malformed_streamed_scenes_are_refused(tmp_path, name):
-    with pytest.raises(InputError):
-        load_gaussians(streamed(tmp_path, MALFORMED_STREAMS[name]))
-
-
-@pytest.mark.slow
-def test_scenes_streamed_by_splat_transform_are_read(tmp_path, splat_transform):
-    scene, path = random_gaussians(30_000, sh_degree=1), tmp_path / "a.ply"
-    write_ply(path, scene)
-    lod = tmp_path / "lod" / "lod-meta.json"
-    splat_transform("-g", "cpu", "-C", "8", path, "-l", "0", path, "-F", "20%", "-l", "1", lod)
-    got = load_gaussians(tmp_path / "lod")
-    assert len(got) == len(scene)
-    near, _ = cKDTree(got.means).query(scene.means)
-    assert near.max() < 1e-3

@@ -28,7 +28,6 @@ from langsplat_core.semantics.store import FeatureStore, ImageFeatures
 from tests.support.file_samples import (
     ascii_ply,
     compressed_ply,
-    ksplat_bytes,
     mixed_ply,
     plain_ply,
     random_field,
@@ -258,9 +257,6 @@ KINDS = {
     ".glb": _scenes("a.glb", gltf_bytes(SCENE), gltf_bytes(PLAIN)),
     ".gltf": _scenes("a.gltf", gltf_bytes(random_gaussians(3), ".gltf")),
     ".splat": _scenes("a.splat", splat_bytes(SCENE), splat_bytes(PLAIN)),
-    ".ksplat": _scenes(
-        "a.ksplat", *(ksplat_bytes([SCENE, PLAIN][: 1 + level % 2], level) for level in range(3))
-    ),
     "sidecar": FileKind("a.langsplat.safetensors", sidecars, searched),
     "cameras.json": FileKind("a.cameras.json", camera_files, camera_list),
     "transforms.json": FileKind("transforms.json", transforms, beside_transforms),
@@ -275,5 +271,5 @@ KINDS = {
     **{kind: _photographs(kind) for kind in ("JPEG", "WEBP", "TIFF", "BMP", "AVIF")},
 }
 # In which a byte that is missing cannot go unseen, nor can another format's file be taken for one.
-STRICT = ["INRIA PLY", "compressed PLY", "SOG", "SPZ 3", "SPZ 4", ".splat", ".ksplat"]
+STRICT = ["INRIA PLY", "compressed PLY", "SOG", "SPZ 3", "SPZ 4", ".splat"]
 STRICT += ["sidecar", "cameras.json"]

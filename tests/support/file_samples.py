@@ -282,7 +282,7 @@ def random_field(
     )
 
 
-# Encoders of .splat, .ksplat and .spz: one Gaussian at a time.
+# Encoders of .splat and .spz: one Gaussian at a time.
 
 HALF_TURN = np.diag([1.0, -1.0, -1.0])  # right down front <-> right up back
 
@@ -310,57 +310,6 @@ def splat_bytes(g: Gaussians) -> bytes:
         out += struct.pack("<3f", *g.means[i]) + struct.pack("<3f", *np.exp(g.log_scales[i])) + _rgba(g, i)
         out += bytes(_byte(128 + 128 * q) for q in _quaternion(g, i))
     return out
-
-
-def ksplat_bytes(parts: list[Gaussians], level: int, bucket: int = 8, sh_range: float = 1.5) -> bytes:
-    """One section per part: as many full buckets of `bucket` rows as go, less one, then one of 3, one of the
-    rest. The last section has two places more than Gaussians."""
-    headers, bodies = b"", b""
-    for part in parts:
-        spare = 2 if part is parts[-1] else 0
-        full = max(len(part) // bucket - 1, 0) if level else 0
-        sizes = [3, len(part) - full * bucket - 3] if level else []
-        ends = [bucket * (i + 1) for i in range(full)] + [full * bucket + 3, len(part)]
-        starts = [0, *ends[:-1]]
-        centres, bucket_of = [], []
-        for number, (start, end) in enumerate(zip(starts, ends, strict=True)):
-            centres.append((part.means[start:end].min(0) + part.means[start:end].max(0)) / 2)
-            bucket_of += [number] * (end - start)
-        side = 5.0
-        body = struct.pack(f"<{len(sizes)}I", *sizes)
-        if level:
-            body += np.array(centres, "<f4").tobytes()
-        for i in range(len(part)):
-            floats = "<{}f" if level == 0 else "<{}e"
-            if level == 0:
-                body += struct.pack("<3f", *part.means[i])
-            else:
-                offset = (part.means[i] - np.float32(centres[bucket_of[i]])) / (side / 2)
-                body += struct.pack("<3H", *(round(32767 + 32767 * float(x)) for x in offset))
-            body += struct.pack(floats.format(3), *np.exp(part.log_scales[i]))
-            body += struct.pack(floats.format(4), *_quaternion(part, i)) + _rgba(part, i)
-            rest = [
-                float(part.sh[i, k, channel])
-                for degree in range(1, part.sh_degree + 1)
-                for channel in range(3)
-                for k in range(degree**2, (degree + 1) ** 2)
-            ]
-            if level == 2:
-                body += bytes(_byte((c + sh_range) / (2 * sh_range) * 255) for c in rest)
-            else:
-                body += struct.pack(floats.format(len(rest)), *rest)
-        record = (len(body) - (4 * len(sizes) + 12 * len(centres) if level else 0)) // len(part)
-        bodies += body + bytes(spare * record)
-        header = struct.pack(
-            "<IIIIf", len(part), len(part) + spare, bucket, len(centres) if level else 0, side
-        )
-        header += struct.pack("<HxxI", 12 if level else 0, 32767 if level else 0)
-        header += struct.pack("<IIIH", 0, full, len(sizes), part.sh_degree)
-        headers += header.ljust(1024, b"\0")
-    total = sum(map(len, parts))
-    main = struct.pack("<BBxxIIIIHxx", 0, 1, len(parts), len(parts), total, total, level)
-    main += struct.pack("<3fff", 0, 0, 0, -sh_range, sh_range)
-    return main.ljust(4096, b"\0") + headers + bodies
 
 
 def turned_coefficients(sh: Array, turn: Array) -> Array:

@@ -22,7 +22,7 @@ from msgspec import Meta
 
 from langsplat_core.config import LevelChoice, check_settings
 from langsplat_core.errors import FormatError, InputError, printable_line, quoted
-from langsplat_core.io.cameras import is_rotation, numbers
+from langsplat_core.io.cameras import is_rotation
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import read_json_file
 from langsplat_core.scene import FARTHEST, Intrinsics
@@ -123,7 +123,7 @@ def _flat(entry: dict[str, Any]) -> dict[str, Any]:
 
 def _nested(entry: Any) -> dict[str, Any]:
     pose = {name: entry[name] for name in POSE if name in entry}
-    rotation = numbers(pose, "rotation", (3, 3), "a pose").T.tolist()
+    rotation = np.transpose(pose["rotation"]).tolist()
     return {**{k: v for k, v in entry.items() if k not in POSE}, "pose": {**pose, "rotation": rotation}}
 
 
@@ -383,10 +383,7 @@ def _from_version_1(top: dict[str, Any]) -> dict[str, Any]:
         "notes": top["notes"],
         "ruler": {"points": top["ruler"]},
         "marks": top["marks"],
-        "moves": [
-            {"to": _plain(similarity(numbers(move, "matrix", (4, 4), "move"))), "of": move["of"]}
-            for move in top["moves"]
-        ],
+        "moves": [{"to": _plain(similarity(move["matrix"])), "of": move["of"]} for move in top["moves"]],
         "things": {**top["things"], "names": dict(top["things"]["names"])},
     }
     return {**top, "view": _nested(top["view"]), "session": session}

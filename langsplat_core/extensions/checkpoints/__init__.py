@@ -5,6 +5,6 @@ from langsplat_core.registry import Extension
 _HERE = "langsplat_core.extensions.checkpoints"
 EXTENSION = Extension(
     importers={"checkpoints": f"{_HERE}.convert:IMPORTER"},
-    exporters={name: f"{_HERE}.convert:{name.upper()}" for name in ("langsplat", "occam", "features")},
+    exporters={name: f"{_HERE}.convert:{name.upper()}" for name in ("langsplat", "occam")},
     layouts={"open_clip, segment_anything, sam2": f"{_HERE}.weight_layouts:converted"},
 )

@@ -1,15 +1,22 @@
 """What `langsplat convert` reads and writes of other methods."""
 
+from pathlib import Path
+
+import numpy as np
+
 from langsplat_core.errors import InputError
-from langsplat_core.extensions.checkpoints.methods import read_foreign
-from langsplat_core.io.exchange import Exporter, ExportRequest, Importer, ImportRequest
-from langsplat_core.progress import Progress
-from langsplat_core.scene import Scene
+from langsplat_core.extensions.checkpoints.langsplat_files import write_autoencoder, write_checkpoint
+from langsplat_core.io.scenes import Exporter, ExportRequest, Importer, ImportRequest
+from langsplat_core.progress import Progress, silent
+from langsplat_core.scene import LEVELS, AutoencoderCodec, LanguageField, Scene
+
+LANGSPLAT_LATENT = 3  # numbers per Gaussian that its rasterizer is compiled for
+BLOCK = 16_384  # Gaussians decoded at a time
 
 
 def _import(request: ImportRequest, progress: Progress) -> tuple[Scene, tuple[str, ...]]:
     """Return the scene of a method's files, and lines that say what came over."""
-    from langsplat_core.extensions.checkpoints.importing import import_scene  # imports torch
+    from langsplat_core.extensions.checkpoints.importing import import_scene, read_foreign  # imports torch
 
     foreign = read_foreign(request.paths, request.levels)
     scene, report = import_scene(foreign, request.encoder, request.phrases, request.codec, progress)
@@ -28,41 +35,62 @@ def _import(request: ImportRequest, progress: Progress) -> tuple[Scene, tuple[st
     return scene, tuple(lines)
 
 
-def _export_langsplat(request: ExportRequest, progress: Progress) -> tuple[str, ...]:
-    from langsplat_core.extensions.checkpoints.exporting import export_langsplat
+def export_langsplat(scene: Scene, folder: Path, name: str) -> list[Path]:
+    """`NAME_{1,2,3}/chkpnt30000.pth` with latents and `best_ckpt.pth` in `folder`; returns what was written.
 
+    Raises InputError for a scene whose codec is not an autoencoder of 3 numbers.
+    """
+    language = _language(scene)
+    codec = language.codec
+    if not isinstance(codec, AutoencoderCodec) or codec.latent_dim != LANGSPLAT_LATENT:
+        raise InputError(
+            f"{scene.path}: its codec, {codec.kind} of {codec.size}, is not "
+            "LangSplat's autoencoder of 3 numbers; write vectors by --to occam, or train with "
+            "--codec.kind autoencoder"
+        )
+    latents = np.where(language.known[..., None], language.latents, np.float32(0))
+    written = [folder / f"{name}_{level + 1}" / "chkpnt30000.pth" for level in range(len(LEVELS))]
+    for level, path in enumerate(written):
+        write_checkpoint(path, scene.gaussians, latents[level])
+    write_autoencoder(folder / "best_ckpt.pth", codec.encoder, codec.decoder)
+    return [*written, folder / "best_ckpt.pth"]
+
+
+def export_occam(scene: Scene, folder: Path, progress: Progress = silent) -> list[Path]:
+    """`chkpnt30000_langfeat_{1,2,3}.pth` with (N, D) unit vectors, zero for no meaning, in `folder`.
+
+    Returns what was written. One level is held in memory at a time: 5 GB for 2.5 million Gaussians.
+    """
+    language = _language(scene)
+    written = []
+    for level in range(len(LEVELS)):
+        path = folder / f"chkpnt30000_langfeat_{level + 1}.pth"
+        progress("decoding", level / len(LEVELS))
+        vectors = np.zeros((len(language), language.codec.vector_dim), np.float32)
+        known = np.flatnonzero(language.known[level])
+        for start in range(0, len(known), BLOCK):
+            rows = known[start : start + BLOCK]
+            vectors[rows] = language.codec.decode(language.latents[level, rows])
+        write_checkpoint(path, scene.gaussians, vectors)
+        written.append(path)
+    progress("decoding", 1.0)
+    return written
+
+
+def _language(scene: Scene) -> LanguageField:
+    if scene.language is None:
+        raise InputError(f"{scene.path}: has no language field to write; 'langsplat train' makes one")
+    return scene.language
+
+
+def _export_langsplat(request: ExportRequest, progress: Progress) -> tuple[str, ...]:
     return tuple(map(str, export_langsplat(request.load(), request.out, request.sources[0].stem)))
 
 
 def _export_occam(request: ExportRequest, progress: Progress) -> tuple[str, ...]:
-    from langsplat_core.extensions.checkpoints.exporting import export_occam
-
     return tuple(map(str, export_occam(request.load(), request.out, progress)))
-
-
-def _export_features(request: ExportRequest, progress: Progress) -> tuple[str, ...]:
-    from langsplat_core.extensions.checkpoints.exporting import (
-        features_from_langsplat,
-        features_to_langsplat,
-        langsplat_stems,
-    )
-    from langsplat_core.semantics.store import FeatureStore
-
-    folder = request.sources[0]
-    if len(request.sources) > 1 or not folder.is_dir():
-        raise InputError(f"{folder}: --to features reads one folder of masks and vectors of photographs")
-    if langsplat_stems(folder):
-        count = features_from_langsplat(folder, FeatureStore(request.out), progress)
-    else:
-        count = features_to_langsplat(FeatureStore(folder), request.out, progress)
-    return (f"{request.out}: masks and vectors of {count} photographs",)
 
 
 IMPORTER = Importer((".pth", ".pt", ".ckpt", ".npz"), _import)
 LANGSPLAT = Exporter("a folder with LangSplat's three checkpoints and its autoencoder", _export_langsplat)
 OCCAM = Exporter("a folder with Occam's LGS's three checkpoints of whole vectors", _export_occam)
-FEATURES = Exporter(
-    "masks and vectors of photographs, `features` of a training's work folder, as LangSplat's "
-    "language_features, or the other way",
-    _export_features,
-)

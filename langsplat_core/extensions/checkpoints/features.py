@@ -1,14 +1,14 @@
-"""Language features of other methods' checkpoints, read a block of Gaussians at a time.
+"""Files of other methods, each told by what it holds; and their language features, read a block at a time.
 
-`Features` are the vectors of N Gaussians at one level. Methods keep 512 numbers per Gaussian, or something
-smaller that stands for them; either way no (N, 512) array is made here.
+Methods keep 512 numbers per Gaussian, or something smaller that stands for them; either way no (N, 512) array
+is made here.
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -30,54 +30,37 @@ from langsplat_core.scene.gaussians import join_gaussians
 TOPK = 4  # codewords of a Gaussian in LangSplatV2
 
 
-class Features(Protocol):
-    """The vectors of N Gaussians."""
-
-    @property
-    def dim(self) -> int:
-        """Count of numbers per vector."""
-
-    def rows(self, indices: Array) -> Array:
-        """(n,) whole numbers below N -> (n, dim) float32 vectors of any length; zero for no features."""
-
-
 @dataclass(frozen=True, eq=False)
-class Vectors:
-    """A vector for each: Occam's LGS, Feature-3DGS; or a latent for each: LangSplat."""
+class Features:
+    """The vectors, or latents, of N Gaussians at one level."""
 
-    values: Array  # (N, D) floats of any length
-
-    @property
-    def dim(self) -> int:
-        return int(self.values.shape[1])
-
-    def rows(self, indices: Array) -> Array:
-        return np.asarray(self.values[indices], np.float32)
+    dim: int  # numbers per vector
+    # (n,) whole numbers below N -> (n, dim) float32 vectors of any length; zero for no features
+    rows: Callable[[Array], Array]
 
 
-@dataclass(frozen=True, eq=False)
-class SparseCodes:
-    """LangSplatV2: a Gaussian is a mixture of the few codewords that its logits name.
+def whole_vectors(values: Array) -> Features:
+    """Return (N, D) floats: vectors of Occam's LGS and Feature-3DGS, latents of LangSplat."""
+    return Features(int(values.shape[1]), lambda indices: np.asarray(values[indices], np.float32))
 
-    The weights are the largest `TOPK` of a softmax, scaled to the sum 1. Logits that are all equal were
-    never trained, and stand for nothing.
+
+def sparse_codes(logits: Array, codewords: Array) -> Features:
+    """Return LangSplatV2's mixtures of the few codewords that a Gaussian's logits name.
+
+    logits: (N, L K) floats, for L layers of codewords one after the other; codewords: (L, K, D) float32, the
+    layers' mixtures are added. The weights are the largest `TOPK` of a softmax, scaled to the sum 1. Logits
+    that are all equal were never trained, and stand for nothing.
     """
+    size, dim = codewords.shape[1:]
 
-    logits: Array  # (N, L K) floats, for L layers of codewords one after the other
-    codewords: Array  # (L, K, D) float32; the layers' mixtures are added
+    def rows(indices: Array) -> Array:
+        chosen = np.asarray(logits[indices], np.float32)
+        mixed = np.zeros((len(chosen), dim), np.float32)
+        for layer, words in enumerate(codewords):
+            mixed += _largest_of_softmax(chosen[:, layer * size : (layer + 1) * size]) @ words
+        return np.where(np.ptp(chosen, axis=1, keepdims=True) != 0, mixed, np.float32(0))
 
-    @property
-    def dim(self) -> int:
-        return int(self.codewords.shape[2])
-
-    def rows(self, indices: Array) -> Array:
-        layers, size, dim = self.codewords.shape
-        logits = np.asarray(self.logits[indices], np.float32)
-        mixed = np.zeros((len(logits), dim), np.float32)
-        for layer in range(layers):
-            weights = _largest_of_softmax(logits[:, layer * size : (layer + 1) * size])
-            mixed += weights @ self.codewords[layer]
-        return np.where(np.ptp(logits, axis=1, keepdims=True) != 0, mixed, np.float32(0))
+    return Features(int(dim), rows)
 
 
 def _largest_of_softmax(logits: Array) -> Array:
@@ -91,48 +74,20 @@ def _largest_of_softmax(logits: Array) -> Array:
     return weights
 
 
-@dataclass(frozen=True, eq=False)
-class Leaves:
-    """OpenGaussian: a Gaussian belongs to one cluster, and the clusters have vectors."""
+def rearranged(features: Features, partner: Array) -> Features:
+    """Return features of other Gaussians; partner: (N,) int64 row of `features` of each, -1 for none."""
 
-    index: Array  # (N,) int64 rows of `vectors`; anything beyond them has no features
-    vectors: Array  # (K, D) float32 of any length; zero for a cluster without any
-
-    def __len__(self) -> int:
-        return len(self.index)
-
-    @property
-    def dim(self) -> int:
-        return int(self.vectors.shape[1])
-
-    def rows(self, indices: Array) -> Array:
-        index = self.index[indices]
-        named = (index >= 0) & (index < len(self.vectors))
-        return np.where(named[:, None], self.vectors[np.where(named, index, 0)], np.float32(0))
-
-
-@dataclass(frozen=True, eq=False)
-class Rearranged:
-    """Features carried over to other Gaussians."""
-
-    features: Features
-    partner: Array  # (N,) int64 row of `features`; -1 for none
-
-    @property
-    def dim(self) -> int:
-        return self.features.dim
-
-    def rows(self, indices: Array) -> Array:
-        partner = self.partner[indices]
-        out = np.zeros((len(partner), self.dim), np.float32)
-        found = partner >= 0
-        out[found] = self.features.rows(partner[found])
+    def rows(indices: Array) -> Array:
+        chosen = partner[indices]
+        out = np.zeros((len(chosen), features.dim), np.float32)
+        out[chosen >= 0] = features.rows(chosen[chosen >= 0])
         return out
 
+    return Features(features.dim, rows)
 
-# One file of what people give to an import, recognised by what it holds, never by its name or length.
-#
-# A `Carrier` has Gaussians, features of one level, or both. What a method keeps beside its checkpoints, an
+
+# One file of what people give to an import, recognised by what it holds, never by its name or length. A
+# `Carrier` has Gaussians, features of one level, or both. What a method keeps beside its checkpoints, an
 # autoencoder or the vectors of clusters, is of no use alone.
 
 PLAIN, UNNAMED = "3D Gaussian Splatting", "LangSplat or Occam's LGS"
@@ -150,7 +105,7 @@ class Carrier:
     path: Path
     method: str
     gaussians: Gaussians
-    features: Vectors | SparseCodes | None = None
+    features: Features | None = None
     extras: Mapping[str, Array] = field(default_factory=dict)  # of a PLY, as `Scene.extras`
     antialiased: bool = False
 
@@ -162,10 +117,16 @@ class Carrier:
 
 @dataclass(frozen=True, eq=False)
 class Clusters:
-    """Cluster vectors of OpenGaussian, `cluster_lang.npz`."""
+    """OpenGaussian's vectors of clusters, and the cluster of each Gaussian: `cluster_lang.npz`."""
 
     path: Path
-    leaves: Leaves
+    index: Array  # (N,) int64 rows of `vectors`; -1 for Gaussians of no cluster
+    vectors: Array  # (K, D) float32 of any length; zero for a cluster without any
+
+    @property
+    def features(self) -> Features:
+        """The vectors of the Gaussians."""
+        return rearranged(whole_vectors(self.vectors), self.index)
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,11 +175,10 @@ def _from_ply(path: Path) -> Carrier:
     if set(ordered) != set(names):
         raise FormatError(f"{path}: {len(names)} properties semantic_*, not counted from 0 without gaps")
     vectors = np.stack([scene.extras[name].astype(np.float32) for name in ordered], axis=1)
-    return Carrier(path, FEATURE_3DGS, scene.gaussians, Vectors(vectors), rest, scene.antialiased)
+    return Carrier(path, FEATURE_3DGS, scene.gaussians, whole_vectors(vectors), rest, scene.antialiased)
 
 
 def _clusters(arrays: dict[str, Array], path: Path) -> Clusters:
-    """OpenGaussian's vectors of clusters, and the cluster of each Gaussian."""
     if not {"leaf_feat", "leaf_ind"} <= set(arrays):
         shapes = ", ".join(str(array.shape) for array in list(arrays.values())[:6])
         raise FormatError(
@@ -234,7 +194,8 @@ def _clusters(arrays: dict[str, Array], path: Path) -> Clusters:
     if counts.shape != (len(vectors),):
         raise FormatError(f"{path}: occu_count has the shape {counts.shape}, leaf_feat {vectors.shape}")
     known = np.where(counts[:, None] > 0, vectors, 0).astype(np.float32)
-    return Clusters(path, Leaves(index.astype(np.int64), known))
+    named = np.where((index >= 0) & (index < len(vectors)), index, -1)
+    return Clusters(path, named.astype(np.int64), known)
 
 
 def _from_torch(content: Any, path: Path) -> Part:
@@ -257,14 +218,14 @@ def _from_torch(content: Any, path: Path) -> Part:
     raise FormatError(f"{path}: a torch file, but not a checkpoint or autoencoder of a known method")
 
 
-def _language(elements: tuple[Any, ...], count: int, path: Path) -> tuple[str, Vectors | SparseCodes | None]:
+def _language(elements: tuple[Any, ...], count: int, path: Path) -> tuple[str, Features | None]:
     """Return the method and the features of what follows the geometry."""
     first = plain_array(elements[GEOMETRY], path)
     second = plain_array(elements[GEOMETRY + 1], path) if len(elements) > GEOMETRY + 1 else None
     if first is None or first.ndim != 2:  # (N,) radii of plain 3D Gaussian Splatting
         late = [plain_array(element, path) for element in elements[GEOMETRY + 1 :]]
         wide = [flat for array in late if (flat := _wide(array, count)) is not None]
-        return (FEATURE_3DGS, Vectors(wide[0])) if wide else (PLAIN, None)
+        return (FEATURE_3DGS, whole_vectors(wide[0])) if wide else (PLAIN, None)
     if len(first) != count:
         raise FormatError(f"{path}: features {first.shape} for {count} Gaussians")
     if first.dtype.kind != "f":
@@ -273,7 +234,7 @@ def _language(elements: tuple[Any, ...], count: int, path: Path) -> tuple[str, V
         return V2, _sparse(first, second, path)
     if second is not None and first.shape == second.shape == (count, INSTANCE):
         return OPEN_GAUSSIAN, None
-    return UNNAMED, Vectors(first)
+    return UNNAMED, whole_vectors(first)
 
 
 def _wide(array: Array | None, count: int) -> Array | None:
@@ -284,14 +245,14 @@ def _wide(array: Array | None, count: int) -> Array | None:
     return flat if flat.ndim == 2 and flat.shape[1] > 1 else None
 
 
-def _sparse(logits: Array, codewords: Array, path: Path) -> SparseCodes:
+def _sparse(logits: Array, codewords: Array, path: Path) -> Features:
     layers, size, _ = codewords.shape
     if logits.ndim != 2 or logits.shape[1] != layers * size or not np.isfinite(codewords).all():
         raise FormatError(
             f"{path}: logits {logits.shape} for codewords {codewords.shape}; expected (N, L K) and finite "
             "(L, K, D)"
         )
-    return SparseCodes(logits, np.asarray(codewords, np.float32))
+    return sparse_codes(logits, np.asarray(codewords, np.float32))
 
 
 # Which of the three levels a checkpoint is of, and how its Gaussians go with those of the others.
@@ -307,8 +268,13 @@ def levels_of(carriers: Sequence[Carrier], asked: Sequence[str]) -> tuple[list[i
     folders; else three in their order, and one alone is the whole. Raises InputError where
     that leaves a doubt.
     """
+    if asked and (len(asked) != len(carriers) or len(set(asked)) != len(asked)):
+        raise InputError(
+            f"--levels {' '.join(asked)}: {len(carriers)} checkpoints have features; name a level for each, "
+            "each once"
+        )
     if asked:
-        return _as_asked(carriers, asked), "as asked"
+        return [LEVELS.index(name) for name in asked], "as asked"
     numbers = [_numbered(carrier.path) for carrier in carriers]
     chosen = [number - 1 for number in numbers if number is not None]
     if len(set(chosen)) == len(carriers):
@@ -321,15 +287,6 @@ def levels_of(carriers: Sequence[Carrier], asked: Sequence[str]) -> tuple[list[i
     raise InputError(
         f"{paths}: of which levels? Say, for example, --levels {' '.join(LEVELS[: len(carriers)])}"
     )
-
-
-def _as_asked(carriers: Sequence[Carrier], asked: Sequence[str]) -> list[int]:
-    if len(asked) != len(carriers) or len(set(asked)) != len(asked):
-        raise InputError(
-            f"--levels {' '.join(asked)}: {len(carriers)} checkpoints have features; name a level for each, "
-            "each once"
-        )
-    return [LEVELS.index(name) for name in asked]
 
 
 def _numbered(path: Path) -> int | None:
@@ -389,23 +346,20 @@ def _require_shared(row: Array, count: int, carrier: Carrier) -> None:
 
 
 def _row_of(means: Array, theirs: Array) -> Array:
-    """(N,) row of `theirs` at the same position; the k-th of several at one place goes with the k-th."""
-    keys = np.concatenate([_keys(means), _keys(theirs)])
-    order = np.lexsort(keys.T)  # stable: of two equal keys, one of each side, that of `means` is first
-    ordered = keys[order]
-    same = (ordered[1:] == ordered[:-1]).all(1)
+    """(N,) row of `theirs` at the same position, -1 for none; of several the k-th goes with the k-th."""
+    bits = np.concatenate([means, theirs]).astype(np.float32).view(np.uint32)
+    places = np.unique(bits, axis=0, return_inverse=True)[1].reshape(-1)
+    ours, others = _ranked(places[: len(means)]), _ranked(places[len(means) :])
+    _, mine, other = np.intersect1d(ours, others, assume_unique=True, return_indices=True)
     row = np.full(len(means), -1, np.int64)
-    row[order[:-1][same]] = order[1:][same] - len(means)
+    row[mine] = other
     return row
 
 
-def _keys(means: Array) -> Array:
-    """(N, 3) float32 -> (N, 4) uint32: the bits of a position, and its rank among those at the same one."""
-    bits = np.ascontiguousarray(means, np.float32).view(np.uint32).reshape(len(means), 3)
-    order = np.lexsort(bits.T)
-    first = np.ones(len(means), bool)
-    first[1:] = (bits[order][1:] != bits[order][:-1]).any(1)
-    starts = np.flatnonzero(first)
-    turn = np.empty(len(means), np.uint32)
-    turn[order] = np.arange(len(means)) - np.repeat(starts, np.diff(np.append(starts, len(means))))
-    return np.concatenate([bits, turn[:, None]], axis=1)
+def _ranked(places: Array) -> Array:
+    """(N,) whole numbers -> (N,) numbers of them and of their rank among equals."""
+    order = np.argsort(places, kind="stable")
+    ordered = places[order]
+    rank = np.empty(len(places), np.int64)
+    rank[order] = np.arange(len(places)) - np.searchsorted(ordered, ordered)
+    return places * np.int64(2**32) + rank

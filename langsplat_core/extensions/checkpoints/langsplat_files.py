@@ -1,15 +1,4 @@
-"""Files of the original LangSplat and of Gaussian Splatting in torch.
-
-These are features of photographs, the autoencoder, and checkpoints of Gaussian models.
-
-The masks and CLIP vectors of one photograph:
-
-    <stem>_f.npy   float32 (M, D)      one CLIP vector per mask; D = 512, or 3 after its autoencoder
-    <stem>_s.npy   integer (4, H, W)   row of `_f` per pixel, -1 where there is no mask; maps in order
-                                       default, subpart (s), part (m), whole (l). Floats are read too.
-
-Rows are global: they count on from one map to the next.
-"""
+"""Files of the original LangSplat and of Gaussian Splatting in torch: autoencoders, Gaussian models."""
 
 import re
 from collections.abc import Mapping
@@ -22,53 +11,9 @@ from langsplat_core.arrays import Array, check_array
 from langsplat_core.errors import FormatError
 from langsplat_core.extensions.checkpoints.unpickling import plain_array
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.hostile import read_npy, write_npy
 from langsplat_core.io.ply import REST_COUNTS
 from langsplat_core.scene import AutoencoderCodec, Gaussians
 from langsplat_core.scene.codec import Layers
-
-MAP_COUNT = 4
-NO_MASK = -1
-
-
-def read_features(folder: Path | str, stem: str) -> tuple[Array, Array]:
-    """(M, D) float32 vectors and (4, H, W) int32 rows of them, of the photograph `stem`.
-
-    Raises InputError when a file cannot be opened and FormatError when one breaks a rule.
-    """
-    vectors_path, maps_path = _paths(folder, stem)
-    vectors, maps = read_npy(vectors_path), read_npy(maps_path)
-    if vectors.ndim != 2 or vectors.shape[1] < 1 or vectors.dtype.kind != "f":
-        raise FormatError(f"{vectors_path}: {vectors.dtype} {vectors.shape}; expected floats of shape (M, D)")
-    if not np.isfinite(vectors).all():
-        raise FormatError(f"{vectors_path}: holds numbers that are not finite")
-    if maps.ndim != 3 or len(maps) != MAP_COUNT or 0 in maps.shape or maps.dtype.kind not in "iuf":
-        raise FormatError(f"{maps_path}: {maps.dtype} {maps.shape}; expected numbers of shape (4, H, W)")
-    least, greatest = maps.min(), maps.max()
-    if not (least >= NO_MASK and greatest < len(vectors)):  # NaN fails both
-        raise FormatError(
-            f"{maps_path}: ids from {least} to {greatest}; expected {NO_MASK} to {len(vectors) - 1}, "
-            f"the rows of {vectors_path.name}"
-        )
-    rows = maps.astype(np.int32)
-    if not np.array_equal(rows, maps):
-        raise FormatError(f"{maps_path}: holds ids that are not whole numbers")
-    return vectors.astype(np.float32), rows
-
-
-def write_features(folder: Path | str, stem: str, vectors: Array, maps: Array) -> None:
-    """Write both files, the maps last: whoever waits for `_s.npy` finds the vectors it points into."""
-    check_array("vectors", vectors, ("M", "D"), dtype=np.float32)
-    check_array("maps", maps, (MAP_COUNT, "H", "W"), dtype=np.int32)
-    if maps.size and not (maps.min() >= NO_MASK and maps.max() < len(vectors)):
-        raise ValueError(f"maps: ids beyond the {len(vectors)} vectors")
-    for path, array in zip(_paths(folder, stem), (vectors, maps), strict=True):
-        write_npy(path, array)
-
-
-def _paths(folder: Path | str, stem: str) -> tuple[Path, Path]:
-    return Path(folder) / f"{stem}_f.npy", Path(folder) / f"{stem}_s.npy"
-
 
 # ---- LangSplat's autoencoder, `best_ckpt.pth`: weights by the number of a layer in its network ----
 #
@@ -137,24 +82,19 @@ def _folded(layers: list[Layer]) -> tuple[tuple[Array, Array], ...]:
 
 
 def autoencoder_weights(encoder: Layers, decoder: Layers) -> dict[str, Array]:
-    """Return the dictionary of a codec.
-
-    Its batch normalisations change nothing, because theirs are folded in.
-    """
+    """Return the dictionary of a codec; its batch normalisations change nothing: theirs are folded in."""
     named: dict[str, Array] = {}
-    last = len(encoder) - 1
-    for number, (weight, bias) in enumerate(encoder):
-        named |= {f"encoder.{3 * number}.weight": weight, f"encoder.{3 * number}.bias": bias}
-        if number < last:
-            ones, zeros = np.ones(len(bias), np.float32), np.zeros(len(bias), np.float32)
-            neutral = {"weight": ones, "bias": zeros, "running_mean": zeros}
-            neutral |= {
-                "running_var": ones - np.float32(EPSILON),
-                "num_batches_tracked": np.array(0, np.int64),
-            }
-            named |= {f"encoder.{3 * number + 1}.{name}": array for name, array in neutral.items()}
-    for number, (weight, bias) in enumerate(decoder):
-        named |= {f"decoder.{2 * number}.weight": weight, f"decoder.{2 * number}.bias": bias}
+    for part, layers, step in (("encoder", encoder, 3), ("decoder", decoder, 2)):
+        for number, (weight, bias) in enumerate(layers):
+            named |= {f"{part}.{step * number}.weight": weight, f"{part}.{step * number}.bias": bias}
+    for number, (_, bias) in enumerate(encoder[:-1]):
+        ones, zeros = np.ones(len(bias), np.float32), np.zeros(len(bias), np.float32)
+        neutral = {"weight": ones, "bias": zeros, "running_mean": zeros}
+        neutral |= {
+            "running_var": ones - np.float32(EPSILON),
+            "num_batches_tracked": np.array(0, np.int64),
+        }
+        named |= {f"encoder.{3 * number + 1}.{name}": array for name, array in neutral.items()}
     return named
 
 
@@ -183,52 +123,42 @@ def model_tuple(content: Any) -> tuple[Any, ...] | None:
     return tuple(content) if isinstance(content[0], int) else None
 
 
+_ELEMENTS: Mapping[str, tuple[int | str, ...]] = {
+    "positions": ("N", 3),
+    "base colours": ("N", 1, 3),
+    "SH coefficients": ("N", "K", 3),
+    "log scales": ("N", 3),
+    "rotations": ("N", 4),
+    "opacities": ("N", 1),
+}
+
+
 def gaussians_of(elements: tuple[Any, ...], path: Path) -> Gaussians:
-    """Return the Gaussians in elements 1 to 6.
-
-    Raises FormatError where one has another shape.
-    """
-    means = _element(elements, 1, (None, 3), "positions (N, 3)", path)
-    count = len(means)
-    base = _element(elements, 2, (count, 1, 3), f"base colours ({count}, 1, 3)", path)
-    rest = _element(elements, 3, (count, None, 3), f"SH coefficients ({count}, K, 3)", path)
-    if 3 * rest.shape[1] not in REST_COUNTS:
-        raise FormatError(
-            f"{path}: {rest.shape[1]} SH coefficients beside the constant; expected 0, 3, 8, 15"
-        )
-    return Gaussians(
-        means,
-        _element(elements, 4, (count, 3), f"log scales ({count}, 3)", path),
-        _element(elements, 5, (count, 4), f"rotations ({count}, 4)", path),
-        _element(elements, 6, (count, 1), f"opacities ({count}, 1)", path)[:, 0],
-        np.concatenate([base, rest], axis=1),
-    )
-
-
-def _element(
-    elements: tuple[Any, ...], index: int, shape: tuple[int | None, ...], wanted: str, path: Path
-) -> Array:
-    array = plain_array(elements[index], path)
-    if array is None or array.dtype.kind != "f":
-        raise FormatError(f"{path}: element {index} holds no {wanted}; is it a checkpoint of Gaussians?")
-    fits = array.ndim == len(shape) and all(
-        size in (None, actual) for size, actual in zip(shape, array.shape, strict=True)
-    )
-    if not fits:
-        raise FormatError(f"{path}: element {index} has the shape {array.shape}; expected {wanted}")
-    return np.asarray(array, np.float32)
+    """Return the Gaussians in elements 1 to 6; FormatError where one has another shape."""
+    arrays, dims = [], dict[str, int]()
+    for index, (name, shape) in enumerate(_ELEMENTS.items(), 1):
+        array = plain_array(elements[index], path)
+        if array is None or array.dtype.kind != "f":
+            raise FormatError(f"{path}: element {index} holds no {name}; is it a checkpoint of Gaussians?")
+        try:
+            dims = check_array(name, array, shape, dims)
+        except ValueError as error:
+            raise FormatError(f"{path}: element {index}: {error}") from None
+        arrays.append(np.asarray(array, np.float32))
+    means, base, rest, log_scales, quats, logits = arrays
+    if 3 * dims["K"] not in REST_COUNTS:
+        raise FormatError(f"{path}: {dims['K']} SH coefficients beside the constant; expected 0, 3, 8, 15")
+    return Gaussians(means, log_scales, quats, logits[:, 0], np.concatenate([base, rest], axis=1))
 
 
 # Checkpoints as LangSplat and Occam's LGS read them: element 7 holds the features, and what an optimiser
 # would need is empty.
 
-ITERATION = 30_000
-
 
 def write_checkpoint(path: Path, gaussians: Gaussians, features: Array) -> None:
-    """Return a level's checkpoint with (N, D) float32 `features`, zero where a Gaussian has no meaning.
+    """Write a level's checkpoint with (N, D) float32 `features`, zero where a Gaussian has no meaning.
 
-    Atomically. It loads with and without `weights_only`.
+    It loads with and without `weights_only`.
     """
     import torch
 
@@ -250,11 +180,11 @@ def write_checkpoint(path: Path, gaussians: Gaussians, features: Array) -> None:
         {"state": {}, "param_groups": []},
         1.0,  # the scene's extent, which scales a learning rate
     )
-    _save((elements, ITERATION), path)
+    _save((elements, 30_000), path)
 
 
 def write_autoencoder(path: Path, encoder: Layers, decoder: Layers) -> None:
-    """`best_ckpt.pth` of a codec, atomically."""
+    """Write `best_ckpt.pth` of a codec."""
     _save({name: _tensor(array) for name, array in autoencoder_weights(encoder, decoder).items()}, path)
 
 

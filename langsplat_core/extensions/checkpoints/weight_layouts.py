@@ -106,7 +106,6 @@ SAM2_NAMES = tuple(  # what is named otherwise than in SAM
 )
 SAM_GRID = "prompt_encoder.shared_embedding.positional_embedding"
 SAM2_POINTS = [f"prompt_encoder.point_embeddings.{n}.weight" for n in range(4)]  # outside, inside, corners
-SAM2_SIDE = 1024  # px, of the square that SAM 2 sees, which no shape tells
 
 
 @dataclass(frozen=True)
@@ -128,17 +127,21 @@ SAM2_SIZES: Mapping[tuple[int, int], Hiera] = MappingProxyType(  # by width of t
 )
 
 
-def converted(id: str, file: Path) -> Converted | None:
+def converted(
+    id: str, file: Path, sizes: Mapping[tuple[int, int], Hiera] = SAM2_SIZES, side: int = 1024
+) -> Converted | None:
     """Return weights renamed to those of transformers; None where they are of no layout known here.
 
-    id: what messages name. Raises EncoderError for a file that is damaged.
+    id: what messages name; sizes, side: what no shape tells of a SAM 2, its encoder's settings and the pixels
+    of the square that it sees. Raises EncoderError for a file that is damaged.
     """
     with loading_errors(id, "CLIP or SAM"):
         tensors = _read(id, file)
         if "image_encoder.pos_embed" in tensors:
             return Converted(_sam_config(tensors), _sam_tensors(tensors, SAM_NAMES), {})
         if "image_encoder.trunk.pos_embed" in tensors:
-            return _sam2({name.removeprefix("sam_"): tensor for name, tensor in tensors.items()})
+            own = {name.removeprefix("sam_"): tensor for name, tensor in tensors.items()}
+            return Converted(_sam2_config(own, sizes, side), _sam2_tensors(own), {})
         if "image_encoder.patch_embed.seq.0.c.weight" in tensors:
             raise EncoderError(f"{id}: {MOBILE_SAM}")
         return _clip(file, tensors) if "visual.class_embedding" in tensors else None
@@ -267,26 +270,20 @@ def _clip_tensors(tensors: Tensors) -> dict[str, Any]:
             renamed[f"{NORMS[stem]}.{leaf}"] = tensor
         elif name in TRANSPOSED:
             renamed[TRANSPOSED[name]] = tensor.T
-        elif block := BLOCK.fullmatch(name):
-            renamed |= _block(name, block, tensor)
+        elif (found := BLOCK.fullmatch(name)) and found[4].startswith("in_proj_"):
+            # queries, keys and values are one tensor of open_clip's
+            layer, part = f"{_layer(found)}self_attn.", found[4].removeprefix("in_proj_")
+            for role, third in zip("qkv", tensor.chunk(3), strict=True):
+                renamed[f"{layer}{role}_proj.{part}"] = third
+        elif found and (inner := f"{found[3]} {found[4]}") in IN_BLOCK:
+            renamed[f"{_layer(found)}{IN_BLOCK[inner]}"] = tensor
         elif name not in UNUSED:
             raise ValueError(f"{name} is no tensor of a CLIP with a vision transformer")
     return renamed
 
 
-def _block(name: str, found: re.Match[str], tensor: Any) -> dict[str, Any]:
-    """Return the tensors of a layer that one of open_clip's is: queries, keys and values are one there."""
-    layer = f"{'vision' if found[1] else 'text'}_model.encoder.layers.{found[2]}."
-    if found[4].startswith("in_proj_"):
-        part = found[4].removeprefix("in_proj_")
-        return {
-            f"{layer}self_attn.{role}_proj.{part}": third
-            for role, third in zip("qkv", tensor.chunk(3), strict=True)
-        }
-    inner = f"{found[3]} {found[4]}"
-    if inner not in IN_BLOCK:
-        raise ValueError(f"{name} is no tensor of a CLIP with a vision transformer")
-    return {f"{layer}{IN_BLOCK[inner]}": tensor}
+def _layer(found: re.Match[str]) -> str:
+    return f"{'vision' if found[1] else 'text'}_model.encoder.layers.{found[2]}."
 
 
 def _sam_tensors(tensors: Tensors, names: Names) -> dict[str, Any]:
@@ -351,26 +348,27 @@ def _decoder_config(tensors: Tensors, first: str) -> Settings:
     return {"prompt_encoder_config": prompts, "mask_decoder_config": masks}
 
 
-def _sam2(tensors: dict[str, Any]) -> Converted:
+def _sam2_tensors(tensors: Tensors) -> dict[str, Any]:
     """Return the half of a SAM 2 or 2.1 that sees single images; its memory of films is left out.
 
     tensors: without "sam_" before the names of prompt encoder and mask decoder.
     """
     import torch
 
-    points = [tensors.pop(name) for name in SAM2_POINTS if _shape(tensors, name, 2)]
-    renamed = _sam_tensors(tensors, SAM_NAMES + SAM2_NAMES)
+    points = [tensors[name] for name in SAM2_POINTS if _shape(tensors, name, 2)]
+    rest = {name: tensor for name, tensor in tensors.items() if name not in SAM2_POINTS}
+    renamed = _sam_tensors(rest, SAM_NAMES + SAM2_NAMES)
     renamed["prompt_encoder.point_embed.weight"] = torch.cat(points)
-    return Converted(_sam2_config(tensors), renamed, {})
+    return renamed
 
 
-def _sam2_config(tensors: Tensors) -> Settings:
+def _sam2_config(tensors: Tensors, sizes: Mapping[tuple[int, int], Hiera], side: int) -> Settings:
     """Return settings by shapes and published sizes, as in a config.json of transformers."""
     _, wide, *background = _shape(tensors, "image_encoder.trunk.pos_embed", 4)
     blocks = _count(tensors, r"image_encoder\.trunk\.blocks\.(\d+)\.")
-    if (wide, blocks) not in SAM2_SIZES:
+    if (wide, blocks) not in sizes:
         raise ValueError(f"a SAM 2 of {blocks} blocks, {wide} wide, which is none of the published ones")
-    size = SAM2_SIZES[wide, blocks]
+    size = sizes[wide, blocks]
     widths = [
         _shape(tensors, f"image_encoder.trunk.blocks.{n}.attn.proj.weight", 2)[0] for n in range(blocks)
     ]
@@ -379,7 +377,7 @@ def _sam2_config(tensors: Tensors) -> Settings:
         "model_type": "sam2_hiera_det_model",
         "hidden_size": wide,
         "num_attention_heads": size.heads,
-        "image_size": [SAM2_SIDE, SAM2_SIDE],
+        "image_size": [side, side],
         "window_positional_embedding_background_size": background,
         "blocks_per_stage": [widths.count(width) for width in stages],
         "embed_dim_per_stage": stages,
@@ -390,11 +388,11 @@ def _sam2_config(tensors: Tensors) -> Settings:
     vision = {
         "backbone_config": backbone,
         "backbone_channel_list": stages[::-1],
-        "backbone_feature_sizes": [[SAM2_SIDE // step] * 2 for step in (4, 8, 16)],
+        "backbone_feature_sizes": [[side // step] * 2 for step in (4, 8, 16)],
         "fpn_hidden_size": _shape(tensors, "image_encoder.neck.convs.0.conv.weight", 4)[0],
     }
     settings = _decoder_config(tensors, "layers.0") | {"model_type": "sam2", "vision_config": vision}
-    settings["prompt_encoder_config"]["image_size"] = SAM2_SIDE
+    settings["prompt_encoder_config"]["image_size"] = side
     return settings
 
 

@@ -12,7 +12,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.cli.answers import found_answer, unit_of
 from langsplat_core.cli.arguments import AnyScene, EncoderOption, OutFile, OutFolder
 from langsplat_core.config import Count, LevelChoice, Positive
-from langsplat_core.errors import EncoderError, InputError, optional_imports
+from langsplat_core.errors import EncoderError, InputError, malformed, optional_imports, printable_line
 from langsplat_core.extensions.geometry.occupancy import (
     FloorMap,
     Occupancy,
@@ -24,7 +24,6 @@ from langsplat_core.extensions.geometry.occupancy import (
     reachable,
 )
 from langsplat_core.extensions.geometry.registration import TRUSTED, Registration, merge, register
-from langsplat_core.io.cameras import numbers
 from langsplat_core.io.files import atomic_path, write_json
 from langsplat_core.io.hostile import read_json_file
 from langsplat_core.io.scenes import check_keeps, check_writable, load_scene, save_scene
@@ -179,11 +178,10 @@ def registered(moving: Scene, fixed: Scene, scaled: bool, progress: Progress) ->
 def read_transform(path: Path) -> Similarity:
     """Return the similarity in a file of `langsplat register`; InputError and FormatError name the file."""
     entry = read_json_file(path, TRANSFORM_LIMIT)
-    matrix = numbers(entry if isinstance(entry, dict) else {}, "matrix", (4, 4), str(path))
     try:
-        return similarity(matrix)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+        return similarity(entry["matrix"])
+    except (InputError, LookupError, TypeError, ValueError) as error:
+        raise malformed(path, f"no transform ({printable_line(error, 100)})") from None
 
 
 # `langsplat map`: what a robot needs to know of a scene.

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,24 +12,19 @@ import torch
 from langsplat_core.arrays import Array, unit
 from langsplat_core.config import CodebookConfig, LinearConfig
 from langsplat_core.errors import EncoderError, FormatError, InputError
-from langsplat_core.extensions.checkpoints.exporting import (
-    export_langsplat,
-    export_occam,
-    features_from_langsplat,
-    features_to_langsplat,
-)
-from langsplat_core.extensions.checkpoints.importing import import_scene
-from langsplat_core.extensions.checkpoints.langsplat_files import read_features, write_features
-from langsplat_core.extensions.checkpoints.methods import read_foreign
+from langsplat_core.extensions.checkpoints.convert import export_langsplat, export_occam
+from langsplat_core.extensions.checkpoints.importing import import_scene, read_foreign
+from langsplat_core.extensions.checkpoints.langsplat_files import write_autoencoder, write_checkpoint
 from langsplat_core.io.scenes import load_scene, save_scene
-from langsplat_core.scene import CANONICAL_PHRASES, LanguageField, Scene
+from langsplat_core.scene import CANONICAL_PHRASES, AutoencoderCodec, LanguageField, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
-from langsplat_core.semantics.store import FeatureStore, ImageFeatures
 from langsplat_core.training.language.codec_fit import everyday_vocabulary
+from tests.support.commands import refusal, run
 from tests.support.comparing import assert_same
-from tests.support.file_samples import autoencoder, random_field, save_model, tensor
-from tests.support.scenes import random_gaussians
+from tests.support.file_samples import autoencoder, random_codec, random_field, save_model, tensor
+from tests.support.scenes import random_camera, random_gaussians
 from tests.support.tiny_models import tiny_clip
+from tests.support.writing import Captured, Write, check_full_disk, check_small_disk
 
 pytestmark = pytest.mark.long
 
@@ -204,60 +200,99 @@ def test_refusals(tmp_path, clip, caplog):
         import_scene(read_foreign(occam(tmp_path / "inf", spoiled)), clip)
 
 
-# ---- masks and vectors of photographs ----
+# `langsplat convert`.
 
 
-def photograph(seed: int) -> ImageFeatures:
-    generator = np.random.default_rng(seed)
-    vectors = unit(generator.normal(size=(9, D))).astype(np.float16).astype(np.float32)
-    labels = generator.integers(-1, 9, (3, 5, 7)).astype(np.int32)
-    labels.flat[:9] = range(9)
-    return ImageFeatures(labels, vectors)
+@pytest.fixture
+def checkpoints(tmp_path: Path) -> list[Path]:
+    """Of Occam's LGS, three levels of vectors as long as the demo encoder's."""
+    g = random_gaussians(20, sh_degree=1)
+    features = unit(rng.normal(size=(5, load_text_encoder("demo").dim))).astype(np.float32)
+    return [
+        save_model(tmp_path / f"chkpnt_langfeat_{level}.pth", g, tensor(features[rng.integers(0, 5, 20)]))
+        for level in (1, 2, 3)
+    ]
 
 
-def test_features_there_and_back(tmp_path):
-    store, wanted = FeatureStore(tmp_path / "store"), {}
-    for seed, name in enumerate(("frame_00001.jpg", "a b.png")):
-        wanted[name] = photograph(seed)
-        store.save(name, wanted[name])
-    assert features_to_langsplat(store, tmp_path / "out") == 2
-    _, maps = read_features(tmp_path / "out", "frame_00001")
-    assert maps.shape == (4, 5, 7)
-    assert (maps[0] == -1).all()
-    np.testing.assert_array_equal(maps[1:], wanted["frame_00001.jpg"].labels)
-    back = FeatureStore(tmp_path / "back")
-    assert features_from_langsplat(tmp_path / "out", back) == 2
-    for name, want in wanted.items():
-        got = back.load(name.split(".")[0])
-        np.testing.assert_array_equal(got.labels, want.labels)
-        np.testing.assert_allclose(got.vectors, want.vectors, atol=1e-3)
+@pytest.mark.long
+def test_checkpoints_become_a_scene_and_back(tmp_path, checkpoints, capsys):
+    read = ("--encoder", "demo", "--phrases", "apple", "red mug")
+    assert run("convert", *checkpoints, tmp_path / "a.ply", *read) == 0
+    printed = capsys.readouterr().out
+    assert "Occam's LGS: levels (by the names of files and folders): subpart from" in printed
+    assert "codec codebook of 5, encoder demo" in printed
+    assert "relevancy error of the codec: mean 0.000" in printed
+    scene = load_scene(tmp_path / "a.ply")
+    assert scene.language is not None
+    assert set(scene.language.phrasebook) == {"apple", "red mug"}
+    assert (scene.language.confidence == 1).all()
+    assert run("convert", tmp_path / "a.ply", tmp_path / "out", "--to", "occam") == 0
+    assert len(list((tmp_path / "out").glob("chkpnt30000_langfeat_[123].pth"))) == 3
+    words = ("convert", tmp_path / "a.ply", tmp_path / "out", "--to", "langsplat")
+    assert "--to occam" in refusal(capsys, *words)
 
 
-def test_default_masks_of_langsplat_are_left_out(tmp_path):
-    vectors = rng.normal(size=(12, D)).astype(np.float32)
-    maps = np.full((4, 2, 3), -1, np.int32)
-    for level in range(4):
-        maps[level, 0] = 3 * level + np.arange(3)
-    write_features(tmp_path / "in", "a", vectors, maps)
-    store = FeatureStore(tmp_path / "store")
-    features_from_langsplat(tmp_path / "in", store)
-    got = store.load("a")
-    assert len(got.vectors) == 9
-    np.testing.assert_array_equal(got.labels[:, 0], np.arange(9).reshape(3, 3))
-    assert (got.labels[:, 1] == -1).all()
-    np.testing.assert_allclose(got.vectors, unit(vectors[3:]), atol=1e-3)
+def test_a_checkpoint_of_gaussians_is_converted(tmp_path, capsys):
+    g = random_gaussians(20, sh_degree=3)
+    path = save_model(tmp_path / "chkpnt30000.pth", g)
+    assert run("convert", path, tmp_path / "a.spz") == 0
+    assert "20 Gaussians, without a language field" in capsys.readouterr().out
+    assert np.abs(load_scene(tmp_path / "a.spz").gaussians.means - g.means).max() < 1e-3
+    words = ("convert", tmp_path / "a.spz", tmp_path / "out", "--to", "langsplat")
+    assert "has no language field" in refusal(capsys, *words)
 
 
-def test_features_that_cannot_be_converted(tmp_path):
-    store = FeatureStore(tmp_path / "store")
-    with pytest.raises(InputError, match=r"holds no \*_f\.npy"):
-        features_from_langsplat(tmp_path, store)
-    with pytest.raises(InputError, match=r"holds no \*\.features\.npz"):
-        features_to_langsplat(store, tmp_path)
-    write_features(tmp_path / "dim3", "a", np.ones((1, 3), np.float32), np.zeros((4, 2, 2), np.int32))
-    with pytest.raises(InputError, match="3 numbers per mask, latents of an autoencoder"):
-        features_from_langsplat(tmp_path / "dim3", store)
-    for name in ("a.1.png", "a.2.png"):
-        store.save(name, photograph(0))
-    with pytest.raises(InputError, match="one name up to its first dot"):
-        features_to_langsplat(store, tmp_path / "out")
+def test_a_scene_of_an_autoencoder_becomes_langsplats(tmp_path):
+    scene = Scene(random_gaussians(30, sh_degree=1), random_field(30), (random_camera(),))
+    save_scene(tmp_path / "case.ply", scene)
+    assert run("convert", tmp_path / "case.ply", tmp_path / "out", "--to", "langsplat") == 0
+    made = sorted(str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*.pth"))
+    assert made == ["best_ckpt.pth", *(f"case_{level}/chkpnt30000.pth" for level in (1, 2, 3))]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["{0}", "{1}", "out.ply"], "of which levels|latents of LangSplat's autoencoder"),
+        (["{0}", "out.ply", "--rematch", "x.safetensors"], "--rematch is for one scene"),
+        (["{0}", "{1}", "--levels", "whole"], "scenes are written as"),
+        (["missing.pth", "out.ply"], "no such file"),
+        (["{0}", "out.ply", "--levels", "whole", "--encoder", "/nowhere"], "autoencoder"),
+    ],
+)
+def test_unusable_checkpoints_are_refused(tmp_path, capsys, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    g = random_gaussians(20)
+    paths = [save_model(tmp_path / f"{name}.pth", g, tensor(np.ones((20, 3), np.float32))) for name in "ab"]
+    assert re.search(message, refusal(capsys, "convert", *(word.format(*paths) for word in words)))
+
+
+# A full disk: one line, and what was there stays.
+
+
+def checkpoint(count: int) -> Write:
+    gaussians = random_gaussians(count, 1, sh_degree=1)
+    return lambda folder: write_checkpoint(folder / "c.pth", gaussians, np.ones((count, 3), np.float32))
+
+
+def best_checkpoint(folder: Path) -> object:
+    codec = random_codec("autoencoder")
+    assert isinstance(codec, AutoencoderCodec)
+    return write_autoencoder(folder / "a.pth", codec.encoder, codec.decoder)
+
+
+WRITERS: dict[str, Write] = {
+    "checkpoint": checkpoint(40),
+    "autoencoder": best_checkpoint,
+}
+FILLED: dict[str, Write] = {**WRITERS, "large checkpoint": checkpoint(6_000)}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_full_disk_is_one_line(name: str, tmp_path: Path, capsys: Captured) -> None:
+    check_full_disk(WRITERS[name], tmp_path, capsys, b"what was there before")
+
+
+@pytest.mark.parametrize("name", FILLED)
+def test_a_small_disk_that_fills_up_is_a_line(name: str, tmp_path: Path, capsys: Captured) -> None:
+    check_small_disk(FILLED[name], tmp_path, capsys)

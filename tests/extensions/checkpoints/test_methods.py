@@ -1,10 +1,8 @@
 """Files of other methods: what is found in them, which belong together, and what is refused."""
 
-import io
 import json
 import os
 import pickle
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,9 +11,8 @@ import pytest
 import torch
 
 from langsplat_core.arrays import Array, unit
-from langsplat_core.errors import FormatError, InputError
-from langsplat_core.extensions.checkpoints.langsplat_files import read_features, write_features
-from langsplat_core.extensions.checkpoints.methods import ForeignScene, read_foreign
+from langsplat_core.errors import InputError
+from langsplat_core.extensions.checkpoints.importing import ForeignScene, read_foreign
 from langsplat_core.io.ply import write_ply
 from langsplat_core.scene import Gaussians
 from tests.support.comparing import assert_same
@@ -277,11 +274,11 @@ def wrong(index: int, value: object) -> tuple[object, ...]:
 @pytest.mark.parametrize(
     ("index", "value", "message"),
     [
-        (1, torch.zeros(N, 2), r"element 1 has the shape \(20, 2\); expected positions"),
+        (1, torch.zeros(N, 2), "element 1: positions"),
         (1, None, "element 1 holds no positions"),
         (3, torch.zeros(N, 7, 3), "7 SH coefficients"),
-        (4, torch.zeros(N, 2), r"element 4 has the shape \(20, 2\); expected log scales"),
-        (5, torch.zeros(N + 1, 4), r"expected rotations \(20, 4\)"),
+        (4, torch.zeros(N, 2), "element 4: log scales"),
+        (5, torch.zeros(N + 1, 4), "element 5: rotations"),
         (6, torch.zeros(N, 1, dtype=torch.int64), "element 6 holds no opacities"),
         (7, torch.zeros(N + 1, D), r"features \(21, 24\) for 20 Gaussians"),
         (7, torch.zeros(N, D, dtype=torch.int32), "features of the type int32"),
@@ -346,105 +343,3 @@ def test_files_of_no_method_are_refused(tmp_path):
         refused([path, checkpoint], "neither a PLY nor a file of torch")
     np.savez(tmp_path / "x.npz", a=np.zeros((3, 4)))
     refused([tmp_path / "x.npz", checkpoint], r"holds arrays \(3, 4\)")
-
-
-# The masks and vectors of one photograph as the original LangSplat stores them.
-
-FEATURES = rng.normal(size=(9, 512)).astype(np.float32)
-MAPS = rng.integers(-1, 9, size=(4, 6, 8)).astype(np.int32)
-
-
-@pytest.fixture
-def save(tmp_path: Path) -> Callable[..., Path]:
-    """Writes both files of "view.01", each from an array or as bytes."""
-
-    def write(vectors: Array | bytes = FEATURES, maps: Array | bytes = MAPS) -> Path:
-        for letter, content in (("f", vectors), ("s", maps)):
-            path = tmp_path / f"view.01_{letter}.npy"
-            path.write_bytes(content) if isinstance(content, bytes) else np.save(path, content)
-        return tmp_path
-
-    return write
-
-
-def test_features_are_read_back(tmp_path):
-    write_features(tmp_path / "new", "view.01", FEATURES, MAPS)
-    assert sorted(p.name for p in (tmp_path / "new").iterdir()) == ["view.01_f.npy", "view.01_s.npy"]
-    vectors, maps = read_features(tmp_path / "new", "view.01")
-    np.testing.assert_array_equal(vectors, FEATURES)
-    np.testing.assert_array_equal(maps, MAPS)
-    assert (vectors.dtype, maps.dtype) == (np.float32, np.int32)
-    np.testing.assert_array_equal(np.load(tmp_path / "new" / "view.01_s.npy"), MAPS)
-    write_features(tmp_path, "empty", FEATURES[:0], np.full_like(MAPS, -1))
-    vectors, maps = read_features(tmp_path, "empty")
-    assert vectors.shape == (0, 512)
-    assert (maps == -1).all()
-
-
-@pytest.mark.parametrize("kind", ["f4", "i8", "i2", ">i4"])
-@pytest.mark.parametrize("order", ["C", "F"])
-def test_maps_of_other_writers(save, kind, order):
-    folder = save(FEATURES[:, :3].astype(np.float16), np.asarray(MAPS, kind, order=order))
-    vectors, maps = read_features(folder, "view.01")
-    np.testing.assert_array_equal(maps, MAPS)
-    assert vectors.shape == (9, 3)
-
-
-def with_value(value: float) -> Array:
-    maps = MAPS.astype("f4")
-    maps[3, 5, 7] = value
-    return maps
-
-
-def npy(shape: tuple[int, ...], data: bytes = b"", kind: str = "<f4") -> bytes:
-    buffer = io.BytesIO()
-    np.lib.format.write_array_header_1_0(buffer, {"descr": kind, "fortran_order": False, "shape": shape})
-    return buffer.getvalue() + data
-
-
-MAP_SHAPE, VECTOR_SHAPE = "expected numbers of shape", r"expected floats of shape \(M, D\)"
-HELD, PLAIN = "truncated or damaged", "not a .npy file of plain numbers"
-BROKEN = {  # vectors, maps, message
-    "an id too high": (FEATURES, with_value(9), r"ids from -1.* to 9.*expected -1 to 8, the rows of view"),
-    "an id below -1": (FEATURES, with_value(-2), "ids from -2"),
-    "an id that is none": (FEATURES, with_value(np.nan), "ids from nan"),
-    "half an id": (FEATURES, with_value(1.5), "ids that are not whole"),
-    "three maps": (FEATURES, MAPS[:3], rf"\(3, 6, 8\); {MAP_SHAPE} \(4, H, W\)"),
-    "one map": (FEATURES, MAPS[0], MAP_SHAPE),
-    "maps without pixels": (FEATURES, MAPS[:, :0], MAP_SHAPE),
-    "maps of text": (FEATURES, MAPS.astype("U2"), MAP_SHAPE),
-    "flat vectors": (FEATURES[0], MAPS, VECTOR_SHAPE),
-    "whole vectors": (FEATURES.astype(np.int32), MAPS, VECTOR_SHAPE),
-    "vectors that are none": (FEATURES * np.float32(np.nan), MAPS, "not finite"),
-    "pickled objects": (np.array([{}], dtype=object), MAPS, PLAIN),
-    "complex vectors": (FEATURES.astype(complex), MAPS, PLAIN),
-    "a trillion rows": (npy((10**12, 512)), MAPS, HELD),
-    "2^80 numbers": (npy((2**40, 2**40)), MAPS, HELD),
-    "truncated": (npy((9, 512), FEATURES.tobytes()[:-1]), MAPS, HELD),
-    "too long": (npy((9, 512), FEATURES.tobytes() + b"x"), MAPS, HELD),
-    **{
-        f"another kind {content[:8]!r}": (FEATURES, content, r"view\.01_s\.npy: not a \.npy file")
-        for content in (b"", b"\x93NUMPY", b"\x93NUMPY\x09\x00aa", pickle.dumps([1]), npy((-9, -8)))
-    },
-    "objects for maps": (FEATURES, npy((9,), kind="|O"), r"view\.01_s\.npy: not a \.npy file"),
-}
-
-
-@pytest.mark.parametrize("case", BROKEN)
-def test_every_broken_rule_of_features_has_its_message(save, case):
-    *arrays, message = BROKEN[case]
-    folder = save(*arrays)
-    with pytest.raises(FormatError, match=message) as caught:
-        read_features(folder, "view.01")
-    assert str(caught.value).startswith(str(folder / "view.01_"))
-
-
-def test_features_that_are_missing_or_could_not_be_read_again(tmp_path, save):
-    (save() / "view.01_s.npy").unlink()
-    with pytest.raises(InputError, match=r"view\.01_s\.npy: no such file"):
-        read_features(tmp_path, "view.01")
-    with pytest.raises(ValueError, match="beyond the 8 vectors"):
-        write_features(tmp_path / "none", "a", FEATURES[:8], np.full((4, 1, 1), 8, np.int32))
-    with pytest.raises(TypeError):
-        write_features(tmp_path / "none", "a", FEATURES.astype(np.float64), MAPS)
-    assert not list(tmp_path.glob("none/*"))

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 import torch
 
-from langsplat_core.extensions.checkpoints.unpickling import load_torch, plain_array
+from langsplat_core.extensions.checkpoints.importing import read_foreign
 from tests.support.commands import Ended, convert_each
-from tests.support.file_samples import geometry, training_state
-from tests.support.mutation import mutant
+from tests.support.file_kinds import drawable_share
+from tests.support.file_samples import autoencoder, geometry, save_model, tensor, training_state
+from tests.support.mutation import FileKind, fuzz, mutant
 from tests.support.scenes import random_gaussians
 
-pytestmark = pytest.mark.long  # a child for every file
 G = random_gaussians(4, sh_degree=0)
-F8, S8, U2 = np.dtype("f8"), np.dtype("S8"), np.dtype("U2")
+F8 = np.dtype("f8")
 EIGHT = struct.pack("<d", 4.25)
 FLOATS = torch.arange(12.0)
 FIT = (4, 3)
@@ -58,70 +58,22 @@ def rebuilt(
     return Crafted(function, storage, offset, shape, stride, False, OrderedDict(), *more)
 
 
-def state(*, order: Any = "<", inside: Any = None, names: Any = None, fields: Any = None, size: Any = -1,
-          alignment: Any = -1, flags: Any = 0, version: int = 3) -> tuple[Any, ...]:  # fmt: skip
-    return (version, order, inside, names, fields, size, alignment, flags)
-
-
-OBJECT = kind("O", state(order="|", flags=63))
-FIELDS = {"a": (OBJECT, 0)}
-KINDS = {  # states of a type that are not the type's own
-    **{f"S8 of size {size}": ("S8", state(order="|", size=size, alignment=1)) for size in
-       (-8, 0, -1, 7, 9, 2**31 - 1, -(2**31), 2**40, 2**70, None, 8.5, "8")},
-    **{f"U2 of size {size}": ("U2", state(size=size, alignment=4, flags=8)) for size in (-8, 7)},
-    **{f"f8 of size {size}": ("f8", state(size=size)) for size in (-8, 0, 4, 2**31 - 1)},
-    **{f"f8 with flags {flags}": ("f8", state(flags=flags)) for flags in (1, 2, 4, 16, 63, -1, 2**40)},
-    **{f"f8 aligned to {by}": ("f8", state(alignment=by)) for by in (0, -8, 2**31 - 1)},
-    **{f"f8 in order {order!r}": ("f8", state(order=order)) for order in ("|", "x", "", 1, None, "<>")},
-    "f8 of objects": ("f8", state(inside=(OBJECT, (1,)))),
-    "f4 of objects": ("f4", state(inside=(OBJECT, (1,)))),
-    "f8 of many f8": ("f8", state(inside=(kind("f8"), (2**40,)))),
-    "f8 of fewer than none": ("f8", state(inside=(kind("f8"), (-1,)))),
-    "f8 of one f8": ("f8", state(inside=(kind("f8"), 1))),
-    "f8 of nothing": ("f8", state(inside=())),
-    "f8 with an object in a field": ("f8", state(names=("a",), fields=FIELDS)),
-    "f8 with a field before it": ("f8", state(names=("a",), fields={"a": (kind("f8"), -8)})),
-    "f8 with a field far away": ("f8", state(names=("a",), fields={"a": (kind("f8"), 2**40)})),
-    "f8 with names alone": ("f8", state(names=("a",))),
-    "V8 with an object in a field": ("V8", state(order="|", names=("a",), fields=FIELDS, size=8)),
-    "f8 of another version": ("f8", state(version=4)),
-    "f8 with metadata": ("f8", (*state(version=4), {"a": OBJECT})),
-    "f8 in a short state": ("f8", (3, "<")),
-    "f8 in no state": ("f8", {"dtype": OBJECT, "itemsize": -8}),
-    "f8 and attributes": ("f8", (None, {"dtype": OBJECT, "itemsize": -8})),
-}  # fmt: skip
-NUMBERS = {
-    **{name: scalar(kind(*of)) for name, of in KINDS.items()},
-    **{f"scalar {code}": scalar(kind(code)) for code in
-       ("O", "V8", "M8", "m8", "f16", "c8", "S-8", "i3", "f8,O", "(2,)f8", "S99999999999", "", "٤")},
-    "scalar of a list": scalar(Crafted(np.dtype, [("a", "O")], False, True)),
+NUMBERS = {  # of NumPy, which are passed over whatever they state
+    "scalar of size -8": scalar(kind("S8", (3, "|", None, None, None, -8, 1, 0))),
+    "scalar of objects": scalar(kind("O", (3, "|", None, None, None, -1, -1, 63))),
+    "scalar of a far field": scalar(
+        kind("f8", (3, "<", None, ("a",), {"a": (kind("f8"), 2**40)}, -1, -1, 0))
+    ),
+    "scalar of many": scalar(kind("f8", (3, "<", (kind("f8"), (2**40,)), None, None, -1, -1, 0))),
     "scalar of the class": scalar(np.dtype),
-    "scalar of a string": scalar("f8"),
-    "scalar of nothing": scalar(None),
-    "scalar of an object": scalar(OBJECT),
-    "scalar of 4 bytes": scalar(kind("f8"), EIGHT[:4]),
-    "scalar of 9 bytes": scalar(kind("f8"), EIGHT + b"x"),
-    "scalar of a text": scalar(kind("f8"), "12345678"),
+    "scalar of a list": scalar(Crafted(np.dtype, [("a", "O")], False, True)),
     "scalar without data": scalar(kind("f8"), None),
-}  # fmt: skip
-ARRAYS = {
-    **{f"array of {name}": array(1, FIT, kind(*of), False, EIGHT * 12)
-       for name, of in KINDS.items() if "-8" in name or "object" in name or "many" in name},
-    **{f"array {shape}": array(1, shape, F8, False, EIGHT * 12) for shape in
-       ((-4, -3), (2**62, 4), (2**32, 2**32), (4, 2), (4, 4), (2**64,), (-1,), (3.0, 4), (True, 12), 12)},
-    "array of a hundred dimensions": array(1, (1,) * 100, F8, False, EIGHT),
-    "array without numbers": array(1, (0, 2**62, 2**62), F8, False, S8),
-    "array of a list": array(1, (1,), OBJECT, False, [EIGHT]),
-    "array of addresses": array(1, (1,), OBJECT, False, EIGHT),
-    "array of a text": array(1, (1,), F8, False, "12345678"),
-    "array of an array": array(1, FIT, array(1, FIT, F8, False, EIGHT * 12), False, EIGHT * 12),
-    "array of the class": array(1, FIT, np.dtype, False, EIGHT * 12),
-    "array of another version": array(2, FIT, F8, False, EIGHT * 12),
-    "array in a short state": array(1, FIT),
-    "array in no state": Crafted(multiarray._reconstruct, np.ndarray, (0,), b"b"),  # noqa: SLF001
-    "array with attributes": Crafted(np.ndarray, FIT, state={"values": 1, "data": EIGHT, "shape": (2**40,)}),
-    "array of a shape": Crafted(np.ndarray, (2**40,)),
-}  # fmt: skip
+    "array of 2^40": Crafted(np.ndarray, (2**40,)),
+    "array of addresses": array(1, (1,), kind("O"), False, EIGHT),
+    "array of attributes": Crafted(np.ndarray, FIT, state={"values": 1, "shape": (2**40,)}),
+    "array of less": array(1, (-4, -3), F8, False, EIGHT),
+    "text of no characters": scalar(kind("U2"), b"\xff" * 8),
+}
 TENSORS = {
     **{f"offset {offset}": rebuilt(offset=offset) for offset in (1, -1, 12, 2**62, -(2**63), 2**63)},
     **{f"stride {stride}": rebuilt(stride=stride) for stride in
@@ -217,8 +169,7 @@ def hostile_files() -> dict[str, bytes]:
     plain, legacy = saved(model()), saved(model(), **OLD)
     tuples = b"\x85" * 300_000  # in one another; a hash goes down all of them
     return {
-        **{name: saved(model(extent=crafted)) for name, crafted in NUMBERS.items()},
-        **{name: saved(model(means=crafted)) for name, crafted in (ARRAYS | TENSORS).items()},
+        **{f"means: {name}": saved(model(means=crafted)) for name, crafted in (NUMBERS | TENSORS).items()},
         **{f"{name}, old": saved(model(means=crafted), **OLD) for name, crafted in [*TENSORS.items()][::4]},
         **{f"{name} tensor": saved(model(means=crafted)) for name, crafted in NAMES.items()},
         **{f"with another {name}": saved(Crafted(OrderedDict, state={name: 5})) for name in ("get", "items")},
@@ -234,7 +185,7 @@ def hostile_files() -> dict[str, bytes]:
 
 def mutants() -> dict[str, bytes]:
     rng = np.random.default_rng(0)
-    good = saved(model(means=array(1, FIT, F8, False, EIGHT * 12), extent=np.float64(4.25)))
+    good = saved(model(extent=np.float64(4.25)))
     stream = pickle_of(good)
     return {f"mutant {number}": with_pickle(good, mutant(stream, [stream], rng)) for number in range(20)}
 
@@ -243,12 +194,13 @@ def harmless_files() -> dict[str, bytes]:
     return {
         "untouched": saved(model()),
         "untouched, old": saved(model(), **OLD),
-        "an array for means": saved(model(means=array(1, FIT, F8, False, EIGHT * 12))),
-        "a text of no characters": saved(model(extent=scalar(kind("U2"), b"\xff" * 8))),
+        **{name: saved(model(extent=crafted)) for name, crafted in NUMBERS.items()},
+        "numpy 1": numpy_1(saved(model(extent=np.float64(4.25)))),
         "a view of one number": saved(model(means=rebuilt(stride=(0, 0)))),
     }
 
 
+@pytest.mark.long
 def test_every_crafted_file_is_refused_in_a_line_and_nothing_else(tmp_path):
     hostile, damaged, harmless = hostile_files(), mutants(), harmless_files()
     ended = ends(hostile | damaged | harmless, tmp_path)
@@ -259,37 +211,45 @@ def test_every_crafted_file_is_refused_in_a_line_and_nothing_else(tmp_path):
     assert {name: how for name, how in others.items() if not refused(how)} == {}
 
 
-VALUES = [
-    *(np.dtype(code).type(7) for code in ("f2", "f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")),
-    *(np.bool_(True), np.float64("nan"), np.float32(1e-45), np.int64(-(2**63)), np.uint64(2**64 - 1)),
-]
-FLOAT_ROWS = np.random.default_rng(1).normal(size=(3, 4))
-ROWS = [
-    *(FLOAT_ROWS.astype(code) for code in ("f2", "<f4", ">f4", "<f8", ">f8")),
-    *((100 * FLOAT_ROWS).astype(code) for code in ("i1", ">i2", "i4", ">i8")),
-    *(np.asfortranarray(FLOAT_ROWS), FLOAT_ROWS > 0, np.array(3.5), np.arange(6, dtype=np.uint8)[::2]),
-]
+# Damaged checkpoints of other methods: read, or refused in one line.
+
+SCENE = random_gaussians(20, sh_degree=1)
 
 
-FORMS = {"numpy 2": saved((VALUES, ROWS)), "numpy 1": numpy_1(saved((VALUES, ROWS)))}
-FORMS["no archive"] = saved((VALUES, ROWS), **OLD)
+def checkpoints(folder: Path) -> list[bytes]:
+    """Of Occam's LGS, and without features."""
+    vectors = np.random.default_rng(0).normal(size=(20, 24)).astype(np.float32)
+    paths = [save_model(folder / "made", SCENE, tensor(vectors)), save_model(folder / "plain", SCENE)]
+    return [path.read_bytes() for path in paths]
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_numbers_and_arrays_of_numpy(form, tmp_path):
-    (tmp_path / "a.pth").write_bytes(FORMS[form])
-    values, rows = load_torch(tmp_path / "a.pth")
-    assert [repr(value) for value in values] == [repr(value.item()) for value in VALUES]
-    for value, expected in zip(rows, ROWS, strict=True):
-        found = plain_array(value, tmp_path / "a.pth")
-        assert found is not None
-        assert found.dtype == expected.dtype.newbyteorder("=")
-        assert found.flags.writeable
-        np.testing.assert_array_equal(found, expected)
+def autoencoders(folder: Path) -> list[bytes]:
+    """Of LangSplat; the checkpoint that goes with it lies beside."""
+    save_model(folder / "latents_1.pth", SCENE, tensor(np.ones((20, 3), np.float32)))
+    torch.save(autoencoder(24, (8, 3), (5,)).state_dict(), folder / "made")
+    return [(folder / "made").read_bytes()]
 
 
-def test_texts_of_numpy_are_passed_over(tmp_path):
-    torch.save([np.str_("a"), np.bytes_(b"a"), np.array(["a", "bc"])], tmp_path / "a.pth")
-    found = load_torch(tmp_path / "a.pth")
-    assert found[:2] == [None, None]
-    assert plain_array(found[2], tmp_path / "a.pth") is None
+def imported(path: Path) -> float:
+    beside = path.with_name("latents_1.pth")
+    scene = read_foreign([path, *[beside] * beside.exists()])
+    for level in (level for level in range(3) if scene.levels[level] is not None):
+        scene.rows(level, np.arange(len(scene.scene.gaussians)))
+    return drawable_share(scene.scene.gaussians)
+
+
+KINDS = {name: FileKind("a.pth", made, imported) for name, made in
+         (("checkpoint", checkpoints), ("autoencoder", autoencoders))}  # fmt: skip
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", KINDS)
+def test_a_few_mutants_are_read_or_refused(tmp_path: Path, name: str) -> None:
+    fuzz(KINDS[name], tmp_path, 60, seed=0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("name", KINDS)
+def test_many_mutants_are_read_or_refused(tmp_path: Path, name: str, seed: int) -> None:
+    fuzz(KINDS[name], tmp_path, 3000, seed)

@@ -20,9 +20,10 @@ from torch.nn import functional
 from transformers import CLIPTokenizer
 
 from langsplat_core.errors import EncoderError, InputError
-from langsplat_core.extensions.checkpoints import weight_layouts as layouts
+from langsplat_core.extensions.checkpoints.weight_layouts import Hiera, converted
 from langsplat_core.semantics.encoders import CLIP_MEAN, CLIP_STD, load_encoder, load_text_encoder
-from langsplat_core.semantics.sam import load_segmenter
+from langsplat_core.semantics.sam import FAMILIES, Segmenter, load_segmenter
+from langsplat_core.semantics.weights import Weights
 from tests.support.tiny_models import SAM_SIDE, MakesFolder, tiny_clip, tiny_sam, tiny_sam2
 
 pytestmark = pytest.mark.long
@@ -378,11 +379,11 @@ def refusal(load: Callable[[str], object], path: Path) -> str:
     return said
 
 
-@pytest.fixture
-def sam2_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The tiny SAM 2 counts as published."""
-    monkeypatch.setattr(layouts, "SAM2_SIDE", SAM_SIDE)
-    monkeypatch.setattr(layouts, "SAM2_SIZES", {(8, 5): layouts.Hiera(1, (8, 4, 4, 2), (3,))})
+def load_sam2(id: str) -> Segmenter:
+    """Load a file of the tiny SAM 2 as if it were one of the published sizes."""
+    found = converted(id, Path(id), {(8, 5): Hiera(1, (8, 4, 4, 2), (3,))}, SAM_SIDE)
+    assert found is not None
+    return FAMILIES["sam2"](Weights(id, Path(id).parent, "cpu", found))
 
 
 def sam2_checkpoint(folder: Path) -> Tensors:
@@ -395,13 +396,12 @@ def sam_checkpoint(folder: Path) -> Tensors:
     return segment_anything_tensors(tiny_sam(folder, decoder_heads=8))
 
 
-@pytest.mark.usefixtures("sam2_size")
 @pytest.mark.parametrize(
     ("make", "change", "load"),
     [
         *((lambda folder: open_clip_tensors(), change, load_encoder) for change in BROKEN_CLIP.values()),
         *((sam_checkpoint, change, load_segmenter) for change in BROKEN_SAM.values()),
-        *((sam2_checkpoint, change, load_segmenter) for change in BROKEN_SAM2.values()),
+        *((sam2_checkpoint, change, load_sam2) for change in BROKEN_SAM2.values()),
     ],
     ids=[*BROKEN_CLIP, *(f"SAM: {case}" for case in BROKEN_SAM), *(f"SAM 2: {c}" for c in BROKEN_SAM2)],
 )
@@ -458,15 +458,14 @@ def test_a_configuration_of_another_model_is_named(case: str, tmp_path: Path) ->
 
 
 FILES = {
-    "sam_vit_b_01ec64.pth": (tiny_sam, segment_anything_tensors),
-    "sam2.1_hiera_tiny.pt": (tiny_sam2, lambda model: {"model": sam2_tensors(model)}),
+    "sam_vit_b_01ec64.pth": (tiny_sam, segment_anything_tensors, load_segmenter),
+    "sam2.1_hiera_tiny.pt": (tiny_sam2, lambda model: {"model": sam2_tensors(model)}, load_sam2),
 }
 
 
-@pytest.mark.usefixtures("sam2_size")
 @pytest.mark.parametrize("name", FILES)
 def test_a_file_of_a_segmenter_answers_as_the_folder_does(name: str, tmp_path: Path) -> None:
-    make, renamed = FILES[name]
+    make, renamed, load_file = FILES[name]
     model = make(tmp_path / "folder", decoder_heads=8)
     with torch.no_grad():  # what is zero in a new one too
         for parameter in model.parameters():
@@ -479,8 +478,8 @@ def test_a_file_of_a_segmenter_answers_as_the_folder_does(name: str, tmp_path: P
     points = np.array([[5, 7], [60, 40]], np.float32)
     with torch.inference_mode():
         (got, masks), (want, folder_masks) = (
-            load_segmenter(str(tmp_path / path), "cpu").encode(image).masks_at(points)
-            for path in (name, "folder")
+            load(str(tmp_path / path)).encode(image).masks_at(points)
+            for load, path in ((load_file, name), (load_segmenter, "folder"))
         )
     torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(masks, folder_masks, rtol=1e-5, atol=1e-5)

@@ -1,0 +1,121 @@
+"""Codes that the small formats of scenes share, and the simplest of these: antimatter15's .splat.
+
+A .splat is 32 bytes per Gaussian and nothing else:
+
+    position   3 float32, world units, axes as in the PLY
+    scale      3 float32, world units (not logarithms)
+    colour     4 uint8: red, green, blue and opacity, as fractions of 255
+    rotation   4 uint8: w x y z as (value - 128) / 128
+
+Little endian, no header, no spherical harmonics beyond the base colour. Writers in the wild order the rows
+by size times opacity, so that a viewer can show the first part; here the order is kept, because the
+language field goes by rows. Source of the layout: antimatter15/splat; the code here is our own.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from langsplat_core.arrays import Array, logit, sigmoid, unit
+from langsplat_core.errors import malformed
+from langsplat_core.io.files import atomic_path
+from langsplat_core.io.hostile import open_for_reading
+from langsplat_core.scene import Gaussians
+from langsplat_core.scene.transform import C0
+
+# Components beside the largest, by its index
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+# Axes in which each spherical harmonic from degree 1 on is odd
+_ODD = ["y", "z", "x", "xy", "yz", "-", "xz", "-", "y", "xyz", "y", "z", "x", "z", "x"]
+
+
+def to_bytes(values: Array) -> Array:
+    """Round numbers and clip them to uint8."""
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+
+
+def smallest_three(three: Array, largest: Array) -> Array:
+    """Return (N, 4) unit quaternions from their (N, 3) components other than the largest.
+
+    largest: (N,) index of that one, which is positive.
+    """
+    out = np.empty((len(three), 4))
+    np.put_along_axis(out, _OTHERS[largest], three, 1)
+    np.put_along_axis(out, largest[:, None], np.sqrt(np.maximum(0, 1 - (three**2).sum(1)))[:, None], 1)
+    return out
+
+
+def without_largest(quats: Array) -> tuple[Array, Array]:
+    """Return (N, 3) components and (N,) index for `smallest_three`, of (N, 4) quaternions of any length."""
+    turns = unit(quats.astype(np.float64), 1e-30)
+    largest = np.abs(turns).argmax(axis=1)
+    turns *= np.where(np.take_along_axis(turns, largest[:, None], 1) < 0, -1, 1)
+    return np.take_along_axis(turns, _OTHERS[largest], axis=1), largest
+
+
+def quaternion_signs(signs: Array) -> Array:
+    """Return the (4,) signs of w x y z where the axes have the (3,) `signs`.
+
+    Mirroring an axis turns the two rotations about the others round.
+    """
+    return np.array([1, signs[1] * signs[2], signs[0] * signs[2], signs[0] * signs[1]])
+
+
+def coefficient_signs(signs: Array, count: int) -> Array:
+    """Return the (count,) signs of the coefficients from degree 1 on where the axes have the (3,) `signs`."""
+    odd = np.array([[axis in axes for axis in "xyz"] for axes in _ODD])
+    return np.where(odd, signs, 1).prod(axis=1)[:count]
+
+
+# ---- .splat ----
+
+_HUGE = 1e12  # world units that no Gaussian of a real scene has
+_RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("rotation", "u1", 4)])
+
+
+def read_splat(path: Path | str) -> Gaussians:
+    """Return the Gaussians of a .splat file, of SH degree 0.
+
+    A file cut off between two Gaussians cannot be told from a whole one. Raises InputError when the file
+    cannot be opened and FormatError when it is no such file.
+    """
+    path = Path(path)
+    file, size = open_for_reading(path)
+    with file:
+        if size == 0 or size % _RECORD.itemsize:
+            what = f"{size} bytes are not a whole number of Gaussians of {_RECORD.itemsize}"
+            raise malformed(path, what, "it is truncated or no .splat: copy it again")
+        rows = np.frombuffer(file.read(size), _RECORD)
+    # Nothing else in the file tells it from noise, whose floats are negative, not finite or enormous.
+    with np.errstate(invalid="ignore", divide="ignore"):
+        sound = (np.abs(rows["position"]) < _HUGE).all(1) & (rows["scale"] >= 0).all(1)
+        sound &= (rows["scale"] < _HUGE).all(1)
+        log_scales = np.log(rows["scale"])  # -infinity of 0, a flat axis; NaN where negative: not drawn
+    if sound.mean() < 0.9:
+        raise malformed(path, f"not a .splat: {(~sound).sum()} of {len(rows)} rows are no Gaussians")
+    colours = rows["colour"] / 255
+    return Gaussians(
+        means=rows["position"],
+        log_scales=log_scales,
+        quats_wxyz=(rows["rotation"].astype(np.float32) - 128) / 128,
+        opacity_logits=logit(colours[:, 3]),
+        sh=((colours[:, :3] - 0.5) / C0)[:, None],
+    )
+
+
+def write_splat(path: Path | str, gaussians: Gaussians) -> None:
+    """Write the Gaussians in their order, atomically, without their view dependence.
+
+    Colours and opacities are rounded to 1/255 (colours beyond 0..1 are cut off), rotations to 1/128 per
+    component; positions and scales stay exact. A row that cannot be drawn is written with opacity 0.
+    """
+    valid = gaussians.valid()
+    drawn = gaussians.take(valid)
+    rows = np.zeros(len(gaussians), _RECORD)
+    rows["position"][valid] = drawn.means
+    rows["scale"][valid] = np.exp(drawn.log_scales)
+    rows["colour"][valid, :3] = to_bytes((0.5 + C0 * drawn.sh[:, 0].astype(np.float64)) * 255)
+    rows["colour"][valid, 3] = to_bytes(sigmoid(drawn.opacity_logits) * 255)
+    rows["rotation"][valid] = to_bytes(unit(drawn.quats_wxyz.astype(np.float64)) * 128 + 128)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(rows.tobytes())
