@@ -78,15 +78,6 @@ def _display(button: Button, number: int) -> Command:
     )
 
 
-def _flip(viewer: Viewer, switch: str) -> None:
-    """Turn a switch of the state over."""
-    settings.put(viewer.state, **{switch: not getattr(viewer.state, switch)})
-
-
-def _reset_layout(viewer: Viewer) -> None:
-    settings.put(viewer.state, show_panel=True, resets_panels=True)
-
-
 def _theme(theme: Theme) -> Command:
     return Command(
         f"{theme} theme",
@@ -279,8 +270,16 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
         Command("play the camera path, or stop", viewpoint.toggle_playing, ("Shift+K",)),
     ),
     "Window": (
-        Command("hide or show the panels", lambda v: _flip(v, "show_panel"), ("F11",)),
-        Command("reset the layout", _reset_layout, apart=True),
+        Command(
+            "hide or show the panels",
+            lambda v: settings.put(v.state, show_panel=not v.state.show_panel),
+            ("F11",),
+        ),
+        Command(
+            "reset the layout",
+            lambda v: settings.put(v.state, show_panel=True, resets_panels=True),
+            apart=True,
+        ),
         *(_theme(theme) for theme in THEMES),
         Command("larger text", lambda v: settings.scale_text(v, 0.25), apart=True),
         Command("smaller text", lambda v: settings.scale_text(v, -0.25)),
@@ -288,7 +287,7 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
     "": tuple(_panel(title) for title in PANEL_TITLES),
     "Help": (
         Command("find a command", settings.toggle_palette, ("Ctrl+Shift+P",)),
-        Command("first steps, and list of keys", lambda v: _flip(v, "show_help"), ("F1", "?")),
+        Command("first steps, and list of keys", settings.toggle_help, ("F1", "?")),
     ),
 }
 COMMANDS: tuple[Command, ...] = (

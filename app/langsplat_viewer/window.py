@@ -201,7 +201,7 @@ class Window:
         self._request = request
         self._make_renderer = make_renderer
         self.keyboard = Keyboard(self.viewer.state)
-        self._hiding, self._column = layout.Hiding(), layout.Column()
+        self._docks = layout.Docks()
         self._workspace = Workspace(request.settings, self.viewer)
         self._canvas: Canvas | None = None
         self._menu = outline.ThingsMenu()
@@ -344,9 +344,7 @@ class Window:
         viewpoint.tick(viewer, imgui.get_time())
         opening.follow_beside(viewer)
         opening.watch_training(viewer)
-        self._hiding.apply(viewer)
-        self._column.apply(viewer)
-        layout.show_wanted(viewer)
+        self._docks.apply(viewer)
         self._title()
         self._workspace.update()
 

@@ -67,7 +67,7 @@ def switch_between_scenes(s: Any) -> None:
     assert [path.name for path in s.state.scenes] == ["blobs.ply", "plain.ply"]
     s.drag((600, 300), (656, 279))
     view = s.state.view
-    s.ctx.item_click("//**/plain.ply##scene")
+    s.ctx.item_click("//**/plain.ply##scenes")
     s.shows("plain.ply")
     assert s.state.view is not view
     s.key("Ctrl+page_up", frames=1)
@@ -259,7 +259,7 @@ def mark_and_return(s: Any) -> None:
     s.key("keypad7")
     np.testing.assert_allclose(s.state.view.rotation[2], -start.up, atol=1e-6)
     s.open_panel("Bookmarks", frames=4)
-    s.click("//**/view 1##bookmark")
+    s.click("//**/view 1##bookmarks")
     np.testing.assert_allclose(s.state.view.rotation, start.rotation, atol=1e-6)
     s.ctx.item_click("//**/##bookmark")
     s.enter("by the key of k", frames=2)

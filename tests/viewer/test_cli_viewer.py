@@ -204,7 +204,7 @@ def test_impossible_options_are_one_line(run_viewer, folder, arguments, reason):
         (["--headless", "--out", "a.jpg"], "end the name in .png"),
         (["--headless", "--out", "folder.png"], "is a folder"),
         (["--headless", "--out", "blobs.ply/a.png"], "is a file, not a folder"),
-        (["--headless", "--out", "x" * 5000 + ".png"], "choose a shorter one"),
+        (["--headless", "--out", "x" * 5000 + ".png"], "choose another"),
         (["--out", "a.png"], "add --headless"),
         # Where the window has what is for pictures.
         (["--transparent"], "panel Display"),

@@ -12,7 +12,7 @@ from langsplat_viewer import panels
 from langsplat_viewer.actions import settings, viewpoint
 from langsplat_viewer.commands import COMMANDS, PANEL_TITLES, matching
 from langsplat_viewer.files.projects import FILE_NAME, load_preferences, save_preferences
-from langsplat_viewer.panels import menus, ui
+from langsplat_viewer.panels import ui
 from langsplat_viewer.panels.layout import all_panels
 from langsplat_viewer.panels.navigation import chord
 from langsplat_viewer.panels.ui import elided
@@ -201,18 +201,3 @@ def test_the_first_fallback_has_the_scripts_that_it_is_there_for():
     letters = FT2Font(ui.fallbacks()[0]).get_charmap()
     for text in ("жук", "κούπα", "čaj żółć", "ספל", "كوب", "→ ≥ ✓"):
         assert all(ord(letter) in letters for letter in text if letter != " "), text
-
-
-@pytest.mark.parametrize("platform", ["linux", "darwin", "win32", "emscripten"])
-def test_a_system_without_fonts_is_no_error(monkeypatch, platform):
-    monkeypatch.setattr(ui.sys, "platform", platform)
-    monkeypatch.setattr(ui, "FOLDERS", {})
-    assert [path.name for path in ui.fallbacks()] == ["DejaVuSans.ttf", "NotoEmoji-Regular.ttf"]
-
-
-@pytest.mark.parametrize(("room", "columns"), [(1000.0, 1), (125.0, 2), (60.0, 3), (10.0, 6)])
-def test_buttons_of_the_toolbar_stay_apart_and_inside(room, columns):
-    places = menus.toolbar_places([1, 3, 2], room, 20.0, 5.0)
-    assert len(set(places)) == 6
-    assert len({x for x, _ in places}) == columns
-    assert all(y + 20 <= max(room, 20) for _, y in places)

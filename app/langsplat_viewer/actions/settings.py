@@ -207,6 +207,11 @@ def open_panel(viewer: Viewer, title: str) -> None:
     viewer.state.show_panel, viewer.state.wanted_panel = True, title
 
 
+def toggle_help(viewer: Viewer) -> None:
+    """Show or close the help."""
+    viewer.state.show_help = not viewer.state.show_help
+
+
 def toggle_palette(viewer: Viewer) -> None:
     """Show or close the list of everything that can be done."""
     viewer.state.show_palette = not viewer.state.show_palette

@@ -8,18 +8,14 @@ from imgui_bundle import ImVec2, hello_imgui, imgui
 from langsplat_core import registry
 from langsplat_viewer.actions import settings
 from langsplat_viewer.panels import (
+    dialogs,
     display,
-    files,
     menus,
-    notes,
     outline,
     overlays,
-    questions,
     scene,
     search,
     select,
-    status,
-    training,
     ui,
     viewpoint,
 )
@@ -48,12 +44,12 @@ CORE_PANELS: tuple[Panel, ...] = (
     Panel("Outline", MIDDLE, outline.draw, is_open=False),
     Panel("Select", MIDDLE, select.draw, is_open=False),
     Panel("Transform", MIDDLE, select.draw_transform, is_open=False),
-    Panel("Train", MIDDLE, training.draw, is_open=False),
+    Panel("Train", MIDDLE, scene.draw_training, is_open=False),
     Panel("Record", MIDDLE, viewpoint.draw_record, is_open=False),
     Panel("Bookmarks", MIDDLE, viewpoint.draw_bookmarks, is_open=False),
-    Panel("Messages", FOOT, status.draw_messages),
-    Panel("Overlays", MIDDLE, notes.draw_overlays, is_open=False),
-    Panel("Notes", MIDDLE, notes.draw_notes, is_open=False),
+    Panel("Messages", FOOT, scene.draw_messages),
+    Panel("Overlays", MIDDLE, overlays.draw_overlays, is_open=False),
+    Panel("Notes", MIDDLE, overlays.draw_notes, is_open=False),
 )
 
 
@@ -88,73 +84,53 @@ def _window(viewer: Viewer, panel: Panel) -> hello_imgui.DockableWindow:
     return window
 
 
-def show_wanted(viewer: Viewer) -> None:
-    """Open the panel that an action wants seen, in front of those it shares its place with."""
-    title, docking = (
-        settings.take(viewer.state, "wanted_panel"),
-        hello_imgui.get_runner_params().docking_params,
-    )
-    titles = viewer.state.shows_panels
-    for window in docking.dockable_windows if any(panel.title in titles for panel in all_panels()) else ():
-        window.is_visible = window.label in titles
-    settings.put(viewer.state, shows_panels=())
-    docking.layout_reset |= settings.take(viewer.state, "resets_panels")
-    if title:
-        docking.dockable_window_of_name(title).is_visible = True
-        docking.focus_dockable_window(title)
-
-
-class Column:
-    """Makes the column beside the scene wider when letters grow, and narrower when they shrink."""
+class Docks:
+    """Keeps the panels as the state wants them."""
 
     def __init__(self) -> None:
-        self._scale: float | None = None  # of the letters, in the last frame
-        self._wanted = self._given = 0.0  # width for these letters, and the one that there was room for
+        self._scale = 0.0  # of the letters, in the last frame
+        self._hidden: list[str] = []  # panels that were taken away at one key
 
     def apply(self, viewer: Viewer) -> None:
-        """Apply the layout and the scale of the interface; called once per frame."""
-        scale = viewer.state.preferences.ui_scale
-        before, self._scale = self._scale, scale
-        node = _column() if before is not None and before != scale else None
-        if node is not None and before is not None:
-            most = max(MOST_SHARE * imgui.get_main_viewport().size.x, node.size.x)
-            dragged = abs(node.size.x - self._given) > 1
-            self._wanted = (node.size.x if dragged else self._wanted) * scale / before
-            self._given = min(self._wanted, most)
-            imgui.internal.dock_builder_set_node_size(node.id_, ImVec2(self._given, node.size.y))
+        """Open, hide and bring back panels, and make their column as wide as letters want; once per frame."""
+        docking, state = hello_imgui.get_runner_params().docking_params, viewer.state
+        windows, scale = docking.dockable_windows, state.preferences.ui_scale
+        if self._scale not in (0.0, scale):
+            _widen(COLUMN * scale)
+        self._scale = scale
+        if not state.show_panel and not self._hidden:
+            self._hidden = [window.label for window in windows if window.is_visible]
+            for window in windows:
+                window.is_visible = False
+        elif state.show_panel and self._hidden:
+            for title in self._hidden:
+                docking.dockable_window_of_name(title).is_visible = True
+            self._hidden = []
+        if state.show_panel:
+            visible = (window.label for window in windows if window.is_visible)
+            settings.prefer(viewer, panels=tuple(visible))
+        alone = settings.take(state, "shows_panels")
+        if any(window.label in alone for window in windows):
+            for window in windows:
+                window.is_visible = window.label in alone
+        docking.layout_reset |= settings.take(state, "resets_panels")
+        title = settings.take(state, "wanted_panel")
+        if title:  # in front of those that it shares its place with
+            docking.dockable_window_of_name(title).is_visible = True
+            docking.focus_dockable_window(title)
 
 
-def _column() -> imgui.internal.DockNode | None:
-    """Return the node of the docks beside the scene, as long as it lies there."""
+def _widen(width: float) -> None:
+    """Make the column beside the scene `width` units wide, as long as it lies there."""
     docking = hello_imgui.get_runner_params().docking_params
     root = docking.dock_space_id_from_name(ui.MAIN_DOCK)
     node = imgui.internal.dock_builder_get_node(docking.dock_space_id_from_name(LEFT) or 0)
     while node is not None and node.parent_node is not None and node.parent_node.id_ != root:
         node = node.parent_node
-    beside_scene = node is not None and node.parent_node is not None
-    return node if beside_scene and node.parent_node.split_axis == imgui.internal.Axis.x else None
-
-
-class Hiding:
-    """Takes all panels away at one key, and brings back those that were there."""
-
-    def __init__(self) -> None:
-        self._hidden: list[str] = []
-
-    def apply(self, viewer: Viewer) -> None:
-        """Hide the panels or bring them back where that changed, and note which are open; once per frame."""
-        docking, shown = hello_imgui.get_runner_params().docking_params, viewer.state.show_panel
-        if not shown and not self._hidden:
-            self._hidden = [window.label for window in docking.dockable_windows if window.is_visible]
-            for window in docking.dockable_windows:
-                window.is_visible = False
-        elif shown and self._hidden:
-            for title in self._hidden:
-                docking.dockable_window_of_name(title).is_visible = True
-            self._hidden = []
-        if shown:
-            visible = (window.label for window in docking.dockable_windows if window.is_visible)
-            settings.prefer(viewer, panels=tuple(visible))
+    above = None if node is None else node.parent_node
+    if node is not None and above is not None and above.split_axis == imgui.internal.Axis.x:
+        width = min(width, MOST_SHARE * imgui.get_main_viewport().size.x)
+        imgui.internal.dock_builder_set_node_size(node.id_, ImVec2(width, node.size.y))
 
 
 def draw_over(viewer: Viewer) -> None:
@@ -173,9 +149,9 @@ def draw_over(viewer: Viewer) -> None:
     overlays.draw_grip(viewer, area)
     overlays.draw_axes(viewer, area)
     menus.draw_toolbar(viewer, area)
-    questions.draw_changed(viewer, area)
-    questions.draw_unsaved(viewer)
-    files.draw_browser(viewer)
+    dialogs.draw_changed(viewer, area)
+    dialogs.draw_unsaved(viewer)
+    dialogs.draw_browser(viewer)
     menus.draw_help(viewer)
     menus.draw_palette(viewer)
 

@@ -59,54 +59,37 @@ def _panels() -> None:
 # The toolbar: commands that have an icon, in a strip at the left edge of the scene.
 
 GROUPS = [group for menu in MENUS if (group := [command for command in BY_MENU[menu] if command.icon])]
-SIDE_EM, GROUP_GAP_EM, MARGIN_EM = 1.75, 0.3, 0.3  # of a button, between groups, around them
+TOOLS = [command for group in GROUPS for command in group]
+SIDE_EM, GAP_EM, MARGIN_EM = 1.75, 0.3, 0.3  # of a button, between menus, around them
 OPACITY = 0.95  # of a button
-MOST_OF_SCENE = 0.4  # of the scene's width
 
 
 def draw_toolbar(viewer: Viewer, area: ui.Area) -> None:
-    """Draw a column of buttons over the scene's left edge.
+    """Draw a column of buttons over the scene's left edge, smaller ones where the scene is low.
 
-    It lies between the titles of images and what is written at their foot; there are further columns where
-    the scene is low, and none where it is too narrow for them.
+    It lies between the titles of images and what is written at their foot.
     """
     if viewer.state.scene is None or not viewer.state.show_panel:
         return
-    side, gap, margin = (float(hello_imgui.em_size(size)) for size in (SIDE_EM, GROUP_GAP_EM, MARGIN_EM))
-    top = area.top + side
-    places = toolbar_places([len(group) for group in GROUPS], area.height - 2 * side - 2 * margin, side, gap)
-    width, height = (max(place[axis] for place in places) + side + 2 * margin for axis in (0, 1))
-    if width > MOST_OF_SCENE * area.width:
+    top, gap, margin = (float(hello_imgui.em_size(size)) for size in (SIDE_EM, GAP_EM, MARGIN_EM))
+    gaps = len(GROUPS) * gap
+    side = min(top, (area.height - 2 * top - 2 * margin - gaps) / len(TOOLS))
+    if side < top / 3:
         return
-    imgui.set_next_window_pos(ImVec2(area.left, top))
-    imgui.set_next_window_size(ImVec2(width, height))
+    imgui.set_next_window_pos(ImVec2(area.left, area.top + top))
+    imgui.set_next_window_size(ImVec2(side + 2 * margin, len(TOOLS) * side + gaps + 2 * margin))
     imgui.set_next_window_bg_alpha(0.0)
     imgui.push_style_var(imgui.StyleVar_.window_padding, ImVec2(margin, margin))
+    imgui.push_style_var(imgui.StyleVar_.item_spacing, ImVec2(0, 0))
+    imgui.push_style_var(imgui.StyleVar_.frame_padding, ImVec2(0, 0))
     imgui.begin("toolbar", None, ui.OVER | ui.FIXED)
-    for command, (x, y) in zip((c for group in GROUPS for c in group), places, strict=True):
-        imgui.set_cursor_pos(ImVec2(margin + x, margin + y))
-        _tool_button(viewer, command, side)
+    for group in GROUPS:
+        if group is not GROUPS[0]:
+            imgui.dummy(ImVec2(side, gap))
+        for command in group:
+            _tool_button(viewer, command, side)
     imgui.end()
-    imgui.pop_style_var()
-
-
-def toolbar_places(sizes: list[int], room: float, side: float, gap: float) -> list[tuple[float, float]]:
-    """Return the places (x, y) of the buttons of groups of `sizes`, in columns not higher than `room`.
-
-    A group begins a new column where it does not fit into the rest of the last one.
-    """
-    places: list[tuple[float, float]] = []
-    x = y = 0.0
-    for size in sizes:
-        if places and y + size * side > room:
-            x, y = x + side, 0.0
-        for _ in range(size):
-            if y and y + side > room:
-                x, y = x + side, 0.0
-            places.append((x, y))
-            y += side
-        y += gap
-    return places
+    imgui.pop_style_var(3)
 
 
 def _tool_button(viewer: Viewer, command: Command, side: float) -> None:
@@ -129,7 +112,6 @@ def button_label(command: Command) -> str:
 # grow with the text.
 
 WIDTH_EM, HEIGHT_EM = 26.0, 20.0
-GAP_EM = 0.6  # from the keys to the scrollbar
 
 
 def draw_palette(viewer: Viewer) -> None:
@@ -165,7 +147,7 @@ def _clicked(found: list[Command], typing: bool) -> Command | None:
     if imgui.begin_child("found", child_flags=imgui.ChildFlags_.nav_flattened):
         if not found:
             imgui.text_colored(ui.muted(), "no command has these words")
-        right = imgui.get_content_region_avail().x - hello_imgui.em_size(GAP_EM)
+        right = imgui.get_content_region_avail().x - hello_imgui.em_size(0.6)  # to the scrollbar
         for place, command in enumerate(found):  # Enter does the one that is lit
             if imgui.selectable(command.does, place == 0 and typing)[0]:
                 chosen = command

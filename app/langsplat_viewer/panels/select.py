@@ -1,6 +1,5 @@
 """The panels "Select" and "Transform", and the strokes of tools and the gizmo over the scene."""
 
-from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +14,6 @@ from langsplat_core.scene import Camera
 from langsplat_core.scene.transform import Similarity, moving, scaling, similarity
 from langsplat_viewer import marks
 from langsplat_viewer.actions import editing, saving, settings
-from langsplat_viewer.commands import with_key
 from langsplat_viewer.marks import BRUSHES, MODES, REACHES, TOOLS, Marks, Mode, Tool
 from langsplat_viewer.panels import ui
 from langsplat_viewer.panels.overlays import say
@@ -24,8 +22,7 @@ from langsplat_viewer.session import Point
 from langsplat_viewer.state import EditForm, Gizmo
 from langsplat_viewer.viewer import Viewer
 
-Verb = tuple[str, Callable[[Viewer], object], str]  # button, action, tip
-CHANGES: tuple[Verb, ...] = (
+CHANGES: tuple[ui.Verb, ...] = (
     ("All", editing.select_all, "Everything that is shown"),
     ("None", editing.select_none, "Nothing"),
     ("Invert", editing.invert_selection, "What was not selected"),
@@ -33,7 +30,7 @@ CHANGES: tuple[Verb, ...] = (
     ("Shrink", editing.shrink_selection, "Without what is within reach of the rest"),
     ("More like it", editing.select_alike, "Everything that is like what is selected, and that too"),
 )
-FATES: tuple[Verb, ...] = (
+FATES: tuple[ui.Verb, ...] = (
     ("Hide", editing.hide_selected, "Out of the picture"),
     ("Isolate", editing.isolate_selected, "Everything else out of the picture"),
     ("Show all", editing.show_hidden, "Everything that was hidden"),
@@ -44,7 +41,7 @@ OF_SELECTED = {
     *("Hide", "Isolate", "Delete"),
     *("Selection", "Rest", "Points"),
 }
-FILES: tuple[Verb, ...] = (
+FILES: tuple[ui.Verb, ...] = (
     ("Selection", lambda viewer: saving.export(viewer, Path.cwd(), "selection"), "A PLY with its field"),
     ("Rest", lambda viewer: saving.export(viewer, Path.cwd(), "rest"), "Everything else as a PLY"),
     (
@@ -64,22 +61,23 @@ def draw(viewer: Viewer) -> None:
     """Draw the panel "Select": counts, tools, the search, verbs, files."""
     imgui.begin_disabled(viewer.state.scene is None)
     ui.small_wrapped(counts(viewer.state.marks), ui.muted())
+    disabled = () if viewer.state.marks.selected.any() else OF_SELECTED
     _tools(viewer)
     _found(viewer)
     imgui.separator()
-    _buttons(viewer, CHANGES)
+    ui.verbs(viewer, CHANGES, disabled)
     reach = ui.slider(
         "Reach", viewer.state.tools.reach, REACHES, "%.3f of the scene", logarithmic=True, ems=12
     )
     editing.set_tools(viewer, reach=reach)
     _name(viewer)
     imgui.separator()
-    _buttons(viewer, FATES)
+    ui.verbs(viewer, FATES, disabled)
     imgui.separator()
     imgui.align_text_to_frame_padding()
     imgui.text("Save")
     imgui.same_line()
-    _buttons(viewer, FILES)
+    ui.verbs(viewer, FILES, disabled)
     imgui.end_disabled()
 
 
@@ -134,15 +132,6 @@ def _name(viewer: Viewer) -> None:
     if name is not None:
         editing.name_selection(viewer, name)
     ui.tip("Searching for the name finds this, and what is like it")
-
-
-def _buttons(viewer: Viewer, verbs: Sequence[Verb]) -> None:
-    nothing = not viewer.state.marks.selected.any()
-    for place, (name, act, what) in enumerate(verbs):
-        if place:
-            ui.beside(name)
-        if ui.button(f"{name}##verb", with_key(what, act), enabled=not (nothing and name in OF_SELECTED)):
-            act(viewer)
 
 
 # Strokes: the left button while a tool selects.

@@ -1,7 +1,7 @@
 """What panels share: the scene's area of the window, colours, letters, and small widgets."""
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
@@ -14,6 +14,7 @@ from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
 from msgspec import Meta
 
 from langsplat_core.arrays import Array
+from langsplat_viewer.commands import with_key
 from langsplat_viewer.session import Preferences
 from langsplat_viewer.viewer import Viewer
 
@@ -128,7 +129,7 @@ def small_wrapped(text: str, colour: ImVec4) -> None:
 
 def tip(text: str) -> None:
     """Show a tooltip while the mouse is over the last item."""
-    if imgui.is_item_hovered():
+    if text and imgui.is_item_hovered():
         imgui.set_tooltip(fill(text, TIP_LETTERS, break_on_hyphens=False))
 
 
@@ -175,8 +176,7 @@ def button(label: str, about: str = "", *, enabled: bool = True) -> bool:
     imgui.begin_disabled(not enabled)
     clicked = bool(imgui.button(label))
     imgui.end_disabled()
-    if about:
-        tip(about)
+    tip(about)
     return clicked
 
 
@@ -184,6 +184,18 @@ def next_button(label: str, about: str = "", *, enabled: bool = True) -> bool:
     """Draw a button in the last row, where there is room; return whether it was clicked."""
     beside(label)
     return button(label, about, enabled=enabled)
+
+
+Verb = tuple[str, Callable[[Viewer], object], str]  # of a button: its label, what it does, its tip
+
+
+def verbs(viewer: Viewer, buttons: Sequence[Verb], disabled: Container[str] = ()) -> None:
+    """Draw buttons beside each other, each with the key of its command in its tip; do what is clicked."""
+    for place, (label, act, about) in enumerate(buttons):
+        if place:
+            beside(label)
+        if button(label, with_key(about, act).strip(), enabled=label not in disabled):
+            act(viewer)
 
 
 def box(label: str, hint: str, text: str, width: float = -1.0) -> tuple[bool, str]:
@@ -260,8 +272,7 @@ def radio(choices: Mapping[T, str], chosen: T, tips: Mapping[T, str] | None = No
             beside_boxed(label)
         if imgui.radio_button(label, value == chosen):
             chosen = value
-        if tips:
-            tip(tips[value])
+        tip(tips[value] if tips else "")
     return chosen
 
 
@@ -283,22 +294,44 @@ def slider(
     return new if changed else value  # what comes back unchanged has been rounded
 
 
-def row(text: str, tag: str, chosen: bool, *, can_go: bool = True, about: str = "") -> tuple[bool, bool]:
-    """Draw a row of a list, and a button that takes it off; return whether each was clicked.
+@dataclass(frozen=True)
+class Row:
+    """A row of a list."""
 
-    about: its tip.
+    text: str
+    chosen: bool = False
+    about: str = ""  # its tip
+
+
+def listed(
+    name: str, rows: Sequence[Row], empty: str = "", height: float = 0, *, keeps_chosen: bool = False
+) -> tuple[int | None, int | None]:
+    """Draw a list, each row with a button that takes it off.
+
+    Return the numbers of the row that was clicked and of the one taken off. `empty` is said in place of rows;
+    `height` in rows, 0 for all of the panel. `keeps_chosen`: the chosen one cannot be taken off.
     """
-    side, right = imgui.get_frame_height(), imgui.get_content_region_avail().x
-    room = right - side - imgui.get_style().item_spacing.x
-    imgui.align_text_to_frame_padding()
-    clicked = imgui.selectable(f"{elided(text, room)}##{tag}", chosen, size=ImVec2(room, 0))[0]
-    if about:
-        tip(about)
-    imgui.same_line(imgui.get_cursor_start_pos().x + right - side)
-    imgui.begin_disabled(not can_go)
-    gone = imgui.button("x", ImVec2(side, 0))
-    imgui.end_disabled()
-    return bool(clicked), bool(gone)
+    clicked = gone = None
+    borders = imgui.ChildFlags_.borders if height else 0
+    if imgui.begin_child(name, ImVec2(0, height * imgui.get_frame_height_with_spacing()), borders):
+        if not rows:
+            small_wrapped(empty, muted())
+        side, right = imgui.get_frame_height(), imgui.get_content_region_avail().x
+        room = right - side - imgui.get_style().item_spacing.x
+        for number, row in enumerate(rows):
+            imgui.push_id(number)
+            imgui.align_text_to_frame_padding()
+            label = f"{elided(row.text, room)}##{name}"
+            clicked = number if imgui.selectable(label, row.chosen, size=ImVec2(room, 0))[0] else clicked
+            tip(row.about)
+            imgui.same_line(imgui.get_cursor_start_pos().x + right - side)
+            imgui.begin_disabled(keeps_chosen and row.chosen)
+            gone = number if imgui.button("x", ImVec2(side, 0)) else gone
+            imgui.end_disabled()
+            tip("Take it off the list")
+            imgui.pop_id()
+    imgui.end_child()
+    return clicked, gone
 
 
 class Picture:
@@ -349,17 +382,6 @@ def ask_for_popup(title: str, is_wanted: bool) -> None:
         imgui.open_popup(title)
     centre = imgui.get_main_viewport().get_center()
     imgui.set_next_window_pos(centre, imgui.Cond_.appearing, ImVec2(0.5, 0.5))
-
-
-UNITS = ("bytes", "kB", "MB", "GB", "TB")
-
-
-def in_words(size: float) -> str:
-    """Bytes as people read them: "1.4 MB"."""
-    unit = 0
-    while size >= 1000 and unit + 1 < len(UNITS):
-        size, unit = size / 1000, unit + 1
-    return f"{size:.0f} {UNITS[unit]}" if unit == 0 or size >= 100 else f"{size:.1f} {UNITS[unit]}"
 
 
 def elided(text: str, room: float, width_of: Callable[[str], float] = width_of) -> str:

@@ -1,9 +1,11 @@
 """The panels "Camera", "Record" and "Bookmarks"."""
 
 import math
+from collections.abc import Sequence
 
-from imgui_bundle import ImVec2, hello_imgui, imgui
+from imgui_bundle import hello_imgui, imgui
 
+from langsplat_core.scene import Camera
 from langsplat_viewer.actions import saving, settings, viewpoint
 from langsplat_viewer.camera.controls import FOV_RANGE, OrbitCamera, adopt_up, level, with_fov
 from langsplat_viewer.camera.flight import Keyframe
@@ -17,25 +19,26 @@ from langsplat_viewer.viewer import Viewer
 CUT_RANGE = (0.01, 20.0)  # of the scene's radius, the least and most that a cut can be chosen
 
 
+VIEWS: tuple[ui.Verb, ...] = (
+    ("Reset", viewpoint.reset_view, "Return to the opening view"),
+    ("Focus", viewpoint.focus_result, "Go to the latest answer"),
+    ("Frame all", viewpoint.frame_scene, "Show the whole scene from this side"),
+    ("Horizon", lambda viewer: viewpoint.move(viewer, level), "Turn the picture until the horizon is level"),
+    ("Align up", lambda viewer: viewpoint.move(viewer, adopt_up), "Take the picture's up as the world's up"),
+)
+
+
 def draw_camera(viewer: Viewer) -> None:
     """Draw the panel "Camera"."""
     state = viewer.state
     imgui.begin_disabled(state.view is None)
     if state.scene is not None and state.scene.cameras:
-        _training_cameras(viewer)
-    if ui.button(with_key("Reset", viewpoint.reset_view), "Return to the opening view"):
-        viewpoint.reset_view(viewer)
-    if ui.next_button(with_key("Focus", viewpoint.focus_result)):
-        viewpoint.focus_result(viewer)
-    if ui.next_button("Frame all", with_key("Show the whole scene from this side", viewpoint.frame_scene)):
-        viewpoint.frame_scene(viewer)
-    if ui.button("Horizon", "Turn the picture until the horizon is level"):
-        viewpoint.move(viewer, level)
-    if ui.next_button("Align up", "Take the picture's up as the world's up axis"):
-        viewpoint.move(viewer, adopt_up)
+        _training_cameras(viewer, state.scene.cameras)
+    ui.verbs(viewer, VIEWS)
     if state.view is not None:
         _projection(viewer, state.view)
-    _cuts(viewer)
+    if state.extent is not None:
+        _cuts(viewer, state.extent.radius)
     viewer.change("settings", **ui.draw_fields(state.session, "Camera"))
     settings.prefer(viewer, **ui.draw_fields(state.preferences, "Camera"))
     imgui.end_disabled()
@@ -56,46 +59,41 @@ def _projection(viewer: Viewer, view: OrbitCamera) -> None:
         viewpoint.move(viewer, lambda view: with_fov(view, fov))
 
 
-def _cuts(viewer: Viewer) -> None:
+def _cuts(viewer: Viewer, radius: float) -> None:
     """Near and far cut; at the ends of their sliders there is none."""
-    extent, clip = viewer.state.extent, viewer.state.session.clip
-    if extent is None:
-        return
-    low, high = limits = CUT_RANGE[0] * extent.radius, CUT_RANGE[1] * extent.radius
+    clip, (low, high) = viewer.state.session.clip, (part * radius for part in CUT_RANGE)
     text = "%.3g" if clip.near else "off"
-    near = ui.slider("Near cut", max(clip.near, low), limits, text, logarithmic=True)
+    near = ui.slider("Near cut", max(clip.near, low), (low, high), text, logarithmic=True)
     ui.tip("Nearer than this nothing is drawn, to look into things; world units")
     text = "%.3g" if clip.far < high else "off"
-    far = ui.slider("Far cut", min(clip.far, high), limits, text, logarithmic=True)
+    far = ui.slider("Far cut", min(clip.far, high), (low, high), text, logarithmic=True)
     ui.tip("Farther than this nothing is drawn; world units")
     clip = Clip(0.0 if near < 1.001 * low else near, math.inf if far > 0.999 * high else far)
     settings.set_clip(viewer, clip)
 
 
-def _training_cameras(viewer: Viewer) -> None:
-    state = viewer.state
-    assert state.scene is not None
-    if imgui.arrow_button("##previous", imgui.Dir.left):
-        viewpoint.step_camera(viewer, -1)
-    imgui.same_line()
-    if imgui.arrow_button("##next", imgui.Dir.right):
-        viewpoint.step_camera(viewer, 1)
-    imgui.same_line()
-    index = state.camera_index or 0
+def _training_cameras(viewer: Viewer, cameras: Sequence[Camera]) -> None:
+    for by, label, direction in ((-1, "##previous", imgui.Dir.left), (1, "##next", imgui.Dir.right)):
+        if imgui.arrow_button(label, direction):
+            viewpoint.step_camera(viewer, by)
+        imgui.same_line()
+    index = viewer.state.camera_index or 0
     imgui.set_next_item_width(-1)
-    name = state.scene.cameras[index].name.replace("%", "%%")
-    changed, index = imgui.slider_int(
-        "##camera", index, 0, len(state.scene.cameras) - 1, f"camera %d  {name}"
-    )
+    name = cameras[index].name.replace("%", "%%")
+    changed, wanted = imgui.slider_int("##camera", index, 0, len(cameras) - 1, f"camera %d  {name}")
     ui.tip("Training cameras: stand where a photograph was taken")
-    if changed and index != state.camera_index:
-        viewpoint.go_to_camera(viewer, index)
+    if changed and wanted != viewer.state.camera_index:
+        viewpoint.go_to_camera(viewer, wanted)
 
 
 # The panel "Record": keyframes of the camera path, playing it, films of it.
 
 ROWS = 3.5  # of the list: the half one says that there are more
 NUMBER_EM, FPS_EM = 7.5, 4.5
+FILMS: tuple[ui.Verb, ...] = (
+    ("Save film", saving.save_film, ""),
+    ("Save picture##sized", saving.save_sized_picture, "What is shown now, in this size"),
+)
 
 
 def draw_record(viewer: Viewer) -> None:
@@ -118,12 +116,10 @@ def draw_record(viewer: Viewer) -> None:
 def _play(viewer: Viewer) -> None:
     record, seconds = viewer.state.record, viewpoint.path_seconds(viewer)
     imgui.begin_disabled(seconds <= 0)
-    if ui.button(
-        "Stop##path" if record.began is not None else "Play##path", with_key("Play", viewpoint.toggle_playing)
-    ):
-        viewpoint.toggle_playing(viewer)
+    label = "Stop##path" if record.began is not None else "Play##path"
+    ui.verbs(viewer, [(label, viewpoint.toggle_playing, "Play")])
     imgui.same_line()
-    loop = imgui.calc_text_size("Loop").x + imgui.get_frame_height() + 2 * imgui.get_style().item_spacing.x
+    loop = ui.width_of("Loop") + imgui.get_frame_height() + 2 * imgui.get_style().item_spacing.x
     imgui.set_next_item_width(-loop)
     changed, at = imgui.slider_float("##at", record.at, 0.0, max(seconds, 1e-3), "%.2f s")
     if changed:
@@ -152,30 +148,22 @@ def _number(label: str, value: float, step: float) -> float | None:
 
 def _keyframes(viewer: Viewer) -> None:
     record, keyframes = viewer.state.record, viewer.state.session.keyframes
-    if ui.button("Add keyframe", with_key("The current view", viewpoint.add_keyframe)):
-        viewpoint.add_keyframe(viewer)
-    if ui.next_button("Clear", enabled=bool(keyframes)):
-        viewpoint.clear_path(viewer)
+    edits = ("Add keyframe", viewpoint.add_keyframe, "The current view"), ("Clear", viewpoint.clear_path, "")
+    ui.verbs(viewer, edits, () if keyframes else ("Clear",))
     ui.beside("Duration", hello_imgui.em_size(NUMBER_EM))
     _duration(viewer)
-    height = ROWS * imgui.get_frame_height_with_spacing()
-    if imgui.begin_child("keyframes", ImVec2(0, height), imgui.ChildFlags_.borders):
-        if not keyframes:
-            ui.small_wrapped("Add the current view; the path goes smoothly from one to the next", ui.muted())
-        for number, key in enumerate(keyframes, 1):
-            imgui.push_id(number)
-            text = f"{number}   {key.seconds:.2f} s"
-            clicked, gone = ui.row(text, "keyframe", key is record.chosen)
-            ui.tip("Take it off the path")
-            if clicked:
-                viewpoint.choose_keyframe(viewer, key)
-            if gone:
-                viewpoint.delete_keyframe(viewer, key)
-            imgui.pop_id()
-    imgui.end_child()
+    rows = [
+        ui.Row(f"{number}   {key.seconds:.2f} s", key is record.chosen)
+        for number, key in enumerate(keyframes, 1)
+    ]
+    empty = "Add the current view; the path goes smoothly from one to the next"
+    clicked, gone = ui.listed("keyframes", rows, empty, ROWS)
+    if clicked is not None:
+        viewpoint.choose_keyframe(viewer, keyframes[clicked])
+    if gone is not None:
+        viewpoint.delete_keyframe(viewer, keyframes[gone])
     _chosen(viewer, record.chosen)
-    if ui.button("Save path", "A new file; dropped onto the window, it comes back"):
-        saving.save_path(viewer)
+    ui.verbs(viewer, [("Save path", saving.save_path, "A new file; dropped onto the window, it comes back")])
 
 
 def _chosen(viewer: Viewer, key: Keyframe | None) -> None:
@@ -213,10 +201,7 @@ def _films(viewer: Viewer) -> None:
         if ui.stoppable(*work, tag="film"):
             saving.cancel_film(viewer)
         return
-    if imgui.button("Save film"):
-        saving.save_film(viewer)
-    if ui.next_button("Save picture##sized", "What is shown now, in this size"):
-        saving.save_sized_picture(viewer)
+    ui.verbs(viewer, FILMS)
 
 
 # The panel "Bookmarks".
@@ -226,21 +211,14 @@ def draw_bookmarks(viewer: Viewer) -> None:
     """Draw the panel "Bookmarks": a box for a name, and the list."""
     state = viewer.state
     imgui.begin_disabled(state.view is None)
-    hint = "name of this view"
-    name = ui.kept_box(viewer, "##bookmark", hint, "Keep")
+    name = ui.kept_box(viewer, "##bookmark", "name of this view", "Keep")
     if name is not None:
         viewpoint.add_bookmark(viewer, name)
     imgui.end_disabled()
-    if imgui.begin_child("bookmarks"):
-        if not state.session.bookmarks:
-            words = "views that you keep are listed here"
-            ui.small_wrapped(with_key(words, viewpoint.add_bookmark), ui.muted())
-        for number, bookmark in enumerate(state.session.bookmarks):
-            imgui.push_id(number)
-            clicked, gone = ui.row(bookmark.name, "bookmark", False)
-            if clicked:
-                viewpoint.go_to_bookmark(viewer, bookmark)
-            if gone:
-                viewpoint.delete_bookmark(viewer, bookmark)
-            imgui.pop_id()
-    imgui.end_child()
+    bookmarks, words = state.session.bookmarks, "views that you keep are listed here"
+    rows = [ui.Row(bookmark.name) for bookmark in bookmarks]
+    clicked, gone = ui.listed("bookmarks", rows, with_key(words, viewpoint.add_bookmark))
+    if clicked is not None:
+        viewpoint.go_to_bookmark(viewer, bookmarks[clicked])
+    if gone is not None:
+        viewpoint.delete_bookmark(viewer, bookmarks[gone])

@@ -1,0 +1,173 @@
+"""What asks over the scene: the file browser, a file that has changed, and what is not saved.
+
+The browser is the project's own beside ImFileDialog, since it fits small windows and large text, says why a
+folder cannot be read, lists recent scenes and opens folders that are scenes. Native dialogs need helpers that
+may be missing.
+"""
+
+from pathlib import Path
+
+from imgui_bundle import ImVec2, hello_imgui, imgui
+
+from langsplat_viewer.actions import opening, saving, settings
+from langsplat_viewer.files.disk import FolderEntry, Listing
+from langsplat_viewer.panels import ui
+from langsplat_viewer.viewer import Viewer
+
+# The file browser.
+
+BROWSER_EM = 40.0, 30.0
+
+
+def draw_browser(viewer: Viewer) -> None:
+    """Draw the browser: a box for a path, the folders above, what is in this one, and recent scenes."""
+    listing, choice = viewer.state.browser, viewer.state.choice
+    title = choice.title or "Open"
+    ui.ask_for_popup(title, listing is not None)
+    imgui.set_next_window_size(ui.fitting(*BROWSER_EM), imgui.Cond_.appearing)
+    shown, stays = imgui.begin_popup_modal(title, True, imgui.WindowFlags_.no_saved_settings)
+    if not shown:
+        return
+    if listing is not None:
+        _path_box(viewer)
+        _above(viewer, listing.folder)
+        _entries(viewer, listing)
+        if choice.is_folder and imgui.button("Take this folder"):
+            opening.choose(viewer, listing.folder)
+    if not stays or imgui.is_key_pressed(imgui.Key.escape):
+        settings.put(viewer.state, browser=None)
+    if viewer.state.browser is None:
+        imgui.close_current_popup()
+    imgui.end_popup()
+
+
+def _path_box(viewer: Viewer) -> None:
+    if imgui.is_window_appearing():
+        viewer.state.drafts.pop("##path", None)
+        imgui.set_keyboard_focus_here()
+    picks = viewer.state.choice.is_folder
+    hint = "path of a folder" if picks else "path of a scene or folder, or drop files onto the window"
+    typed = ui.kept_box(viewer, "##path", hint, "Open")
+    if typed is not None:
+        opening.open_typed(viewer, typed)
+
+
+def _above(viewer: Viewer, folder: Path) -> None:
+    for number, parent in enumerate((*reversed(folder.parents), folder)):
+        if number:
+            ui.beside(parent.name)
+        if imgui.small_button(f"{parent.name or parent}##above {number}"):
+            opening.browse(viewer, parent)
+
+
+def _entries(viewer: Viewer, listing: Listing) -> None:
+    picks = viewer.state.choice.is_folder
+    recent = () if picks else viewer.state.preferences.recent
+    below = (min(len(recent), 4) + 2 * bool(recent)) * imgui.get_text_line_height_with_spacing()
+    below += imgui.get_frame_height_with_spacing() * picks
+    if imgui.begin_child("entries", ImVec2(0, -below), imgui.ChildFlags_.borders):
+        if listing.problem:
+            ui.small_wrapped(listing.problem, ui.bad())
+        elif not listing.entries:
+            ui.small_wrapped("no folders here" if picks else "no scenes and no folders here", ui.muted())
+        for entry in (entry for entry in listing.entries if not (picks and entry.is_file)):
+            _entry(viewer, entry)
+        if listing.left_out:
+            ui.small_wrapped(f"{listing.left_out:,} more: type a path", ui.muted())
+    imgui.end_child()
+    if recent:
+        imgui.text_colored(ui.muted(), "Recent")
+        if imgui.begin_child("recent"):
+            for path in recent:
+                if imgui.selectable(f"{path}##recent", False)[0]:
+                    opening.open_file(viewer, Path(path))
+        imgui.end_child()
+
+
+def _entry(viewer: Viewer, entry: FolderEntry) -> None:
+    right = imgui.get_content_region_avail().x
+    if imgui.selectable(entry.path.name if entry.is_file else f"{entry.path.name}/", False)[0]:
+        (opening.choose if entry.is_file else opening.browse)(viewer, entry.path)
+    if entry.size:
+        text = f"{entry.size / 1e6:.1f} MB"
+        imgui.same_line(right - ui.width_of(text))
+        imgui.text_colored(ui.muted(), text)
+
+
+# A file that has changed.
+
+
+def draw_changed(viewer: Viewer, area: ui.Area) -> None:
+    """Draw the bar of a file that has changed."""
+    state = viewer.state
+    if not viewer.watch.changed or state.path is None or state.opening is not None:
+        return
+    top = ImVec2(area.left + area.width / 2, area.top + hello_imgui.em_size(3))  # below what a tool says
+    imgui.set_next_window_pos(top, imgui.Cond_.always, ImVec2(0.5, 0))
+    no_nav, resize = imgui.WindowFlags_.no_nav, imgui.WindowFlags_.always_auto_resize
+    imgui.begin("changed", None, ui.OVER | ui.FIXED | no_nav | resize)
+    imgui.align_text_to_frame_padding()
+    imgui.text_unformatted(f"{state.path.name} has changed on disk")
+    imgui.same_line()
+    if ui.button("Reload", "Read it again; camera, queries and view settings stay"):
+        opening.reload(viewer)
+    imgui.same_line()
+    if imgui.button("Not now"):
+        viewer.watch.dismiss()
+    imgui.end()
+
+
+# What is not saved.
+
+
+def draw_unsaved(viewer: Viewer) -> None:
+    """Ask whether to save, discard or stay; over everything else, while something waits for the answer."""
+    leaving = viewer.state.leaving
+    ui.ask_for_popup("Not saved", leaving is not None)
+    flags = imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_saved_settings
+    if not imgui.begin_popup_modal("Not saved", None, flags)[0]:
+        return
+    if leaving is not None and leaving.film:
+        _wait_for_film(viewer)
+    elif leaving is not None:
+        _ask(viewer, leaving.to)
+    if viewer.state.leaving is None:
+        imgui.close_current_popup()
+    imgui.end_popup()
+
+
+def _ask(viewer: Viewer, to: str) -> None:
+    state = viewer.state
+    if state.is_unsaved:
+        moved = " and some transformed" if state.session.moves else ""
+        count = f"{int(state.marks.deleted.sum()):,} Gaussians"
+        imgui.text_unformatted(f"{count} were deleted{moved}, and the scene is not saved so.")
+    if state.has_unsaved_notes:
+        imgui.text_unformatted("Notes or names are in no project.")
+    imgui.text_unformatted(f"Save before {to}?")
+    if state.is_unsaved:
+        if ui.button("Save", "The scene as a new file, without what was deleted"):
+            saving.save_and_leave(viewer)
+        imgui.same_line()
+    if ui.button("Save the project", "Everything in one small file; the scene stays as it is"):
+        saving.save_project_and_leave(viewer)
+    imgui.same_line()
+    if imgui.button("Discard"):
+        saving.go_on(viewer)
+    imgui.same_line()
+    if imgui.button("Cancel"):
+        settings.put(viewer.state, leaving=None)
+
+
+def _wait_for_film(viewer: Viewer) -> None:
+    work = viewer.recorder.current
+    if work is None:
+        saving.go_on(viewer)
+        return
+    imgui.text_unformatted("The window closes once this is written.")
+    imgui.progress_bar(work[1], ImVec2(-1, 0), work[0])
+    if imgui.button("Stop it, and close"):
+        saving.end_at_once(viewer)
+    imgui.same_line()
+    if imgui.button("Stay"):
+        settings.put(viewer.state, leaving=None)
