@@ -36,12 +36,8 @@ from langsplat_core.errors import EncoderError, InputError, LangSplatError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.scenes import check_keeps, check_writable, save_scene
 from langsplat_core.io.shapes import (
-    MESH_SUFFIXES,
     POINT_SUFFIXES,
-    base_colours,
     check_suffix,
-    gltf_axes,
-    write_meshes,
     write_points,
 )
 from langsplat_core.io.sidecar import read_words
@@ -51,7 +47,7 @@ from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import Number, check_phrase, count_things, joined, run_phrase
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder, searchable
 from langsplat_core.query.grammar import Atom, Counted, Phrase, heads, unparse
-from langsplat_core.query.instances import Instance, hull
+from langsplat_core.query.instances import Instance
 from langsplat_core.query.lookup import decoded_relevancy, peak_pixel, splatted_relevancy
 from langsplat_core.query.selection import grow, of_rows, shrink
 from langsplat_core.raster import load_rasterizer
@@ -151,7 +147,7 @@ class QueryScene:
                 if self.mode == "paper" and engine.is_taught(phrase):
                     raise InputError(NOT_DECODED)
                 if self._plainly and not engine.is_taught(phrase):
-                    engine.text_vector(phrase)
+                    engine.text_vectors([phrase])[0]
                 else:
                     check_phrase(engine, phrase, camera)
             except LangSplatError as error:
@@ -283,7 +279,7 @@ def _answer(
         view = view_of(scene, camera)
         gate = PictureConfig().alpha_gate
         if mode == "paper":
-            phrase = engine.text_vector(result.phrase)[None]
+            phrase = engine.text_vectors([result.phrase])
             relevancy = decoded_relevancy(view, engine.field, result.level, phrase, gate)
         else:
             relevancy = splatted_relevancy(view, result.even[:, None], gate)
@@ -308,7 +304,7 @@ def _lines(answer: dict[str, Any], unit: Unit) -> list[str]:
     return [said] if reading is None else [said, f"  read as: {reading}"]
 
 
-Shape = Literal["scene", "points", "hull"]
+Shape = Literal["scene", "points"]
 
 
 @dataclass(frozen=True)
@@ -322,7 +318,7 @@ class Select:
     texts: tyro.conf.Positional[tuple[str, ...]]
     """Phrases, each in quotes if it has several words; what any of them names is taken."""
     out: OutFile
-    """File to write: .ply, .spz or .splat for a scene, .ply for points, .ply, .obj or .glb for hulls."""
+    """File to write: .ply, .spz or .splat for a scene, .ply for points."""
     remove: bool = False
     """Write everything else instead."""
     level: LevelChoice = "auto"
@@ -334,7 +330,7 @@ class Select:
     shrink: NotNegative = 0.0
     """Leave out what is so near to the rest along the surface, in the same unit; after growing."""
     shape: Annotated[Shape, tyro.conf.arg(name="as")] = "scene"
-    """scene: Gaussians. points: their centres, with colour and relevancy. hull: a closed mesh around each."""
+    """scene: Gaussians. points: their centres, with colour and relevancy."""
     scale: ScaleOption = None
     encoder: EncoderOption = ""
     taught: WordsOption = None
@@ -363,11 +359,7 @@ class Select:
         if self.shape == "scene":
             check_writable(self.out)
         else:
-            check_suffix(self.out, POINT_SUFFIXES if self.shape == "points" else MESH_SUFFIXES)
-        if self.shape == "hull" and self.remove:
-            raise InputError(
-                "--as hull is the shape of things; what is left after --remove is written as points"
-            )
+            check_suffix(self.out, POINT_SUFFIXES)
         check_keeps(self.out, self.scene)
         folder = self.out.parent
         if not folder.is_dir():
@@ -385,19 +377,11 @@ class Select:
         return selected
 
     def _write(self, engine: QueryEngine, answer: QueryResult) -> int:
-        """Write the file; return the number of Gaussians, points or meshes in it."""
+        """Write the file; return the number of Gaussians or points in it."""
         scene, rows = engine.scene, np.flatnonzero(~answer.members if self.remove else answer.members)
         if self.shape == "points":
             relevancy = answer.relevancy[answer.level][rows]
             return write_points(self.out, scene.gaussians.take(rows), {"relevancy": relevancy})
-        if self.shape == "hull":
-            colours, name = base_colours(scene.gaussians), " ".join(self.texts)
-            meshes = [
-                hull(instance, scene.gaussians, colours, f"{name} {number}")
-                for number, instance in enumerate(engine.instances(answer), 1)
-            ]
-            write_meshes(self.out, meshes, gltf_axes(scene))
-            return len(meshes)
         save_scene(self.out, replace(scene.take(rows), path=self.out))
         return len(rows)
 
@@ -417,6 +401,6 @@ class Select:
             print_json(content)
             return
         print("\n".join(instance_lines(found, unit)))
-        what = {"scene": "Gaussians", "points": "points", "hull": "closed hulls"}[self.shape]
+        what = {"scene": "Gaussians", "points": "points"}[self.shape]
         of = f"all but the {selected} selected" if self.remove else f"of {selected} selected Gaussians"
         print(f"{self.out}: {written} {what}, {of}")

@@ -29,11 +29,11 @@ from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query import grammar, taught
+from langsplat_core.query.answers import place_of
 from langsplat_core.query.engine import QueryEngine, TextEncoder, no_field
 from langsplat_core.query.instances import BOXED, oriented_box
 from langsplat_core.query.inventory import suggest
-from langsplat_core.query.regions import place_of
-from langsplat_core.query.rule import RULE, bars_of
+from langsplat_core.query.rule import RULE
 from langsplat_core.raster.opengl.shaders import WEB, shader, splat_shaders
 from langsplat_core.scene import LEVELS, Camera, Gaussians, Scene
 from langsplat_core.scene.gaussians import along_curve
@@ -216,7 +216,7 @@ def language_tables(
         "palette": np.rint(255 * palette).astype(np.uint8),
         **_region_tables(engine),
     }
-    bars = [] if engine.chance is None else [asdict(bar) for bar in bars_of(engine.chance)]
+    bars = [asdict(bar) for bar in engine.bars or ()]
     progress("choosing phrases", 0.3)
     suggested = suggest(engine)
     numbers: dict[str, Any] = {

@@ -1,28 +1,32 @@
-"""Answers to a phrase: whole regions by `rule.decide`, or, as published, what is around the peak."""
+"""Answers to a phrase: whole regions of a scene's tree by `rule.decide`, or, as published, its peak."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from scipy.sparse import csr_matrix
 
 from langsplat_core.arrays import Array
-from langsplat_core.compiled import plain
+from langsplat_core.compiled import kernel, plain, shared_workers
 from langsplat_core.config import LevelChoice
 from langsplat_core.query.grammar import named
 from langsplat_core.query.instances import axis_aligned_box
-from langsplat_core.query.regions import Regions, place_of
 from langsplat_core.query.rule import (
+    RULE,
     Bars,
     Outcome,
+    RegionTable,
     Verdict,
     decide,
     region_fits,
     region_relevancies,
     triple,
 )
-from langsplat_core.scene import LEVELS, Calibration, Fits
+from langsplat_core.scene import LEVELS, Calibration, Fits, LanguageField, Tree
 from langsplat_core.scene.surface import Surface
-from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, Scale
+from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, Scale, relevancy_of
 
 AnswerRule = Literal["regions", "peak"]  # by `rule.decide`, or as published
 
@@ -77,12 +81,150 @@ class QueryResult:
 
 
 def recut(result: QueryResult, cut: float) -> QueryResult:
-    """Return the answer with everything as a member whose relevancy is at least `cut`.
-
-    The relevancy counts that is even over a region. Place, box and verdict stay: they are of the best,
-    wherever the answer ends.
-    """
+    """Return the answer with all as members whose even relevancy is at least `cut`; the verdict stays."""
     return replace(result, own_cut=cut, members=result.even >= np.float32(cut))
+
+
+# Regions: the sets of Gaussians that a scene's tree makes at each level.
+
+PIECES = 4  # that a level is summed in, so that more than three cores have work
+CHUNK = 16_384  # distinct features read at a time
+MIDDLE = 16  # Gaussians around the middle of a region
+
+
+@dataclass(frozen=True, eq=False)
+class Regions:
+    """Regions of the N Gaussians of a scene; R of them at a level."""
+
+    nodes: tuple[Array, ...]  # (R,) number in the tree of each region of a level, rising
+    everywhere: Array  # (3, N) int32 number of the region at each level, from 0; -1: in none
+    weights: Array  # (N,) float32 opacity of what counts, 0 for all others, see `surface_weights`
+    parents: tuple[Array, Array]  # (R,) region of the level above that each is part of: of two levels
+    sizes: tuple[Array, ...]  # (R,) Gaussians that count
+    totals: tuple[Array, ...]  # (R,) float64 sums of their weights
+
+    @cached_property
+    def table(self) -> RegionTable:
+        """The regions of all levels one after the other, as the rule for answers reads them."""
+        counts = np.array([len(sizes) for sizes in self.sizes])
+        parts, wholes = counts[0], counts[0] + counts[1]
+        parents = self.parents[0] + parts, self.parents[1] + wholes, np.full(counts[2], -1)
+        solid = np.concatenate(self.sizes) >= RULE.smallest
+        return RegionTable(counts[None], np.concatenate(parents), solid)
+
+    def means(self, values: Array) -> tuple[Array, ...]:
+        """Return the (R,) float64 opacity-weighted means of (3, N) values over the regions of every level.
+
+        Summed in the order of the Gaussians and not of the surface: memory is read from front to back.
+        """
+        longest = max(len(total) for total in self.totals)
+        sums = np.zeros((len(LEVELS) * PIECES, longest))
+        shared_workers().run(_sum_pieces, len(sums), plain(values), self.everywhere, self.weights, sums)
+        levels = sums.reshape(len(LEVELS), PIECES, longest).sum(1)
+        return tuple(row[: len(total)] / total for row, total in zip(levels, self.totals, strict=True))
+
+    def spread(self, level: int, values: Array, others: Array) -> Array:
+        """Return the (N,) values of all Gaussians from the (R,) values of a level's regions.
+
+        A Gaussian in no region has its own of `others` (N,), of the same type.
+        """
+        spread = np.empty_like(others)
+        shared_workers().run(_spread, len(others), self.everywhere[level], values, others, spread)
+        return spread
+
+    def level_of(self, members: Array) -> int:
+        """Return the level with the region most like `members` (N,) bool, of equal ones the coarsest."""
+        best = []
+        for of, sizes in zip(self.everywhere, self.sizes, strict=True):
+            hits = np.bincount(of[members & (of >= 0) & (self.weights > 0)], minlength=len(sizes))
+            best.append((hits / np.maximum(sizes + hits.sum() - hits, 1)).max(initial=0))
+        return int(np.flatnonzero(np.array(best) == max(best))[-1])
+
+    def place(self, means: Array, level: int, region: int) -> tuple[Array, Array] | tuple[None, None]:
+        """Return place (3,) and box (2, 3) of a region, see `place_of`; region: -1 for none."""
+        if region < 0:
+            return None, None
+        return place_of(means[np.flatnonzero((self.everywhere[level] == region) & (self.weights > 0))])
+
+
+def build_regions(tree: Tree, weights: Array) -> Regions:
+    """Return the regions of a scene. weights: (N,) float32, see `surface_weights`."""
+    weights = np.where(tree.leaves >= 0, weights, np.float32(0))
+    counts = np.flatnonzero(weights > 0)
+    nodes, everywhere, parents, sizes, totals = [], [], [], [], []
+    for level in range(len(LEVELS)):
+        at = tree.at(level)
+        there, first, row = np.unique(at[counts], return_index=True, return_inverse=True)
+        number = np.full(tree.count + 1, -1, np.int32)
+        number[there] = np.arange(len(there))
+        nodes.append(there)
+        everywhere.append(number[at])
+        sizes.append(np.bincount(row, minlength=len(there)))
+        totals.append(np.bincount(row, weights[counts], minlength=len(there)))
+        parents.append(counts[first])  # a Gaussian of each region
+    above = everywhere[1][parents[0]], everywhere[2][parents[1]]
+    return Regions(tuple(nodes), np.stack(everywhere), weights, above, tuple(sizes), tuple(totals))
+
+
+@kernel
+def _sum_pieces(first: int, last: int, values: Array, everywhere: Array, weights: Array, sums: Array) -> None:
+    """Rows [first, last) of `sums` (3 P, R): of a level's P pieces the weighted sums over its regions."""
+    count, pieces = len(weights), len(sums) // len(values)
+    for row in range(first, last):
+        level, piece = row // pieces, row % pieces
+        for i in range(count * piece // pieces, count * (piece + 1) // pieces):
+            if weights[i] > 0:
+                sums[row, everywhere[level, i]] += np.float64(weights[i]) * values[level, i]
+
+
+@kernel
+def _spread(first: int, last: int, of: Array, values: Array, others: Array, spread: Array) -> None:
+    """Fill rows [first, last) of `spread` (N,)."""
+    for i in range(first, last):
+        region = of[i]
+        spread[i] = values[region] if region >= 0 else others[i]
+
+
+def place_of(points: Array) -> tuple[Array, Array]:
+    """Return place (3,), at what is nearest to the middle, and box (2, 3) of (K, 3) points, K >= 1."""
+    points = points.astype(np.float64)
+    far = ((points - points.mean(0)) ** 2).sum(1)
+    near = np.argpartition(far, min(MIDDLE, len(far)) - 1)[:MIDDLE]
+    return points[near].mean(0), axis_aligned_box(points)
+
+
+def feature_sums(
+    field: LanguageField, level: int, of: Array, weights: Array, count: int, read: Callable[[Array], Array]
+) -> Array:
+    """Return (count, V) weighted sums, over sets of Gaussians, of what `read` makes of their features.
+
+    read: (M, d) latents -> (M, V). of: (N,) set of each Gaussian, -1 for none; weights: (N,).
+    """
+    rows = np.flatnonzero(field.known[level] & (of >= 0) & (weights > 0))
+    latents, kinds = field.codec.unique(field.latents[level, rows])
+    shares = csr_matrix((weights[rows], (of[rows], kinds)), shape=(count, len(latents))).tocsc()
+    parts = [slice(start, start + CHUNK) for start in range(0, max(len(latents), 1), CHUNK)]
+    return sum((shares[:, part] @ read(latents[part])).astype(np.float64) for part in parts)
+
+
+def chance_in(field: LanguageField, regions: Regions, scale: Scale) -> Array:
+    """Return the (R, V) float32 fits of everyday phrases in the regions of all levels."""
+
+    def everyday(latents: Array) -> Array:
+        cosines = field.codec.cosines(latents, scale.texts)
+        zero, rate = scale.of(cosines)
+        return relevancy_of(cosines[:, len(scale.canonical) :], zero[:, None], rate[:, None])
+
+    means = [
+        feature_sums(field, level, of, regions.weights, len(totals), everyday) / totals[:, None]
+        for level, (of, totals) in enumerate(zip(regions.everywhere, regions.totals, strict=True))
+    ]
+    return region_fits(
+        regions.table, np.concatenate([scale.fit(values).astype(np.float32) for values in means])
+    )
+
+
+# The answers.
 
 
 def by_regions(
@@ -99,9 +241,7 @@ def by_regions(
     own = np.concatenate([scale.fit(values) for values in regions.means(relevancy)])
     decision = decide(regions.table, own, named(phrase), level, bars, calibration)
     chosen = decision.level
-    place = box = None
-    if decision.best >= 0:
-        place, box = place_of(means[regions.counted(chosen, decision.best)])
+    place, box = regions.place(means, chosen, decision.best)
     return QueryResult(
         phrase=phrase,
         level=chosen,
@@ -127,18 +267,16 @@ def even_relevancy(regions: Regions, scale: Scale, relevancy: Array) -> Array:
     )
 
 
-# The answer as published, by the peak alone.
-
 SPAN = 0.02  # the least distance between the floor and the peak that is divided
+PLATEAU = 1e-3  # of relevancy: what is this close to the peak is as high
 
 
 def by_peak(
     phrase: str, relevancy: Array, surface: Surface, scale: Scale, found: float, level: LevelChoice
 ) -> QueryResult:
-    """Return the answer as published: the level with the highest smoothed peak.
+    """Return the answer as published: the level with the highest smoothed peak, cut half way to the floor.
 
-    Members are cut half way between the floor and that peak. found: relevancy from which a phrase counts as
-    found.
+    found: relevancy from which a phrase counts as found.
     """
     smoothed = np.stack([surface.smooth(values) for values in relevancy])
     scores = triple(smoothed.max(1, initial=0))
@@ -161,14 +299,11 @@ def by_peak(
     )
 
 
-PLATEAU = 1e-3  # of relevancy: what is this close to the peak is as high
-
-
 def locate(surface: Surface, smoothed: Array, threshold: float) -> tuple[Array, Array] | tuple[None, None]:
-    """Return place and box, world units, of the connected part above `threshold` that holds the peak.
+    """Return place (3,) and box (2, 3) of the connected part above `threshold` that holds the peak.
 
-    smoothed: (M,) relevancy of the surface. The place (3,) is around the middle of what is as high as the
-    peak; the box (2, 3) holds the part's Gaussians between 2 % and 98 %. None where all is 0.
+    smoothed: (M,) relevancy of the surface; None where all is 0. The place is around the middle of what is as
+    high as the peak: all of a thing may have the very same feature.
     """
     if smoothed.max(initial=0) <= 0:
         return None, None
@@ -176,7 +311,6 @@ def locate(surface: Surface, smoothed: Array, threshold: float) -> tuple[Array, 
     inside = smoothed > threshold
     inside[peak] = True
     members = surface.connected(inside, peak)
-    # All of a thing may have the very same feature: then its middle is the place, not whichever comes first.
     highest = members[smoothed[members] >= smoothed[peak] - PLATEAU]
     centre = surface.positions[highest].mean(0)
     middle = highest[((surface.positions[highest] - centre) ** 2).sum(1).argmin()]

@@ -1,6 +1,11 @@
-"""Phrases with structure: each phrase of the tree is asked for itself, and the answers are combined."""
+"""Phrases with structure: each phrase of the tree is asked for itself, and the answers are combined.
+
+The relevancy of a combined answer is zero wherever it does not hold, and the same at every level where it has
+parts of several; its peak is that of its weakest necessary part.
+"""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,7 +14,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.answers import QueryResult, even_relevancy, locate
+from langsplat_core.query.answers import SPAN, QueryResult, even_relevancy, locate
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import (
     Atom,
@@ -31,157 +36,15 @@ from langsplat_core.query.relations import WHOLE, Body, body, most, separate, st
 from langsplat_core.query.rule import RULE, combined, judge, triple
 from langsplat_core.scene import LEVELS, Camera
 from langsplat_core.scene.language import phrase_key, tidy
-from langsplat_core.scene.surface import Surface
 from langsplat_core.semantics.relevancy import FLOOR
-
-# Answers to single phrases, combined among the Gaussians into one of the same form.
-#
-# The relevancy of a combined answer is zero wherever it does not hold, and the same at every level where it
-# has parts of several; its peak is that of its weakest necessary part.
 
 SHARE = 0.6  # of the way from what is typical of a thing's least fitting surface to the part's peak on it
 LEAST = 0.05  # quantile of a part's relevancy on its thing that stands for "not this part"
-SPAN = 0.02  # of relevancy: the least distance that is divided
-SURE = 0.5  # of the way that an answer reaches: what fits an unwanted name so well is what was meant
 HALF = 0.5  # of the peak: what is less is no longer the place
-
-
-def grown(surface: Surface, members: Array) -> Array:
-    """`members` (N,) and what is next to them on the surface."""
-    inside = np.flatnonzero(members[surface.rows])
-    result = members.copy()
-    result[surface.rows[surface.links[inside].indices]] = True
-    return result
-
-
-def cut_inside(
-    engine: QueryEngine, asked: list[QueryResult], thing: QueryResult, there: Array, level: LevelChoice
-) -> QueryResult:
-    """Return the answers of a part in one, cut anew among the Gaussians of its thing.
-
-    there: (N,) bool.
-    """
-    surface, known = engine.surface, engine.field.known
-    relevancy = np.asarray(np.mean([result.relevancy for result in asked], axis=0, dtype=np.float32))
-    even = np.where(there, even_relevancy(engine.regions, engine.scale, relevancy), 0)
-    relevancy = np.where(there, relevancy, 0)
-    peaks = triple(even[:, surface.rows[there[surface.rows]]].max(1, initial=0))
-    own = int(np.argmax(peaks[:WHOLE])) if max(peaks[:WHOLE]) > 0 else WHOLE
-    chosen = own if level == "auto" else LEVELS.index(level)
-    peak, inside = peaks[chosen], there & known[chosen]
-    own_surface = thing.members & known[chosen]  # without what it touches, which may be anything
-    low = float(np.quantile(even[chosen][own_surface], LEAST)) if own_surface.any() else peak
-    members = inside & (even[chosen] > low + SHARE * max(peak - low, SPAN))
-    fits, judgements = triple(engine.scale.fit(np.array(peaks))), [thing.judgement]
-    if engine.chance is not None:
-        calibration = engine.calibration if thing.probability is not None else None
-        bars = engine.chance_among(there) if calibration is None else None
-        judgements += [judge(fits, "inside", level, bars, calibration)]
-    judgement = combined(judgements, all_needed=True)
-    return replace(
-        asked[0],
-        level=chosen,
-        scores=peaks,
-        relevancy=relevancy,
-        even=even[chosen],
-        peak=peak,
-        fits=fits,
-        judgement=judgement if members.any() else judgement.absent,
-        members=members,
-    )
-
-
-def joined(answers: Sequence[QueryResult], all_needed: bool) -> QueryResult:
-    """Return the union of answers, found if all are, or any is.
-
-    What is not found of alternatives does not count.
-    """
-    counting = answers if all_needed else [answer for answer in answers if answer.found] or answers
-    score = min if all_needed else max
-    values = np.max([np.where(a.members, a.relevancy[a.level], 0) for a in counting], axis=0)
-    peak = score(answer.peak for answer in counting)
-    return replace(
-        counting[0],
-        scores=(peak, peak, peak),
-        relevancy=np.tile(values.astype(np.float32), (len(LEVELS), 1)),
-        even=np.max([np.where(a.members, a.even, 0) for a in counting], axis=0),
-        peak=peak,
-        judgement=combined([answer.judgement for answer in counting], all_needed),
-        members=np.any([answer.members for answer in counting], axis=0),
-    )
-
-
-def without(what: QueryResult, unwanted: QueryResult) -> QueryResult:
-    """Return `what` without the members of `unwanted`, if that was found."""
-    return restricted(what, ~unwanted.members, what) if unwanted.found else what
-
-
-def surest(engine: QueryEngine, answer: QueryResult) -> QueryResult:
-    """`answer` with those members alone that fit nearly as well as the best one does.
-
-    A green mug may be in the answer to "red mug", for want of a better one; it is not what "not red mug"
-    means.
-    """
-    fits = engine.scale.fit(answer.even)
-    best = float(fits[answer.members].max(initial=-np.inf))
-    return replace(answer, members=answer.members & (fits >= RULE.least_fit(best, SURE)))
-
-
-def restricted(answer: QueryResult, keep: Array, needed: QueryResult) -> QueryResult:
-    """`answer` limited to `keep` (N,); nothing is found where `needed` is not."""
-    members = answer.members & keep
-    judgement = combined([answer.judgement, needed.judgement], all_needed=True)
-    return replace(
-        answer,
-        relevancy=np.where(members, answer.relevancy, 0),
-        even=np.where(members, answer.even, 0),
-        peak=answer.peak if members.any() else 0.0,
-        judgement=judgement if members.any() else judgement.absent,
-        members=members,
-    )
-
-
-def placed(surface: Surface, answer: QueryResult) -> QueryResult:
-    """`answer` with the place of its strongest connected members."""
-    values = np.where(answer.members, answer.relevancy[answer.level], 0).astype(np.float32)
-    smoothed = surface.smooth(values)
-    place, box = locate(surface, smoothed, HALF * float(smoothed.max(initial=0)))
-    return replace(answer, place=place, box=box)
-
-
-# Counting.
-
-
-@dataclass(frozen=True)
-class Number:
-    """How many single things an answer has, and how many it may have."""
-
-    best: int
-    least: int  # with a stricter cut
-    most: int  # with a wider one
-
-
-STRICT, WIDE = 0.25, 2.0  # of the way that an answer reaches
-
-
-def count_things(engine: QueryEngine, answer: QueryResult) -> Number:
-    """Return the number of single things in an answer, as `separate` tells them apart.
-
-    The range is that of the answers that would reach less far, or farther, below the best region.
-    """
-    fits = engine.scale.fit(answer.even)
-    best = float(fits[answer.members].max(initial=-np.inf))
-    least, most = (fits >= RULE.least_fit(best, share) for share in (STRICT, WIDE))
-    low, own, high = (
-        len(separate(engine.surface, inside[engine.surface.rows], engine.tree))
-        for inside in (least & answer.members, answer.members, most | answer.members)
-    )
-    return Number(own, min(low, own), max(high, own))
-
-
-# Answers to whole trees: each phrase is asked at its fitting level.
-
 SAME = 0.5  # of a thing's Gaussians: what shares so many with another is the same, and not related to it
+# Of the way that an answer reaches below its best region: what fits an unwanted name so well is what was
+# meant, and the answers that the range of a count is taken from.
+SURE, STRICT, WIDE = 0.5, 0.25, 2.0
 SAID_BY_VIEWER = ("left of", "right of", "behind", "in front of", "leftmost", "rightmost")
 
 
@@ -209,40 +72,36 @@ def run_phrase(
 
     It is asked whole, as `QueryEngine.run` does, where the grammar finds no structure, and where only the
     whole phrase can be asked (of a phrasebook). level: of what is asked for; the things that it is related to
-    keep their own. viewpoint: from where "left of", "right of", "behind", "in front of", "leftmost" and
-    "rightmost" are said, and "nearest" and "farthest" where they are of nothing else. Raises InputError as
-    `grammar.parse` does and where a viewpoint is needed, EncoderError as `QueryEngine.run`.
+    keep their own. viewpoint: from where left, right, behind and in front are said, and "nearest" and
+    "farthest" where they are of nothing else. Raises InputError as `grammar.parse` does and where a viewpoint
+    is needed, EncoderError as `QueryEngine.run`.
     """
     tree = parse(text, engine.taught)
-    if not isinstance(tree, Atom):
-        _check_viewpoint(tree, viewpoint)
-        asking = _Asking(engine, viewpoint, progress)
-        try:
-            found = asking.answer(tree, level)
-        except EncoderError:
-            if phrase_key(text) not in engine.field.phrasebook:
-                raise
-            tree = Atom(tidy(text))
-        else:
-            answer = replace(found, phrase=tidy(text))
-            return ComposedResult(placed(engine.surface, answer), tree)
-    return ComposedResult(engine.run(tree.text, level, progress), tree)
+    if isinstance(tree, Atom):
+        return ComposedResult(engine.run(tree.text, level, progress), tree)
+    _check_viewpoint(tree, viewpoint)
+    try:
+        found = _Asking(engine, viewpoint, progress).answer(tree, level)
+    except EncoderError:
+        if phrase_key(text) not in engine.field.phrasebook:
+            raise
+        return ComposedResult(engine.run(text, level, progress), Atom(tidy(text)))
+    # The place is that of the strongest connected members.
+    values = np.where(found.members, found.relevancy[found.level], 0).astype(np.float32)
+    smoothed = engine.surface.smooth(values)
+    place, box = locate(engine.surface, smoothed, HALF * float(smoothed.max(initial=0)))
+    return ComposedResult(replace(found, phrase=tidy(text), place=place, box=box), tree)
 
 
 def check_phrase(
     engine: QueryEngine, text: str, viewpoint: Camera | None = None, progress: Progress = silent
 ) -> None:
-    """Raise what `run_phrase` would, without searching.
-
-    That is for a phrase that names nothing, unknown words, an encoder that cannot be loaded, and a viewpoint
-    that is needed. What was encoded for it is kept.
-    """
+    """Raise what `run_phrase` would, without searching; what was encoded for it is kept."""
     tree = parse(text, engine.taught)
     if not isinstance(tree, Atom):
         _check_viewpoint(tree, viewpoint)
     try:
-        texts = [atom.text for atom in atoms(tree) if not engine.is_taught(atom.text)]
-        engine.text_vectors(texts, progress)
+        engine.text_vectors([atom.text for atom in atoms(tree) if not engine.is_taught(atom.text)], progress)
     except EncoderError:
         if phrase_key(text) not in engine.field.phrasebook:
             raise
@@ -250,13 +109,12 @@ def check_phrase(
 
 def _check_viewpoint(tree: Phrase, viewpoint: Camera | None) -> None:
     """Raise InputError for the first word in the tree that only a viewer can say, if there is none."""
-    match tree:
-        case Relation(kind) | Superlative(kind):
-            free = isinstance(tree, Superlative) and kind in ("nearest", "farthest") and tree.anchor is None
-            if viewpoint is None and (free or kind in SAID_BY_VIEWER):
-                raise InputError(
-                    f"'{kind}' depends on where one looks from; give a camera, or say it otherwise"
-                )
+    if viewpoint is None and isinstance(tree, Relation | Superlative):
+        free = isinstance(tree, Superlative) and tree.kind in ("nearest", "farthest") and tree.anchor is None
+        if free or tree.kind in SAID_BY_VIEWER:
+            raise InputError(
+                f"'{tree.kind}' depends on where one looks from; give a camera, or say it otherwise"
+            )
     for child in children(tree):
         _check_viewpoint(child, viewpoint)
 
@@ -266,7 +124,6 @@ class _Asking:
 
     def __init__(self, engine: QueryEngine, camera: Camera | None, progress: Progress) -> None:
         self.engine, self._progress = engine, progress
-        self.surface = engine.surface
         self._asked: dict[tuple[str, LevelChoice], QueryResult] = {}
         self._frame = upright(engine.scene.up())
         self._viewpoint = None if camera is None else viewpoint(camera, self._frame)
@@ -277,13 +134,15 @@ class _Asking:
             case Atom(text):
                 return self._thing(text, level)
             case Both(items) | Union(items):
-                answers = [self.answer(item, level) for item in items]
-                return joined(answers, all_needed=isinstance(tree, Both))
+                return joined([self.answer(item, level) for item in items], isinstance(tree, Both))
             case Without(what, unwanted):
-                excluded = self.answer(unwanted)
+                excluded, wanted = self.answer(unwanted), self.answer(what, level)
+                members = excluded.members
                 if isinstance(unwanted, Atom):
-                    excluded = surest(self.engine, excluded)
-                return without(self.answer(what, level), excluded)
+                    # A green mug may be in the answer to "red mug", for want of a better one; it is not what
+                    # "not red mug" means.
+                    members = members & within_reach(self.engine, excluded, SURE)
+                return restricted(wanted, ~members, wanted) if excluded.found else wanted
             case Inside(part, whole):
                 return self._inside(part, whole, level)
             case Counted(count, what):
@@ -307,29 +166,24 @@ class _Asking:
         return whole if whole.peak >= FLOOR else self._ask(text, "auto")
 
     def _inside(self, part: Phrase, whole: Phrase, level: LevelChoice) -> QueryResult:
-        thing = self.answer(whole)
-        there = grown(self.surface, thing.members)
+        thing, surface = self.answer(whole), self.engine.surface
+        there = thing.members.copy()  # and what is next to them on the surface
+        there[surface.rows[surface.links[np.flatnonzero(there[surface.rows])].indices]] = True
         if not isinstance(part, Atom) or self.engine.is_taught(part.text):
             found = self.answer(part, level)
             return restricted(found, found.members & there, thing)
         asked = [self._ask(part.text, level)]
         if isinstance(whole, Atom) and not self.engine.is_taught(whole.text):
-            asked += self._if_known(f"{whole.text} {part.text}", level)
+            with suppress(EncoderError):  # where it is unknown, the part alone is left
+                asked.append(self._ask(f"{whole.text} {part.text}", level))
         return cut_inside(self.engine, asked, thing, there, level)
-
-    def _if_known(self, text: str, level: LevelChoice) -> list[QueryResult]:
-        try:
-            return [self._ask(text, level)]
-        except EncoderError:
-            return []
 
     def _chosen(self, tree: Relation | Superlative, level: LevelChoice) -> QueryResult:
         what = self.answer(tree.what, level)
         anchor = None if tree.anchor is None else self.answer(tree.anchor)
         things, anchors = self._bodies(what), [] if anchor is None else self._bodies(anchor)
         if isinstance(tree, Superlative):
-            every = [thing for _, thing in things]
-            others = [other for _, other in anchors]
+            every, others = [thing for _, thing in things], [other for _, other in anchors]
             right = {most(tree.kind, every, others, self._viewpoint)} if every else set()
         else:
             right = {
@@ -343,11 +197,101 @@ class _Asking:
             }
         keep = np.zeros(len(what.members), bool)
         for row in right:
-            keep[self.surface.rows[things[row][0]]] = True
+            keep[self.engine.surface.rows[things[row][0]]] = True
         return restricted(what, keep, anchor or what)
 
     def _bodies(self, answer: QueryResult) -> list[tuple[Array, Body]]:
         """Every single thing of an answer, as surface numbers and as the place it takes."""
-        inside = answer.members[self.surface.rows]
-        parts = separate(self.surface, inside, self.engine.tree)
-        return [(numbers, body(self.surface.positions[numbers], self._frame)) for numbers in parts]
+        surface = self.engine.surface
+        parts = separate(surface, answer.members[surface.rows], self.engine.tree)
+        return [(numbers, body(surface.positions[numbers], self._frame)) for numbers in parts]
+
+
+def cut_inside(
+    engine: QueryEngine, asked: list[QueryResult], thing: QueryResult, there: Array, level: LevelChoice
+) -> QueryResult:
+    """Return the answers of a part in one, cut anew among the Gaussians of its thing, `there` (N,) bool."""
+    surface, known = engine.surface, engine.field.known
+    relevancy = np.asarray(np.mean([result.relevancy for result in asked], axis=0, dtype=np.float32))
+    even = np.where(there, even_relevancy(engine.regions, engine.scale, relevancy), 0)
+    peaks = triple(even[:, surface.rows[there[surface.rows]]].max(1, initial=0))
+    own = int(np.argmax(peaks[:WHOLE])) if max(peaks[:WHOLE]) > 0 else WHOLE
+    chosen = own if level == "auto" else LEVELS.index(level)
+    peak = peaks[chosen]
+    own_surface = thing.members & known[chosen]  # without what it touches, which may be anything
+    low = float(np.quantile(even[chosen][own_surface], LEAST)) if own_surface.any() else peak
+    members = there & known[chosen] & (even[chosen] > low + SHARE * max(peak - low, SPAN))
+    fits, judgements = triple(engine.scale.fit(np.array(peaks))), [thing.judgement]
+    if engine.bars is not None:
+        calibration = engine.calibration if thing.probability is not None else None
+        bars = engine.bars_among(there) if calibration is None else None
+        judgements += [judge(fits, "inside", level, bars, calibration)]
+    judgement = combined(judgements, all_needed=True)
+    return replace(
+        asked[0],
+        level=chosen,
+        scores=peaks,
+        relevancy=np.where(there, relevancy, 0),
+        even=even[chosen],
+        peak=peak,
+        fits=fits,
+        judgement=judgement if members.any() else judgement.absent,
+        members=members,
+    )
+
+
+def joined(answers: Sequence[QueryResult], all_needed: bool) -> QueryResult:
+    """Return the union of answers, found if all are, or any; alternatives that are not found do not count."""
+    counting = answers if all_needed else [answer for answer in answers if answer.found] or answers
+    score = min if all_needed else max
+    values = np.max([np.where(a.members, a.relevancy[a.level], 0) for a in counting], axis=0)
+    peak = score(answer.peak for answer in counting)
+    return replace(
+        counting[0],
+        scores=(peak, peak, peak),
+        relevancy=np.tile(values.astype(np.float32), (len(LEVELS), 1)),
+        even=np.max([np.where(a.members, a.even, 0) for a in counting], axis=0),
+        peak=peak,
+        judgement=combined([answer.judgement for answer in counting], all_needed),
+        members=np.any([answer.members for answer in counting], axis=0),
+    )
+
+
+def restricted(answer: QueryResult, keep: Array, needed: QueryResult) -> QueryResult:
+    """`answer` limited to `keep` (N,); nothing is found where `needed` is not."""
+    members = answer.members & keep
+    judgement = combined([answer.judgement, needed.judgement], all_needed=True)
+    return replace(
+        answer,
+        relevancy=np.where(members, answer.relevancy, 0),
+        even=np.where(members, answer.even, 0),
+        peak=answer.peak if members.any() else 0.0,
+        judgement=judgement if members.any() else judgement.absent,
+        members=members,
+    )
+
+
+def within_reach(engine: QueryEngine, answer: QueryResult, share: float) -> Array:
+    """Return (N,) bool: what the answer would hold if it reached `share` as far below its best region."""
+    fits = engine.scale.fit(answer.even)
+    best = float(fits[answer.members].max(initial=-np.inf))
+    return np.asarray(fits >= RULE.least_fit(best, share))
+
+
+@dataclass(frozen=True)
+class Number:
+    """How many single things an answer has, and how many it may have."""
+
+    best: int
+    least: int  # with a stricter cut
+    most: int  # with a wider one
+
+
+def count_things(engine: QueryEngine, answer: QueryResult) -> Number:
+    """Return the number of single things in an answer, as `separate` tells them apart, and its range."""
+    least, most = (within_reach(engine, answer, share) for share in (STRICT, WIDE))
+    low, own, high = (
+        len(separate(engine.surface, inside[engine.surface.rows], engine.tree))
+        for inside in (least & answer.members, answer.members, most | answer.members)
+    )
+    return Number(own, min(low, own), max(high, own))

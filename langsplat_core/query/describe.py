@@ -1,15 +1,13 @@
-"""Vocabularies as numbers: how probable each of many words is for a language feature.
+"""Reverse queries: the most probable words for Gaussians, and for the surface under a pixel.
 
     p(word | x)  =  softmax over words of  scale * (cos(x, word) - hub(word) / 2)
 
 The hub of a word is its mean cosine with the features of the scene that are nearest to it. Some words lie
-near every image and would be the answer everywhere ("hubs"); what is left of the cosine says how much
-better a word fits here than where it fits anyway. It is cross-domain similarity local scaling ("Word
-translation without parallel data", Conneau et al. 2018, equation 3): 2 cos(x, w) - hub(w) - hub(x), halved,
-and without hub(x), which all words have in common.
-
-The canonical phrases ("object", "things", "stuff", "texture") compete too: their share is the chance that no
-word of the vocabulary fits.
+near every image and would be the answer everywhere ("hubs"); what is left says how much better a word fits
+here than where it fits anyway. It is cross-domain similarity local scaling ("Word translation without
+parallel data", Conneau et al. 2018, equation 3): 2 cos(x, w) - hub(w) - hub(x), halved, and without hub(x),
+which all words have in common. The canonical phrases ("object", "things", "stuff", "texture") compete too:
+their share is the chance that no word of the vocabulary fits.
 """
 
 from collections.abc import Sequence
@@ -51,6 +49,15 @@ class Word:
     probability: float  # in [0, 1]
 
 
+def likely_name(words: Sequence[Word]) -> Word | None:
+    """Return the best word, or as many as are `LIKELY` together: "mug or cup"; None where all are not."""
+    for count in range(1, len(words) + 1):
+        probability = sum(word.probability for word in words[:count])
+        if probability >= LIKELY:
+            return Word(OR.join(word.phrase for word in words[:count]), probability)
+    return None
+
+
 @dataclass(frozen=True, eq=False)
 class WordScores:
     """A vocabulary as numbers: everything about it that does not depend on the place that is asked for."""
@@ -59,10 +66,6 @@ class WordScores:
     vectors: Array  # (V + C, D) float32 unit; the last C stand for "none of these"
     hubs: Array  # (V + C,) float32, taken half
     scale: float  # of the softmax
-
-    def vector(self, phrase: str) -> Array:
-        """Return the (D,) unit vector of one of the phrases."""
-        return self.vectors[self.phrases.index(phrase)]
 
     def take(self, chosen: Array) -> "WordScores":
         """Return the scores of the phrases for which `chosen` (V,) bool is True; the canonical ones stay."""
@@ -89,17 +92,14 @@ class WordScores:
         return total / total.sum()
 
     def best(self, codec: Codec, latents: Array, count: int) -> tuple[Array, Array]:
-        """Return the (M, count) numbers of the most probable phrases, the best first.
+        """Return (M, count) numbers of the most probable phrases of (M, d) latents, best first, and these.
 
-        Beside them their (M, count) float32 probabilities; fewer columns where the vocabulary has fewer.
-        latents: (M, d).
+        Probabilities are float32; there are fewer columns where the vocabulary has fewer phrases.
         """
         count = min(count, len(self.phrases))
-        if count == 0:
-            return np.empty((len(latents), 0), np.int32), np.empty((len(latents), 0), np.float32)
         words = np.empty((len(latents), count), np.int32)
         shares = np.empty((len(latents), count), np.float32)
-        for part in self._blocks(len(latents)):
+        for part in self._blocks(len(latents) if count else 0):
             found = self.probabilities(codec, latents[part])[:, : len(self.phrases)]
             some = np.argpartition(-found, count - 1, axis=1)[:, :count]
             order = np.argsort(-np.take_along_axis(found, some, 1), axis=1, kind="stable")
@@ -112,15 +112,6 @@ class WordScores:
         return [slice(start, start + rows) for start in range(0, count, rows)]
 
 
-def likely_name(words: Sequence[Word]) -> Word | None:
-    """Return the best word, or as many as are `LIKELY` together: "mug or cup"; None where all are not."""
-    for count in range(1, len(words) + 1):
-        probability = sum(word.probability for word in words[:count])
-        if probability >= LIKELY:
-            return Word(OR.join(word.phrase for word in words[:count]), probability)
-    return None
-
-
 def build_words(field: LanguageField, phrases: tuple[str, ...], vectors: Array) -> WordScores:
     """Return scores of names of things, from V phrases and their (V, D) unit vectors."""
     every = np.concatenate([vectors, field.canonical]).astype(np.float32)
@@ -129,10 +120,7 @@ def build_words(field: LanguageField, phrases: tuple[str, ...], vectors: Array) 
 
 
 def build_attributes(field: LanguageField, phrases: tuple[str, ...], vectors: Array) -> WordScores:
-    """Return scores of words of which a thing has one, such as colours, from V phrases and (V, D) vectors.
-
-    Few and all of one kind, they are no hubs.
-    """
+    """Return scores of words of which a thing has one, such as colours: few and alike, they are no hubs."""
     scale = ATTRIBUTE_SCALE / _spread(field, vectors, field_features(field))
     return WordScores(phrases, vectors.astype(np.float32), np.zeros(len(vectors), np.float32), scale)
 
@@ -145,11 +133,7 @@ def _spread(field: LanguageField, vectors: Array, bank: Array) -> float:
 
 
 def field_features(field: LanguageField) -> Array:
-    """Return (B, D) float32 unit vectors that the scene's Gaussians have.
-
-    Every codeword that one of them has, or the features of evenly spread Gaussians where there are no
-    codewords.
-    """
+    """Return (B, D) float32 unit vectors of the scene's Gaussians, evenly chosen where there are many."""
     latents, _ = field.codec.unique(field.latents[field.known])
     most = SAMPLES if field.codec.blends else BANK  # latents that are no numbers are all distinct features
     chosen = np.unique(np.linspace(0, len(latents) - 1, min(most, len(latents))).astype(np.int64))
@@ -164,6 +148,8 @@ def hubs(vectors: Array, bank: Array) -> Array:
     near = np.partition(vectors @ bank.T, len(bank) - count, axis=1)[:, -count:]
     return near.mean(1, dtype=np.float64).astype(np.float32)
 
+
+# Places in words.
 
 CERTAIN = 0.5  # probability from which a colour or material is said
 ATTRIBUTES: tuple[Bundled, ...] = ("colours", "materials")
@@ -185,10 +171,7 @@ Levels = tuple[LevelWords, ...]  # of subpart, part and whole
 
 
 class Describer:
-    """Reverse queries against one scene, for one thread at a time.
-
-    The vocabulary is encoded once, here; a question costs milliseconds.
-    """
+    """Reverse queries against one scene, for one thread at a time; the vocabulary is encoded once, here."""
 
     def __init__(
         self, engine: QueryEngine, vocabulary: Sequence[str] | None = None, progress: Progress = silent
@@ -202,9 +185,8 @@ class Describer:
         """
         things = tuple(vocabulary) if vocabulary is not None else bundled_vocabulary("things")
         parts = () if vocabulary is not None else bundled_vocabulary("parts")
-        phrases = (*things, *parts)
-        field = engine.field
-        self.engine, self.known = engine, engine.field.known
+        phrases, field = (*things, *parts), engine.field
+        self.engine, self.known = engine, field.known
         known, vectors = engine.known_vectors(phrases, progress)
         self.left_out: tuple[str, ...] = tuple(sorted(set(phrases) - set(known)))
         if not known:
@@ -212,9 +194,9 @@ class Describer:
                 f"the encoder knows none of the vocabulary's {len(phrases)} phrases; name others, or use "
                 "a scene made with OpenCLIP weights"
             )
-        whole = np.isin(known, things)
         every = build_words(field, known, vectors)
-        self.words: tuple[WordScores, WordScores, WordScores] = (every, every, every.take(whole))
+        self.words: tuple[WordScores, WordScores, WordScores]
+        self.words = every, every, every.take(np.isin(known, things))
         taught = [engine.known_vectors(bundled_vocabulary(name), progress) for name in ATTRIBUTES]
         self._attributes = [build_attributes(field, *pair) if pair[0] else None for pair in taught]
 
@@ -234,18 +216,6 @@ class Describer:
             counted = np.ones(len(rows))
         return tuple(self.at_level(level, rows, counted, top) for level in range(len(LEVELS)))
 
-    def appearance(self, latents: Array, weights: Array) -> tuple[Word | None, Word | None]:
-        """Return colour and material of (M, d) latents, weighted by (M,), where one is certain."""
-        colour, material = (self._certain(words, latents, weights) for words in self._attributes)
-        return colour, material
-
-    def _certain(self, words: WordScores | None, latents: Array, weights: Array) -> Word | None:
-        if words is None:
-            return None
-        shares = words.mixture(self.engine.field.codec, latents, weights)
-        best = int(shares.argmax())
-        return Word(words.phrases[best], float(shares[best])) if shares[best] >= CERTAIN else None
-
     def at_level(self, level: int, rows: Array, weights: Array, top: int) -> LevelWords:
         """Return words for the Gaussians at `rows` (M,) at one level, weighted by (M,)."""
         field = self.engine.field
@@ -261,8 +231,17 @@ class Describer:
         other = float(shares[len(names.phrases) :].sum())
         return LevelWords(level, words, other, seen / total, *self.appearance(latents, weights))
 
+    def appearance(self, latents: Array, weights: Array) -> tuple[Word | None, Word | None]:
+        """Return colour and material of (M, d) latents, weighted by (M,), where one is certain."""
+        colour, material = (self._certain(words, latents, weights) for words in self._attributes)
+        return colour, material
 
-# The surface under one pixel: where it is, what it is called, and how relevant it is to what was asked.
+    def _certain(self, words: WordScores | None, latents: Array, weights: Array) -> Word | None:
+        if words is None:
+            return None
+        shares = words.mixture(self.engine.field.codec, latents, weights)
+        best = int(shares.argmax())
+        return Word(words.phrases[best], float(shares[best])) if shares[best] >= CERTAIN else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,16 +273,10 @@ def look_at_pixel(
     total = float(weights.sum())
     if total <= PictureConfig().alpha_gate:
         return None
-    means = scene.gaussians.means[rows].astype(np.float64)
-    depths = means @ camera.rotation[2] + camera.world_to_camera[2, 3]
+    depths = camera.project(scene.gaussians.means[rows].astype(np.float64))[1]
     order = np.argsort(depths, kind="stable")
     median = order[np.searchsorted(np.cumsum(weights[order], dtype=np.float64), 0.5 * total)]
     depth = float(depths[median])
-    centre = (pixel[0] + 0.5, pixel[1] + 0.5)
     relevancy = (float(weights @ result.relevancy[result.level][rows]) / total for result in results)
-    return Pointed(
-        position=camera.unproject(centre, depth),
-        depth=depth,
-        words=describer.at_gaussians(rows, weights, top),
-        relevancy=tuple(relevancy),
-    )
+    place = camera.unproject((pixel[0] + 0.5, pixel[1] + 0.5), depth)
+    return Pointed(place, depth, describer.at_gaussians(rows, weights, top), tuple(relevancy))

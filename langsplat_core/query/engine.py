@@ -1,4 +1,8 @@
-"""Phrases asked of a scene: encoded, looked up at every Gaussian, and read (`answers`)."""
+"""Phrases asked of a scene, from the text to the answer.
+
+A phrase becomes a text vector (`text_vectors`), the vector a relevancy of every Gaussian (`lookup`), these
+become fits of the regions of the scene's tree (`answers`), and the fits an answer (`rule`).
+"""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -14,23 +18,40 @@ from langsplat_core.errors import EncoderError, InputError, UnknownWordError
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.io.sidecar import SUFFIX, Words
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.answers import AnswerRule, QueryResult, by_peak, by_regions
+from langsplat_core.query.answers import (
+    AnswerRule,
+    QueryResult,
+    Regions,
+    build_regions,
+    by_peak,
+    by_regions,
+    chance_in,
+)
 from langsplat_core.query.grammar import STOP_WORDS, check_names, only
 from langsplat_core.query.instances import Instance, find_instances
 from langsplat_core.query.lookup import Lookup, through_cells
-from langsplat_core.query.regions import Regions, build_regions, chance_in
-from langsplat_core.query.rule import Bars, Chance, bars_of
+from langsplat_core.query.rule import Bars, bars_of
 from langsplat_core.query.taught import WordSpace, build_word_space, by_showing, compared, shown
-from langsplat_core.scene import CANONICAL_PHRASES, LEVELS, Calibration, LanguageField, Scene, TaughtWord
-from langsplat_core.scene.language import LONGEST_NAME, MOST_SHOWN, Tree, phrase_key, split_phrases, tidy
+from langsplat_core.scene import (
+    CANONICAL_PHRASES,
+    LEVELS,
+    Calibration,
+    LanguageField,
+    Scene,
+    TaughtWord,
+    Tree,
+)
+from langsplat_core.scene.language import LONGEST_NAME, MOST_SHOWN, phrase_key, split_phrases, tidy
 from langsplat_core.scene.surface import Surface, build_surface, build_tree, surface_weights
 from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE
 from langsplat_core.semantics.relevancy import Scale, relevancy_of
 from langsplat_core.semantics.vocabulary import FEWEST, TextEncoder, everyday_vectors
 
-BATCH = 256  # phrases that are encoded, and compared with codewords, at a time
+BATCH = 256  # phrases that are encoded at a time
 SAME_ENCODER = 0.99  # least cosine of canonical vectors of one encoder, whatever rounds them
 NO_FIELD = "this scene has no language field: it can be looked at, not searched; `langsplat train` makes one"
+
+LoadEncoder = Callable[[str], TextEncoder]  # from a hub id, a folder or "demo"; may raise EncoderError
 
 
 def no_field(scene: Scene) -> str:
@@ -58,9 +79,6 @@ class Basis:
     guesses: bool  # of the demo encoder, outside the rooms that it was made for
 
 
-LoadEncoder = Callable[[str], TextEncoder]  # from a hub id, a folder or "demo"; may raise EncoderError
-
-
 class QueryEngine:
     """Queries against one scene.
 
@@ -83,9 +101,9 @@ class QueryEngine:
 
         load_encoder: usually `semantics.encoders.load_text_encoder`; without one only the scene's own
         phrasebook can be asked. encoder_id: in place of the encoder that the scene names. exact: compare
-        every latent itself instead of its cell, to measure the cells by. rule: see `answers`; "regions"
-        becomes "peak" where neither scene nor encoder has everyday phrases to compare with. words: taught
-        ones of the user, before those of the scene; EncoderError where they are of another encoder.
+        every latent itself instead of its cell, to measure the cells by. rule: "regions" becomes "peak" where
+        neither scene nor encoder has everyday phrases to compare with. words: taught ones of the user, before
+        those of the scene; EncoderError where they are of another encoder.
         """
         self.scene = scene
         self.exact = exact
@@ -93,9 +111,10 @@ class QueryEngine:
         self._load_encoder = load_encoder
         self._encoder_id = encoder_id
         self._encoder: TextEncoder | None = None
-        self._turn = RLock()  # at the encoder, whose tokenizer is not made for two at once
-        self._encoded: dict[str, Array] = {}  # phrases asked so far, 2 KB each at D = 512
         self._encoder_checked = False
+        self._turn = RLock()  # at the encoder, whose tokenizer is not made for two at once
+        # Of phrases that can be asked without encoding, 2 KB each at D = 512.
+        self._vectors: dict[str, Array] = {} if scene.language is None else dict(scene.language.phrasebook)
         self._canonical: Array | None = None  # (C, D) in place of the scene's own
         self.canonical_phrases: tuple[str, ...] = CANONICAL_PHRASES
         taught = () if scene.language is None else scene.language.taught
@@ -103,6 +122,56 @@ class QueryEngine:
             check_words(self.field, words)
             taught += words.words
         self.taught: dict[str, TaughtWord] = {word.key: word for word in taught}
+
+    # Answers.
+
+    def run(self, phrase: str, level: LevelChoice = "auto", progress: Progress = silent) -> QueryResult:
+        """Answer `phrase`; a taught word by what was shown.
+
+        The level is chosen once for the scene, on raw relevancy, so that the image does not flicker between
+        levels as the camera moves. Raises as `text_vectors` does.
+        """
+        return self.run_many([phrase], level, progress)[0]
+
+    def run_many(
+        self, phrases: Sequence[str], level: LevelChoice = "auto", progress: Progress = silent
+    ) -> list[QueryResult]:
+        """Return the answers to phrases, which are encoded and compared together; 17 bytes per Gaussian each.
+
+        Raises as `text_vectors` does, before any is asked.
+        """
+        texts = [phrase for phrase in phrases if not self.is_taught(phrase)]
+        relevancies = self._relevancies(self.text_vectors(texts, progress))
+        answers = []
+        for phrase in phrases:
+            progress(f"searching '{tidy(phrase)}'", 0.5)
+            if self.is_taught(phrase):
+                answers.append(self._by_showing(self.taught[phrase_key(phrase)], level))
+            else:
+                answers.append(self._answer(tidy(phrase), next(relevancies), level))
+        return answers
+
+    def relevancy(self, vector: Array) -> Array:
+        """(D,) unit text vector -> (3, N) float32 relevancy per level and Gaussian."""
+        return next(self._relevancies(vector[None]))
+
+    def _relevancies(self, vectors: Array) -> Iterator[Array]:
+        for values in self._lookup.relevancies(vectors):
+            yield values.reshape(self.field.confidence.shape)
+
+    def _answer(self, phrase: str, relevancy: Array, level: LevelChoice) -> QueryResult:
+        if self.bars is None:
+            return by_peak(phrase, relevancy, self.surface, self.scale, self.field.found, level)
+        means, judged = self.scene.gaussians.means, (self.scale, self.bars, self.calibration)
+        return by_regions(phrase, relevancy, means, self.regions, *judged, level)
+
+    def instances(self, result: QueryResult, at_most: int | None = None) -> tuple[Instance, ...]:
+        """Return the things among the members of an answer, best first, or only so many of them."""
+        relevancy, whole = result.relevancy[result.level], len(LEVELS) - 1
+        told = self.tree.voted(whole), result.level == whole
+        return find_instances(self.surface, self.scene.gaussians, result.members, relevancy, at_most, *told)
+
+    # What answers stand on: each is computed when first needed.
 
     @property
     def field(self) -> LanguageField:
@@ -125,22 +194,78 @@ class QueryEngine:
 
     @property
     def calibration(self) -> Calibration | None:
-        """The calibration of probabilities; None where the encoder has none.
-
-        Nor has it one with other canonical phrases than those that it was fitted with.
-        """
+        """The calibration of probabilities; None with other canonical phrases than it was fitted with."""
         usual = self._canonical is None and self.rule == "regions"
         return self.field.calibration if usual else None
+
+    @cached_property
+    def compared(self) -> LanguageField:
+        """The field as phrases are compared with it, see `through_cells`."""
+        return self.field if self.exact else through_cells(self.field)
+
+    @cached_property
+    def _lookup(self) -> Lookup:
+        return Lookup(self.compared, self.scale)
+
+    @cached_property
+    def surface(self) -> Surface:
+        """The surface of the scene's Gaussians: a tenth of a second at 80k."""
+        return build_surface(self.scene.gaussians)
+
+    @cached_property
+    def tree(self) -> Tree:
+        """The scene's own tree; where it has none, or wholes alone, one that is built."""
+        field = self.field
+        if field.tree is not None and field.tree.complete:
+            return field.tree
+        things = None if field.tree is None else field.tree.things()
+        tree = build_tree(self.surface, field.codec, field.latents, field.known, things)
+        return tree if things is None else tree.voted_by(things)
+
+    @cached_property
+    def regions(self) -> Regions:
+        """The tree's nodes at each level."""
+        return build_regions(self.tree, surface_weights(self.scene.gaussians))
+
+    @cached_property
+    def chance(self) -> Array | None:
+        """(R, V) fits of everyday phrases in the regions of all levels; None where there are none."""
+        return None if self.rule == "peak" else chance_in(self.compared, self.regions, self.scale)
+
+    @cached_property
+    def bars(self) -> Bars | None:
+        """The best fits of everyday phrases in the scene; None where there are none."""
+        return None if self.chance is None else bars_of(self.regions.table, self.chance)
+
+    def bars_among(self, members: Array) -> Bars:
+        """Return the best fits of everyday phrases at the regions of some Gaussians, (N,) bool."""
+        assert self.chance is not None
+        chosen = [
+            np.isin(np.arange(len(sizes)), row[members])
+            for row, sizes in zip(self.regions.everywhere, self.regions.sizes, strict=True)
+        ]
+        return bars_of(self.regions.table, self.chance, np.concatenate(chosen))
+
+    def compare_with(self, phrases: Sequence[str] = (), progress: Progress = silent) -> None:
+        """Take other canonical phrases from now on; without any, the scene's own again.
+
+        They are what everything is compared with (LERF, section 3.3). With others no probability is said,
+        since it was calibrated on those. Raises as `text_vectors` does, and leaves everything as it was then.
+        """
+        canonical = self.text_vectors(phrases, progress) if phrases else None
+        self._canonical = canonical
+        self.canonical_phrases = tuple(map(phrase_key, phrases)) or CANONICAL_PHRASES
+        for made in ("compared", "_lookup", "chance", "bars"):
+            self.__dict__.pop(made, None)
 
     @property
     def basis(self) -> Basis:
         """The basis of answers, by what is known so far: nothing is loaded for it."""
         field = self.field
         everyday = None if self._rule == "peak" else self.__dict__.get("_everyday", _enough(field.everyday))
-        name, calibration = field.encoder_id, None
-        if name == DEMO:
-            name = "demo encoder"
+        name = "demo encoder" if field.encoder_id == DEMO else field.encoder_id
         guesses = field.encoder_id == DEMO and field.calibration is None
+        calibration = None
         if guesses:
             short, long = f"{name}, made for drawn rooms: guesses here", DEMO_ELSEWHERE
         elif everyday is None:
@@ -157,32 +282,7 @@ class QueryEngine:
             long = f"{short}. Percentages hold in such rooms, and this scene is one"
         return Basis(field.encoder_id, calibration, short, long, guesses)
 
-    @cached_property
-    def _everyday(self) -> Array | None:
-        """The scene's own everyday phrases, else the encoder's; None where the rule needs none."""
-        if self._rule == "peak":
-            return None
-        if self.field.everyday is not None:
-            return _enough(self.field.everyday)
-        try:
-            encoder = self.load_encoder()
-            self._check_encoder(encoder)
-            with self._turn:
-                return everyday_vectors(encoder)
-        except EncoderError:
-            return None
-
-    def compare_with(self, phrases: Sequence[str] = (), progress: Progress = silent) -> None:
-        """Take other canonical phrases from now on; without any, the scene's own again.
-
-        They are what everything is compared with (LERF, section 3.3). With others no probability is said,
-        since it was calibrated on those. Raises as `text_vectors` does, and leaves everything as it was then.
-        """
-        canonical = self.text_vectors(phrases, progress) if phrases else None
-        self._canonical = canonical
-        self.canonical_phrases = tuple(map(phrase_key, phrases)) or CANONICAL_PHRASES
-        for made in ("compared", "_lookup", "chance", "_bars"):
-            self.__dict__.pop(made, None)
+    # Text vectors.
 
     def load_encoder(self, progress: Progress = silent) -> TextEncoder:
         """Return the text encoder, loaded at the first call, which imports torch: seconds.
@@ -200,73 +300,19 @@ class QueryEngine:
                 self._encoder = self._load_encoder(self._encoder_id or self.field.encoder_id)
             return self._encoder
 
-    @cached_property
-    def surface(self) -> Surface:
-        """The surface of the scene's Gaussians; built when first needed, a tenth of a second at 80k."""
-        return build_surface(self.scene.gaussians)
-
-    @cached_property
-    def tree(self) -> Tree:
-        """The scene's own tree; where it has none, or wholes alone, one that is built when first needed."""
-        field = self.field
-        if field.tree is not None and field.tree.complete:
-            return field.tree
-        things = None if field.tree is None else field.tree.things()
-        tree = build_tree(self.surface, field.codec, field.latents, field.known, things)
-        return tree if things is None else tree.voted_by(things)
-
-    @cached_property
-    def regions(self) -> Regions:
-        """The tree's nodes at each level."""
-        return build_regions(self.tree, surface_weights(self.scene.gaussians))
-
-    @cached_property
-    def compared(self) -> LanguageField:
-        """The field as phrases are compared with it, see `through_cells`."""
-        return self.field if self.exact else through_cells(self.field)
-
-    @cached_property
-    def _lookup(self) -> Lookup:
-        return Lookup(self.compared, self.scale)
-
-    @cached_property
-    def chance(self) -> Chance | None:
-        """The fits of everyday phrases in the scene; None where there are none."""
-        if self.scale.everyday is None:
-            return None
-        return chance_in(self.compared, self.regions, self.scale)
-
-    @cached_property
-    def _bars(self) -> Bars | None:
-        return None if self.chance is None else bars_of(self.chance)
-
-    def chance_among(self, members: Array) -> Bars:
-        """Return the best fits of everyday phrases at the regions of some Gaussians, (N,) bool."""
-        assert self.chance is not None
-        everywhere = self.regions.everywhere[:, members]
-        return bars_of(self.chance, [np.unique(row[row >= 0]) for row in everywhere])
-
     def unknown_words(self, phrase: str) -> tuple[str, ...]:
-        """Words for which `phrase` cannot be asked; none where it was taught or the phrasebook has it.
+        """Words for which `phrase` cannot be asked; EncoderError as `load_encoder` raises it."""
+        key = phrase_key(phrase)
+        return () if key in self.taught or key in self._vectors else self.load_encoder().unknown_words(key)
 
-        EncoderError as `load_encoder` raises it.
-        """
-        if self.is_taught(phrase) or phrase_key(phrase) in self.field.phrasebook:
-            return ()
-        return self.load_encoder().unknown_words(phrase_key(phrase))
-
-    def text_vector(self, phrase: str, progress: Progress = silent) -> Array:
-        """(D,) unit vector of a phrase: from the scene's phrasebook, else from the encoder.
+    def text_vectors(self, phrases: Sequence[str], progress: Progress = silent) -> Array:
+        """(Q, D) unit vectors of phrases, from the scene's phrasebook, else encoded together.
 
         Raises InputError for an empty phrase and one of stop words alone, UnknownWordError for words that the
         encoder was never taught, and EncoderError for one that is not the scene's or cannot be loaded.
         """
-        return self.text_vectors([phrase], progress)[0]
-
-    def text_vectors(self, phrases: Sequence[str], progress: Progress = silent) -> Array:
-        """(Q, D) unit vectors of phrases, encoded together. Raises as `text_vector`."""
         keys = list(map(phrase_key, phrases))
-        fresh = self._fresh(keys)
+        fresh = [key for key in dict.fromkeys(keys) if key not in self._vectors]
         for key in fresh:
             check_names(key.split())
         if fresh:
@@ -277,35 +323,27 @@ class QueryEngine:
                     near = {word: encoder.near_words(word) for word in unknown}
                     raise UnknownWordError(near, "use other words, or a scene made with OpenCLIP weights")
                 self._encode(encoder, fresh)
-        return self._vectors(keys)
+        return self._stacked(keys)
 
     def known_vectors(
         self, phrases: Iterable[str], progress: Progress = silent
     ) -> tuple[tuple[str, ...], Array]:
-        """Return the `phrases` whose words the encoder was taught, each once, and their (V, D) vectors.
+        """Return the keys of `phrases` whose words the encoder was taught, each once, and (V, D) vectors.
 
-        Phrases are as of `phrase_key`, vectors from the phrasebook, else encoded together. Raises
-        EncoderError for an encoder that is not the scene's, or one that cannot be loaded.
+        Raises EncoderError for an encoder that is not the scene's, or one that cannot be loaded.
         """
         keys = tuple(dict.fromkeys(map(phrase_key, phrases)))
-        fresh = [key for key in self._fresh(keys) if not only(STOP_WORDS, key.split())]
+        fresh = [key for key in keys if key not in self._vectors and not only(STOP_WORDS, key.split())]
         if fresh:
             encoder = self.load_encoder(progress)
             progress("loading the text encoder", 1.0)
             self._encode(encoder, [key for key in fresh if not encoder.unknown_words(key)], progress)
-        unknown = set(self._fresh(keys))
-        known = tuple(key for key in keys if key not in unknown)
-        return known, self._vectors(known)
+        known = tuple(key for key in keys if key in self._vectors)
+        return known, self._stacked(known)
 
-    def _fresh(self, keys: Iterable[str]) -> list[str]:
-        """Return the phrases that are neither in the phrasebook nor encoded yet, each once."""
-        book = self.field.phrasebook
-        return [key for key in dict.fromkeys(keys) if key not in book and key not in self._encoded]
-
-    def _vectors(self, keys: Sequence[str]) -> Array:
+    def _stacked(self, keys: Sequence[str]) -> Array:
         """(Q, D) vectors of phrases that are all known already."""
-        book = self.field.phrasebook
-        vectors = [book[key] if key in book else self._encoded[key] for key in keys]
+        vectors = [self._vectors[key] for key in keys]
         return np.stack(vectors) if vectors else np.zeros((0, self.field.codec.vector_dim), np.float32)
 
     def _encode(self, encoder: TextEncoder, keys: Sequence[str], progress: Progress = silent) -> None:
@@ -313,84 +351,46 @@ class QueryEngine:
         for start in range(0, len(keys), BATCH):
             batch = list(keys[start : start + BATCH])
             with self._turn:
-                vectors = np.asarray(encoder.encode_texts(batch), np.float32)
-                if vectors.shape[1:] != (self.field.codec.vector_dim,):
-                    raise EncoderError(
-                        f"the encoder gives {vectors.shape[1]} numbers, the scene was made with "
-                        f"{self.field.codec.vector_dim} by {self.field.encoder_id}; give that one with "
-                        "--encoder"
-                    )
                 self._check_encoder(encoder)
-            self._encoded.update(zip(batch, vectors, strict=True))
+                vectors = np.asarray(encoder.encode_texts(batch), np.float32)
+            self._vectors.update(zip(batch, vectors, strict=True))
             progress("reading the vocabulary", (start + len(batch)) / len(keys))
 
     def _check_encoder(self, encoder: TextEncoder) -> None:
-        """Raise EncoderError unless `encoder` is the scene's.
-
-        It must turn the canonical phrases into the vectors that the scene has for them. Other weights would
-        answer with noise, whatever their name.
-        """
+        """EncoderError unless `encoder` makes the scene's canonical vectors: others answer with noise."""
         if self._encoder_checked:
             return
-        canonical = np.asarray(encoder.encode_texts(list(CANONICAL_PHRASES)), np.float64)
         assert self.scene.language is not None
-        own = self.scene.language.canonical
+        own, made_with = self.scene.language.canonical, self.field.encoder_id
+        canonical = np.asarray(encoder.encode_texts(list(CANONICAL_PHRASES)), np.float64)
+        if canonical.shape[1:] != own.shape[1:]:
+            raise EncoderError(
+                f"the encoder gives {canonical.shape[1]} numbers, the scene was made with {own.shape[1]} by "
+                f"{made_with}; give that one with --encoder"
+            )
         if not same_vectors(canonical, own):
             raise EncoderError(
-                f"the scene was made with other weights of {self.field.encoder_id}; give those with "
-                "--encoder, or make the scene again"
+                f"the scene was made with other weights of {made_with}; give those with --encoder, or make "
+                "the scene again"
             )
         self._encoder_checked = True
 
-    def relevancy(self, vector: Array) -> Array:
-        """(D,) unit text vector -> (3, N) float32 relevancy per level and Gaussian."""
-        return next(self._relevancies(vector[None]))
+    @cached_property
+    def _everyday(self) -> Array | None:
+        """The scene's own everyday phrases, else the encoder's; None where the rule needs none."""
+        if self._rule == "peak":
+            return None
+        if self.field.everyday is not None:
+            return _enough(self.field.everyday)
+        try:
+            encoder = self.load_encoder()
+            with self._turn:
+                self._check_encoder(encoder)
+                return everyday_vectors(encoder)
+        except EncoderError:
+            return None
 
-    def _relevancies(self, vectors: Array) -> Iterator[Array]:
-        for start in range(0, len(vectors), BATCH):
-            for values in self._lookup.relevancies(vectors[start : start + BATCH]):
-                yield values.reshape(self.field.confidence.shape)
-
-    def run(
-        self,
-        phrase: str,
-        level: LevelChoice = "auto",
-        progress: Progress = silent,
-        vector: Array | None = None,
-    ) -> QueryResult:
-        """Answer `phrase`; a taught word by what was shown.
-
-        The level is chosen once for the scene, on raw relevancy, so that the image does not flicker between
-        levels as the camera moves. vector: (D,) unit, the phrase's own, where it is at hand. Raises as
-        `text_vector` does.
-        """
-        if vector is None and self.is_taught(phrase):
-            return self._by_showing(self.taught[phrase_key(phrase)], level)
-        if vector is None:
-            vector = self.text_vector(phrase, progress)
-        progress(f"searching '{tidy(phrase)}'", 0.5)
-        return self._answer(tidy(phrase), self.relevancy(vector), level)
-
-    def run_many(self, phrases: Sequence[str], level: LevelChoice = "auto") -> list[QueryResult]:
-        """Return the answers of `run` to each of `phrases`, which are encoded and compared together.
-
-        An answer keeps 17 bytes per Gaussian. Raises as `text_vector` does, before any is asked.
-        """
-        plain = [phrase for phrase in phrases if not self.is_taught(phrase)]
-        relevancies = self._relevancies(self.text_vectors(plain))
-        return [
-            self._by_showing(self.taught[phrase_key(phrase)], level)
-            if self.is_taught(phrase)
-            else self._answer(tidy(phrase), next(relevancies), level)
-            for phrase in phrases
-        ]
-
-    def _answer(self, phrase: str, relevancy: Array, level: LevelChoice) -> QueryResult:
-        if self._bars is None:
-            found = self.field.found
-            return by_peak(phrase, relevancy, self.surface, self.scale, found, level)
-        means, judged = self.scene.gaussians.means, (self.scale, self._bars, self.calibration)
-        return by_regions(phrase, relevancy, means, self.regions, *judged, level)
+    # Words that are taught by showing.
 
     @cached_property
     def word_space(self) -> WordSpace:
@@ -398,16 +398,15 @@ class QueryEngine:
         return build_word_space(self.field, self.regions, self.tree.votes[:, 0])
 
     def is_taught(self, phrase: str) -> bool:
-        """Whether a phrase is a taught word, and is answered by what was shown."""
+        """Return whether a phrase is a taught word, and is answered by what was shown."""
         return phrase_key(phrase) in self.taught
 
     def teach(self, name: str, members: Array, level: LevelChoice = "auto") -> TaughtWord:
-        """Learn `name` for the features of `members` (N,) bool at a level.
+        """Learn `name` for the features of `members` (N,) bool, by default at the level most like them.
 
-        By default that is the level with a region most like them. The name answers from now on, in place of
-        any text; a word that is taught again, at its own level, has one example more. Nothing is written.
-        Raises InputError for what is no name, members without a feature, and a word that is known at another
-        level or by enough examples.
+        The name answers from now on, in place of any text; taught again, at its own level, it has one example
+        more. Nothing is written. Raises InputError for what is no name, members without a feature, and a word
+        that is known at another level or by enough examples.
         """
         tidied = tidy(name)
         unsayable = only(STOP_WORDS, phrase_key(name).split()) or split_phrases(name) != [tidied]
@@ -421,8 +420,7 @@ class QueryEngine:
             raise InputError(f"'{tidied}' was shown {MOST_SHOWN} times, which is the most; remove it first")
         if known is not None and level not in ("auto", LEVELS[known.level]):
             raise InputError(f"'{tidied}' was taught at level {LEVELS[known.level]}; teach it there again")
-        at = self._level(members, level) if known is None else known.level
-        word = shown(self.word_space, self.field, self.regions, tidied, members, at)
+        word = self._shown(tidied, members, level if known is None else LEVELS[known.level])
         if known is not None:
             vectors = np.concatenate([known.vectors, word.vectors])
             word = replace(known, vectors=vectors, rivals=np.append(known.rivals, word.rivals))
@@ -431,12 +429,11 @@ class QueryEngine:
 
     def like(self, members: Array, level: LevelChoice = "auto") -> QueryResult:
         """Everything that is like `members` (N,) bool, they too: `teach` and `run`, but nothing is kept."""
-        at = self._level(members, level)
-        word = shown(self.word_space, self.field, self.regions, "more like this", members, at)
-        return self._by_showing(word, "auto")
+        return self._by_showing(self._shown("more like this", members, level), "auto")
 
-    def _level(self, members: Array, level: LevelChoice) -> int:
-        return self.regions.level_of(members) if level == "auto" else LEVELS.index(level)
+    def _shown(self, name: str, members: Array, level: str) -> TaughtWord:
+        at = self.regions.level_of(members) if level == "auto" else LEVELS.index(level)
+        return shown(self.word_space, self.field, self.regions, name, members, at)
 
     def _by_showing(self, word: TaughtWord, level: LevelChoice) -> QueryResult:
         return by_showing(word, self.word_space, self.regions, self.scene.gaussians.means, level)
@@ -444,21 +441,13 @@ class QueryEngine:
     def compare(self, phrase: str, vectors: Array, level: int) -> tuple[Array, Array]:
         """Return (M,) cosines of a phrase with (M, D) unit vectors of images, and their fits, in spreads.
 
-        Those of a taught word are at a level (index into LEVELS), see `taught.compared`. Raises as
-        `text_vector` does.
+        Those of a taught word are at a level (index into LEVELS), see `taught.compared`.
         """
         if self.is_taught(phrase):
             return compared(self.taught[phrase_key(phrase)], self.word_space, vectors, level)
-        cosines = vectors @ self.text_vector(phrase)
+        cosines = vectors @ self.text_vectors([phrase])[0]
         zero, rate = self.scale.of(vectors @ self.scale.texts.T)
         return cosines, self.scale.fit(relevancy_of(cosines, zero, rate))
-
-    def instances(self, result: QueryResult, at_most: int | None = None) -> tuple[Instance, ...]:
-        """Return the things among the members of an answer, best first, or only so many of them."""
-        relevancy = result.relevancy[result.level]
-        whole = len(LEVELS) - 1
-        told = self.tree.voted(whole), result.level == whole
-        return find_instances(self.surface, self.scene.gaussians, result.members, relevancy, at_most, *told)
 
 
 def check_words(field: LanguageField, words: Words) -> None:
@@ -472,9 +461,9 @@ def check_words(field: LanguageField, words: Words) -> None:
 
 def same_vectors(canonical: Array, own: Array) -> bool:
     """Return whether two sets of canonical vectors are of the same encoder."""
-    return canonical.shape == own.shape and bool(
-        ((canonical.astype(np.float64) * own).sum(1) >= SAME_ENCODER).all()
-    )
+    if canonical.shape != own.shape:
+        return False
+    return bool(((canonical.astype(np.float64) * own).sum(1) >= SAME_ENCODER).all())
 
 
 def _enough(everyday: Array | None) -> Array | None:

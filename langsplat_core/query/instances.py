@@ -1,14 +1,12 @@
-"""Instances of an answer: its Gaussians, taken apart where the surface is, with boxes, scores and hulls."""
+"""Instances of an answer: its Gaussians, taken apart where the surface is, with boxes and scores."""
 
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
 from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.compiled import plain
-from langsplat_core.errors import InputError
 from langsplat_core.scene import Gaussians
 from langsplat_core.scene.language import NO_NODE
 from langsplat_core.scene.surface import Surface
@@ -41,16 +39,14 @@ class OrientedBox:
 
 def axis_aligned_box(points: Array) -> Array:
     """(M, 3), M >= 1 -> (2, 3) float64 lower and upper corner between the `INNER` quantiles."""
-    return _inner(np.ascontiguousarray(points.T, np.float64))
+    return np.quantile(np.ascontiguousarray(points.T, np.float64), INNER, axis=1)
 
 
 def oriented_box(points: Array) -> OrientedBox:
     """Box around (M, 3) points, M >= 1, between the `INNER` quantiles along each of its axes.
 
-    The axes begin as the principal ones of the points that are no strays, and are then turned about one
-    another to the least area of the box's faces: principal axes alone say nothing about how a square, a cube
-    or a round table top with something on it lies. Where the points leave axes open (a single point, a line)
-    they are some that fit.
+    The axes are the principal ones of the points that are no strays, turned about one another to the least
+    area of the box's faces: principal axes alone say nothing about how a square or a cube lies.
     """
     columns = np.ascontiguousarray(points.T, np.float64)
     low, high = axis_aligned_box(points)[..., None]
@@ -61,15 +57,14 @@ def oriented_box(points: Array) -> OrientedBox:
     spread = core - middle
     axes = np.linalg.eigh(spread @ spread.T)[1]
     axes = _turned(spread[:, :: -(-spread.shape[1] // TURNED)], axes)
-    low, high = _inner(axes.T @ (columns - middle))
+    low, high = np.quantile(axes.T @ (columns - middle), INNER, axis=1)
     order = np.argsort(low - high, kind="stable")
     axes, low, high = axes[:, order], low[order], high[order]
-    return OrientedBox(middle[:, 0] + axes @ ((low + high) / 2), _right_handed(axes), (high - low) / 2)
-
-
-def _inner(columns: Array) -> Array:
-    """(3, M) -> (2, 3) the `INNER` quantiles of each row."""
-    return np.quantile(columns, INNER, axis=1)
+    centre = middle[:, 0] + axes @ ((low + high) / 2)
+    # Settled signs: the largest entry of the first two axes is positive, and the axes are right-handed.
+    signs = np.sign(axes[np.abs(axes).argmax(0), range(3)])
+    signs[2] = signs[0] * signs[1] * np.sign(np.linalg.det(axes))
+    return OrientedBox(centre, axes * signs, (high - low) / 2)
 
 
 def _turned(columns: Array, axes: Array) -> Array:
@@ -95,19 +90,12 @@ def _widths(rows: Array) -> Array:
     return rows[:, high] - rows[:, low]
 
 
-def _right_handed(axes: Array) -> Array:
-    """Return the same axes with settled signs: the largest entry of the first two is positive."""
-    signs = np.sign(axes[np.abs(axes).argmax(0), range(3)])
-    signs[2] = signs[0] * signs[1] * np.sign(np.linalg.det(axes))
-    return axes * signs
-
-
 # Two members belong to one instance when they are of one whole that masks voted for, in an answer of wholes,
 # or when a walk over linked members of the surface, of the same such whole or of none, leads from one to the
 # other. What is too faint to be on the surface belongs where the surface Gaussian nearest to it belongs.
 
-CRUMB_COUNT = 8  # half of the neighbourhood that relevancy is smoothed over
-CRUMB_SHARE = 0.01  # of the largest instance's extent on the surface
+CRUMB_COUNT = 8  # Gaussians, half of the neighbourhood that relevancy is smoothed over: fewer are a crumb,
+CRUMB_SHARE = 0.01  # and so is less than this of the largest instance's extent on the surface
 EQUAL_SCORES = 1e-3  # of relevancy: instances this close are as good, and the larger comes first
 BOXED = 2048  # members, at most, that a box is taken from
 _FLAT = -100.0  # logarithm of a scale, instead of -infinity
@@ -148,8 +136,8 @@ class Instance:
 def told_apart(surface: Surface, numbers: Array, wholes: Array | None, join: bool) -> list[Array]:
     """Divide the Gaussians `numbers` (K,) of a surface into single things.
 
-    wholes: (N,) voted wholes, see `Tree.voted`, which tell apart things that touch; join: what is of one
-    whole is one, connected or not.
+    wholes: (N,) voted wholes, which tell apart things that touch; join: what is of one is one, connected or
+    not.
     """
     if wholes is None:
         return surface.parts(numbers)
@@ -173,8 +161,7 @@ def find_instances(
     """Return the instances among `members` (N,) bool, best first by score, of equal ones the larger first.
 
     relevancy: (N,) in [0, 1], at the level of the answer. wholes, join: see `told_apart`. at_most: only so
-    many of the best. Crumbs are left out: parts of fewer than `CRUMB_COUNT` Gaussians on the surface, or of
-    less than `CRUMB_SHARE` of the largest part's extent. Where all are crumbs, the largest alone is kept.
+    many of the best. Crumbs are left out, unless all are: then the largest alone is kept.
     """
     every = np.flatnonzero(members)
     numbers = surface.anchors[every]
@@ -193,20 +180,14 @@ def find_instances(
     sizes = _extent(gaussians, every)
     extents = np.bincount(labels + 1, sizes[near], len(parts) + 1)[1:]
     found = []
-    for part in _ranked(scores, extents, counts)[:at_most]:
+    kept = np.flatnonzero((counts >= CRUMB_COUNT) & (extents >= CRUMB_SHARE * extents.max()))
+    kept = kept if len(kept) else np.array([int(extents.argmax())])
+    ranked = kept[np.lexsort((-extents[kept], -np.round(scores[kept] / EQUAL_SCORES)))]
+    for part in ranked[:at_most]:
         share = extents[part] / max(sizes.sum(), 1e-300)
         own = rows[labels == part]
         found.append(_instance(surface, parts[part], own, values, float(scores[part]), share))
     return tuple(found)
-
-
-def _ranked(scores: Array, extents: Array, counts: Array) -> Array:
-    """Return the indices of the parts that are not crumbs, best first."""
-    kept = np.flatnonzero((counts >= CRUMB_COUNT) & (extents >= CRUMB_SHARE * extents.max()))
-    if len(kept) == 0:
-        return np.array([int(extents.argmax())])
-    steps = np.round(scores[kept] / EQUAL_SCORES)
-    return kept[np.lexsort((-extents[kept], -steps))]
 
 
 def _instance(
@@ -226,64 +207,7 @@ def _instance(
 
 
 def _extent(gaussians: Gaussians, rows: Array) -> Array:
-    """(K,) float64: opacity times the largest cross-section.
-
-    A volume would count flat Gaussians, which surfaces are made of, as nothing.
-    """
+    """(K,) float64: opacity times the largest cross-section; of flat Gaussians the volume is nothing."""
     x, y, z = np.maximum(gaussians.log_scales[rows].astype(np.float64), _FLAT).T
     opacity = sigmoid(gaussians.opacity_logits[rows].astype(np.float64))
     return opacity * np.exp(x + y + z - np.minimum(np.minimum(x, y), z))
-
-
-# The convex hull of an instance, as a closed mesh.
-
-FEW = 8  # Gaussians in the box: of so few none is a stray
-THICKNESS = 1e-3  # of the longest side: what is flatter than this is given it, since a hull needs a volume
-
-
-@dataclass(frozen=True, eq=False)
-class Hull:
-    """Triangles that close around something."""
-
-    name: str
-    vertices: Array  # (V, 3) float64 world units
-    triangles: Array  # (T, 3) int32 numbers of vertices, counter-clockwise seen from outside
-    colour: Array  # (3,) display values in [0, 1], of the whole
-
-
-def hull(instance: Instance, gaussians: Gaussians, colours: Array, name: str) -> Hull:
-    """Hull around the instance's Gaussians that lie in its oriented box: strays would stretch it.
-
-    colours: (N, 3) of the scene's Gaussians, in [0, 1]; the mesh has the mean of its own. Raises InputError
-    where all lie at one point.
-    """
-    box, rows = instance.oriented, instance.members
-    means = gaussians.means[rows].astype(np.float64)
-    inside = box.contains(means)
-    if inside.sum() < FEW:
-        inside[:] = True
-    own = (means[inside] - box.centre) @ box.axes
-    longest = 2 * float(box.half_extents[0])
-    if longest <= 0:
-        raise InputError(f"{name} is a single point, which has no hull; write it with --as points")
-    flat = 2 * box.half_extents < THICKNESS * longest
-    if flat.any():  # both sides of a sheet, all four of a line
-        for axis in np.flatnonzero(flat):
-            offset = np.eye(3)[axis] * THICKNESS * longest / 2
-            own = np.concatenate([own - offset, own + offset])
-    try:
-        found = ConvexHull(own)
-    except QhullError:
-        raise InputError(f"{name} has too few points for a hull; write it with --as points") from None
-    number = np.full(len(own), -1, np.int32)
-    number[found.vertices] = np.arange(len(found.vertices))
-    vertices = own[found.vertices]
-    triangles = _outward(vertices, number[found.simplices], found.equations[:, :3])
-    return Hull(name, box.centre + vertices @ box.axes.T, triangles, colours[rows[inside]].mean(0))
-
-
-def _outward(vertices: Array, triangles: Array, normals: Array) -> Array:
-    """Return the triangles, turned where they run against their outward `normals` (T, 3)."""
-    a, b, c = vertices[triangles].transpose(1, 0, 2)
-    inward = (np.cross(b - a, c - a) * normals).sum(1) < 0
-    return np.where(inward[:, None], triangles[:, [0, 2, 1]], triangles)

@@ -1,8 +1,8 @@
-"""The inventory of a scene: every word that is true in it, where, and how probable it is.
+"""What is in a scene, in words: its inventory, the outline of its tree, and examples of what to ask.
 
 Every feature of the scene has its best word, and so every Gaussian. Words that cover enough of the surface
-are candidates; those that claim the same features are one thing by two names ("mug" and "cup"); and what is
-listed was asked for, as a phrase, and found where it was claimed.
+are candidates for the inventory; those that claim the same features are one thing by two names ("mug" and
+"cup"); and what is listed was asked for, as a phrase, and found where it was claimed.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,20 +17,20 @@ from langsplat_core.config import LevelChoice
 from langsplat_core.errors import LangSplatError
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.compose import run_phrase
-from langsplat_core.query.describe import LIKELY, OR, Describer, Word, WordScores, likely_name
+from langsplat_core.query.describe import LIKELY, OR, Describer, Word, likely_name
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.instances import axis_aligned_box, oriented_box
-from langsplat_core.scene import LEVELS, NO_NODE, Codec
+from langsplat_core.scene import LEVELS, NO_NODE
 from langsplat_core.scene.language import phrase_key
-from langsplat_core.scene.surface import Surface
 from langsplat_core.semantics.relevancy import FLOOR
 
-LEAST_SHARE = 5e-4  # of the scene's surface that a word, with others for the same, must be the best for
+LEAST_SHARE = 5e-4  # of the scene's surface that a listed word or node must have
 LEAST_SPOT = 0.15  # of its largest spot's surface: a smaller one is a splinter of a border
-LEAST_COUNT = 12  # Gaussians of a spot
+LEAST_COUNT = 12  # Gaussians of a spot or node
 SAME = 0.5  # overlap of claims from which two words name the same thing
 RUNNERS_UP = 5  # words per feature that may be names for it
 MOST = 200  # candidates per level, the largest first
+NAMES = 3  # words, at most, that a node is called by
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,14 +68,35 @@ class _Claim:
     probability: float
 
 
-def _claims(
-    codec: Codec, latents: Array, of: Array, words: WordScores, level: int, areas: Array
-) -> Iterator[_Claim]:
+def scene_inventory(describer: Describer, progress: Progress = silent) -> list[InventoryEntry]:
+    """Return every word that is true in the scene, whole things first, then by surface.
+
+    A word is listed once, at the coarsest level where it is claimed and found.
+    """
+    field, known = describer.engine.field, describer.known
+    of = np.full(known.shape, -1, np.int64)
+    latents, of[known] = field.codec.unique(field.latents[known])
+    entries: list[InventoryEntry] = []
+    named: set[str] = set()
+    for level in reversed(range(len(LEVELS))):
+        claims = list(_claims(describer, latents, of[level], level))
+        for done, claim in enumerate(claims):
+            progress("checking words", done / len(claims), LEVELS[level])
+            entry = _verified(describer, claim) if named.isdisjoint(claim.phrases) else None
+            if entry is not None:
+                entries.append(entry)
+                named.update(claim.phrases)
+        progress("checking words", 1.0, LEVELS[level])
+    return entries
+
+
+def _claims(describer: Describer, latents: Array, of: Array, level: int) -> Iterator[_Claim]:
     """Yield groups of words at a level, those that cover most first.
 
     latents: (M, d) the distinct ones of the field; of: (N,) int64 number of each Gaussian's, -1 for none.
     """
-    best, shares = words.best(codec, latents, RUNNERS_UP)
+    words, areas = describer.words[level], describer.areas
+    best, shares = words.best(describer.engine.field.codec, latents, RUNNERS_UP)
     if best.size == 0:  # no words, or no features
         return
     has = of >= 0
@@ -94,19 +115,17 @@ def _claims(
         if weight.sum() < least:
             continue
         probability = float(weight @ names[winners][:, group].sum(1)) / float(weight.sum())
-        if probability < LIKELY:
-            continue
-        rows = np.flatnonzero(has & winners[np.maximum(of, 0)])
-        yield _Claim(level, tuple(words.phrases[number] for number in numbers), rows, probability)
+        if probability >= LIKELY:
+            rows = np.flatnonzero(has & winners[np.maximum(of, 0)])
+            yield _Claim(level, tuple(words.phrases[number] for number in numbers), rows, probability)
 
 
 def same_things(names: Array, surface: Array) -> list[list[int]]:
     """Return groups of columns that name the same.
 
-    names: (M, C) probabilities of C words, the most claimed first; surface: (M,) of each feature. Two
-    words name the same where most of what either claims is claimed by the other as well:
-    sum_m s_m min(p_ma, p_mb) >= SAME max(sum_m s_m p_ma, sum_m s_m p_mb). A word joins the first group
-    whose most claimed word it agrees with.
+    names: (M, C) probabilities of C words, the most claimed first; surface: (M,) of each feature. A word
+    joins the first group with whose head b, the most claimed, it has most in common: sum_m s_m min(p_ma,
+    p_mb) >= SAME max(sum_m s_m p_ma, sum_m s_m p_mb).
     """
     weighted = names.astype(np.float64) * surface[:, None]
     totals = weighted.sum(0)
@@ -123,41 +142,15 @@ def same_things(names: Array, surface: Array) -> list[list[int]]:
     return groups
 
 
-def scene_inventory(describer: Describer, progress: Progress = silent) -> list[InventoryEntry]:
-    """Return every word that is true in the scene, whole things first, then by surface.
-
-    A word is listed once, at the coarsest level where it is claimed and found.
-    """
-    field, known = describer.engine.field, describer.known
-    of = np.full(known.shape, -1, np.int64)
-    latents, of[known] = field.codec.unique(field.latents[known])
-    entries: list[InventoryEntry] = []
-    named: set[str] = set()
-    for level in reversed(range(len(LEVELS))):
-        claims = list(
-            _claims(field.codec, latents, of[level], describer.words[level], level, describer.areas)
-        )
-        for done, claim in enumerate(claims):
-            progress("checking words", done / len(claims), LEVELS[level])
-            if named.isdisjoint(claim.phrases):
-                entry = _verified(describer, claim)
-                if entry is not None:
-                    entries.append(entry)
-                    named.update(claim.phrases)
-        progress("checking words", 1.0, LEVELS[level])
-    return entries
-
-
 def _verified(describer: Describer, claim: _Claim) -> InventoryEntry | None:
     """Return the claim as an entry under the first of its words that a query finds there, if any."""
     engine, areas, level = describer.engine, describer.areas, claim.level
     for phrase in claim.phrases:
-        vector = describer.words[level].vector(phrase)
-        result = engine.run(phrase, get_args(LevelChoice)[1 + level], vector=vector)  # after "auto"
+        result = engine.run(phrase, get_args(LevelChoice)[1 + level])  # after "auto"
         agreed = claim.rows[result.relevancy[level, claim.rows] > FLOOR]
         if not result.found or 2 * areas[agreed].sum() < areas[claim.rows].sum():
             continue
-        spots = tuple(_spot(describer, level, part) for part in _solid(engine.surface, areas, agreed))
+        spots = _spots(describer, level, agreed)
         if spots:
             others = tuple(other for other in claim.phrases if other != phrase)
             share = float(sum(spot.share for spot in spots))
@@ -165,32 +158,26 @@ def _verified(describer: Describer, claim: _Claim) -> InventoryEntry | None:
     return None
 
 
-def _solid(surface: Surface, areas: Array, rows: Array) -> list[Array]:
+def _spots(describer: Describer, level: int, rows: Array) -> tuple[Spot, ...]:
     """Return the connected parts of Gaussians `rows` (M,), the largest first, without splinters."""
-    numbers = np.flatnonzero(np.isin(surface.rows, rows))
-    found = [surface.rows[part] for part in surface.parts(numbers)]
-    parts = sorted(found, key=lambda part: -areas[part].sum())
-    least = LEAST_SPOT * areas[parts[0]].sum() if parts else 0.0
-    return [part for part in parts if len(part) >= LEAST_COUNT and areas[part].sum() >= least]
+    engine, areas, found = describer.engine, describer.areas, []
+    on_surface = engine.surface.rows
+    parts = [on_surface[part] for part in engine.surface.parts(np.flatnonzero(np.isin(on_surface, rows)))]
+    parts.sort(key=lambda part: -areas[part].sum())
+    for own in parts:
+        if len(own) < LEAST_COUNT or areas[own].sum() < LEAST_SPOT * areas[parts[0]].sum():
+            continue
+        weights, positions = (
+            np.maximum(areas[own], 1e-300),
+            engine.scene.gaussians.means[own].astype(np.float64),
+        )
+        centre, share = weights @ positions / weights.sum(), float(weights.sum()) / float(areas.sum())
+        seen = describer.appearance(engine.field.latents[level, own], weights)
+        found.append(Spot(centre, axis_aligned_box(positions), own, share, *seen))
+    return tuple(found)
 
 
-def _spot(describer: Describer, level: int, rows: Array) -> Spot:
-    engine, weights = describer.engine, np.maximum(describer.areas[rows], 1e-300)
-    positions = engine.scene.gaussians.means[rows].astype(np.float64)
-    colour, material = describer.appearance(engine.field.latents[level, rows], weights)
-    return Spot(
-        centre=weights @ positions / weights.sum(),
-        box=axis_aligned_box(positions),
-        rows=rows,
-        share=float(weights.sum()) / float(describer.areas.sum()),
-        colour=colour,
-        material=material,
-    )
-
-
-LEAST_SHARE = 5e-4  # of the scene's surface that a node must have to be listed
-LEAST_COUNT = 12  # Gaussians that it must have
-NAMES = 3  # words, at most, that a node is called by
+# The outline: the tree in words, each thing with its parts.
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,19 +195,18 @@ class Outline:
     parts: tuple["Outline", ...]  # the largest first
 
 
-def scene_outline(describer: Describer, least: float = LEAST_SHARE) -> tuple[Outline, ...]:
+def scene_outline(describer: Describer) -> tuple[Outline, ...]:
     """Return the scene's tree, wholes with the largest surface first.
 
-    Left out are nodes of less than `least` of the scene's surface, and parts that say nothing new: without a
-    word, or with that of what they are in; their own parts take their place.
+    Left out are small nodes, and parts that say nothing new: without a word, or with that of what they are
+    in; their own parts take their place.
     """
     tree, members, areas = describer.engine.tree, describer.engine.tree.gaussians(), describer.areas
     every = max(float(areas.sum()), 1e-300)
     totals = np.array([areas[rows].sum() for rows in members]) / every
-    large = [node for node, rows in enumerate(members) if totals[node] >= least and len(rows) >= LEAST_COUNT]
-    large.sort(key=lambda node: -totals[node])
+    large = [n for n, rows in enumerate(members) if totals[n] >= LEAST_SHARE and len(rows) >= LEAST_COUNT]
     parts: dict[int, list[int]] = {}
-    for node in large:
+    for node in sorted(large, key=lambda node: -totals[node]):
         parts.setdefault(int(tree.parents[node]), []).append(node)
 
     def name_of(node: int) -> Word | None:
@@ -255,6 +241,8 @@ def scene_outline(describer: Describer, least: float = LEAST_SHARE) -> tuple[Out
     return tuple(shown(node, name_of(node)) for node in parts.get(NO_NODE, []))
 
 
+# Suggestions of what to ask: examples, completions and corrections of what is typed.
+
 EXAMPLES = 6
 TRIES = 4  # candidates that are asked for each example wanted
 
@@ -268,11 +256,10 @@ class Suggestions:
 
 
 def suggest(engine: QueryEngine, at_most: int = EXAMPLES, progress: Progress = silent) -> Suggestions:
-    """Return examples for a scene, from its inventory and phrasebook, each asked and found.
+    """Return examples from a scene's inventory and phrasebook, each asked and found, in seconds.
 
-    There are none where nothing can be asked. This takes seconds: keep what it returns.
+    There are none where nothing can be asked.
     """
-    book = tuple(engine.field.phrasebook)
     here: tuple[str, ...] = ()
     taught: tuple[str, ...] = ()
     try:
@@ -282,7 +269,7 @@ def suggest(engine: QueryEngine, at_most: int = EXAMPLES, progress: Progress = s
         here = tuple(entry.phrase for entry in entries)
     except LangSplatError:  # no encoder here, or one that knows none of the words: the phrasebook is left
         pass
-    candidates = tuple(dict.fromkeys((*here, *book)))
+    candidates = tuple(dict.fromkeys((*here, *engine.field.phrasebook)))
     found = (phrase for phrase in candidates[: TRIES * at_most] if _is_found(engine, phrase))
     return Suggestions(tuple(islice(found, at_most)), tuple(dict.fromkeys((*candidates, *taught))))
 
@@ -295,10 +282,9 @@ def _is_found(engine: QueryEngine, phrase: str) -> bool:
 
 
 def completions(text: str, phrases: Sequence[str], at_most: int = 6) -> list[str]:
-    """Return phrases that go on from what was typed, in the order of `phrases`.
+    """Return phrases that go on from what was typed, then what was typed with its last word completed.
 
-    First come those that begin with all of it, then what was typed with its last word completed; nothing
-    where no text is, or a word has ended.
+    Nothing where no text is, or a word has ended.
     """
     typed = phrase_key(text)
     if not typed or text[-1:].isspace():
@@ -311,11 +297,7 @@ def completions(text: str, phrases: Sequence[str], at_most: int = 6) -> list[str
 
 
 def corrected(text: str, near: Mapping[str, Sequence[str]]) -> str | None:
-    """Return `text` with every unknown word replaced by the nearest known one; None where one has none.
-
-    near: as of `UnknownWordError`.
-    """
+    """Return `text` with unknown words replaced by the nearest, see `UnknownWordError`; None without one."""
     if not all(near.values()):
         return None
-    words = phrase_key(text).split(" ")
-    return " ".join(near[word][0] if near.get(word) else word for word in words)
+    return " ".join(near[word][0] if near.get(word) else word for word in phrase_key(text).split(" "))

@@ -14,8 +14,7 @@ from langsplat_core.scene.language import Tree
 from langsplat_core.scene.surface import Surface
 
 WHOLE = LEVELS.index("whole")
-FEWEST = 8  # Gaussians; what has fewer is a speck
-SPECK = 0.1  # of the largest instance's Gaussians; so is what has fewer
+FEWEST, SPECK = 8, 0.1  # Gaussians, and of the largest instance's Gaussians; what has fewer is a speck
 SAMPLE = 1500  # points of a thing that distances are measured with
 NEAR = 0.75  # of the smaller thing's size: the widest gap that is still near
 TOUCH = 0.1  # of the smaller thing's size: the widest gap that is still touching
@@ -55,22 +54,6 @@ class Body:
         return float(np.median(self.tree.query(self.points, k=2)[0][:, 1]))
 
 
-@dataclass(frozen=True, eq=False)
-class Viewpoint:
-    """The camera from which left, right, near, far, behind and in front are said."""
-
-    matrix: Array  # (4, 4) from the axes of bodies to the camera's
-
-    def centre(self, body: Body) -> Array:
-        """(3,) centre of a body, in the camera's axes."""
-        return self.matrix[:3, :3] @ body.centre + self.matrix[:3, 3]
-
-    def seen(self, body: Body) -> tuple[float, float]:
-        """Tangent of the angle to the right of the viewing direction, and depth; NaN for what is behind."""
-        x, _, z = self.centre(body)
-        return (float(x / z), float(z)) if z > 0 else (float("nan"), float("nan"))
-
-
 def upright(up: Array) -> Array:
     """(3,) unit -> (3, 3) rotation of world points into axes of which the last is up."""
     first = across(up)
@@ -78,11 +61,21 @@ def upright(up: Array) -> Array:
     return np.stack([first, np.cross(up, first), up])
 
 
-def viewpoint(camera: Camera, frame: Array) -> Viewpoint:
-    """`camera` as seen in the axes of `frame` (3, 3), see `upright`."""
+def viewpoint(camera: Camera, frame: Array) -> Array:
+    """Return the (4, 4) matrix from the axes of `frame` (3, 3), see `upright`, to those of `camera`."""
     turned = np.eye(4)
     turned[:3, :3] = frame.T
-    return Viewpoint(camera.world_to_camera @ turned)
+    return camera.world_to_camera @ turned
+
+
+def _centre(what: Body, seen_by: Array) -> Array:
+    return np.asarray(seen_by[:3, :3] @ what.centre + seen_by[:3, 3])
+
+
+def _seen(what: Body, seen_by: Array) -> tuple[float, float]:
+    """Return the tangent of the angle to the right of the viewing direction, and depth; NaN behind."""
+    x, _, z = _centre(what, seen_by)
+    return (float(x / z), float(z)) if z > 0 else (float("nan"), float("nan"))
 
 
 def body(positions: Array, frame: Array) -> Body:
@@ -95,8 +88,7 @@ def body(positions: Array, frame: Array) -> Body:
 def separate(surface: Surface, inside: Array, tree: Tree | None = None) -> list[Array]:
     """(M,) bool -> surface numbers of each single thing in it, the largest first, without specks.
 
-    tree: what tells apart things that touch, by its wholes that masks voted for. All other Gaussians are
-    taken apart where the surface is.
+    tree: tells apart things that touch, by its wholes that masks voted for.
     """
     wholes = None if tree is None else tree.voted(WHOLE)
     parts = told_apart(surface, np.flatnonzero(inside), wholes, join=True)
@@ -109,11 +101,10 @@ def gap(one: Body, other: Body) -> float:
     return float(other.tree.query(one.points)[0].min())
 
 
-def stands(kind: Side, what: Body, anchor: Body, seen_by: Viewpoint | None) -> bool:
-    """Return whether `what` stands so to `anchor`.
-
-    "left of", "right of", "behind" and "in front of" are said from a viewpoint, which is then not None.
-    """
+def stands(  # noqa: PLR0911  one row of a table each
+    kind: Side, what: Body, anchor: Body, seen_by: Array | None
+) -> bool:
+    """Return whether `what` stands so to `anchor`; a viewpoint says what is left, right, behind, in front."""
     match kind:
         case "on":
             return _on(what, anchor)
@@ -125,9 +116,13 @@ def stands(kind: Side, what: Body, anchor: Body, seen_by: Viewpoint | None) -> b
             return _above(what, anchor)
         case "below":
             return _above(anchor, what)
-        case _:
-            assert seen_by is not None
-            return _beside(kind, what, anchor, seen_by)
+    assert seen_by is not None
+    (x, z), (anchor_x, anchor_z) = _seen(what, seen_by), _seen(anchor, seen_by)
+    mean = (what.size + anchor.size) / 2
+    aside = (x - anchor_x) * anchor_z  # world units at the anchor's depth
+    if kind in ("left of", "right of"):
+        return (aside if kind == "right of" else -aside) > ASIDE * mean
+    return abs(aside) <= mean and (z - anchor_z if kind == "behind" else anchor_z - z) > ASIDE * mean
 
 
 def _on(what: Body, anchor: Body) -> bool:
@@ -158,29 +153,13 @@ def _above(what: Body, anchor: Body) -> bool:
     return bool(overlap and what.centre[2] > anchor.high[2] and what.low[2] > anchor.centre[2])
 
 
-def _beside(kind: Side, what: Body, anchor: Body, seen_by: Viewpoint) -> bool:
-    (x, z), (anchor_x, anchor_z) = seen_by.seen(what), seen_by.seen(anchor)
-    apart = ASIDE * (what.size + anchor.size) / 2
-    aside = (x - anchor_x) * anchor_z  # world units at the anchor's depth
-    if kind == "left of":
-        return aside < -apart
-    if kind == "right of":
-        return aside > apart
-    in_line = abs(aside) <= (what.size + anchor.size) / 2
-    return in_line and (z - anchor_z > apart if kind == "behind" else anchor_z - z > apart)
-
-
-def most(kind: Extreme, things: list[Body], anchors: list[Body], seen_by: Viewpoint | None) -> int:
-    """Return number of the one of `things` (at least one) that is most so.
-
-    "nearest" and "farthest" are measured from any of `anchors`, and without one from the viewpoint, as
-    "leftmost" and "rightmost" are.
-    """
+def most(kind: Extreme, things: list[Body], anchors: list[Body], seen_by: Array | None) -> int:
+    """Return number of the one of `things` that is most so, as nearest to `anchors`, else the viewpoint."""
     sign = -1 if kind in ("smallest", "nearest", "lowest", "leftmost") else 1
     return int(np.nanargmax([sign * _measure(kind, thing, anchors, seen_by) for thing in things]))
 
 
-def _measure(kind: Extreme, thing: Body, anchors: list[Body], seen_by: Viewpoint | None) -> float:
+def _measure(kind: Extreme, thing: Body, anchors: list[Body], seen_by: Array | None) -> float:
     if kind in ("biggest", "smallest"):
         return thing.size
     if kind in ("highest", "lowest"):
@@ -189,6 +168,6 @@ def _measure(kind: Extreme, thing: Body, anchors: list[Body], seen_by: Viewpoint
         return min(gap(thing, anchor) for anchor in anchors)
     assert seen_by is not None
     if kind in ("nearest", "farthest"):
-        return float(np.linalg.norm(seen_by.centre(thing)))
-    aside = seen_by.seen(thing)[0]
+        return float(np.linalg.norm(_centre(thing, seen_by)))
+    aside = _seen(thing, seen_by)[0]
     return (np.inf if kind == "leftmost" else -np.inf) if np.isnan(aside) else aside

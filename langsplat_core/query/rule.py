@@ -1,10 +1,9 @@
 """The rule that turns the fits of regions into an answer: one table of numbers, `RULE`, and `decide`.
 
 A fit (`semantics.relevancy.Scale`) says by how many spreads a region is nearer to a phrase than everyday
-phrases are to it by chance, so that one rule serves all encoders. The exported page has the table as JSON and
-`decide` in JavaScript (`web/rule.js`); the index over scans calls the same functions for many scenes at once.
-The numbers were chosen on rooms 201 to 203, with the bundled encoder and with the geometry of CLIP, never on
-rooms that measure.
+phrases are by chance, so that one rule serves all encoders. The exported page has the table as JSON and
+`decide` in JavaScript (`web/rule.js`); the index over scans calls these functions for many scenes at once.
+The numbers were chosen on rooms 201 to 203, with the bundled encoder and CLIP's geometry.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,12 +26,10 @@ Sought = Named | Literal["inside"]  # "inside": a part, among what is on a thing
 class Rule:
     """The numbers of the rule. Fits are spreads, relevancies and probabilities are in [0, 1]."""
 
-    # Added to the fit of each level before the best level is chosen, by what a phrase names. A thing is one
-    # whole, whatever some part of it looks like.
+    # Added to the fit of each level before the best is chosen: a thing is one whole, whatever its parts are.
     advantage: Mapping[Named, Fits]
     # Spreads above the median best fit of everyday phrases from which a phrase is found: among whole things,
-    # and at the finer levels. One absent phrase in twenty exceeds them. Some everyday phrases are there,
-    # which raises their median; that is in these numbers.
+    # and at the finer levels. One absent phrase in twenty exceeds them.
     found: Mapping[Sought, tuple[float, float]]
     part_share: float = 0.25  # weight of its best part in the fit of a region: of a thing, something is sure
     reach: float = 0.45  # of the best fit: a region that fits less by this or less belongs to the answer,
@@ -52,10 +49,7 @@ class Rule:
         return asdict(self) | {"advantage": dict(self.advantage), "found": found}
 
     def least_fit(self, best: float, share: float = 1.0) -> float:
-        """Return the fit from which a region belongs to an answer whose best region has the fit `best`.
-
-        share: of the way that such an answer reaches.
-        """
+        """Return the fit from which a region belongs to an answer; `share`: of the way that it reaches."""
         return best - share * float(np.clip(self.reach * best, self.nearest, self.farthest))
 
 
@@ -92,10 +86,9 @@ class RegionTable:
 
 
 def region_fits(table: RegionTable, own: Array) -> Array:
-    """Return the (R, ...) fits of regions, each mixed with the fit of its best part.
+    """Return the (R, ...) fits of regions, each its `own` of its mean relevancy mixed with its best part's.
 
-    own: (R, ...) fits of the mean relevancy of each region's Gaussians. Parts that fit nothing, and crumbs,
-    say nothing; a region without parts is its own part.
+    Parts that fit nothing, and crumbs, say nothing; a region without parts is its own part.
     """
     telling = ((own > RULE.nothing).T & table.solid).T
     heard = np.where(telling, own, -np.inf)
@@ -112,10 +105,7 @@ def region_relevancies(fits: Array) -> Array:
 
 
 def best_relevancies(table: RegionTable, relevancies: Array) -> Array:
-    """Return the (S, 3) best relevancy of each scene and level; of crumbs only where a level has no more.
-
-    relevancies: (R,) of the regions.
-    """
+    """Return the (S, 3) best of the (R,) `relevancies`; of crumbs only where a level has no more."""
     counts = table.counts.ravel()
     filled, starts = counts > 0, np.cumsum(counts) - counts
     best = np.zeros((2, len(counts)))
@@ -126,9 +116,8 @@ def best_relevancies(table: RegionTable, relevancies: Array) -> Array:
     return np.maximum(np.where(np.isfinite(solid), solid, every), 0).reshape(-1, len(LEVELS))
 
 
-# Chance: the fits of everyday phrases in a scene, most of which name nothing there. The more places a scene
-# has, the better the best of them fits a phrase by chance; so what counts as found is measured by the best
-# fits of everyday phrases in the scene itself.
+# Chance: the more places a scene has, the better the best of them fits a phrase that names nothing there; so
+# what counts as found is measured by the best fits of everyday phrases in the scene itself.
 
 LOW = 0.16  # quantile one standard deviation below the median; what is there lies above, and widens nothing
 
@@ -146,13 +135,18 @@ class Bar:
 
 
 Bars = tuple[Bar, Bar, Bar, Bar]  # of each level, and of the better one of the finer two
-Chance = tuple[Array, ...]  # (r, V) float32 of each level: fits of V everyday phrases at r regions
 
 
-def bars_of(chance: Chance, rows: Sequence[Array] | None = None) -> Bars:
-    """Return the bars of a scene, or of some regions `rows` of each level alone."""
-    chosen = [fits if rows is None else fits[rows[level]] for level, fits in enumerate(chance)]
-    subpart, part, whole = (fits.max(0, initial=-np.inf) for fits in chosen)
+def bars_of(table: RegionTable, chance: Array, chosen: Array | None = None) -> Bars:
+    """Return the bars of (R, V) fits of everyday phrases in a scene, or in its `chosen` (R,) regions."""
+    best = []
+    for level in range(len(LEVELS)):
+        solid = table.level(level, table.solid)
+        counts = solid if solid.any() else np.ones_like(solid)
+        if chosen is not None:
+            counts = counts & table.level(level, chosen)
+        best.append(table.level(level, chance)[counts].max(0, initial=-np.inf))
+    subpart, part, whole = best
     return _bar(subpart), _bar(part), _bar(whole), _bar(np.maximum(subpart, part))
 
 
@@ -164,10 +158,7 @@ def _bar(best: Array) -> Bar:
 
 
 def excess(fits: Fits, bars: Bars, sought: Sought, level: LevelChoice = "auto") -> float:
-    """Return the spreads by which the best fits of a phrase exceed those from which it is found.
-
-    At one `level`, or, where that is free, at any.
-    """
+    """Return the spreads by which the best fits of a phrase, at a level or any, exceed what is found."""
     whole, finer = RULE.found[sought]
     if level != "auto":
         index = LEVELS.index(level)
@@ -178,15 +169,15 @@ def excess(fits: Fits, bars: Bars, sought: Sought, level: LevelChoice = "auto") 
 # Verdicts.
 
 Outcome = Literal["found", "weak match", "not here"]
-# By a calibrated probability; by the fits of everyday phrases; by likeness to a taught word's examples; by
-# the relevancy itself, as published; several: by different ones for the parts of a phrase with structure.
+# By a calibrated probability, the fits of everyday phrases, likeness to examples of a taught word, or as
+# published, relevancy; "several": by different ones for the parts of a phrase with structure.
 Reached = Literal["calibration", "chance", "example", "relevancy", "several"]
 IN_SPREADS: tuple[Reached, ...] = ("chance", "example")  # those whose margins can be compared
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The judgement whether what was asked for is there, and how it was reached."""
+    """The judgement on whether what was asked for is there, and how it was reached."""
 
     found: bool
     reached: Reached
@@ -226,16 +217,13 @@ def combined(verdicts: Sequence[Verdict], all_needed: bool) -> Verdict:
 def judge(
     fits: Fits, sought: Sought, level: LevelChoice, bars: Bars | None, calibration: Calibration | None
 ) -> Verdict:
-    """Return the verdict that the best fits of a scene's levels stand for.
-
-    bars: where nothing is calibrated.
-    """
+    """Return the verdict that the best fits of a scene's levels stand for; `bars` without a calibration."""
     if calibration is None:
         assert bars is not None
         margin = excess(fits, bars, sought, level)
         return Verdict(margin >= 0, "chance", margin)
-    alone = calibration.thing if sought == "thing" else calibration.part
-    scaling = calibration.inside if sought == "inside" else alone
+    ways = {"thing": calibration.thing, "inside": calibration.inside}
+    scaling = ways.get(sought, calibration.part)
     probability = scaling.probability(fits)
     margin = float(logit(np.array(probability)) - logit(np.array(min(scaling.found, 1 - RULE.narrowest))))
     # It may be there, but what the wanted level shows is nearer to other phrases.
@@ -267,9 +255,9 @@ def decide(
     bars: Bars,
     calibration: Calibration | None,
 ) -> Decision:
-    """Return the answer of the whole regions that fit nearly as well as the best one.
+    """Return the answer of the whole regions of a scene that fit nearly as well as the best one.
 
-    table: of one scene. own: (R,) fits of the mean relevancy of each region. named: what the phrase names.
+    own: (R,) fits of the mean relevancy of each region. named: what the phrase names.
     """
     fits = region_fits(table, own)
     relevancies = region_relevancies(fits)

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.errors import InputError
-from langsplat_core.query.regions import Regions
+from langsplat_core.query.answers import Regions
 from langsplat_core.scene import Camera
 from langsplat_core.scene.surface import Surface
 

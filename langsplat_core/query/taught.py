@@ -1,11 +1,10 @@
 """Words that are taught by showing: what else is like something that was pointed at.
 
-Cosines between images are no cosines between an image and a text: those of any two images of CLIP are 0.65,
-and what tells things apart is lost in what is no matter of words, such as light and background. So regions
-are compared in the *word space*: along the directions in which everyday phrases differ, and less the mean of
-the scene's regions. How alike different things are there depends on encoder and scene; it is measured as the
-scene's *rival*, the similarity that most pairs of its wholes stay below: the rest may show one thing twice. A
-region is what was shown if it is more like it than `FOUND` says for the mean rival of both scenes.
+Any two images of CLIP have a cosine of 0.65, and what tells things apart is lost in light and background. So
+regions are compared in the *word space*: along the directions in which everyday phrases differ, and less the
+mean of the scene's regions. How alike different things are there is measured as the scene's *rival*, the
+similarity that most pairs of its wholes stay below: the rest may show one thing twice. A region is what was
+shown if it is more like it than `FOUND` says for the mean rival of both scenes.
 """
 
 from dataclasses import dataclass
@@ -16,8 +15,7 @@ import numpy as np
 from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import InputError
-from langsplat_core.query.answers import QueryResult
-from langsplat_core.query.regions import Regions, feature_sums, place_of
+from langsplat_core.query.answers import QueryResult, Regions, feature_sums
 from langsplat_core.query.rule import Verdict, triple
 from langsplat_core.scene import LEVELS, LanguageField, TaughtWord
 from langsplat_core.scene.surface import SMALLEST
@@ -45,10 +43,10 @@ class WordSpace:
 
 
 def build_word_space(field: LanguageField, regions: Regions, votes: Array) -> WordSpace:
-    """Return the word space of a scene; that of all images where the scene keeps no everyday phrases.
+    """Return the word space of a scene; the whole space where it keeps no everyday phrases.
 
-    votes: (K,) of the tree's nodes. Where masks voted, mean and rival are of those regions that have a vote:
-    the others are mostly fragments of walls and floors, many of one thing.
+    votes: (K,) of the tree's nodes. Where masks voted, mean and rival are of regions with a vote: the others
+    are mostly fragments of walls and floors, many of one thing.
     """
     basis = np.eye(field.codec.vector_dim, dtype=np.float32)
     if field.everyday is not None and len(field.everyday) > 1:
@@ -72,10 +70,7 @@ def build_word_space(field: LanguageField, regions: Regions, votes: Array) -> Wo
 def _means(
     field: LanguageField, basis: Array, level: int, of: Array, weights: Array, count: int
 ) -> tuple[Array, Array]:
-    """Return the mean features of sets of Gaussians in a space, and whether each set has any.
-
-    They are (count, W) and (count,) bool. of: (N,) number of each Gaussian's set, -1 for none; weights: (N,).
-    """
+    """Return (count, W) mean features of sets of Gaussians in a space, and (count,) bool: it has any."""
     counted = field.known[level] & (of >= 0)
     totals = np.bincount(of[counted], weights[counted], count)
     sums = feature_sums(field, level, of, weights, count, partial(field.codec.cosines, vectors=basis))
@@ -85,10 +80,7 @@ def _means(
 def shown(
     space: WordSpace, field: LanguageField, regions: Regions, name: str, members: Array, level: int
 ) -> TaughtWord:
-    """Return the word for `members` (N,) bool at a level (index into LEVELS).
-
-    Raises InputError where they have no features, or none that tell them from the rest of the scene.
-    """
+    """Return the word for `members` (N,) bool at a level; InputError where they are like all the rest."""
     sets = np.where(members, 0, -1)
     (mean,), (known,) = _means(field, space.basis, level, sets, regions.weights, 1)
     vector = unit(mean - space.centres[level]) @ space.basis
@@ -100,10 +92,7 @@ def shown(
 
 
 def compared(word: TaughtWord, space: WordSpace, vectors: Array, level: int) -> tuple[Array, Array]:
-    """Return (M,) the largest cosine of images with an example, and (M,) the fits.
-
-    vectors: (M, D) unit, of images; cosines are in the word space, at a level (index into LEVELS).
-    """
+    """Return (M,) largest cosines of (M, D) unit image vectors with an example, and (M,) fits, at a level."""
     examples, bars = _examples(word, space)
     alike = unit(vectors @ space.basis.T - space.centres[level]) @ examples.T
     return alike.max(1), _fits(alike, bars[level])
@@ -122,10 +111,7 @@ def _fits(alike: Array, bar: Array) -> Array:
 
 
 def likeness(word: TaughtWord, space: WordSpace) -> tuple[list[Array], list[Array]]:
-    """Return of each level the (R,) fits of the regions, and the (R,) margins above what is found.
-
-    A margin is by how many `UNIT`s a region is more like an example than what is found has to be.
-    """
+    """Return of each level the (R,) fits of its regions, and (R,) `UNIT`s above what is found."""
     examples, bars = _examples(word, space)
     fits, above = [], []
     for row, bar in zip(space.regions, bars, strict=True):
@@ -138,10 +124,7 @@ def likeness(word: TaughtWord, space: WordSpace) -> tuple[list[Array], list[Arra
 def by_showing(
     word: TaughtWord, space: WordSpace, regions: Regions, means: Array, level: LevelChoice
 ) -> QueryResult:
-    """Return the answer to a taught word: the whole regions that are like one of its examples.
-
-    At the level that was shown unless another `level` is asked for. means: (N, 3) of the Gaussians.
-    """
+    """Return the answer to a taught word: the regions, usually at its own level, like one of its examples."""
     chosen = word.level if level == "auto" else LEVELS.index(level)
     fits, above = likeness(word, space)
     every = [sigmoid(row) for row in fits]
@@ -154,9 +137,7 @@ def by_showing(
     relevancy = np.stack(
         [regions.spread(at, row.astype(np.float32), nothing) for at, row in enumerate(every)]
     )
-    place = box = None
-    if len(best):
-        place, box = place_of(means[regions.counted(chosen, int(best.argmax()))])
+    place, box = regions.place(means, chosen, int(best.argmax()) if len(best) else -1)
     return QueryResult(
         phrase=word.name,
         level=chosen,

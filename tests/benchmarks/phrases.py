@@ -21,7 +21,7 @@ from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.grammar import EXTREMES, SIDES, atoms, parse
 from langsplat_core.query.inventory import InventoryEntry, scene_inventory
-from langsplat_core.query.relations import Body, Viewpoint, body, most, stands, upright, viewpoint
+from langsplat_core.query.relations import Body, body, most, stands, upright, viewpoint
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.scene import LEVELS, Camera
 from tests.benchmarks.oracles import surface_points
@@ -93,7 +93,7 @@ def things_in(world: World, frame: Array, seed: int = 0) -> Things:
     return Things(words, extents)
 
 
-def cases(truth: Truth, things: Things, seen_by: Viewpoint, seed: int) -> list[Case]:
+def cases(truth: Truth, things: Things, seen_by: Array, seed: int) -> list[Case]:
     """At most `MOST_CASES` of every construction but of parts, of which there are all."""
     rng = np.random.default_rng((seed, 7))
     found: dict[str, list[Case]] = {name: [] for name in CONSTRUCTIONS}
@@ -141,7 +141,7 @@ def _kinds(things: Things) -> list[str]:
     return sorted({kind for word in things.words.values() for kind in CATEGORIES.get(word, ())})
 
 
-def _relations(things: Things, seen_by: Viewpoint) -> Iterator[Case]:
+def _relations(things: Things, seen_by: Array) -> Iterator[Case]:
     """Of a kind of which some stand so and others do not; and of single things, of which none does."""
     objects = sorted(set(things.words.values()) - set(SHELL))
     for side, anchor in product(SIDES, objects):
@@ -159,7 +159,7 @@ def _relations(things: Things, seen_by: Viewpoint) -> Iterator[Case]:
                 yield Case(side, text, text, right)
 
 
-def _extremes(things: Things, seen_by: Viewpoint) -> Iterator[Case]:
+def _extremes(things: Things, seen_by: Array) -> Iterator[Case]:
     for kind, word in product(EXTREMES, _kinds(things)):
         numbers = things.called(word)
         if len(numbers) >= FEWEST:

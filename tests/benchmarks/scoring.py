@@ -21,10 +21,9 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice, PictureConfig
 from langsplat_core.extensions.benchmarks.report import intersection_over_union
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.answers import SPAN, QueryResult
+from langsplat_core.query.answers import SPAN, QueryResult, Regions
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.lookup import decoded_relevancy, peak_pixel, splatted_relevancy
-from langsplat_core.query.regions import Regions
 from langsplat_core.raster.protocol import Rasterizer, View
 from langsplat_core.raster.render import view_of
 from langsplat_core.scene import Camera

@@ -260,16 +260,12 @@ def test_select_grows_and_shrinks_in_metres(folder):
     assert len(load_scene("u.ply").gaussians) == sizes["g"]
 
 
-def test_select_writes_points_and_hulls(folder, capsys):
+def test_select_writes_points(folder):
     assert run("select", "a.ply", "mug", "--out", "p.ply", "--as", "points") == 0
     vertex = PlyData.read("p.ply")["vertex"]
     assert 0.9 * PER_BLOB < len(vertex["x"]) <= PER_BLOB
     assert vertex["relevancy"].min() > 0.5
     assert vertex["red"].mean() > 190 > 60 > vertex["green"].mean() > 40
-    assert run("select", "a.ply", "pair", "--out", "h.obj", "--as", "hull") == 0
-    assert "h.obj: 2 closed hulls" in capsys.readouterr().out
-    named = [line for line in Path("h.obj").read_text().splitlines() if line[0] == "o"]
-    assert named == ["o pair_1", "o pair_2"]
     assert run("select", "a.ply", "mug", "--out", "rest.ply", "--as", "points", "--remove") == 0
     assert len(PlyData.read("rest.ply")["vertex"]["x"]) >= 2 * PER_BLOB
 
@@ -369,8 +365,6 @@ def test_describe_names_a_pixel(described, capsys):
         ("select a.ply mug --grow -1", "--grow -1: must be 0 to 1e+09"),
         ("select a.ply pair --shrink 9", "nothing is left; shrink by less"),
         ("select a.ply mug book plant --grow 99 --remove", "the whole scene"),
-        ("select a.ply mug --as hull --remove", "--as hull"),
-        ("select a.ply mug --as hull --out b.stl", ".ply or .obj"),
         ("select a.ply mug --as points --out b.spz", "written as .ply"),
         ("select a.ply mug --out b.obj.gz", "scenes are written as"),
         ("select a.ply mug --out a.ply", "would replace the original"),

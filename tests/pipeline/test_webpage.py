@@ -304,7 +304,7 @@ def test_markup_in_names_is_shown_as_text(
 ) -> None:
     name = MARKUP.replace(",", "")[:80]
     word = replace(QueryEngine(demo).teach("bruno", engine.run("teddy bear").members), name=name)
-    vector = engine.text_vector("laptop")
+    vector = engine.text_vectors(["laptop"])[0]
     scene, other = without_encoder(demo, phrasebook={MARKUP: vector, "laptop": vector}, taught=(word,))
     scene = replace(scene, cameras=tuple(replace(camera, name=MARKUP) for camera in demo.cameras[:3]))
     path = tmp_path / "a.html"

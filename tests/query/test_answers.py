@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 
 from langsplat_core.arrays import Array, sigmoid
-from langsplat_core.query import regions as module
-from langsplat_core.query.answers import QueryResult, by_peak, by_regions
+from langsplat_core.query.answers import QueryResult, Regions, build_regions, by_peak, by_regions, chance_in
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import Named
-from langsplat_core.query.regions import Regions, build_regions, chance_in
-from langsplat_core.query.rule import RULE, Bar, bars_of, excess, region_fits
+from langsplat_core.query.rule import RULE, Bar, RegionTable, bars_of, excess, region_fits
 from langsplat_core.scene import LEVELS, NO_NODE, Calibration, Gaussians, LanguageField, PlattScaling, Scene
 from langsplat_core.scene.surface import SMALLEST, Surface, build_surface
 from langsplat_core.semantics.relevancy import FLOOR, Scale
@@ -38,7 +36,7 @@ def asked(
     if rule == "peak":
         return by_peak(phrase, relevancy, surface, scale, field.found, level)
     regions, calibration = regions_of(Scene(gaussians, field), surface), field.calibration
-    by_chance = bars_of(chance_in(field, regions, replace(scale, everyday=field.everyday[:9])))
+    by_chance = bars_of(regions.table, chance_in(field, regions, replace(scale, everyday=field.everyday[:9])))
     return by_regions(phrase, relevancy, gaussians.means, regions, scale, by_chance, calibration, level)
 
 
@@ -172,32 +170,29 @@ BARS = (Bar(0.0, 1.0), Bar(0.5, 1.0), Bar(-1.0, 2.0), Bar(0.6, 0.5))
 
 
 @pytest.mark.parametrize("kind", ["codebook", "autoencoder", "linear"])
-def test_chance_equals_fits_of_everyday_phrases(kind, monkeypatch):
-    monkeypatch.setattr(module, "CHUNK", 7)  # several
+def test_chance_equals_fits_of_everyday_phrases(kind):
     engine = QueryEngine(Scene(random_gaussians(400), random_field(400, kind)))
     fits = engine.chance
     for number, vector in enumerate(engine.field.everyday):
         means = np.concatenate(engine.regions.means(engine.relevancy(vector)))
-        every = region_fits(engine.regions.table, engine.scale.fit(means))
-        for level in range(len(LEVELS)):
-            want = engine.regions.table.level(level, every)
-            solid = engine.regions.sizes[level] >= SMALLEST
-            np.testing.assert_allclose(fits[level][solid, number], want[solid], atol=TOLERANCE[kind])
-            assert np.isneginf(fits[level][~solid, number]).all() or not solid.any()
+        want = region_fits(engine.regions.table, engine.scale.fit(means))
+        np.testing.assert_allclose(fits[:, number], want, atol=TOLERANCE[kind])
 
 
 def test_bars_are_quantiles_of_the_best_fits():
     rng = np.random.default_rng(0)
-    fits = tuple(rng.normal(size=(9, 101)) for _ in LEVELS)
-    whole = bars_of(fits)
-    for bar, level in zip(whole[:3], fits, strict=True):
-        low, median = np.quantile(level.max(0), [0.16, 0.5])
+    fits, solid = rng.normal(size=(3, 9, 101)), np.arange(27) % 9 != 4
+    fits[:, 4] += 9  # crumbs, which do not count
+    table = RegionTable(np.full((1, 3), 9), np.full(27, -1), solid)
+    bars = bars_of(table, fits.reshape(27, 101))
+    best = np.delete(fits, 4, axis=1).max(1)
+    for bar, level in zip(bars, (*best, best[:2].max(0)), strict=True):
+        low, median = np.quantile(level, [0.16, 0.5])
         assert (bar.median, bar.spread) == (pytest.approx(median), pytest.approx(median - low))
-    finer = np.maximum(fits[0].max(0), fits[1].max(0))
-    assert whole[3].median == pytest.approx(np.median(finer))
-    some = bars_of(fits, (np.array([2]), np.array([0, 1]), np.array([], int)))
-    assert some[0].median < whole[0].median
+    some = bars_of(table, fits.reshape(27, 101), np.isin(np.arange(27), [2, 9, 10]))
+    assert some[0].median < bars[0].median
     assert not np.isfinite(some[2].median)  # nothing is found where there is nothing
+    assert np.isfinite(bars_of(replace(table, solid=~solid & False), fits.reshape(27, 101))[0].median)
 
 
 @pytest.mark.parametrize("named", RULE.found)
@@ -220,7 +215,7 @@ def test_peak_rule_answers_without_everyday_phrases():
     field = replace(language(), everyday=None, found=0.6)
     scene = replace(blob_scene(), language=field)
     engine = QueryEngine(scene, lambda _: FakeEncoder())  # which knows too few of them
-    assert (engine.rule, engine.chance, engine.calibration) == ("peak", None, None)
+    assert (engine.rule, engine.bars, engine.calibration) == ("peak", None, None)
     result = engine.run("mug")
     assert (result.found, result.judgement.reached, result.probability) == (True, "relevancy", None)
     few = replace(field, everyday=np.ones((3, 8), np.float32))

@@ -2,12 +2,10 @@
 
 import numpy as np
 import pytest
-from scipy.spatial import ConvexHull
 
 from langsplat_core.arrays import Array, logit, rotation_matrices, sigmoid
-from langsplat_core.errors import InputError
 from langsplat_core.query import instances
-from langsplat_core.query.instances import OrientedBox, axis_aligned_box, find_instances, hull, oriented_box
+from langsplat_core.query.instances import OrientedBox, axis_aligned_box, find_instances, oriented_box
 from langsplat_core.scene import Gaussians
 from langsplat_core.scene.surface import Surface, build_surface
 from tests.support.scenes import random_gaussians, unturned_gaussians
@@ -211,57 +209,3 @@ def test_line_has_a_length():
     check(box)
     np.testing.assert_allclose(2 * box.half_extents, [5 * INSIDE, 0, 0], atol=1e-9)
     np.testing.assert_allclose(np.abs(box.axes[:, 0]), [0.6, 0.8, 0], atol=1e-9)
-
-
-# Hulls: closed, turned outwards, around the thing and not its strays.
-
-
-def thing(points: Array) -> tuple[instances.Instance, Gaussians]:
-    gaussians = unturned_gaussians(points, -4.0, 3.0)
-    positions = gaussians.means.astype(np.float64)
-    return instances.Instance(np.arange(len(points)), 0.9, 0.9, positions.mean(0), positions, 1.0), gaussians
-
-
-def colours(n: int) -> Array:
-    return np.tile([0.2, 0.4, 0.6], (n, 1))
-
-
-def volume(mesh: instances.Hull) -> float:
-    """Positive where the triangles are turned outwards; a closed mesh is needed."""
-    a, b, c = mesh.vertices[mesh.triangles].transpose(1, 0, 2)
-    return float((np.cross(a, b) * c).sum() / 6)
-
-
-def check_closed(mesh: instances.Hull) -> None:
-    edges = [(int(t[k]), int(t[(k + 1) % 3])) for t in mesh.triangles for k in range(3)]
-    assert len(set(edges)) == len(edges)
-    assert {(b, a) for a, b in edges} == set(edges)
-
-
-def test_hull_equals_the_convex_hull_within_the_box():
-    points = np.random.default_rng(0).uniform(size=(3000, 3)) * [3, 2, 1]
-    points[:5] += 100  # strays
-    instance, gaussians = thing(points)
-    mesh = hull(instance, gaussians, colours(3000), "cloud")
-    check_closed(mesh)
-    inside = instance.oriented.contains(gaussians.means.astype(np.float64))
-    assert volume(mesh) == pytest.approx(ConvexHull(gaussians.means[inside]).volume, rel=1e-6)
-    assert 0.85 * 6 * (instances.INNER[1] - instances.INNER[0]) ** 3 < volume(mesh) < 6
-    np.testing.assert_allclose(mesh.colour, [0.2, 0.4, 0.6])
-    assert (np.abs((mesh.vertices - instance.oriented.centre) @ instance.oriented.axes) < 1.6).all()
-
-
-@pytest.mark.parametrize("flat", [[1, 1, 0], [1, 0, 0]], ids=["sheet", "line"])
-def test_hulls_of_sheets_and_lines_have_a_thickness(flat):
-    instance, gaussians = thing(np.random.default_rng(0).uniform(size=(200, 3)) * flat)
-    mesh = hull(instance, gaussians, colours(200), "red mug 1")
-    assert mesh.name == "red mug 1"
-    check_closed(mesh)
-    assert volume(mesh) > 0
-
-
-def test_hull_needs_more_than_one_point():
-    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
-    assert volume(hull(*thing(points), colours(4), "four")) == pytest.approx(1 / 6)
-    with pytest.raises(InputError, match="mug 1 is a single point"):
-        hull(*thing(np.ones((5, 3))), colours(5), "mug 1")

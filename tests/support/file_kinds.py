@@ -3,6 +3,7 @@ read."""
 
 import io
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -82,10 +83,10 @@ def searched(path: Path) -> float:
     """Asks a field and draws the answer and what its latents look like: numbers that can be read may still be
     none to reckon with."""
     field = read_language(path, SCENE.means)
-    scene = Scene(SCENE, field)
-    engine = QueryEngine(scene)
     vector = unit(np.random.default_rng(0).normal(size=field.codec.vector_dim)).astype(np.float32)
-    answer = engine.run("cup", vector=vector)
+    scene = Scene(SCENE, replace(field, phrasebook={"cup": vector}))
+    engine = QueryEngine(scene)
+    answer = engine.run("cup")
     engine.instances(answer)
     values = np.concatenate([answer.relevancy.T, *latent_colours(field)], axis=1)
     drawn = render(scene, scene.framing_camera((32, 24)), values)

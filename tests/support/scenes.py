@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from langsplat_core.arrays import Array, logit, rotation_matrices, unit
-from langsplat_core.query.regions import Regions, build_regions
+from langsplat_core.query.answers import Regions, build_regions
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians, LanguageField, LinearCodec, Scene, look_at
 from langsplat_core.scene.language import Tree

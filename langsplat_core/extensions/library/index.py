@@ -46,7 +46,6 @@ from langsplat_core.query.rule import (
     Outcome,
     RegionTable,
     Verdict,
-    bars_of,
     best_relevancies,
     judge,
     region_fits,
@@ -215,9 +214,9 @@ def digest(path: Path, name: str, load_encoder: LoadEncoder | None) -> Digest:
     taught = tuple(word.key for word in field.taught)
     listed = replace(listed, taught=taught, phrases=len(field.phrasebook))
     made = Digest(listed, field.encoder_id, field.canonical, None, picture)
-    if field.codec.blends or engine.chance is None or not field.known.any():
+    if field.codec.blends or engine.bars is None or not field.known.any():
         return made
-    bars = bars_of(engine.chance)
+    bars = engine.bars
     if not np.isfinite([(bar.median, bar.spread) for bar in bars]).all():
         return made
     columns, regions = _columns(engine), engine.regions.table.counts[0]
@@ -562,7 +561,7 @@ def _vector(library: Library, group: EncoderGroup, text: str, load_encoder: Load
     none = np.zeros((len(LEVELS), 0, 1), np.float32), np.zeros((len(LEVELS), 0), np.float32)
     field = LanguageField(*none, codec, group.canonical, group.encoder_id)
     try:
-        return QueryEngine(Scene(join_gaussians([]), field), load_encoder).text_vector(text)
+        return QueryEngine(Scene(join_gaussians([]), field), load_encoder).text_vectors([text])[0]
     except EncoderError:
         for scene in group.scenes:
             if scene.phrases:

@@ -72,7 +72,7 @@ def test_the_index_has_the_fits_of_the_engine(folder, phrase):
     group = update_library(folder, load_encoder=load).groups[0]
     vector = FakeEncoder().encode_texts([phrase])[0]
     for scene, fits in zip(group.scenes, fits_in(group, vector), strict=True):
-        answer = QueryEngine(load_scene(folder / scene.path)).run(phrase, vector=vector)
+        answer = QueryEngine(load_scene(folder / scene.path), load).run(phrase)
         if scene.path == "linear.spz":
             assert not scene.is_indexed
             assert np.isneginf(fits).all()

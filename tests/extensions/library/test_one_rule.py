@@ -73,7 +73,7 @@ def index_verdicts(engine: QueryEngine, phrases: list[str], folder: Path) -> Ite
     group = read_library(folder / "index", folder).groups[0]
     (scene,) = group.scenes
     for phrase in phrases:
-        (fits,) = fits_in(group, engine.text_vector(phrase))
+        (fits,) = fits_in(group, engine.text_vectors([phrase])[0])
         yield fits, judge(triple(fits), named(phrase), "auto", scene.bars, scene.calibration)
 
 
