@@ -3,7 +3,7 @@
 Features of surface points are matched by RANSAC and refined by ICP (Open3D); renderings check the answer.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -265,8 +265,7 @@ def _one_codec(a: LanguageField, b: LanguageField) -> tuple[Codec, Array]:
 def _one_tree(a: Tree, b: Tree) -> Tree:
     """Return the nodes of `a`, then those of `b`."""
     leaves, parents = (
-        np.where(row == NO_NODE, row, row + np.int32(a.count)) for row in (b.leaves, b.parents)
+        np.where(rows == NO_NODE, rows, rows + np.int32(a.count)) for rows in (b.leaves, b.parents)
     )
-    shifted = replace(b, leaves=leaves, parents=parents)
-    names = [column.name for column in fields(Tree)]
-    return Tree(**{name: np.concatenate([getattr(a, name), getattr(shifted, name)]) for name in names})
+    shifted = {"leaves": leaves, "parents": parents, "levels": b.levels, "votes": b.votes}
+    return Tree(**{name: np.concatenate([getattr(a, name), rows]) for name, rows in shifted.items()})
