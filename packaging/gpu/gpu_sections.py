@@ -57,7 +57,7 @@ from langsplat_core.semantics.encoders import load_encoder
 from langsplat_core.semantics.sam import grid_points, load_segmenter
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language.mask_weights import find_mask_weights
-from langsplat_core.training.radiance.scores import evaluate_views
+from langsplat_core.training.radiance.differentiable import evaluate_views
 from langsplat_core.training.radiance.trainer import train_radiance
 from tests.support.differences import reference_gradients
 

@@ -45,7 +45,7 @@ from langsplat_core.query.rule import RULE
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import Calibration, Fits, PlattScaling
 from langsplat_core.semantics.encoders import load_text_encoder
-from langsplat_core.training.radiance.scores import evaluate_views
+from langsplat_core.training.radiance.differentiable import evaluate_views
 from tests.benchmarks.room import HOLD_OUT, InRooms, MaskOrigin, Room, Seeds, Variant, publish
 from tests.benchmarks.scoring import (
     MIN_GAUSSIANS,

@@ -25,6 +25,7 @@ from langsplat_core.extensions.benchmarks.report import markdown
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Scene
+from langsplat_core.training.radiance.differentiable import evaluate_views
 from langsplat_core.training.radiance.rehearsal import (
     budget_text,
     budgets_for,
@@ -32,7 +33,6 @@ from langsplat_core.training.radiance.rehearsal import (
     supported,
     train_within,
 )
-from langsplat_core.training.radiance.scores import evaluate_views
 from tests.benchmarks.captures import Kind, draw_capture
 
 LARGE = 800  # px, of a window beside them: with dilation as at the photographs' size, and growing
@@ -145,8 +145,9 @@ def _measured(
     progress: Progress,
 ) -> tuple[str, ...]:
     began = time.process_time()
-    found = rehearse(capture, config, train, progress=progress)
-    budget = supported(found, budgets_for(capture, config, len(train)))
+    budgets = budgets_for(capture, config, len(train))
+    found = rehearse(capture, config, budgets, train, progress=progress)
+    budget = supported(found, budgets)
     gaussians = train_within(capture, budget, config, train, progress=progress)
     seconds = time.process_time() - began
     small = capture.read_at(held_out, QUICK.longer_side)

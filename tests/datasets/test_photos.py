@@ -33,7 +33,7 @@ from langsplat_core.errors import FormatError, InputError, LangSplatError
 from langsplat_core.io.hostile import PictureError, is_video
 from langsplat_core.progress import WorkCancelledError, silent
 from langsplat_core.scene import look_at
-from langsplat_core.training.radiance.scores import evaluate_views
+from langsplat_core.training.radiance.differentiable import evaluate_views
 from langsplat_core.training.radiance.trainer import train_radiance
 from tests.support.photographs import (
     CONFIG,

@@ -17,8 +17,12 @@ from langsplat_core.raster import gsplat, load_lifting_rasterizer, load_rasteriz
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera
 from langsplat_core.training.language.mask_weights import find_mask_weights
-from langsplat_core.training.radiance.differentiable import CpuRenderer, CudaRenderer, DifferentiableRenderer
-from langsplat_core.training.radiance.scores import evaluate_views
+from langsplat_core.training.radiance.differentiable import (
+    CpuRenderer,
+    CudaRenderer,
+    DifferentiableRenderer,
+    evaluate_views,
+)
 from langsplat_core.training.radiance.state import PARAMETERS, start
 from langsplat_core.training.radiance.trainer import train_radiance
 from tests.support import gsplat_twin as twin

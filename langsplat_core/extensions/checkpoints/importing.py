@@ -48,9 +48,9 @@ from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.training.language.codec_fit import (
     CodecReport,
     Vocabulary,
+    codebook_of,
     codec_report,
     everyday_vocabulary,
-    exact_codec,
     fit_codec,
 )
 
@@ -296,15 +296,12 @@ def _codec(
     if foreign.codec is not None:
         return foreign.codec, None
     clusters = foreign.clusters
-    if clusters is not None and len(clusters.vectors) <= LARGEST:
+    if clusters is not None and len(clusters.vectors) <= LARGEST and config.kind == "codebook":
         counts = np.bincount(clusters.index[clusters.index >= 0], minlength=len(clusters.vectors))
         used = np.flatnonzero((counts > 0) & _has_meaning(clusters.vectors))
         if len(used) == 0:
             raise InputError("no cluster that Gaussians belong to has a meaning; there is nothing to search")
-        # None for a kind of codec that keeps no vectors as they are.
-        exact = exact_codec(unit(clusters.vectors[used]), counts[used].astype(np.float64), config)
-        if exact is not None:
-            return exact, None
+        return codebook_of(unit(clusters.vectors[used]), counts[used].astype(np.float64)), None
     fitted, judged = _samples(foreign, config.seed)
     codec = fit_codec(fitted, config, vocabulary, progress)
     return codec, codec_report(codec, judged if len(judged) else fitted, vocabulary)

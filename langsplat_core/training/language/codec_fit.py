@@ -1,26 +1,33 @@
 """Fitting codecs to the CLIP vectors of one scene, and what they cost: errors of the relevancy of phrases."""
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-import torch
-from torch import nn
+from scipy.sparse import csr_matrix
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, unit
 from langsplat_core.config import AutoencoderConfig, CodebookConfig, CodecConfig, LinearConfig, check_settings
 from langsplat_core.progress import Progress, silent
-from langsplat_core.scene import CANONICAL_PHRASES, AutoencoderCodec, CodebookCodec, Codec, LinearCodec
+from langsplat_core.scene import (
+    CANONICAL_PHRASES,
+    NO_NODE,
+    AutoencoderCodec,
+    CodebookCodec,
+    Codec,
+    LanguageField,
+    LinearCodec,
+    Tree,
+)
 from langsplat_core.scene.codec import KINDS, principal_colours
+from langsplat_core.scene.surface import Surface
 from langsplat_core.semantics.encoder import PhraseEncoder
 from langsplat_core.semantics.relevancy import Scale, relevancy_of
 from langsplat_core.semantics.vocabulary import everyday_phrases, everyday_vectors
 from langsplat_core.training import one_torch_thread
-from langsplat_core.training.language.kmeans import nearest_centres, spherical_kmeans
 
 log = logging.getLogger("langsplat")
 
@@ -76,26 +83,63 @@ def codec_report(codec: Codec, vectors: Array, vocabulary: Vocabulary) -> CodecR
     return CodecReport(cosine, *relevancy_error(made, vectors, vocabulary))
 
 
-# The paper's codec: an autoencoder of one scene's CLIP vectors.
-#
-# LangSplat section 3.2, with the layer widths of its public code (512-256-128-64-32-d with
-# batch normalisation and ReLU, latent normalised to length 1; decoder d-16-32-64-128-256-256-512 with
-# ReLU) and the paper's loss, L1 plus cosine distance.
+def fit_codec(
+    vectors: Array,
+    config: CodecConfig,
+    vocabulary: Vocabulary,
+    progress: Progress = silent,
+    further: Array | None = None,
+) -> Codec:
+    """Fit a codec to (M, D) float32 unit CLIP vectors, so that phrases of the `vocabulary` find the same.
 
-ENCODER_WIDTHS = (256, 128, 64, 32)
-DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)
+    Deterministic for a given seed on one machine. Raises InputError for settings out of range. further: (M',
+    D) vectors that are not kept, but help a kind that interpolates between what it has seen.
+    """
+    check_settings(config, "--codec.")
+    if further is not None and (KINDS[config.kind].blends or len(vectors) == 0):
+        vectors = np.concatenate([further, vectors])
+    if isinstance(config, CodebookConfig):
+        return fit_codebook(vectors, config, vocabulary, progress)
+    if isinstance(config, AutoencoderConfig):
+        return train_autoencoder(vectors, config, progress)
+    return fit_linear(vectors, config)
+
+
+def fit_linear(vectors: Array, config: LinearConfig) -> LinearCodec:
+    """Fit the leading `config.latent_dim` right singular vectors, the best basis by least squares."""
+    # Through the D x D Gram matrix: D is 512, M may be a million. float64 keeps its squared condition usable.
+    wide = np.asarray(vectors, np.float64)
+    _, axes = np.linalg.eigh(wide.T @ wide)
+    return LinearCodec(np.ascontiguousarray(axes[:, ::-1][:, : config.latent_dim].T, np.float32))
+
+
+# The paper's codec: an autoencoder of one scene's CLIP vectors (LangSplat section 3.2, layers of its code).
+
+ENCODER_WIDTHS = (256, 128, 64, 32)  # each with batch normalisation and ReLU
+DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)  # each with ReLU
 
 
 def train_autoencoder(
     vectors: Array, config: AutoencoderConfig, progress: Progress = silent
 ) -> AutoencoderCodec:
-    """Train the autoencoder of (M, D) unit vectors: Adam with a cosine schedule on random batches.
+    """Train the autoencoder of (M, D) unit vectors, with latents of length 1.
 
-    Progress shows the batch's mean cosine. Deterministic for a given seed on one machine.
+    By the paper's loss, L1 plus cosine distance, and Adam with a cosine schedule on random batches. Progress
+    shows the batch's mean cosine. Deterministic for a given seed on one machine.
     """
+    import torch  # seconds that other kinds need not pay
+    from torch import nn
+
     torch.manual_seed(config.seed)
     data = torch.from_numpy(np.ascontiguousarray(vectors, np.float32))
-    encoder, decoder = networks(data.shape[1], config.latent_dim)
+    layers: list[nn.Module] = []
+    for width, size in pairwise((data.shape[1], *ENCODER_WIDTHS)):
+        layers += [nn.Linear(width, size), nn.BatchNorm1d(size), nn.ReLU()]
+    encoder = nn.Sequential(*layers, nn.Linear(ENCODER_WIDTHS[-1], config.latent_dim))
+    layers = []
+    for width, size in pairwise((config.latent_dim, *DECODER_WIDTHS)):
+        layers += [nn.Linear(width, size), nn.ReLU()]
+    decoder = nn.Sequential(*layers, nn.Linear(DECODER_WIDTHS[-1], data.shape[1]))
     parameters = [*encoder.parameters(), *decoder.parameters()]
     optimiser = torch.optim.Adam(parameters, lr=config.lr, fused=True)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, config.steps)
@@ -117,26 +161,15 @@ def train_autoencoder(
     return AutoencoderCodec(folded_layers(encoder), folded_layers(decoder))
 
 
-def networks(dim: int, latent_dim: int) -> tuple[nn.Sequential, nn.Sequential]:
-    """Return the encoder and the decoder, with random weights."""
-    encoder: list[nn.Module] = []
-    for width, size in pairwise((dim, *ENCODER_WIDTHS)):
-        encoder += [nn.Linear(width, size), nn.BatchNorm1d(size), nn.ReLU()]
-    encoder.append(nn.Linear(ENCODER_WIDTHS[-1], latent_dim))
-    decoder: list[nn.Module] = []
-    for width, size in pairwise((latent_dim, *DECODER_WIDTHS)):
-        decoder += [nn.Linear(width, size), nn.ReLU()]
-    decoder.append(nn.Linear(DECODER_WIDTHS[-1], dim))
-    return nn.Sequential(*encoder), nn.Sequential(*decoder)
-
-
-def _settle_statistics(encoder: nn.Sequential, data: torch.Tensor) -> None:
+def _settle_statistics(encoder: Any, data: Any) -> None:
     """Recompute batch statistics over the data with final weights.
 
     Running averages lag behind them, and with few vectors that lag is most of the reconstruction error.
     """
+    import torch
+
     for module in encoder:
-        if isinstance(module, nn.BatchNorm1d):
+        if isinstance(module, torch.nn.BatchNorm1d):
             module.reset_running_stats()
             module.momentum = None  # cumulative average
     encoder.train()
@@ -144,23 +177,26 @@ def _settle_statistics(encoder: nn.Sequential, data: torch.Tensor) -> None:
         for chunk in data.split(8_192):
             if len(chunk) > 1:
                 encoder(chunk)
-    encoder.eval()
 
 
-def folded_layers(network: nn.Sequential) -> tuple[tuple[Array, Array], ...]:
-    """Weights as (out, in), bias pairs, with each batch normalisation folded into the layer before it."""
+def folded_layers(network: Any) -> tuple[tuple[Array, Array], ...]:
+    """Return (out, in) weights and biases of a torch `Sequential`.
+
+    Each batch normalisation is folded into the layer before it.
+    """
+    from torch import nn
+
     layers: list[tuple[Array, Array]] = []
     for module in network:
         if isinstance(module, nn.Linear):
-            weight, bias = module.weight.detach().double(), module.bias.detach().double()
-            layers.append((weight.numpy(), bias.numpy()))
+            layers.append((module.weight.detach().double().numpy(), module.bias.detach().double().numpy()))
         elif isinstance(module, nn.BatchNorm1d):
             assert module.running_mean is not None
             assert module.running_var is not None
-            scale = (module.weight / torch.sqrt(module.running_var + module.eps)).detach().double().numpy()
+            scale = (module.weight / (module.running_var + module.eps).sqrt()).detach().double().numpy()
             shift = module.bias.detach().double().numpy() - module.running_mean.double().numpy() * scale
-            last_weight, last_bias = layers[-1]
-            layers[-1] = (last_weight * scale[:, None], last_bias * scale + shift)
+            weight, bias = layers[-1]
+            layers[-1] = (weight * scale[:, None], bias * scale + shift)
     return tuple((w.astype(np.float32), b.astype(np.float32)) for w, b in layers)
 
 
@@ -186,12 +222,16 @@ def fit_codebook(
         progress("codebook", 0.1 + 0.6 * min(size / 2_048, 1), f"{size} codewords")
         return rounded(spherical_kmeans(fitted, size, 8 if start is None else 4, start, generator))
 
+    def error(codewords: Array) -> float:
+        made = codewords[nearest_centres(judged, codewords)[0]]
+        return relevancy_error(made, judged, vocabulary)[0]
+
     if config.size:
         codewords = grow(config.size, None)
     else:
         # With fewer than four vectors per codeword, a codebook is a copy.
         most = max(min(len(fitted) // 4, 65_535), 1)
-        codewords = _smallest(grow, most, judged, config.max_relevancy_error, vocabulary)
+        codewords = _smallest(grow, error, most, config.max_relevancy_error)
     progress("colours of the codewords", 0.8)
     nearest, _ = nearest_centres(fitted, codewords)
     usage = np.bincount(nearest, minlength=len(codewords)).astype(np.float64)
@@ -205,20 +245,13 @@ def codebook_of(vectors: Array, usage: Array) -> CodebookCodec:
 
 
 def _smallest(
-    grow: Callable[[int, Array | None], Array],
-    most: int,
-    judged: Array,
-    budget: float,
-    vocabulary: Vocabulary,
+    grow: Callable[[int, Array | None], Array], error_of: Callable[[Array], float], most: int, budget: float
 ) -> Array:
-    """Return the smallest codebook within `budget`.
-
-    Sizes are doubled, then the last interval is halved twice.
-    """
+    """Smallest codebook within `budget`: sizes are doubled, then the last interval is halved twice."""
     size, smaller = min(64, most), None
     while True:
         codewords = grow(size, smaller)
-        error = codebook_error(codewords, judged, vocabulary)
+        error = error_of(codewords)
         if error <= budget or size == most or len(codewords) < size:
             break
         smaller, size = codewords, min(2 * size, most)
@@ -230,72 +263,163 @@ def _smallest(
     for _ in range(2):
         middle = round((low * high) ** 0.5)
         tried = grow(middle, smaller)
-        if codebook_error(tried, judged, vocabulary) <= budget:
+        if error_of(tried) <= budget:
             codewords, high = tried, middle
         else:
             smaller, low = tried, middle
     return codewords
 
 
-def codebook_error(codewords: Array, vectors: Array, vocabulary: Vocabulary) -> float:
-    """Mean error of relevancy when every vector is replaced by its nearest codeword."""
-    nearest, _ = nearest_centres(vectors, codewords)
-    return relevancy_error(codewords[nearest], vectors, vocabulary)[0]
-
-
 def rounded(numbers: Array) -> Array:
-    """Numbers rounded to float16, as float32."""
+    """Return numbers rounded to float16, as float32."""
     return numbers.astype(np.float16).astype(np.float32)
 
 
-# Fitting a codec to the CLIP vectors of one scene.
+# Spherical k-means: few unit vectors that many lie close to (Dhillon and Modha 2001). scikit-learn's knows
+# neither the sphere nor a growing codebook.
+
+CHUNK = 8_192  # vectors compared with all centres at a time
+STEP = 8  # one in so many centres is added, or given up, at a time
 
 
-def fit_codec(
+def nearest_centres(vectors: Array, centres: Array) -> tuple[Array, Array]:
+    """Return the (M,) int64 nearest centre of each vector, and its (M,) float32 cosine.
+
+    vectors: (M, D), centres: (K, D) float32 unit vectors.
+    """
+    nearest, cosines, _ = _assigned(vectors, centres)
+    return nearest, cosines
+
+
+def _assigned(vectors: Array, centres: Array, gains: bool = False) -> tuple[Array, Array, Array]:
+    """(M,) nearest centre of each vector, its cosine, and, where asked, by how much the next is further."""
+    nearest, cosines = np.empty(len(vectors), np.int64), np.empty(len(vectors), np.float32)
+    gain = np.zeros(len(vectors), np.float32)
+    for start in range(0, len(vectors), CHUNK):
+        part = slice(start, start + CHUNK)
+        products = vectors[part] @ centres.T
+        nearest[part] = products.argmax(1)
+        cosines[part] = np.take_along_axis(products, nearest[part, None], 1)[:, 0]
+        if gains:
+            np.put_along_axis(products, nearest[part, None], -1, 1)
+            gain[part] = cosines[part] - products.max(1)
+    return nearest, cosines, gain
+
+
+def spherical_kmeans(
     vectors: Array,
-    config: CodecConfig,
-    vocabulary: Vocabulary,
-    progress: Progress = silent,
-    further: Array | None = None,
-) -> Codec:
-    """Fit a codec to (M, D) float32 unit CLIP vectors, so that phrases of the `vocabulary` find the same.
+    count: int,
+    rounds: int = 8,
+    start: Array | None = None,
+    generator: np.random.Generator | None = None,
+) -> Array:
+    """Return at most `count` unit centres (K, D) float32 of (M, D) float32 unit vectors.
 
-    Deterministic for a given seed on one machine. Raises InputError for settings out of range. further: (M',
-    D) vectors that are not kept, but help a kind that interpolates between what it has seen.
+    Begins at `start` (K' <= count centres) and adds vectors that these fit badly, drawn by their distance: a
+    quarter more than asked for, of which those are given up again, round by round, that would be missed
+    least. That finds the gaps which plain k-means leaves where two clusters share a centre. Fewer than
+    `count` come back where fewer different vectors are there.
     """
-    check_settings(config, "--codec.")
-    if further is not None and (KINDS[config.kind].blends or len(vectors) == 0):
-        vectors = np.concatenate([further, vectors])
-    return FITTERS[config.kind](vectors, config, vocabulary, progress)
+    generator = generator or np.random.default_rng(0)
+    centres = np.zeros((0, vectors.shape[1]), np.float32) if start is None else start
+    extra = (count - len(centres)) / 4
+    centres = _grown(vectors, centres, count + round(extra), generator)
+    for done in range(1, rounds + 1):
+        nearest, kept = _worth_keeping(vectors, centres, count + round(extra * max(1 - 2 * done / rounds, 0)))
+        centres = _means(vectors, nearest, len(centres))[kept]
+    while True:
+        _, kept = _worth_keeping(vectors, centres, count)
+        if kept.all():
+            return centres
+        centres = centres[kept]
 
 
-def fit_linear(vectors: Array, config: LinearConfig) -> LinearCodec:
-    """Fit the leading `config.latent_dim` right singular vectors.
+def _worth_keeping(vectors: Array, centres: Array, size: int) -> tuple[Array, Array]:
+    """(M,) nearest centre of each vector, and (K,) bool: all that serve some, without those missed least.
 
-    They are the best basis in the least-squares sense (Eckart-Young).
+    Where there are more than `size`. Only one in `STEP` goes at a time, because of two that are alike neither
+    is missed.
     """
-    # Through the D x D Gram matrix: D is 512, M may be a million. float64 keeps its squared condition usable.
-    wide = np.asarray(vectors, np.float64)
-    _, axes = np.linalg.eigh(wide.T @ wide)
-    return LinearCodec(np.ascontiguousarray(axes[:, ::-1][:, : config.latent_dim].T, np.float32))
+    nearest, _, gain = _assigned(vectors, centres, gains=True)
+    missed = np.bincount(nearest, gain, len(centres))  # by how much the sum of cosines would fall
+    spare = min(max(len(missed) - size, 0), 1 + len(missed) // STEP)
+    kept = np.bincount(nearest, minlength=len(centres)) > 0
+    kept[np.argsort(missed, kind="stable")[:spare]] = False
+    return nearest, kept
 
 
-def exact_codec(vectors: Array, usage: Array, config: CodecConfig) -> Codec | None:
-    """Return the codec whose latents stand for just the (K, D) float32 unit vectors.
+def _grown(vectors: Array, centres: Array, count: int, generator: np.random.Generator) -> Array:
+    """`centres` and badly fitted vectors, few at a time: one gap is not filled ten times."""
+    distance = np.full(len(vectors), 2, np.float32)
+    new = centres if len(centres) else vectors[_badly_fitted(distance, 1, generator)]
+    while True:
+        distance = np.minimum(distance, 1 - nearest_centres(vectors, new)[1])
+        centres = np.concatenate([centres, new]) if new is not centres else centres
+        rows = _badly_fitted(distance, min(count - len(centres), 1 + len(centres) // STEP), generator)
+        if len(rows) == 0:
+            return centres
+        new = vectors[rows]
 
-    They occur (K,) `usage` times. None for a kind that only comes near to them.
+
+def _badly_fitted(distance: Array, count: int, generator: np.random.Generator) -> Array:
+    """Up to `count` rows, drawn without repetition in proportion to (M,) distances; none that fit."""
+    weights = np.where(distance > 1e-5, distance, 0).astype(np.float64)
+    possible = int((weights > 0).sum())
+    if possible == 0:
+        return np.zeros(0, np.int64)
+    return generator.choice(len(weights), min(count, possible), replace=False, p=weights / weights.sum())
+
+
+def _means(vectors: Array, nearest: Array, count: int) -> Array:
+    """(K, D) float32 directions of the sums over each centre's vectors."""
+    order = np.argsort(nearest, kind="stable")
+    used, firsts = np.unique(nearest[order], return_index=True)
+    means = np.zeros((count, vectors.shape[1]), np.float32)
+    means[used] = unit(np.add.reduceat(vectors[order], firsts, axis=0))
+    return means
+
+
+# Colours of codewords by which neighbouring things are told apart.
+
+FEWEST_LINKS = 10  # between the surfaces of two nodes that are neighbours
+LEAST = 30  # Gaussians of a node that has a say
+
+
+def contrasting_colours(field: LanguageField, tree: Tree, surface: Surface) -> Array | None:
+    """Return (K, 3) float32 colours in [0, 1] of a codebook's words, the same for all levels and views.
+
+    None where nothing lies beside anything else. The axes are those along which the mean vectors of
+    neighbouring nodes, at all levels, differ the most. Along each, words are ranked, so that all of it is
+    used: a node has as much say in that as another, however large it is.
     """
-    return EXACT[config.kind](vectors, usage) if config.kind in EXACT else None
-
-
-# By the kind: the fit, and the codec of given vectors.
-FITTERS: Mapping[str, Callable[[Array, Any, Vocabulary, Progress], Codec]] = MappingProxyType(
-    {
-        "codebook": fit_codebook,
-        "autoencoder": lambda vectors, config, vocabulary, progress: train_autoencoder(
-            vectors, config, progress
-        ),
-        "linear": lambda vectors, config, vocabulary, progress: fit_linear(vectors, config),
-    }
-)
-EXACT: Mapping[str, Callable[[Array, Array], Codec]] = MappingProxyType({"codebook": codebook_of})
+    vectors = field.codec.decode(np.arange(field.codec.size, dtype=np.uint16)[:, None]).astype(np.float64)
+    ends = np.stack([surface.rows[end] for end in surface.ends])
+    differences, weights = [np.zeros((0, vectors.shape[1]))], np.zeros(len(vectors))
+    for level in range(len(field.latents)):
+        codes, node = field.latents[level, :, 0], tree.at(level)
+        counted = np.flatnonzero((node != NO_NODE) & field.known[level])
+        names, number, sizes = np.unique(node[counted], return_inverse=True, return_counts=True)
+        if len(names) == 0:
+            continue
+        has_say = sizes[number] >= LEAST
+        weights += np.bincount(codes[counted][has_say], 1 / sizes[number][has_say], len(vectors))
+        shape = (len(names), len(vectors))
+        shares = csr_matrix((1 / sizes[number], (number, codes[counted])), shape=shape)
+        place = np.full(int(node.max(initial=0)) + 1, -1)
+        place[names] = np.arange(len(names))
+        beside = np.sort(np.where(node[ends] == NO_NODE, -1, place[node[ends]]), axis=0)
+        beside = beside[:, (beside[0] >= 0) & (beside[0] < beside[1])]
+        pairs, links = np.unique(beside, axis=1, return_counts=True)
+        first, second = pairs[:, (links >= FEWEST_LINKS) & (sizes[pairs] >= LEAST).all(0)]
+        means = shares @ vectors
+        differences.append(means[first] - means[second])
+    found = np.concatenate(differences)
+    if not found.any() or vectors.shape[1] < 3:
+        return None
+    values = vectors @ np.linalg.eigh(found.T @ found)[1][:, :-4:-1]
+    ranks = np.empty(values.shape, np.float32)  # share of the weights that lies below each value
+    for axis in range(3):
+        order = np.argsort(values[:, axis], kind="stable")
+        below = np.cumsum(weights[order])
+        ranks[order, axis] = (below - weights[order] / 2) / max(below[-1], 1e-30)
+    return ranks

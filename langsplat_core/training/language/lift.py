@@ -30,35 +30,23 @@ class Lifted:
     confidence: Array  # (3, n) float32 total blending weight, in pixels
 
 
-def lift_block(mask_weights: MaskWeights, groups: MaskGroups, number: int, robust: bool) -> Lifted:
-    """Lift onto the Gaussians of one block; `robust` takes the geometric median, else the mean."""
-    return lift_weights(mask_weights.block(number, groups), groups.vectors, robust)
-
-
 def lift_sample(
     mask_weights: MaskWeights, groups: MaskGroups, rows: Array, robust: bool, progress: Progress = silent
 ) -> Lifted:
     """Lift onto the Gaussians at `rows`, which ascend."""
-    parts = []
+    parts = [sparse.csr_matrix((0, len(LEVELS) * len(groups.vectors)), dtype=np.float32)]
     for number, (first, last) in enumerate(mask_weights.blocks):
         inside = rows[(rows >= first) & (rows < last)] - first
         if len(inside):
-            weights = mask_weights.block(number, groups)[inside]
-            parts.append(lift_weights(weights, groups.vectors, robust))
+            parts.append(mask_weights.block(number, groups)[inside])
         progress("averaging the masks of a sample", last / mask_weights.count)
-    if not parts:
-        nothing = np.zeros((len(LEVELS), 0, groups.vectors.shape[1]), np.float32)
-        return Lifted(nothing, np.zeros((len(LEVELS), 0), np.float32))
-    return Lifted(
-        np.concatenate([part.vectors for part in parts], axis=1),
-        np.concatenate([part.confidence for part in parts], axis=1),
-    )
+    return lift_weights(sparse.vstack(parts, "csr"), groups.vectors, robust)
 
 
 def lift_weights(weights: sparse.csr_matrix, vectors: Array, robust: bool) -> Lifted:
     """Lift by the (n, 3 G) weights of n Gaussians in G groups of masks, level after level.
 
-    vectors: (G, D) float32 unit vectors of the groups.
+    vectors: (G, D) float32 unit vectors of the groups; `robust` takes the geometric median, else the mean.
     """
     lifted = Lifted(
         np.zeros((len(LEVELS), weights.shape[0], vectors.shape[1]), np.float32),
@@ -129,10 +117,9 @@ def lift_latents(
     codec: Codec,
     progress: Progress = silent,
 ) -> tuple[Array, Array]:
-    """Return the paper's quantity in one pass: (3, N, d) latents ``W^T H / W^T 1`` and (3, N) confidence.
+    """Return (3, N, d) latents ``W^T H / W^T 1`` and (3, N) confidence.
 
-    H holds the encoded vector of each pixel's mask; pixels without a mask count in neither sum. All three
-    levels go through one gather per view.
+    H holds the encoded vector of each pixel's mask; pixels without a mask count in neither sum.
     """
     count, d = len(gaussians), codec.latent_dim
     total = np.zeros((count, len(LEVELS), d + 1))
@@ -156,25 +143,15 @@ def lift_latents(
 # LangSplat (section 3.3, and its public code): everything but the language features is frozen; a step
 # compares one photograph's latents H with the blended features, ``F = W y``, by their mean absolute
 # difference over pixels with a mask, and Adam moves the features x. The renderer is linear, so that a step
-# is one `splat` and one `gather`:
+# is one `splat` and one `gather`, which serve all three levels:
 #
 #     d loss / d y = W^T (mask * sign(F - H)) / (pixels times d).
 #
 # What is blended is y = x, or, as published, y = x / (|x| + 1e-9). The published start at zero then makes
 # the first gradients about 1e9 times too large, which Adam's second moment must forget before anything
-# moves; from the one-pass mean the same loss is reached much sooner. The three levels share W and do not
-# otherwise meet: one splat and one gather serve them all.
+# moves; from the one-pass mean the same loss is reached much sooner.
 
 KEPT_BYTES = 4e9  # weights of views that are kept; further views are projected again at every step
-
-
-@dataclass(frozen=True, eq=False)
-class _Target:
-    """One photograph: its camera, and what each pixel ought to show at every level."""
-
-    camera: Camera
-    labels: Array  # (3, H, W) int32, -1 for none
-    latents: Array  # (M, d) float32 of the masks
 
 
 def lift_by_gradient(
@@ -199,7 +176,7 @@ def lift_by_gradient(
     features = torch.from_numpy(x)  # the same memory
     adam = torch.optim.Adam([features], config.lr, (0.9, 0.999), 1e-15, fused=True)  # as in the INRIA code
     targets = [
-        _Target(camera, np.asarray(seen.labels, np.int32), plain(codec.encode(seen.vectors)))
+        (camera, np.asarray(seen.labels, np.int32), plain(codec.encode(seen.vectors)))
         for camera, seen in views
     ]
     kept: dict[int, LiftingView] = {}
@@ -209,14 +186,15 @@ def lift_by_gradient(
         if step and step % len(views) == 0:  # each view once in every pass
             order = generator.permutation(len(views))
         index = int(order[step % len(views)])
+        camera, labels, latents = targets[index]
         view = kept.get(index)
         if view is None:  # the geometry is frozen: weights are kept as far as memory allows
-            view = rasterizer.view(gaussians, targets[index].camera)
+            view = rasterizer.view(gaussians, camera)
             if sum(one.nbytes for one in kept.values()) <= KEPT_BYTES:
                 frozen = view.frozen()
                 if frozen is not view:
                     view = kept[index] = frozen
-        loss, gradient = loss_and_gradient(view, targets[index], blended(x) if published else x)
+        loss, gradient = _loss_and_gradient(view, labels, latents, blended(x) if published else x)
         features.grad = torch.from_numpy(plain(by_features(x, gradient) if published else gradient))
         adam.step()
         if (step + 1) % 20 == 0 or step + 1 == config.steps:
@@ -225,30 +203,27 @@ def lift_by_gradient(
 
 
 def blended(x: Array) -> Array:
-    """Return the values that are blended as published, for (..., d) features: x / (|x| + 1e-9)."""
+    """Return the values that are blended as published, x / (|x| + 1e-9) of (..., d) features."""
     return x / (np.linalg.norm(x, axis=-1, keepdims=True) + 1e-9)
 
 
 def by_features(x: Array, by_y: Array) -> Array:
-    """Return the gradient by x from that by y = `blended` x.
-
-    At zero the norm's own gradient counts as zero.
-    """
+    """Return the gradient by x from that by y = `blended` x; at zero the norm's own counts as zero."""
     length = np.linalg.norm(x, axis=-1, keepdims=True)
     along = (x * by_y).sum(-1, keepdims=True) / np.maximum(length, 1e-30)
     return by_y / (length + 1e-9) - x * along / (length + 1e-9) ** 2
 
 
-def loss_and_gradient(view: LiftingView, target: _Target, y: Array) -> tuple[float, Array]:
-    """Return the masked L1 of one view, and its (3, N, d) gradient by y.
+def _loss_and_gradient(view: LiftingView, labels: Array, latents: Array, y: Array) -> tuple[float, Array]:
+    """Masked L1 of one view, the mean over levels, pixels and numbers, and its (3, N, d) gradient by y.
 
-    The mean over levels, pixels and numbers.
+    What each pixel ought to show: the row of the (M, d) `latents` by its (3, H, W) `labels`, -1 for none.
     """
     levels, count, d = y.shape
     image = view.splat(np.ascontiguousarray(np.moveaxis(y, 0, 1).reshape(count, levels * d)))[0]
     signs, losses = np.empty_like(image), np.empty(len(image))
     share = np.float32(1 / image.size)
-    shared_workers().run(_compare, len(image), image, target.labels, target.latents, share, signs, losses)
+    shared_workers().run(_compare, len(image), image, labels, latents, share, signs, losses)
     gradient = view.gather(signs)
     return float(losses.sum() / image.size), np.moveaxis(gradient.reshape(count, levels, d), 1, 0)
 

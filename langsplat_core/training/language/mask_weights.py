@@ -20,15 +20,14 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.scene import LEVELS, NO_NODE, Camera, Gaussians, Tree
 from langsplat_core.semantics.store import ImageFeatures
-from langsplat_core.training.language.kmeans import nearest_centres, spherical_kmeans
+from langsplat_core.training.language.codec_fit import nearest_centres, spherical_kmeans
 
 
 @dataclass(frozen=True, eq=False)
 class MaskGroups:
     """Groups of masks that say the same: the group, of G, of every mask of every view.
 
-    A Gaussian is seen by a hundred masks in a hundred photographs, and most say one of a few things; grouped
-    first, its median is taken over a few vectors instead.
+    Most of the hundred masks that show a Gaussian say one of a few things: its median is taken over these.
     """
 
     of_mask: tuple[Array, ...]  # of each view, (M,) int32
@@ -75,10 +74,7 @@ class MaskWeights:
         return [np.searchsorted(view["row"], firsts) for view in self.pairs]
 
     def block(self, number: int, groups: MaskGroups) -> sparse.csr_matrix:
-        """Return the (n, 3 G) float32 weights, in pixels, of a block's Gaussians.
-
-        In the G groups at each level, level after level.
-        """
+        """Return the (n, 3 G) weights, in pixels, of a block's Gaussians in the groups, level after level."""
         first, last = self.blocks[number]
         rows, columns, weights = [], [], []
         for pairs, edges, group in zip(self.pairs, self._edges, groups.of_mask, strict=True):
@@ -93,10 +89,10 @@ class MaskWeights:
         return sparse.coo_matrix(entries, shape).tocsr()  # which adds up what falls on one place
 
     def sums(self, sets: Array, size: int, counts: Sequence[int]) -> tuple[sparse.csr_matrix, Array]:
-        """Return the float32 pixels that each set of Gaussians paints of each mask, and labels of masks.
+        """Return the (size, masks of all views) float32 pixels that each set of Gaussians paints.
 
-        (size, masks of all views), and the int32 view and level of each mask as one number, 3 view + level.
-        sets: (N,) set of each Gaussian, -1 for those of none; counts: number of masks of each view.
+        And the int32 view and level of each mask as one number, 3 view + level. sets: (N,) set of each
+        Gaussian, -1 for those of none; counts: number of masks of each view.
         """
         views, labelling = [sparse.csr_matrix((size, 0))], [np.zeros(0, np.int32)]
         for view, (pairs, count) in enumerate(zip(self.pairs, counts, strict=True)):
@@ -151,14 +147,12 @@ def view_pairs(
     return pairs
 
 
-# 3D instances: which masks of different photographs show one and the same, and so which Gaussians belong
-# together.
+# 3D instances: which Gaussians belong together, by the plainest form of MaskClustering (Yan et al. 2024).
 #
 # Two masks of different views are of one instance where most of what they claim, among the Gaussians that
 # both views see, is claimed by both; masks linked so, directly or not, are one instance, and a Gaussian
 # belongs to the instance whose masks it paints most of. No vector is looked at: that the front and the back
-# of a thing have slightly different vectors does not tear it apart. (Clustering masks by what they claim in
-# 3D is known from MaskClustering, Yan et al. 2024; this is its plainest form.)
+# of a thing have slightly different vectors does not tear it apart.
 
 SAME = 0.6  # overlap over union of what two masks claim from which they are one instance
 SAMPLE = 50_000  # Gaussians that decide which masks go together: what is compared grows with views squared
@@ -191,10 +185,7 @@ def find_instances(
 def instances_of_masks(
     mask_weights: MaskWeights, counts: Sequence[int], level: int, sample: int = SAMPLE
 ) -> Array:
-    """Return the (M,) number, from 0, of the instance that each mask of all views shows.
-
-    -1 for masks of other levels and for those that claim nothing.
-    """
+    """Return the (M,) instance that each mask shows; -1 for other levels and masks that claim nothing."""
     view_of = np.repeat(np.arange(len(counts)), counts)
     claims = _claims(mask_weights, np.cumsum([0, *counts]), level, sample)
     _, found = connected_components(_overlapping(claims, view_of), directed=False)

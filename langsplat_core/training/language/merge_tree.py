@@ -29,7 +29,9 @@ from langsplat_core.arrays import Array
 from langsplat_core.compiled import kernel, shared_workers
 from langsplat_core.io.shapes import base_colours
 from langsplat_core.progress import Progress, silent
-from langsplat_core.scene import LEVELS, Gaussians
+from langsplat_core.raster.protocol import LiftingView
+from langsplat_core.raster.reference import project
+from langsplat_core.scene import LEVELS, Camera, Gaussians
 from langsplat_core.scene.surface import Surface, divide, surface_areas
 from langsplat_core.training.language.mask_weights import MaskWeights
 
@@ -71,17 +73,6 @@ class MergeTree:
 
 
 @dataclass(frozen=True, eq=False)
-class Borders:
-    """Two neighbouring patches a row, first < second, with sums over the L links between them."""
-
-    first: Array  # (B,) int32
-    second: Array  # (B,) int32
-    links: Array  # (B,) float64 count
-    disagreement: Array  # (B,) float64 sum
-    concavity: Array  # (B,) float64 sum
-
-
-@dataclass(frozen=True, eq=False)
 class Patches:
     """The masks, colours, areas and borders of P patches, from which they are merged."""
 
@@ -89,7 +80,8 @@ class Patches:
     labelling: Array  # (masks of all views,) int32 view and level of each mask, counted through
     colours: Array  # (P, 3) mean chromaticity
     areas: Array  # (P,) > 0
-    borders: Borders
+    borders: Array  # (2, B) int32 neighbouring patches, the first one's number is the lower
+    sums: Array  # (B, 3) float64 over the links between them: their count, disagreement, concavity
 
 
 def find_tree(
@@ -120,7 +112,7 @@ def find_tree(
         *mask_weights.sums(everywhere, len(sizes), counts),
         np.stack([np.bincount(of, channel) / sizes for channel in colours.T], 1),
         np.maximum(np.bincount(of, surface_areas(gaussians)[surface.rows]), 1e-30),
-        find_borders(of, surface.ends, disagreement, concavity),
+        *find_borders(of, surface.ends, disagreement, concavity),
     )
     children, costs = merge(patches, progress)
     near = surface.anchors >= 0
@@ -134,7 +126,7 @@ def find_tree(
 def link_disagreement(surface: Surface, mask_weights: MaskWeights, progress: Progress = silent) -> Array:
     """Return the (E,) share of views and levels in which the ends of each link lie in two masks.
 
-    In [0, 1], of those where both lie in one, weighted by the pixels of the fainter end, at most `ENOUGH`.
+    Of those where both lie in one, weighted by the pixels of the fainter end, at most `ENOUGH`.
     """
     first, second = surface.ends
     apart, seen = np.zeros(len(first), np.float32), np.zeros(len(first), np.float32)
@@ -158,21 +150,14 @@ def link_disagreement(surface: Surface, mask_weights: MaskWeights, progress: Pro
 
 @kernel
 def _compare(
-    start: int,
-    stop: int,
-    first: Array,
-    second: Array,
-    masks: Array,
-    weights: Array,
-    apart: Array,
-    seen: Array,
+    begin: int, end: int, first: Array, second: Array, masks: Array, most: Array, apart: Array, seen: Array
 ) -> None:
-    """Add a view's levels to links [start, stop): (3, M) mask and weight of each Gaussian."""
-    for link in range(start, stop):
+    """Add a view's levels to links [begin, end): (3, M) mask and weight of each Gaussian."""
+    for link in range(begin, end):
         a, b = first[link], second[link]
         for level in range(masks.shape[0]):
             if masks[level, a] >= 0 and masks[level, b] >= 0:
-                weight = min(weights[level, a], weights[level, b], np.float32(ENOUGH))
+                weight = min(most[level, a], most[level, b], np.float32(ENOUGH))
                 seen[link] += weight
                 if masks[level, a] != masks[level, b]:
                     apart[link] += weight
@@ -208,18 +193,19 @@ def _normals(surface: Surface) -> Array:
 # Patches, and their merging.
 
 
-def find_borders(of: Array, ends: tuple[Array, Array], disagreement: Array, concavity: Array) -> Borders:
-    """Return the borders of patches.
+def find_borders(
+    of: Array, ends: tuple[Array, Array], disagreement: Array, concavity: Array
+) -> tuple[Array, Array]:
+    """Return the borders of patches, and the sums over their links, see `Patches`.
 
     of: (M,) patch of each end; ends, disagreement, concavity: (E,) of each link.
     """
-    a, b = of[ends[0]].astype(np.int64), of[ends[1]].astype(np.int64)
-    between, size = a != b, int(of.max(initial=-1)) + 1
-    keys = np.minimum(a, b)[between] * size + np.maximum(a, b)[between]
-    found, row = np.unique(keys, return_inverse=True)
-    sums = [np.bincount(row, values[between], len(found)) for values in (disagreement, concavity)]
-    first, second = (found // max(size, 1)).astype(np.int32), (found % max(size, 1)).astype(np.int32)
-    return Borders(first, second, np.bincount(row, minlength=len(found)).astype(np.float64), *sums)
+    sides = np.sort(np.stack([of[end] for end in ends]).astype(np.int64), axis=0)
+    between, size = sides[0] != sides[1], int(of.max(initial=-1)) + 1
+    found, row = np.unique(sides[0, between] * size + sides[1, between], return_inverse=True)
+    values = np.ones(int(between.sum())), disagreement[between], concavity[between]
+    sums = np.stack([np.bincount(row, value, len(found)) for value in values], 1)
+    return np.stack(np.divmod(found, max(size, 1))).astype(np.int32), sums
 
 
 class _Merger:
@@ -233,17 +219,15 @@ class _Merger:
         self._columns = [*np.split(masses.indices, ends), *[np.zeros(0, np.int32)] * spare]
         self._values = [*np.split(masses.data, ends), *[np.zeros(0, np.float32)] * spare]
         self._pixels = np.zeros((most, int(patches.labelling.max(initial=-1)) + 1), np.float32)
-        entries = sparse.csr_matrix((masses.data, patches.labelling[masses.indices], masses.indptr),
-            shape=(count, self._pixels.shape[1]))  # fmt: skip
+        columns = patches.labelling[masses.indices]
+        entries = sparse.csr_matrix((masses.data, columns, masses.indptr), (count, self._pixels.shape[1]))
         self._pixels[:count] = entries.toarray()
         self._areas = np.concatenate([patches.areas, np.zeros(spare)])
         self._colours = np.zeros((most, 3))
         self._colours[:count] = patches.colours * patches.areas[:, None]
         self._plain = PLAIN * float(patches.areas.sum())
         self.neighbours: list[dict[int, Array]] = [{} for _ in range(most)]
-        borders = patches.borders
-        sums = np.stack([borders.links, borders.disagreement, borders.concavity], 1)
-        for a, b, own in zip(borders.first.tolist(), borders.second.tolist(), sums, strict=True):
+        for a, b, own in zip(*patches.borders.tolist(), patches.sums, strict=True):
             self.neighbours[a][b] = self.neighbours[b][a] = own
 
     def cost(self, a: int, b: int) -> float:
@@ -327,3 +311,84 @@ def _agreement(
             i += 1
             j += 1
     return agreed / seen
+
+
+# Label maps of patches and nodes: what each pixel of a photograph shows of them.
+
+SOLID = 0.5  # of a pixel: where the Gaussians cover less, there is nothing
+CELL = 8  # pixels a side, in which patches of one channel keep apart
+
+
+def draw_patches(view: LiftingView, gaussians: Gaussians, patches: Array) -> Array:
+    """Return the (H, W) int32 patch that most of each pixel is, -1 for none.
+
+    patches: (N,) int32 of the Gaussians, -1 for those of none. Patches whose boxes in the image do not meet
+    share a channel, so that thousands take some dozen.
+    """
+    inside = patches >= 0
+    if not inside.any():
+        return np.full((view.camera.height, view.camera.width), -1, np.int32)
+    shown = np.bincount(patches[inside], view.contributions()[inside]) >= 1  # pixel
+    channel_of, owners = _share_channels(_boxes(view.camera, gaussians, patches, len(shown)), shown)
+    channels, view = np.where(inside, channel_of[patches], -1), view.frozen()
+    most = np.zeros((view.camera.height, view.camera.width), np.float32)
+    drawn = np.full(most.shape, -1, np.int32)
+    rows, columns = np.indices(most.shape) // CELL
+    for some in np.split(np.arange(len(owners)), np.arange(32, len(owners), 32)):
+        image, alpha = view.splat((channels[:, None] == some).astype(np.float32))
+        best = image.max(-1)
+        more = (best > most) & (alpha > SOLID)
+        drawn[more] = owners[some[image.argmax(-1)[more]], rows[more], columns[more]]
+        most = np.where(more, best, most)
+    return drawn
+
+
+def _boxes(camera: Camera, gaussians: Gaussians, patches: Array, count: int) -> Array:
+    """(P, 4) left, top, right, bottom cell of what each patch may paint, the last two exclusive."""
+    footprints = project(gaussians, camera)
+    drawn = np.flatnonzero((patches >= 0) & (footprints.opacities > 0))
+    low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+    np.minimum.at(low, patches[drawn], footprints.means_px[drawn] - footprints.extents_px[drawn] - 1)
+    np.maximum.at(high, patches[drawn], footprints.means_px[drawn] + footprints.extents_px[drawn] + 1)
+    size = camera.width, camera.height
+    boxes = np.concatenate([np.clip(low, 0, size) // CELL, -(-np.clip(high, 0, size) // CELL)], 1)
+    return np.asarray(boxes.astype(np.int64))
+
+
+def _share_channels(boxes: Array, shown: Array) -> tuple[Array, Array]:
+    """(P,) channel of each patch, -1 for those not shown, and (C, rows, columns) patches in each cell.
+
+    The largest boxes choose first.
+    """
+    channel_of = np.full(len(boxes), -1)
+    owners: list[Array] = []
+    rows, columns = (int(boxes[:, side].max(initial=0)) for side in (3, 2))
+    areas = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
+    seen = np.flatnonzero(shown & (boxes[:, :2] < boxes[:, 2:]).all(1))
+    for patch in seen[np.argsort(-areas[seen], kind="stable")]:
+        left, top, right, bottom = boxes[patch]
+        place = np.s_[top:bottom, left:right]
+        free = (number for number, owner in enumerate(owners) if owner[place].max() < 0)
+        channel_of[patch] = channel = next(free, len(owners))
+        if channel == len(owners):
+            owners.append(np.full((rows, columns), -1, np.int32))
+        owners[channel][place] = patch
+    return channel_of, np.array(owners, np.int32).reshape(-1, rows, columns)
+
+
+def nested_maps(drawn: Array, cuts: Sequence[Array], least: float) -> Array:
+    """Return label maps (3, H, W) int32, as of `masks.label_maps`, of the nodes of patches.
+
+    drawn: (H, W) patches, -1 for none; cuts: (P,) node of each patch at each level; least: share of the image
+    below which a node is left out.
+    """
+    maps = np.full((len(cuts), *drawn.shape), -1, np.int32)
+    first, there = 0, drawn >= 0
+    for level, nodes in zip(maps, cuts, strict=True):
+        found = nodes[drawn[there]]
+        kept = np.flatnonzero(np.bincount(found) >= max(least * drawn.size, 1))
+        rows = np.full(int(nodes.max(initial=-1)) + 1, -1, np.int32)
+        rows[kept] = np.arange(first, first + len(kept))
+        level[there] = rows[found]
+        first += len(kept)
+    return maps

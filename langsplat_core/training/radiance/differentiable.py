@@ -1,10 +1,10 @@
-"""Rendering with gradients by every parameter of the Gaussians, one small interface, two backends.
+"""Rendering with gradients by every parameter of the Gaussians, on two backends, and scores of views.
 
 * CPU: the project's own kernels behind a `torch.autograd.Function`; arrays are shared, not copied.
 * CUDA: gsplat and its gradients.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -12,12 +12,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from langsplat_core.arrays import ViewScore, psnr
 from langsplat_core.config import INRIA, RasterSettings
+from langsplat_core.datasets.capture import Capture, shrunk_view
 from langsplat_core.errors import BackendError
 from langsplat_core.raster import gsplat
 from langsplat_core.raster.cpu.projection import colours, colours_backward
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer, CpuView
 from langsplat_core.scene import Camera, Gaussians
+from langsplat_core.training.radiance.losses import fit_exposure, ssim_map, with_exposure
+
+PARAMETERS = ("means", "log_scales", "quats_wxyz", "opacity_logits", "sh_dc", "sh_rest")
+
+
+def parameters_of(gaussians: Gaussians, device: torch.device) -> dict[str, Tensor]:
+    """Return the raw `PARAMETERS` of Gaussians as tensors; sh is split in degree 0 and the rest."""
+    names = PARAMETERS[:4]
+    arrays = [*(getattr(gaussians, name) for name in names), gaussians.sh[:, :1], gaussians.sh[:, 1:]]
+    return {name: torch.tensor(array, device=device) for name, array in zip(PARAMETERS, arrays, strict=True)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,9 +43,8 @@ class Rendered:
 
     def means_px_grad(self) -> Tensor:
         """Return the (N, 2) gradient; zeros when nothing was differentiated."""
-        if self.means_px.grad is None:
-            return torch.zeros_like(self.means_px).reshape(-1, 2)
-        return self.means_px.grad.reshape(-1, 2)
+        grad = torch.zeros_like(self.means_px) if self.means_px.grad is None else self.means_px.grad
+        return grad.reshape(-1, 2)
 
 
 class DifferentiableRenderer(Protocol):
@@ -42,19 +53,18 @@ class DifferentiableRenderer(Protocol):
     device: torch.device  # where parameters and images live
 
     def render(self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int) -> Rendered:
-        """Draw the raw `parameters` (see `state`) with harmonics up to `sh_degree`."""
+        """Draw the raw `parameters` with harmonics up to `sh_degree`."""
 
 
-def sh_coefficients(parameters: dict[str, Tensor], sh_degree: int) -> Tensor:
-    """Return the (N, (degree + 1)^2, 3) coefficients in use, without a copy when degree 0 is all there is."""
+def _coefficients(parameters: dict[str, Tensor], sh_degree: int) -> Tensor:
+    """(N, (degree + 1)^2, 3) coefficients in use, without a copy when degree 0 is all there is."""
     if sh_degree == 0:
         return parameters["sh_dc"]
-    rest = parameters["sh_rest"][:, : (sh_degree + 1) ** 2 - 1]
-    return torch.cat([parameters["sh_dc"], rest], dim=1)
+    return torch.cat([parameters["sh_dc"], parameters["sh_rest"][:, : (sh_degree + 1) ** 2 - 1]], dim=1)
 
 
 class _CpuImage(torch.autograd.Function):
-    """(means, log scales, quaternions, opacity logits, sh, means_px probe) -> (image, alpha).
+    """(means, log scales, quaternions, opacity logits, sh, means_px probe) -> (image, alpha, visible).
 
     The probe is not read: it is an input only so that autograd hands out the gradient by the projected
     means, which densification needs.
@@ -62,40 +72,31 @@ class _CpuImage(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any,
-        setup: tuple[Callable[[Gaussians], CpuView], Camera, list[Tensor]],
-        means: Tensor,
-        log_scales: Tensor,
-        quats_wxyz: Tensor,
-        opacity_logits: Tensor,
-        sh: Tensor,
-        probe: Tensor,
-    ) -> tuple[Tensor, Tensor]:
-        project, camera, visible = setup
-        gaussians = Gaussians(
-            *(t.detach().numpy() for t in (means, log_scales, quats_wxyz, opacity_logits, sh))
-        )
+        ctx: Any, project: Callable[[Gaussians], CpuView], eye: Any, *parameters: Tensor
+    ) -> tuple[Tensor, ...]:
+        gaussians = Gaussians(*(tensor.detach().numpy() for tensor in parameters[:5]))
         view = project(gaussians)
-        values = colours(gaussians.sh, gaussians.means, camera.position)
+        values = colours(gaussians.sh, gaussians.means, eye)
         image, alpha = view.splat(values)
-        visible.append(torch.from_numpy(view.radii > 0))
-        ctx.kept = (gaussians, camera, view, values)
-        return torch.from_numpy(image), torch.from_numpy(alpha)
+        ctx.kept = (gaussians, eye, view, values)
+        visible = torch.from_numpy(view.radii > 0)
+        ctx.mark_non_differentiable(visible)
+        return torch.from_numpy(image), torch.from_numpy(alpha), visible
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        gaussians, camera, view, values = ctx.kept
-        image_grad, alpha_grad = grads
+        gaussians, eye, view, values = ctx.kept
+        image_grad, alpha_grad, _ = grads
         assert image_grad is not None  # the image always enters the loss
         by = view.backward(
             values,
             np.ascontiguousarray(image_grad.numpy()),
             None if alpha_grad is None else np.ascontiguousarray(alpha_grad.numpy()),
         )
-        sh_grad, means_grad = colours_backward(gaussians.sh, gaussians.means, camera.position, by.values)
+        sh_grad, means_grad = colours_backward(gaussians.sh, gaussians.means, eye, by.values)
         by_means = by.means + means_grad
         arrays = (by_means, by.log_scales, by.quats_wxyz, by.opacity_logits, sh_grad, by.means_px)
-        return (None, *(torch.from_numpy(np.asarray(array, np.float32)) for array in arrays))
+        return (None, None, *(torch.from_numpy(np.asarray(array, np.float32)) for array in arrays))
 
 
 class CpuRenderer:
@@ -103,23 +104,19 @@ class CpuRenderer:
 
     def __init__(self, settings: RasterSettings = INRIA) -> None:
         self.device = torch.device("cpu")
-        self._settings = settings
-        self._rasterizer = CpuRasterizer()
+        self._settings, self._rasterizer = settings, CpuRasterizer()
 
     def render(self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int) -> Rendered:
-        p = parameters
-        probe = torch.zeros(len(p["means"]), 2, requires_grad=p["means"].requires_grad)
-        visible: list[Tensor] = []
-        image, alpha = _CpuImage.apply(
-            (lambda gaussians: self._rasterizer.view(gaussians, camera, self._settings), camera, visible),
-            p["means"],
-            p["log_scales"],
-            p["quats_wxyz"],
-            p["opacity_logits"],
-            sh_coefficients(p, sh_degree),
+        means = parameters["means"]
+        probe = torch.zeros(len(means), 2, requires_grad=means.requires_grad)
+        image, alpha, visible = _CpuImage.apply(
+            lambda gaussians: self._rasterizer.view(gaussians, camera, self._settings),
+            camera.position,
+            *(parameters[name] for name in PARAMETERS[:4]),
+            _coefficients(parameters, sh_degree),
             probe,
         )
-        return Rendered(image, alpha, visible[0], probe)
+        return Rendered(image, alpha, visible, probe)
 
 
 class CudaRenderer:
@@ -134,10 +131,9 @@ class CudaRenderer:
             raise BackendError(f"backend cuda: {error}; use --backend cpu") from error
 
     def render(self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int) -> Rendered:
-        names = ("means", "log_scales", "quats_wxyz", "opacity_logits")
-        gaussians = gsplat.DeviceGaussians(**{name: parameters[name] for name in names})
-        colours = sh_coefficients(parameters, sh_degree)
-        drawn = gsplat.draw(gaussians, colours, camera, self._settings, sh_degree)
+        gaussians = gsplat.DeviceGaussians(**{name: parameters[name] for name in PARAMETERS[:4]})
+        values = _coefficients(parameters, sh_degree)
+        drawn = gsplat.draw(gaussians, values, camera, self._settings, sh_degree)
         return Rendered(drawn.image, drawn.alpha, drawn.visible, drawn.means_px)
 
 
@@ -157,3 +153,73 @@ def renderer_for(backend: Backend) -> DifferentiableRenderer:
         if backend == "cuda":
             raise
         return CpuRenderer()
+
+
+# Scores of trained Gaussians: images of views against their photographs.
+
+
+def evaluate_views(
+    gaussians: Gaussians,
+    capture: Capture,
+    indices: Sequence[int],
+    backend: Backend = "auto",
+    small: Capture | None = None,
+) -> list[ViewScore]:
+    """Draw the views at `indices` and score them against the photographs; colours are clamped to [0, 1].
+
+    small: the same views read at 320 px, which images are compared with too, shrunk. A photograph that is
+    shrunk twice differs from one that was read at that size, by as much as good images do.
+    """
+    renderer = renderer_for(backend)
+    parameters = parameters_of(gaussians, renderer.device)
+    scores = []
+    for number, index in enumerate(indices):
+        camera, mask = capture.cameras[index], capture.mask(index)
+        target = torch.tensor(capture.images[index], device=renderer.device).float().div_(255)
+        with torch.no_grad():
+            rendered = renderer.render(parameters, camera, gaussians.sh_degree)
+        image = rendered.image.clamp(0, 1)
+        counted = torch.tensor(
+            np.ones(target.shape[:2], bool) if mask is None else mask, device=renderer.device
+        )
+        target = torch.where(counted[..., None], target, image)
+        similarity = 1 - (1 - float(ssim_map(image, target).mean())) / max(
+            float(counted.float().mean()), 1e-9
+        )
+        scores.append(
+            ViewScore(
+                camera.name,
+                psnr(image[counted].cpu().numpy(), target[counted].cpu().numpy()),
+                similarity,
+                float((rendered.alpha >= 0.5)[counted].float().mean()),
+                _psnr_exposed(image, target, counted),
+                None if small is None else _psnr_small(camera, image, small, number),
+            )
+        )
+    return scores
+
+
+def _psnr_exposed(image: Tensor, target: Tensor, counted: Tensor) -> float | None:
+    """PSNR of an image whose halves, left and right, each have the exposure that fits the other best.
+
+    None where a half has no pixel that counts.
+    """
+    left, right = counted.clone(), counted.clone()
+    left[:, image.shape[1] // 2 :] = False
+    right[:, : image.shape[1] // 2] = False
+    if not (left.any() and right.any()):
+        return None
+    exposed = [
+        with_exposure(image[one], fit_exposure([(image[other], target[other])])).clamp(0, 1)
+        for one, other in ((left, right), (right, left))
+    ]
+    return psnr(torch.cat(exposed).cpu().numpy(), torch.cat([target[left], target[right]]).cpu().numpy())
+
+
+def _psnr_small(camera: Camera, image: Tensor, small: Capture, number: int) -> float | None:
+    """PSNR of an image shrunk to the size of a photograph; None where nothing of that counts."""
+    photograph, mask = small.images[number], small.mask(number)
+    shown = (255 * image).round().byte().cpu().numpy()
+    _, shrunk, _ = shrunk_view(camera, shown, None, (photograph.shape[1], photograph.shape[0]))
+    counted = np.ones(shrunk.shape[:2], bool) if mask is None else mask
+    return psnr(shrunk[counted] / 255, photograph[counted] / 255) if counted.any() else None

@@ -1,10 +1,12 @@
-"""Image losses: L1 and structural similarity (Wang et al. 2004), in torch and as compiled CPU kernels.
+"""Images against photographs: exposures, and losses in torch and as compiled CPU kernels.
 
-Images are (H, W, C) float32 with values about [0, 1]. The SSIM window is the usual Gaussian of 11x11 pixels
-with sigma 1.5; outside the image it sees zeros, as in the INRIA code.
+The losses are L1 and structural similarity (Wang et al. 2004). Images are (H, W, C) float32 with values about
+[0, 1]. The SSIM window is the usual Gaussian of 11x11 pixels with sigma 1.5; outside the image it sees zeros,
+as in the INRIA code.
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -30,6 +32,10 @@ def _window() -> list[float]:
 # blurs them across rows, forms SSIM and its derivatives by the moments, and blurs those along rows; pass 3
 # blurs the derivatives across rows and adds everything up. Rows are independent within a pass, so results do
 # not depend on the number of threads.
+#
+# With S = a1 a2 / (b1 b2) and mx, xx, xy the blurred x, x^2, x y: dS/dmx = 2 my (a2 - a1) / (b1 b2)
+# - 2 mx S (1/b1 - 1/b2), dS/dxx = -S / b2, dS/dxy = 2 a1 / (b1 b2), and dS/dx = blur(dS/dmx)
+# + 2 x blur(dS/dxx) + y blur(dS/dxy), because the blur is symmetric.
 
 
 @helper
@@ -140,8 +146,8 @@ def _gather_gradient(
         row_l1[row] = difference.sum()
 
 
-def loss_and_gradient(image: Array, target: Array, lambda_dssim: float) -> tuple[float, Array]:
-    """Return the loss of (H, W, C) contiguous float32 images, and its (H, W, C) gradient by `image`."""
+def _loss_and_gradient(image: Array, target: Array, lambda_dssim: float) -> tuple[float, Array]:
+    """Loss of (H, W, C) contiguous float32 images, and its (H, W, C) gradient by `image`."""
     height, width, channels = image.shape
     n = width * channels
     x, y = image.reshape(height, n), target.reshape(height, n)
@@ -161,62 +167,45 @@ def loss_and_gradient(image: Array, target: Array, lambda_dssim: float) -> tuple
 # The same by torch, on any device, and the loss of training.
 
 
+class _Blur(torch.autograd.Function):
+    """Blur of each channel of (..., H, W, C) under the SSIM window; zeros outside.
+
+    Eleven shifted additions per axis: on a CPU about 25 times as fast as a grouped `conv2d`. The operator is
+    symmetric, so that it is its own gradient.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, images: Tensor) -> Tensor:
+        taps = _window()
+        for axis, size in ((-2, images.shape[-2]), (-3, images.shape[-3])):
+            padded = torch.nn.functional.pad(images, [0, 0] * (-axis - 1) + [RADIUS, RADIUS])
+            images = padded.narrow(axis, 0, size) * taps[0]
+            for offset, tap in enumerate(taps[1:], start=1):
+                images.add_(padded.narrow(axis, offset, size), alpha=tap)
+        return images
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Tensor:
+        return blur(grads[0])
+
+
 def blur(images: Tensor) -> Tensor:
-    """Blur each channel of (..., H, W, C) under the SSIM window; zeros outside.
+    """Blur each channel of (..., H, W, C) under the SSIM window; zeros outside."""
+    blurred: Tensor = _Blur.apply(images)
+    return blurred
 
-    Eleven shifted additions per axis: on a CPU about 25 times as fast as a grouped `conv2d`.
-    The operator is symmetric, so it is its own adjoint.
+
+def ssim_map(image: Tensor, target: Tensor) -> Tensor:
+    """Return the (H, W, C) structural similarity of two images, in [-1, 1].
+
+    SSIM needs the squares only as their sum.
     """
-    taps = _window()
-    height, width = images.shape[-3], images.shape[-2]
-    for axis, size in ((-2, width), (-3, height)):
-        padding = [0, 0] * (-axis - 1) + [RADIUS, RADIUS]
-        padded = torch.nn.functional.pad(images, padding)
-        images = padded.narrow(axis, 0, size) * taps[0]
-        for offset, tap in enumerate(taps[1:], start=1):
-            images.add_(padded.narrow(axis, offset, size), alpha=tap)
-    return images
-
-
-def raw_moments(image: Tensor, target: Tensor) -> Tensor:
-    """Return (4, H, W, C): x, y, x^2 + y^2, x y. SSIM needs the two squares only as their sum."""
     squares = torch.addcmul(image * image, target, target)
-    return torch.stack([image, target, squares, image * target])
-
-
-def ssim_terms(moments: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the four factors of SSIM = a1 a2 / (b1 b2) from (4, H, W, C) blurred x, y, x^2 + y^2, xy."""
-    mx, my, xx_yy, xy = moments
+    mx, my, xx_yy, xy = blur(torch.stack([image, target, squares, image * target]))
     product, squares = mx * my, torch.addcmul(mx * mx, my, my)
-    return 2 * product + C1, 2 * (xy - product) + C2, squares + C1, xx_yy - squares + C2
-
-
-class _MeanSsim(torch.autograd.Function):
-    """Mean SSIM with its gradient by the first image written out.
-
-    Automatic differentiation of the same formula keeps some twenty image-sized temporaries; by hand it
-    is three more blurs. With S = a1 a2 / (b1 b2) and mx, xx, xy the blurred x, x^2, x y:
-    dS/dmx = 2 my (a2 - a1) / (b1 b2) - 2 mx S (1/b1 - 1/b2), dS/dxx = -S / b2, dS/dxy = 2 a1 / (b1 b2),
-    and dS/dx = blur(dS/dmx) + 2 x blur(dS/dxx) + y blur(dS/dxy), because the blur is symmetric.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor) -> Tensor:
-        moments = blur(raw_moments(image, target))
-        a1, a2, b1, b2 = ssim_terms(moments)
-        similarity = (a1 * a2) / (b1 * b2)
-        if ctx.needs_input_grad[0]:
-            ctx.save_for_backward(image, target, moments[0], moments[1], a1, a2, b1, b2, similarity)
-        return similarity.mean()
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
-        image, target, mx, my, a1, a2, b1, b2, similarity = ctx.saved_tensors
-        inverse = 1 / (b1 * b2)
-        by_mx = 2 * my * (a2 - a1) * inverse - 2 * mx * similarity * (1 / b1 - 1 / b2)
-        blurred = blur(torch.stack([by_mx, similarity / b2, a1 * inverse]))
-        gradient = blurred[0] - 2 * image * blurred[1] + 2 * target * blurred[2]
-        return gradient * (grads[0] / similarity.numel()), None
+    a1, a2 = 2 * product + C1, 2 * (xy - product) + C2
+    b1, b2 = squares + C1, xx_yy - squares + C2
+    return (a1 * a2) / (b1 * b2)
 
 
 class _CpuLoss(torch.autograd.Function):
@@ -224,11 +213,8 @@ class _CpuLoss(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, lambda_dssim: float) -> Tensor:
-        value, gradient = loss_and_gradient(
-            image.detach().contiguous().numpy(),
-            target.contiguous().numpy(),
-            lambda_dssim,
-        )
+        pair = image.detach().contiguous().numpy(), target.contiguous().numpy()
+        value, gradient = _loss_and_gradient(*pair, lambda_dssim)
         ctx.save_for_backward(torch.from_numpy(gradient))
         return torch.tensor(value)
 
@@ -238,20 +224,11 @@ class _CpuLoss(torch.autograd.Function):
         return gradient * grads[0], None, None
 
 
-def ssim(image: Tensor, target: Tensor) -> Tensor:
-    """Return the mean structural similarity of two (H, W, C) images, a scalar in [-1, 1].
-
-    Differentiable by `image` only.
-    """
-    result: Tensor = _MeanSsim.apply(image, target)
-    return result
-
-
 def radiance_loss(image: Tensor, target: Tensor, lambda_dssim: float) -> Tensor:
     """Return (1 - lambda) L1 + lambda (1 - SSIM), equation 7 of Kerbl et al. 2023; a scalar >= 0.
 
-    Differentiable by `image` only. Single precision on the CPU takes the compiled kernels, four times
-    as fast; they agree with the formula below to 1e-6.
+    Differentiable by `image` only. Single precision on the CPU takes the compiled kernels: four times as
+    fast, equal to 1e-6.
     """
     if image.device.type == "cpu" and image.dtype == torch.float32:
         loss: Tensor = _CpuLoss.apply(image, target, lambda_dssim)
@@ -259,4 +236,52 @@ def radiance_loss(image: Tensor, target: Tensor, lambda_dssim: float) -> Tensor:
     l1 = (image - target).abs().mean()
     if lambda_dssim == 0:
         return l1
-    return (1 - lambda_dssim) * l1 + lambda_dssim * (1 - ssim(image, target))
+    return (1 - lambda_dssim) * l1 + lambda_dssim * (1 - ssim_map(image, target).mean())
+
+
+# Exposure and white balance of a photograph, as an affine change of the scene's colours.
+
+
+def fit_exposure(pairs: Sequence[tuple[Tensor, Tensor]], ridge: float = 0.1) -> Tensor:
+    """Return the (4, 3) affine change of colours that best takes images to their targets (least squares).
+
+    (r, g, b, 1) @ change are the new colours. pairs: (..., 3) images and targets, at least one pair. ridge:
+    a share of the mean square of colours, by which the change is pulled to none.
+    """
+    device = pairs[0][0].device
+    moments = torch.zeros((4, 4), dtype=torch.float64, device=device)
+    wanted, count = moments[:, :3], 0
+    for image, target in pairs:
+        padded = torch.nn.functional.pad(image.detach().reshape(-1, 3).double(), (0, 1), value=1.0)
+        moments = moments + padded.T @ padded
+        wanted = wanted + padded.T @ target.detach().reshape(-1, 3).double()
+        count += len(padded)
+    # Black images tell nothing: the second term keeps the system solvable.
+    hold = max(ridge * float(moments.diagonal()[:3].mean()), 1e-9 * max(count, 1))
+    none = torch.eye(4, dtype=torch.float64, device=device)
+    return torch.linalg.solve(moments + hold * none, wanted + hold * none[:, :3]).float()
+
+
+def with_exposure(image: Tensor, change: Tensor) -> Tensor:
+    """Return the (..., 3) image under the (4, 3) affine change of its colours."""
+    return image @ change[:3] + change[3]
+
+
+def no_exposures(views: int, device: torch.device) -> Tensor:
+    """Return the (V, 4, 3) changes of colours that change nothing."""
+    return torch.eye(4, 3, device=device).repeat(views, 1, 1)
+
+
+def fit_exposures(pairs: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, float]:
+    """Return the (V, 4, 3) exposure of each view beyond what all have in common, and what that gains in dB.
+
+    pairs: (..., 3) image and target of each view.
+    """
+    common = fit_exposure(pairs)
+    pairs = [(with_exposure(image, common), target) for image, target in pairs]
+    exposures = torch.stack([fit_exposure([pair]) for pair in pairs])
+    before = after = 0.0
+    for (image, target), exposure in zip(pairs, exposures, strict=True):
+        before += float((image - target).square().sum())
+        after += float((with_exposure(image, exposure) - target).square().sum())
+    return exposures, 10 * math.log10(max(before, 1e-12) / max(after, 1e-12))

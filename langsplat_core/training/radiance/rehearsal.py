@@ -7,7 +7,7 @@ itself then takes all views.
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,37 +17,31 @@ from langsplat_core.config import GOOD, INRIA, QUICK, RadianceBudget, RadianceCo
 from langsplat_core.datasets.capture import Capture, surrounded_views
 from langsplat_core.progress import Progress, Report, silent
 from langsplat_core.scene import Camera, Gaussians
-from langsplat_core.training.radiance.scores import evaluate_views
+from langsplat_core.training.radiance.differentiable import evaluate_views
 from langsplat_core.training.radiance.trainer import STAGE as STEPS
 from langsplat_core.training.radiance.trainer import train_radiance
 
 log = logging.getLogger("langsplat")
 
 STAGE = "rehearsing"
-FACTOR = 3  # between the steps of one rehearsal and the next one
 LEAST_GAIN = 0.25  # dB, for which more is spent: less may be chance
 
 
 def budgets_for(capture: Capture, config: RadianceConfig, views: int) -> list[RadianceBudget]:
-    """Return the ascending budgets that `views` of the capture's photographs may be trained with."""
-    longer_side = max(max(camera.width, camera.height) for camera in capture.cameras)
-    return ascending_budgets(config, views, longer_side)
+    """Return the ascending budgets that are tried with so many training views.
 
-
-def ascending_budgets(config: RadianceConfig, views: int, longer_side: int) -> list[RadianceBudget]:
-    """Return the ascending budgets that are tried with so many training views of so many pixels.
-
-    The last is all that is asked for, and the only one with many views or few steps. A larger preset's begin
-    with the smaller one's, so that it cannot choose worse.
+    The last is all that is asked for, and the only one with many views or few steps. Steps grow threefold. A
+    larger preset's budgets begin with the smaller one's, so that it cannot choose worse.
     """
+    longer_side = max(max(camera.width, camera.height) for camera in capture.cameras)
     whole = RadianceBudget(longer_side, config.steps, config.max_gaussians, config.sh_degree)
-    steps = [QUICK.steps]
-    while FACTOR**2 * steps[-1] <= config.steps:
-        steps.append(FACTOR * steps[-1])
-    if views > config.rehearsed_views or config.steps < FACTOR * QUICK.steps:
+    if views > config.rehearsed_views or config.steps < 3 * QUICK.steps:
         return [whole]
-    sizes = [(GOOD if count <= GOOD.steps else whole)._replace(steps=count) for count in steps]
-    return list(dict.fromkeys(budget.at_most(whole) for budget in (QUICK, *sizes, whole)))
+    steps = [QUICK.steps]
+    while 9 * steps[-1] <= config.steps:
+        steps.append(3 * steps[-1])
+    larger = [(GOOD if count <= GOOD.steps else whole)._replace(steps=count) for count in steps]
+    return list(dict.fromkeys(budget.at_most(whole) for budget in (QUICK, *larger, whole)))
 
 
 def budget_text(budget: RadianceBudget) -> str:
@@ -58,47 +52,59 @@ def budget_text(budget: RadianceBudget) -> str:
 def rehearse(
     capture: Capture,
     config: RadianceConfig,
+    budgets: Sequence[RadianceBudget],
     train_indices: Sequence[int],
     checkpoint: Path | None = None,
     progress: Progress = silent,
 ) -> list[list[float]]:
-    """Train without some of the views at `train_indices`, and score these.
+    """Train with ascending budgets without some of the views at `train_indices`, and score these.
 
     Returns for each budget, from the smallest on up to one that clearly loses, the mean PSNR (dB, exposures
-    fitted) of the held-out views, in one rehearsal after the other; one in which a budget does not gain is
-    its last. Empty where there is nothing to decide: many views, so few that none can be held out, or few
-    steps.
+    fitted) of the held-out views, in one rehearsal after the other, see `climb`. Empty where there is nothing
+    to decide: one budget, or so few views that none can be held out.
 
     With a `checkpoint` path an interrupted rehearsal goes on where it stopped; the files are those of
     `checkpoints_of` it, and stay.
     """
-    budgets = budgets_for(capture, config, len(train_indices))
     held_out = _held_out([capture.cameras[i] for i in train_indices])
     if len(budgets) < 2 or not held_out:
         return []
-    found: list[list[float]] = [[] for _ in budgets]
+    done: list[float] = []
 
     def score(index: int, number: int) -> float:
-        """Return what budget `index` reaches in rehearsal `number`."""
+        budget, without = budgets[index], held_out[number]
+        part = progress.part(len(done), len(budgets) * len(held_out), STAGE, budget_text(budget))
+        at = checkpoint and checkpoint.with_name(f"{index}-{number}-{checkpoint.name}")
+        small = capture.read_at(train_indices, budget.longer_side)
+        train = [row for row in range(len(small)) if row not in without]
+        gaussians = train_radiance(small, config.spending(budget), train, at, _steps_alone(part))
+        scores = evaluate_views(gaussians, small, without, config.backend)
+        done.append(float(np.mean([score.psnr_exposed or score.psnr for score in scores])))
+        log.debug("%s without %s: %.2f dB", budget_text(budget), without, done[-1])
+        return done[-1]
+
+    return climb(len(budgets), len(held_out), score)
+
+
+def climb(budgets: int, rehearsals: int, score: Callable[[int, int], float]) -> list[list[float]]:
+    """Return the scores (dB) of ascending budgets, from the smallest on up to one that clearly loses.
+
+    score(i, n): what budget i reaches in rehearsal n. One in which a budget does not gain over the best so
+    far is its last: others could not make it pay.
+    """
+    found: list[list[float]] = [[] for _ in range(budgets)]
+
+    def reached(index: int, number: int) -> float:
         if len(found[index]) == number:
-            done, most = sum(map(len, found)), len(budgets) * len(held_out)
-            budget, without = budgets[index], held_out[number]
-            told = _steps_alone(progress.part(done, most, STAGE, budget_text(budget)))
-            at = checkpoint and checkpoint.with_name(f"{index}-{number}-{checkpoint.name}")
-            small = capture.read_at(train_indices, budget.longer_side)
-            train = [row for row in range(len(small)) if row not in without]
-            gaussians = train_radiance(small, config.spending(budget), train, at, told)
-            scores = evaluate_views(gaussians, small, without, config.backend)
-            found[index].append(float(np.mean([score.psnr_exposed or score.psnr for score in scores])))
-            log.debug("%s without %s: %.2f dB", budget_text(budget), without, found[index][-1])
+            found[index].append(score(index, number))
         return found[index][number]
 
     best = 0
-    for index in range(1, len(budgets)):
+    for index in range(1, budgets):
         gains: list[float] = []
-        while len(gains) < len(held_out) and all(gain > 0 for gain in gains):
-            before = score(best, len(gains))
-            gains.append(score(index, len(gains)) - before)
+        while len(gains) < rehearsals and all(gain > 0 for gain in gains):
+            before = reached(best, len(gains))
+            gains.append(reached(index, len(gains)) - before)
         if _pays(gains):
             best = index
         elif np.mean(gains) < -LEAST_GAIN:
@@ -113,10 +119,9 @@ def _held_out(cameras: Sequence[Camera]) -> list[list[int]]:
     differ by a decibel or two.
     """
     views: list[list[int]] = []
-    while sum(map(len, views)) < 3:
-        more = surrounded_views(cameras, 8, [index for taken in views for index in taken])
-        if not more:
-            break
+    taken: list[int] = []
+    while len(taken) < 3 and (more := surrounded_views(cameras, 8, taken)):
+        taken = [*taken, *more]
         views.append(more)
     return views
 

@@ -1,11 +1,10 @@
-"""State of radiance training: first Gaussians, Adam's rows, checkpoints, density control."""
+"""State of radiance training: first Gaussians, Adam's rows, density control, checkpoints."""
 
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -22,10 +21,10 @@ from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians
 from langsplat_core.scene.transform import C0
-from langsplat_core.training.radiance.exposure import no_exposures
+from langsplat_core.training.radiance.differentiable import PARAMETERS, parameters_of
+from langsplat_core.training.radiance.losses import no_exposures
 from langsplat_core.training.radiance.transients import Transients, no_transients
 
-NEIGHBOURS = 3  # points, whose mean distance is the size of the Gaussian that begins at a point
 # Fewer points are topped up to this number: features are found where there is detail, and what lies between
 # is covered from random ones better than by splitting what is elsewhere (docs/photographs.md) ...
 FEWEST_POINTS = 3_000
@@ -77,7 +76,7 @@ def _usable_points(points: Array, rgb: Array, cameras: Sequence[Camera]) -> tupl
     for camera in cameras:
         seen |= camera.in_image(*camera.project(points))
     points, rgb = points[seen], rgb[seen]
-    if len(points) > NEIGHBOURS:
+    if len(points) > 3:
         distance = _neighbour_distance(points)
         keep = distance <= 10 * np.median(distance)
         points, rgb = points[keep], rgb[keep]
@@ -88,30 +87,27 @@ def _neighbour_distance(points: Array) -> Array:
     """(N,) root mean square distance to the three nearest other points, world units, > 0."""
     if len(points) < 2:
         return np.ones(len(points))
-    neighbours = min(NEIGHBOURS, len(points) - 1)
-    distances, _ = cKDTree(points).query(points, k=neighbours + 1)
+    distances, _ = cKDTree(points).query(points, k=min(4, len(points)))
     return np.sqrt(np.maximum((distances[:, 1:] ** 2).mean(1), 1e-7))  # the bound is INRIA's
 
 
 # Parameters, Adam's moments and statistics. All of it has one row per Gaussian, so that adding and removing
 # Gaussians is one operation (`rearrange`) that cannot leave the optimiser behind the parameters.
 
-PARAMETERS = ("means", "log_scales", "quats_wxyz", "opacity_logits", "sh_dc", "sh_rest")
-
 
 @dataclass
 class TrainingState:
     """N Gaussians in training. Every dictionary has the keys `PARAMETERS`."""
 
-    values: dict[str, Tensor]  # raw parameters as in `Gaussians`; sh is split in degree 0 and the rest
+    values: dict[str, Tensor]  # raw parameters, see `parameters_of`
     first: dict[str, Tensor]  # Adam's first moments, shaped like the values
     second: dict[str, Tensor]  # Adam's second moments
-    updates: dict[str, int]  # how often Adam has updated each parameter
     grad_sum: Tensor  # (N,) norms of the gradients by the projected means, NDC, summed over `seen` views
     seen: Tensor  # (N,) float32: in how many steps since the last round the Gaussian was visible
-    rng: np.random.Generator
     exposures: Tensor  # (V, 4, 3) affine changes of colours, of the training views
     transients: Transients  # of the training views; of none where nothing may move
+    rng: np.random.Generator
+    updates: dict[str, int]  # how often Adam has updated each parameter
     step: int = 0  # steps done
     queue: list[int] = field(default_factory=list)  # views still to come in this pass over the photographs
     non_finite: int = 0  # gradient entries that were not finite and were taken as zero
@@ -132,26 +128,17 @@ class TrainingState:
 
 def start(gaussians: Gaussians, seed: int, device: torch.device) -> TrainingState:
     """Return the state before the first step."""
-    arrays = {
-        "means": gaussians.means,
-        "log_scales": gaussians.log_scales,
-        "quats_wxyz": gaussians.quats_wxyz,
-        "opacity_logits": gaussians.opacity_logits,
-        "sh_dc": gaussians.sh[:, :1],
-        "sh_rest": gaussians.sh[:, 1:],
-    }
-    values = {name: torch.tensor(array, device=device) for name, array in arrays.items()}
-    count = len(gaussians)
+    values = parameters_of(gaussians, device)
     return TrainingState(
         values={name: value.requires_grad_() for name, value in values.items()},
         first={name: torch.zeros_like(value) for name, value in values.items()},
         second={name: torch.zeros_like(value) for name, value in values.items()},
-        updates=dict.fromkeys(PARAMETERS, 0),
-        grad_sum=torch.zeros(count, device=device),
-        seen=torch.zeros(count, device=device),
-        rng=np.random.default_rng(seed),
+        grad_sum=torch.zeros(len(gaussians), device=device),
+        seen=torch.zeros(len(gaussians), device=device),
         exposures=no_exposures(0, device),
         transients=no_transients(0),
+        rng=np.random.default_rng(seed),
+        updates=dict.fromkeys(PARAMETERS, 0),
     )
 
 
@@ -188,14 +175,10 @@ def adam_step(state: TrainingState, learning_rates: dict[str, float]) -> None:
     for name, value in state.values.items():
         if value.grad is None or value.numel() == 0:
             continue
+        updates = torch.tensor(float(state.updates[name]), device=state.device)
         with torch.no_grad():
             adam(
-                [value],
-                [value.grad],
-                [state.first[name]],
-                [state.second[name]],
-                [],
-                [torch.tensor(float(state.updates[name]), device=state.device)],
+                *([value], [value.grad], [state.first[name]], [state.second[name]], [], [updates]),
                 fused=True,
                 amsgrad=False,
                 beta1=0.9,
@@ -209,6 +192,96 @@ def adam_step(state: TrainingState, learning_rates: dict[str, float]) -> None:
         value.grad = None
 
 
+# Adaptive density control: where Gaussians are added and removed (Kerbl et al. 2023, section 5.2).
+#
+# The statistic is INRIA's: the norm of the loss gradient by the projected mean, in normalised device
+# coordinates (the gradient per pixel times half the image's width and height), averaged over the steps in
+# which the Gaussian was visible.
+
+LARGE_SCALE = 0.1  # of the extent: Gaussians above are removed once the schedule says so
+FEWEST_GAUSSIANS = 64  # pruning never leaves fewer; the most opaque ones stay
+
+
+def accumulate(state: TrainingState, means_px_grad: Tensor, visible: Tensor, size: tuple[int, int]) -> None:
+    """Add one step to the statistic.
+
+    means_px_grad: (N, 2) loss gradient per pixel of mean position; visible: (N,) bool; size: (width, height)
+    of the image.
+    """
+    to_ndc = means_px_grad.new_tensor([0.5 * size[0], 0.5 * size[1]])
+    x, y = (torch.nan_to_num(means_px_grad, 0.0, 0.0, 0.0) * to_ndc).unbind(1)
+    state.grad_sum += torch.hypot(x, y) * visible
+    state.seen += visible
+
+
+def densify(state: TrainingState, config: RadianceConfig, extent: float, prune_large: bool) -> None:
+    """Clone small and split large Gaussians with large gradients, and remove faint ones.
+
+    `extent` is the cameras' extent in world units. When the cap of `config.max_gaussians` is near, the
+    largest gradients go first.
+    """
+    values = {name: value.detach() for name, value in state.values.items()}
+    opacity_logits, largest_scale = values["opacity_logits"], values["log_scales"].amax(1).exp()
+    too_large = (largest_scale > LARGE_SCALE * extent) & prune_large
+    remove = torch.sigmoid(opacity_logits) < config.prune_opacity
+    gradient = torch.where(remove, -1.0, state.grad_sum / state.seen.clamp(min=1))
+    grows = gradient >= config.densify_grad
+    room = max(config.max_gaussians - int((~remove).sum()), 0)
+    if int(grows.sum()) > room:
+        largest = torch.argsort(gradient, descending=True, stable=True)[:room]
+        grows = torch.zeros_like(grows).index_fill_(0, largest, True)
+    splits = grows & (largest_scale > config.percent_dense * extent)
+    clones = grows & ~splits
+
+    children = _children(values, splits, state)
+    if prune_large:
+        small_enough = children["log_scales"].amax(1).exp() <= LARGE_SCALE * extent
+        children = {name: child[small_enough] for name, child in children.items()}
+    added = {name: torch.cat([values[name][clones & ~too_large], children[name]]) for name in PARAMETERS}
+    keep = ~(remove | splits | too_large)
+    if int(keep.sum()) + len(added["means"]) < FEWEST_GAUSSIANS:
+        best = torch.argsort(opacity_logits, descending=True, stable=True)[:FEWEST_GAUSSIANS]
+        keep.index_fill_(0, best, True)
+    rearrange(state, keep.nonzero()[:, 0], added)
+
+
+def _children(values: dict[str, Tensor], splits: Tensor, state: TrainingState) -> dict[str, Tensor]:
+    """Two children per split Gaussian: means drawn from the parent itself, scales divided by 1.6."""
+    parents = {name: value[splits].repeat_interleave(2, dim=0) for name, value in values.items()}
+    draws = state.rng.standard_normal((len(parents["means"]), 3), dtype="float32")
+    offsets = torch.from_numpy(draws).to(state.device) * parents["log_scales"].exp()
+    # A quaternion (w, q) turns v into v + 2 w (q x v) + 2 q x (q x v).
+    unit = torch.nn.functional.normalize(parents["quats_wxyz"], dim=1)
+    w, q = unit[:, :1], unit[:, 1:]
+    cross = torch.linalg.cross(q, offsets)
+    parents["means"] = parents["means"] + (offsets + 2 * (w * cross + torch.linalg.cross(q, cross)))
+    parents["log_scales"] = parents["log_scales"] - torch.log(offsets.new_tensor(1.6))
+    return parents
+
+
+def remove_gaussians(state: TrainingState, rows: Array) -> None:
+    """Remove the Gaussians where the (N,) bool `rows` are True, unless hardly any would be left."""
+    if len(state) - np.count_nonzero(rows) >= FEWEST_GAUSSIANS:
+        rearrange(state, torch.from_numpy(np.flatnonzero(~rows)).to(state.device))
+
+
+def reset_opacities(state: TrainingState) -> None:
+    """Cap every opacity at 0.01 and forget its moments, so that floaters can be told from surfaces."""
+    value = state.values["opacity_logits"].detach()
+    cap = torch.logit(value.new_tensor(0.01))
+    state.values["opacity_logits"] = torch.minimum(value, cap).requires_grad_()
+    state.first["opacity_logits"].zero_()
+    state.second["opacity_logits"].zero_()
+
+
+def add_opacity_decay(state: TrainingState, strength: float) -> None:
+    """Add the gradient of `strength` times the mean opacity, as Kheradmand et al. 2024."""
+    logits = state.values["opacity_logits"]
+    raw = logits.detach()
+    slope = torch.sigmoid(raw) * torch.sigmoid(-raw) * (strength / max(len(state), 1))
+    logits.grad = slope if logits.grad is None else logits.grad + slope
+
+
 # Checkpoints of radiance training: one safetensors file, written atomically, resumed exactly.
 #
 # Tensors: ``values.*``, ``first.*``, ``second.*`` for every parameter, ``grad_sum``, ``seen``, ``exposures``
@@ -216,6 +289,8 @@ def adam_step(state: TrainingState, learning_rates: dict[str, float]) -> None:
 # elsewhere cannot run code.
 
 KIND = "langsplat-radiance-checkpoint-3"
+ROWS, TENSORS = ("values", "first", "second"), ("grad_sum", "seen", "exposures")
+WATCHED = tuple(Transients.__dataclass_fields__)
 
 
 def fingerprint(capture: Capture, config: RadianceConfig, train_indices: Sequence[int]) -> str:
@@ -233,20 +308,11 @@ def fingerprint(capture: Capture, config: RadianceConfig, train_indices: Sequenc
 
 def save_checkpoint(path: Path, state: TrainingState, made_from: str) -> None:
     """Write `state`; `made_from` is the run's `fingerprint`."""
-    tensors = {"grad_sum": state.grad_sum, "seen": state.seen, "exposures": state.exposures}
-    tensors |= {f"watched.{name}": torch.from_numpy(array) for name, array in vars(state.transients).items()}
-    for name in PARAMETERS:
-        tensors[f"values.{name}"] = state.values[name].detach()
-        tensors[f"first.{name}"] = state.first[name]
-        tensors[f"second.{name}"] = state.second[name]
-    header = {
-        "fingerprint": made_from,
-        "step": state.step,
-        "updates": state.updates,
-        "queue": state.queue,
-        "non_finite": state.non_finite,
-        "rng": state.rng.bit_generator.state,
-    }
+    tensors = {name: getattr(state, name) for name in TENSORS}
+    tensors |= {f"watched.{name}": torch.from_numpy(getattr(state.transients, name)) for name in WATCHED}
+    tensors |= {f"{rows}.{name}": getattr(state, rows)[name].detach() for rows in ROWS for name in PARAMETERS}
+    header = {name: getattr(state, name) for name in ("step", "updates", "queue", "non_finite")}
+    header |= {"fingerprint": made_from, "rng": state.rng.bit_generator.state}
     with atomic_path(path) as temporary:
         save_file(
             {name: tensor.contiguous().cpu() for name, tensor in tensors.items()},
@@ -260,7 +326,6 @@ def load_checkpoint(path: Path, made_from: str, device: torch.device) -> Trainin
 
     Raises FormatError for a file that is no checkpoint and InputError for one of another run.
     """
-    tensors: dict[str, torch.Tensor] = {}
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
@@ -273,28 +338,23 @@ def load_checkpoint(path: Path, made_from: str, device: torch.device) -> Trainin
                 f"{path}: this checkpoint belongs to other photographs or settings; "
                 "delete it to train afresh, or give the arguments it was made with"
             )
-        return _rebuild(tensors, header)
+        rng = np.random.default_rng()
+        rng.bit_generator.state = header["rng"]
+        values, first, second = ({name: tensors[f"{rows}.{name}"] for name in PARAMETERS} for rows in ROWS)
+        return TrainingState(
+            values={name: value.requires_grad_() for name, value in values.items()},
+            first=first,
+            second=second,
+            grad_sum=tensors["grad_sum"],
+            seen=tensors["seen"],
+            exposures=tensors["exposures"],
+            transients=Transients(*(tensors[f"watched.{name}"].cpu().numpy() for name in WATCHED)),
+            rng=rng,
+            updates={name: int(header["updates"][name]) for name in PARAMETERS},
+            step=int(header["step"]),
+            queue=[int(index) for index in header["queue"]],
+            non_finite=int(header["non_finite"]),
+        )
     except (SafetensorError, ValueError, KeyError, TypeError) as error:
         problem = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise FormatError(f"{path}: not a usable checkpoint ({problem}); delete it to train afresh") from None
-
-
-def _rebuild(tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> TrainingState:
-    rng = np.random.default_rng()
-    rng.bit_generator.state = header["rng"]
-    return TrainingState(
-        values={name: tensors[f"values.{name}"].requires_grad_() for name in PARAMETERS},
-        first={name: tensors[f"first.{name}"] for name in PARAMETERS},
-        second={name: tensors[f"second.{name}"] for name in PARAMETERS},
-        updates={name: int(header["updates"][name]) for name in PARAMETERS},
-        grad_sum=tensors["grad_sum"],
-        seen=tensors["seen"],
-        rng=rng,
-        exposures=tensors["exposures"],
-        transients=Transients(
-            *(tensors[f"watched.{part.name}"].cpu().numpy() for part in fields(Transients))
-        ),
-        step=int(header["step"]),
-        queue=[int(index) for index in header["queue"]],
-        non_finite=int(header["non_finite"]),
-    )

@@ -23,7 +23,6 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import Camera
 
 STAGE = "finding depths"
-LONGER_SIDE = 320  # px at most, of the images that are compared
 PLANES = 96
 RADIUS = 3  # px, of the windows that are compared
 BEST = 2  # scores of neighbours that count: others may see something before a pixel
@@ -54,11 +53,11 @@ class DepthMap:
 
 
 def find_depths(capture: Capture, indices: Sequence[int], progress: Progress = silent) -> list[DepthMap]:
-    """Find the depths of the photographs at `indices` that another one confirms.
+    """Find the depths of the photographs at `indices` that another one confirms, at 320 px.
 
     Photographs without neighbours have no map. Masked pixels have no depth.
     """
-    small = capture.shrunk(indices, LONGER_SIDE)
+    small = capture.shrunk(indices, 320)
     masks = [np.True_ if (mask := small.mask(index)) is None else mask for index in range(len(small))]
     # Windows reach into what is masked: it is the same in all photographs.
     greys = [
@@ -70,11 +69,10 @@ def find_depths(capture: Capture, indices: Sequence[int], progress: Progress = s
         if others:
             depth, score = sweep(index, others, small.cameras, greys, capture.points)
             depth = np.where(masks[index], depth, np.nan)
-            maps.append(
-                DepthMap(small.cameras[index], depth, np.zeros_like(depth), score, small.images[index])
-            )
+            free = np.zeros_like(depth)
+            maps.append(DepthMap(small.cameras[index], depth, free, score, small.images[index]))
         progress(STAGE, (index + 1) / len(small))
-    depths = [confirmed(one, [other for other in maps if other is not one]) for one in maps]
+    depths = [_confirmed(one, [other for other in maps if other is not one]) for one in maps]
     return [
         replace(one, depth=depth, free=free_depths(one.camera, shared_depths(depth), capture.points))
         for one, depth in zip(maps, depths, strict=True)
@@ -136,15 +134,13 @@ def sweep(
 
     greys: (H, W) float32 in [0, 1].
     """
-    camera, grey = cameras[index], greys[index]
+    camera, grey, run = cameras[index], greys[index], shared_workers().run
     planes = inverse_depths(camera, cameras, known)
     best = np.full((BEST, PLANES, *grey.shape), -1, np.float32)
     for other in others:
-        shared_workers().run(
-            score_planes, PLANES, grey, greys[other], *warp(camera, cameras[other]), planes, best
-        )
+        run(score_planes, PLANES, grey, greys[other], *warp(camera, cameras[other]), planes, best)
     at, score = np.empty(grey.shape, np.float32), np.empty(grey.shape, np.float32)
-    shared_workers().run(_choose_planes, len(grey), best, min(BEST, len(others)), at, score)
+    run(_choose_planes, len(grey), best, min(BEST, len(others)), at, score)
     return 1 / (planes[0] + at.astype(np.float64) * (planes[1] - planes[0])), score
 
 
@@ -246,8 +242,8 @@ def _choose_planes(first: int, last: int, best: Array, count: int, at: Array, sc
             score[row, x] = mean[top]
 
 
-def confirmed(one: DepthMap, others: Sequence[DepthMap]) -> Array:
-    """Return the (H, W) depths of the map, NaN where their score is low or no other map confirms them."""
+def _confirmed(one: DepthMap, others: Sequence[DepthMap]) -> Array:
+    """(H, W) depths of the map, NaN where their score is low or no other map confirms them."""
     depth = np.where(one.score > 0.6, one.depth, np.nan)
     points, _ = replace(one, depth=depth).points()
     kept = np.zeros(len(points), bool)
@@ -262,8 +258,7 @@ def confirmed(one: DepthMap, others: Sequence[DepthMap]) -> Array:
 def shared_depths(depth: Array) -> Array:
     """Return the (H, W) depths, NaN where too few pixels around share one.
 
-    What two views agree on by chance is alone. Where views lie one behind another, as on a walk, that is one
-    depth in ten, and each would free a window of space behind the surface.
+    What two views agree on by chance is alone, and would free a window of space behind the surface.
     """
     size = 2 * RADIUS + 1
     windows = sliding_window_view(np.pad(depth, RADIUS, constant_values=np.nan), (size, size))
@@ -275,8 +270,7 @@ def free_depths(camera: Camera, depth: Array, known: Array) -> Array:
     """Return the (H, W) depths up to which space is free.
 
     By the surfaces of the (H, W) `depth`, NaN where it is not known, and by the (N, 3) `known` points. What
-    no other photograph confirms is mostly flat, or seen by this one alone: there nothing else tells haze from
-    a surface. It is not much nearer than the surfaces around it.
+    no other photograph confirms is mostly flat: it is not much nearer than the surfaces around it.
     """
     told = np.where(np.isfinite(depth), depth, np.inf)
     _, pixels, depths = _in_view(camera, known)
@@ -301,10 +295,7 @@ def in_free_space(points: Array, maps: Sequence[DepthMap]) -> Array:
 
 
 def _in_view(camera: Camera, points: Array) -> tuple[Array, tuple[Array, Array], Array]:
-    """Return the numbers of the (N, 3) points that lie in the image, their pixels and their depths.
-
-    Pixels are rows and columns.
-    """
+    """Numbers of the (N, 3) points that lie in the image, their (rows, columns) and their depths."""
     pixels, depths = camera.project(points)
     there = np.flatnonzero(camera.in_image(pixels, depths))
     columns, rows = pixels[there].astype(int).T

@@ -24,23 +24,25 @@ from langsplat_core.interrupts import Terminated, handled
 from langsplat_core.progress import Progress, WorkCancelledError, silent
 from langsplat_core.scene import Camera, Gaussians
 from langsplat_core.training import one_torch_thread
-from langsplat_core.training.radiance.density import (
-    accumulate,
-    add_opacity_decay,
-    densify,
-    remove_gaussians,
-    reset_opacities,
-)
 from langsplat_core.training.radiance.differentiable import DifferentiableRenderer, renderer_for
-from langsplat_core.training.radiance.exposure import fit_exposures, no_exposures, with_exposure
-from langsplat_core.training.radiance.losses import radiance_loss
+from langsplat_core.training.radiance.losses import (
+    fit_exposures,
+    no_exposures,
+    radiance_loss,
+    with_exposure,
+)
 from langsplat_core.training.radiance.state import (
     TrainingState,
+    accumulate,
     adam_step,
+    add_opacity_decay,
     clean_gradients,
+    densify,
     fingerprint,
     initial_gaussians,
     load_checkpoint,
+    remove_gaussians,
+    reset_opacities,
     save_checkpoint,
     start,
 )
@@ -56,13 +58,11 @@ STAGE = "training Gaussians"
 class Schedule:
     """Step numbers and rates of one training run of any length; steps count from 1.
 
-    At the reference budget this is exactly the INRIA schedule (arguments/__init__.py and train.py of the
-    public code). A smaller budget shortens every interval in proportion, but not below what it needs to make
-    sense: a gradient mean wants some views, a reset opacity wants time to recover.
-
-    Positions, scales and rotations then learn faster, by the square root of the missing factor: Adam moves a
-    parameter by about its rate per step, and 600 steps at rates meant for 30 000 leave Gaussians where they
-    began. Measured on 12 photographs at 320 px, 600 steps, held-out SSIM: 0.58 as published, 0.73 so.
+    At the reference budget this is the INRIA schedule (arguments/__init__.py and train.py of the public
+    code). A smaller budget shortens every interval in proportion, but not below what it needs to make sense.
+    Positions, scales and rotations then learn faster, by the square root of the missing factor: 600 steps at
+    rates meant for 30 000 leave Gaussians where they began (held-out SSIM of 12 photographs at 320 px: 0.58
+    as published, 0.73 so).
     """
 
     steps: int  # in all
@@ -140,27 +140,6 @@ def schedule_for(config: RadianceConfig, extent: float) -> Schedule:
     )
 
 
-def for_few_views(config: RadianceConfig) -> RadianceConfig:
-    """Return `config` without resets of opacities, for few photographs.
-
-    After a reset these let what stands close before each camera come back first. A decay of opacities takes
-    what no photograph needs.
-    """
-    return replace(config, opacity_reset_every=0, opacity_decay=max(config.opacity_decay, 0.01))
-
-
-@dataclass(frozen=True)
-class _Run:
-    """Constants of a run."""
-
-    config: RadianceConfig
-    schedule: Schedule
-    views: "_Views"
-    renderer: DifferentiableRenderer
-    extent: float  # world units
-    depths: Sequence[DepthMap]  # of surfaces that Gaussians do not stay before; none for many views
-
-
 def train_radiance(
     capture: Capture,
     config: RadianceConfig,
@@ -182,7 +161,9 @@ def train_radiance(
     made_from = fingerprint(capture, config, train_indices) if checkpoint else ""
     depths: list[DepthMap] = []
     if len(train_indices) <= config.few_views:
-        config = for_few_views(config)
+        # After a reset, what stands close before each of few cameras comes back first. A decay of opacities
+        # takes what no photograph needs instead.
+        config = replace(config, opacity_reset_every=0, opacity_decay=max(config.opacity_decay, 0.01))
         depths = find_depths(capture, train_indices, progress)
         capture = _with_points(capture, depths, config)
     first = initial_gaussians(capture, train_indices, config.sh_degree, config.max_gaussians, config.seed)
@@ -202,7 +183,7 @@ def train_radiance(
     with one_torch_thread(), handled(lambda number, _: signals.append(number)):
         try:
             while state.step < config.steps:
-                losses.append(_step(run, state))
+                losses.append(run.step(state))
                 # Every photograph has another loss: what is told is the mean over each 200th of the run.
                 if state.step * 200 // config.steps > (state.step - 1) * 200 // config.steps:
                     metrics, losses = {"loss": float(np.mean(losses))}, []
@@ -217,98 +198,6 @@ def train_radiance(
             raise
     gaussians = state.gaussians()  # without those that no image can show
     return gaussians.take(gaussians.valid() & (sigmoid(gaussians.opacity_logits) >= INRIA.alpha_min))
-
-
-def _step(run: _Run, state: TrainingState) -> float:
-    """One photograph, one update; the loss before it."""
-    config, schedule, step = run.config, run.schedule, state.step + 1
-    if not state.queue:
-        state.queue = [int(index) for index in state.rng.permutation(len(run.views))]
-    exposing = [] if config.exposure == "off" else [1 + round(third * config.steps / 3) for third in (1, 2)]
-    if step in exposing:
-        state.exposures = _exposures(run, state)
-    index = state.queue.pop()
-    camera, target, mask = run.views.at(index, coarse=step <= schedule.coarse_until)
-    rendered = run.renderer.render(state.values, camera, schedule.active_sh_degree(step))
-    image = rendered.image
-    if exposing and step >= exposing[0]:
-        image = with_exposure(image, state.exposures[index])
-    _observe_transients(run, state, index, image, target, mask)
-    mask = _counted(run, state, index, mask, (camera.height, camera.width))
-    if mask is not None:  # what is masked differs from nothing, and nothing flows back from it
-        image = torch.where(mask[..., None], image, image.detach())
-        target = torch.where(mask[..., None], target, image.detach())
-    loss = radiance_loss(image, target, config.lambda_dssim)
-    loss.backward()
-    if config.opacity_decay > 0:
-        add_opacity_decay(state, config.opacity_decay)
-    clean_gradients(state)
-    if step < schedule.densify_until:
-        accumulate(state, rendered.means_px_grad(), rendered.visible, (camera.width, camera.height))
-    adam_step(state, schedule.learning_rates(step))
-    if schedule.densifies(step):
-        densify(state, config, run.extent, prune_large=schedule.prunes_large(step))
-    if run.depths and schedule.clears_free_space(step):
-        remove_gaussians(state, in_free_space(state.values["means"].detach().cpu().numpy(), run.depths))
-    if schedule.resets_opacity(step):
-        reset_opacities(state)
-    state.step = step
-    return float(loss.detach())
-
-
-def _exposures(run: _Run, state: TrainingState) -> Tensor:
-    """(V, 4, 3) exposures of the training views; no change where they explain too little."""
-    pairs: list[tuple[Tensor, Tensor]] = []
-    for index in range(len(run.views)):
-        camera, target, mask = run.views.at(index, coarse=True)
-        mask = _counted(run, state, index, mask, (camera.height, camera.width))
-        with torch.no_grad():
-            degree = run.schedule.active_sh_degree(state.step)
-            image = run.renderer.render(state.values, camera, degree).image
-        counted = (slice(None), slice(None)) if mask is None else mask
-        # One pixel in seven tells the exposure.
-        pairs.append((image[counted].reshape(-1, 3)[::7], target[counted].reshape(-1, 3)[::7]))
-    exposures, gain = fit_exposures(pairs)
-    log.debug("exposures of the photographs explain %.2f dB", gain)
-    if gain >= 0.35 or run.config.exposure == "on":
-        return exposures
-    return no_exposures(len(run.views), exposures.device)
-
-
-def _transients_count_from(config: RadianceConfig) -> int:
-    """Return the step from which on transients do not count: a fifth of the run has to show what is."""
-    return max(round(config.steps / 5), 1)
-
-
-def _observe_transients(
-    run: _Run, state: TrainingState, index: int, image: Tensor, target: Tensor, mask: Tensor | None
-) -> None:
-    """Judge the patches of view `index`, of which this step renders `image`.
-
-    Transients that explain too little of the error, less than 24 % of its squares, are given up for the rest
-    of the run.
-    """
-    transients = state.transients
-    judged = state.step == _transients_count_from(run.config) and run.config.transients == "auto"
-    if judged and transients.explained() < 0.24:
-        state.transients = transients = no_transients(0)
-    if len(transients.moving):
-        rendered = patch_means(image)
-        if mask is not None:
-            rendered[patch_means(mask[..., None].float())[..., 0] < 0.5] = np.nan
-        depths = rendered_depths(run.renderer, state.values, run.views.cameras[index])
-        transients.observe(index, run.views.cameras, rendered, patch_means(target), depths)
-
-
-def _counted(
-    run: _Run, state: TrainingState, index: int, mask: Tensor | None, size: tuple[int, int]
-) -> Tensor | None:
-    """Return the (H, W) bool pixels of view `index` that count, of those of its `mask`; None: all of them."""
-    moving = state.transients.moving
-    if not len(moving) or state.step < _transients_count_from(run.config) or not moving[index].any():
-        return mask
-    still = state.transients.still_pixels(index, size, run.renderer.device)
-    return still if mask is None else mask & still
 
 
 class _Views:
@@ -343,6 +232,105 @@ def _halved(camera: Camera, image: Array, mask: Array | None) -> tuple[Camera, A
     if min(camera.width, camera.height) < 64:
         return camera, image, mask
     return shrunk_view(camera, image, mask, (camera.width // 2, camera.height // 2))
+
+
+@dataclass(frozen=True)
+class _Run:
+    """What stays the same over all steps."""
+
+    config: RadianceConfig
+    schedule: Schedule
+    views: _Views
+    renderer: DifferentiableRenderer
+    extent: float  # world units
+    depths: Sequence[DepthMap]  # of surfaces that Gaussians do not stay before; none for many views
+
+    def step(self, state: TrainingState) -> float:
+        """One photograph, one update; the loss before it."""
+        config, schedule, step = self.config, self.schedule, state.step + 1
+        if not state.queue:
+            state.queue = [int(index) for index in state.rng.permutation(len(self.views))]
+        exposing = [] if config.exposure == "off" else [1 + round(n * config.steps / 3) for n in (1, 2)]
+        if step in exposing:
+            state.exposures = self.find_exposures(state)
+        index = state.queue.pop()
+        camera, target, mask = self.views.at(index, coarse=step <= schedule.coarse_until)
+        rendered = self.renderer.render(state.values, camera, schedule.active_sh_degree(step))
+        image = rendered.image
+        if exposing and step >= exposing[0]:
+            image = with_exposure(image, state.exposures[index])
+        self.observe_transients(state, index, image, target, mask)
+        mask = self.counted(state, index, mask, camera)
+        if mask is not None:  # what is masked differs from nothing, and nothing flows back from it
+            image = torch.where(mask[..., None], image, image.detach())
+            target = torch.where(mask[..., None], target, image.detach())
+        loss = radiance_loss(image, target, config.lambda_dssim)
+        loss.backward()
+        if config.opacity_decay > 0:
+            add_opacity_decay(state, config.opacity_decay)
+        clean_gradients(state)
+        if step < schedule.densify_until:
+            accumulate(state, rendered.means_px_grad(), rendered.visible, (camera.width, camera.height))
+        adam_step(state, schedule.learning_rates(step))
+        if schedule.densifies(step):
+            densify(state, config, self.extent, prune_large=schedule.prunes_large(step))
+        if self.depths and schedule.clears_free_space(step):
+            means = state.values["means"].detach().cpu().numpy()
+            remove_gaussians(state, in_free_space(means, self.depths))
+        if schedule.resets_opacity(step):
+            reset_opacities(state)
+        state.step = step
+        return float(loss.detach())
+
+    def find_exposures(self, state: TrainingState) -> Tensor:
+        """(V, 4, 3) exposures of the training views; no change where they explain too little."""
+        pairs: list[tuple[Tensor, Tensor]] = []
+        for index in range(len(self.views)):
+            camera, target, mask = self.views.at(index, coarse=True)
+            mask = self.counted(state, index, mask, camera)
+            with torch.no_grad():
+                degree = self.schedule.active_sh_degree(state.step)
+                image = self.renderer.render(state.values, camera, degree).image
+            counted = (slice(None), slice(None)) if mask is None else mask
+            # One pixel in seven tells the exposure.
+            pairs.append((image[counted].reshape(-1, 3)[::7], target[counted].reshape(-1, 3)[::7]))
+        exposures, gain = fit_exposures(pairs)
+        log.debug("exposures of the photographs explain %.2f dB", gain)
+        if gain >= 0.35 or self.config.exposure == "on":
+            return exposures
+        return no_exposures(len(self.views), exposures.device)
+
+    @property
+    def transients_from(self) -> int:
+        """Step from which on transients do not count: a fifth of the run has to show what is."""
+        return max(round(self.config.steps / 5), 1)
+
+    def observe_transients(
+        self, state: TrainingState, index: int, image: Tensor, target: Tensor, mask: Tensor | None
+    ) -> None:
+        """Judge the patches of view `index`, of which this step renders `image`.
+
+        Transients that explain less than 24 % of the squared error are given up for the rest of the run.
+        """
+        judged = state.step == self.transients_from and self.config.transients == "auto"
+        if judged and state.transients.explained() < 0.24:
+            state.transients = no_transients(0)
+        if len(state.transients.moving):
+            rendered = patch_means(image)
+            if mask is not None:
+                rendered[patch_means(mask[..., None].float())[..., 0] < 0.5] = np.nan
+            cameras = self.views.cameras
+            depths = rendered_depths(self.renderer, state.values, cameras[index])
+            state.transients.observe(index, cameras, rendered, patch_means(target), depths)
+
+    def counted(self, state: TrainingState, index: int, mask: Tensor | None, camera: Camera) -> Tensor | None:
+        """(H, W) bool pixels of view `index` that count, of those of its `mask`; None: all of them."""
+        moving = state.transients.moving
+        if not len(moving) or state.step < self.transients_from or not moving[index].any():
+            return mask
+        size = camera.height, camera.width
+        still = state.transients.still_pixels(index, size, self.renderer.device)
+        return still if mask is None else mask & still
 
 
 def _with_points(capture: Capture, depths: Sequence[DepthMap], config: RadianceConfig) -> Capture:

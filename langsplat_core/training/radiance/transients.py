@@ -7,8 +7,7 @@ several times the median over all views. It is transient where other views see t
 rendered there, and find it as it is rendered. What stands still and is not learnt yet, or shines, differs in
 other views too, and what only one photograph shows is in no other.
 
-Nothing is masked for good: patches are judged anew whenever their view is rendered, and what other views
-teach comes back.
+Nothing is masked for good: patches are judged anew whenever their view is rendered.
 """
 
 from collections.abc import Sequence
@@ -23,7 +22,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.scene import Camera
 from langsplat_core.scene.transform import C0
 from langsplat_core.training.radiance.differentiable import DifferentiableRenderer
-from langsplat_core.training.radiance.exposure import fit_exposure, with_exposure
+from langsplat_core.training.radiance.losses import fit_exposure, with_exposure
 
 GRID = 32  # patches along both sides of a view
 MOST = 0.4  # of a photograph's patches that may be transient
@@ -48,8 +47,7 @@ class Transients:
     ) -> None:
         """Judge the patches of view `index` anew.
 
-        By its mean colours, rendered and photographed, (GRID, GRID, 3), NaN where masked, and the (GRID,
-        GRID) depths rendered.
+        By its (GRID, GRID, 3) mean colours, NaN where masked, and its rendered (GRID, GRID) depths.
         """
         found, before = colour_difference(rendered, photographed), self.differences[index]
         self.differences[index] = np.where(np.isnan(before), found, (before + found) / 2)
@@ -75,10 +73,7 @@ def no_transients(views: int) -> Transients:
 
 
 def colour_difference(rendered: Array, photographed: Array) -> Array:
-    """Return the (GRID, GRID, 3) colours rendered less those photographed.
-
-    Under the exposure that brings most patches together.
-    """
+    """Return the (GRID, GRID, 3) colours rendered less those photographed, under the best exposure."""
     image, target = (torch.from_numpy(colours.reshape(-1, 3)) for colours in (rendered, photographed))
     fits = torch.isfinite(image).all(1)
     for _ in range(3):  # the 70 % of the patches that fit best tell the exposure
@@ -89,10 +84,10 @@ def colour_difference(rendered: Array, photographed: Array) -> Array:
 
 
 def count_agreeing(index: int, cameras: Sequence[Camera], depths: Array, alike: Array) -> Array:
-    """Return how many other views see the surface in each patch of view `index`, and find it alike.
+    """Return (2, GRID, GRID) numbers of other views for each patch of view `index`.
 
-    (2, GRID, GRID): the numbers of views that find it `alike` (V, GRID, GRID), and of those that see it where
-    view `index` renders it.
+    Of those that see the surface where view `index` renders it, and find it `alike` (V, GRID, GRID), and of
+    all that see it.
     """
     grids = [camera.resized(GRID, GRID) for camera in cameras]  # a pixel for each patch
     points = grids[index].unproject(grids[index].pixel_centres(), depths[index]).reshape(-1, 3)
@@ -131,10 +126,7 @@ def patch_means(image: Tensor) -> Array:
 
 
 def rendered_depths(renderer: DifferentiableRenderer, values: dict[str, Tensor], camera: Camera) -> Array:
-    """Return the (GRID, GRID) mean depths of what a camera sees, NaN where little is.
-
-    values: as of `TrainingState`.
-    """
+    """Return the (GRID, GRID) mean depths of what a camera sees of the `values`, NaN where little is."""
     small = camera.resized(64, max(1, round(64 * camera.height / camera.width)))
     z = camera.project(values["means"].detach().cpu().numpy())[1].clip(0).astype(np.float32)
     grey = torch.from_numpy(np.repeat((z[:, None, None] - 0.5) / C0, 3, axis=2)).to(values["means"].device)

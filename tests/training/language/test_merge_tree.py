@@ -13,8 +13,15 @@ from langsplat_core.scene.surface import build_surface
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language import merge_tree as module
 from langsplat_core.training.language.mask_weights import PAIR, MaskWeights, find_mask_weights
-from langsplat_core.training.language.merge_tree import MergeTree, Patches, find_tree, merge
-from langsplat_core.training.language.patch_maps import SOLID, draw_patches, nested_maps
+from langsplat_core.training.language.merge_tree import (
+    SOLID,
+    MergeTree,
+    Patches,
+    draw_patches,
+    find_tree,
+    merge,
+    nested_maps,
+)
 from tests.support.fakes import PER_BLOB, blob_scene, cameras
 from tests.support.scenes import make_views, random_camera, random_gaussians
 
@@ -32,19 +39,19 @@ def random_patches(seed: int, count: int = 24, views: int = 4) -> Patches:
     )
     labelling = np.arange(masks, dtype=np.int32) // 5
     colours, areas = rng.dirichlet(np.ones(3), count), rng.uniform(0.1, 3, count)
-    return Patches(sparse.csr_matrix(masses.astype(np.float32)), labelling, colours, areas, borders)
+    return Patches(sparse.csr_matrix(masses.astype(np.float32)), labelling, colours, areas, *borders)
 
 
 def merged_plainly(patches: Patches) -> tuple[list[tuple[int, int]], list[float]]:
     """Every cost anew at every step, from the patches themselves."""
-    masses, borders = patches.masses.toarray().astype(np.float64), patches.borders
+    masses = patches.masses.toarray().astype(np.float64)
     nodes = {number: [number] for number in range(len(patches.areas))}
     children, costs = [], []
 
     def cost(a: list[int], b: list[int]) -> float | None:
         across = [
             row
-            for row, ends in enumerate(zip(borders.first, borders.second, strict=True))
+            for row, ends in enumerate(patches.borders.T)
             if (ends[0] in a and ends[1] in b) or (ends[0] in b and ends[1] in a)
         ]
         if not across:
@@ -57,10 +64,10 @@ def merged_plainly(patches: Patches) -> tuple[list[tuple[int, int]], list[float]
             if least > 0:
                 agreed += least * (mine / mine.sum()) @ (theirs / theirs.sum())
         agreement = agreed / seen if seen > 0 else 1 - module.UNSEEN
-        links = borders.links[across].sum()
+        links, disagreement, concavity = patches.sums[across].sum(0)
         means = [np.average(patches.colours[nodes], axis=0, weights=patches.areas[nodes]) for nodes in (a, b)]
-        between = module.SEEN * (1 - agreement) + module.SEEN * borders.disagreement[across].sum() / links
-        between += module.BENT * borders.concavity[across].sum() / links
+        between = module.SEEN * (1 - agreement) + module.SEEN * disagreement / links
+        between += module.BENT * concavity / links
         between += module.COLOUR * np.linalg.norm(means[0] - means[1])
         smaller = min(patches.areas[a].sum(), patches.areas[b].sum()) / patches.areas.sum()
         return between * (smaller / module.PLAIN) ** module.SMALL

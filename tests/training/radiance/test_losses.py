@@ -1,16 +1,24 @@
-"""Losses: structural similarity and compiled kernels, against scikit-image and automatic differentiation."""
+"""Losses against scikit-image and automatic differentiation; exposures; what moves, against plain loops."""
+
+import math
 
 import numpy as np
 import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from langsplat_core.training.radiance.losses import (
-    blur,
-    radiance_loss,
-    raw_moments,
-    ssim,
-    ssim_terms,
+from langsplat_core.arrays import Array
+from langsplat_core.scene import Camera, look_at
+from langsplat_core.training.radiance.losses import blur, fit_exposure, radiance_loss, ssim_map, with_exposure
+from langsplat_core.training.radiance.transients import (
+    GRID,
+    MOST,
+    SAME_SURFACE,
+    colour_difference,
+    connected_patches,
+    count_agreeing,
+    no_transients,
+    patch_means,
 )
 
 
@@ -32,11 +40,8 @@ def test_ssim_agrees_with_scikit_image_away_from_the_border() -> None:
         data_range=1.0,
         full=True,
     )
-    a1, a2, b1, b2 = ssim_terms(blur(raw_moments(a, b)))
-    ours = (a1 * a2 / (b1 * b2)).numpy()
     inside = np.s_[5:-5, 5:-5]  # the border differs: zeros here, reflection there
-    np.testing.assert_allclose(ours[inside], want[inside], atol=1e-10)
-    assert float(ssim(a, b)) == pytest.approx(ours.mean(), abs=1e-12)
+    np.testing.assert_allclose(ssim_map(a, b).numpy()[inside], want[inside], atol=1e-10)
 
 
 def test_blur_is_its_own_adjoint_and_keeps_constants_inside() -> None:
@@ -47,9 +52,8 @@ def test_blur_is_its_own_adjoint_and_keeps_constants_inside() -> None:
     assert float(flat[0, 0]) < 0.5  # zeros outside
 
 
-def test_hand_written_gradient_is_the_derivative() -> None:
+def test_gradient_of_the_loss_is_its_derivative() -> None:
     a, b = pictures(3, (9, 8, 2))
-    assert torch.autograd.gradcheck(lambda x: ssim(x, b), a.clone().requires_grad_(), atol=1e-9)
     assert torch.autograd.gradcheck(lambda x: radiance_loss(x, b, 0.2), a.clone().requires_grad_(), atol=1e-8)
 
 
@@ -70,3 +74,131 @@ def test_compiled_loss_equals_the_formula(shape: tuple[int, int, int], weight: f
     assert ours == pytest.approx(want, abs=1e-6)
     # 1e-7: of equal pictures the gradient is a difference of equal numbers, not exactly 0 in float32
     np.testing.assert_allclose(gradient, want_gradient, atol=2e-6 * np.abs(want_gradient).max() + 1e-7)
+
+
+def test_exposure_is_a_ridge_regression() -> None:
+    rng = np.random.default_rng(4)
+    image = torch.tensor(rng.random((30, 40, 3)), dtype=torch.float32)
+    change = torch.tensor([[1.2, 0.0, 0.1], [0.0, 0.8, 0.0], [0.0, 0.1, 1.0], [0.05, -0.02, 0.0]])
+    target = with_exposure(image, change)
+    found = fit_exposure([(image[:10], target[:10]), (image[10:], target[10:])], ridge=0.0)
+    torch.testing.assert_close(found, change, rtol=1e-4, atol=1e-5)
+    x = np.pad(image.reshape(-1, 3).numpy().astype(np.float64), ((0, 0), (0, 1)), constant_values=1.0)
+    y, none = target.reshape(-1, 3).numpy().astype(np.float64), np.eye(4, 3)
+    hold = 0.5 * (x[:, :3] ** 2).mean() * np.eye(4)
+    held = none + np.linalg.solve(x.T @ x / len(x) + hold, x.T @ (y - x @ none) / len(x))
+    np.testing.assert_allclose(fit_exposure([(image, target)], ridge=0.5), held, atol=1e-5)
+    nothing = torch.zeros((0, 3))
+    torch.testing.assert_close(fit_exposure([(nothing, nothing)]), torch.eye(4, 3))
+
+
+# Transients.
+
+SIZE = (64, 48)
+
+
+def cameras() -> list[Camera]:
+    """Three before the wall z = 0."""
+    eyes = [np.array([x, 0.1 * x, -3.0 - 0.1 * x]) for x in (-0.5, 0.0, 0.6)]
+    return [look_at(eye, np.zeros(3), np.array([0.0, 1, 0]), SIZE, 40.0) for eye in eyes]
+
+
+def wall(camera: Camera) -> Array:
+    """(GRID, GRID) depths of the wall."""
+    y, x = (np.mgrid[:GRID, :GRID] + 0.5) / GRID
+    local = [(x * SIZE[0] - camera.cx) / camera.fx, (y * SIZE[1] - camera.cy) / camera.fy, np.ones_like(x)]
+    return -camera.position[2] / (np.stack(local, -1) @ camera.rotation)[..., 2]
+
+
+def counted_slowly(index: int, depths: Array, alike: Array) -> Array:
+    """`count_agreeing` by one patch after the other."""
+    counts, camera = np.zeros((2, GRID, GRID), int), cameras()[index]
+    for row in range(GRID):
+        for column in range(GRID):
+            pixel = (column + 0.5) * SIZE[0] / GRID, (row + 0.5) * SIZE[1] / GRID
+            point = camera.unproject(pixel, float(depths[index, row, column]))
+            for other, at in enumerate(cameras()):
+                if other == index or not np.isfinite(point).all():
+                    continue
+                (x, y), z = (part[0] for part in at.project(point[None]))
+                r, c = math.floor(y * GRID / SIZE[1]), math.floor(x * GRID / SIZE[0])
+                if (
+                    z > 0
+                    and 0 <= r < GRID
+                    and 0 <= c < GRID
+                    and abs(z / depths[other, r, c] - 1) < SAME_SURFACE
+                ):
+                    counts[:, row, column] += bool(alike[other, r, c]), 1
+    return counts
+
+
+def test_views_agree_on_the_surface_that_both_see() -> None:
+    rng = np.random.default_rng(0)
+    depths = np.stack([wall(camera) for camera in cameras()])
+    depths *= rng.uniform(0.9, 1.1, depths.shape)
+    depths[rng.random(depths.shape) < 0.1] = np.nan
+    alike = rng.random(depths.shape) < 0.6
+    for index in range(3):
+        found = count_agreeing(index, cameras(), depths, alike)
+        np.testing.assert_array_equal(found, counted_slowly(index, depths, alike))
+        assert found.max() == 2
+
+
+def test_colour_difference_ignores_exposure() -> None:
+    rng = np.random.default_rng(1)
+    drawn = rng.random((GRID, GRID, 3)).astype(np.float32)
+    seen = 0.8 * drawn + np.float32(0.05)
+    seen[4:10, 4:10] += 0.3
+    drawn[20, :] = np.nan  # masked
+    found = colour_difference(drawn, seen)
+    moved = np.zeros((GRID, GRID), bool)
+    moved[4:10, 4:10] = True
+    assert np.abs(found[~moved & (np.arange(GRID) != 20)[:, None]]).max() < 0.02  # what the ridge holds
+    np.testing.assert_allclose(found[moved], -0.3, atol=0.02)
+    assert np.isnan(found[20]).all()
+
+
+def test_transients_are_connected_patches() -> None:
+    differs, sizes = np.zeros((GRID, GRID), bool), np.zeros((GRID, GRID))
+    differs[3:5, 3:5], differs[10:13, 10], differs[20:23, 20:23] = True, True, True
+    sizes[3, 3], sizes[11, 10] = 0.2, 0.2  # the second piece is too small, the third nowhere sure
+    found = connected_patches(differs, sizes, 0.1)
+    want = np.zeros_like(found)
+    want[2:6, 2:6] = True
+    np.testing.assert_array_equal(found, want)
+    everything = connected_patches(np.ones_like(differs), np.random.default_rng(0).random(differs.shape), 0.1)
+    assert everything.mean() == pytest.approx(MOST, abs=0.01)
+
+
+def test_patches_that_other_views_contradict_are_transient() -> None:
+    """A patch counts as moving while its view alone differs there; once all differ it counts again."""
+    rng = np.random.default_rng(2)
+    colours = rng.uniform(0.2, 0.8, (GRID, GRID, 3)).astype(np.float32)
+    apart = colours.copy()
+    apart[12:18, 12:18, 0] += 0.3
+    found, depths = no_transients(3), [wall(camera) for camera in cameras()]
+    for index, seen in ((0, colours), (2, colours), (1, apart), (1, apart)):
+        found.observe(index, cameras(), colours, seen, depths[index])
+    inside = np.zeros((GRID, GRID), bool)
+    inside[12:18, 12:18] = True
+    assert found.moving[1][inside].all()
+    assert found.moving[1].sum() <= 8 * 8
+    assert not found.moving[[0, 2]].any()
+    assert found.explained() > 0.9
+    for _ in range(3):
+        for index in range(3):
+            everywhere = colours.copy()
+            everywhere[8:24, 6:26, 0] += 0.3
+            found.observe(index, cameras(), colours, everywhere, depths[index])
+    assert not found.moving[1][14:16, 14:16].any()
+
+
+def test_patches_map_to_their_pixels() -> None:
+    picture = torch.arange(64 * 96, dtype=torch.float32).reshape(64, 96, 1)
+    want = picture.numpy().reshape(GRID, 2, GRID, 3).mean((1, 3))
+    np.testing.assert_allclose(patch_means(picture)[..., 0], want, rtol=1e-6)
+    moving = np.random.default_rng(3).random((GRID, GRID)) < 0.5
+    transients = no_transients(1)
+    transients.moving[0] = moving
+    still = transients.still_pixels(0, (64, 96), torch.device("cpu")).numpy()
+    np.testing.assert_array_equal(still, ~moving.repeat(2, 0).repeat(3, 1))

@@ -1,4 +1,4 @@
-"""Radiance training: its schedule, and whole runs on a tiny scene drawn by the reference rasterizer."""
+"""Radiance training on a tiny scene drawn by the reference rasterizer: schedule, whole runs, rehearsals."""
 
 import math
 import os
@@ -9,27 +9,38 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from safetensors.torch import load_file
 
-from langsplat_core.arrays import Array
-from langsplat_core.config import INRIA, RadianceConfig
+from langsplat_core.arrays import Array, psnr
+from langsplat_core.config import (
+    GOOD,
+    INRIA,
+    QUICK,
+    RadianceBudget,
+    RadianceConfig,
+    TrainConfig,
+    with_preset,
+)
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import BackendError, InputError
 from langsplat_core.progress import Progress, Report, WorkCancelledError
-from langsplat_core.scene import Gaussians, look_at
-from langsplat_core.training.radiance.differentiable import CpuRenderer, renderer_for
-from langsplat_core.training.radiance.scores import evaluate_views
-from langsplat_core.training.radiance.state import (
-    PARAMETERS,
-    initial_gaussians,
-    start,
+from langsplat_core.raster.render import render
+from langsplat_core.scene import Gaussians, Scene, look_at
+from langsplat_core.training.radiance import rehearsal
+from langsplat_core.training.radiance.differentiable import CpuRenderer, evaluate_views, renderer_for
+from langsplat_core.training.radiance.rehearsal import (
+    budgets_for,
+    checkpoints_of,
+    climb,
+    rehearse,
+    supported,
+    train_within,
+    widened,
 )
+from langsplat_core.training.radiance.state import PARAMETERS, initial_gaussians, start
 from langsplat_core.training.radiance.stereo import STAGE
-from langsplat_core.training.radiance.trainer import (
-    for_few_views,
-    schedule_for,
-    train_radiance,
-)
+from langsplat_core.training.radiance.trainer import schedule_for, train_radiance
 from tests.support.processes import stop_at
 from tests.support.radiance import SHORT, SIZE, capture, picture, truth
 
@@ -139,18 +150,6 @@ def test_training_learns_the_scene() -> None:
     assert all(0 < score.covered <= 1 for score in [*before, *after])
     assert trained.valid().all()
     assert trained.opacity_logits.min() > -5.6  # none below alpha 1/255
-
-
-@pytest.mark.long
-def test_reported_losses_are_means_over_shares_of_the_run() -> None:
-    reports: list[Report] = []
-    config = replace(SHORT, steps=400, max_gaussians=64, few_views=0, exposure="off", transients="off")
-    small = capture().shrunk(range(6), 12)
-    train_radiance(small, config, [0, 1], progress=Progress(reports.append))
-    losses = [report.metrics.get("loss") for report in reports]
-    assert losses[0] is None
-    assert losses[1:-1:2] == losses[2::2]  # a new one every other step: of 400 steps, each 200th
-    assert len(set(losses)) > 190
 
 
 @pytest.mark.long
@@ -276,12 +275,7 @@ def test_training_ignores_transients(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_few_views_use_depths_instead_of_opacity_resets() -> None:
-    few, many = for_few_views(SHORT), SHORT
-    assert schedule_for(many, 1.0).resets_opacity(25)
-    schedule = schedule_for(few, 1.0)
-    assert not any(schedule.resets_opacity(step) or schedule.prunes_large(step) for step in range(1, 41))
-    assert few.opacity_decay > 0
+def test_few_views_alone_use_depths() -> None:
     stages: list[str] = []
     told = Progress(lambda at: stages.append(at.stage))
     train_radiance(capture(), replace(SHORT, steps=2), [0, 1, 2], progress=told)
@@ -289,3 +283,128 @@ def test_few_views_use_depths_instead_of_opacity_resets() -> None:
     stages.clear()
     train_radiance(capture(), replace(SHORT, steps=2, few_views=2), [0, 1, 2], progress=told)
     assert STAGE not in stages
+
+
+# Rehearsals: budgets that few photographs support, decided by views held out of the training views.
+
+
+def noise(side: int = 24, views: int = 8) -> Capture:
+    """Cameras on an arc; their images are noise, which nothing but learning by heart explains."""
+    rng = np.random.default_rng(0)
+    eyes = [np.array([4 * np.sin(a), 0.5, -4 * np.cos(a)]) for a in np.linspace(0, 1, views)]
+    cameras = [look_at(eye, np.zeros(3), np.array([0.0, -1.0, 0.0]), (side, side), 40.0) for eye in eyes]
+    images = [rng.integers(0, 255, (side, side, 3), dtype=np.uint8) for _ in eyes]
+    points = rng.normal(size=(100, 3)) * 0.3
+    return Capture(tuple(cameras), tuple(images), points, np.full(points.shape, 128, np.uint8))
+
+
+def test_presets_are_rehearsed_with_few_views_only() -> None:
+    def tried(config: TrainConfig, views: int = 9) -> list[RadianceBudget]:
+        return budgets_for(noise(config.dataset.max_side, 1), config.radiance, views)
+
+    assert tried(with_preset(TrainConfig(), "quick")) == [QUICK]
+    good = tried(with_preset(TrainConfig(), "good"))
+    assert good == [QUICK, RadianceBudget(480, 500, 60_000, 1), GOOD]
+    whole = RadianceBudget(800, 30_000, 1_000_000, 3)
+    assert tried(TrainConfig()) == [*good, whole._replace(steps=4_500), whole]
+    assert tried(TrainConfig(), RadianceConfig.rehearsed_views + 1) == [whole]
+    assert tried(TrainConfig(radiance=RadianceConfig(rehearsed_views=0))) == [whole]
+    small = budgets_for(noise(200, 1), RadianceConfig(steps=1_500, max_gaussians=5_000, sh_degree=0), 9)
+    assert small == [RadianceBudget(200, steps, 5_000, 0) for steps in (500, 1500)]
+
+
+@pytest.mark.parametrize(
+    ("scores", "best"),
+    [
+        # the second gains each time, but it may be chance; the fourth loses
+        ([[20.0, 18.0, 15.0], [20.2, 18.2, 15.2], [21.0, 18.1, 15.4], [19.5]], 2),
+        ([[20.0, 18.0], [19.9], [22.0, 17.9], [19.0]], 0),  # one losing view rejects a budget
+        ([[20.0], [19.0]], 0),
+        ([], 0),
+    ],
+)
+def test_larger_budgets_are_tried_until_one_loses(scores: list[list[float]], best: int) -> None:
+    tried: list[tuple[int, int]] = []
+
+    def score(index: int, number: int) -> float:
+        tried.append((index, number))
+        return scores[index][number]
+
+    assert climb(5 if scores else 1, 3, score) == scores
+    assert sorted(tried) == [(i, n) for i, found in enumerate(scores) for n in range(len(found))]
+    assert supported(scores, [*range(5)]) == best  # type: ignore[arg-type, comparison-overlap]
+
+
+def test_nothing_is_rehearsed_without_spare_views() -> None:
+    assert rehearse(noise(), RadianceConfig(), [QUICK, GOOD], [0, 4, 7]) == []
+    assert rehearse(noise(), RadianceConfig(), [QUICK], range(8)) == []
+
+
+def some_gaussians(scale: float) -> Gaussians:
+    rng = np.random.default_rng(1)
+    arrays = rng.normal(0, 0.4, (60, 3)), rng.normal(scale, 0.5, (60, 3)), rng.normal(size=(60, 4))
+    return Gaussians(*arrays, np.full(60, 2.0), rng.normal(0, 0.5, (60, 1, 3)))
+
+
+def test_widened_gaussians_look_the_same_at_full_size() -> None:
+    fitted, cameras = some_gaussians(-5.5), noise(160).cameras[1:3]
+    wide = widened(fitted, [(camera.resized(40, 40), camera) for camera in cameras])
+    small = render(Scene(fitted), cameras[0].resized(40, 40)).colours.repeat(4, 0).repeat(4, 1)
+    thin, seen = (render(Scene(gaussians), cameras[0]).colours for gaussians in (fitted, wide))
+    assert np.abs(small - seen).mean() < 0.5 * np.abs(small - thin).mean()
+    # A Gaussian in the middle, seen by both cameras: its variance grows by what the dilation lost.
+    depth = min(camera.project(fitted.means)[1][0] for camera in cameras)
+    grown = np.exp(2 * fitted.log_scales[0].astype(float)) + 0.3 * depth**2 * 15 / cameras[0].fx ** 2
+    np.testing.assert_allclose(np.exp(2 * wide.log_scales[0].astype(float)), grown, rtol=1e-4)
+
+
+def test_budgets_limit_steps_and_photographs() -> None:
+    steps: list[float] = []
+    told = Progress(lambda at: steps.append(at.fraction))
+    budget = RadianceBudget(12, 4, 60, 0)
+    made = train_within(noise(), budget, replace(SHORT, few_views=0), range(4), progress=told)
+    assert steps == [0.25, 0.5, 0.75, 1.0]
+    assert 0 < len(made) <= 60
+    assert made.sh_degree == 0
+
+
+def test_small_scores_compare_shrunk_images() -> None:
+    """As if both had been shrunk beforehand; what a mask leaves out of a small pixel leaves out the pixel."""
+    scene, mask = some_gaussians(-2.0), np.ones((640, 640), bool)
+    mask[:, 301:] = False
+    photographs = replace(noise(640), masks=(None, mask, *[None] * 6))
+    scores = evaluate_views(scene, photographs, [0, 1], "cpu", photographs.shrunk([0, 1], 320))
+    for index, (score, columns) in enumerate(zip(scores, (320, 150), strict=True)):
+        drawn = render(Scene(scene), photographs.cameras[index]).colours.clip(0, 1)
+        pair = np.round(255 * drawn).astype(np.uint8), photographs.images[index]
+        small = [
+            np.asarray(Image.fromarray(one).resize((320, 320), Image.Resampling.LANCZOS)) for one in pair
+        ]
+        expected = psnr(*(one[:, :columns] / 255 for one in small))
+        assert score.psnr_small == pytest.approx(expected, abs=0.01)
+        assert expected > score.psnr + 1  # of noise
+
+
+@pytest.mark.long
+def test_an_interrupted_rehearsal_ends_as_an_uninterrupted_one(tmp_path: Path) -> None:
+    config = RadianceConfig(steps=36, reference_steps=36, backend="cpu", sh_degree=0, max_gaussians=200)
+    job = noise(), config, [RadianceBudget(24, steps, 200, 0) for steps in (12, 36)], range(8)
+    reports: list[Report] = []
+
+    def stop(at: Report) -> None:
+        reports.append(at)
+        if at.fraction > 0.25:
+            raise WorkCancelledError
+
+    path = tmp_path / "rehearsal.safetensors"
+    straight = rehearse(*job)
+    assert len(straight) == 2
+    assert 1 <= len(straight[0]) == len(straight[1]) <= 3
+    with pytest.raises(WorkCancelledError):
+        rehearse(*job, path, Progress(stop))
+    assert len(checkpoints_of(path)) > 1
+    assert {report.stage for report in reports} == {rehearsal.STAGE}
+    assert reports[0].fraction < 0.1
+    again: list[Report] = []
+    assert rehearse(*job, path, Progress(again.append)) == straight
+    assert again[0].fraction >= 0.25
