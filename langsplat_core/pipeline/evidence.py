@@ -11,15 +11,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw, ImageFont, ImageOps
 from scipy import ndimage
 from scipy.special import betaincinv
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.io.hostile import exists, read_json_file
-from langsplat_core.pipeline.report import LIMIT, REPORT, work_folder
+from langsplat_core.io.hostile import exists
+from langsplat_core.pipeline.report import REPORT, stated_figures, work_folder
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import QueryEngine
@@ -29,10 +29,7 @@ from langsplat_core.scene import LEVELS, NO_NODE, Scene
 from langsplat_core.scene.surface import SMALLEST
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures, StoredFeatures
 from langsplat_core.training.language.mask_weights import SHOWN, VOTE
-from langsplat_core.training.language.patch_maps import SOLID
-
-TAILS = (0.05, 0.95)  # quantiles of the share of votes between which it is given
-STAGE = "comparing photographs"
+from langsplat_core.training.language.merge_tree import SOLID
 
 
 @dataclass(frozen=True)
@@ -76,7 +73,7 @@ class Evidence:
     @property
     def interval(self) -> tuple[float, float]:
         """The 5 % and 95 % quantiles of the same distribution."""
-        low, high = betaincinv(1 + len(self.votes), 1 + len(self.others), TAILS)
+        low, high = betaincinv(1 + len(self.votes), 1 + len(self.others), (0.05, 0.95))
         return float(low), float(high)
 
     def __str__(self) -> str:
@@ -107,7 +104,7 @@ def find_evidence(
     if len(phrases) > 1:
         phrase = max(phrases, key=lambda one: float(engine.run(one).relevancy[place].mean()))
     for view, camera in enumerate(scene.cameras):
-        progress(STAGE, view / len(scene.cameras))
+        progress("comparing photographs", view / len(scene.cameras))
         seen = features[view]
         if seen.labels.shape[1:] != (camera.height, camera.width) or seen.vectors.shape[1] != size:
             raise FormatError(
@@ -123,7 +120,7 @@ def find_evidence(
                 cosines, fits = engine.compare(phrase, seen.vectors[[mask]], answer.level)
                 cosine, fit = float(cosines[0]), float(fits[0])
             votes.append(Vote(view, camera.name, int(shown.sum()), mask, overlap, cosine, fit))
-    progress(STAGE, 1.0)
+    progress("comparing photographs", 1.0)
     agreeing = sorted((vote for vote in votes if vote.agrees), key=lambda vote: -(vote.fit or 0.0))
     others = sorted((vote for vote in votes if not vote.agrees), key=lambda vote: -vote.pixels)
     return Evidence(phrase, *found, tuple(agreeing), tuple(others))
@@ -164,10 +161,7 @@ def _nearest(seen: ImageFeatures, shown: Array) -> tuple[int, float]:
 
 
 def kept_features(path: Path, scene: Scene, work: Path | None = None) -> StoredFeatures:
-    """Return masks and vectors of the photographs of a scene, from `work` or the folder beside it.
-
-    Raises InputError where there are none.
-    """
+    """Return masks and vectors of a scene's photographs, from `work` or beside it; InputError without."""
     store = FeatureStore((work or work_folder(path)) / "features")
     missing = [camera.name for camera in scene.cameras if not exists(store.path(camera.name))]
     if missing or not scene.cameras:
@@ -188,13 +182,12 @@ def kept_photographs(
 ) -> dict[str, Array]:
     """Return photographs by the name of their camera, (H, W, 3) uint8 as training saw them.
 
-    They are read from `dataset`, or from where the report of the training says. Raises InputError where some
-    are missing.
+    From `dataset`, or from where the report of the training says. Raises InputError where some are missing.
     """
     from langsplat_core.datasets import load_photographs
 
     work = work or work_folder(path)
-    dataset = dataset or _stated_dataset(path, work / REPORT)
+    dataset = dataset or _stated_dataset(path, work)
     most = max(max(camera.width, camera.height) for camera in scene.cameras)
     capture = load_photographs(dataset, DatasetConfig(max_side=most, allow_few_cameras=True), work, progress)
     found = {camera.name: image for camera, image in zip(capture.cameras, capture.images, strict=True)}
@@ -209,16 +202,12 @@ def kept_photographs(
     return photographs
 
 
-def _stated_dataset(path: Path, report: Path) -> Path:
-    """Return the dataset that a report names, if it is still there."""
-    try:
-        stated = read_json_file(report, LIMIT)
-    except InputError:
-        stated = None
-    place = stated.get("dataset") if isinstance(stated, dict) else None
+def _stated_dataset(path: Path, work: Path) -> Path:
+    """Return the dataset that the report of a training names, if it is still there."""
+    place = stated_figures(work).get("dataset")
     if isinstance(place, str) and place and exists(Path(place)):
         return Path(place)
-    where = f"not in {place}" if isinstance(place, str) and place else f"not named in {report}"
+    where = f"not in {place}" if isinstance(place, str) and place else f"not named in {work / REPORT}"
     raise InputError(f"{path}: its photographs are {where}; name their folder with --photographs")
 
 
@@ -226,10 +215,8 @@ def _stated_dataset(path: Path, report: Path) -> Path:
 
 FEW = 5  # photographs in a row
 SIDE, GAP, LINE = 200, 10, 16  # px: of a thumbnail, between them, from line to line
-AROUND = 0.3  # of what is outlined, shown around it
 LEAST = 48  # px of the photograph that a thumbnail shows at least
 PAPER, INK, MASK, ANSWER = (255, 255, 255), (30, 30, 30), (255, 210, 0), (0, 200, 255)
-LEGEND = "yellow: the mask that overlaps most; blue: the answer as rendered"
 
 
 def draw_evidence(
@@ -240,11 +227,7 @@ def draw_evidence(
     photographs: Mapping[str, Array],
     rasterizer: Rasterizer,
 ) -> Array:
-    """Return an (H, W, 3) uint8 contact sheet of votes.
-
-    It has the best votes, the worst ones, and photographs that show the answer without a mask of just that.
-    Yellow outlines the mask, blue the answer as rendered.
-    """
+    """Return an (H, W, 3) uint8 contact sheet: the best votes, the worst ones, those against the answer."""
     rows = {"best votes": evidence.votes[:FEW]}
     rows["worst votes"] = evidence.votes[FEW:][-FEW:]
     rows["shown without a mask of just that"] = evidence.others[:FEW]
@@ -254,7 +237,8 @@ def draw_evidence(
     brush, font = ImageDraw.Draw(sheet), ImageFont.load_default(13)
     heading = f"{answer.phrase}: {answer.verdict}, {LEVELS[answer.level]}; {evidence}"
     brush.text((GAP, GAP), heading, INK, ImageFont.load_default(16))
-    brush.text((sheet.width - GAP, 2 * LINE), LEGEND, INK, font, anchor="ra")
+    legend = "yellow: the mask that overlaps most; blue: the answer as rendered"
+    brush.text((sheet.width - GAP, 2 * LINE), legend, INK, font, anchor="ra")
     for row, (title, votes) in enumerate(kept.items()):
         top = 3 * LINE + row * step
         brush.text((GAP, top), title, INK, font)
@@ -271,23 +255,16 @@ def draw_evidence(
 
 
 def _thumbnail(photograph: Array, mask: Array, shown: Array) -> Image.Image:
-    """Return the square of a photograph around mask and answer, with both outlined."""
+    """Return the part of a photograph around mask and answer, with both outlined, in a square."""
     rows, columns = np.nonzero(mask | shown)
-    low, high = np.array([columns.min(), rows.min()]), np.array([columns.max(), rows.max()]) + 1
-    size = np.array([photograph.shape[1], photograph.shape[0]])
-    side = min(max(int((1 + 2 * AROUND) * (high - low).max()), LEAST), int(size.max()))
-    corner = (low + high - side) // 2
-    # Within the photograph, or, of a side that is longer than it, with as much beyond it at both ends.
-    corner = np.where(side > size, (size - side) // 2, corner.clip(0, (size - side).clip(0)))
-    left, top = corner.tolist()
-    box = left, top, left + side, top + side
-    image = np.array(_cut(photograph, box, Image.Resampling.BICUBIC))
-    image[~np.asarray(_cut(np.ones(mask.shape, bool), box, Image.Resampling.NEAREST))] = PAPER
+    extent = max(np.ptp(rows), np.ptp(columns)) + 1
+    around = round(max(0.3 * extent, (LEAST - extent) / 2))
+    top, left = max(rows.min() - around, 0), max(columns.min() - around, 0)
+    part = np.s_[top : rows.max() + 1 + around, left : columns.max() + 1 + around]
+    square = Image.fromarray(np.ascontiguousarray(photograph[part]))
+    image = np.array(ImageOps.pad(square, (SIDE, SIDE), Image.Resampling.BICUBIC, PAPER))
     for region, colour in ((shown, ANSWER), (mask, MASK)):
-        inside = np.asarray(_cut(region, box, Image.Resampling.NEAREST))
+        cut = ImageOps.pad(Image.fromarray(region[part]), (SIDE, SIDE), Image.Resampling.NEAREST)
+        inside = np.asarray(cut)
         image[inside & ~ndimage.binary_erosion(inside, iterations=2, border_value=1)] = colour
     return Image.fromarray(image)
-
-
-def _cut(image: Array, box: tuple[int, int, int, int], how: Image.Resampling) -> Image.Image:
-    return Image.fromarray(image).crop(box).resize((SIDE, SIDE), how)

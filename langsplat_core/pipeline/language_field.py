@@ -1,4 +1,4 @@
-"""From masks with vectors to a language field: mask weights, groups of masks, codec, latents.
+"""From masks with vectors to a language field: mask weights, groups of masks, codec, latents, tree.
 
 Each is kept in the work folder. Mask weights are kept view by view and latents block by block, so that an
 interrupted run, or one that is shared by several processes, repeats little, and so that what is held in
@@ -6,9 +6,9 @@ memory depends on a block of Gaussians and not on all of them times all photogra
 """
 
 import shutil
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, replace
-from functools import partial
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +20,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.pipeline.stages import (
     Arrays,
     ProcessGroup,
-    features_digest,
-    gaussians_digest,
+    digest_of,
     kept,
     kept_array,
     open_array,
@@ -44,21 +43,22 @@ from langsplat_core.scene.codec import KINDS, CodebookCodec
 from langsplat_core.scene.language import phrase_key
 from langsplat_core.scene.surface import build_surface, build_tree
 from langsplat_core.semantics.encoder import Encoder, PhraseEncoder
-from langsplat_core.semantics.store import ImageFeatures
+from langsplat_core.semantics.regions import ImageEncoder, embed_regions, fingerprint, within
+from langsplat_core.semantics.store import FeatureStore, ImageFeatures, StoredFeatures
 from langsplat_core.semantics.vocabulary import everyday_vectors
 from langsplat_core.training.language.codec_fit import (
     CodecReport,
     codec_report,
+    contrasting_colours,
     everyday_vocabulary,
     fit_codec,
     rounded,
 )
 from langsplat_core.training.language.lift import (
-    Lifted,
-    lift_block,
     lift_by_gradient,
     lift_latents,
     lift_sample,
+    lift_weights,
 )
 from langsplat_core.training.language.mask_weights import (
     MaskGroups,
@@ -68,7 +68,7 @@ from langsplat_core.training.language.mask_weights import (
     group_masks,
     view_pairs,
 )
-from langsplat_core.training.language.palette import contrasting_colours
+from langsplat_core.training.language.merge_tree import MergeTree, draw_patches, find_tree, nested_maps
 
 Views = Sequence[tuple[Camera, ImageFeatures]]  # read when needed: they may be more than memory holds
 Latents = tuple[Array, Array]  # (3, N, d) of the codec's type, (3, N) float32
@@ -94,38 +94,6 @@ class StoredViews(Sequence[tuple[Camera, ImageFeatures]]):
         return self.cameras[index], self.features[index]
 
 
-def language_field(
-    gaussians: Gaussians,
-    views: Views,
-    encoder: Encoder,
-    config: TrainConfig,
-    work: Path,
-    progress: Progress,
-    processes: ProcessGroup | None = None,
-) -> tuple[LanguageField, CodecReport]:
-    """Return the language field of the views' mask vectors, and what its codec loses.
-
-    Raises InputError where no view has a mask, and for a codebook whose numbers the lifting would average.
-    """
-    check_lift(config)
-    check_masks(features for _, features in views)
-    stages = _Stages(gaussians, views, encoder, config, work, processes or ProcessGroup(), progress)
-    codec, report = stages.codec()
-    latents, confidence = stages.latents(codec)
-    confidence = confidence.clip(max=MOST_CONFIDENCE).astype(np.float16).astype(np.float32)
-    field = field_of((latents, confidence), codec, encoder, config.phrases)
-    tree = stages.tree(field)
-    return replace(field, tree=tree, codec=_coloured(field, tree, gaussians)), report
-
-
-def _coloured(field: LanguageField, tree: Tree, gaussians: Gaussians) -> Codec:
-    """Return the codec of a field; a codebook gets colours that differ between neighbours."""
-    if not isinstance(field.codec, CodebookCodec):
-        return field.codec
-    colours = contrasting_colours(field, tree, build_surface(gaussians))
-    return field.codec if colours is None else replace(field.codec, palette=rounded(colours))
-
-
 def check_lift(config: TrainConfig) -> None:
     """Raise InputError for a codec whose latents cannot be averaged with a lifting that averages them."""
     if config.lift.mode in LATENT_LIFTS and not KINDS[config.codec.kind].blends:
@@ -143,205 +111,31 @@ def check_masks(features: Iterable[ImageFeatures]) -> None:
         )
 
 
-class _Stages:
-    """Results on the way to a field, each made at most once, or read where it was kept."""
-
-    def __init__(
-        self,
-        gaussians: Gaussians,
-        views: Views,
-        encoder: Encoder,
-        config: TrainConfig,
-        work: Path,
-        processes: ProcessGroup,
-        progress: Progress,
-    ) -> None:
-        self._gaussians, self._views, self._encoder = gaussians, views, encoder
-        self._config, self._work, self._processes, self._progress = config, work, processes, progress
-        self._lift = _settings_in_key(config.lift)
-        self._robust = self._lift.mode == "median"
-        self._vectors, digests = [], []
-        for _, features in views:
-            self._vectors.append(features.vectors)
-            digests.append(features_digest(features))
-        self._inputs = (gaussians_digest(gaussians), digests)
-        self._made: tuple[MaskWeights, MaskGroups] | None = None
-
-    def codec(self) -> tuple[Codec, CodecReport]:
-        """Return the codec, fitted to lifted vectors and, where that helps, to the masks' own.
-
-        Where latents are averaged themselves it is fitted to the masks' vectors alone.
-        """
-        fitted_to = "masks" if self._lift.mode in LATENT_LIFTS else self._lift.mode
-        path = self._work / f"{stage_key('codec', 2, *self._inputs, fitted_to, self._config.codec)}.npz"
-        if self._lift.mode not in LATENT_LIFTS and not path.exists():
-            self._mask_weights()  # everyone's work, unlike the fit
-        return self._processes.once(lambda: kept(path, self._fit, _pack_codec, _unpack_codec))
-
-    def latents(self, codec: Codec) -> Latents:
-        """Return the latents of every Gaussian at every level, and the confidence in them."""
-        blocks = self._work / stage_key("latents", 2, *self._inputs, self._lift, self._config.codec)
-        done = blocks.with_name(f"{blocks.name}.npz")
-        if self._lift.mode not in LATENT_LIFTS and not done.exists():
-            self._lift_blocks(codec, blocks)
-            self._processes.barrier()
-        made = self._processes.once(
-            lambda: kept(done, lambda: self._all_latents(codec, blocks), _pack, _unpack)
-        )
-        if self._processes.is_main:
-            shutil.rmtree(blocks, ignore_errors=True)
-        return made
-
-    def tree(self, field: LanguageField) -> Tree:
-        """Return the tree of the scene.
-
-        It has no votes where latents are averaged themselves, which needs no mask weights.
-        """
-        surface = partial(build_surface, self._gaussians)
-        if self._lift.mode in LATENT_LIFTS:
-            return self._processes.once(
-                lambda: build_tree(surface(), field.codec, field.latents, field.known)
-            )
-        path = self._work / f"{stage_key('nodes', 4, *self._inputs, self._lift, self._config.codec)}.npz"
-        if not path.exists():
-            self._mask_weights()  # everyone's work
-
-        def make() -> Tree:
-            self._progress("building the tree", 0.5)
-            counts, mask_weights = [len(vectors) for vectors in self._vectors], self._mask_weights()[0]
-            things = np.stack([find_instances(mask_weights, counts, level) for level in range(len(LEVELS))])
-            tree = build_tree(surface(), field.codec, field.latents, field.known, things)
-            return replace(tree, votes=count_votes(tree, mask_weights, counts))
-
-        return self._processes.once(lambda: kept(path, make, vars, lambda arrays: Tree(**arrays)))
-
-    def _fit(self) -> tuple[Codec, CodecReport]:
-        config, vocabulary = self._config.codec, everyday_vocabulary(self._encoder, self._config.phrases)
-        masks = np.concatenate(self._vectors)
-        if self._lift.mode in LATENT_LIFTS:
-            codec = fit_codec(masks, config, vocabulary, self._progress)
-            return codec, codec_report(codec, masks, vocabulary)
-        fitted, judged = self._lifted_samples()
-        codec = fit_codec(fitted, config, vocabulary, self._progress, further=masks)
-        return codec, codec_report(codec, judged if len(judged) else masks, vocabulary)
-
-    def _lifted_samples(self) -> tuple[Array, Array]:
-        """(M, D) float32 vectors of Gaussians that a codec is fitted to, and of others that judge it."""
-        mask_weights, groups = self._mask_weights()
-        order = np.random.default_rng(self._config.codec.seed).permutation(len(self._gaussians))
-        samples = []
-        for rows in (order[:FITTED], order[FITTED : FITTED + JUDGED]):
-            lifted = lift_sample(mask_weights, groups, np.sort(rows), self._robust, self._progress)
-            samples.append(lifted.vectors[lifted.confidence > 0])
-        return samples[0], samples[1]
-
-    def _lift_blocks(self, codec: Codec, folder: Path) -> None:
-        """Lift this process's share of the blocks of Gaussians, each into a file."""
-        mask_weights, groups = self._mask_weights()
-
-        def lift(number: int) -> Latents:
-            return _encoded(codec, lift_block(mask_weights, groups, number, self._robust))
-
-        for number in self._processes.share(range(len(mask_weights.blocks))):
-            kept(folder / f"{number:05d}.npz", partial(lift, number), _pack, _unpack)
-            self._progress("averaging mask vectors", (number + 1) / len(mask_weights.blocks))
-
-    def _all_latents(self, codec: Codec, folder: Path) -> Latents:
-        if self._lift.mode in LATENT_LIFTS:
-            scene = (self._rasterizer(), self._gaussians, self._views, codec)
-            if self._lift.mode == "one-pass":
-                return lift_latents(*scene, progress=self._progress)
-            return lift_by_gradient(*scene, config=self._config.lift, progress=self._progress)
-        shape = (len(LEVELS), len(self._gaussians), codec.latent_dim)
-        latents, confidence = np.zeros(shape, codec.dtype), np.zeros(shape[:2], np.float32)
-        for number, (first, last) in enumerate(self._mask_weights()[0].blocks):
-            latents[:, first:last], confidence[:, first:last] = _unpack(
-                read_arrays(folder / f"{number:05d}.npz")
-            )
-        return latents, confidence
-
-    def _mask_weights(self) -> tuple[MaskWeights, MaskGroups]:
-        """Return the mask weights, in files that are read where they are needed, and the groups of masks."""
-        if self._made is None:
-            # Named as in older work folders.
-            folder = self._work / stage_key("memberships", 2, *self._inputs)  # codespell:ignore memberships
-            shared = self._rasterizer(), self._processes, self._progress
-            mask_weights = kept_mask_weights(self._gaussians, self._views, folder, *shared)
-            path = folder / "groups.npz"
-            groups = self._processes.once(
-                lambda: kept(path, lambda: group_masks(self._vectors), _pack_groups, self._unpack_groups)
-            )
-            self._made = mask_weights, groups
-        return self._made
-
-    def _rasterizer(self) -> LiftingRasterizer:
-        return load_lifting_rasterizer(self._config.lift.backend)
-
-    def _unpack_groups(self, arrays: Arrays) -> MaskGroups:
-        edges = np.cumsum([len(view) for view in self._vectors])[:-1]
-        return MaskGroups(tuple(np.split(arrays["of_mask"], edges)), arrays["vectors"])
-
-
-def kept_mask_weights(
+def language_field(
     gaussians: Gaussians,
     views: Views,
-    folder: Path,
-    rasterizer: LiftingRasterizer,
-    processes: ProcessGroup,
+    encoder: Encoder,
+    config: TrainConfig,
+    work: Path,
     progress: Progress,
-) -> MaskWeights:
-    """Return the mask weights of all views, a file in `folder` each, which is read where it is needed."""
+    processes: ProcessGroup | None = None,
+) -> tuple[LanguageField, CodecReport]:
+    """Return the language field of the views' mask vectors, and what its codec loses.
 
-    def pairs(index: int) -> Array:
-        camera, features = views[index]
-        return view_pairs(rasterizer, gaussians, camera, features)
-
-    files = [folder / f"{index:05d}.npy" for index in range(len(views))]
-    for index in processes.share(range(len(views))):
-        kept_array(files[index], partial(pairs, index))
-        progress("lifting masks onto the Gaussians", (index + 1) / len(views))
-    processes.barrier()
-    return MaskWeights([open_array(path) for path in files], len(gaussians))
-
-
-def _settings_in_key(config: LiftConfig) -> LiftConfig:
-    """Return the settings that change the result: not the backend and batches, which change who computes."""
-    if config.mode != "gradient":
-        return LiftConfig(mode=config.mode)
-    return replace(config, backend="auto")
-
-
-def _encoded(codec: Codec, lifted: Lifted) -> Latents:
-    """Encode lifted vectors: (3, n, d) latents, zero where unobserved, and (3, n) confidence."""
-    levels, count, dim = lifted.vectors.shape
-    latents = codec.encode(lifted.vectors.reshape(-1, dim)).reshape(levels, count, -1)
-    return np.where(lifted.confidence[..., None] > 0, latents, 0).astype(latents.dtype), lifted.confidence
-
-
-def _pack(latents: Latents) -> Arrays:
-    return {"latents": latents[0], "confidence": latents[1]}
-
-
-def _unpack(arrays: Arrays) -> Latents:
-    return arrays["latents"], arrays["confidence"]
-
-
-def _pack_groups(groups: MaskGroups) -> Arrays:
-    return {"of_mask": np.concatenate(groups.of_mask), "vectors": groups.vectors}
-
-
-def _pack_codec(made: tuple[Codec, CodecReport]) -> Arrays:
-    codec, report = made
-    return {
-        "kind": np.array(codec.kind),
-        "report": np.array(list(asdict(report).values())),
-        **codec.tensors(),
-    }
-
-
-def _unpack_codec(arrays: Arrays) -> tuple[Codec, CodecReport]:
-    tensors = {name: array for name, array in arrays.items() if name not in ("kind", "report")}
-    return codec_from_tensors(str(arrays["kind"]), tensors), CodecReport(*arrays["report"].tolist())
+    Raises InputError where no view has a mask, and for a codebook whose numbers the lifting would average.
+    """
+    check_lift(config)
+    check_masks(features for _, features in views)
+    stages = _Stages(gaussians, views, encoder, config, work, progress, processes or ProcessGroup())
+    codec, report = stages.codec()
+    latents, confidence = stages.latents(codec)
+    confidence = confidence.clip(max=MOST_CONFIDENCE).astype(np.float16).astype(np.float32)
+    field = field_of((latents, confidence), codec, encoder, config.phrases)
+    tree = stages.tree(field)
+    if isinstance(codec, CodebookCodec):
+        colours = contrasting_colours(field, tree, build_surface(gaussians))
+        codec = codec if colours is None else replace(codec, palette=rounded(colours))
+    return replace(field, tree=tree, codec=codec), report
 
 
 def field_of(
@@ -363,3 +157,238 @@ def field_of(
         calibration=encoder.calibration,
         everyday=everyday_vectors(encoder),
     )
+
+
+@dataclass(frozen=True)
+class _Stages:
+    """Results on the way to a field, each made at most once, or read where it was kept."""
+
+    gaussians: Gaussians
+    views: Views
+    encoder: Encoder
+    config: TrainConfig
+    work: Path
+    progress: Progress
+    processes: ProcessGroup
+
+    @property
+    def by_weights(self) -> bool:
+        """True where vectors are lifted by mask weights, else latents are averaged themselves."""
+        return self.config.lift.mode not in LATENT_LIFTS
+
+    @property
+    def lift(self) -> LiftConfig:
+        """The settings that change the result: not the backend, which changes who computes."""
+        mode = self.config.lift.mode
+        return LiftConfig(mode=mode) if mode != "gradient" else replace(self.config.lift, backend="auto")
+
+    @cached_property
+    def inputs(self) -> tuple[list[Array], tuple[Any, ...]]:
+        """The vectors of each view's masks, and digests of all that the results are made from."""
+        vectors, digests = [], []
+        for _, features in self.views:
+            vectors.append(features.vectors)
+            digests.append(digest_of(features))
+        return vectors, (digest_of(self.gaussians), digests)
+
+    def path(self, name: str, version: int, *settings: Any) -> Path:
+        """Return the file of a stage."""
+        return self.work / f"{stage_key(name, version, *self.inputs[1], *settings)}.npz"
+
+    def kept(self, path: Path, make: Callable[[], Arrays]) -> Arrays:
+        """Return what one process makes, from mask weights that are everyone's work."""
+        if self.by_weights and not path.exists():
+            _ = self.mask_weights
+        return self.processes.once(lambda: kept(path, make))
+
+    @cached_property
+    def mask_weights(self) -> tuple[MaskWeights, MaskGroups]:
+        """The mask weights, in files that are read where they are needed, and the groups of masks."""
+        vectors, inputs = self.inputs
+        # Named as in older work folders.
+        folder = self.work / stage_key("memberships", 2, *inputs)  # codespell:ignore memberships
+        shared = self.rasterizer(), self.processes, self.progress
+        mask_weights = kept_mask_weights(self.gaussians, self.views, folder, *shared)
+
+        def make() -> Arrays:
+            groups = group_masks(vectors)
+            return {"of_mask": np.concatenate(groups.of_mask), "vectors": groups.vectors}
+
+        made = self.processes.once(lambda: kept(folder / "groups.npz", make))
+        edges = np.cumsum([len(view) for view in vectors])[:-1]
+        return mask_weights, MaskGroups(tuple(np.split(made["of_mask"], edges)), made["vectors"])
+
+    def rasterizer(self) -> LiftingRasterizer:
+        return load_lifting_rasterizer(self.config.lift.backend)
+
+    def codec(self) -> tuple[Codec, CodecReport]:
+        """Return the codec, fitted to lifted vectors and, where that helps, to the masks' own.
+
+        Where latents are averaged themselves it is fitted to the masks' vectors alone.
+        """
+
+        def make() -> Arrays:
+            settings, masks = self.config.codec, np.concatenate(self.inputs[0])
+            vocabulary = everyday_vocabulary(self.encoder, self.config.phrases)
+            if self.by_weights:
+                fitted, judged = self.lifted_samples()
+                codec = fit_codec(fitted, settings, vocabulary, self.progress, further=masks)
+                report = codec_report(codec, judged if len(judged) else masks, vocabulary)
+            else:
+                codec = fit_codec(masks, settings, vocabulary, self.progress)
+                report = codec_report(codec, masks, vocabulary)
+            figures = np.array(list(asdict(report).values()))
+            return {"kind": np.array(codec.kind), "report": figures, **codec.tensors()}
+
+        fitted_to = self.lift.mode if self.by_weights else "masks"
+        made = dict(self.kept(self.path("codec", 2, fitted_to, self.config.codec), make))
+        kind, figures = str(made.pop("kind")), made.pop("report").tolist()
+        return codec_from_tensors(kind, made), CodecReport(*figures)
+
+    def lifted_samples(self) -> tuple[Array, Array]:
+        """(M, D) float32 vectors of Gaussians that a codec is fitted to, and of others that judge it."""
+        order = np.random.default_rng(self.config.codec.seed).permutation(len(self.gaussians))
+        robust, samples = self.lift.mode == "median", []
+        for rows in (order[:FITTED], order[FITTED : FITTED + JUDGED]):
+            lifted = lift_sample(*self.mask_weights, np.sort(rows), robust, self.progress)
+            samples.append(lifted.vectors[lifted.confidence > 0])
+        return samples[0], samples[1]
+
+    def latents(self, codec: Codec) -> Latents:
+        """Return the latents of every Gaussian at every level, and the confidence in them."""
+        done = self.path("latents", 2, self.lift, self.config.codec)
+        blocks = done.with_suffix("")
+        if self.by_weights and not done.exists():
+            self.lift_blocks(codec, blocks)
+
+        def make() -> Arrays:
+            scene = self.gaussians, self.views, codec
+            if self.by_weights:
+                shape = len(LEVELS), len(self.gaussians)
+                latents = np.zeros((*shape, codec.latent_dim), codec.dtype)
+                confidence = np.zeros(shape, np.float32)
+                for number, (first, last) in enumerate(self.mask_weights[0].blocks):
+                    part = read_arrays(blocks / f"{number:05d}.npz")
+                    latents[:, first:last], confidence[:, first:last] = part["latents"], part["confidence"]
+            elif self.lift.mode == "one-pass":
+                latents, confidence = lift_latents(self.rasterizer(), *scene, progress=self.progress)
+            else:
+                latents, confidence = lift_by_gradient(
+                    self.rasterizer(), *scene, config=self.config.lift, progress=self.progress
+                )
+            return {"latents": latents, "confidence": confidence}
+
+        made = self.processes.once(lambda: kept(done, make))
+        if self.processes.is_main:
+            shutil.rmtree(blocks, ignore_errors=True)
+        return made["latents"], made["confidence"]
+
+    def lift_blocks(self, codec: Codec, folder: Path) -> None:
+        """Lift this process's share of the blocks of Gaussians, each into a file."""
+        mask_weights, groups = self.mask_weights
+
+        def lift(number: int) -> Arrays:
+            weights = mask_weights.block(number, groups)
+            lifted = lift_weights(weights, groups.vectors, robust=self.lift.mode == "median")
+            levels, count, dim = lifted.vectors.shape
+            latents = codec.encode(lifted.vectors.reshape(-1, dim)).reshape(levels, count, -1)
+            latents = np.where(lifted.confidence[..., None] > 0, latents, 0).astype(latents.dtype)
+            return {"latents": latents, "confidence": lifted.confidence}
+
+        for number in self.processes.share(range(len(mask_weights.blocks))):
+            kept(folder / f"{number:05d}.npz", partial(lift, number))
+            self.progress("averaging mask vectors", (number + 1) / len(mask_weights.blocks))
+        self.processes.barrier()
+
+    def tree(self, field: LanguageField) -> Tree:
+        """Return the tree of the scene.
+
+        It has no votes where latents are averaged themselves, which needs no mask weights.
+        """
+
+        def make() -> Arrays:
+            self.progress("building the tree", 0.5)
+            parts = build_surface(self.gaussians), field.codec, field.latents, field.known
+            if not self.by_weights:
+                return vars(build_tree(*parts))
+            counts, mask_weights = [len(vectors) for vectors in self.inputs[0]], self.mask_weights[0]
+            things = [find_instances(mask_weights, counts, level) for level in range(len(LEVELS))]
+            tree = build_tree(*parts, np.stack(things))
+            return vars(replace(tree, votes=count_votes(tree, mask_weights, counts)))
+
+        return Tree(**self.kept(self.path("nodes", 4, self.lift, self.config.codec), make))
+
+
+def kept_mask_weights(
+    gaussians: Gaussians,
+    views: Views,
+    folder: Path,
+    rasterizer: LiftingRasterizer,
+    processes: ProcessGroup,
+    progress: Progress,
+) -> MaskWeights:
+    """Return the mask weights of all views, a file in `folder` each, which is read where it is needed."""
+
+    def pairs(index: int) -> Array:
+        return view_pairs(rasterizer, gaussians, *views[index])
+
+    files = [folder / f"{index:05d}.npy" for index in range(len(views))]
+    for index in processes.share(range(len(views))):
+        kept_array(files[index], partial(pairs, index))
+        progress("lifting masks onto the Gaussians", (index + 1) / len(views))
+    processes.barrier()
+    return MaskWeights([open_array(path) for path in files], len(gaussians))
+
+
+# Masks that all photographs agree on, in place of those that each photograph was given.
+#
+# A segmenter without weights divides every photograph by itself, each one differently. Their consensus is a
+# tree of things on the Gaussians (`training.language.merge_tree`); three cuts of it, drawn into each
+# photograph, are masks that fit from all sides, and these are shown to the encoder.
+
+CUTS = (0.15, 0.4, 0.8)  # costs up to which subparts, parts and wholes grow; chosen in rooms 201 and 203
+LEAST = 2.5e-4  # of the image: smaller regions show the encoder nothing
+AGREED = "describing what masks agree on"  # stage
+VERSION = 1
+
+
+def agreed_features(
+    gaussians: Gaussians,
+    views: Views,
+    photographs: Sequence[tuple[Array, Array | None]],
+    encoder: ImageEncoder,
+    rasterizer: LiftingRasterizer,
+    work: Path,
+    progress: Progress,
+    processes: ProcessGroup | None = None,
+) -> StoredFeatures:
+    """Describe masks by the consensus of all views' masks, whose vectors are not read.
+
+    photographs: (H, W, 3) uint8 of each view, and its (H, W) bool mask of pixels that count (None: all do).
+    What is finished is kept in `work`.
+    """
+    processes = processes or ProcessGroup()
+    inputs = digest_of(gaussians), [digest_of(features) for _, features in views]
+    folder = work / stage_key("rough-memberships", VERSION, *inputs)
+    mask_weights = kept_mask_weights(gaussians, views, folder, rasterizer, processes, progress)
+    counts = [len(features.vectors) for _, features in views]
+    eyes = np.stack([camera.position for camera, _ in views])
+
+    def make() -> Arrays:
+        return vars(find_tree(gaussians, build_surface(gaussians), mask_weights, counts, eyes, progress))
+
+    key = stage_key("tree", VERSION, *inputs)
+    tree = MergeTree(**processes.once(lambda: kept(work / f"{key}.npz", make)))
+    cuts = [tree.cut(cost) for cost in CUTS]
+    store = FeatureStore(work / "features")
+    made_by = stage_key(key, VERSION, CUTS, LEAST, fingerprint(encoder))
+    for index in processes.share(range(len(views))):
+        camera, _ = views[index]
+        if not store.has(camera.name, made_by):
+            drawn = draw_patches(rasterizer.view(gaussians, camera), gaussians, tree.patches)
+            image, mask = photographs[index]
+            maps = within(nested_maps(drawn, cuts, LEAST), mask)
+            store.save(camera.name, ImageFeatures(maps, embed_regions(image, maps, encoder)), made_by)
+        progress(AGREED, (index + 1) / len(views))
+    processes.barrier()
+    return StoredFeatures(store, [camera.name for camera, _ in views])

@@ -1,23 +1,33 @@
-"""Report of a training, `report.json` in its work folder, and quality warnings; read without torch."""
+"""Report of a training: `report.json` and the page `report.html` in its work folder; read without torch.
 
+The page is one file without scripts: photographs beside what the scene shows, cameras from above, warnings
+and figures.
+"""
+
+import html
+import io
 import json
-from collections.abc import Mapping, Sequence
+from base64 import b64encode
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from PIL import Image
 
-from langsplat_core.arrays import Array, ViewScore
+from langsplat_core.arrays import Array, ViewScore, sigmoid
+from langsplat_core.datasets.capture import Capture
+from langsplat_core.datasets.workspace import Matches, NotLocatedError
 from langsplat_core.errors import FormatError, InputError, printable_line
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import read_json_file
-from langsplat_core.scene import Camera
+from langsplat_core.raster.render import render
+from langsplat_core.scene import Camera, Gaussians, Scene
+from langsplat_core.scene.transform import C0
 
 REPORT, PAGE = "report.json", "report.html"
-LIMIT = 1_000_000  # bytes; a report has about a thousand
-MOST_WARNINGS = 5  # that are taken from a file
-LEAST_PSNR = 16.0  # dB: below, held-out photographs are hardly recognised
-LEAST_COVERED = 0.5  # of an image's pixels
 APART = 10.0  # times the median step to a neighbouring camera; captures that went well have at most 5
 
 
@@ -60,12 +70,6 @@ def work_folder(out: Path) -> Path:
     return out.with_name(f"{out.stem}.work")
 
 
-def write_report(work: Path, report: TrainReport) -> None:
-    """Write the report into the work folder, whole or not at all."""
-    with atomic_path(work / REPORT) as temporary:
-        temporary.write_text(json.dumps(asdict(report), indent=1))
-
-
 def read_report(work: Path) -> TrainReport:
     """Read the report of the run which has just ended, in this process or another."""
     stated = json.loads((work / REPORT).read_text())
@@ -73,21 +77,22 @@ def read_report(work: Path) -> TrainReport:
     return TrainReport(**stated | {"warnings": tuple(stated["warnings"]), "held_out_views": scores})
 
 
-def stated_warnings(scene: Path, gaussians: int) -> tuple[str, ...]:
-    """Return the quality warnings of the report beside a scene.
-
-    There are none without a report, where it cannot be read, and where it is of a scene with another number
-    of Gaussians than this file has.
-    """
+def stated_figures(work: Path) -> dict[str, Any]:
+    """Return what a report of whatever origin says; nothing where there is none or it cannot be read."""
     try:
-        stated = read_json_file(work_folder(scene) / REPORT, LIMIT)
+        stated = read_json_file(work / REPORT, limit=1_000_000)
     except (InputError, FormatError):
+        return {}
+    return stated if isinstance(stated, dict) else {}
+
+
+def stated_warnings(scene: Path, gaussians: int) -> tuple[str, ...]:
+    """Return the first quality warnings of the report beside a scene, if it has as many Gaussians."""
+    stated = stated_figures(work_folder(scene))
+    lines = stated.get("warnings") if stated.get("gaussians") == gaussians else None
+    if not isinstance(lines, list):
         return ()
-    if not isinstance(stated, dict) or stated.get("gaussians") != gaussians:
-        return ()
-    warnings = stated.get("warnings")
-    lines = warnings[:MOST_WARNINGS] if isinstance(warnings, list) else []
-    return tuple(printable_line(line, 300) for line in lines if isinstance(line, str))
+    return tuple(printable_line(line, 300) for line in lines[:5] if isinstance(line, str))
 
 
 def quality_warnings(scores: Sequence[ViewScore], cameras: Sequence[Camera]) -> tuple[str, ...]:
@@ -99,12 +104,12 @@ def quality_warnings(scores: Sequence[ViewScore], cameras: Sequence[Camera]) -> 
     if scores:
         psnr = float(np.mean([score.psnr for score in scores]))
         covered = float(np.mean([score.covered for score in scores]))
-        if psnr < LEAST_PSNR:
+        if psnr < 16:  # held-out photographs are hardly recognised
             found.append(
-                f"held-out photographs are reproduced at {psnr:.1f} dB, below {LEAST_PSNR:g}: cameras may "
+                f"held-out photographs are reproduced at {psnr:.1f} dB, below 16: cameras may "
                 "be wrong, or photographs too few; take more that overlap, or give COLMAP's cameras"
             )
-        if covered < LEAST_COVERED:
+        if covered < 0.5:
             found.append(
                 f"only {100 * covered:.0f} % of the held-out pictures' pixels show anything: photograph "
                 "what is there from more sides, or train for more steps"
@@ -138,3 +143,195 @@ def camera_groups(positions: Array) -> list[Array]:
     count, labels = connected_components(tree, directed=False)
     groups = [np.flatnonzero(labels == label) for label in range(count)]
     return sorted((group for group in groups if len(group) > 1), key=len, reverse=True) or whole
+
+
+# The page.
+
+MOST_VIEWS = 48  # on the page, held-out ones first
+SIDE = 400  # px, longer side of an image
+PLOT = 640  # units of a drawing's side
+CELLS = 220  # of the map, along its longer side
+
+
+def write_reports(work: Path, report: TrainReport, capture: Capture, gaussians: Gaussians) -> None:
+    """Write the report of a finished training, as JSON and as a page."""
+    from langsplat_core.training.radiance.differentiable import evaluate_views  # torch
+
+    with atomic_path(work / REPORT) as temporary:
+        temporary.write_text(json.dumps(asdict(report), indent=1))
+    held_out = {score.name: score for score in report.held_out_views[:MOST_VIEWS]}
+    measured = {score.name for score in report.held_out_views}
+    rows = {camera.name: index for index, camera in enumerate(capture.cameras)}
+    others = [index for name, index in rows.items() if name not in measured]
+    most = min(len(others), MOST_VIEWS - len(held_out))
+    shown = [others[at] for at in np.linspace(0, len(others) - 1, most).round().astype(int)]
+    scores = [*held_out.values(), *evaluate_views(gaussians, capture, shown)]
+    scene = Scene(gaussians, cameras=capture.cameras)
+    views = (_view(capture, scene, rows[score.name], score, score.name in held_out) for score in scores)
+    more = len(capture) - len(scores)
+    _write(work / PAGE, Path(report.dataset).name or "Training", [
+        _tiles(report), *_warnings(report.warnings), "<div class=halves>",
+        _section("Cameras from above", _from_above(scene, held_out)), _figures(report, capture.matches),
+        "</div><h2>Photographs, and what the scene shows there</h2>",
+        "<p class=soft>Left the photograph, right the scene. Held-out photographs, which were not trained "
+        f"on, come first{f'; {more} more are not shown' if more else ''}.</p>",
+        "<div class=views>", *views, "</div>",
+    ])  # fmt: skip
+
+
+def write_refusal(work: Path, error: NotLocatedError) -> Path:
+    """Write the page of a training that ended without cameras, and return its path."""
+    matches = error.matches
+    groups = {
+        ", ".join(matches.names[row] for row in group): "located"
+        if group[0] in matches.located
+        else matches.why(group[0])
+        for group in matches.groups
+    }
+    parts = [f"<div class='card warning'>{_text(error, 1000)}</div>", _section("Groups", _table(groups))]
+    _write(work / PAGE, "Too few photographs could be located", [*parts, f"<p>{_located(matches)}</p>"])
+    return work / PAGE
+
+
+def _write(path: Path, title: str, parts: Iterable[str]) -> None:
+    head = files("langsplat_core.web").joinpath("report.html").read_text(encoding="utf-8")
+    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        file.writelines(f"{part}\n" for part in (head.replace("{{TITLE}}", _text(title)), *parts))
+
+
+def _text(text: object, limit: int = 120) -> str:
+    """Return text of whatever origin as HTML."""
+    return html.escape(printable_line(text, limit))
+
+
+def _section(title: str, content: str) -> str:
+    return f"<div><h2>{title}</h2><div class=card>{content}</div></div>"
+
+
+def _table(rows: Mapping[str, object]) -> str:
+    cells = (f"<tr><td>{_text(name, 1000)}<td>{_text(value, 300)}" for name, value in rows.items())
+    return f"<table>{''.join(cells)}</table>"
+
+
+def _warnings(warnings: Iterable[str]) -> Iterator[str]:
+    """Yield a card for each warning, in which the remedy stands behind the colon."""
+    for warning in warnings:
+        fault, colon, remedy = warning.partition(": ")
+        yield f"<div class='card warning'><b>{_text(fault + colon, 600)}</b> {_text(remedy, 1000)}</div>"
+
+
+def _tiles(report: TrainReport) -> str:
+    scores = report.held_out_views
+    tiles = {
+        "photographs": report.views + report.held_out,
+        "held out": report.held_out,
+        "held-out PSNR": "none" if report.psnr is None else f"{report.psnr:.1f} dB",
+        "PSNR at 320 px": "none" if report.psnr_small is None else f"{report.psnr_small:.1f} dB",
+        "held-out SSIM": f"{np.mean([s.ssim for s in scores]):.3f}" if scores else "none",
+        "Gaussians": f"{report.gaussians:,}",
+        "masks": f"{report.mask_count:,}",
+        "in all": f"{sum(report.seconds.values()):.0f} s",
+    }
+    cards = "".join(f"<div class=card><b>{value}</b>{name}</div>" for name, value in tiles.items())
+    return f"<p class=soft>{_text(report.dataset, 400)}</p><div class='tiles soft'>{cards}</div>"
+
+
+def _figures(report: TrainReport, matches: Matches | None) -> str:
+    figures = {name: f"{seconds:.1f} s" for name, seconds in report.seconds.items()}
+    figures |= {
+        "matches": "not sought: cameras were given" if matches is None else _located(matches),
+        "rehearsed": rehearsals_in_words(report.rehearsed) or "no",
+        "masks by": report.masks,
+        "encoder": report.encoder,
+        "codec": f"{report.codec} of {report.codec_size}, mean cosine {report.codec_cosine:.4f}",
+        "relevancy error": f"{report.relevancy_error:.4f} (99 % below {report.relevancy_error_p99:.3f})",
+        "Gaussians with language features": f"{100 * report.observed:.1f} %",
+    }
+    return _section("Stages and figures", _table(figures))
+
+
+def _located(matches: Matches) -> str:
+    text = f"{len(matches.located)} of {len(matches.names)} photographs are located"
+    return f"{text}; to join the others, {matches.advice()}" if matches.gaps() else text
+
+
+def _view(capture: Capture, scene: Scene, index: int, score: ViewScore, held: bool) -> str:
+    camera, photo, mask = capture.cameras[index], capture.images[index], capture.mask(index)
+    scale = min(1.0, SIDE / max(camera.width, camera.height))
+    size = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
+    if mask is not None:  # what does not count is faint
+        photo = np.where(mask[..., None], photo, 200 + photo // 5).astype(np.uint8)
+    drawn = render(scene, camera.resized(*size)).colours.clip(0, 1)
+    photograph = Image.fromarray(np.ascontiguousarray(photo)).resize(size)
+    badge = " <span class=badge>held out</span>" if held else ""
+    return (
+        f"<div class='card{' held' if held else ''}'><div class=name><span>{_text(camera.name)}{badge}</span>"
+        f"<span class=soft>{score.psnr:.1f} dB, SSIM {score.ssim:.3f}</span></div>"
+        f"<div class=pair><img alt=photograph src='{_uri(photograph)}'>"
+        f"<img alt=scene src='{_uri(_image(drawn))}'></div></div>"
+    )
+
+
+def _image(colours: Array) -> Image.Image:
+    return Image.fromarray((colours * 255 + 0.5).astype(np.uint8))
+
+
+def _uri(image: Image.Image) -> str:
+    packed = io.BytesIO()
+    image.save(packed, "JPEG", quality=80)
+    return f"data:image/jpeg;base64,{b64encode(packed.getvalue()).decode()}"
+
+
+def _from_above(scene: Scene, held_out: Container[str]) -> str:
+    """Draw the cameras and the Gaussians from above, with the cameras' longest way across the page."""
+    up, eyes = scene.up(), np.array([camera.position for camera in scene.cameras])
+    flat = (eyes - eyes.mean(0)) - np.outer((eyes - eyes.mean(0)) @ up, up)
+    right = np.linalg.svd(flat)[2][0]
+    axes = np.stack([right - (right @ up) * up, np.cross(up, right)])  # right and, on the page, up
+    gaussians = scene.gaussians.take(np.flatnonzero(scene.gaussians.valid()))
+    points, places = gaussians.means.astype(np.float64) @ axes.T, eyes @ axes.T
+    low, high = places.min(0), places.max(0)
+    margin = max(float((high - low).max()), 1e-6)
+    if len(points):
+        near, far = np.quantile(points, (0.05, 0.95), axis=0)
+        low, high = np.clip(near, low - margin, low), np.clip(far, high, high + margin)
+    low, high = low - 0.06 * margin, high + 0.06 * margin
+    scale = PLOT / float((high - low).max())
+    width, height = (high - low) * scale
+
+    def at(place: Array) -> Array:
+        return np.asarray((place - low) * scale * (1, -1) + (0, height))
+
+    drawn = [_ground(at(points), gaussians, width, height)]
+    for camera, place in zip(scene.cameras, at(places), strict=True):
+        # A wedge for what a camera looks towards; one that looks straight down is its dot alone.
+        ahead = axes @ camera.rotation[2] * (1, -1)
+        across = np.array([-ahead[1], ahead[0]]) * min(0.5 * camera.width / camera.fx, 1.0)
+        corners = (place, place + 17 * (ahead + across), place + 17 * (ahead - across))
+        drawn.append(
+            f"<g fill='{'#e07b00' if camera.name in held_out else '#3b6fb6'}'>"
+            f"<title>{_text(camera.name)}</title><circle cx='{place[0]:.1f}' cy='{place[1]:.1f}' r='3.4'/>"
+            f"<polygon fill-opacity='.45' points='{' '.join(f'{x:.1f},{y:.1f}' for x, y in corners)}'/></g>"
+        )
+    key = "".join(
+        f"<span class='soft key'><i style='background:{colour}'></i>{name}</span>"
+        for colour, name in (("#3b6fb6", "trained on"), ("#e07b00", "held out"), ("#b9c0ca", "Gaussians"))
+    )
+    return f"<svg viewBox='0 0 {width:.0f} {height:.0f}' role=img>{''.join(drawn)}</svg>{key}"
+
+
+def _ground(places: Array, gaussians: Gaussians, width: float, height: float) -> str:
+    """Draw the mean colours of Gaussians at `places` (N, 2) on the page, faint as a map's ground."""
+    cell = max(width, height) / CELLS
+    rows, columns = max(1, int(np.ceil(height / cell))), max(1, int(np.ceil(width / cell)))
+    column, row = (places // cell).astype(int).T
+    inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
+    colours = (0.5 + C0 * gaussians.sh[:, 0]).clip(0, 1)
+    weights = sigmoid(gaussians.opacity_logits)[:, None] * np.column_stack([colours, np.ones(len(colours))])
+    sums = np.zeros((rows, columns, 4))
+    np.add.at(sums, (row[inside], column[inside]), weights[inside])
+    total = sums[..., 3:]
+    full = float(np.quantile(total[total > 0], 0.7)) if total.any() else 1.0
+    shade = 1 - 0.75 * np.minimum(1, total / full) * (1 - sums[..., :3] / np.maximum(total, 1e-9))
+    size = f"width='{columns * cell:.1f}' height='{rows * cell:.1f}'"
+    return f"<image {size} href='{_uri(_image(shade))}'/>"

@@ -7,9 +7,6 @@ import json
 import logging
 import os
 import socket
-import struct
-import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, is_dataclass
@@ -22,7 +19,7 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.hostile import write_npy
+from langsplat_core.io.hostile import read_npz, write_npy
 from langsplat_core.scene import Gaussians
 from langsplat_core.semantics.store import ImageFeatures
 
@@ -49,19 +46,18 @@ def stage_key(name: str, version: int, *inputs: Any) -> str:
     return f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
 
 
-def kept(path: Path, make: Callable[[], T], pack: Callable[[T], Arrays], unpack: Callable[[Arrays], T]) -> T:
-    """Return the result of a stage, read from `path` (*.npz) where it was made before.
+def kept(path: Path, make: Callable[[], Arrays]) -> Arrays:
+    """Return the arrays of a stage, read from `path` (*.npz) where they were made before.
 
-    Else it is made and stored there, whole or not at all. `pack` and `unpack` turn it into named arrays and
-    back.
+    Else they are made and stored there, whole or not at all. Raises FormatError for a damaged file.
     """
     if path.exists():
         log.debug("%s: kept from an earlier run", path.name)
-        return unpack(read_arrays(path))
-    result = make()
+        return read_arrays(path)
+    made = make()
     with atomic_path(path) as temporary:
-        np.savez(temporary, allow_pickle=False, **pack(result))
-    return result
+        np.savez(temporary, allow_pickle=False, **made)
+    return made
 
 
 def kept_array(path: Path, make: Callable[[], Array]) -> None:
@@ -81,32 +77,19 @@ def open_array(path: Path) -> Array:
         raise FormatError(f"{path}: damaged ({error}); delete it and run again") from None
 
 
-# What zipfile and NumPy raise; RuntimeError where an archive claims to be encrypted or of a later version.
-_DAMAGED = OSError, ValueError, LookupError, EOFError, RuntimeError
-
-
-def read_arrays(path: Path) -> dict[str, Array]:
+def read_arrays(path: Path) -> Arrays:
     """Return the arrays of an .npz file; FormatError for a damaged one."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except (*_DAMAGED, zipfile.BadZipFile, zlib.error, struct.error) as error:
-        raise FormatError(f"{path}: damaged ({error}); delete it and run again") from None
+        return {name: array.copy() for name, array in read_npz(path).items()}  # kernels want them writable
+    except InputError as error:
+        raise FormatError(f"{error}; delete it and run again") from None
 
 
-def gaussians_digest(gaussians: Gaussians) -> str:
-    """Return a digest of every number of the Gaussians."""
-    return _digest(*(getattr(gaussians, field.name) for field in fields(gaussians)))
-
-
-def features_digest(features: ImageFeatures) -> str:
-    """Return a digest of the masks and vectors of a photograph."""
-    return _digest(features.labels, features.vectors)
-
-
-def _digest(*arrays: Array) -> str:
+def digest_of(data: Gaussians | ImageFeatures) -> str:
+    """Return a digest of every number of Gaussians, or of the masks and vectors of a photograph."""
     digest = hashlib.blake2b(digest_size=16)
-    for array in arrays:
+    for entry in fields(data):
+        array = getattr(data, entry.name)
         digest.update(repr((array.shape, array.dtype.str)).encode())
         digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()
@@ -117,9 +100,8 @@ def sole_use(folder: Path) -> Iterator[None]:
     """Hold `folder` for one training, as two would write each other's stages.
 
     It is made if it is missing, and removed again if nothing came into it. The lock is the operating
-    system's: it ends with its process, however that ends, so that none is ever left by a dead one. On file
-    systems without locks nothing is held. Raises InputError where another process, or another training in
-    this one, holds the folder.
+    system's and ends with its process, however that ends; on file systems without locks nothing is held.
+    Raises InputError where another process, or another training in this one, holds the folder.
     """
     if fcntl is None:
         folder.mkdir(parents=True, exist_ok=True)

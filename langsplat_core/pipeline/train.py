@@ -4,40 +4,62 @@ Every stage keeps its result in the work folder under a key of its settings, so 
 continues where it stopped and a changed setting recomputes only what depends on it.
 """
 
+import json
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from langsplat_core.config import QUICK, TrainConfig, check_settings
+from langsplat_core.config import QUICK, RadianceBudget, RadianceConfig, TrainConfig, check_settings
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture, split_views
 from langsplat_core.datasets.workspace import NotLocatedError
 from langsplat_core.errors import InputError
-from langsplat_core.io.files import check_output_folder, shown
+from langsplat_core.io.files import atomic_path, check_output_folder, shown
+from langsplat_core.io.ply import read_ply, write_ply
 from langsplat_core.io.scenes import check_writable, load_scene, save_scene
-from langsplat_core.pipeline.agreement import agreed_features
-from langsplat_core.pipeline.language_field import StoredViews, check_lift, check_masks, language_field
-from langsplat_core.pipeline.radiance import gaussians_of
-from langsplat_core.pipeline.report import TrainReport, quality_warnings, read_report, work_folder
-from langsplat_core.pipeline.report_page import write_refusal, write_reports
-from langsplat_core.pipeline.stages import ProcessGroup, sole_use
+from langsplat_core.pipeline.language_field import (
+    StoredViews,
+    agreed_features,
+    check_lift,
+    check_masks,
+    language_field,
+)
+from langsplat_core.pipeline.report import (
+    TrainReport,
+    quality_warnings,
+    read_report,
+    rehearsals_in_words,
+    work_folder,
+    write_refusal,
+    write_reports,
+)
+from langsplat_core.pipeline.stages import ProcessGroup, sole_use, stage_key
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster import load_lifting_rasterizer
-from langsplat_core.scene import Scene
+from langsplat_core.scene import Gaussians, Scene
 from langsplat_core.semantics.encoder import Encoder
 from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE, load_encoder
 from langsplat_core.semantics.masks import MaskSource
 from langsplat_core.semantics.regions import describe_capture
 from langsplat_core.semantics.sam import load_mask_source
 from langsplat_core.semantics.store import FeatureStore, StoredFeatures
-from langsplat_core.training.radiance.scores import evaluate_views
+from langsplat_core.training.radiance.differentiable import evaluate_views
+from langsplat_core.training.radiance.rehearsal import (
+    budget_text,
+    budgets_for,
+    checkpoints_of,
+    rehearse,
+    supported,
+    train_within,
+)
 
 FEWEST_VIEWS = 3
+VERSION = 7  # of what training and rehearsals make
 
 log = logging.getLogger("langsplat")
 
@@ -114,9 +136,7 @@ def _train(run: _Run, masks_of: Callable[[Capture], MaskSource] | None, given: S
         check_masks(views.features)  # before the Gaussians, which may cost hours
 
     with run.timed("radiance"):
-        gaussians, rehearsed = (
-            gaussians_of(capture, train, config.radiance, *shared) if given is None else (given.gaussians, {})
-        )
+        gaussians, rehearsed = _gaussians(run, capture, train) if given is None else (given.gaussians, {})
 
     if not mask_source.agrees:
         with run.timed("masks that agree"):
@@ -163,6 +183,12 @@ def _train(run: _Run, masks_of: Callable[[Capture], MaskSource] | None, given: S
     return read_report(run.work)
 
 
+def _mean(scores: Iterable[float | None]) -> float | None:
+    """Mean of the scores that could be measured; None where none could."""
+    measured = [score for score in scores if score is not None]
+    return float(np.mean(measured)) if measured else None
+
+
 def _photographs(run: _Run) -> Capture:
     """Return the photographs that have cameras, enough for a scene."""
     try:
@@ -196,7 +222,71 @@ def _described_views(
     return StoredViews(cameras, StoredFeatures(store, [camera.name for camera in cameras]))
 
 
-def _mean(scores: Iterable[float | None]) -> float | None:
-    """Return the mean of the scores that could be measured; None where none could."""
-    measured = [score for score in scores if score is not None]
-    return float(np.mean(measured)) if measured else None
+def _gaussians(run: _Run, capture: Capture, train: list[int]) -> tuple[Gaussians, dict[str, list[float]]]:
+    """Return Gaussians trained within the budget that rehearsals support, and what these found.
+
+    That is the held-out PSNRs (dB) for each budget. One process trains; the others read what it keeps.
+    """
+    config, where = run.config.radiance, (run.work, run.progress)
+    budgets = budgets_for(capture, config, len(train))
+    found = run.processes.once(lambda: _rehearsals(capture, train, config, budgets, *where))
+    budget = supported(found, budgets)
+    scores = [[round(decibels, 2) for decibels in each] for each in found]
+    rehearsed = dict(zip(map(budget_text, budgets), scores, strict=False))
+    if budget != budgets[-1]:
+        log.info(
+            "training takes %s, not %s: with so few photographs more does not pay (held out: %s); "
+            "--radiance.rehearsed-views 0 spends all",
+            *(budget_text(budget), budget_text(budgets[-1])),
+            rehearsals_in_words(rehearsed) or "none could be",
+        )
+    made = run.processes.once(lambda: trained_gaussians(capture, train, config, budget, *where))
+    return made, rehearsed
+
+
+def _rehearsals(
+    capture: Capture,
+    train: list[int],
+    config: RadianceConfig,
+    budgets: Sequence[RadianceBudget],
+    work: Path,
+    progress: Progress,
+) -> list[list[float]]:
+    """`rehearse` for the photographs at `train`, from `work` where that was done before."""
+    done = work / f"{_radiance_key('rehearsal', capture, train, config)}.json"
+    if not done.exists():
+        checkpoint = done.with_suffix(".checkpoint.safetensors")
+        found = rehearse(capture, config, budgets, train, checkpoint, progress)
+        with atomic_path(done) as temporary:
+            temporary.write_text(json.dumps(found))
+        for left in checkpoints_of(checkpoint):
+            left.unlink(missing_ok=True)
+    return [[float(decibels) for decibels in each] for each in json.loads(done.read_text())]
+
+
+def trained_gaussians(
+    capture: Capture,
+    train: list[int],
+    config: RadianceConfig,
+    budget: RadianceBudget,
+    work: Path,
+    progress: Progress,
+) -> Gaussians:
+    """Return the Gaussians of the photographs at `train`, from `work` where they were trained before."""
+    done = work / f"{_radiance_key('radiance', capture, train, config, budget)}.ply"
+    if done.exists():
+        log.debug("%s: kept from an earlier run", done.name)
+        return read_ply(done)
+    checkpoint = done.with_suffix(".checkpoint.safetensors")
+    gaussians = train_within(capture, budget, config, train, checkpoint, progress)
+    write_ply(done, gaussians)
+    checkpoint.unlink(missing_ok=True)
+    return gaussians
+
+
+def _radiance_key(
+    name: str, capture: Capture, train: list[int], config: RadianceConfig, *more: RadianceBudget
+) -> str:
+    # The backend changes who computes, not what, so that a run may move between machines; nor do checkpoints.
+    settings = replace(config, backend="auto", checkpoint_every=RadianceConfig.checkpoint_every)
+    return stage_key(name, VERSION, settings, capture.digest(train), *more)

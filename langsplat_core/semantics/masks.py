@@ -34,7 +34,7 @@ class MaskSource(Protocol):
 
     agrees: bool = True
     """False where masks of different photographs differ so much that what all of them agree on takes their
-    place (`pipeline.agreement`) before CLIP sees it."""
+    place (`pipeline.language_field`) before CLIP sees it."""
 
     @property
     def name(self) -> str:

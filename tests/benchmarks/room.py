@@ -47,10 +47,9 @@ from langsplat_core.errors import InputError
 from langsplat_core.extensions.benchmarks.report import write_report
 from langsplat_core.io.hostile import write_npy
 from langsplat_core.io.sidecar import means_checksum
-from langsplat_core.pipeline.agreement import agreed_features
-from langsplat_core.pipeline.language_field import Views, language_field
-from langsplat_core.pipeline.radiance import trained_gaussians
+from langsplat_core.pipeline.language_field import Views, agreed_features, language_field
 from langsplat_core.pipeline.stages import stage_key
+from langsplat_core.pipeline.train import trained_gaussians
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.answers import AnswerRule
 from langsplat_core.query.engine import QueryEngine

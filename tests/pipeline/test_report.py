@@ -1,21 +1,36 @@
-"""Quality warnings of a trained scene."""
+"""The report of a training: quality warnings, and a page that stands alone, where names stay text."""
 
 import json
+from collections.abc import Sequence
+from dataclasses import replace
+from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from langsplat_core.arrays import Array, ViewScore
+from langsplat_core.config import ClipConfig, TrainConfig
+from langsplat_core.datasets.capture import Capture
+from langsplat_core.datasets.workspace import Matches, NotLocatedError
+from langsplat_core.errors import InputError
 from langsplat_core.pipeline.report import (
     APART,
+    MOST_VIEWS,
+    PAGE,
     REPORT,
+    TrainReport,
     camera_groups,
     quality_warnings,
+    read_report,
     stated_warnings,
     work_folder,
+    write_refusal,
+    write_reports,
 )
-from langsplat_core.scene import Camera, look_at
+from langsplat_core.pipeline.train import train_scene
+from langsplat_core.scene import Camera, Gaussians, look_at
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -80,3 +95,117 @@ def test_warnings_are_read_from_the_report_of_this_scene_alone(tmp_path: Path) -
     for text in wrong:
         report.write_bytes(text.encode("utf-8", "surrogateescape"))
         assert stated_warnings(scene, 3) == ()
+
+
+# The page.
+
+HOSTILE = "<script>alert(1)</script>\"'&\n"
+
+
+class Read(HTMLParser):
+    """Tags with their attributes, and the text between them."""
+
+    def __init__(self, page: Path) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ""
+        self.feed(page.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+    def of(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.tags if name == tag]
+
+
+def capture(names: Sequence[str], matches: Matches | None = None) -> Capture:
+    cameras = [replace(camera, name=name) for name, camera in zip(names, ring(len(names)), strict=True)]
+    images = tuple(np.full((48, 64, 3), 9 * k % 256, np.uint8) for k in range(len(names)))
+    masks = (np.eye(48, 64, dtype=bool), *[None] * (len(names) - 1))
+    none = np.zeros((0, 3))
+    return Capture(tuple(cameras), images, none, none.astype(np.uint8), masks=masks, matches=matches)
+
+
+def gaussians(count: int = 50) -> Gaussians:
+    rng = np.random.default_rng(1)
+    return Gaussians(
+        means=rng.uniform(-1, 1, (count, 3)),
+        log_scales=np.full((count, 3), -2.0),
+        quats_wxyz=np.tile([1.0, 0, 0, 0], (count, 1)),
+        opacity_logits=np.full(count, 2.0),
+        sh=rng.normal(size=(count, 1, 3)),
+    )
+
+
+def report(held_out: Sequence[str], **fields: object) -> TrainReport:
+    scores = tuple(ViewScore(name, 21.4, 0.7123, 0.9) for name in held_out)
+    stated = {
+        "views": 6, "held_out": len(scores), "gaussians": 50, "psnr": 21.4 if scores else None,
+        "masks": "graph", "encoder": HOSTILE, "mask_count": 7, "codec": "codebook", "codec_size": 8,
+        "codec_cosine": 0.9,
+        "relevancy_error": 0.01, "relevancy_error_p99": 0.02, "observed": 0.5, "warnings": (),
+        "seconds": {"radiance": 3.0}, "dataset": f"/a/{HOSTILE.replace('/', '')}", "held_out_views": scores,
+    }  # fmt: skip
+    return TrainReport(**stated | fields)  # type: ignore[arg-type]
+
+
+def test_page_shows_held_out_views_first_and_needs_no_other_file(tmp_path: Path) -> None:
+    names = [f"{number}{HOSTILE}" for number in range(8)]
+    matches = Matches(tuple(names), (900,) * 8, ((0, 1, 80), (1, 2, 20), (5, 6, 3)), frozenset(range(7)))
+    rehearsed = {"500 steps at 320 px": [24.61, 21.1], "1500 steps at 480 px": [24.0]}
+    warned = report(names[2:4], warnings=("it is dim: add <light>",), rehearsed=rehearsed, psnr_small=22.7)
+    write_reports(tmp_path, warned, capture(names, matches=matches), gaussians())
+    assert read_report(tmp_path) == warned
+    page = Read(tmp_path / PAGE)
+    assert not {"script", "link", "iframe", "light"} & {tag for tag, _ in page.tags}
+    sources = [image["src"] or "" for image in page.of("img")] + [i["href"] or "" for i in page.of("image")]
+    assert len(page.of("img")) == 16
+    assert all(source.startswith("data:image/jpeg;base64,") for source in sources)
+    views = page.text.partition("what the scene shows there")[2]
+    assert views.index("2<script>") < views.index("3<script>") < views.index("0<script>")
+    assert views.count("held out") == 2
+    assert "after 500 steps at 320 px 24.6, 21.1 dB; after 1500 steps at 480 px 24.0 dB" in page.text
+    assert "22.7 dB" in page.text
+    for words in ("it is dim: add <light>", "21.4 dB, SSIM 0.712", "7 of 8 photographs are located"):
+        assert words in page.text
+    assert len(page.of("polygon")) == 8  # cameras from above
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_few_cameras_and_no_gaussians(count: int, tmp_path: Path) -> None:
+    write_reports(tmp_path, report([]), capture([str(k) for k in range(count)]), gaussians(0))
+    assert len(Read(tmp_path / PAGE).of("img")) == 2 * count
+
+
+def test_page_shows_evenly_spaced_views(tmp_path: Path) -> None:
+    names = [f"view {number:03d}" for number in range(101)]
+    write_reports(tmp_path, report(names[:1]), capture(names), gaussians(3))
+    page = Read(tmp_path / PAGE)
+    assert len(page.of("img")) == 2 * MOST_VIEWS
+    shown = [name for name in names if name in page.text.partition("what the scene shows")[2]]
+    assert (shown[0], shown[1], shown[-1]) == ("view 000", "view 001", "view 100")
+    assert "53 more are not shown" in page.text
+
+
+def test_a_refusal_shows_its_groups(tmp_path: Path) -> None:
+    names = (f"a{HOSTILE}", "b", "c", "d")
+    matches = Matches(names, (900, 900, 900, 0), ((0, 1, 80), (1, 2, 4)), frozenset())
+    page = Read(write_refusal(tmp_path, NotLocatedError("too few", matches)))
+    assert not page.of("script")
+    for words in ("too few", "a<script>", "no features", "no matches with any other", "0 of 4 photographs"):
+        assert words in page.text
+
+
+def test_refusal_of_unmatched_photographs_names_the_page(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for index in range(3):
+        noise = rng.integers(0, 256, (120, 160, 3), dtype=np.uint8)
+        Image.fromarray(noise).save(tmp_path / f"{index}.png")
+    demo = TrainConfig(clip=ClipConfig(model="demo"))
+    with pytest.raises(InputError, match=r"see .*work/report\.html") as caught:
+        train_scene(tmp_path, tmp_path / "a.ply", demo, tmp_path / "work")
+    assert "between 0.png and 1.png" in str(caught.value)
+    assert "2.png" in Read(tmp_path / "work" / PAGE).text
