@@ -106,7 +106,7 @@ def moments(whole: Ended, seed: int) -> list[Moment]:
 
 
 def photographs(folder: Path, kind: str) -> Path:
-    """Of the room, plain or with the cameras of a COLMAP model without points."""
+    """Photographs of the room, plain or with the cameras of a COLMAP model without points."""
     names = write_photos(folder / "images", LENS, poses(VIEWS))
     if kind == "COLMAP":
         (folder / "sparse" / "0").mkdir(parents=True)
@@ -174,18 +174,3 @@ def test_training_resumes_after_full_disks(kind: str, tmp_path: Path) -> None:
         print(f"full {filled} times")
         assert filled > STEPS / 2
         assert_same(disk / "out", tmp_path / "whole")
-
-
-def test_photographs_changed_between_runs_are_trained_on(tmp_path: Path) -> None:
-    """One is replaced between a stop in the last stages and the next run, which then ends as a
-    training of what is there now."""
-    data, encoder = photographs(tmp_path / "data", "COLMAP"), tmp_path / "encoder"
-    tiny_clip(encoder)
-    stop = Moment("lifting masks onto the Gaussians", 0, 0, signal.SIGTERM)
-    assert train(data, encoder, tmp_path / "stopped", stop).code in (0, 128 + signal.SIGTERM)
-    first, second, *_ = sorted((data / "images").iterdir())
-    first.write_bytes(second.read_bytes())
-    again = train(data, encoder, tmp_path / "stopped")
-    assert again.code == 0, again.said
-    assert train(data, encoder, tmp_path / "whole").code == 0
-    assert_same(tmp_path / "stopped", tmp_path / "whole")

@@ -13,9 +13,7 @@ import torch.distributed
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
 from langsplat_core.errors import InputError
-from langsplat_core.pipeline.language_field import StoredViews
 from langsplat_core.pipeline.stages import LOCK, ProcessGroup, join_processes, sole_use, stage_key
-from tests.support.scenes import make_views
 from tests.support.tiny_models import tiny_room, tiny_sam
 
 pytestmark = pytest.mark.long
@@ -27,12 +25,8 @@ HOLD = (
 
 
 def test_stage_key_names_stage_version_and_inputs() -> None:
-    keys = {
-        stage_key("lift", 2, "a"),
-        stage_key("lift", 3, "a"),
-        stage_key("fit", 2, "a"),
-        stage_key("lift", 2, "b"),
-    }
+    keys = {stage_key(*parts) for parts in (("lift", 2, "a"), ("lift", 3, "a"), ("fit", 2, "a"))}
+    keys.add(stage_key("lift", 2, "b"))
     assert len(keys) == 4
     assert stage_key("lift", 2, "a") in keys
 
@@ -88,14 +82,6 @@ def test_barrier_names_a_lost_process(monkeypatch):
     monkeypatch.setattr("torch.distributed.barrier", lost)
     with pytest.raises(InputError, match=r"ended \(Connection closed by peer .*what is finished is kept"):
         ProcessGroup(1, 2).barrier()
-
-
-def test_stored_views_read_features_on_access():
-    pairs = make_views(3)
-    views = StoredViews([camera for camera, _ in pairs], [features for _, features in pairs])
-    assert len(views) == 3
-    assert views[1][1] is pairs[1][1]
-    assert [camera for camera, _ in views] == [camera for camera, _ in pairs]
 
 
 def train(room: Path, out: Path, said: Path, surroundings: dict[str, str], *more: str) -> None:

@@ -142,15 +142,12 @@ def test_a_setting_repeats_only_what_depends_on_it(room, tmp_path):
     assert added == {"codec", "latents", "nodes"}
     other_machine = replace(tiny_settings(room), lift=LiftConfig(backend="cpu"))
     train_scene(room, out, other_machine)
-    assert len(kept_results(work)) == len(before) + 3  # who computes, and in which batches, changes nothing
-
-
-def test_more_steps_of_lifting_do_not_fit_the_codec_again(room, tmp_path):
-    work = tmp_path / "scene.work"
+    assert len(kept_results(work)) == len(before) + 3  # who computes changes nothing
     for steps in (10, 20):
         lift, codec = LiftConfig(mode="gradient", steps=steps), AutoencoderConfig(steps=30)
-        train_scene(room, tmp_path / "scene.ply", replace(tiny_settings(room), lift=lift, codec=codec))
-    assert (len(list(work.glob("codec-*.npz"))), len(list(work.glob("latents-*.npz")))) == (1, 2)
+        train_scene(room, out, replace(tiny_settings(room), lift=lift, codec=codec))
+    # More steps of lifting do not fit the codec again.
+    assert (len(list(work.glob("codec-*.npz"))), len(list(work.glob("latents-*.npz")))) == (3, 4)
 
 
 @pytest.mark.parametrize("name", ["member*/*.npy", "member*/*.npz", "codec-*", "latents-*", "nodes-*"])
@@ -289,14 +286,6 @@ def test_paper_profile_runs(room, tmp_path, capsys):
 FUTURE = 4_070_000_000  # in 2098
 
 
-@pytest.fixture(scope="module")
-def whole(room: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """The scene of a run that nothing happened to."""
-    out = tmp_path_factory.mktemp("whole") / "scene.ply"
-    train_scene(room, out, tiny_settings(room))
-    return scene_in(out.parent)
-
-
 def scene_in(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
 
@@ -308,38 +297,30 @@ def interrupted(room: Path, folder: Path, config: TrainConfig) -> None:
     assert list((folder / "scene.work").glob("*.checkpoint.safetensors"))
 
 
-def retrained(data: Path, folder: Path, config: TrainConfig) -> None:
-    """Go on in a folder; the scene is that of a run in an empty one."""
-    (folder / "fresh").mkdir()
-    for out in (folder, folder / "fresh"):
-        train_scene(data, out / "scene.ply", config)
-    assert scene_in(folder) == scene_in(folder / "fresh")
-
-
-def test_changed_options_after_an_interruption_start_fresh_stages(room: Path, tmp_path: Path) -> None:
-    config = tiny_settings(room)
-    interrupted(room, tmp_path, config)
-    radiance, dataset = replace(config.radiance, seed=7), replace(config.dataset, max_side=48)
-    retrained(room, tmp_path, replace(config, radiance=radiance, dataset=dataset))
-
-
-def test_changed_photographs_start_fresh_stages(room: Path, tmp_path: Path) -> None:
-    data = tmp_path / "data"
+def test_changed_options_and_photographs_start_fresh_stages(room: Path, tmp_path: Path) -> None:
+    """The scene is that of a run in an empty folder."""
+    data, config = tmp_path / "data", tiny_settings(room)
     shutil.copytree(room, data)
-    interrupted(data, tmp_path, tiny_settings(room))
+    interrupted(data, tmp_path, config)
     photo = data / "images" / "photo_1.png"
     pixels = np.array(Image.open(photo))
     pixels[:9] = 255 - pixels[:9]
     Image.fromarray(pixels).save(photo)
     (data / "images" / "photo_3.png").unlink()
-    retrained(data, tmp_path, tiny_settings(room))
+    changed = replace(config, radiance=replace(config.radiance, seed=7))
+    (tmp_path / "fresh").mkdir()
+    for settings in (config, changed):
+        for out in (tmp_path, tmp_path / "fresh"):
+            train_scene(data, out / "scene.ply", settings)
+        assert scene_in(tmp_path) == scene_in(tmp_path / "fresh")
 
 
-def test_a_moved_work_folder_resumes(room: Path, whole: dict[str, bytes], tmp_path: Path) -> None:
+def test_a_moved_work_folder_resumes_whatever_its_dates(room: Path, tmp_path: Path) -> None:
     shutil.copytree(room, tmp_path / "here" / "data")
     interrupted(tmp_path / "here" / "data", tmp_path / "here", tiny_settings(room))
-    (tmp_path / "here").rename(tmp_path / "there")
-    there = tmp_path / "there"
+    there = (tmp_path / "here").rename(tmp_path / "there")
+    for path in [path for path in there.rglob("*") if path.is_file()]:
+        os.utime(path, (FUTURE, FUTURE))
     reported: list[float] = []
 
     def watch(at: Report) -> None:
@@ -348,22 +329,9 @@ def test_a_moved_work_folder_resumes(room: Path, whole: dict[str, bytes], tmp_pa
 
     train_scene(there / "data", there / "scene.ply", tiny_settings(room), progress=Progress(watch))
     assert min(reported) > 0.5  # it went on from the checkpoint
-    assert scene_in(there) == whole
-
-
-def test_resuming_ignores_dates_of_files(room: Path, whole: dict[str, bytes], tmp_path: Path) -> None:
-    data = tmp_path / "data"
-    shutil.copytree(room, data)
-    interrupted(data, tmp_path, tiny_settings(room))
-    for path in [path for path in tmp_path.rglob("*") if path.is_file()]:
-        os.utime(path, (FUTURE, FUTURE))
-    train_scene(data, tmp_path / "scene.ply", tiny_settings(room))
-    assert scene_in(tmp_path) == whole
-    kept = list((tmp_path / "scene.work").rglob("*.np*"))
-    for path in kept:
-        os.utime(path, (FUTURE, FUTURE))
-    train_scene(data, tmp_path / "scene.ply", tiny_settings(room))
-    assert {int(path.stat().st_mtime) for path in kept} == {FUTURE}  # nothing was made again
+    (tmp_path / "fresh").mkdir()
+    train_scene(there / "data", tmp_path / "fresh" / "scene.ply", tiny_settings(room))
+    assert scene_in(there) == scene_in(tmp_path / "fresh")  # which nothing happened to
 
 
 def test_query_needs_no_home_locale_or_writable_folder(tmp_path: Path) -> None:

@@ -182,26 +182,6 @@ def test_page_draws_hard_scenes_as_opengl_does(
     compare(measured, "hard scenes", ours, drawn(gl, scene, camera))
 
 
-def test_image_waits_for_the_order_of_its_camera(browser: Any, tmp_path: Path) -> None:
-    """The page's own camera looks elsewhere while the order for the image is waited for."""
-    scene = Scene(hard("one"))
-    camera = Scene(random_gaussians(600, 4)).framing_camera((64, 48))
-    with open_tab(browser, exported(tmp_path, scene)) as tab:
-        tab.run("""async () => {
-          const { page } = await langsplat, sort = page.painter.sort.bind(page.painter);
-          const away = (x) => ({ rotation: [1, 0, 0, 0, 1, 0, 0, 0, 1], position: [x, 0, 1e6] });
-          let asked = 0;
-          page.painter.sort = (camera) => {
-            if (asked++) return sort(camera);
-            sort(away(1));
-            const order = sort(camera);
-            sort({ ...away(2), rotation: [1, 0, 0, 0, 0, 1, 0, -1, 0] });
-            return order;
-          };
-        }""")
-        assert tab.image(camera, scene.bounds()[0]).max() > 50
-
-
 def same(found: dict[str, Any], expected: Any, members: int) -> None:
     for name in FIELDS:
         value = getattr(expected, name)

@@ -240,15 +240,6 @@ def apart(vectors: Array, centres: Array) -> float:
     return float(1 - nearest_centres(vectors, centres)[1].mean())
 
 
-def test_nearest_is_the_largest_cosine() -> None:
-    vectors, _ = clusters(5, 40)
-    centres = unit(np.random.default_rng(1).normal(size=(7, D))).astype(np.float32)
-    nearest, cosines = nearest_centres(vectors, centres)
-    products = vectors.astype(np.float64) @ centres.T
-    np.testing.assert_array_equal(nearest, products.argmax(1))
-    np.testing.assert_allclose(cosines, products.max(1), atol=1e-6)
-
-
 def test_separate_clusters_are_found_the_same_for_the_same_seed() -> None:
     vectors, labels = clusters(40, 25)
     centres, again = (spherical_kmeans(vectors, 40, generator=np.random.default_rng(3)) for _ in range(2))
@@ -268,14 +259,6 @@ def test_more_centres_fit_better_and_a_start_is_kept() -> None:
         spreads.append(apart(vectors, start))
     assert spreads == sorted(spreads, reverse=True)
     assert spreads[-1] < 0.6 * spreads[0]
-
-
-@pytest.mark.parametrize("different", [1, 3])
-def test_fewer_different_vectors_than_centres(different: int) -> None:
-    vectors = np.repeat(np.eye(8, dtype=np.float32)[:different], 50, 0)
-    centres = spherical_kmeans(vectors, 10)
-    assert sorted(centres.argmax(1)) == list(range(different))
-    assert apart(vectors, centres) < 1e-6
 
 
 # Colours of codewords: neighbours are told apart, whatever else is large.

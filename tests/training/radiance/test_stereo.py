@@ -167,20 +167,6 @@ def test_free_depth_follows_nearby_depths_and_points() -> None:
     assert 0 < alone < depth.size / 2
 
 
-def test_space_before_unconfirmed_surfaces_is_free() -> None:
-    images = list(capture().images)
-    images[0] = images[0].copy()
-    images[0][20:34, 20:30] = 120  # flat in this view alone
-    maps = find_depths(replace(capture(), images=tuple(images)), range(4))
-    camera = cameras()[0]
-    assert not np.isfinite(maps[0].depth[24:30, 24:26]).any()
-    close, at = (
-        camera.unproject((25.0, 27.0), share * true_depth(camera)[27, 25])[None] for share in (0.6, 1)
-    )
-    assert in_free_space(close, maps[:1]).all()
-    assert not in_free_space(at, maps[:1]).any()
-
-
 def test_masked_pixels_have_no_depth() -> None:
     mask = np.ones(SIZE[::-1], bool)
     mask[:, :30] = False

@@ -192,24 +192,19 @@ def test_ctrl_c_ends_training_with_a_checkpoint(tmp_path: Path) -> None:
 
 
 def test_one_view_is_enough_and_none_is_refused() -> None:
-    trained = train_radiance(capture(), replace(SHORT, steps=5), [0])
-    assert len(trained) > 0
+    assert len(train_radiance(capture(), replace(SHORT, steps=5), [0])) > 0
     with pytest.raises(InputError, match="no photographs to train on"):
         train_radiance(capture(), SHORT, [])
 
 
-def test_empty_views_do_not_disturb_training() -> None:
+@pytest.mark.parametrize("what", ["empty", "masked"])
+def test_views_that_show_nothing_do_not_disturb_training(what: str) -> None:
     away = look_at(np.array([0, 0, -4.0]), np.array([0, 0, -9.0]), np.array([0.0, -1.0, 0.0]), SIZE)
     blind = replace(capture(), cameras=(away, *capture().cameras[1:]))
-    trained = train_radiance(blind, replace(SHORT, steps=12), [0, 1])
+    masked = replace(capture(), masks=(np.zeros(SIZE[::-1], bool), *[None] * 5))
+    config = replace(SHORT, steps=12, exposure="on")
+    trained = train_radiance(blind if what == "empty" else masked, config, [0, 1, 2])
     assert len(trained) > 100
-    assert trained.valid().all()
-
-
-def test_fully_masked_photographs_get_no_exposure() -> None:
-    nothing = np.zeros(SIZE[::-1], bool)
-    masked = replace(capture(), masks=(None, None, nothing, None, None, None))
-    trained = train_radiance(masked, replace(SHORT, steps=9, exposure="on"), [0, 1, 2])
     assert trained.valid().all()
 
 
@@ -275,14 +270,12 @@ def test_training_ignores_transients(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_few_views_alone_use_depths() -> None:
+@pytest.mark.parametrize("few_views", [2, 3])
+def test_few_views_alone_use_depths(few_views: int) -> None:
     stages: list[str] = []
     told = Progress(lambda at: stages.append(at.stage))
-    train_radiance(capture(), replace(SHORT, steps=2), [0, 1, 2], progress=told)
-    assert STAGE in stages
-    stages.clear()
-    train_radiance(capture(), replace(SHORT, steps=2, few_views=2), [0, 1, 2], progress=told)
-    assert STAGE not in stages
+    train_radiance(capture(), replace(SHORT, steps=2, few_views=few_views), [0, 1, 2], progress=told)
+    assert (STAGE in stages) == (few_views == 3)
 
 
 # Rehearsals: budgets that few photographs support, decided by views held out of the training views.
