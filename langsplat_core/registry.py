@@ -37,7 +37,7 @@ class Extension:
     exporters: References = field(default_factory=dict)  # word of `convert --to` -> io.scenes.Exporter
     encoders: References = field(
         default_factory=dict
-    )  # `model_type` of config.json -> semantics.encoder.Family
+    )  # `model_type` of config.json -> semantics.encoders.Family
     segmenters: References = field(default_factory=dict)  # `model_type` -> function of Weights to a Segmenter
     layouts: References = field(default_factory=dict)  # name -> semantics.weights.Layout
     mask_sources: References = field(

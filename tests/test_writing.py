@@ -23,7 +23,7 @@ from langsplat_core.io.shapes import write_points
 from langsplat_core.io.sidecar import write_language
 from langsplat_core.pipeline.stages import kept, kept_array
 from langsplat_core.scene import Scene
-from langsplat_core.semantics.store import FeatureStore, ImageFeatures
+from langsplat_core.semantics.features import FeatureStore, ImageFeatures
 from langsplat_core.training.radiance.state import save_checkpoint
 from langsplat_viewer.files.projects import Bookmark, Shelf, save_preferences, write_flight, write_queries
 from langsplat_viewer.output import Film, save_png, write_film

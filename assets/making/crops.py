@@ -19,7 +19,7 @@ from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import opened
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera, look_at
-from langsplat_core.semantics.regions import masked_crop
+from langsplat_core.semantics.features import masked_crop
 
 CROP = 64  # side of a training crop, px
 _VIEW = (480, 360)  # width, height of the photographs that crops are cut from

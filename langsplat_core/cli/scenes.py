@@ -21,8 +21,7 @@ from langsplat_core.errors import EXTRAS, BackendError, LangSplatError, remedy
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.io.summary import SceneSummary, disk_bytes, summarise
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.semantics.encoder import OPEN_MODEL
-from langsplat_core.semantics.encoders import load_text_encoder
+from langsplat_core.semantics.encoders import OPEN_MODEL, load_text_encoder
 
 OPTIONAL = ("torch", "transformers", "pycolmap", "matplotlib", "gsplat")
 # Debian's packages

@@ -42,9 +42,16 @@ from langsplat_core.scene import (
 from langsplat_core.scene.codec import KINDS, CodebookCodec
 from langsplat_core.scene.language import phrase_key
 from langsplat_core.scene.surface import build_surface, build_tree
-from langsplat_core.semantics.encoder import Encoder, PhraseEncoder
-from langsplat_core.semantics.regions import ImageEncoder, embed_regions, fingerprint, within
-from langsplat_core.semantics.store import FeatureStore, ImageFeatures, StoredFeatures
+from langsplat_core.semantics.encoders import Encoder, PhraseEncoder
+from langsplat_core.semantics.features import (
+    FeatureStore,
+    ImageEncoder,
+    ImageFeatures,
+    StoredFeatures,
+    embed_regions,
+    fingerprint,
+    within,
+)
 from langsplat_core.semantics.vocabulary import everyday_vectors
 from langsplat_core.training.language.codec_fit import (
     CodecReport,

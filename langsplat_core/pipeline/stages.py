@@ -21,7 +21,7 @@ from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import read_npz, write_npy
 from langsplat_core.scene import Gaussians
-from langsplat_core.semantics.store import ImageFeatures
+from langsplat_core.semantics.features import ImageFeatures
 
 try:
     import fcntl

@@ -42,12 +42,10 @@ from langsplat_core.pipeline.stages import ProcessGroup, sole_use, stage_key
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Gaussians, Scene
-from langsplat_core.semantics.encoder import Encoder
-from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE, load_encoder
+from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE, Encoder, load_encoder
+from langsplat_core.semantics.features import FeatureStore, StoredFeatures, describe_capture
 from langsplat_core.semantics.masks import MaskSource
-from langsplat_core.semantics.regions import describe_capture
 from langsplat_core.semantics.sam import load_mask_source
-from langsplat_core.semantics.store import FeatureStore, StoredFeatures
 from langsplat_core.training.radiance.differentiable import evaluate_views
 from langsplat_core.training.radiance.rehearsal import (
     budget_text,

@@ -1,64 +1,43 @@
-"""The text half of a small CLIP in NumPy, from the files of its weights and tokenizer.
+"""The text half of a small CLIP of few words in NumPy, from the files of its weights and tokenizer.
 
-Written here so that search needs neither torch nor transformers nor tokenizers, which take seconds to import
-and hundreds of megabytes to install.
+Written here so that search with the bundled encoder needs neither torch nor transformers nor tokenizers,
+which take seconds to import and hundreds of megabytes to install.
 
 The network is that of Radford et al. 2021: token and position vectors, layers of causal self-attention and a
 two-layer perceptron, each behind a layer norm and added to what came in, a last norm, and the vector at the
 end token projected. It is equal to `transformers.CLIPTextModelWithProjection` but for rounding. The tokenizer
-is CLIP's byte-level byte-pair encoding (Sennrich et al. 2016), equal to that of `tokenizers` but for letters
-that are newer than Python's table of Unicode.
+is CLIP's byte-pair encoding (Sennrich et al. 2016) of words of the letters a to z.
 """
 
 import json
 import re
-import unicodedata
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby, pairwise
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.semantics.encoder import FILE, check_whole
+from langsplat_core.errors import EncoderError, InputError, LangSplatError
 from langsplat_core.semantics.weights import CONFIG, SAFE, Weights
 
-# Of the text half. NumPy was the quicker one at 63 million too; but checkpoints that large
-# come from elsewhere, and their tokenizers have not been compared with transformers' reading of them.
-MOST_WEIGHTS = 20_000_000
-MOST_LAYERS = 64  # of a model that is small: beyond, its shapes alone could fill the memory
+TOKENIZER = "tokenizer.json"
+VOCABULARY = "vocabulary.txt"  # beside the weights: the only words the encoder was taught, one per line
 TEMPERATURE = 10.0  # of LERF and LangSplat, whatever scale a checkpoint ended its training with
-# What reading a file raises that states something else.
-UNCLEAR = (OSError, ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError)
-READABLE = ("F16", "F32", "F64")  # types of safetensors that NumPy has too
-LEGACY_END = 2  # of configurations whose end token is the one with the highest number
 PREFIX = "text_model."
 TOKENS, POSITIONS = (f"{PREFIX}embeddings.{name}_embedding.weight" for name in ("token", "position"))
 PROJECTION = "text_projection.weight"
 
 Tensors = Mapping[str, Array]  # name -> float32
 
-# How tokenizer.json states CLIP's rules; a file that states others is left to `tokenizers`.
-NORMALIZERS = (
-    {"type": "NFC"},
-    {"type": "Replace", "pattern": {"Regex": "\\s+"}, "content": " "},
-    {"type": "Lowercase"},
-)
-SPLIT = r"<\|startoftext\|>|<\|endoftext\|>|'s|'t|'re|'ve|'m|'ll|'d|[\p{L}]+|[\p{N}]|[^\s\p{L}\p{N}]+"
-END_OF_WORD = "</w>"
-# `SPLIT` in Python's syntax, which has no classes of letters and numbers: runs of both are parted afterwards.
-# Unlike Unicode, it also counts four control characters as spaces.
-PIECES = re.compile(
-    r"<\|startoftext\|>|<\|endoftext\|>|'s|'t|'re|'ve|'m|'ll|'d|[^\W_]+|(?:[^\s\w]|[_\x1c-\x1f])+"
-)
-
 
 @dataclass(frozen=True)
 class TextConfig:
     """Settings that the weights alone do not say; defaults as of `transformers.CLIPTextConfig`."""
 
-    vocab_size: int = 49_408
     hidden_size: int = 512
     intermediate_size: int = 2_048
     num_hidden_layers: int = 12
@@ -69,23 +48,20 @@ class TextConfig:
     eos_token_id: int = 49_407
     projection_dim: int = 512
 
-    def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Every tensor of the text half and its shape."""
-        wide, inner = self.hidden_size, self.intermediate_size
-        found: dict[str, tuple[int, ...]] = {
-            TOKENS: (self.vocab_size, wide),
-            POSITIONS: (self.max_position_embeddings, wide),
-            PROJECTION: (self.projection_dim, wide),
-        }
-        matrices = {f"self_attn.{name}_proj": (wide, wide) for name in ("q", "k", "v", "out")}
-        matrices |= {"mlp.fc1": (inner, wide), "mlp.fc2": (wide, inner)}
-        norms = [f"{PREFIX}final_layer_norm"]
-        for number in range(self.num_hidden_layers):
-            layer = _layer(number)
-            norms += [f"{layer}layer_norm1", f"{layer}layer_norm2"]
-            for name, shape in matrices.items():
-                found |= {f"{layer}{name}.weight": shape, f"{layer}{name}.bias": shape[:1]}
-        return found | {f"{name}.{part}": (wide,) for name in norms for part in ("weight", "bias")}
+
+def check_whole(text: str, ids: Sequence[int], room: int, ends: Collection[int]) -> None:
+    """Refuse a phrase of which a model would not see all.
+
+    ids: its tokens without those that begin and end a phrase; room: how many the model reads; ends: tokens
+    that end a phrase, which some tokenizers give for every mark that they cannot read. Raises InputError for
+    a phrase that is too long, EncoderError for one that would end early.
+    """
+    if len(ids) > room:
+        raise InputError(
+            f"'{text[:40]} ...' is too long: {len(ids)} tokens; this encoder reads {room}, so use fewer words"
+        )
+    if not set(ends).isdisjoint(ids):
+        raise EncoderError(f"{text[:80]!r} holds marks that this encoder cannot read; use plain words")
 
 
 class PlainClipText:
@@ -112,32 +88,44 @@ class PlainClipText:
 
 
 def plain_text_tower(weights: Weights) -> PlainClipText | None:
-    """Return the text half in `weights`, if it is small, whole and of a kind that is computed here.
+    """Return the text half in `weights`, if it was taught plain words, is whole, and is computed here.
 
     Else None, and torch reads the folder, or says what is wrong with it.
     """
-    if weights.device != "cpu" or weights.converted:
+    if weights.converted or weights.device != "cpu" or not (weights.folder / VOCABULARY).is_file():
         return None
-    config = _text_config(weights)
-    if (
-        config is None
-        or config.hidden_act not in _ACTIVATIONS
-        or config.num_hidden_layers > MOST_LAYERS
-        or config.hidden_size % config.num_attention_heads
-    ):
+    try:
+        words = (weights.folder / VOCABULARY).read_text(encoding="utf-8").split()
+        stated = json.loads((weights.folder / CONFIG).read_text(encoding="utf-8"))
+        settings = {"projection_dim": stated["projection_dim"]}
+        config = msgspec.convert({**stated["text_config"], **settings}, TextConfig)
+        tokenizer = read_tokenizer(weights.folder / TOKENIZER)
+        tower = PlainClipText(weights.id, config, _tensors(weights.folder, config), tokenizer)
+        plain = all(re.fullmatch("[a-z]+", word) for word in words) and tokenizer.end == config.eos_token_id
+        return (
+            tower if plain and tower.encode(words[:1]).shape == (1, tower.dim) else None
+        )  # all fits together
+    except (OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError):
         return None
-    shapes = config.shapes()
-    if sum(int(np.prod(shape)) for shape in shapes.values()) > MOST_WEIGHTS:
+    except LangSplatError:
         return None
-    tokenizer = read_pair_tokenizer(weights.folder / FILE)
-    tensors = _tensors(weights.folder, shapes) if tokenizer else None
-    if tokenizer is None or tensors is None:
-        return None
-    numbers = set(tokenizer.numbers.values())
-    end = config.eos_token_id if config.eos_token_id != LEGACY_END else max(numbers, default=-1)
-    if tokenizer.end != end or not {tokenizer.begin, end} <= numbers <= set(range(config.vocab_size)):
-        return None
-    return PlainClipText(weights.id, config, tensors, tokenizer)
+
+
+def _tensors(folder: Path, config: TextConfig) -> dict[str, Array]:
+    """Return the tensors of the text half as float32; ValueError where they are not those of its layers."""
+    from safetensors import SafetensorError, safe_open
+
+    found: dict[str, Array] = {}
+    try:
+        for path in (path for pattern in SAFE for path in folder.glob(pattern)):
+            with safe_open(path, framework="np") as file:
+                names = [name for name in file.keys() if name.startswith(PREFIX) or name == PROJECTION]  # noqa: SIM118
+                found |= {name: file.get_tensor(name).astype(np.float32) for name in names}
+    except SafetensorError as error:
+        raise ValueError(error) from None
+    if len(found) != 5 + 16 * config.num_hidden_layers:
+        raise ValueError(f"{len(found)} tensors")
+    return found
 
 
 def text_vectors(tensors: Tensors, config: TextConfig, ids: Array, ends: Array) -> Array:
@@ -147,17 +135,13 @@ def text_vectors(tensors: Tensors, config: TextConfig, ids: Array, ends: Array) 
     later = np.triu(np.full((length, length), -np.inf, np.float32), 1)
     x = tensors[TOKENS][ids] + tensors[POSITIONS][:length]
     for number in range(config.num_hidden_layers):
-        layer = _layer(number)
+        layer = f"{PREFIX}encoder.layers.{number}."
         before = _norm(tensors, f"{layer}layer_norm1", x, eps)
         x = x + _attention(tensors, f"{layer}self_attn.", before, later, config.num_attention_heads)
         inner = _linear(tensors, f"{layer}mlp.fc1", _norm(tensors, f"{layer}layer_norm2", x, eps))
         x = x + _linear(tensors, f"{layer}mlp.fc2", activate(inner))
     last = _norm(tensors, f"{PREFIX}final_layer_norm", x[np.arange(len(ids)), ends], eps)
     return last @ tensors[PROJECTION].T
-
-
-def _layer(number: int) -> str:
-    return f"{PREFIX}encoder.layers.{number}."
 
 
 def _linear(tensors: Tensors, name: str, x: Array) -> Array:
@@ -201,24 +185,9 @@ def _gelu(x: Array) -> Array:
 _ACTIVATIONS: Mapping[str, Callable[[Array], Array]] = {"quick_gelu": _quick_gelu, "gelu": _gelu}
 
 
-def _text_config(weights: Weights) -> TextConfig | None:
-    """Return settings of the text half in config.json; None where they cannot be understood."""
-    try:
-        whole = json.loads((weights.folder / CONFIG).read_text(encoding="utf-8"))
-        stated = {**(whole.get("text_config") or {}), **(whole.get("text_config_dict") or {})}
-        stated["projection_dim"] = whole.get("projection_dim", TextConfig.projection_dim)
-        kinds = {name: type(getattr(TextConfig, name)) for name in TextConfig.__dataclass_fields__}
-        config = TextConfig(**{name: kind(stated[name]) for name, kind in kinds.items() if name in stated})
-    except UNCLEAR:
-        return None
-    return (
-        config if min(config.num_attention_heads, config.num_hidden_layers, config.hidden_size) > 0 else None
-    )
-
-
 @dataclass(frozen=True)
 class PairTokenizer:
-    """Tokenizer of CLIP's byte-pair encoding."""
+    """Tokenizer of CLIP's byte-pair encoding, of words of the letters a to z with blanks between."""
 
     numbers: Mapping[str, int]  # token -> its number
     ranks: Mapping[tuple[str, str], int]  # pair of tokens that are merged -> its place, the lowest first
@@ -227,14 +196,11 @@ class PairTokenizer:
 
     def encode(self, text: str) -> list[int]:
         """Numbers of the tokens of `text`, without those that begin and end a phrase."""
-        return [self.numbers.get(token, self.end) for piece in _pieces(text) for token in self._merged(piece)]
+        return [self.numbers.get(token, self.end) for word in text.split() for token in self._merged(word)]
 
-    def _merged(self, piece: str) -> list[str]:
-        """Return the tokens of a word: its bytes, of which neighbours are merged by their ranks."""
-        if piece in ("<|startoftext|>", "<|endoftext|>"):
-            return [""]  # neither may stand within a phrase
-        word = [BYTES[byte] for byte in piece.encode()]
-        word[-1] += END_OF_WORD
+    def _merged(self, text: str) -> list[str]:
+        """Return the tokens of a word: its letters, of which neighbours are merged by their ranks."""
+        word = [*text[:-1], f"{text[-1]}</w>"]
         while pairs := [pair for pair in pairwise(word) if pair in self.ranks]:
             first = min(pairs, key=self.ranks.__getitem__)
             merged, at = [], 0
@@ -246,73 +212,12 @@ class PairTokenizer:
         return word
 
 
-def _pieces(text: str) -> Iterator[str]:
-    """Pieces that `SPLIT` finds in `text` behind the normalizers: words, single numbers, runs of marks."""
-    plain = "".join(letter.lower() for letter in unicodedata.normalize("NFC", text))
-    for found in PIECES.findall(plain):
-        for is_word, letters in groupby(found, str.isalpha) if found[0].isalnum() else [(True, found)]:
-            yield from ["".join(letters)] if is_word else letters
-
-
-def _byte_letters() -> tuple[str, ...]:
-    """Return the letter that stands for each byte in a byte-level vocabulary (Radford et al. 2019).
-
-    It is the byte itself where Latin-1 prints it, the others from U+0100 on.
-    """
-    shown = [*range(0x21, 0x7F), *range(0xA1, 0xAD), *range(0xAE, 0x100)]
-    others = [byte for byte in range(256) if byte not in shown]
-    return tuple(chr(byte if byte in shown else 256 + others.index(byte)) for byte in range(256))
-
-
-BYTES = _byte_letters()
-
-
-def read_pair_tokenizer(path: Path) -> PairTokenizer | None:
-    """Return the tokenizer of a tokenizer.json that states CLIP's rules.
-
-    None for another, and for no file.
-    """
-    try:
-        stated = json.loads(path.read_text(encoding="utf-8"))
-        model, ends = stated["model"], stated["post_processor"]
-        split, level = stated["pre_tokenizer"]["pretokenizers"]
-        rules = (
-            *stated["normalizer"]["normalizers"],
-            *(model["type"], model["end_of_word_suffix"], model["unk_token"], ends["type"]),
-            *(split["pattern"], split["behavior"], split["invert"]),
-            *(level["type"], level["add_prefix_space"]),
-        )
-        (last, end), (_, begin) = ends["sep"], ends["cls"]
-        if rules != (
-            *NORMALIZERS,
-            *("BPE", END_OF_WORD, last, "RobertaProcessing"),
-            *({"Regex": SPLIT}, "Removed", True),
-            *("ByteLevel", False),
-        ):
-            return None
-        merges = [pair.split() if isinstance(pair, str) else pair for pair in model["merges"]]
-        ranks = {(first, second): rank for rank, (first, second) in enumerate(merges)}
-        return PairTokenizer({str(k): int(v) for k, v in model["vocab"].items()}, ranks, int(begin), int(end))
-    except UNCLEAR:
-        return None
-
-
-def _tensors(folder: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Array] | None:
-    """Return the tensors of these names as float32, from all safetensors of a folder.
-
-    None where one is absent, has another shape, or is of a type that NumPy lacks.
-    """
-    from safetensors import SafetensorError, safe_open
-
-    found: dict[str, Array] = {}
-    try:
-        for path in sorted(path for pattern in SAFE for path in folder.glob(pattern)):
-            with safe_open(path, framework="np") as file:
-                for name in shapes.keys() & set(file.keys()):
-                    tensor = file.get_slice(name)
-                    if tuple(tensor.get_shape()) != shapes[name] or tensor.get_dtype() not in READABLE:
-                        return None
-                    found[name] = file.get_tensor(name).astype(np.float32)
-    except (OSError, ValueError, SafetensorError):
-        return None
-    return found if len(found) == len(shapes) else None
+def read_tokenizer(path: Path) -> PairTokenizer:
+    """Return the tokenizer of a tokenizer.json as CLIP's; ValueError or LookupError for another one."""
+    model: Any = json.loads(path.read_text(encoding="utf-8"))["model"]
+    if (model["type"], model["end_of_word_suffix"]) != ("BPE", "</w>"):
+        raise ValueError("no byte-pair encoding of CLIP's kind")
+    pairs = [pair.split() if isinstance(pair, str) else pair for pair in model["merges"]]
+    ranks = {(first, second): rank for rank, (first, second) in enumerate(pairs)}
+    numbers = {str(token): int(number) for token, number in model["vocab"].items()}
+    return PairTokenizer(numbers, ranks, numbers["<|startoftext|>"], numbers["<|endoftext|>"])

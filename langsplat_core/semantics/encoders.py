@@ -1,37 +1,36 @@
-"""Families of image-text encoders and their loading: CLIP and SigLIP.
+"""Image-text encoders: what callers ask of them, the families CLIP and SigLIP, and their loading.
 
-CLIP is that of Radford et al. 2021, with OpenCLIP and the bundled demo encoder.
+CLIP is that of Radford et al. 2021, with OpenCLIP and the bundled demo encoder. A family brings two towers,
+each a few lines; checks of phrases and images, batches and unit vectors are the same for all.
 """
 
+import html
+import json
 import math
+import re
 import string
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any, Protocol
+
+import numpy as np
+from msgspec import Meta, Struct
 
 from langsplat_core import registry
-from langsplat_core.arrays import Array
-from langsplat_core.errors import EncoderError, optional_imports
-from langsplat_core.semantics.clip_plain import TEMPERATURE, plain_text_tower
-from langsplat_core.semantics.encoder import (
-    OPEN_MODEL,
-    SHARE_OF_SCALE,
-    UNUSUAL,
-    Encoder,
-    Family,
-    ImageTower,
-    PhraseEncoder,
-    TextTower,
-    check_whole,
-    inferred,
-    load_tokens,
-    pixel_statistics,
-    text_cleaner,
-)
+from langsplat_core.arrays import Array, unit
+from langsplat_core.errors import EncoderError, FormatError, InputError, UnknownWordError, optional_imports
+from langsplat_core.io.hostile import decode_json
+from langsplat_core.scene import Calibration, LanguageField
+from langsplat_core.semantics.clip_plain import TEMPERATURE, TOKENIZER, check_whole, plain_text_tower
 from langsplat_core.semantics.weights import (
+    OPEN_CLIP_CONFIG,
     Weights,
+    asking_errors,
     load_config,
     load_model,
     loading_errors,
@@ -42,21 +41,248 @@ from langsplat_core.semantics.weights import (
     weights_path,
 )
 
-CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)  # of OpenAI's CLIP, kept by OpenCLIP
-CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
+OPEN_MODEL = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
+WORD = re.compile(r"[^\W_]+(?:'[^\W_]+)?")
+TEXT_BATCH = 64  # phrases per forward pass
+
+
+class TextTower(Protocol):
+    """The half of a model that reads phrases."""
+
+    @property
+    def dim(self) -> int:
+        """Length D of the vectors."""
+
+    @property
+    def temperature(self) -> float:
+        """Factor of a difference of cosines before the sigmoid of relevancy, see `SHARE_OF_SCALE`."""
+
+    def encode(self, texts: list[str]) -> Array:
+        """(B, D) float32 vectors, of any length, of B > 0 phrases.
+
+        Raises InputError and EncoderError as `check_whole`: no part of a phrase is left out in silence.
+        """
+
+
+class ImageTower(Protocol):
+    """The half of a model that sees images."""
+
+    @property
+    def image_size(self) -> int:
+        """Side of the images it takes, px."""
+
+    @property
+    def statistics(self) -> tuple[Array, Array]:
+        """(3,) mean and (3,) standard deviation that it expects to be taken out, of values in [0, 1]."""
+
+    def encode(self, pixels: Any) -> Any:
+        """(B, 3, S, S) float32 tensor, normalised -> (B, D) float tensor, of any length."""
+
+
+@dataclass(frozen=True)
+class Family:
+    """An architecture: how its two halves are loaded."""
+
+    text: Callable[[Weights], TextTower]
+    images: Callable[[Weights], ImageTower]
+
+
+class _Beside(Struct, forbid_unknown_fields=True):
+    """reading.json beside the weights, optional: how cosines are read, as a scene keeps it."""
+
+    found: Annotated[float, Meta(ge=0, le=1)] = LanguageField.found
+    calibration: Calibration | None = None
+
+
+class PhraseEncoder:
+    """The text half of a model, in float32; it satisfies `vocabulary.TextEncoder`."""
+
+    def __init__(self, weights: Weights, tower: TextTower) -> None:
+        self.id = weights.id  # hub id or folder as it was asked for; "demo" for the bundled encoder
+        self.tower = tower
+        taught, reading = weights.folder / "vocabulary.txt", weights.folder / "reading.json"
+        # The only words the encoder was taught; None: open vocabulary.
+        self.words = frozenset(taught.read_text(encoding="utf-8").split()) if taught.is_file() else None
+        try:
+            beside = decode_json(reading.read_bytes(), _Beside, reading) if reading.is_file() else _Beside()
+        except FormatError as error:
+            raise EncoderError(f"{weights.id}: reading.json is none of an encoder's ({error})") from None
+        self.found, self.calibration = beside.found, beside.calibration
+
+    @property
+    def dim(self) -> int:
+        """Length D of the vectors."""
+        return self.tower.dim
+
+    @property
+    def temperature(self) -> float:
+        """Factor with which a margin of cosines, phrase minus nearest canonical phrase, becomes relevancy."""
+        return self.tower.temperature
+
+    def unknown_words(self, text: str) -> tuple[str, ...]:
+        """Words of `text` that the encoder was never taught; empty when it was taught open vocabulary."""
+        if self.words is None:
+            return ()
+        return tuple(word for word in WORD.findall(text.lower()) if self._taught(word) is None)
+
+    def near_words(self, word: str) -> tuple[str, ...]:
+        """Words it was taught that are written like an unknown one, the nearest first."""
+        return tuple(get_close_matches(word.lower(), sorted(self.words or ()), n=2))
+
+    def _taught(self, word: str) -> str | None:
+        """Return the word in which the encoder was taught `word`: itself, or of a possessive its owner."""
+        return next((form for form in (word, word.partition("'")[0]) if form in (self.words or ())), None)
+
+    def encode_texts(self, texts: Sequence[str]) -> Array:
+        """(M, D) float32 unit vectors of M phrases, raw: no prompt template, as in LangSplat.
+
+        An encoder of a closed vocabulary is given its words and nothing else: any mark that its tokenizer
+        lacks might end the phrase. Raises InputError for a phrase without a letter or digit or with more
+        tokens than the model reads, UnknownWordError for words it was not taught, EncoderError for other
+        marks that it cannot read.
+        """
+        for text in texts:
+            self._check(text)
+        said = list(texts)
+        if self.words is not None:
+            said = [" ".join(self._taught(w) or "" for w in WORD.findall(text.lower())) for text in texts]
+        starts = range(0, len(texts), TEXT_BATCH)
+        parts = [unit(self.tower.encode(said[i : i + TEXT_BATCH])) for i in starts]
+        return np.concatenate(parts) if parts else np.zeros((0, self.dim), np.float32)
+
+    def _check(self, text: str) -> None:
+        if not WORD.search(text):
+            raise InputError(f"empty phrase {text!r}: type a word or a few, such as 'red mug'")
+        unknown = self.unknown_words(text)
+        if unknown:
+            words = sorted(self.words or ())
+            examples = ", ".join(words[:: len(words) // 12 + 1])
+            raise UnknownWordError(
+                {word: self.near_words(word) for word in unknown},
+                f"'{self.id}' was taught {len(words)} words, such as {examples}; a scene trained with "
+                f"`--clip.model {OPEN_MODEL}` can be asked anything",
+            )
+
+
+class Encoder(PhraseEncoder):
+    """Both halves of a model; it satisfies `features.ImageEncoder` too."""
+
+    def __init__(self, weights: Weights, text: TextTower, images: ImageTower, batch: int) -> None:
+        super().__init__(weights, text)
+        self._images, self._device, self._batch = images, weights.device, batch
+
+    @property
+    def image_size(self) -> int:
+        """Side of the images it takes, px."""
+        return self._images.image_size
+
+    def encode_images(self, crops: Array | Sequence[Array]) -> Array:
+        """(M, D) float32 unit vectors of M images (image_size, image_size, 3) uint8, display values."""
+        size = self.image_size
+        for crop in crops:
+            if crop.shape != (size, size, 3):
+                raise ValueError(f"crops: expected {size} x {size} x 3 images, got shape {crop.shape}")
+        starts = range(0, len(crops), self._batch)
+        parts = [self._encode(np.stack(list(crops[i : i + self._batch]))) for i in starts]
+        return np.concatenate(parts) if parts else np.zeros((0, self.dim), np.float32)
+
+    def _encode(self, crops: Array) -> Array:
+        import torch
+
+        mean, std = self._images.statistics
+        pixels = (crops.astype(np.float32) / 255 - mean) / std
+        inputs = torch.from_numpy(np.ascontiguousarray(pixels.transpose(0, 3, 1, 2))).to(self._device)
+        return unit(inferred(lambda: self._images.encode(inputs)))
+
+
+@asking_errors("the encoder")
+def inferred(forward: Callable[[], Any]) -> Array:
+    """Return the float32 array of a torch tensor that `forward` computes, without gradients."""
+    import torch
+
+    with torch.inference_mode():
+        values: Array = forward().float().cpu().numpy()
+    return values
+
+
+# What families share.
+
+
+def text_cleaner() -> Callable[[str], str]:
+    """Return the cleaning that open_clip does before its tokenizer reads a text.
+
+    Broken Unicode is mended, curly quotes and ligatures are made plain, names of HTML replaced, spaces made
+    single. The function raises InputError where no letter and no digit is left.
+    """
+    import ftfy
+
+    def clean(text: str) -> str:
+        plain = " ".join(html.unescape(html.unescape(ftfy.fix_text(text))).split())
+        if not any(map(str.isalnum, plain)):
+            raise InputError(f"empty phrase {text!r}: type a word or a few, such as 'red mug'")
+        return plain
+
+    return clean
+
+
+class Images:
+    """An `ImageTower` computed by torch."""
+
+    def __init__(self, kind: Any, weights: Weights, config: Any, output: str, usual: Array) -> None:
+        """kind: class of transformers; output: name of the vectors in what it returns.
+
+        usual: (2, 3) mean and standard deviation of pixels, unless preprocessor_config.json states others.
+        """
+        self._model, self._output = load_model(kind, weights, config), output
+        self.statistics = _pixel_statistics(weights, usual)
+
+    @property
+    def image_size(self) -> int:
+        return int(self._model.config.image_size)
+
+    def encode(self, pixels: Any) -> Any:
+        return getattr(self._model(pixel_values=pixels), self._output)
+
+
+def _pixel_statistics(weights: Weights, usual: Array) -> tuple[Array, Array]:
+    """Return mean and standard deviation of the pixels a model was trained with.
+
+    Raises EncoderError where the folder's file cannot be read, or states no three numbers.
+    """
+    path = weights.folder / "preprocessor_config.json"
+    name = OPEN_CLIP_CONFIG if weights.converted else path.name
+    try:
+        settings = weights.converted.preprocessor if weights.converted else {}
+        if not weights.converted and path.is_file():
+            settings = json.loads(path.read_text(encoding="utf-8"))
+        stated = settings.get("image_mean") or usual[0], settings.get("image_std") or usual[1]
+        found = np.array(stated, np.float32)
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise EncoderError(f"{weights.id}: {name} cannot be read ({error})") from error
+    if found.shape != (2, 3) or not (found[1] > 0).all():
+        raise EncoderError(f"{weights.id}: {name} states no mean and deviation of three colours")
+    return found[0], found[1]
+
+
+# CLIP.
+
+CLIP_PIXELS = np.array([  # mean and standard deviation of OpenAI's CLIP, kept by OpenCLIP
+    (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711),
+])  # fmt: skip
+UNUSUAL = "\u3042"  # where the token for what is not known is lacking, this cannot be read
 
 
 class ClipText:
     """A `TextTower` computed by torch."""
 
     def __init__(self, weights: Weights) -> None:
-        from transformers import CLIPTextModelWithProjection, CLIPTokenizerFast
+        from transformers import CLIPTextModelWithProjection
 
         self.temperature = TEMPERATURE
         self._clean = text_cleaner()
         self._device = weights.device
-        self._model: Any = _load(CLIPTextModelWithProjection, "text", weights)
-        self._tokenizer: Any = _load_tokenizer(CLIPTokenizerFast, weights, int(self._model.config.vocab_size))
+        self._model: Any = load_model(CLIPTextModelWithProjection, weights, _clip_config(weights, "text"))
+        self._tokenizer: Any = _clip_tokenizer(weights, int(self._model.config.vocab_size))
 
     @property
     def dim(self) -> int:
@@ -73,53 +299,39 @@ class ClipText:
         return inferred(lambda: self._model(input_ids=tokens).text_embeds)
 
 
-class Images:
-    """An `ImageTower` computed by torch."""
-
-    def __init__(self, model: Any, output: str, statistics: tuple[Array, Array]) -> None:
-        """model: of transformers; output: name of the vectors in what it returns."""
-        self._model, self._output, self.statistics = model, output, statistics
-
-    @property
-    def image_size(self) -> int:
-        return int(self._model.config.image_size)
-
-    def encode(self, pixels: Any) -> Any:
-        return getattr(self._model(pixel_values=pixels), self._output)
-
-
-def clip_images(weights: Weights) -> ImageTower:
-    """Return the image tower of a CLIP, by torch."""
-    from transformers import CLIPVisionModelWithProjection
-
-    model = _load(CLIPVisionModelWithProjection, "vision", weights)
-    return Images(model, "image_embeds", pixel_statistics(weights, CLIP_MEAN, CLIP_STD))
-
-
 def clip_text(weights: Weights) -> TextTower:
     """Return the text tower in NumPy where the model is small, else by torch."""
     return plain_text_tower(weights) or ClipText(weights)
 
 
-def _load(kind: Any, tower: str, weights: Weights) -> Any:
-    """Load one tower, "text" or "vision", with its projection."""
+def clip_images(weights: Weights) -> ImageTower:
+    """Return the image tower of a CLIP, by torch."""
+    from transformers import CLIPVisionModelWithProjection as Model
+
+    return Images(Model, weights, _clip_config(weights, "vision"), "image_embeds", CLIP_PIXELS)
+
+
+def _clip_config(weights: Weights, tower: str) -> Any:
+    """Return the configuration of one tower, "text" or "vision", with its projection."""
     from transformers import CLIPConfig
 
     config = load_config(CLIPConfig, weights, "CLIP")
     tower_config = getattr(config, f"{tower}_config")
     tower_config.projection_dim = config.projection_dim  # some files state it for the pair only
-    return load_model(kind, weights, tower_config)
+    return tower_config
 
 
-def _load_tokenizer(kind: Any, weights: Weights, vocabulary: int) -> Any:
+def _clip_tokenizer(weights: Weights, vocabulary: int) -> Any:
+    from transformers import CLIPTokenizerFast
+
     folder = weights.folder
-    if not (folder / "tokenizer.json").is_file() and not (folder / "merges.txt").is_file():
+    if not (folder / TOKENIZER).is_file() and not (folder / "merges.txt").is_file():
         raise EncoderError(
-            f"{weights.id}: no CLIP tokenizer in {folder}; put tokenizer.json there, or vocab.json and "
+            f"{weights.id}: no CLIP tokenizer in {folder}; put {TOKENIZER} there, or vocab.json and "
             "merges.txt; all CLIPs share those of openai/clip-vit-base-patch32 on the Hugging Face hub"
         )
     with loading_errors(weights.id, "CLIP"):
-        tokenizer = kind.from_pretrained(folder, local_files_only=True)
+        tokenizer = CLIPTokenizerFast.from_pretrained(folder, local_files_only=True)
         tokenizer(UNUSUAL)
         highest = max(tokenizer.get_vocab().values())
     if highest >= vocabulary:
@@ -137,15 +349,24 @@ def _load_tokenizer(kind: Any, weights: Weights, vocabulary: int) -> Any:
 #
 # Their logits are scale * cosine + bias, with a learned scale of 110 to 120 and a bias of -12 to -17. The
 # bias makes a pair improbable unless it is right, since of n^2 pairs in a batch only n are; in relevancy,
-# which is made of differences of cosines, it cancels. The temperature is a tenth of the scale, see
-# `encoder.SHARE_OF_SCALE`.
+# which is made of differences of cosines, it cancels.
 
-HALF = (0.5, 0.5, 0.5)  # mean and standard deviation of pixels
-NO_PUNCTUATION = str.maketrans("", "", string.punctuation)
+# Share of a model's logit scale that is the temperature of relevancy. LERF and LangSplat take 10 for CLIP,
+# whose training caps the scale at 100: a tenth. The larger the scale, the smaller the gaps between cosines of
+# right and wrong pairs that training had to make, so a tenth of it gives the margins of two families like
+# relevancies. It is a rule of proportion, not a calibration: verdicts need thresholds of their own.
+SHARE_OF_SCALE = 0.1
+SIGLIP_PIXELS = np.full((2, 3), 0.5)
+# The library ends the process over a token of 300 000 bytes; the table of a normaliser may be as long.
+_LONG = re.compile(rb'(?<!"precompiled_charsmap":)(?<!"precompiled_charsmap": )"[^"]{10000}')
 
 
 class SiglipText:
-    """A `TextTower` computed by torch."""
+    """A `TextTower` computed by torch.
+
+    Its tokenizer.json is read as it is, by the `tokenizers` library: what transformers' own classes add
+    around it (which side is padded, whether an end token is there) differs between its versions.
+    """
 
     def __init__(self, weights: Weights) -> None:
         from transformers import SiglipTextModel
@@ -154,7 +375,11 @@ class SiglipText:
         self._device = weights.device
         self._model: Any = load_model(SiglipTextModel, weights, config)
         self._clean = text_cleaner()
-        self._tokens = load_tokens(weights, int(config.max_position_embeddings))
+        self._tokenizer = _tokenizer(weights)
+        # SentencePiece's unigram kind is the first generation's, whose captions had no punctuation.
+        self._is_first = type(self._tokenizer.model).__name__ == "Unigram"
+        self._pad = _special_token(weights, self._tokenizer, "pad_token", ("<pad>", "</s>"))
+        self._end = _special_token(weights, self._tokenizer, "eos_token", ("</s>", "<eos>"))
         scale = read_scalar(weights, "logit_scale")
         if not math.isfinite(scale):
             raise EncoderError(f"{weights.id}: not SigLIP weights: logit_scale is not in them")
@@ -165,24 +390,27 @@ class SiglipText:
         return int(self._model.config.projection_size)
 
     def encode(self, texts: list[str]) -> Array:
-        ids = self._tokens.rows([self.canonical(text) for text in texts])
+        import torch
+
+        plain = [self._canonical(text) for text in texts]
+        ids = torch.full((len(texts), int(self._model.config.max_position_embeddings)), self._pad)
+        for row, found in enumerate(self._tokenizer.encode_batch(plain, add_special_tokens=False)):
+            check_whole(plain[row], found.ids, ids.shape[1] - 1, {self._end})
+            ids[row, : len(found.ids) + 1] = torch.tensor([*found.ids, self._end])
         return inferred(lambda: self._model(input_ids=ids.to(self._device)).pooler_output)
 
-    def canonical(self, text: str) -> str:
-        """Return `text` like the captions of its training: clean, in lower case.
-
-        SigLIP 1 had no punctuation either.
-        """
+    def _canonical(self, text: str) -> str:
+        """Return `text` like the captions of its training: clean, in lower case."""
         lower = self._clean(text).lower()
-        return " ".join(lower.translate(NO_PUNCTUATION).split()) if self._tokens.is_unigram else lower
+        bare = lower.translate(str.maketrans("", "", string.punctuation))
+        return " ".join(bare.split()) if self._is_first else lower
 
 
 def siglip_images(weights: Weights) -> ImageTower:
     """Return the image tower of a SigLIP, by torch."""
-    from transformers import SiglipVisionModel
+    from transformers import SiglipVisionModel as Model
 
-    model = load_model(SiglipVisionModel, weights, _siglip_config(weights).vision_config)
-    return Images(model, "pooler_output", pixel_statistics(weights, HALF, HALF))
+    return Images(Model, weights, _siglip_config(weights).vision_config, "pooler_output", SIGLIP_PIXELS)
 
 
 def _siglip_config(weights: Weights) -> Any:
@@ -191,7 +419,40 @@ def _siglip_config(weights: Weights) -> Any:
     return load_config(SiglipConfig, weights, "SigLIP")
 
 
-# Image-text encoders by hub id, folder or file: a new family is two towers above and one row here.
+def _tokenizer(weights: Weights) -> Any:
+    """Return the folder's `tokenizers.Tokenizer`, which neither cuts nor pads; EncoderError without one."""
+    from tokenizers import Tokenizer
+
+    path = weights.folder / TOKENIZER
+    if not path.is_file():
+        raise EncoderError(f"{weights.id}: no {TOKENIZER} in this folder, which its phrases are read with")
+    try:
+        if _LONG.search(path.read_bytes()):
+            raise ValueError("a token of more than 10000 bytes")
+        tokenizer = Tokenizer.from_file(str(path))
+        tokenizer.no_truncation()
+        tokenizer.no_padding()
+        tokenizer.encode(UNUSUAL, add_special_tokens=False)
+        return tokenizer
+    except Exception as error:  # the library raises no narrower class for a damaged file
+        reason = (str(error).splitlines() or ["unreadable"])[0][:200]
+        raise EncoderError(f"{weights.id}: {TOKENIZER} is no tokenizer ({reason})") from error
+
+
+def _special_token(weights: Weights, tokenizer: Any, role: str, usual: tuple[str, ...]) -> int:
+    """Return the number of the token with a role: as the folder states it, else by its usual names."""
+    stated = None
+    with suppress(OSError, ValueError, AttributeError, RecursionError):
+        text = (weights.folder / "tokenizer_config.json").read_text(encoding="utf-8")
+        stated = json.loads(text).get(role)
+    for token in (stated.get("content") if isinstance(stated, dict) else stated, *usual):
+        number = tokenizer.token_to_id(token) if isinstance(token, str) else None
+        if number is not None:
+            return int(number)
+    raise EncoderError(f"{weights.id}: its tokenizer has no {role}, such as {usual[0]}")
+
+
+# Loading by hub id, folder or file: a new family is two towers above and one row here.
 
 DEMO = "demo"
 DEMO_ELSEWHERE = (
@@ -217,18 +478,14 @@ def load_text_encoder(model: str, device: str = "cpu") -> PhraseEncoder:
 
 @optional_imports(EncoderError)
 def load_encoder(model: str, device: str = "auto", batch: int = 32) -> Encoder:
-    """Load both halves of `model`: a folder, a file, a hub id, or "demo" for the bundled encoder.
-
-    batch: images per forward pass. Raises EncoderError where the weights are absent or are those of no family
-    here.
-    """
+    """Load both halves of `model`, as `load_text_encoder` does; batch: images per forward pass."""
     weights = open_weights(model, model_path(model, "--clip.model"), torch_device(device))
     family = _family(weights)
     return Encoder(weights, family.text(weights), family.images(weights), batch)
 
 
 def model_path(model: str, option: str) -> Path:
-    """Folder or file of `model`; `option` is what messages name, see `weights.weights_path`."""
+    """Return the folder or file of `model`; `option` is what messages name, see `weights.weights_path`."""
     if model != DEMO:
         return weights_path(model, option)
     folder = Path(str(files("langsplat_assets") / "demo_encoder"))

@@ -1,4 +1,9 @@
-"""Masks by models of the SAM family: an image is seen once, asked about a grid of points, and filtered."""
+"""Masks by models of the SAM family: an image is seen once, asked about a grid of points, and filtered.
+
+The three answers to one point are taken as the levels subpart, part and whole (LangSplat section 3.1). The
+image is seen once, as a whole; the method's public code, not its paper, sees 2 x 2 crops of it too. Source:
+the mask generator of segment-anything, with the settings of LangSplat's public code.
+"""
 
 import json
 from collections.abc import Callable, Mapping
@@ -10,14 +15,21 @@ from typing import Any, Protocol
 
 import numpy as np
 from PIL import Image
-from scipy import ndimage
 
 from langsplat_core import registry
 from langsplat_core.arrays import Array
 from langsplat_core.config import MaskConfig
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.progress import Progress
-from langsplat_core.semantics.masks import GraphMasks, LevelMasks, MaskSource
+from langsplat_core.semantics.masks import (
+    GraphMasks,
+    LevelMasks,
+    MaskSource,
+    box_nms,
+    clean_regions,
+    mask_boxes,
+    mask_nms,
+)
 from langsplat_core.semantics.weights import (
     Weights,
     asking_errors,
@@ -85,28 +97,18 @@ def by_area(ious: Any, logits: Any) -> tuple[Any, Any]:
     return ious[points, order], logits[points, order]
 
 
-def padded(image: Array, side: int) -> tuple[Array, tuple[int, int]]:
-    """Scale the longer side of (H, W, 3) uint8 to `side`, normalise, pad with zeros to the right and below.
+def normalised(image: Array, side: int, padded: bool) -> tuple[Array, tuple[int, int]]:
+    """Return (1, 3, side, side) float32 of (H, W, 3) uint8, and the (height, width) of the image in it.
 
-    Returns (1, 3, side, side) float32 and the (height, width) of the image in it, px.
+    It is stretched to the square, or with `padded` its longer side is, with zeros to the right and below.
     """
     height, width = image.shape[:2]
     scale = side / max(height, width)
-    size = max(1, int(height * scale + 0.5)), max(1, int(width * scale + 0.5))
-    pixels = np.zeros((side, side, 3), np.float32)
-    pixels[: size[0], : size[1]] = _normalised(image, size)
-    return np.ascontiguousarray(pixels.transpose(2, 0, 1)[None]), size
-
-
-def squashed(image: Array, side: int) -> Array:
-    """(H, W, 3) uint8 -> (1, 3, side, side) float32, normalised; an image's proportions are lost."""
-    return np.ascontiguousarray(_normalised(image, (side, side)).transpose(2, 0, 1)[None])
-
-
-def _normalised(image: Array, size: tuple[int, int]) -> Array:
+    size = (max(1, int(height * scale + 0.5)), max(1, int(width * scale + 0.5))) if padded else (side, side)
     resized = Image.fromarray(image).resize((size[1], size[0]), Image.Resampling.BILINEAR)
-    scaled: Array = (np.asarray(resized, np.float32) - PIXEL_MEAN) / PIXEL_STD
-    return scaled.astype(np.float32)
+    pixels = np.zeros((side, side, 3), np.float32)
+    pixels[: size[0], : size[1]] = (np.asarray(resized, np.float32) - PIXEL_MEAN) / PIXEL_STD
+    return np.ascontiguousarray(pixels.transpose(2, 0, 1)[None]), size
 
 
 def upscale(logits: Any, side: int, size: tuple[int, int] | None, shape: tuple[int, int]) -> Any:
@@ -120,13 +122,8 @@ def upscale(logits: Any, side: int, size: tuple[int, int] | None, shape: tuple[i
     return interpolate(square, shape, mode="bilinear", align_corners=False)[:, 0]
 
 
-# Segment Anything (Kirillov et al. 2023).
-
-EPSILON = 1e-5  # of the norms between attentions in segment_anything, PyTorch's; transformers has 1e-6 there
-
-
 class Sam:
-    """A `Segmenter`. Its three masks of a point are subpart, part and whole (LangSplat section 3.1)."""
+    """Segment Anything (Kirillov et al. 2023): its three masks of a point are subpart, part and whole."""
 
     name = "SAM"
 
@@ -134,7 +131,8 @@ class Sam:
         from transformers import SamConfig, SamModel
 
         settings = load_config(SamConfig, weights, self.name)
-        settings.mask_decoder_config.layer_norm_eps = EPSILON
+        # Of the norms between attentions in segment_anything, PyTorch's; transformers has 1e-6 there.
+        settings.mask_decoder_config.layer_norm_eps = 1e-5
         self._model: Any = load_model(SamModel, weights, settings)
 
     @asking_errors("the segmenter")
@@ -142,17 +140,17 @@ class Sam:
         import torch
 
         side = int(self._model.config.vision_config.image_size)
-        pixels, size = padded(image, side)
+        pixels, size = normalised(image, side, padded=True)
         given = torch.from_numpy(pixels).to(self._model.device)
         seen = {"image_embeddings": self._model.get_image_embeddings(given)}
         return EncodedImage(self._model, seen, side, size, image.shape[:2], ordered=True)
 
 
-# SAM 2 and 2.1 (Ravi et al. 2024) on single images, by the image half of their video model.
-
-
 class Sam2:
-    """A `Segmenter`. The order of its three masks of a point means nothing, so their size tells the level."""
+    """SAM 2 and 2.1 (Ravi et al. 2024) on single images, by the image half of their video model.
+
+    The order of its three masks of a point means nothing, so their size tells the level.
+    """
 
     name = "SAM 2"
 
@@ -167,16 +165,18 @@ class Sam2:
         import torch
 
         side = int(self._model.config.prompt_encoder_config.image_size)
-        pixels = torch.from_numpy(squashed(image, side)).to(self._model.device)
-        seen = {"image_embeddings": self._model.get_image_embeddings(pixels)}
+        pixels, _ = normalised(image, side, padded=False)
+        given = torch.from_numpy(pixels).to(self._model.device)
+        seen = {"image_embeddings": self._model.get_image_embeddings(given)}
         return EncodedImage(self._model, seen, side, None, image.shape[:2], ordered=False)
 
 
-# Segmenters by hub id, folder or file: a new family is a class above and one row here.
+# Loading by hub id, folder or file: a new family is a class above and one row here.
 
 FAMILIES: Mapping[str, Callable[[Weights], Segmenter]] = MappingProxyType(  # by `model_type` of config.json
     {"sam": Sam, "sam2": Sam2, "sam2_video": Sam2}
 )
+HALF_ON = "cuda"  # where products are float16's: bfloat16's error is seven times as large
 
 
 def load_segmenter(model: str, device: str = "auto") -> Segmenter:
@@ -193,165 +193,6 @@ def load_segmenter(model: str, device: str = "auto") -> Segmenter:
         known = ", ".join((*FAMILIES, *more))
         raise EncoderError(f"{model}: its {named!r} model is no segmenter known here; known are {known}")
     return registry.part("segmenters", named)(weights)
-
-
-# SAM's layers of crops: parts of a photograph that are looked at for themselves, for masks of small things.
-#
-# Source: the mask generator of segment-anything, with the settings of LangSplat's public code.
-
-OVERLAP = 512 / 1500  # of neighbouring crops, as a share of the image's shorter side, in the first layer
-EDGE = 20.0  # px: a box that ends this near to an edge touches it
-
-
-def crop_boxes(shape: tuple[int, int], layers: int) -> Array:
-    """(C, 4) int64 left, top, right, bottom, px, of the whole image and its crops; the last two exclusive.
-
-    shape: (height, width); layer k cuts 2^k x 2^k crops that overlap. The whole image comes first.
-    """
-    height, width = shape
-    boxes = [(0, 0, width, height)]
-    for layer in range(1, layers + 1):
-        count = 2**layer
-        overlap = int(OVERLAP * min(shape) * 2 / count)
-        columns, rows = _spans(width, count, overlap), _spans(height, count, overlap)
-        boxes += [(left, top, right, bottom) for left, right in columns for top, bottom in rows]
-    return np.array(boxes, np.int64)
-
-
-def _spans(length: int, count: int, overlap: int) -> list[tuple[int, int]]:
-    """`count` equal pieces that cover `length` px and share `overlap` px with the next."""
-    size = ceil((overlap * (count - 1) + length) / count)
-    starts = [int((size - overlap) * i) for i in range(count)]
-    return [(start, min(start + size, length)) for start in starts if start < length]
-
-
-def cut_by_crop(boxes: Array, crop: Array, shape: tuple[int, int]) -> Array:
-    """Return (...,) bool, True where a box ends at an edge of the crop that is no edge of the image.
-
-    What such a mask shows goes on outside, and the next crop or the whole image shows it better. boxes:
-    (..., 4); crop: (4,) left, top, right, bottom, px of the image; shape: its (height, width).
-    """
-    whole = np.array([0, 0, shape[1], shape[0]])
-    at_crop, at_edge = np.abs(boxes - crop) <= EDGE, np.abs(boxes - whole) <= EDGE
-    return (at_crop & ~at_edge).any(axis=-1)
-
-
-# Which of many proposed masks are kept: suppression by box and by pixels, and the removal of crumbs.
-
-CONTAINED = 0.85  # of a mask's area inside another one: it counts as inside
-DOMINATED = 0.5  # a mask that covers less than this of the one around it is small beside it
-PIXELS_PER_PRODUCT = 1 << 16  # columns of the matrix product that counts common pixels
-EIGHT = np.ones((3, 3), bool)  # diagonal neighbours are connected, as in SAM's own clean-up
-
-
-def mask_boxes(masks: Array) -> Array:
-    """(M, H, W) bool, none empty -> (M, 4) int64 left, top, right, bottom; the last two exclusive."""
-    boxes = np.zeros((len(masks), 4), np.int64)
-    for box, mask in zip(boxes, masks, strict=True):
-        rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-        box[:] = columns[0], rows[0], columns[-1] + 1, rows[-1] + 1
-    return boxes
-
-
-def box_nms(boxes: Array, scores: Array, iou: float) -> Array:
-    """Greedy non-maximum suppression: (K,) indices kept, by falling score; ties by index.
-
-    boxes: (M, 4) left, top, right, bottom, non-empty; a box goes when its IoU with a kept one is > `iou`.
-    """
-    order = np.argsort(-scores, kind="stable")
-    left, top, right, bottom = boxes.astype(float).T
-    area = (right - left) * (bottom - top)
-    kept = []
-    while len(order):
-        best, rest = order[0], order[1:]
-        kept.append(int(best))
-        width = np.minimum(right[best], right[rest]) - np.maximum(left[best], left[rest])
-        height = np.minimum(bottom[best], bottom[rest]) - np.maximum(top[best], top[rest])
-        common = np.maximum(width, 0) * np.maximum(height, 0)
-        order = rest[common / (area[best] + area[rest] - common) <= iou]
-    return np.array(kept, int)
-
-
-def clean_regions(mask: Array, min_region: int) -> tuple[Array, bool]:
-    """Fill holes below `min_region` px, then drop islands below it; the largest island always stays.
-
-    mask: (H, W) bool, not empty. Returns the mask and whether anything changed. As SAM's
-    `remove_small_regions`; only the surroundings of the mask are looked at, which changes nothing else.
-    """
-    (left, top, right, bottom), (height, width) = mask_boxes(mask[None])[0], mask.shape
-    gaps = np.array([top * width, (height - bottom) * width, left * height, (width - right) * height])
-    if ((gaps > 0) & (gaps < min_region)).any():  # what lies beyond the box may itself be a small hole
-        window = np.s_[0:height, 0:width]
-        gaps[:] = 0
-    else:
-        window = np.s_[max(top - 1, 0) : bottom + 1, max(left - 1, 0) : right + 1]
-    cleaned = np.zeros_like(mask)
-    cleaned[window] = _drop_islands(_fill_holes(mask[window], min_region, gaps > 0), min_region)
-    return cleaned, not np.array_equal(cleaned, mask)
-
-
-def _fill_holes(mask: Array, min_region: int, open_sides: Array) -> Array:
-    """open_sides: (4,) bool top, bottom, left, right: whether the background goes on for long there."""
-    holes, count = ndimage.label(~mask, EIGHT)
-    small = np.bincount(holes.ravel(), minlength=count + 1) < min_region
-    for side, is_open in zip((holes[0], holes[-1], holes[:, 0], holes[:, -1]), open_sides, strict=True):
-        if is_open:
-            small[side] = False
-    small[0] = False  # the mask itself
-    return mask | small[holes]
-
-
-def _drop_islands(mask: Array, min_region: int) -> Array:
-    islands, count = ndimage.label(mask, EIGHT)
-    sizes = np.bincount(islands.ravel(), minlength=count + 1)
-    keep = sizes >= min_region
-    if not keep[1:].any():
-        keep[1 + np.argmax(sizes[1:])] = True
-    keep[0] = False
-    return keep[islands]
-
-
-def common_pixels(masks: Array) -> Array:
-    """(M, H, W) bool -> (M, M) int64: pixels in both masks; areas on the diagonal."""
-    flat = masks.reshape(len(masks), -1)
-    total = np.zeros((len(masks), len(masks)), np.int64)
-    for start in range(0, flat.shape[1], PIXELS_PER_PRODUCT):
-        part = flat[:, start : start + PIXELS_PER_PRODUCT].astype(np.float32)
-        total += (part @ part.T).astype(np.int64)  # exact: counts stay below 2**24
-    return total
-
-
-def mask_nms(masks: Array, scores: Array, config: MaskConfig) -> Array:
-    """(K,) indices of the masks that stay, rising.
-
-    masks: (M, H, W) bool, none empty; scores: (M,) stability times predicted IoU. A mask goes when its IoU
-    with any higher-scored mask, gone or not, is > nms_iou; when its score is <= nms_score; or when it lies
-    inside another mask, whatever the scores, so that 1 - (its share in both areas multiplied) > nms_inner.
-    Source: `mask_nms` of LangSplat's preprocessing, with the thresholds that it passes.
-    """
-    common = common_pixels(masks)
-    area = np.diag(common)
-    order = np.argsort(-scores, kind="stable")
-    rank = np.empty(len(scores), int)
-    rank[order] = np.arange(len(scores))
-    iou = common / np.maximum(area[:, None] + area[None] - common, 1)
-    rival = (iou > config.nms_iou) & (rank[None] < rank[:, None])
-    share = common / np.maximum(area[:, None], 1)  # of the row's mask that lies in the column's
-    inside = (share >= CONTAINED) & (share.T < DOMINATED) & (1 - share * share.T > config.nms_inner)
-    keep = (scores > config.nms_score) & ~rival.any(axis=1) & ~inside.any(axis=1)
-    return np.flatnonzero(keep)
-
-
-# Masks by a model of the SAM family: a grid of points, three masks a point, filtered.
-#
-# The three answers to one point are taken as the levels subpart, part and whole (LangSplat section 3.1). The
-# image is seen once, as a whole; the method's public code, not its paper, sees 2 x 2 crops of it too.
-
-VERSION = 2
-# Full-size masks of float logits held at one time: on a CPU 16 take twice as long as four times 4, since the
-# system gives and takes back large memory page by page.
-MASKS_AT_ONCE = 4
-HALF_ON = "cuda"  # where products are float16's: bfloat16's error is seven times as large
 
 
 def load_mask_source(config: MaskConfig, device: str = "auto") -> MaskSource:
@@ -373,7 +214,66 @@ def load_mask_source(config: MaskConfig, device: str = "auto") -> MaskSource:
         raise InputError(
             "masks.source sam: name the weights too, such as `--masks.sam facebook/sam-vit-huge`"
         )
-    return SamMasks(load_segmenter(config.sam, device), config, torch_device(device).startswith(HALF_ON))
+    half_on = HALF_ON if torch_device(device).startswith(HALF_ON) else None
+    return SamMasks(load_segmenter(config.sam, device), config, half_on)
+
+
+# The grid of points, and layers of crops: parts of a photograph that are looked at for themselves, for masks
+# of small things.
+
+OVERLAP = 512 / 1500  # of neighbouring crops, as a share of the image's shorter side, in the first layer
+EDGE = 20.0  # px: a box that ends this near to an edge touches it
+
+
+def grid_points(per_side: int, size: tuple[int, int]) -> Array:
+    """Return (per_side^2, 2) float32 points x, y in an image of `size` (height, width).
+
+    They are the centres of equal cells, row by row.
+    """
+    centres = (np.arange(per_side) + 0.5) / per_side
+    x, y = np.meshgrid(centres * size[1], centres * size[0])
+    return np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32)
+
+
+def crop_boxes(shape: tuple[int, int], layers: int) -> Array:
+    """(C, 4) int64 left, top, right, bottom, px, of the whole image and its crops; the last two exclusive.
+
+    shape: (height, width); layer k cuts 2^k x 2^k crops that overlap. The whole image comes first.
+    """
+    height, width = shape
+    boxes = [(0, 0, width, height)]
+    for layer in range(1, layers + 1):
+        count = 2**layer
+        overlap = int(OVERLAP * min(shape) * 2 / count)
+        columns, rows = _spans(width, count, overlap), _spans(height, count, overlap)
+        boxes += [(left, top, right, bottom) for left, right in columns for top, bottom in rows]
+    return np.array(boxes, np.int64)
+
+
+def _spans(length: int, count: int, overlap: int) -> list[tuple[int, int]]:
+    """`count` equal pieces that cover `length` px and share `overlap` px with the next."""
+    size = ceil((overlap * (count - 1) + length) / count)
+    starts = [(size - overlap) * i for i in range(count)]
+    return [(start, min(start + size, length)) for start in starts if start < length]
+
+
+def cut_by_crop(boxes: Array, crop: Array, shape: tuple[int, int]) -> Array:
+    """Return (...,) bool, True where a box ends at an edge of the crop that is no edge of the image.
+
+    What such a mask shows goes on outside, and the next crop or the whole image shows it better. boxes:
+    (..., 4); crop: (4,) left, top, right, bottom, px of the image; shape: its (height, width).
+    """
+    whole = np.array([0, 0, shape[1], shape[0]])
+    at_crop, at_edge = np.abs(boxes - crop) <= EDGE, np.abs(boxes - whole) <= EDGE
+    return (at_crop & ~at_edge).any(axis=-1)
+
+
+# Asking, and what is kept of the answers.
+
+VERSION = 2
+# Full-size masks of float logits held at one time: on a CPU 16 take twice as long as four times 4, since the
+# system gives and takes back large memory page by page.
+MASKS_AT_ONCE = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -398,11 +298,11 @@ class Proposal:
 class SamMasks(MaskSource):
     """Masks of a segmenter's answers to a grid of points."""
 
-    def __init__(self, segmenter: Segmenter, config: MaskConfig, half: bool = False) -> None:
-        """half: whether the model multiplies in float16, see `HALF_ON`."""
+    def __init__(self, segmenter: Segmenter, config: MaskConfig, half_on: str | None = None) -> None:
+        """half_on: type of the device on which the model multiplies in float16; None: in float32."""
         self._segmenter = segmenter
         self._config = config
-        self._half = half
+        self._half_on = half_on
 
     @property
     def name(self) -> str:
@@ -412,7 +312,7 @@ class SamMasks(MaskSource):
     def key(self) -> str:
         """The settings that change the masks, as JSON; the size of batches does not."""
         settings = asdict(self._config) | {"source": "sam", "points_per_batch": 0}
-        return json.dumps(["sam", VERSION, settings, *["float16"] * self._half], sort_keys=True)
+        return json.dumps(["sam", VERSION, settings, *["float16"] * bool(self._half_on)], sort_keys=True)
 
     def __call__(self, image: Array, progress: Progress) -> LevelMasks:
         """Masks of an image (H, W, 3) uint8, by falling predicted IoU; a level may have none."""
@@ -425,9 +325,9 @@ class SamMasks(MaskSource):
         for index, crop in enumerate(crops):
             part = progress.part(index, len(crops))
             try:
-                found = self._in_crop(image, crop, part, self._half)
+                found = self._in_crop(image, crop, part, self._half_on)
             except OverflowError:
-                found = self._in_crop(image, crop, part, half=False)
+                found = self._in_crop(image, crop, part, None)
             for proposals, more in zip(levels, found, strict=True):
                 proposals += more
         progress("finding masks", 1.0)
@@ -437,10 +337,12 @@ class SamMasks(MaskSource):
         kept = [filter_level(level, shape, self._config) for level in levels]
         return LevelMasks((kept[0][0], kept[1][0], kept[2][0]), (kept[0][1], kept[1][1], kept[2][1]))
 
-    def _in_crop(self, image: Array, crop: Array, progress: Progress, half: bool) -> list[list[Proposal]]:
+    def _in_crop(
+        self, image: Array, crop: Array, progress: Progress, half_on: str | None
+    ) -> list[list[Proposal]]:
         """Return the proposals that one crop (4,) of the image gives at each level, in pixels of the image.
 
-        Raises OverflowError for `half` where numbers are larger than float16 holds.
+        Raises OverflowError with `half_on` where numbers are larger than float16 holds.
         """
         import torch
 
@@ -448,17 +350,18 @@ class SamMasks(MaskSource):
         part = np.ascontiguousarray(image[top:bottom, left:right])
         points = grid_points(self._config.points_per_side, part.shape[:2])
         step = self._config.points_per_batch
+        half = partial(torch.autocast, half_on or "cpu", torch.float16, enabled=half_on is not None)
         found = []
         with torch.inference_mode():
             progress("finding masks", 0.0)
-            with torch.autocast(HALF_ON, torch.float16, enabled=half):
+            with half():
                 encoded = self._segmenter.encode(part)
             for start in range(0, len(points), step):
                 if start:
                     progress("finding masks", start / len(points))
-                with torch.autocast(HALF_ON, torch.float16, enabled=half):
+                with half():
                     answer = encoded.masks_at(points[start : start + step])
-                if half and not bool(answer[0].isfinite().all()):
+                if half_on and not bool(answer[0].isfinite().all()):
                     raise OverflowError
                 found.append(self._passing(encoded, answer, crop, image.shape[:2]))
             figures = np.concatenate([some for some, _ in found])
@@ -513,8 +416,7 @@ def measure(logits: Any, offset: float) -> Any:
     """Return (B, 5) float32 stability, left, top, right, bottom of (B, H, W) full-size logits.
 
     On their device, px; right and bottom exclusive, all 0 of an empty mask. At full size, as in
-    segment_anything: at the
-    decoder's own, areas and boxes of small masks differ.
+    segment_anything: at the decoder's own, areas and boxes of small masks differ.
     """
     import torch
 
@@ -549,13 +451,3 @@ def filter_level(
     masks, scores = masks[again], scores[again]
     kept = mask_nms(masks, scores, config)
     return masks[kept], scores[kept].clip(0, 1).astype(np.float32)
-
-
-def grid_points(per_side: int, size: tuple[int, int]) -> Array:
-    """Return (per_side^2, 2) float32 points x, y in an image of `size` (height, width).
-
-    They are the centres of equal cells, row by row.
-    """
-    centres = (np.arange(per_side) + 0.5) / per_side
-    x, y = np.meshgrid(centres * size[1], centres * size[0])
-    return np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32)

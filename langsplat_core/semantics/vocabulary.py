@@ -8,12 +8,11 @@ from typing import Literal, Protocol, get_args
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.errors import InputError
+from langsplat_core.errors import InputError, quoted
 from langsplat_core.scene.language import phrase_key
 
 Bundled = Literal["things", "parts", "colours", "materials"]
 BUNDLED: tuple[Bundled, ...] = get_args(Bundled)
-COMMENT = "#"
 LONGEST = 80  # characters of a phrase: CLIP reads 77 tokens, and a whole paragraph is no word
 
 
@@ -37,35 +36,20 @@ def read_vocabulary(path: Path) -> tuple[str, ...]:
         raise InputError(f"{path}: the vocabulary cannot be read ({error.strerror or error})") from None
     phrases: dict[str, None] = {}
     for number, line in enumerate(lines, 1):
-        phrase = _phrase(line, f"{path}, line {number}")
-        if phrase:
-            phrases[phrase] = None
+        text = " ".join(line.decode(errors="replace").split())
+        if not text or text.startswith("#"):
+            continue
+        phrase = phrase_key(text)
+        plain = text.isprintable() and "\ufffd" not in text  # which stands for bytes that are not UTF-8
+        if not (plain and any(map(str.isalnum, phrase)) and len(phrase) <= LONGEST):
+            raise InputError(
+                f"{path}, line {number}: {quoted(text, 30)} is no phrase; write plain text in UTF-8, one "
+                f"phrase of at most {LONGEST} letters a line, or begin with # what is none"
+            )
+        phrases[phrase] = None
     if not phrases:
         raise InputError(f"{path}: the vocabulary is empty; write one phrase per line, such as 'cup'")
     return tuple(phrases)
-
-
-def _phrase(line: bytes, where: str) -> str:
-    """Return the phrase of a line, "" where it has none.
-
-    InputError that begins with `where` for a bad line.
-    """
-    try:
-        text = line.decode("utf-8").strip()
-    except UnicodeDecodeError:
-        raise InputError(f"{where}: is not UTF-8 text; save the list as plain text in UTF-8") from None
-    if not text or text.startswith(COMMENT):
-        return ""
-    if not " ".join(text.split()).isprintable():
-        raise InputError(f"{where}: holds control characters; a vocabulary is plain text, a phrase per line")
-    phrase = phrase_key(text)
-    if not any(character.isalnum() for character in phrase):
-        raise InputError(f"{where}: {text[:20]!r} has no letter or digit; write a phrase, or begin with #")
-    if len(phrase) > LONGEST:
-        raise InputError(
-            f"{where}: {len(phrase)} characters, a phrase has at most {LONGEST}; write one phrase per line"
-        )
-    return phrase
 
 
 # Everyday phrases: what a codec's errors are judged on, beside a scene's own vectors, and what answers are

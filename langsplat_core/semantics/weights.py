@@ -17,22 +17,15 @@ from langsplat_core import registry
 from langsplat_core.errors import EncoderError
 
 CONFIG = "config.json"
-SMALL_FILES = ["*.json", "*.txt"]
 SAFE = ["model.safetensors", "model-*.safetensors"]
 PICKLED = ["pytorch_model.bin", "pytorch_model-*.bin"]  # transformers reads these with weights_only
 OPEN_CLIP_CONFIG = "open_clip_config.json"
 OPEN_CLIP = ["open_clip_model.safetensors", "open_clip_pytorch_model.bin"]  # either, the first is preferred
-FILES = (".safetensors", ".bin", ".pt", ".pth")  # what no hub id ends with
-# What transformers, safetensors and torch raise for files that are no weights.
-UNREADABLE = (
-    *(OSError, ValueError, TypeError, LookupError, AttributeError, AssertionError, ImportError),
-    *(RuntimeError, EOFError, pickle.PickleError, zipfile.BadZipFile, ArithmeticError),
-)
 
 
 @dataclass(frozen=True, eq=False)
 class Converted:
-    """Weights of another layout as transformers names them, see `layouts.open_weights`."""
+    """Weights of another layout as transformers names them."""
 
     config: dict[str, Any]  # of config.json
     tensors: Mapping[str, Any]  # name -> torch.Tensor
@@ -49,9 +42,7 @@ class Weights:
     converted: Converted | None = None  # where they are in another layout than Hugging Face's
 
 
-Layout = Callable[
-    [str, Path], Converted | None
-]  # id for messages, file -> None where it is of another layout
+Layout = Callable[[str, Path], Converted | None]  # id for messages, file -> None where it is of another one
 
 
 def open_weights(id: str, path: Path, device: str) -> Weights:
@@ -60,7 +51,7 @@ def open_weights(id: str, path: Path, device: str) -> Weights:
     Other layouts than Hugging Face's are read by extensions. Raises EncoderError for a file that is damaged,
     or of no layout known here.
     """
-    if path.is_dir() and is_hugging_face(path):
+    if path.is_dir() and _is_hugging_face(path):
         return Weights(id, path, device)
     file = path if path.is_file() else next(path / name for name in OPEN_CLIP if (path / name).is_file())
     layouts: Mapping[str, Layout] = registry.parts("layouts")
@@ -85,15 +76,15 @@ def weights_path(model: str, option: str) -> Path:
     path = Path(model).expanduser()
     if path.is_file():
         plain = any(path.match(pattern) for pattern in SAFE + PICKLED)
-        return path.parent if plain and is_hugging_face(path.parent) else path
+        return path.parent if plain and _is_hugging_face(path.parent) else path
     if path.is_dir():
-        if not _complete(path):
+        if not _is_complete(path):
             raise EncoderError(
                 f"{model}: no {CONFIG} with model.safetensors in this folder; {option} wants a model folder "
                 f"in Hugging Face layout, or that of open_clip with {OPEN_CLIP_CONFIG} and {OPEN_CLIP[0]}"
             )
         return path
-    if not _is_hub_id(model):
+    if not re.fullmatch(r"[^./~][^/]*/[^/]+(?<!\.safetensors)(?<!\.bin)(?<!\.pt)(?<!\.pth)", model):
         raise EncoderError(
             f"{model}: no such file, no such folder; pass `{option} FOLDER`, a file or a hub id such as "
             "owner/name"
@@ -101,21 +92,14 @@ def weights_path(model: str, option: str) -> Path:
     return _from_hub(model, option)
 
 
-def _is_hub_id(model: str) -> bool:
-    return (
-        model.count("/") == 1 and not model.startswith((".", "~", "/")) and not model.endswith(("/", *FILES))
-    )
-
-
-def is_hugging_face(folder: Path) -> bool:
+def _is_hugging_face(folder: Path) -> bool:
     """Return True where a folder holds weights and their configuration as transformers saves them."""
-    weights = any(next(folder.glob(pattern), None) for pattern in SAFE + PICKLED)
-    return weights and (folder / CONFIG).is_file()
+    return bool(_weight_files(folder)) and (folder / CONFIG).is_file()
 
 
-def _complete(folder: Path) -> bool:
+def _is_complete(folder: Path) -> bool:
     weights = any((folder / name).is_file() for name in OPEN_CLIP)
-    return is_hugging_face(folder) or (weights and (folder / OPEN_CLIP_CONFIG).is_file())
+    return _is_hugging_face(folder) or (weights and (folder / OPEN_CLIP_CONFIG).is_file())
 
 
 def _from_hub(model: str, option: str) -> Path:
@@ -125,18 +109,52 @@ def _from_hub(model: str, option: str) -> Path:
     for local_only in (True,) if constants.HF_HUB_OFFLINE else (True, False):
         for weights in (SAFE, PICKLED, OPEN_CLIP[:1], OPEN_CLIP[1:]):
             try:
-                patterns = SMALL_FILES + weights
+                patterns = ["*.json", "*.txt", *weights]
                 found = snapshot_download(model, allow_patterns=patterns, local_files_only=local_only)
             except (OSError, ValueError, errors.HTTPError) as error:  # of whichever client the hub uses
                 reason = reason if local_only else type(error).__name__
                 continue
-            if _complete(Path(found)):
+            if _is_complete(Path(found)):
                 return Path(found)
             reason = reason if local_only else "it has no weights for transformers"
     raise EncoderError(
         f"{model}: neither a folder nor in the local cache, and the hub cannot supply it ({reason}); "
         f"run `hf download {model}` where there is a network, or pass `{option} FOLDER`"
     )
+
+
+def _weight_files(folder: Path) -> list[Path]:
+    """Return the files with a folder's weights: of both kinds the first, which transformers prefers, too."""
+    kinds = (sorted(path for pattern in kind for path in folder.glob(pattern)) for kind in (SAFE, PICKLED))
+    return next(filter(None, kinds), [])
+
+
+def unpickled(path: Path) -> dict[str, Any]:
+    """Return the tensors of a file of torch, by name, read when they are used where the file allows."""
+    import torch
+
+    mapped = zipfile.is_zipfile(path)  # files of PyTorch before 1.6 are none, and are read whole
+    return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
+
+
+def read_scalar(weights: Weights, name: str) -> float:
+    """Return a number that is among the weights, without loading the rest of them; NaN where it is not there.
+
+    Half a model (a text tower) has no place for what belongs to the pair, such as a logit scale.
+    """
+    from safetensors import safe_open
+
+    with loading_errors(weights.id, "readable"):
+        for path in _weight_files(weights.folder):
+            if path.suffix != ".safetensors":
+                return float(unpickled(path).get(name, math.nan))
+            with safe_open(path, framework="pt") as file:
+                if name in file.keys():  # noqa: SIM118  not a mapping
+                    return float(file.get_tensor(name))
+    return math.nan
+
+
+# Building a model: transformers fills with random numbers what its configuration has and its weights lack.
 
 
 def model_type(weights: Weights) -> str:
@@ -161,96 +179,54 @@ def load_config(kind: Any, weights: Weights, name: str) -> Any:
     with loading_errors(weights.id, name):
         if weights.converted:
             return kind.from_dict(deepcopy(weights.converted.config))
-        _check_counts(weights)
+        _check_counts(weights.id, json.loads((weights.folder / CONFIG).read_text(encoding="utf-8")))
         return kind.from_pretrained(weights.folder, local_files_only=True)
 
 
-# Names in config.json of the numbers of parts that are built one by one, each with tensors of its own.
-COUNTS = frozenset({
-    "num_hidden_layers", "blocks_per_stage", "iou_head_depth", "num_multimask_outputs",
-    "num_point_embeddings",
-})  # fmt: skip
-LARGEST_IMAGE = 1 << 14  # pixels a side
-_LAYER = re.compile(r"(?:layers|blocks)\.\d+\.")
+# Settings whose parts are built one by one, for hours before anybody compares, and the side of images in px.
+LARGEST = {
+    **dict.fromkeys(("num_hidden_layers", "blocks_per_stage", "iou_head_depth"), 512),
+    **dict.fromkeys(("num_multimask_outputs", "num_point_embeddings"), 512),
+    "image_size": 1 << 14,
+}
 
 
-def _check_counts(weights: Weights) -> None:
-    """Raise EncoderError where config.json states more parts than the weights have tensors, or huge images.
-
-    Building such parts could take hours, before anybody compares.
-    """
-    settings = json.loads((weights.folder / CONFIG).read_text(encoding="utf-8"))
-    largest = dict.fromkeys(COUNTS, len(_shapes(weights))) | {"image_size": LARGEST_IMAGE}
-    for name, value in _named_values(settings):
+def _check_counts(id: str, settings: Any) -> None:
+    """Raise EncoderError where a configuration, or a part of it, asks for absurdly many parts."""
+    for name, value in settings.items() if isinstance(settings, dict) else ():
+        _check_counts(id, value)
+        most = LARGEST.get(name)
         values = value if isinstance(value, list) else [value]
-        most = largest.get(name, 0)
         if most and not all(isinstance(n, int) and 1 <= n <= most for n in values if n is not None):
             raise EncoderError(
-                f"{weights.id}: {CONFIG}: {name} is {json.dumps(value)[:40]}, its weights allow 1 to {most}; "
-                "take the file that belongs to them"
+                f"{id}: {CONFIG}: {name} is {json.dumps(value)[:40]}, which is not within 1 to {most}; take "
+                "the file that belongs to the weights"
             )
 
 
-def _named_values(settings: Any) -> Iterator[tuple[str, Any]]:
-    """Yield the name and value of every setting, part by part."""
-    for name, value in settings.items() if isinstance(settings, dict) else ():
-        yield from _named_values(value) if isinstance(value, dict) else ((name, value),)
-
-
 def _check_size(kind: Any, weights: Weights, config: Any) -> None:
-    """Raise EncoderError where a model of this configuration holds more numbers than its weights.
+    """Raise EncoderError where a model of this configuration has more numbers than its files have bytes.
 
-    transformers would fill memory with random ones, before anybody compares. The model is built on torch's
-    meta device, where it takes no room.
+    The model is built on torch's meta device, where it takes no room.
     """
     import torch
 
     with torch.device("meta"):
         asked = sum(parameter.numel() for parameter in kind(config).parameters())
-    held = sum(math.prod(shape) for shape in _shapes(weights).values())
+    held = sum(path.stat().st_size for path in _weight_files(weights.folder))
     if asked > held:
         raise EncoderError(
-            f"{weights.id}: {CONFIG} states a model of {asked} numbers, its weights have {held}; take the "
-            "file that belongs to them"
+            f"{weights.id}: {CONFIG} states a model of {asked} numbers, its weights have {held} bytes; take "
+            "the file that belongs to them"
         )
-
-
-def _shapes(weights: Weights) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of all tensors of a folder, by name; of pickles without reading their numbers."""
-    from safetensors import safe_open
-
-    found: dict[str, tuple[int, ...]] = {}
-    for path in _weight_files(weights.folder):
-        if path.suffix == ".safetensors":
-            with safe_open(path, framework="np") as file:
-                found |= {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118
-        else:
-            found |= {name: tuple(tensor.shape) for name, tensor in unpickled(path).items()}
-    return found
-
-
-def _weight_files(folder: Path) -> list[Path]:
-    """Return the files with a folder's weights: of both kinds the first, which transformers prefers, too."""
-    for patterns in (SAFE, PICKLED):
-        if paths := sorted(path for pattern in patterns for path in folder.glob(pattern)):
-            return paths
-    return []
-
-
-def unpickled(path: Path) -> dict[str, Any]:
-    """Return the tensors of a file of torch, by name, read when they are used where the file allows."""
-    import torch
-
-    mapped = zipfile.is_zipfile(path)  # files of PyTorch before 1.6 are none, and are read whole
-    return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
 
 
 def load_model(kind: Any, weights: Weights, config: Any) -> Any:
     """Return a transformers model of class `kind` in float32 on the device of `weights`, ready to be asked.
 
-    Raises EncoderError where the folder lacks some of its weights or has them in another shape: transformers
-    alone would fill those with random numbers. Nor may it have more layers than the model, and converted
-    weights anything more: what was deduced from them may be wrong.
+    Raises EncoderError where the folder lacks some of its weights or has them in another shape. Nor may it
+    have more layers than the model, and converted weights anything more: what was deduced from them may be
+    wrong.
     """
     import torch
 
@@ -264,34 +240,16 @@ def load_model(kind: Any, weights: Weights, config: Any) -> Any:
             source, config=config, state_dict=tensors, dtype=torch.float32, **options
         )
     wrong = sorted(report["missing_keys"]) or sorted(str(key[0]) for key in report["mismatched_keys"])
-    if not wrong:  # a layer more, or of converted weights anything more
+    if not wrong:
         halves = {name.partition(".")[0] for name in model.state_dict()}
         more = (name for name in report["unexpected_keys"] if name.partition(".")[0] in halves)
-        wrong = sorted(name for name in more if weights.converted or _LAYER.search(name))
+        layer = re.compile(r"(?:layers|blocks)\.\d+\.")
+        wrong = sorted(name for name in more if weights.converted or layer.search(name))
     if wrong:
         raise EncoderError(
             f"{weights.id}: not weights of {kind.__name__}: {len(wrong)} do not fit, such as {wrong[0]}"
         )
     return model.eval().to(weights.device)
-
-
-def read_scalar(weights: Weights, name: str) -> float:
-    """Read a number that is among the weights, without loading the rest of them; NaN where it is not there.
-
-    Half a model (a text tower) has no place for what belongs to the pair, such as a logit scale.
-    """
-    from safetensors import safe_open
-
-    value = math.nan
-    with loading_errors(weights.id, "readable"):
-        for path in _weight_files(weights.folder):
-            if path.suffix == ".safetensors":
-                with safe_open(path, framework="pt") as file:
-                    tensor = file.get_tensor(name) if name in file.keys() else None  # noqa: SIM118
-            else:
-                tensor = unpickled(path).get(name)
-            value = value if tensor is None else float(tensor)
-    return value
 
 
 @contextmanager
@@ -312,10 +270,9 @@ def loading_errors(id: str, kind: str) -> Iterator[None]:
     except Exception as error:  # tokenizers raises no narrower class for a damaged file
         # Its own text names the class that complains; why it does stands in its cause.
         told = (error.__cause__ or error) if isinstance(error, StrictDataclassError) else error
-        lines = str(told).strip().splitlines() or [type(error).__name__]
         # torch's own words advise to run the file.
         pickled = isinstance(error, pickle.UnpicklingError) or "weights_only" in str(error)
-        reason = "a pickle that holds more than tensors, which is not run" if pickled else lines[0][:200]
+        reason = "a pickle that holds more than tensors, which is not run" if pickled else _first_line(told)
         raise EncoderError(f"{id}: not {kind} weights that can be loaded ({reason})") from error
     finally:
         logging.set_verbosity(level)
@@ -336,12 +293,16 @@ def asking_errors(what: str) -> Iterator[None]:
     except torch.OutOfMemoryError:
         raise
     except (TypeError, AttributeError, LookupError, ArithmeticError, ValueError, RuntimeError) as error:
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
+        reason = _first_line(error)
         raise EncoderError(f"{what}: cannot be asked; does {CONFIG} belong to it? ({reason})") from error
 
 
+def _first_line(error: BaseException) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
+
+
 def torch_device(device: str) -> str:
-    """Device that "auto" means here: cuda where PyTorch sees one, else cpu.
+    """Return the device that "auto" means here: cuda where PyTorch sees one, else cpu.
 
     EncoderError for an absent device. By its number: which one is current is a matter of each thread.
     """

@@ -54,8 +54,8 @@ from langsplat_core.raster.opengl.scene_textures import create_egl_context, is_s
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera, Scene
 from langsplat_core.semantics.encoders import load_encoder
+from langsplat_core.semantics.features import ImageFeatures
 from langsplat_core.semantics.sam import grid_points, load_segmenter
-from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language.mask_weights import find_mask_weights
 from langsplat_core.training.radiance.differentiable import evaluate_views
 from langsplat_core.training.radiance.trainer import train_radiance

@@ -56,12 +56,10 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.scene import LEVELS, Camera, Gaussians, LanguageField, Scene
-from langsplat_core.semantics.encoder import Encoder
-from langsplat_core.semantics.encoders import load_encoder, model_path
+from langsplat_core.semantics.encoders import Encoder, load_encoder, model_path
+from langsplat_core.semantics.features import FeatureStore, ImageFeatures, describe_capture
 from langsplat_core.semantics.masks import MaskSource
-from langsplat_core.semantics.regions import describe_capture
 from langsplat_core.semantics.sam import load_mask_source
-from langsplat_core.semantics.store import FeatureStore, ImageFeatures
 from langsplat_core.training.language.codec_fit import CodecReport
 from langsplat_core.training.radiance.rehearsal import budgets_for
 from tests.benchmarks.oracles import (

@@ -10,7 +10,7 @@ from langsplat_core.arrays import unit
 from langsplat_core.errors import InputError
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
-from langsplat_core.semantics.store import ImageFeatures
+from langsplat_core.semantics.features import ImageFeatures
 from tests.benchmarks.oracles import (
     OTHER,
     PROMPTS,

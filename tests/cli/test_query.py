@@ -17,7 +17,7 @@ from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import Scene
-from langsplat_core.semantics.encoder import OPEN_MODEL
+from langsplat_core.semantics.encoders import OPEN_MODEL
 from tests.support.commands import refusal, run
 from tests.support.fakes import (
     CENTRES,

@@ -26,7 +26,7 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import NO_NODE, Scene
 from langsplat_core.scene.language import Tree
-from langsplat_core.semantics.store import ImageFeatures
+from langsplat_core.semantics.features import ImageFeatures
 from tests.support.commands import run
 from tests.support.fakes import (
     CENTRES,

@@ -32,8 +32,8 @@ from langsplat_core.progress import Progress, Report, WorkCancelledError, silent
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.render import render
+from langsplat_core.semantics.features import ImageFeatures
 from langsplat_core.semantics.masks import LevelMasks, MaskSource
-from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language.merge_tree import draw_patches
 from tests.support.commands import run
 from tests.support.comparing import assert_same_tree

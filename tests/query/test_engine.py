@@ -41,8 +41,7 @@ from langsplat_core.scene import (
 )
 from langsplat_core.scene.codec import CodebookCodec
 from langsplat_core.semantics import relevancy as relevancies
-from langsplat_core.semantics.encoder import OPEN_MODEL
-from langsplat_core.semantics.encoders import DEMO
+from langsplat_core.semantics.encoders import DEMO, OPEN_MODEL
 from langsplat_core.semantics.relevancy import Scale, latent_relevancy, relevancy, relevancy_of
 from langsplat_core.semantics.vocabulary import FEWEST
 from tests.support.fakes import DIM, PER_BLOB, WORDS, FakeEncoder, axis, blob_scene, named_scene

@@ -1,7 +1,8 @@
-"""CLIP through the real loading path, with a tiny model made here."""
+"""Encoders through the real loading path, with tiny models made here, broken folders, and vocabularies."""
 
 import json
 import os
+import pickle
 import re
 import subprocess
 import sys
@@ -13,8 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from safetensors.torch import load_file, save_file
 from tokenizers import Tokenizer
 from transformers import CLIPModel, CLIPTokenizerFast, PreTrainedTokenizerFast, Siglip2Tokenizer
@@ -22,11 +21,30 @@ from transformers import CLIPModel, CLIPTokenizerFast, PreTrainedTokenizerFast, 
 from langsplat_core.arrays import unit
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.scene import Calibration, PlattScaling
-from langsplat_core.semantics import clip_plain, encoders
-from langsplat_core.semantics.clip_plain import PlainClipText, plain_text_tower, read_pair_tokenizer
-from langsplat_core.semantics.encoders import ClipText, clip_text, load_encoder, load_text_encoder
+from langsplat_core.semantics.clip_plain import PlainClipText, plain_text_tower, read_tokenizer
+from langsplat_core.semantics.encoders import (
+    CLIP_PIXELS,
+    ClipText,
+    clip_text,
+    load_encoder,
+    load_text_encoder,
+)
+from langsplat_core.semantics.sam import load_segmenter
+from langsplat_core.semantics.vocabulary import BUNDLED, LONGEST, bundled_vocabulary, read_vocabulary
 from langsplat_core.semantics.weights import Weights
-from tests.support.tiny_models import LENGTH, SCALE, SIDE, WORDS, change_json, tiny_clip, tiny_siglip
+from tests.support.tiny_models import (
+    LENGTH,
+    SAM_SIDE,
+    SCALE,
+    SIDE,
+    WORDS,
+    MakesFolder,
+    change_json,
+    tiny_clip,
+    tiny_sam,
+    tiny_sam2,
+    tiny_siglip,
+)
 
 pytestmark = pytest.mark.long
 
@@ -48,7 +66,7 @@ def test_images_agree_with_the_whole_model(folder: Path) -> None:
     got = encoder.encode_images(pictures)
     assert (encoder.dim, encoder.image_size, encoder.id) == (24, SIDE, str(folder))
     model = CLIPModel.from_pretrained(folder).eval()
-    pixels = (pictures / 255 - np.array(encoders.CLIP_MEAN)) / np.array(encoders.CLIP_STD)
+    pixels = (pictures / 255 - CLIP_PIXELS[0]) / CLIP_PIXELS[1]
     inputs = torch.from_numpy(pixels.transpose(0, 3, 1, 2).astype(np.float32))
     with torch.no_grad():
         want = model.visual_projection(model.vision_model(inputs).pooler_output)
@@ -72,12 +90,6 @@ def test_pickled_weights_give_the_same_vectors(tmp_path: Path) -> None:
     after = load_encoder(str(tmp_path), "cpu").encode_images(crops(1))
     # equal weights at other addresses: torch may add up in another order
     np.testing.assert_allclose(after, before, rtol=0, atol=2e-7)
-
-
-@pytest.mark.parametrize("phrase", ["", "   ", "?!"])
-def test_an_empty_phrase_is_an_input_error(folder: Path, phrase: str) -> None:
-    with pytest.raises(InputError, match="type a word"):
-        load_text_encoder(str(folder)).encode_texts([phrase])
 
 
 def test_a_vocabulary_makes_words_unknown(tmp_path: Path) -> None:
@@ -138,26 +150,22 @@ def test_reading_json_is_read_beside_the_weights(tmp_path):
 
 
 ODDS = '{"constant": 0, "whole": 1, "finer": 0}'
+
 BROKEN_READINGS = (
     *("[", '{"found": 2}', '{"verdict": {}}', '{"calibration": {}}'),
-    f'{{"calibration": {{"thing": {ODDS}, "part": {ODDS}}}}}',
     *(
         f'{{"calibration": {{"thing": {ODDS}, "part": {{"constant": 0, {broken}}}, "inside": {ODDS}}}}}'
-        for broken in (
-            '"whole": 1',
-            '"whole": NaN, "finer": 0',
-            '"whole": -1, "finer": 0.5',
-            '"whole": 1' + "0" * 400 + ', "finer": 0',
-        )
+        for broken in ('"whole": 1', '"whole": NaN, "finer": 0', '"whole": -1, "finer": 0.5')
     ),
 )
+
 BROKEN_NORMALISATIONS = ("{", '{"image_mean": [0.5]}', '{"image_std": [0, 0, 0]}')
 
 
 @pytest.mark.parametrize(
     ("name", "said", "text"),
     [
-        *(("reading.json", "reading.json is not", text) for text in BROKEN_READINGS),
+        *(("reading.json", "reading.json", text) for text in BROKEN_READINGS),
         *(("preprocessor_config.json", "preprocessor_config.json", text) for text in BROKEN_NORMALISATIONS),
     ],
 )
@@ -168,7 +176,7 @@ def test_broken_files_beside_weights_are_named(tmp_path, name, said, text):
         load_encoder(str(tmp_path), "cpu")
 
 
-# SigLIP and SigLIP 2 through the real loading path, with tiny models made here.
+# SigLIP and SigLIP 2.
 
 
 def unit_tensor(tensor: torch.Tensor) -> np.ndarray:
@@ -281,7 +289,7 @@ def test_a_broken_folder_is_named(
 # The text half of a small CLIP in NumPy, against transformers' in float64.
 
 DEMO = Path(str(files("langsplat_assets"))) / "demo_encoder"
-PHRASES = ["red mug", "handle", "a", "the handle of a red mug things"]
+
 CLOSE = 1e-5  # of unit vectors
 
 
@@ -299,6 +307,10 @@ def text_setting(**settings: object) -> Callable[[Path], None]:
     return lambda folder: change_json(
         folder / "config.json", lambda stated: stated["text_config"].update(settings)
     )
+
+
+def teach(folder: Path, *words: str) -> None:
+    (folder / "vocabulary.txt").write_text("\n".join(words), encoding="utf-8")
 
 
 def taught(folder: Path) -> list[str]:
@@ -322,35 +334,28 @@ def test_bundled_encoder_in_numpy_agrees_with_torch(measured) -> None:
 def test_random_weights_agree_with_float64(tmp_path: Path, activation: str, half: bool) -> None:
     tiny_clip(tmp_path, half)
     text_setting(hidden_act=activation)(tmp_path)
+    teach(tmp_path, "red", "mug", "a", "handle")
     tower = clip_text(Weights("tiny", tmp_path, "cpu"))
     assert isinstance(tower, PlainClipText)
     phrases = ["red mug", "a", "handle"]
     want = by_transformers(tmp_path, phrases)
     np.testing.assert_allclose(unit(tower.encode(phrases)), want, atol=CLOSE)
-    for encoder in (load_text_encoder(str(tmp_path)), load_encoder(str(tmp_path), "cpu")):
-        np.testing.assert_allclose(encoder.encode_texts(phrases), want, atol=CLOSE)
+    np.testing.assert_allclose(load_encoder(str(tmp_path), "cpu").encode_texts(phrases), want, atol=CLOSE)
     by_torch = ClipText(Weights("tiny", tmp_path, "cpu"))
     np.testing.assert_allclose(tower.encode(phrases), by_torch.encode(phrases), rtol=1e-4, atol=CLOSE)
     assert tower.dim == by_torch.dim == 24
 
 
-def test_legacy_end_tokens_are_understood(tmp_path: Path) -> None:
-    """OpenAI's and OpenCLIP's configurations say 2, and mean the token with the highest number."""
-    tiny_clip(tmp_path)
-    text_setting(eos_token_id=2)(tmp_path)
-    assert plain_text_tower(Weights("tiny", tmp_path, "cpu")) is None  # whose end token is the second
-
-
 NOT_PLAIN: dict[str, Callable[[Path], object]] = {
     "no tokenizer": lambda folder: (folder / "tokenizer.json").unlink(),
     "no tokens": tokenizer_of(lambda stated: stated["model"].update(vocab={})),
-    "a beginning that is no token": tokenizer_of(
-        lambda stated: stated["post_processor"].update(cls=["<|startoftext|>", 97])
-    ),
+    "another end": text_setting(eos_token_id=2),
     "another activation": text_setting(hidden_act="relu"),
     "more layers": text_setting(num_hidden_layers=3),
-    "narrower": text_setting(intermediate_size=40),
+    "fewer layers": text_setting(num_hidden_layers=1),
     "no heads": text_setting(num_attention_heads=0),
+    "open words": lambda folder: (folder / "vocabulary.txt").unlink(),
+    "words of other letters": lambda folder: teach(folder, "mug", "café"),
     "cut weights": lambda folder: os.truncate(folder / "model.safetensors", 2000),
     "broken configuration": lambda folder: (folder / "config.json").write_text("[]"),
 }
@@ -359,27 +364,19 @@ NOT_PLAIN: dict[str, Callable[[Path], object]] = {
 @pytest.mark.parametrize("case", NOT_PLAIN)
 def test_unknown_clip_configurations_are_left_to_torch(tmp_path: Path, case: str) -> None:
     tiny_clip(tmp_path)
+    teach(tmp_path, "mug")
     weights = Weights("tiny", tmp_path, "cpu")
     assert plain_text_tower(weights) is not None
+    assert plain_text_tower(Weights("tiny", tmp_path, "cuda")) is None
     NOT_PLAIN[case](tmp_path)
     assert plain_text_tower(weights) is None
-
-
-def test_large_models_and_other_devices_are_left_to_torch(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    tiny_clip(tmp_path)
-    count = sum(int(np.prod(shape)) for shape in clip_plain.TextConfig().shapes().values())
-    assert count == 63_428_096  # the text half of ViT-B/16
-    assert plain_text_tower(Weights("tiny", tmp_path, "cuda")) is None
-    monkeypatch.setattr(clip_plain, "MOST_WEIGHTS", 1_000)
-    assert plain_text_tower(Weights("tiny", tmp_path, "cpu")) is None
 
 
 @pytest.mark.parametrize("plain", [True, False])
 def test_long_phrases_are_refused_and_not_cut(tmp_path: Path, plain: bool) -> None:
     """The tokenizer's token for what it cannot read is the one that ends a phrase."""
     tiny_clip(tmp_path)
+    teach(tmp_path, "red")
     weights = Weights("tiny", tmp_path, "cpu")
     tower = clip_text(weights) if plain else ClipText(weights)
     assert isinstance(tower, PlainClipText) == plain
@@ -409,40 +406,10 @@ def test_the_bundled_encoder_is_asked_words_alone(written: str, meant: str) -> N
     assert encoder.near_words("penguni")[0] == "penguin"
 
 
-def spelled_bytes(path: Path) -> Tokenizer:
-    """The bundled tokenizer with a vocabulary that has every byte, within a word and at its end, and a few
-    merges; written to `path`."""
-    stated = json.loads((DEMO / "tokenizer.json").read_text(encoding="utf-8"))
-    spelled = (byte + end for end in ("", "</w>") for byte in clip_plain.BYTES)
-    tokens = ["<|startoftext|>", "<|endoftext|>", *spelled]
-    merges = [["a", "b"], ["ab", "ab"], ["a", "a"], ["'", "'"], ["Ã", "Ł"], ["0", "1</w>"], ["b", "a</w>"]]
-    tokens += ["".join(pair) for pair in merges]
-    stated["model"] |= {"vocab": {token: i for i, token in enumerate(tokens)}, "merges": merges}
-    path.write_text(json.dumps(stated), encoding="utf-8")
-    return Tokenizer.from_file(str(path))
-
-
-def test_phrases_are_read_as_tokenizers_reads_them(tmp_path: Path) -> None:
-    theirs = spelled_bytes(tmp_path / "tokenizer.json")
-    ours = read_pair_tokenizer(tmp_path / "tokenizer.json")
-    assert ours is not None
-    # Letters as old as any table of Unicode: the two libraries have tables of different years.
-    likely = st.sampled_from("aaabb01' -_.sÀßΣσİé\u0301²½Ⅷ漢ﬁ\t\n")
-
-    @given(st.text(likely | st.characters(max_codepoint=0x2FF)))
-    def check(phrase: str) -> None:
-        assert ours.encode(phrase) == theirs.encode(phrase, add_special_tokens=False).ids
-
-    check()
-    assert ours.encode("red <|endoftext|>")[-1] == ours.end
-
-
-@pytest.mark.parametrize("place", ["normalizer", "pre_tokenizer", "post_processor"])
-def test_tokenizers_of_other_rules_are_left_to_torch(tmp_path: Path, place: str) -> None:
-    path = tmp_path / "tokenizer.json"
-    spelled_bytes(path)
-    change_json(path, lambda stated: stated.update({place: {"type": "Sequence"}}))
-    assert read_pair_tokenizer(path) is None
+def test_words_are_read_as_tokenizers_reads_them() -> None:
+    ours, theirs = read_tokenizer(DEMO / "tokenizer.json"), Tokenizer.from_file(str(DEMO / "tokenizer.json"))
+    for word in (*taught(DEMO), "penguni", "aab"):
+        assert ours.encode(word) == theirs.encode(word, add_special_tokens=False).ids
 
 
 def test_neither_torch_nor_transformers_is_imported() -> None:
@@ -454,3 +421,158 @@ def test_neither_torch_nor_transformers_is_imported() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+# Folders of weights that hold something else: one line each, and nothing in them is run.
+
+PLAIN, WEIGHTS = "pytorch_model.bin", "model.safetensors"
+
+
+@pytest.mark.parametrize("write", [lambda content, path: path.write_bytes(pickle.dumps(content)), torch.save])
+@pytest.mark.parametrize(
+    ("make", "load"), [(tiny_clip, load_encoder), (tiny_clip, load_text_encoder), (tiny_sam, load_segmenter)]
+)
+def test_a_pickle_with_code_is_refused_and_not_run(write, make, load, tmp_path: Path, recwarn) -> None:  # type: ignore[no-untyped-def]
+    folder = tmp_path / "model"
+    folder.mkdir()
+    make(folder)
+    (folder / WEIGHTS).unlink()
+    enough = bytes(1 << 20)  # for as many numbers as the model has
+    write({"text_model.embeddings": MakesFolder(tmp_path / "ran"), "more": enough}, folder / PLAIN)
+    with pytest.raises(EncoderError, match="a pickle that holds more than tensors") as caught:
+        load(str(folder))
+    assert len(str(caught.value)) < 300
+    assert not (tmp_path / "ran").exists()
+    assert not recwarn.list
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"\x80", b"not weights", bytes(8) + b"{}", b"PK\x03\x04" + bytes(40)]
+)
+@pytest.mark.parametrize(("name", "size"), [(PLAIN, 0), (WEIGHTS, 0), (PLAIN, 1 << 20), (WEIGHTS, 1 << 20)])
+def test_bytes_that_are_no_weights_are_refused(content: bytes, name: str, size: int, tmp_path: Path) -> None:
+    tiny_clip(tmp_path)
+    (tmp_path / WEIGHTS).unlink()
+    (tmp_path / name).write_bytes(content + bytes(size))
+    with pytest.raises(EncoderError, match="weights"):
+        load_text_encoder(str(tmp_path))
+
+
+def setting(folder: Path, part: str, name: str, value: object) -> str:
+    """The folder, with a number of a part of its configuration changed."""
+    change_json(folder / "config.json", lambda stated: stated[part].update({name: value}))
+    return str(folder)
+
+
+def test_a_contradictory_configuration_is_named(tmp_path: Path) -> None:
+    tiny_clip(tmp_path)
+    setting(tmp_path, "vision_config", "num_attention_heads", 7)  # of a width of 32
+    with pytest.raises(EncoderError, match="multiple of the number of attention heads"):
+        load_encoder(str(tmp_path))
+
+
+FOLDERS: dict[str, tuple[Callable[[Path], object], Callable[[str], Any]]] = {
+    "CLIP": (tiny_clip, load_encoder),
+    "SigLIP": (tiny_siglip, load_encoder),
+    "SAM": (tiny_sam, load_segmenter),
+    "SAM 2": (tiny_sam2, load_segmenter),
+}
+
+
+def replace(config: dict[str, Any], name: str, value: object) -> None:
+    """Change every setting of a name, in all parts of a configuration."""
+    for key, part in config.items():
+        if isinstance(part, dict):
+            replace(part, name, value)
+        elif key == name:
+            config[key] = value
+
+
+@pytest.mark.parametrize("kind", FOLDERS)
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("hidden_size", 10**9),
+        ("hidden_size", 0),
+        ("image_size", 10**6),
+        ("patch_size", "x"),
+        ("num_hidden_layers", 10**9),
+        ("num_hidden_layers", 1),  # one fewer than the weights have
+        ("blocks_per_stage", [10**9]),
+    ],
+)
+def test_a_configuration_of_other_sizes_is_refused(
+    kind: str, name: str, value: object, tmp_path: Path
+) -> None:
+    """Before a model of these sizes is filled with random numbers."""
+    make, load = FOLDERS[kind]
+    make(tmp_path)
+    path = tmp_path / "config.json"
+    before = path.read_text(encoding="utf-8")
+    change_json(path, lambda config: replace(config, name, value))
+    if json.loads(before) != json.loads(path.read_text(encoding="utf-8")):
+        with pytest.raises(EncoderError) as caught:
+            load(str(tmp_path))
+        assert str(caught.value).startswith(str(tmp_path))
+
+
+def test_asking_names_a_configuration_that_does_not_fit(tmp_path: Path) -> None:
+    tiny_clip(tmp_path / "clip")
+    encoder = load_encoder(setting(tmp_path / "clip", "text_config", "eos_token_id", None))
+    with pytest.raises(EncoderError, match=r"the encoder: cannot be asked; does config\.json belong to it"):
+        encoder.encode_texts(["red mug"])
+    tiny_sam2(tmp_path / "sam")
+    segmenter = load_segmenter(setting(tmp_path / "sam", "vision_config", "fpn_padding", -1))
+    with pytest.raises(EncoderError, match="the segmenter: cannot be asked"):
+        segmenter.encode(np.zeros((SAM_SIDE, SAM_SIDE, 3), np.uint8))
+
+
+# Vocabularies: the bundled lists, and files of others with everything that can be wrong in them.
+
+
+def entries(name: str) -> list[str]:
+    """The lines of a bundled file that are phrases, as they stand there."""
+    text = (Path(str(files("langsplat_assets"))) / "vocabulary" / f"{name}.txt").read_text(encoding="utf-8")
+    return [line for line in text.splitlines() if line and not line.startswith("#")]
+
+
+def test_the_bundled_words_are_many_and_each_is_there_once():
+    things, parts = entries("things"), entries("parts")
+    assert len(things) + len(parts) >= 2000
+    assert len({*things, *parts}) == len(things) + len(parts)
+    assert {"mug", "teddy bear", "table"} <= set(things)
+    assert {"handle", "chair leg"} <= set(parts)
+
+
+@pytest.mark.parametrize("name", BUNDLED)
+def test_bundled_lists_are_tidy(name):
+    lines = entries(name)
+    assert len(set(lines)) == len(lines)
+    assert [line for line in lines if line != " ".join(line.lower().split())] == []
+    assert bundled_vocabulary(name) == tuple(lines)
+
+
+def test_vocabulary_files_are_read_leniently(tmp_path):
+    """A byte order mark, lines ended as on Windows, capitals, spaces, doubles, comments, other scripts."""
+    path = tmp_path / "mine.txt"
+    path.write_bytes("\ufeffRed  Mug\r\n# kitchen\r\n\r\n  cup \r\nred mug\r\nтарелка\r\n".encode())
+    assert read_vocabulary(path) == ("red mug", "cup", "тарелка")
+
+
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [
+        (b"cup\n!!!\n", "line 2: "),
+        (b"cup\nmug\n\xff\xfe\n", "line 3: "),
+        (b"c\x00p\n", "line 1: "),
+        (b"cup\n" + b"x" * (LONGEST + 1), "line 2: "),
+        (b"# nothing\n\n", "is empty"),
+    ],
+)
+def test_broken_vocabularies_are_named_by_file_and_line(tmp_path, content, problem):
+    path = tmp_path / "mine.txt"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=re.escape(str(path)) + ".*" + re.escape(problem)):
+        read_vocabulary(path)
+    with pytest.raises(InputError, match="cannot be read"):
+        read_vocabulary(tmp_path)

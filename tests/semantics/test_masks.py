@@ -1,20 +1,38 @@
-"""Maps of masks, and the segmenter that needs no weights."""
+"""Maps of masks, the segmenter without weights, and masks of the SAM family against plain loops."""
 
-import os
+from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
+import torch
+from scipy import ndimage
+from transformers import Sam2Model, SamModel
 
-from langsplat_core.progress import silent
-from langsplat_core.semantics.masks import GraphMasks, LevelMasks, RegionGraph, label_maps, nested_partitions
+from langsplat_core.config import MaskConfig
+from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.progress import Progress, silent
+from langsplat_core.semantics import sam
+from langsplat_core.semantics.masks import (
+    GraphMasks,
+    LevelMasks,
+    RegionGraph,
+    box_nms,
+    clean_regions,
+    common_pixels,
+    label_maps,
+    mask_boxes,
+    mask_nms,
+    nested_partitions,
+)
+from langsplat_core.semantics.sam import SamMasks, load_mask_source, load_segmenter
+from tests.support.tiny_models import SAM_SIDE as SIDE
+from tests.support.tiny_models import change_json, tiny_sam, tiny_sam2, tiny_sam2_video
 
 pytestmark = pytest.mark.long
-
-DATA = Path(os.environ.get("LANGSPLAT_TEST_DATA", Path(__file__).parents[3] / "shared" / "data"))
-PHOTOGRAPH = DATA / "banana" / "colmap_640" / "images" / "DSC_0428.JPG"
 
 
 def level_masks(*levels: np.ndarray) -> LevelMasks:
@@ -52,11 +70,6 @@ def test_later_masks_cover_earlier_ones_and_hidden_masks_have_no_row() -> None:
     assert maps[0].tolist() == [[0, 0, 1, 1]] * 2
     assert maps[1].tolist() == [[-1, -1, 2, 2]] * 2
     assert (maps[2] == -1).all()
-
-
-def test_levels_of_different_sizes_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"masks\[1\]"):
-        level_masks(np.ones((1, 4, 4), bool), np.ones((1, 4, 5), bool), np.ones((1, 4, 4), bool))
 
 
 def assert_nested(levels: np.ndarray) -> None:
@@ -131,13 +144,456 @@ def test_small_regions_join_their_likest_neighbour() -> None:
     assert merged[10, 10] == merged[10, 15] != merged[0, 0]
 
 
-@pytest.mark.skipif(not PHOTOGRAPH.exists(), reason="no photographs here")
-def test_a_bunch_of_bananas_is_few_regions() -> None:
-    image = np.asarray(Image.open(PHOTOGRAPH))
-    levels = nested_partitions(image)
-    rgb = image.astype(int)
-    yellow = (rgb[..., 0] - rgb[..., 2] > 50) & (rgb[..., 0] > 90)
-    assert yellow.mean() > 0.03
-    best = max(iou(levels[2] == i, yellow) for i in np.unique(levels[2]))
-    assert best > 0.75  # `yellow` itself lacks the sticker and the brown specks
-    assert levels[2].max() + 1 <= 6
+# The filters of masks against plain loops.
+
+
+def plain_mask_nms(masks: np.ndarray, scores: np.ndarray, config: MaskConfig) -> list[int]:
+    """The rule of LangSplat's preprocessing, one pair at a time."""
+    kept = []
+    for i, mask in enumerate(masks):
+        good = scores[i] > config.nms_score
+        for j, other in enumerate(masks):
+            if i == j:
+                continue
+            both = (mask & other).sum()
+            if scores[j] > scores[i] and both / (mask | other).sum() > config.nms_iou:
+                good = False
+            mine, its = both / mask.sum(), both / other.sum()
+            if mine >= 0.85 and its < 0.5 and 1 - mine * its > config.nms_inner:
+                good = False
+        if good:
+            kept.append(i)
+    return kept
+
+
+def plain_box_nms(boxes: np.ndarray, scores: np.ndarray, limit: float) -> list[int]:
+    drawn = np.zeros((len(boxes), 100, 100), bool)
+    for image, (left, top, right, bottom) in zip(drawn, boxes, strict=True):
+        image[top:bottom, left:right] = True
+    kept: list[int] = []
+    for i in sorted(range(len(boxes)), key=lambda k: (-scores[k], k)):
+        if not any((drawn[i] & drawn[j]).sum() / (drawn[i] | drawn[j]).sum() > limit for j in kept):
+            kept.append(i)
+    return kept
+
+
+def blobs(count: int, seed: int) -> np.ndarray:
+    """Masks of many sizes, many of them nested, doubled or nearly so."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[0:40, 0:50]
+    masks = []
+    for _ in range(count):
+        centre, radius = rng.uniform((5, 5), (35, 45)), rng.choice([3, 5, 8, 12, 15])
+        masks.append((y - centre[0]) ** 2 + (x - centre[1]) ** 2 <= radius**2)
+        if rng.random() < 0.5:
+            masks.append(np.roll(masks[-1], rng.integers(-2, 3, 2), (0, 1)))
+    return np.stack(masks)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_suppression_agrees_with_double_loops(seed: int) -> None:
+    masks = blobs(40, seed)
+    scores = np.random.default_rng(seed).uniform(0.6, 1, len(masks))
+    boxes = mask_boxes(masks)
+    assert box_nms(boxes, scores, 0.7).tolist() == plain_box_nms(boxes, scores, 0.7)
+    kept = mask_nms(masks, scores, MaskConfig()).tolist()
+    assert kept == plain_mask_nms(masks, scores, MaskConfig())
+    assert 3 < len(kept) < len(masks) - 10
+
+
+def test_common_pixels_are_exact_beyond_one_product() -> None:
+    masks = np.random.default_rng(0).random((3, 300, 400)) < 0.7  # two chunks of 65536
+    want = [[(a & b).sum() for b in masks] for a in masks]
+    np.testing.assert_array_equal(common_pixels(masks), want)
+
+
+def plain_clean(mask: np.ndarray, min_region: int) -> np.ndarray:
+    """Holes, then islands, on the whole picture, one component at a time."""
+    mask = mask.copy()
+    for value in (False, True):
+        parts, count = ndimage.label(mask == value, np.ones((3, 3)))
+        sizes = [(parts == i).sum() for i in range(1, count + 1)]
+        small = [i for i, size in enumerate(sizes, 1) if size < min_region]
+        if value and len(small) == count:
+            small.remove(1 + int(np.argmax(sizes)))
+        for i in small:
+            mask[parts == i] = not value
+    return mask
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_cleaning_agrees_with_the_whole_picture(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    shape = rng.integers(6, 40, 2)
+    noise = ndimage.gaussian_filter(rng.normal(size=shape), rng.choice([0.7, 1.5, 3]))
+    mask = noise > np.quantile(noise, rng.choice([0.1, 0.5, 0.9]))
+    if seed % 3 == 0:
+        mask[: rng.integers(1, 4)] = mask[:, : rng.integers(1, 4)] = False
+    if not mask.any():
+        mask[-1, -1] = True
+    for min_region in (2, 12, 60):
+        want = plain_clean(mask, min_region)
+        got, changed = clean_regions(mask, min_region)
+        np.testing.assert_array_equal(got, want)
+        assert changed == (want != mask).any()
+
+
+def test_a_box_tied_at_the_limit_stays() -> None:
+    boxes = np.array([[0, 0, 9, 10], [0, 0, 9, 7]])  # 63 of 90 px, though 0.7 * 90 is less than 63 in floats
+    assert box_nms(boxes, np.array([0.9, 0.8]), 0.7).tolist() == [0, 1]
+    assert box_nms(boxes, np.array([0.9, 0.8]), 0.69).tolist() == [0]
+
+
+# The crops that SAM sees beside the whole picture, and what becomes of the masks that they give.
+
+
+def test_crops_are_those_of_the_public_code() -> None:
+    # overlap int(1080 * 512 / 1500) = 368; width (1440 + 368) / 2 = 904, height (1080 + 368) / 2 = 724
+    corners = [(0, 0), (0, 356), (536, 0), (536, 356)]
+    want = [(0, 0, 1440, 1080), *((x, y, x + 904, y + 724) for x, y in corners)]
+    assert sam.crop_boxes((1080, 1440), 1).tolist() == [list(box) for box in want]
+    assert sam.crop_boxes((1080, 1440), 0).tolist() == [[0, 0, 1440, 1080]]
+    assert len(sam.crop_boxes((1080, 1440), 2)) == 1 + 4 + 16
+    for shape in [(1, 1), (1, 70), (7, 3)]:
+        boxes = sam.crop_boxes(shape, 2)
+        assert (boxes[:, :2] < boxes[:, 2:]).all()
+        assert boxes.max(axis=0).tolist() == [*boxes[:, :2].max(axis=0), shape[1], shape[0]]
+
+
+def test_masks_cut_by_their_crop_are_dropped() -> None:
+    crop, shape = np.array([0, 0, 904, 724]), (1080, 1440)
+    assert not sam.cut_by_crop(np.array([30, 30, 500, 500]), crop, shape)
+    assert not sam.cut_by_crop(np.array([0, 0, 500, 500]), crop, shape)  # the picture itself ends there
+    assert sam.cut_by_crop(np.array([30, 30, 890, 500]), crop, shape)
+    assert not sam.cut_by_crop(np.array([0, 0, 1440, 1080]), np.array([0, 0, 1440, 1080]), shape)
+
+
+class Blind:
+    """Stands in for a SAM that overlooks small things in large pictures: a mask is what has one colour."""
+
+    name = "blind"
+
+    def encode(self, image: np.ndarray) -> "Seen":
+        return Seen(image[..., 0])
+
+
+class Seen:
+    def __init__(self, colours: np.ndarray) -> None:
+        self.colours = colours
+        self.from_afar = colours.size >= 200 * 200
+
+    def masks_at(self, points: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+        masks = [self.mask(self.colours[int(y), int(x)]) for x, y in points]
+        logits = torch.from_numpy(np.stack(masks) * 20.0 - 10)[:, None].repeat(1, 3, 1, 1)
+        scores = torch.zeros(len(points), 3)
+        scores[:, 0] = torch.tensor([(0.95 if self.from_afar else 0.9) * mask.any() for mask in masks])
+        return scores, logits
+
+    def mask(self, colour: int) -> np.ndarray:
+        mask = (self.colours == colour) & (colour > 0)
+        if self.from_afar:
+            return mask & (mask.sum() >= 400)
+        rows, columns = np.nonzero(mask)
+        if len(rows):  # by this the mask of a crop can be told from that of the whole picture
+            mask[int(rows.mean()), int(columns.mean())] = False
+        return mask
+
+    def enlarge(self, logits: torch.Tensor) -> torch.Tensor:
+        return logits
+
+
+def test_crops_find_small_things_and_win_over_the_whole_image() -> None:
+    image = np.zeros((200, 200, 3), np.uint8)  # crops of 134 px begin at 0 and 66
+    small, across, both = np.s_[30:40, 30:40], np.s_[70:130, 70:130], np.s_[25:65, 140:180]
+    for colour, place in enumerate((small, across, both), start=1):
+        image[place] = colour
+    config = MaskConfig(points_per_side=16, predicted_iou=0.5, min_region=0)
+    alone = SamMasks(Blind(), config)(image, silent).masks[0]
+    assert sorted(mask.sum() for mask in alone) == [1600, 3600]
+    found = SamMasks(Blind(), replace(config, crop_layers=1))(image, silent)
+    assert sorted(mask.sum() for mask in found.masks[0]) == [99, 1599, 3600]
+    for mask in found.masks[0]:
+        assert len(np.unique(image[..., 0][mask])) == 1  # in its place in the whole picture
+    assert [len(masks) for masks in found.masks[1:]] == [0, 0]
+
+
+def test_progress_runs_once_through_all_crops() -> None:
+    seen: list[float] = []
+    config = MaskConfig(points_per_side=4, points_per_batch=8, crop_layers=1)
+    SamMasks(Blind(), config)(np.zeros((40, 40, 3), np.uint8), Progress(lambda at: seen.append(at.fraction)))
+    assert seen == sorted(seen)
+    assert (seen[0], seen[-1], len(seen)) == (0.0, 1.0, 5 * 2 + 1)
+
+
+# SAM masks: the real loading path, with a tiny model made here, against one point at a time.
+
+
+# Random weights give random scores: thresholds that let some masks through each filter, and stop some.
+
+FILTERS = {"predicted_iou": -0.8, "stability": 0.95, "stability_offset": 0.01, "box_nms": 0.99}
+FILTERS |= {"nms_iou": 0.95, "nms_score": -9.0, "nms_inner": 0.9}
+
+LOOSE = MaskConfig(source="sam", points_per_side=5, points_per_batch=7, min_region=12, **FILTERS)
+
+FAMILIES: dict[str, tuple[Callable[[Path], Any], Any, MaskConfig]] = {
+    "sam": (tiny_sam, SamModel, LOOSE),
+    "sam2": (tiny_sam2, Sam2Model, replace(LOOSE, predicted_iou=0.4)),
+    "sam2_video": (tiny_sam2_video, Sam2Model, replace(LOOSE, predicted_iou=0.5)),
+}
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory: pytest.TempPathFactory) -> MaskConfig:
+    folder = tmp_path_factory.mktemp("sam")
+    tiny_sam(folder)
+    return replace(LOOSE, sam=str(folder))
+
+
+def photograph(height: int = 48, width: int = 80) -> np.ndarray:
+    noise = np.random.default_rng(2).uniform(0, 255, (height, width, 3))
+    return ndimage.gaussian_filter(noise, (4, 4, 0)).clip(0, 255).astype(np.uint8)
+
+
+def test_the_grid_is_made_of_cell_centres() -> None:
+    points = sam.grid_points(2, (40, 80))
+    assert points.tolist() == [[20, 10], [60, 10], [20, 30], [60, 30]]
+
+
+def test_preprocessing_scales_the_longer_side_and_pads() -> None:
+    pixels, size = sam.normalised(np.full((10, 30, 3), 255, np.uint8), 64, padded=True)
+    assert size == (21, 64)
+    assert pixels.shape == (1, 3, 64, 64)
+    np.testing.assert_allclose(pixels[0, :, 0, 0], [2.2489, 2.4286, 2.6400], atol=1e-4)
+    assert (pixels[0, :, 21:] == 0).all()
+
+
+def test_upscaling_forgets_the_padding() -> None:
+    logits = torch.arange(16.0).repeat(16, 1)[None]  # rises by 1 per column of 16: 4 px of 64
+    full = sam.upscale(logits, 64, (32, 64), (16, 32))
+    assert full.shape == (1, 16, 32)
+    columns = (np.arange(32) + 0.5) / 2 - 0.5
+    np.testing.assert_allclose(full[0, 5, 1:-1], columns[1:-1], atol=1e-5)
+
+
+def test_boxes_and_stability_are_those_of_whole_masks() -> None:
+    rng = np.random.default_rng(0)
+    logits = ndimage.gaussian_filter(rng.normal(size=(9, 30, 41)), (0, 3, 3)) * 20 - 1.5
+    logits[0], logits[1] = -5, 5
+    logits[2], logits[2, 29, 40] = -0.5, 0.5  # one pixel, in the corner
+    found = sam.measure(torch.from_numpy(logits.astype(np.float32)), 1.0).numpy()
+    assert found[0].tolist() == [0] * 5  # nothing at all
+    assert found[2].tolist() == [0, 40, 29, 41, 30]
+    np.testing.assert_array_equal(found[1:, 1:], mask_boxes(logits[1:] > 0))
+    for row, mask in zip(found, logits, strict=True):
+        assert row[0] == pytest.approx((mask > 1).sum() / max((mask > -1).sum(), 1), rel=1e-6)
+
+
+def plain_answer(model: Any, image: np.ndarray, point: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+    """(3,) scores and (3, H, W) logits of subpart, part and whole at one point, by the whole model."""
+    height, width = image.shape[:2]
+    pixels, size = sam.normalised(image, SIDE, padded=not isinstance(model, Sam2Model))
+    scale = np.array([size[1] / width, size[0] / height])
+    given = torch.from_numpy((point * scale).astype(np.float32))[None, None, None]
+    with torch.no_grad():
+        answer = model(pixel_values=torch.from_numpy(pixels), input_points=given)
+    ious, low = answer.iou_scores[0, 0], answer.pred_masks[0, 0]
+    if isinstance(model, Sam2Model):
+        full = torch.nn.functional.interpolate(low[None], (height, width), mode="bilinear")[0]
+    else:
+        full = sam.upscale(low, SIDE, size, (height, width))
+    if not isinstance(model, SamModel):
+        order = sorted(range(3), key=lambda k: int((low[k] > 0).sum()))
+        ious, full = ious[order], full[order]
+    return ious, full
+
+
+Found = tuple[np.ndarray, float, float]  # mask, predicted IoU, stability
+
+
+def plain_proposals(
+    model: Any, image: np.ndarray, crop: tuple[int, ...], config: MaskConfig, level: int
+) -> list[Found]:
+    left, top, right, bottom = crop
+    part = image[top:bottom, left:right]
+    found = []
+    for point in sam.grid_points(config.points_per_side, part.shape[:2]):
+        ious, logits = plain_answer(model, part, point)
+        iou, logits = ious[level].item(), logits[level].numpy()
+        offset = config.stability_offset
+        stability = (logits > offset).sum() / max((logits > -offset).sum(), 1)
+        if iou > config.predicted_iou and stability >= config.stability and (logits > 0).any():
+            mask = np.zeros(image.shape[:2], bool)
+            mask[top:bottom, left:right] = logits > 0
+            if not plain_cut(mask, crop):
+                found.append((mask, iou, stability))
+    return plain_suppression(found, [iou for _, iou, _ in found], config)
+
+
+def plain_cut(mask: np.ndarray, crop: tuple[int, ...]) -> bool:
+    box, picture = mask_boxes(mask[None])[0], (0, 0, mask.shape[1], mask.shape[0])
+    sides = zip(box, crop, picture, strict=True)
+    return any(abs(b - c) <= 20 and abs(b - p) > 20 for b, c, p in sides)
+
+
+def plain_suppression(found: list[Found], scores: list[float], config: MaskConfig) -> list[Found]:
+    if not found:
+        return []
+    boxes = mask_boxes(np.stack([mask for mask, _, _ in found]))
+    return [found[i] for i in plain_box_nms(boxes, np.array(scores), config.box_nms)]
+
+
+def plain_level(
+    model: Any, image: np.ndarray, crops: list[tuple[int, ...]], config: MaskConfig, level: int
+) -> list[np.ndarray]:
+    """One level by the book: one point at a time through the whole model, lists and loops."""
+    found, areas = [], []
+    for crop in crops:
+        more = plain_proposals(model, image, crop, config, level)
+        found += more
+        areas += [(crop[2] - crop[0]) * (crop[3] - crop[1])] * len(more)
+    found = plain_suppression(found, [1 / area for area in areas], config)
+    if not found:
+        return []
+    cleaned = [clean_regions(mask, config.min_region) for mask, _, _ in found]
+    boxes = mask_boxes(np.stack([mask for mask, _ in cleaned]))
+    again = plain_box_nms(boxes, np.array([not changed for _, changed in cleaned], float), config.box_nms)
+    masks = [cleaned[i][0] for i in again]
+    scores = np.array([found[i][1] * found[i][2] for i in again])
+    return [masks[i] for i in plain_mask_nms(np.stack(masks), scores, config)]
+
+
+def compare(config: MaskConfig, model: Any, image: np.ndarray, crops: list[tuple[int, ...]]) -> list[int]:
+    """The masks of every level against the plain ones; returns how many there are."""
+    levels = load_mask_source(config, "cpu")(image, silent)
+    for level in range(3):
+        want = plain_level(model, image, crops, config, level)
+        assert len(levels.masks[level]) == len(want)
+        for got, mask in zip(levels.masks[level], want, strict=True):
+            assert (got ^ mask).sum() <= 2  # batches of another size: float32 logits near zero may flip
+    return [len(masks) for masks in levels.masks]
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_whole_source_agrees_with_one_point_at_a_time(family: str, tmp_path: Path) -> None:
+    make, kind, thresholds = FAMILIES[family]
+    make(tmp_path)
+    config, image = replace(thresholds, sam=str(tmp_path)), photograph()
+    counts = compare(config, kind.from_pretrained(tmp_path).eval(), image, [(0, 0, 80, 48)])
+    assert sum(counts) >= 3
+    everything = replace(config, predicted_iou=-99.0, stability=0.0)
+    loose = load_mask_source(everything, "cpu")(image, silent)
+    assert sum(map(len, loose.masks)) > sum(counts)  # so both scores did filter something
+
+
+@pytest.mark.parametrize("family", ["sam", "sam2"])
+def test_a_layer_of_crops_agrees_with_crops_one_after_another(family: str, tmp_path: Path) -> None:
+    make, kind, thresholds = FAMILIES[family]
+    make(tmp_path)
+    config, image = replace(thresholds, sam=str(tmp_path), crop_layers=1, points_per_side=3), photograph()
+    # overlap int(48 * 512 / 1500) = 16; width (80 + 16) / 2 = 48, height (48 + 16) / 2 = 32
+    crops = [(0, 0, 48, 32), (0, 16, 48, 48), (32, 0, 80, 32), (32, 16, 80, 48)]
+    compare(config, kind.from_pretrained(tmp_path).eval(), image, [(0, 0, 80, 48), *crops])
+    assert load_mask_source(config, "cpu").key != load_mask_source(replace(config, crop_layers=0), "cpu").key
+
+
+def decoder_setting(folder: Path, **settings: float) -> None:
+    change_json(folder / "config.json", lambda stated: stated["mask_decoder_config"].update(settings))
+
+
+def test_sam_decoder_norms_have_the_published_epsilon(tmp_path: Path) -> None:
+    tiny_sam(tmp_path)
+    answers = []
+    for epsilon in (1e-6, 0.5):
+        decoder_setting(tmp_path, layer_norm_eps=epsilon)
+        with torch.inference_mode():
+            encoded = load_segmenter(str(tmp_path), "cpu").encode(photograph())
+            answers.append(encoded.masks_at(sam.grid_points(2, (48, 80))))
+    assert torch.equal(answers[0][1], answers[1][1])
+
+
+def test_sam_2_masks_are_ordered_by_size_at_each_point() -> None:
+    logits = -torch.ones(2, 3, 4, 4)
+    for point, sizes in enumerate([(3, 1, 2), (2, 2, 1)]):
+        for k, size in enumerate(sizes):
+            logits[point, k, :size] = 1 + k
+    ious, ordered = sam.by_area(torch.tensor([[0.3, 0.1, 0.2], [0.5, 0.6, 0.4]]), logits)
+    np.testing.assert_allclose(ious, [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])  # of equals the first stays first
+    assert (ordered > 0).flatten(2).sum(2).tolist() == [[4, 8, 12], [4, 8, 8]]
+    assert ordered[:, :, 0, 0].tolist() == [[2, 3, 1], [3, 1, 2]]
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_weights_that_do_not_fit_are_named(family: str, tmp_path: Path) -> None:
+    FAMILIES[family][0](tmp_path)
+    decoder_setting(tmp_path, iou_head_hidden_dim=12)
+    with pytest.raises(EncoderError, match="do not fit, such as mask_decoder"):
+        load_mask_source(MaskConfig(sam=str(tmp_path)), "cpu")
+
+
+def test_batches_do_not_change_the_masks(config: MaskConfig) -> None:
+    one = load_mask_source(replace(config, points_per_batch=1), "cpu")
+    all_at_once = load_mask_source(replace(config, points_per_batch=64), "cpu")
+    assert one.key == all_at_once.key
+    assert one.key != load_mask_source(replace(config, box_nms=0.6), "cpu").key
+    for a, b in zip(one(photograph(), silent).masks, all_at_once(photograph(), silent).masks, strict=True):
+        assert a.shape == b.shape
+        assert (a ^ b).sum() <= 2 * len(a)
+
+
+def test_no_mask_at_all_is_an_answer(config: MaskConfig) -> None:
+    levels = load_mask_source(replace(config, predicted_iou=99.0), "cpu")(photograph(), silent)
+    assert [masks.shape for masks in levels.masks] == [(0, 48, 80)] * 3
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 70), (70, 1)])
+def test_thin_pictures_work(config: MaskConfig, shape: tuple[int, int]) -> None:
+    levels = load_mask_source(config, "cpu")(np.full((*shape, 3), 80, np.uint8), silent)
+    assert all(masks.shape[1:] == shape for masks in levels.masks)
+
+
+def test_sources_are_chosen_and_absences_named(config: MaskConfig, tmp_path: Path) -> None:
+    assert load_mask_source(MaskConfig()).name == "graph (no weights)"
+    assert load_mask_source(replace(config, source="auto"), "cpu").name == f"SAM {config.sam}"
+    assert load_mask_source(replace(config, source="graph")).name == "graph (no weights)"
+    with pytest.raises(InputError, match=r"--masks\.sam facebook/sam-vit-huge"):
+        load_mask_source(MaskConfig(source="sam"))
+    with pytest.raises(EncoderError, match=r"`--masks\.sam FOLDER`"):
+        load_mask_source(MaskConfig(sam=str(tmp_path / "absent")))
+    (tmp_path / "config.json").write_text('{"model_type": "clip"}', encoding="utf-8")
+    (tmp_path / "model.safetensors").write_bytes(b"")
+    with pytest.raises(EncoderError, match="no segmenter known here"):
+        load_mask_source(MaskConfig(sam=str(tmp_path)))
+
+
+@pytest.mark.parametrize("make", [tiny_sam, tiny_sam2])
+def test_half_the_digits_give_nearly_the_same_masks(make: Callable[[Path], Any], tmp_path: Path) -> None:
+    """As on a GPU, which alone is asked so: PyTorch rounds on a CPU to the same digits."""
+    make(tmp_path)
+    config = replace(LOOSE, sam=str(tmp_path), predicted_iou=-9.0, stability=0.0, box_nms=1.0, nms_iou=1.0)
+    segmenter = load_segmenter(str(tmp_path), "cpu")
+    whole, half = (SamMasks(segmenter, config, half_on) for half_on in (None, "cpu"))
+    assert whole.key != half.key
+    for want, got in zip(whole(photograph(), silent).masks, half(photograph(), silent).masks, strict=True):
+        assert abs(len(want) - len(got)) <= 2
+        apart = np.array([min((mask ^ other).mean() for other in want) for mask in got])
+        assert np.median(apart) < 0.02
+        assert (apart > 0).any()  # so it was rounded
+
+
+def test_overflow_of_float16_is_computed_in_float32(config: MaskConfig) -> None:
+    segmenter, asked = load_segmenter(config.sam, "cpu"), []
+
+    class Overflowing:
+        name = "overflowing"
+
+        def encode(self, image: np.ndarray) -> sam.EncodedImage:
+            asked.append(torch.is_autocast_enabled("cpu"))
+            encoded = segmenter.encode(image)
+            if asked[-1]:
+                encoded.seen["image_embeddings"].fill_(torch.inf)
+            return encoded
+
+    found = SamMasks(Overflowing(), config, half_on="cpu")(photograph(), silent)
+    for got, want in zip(found.masks, SamMasks(segmenter, config)(photograph(), silent).masks, strict=True):
+        np.testing.assert_array_equal(got, want)
+    assert asked == [True, False]

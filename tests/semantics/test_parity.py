@@ -28,8 +28,8 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import MaskConfig
 from langsplat_core.progress import silent
 from langsplat_core.semantics.encoders import load_encoder
+from langsplat_core.semantics.features import masked_crop
 from langsplat_core.semantics.masks import label_maps
-from langsplat_core.semantics.regions import masked_crop
 from langsplat_core.semantics.sam import (
     MASKS_PER_POINT,
     EncodedImage,

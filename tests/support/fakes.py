@@ -25,7 +25,7 @@ from langsplat_core.scene import (
     look_at,
 )
 from langsplat_core.scene.codec import CodebookCodec
-from langsplat_core.semantics.store import FeatureStore, ImageFeatures
+from langsplat_core.semantics.features import FeatureStore, ImageFeatures
 from tests.support.scenes import transforms, unturned_gaussians
 
 COUNT = 64

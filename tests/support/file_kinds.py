@@ -25,7 +25,7 @@ from langsplat_core.progress import silent
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Gaussians, Scene
-from langsplat_core.semantics.store import FeatureStore, ImageFeatures
+from langsplat_core.semantics.features import FeatureStore, ImageFeatures
 from tests.support.file_samples import (
     ascii_ply,
     compressed_ply,

@@ -14,7 +14,7 @@ from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians, LanguageField, LinearCodec, Scene, look_at
 from langsplat_core.scene.language import Tree
 from langsplat_core.scene.surface import Surface, build_surface, build_tree, surface_weights
-from langsplat_core.semantics.store import ImageFeatures
+from langsplat_core.semantics.features import ImageFeatures
 
 
 def random_gaussians(

@@ -14,7 +14,7 @@ from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
 import glfw  # isort: skip
 from langsplat_core.extensions.library import panel as library_panel
 from langsplat_core.io.scenes import save_scene
-from langsplat_core.semantics.store import ImageFeatures
+from langsplat_core.semantics.features import ImageFeatures
 from langsplat_viewer import viewer as training
 from langsplat_viewer.actions import editing, opening, settings, viewpoint
 from langsplat_viewer.commands import COMMANDS

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from langsplat_core.display.displays import NO_HEAT, Subject, relevancies
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.scene import CANONICAL_PHRASES
-from langsplat_core.semantics.store import ImageFeatures
+from langsplat_core.semantics.features import ImageFeatures
 from langsplat_viewer.actions import editing, opening, queries, settings
 from langsplat_viewer.files.projects import read_queries, write_queries
 from langsplat_viewer.headless import answer_line

@@ -43,8 +43,7 @@ from langsplat_core.pipeline.language_field import field_of
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import LEVELS, AutoencoderCodec, Codec, Scene
 from langsplat_core.scene.codec import LARGEST, SHORTEST
-from langsplat_core.semantics.encoder import OPEN_MODEL
-from langsplat_core.semantics.encoders import load_text_encoder
+from langsplat_core.semantics.encoders import OPEN_MODEL, load_text_encoder
 from langsplat_core.training.language.codec_fit import (
     CodecReport,
     Vocabulary,

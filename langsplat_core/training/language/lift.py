@@ -18,7 +18,7 @@ from langsplat_core.config import LiftConfig, check_settings
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.protocol import LiftingRasterizer, LiftingView
 from langsplat_core.scene import LEVELS, Camera, Codec, Gaussians
-from langsplat_core.semantics.store import ImageFeatures
+from langsplat_core.semantics.features import ImageFeatures
 from langsplat_core.training.language.mask_weights import MaskGroups, MaskWeights
 
 

@@ -19,7 +19,7 @@ from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.scene import LEVELS, NO_NODE, Camera, Gaussians, Tree
-from langsplat_core.semantics.store import ImageFeatures
+from langsplat_core.semantics.features import ImageFeatures
 from langsplat_core.training.language.codec_fit import nearest_centres, spherical_kmeans
 
 

@@ -21,7 +21,7 @@ from transformers import CLIPTokenizer
 
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.extensions.checkpoints.weight_layouts import Hiera, converted
-from langsplat_core.semantics.encoders import CLIP_MEAN, CLIP_STD, load_encoder, load_text_encoder
+from langsplat_core.semantics.encoders import CLIP_PIXELS, load_encoder, load_text_encoder
 from langsplat_core.semantics.sam import FAMILIES, Segmenter, load_segmenter
 from langsplat_core.semantics.weights import Weights
 from tests.support.tiny_models import SAM_SIDE, MakesFolder, tiny_clip, tiny_sam, tiny_sam2
@@ -275,7 +275,9 @@ def compare(case: Case, tensors: Tensors, tolerance: float = 1e-5) -> None:
     path, vision_heads, text_heads, quick, config = case
     encoder = load_encoder(str(path), "cpu")
     assert (encoder.id, encoder.image_size, encoder.dim) == (str(path), SIDE, 24)
-    stated = config["preprocess_cfg"] if config else {"mean": CLIP_MEAN, "std": CLIP_STD}
+    stated = (
+        config["preprocess_cfg"] if config else dict(zip(("mean", "std"), CLIP_PIXELS.tolist(), strict=True))
+    )
     pixels = (crops() / 255 - np.array(stated["mean"])) / np.array(stated["std"])
     given = torch.from_numpy(pixels.transpose(0, 3, 1, 2).astype(np.float32))
     pictures, texts = encoder.encode_images(crops()), encoder.encode_texts(PHRASES)

@@ -16,7 +16,7 @@ from langsplat_core.progress import WorkCancelledError
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import LEVELS, NO_NODE, Camera, LinearCodec, Tree
-from langsplat_core.semantics.store import ImageFeatures
+from langsplat_core.semantics.features import ImageFeatures
 from langsplat_core.training.language.lift import (
     blended,
     by_features,

@@ -11,15 +11,16 @@ import pytest
 from langsplat_core.arrays import unit
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.progress import Progress, Report, WorkCancelledError, silent
-from langsplat_core.semantics.masks import LevelMasks, MaskSource
-from langsplat_core.semantics.regions import (
+from langsplat_core.semantics.features import (
+    FeatureStore,
+    ImageFeatures,
     describe_capture,
     embed_regions,
     feature_key,
     fingerprint,
     masked_crop,
 )
-from langsplat_core.semantics.store import FeatureStore, ImageFeatures
+from langsplat_core.semantics.masks import LevelMasks, MaskSource
 
 
 def test_a_square_region_of_the_right_size_is_copied_exactly() -> None:
