@@ -136,7 +136,7 @@ def _palette(ctx: Any, window: Window) -> None:
 
 def _light(ctx: Any, window: Window) -> None:
     viewer = window.viewer
-    settings.prefer(viewer, theme="light")
+    settings.toggle_theme(viewer)
     settings.set_picture(viewer, replace(viewer.state.session.picture, colour_map="cividis"))
 
 

@@ -24,7 +24,8 @@ from langsplat_core import load_scene
 from langsplat_core.errors import EXTRAS
 from langsplat_core.io.scenes import formats
 from langsplat_core.raster.opengl.scene_textures import create_egl_context
-from langsplat_viewer.viewer import TrainingRequest, command
+from langsplat_viewer.state import TrainingForm
+from langsplat_viewer.viewer import command
 
 PACKAGING = Path(__file__).resolve().parents[1] / "packaging"
 DESKTOP, GPU = PACKAGING / "desktop", PACKAGING / "gpu"
@@ -75,7 +76,7 @@ def test_desktop_entry_and_mime_types_cover_every_format():
 
 
 def test_frozen_viewer_trains_by_the_program_beside_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    request = TrainingRequest(tmp_path / "photographs", tmp_path / "scene.ply")
+    request = TrainingForm(str(tmp_path / "photographs"), str(tmp_path / "scene.ply"))
     plain = command(request)
     monkeypatch.setattr("sys.frozen", True, raising=False)
     monkeypatch.setattr("sys.executable", str(tmp_path / "langsplat-viewer"))

@@ -16,7 +16,7 @@ from langsplat_viewer.actions import editing, opening, queries, saving, settings
 from langsplat_viewer.actions.saving import Part
 from langsplat_viewer.camera.controls import Side, adopt_up, level
 from langsplat_viewer.marks import TOOLS, Tool
-from langsplat_viewer.session import THEMES, Overlay, Theme
+from langsplat_viewer.session import Overlay
 from langsplat_viewer.state import ViewerState
 from langsplat_viewer.viewer import Viewer
 
@@ -75,14 +75,6 @@ def _display(button: Button, number: int) -> Command:
         (str(number),) if number < 10 else (),
         is_on=lambda viewer: is_shown(viewer.state, button),
         icon="" if button.latent_level in (0, 1) else DISPLAY_ICONS.get(button.display, ""),
-    )
-
-
-def _theme(theme: Theme) -> Command:
-    return Command(
-        f"{theme} theme",
-        lambda viewer: settings.prefer(viewer, theme=theme),
-        is_on=lambda viewer: viewer.state.preferences.theme == theme,
     )
 
 
@@ -270,17 +262,13 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
         Command("play the camera path, or stop", viewpoint.toggle_playing, ("Shift+K",)),
     ),
     "Window": (
+        Command("hide or show the panels", settings.toggle_panels, ("F11",)),
+        Command("reset the layout", settings.reset_layout, apart=True),
         Command(
-            "hide or show the panels",
-            lambda v: settings.put(v.state, show_panel=not v.state.show_panel),
-            ("F11",),
+            "light theme, or dark again",
+            settings.toggle_theme,
+            is_on=lambda viewer: viewer.state.preferences.theme == "light",
         ),
-        Command(
-            "reset the layout",
-            lambda v: settings.put(v.state, show_panel=True, resets_panels=True),
-            apart=True,
-        ),
-        *(_theme(theme) for theme in THEMES),
         Command("larger text", lambda v: settings.scale_text(v, 0.25), apart=True),
         Command("smaller text", lambda v: settings.scale_text(v, -0.25)),
     ),

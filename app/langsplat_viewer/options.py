@@ -63,10 +63,6 @@ class ViewerOptions:
     """Without a window: depth up to which nothing is drawn, world units."""
     far_cut: Positive | None = None
     """Without a window: depth beyond which nothing is drawn, world units (default: everything is)."""
-    heat_opacity: Share = PictureConfig.heat_opacity
-    """How much of the heat map covers the colours where relevancy is high."""
-    dim: Share = PictureConfig.dim
-    """Brightness of what a query does not find."""
     heat_scale: Annotated[tuple[Share, Share] | None, tyro.conf.arg(metavar="LOW HIGH")] = None
     """Relevancies at the ends of the heat map, the same in every image (default: each answer's own)."""
     size: Annotated[str, tyro.conf.arg(metavar="WxH")] = ""
@@ -120,8 +116,6 @@ class ViewerOptions:
             raise InputError(f"--heat-scale {scale[0]:g} {scale[1]:g}: the second must be the larger")
         return PictureConfig(
             display=self.shown_display,
-            heat_opacity=self.heat_opacity,
-            dim=self.dim,
             heat_scale=scale,
             colour_map=self.colour_map or PictureConfig.colour_map,
             transparent=self.transparent,

@@ -12,6 +12,8 @@ from langsplat_core.progress import Progress, TerminalProgress, silent
 from langsplat_viewer.files.projects import PROJECTS, preferences_folder
 from langsplat_viewer.options import ViewerOptions, camera_file, scene_path, services
 
+WITHOUT_WINDOW = ("out", "turntable", "colour_map", "transparent", "cut", "canonical", "near_cut", "far_cut")
+
 
 @dataclass(frozen=True)
 class ViewerCommand(ViewerOptions):
@@ -44,23 +46,12 @@ class ViewerCommand(ViewerOptions):
         print("\n".join(lines))
 
     def _window(self, path: Path) -> None:
-        if self.out is not None:
-            raise InputError("--out is for pictures without a window; add --headless")
-        for option, given, panel in (
-            ("--colour-map", self.colour_map, "Display"),
-            ("--transparent", self.transparent, "Display"),
-            ("--cut", self.cut, "Search"),
-            ("--canonical", self.canonical, "Search"),
-            ("--near-cut", self.near_cut, "Camera"),
-            ("--far-cut", self.far_cut, "Camera"),
-        ):
-            if given:
+        for name in WITHOUT_WINDOW:
+            if getattr(self, name):
+                option = f"--{name.replace('_', '-')}"
                 raise InputError(
-                    f"{option} is for pictures without a window; choose it in the panel {panel}, "
-                    "or add --headless"
+                    f"{option} is for pictures without a window; choose it there, or add --headless"
                 )
-        if self.turntable is not None:
-            raise InputError("--turntable is a film without a window; add --headless --out film.mp4")
         from langsplat_viewer.window import WindowRequest, open_window
 
         open_window(

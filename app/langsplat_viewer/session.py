@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from msgspec import Meta
@@ -249,15 +249,7 @@ class Session:
 
     def of_next_scene(self, bookmarks: tuple[Bookmark, ...]) -> "Session":
         """Return the session that another scene begins with: settings of the window stay."""
-        return Session(
-            picture=self.picture,
-            latent_level=self.latent_level,
-            split=self.split,
-            splats=self.splats,
-            overlays=self.overlays,
-            level=self.level,
-            bookmarks=bookmarks,
-        )
+        return Session(bookmarks=bookmarks, **{name: getattr(self, name) for name in OF_WINDOW})
 
     def found_again(self, now: "Session") -> "Session":
         """Return the session of a scene that is shown again.
@@ -265,26 +257,17 @@ class Session:
         Settings of the window are as `now`; what was selected, hidden, deleted and moved was saved or
         discarded when it was left.
         """
-        settings = now.of_next_scene(now.bookmarks)
-        return replace(
-            settings,
-            picture=replace(now.picture, display=self.picture.display),
-            latent_level=self.latent_level,
-            clip=self.clip,
-            queries=self.queries,
-            chosen=self.chosen,
-            canonical=self.canonical,
-            things=self.things,
-            notes=self.notes,
-            keyframes=self.keyframes,
-            ruler=self.ruler,
-        )
+        kept: dict[str, Any] = {name: getattr(now, name) for name in OF_WINDOW}
+        kept |= {"picture": replace(now.picture, display=self.picture.display)}
+        kept |= {"latent_level": self.latent_level, "bookmarks": now.bookmarks}
+        return replace(self, **kept, marks=Marked(), moves=())
+
+
+OF_WINDOW = ("picture", "latent_level", "split", "splats", "overlays", "level")  # not of a scene
 
 
 # Preferences, kept in the platform's folder for settings.
 
-Theme = Literal["dark", "light"]
-THEMES: tuple[Theme, ...] = get_args(Theme)
 SCALES = (0.75, 3.0)  # least and largest size of letters and widgets
 MOST_RECENT = 12
 
@@ -293,7 +276,7 @@ MOST_RECENT = 12
 class Preferences:
     """The settings that outlive a window."""
 
-    theme: Theme = "dark"
+    theme: Literal["dark", "light"] = "dark"
     ui_scale: Annotated[float, Meta(ge=SCALES[0], le=SCALES[1])] = 1.0  # of letters and widgets
     recent: tuple[str, ...] = ()  # scenes that were opened, the latest first
     panels: tuple[str, ...] | None = None  # titles of those that are open; None: those that are at first

@@ -27,7 +27,6 @@ from langsplat_viewer.session import Move, Note, Point, Preferences, Query, Sess
 # Camera path and film: the panel "Record".
 
 SPACING = 2.0  # seconds from the last keyframe to one that is added
-FPS_CHOICES = (10.0, 24.0, 25.0, 30.0, 60.0)
 
 
 @dataclass(eq=False)
@@ -100,14 +99,6 @@ class Leaving:
     then: Callable[[Any], None]  # takes the `Viewer`
     to: str  # what it does, in words: "the window closes"
     film: bool = False  # it is done as soon as the recorder is
-
-
-@dataclass(frozen=True, eq=False)
-class EvidenceSheet:
-    """The photographs and masks that an answer stands on."""
-
-    phrase: str
-    image: Array  # (H, W, 3) uint8, row 0 on top
 
 
 @dataclass(frozen=True)
@@ -239,7 +230,7 @@ class SceneState:
     hover: Hover | None = None
     fresh_note: Note | None = None  # just pinned, to be written now
     outline: OutlineView | None = None  # once it was wanted
-    evidence: EvidenceSheet | None = None  # in a window of its own, while that is open
+    evidence: tuple[str, Array] | None = None  # a phrase, and what its answer stands on: (H, W, 3) uint8
     suggestions: Suggestions = field(default_factory=Suggestions)
     suggestions_of: Scene | None = None  # the scene for which they were looked for
     _edited: EditedScene | None = None  # of the last request
@@ -253,11 +244,6 @@ class SceneState:
     def has_field(self) -> bool:
         """True where a scene with a language field is open."""
         return self.scene is not None and self.scene.language is not None
-
-    @property
-    def lacks_field(self) -> bool:
-        """True where a scene without one is open."""
-        return self.scene is not None and self.scene.language is None
 
     @property
     def is_unsaved(self) -> bool:
@@ -327,11 +313,6 @@ class ViewerState(SceneState):
     def result(self, query: Query) -> QueryResult | None:
         """Return the result of a query with its threshold, None without one."""
         return self.answer(query).at(query.cut)
-
-    @property
-    def chosen_query(self) -> Query | None:
-        """The query whose details are shown."""
-        return self.session.query(self.session.chosen)
 
     def shown(self) -> list[Query | None]:
         """Return the answered queries by slot, as many as the highest slot in use."""

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import IO, Any, Protocol, TypeVar
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import TrainPreset
 from langsplat_core.errors import LangSplatError, printable_line
 from langsplat_core.progress import Progress, Report
 from langsplat_core.query.describe import Describer
@@ -25,20 +24,10 @@ from langsplat_viewer.jobs import Job, Worker, one_line
 from langsplat_viewer.marks import Marks
 from langsplat_viewer.rendering.request import RenderRequest
 from langsplat_viewer.session import Point, Session
-from langsplat_viewer.state import OutlineView, SceneState, ViewerState
+from langsplat_viewer.state import OutlineView, SceneState, TrainingForm, ViewerState
 
 PREVIEW_EVERY = 100  # steps between the checkpoints that can be looked at
 KEPT = 20  # lines of what it says that are kept
-
-
-@dataclass(frozen=True)
-class TrainingRequest:
-    """Options of a training run."""
-
-    dataset: Path
-    out: Path  # *.ply
-    preset: TrainPreset = "good"
-    encoder: str = "demo"
 
 
 @dataclass(eq=False)
@@ -64,14 +53,14 @@ class TrainingProgress:
             self.losses = [*self.losses, loss]
 
 
-def command(request: TrainingRequest) -> list[str]:
-    """Return the command line of a request, for this interpreter or the program beside a one-folder build."""
+def command(form: TrainingForm) -> list[str]:
+    """Return the command line of a training, of this interpreter or of the program in a one-folder build."""
     program = [sys.executable, "-m", "langsplat_core"]
     if getattr(sys, "frozen", False):
         program = [str(Path(sys.executable).with_stem("langsplat"))]
     return [
-        *(*program, "train", str(request.dataset), "--out", str(request.out)),
-        *("--preset", request.preset, "--clip.model", request.encoder, "--progress", "lines"),
+        *(*program, "train", form.dataset, "--out", form.out),
+        *("--preset", form.preset, "--clip.model", form.encoder, "--progress", "lines"),
         *("--radiance.checkpoint-every", str(PREVIEW_EVERY)),
     ]
 
@@ -79,16 +68,16 @@ def command(request: TrainingRequest) -> list[str]:
 class Training:
     """Training in a process of its own, and its progress."""
 
-    def __init__(self, request: TrainingRequest, wake: Callable[[], None]) -> None:
+    def __init__(self, form: TrainingForm, wake: Callable[[], None]) -> None:
         """`wake` is called from another thread when there is news. OSError where it cannot be started."""
-        self.request = request
+        self.out = Path(form.out)
         self.progress = TrainingProgress()
         self.interrupted = False
         self.previewed: Stamps = ()  # the checkpoint that is looked at
         self._wake = wake
         # Ctrl-C in the terminal is the window's; the process gets its own signal from `interrupt`.
         self.process = subprocess.Popen(
-            command(request),
+            command(form),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,

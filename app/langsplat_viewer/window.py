@@ -315,8 +315,7 @@ class Window:
         if span is not None:
             viewpoint.move(viewer, lambda view: spanning(view, span))
         wanted = request.picture
-        given = {name: getattr(wanted, name) for name in ("heat_opacity", "dim", "heat_scale")}
-        settings.set_picture(viewer, replace(state.session.picture, **given))
+        settings.set_picture(viewer, replace(state.session.picture, heat_scale=wanted.heat_scale))
         if request.path_file is not None:
             viewpoint.load_path(viewer, request.path_file)
         queries.set_level(viewer, request.level)

@@ -116,7 +116,7 @@ def test_fourth_query_takes_the_colour_of_the_oldest(opened):
     queries.remove(opened, "mug")
     assert [result is not None for result in opened.state.shown_results()] == [False, True, True]
     queries.remove_all(opened)
-    assert (opened.state.session.queries, opened.state.chosen_query, opened.state.answers) == ((), None, {})
+    assert (opened.state.session.queries, opened.state.session.chosen, opened.state.answers) == ((), "", {})
     editing.undo(opened)
     assert phrases(opened) == ["book", "plant", "mug or book"]
 
@@ -155,8 +155,8 @@ def test_answer_is_explained_by_kept_photographs(opened, tmp_path, monkeypatch):
     seen = ImageFeatures(np.zeros((3, 120, 160), np.int32), axis(1)[None])
     as_trained(tmp_path / "blobs.ply", scene, [seen] * len(scene.cameras))
     act(queries.explain, opened, query)
-    assert opened.state.evidence.phrase == "book"
-    assert opened.state.evidence.image.ndim == 3
+    assert opened.state.evidence[0] == "book"
+    assert opened.state.evidence[1].ndim == 3
     opened.state.evidence = None
     assert opened.state.evidence is None
 

@@ -19,7 +19,8 @@ from langsplat_core.scene import Scene
 from langsplat_viewer import viewer as training_process
 from langsplat_viewer.actions import opening, settings, viewpoint
 from langsplat_viewer.files.disk import IN_TRAINING, PREVIEW, write_preview
-from langsplat_viewer.viewer import PREVIEW_EVERY, TrainingProgress, TrainingRequest, command
+from langsplat_viewer.state import TrainingForm
+from langsplat_viewer.viewer import PREVIEW_EVERY, TrainingProgress, command
 from tests.support.fakes import blob_scene
 from tests.support.scenes import random_gaussians
 from tests.support.windowless import SCENES, act, errors, open_scene, settle
@@ -140,8 +141,7 @@ def test_folder_without_photographs_is_refused(viewer, tmp_path, monkeypatch, da
 
 
 def test_training_command_is_parsed_by_the_program():
-    request = TrainingRequest(Path("photos"), Path("s.ply"), "quick", "demo")
-    words = command(request)
+    words = command(TrainingForm("photos", "s.ply", "quick", "demo"))
     assert words[1:3] == ["-m", "langsplat_core"]
     parsed = parse(words[3:])
     assert (parsed.dataset, parsed.out, parsed.progress) == (Path("photos"), Path("s.ply"), "lines")

@@ -143,8 +143,8 @@ def name_selection(viewer: Viewer, name: str) -> None:
 
 def chosen_query(viewer: Viewer) -> Query | None:
     """Return the query whose details are shown, else the latest; None without one."""
-    state = viewer.state
-    return state.chosen_query or (state.session.queries[-1] if state.session.queries else None)
+    session = viewer.state.session
+    return session.query(session.chosen) or (session.queries[-1] if session.queries else None)
 
 
 def select_query(viewer: Viewer, query: Query | None = None, mode: Mode | None = None) -> None:

@@ -31,7 +31,7 @@ from langsplat_viewer.marks import unmarked
 from langsplat_viewer.rendering.request import Split, why_undrawable
 from langsplat_viewer.session import Marked, Query, Session, Things
 from langsplat_viewer.state import FileChoice, Recording, SceneState, ViewerState
-from langsplat_viewer.viewer import History, Training, TrainingRequest, Viewer
+from langsplat_viewer.viewer import History, Training, Viewer
 
 
 @dataclass(frozen=True, eq=False)
@@ -420,9 +420,9 @@ def start_training(viewer: Viewer) -> None:
     if not typed or photographs == 0:
         viewer.say_error(f"no photographs in '{typed}'; name a folder that has some")
         return
-    request = TrainingRequest(dataset, out, form.preset, form.encoder.strip() or "demo")
+    form = replace(form, dataset=str(dataset), out=str(out), encoder=form.encoder.strip() or "demo")
     try:
-        viewer.training = Training(request, viewer.worker.wake)
+        viewer.training = Training(form, viewer.worker.wake)
     except OSError as error:
         viewer.say_error(f"training cannot be started ({one_line(error)})")
         return
@@ -437,7 +437,7 @@ def look_at_training(viewer: Viewer) -> None:
     training = viewer.training
     if training is None:
         return
-    written = disk.newest(training.request.out)
+    written = disk.newest(training.out)
     if not written:
         viewer.state.say("there are no Gaussians to look at yet")
         return
@@ -462,9 +462,9 @@ def watch_training(viewer: Viewer) -> None:
     if training is None:
         return
     if training.exit_code is None:
-        follows = state.path == work_folder(training.request.out) / disk.PREVIEW
+        follows = state.path == work_folder(training.out) / disk.PREVIEW
         if follows and viewer.worker.current is None:
-            written = disk.newest(training.request.out)
+            written = disk.newest(training.out)
             if written and written != training.previewed and written[0][0].name.endswith(disk.IN_TRAINING):
                 look_at_training(viewer)
         return
@@ -473,7 +473,7 @@ def watch_training(viewer: Viewer) -> None:
         told = [line for line in training.progress.said if not line.startswith(WARNING)]
         for line in told[-3:]:  # what speaks against the scene is said with it, from its report
             state.say(line)
-        open_scene(viewer, training.request.out)
+        open_scene(viewer, training.out)
     elif training.interrupted:
         state.say("training stopped; Train goes on where it was")
     else:

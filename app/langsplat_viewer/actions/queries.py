@@ -23,7 +23,7 @@ from langsplat_viewer.files.projects import QUERIES, read_queries, write_queries
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.output import free_name
 from langsplat_viewer.session import Query
-from langsplat_viewer.state import EvidenceSheet, QueryAnswer
+from langsplat_viewer.state import QueryAnswer
 from langsplat_viewer.viewer import Viewer
 
 MOST_THINGS = 20  # instances of one answer
@@ -245,7 +245,7 @@ def explain(viewer: Viewer, query: Query) -> None:
 
     def done(image: Array) -> None:
         if query.phrase in state.answers:
-            state.evidence = EvidenceSheet(query.phrase, image)
+            state.evidence = query.phrase, image
 
     viewer.run(f"looking for the evidence of '{query.phrase}'", work, done)
 

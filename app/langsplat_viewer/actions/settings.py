@@ -191,6 +191,11 @@ def take_preferences(viewer: Viewer) -> None:
     viewer.put(picture=replace(picture, colour_map=kept.colour_map), overlays=overlays)
 
 
+def toggle_theme(viewer: Viewer) -> None:
+    """Make the panels light, or dark again."""
+    prefer(viewer, theme="dark" if viewer.state.preferences.theme == "light" else "light")
+
+
 def scale_text(viewer: Viewer, by: float) -> None:
     """Make letters and widgets larger or smaller."""
     low, high = SCALES
@@ -205,6 +210,16 @@ def resize(viewer: Viewer, width: int, height: int) -> None:
 def open_panel(viewer: Viewer, title: str) -> None:
     """Have a panel opened, in front of those it shares its place with."""
     viewer.state.show_panel, viewer.state.wanted_panel = True, title
+
+
+def toggle_panels(viewer: Viewer) -> None:
+    """Hide all panels, or bring them back."""
+    viewer.state.show_panel = not viewer.state.show_panel
+
+
+def reset_layout(viewer: Viewer) -> None:
+    """Put the panels where they are at first."""
+    viewer.state.show_panel = viewer.state.resets_panels = True
 
 
 def toggle_help(viewer: Viewer) -> None:

@@ -99,7 +99,7 @@ def _display_line(viewer: Viewer, rows: tuple[DisplayRow, ...]) -> None:
     for place, button in enumerate(buttons):
         if place:
             ui.beside_boxed(button.label)
-        imgui.begin_disabled(state.lacks_field and DISPLAYS[button.display].needs_field)
+        imgui.begin_disabled(not state.has_field and DISPLAYS[button.display].needs_field)
         if imgui.radio_button(button.label, is_shown(state, button)):
             settings.set_display(viewer, button.display, button.latent_level)
         imgui.end_disabled()
@@ -118,11 +118,11 @@ def _compared(viewer: Viewer) -> None:
     if imgui.selectable("nothing", split.mode == "off")[0]:
         settings.set_split(viewer, "off")
     for button in BUTTONS:
-        imgui.begin_disabled(state.lacks_field and DISPLAYS[button.display].needs_field)
+        imgui.begin_disabled(not state.has_field and DISPLAYS[button.display].needs_field)
         if imgui.selectable(compared_name(button), shown == compared_name(button))[0]:
             settings.compare_with(viewer, button.display, button.latent_level)
         imgui.end_disabled()
-    imgui.begin_disabled(state.lacks_field)
+    imgui.begin_disabled(not state.has_field)
     if imgui.selectable("three levels", split.mode == "levels")[0]:
         settings.set_split(viewer, "levels")
     imgui.end_disabled()

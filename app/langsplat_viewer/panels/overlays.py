@@ -128,11 +128,12 @@ def draw_evidence(viewer: Viewer, picture: ui.Picture) -> None:
     sheet, area = viewer.state.evidence, ui.scene_area()
     if sheet is None:
         return
-    texture = picture.texture(sheet.image)
+    phrase, image = sheet
+    texture = picture.texture(image)
     imgui.set_next_window_pos(ImVec2(area.left, area.top), imgui.Cond_.appearing)
     imgui.set_next_window_size(ui.fitting(*EVIDENCE_EM), imgui.Cond_.appearing)
     imgui.set_next_window_bg_alpha(1.0)
-    _, still_open = imgui.begin(f"Evidence: {sheet.phrase}###evidence", True)
+    _, still_open = imgui.begin(f"Evidence: {phrase}###evidence", True)
     width = imgui.get_content_region_avail().x
     imgui.image(imgui.ImTextureRef(texture.glo), ImVec2(width, width * texture.height / texture.width))
     imgui.end()

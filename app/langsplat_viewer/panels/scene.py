@@ -95,7 +95,7 @@ def _text_box(label: str, hint: str, text: str) -> str:
 
 def _running(viewer: Viewer, process: Training) -> None:
     progress = process.progress
-    imgui.text_unformatted(process.request.out.name)
+    imgui.text_unformatted(process.out.name)
     if not progress.stages:
         imgui.text_colored(ui.muted(), "starting")
     for label, fraction in list(progress.stages.items()):

@@ -143,7 +143,7 @@ def _answers(viewer: Viewer) -> None:
             _line(viewer, query)
             imgui.pop_id()
     imgui.end_child()
-    chosen = viewer.state.chosen_query
+    chosen = viewer.state.session.query(viewer.state.session.chosen)
     if chosen is not None:
         _details(viewer, chosen)
 

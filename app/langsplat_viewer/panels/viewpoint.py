@@ -13,7 +13,6 @@ from langsplat_viewer.commands import with_key
 from langsplat_viewer.options import MAX_SIDE
 from langsplat_viewer.panels import ui
 from langsplat_viewer.rendering.request import Clip
-from langsplat_viewer.state import FPS_CHOICES
 from langsplat_viewer.viewer import Viewer
 
 CUT_RANGE = (0.01, 20.0)  # of the scene's radius, the least and most that a cut can be chosen
@@ -188,7 +187,7 @@ def _films(viewer: Viewer) -> None:
     ui.beside("fps", hello_imgui.em_size(FPS_EM))
     imgui.set_next_item_width(hello_imgui.em_size(FPS_EM))
     if imgui.begin_combo("fps", f"{record.fps:g}"):
-        for fps in FPS_CHOICES:
+        for fps in (10.0, 24.0, 25.0, 30.0, 60.0):
             if imgui.selectable(f"{fps:g}", fps == record.fps)[0]:
                 settings.put(record, fps=fps)
         imgui.end_combo()
