@@ -60,19 +60,18 @@ class _Versioned(Struct):
     version: Any = 1
 
 
+class _Images(Struct):
+    files: One
+
+
 class _Means(Struct):
     mins: tuple[Number, Number, Number]
     maxs: tuple[Number, Number, Number]
     files: Two
 
 
-class _Quats(Struct):
-    files: One
-
-
-class _Coded(Struct):
+class _Coded(_Images, kw_only=True):
     codebook: Codebook
-    files: One
 
 
 class _Higher(Struct):
@@ -86,7 +85,7 @@ class _Meta(Struct, rename={"higher": "shN"}):
     count: Whole
     means: _Means
     scales: _Coded
-    quats: _Quats
+    quats: _Images
     sh0: _Coded
     higher: _Higher | None = None
     model: Any = None
@@ -132,6 +131,14 @@ def _gaussians(planes: "_Planes", meta: _Meta) -> Gaussians:
         raise malformed(planes.path, "'quats' holds an alpha below 252", "was the image saved lossily?")
     sh0 = planes.of_gaussians(meta.sh0.files[0])
     base = np.array(meta.sh0.codebook)[sh0[:, :3]]
+    rest = np.zeros((meta.count, 0, 3))
+    if meta.higher is not None:
+        palette = planes.palette(meta.higher.files[0], SH_COUNTS[meta.higher.bands] - 1, meta.higher.count)
+        labels = planes.of_gaussians(meta.higher.files[1])
+        entry = labels[:, 0] + labels[:, 1].astype(np.uint32) * 256
+        if entry.max(initial=0) >= len(palette):
+            raise malformed(planes.path, f"a label of 'shN' is beyond the {len(palette)} of its palette")
+        rest = np.array(meta.higher.codebook)[palette[entry]]
     with np.errstate(over="ignore"):  # overflow to infinity makes rows that are dropped later
         means = np.sign(logs) * np.expm1(np.abs(logs))
     return Gaussians(
@@ -139,21 +146,8 @@ def _gaussians(planes: "_Planes", meta: _Meta) -> Gaussians:
         log_scales=np.array(meta.scales.codebook)[planes.of_gaussians(meta.scales.files[0])[:, :3]],
         quats_wxyz=smallest_three((quats[:, :3] / 255 - 0.5) * np.sqrt(2), quats[:, 3] - 252),
         opacity_logits=logit(sh0[:, 3] / 255),
-        sh=np.concatenate([base[:, None], _rest(planes, meta.higher)], axis=1),
+        sh=np.concatenate([base[:, None], rest], axis=1),
     )
-
-
-def _rest(planes: "_Planes", meta: _Higher | None) -> Array:
-    """(N, K - 1, 3) higher coefficients, from the palette."""
-    if meta is None:
-        return np.zeros((planes.count, 0, 3))
-    palette = planes.palette(meta.files[0], SH_COUNTS[meta.bands] - 1, meta.count)
-    labels = planes.of_gaussians(meta.files[1])
-    entry = labels[:, 0] + labels[:, 1].astype(np.uint32) * 256
-    if planes.count and entry.max() >= meta.count:
-        what = f"a label of 'shN' is {entry.max()}, the palette has {meta.count} entries"
-        raise malformed(planes.path, what)
-    return np.array(meta.codebook)[palette[entry]]
 
 
 class _Planes:
@@ -164,11 +158,9 @@ class _Planes:
 
     def of_gaussians(self, name: str, is_noise: bool = False) -> Array:
         """Return the (N, 4) uint8 rgba of an image; `is_noise`: which no compression gains much on."""
-
-        def suits(width: int, height: int) -> bool:
-            return self.count <= width * height <= 2 * self.count + SLACK_PIXELS
-
-        return self._image(name, suits, is_noise).reshape(-1, 4)[: self.count]
+        most = 2 * self.count + SLACK_PIXELS
+        pixels = self._image(name, lambda w, h: self.count <= w * h <= most, is_noise)
+        return pixels.reshape(-1, 4)[: self.count]
 
     def palette(self, name: str, coefficients: int, entries: int) -> Array:
         """Return the (entries, coefficients, 3) uint8 codes of an image."""
@@ -196,7 +188,7 @@ class _Planes:
 
 CODES = 256  # entries of a codebook
 ROUNDS = 30  # of Lloyd's algorithm for one
-MOST_ENTRIES = 65536  # of the palette of higher coefficients
+HALVINGS = 16  # that make the palette of higher coefficients, of 65536 entries at most
 
 
 def write_sog(path: Path | str, gaussians: Gaussians, antialiased: bool = False) -> None:
@@ -207,28 +199,31 @@ def write_sog(path: Path | str, gaussians: Gaussians, antialiased: bool = False)
     scene; with more than 65536 Gaussians the higher coefficients of several are one entry of a palette. A row
     that cannot be drawn is written with opacity 0.
     """
-    valid = gaussians.valid()
-    count = len(gaussians)
-    side = max(int(np.ceil(np.sqrt(count))), 1)
+    valid, count = gaussians.valid(), len(gaussians)
     images: dict[str, Array] = {}
 
-    def plane(name: str, codes: Array) -> str:
+    def plane(name: str, *codes: Array) -> str:
+        side = max(int(np.ceil(np.sqrt(count))), 1)
         pixels = np.zeros((-(-max(count, 1) // side) * side, 4), np.uint8)
         pixels[:, 3] = 255
-        pixels[:count, : codes.shape[1]] = codes
+        whole = np.column_stack(codes)
+        pixels[:count, : whole.shape[1]] = whole
         images[name] = pixels.reshape(-1, side, 4)
         return name
 
-    means = np.where(valid[:, None], gaussians.means, 0).astype(np.float64)
+    def known(values: Array, other: Any = 0) -> Array:
+        there = valid.reshape(-1, *[1] * (values.ndim - 1))
+        return np.where(there, values, other).astype(np.float64)
+
+    means = known(gaussians.means)
     logs = np.sign(means) * np.log1p(np.abs(means))
     low, high = (reduced(logs[valid], axis=0) if valid.any() else np.zeros(3) for reduced in (np.min, np.max))
-    spans = np.where(high > low, high - low, 1)
-    whole = np.rint(((logs - low) / spans).clip(0, 1) * 65535).astype(np.uint32)
-    scales = np.where(valid[:, None], gaussians.log_scales, 0).astype(np.float64).clip(LEAST_SCALE)
-    scale_codes, scale_book = _coded(scales, valid)
-    colours = np.where(valid[:, None, None], gaussians.sh, 0).astype(np.float64)
-    base_codes, base_book = _coded(colours[:, 0], valid)
-    opacities = np.where(valid, sigmoid(gaussians.opacity_logits.astype(np.float64)), 0)
+    whole = np.rint(((logs - low) / np.where(high > low, high - low, 1)).clip(0, 1) * 65535).astype(np.uint32)
+    three, largest = without_largest(known(gaussians.quats_wxyz, [1, 0, 0, 0]))
+    scales, scale_book = _coded(known(gaussians.log_scales).clip(-30), valid)  # a flat axis is e^-30 thick
+    colours = known(gaussians.sh)
+    base, base_book = _coded(colours[:, 0], valid)
+    opacities = np.where(valid, to_bytes(255 * sigmoid(gaussians.opacity_logits.astype(np.float64))), 0)
     meta: dict[str, Any] = {
         "version": 2,
         "asset": {"generator": "langsplat-viewer"},
@@ -238,14 +233,9 @@ def write_sog(path: Path | str, gaussians: Gaussians, antialiased: bool = False)
             "maxs": high.tolist(),
             "files": [plane("means_l.webp", whole & 255), plane("means_u.webp", whole >> 8)],
         },
-        "scales": {"codebook": scale_book.tolist(), "files": [plane("scales.webp", scale_codes)]},
-        "quats": {"files": [plane("quats.webp", _quaternion_codes(gaussians.quats_wxyz, valid))]},
-        "sh0": {
-            "codebook": base_book.tolist(),
-            "files": [
-                plane("sh0.webp", np.concatenate([base_codes, np.rint(255 * opacities)[:, None]], axis=1))
-            ],
-        },
+        "scales": {"codebook": scale_book.tolist(), "files": [plane("scales.webp", scales)]},
+        "quats": {"files": [plane("quats.webp", to_bytes((three / np.sqrt(2) + 0.5) * 255), 252 + largest)]},
+        "sh0": {"codebook": base_book.tolist(), "files": [plane("sh0.webp", base, opacities)]},
     }
     if antialiased:
         meta["antialias"] = True
@@ -257,12 +247,11 @@ def write_sog(path: Path | str, gaussians: Gaussians, antialiased: bool = False)
         table = np.full((rows * PALETTE_ROW, coefficients, 4), 255, np.uint8)
         table[: len(palette), :, :3] = codes.reshape(len(palette), coefficients, 3)
         images["shN_centroids.webp"] = table.reshape(rows, PALETTE_ROW * coefficients, 4)
-        labels = np.stack([entry & 255, entry >> 8], axis=1)
         meta["shN"] = {
             "count": len(palette),
             "bands": gaussians.sh_degree,
             "codebook": book.tolist(),
-            "files": ["shN_centroids.webp", plane("shN_labels.webp", labels)],
+            "files": ["shN_centroids.webp", plane("shN_labels.webp", entry & 255, entry >> 8)],
         }
     with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         for name, pixels in images.items():
@@ -270,16 +259,6 @@ def write_sog(path: Path | str, gaussians: Gaussians, antialiased: bool = False)
             Image.fromarray(pixels).save(encoded, "WEBP", lossless=True, exact=True, quality=100)
             archive.writestr(zipfile.ZipInfo(name), encoded.getvalue())
         archive.writestr(zipfile.ZipInfo(META_NAME), json.dumps(meta))
-
-
-LEAST_SCALE = -30.0  # logarithm: a flat axis
-
-
-def _quaternion_codes(quats: Array, valid: Array) -> Array:
-    """(N, 4) uint8: the three smaller components, and 252 plus the number of the largest."""
-    three, largest = without_largest(np.where(valid[:, None], quats, [1, 0, 0, 0]))
-    codes = to_bytes((three / np.sqrt(2) + 0.5) * 255)
-    return np.concatenate([codes, 252 + largest[:, None].astype(np.uint8)], axis=1)
 
 
 def _coded(values: Array, counts: Array) -> tuple[Array, Array]:
@@ -308,22 +287,20 @@ def _palette(values: Array, counts: Array) -> tuple[Array, Array]:
     Every row that counts has its own while there is room; else entries are the means of groups that are
     halved where they vary most (median cut).
     """
-    rows = np.flatnonzero(counts)
-    group = np.zeros(len(values), np.int64)
-    if len(rows) <= MOST_ENTRIES:
-        group[rows] = np.arange(len(rows))
-        return group, values[rows]
+    rows = values[counts]
     own = np.zeros(len(rows), np.int64)
-    for _ in range(int(np.log2(MOST_ENTRIES))):
-        sizes = np.bincount(own)
-        centres, squares = (
-            np.stack([np.bincount(own, column) for column in powers.T], 1) / sizes[:, None]
-            for powers in (values[rows], values[rows] ** 2)
-        )
-        axis = (squares - centres**2).argmax(1)[own]
-        above = values[rows, axis] > centres[own, axis]
-        own = np.unique(2 * own + above, return_inverse=True)[1]
-    sizes = np.bincount(own)
-    entries = np.stack([np.bincount(own, column) for column in values[rows].T], 1) / sizes[:, None]
-    group[rows] = own
-    return group, entries
+
+    def means(of: Array) -> Array:
+        return np.stack([np.bincount(own, column) for column in of.T], 1) / np.bincount(own)[:, None]
+
+    if len(rows) <= 1 << HALVINGS:
+        own = np.arange(len(rows))
+    else:
+        for _ in range(HALVINGS):
+            centres = means(rows)
+            axis = (means(rows**2) - centres**2).argmax(1)[own]
+            above = rows[np.arange(len(rows)), axis] > centres[own, axis]
+            own = np.unique(2 * own + above, return_inverse=True)[1]
+    entry = np.zeros(len(values), np.int64)
+    entry[counts] = own
+    return entry, means(rows)

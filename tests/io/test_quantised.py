@@ -4,7 +4,6 @@ written, and what another program reads."""
 import gzip
 import json
 import struct
-import zipfile
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +13,6 @@ from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import rotation_matrices, sigmoid, unit
 from langsplat_core.errors import InputError
-from langsplat_core.io import sog
 from langsplat_core.io.quantised import read_splat, write_splat
 from langsplat_core.io.scenes import load_gaussians, load_scene
 from langsplat_core.io.sog import write_sog
@@ -382,17 +380,15 @@ def test_sog_is_written_and_read_back(tmp_path, degree):
         assert np.abs(have - want).max() < 0.05 * np.ptp(want)
 
 
-def test_sog_shares_palette_entries_of_large_scenes(tmp_path, monkeypatch):
-    monkeypatch.setattr(sog, "MOST_ENTRIES", 256)
+@pytest.mark.long
+def test_sog_shares_palette_entries_of_large_scenes(tmp_path):
     rng = np.random.default_rng(0)
-    scene = random_gaussians(5000, sh_degree=1)
+    scene = random_gaussians(70_000, sh_degree=1)
     kinds = rng.normal(size=(40, 3, 3)).astype(np.float32)
-    rest = kinds[rng.integers(0, 40, 5000)] + 0.01 * rng.normal(size=(5000, 3, 3)).astype(np.float32)
+    rest = kinds[rng.integers(0, 40, 70_000)] + 0.01 * rng.normal(size=(70_000, 3, 3)).astype(np.float32)
     scene = replace(scene, sh=np.concatenate([scene.sh[:, :1], rest], axis=1))
     got = written(tmp_path, scene)
     assert np.sqrt(((got.sh[:, 1:] - rest) ** 2).mean()) < 0.1 * rest.std()
-    meta = zipfile.ZipFile(tmp_path / "a.sog").read("meta.json")
-    assert json.loads(meta)["shN"]["count"] <= 256
 
 
 def test_sog_writes_rows_that_cannot_be_drawn(tmp_path):
@@ -415,13 +411,3 @@ def test_sog_is_deterministic(tmp_path):
     write_sog(tmp_path / "a.sog", scene)
     write_sog(tmp_path / "b.sog", scene)
     assert (tmp_path / "a.sog").read_bytes() == (tmp_path / "b.sog").read_bytes()
-
-
-def test_splat_transform_reads_the_same_sog(tmp_path, splat_transform):
-    mine = written(tmp_path, random_gaussians(2000, sh_degree=2))
-    splat_transform(tmp_path / "a.sog", tmp_path / "b.ply")
-    theirs = load_gaussians(tmp_path / "b.ply")
-    for name in ("means", "log_scales", "sh"):
-        np.testing.assert_allclose(getattr(theirs, name), getattr(mine, name), rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(sigmoid(theirs.opacity_logits), sigmoid(mine.opacity_logits), atol=1e-6)
-    assert angles(mine, theirs).max() < 0.05
