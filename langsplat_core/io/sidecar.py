@@ -47,11 +47,8 @@ A user's own words are a file of this kind too: `taught`, `taught.rivals` and `c
 format "langsplat words", version "1", encoder and taught.
 
 "float" is float16 where every number of the tensor is one, else float32: a saved scene answers exactly
-like the one in memory. With a codebook as `langsplat train` makes it that is 22 bytes per Gaussian, 6 of
-them codes and 2 the tree.
-
-The PLY stays a plain file that other programs edit; the checksum notices it, and the positions let
-`rematch_language` carry the field over to an edited PLY. Older versions are read too: version 2 has no tree
+like the one in memory. The PLY stays a plain file that other programs edit; the checksum notices it, and the
+positions let `rematch_language` carry the field over to an edited PLY. Older versions are read too: version 2 has no tree
 but `things`, uint16 (N,) number of the thing of each Gaussian, 65535 for none; in version 1 everything is
 float32, with `means` (N, 3) in place of positions and corners, no temperature and no found.
 """
@@ -151,8 +148,7 @@ def read_stored(path: Path) -> Stored:
         positions, corners = tensors["positions"], tensors["corners"]
         check_array("positions", positions, (len(field),))
         check_array("corners", corners, (2, 3))
-        means = unpack_positions(positions, corners)
-        return Stored(field, means, position_step(corners), about["means_blake2b"])
+        return Stored(field, *unpack_positions(positions, corners), about["means_blake2b"])
 
 
 @contextmanager
@@ -391,43 +387,36 @@ def read_language(path: Path | str, means: Array) -> LanguageField:
     return stored.field
 
 
-def rematch_language(
-    sidecar: Path | str, new_means: Array, max_distance: float | None = None
-) -> LanguageField:
+def rematch_language(sidecar: Path | str, new_means: Array) -> LanguageField:
     """Return the field in `sidecar`, carried over to Gaussians at `new_means` (N, 3) by nearest position.
 
-    `max_distance` is in world units; by default the median distance of the old Gaussians to their nearest
-    neighbours, so that positions may have been rounded (a compressed PLY does) but what was added or
-    moved far gets no meaning. A Gaussian without a partner has confidence 0 and zero latents.
+    Partners lie no farther apart than the old Gaussians from their nearest neighbours, in the median, so that
+    positions may have been rounded (a compressed PLY does) but what was added or moved far gets no meaning.
+    A Gaussian without a partner has confidence 0 and zero latents.
     """
     from scipy.spatial import cKDTree  # 0.2 s to import, and only this function needs it
 
-    stored: Stored = read_stored(Path(sidecar))
-    field, old_means = stored.field, stored.means
-    old_rows = np.flatnonzero(np.isfinite(old_means).all(1))
-    new_rows = np.flatnonzero(np.isfinite(new_means).all(1))
-    latents = np.zeros((len(LEVELS), len(new_means), field.latents.shape[2]), field.latents.dtype)
-    confidence = np.zeros((len(LEVELS), len(new_means)), np.float32)
-    leaves = np.full(len(new_means), NO_NODE, np.int32)
-    if len(old_rows) and len(new_rows):
-        tree = cKDTree(old_means[old_rows])
-        if max_distance is None:
-            max_distance = _median_spacing(tree)
-        distance, partner = tree.query(new_means[new_rows])
-        found = distance <= max_distance + stored.precision
-        to, source = new_rows[found], old_rows[partner[found]]
-        latents[:, to], confidence[:, to] = field.latents[:, source], field.confidence[:, source]
-        if field.tree is not None:
-            leaves[to] = field.tree.leaves[source]
-    tree = None if field.tree is None else replace(field.tree, leaves=leaves)
-    return replace(field, latents=latents, confidence=confidence, tree=tree)
-
-
-def _median_spacing(tree: Any) -> float:
-    """Median distance of (a sample of) the tree's points to their nearest neighbours; 0 for a single one."""
-    sample = tree.data[:: max(1, len(tree.data) // 10_000)]
-    distances = tree.query(sample, k=2)[0][:, 1]  # infinite where there is no second point
-    return float(np.median(np.where(np.isfinite(distances), distances, 0)))
+    stored = read_stored(Path(sidecar))
+    field, old_rows = stored.field, np.flatnonzero(np.isfinite(stored.means).all(1))
+    partner = np.full(len(new_means), -1)  # the row that is padded
+    if len(old_rows):
+        points = cKDTree(stored.means[old_rows])
+        spacing = points.query(points.data[:: max(1, len(old_rows) // 10_000)], k=2)[0][:, 1]
+        spacing[~np.isfinite(spacing)] = 0  # there is no second one
+        new_rows = np.flatnonzero(np.isfinite(new_means).all(1))
+        distance, nearest = points.query(new_means[new_rows])
+        found = distance <= np.median(spacing) + stored.precision
+        partner[new_rows[found]] = old_rows[nearest[found]]
+    field = replace(
+        field,
+        latents=np.pad(field.latents, ((0, 0), (0, 1), (0, 0)))[:, partner],
+        confidence=np.pad(field.confidence, ((0, 0), (0, 1)))[:, partner],
+        tree=None,
+    )
+    if stored.field.tree is None:
+        return field
+    leaves = np.pad(stored.field.tree.leaves, (0, 1), constant_values=NO_NODE)[partner]
+    return replace(field, tree=replace(stored.field.tree, leaves=leaves))
 
 
 # ---- positions in 8 bytes: 21 bits an axis, between the corners of their box ----
@@ -435,36 +424,33 @@ def _median_spacing(tree: Any) -> float:
 # They tell which Gaussian was which after a PLY was edited; a 2 millionth of the box is closer than that
 # needs, also where a few floaters make the box a thousand times larger than what is looked at.
 
-_BITS = 21
+_SHIFTS = np.array([0, 21, 42], np.uint64)
+_STEPS = 2**21 - 1
 _NOWHERE = np.uint64(2**64 - 1)  # of a position that is not finite
-_STEPS = 2**_BITS - 1
 
 
 def pack_positions(means: Array) -> tuple[Array, Array]:
     """Return (N, 3) float32 positions as (N,) uint64, and the (2, 3) float32 corners of what is finite."""
     finite = np.isfinite(means).all(1)
+    packed = np.full(len(means), _NOWHERE)
     if not finite.any():
-        return np.full(len(means), _NOWHERE), np.zeros((2, 3), np.float32)
+        return packed, np.zeros((2, 3), np.float32)
     corners = np.stack([means[finite].min(0), means[finite].max(0)]).astype(np.float32)
     low, span = _box(corners)
     steps = np.rint((means[finite].astype(np.float64) - low) / span * _STEPS).astype(np.uint64)
-    packed = np.full(len(means), _NOWHERE)
-    packed[finite] = steps[:, 0] | steps[:, 1] << np.uint64(_BITS) | steps[:, 2] << np.uint64(2 * _BITS)
+    packed[finite] = np.bitwise_or.reduce(steps << _SHIFTS, axis=1)
     return packed, corners
 
 
-def unpack_positions(packed: Array, corners: Array) -> Array:
-    """Return the (N, 3) float64 positions, to half a `position_step` an axis; NaN for what was not finite."""
+def unpack_positions(packed: Array, corners: Array) -> tuple[Array, float]:
+    """Return the (N, 3) float64 positions, NaN for what was not finite, and the longest step of an axis.
+
+    They are exact to half a step.
+    """
     low, span = _box(corners)
-    axes = [(packed >> np.uint64(shift)) & np.uint64(_STEPS) for shift in (0, _BITS, 2 * _BITS)]
-    means = np.stack(axes, 1).astype(np.float64) / _STEPS * span + low
+    means = (packed[:, None] >> _SHIFTS & np.uint64(_STEPS)).astype(np.float64) / _STEPS * span + low
     means[packed == _NOWHERE] = np.nan
-    return means
-
-
-def position_step(corners: Array) -> float:
-    """Return the largest distance between two neighbouring packed numbers, in units of the positions."""
-    return float(_box(corners)[1].max() / _STEPS)
+    return means, float(span.max() / _STEPS)
 
 
 def _box(corners: Array) -> tuple[Array, Array]:

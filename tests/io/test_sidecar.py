@@ -17,7 +17,6 @@ from langsplat_core.io.sidecar import (
     Words,
     means_checksum,
     pack_positions,
-    position_step,
     read_language,
     read_words,
     rematch_language,
@@ -322,9 +321,6 @@ def test_rematch_follows_removing_reordering_and_adding(sidecar, means):
     assert got.tree.leaves.tolist()[N:] == [NO_NODE] * 2
     nobody = rematch_language(sidecar, np.zeros((0, 3), np.float32))
     assert nobody.tree.leaves.shape == (0,)
-    moved = means + np.float32([0.01, 0, 0])
-    assert rematch_language(sidecar, moved, max_distance=0.02).confidence.any()
-    assert not rematch_language(sidecar, moved, max_distance=0.005).confidence.any()
 
 
 def test_a_sidecar_of_other_gaussians_names_the_rematch(sidecar, means, tmp_path):
@@ -391,13 +387,11 @@ def test_packed_positions_are_exact_to_half_a_step():
     means[7] = np.nan
     means[:, 2] = 4.0  # an axis without extent
     packed, corners = pack_positions(means)
-    got = unpack_positions(packed, corners)
+    got, step = unpack_positions(packed, corners)
     finite = np.isfinite(means).all(1)
     assert np.isnan(got[7]).all()
-    assert np.abs(got[finite] - means[finite]).max() <= 0.51 * position_step(corners)
-    assert position_step(corners) < 0.002
-    empty, nowhere = pack_positions(np.full((2, 3), np.inf, np.float32))
-    assert np.isnan(unpack_positions(empty, nowhere)).all()
+    assert np.abs(got[finite] - means[finite]).max() <= 0.51 * step < 0.001
+    assert np.isnan(unpack_positions(*pack_positions(np.full((2, 3), np.inf, np.float32)))[0]).all()
 
 
 def rounded(tensor: np.ndarray) -> np.ndarray:
