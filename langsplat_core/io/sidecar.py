@@ -48,9 +48,11 @@ format "langsplat words", version "1", encoder and taught.
 
 "float" is float16 where every number of the tensor is one, else float32: a saved scene answers exactly
 like the one in memory. The PLY stays a plain file that other programs edit; the checksum notices it, and the
-positions let `rematch_language` carry the field over to an edited PLY. Older versions are read too: version 2 has no tree
-but `things`, uint16 (N,) number of the thing of each Gaussian, 65535 for none; in version 1 everything is
-float32, with `means` (N, 3) in place of positions and corners, no temperature and no found.
+positions let `rematch_language` carry the field over to an edited PLY.
+
+Older versions are read too: version 2 has no tree but `things`, uint16 (N,) number of the thing of each
+Gaussian, 65535 for none; in version 1 everything is float32, with `means` (N, 3) in place of positions and
+corners, no temperature and no found.
 """
 
 import hashlib
