@@ -1,7 +1,5 @@
 """Fixtures of the tests of file formats."""
 
-import shutil
-import subprocess
 import tracemalloc
 import warnings
 
@@ -32,12 +30,3 @@ def put(tmp_path):
         return path
 
     return write
-
-
-@pytest.fixture
-def splat_transform():
-    """Runs @playcanvas's program of that name; the test is skipped where it is not installed."""
-    program = shutil.which("splat-transform")
-    if program is None:
-        pytest.skip("splat-transform of @playcanvas is not installed")
-    return lambda *words: subprocess.run([program, "-w", "-q", *words], check=True, timeout=300)

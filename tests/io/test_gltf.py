@@ -15,9 +15,8 @@ from plyfile import PlyData
 from langsplat_core.arrays import sigmoid, unit
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.gltf import EXTENSION, PACKED, write_gltf
-from langsplat_core.io.ply import write_ply
 from langsplat_core.io.scenes import load_gaussians
-from langsplat_core.io.shapes import base_colours, gltf_axes, write_meshes, write_points
+from langsplat_core.io.shapes import gltf_axes, write_mesh, write_points
 from langsplat_core.io.spz import write_spz
 from langsplat_core.scene import Gaussians, Scene
 from langsplat_core.scene.transform import moving, rotating, scaling, transform_gaussians
@@ -234,30 +233,18 @@ def test_written_files_keep_the_rules(tmp_path):
     assert np.less(positions["min"], positions["max"]).all()
 
 
-def test_files_of_splat_transform_are_read(tmp_path, splat_transform):
-    scene = random_gaussians(500, sh_degree=3)
-    write_ply(tmp_path / "a.ply", scene)
-    splat_transform(tmp_path / "a.ply", tmp_path / "b.glb")
-    got = load_gaussians(tmp_path / "b.glb")
-    for name in ("means", "log_scales", "sh"):
-        np.testing.assert_allclose(getattr(got, name), getattr(scene, name), atol=1e-5)
-    np.testing.assert_allclose(covariances(got), covariances(scene), rtol=1e-4, atol=1e-5)
-
-
 # Point clouds and meshes, read back by other programs.
 
 TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float64)
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
-SHADES = np.array([[1.0, 0, 0], [0, 0.5, 0], [0, 0, 0], [0, 1, 0]])  # of the vertices of the first
-MESHES = [
-    SimpleNamespace(name="red mug 1", vertices=TETRAHEDRON, triangles=FACES, colour=SHADES),
-    SimpleNamespace(name="two", vertices=TETRAHEDRON + 5, triangles=FACES, colour=np.array([1, 0, 0.5])),
-]
+SHADES = np.array([[1.0, 0, 0], [0, 0.5, 0], [0, 0, 0], [0, 1, 0]])
+MESH = SimpleNamespace(name="red mug", vertices=TETRAHEDRON, triangles=FACES, colour=SHADES)
 
 
 def test_points_have_colours_and_extras(tmp_path):
     gaussians = random_gaussians(40, sh_degree=1)
     gaussians.means[7] = np.nan
+    gaussians.sh[8, 0] = 9, -9, 0
     relevancy = np.linspace(0, 1, 40)
     assert write_points(tmp_path / "a.ply", gaussians, {"relevancy": relevancy}) == 39
     vertex = PlyData.read(tmp_path / "a.ply")["vertex"]
@@ -269,39 +256,19 @@ def test_points_have_colours_and_extras(tmp_path):
     np.testing.assert_allclose(vertex["relevancy"], relevancy[kept], atol=1e-7)
 
 
-def test_base_colours_lie_between_0_and_1():
-    gaussians = random_gaussians(4)
-    gaussians.sh[:, 0] = [[np.nan, np.inf, -np.inf], [9, -9, 0], [0, 0, 0], [1, 1, 1]]
-    colours = base_colours(gaussians)
-    assert ((colours >= 0) & (colours <= 1)).all()
-    assert colours[1].tolist() == [1, 0, 0.5]
-
-
-def test_a_ply_holds_all_meshes(tmp_path):
-    write_meshes(tmp_path / "a.ply", MESHES)
+def test_a_ply_holds_a_mesh(tmp_path):
+    write_mesh(tmp_path / "a.ply", MESH, np.eye(4))
     data = PlyData.read(tmp_path / "a.ply")
-    places = np.stack([data["vertex"][k] for k in "xyz"], 1)
-    np.testing.assert_array_equal(places, np.concatenate([TETRAHEDRON, TETRAHEDRON + 5]))
-    faces = np.stack(data["face"]["vertex_indices"])
-    np.testing.assert_array_equal(faces, np.concatenate([FACES, FACES + 4]))
-    assert data["vertex"]["red"].tolist() == [255, 0, 0, 0] + [255] * 4
-
-
-def test_an_obj_names_its_objects(tmp_path):
-    write_meshes(tmp_path / "a.OBJ", MESHES)
-    lines = (tmp_path / "a.OBJ").read_text().splitlines()
-    assert [line for line in lines if line.startswith("o ")] == ["o red_mug_1", "o two"]
-    assert lines[2] == "v 1 0 0 0.0000 0.5000 0.0000"
-    faces = np.array([line.split()[1:] for line in lines if line.startswith("f ")], int)
-    np.testing.assert_array_equal(faces, np.concatenate([FACES, FACES + 4]) + 1)
+    np.testing.assert_array_equal(np.stack([data["vertex"][k] for k in "xyz"], 1), TETRAHEDRON)
+    np.testing.assert_array_equal(np.stack(data["face"]["vertex_indices"]), FACES)
+    assert data["vertex"]["red"].tolist() == [255, 0, 0, 0]
 
 
 def test_a_glb_mesh_has_linear_colours_and_y_up(tmp_path):
     scene = Scene(random_gaussians(3), metres_per_unit=2.0)
-    write_meshes(tmp_path / "a.glb", MESHES, gltf_axes(scene))
+    write_mesh(tmp_path / "a.glb", MESH, gltf_axes(scene))
     content, binary = parts((tmp_path / "a.glb").read_bytes())
     assert content["buffers"][0]["byteLength"] == len(binary)
-    assert len(content["meshes"]) == 2
     np.testing.assert_array_equal(np.frombuffer(binary[:48], "<f4").reshape(4, 3), TETRAHEDRON)
     colours = np.frombuffer(binary[48:80], "<u2").reshape(4, 4) / 65_535
     np.testing.assert_allclose(colours[:, :3].sum(1), [1, 0.2140, 0, 1], atol=1e-4)
@@ -309,26 +276,9 @@ def test_a_glb_mesh_has_linear_colours_and_y_up(tmp_path):
     np.testing.assert_allclose(matrix @ [*scene.up(), 1], [0, 2, 0, 1], atol=1e-6)  # up, metres
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb"])
-def test_open3d_reads_meshes_and_points(tmp_path, suffix):
-    open3d = pytest.importorskip("open3d")
-    write_meshes(tmp_path / f"a{suffix}", MESHES)
-    mesh = open3d.io.read_triangle_mesh(str(tmp_path / f"a{suffix}"))
-    assert len(mesh.triangles) == 8
-    assert mesh.is_watertight()
-    assert mesh.get_volume() == pytest.approx(1 / 3)
-    shades = dict(zip(map(tuple, np.asarray(mesh.vertices)), np.asarray(mesh.vertex_colors), strict=True))
-    found = [shades[tuple(place)] for place in TETRAHEDRON]
-    if suffix != ".glb":  # whose colours are linear
-        np.testing.assert_allclose(found, SHADES, atol=0.003)
-    write_points(tmp_path / "p.ply", random_gaussians(10))
-    assert len(open3d.io.read_point_cloud(str(tmp_path / "p.ply")).points) == 10
-
-
 def test_another_suffix_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"\.ply; choose"):
+    with pytest.raises(InputError):
         write_points(tmp_path / "a.obj", random_gaussians(3))
-    with pytest.raises(InputError, match=r"\.ply or \.obj"):
-        write_meshes(tmp_path / "a.stl", MESHES)
+    with pytest.raises(InputError):
+        write_mesh(tmp_path / "a.stl", MESH, np.eye(4))
     assert list(tmp_path.iterdir()) == []

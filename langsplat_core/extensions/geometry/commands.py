@@ -27,7 +27,7 @@ from langsplat_core.extensions.geometry.registration import TRUSTED, Registratio
 from langsplat_core.io.files import atomic_path, write_json
 from langsplat_core.io.hostile import read_json_file
 from langsplat_core.io.scenes import check_keeps, check_writable, load_scene, save_scene
-from langsplat_core.io.shapes import MESH_SUFFIXES, check_suffix, gltf_axes, write_meshes
+from langsplat_core.io.shapes import MESH_SUFFIXES, check_suffix, gltf_axes, write_mesh
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.describe import Describer
@@ -51,7 +51,7 @@ class WriteMesh:
 
     scene: AnyScene
     out: tyro.conf.Positional[OutFile]
-    """File to write: .ply or .obj in world units, .glb in metres with y up."""
+    """File to write: .ply in world units, .glb in metres with y up."""
     phrase: str = ""
     """Of everything that this names alone; the scene then needs its language field."""
     level: LevelChoice = "auto"
@@ -86,7 +86,7 @@ class WriteMesh:
                 left = "" if mesh.holes() == 0 else f", {mesh.holes()} left at the border of the scene"
                 made = f" closed{left}; made up: {area * unit.length**2:.3g} {unit.name}^2 ({share:.0f} %)"
             mesh = replace(mesh, name=self.phrase or self.scene.stem)
-            write_meshes(self.out, [mesh], gltf_axes(scene))
+            write_mesh(self.out, mesh, gltf_axes(scene))
         print(
             f"{self.out}: {len(mesh.triangles)} triangles, {len(mesh.vertices)} vertices, voxels of "
             f"{side * unit.length:.3g} {unit.name}; {holes} holes{made}"

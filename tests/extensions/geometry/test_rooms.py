@@ -203,7 +203,7 @@ def test_a_mesh_of_a_room_is_written(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("mesh a.ply m.stl", ".ply or .obj or .glb"),
+        ("mesh a.ply m.stl", ".ply or .glb"),
         ("mesh a.ply a.ply", "would replace the original"),
         ("mesh a.ply m.ply --resolution 1e-9", "finer than the images"),
         ("mesh a.ply m.ply --phrase mug", "no language field"),
