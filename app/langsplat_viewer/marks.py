@@ -137,16 +137,16 @@ def caught(drawn: Drawn, means: Array, depths: Array | None = None) -> Array:
     if drawn.tool not in ON_SCREEN:
         return _in_body(drawn, means)
     camera, pixels = drawn.camera, drawn.pixels
-    seen = project(means, camera)
+    seen, size = project(means, camera), (camera.width, camera.height)
     if drawn.tool == "rectangle":
         inside = in_rectangle(seen, pixels[0], pixels[-1])
     elif drawn.tool == "lasso":
-        inside = in_polygon(seen, pixels)
+        inside = in_polygon(seen, pixels, size)
     else:
-        inside = in_stroke(seen, pixels, drawn.brush * camera.height)
+        inside = in_stroke(seen, pixels, drawn.brush * camera.height, size)
     if depths is None:
         return inside
-    return inside & on_surface(seen, depths, (camera.width, camera.height))
+    return inside & on_surface(seen, depths, size)
 
 
 def _in_body(drawn: Drawn, means: Array) -> Array:

@@ -7,9 +7,9 @@ be on it go where the one goes that they are nearest to (`Surface.anchors`); tho
 from dataclasses import dataclass
 
 import numpy as np
+from PIL import Image, ImageDraw
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
-from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.errors import InputError
@@ -26,10 +26,7 @@ def of_rows(rows: Array, count: int) -> Array:
 
 
 def in_sphere(means: Array, centre: Array, radius: float) -> Array:
-    """(N, 3) -> (N,) bool: at most `radius` from `centre` (3,), world units.
-
-    A mean that is not finite is nowhere.
-    """
+    """(N, 3) -> (N,) bool: finite, and at most `radius` from `centre` (3,), world units."""
     offsets = np.asarray(means, np.float64) - centre
     with np.errstate(invalid="ignore"):
         squares: Array = (offsets**2).sum(1)
@@ -42,21 +39,14 @@ def in_box(means: Array, low: Array, high: Array) -> Array:
 
 
 def above_plane(means: Array, normal: Array, offset: float) -> Array:
-    """(N, 3) -> (N,) bool: on the side of a plane that its `normal` (3,) points to, itself included.
-
-    offset: of its points along the normal as it is given. A mean that is not finite is nowhere.
-    """
+    """(N, 3) -> (N,) bool: finite, and `normal` (3,) @ mean >= offset."""
     with np.errstate(invalid="ignore"):
         above: Array = np.asarray(means, np.float64) @ np.asarray(normal, np.float64) >= offset
         return above & np.isfinite(means).all(1)
 
 
 def at_point(surface: Surface, regions: Regions, level: int, point: Array) -> Array:
-    """Return the (N,) bool region of what lies nearest to `point` (3,), world units.
-
-    It is the whole region at a level (index into LEVELS), with the faint Gaussians beside it. Nothing where
-    the scene has no surface.
-    """
+    """Return the (N,) bool region, at a level (index into LEVELS), of the surface nearest to `point` (3,)."""
     if len(surface.rows) == 0:
         return np.zeros(len(surface.anchors), bool)
     nearest = int(((surface.positions - point) ** 2).sum(1).argmin())
@@ -64,10 +54,7 @@ def at_point(surface: Surface, regions: Regions, level: int, point: Array) -> Ar
 
 
 def in_pixel(regions: Regions, level: int, rows: Array, weights: Array) -> Array:
-    """Return the (N,) bool region, at a level, that paints most of a pixel.
-
-    rows: (M,) Gaussians in the pixel; weights: (M,) blending weights. Nothing where no region does.
-    """
+    """Return the (N,) bool region, at a level, that paints most of a pixel: (M,) Gaussians, (M,) weights."""
     of = regions.everywhere[level]
     shares = np.bincount(of[rows] + 1, weights, 1)[1:]
     return np.asarray(of == shares.argmax()) if shares.any() else np.zeros(len(of), bool)
@@ -80,17 +67,18 @@ def grow(surface: Surface, selected: Array, distance: float) -> Array:
     reached = selected[surface.rows]
     if not reached.any() or reached.all():
         return _with_reached(surface, selected, reached)
-    lengths = dijkstra(
-        _lengths(surface), directed=False, indices=np.flatnonzero(reached), limit=distance, min_only=True
-    )
-    return _with_reached(surface, selected, np.isfinite(lengths))
+    links = surface.links
+    source = np.repeat(np.arange(len(surface.rows)), np.diff(links.indptr))
+    gaps = np.linalg.norm(surface.positions[source] - surface.positions[links.indices], axis=1)
+    # A stored zero is no link to the sparse format's walkers: coincident points are at the least distance.
+    lengths = csr_matrix((np.maximum(gaps, 1e-12), links.indices, links.indptr), shape=links.shape)
+    seeds = np.flatnonzero(reached)
+    away = dijkstra(lengths, directed=False, indices=seeds, limit=distance, min_only=True)
+    return _with_reached(surface, selected, np.isfinite(away))
 
 
 def shrink(surface: Surface, selected: Array, distance: float) -> Array:
-    """Return `selected` without what lies within `distance` of the rest along the surface, world units.
-
-    Where the surface itself ends, nothing is lost.
-    """
+    """Return `selected` without what is within `distance` of the rest; where the surface ends, none is."""
     return ~grow(surface, ~selected, distance)
 
 
@@ -101,19 +89,8 @@ def _with_reached(surface: Surface, selected: Array, reached: Array) -> Array:
     return selected | (reached[surface.anchors] & (surface.anchors >= 0))
 
 
-def _lengths(surface: Surface) -> csr_matrix:
-    """Return the links of the surface, weighted by their lengths, world units."""
-    links = surface.links
-    source = np.repeat(np.arange(len(surface.rows)), np.diff(links.indptr))
-    gaps = np.linalg.norm(surface.positions[source] - surface.positions[links.indices], axis=1)
-    # A stored zero is no link to the sparse format's walkers: coincident points are at the least distance.
-    return csr_matrix((np.maximum(gaps, 1e-12), links.indices, links.indptr), shape=links.shape)
-
-
 # Selections drawn on an image: the Gaussians whose centres a camera sees inside an outline or a stroke.
-#
-# Places are pixels of the camera, x to the right and y down, the centre of the first pixel at (0.5, 0.5).
-# What lies on or behind the camera's plane, or has no finite place, is never inside.
+# Places are pixels of the camera, the centre of the first at (0.5, 0.5).
 
 BEHIND = 0.03  # of the surface's depth: a centre no farther behind it is on the surface that one sees
 
@@ -146,70 +123,51 @@ def in_rectangle(seen: Projected, corner: Array, opposite: Array) -> Array:
     return seen.ahead & ((seen.pixels >= low) & (seen.pixels <= high)).all(1)
 
 
-def in_polygon(seen: Projected, outline: Array) -> Array:
-    """Return (N,) bool: inside the closed `outline` (K, 2), pixels, by the even-odd rule.
-
-    Nothing is inside fewer than three corners. What lies exactly on an edge may count either way. A ray from
-    the centre to the right crosses an odd number of edges (Shimrat 1962, Algorithm 112). Centres are sorted
-    by height once, so that an edge meets only those that are level with it.
-    """
-    outline = np.asarray(outline, np.float64)
+def in_polygon(seen: Projected, outline: Array, size: tuple[int, int]) -> Array:
+    """Return (N,) bool: in a pixel inside the closed `outline` (K, 2), pixels, of an image of `size`."""
     check_array("outline", outline, ("K", 2))
-    inside = np.zeros(len(seen.depths), bool)
-    if len(outline) < 3:
-        return inside
-    near = np.flatnonzero(in_rectangle(seen, outline.min(0), outline.max(0)))
-    near = near[np.argsort(seen.pixels[near, 1], kind="stable")]
-    x, y = seen.pixels[near].T
-    odd = np.zeros(len(near), bool)
-    for (x0, y0), (x1, y1) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
-        first, last = np.searchsorted(y, (min(y0, y1), max(y0, y1)))
-        level = slice(first, last)
-        if first < last:  # also: the edge is not level itself
-            odd[level] ^= x[level] < x0 + (y[level] - y0) * ((x1 - x0) / (y1 - y0))
-    inside[near] = odd
-    return inside
+    mask = Image.new("1", size)
+    if len(outline) >= 3:
+        ImageDraw.Draw(mask).polygon([*map(tuple, outline - 0.5)], fill=1)
+    return _in_mask(seen, mask)
 
 
-def in_stroke(seen: Projected, path: Array, radius: float) -> Array:
-    """Return (N,) bool: at most `radius` pixels from the line through `path` (K, 2), pixels, K >= 1.
-
-    Of one place, that is a disk. Between two places of a fast mouse there is no gap.
-    """
-    path = np.asarray(path, np.float64)
+def in_stroke(seen: Projected, path: Array, radius: float, size: tuple[int, int]) -> Array:
+    """Return (N,) bool: in a pixel of `size` at most `radius` pixels from the line through `path` (K, 2)."""
     check_array("path", path, ("K", 2))
-    inside = np.zeros(len(seen.depths), bool)
-    if len(path) == 0:
-        return inside
-    near = np.flatnonzero(in_rectangle(seen, path.min(0) - radius, path.max(0) + radius))
-    if len(near) == 0:
-        return inside
-    pixels = seen.pixels[near]
-    tree = cKDTree(pixels)
-    swept = np.zeros(len(near), bool)
-    for start, end in zip(path, path[1:] if len(path) > 1 else path, strict=False):
-        half = (end - start) / 2
-        around = 1.001 * (radius + np.hypot(*half)) + 1e-9  # a little more: what counts is decided below
-        some = np.array(tree.query_ball_point(start + half, around, return_sorted=False), np.intp)
-        offsets = pixels[some] - start
-        share = np.clip(offsets @ (2 * half) / max(4 * half @ half, 1e-300), 0, 1)
-        swept[some] |= ((offsets - share[:, None] * (2 * half)) ** 2).sum(1) <= radius**2
-    inside[near] = swept
+    mask = Image.new("1", size)
+    draw = ImageDraw.Draw(mask)
+    draw.line([*map(tuple, path - 0.5)], fill=1, width=round(2 * radius))
+    for x, y in path - 0.5:
+        draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=1)
+    return _in_mask(seen, mask)
+
+
+def _in_mask(seen: Projected, mask: Image.Image) -> Array:
+    inside, columns, rows = _cells(seen, 1.0, 1.0, mask.width, mask.height)
+    inside[inside] = np.asarray(mask)[rows, columns]
     return inside
+
+
+def _cells(
+    seen: Projected, across: float, down: float, width: int, height: int
+) -> tuple[Array, Array, Array]:
+    """(N,) bool, which lie in a grid of that size, and the columns and rows of those, at cells per pixel."""
+    columns, rows = np.floor(seen.pixels * (across, down)).T
+    inside = seen.ahead & (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    return inside, columns[inside].astype(np.intp), rows[inside].astype(np.intp)
 
 
 def on_surface(seen: Projected, depths: Array, size: tuple[int, int], behind: float = BEHIND) -> Array:
-    """Return (N,) bool: in the image and not hidden there.
+    """Return (N,) bool: in the image of `size` and not hidden there.
 
-    The depth of the centre is at most that of the surface in its pixel and `behind` of it more. Where nothing
-    is drawn, nothing hides. depths: (H, W) camera z of the surface, world units, 0 where nothing is drawn; it
-    may be coarser or finer than the `size` (width, height) of the image that the centres were projected into.
+    The depth of the centre is at most that of the surface in its pixel and `behind` of it more. depths:
+    (H, W) camera z of the surface, world units, 0 where nothing is drawn and nothing hides; it may be coarser
+    or finer than the image.
     """
     check_array("depths", depths, ("H", "W"))
     height, width = depths.shape
-    columns, rows = np.floor(seen.pixels * (width / size[0], height / size[1])).T
-    inside = seen.ahead & (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    numbers = np.flatnonzero(inside)
-    there = depths[rows[numbers].astype(np.intp), columns[numbers].astype(np.intp)].astype(np.float64)
-    inside[numbers] = (there <= 0) | (seen.depths[numbers] <= there * (1 + behind))
+    inside, columns, rows = _cells(seen, width / size[0], height / size[1], width, height)
+    there = depths[rows, columns].astype(np.float64)
+    inside[inside] = (there <= 0) | (seen.depths[inside] <= there * (1 + behind))
     return inside
