@@ -12,8 +12,8 @@ from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import Atom, Both, Counted, Inside, Relation, Superlative, Union, Without
 from langsplat_core.query.relations import Body, body, most, separate, stands, upright, viewpoint
-from langsplat_core.scene import NO_NODE, look_at
-from langsplat_core.scene.language import split_phrases, tree_of_wholes
+from langsplat_core.scene import look_at
+from langsplat_core.scene.language import split_phrases
 from langsplat_core.scene.surface import build_surface
 from tests.support.fakes import UP, PlainEncoder, front_camera, laid_table, meaning
 
@@ -319,19 +319,3 @@ def test_separate_drops_specks():
     parts = separate(surface, inside)
     assert [len(part) for part in parts] == [blocks["far mug"].sum()]  # the book has less than a tenth of it
     assert separate(surface, np.zeros(len(surface.rows), bool)) == []
-
-
-def test_voted_wholes_divide_touching_things_and_join_hidden_ones():
-    """A mug and the table under it are one connected surface, and two things; of what is of no thing, the
-    surface decides."""
-    scene, blocks = laid_table()
-    surface = build_surface(scene.gaussians)
-    mugs = blocks["far mug"] | blocks["red mug"]
-    inside: Array = (mugs | blocks["table"])[surface.rows]
-    things = np.full(len(scene.gaussians), NO_NODE)
-    things[mugs] = 3  # as if one thing, half hidden by what stands before it
-    counts = sorted(len(part) for part in separate(surface, inside, tree_of_wholes(things)))
-    assert counts == sorted([int(mugs.sum()), int(blocks["table"].sum())])
-    apart = separate(surface, mugs[surface.rows], tree_of_wholes(np.full(len(things), NO_NODE)))
-    assert [list(part) for part in apart] == [list(part) for part in separate(surface, mugs[surface.rows])]
-    assert len(apart) == 2

@@ -3,8 +3,6 @@ the basis of answers; and relevancy, by whatever the codec allows, against its d
 
 import math
 import multiprocessing
-import os
-import sys
 import threading
 import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
@@ -39,7 +37,6 @@ from langsplat_core.scene import (
     PlattScaling,
     Scene,
 )
-from langsplat_core.scene.codec import CodebookCodec
 from langsplat_core.semantics import relevancy as relevancies
 from langsplat_core.semantics.encoders import DEMO, OPEN_MODEL
 from langsplat_core.semantics.relevancy import Scale, latent_relevancy, relevancy, relevancy_of
@@ -224,22 +221,6 @@ def test_forked_process_gives_its_parents_answers(how: str) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.skipif(sys.platform == "win32", reason="no fork")
-def test_forked_process_may_fork_again() -> None:
-    wanted = answers()
-    child = os.fork()
-    if child == 0:
-        grandchild = os.fork()
-        code = 1
-        try:
-            check_equal(answers(), wanted)
-            code = 0 if grandchild == 0 else os.waitstatus_to_exitcode(os.waitpid(grandchild, 0)[1])
-        finally:
-            os._exit(code)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
-
-
-@pytest.mark.long
 def test_twelve_threads_share_engine_and_rasterizer() -> None:
     wanted = answers()
     shared.cache_clear()
@@ -286,13 +267,6 @@ def test_basis_names_a_calibration_where_there_is_one(encoder, calibration, ever
     engine.compare_with(["plant"])
     assert engine.run("mug").probability is None
     assert engine.basis.calibration is None
-
-
-def test_basis_tells_rules_apart():
-    demo, clip = scene_of(DEMO, CALIBRATED), scene_of("lab/clip")
-    guessed, published = scene_of(DEMO), scene_of("lab/clip", everyday=False)
-    said = [QueryEngine(scene).basis for scene in (demo, clip, guessed, published)]
-    assert len({basis.short for basis in said}) == len({basis.long for basis in said}) == 4
 
 
 class Speaker(FakeEncoder):
@@ -379,28 +353,6 @@ def test_codeword_zero_is_a_feature():
     assert (np.delete(values[2], 4) > 0.5).all()
 
 
-def test_fits_do_not_depend_on_the_size_of_cosines():
-    """All texts and features mixed with directions of their own lie closer together, as CLIP's do; what a
-    phrase fits against everyday phrases stays, and as published it does not."""
-    field = random_field(200, "codebook")
-    dim, share = field.codec.vector_dim, 0.2
-
-    def beside(vectors: Array, axis: int) -> Array:
-        common = np.zeros((len(vectors), 2))
-        common[:, axis] = math.sqrt(1 - share)
-        return np.concatenate([math.sqrt(share) * vectors, common], 1).astype(np.float32)
-
-    codec = CodebookCodec(beside(field.codec.vectors, 0), field.codec.palette)
-    canonical, everyday = beside(field.canonical, 1), beside(field.everyday, 1)
-    narrow = replace(field, codec=codec, canonical=canonical, everyday=everyday, phrasebook={})
-    phrase = unit(np.random.default_rng(3).normal(size=dim))[None].astype(np.float32)
-    for chance, tolerance in ((True, 1e-5), (False, None)):
-        wide = next(Lookup(field, scale_of(field, chance)).relevancies(phrase))
-        close = next(Lookup(narrow, scale_of(narrow, chance)).relevancies(beside(phrase, 1)))
-        apart = np.abs(wide - close).max()
-        assert apart < tolerance if tolerance else apart > 0.2
-
-
 @pytest.mark.parametrize("everyday", [np.ones((1, 4)), np.eye(4)[[0] * 60], np.zeros((60, 4))])
 def test_identical_everyday_phrases_give_finite_scales(everyday):
     scale = Scale(np.eye(4, dtype=np.float32)[:1], unit(everyday).astype(np.float32), 10.0)
@@ -453,20 +405,6 @@ def test_published_relevancy_is_the_minimum_of_pairwise_softmaxes(linear):
         np.testing.assert_allclose(got, want, atol=1e-5)
     assert (latent_relevancy(codec, 0 * latents, phrases, canonical) == 0).all()
     assert relevancy(vectors[:1], vectors[:1], vectors[:1]).tolist() == [[relevancies.FLOOR]]
-
-
-def test_cells_hold_latents_near_their_centres():
-    rng = np.random.default_rng(5)
-    latents = unit(rng.normal(size=(5000, 3)) * (1, 1, 0.2)).astype(np.float32)
-    latents[:6] = np.concatenate([np.eye(3), -np.eye(3)])  # the fold's corners and edges
-    for most, farthest in ((300, 0.25), (1200, 0.13)):
-        cells, centres = sphere_cells(5 * latents, most)
-        assert 0.6 * most < len(centres) <= most
-        assert np.array_equal(np.unique(cells), np.arange(len(centres)))
-        np.testing.assert_allclose(np.linalg.norm(centres, axis=1), 1, atol=1e-6)
-        assert np.linalg.norm(latents - centres[cells], axis=1).max() < farthest
-    cells, centres = sphere_cells(latents, 5000)
-    np.testing.assert_allclose(centres[cells], latents, atol=1e-6)
 
 
 def test_cells_converge_to_exact_decoding():

@@ -172,15 +172,6 @@ def test_merge_shrinks_a_dense_scene_that_looks_alike(dense):
     assert sorted(entries.col[entries.data > 0]) == list(range(1600))  # every row counts once
 
 
-def test_merge_does_not_depend_on_blocks(dense, monkeypatch):
-    whole = merged(dense).gaussians
-    monkeypatch.setattr("langsplat_core.scene.gaussians.BLOCK", 37)
-    blocks = merged(dense).gaussians
-    whole, blocks = (one.take(np.lexsort(one.means.T)) for one in (whole, blocks))
-    for name in ("means", "log_scales", "sh"):
-        np.testing.assert_array_equal(getattr(whole, name), getattr(blocks, name))
-
-
 def test_merge_leaves_out_invalid_rows():
     broken = random_gaussians(11)
     broken.means[3] = np.nan
