@@ -15,7 +15,7 @@ from langsplat_core.cli.train import Train
 from langsplat_core.config import AutoencoderConfig, TrainConfig, check_settings, numeric_settings
 from langsplat_core.errors import InputError
 from langsplat_core.pipeline.train import train_scene
-from tests.support.commands import refusal
+from tests.support.processes import refusal
 
 CONFIGS = {
     name: value

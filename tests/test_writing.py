@@ -29,10 +29,16 @@ from langsplat_viewer.files.projects import Bookmark, Shelf, save_preferences, w
 from langsplat_viewer.output import Film, save_png, write_film
 from langsplat_viewer.session import Preferences, Query, Session
 from tests.support.file_samples import random_field
-from tests.support.processes import bound_by_permissions, files_of_at_most
+from tests.support.processes import (
+    Captured,
+    Write,
+    bound_by_permissions,
+    check_full_disk,
+    contents,
+    files_of_at_most,
+)
 from tests.support.scenes import random_camera, random_gaussians
 from tests.support.windowless import flight as some_flight
-from tests.support.writing import Captured, Write, check_full_disk, check_small_disk, contents
 
 CHECKS = [check_output_file, check_output_folder]
 Check = Callable[[Path], None]
@@ -242,18 +248,3 @@ def test_other_errors_of_a_writer_are_raised(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="ours"), files_of_at_most(0), atomic_path(tmp_path / "a"):
         raise InputError("ours")
     assert not list(tmp_path.iterdir())
-
-
-LARGER = Scene(random_gaussians(6_000, 3, sh_degree=3), random_field(6_000, seed=4), SCENE.cameras)
-LARGE: dict[str, Write] = {
-    "large scene": lambda folder: save_scene(folder / "s.ply", LARGER),
-    "large sidecar": lambda folder: write_language(
-        folder / "s.safetensors", random_field(40_000, seed=5), random_gaussians(40_000).means
-    ),
-}
-FILLED: dict[str, Write] = {**WRITERS, **LARGE}
-
-
-@pytest.mark.parametrize("name", FILLED)
-def test_a_small_disk_that_fills_up_is_a_line(name: str, tmp_path: Path, capsys: Captured) -> None:
-    check_small_disk(FILLED[name], tmp_path, capsys)

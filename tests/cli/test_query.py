@@ -18,7 +18,6 @@ from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.encoders import OPEN_MODEL
-from tests.support.commands import refusal, run
 from tests.support.fakes import (
     CENTRES,
     NAMES,
@@ -32,6 +31,7 @@ from tests.support.fakes import (
     language,
     named_scene,
 )
+from tests.support.processes import refusal, run
 
 
 @pytest.fixture

@@ -11,9 +11,9 @@ from langsplat_core.cli import query
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.io.sidecar import read_words
 from langsplat_core.scene import Scene
-from tests.support.commands import refusal, run
 from tests.support.comparing import assert_same_field
 from tests.support.fakes import PER_BLOB, axis, language, named_scene
+from tests.support.processes import refusal, run
 
 SCENE = named_scene()
 

@@ -27,7 +27,6 @@ from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import NO_NODE, Scene
 from langsplat_core.scene.language import Tree
 from langsplat_core.semantics.features import ImageFeatures
-from tests.support.commands import run
 from tests.support.fakes import (
     CENTRES,
     DIM,
@@ -41,6 +40,7 @@ from tests.support.fakes import (
     cameras,
     named_scene,
 )
+from tests.support.processes import run
 from tests.support.tiny_models import tiny_room, tiny_settings
 
 VIEWS = 8

@@ -35,10 +35,9 @@ from langsplat_core.raster.render import render
 from langsplat_core.semantics.features import ImageFeatures
 from langsplat_core.semantics.masks import LevelMasks, MaskSource
 from langsplat_core.training.language.merge_tree import draw_patches
-from tests.support.commands import run
 from tests.support.comparing import assert_same_tree
 from tests.support.fakes import PER_BLOB, blob_scene, cameras
-from tests.support.processes import bound_by_permissions, stop_at
+from tests.support.processes import bound_by_permissions, run, stop_at
 from tests.support.tiny_models import tiny_room, tiny_settings
 
 pytestmark = pytest.mark.long

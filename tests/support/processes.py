@@ -1,7 +1,11 @@
-"""What stops a program (permissions, a full disk, its user), programs on a display of their own, browsers."""
+"""The program `langsplat` in this process and in children; what stops programs; windows and browsers.
+
+python -m tests.support.processes FOLDER    runs `langsplat convert` for every FOLDER/NAME.pth
+"""
 
 import base64
 import ctypes
+import gc
 import json
 import os
 import resource
@@ -11,6 +15,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +23,9 @@ import numpy as np
 import pytest
 
 from langsplat_core.arrays import Array
+from langsplat_core.cli.app import parse
+from langsplat_core.cli.export import Convert
+from langsplat_core.cli.run import main
 from langsplat_core.io import apart
 from langsplat_core.progress import Progress, Report, WorkCancelledError
 from langsplat_core.scene import Camera
@@ -234,3 +242,126 @@ def open_tab(browser: Any, path: Path, **settings: Any) -> Iterator[Tab]:
         yield tab
     finally:
         context.close()
+
+
+# The program `langsplat`.
+
+
+def run(*words: object) -> int:
+    """The exit code of `langsplat` with these words."""
+    return main("langsplat", lambda: parse([str(word) for word in words]))
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+    """The one line with which `langsplat` refuses these words; nothing is printed beside it."""
+    capsys.readouterr()
+    assert run(*words) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    (line,) = (line for line in said.err.splitlines() if line.startswith("langsplat"))
+    return line
+
+
+# A command once for each of many files, each in a child of one process that has all imports behind it: what
+# crashes is told from what refuses, and starting torch is paid for once.
+
+ROOM, SECONDS = 3 << 30, 20  # bytes of address space beyond the parent's, seconds of the processor
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a child ended."""
+
+    code: int  # negative: the number of the signal that killed it
+    said: str  # on the standard error
+    wrote: bool  # anything beside its log
+
+
+def convert_each(folder: Path) -> dict[str, Ended]:
+    """`langsplat convert` of every checkpoint in `folder`, by name."""
+    command = [sys.executable, "-m", __name__, str(folder)]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+    return {name: Ended(*how) for name, how in json.loads(done.stdout).items()}
+
+
+def _child(path: Path) -> tuple[int, str, bool]:
+    folder = path.with_suffix("")
+    folder.mkdir()
+    log = path.with_suffix(".log")
+    process = os.fork()
+    if process == 0:
+        try:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+            os.dup2(os.open(log, os.O_CREAT | os.O_WRONLY), 2)
+            held = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+            resource.setrlimit(resource.RLIMIT_AS, (held + ROOM,) * 2)
+            resource.setrlimit(resource.RLIMIT_CPU, (SECONDS,) * 2)
+            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+            code = main("langsplat", lambda: Convert(path, (folder / "out.ply",)))
+        except BaseException:  # noqa: BLE001  as at the end of any program
+            sys.excepthook(*sys.exc_info())  # type: ignore[arg-type]
+            code = 1
+        sys.stderr.flush()
+        os._exit(code)
+    code = os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
+    return code, log.read_text(), any(folder.iterdir())
+
+
+def _all(folder: Path) -> None:
+    import langsplat_core.extensions.checkpoints.importing  # noqa: F401  and torch, once for all children
+
+    gc.freeze()  # or every child copies what its first collection touches
+    print(json.dumps({path.stem: _child(path) for path in sorted(folder.glob("*.pth"))}))
+
+
+# The law of a full disk, for any function that writes: exit code 2, one line, and what was there stays.
+
+
+Write = Callable[[Path], object]  # gets a folder of its own
+Captured = pytest.CaptureFixture[str]
+
+
+@dataclass
+class _Command:
+    """A command that writes."""
+
+    write: Write
+    folder: Path
+
+    def run(self) -> None:
+        self.write(self.folder)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return what lies in a folder, file by file."""
+    found = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in found}
+
+
+def check_full_disk(write: Write, tmp_path: Path, capsys: Captured, earlier: bytes | None) -> None:
+    """Cut off every file at its beginning, its middle and its last byte; `earlier`: what was there before."""
+    folder = tmp_path / "out"
+    write(tmp_path / "whole")
+    whole = contents(tmp_path / "whole")
+    before = {} if earlier is None else dict.fromkeys(whole, earlier)
+    sizes = {len(content) for content in whole.values()}
+    for size in sorted({0, *(length // 2 for length in sizes), *(length - 1 for length in sizes)}):
+        shutil.rmtree(folder, ignore_errors=True)
+        for path in whole:
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        for path, content in before.items():
+            (folder / path).write_bytes(content)
+        with files_of_at_most(size):
+            code = main("langsplat", lambda: _Command(write, folder))
+        (line,) = capsys.readouterr().err.splitlines()
+        assert code == 2
+        assert "File too large" in line
+        assert any(Path(path).name in line for path in whole), line
+        after = contents(folder)
+        assert before.keys() <= after.keys() < whole.keys() | before.keys() | {"nothing else"}
+        for path, content in after.items():
+            assert content == before.get(path) or len(content) == len(whole[path])
+
+
+if __name__ == "__main__":
+    _all(Path(sys.argv[1]))

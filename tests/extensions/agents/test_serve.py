@@ -18,8 +18,8 @@ from langsplat_core.errors import InputError
 from langsplat_core.extensions.agents.commands import MOST_SIDE, Door, scene_files
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.scene import Scene
-from tests.support.commands import refusal
 from tests.support.fakes import PER_BLOB, named_scene
+from tests.support.processes import refusal
 
 SCENE = named_scene()
 

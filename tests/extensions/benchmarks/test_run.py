@@ -31,9 +31,9 @@ from langsplat_core.extensions.benchmarks.report import (
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Scene
-from tests.support.commands import refusal, run
 from tests.support.fakes import PER_BLOB, WORDS, FakeEncoder, blob_scene, cameras
 from tests.support.photographs import SIZE, block, lerf_frame, mask_map, ovs_view, rectangle, silhouette
+from tests.support.processes import refusal, run
 
 CODE_RULE = LERF_PROFILES["langsplat-code"].rule
 PLAIN_RULE = MapRule(1, 1.0, "mirror", "peak", True, 0.7, "none", 1, 1, False)

@@ -32,11 +32,10 @@ from langsplat_core.extensions.benchmarks.raster_speed import (
 from langsplat_core.extensions.benchmarks.report import write_report
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import CodebookCodec, LanguageField, Scene
-from tests.support.commands import refusal, run
 from tests.support.fakes import DIM, PER_BLOB, FakeEncoder, axis, blob_scene
 from tests.support.file_samples import random_codec
+from tests.support.processes import Captured, check_full_disk, refusal, run
 from tests.support.scenes import random_camera, random_gaussians, random_values
-from tests.support.writing import Captured, check_full_disk, check_small_disk
 
 
 class TestReferenceWindows:
@@ -223,7 +222,3 @@ def write(folder: Path) -> None:
 
 def test_a_full_disk_is_one_line(tmp_path: Path, capsys: Captured) -> None:
     check_full_disk(write, tmp_path, capsys, b"what was there before")
-
-
-def test_a_small_disk_that_fills_up_is_a_line(tmp_path: Path, capsys: Captured) -> None:
-    check_small_disk(write, tmp_path, capsys)

@@ -19,12 +19,11 @@ from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.scene import CANONICAL_PHRASES, AutoencoderCodec, LanguageField, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.training.language.codec_fit import everyday_vocabulary
-from tests.support.commands import refusal, run
 from tests.support.comparing import assert_same
 from tests.support.file_samples import autoencoder, random_codec, random_field, save_model, tensor
+from tests.support.processes import Captured, Write, check_full_disk, refusal, run
 from tests.support.scenes import random_camera, random_gaussians
 from tests.support.tiny_models import tiny_clip
-from tests.support.writing import Captured, Write, check_full_disk, check_small_disk
 
 pytestmark = pytest.mark.long
 
@@ -285,14 +284,8 @@ WRITERS: dict[str, Write] = {
     "checkpoint": checkpoint(40),
     "autoencoder": best_checkpoint,
 }
-FILLED: dict[str, Write] = {**WRITERS, "large checkpoint": checkpoint(6_000)}
 
 
 @pytest.mark.parametrize("name", WRITERS)
 def test_a_full_disk_is_one_line(name: str, tmp_path: Path, capsys: Captured) -> None:
     check_full_disk(WRITERS[name], tmp_path, capsys, b"what was there before")
-
-
-@pytest.mark.parametrize("name", FILLED)
-def test_a_small_disk_that_fills_up_is_a_line(name: str, tmp_path: Path, capsys: Captured) -> None:
-    check_small_disk(FILLED[name], tmp_path, capsys)

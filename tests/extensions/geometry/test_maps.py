@@ -25,8 +25,8 @@ from langsplat_core.extensions.geometry.occupancy import (
 from langsplat_core.extensions.geometry.planes import Room
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.scene import Scene
-from tests.support.commands import refusal, run
 from tests.support.fakes import named_scene
+from tests.support.processes import refusal, run
 from tests.support.scenes import FLOOR, WALL, box_room
 
 COARSE = "--resolution", 0.1, "--step", 0.15

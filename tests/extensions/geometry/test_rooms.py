@@ -18,9 +18,9 @@ from langsplat_core.raster.reference import ReferenceRasterizer, colours
 from langsplat_core.scene import NO_NODE, Scene, TaughtWord
 from langsplat_core.scene.language import tree_of_wholes
 from langsplat_core.scene.transform import IDENTITY, Similarity, moving, transform_scene
-from tests.support.commands import refusal, run
 from tests.support.fakes import FakeEncoder, blob_scene
 from tests.support.file_samples import random_field
+from tests.support.processes import refusal, run
 from tests.support.scenes import FLOOR, WALL, box_room, random_camera, random_gaussians
 
 pytest.importorskip("open3d")

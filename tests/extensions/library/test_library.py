@@ -31,9 +31,9 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.rule import judge, triple
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Gaussians, Scene
-from tests.support.commands import refusal, run
 from tests.support.comparing import FIELDS
 from tests.support.fakes import CENTRES, NAMES, PER_BLOB, WORDS, FakeEncoder, axis, named_scene
+from tests.support.processes import refusal, run
 from tests.support.scenes import unturned_gaussians
 
 MUG, BOOK, PLANT = (slice(k * PER_BLOB, (k + 1) * PER_BLOB) for k in range(3))

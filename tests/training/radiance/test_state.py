@@ -29,8 +29,7 @@ from langsplat_core.training.radiance.state import (
     save_checkpoint,
     start,
 )
-from tests.support.radiance import SIZE, capture, truth
-from tests.support.scenes import random_gaussians
+from tests.support.scenes import SIZE, capture, random_gaussians, truth
 
 CPU = torch.device("cpu")
 

@@ -42,7 +42,7 @@ from langsplat_core.training.radiance.state import PARAMETERS, initial_gaussians
 from langsplat_core.training.radiance.stereo import STAGE
 from langsplat_core.training.radiance.trainer import schedule_for, train_radiance
 from tests.support.processes import stop_at
-from tests.support.radiance import SHORT, SIZE, capture, picture, truth
+from tests.support.scenes import SHORT, SIZE, capture, picture, truth
 
 
 def test_the_full_budget_is_the_inria_schedule() -> None:
