@@ -249,10 +249,8 @@ def metres_of(capture: Capture) -> float | None:
         return None
     eyes = np.array([camera.position for camera in capture.cameras])[named]
     metres = metres_per_unit(eyes, places[named])
-    if metres is None:
-        log.info("the places (GPS) of %d photographs differ too much to say how long a unit is", named.sum())
-    else:
-        log.info("a unit is about %.3g m long by the places (GPS) of %d photographs", metres, named.sum())
+    said = "of no length that they agree on" if metres is None else f"about {metres:.3g} m long"
+    log.info("a unit is %s, by the places (GPS) of %d photographs", said, named.sum())
     return metres
 
 

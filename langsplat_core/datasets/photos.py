@@ -58,10 +58,7 @@ def photo_folder(folder: Path) -> Path | None:
 
 
 def count_photographs(dataset: Path) -> int:
-    """Return the number of photographs in a dataset: of a video those that are taken out of it by default.
-
-    It is 0 where there are none, and where the dataset cannot be read.
-    """
+    """Return the number of photographs in a dataset, 0 where it cannot be read; of a video the default."""
     try:
         if is_video(dataset):
             return DatasetConfig.frames
@@ -72,10 +69,7 @@ def count_photographs(dataset: Path) -> int:
 
 
 def mask_beside(photo: Path) -> Path | None:
-    """Return the mask of a photograph where COLMAP and nerfstudio keep it.
-
-    That is masks/NAME.jpg.png or masks/NAME.png, in the photograph's folder or beside that.
-    """
+    """Return the mask of a photograph: masks/NAME.jpg.png or masks/NAME.png, in its folder or beside that."""
     folders = (photo.parent / "masks", photo.parent.parent / "masks")
     candidates = (folder / name for folder in folders for name in (f"{photo.name}.png", f"{photo.stem}.png"))
     # os.path.isfile, unlike Path.is_file, also says no to names that no file system could hold.
@@ -247,30 +241,22 @@ def developer(max_side: int) -> Callable[[Photo], View]:
     return view
 
 
-class Album:
-    """Images in bounded memory.
+IN_MEMORY = 512_000_000  # bytes of images that are held there; further ones lie in files
 
-    Beyond a limit they lie in files without a name in the temporary folder (`TMPDIR`), which the system reads
-    in where they are used and which end with the process.
+
+def in_file(image: Array) -> Array:
+    """Return the same (H, W, 3) uint8 image in a file without a name in the temporary folder (`TMPDIR`).
+
+    The system reads it in where it is used, and the file ends with the process.
     """
-
-    def __init__(self, in_memory: int = 512_000_000) -> None:
-        """in_memory: bytes of images that are held there."""
-        self._left = in_memory
-
-    def keep(self, image: Array) -> Array:
-        """Return the same (H, W, 3) uint8 image, in memory as long as there is room, else in a file."""
-        self._left -= image.nbytes
-        if self._left >= 0:
-            return image
-        try:
-            with tempfile.TemporaryFile(prefix="langsplat-") as file:
-                # Written, not mapped and filled: on a full disk that would kill the process without a word.
-                file.write(np.ascontiguousarray(image).data)
-                file.flush()
-                return np.memmap(file, np.uint8, "c", shape=image.shape)
-        except OSError as error:
-            raise OSError(error.errno, error.strerror, tempfile.gettempdir()) from error
+    try:
+        with tempfile.TemporaryFile(prefix="langsplat-") as file:
+            # Written, not mapped and filled: on a full disk that would kill the process without a word.
+            file.write(np.ascontiguousarray(image).data)
+            file.flush()
+            return np.memmap(file, np.uint8, "c", shape=image.shape)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, tempfile.gettempdir()) from error
 
 
 def develop(
@@ -297,7 +283,7 @@ def develop(
             return f"{photo.label} (its mask leaves nothing of it)"
         return replace(camera, name=names[index]), image, mask
 
-    album = Album()
+    room = IN_MEMORY
     done: list[tuple[Camera, Array, Photo, Array | None]] = []
     broken: list[str] = []
     with ThreadPoolExecutor(WORKERS) as pool:
@@ -306,7 +292,8 @@ def develop(
                 broken.append(found)
             else:
                 camera, image, mask = found
-                done.append((camera, album.keep(image), photos[index], mask))
+                room -= image.nbytes
+                done.append((camera, image if room >= 0 else in_file(image), photos[index], mask))
             progress("reading photographs", count / len(order))
     if not done:
         raise InputError(f"no photograph can be read: {shortened(broken)}")

@@ -69,12 +69,8 @@ class PlainClipText:
 
     def __init__(self, id: str, config: TextConfig, tensors: Tensors, tokenizer: "PairTokenizer") -> None:
         self.id = id
-        self.temperature = TEMPERATURE
+        self.temperature, self.dim = TEMPERATURE, config.projection_dim
         self.config, self.tensors, self.tokenizer = config, tensors, tokenizer
-
-    @property
-    def dim(self) -> int:
-        return self.config.projection_dim
 
     def encode(self, texts: list[str]) -> Array:
         begin, end = self.tokenizer.begin, self.tokenizer.end

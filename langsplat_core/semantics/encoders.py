@@ -49,13 +49,8 @@ TEXT_BATCH = 64  # phrases per forward pass
 class TextTower(Protocol):
     """The half of a model that reads phrases."""
 
-    @property
-    def dim(self) -> int:
-        """Length D of the vectors."""
-
-    @property
-    def temperature(self) -> float:
-        """Factor of a difference of cosines before the sigmoid of relevancy, see `SHARE_OF_SCALE`."""
+    dim: int  # length D of the vectors
+    temperature: float  # factor of a difference of cosines before the sigmoid, see `SHARE_OF_SCALE`
 
     def encode(self, texts: list[str]) -> Array:
         """(B, D) float32 vectors, of any length, of B > 0 phrases.
@@ -67,13 +62,8 @@ class TextTower(Protocol):
 class ImageTower(Protocol):
     """The half of a model that sees images."""
 
-    @property
-    def image_size(self) -> int:
-        """Side of the images it takes, px."""
-
-    @property
-    def statistics(self) -> tuple[Array, Array]:
-        """(3,) mean and (3,) standard deviation that it expects to be taken out, of values in [0, 1]."""
+    image_size: int  # side of the images it takes, px
+    statistics: tuple[Array, Array]  # (3,) mean and deviation to be taken out, of values in [0, 1]
 
     def encode(self, pixels: Any) -> Any:
         """(B, 3, S, S) float32 tensor, normalised -> (B, D) float tensor, of any length."""
@@ -100,6 +90,9 @@ class PhraseEncoder:
     def __init__(self, weights: Weights, tower: TextTower) -> None:
         self.id = weights.id  # hub id or folder as it was asked for; "demo" for the bundled encoder
         self.tower = tower
+        self.dim = tower.dim  # length D of the vectors
+        # Factor with which a margin of cosines, phrase minus nearest canonical phrase, becomes relevancy.
+        self.temperature = tower.temperature
         taught, reading = weights.folder / "vocabulary.txt", weights.folder / "reading.json"
         # The only words the encoder was taught; None: open vocabulary.
         self.words = frozenset(taught.read_text(encoding="utf-8").split()) if taught.is_file() else None
@@ -108,16 +101,6 @@ class PhraseEncoder:
         except FormatError as error:
             raise EncoderError(f"{weights.id}: reading.json is none of an encoder's ({error})") from None
         self.found, self.calibration = beside.found, beside.calibration
-
-    @property
-    def dim(self) -> int:
-        """Length D of the vectors."""
-        return self.tower.dim
-
-    @property
-    def temperature(self) -> float:
-        """Factor with which a margin of cosines, phrase minus nearest canonical phrase, becomes relevancy."""
-        return self.tower.temperature
 
     def unknown_words(self, text: str) -> tuple[str, ...]:
         """Words of `text` that the encoder was never taught; empty when it was taught open vocabulary."""
@@ -170,11 +153,7 @@ class Encoder(PhraseEncoder):
     def __init__(self, weights: Weights, text: TextTower, images: ImageTower, batch: int) -> None:
         super().__init__(weights, text)
         self._images, self._device, self._batch = images, weights.device, batch
-
-    @property
-    def image_size(self) -> int:
-        """Side of the images it takes, px."""
-        return self._images.image_size
+        self.image_size = images.image_size  # side of the images it takes, px
 
     def encode_images(self, crops: Array | Sequence[Array]) -> Array:
         """(M, D) float32 unit vectors of M images (image_size, image_size, 3) uint8, display values."""
@@ -234,11 +213,8 @@ class Images:
         usual: (2, 3) mean and standard deviation of pixels, unless preprocessor_config.json states others.
         """
         self._model, self._output = load_model(kind, weights, config), output
+        self.image_size = int(self._model.config.image_size)
         self.statistics = _pixel_statistics(weights, usual)
-
-    @property
-    def image_size(self) -> int:
-        return int(self._model.config.image_size)
 
     def encode(self, pixels: Any) -> Any:
         return getattr(self._model(pixel_values=pixels), self._output)
@@ -281,12 +257,10 @@ class ClipText:
         self.temperature = TEMPERATURE
         self._clean = text_cleaner()
         self._device = weights.device
-        self._model: Any = load_model(CLIPTextModelWithProjection, weights, _clip_config(weights, "text"))
-        self._tokenizer: Any = _clip_tokenizer(weights, int(self._model.config.vocab_size))
-
-    @property
-    def dim(self) -> int:
-        return int(self._model.config.projection_dim)
+        config = _clip_config(weights, "text")
+        self._model: Any = load_model(CLIPTextModelWithProjection, weights, config)
+        self._tokenizer: Any = _clip_tokenizer(weights, int(config.vocab_size))
+        self.dim = int(config.projection_dim)
 
     def encode(self, texts: list[str]) -> Array:
         limit = int(self._model.config.max_position_embeddings) - 2  # one begins a phrase, one ends it
@@ -384,10 +358,7 @@ class SiglipText:
         if not math.isfinite(scale):
             raise EncoderError(f"{weights.id}: not SigLIP weights: logit_scale is not in them")
         self.temperature = SHARE_OF_SCALE * math.exp(scale)
-
-    @property
-    def dim(self) -> int:
-        return int(self._model.config.projection_size)
+        self.dim = int(config.projection_size)
 
     def encode(self, texts: list[str]) -> Array:
         import torch

@@ -12,7 +12,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
-from urllib.parse import quote, unquote
+from urllib.parse import quote
 
 import numpy as np
 from PIL import Image
@@ -27,9 +27,6 @@ from langsplat_core.semantics.masks import LevelMasks, MaskSource, label_maps
 
 VERSION = 1  # of what is stored of a photograph
 STAGE = "masks and vectors"
-SUFFIX = ".features.npz"
-LONGEST_NAME = 200  # bytes before the suffix; file systems take 255, the suffix and a temporary name more
-SHORTENED = "%~"  # percent-encoding never writes this
 
 log = logging.getLogger("langsplat")
 
@@ -61,29 +58,11 @@ class FeatureStore:
         self._warned: set[str] = set()  # names of damaged files
 
     def path(self, name: str) -> Path:
-        """Return the file of the photograph called `name`: its name percent-encoded.
-
-        A name that is longer than files' names may be is cut, and a digest stands in for the rest. The file
-        itself holds the whole name.
-        """
+        """Return the file of the photograph called `name`: its name percent-encoded, if long cut."""
         quoted = quote(name, safe=" ", errors="surrogateescape")
-        if len(quoted) > LONGEST_NAME:
-            digest = hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
-            quoted = f"{quoted[: LONGEST_NAME // 2]}{SHORTENED}{digest}"
-        return self.folder / (quoted + SUFFIX)
-
-    def names(self) -> list[str]:
-        """Return the names of the photographs in the store, sorted. Raises FormatError for a damaged file."""
-        return sorted(self._name(path) for path in self.folder.glob(f"*{SUFFIX}"))
-
-    def _name(self, path: Path) -> str:
-        stem = path.name.removesuffix(SUFFIX)
-        if SHORTENED not in stem:
-            return unquote(stem, errors="surrogateescape")
-        stored = read_npz(path).get("name")
-        if stored is None or stored.dtype != np.uint8:
-            raise FormatError(f"{path}: does not say which photograph it is of; delete it and run again")
-        return os.fsdecode(stored.tobytes())
+        if len(quoted) > 200:  # file systems take 255, the suffix and a temporary name more
+            quoted = f"{quoted[:100]}%~{hashlib.sha256(os.fsencode(name)).hexdigest()[:16]}"
+        return self.folder / f"{quoted}.features.npz"
 
     def has(self, name: str, key: str | None = None) -> bool:
         """Return True where a whole file for `name` exists; with `key`, only if it was saved with that key.
@@ -91,15 +70,12 @@ class FeatureStore:
         A damaged file counts as absent, and is warned of once: what it held is then made again.
         """
         try:
-            if not exists(self.path(name)):
-                return False
-            stored_key = self._read(name)[1]
+            return exists(self.path(name)) and key in (None, self._read(name)[1])
         except InputError as error:
             if name not in self._warned:
-                self._warned.add(name)
                 log.warning("%s; made again", error)
+            self._warned.add(name)
             return False
-        return key is None or stored_key == key
 
     def save(self, name: str, features: ImageFeatures, key: str = "") -> None:
         """Keep the features of one photograph; `key` names all that they depend on."""
@@ -109,7 +85,6 @@ class FeatureStore:
                 temporary,
                 allow_pickle=False,
                 key=np.array(key),
-                name=np.frombuffer(os.fsencode(name), np.uint8),
                 labels=features.labels.astype(rows),
                 vectors=features.vectors.astype(np.float16),
             )
@@ -157,13 +132,8 @@ class StoredFeatures(Sequence[ImageFeatures]):
 class ImageEncoder(Protocol):
     """The image half of a CLIP model, with its name."""
 
-    @property
-    def id(self) -> str:
-        """Hub id or folder."""
-
-    @property
-    def image_size(self) -> int:
-        """Side of the images it takes, px."""
+    id: str  # hub id or folder
+    image_size: int  # side of the images it takes, px
 
     def encode_images(self, crops: Array) -> Array:
         """(M, S, S, 3) uint8 -> (M, D) float32 unit vectors."""
@@ -216,10 +186,7 @@ def within(labels: Array, mask: Array | None) -> Array:
 
 
 def fingerprint(encoder: ImageEncoder) -> str:
-    """Return what tells an encoder from others, also from other weights under the same name.
-
-    That is the vector that it makes of a ramp.
-    """
+    """Return what tells an encoder from others of its name too: the vector that it makes of a ramp."""
     side = encoder.image_size
     ramp = np.linspace(0, 255, side * side * 3).reshape(1, side, side, 3).astype(np.uint8)
     made = np.round(encoder.encode_images(ramp)[0], 2) + 0.0  # minus zero is zero
@@ -249,8 +216,7 @@ def describe_capture(
 
     Without an encoder the vectors have no numbers. images: (H, W, 3) uint8 each; names: unique, one per
     image; counted: (H, W) bool each, outside of which no mask is kept (None: everywhere). What is finished is
-    in the store even when `progress` interrupts the work. Each photograph's regions are encoded by
-    themselves: its file does not depend on which others were made beside it.
+    in the store even when `progress` interrupts the work, and does not depend on what was made beside it.
     """
     made_by = "none" if encoder is None else fingerprint(encoder)
 

@@ -20,8 +20,8 @@ from langsplat_core.progress import Progress
 class LevelMasks:
     """Masks of one photograph at the levels subpart, part, whole; a level may have none."""
 
-    masks: tuple[Array, Array, Array]  # (M_l, H, W) bool each; may overlap, later ones lie on top
-    scores: tuple[Array, Array, Array]  # (M_l,) float32 each, in [0, 1]
+    masks: tuple[Array, ...]  # three of (M_l, H, W) bool; may overlap, later ones lie on top
+    scores: tuple[Array, ...]  # three of (M_l,) float32, in [0, 1]
 
     def __post_init__(self) -> None:
         dims: dict[str, int] = {}
@@ -321,8 +321,7 @@ class GraphMasks(MaskSource):
         levels = nested_partitions(image)
         masks = [labels == np.arange(labels.max() + 1)[:, None, None] for labels in levels]
         progress("finding regions", 1.0)
-        subpart, part, whole = (np.ones(len(stack), np.float32) for stack in masks)
-        return LevelMasks((masks[0], masks[1], masks[2]), (subpart, part, whole))
+        return LevelMasks(tuple(masks), tuple(np.ones(len(stack), np.float32) for stack in masks))
 
 
 def nested_partitions(image: Array) -> Array:

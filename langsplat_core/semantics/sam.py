@@ -80,9 +80,7 @@ class EncodedImage:
 class Segmenter(Protocol):
     """A model that finds masks at points."""
 
-    @property
-    def name(self) -> str:
-        """Name for messages, such as "SAM 2"."""
+    name: str  # for messages, such as "SAM 2"
 
     def encode(self, image: Array) -> EncodedImage:
         """Show the model an image (H, W, 3) uint8 once."""
@@ -334,8 +332,7 @@ class SamMasks(MaskSource):
         return partial(self._finish, levels, image.shape[:2])
 
     def _finish(self, levels: list[list[Proposal]], shape: tuple[int, int]) -> LevelMasks:
-        kept = [filter_level(level, shape, self._config) for level in levels]
-        return LevelMasks((kept[0][0], kept[1][0], kept[2][0]), (kept[0][1], kept[1][1], kept[2][1]))
+        return LevelMasks(*zip(*(filter_level(level, shape, self._config) for level in levels), strict=True))
 
     def _in_crop(
         self, image: Array, crop: Array, progress: Progress, half_on: str | None

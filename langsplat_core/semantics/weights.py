@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -105,18 +106,16 @@ def _is_complete(folder: Path) -> bool:
 def _from_hub(model: str, option: str) -> Path:
     from huggingface_hub import constants, errors, snapshot_download
 
-    reason = "HF_HUB_OFFLINE is set"
-    for local_only in (True,) if constants.HF_HUB_OFFLINE else (True, False):
-        for weights in (SAFE, PICKLED, OPEN_CLIP[:1], OPEN_CLIP[1:]):
-            try:
-                patterns = ["*.json", "*.txt", *weights]
-                found = snapshot_download(model, allow_patterns=patterns, local_files_only=local_only)
-            except (OSError, ValueError, errors.HTTPError) as error:  # of whichever client the hub uses
-                reason = reason if local_only else type(error).__name__
-                continue
-            if _is_complete(Path(found)):
-                return Path(found)
+    reason, here_or_there = "HF_HUB_OFFLINE is set", (True,) if constants.HF_HUB_OFFLINE else (True, False)
+    for local_only, kind in product(here_or_there, (SAFE, PICKLED, OPEN_CLIP[:1], OPEN_CLIP[1:])):
+        try:
+            patterns = ["*.json", "*.txt", *kind]
+            found = Path(snapshot_download(model, allow_patterns=patterns, local_files_only=local_only))
+            if _is_complete(found):
+                return found
             reason = reason if local_only else "it has no weights for transformers"
+        except (OSError, ValueError, errors.HTTPError) as error:  # of whichever client the hub uses
+            reason = reason if local_only else type(error).__name__
     raise EncoderError(
         f"{model}: neither a folder nor in the local cache, and the hub cannot supply it ({reason}); "
         f"run `hf download {model}` where there is a network, or pass `{option} FOLDER`"

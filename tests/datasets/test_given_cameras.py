@@ -23,7 +23,6 @@ from langsplat_core.progress import Progress, silent
 from tests.support.photographs import (
     CONFIG,
     colmap_reconstruction,
-    photograph,
     pinhole_picture,
     poses,
     psnr,
@@ -36,7 +35,6 @@ from tests.support.photographs import (
 
 pytestmark = pytest.mark.long
 
-BANANA = Path(__file__).parents[3] / "shared" / "data" / "banana" / "colmap_640"
 PARAMS = [190.0, 188.0, 103.0, 74.0, -0.1, 0.02, 0.001, -0.001]
 LENS = PhotoIntrinsics(200, 150, *PARAMS[:4], BrownDistortion(*PARAMS[4:]))
 WHOLE = DatasetConfig(max_side=200)
@@ -102,20 +100,6 @@ def test_the_model_with_most_photographs_is_taken(tmp_path: Path, caplog: pytest
         load_capture(tmp_path, WHOLE, tmp_path / "work")
 
 
-def test_photographs_in_subfolders_keep_apart(tmp_path: Path) -> None:
-    matrices = poses(2)
-    names = ["left/0001.png", "right/0001.png"]
-    for name, matrix in zip(names, matrices, strict=True):
-        (tmp_path / "images" / name).parent.mkdir(parents=True)
-        Image.fromarray(photograph(LENS, matrix)).save(tmp_path / "images" / name)
-    model = colmap_reconstruction("OPENCV", (200, 150), PARAMS, names, matrices)
-    model.add_point3D(np.zeros(3), pycolmap.Track(), np.zeros(3, np.uint8))
-    (tmp_path / "sparse").mkdir()
-    model.write_text(tmp_path / "sparse")
-    capture = load_capture(tmp_path, WHOLE, tmp_path / "work")
-    assert [camera.name for camera in capture.cameras] == ["left_0001", "right_0001"]
-
-
 def test_missing_photographs_and_cameras_are_warned_of(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -179,20 +163,6 @@ def test_plainly_wrong_points_are_dropped(tmp_path: Path) -> None:
     points, colours = good_points(read_model(tmp_path / "sparse/0"))
     np.testing.assert_array_equal(points, [[1, 2, 3], [1, 2, 3]])
     np.testing.assert_array_equal(colours, [[9, 8, 7], [9, 8, 7]])
-
-
-@pytest.mark.skipif(not BANANA.is_dir(), reason="real data absent")
-def test_real_points_lie_where_the_photographs_show_them(tmp_path: Path) -> None:
-    capture = load_capture(BANANA, DatasetConfig(max_side=320), tmp_path)
-    assert len(capture) == 14
-    assert len(capture.points) == 7308
-    camera, image = capture.cameras[7], capture.images[7].astype(float)
-    pixels, depth = camera.project(capture.points)
-    seen = (depth > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
-    x, y = pixels[seen].astype(int).T
-    off = np.abs(image[y, x] - capture.colours[seen]).mean(1)
-    shuffled = np.abs(image[y, x] - capture.colours[seen][::-1]).mean(1)
-    assert np.median(off) < 0.7 * np.median(shuffled)
 
 
 # transforms.json: poses, intrinsics in all their spellings, points, and what may be missing.
@@ -310,15 +280,6 @@ def test_applied_transform_changes_neither_points_nor_poses(tmp_path: Path) -> N
     np.testing.assert_array_equal(capture.points, points[good])
     np.testing.assert_array_equal(capture.colours, colours[good])
     np.testing.assert_allclose(capture.cameras[0].world_to_camera, poses(3)[0], atol=1e-9)
-
-
-def test_colours_may_be_fractions_or_absent(tmp_path: Path) -> None:
-    write_transforms(tmp_path, {**GLOBAL, "ply_file_path": "cloud.ply"})
-    xyz = {axis: np.ones(2, np.float64) for axis in "xyz"}
-    write_ply(tmp_path / "cloud.ply", xyz | {c: np.array([0, 1], "f4") for c in ("red", "green", "blue")})
-    np.testing.assert_array_equal(load(tmp_path).colours, [[0, 0, 0], [255, 255, 255]])
-    write_ply(tmp_path / "cloud.ply", xyz)
-    np.testing.assert_array_equal(load(tmp_path).colours, np.full((2, 3), 128))
 
 
 def test_transparent_photographs_lie_over_black(tmp_path: Path) -> None:
@@ -471,18 +432,6 @@ def test_a_broken_json_is_refused(tmp_path: Path, content: bytes) -> None:
     write_picture(tmp_path / "a.png")
     (tmp_path / "transforms.json").write_bytes(content)
     assert "transforms.json" in refuse(tmp_path, tmp_path / "work")
-
-
-PLY = b"ply\nformat ascii 1.0\nelement vertex 2\n%send_header\n1 2 3\n"
-
-
-@pytest.mark.parametrize(
-    "content", [b"not a ply", PLY % b"".join(b"property float %c\n" % axis for axis in b"xyz"), PLY % b""]
-)
-def test_a_broken_cloud_is_refused(tmp_path: Path, content: bytes) -> None:
-    write_nerfstudio(tmp_path, ply_file_path="cloud.ply")
-    (tmp_path / "cloud.ply").write_bytes(content)
-    assert "cloud.ply" in refuse(tmp_path, tmp_path / "work")
 
 
 @pytest.mark.parametrize("name", [None, 3, "", "absent.ply", "."])

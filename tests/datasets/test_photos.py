@@ -11,7 +11,7 @@ import av
 import numpy as np
 import pillow_heif
 import pytest
-from PIL import Image, ImageOps
+from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from langsplat_core.arrays import Array
@@ -19,16 +19,16 @@ from langsplat_core.config import DatasetConfig, RadianceConfig
 from langsplat_core.datasets import Capture, load_capture
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics
 from langsplat_core.datasets.photos import (
-    Album,
     Photo,
     count_photographs,
     develop,
+    in_file,
     mask_beside,
     optics,
     read_photo,
     unique_names,
 )
-from langsplat_core.datasets.video import extract_frames, kept_frames, sharpness
+from langsplat_core.datasets.video import extract_frames, kept_frames
 from langsplat_core.errors import FormatError, InputError, LangSplatError
 from langsplat_core.io.hostile import PictureError, is_video
 from langsplat_core.progress import WorkCancelledError, silent
@@ -47,22 +47,19 @@ from tests.support.photographs import (
 from tests.support.processes import files_of_at_most, stop_at
 
 
-def test_album_files_images_unchanged_beyond_memory(tmp_path, monkeypatch):
+def test_images_in_files_are_the_same(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    pictures = np.random.default_rng(0).integers(256, size=(5, 6, 8, 3)).astype(np.uint8)
-    album = Album(in_memory=2 * pictures[0].nbytes + 1)
-    kept = [album.keep(picture) for picture in pictures]
-    assert [isinstance(picture, np.memmap) for picture in kept] == [False, False, True, True, True]
-    np.testing.assert_array_equal(np.stack(kept), pictures)
+    picture = np.random.default_rng(0).integers(256, size=(6, 8, 3)).astype(np.uint8)
+    np.testing.assert_array_equal(in_file(picture), picture)
     assert list(tmp_path.iterdir()) == []  # the files have no name: nothing is left behind
 
 
-def test_album_raises_where_the_disk_is_full(tmp_path, monkeypatch):
+def test_image_files_need_room_on_the_disk(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     picture = np.zeros((60, 80, 3), np.uint8)
     for size in (0, picture.nbytes - 1):
         with files_of_at_most(size), pytest.raises(OSError, match="large") as caught:
-            Album(in_memory=0).keep(picture)
+            in_file(picture)
         assert (caught.value.errno, caught.value.filename) == (errno.EFBIG, str(tmp_path))
 
 
@@ -84,18 +81,6 @@ def test_every_kind_of_picture_becomes_rgb(tmp_path: Path) -> None:
         got = np.asarray(read_photo(tmp_path / name, upright=False))
         assert got.shape == (12, 16, 3), name
         assert np.abs(got.astype(int) - grey[..., None]).max() <= 1, name
-
-
-@pytest.mark.parametrize("orientation", range(1, 9))
-def test_every_exif_orientation(tmp_path: Path, orientation: int) -> None:
-    picture = Image.fromarray(np.random.default_rng(0).integers(0, 256, (6, 9, 3), dtype=np.uint8))
-    exif = Image.Exif()
-    exif[0x0112] = orientation
-    picture.save(tmp_path / "a.png", exif=exif)
-    want = np.asarray(ImageOps.exif_transpose(Image.open(tmp_path / "a.png")))
-    assert want.shape == ((6, 9, 3) if orientation < 5 else (9, 6, 3))
-    np.testing.assert_array_equal(np.asarray(read_photo(tmp_path / "a.png", upright=True)), want)
-    np.testing.assert_array_equal(np.asarray(read_photo(tmp_path / "a.png", upright=False)), picture)
 
 
 def test_broken_exif_data_count_as_none(tmp_path: Path) -> None:
@@ -314,12 +299,6 @@ def test_the_sharpest_image_of_every_part_is_taken(clip: Path, tmp_path: Path) -
 def test_fewer_images_than_parts_are_all_taken(tmp_path: Path) -> None:
     video = write_video(tmp_path / "short.mov", [scene(3 * k) for k in range(5)])
     assert len(extract_frames(video, tmp_path / "out", 100)) == 5
-
-
-def test_sharpness_falls_with_blur_and_stands_tiny_images():
-    sharp = [sharpness(av.VideoFrame.from_ndarray(scene(0, blur), format="rgb24")) for blur in (0, 0.7, 2)]
-    assert sharp[0] > 2 * sharp[1] > 4 * sharp[2] > 0
-    assert sharpness(av.VideoFrame.from_ndarray(np.zeros((2, 2, 3), np.uint8), format="rgb24")) == 0
 
 
 def test_work_folder_keeps_whole_sets_of_frames_alone(clip: Path, tmp_path: Path) -> None:

@@ -165,22 +165,6 @@ def test_photographs_left_out_are_warned_of(located) -> None:  # type: ignore[no
     assert "cannot be read: aa_broken.jpg" in lost
 
 
-def test_repeated_reconstruction_computes_nothing(
-    photos: Path,
-    located,  # type: ignore[no-untyped-def]
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    capture, work, _, _ = located
-    in_this_process(monkeypatch)
-    for name in ("extract_features", "match_image_pairs", "incremental_mapping"):
-        monkeypatch.setattr(pycolmap, name, _never)
-    again = load_capture(photos, CONFIG, work)
-    np.testing.assert_array_equal(again.points, capture.points)
-    np.testing.assert_array_equal(again.cameras[3].world_to_camera, capture.cameras[3].world_to_camera)
-    (stage,) = work.glob("sfm-*")
-    assert sorted(path.name for path in stage.iterdir()) == ["matches.json", "sparse"]
-
-
 def test_cameras_are_the_same_byte_for_byte(
     photos: Path,
     located,  # type: ignore[no-untyped-def]
@@ -523,14 +507,6 @@ def test_gaps_join_photographs_where_they_match_most():
 def test_all_from_one_place_are_told_to_step_aside():
     assert "step aside" in graph(4, chain(range(4))).advice()
     assert graph(4, chain(range(4)), range(4)).gaps() == []
-
-
-@pytest.mark.parametrize("features", [0, 20, -1])
-def test_blank_photographs_are_no_gap(features: int):
-    matches = graph(4, [], features=features)
-    assert matches.gaps() == []
-    assert "two thirds" in matches.advice()
-    assert matches.why(0) != graph(4, []).why(0)
 
 
 def test_long_names_of_files_stay_short_in_a_message():

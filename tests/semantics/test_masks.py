@@ -14,7 +14,7 @@ from transformers import Sam2Model, SamModel
 
 from langsplat_core.config import MaskConfig
 from langsplat_core.errors import EncoderError, InputError
-from langsplat_core.progress import Progress, silent
+from langsplat_core.progress import silent
 from langsplat_core.semantics import sam
 from langsplat_core.semantics.masks import (
     GraphMasks,
@@ -268,63 +268,6 @@ def test_masks_cut_by_their_crop_are_dropped() -> None:
     assert not sam.cut_by_crop(np.array([0, 0, 1440, 1080]), np.array([0, 0, 1440, 1080]), shape)
 
 
-class Blind:
-    """Stands in for a SAM that overlooks small things in large pictures: a mask is what has one colour."""
-
-    name = "blind"
-
-    def encode(self, image: np.ndarray) -> "Seen":
-        return Seen(image[..., 0])
-
-
-class Seen:
-    def __init__(self, colours: np.ndarray) -> None:
-        self.colours = colours
-        self.from_afar = colours.size >= 200 * 200
-
-    def masks_at(self, points: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
-        masks = [self.mask(self.colours[int(y), int(x)]) for x, y in points]
-        logits = torch.from_numpy(np.stack(masks) * 20.0 - 10)[:, None].repeat(1, 3, 1, 1)
-        scores = torch.zeros(len(points), 3)
-        scores[:, 0] = torch.tensor([(0.95 if self.from_afar else 0.9) * mask.any() for mask in masks])
-        return scores, logits
-
-    def mask(self, colour: int) -> np.ndarray:
-        mask = (self.colours == colour) & (colour > 0)
-        if self.from_afar:
-            return mask & (mask.sum() >= 400)
-        rows, columns = np.nonzero(mask)
-        if len(rows):  # by this the mask of a crop can be told from that of the whole picture
-            mask[int(rows.mean()), int(columns.mean())] = False
-        return mask
-
-    def enlarge(self, logits: torch.Tensor) -> torch.Tensor:
-        return logits
-
-
-def test_crops_find_small_things_and_win_over_the_whole_image() -> None:
-    image = np.zeros((200, 200, 3), np.uint8)  # crops of 134 px begin at 0 and 66
-    small, across, both = np.s_[30:40, 30:40], np.s_[70:130, 70:130], np.s_[25:65, 140:180]
-    for colour, place in enumerate((small, across, both), start=1):
-        image[place] = colour
-    config = MaskConfig(points_per_side=16, predicted_iou=0.5, min_region=0)
-    alone = SamMasks(Blind(), config)(image, silent).masks[0]
-    assert sorted(mask.sum() for mask in alone) == [1600, 3600]
-    found = SamMasks(Blind(), replace(config, crop_layers=1))(image, silent)
-    assert sorted(mask.sum() for mask in found.masks[0]) == [99, 1599, 3600]
-    for mask in found.masks[0]:
-        assert len(np.unique(image[..., 0][mask])) == 1  # in its place in the whole picture
-    assert [len(masks) for masks in found.masks[1:]] == [0, 0]
-
-
-def test_progress_runs_once_through_all_crops() -> None:
-    seen: list[float] = []
-    config = MaskConfig(points_per_side=4, points_per_batch=8, crop_layers=1)
-    SamMasks(Blind(), config)(np.zeros((40, 40, 3), np.uint8), Progress(lambda at: seen.append(at.fraction)))
-    assert seen == sorted(seen)
-    assert (seen[0], seen[-1], len(seen)) == (0.0, 1.0, 5 * 2 + 1)
-
-
 # SAM masks: the real loading path, with a tiny model made here, against one point at a time.
 
 
@@ -520,24 +463,6 @@ def test_sam_2_masks_are_ordered_by_size_at_each_point() -> None:
     np.testing.assert_allclose(ious, [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])  # of equals the first stays first
     assert (ordered > 0).flatten(2).sum(2).tolist() == [[4, 8, 12], [4, 8, 8]]
     assert ordered[:, :, 0, 0].tolist() == [[2, 3, 1], [3, 1, 2]]
-
-
-@pytest.mark.parametrize("family", FAMILIES)
-def test_weights_that_do_not_fit_are_named(family: str, tmp_path: Path) -> None:
-    FAMILIES[family][0](tmp_path)
-    decoder_setting(tmp_path, iou_head_hidden_dim=12)
-    with pytest.raises(EncoderError, match="do not fit, such as mask_decoder"):
-        load_mask_source(MaskConfig(sam=str(tmp_path)), "cpu")
-
-
-def test_batches_do_not_change_the_masks(config: MaskConfig) -> None:
-    one = load_mask_source(replace(config, points_per_batch=1), "cpu")
-    all_at_once = load_mask_source(replace(config, points_per_batch=64), "cpu")
-    assert one.key == all_at_once.key
-    assert one.key != load_mask_source(replace(config, box_nms=0.6), "cpu").key
-    for a, b in zip(one(photograph(), silent).masks, all_at_once(photograph(), silent).masks, strict=True):
-        assert a.shape == b.shape
-        assert (a ^ b).sum() <= 2 * len(a)
 
 
 def test_no_mask_at_all_is_an_answer(config: MaskConfig) -> None:

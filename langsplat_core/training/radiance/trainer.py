@@ -203,7 +203,7 @@ def train_radiance(
 class _Views:
     """Photographs and cameras of the training views, whole and at half size.
 
-    On a GPU they are copied to it; else they stay as they are, which for many is in files (`capture.Album`).
+    On a GPU they are copied to it; else they stay as they are, which for many is in files (`photos.in_file`).
     """
 
     def __init__(self, capture: Capture, indices: Sequence[int], device: torch.device) -> None:
