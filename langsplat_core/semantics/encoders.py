@@ -33,7 +33,6 @@ from langsplat_core.semantics.weights import (
     asking_errors,
     load_config,
     load_model,
-    loading_errors,
     model_type,
     open_weights,
     read_scalar,
@@ -240,42 +239,110 @@ def _pixel_statistics(weights: Weights, usual: Array) -> tuple[Array, Array]:
     return found[0], found[1]
 
 
+UNUSUAL = "\u3042"  # where the token for what is not known is lacking, this cannot be read
+# The library ends the process over a token of 300 000 bytes; the table of a normaliser may be as long.
+_LONG = re.compile(rb'(?<!"precompiled_charsmap":)(?<!"precompiled_charsmap": )"[^"]{10000}')
+
+
+class TorchText:
+    """A `TextTower` computed by torch.
+
+    The folder's tokenizer.json is read as it is, by the `tokenizers` library: what transformers' own classes
+    add around it (which side is padded, whether an end token is there) differs between its versions.
+    """
+
+    def __init__(self, kind: Any, weights: Weights, config: Any, output: str, begin: str | None) -> None:
+        """kind: class of transformers; output: name of the vectors in what it returns.
+
+        begin: token that every phrase begins with; without one, phrases are padded to the length of training.
+        """
+        self.dim = int(config.projection_dim if begin else config.projection_size)
+        self.temperature = TEMPERATURE
+        self._device, self._output = weights.device, output
+        self._length = int(config.max_position_embeddings)
+        self._model: Any = load_model(kind, weights, config)
+        self._clean = text_cleaner()
+        self._tokenizer = _tokenizer(weights, int(config.vocab_size))
+        self._end = _special_token(weights, self._tokenizer, "eos_token", ("<|endoftext|>", "</s>", "<eos>"))
+        self._begin = [_special_token(weights, self._tokenizer, "bos_token", (begin,))] if begin else []
+        self._pad = (
+            _special_token(weights, self._tokenizer, "pad_token", ("<pad>", "</s>")) if not begin else 0
+        )
+
+    def encode(self, texts: list[str]) -> Array:
+        import torch
+
+        plain = [self._clean(text) for text in texts]
+        found = self._tokenizer.encode_batch(plain, add_special_tokens=False)
+        rows = [[*self._begin, *row.ids, self._end] for row in found]
+        room = self._length - len(self._begin) - 1
+        for text, row in zip(plain, found, strict=True):
+            check_whole(text, row.ids, room, {self._end})
+        # What follows the end token of a CLIP is not seen by it.
+        length, pad = (max(map(len, rows)), self._end) if self._begin else (self._length, self._pad)
+        ids = torch.tensor([row + [pad] * (length - len(row)) for row in rows]).to(self._device)
+        return inferred(lambda: getattr(self._model(input_ids=ids), self._output))
+
+
+def _tokenizer(weights: Weights, vocabulary: int) -> Any:
+    """Return the folder's `tokenizers.Tokenizer`, which neither cuts nor pads.
+
+    EncoderError without one, and for one of more tokens than the model's `vocabulary`.
+    """
+    from tokenizers import Tokenizer
+
+    path = weights.folder / TOKENIZER
+    if not path.is_file():
+        raise EncoderError(
+            f"{weights.id}: no {TOKENIZER} in {weights.folder}, which reads its phrases; put it there: all "
+            "CLIPs share that of openai/clip-vit-base-patch32 on the Hugging Face hub"
+        )
+    try:
+        if _LONG.search(path.read_bytes()):
+            raise ValueError("a token of more than 10000 bytes")
+        tokenizer = Tokenizer.from_file(str(path))
+        tokenizer.no_truncation()
+        tokenizer.no_padding()
+        tokenizer.encode(UNUSUAL, add_special_tokens=False)
+        most = max(tokenizer.get_vocab().values()) + 1
+        if most > vocabulary:
+            raise ValueError(f"{most} tokens, its model knows {vocabulary}")
+        return tokenizer
+    except Exception as error:  # the library raises no narrower class for a damaged file
+        reason = (str(error).splitlines() or ["unreadable"])[0][:200]
+        raise EncoderError(f"{weights.id}: {TOKENIZER} is no tokenizer of this model ({reason})") from error
+
+
+def _special_token(weights: Weights, tokenizer: Any, role: str, usual: tuple[str, ...]) -> int:
+    """Return the number of the token with a role: as the folder states it, else by its usual names."""
+    stated = None
+    with suppress(OSError, ValueError, AttributeError, RecursionError):
+        text = (weights.folder / "tokenizer_config.json").read_text(encoding="utf-8")
+        stated = json.loads(text).get(role)
+    for token in (stated.get("content") if isinstance(stated, dict) else stated, *usual):
+        number = tokenizer.token_to_id(token) if isinstance(token, str) else None
+        if number is not None:
+            return int(number)
+    raise EncoderError(f"{weights.id}: its tokenizer has no {role}, such as {usual[0]}")
+
+
 # CLIP.
 
 CLIP_PIXELS = np.array([  # mean and standard deviation of OpenAI's CLIP, kept by OpenCLIP
     (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711),
 ])  # fmt: skip
-UNUSUAL = "\u3042"  # where the token for what is not known is lacking, this cannot be read
-
-
-class ClipText:
-    """A `TextTower` computed by torch."""
-
-    def __init__(self, weights: Weights) -> None:
-        from transformers import CLIPTextModelWithProjection
-
-        self.temperature = TEMPERATURE
-        self._clean = text_cleaner()
-        self._device = weights.device
-        config = _clip_config(weights, "text")
-        self._model: Any = load_model(CLIPTextModelWithProjection, weights, config)
-        self._tokenizer: Any = _clip_tokenizer(weights, int(config.vocab_size))
-        self.dim = int(config.projection_dim)
-
-    def encode(self, texts: list[str]) -> Array:
-        limit = int(self._model.config.max_position_embeddings) - 2  # one begins a phrase, one ends it
-        ends = {int(self._tokenizer.eos_token_id)}
-        plain = [self._clean(text) for text in texts]
-        for text, row in zip(texts, self._tokenizer(plain, verbose=False).input_ids, strict=True):
-            check_whole(text, row[1:-1], limit, ends)
-        # Padding follows the end token, which attends to earlier tokens only: no attention mask is needed.
-        tokens = self._tokenizer(plain, padding=True, return_tensors="pt").input_ids.to(self._device)
-        return inferred(lambda: self._model(input_ids=tokens).text_embeds)
 
 
 def clip_text(weights: Weights) -> TextTower:
     """Return the text tower in NumPy where the model is small, else by torch."""
-    return plain_text_tower(weights) or ClipText(weights)
+    return plain_text_tower(weights) or torch_clip_text(weights)
+
+
+def torch_clip_text(weights: Weights) -> TorchText:
+    """Return the text tower of a CLIP, by torch."""
+    from transformers import CLIPTextModelWithProjection as Model
+
+    return TorchText(Model, weights, _clip_config(weights, "text"), "text_embeds", "<|startoftext|>")
 
 
 def clip_images(weights: Weights) -> ImageTower:
@@ -295,26 +362,6 @@ def _clip_config(weights: Weights, tower: str) -> Any:
     return tower_config
 
 
-def _clip_tokenizer(weights: Weights, vocabulary: int) -> Any:
-    from transformers import CLIPTokenizerFast
-
-    folder = weights.folder
-    if not (folder / TOKENIZER).is_file() and not (folder / "merges.txt").is_file():
-        raise EncoderError(
-            f"{weights.id}: no CLIP tokenizer in {folder}; put {TOKENIZER} there, or vocab.json and "
-            "merges.txt; all CLIPs share those of openai/clip-vit-base-patch32 on the Hugging Face hub"
-        )
-    with loading_errors(weights.id, "CLIP"):
-        tokenizer = CLIPTokenizerFast.from_pretrained(folder, local_files_only=True)
-        tokenizer(UNUSUAL)
-        highest = max(tokenizer.get_vocab().values())
-    if highest >= vocabulary:
-        raise EncoderError(
-            f"{weights.id}: the tokenizer in {folder} has more tokens than the model's {vocabulary}"
-        )
-    return tokenizer
-
-
 # SigLIP (Zhai et al. 2023) and SigLIP 2 (Tschannen et al. 2025): pairs judged one by one by a sigmoid.
 #
 # SigLIP 2's fixed-resolution checkpoints are SigLIP models with another vocabulary, and say so in their
@@ -330,97 +377,41 @@ def _clip_tokenizer(weights: Weights, vocabulary: int) -> Any:
 # right and wrong pairs that training had to make, so a tenth of it gives the margins of two families like
 # relevancies. It is a rule of proportion, not a calibration: verdicts need thresholds of their own.
 SHARE_OF_SCALE = 0.1
-SIGLIP_PIXELS = np.full((2, 3), 0.5)
-# The library ends the process over a token of 300 000 bytes; the table of a normaliser may be as long.
-_LONG = re.compile(rb'(?<!"precompiled_charsmap":)(?<!"precompiled_charsmap": )"[^"]{10000}')
 
 
-class SiglipText:
-    """A `TextTower` computed by torch.
-
-    Its tokenizer.json is read as it is, by the `tokenizers` library: what transformers' own classes add
-    around it (which side is padded, whether an end token is there) differs between its versions.
-    """
+class SiglipText(TorchText):
+    """The text tower of a SigLIP, by torch."""
 
     def __init__(self, weights: Weights) -> None:
-        from transformers import SiglipTextModel
+        from transformers import SiglipTextModel as Model
 
-        config = _siglip_config(weights).text_config
-        self._device = weights.device
-        self._model: Any = load_model(SiglipTextModel, weights, config)
-        self._clean = text_cleaner()
-        self._tokenizer = _tokenizer(weights)
-        # SentencePiece's unigram kind is the first generation's, whose captions had no punctuation.
-        self._is_first = type(self._tokenizer.model).__name__ == "Unigram"
-        self._pad = _special_token(weights, self._tokenizer, "pad_token", ("<pad>", "</s>"))
-        self._end = _special_token(weights, self._tokenizer, "eos_token", ("</s>", "<eos>"))
+        super().__init__(Model, weights, _siglip_config(weights).text_config, "pooler_output", None)
         scale = read_scalar(weights, "logit_scale")
         if not math.isfinite(scale):
             raise EncoderError(f"{weights.id}: not SigLIP weights: logit_scale is not in them")
         self.temperature = SHARE_OF_SCALE * math.exp(scale)
-        self.dim = int(config.projection_size)
+        # SentencePiece's unigram kind is the first generation's, whose captions had no punctuation.
+        gone = string.punctuation if type(self._tokenizer.model).__name__ == "Unigram" else ""
+        self._without = str.maketrans("", "", gone)
 
     def encode(self, texts: list[str]) -> Array:
-        import torch
-
-        plain = [self._canonical(text) for text in texts]
-        ids = torch.full((len(texts), int(self._model.config.max_position_embeddings)), self._pad)
-        for row, found in enumerate(self._tokenizer.encode_batch(plain, add_special_tokens=False)):
-            check_whole(plain[row], found.ids, ids.shape[1] - 1, {self._end})
-            ids[row, : len(found.ids) + 1] = torch.tensor([*found.ids, self._end])
-        return inferred(lambda: self._model(input_ids=ids.to(self._device)).pooler_output)
-
-    def _canonical(self, text: str) -> str:
-        """Return `text` like the captions of its training: clean, in lower case."""
-        lower = self._clean(text).lower()
-        bare = lower.translate(str.maketrans("", "", string.punctuation))
-        return " ".join(bare.split()) if self._is_first else lower
+        """Encode texts like the captions of its training: clean, in lower case."""
+        lower = (self._clean(text).lower().translate(self._without) for text in texts)
+        return super().encode([" ".join(text.split()) for text in lower])
 
 
 def siglip_images(weights: Weights) -> ImageTower:
     """Return the image tower of a SigLIP, by torch."""
     from transformers import SiglipVisionModel as Model
 
-    return Images(Model, weights, _siglip_config(weights).vision_config, "pooler_output", SIGLIP_PIXELS)
+    usual = np.full((2, 3), 0.5)
+    return Images(Model, weights, _siglip_config(weights).vision_config, "pooler_output", usual)
 
 
 def _siglip_config(weights: Weights) -> Any:
     from transformers import SiglipConfig
 
     return load_config(SiglipConfig, weights, "SigLIP")
-
-
-def _tokenizer(weights: Weights) -> Any:
-    """Return the folder's `tokenizers.Tokenizer`, which neither cuts nor pads; EncoderError without one."""
-    from tokenizers import Tokenizer
-
-    path = weights.folder / TOKENIZER
-    if not path.is_file():
-        raise EncoderError(f"{weights.id}: no {TOKENIZER} in this folder, which its phrases are read with")
-    try:
-        if _LONG.search(path.read_bytes()):
-            raise ValueError("a token of more than 10000 bytes")
-        tokenizer = Tokenizer.from_file(str(path))
-        tokenizer.no_truncation()
-        tokenizer.no_padding()
-        tokenizer.encode(UNUSUAL, add_special_tokens=False)
-        return tokenizer
-    except Exception as error:  # the library raises no narrower class for a damaged file
-        reason = (str(error).splitlines() or ["unreadable"])[0][:200]
-        raise EncoderError(f"{weights.id}: {TOKENIZER} is no tokenizer ({reason})") from error
-
-
-def _special_token(weights: Weights, tokenizer: Any, role: str, usual: tuple[str, ...]) -> int:
-    """Return the number of the token with a role: as the folder states it, else by its usual names."""
-    stated = None
-    with suppress(OSError, ValueError, AttributeError, RecursionError):
-        text = (weights.folder / "tokenizer_config.json").read_text(encoding="utf-8")
-        stated = json.loads(text).get(role)
-    for token in (stated.get("content") if isinstance(stated, dict) else stated, *usual):
-        number = tokenizer.token_to_id(token) if isinstance(token, str) else None
-        if number is not None:
-            return int(number)
-    raise EncoderError(f"{weights.id}: its tokenizer has no {role}, such as {usual[0]}")
 
 
 # Loading by hub id, folder or file: a new family is two towers above and one row here.

@@ -23,6 +23,7 @@ import torch
 from PIL import Image
 from scipy import ndimage
 from torch.nn.functional import normalize
+from transformers import CLIPTokenizer
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import MaskConfig
@@ -114,16 +115,14 @@ def scrambled(build: Callable[..., Any], *arguments: str, **options: str) -> Any
 
 
 def save_clip(name: str, model: Any, folder: Path) -> None:
-    """A CLIP of open_clip as its hub folders hold it, with OpenAI's words in the hub's two older files."""
+    """A CLIP of open_clip as its hub folders hold it, with OpenAI's words."""
     open_clip = upstream().open_clip
     torch.save(model.state_dict(), folder / "open_clip_pytorch_model.bin")
     stated = {"model_cfg": open_clip.get_model_config(name), "preprocess_cfg": {}}
     (folder / "open_clip_config.json").write_text(json.dumps(stated), encoding="utf-8")
     words = open_clip.get_tokenizer(name)
     numbers = {ENDS.get(token, token): number for token, number in words.encoder.items()}
-    (folder / "vocab.json").write_text(json.dumps(numbers), encoding="utf-8")
-    merges = "\n".join(" ".join(pair) for pair in words.bpe_ranks)
-    (folder / "merges.txt").write_text(f"#version: 0.2\n{merges}\n", encoding="utf-8")
+    CLIPTokenizer(vocab=numbers, merges=list(words.bpe_ranks)).save_pretrained(folder)
 
 
 def siglip_tensors(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:

@@ -129,14 +129,9 @@ def _linear(tensors: Tensors, name: str, x: Tensor) -> Tensor:
     return functional.linear(x, tensors[f"{name}.weight"], tensors[f"{name}.bias"])
 
 
-def letter_tokenizer(folder: Path, old: bool = False) -> None:
-    """A CLIP tokenizer that spells; `old`: as vocab.json and merges.txt."""
-    numbers = {token: number for number, token in enumerate(TOKENS)}
-    if old:
-        (folder / "vocab.json").write_text(json.dumps(numbers), encoding="utf-8")
-        (folder / "merges.txt").write_text("#version: 0.2\n", encoding="utf-8")
-    else:
-        CLIPTokenizer(vocab=numbers, merges=[]).save_pretrained(folder)
+def letter_tokenizer(folder: Path) -> None:
+    """A CLIP tokenizer that spells."""
+    CLIPTokenizer(vocab={token: n for n, token in enumerate(TOKENS)}, merges=[]).save_pretrained(folder)
 
 
 def segment_anything_tensors(model: Any) -> Tensors:
@@ -292,7 +287,7 @@ def test_each_layout_of_clip_gives_the_vectors_of_open_clip(
     write: Callable[[Path, Tensors], Case], tmp_path: Path
 ) -> None:
     tensors = open_clip_tensors()
-    letter_tokenizer(tmp_path, old=write is openai_state)
+    letter_tokenizer(tmp_path)
     compare(write(tmp_path, tensors), tensors)
 
 
@@ -315,7 +310,7 @@ def test_a_named_file_wins_over_its_folder(tmp_path: Path) -> None:
 
 def test_a_missing_tokenizer_names_the_file_to_add(tmp_path: Path) -> None:
     path = training_checkpoint(tmp_path, open_clip_tensors())[0]
-    with pytest.raises(EncoderError, match=r"put tokenizer\.json there.*openai/clip-vit-base-patch32"):
+    with pytest.raises(EncoderError, match=r"no tokenizer\.json in .*openai/clip-vit-base-patch32"):
         load_text_encoder(str(path))
     tokens = {f"x{number}": number for number in range(60)} | {"<|startoftext|>": 60, "<|endoftext|>": 61}
     CLIPTokenizer(vocab=tokens, merges=[]).save_pretrained(tmp_path)
