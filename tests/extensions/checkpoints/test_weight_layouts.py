@@ -314,7 +314,7 @@ def test_a_missing_tokenizer_names_the_file_to_add(tmp_path: Path) -> None:
         load_text_encoder(str(path))
     tokens = {f"x{number}": number for number in range(60)} | {"<|startoftext|>": 60, "<|endoftext|>": 61}
     CLIPTokenizer(vocab=tokens, merges=[]).save_pretrained(tmp_path)
-    with pytest.raises(EncoderError, match="has more tokens than the model's 58"):
+    with pytest.raises(EncoderError, match="its model knows 58"):
         load_text_encoder(str(path))
 
 
