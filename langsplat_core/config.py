@@ -396,25 +396,6 @@ def with_preset(config: TrainConfig, preset: TrainPreset) -> TrainConfig:
     )
 
 
-@dataclass(frozen=True)
-class BudgetConfig:
-    """An error that is allowed, and the views it is measured on."""
-
-    max_psnr_loss: Decibels = 0.1  # dB, mean over the measuring views; nothing that loses more is written
-    views: SeveralCount = 96
-    """At most, of the scene's cameras or photographs; a sixth of them measures the loss."""
-    max_side: Side = 800  # images are drawn with at most this many pixels on their longer side
-    # dB that the scene is assumed to have where no photographs are given: higher is more cautious
-    assumed_psnr: Annotated[float, Range(0.0, 200.0, above=True)] = 35.0
-
-
-@dataclass(frozen=True)
-class CleanConfig(BudgetConfig):
-    """Settings of `langsplat clean`: the error allowed, its views, and what may be a floater."""
-
-    region: Count = 100  # Gaussians: a larger connected region is no floater
-
-
 Display = Literal["rgb", "latent", "tree", "relevancy", "segmentation", "depth", "alpha"]
 ColourMap = Literal["turbo", "viridis", "cividis", "magma", "grey"]
 LevelChoice = Literal["auto", "subpart", "part", "whole"]

@@ -8,15 +8,14 @@ from pathlib import Path
 
 from assets.making.dataset import write_dataset
 from assets.making.truth import TruthMasks, read_truth
-from langsplat_core.compaction.compact import compact_scene
 from langsplat_core.config import (
-    BudgetConfig,
     ClipConfig,
     DatasetConfig,
     MaskConfig,
     RadianceConfig,
     TrainConfig,
 )
+from langsplat_core.extensions.compaction.compact import BudgetConfig, compact_scene
 from langsplat_core.pipeline.train import train_scene
 from langsplat_core.progress import Progress, silent
 

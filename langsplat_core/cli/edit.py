@@ -1,21 +1,19 @@
-"""`langsplat transform`, `crop`, `clean`, `compact` and `scale`: scenes edited by numbers.
+"""`langsplat transform`, `crop` and `scale`: scenes edited by numbers.
 
 What belongs to them goes along.
 """
 
 import math
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
-from rich.table import Table
 
 from langsplat_core.arrays import Array
-from langsplat_core.cli.arguments import AnyScene, OutFile, WrittenScene
-from langsplat_core.cli.run import OutputConsole, print_json
-from langsplat_core.config import BudgetConfig, CleanConfig, Positive, Range
+from langsplat_core.cli.arguments import AnyScene, WrittenScene
+from langsplat_core.config import Positive, Range
 from langsplat_core.errors import InputError
 from langsplat_core.io.ply import write_metres
 from langsplat_core.io.scenes import (
@@ -25,7 +23,6 @@ from langsplat_core.io.scenes import (
     load_without_language,
     save_scene,
 )
-from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.selection import above_plane, in_box, in_sphere
 from langsplat_core.scene import Scene
 from langsplat_core.scene.transform import (
@@ -39,10 +36,6 @@ from langsplat_core.scene.transform import (
     transform_scene,
     turning,
 )
-
-if TYPE_CHECKING:
-    from langsplat_core.compaction.clean import CleanReport
-    from langsplat_core.compaction.compact import CompactReport
 
 Coordinate = Annotated[float, Range(-1e12, 1e12)]
 Point = tuple[Coordinate, Coordinate, Coordinate]
@@ -138,48 +131,6 @@ class Crop:
         return inside
 
 
-@dataclass(frozen=True)
-class Clean:
-    """Remove floaters: small regions that touch nothing and veils in free space, the least visible first.
-
-    As many go as the allowed loss of PSNR lets go. It is measured on photographs that the scene was not
-    trained on where --photos has some, else derived from how far the scene's images change.
-    """
-
-    scene: AnyScene
-    out: WrittenScene
-    photos: Path | None = None
-    """Dataset the scene was trained on: true floaters then cost nothing, and more of them go."""
-    json: bool = False
-    """Print JSON."""
-    config: Annotated[CleanConfig, tyro.conf.arg(name="")] = field(default_factory=CleanConfig)
-
-    def run(self) -> None:
-        from langsplat_core.compaction.clean import clean_scene  # pycolmap: not every install has it
-
-        with TerminalProgress() as progress:
-            report = clean_scene(self.scene, self.out, self.config, self.photos, progress)
-        if self.json:
-            print_json({"out": str(self.out), "removed": report.removed, **asdict(report)})
-            return
-        print(*_lines(report), f"written: {self.out}", sep="\n")
-
-
-def _lines(report: "CleanReport") -> list[str]:
-    how = "on photographs" if report.assumed_psnr is None else f"if the scene has {report.assumed_psnr:g} dB"
-    lines = [
-        f"removed: {report.removed} of {report.gaussians} Gaussians: {report.regions} in small regions, "
-        f"{report.free_space} in free space, {report.invalid} that cannot be drawn",
-        f"loss: {report.loss:.3f} dB of {report.budget:g} allowed, worst view {report.worst_loss:.2f} dB "
-        f"({how}; {report.measuring_views} views; {report.views_from})",
-    ]
-    if report.psnr_before is not None and report.psnr_after is not None:
-        lines.append(f"PSNR: {report.psnr_before:.2f} dB before, {report.psnr_after:.2f} after")
-    if report.kept:
-        lines.append(f"kept: {report.kept} more are suspected; --max-psnr-loss allows more")
-    return lines
-
-
 def _extent(scene: Scene) -> str:
     """Return the extent of a scene's Gaussians, in words."""
     means = scene.gaussians.means[np.isfinite(scene.gaussians.means).all(1)]
@@ -187,69 +138,6 @@ def _extent(scene: Scene) -> str:
         return "the scene holds none that lies anywhere"
     low, high = (" ".join(f"{number:.4g}" for number in corner) for corner in (means.min(0), means.max(0)))
     return f"they lie between {low} and {high}"
-
-
-@dataclass(frozen=True)
-class Compact:
-    """Drop the Gaussians and colour harmonics that the views do not need, within an error budget.
-
-    Nothing is retrained; the language field, the cameras and extra properties are taken along.
-    """
-
-    scene: AnyScene
-    out: OutFile | None = None
-    """The scene to write (default: SCENE with .compact.ply for its ending)."""
-    photos: Path | None = None
-    """Dataset the scene was trained on: the loss is then measured against its photographs."""
-    json: bool = False
-    """Print JSON."""
-    config: Annotated[BudgetConfig, tyro.conf.arg(name="")] = field(default_factory=BudgetConfig)
-
-    def run(self) -> None:
-        from langsplat_core.compaction.compact import compact_scene
-
-        out = self.out or self.scene.with_name(self.scene.name.split(".")[0] + ".compact.ply")
-        with TerminalProgress() as progress:
-            report = compact_scene(self.scene, out, self.config, self.photos, progress)
-        if self.json:
-            print_json({"out": str(out), **asdict(report)})
-            return
-        OutputConsole().print(_table(report))
-        print(*_notes(report), f"written: {out}", sep="\n")
-
-
-def _table(report: "CompactReport") -> Table:
-    table = Table("", "before", "after", "after / before")
-    for column in table.columns[1:]:
-        column.justify = "right"
-    before, after = report.before, report.after
-
-    def row(name: str, old: float, new: float, form: str, factor: float = 1.0) -> None:
-        share = f"{100 * new / old:.1f} %" if old else "-"
-        table.add_row(name, format(old * factor, form), format(new * factor, form), share)
-
-    row("Gaussians", before.gaussians, after.gaussians, ",d", 1)
-    table.add_row("SH degree", str(before.sh_degree), str(after.sh_degree), "")
-    row("on disk, MB", before.disk_bytes, after.disk_bytes, ".2f", 1e-6)
-    row("in memory, MB", before.memory_bytes, after.memory_bytes, ".2f", 1e-6)
-    if before.psnr is not None and after.psnr is not None:
-        table.add_row("PSNR, dB", f"{before.psnr:.2f}", f"{after.psnr:.2f}", "")
-    return table
-
-
-def _notes(report: "CompactReport") -> list[str]:
-    how = (
-        "measured on photographs"
-        if report.assumed_psnr is None
-        else f"derived from the change, if the scene has {report.assumed_psnr:g} dB"
-    )
-    lines = [
-        f"loss: {report.loss:.3f} dB of {report.budget:g} allowed, worst view "
-        f"{report.worst_loss:.2f} dB ({how})",
-        f"views: {report.ranking_views} ranked the Gaussians, {report.measuring_views} others measured; "
-        f"{report.views_from}",
-    ]
-    return lines
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,9 @@ from scipy.spatial import cKDTree
 from assets.making.dataset import photographed_room
 from assets.making.objects.furniture import TABLE_HEIGHT
 from langsplat_core.arrays import Array, logit, sigmoid
-from langsplat_core.compaction.clean import clean, find_floaters
-from langsplat_core.compaction.compact import Views, choose_views, mean_psnr
-from langsplat_core.config import CleanConfig
 from langsplat_core.extensions.benchmarks.report import markdown
+from langsplat_core.extensions.compaction.clean import CleanConfig, clean, find_floaters
+from langsplat_core.extensions.compaction.compact import Views, choose_views, mean_psnr
 from langsplat_core.extensions.geometry.mesh import fuse
 from langsplat_core.extensions.geometry.occupancy import find_occupancy, floor_map, map_axes
 from langsplat_core.extensions.geometry.planes import find_room

@@ -26,15 +26,16 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from langsplat_core.arrays import Array, rotation_matrices
-from langsplat_core.compaction.compact import (
+from langsplat_core.config import Count, check_settings
+from langsplat_core.errors import InputError
+from langsplat_core.extensions.compaction.compact import (
+    BudgetConfig,
     Views,
     choose_views,
     contributions,
     mean_psnr,
     psnr_losses,
 )
-from langsplat_core.config import CleanConfig, check_settings
-from langsplat_core.errors import InputError
 from langsplat_core.io.scenes import check_keeps, check_writable, load_scene, save_scene
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.render import view_of
@@ -46,6 +47,13 @@ from langsplat_core.scene.surface import Surface, build_surface
 TOUCH = (1.1, 1.25, 1.5)  # a region that touches no other even if so many extents are bridged
 AHEAD = (0.4, 0.55, 0.7)  # share of the views of a place in which it lies in free space
 USUAL = 0.45  # median gap to the nearest in trained scenes, at most; sparser ones get as much larger a TOUCH
+
+
+@dataclass(frozen=True)
+class CleanConfig(BudgetConfig):
+    """Settings of `langsplat clean`: the error allowed, its views, and what may be a floater."""
+
+    region: Count = 100  # Gaussians: a larger connected region is no floater
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,12 +37,12 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
 import numpy as np
 
 from langsplat_core.arrays import Array, mean_squared_error, psnr
-from langsplat_core.config import BudgetConfig, DatasetConfig, check_settings
+from langsplat_core.config import DatasetConfig, Decibels, Range, SeveralCount, Side, check_settings
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import InputError
 from langsplat_core.io.scenes import check_keeps, check_writable, load_scene, save_scene
@@ -57,6 +57,18 @@ T = TypeVar("T")
 
 ALONE = 0.055  # display values, RGB distance; see above
 HOLD_OUT = 6  # every n-th view measures
+
+
+@dataclass(frozen=True)
+class BudgetConfig:
+    """An error that is allowed, and the views it is measured on."""
+
+    max_psnr_loss: Decibels = 0.1  # dB, mean over the measuring views; nothing that loses more is written
+    views: SeveralCount = 96
+    """At most, of the scene's cameras or photographs; a sixth of them measures the loss."""
+    max_side: Side = 800  # images are drawn with at most this many pixels on their longer side
+    # dB that the scene is assumed to have where no photographs are given: higher is more cautious
+    assumed_psnr: Annotated[float, Range(0.0, 200.0, above=True)] = 35.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,12 +7,15 @@ import pytest
 
 from langsplat_core.arrays import Array, psnr
 from langsplat_core.cli import run as command_line
-from langsplat_core.cli.edit import Compact
-from langsplat_core.compaction import compact
-from langsplat_core.compaction.clean import CleanReport, clean, find_floaters
-from langsplat_core.compaction.compact import (
+from langsplat_core.datasets import Capture
+from langsplat_core.errors import InputError
+from langsplat_core.extensions.compaction import compact
+from langsplat_core.extensions.compaction.clean import CleanConfig, CleanReport, clean, find_floaters
+from langsplat_core.extensions.compaction.commands import Compact
+from langsplat_core.extensions.compaction.compact import (
     ALONE,
     HOLD_OUT,
+    BudgetConfig,
     MeasuringView,
     Views,
     check_same_world,
@@ -25,9 +28,6 @@ from langsplat_core.compaction.compact import (
     psnr_losses,
     smallest,
 )
-from langsplat_core.config import BudgetConfig, CleanConfig
-from langsplat_core.datasets import Capture
-from langsplat_core.errors import InputError
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.progress import Progress, Report, silent
 from langsplat_core.raster.reference import ReferenceRasterizer

@@ -1,1 +1,0 @@
-"""`langsplat compact`: a scene with no more Gaussians than it needs."""
