@@ -17,7 +17,6 @@ from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, no_field
 from langsplat_core.scene import LanguageField, Scene
 from langsplat_core.semantics.encoders import DEMO
-from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.files.disk import Stamps, Watch
 from langsplat_viewer.files.projects import Shelf
 from langsplat_viewer.jobs import Job, Worker, one_line
@@ -181,9 +180,7 @@ class Viewer:
     pivot: tuple[Scene, Array, Array] | None = None  # of what is selected in which scene, a point (3,)
     out_of_sight: tuple[OutlineView, Marks, Array] | None = None  # nodes with nothing shown, of which
     beside: "Viewer | None" = None  # of a second scene, seen and asked as this one is
-    # view and session of the first scene that this second one was given last
-    followed: OrbitCamera | None = None
-    mirrored: Session | None = None
+    mirrored: Session | None = None  # of the first scene, that this second one was given last
     surface: ShownImage | None = None
     training: Training | None = None  # under way
     clock: float = 0.0  # seconds, as of the last frame

@@ -11,7 +11,7 @@ import pytest
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions import editing, opening, queries, settings, viewpoint
-from langsplat_viewer.camera.controls import default_view, extent_of, orbit
+from langsplat_viewer.camera.controls import orbit
 from langsplat_viewer.files.disk import MOST_LISTED, Watch, list_folder, stamps
 from langsplat_viewer.options import say_compiling
 from langsplat_viewer.rendering.request import UNCLIPPED, Clip
@@ -170,15 +170,6 @@ def test_scene_returns_with_its_camera_and_queries(three):
     assert [query.phrase for query in three.state.session.queries] == ["plant"]
     assert three.state.shown_results()[0].found
     assert three.engine.canonical_phrases != ("plant",)
-
-
-def test_scene_is_removed_from_the_list(three):
-    act(opening.switch_scene, three, PLAIN)
-    opening.unlist_scene(three, BLOBS)
-    assert three.state.scenes == (PLAIN, BARE)
-    assert three.visits == {}
-    act(opening.step_scene, three, 1)
-    assert three.state.path == BARE
 
 
 # The file browser, without a window.
@@ -478,15 +469,3 @@ def test_second_scene_closes_with_the_split(two):
     editing.undo(two)
     opening.follow_beside(two)
     assert two.state.session.split.mode == "off"
-
-
-def test_second_scene_of_other_coordinates_is_seen_from_that_side():
-    scene = SCENES["blobs.ply"]
-    moved = replace(scene.gaussians, means=3 * scene.gaussians.means + 50)
-    here, there = extent_of(scene), extent_of(replace(scene, gaussians=moved))
-    view = default_view(scene, here, (80, 60))
-    other = opening.linked(view, here, there)
-    assert opening.linked(view, here, here) is view
-    np.testing.assert_array_equal(other.rotation, view.rotation)
-    eyes = [(one.eye - extent.centre) / extent.radius for one, extent in ((other, there), (view, here))]
-    np.testing.assert_allclose(*eyes)

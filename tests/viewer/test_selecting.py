@@ -247,7 +247,7 @@ def test_click_without_surface_or_field_says_why(front, monkeypatch):
     assert "nothing under the cursor" in front.state.messages[-1].text
     front.state.scene = type(front.state.scene)(front.state.scene.gaussians)
     draw(front, "thing", [(0.5, 0.5)])
-    assert "without a language field" in errors(front)[-1]
+    assert "language field" in errors(front)[-1]
     assert marked(front) == ("", "", "")
 
 

@@ -13,13 +13,14 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import LangSplatError
+from langsplat_core.progress import Progress
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.instances import Instance
 from langsplat_core.query.selection import at_point, grow, in_box, of_rows, shrink
 from langsplat_core.scene import LEVELS
 from langsplat_core.scene.transform import AXES, Similarity, moving, rotating, scaling
 from langsplat_viewer import marks
-from langsplat_viewer.actions.queries import ask_again, ask_unanswered, forget_unlisted, set_canonical, teach
+from langsplat_viewer.actions.queries import ask_listed, forget_unlisted, set_canonical, teach
 from langsplat_viewer.camera.controls import extent_of
 from langsplat_viewer.marks import Drawn, Marks, Mode, Stroke, Tool
 from langsplat_viewer.rendering.request import UNCLIPPED
@@ -135,6 +136,32 @@ def select_alike(viewer: Viewer) -> None:
         find(viewer, "looking for more like", lambda engine: engine.like(selected).members, "replace")
 
 
+Target = int | Array  # a node of the tree, or a (3,) point on the surface, world units
+
+
+def of_thing(act: Callable[[Viewer, Array], None]) -> Callable[[Viewer, Target], None]:
+    """Return the action that has the worker find (N,) bool of a thing, and then does `act` with it."""
+
+    def begin(viewer: Viewer, target: Target) -> None:
+        engine, scene, level = viewer.searchable(), viewer.state.scene, viewer.state.session.level
+        if engine is None:
+            return
+
+        def work(progress: Progress) -> Array:
+            if isinstance(target, int):
+                return engine.tree.members(target)
+            index = LEVELS.index("whole" if level == "auto" else level)
+            return at_point(engine.surface, engine.regions, index, target)
+
+        def done(members: Array) -> None:
+            if viewer.state.scene is scene and members.any():
+                act(viewer, members)
+
+        viewer.run("finding the thing", work, done)
+
+    return begin
+
+
 def name_selection(viewer: Viewer, name: str) -> None:
     """Teach a name by what is selected."""
     if has_selection(viewer):
@@ -214,7 +241,7 @@ def end_stroke(viewer: Viewer, mode: Mode | None = None) -> None:
         return
     set_tools(viewer, stroke=None)
     if drawn.tool == "thing":
-        _select_under(viewer, drawn.centre, mode)
+        of_thing(lambda viewer, members: take(viewer, members, mode))(viewer, drawn.centre)
         return
     on_screen = drawn.tool in marks.ON_SCREEN
     wanted = state.tools.only_visible and on_screen and viewer.surface is not None
@@ -233,21 +260,6 @@ def drawn_stroke(viewer: Viewer) -> Drawn | None:
     if tool is None or stroke is None or state.view is None:
         return None
     return Drawn(tool, stroke, state.view.camera(*state.size), state.tools.brush, reach(viewer))
-
-
-def _select_under(viewer: Viewer, centre: Array, mode: Mode | None) -> None:
-    """Select the thing at a place (3,), or the part of it if that is the level of the queries."""
-    state = viewer.state
-    if not state.has_field:
-        viewer.say_error("without a language field no things are known: use a brush, sphere or box")
-        return
-    level = LEVELS.index("whole" if state.session.level == "auto" else state.session.level)
-    find(
-        viewer,
-        "finding the thing for",
-        lambda engine: at_point(engine.surface, engine.regions, level, centre),
-        mode,
-    )
 
 
 # Transforms of the selection, else of the scene.
@@ -322,7 +334,7 @@ def place(viewer: Viewer) -> None:
     if state.session.canonical:
         set_canonical(viewer, state.session.canonical)  # which asks again
     else:
-        ask_again(viewer)
+        ask_listed(viewer)
 
 
 def apply_form(viewer: Viewer) -> None:
@@ -416,6 +428,6 @@ def adopt(viewer: Viewer, session: Session) -> None:
     elif session.canonical != before.canonical:
         set_canonical(viewer, session.canonical)  # which asks again
     elif session.level != before.level:
-        ask_again(viewer)
+        ask_listed(viewer)
     else:
-        ask_unanswered(viewer)
+        ask_listed(viewer, anew=False)

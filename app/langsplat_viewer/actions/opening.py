@@ -5,8 +5,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from langsplat_core.compiled import is_compiled
 from langsplat_core.datasets.photos import count_photographs
 from langsplat_core.display.displays import DISPLAYS, latent_colours
@@ -22,7 +20,7 @@ from langsplat_viewer.actions.editing import adopt
 from langsplat_viewer.actions.queries import load_queries
 from langsplat_viewer.actions.saving import leave
 from langsplat_viewer.actions.settings import open_panel
-from langsplat_viewer.camera.controls import Extent, OrbitCamera, extent_of
+from langsplat_viewer.camera.controls import Extent, extent_of
 from langsplat_viewer.files import disk
 from langsplat_viewer.files.disk import Stamps, stamps
 from langsplat_viewer.files.projects import PATHS, PROJECTS, QUERIES, Project, read_project
@@ -237,12 +235,6 @@ def step_scene(viewer: Viewer, by: int) -> None:
         return
     here = scenes.index(path.absolute()) if path is not None and path.absolute() in scenes else -1
     switch_scene(viewer, scenes[(here + by) % len(scenes)])
-
-
-def unlist_scene(viewer: Viewer, path: Path) -> None:
-    """Take a scene off the list, and forget its visit; the scene that is shown stays."""
-    viewer.state.scenes = tuple(other for other in viewer.state.scenes if other != path)
-    viewer.visits.pop(path, None)
 
 
 # The file browser, typed paths, files dropped onto the window, and recent scenes.
@@ -480,10 +472,8 @@ def watch_training(viewer: Viewer) -> None:
         viewer.say_error((training.progress.said or ["no reason given"])[-1])
 
 
-# A second scene, or the same by another encoder or method, right of a line across the image: a viewer of its
-# own without a window, whose session follows from the first one's.
-
-ALIKE = 0.5, 1.5  # of two scenes in the same coordinates: distance of their middles in radii, ratio of radii
+# A second scene right of a line across the image, by another encoder or method in the same coordinates: a
+# viewer of its own without a window, whose session follows from the first one's.
 
 
 def open_beside(viewer: Viewer, path: Path) -> None:
@@ -514,10 +504,9 @@ def follow_beside(viewer: Viewer) -> None:
     for message in other.messages:
         state.say(f"beside: {message.text}", message.is_error)
     other.messages, other.size = [], state.size
-    if other.extent is None or state.extent is None or state.view is None:
+    if other.scene is None or state.view is None:
         return
-    if beside.followed is not state.view:
-        other.view, beside.followed = linked(state.view, state.extent, other.extent), state.view
+    other.view = state.view
     session, before = _mirrored(state, other), beside.mirrored
     if session != before:
         beside.mirrored = session
@@ -545,17 +534,3 @@ def _mirrored(state: ViewerState, other: ViewerState) -> Session:
         canonical=first.canonical,
         queries=tuple(replace(query, slot=None) if hidden(query) else query for query in answered),
     )
-
-
-def linked(view: OrbitCamera, here: Extent, there: Extent) -> OrbitCamera:
-    """Return the same view of another scene.
-
-    It is itself where both have the same coordinates, as far as their extents tell, else it is from the same
-    side and as far away in radii.
-    """
-    ratio = there.radius / here.radius
-    away = np.linalg.norm(here.centre - there.centre)
-    if away < ALIKE[0] * here.radius and 1 / ALIKE[1] < ratio < ALIKE[1]:
-        return view
-    target = there.centre + ratio * (view.target - here.centre)
-    return replace(view, target=target, distance=ratio * view.distance)

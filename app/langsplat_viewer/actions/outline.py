@@ -1,6 +1,6 @@
 """The outline: the scene's tree in words, and what can be done with a thing of it or one that is clicked."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -11,16 +11,13 @@ from langsplat_core.progress import Progress
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.instances import axis_aligned_box
 from langsplat_core.query.inventory import Outline, scene_outline
-from langsplat_core.query.selection import at_point
-from langsplat_core.scene import LEVELS, NO_NODE
+from langsplat_core.scene import NO_NODE
 from langsplat_core.scene.language import tidy
-from langsplat_viewer.actions.editing import mark, select_alike, take
+from langsplat_viewer.actions.editing import Target, mark, of_thing, select_alike, take
 from langsplat_viewer.actions.queries import teach
 from langsplat_viewer.actions.viewpoint import focus_on
 from langsplat_viewer.state import OutlineView
 from langsplat_viewer.viewer import Viewer
-
-Target = int | Array  # a node of the tree, or a (3,) point on the surface, world units
 
 
 def wanted(viewer: Viewer) -> OutlineView | None:
@@ -139,83 +136,51 @@ def in_view(viewer: Viewer) -> list[Outline]:
 # What can be done with a thing.
 
 
-def with_thing(viewer: Viewer, target: Target, act: Callable[[Array], None]) -> None:
-    """Have the worker find (N,) bool of a thing, and then `act` with it."""
-    engine, scene, level = viewer.searchable(), viewer.state.scene, viewer.state.session.level
-    if engine is None:
-        return
-
-    def work(progress: Progress) -> Array:
-        if isinstance(target, int):
-            return engine.tree.members(target)
-        index = LEVELS.index("whole" if level == "auto" else level)
-        return at_point(engine.surface, engine.regions, index, target)
-
-    def done(members: Array) -> None:
-        if viewer.state.scene is scene and members.any():
-            act(members)
-
-    viewer.run("finding the thing", work, done)
-
-
-def select(viewer: Viewer, target: Target) -> None:
+@of_thing
+def select(viewer: Viewer, members: Array) -> None:
     """Select the Gaussians of a thing in place of what is selected."""
-    with_thing(viewer, target, lambda members: take(viewer, members, "replace"))
+    take(viewer, members, "replace")
 
 
-def visit(viewer: Viewer, target: Target) -> None:
+@of_thing
+def visit(viewer: Viewer, members: Array) -> None:
     """Select a thing, and look at it from as near as it is small."""
-
-    def act(members: Array) -> None:
-        take(viewer, members, "replace")
-        scene = viewer.state.scene
-        if scene is not None:
-            box = axis_aligned_box(scene.gaussians.means[members].astype(np.float64))
-            focus_on(viewer, box.mean(0), box)
-
-    with_thing(viewer, target, act)
+    take(viewer, members, "replace")
+    scene = viewer.state.scene
+    assert scene is not None
+    box = axis_aligned_box(scene.gaussians.means[members].astype(np.float64))
+    focus_on(viewer, box.mean(0), box)
 
 
-def find_alike(viewer: Viewer, target: Target) -> None:
+@of_thing
+def find_alike(viewer: Viewer, members: Array) -> None:
     """Select everything like a thing."""
-
-    def act(members: Array) -> None:
-        take(viewer, members, "replace")
-        select_alike(viewer)
-
-    with_thing(viewer, target, act)
+    take(viewer, members, "replace")
+    select_alike(viewer)
 
 
-def hide(viewer: Viewer, target: Target) -> None:
+@of_thing
+def hide(viewer: Viewer, members: Array) -> None:
     """Hide a thing; what is selected stays so."""
-
-    def act(members: Array) -> None:
-        marks = viewer.state.marks
-        hidden = marks.hidden | members
-        mark(viewer, replace(marks, selected=marks.selected & ~hidden, hidden=hidden))
-
-    with_thing(viewer, target, act)
+    marks = viewer.state.marks
+    hidden = marks.hidden | members
+    mark(viewer, replace(marks, selected=marks.selected & ~hidden, hidden=hidden))
 
 
-def show(viewer: Viewer, target: Target) -> None:
+@of_thing
+def show(viewer: Viewer, members: Array) -> None:
     """Show a thing that is hidden."""
-
-    def act(members: Array) -> None:
-        marks = viewer.state.marks
-        mark(viewer, replace(marks, hidden=marks.hidden & ~members))
-
-    with_thing(viewer, target, act)
+    mark(viewer, replace(viewer.state.marks, hidden=viewer.state.marks.hidden & ~members))
 
 
 def give_name(viewer: Viewer, target: Target, name: str) -> None:
     """Name a thing, and teach the name, so that it is found by it."""
     name = tidy(name)
-    if not name:
-        return
 
     def done(taught: str) -> None:
         if isinstance(target, int):
             things = viewer.state.session.things
             viewer.change(things=replace(things, names={**things.names, target: name}))
 
-    with_thing(viewer, target, lambda members: teach(viewer, name, members, done))
+    if name:
+        of_thing(lambda viewer, members: teach(viewer, name, members, done))(viewer, target)

@@ -104,16 +104,10 @@ def _tell_apart(viewer: Viewer, engine: QueryEngine, phrase: str, result: QueryR
     viewer.run("telling instances apart", lambda progress: engine.instances(result, MOST_THINGS), done)
 
 
-def ask_again(viewer: Viewer) -> None:
-    """Answer every query of the list anew: what they depend on has changed."""
+def ask_listed(viewer: Viewer, anew: bool = True) -> None:
+    """Answer the queries of the list: all of them `anew`, or those that were not asked yet."""
     for query in viewer.state.session.queries:
-        answer(viewer, query.phrase)
-
-
-def ask_unanswered(viewer: Viewer) -> None:
-    """Answer the queries of the list that were not asked yet."""
-    for query in viewer.state.session.queries:
-        if query.phrase not in viewer.state.answers:
+        if anew or query.phrase not in viewer.state.answers:
             answer(viewer, query.phrase)
 
 
@@ -184,7 +178,7 @@ def set_level(viewer: Viewer, level: LevelChoice) -> None:
     """Choose the semantic level of all queries, or leave it to the score ("auto")."""
     if level != viewer.state.session.level:
         viewer.change(level=level)
-        ask_again(viewer)
+        ask_listed(viewer)
 
 
 def set_cut(viewer: Viewer, phrase: str, cut: float | None, *, is_new: bool = True) -> None:
@@ -214,12 +208,12 @@ def set_canonical(viewer: Viewer, phrases: tuple[str, ...]) -> None:
     def done(canonical: tuple[str, ...]) -> None:
         viewer.put(canonical=phrases)
         state.say(f"compared with {', '.join(canonical)}")
-        ask_again(viewer)
+        ask_listed(viewer)
 
     def failed(reason: str) -> None:
         viewer.say_error(reason)
         viewer.put(canonical=before if before != phrases else ())
-        ask_unanswered(viewer)
+        ask_listed(viewer, anew=False)
 
     viewer.run("encoding canonical phrases", work, done, failed)
 

@@ -1,5 +1,6 @@
 """What is shown and how: displays side by side, overlays, ruler and notes; preferences and panels."""
 
+from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import Any
 
@@ -212,19 +213,17 @@ def open_panel(viewer: Viewer, title: str) -> None:
     viewer.state.show_panel, viewer.state.wanted_panel = True, title
 
 
-def toggle_panels(viewer: Viewer) -> None:
-    """Hide all panels, or bring them back."""
-    viewer.state.show_panel = not viewer.state.show_panel
+def _switch(name: str) -> Callable[[Viewer], None]:
+    """Return the action that turns a switch of the state over."""
+    return lambda viewer: setattr(viewer.state, name, not getattr(viewer.state, name))
+
+
+toggle_panels, toggle_help = _switch("show_panel"), _switch("show_help")
 
 
 def reset_layout(viewer: Viewer) -> None:
     """Put the panels where they are at first."""
     viewer.state.show_panel = viewer.state.resets_panels = True
-
-
-def toggle_help(viewer: Viewer) -> None:
-    """Show or close the help."""
-    viewer.state.show_help = not viewer.state.show_help
 
 
 def toggle_palette(viewer: Viewer) -> None:
