@@ -3,6 +3,8 @@
 import gc
 import os
 import random
+import tracemalloc
+import warnings
 from pathlib import Path
 
 # Before torch and BLAS are imported. Networks as small as the tests' are ten times slower on two threads than
@@ -76,3 +78,26 @@ def real_data() -> Path:
     if not folder.is_dir():
         pytest.skip("no real data beside the repository")
     return folder
+
+
+@pytest.fixture
+def bounded():
+    """Fails the test when Python and NumPy together ever held more than 32 MiB, or a warning was given."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        tracemalloc.start()
+        yield
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert peak < 1 << 25, f"{peak / 1e6:.0f} MB"
+
+
+@pytest.fixture
+def put(tmp_path):
+    """Writes a file with the given content and returns its path."""
+
+    def write(content: bytes, name: str = "scene"):
+        (tmp_path / name).write_bytes(content)
+        return tmp_path / name
+
+    return write

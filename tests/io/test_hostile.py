@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
-from PIL import EpsImagePlugin, Image
+from PIL import Image
 
-from langsplat_core.datasets.photos import find_photos, read_photo
+from langsplat_core.datasets.photos import read_photo
 from langsplat_core.io.cameras import read_cameras
 from langsplat_core.io.hostile import (
     MOST_PIXELS,
@@ -52,18 +52,6 @@ def read(path: Path, limit: int = 10_000) -> bytes:
 @pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
 def test_other_methods_are_refused_before_they_run(tmp_path: Path, method: int) -> None:
     assert_refused(read, packed(tmp_path / "a.zip", method))
-
-
-def test_archives_of_an_unknown_version_are_refused(tmp_path: Path) -> None:
-    """ZIP says which version it takes to be unpacked: 12.7, or an encrypted member."""
-    np.savez(tmp_path / "a.npz", key=np.ones(3))
-    good = (tmp_path / "a.npz").read_bytes()
-    entry = good.rindex(b"PK\x01\x02")
-    for place, value in ((6, 127), (8, 1)):
-        data = bytearray(good)
-        data[entry + place] = value
-        (tmp_path / "a.npz").write_bytes(data)
-        assert_refused(read_npz, tmp_path / "a.npz")
 
 
 def test_members_larger_than_the_limit_are_refused(tmp_path: Path) -> None:
@@ -160,7 +148,6 @@ def test_arrays_of_other_types_are_refused(put: Callable[..., Path], dtype: obje
 # Pictures are opened by their content, in one place, within limits, and every failure is one error.
 
 ROOT = Path(__file__).parents[2]
-EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 10 10\n%%EndComments\nshowpage\n%%EOF\n"
 
 
 def saved(kind: str, size: tuple[int, int] = (20, 15), **options: object) -> bytes:
@@ -184,15 +171,6 @@ def test_one_place_alone_opens_images() -> None:
     assert openers == [ROOT / "langsplat_core/io/hostile.py"]
 
 
-def test_postscript_starts_no_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    started: list[object] = []
-    monkeypatch.setattr(EpsImagePlugin, "Ghostscript", lambda *args: started.append(args))
-    (tmp_path / "a.png").write_bytes(EPS)
-    with pytest.raises(PictureError, match="the content is none of JPEG, PNG"):
-        read_photo(tmp_path / "a.png", upright=False)
-    assert not started
-
-
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP", "TIFF", "BMP"])
 def test_the_content_tells_the_kind_of_an_image(tmp_path: Path, kind: str) -> None:
     (tmp_path / "a.jpg").write_bytes(saved(kind))
@@ -200,17 +178,11 @@ def test_the_content_tells_the_kind_of_an_image(tmp_path: Path, kind: str) -> No
     assert read_photo(tmp_path / "a.jpg", upright=True).size == (20, 15)
 
 
-@pytest.mark.parametrize("kind", ["GIF", "PPM", "TGA", "ICO", "DDS", "PCX"])
+@pytest.mark.parametrize("kind", ["EPS", "GIF", "PPM", "TGA", "ICO", "DDS", "PCX"])
 def test_other_kinds_of_images_are_refused(tmp_path: Path, kind: str) -> None:
     (tmp_path / "a.png").write_bytes(saved(kind))
     with pytest.raises(PictureError, match="the content is none of"):
         picture_size(tmp_path / "a.png")
-
-
-def test_photographs_are_found_by_their_suffixes(tmp_path: Path) -> None:
-    for name in ("a.bmp", "b.avif", "c.heic", "d.gif"):
-        (tmp_path / name).touch()
-    assert [path.name for path in find_photos(tmp_path)] == ["a.bmp", "b.avif", "c.heic"]
 
 
 @pytest.mark.parametrize("size", [(12_000, 12_000), (1, 2**31 - 1), (5000, 5000), (40_000, 40_000)])
@@ -260,14 +232,6 @@ def webp_that_claims(width: int, height: int) -> bytes:
 @pytest.mark.parametrize("name", ["means_l.webp", "quats.webp", "shN_centroids.webp", "shN_labels.webp"])
 def test_images_that_unfold_to_gigabytes_are_refused(tmp_path, bounded, name, width):
     folder = write_folder(tmp_path / "a", sog_files(SCENE) | {name: webp_that_claims(width, 16384)})
-    assert_refused(load_gaussians, folder)
-
-
-def test_a_count_beyond_any_compression_is_refused(tmp_path, bounded):
-    files = sog_files(SCENE)
-    meta = json.dumps(json.loads(files["meta.json"]) | {"count": 16384 * 16384}).encode()
-    files = dict.fromkeys(files, webp_that_claims(16384, 16384)) | {"meta.json": meta}
-    folder = write_folder(tmp_path / "a", files)
     assert_refused(load_gaussians, folder)
 
 
@@ -368,12 +332,6 @@ def test_headers_are_compared_with_the_file(put, bounded, before, lines):
 
 def sidecar(path: Path) -> LanguageField:
     return read_language(path, SCENE.means)
-
-
-@pytest.mark.parametrize("length", [2**63 - 1, 2**40, 100_000_001])
-def test_a_sidecar_that_claims_gigabytes_is_refused(put, bounded, length):
-    path = put(struct.pack("<Q", length) + b"{" * 100)
-    assert_refused(sidecar, path)
 
 
 def test_a_sidecar_of_unfitting_shapes_is_refused(tmp_path, bounded):

@@ -25,7 +25,7 @@ from langsplat_core.io.scenes import (
 )
 from langsplat_core.io.sidecar import SUFFIX as SIDECAR
 from langsplat_core.io.sidecar import write_language
-from langsplat_core.io.summary import disk_bytes, summarise
+from langsplat_core.io.summary import summarise
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import NO_NODE, Calibration, PlattScaling, Scene
 from langsplat_core.scene.language import tree_of_wholes
@@ -261,8 +261,6 @@ def test_an_unusable_sidecar_is_left_out(path, capsys, other):
         assert reason in str(refused.value)
     Inspect(path, json=True).run()
     assert json.loads(capsys.readouterr().out)["unread"] == [reason]
-    Inspect(path).run()
-    assert "not read" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", [CAMERAS, FIELD])
@@ -290,24 +288,15 @@ def test_summary_counts_faults_by_reason():
 
 
 def test_inspect_prints_a_table_and_json(tmp_path, capsys):
-    path, scene = tmp_path / "scene.ply", full_scene()
-    extras = {"age": np.arange(N, dtype=np.float32)}
-    save_scene(path, replace(scene, antialiased=True, extras=extras))
+    path, extras = tmp_path / "scene.ply", {"age": np.arange(N, dtype=np.float32)}
+    save_scene(path, replace(full_scene(), antialiased=True, extras=extras))
     Inspect(path).run()
-    text = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
-    for words in ("Gaussians         60\n", "yes (Mip-Splatting)", "age", "codec"):
-        assert words in "\n".join([*text, ""]), words
+    assert "yes (Mip-Splatting)" in capsys.readouterr().out
     Inspect(path, json=True).run()
     answer = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     assert (answer["gaussians"], answer["cameras"]) == (N, 3)
     assert answer["disk_bytes"] == sum(file.stat().st_size for file in tmp_path.iterdir())
     assert answer["memory_bytes"] == 4 * N * (3 + 3 + 4 + 1 + 12 + 1 + 3 * (3 + 1))
-
-
-def test_disk_bytes_of_a_folder_are_those_of_its_files(real_data):
-    folder = real_data / "gaussians" / "playbot_8k_sog"
-    expected = sum(file.stat().st_size for file in folder.iterdir())
-    assert disk_bytes(folder) == disk_bytes(folder / "meta.json") == expected
 
 
 def test_summary_counts_nodes():

@@ -1,0 +1,599 @@
+"""Formats other than PLY: .splat, .spz and SOG, each against an encoder of the tests' own, glTF with
+KHR_gaussian_splatting, and points and meshes for other programs."""
+
+import gzip
+import json
+import struct
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import zstandard
+from plyfile import PlyData
+
+from langsplat_core.arrays import rotation_matrices, sigmoid, unit
+from langsplat_core.errors import FormatError, InputError
+from langsplat_core.io.gltf import EXTENSION, PACKED, write_gltf
+from langsplat_core.io.quantised import read_splat, write_splat
+from langsplat_core.io.scenes import load_gaussians, load_scene, save_scene
+from langsplat_core.io.shapes import gltf_axes, write_mesh, write_points
+from langsplat_core.io.sog import write_sog
+from langsplat_core.io.spz import read_spz_scene, write_spz
+from langsplat_core.raster.reference import colours
+from langsplat_core.scene import Gaussians, Scene
+from langsplat_core.scene.transform import moving, rotating, scaling, transform_gaussians
+from tests.support.comparing import assert_refused, assert_same
+from tests.support.file_samples import (
+    C0,
+    sog_files,
+    splat_bytes,
+    spz_bytes,
+    write_folder,
+    zipped,
+)
+from tests.support.scenes import covariances, random_gaussians
+
+# ---- .splat ----
+
+
+def rotation_error(got: Gaussians, want: Gaussians) -> float:
+    matrices = [rotation_matrices(g.quats_wxyz.astype(float)) for g in (got, want)]
+    return float(np.abs(matrices[0] - matrices[1]).max())
+
+
+def check_bytes(got: Gaussians, want: Gaussians) -> None:
+    """Colour and opacity in 8 bits; half a step each."""
+    colours = np.clip(0.5 + C0 * want.sh[:, 0], 0, 1)
+    assert np.abs(0.5 + C0 * got.sh[:, 0] - colours).max() <= 0.5 / 255 + 1e-6
+    assert np.abs(sigmoid(got.opacity_logits) - sigmoid(want.opacity_logits)).max() <= 0.5 / 255 + 1e-6
+
+
+def test_splat_is_written_and_read_back(tmp_path):
+    want = random_gaussians(200, sh_degree=2)
+    write_splat(tmp_path / "a.splat", want)
+    assert (tmp_path / "a.splat").read_bytes() == splat_bytes(want)  # as of another encoder
+    got = read_splat(tmp_path / "a.splat")
+    assert got.sh_degree == 0
+    np.testing.assert_array_equal(got.means, want.means)
+    np.testing.assert_allclose(got.log_scales, want.log_scales, atol=1e-6)
+    check_bytes(got, want)
+    # Half a step of 1/128 a component (a whole one where 128 is cut to 127), at most 3 times in the matrix
+    assert rotation_error(got, want) <= 3 / 128
+    write_splat(tmp_path / "b.splat", got)
+    check_bytes(read_splat(tmp_path / "b.splat"), want)  # a second turn loses nothing more
+
+
+WANT = random_gaussians(30, sh_degree=1)
+SPLAT = splat_bytes(WANT)
+
+
+def patched(content: bytes, at: int, code: str, value: int) -> bytes:
+    """`content` with one number of the type `code` changed."""
+    changed = bytearray(content)
+    struct.pack_into(code, changed, at, value)
+    return bytes(changed)
+
+
+def test_a_real_splat_is_read(real_data):
+    splat = read_splat(real_data / "formats" / "splat" / "minimal.splat")
+    assert splat.valid().all()
+    np.testing.assert_allclose(splat.means, [[-1, 0, -1], [0, 0, -1], [-1, 0, 0], [0, 0, 0]])
+
+
+# ---- .spz ----
+
+# Half a step of each code, and the error of a rotation matrix. From version 3 on: half a step of 9 bits over
+# [0, 0.71] is 7e-4 a component, amplified up to 5 times in the matrix, whose entries are twice products of
+# components, one of them reconstructed. Before: half a step is 1/255, w^2 is off by up to 2 sqrt(3) / 255, so
+# that a w near 0 is off by 0.12, and the matrix by 0.24.
+POSITION = {1: 2.0**-12, 2: 0.5 / 4096, 3: 0.5 / 4096, 4: 0.5 / 4096}
+ROTATION = {1: 0.24, 2: 0.24, 3: 4e-3, 4: 4e-3}
+
+
+def check_spz(got: Gaussians, want: Gaussians, version: int) -> None:
+    assert len(got) == len(want)
+    assert got.sh_degree == want.sh_degree
+    assert np.abs(got.means - want.means).max() <= POSITION[version] + 1e-7
+    assert np.abs(got.log_scales - want.log_scales).max() <= 0.5 / 16 + 1e-6
+    assert np.abs(sigmoid(got.opacity_logits) - sigmoid(want.opacity_logits)).max() <= 0.5 / 255 + 1e-6
+    assert np.abs(got.sh[:, 0] - want.sh[:, 0]).max() <= 0.5 / 255 / 0.15 + 1e-5
+    # a coefficient of more than 127/128 is cut to that
+    higher = np.clip(want.sh[:, 1:], -1, 127 / 128)
+    assert np.abs(got.sh[:, 1:] - higher).max(initial=0) <= 0.5 / 128 + 1e-6
+    assert rotation_error(got, want) <= ROTATION[version]
+
+
+@pytest.mark.parametrize("version", [1, 2, 3, 4])
+@pytest.mark.parametrize("degree", range(4))
+def test_spz_is_exact_to_the_quantisation(put, version, degree):
+    want = random_gaussians(150, sh_degree=degree)
+    scene = read_spz_scene(put(spz_bytes(want, version)))
+    check_spz(scene.gaussians, want, version)
+    assert not scene.antialiased
+    assert read_spz_scene(put(spz_bytes(want, version, flags=1))).antialiased
+
+
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_spz_is_written_as_by_another_encoder(tmp_path, degree, antialiased):
+    want = random_gaussians(150, sh_degree=degree)
+    write_spz(tmp_path / "a.spz", want, antialiased)
+    content = gzip.decompress((tmp_path / "a.spz").read_bytes())
+    assert content == gzip.decompress(spz_bytes(want, 3, flags=int(antialiased)))  # as of another encoder
+    once = read_spz_scene(tmp_path / "a.spz").gaussians
+    write_spz(tmp_path / "b.spz", once, antialiased)  # a second turn loses nothing more
+    again = read_spz_scene(tmp_path / "b.spz").gaussians
+    np.testing.assert_array_equal(again.means, once.means)
+    np.testing.assert_allclose(again.sh, once.sh, atol=1e-6)
+
+
+AXES = ("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF")
+
+
+@pytest.mark.parametrize("axes", AXES)
+@pytest.mark.parametrize("version", [3, 4])
+def test_spz_along_other_axes_is_turned(put, axes, version):
+    """Other axes, two or none of them mirrored; a record of another kind stands in front."""
+    turn = np.diag([1.0 if letter in "RDF" else -1.0 for letter in axes])
+    records = struct.pack("<IIxxx", 0x12340001, 3) + struct.pack("<III", 0xADBE0003, 4, AXES.index(axes) + 1)
+    want = random_gaussians(60, sh_degree=3)
+    got = read_spz_scene(put(spz_bytes(want, version, flags=2, records=records, turn=turn))).gaussians
+    np.testing.assert_allclose(got.means, want.means, atol=POSITION[3] + 1e-7)
+    for eye in np.random.default_rng(1).normal(size=(3, 3)) * 4:
+        seen, truth = (colours(np.clip(g.sh, -1, 127 / 128), want.means, eye) for g in (got, want))
+        # Each colour adds 15 coefficients off by at most 1/256, on functions that span less than 1.5
+        assert np.abs(seen - truth).max() <= 15 / 256 * 1.5
+        assert np.abs(seen - truth).mean() <= 2e-3 * 3
+    # scales are off by a factor of at most e^(1/32), their squares by e^(1/16)
+    largest = np.exp(2 * want.log_scales.max(axis=1).astype(float))[:, None, None]
+    off = np.abs(covariances(got) - covariances(want)) / largest
+    assert off.max() <= np.expm1(1 / 16) + 2 * ROTATION[3]
+
+
+def test_spz_of_degree_four_is_read_to_degree_three(put):
+    """In a file that is not zipped, which is read too."""
+    want = random_gaussians(20, sh_degree=3)
+    content = patched(gzip.decompress(spz_bytes(want, 3)), 12, "B", 4)
+    rest = np.frombuffer(content[16 + 20 * 20 :], np.uint8).reshape(20, 45)
+    longer = np.concatenate([rest, np.full((20, 27), 200, np.uint8)], axis=1)
+    check_spz(read_spz_scene(put(content[: 16 + 20 * 20] + longer.tobytes())).gaussians, want, 3)
+
+
+def test_spz_keeps_positions_of_small_and_large_scenes(tmp_path):
+    """The place of the point follows the scene: steps of a sixteenth of a Gaussian, and no overflow."""
+    for radius in (1e-3, 0.1, 30.0, 3000.0, 1e5):
+        want = random_gaussians(100, radius=radius, scale_range=(1e-3, 0.02))
+        write_spz(tmp_path / "a.spz", want)
+        got = read_spz_scene(tmp_path / "a.spz").gaussians
+        size = np.exp(np.median(want.log_scales.max(axis=1)))
+        step = max(2.0 ** np.ceil(np.log2(radius / (2**23 - 1))), min(1 / 4096, size / 16))
+        assert np.abs(got.means - want.means).max() <= 0.5 * step
+    far = random_gaussians(100)
+    far.means[0, 1] = 1e9
+    with pytest.raises(InputError):
+        write_spz(tmp_path / "far.spz", far)
+    assert not (tmp_path / "far.spz").exists()
+
+
+@pytest.mark.parametrize("name", ["v3", "v4"])
+def test_real_spz_agree(real_data, name):
+    """Written by Niantic's library, from the Gaussians of the .splat."""
+    folder = real_data / "formats" / "splat"
+    want, got = read_splat(folder / "minimal.splat"), load_gaussians(folder / f"minimal-{name}.spz")
+    assert np.abs(got.log_scales - want.log_scales).max() <= 0.5 / 16
+    np.testing.assert_array_equal(got.opacity_logits, want.opacity_logits)
+    np.testing.assert_array_equal(got.means, want.means)
+    assert np.abs(got.sh - want.sh).max() <= 0.5 / 255 / 0.15 + 1e-6
+    assert np.abs(covariances(got) - covariances(want)).max() <= 0.01 * np.expm1(1 / 16)
+
+
+# ---- SOG ----
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_sog_is_exact_to_the_quantisation(tmp_path, degree):
+    want = random_gaussians(150, sh_degree=degree)
+    folder = write_folder(tmp_path / "a", sog_files(want))
+    (tmp_path / "a.sog").write_bytes(zipped(sog_files(want)))
+    got, *others = (load_gaussians(path) for path in (folder, folder / "meta.json", tmp_path / "a.sog"))
+    for other in others:
+        assert_same(got, other)
+    assert got.sh_degree == degree
+    # 16 bits of sign(x) log(1 + |x|), which stretches by at most 1 + |x| <= 2
+    assert np.abs(got.means - want.means).max() <= 2 * np.log(2) * 2 / 65535
+    step = np.ptp(want.log_scales) / 255
+    assert np.abs(got.log_scales - want.log_scales).max() <= 0.51 * step
+    assert np.abs(got.sh[:, 0] - want.sh[:, 0]).max() <= 0.51 * np.ptp(want.sh[:, 0]) / 255
+    assert np.abs(sigmoid(got.opacity_logits) - sigmoid(want.opacity_logits)).max() <= 0.5 / 255 + 1e-6
+    # 8 bits over [-0.71, 0.71]: 2.8e-3 a component, amplified as in the compressed PLY
+    assert rotation_error(got, want) <= 2.4e-2
+    if degree:
+        palette = np.clip(want.sh[np.arange(150) % 70, 1:], -1, 1)  # entry i modulo 70
+        assert np.abs(got.sh[:, 1:] - palette).max() <= 0.51 * 2 / 255
+
+
+SOG = sog_files(random_gaussians(40, sh_degree=1))
+
+
+def meta_with(**entries: object) -> dict[str, bytes]:
+    """The files of `SOG` with other entries in the JSON, part__entry for one in a part; None: without it."""
+    meta = json.loads(SOG["meta.json"])
+    for name, value in entries.items():
+        *part, key = name.split("__")
+        within = meta[part[0]] if part else meta
+        within[key] = value
+        if value is None:
+            del within[key]
+    return SOG | {"meta.json": json.dumps(meta).encode()}
+
+
+def with_positions_of(size: int) -> bytes:
+    """`SPZ_4` with a first stream of `size` bytes, of which the table says 270."""
+    frame = zstandard.ZstdCompressor().compress(bytes(size))
+    old, start = struct.unpack_from("<Q", SPZ_4, 32)[0], 32 + 6 * 16
+    return patched(SPZ_4[:start], 32, "<Q", len(frame)) + frame + SPZ_4[start + old :]
+
+
+SPZ, SPZ_4 = gzip.decompress(spz_bytes(WANT, 3)), spz_bytes(WANT, 4)
+AXES_9 = spz_bytes(WANT, 4, flags=2, records=struct.pack("<III", 0xADBE0003, 4, 9))
+MOST = 2**32 - 1
+MALFORMED = {  # what a file with this ending holds
+    "a.splat": (b"", SPLAT[:-1], SPLAT + b"\0", np.random.default_rng(0).bytes(3200)),
+    "a.spz": (
+        *(b"words of no meaning, none", gzip.compress(b"words of no meaning")),
+        *(patched(SPZ, *change) for change in ((4, "<I", 0), (4, "<I", 5), (12, "B", 5))),
+        *(gzip.compress(patched(SPZ, 8, "<I", count)) for count in (31, MOST)),
+        *(spz_bytes(WANT, 3)[:300], spz_bytes(WANT, 3)[:-8] + bytes(8), gzip.compress(SPZ + bytes(2**21))),
+        *(SPZ_4[:30], SPZ_4[:60], patched(SPZ_4, 8, "<I", MOST), AXES_9),
+        *(patched(SPZ_4, 16, "<I", table) for table in (10**9, 8)),
+        *(patched(SPZ_4, *change) for change in ((15, "B", 5), (32, "<Q", 2**63), (40, "<Q", 271))),
+        *(patched(SPZ_4, 32 + 6 * 16, "<I", 0), with_positions_of(269), with_positions_of(271)),
+    ),
+    "a.sog": tuple(
+        zipped(files)
+        for files in (
+            *(meta_with(version=None), meta_with(version=3)),
+            *(meta_with(count=count) for count in (None, "9", -1, 70, 10**9)),
+            *(meta_with(means__mins=bounds) for bounds in ([0, 0], ["0"] * 3, [10**400] * 3)),
+            *(meta_with(sh0__codebook=[0.0] * 255), meta_with(scales=None), meta_with(scales="x")),
+            *(meta_with(quats__files=[]), meta_with(quats__files=["../a/quats.webp"])),
+            *(meta_with(shN__bands=5), meta_with(shN__count=20), meta_with(shN__bands=2)),
+            *(SOG | {"quats.webp": SOG["sh0.webp"]}, SOG | {"sh0.webp": b"RIFF words"}),
+            *(SOG | {"meta.json": text} for text in (b"{", b"[" * 100_000, b"[]")),
+        )
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "number"), [(name, number) for name in MALFORMED for number in range(len(MALFORMED[name]))]
+)
+def test_malformed_files_are_refused_in_a_line(put, bounded, name, number):
+    assert_refused(load_gaussians, put(MALFORMED[name][number], name))
+
+
+def test_missing_files_of_a_sog_are_named(tmp_path):
+    files = {name: content for name, content in SOG.items() if name != "quats.webp"}
+    write_folder(tmp_path / "a", files)
+    (tmp_path / "b.sog").write_bytes(zipped(files))
+    for name in ("a", "b.sog"):
+        with pytest.raises(InputError, match=r"quats\.webp"):
+            load_gaussians(tmp_path / name)
+
+
+def test_a_real_sog_is_read(real_data):
+    got = load_gaussians(real_data / "gaussians" / "playbot_8k_sog")
+    assert len(got) == 8406
+    assert got.sh_degree == 2
+    assert got.valid().all()
+
+
+def test_a_sog_says_antialiased(tmp_path):
+    plain = [{}, {"model": "2dgs"}, {"model": ["antialiased"]}, {"antialias": False}, {"antialias": "no"}]
+    for entry in (*plain, {"model": "antialiased"}, {"antialias": True}):
+        assert load_scene(write_folder(tmp_path / "a", meta_with(**entry))).antialiased is (
+            entry not in plain
+        )
+
+
+def written(tmp_path, gaussians: Gaussians) -> Gaussians:
+    write_sog(tmp_path / "a.sog", gaussians)
+    return load_gaussians(tmp_path / "a.sog")
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_sog_is_written_and_read_back(tmp_path, degree):
+    scene = random_gaussians(3000, sh_degree=degree)
+    got = written(tmp_path, scene)
+    assert got.sh.shape == scene.sh.shape
+    logs = np.log1p(np.abs(scene.means.astype(np.float64)))
+    step = (logs.max() * 2) / 65535 * np.exp(logs)
+    assert (np.abs(got.means - scene.means) <= step).all()
+    assert np.abs(sigmoid(got.opacity_logits) - sigmoid(scene.opacity_logits)).max() <= 0.5 / 255 + 1e-6
+    assert rotation_error(got, scene) <= 2.4e-2
+    for name in ("log_scales", "sh"):
+        have, want = getattr(got, name), getattr(scene, name)
+        assert np.abs(have - want).mean() < 0.01 * want.std()
+        assert np.abs(have - want).max() < 0.05 * np.ptp(want)
+
+
+@pytest.mark.long
+def test_sog_shares_palette_entries_of_large_scenes(tmp_path):
+    rng = np.random.default_rng(0)
+    scene = random_gaussians(70_000, sh_degree=1)
+    kinds = rng.normal(size=(40, 3, 3)).astype(np.float32)
+    rest = kinds[rng.integers(0, 40, 70_000)] + 0.01 * rng.normal(size=(70_000, 3, 3)).astype(np.float32)
+    scene = replace(scene, sh=np.concatenate([scene.sh[:, :1], rest], axis=1))
+    got = written(tmp_path, scene)
+    assert np.sqrt(((got.sh[:, 1:] - rest) ** 2).mean()) < 0.1 * rest.std()
+
+
+# ---- all that are written ----
+
+
+@pytest.mark.parametrize("suffix", [".splat", ".spz", ".sog", ".glb", ".gltf"])
+def test_rows_that_cannot_be_drawn_are_transparent(tmp_path, suffix):
+    path, scene = tmp_path / f"a{suffix}", random_gaussians(10, sh_degree=1)
+    scene.means[0], scene.quats_wxyz[1], scene.sh[2, 0], scene.log_scales[3] = np.nan, 0, np.nan, 200
+    scene.opacity_logits[4:6] = np.inf, -np.inf  # legal, as is a flat axis
+    scene.log_scales[6, 0] = -np.inf
+    scene.quats_wxyz[7] *= -7
+    save_scene(path, Scene(scene))
+    got = load_gaussians(path)
+    assert got.valid().all()
+    assert got.opacity_logits[:6].tolist() == [*[-np.inf] * 4, np.inf, -np.inf]
+    assert got.log_scales[6, 0] < -9.9
+    assert np.abs(got.means[4:] - scene.means[4:]).max() < 1e-3
+    assert rotation_error(got.take([7]), scene.take([7])) < 3 / 128
+    for count in (0, 1)[suffix == ".splat" :]:
+        save_scene(path, Scene(scene.take(np.arange(count))))
+        assert len(load_gaussians(path)) == count
+
+
+# ---- glTF ----
+
+HALF_TURN = rotating(np.array([0, 0, 1]), 180)  # between the axes of glTF and those of the PLY
+
+
+def parts(data: bytes) -> tuple[dict, bytes]:
+    """JSON and binary chunk of a .glb."""
+    size = struct.unpack_from("<I", data, 12)[0]
+    return json.loads(data[20 : 20 + size]), data[28 + size :]
+
+
+def glb(content: dict, binary: bytes) -> bytes:
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    binary += bytes(-len(binary) % 4)
+    header = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text) + len(binary), len(text), b"JSON")
+    return header + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+
+
+def changed(path: Path, scene: Gaussians, change: Callable[[dict], object] = lambda content: None) -> Path:
+    """`scene` as a .glb whose JSON is changed in place."""
+    write_gltf(path, scene)
+    content, binary = parts(path.read_bytes())
+    change(content)
+    path.write_bytes(glb(content, binary))
+    return path
+
+
+def assert_alike(got: Gaussians, want: Gaussians, places: float = 1e-5) -> None:
+    np.testing.assert_allclose(got.means, want.means, atol=places)
+    np.testing.assert_allclose(got.log_scales, want.log_scales, rtol=1e-6, atol=1e-5)
+    np.testing.assert_allclose(got.sh, want.sh, atol=1e-5)
+    np.testing.assert_allclose(sigmoid(got.opacity_logits), sigmoid(want.opacity_logits), atol=1e-6)
+    one, other = (unit(rows.quats_wxyz.astype(np.float64)) for rows in (got, want))
+    assert (np.abs((one * other).sum(1)) > 1 - 1e-9).all()
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".gltf"])
+@pytest.mark.parametrize("degree", range(4))
+def test_scenes_are_read_back_in_their_order(tmp_path, degree, suffix):
+    scene = random_gaussians(200, sh_degree=degree)
+    write_gltf(tmp_path / f"a{suffix}", scene)
+    got = load_gaussians(tmp_path / f"a{suffix}")
+    assert_alike(got, scene)
+    np.testing.assert_array_equal(got.means, scene.means)  # sidecars know them to the bit
+    np.testing.assert_array_equal(got.sh, scene.sh)
+
+
+def test_written_axes_are_those_of_the_standard(tmp_path):
+    """The file itself, read by its own words, is the scene half a turn about z further."""
+    scene = random_gaussians(50, sh_degree=3)
+    write_gltf(tmp_path / "a.glb", scene)
+    content, binary = parts((tmp_path / "a.glb").read_bytes())
+
+    def column(name: str) -> np.ndarray:
+        about = content["accessors"][splats(content)["attributes"][name]]
+        view = content["bufferViews"][about["bufferView"]]
+        data = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+        return np.frombuffer(data, "<f4").reshape(50, -1)
+
+    want = transform_gaussians(scene, HALF_TURN)
+    np.testing.assert_allclose(column("POSITION"), want.means, atol=1e-6)
+    np.testing.assert_allclose(column(f"{EXTENSION}:SCALE"), np.exp(want.log_scales), rtol=1e-5)
+    for number, degree, coefficient in ((0, 0, 0), (1, 1, 0), (8, 2, 4), (9, 3, 0), (15, 3, 6)):
+        found = column(f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{coefficient}")
+        np.testing.assert_allclose(found, want.sh[:, number], atol=1e-5)
+    # the shapes, of which quaternions are one way to say them
+    made = replace(want, quats_wxyz=column(f"{EXTENSION}:ROTATION")[:, [3, 0, 1, 2]])
+    np.testing.assert_allclose(covariances(made), covariances(want), atol=1e-5 * covariances(want).max())
+
+
+def test_nodes_place_their_primitives(tmp_path):
+    scene = random_gaussians(40, sh_degree=3)
+    turn = rotating(np.array([1.0, 2, 3]), 70)
+
+    def place(content: dict) -> None:
+        half = np.radians(35)
+        x, y, z = np.sin(half) * np.array([1, 2, 3]) / np.sqrt(14)
+        content["nodes"] = [
+            {"mesh": 0, "rotation": [x, y, z, np.cos(half)], "scale": [2, 2, 2]},
+            {"children": [0], "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 5, 6, 7, 1]},
+        ]
+        content["scenes"] = [{"nodes": [1]}]
+
+    there = scaling(2).then(turn).then(moving(np.array([5.0, 6, 7])))
+    want = transform_gaussians(scene, HALF_TURN.then(there).then(HALF_TURN))
+    assert_alike(load_gaussians(changed(tmp_path / "a.glb", scene, place)), want, 1e-4)
+
+
+def one_mesh(attributes: dict[str, int], extension: dict, size: int, **buffer: str) -> dict:
+    """The JSON of a file of one primitive, its numbers in a buffer of `size` bytes; without its columns."""
+    primitive = {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: extension}}
+    return {
+        "asset": {"version": "2.0"},
+        "bufferViews": [{"buffer": 0, "byteLength": size}],
+        "buffers": [{"byteLength": size, **buffer}],
+        "meshes": [{"primitives": [primitive]}],
+        "nodes": [{"mesh": 0}],
+    }
+
+
+@pytest.mark.parametrize("name", PACKED)
+def test_an_spz_inside_is_read(tmp_path, name):
+    scene = random_gaussians(60, sh_degree=2)
+    write_spz(tmp_path / "a.spz", scene)
+    data = (tmp_path / "a.spz").read_bytes()
+    inside = {"extensions": {name: {"bufferView": 0}}}
+    content = one_mesh({"POSITION": 0}, inside, len(data)) | {
+        "extensionsRequired": [EXTENSION, name],
+        "accessors": [{"count": 60, "type": "VEC3", "componentType": 5126}],
+    }
+    (tmp_path / "a.glb").write_bytes(glb(content, data))
+    assert_alike(load_gaussians(tmp_path / "a.glb"), load_gaussians(tmp_path / "a.spz"))
+    content["nodes"] = [{"mesh": 0}] * 3
+    (tmp_path / "a.glb").write_bytes(glb(content, data))
+    with pytest.raises(FormatError, match="more Gaussians than"):
+        load_gaussians(tmp_path / "a.glb")
+
+
+def test_quantised_and_interleaved_columns_are_read(tmp_path):
+    rows = np.zeros(3, [("p", "<f4", 3), ("q", "i1", 4), ("s", "i1", 4), ("o", "u1", 4)])
+    rows["p"], rows["q"], rows["s"][:, :3], rows["o"][:, 0] = 1, [0, 0, 0, -127], [0, 1, 2], [0, 51, 255]
+    offsets = {"POSITION": (0, 5126, "VEC3"), "ROTATION": (12, 5120, "VEC4"), "SCALE": (16, 5120, "VEC3")}
+    offsets |= {"OPACITY": (20, 5121, "SCALAR"), "SH_DEGREE_0_COEF_0": (0, 5126, "VEC3")}
+    names = [name if name == "POSITION" else f"{EXTENSION}:{name}" for name in offsets]
+    content = one_mesh({name: i for i, name in enumerate(names)}, {}, 72, uri="b%20c.bin")
+    content["bufferViews"][0]["byteStride"] = 24
+    content["accessors"] = [
+        {"bufferView": 0, "byteOffset": at, "componentType": kind, "type": shape, "count": 3}
+        | {"normalized": name in ("ROTATION", "OPACITY")}
+        for name, (at, kind, shape) in offsets.items()
+    ]
+    (tmp_path / "a.gltf").write_text(json.dumps(content))
+    (tmp_path / "b c.bin").write_bytes(rows.tobytes())
+    got = load_gaussians(tmp_path / "a.gltf")
+    np.testing.assert_allclose(np.exp(got.log_scales), [[0, 1, 2]] * 3)
+    np.testing.assert_allclose(sigmoid(got.opacity_logits), [0, 0.2, 1], atol=1e-6)
+    np.testing.assert_array_equal(np.abs(got.quats_wxyz), [[1, 0, 0, 0]] * 3)
+    rows["s"][1] = -3  # of a draft of the extension: logarithms
+    (tmp_path / "b c.bin").write_bytes(rows.tobytes())
+    np.testing.assert_array_equal(load_gaussians(tmp_path / "a.gltf").log_scales[1], [-3, -3, -3])
+
+
+def splats(content: dict) -> dict:
+    """The one primitive of a file."""
+    return content["meshes"][0]["primitives"][0]
+
+
+MALFORMED_GLTF = {
+    "a path": lambda c: c["buffers"][0].update(uri="../../etc/passwd"),
+    "beyond its buffer": lambda c: c["bufferViews"][0].update(byteOffset=2**30),
+    "many rows": lambda c: [one.update(count=2**31) for one in c["accessors"]],
+    "one count alone": lambda c: c["accessors"][2].update(count=9),
+    "a sparse column": lambda c: c["accessors"][0].update(sparse={"count": 1}),
+    "no buffer": lambda c: c["accessors"][0].pop("bufferView"),
+    "a circle": lambda c: c["nodes"][0].update(children=[0]),
+    "many instances": lambda c: c.update(nodes=[{"mesh": 0}] * 999, scenes=[{"nodes": list(range(999))}]),
+    "a mirror": lambda c: c["nodes"][0].update(scale=[-1, 1, 1]),
+    "an axis of its own": lambda c: c["nodes"][0].update(scale=[1, 2, 1]),
+    "no numbers": lambda c: c["nodes"][0].update(translation=["a", 1, 1]),
+    "huge numbers": lambda c: c["nodes"][0].update(translation=[10**400, 1, 1]),
+    "meshopt": lambda c: c.update(extensionsRequired=["EXT_meshopt_compression"]),
+    "triangles": lambda c: splats(c).update(mode=4),
+    "linear colours": lambda c: splats(c)["extensions"][EXTENSION].update(colorSpace="lin_rec709_display"),
+    "half a degree": lambda c: splats(c)["attributes"].pop(f"{EXTENSION}:SH_DEGREE_1_COEF_1"),
+    "negative index": lambda c: c["nodes"][0].update(mesh=-1),
+    "another version": lambda c: c.update(asset={"version": "1.0"}),
+    "no Gaussians": lambda c: c.update(nodes=[], scenes=[], extensionsUsed=[]),
+}
+
+
+@pytest.mark.parametrize("name", MALFORMED_GLTF)
+def test_malformed_gltf_is_refused_in_a_line(tmp_path, name):
+    path = changed(tmp_path / "a.glb", random_gaussians(20, sh_degree=1), MALFORMED_GLTF[name])
+    assert_refused(load_gaussians, path)
+
+
+def test_written_files_keep_the_rules(tmp_path):
+    """Of glTF: aligned views in one buffer, bounds of positions; of the extension: all that it requires."""
+    write_gltf(tmp_path / "a.glb", random_gaussians(7, sh_degree=1))
+    data = (tmp_path / "a.glb").read_bytes()
+    content, binary = parts(data)
+    assert struct.unpack_from("<I", data, 8)[0] == len(data)
+    assert content["buffers"][0]["byteLength"] == len(binary)
+    assert all(view["byteOffset"] % 4 == 0 for view in content["bufferViews"])
+    says, attributes = splats(content)["extensions"][EXTENSION], splats(content)["attributes"]
+    assert says["kernel"] == "ellipse"
+    assert says["colorSpace"] == "srgb_rec709_display"
+    coefficients = ("0_COEF_0", *(f"1_COEF_{n}" for n in range(3)))
+    names = {"ROTATION", "SCALE", "OPACITY", *(f"SH_DEGREE_{name}" for name in coefficients)}
+    assert set(attributes) == {"POSITION", "COLOR_0", *(f"{EXTENSION}:{name}" for name in names)}
+    positions = content["accessors"][attributes["POSITION"]]
+    assert np.less(positions["min"], positions["max"]).all()
+
+
+# Point clouds and meshes, read back by other programs.
+
+TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float64)
+FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
+SHADES = np.array([[1.0, 0, 0], [0, 0.5, 0], [0, 0, 0], [0, 1, 0]])
+MESH = SimpleNamespace(name="red mug", vertices=TETRAHEDRON, triangles=FACES, colour=SHADES)
+
+
+def test_points_have_colours_and_extras(tmp_path):
+    gaussians = random_gaussians(40, sh_degree=1)
+    gaussians.means[7] = np.nan
+    gaussians.sh[8, 0] = 9, -9, 0
+    relevancy = np.linspace(0, 1, 40)
+    assert write_points(tmp_path / "a.ply", gaussians, {"relevancy": relevancy}) == 39
+    vertex = PlyData.read(tmp_path / "a.ply")["vertex"]
+    kept = np.delete(np.arange(40), 7)
+    np.testing.assert_array_equal(np.stack([vertex[k] for k in "xyz"], 1), gaussians.means[kept])
+    colours = np.stack([vertex[name] for name in ("red", "green", "blue")], 1)
+    want = np.clip(0.5 + 0.28209479177 * gaussians.sh[kept, 0].astype(np.float64), 0, 1)
+    assert np.abs(colours / 255 - want).max() <= 0.5 / 255 + 1e-9
+    np.testing.assert_allclose(vertex["relevancy"], relevancy[kept], atol=1e-7)
+
+
+def test_a_ply_holds_a_mesh(tmp_path):
+    write_mesh(tmp_path / "a.ply", MESH, np.eye(4))
+    data = PlyData.read(tmp_path / "a.ply")
+    np.testing.assert_array_equal(np.stack([data["vertex"][k] for k in "xyz"], 1), TETRAHEDRON)
+    np.testing.assert_array_equal(np.stack(data["face"]["vertex_indices"]), FACES)
+    assert data["vertex"]["red"].tolist() == [255, 0, 0, 0]
+
+
+def test_a_glb_mesh_has_linear_colours_and_y_up(tmp_path):
+    scene = Scene(random_gaussians(3), metres_per_unit=2.0)
+    write_mesh(tmp_path / "a.glb", MESH, gltf_axes(scene))
+    content, binary = parts((tmp_path / "a.glb").read_bytes())
+    assert content["buffers"][0]["byteLength"] == len(binary)
+    np.testing.assert_array_equal(np.frombuffer(binary[:48], "<f4").reshape(4, 3), TETRAHEDRON)
+    colours = np.frombuffer(binary[48:80], "<u2").reshape(4, 4) / 65_535
+    np.testing.assert_allclose(colours[:, :3].sum(1), [1, 0.2140, 0, 1], atol=1e-4)
+    matrix = np.array(content["nodes"][0]["matrix"]).reshape(4, 4).T
+    np.testing.assert_allclose(matrix @ [*scene.up(), 1], [0, 2, 0, 1], atol=1e-6)  # up, metres
+
+
+def test_another_suffix_is_refused(tmp_path):
+    with pytest.raises(InputError):
+        write_points(tmp_path / "a.obj", random_gaussians(3))
+    with pytest.raises(InputError):
+        write_mesh(tmp_path / "a.stl", MESH, np.eye(4))
+    assert list(tmp_path.iterdir()) == []
