@@ -66,7 +66,7 @@ def _fetch(first: int, last: int, values: Array, codes: Array, found: Array) -> 
 
 def through_cells(field: LanguageField) -> LanguageField:
     """Return the field with a codebook in place of unit latents of three numbers; another as it is."""
-    if not field.codec.spherical:
+    if not (field.codec.unit_latents and field.codec.latent_dim == 3):
         return field
     known = field.known
     latents = field.latents[known] if known.any() else np.array([[0, 0, 1]], np.float32)

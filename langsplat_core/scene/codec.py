@@ -31,6 +31,7 @@ class Codec(ABC):
     kind: ClassVar[str]  # its name in the scene file
     dtype: ClassVar[type[np.generic]] = np.float32  # of latents
     blends: ClassVar[bool] = True  # a weighted mean of latents is a latent
+    unit_latents: ClassVar[bool] = False  # they have length 1: of 3 numbers, cosines are smooth on a sphere
 
     @property
     @abstractmethod
@@ -47,11 +48,6 @@ class Codec(ABC):
         """The number that a report gives beside the kind: numbers per latent, or codewords."""
         return self.latent_dim
 
-    @property
-    def spherical(self) -> bool:
-        """True where latents are unit vectors of 3 numbers, over which cosines with a text are smooth."""
-        return False
-
     @abstractmethod
     def encode(self, vectors: Array) -> Array:
         """(M, D) unit CLIP vectors -> (M, d) latents of the codec's type."""
@@ -60,9 +56,10 @@ class Codec(ABC):
     def decode(self, latents: Array) -> Array:
         """(M, d) latents -> (M, D) float32 unit vectors."""
 
-    @abstractmethod
     def cosines(self, latents: Array, vectors: Array) -> Array:
         """(M, d) latents of any length, (Q, D) unit vectors -> (M, Q) float32 cosines; zero gives zeros."""
+        towards, known = _directions(latents)
+        return np.where(known[:, None], self.decode(towards) @ vectors.T, 0).astype(np.float32)
 
     @abstractmethod
     def tensors(self) -> dict[str, Array]:
@@ -172,6 +169,7 @@ class AutoencoderCodec(Codec):
     encoder: Layers
     decoder: Layers
     kind: ClassVar[str] = "autoencoder"
+    unit_latents: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         for name, layers in (("encoder", self.encoder), ("decoder", self.decoder)):
@@ -194,19 +192,11 @@ class AutoencoderCodec(Codec):
     def vector_dim(self) -> int:
         return int(self.encoder[0][0].shape[1])
 
-    @property
-    def spherical(self) -> bool:
-        return self.latent_dim == 3
-
     def encode(self, vectors: Array) -> Array:
         return unit(_run(self.encoder, np.asarray(vectors, np.float32)))
 
     def decode(self, latents: Array) -> Array:
         return unit(_run(self.decoder, np.asarray(latents, np.float32)))
-
-    def cosines(self, latents: Array, vectors: Array) -> Array:
-        towards, known = _directions(latents)
-        return np.where(known[:, None], self.decode(towards) @ vectors.T, 0).astype(np.float32)
 
     def tensors(self) -> dict[str, Array]:
         named = {}

@@ -166,21 +166,17 @@ def transform_gaussians(gaussians: Gaussians, to: Similarity) -> Gaussians:
     return moved
 
 
-def transform_rows(gaussians: Gaussians, selected: Array, to: Similarity) -> Gaussians:
-    """Return the Gaussians with those `selected` (N,) bool transformed."""
-    part = transform_gaussians(gaussians.take(selected), to)
-    arrays = {name: getattr(gaussians, name).copy() for name in ("means", "log_scales", "quats_wxyz", "sh")}
-    for name, values in arrays.items():
-        values[selected] = getattr(part, name)
-    return replace(gaussians, **arrays)
-
-
 def transform_scene(scene: Scene, to: Similarity, selected: Array | None = None) -> Scene:
     """Return the scene with its cameras and metres per unit transformed, or `selected` (N,) bool alone."""
     if to.is_identity:
         return scene
     if selected is not None:
-        return replace(scene, gaussians=transform_rows(scene.gaussians, selected, to))
+        part = transform_gaussians(scene.gaussians.take(selected), to)
+        names = ("means", "log_scales", "quats_wxyz", "sh")
+        arrays = {name: getattr(scene.gaussians, name).copy() for name in names}
+        for name, values in arrays.items():
+            values[selected] = getattr(part, name)
+        return replace(scene, gaussians=replace(scene.gaussians, **arrays))
     metres = scene.metres_per_unit
     return replace(
         scene,

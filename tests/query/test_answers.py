@@ -132,18 +132,6 @@ def test_part_asked_for_alone_has_its_own_calibration():
     assert (thing.found, thing.probability) == (False, pytest.approx(sigmoid(np.array(20 * part.fits[2]))))
 
 
-def test_probability_does_not_depend_on_the_level():
-    """It knows no level: what is asked for at another one is there all the same. The peak, whose scale is
-    another, has none."""
-    scene = calibrated(SURE).scene
-    assert QueryEngine(scene, lambda _: FakeEncoder(), rule="peak").run("mug").probability is None
-    engine = QueryEngine(scene, lambda _: FakeEncoder())
-    said = {engine.run("mug", level).probability for level in ("auto", *LEVELS)}
-    assert len(said) == 1
-    assert min(said) > 0.99
-    assert calibrated(None).run("mug").probability is None
-
-
 @pytest.mark.parametrize("rule", RULES)
 def test_negative_fits_give_no_answer(rule):
     gaussians, field = random_gaussians(200), random_field(200, "codebook")

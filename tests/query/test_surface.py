@@ -62,16 +62,6 @@ def test_links_are_symmetric_and_parts_are_the_connected_components():
     assert not np.concatenate(surface.parts(numbers[:0])).size
 
 
-def test_gap_divides_surfaces():
-    gaussians = random_gaussians(60)
-    gaussians.means[:] = np.random.default_rng(2).normal(scale=0.05, size=(60, 3))
-    gaussians.means[50:, 0] += 9  # fewer than the neighbours everyone has: they reach across
-    surface = build_surface(gaussians, min_opacity=0.0)
-    near = np.flatnonzero(np.isin(surface.rows, np.arange(50)))
-    reached = surface.connected(np.ones(len(surface.rows), bool), int(near[0]))
-    assert set(reached) <= set(near)
-
-
 # Regions of the surface, against the criterion written out plainly in float64.
 
 KINDS = ("codebook", "autoencoder", "linear")
@@ -229,16 +219,6 @@ def test_borders_of_regions_on_a_line(meaning, known, things, finer, whole):
     regions = on_surface_of(regions_of(Scene(gaussians, field), surface), surface)
     for of, want in zip(regions, (finer, finer, whole), strict=True):
         assert_same_partition(of, np.broadcast_to(want, 80)[surface.rows])
-
-
-def test_means_ignore_nan_of_uncounted_gaussians():
-    """Faint Gaussians are off the surface: what they hold is not looked at."""
-    gaussians, field = patched("codebook")
-    gaussians.opacity_logits[::3] = -9
-    values = np.full((3, N), 0.5, np.float32)
-    values[:, ::3] = np.nan
-    for means in regions_of(Scene(gaussians, field)).means(values):
-        assert means == pytest.approx(0.5)
 
 
 def plain_means(surface: Surface, regions: Regions, values: np.ndarray) -> list[np.ndarray]:

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from langsplat_core import render
 from langsplat_core.arrays import logit, psnr, rotation_matrices, sigmoid, unit
 from langsplat_core.errors import InputError
-from langsplat_core.progress import WorkCancelledError
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import NO_NODE, Camera, Gaussians, PlattScaling, Scene, Tree
 from langsplat_core.scene.gaussians import GROUP, merged
@@ -27,7 +26,6 @@ from langsplat_core.scene.transform import (
     sh_rotations,
     similarity,
     transform_gaussians,
-    transform_rows,
     transform_scene,
     turning,
 )
@@ -200,14 +198,6 @@ def test_merged_extremes_are_drawable():
     with np.errstate(all="raise", under="ignore"):
         found = merged(hard)
     assert found.gaussians.valid().all()
-
-
-def test_merge_can_be_cancelled(dense):
-    def stop(label: str, fraction: float) -> None:
-        raise WorkCancelledError
-
-    with pytest.raises(WorkCancelledError):
-        merged(dense, stop)
 
 
 # Phrases as they are written.
@@ -455,12 +445,7 @@ def test_cameras_and_scale_are_transformed_along():
 @pytest.mark.parametrize("chosen", [[], [4], range(9)])
 def test_selected_gaussians_are_transformed_alone(chosen) -> None:
     gaussians, selected = random_gaussians(9, sh_degree=2), np.isin(np.arange(9), list(chosen))
-    moved, whole = transform_rows(gaussians, selected, TO), transform_gaussians(gaussians, TO)
+    whole = transform_gaussians(gaussians, TO)
+    moved = transform_scene(Scene(gaussians), TO, selected).gaussians
     assert_same(moved.take(~selected), gaussians.take(~selected))
     assert_same(moved.take(selected), whole.take(selected))
-
-
-def test_an_empty_scene_is_transformed():
-    nothing = random_gaussians(0, sh_degree=3)
-    assert len(transform_gaussians(nothing, TO)) == 0
-    assert isinstance(transform_scene(Scene(nothing), replace(TO)).gaussians, Gaussians)
