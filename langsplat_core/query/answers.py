@@ -124,10 +124,7 @@ class Regions:
         return tuple(row[: len(total)] / total for row, total in zip(levels, self.totals, strict=True))
 
     def spread(self, level: int, values: Array, others: Array) -> Array:
-        """Return the (N,) values of all Gaussians from the (R,) values of a level's regions.
-
-        A Gaussian in no region has its own of `others` (N,), of the same type.
-        """
+        """Return the (N,) of the (R,) `values` of a level's regions; in none, its own of `others` (N,)."""
         spread = np.empty_like(others)
         shared_workers().run(_spread, len(others), self.everywhere[level], values, others, spread)
         return spread

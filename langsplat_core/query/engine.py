@@ -99,11 +99,10 @@ class QueryEngine:
     ) -> None:
         """Prepare queries against a scene; nothing is computed yet.
 
-        load_encoder: usually `semantics.encoders.load_text_encoder`; without one only the scene's own
-        phrasebook can be asked. encoder_id: in place of the encoder that the scene names. exact: compare
-        every latent itself instead of its cell, to measure the cells by. rule: "regions" becomes "peak" where
-        neither scene nor encoder has everyday phrases to compare with. words: taught ones of the user, before
-        those of the scene; EncoderError where they are of another encoder.
+        load_encoder: without one only the scene's own phrasebook can be asked. encoder_id: in place of the
+        encoder that the scene names. exact: compare every latent itself instead of its cell, to measure the
+        cells by. rule: "regions" becomes "peak" where neither scene nor encoder has everyday phrases. words:
+        taught ones of the user, before the scene's; EncoderError where they are of another encoder.
         """
         self.scene = scene
         self.exact = exact
@@ -126,20 +125,16 @@ class QueryEngine:
     # Answers.
 
     def run(self, phrase: str, level: LevelChoice = "auto", progress: Progress = silent) -> QueryResult:
-        """Answer `phrase`; a taught word by what was shown.
+        """Answer `phrase`; a taught word by what was shown. Raises as `text_vectors` does.
 
-        The level is chosen once for the scene, on raw relevancy, so that the image does not flicker between
-        levels as the camera moves. Raises as `text_vectors` does.
+        The level is chosen for the scene and not for a view: the image does not flicker between levels.
         """
         return self.run_many([phrase], level, progress)[0]
 
     def run_many(
         self, phrases: Sequence[str], level: LevelChoice = "auto", progress: Progress = silent
     ) -> list[QueryResult]:
-        """Return the answers to phrases, which are encoded and compared together; 17 bytes per Gaussian each.
-
-        Raises as `text_vectors` does, before any is asked.
-        """
+        """Return the answers of `run` to phrases, which are encoded and compared together."""
         texts = [phrase for phrase in phrases if not self.is_taught(phrase)]
         relevancies = self._relevancies(self.text_vectors(texts, progress))
         answers = []
@@ -247,10 +242,9 @@ class QueryEngine:
         return bars_of(self.regions.table, self.chance, np.concatenate(chosen))
 
     def compare_with(self, phrases: Sequence[str] = (), progress: Progress = silent) -> None:
-        """Take other canonical phrases from now on; without any, the scene's own again.
+        """Take other canonical phrases (LERF, section 3.3) from now on; without any, the scene's own again.
 
-        They are what everything is compared with (LERF, section 3.3). With others no probability is said,
-        since it was calibrated on those. Raises as `text_vectors` does, and leaves everything as it was then.
+        With others no probability is said. Raises as `text_vectors` does, and leaves everything as it was.
         """
         canonical = self.text_vectors(phrases, progress) if phrases else None
         self._canonical = canonical
@@ -285,10 +279,7 @@ class QueryEngine:
     # Text vectors.
 
     def load_encoder(self, progress: Progress = silent) -> TextEncoder:
-        """Return the text encoder, loaded at the first call, which imports torch: seconds.
-
-        Raises EncoderError where it cannot be loaded, or where the engine was given no way to.
-        """
+        """Return the text encoder, loaded at the first call, in seconds; EncoderError where that fails."""
         with self._turn:
             if self._encoder is None:
                 if self._load_encoder is None:
@@ -439,10 +430,7 @@ class QueryEngine:
         return by_showing(word, self.word_space, self.regions, self.scene.gaussians.means, level)
 
     def compare(self, phrase: str, vectors: Array, level: int) -> tuple[Array, Array]:
-        """Return (M,) cosines of a phrase with (M, D) unit vectors of images, and their fits, in spreads.
-
-        Those of a taught word are at a level (index into LEVELS), see `taught.compared`.
-        """
+        """Return (M,) cosines of a phrase with (M, D) unit vectors of images, at a level, and their fits."""
         if self.is_taught(phrase):
             return compared(self.taught[phrase_key(phrase)], self.word_space, vectors, level)
         cosines = vectors @ self.text_vectors([phrase])[0]

@@ -96,10 +96,7 @@ def is_part(word: str) -> bool:
 
 
 def named(phrase: str) -> Named:
-    """Return the kind of what a phrase without structure names.
-
-    "red mug" is a thing, "red handle" and "keyboard" are parts, "mug handle" is a part of a thing.
-    """
+    """Return what a phrase names: "mug" a thing, "red handle" a part, "mug handle" a part of a thing."""
     *before, last = phrase.split() or [""]
     if not is_part(last):
         return "thing"
@@ -175,7 +172,7 @@ class Without:
 
 @dataclass(frozen=True)
 class Superlative:
-    """The one of `what` that is the most `kind`; "nearest" and "farthest" from `anchor`, else the camera."""
+    """The one of `what` that is the most `kind`; nearest to or farthest from `anchor`, else the camera."""
 
     kind: Extreme
     what: "Phrase"
@@ -201,36 +198,27 @@ def atoms(tree: Phrase) -> tuple[Atom, ...]:
 
 
 def heads(tree: Phrase) -> tuple[str, ...]:
-    """Return the words of what is asked for, without what that is related to.
-
-    "mug" and "handle" of "mug or handle of the cup".
-    """
+    """Return the words of what is asked for: "mug" and "handle" of "mug or handle of the cup"."""
     if isinstance(tree, Atom):
         return (tree.text,)
     asked = children(tree) if isinstance(tree, Both | Union) else children(tree)[:1]
     return tuple(text for child in asked for text in heads(child))
 
 
-def unparse(tree: Phrase) -> str:  # noqa: PLR0911  one row of a table each
+def unparse(tree: Phrase) -> str:
     """Return a tree as text, such as "handle  inside  red mug"; groups in a group stand in brackets."""
     match tree:
         case Atom(text):
             return text
-        case Both(items):
-            return "  and  ".join(map(_nested, items))
-        case Union(items):
-            return "  or  ".join(map(_nested, items))
-        case Without(what, unwanted):
-            return f"{_nested(what)}  without  {_nested(unwanted)}"
-        case Inside(part, whole):
-            return f"{_nested(part)}  inside  {_nested(whole)}"
-        case Relation(kind, what, anchor):
-            return f"{_nested(what)}  {kind}  {_nested(anchor)}"
         case Counted(count, what):
             return f"{count}  {_nested(what)}"
         case Superlative(kind, what, anchor):
-            seen_from = "" if anchor is None else f"  from  {_nested(anchor)}"
-            return f"{kind}  {_nested(what)}{seen_from}"
+            return f"{kind}  {_nested(what)}" + ("" if anchor is None else f"  from  {_nested(anchor)}")
+        case Relation(kind):
+            between = str(kind)
+        case _:
+            between = {Both: "and", Union: "or", Without: "without", Inside: "inside"}[type(tree)]
+    return f"  {between}  ".join(map(_nested, children(tree)))
 
 
 def _nested(tree: Phrase) -> str:
@@ -301,11 +289,10 @@ _EXCLUSIONS = tuple(
 
 
 def parse(text: str, names: Collection[str] = ()) -> Phrase:
-    """Return the tree of one query.
+    """Return the tree of one query; `names` are keys of phrases that are one name, whatever their words.
 
-    names: keys of phrases that are one name, whatever words they have. Raises InputError where nothing is
-    named, where something is only excluded ("not the cup"), and for a text beyond `MAX_CHARACTERS` or
-    `MAX_ATOMS`.
+    Raises InputError where nothing is named, where something is only excluded ("not the cup"), and for a text
+    beyond `MAX_CHARACTERS` or `MAX_ATOMS`.
     """
     if len(text) > MAX_CHARACTERS:
         raise InputError(f"a query of {len(text)} characters; use at most {MAX_CHARACTERS}")
@@ -374,15 +361,15 @@ def _alternatives(tokens: list[str]) -> Phrase:
     ahead = [*(token.lower() for token in tokens[1:]), ""]
     tokens = [token for token, then in zip(tokens, ahead, strict=True) if (token, then) != (",", "or")]
     sides = _split(tokens, ("or", ","))
-    items = [_all([token for token in side if token != ","]) for side in sides]
-    return items[0] if len(items) == 1 else Union(tuple(items))
+    items = tuple(_all([token for token in side if token != ","]) for side in sides)
+    return items[0] if len(items) == 1 else Union(items)
 
 
 def _all(tokens: list[str]) -> Phrase:
     as_one = " ".join(tokens)
     tokens = re.sub(r"\bas well as\b", "&", as_one, flags=re.IGNORECASE).split(" ")
-    items = [_clause(part) for part in _split(tokens, ("and", "&"))]
-    return items[0] if len(items) == 1 else Both(tuple(items))
+    items = tuple(_clause(part) for part in _split(tokens, ("and", "&")))
+    return items[0] if len(items) == 1 else Both(items)
 
 
 def _split(tokens: list[str], marks: tuple[str, ...]) -> list[list[str]]:
@@ -414,7 +401,8 @@ def _clause(tokens: list[str]) -> Phrase:
         if kind in ("nearest", "farthest") and at and _names(tokens[1:at]) and _names(tokens[at + 1 :]):
             return Superlative(kind, _related(tokens[1:at]), _related(tokens[at + 1 :]))
         return Superlative(kind, what)
-    count = _NUMBERS.index(low[0]) + 1 if low[0] in _NUMBERS else _digits(low[0])
+    digits = low[0] if re.fullmatch("[0-9]{1,3}", low[0]) else "0"
+    count = _NUMBERS.index(low[0]) + 1 if low[0] in _NUMBERS else int(digits)
     if count and _names(tokens[1:]):
         what = _clause(tokens[1:])
         return Counted(count, what if count == 1 else _one_of(what))
@@ -422,11 +410,6 @@ def _clause(tokens: list[str]) -> Phrase:
         if low[-3:] == ["on", "the", side] and _names(tokens[:-3]):
             return Superlative(_SUPERLATIVES[extreme], _related(tokens[:-3]))
     return _related(tokens)
-
-
-def _digits(word: str) -> int:
-    """Return the number that a word writes in at most three digits; 0 for any other word."""
-    return int(word) if re.fullmatch("[0-9]{1,3}", word) else 0
 
 
 def _one_of(tree: Phrase) -> Phrase:
