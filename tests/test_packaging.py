@@ -1,6 +1,4 @@
-"""The wheel without extras, what a desktop is told of the viewer, the one-folder build, and the scripts in
-`packaging`: rows of other machines; `make gpu`, its sections over the twin of gsplat's kernels and its runner
-where there is no GPU."""
+"""The wheel without extras; what a desktop is told of the viewer; `make gpu`, over a twin of gsplat's kernels."""
 
 import importlib.util
 import os
@@ -84,27 +82,6 @@ def test_frozen_viewer_trains_by_the_program_beside_it(monkeypatch: pytest.Monke
     assert frozen == [str(tmp_path / "langsplat"), *plain[3:]]
 
 
-def test_elsewhere_keeps_the_rows_it_does_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    module = script("elsewhere", monkeypatch)
-    python = tmp_path / "python"
-    python.write_text('#!/bin/sh\necho "$*"\necho "$CODE failed, 2 passed, 3 skipped in 1s"\nexit $CODE\n')
-    python.chmod(0o755)
-    rows = [module.Row(f"row{n}", f"CODE={n}", folders="a b", python=str(python)) for n in range(3)]
-    for name, value in {"ROOT": tmp_path, "OUT": tmp_path / "out", "TABLE": tmp_path / "table.md"}.items():
-        monkeypatch.setattr(module, name, value)
-    monkeypatch.setattr(module, "rows", lambda seed, newest: rows)
-    for only, code in (("row1", 1), ("row0", 0), ("row2", 1)):
-        monkeypatch.setattr("sys.argv", ["elsewhere.py", "--only", only])
-        assert module.main() == code
-    lines = [line.split(" | ")[:5] for line in (tmp_path / "table.md").read_text().splitlines()[-3:]]
-    assert lines == [
-        ["| row0", "`CODE=0`, `python`", "2", "0", "3"],
-        ["| row1", "`CODE=1`, `python`", "2", "1", "3"],
-        ["| row2", "`CODE=2`, `python`", "2", "ended with 2", "3"],
-    ]
-    assert "-n 2 --dist loadfile tests/a tests/b" in (tmp_path / "out" / "row1.txt").read_text()
-
-
 def test_seeded_faults_stand_once_in_their_files(monkeypatch: pytest.MonkeyPatch) -> None:
     module = script("seeded_bugs", monkeypatch)
     faults = module.load_faults()
@@ -112,21 +89,6 @@ def test_seeded_faults_stand_once_in_their_files(monkeypatch: pytest.MonkeyPatch
     assert [fault.name for fault in faults if fault.occurrences(module.ROOT) != 1] == []
     tests = {module.ROOT / "tests" / name for fault in faults for name in fault.tests.split()}
     assert [path for path in tests if not path.exists()] == []
-
-
-def test_sizes_fail_above_a_budget(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    module = script("sizes", monkeypatch)
-    monkeypatch.setattr(module, "ROOT", tmp_path)
-    subprocess.run(["git", "init", "--quiet", tmp_path], check=True)
-    (tmp_path / "a.py").write_text("1\n2\n3\n")
-    (tmp_path / "untracked.py").write_text("1\n")
-    subprocess.run(["git", "-C", tmp_path, "add", "a.py"], check=True)
-    for budget, code in ((3, 0), (2, 1)):
-        (tmp_path / "CONTRIBUTING.md").write_text(f"| room | `*.py` | {budget} lines | 1 |\n")
-        assert module.main() == code
-    assert "above its budget" in capsys.readouterr().out
 
 
 # `make gpu`.
@@ -141,21 +103,6 @@ def sections(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 @pytest.fixture
 def runner(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return script("gpu/run", monkeypatch)
-
-
-@pytest.fixture
-def fake_sections(tmp_path: Path, runner: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Sections that do as they are called, in place of the real ones."""
-    (tmp_path / "gpu_sections.py").write_text(
-        "import sys, time\nfrom pathlib import Path\n_, name, plan, report = sys.argv\n"
-        "if name == 'opengl':\n    sys.exit(print('no driver', file=sys.stderr) or 3)\n"
-        "Path(report).write_text(f'# {name}\\n\\nfound by {plan}\\n')\n"
-        "if name == 'lifting':\n    time.sleep(60)\n"
-        "if name == 'gradients':\n    raise ValueError('three\\nlines\\nof it')\n"
-    )
-    monkeypatch.setattr(runner, "HERE", tmp_path)
-    monkeypatch.setattr(runner, "SECTIONS", {"environment": 60, "gradients": 60, "lifting": 5, "opengl": 60})
-    return tmp_path
 
 
 def pieces(sections: ModuleType, name: str) -> str:
@@ -217,44 +164,6 @@ def test_gpu_run_without_a_gpu_writes_nothing(
     assert said.err == "gpu: nothing could be run (no CUDA device); see docs/speed.md\n"
     assert "gradients: skipped: no CUDA device" in said.out
     assert not out.exists()
-
-
-def test_gpu_run_goes_on_after_a_failed_or_slow_section(
-    fake_sections: Path, runner: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = fake_sections / "out"
-    monkeypatch.setattr(sys, "argv", ["run.py", "--out", str(out)])
-    monkeypatch.setattr(runner, "ON_GSPLAT", {"gradients"})
-    assert runner.main() == 1
-    page = (out / "README.md").read_text()
-    said = ("| gradients | ", "failed (exit code 1)", "of it\n```", "stopped after 5 s", "skipped: no driver")
-    assert [text for text in ("# environment\n\nfound by full", *said) if text not in page] == []
-    stopped = (out / "lifting.md").read_text()
-    assert stopped.startswith("# lifting\n\nfound by full\n\n## Machine\n\n# environment")
-    assert not (out / "opengl.md").exists()
-
-
-def test_gpu_run_skips_sections_where_gsplat_fails(
-    fake_sections: Path, runner: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    main = fake_sections / "gpu_sections.py"
-    main.write_text(main.read_text().replace("'gradients'", "'environment'"))
-    monkeypatch.setattr(runner, "SECTIONS", {"environment": 60, "gradients": 60, "opengl": 60})
-    monkeypatch.setattr(sys, "argv", ["run.py", "--out", str(fake_sections / "out")])
-    assert runner.main() == 1
-    page = (fake_sections / "out" / "README.md").read_text()
-    assert "skipped: gsplat does not work here" in page
-
-
-@pytest.mark.parametrize("words", [["--minutes", "0"], ["--only", "raster,tables"], ["--plan", "huge"]])
-def test_gpu_run_refuses_unusable_arguments(
-    words: list[str], runner: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["run.py", *words])
-    with pytest.raises(SystemExit) as stop:
-        runner.main()
-    assert stop.value.code == 2
-    assert words[0] in capsys.readouterr().err
 
 
 def test_gpu_sections_have_functions_and_docs(runner: ModuleType, sections: ModuleType) -> None:
