@@ -1,4 +1,4 @@
-"""The wheel without extras; what a desktop is told of the viewer; `make gpu`, over a twin of gsplat's kernels."""
+"""The wheel without extras; what a desktop is told of the viewer; `make gpu`, over a twin of gsplat."""
 
 import importlib.util
 import os
