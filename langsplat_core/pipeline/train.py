@@ -7,7 +7,7 @@ continues where it stopped and a changed setting recomputes only what depends on
 import json
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -225,9 +225,9 @@ def _gaussians(run: _Run, capture: Capture, train: list[int]) -> tuple[Gaussians
 
     That is the held-out PSNRs (dB) for each budget. One process trains; the others read what it keeps.
     """
-    config, where = run.config.radiance, (run.work, run.progress)
+    config = run.config.radiance
     budgets = budgets_for(capture, config, len(train))
-    found = run.processes.once(lambda: _rehearsals(capture, train, config, budgets, *where))
+    found = run.processes.once(lambda: _rehearsals(run, capture, train, budgets))
     budget = supported(found, budgets)
     scores = [[round(decibels, 2) for decibels in each] for each in found]
     rehearsed = dict(zip(map(budget_text, budgets), scores, strict=False))
@@ -238,23 +238,21 @@ def _gaussians(run: _Run, capture: Capture, train: list[int]) -> tuple[Gaussians
             *(budget_text(budget), budget_text(budgets[-1])),
             rehearsals_in_words(rehearsed) or "none could be",
         )
-    made = run.processes.once(lambda: trained_gaussians(capture, train, config, budget, *where))
+    made = run.processes.once(
+        lambda: trained_gaussians(capture, train, config, budget, run.work, run.progress)
+    )
     return made, rehearsed
 
 
 def _rehearsals(
-    capture: Capture,
-    train: list[int],
-    config: RadianceConfig,
-    budgets: Sequence[RadianceBudget],
-    work: Path,
-    progress: Progress,
+    run: _Run, capture: Capture, train: list[int], budgets: list[RadianceBudget]
 ) -> list[list[float]]:
-    """`rehearse` for the photographs at `train`, from `work` where that was done before."""
-    done = work / f"{_radiance_key('rehearsal', capture, train, config)}.json"
+    """`rehearse` for the photographs at `train`, from the work folder where that was done before."""
+    config = run.config.radiance
+    done = run.work / f"{_radiance_key('rehearsal', capture, train, config)}.json"
     if not done.exists():
         checkpoint = done.with_suffix(".checkpoint.safetensors")
-        found = rehearse(capture, config, budgets, train, checkpoint, progress)
+        found = rehearse(capture, config, budgets, train, checkpoint, run.progress)
         with atomic_path(done) as temporary:
             temporary.write_text(json.dumps(found))
         for left in checkpoints_of(checkpoint):

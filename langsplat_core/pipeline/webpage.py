@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from safetensors.numpy import save
 from scipy.sparse import csr_matrix
 
 from langsplat_core.arrays import Array, sigmoid, unit
@@ -44,11 +45,10 @@ from langsplat_core.semantics.vocabulary import BUNDLED, bundled_vocabulary
 # In an order in which each imports only those before it, so that their code can stand in one script.
 MODULES = ("words", "rule", "encoder", "language", "data", "camera", "draw", "page")
 BEGIN, END = "// [page]\n", "// [/page]\n"  # around the code of a module, without its imports and exports
+WORD_LISTS = ("ARTICLES", "STOP_WORDS", "ADJECTIVES", "PARTS")  # which tell a part from a thing
 WIDE = 10  # columns of 16 bits: means, scales, quaternions
 CHUNK = 256  # Gaussians that share the range of a quantised column
 FLATTEST, OPAQUE = -46.0, 20.0  # bounds of the logarithm of a scale, whatever a file holds; of a logit
-MOST_VIEWS = 200  # bookmarks; of more cameras every so-manyth
-NO_TABLES = "a page answers by everyday phrases, and neither the scene nor an encoder here has them"
 
 
 @dataclass(frozen=True)
@@ -65,13 +65,13 @@ class PageReport:
 def write_page(
     path: Path, scene: Scene, engine: QueryEngine | None, title: str, progress: Progress = silent
 ) -> PageReport:
-    """Write `scene` as an HTML file.
+    """Write `scene` as an HTML file; InputError for one of which nothing can be drawn.
 
     engine: of the same scene, None where it is only to be looked at. title: plain text.
-
-    Raises InputError for a scene of which nothing can be drawn.
     """
-    rows = drawable(scene.gaussians)
+    opacities = sigmoid(scene.gaussians.opacity_logits.astype(np.float64))
+    rows = np.flatnonzero(scene.gaussians.valid() & (opacities >= 1 / 255))
+    rows = rows[np.argsort(along_curve(scene.gaussians.means[rows]), kind="stable")]
     if len(rows) == 0:
         raise InputError(f"{scene.path}: no Gaussian of this scene can be drawn; there is nothing to export")
     centre, radius = scene.bounds()
@@ -95,14 +95,15 @@ def write_page(
         "shaders": page_shaders(),
     }
     tensors["colour_map"] = COLOUR_MAPS["turbo"]
-    why_not = no_field(scene) if engine is None else unsearchable(engine)
-    language: dict[str, Any] = {}
+    why_not, language = no_field(scene) if engine is None else unsearchable(engine), dict[str, Any]()
     if engine is not None and not why_not:
         language, own = language_tables(engine, rows, progress)
         tensors |= own
     meta |= {"language": language or None, "why_not": why_not}
     progress("compressing", 0.8)
-    text = page_text(title, pack(tensors, meta))
+    plain = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
+    packed = zlib.compress(save(plain, {"page": json.dumps(meta, allow_nan=False)}), 9)
+    text = page_text(title, packed)
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     free = "encoder" in language
@@ -110,24 +111,18 @@ def write_page(
 
 
 def unsearchable(engine: QueryEngine) -> str:
-    """Why a page of a scene with a language field cannot answer; "" where it can."""
+    """Return why a page of a scene with a language field cannot answer; "" where it can."""
     if engine.field.codec.blends:
         return (
             f"its language field is {engine.field.codec.kind!r}, not a codebook: train it with "
             "--codec.kind codebook to search it in a page"
         )
-    return "" if engine.rule == "regions" else NO_TABLES
+    if engine.rule != "regions":
+        return "a page answers by everyday phrases, and neither the scene nor an encoder here has them"
+    return ""
 
 
 # The Gaussians: every column in 8 or 16 bits between the least and the largest value of its chunk.
-
-
-def drawable(gaussians: Gaussians) -> Array:
-    """(M,) rows that some camera could show, in the order of a Morton curve."""
-    opacities = sigmoid(gaussians.opacity_logits.astype(np.float64))
-    rows = np.flatnonzero(gaussians.valid() & (opacities >= 1 / 255))
-    found: Array = rows[np.argsort(along_curve(gaussians.means[rows]), kind="stable")]
-    return found
 
 
 def pack_gaussians(gaussians: Gaussians, centre: Array) -> dict[str, Array]:
@@ -148,9 +143,8 @@ def pack_gaussians(gaussians: Gaussians, centre: Array) -> dict[str, Array]:
         axis=1,
     ).T
     chunks = -(-count // CHUNK)
-    edge = np.pad(columns, ((0, 0), (0, chunks * CHUNK - count)), mode="edge").reshape(
-        len(columns), -1, CHUNK
-    )
+    edge = np.pad(columns, ((0, 0), (0, chunks * CHUNK - count)), mode="edge")
+    edge = edge.reshape(len(columns), -1, CHUNK)
     ranges = np.stack([edge.min(2), edge.max(2)], -1).astype(np.float32)
     steps = np.where(np.arange(len(columns)) < WIDE, 65_535, 255)[:, None, None]
     low = ranges[..., :1].astype(np.float64)
@@ -168,7 +162,7 @@ def views(scene: Scene) -> list[dict[str, Any]]:
     """Return the scene's cameras, relative to the page's origin; one that frames it where it has none."""
     centre, _ = scene.bounds()
     cameras: Sequence[Camera] = scene.cameras or (scene.framing_camera((1280, 800)),)
-    step = -(-len(cameras) // MOST_VIEWS)
+    step = -(-len(cameras) // 200)  # bookmarks at most
     return [
         {
             "name": camera.name or f"view {number}",
@@ -227,7 +221,7 @@ def language_tables(
         "bars": bars,
         "calibration": None if engine.calibration is None else asdict(engine.calibration),
         "rule": RULE.as_json() | {"least_likeness": [-taught.HEAT, -1 / taught.UNIT]},
-        "grammar": _word_lists(),
+        "grammar": {name.lower(): sorted(getattr(grammar, name)) for name in WORD_LISTS},
         "examples": suggested.examples,
         "phrases": suggested.phrases,
     }
@@ -239,12 +233,6 @@ def language_tables(
     progress("encoding words", 0.6)
     words, own = _words(engine, suggested.phrases)
     return numbers | words, tensors | own
-
-
-def _word_lists() -> dict[str, list[str]]:
-    """Return the word lists by which a part is told from a thing, sorted."""
-    names = ("ARTICLES", "STOP_WORDS", "ADJECTIVES", "PARTS")
-    return {name.lower(): sorted(getattr(grammar, name)) for name in names}
 
 
 def _region_tables(engine: QueryEngine) -> dict[str, Array]:
@@ -308,14 +296,6 @@ def _words(engine: QueryEngine, suggested: Sequence[str]) -> tuple[dict[str, Any
 
 
 # The file.
-
-
-def pack(tensors: dict[str, Array], meta: dict[str, Any]) -> bytes:
-    """Tensors and `meta` as a safetensors file, deflated."""
-    from safetensors.numpy import save
-
-    plain = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
-    return zlib.compress(save(plain, {"page": json.dumps(meta, allow_nan=False)}), 9)
 
 
 def page_text(title: str, data: bytes) -> str:

@@ -13,7 +13,6 @@ from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.pipeline.evidence import (
     Evidence,
-    draw_evidence,
     find_evidence,
     kept_features,
     kept_photographs,
@@ -168,17 +167,6 @@ def test_features_of_another_scene_are_refused(engine, features, wrong):
         find_evidence(engine, engine.run("mug"), ["mug"], [other] * VIEWS, load_rasterizer("cpu"))
 
 
-def test_the_sheet_outlines_masks_in_their_photographs(evidence, engine, scene, features):
-    answer = engine.run("mug")
-    grey = {camera.name: np.full((120, 160, 3), 128, np.uint8) for camera in scene.cameras}
-    sheet = draw_evidence(evidence, answer, scene, features, grey, load_rasterizer("cpu"))
-    yellow, blue = ((sheet == colour).all(-1) for colour in ((255, 210, 0), (0, 200, 255)))
-    assert yellow.sum() > 1000
-    assert blue.sum() > 200  # of the merged one and the blank one, whose masks lie elsewhere
-    few = draw_evidence(replace(evidence, others=()), answer, scene, features, grey, load_rasterizer("cpu"))
-    assert few.shape[0] < sheet.shape[0]
-
-
 # On the command line, with what a training keeps.
 
 
@@ -200,6 +188,9 @@ def test_query_why_draws_a_sheet(trained, capsys):
     assert book["for"] == 0
     with Image.open("out.png") as sheet:
         assert sheet.height > 800  # of both
+        yellow, blue = ((np.asarray(sheet) == colour).all(-1) for colour in ((255, 210, 0), (0, 200, 255)))
+    assert yellow.sum() > 1000
+    assert blue.sum() > 200  # of the merged one and the blank one, whose masks lie elsewhere
     assert run("query", "a.ply", "mug", "--why", "out.png") == 0
     said = capsys.readouterr().out
     assert "5 of 7 photographs" in said

@@ -155,21 +155,27 @@ def view_pairs(
 # of a thing have slightly different vectors does not tear it apart.
 
 SAME = 0.6  # overlap over union of what two masks claim from which they are one instance
-SAMPLE = 50_000  # Gaussians that decide which masks go together: what is compared grows with views squared
 
 
 def find_instances(
-    mask_weights: MaskWeights, counts: Sequence[int], level: int = len(LEVELS) - 1, sample: int = SAMPLE
+    mask_weights: MaskWeights, counts: Sequence[int], level: int = len(LEVELS) - 1, sample: int = 50_000
 ) -> Array:
     """Return the (N,) int32 number of the instance that each Gaussian belongs to, at a level.
 
     NO_NODE where no mask of that level shows it. Instances are numbered from the largest, by number of
-    Gaussians. counts: number of masks of each view; sample: Gaussians that decide which masks go together.
+    Gaussians. counts: number of masks of each view; sample: Gaussians that decide which masks go together,
+    since what is compared grows with views squared.
     """
-    numbers = instances_of_masks(mask_weights, counts, level, sample)
-    size = int(numbers.max(initial=-1)) + 1
-    of_mask = np.split(np.where(numbers >= 0, numbers, size).astype(np.int32), np.cumsum(counts)[:-1])
-    groups = MaskGroups(tuple(of_mask), np.zeros((size + 1, 1), np.float32))
+    view_of = np.repeat(np.arange(len(counts)), counts)
+    claims = _claims(mask_weights, np.cumsum([0, *counts]), level, sample)
+    _, found = connected_components(_overlapping(claims, view_of), directed=False)
+    claiming = np.flatnonzero(np.diff(claims.tocsc().indptr) > 0)
+    names, numbers = np.unique(found[claiming], return_inverse=True)
+    size = len(names)
+    of_mask = np.full(len(view_of), size, np.int32)  # masks of other levels, and those that claim nothing
+    of_mask[claiming] = numbers
+    by_view = np.split(of_mask, np.cumsum(counts)[:-1])
+    groups = MaskGroups(tuple(by_view), np.zeros((size + 1, 1), np.float32))
     instances = np.full(mask_weights.count, size, np.int64)
     for number, (first, last) in enumerate(mask_weights.blocks):
         weights = mask_weights.block(number, groups)[:, level * (size + 1) : (level + 1) * (size + 1)].tocsr()
@@ -180,19 +186,6 @@ def find_instances(
     rank = np.full(size + 1, NO_NODE, np.int32)
     rank[order] = np.arange(size)
     return np.asarray(rank[instances])
-
-
-def instances_of_masks(
-    mask_weights: MaskWeights, counts: Sequence[int], level: int, sample: int = SAMPLE
-) -> Array:
-    """Return the (M,) instance that each mask shows; -1 for other levels and masks that claim nothing."""
-    view_of = np.repeat(np.arange(len(counts)), counts)
-    claims = _claims(mask_weights, np.cumsum([0, *counts]), level, sample)
-    _, found = connected_components(_overlapping(claims, view_of), directed=False)
-    numbers = np.full(len(view_of), -1)
-    claiming = np.flatnonzero(np.diff(claims.tocsc().indptr) > 0)
-    numbers[claiming] = np.unique(found[claiming], return_inverse=True)[1]
-    return numbers
 
 
 def _claims(mask_weights: MaskWeights, firsts: Array, level: int, most: int) -> sparse.csr_matrix:

@@ -33,7 +33,6 @@ from langsplat_core.training.language.mask_weights import (
     find_instances,
     find_mask_weights,
     group_masks,
-    instances_of_masks,
     view_pairs,
 )
 from tests.support.processes import stop_at
@@ -189,29 +188,14 @@ def plain_masks_of_things(views: Sequence[Array], level: int) -> list[int]:
 
 
 @pytest.mark.parametrize(("seed", "level"), [(0, 1), (0, 2), (1, 2), (2, 2)])
-def test_masks_are_linked_by_the_plain_rule(seed, level):
+def test_gaussians_belong_to_the_instance_they_paint_most(seed, level):
     views = random_views(seed)
-    got = instances_of_masks(MaskWeights(views, 240), counts_of(views), level)
-    want = np.array(plain_masks_of_things(views, level))
-    assert ((got == -1) == (want == -1)).all()
-    pairs = len({*zip(got.tolist(), want.tolist(), strict=True)})
-    assert pairs == len({*got.tolist()}) == len({*want.tolist()})
-    assert sorted({*got.tolist()} - {-1}) == list(range(got.max() + 1))
-    if level == WHOLE:
-        assert 6 <= got.max() + 1 < sum(counts_of(views)) / 2  # many were merged, not all
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_gaussians_belong_to_the_instance_they_paint_most(seed):
-    views = random_views(seed)
-    counts = counts_of(views)
-    things = found(views, 240)
-    numbers = np.array(plain_masks_of_things(views, WHOLE))
-    firsts = np.cumsum([0, *counts])
+    counts, things = counts_of(views), found(views, 240, level=level)
+    numbers = np.array(plain_masks_of_things(views, level))
     weights = np.zeros((240, numbers.max() + 1))
-    for first, pairs in zip(firsts, views, strict=False):
-        for row, mask, level, weight in pairs.tolist():
-            if level == WHOLE and numbers[first + mask] >= 0:
+    for first, pairs in zip(np.cumsum([0, *counts]), views, strict=False):
+        for row, mask, of, weight in pairs.tolist():
+            if of == level and numbers[first + mask] >= 0:
                 weights[row, numbers[first + mask]] += weight
     want = np.where(weights.any(1), weights.argmax(1), -1)
     assert ((things == NO_NODE) == (want == -1)).all()
@@ -219,7 +203,8 @@ def test_gaussians_belong_to_the_instance_they_paint_most(seed):
     sizes = np.bincount(things[things != NO_NODE])
     assert (np.diff(sizes) <= 0).all()  # from the largest
     assert sizes.min() > 0
-    np.testing.assert_array_equal(found(views, 240), things)
+    if level == WHOLE:
+        assert 6 <= len(sizes) < sum(counts) / 2  # many were merged, not all
 
 
 ROWS = np.arange(40)
@@ -294,19 +279,15 @@ def test_votes_count_masks_of_just_one_node():
         np.zeros((3, 2), np.uint16),
     )
 
-    def photograph(mask: Array, level: int, seen: Array) -> Array:
-        pairs = np.zeros(int(seen.sum()), PAIR)
-        pairs["row"], pairs["mask"], pairs["level"] = rows[seen], mask[seen], level
-        pairs["weight"] = 3.0
-        return pairs
+    def photograph(mask: Array, level: int, seen: int = 40) -> Array:
+        return view(np.where(rows < seen, mask, UNSEEN), level, np.full(40, 3.0, np.float32))
 
-    everything = rows >= 0
     views = [
-        photograph(np.zeros(40, int), 2, everything),
-        photograph(rows // 20, 0, everything),
-        photograph((rows >= 13).astype(int), 1, everything),  # 13 and 27: overlaps of 0.65, 0.74 and 0.675
-        photograph(np.zeros(40, int), 2, rows < 8),  # 24 pixels show nothing
-        photograph(np.zeros(40, int), 2, rows < 9),  # the part that is seen is all that counts
+        photograph(0 * rows, 2),
+        photograph(rows // 20, 0),
+        photograph((rows >= 13).astype(int), 1),  # 13 and 27: overlaps of 0.65, 0.74 and 0.675
+        photograph(0 * rows, 2, seen=8),  # 24 pixels show nothing
+        photograph(0 * rows, 2, seen=9),  # the part that is seen is all that counts
         np.zeros(0, PAIR),
     ]
     votes = count_votes(tree, MaskWeights(views, 40), [1, 2, 2, 1, 1, 0])

@@ -9,7 +9,7 @@ from skimage.metrics import structural_similarity
 
 from langsplat_core.arrays import Array
 from langsplat_core.scene import Camera, look_at
-from langsplat_core.training.radiance.losses import blur, fit_exposure, radiance_loss, ssim_map, with_exposure
+from langsplat_core.training.radiance.losses import fit_exposure, radiance_loss, ssim_map, with_exposure
 from langsplat_core.training.radiance.transients import (
     GRID,
     MOST,
@@ -42,14 +42,6 @@ def test_ssim_agrees_with_scikit_image_away_from_the_border() -> None:
     )
     inside = np.s_[5:-5, 5:-5]  # the border differs: zeros here, reflection there
     np.testing.assert_allclose(ssim_map(a, b).numpy()[inside], want[inside], atol=1e-10)
-
-
-def test_blur_is_its_own_adjoint_and_keeps_constants_inside() -> None:
-    a, b = pictures(2)
-    assert float((blur(a) * b).sum()) == pytest.approx(float((a * blur(b)).sum()), rel=1e-12)
-    flat = blur(torch.ones(20, 30, 1, dtype=torch.float64))
-    assert float((flat[5:-5, 5:-5] - 1).abs().max()) < 1e-12
-    assert float(flat[0, 0]) < 0.5  # zeros outside
 
 
 def test_gradient_of_the_loss_is_its_derivative() -> None:
@@ -105,9 +97,9 @@ def cameras() -> list[Camera]:
 
 def wall(camera: Camera) -> Array:
     """(GRID, GRID) depths of the wall."""
-    y, x = (np.mgrid[:GRID, :GRID] + 0.5) / GRID
-    local = [(x * SIZE[0] - camera.cx) / camera.fx, (y * SIZE[1] - camera.cy) / camera.fy, np.ones_like(x)]
-    return -camera.position[2] / (np.stack(local, -1) @ camera.rotation)[..., 2]
+    patches = camera.resized(GRID, GRID)
+    ray = patches.unproject(patches.pixel_centres(), np.ones((GRID, GRID))) - camera.position
+    return -camera.position[2] / ray[..., 2]
 
 
 def counted_slowly(index: int, depths: Array, alike: Array) -> Array:

@@ -10,9 +10,8 @@ import torch
 from safetensors.torch import save_file
 
 from langsplat_core.config import RadianceConfig
-from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.scene import Gaussians, look_at
+from langsplat_core.scene import Gaussians
 from langsplat_core.scene.transform import C0
 from langsplat_core.training.radiance.state import (
     PARAMETERS,
@@ -252,13 +251,6 @@ def filled_state() -> TrainingState:
     return state
 
 
-def make_capture() -> Capture:
-    rng = np.random.default_rng(1)
-    cameras = [look_at(eye, np.zeros(3), np.array([0, 1, 0]), (8, 6)) for eye in np.eye(3) * 4 + 0.1]
-    images = [rng.integers(0, 255, (6, 8, 3), dtype=np.uint8) for _ in cameras]
-    return Capture(tuple(cameras), tuple(images), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-
-
 def test_checkpoints_restore_the_exact_state(tmp_path: Path) -> None:
     state = filled_state()
     path = tmp_path / "run.safetensors"
@@ -306,13 +298,12 @@ def test_damaged_checkpoints_are_refused_in_one_line(tmp_path: Path, damage: str
 
 
 def test_fingerprint_depends_on_what_decides_the_result() -> None:
-    capture, config = make_capture(), RadianceConfig()
-    base = fingerprint(capture, config, [0, 1])
-    assert fingerprint(make_capture(), config, [0, 1]) == base
-    assert fingerprint(capture, replace(config, checkpoint_every=7, backend="cpu"), [0, 1]) == base
-    assert fingerprint(capture, replace(config, seed=1), [0, 1]) != base
-    assert fingerprint(capture, config, [0, 2]) != base
-    brighter = [capture.images[0] + 1, *capture.images[1:]]
-    assert fingerprint(replace(capture, images=tuple(brighter)), config, [0, 1]) != base
-    moved = [replace(capture.cameras[0], fx=9.0), *capture.cameras[1:]]
-    assert fingerprint(replace(capture, cameras=tuple(moved)), config, [0, 1]) != base
+    photographs, config = capture(), RadianceConfig()
+    base = fingerprint(photographs, config, [0, 1])
+    assert fingerprint(photographs, replace(config, checkpoint_every=7, backend="cpu"), [0, 1]) == base
+    assert fingerprint(photographs, replace(config, seed=1), [0, 1]) != base
+    assert fingerprint(photographs, config, [0, 2]) != base
+    images = photographs.images[0] + 1, *photographs.images[1:]
+    cameras = replace(photographs.cameras[0], fx=9.0), *photographs.cameras[1:]
+    for changed in (replace(photographs, images=images), replace(photographs, cameras=cameras)):
+        assert fingerprint(changed, config, [0, 1]) != base

@@ -35,18 +35,13 @@ def cameras() -> list[Camera]:
 
 def true_depth(camera: Camera) -> Array:
     """(H, W) depth of the surface."""
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    local = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1)
-    ray = local @ camera.rotation
+    ray = camera.unproject(camera.pixel_centres(), np.ones((camera.height, camera.width))) - camera.position
     return (TILT * camera.position[0] - camera.position[2]) / (ray[..., 2] - TILT * ray[..., 0])
 
 
 def picture(camera: Camera) -> Array:
     """The surface with a texture of waves that repeats nowhere."""
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    z = true_depth(camera)
-    local = np.stack([(x - camera.cx) / camera.fx * z, (y - camera.cy) / camera.fy * z, z], -1)
-    at = local @ camera.rotation + camera.position
+    at = camera.unproject(camera.pixel_centres(), true_depth(camera))
     rng = np.random.default_rng(2)
     waves = rng.normal(size=(40, 2)) * 14
     phases, colours = rng.uniform(0, 6, 40), rng.normal(size=(40, 3)) * 0.09
