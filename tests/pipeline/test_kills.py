@@ -5,9 +5,7 @@ import random
 import signal
 import subprocess
 import sys
-import threading
-import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -22,7 +20,6 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name == "nt", reason="no s
 LENS = PhotoIntrinsics(320, 240, 300.0, 300.0, 160.0, 120.0)
 VIEWS = 6
 STEPS = 5  # in which a disk is made as large as a training needs
-START = "starting"  # before the first report
 SCENE = ("scene.ply", "scene.langsplat.safetensors", "scene.cameras.json")
 SETTINGS = (
     *("--dataset.max-side", "64", "--dataset.test-every", "4", "--radiance.steps", "30"),
@@ -32,77 +29,35 @@ SETTINGS = (
 
 
 @dataclass(frozen=True)
-class Moment:
-    """When a process is killed: some seconds after a stage has come so far, or is over."""
-
-    stage: str
-    fraction: float
-    seconds: float
-    signal: int = signal.SIGKILL
-
-
-@dataclass(frozen=True)
 class Ended:
-    """A process: its code, what it said besides its progress, and when its stages began."""
+    """A process: its code, what it said besides its progress, and its stages in their order."""
 
     code: int
     said: str
-    began: dict[str, float]  # seconds since the process did
-    seconds: float
+    stages: list[str]
 
 
-def train(data: Path, encoder: Path, folder: Path, kill: Moment | None = None) -> Ended:
-    """Train ``folder/scene.ply``, and send it a signal at a moment."""
+def train(
+    data: Path, encoder: Path, folder: Path, stop: tuple[str, float] = ("", 0), number: int = signal.SIGKILL
+) -> Ended:
+    """Train ``folder/scene.ply``, and send a signal once a stage has come so far."""
     words = ["train", str(data), "--out", str(folder / SCENE[0]), "--clip.model", str(encoder), *SETTINGS]
-    start = time.monotonic()
-    began, said = {START: 0.0}, []
-    with subprocess.Popen(
-        [sys.executable, "-m", "langsplat_core", *words],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as process:
-        number = kill.signal if kill else 0
-        killer = threading.Timer(kill.seconds if kill else 0, process.send_signal, (number,))
-        if kill is not None and kill.stage == START:
-            killer.start()
+    command = [sys.executable, "-m", "langsplat_core", *words]
+    stages, said, sent = dict[str, None](), [], False
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         for line in process.stderr:
-            report = _report(line)
-            if report is None:
+            try:
+                report = Report.from_json(line)
+            except ValueError:
                 said.append(line)
                 continue
-            stage, fraction = report
-            began.setdefault(stage, time.monotonic() - start)
-            passed = kill is not None and kill.stage in began
-            passed = passed and (stage != kill.stage or fraction >= kill.fraction)
-            if passed and not killer.is_alive() and not killer.finished.is_set():
-                killer.start()
+            stages[report.stage] = None
+            if not sent and report.stage == stop[0] and report.fraction >= stop[1]:
+                process.send_signal(number)
+                sent = True
         code = process.wait()
-    killer.cancel()
-    return Ended(code, "".join(said), began, time.monotonic() - start)
-
-
-def _report(line: str) -> tuple[str, float] | None:
-    """Stage and fraction of a line of progress; None for other lines."""
-    try:
-        report = Report.from_json(line)
-    except ValueError:
-        return None
-    return report.stage, report.fraction
-
-
-def moments(whole: Ended, seed: int) -> list[Moment]:
-    """One in every stage of a run, in their order: anywhere in its progress, and where there is none to see,
-    before the first report and after the last, anywhere in its time."""
-    first, *stages, last = sorted(whole.began, key=whole.began.__getitem__)
-    generator = random.Random(seed)
-    before, after = whole.began[stages[0]], whole.seconds - whole.began[last]
-    return [
-        Moment(first, 0, generator.uniform(0, before)),
-        *(Moment(stage, generator.random(), 0) for stage in stages),
-        Moment(last, 0, generator.uniform(0, after)),
-    ]
+    return Ended(code, "".join(said), list(stages))
 
 
 def photographs(folder: Path, kind: str) -> Path:
@@ -137,15 +92,18 @@ def test_training_stopped_in_every_stage_ends_with_the_same_bytes(
     asked = [signal.SIGTERM]
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # as in a shell's background
         asked.append(signal.SIGINT)
-    for moment in moments(whole, seed):
+    # The last stage also when it is over: then the scene is written.
+    for stage, fraction in [
+        *((stage, choose.random() / 2) for stage in whole.stages),
+        (whole.stages[-1], 1.0),
+    ]:
         number = choose.choice(asked) if how == "signals" else signal.SIGKILL
-        ended = train(data, encoder, tmp_path / "stopped", replace(moment, signal=number))
+        ended = train(data, encoder, tmp_path / "stopped", (stage, fraction), number)
         expected = -number if how == "killed" else 128 + number
-        assert ended.code in (0, expected), ended.said  # 0: it was faster than before
+        assert ended.code in (0, expected), ended.said  # 0: it was faster than the signal
         assert "Traceback" not in ended.said
         if ended.code > 0:
-            said = ended.said.splitlines()[-1]  # before its arguments are read there is nothing to continue
-            assert said.endswith("the same command continues where it stopped") or moment.stage == START
+            assert ended.said.splitlines()[-1].endswith("the same command continues where it stopped")
         stopped.append(ended.code != 0)
     print(f"{kind}: {sum(stopped)} of {len(stopped)} {how}")
     assert sum(stopped) > len(stopped) / 2
