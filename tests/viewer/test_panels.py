@@ -4,10 +4,12 @@ import ast
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 from matplotlib.ft2font import FT2Font
 
 from langsplat_core.errors import InputError
+from langsplat_core.scene.transform import AXES, moving, rotating
 from langsplat_viewer import panels
 from langsplat_viewer.actions import settings, viewpoint
 from langsplat_viewer.commands import COMMANDS, PANEL_TITLES, matching
@@ -15,9 +17,11 @@ from langsplat_viewer.files.projects import FILE_NAME, load_preferences, save_pr
 from langsplat_viewer.panels import ui
 from langsplat_viewer.panels.layout import all_panels
 from langsplat_viewer.panels.navigation import chord
+from langsplat_viewer.panels.select import box_of, dragged, gl_matrices
 from langsplat_viewer.panels.ui import elided
 from langsplat_viewer.session import MOST_RECENT, Preferences
 from langsplat_viewer.state import MAX_MESSAGES
+from tests.support.scenes import random_camera, without_perspective
 from tests.support.windowless import settle
 
 SOURCES = sorted(Path(panels.__path__[0]).glob("*.py"))
@@ -201,3 +205,37 @@ def test_the_first_fallback_has_the_scripts_that_it_is_there_for():
     letters = FT2Font(ui.fallbacks()[0]).get_charmap()
     for text in ("жук", "κούπα", "čaj żółć", "ספל", "كوب", "→ ≥ ✓"):
         assert all(ord(letter) in letters for letter in text if letter != " "), text
+
+
+# The gizmo.
+
+
+@pytest.mark.parametrize("perspective", [True, False])
+def test_gizmo_matrices_agree_with_the_camera(perspective):
+    camera = random_camera(3)
+    camera = camera if perspective else without_perspective(camera)
+    points = np.random.default_rng(0).normal(scale=0.3, size=(20, 3))
+    view, projection = gl_matrices(camera, 3.0)
+    clip = np.c_[points, np.ones(20)] @ (projection @ view).T
+    x, y, depth = (clip[:, :3] / clip[:, 3:]).T
+    pixels, _ = camera.project(points)
+    np.testing.assert_allclose((x + 1) / 2 * camera.width, pixels[:, 0], atol=1e-9)
+    np.testing.assert_allclose((1 - y) / 2 * camera.height, pixels[:, 1], atol=1e-9)
+    assert (np.abs(depth) < 1).all()
+
+
+def test_gizmo_drags_become_similarities():
+    box = np.diag([2.0, -4.0, 6.0, 1.0])  # a handle was dragged beyond the opposite one
+    box[:3, 3] = 1.0, 2.0, 3.0
+    assert box_of(box) == ((0.0, 0.0, 0.0), (2.0, 4.0, 6.0))
+    start = moving(np.array([1.0, 2.0, 3.0])).matrix
+    turned = rotating(AXES["y"], 20).about(start[:3, 3])
+    np.testing.assert_allclose(dragged(start, turned.matrix @ start).matrix, turned.matrix, atol=1e-9)
+    stretched = start.copy()
+    stretched[:3, :3] = np.diag([1.0, 1.4, 1.0])
+    grown = dragged(start, stretched)
+    assert grown.scale == pytest.approx(1.4)
+    np.testing.assert_allclose(grown.points(start[None, :3, 3])[0], start[:3, 3])
+    stretched[:3, :3] = 0
+    with pytest.raises(InputError):
+        dragged(start, stretched)
