@@ -32,7 +32,6 @@ assumed loses less than stated, so the assumption should be on the high side. On
 photographs and true e, this agreed with the measured loss within 0.03 dB at losses up to 1 dB.
 """
 
-import logging
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -50,8 +49,6 @@ from langsplat_core.io.summary import disk_bytes, memory_bytes
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.render import colours_seen, render, view_of
 from langsplat_core.scene import SH_COUNTS, Camera, Scene
-
-log = logging.getLogger("langsplat")
 
 T = TypeVar("T")
 
@@ -111,8 +108,7 @@ def choose_views(scene: Scene, photos: Path | None, config: BudgetConfig, progre
     """Choose the cameras of the photographs, else of the scene, else some around it.
 
     At most ``config.views``. Photographs that the scene was not trained on, if there are any, all measure;
-    otherwise every `HOLD_OUT`-th view does. Raises InputError where fewer than two views are left or the
-    photographs belong to another world than the scene.
+    otherwise every `HOLD_OUT`-th view does. Raises InputError where fewer than two views are left.
     """
     check_settings(config)
     if photos is not None:
@@ -121,8 +117,7 @@ def choose_views(scene: Scene, photos: Path | None, config: BudgetConfig, progre
         cameras, origin = _thinned(scene.cameras, config.views), "the scene's cameras"
     else:
         # The whole scene, and nearer, where small Gaussians show.
-        around = scene.spiral_cameras(min(config.views, 48), (640, 480), distances=(2.6, 1.6))
-        cameras = list(around)
+        cameras = [*scene.spiral_cameras(min(config.views, 48), (640, 480), distances=(2.6, 1.6))]
         origin = "a ring around the scene (it has no cameras): what lies inside may be judged invisible"
     ranking, measuring = _divided([camera.within(config.max_side) for camera in cameras])
     return Views(tuple(ranking), tuple(measuring), (None,) * len(measuring), origin)
@@ -132,7 +127,6 @@ def _photographed(scene: Scene, photos: Path, config: BudgetConfig, progress: Pr
     with tempfile.TemporaryDirectory() as work:  # for points that may have to be found, and that are not used
         settings = DatasetConfig(max_side=config.max_side, allow_few_cameras=True)  # only looked through
         capture = load_capture(photos, settings, Path(work), progress)
-    check_same_world(scene.cameras, capture.cameras, photos)
     trained = {camera.name for camera in scene.cameras}
     known = [i for i, camera in enumerate(capture.cameras) if camera.name in trained]
     unknown = [i for i, camera in enumerate(capture.cameras) if camera.name not in trained]
@@ -151,24 +145,6 @@ def _photographed(scene: Scene, photos: Path, config: BudgetConfig, progress: Pr
         tuple(capture.images[i] for i in measuring),
         origin,
     )
-
-
-def check_same_world(own: Sequence[Camera], photographed: Sequence[Camera], photos: Path) -> None:
-    """Raise InputError where cameras of one name stand elsewhere in the scene and in the photographs."""
-    places = {camera.name: camera.position for camera in own}
-    pairs = [(places[c.name], c.position) for c in photographed if c.name in places]
-    if not pairs:
-        log.warning(
-            "%s: no photograph is named like a camera of the scene; the worlds are taken as equal", photos
-        )
-        return
-    ours, theirs = np.array(pairs).transpose(1, 0, 2)
-    spread = max(float(np.linalg.norm(ours - ours.mean(0), axis=1).max()), 1e-6)
-    if np.median(np.linalg.norm(ours - theirs, axis=1)) > 0.01 * spread:
-        raise InputError(
-            f"{photos}: its cameras lie elsewhere than the scene's of the same name; "
-            "give the dataset that the scene was trained on, or leave --photos out"
-        )
 
 
 def _thinned(items: Sequence[T], most: int) -> list[T]:
@@ -258,7 +234,7 @@ class CompactReport:
     after: Weight
     budget: float
     loss: float  # mean, of the file
-    worst_loss: float  # of any one view, ranking ones included, of the file
+    worst_loss: float  # of any one view, of the file
     assumed_psnr: float | None  # None: measured against photographs
     ranking_views: int
     measuring_views: int
@@ -286,10 +262,6 @@ def compact_scene(
     losses = psnr_losses(after, measured, config.assumed_psnr)
     if not losses.mean() <= config.max_psnr_loss:
         raise InputError(f"{out}: as stored it would lose {losses.mean():.3f} dB; not written, allow more")
-    truth = mean_psnr(scene, measured) or config.assumed_psnr
-    worst = losses.max()
-    for camera in views.ranking:  # one at a time, for their images may be many
-        worst = max(worst, *psnr_losses(after, [MeasuringView(camera, draw(scene, camera))], truth))
 
     def weigh(one: Scene, stored_bytes: int) -> Weight:
         degree, memory = one.gaussians.sh_degree, memory_bytes(one)
@@ -300,7 +272,7 @@ def compact_scene(
         after=weigh(after, after_bytes),
         budget=config.max_psnr_loss,
         loss=float(losses.mean()),
-        worst_loss=float(worst),
+        worst_loss=float(losses.max()),
         assumed_psnr=config.assumed_psnr if photos is None else None,
         ranking_views=len(views.ranking),
         measuring_views=len(views.measuring),

@@ -18,7 +18,6 @@ from langsplat_core.extensions.compaction.compact import (
     BudgetConfig,
     MeasuringView,
     Views,
-    check_same_world,
     choose_views,
     compact_scene,
     contributions,
@@ -204,14 +203,6 @@ def test_bisection_weighs_counts_against_sh_degrees():
     assert 800 <= count <= 800 + 1000 // 256 + 1
     assert smallest(1000, 1, lambda *_: 1.0, 0.3) is None
     assert smallest(1000, 1, lambda *choice: 0.0 if choice == (1000, 1) else 1.0, 0.3) == (1000, 1)
-
-
-def test_photographs_of_another_world_are_refused(scene):
-    named = [replace(camera, name=f"v{i}") for i, camera in enumerate(scene.cameras)]
-    check_same_world(named, named, "photos")
-    moved = [moving(np.array([0.2, 0, 0])).camera(camera) for camera in named]
-    with pytest.raises(InputError, match="lie elsewhere"):
-        check_same_world(named, moved, "photos")
 
 
 def test_photographs_held_out_from_training_measure(scene, source, tmp_path, monkeypatch):
