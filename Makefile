@@ -95,7 +95,7 @@ parity: $(STAMP)  ## vectors and masks against those of open_clip, segment_anyth
 bench: system  ## speed against error, on this machine
 	$(BIN)/langsplat bench raster --out bench_out
 
-# Rooms are kept in eval_out and methods in docs/benchmarks/lifting.rows.jsonl: an interrupted run goes on.
+# Rooms are kept in eval_out: an interrupted run goes on.
 FRESH := --tiers clutter --seeds 401 402 403 404 405
 report: system  ## every report under docs/benchmarks, again: hours (ONLY="rooms scale": some of them)
 	$(if $(ONLY),,$(BIN)/langsplat bench raster --out docs/benchmarks)

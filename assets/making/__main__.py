@@ -10,7 +10,9 @@ from typing import Annotated
 
 import tyro
 
-from assets.making.config import EncoderConfig, LabelLayout, Size, Tier
+from assets.making.crops import EncoderConfig
+from assets.making.dataset import LabelLayout, Size
+from assets.making.world import Tier
 from langsplat_core.cli.arguments import OutFile, OutFolder, Runnable
 from langsplat_core.cli.run import main, parsed
 from langsplat_core.config import Count, Seed
@@ -75,7 +77,7 @@ class Build:
 
     def run(self) -> None:
         """Build the scene."""
-        from assets.making.scene import build_scene
+        from assets.making.dataset import build_scene
 
         with TerminalProgress() as progress:
             made = build_scene(self.out, self.gaussians, progress)

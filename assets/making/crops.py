@@ -9,12 +9,11 @@ import numpy as np
 from PIL import Image, ImageFilter
 from scipy.ndimage import binary_dilation, binary_erosion
 
-from assets.making.config import TIERS, EncoderConfig
 from assets.making.kit import COLOURS, from_lch, random_colour, to_display, to_lch, to_linear
 from assets.making.render import Light, RenderedView, Renderer, noise
-from assets.making.vocabulary import RegionLabel
-from assets.making.world import World, build_room
+from assets.making.world import TIERS, RegionLabel, World, build_room
 from langsplat_core.arrays import Array
+from langsplat_core.config import Count, CountOrZero, Rate, Seed
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import opened
 from langsplat_core.progress import Progress
@@ -28,6 +27,20 @@ _ROOMS_PER_FILE = 10
 _HELD_OUT = 1_000_000  # room seeds from here on are never trained with
 _TIER_SHARES = (0.35, 0.5, 0.15)  # of the rooms
 _CLUTTER = RegionLabel(-1, "", "", "", "", ())  # generic: the canonical phrases are right, no other
+
+
+@dataclass(frozen=True)
+class EncoderConfig:
+    """Training of the demo encoder."""
+
+    rooms: Count = 400  # random rooms that crops are rendered from
+    views: Count = 3  # photographs of each room
+    plain_crops: CountOrZero = 8_000  # crops of nothing but a colour or a texture
+    steps: Count = 8_000  # of training
+    batch: Count = 128  # crops per step
+    phrases: Count = 192  # phrases per step
+    lr: Rate = 1e-3  # largest learning rate
+    seed: Seed = 0  # of random numbers
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,24 +1,167 @@
-"""Folders of photographs of a procedural room, with cameras, points and ground truth in three layouts."""
+"""Photographs of a procedural room with cameras, points and ground truth, read again; the bundled scene.
 
+The bundled scene's room is photographed by our renderer and trained by our pipeline, which sees photographs,
+cameras, noisy points and, in place of SAM, the outlines of things and parts. Their names and colours it never
+sees: those come from the encoder.
+"""
+
+import hashlib
 import json
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 from PIL import Image
 from scipy.ndimage import binary_fill_holes, find_objects
 from scipy.ndimage import label as connected
 
-from assets.making.config import LabelLayout, Tier
 from assets.making.render import Light, RenderedView, Renderer
-from assets.making.truth import Phrase, Truth, read_truth
-from assets.making.world import World, build_room
+from assets.making.world import Tier, World, build_room, object_words
 from langsplat_core.arrays import Array
+from langsplat_core.config import (
+    ClipConfig,
+    DatasetConfig,
+    MaskConfig,
+    RadianceConfig,
+    Range,
+    TrainConfig,
+)
+from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.ply import write_table
-from langsplat_core.progress import Progress
+from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import LEVELS, Camera, look_at
+from langsplat_core.semantics.masks import LevelMasks, MaskSource
+
+LabelLayout = Literal["plain", "lerf-ovs", "3d-ovs"]  # how a rendered room's truth is written
+Pixels = Annotated[int, Range(1, 65_536)]
+Size = tuple[Pixels, Pixels]  # width and height of an image
+
+# The truth, read again: regions, the phrases that are right for them, and masks.
+
+PHRASE_KINDS = ("object", "colour+object", "part", "subpart")  # of phrases, in the order of tables
+MIN_REGION = 16  # px: of a smaller region not even an oracle's crop shows anything
+
+
+@dataclass(frozen=True)
+class Region:
+    """One region as in `truth/labels.json`; empty words where none fits."""
+
+    level: str  # one of LEVELS
+    word: str  # its own: the object's at level whole, else the part's
+    thing: str  # the word of the object it belongs to
+    colour: str = ""
+    phrase: str = ""  # the one that says most about it
+    words: tuple[str, ...] = ()  # every phrase that is right for it
+
+    @property
+    def is_part(self) -> bool:
+        """True for a part with a word of its own."""
+        return self.level != "whole" and self.word not in ("", self.thing, "body")
+
+
+@dataclass(frozen=True)
+class Phrase:
+    """A phrase and what it is true for."""
+
+    text: str
+    kind: str  # one of PHRASE_KINDS
+    ids: tuple[int, ...]  # truth ids, of any level
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Everything known about the photographs of a room."""
+
+    folder: Path
+    phrases: tuple[Phrase, ...]
+    regions: Mapping[int, Region] = field(default_factory=dict)  # by truth id
+
+    @cached_property
+    def words(self) -> frozenset[str]:
+        """Every phrase that is right for anything in the room."""
+        return frozenset(word for region in self.regions.values() for word in region.words)
+
+    def labels(self, name: str) -> Array:
+        """(3, H, W) ids of the photograph with this stem, -1 where nothing is."""
+        with np.load(self.folder / f"{name}.npz", allow_pickle=False) as stored:
+            return np.asarray(stored["ids"]).astype(np.int64)
+
+    def absent(self, things: Iterable[str]) -> list[str]:
+        """Words of `things` by which, or by whose synonyms, nothing in the room may be called."""
+        return sorted(thing for thing in things if self.words.isdisjoint(object_words(thing)))
+
+
+def read_truth(dataset: Path) -> Truth:
+    """Return the truth beside the photographs; InputError where there is none."""
+    folder = dataset / "truth"
+    if not (folder / "labels.json").is_file():
+        raise InputError(
+            f"{dataset}: no truth/labels.json; make one with `python -m assets.making dataset --out DIR`"
+        )
+    stated = json.loads((folder / "labels.json").read_text(encoding="utf-8"))
+    names = {entry.name for entry in fields(Region)}
+    regions = {
+        int(key): Region(**{n: v for n, v in item.items() if n in names} | {"words": tuple(item["words"])})
+        for key, item in stated.items()
+    }
+    phrases: dict[str, Phrase] = {}
+    for region in regions.values():
+        for text, kind in _asked(region):
+            ids = tuple(key for key, other in regions.items() if text in other.words)
+            # A part without finer regions is its own subpart: the coarsest level gives a phrase its kind.
+            if text not in phrases or PHRASE_KINDS.index(kind) < PHRASE_KINDS.index(phrases[text].kind):
+                phrases[text] = Phrase(text, kind, ids)
+    return Truth(folder, tuple(phrases.values()), regions)
+
+
+def _asked(region: Region) -> Iterator[tuple[str, str]]:
+    """Return the phrases that are asked about one region: (text, kind)."""
+    if region.level == "whole" and region.thing:
+        yield region.thing, "object"
+        if region.colour:
+            yield f"{region.colour} {region.thing}", "colour+object"
+    elif region.is_part:
+        yield f"{region.thing} {region.word}", region.level
+
+
+class TruthMasks(MaskSource):
+    """A `MaskSource` that gives the regions of the truth, at its three levels.
+
+    A photograph is recognised by its content, since a mask source is given nothing else.
+    """
+
+    name = "truth"
+    key = json.dumps(["truth", 1, MIN_REGION])
+
+    def __init__(self, capture: Capture, truth: Truth) -> None:
+        self._truth = truth
+        pairs = zip(capture.images, capture.cameras, strict=True)
+        self._names = {_digest(image): camera.name for image, camera in pairs}
+
+    def __call__(self, image: Array, progress: Progress) -> LevelMasks:
+        """Masks of an image (H, W, 3) uint8 of the capture; InputError for any other."""
+        name = self._names.get(_digest(image))
+        if name is None:
+            raise InputError(f"{self._truth.folder}: has no truth for this photograph; render the room again")
+        stacks = []
+        for ids in self._truth.labels(name):
+            found, pixels = np.unique(ids[ids >= 0], return_counts=True)
+            stacks.append(ids == found[pixels >= MIN_REGION][:, None, None])
+        progress("reading the truth", 1.0)
+        subpart, part, whole = (np.ones(len(stack), np.float32) for stack in stacks)
+        return LevelMasks((stacks[0], stacks[1], stacks[2]), (subpart, part, whole))
+
+
+def _digest(image: Array) -> str:
+    return hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest()
+
+
+# Photographs, cameras, points and truth, written.
 
 POINTS = 20_000  # sparse points, as structure from motion would give
 FIRST_ROOM = 2_000_000  # the demo encoder was trained in rooms of lower numbers only
@@ -307,3 +450,50 @@ def _trace(piece: Array) -> Array:
     corners = np.rint(longest - 1).astype(int)[:, ::-1]
     corners = corners[np.r_[True, (np.diff(corners, axis=0) != 0).any(1)]]
     return np.concatenate([corners, np.repeat(corners[-1:], max(0, 3 - len(corners)), 0)])
+
+
+# The bundled scene.
+
+SEED = 2
+VIEWS = 72
+SIZE = (640, 480)
+MAX_LOSS = 0.25  # dB that compaction may cost
+
+
+# A low SH degree and a cap on the count keep the file small.
+CONFIG = TrainConfig(
+    dataset=DatasetConfig(max_side=max(SIZE), test_every=9, hold_out="every"),
+    radiance=RadianceConfig(steps=6_000, sh_degree=1, max_gaussians=110_000),
+    masks=MaskConfig(source="graph"),
+    clip=ClipConfig(model="demo"),
+)
+
+
+def build_scene(out: Path, gaussians: Path | None = None, progress: Progress = silent) -> str:
+    """Render the room, train a scene, and drop what its photographs do not miss.
+
+    Given `gaussians`, a scene of that room, only its language field is made anew. Returns a line about what
+    was made. Photographs and truth stay in `<out>.work/photographs`, the scene as trained in
+    `<out>.work/trained.ply`.
+    """
+    from langsplat_core.extensions.compaction.compact import BudgetConfig, compact_scene
+    from langsplat_core.pipeline.train import train_scene
+
+    work = out.with_name(out.stem + ".work")
+    photographs, trained = work / "photographs", work / "trained.ply"
+    if not (photographs / "transforms.json").exists():
+        write_dataset(photographs, SEED, VIEWS, SIZE, progress)
+    made = train_scene(
+        photographs,
+        out if gaussians else trained,
+        CONFIG,
+        work,
+        progress,
+        masks_of=lambda capture: TruthMasks(capture, read_truth(photographs)),
+        gaussians_from=gaussians,
+    )
+    if gaussians:
+        return f"{made.gaussians} Gaussians of {gaussians}, {made.codec} of {made.codec_size}"
+    report = compact_scene(trained, out, BudgetConfig(max_psnr_loss=MAX_LOSS), photographs, progress)
+    kept, before = report.after, report.before.gaussians
+    return f"{kept.gaussians} Gaussians of {before} trained, held-out {kept.psnr:.2f} dB"

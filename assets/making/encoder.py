@@ -11,7 +11,7 @@ import json
 import math
 from collections import Counter
 from dataclasses import asdict, dataclass
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +21,21 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torch.nn import functional as F
 
-from assets.making.config import EncoderConfig
-from assets.making.crops import CROP, CropSet, read_crops, write_crops
+from assets.making.crops import CROP, CropSet, EncoderConfig, read_crops, write_crops
+from assets.making.kit import COLOURS
 from assets.making.objects import TABLE_TOP
-from assets.making.vocabulary import BOOK_KINDS, PhraseBook, phrase_book
+from assets.making.world import (
+    BULK,
+    MATERIALS,
+    RegionLabel,
+    colour_phrases,
+    material_part_phrases,
+    material_phrases,
+    material_whole_phrases,
+    object_words,
+    part_phrases,
+    whole_phrases,
+)
 from langsplat_core.arrays import Array
 from langsplat_core.io.files import atomic_path
 from langsplat_core.progress import Progress
@@ -48,6 +59,80 @@ _AVERAGING = 0.998  # decay of the running mean of the weights, which is what is
 SAVE_EVERY = 250  # steps
 FLOOR_COSINE = 0.20  # of a nameable crop with the canonical phrases once trained: relevancy 0.5 lies there
 _CALIBRATION_CROPS = 2_500
+
+
+BOOK_KINDS = ("colour", "material", "object", "colour+object", "material+object", "part")
+
+
+@dataclass(frozen=True, eq=False)
+class PhraseBook:
+    """All phrases of a training run and how each fits each distinct label."""
+
+    phrases: tuple[str, ...]  # P; the four canonical phrases come first
+    kinds: tuple[str, ...]  # (P) "canonical", one of BOOK_KINDS
+    labels: tuple[RegionLabel, ...]  # U distinct labels
+    fits: Array  # (U, P) int8: 1 right, 0 wrong, -1 neither (left out of the loss)
+
+
+def phrase_book(labels: list[RegionLabel]) -> PhraseBook:
+    """Return the phrases for a set of labels, and every object in every colour beside them."""
+    distinct = tuple(dict.fromkeys(labels))
+    kinds = _kinds(distinct)
+    phrases = tuple(kinds)
+    column = {phrase: k for k, phrase in enumerate(phrases)}
+    fits = np.stack([_row(label, column) for label in distinct])
+    return PhraseBook(phrases, tuple(kinds.values()), distinct, fits)
+
+
+def _kinds(labels: tuple[RegionLabel, ...]) -> dict[str, str]:
+    """Every phrase and its kind, the canonical ones first; a phrase of several kinds has the first."""
+    kinds: dict[str, str] = dict.fromkeys(CANONICAL_PHRASES, "canonical")
+    for colour in COLOURS:
+        kinds.update(dict.fromkeys(colour_phrases(colour), "colour"))
+    for material in sorted({label.material for label in labels if label.material}):
+        kinds.update(dict.fromkeys(material_phrases(material), "material"))
+    for thing in sorted({label.thing for label in labels if label.thing}):
+        kinds.update({name: kinds.get(name, "object") for name in whole_phrases(thing, "")})
+        for colour in COLOURS:
+            for name in whole_phrases(thing, colour):
+                kinds.setdefault(name, "colour+object")
+    wholes = [label for label in labels if label.level == 2]
+    for name in chain.from_iterable(material_whole_phrases(label.thing, label.material) for label in wholes):
+        kinds.setdefault(name, "material+object")
+    for name in chain.from_iterable(label.names for label in labels):
+        kinds.setdefault(name, "part")
+    return kinds
+
+
+def _row(label: RegionLabel, column: dict[str, int]) -> Array:
+    """(P,) int8 of one label: 1 right, 0 wrong, -1 neither."""
+    row = np.zeros(len(column), np.int8)
+
+    def mark(phrases: list[str] | tuple[str, ...], value: int) -> None:
+        row[[column[phrase] for phrase in phrases if phrase in column]] = value
+
+    if label.thing and label.level < 2 and label.word in BULK:
+        for colour in ("", label.colour, label.thing_colour):  # the body of a mug may pass for a mug
+            mark(whole_phrases(label.thing, colour), -1)
+    if label.level == 2:
+        for bulk in BULK:
+            mark(part_phrases(bulk, label.thing, label.colour, label.colour), -1)
+    unknown = COLOURS if not label.colour else label.hues
+    for hue in unknown:
+        mark(colour_phrases(hue), -1)
+        if not label.colour:
+            mark([f"{hue} {name}" for name in (*object_words(label.thing), label.word)], -1)
+    known = label.materials and "" not in label.materials
+    for material in label.materials if known else MATERIALS:
+        mark(material_phrases(material), -1)
+        mark(material_whole_phrases(label.thing, material), -1)
+        mark(material_part_phrases(label.word, label.thing, material), -1)
+    mark(label.names, 1)
+    mark(colour_phrases(label.colour), 1)
+    mark(material_phrases(label.material), 1)
+    if label.level == -1 and not label.colour:
+        mark(CANONICAL_PHRASES, 1)
+    return row
 
 
 def word_list(book: PhraseBook) -> list[str]:

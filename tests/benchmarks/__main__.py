@@ -5,11 +5,9 @@ from typing import Union
 
 from langsplat_core.cli.arguments import Runnable, with_codec
 from langsplat_core.cli.run import main, parsed
-from tests.benchmarks.answers import Rooms, Verdicts
+from tests.benchmarks.answers import Lifting, Rooms, Verdicts
+from tests.benchmarks.extensions import Changed, Clean, Found, Maps, Meshes
 from tests.benchmarks.few import Few
-from tests.benchmarks.geometry import Clean, Maps, Meshes
-from tests.benchmarks.library import Changed, Found
-from tests.benchmarks.lifting import Lifting
 from tests.benchmarks.phrases import Phrases
 from tests.benchmarks.scale import Formats, Scale
 

@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from assets.making.truth import Region, Truth
+from assets.making.dataset import Region, Truth
 from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import InputError
 from langsplat_core.io.hostile import read_npy

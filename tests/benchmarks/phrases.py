@@ -10,10 +10,8 @@ from itertools import chain, pairwise, product
 
 import numpy as np
 
-from assets.making.dataset import MIN_PIXELS, photographed_room
-from assets.making.truth import Region, Truth
-from assets.making.vocabulary import CATEGORIES, colour_words, object_words
-from assets.making.world import World
+from assets.making.dataset import MIN_PIXELS, Region, Truth, photographed_room
+from assets.making.world import CATEGORIES, World, colour_words, object_words
 from langsplat_core.arrays import Array
 from langsplat_core.extensions.benchmarks.report import intersection_over_union, markdown
 from langsplat_core.query.answers import QueryResult

@@ -18,11 +18,9 @@ from typing import Annotated, Any, Literal, TypeVar, cast
 import numpy as np
 import tyro
 
-from assets.making.config import Size, Tier
-from assets.making.dataset import write_dataset
+from assets.making.dataset import SEED, Size, Truth, TruthMasks, read_truth, write_dataset
 from assets.making.objects import EVERYTHING
-from assets.making.scene import SEED
-from assets.making.truth import Truth, TruthMasks, read_truth
+from assets.making.world import Tier
 from langsplat_core.arrays import Array
 from langsplat_core.cli.arguments import OutFolder
 from langsplat_core.config import (

@@ -2,8 +2,8 @@
 
 * load: a large PLY, read by this program and by plyfile, into the same five arrays. The file has just been
   written, so it is in the system's cache.
-* moving: the coarse images that the viewer draws while the camera moves, step by step,
-  beside their distance from the full one.
+* moving: the coarse images that the viewer draws while the camera moves, beside their distance from the full
+  one.
 * endurance: one process, a scene made large, large images and many phrases.
 
 The report `formats`: what writing a scene in each format and reading it back changes.
@@ -36,7 +36,7 @@ from langsplat_core.extensions.benchmarks.raster_speed import Size, peak_memory,
 from langsplat_core.extensions.benchmarks.report import markdown
 from langsplat_core.io.ply import write_ply
 from langsplat_core.io.scenes import formats, load_scene, save_scene
-from langsplat_core.progress import Progress, TerminalProgress, lap, silent, watched
+from langsplat_core.progress import Progress, TerminalProgress, silent
 from langsplat_core.query.engine import QueryEngine, TextEncoder, no_field
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.render import render, splat_colours
@@ -158,7 +158,6 @@ class MovingCost:
     processor: float  # milliseconds, all threads together
     psnr: float  # dB, to the full image; 100 for itself
     error: float  # mean absolute difference, values in [0, 1]
-    steps: Mapping[str, float]  # milliseconds
 
 
 def measure_moving(command: Scale, progress: Progress = silent) -> list[MovingCost]:
@@ -181,23 +180,19 @@ def measure_moving(command: Scale, progress: Progress = silent) -> list[MovingCo
     for done, (scale, is_merged) in enumerate(COARSE):
         progress("drawing", done / len(COARSE))
         gaussians = fewer if is_merged else scene.gaussians
-        seconds, processor, decibels, errors, steps = [], [], [], [], []
+        seconds, processor, decibels, errors = [], [], [], []
         for camera, wanted in zip(cameras, full, strict=True):
             small = camera.resized(max(round(camera.width * scale), 1), max(round(camera.height * scale), 1))
             wall, cpu = time.perf_counter(), time.process_time()
-            with watched() as laps:
-                drawn = channels(gaussians, small)
-                with lap("compose"):
-                    compose_upwards(drawn, PictureConfig())
+            drawn = channels(gaussians, small)
+            compose_upwards(drawn, PictureConfig())
             seconds.append(time.perf_counter() - wall)
             processor.append(time.process_time() - cpu)
-            steps.append(laps)
             shown = _enlarged(drawn.rgb.clip(0, 1), wanted.shape[1::-1])
             decibels.append(psnr(shown, wanted))
             errors.append(float(np.abs(shown - wanted).mean()))
         times = 1e3 * median(seconds), 1e3 * median(processor)
-        each = {name: median(laps[name] for laps in steps) for name in steps[0]}
-        costs.append(MovingCost(scale, is_merged, len(gaussians), *times, mean(decibels), mean(errors), each))
+        costs.append(MovingCost(scale, is_merged, len(gaussians), *times, mean(decibels), mean(errors)))
     return costs
 
 
@@ -214,11 +209,10 @@ def moving_table(costs: Sequence[MovingCost]) -> str:
         (f"{cost.scale:g}", f"{cost.gaussians}{' (merged)' if cost.merged else ''}")
         + (f"{cost.milliseconds:.0f}", f"{1e3 / cost.milliseconds:.1f}", f"{cost.processor:.0f}")
         + (f"{cost.psnr:.1f}", f"{cost.error:.1e}")
-        + tuple(f"{taken:.1f}" for taken in cost.steps.values())
         for cost in costs
     )
     head = ("resolution", "Gaussians", "image, ms", "a second", "processor, ms", "PSNR, dB", "mean error")
-    return markdown([*head, *costs[0].steps], lines)
+    return markdown(head, lines)
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from assets.making.dataset import MIN_PIXELS
-from assets.making.truth import PHRASE_KINDS, Phrase, Truth
+from assets.making.dataset import MIN_PIXELS, PHRASE_KINDS, Phrase, Truth
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice, PictureConfig
 from langsplat_core.extensions.benchmarks.report import intersection_over_union

@@ -9,22 +9,26 @@ import numpy as np
 import pytest
 
 from assets.making import dataset
-from assets.making.scene import SEED
-from assets.making.truth import MIN_REGION, TruthMasks, read_truth
+from assets.making.dataset import MIN_REGION, SEED, TruthMasks, read_truth
 from langsplat_core.cli.run import main
 from langsplat_core.config import DatasetConfig, numeric_settings
 from langsplat_core.datasets import load_capture
-from langsplat_core.errors import FormatError, InputError
+from langsplat_core.errors import InputError
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.progress import silent
-from langsplat_core.scene import Scene
 from langsplat_core.semantics.masks import label_maps
 from tests.benchmarks import scoring
 from tests.benchmarks.__main__ import PROGRAM, parse
-from tests.benchmarks.answers import Rooms, measure_verdicts, variants
-from tests.benchmarks.lifting import KeptRows, Lifting, measure_methods, method_table
+from tests.benchmarks.answers import (
+    Lifting,
+    Rooms,
+    measure_methods,
+    measure_verdicts,
+    method_table,
+    variants,
+)
 from tests.benchmarks.phrases import Phrases
-from tests.benchmarks.room import HOLD_OUT, RoomSettings, Variant
+from tests.benchmarks.room import RoomSettings, Variant
 from tests.benchmarks.scale import COARSE
 from tests.support.fakes import blob_scene
 
@@ -104,7 +108,6 @@ def test_truth_masks_are_the_regions_of_the_truth(run):
         "rooms --tiers",
         "rooms --views 5",
         "rooms --codec.kind autoencoder --codec.batch 1",
-        "rooms --scene a.ply",
         "rooms --encoder clip-geometry:0.9",
         "scale --rows 0",
     ],
@@ -122,17 +125,6 @@ def test_every_number_of_a_report_has_a_range(name):
 
 
 @pytest.mark.long
-def test_rooms_measure_a_given_scene(run, tmp_path, capsys):
-    field, _, _ = run.room.field(variants(TINY, 512)[0])
-    train, _ = run.room.capture.split(HOLD_OUT)
-    path = tmp_path / "scene.ply"
-    cameras = tuple(run.room.capture.cameras[i] for i in train)
-    save_scene(path, Scene(run.room.gaussians, field, cameras))
-    Rooms(scene=path, dataset=run.photographs).run()
-    assert "absent objects rejected" in capsys.readouterr().out
-
-
-@pytest.mark.long
 def test_verdicts_and_phrases_measure_the_same_room(run, tmp_path):
     rows = measure_verdicts(run.room, Variant("the method", "truth", codec=TINY.codec))
     assert {"object", "absent", "part", "absent part"} <= {row.kind for row in rows}
@@ -144,22 +136,17 @@ def test_verdicts_and_phrases_measure_the_same_room(run, tmp_path):
 
 
 @pytest.mark.long
-def test_lifting_compares_methods_and_keeps_their_rows(run, tmp_path):
+def test_lifting_compares_methods(run):
     command = Lifting(("separate",), (101,), SETTINGS, codec_steps=40, gradient_steps=20)
     chosen = replace(command, only=("trained", "d = 1", "codebook of 256", "subpart alone"))
-    kept = tmp_path / "lifting.rows.jsonl"
-    rows = list(measure_methods(run.room, chosen, KeptRows(kept)))
-    assert list(measure_methods(run.room, chosen, KeptRows(kept))) == rows  # seconds too
+    rows = list(measure_methods(run.room, chosen))
     trained, zeros, one_pass, codebook, subpart = (row.measured for row in rows)
     assert (one_pass.query, codebook.bytes_per_gaussian) == ("paper", 6)
     assert trained.peaks != zeros.peaks
     assert len({row.scores for row in (trained, codebook, subpart)}) == 3
     assert method_table(rows).count("\n") == 2 + len(rows)
     with pytest.raises(InputError, match="--only nothing"):
-        list(measure_methods(run.room, replace(command, only=("nothing",)), KeptRows(kept)))
-    kept.write_text(kept.read_text()[:-20])
-    with pytest.raises(FormatError):
-        KeptRows(kept)
+        list(measure_methods(run.room, replace(command, only=("nothing",))))
 
 
 SMALL = """scale --rows 5001 --repeats 1 --moving 0 --moving-size 160 100

@@ -1,16 +1,33 @@
-"""Scores in closed form, oracles, and the simulated CLIP that methods are compared with."""
+"""Scores in closed form, oracles, and what reports count on rows, rooms and files with known figures."""
 
+import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
-from assets.making.truth import Phrase, Region, Truth
-from langsplat_core.arrays import unit
+from assets.making.dataset import FIRST_ROOM, Phrase, Region, Truth
+from assets.making.world import furnished
+from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.errors import InputError
-from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.inventory import InventoryEntry, Spot
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
+from langsplat_core.scene import PlattScaling
 from langsplat_core.semantics.features import ImageFeatures
+from tests.benchmarks import answers
+from tests.benchmarks.__main__ import parse
+from tests.benchmarks.answers import (
+    PAIRS,
+    REJECTED,
+    Verdict,
+    curve,
+    curve_table,
+    fit_odds,
+    verdict_table,
+)
+from tests.benchmarks.extensions import FAR, alter, middle, with_floaters
 from tests.benchmarks.oracles import (
     OTHER,
     PROMPTS,
@@ -20,8 +37,12 @@ from tests.benchmarks.oracles import (
     read_geometry,
     true_labels,
 )
-from tests.benchmarks.scoring import Asked, ask, evaluate_direct, found_rate
-from tests.support.fakes import PER_BLOB, FakeEncoder, blob_scene, blobs, cameras
+from tests.benchmarks.phrases import InventoryScore, score_inventory
+from tests.benchmarks.room import InRooms
+from tests.benchmarks.scale import errors
+from tests.benchmarks.scoring import Asked, evaluate_direct
+from tests.support.fakes import PER_BLOB, FakeEncoder, blobs, cameras
+from tests.support.scenes import random_camera, random_gaussians
 
 THINGS = [3 * letter for letter in "abcdefghijklmnopqrtuvwxyz"]
 SIDE = 2  # px of a region
@@ -46,17 +67,6 @@ def test_direct_overlap_has_its_closed_form():
     assert score.ceiling == 1
     assert (score.kind, score.phrases) == ("object", 2)
     assert score.mean_iou == pytest.approx((30 / 100 + 70 / 120) / 2)
-
-
-def test_absent_things_have_no_synonym_in_the_room():
-    truth = Truth(None, (), {0: Region("whole", "", "", words=("mug", "cup", "orange", "couch"))})
-    assert truth.absent(["mug", "orange", "sofa", "lamp", "apple"]) == ["apple", "lamp"]
-
-
-def test_phrases_with_unknown_words_are_not_asked():
-    asked = ask(QueryEngine(blob_scene(), lambda _: FakeEncoder()), ["mug", "red cactus", "mug"])
-    assert asked.unknown == ("red cactus",)
-    assert found_rate(asked, ["mug", "red cactus"]) == (1.0, 1)
 
 
 def test_oracle_gives_regions_the_vectors_of_their_words():
@@ -122,23 +132,6 @@ def test_simulated_clip_has_the_requested_cosines(tmp_path, own, alike):
     assert prompts[~same].mean() == pytest.approx(PROMPTS, abs=0.03)
 
 
-def test_simulated_clip_draws_noise_by_room(tmp_path):
-    encoder = ClipGeometry(0.31)
-    once, again = seen(encoder, tmp_path, 2), seen(ClipGeometry(0.31), tmp_path, 2)
-    np.testing.assert_array_equal(once, again)
-    assert (once[0] != once[1]).any()
-    other = seen(encoder, tmp_path, 2, "other")
-    assert 0.9 > float((once[0] * other[0]).sum(1).mean()) > 0.5
-
-
-def test_phrase_vector_follows_head_and_modifier():
-    encoder = ClipGeometry(0.31)
-    red, mug, handle, of_mug = encoder.encode_texts(["red mug", "mug", "mug handle", "handle of the mug"])
-    assert red @ mug > 0.85
-    assert handle @ mug > 0.65
-    assert of_mug @ handle > 0.95
-
-
 def test_vectors_of_a_file_are_found_by_name(tmp_path):
     rng = np.random.default_rng(0)
     vectors = rng.normal(size=(5, 512)) + 1
@@ -159,3 +152,174 @@ def test_impossible_cosines_are_refused_in_one_line(text):
         read_geometry(f"clip-geometry:{text}")
     assert "\n" not in str(refused.value)
     assert read_geometry("demo") is None  # no such encoder, and no mistake
+
+
+TRUE = PlattScaling(-1.0, 18.0, 6.0)
+
+
+def logistic(count: int, seed: int = 0) -> tuple[Array, Array]:
+    """Fits of things that are there and that are not, by `TRUE`: about as many of both."""
+    rng = np.random.default_rng(seed)
+    margins = rng.uniform([-0.3, -0.3, -0.25], [0.3, 0.1, 0.3], (count, 3))
+    likely = np.array([TRUE.probability(tuple(row)) for row in margins.tolist()])
+    there = rng.uniform(size=count) < likely
+    return margins[there], margins[~there]
+
+
+def test_fit_recovers_the_odds_that_made_the_data():
+    present, absent = logistic(20_000)
+    fitted = fit_odds(present, absent)
+    assert fitted.whole == pytest.approx(TRUE.whole, rel=0.06)
+    assert fitted.finer == pytest.approx(TRUE.finer, rel=0.12)
+    # Both weigh the same in the fit: the constant moves by the logarithm of how many there are of each.
+    want = TRUE.constant - np.log(len(present) / len(absent))
+    assert fitted.constant == pytest.approx(want, abs=0.12)
+
+
+def test_fitted_threshold_rejects_the_required_share():
+    present, absent = logistic(3_000)
+    fitted = fit_odds(present, absent)
+    said = np.array([fitted.probability(tuple(row)) for row in absent.tolist()])
+    assert REJECTED <= (said < fitted.found).mean() < REJECTED + 0.01
+    often = fit_odds(present, np.tile(absent, (9, 1)))  # how many there are of each changes nothing
+    for name in ("constant", "whole", "finer", "found"):
+        assert getattr(often, name) == pytest.approx(getattr(fitted, name), rel=0.02, abs=0.02)
+    apart = fit_odds(np.full((20, 3), 0.5), np.full((20, 3), -0.5))
+    assert apart.found == 0.5  # never less than even
+    assert np.isfinite([apart.constant, apart.whole, apart.finer]).all()  # Platt's targets keep it so
+
+
+def test_fit_refuses_too_little_and_reversed_evidence():
+    present, absent = logistic(500)
+    for there, lacking in ((present[:9], absent), (present, absent[:9]), (absent, present)):
+        with pytest.raises(InputError):
+            fit_odds(there, lacking)
+
+
+def row(kind: str, probability: float | None, *, found: bool | None = None, seed: int = 1, tier="clutter"):
+    margin = 0.1 if probability is None else probability
+    said = (probability or 0) >= 0.75 if found is None else found
+    return Verdict(tier, seed, "a thing", kind, (margin, -0.1, margin), probability, said)
+
+
+ROOM = [row("object", p) for p in (0.2, 0.8, 0.9, 0.95)] + [row("colour+object", p) for p in (0.7, 0.99)]
+ROOM += [row("absent", p) for p in (0.01, 0.02, 0.5, 0.76)]
+
+
+def cells(table: str, line: int) -> list[str]:
+    return [cell.strip() for cell in table.splitlines()[line].strip("|").split("|")]
+
+
+def test_verdict_table_states_means_over_rooms():
+    parts = [row("part", 0.9), row("part", 0.3), row("absent part", 0.1)]
+    table = verdict_table(ROOM + parts)
+    assert [cells(table, n)[1] for n in range(2, 5)] == ["thing", "colour + thing", "part"]
+    tier, _, phrases, accepted, rejected, area, *at = cells(table, 2)
+    assert (tier, phrases, accepted, rejected) == ("clutter", "8", "75.0 +/- 0.0", "75.0 +/- 0.0")
+    pairs = [a > b for a in (0.2, 0.8, 0.9, 0.95) for b in (0.01, 0.02, 0.5, 0.76)]
+    assert area == f"{100 * np.mean(pairs):.1f} +/- 0.0"
+    assert at == ["75.0 +/- 0.0"] * 3  # of four absent things none but the best is the limit
+    assert cells(table, 4)[2:5] == ["3", "50.0 +/- 0.0", "100.0 +/- 0.0"]
+    other = [replace(r, seed=2, found=True) for r in ROOM]
+    assert cells(verdict_table(ROOM + other), 2)[3] == f"87.5 +/- {100 * np.std([0.75, 1], ddof=1):.1f}"
+    assert cells(verdict_table([row("object", 0.9)]), 2)[3:] == ["100.0 +/- 0.0", *["-"] * 5]
+
+
+def test_calibration_curve_weighs_present_and_absent_alike():
+    points = curve(ROOM)
+    assert [(p.low, p.high) for p in points] == [(0, 0.1), (0.1, 0.25), (0.5, 0.75), (0.75, 0.9), (0.9, 1)]
+    assert [p.phrases for p in points] == [2, 1, 1, 2, 2]  # coloured things are not counted
+    assert [p.said for p in points] == pytest.approx([0.015, 0.2, 0.5, 0.78, 0.925])
+    assert [p.there for p in points] == pytest.approx([0, 1, 0, 0.5, 1])
+    uneven = curve(ROOM + [row("absent", p) for p in (0.01, 0.02, 0.5, 0.76)] * 9)
+    assert [p.phrases for p in uneven] == [20, 1, 10, 11, 2]
+    assert [p.said for p in uneven] == pytest.approx([p.said for p in points])
+    assert [p.there for p in uneven] == pytest.approx([p.there for p in points])
+    assert cells(curve_table(ROOM), 5) == ["0.75 to 0.9", "2", "78", "50"]
+    certain = curve([row("object", 1.0), row("absent", 0.0)])
+    assert [(p.low, p.there) for p in certain] == [(0, 0), (0.9, 1)]
+    assert curve([row("object", None)]) == []
+
+
+def test_verdicts_write_tables_and_a_calibration(tmp_path, monkeypatch):
+    rows = [
+        Verdict("clutter", 301, "x", kind, tuple(m), float(sigmoid(20 * np.float64(m[2]))), m[2] > 0.1)
+        for pair in PAIRS.values()
+        for kind, margins in zip(pair, logistic(300), strict=True)
+        for m in margins.tolist()
+    ]
+    monkeypatch.setattr(InRooms, "rooms", lambda *_: ["a room"])
+    monkeypatch.setattr(answers, "measure_verdicts", lambda *_: rows)
+    out, reading = tmp_path / "out", tmp_path / "reading.json"
+    replace(parse(["verdicts", "--seeds", "301", "--out", str(out)]), fit=reading).run()
+    stored = json.loads((out / "verdicts.json").read_text())
+    assert (stored["settings"]["seeds"], len(stored["rows"])) == ([301], len(rows))
+    assert verdict_table(rows) in (out / "verdicts.md").read_text()
+    stated = json.loads(reading.read_text())["calibration"]
+    assert all(10 < PlattScaling(**stated[name]).whole < 30 for name in PAIRS)
+
+
+def test_altered_room_keeps_all_but_eight_things():
+    placed = furnished(FIRST_ROOM + 9, "clutter")
+    altered, done = alter(9, placed)
+    assert sorted(one.kind for one in done) == sorted(2 * ["gone", "recoloured", "moved", "appeared"])
+    assert len(altered) == len(placed)
+    assert len([item for item in altered if item in placed]) == len(placed) - 6
+    for one in done:
+        here = [np.linalg.norm(middle(item) - np.add(one.centre, one.moved)) for item in altered]
+        same = [k for k, away in enumerate(here) if away < 0.01 and altered[k].thing.word == one.word]
+        assert bool(same) == (one.kind != "gone")
+        assert one.kind != "moved" or np.linalg.norm(one.moved) >= FAR
+
+
+def test_floaters_follow_the_rooms_own_gaussians():
+    room, cameras = random_gaussians(500, sh_degree=1), [random_camera(seed) for seed in range(5)]
+    made, kinds = with_floaters(room, cameras, seed=3)
+    np.testing.assert_array_equal(np.bincount(kinds), [500, 300, 300, 40])
+    np.testing.assert_array_equal(made.means[:500], room.means)
+    assert made.valid().all()
+    size = (np.quantile(room.means, 0.98, axis=0) - np.quantile(room.means, 0.02, axis=0)).max()
+    near = cKDTree(room.means[sigmoid(room.opacity_logits) > 0.1])
+    assert near.query(made.means[kinds == 1])[0].min() > 0.039 * size
+
+
+def test_format_errors_are_those_that_were_made():
+    want = random_gaussians(20, sh_degree=2)
+    assert errors(want, want) == [0] * 6
+    half = np.radians(10) / 2
+    w, x, y, z = want.quats_wxyz[3].astype(float)
+    turned = want.quats_wxyz.astype(float).copy()
+    # followed by 10 degrees about z, and with the other sign, which says the same
+    turned[3] = -np.array([w, x, y, z]) * np.cos(half) - np.array([-z, -y, x, w]) * np.sin(half)
+    means, scales, sh = want.means.copy(), want.log_scales.copy(), want.sh.copy()
+    means[1, 2] += 0.5
+    scales[2, scales[2].argmax()] += np.log(1.25)
+    sh[4, 5, 1] -= 0.25
+    got = replace(want, means=means, log_scales=scales, quats_wxyz=turned, sh=sh)
+    assert errors(want, got) == pytest.approx([0.5, 25, 10, 0, 0, 0.25], rel=1e-4)
+    bare = replace(want, sh=want.sh[:, :1])  # what is lost is an error too
+    assert errors(want, bare)[5] == np.abs(want.sh[:, 1:]).max()
+
+
+TRUTH = {
+    0: Region("whole", "mug", "mug", words=("mug", "cup", "red mug")),
+    1: Region("whole", "table", "table", words=("table",)),
+    2: Region("whole", "duck", "duck", words=("duck",)),
+}
+LABELS = np.stack([np.repeat([-1, -1, -1, -1], 30), np.repeat([-1] * 4, 30), np.repeat([0, 1, 2, -1], 30)])
+
+
+def entry(phrase: str, rows: range, level: int = 2) -> InventoryEntry:
+    spot = Spot(np.zeros(3), np.zeros((2, 3)), np.array(rows), 0.1, None, None)
+    return InventoryEntry(phrase, (), level, 0.9, 0.9, 0.1, (spot,))
+
+
+def test_inventory_entry_is_judged_by_most_of_its_surface():
+    entries = [
+        entry("cup", range(35)),  # the mug, and a little of the table
+        entry("duck", range(50, 70)),  # half the table
+        entry("lamp", range(60, 90)),  # the duck
+        entry("table", range(30, 60), level=1),  # no whole thing
+    ]
+    score = score_inventory(entries, LABELS, TRUTH, np.ones(120), ["cup", "duck", "table"])
+    assert score == InventoryScore(entries=3, true=1 / 3, things=3, named=1 / 3, seconds=0.0)

@@ -5,8 +5,10 @@ Each takes a `Kit` and a colour word; front is -y, metres.
 
 import numpy as np
 
-from assets.making.kit import Kit, Piece, Thing
-from assets.making.shapes import (
+from assets.making.kit import (
+    Kit,
+    Piece,
+    Thing,
     TriMesh,
     arc,
     ball,

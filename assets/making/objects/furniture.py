@@ -1,7 +1,6 @@
 """Builders of the room around the table: floor, walls, rug, furniture, picture. Metres, z up."""
 
-from assets.making.kit import Kit, Piece, Thing
-from assets.making.shapes import ball, box, cylinder, join, pillow, sheet
+from assets.making.kit import Kit, Piece, Thing, ball, box, cylinder, join, pillow, sheet
 
 TABLE_HEIGHT = 0.72  # height of the table's upper face above the floor
 ROOM = 4.6  # side of the square room

@@ -5,8 +5,11 @@ Each takes a `Kit` and a colour word; front is -y, metres.
 
 import numpy as np
 
-from assets.making.kit import Kit, Material, Piece, Thing
-from assets.making.shapes import (
+from assets.making.kit import (
+    Kit,
+    Material,
+    Piece,
+    Thing,
     TriMesh,
     arc,
     ball,

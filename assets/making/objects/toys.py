@@ -7,8 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from assets.making.kit import Kit, Material, Piece, Thing
-from assets.making.shapes import (
+from assets.making.kit import (
+    Kit,
+    Material,
+    Piece,
+    Thing,
     TriMesh,
     arc,
     ball,

@@ -9,7 +9,6 @@ here depends on a label: a profile is chosen by name, and no threshold is search
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -88,42 +87,38 @@ _OURS = Profile(
     "ours", "this program's answer as it shows it, its verdict included: not here is an empty mask", OwnRule()
 )
 
-LERF_PROFILES: Mapping[LerfProtocol, Profile] = MappingProxyType(
-    {
-        "langsplat-code": Profile(
+LERF_PROFILES: Mapping[str, Profile] = {
+    profile.name: profile
+    for profile in (
+        Profile(
             "langsplat-code",
             "LangSplat's public evaluator: (filter 30 + raw) / 2, level by the peak before min-max, min-max "
             "above 0.7, 7x7 majority; place: all highest pixels of the filtered map",
             MapRule(30, 0.5, "mirror", "peak", True, 0.7, "clipped", 7, 30, True),
         ),
-        "langsplat-paper": Profile(
+        Profile(
             "langsplat-paper",
             "LangSplat's text: filter 20, level and place by the filtered peak; the text gives no cut for "
             "LERF-OVS: min-max above 0.7 as its code, without the vote",
             MapRule(20, 0.0, "mirror", "peak", True, 0.7, "none", 1, 20, False),
         ),
-        "langsplat-v2": Profile(
+        Profile(
             "langsplat-v2",
             "LangSplatV2's public evaluator: 29x29 mean of what lies inside the image, the same blend and "
             "cut, 7x7 mean above one half; place as in LangSplat's code",
             MapRule(29, 0.5, "inside", "peak", True, 0.7, "inside", 7, 29, True),
         ),
-        "direct-3d": _DIRECT,
-        "ours": _OURS,
-    }
+        _DIRECT,
+        _OURS,
+    )
+}
+_OVS_PAPER = Profile(
+    "langsplat-paper",
+    "LangSplat's appendix: absolute 0.4, the level whose mask has the highest mean relevancy, no filter; its "
+    "code for 3D-OVS was never released",
+    MapRule(1, 1.0, "mirror", "inside", False, 0.4, "none", 1, 20, False),
 )
-OVS_PROFILES: Mapping[OvsProtocol, Profile] = MappingProxyType(
-    {
-        "langsplat-paper": Profile(
-            "langsplat-paper",
-            "LangSplat's appendix: absolute 0.4, the level whose mask has the highest mean relevancy, no "
-            "filter; its code for 3D-OVS was never released",
-            MapRule(1, 1.0, "mirror", "inside", False, 0.4, "none", 1, 20, False),
-        ),
-        "direct-3d": _DIRECT,
-        "ours": _OURS,
-    }
-)
+OVS_PROFILES: Mapping[str, Profile] = {profile.name: profile for profile in (_OVS_PAPER, _DIRECT, _OURS)}
 
 
 # From relevancy maps or images of selected Gaussians to a mask and a place; nothing here is given a label.

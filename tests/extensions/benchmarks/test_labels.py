@@ -8,8 +8,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from assets.making import dataset
-from assets.making.dataset import MIN_PIXELS, outlines, write_labelled
-from assets.making.truth import read_truth
+from assets.making.dataset import MIN_PIXELS, outlines, read_truth, write_labelled
 from langsplat_core.cli.app import parse
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.extensions.benchmarks.labels import (

@@ -105,15 +105,6 @@ def test_the_level_is_chosen_before_min_max():
     assert (answer.level, answer.mask.sum(), answer.peaks.tolist()) == (2, 1, [[5, 5]])
 
 
-def test_the_place_has_its_own_level():
-    """A lone high pixel wins the raw maps, a broad one the filtered ones."""
-    maps = np.zeros((2, 12, 12))
-    maps[0, 1, 1] = 1.0
-    maps[1, 5:10, 5:10] = 0.8
-    answer = read_maps(maps, replace(PLAIN_RULE, peak_window=5))
-    assert (answer.level, answer.peaks.tolist()) == (0, [[7, 7]])
-
-
 def test_3d_ovs_takes_the_level_that_is_highest_inside_its_mask():
     rule = OVS_PROFILES["langsplat-paper"].rule
     maps = np.full((3, 5, 5), 0.1)
@@ -257,13 +248,6 @@ def test_boxes_have_their_borders_inside():
     assert not inside_any_box(np.empty((0, 2), int), boxes, SIZE, (40, 30))
     assert scored_size((4032, 3024), 1080) == (1440, 1080)  # a grid with too many rows is shrunk
     assert scored_size((988, 731), 1080) == (988, 731)
-
-
-def test_pictures(two_scenes, tmp_path):
-    of_maps(*two_scenes, pictures=tmp_path / "out")
-    names = sorted(str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*.png"))
-    assert names == ["a/one.1/mug.png", "a/two/mug.png", "a/two/red_blue cup.png", "b/one.1/mug.png"]
-    assert Image.open(tmp_path / "out" / names[0]).size == SIZE
 
 
 # A scene of ours: three blobs, and labels that are drawn from its own views.

@@ -293,13 +293,6 @@ def test_wrong_elements(tmp_path, index, value, message):
     refused([tmp_path / "c.pth"], message)
 
 
-def test_checkpoints_that_can_hardly_be_drawn_are_warned_of(tmp_path, caplog):
-    path = save_model(tmp_path / "c.pth", replace(G, log_scales=np.full_like(G.log_scales, np.nan)))
-    with caplog.at_level("WARNING", "langsplat"):
-        read_foreign([path])
-    assert "100% of the 20 Gaussians cannot be drawn" in caplog.text
-
-
 def test_files_that_do_not_go_together(tmp_path):
     ae, levels = best_ckpt(tmp_path), langsplat(tmp_path)
     refused(levels, "3 numbers per Gaussian, latents of LangSplat's autoencoder; name its best_ckpt.pth")

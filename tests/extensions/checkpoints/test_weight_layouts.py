@@ -24,7 +24,7 @@ from langsplat_core.extensions.checkpoints.weight_layouts import Hiera, converte
 from langsplat_core.semantics.encoders import CLIP_PIXELS, load_encoder, load_text_encoder
 from langsplat_core.semantics.sam import FAMILIES, Segmenter, load_segmenter
 from langsplat_core.semantics.weights import Weights
-from tests.support.tiny_models import SAM_SIDE, MakesFolder, tiny_clip, tiny_sam, tiny_sam2
+from tests.support.tiny_models import SAM_SIDE, MakesFolder, tiny_sam, tiny_sam2
 
 pytestmark = pytest.mark.long
 
@@ -298,26 +298,6 @@ def test_heads_of_a_wide_model_without_configuration(tmp_path: Path) -> None:
     compare((tmp_path / "quickgelu.pt", 16, 2, True, None), tensors)
 
 
-def test_a_named_file_wins_over_its_folder(tmp_path: Path) -> None:
-    tensors = open_clip_tensors()
-    tiny_clip(tmp_path)  # another model, of which a tokenizer will be replaced
-    (tmp_path / "tokenizer.json").unlink()
-    letter_tokenizer(tmp_path)
-    compare(quick_by_name(tmp_path, tensors), tensors)
-    folder = load_encoder(str(tmp_path / "model.safetensors"), "cpu")  # a file of a folder is the folder
-    assert folder.image_size == load_encoder(str(tmp_path), "cpu").image_size == 32
-
-
-def test_a_missing_tokenizer_names_the_file_to_add(tmp_path: Path) -> None:
-    path = training_checkpoint(tmp_path, open_clip_tensors())[0]
-    with pytest.raises(EncoderError, match=r"no tokenizer\.json in .*openai/clip-vit-base-patch32"):
-        load_text_encoder(str(path))
-    tokens = {f"x{number}": number for number in range(60)} | {"<|startoftext|>": 60, "<|endoftext|>": 61}
-    CLIPTokenizer(vocab=tokens, merges=[]).save_pretrained(tmp_path)
-    with pytest.raises(EncoderError, match="its model knows 58"):
-        load_text_encoder(str(path))
-
-
 CLEANED = {
     "the cat’s mug": "the cat's mug",
     "mug &amp;amp; bowl": "mug & bowl",
@@ -409,14 +389,6 @@ def test_tensors_of_no_model_known_are_named(make, change, load, tmp_path: Path)
     refusal(load, tmp_path / "model.pt")
 
 
-def test_mobile_sam_is_refused_with_alternatives(tmp_path: Path) -> None:
-    encoder = {"image_encoder.patch_embed.seq.0.c.weight": torch.zeros(32, 3, 3, 3)}
-    tensors = sam_checkpoint(tmp_path).items()
-    decoder = {name: tensor for name, tensor in tensors if not name.startswith("image_encoder")}
-    torch.save(encoder | decoder, tmp_path / "mobile_sam.pt")
-    assert "sam_vit_b_01ec64.pth" in refusal(load_segmenter, tmp_path / "mobile_sam.pt")
-
-
 @pytest.mark.parametrize("load", [load_encoder, load_segmenter])
 def test_damaged_weights_are_named_and_run_nothing(load: Callable[[str], object], tmp_path: Path) -> None:
     whole = tmp_path / "whole.pt"
@@ -482,14 +454,3 @@ def test_a_file_of_a_segmenter_answers_as_the_folder_does(name: str, tmp_path: P
     torch.testing.assert_close(masks, folder_masks, rtol=1e-5, atol=1e-5)
     assert masks.std() > 0.01
     assert (masks[0] - masks[1]).abs().max() > 0.01
-
-
-def test_a_file_is_never_a_hub_id(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("models").mkdir()
-    assert "no such file" in refusal(load_segmenter, Path("models/sam_vit_h_4b8939.pth"))
-    for name in ("models/sam_vit_h_4b8939.pth", "models/sam"):
-        Path(name).write_bytes(b"PK\x03\x04")
-        said = refusal(load_segmenter, Path(name))
-        assert "hf download" not in said
-        assert "not CLIP or SAM weights" in said

@@ -283,13 +283,6 @@ def test_a_move_is_one_change_and_has_its_length(scene):
     assert change.distance == pytest.approx(np.linalg.norm((0.3, 0.2, 1.0)), abs=0.05)
 
 
-def test_another_colour_is_named(scene):
-    sh = scene.gaussians.sh.copy()
-    sh[MUG] = sh[PLANT]
-    (change,) = compared(scene, with_gaussians(scene, sh=sh))
-    assert (change.kind, change.colours) == ("recoloured", ("red", "blue"))
-
-
 def test_names_are_the_words_of_the_encoder(scene):
     one, other = (QueryEngine(part, lambda _: FakeEncoder()) for part in (scene, noisy(without(scene, BOOK))))
     describers = Describer(one, WORDS), Describer(other, WORDS)
