@@ -15,7 +15,7 @@ import re
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
@@ -286,12 +286,12 @@ def _processor() -> str:
 # One backend on one case.
 
 
+@dataclass(frozen=True, eq=False)
 class Foresight:
     """Expected seconds of operations: time grows with the overlaps of footprints and tiles."""
 
-    def __init__(self, limit_s: float) -> None:
-        self.limit_s = limit_s
-        self.rates: dict[tuple[str, str, int], float] = {}  # seconds per overlap
+    limit_s: float
+    rates: dict[tuple[str, str, int], float] = field(default_factory=dict)  # seconds per overlap
 
 
 def warm_up(backends: Sequence[Rasterizer], channels: Sequence[int]) -> None:
@@ -506,27 +506,21 @@ def reference_windows(
 ) -> ReferenceWindows:
     """Draw the windows with the reference; about 0.1 ms for each Gaussian that reaches into one."""
     footprints = project(gaussians, camera, settings)
+    reach = rim(footprints, settings, _BAND)
+    low, high = footprints.means_px - reach, footprints.means_px + reach
     places = [_place(camera, fraction) for fraction in _PLACES]
-    reaching = [np.flatnonzero(_reaches(footprints, settings, at)) for at in places]
+    reaching = []
+    for down, across in places:
+        inside = (high > (across.start, down.start)) & (low < (across.stop, down.stop))
+        reaching.append(np.flatnonzero(inside.all(1) & (footprints.opacities > 0)))
     rows = np.unique(np.concatenate(reaching))
     windows = []
     for at, mine in zip(places, reaching, strict=True):
-        columns = (len(rows), np.searchsorted(rows, mine))
-        windows.append(_window(_take(footprints, mine), camera, settings, at, columns))
+        part = Footprints(
+            **{column.name: getattr(footprints, column.name)[mine] for column in fields(Footprints)}
+        )
+        windows.append(_window(part, camera, settings, at, (len(rows), np.searchsorted(rows, mine))))
     return ReferenceWindows(footprints, rows, tuple(windows))
-
-
-def _reaches(footprints: Footprints, settings: RasterSettings, at: tuple[slice, slice]) -> Array:
-    """(N,) bool: drawn, and not wholly outside the window."""
-    rows, columns = at
-    reach = rim(footprints, settings, _BAND)
-    low, high = footprints.means_px - reach, footprints.means_px + reach
-    inside = (high > (columns.start, rows.start)) & (low < (columns.stop, rows.stop))
-    return inside.all(1) & (footprints.opacities > 0)
-
-
-def _take(f: Footprints, rows: Array) -> Footprints:
-    return Footprints(f.means_px[rows], f.depths[rows], f.conics[rows], f.extents_px[rows], f.opacities[rows])
 
 
 def _place(camera: Camera, fraction: tuple[float, float]) -> tuple[slice, slice]:
