@@ -35,6 +35,7 @@ from langsplat_core.extensions.benchmarks.report import markdown
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Scene, look_at
+from langsplat_core.training.radiance.differentiable import evaluate_views
 from langsplat_core.training.radiance.rehearsal import (
     budget_text,
     budgets_for,
@@ -42,7 +43,6 @@ from langsplat_core.training.radiance.rehearsal import (
     supported,
     train_within,
 )
-from langsplat_core.training.radiance.differentiable import evaluate_views
 
 Kind = Literal["few", "walk"]  # on an arc around a room's table; straight ahead along a street
 VIEWS = 12
