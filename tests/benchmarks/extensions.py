@@ -24,9 +24,9 @@ from assets.making.objects import BRIGHT, TABLE_TOP
 from assets.making.objects.furniture import TABLE_HEIGHT
 from assets.making.world import ENLARGED, Placed, StandingArea, assemble, footprint, furnished
 from langsplat_core.arrays import Array, logit, sigmoid
+from langsplat_core.extensions.benchmarks.report import markdown
 from langsplat_core.extensions.compaction.clean import CleanConfig, clean, find_floaters
 from langsplat_core.extensions.compaction.compact import Views, choose_views, mean_psnr
-from langsplat_core.extensions.benchmarks.report import markdown
 from langsplat_core.extensions.geometry.mesh import fuse
 from langsplat_core.extensions.geometry.occupancy import find_occupancy, floor_map, map_axes
 from langsplat_core.extensions.geometry.planes import find_room
