@@ -63,10 +63,7 @@ class Capture:
         return self.masks[index] if self.masks else None
 
     def split(self, test_every: int) -> tuple[list[int], list[int]]:
-        """Return indices of (training, held-out) views; every `test_every`-th is held out, 0 holds out none.
-
-        There is always a training view.
-        """
+        """Return indices of (training, held-out) views; every `test_every`-th is held out, 0: none."""
         test = [i for i in range(len(self)) if test_every > 1 and i % test_every == 0 and len(self) > 1]
         return [i for i in range(len(self)) if i not in test], test
 
@@ -127,10 +124,7 @@ class Capture:
         return replace(self, cameras=cameras, images=images, masks=masks, photos=(), matches=None)
 
     def extent(self) -> float:
-        """Return 1.1 times the largest distance of a camera from the cameras' mean, world units, > 0.
-
-        It is the scene scale that the INRIA code multiplies position learning rates with.
-        """
+        """Return INRIA's scene scale: 1.1 times the largest distance of a camera from their mean, > 0."""
         centres = np.array([camera.position for camera in self.cameras])
         return max(1.1 * float(np.linalg.norm(centres - centres.mean(0), axis=1).max()), 1e-6)
 
@@ -221,10 +215,7 @@ def _stands(cameras: Sequence[Camera]) -> Array:
 
 
 def _lean(stands: Array, apart: Array, training: Array, index: int) -> float:
-    """Return how far view `index` is from the middle of its nearest training views, over how far those are.
-
-    It is 0 in the middle, about 1 beside them.
-    """
+    """Return how far a view is from the middle of its nearest training views, over how far those are."""
     others = training[training != index]
     nearest = others[np.argsort(apart[index, others], kind="stable")[:NEIGHBOURS]]
     offset = np.linalg.norm(stands[nearest].mean(0) - stands[index])

@@ -217,10 +217,7 @@ View = tuple[Camera, Array, Array | None]
 
 
 def developer(max_side: int) -> Callable[[Photo], View]:
-    """Return the function that makes the view of a photograph, at most `max_side` pixels long.
-
-    The camera has no name yet. The function raises PictureError for a file that cannot be read.
-    """
+    """Return the function that makes views, at most `max_side` px long, of photographs; PictureError."""
 
     # Photographs of one lens share its pinhole and its map; a few maps are kept, not one per photograph.
     @lru_cache(maxsize=4)
@@ -245,10 +242,7 @@ IN_MEMORY = 512_000_000  # bytes of images that are held there; further ones lie
 
 
 def in_file(image: Array) -> Array:
-    """Return the same (H, W, 3) uint8 image in a file without a name in the temporary folder (`TMPDIR`).
-
-    The system reads it in where it is used, and the file ends with the process.
-    """
+    """Return the same image in a file without a name in `TMPDIR`, which ends with the process."""
     try:
         with tempfile.TemporaryFile(prefix="langsplat-") as file:
             # Written, not mapped and filled: on a full disk that would kill the process without a word.

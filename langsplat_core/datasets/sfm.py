@@ -104,10 +104,7 @@ def numbered(paths: Sequence[Path]) -> dict[str, Path]:
 
 
 def _content(path: Path) -> str:
-    """Return a digest of a file: photographs that were copied, moved or touched are the same.
-
-    It is empty for a file that may not be read, which is reported where it is opened.
-    """
+    """Return a digest of a file, empty if it may not be read: what was copied or touched is the same."""
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
@@ -116,10 +113,7 @@ def _content(path: Path) -> str:
 
 
 def _left_out(matches: Matches, contents: Sequence[tuple[str, str]]) -> dict[str, list[str]]:
-    """Return photographs without a camera by the reason: ``{"no features": ["a.jpg", "b.jpg"]}``.
-
-    contents: names and digests of all photographs
-    """
+    """Return photographs without a camera by the reason; contents: names and digests of all photographs."""
     first: dict[str, str] = {}
     groups: dict[str, list[str]] = {}
     for row, (name, content) in enumerate(contents):
@@ -191,10 +185,7 @@ def _small_copies(folder: Path, files: dict[str, Path], progress: Progress) -> l
 
 
 def _write_mask(images: Path, name: str, mask: Image.Image) -> None:
-    """Write the mask of an image of a workspace as COLMAP reads it.
-
-    Where some have a mask, COLMAP finds nothing in images that have none: theirs is white.
-    """
+    """Write an image's mask for COLMAP. Where some have one, those without are white, or it finds nothing."""
     path = images.with_name(MASKS) / f"{name}.png"
     path.parent.mkdir(exist_ok=True)
     with atomic_path(path) as temporary:
@@ -223,11 +214,7 @@ MAX_ANGLE = 75.0  # degrees between the axes of views that are matched
 
 
 def add_points(capture: Capture, views: Sequence[int], work: Path, progress: Progress) -> Capture:
-    """Return the capture with points in its own world, from the photographs at `views`.
-
-    They are triangulated (kept in ``work/sfm-*``), or random ones in front of the cameras when fewer than
-    `MIN_POINTS` can be.
-    """
+    """Return the capture with points triangulated from the photographs at `views`, or random ones."""
     points, colours = _triangulated(capture, views, work, progress)
     if len(points) < MIN_POINTS:
         log.warning(
@@ -279,11 +266,7 @@ def _match_and_triangulate(
 def _write_images(
     folder: Path, names: Sequence[str], capture: Capture, views: Sequence[int], progress: Progress
 ) -> tuple[Camera, ...]:
-    """Write images to seek features in, one after the other, and return their cameras.
-
-    They are made from the files again, larger than what is trained on: small images lack the details that
-    features are found at.
-    """
+    """Write images to seek features in and return their cameras: from the files, larger than for training."""
     enlarge = developer(SIDE)
     cameras = []
     for count, (name, index) in enumerate(zip(names, views, strict=True)):

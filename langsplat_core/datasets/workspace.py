@@ -178,10 +178,7 @@ class NotLocatedError(InputError):
 
 
 def read_matches(folder: Path, files: dict[str, Path], located: Collection[str]) -> Matches:
-    """Return the graph of matches of a workspace.
-
-    files: photographs by their names there, see `sfm.numbered`; located: names of those that have a camera
-    """
+    """Return a workspace's graph of matches; files: by their names there; located: names with a camera."""
     kept = json.loads((folder / MATCHES).read_text())
     row = {name: index for index, name in enumerate(files)}
     return Matches(

@@ -84,10 +84,7 @@ class PlainClipText:
 
 
 def plain_text_tower(weights: Weights) -> PlainClipText | None:
-    """Return the text half in `weights`, if it was taught plain words, is whole, and is computed here.
-
-    Else None, and torch reads the folder, or says what is wrong with it.
-    """
+    """Return the text half in `weights` if it was taught plain words and is whole; else None, for torch."""
     if weights.converted or weights.device != "cpu" or not (weights.folder / VOCABULARY).is_file():
         return None
     try:

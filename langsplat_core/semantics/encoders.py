@@ -21,7 +21,6 @@ from typing import Annotated, Any, Protocol
 import numpy as np
 from msgspec import Meta, Struct
 
-from langsplat_core import registry
 from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import EncoderError, FormatError, InputError, UnknownWordError, optional_imports
 from langsplat_core.io.hostile import decode_json
@@ -31,12 +30,11 @@ from langsplat_core.semantics.weights import (
     OPEN_CLIP_CONFIG,
     Weights,
     asking_errors,
+    family_of,
     load_config,
     load_model,
-    model_type,
     open_weights,
     read_scalar,
-    torch_device,
     weights_path,
 )
 
@@ -220,10 +218,7 @@ class Images:
 
 
 def _pixel_statistics(weights: Weights, usual: Array) -> tuple[Array, Array]:
-    """Return mean and standard deviation of the pixels a model was trained with.
-
-    Raises EncoderError where the folder's file cannot be read, or states no three numbers.
-    """
+    """Return mean and deviation of the pixels a model was trained with. EncoderError for a broken file."""
     path = weights.folder / "preprocessor_config.json"
     name = OPEN_CLIP_CONFIG if weights.converted else path.name
     try:
@@ -285,10 +280,7 @@ class TorchText:
 
 
 def _tokenizer(weights: Weights, vocabulary: int) -> Any:
-    """Return the folder's `tokenizers.Tokenizer`, which neither cuts nor pads.
-
-    EncoderError without one, and for one of more tokens than the model's `vocabulary`.
-    """
+    """Return the folder's `tokenizers.Tokenizer`, which neither cuts nor pads, if it is the model's."""
     from tokenizers import Tokenizer
 
     path = weights.folder / TOKENIZER
@@ -434,15 +426,15 @@ def load_text_encoder(model: str, device: str = "cpu") -> PhraseEncoder:
     The device is the CPU unless told otherwise, because a phrase takes it a few milliseconds. Raises
     EncoderError where the weights are absent or are those of no family here.
     """
-    weights = open_weights(model, model_path(model, "--encoder"), torch_device(device))
-    return PhraseEncoder(weights, _family(weights).text(weights))
+    weights = open_weights(model, model_path(model, "--encoder"), device)
+    return PhraseEncoder(weights, family_of(weights, FAMILIES, "encoders").text(weights))
 
 
 @optional_imports(EncoderError)
 def load_encoder(model: str, device: str = "auto", batch: int = 32) -> Encoder:
     """Load both halves of `model`, as `load_text_encoder` does; batch: images per forward pass."""
-    weights = open_weights(model, model_path(model, "--clip.model"), torch_device(device))
-    family = _family(weights)
+    weights = open_weights(model, model_path(model, "--clip.model"), device)
+    family = family_of(weights, FAMILIES, "encoders")
     return Encoder(weights, family.text(weights), family.images(weights), batch)
 
 
@@ -454,16 +446,3 @@ def model_path(model: str, option: str) -> Path:
     if not folder.is_dir():
         raise EncoderError(f"the bundled demo encoder is missing ({folder}); reinstall, or pass {option}")
     return folder
-
-
-def _family(weights: Weights) -> Family:
-    named = model_type(weights)
-    if named in FAMILIES:
-        return FAMILIES[named]
-    more = registry.references("encoders")
-    if named not in more:
-        known = ", ".join((*FAMILIES, *more))
-        raise EncoderError(
-            f"{weights.id}: its {named!r} model is no image-text encoder known here; known are {known}"
-        )
-    return registry.part("encoders", named)

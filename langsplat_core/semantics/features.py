@@ -194,10 +194,7 @@ def fingerprint(encoder: ImageEncoder) -> str:
 
 
 def feature_key(image: Array, mask: Array | None, mask_source: MaskSource, encoder: str) -> str:
-    """Return a short name of everything that the features of a photograph depend on.
-
-    image: (H, W, 3) uint8; mask: (H, W) bool pixels that count, or None; encoder: its `fingerprint`
-    """
+    """Return a short name of all that features of an image depend on; encoder: its `fingerprint`."""
     settings = json.dumps([VERSION, mask_source.key, encoder, image.shape])
     key = hashlib.sha256(settings.encode() + np.ascontiguousarray(image).tobytes()).hexdigest()[:16]
     return key if mask is None else key + hashlib.sha256(np.packbits(mask).tobytes()).hexdigest()[:12]

@@ -51,10 +51,7 @@ class MaskSource(Protocol):
         """Masks of an image (H, W, 3) uint8."""
 
     def begin(self, image: Array, progress: Progress) -> Callable[[], LevelMasks]:
-        """Do the model's part, and return what does the rest, in any thread.
-
-        A model meanwhile sees the next photograph. By default all is done at once.
-        """
+        """Do the model's part, and return what does the rest, in any thread beside the next one."""
         found = self(image, progress)
         return lambda: found
 
@@ -211,10 +208,7 @@ class RegionGraph:
                     self._push(i, j)
 
     def merge_until(self, cost: float, min_fraction: float) -> None:
-        """Merge every pair cheaper than `cost`, then small regions with their cheapest neighbour.
-
-        Small is below `min_fraction` of the image.
-        """
+        """Merge pairs cheaper than `cost`, then regions below `min_fraction` of the image."""
         while self._heap and self._heap[0][0] <= cost:
             _, i, j, version_i, version_j = heapq.heappop(self._heap)
             if (self._version[i], self._version[j]) == (version_i, version_j):
@@ -325,10 +319,7 @@ class GraphMasks(MaskSource):
 
 
 def nested_partitions(image: Array) -> Array:
-    """(3, H, W) int32 regions of an image (H, W, 3) uint8, numbered from 0 at each level.
-
-    Every region is a union of regions of the level before. Deterministic.
-    """
+    """(3, H, W) int32 regions of an image (H, W, 3) uint8, each a union of regions of the level before."""
     from skimage.color import rgb2lab
     from skimage.restoration import denoise_tv_chambolle
 

@@ -30,10 +30,7 @@ CHUNK = 16_384  # decoded vectors held at a time: 32 MB at 512 float32 numbers
 
 
 def relevancy_of(cosines: Array, zero: Array, rate: Array | float) -> Array:
-    """Relevancy in (0, 1) of cosines, zeros and rates whose shapes go together.
-
-    As published: zero is the largest cosine with a canonical phrase, the rate the temperature.
-    """
+    """Relevancy in (0, 1) of cosines; as published zero is the best canonical cosine, rate 10."""
     return sigmoid(rate * (cosines - zero))
 
 

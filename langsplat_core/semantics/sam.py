@@ -19,7 +19,7 @@ from PIL import Image
 from langsplat_core import registry
 from langsplat_core.arrays import Array
 from langsplat_core.config import MaskConfig
-from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress
 from langsplat_core.semantics.masks import (
     GraphMasks,
@@ -33,9 +33,9 @@ from langsplat_core.semantics.masks import (
 from langsplat_core.semantics.weights import (
     Weights,
     asking_errors,
+    family_of,
     load_config,
     load_model,
-    model_type,
     open_weights,
     torch_device,
     weights_path,
@@ -59,10 +59,7 @@ class EncodedImage:
 
     @asking_errors("the segmenter")
     def masks_at(self, points: Array) -> tuple[Any, Any]:
-        """Return (P, 3) predicted IoU and (P, 3, h, w) logits of the masks at each point.
-
-        They are subpart, part, whole, logits in low resolution. points: (P, 2) float32 x, y, px of the image
-        """
+        """(P, 2) float32 x, y, px of the image -> (P, 3) predicted IoU, (P, 3, h, w) small logits."""
         import torch
 
         height, width = self.size or (self.side, self.side)
@@ -178,28 +175,13 @@ HALF_ON = "cuda"  # where products are float16's: bfloat16's error is seven time
 
 
 def load_segmenter(model: str, device: str = "auto") -> Segmenter:
-    """Load `model`: a folder in Hugging Face layout, a file of segment_anything or sam2, or a hub id.
-
-    Raises EncoderError where the weights are absent or are those of no family here.
-    """
-    weights = open_weights(model, weights_path(model, "--masks.sam"), torch_device(device))
-    named = model_type(weights)
-    if named in FAMILIES:
-        return FAMILIES[named](weights)
-    more = registry.references("segmenters")
-    if named not in more:
-        known = ", ".join((*FAMILIES, *more))
-        raise EncoderError(f"{model}: its {named!r} model is no segmenter known here; known are {known}")
-    return registry.part("segmenters", named)(weights)
+    """Load `model`: a folder in Hugging Face layout, a file of segment_anything or sam2, or a hub id."""
+    weights = open_weights(model, weights_path(model, "--masks.sam"), device)
+    return family_of(weights, FAMILIES, "segmenters")(weights)
 
 
 def load_mask_source(config: MaskConfig, device: str = "auto") -> MaskSource:
-    """Return the source of masks that `config` asks for.
-
-    "auto" is SAM where `config.sam` names weights, else the graph. Raises EncoderError where SAM's weights
-    are absent, InputError where they are not named at all or the source is none of the core or of an
-    extension.
-    """
+    """Return the source of masks that `config` asks for; "auto": SAM if it names weights, else the graph."""
     if config.source == "graph" or (config.source == "auto" and not config.sam):
         return GraphMasks()
     if config.source not in ("auto", "sam"):
@@ -224,10 +206,7 @@ EDGE = 20.0  # px: a box that ends this near to an edge touches it
 
 
 def grid_points(per_side: int, size: tuple[int, int]) -> Array:
-    """Return (per_side^2, 2) float32 points x, y in an image of `size` (height, width).
-
-    They are the centres of equal cells, row by row.
-    """
+    """Return (per_side^2, 2) float32 x, y, centres of equal cells of an image of `size` (height, width)."""
     centres = (np.arange(per_side) + 0.5) / per_side
     x, y = np.meshgrid(centres * size[1], centres * size[0])
     return np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32)
@@ -337,10 +316,7 @@ class SamMasks(MaskSource):
     def _in_crop(
         self, image: Array, crop: Array, progress: Progress, half_on: str | None
     ) -> list[list[Proposal]]:
-        """Return the proposals that one crop (4,) of the image gives at each level, in pixels of the image.
-
-        Raises OverflowError with `half_on` where numbers are larger than float16 holds.
-        """
+        """Return proposals of each level in one crop (4,); OverflowError beyond float16."""
         import torch
 
         left, top, right, bottom = crop
@@ -390,10 +366,7 @@ class SamMasks(MaskSource):
     def _best(
         self, encoded: EncodedImage, figures: Array, logits: Any, level: int, crop: Array
     ) -> list[Proposal]:
-        """Return the proposals of a level whose box no better one resembles.
-
-        Only they are enlarged and leave the device.
-        """
+        """Return the proposals of a level whose box no better one resembles; only they leave the device."""
         rows = np.flatnonzero(figures[:, 0] == level)
         rows = rows[box_nms(figures[rows, 3:], figures[rows, 1], self._config.box_nms)]
         area = int((crop[2] - crop[0]) * (crop[3] - crop[1]))

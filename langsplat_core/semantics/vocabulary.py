@@ -17,10 +17,7 @@ LONGEST = 80  # characters of a phrase: CLIP reads 77 tokens, and a whole paragr
 
 
 def bundled_vocabulary(name: Bundled) -> tuple[str, ...]:
-    """Return the phrases of a bundled list: everyday things, parts of things, colours, materials.
-
-    Raises InputError where it is missing from the installation.
-    """
+    """Return the phrases of a bundled list: everyday things, parts of things, colours, materials."""
     return read_vocabulary(Path(str(files("langsplat_assets") / "vocabulary" / f"{name}.txt")))
 
 
@@ -95,10 +92,7 @@ class TextEncoder(Protocol):
 
 
 def everyday_phrases(unknown_words: Callable[[str], Sequence[str]]) -> list[str]:
-    """Nouns, and as many as `MIXED` random pairs of an adjective and a noun, the same each time.
-
-    Without words that the encoder was never taught.
-    """
+    """Nouns and `MIXED` random pairs of adjective and noun, always the same, without unknown words."""
     nouns = [word for word in NOUNS if not unknown_words(word)]
     adjectives = [word for word in ADJECTIVES if not unknown_words(word)]
     if not nouns or not adjectives:
@@ -109,10 +103,7 @@ def everyday_phrases(unknown_words: Callable[[str], Sequence[str]]) -> list[str]
 
 
 def everyday_vectors(encoder: TextEncoder) -> Array | None:
-    """(V, D) float32 unit vectors of the everyday phrases, of float16 precision, as a scene keeps them.
-
-    None for an encoder that was taught too few of them.
-    """
+    """(V, D) float32 unit vectors of the everyday phrases, of float16 precision; None if it knows too few."""
     phrases = everyday_phrases(encoder.unknown_words)
     if len(phrases) < FEWEST:
         return None

@@ -12,11 +12,12 @@ from copy import deepcopy
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeVar, cast
 
 from langsplat_core import registry
 from langsplat_core.errors import EncoderError
 
+T = TypeVar("T")
 CONFIG = "config.json"
 SAFE = ["model.safetensors", "model-*.safetensors"]
 PICKLED = ["pytorch_model.bin", "pytorch_model-*.bin"]  # transformers reads these with weights_only
@@ -46,24 +47,25 @@ class Weights:
 Layout = Callable[[str, Path], Converted | None]  # id for messages, file -> None where it is of another one
 
 
-def open_weights(id: str, path: Path, device: str) -> Weights:
-    """Return the weights at `path`, a folder or a file that `weights_path` found.
+def open_weights(model: str, path: Path, device: str) -> Weights:
+    """Return the weights at a path that `weights_path` found, for a device as `torch_device` has it.
 
     Other layouts than Hugging Face's are read by extensions. Raises EncoderError for a file that is damaged,
     or of no layout known here.
     """
+    device = torch_device(device)
     if path.is_dir() and _is_hugging_face(path):
-        return Weights(id, path, device)
+        return Weights(model, path, device)
     file = path if path.is_file() else next(path / name for name in OPEN_CLIP if (path / name).is_file())
     layouts: Mapping[str, Layout] = registry.parts("layouts")
     for layout in layouts.values():
-        converted = layout(id, file)
+        converted = layout(model, file)
         if converted is not None:
-            return Weights(id, file.parent, device, converted)
+            return Weights(model, file.parent, device, converted)
     known = "; ".join(layouts) or "none"
     raise EncoderError(
-        f"{id}: its weights are of no layout known here ({known}); for another model pass a folder or hub id "
-        "in Hugging Face layout"
+        f"{model}: its weights are of no layout known here ({known}); for another model pass a folder or hub "
+        "id in Hugging Face layout"
     )
 
 
@@ -145,36 +147,39 @@ def read_scalar(weights: Weights, name: str) -> float:
 
     with loading_errors(weights.id, "readable"):
         for path in _weight_files(weights.folder):
-            if path.suffix != ".safetensors":
-                return float(unpickled(path).get(name, math.nan))
-            with safe_open(path, framework="pt") as file:
-                if name in file.keys():  # noqa: SIM118  not a mapping
-                    return float(file.get_tensor(name))
+            if path.suffix != ".safetensors" and name in (found := unpickled(path)):
+                return float(found[name])
+            if path.suffix == ".safetensors":
+                with safe_open(path, framework="pt") as file:
+                    if name in file.keys():  # noqa: SIM118  not a mapping
+                        return float(file.get_tensor(name))
     return math.nan
 
 
 # Building a model: transformers fills with random numbers what its configuration has and its weights lack.
 
 
-def model_type(weights: Weights) -> str:
-    """Return the architecture that the folder's config.json names, "" where it names none.
-
-    Raises EncoderError for a file that is no JSON.
-    """
+def family_of(weights: Weights, families: Mapping[str, T], kind: Literal["encoders", "segmenters"]) -> T:
+    """Return the row of what config.json names: one of `families`, or of an extension's `kind`."""
     if weights.converted:
-        return str(weights.converted.config["model_type"])
-    try:
-        settings = json.loads((weights.folder / CONFIG).read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise EncoderError(f"{weights.id}: {CONFIG} cannot be read ({error})") from error
-    return str(settings.get("model_type", ""))[:40] if isinstance(settings, dict) else ""
+        named = str(weights.converted.config["model_type"])
+    else:
+        try:
+            settings = json.loads((weights.folder / CONFIG).read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError) as error:
+            raise EncoderError(f"{weights.id}: {CONFIG} cannot be read ({error})") from error
+        named = str(settings.get("model_type", ""))[:40] if isinstance(settings, dict) else ""
+    if named in families:
+        return families[named]
+    more = registry.references(kind)
+    if named not in more:
+        known = ", ".join((*families, *more))
+        raise EncoderError(f"{weights.id}: {named!r} is none of the {kind} known here, which are {known}")
+    return cast("T", registry.part(kind, named))
 
 
 def load_config(kind: Any, weights: Weights, name: str) -> Any:
-    """Return the configuration of `weights` as transformers' class `kind`.
-
-    `name` is the family's in messages. Raises EncoderError where it cannot be read.
-    """
+    """Return the configuration of `weights` as transformers' class `kind`; `name` is for messages."""
     with loading_errors(weights.id, name):
         if weights.converted:
             return kind.from_dict(deepcopy(weights.converted.config))
@@ -204,10 +209,7 @@ def _check_counts(id: str, settings: Any) -> None:
 
 
 def _check_size(kind: Any, weights: Weights, config: Any) -> None:
-    """Raise EncoderError where a model of this configuration has more numbers than its files have bytes.
-
-    The model is built on torch's meta device, where it takes no room.
-    """
+    """Raise EncoderError where a model of this configuration has more numbers than its files have bytes."""
     import torch
 
     with torch.device("meta"):
@@ -281,10 +283,7 @@ def loading_errors(id: str, kind: str) -> Iterator[None]:
 
 @contextmanager
 def asking_errors(what: str) -> Iterator[None]:
-    """Turn the errors of asking a loaded model into EncoderError.
-
-    Loading compares no more than sizes; whether a configuration fits its weights may show later.
-    """
+    """Turn errors of asking a model into EncoderError: loading compares no more than sizes."""
     import torch
 
     try:
@@ -301,10 +300,7 @@ def _first_line(error: BaseException) -> str:
 
 
 def torch_device(device: str) -> str:
-    """Return the device that "auto" means here: cuda where PyTorch sees one, else cpu.
-
-    EncoderError for an absent device. By its number: which one is current is a matter of each thread.
-    """
+    """Return the device that "auto" means here: cuda where PyTorch sees one, by its number, else cpu."""
     if device == "cpu":
         return device  # without importing torch, which a small text encoder does without
     import torch

@@ -146,7 +146,7 @@ def aligned(points: Array, source: Array, target: Array) -> Array:
 
 def test_cameras_are_found_where_they_were(located) -> None:  # type: ignore[no-untyped-def]
     """On every processor; that they are the same bytes is promised within one machine only."""
-    capture, _, labels, _ = located
+    capture, _, labels, messages = located
     assert [camera.name for camera in capture.cameras] == [f"view_{i}" for i in range(VIEWS)]
     assert list(dict.fromkeys(labels)) == STAGES
     centres = np.array([camera.position for camera in capture.cameras])
@@ -155,10 +155,6 @@ def test_cameras_are_found_where_they_were(located) -> None:  # type: ignore[no-
     room = aligned(capture.points, centres, truth)
     assert len(room) > 300
     assert np.median(distance_to_room(room)) < 0.01
-
-
-def test_photographs_left_out_are_warned_of(located) -> None:  # type: ignore[no-untyped-def]
-    _, _, _, messages = located
     assert any("aa_broken.jpg" in message and "cannot be read" in message for message in messages)
     (lost,) = [message for message in messages if "could not be located" in message]
     assert "no matches with any other: zz_noise.JPG" in lost
@@ -210,20 +206,12 @@ def test_known_poses_give_points_in_their_own_world(tmp_path: Path, monkeypatch:
     np.testing.assert_array_equal(add_points(capture, range(4), tmp_path, silent).points, found.points)
 
 
-def write_located(folder: Path, count: int) -> None:
-    """Photographs through `LENS` with a COLMAP model of true cameras that has no points."""
-    names = write_photos(folder / "images", LENS, poses(count))
-    params = [LENS.fx, LENS.cx, LENS.cy, -0.06]
-    model = colmap_reconstruction("SIMPLE_RADIAL", (400, 300), params, names, poses(count))
-    (folder / "sparse").mkdir()
-    model.write_binary(folder / "sparse")
-
-
-def test_points_come_from_larger_pictures_of_the_training_views(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_points_come_from_larger_pictures_of_the_training_views(tmp_path: Path) -> None:
     """Pictures of 120 px lack what is found at 400; a photograph that is held out gives no point."""
-    write_located(tmp_path, 5)
+    names, params = write_photos(tmp_path / "images", LENS, poses(5)), [LENS.fx, LENS.cx, LENS.cy, -0.06]
+    (tmp_path / "sparse").mkdir()
+    model = colmap_reconstruction("SIMPLE_RADIAL", (400, 300), params, names, poses(5))
+    model.write_binary(tmp_path / "sparse")
     small = DatasetConfig(max_side=120, test_every=4, hold_out="every")  # views 0 and 4 are held out
     capture = load_capture(tmp_path, small, tmp_path / "work")
     assert max(capture.images[0].shape) <= 120
@@ -232,11 +220,8 @@ def test_points_come_from_larger_pictures_of_the_training_views(
     few = add_points(blind, [1, 2, 3], tmp_path / "other", silent)
     assert len(capture.points) > 3 * len(few.points)
 
-    black = tuple(np.zeros_like(image) if i in (0, 4) else image for i, image in enumerate(capture.images))
-    for name in ("view_0.png", "view_4.png"):
-        Image.new("RGB", (400, 300)).save(tmp_path / "images" / name)
+    Image.new("RGB", (400, 300)).save(tmp_path / "images" / "view_4.png")
     again = load_capture(tmp_path, small, tmp_path / "third")
-    np.testing.assert_array_equal(again.images[4], black[4])
     np.testing.assert_array_equal(again.points, capture.points)
 
 
@@ -262,12 +247,9 @@ def test_pairs_are_all_of_few_and_linked_ones_of_many() -> None:
 
 
 def test_neighbouring_views_look_a_similar_way() -> None:
-    ring = [
-        look_at(
-            np.array([np.cos(a), np.sin(a), 0]), 2 * np.array([np.cos(a), np.sin(a), 0]), [0, 0, 1], (9, 9)
-        )
-        for a in np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    ]
+    around = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    eyes = np.stack([np.cos(around), np.sin(around), 0 * around], axis=1)
+    ring = [look_at(eye, 2 * eye, np.array([0, 0, 1.0]), (9, 9)) for eye in eyes]
     pairs = neighbouring_views(tuple(ring))
     steps = {min(j - i, 24 - (j - i)) for i, j in pairs}
     assert steps == {1, 2, 3, 4, 5}  # 15 degrees each: 75 at most, never back to back

@@ -486,7 +486,7 @@ def test_sources_are_chosen_and_absences_named(config: MaskConfig, tmp_path: Pat
         load_mask_source(MaskConfig(sam=str(tmp_path / "absent")))
     (tmp_path / "config.json").write_text('{"model_type": "clip"}', encoding="utf-8")
     (tmp_path / "model.safetensors").write_bytes(b"")
-    with pytest.raises(EncoderError, match="no segmenter known here"):
+    with pytest.raises(EncoderError, match="none of the segmenters"):
         load_mask_source(MaskConfig(sam=str(tmp_path)))
 
 

@@ -29,8 +29,6 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import MaskConfig
 from langsplat_core.progress import silent
 from langsplat_core.semantics.encoders import load_encoder
-from langsplat_core.semantics.features import masked_crop
-from langsplat_core.semantics.masks import label_maps
 from langsplat_core.semantics.sam import (
     MASKS_PER_POINT,
     EncodedImage,
@@ -375,67 +373,3 @@ def test_the_filters_of_segment_anything_but_for_its_boxes(
     monkeypatch.setattr(module, "batched_mask_to_box", lambda masks: theirs(masks) + after)
     assert [generated(level) for level in range(MASKS_PER_POINT)] == ours
     assert min(map(len, ours)) > 20
-
-
-def langsplat_crop(image: Array, mask: Array, side: int, whole_box: bool = False) -> Array:
-    """As LangSplat's preprocess.py: boxes end one pixel early; OpenCV's linear resize without antialias."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    black = np.where(mask[..., None], image, np.uint8(0))
-    patch = black[rows[0] : rows[-1] + whole_box, columns[0] : columns[-1] + whole_box]
-    height, width = patch.shape[:2]
-    square = np.zeros((max(height, width),) * 2 + (3,), np.uint8)
-    top, left = (len(square) - height) // 2, (len(square) - width) // 2
-    square[top : top + height, left : left + width] = patch
-    resized: Array = upstream().cv2.resize(square, (side, side))
-    return resized
-
-
-Region = tuple[Array, Array]  # picture of its box and its mask there
-SIZES = {"under 112": (4, 112), "112 to 448": (112, 448), "over 448": (448, 4000)}  # px of the longer side
-
-
-@pytest.fixture(scope="module")
-def regions(real_data: Path) -> dict[str, list[Region]]:
-    """40 regions of each of `SIZES` in real photographs, by the segmenter that needs no weights."""
-    source = load_mask_source(MaskConfig(source="graph"))
-    found: dict[str, list[Region]] = {name: [] for name in SIZES}
-    for folder in ("banana/photos", "captures/buddha", "captures/monstree", "captures/tower", "fox/images"):
-        for path in sorted((real_data / folder).iterdir())[1:6:3]:
-            photograph = Image.open(path).convert("RGB")
-            photograph.thumbnail((1440, 1440))
-            image = np.asarray(photograph)
-            for labels in label_maps(source(image, silent)):
-                for row, box in enumerate(ndimage.find_objects(labels + 1)):
-                    sides = [part.stop - part.start for part in box or ()]
-                    for name, (least, most) in SIZES.items():
-                        if box and min(sides) >= 4 and least <= max(sides) < most:
-                            found[name].append((image[box], labels[box] == row))
-    rng = np.random.default_rng(0)
-    return {name: [some[i] for i in rng.permutation(len(some))[:40]] for name, some in found.items()}
-
-
-def test_crops_are_resized_as_langsplats_where_they_grow(regions: dict[str, list[Region]]) -> None:
-    for image, mask in regions["under 112"]:
-        ours = masked_crop(image, mask, 224).astype(int)
-        assert abs(ours - langsplat_crop(image, mask, 224, whole_box=True)).max() <= 2
-
-
-@pytest.mark.parametrize("name", ["demo", "ViT-B-16"])
-def test_vectors_of_langsplats_crops(
-    name: str, regions: dict[str, list[Region]], field: SimpleNamespace, tmp_path: Path, measured: Measure
-) -> None:
-    if name != "demo":
-        save_clip(name, scrambled(field.open_clip.create_model, name), tmp_path)
-    encoder = load_encoder(name if name == "demo" else str(tmp_path), "cpu")
-    for size, every in regions.items():
-        some = every if name == "demo" else every[:10]
-        ours, theirs = (
-            encoder.encode_images(np.stack([crop(image, mask, encoder.image_size) for image, mask in some]))
-            for crop in (masked_crop, langsplat_crop)
-        )
-        apart = 1 - (ours * theirs).sum(axis=1)
-        others = 1 - (ours @ ours.T)[~np.eye(len(ours), dtype=bool)]
-        for what, value in (("median", np.median(apart)), ("largest", apart.max())):
-            measured(f"{name}, crops {size} px, 1 - cosine", what, value)
-        measured(f"{name}, crops {size} px, 1 - cosine", "median to other crops", np.median(others))
-        assert np.median(apart) < 0.05 * np.median(others)
