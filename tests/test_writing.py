@@ -141,7 +141,7 @@ EARLIER = b"what was there before"
 def film(name: str) -> Write:
     def write(folder: Path) -> None:
         noise = np.random.default_rng(0)
-        settings = Film(folder / name, 3, (32, 24), 4.0, "settings")
+        settings = Film(folder / name, 3, (32, 24), 4.0)
         write_film(settings, lambda _: noise.integers(0, 255, (24, 32, 3), dtype=np.uint8))
 
     return write

@@ -1,15 +1,13 @@
 """Images and films as files: PNG; MP4 by PyAV, animated WebP and GIF, or a folder of images.
 
-A file is written whole or not at all. A folder is filled image by image; where the same film was begun in
-it before, the images that are there are kept.
+A file is written whole or not at all. A folder is filled image by image.
 """
 
-import hashlib
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from fractions import Fraction
 from importlib.util import find_spec
 from itertools import count
@@ -17,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import moderngl
-import numpy as np
 from PIL import Image
 
 from langsplat_core.arrays import Array
@@ -27,11 +24,11 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import Camera
 from langsplat_viewer.camera.controls import Extent
 from langsplat_viewer.camera.flight import Motion, camera_of, frame_times
-from langsplat_viewer.rendering.renderer import Backend, Inputs, Renderer, open_renderer
+from langsplat_viewer.rendering.renderer import Backend, Renderer, open_renderer
 from langsplat_viewer.rendering.request import RenderRequest, why_nothing
 
 VIDEO, ANIMATIONS = ".mp4", (".webp", ".gif")
-SETTINGS = "film.json"  # in a folder of images: what they are images of
+SETTINGS = "film.json"  # in a folder of images: how many, and how fast
 FRAME = re.compile(r"frame-\d{5,}\.png")
 MOST_FRAMES = 100_000
 
@@ -87,7 +84,6 @@ class Film:
     count: int  # images
     size: tuple[int, int]  # width and height, pixels
     fps: float
-    settings: str  # the same for films of the same images
 
 
 def has_video() -> bool:
@@ -135,39 +131,31 @@ def _check_own(folder: Path) -> None:
             raise InputError(f"--out {folder}: holds {stranger} of another program; choose another folder")
 
 
-def write_film(film: Film, draw: Draw) -> int:
-    """Draw and write all images; return how many were drawn, for others were there already.
+def write_film(film: Film, draw: Draw) -> None:
+    """Draw and write all images.
 
     Raises InputError where the library of the format fails, OSError where nothing can be written, and what
     `draw` does; a file is then as it was before.
     """
     if is_folder(film.out):
-        return _write_folder(film, draw)
+        _write_folder(film, draw)
+        return
     with atomic_path(film.out) as temporary:
         if film.out.suffix.lower() == VIDEO:
             _write_video(film, draw, temporary)
         else:
             _write_animation(film, draw, temporary)
-    return film.count
 
 
-def _write_folder(film: Film, draw: Draw) -> int:
-    folder, before = film.out, ""
-    folder.mkdir(parents=True, exist_ok=True)
-    _check_own(folder)
-    text = json.dumps({"film": film.settings, "pictures": film.count, "fps": film.fps}) + "\n"
-    with suppress(OSError, ValueError):
-        before = (folder / SETTINGS).read_text(encoding="utf-8")
-    if before != text:
-        for path in folder.iterdir():  # of another film, or of this one in other settings
-            if FRAME.fullmatch(path.name):
-                path.unlink()
-        with atomic_path(folder / SETTINGS) as temporary:
-            temporary.write_text(text, encoding="utf-8")
-    missing = [number for number in range(film.count) if not (folder / frame_name(number)).exists()]
-    for number in missing:
-        save_png(folder / frame_name(number), draw(number))
-    return len(missing)
+def _write_folder(film: Film, draw: Draw) -> None:
+    film.out.mkdir(parents=True, exist_ok=True)
+    _check_own(film.out)
+    (film.out / SETTINGS).write_text(json.dumps({"pictures": film.count, "fps": film.fps}), encoding="utf-8")
+    for path in film.out.iterdir():  # of another film
+        if FRAME.fullmatch(path.name):
+            path.unlink()
+    for number in range(film.count):
+        save_png(film.out / frame_name(number), draw(number))
 
 
 def _write_animation(film: Film, draw: Draw, path: Path) -> None:
@@ -229,7 +217,7 @@ def make_film(shot: Shot, out: Path, progress: Progress = silent) -> list[str]:
     may raise to stop it.
     """
     (width, height), cameras, empty = shot.request.size, shot.cameras, 0
-    film = Film(out, len(cameras), (width, height), shot.fps, fingerprint(shot))
+    film = Film(out, len(cameras), (width, height), shot.fps)
     with in_one_line(out, f"{width}x{height}"), open_renderer(shot.backend) as renderer:
 
         def draw(number: int) -> Array:
@@ -245,36 +233,8 @@ def make_film(shot: Shot, out: Path, progress: Progress = silent) -> list[str]:
                 )
             return image
 
-        drawn = write_film(film, draw)
-    kept = f", {film.count - drawn} of them kept" if drawn < film.count else ""
+        write_film(film, draw)
     name = f"{out}/" if is_folder(out) else str(out)
     pictures = "picture" if film.count == 1 else "pictures"
     nothing = [f"{empty} of {film.count} pictures show nothing of the scene"] if empty else []
-    return [f"{name}: {width}x{height}, {film.count} {pictures}{kept}, {film.fps:g} a second", *nothing]
-
-
-def fingerprint(shot: Shot) -> str:
-    """Return a digest that is the same for shots that give the same images, whoever asks for them."""
-    digest, inputs = hashlib.sha256(), Inputs()
-    request = shot.request
-    scene = inputs.scene(request)
-    _add(digest.update, (scene.gaussians, scene.raster_settings(), request.clip, request.split, request.size))
-    _add(digest.update, [(pane.picture, pane.ranges) for pane in request.panes])
-    _add(digest.update, [c if isinstance(c, np.ndarray) else None for c in inputs.channels(request)])
-    _add(digest.update, (shot.backend, shot.fps, shot.cameras))
-    return digest.hexdigest()
-
-
-def _add(update: Callable[[bytes], object], value: object) -> None:
-    if is_dataclass(value) and not isinstance(value, type):
-        for field in fields(value):
-            _add(update, getattr(value, field.name))
-    elif isinstance(value, np.ndarray):
-        update(repr((value.dtype, value.shape)).encode())
-        update(np.ascontiguousarray(value).data)  # type: ignore[arg-type]  # a buffer
-    elif isinstance(value, Sequence) and not isinstance(value, str):
-        update(f"[{len(value)}".encode())
-        for item in value:
-            _add(update, item)
-    else:
-        update(f"{value!r};".encode())
+    return [f"{name}: {width}x{height}, {film.count} {pictures}, {film.fps:g} a second", *nothing]
