@@ -1,14 +1,14 @@
 """Opens the real window as the program does, without the test engine, and measures it.
 
     python -m tests.viewer.process_driver [--scene SCENE.ply] [--count 500000] [--seconds 10]
-                                          [--size 1280 800] [--at-once] [--slow]
+                                          [--size 1280 800] [--slow]
     python -m tests.viewer.process_driver --idle SCENE.ply | --leave SCENE.ply | --type SCENE.ply
 
 By default the camera orbits. Prints JSON: pictures per second while it moves, seconds from the last move to
 the full picture, the longest that a frame kept the window's thread in either, and the processor time of both,
-which other work on the machine changes little. --at-once: full pictures are rasterized in the window's own
-thread. --idle: prints frames and the share of a core while nothing happens. --leave: closes the window while
-a scene is being read for a minute. --type: types faster than frames are drawn. Needs a display (xvfb-run).
+which other work on the machine changes little. --idle: prints frames and the share of a core while nothing
+happens. --leave: closes the window while a scene is being read for a minute. --type: types faster than frames
+are drawn. Needs a display (xvfb-run).
 """
 
 import argparse
@@ -28,14 +28,13 @@ from imgui_bundle.glfw_utils import glfw_window_hello_imgui
 import glfw  # isort: skip
 from langsplat_core.extensions.benchmarks.query_speed import repeated
 from langsplat_core.io.scenes import load_scene
-from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions import viewpoint
 from langsplat_viewer.camera.controls import orbit
 from langsplat_viewer.panels.navigation import Event
-from langsplat_viewer.rendering.renderer import ArrayRenderer, renderer_for
+from langsplat_viewer.rendering.renderer import renderer_for
 from langsplat_viewer.viewer import Services
-from langsplat_viewer.window import MakeRenderer, Window, WindowRequest, open_window
+from langsplat_viewer.window import Window, WindowRequest, open_window
 from tests.support.fakes import FakeEncoder
 
 DEMO = Path(__file__).parents[2] / "assets" / "demo" / "scene.ply"
@@ -58,13 +57,6 @@ class Orbiting:
     longest_resting: list[float] = field(default_factory=list)  # the same, until the full picture is there
     sharp_after: list[float] = field(default_factory=list)
     cpu_to_sharp: list[float] = field(default_factory=list)
-
-
-class AtOnce(ArrayRenderer):
-    """Leaves nothing to other threads."""
-
-    def ahead(self, *_: object) -> None:
-        return None
 
 
 class Rider:
@@ -140,7 +132,6 @@ def ride(
     count: int,
     seconds: float,
     size: tuple[int, int],
-    renderer: MakeRenderer = renderer_for,
     **request: float,
 ) -> Orbiting:
     def load(path: Path) -> Scene:
@@ -148,7 +139,9 @@ def ride(
         return repeated(found, count) if count else found
 
     window = Window(
-        WindowRequest(scene, size=size, **request), Services(load, lambda encoder_id: FakeEncoder()), renderer
+        WindowRequest(scene, size=size, **request),
+        Services(load, lambda encoder_id: FakeEncoder()),
+        renderer_for,
     )
     window.idles = False
     rider = Rider(window, seconds)
@@ -309,7 +302,6 @@ if __name__ == "__main__":
     parser.add_argument("--count", type=int, default=500_000, help="Gaussians; 0: as the file has")
     parser.add_argument("--seconds", type=float, default=10.0, help="of moving, three times")
     parser.add_argument("--size", type=int, nargs=2, default=(1280, 800))
-    parser.add_argument("--at-once", action="store_true", help="full pictures in the window's thread")
     parser.add_argument("--slow", action="store_true", help="as if the machine were slow")
     asked = parser.parse_args()
     if asked.idle:
@@ -319,7 +311,6 @@ if __name__ == "__main__":
     elif asked.leave:
         leave(asked.leave)
     else:
-        renderer = (lambda ctx: AtOnce(load_rasterizer("cpu"))) if asked.at_once else renderer_for
         more = {"moving_budget": 0.0} if asked.slow else {}
-        seen = ride(asked.scene, asked.count, asked.seconds, tuple(asked.size), renderer, **more)
+        seen = ride(asked.scene, asked.count, asked.seconds, tuple(asked.size), **more)
         print(json.dumps(asdict(seen)))

@@ -1,4 +1,4 @@
-"""A long day at the window: 100 scenes opened and closed, and actions in each; run by test_process.py.
+"""A long day at the window: 100 scenes opened and closed, and actions in each; run by test_window.py.
 
     python -m tests.viewer.soak_driver BACKEND FOLDER ACTIONS
 

@@ -1,7 +1,10 @@
-"""Panels change nothing by themselves: what they are told goes through `actions`."""
+"""Panels, the table of commands, preferences, and what is drawn over the image."""
 
 import ast
+import math
 import threading
+from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -9,20 +12,30 @@ import pytest
 from matplotlib.ft2font import FT2Font
 
 from langsplat_core.errors import InputError
+from langsplat_core.query import instances
+from langsplat_core.query.describe import Describer, look_at_pixel
+from langsplat_core.query.engine import QueryEngine
+from langsplat_core.raster import load_lifting_rasterizer
+from langsplat_core.scene import look_at
 from langsplat_core.scene.transform import AXES, moving, rotating
 from langsplat_viewer import panels
 from langsplat_viewer.actions import settings, viewpoint
+from langsplat_viewer.camera import overlays
+from langsplat_viewer.camera.controls import extent_of, frame_of
+from langsplat_viewer.camera.overlays import PlacedText, placed
 from langsplat_viewer.commands import COMMANDS, PANEL_TITLES, matching
 from langsplat_viewer.files.projects import FILE_NAME, load_preferences, save_preferences
 from langsplat_viewer.panels import ui
 from langsplat_viewer.panels.layout import all_panels
 from langsplat_viewer.panels.navigation import chord
+from langsplat_viewer.panels.overlays import pointed_figures, said
 from langsplat_viewer.panels.select import box_of, dragged, gl_matrices
 from langsplat_viewer.panels.ui import elided
 from langsplat_viewer.session import MOST_RECENT, Preferences
 from langsplat_viewer.state import MAX_MESSAGES
+from tests.support.fakes import CENTRES, FakeEncoder, blob_scene, cameras
 from tests.support.scenes import random_camera, without_perspective
-from tests.support.windowless import settle
+from tests.support.windowless import ask, errors, open_scene, settle
 
 SOURCES = sorted(Path(panels.__path__[0]).glob("*.py"))
 
@@ -239,3 +252,217 @@ def test_gizmo_drags_become_similarities():
     stretched[:3, :3] = 0
     with pytest.raises(InputError):
         dragged(start, stretched)
+
+
+SIZE = (120, 80)
+NEAR = 0.05
+
+
+def plain_clip(camera, start, end):
+    """One segment cut at one plane after the other, in plain Python: (2, 2) pixels or None."""
+    a, b = (camera.rotation @ p + camera.world_to_camera[:3, 3] for p in (start, end))
+    planes = [
+        lambda p: p[2] - NEAR,
+        lambda p: camera.fx * p[0] + camera.cx * p[2],
+        lambda p: (camera.width - camera.cx) * p[2] - camera.fx * p[0],
+        lambda p: camera.fy * p[1] + camera.cy * p[2],
+        lambda p: (camera.height - camera.cy) * p[2] - camera.fy * p[1],
+    ]
+    for side in planes:
+        if side(a) < 0 and side(b) < 0:
+            return None
+        if side(a) < 0:
+            a = a + side(a) / (side(a) - side(b)) * (b - a)
+        elif side(b) < 0:
+            b = b + side(b) / (side(b) - side(a)) * (a - b)
+    return np.array(
+        [(p[0] / p[2] * camera.fx + camera.cx, p[1] / p[2] * camera.fy + camera.cy) for p in (a, b)]
+    )
+
+
+def test_segments_are_cut_as_plain_arithmetic_cuts_them():
+    rng = np.random.default_rng(4)
+    camera = look_at(np.array([0.3, -0.2, -2.0]), np.zeros(3), np.array([0, -1.0, 0]), SIZE)
+    segments = rng.normal(scale=2.5, size=(4000, 2, 3))
+    got, rows = overlays.clip_segments(camera, segments, NEAR)
+    expected = [plain_clip(camera, *segment) for segment in segments]
+    assert rows.tolist() == [row for row, cut in enumerate(expected) if cut is not None]
+    assert 500 < len(rows) < 3500
+    np.testing.assert_allclose(got, [cut for cut in expected if cut is not None], atol=1e-6)
+    assert got.min() > -1e-6
+    assert (got.max((0, 1)) < np.array(SIZE) + 1e-6).all()
+
+
+def test_a_segment_through_the_eye_is_cut_in_front_of_it():
+    camera = look_at(np.array([0, 0, -2.0]), np.zeros(3), np.array([0, -1.0, 0]), SIZE)
+    through = np.array([[[0, 0, -4.0], [0, 0, 3.0]], [[0, 0, -9.0], [0, 0, -3.0]]])
+    got, rows = overlays.clip_segments(camera, through, NEAR)
+    assert rows.tolist() == [0]
+    np.testing.assert_allclose(got[0], [[60, 40], [60, 40]], atol=1e-9)
+    far = np.array([[[-1e9, 0, 1.0], [1e9, 0, 1.0]]])
+    np.testing.assert_allclose(overlays.clip_segments(camera, far, NEAR)[0][0, :, 0], [0, 120], atol=1e-3)
+    assert len(overlays.clip_segments(camera, np.zeros((0, 2, 3)), NEAR)[0]) == 0
+
+
+def test_a_frustum_ends_where_its_picture_does():
+    camera = cameras()[1]
+    edges = overlays.frusta([camera], 0.4)[0]
+    np.testing.assert_allclose(edges[:4, 0], np.tile(camera.position, (4, 1)), atol=1e-12)
+    pixels, depths = camera.project(edges[:4, 1])
+    np.testing.assert_allclose(depths, 0.4)
+    np.testing.assert_allclose(pixels, [(0, 0), (160, 0), (160, 120), (0, 120)], atol=1e-9)
+    assert overlays.frusta([], 1.0).shape == (0, 8, 2, 3)
+
+
+def test_the_nearest_segment():
+    segments = np.array([[[0.0, 0], [10, 0]], [[0, 5], [10, 5]], [[3, 3], [3, 3]]])
+    assert overlays.nearest_segment(segments, (20.0, 0.0)) == (0, 10.0)
+    assert overlays.nearest_segment(segments, (6.0, 4.5)) == (1, 0.5)
+    assert overlays.nearest_segment(segments, (3.0, 2.9))[0] == 2
+    assert overlays.nearest_segment(segments[:0], (0.0, 0.0)) == (-1, math.inf)
+
+
+@pytest.mark.parametrize(
+    ("length", "rounded"), [(1, 1), (1.3, 1), (1.5, 2), (0.031, 0.02), (4, 5), (88, 100), (7e-9, 5e-9)]
+)
+def test_round_lengths(length, rounded):
+    assert overlays.round_length(length) == pytest.approx(rounded)
+
+
+@pytest.mark.parametrize("scale", [None, 0.3])
+def test_the_grid_lies_level_below_the_scene_at_round_distances(scale):
+    scene = blob_scene()
+    extent, up = extent_of(scene), np.array([0, -1.0, 0])
+    grid = overlays.ground_grid(extent, up, scale)
+    heights = grid.segments @ up
+    assert np.ptp(heights) < 1e-9
+    below = (scene.gaussians.means.astype(float) @ up < heights[0, 0]).mean()
+    assert 0 < below < 0.05
+    unit = scale or 1.0
+    assert overlays.round_length(grid.spacing * unit) == pytest.approx(grid.spacing * unit)
+    right = grid.segments[:, 0] @ frame_of(up)[0]
+    np.testing.assert_allclose(right / grid.spacing, np.rint(right / grid.spacing), atol=1e-9)
+    assert 8 < len(grid.segments) < 40
+    for text, point in grid.marks:
+        along = frame_of(up)[[0, 2]] @ point * unit
+        assert np.abs(along - float(text)).min() < 1e-9
+
+
+def test_the_edges_of_a_box_join_neighbouring_corners():
+    box = instances.OrientedBox(np.array([1.0, 2, 3]), np.eye(3), np.array([3.0, 2, 1]))
+    edges = overlays.box_edges(box.corners)
+    lengths = np.sort(np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1))
+    np.testing.assert_allclose(lengths, [2.0] * 4 + [4.0] * 4 + [6.0] * 4)
+    assert len({tuple(sorted(map(tuple, edge))) for edge in edges.tolist()}) == 12
+
+
+# Words beside things: none covers another, and they stay where they are while nothing meets.
+
+PICTURE = (400.0, 300.0)
+
+
+def test_labels_that_meet_lie_one_above_the_other():
+    for wanted, heights in (((45, 50, 60), [45, 25, 5]), ((0, 3, 6), [0, 3, 6])):  # without room they stay
+        labels = placed([PlacedText(0, y, 50, 20) for y in wanted], PICTURE)
+        assert [label.y for label in labels] == heights
+
+
+def random_labels(seed: int, count: int) -> list[PlacedText]:
+    rng = np.random.default_rng(seed)
+    return [
+        PlacedText(*map(float, rng.uniform((-20, -20), (420, 320))), float(rng.uniform(20, 90)), 18.0)
+        for _ in range(count)
+    ]
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_labels_in_the_open_do_not_cover_each_other(seed):
+    labels = [replace(label, y=label.y + 500) for label in random_labels(seed, 25)]
+    found = placed(labels, (PICTURE[0], 900.0))
+    assert not any(a.covers(b) for a, b in combinations(found, 2))
+    assert all(0 <= label.x <= PICTURE[0] - label.width for label in found)
+
+
+def test_small_moves_move_labels_as_little_until_two_meet():
+    """Things that drift by a tenth of a pixel a frame: labels follow, but for a jump where two meet."""
+    start, rng = random_labels(3, 8), np.random.default_rng(0)
+    drift = rng.uniform(-0.1, 0.1, (8, 2))
+    before, jumps = placed(start, PICTURE), 0
+    for frame in range(1, 400):
+        moved = [
+            PlacedText(label.x + frame * float(dx), label.y + frame * float(dy), label.width, label.height)
+            for label, (dx, dy) in zip(start, drift, strict=True)
+        ]
+        after = placed(moved, PICTURE)
+        jumps += sum(abs(a.y - b.y) > 0.25 for a, b in zip(before, after, strict=True))
+        before = after
+    assert jumps <= 8
+
+
+# What is said beside the cursor, without a window.
+
+
+@pytest.fixture(scope="module")
+def compiled() -> None:
+    """The kernels that look at a pixel: half a minute on a fresh machine."""
+    engine = QueryEngine(blob_scene(), lambda encoder_id: FakeEncoder())
+    camera = engine.scene.cameras[0].resized(16, 12)
+    look_at_pixel(load_lifting_rasterizer("cpu"), Describer(engine, ("mug",)), camera, (8, 6))
+
+
+@pytest.fixture
+def pointing(compiled, opened):
+    """The mug asked for, and the mouse asked about."""
+    settings.resize(opened, 160, 120)
+    ask(opened, "mug")
+    viewpoint.toggle_pointing(opened)
+    return opened
+
+
+def at(viewer, thing: int) -> tuple[int, int]:
+    x, y = viewer.state.view.camera(160, 120).project(CENTRES[thing][None])[0][0]
+    return int(x), int(y)
+
+
+def rest(viewer, pixel, seconds: float = 0.5) -> None:
+    """The mouse lies still there."""
+    began = viewer.clock
+    for now in (began, began + seconds):
+        viewpoint.tick(viewer, now)
+        viewpoint.hover(viewer, pixel)
+    settle(viewer)
+
+
+def test_tooltip_appears_when_the_mouse_stops(pointing):
+    rest(pointing, at(pointing, 0), seconds=0.05)
+    assert pointing.state.hover.found is None
+    rest(pointing, at(pointing, 0))
+    found = pointing.state.hover
+    assert found.phrases == ("mug",)
+    assert found.found.relevancy[0] > 0.9
+    assert "mug" in said(found.found.words[2], sure=False)
+    assert "%" not in said(found.found.words[2], sure=False)
+    assert "mug 100 %" in said(found.found.words[2], sure=True)
+    first, *_, last = pointed_figures(found)
+    assert (first[:5], "away" in last) == ("mug: ", True)
+
+
+def test_tooltip_disappears_when_mouse_or_camera_moves(pointing):
+    rest(pointing, at(pointing, 0))
+    viewpoint.hover(pointing, (3, 4))
+    assert pointing.state.hover.found is None
+    rest(pointing, at(pointing, 1))
+    assert pointing.state.hover.found is not None
+    viewpoint.step_camera(pointing, 1)
+    for now in (10.0, 11.0):
+        viewpoint.tick(pointing, now)
+    viewpoint.hover(pointing, at(pointing, 1))
+    assert pointing.state.hover.found is None
+    for elsewhere in (None, (-1, 5), (160, 5), (5, 120)):
+        viewpoint.hover(pointing, elsewhere)
+        assert pointing.state.hover is None
+    open_scene(pointing, "plain.ply")  # which means nothing
+    assert not pointing.state.pointing
+    viewpoint.toggle_pointing(pointing)
+    assert not pointing.state.pointing
+    assert "langsplat train" in errors(pointing)[-1]

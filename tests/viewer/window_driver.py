@@ -32,7 +32,7 @@ from langsplat_viewer.viewer import Services, Viewer
 from langsplat_viewer.window import Window, WindowRequest
 from tests.support.fakes import CENTRES, FakeEncoder
 from tests.support.processes import serve
-from tests.viewer import scenarios_panels, scenarios_scene
+from tests.viewer import scenarios
 
 MUG, BOOK, PLANT = CENTRES
 PATIENCE = 240.0  # seconds: other tests may have the cores
@@ -413,15 +413,6 @@ def close_while_opening(s: Session) -> None:
     Timer(1.0, READ_ON.set).start()  # when the window is closed
 
 
-def look_from_the_broad_side(s: Session) -> None:
-    """Without cameras, and upright: the blobs lie beside each other, none behind another."""
-    assert s.state.scene.cameras == ()
-    assert abs(s.state.view.rotation[2] @ [1, 0, 0]) < 0.5  # along which the blobs lie
-    assert abs(s.state.view.rotation[0] @ s.state.view.up) < 1e-6
-    rgb = s.shot("bare")
-    assert [s.at(rgb, thing).argmax() for thing in CENTRES] == [0, 1, 2]
-
-
 def end_by_signals(s: Session) -> None:
     """What is not saved is asked about, and a film is waited for."""
     s.viewer.recorder.submit("a film", slow_film, print, print)
@@ -464,16 +455,15 @@ OPENED = {  # scene and request of the scenarios that do not just open "blobs.pl
     "leave_settings": ("blobs.ply", {"settings": Path("settings")}),
     "find_settings": ("blobs.ply", {"settings": Path("settings")}),
     "close_while_opening": ("blobs.ply", {"load": slow_load}),
-    "look_from_the_broad_side": ("wide.ply", {}),
     "look_at_nothing": ("nothing.ply", {}),
     "large_letters": ("blobs.ply", {"size": (1280, 720)}),
 }
 
 
 def play_one(arguments: list[str]) -> None:
-    """Play the scenario that is the function of that name, here or in one of the modules of scenarios."""
+    """Play the scenario that is the function of that name, here or among the scenarios."""
     name, folder = arguments
-    known = {**vars(scenarios_scene), **vars(scenarios_panels), **globals()}
+    known = {**vars(scenarios), **globals()}
     scene, request = OPENED.get(name, ("blobs.ply", {}))
     Session(Path(folder), scene, **request).run(known[name])
     print("PASSED")

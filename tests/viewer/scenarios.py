@@ -1,28 +1,323 @@
-"""Scenarios of `window_driver` in the panels: files, training, layout, recording, bookmarks, keys."""
+"""Scenarios of `window_driver`: what is seen and done with mouse and keys."""
 
-import sys
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tests.support.windowless import answer, result
-
-from imgui_bundle import imgui  # isort: skip
-from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
-import glfw  # isort: skip
 from langsplat_core.extensions.library import panel as library_panel
-from langsplat_core.io.scenes import save_scene
-from langsplat_core.semantics.features import ImageFeatures
-from langsplat_viewer import viewer as training
-from langsplat_viewer.actions import editing, opening, settings, viewpoint
+from langsplat_core.io.scenes import load_scene, save_scene
+from langsplat_core.semantics.store import ImageFeatures
+from langsplat_viewer.actions import browsing, editing, filming, opening, selecting, settings
+from langsplat_viewer.camera.controls import from_side
 from langsplat_viewer.commands import COMMANDS
-from langsplat_viewer.files.projects import read_flight
+from langsplat_viewer.files.preferences import with_recent
+from langsplat_viewer.panels import overlays, select
 from langsplat_viewer.panels.layout import all_panels
 from langsplat_viewer.panels.menus import button_label
 from langsplat_viewer.panels.ui import scene_area
+from langsplat_viewer.rendering.request import TINT
 from tests.support.fakes import CENTRES, PER_BLOB, as_trained, blob_scene, cameras, named_scene
+from tests.support.windowless import answer, marked, result
+
+from imgui_bundle import hello_imgui, imgui  # isort: skip
+from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
+import glfw  # isort: skip
+
+
+MUG, BOOK, PLANT = CENTRES
+
+
+def split_the_view(s: Any) -> None:
+    """The line is dragged without the camera; nothing is drawn for it, and nothing at rest."""
+    rgb = s.shot("rgb")
+    s.key("V")
+    assert s.state.session.split.mode == "wipe"
+    both, area, before = s.shot("both"), scene_area(), s.state.view
+    np.testing.assert_allclose(s.at(both, MUG), s.at(rgb, MUG), atol=2)
+    assert np.abs(s.at(both, PLANT) - s.at(rgb, PLANT)).max() > 40  # depth
+
+    middle, y = area.left + area.width / 2, area.top + 0.8 * area.height
+    drawn = s.drawn
+    s.drag((middle, y), (area.left + 0.9 * area.width, y))
+    assert abs(s.state.session.split.at - 0.9) < 0.02
+    assert s.state.view is before
+    assert s.drawn == drawn
+    np.testing.assert_allclose(s.at(s.shot("wiped"), PLANT), s.at(rgb, PLANT), atol=2)
+
+    s.drag((middle, y), (middle + 40, y))  # beside the line the camera turns as ever
+    assert s.state.view is not before
+    s.menu("View", "Three levels side by side")
+    levels = s.shot("levels")
+    assert s.drawn > drawn
+    thirds = [levels[250:400, int(area.left + (i + 0.5) * area.width / 3)] for i in range(3)]
+    assert np.abs(thirds[0] - thirds[2]).max() > 30
+    s.draws_nothing()
+
+
+def draw_over_the_scene(s: Any) -> None:
+    """The end of an axis turns the view, a click on a camera stands there, two clicks measure."""
+    s.menu("View", "Show or hide the axes")
+    s.menu("View", "Show or hide the training cameras")
+    area, before = scene_area(), s.state.view
+    corner = s.ctx.item_info("//axes/sides").rect_full
+    assert corner.max.x <= area.left + area.width + 1
+    forward = from_side(before, "top").rotation[2]
+    end = -before.rotation[:2] @ forward * overlays.REACH_OF_ENDS * (corner.max.x - corner.min.x)
+    s.click_at(((corner.min.x + corner.max.x) / 2 + end[0], (corner.min.y + corner.max.y) / 2 + end[1]))
+    np.testing.assert_allclose(s.state.view.rotation[2], forward, atol=1e-6)
+
+    turn_the_wheel(s, 8)  # until all cameras are in the picture
+    camera = s.state.scene.cameras[2]
+    seen = s.shot("cameras")
+    s.menu("View", "Show or hide the training cameras")
+    assert np.abs(seen - s.shot("none"))[:, int(area.left) :].max() > 60
+    s.menu("View", "Show or hide the training cameras")
+    s.click_at(s.on_screen(camera.position))
+    assert s.state.camera_index == 2
+    got = s.state.view.camera(160, 120).world_to_camera
+    np.testing.assert_allclose(got, camera.world_to_camera, atol=1e-9)
+
+    s.key("M", frames=2)
+    turned = s.state.view
+    for thing in (MUG, BOOK):
+        s.click_at(s.on_screen(thing))
+    assert s.state.view is turned
+    assert abs(s.state.session.ruler.length - np.linalg.norm(MUG - BOOK)) < 0.2
+    s.ctx.mouse_double_click(0)  # two points in quick succession; elsewhere it would move the view
+    s.settle()
+    assert s.state.view is turned
+    assert s.state.session.ruler.length is not None
+    assert s.state.session.ruler.length < 0.05
+    s.draws_nothing()
+    s.key("escape", frames=2)
+    assert not s.state.session.ruler.measures
+
+
+def turn_the_wheel(s: Any, times: int) -> None:
+    """Away from the scene, over its middle."""
+    area = scene_area()
+    for _ in range(times):
+        s.ctx.mouse_teleport_to_pos((area.left + area.width / 2, area.top + area.height / 2))
+        s.ctx.mouse_wheel_y(-1)
+        s.ctx.yield_(2)
+    s.settle()
+
+
+def look_without_perspective(s: Any) -> None:
+    """A key takes perspective away until it is pressed again; the picture says what it is."""
+    deep, view = s.shot("deep"), s.state.view
+    s.key("O")
+    assert s.state.view.orthographic
+    flat, area = s.shot("flat"), scene_area()
+    for thing in CENTRES:
+        assert s.at(flat, thing).argmax() == s.at(deep, thing).argmax()
+    corner = (slice(int(area.top + area.height) - 40, None), slice(int(area.left), int(area.left) + 200))
+    assert (flat[corner].min(-1) > 200).sum() > 100  # words
+    s.key("keypad5")
+    poses = [one.camera(160, 120).world_to_camera for one in (s.state.view, view)]
+    np.testing.assert_allclose(*poses, atol=1e-9)
+
+
+# Selecting.
+
+
+def around(s: Any, centre: np.ndarray) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Two corners around a blob, as it is seen now."""
+    x, y = s.on_screen(centre)
+    right, _ = s.on_screen(centre + 0.6 * s.state.view.rotation[0])
+    half = right - x
+    return (x - half, y - half), (x + half, y + half)
+
+
+def looks_selected(colour: np.ndarray) -> bool:
+    """Whether a colour of the picture, 0 to 255, has the tint."""
+    return bool(np.abs(colour - 255 * TINT).max() < 0.55 * 255 and colour[2] > colour[1] + 60)
+
+
+def select_with_the_mouse(s: Any) -> None:
+    """A rectangle, keys and buttons; what they did is undone."""
+    s.key("period")  # the camera in front: no blob hides another
+    plain = s.shot("plain")
+    s.menu("Window", "Select")
+    s.click("//**/Rectangle##tool")
+    s.drag(*around(s, PLANT))
+    seen = s.state.marks.selected
+    assert 10 < seen.sum() < 110  # the front of it
+    s.click("//**/Only what is visible")
+    before = s.state.view
+    s.drag(*around(s, PLANT))
+    assert s.state.view is before  # the drag turned nothing
+    assert marked(s.viewer) == ("plant", "", "")
+    chosen = s.shot("chosen")
+    assert looks_selected(s.at(chosen, PLANT))
+    np.testing.assert_allclose(s.at(chosen, BOOK), s.at(plain, BOOK), atol=6)
+
+    s.ctx.key_down(imgui.Key.mod_shift)
+    s.drag(*around(s, BOOK))
+    s.ctx.key_up(imgui.Key.mod_shift)
+    assert marked(s.viewer)[0] == "book plant"
+
+    s.key("H")
+    assert marked(s.viewer) == ("", "book plant", "")
+    s.key("Ctrl+Z")
+    assert marked(s.viewer) == ("book plant", "", "")
+    s.key("escape", frames=3)
+    assert s.state.tools.tool is None
+    s.drag((600, 300), (656, 279))
+    assert not np.array_equal(before.rotation, s.state.view.rotation)  # the drag turns again
+
+
+def outline_and_rest(s: Any) -> None:
+    """An outline is drawn while the button is held, Esc gives it up, and nothing is drawn again at rest."""
+    s.menu("Select", "Select: lasso")
+    s.ctx.mouse_teleport_to_pos((500, 200))
+    s.ctx.mouse_down(0)
+    for place in ((700, 200), (700, 400), (520, 390)):
+        s.ctx.mouse_teleport_to_pos(place)
+        s.ctx.yield_(2)
+    assert len(s.state.tools.stroke.path) == 4
+    line = s.shot("lasso")[196:205, 600]
+    assert line.min(1).max() > 100  # a light line on black
+    s.key("escape", frames=1)
+    s.ctx.mouse_up(0)
+    s.settle()
+    assert (s.state.tools.stroke, s.state.tools.tool) == (None, "lasso")
+    assert marked(s.viewer)[0] == ""
+    s.draws_nothing()
+
+
+def ask_before_leaving(s: Any) -> None:
+    """What was deleted and not saved is asked about before another scene opens or the window closes."""
+    s.search("mug")
+    s.menu("Select", "Select what the search found")
+    s.key("delete")
+    assert marked(s.viewer) == ("", "", "mug")
+    s.drop("plain.ply")
+    s.click("//**/Cancel")
+    assert s.state.path.name == "blobs.ply"
+
+    s.menu("File", "Quit")
+    assert not hello_imgui.get_runner_params().app_shall_exit
+    s.click("//**/Cancel")
+    assert not s.state.may_close
+    glfw.set_window_should_close(glfw_window_hello_imgui(), True)  # its cross was clicked
+    s.wait(lambda: s.state.leaving is not None)
+    s.click("//**/Cancel")
+    assert marked(s.viewer) == ("", "", "mug")
+
+    s.drop("plain.ply")
+    s.click("//**/Not saved/Save")
+    s.shows("plain.ply")
+    assert len(load_scene(s.folder / "blobs-edited-001.ply").gaussians) < 360
+    assert len(load_scene(s.folder / "blobs.ply").gaussians) == 360  # as it was
+
+
+def drag_the_gizmo(s: Any) -> None:
+    """What was found is moved by the gizmo's middle, and seen there; the camera stays."""
+    viewer, before = s.viewer, s.state.scene.gaussians.means.copy()
+    rgb = s.shot("rgb")
+    s.search("mug")
+    selecting.select_query(viewer)
+    settings.set_display(viewer, "rgb")
+    s.open_panel("Transform", frames=1)
+    s.key("G")
+    view, chosen = s.state.view, s.state.marks.selected
+    x, y = s.on_screen(editing.pivot(viewer))
+    s.ctx.mouse_teleport_to_pos((x, y))
+    for covered in (True, False):  # by a window over the scene, whose mouse it leaves alone
+        viewer.state.show_help = covered
+        s.ctx.yield_(3)
+        assert select.holds_mouse(viewer) != covered
+    with s.dragging((x, y), (x + 60, y - 120)):
+        assert s.state.moving is not None
+        s.capture(s.folder / "dragging.png")
+    s.settle()
+    assert s.state.view is view
+    moved = s.state.scene.gaussians.means - before
+    assert (moved[~chosen] == 0).all()
+    assert np.ptp(moved[chosen], axis=0).max() < 1e-5
+    went = s.on_screen(editing.pivot(viewer))
+    np.testing.assert_allclose(went, (x + 60, y - 120), atol=3)
+    selecting.select_none(viewer)
+    for _ in range(4):  # off again
+        s.key("G", frames=1)
+    shot = s.shot("moved")
+    assert s.at(shot, MUG + moved[chosen][0]).argmax() == s.at(rgb, MUG).argmax()
+    assert np.abs(s.at(shot, MUG) - s.at(rgb, MUG)).max() > 40
+
+    s.key("Ctrl+Z")
+    np.testing.assert_array_equal(s.state.scene.gaussians.means, before)
+
+
+def drag_the_crop_box(s: Any) -> None:
+    """A corner of the box is dragged, and what lies outside is cropped."""
+    viewer = s.viewer
+    s.open_panel("Transform", frames=1)
+    editing.fill_box(viewer)
+    s.ctx.yield_(2)
+    s.ctx.item_click("//Transform/Box##gizmo")
+    form, means = s.state.edit_form, s.state.scene.gaussians.means
+    middle = np.array(s.on_screen(np.mean([form.low, form.high], 0)))
+    for corner in product(*zip(form.low, form.high, strict=True)):
+        start = np.array(s.on_screen(np.array(corner)))
+        s.drag(tuple(start), tuple(start + 0.8 * (middle - start)))
+        if s.state.edit_form != form:
+            break
+    low, high = s.state.edit_form.low, s.state.edit_form.high
+    inside = ((means >= low) & (means <= high)).all(1)
+    s.click("//Transform/Crop")
+    np.testing.assert_array_equal(s.state.marks.shown, inside)
+    assert 0 < inside.sum() < len(means)
+    s.key("Ctrl+Z")
+    s.ctx.item_click("//Transform/No gizmo##gizmo")
+    assert s.state.marks.shown.all()
+
+
+def compare_two_scenes(s: Any) -> None:
+    """Right of the line another scene is drawn by the same camera and answers the same phrase; without
+    the line it is gone."""
+    viewer = s.viewer
+    s.search("mug")
+    alone, area = s.shot("alone"), scene_area()
+    gaussians = blob_scene().gaussians
+    dyed = replace(blob_scene(), path=None, gaussians=replace(gaussians, sh=-gaussians.sh))
+    save_scene(s.folder / "other.ply", dyed)
+    settings.set_display(viewer, "rgb")
+    rgb = s.shot("rgb one")
+    opening.open_beside(viewer, s.folder / "other.ply")
+    s.wait(lambda: len(viewer.beside.state.session.queries) == 1 and viewer.beside.worker.current is None)
+    settings.move_line(viewer, 0.5)
+    both = s.shot("rgb two")
+    middle = int(area.left + area.width / 2)
+    assert (both == rgb)[100:450, 450 : middle - 8].all()
+    assert np.abs(both - rgb)[100:450, middle + 8 :].max() > 60
+    settings.set_display(viewer, "relevancy")
+    assert (s.shot("asked") == alone)[100:450, 450 : middle - 8].all()
+    settings.set_split(viewer, "off")
+    assert (s.shot("alone again") == alone)[100:450, 450:].all()
+    assert viewer.beside is None
+
+
+def pin_a_note(s: Any) -> None:
+    """What is typed after the click is its text; it is kept in the project, and undone."""
+    s.key("N", frames=2)
+    s.click_at(s.on_screen(BOOK))
+    s.wait(lambda: imgui.get_io().want_text_input)
+    s.ctx.key_chars("lent by Ada")
+    s.key("enter", frames=2)
+    (note,) = s.state.session.notes
+    assert (note.text, s.state.pins_notes) == ("lent by Ada", False)
+    assert np.linalg.norm(note.at - BOOK) < 1.0
+    s.key("Ctrl+Shift+S", frames=1)
+    s.until((s.folder / "blobs-001.langsplat").exists)
+    for left in (1, 0):
+        s.key("Ctrl+Z")
+        assert len(s.state.session.notes) == left
+    browsing.open_file(s.viewer, s.folder / "blobs-001.langsplat")
+    s.until(lambda: s.state.session.notes == (note,))
 
 
 def reload_what_changed(s: Any) -> None:
@@ -39,8 +334,6 @@ def reload_what_changed(s: Any) -> None:
     assert s.state.view is view
     assert result(s, 0).found
     assert not s.ctx.item_exists("//changed/Reload")
-    hot = s.at(s.shot("reloaded"), CENTRES[0])
-    assert hot[0] > hot[2] + 60
 
 
 def see_the_evidence(s: Any) -> None:
@@ -59,20 +352,6 @@ def see_the_evidence(s: Any) -> None:
     s.ctx.window_close("//###evidence")
     s.ctx.yield_(2)
     assert s.state.evidence is None
-
-
-def switch_between_scenes(s: Any) -> None:
-    """Dropped together; the list in the panel shows one after the other, as it was left."""
-    s.drop("blobs.ply", "plain.ply")
-    assert [path.name for path in s.state.scenes] == ["blobs.ply", "plain.ply"]
-    s.drag((600, 300), (656, 279))
-    view = s.state.view
-    s.ctx.item_click("//**/plain.ply##scenes")
-    s.shows("plain.ply")
-    assert s.state.view is not view
-    s.key("Ctrl+page_up", frames=1)
-    s.shows("blobs.ply")
-    assert s.state.view is view
 
 
 def search_a_library(s: Any) -> None:
@@ -96,35 +375,6 @@ def search_a_library(s: Any) -> None:
     s.shows("named.ply")
     assert s.state.session.queries[0].phrase == "plant"
     assert result(s, 0).found
-
-
-TRAINS = """
-import json, sys, time
-for step in range(60):
-    report = {"stage": "training Gaussians", "fraction": step / 60, "note": f"{300 + step} Gaussians"}
-    report["metrics"] = {"loss": 0.04 + 0.2 / (1 + step)}
-    print(json.dumps(report), file=sys.stderr, flush=True)
-time.sleep(60)
-"""
-
-
-def watch_a_training(s: Any) -> None:
-    """The panel plots what the process says of its loss."""
-    viewer, photographs = s.viewer, s.folder / "photos"
-    photographs.mkdir()
-    for number in range(3):
-        (photographs / f"{number}.jpg").write_bytes(b"")
-    training.command = lambda request: [sys.executable, "-c", TRAINS]
-    opening.choose_photographs(viewer, photographs)
-    s.open_panel("Train", frames=3)
-    s.ctx.item_click("//Train/Train")
-    s.wait(lambda: viewer.training is not None and len(viewer.training.progress.losses) > 50)
-    shot, plot = s.shot("loss"), s.ctx.item_info("//Train/##loss").rect_full
-    inside = shot[int(plot.min.y) : int(plot.max.y), int(plot.min.x) : int(plot.max.x)]
-    assert np.ptp(inside) > 60
-    s.ctx.item_click("//Train/Stop")
-    s.wait(lambda: viewer.training is None)
-    assert "training stopped" in s.state.messages[-1].text
 
 
 # Where things lie: large letters, long words.
@@ -210,7 +460,7 @@ def use_the_outline_by_keys(s: Any, node: int) -> None:
 
 
 def record_and_play(s: Any) -> None:
-    """Keyframes by a key, played in the window, saved as a path and as a film."""
+    """Keyframes by a key, played in the window until the hand takes over."""
     record = s.state.record
     s.open_panel("Record", frames=4)
     for end in ((656, 300), (700, 320)):
@@ -219,52 +469,16 @@ def record_and_play(s: Any) -> None:
     s.click("//Record/Add keyframe", frames=2)
     assert [key.seconds for key in s.state.session.keyframes] == [0, 2, 4]
     last = s.state.view
-    s.ctx.item_click("//Record/Clear")
-    s.key("Ctrl+Z", frames=2)
-    assert len(s.state.session.keyframes) == 3
-
-    viewpoint.set_path_seconds(s.viewer, 60.0)  # longer than a frame may take
-    start = s.shot("start")
-    s.ctx.item_click("//Record/Play##path")
-    s.wait(lambda: 0.2 < record.at < 60.0)
-    moving = s.state.view
-    viewpoint.set_path_seconds(s.viewer, 1.0)
+    filming.set_path_seconds(s.viewer, 1.0)
     s.ctx.item_click("//Record/Play##path")
     s.wait(lambda: record.began is None)
-    assert record.at == 1.0
     np.testing.assert_allclose(s.state.view.eye, last.eye, atol=1e-6)
-    assert np.abs(moving.eye - last.eye).max() > 1e-3
-    viewpoint.set_path_seconds(s.viewer, 60.0)
+    filming.set_path_seconds(s.viewer, 60.0)  # longer than a frame may take
     s.key("Shift+K", frames=1)  # from the start again
     s.wait(lambda: 0 < record.at < 59.0)
-    s.drag((600, 300), (620, 310))  # the hand is stronger
+    assert np.abs(s.state.view.eye - last.eye).max() > 1e-3
+    s.drag((600, 300), (620, 310))
     assert record.began is None
-    assert np.abs(s.shot("elsewhere") - start)[100:500, 400:].max() > 30
-
-    s.click("//Record/Save path", frames=2)
-    assert len(read_flight(s.folder / "blobs-001.path.json").keyframes) == 3
-    viewpoint.set_path_seconds(s.viewer, 1.0)
-    settings.put(s.viewer.state.record, size=(32, 24))
-    s.viewer.state.record.fps = 4.0
-    s.viewer.state.record.film_file = "film"
-    s.ctx.item_click("//Record/Save film")
-    s.until(lambda: s.viewer.recorder.current is None)
-    assert len(list((s.folder / "film").glob("frame-*.png"))) == 5
-
-
-def mark_and_return(s: Any) -> None:
-    """A bookmark by its key, the sides by theirs."""
-    s.key("Ctrl+B", frames=2)
-    start = s.state.view
-    s.key("keypad7")
-    np.testing.assert_allclose(s.state.view.rotation[2], -start.up, atol=1e-6)
-    s.open_panel("Bookmarks", frames=4)
-    s.click("//**/view 1##bookmarks")
-    np.testing.assert_allclose(s.state.view.rotation, start.rotation, atol=1e-6)
-    s.ctx.item_click("//**/##bookmark")
-    s.enter("by the key of k", frames=2)
-    assert [mark.name for mark in s.state.session.bookmarks] == ["view 1", "by the key of k"]
-    assert s.state.session.keyframes == ()
 
 
 # Keys, palette, toolbar, and where panels lie.
@@ -281,20 +495,6 @@ def use_the_palette(s: Any) -> None:
     s.enter("show depth", frames=3)
     assert s.state.session.picture.display == "depth"
     assert not s.state.show_palette
-
-    s.key("Ctrl+Shift+P", frames=3)
-    for width, height in ((1100, 600), (200, 150)):
-        resize(s, width, height)
-        palette = s.ctx.window_info("//Commands").window
-        assert abs(palette.pos.x + palette.size.x / 2 - width / 2) < 2 or width == 200
-        assert 0 <= palette.pos.x <= palette.pos.x + palette.size.x <= width
-    s.key("escape", frames=1)
-    resize(s, 860, 620)
-
-
-def resize(s: Any, width: int, height: int) -> None:
-    glfw.set_window_size(glfw_window_hello_imgui(), width, height)
-    s.until(lambda: imgui.get_main_viewport().size.x == width)
 
 
 def use_shortcuts(s: Any) -> None:
@@ -345,11 +545,6 @@ def use_the_toolbar(s: Any) -> None:
     s.click(icons["select: lasso"], frames=2)
     assert (s.state.session.picture.display, s.state.tools.tool) == ("depth", "lasso")
     s.ctx.item_click(icons["select with no tool: the left button turns the view"])
-    for phrase in ("mug", "book"):
-        s.search(phrase)
-    s.click("//**/Fixed heat scale", frames=2)
-    lows, highs = zip(*(found.heat_range for found in s.state.shown_results()), strict=True)
-    assert s.state.session.picture.heat_scale == (min(lows), max(highs))
 
 
 def many_queries(s: Any) -> None:
@@ -449,6 +644,3 @@ def travel_by_keys(s: Any) -> None:
         s.key("down_arrow", frames=2)
     s.key("enter", frames=3)
     assert s.state.session.picture.display == "depth"
-    s.key("Ctrl+Shift+P", frames=3)
-    s.enter("teleport", frames=3)
-    assert s.state.show_palette
