@@ -10,10 +10,9 @@ import numpy as np
 from langsplat_core.extensions.library import panel as library_panel
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.semantics.store import ImageFeatures
-from langsplat_viewer.actions import browsing, editing, filming, opening, selecting, settings
+from langsplat_viewer.actions import editing, opening, settings, viewpoint
 from langsplat_viewer.camera.controls import from_side
 from langsplat_viewer.commands import COMMANDS
-from langsplat_viewer.files.preferences import with_recent
 from langsplat_viewer.panels import overlays, select
 from langsplat_viewer.panels.layout import all_panels
 from langsplat_viewer.panels.menus import button_label
@@ -220,7 +219,7 @@ def drag_the_gizmo(s: Any) -> None:
     viewer, before = s.viewer, s.state.scene.gaussians.means.copy()
     rgb = s.shot("rgb")
     s.search("mug")
-    selecting.select_query(viewer)
+    editing.select_query(viewer)
     settings.set_display(viewer, "rgb")
     s.open_panel("Transform", frames=1)
     s.key("G")
@@ -241,7 +240,7 @@ def drag_the_gizmo(s: Any) -> None:
     assert np.ptp(moved[chosen], axis=0).max() < 1e-5
     went = s.on_screen(editing.pivot(viewer))
     np.testing.assert_allclose(went, (x + 60, y - 120), atol=3)
-    selecting.select_none(viewer)
+    editing.select_none(viewer)
     for _ in range(4):  # off again
         s.key("G", frames=1)
     shot = s.shot("moved")
@@ -316,7 +315,7 @@ def pin_a_note(s: Any) -> None:
     for left in (1, 0):
         s.key("Ctrl+Z")
         assert len(s.state.session.notes) == left
-    browsing.open_file(s.viewer, s.folder / "blobs-001.langsplat")
+    opening.open_file(s.viewer, s.folder / "blobs-001.langsplat")
     s.until(lambda: s.state.session.notes == (note,))
 
 
@@ -469,11 +468,11 @@ def record_and_play(s: Any) -> None:
     s.click("//Record/Add keyframe", frames=2)
     assert [key.seconds for key in s.state.session.keyframes] == [0, 2, 4]
     last = s.state.view
-    filming.set_path_seconds(s.viewer, 1.0)
+    viewpoint.set_path_seconds(s.viewer, 1.0)
     s.ctx.item_click("//Record/Play##path")
     s.wait(lambda: record.began is None)
     np.testing.assert_allclose(s.state.view.eye, last.eye, atol=1e-6)
-    filming.set_path_seconds(s.viewer, 60.0)  # longer than a frame may take
+    viewpoint.set_path_seconds(s.viewer, 60.0)  # longer than a frame may take
     s.key("Shift+K", frames=1)  # from the start again
     s.wait(lambda: 0 < record.at < 59.0)
     assert np.abs(s.state.view.eye - last.eye).max() > 1e-3

@@ -114,14 +114,6 @@ def test_zoom_never_sticks(view):
     assert gone > start.distance + 0.5  # on and through where the target was
 
 
-def test_focus_keeps_the_direction_of_view(view):
-    point = np.array([0.3, -0.4, 0.2])
-    focused = controls.focus(view, point, 1.5)
-    assert_allclose(pixel(focused, point), (160, 100), atol=1e-6)
-    assert_allclose(focused.rotation, view.rotation)
-    assert np.linalg.norm(focused.eye - point) == pytest.approx(1.5)
-
-
 def test_between_starts_and_ends_at_its_ends(view):
     end = controls.focus(controls.orbit(view, 2.0, 0.3), np.array([1.0, 0, 0]), 0.7)
     assert_same(controls.between(view, end, 0.0), view)
@@ -569,14 +561,3 @@ def test_moving_keeps_it(flat, move):
     go(move, flat)
     assert flat.state.view is not before
     assert flat.state.view.orthographic
-
-
-def test_a_glide_under_way_goes_on_and_has_the_projection_of_its_end(opened):
-    assert controls.between(VIEW, FLAT, 0.3).orthographic
-    assert not controls.between(FLAT, VIEW, 0.3).orthographic
-    viewpoint.look_from(opened, "top")
-    viewpoint.tick(opened, opened.clock + 0.5 * GLIDE_SECONDS)
-    go(viewpoint.toggle_orthographic, opened)
-    wanted = from_side(opened.state.view, "top")
-    assert_allclose(opened.state.view.rotation, wanted.rotation, atol=1e-9)
-    assert opened.state.view.orthographic

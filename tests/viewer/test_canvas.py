@@ -202,17 +202,6 @@ def test_merged_gaussians_are_drawn_while_a_large_scene_moves(merging, shown):
     assert sizes(renderer) == [(100, 60)]
 
 
-def test_gaussians_are_merged_anew_after_an_edit(merging, shown):
-    canvas, renderer = merging
-    counts, now = [], 0.0
-    for hidden in (0, 120):
-        put_marks(shown, hidden=np.arange(360) < hidden)
-        canvas.update(shown.state, now := now + 1.0)
-        now = moved_until_merged(canvas, renderer, shown, now)
-        counts.append(len(renderer.drawn[-1].gaussians))
-    assert 0 < counts[1] < counts[0] < 360
-
-
 def test_canvas_lets_go_of_a_scene_that_was_left(merging, shown):
     canvas, renderer = merging
     shown.state.scene = blob_scene()

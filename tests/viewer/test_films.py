@@ -15,7 +15,7 @@ from langsplat_core.io.cameras import read_cameras
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.progress import Progress, Report, WorkCancelledError
 from langsplat_viewer import output
-from langsplat_viewer.actions import browsing, editing, filming, queries, viewpoint
+from langsplat_viewer.actions import editing, opening, queries, saving, settings, viewpoint
 from langsplat_viewer.camera.controls import extent_of, orbit, zoom
 from langsplat_viewer.camera.flight import Flight, Keyframe
 from langsplat_viewer.files.projects import read_flight, write_flight
@@ -36,7 +36,7 @@ def record_three(viewer: Viewer) -> list:
     views = []
     for _ in range(3):
         views.append(viewer.state.view)
-        filming.add_keyframe(viewer)
+        viewpoint.add_keyframe(viewer)
         turn(viewer, 0.3)
     return views
 
@@ -49,7 +49,7 @@ def times(viewer: Viewer) -> list[float]:
 def frames(monkeypatch: pytest.MonkeyPatch) -> None:
     """Films are folders of images."""
     monkeypatch.setattr(output, "has_video", lambda: False)
-    monkeypatch.setattr(filming, "has_video", lambda: False)
+    monkeypatch.setattr(saving, "has_video", lambda: False)
 
 
 def test_a_played_path_goes_through_its_keyframes(opened):
@@ -84,8 +84,8 @@ def test_playing_resumes_loops_and_ends_with_a_drag(opened):
 
 def test_a_turntable_comes_back_and_begins_anew_after_a_drag(opened):
     start = opened.state.view
-    filming.set_turning(opened, True)
-    filming.set_path_seconds(opened, 4.0)
+    viewpoint.set_turning(opened, True)
+    viewpoint.set_path_seconds(opened, 4.0)
     viewpoint.toggle_playing(opened)
     began = opened.clock
     viewpoint.tick(opened, began + 2)
@@ -102,11 +102,11 @@ def test_a_turntable_comes_back_and_begins_anew_after_a_drag(opened):
 def test_keyframes_are_changed_and_changes_undone(opened):
     record_three(opened)
     first, second, third = opened.state.session.keyframes
-    filming.move_keyframe(opened, second, 5.0)
+    viewpoint.move_keyframe(opened, second, 5.0)
     assert times(opened) == [0, 4, 5]
-    filming.move_keyframe(opened, opened.state.session.keyframes[2], 4.0)  # there is one
+    viewpoint.move_keyframe(opened, opened.state.session.keyframes[2], 4.0)  # there is one
     assert times(opened) == [0, 4, 4.01]
-    filming.delete_keyframe(opened, first)
+    viewpoint.delete_keyframe(opened, first)
     assert times(opened) == [4, 4.01]
     for expected in ([0, 4, 4.01], [0, 4, 5], [0, 2, 4], [0, 2]):
         editing.undo(opened)
@@ -114,11 +114,11 @@ def test_keyframes_are_changed_and_changes_undone(opened):
     assert opened.state.session.keyframes == (first, second)
     editing.redo(opened)
     assert opened.state.session.keyframes == (first, second, third)
-    filming.replace_keyframe(opened, first)
+    viewpoint.replace_keyframe(opened, first)
     assert_allclose(opened.state.session.keyframes[0].pose.position, opened.state.view.eye)
-    filming.set_path_seconds(opened, 8)
+    viewpoint.set_path_seconds(opened, 8)
     assert times(opened) == [0, 4, 8]
-    filming.clear_path(opened)
+    viewpoint.clear_path(opened)
     assert times(opened) == []
     editing.undo(opened)
     assert times(opened) == [0, 4, 8]
@@ -126,18 +126,18 @@ def test_keyframes_are_changed_and_changes_undone(opened):
 
 def test_a_path_is_saved_loaded_and_dropped(opened, tmp_path, frames):
     record_three(opened)
-    path = filming.save_path(opened, tmp_path)
+    path = saving.save_path(opened, tmp_path)
     assert path.name == "blobs-001.path.json"
     assert len(read_flight(path).keyframes) == 3
-    filming.clear_path(opened)
-    browsing.open_dropped(opened, [path])
+    viewpoint.clear_path(opened)
+    opening.open_dropped(opened, [path])
     assert times(opened) == [0, 2, 4]
     assert opened.state.wanted_panel == "Record"
     (tmp_path / "bad.path.json").write_text("{}")
-    filming.load_path(opened, tmp_path / "bad.path.json")
+    viewpoint.load_path(opened, tmp_path / "bad.path.json")
     assert "no camera path" in errors(opened)[-1]
     assert times(opened) == [0, 2, 4]
-    filming.set_film_size(opened, 640, 0)
+    settings.put(opened.state.record, size=(640, 1))
     open_scene(opened, "plain.ply")  # has no path of this one
     assert times(opened) == []
     assert opened.state.record.size == (640, 1)
@@ -145,11 +145,11 @@ def test_a_path_is_saved_loaded_and_dropped(opened, tmp_path, frames):
 
 def test_impossible_recordings_are_refused_in_a_line(viewer, opened, tmp_path, frames):
     viewpoint.toggle_playing(opened)
-    filming.save_film(opened, tmp_path)
-    filming.save_path(opened, tmp_path)
+    saving.save_film(opened, tmp_path)
+    saving.save_path(opened, tmp_path)
     record_three(opened)
     opened.state.record.film_file = "film.avi"
-    filming.save_film(opened, tmp_path)
+    saving.save_film(opened, tmp_path)
     wanted = ["two keyframes", "needs a path", "needs a keyframe", "a film is .mp4"]
     assert [reason in text for reason, text in zip(wanted, errors(opened), strict=True)] == [True] * 4
     assert list(tmp_path.iterdir()) == []
@@ -157,10 +157,10 @@ def test_impossible_recordings_are_refused_in_a_line(viewer, opened, tmp_path, f
 
 def test_a_film_is_made_beside_the_window(opened, tmp_path, frames):
     record_three(opened)
-    filming.set_film_size(opened, 32, 24)
+    settings.put(opened.state.record, size=(32, 24))
     opened.state.record.fps = 1.0
     request = opened.state.request((32, 24))
-    filming.save_film(opened, tmp_path)
+    saving.save_film(opened, tmp_path)
     queries.ask(opened, "mug")  # the other worker answers meanwhile, and changes what is shown
     recorded(opened)
     assert "blobs-film-001/: 32x24, 5 pictures" in " ".join(m.text for m in opened.state.messages)
@@ -173,9 +173,9 @@ def test_a_film_is_made_beside_the_window(opened, tmp_path, frames):
 
 def test_a_film_can_be_stopped(opened, tmp_path, frames):
     record_three(opened)
-    filming.set_film_size(opened, 320, 240)
-    filming.save_film(opened, tmp_path)
-    filming.cancel_film(opened)
+    settings.put(opened.state.record, size=(320, 240))
+    saving.save_film(opened, tmp_path)
+    saving.cancel_film(opened)
     recorded(opened)
     opened.recorder.close(10.0)
     assert len(list(tmp_path.glob("blobs-film-001/*.png"))) < 121
@@ -186,7 +186,7 @@ def test_a_film_can_be_stopped(opened, tmp_path, frames):
 
 
 def test_pictures_are_saved_under_new_names(opened, tmp_path):
-    first, second = filming.save_picture(opened, tmp_path), filming.save_picture(opened, tmp_path)
+    first, second = saving.save_picture(opened, tmp_path), saving.save_picture(opened, tmp_path)
     assert [first.name, second.name] == ["blobs-001.png", "blobs-002.png"]
     assert np.asarray(Image.open(second)).tolist() == np.full((6, 8, 3), 77).tolist()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["blobs-001.png", "blobs-002.png"]
@@ -194,13 +194,13 @@ def test_pictures_are_saved_under_new_names(opened, tmp_path):
 
 def test_a_saved_view_can_be_read_again(opened, tmp_path):
     opened.state.size = (321, 123)
-    camera = read_cameras(filming.save_view(opened, tmp_path))[0]
+    camera = read_cameras(saving.save_view(opened, tmp_path))[0]
     expected = opened.state.view.camera(321, 123)
     assert (camera.width, camera.height) == (321, 123)
     assert_allclose(camera.world_to_camera, expected.world_to_camera, atol=1e-9)
     assert camera.fx == pytest.approx(expected.fx)
     (tmp_path / "file").write_text("not a folder")
-    for save in (filming.save_picture, filming.save_view):
+    for save in (saving.save_picture, saving.save_view):
         assert save(opened, tmp_path / "file") is None
     assert ["not saved" in text for text in errors(opened)] == [True, True]
 
@@ -363,13 +363,3 @@ def test_impossible_options_are_one_line(program, folder, arguments, reason):
     assert (code, out, len(err)) == (2, [], 1)
     assert reason in err[0]
     assert sorted(folder.rglob("*")) == before
-
-
-def test_orthographic_turntable_begins_with_the_shown_view(program, folder):
-    arguments = ["--orthographic", "3", "--size", "64x48", "--query", "plant", "--display", "rgb"]
-    for more in (["--turntable", "1", "--fps", "4", "--out", "film"], ["--out", "still.png"]):
-        assert program("blobs.ply", *arguments, *more)[0] == 0
-    first, still = picture(folder / "film" / FRAMES[0]), picture(folder / "still.png")
-    assert still.std() > 10
-    np.testing.assert_allclose(first, still, atol=2)
-    assert np.abs(picture(folder / "film" / FRAMES[1]) - still).max() > 30

@@ -74,20 +74,6 @@ def test_velocities_are_continuous(seed):
         assert np.abs(before[:6]).max() > 0.05  # and it does not stop there
 
 
-def test_uneven_keyframes_on_a_parabola_stay_on_it():
-    path = Flight(tuple(key(t, (t * t, 0, 0)) for t in (0.0, 1.0, 1.5, 4.0, 5.0)))
-    times = np.linspace(1.0, 4.0, 13)
-    assert_allclose([pose.position[0] for pose in path.poses(times)], times**2, atol=1e-12)
-
-
-def test_two_keyframes_are_an_even_straight_way():
-    flight = Flight((key(1, (0, 0, 0)), key(3, (4, -2, 0), (0, 1, 0))))
-    for t in np.linspace(1, 3, 9):
-        pose = pose_at(flight, t)
-        assert_allclose(pose.position, np.array([4, -2, 0]) * (t - 1) / 2, atol=1e-12)
-        assert_allclose(pose.rotation, turned(0, (t - 1) / 2, 0), atol=1e-12)
-
-
 def test_an_even_turn_stays_even_and_agrees_with_scipys_spline():
     axis = np.array([1.0, 2, -1]) / math.sqrt(6)
     times = np.array([0.0, 1, 2.5, 3, 5])

@@ -383,22 +383,6 @@ def test_labels_in_the_open_do_not_cover_each_other(seed):
     assert all(0 <= label.x <= PICTURE[0] - label.width for label in found)
 
 
-def test_small_moves_move_labels_as_little_until_two_meet():
-    """Things that drift by a tenth of a pixel a frame: labels follow, but for a jump where two meet."""
-    start, rng = random_labels(3, 8), np.random.default_rng(0)
-    drift = rng.uniform(-0.1, 0.1, (8, 2))
-    before, jumps = placed(start, PICTURE), 0
-    for frame in range(1, 400):
-        moved = [
-            PlacedText(label.x + frame * float(dx), label.y + frame * float(dy), label.width, label.height)
-            for label, (dx, dy) in zip(start, drift, strict=True)
-        ]
-        after = placed(moved, PICTURE)
-        jumps += sum(abs(a.y - b.y) > 0.25 for a, b in zip(before, after, strict=True))
-        before = after
-    assert jumps <= 8
-
-
 # What is said beside the cursor, without a window.
 
 

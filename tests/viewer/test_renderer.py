@@ -21,11 +21,9 @@ from langsplat_core.raster.reference import ReferenceRasterizer, colours
 from langsplat_core.scene import Camera, Gaussians, Scene, look_at
 from langsplat_viewer.actions import editing, settings, viewpoint
 from langsplat_viewer.camera.controls import default_view, extent_of, from_camera
-from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.rendering import renderer as renderers
 from langsplat_viewer.rendering.renderer import ArrayRenderer, GlRenderer, render_image, renderer_for
 from langsplat_viewer.rendering.request import (
-    UNCLIPPED,
     Clip,
     RenderRequest,
     Split,
@@ -37,9 +35,9 @@ from langsplat_viewer.rendering.request import (
     why_undrawable,
 )
 from tests.support.backends import gl_state
-from tests.support.fakes import CENTRES, blob_scene
+from tests.support.fakes import blob_scene
 from tests.support.scenes import random_answer, random_camera, random_gaussians, random_scene, with_tree
-from tests.support.windowless import marked, on_screen, rest
+from tests.support.windowless import marked
 
 COUNT = 150
 SCENE = with_tree(random_scene(COUNT))
@@ -171,22 +169,6 @@ def test_the_reference_image_is_composed_of_float64_channels():
         expected = compose(Channels(image[..., :3], alpha, extra), picture, ranges[display])
         got = ArrayRenderer(ReferenceRasterizer()).read(request_for(display))
         assert (np.abs(got.astype(int) - expected).max(-1) > 1).mean() <= 2e-3
-
-
-@pytest.mark.parametrize("display", DISPLAYS)
-def test_images_with_and_without_a_graphics_device_agree(gl, display):
-    with_gl, without = (render_image(request_for(display), backend) for backend in ("opengl", "cpu"))
-    difference = np.abs(with_gl.astype(int) - without).max(-1)
-    assert np.quantile(difference, 0.95) <= 4  # half floats, and heat colours that magnify them
-    if display == "rgb":
-        assert difference.max() <= 3
-
-
-def test_a_missing_channel_shows_the_plain_colours(renderer):
-    plain = plain_request(replace(SCENE, language=None), CAMERA, PICTURE)
-    for display in (row.name for row in DISPLAYS.values() if row.needs_field):
-        request = replace(plain, picture=replace(PICTURE, display=display))
-        assert largest_difference(renderer.read(request), renderer.read(plain)) == 0
 
 
 # What is kept between requests.
@@ -450,20 +432,6 @@ def beside(opened):
     settings.resize(opened, *SIZE)
     viewpoint.move(opened, lambda view: from_camera(SIDE, opened.state.extent))
     return opened
-
-
-def test_canvas_says_that_the_clip_leaves_nothing(gl, beside):
-    renderer = renderer_for(gl, "cpu")
-    canvas, state = Canvas(gl, renderer), beside.state
-    for clip, nothing in ((BOOK_ALONE, ""), (Clip(20.0, 30.0), "between the cuts"), (UNCLIPPED, "")):
-        settings.set_clip(beside, clip)
-        rest(canvas, state, 1.0)
-        assert nothing in state.nothing
-        assert bool(nothing) == bool(state.nothing)
-        if clip == BOOK_ALONE:
-            assert on_screen(canvas)[0][60, 80].argmax() == 1
-            assert abs(canvas.point_at(0.5, 0.5)[0] - CENTRES[1][0]) < 0.6  # of the surface that is seen
-    renderer.release()
 
 
 def test_an_outline_selects_nothing_that_is_clipped(beside):

@@ -8,7 +8,6 @@ import pytest
 from PIL import Image
 
 from langsplat_core.config import PictureConfig
-from langsplat_core.errors import InputError
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Scene
@@ -17,10 +16,9 @@ from langsplat_viewer.actions import editing, queries, saving, settings, viewpoi
 from langsplat_viewer.actions.editing import mark
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.commands import BUTTONS, COMMANDS, OVERLAY_TITLES, matching
-from langsplat_viewer.files.projects import FILE_NAME, load_preferences, save_preferences
+from langsplat_viewer.files.preferences import load_preferences, save_preferences
 from langsplat_viewer.marks import Marks
 from langsplat_viewer.panels.display import compared_name
-from langsplat_viewer.panels.overlays import STEPS, bar_colours
 from langsplat_viewer.rendering.renderer import ArrayRenderer, Inputs, renderer_for
 from langsplat_viewer.rendering.request import (
     AT_RANGE,
@@ -120,20 +118,6 @@ def test_screen_file_film_and_reference_agree(gl, opened, tmp_path, mode, backen
         assert (np.abs(got - expected).max(-1) > 2).mean() <= 2e-3, name
     assert errors(opened) == []
     renderer.release()
-
-
-def test_images_are_saved_without_background_if_so_chosen(gl, opened, tmp_path):
-    opened.surface = Canvas(gl, renderer_for(gl, "cpu"))
-    settings.resize(opened, 40, 30)
-    settings.put(opened.state.record, size=(40, 30))
-    assert image(saving.save_picture(opened, tmp_path)).shape == (30, 40, 3)
-    settings.set_picture(opened, replace(opened.state.session.picture, transparent=True))
-    saved = image(saving.save_picture(opened, tmp_path))
-    saving.save_sized_picture(opened, tmp_path)
-    recorded(opened)
-    assert saved.shape == (30, 40, 4)
-    np.testing.assert_allclose(image(tmp_path / "blobs-40x30-001.png"), saved, atol=1)
-    assert not opened.state.request().picture.transparent  # on screen there is a background
 
 
 # Requests are equal where the image is.
@@ -251,14 +235,6 @@ def test_panes_are_joined_at_the_line(opened):
     assert wide[0, :, 0].tolist() == [0] * 20 + [9] * 12
 
 
-def test_colour_bars_end_where_the_image_does():
-    alone, own, weak = bar_colours(1, 1.0, True), bar_colours(1, 1.0, False), bar_colours(1, 0.5, False)
-    assert alone.shape == own.shape == (STEPS, 3)
-    assert not own[0].any()
-    np.testing.assert_allclose(weak[-1], 0.5 * own[-1])
-    assert alone[-1, 0] > alone[-1, 2]  # red is hot
-
-
 # The edited scene.
 
 
@@ -341,11 +317,6 @@ def test_overlays_and_colour_map_have_commands_and_are_remembered(opened, tmp_pa
     settings.keep_preferences(opened)
     save_preferences(tmp_path, opened.state.preferences)
     assert load_preferences(tmp_path) == opened.state.preferences
-    settings.toggle_overlay(opened, "cube")
-    assert opened.state.session.overlays == tuple(name for name in OVERLAYS if name != "cube")
-    (tmp_path / FILE_NAME).write_text('{"colour_map": "rainbow"}')
-    with pytest.raises(InputError, match="rainbow"):
-        load_preferences(tmp_path)
 
 
 def test_two_clicks_measure_and_a_third_begins_anew(opened):

@@ -16,7 +16,6 @@ import pytest
 
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.scene import Scene
-from tests.support.backends import Measure
 from tests.support.fakes import blob_scene
 from tests.support.processes import Cast, play, surroundings
 
@@ -26,7 +25,7 @@ SCENARIOS = [
     "drag_the_gizmo", "travel_by_keys", "end_by_signals", "look_at_nothing", "record_and_play",
     "close_while_opening", "split_the_view", "draw_over_the_scene", "look_without_perspective",
     "reload_what_changed", "search_a_library", "see_the_evidence", "large_letters", "use_the_toolbar",
-    "drag_the_crop_box", "pin_a_note", "use_the_outline", "compare_two_scenes",
+    "drag_the_crop_box", "pin_a_note", "open_many_scenes", "use_the_outline", "compare_two_scenes",
 ]  # fmt: skip
 
 
@@ -197,58 +196,3 @@ def test_threads_share_one_heap():
     if heaps("many") == 1:
         pytest.skip("this C library does not tell")
     assert heaps("one") == 1
-
-
-COPIES = 40  # of each Gaussian: a scene that is kept is megabytes
-MOST_GROWTH = 80.0  # MB; forty scenes that are kept would be some 200
-# The scene as it was read, marked, drawn and merged; answers of seven phrases at their levels; pictures of
-# the three sizes that moving and resting take.
-MOST_ALIVE = {"Scene": 8, "QueryEngine": 1, "QueryResult": 60}
-MOST_HELD = MOST_ALIVE | {"texture": 30, "buffer": 8, "framebuffer": 20, "vertexarray": 8, "program": 16}
-
-
-def crowded(scene: Scene, copies: int) -> Scene:
-    """With `copies` small ones about each Gaussian."""
-    rng = np.random.default_rng(0)
-    many = scene.take(np.repeat(np.arange(len(scene.gaussians)), copies))
-    means = many.gaussians.means + rng.normal(scale=0.05, size=many.gaussians.means.shape)
-    scales = many.gaussians.log_scales - 0.5 * np.log(copies)
-    return replace(many, gaussians=replace(many.gaussians, means=means, log_scales=scales))
-
-
-@pytest.fixture
-def crowds(tmp_path: Path) -> Path:
-    """With and without a language field, cameras and a phrasebook, of several sizes."""
-    scenes = {
-        "blobs": crowded(blob_scene(), COPIES),
-        "plain": crowded(blob_scene(field=False), COPIES),
-        "many": crowded(blob_scene(phrasebook=True), 2 * COPIES),
-        "bare": crowded(blob_scene(with_cameras=False), COPIES),
-        "few": blob_scene(),
-    }
-    for name, scene in scenes.items():
-        save_scene(tmp_path / f"{name}.ply", replace(scene, path=None))
-    return tmp_path
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(os.name == "nt", reason="reads /proc and libGL.so")
-@pytest.mark.parametrize(("backend", "actions"), [("opengl", 2), ("opengl", 20), ("cpu", 20)])
-def test_hundred_scenes_leak_nothing(
-    backend: str, actions: int, display: str, crowds: Path, measured: Measure
-):
-    arguments = ["-m", "tests.viewer.soak_driver", backend, str(crowds), str(actions)]
-    said = play(display, arguments, crowds, timeout=3500).splitlines()
-    assert said[-1].endswith("PASSED"), "\n".join(said)[-4000:]
-    first, *later = [json.loads(line[line.index("{") :]) for line in said if '"scenes"' in line]
-    assert (later[-1]["scenes"], later[-1]["actions"]) == (100, 100 * actions)
-    for held in (first, later[-1]):
-        what = f"MB after {held['scenes']} scenes and {held['actions']} actions"
-        measured(f"soak, {backend}", what, held["MB"])
-    if actions == 2:  # what actions load when they are first done is not of the scenes
-        assert abs(later[-1]["MB"] / first["MB"] - 1) < 0.05
-    # Ninety scenes lie between, each with its answers megabytes.
-    assert later[-1]["MB"] - first["MB"] < MOST_GROWTH
-    for mark in (first, *later):
-        for kind, most in MOST_HELD.items():
-            assert mark[kind] <= most, (kind, mark)

@@ -8,10 +8,8 @@ keyframes are equal, the camera rests between them. Perspective or not is as in 
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -56,21 +54,6 @@ class Keyframe:
     pose: Pose
 
 
-class Motion(Protocol):
-    """A camera that moves."""
-
-    @property
-    def seconds(self) -> float:
-        """Duration of the motion in seconds."""
-
-    @property
-    def closed(self) -> bool:
-        """True where it ends as it began."""
-
-    def poses(self, seconds: Array) -> tuple[Pose, ...]:
-        """Return the poses at (T,) times; before the start and after the end it stands still."""
-
-
 @dataclass(frozen=True, eq=False)
 class Flight:
     """A path through keyframes.
@@ -97,6 +80,7 @@ class Flight:
         return _Curve(self.keyframes)
 
     def poses(self, seconds: Array) -> tuple[Pose, ...]:
+        """Return the poses at (T,) times; before the start and after the end it stands still."""
         if len(self.keyframes) == 1:
             return (self.keyframes[0].pose,) * len(seconds)
         return self._curve.poses(np.asarray(seconds, np.float64))
@@ -113,6 +97,7 @@ class Turntable:
     closed: bool = True
 
     def poses(self, seconds: Array) -> tuple[Pose, ...]:
+        """Return the poses at (T,) times; before the start and after the end it stands still."""
         angles = 2 * math.pi * np.clip(seconds, 0, self.seconds) / self.seconds
         turns = Rotation.from_rotvec(angles[:, None] * self.up).as_matrix()
         arm = self.start.position - self.centre
@@ -120,6 +105,9 @@ class Turntable:
             replace(self.start, position=self.centre + turn.T @ arm, rotation=self.start.rotation @ turn)
             for turn in turns
         )
+
+
+Motion = Flight | Turntable
 
 
 def turntable(view: OrbitCamera, seconds: float) -> Turntable:
@@ -208,9 +196,10 @@ class _Curve:
         # The focal length, which grows evenly when one zooms; its curve stays within the keyframes.
         focal = [-math.log(math.tan(math.radians(key.pose.fov_degrees) / 2)) for key in keyframes]
         self._focal = PchipInterpolator(self._times, focal)
-        spans = [key.pose.span for key in keyframes]
-        self._parallel = np.array([span is not None for span in spans])
-        self._span = PchipInterpolator(self._times, np.log(_without_gaps(spans)))
+        spans = np.array([key.pose.span or np.nan for key in keyframes], np.float64)
+        self._parallel = flat = np.isfinite(spans)
+        logs = np.interp(self._times, self._times[flat], np.log(spans[flat])) if flat.any() else 0 * spans
+        self._span = PchipInterpolator(self._times, np.nan_to_num(logs))
 
     def poses(self, seconds: Array) -> tuple[Pose, ...]:
         times = np.clip(seconds, self._times[0], self._times[-1])
@@ -230,15 +219,6 @@ class _Curve:
         ]
         found = zip(self._positions(times), turned.inv().as_matrix(), fov.tolist(), spans, strict=True)
         return tuple(Pose(*parts) for parts in found)
-
-
-def _without_gaps(spans: Sequence[float | None]) -> list[float]:
-    """Each where it is None as the last one before it, at the start as the next one; 1 without any."""
-    held, filled = next((span for span in spans if span is not None), 1.0), []
-    for span in spans:
-        held = held if span is None else span
-        filled.append(held)
-    return filled
 
 
 def tangents(times: Array, steps: Array, least: float) -> Array:

@@ -11,7 +11,6 @@ from langsplat_core.scene import LEVELS
 from langsplat_viewer.actions import opening, settings
 from langsplat_viewer.commands import BUTTONS, Button, buttons_of, is_shown
 from langsplat_viewer.panels import ui
-from langsplat_viewer.rendering.request import MOST_DEGREE, SIZE_RANGE, Splats
 from langsplat_viewer.viewer import Viewer
 
 WIDTH_EM = 11.0  # of lists and of sliders of `ui`, where there is room
@@ -45,21 +44,8 @@ def draw(viewer: Viewer) -> None:
     ui.tip("Pictures are saved transparent where the scene is not")
     settings.set_picture(viewer, picture)
     viewer.change("settings", **ui.draw_fields(viewer.state.session, "Display"))
-    _splats(viewer)
-
-
-def _splats(viewer: Viewer) -> None:
-    scene, splats = viewer.state.scene, viewer.state.session.splats
-    size = ui.slider("Splat size", splats.size, SIZE_RANGE)
-    ui.tip("Smaller, every Gaussian can be seen; answers and files do not change")
-    degree, most = splats.sh_degree, MOST_DEGREE if scene is None else scene.gaussians.sh_degree
-    if most > 0:
-        ui.leave_room("SH degree", WIDTH_EM)
-        flags = imgui.SliderFlags_.always_clamp
-        changed, chosen = imgui.slider_int("SH degree", min(degree, most), 0, most, "%d", flags)
-        degree = (MOST_DEGREE if chosen == most else chosen) if changed else degree
-        ui.tip("Up to which degree colours change with the direction that they are seen from")
-    viewer.change("splats", splats=Splats(size, degree))
+    splats = viewer.state.session.splats
+    viewer.change("splats", splats=replace(splats, **ui.draw_fields(splats, "Display")))
 
 
 def _heat_scale(viewer: Viewer) -> tuple[float, float] | None:

@@ -10,7 +10,7 @@ from langsplat_core.query.inventory import Outline
 from langsplat_viewer.actions import outline
 from langsplat_viewer.actions.outline import Target
 from langsplat_viewer.panels import ui
-from langsplat_viewer.panels.overlays import STILL, begin_legend
+from langsplat_viewer.panels.overlays import begin_legend, clicked
 from langsplat_viewer.viewer import Viewer
 
 LEGEND_ROWS, LEGEND_EM = 8, 9.0
@@ -126,12 +126,10 @@ class ThingsMenu:
 
     def draw(self, viewer: Viewer, area: ui.Area) -> None:
         """Draw the menu while it is open; once per frame, after the panels."""
-        io = imgui.get_io()
-        moved = imgui.get_mouse_drag_delta(1, 0.0)
-        u, v = area.fraction(io.mouse_pos.x, io.mouse_pos.y)
-        still = abs(moved.x) + abs(moved.y) < STILL
-        if imgui.is_mouse_released(1) and still and not io.want_capture_mouse and 0 <= u <= 1 and 0 <= v <= 1:
-            self._at = None if viewer.surface is None else viewer.surface.point_at(u, v)
+        if clicked(area, 1):
+            mouse = imgui.get_io().mouse_pos
+            place = area.fraction(mouse.x, mouse.y)
+            self._at = None if viewer.surface is None else viewer.surface.point_at(*place)
             if self._at is not None and viewer.engine is not None:
                 imgui.open_popup(MENU)
         if imgui.begin_popup(MENU):

@@ -1,6 +1,6 @@
 """The images of the scene behind the panels, and the overlays on them with their panels."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, get_args
 
@@ -19,6 +19,7 @@ from langsplat_viewer.camera.controls import Side, from_side
 from langsplat_viewer.camera.overlays import PlacedText, placed
 from langsplat_viewer.commands import OVERLAY_TITLES, with_key
 from langsplat_viewer.panels import ui
+from langsplat_viewer.session import Note, Point, Ruler
 from langsplat_viewer.state import Hover
 from langsplat_viewer.viewer import Viewer
 
@@ -141,13 +142,13 @@ def draw_evidence(viewer: Viewer, picture: ui.Picture) -> None:
         settings.put(viewer.state, evidence=None)
 
 
-# Lines: training cameras, boxes of instances, ground grid, ruler; and the clicks on them.
+# What is drawn over every image: training cameras, boxes of instances, ground grid, ruler and notes.
 
+Colour = tuple[float, float, float, float]
 REACH = 7.0  # window units from a line at which a click means it
 STILL = 4.0  # a click that moves farther is a drag
 CAMERA, CHOSEN, HOVERED = (0.75, 0.82, 0.95, 0.3), (0.98, 0.62, 0.15, 1.0), (1.0, 1.0, 1.0, 1.0)
-NOTE = (0.55, 0.85, 1.0, 1.0)
-GRID, RULER = (0.85, 0.85, 0.85, 0.4), (1.0, 0.9, 0.2, 1.0)
+NOTE, GRID, RULER = (0.55, 0.85, 1.0, 1.0), (0.85, 0.85, 0.85, 0.4), (1.0, 0.9, 0.2, 1.0)
 
 
 @dataclass(frozen=True)
@@ -155,41 +156,61 @@ class Named:
     """A thing that has a name in the image."""
 
     text: str
-    corner: tuple[float, float]  # the highest one of its box, in units of the image
-    colour: tuple[float, float, float, float]
+    corner: Array  # (2,) the highest one of its box, window units
+    colour: Colour
+
+
+@dataclass(frozen=True, eq=False)
+class Pen:
+    """Draws things of the world over one image of it; places are in window units."""
+
+    area: ui.Area  # of the image
+    camera: Camera
+    least: float  # camera z from which on lines are drawn
+
+    @property
+    def corner(self) -> Array:
+        return np.array([self.area.left, self.area.top])
+
+    def segments(self, edges: Array) -> tuple[Array, Array]:
+        """Return what is seen of (M, 2, 3) edges, (K, 2, 2), and the rows that they come from."""
+        found, rows = overlays.clip_segments(self.camera, edges, self.least)
+        return found + self.corner, rows
+
+    def place(self, point: Array | Point) -> Array | None:
+        """Return (2,) where a world point is; None outside the image."""
+        pixels, depths = self.camera.project(np.asarray(point, np.float64)[None])
+        inside = depths[0] > self.least and self.camera.in_image(pixels, depths)[0]
+        return pixels[0] + self.corner if inside else None
 
 
 def draw_lines(viewer: Viewer, area: ui.Area) -> None:
     """Draw grid, cameras, boxes, ruler and notes over every image in the area, after they are drawn."""
-    state = viewer.state
+    state, shown = viewer.state, viewer.state.session.overlays
     if state.scene is None or state.view is None or state.extent is None:
         return
     paint, metres = imgui.get_background_draw_list(), state.scene.metres_per_unit
-    least = overlays.LEAST_DEPTH * state.extent.radius  # from this camera z on lines are drawn
-    grid = None
-    if "grid" in state.session.overlays:
-        grid = overlays.ground_grid(state.extent, state.view.up, metres)
+    grid = overlays.ground_grid(state.extent, state.view.up, metres) if "grid" in shown else None
     for part in area.columns(state.session.split.columns):
-        camera = state.view.camera(*part.size)
+        pen = Pen(part, state.view.camera(*part.size), overlays.LEAST_DEPTH * state.extent.radius)
         paint.push_clip_rect(*part.corners, True)
         if grid is not None:
-            _grid(grid, part, camera, least)
-        if "cameras" in state.session.overlays:
+            _grid(grid, pen)
+        if "cameras" in shown:
             edges = overlays.frusta(state.scene.cameras, overlays.FRUSTUM_DEPTH * state.extent.radius)
-            _cameras(viewer, edges, part, camera, least)
-        if "things" in state.session.overlays:  # after the lines, so that its words are readable
-            _things(viewer, part, camera, least)
-        _ruler(viewer, part, camera, least, metres)
-        _notes(viewer, part, camera, least)
+            _cameras(viewer, edges, pen)
+        if "things" in shown:  # after the lines, so that its words are readable
+            _things(viewer, pen)
+        _ruler(state.session.ruler, pen, metres)
+        _notes(state.session.notes, pen)
         paint.pop_clip_rect()
-    line = imgui.get_text_line_height()
-    left, foot = area.left + 0.6 * line, area.top + area.height
-    if grid is not None:
-        text_on_shade(f"grid {overlays.length_text(grid.spacing, metres)}", left, foot - 1.6 * line, area)
+    foot = [] if grid is None else [f"grid {overlays.length_text(grid.spacing, metres)}"]
     if state.view.orthographic:
         span = overlays.length_text(state.view.span_in(*state.size), metres)
-        below = 1 if grid is None else 2  # lines
-        text_on_shade(f"orthographic, {span} across the shorter side", left, foot - 1.6 * below * line, area)
+        foot.append(f"orthographic, {span} across the shorter side")
+    line = imgui.get_text_line_height()
+    for number, text in enumerate(foot, 1):
+        text_on_shade(text, area.left + 0.6 * line, area.top + area.height - 1.6 * number * line, area)
     if not imgui.get_io().want_capture_mouse:
         _take_click(viewer, area)
 
@@ -205,48 +226,53 @@ def _take_click(viewer: Viewer, area: ui.Area) -> None:
         act(viewer, *area.fraction(mouse.x, mouse.y))
 
 
-def clicked(area: ui.Area) -> bool:
-    """Return whether the left button was clicked in the area, without modifiers and without a drag."""
+def clicked(area: ui.Area, button: int = 0) -> bool:
+    """Return whether a button was clicked in the area, without modifiers and without a drag."""
     io = imgui.get_io()
-    if io.want_capture_mouse or io.key_ctrl or io.key_shift or not imgui.is_mouse_released(0):
+    if io.want_capture_mouse or io.key_ctrl or io.key_shift or not imgui.is_mouse_released(button):
         return False
-    moved = imgui.get_mouse_drag_delta(0, 0.0)
+    moved = imgui.get_mouse_drag_delta(button, 0.0)
     u, v = area.fraction(io.mouse_pos.x, io.mouse_pos.y)
     return abs(moved.x) + abs(moved.y) < STILL and 0 <= u <= 1 and 0 <= v <= 1
 
 
-def _lines(area: ui.Area, segments: Array, colour: tuple[float, float, float, float], thick: float) -> None:
+def _lines(segments: Array, colour: Colour, thick: float) -> None:
     paint, packed = imgui.get_background_draw_list(), imgui.get_color_u32(colour)
-    for (x0, y0), (x1, y1) in (segments + (area.left, area.top)).tolist():
-        paint.add_line(ImVec2(x0, y0), ImVec2(x1, y1), packed, thick)
+    for start, end in segments.tolist():
+        paint.add_line(ImVec2(*start), ImVec2(*end), packed, thick)
 
 
-def _cameras(viewer: Viewer, edges: Array, area: ui.Area, camera: Camera, least: float) -> None:
+def _dot(place: Array, colour: Colour) -> None:
+    paint, middle = imgui.get_background_draw_list(), ImVec2(*place)
+    paint.add_circle_filled(middle, 4.0, imgui.get_color_u32(colour))
+    paint.add_circle(middle, 5.0, SHADE)
+
+
+def _cameras(viewer: Viewer, edges: Array, pen: Pen) -> None:
     """(C, 8, 2, 3) edges of all, but for the one that the view looks through; a click on one stands there."""
-    state = viewer.state
+    state, mouse = viewer.state, imgui.get_io().mouse_pos
     assert state.scene is not None
-    away = np.linalg.norm(edges[:, 0, 0] - camera.position, axis=1) > least
+    away = np.linalg.norm(edges[:, 0, 0] - pen.camera.position, axis=1) > pen.least
     edges = edges * away[:, None, None, None]  # all in one point, which is no line
-    segments, rows = overlays.clip_segments(camera, edges.reshape(-1, 2, 3), least)
+    segments, rows = pen.segments(edges.reshape(-1, 2, 3))
     owners = rows // edges.shape[1]
     segments, owners = segments[away[owners]], owners[away[owners]]
     under = -1
     if not (imgui.get_io().want_capture_mouse or state.session.ruler.measures):
-        mouse = imgui.get_io().mouse_pos
-        row, distance = overlays.nearest_segment(segments, (mouse.x - area.left, mouse.y - area.top))
+        row, distance = overlays.nearest_segment(segments, (mouse.x, mouse.y))
         under = int(owners[row]) if distance < REACH else -1
     chosen = -1 if state.camera_index is None else state.camera_index
-    _lines(area, segments[(owners != under) & (owners != chosen)], CAMERA, 1.0)
-    _lines(area, segments[owners == chosen], CHOSEN, 2.0)
+    _lines(segments[(owners != under) & (owners != chosen)], CAMERA, 1.0)
+    _lines(segments[owners == chosen], CHOSEN, 2.0)
     if under >= 0:
-        _lines(area, segments[owners == under], HOVERED, 2.0)
+        _lines(segments[owners == under], HOVERED, 2.0)
         name = state.scene.cameras[under].name
-        text_on_shade(f"camera {under}  {name}", mouse.x + 14, mouse.y + 10, area)
-        if clicked(area):
+        text_on_shade(f"camera {under}  {name}", mouse.x + 14, mouse.y + 10, pen.area)
+        if clicked(pen.area):
             viewpoint.go_to_camera(viewer, under)
 
 
-def _things(viewer: Viewer, area: ui.Area, camera: Camera, least: float) -> None:
+def _things(viewer: Viewer, pen: Pen) -> None:
     """Draw a box around each thing that a query shown has found, and the phrase beside it."""
     named: list[Named] = []
     for query in viewer.state.shown():
@@ -255,15 +281,14 @@ def _things(viewer: Viewer, area: ui.Area, camera: Camera, least: float) -> None
         red, green, blue = QUERY_COLOURS[query.slot]
         things = viewer.state.answer(query).things
         for number, thing in enumerate(things, start=1):
-            edges = overlays.box_edges(thing.oriented.corners)
-            segments, _ = overlays.clip_segments(camera, edges, least)
-            _lines(area, segments, (0.0, 0.0, 0.0, 0.5), 3.0)
-            _lines(area, segments, (red, green, blue, 1.0), 1.5)
+            segments, _ = pen.segments(overlays.box_edges(thing.oriented.corners))
+            _lines(segments, (0.0, 0.0, 0.0, 0.5), 3.0)
+            _lines(segments, (red, green, blue, 1.0), 1.5)
             if len(segments):
-                x, y = segments.reshape(-1, 2)[segments.reshape(-1, 2)[:, 1].argmin()].tolist()
+                ends = segments.reshape(-1, 2)
                 text = query.phrase if len(things) == 1 else f"{query.phrase} {number}"
-                named.append(Named(text, (x, y), (red, green, blue, 1.0)))
-    _names(named, area)
+                named.append(Named(text, ends[ends[:, 1].argmin()], (red, green, blue, 1.0)))
+    _names(named, pen.area)
 
 
 def _names(named: list[Named], area: ui.Area) -> None:
@@ -271,66 +296,47 @@ def _names(named: list[Named], area: ui.Area) -> None:
     line, edge, paint = imgui.get_text_line_height(), shade_edge(), imgui.get_background_draw_list()
     wanted = []
     for name in named:
-        (x, y), size = name.corner, imgui.calc_text_size(name.text)
+        (x, y), size = name.corner - (area.left, area.top), imgui.calc_text_size(name.text)
         wanted.append(PlacedText(x + 4 - edge, y - 1.4 * line - edge, size.x + 2 * edge, size.y + 2 * edge))
     found = placed(wanted, (area.width, area.height))
     for name, alone, label in zip(named, wanted, found, strict=True):
         if label.y < alone.y - label.height / 2:
-            start = ImVec2(area.left + name.corner[0], area.top + name.corner[1])
             end = ImVec2(area.left + label.x, area.top + label.y + label.height / 2)
-            paint.add_line(start, end, imgui.get_color_u32(name.colour), 1.5)
+            paint.add_line(ImVec2(*name.corner), end, imgui.get_color_u32(name.colour), 1.5)
     for name, label in zip(named, found, strict=True):
         text_on_shade(name.text, area.left + label.x + edge, area.top + label.y + edge, area)
 
 
-def _grid(grid: overlays.Grid, area: ui.Area, camera: Camera, least: float) -> None:
+def _grid(grid: overlays.Grid, pen: Pen) -> None:
     """Draw the lines on the ground, each with its distance from the world's origin."""
-    segments, _ = overlays.clip_segments(camera, grid.segments, least)
-    _lines(area, segments, GRID, 1.0)
+    _lines(pen.segments(grid.segments)[0], GRID, 1.0)
     paint, packed = imgui.get_background_draw_list(), imgui.get_color_u32((*GRID[:3], 1.0))
     for text, point in grid.marks:
-        place = _place(camera, point, least)
+        place = pen.place(point)
         if place is not None:
-            paint.add_text(ImVec2(area.left + place[0] + 3, area.top + place[1]), packed, text)
+            paint.add_text(ImVec2(*(place + (3, 0))), packed, text)
 
 
-def _ruler(viewer: Viewer, area: ui.Area, camera: Camera, least: float, metres: float | None) -> None:
-    ruler, paint = viewer.state.session.ruler, imgui.get_background_draw_list()
-    for point in ruler.points:
-        place = _place(camera, np.array(point), least)
+def _ruler(ruler: Ruler, pen: Pen, metres: float | None) -> None:
+    for place in map(pen.place, ruler.points):
         if place is not None:
-            middle = ImVec2(area.left + place[0], area.top + place[1])
-            paint.add_circle_filled(middle, 4.0, imgui.get_color_u32(RULER))
-            paint.add_circle(middle, 5.0, imgui.get_color_u32((0.0, 0.0, 0.0, 0.8)))
-    if ruler.length is None:
-        return
-    segments, _ = overlays.clip_segments(camera, np.array([ruler.points]), least)
-    _lines(area, segments, (0.0, 0.0, 0.0, 0.6), 4.0)
-    _lines(area, segments, RULER, 2.0)
-    for start, end in segments:
-        x, y = (start + end) / 2
-        text = overlays.length_text(ruler.length, metres)
-        text_on_shade(text, area.left + float(x) + 8, area.top + float(y) + 8, area)
+            _dot(place, RULER)
+    if ruler.length is not None:
+        segments, _ = pen.segments(np.array([ruler.points]))
+        _lines(segments, (0.0, 0.0, 0.0, 0.6), 4.0)
+        _lines(segments, RULER, 2.0)
+        for segment in segments:
+            x, y = segment.mean(0) + 8
+            text_on_shade(overlays.length_text(ruler.length, metres), x, y, pen.area)
 
 
-def _notes(viewer: Viewer, area: ui.Area, camera: Camera, least: float) -> None:
+def _notes(notes: Sequence[Note], pen: Pen) -> None:
     """Write the notes at the places that they are pinned to."""
-    named, paint = [], imgui.get_background_draw_list()
-    for note in viewer.state.session.notes:
-        place = _place(camera, np.array(note.at), least)
-        if place is not None:
-            middle = ImVec2(area.left + place[0], area.top + place[1])
-            paint.add_circle_filled(middle, 4.0, imgui.get_color_u32(NOTE))
-            named.append(Named(note.text, place, NOTE))
-    _names(named, area)
-
-
-def _place(camera: Camera, point: Array, least_depth: float) -> tuple[float, float] | None:
-    """Project a world point (3,) to pixels; None outside the image."""
-    pixels, depths = camera.project(point[None].astype(np.float64))
-    x, y = (float(part) for part in pixels[0])
-    inside = depths[0] > least_depth and 0 <= x <= camera.width and 0 <= y <= camera.height
-    return (x, y) if inside else None
+    places = [(note, pen.place(note.at)) for note in notes]
+    named = [Named(note.text, place, NOTE) for note, place in places if place is not None]
+    for name in named:
+        _dot(name.corner, NOTE)
+    _names(named, pen.area)
 
 
 # The legend of relevancy, and words in place of an image.

@@ -239,12 +239,12 @@ def _titled(kind: Any, panel: str) -> list[tuple[str, Any, Meta]]:
     return found
 
 
-def draw_fields(holder: Any, panel: str) -> dict[str, object]:
+def draw_fields(holder: Any, panel: str) -> dict[str, Any]:
     """Draw a widget for every field of a dataclass that has a title and names the panel.
 
     Return their values: a check box for a bool, a slider for a number, a list for a `Literal`.
     """
-    values: dict[str, object] = {}
+    values: dict[str, Any] = {}
     holders: Any = type(holder)
     for name, kind, meta in _titled(holders, panel):
         value, title = getattr(holder, name), meta.title or name
@@ -255,7 +255,8 @@ def draw_fields(holder: Any, panel: str) -> dict[str, object]:
             value = slider(title, value, (low, high), logarithmic=low > 0)
         elif kind is int:
             leave_room(title, 11.0)
-            value = imgui.slider_int(title, value, int(meta.ge or 0), int(meta.le or 1))[1]
+            limits, flags = (int(meta.ge or 0), int(meta.le or 1)), imgui.SliderFlags_.always_clamp
+            value = imgui.slider_int(title, value, *limits, "%d", flags)[1]
         else:
             choices = list(get_args(kind))
             leave_room(title, 11.0)

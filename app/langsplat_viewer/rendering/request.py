@@ -40,18 +40,32 @@ class Clip:
 
 
 UNCLIPPED = Clip()
-SIZE_RANGE = (0.1, 1.0)  # of `Splats.size`
-MOST_DEGREE = 3
 
 
 @dataclass(frozen=True)
 class Splats:
     """Sizes and colours of the Gaussians as drawn; answers and files have them as they are."""
 
-    # factor of every axis: small ones are points, and show gaps
-    size: Annotated[float, Meta(ge=SIZE_RANGE[0], le=SIZE_RANGE[1])] = 1.0
-    # at most; 0: colours that do not depend on the direction
-    sh_degree: Annotated[int, Meta(ge=0, le=MOST_DEGREE)] = MOST_DEGREE
+    size: Annotated[
+        float,
+        Meta(
+            ge=0.1,
+            le=1,
+            title="Splat size",
+            description="Smaller, every Gaussian can be seen; answers and files do not change",
+            extra={"panel": "Display"},
+        ),
+    ] = 1.0  # factor of every axis
+    sh_degree: Annotated[
+        int,
+        Meta(
+            ge=0,
+            le=len(SH_COUNTS) - 1,
+            title="SH degree",
+            description="Up to which degree colours change with the direction that they are seen from",
+            extra={"panel": "Display"},
+        ),
+    ] = len(SH_COUNTS) - 1  # at most
 
 
 SplitMode = Literal["off", "wipe", "levels", "scenes"]
@@ -63,16 +77,13 @@ class Split:
     """Several panes of one camera in an image.
 
     "wipe": the display that is chosen left of a line, `second` right of it. "levels": three columns, from
-    subpart to whole, with the relevancy of the shown queries at each level where a display of answers is
-    chosen, else with the latents. "scenes": one pane, and another scene right of the line, whose image is
-    not this request's.
+    subpart to whole, of relevancy where a display of answers is chosen, else of latents. "scenes": one pane,
+    and another scene right of the line, whose image is not this request's.
     """
 
     mode: SplitMode = "off"
     second: Display = "depth"
-    second_level: Annotated[int, Meta(ge=0, lt=len(LEVELS))] = (
-        2  # index into scene.LEVELS, where latents are shown
-    )
+    second_level: Annotated[int, Meta(ge=0, lt=len(LEVELS))] = 2  # of latents, index into scene.LEVELS
     at: Annotated[float, Meta(ge=AT_RANGE[0], le=AT_RANGE[1])] = 0.5  # where the line is, of the area's width
 
     @property
@@ -296,8 +307,8 @@ def _in_image(gaussians: Gaussians, camera: Camera) -> tuple[slice, Array, Array
 def near_plane(gaussians: Gaussians, camera: Camera, most: float = INRIA.near) -> float:
     """Return the near plane's distance, world units: a share of the depth of what is nearest in the image.
 
-    So one can go as near to a thing as it is small. It is at most `most`, the constant of training: the view
-    of a photograph is the one that was trained. An orthographic camera has it at the eye.
+    At most `most`, the constant of training: the view of a photograph is the one that was trained. An
+    orthographic camera has it at the eye.
     """
     if camera.orthographic:
         return 0.0
@@ -318,10 +329,9 @@ def image_formation(scene: Scene, camera: Camera, clip: Clip = UNCLIPPED) -> Ras
 
 
 def depth_range(gaussians: Gaussians, camera: Camera, clip: Clip = UNCLIPPED) -> tuple[float, float]:
-    """Return near and far end of the depth display, world units; (0, 1) where nothing is in the image.
+    """Return the 2 % and 98 % quantiles of camera z of what is in the image and in `clip`, world units.
 
-    They are the 2 % and 98 % quantiles of the camera z of Gaussians whose centres are in the image and
-    within `clip`.
+    (0, 1) where nothing is.
     """
     _, depths, inside = _in_image(gaussians, camera)
     with np.errstate(invalid="ignore"):
@@ -333,10 +343,7 @@ def depth_range(gaussians: Gaussians, camera: Camera, clip: Clip = UNCLIPPED) ->
 
 
 def with_splats(scene: Scene, splats: Splats) -> Scene:
-    """Return the scene with its Gaussians as `splats` wants them drawn; itself where that changes nothing.
-
-    The rows stay the same, so that channels fit both.
-    """
+    """Return the scene with its Gaussians as `splats` wants them drawn; itself where that changes nothing."""
     gaussians = scene.gaussians
     if splats.size != 1:
         scales = gaussians.log_scales + np.float32(np.log(splats.size))
@@ -348,10 +355,9 @@ def with_splats(scene: Scene, splats: Splats) -> Scene:
 
 def why_undrawable(gaussians: Gaussians) -> str:
     """Return why no camera could see anything of these; empty where one could."""
-    count = len(gaussians)
+    count, valid = len(gaussians), gaussians.valid()
     if count == 0:
         return "the scene holds no Gaussians"
-    valid = gaussians.valid()
     if not valid.any():
         reasons = ", ".join(f"{rows:,} with {reason}" for reason, rows in gaussians.invalid_rows().items())
         return f"none of the {count:,} Gaussians can be drawn: {reasons}"
