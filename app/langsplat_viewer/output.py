@@ -150,7 +150,8 @@ def write_film(film: Film, draw: Draw) -> None:
 def _write_folder(film: Film, draw: Draw) -> None:
     film.out.mkdir(parents=True, exist_ok=True)
     _check_own(film.out)
-    (film.out / SETTINGS).write_text(json.dumps({"pictures": film.count, "fps": film.fps}), encoding="utf-8")
+    with atomic_path(film.out / SETTINGS) as temporary:
+        temporary.write_text(json.dumps({"pictures": film.count, "fps": film.fps}), encoding="utf-8")
     for path in film.out.iterdir():  # of another film
         if FRAME.fullmatch(path.name):
             path.unlink()
