@@ -14,7 +14,7 @@ from langsplat_core.config import PictureConfig
 from langsplat_core.scene import Camera, Intrinsics, Scene
 from langsplat_viewer.actions import settings, viewpoint
 from langsplat_viewer.camera import controls
-from langsplat_viewer.camera.controls import OrbitCamera, from_side, spanning, with_projection
+from langsplat_viewer.camera.controls import OrbitCamera, from_side, spanning
 from langsplat_viewer.camera.flight import Flight, Keyframe, camera_of, pose_at, pose_of
 from langsplat_viewer.files.projects import BOOKMARKS, Shelf
 from langsplat_viewer.rendering.renderer import renderer_for
@@ -319,7 +319,7 @@ def test_the_share_is_held_and_a_step_nearer_loses_it(sample, inner):
 
     eye = controls.framing_eye(sample, ROTATION, inner)
     assert held(eye) >= controls.SHARE
-    depth = controls.median_depth(sample, eye, ROTATION[2])
+    depth = controls.depth_share(sample, eye, ROTATION[2], 0.5)
     assert held(eye + 0.25 * depth * ROTATION[2]) < controls.SHARE
     assert held(controls.framing_eye(sample, ROTATION, inner, share=1.0)) == 1.0
 
@@ -424,7 +424,7 @@ FULL = (1280, 720)
 BLOBS = blob_scene()
 EXTENT = controls.extent_of(BLOBS)
 VIEW = controls.default_view(BLOBS, EXTENT, FULL)
-FLAT = with_projection(VIEW, orthographic=True)
+FLAT = replace(VIEW, orthographic=True)
 MEANS = BLOBS.gaussians.means.astype(np.float64)
 
 
@@ -462,7 +462,7 @@ def test_the_plane_through_the_target_keeps_its_scale():
     across = VIEW.target + 0.3 * VIEW.rotation[0] - 0.7 * VIEW.rotation[1]
     points = np.stack([VIEW.target, across])
     assert_allclose(FLAT.camera(*FULL).project(points)[0], VIEW.camera(*FULL).project(points)[0], atol=1e-9)
-    assert with_projection(FLAT, orthographic=False).camera(*FULL).intrinsics == VIEW.camera(*FULL).intrinsics
+    assert replace(FLAT, orthographic=False).camera(*FULL).intrinsics == VIEW.camera(*FULL).intrinsics
     assert FLAT.span == pytest.approx(2 * np.tan(np.radians(VIEW.intrinsics.fov_degrees / 2)) * VIEW.distance)
 
 

@@ -21,7 +21,6 @@ from langsplat_core.progress import Progress
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions.editing import has_scene, has_selection
 from langsplat_viewer.actions.viewpoint import path_motion
-from langsplat_viewer.camera.controls import with_projection
 from langsplat_viewer.camera.flight import pose_of
 from langsplat_viewer.files.projects import PATHS, PROJECTS, Project, write_flight, write_project
 from langsplat_viewer.options import say_compiling
@@ -94,7 +93,7 @@ def save_view(viewer: Viewer, folder: Path = Path()) -> Path | None:
         viewer.say_error("open a scene first, then save a view of it")
         return None
     path = _new_file(viewer, folder, ".json", "-view")
-    camera = with_projection(state.view, orthographic=False).camera(*state.size)
+    camera = replace(state.view, orthographic=False).camera(*state.size)
     span = f" --orthographic {state.view.span_in(*state.size):.6g}" if state.view.orthographic else ""
     more = f"; show it again with --camera {path.name}{span}"
     return viewer.save(path, lambda: write_cameras(path, (camera,)), more)

@@ -27,7 +27,6 @@ from langsplat_viewer.camera.controls import (
     from_side,
     holding_distance,
     orbit,
-    with_projection,
     zoom,
 )
 from langsplat_viewer.camera.flight import (
@@ -118,7 +117,7 @@ def reset_view(viewer: Viewer) -> None:
     if view is None or state.scene is None or state.extent is None:
         return
     if state.view is not None and state.view.orthographic:
-        view = with_projection(view, orthographic=True)
+        view = replace(view, orthographic=True)
         if state.opening_camera is None and not state.scene.cameras:
             view = frame_all(view, state.extent, state.size)
     glide_to(viewer, view)
@@ -142,9 +141,9 @@ def toggle_orthographic(viewer: Viewer) -> None:
     state = viewer.state
     if state.view is not None:
         orthographic, glide = not state.view.orthographic, state.glide
-        move(viewer, lambda view: with_projection(view, orthographic))
+        move(viewer, lambda view: replace(view, orthographic=orthographic))
         if glide is not None:
-            state.glide = replace(glide, end=with_projection(glide.end, orthographic))
+            state.glide = replace(glide, end=replace(glide.end, orthographic=orthographic))
 
 
 def go_to_camera(viewer: Viewer, index: int) -> None:

@@ -90,17 +90,12 @@ def framing_eye(sample: Sample, rotation: Array, inner: Intrinsics, share: float
     return np.asarray(eye(low) @ rotation)
 
 
-def median_depth(sample: Sample, eye: Array, forward: Array) -> float:
-    """Return the depth from `eye` (3,) along the unit `forward` (3,) of half of the weight, world units."""
-    return weighted_quantile((sample.points - eye) @ forward, sample.weights, 0.5)
+def depth_share(sample: Sample, eye: Array, forward: Array, share: float) -> float:
+    """Return the depth from `eye` (3,) along the unit `forward` (3,) before which a `share` of weight lies.
 
-
-def nearest_depth(sample: Sample, eye: Array, forward: Array) -> float:
-    """Return the depth from `eye` (3,) along the unit `forward` (3,) before which almost nothing lies.
-
-    World units, negative behind the eye; `1 - SHARE` of the weight lies before it.
+    World units, negative behind the eye.
     """
-    return weighted_quantile((sample.points - eye) @ forward, sample.weights, 1 - SHARE)
+    return weighted_quantile((sample.points - eye) @ forward, sample.weights, share)
 
 
 def _ordered(values: Array, weights: Array) -> tuple[Array, Array]:
@@ -151,7 +146,7 @@ class OrbitCamera:
     distance: float  # world units from the eye to the target, > 0
     up: Array  # (3,) unit, the world's up: the axis that a sideways drag turns about
     intrinsics: Intrinsics  # of an image that any window shows whole, uncropped
-    orthographic: bool = False  # without perspective: everything has the size that it has at the target
+    orthographic: bool = False  # everything has the size that it has at the target
 
     @property
     def eye(self) -> Array:
@@ -276,11 +271,8 @@ def from_side(view: OrbitCamera, side: Side) -> OrbitCamera:
 
 def focus(view: OrbitCamera, point: Array, distance: float | None = None) -> OrbitCamera:
     """Bring `point` (3,) to the centre and turn around it from now on; the direction of view is kept."""
-    return replace(
-        view,
-        target=np.asarray(point, np.float64),
-        distance=view.distance if distance is None else max(distance, 1e-9),
-    )
+    distance = view.distance if distance is None else max(distance, 1e-9)
+    return replace(view, target=np.asarray(point, np.float64), distance=distance)
 
 
 def level(view: OrbitCamera) -> OrbitCamera:
@@ -352,18 +344,13 @@ def from_camera(camera: Camera, extent: Extent) -> OrbitCamera:
     return OrbitCamera(camera.rotation, target, distance, extent.up, inner)
 
 
-def with_projection(view: OrbitCamera, orthographic: bool) -> OrbitCamera:
-    """Return the same view with or without perspective: what is as far as the target keeps its size."""
-    return replace(view, orthographic=orthographic)
-
-
 def spanning(view: OrbitCamera, span: float) -> OrbitCamera:
     """Return the orthographic view from the same eye whose shorter side spans `span` world units.
 
     That is the side of the uncropped image.
     """
     distance = view.distance * span / view.span
-    return with_projection(focus(view, view.eye + distance * view.rotation[2], distance), orthographic=True)
+    return replace(focus(view, view.eye + distance * view.rotation[2], distance), orthographic=True)
 
 
 def frame_all(view: OrbitCamera, extent: Extent, size: tuple[int, int]) -> OrbitCamera:
@@ -373,10 +360,10 @@ def frame_all(view: OrbitCamera, extent: Extent, size: tuple[int, int]) -> Orbit
     forward = view.rotation[2]
     if eye is None:
         return focus(view, extent.centre, 2.6 * extent.radius)
-    depth = max(median_depth(extent.sample, eye, forward), 1e-3 * extent.radius)
+    depth = max(depth_share(extent.sample, eye, forward, 0.5), 1e-3 * extent.radius)
     target, distance = eye + depth * forward, depth / narrow
     if view.orthographic:  # however flat the scene looks from here, nothing of it is behind the eye
-        distance = max(distance, -nearest_depth(extent.sample, target, forward))
+        distance = max(distance, -depth_share(extent.sample, target, forward, 1 - SHARE))
     return replace(view, target=target, distance=distance)
 
 
