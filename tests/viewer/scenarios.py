@@ -9,7 +9,7 @@ import numpy as np
 
 from langsplat_core.extensions.library import panel as library_panel
 from langsplat_core.io.scenes import load_scene, save_scene
-from langsplat_core.semantics.store import ImageFeatures
+from langsplat_core.semantics.features import ImageFeatures
 from langsplat_viewer.actions import editing, opening, settings, viewpoint
 from langsplat_viewer.camera.controls import from_side
 from langsplat_viewer.commands import COMMANDS
