@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -99,18 +98,9 @@ class Regions:
     nodes: tuple[Array, ...]  # (R,) number in the tree of each region of a level, rising
     everywhere: Array  # (3, N) int32 number of the region at each level, from 0; -1: in none
     weights: Array  # (N,) float32 opacity of what counts, 0 for all others, see `surface_weights`
-    parents: tuple[Array, Array]  # (R,) region of the level above that each is part of: of two levels
     sizes: tuple[Array, ...]  # (R,) Gaussians that count
     totals: tuple[Array, ...]  # (R,) float64 sums of their weights
-
-    @cached_property
-    def table(self) -> RegionTable:
-        """The regions of all levels one after the other, as the rule for answers reads them."""
-        counts = np.array([len(sizes) for sizes in self.sizes])
-        parts, wholes = counts[0], counts[0] + counts[1]
-        parents = self.parents[0] + parts, self.parents[1] + wholes, np.full(counts[2], -1)
-        solid = np.concatenate(self.sizes) >= RULE.smallest
-        return RegionTable(counts[None], np.concatenate(parents), solid)
+    table: RegionTable  # of all levels one after the other, as the rule for answers reads them
 
     def means(self, values: Array) -> tuple[Array, ...]:
         """Return the (R,) float64 opacity-weighted means of (3, N) values over the regions of every level.
@@ -148,7 +138,7 @@ def build_regions(tree: Tree, weights: Array) -> Regions:
     """Return the regions of a scene. weights: (N,) float32, see `surface_weights`."""
     weights = np.where(tree.leaves >= 0, weights, np.float32(0))
     counts = np.flatnonzero(weights > 0)
-    nodes, everywhere, parents, sizes, totals = [], [], [], [], []
+    nodes, everywhere, members, sizes, totals = [], [], [], [], []
     for level in range(len(LEVELS)):
         at = tree.at(level)
         there, first, row = np.unique(at[counts], return_index=True, return_inverse=True)
@@ -158,9 +148,14 @@ def build_regions(tree: Tree, weights: Array) -> Regions:
         everywhere.append(number[at])
         sizes.append(np.bincount(row, minlength=len(there)))
         totals.append(np.bincount(row, weights[counts], minlength=len(there)))
-        parents.append(counts[first])  # a Gaussian of each region
-    above = everywhere[1][parents[0]], everywhere[2][parents[1]]
-    return Regions(tuple(nodes), np.stack(everywhere), weights, above, tuple(sizes), tuple(totals))
+        members.append(counts[first])  # a Gaussian of each region
+    subparts, parts, wholes = map(len, nodes)
+    above = everywhere[1][members[0]] + subparts, everywhere[2][members[1]] + subparts + parts
+    parents = np.concatenate([*above, np.full(wholes, -1)])
+    table = RegionTable(
+        np.array([[subparts, parts, wholes]]), parents, np.concatenate(sizes) >= RULE.smallest
+    )
+    return Regions(tuple(nodes), np.stack(everywhere), weights, tuple(sizes), tuple(totals), table)
 
 
 @kernel

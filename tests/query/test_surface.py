@@ -3,7 +3,7 @@
 import heapq
 from dataclasses import replace
 from itertools import pairwise
-from math import cos, hypot, inf, nan, pi, sin
+from math import hypot, inf, nan
 
 import numpy as np
 import pytest
@@ -374,22 +374,6 @@ def seen() -> Projected:
     return Projected(rng.uniform(-10, 95, (700, 2)), depths)
 
 
-def star(points: int = 7) -> np.ndarray:
-    """An outline that crosses itself, with a level edge at its end."""
-    turns = [2 * pi * 3 * k / points for k in range(points)]
-    return np.array([[40 + 30 * cos(t), 30 + 25 * sin(t)] for t in turns] + [[50.0, 10.0], [60.0, 10.0]])
-
-
-def plainly_in_polygon(x: float, y: float, outline) -> bool:
-    odd, before = False, outline[-1]
-    for corner in outline:
-        (x0, y0), (x1, y1) = before, corner
-        if (y0 > y) != (y1 > y) and x < x0 + (x1 - x0) * (y - y0) / (y1 - y0):
-            odd = not odd
-        before = corner
-    return odd
-
-
 def plainly_from_segment(x: float, y: float, start, end) -> float:
     (x0, y0), (x1, y1) = start, end
     square = (x1 - x0) ** 2 + (y1 - y0) ** 2
@@ -409,9 +393,17 @@ def within(seen: Projected) -> np.ndarray:
     return (seen.depths > 0) & (seen.pixels >= 0).all(1) & (seen.pixels < SIZE).all(1)
 
 
-def test_polygon_holds_points_by_their_winding(seen):
-    for outline in (star(), star()[::-1], np.array([[5, 5], [70, 20], [30, 55.0]])):
-        wanted = np.array([plainly_in_polygon(x, y, outline.tolist()) for x, y in seen.pixels]) & within(seen)
+def test_polygon_holds_points_by_the_even_odd_rule(seen):
+    box = np.array([[20, 5], [60, 5], [60, 40], [20, 40.0]])
+    hole = box * 0.5 + (20, 11.25)  # a second turn inside the first
+    for outline, wanted in (
+        (box, in_rectangle(seen, box[0], box[2])),
+        (box[::-1], in_rectangle(seen, box[2], box[0])),
+        (
+            np.concatenate([box, box[:1], hole, hole[:1]]),
+            in_rectangle(seen, box[1], box[3]) & ~in_rectangle(seen, hole[3], hole[1]),
+        ),
+    ):
         sure = (
             from_line(seen, np.concatenate([outline, outline[:1]])) > 1.5
         )  # a pixel on the edge counts whole
