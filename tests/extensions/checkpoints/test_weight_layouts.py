@@ -1,4 +1,4 @@
-"""Weights in the layouts of open_clip, segment_anything and sam2, and what open_clip computes.
+"""Weights in the layouts of open_clip, segment_anything and sam2.
 
 Written from the papers and the names in published checkpoints, apart from the product's own tables.
 """
@@ -16,12 +16,11 @@ import pytest
 import torch
 from safetensors.torch import save_file
 from torch import Tensor
-from torch.nn import functional
-from transformers import CLIPTokenizer
+from transformers import CLIPConfig, CLIPModel, CLIPTokenizer
 
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.extensions.checkpoints.weight_layouts import Hiera, converted
-from langsplat_core.semantics.encoders import CLIP_PIXELS, load_encoder, load_text_encoder
+from langsplat_core.semantics.encoders import load_encoder, load_text_encoder
 from langsplat_core.semantics.sam import FAMILIES, Segmenter, load_segmenter
 from langsplat_core.semantics.weights import Weights
 from tests.support.tiny_models import SAM_SIDE, MakesFolder, tiny_sam, tiny_sam2
@@ -33,100 +32,70 @@ MARKS = "'&"
 LETTERS = ascii_lowercase + MARKS
 TOKENS = [*LETTERS, *(f"{letter}</w>" for letter in LETTERS), "<|startoftext|>", "<|endoftext|>"]
 BEGIN, END = len(TOKENS) - 2, len(TOKENS) - 1
-PROJECTIONS = ("in_proj_weight", "in_proj_bias", "out_proj.weight", "out_proj.bias")
 Tensors = dict[str, Tensor]
 
 
-def open_clip_tensors(vision: int = 128, layers: int = 2, inner: int = 48) -> Tensors:
-    """Random weights of a CLIP as open_clip names them; `vision`: width of the half that sees."""
-    text = 128
-    made = torch.Generator().manual_seed(5)
+def clip_model(
+    vision: int = 128, layers: int = 2, inner: int = 48, heads: tuple[int, int] = (2, 2), quick: bool = False
+) -> CLIPModel:
+    """A CLIP of transformers, whose weights depend on its sizes alone.
 
-    def random(*shape: int, scale: float = 0.1) -> Tensor:
-        return torch.randn(*shape, generator=made) * scale
-
-    def norm(name: str, wide: int) -> Tensors:
-        return {f"{name}.weight": 1 + random(wide), f"{name}.bias": random(wide)}
-
-    def blocks(prefix: str, wide: int) -> Tensors:
-        found: Tensors = {}
-        for number in range(layers):
-            block = f"{prefix}transformer.resblocks.{number}."
-            found |= norm(f"{block}ln_1", wide) | norm(f"{block}ln_2", wide)
-            found[f"{block}attn.in_proj_weight"] = random(3 * wide, wide)
-            found[f"{block}attn.in_proj_bias"] = random(3 * wide)
-            shapes = {"attn.out_proj": (wide, wide), "mlp.c_fc": (inner, wide), "mlp.c_proj": (wide, inner)}
-            for name, (rows, columns) in shapes.items():
-                found |= {f"{block}{name}.weight": random(rows, columns), f"{block}{name}.bias": random(rows)}
-        return found
-
-    return {
-        "logit_scale": torch.tensor(4.6),
-        "token_embedding.weight": random(len(TOKENS), text, scale=1),
-        "positional_embedding": random(CONTEXT, text),
-        "text_projection": random(text, SIZE),
-        "visual.class_embedding": random(vision, scale=1),
-        "visual.positional_embedding": random((SIDE // PATCH) ** 2 + 1, vision),
-        "visual.conv1.weight": random(vision, 3, PATCH, PATCH),
-        "visual.proj": random(vision, SIZE),
-        **norm("ln_final", text),
-        **norm("visual.ln_pre", vision),
-        **norm("visual.ln_post", vision),
-        **blocks("", text),
-        **blocks("visual.", vision),
+    vision: width of the half that sees; heads: of images and of text; quick: OpenAI's GELU.
+    """
+    half = {
+        "intermediate_size": inner,
+        "num_hidden_layers": layers,
+        "hidden_act": "quick_gelu" if quick else "gelu",
     }
+    text = {"hidden_size": 128, "num_attention_heads": heads[1], "vocab_size": len(TOKENS)}
+    text |= {
+        "max_position_embeddings": CONTEXT,
+        "bos_token_id": BEGIN,
+        "eos_token_id": END,
+        "pad_token_id": END,
+    }
+    seeing = {"hidden_size": vision, "num_attention_heads": heads[0], "image_size": SIDE, "patch_size": PATCH}
+    torch.manual_seed(5)
+    model = CLIPModel(
+        CLIPConfig(text_config=half | text, vision_config=half | seeing, projection_dim=SIZE)
+    ).eval()
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(torch.randn_like(parameter) * 0.1)
+    return model
 
 
-def plain_texts(tensors: Tensors, phrases: list[str], heads: int, quick: bool) -> Tensor:
-    """(M, SIZE) unit vectors of words that are spelled, one phrase at a time and without padding."""
-    rows = []
-    for phrase in phrases:
-        letters = [letter for word in phrase.split() for letter in [*word[:-1], f"{word[-1]}</w>"]]
-        ids = [BEGIN, *map(TOKENS.index, letters), END]
-        x = tensors["token_embedding.weight"][ids] + tensors["positional_embedding"][: len(ids)]
-        later = torch.full((len(ids), len(ids)), -torch.inf).triu(1)
-        x = _norm(tensors, "ln_final", _blocks(tensors, "", x[:, None], heads, quick, later))
-        rows.append(x[-1, 0] @ tensors["text_projection"])
-    return functional.normalize(torch.stack(rows))
+CLIP_WORDS = (
+    (r"^vision_model\.embeddings\.class_embedding$", "visual.class_embedding"),
+    (r"^vision_model\.embeddings\.patch_embedding\.", "visual.conv1."),
+    (r"^vision_model\.embeddings\.position_embedding\.weight$", "visual.positional_embedding"),
+    (r"^text_model\.embeddings\.token_embedding\.", "token_embedding."),
+    (r"^text_model\.embeddings\.position_embedding\.weight$", "positional_embedding"),
+    (r"^vision_model\.pre_layrnorm\.", "visual.ln_pre."),
+    (r"^vision_model\.post_layernorm\.", "visual.ln_post."),
+    (r"^text_model\.final_layer_norm\.", "ln_final."),
+    (r"^vision_model\.encoder\.layers\.", "visual.transformer.resblocks."),
+    (r"^text_model\.encoder\.layers\.", "transformer.resblocks."),
+    (r"\.layer_norm(\d)\.", r".ln_\1."),
+    (r"\.mlp\.fc1\.", ".mlp.c_fc."),
+    (r"\.mlp\.fc2\.", ".mlp.c_proj."),
+    (r"\.self_attn\.", ".attn."),
+    (r"^visual_projection\.weight$", "visual.proj"),
+    (r"^text_projection\.weight$", "text_projection"),
+)
 
 
-def plain_pictures(tensors: Tensors, pixels: Tensor, heads: int, quick: bool) -> Tensor:
-    """(M, SIZE) unit vectors of (M, 3, SIDE, SIDE) normalised pictures."""
-    patches = functional.conv2d(pixels, tensors["visual.conv1.weight"], stride=PATCH).flatten(2)
-    first = tensors["visual.class_embedding"].expand(len(pixels), 1, -1)
-    x = torch.cat([first, patches.transpose(1, 2)], 1) + tensors["visual.positional_embedding"]
-    x = _norm(tensors, "visual.ln_pre", x).transpose(0, 1)
-    x = _blocks(tensors, "visual.", x, heads, quick, None)[0]
-    return functional.normalize(_norm(tensors, "visual.ln_post", x) @ tensors["visual.proj"])
-
-
-def _blocks(tensors: Tensors, prefix: str, x: Tensor, heads: int, quick: bool, mask: Tensor | None) -> Tensor:
-    number = 0
-    while (block := f"{prefix}transformer.resblocks.{number}.") + "ln_1.weight" in tensors:
-        y = _norm(tensors, f"{block}ln_1", x)
-        projections = [tensors[f"{block}attn.{name}"] for name in PROJECTIONS]
-        x = (
-            x
-            + functional.multi_head_attention_forward(
-                *(y, y, y, y.shape[-1], heads, *projections[:2], None, None, False, 0.0, *projections[2:]),
-                training=False,
-                need_weights=False,
-                attn_mask=mask,
-            )[0]
-        )
-        y = _linear(tensors, f"{block}mlp.c_fc", _norm(tensors, f"{block}ln_2", x))
-        y = y * torch.sigmoid(1.702 * y) if quick else functional.gelu(y)
-        x = x + _linear(tensors, f"{block}mlp.c_proj", y)
-        number += 1
-    return x
-
-
-def _norm(tensors: Tensors, name: str, x: Tensor) -> Tensor:
-    return functional.layer_norm(x, x.shape[-1:], tensors[f"{name}.weight"], tensors[f"{name}.bias"])
-
-
-def _linear(tensors: Tensors, name: str, x: Tensor) -> Tensor:
-    return functional.linear(x, tensors[f"{name}.weight"], tensors[f"{name}.bias"])
+def open_clip_tensors(**sizes: int) -> Tensors:
+    """The weights of `clip_model` as open_clip names them: queries, keys and values in one tensor."""
+    found = {name: tensor.detach() for name, tensor in clip_model(**sizes).state_dict().items()}
+    for pattern, by in CLIP_WORDS:
+        found = {re.sub(pattern, by, name): tensor for name, tensor in found.items()}
+    for name in [name for name in found if ".q_proj." in name]:
+        thirds = [found.pop(name.replace(".q_proj.", f".{role}_proj.")) for role in "qkv"]
+        found[name.replace(".q_proj.", ".in_proj_")] = torch.cat(thirds)
+    for name in ("visual.proj", "text_projection"):
+        found[name] = found[name].T.contiguous()
+    return {name: tensor for name, tensor in found.items() if not name.endswith("position_ids")}
 
 
 def letter_tokenizer(folder: Path) -> None:
@@ -192,8 +161,8 @@ SAM2_WORDS = (
 )
 
 
-# Weights in the layouts of open_clip, OpenAI, segment_anything and sam2, against open_clip's arithmetic and
-# against the same weights in Hugging Face layout.
+# Weights in the layouts of open_clip, OpenAI, segment_anything and sam2, against
+# the same weights in Hugging Face layout.
 
 PHRASES = ["red mug", "a", "handle"]
 CONFIG = "open_clip_config.json"
@@ -265,37 +234,42 @@ LAYOUTS = [
 ]
 
 
-def compare(case: Case, tensors: Tensors, tolerance: float = 1e-5) -> None:
-    """Both halves of what `case` loads against open_clip's arithmetic."""
+def compare(case: Case, tmp_path: Path, **sizes: int) -> None:
+    """Both halves of what `case` loads against the same weights as transformers has them."""
     path, vision_heads, text_heads, quick, config = case
     encoder = load_encoder(str(path), "cpu")
     assert (encoder.id, encoder.image_size, encoder.dim) == (str(path), SIDE, 24)
-    stated = (
-        config["preprocess_cfg"] if config else dict(zip(("mean", "std"), CLIP_PIXELS.tolist(), strict=True))
-    )
-    pixels = (crops() / 255 - np.array(stated["mean"])) / np.array(stated["std"])
-    given = torch.from_numpy(pixels.transpose(0, 3, 1, 2).astype(np.float32))
-    pictures, texts = encoder.encode_images(crops()), encoder.encode_texts(PHRASES)
-    np.testing.assert_allclose(pictures, plain_pictures(tensors, given, vision_heads, quick), atol=tolerance)
-    np.testing.assert_allclose(texts, plain_texts(tensors, PHRASES, text_heads, quick), atol=tolerance)
-    other = plain_texts(tensors, PHRASES, text_heads, not quick)
-    assert abs(texts - other.numpy()).max() > 20 * tolerance  # so the kind of GELU was seen
+    texts = []
+    for act in (quick, not quick):
+        folder = tmp_path / f"quick_{act}"
+        clip_model(**sizes, heads=(vision_heads, text_heads), quick=act).save_pretrained(folder)
+        letter_tokenizer(folder)
+        if config:
+            pixels = {f"image_{name}": values for name, values in config["preprocess_cfg"].items()}
+            (folder / "preprocessor_config.json").write_text(json.dumps(pixels))
+        other = load_encoder(str(folder), "cpu")
+        texts.append(other.encode_texts(PHRASES))
+        if act == quick:
+            np.testing.assert_allclose(
+                encoder.encode_images(crops()), other.encode_images(crops()), atol=1e-5
+            )
+    np.testing.assert_allclose(encoder.encode_texts(PHRASES), texts[0], atol=1e-5)
+    assert abs(texts[0] - texts[1]).max() > 2e-4  # so the kind of GELU was seen
 
 
 @pytest.mark.parametrize("write", LAYOUTS)
 def test_each_layout_of_clip_gives_the_vectors_of_open_clip(
     write: Callable[[Path, Tensors], Case], tmp_path: Path
 ) -> None:
-    tensors = open_clip_tensors()
     letter_tokenizer(tmp_path)
-    compare(write(tmp_path, tensors), tensors)
+    compare(write(tmp_path, open_clip_tensors()), tmp_path)
 
 
 def test_heads_of_a_wide_model_without_configuration(tmp_path: Path) -> None:
-    tensors = open_clip_tensors(vision=1280, layers=1, inner=8)  # as ViT-H-14: 16 heads of 80
+    sizes = {"vision": 1280, "layers": 1, "inner": 8}  # as ViT-H-14: 16 heads of 80
     letter_tokenizer(tmp_path)
-    torch.save(tensors, tmp_path / "quickgelu.pt")
-    compare((tmp_path / "quickgelu.pt", 16, 2, True, None), tensors)
+    torch.save(open_clip_tensors(**sizes), tmp_path / "quickgelu.pt")
+    compare((tmp_path / "quickgelu.pt", 16, 2, True, None), tmp_path, **sizes)
 
 
 CLEANED = {
