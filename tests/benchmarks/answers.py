@@ -62,8 +62,7 @@ WHOLE = DatasetConfig(max_side=65_536)  # photographs are not shrunk
 class Rooms(InRooms):
     """Localisation, segmentation and rejection in procedural rooms, in views that training did not see.
 
-    Without --scene, fresh rooms are rendered and trained first, some minutes each; an interrupted run
-    continues where it stopped."""
+    Rooms are rendered and trained first, some minutes each; an interrupted run continues where it stopped."""
 
     tiers: tuple[Tier, ...] = TIERS  # how crowded the rooms are
     seeds: Seeds = (101,)
