@@ -6,10 +6,7 @@ it can lift, `gather` (``W^T y``, the exact adjoint).
 """
 
 import math
-import os
 from abc import ABC, abstractmethod
-from functools import cache
-from pathlib import Path
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -20,13 +17,11 @@ from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.errors import InputError
 from langsplat_core.scene import Camera, Gaussians
 
-# Of an image of colours with alpha while it is drawn and turned into display values, float32 and uint8.
-BYTES_PER_PIXEL = 40
+MOST_PIXELS = 2**28  # 16384 x 16384, which takes 11 GB while it is drawn
 # Of the dilation, for images 16 times as large as the photographs: with more of it, wrong cameras beside a
 # scene would spread every Gaussian over the whole image.
 MOST_GROWTH = 256.0
 LABELS_AT_ONCE = 32  # that a plain gather lifts
-_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
 
 
 class View(ABC):
@@ -172,28 +167,9 @@ def dilation(camera: Camera, settings: RasterSettings) -> float:
     return settings.dilation * min(growth, MOST_GROWTH)
 
 
-def check_picture(camera: Camera) -> None:
-    """InputError where an image of the camera's size needs more than all of this machine's memory."""
-    needed = camera.width * camera.height * BYTES_PER_PIXEL
-    if needed > memory_bytes():
+def check_size(camera: Camera) -> None:
+    """InputError where an image of the camera's size is larger than any that is drawn."""
+    if camera.width * camera.height > MOST_PIXELS:
         raise InputError(
-            f"a picture of {camera.width}x{camera.height} pixels needs {needed / 1e9:.0f} GB of memory, and "
-            f"this machine has {memory_bytes() / 1e9:.0f}; choose a smaller size"
+            f"an image of {camera.width}x{camera.height} pixels is too large; choose a smaller size"
         )
-
-
-@cache
-def memory_bytes() -> float:
-    """Most that a process here may use: the machine's memory, or its container's share.
-
-    Infinite where the system does not say.
-    """
-    found = [float("inf")]
-    if "SC_PHYS_PAGES" in getattr(os, "sysconf_names", {}):
-        found.append(float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")))
-    for limit in _LIMITS:
-        try:
-            found.append(float(limit.read_text()))
-        except (OSError, ValueError):  # not there, or "max"
-            continue
-    return min(found)

@@ -33,18 +33,18 @@ from langsplat_core.raster.cpu.tiles import (
     CHECK_EVERY,
     PIXELS,
     TILE,
-    Cutoffs,
     Tiles,
     begin_rows,
     blend_row,
     correlate,
     enter,
+    grown,
     load_tile,
     padded_inside,
     rows_to_blend,
     running_rows,
-    spread,
     start_tile,
+    tile_at,
 )
 
 # Columns of the partial sums (two are unused); the gradient by the values follows them.
@@ -55,20 +55,7 @@ _TAPE = 128 * TILE * _ENTRY  # its first length: 128 Gaussians that fill the til
 
 
 @helper
-def _grown(tape: Array, used: int) -> Array:
-    """Return the tape, with room for one more Gaussian behind `used` numbers."""
-    if used + TILE * _ENTRY <= tape.shape[0]:
-        return tape
-    longer = np.empty(2 * tape.shape[0], np.float32)
-    for n in range(used):
-        longer[n] = tape[n]
-    return longer
-
-
-@helper
-def _record(
-    tile: int, tiles: Tiles, geometry: Array, cutoffs: Cutoffs, state: Array, spans: Array, tape: Array
-) -> tuple[Array, int, int]:
+def _record(tile: int, tiles: Tiles, state: Array, spans: Array, tape: Array) -> tuple[Array, int, int]:
     """`walk`, but with a tape that may have to grow on the way.
 
     Returns it (a longer one where it was full), its length and the end of the intersections visited.
@@ -85,13 +72,14 @@ def _record(
             top, bottom = running_rows(state, top, bottom)
             if top >= bottom:
                 return tape, used, s
-        tape = _grown(tape, used)
+        if used + TILE * _ENTRY > tape.shape[0]:
+            tape = grown(tape, used)
         low, high = rows_to_blend(tiles.rows[s], top, bottom)
-        g = enter(geometry, tiles, s, min(s + AHEAD, last - 1))
+        g = enter(tiles, s, min(s + AHEAD, last - 1))
         step, peak, w, v, w_step, v_step = begin_rows(g, x, y + low)
         start, most = used, lanes(np.float32(0))
         for row in range(low, high):
-            added, before = blend_row(state, row * TILE, step + w, peak - v * v, cutoffs)
+            added, before = blend_row(state, row * TILE, step + w, peak - v * v, tiles.cutoffs)
             w, v = w + w_step, v + v_step
             store(tape, used, added)
             store(tape, used + TILE, before)
@@ -108,28 +96,25 @@ def _record(
 def _backward_tile(
     tile: int,
     tiles: Tiles,
-    geometry: Array,
     values: Array,
     grads: tuple[Array, Array],
-    cutoffs: Cutoffs,
     partial: Array,
     reached: Array,
     tape: Array,
 ) -> Array:
     """One tile; returns the tape, for the next tile to write over."""
     image_grad, alpha_grad = grads
-    height, width, _ = image_grad.shape
     channels, columns = values.shape[1], partial.shape[1]
     lines = padded_inside(channels)
     left, top = tile % tiles.columns * TILE + 0.5, tile // tiles.columns * TILE + 0.5
     first, last = tiles.starts[tile], tiles.starts[tile + 1]
-    state = start_tile(tile, tiles, width, height)
+    state = start_tile(tile, tiles)
     spans = np.zeros((last - first, 2), np.int64)
-    tape, used, end = _record(tile, tiles, geometry, cutoffs, state, spans, tape)
+    tape, used, end = _record(tile, tiles, state, spans, tape)
     reached[end:last] = False
     planes, plane = np.empty(PIXELS * lines, np.float32), np.empty(PIXELS, np.float32)
-    load_tile(planes, image_grad, tile, tiles.columns)
-    load_tile(plane, alpha_grad, tile, tiles.columns)
+    load_tile(planes, image_grad, tile, tiles)
+    load_tile(plane, alpha_grad, tile, tiles)
     weights = np.empty(PIXELS, np.float32)
     behind = state
     behind[:] = 0
@@ -139,7 +124,7 @@ def _backward_tile(
         if low >= high:
             continue
         used -= (high - low) * _ENTRY
-        g = enter(geometry, tiles, s, max(s - AHEAD, first))
+        g = enter(tiles, s, max(s - AHEAD, first))
         x = values[tiles.ranks[s]]
         step, _, offset, v, w_step, v_step = begin_rows(g, left, top + low)
         q0 = qw = qv = qww = qwv = qvv = none = lanes(np.float32(0))
@@ -155,7 +140,7 @@ def _backward_tile(
             hidden = load(behind, row * TILE)
             store(behind, row * TILE, hidden + weight * slope)
             q = weight * slope - hidden * alpha * reciprocal(1.0 - alpha)
-            q = where_greater(cutoffs.alpha_max, alpha, q, 0.0)
+            q = where_greater(tiles.cutoffs.alpha_max, alpha, q, 0.0)
             moved, lifted = q * w, q * v
             q0, qw, qv = q0 + q, qw + moved, qv + lifted
             qww, qwv, qvv = qww + moved * w, qwv + moved * v, qvv + lifted * v
@@ -171,10 +156,8 @@ def backward(
     first: int,
     last: int,
     tiles: Tiles,
-    geometry: Array,
     values: Array,
     grads: tuple[Array, Array],
-    cutoffs: Cutoffs,
     partial: Array,
     reached: Array,
 ) -> None:
@@ -183,12 +166,9 @@ def backward(
     Fills (I,) bool `reached`, and (I, 8 + padded(C)) partial sums where that is True. float32, for tiles
     [first, last).
     """
-    count = tiles.starts.shape[0] - 1
     tape = np.empty(_TAPE, np.float32)
     for i in range(first, last):
-        tape = _backward_tile(
-            spread(i, count), tiles, geometry, values, grads, cutoffs, partial, reached, tape
-        )
+        tape = _backward_tile(tile_at(i, tiles), tiles, values, grads, partial, reached, tape)
 
 
 # Gradients of the CPU backend, second half: from a footprint back to the Gaussian's parameters.
@@ -209,7 +189,6 @@ class Sums(NamedTuple):
     """What `backward` left of the M Gaussians that are drawn."""
 
     rank_of: Array  # (N,) int32 place in depth order of every row, -1 where it is not drawn
-    geometry: Array  # (M, 8)
     partial: Array  # (I, 8 + padded(C))
     reached: Array  # (I,) bool
 
@@ -220,7 +199,7 @@ def _fetch(i: int, last: int, tiles: Tiles, sums: Sums) -> None:
     rank = sums.rank_of[min(i + 3 * AHEAD, last - 1)]
     if rank >= 0:
         prefetch(tiles.firsts, np.int64(rank))
-        prefetch(sums.geometry, np.int64(rank) * cp.COLUMNS)
+        prefetch(tiles.geometry, np.int64(rank) * cp.COLUMNS)
     rank = sums.rank_of[min(i + 2 * AHEAD, last - 1)]
     if rank >= 0:
         prefetch(tiles.slots, tiles.firsts[rank])
@@ -398,7 +377,7 @@ def to_parameters(
             continue
         for channel in range(out.values.shape[1]):
             out.values[i, channel] = added[MOMENTS + channel]
-        du, dv, by_covariance = _footprint_gradient(sums.geometry[rank], moments)
+        du, dv, by_covariance = _footprint_gradient(tiles.geometry[rank], moments)
         out.means_px[i, 0], out.means_px[i, 1] = du, dv
         out.opacity_logits[i] = moments[Q] * (1 - cp.opacity_of(rows.opacity_logits[i]))
         point = cp.camera_point(rows.means[i], camera)

@@ -13,6 +13,7 @@ is not, so float32 pixels suffice.
 """
 
 from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -21,13 +22,13 @@ from langsplat_core.compiled import helper, kernel, plain, shared_workers
 from langsplat_core.config import RasterSettings
 from langsplat_core.raster.cpu.lanes import prefetch
 from langsplat_core.raster.protocol import dilation, farthest, tangent_limits
-from langsplat_core.scene import Camera
+from langsplat_core.scene import Camera, Gaussians
 from langsplat_core.scene.gaussians import LARGEST_COEFFICIENT
 from langsplat_core.scene.transform import C0, C1, C2, C3
 
 COLUMNS = 8  # of the geometry: one cache line a row
 INVALID, UNDRAWN, DRAWN = 0, 1, 2  # what `project` says of a row
-UNKNOWN, UNUSABLE = 0.0, -1.0  # sizes of rows that no view has come to yet, and of those that are not valid
+UNUSABLE = -1.0  # size of a row that is not valid
 MEAN_X, MEAN_Y, FACTOR_A, FACTOR_K, FACTOR_C, LOG2_OPACITY, HALF_WIDTH, HALF_HEIGHT = range(8)  # columns
 HALF_LOG2_E = 0.5 / np.log(2.0)
 LN2 = np.log(2.0)
@@ -48,7 +49,7 @@ class Rows(NamedTuple):
     quats_wxyz: Array  # (N, 4) float32
     opacity_logits: Array  # (N,) float32
     sh_bits: Array  # (N, 3 K) uint32: the SH coefficients' bits, only to see whether they are usable
-    sizes: Array  # (N,) float32 the largest of a row's scales or a little more; see `UNKNOWN`, `UNUSABLE`
+    sizes: Array  # (N,) float32 the largest of a row's scales or a little more, world units; or `UNUSABLE`
 
 
 class Projection(NamedTuple):
@@ -237,17 +238,43 @@ def _is_outside(x: float, y: float, over: float, size: float, camera: KernelCame
 
 
 @kernel
+def _measure(first: int, last: int, rows: Rows) -> None:
+    """Fill the sizes of rows [first, last)."""
+    for i in range(first, last):
+        logs = rows.log_scales[i]
+        largest = np.exp(np.float64(max(logs[0], logs[1], logs[2])))
+        rows.sizes[i] = 1.000001 * largest + _TINY if _is_valid(rows, i) else UNUSABLE
+
+
+_SIZES: WeakKeyDictionary[Gaussians, Array] = WeakKeyDictionary()  # Gaussians are not changed
+
+
+def rows_of(gaussians: Gaussians) -> Rows:
+    """Return the Gaussians as kernels take them; their sizes are measured once."""
+    rows = Rows(
+        plain(gaussians.means),
+        plain(gaussians.log_scales),
+        plain(gaussians.quats_wxyz),
+        plain(gaussians.opacity_logits),
+        plain(gaussians.sh).reshape(len(gaussians), gaussians.sh.shape[1] * 3).view(np.uint32),
+        _SIZES.get(gaussians, np.empty(len(gaussians), np.float32)),
+    )
+    if gaussians not in _SIZES:
+        shared_workers().run(_measure, len(gaussians), rows)
+        _SIZES[gaussians] = rows.sizes
+    return rows
+
+
+@kernel
 def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Projection) -> None:
-    """Fill `out` for rows [first, last), and sizes that are not known yet.
+    """Fill `out` for rows [first, last).
 
     A Gaussian whose alpha = alpha_min contour meets no pixel centre is UNDRAWN.
     """
     work = np.empty((3, 3, 3))
     log2_least = np.log2(camera.alpha_min)
     for i in range(first, last):
-        size = rows.sizes[i]
-        if size == UNUSABLE or (size == UNKNOWN and not _is_valid(rows, i)):
-            rows.sizes[i] = UNUSABLE
+        if rows.sizes[i] == UNUSABLE:
             out.status[i] = INVALID
             continue
         out.status[i] = UNDRAWN
@@ -255,14 +282,12 @@ def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Projec
         if not (camera.near < z <= camera.far):
             continue
         over = 1.0 if camera.orthographic else z
-        if size != UNKNOWN and _is_outside(x, y, over, size, camera):
+        if _is_outside(x, y, over, rows.sizes[i], camera):
             continue
         opacity = opacity_of(rows.opacity_logits[i])
         if not opacity >= camera.alpha_min:
             continue
-        scales, _ = fill_axes((x, y, z), rows.log_scales[i], rows.quats_wxyz[i], camera, work)
-        if size == UNKNOWN:
-            rows.sizes[i] = 1.000001 * max(scales[0], scales[1], scales[2]) + _TINY
+        fill_axes((x, y, z), rows.log_scales[i], rows.quats_wxyz[i], camera, work)
         xx, xy, yy, det, sharp = covariance(work[2], camera.dilation)
         if camera.antialiased:
             opacity *= np.sqrt(max(sharp / det, COMPENSATION_MIN))

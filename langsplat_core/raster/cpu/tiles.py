@@ -4,8 +4,9 @@ From top to bottom: the depth order, binning, a tile's own memory, and the walk 
 its adjoint and its gradients share.
 """
 
+import math
 from collections.abc import Callable
-from itertools import pairwise
+from itertools import count, pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,52 +22,55 @@ from langsplat_core.raster.cpu.lanes import (
     lanes,
     largest,
     load,
-    load_four,
-    load_three,
+    load_units,
     prefetch,
     ramp,
     smaller,
     store,
-    store_four,
-    store_three,
     store_totals,
     total,
     where_at_least,
     where_greater,
 )
-from langsplat_core.raster.cpu.memory import Memory
 
 TILE = 16
+PIXELS = TILE * TILE
 _SLACK = 1e-3  # px by which footprints are widened here; the blending kernels test alpha itself
 _MOST = 2**31 - 1  # intersections of Gaussians and tiles in one view
 _DIGIT, _PASSES = 11, 3  # bits per pass of the radix sort, of 32
 _MOVES = 4  # for each depth, after which sorting by neighbours is given up
-_FEW = 32  # tiles, too few to count more closely
 _PIECES = 16  # of the depth order that are binned side by side; the result does not depend on it
-
 
 # Of a footprint: centre, half width, abscissa of its lowest point, slope and bulge of `_rows_in_column`; px.
 Ellipse = tuple[float, float, float, float, float, float]
+Size = tuple[int, int]  # width and height of an image, px
+Touched = tuple[Array, Array, Array]  # rank, tile and span of rows of intersections
 
 
-class TileGrid(NamedTuple):
-    """An image cut into tiles."""
+class Cutoffs(NamedTuple):
+    """The constants of steps 3 and 4 of `reference.py`."""
 
-    width: float  # px; a float, as it is compared with floats
-    height: float
-    columns: int  # tiles per row of tiles
-    lines: int  # rows of tiles
+    alpha_min: float
+    alpha_max: float
+    transmittance_min: float
 
 
 class Tiles(NamedTuple):
     """I intersections of M drawn Gaussians (numbered front to back) with T tiles (row by row)."""
 
+    geometry: Array  # (M, 8) float64 footprints, see `projection`
     starts: Array  # (T + 1,) int64: tile t owns intersections starts[t] to starts[t + 1]
     ranks: Array  # (I,) int32 Gaussian of each intersection, ascending within a tile
     rows: Array  # (I,) uint16 spans of rows that the footprint touches in the tile, see `pack_span`
     firsts: Array  # (M + 1,) int64: Gaussian r has intersections slots[firsts[r] : firsts[r + 1]]
     slots: Array  # (I,) int32
     columns: int  # tiles per row of tiles
+    stride: (
+        int  # from a tile to the one that is blended next: threads take pieces, and busy tiles lie together
+    )
+    width: int  # of the image, px
+    height: int
+    cutoffs: Cutoffs
 
 
 @helper
@@ -81,91 +85,60 @@ def unpack_span(packed: int) -> tuple[int, int]:
     return packed & 255, packed >> 8
 
 
-class Sorting(NamedTuple):
-    """Memory for what is sorted."""
-
-    keys: Array  # (2, M) uint32
-    order: Array  # (2, M) int32 rows; the second one is the result
-    depth_bits: Array  # (M,) uint64
-
-
-@helper
-def _fill_keys(status: Array, depth_bits: Array, out: Sorting, counts: Array) -> None:
-    """keys[0], order[0] <- the 32 leading bits in which drawn depths differ, and their rows.
-
-    Counts[digit, value] <- how often.
-    """
-    low, high = np.uint64(2**64 - 1), np.uint64(0)
-    for i in range(status.shape[0]):
-        if status[i] == cp.DRAWN:
-            low, high = min(low, depth_bits[i]), max(high, depth_bits[i])
-    shift = np.uint64(0)
-    while low < high and (high - low) >> shift >= np.uint64(1 << 32):
-        shift += np.uint64(1)
-    n = 0
-    for i in range(status.shape[0]):
-        if status[i] == cp.DRAWN:
-            key = np.uint32((depth_bits[i] - low) >> shift)
-            out.keys[0, n], out.order[0, n] = key, i
-            n += 1
-            for digit in range(_PASSES):
-                counts[digit, _digit_of(key, digit)] += 1
-
-
 @helper
 def _digit_of(key: Any, digit: int) -> Any:
     return (key >> np.uint32(_DIGIT * digit)) & np.uint32((1 << _DIGIT) - 1)
 
 
 @kernel
-def _depth_order(status: Array, depth_bits: Array, out: Sorting) -> bool:
-    """(N,) status and depths reinterpreted as uint64 -> fills `out`, of the length of what is drawn.
+def _sort_depths(keys: Array, depths: Array, order: Array) -> bool:
+    """(2, M) uint32 keys, those of the depths first -> order[1]: by depth, ties by index.
 
-    By depth, ties by index. False where it gave up, as very many depths are nearly equal.
-    Positive floats order as their bits do. Sorted by their 32 leading bits that differ (radix, least
-    significant digit first, each pass stable); then neighbours that are still in the wrong order change
-    places.
+    False where it gave up, as very many depths are nearly equal. Sorted by key (radix, least significant
+    digit first, each pass stable); then neighbours that are still in the wrong order change places.
     """
+    number = depths.shape[0]
     ends = np.zeros((_PASSES, 1 << _DIGIT), np.int64)
-    _fill_keys(status, depth_bits, out, ends)
+    for i in range(number):
+        order[0, i] = i
+        for digit in range(_PASSES):
+            ends[digit, _digit_of(keys[0, i], digit)] += 1
     for digit in range(_PASSES):
         here, total = digit % 2, 0
         for value in range(1 << _DIGIT):
             total, ends[digit, value] = total + ends[digit, value], total
-        for i in range(out.depth_bits.shape[0]):
-            key = out.keys[here, i]
+        for i in range(number):
+            key = keys[here, i]
             value = _digit_of(key, digit)
             place = ends[digit, value]
             ends[digit, value] = place + 1
-            out.keys[1 - here, place], out.order[1 - here, place] = key, out.order[here, i]
-    order, ordered_bits, moves = out.order[_PASSES % 2], out.depth_bits, 0
-    for i in range(order.shape[0]):
-        row, bits, place = order[i], depth_bits[order[i]], i
-        while place > 0 and ordered_bits[place - 1] > bits and moves <= _MOVES * order.shape[0]:
-            order[place], ordered_bits[place] = order[place - 1], ordered_bits[place - 1]
+            keys[1 - here, place], order[1 - here, place] = key, order[here, i]
+    by_depth, moves = order[_PASSES % 2], 0
+    for i in range(number):
+        row, place = by_depth[i], i
+        while place > 0 and depths[by_depth[place - 1]] > depths[row] and moves <= _MOVES * number:
+            by_depth[place] = by_depth[place - 1]
             place -= 1
             moves += 1
-        order[place], ordered_bits[place] = row, bits
-    return moves <= _MOVES * order.shape[0]
+        by_depth[place] = row
+    return moves <= _MOVES * number
 
 
-def depth_order(status: Array, depths: Array, memory: Memory) -> tuple[Array, Array]:
-    """(N,) status and positive depths -> (M,) int32 drawn rows, by depth, ties by index, and their depths."""
-    count = int(np.count_nonzero(status == cp.DRAWN))
-    keys, orders = memory.empty((2, count), np.uint32), memory.empty((2, count), np.int32)
-    bits = memory.empty((count,), np.uint64)
-    if _depth_order(status, depths.view(np.uint64), Sorting(keys, orders, bits)):
-        return orders[_PASSES % 2], bits.view(np.float64)
-    drawn = np.flatnonzero(status == cp.DRAWN)
-    order = drawn[np.argsort(depths[drawn], kind="stable")].astype(np.int32)
-    return order, depths[order]
+def depth_order(depths: Array) -> Array:
+    """(M,) positive float64 depths -> (M,) int32 rows by depth, ties by index."""
+    keys, order = np.empty((2, len(depths)), np.uint32), np.empty((2, len(depths)), np.int32)
+    with np.errstate(over="ignore"):  # infinity is the largest key
+        keys[0] = depths.astype(np.float32).view(np.uint32)  # positive floats order as their bits do
+    if _sort_depths(keys, depths, order):
+        return order[_PASSES % 2]
+    return np.argsort(depths, kind="stable").astype(np.int32)
 
 
 @helper
-def _span(centre: float, low: float, high: float, size: float) -> tuple[int, int]:
+def _span(centre: float, low: float, high: float, size: int) -> tuple[int, int]:
     """Pixels [first, last) of `size` whose centres lie in [centre + low, centre + high]."""
-    first = min(max(np.ceil(centre + low - 0.5 - _SLACK), 0.0), size)
-    last = min(max(np.floor(centre + high - 0.5 + _SLACK) + 1, 0.0), size)
+    first = min(max(np.ceil(centre + low - 0.5 - _SLACK), 0.0), float(size))
+    last = min(max(np.floor(centre + high - 0.5 + _SLACK) + 1, 0.0), float(size))
     return int(first), int(last)
 
 
@@ -178,7 +151,7 @@ def _ellipse(g: Array) -> Ellipse:
 
 
 @helper
-def _rows_in_column(ellipse: Ellipse, column: int, height: float) -> tuple[int, int]:
+def _rows_in_column(ellipse: Ellipse, column: int, height: int) -> tuple[int, int]:
     """Pixel rows [first, last) in which a footprint meets a column of tiles.
 
     At abscissa dx the ellipse spans dy = slope dx +- bulge sqrt(half_width^2 - dx^2); its lowest point over
@@ -194,75 +167,66 @@ def _rows_in_column(ellipse: Ellipse, column: int, height: float) -> tuple[int, 
 
 
 @helper
-def _columns_touched(g: Array, grid: TileGrid) -> tuple[int, int]:
-    first, last = _span(g[cp.MEAN_X], -g[cp.HALF_WIDTH], g[cp.HALF_WIDTH], grid.width)
-    return first // TILE, (last + TILE - 1) // TILE if last > first else first // TILE
-
-
-@helper
-def _at_most(g: Array, grid: TileGrid) -> float:
-    """Return a bound of the tiles that a footprint touches.
-
-    Those of its box, or, for a needle, of the area within a tile's side of it (Steiner).
-    """
-    wide, high = 2 * g[cp.HALF_WIDTH] / TILE, 2 * g[cp.HALF_HEIGHT] / TILE
-    box = min(float(grid.columns), wide + 2) * min(float(grid.lines), high + 2)  # in this order also of a NaN
-    if box <= _FEW:
-        return box
-    a, c, k = g[cp.FACTOR_A], g[cp.FACTOR_C], g[cp.FACTOR_K]
-    area = 0.25 * np.pi * wide * wide * a * c / (a * a * k * k + c * c)
-    return min(box, area + 2 * (wide + high) + 5)
+def grown(array: Array, used: int) -> Array:
+    """Return an array twice as long whose first `used` entries are those of `array`."""
+    longer = np.empty(2 * array.shape[0], array.dtype)
+    longer[:used] = array[:used]
+    return longer
 
 
 @kernel
 def _touch(
-    first: int, last: int, order: Array, footprints: Array, grid: TileGrid, geometry: Array, firsts: Array
-) -> tuple[tuple[Array, Array, Array], int, Array]:
-    """Find the tiles that ranks [first, last) touch.
+    first: int,
+    last: int,
+    order: Array,
+    footprints: Array,
+    size: Size,
+    geometry: Array,
+    firsts: Array,
+) -> tuple[Touched, int, Array]:
+    """Find the tiles that ranks [first, last) touch, in an image of `size` (width, height).
 
-    geometry[rank] <- footprints[order[rank]], firsts[rank + 1] <- how many tiles it touches. Returns the
-    ranks, tiles and spans of rows of these intersections, their number, and how often each tile was touched.
+    geometry[rank] <- footprints[order[rank]], firsts[rank + 1] <- how many tiles it touches. Returns these
+    intersections, their number, and how often each tile was touched.
     """
-    most = 0.0
+    width, height = size
+    columns, lines_of_tiles = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
+    room = 4 * (last - first) + 2 * lines_of_tiles + 2
+    ranks, where, spans = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(room, np.uint16)
+    counts = np.zeros((lines_of_tiles + 2) * columns, np.int64)  # two lines more than there are, see below
+    used = 0
     for rank in range(first, last):
         prefetch(footprints, np.int64(order[min(rank + 2 * AHEAD, last - 1)]) * cp.COLUMNS)
         for n in range(cp.COLUMNS):
             geometry[rank, n] = footprints[order[rank], n]
-        most += _at_most(geometry[rank], grid)
-    room = int(most) + 3  # two places are always written
-    touched = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(room, np.uint16)
-    ranks, where, spans = touched
-    counts = np.zeros((grid.lines + 2) * grid.columns, np.int64)  # the last two lines: the same
-    used = 0
-    for rank in range(first, last):
         g, before = geometry[rank], used
-        left, right = _columns_touched(g, grid)
+        left, right = _span(g[cp.MEAN_X], -g[cp.HALF_WIDTH], g[cp.HALF_WIDTH], width)
         ellipse = _ellipse(g)
-        for column in range(left, right):
-            low, high = _rows_in_column(ellipse, column, grid.height)
+        for column in range(left // TILE, (right + TILE - 1) // TILE if left < right else 0):
+            low, high = _rows_in_column(ellipse, column, height)
             line = low // TILE
             lines = (high + TILE - 1) // TILE - line if low < high else 0
-            tile, top = line * grid.columns + column, line * TILE
+            if used + lines_of_tiles + 2 > ranks.shape[0]:
+                ranks, where, spans = grown(ranks, used), grown(where, used), grown(spans, used)
+            tile, top = line * columns + column, line * TILE
             # Most columns have one tile or two: writing two always, without a branch to foretell, is faster.
             ranks[used], ranks[used + 1] = rank, rank
-            where[used], where[used + 1] = tile, tile + grid.columns
+            where[used], where[used + 1] = tile, tile + columns
             spans[used] = pack_span(low - top, min(high - top, TILE))
             spans[used + 1] = pack_span(0, min(high - top - TILE, TILE))
             counts[tile] += lines >= 1
-            counts[tile + grid.columns] += lines >= 2
+            counts[tile + columns] += lines >= 2
             for n in range(2, lines):
-                ranks[used + n], where[used + n] = rank, tile + n * grid.columns
+                ranks[used + n], where[used + n] = rank, tile + n * columns
                 spans[used + n] = pack_span(0, min(high - top - n * TILE, TILE))
-                counts[tile + n * grid.columns] += 1
+                counts[tile + n * columns] += 1
             used += lines
         firsts[rank + 1] = used - before
-    return touched, used, counts
+    return (ranks, where, spans), used, counts
 
 
 @kernel
-def _place(
-    first: int, last: int, touched: tuple[Array, Array, Array], places: Array, start: int, tiles: Tiles
-) -> None:
+def _place(first: int, last: int, touched: Touched, places: Array, start: int, tiles: Tiles) -> None:
     """Write intersections [first, last) that `_touch` found into their tiles.
 
     Those of a tile go to places[tile] and on: within a tile ranks ascend, whoever runs which piece. They are
@@ -278,20 +242,20 @@ def _place(
 
 
 def bin_tiles(
-    footprints: Array, order: Array, size: tuple[int, int], workers: Workers, memory: Memory
-) -> tuple[Array, Tiles]:
-    """(N, 8) footprints, (M,) the drawn ones in depth order -> (M, 8) geometry in that order, and the tiles.
+    footprints: Array,
+    order: Array,
+    size: Size,
+    settings: RasterSettings,
+    workers: Workers,
+    empty: Callable[[tuple[int, ...], Any], Array],
+) -> Tiles:
+    """(N, 8) footprints, (M,) the drawn ones in depth order -> the tiles of an image of `size`.
 
-    size: width and height of the image.
+    `empty` makes arrays as `numpy.empty` does.
     """
-    geometry = memory.empty((len(order), cp.COLUMNS), np.float64)
-    width, height = size
-    grid = TileGrid(float(width), float(height), -(-width // TILE), -(-height // TILE))
-    firsts = memory.empty((len(order) + 1,), np.int64)
-    firsts[0] = 0
-    edges = [len(order) * i // _PIECES for i in range(_PIECES + 1)]
-    pieces = list(pairwise(edges))
-    shared = order, footprints, grid, geometry, firsts
+    geometry, firsts = empty((len(order), cp.COLUMNS), np.float64), np.zeros(len(order) + 1, np.int64)
+    pieces = list(pairwise(len(order) * i // _PIECES for i in range(_PIECES + 1)))
+    shared = order, footprints, size, geometry, firsts
     found = workers.each(_touch, [(*piece, *shared) for piece in pieces])
     np.cumsum(firsts, out=firsts)
     total = int(firsts[-1])
@@ -301,34 +265,30 @@ def bin_tiles(
             "render a smaller image"
         )
     # Where each piece writes in each tile: tile by tile, and in a tile piece by piece.
-    counts = np.stack([counts[: grid.columns * grid.lines] for _, _, counts in found], 1)
+    columns = -(-size[0] // TILE)
+    number = columns * -(-size[1] // TILE)
+    counts = np.stack([counts[:number] for _, _, counts in found], 1)
     ends = np.cumsum(counts).reshape(counts.shape)
     places = np.ascontiguousarray((ends - counts).T)
-    starts = np.append(places[0], total)
-    ranks, rows, slots = (memory.empty((total,), kind) for kind in (np.int32, np.uint16, np.int32))
-    tiles = Tiles(starts, ranks, rows, firsts, slots, grid.columns)
+    golden = max(int(number * 0.6180339887), 1)  # every stretch of tiles then samples the whole image evenly
+    tiles = Tiles(
+        geometry=geometry,
+        starts=np.append(places[0], total),
+        ranks=empty((total,), np.int32),
+        rows=empty((total,), np.uint16),
+        firsts=firsts,
+        slots=empty((total,), np.int32),
+        columns=columns,
+        stride=next(stride for stride in count(golden) if math.gcd(stride, number) == 1),
+        width=size[0],
+        height=size[1],
+        cutoffs=Cutoffs(*map(float, (settings.alpha_min, settings.alpha_max, settings.transmittance_min))),
+    )
     calls = []
     for (first, _), (touched, used, _), places_of_it in zip(pieces, found, places, strict=True):
         calls.append((0, used, touched, places_of_it, int(firsts[first]), tiles))
     workers.each(_place, calls)
-    return geometry, tiles
-
-
-@helper
-def spread(index: int, count: int) -> int:
-    """Return a permutation of range(count) whose every stretch samples the whole image evenly.
-
-    Threads take contiguous pieces of a loop over tiles, and busy tiles lie together. The stride is near the
-    golden section of `count` and prime to it.
-    """
-    stride = max(int(count * 0.6180339887), 1)
-    while True:
-        a, b = stride, count
-        while b != 0:
-            a, b = b, a % b
-        if a == 1:
-            return (index * stride) % count
-        stride += 1
+    return tiles
 
 
 # A tile's own memory: sixteen numbers per row and channel, `planes[(row, channel, column)]`, one flat array.
@@ -359,64 +319,44 @@ def add_weighted(sums: Array, at: int, channels: int, weight: Lanes, x: Array) -
 
 
 @helper
-def write_tile(planes: Array, image: Array, tile: int, columns: int) -> None:
-    """Copy planes[(row, channel, column)] to tile `tile` (`columns` to a row) of the (H, W, C) image."""
-    x0, y0 = tile % columns * TILE, tile // columns * TILE
-    height, width, channels = image.shape
-    lines = padded_inside(channels)
-    fours = channels & ~3 if x0 + TILE <= width else 0
-    for row in range(min(TILE, height - y0)):
-        first, at = row * lines * TILE, ((y0 + row) * width + x0) * channels
-        if channels == 1 and x0 + TILE <= width:
-            store(image, at, load(planes, first))
-            continue
-        if channels == 3 and x0 + TILE <= width:
-            a, b, c = load(planes, first), load(planes, first + TILE), load(planes, first + 2 * TILE)
-            store_three(image, at, a, b, c)
-            continue
-        for channel in range(0, fours, 4):
-            f = first + channel * TILE
-            a, b, c, d = (
-                load(planes, f),
-                load(planes, f + TILE),
-                load(planes, f + 2 * TILE),
-                load(planes, f + 3 * TILE),
-            )
-            store_four(image, at + channel, channels, a, b, c, d)
-        for column in range(min(TILE, width - x0)):
-            for channel in range(fours, channels):
-                image[y0 + row, x0 + column, channel] = planes[first + channel * TILE + column]
+def _write_row(planes: Array, at: int, image: Array, x0: int, y: int, columns: int, channels: int) -> None:
+    for channel in range(channels):
+        for column in range(columns):
+            image[y, x0 + column, channel] = planes[at + channel * TILE + column]
 
 
 @helper
-def load_tile(planes: Array, image: Array, tile: int, columns: int) -> None:
-    """planes[(row, channel, column)] <- that tile (of `columns` in a row of tiles) of (H, W, C) image.
+def _load_row(planes: Array, at: int, image: Array, x0: int, y: int, columns: int, channels: int) -> None:
+    for channel in range(channels):
+        for column in range(columns):
+            planes[at + channel * TILE + column] = image[y, x0 + column, channel]
 
-    0 beyond its border and in the fourth channel of three.
-    """
+
+@helper
+def _copy_rows(copy: Callable[..., None], planes: Array, image: Array, tile: int, columns: int) -> None:
     x0, y0 = tile % columns * TILE, tile // columns * TILE
     height, width, channels = image.shape
-    lines = padded_inside(channels)
-    planes[:] = 0
-    fours = channels & ~3 if x0 + TILE <= width else 0
     for row in range(min(TILE, height - y0)):
-        first, at = row * lines * TILE, ((y0 + row) * width + x0) * channels
-        if channels == 3 and x0 + TILE <= width:
-            p, q, r = load_three(image, at)
-            store(planes, first, p)
-            store(planes, first + TILE, q)
-            store(planes, first + 2 * TILE, r)
-            continue
-        for channel in range(0, fours, 4):
-            a, b, c, d = load_four(image, at + channel, channels)
-            f = first + channel * TILE
-            store(planes, f, a)
-            store(planes, f + TILE, b)
-            store(planes, f + 2 * TILE, c)
-            store(planes, f + 3 * TILE, d)
-        for column in range(min(TILE, width - x0)):
-            for channel in range(fours, channels):
-                planes[first + channel * TILE + column] = image[y0 + row, x0 + column, channel]
+        at = row * padded_inside(channels) * TILE
+        if x0 + TILE > width:
+            copy(planes, at, image, x0, y0 + row, width - x0, channels)
+        elif channels == 3:  # with constants, whole rows are shuffled instead of copied one by one
+            copy(planes, at, image, x0, y0 + row, TILE, 3)
+        else:
+            copy(planes, at, image, x0, y0 + row, TILE, channels)
+
+
+@helper
+def write_tile(planes: Array, image: Array, tile: int, tiles: Tiles) -> None:
+    """Copy planes[(row, channel, column)] to a tile of the (H, W, C) image."""
+    _copy_rows(_write_row, planes, image, tile, tiles.columns)
+
+
+@helper
+def load_tile(planes: Array, image: Array, tile: int, tiles: Tiles) -> None:
+    """planes[(row, channel, column)] <- a tile of the (H, W, C) image, 0 beyond its border."""
+    planes[:] = 0
+    _copy_rows(_load_row, planes, image, tile, tiles.columns)
 
 
 @helper
@@ -447,9 +387,9 @@ def correlate(
 #
 # What an operation does on the way is given as three helpers, compiled into the walk:
 #
-# open_(work, s, later)          before the rows of intersection s; its result is handed to the next two
-# row_(work, mine, s, at, low, added, before) at a row `at` of rows from `low`: alpha (0 where not added)
-# and T before it close_(work, mine, s, low, high)  after rows [low, high)
+# open_(work, s, later)                        before the rows of intersection s; the next two get its result
+# row_(work, mine, s, row, low, weight, before)  at a row of rows from `low`: weight alpha T, and T before it
+# close_(work, mine, s, low, high)             after rows [low, high)
 #
 # A row is sixteen lanes, without branches. A tile's state is one flat float32 array, sixteen numbers a row. A
 # pixel's transmittance is stored negative once the pixel has stopped: its size stays readable, and
@@ -457,30 +397,30 @@ def correlate(
 
 AHEAD = 8  # intersections between asking for a footprint and using it
 CHECK_EVERY = 16  # Gaussians between two looks at whether a tile still has running pixels
-PIXELS = TILE * TILE
 
 
-class Cutoffs(NamedTuple):
-    """The constants of step 3 and 4 of `reference.py`."""
+class Kept(NamedTuple):
+    """The blending weights of a view, sixteen bits of fixed point each."""
 
-    alpha_min: float
-    alpha_max: float
-    transmittance_min: float
-
-
-def make_cutoffs(settings: RasterSettings) -> Cutoffs:
-    """Return the settings as kernels take them."""
-    return Cutoffs(float(settings.alpha_min), float(settings.alpha_max), float(settings.transmittance_min))
+    rows: Array  # (I,) uint16 spans of rows that have a weight, packed as those of `Tiles`
+    firsts: Array  # (I + 1,) int64: intersection s has weights[firsts[s] : firsts[s + 1]]
+    weights: Array  # (R, 16) uint16, a row of a tile each
 
 
 @helper
-def start_tile(tile: int, tiles: Tiles, width: int, height: int) -> Array:
+def tile_at(i: int, tiles: Tiles) -> int:
+    """Return the i-th tile that is blended."""
+    return (i * tiles.stride) % (tiles.starts.shape[0] - 1)
+
+
+@helper
+def start_tile(tile: int, tiles: Tiles) -> Array:
     """Return a tile's transmittance: 1 inside the image; pixels beyond its border have stopped already."""
     x0, y0 = tile % tiles.columns * TILE, tile // tiles.columns * TILE
     transmittance = np.empty(PIXELS, np.float32)
     for row in range(TILE):
         for column in range(TILE):
-            inside = (x0 + column < width) & (y0 + row < height)
+            inside = (x0 + column < tiles.width) & (y0 + row < tiles.height)
             transmittance[row * TILE + column] = 1.0 if inside else -1.0
     return transmittance
 
@@ -503,10 +443,10 @@ def rows_to_blend(packed: int, top: int, bottom: int) -> tuple[int, int]:
 
 
 @helper
-def enter(geometry: Array, tiles: Tiles, s: int, later: int) -> Array:
+def enter(tiles: Tiles, s: int, later: int) -> Array:
     """Return the footprint of intersection `s`; that of `later` is asked for, as memory is far away."""
-    prefetch(geometry, np.int64(tiles.ranks[later]) * cp.COLUMNS)
-    return geometry[tiles.ranks[s]]
+    prefetch(tiles.geometry, np.int64(tiles.ranks[later]) * cp.COLUMNS)
+    return tiles.geometry[tiles.ranks[s]]
 
 
 @helper
@@ -544,37 +484,57 @@ def blend_row(
 def walk(
     tile: int,
     tiles: Tiles,
-    geometry: Array,
-    cutoffs: Cutoffs,
-    transmittance: Array,
     work: Any,
     open_: Callable[..., Any],
     row_: Callable[..., None],
     close_: Callable[..., None],
-) -> int:
-    """Blend the tile, changing its `transmittance`.
+) -> tuple[Array, int]:
+    """Blend the tile; return its transmittance and the end of the intersections visited.
 
-    Returns the end of the intersections visited, which comes early where no pixel runs any more.
+    The end comes early where no pixel runs any more.
     """
     x, y = tile % tiles.columns * TILE + 0.5, tile // tiles.columns * TILE + 0.5
     first, last = tiles.starts[tile], tiles.starts[tile + 1]
+    transmittance = start_tile(tile, tiles)
     top, bottom = 0, TILE
     for s in range(first, last):
         if (s - first) % CHECK_EVERY == CHECK_EVERY - 1:
             top, bottom = running_rows(transmittance, top, bottom)
             if top >= bottom:
-                return s
+                return transmittance, s
         low, high = rows_to_blend(tiles.rows[s], top, bottom)
         later = min(s + AHEAD, last - 1)
-        g = enter(geometry, tiles, s, later)
+        g = enter(tiles, s, later)
         mine = open_(work, s, later)
         step, peak, w, v, w_step, v_step = begin_rows(g, x, y + low)
         for row in range(low, high):
-            added, before = blend_row(transmittance, row * TILE, step + w, peak - v * v, cutoffs)
+            added, before = blend_row(transmittance, row * TILE, step + w, peak - v * v, tiles.cutoffs)
             w, v = w + w_step, v + v_step
-            row_(work, mine, s, row, low, added, before)
+            row_(work, mine, s, row, low, added * before, before)
         close_(work, mine, s, low, high)
-    return last
+    return transmittance, last
+
+
+@helper
+def walk_kept(
+    tile: int,
+    tiles: Tiles,
+    kept: Kept,
+    work: Any,
+    open_: Callable[..., Any],
+    row_: Callable[..., None],
+    close_: Callable[..., None],
+) -> None:
+    """Do what `walk` does, with weights that are kept; there is no transmittance."""
+    last = tiles.starts[tile + 1]
+    for s in range(tiles.starts[tile], last):
+        low, high = unpack_span(kept.rows[s])
+        mine = open_(work, s, min(s + AHEAD, last - 1))
+        at = kept.firsts[s] * TILE
+        for row in range(low, high):
+            row_(work, mine, s, row, low, load_units(kept.weights, at), None)
+            at += TILE
+        close_(work, mine, s, low, high)
 
 
 @helper
