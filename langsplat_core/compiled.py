@@ -6,10 +6,9 @@ balances uneven pieces, and two Python threads may render at the same time (one 
 aborts the process then).
 
 Machine code is kept by numba's own cache: in `$NUMBA_CACHE_DIR` where that is set, else beside the source,
-else in the user's cache folder. Two things are added. numba notices a change in a kernel's own file only, and
-a kernel is made of helpers and constants of other files too: here code is stale once any file of this package
-changes that the kernel's imports, directly or not. And numba's index knows no locks: processes that need the
-same kernel at once compile it once.
+else in the user's cache folder. numba notices a change in a kernel's own file only, and a kernel is made of
+helpers and constants of other files too: here code is stale once any file of this package changes that the
+kernel's imports, directly or not.
 """
 
 import hashlib
@@ -18,8 +17,7 @@ import os
 import re
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, suppress
-from functools import cache, partial
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -27,21 +25,14 @@ from typing import Any
 import numba
 import numpy as np
 from numba.core.caching import FunctionCache, IndexDataCacheFile
-from numba.core.compiler_lock import global_compiler_lock
 
 from langsplat_core.arrays import Array
-
-try:
-    import fcntl
-except ImportError:  # Windows; there processes that begin at once compile the same twice
-    fcntl = None  # type: ignore[assignment]
 
 log = logging.getLogger("langsplat")
 
 _PIECES_PER_THREAD = 4
 _PACKAGE = Path(__file__).resolve().parent
 _IMPORT = re.compile(rf"^\s*from {_PACKAGE.name}([\w.]*) import (\([^)]*\)|.*)$", re.MULTILINE)
-_compiling: set[Path] = set()  # locks that this process holds
 
 
 def helper(function: Callable[..., Any], **options: Any) -> Any:
@@ -56,12 +47,9 @@ def kernel(function: Callable[..., Any], **options: Any) -> Any:
     """
     made = numba.njit(nogil=True, error_model="numpy", **options)(function)
     try:
-        kept = _KernelCache(function)
+        made._cache = _KernelCache(function)  # noqa: SLF001  numba has no other way to it
     except RuntimeError:
         _say_once("no folder for them can be written to; set NUMBA_CACHE_DIR to one that can")
-        return made
-    made._cache = kept  # noqa: SLF001  numba has no other way to it
-    made.compile = partial(_compile_once, Path(kept.cache_path, f"{function.__name__}.lock"), made.compile)
     return made
 
 
@@ -71,8 +59,10 @@ class _KernelCache(FunctionCache):
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
         source = Path(function.__code__.co_filename)
-        name = f"{source.stem}.{function.__name__}"
-        self._cache_file = IndexDataCacheFile(self.cache_path, name, digest_of_sources(source))
+        digest = digest_of_sources(source)
+        self._cache_file = IndexDataCacheFile(self.cache_path, f"{source.stem}.{function.__name__}", digest)
+        # Looked at before the index, whose types may be gone, is unpickled.
+        self._cache_file._version = f"{numba.__version__} {digest}"  # noqa: SLF001
 
     def is_filled(self) -> bool:
         return bool(self._cache_file._load_index())  # noqa: SLF001
@@ -89,19 +79,6 @@ def is_compiled(kernel: Any) -> bool:
     """Return True where an earlier process has left machine code of `kernel` as its sources are now."""
     kept = kernel._cache  # noqa: SLF001
     return isinstance(kept, _KernelCache) and kept.is_filled()
-
-
-def _compile_once(lock: Path, compiled: Callable[..., Any], signature: Any) -> Any:
-    """Compile a kernel, or wait for the process that does and take its machine code."""
-    with global_compiler_lock, ExitStack() as held:  # in this order in every thread
-        if fcntl is not None and lock not in _compiling:
-            _compiling.add(lock)
-            held.callback(_compiling.discard, lock)
-            with suppress(OSError):  # a full disk, or a file system that knows no locks
-                file = held.enter_context(lock.open("ab"))
-                fcntl.flock(file, fcntl.LOCK_EX)
-                held.callback(fcntl.flock, file, fcntl.LOCK_UN)
-        return compiled(signature)
 
 
 @cache

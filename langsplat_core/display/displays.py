@@ -21,38 +21,23 @@ from langsplat_core.config import ColourMap, Display
 from langsplat_core.io.hostile import opened
 from langsplat_core.scene import NO_NODE, LanguageField
 
-# Turbo colour map: polynomial fit published by A. Mikhailov, Google (2019), coefficients by channel.
-_TURBO_COEFFICIENTS = np.array(
-    [
-        [0.13572138, 4.61539260, -42.66032258, 132.13108234, -152.94239396, 59.28637943],
-        [0.09140261, 2.19418839, 4.84296658, -14.18503333, 4.27729857, 2.82956604],
-        [0.10667330, 12.64194608, -60.58204836, 110.36276771, -89.90310912, 27.34824973],
-    ]
-)
 NODES = 256  # of a colour map; looked up with linear interpolation between them
 
 
-def _turbo() -> Array:
-    powers = np.linspace(0, 1, NODES)[:, None] ** np.arange(6)
-    return np.rint(255 * np.clip(powers @ _TURBO_COEFFICIENTS.T, 0, 1)).astype(np.uint8)
+def _colour_maps() -> dict[ColourMap, Array]:
+    """Return (NODES, 3) uint8 by name, in the order of `config.ColourMap`.
 
-
-def _published() -> dict[ColourMap, Array]:
-    """Viridis and magma by N.
-
-    Smith and S. van der Walt (2015) and cividis by J. Nunez, C. Anderton and R. Renslow (2018), as matplotlib
-    has them: the rows of a small image beside this file.
+    Viridis and magma are by N. Smith and S. van der Walt (2015), cividis by J. Nunez, C. Anderton and
+    R. Renslow (2018), as matplotlib has them, turbo by A. Mikhailov, Google (2019, its polynomial fit): the
+    rows of a small image beside this file.
     """
-    table = files(__package__).joinpath("colour_maps.png").read_bytes()
-    with opened(table, "colour_maps.png") as picture:
-        rows = np.asarray(picture.convert("RGB"))
-    return {"viridis": rows[0], "cividis": rows[1], "magma": rows[2]}
+    with opened(files(__package__).joinpath("colour_maps.png").read_bytes(), "colour_maps.png") as image:
+        viridis, cividis, magma, turbo = np.asarray(image.convert("RGB"))
+    grey = np.repeat(np.arange(NODES, dtype=np.uint8)[:, None], 3, 1)
+    return {"turbo": turbo, "viridis": viridis, "cividis": cividis, "magma": magma, "grey": grey}
 
 
-# Name -> (NODES, 3) uint8, in the order of `config.ColourMap`.
-COLOUR_MAPS: Mapping[ColourMap, Array] = MappingProxyType(
-    {"turbo": _turbo(), **_published(), "grey": np.repeat(np.arange(NODES, dtype=np.uint8)[:, None], 3, 1)}
-)
+COLOUR_MAPS: Mapping[ColourMap, Array] = MappingProxyType(_colour_maps())
 
 QUERY_COLOURS = np.array([[0.98, 0.45, 0.09], [0.13, 0.59, 0.95], [0.30, 0.80, 0.35]])  # per shown query
 MAX_QUERIES = len(QUERY_COLOURS)  # shown at a time: one colour each, one channel of a texture each

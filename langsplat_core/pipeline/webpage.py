@@ -35,7 +35,7 @@ from langsplat_core.query.engine import QueryEngine, TextEncoder, no_field
 from langsplat_core.query.instances import BOXED, oriented_box
 from langsplat_core.query.inventory import suggest
 from langsplat_core.query.rule import RULE
-from langsplat_core.raster.opengl.shaders import WEB, shader, splat_shaders
+from langsplat_core.raster.opengl import WEB, shader, splat_shaders
 from langsplat_core.scene import LEVELS, Camera, Gaussians, Scene
 from langsplat_core.scene.gaussians import along_curve
 from langsplat_core.semantics.clip_plain import PlainClipText

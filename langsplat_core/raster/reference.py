@@ -104,11 +104,14 @@ def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings = INR
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One Gaussian's part in an image."""
+    """One Gaussian's part in an image, at the pixels of a window."""
 
     index: int
     window: tuple[slice, slice]  # rows and columns of the image that it may touch
-    weights: Array  # alpha T in the window, 0 where it is not added
+    running: Array  # False where the pixel has stopped before
+    alpha: Array  # capped, but not cut off
+    before: Array  # transmittance before it
+    weights: Array  # alpha T, 0 where it is not added
     after: Array  # transmittance behind it
 
 
@@ -137,66 +140,43 @@ class ReferenceView(LiftingView):
         self.camera, self.settings, self.footprints = camera, settings, footprints
         self.count, self.dropped = len(footprints.depths), dropped
         self.order = np.argsort(footprints.depths, kind="stable")
-        self.windows = self._windows()
 
-    def _windows(self) -> tuple[Array, Array]:
-        """First and one-past-last pixel (x, y) that each Gaussian may touch: two (N, 2) ints.
+    def steps(self, wider: float = 0.0) -> Iterator[Step]:
+        """Every Gaussian that is drawn, front to back: steps 3 and 4 of the module's list.
 
-        They only save time: outside the extent alpha is below alpha_min anyway. 1e-9 relative slack keeps
-        rounding from cutting a pixel that lies on the contour.
+        Windows only save time: outside of them alpha is below alpha_min (1 - wider).
         """
-        f, size = self.footprints, (self.camera.width, self.camera.height)
-        reach = f.extents_px * (1 + 1e-9) + 1e-9
-        low = np.clip(np.ceil(f.means_px - reach - 0.5), 0, size).astype(np.int64)
-        high = np.clip(np.floor(f.means_px + reach - 0.5) + 1, 0, size).astype(np.int64)
-        high[f.opacities == 0] = 0
-        return low, high
-
-    def steps(self) -> Iterator[Step]:
-        """Every Gaussian that is drawn, front to back: steps 3 and 4 of the module's list."""
         f, s = self.footprints, self.settings
-        height, width = self.camera.height, self.camera.width
-        transmittance = np.ones((height, width))
-        running = np.ones((height, width), bool)
-        low, high = self.windows
-        for i in self.order:
-            (x0, y0), (x1, y1) = low[i], high[i]
-            if x0 >= x1 or y0 >= y1:
-                continue
-            window = np.s_[y0:y1, x0:x1]
+        size = (self.camera.width, self.camera.height)
+        transmittance, running = np.ones(size[::-1]), np.ones(size[::-1], bool)
+        reach = rim(f, s, wider)
+        low = np.clip(np.ceil(f.means_px - reach - 0.5), 0, size).astype(int)
+        high = np.clip(np.floor(f.means_px + reach - 0.5) + 1, 0, size).astype(int)
+        for i in self.order[((f.opacities > 0) & (low < high).all(1))[self.order]]:
+            window = np.s_[low[i, 1] : high[i, 1], low[i, 0] : high[i, 0]]
             alpha = alphas_in(f, i, window, s)
-            hit = running[window] & (alpha >= s.alpha_min)
-            next_transmittance = transmittance[window] * (1 - alpha)
-            stops = hit & (next_transmittance <= s.transmittance_min)
-            running[window] &= ~stops
+            before, was_running = transmittance[window].copy(), running[window].copy()
+            hit = was_running & (alpha >= s.alpha_min)
+            after = before * (1 - alpha)
+            stops = hit & (after <= s.transmittance_min)
             hit &= ~stops
-            weights = np.where(hit, alpha * transmittance[window], 0)
-            transmittance[window] = np.where(hit, next_transmittance, transmittance[window])
-            yield Step(int(i), window, weights, transmittance[window])
+            running[window] &= ~stops
+            transmittance[window] = np.where(hit, after, before)
+            weights = np.where(hit, alpha * before, 0)
+            yield Step(int(i), window, was_running, alpha, before, weights, transmittance[window])
 
     def cut_off_band(self, relative: float) -> Array:
         """(H, W) True where some Gaussian's alpha, or T behind it, is within `relative` of a cut-off.
 
         There rounding decides, and a fast rasterizer may come out on the other side.
         """
-        f, s = self.footprints, self.settings
-        size = (self.camera.width, self.camera.height)
-        band, running = np.zeros(size[::-1], bool), np.ones(size[::-1], bool)
-        transmittance = np.ones(size[::-1])
-        reach = rim(f, s, relative)
-        low = np.clip(np.floor(f.means_px - reach), 0, size).astype(int)
-        high = np.clip(np.ceil(f.means_px + reach), 0, size).astype(int)
-        for i in self.order[(f.opacities > 0)[self.order] & (low < high).all(1)[self.order]]:
-            window = np.s_[low[i, 1] : high[i, 1], low[i, 0] : high[i, 0]]
-            alpha = alphas_in(f, i, window, s)
-            after = transmittance[window] * (1 - alpha)
-            hit = running[window] & (alpha >= s.alpha_min)
-            band[window] |= running[window] & (np.abs(alpha / s.alpha_min - 1) < relative)
+        s, band = self.settings, np.zeros((self.camera.height, self.camera.width), bool)
+        for step in self.steps(relative):
+            at_cut = np.abs(step.alpha / s.alpha_min - 1) < relative
             if s.transmittance_min > 0:
-                band[window] |= hit & (np.abs(after / s.transmittance_min - 1) < relative)
-            stops = hit & (after <= s.transmittance_min)
-            running[window] &= ~stops
-            transmittance[window] = np.where(hit & ~stops, after, transmittance[window])
+                after = step.before * (1 - step.alpha) / s.transmittance_min
+                at_cut |= (step.alpha >= s.alpha_min) & (np.abs(after - 1) < relative)
+            band[step.window] |= step.running & at_cut
         return band
 
     def splat(self, values: Array) -> tuple[Array, Array]:

@@ -9,10 +9,9 @@ from scipy import sparse
 from langsplat_core.arrays import Array
 from langsplat_core.config import GSPLAT, INRIA
 from langsplat_core.raster import reference
-from langsplat_core.raster.cpu.memory import Memory
 from langsplat_core.raster.cpu.projection import colours, colours_backward
-from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
-from langsplat_core.raster.cpu.tiles import TileGrid, _at_most, depth_order
+from langsplat_core.raster.cpu.rasterizer import CpuRasterizer, Memory
+from langsplat_core.raster.cpu.tiles import depth_order
 from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera
@@ -74,7 +73,7 @@ def test_a_frozen_view_differs_by_its_rounding_only(channels, size):
     y = np.random.default_rng(3).uniform(-1, 1, image.shape).astype(np.float32)
     assert np.abs(frozen.gather(y) - view.gather(y)).max() < 0.5 / 65535 * size[0] * size[1]
     np.testing.assert_array_equal(frozen.depth(), view.depth())
-    assert 0 < frozen.nbytes < 40 * len(view.tiles.ranks) * 16 + 16 * size[0] * size[1] + 64
+    assert view.nbytes == 0 < frozen.nbytes < 40 * len(view.tiles.ranks) * 16 + 16 * size[0] * size[1] + 64
 
 
 def test_radii_are_positive_exactly_where_something_is_drawn():
@@ -121,42 +120,15 @@ def test_tiles_hold_little_more_than_what_touches_them():
     assert touched <= kept <= 1.15 * touched
 
 
-@pytest.mark.parametrize("needles", [0.0, 6.0])
-def test_no_footprint_touches_more_tiles_than_there_is_room_for(needles):
-    gaussians = random_gaussians(400, 30, radius=2.0)
-    stretched = gaussians.log_scales + needles * np.eye(3, dtype=np.float32)[np.arange(400) % 3]
-    camera = random_camera(30, 640, 480)
-    view = CPU.view(replace(gaussians, log_scales=stretched), camera)
-    grid = TileGrid(640.0, 480.0, 40, 30)
-    touched = np.diff(view.tiles.firsts)
-    assert touched.max() > (100 if needles else 4)
-    most = [_at_most(footprint, grid) for footprint in view._geometry]  # noqa: SLF001
-    assert (touched <= most).all()
-
-
 def test_memory_is_used_again_once_nothing_lies_in_it():
     memory = Memory()
     first = memory.empty((50_000, 4), np.float64)
     part, place = first[3:9].view(np.uint64), first.ctypes.data
-    assert place % 64 == 0
     del first
     second = memory.empty((50_000, 4), np.float64)
     assert not np.shares_memory(second, part)
     del part
     assert memory.empty((40_000, 4), np.float64).ctypes.data == place
-
-
-def test_culling_by_size_changes_no_image():
-    """A second view knows the rows' sizes and leaves out what cannot be seen before it is projected."""
-    gaussians, camera = random_gaussians(500, 31, radius=3.0), random_camera(31)
-    turned = random_camera(32)
-    for without in (camera, without_perspective(camera)):
-        for settings in (INRIA, replace(GSPLAT, antialiased=True)):
-            known = CPU.view(gaussians, turned, settings), CPU.view(gaussians, without, settings)
-            fresh = CPU.view(replace(gaussians), without, settings)
-            assert 0 < len(fresh.order) < 500
-            np.testing.assert_array_equal(known[1].order, fresh.order)
-            np.testing.assert_array_equal(known[1].tiles.rows, fresh.tiles.rows)
 
 
 def test_depth_order_is_a_stable_sort():
@@ -168,12 +140,7 @@ def test_depth_order_is_a_stable_sort():
         np.ones(0),
         np.append(1 + 1e-14 * rng.random(5000), 1e300),  # a plane, nearly, and a floater
     ):
-        status = rng.integers(0, 3, len(depths)).astype(np.uint8)
-        drawn = np.flatnonzero(status == 2)
-        want = drawn[np.argsort(depths[drawn], kind="stable")]
-        order, sorted_depths = depth_order(status, depths, Memory())
-        assert np.array_equal(order, want)
-        assert np.array_equal(sorted_depths, depths[want])
+        assert np.array_equal(depth_order(depths), np.argsort(depths, kind="stable"))
 
 
 @pytest.mark.parametrize("degree", range(4))
@@ -281,14 +248,6 @@ def test_small_weights_are_left_out_and_rows_keep_their_place():
     kept = sparse.csr_matrix(np.where(whole.toarray() > 0.5, whole.toarray(), 0))
     assert 0 < some.nnz < whole.nnz
     assert (abs(some - kept) > 0).nnz == 0
-
-
-def test_lifted_labels_do_not_depend_on_threads():
-    gaussians, camera = random_gaussians(300, 7), random_camera(5, 120, 90)
-    maps = label_maps(40, 120, 90)
-    one, many = (CpuRasterizer(n).view(gaussians, camera).gather_labels(maps, 40) for n in (1, 4))
-    for name in ("data", "indices", "indptr"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(many, name))
 
 
 @pytest.mark.parametrize("label", [-2, 3])

@@ -328,7 +328,7 @@ def test_dropped_rows_are_counted_by_reason() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("case", NAMED)
 def test_results_do_not_depend_on_the_number_of_threads(case: Case) -> None:
-    """Forward, adjoint and gradients of the CPU backend, bit for bit."""
+    """Forward, adjoint, lifted labels and gradients of the CPU backend, bit for bit."""
     drawing = case.build()
     target = np.random.default_rng(3).normal(size=(drawing.camera.height, drawing.camera.width, 1))
     x = drawing.features()[:, :1]
@@ -337,7 +337,8 @@ def test_results_do_not_depend_on_the_number_of_threads(case: Case) -> None:
         rasterizer = load_rasterizer("cpu", threads=threads)
         view = rasterizer.view(drawing.gaussians, drawing.camera, drawing.settings)
         gradients = view.backward(x, target, target[..., 0])
-        results.append([*view.splat(x), view.gather(target), view.median_depth(), *gradients])
+        labels = view.gather_labels((target[None, ..., 0] > 0).astype(np.int32), 2).toarray()
+        results.append([*view.splat(x), view.gather(target), view.median_depth(), labels, *gradients])
     for other in results[1:]:
         assert all(np.array_equal(one, two) for one, two in zip(results[0], other, strict=True))
 

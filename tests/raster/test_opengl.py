@@ -15,14 +15,11 @@ from langsplat_core.errors import BackendError
 from langsplat_core.raster.opengl import scene_textures
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer
 from langsplat_core.raster.opengl.scene_textures import (
-    CpuOrder,
     DepthSorter,
-    DeviceOrder,
     SortBuffers,
     chosen_sorter,
     create_egl_context,
     front_to_back,
-    working_sorter,
 )
 from langsplat_core.raster.reference import ReferenceRasterizer, colours
 from langsplat_core.scene import Camera, Gaussians
@@ -134,7 +131,6 @@ def test_images_do_not_depend_on_the_sorter(gl, both):
     views = [[rasterizer.view(*case) for case in cases] for rasterizer in both]
     for _ in range(2):  # in turn: each scene is uploaded and sorted again
         for cpu, device in zip(*views, strict=True):
-            assert (type(cpu.order), type(device.order)) == (CpuOrder, DeviceOrder)
             values = random_values(len(cpu.gaussians), 4)
             for got, want in zip(device.splat(values), cpu.splat(values), strict=True):
                 np.testing.assert_array_equal(got, want)
@@ -149,14 +145,15 @@ def test_a_scene_before_the_near_plane_draws_nothing(gl, both):
         assert not np.any(view.splat(np.ones((30, 1)))[1])
 
 
-def test_the_order_is_kept_while_the_camera_stands(gl, both):
-    _, rasterizer = both
+def test_one_order_serves_images_of_every_size(gl, both):
     gaussians, camera = random_gaussians(50), random_camera()
-    view = rasterizer.view(gaussians, camera)
-    view.splat(random_values(50, 1))
-    assert rasterizer.view(gaussians, camera.resized(20, 20)).order is view.order
-    assert rasterizer.view(gaussians, random_camera(3)).order is not view.order
-    assert rasterizer.view(gaussians, camera, GSPLAT).order is not view.order
+    for rasterizer in both:
+        for case in ((camera,), (camera.resized(20, 20),), (camera, GSPLAT), (random_camera(3),)):
+            fresh = GlRasterizer(gl, "single", sort="cpu")
+            want = fresh.view(gaussians, *case).splat(random_values(50, 1))[0]
+            got = rasterizer.view(gaussians, *case).splat(random_values(50, 1))[0]
+            np.testing.assert_array_equal(got, want)
+            fresh.release()
 
 
 def refuse(*_: object) -> None:
@@ -165,11 +162,13 @@ def refuse(*_: object) -> None:
 
 @pytest.mark.parametrize(
     ("of", "name", "made"),
-    [(SortBuffers, "order", lambda b: np.arange(b.count, dtype=np.int32)), (DepthSorter, "__init__", refuse)],
+    [
+        (SortBuffers, "order", lambda b: np.arange(b.count, dtype=np.int32)),
+        (moderngl.Context, "compute_shader", refuse),
+    ],
 )
 def test_a_driver_that_fails_at_sorting_is_not_used(gl, monkeypatch, of, name, made):
     monkeypatch.setattr(of, name, made)
-    assert working_sorter(gl) is None
     with pytest.raises(BackendError, match="cannot sort"):
         GlRasterizer(gl, sort="device")
 
@@ -184,11 +183,11 @@ def test_numpy_sorts_on_a_software_driver(gl, sorter, monkeypatch, software):
 
 
 def test_scenes_beyond_the_drivers_buffers_are_sorted_by_numpy(gl, both, monkeypatch):
-    _, rasterizer = both
     monkeypatch.setattr(DepthSorter, "holds", lambda *_: False)
-    view = rasterizer.view(random_gaussians(20), random_camera())
-    assert isinstance(view.order, CpuOrder)
-    assert view.splat(np.ones((20, 1)))[1].any()
+    monkeypatch.setattr(DepthSorter, "sort", refuse)
+    images = [one.view(random_gaussians(20), random_camera()).splat(np.ones((20, 1)))[1] for one in both]
+    np.testing.assert_array_equal(*images)
+    assert images[0].any()
 
 
 # The OpenGL rasterizer against the float64 reference.
@@ -252,8 +251,8 @@ def test_any_number_of_channels_is_splatted(gl, raster, channels):
 
 
 def test_gsplats_profile_draws_what_is_nearer(gl, raster):
-    inria, gsplat = (raster.view(*NEAR, settings) for settings in (INRIA, GSPLAT))
-    assert len(gsplat.order.texels) > len(inria.order.texels)
+    inria, gsplat = (len(raster.project(raster.view(*NEAR, some)).texels()) for some in (INRIA, GSPLAT))
+    assert gsplat > inria
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -345,14 +344,14 @@ MAC = """
 import numpy as np, moderngl
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
-from langsplat_core.raster.opengl.scene_textures import create_egl_context, working_sorter
+from langsplat_core.raster.opengl.scene_textures import chosen_sorter, create_egl_context
 from tests.support.scenes import random_camera, random_gaussians, random_values
 ctx = create_egl_context()
 assert ctx.version_code == 410, ctx.version_code
 g, c, v = random_gaussians(80, sh_degree=3), random_camera(), random_values(80, 7)
 image, _ = GlRasterizer(ctx, "single").view(g, c).splat(v)
 want, _ = ReferenceRasterizer().view(g, c).splat(v)
-print(np.abs(image - want).max() <= 1 / 255, working_sorter(ctx), ctx.error)
+print(np.abs(image - want).max() <= 1 / 255, chosen_sorter(ctx, "auto"), ctx.error)
 """
 
 

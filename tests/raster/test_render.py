@@ -124,22 +124,14 @@ def test_every_public_name_is_there():
         getattr(langsplat_core, "nothing_like_it")  # noqa: B009  the module's own __getattr__ is meant
 
 
-# A camera may ask for any number of pixels: what memory cannot hold is refused before it is allocated.
-
-
-def test_an_image_beyond_memory_is_refused_before_allocation(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(protocol, "memory_bytes", lambda: 64e9)
+def test_an_image_beyond_memory_is_refused_before_allocation(tmp_path: Path) -> None:
     write_cameras(tmp_path / "view.json", (replace(random_camera(2), width=65_536, height=65_536),))
     (camera,) = read_cameras(tmp_path / "view.json")
     tracemalloc.start()
-    with pytest.raises(InputError, match=r"65536x65536 pixels needs 172 GB .* has 64; choose a smaller size"):
+    with pytest.raises(InputError, match="65536x65536 pixels is too large; choose a smaller size"):
         render(Scene(G), camera)
-    assert tracemalloc.get_traced_memory()[1] < 1e9  # modules that are imported meanwhile, no pictures
+    assert tracemalloc.get_traced_memory()[1] < 1e9  # modules that are imported meanwhile, no images
     tracemalloc.stop()
-    monkeypatch.undo()
-    assert 1e8 < protocol.memory_bytes() < 1e15
 
 
 # The Gaussians of one pixel are those that the whole view blends there.
@@ -167,20 +159,6 @@ def test_pixel_weights_are_a_row_of_w(backend, distance, orthographic):
         np.testing.assert_allclose(got, truth.gather(image)[:, 0], atol=2e-5)
 
 
-def test_pixel_weights_project_few_and_no_invalid_rows():
-    gaussians = random_gaussians(2000, 4, scale_range=(0.005, 0.02))
-    broken = replace(gaussians, means=np.where(np.arange(2000)[:, None] == 5, np.nan, gaussians.means))
-    seen = []
-
-    class Recorder:
-        name = "recorder"
-
-        def view(self, some, camera, settings=INRIA):
-            seen.append(len(some))
-            return load_lifting_rasterizer("cpu").view(some, camera, settings)
-
-    rows, _ = pixel_weights(Scene(broken), view_from(3.0), (32, 24), Recorder())
-    assert 5 not in rows
-    assert seen[0] < 200
-    rows, weights = pixel_weights(Scene(gaussians.take(slice(0))), view_from(3.0), (1, 1))
+def test_empty_scenes_have_no_pixel_weights():
+    rows, weights = pixel_weights(Scene(random_gaussians(20).take(slice(0))), view_from(3.0), (1, 1))
     assert len(rows) == len(weights) == 0

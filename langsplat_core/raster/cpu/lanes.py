@@ -8,6 +8,8 @@ multiplied with `+ - *`, scalars broadcast; the rest are the functions below, fo
 
 import operator
 from collections.abc import Callable
+from inspect import signature as parameters_of
+from itertools import product
 from typing import Any
 
 import llvmlite.ir as ir
@@ -17,8 +19,8 @@ from numba.extending import intrinsic, lower_builtin, models, register_model
 
 LANES = 16
 Lanes = Any  # how a value of sixteen lanes is annotated in kernels
-FLOAT, INT = ir.FloatType(), ir.IntType(32)
-FLOATS, INTS = ir.VectorType(FLOAT, LANES), ir.VectorType(INT, LANES)
+FLOAT, INT, SHORT = ir.FloatType(), ir.IntType(32), ir.IntType(16)
+FLOATS, INTS, SHORTS = (ir.VectorType(kind, LANES) for kind in (FLOAT, INT, SHORT))
 _FUSE = ("contract",)  # a * b + c may round once; nothing is reordered
 
 # 2^x on [-0.5, 0.5], minimax in relative error (7.5e-8, found by iteratively reweighted least squares).
@@ -54,34 +56,33 @@ def as_lanes(builder: Any, value: Any) -> Any:
     return builder.shuffle_vector(first, undefined, ir.Constant(INTS, [0] * LANES))
 
 
-def _is_lanes_or_float(*arguments: types.Type) -> bool:
-    return all(isinstance(a, (_Lanes, types.Float)) for a in arguments)
+def lanewise(build: Callable[..., Any], symbol: Any = None) -> Any:
+    """Let kernels call `build`, or use the operator `symbol`, without its first argument, the builder.
 
+    The others may be lanes or floats, of which one at least must be lanes.
+    """
+    symbol, arity = symbol or build, len(parameters_of(build).parameters) - 1
 
-def _add_operator(symbol: Callable[[Any, Any], Any], instruction: str) -> None:
-    @infer_global(symbol)
     class Typing(AbstractTemplate):
+        key = symbol
+
         def generic(self, arguments: Any, keywords: Any) -> Any:
-            if len(arguments) == 2 and lanes16 in arguments and _is_lanes_or_float(*arguments):
-                return signature(lanes16, *arguments)
-            return None
+            fits = len(arguments) == arity and all(isinstance(a, (_Lanes, types.Float)) for a in arguments)
+            return signature(lanes16, *arguments) if fits and lanes16 in arguments else None
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        a, b = (as_lanes(builder, argument) for argument in arguments)
-        return getattr(builder, instruction)(a, b, flags=_FUSE)
+        return build(builder, *(as_lanes(builder, argument) for argument in arguments))
 
-    for kinds in ((_Lanes, _Lanes), (_Lanes, types.Float), (types.Float, _Lanes)):
-        lower_builtin(symbol, *kinds)(lower)
-
-
-_add_operator(operator.add, "fadd")
-_add_operator(operator.sub, "fsub")
-_add_operator(operator.mul, "fmul")
+    infer_global(symbol, types.Function(Typing))
+    for kinds in product((_Lanes, types.Float), repeat=arity):
+        if _Lanes in kinds:
+            lower_builtin(symbol, *kinds)(lower)
+    return build
 
 
-def shuffle(builder: Any, a: Any, b: Any, picks: list[int]) -> Any:
-    """Lanes of a (0 to n - 1) and b (n to 2 n - 1)."""
-    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(INT, len(picks)), picks))
+lanewise(lambda builder, a, b: builder.fadd(a, b, flags=_FUSE), operator.add)
+lanewise(lambda builder, a, b: builder.fsub(a, b, flags=_FUSE), operator.sub)
+lanewise(lambda builder, a, b: builder.fmul(a, b, flags=_FUSE), operator.mul)
 
 
 @intrinsic
@@ -97,72 +98,69 @@ def ramp(typing: Any) -> Any:
     return lanes16(), lambda context, builder, sig, args: values
 
 
-@intrinsic
-def where_greater(typing: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
+@lanewise
+def where_greater(builder: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
     """Return a > b ? yes : no."""
-    return lanes16(a, b, yes, no), lambda context, builder, sig, args: _select(builder, ">", *args)
+    return builder.select(builder.fcmp_ordered(">", a, b), yes, no)
 
 
-@intrinsic
-def where_at_least(typing: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
+@lanewise
+def where_at_least(builder: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
     """Return a >= b ? yes : no."""
-    return lanes16(a, b, yes, no), lambda context, builder, sig, args: _select(builder, ">=", *args)
+    return builder.select(builder.fcmp_ordered(">=", a, b), yes, no)
 
 
-@intrinsic
-def smaller(typing: Any, a: Any, b: Any) -> Any:
-    """Return min(a, b), lane by lane."""
-    return lanes16(a, b), lambda context, builder, sig, args: _select(builder, "<", *args, *args)
+@lanewise
+def smaller(builder: Any, a: Any, b: Any) -> Any:
+    """Return min(a, b)."""
+    return builder.select(builder.fcmp_ordered("<", a, b), a, b)
 
 
-def _select(builder: Any, comparison: str, a: Any, b: Any, yes: Any, no: Any) -> Any:
-    a, b, yes, no = (as_lanes(builder, value) for value in (a, b, yes, no))
-    return builder.select(builder.fcmp_ordered(comparison, a, b), yes, no)
+@lanewise
+def reciprocal(builder: Any, value: Any) -> Any:
+    """Return 1 / value."""
+    return builder.fdiv(_constant(1), value)
 
 
-@intrinsic
-def reciprocal(typing: Any, value: Any) -> Any:
-    """Return 1 / value, lane by lane."""
-    return lanes16(value), lambda context, builder, sig, args: builder.fdiv(_constant(1), args[0])
-
-
-@intrinsic
-def exp2(typing: Any, power: Any) -> Any:
+@lanewise
+def exp2(builder: Any, power: Any) -> Any:
     """2^power for power <= 0.5, relative error 2e-7; powers below -100 give 2^-100."""
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        low = _constant(-100)
-        power = builder.select(builder.fcmp_ordered(">", arguments[0], low), arguments[0], low)
-        # Conversion truncates, and power - 0.5 <= 0: so this rounds to the nearest integer.
-        whole = builder.fptosi(builder.fsub(power, _constant(0.5)), INTS)
-        rest = builder.fsub(power, builder.sitofp(whole, FLOATS))
-        result = _constant(_EXP2[-1])
-        for coefficient in _EXP2[-2::-1]:
-            product = builder.fmul(result, rest, flags=_FUSE)
-            result = builder.fadd(product, _constant(coefficient), flags=_FUSE)
-        # Multiplying by 2^whole is an addition to the exponent's bits.
-        bits = builder.add(builder.bitcast(result, INTS), builder.shl(whole, ir.Constant(INTS, [23] * LANES)))
-        return builder.bitcast(bits, FLOATS)
-
-    return lanes16(power), lower
+    low = _constant(-100)
+    power = builder.select(builder.fcmp_ordered(">", power, low), power, low)
+    # Conversion truncates, and power - 0.5 <= 0: so this rounds to the nearest integer.
+    whole = builder.fptosi(builder.fsub(power, _constant(0.5)), INTS)
+    rest = builder.fsub(power, builder.sitofp(whole, FLOATS))
+    result = _constant(_EXP2[-1])
+    for coefficient in _EXP2[-2::-1]:
+        scaled = builder.fmul(result, rest, flags=_FUSE)
+        result = builder.fadd(scaled, _constant(coefficient), flags=_FUSE)
+    # Multiplying by 2^whole is an addition to the exponent's bits.
+    bits = builder.add(builder.bitcast(result, INTS), builder.shl(whole, ir.Constant(INTS, [23] * LANES)))
+    return builder.bitcast(bits, FLOATS)
 
 
-def _fold(builder: Any, value: Any, combine: Callable[[Any, Any], Any]) -> Any:
-    """Halve the lanes until one is left."""
-    width = LANES
-    while width > 1:
-        width //= 2
-        low, high = (
-            ir.Constant(ir.VectorType(INT, width), list(range(start, start + width))) for start in (0, width)
-        )
-        value = combine(builder.shuffle_vector(value, value, low), builder.shuffle_vector(value, value, high))
-    return builder.extract_element(value, INT(0))
+def shuffle(builder: Any, a: Any, b: Any, picks: list[int]) -> Any:
+    """Lanes of a (0 to n - 1) and b (n to 2 n - 1)."""
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(INT, len(picks)), picks))
+
+
+def _fold(builder: Any, value: Any, combine: Callable[[Any, Any], Any], width: int = 1) -> Any:
+    """Halve the lanes until `width` are left."""
+    while value.type.count > width:
+        half = value.type.count // 2
+        low, high = list(range(half)), list(range(half, 2 * half))
+        value = combine(shuffle(builder, value, value, low), shuffle(builder, value, value, high))
+    return value
 
 
 @intrinsic
 def total(typing: Any, value: Any) -> Any:
     """Sum of the lanes as a float32, added pairwise in a fixed order."""
-    return types.float32(value), lambda context, builder, sig, args: _fold(builder, args[0], builder.fadd)
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        return builder.extract_element(_fold(builder, arguments[0], builder.fadd), INT(0))
+
+    return types.float32(value), lower
 
 
 @intrinsic
@@ -170,16 +168,50 @@ def largest(typing: Any, value: Any) -> Any:
     """Return the greatest of the lanes as a float32."""
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        return _fold(
-            builder, arguments[0], lambda a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b)
-        )
+        def larger(a: Any, b: Any) -> Any:
+            return builder.select(builder.fcmp_ordered(">", a, b), a, b)
+
+        return builder.extract_element(_fold(builder, arguments[0], larger), INT(0))
 
     return types.float32(value), lower
 
 
+# Lanes and memory. Indices count elements of a contiguous array as if it were flat; nothing is checked.
+
+
+def _pointer(context: Any, builder: Any, sig: Any, arguments: Any, kind: Any = FLOATS) -> Any:
+    """Return where element arguments[1] of the array arguments[0] lies, as a pointer to `kind`."""
+    data = context.make_array(sig.args[0])(context, builder, arguments[0]).data
+    return builder.bitcast(builder.gep(data, [arguments[1]]), kind.as_pointer())
+
+
+@intrinsic
+def load(typing: Any, array: Any, index: Any) -> Any:
+    """array[index : index + 16] of a flat float32 array."""
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        value = builder.load(_pointer(context, builder, sig, arguments))
+        value.align = 4
+        return value
+
+    return lanes16(array, types.intp), lower
+
+
+@intrinsic
+def store(typing: Any, array: Any, index: Any, value: Any) -> Any:
+    """array[index : index + 16] = value of a flat float32 array."""
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        value = as_lanes(builder, arguments[2])
+        builder.store(value, _pointer(context, builder, sig, arguments)).align = 4
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, value), lower
+
+
 @intrinsic
 def store_totals(typing: Any, array: Any, index: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
-    """array.flat[index : index + 4] = the sums of the lanes of a, b, c, d, added pairwise, unchecked.
+    """array.flat[index : index + 4] = the sums of the lanes of a, b, c, d, added pairwise.
 
     All four at once take a third of the instructions of four times `total`.
     """
@@ -194,65 +226,26 @@ def store_totals(typing: Any, array: Any, index: Any, a: Any, b: Any, c: Any, d:
 
         a, b, c, d = arguments[2:]
         value = merge(merge(a, b, 1), merge(c, d, 1), 2)  # lanes: a b c d a b c d ...
-        for width in (8, 4):
-            low, high = list(range(width)), list(range(width, 2 * width))
-            value = builder.fadd(shuffle(builder, value, value, low), shuffle(builder, value, value, high))
-        data = context.make_array(sig.args[0])(context, builder, arguments[0]).data
-        pointer = builder.bitcast(builder.gep(data, [arguments[1]]), ir.VectorType(FLOAT, 4).as_pointer())
-        builder.store(value, pointer).align = 4
+        value = _fold(builder, value, builder.fadd, 4)
+        builder.store(value, _pointer(context, builder, sig, arguments, value.type)).align = 4
         return context.get_dummy_value()
 
     return types.void(array, types.intp, a, b, c, d), lower
 
 
-# Lanes and memory: loads and stores of sixteen numbers, plain, transposed or as sixteen bits.
-#
-# Indices count elements of a contiguous array as if it were flat; nothing is checked.
-
-
-def _pointer(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
-    data = context.make_array(array_type)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [index]), FLOATS.as_pointer())
-
-
-@intrinsic
-def load(typing: Any, array: Any, index: Any) -> Any:
-    """array[index : index + 16] of a flat float32 array, unchecked."""
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        value = builder.load(_pointer(context, builder, sig.args[0], *arguments))
-        value.align = 4
-        return value
-
-    return lanes16(array, types.intp), lower
-
-
 @intrinsic
 def prefetch(typing: Any, array: Any, index: Any) -> Any:
-    """Ask for the cache line of element `index` (counted flat) of a contiguous array."""
+    """Ask for the cache line of element `index`."""
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        data = context.make_array(sig.args[0])(context, builder, arguments[0]).data
-        byte = ir.IntType(8).as_pointer()
-        signature = ir.FunctionType(ir.VoidType(), [byte, INT, INT, INT])
-        fetch = builder.module.declare_intrinsic("llvm.prefetch", [byte], signature)
+        byte = ir.IntType(8)
+        kind = ir.FunctionType(ir.VoidType(), [byte.as_pointer(), INT, INT, INT])
+        fetch = builder.module.declare_intrinsic("llvm.prefetch", [byte.as_pointer()], kind)
         read, keep, is_data = INT(0), INT(3), INT(1)
-        builder.call(fetch, [builder.bitcast(builder.gep(data, [arguments[1]]), byte), read, keep, is_data])
+        builder.call(fetch, [_pointer(context, builder, sig, arguments, byte), read, keep, is_data])
         return context.get_dummy_value()
 
     return types.void(array, types.intp), lower
-
-
-@intrinsic
-def store(typing: Any, array: Any, index: Any, value: Any) -> Any:
-    """array[index : index + 16] = value of a flat float32 array, unchecked."""
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        value = as_lanes(builder, arguments[2])
-        builder.store(value, _pointer(context, builder, sig.args[0], *arguments[:2])).align = 4
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, value), lower
 
 
 UNIT = 65535  # what stands for 1 in sixteen bits
@@ -260,12 +253,10 @@ UNIT = 65535  # what stands for 1 in sixteen bits
 
 @intrinsic
 def load_units(typing: Any, array: Any, index: Any) -> Any:
-    """array.flat[index : index + 16] / UNIT of uint16, as lanes, unchecked."""
+    """array.flat[index : index + 16] / UNIT of uint16, as lanes."""
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        data = context.make_array(sig.args[0])(context, builder, arguments[0]).data
-        shorts = ir.VectorType(ir.IntType(16), LANES).as_pointer()
-        value = builder.load(builder.bitcast(builder.gep(data, [arguments[1]]), shorts))
+        value = builder.load(_pointer(context, builder, sig, arguments, SHORTS))
         value.align = 2
         return builder.fmul(builder.sitofp(builder.zext(value, INTS), FLOATS), _constant(1 / UNIT))
 
@@ -274,14 +265,12 @@ def load_units(typing: Any, array: Any, index: Any) -> Any:
 
 @intrinsic
 def store_units(typing: Any, array: Any, index: Any, value: Any) -> Any:
-    """array.flat[index : index + 16] = lanes in [0, 1] times UNIT, rounded, as uint16, unchecked."""
+    """array.flat[index : index + 16] = lanes in [0, 1] times UNIT, rounded, as uint16."""
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
         scaled = builder.fadd(builder.fmul(arguments[2], _constant(UNIT)), _constant(0.5))
-        shorts = ir.VectorType(ir.IntType(16), LANES)
-        data = context.make_array(sig.args[0])(context, builder, arguments[0]).data
-        pointer = builder.bitcast(builder.gep(data, [arguments[1]]), shorts.as_pointer())
-        builder.store(builder.trunc(builder.fptosi(scaled, INTS), shorts), pointer).align = 2
+        shorts = builder.trunc(builder.fptosi(scaled, INTS), SHORTS)
+        builder.store(shorts, _pointer(context, builder, sig, arguments, SHORTS)).align = 2
         return context.get_dummy_value()
 
     return types.void(array, types.intp, value), lower

@@ -156,26 +156,17 @@ def fill_axes(
     inverse = 1 / np.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
     q0, q1, q2, q3 = q0 * inverse, q1 * inverse, q2 * inverse, q3 * inverse
     turn, b, a = work[0], work[1], work[2]
-    turn[0, 0], turn[0, 1], turn[0, 2] = (
-        1 - 2 * (q2 * q2 + q3 * q3),
-        2 * (q1 * q2 - q0 * q3),
-        2 * (q1 * q3 + q0 * q2),
-    )
-    turn[1, 0], turn[1, 1], turn[1, 2] = (
-        2 * (q1 * q2 + q0 * q3),
-        1 - 2 * (q1 * q1 + q3 * q3),
-        2 * (q2 * q3 - q0 * q1),
-    )
-    turn[2, 0], turn[2, 1], turn[2, 2] = (
-        2 * (q1 * q3 - q0 * q2),
-        2 * (q2 * q3 + q0 * q1),
-        1 - 2 * (q1 * q1 + q2 * q2),
-    )
-    scales = (
-        np.exp(np.float64(log_scales[0])),
-        np.exp(np.float64(log_scales[1])),
-        np.exp(np.float64(log_scales[2])),
-    )
+    turn[0, 0] = 1 - 2 * (q2 * q2 + q3 * q3)
+    turn[0, 1] = 2 * (q1 * q2 - q0 * q3)
+    turn[0, 2] = 2 * (q1 * q3 + q0 * q2)
+    turn[1, 0] = 2 * (q1 * q2 + q0 * q3)
+    turn[1, 1] = 1 - 2 * (q1 * q1 + q3 * q3)
+    turn[1, 2] = 2 * (q2 * q3 - q0 * q1)
+    turn[2, 0] = 2 * (q1 * q3 - q0 * q2)
+    turn[2, 1] = 2 * (q2 * q3 + q0 * q1)
+    turn[2, 2] = 1 - 2 * (q1 * q1 + q2 * q2)
+    s0, s1, s2 = np.float64(log_scales[0]), np.float64(log_scales[1]), np.float64(log_scales[2])
+    scales = np.exp(s0), np.exp(s1), np.exp(s2)
     for n in range(3):
         b[0, n] = j00 * camera.rotation[0, n] + j02 * camera.rotation[2, n]
         b[1, n] = j11 * camera.rotation[1, n] + j12 * camera.rotation[2, n]

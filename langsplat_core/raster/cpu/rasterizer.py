@@ -108,15 +108,14 @@ class CpuView(LiftingView):
 
     def splat_rows(self, values: Array) -> tuple[Array, Array]:
         check_array("values", values, (len(self.order), "C"))
-        height, width, channels = self.camera.height, self.camera.width, values.shape[1]
-        kept, alpha = self._kept or (None, np.empty((height, width, 1), np.float32))
+        size = self.camera.height, self.camera.width
+        kept, alpha = self._kept or (None, np.empty((*size, 1), np.float32))
         parts = []
-        for start in range(0, max(channels, 1), _CHANNELS_AT_ONCE):
+        for start in range(0, max(values.shape[1], 1), _CHANNELS_AT_ONCE):
             part = plain(values[:, start : start + _CHANNELS_AT_ONCE])
-            image = np.empty((height, width, part.shape[1]), np.float32)
+            parts.append(np.empty((*size, part.shape[1]), np.float32))
             with lap("blend"):
-                self._over_tiles(blend.splat, kept, part, image, alpha)
-            parts.append(image)
+                self._over_tiles(blend.splat, kept, part, parts[-1], alpha)
         return parts[0] if len(parts) == 1 else np.concatenate(parts, -1), alpha[..., 0]
 
     def gather(self, image: Array) -> Array:
@@ -200,10 +199,10 @@ class CpuView(LiftingView):
 
     def depth(self) -> Array:
         # Ones are blended along: alpha itself is 1 - T, which has no digits left where it is small.
-        both = np.zeros((self.count, 2), np.float32)
-        both[self.order] = np.stack([self._depths, np.ones_like(self._depths)], -1)
-        sums, weights = np.moveaxis(self.splat(both)[0], -1, 0)
-        return mean_depth(sums, weights)
+        both = plain(np.stack([self._depths, np.ones_like(self._depths)], -1))
+        image = np.empty((self.camera.height, self.camera.width, 2), np.float32)
+        self._over_tiles(blend.splat, None, both, image, np.empty_like(image[..., :1]))
+        return mean_depth(image[..., 0], image[..., 1])
 
 
 class CpuRasterizer:

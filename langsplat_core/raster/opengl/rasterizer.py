@@ -16,18 +16,16 @@ from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.errors import BackendError
 from langsplat_core.progress import lap
+from langsplat_core.raster.opengl import shader, splat_shaders
 from langsplat_core.raster.opengl.scene_textures import (
     HALF_MAX,
-    DrawOrder,
     SceneTextures,
     Sort,
     Targets,
     chosen_sorter,
-    draw_order,
     drawing,
     set_uniforms,
 )
-from langsplat_core.raster.opengl.shaders import shader, splat_shaders
 from langsplat_core.raster.protocol import View, dilation, farthest, mean_depth, tangent_limits
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians
 
@@ -70,11 +68,12 @@ class GlRasterizer:
         self._project_vao = ctx.vertex_array(self._project, [])
         self._splats: dict[tuple[int, bool], moderngl.Program] = {}
         self._scene: SceneTextures | None = None
-        self._current: GlView | None = None  # whose projection and order the scene's textures hold
+        self._current: GlView | None = None  # whose projection the scene's textures hold
+        self._sorted: tuple[float, ...] | None = None  # near, far and plane of depths of its order
         self._targets: Targets | None = None
 
     def view(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA) -> "GlView":
-        """Project with OpenGL; the order is kept when only the image plane changed."""
+        """Project with OpenGL; BackendError for an image beyond the driver, or without its context."""
         limit = self.ctx.info["GL_MAX_TEXTURE_SIZE"]
         if limit == 0:  # what moderngl reads where no context is current
             raise BackendError(f"rasterizer 'opengl': {NOT_CURRENT}")
@@ -83,25 +82,14 @@ class GlRasterizer:
                 f"rasterizer 'opengl': this driver draws at most {limit} pixels a side, "
                 f"not {camera.width}x{camera.height}; use a smaller size or --backend cpu"
             )
-        scene = self.scene(gaussians)
-        last = self._current
-        if (
-            last is not None
-            and last.gaussians is gaussians
-            and (last.settings.near, farthest(last.settings)) == (settings.near, farthest(settings))
-            and np.array_equal(last.camera.world_to_camera[2], camera.world_to_camera[2])
-        ):
-            order = last.order
-        else:
-            order = draw_order(scene, camera, settings, self._sorter)
-        return GlView(self, gaussians, camera, settings, order)
+        return GlView(self, gaussians, camera, settings)
 
     def scene(self, gaussians: Gaussians) -> SceneTextures:
         """Return the scene's textures, uploaded if another scene was drawn last."""
         if self._scene is None or self._scene.gaussians is not gaussians:
             if self._scene is not None:
                 self._scene.release()
-            self._scene, self._current = None, None  # stays so if the upload fails
+            self._scene = self._current = self._sorted = None  # stays so if the upload fails
             try:
                 self._scene = SceneTextures(self.ctx, gaussians, self.precision == "half", self._sorter)
             except moderngl.Error as error:
@@ -113,7 +101,7 @@ class GlRasterizer:
 
     def forget(self) -> None:
         """Have the next view projected and sorted anew."""
-        self._current = None
+        self._current = self._sorted = None
 
     def draw(
         self, view: "GlView", sources: Sequence[Source], with_depth: bool = False
@@ -147,7 +135,7 @@ class GlRasterizer:
             targets.framebuffer.clear()
             self.ctx.blend_equation = moderngl.FUNC_ADD, moderngl.FUNC_ADD
             self.ctx.blend_func = moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA
-            view.order.draw(scene, vao)
+            scene.draw(vao)
         vao.release()
         return targets.images
 
@@ -184,10 +172,11 @@ class GlRasterizer:
         scene.sh.use(1)
         with lap("projection", self.ctx.finish), drawing(self.ctx, scene.projected, moderngl.NOTHING):
             self._project_vao.render(moderngl.TRIANGLES, vertices=3)
-        if self._current is None or self._current.order is not view.order:
+        wanted = (settings.near, farthest(settings), *camera.world_to_camera[2])
+        if self._sorted != wanted:  # it is kept when only the image plane changed
             with lap("sort", self.ctx.finish):
-                view.order.write(scene)
-        self._current = view
+                scene.sort(camera, settings)
+        self._current, self._sorted = view, wanted
 
     def _splat_program(self, values: int, depth: bool) -> moderngl.Program:
         key = (values, depth)
@@ -225,16 +214,10 @@ class GlView(View):
     """View without device memory: its rasterizer projects it again when another was drawn in between."""
 
     def __init__(
-        self,
-        rasterizer: GlRasterizer,
-        gaussians: Gaussians,
-        camera: Camera,
-        settings: RasterSettings,
-        order: DrawOrder,
+        self, rasterizer: GlRasterizer, gaussians: Gaussians, camera: Camera, settings: RasterSettings
     ) -> None:
         self.rasterizer = rasterizer
         self.gaussians, self.camera, self.settings = gaussians, camera, settings
-        self.order = order
         self.count = len(gaussians)
         self.dropped = self.count - len(rasterizer.scene(gaussians).rows)
 
@@ -274,7 +257,7 @@ class GlView(View):
     def depth_at(self, column: int, row: int) -> tuple[float, float]:
         """Return what `View.depth_at` does, from the projection read back."""
         scene = self.rasterizer.project(self)
-        order = self.order.rows(scene)[::-1]
+        order = scene.texels()[::-1]
         x, y, z, opacity = np.frombuffer(scene.placement.read(), "f4").reshape(-1, 4)[order].T
         along_x, along_y, *inverse = np.frombuffer(scene.shape.read(), "f4").reshape(-1, 4)[order].T
         dx, dy = column + 0.5 - x, row + 0.5 - y

@@ -1,16 +1,15 @@
 """Scenes in the memory of an OpenGL device, and their draw order.
 
 From top to bottom: a context without a window or a display, tools for drawing with moderngl, the sort on the
-device, the textures of a scene, and the draw order of a view, by the CPU or by the device.
+device, and the textures of a scene, which are sorted by the CPU or by the device.
 """
 
 import math
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from itertools import product
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import moderngl
 import numpy as np
@@ -18,8 +17,7 @@ import numpy as np
 from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.config import RasterSettings
 from langsplat_core.errors import BackendError
-from langsplat_core.progress import lap
-from langsplat_core.raster.opengl.shaders import shader
+from langsplat_core.raster.opengl import shader
 from langsplat_core.raster.protocol import farthest
 from langsplat_core.scene import Camera, Gaussians
 
@@ -149,16 +147,24 @@ class SortBuffers:
 
 
 class DepthSorter:
-    """The compiled sort of one context. Raises moderngl.Error where the driver cannot compile it."""
+    """The compiled sort of one context.
+
+    Raises BackendError where the driver cannot compile it, or sorts wrongly as some do.
+    """
 
     def __init__(self, ctx: moderngl.Context) -> None:
         self._ctx = ctx
-        self._programs: Mapping[str, moderngl.ComputeShader] = {
-            name: ctx.compute_shader(
-                shader("depth_sort.comp", "430 core", STEP=number, GROUP=GROUP, ROUNDS=ROUNDS)
-            )
-            for number, name in enumerate(STEPS)
-        }
+        self._programs: dict[str, moderngl.ComputeShader] = {}
+        try:
+            for number, name in enumerate(STEPS):
+                source = shader("depth_sort.comp", "430 core", STEP=number, GROUP=GROUP, ROUNDS=ROUNDS)
+                self._programs[name] = ctx.compute_shader(source)
+            works = self._is_right()
+        except moderngl.Error:
+            works = False
+        if not works:
+            self.release()
+            raise BackendError("this driver cannot sort: older than OpenGL 4.3, or its compute shaders fail")
 
     def holds(self, count: int) -> bool:
         """Return True where the driver's buffers are large enough for so many points."""
@@ -195,8 +201,7 @@ class DepthSorter:
         self._programs[step].run(groups)
         self._ctx.memory_barrier()
 
-    def is_right(self) -> bool:
-        """Return True where a small sort comes out right: drivers are known to get such shaders wrong."""
+    def _is_right(self) -> bool:
         depths = np.random.default_rng(0).integers(-2, 60, _PROBE) * np.pi
         means = np.zeros((_PROBE, 3))
         means[:, 2] = depths
@@ -215,23 +220,6 @@ class DepthSorter:
             program.release()
 
 
-def working_sorter(ctx: moderngl.Context) -> DepthSorter | None:
-    """Return a sorter that was seen to sort.
-
-    None where the driver has no compute shaders or fails at them.
-    """
-    if ctx.version_code < 430:
-        return None
-    try:
-        sorter = DepthSorter(ctx)
-    except moderngl.Error:
-        return None
-    if sorter.is_right():
-        return sorter
-    sorter.release()
-    return None
-
-
 def chosen_sorter(ctx: moderngl.Context, sort: Sort) -> DepthSorter | None:
     """None where the CPU is to sort.
 
@@ -240,10 +228,12 @@ def chosen_sorter(ctx: moderngl.Context, sort: Sort) -> DepthSorter | None:
     """
     if sort == "cpu" or (sort == "auto" and is_software(ctx)):
         return None
-    sorter = working_sorter(ctx)
-    if sorter is None and sort == "device":
-        raise BackendError("this driver cannot sort: older than OpenGL 4.3, or its compute shaders fail")
-    return sorter
+    try:
+        return DepthSorter(ctx)
+    except BackendError:
+        if sort == "device":
+            raise
+        return None
 
 
 # A scene in the memory of an OpenGL 4.1 device: one texel per Gaussian, in layers of 2D textures.
@@ -280,21 +270,41 @@ class SceneTextures:
         self.sh = self._layers(np.clip(sh, -HALF_MAX, HALF_MAX) if half else sh, "f2" if half else "f4")
         self.placement, self.shape, self.colours = (ctx.texture(self.size, 4, dtype="f4") for _ in range(3))
         self.projected = ctx.framebuffer([self.placement, self.shape, self.colours])
-        self.order = ctx.buffer(reserve=4 * max(len(kept), 1), dynamic=True)
-        self.sort = (
-            SortBuffers(ctx, self._means.T, self.order) if sorter and sorter.holds(len(kept)) else None
+        self.order = ctx.buffer(reserve=4 * max(len(kept), 1), dynamic=True)  # int32 texels, back to front
+        self._drawn = 0  # of them, sorted by NumPy
+        self._sorter = sorter if sorter is not None and sorter.holds(len(kept)) else None
+        self._buffers = None if self._sorter is None else SortBuffers(ctx, self._means.T, self.order)
+
+    def sort(self, camera: Camera, settings: RasterSettings) -> None:
+        """Fill `order` by camera z between near and far, ties by index; the device and NumPy do the same."""
+        near, far, plane = settings.near, farthest(settings), camera.world_to_camera[2]
+        if self._sorter is not None and self._buffers is not None:
+            self._sorter.sort(self._buffers, plane, near, far)
+            return
+        # Term by term, as in the reference: a matrix product may round equal rows differently, and equal
+        # depths must tie.
+        x, y, z = self._means
+        depths = x * plane[0] + y * plane[1] + z * plane[2] + plane[3]
+        ahead = np.flatnonzero((depths > near) & (depths <= far))
+        self._drawn = len(ahead)
+        self.order.write(ahead[front_to_back(depths[ahead])][::-1].astype(np.int32))
+
+    def texels(self) -> Array:
+        """(m,) int32 texels that are drawn, back to front, read from `order`."""
+        if self._buffers is not None:
+            return self._buffers.order()
+        return (
+            np.frombuffer(self.order.read(4 * self._drawn), np.int32)
+            if self._drawn
+            else np.zeros(0, np.int32)
         )
 
-    def depths(self, camera: Camera) -> Array:
-        """(n,) float64 camera z.
-
-        Term by term, as in the reference: a matrix product may round equal rows differently, and equal depths
-        must tie.
-        """
-        x, y, z = self._means
-        a, b, c, d = camera.world_to_camera[2]
-        depths: Array = x * a + y * b + z * c + d
-        return depths
+    def draw(self, quads: moderngl.VertexArray) -> None:
+        """Draw a quad for each texel of `order`; sorted by the device, not even their number is read back."""
+        if self._buffers is not None:
+            quads.render_indirect(self._buffers.command, moderngl.TRIANGLE_STRIP, 1)
+        elif self._drawn:
+            quads.render(moderngl.TRIANGLE_STRIP, vertices=4, instances=self._drawn)
 
     @staticmethod
     def _geometry(kept: Gaussians) -> Array:
@@ -331,11 +341,8 @@ class SceneTextures:
         for resource in (self.projected, self.geometry, self.sh, self.placement, self.shape, self.colours):
             resource.release()
         self.order.release()
-        if self.sort is not None:
-            self.sort.release()
-
-
-# In which order the Gaussians of a view are drawn: back to front, found on the CPU or on the device.
+        if self._buffers is not None:
+            self._buffers.release()
 
 
 def front_to_back(depths: Array) -> Array:
@@ -351,70 +358,3 @@ def front_to_back(depths: Array) -> Array:
         tied = np.flatnonzero(np.concatenate([[False], equal]) | np.concatenate([equal, [False]]))
         order[tied] = order[tied][np.lexsort((order[tied], ascending[tied]))]
     return order
-
-
-class DrawOrder(Protocol):
-    """Order in which the Gaussians ahead of one camera are drawn."""
-
-    def write(self, scene: SceneTextures) -> None:
-        """Write this order into `scene.order`."""
-
-    def rows(self, scene: SceneTextures) -> Array:
-        """(m,) int32 texels, back to front; this order must be the one written last."""
-
-    def draw(self, scene: SceneTextures, quads: moderngl.VertexArray) -> None:
-        """Draw a quad for each of them; this order must be the one written last."""
-
-
-@dataclass(frozen=True, eq=False)
-class CpuOrder:
-    """Drawing order sorted by NumPy."""
-
-    texels: Array  # (m,) int32, back to front
-
-    def write(self, scene: SceneTextures) -> None:
-        scene.order.write(self.texels)
-
-    def rows(self, scene: SceneTextures) -> Array:
-        return self.texels
-
-    def draw(self, scene: SceneTextures, quads: moderngl.VertexArray) -> None:
-        if len(self.texels):
-            quads.render(moderngl.TRIANGLE_STRIP, vertices=4, instances=len(self.texels))
-
-
-@dataclass(frozen=True, eq=False)
-class DeviceOrder:
-    """Sorted on the device when it is written; not even their number comes back to draw them."""
-
-    sorter: DepthSorter
-    plane: Array  # (4,) see `DepthSorter.sort`
-    near: float
-    far: float
-
-    def write(self, scene: SceneTextures) -> None:
-        self.sorter.sort(_buffers(scene), self.plane, self.near, self.far)
-
-    def rows(self, scene: SceneTextures) -> Array:
-        return _buffers(scene).order()
-
-    def draw(self, scene: SceneTextures, quads: moderngl.VertexArray) -> None:
-        quads.render_indirect(_buffers(scene).command, moderngl.TRIANGLE_STRIP, 1)
-
-
-def _buffers(scene: SceneTextures) -> SortBuffers:
-    assert scene.sort is not None  # as in `draw_order`; a scene that is uploaded again gets the same
-    return scene.sort
-
-
-def draw_order(
-    scene: SceneTextures, camera: Camera, settings: RasterSettings, sorter: DepthSorter | None
-) -> DrawOrder:
-    """By camera z between the near and the far plane, ties by index; both ways give the same."""
-    near, far = settings.near, farthest(settings)
-    if sorter is not None and scene.sort is not None:
-        return DeviceOrder(sorter, camera.world_to_camera[2], near, far)
-    with lap("sort"):
-        depths = scene.depths(camera)
-        ahead = np.flatnonzero((depths > near) & (depths <= far))
-        return CpuOrder(ahead[front_to_back(depths[ahead])][::-1].astype(np.int32))
