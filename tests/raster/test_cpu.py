@@ -1,6 +1,6 @@
 """The CPU rasterizer against the float64 reference, and laws that need none."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -96,8 +96,8 @@ def test_arrays_of_any_type_and_layout_are_taken():
     assert np.array_equal(view.splat(np.asfortranarray(x.astype(np.float64)))[0], want)
     flipped = np.asfortranarray(y.astype(np.float64))
     assert np.array_equal(view.gather(flipped), view.gather(y))
-    for name in vars(gaussians):
-        getattr(gaussians, name).flags.writeable = False
+    for field in fields(gaussians):
+        getattr(gaussians, field.name).flags.writeable = False
     x.flags.writeable = y.flags.writeable = False
     view = CPU.view(gaussians, camera)
     assert np.array_equal(view.splat(x)[0], want)

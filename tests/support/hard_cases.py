@@ -1,7 +1,7 @@
 """What the table of hard cases is built from: a drawing, and what a rasterizer made of it."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -272,7 +272,8 @@ def _right_to_the_corners(seen: Seen) -> None:
 
 
 def _in_half(seen: Seen) -> None:
-    half = [getattr(seen.drawing.gaussians, name).astype(np.float16) for name in vars(seen.drawing.gaussians)]
+    gaussians = seen.drawing.gaussians
+    half = [getattr(gaussians, field.name).astype(np.float16) for field in fields(gaussians)]
     values = seen.drawing.features().astype(np.float16)
     promoted = Gaussians(*(array.astype(np.float32) for array in half))
     identical(
