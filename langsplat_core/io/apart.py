@@ -2,15 +2,15 @@
 
 The process is a fresh interpreter, which knows nothing of this one but what it is given: the function, named
 by its module, and arguments, which are pickled. Progress and messages come back while it runs. It ends with
-this process, however that ends, and at once where the work is cancelled.
+this process, however that ends (native code that holds the interpreter ends its call first), and at once
+where the work is cancelled.
 
 Not `concurrent.futures.ProcessPoolExecutor`: its processes import the caller's ``__main__`` anew, which a
 script without a guard does not survive; it does not say how a process ended, nor the last that it printed;
-and what it runs in native code outlives a cancelled or killed caller.
+and what it runs outlives a caller that is killed.
 """
 
 import contextlib
-import ctypes
 import logging
 import os
 import pickle
@@ -21,12 +21,11 @@ import tempfile
 import threading
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import IO, Any
+from typing import Any
 
 from langsplat_core.errors import printable_line
 from langsplat_core.progress import Progress, Report
 
-_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of prctl(2): where who started this process ends
 _SERVE = "from langsplat_core.io.apart import serve; serve()"
 
 log = logging.getLogger("langsplat")
@@ -67,7 +66,16 @@ def run(
         try:
             pickle.dump((log.getEffectiveLevel(), function, arguments), process.stdin)
             process.stdin.flush()
-            return _result(process.stdout, progress)
+            while True:
+                match pickle.load(process.stdout):
+                    case "progress", report:
+                        progress.show(Report(*report))
+                    case "message", message:
+                        log.log(*message)
+                    case "error", error:
+                        raise error
+                    case _, result:
+                        return result
         except (EOFError, pickle.UnpicklingError, BrokenPipeError):  # it ended within or before a message
             code = process.wait()
             how = signal.Signals(-code).name if code < 0 else f"code {code}"
@@ -80,20 +88,6 @@ def run(
             process.kill()
             with contextlib.suppress(BrokenPipeError):
                 process.stdin.close()
-
-
-def _result(messages: IO[bytes], progress: Progress) -> Any:
-    """Pass on what comes until the function has returned or raised."""
-    while True:
-        kind, content = pickle.load(messages)
-        if kind == "progress":
-            progress.show(Report(*content))
-        elif kind == "message":
-            log.log(*content)
-        elif kind == "error":
-            raise content
-        else:
-            return content
 
 
 def serve() -> None:
@@ -122,19 +116,13 @@ def serve() -> None:
     log.setLevel(level)
     log.propagate = False
     threading.Thread(target=end_with_caller, daemon=True).start()
-    if sys.platform == "linux":  # the thread waits for native code that keeps the interpreter to itself
-        ctypes.CDLL(None).prctl(_DEATH_SIGNAL, signal.SIGKILL)
     progress = Progress(lambda at: send("progress", (at.stage, at.fraction, at.note, dict(at.metrics))))
     try:
         send("result", function(*arguments, progress))
     except Exception as error:  # noqa: BLE001  raised there instead
-        send("error", _portable(error))
+        try:
+            pickle.loads(pickle.dumps(error))
+        except Exception:  # noqa: BLE001  whatever its class does
+            error = RuntimeError(f"{type(error).__name__}: {error}")
+        send("error", error)
     os._exit(0)  # not past the thread that waits for input
-
-
-def _portable(error: Exception) -> Exception:
-    """Return the error, or where it cannot be pickled one that says the same."""
-    try:
-        return pickle.loads(pickle.dumps(error))
-    except Exception:  # noqa: BLE001  whatever its class does
-        return RuntimeError(f"{type(error).__name__}: {error}")

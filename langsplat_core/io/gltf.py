@@ -103,12 +103,9 @@ class _Scene(Struct):
     nodes: list[Index] = []
 
 
-class _Head(Struct, rename="camel"):
+class _Content(Struct, rename="camel"):
     asset: dict[str, Any]
     extensions_required: list[str] = []
-
-
-class _Content(_Head, rename="camel"):
     accessors: list[_Accessor] = []
     buffer_views: list[_View] = []
     buffers: list[dict[str, Any]] = []
@@ -240,14 +237,13 @@ class _File:
             size = int.from_bytes(text[end : end + 4], "little")
             self._binary = text[end + 8 :][: size if text[end + 4 : end + 8] == BINARY_CHUNK else 0]
             text = text[20:end]
-        head = decode_json(bytes(text), _Head, path)
-        version = head.asset.get("version")
+        self.content = decode_json(bytes(text), _Content, path)
+        version = self.content.asset.get("version")
         if str(version)[:2] != "2.":
             raise malformed(path, f"glTF version {quoted(version)}; only 2 is read", "export it as glTF 2.0")
-        for name in head.extensions_required:
+        for name in self.content.extensions_required:
             if name not in KNOWN:
                 raise malformed(path, f"needs {quoted(name)}, which is not read", "export it without")
-        self.content = decode_json(bytes(text), _Content, path)
 
     def accessor(self, index: int, width: int, count: int, name: str) -> Array:
         """Return the (count, width) float32 values of an accessor."""

@@ -111,10 +111,8 @@ def open_for_reading(path: Path) -> tuple[BinaryIO, int]:
         return path.open("rb"), status.st_size
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; check the spelling and the folder") from None
-    except PermissionError:
-        raise InputError(f"{path}: may not be read; change its permissions") from None
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        raise InputError(f"{path}: cannot be opened ({error})") from None
+        raise InputError(f"{path}: cannot be opened ({error}); check its name and permissions") from None
 
 
 def is_plain_name(name: object) -> bool:
@@ -172,11 +170,7 @@ class Archive:
 
     def __init__(self, archive: zipfile.ZipFile, path: Path, size: int) -> None:
         self._archive, self.path, self.size = archive, path, size  # size of the file, bytes
-
-    @property
-    def names(self) -> list[str]:
-        """Names of all members, in the directory's order."""
-        return self._archive.namelist()
+        self.names = archive.namelist()
 
     def read(self, name: str, limit: int) -> bytes:
         """Return the content of a member.
