@@ -2,7 +2,6 @@
 
 import gzip
 import io
-import json
 import re
 import struct
 import zipfile
@@ -26,14 +25,12 @@ from langsplat_core.io.hostile import (
     read_npy,
     read_npz,
 )
-from langsplat_core.io.ply import GREY, read_cloud, read_ply
+from langsplat_core.io.ply import GREY, read_cloud
 from langsplat_core.io.scenes import formats, load_gaussians
-from langsplat_core.io.sidecar import read_language, write_language
 from langsplat_core.io.spz import read_spz_scene
-from langsplat_core.scene import LanguageField
 from tests.support.comparing import assert_refused
 from tests.support.file_kinds import KINDS, STRICT
-from tests.support.file_samples import plain_ply, random_field, sog_files, spz_bytes, write_folder
+from tests.support.file_samples import sog_files, spz_bytes, write_folder
 from tests.support.mutation import fuzz, tried
 from tests.support.scenes import random_gaussians
 
@@ -311,43 +308,6 @@ def test_zstandard_frames_that_unfold_to_gigabytes_are_refused(tmp_path, bounded
 
 def test_a_file_of_a_terabyte_of_zeros_is_refused(tmp_path, bounded):
     assert_refused(load_gaussians, hole(tmp_path / "a.spz", 10**12))
-
-
-@pytest.mark.parametrize(
-    ("before", "lines"),
-    [
-        (b"element vertex", "element nothing 1000000000000\n"),
-        (b"element vertex", "element face 9000\nproperty list uchar int i\n"),
-        (b"property float x", "".join(f"property char a{i}\n" for i in range(3000))),
-    ],
-)
-def test_headers_are_compared_with_the_file(put, bounded, before, lines):
-    """An element without properties takes no bytes, however many rows it has; empty lists take one each."""
-    path = put(plain_ply(SCENE).replace(before, lines.encode() + before))
-    if "nothing" in lines:
-        assert len(read_ply(path)) == len(SCENE)
-    else:
-        assert_refused(read_ply, path)
-
-
-def sidecar(path: Path) -> LanguageField:
-    return read_language(path, SCENE.means)
-
-
-def test_a_sidecar_of_unfitting_shapes_is_refused(tmp_path, bounded):
-    """Shapes are checked before any product is formed: nothing is broadcast, nothing blows up."""
-    path = tmp_path / "a.langsplat.safetensors"
-    write_language(path, random_field(20), SCENE.means)
-    raw = path.read_bytes()
-    size = struct.unpack("<Q", raw[:8])[0]
-    header = json.loads(raw[8 : 8 + size])
-    for name in header.keys() - {"__metadata__"}:
-        count = int(np.prod(header[name]["shape"]))
-        for shape in ([count], [1, count], [count, 1], [1, 1, count], [count, 1, 1], []):
-            if shape != header[name]["shape"]:
-                changed = json.dumps(header | {name: header[name] | {"shape": shape}}).encode()
-                path.write_bytes(struct.pack("<Q", len(changed)) + changed + raw[8 + size :])
-                assert_refused(sidecar, path)
 
 
 # Every input format, among them every row of the table of scene formats, against thousands of damaged files:

@@ -263,6 +263,8 @@ MALFORMED = {  # a good file, and what of it is replaced by what
     "a negative count": (PLAIN, b"vertex 2", b"vertex -2"),
     "an endless header": (PLAIN, b"end_header", b"comment x\n" * 10_000),
     "a name that clears the screen": (PLAIN, b"element", b"element \x1b[2J 0\nelement"),
+    "properties that eat the vertices": (
+        PLAIN, b"property float x", b"".join(b"property char a%d\n" % i for i in range(900)) + b"property float x"),
     "lists that eat the vertices": (
         PLAIN, b"element vertex", b"element face 1\nproperty list uint float i\nelement vertex"),
     "words in ascii": (ASCII, b"4 0 1 2 3\n", b"4 0 1 2 3\none two"),
