@@ -246,6 +246,7 @@ LONG = PLAIN + bytes(400)  # room for more properties
 OPACITY = b"property float opacity"
 PACKED = compressed_ply(random_gaussians(600, sh_degree=1))
 REST = b"".join(b"property float f_rest_%d\n" % index for index in range(1, 10))
+CHARS = b"".join(b"property char a%d\n" % index for index in range(900))
 MALFORMED = {  # a good file, and what of it is replaced by what
     "empty": (PLAIN, PLAIN, b""),
     "another format": (PLAIN, b"ply\n", b"solid cube\n"),
@@ -263,8 +264,7 @@ MALFORMED = {  # a good file, and what of it is replaced by what
     "a negative count": (PLAIN, b"vertex 2", b"vertex -2"),
     "an endless header": (PLAIN, b"end_header", b"comment x\n" * 10_000),
     "a name that clears the screen": (PLAIN, b"element", b"element \x1b[2J 0\nelement"),
-    "properties that eat the vertices": (
-        PLAIN, b"property float x", b"".join(b"property char a%d\n" % i for i in range(900)) + b"property float x"),
+    "properties that eat the vertices": (PLAIN, b"property float x", CHARS + b"property float x"),
     "lists that eat the vertices": (
         PLAIN, b"element vertex", b"element face 1\nproperty list uint float i\nelement vertex"),
     "words in ascii": (ASCII, b"4 0 1 2 3\n", b"4 0 1 2 3\none two"),
