@@ -365,29 +365,17 @@ def _read_plain(ply: PlyFile, vertex: PlyElement) -> tuple[Gaussians, dict[str, 
     return Gaussians(means, log_scales, quats_wxyz, opacities[:, 0], sh), extras
 
 
-def write_ply_scene(path: Path, scene: Scene) -> None:
-    """Write the Gaussians of a scene and all that a PLY tells of them beside; see `write_ply`."""
-    # The commonest spelling of four
-    comments = ["SplatRenderMode: mip"] if scene.antialiased else []
+def write_ply(path: Path | str, content: Scene | Gaussians) -> None:
+    """Write Gaussians in the plain INRIA form, and what else of a scene a PLY holds, atomically.
+
+    Extras become properties behind those of the layout, where readers that do not know them pass over them.
+    Raises InputError for names and types that no PLY can hold.
+    """
+    scene = Scene(content) if isinstance(content, Gaussians) else content
+    gaussians = scene.gaussians
+    comments = ["SplatRenderMode: mip"] if scene.antialiased else []  # the commonest spelling of four
     if scene.metres_per_unit is not None:
         comments.append(f"{METRES} {float(scene.metres_per_unit)!r}")
-    write_ply(path, scene.gaussians, tuple(comments), scene.extras)
-
-
-def write_ply(
-    path: Path | str,
-    gaussians: Gaussians,
-    comments: tuple[str, ...] = (),
-    extras: Mapping[str, Array] | None = None,
-) -> None:
-    """Write the plain INRIA form, atomically.
-
-    `comments` become header lines of one line each. `extras`, name -> (N,) of a type that PLY has, become
-    properties behind those of the layout, where readers that do not know them pass over them. Raises
-    InputError for what a header cannot hold.
-    """
-    if any("\n" in comment or "\r" in comment for comment in comments):
-        raise InputError("a PLY comment must be a single line")
     sh = gaussians.sh
     columns = dict(zip(POSITION, gaussians.means.T, strict=True))
     columns |= dict.fromkeys(NORMAL, np.zeros(len(gaussians), np.float32))
@@ -397,7 +385,7 @@ def write_ply(
     columns["opacity"] = gaussians.opacity_logits
     columns |= dict(zip(SCALE, gaussians.log_scales.T, strict=True))
     columns |= dict(zip(ROTATION, gaussians.quats_wxyz.T, strict=True))
-    for name, values in (extras or {}).items():
+    for name, values in scene.extras.items():
         if name in columns or name.startswith("f_rest_") or not is_name(name):
             raise InputError(f"{name!r} cannot be an extra property of a PLY: rename it")
         if values.dtype.str[1:] not in TYPE_NAMES:

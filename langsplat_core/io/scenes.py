@@ -25,7 +25,7 @@ from langsplat_core.io import sidecar as language_files
 from langsplat_core.io.files import atomic_path, check_output_file, locked, shown
 from langsplat_core.io.gltf import read_gltf_scene, write_gltf
 from langsplat_core.io.hostile import exists
-from langsplat_core.io.ply import read_ply_scene, write_ply_scene
+from langsplat_core.io.ply import read_ply_scene, write_ply
 from langsplat_core.io.quantised import read_splat, write_splat
 from langsplat_core.io.sog import META_NAME, read_sog_scene, write_sog
 from langsplat_core.io.spz import read_spz_scene, write_spz
@@ -63,7 +63,7 @@ def _gltf(suffix: str, mime: str) -> SceneFormat:
 
 
 CORE_FORMATS = (
-    SceneFormat(".ply", read_ply_scene, write_ply_scene, mime="model/x-ply"),  # plain and compressed
+    SceneFormat(".ply", read_ply_scene, write_ply, mime="model/x-ply"),  # plain and compressed
     SceneFormat(
         ".spz",
         read_spz_scene,

@@ -290,7 +290,7 @@ def test_an_empty_scene_is_the_background(renderer):
 def test_antialiased_files_are_drawn_as_by_the_reference(tmp_path, renderer, antialiased):
     """Its Gaussians are as small as pixels, where the compensation matters."""
     gaussians, camera = random_gaussians(60, scale_range=(0.002, 0.02)), random_camera(1)
-    write_ply(tmp_path / "a.ply", gaussians, ("SplatRenderMode: mip",) if antialiased else ())
+    write_ply(tmp_path / "a.ply", Scene(gaussians, antialiased=antialiased))
     scene = load_scene(tmp_path / "a.ply")
     want, other = (
         ReferenceRasterizer()

@@ -14,7 +14,7 @@ from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.checkpoints.importing import ForeignScene, read_foreign
 from langsplat_core.io.ply import write_ply
-from langsplat_core.scene import Gaussians
+from langsplat_core.scene import Gaussians, Scene
 from tests.support.comparing import assert_same
 from tests.support.file_samples import autoencoder, geometry, save_model, tensor, training_state
 from tests.support.scenes import random_gaussians
@@ -182,7 +182,7 @@ def test_open_gaussian(tmp_path, as_ply):
     instance = rng.normal(size=(N, 6)).astype(np.float32)
     if as_ply:
         path = tmp_path / "point_cloud.ply"
-        write_ply(path, G, extras=dict(zip(names, instance.T, strict=True)))
+        write_ply(path, Scene(G, extras=dict(zip(names, instance.T, strict=True))))
     else:
         path = save_model(tmp_path / "chkpnt90000.pth", G, tensor(instance), tensor(instance))
         refused([path], r"cluster_lang\.npz, name it too")
@@ -200,7 +200,7 @@ def test_open_gaussian(tmp_path, as_ply):
 def test_feature_3dgs(tmp_path):
     ply = tmp_path / "a.ply"
     extras = {f"semantic_{i}": VECTORS[0][:, i] for i in reversed(range(D))} | {"kept": VECTORS[0][:, 0]}
-    write_ply(ply, G, extras=extras)
+    write_ply(ply, Scene(G, extras=extras))
     got = read_foreign([ply])
     assert_rows(got, 2, VECTORS[0])
     assert list(got.scene.extras) == ["kept"]
@@ -211,7 +211,7 @@ def test_feature_3dgs(tmp_path):
         assert_rows(got, 2, VECTORS[0])
     torch.save({"conv.weight": torch.zeros(D, 8, 1, 1), "conv.bias": torch.zeros(D)}, tmp_path / "dec.pth")
     refused([path, tmp_path / "dec.pth"], "decodes pictures, not Gaussians")
-    write_ply(ply, G, extras={"semantic_0": VECTORS[0][:, 0], "semantic_2": VECTORS[0][:, 0]})
+    write_ply(ply, Scene(G, extras={"semantic_0": VECTORS[0][:, 0], "semantic_2": VECTORS[0][:, 0]}))
     refused([ply], "without gaps")
 
 
