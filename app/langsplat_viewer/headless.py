@@ -11,7 +11,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.io.files import check_output_file
 from langsplat_core.io.sidecar import SUFFIX
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.answers import QueryResult, recut
+from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import LEVELS, Camera, Scene
@@ -128,23 +128,11 @@ def _first_camera(scene: Scene, options: ViewerOptions) -> Camera:
 def _answers(
     engine: QueryEngine, options: ViewerOptions, camera: Camera, progress: Progress
 ) -> tuple[QueryResult, ...]:
-    """Return the answers to the queries, in their order, cut where the options say so."""
+    """Return the answers to the queries, in their order."""
     phrases = [phrase for text in options.query for phrase in split_phrases(text) or [text]]
-    if options.cut and len(options.cut) != len(phrases):
-        raise InputError(f"--cut {options.cut[0]:g}: give each --query a cut, 0 for its own, or none any")
-    if options.canonical:
-        canonical = split_phrases(options.canonical)
-        if engine.scene.language is None or not canonical:
-            needed = "needs a phrase, and a scene with a language field"
-            raise InputError(f"--canonical {options.canonical}: {needed}")
-        engine.compare_with(canonical, progress)
     for phrase in phrases:  # before anything slow is done
         check_phrase(engine, phrase, camera, progress)
-    results = tuple(run_phrase(engine, phrase, options.level, camera, progress).answer for phrase in phrases)
-    if not options.cut:
-        return results
-    pairs = zip(results, options.cut, strict=True)
-    return tuple(recut(result, cut) if cut > 0 else result for result, cut in pairs)
+    return tuple(run_phrase(engine, phrase, options.level, camera, progress).answer for phrase in phrases)
 
 
 def _turn(scene: Scene, camera: Camera, results: Sequence[QueryResult], options: ViewerOptions) -> Motion:

@@ -39,7 +39,6 @@ MAX_SIDE = 16_384  # pixels; beyond it drivers refuse textures
 Seconds = Annotated[float, Range(0.1, 36_000.0)]
 PicturesPerSecond = Annotated[float, Range(0.1, 240.0)]
 Span = Annotated[float, Range(*SPAN_LIMITS)]
-Cuts = tuple[Share, ...]
 
 
 @dataclass(frozen=True)
@@ -54,11 +53,6 @@ class ViewerOptions:
     """Semantic level of the search; auto takes the one that answers best."""
     display: DisplayChoice = "auto"
     """What is shown; auto is relevancy with a query, else rgb."""
-    cut: Annotated[tyro.conf.UseAppendAction[Cuts], tyro.conf.arg(metavar="RELEVANCY")] = ()
-    """Without a window: relevancy from 0 to 1 at which an answer ends, 0 where it ends by itself; repeat it
-    for each --query."""
-    canonical: Annotated[str, tyro.conf.arg(metavar="PHRASES")] = ""
-    """Without a window: what everything is compared with, phrases between commas (default: the scene's)."""
     near_cut: NotNegative = 0.0
     """Without a window: depth up to which nothing is drawn, world units."""
     far_cut: Positive | None = None

@@ -12,7 +12,7 @@ from langsplat_core.progress import Progress, TerminalProgress, silent
 from langsplat_viewer.files.projects import PROJECTS, preferences_folder
 from langsplat_viewer.options import ViewerOptions, camera_file, scene_path, services
 
-WITHOUT_WINDOW = ("out", "turntable", "colour_map", "transparent", "cut", "canonical", "near_cut", "far_cut")
+WITHOUT_WINDOW = ("out", "turntable", "colour_map", "transparent", "near_cut", "far_cut")
 
 
 @dataclass(frozen=True)

@@ -154,13 +154,6 @@ def test_scene_without_cameras_is_framed(run_viewer, folder):
         (["blobs.ply", "--backend", "magic"], "magic"),
         (["blobs.ply", "--headles"], "--headles"),
         (["blobs.ply", "plain.ply"], "plain.ply"),
-        (
-            ["blobs.ply", "--query", "mug", "--query", "book", "--cut", "0.6"],
-            "--cut 0.6: give each --query a cut",
-        ),
-        (["blobs.ply", "--query", "mug", "--cut", "1.5"], "--cut 1.5: must be 0 to 1"),
-        (["blobs.ply", "--query", "mug", "--canonical", ", "], "--canonical"),
-        (["blobs.ply", "--query", "mug", "--canonical", "sofa"], "sofa"),
         (["blobs.ply", "--near-cut", "-1"], "--near-cut -1: must be 0"),
         (["blobs.ply", "--far-cut", "0"], "--far-cut 0: must be above 0"),
         (["blobs.ply", "--near-cut", "30"], "nothing of the scene"),
@@ -185,7 +178,7 @@ def test_impossible_options_are_one_line(run_viewer, folder, arguments, reason):
         (["--headless", "--out", "blobs.ply/a.png"], "is a file, not a folder"),
         (["--headless", "--out", "x" * 5000 + ".png"], "choose another"),
         (["--out", "a.png"], "add --headless"),
-        (["--cut", "0.6"], "add --headless"),
+        (["--transparent"], "add --headless"),
         (["--far-cut", "1"], "add --headless"),
     ],
 )
