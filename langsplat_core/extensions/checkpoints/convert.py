@@ -19,18 +19,19 @@ def _import(request: ImportRequest, progress: Progress) -> tuple[Scene, tuple[st
     from langsplat_core.extensions.checkpoints.importing import import_scene, read_foreign  # imports torch
 
     foreign = read_foreign(request.paths, request.levels)
-    scene, report = import_scene(foreign, request.encoder, request.phrases, request.codec, progress)
-    lines = [f"{report.method}: {'; '.join(report.notes)}"]
-    if scene.language is not None:
-        shares = ", ".join(f"{share:.0%}" for share in report.meaningful)
+    scene, loss = import_scene(foreign, request.encoder, request.phrases, request.codec, progress)
+    lines = [f"{foreign.method}: {'; '.join(foreign.notes)}"]
+    field = scene.language
+    if field is not None:
+        shares = ", ".join(f"{share:.0%}" for share in field.confidence.mean(1))
         lines.append(
             f"with language features at subpart, part, whole: {shares} of the Gaussians; "
-            f"codec {report.codec} of {report.codec_size}, encoder {scene.language.encoder_id}"
+            f"codec {field.codec.kind} of {field.codec.size}, encoder {field.encoder_id}"
         )
-    if report.loss is not None:
+    if loss is not None:
         lines.append(
-            f"relevancy error of the codec: mean {report.loss.error_mean:.4f}, "
-            f"99 % below {report.loss.error_p99:.4f}; mean cosine {report.loss.cosine:.4f}"
+            f"relevancy error of the codec: mean {loss.error_mean:.4f}, "
+            f"99 % below {loss.error_p99:.4f}; mean cosine {loss.cosine:.4f}"
         )
     return scene, tuple(lines)
 

@@ -238,26 +238,16 @@ def _scene(carrier: Carrier) -> Scene:
 # Its features as a language field.
 
 
-@dataclass(frozen=True)
-class ImportReport:
-    """Report on the import of a scene of another method."""
-
-    method: str
-    codec: str  # its kind; empty without a language field
-    codec_size: int  # codewords of a codebook, numbers per latent of other kinds
-    meaningful: tuple[float, float, float]  # share of the Gaussians with a meaning, per level
-    loss: CodecReport | None  # of the codec, on vectors it was not fitted to; None where it is the method's
-    notes: tuple[str, ...]
-
-
 def import_scene(
     foreign: ForeignScene,
     encoder_id: str | None = None,
     phrases: tuple[str, ...] = (),
     config: CodecConfig | None = None,
     progress: Progress = silent,
-) -> tuple[Scene, ImportReport]:
-    """Return the scene with its language field; without one where `foreign` has no features.
+) -> tuple[Scene, CodecReport | None]:
+    """Return the scene with its language field, and what its codec loses on vectors not fitted to.
+
+    There is no field where `foreign` has no features, and no loss where the codec is the method's own.
 
     `encoder_id` is the text encoder of the space that the method's vectors are in, by default that of
     LangSplat; `phrases` are stored encoded. A Gaussian's confidence is 1 where it has a feature, else 0.
@@ -267,7 +257,7 @@ def import_scene(
     config = config or CodebookConfig()
     check_settings(config, "--codec.")
     if foreign.dim == 0:
-        return foreign.scene, ImportReport(foreign.method, "", 0, (0.0, 0.0, 0.0), None, foreign.notes)
+        return foreign.scene, None
     encoder = load_text_encoder(encoder_id or OPEN_MODEL)
     if encoder.dim != foreign.dim:
         raise InputError(
@@ -278,10 +268,7 @@ def import_scene(
     codec, loss = _codec(foreign, config, vocabulary, progress)
     latents, confidence = _latents(foreign, codec, progress)
     field = field_of((latents, confidence), codec, encoder, phrases)
-    subpart, part, whole = confidence.mean(1).tolist() if confidence.size else (0.0, 0.0, 0.0)
-    shares = (subpart, part, whole)
-    report = ImportReport(foreign.method, codec.kind, codec.size, shares, loss, foreign.notes)
-    return replace(foreign.scene, language=replace(field, calibration=None)), report
+    return replace(foreign.scene, language=replace(field, calibration=None)), loss
 
 
 def _first_path(foreign: ForeignScene) -> object:
@@ -291,7 +278,6 @@ def _first_path(foreign: ForeignScene) -> object:
 def _codec(
     foreign: ForeignScene, config: CodecConfig, vocabulary: Vocabulary, progress: Progress
 ) -> tuple[Codec, CodecReport | None]:
-    """Return the codec of the scene, and what it loses where it is not the method's own."""
     if foreign.codec is not None:
         return foreign.codec, None
     clusters = foreign.clusters

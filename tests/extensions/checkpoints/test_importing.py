@@ -59,11 +59,11 @@ def decoded(field: LanguageField, level: int) -> Array:
 
 
 def test_few_vectors_become_a_codebook_of_them(tmp_path, clip):
-    scene, report = import_scene(read_foreign(occam(tmp_path)), clip, ("red mug", "Red mug "))
+    scene, loss = import_scene(read_foreign(occam(tmp_path)), clip, ("red mug", "Red mug "))
     field = scene.language
     assert field is not None
     assert_same(scene.gaussians, G)
-    assert (report.codec, report.codec_size) == ("codebook", 7)
+    assert (field.codec.kind, field.codec.size) == ("codebook", 7)
     assert field.calibration is None  # the encoder's is of drawn rooms
     np.testing.assert_array_equal(field.confidence, np.tile(SEEN.astype(np.float32), (3, 1)))
     for level in range(3):
@@ -73,8 +73,8 @@ def test_few_vectors_become_a_codebook_of_them(tmp_path, clip):
     np.testing.assert_array_equal(field.canonical, encoder.encode_texts(list(CANONICAL_PHRASES)))
     assert list(field.phrasebook) == ["red mug"]
     assert (field.encoder_id, field.temperature) == (clip, encoder.temperature)
-    assert report.loss is not None
-    assert report.loss.error_mean < 1e-3
+    assert loss is not None
+    assert loss.error_mean < 1e-3
     save_scene(tmp_path / "a.ply", scene)
     read = load_scene(tmp_path / "a.ply").language
     assert read is not None
@@ -88,15 +88,15 @@ def test_many_vectors_keep_the_stated_error(tmp_path, clip):
     vectors = unit(FEATURES[rng.integers(0, 7, n)] + rng.normal(scale=0.02, size=(n, D))).astype(np.float32)
     path = save_model(tmp_path / "a_3.pth", g, tensor(vectors))
     config = CodebookConfig(max_relevancy_error=0.02)
-    scene, report = import_scene(read_foreign([path]), clip, (), config)
+    scene, loss = import_scene(read_foreign([path]), clip, (), config)
     assert scene.language is not None
-    assert report.loss is not None
+    assert loss is not None
     assert (scene.language.confidence.sum(1) == [0, 0, n]).all()
     vocabulary = everyday_vocabulary(load_text_encoder(clip))
     got, want = (vocabulary.relevancy(v) for v in (decoded(scene.language, 2), vectors))
-    assert 7 < report.codec_size <= n // 4
-    assert np.abs(got - want).mean() <= 1.1 * report.loss.error_mean  # most of these were fitted to
-    assert report.loss.error_mean <= 1.2 * config.max_relevancy_error
+    assert 7 < scene.language.codec.size <= n // 4
+    assert np.abs(got - want).mean() <= 1.1 * loss.error_mean  # most of these were fitted to
+    assert loss.error_mean <= 1.2 * config.max_relevancy_error
     linear, _ = import_scene(read_foreign([path]), clip, (), LinearConfig(latent_dim=D))
     assert linear.language is not None
     np.testing.assert_allclose(decoded(linear.language, 2), vectors, atol=1e-5)
@@ -175,11 +175,11 @@ def test_clusters_are_a_codebook(tmp_path, clip, number):
     index[6] = number  # of none
     np.savez(tmp_path / "cluster_lang.npz", leaf_feat=vectors, leaf_ind=index)
     path = save_model(tmp_path / "c.pth", G, tensor(np.zeros((N, 6))), tensor(np.zeros((N, 6))))
-    scene, report = import_scene(read_foreign([path, tmp_path / "cluster_lang.npz"]), clip)
+    scene, _ = import_scene(read_foreign([path, tmp_path / "cluster_lang.npz"]), clip)
     field = scene.language
     assert field is not None
     seen = (index != 1) & (index < number)
-    assert report.codec_size == len(np.unique(index[seen]))
+    assert field.codec.size == len(np.unique(index[seen]))
     np.testing.assert_array_equal(field.confidence, [np.zeros(N), np.zeros(N), seen])
     np.testing.assert_allclose(decoded(field, 2)[seen], unit(vectors[index[seen]]), atol=5e-4)
 
