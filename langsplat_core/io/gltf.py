@@ -14,7 +14,6 @@ import base64
 import json
 import struct
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 from urllib.parse import unquote
@@ -26,7 +25,7 @@ from langsplat_core.arrays import Array, logit, rotation_matrices, sigmoid, unit
 from langsplat_core.errors import InputError, malformed, quoted
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import decode_json, is_plain_name, read_file
-from langsplat_core.io.quantised import coefficient_signs, quaternion_signs, to_bytes
+from langsplat_core.io.quantised import mirrored, to_bytes
 from langsplat_core.io.spz import decode_spz
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
 from langsplat_core.scene.gaussians import join_gaussians
@@ -131,19 +130,7 @@ def read_gltf_scene(path: Path | str) -> Scene:
         raise malformed(path, f"names what it lacks ({str(error)[:80]})", "export it again") from None
     if not parts and EXTENSION not in file.content.extensions_used:
         raise malformed(path, f"holds no Gaussians ({EXTENSION}); meshes are not read")
-    return Scene(_turned(join_gaussians(parts)))
-
-
-def _turned(gaussians: Gaussians) -> Gaussians:
-    """Return the Gaussians half a turn about z further: from glTF's axes to the PLY's, or back."""
-    harmonics = np.append(np.float32(1), coefficient_signs(SIGNS, gaussians.sh.shape[1] - 1))
-    with np.errstate(invalid="ignore"):
-        return replace(
-            gaussians,
-            means=gaussians.means * SIGNS,
-            quats_wxyz=gaussians.quats_wxyz * quaternion_signs(SIGNS),
-            sh=gaussians.sh * harmonics[:, None],
-        )
+    return Scene(mirrored(join_gaussians(parts), SIGNS))
 
 
 def _parts(file: "_File") -> Iterator[Gaussians]:
@@ -164,7 +151,7 @@ def _parts(file: "_File") -> Iterator[Gaussians]:
         if left < 0:
             raise malformed(file.path, f"shows more Gaussians than {file.size} bytes can hold")
         if packed is not None:
-            gaussians = _turned(decode_spz(bytes(data), file.path).gaussians)
+            gaussians = mirrored(decode_spz(bytes(data), file.path).gaussians, SIGNS)
         else:
             gaussians = _gaussians(file, primitive.attributes, count)
         try:
@@ -374,7 +361,7 @@ def _columns(gaussians: Gaussians) -> dict[str, Array]:
     """Attribute -> (N, ...) values along glTF's axes; rows that cannot be drawn are harmless."""
     valid = gaussians.valid()
     keep = valid[:, None]
-    turned = _turned(gaussians)
+    turned = mirrored(gaussians, SIGNS)
     quats = unit(np.where(keep, turned.quats_wxyz, [1, 0, 0, 0]).astype(np.float64), 1e-30)
     opacity = np.where(valid, sigmoid(gaussians.opacity_logits.astype(np.float64)), 0)
     sh = np.where(keep[..., None], turned.sh, 0)

@@ -12,6 +12,7 @@ by size times opacity, so that a viewer can show the first part; here the order 
 language field goes by rows. Source of the layout: antimatter15/splat; the code here is our own.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +26,8 @@ from langsplat_core.scene.transform import C0
 
 # Components beside the largest, by its index
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-# Axes in which each spherical harmonic from degree 1 on is odd
-_ODD = ["y", "z", "x", "xy", "yz", "-", "xz", "-", "y", "xyz", "y", "z", "x", "z", "x"]
+# Axes in which each spherical harmonic is odd
+_ODD = ["", "y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x"]
 
 
 def to_bytes(values: Array) -> Array:
@@ -53,18 +54,20 @@ def without_largest(quats: Array) -> tuple[Array, Array]:
     return np.take_along_axis(turns, _OTHERS[largest], axis=1), largest
 
 
-def quaternion_signs(signs: Array) -> Array:
-    """Return the (4,) signs of w x y z where the axes have the (3,) `signs`.
+def mirrored(gaussians: Gaussians, signs: Array) -> Gaussians:
+    """Return the Gaussians along axes that have the (3,) `signs`, 1 or -1.
 
-    Mirroring an axis turns the two rotations about the others round.
+    Mirroring an axis turns the rotations about the two others round.
     """
-    return np.array([1, signs[1] * signs[2], signs[0] * signs[2], signs[0] * signs[1]])
-
-
-def coefficient_signs(signs: Array, count: int) -> Array:
-    """Return the (count,) signs of the coefficients from degree 1 on where the axes have the (3,) `signs`."""
-    odd = np.array([[axis in axes for axis in "xyz"] for axes in _ODD])
-    return np.where(odd, signs, 1).prod(axis=1)[:count]
+    x, y, z = signs = signs.astype(np.float32)
+    odd = np.array([[axis in axes for axis in "xyz"] for axes in _ODD[: gaussians.sh.shape[1]]])
+    with np.errstate(invalid="ignore"):
+        return replace(
+            gaussians,
+            means=gaussians.means * signs,
+            quats_wxyz=gaussians.quats_wxyz * np.array([1, y * z, x * z, x * y], np.float32),
+            sh=gaussians.sh * np.where(odd, signs, 1).prod(axis=1)[:, None],
+        )
 
 
 # ---- .splat ----

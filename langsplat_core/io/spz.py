@@ -25,13 +25,7 @@ from langsplat_core.arrays import Array, logit, sigmoid
 from langsplat_core.errors import InputError, malformed
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import open_for_reading
-from langsplat_core.io.quantised import (
-    coefficient_signs,
-    quaternion_signs,
-    smallest_three,
-    to_bytes,
-    without_largest,
-)
+from langsplat_core.io.quantised import mirrored, smallest_three, to_bytes, without_largest
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
 
 MAGIC, GZIP_MAGIC = b"NGSP", b"\x1f\x8b"
@@ -210,21 +204,19 @@ def decode_spz(data: bytes, path: Path) -> Scene:
 
 
 def _scene(packed: _Packed) -> Scene:
-    blocks, signs = packed.blocks, _signs_to_rdf(packed.axes)
-    count, degree = len(blocks["alphas"]), min(packed.header.sh_degree, 3)
-    rest = blocks["sh"].reshape(count, blocks["sh"].shape[1] // 3, 3)[:, : SH_COUNTS[degree] - 1]
-    rest = (rest.astype(np.float32) - 128) / 128 * coefficient_signs(signs, rest.shape[1])[:, None]
+    blocks, degree = packed.blocks, min(packed.header.sh_degree, 3)
+    count, width = blocks["sh"].shape
+    rest = blocks["sh"].reshape(count, width // 3, 3)[:, : SH_COUNTS[degree] - 1]
     base = (blocks["colours"] / 255 - 0.5) / COLOUR_SCALE
-    with np.errstate(invalid="ignore"):  # signalling NaN in half floats become ordinary ones
-        means = _positions(packed) * signs
     gaussians = Gaussians(
-        means=means,
+        means=_positions(packed),
         log_scales=blocks["scales"].astype(np.float32) / 16 - 10,
-        quats_wxyz=_rotations(packed) * quaternion_signs(signs),
+        quats_wxyz=_rotations(packed),
         opacity_logits=logit(blocks["alphas"][:, 0] / 255),
-        sh=np.concatenate([base[:, None], rest], axis=1),
+        sh=np.concatenate([base[:, None], (rest.astype(np.float32) - 128) / 128], axis=1),
     )
-    return Scene(gaussians, antialiased=bool(packed.header.flags & ANTIALIASED))
+    turned = mirrored(gaussians, _signs_to_rdf(packed.axes))
+    return Scene(turned, antialiased=bool(packed.header.flags & ANTIALIASED))
 
 
 def write_spz(path: Path | str, gaussians: Gaussians, antialiased: bool = False) -> None:
@@ -237,17 +229,16 @@ def write_spz(path: Path | str, gaussians: Gaussians, antialiased: bool = False)
     its positions apart.
     """
     valid = gaussians.valid()
-    drawn = gaussians.take(valid)
+    drawn = mirrored(gaussians.take(valid), _signs_to_rdf(AXES_RUB))  # half a turn, its own inverse
     bits = _fractional_bits(drawn, Path(path))
-    signs = _signs_to_rdf(AXES_RUB)  # half a turn, its own inverse
-    codes = np.rint(drawn.means.astype(np.float64) * signs * 2.0**bits).astype("<i4")
-    rest = drawn.sh[:, 1:] * coefficient_signs(signs, drawn.sh.shape[1] - 1)[:, None]
+    codes = np.rint(drawn.means.astype(np.float64) * 2.0**bits).astype("<i4")
+    rest = drawn.sh[:, 1:]
     coded = {
         "positions": codes[..., None].view(np.uint8)[..., :3].reshape(-1, 9),
         "alphas": to_bytes(sigmoid(drawn.opacity_logits) * 255)[:, None],
         "colours": to_bytes((drawn.sh[:, 0] * COLOUR_SCALE + 0.5) * 255),
         "scales": to_bytes((drawn.log_scales + 10) * 16),
-        "rotations": _rotation_codes(drawn.quats_wxyz * quaternion_signs(signs)),
+        "rotations": _rotation_codes(drawn.quats_wxyz),
         "sh": to_bytes(rest.reshape(len(rest), 3 * rest.shape[1]) * 128 + 128),
     }
     flags = ANTIALIASED if antialiased else 0
