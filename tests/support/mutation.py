@@ -3,10 +3,8 @@
 import gzip
 import io
 import logging
-import os
 import re
 import struct
-import tempfile
 import time
 import traceback
 import warnings
@@ -271,8 +269,7 @@ def in_ply_header(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> 
 
 
 # What a reader may do with a damaged file: load it, or refuse it in one short printable line. Everything
-# else is a fault, and so are memory, time, Python warnings, and lines on the standard error that nobody
-# wrote.
+# else is a fault, and so are memory, time and Python warnings.
 
 MEMORY_FACTOR, MEMORY_SLACK = 4, 300_000_000  # bytes: beyond the file's size times the factor
 LINE = 300  # characters of a message, with the short path of a test
@@ -287,25 +284,10 @@ class Outcome:
     loaded: int = 0
     warned: int = 0  # of those, with a warning of ours
     faults: Counter[str] = field(default_factory=Counter)  # description -> mutants
-    examples: dict[str, bytes] = field(default_factory=dict)  # the first mutant of each fault
-    peak: int = 0  # most bytes that one mutant took
-    slowest: float = 0.0  # most seconds of the processor
-
-    def fault(self, what: str, content: bytes) -> None:
-        self.faults[what] += 1
-        self.examples.setdefault(what, content)
 
     @property
     def refused(self) -> int:
         return self.tried - self.loaded - self.faults.total()
-
-    def summary(self) -> str:
-        lines = [
-            f"{self.tried} tried, {self.loaded} loaded ({self.warned} with a warning), "
-            f"{self.refused} refused, {self.faults.total()} faults; "
-            f"most memory {self.peak / 1e6:.0f} MB, longest {self.slowest:.2f} s"
-        ]
-        return "\n".join([*lines, *(f"  {count} x {what}" for what, count in self.faults.most_common())])
 
 
 @dataclass(frozen=True)
@@ -314,23 +296,15 @@ class FileKind:
 
     file: str  # where the mutants are written, below the folder of the test
     samples: Callable[[Path], list[bytes]]  # also writes what has to lie beside them into the folder
-    read: Callable[[Path], float]  # the share of sound content
+    read: Callable[[Path], float]  # the share of sound content, in [0, 1]; below a half a warning is due
     damage: Mutation = mutant
-    complains: bool = False  # native code writes to the standard error what it meets in damaged files
-
-
-def tried(kind: FileKind, folder: Path, contents: Iterable[bytes]) -> Outcome:
-    """What became of each, as the contents of a file of the kind."""
-    outcome = FuzzRun(folder / kind.file, kind.read, kind.complains).run(iter(contents))
-    assert not outcome.faults, outcome.summary()
-    return outcome
 
 
 def fuzz(kind: FileKind, folder: Path, count: int, seed: int) -> Outcome:
     """What became of `count` mutants, after the good samples were read without a word."""
     samples, rng = kind.samples(folder), np.random.default_rng(seed)
     good = tried(kind, folder, samples)
-    assert (good.loaded, good.warned) == (len(samples), 0), good.summary()
+    assert (good.loaded, good.warned) == (len(samples), 0), good
     mutants = (kind.damage(samples[number % len(samples)], samples, rng) for number in range(count))
     outcome = tried(kind, folder, mutants)
     assert outcome.refused + outcome.loaded == outcome.tried
@@ -338,55 +312,44 @@ def fuzz(kind: FileKind, folder: Path, count: int, seed: int) -> Outcome:
     return outcome
 
 
-class FuzzRun:
-    """`read(path)` returns the share of sound content, in [0, 1]; below a half a warning is due."""
+def tried(kind: FileKind, folder: Path, contents: Iterable[bytes]) -> Outcome:
+    """What became of each, as the contents of a file of the kind; no fault among them."""
+    outcome, path = Outcome(), folder / kind.file
+    with _listening() as said:
+        for content in contents:
+            said.clear()
+            outcome.tried += 1
+            path.write_bytes(content)
+            before, began = restart_peak() or 0, time.process_time()
+            what = _verdict(kind, path, said, outcome)
+            took, seconds = (peak_memory() or 0) - before, time.process_time() - began
+            if what is None and took > MEMORY_FACTOR * len(content) + MEMORY_SLACK:
+                what = f"memory: {took / 1e6:.0f} MB for {len(content)} bytes"
+            if what is None and seconds > SECONDS:
+                what = f"time: {seconds:.0f} s for {len(content)} bytes"
+            if what is not None:
+                outcome.faults[what] += 1
+    assert not outcome.faults, outcome
+    return outcome
 
-    def __init__(self, path: Path, read: Callable[[Path], float], complains: bool = False) -> None:
-        self.path, self._read, self._complains = path, read, complains
-        self.outcome = Outcome()
 
-    def run(self, mutants: Iterator[bytes]) -> Outcome:
-        """Try all of them."""
-        with _listening() as said, _standard_error() as stray:
-            for content in mutants:
-                said.clear()
-                self._try(content, said, stray)
-        return self.outcome
-
-    def _try(self, content: bytes, said: list[str], stray: Callable[[], str]) -> None:
-        outcome = self.outcome
-        outcome.tried += 1
-        self.path.write_bytes(content)
-        before, began = restart_peak() or 0, time.process_time()
-        what = self._verdict(said)
-        took, seconds = (peak_memory() or 0) - before, time.process_time() - began
-        outcome.peak, outcome.slowest = max(outcome.peak, took), max(outcome.slowest, seconds)
-        if what is None and took > MEMORY_FACTOR * len(content) + MEMORY_SLACK:
-            what = f"memory: {took / 1e6:.0f} MB for {len(content)} bytes"
-        if what is None and seconds > SECONDS:
-            what = f"time: {seconds:.0f} s for {len(content)} bytes"
-        if (text := stray()) and not self._complains:
-            what = what or f"on the standard error: {text[:100]!r}"
-        if what is not None:
-            outcome.fault(what, content)
-
-    def _verdict(self, said: list[str]) -> str | None:
-        """The fault, if any; counts what loaded."""
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("error")
-                sound = self._read(self.path)
-        except InputError as error:
-            return _bad_line(str(error))
-        except Exception as error:  # noqa: BLE001  which is what is looked for
-            last = traceback.extract_tb(error.__traceback__)[-1]
-            return f"{type(error).__name__} ({str(error)[:80]}) at {Path(last.filename).name}:{last.lineno}"
-        bad = next((line for line in map(_bad_line, said) if line), None)
-        if bad is None and sound < 0.5 and not said:
-            bad = "mostly unsound, unsaid"
-        self.outcome.loaded += bad is None
-        self.outcome.warned += bad is None and bool(said)
-        return bad
+def _verdict(kind: FileKind, path: Path, said: list[str], outcome: Outcome) -> str | None:
+    """The fault, if any; counts what loaded."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            sound = kind.read(path)
+    except InputError as error:
+        return _bad_line(str(error))
+    except Exception as error:  # noqa: BLE001  which is what is looked for
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        return f"{type(error).__name__} ({str(error)[:80]}) at {Path(last.filename).name}:{last.lineno}"
+    bad = next((line for line in map(_bad_line, said) if line), None)
+    if bad is None and sound < 0.5 and not said:
+        bad = "mostly unsound, unsaid"
+    outcome.loaded += bad is None
+    outcome.warned += bad is None and bool(said)
+    return bad
 
 
 def _bad_line(text: str) -> str | None:
@@ -407,27 +370,3 @@ def _listening() -> Iterator[list[str]]:
         yield said
     finally:
         logger.removeHandler(handler)
-
-
-@contextmanager
-def _standard_error() -> Iterator[Callable[[], str]]:
-    """A function that returns what was written to the standard error, by native code too, since its last
-    call."""
-    kept, propagate = os.dup(2), logging.getLogger("langsplat").propagate
-    logging.getLogger("langsplat").propagate = False
-    with tempfile.TemporaryFile() as file:
-        os.dup2(file.fileno(), 2)
-
-        def since() -> str:
-            text = os.pread(file.fileno(), 10_000, 0)
-            if text:
-                file.truncate(0)
-                os.lseek(2, 0, os.SEEK_SET)
-            return text.decode("utf-8", "replace")
-
-        try:
-            yield since
-        finally:
-            os.dup2(kept, 2)
-            os.close(kept)
-            logging.getLogger("langsplat").propagate = propagate
