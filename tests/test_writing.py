@@ -17,11 +17,12 @@ from langsplat_core.errors import InputError
 from langsplat_core.io import files
 from langsplat_core.io.cameras import write_cameras
 from langsplat_core.io.files import atomic_path, check_output_file, check_output_folder
+from langsplat_core.io.hostile import write_npy
 from langsplat_core.io.ply import write_ply
 from langsplat_core.io.scenes import load_scene, save_scene, writable_suffixes
 from langsplat_core.io.shapes import write_points
 from langsplat_core.io.sidecar import write_language
-from langsplat_core.pipeline.stages import kept, kept_array
+from langsplat_core.pipeline.stages import kept
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.features import FeatureStore, ImageFeatures
 from langsplat_core.training.radiance.state import save_checkpoint
@@ -186,7 +187,7 @@ WRITERS: dict[str, Write] = {
     "feature store": features,
     "checkpoint": checkpoint,
     "stage": stage,
-    "stage's array": lambda folder: kept_array(folder / "a.npy", lambda: np.ones(999)),
+    "stage's array": lambda folder: write_npy(folder / "a.npy", np.ones(999)),
     "report of scores": lambda folder: files.write_json(folder / "r.json", list(range(999))),
     "picture": lambda folder: save_png(
         folder / "p.png", np.random.default_rng(0).integers(0, 255, (40, 40, 3), np.uint8)

@@ -17,12 +17,12 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.config import LiftConfig, TrainConfig
 from langsplat_core.errors import InputError
+from langsplat_core.io.hostile import write_npy
 from langsplat_core.pipeline.stages import (
     Arrays,
     ProcessGroup,
     digest_of,
     kept,
-    kept_array,
     open_array,
     read_arrays,
     stage_key,
@@ -335,13 +335,10 @@ def kept_mask_weights(
     progress: Progress,
 ) -> MaskWeights:
     """Return the mask weights of all views, a file in `folder` each, which is read where it is needed."""
-
-    def pairs(index: int) -> Array:
-        return view_pairs(rasterizer, gaussians, *views[index])
-
     files = [folder / f"{index:05d}.npy" for index in range(len(views))]
     for index in processes.share(range(len(views))):
-        kept_array(files[index], partial(pairs, index))
+        if not files[index].exists():
+            write_npy(files[index], view_pairs(rasterizer, gaussians, *views[index]))
         progress("lifting masks onto the Gaussians", (index + 1) / len(views))
     processes.barrier()
     return MaskWeights([open_array(path) for path in files], len(gaussians))

@@ -21,7 +21,7 @@ from langsplat_core.arrays import Array, ViewScore, sigmoid
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.workspace import Matches, NotLocatedError
 from langsplat_core.errors import FormatError, InputError, printable_line
-from langsplat_core.io.files import atomic_path
+from langsplat_core.io.files import atomic_path, write_json
 from langsplat_core.io.hostile import read_json_file
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Gaussians, Scene
@@ -157,8 +157,7 @@ def write_reports(work: Path, report: TrainReport, capture: Capture, gaussians: 
     """Write the report of a finished training, as JSON and as a page."""
     from langsplat_core.training.radiance.differentiable import evaluate_views  # torch
 
-    with atomic_path(work / REPORT) as temporary:
-        temporary.write_text(json.dumps(asdict(report), indent=1))
+    write_json(work / REPORT, asdict(report))
     held_out = {score.name: score for score in report.held_out_views[:MOST_VIEWS]}
     measured = {score.name for score in report.held_out_views}
     rows = {camera.name: index for index, camera in enumerate(capture.cameras)}

@@ -19,7 +19,7 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.hostile import read_npz, write_npy
+from langsplat_core.io.hostile import read_npz
 from langsplat_core.scene import Gaussians
 from langsplat_core.semantics.features import ImageFeatures
 
@@ -58,12 +58,6 @@ def kept(path: Path, make: Callable[[], Arrays]) -> Arrays:
     with atomic_path(path) as temporary:
         np.savez(temporary, allow_pickle=False, **made)
     return made
-
-
-def kept_array(path: Path, make: Callable[[], Array]) -> None:
-    """Store what `make` gives in `path` (*.npy), unless the file is there."""
-    if not path.exists():
-        write_npy(path, make())
 
 
 def open_array(path: Path) -> Array:

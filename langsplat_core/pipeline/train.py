@@ -19,7 +19,7 @@ from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture, split_views
 from langsplat_core.datasets.workspace import NotLocatedError
 from langsplat_core.errors import InputError
-from langsplat_core.io.files import atomic_path, check_output_folder, shown
+from langsplat_core.io.files import check_output_folder, shown, write_json
 from langsplat_core.io.ply import read_ply, write_ply
 from langsplat_core.io.scenes import check_writable, load_scene, save_scene
 from langsplat_core.pipeline.language_field import (
@@ -252,12 +252,11 @@ def _rehearsals(
     done = run.work / f"{_radiance_key('rehearsal', capture, train, config)}.json"
     if not done.exists():
         checkpoint = done.with_suffix(".checkpoint.safetensors")
-        found = rehearse(capture, config, budgets, train, checkpoint, run.progress)
-        with atomic_path(done) as temporary:
-            temporary.write_text(json.dumps(found))
+        write_json(done, rehearse(capture, config, budgets, train, checkpoint, run.progress))
         for left in checkpoints_of(checkpoint):
             left.unlink(missing_ok=True)
-    return [[float(decibels) for decibels in each] for each in json.loads(done.read_text())]
+    found: list[list[float]] = json.loads(done.read_text())
+    return found
 
 
 def trained_gaussians(
