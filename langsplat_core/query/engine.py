@@ -4,7 +4,7 @@ A phrase becomes a text vector (`text_vectors`), the vector a relevancy of every
 become fits of the regions of the scene's tree (`answers`), and the fits an answer (`rule`).
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -136,7 +136,7 @@ class QueryEngine:
     ) -> list[QueryResult]:
         """Return the answers of `run` to phrases, which are encoded and compared together."""
         texts = [phrase for phrase in phrases if not self.is_taught(phrase)]
-        relevancies = self._relevancies(self.text_vectors(texts, progress))
+        relevancies = self._lookup.relevancies(self.text_vectors(texts, progress))
         answers = []
         for phrase in phrases:
             progress(f"searching '{tidy(phrase)}'", 0.5)
@@ -148,11 +148,7 @@ class QueryEngine:
 
     def relevancy(self, vector: Array) -> Array:
         """(D,) unit text vector -> (3, N) float32 relevancy per level and Gaussian."""
-        return next(self._relevancies(vector[None]))
-
-    def _relevancies(self, vectors: Array) -> Iterator[Array]:
-        for values in self._lookup.relevancies(vectors):
-            yield values.reshape(self.field.confidence.shape)
+        return next(self._lookup.relevancies(vector[None]))
 
     def _answer(self, phrase: str, relevancy: Array, level: LevelChoice) -> QueryResult:
         if self.bars is None:

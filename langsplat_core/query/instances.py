@@ -185,25 +185,19 @@ def find_instances(
     ranked = kept[np.lexsort((-extents[kept], -np.round(scores[kept] / EQUAL_SCORES)))]
     for part in ranked[:at_most]:
         share = extents[part] / max(sizes.sum(), 1e-300)
-        own = rows[labels == part]
-        found.append(_instance(surface, parts[part], own, values, float(scores[part]), share))
+        own = parts[part]  # on the surface
+        weights = surface.weights[own].astype(np.float64)
+        weights /= weights.sum()
+        thing = Instance(
+            members=rows[labels == part],
+            score=float(scores[part]),
+            mean=float(weights @ values[surface.rows[own]]),
+            centre=weights @ surface.positions[own],
+            points=surface.positions[np.sort(own)[:: -(-len(own) // BOXED)]],  # near ones have near numbers
+            share=float(share),
+        )
+        found.append(thing)
     return tuple(found)
-
-
-def _instance(
-    surface: Surface, own: Array, members: Array, relevancy: Array, score: float, share: float
-) -> Instance:
-    """Return the thing with the Gaussians `own` on the surface; members: rows of these and of faint ones."""
-    points, weights = surface.positions[own], surface.weights[own].astype(np.float64)
-    weights /= weights.sum()
-    return Instance(
-        members=members,
-        score=score,
-        mean=float(weights @ relevancy[surface.rows[own]]),
-        centre=weights @ points,
-        points=surface.positions[np.sort(own)[:: -(-len(own) // BOXED)]],  # near ones have near numbers
-        share=float(share),
-    )
 
 
 def _extent(gaussians: Gaussians, rows: Array) -> Array:

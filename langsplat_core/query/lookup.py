@@ -33,7 +33,7 @@ class Lookup:
         self._latents, of = field.codec.unique(field.latents.reshape(-1, field.latents.shape[-1]))
         count = len(self._latents)
         kind = np.uint16 if count <= np.iinfo(np.uint16).max else np.uint32
-        self._of = np.where(field.known.reshape(-1), of, count).astype(kind)
+        self._of = np.where(field.known, of.reshape(field.known.shape), count).astype(kind)
         self._zero, self._rate = np.empty(count, np.float32), np.empty(count, np.float32)
         for start in range(0, count, CHUNK):
             part = slice(start, start + CHUNK)
@@ -41,7 +41,7 @@ class Lookup:
             self._zero[part], self._rate[part] = scale.of(cosines)
 
     def relevancies(self, phrases: Array) -> Iterator[Array]:
-        """Yield of (Q, D) unit phrase vectors each one's (3 N,) float32 relevancies, 0 without a feature."""
+        """Yield of (Q, D) unit phrase vectors each one's (3, N) float32 relevancies, 0 without a feature."""
         # A codebook's vectors are there already; what is decoded is decoded a chunk at a time.
         step = CHUNK if self._codec.blends else max(len(self._latents), 1)
         for first in range(0, len(phrases), TOGETHER):
@@ -52,8 +52,8 @@ class Lookup:
                 cosines = self._codec.cosines(self._latents[part], some)
                 values[:, part] = relevancy_of(cosines, self._zero[part, None], self._rate[part, None]).T
             for row in values:
-                found = np.empty(len(self._of), np.float32)
-                shared_workers().run(_fetch, len(found), row, self._of, found)
+                found = np.empty(self._of.shape, np.float32)
+                shared_workers().run(_fetch, found.size, row, self._of.reshape(-1), found.reshape(-1))
                 yield found
 
 

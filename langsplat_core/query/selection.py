@@ -4,7 +4,7 @@ Growing and shrinking walk along the surface and never jump to a thing behind or
 be on it go where the one goes that they are nearest to (`Surface.anchors`); those near none never change.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -95,17 +95,11 @@ def _with_reached(surface: Surface, selected: Array, reached: Array) -> Array:
 BEHIND = 0.03  # of the surface's depth: a centre no farther behind it is on the surface that one sees
 
 
-@dataclass(frozen=True, eq=False)
-class Projected:
+class Projected(NamedTuple):
     """The places of N centres in one image."""
 
     pixels: Array  # (N, 2) float64
     depths: Array  # (N,) float64 camera z, world units; -1 where there is no place
-
-    @property
-    def ahead(self) -> Array:
-        """(N,) bool: before the camera."""
-        return self.depths > 0
 
 
 def project(means: Array, camera: Camera) -> Projected:
@@ -120,7 +114,7 @@ def in_rectangle(seen: Projected, corner: Array, opposite: Array) -> Array:
     """(N,) bool: between two opposite corners (2,), pixels, borders included."""
     corners = np.stack([corner, opposite]).astype(np.float64)
     low, high = corners.min(0), corners.max(0)
-    return seen.ahead & ((seen.pixels >= low) & (seen.pixels <= high)).all(1)
+    return (seen.depths > 0) & ((seen.pixels >= low) & (seen.pixels <= high)).all(1)
 
 
 def in_polygon(seen: Projected, outline: Array, size: tuple[int, int]) -> Array:
@@ -154,7 +148,7 @@ def _cells(
 ) -> tuple[Array, Array, Array]:
     """(N,) bool, which lie in a grid of that size, and the columns and rows of those, at cells per pixel."""
     columns, rows = np.floor(seen.pixels * (across, down)).T
-    inside = seen.ahead & (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    inside = (seen.depths > 0) & (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
     return inside, columns[inside].astype(np.intp), rows[inside].astype(np.intp)
 
 

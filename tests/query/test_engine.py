@@ -338,8 +338,8 @@ def test_every_lookup_finds_the_relevancy_of_its_latents(kind, temperature, exac
     vectors = field.codec.decode(field.latents.reshape(-1, field.latents.shape[2]))
     known = field.known.reshape(-1)
     want = [plain_relevancy(v, phrase, scale) if k else 0 for v, k in zip(vectors, known, strict=True)]
-    assert np.abs(got - want).max() < 1e-5
-    assert (got.reshape(3, 300)[1, 5:20] == 0).all()
+    assert np.abs(got.ravel() - want).max() < 1e-5
+    assert (got[1, 5:20] == 0).all()
 
 
 def test_codeword_zero_is_a_feature():
@@ -348,7 +348,7 @@ def test_codeword_zero_is_a_feature():
     field.confidence[:] = 1
     field.confidence[2, 4] = 0
     lookup = Lookup(field, scale_of(field, chance=False))
-    values = next(lookup.relevancies(field.codec.vectors[:1])).reshape(3, 10)
+    values = next(lookup.relevancies(field.codec.vectors[:1]))
     assert values[2, 4] == 0
     assert (np.delete(values[2], 4) > 0.5).all()
 
