@@ -13,16 +13,15 @@ from imgui_bundle.immapp import testing  # isort: skip
 
 import numpy as np
 
-from langsplat_core.config import AutoencoderConfig, PictureConfig
+from langsplat_core.config import AutoencoderConfig
 from langsplat_core.extensions.benchmarks.query_speed import with_codec
 from langsplat_core.io.hostile import opened
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.training.language.codec_fit import train_autoencoder
 from langsplat_viewer.actions import editing, opening, outline, settings, viewpoint
-from langsplat_viewer.options import scene_path, services
-from langsplat_viewer.rendering.renderer import renderer_for
+from langsplat_viewer.options import ViewerOptions, scene_path, services
 from langsplat_viewer.state import TrainingForm
-from langsplat_viewer.window import Window, WindowRequest
+from langsplat_viewer.window import Window
 
 sys.path.insert(0, str(Path(__file__).parent.parent))  # the tests
 from tests.support.processes import open_browser, open_tab
@@ -233,14 +232,8 @@ WINDOWS: dict[str, tuple[tuple[str, ...], Act]] = {
 
 def window_picture(path: Path, queries: tuple[str, ...], act: Act) -> None:
     """Return a screenshot of the window with the demo scene and answered queries."""
-    request = WindowRequest(
-        scene_path(None),
-        queries=queries,
-        picture=PictureConfig(display="relevancy"),
-        size=(1280, 800),
-        camera=CAMERA,
-    )
-    window = Window(request, services(""), renderer_for)
+    options = ViewerOptions(query=queries, display="relevancy", size="1280x800", camera=CAMERA)
+    window = Window(scene_path(None), options, services(""))
     window.idles = False
     whole = path.with_suffix(".whole.png")
 

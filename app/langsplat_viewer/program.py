@@ -9,7 +9,7 @@ from pathlib import Path
 from langsplat_core.cli.run import main, parsed
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, TerminalProgress, silent
-from langsplat_viewer.files.projects import PROJECTS, preferences_folder
+from langsplat_viewer.files.projects import PROJECTS
 from langsplat_viewer.options import ViewerOptions, camera_file, scene_path, services
 
 WITHOUT_WINDOW = ("out", "turntable", "colour_map", "transparent", "near_cut", "far_cut")
@@ -52,24 +52,11 @@ class ViewerCommand(ViewerOptions):
                 raise InputError(
                     f"{option} is for pictures without a window; choose it there, or add --headless"
                 )
-        from langsplat_viewer.window import WindowRequest, open_window
+        if self.beside is not None:
+            scene_path(self.beside)
+        from langsplat_viewer.window import open_window
 
-        open_window(
-            WindowRequest(
-                path=path,
-                queries=self.query,
-                level=self.level,
-                picture=self.picture,
-                size=self.wanted_size,
-                camera=self.camera,
-                orthographic=self.orthographic,
-                backend=self.backend,
-                path_file=self.path,
-                beside=None if self.beside is None else scene_path(self.beside),
-                settings=None if self.fresh else preferences_folder(),
-            ),
-            services(self.encoder),
-        )
+        open_window(path, self, services(self.encoder))
 
 
 def parse(args: Sequence[str]) -> ViewerCommand:

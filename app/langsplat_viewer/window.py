@@ -5,7 +5,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,6 @@ from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip  (bef
 import glfw  # isort: skip
 import moderngl
 
-from langsplat_core.config import LevelChoice, PictureConfig
 from langsplat_core.errors import BackendError, InputError, LangSplatError
 from langsplat_viewer.actions import opening, queries, saving, settings, viewpoint
 from langsplat_viewer.camera.controls import spanning
@@ -26,10 +25,11 @@ from langsplat_viewer.files.projects import (
     Shelf,
     fitting_scale,
     load_preferences,
+    preferences_folder,
     save_preferences,
 )
 from langsplat_viewer.jobs import give_memory_back, on_signals, one_line, share_one_heap
-from langsplat_viewer.options import chosen_camera, latent_level
+from langsplat_viewer.options import ViewerOptions, chosen_camera, latent_level
 from langsplat_viewer.panels import layout, menus, navigation, outline, overlays, ui
 from langsplat_viewer.panels.navigation import Keyboard
 from langsplat_viewer.rendering.renderer import Backend, Renderer, renderer_for
@@ -141,47 +141,13 @@ IDLE_FPS = 0.01  # frames per second while nothing happens: an event, or the wor
 AWAKE_SECONDS = 0.4  # after an event: tooltips come, and widgets take their places in a few frames
 AWAKE_FRAMES = 4  # after news from the worker, for the same reason
 
-# What may go wrong while an image is drawn, from drivers to arrays that do not fit. It is shown as a line in
-# the window: an exception that left a frame half way would take the whole window down.
-DRAW_ERRORS = (
-    LangSplatError,
-    moderngl.Error,
-    ArithmeticError,
-    LookupError,
-    MemoryError,
-    OSError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-)
-
 RECORDER_PATIENCE = 5.0  # seconds for a film that is being drawn to leave nothing half written
 
-MakeRenderer = Callable[[moderngl.Context], Renderer[Any]]
 
-
-@dataclass(frozen=True)
-class WindowRequest:
-    """Scene, queries and settings that the window opens with."""
-
-    path: Path
-    queries: tuple[str, ...] = ()
-    level: LevelChoice = "auto"
-    picture: PictureConfig = field(default_factory=PictureConfig)
-    size: tuple[int, int] | None = None  # of the window, pixels
-    camera: str = ""
-    orthographic: float | None = None  # world units across the image's shorter side; None: in perspective
-    backend: Backend = "auto"
-    path_file: Path | None = None  # a camera path
-    beside: Path | None = None  # a second scene
-    settings: Path | None = None  # folder of what is remembered between windows; None: nothing is
-    moving_budget: float = MOVING_BUDGET  # milliseconds that an image may take while the camera moves
-
-
-def open_window(request: WindowRequest, services: Services) -> None:
+def open_window(path: Path, options: ViewerOptions, services: Services) -> None:
     """Run until the window is closed. Raises BackendError where there is no display or no OpenGL."""
     share_one_heap()
-    window = Window(request, services, lambda ctx: renderer_for(ctx, request.backend))
+    window = Window(path, options, services, folder=None if options.fresh else preferences_folder())
     with on_signals(glfw.post_empty_event) as window.signals:
         immapp.run(window.params())
     if window.failure is not None:
@@ -195,14 +161,23 @@ def open_window(request: WindowRequest, services: Services) -> None:
 class Window:
     """Callbacks of one window."""
 
-    def __init__(self, request: WindowRequest, services: Services, make_renderer: MakeRenderer) -> None:
-        self.viewer = Viewer(services, shelf=Shelf(request.settings))
+    def __init__(
+        self,
+        path: Path,
+        options: ViewerOptions,
+        services: Services,
+        make_renderer: Callable[[moderngl.Context, Backend], Renderer[Any]] = renderer_for,
+        folder: Path | None = None,
+        budget: float = MOVING_BUDGET,
+    ) -> None:
+        """Keep what is remembered in `folder`, nothing for None; `budget` is that of `Canvas`."""
+        self.viewer = Viewer(services, shelf=Shelf(folder))
         self.failure: LangSplatError | None = None  # why the window could not work
-        self._request = request
-        self._make_renderer = make_renderer
+        self._path, self._options, self._size = path, options, options.wanted_size
+        self._make_renderer, self._budget = make_renderer, budget
         self.keyboard = Keyboard(self.viewer.state)
         self._docks = layout.Docks()
-        self._workspace = Workspace(request.settings, self.viewer)
+        self._workspace = Workspace(folder, self.viewer)
         self._canvas: Canvas | None = None
         self._menu = outline.ThingsMenu()
         self._evidence = ui.Picture()
@@ -223,11 +198,11 @@ class Window:
         params = hello_imgui.RunnerParams()
         window = params.app_window_params
         window.window_title = TITLE
-        self._workspace.load(params, restore_size=self._request.size is None)
+        self._workspace.load(params, restore_size=self._size is None)
         scale = self.viewer.state.preferences.ui_scale
         width, height = DEFAULT_SIZE
-        window.window_geometry.size = self._request.size or (round(scale * width), round(scale * height))
-        if self._request.size is not None:
+        window.window_geometry.size = self._size or (round(scale * width), round(scale * height))
+        if self._size is not None:
             window.window_geometry.window_size_measure_mode = hello_imgui.WindowSizeMeasureMode.screen_coords
         panels = params.imgui_window_params
         panels.default_imgui_window_type = hello_imgui.DefaultImGuiWindowType.provide_full_screen_dock_space
@@ -260,7 +235,7 @@ class Window:
             ctx = moderngl.get_context()
             self._canvas = self._new_canvas(ctx)
             self.viewer.state.backend = self._canvas.backend
-        except DRAW_ERRORS as error:
+        except Exception as error:  # noqa: BLE001  a driver may fail in any way
             self.failure = BackendError(one_line(error))
             return
         self._screen = ctx.detect_framebuffer()
@@ -273,13 +248,13 @@ class Window:
         glfw.set_drop_callback(glfw_window_hello_imgui(), self._dropped)  # type: ignore[arg-type]
         self.keyboard.listen(glfw_window_hello_imgui())
         settings.open_panel(self.viewer, "Search")  # before what was left over it the last time
-        if self._request.path.name.endswith(PROJECTS):  # which says itself how it is looked at
-            opening.open_project(self.viewer, self._request.path, self._ask)
+        if self._path.name.endswith(PROJECTS):  # which says itself how it is looked at
+            opening.open_project(self.viewer, self._path, self._ask)
         else:
-            opening.open_scene(self.viewer, self._request.path, self._first_view)
+            opening.open_scene(self.viewer, self._path, self._first_view)
 
     def _new_canvas(self, ctx: moderngl.Context) -> Canvas:
-        canvas = Canvas(ctx, self._make_renderer(ctx), budget=self._request.moving_budget)
+        canvas = Canvas(ctx, self._make_renderer(ctx, self._options.backend), budget=self._budget)
         canvas.wake_with(glfw.post_empty_event)
         return canvas
 
@@ -298,31 +273,31 @@ class Window:
         return self._second.textures[:1]
 
     def _ask(self, viewer: Viewer) -> None:
-        for phrase in self._request.queries:
+        for phrase in self._options.query:
             queries.ask(viewer, phrase)
 
     def _first_view(self, viewer: Viewer) -> None:
         """Do what else the command line asks for, once its scene is open."""
-        state, request = viewer.state, self._request
+        state, options = viewer.state, self._options
         assert state.scene is not None
         try:
-            camera = chosen_camera(state.scene, request.camera)
+            camera = chosen_camera(state.scene, options.camera)
             if camera is not None:
                 viewpoint.open_at(viewer, camera)
         except InputError as error:
             viewer.say_error(str(error))
-        span = request.orthographic
+        span = options.orthographic
         if span is not None:
             viewpoint.move(viewer, lambda view: spanning(view, span))
-        wanted = request.picture
+        wanted = options.picture
         settings.set_picture(viewer, replace(state.session.picture, heat_scale=wanted.heat_scale))
-        if request.path_file is not None:
-            viewpoint.load_path(viewer, request.path_file)
-        queries.set_level(viewer, request.level)
+        if options.path is not None:
+            viewpoint.load_path(viewer, options.path)
+        queries.set_level(viewer, options.level)
         self._ask(viewer)
-        if request.beside is not None:
-            opening.open_beside(viewer, request.beside)
-        settings.set_display(viewer, wanted.display, latent_level(request.level))
+        if options.beside is not None:
+            opening.open_beside(viewer, options.beside)
+        settings.set_display(viewer, wanted.display, latent_level(options.level))
 
     def drop(self, paths: list[str]) -> None:
         opening.open_dropped(self.viewer, [Path(path) for path in paths])
@@ -422,7 +397,7 @@ class Window:
         try:
             self.unfinished = canvas.update(state, imgui.get_time())
             textures = (*canvas.textures, *self._draw_beside())
-        except DRAW_ERRORS as error:
+        except Exception as error:  # noqa: BLE001  a frame left half way would take the whole window down
             self.unfinished, textures = False, canvas.textures
             viewer.say_error(one_line(error))
         self._set_idling()

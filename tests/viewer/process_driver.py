@@ -31,10 +31,11 @@ from langsplat_core.io.scenes import load_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions import viewpoint
 from langsplat_viewer.camera.controls import orbit
+from langsplat_viewer.canvas import MOVING_BUDGET
+from langsplat_viewer.options import ViewerOptions
 from langsplat_viewer.panels.navigation import Event
-from langsplat_viewer.rendering.renderer import renderer_for
 from langsplat_viewer.viewer import Services
-from langsplat_viewer.window import Window, WindowRequest, open_window
+from langsplat_viewer.window import Window, open_window
 from tests.support.fakes import FakeEncoder
 
 DEMO = Path(__file__).parents[2] / "assets" / "demo" / "scene.ply"
@@ -132,17 +133,14 @@ def ride(
     count: int,
     seconds: float,
     size: tuple[int, int],
-    **request: float,
+    budget: float = MOVING_BUDGET,
 ) -> Orbiting:
     def load(path: Path) -> Scene:
         found = load_scene(path)
         return repeated(found, count) if count else found
 
-    window = Window(
-        WindowRequest(scene, size=size, **request),
-        Services(load, lambda encoder_id: FakeEncoder()),
-        renderer_for,
-    )
+    options = ViewerOptions(size="{}x{}".format(*size))
+    window = Window(scene, options, Services(load, lambda encoder_id: FakeEncoder()), budget=budget)
     window.idles = False
     rider = Rider(window, seconds)
     params = window.params()
@@ -181,7 +179,7 @@ def close() -> None:
 
 def window_of(path: Path) -> Window:
     services = Services(load_scene, lambda encoder_id: FakeEncoder())
-    return Window(WindowRequest(path, size=(860, 620)), services, lambda ctx: renderer_for(ctx, "opengl"))
+    return Window(path, ViewerOptions(size="860x620", backend="opengl"), services)
 
 
 def idle(path: Path) -> None:
@@ -216,7 +214,8 @@ def leave(path: Path) -> None:
         close()
 
     threading.Thread(target=wait, daemon=True).start()
-    open_window(WindowRequest(path, size=(860, 620)), Services(slow_load, lambda encoder_id: FakeEncoder()))
+    options = ViewerOptions(size="860x620", fresh=True)
+    open_window(path, options, Services(slow_load, lambda encoder_id: FakeEncoder()))
 
 
 def press(window: Window, *keys: str) -> Iterator[None]:
@@ -311,6 +310,7 @@ if __name__ == "__main__":
     elif asked.leave:
         leave(asked.leave)
     else:
-        more = {"moving_budget": 0.0} if asked.slow else {}
-        seen = ride(asked.scene, asked.count, asked.seconds, tuple(asked.size), **more)
+        seen = ride(
+            asked.scene, asked.count, asked.seconds, tuple(asked.size), 0.0 if asked.slow else MOVING_BUDGET
+        )
         print(json.dumps(asdict(seen)))

@@ -568,7 +568,7 @@ def arrange_panels(s: Any) -> None:
     """Menus do what keys do; panels are closed, opened and moved; the browser opens a scene."""
     s.menu("View", "Show depth")
     assert s.state.session.picture.display == "depth"
-    s.menu("Window", "Light theme")
+    s.menu("Window", "Light theme, or dark again")
     light = s.shot("light")
     assert light[300:500, 5].min() > 150
     whole = s.state.size
@@ -597,7 +597,7 @@ def leave_settings(s: Any) -> None:
     """The next window finds them; see `find_settings`."""
     assert s.state.show_help  # at the first start
     s.key("escape", frames=1)
-    s.menu("Window", "Light theme")
+    s.menu("Window", "Light theme, or dark again")
     for title in ("Select", "Train", "Record"):  # which do not lie over the search the next time
         s.menu("Window", title)
     s.menu("Window", "Display")

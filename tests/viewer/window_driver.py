@@ -21,7 +21,6 @@ from tests.support.windowless import answer, result
 
 from imgui_bundle import ImVec2, hello_imgui, imgui  # isort: skip
 from imgui_bundle.immapp import testing  # isort: skip
-from langsplat_core.config import PictureConfig
 from langsplat_core.display.displays import QUERY_COLOURS
 from langsplat_core.errors import BackendError
 from langsplat_core.io.scenes import load_scene
@@ -29,10 +28,11 @@ from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions import queries, saving, settings
+from langsplat_viewer.options import ViewerOptions
 from langsplat_viewer.panels.ui import scene_area
 from langsplat_viewer.rendering.renderer import Backend, Renderer, renderer_for
 from langsplat_viewer.viewer import Services, Viewer
-from langsplat_viewer.window import Window, WindowRequest
+from langsplat_viewer.window import Window
 from tests.support.fakes import CENTRES, FakeEncoder
 from tests.support.processes import serve
 from tests.viewer import scenarios
@@ -52,22 +52,22 @@ class Session:
         folder: Path,
         scene: str,
         load=load_scene,
-        size=(860, 620),
+        size: str = "860x620",
         backend: Backend = "opengl",
-        **request,
+        remembered: Path | None = None,
+        **options,
     ) -> None:
-        self.folder, self.backend = folder, backend
+        self.folder = folder
         self.is_slow = load is not load_scene  # the scenario begins while the scene is read
         self.drawn = 0  # pictures
         services = Services(load, lambda encoder_id: FakeEncoder())
-        self.window = Window(
-            WindowRequest(folder / scene, size=size, **request), services, self._make_renderer
-        )
+        wanted = ViewerOptions(size=size, backend=backend, **options)
+        self.window = Window(folder / scene, wanted, services, self._make_renderer, remembered)
         self.window.idles = False
         self.state = self.window.viewer.state
 
-    def _make_renderer(self, ctx) -> Renderer:
-        self.renderer = renderer = renderer_for(ctx, self.backend)
+    def _make_renderer(self, ctx, backend: Backend) -> Renderer:
+        self.renderer = renderer = renderer_for(ctx, backend)
         draw = renderer.draw
 
         def counted(request, targets) -> None:
@@ -460,8 +460,8 @@ def look_at_nothing(s: Session) -> None:
 
 
 ASKED = {
-    "queries": ("mug", "sofa", "plant"),
-    "picture": PictureConfig(display="segmentation"),
+    "query": ("mug", "sofa", "plant"),
+    "display": "segmentation",
     "level": "whole",
     "camera": "2",
     "orthographic": 4.0,
@@ -469,11 +469,11 @@ ASKED = {
 OPENED = {  # scene and request of the scenarios that do not just open "blobs.ply"
     "without_field": ("plain.ply", {}),
     "from_the_command_line": ("blobs.ply", ASKED),
-    "leave_settings": ("blobs.ply", {"settings": Path("settings")}),
-    "find_settings": ("blobs.ply", {"settings": Path("settings")}),
+    "leave_settings": ("blobs.ply", {"remembered": Path("settings")}),
+    "find_settings": ("blobs.ply", {"remembered": Path("settings")}),
     "close_while_opening": ("blobs.ply", {"load": slow_load}),
     "look_at_nothing": ("nothing.ply", {}),
-    "large_letters": ("blobs.ply", {"size": (1280, 720)}),
+    "large_letters": ("blobs.ply", {"size": "1280x720"}),
 }
 
 
@@ -481,8 +481,8 @@ def play_one(arguments: list[str]) -> None:
     """Play the scenario that is the function of that name, here or among the scenarios."""
     name, folder = arguments
     known = {**vars(scenarios), **globals()}
-    scene, request = OPENED.get(name, ("blobs.ply", {}))
-    Session(Path(folder), scene, **request).run(known[name])
+    scene, options = OPENED.get(name, ("blobs.ply", {}))
+    Session(Path(folder), scene, **options).run(known[name])
     print("PASSED")
 
 
