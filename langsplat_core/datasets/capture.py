@@ -150,13 +150,9 @@ def _rounded(values: Array) -> Array:
 
 def warn_of_lost_points(good: Array, source: str) -> None:
     """Warn where most of the points of `source` had to be left out; good: (M,) bool, those that were not."""
-    if 2 * good.sum() < len(good):
-        log.warning(
-            "%d of the %d points of %s are damaged or badly located and are left out; was it written whole?",
-            len(good) - good.sum(),
-            len(good),
-            source,
-        )
+    lost = len(good) - good.sum()
+    if 2 * lost > len(good):
+        log.warning("%d of %d points of %s are damaged or badly located: left out", lost, len(good), source)
 
 
 # Views that are held out from training, to measure it on.

@@ -239,12 +239,8 @@ def find_model(folder: Path) -> Path | None:
     if len(found) < 2:
         return next((f for f in (*found, sparse) if has_model(f)), None)
     best = max(found, key=_photographs_of)
-    log.warning(
-        "%s has %d models; %s is taken, which has most photographs",
-        shown(sparse),
-        len(found),
-        printable_line(best.name, 60),
-    )
+    name = printable_line(best.name, 60)
+    log.warning("%s has %d models; %s is taken, with most photographs", shown(sparse), len(found), name)
     return best
 
 
@@ -264,27 +260,19 @@ def load_colmap(folder: Path, model_folder: Path, max_side: int, progress: Progr
     photos = located_photos(model, images)
     # os.path.isfile, unlike Path.is_file, also says no to names that no file system could hold.
     there = [photo for photo in photos if os.path.isfile(photo.path)]
-    missing = len(photos) - len(there)
+    missing = {photo.label for photo in photos} - {photo.label for photo in there}
     if photos and not there:
         raise InputError(
             f"{shown(model_folder)}: none of its {len(photos)} photographs exists "
             f"(first: {printable_line(photos[0].label, 60)}); put them into {shown(folder / 'images')}"
         )
     if missing:
-        log.warning(
-            "%d of %d photographs of the model do not exist and are left out: %s",
-            missing,
-            len(photos),
-            shortened({photo.label for photo in photos} - {photo.label for photo in there}),
-        )
+        share = f"{len(missing)} of {len(photos)} photographs of the model"
+        log.warning("%s do not exist and are left out: %s", share, shortened(missing))
     present = len(find_photos(images))
     if 2 * len(there) < present:
-        log.warning(
-            "%s has cameras for only %d of the %d photographs beside it; another model may have more",
-            shown(model_folder),
-            len(there),
-            present,
-        )
+        share = f"cameras for only {len(there)} of the {present} photographs beside it"
+        log.warning("%s has %s; another model may have more", shown(model_folder), share)
     cameras, pixels, files, masks = develop(there, max_side, progress)
     return Capture(cameras, pixels, *good_points(model), photos=files, masks=masks)
 

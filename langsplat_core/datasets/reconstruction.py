@@ -134,11 +134,7 @@ def triangulate(folder: Path, names: Sequence[str], cameras: Sequence[Camera]) -
 
 
 def _paths(folder: Path, attempts: Path) -> dict[str, Path]:
-    return {
-        "database_path": folder / "database.db",
-        "image_path": folder / "images",
-        "output_path": attempts,
-    }
+    return {"database_path": folder / "database.db", "image_path": folder / "images", "output_path": attempts}
 
 
 def _repeatable() -> "pycolmap.IncrementalPipelineOptions":

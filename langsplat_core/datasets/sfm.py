@@ -82,13 +82,9 @@ def load_photos(
             matches,
         )
     if lost:
-        log.warning(
-            "%d of %d photographs could not be located and are left out (%s); %s",
-            len(files) - found,
-            len(files),
-            _listed(lost, 5),
-            matches.advice(),
-        )
+        share = f"{len(files) - found} of {len(files)} photographs"
+        what = "could not be located and are left out"
+        log.warning("%s %s (%s); %s", share, what, _listed(lost, 5), matches.advice())
     photos = [
         replace(copy, path=path, label=path.name, upright=True, mask=mask_beside(path))
         for copy in located_photos(model, workspace / "images")
@@ -217,9 +213,7 @@ def add_points(capture: Capture, views: Sequence[int], work: Path, progress: Pro
     """Return the capture with points triangulated from the photographs at `views`, or random ones."""
     points, colours = _triangulated(capture, views, work, progress)
     if len(points) < MIN_POINTS:
-        log.warning(
-            "only %d points could be triangulated; starting from %d random ones", len(points), RANDOM_POINTS
-        )
+        log.warning("only %d points could be triangulated; %d are random", len(points), RANDOM_POINTS)
         generator = np.random.default_rng(0)
         cameras, images = [capture.cameras[i] for i in views], [capture.images[i] for i in views]
         masks = [capture.mask(i) for i in views]
