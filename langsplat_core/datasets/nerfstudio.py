@@ -45,9 +45,10 @@ def load_nerfstudio(file: Path, max_side: int, progress: Progress) -> Capture:
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise FormatError(f'{where} has no "file_path"; it is not a nerfstudio dataset')
         label = frame["file_path"].replace("\\", "/")
-        path = _photo_file(file.parent, label)
-        size = None if path is None else _stored_size(path)
-        if path is None or size is None:
+        try:
+            path = _photo_file(file.parent, label)
+            size = picture_size(path)
+        except (FileNotFoundError, PictureError):
             missing.append(label)
             continue
         try:
@@ -72,11 +73,13 @@ def load_nerfstudio(file: Path, max_side: int, progress: Progress) -> Capture:
     return Capture(cameras, images, points, colours, metres, files, drawn, masks)
 
 
-def _photo_file(folder: Path, label: str) -> Path | None:
-    """Return the photograph called `label`; some datasets leave its suffix away."""
-    candidates = (f"{folder / label}{suffix}" for suffix in ("", *PHOTO_SUFFIXES))
-    # os.path.isfile, unlike Path.is_file, also says no to names that no file system could hold.
-    return next((Path(candidate) for candidate in candidates if os.path.isfile(candidate)), None)
+def _photo_file(folder: Path, label: str) -> Path:
+    """Return the photograph called `label`; some datasets leave its suffix away. FileNotFoundError."""
+    for suffix in ("", *PHOTO_SUFFIXES):
+        # Unlike Path.is_file, also no for names that no file system could hold.
+        if os.path.isfile(candidate := f"{folder / label}{suffix}"):
+            return Path(candidate)
+    raise FileNotFoundError(label)
 
 
 def _mask_file(folder: Path, frame: Json) -> Path | None:
@@ -95,14 +98,6 @@ def _number(values: Json, key: str, default: float | None = None) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e15:
         raise ValueError(f'"{key}" must be a finite number, got {reprlib.repr(value)}')
     return float(value)
-
-
-def _stored_size(path: Path) -> tuple[int, int] | None:
-    """Return width and height in the file's header; None if it is no image."""
-    try:
-        return picture_size(path)
-    except PictureError:
-        return None
 
 
 def _lens(values: Json, size: tuple[int, int]) -> PhotoIntrinsics:

@@ -78,8 +78,6 @@ def label_maps(levels: LevelMasks) -> Array:
 
 # Which of many proposed masks are kept: suppression by box and by pixels, and the removal of crumbs.
 
-CONTAINED = 0.85  # of a mask's area inside another one: it counts as inside
-DOMINATED = 0.5  # a mask that covers less than this of the one around it is small beside it
 PIXELS_PER_PRODUCT = 1 << 16  # columns of the matrix product that counts common pixels
 EIGHT = np.ones((3, 3), bool)  # diagonal neighbours are connected, as in SAM's own clean-up
 
@@ -165,19 +163,15 @@ def mask_nms(masks: Array, scores: Array, config: MaskConfig) -> Array:
     iou = common / np.maximum(area[:, None] + area[None] - common, 1)
     rival = (iou > config.nms_iou) & (rank[None] < rank[:, None])
     share = common / np.maximum(area[:, None], 1)  # of the row's mask that lies in the column's
-    inside = (share >= CONTAINED) & (share.T < DOMINATED) & (1 - share * share.T > config.nms_inner)
+    # nearly all of it in another mask, which is more than twice as large
+    inside = (share >= 0.85) & (share.T < 0.5) & (1 - share * share.T > config.nms_inner)
     keep = (scores > config.nms_score) & ~rival.any(axis=1) & ~inside.any(axis=1)
     return np.flatnonzero(keep)
 
 
 # Hierarchical merging of the regions of a photograph: the data structure behind the graph's masks.
 
-MEAN_LIGHTNESS = 0.25  # weight of lightness where mean colours are compared: shade is no other thing
-EDGE_LIGHTNESS = 0.4  # and where a boundary's contrast is measured
 CONTRAST_REACH = 2  # px on either side of a boundary, because blurred edges are wider than one step
-SIZE_POWER = 0.25  # how much cheaper small regions merge than large ones
-SIZE_UNIT = 1 / 200  # of the image: a region of this size merges at its plain cost
-ENCLOSED = 0.5  # a region wholly inside another merges with it at this much less
 
 
 class RegionGraph:
@@ -194,7 +188,7 @@ class RegionGraph:
         count = int(labels.max()) + 1
         flat = labels.ravel()
         self._size = np.bincount(flat, minlength=count).astype(float)  # px
-        shades = colours * (MEAN_LIGHTNESS, 1.0, 1.0)
+        shades = colours * (0.25, 1.0, 1.0)  # shade is no other thing
         sums = [np.bincount(flat, shades[..., c].ravel(), count) for c in range(3)]
         self._mean = np.stack(sums, axis=1) / self._size[:, None]
         self._neighbours = _adjacency(labels, colours, count)
@@ -233,9 +227,10 @@ class RegionGraph:
         length, contrast = self._neighbours[i][j]
         smaller = min(self._size[i], self._size[j]) / self._labels.size
         shared = length / min(self._perimeter[i], self._perimeter[j])
-        enclosure = 1 - ENCLOSED * max(0.0, 2 * shared - 1)
+        enclosure = 1 - 0.5 * max(0.0, 2 * shared - 1)  # half the cost for one wholly inside another
         difference = float(np.linalg.norm(self._mean[i] - self._mean[j])) + contrast / length
-        return float(difference * (smaller / SIZE_UNIT) ** SIZE_POWER * enclosure)
+        # Small regions merge more cheaply; one of a 200th of the image at its plain cost.
+        return float(difference * (smaller / 0.005) ** 0.25 * enclosure)
 
     def _push(self, i: int, j: int) -> None:
         heapq.heappush(self._heap, (self._cost(i, j), i, j, self._version[i], self._version[j]))
@@ -262,7 +257,7 @@ class RegionGraph:
 
 def _adjacency(labels: Array, colours: Array, count: int) -> list[dict[int, tuple[float, float]]]:
     """Per region: neighbour -> (length of the common boundary, px; sum of the contrast along it)."""
-    weighted = colours * (EDGE_LIGHTNESS, 1.0, 1.0)
+    weighted = colours * (0.4, 1.0, 1.0)
     pairs, contrasts = [], []
     for axis in (0, 1):
         steps = np.arange(labels.shape[axis] - 1)
@@ -290,10 +285,6 @@ def _adjacency(labels: Array, colours: Array, count: int) -> list[dict[int, tupl
 
 VERSION = 1
 WORK_SIDE = 400  # px, longer side at which regions are found; contrasts below are per pixel of it
-SUPERPIXELS = 700
-COMPACTNESS = 0.1  # of SLIC, whose colours are scaled to [0, 1]
-SMOOTHING = 0.12  # total variation weight on L/100: removes carpet, keeps edges
-TYPICAL = 66.0  # L + 16 at L = 50, so that chromaticities below are of the size of a and b
 CHROMA_FALL = 0.045
 MERGE_COSTS = (6.0, 11.0, 19.0)  # colour difference plus contrast; chosen on photographs and renderings
 MIN_FRACTIONS = (0.0008, 0.002, 0.004)  # of the image's area
@@ -322,13 +313,24 @@ def nested_partitions(image: Array) -> Array:
     """(3, H, W) int32 regions of an image (H, W, 3) uint8, each a union of regions of the level before."""
     from skimage.color import rgb2lab
     from skimage.restoration import denoise_tv_chambolle
+    from skimage.segmentation import slic
 
     height, width = image.shape[:2]
     scale = min(1.0, WORK_SIDE / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))
     small = np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BOX))
-    lab = 100 * denoise_tv_chambolle(rgb2lab(small) / 100, SMOOTHING, max_num_iter=60, channel_axis=-1)
-    graph = RegionGraph(_superpixels(lab), _paint(lab))
+    # A weight that removes carpet and keeps edges.
+    lab = 100 * denoise_tv_chambolle(rgb2lab(small) / 100, 0.12, max_num_iter=60, channel_axis=-1)
+    superpixels = slic(
+        lab * np.array([0.6, 1, 1]),
+        n_segments=min(700, lab.shape[0] * lab.shape[1]),
+        compactness=0.1,  # its colours are scaled to [0, 1]
+        max_num_iter=8,
+        start_label=0,
+        convert2lab=False,
+    )
+    numbered = np.unique(superpixels, return_inverse=True)[1].reshape(superpixels.shape)
+    graph = RegionGraph(numbered, _paint(lab))
     levels = []
     for cost, min_fraction in zip(MERGE_COSTS, MIN_FRACTIONS, strict=True):
         graph.merge_until(cost, min_fraction)
@@ -347,22 +349,7 @@ def _paint(lab: Array) -> Array:
     roots of CIELAB turn into straight lines.
     """
     lightness = np.maximum(lab[..., :1], 0)
-    chromaticity = lab[..., 1:] * TYPICAL / (lightness + 16)
+    chromaticity = lab[..., 1:] * 66.0 / (lightness + 16)  # at L = 50 of the size of a and b
     chroma = np.linalg.norm(chromaticity, axis=-1, keepdims=True)
     compressed = np.log1p(CHROMA_FALL * chroma) / np.maximum(CHROMA_FALL * chroma, 1e-9)
     return np.concatenate([lightness, chromaticity * np.where(chroma > 0, compressed, 1)], axis=-1)
-
-
-def _superpixels(lab: Array) -> Array:
-    """(H, W) int superpixels, numbered 0..N-1."""
-    from skimage.segmentation import slic
-
-    labels = slic(
-        lab * np.array([0.6, 1, 1]),
-        n_segments=min(SUPERPIXELS, lab.shape[0] * lab.shape[1]),
-        compactness=COMPACTNESS,
-        max_num_iter=8,
-        start_label=0,
-        convert2lab=False,
-    )
-    return np.unique(labels, return_inverse=True)[1].reshape(labels.shape)

@@ -71,7 +71,13 @@ class EncodedImage:
 
     def enlarge(self, logits: Any) -> Any:
         """(B, h, w) low-resolution logits -> (B, H, W) of the image."""
-        return upscale(logits, self.side, self.size, self.shape)
+        from torch.nn.functional import interpolate
+
+        square = logits[:, None].float()
+        if self.size is not None:  # the padding can only be cut off at the resolution of its pixels
+            square = interpolate(square, (self.side, self.side), mode="bilinear", align_corners=False)
+            square = square[..., : self.size[0], : self.size[1]]
+        return interpolate(square, self.shape, mode="bilinear", align_corners=False)[:, 0]
 
 
 class Segmenter(Protocol):
@@ -104,17 +110,6 @@ def normalised(image: Array, side: int, padded: bool) -> tuple[Array, tuple[int,
     pixels = np.zeros((side, side, 3), np.float32)
     pixels[: size[0], : size[1]] = (np.asarray(resized, np.float32) - PIXEL_MEAN) / PIXEL_STD
     return np.ascontiguousarray(pixels.transpose(2, 0, 1)[None]), size
-
-
-def upscale(logits: Any, side: int, size: tuple[int, int] | None, shape: tuple[int, int]) -> Any:
-    """(B, h, w) low-resolution logits of the square -> (B, H, W) of the photograph; `size`: see there."""
-    from torch.nn.functional import interpolate
-
-    square = logits[:, None].float()
-    if size is not None:  # the padding can only be cut off at the resolution of its pixels
-        square = interpolate(square, (side, side), mode="bilinear", align_corners=False)
-        square = square[..., : size[0], : size[1]]
-    return interpolate(square, shape, mode="bilinear", align_corners=False)[:, 0]
 
 
 class Sam:

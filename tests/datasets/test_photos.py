@@ -340,13 +340,6 @@ def test_other_files_are_no_videos(content: bytes, tmp_path: Path) -> None:
         extract_frames(tmp_path / "b.mp4", tmp_path / "out", 5)
 
 
-def test_frames_are_not_written_over(clip: Path, tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(InputError, match="holds something already"):
-        extract_frames(clip, tmp_path, 5)
-    assert (tmp_path / "notes.txt").read_text() == "mine"
-
-
 def test_heic_is_a_photograph(tmp_path: Path) -> None:
     pillow_heif.register_heif_opener()
     exif = Image.Exif()

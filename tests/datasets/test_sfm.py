@@ -491,11 +491,6 @@ def test_all_from_one_place_are_told_to_step_aside():
     assert graph(4, chain(range(4)), range(4)).gaps() == []
 
 
-def test_long_names_of_files_stay_short_in_a_message():
-    long = Matches(("a" * 200 + ".jpg", "b.jpg"), (900, 900), (), frozenset({0}))
-    assert len(long.advice()) < 120
-
-
 def test_no_feature_is_sought_where_a_mask_is_black(tmp_path: Path) -> None:
     photos, work = tmp_path / "photos", tmp_path / "work"
     write_photos(photos, LENS.regridded(240, 180), poses(3))

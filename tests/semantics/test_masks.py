@@ -98,14 +98,6 @@ def test_shaded_balls_are_found_whole() -> None:
         assert max(iou(wholes == i, ball == k) for i in np.unique(wholes)) > 0.9
 
 
-def test_a_photograph_larger_than_the_working_size_keeps_its_size() -> None:
-    image, ball = rendering(height=600, width=800)
-    levels = nested_partitions(image)
-    assert levels.shape == (3, 600, 800)
-    assert_nested(levels)
-    assert max(iou(levels[2] == i, ball == 1) for i in np.unique(levels[2])) > 0.9
-
-
 @pytest.mark.parametrize("shape", [(1, 1), (1, 50), (50, 1), (2, 3), (3, 500)])
 @pytest.mark.parametrize("noise", [False, True])
 def test_degenerate_pictures_work(shape: tuple[int, int], noise: bool) -> None:
@@ -312,7 +304,7 @@ def test_preprocessing_scales_the_longer_side_and_pads() -> None:
 
 def test_upscaling_forgets_the_padding() -> None:
     logits = torch.arange(16.0).repeat(16, 1)[None]  # rises by 1 per column of 16: 4 px of 64
-    full = sam.upscale(logits, 64, (32, 64), (16, 32))
+    full = sam.EncodedImage(None, {}, 64, (32, 64), (16, 32), ordered=True).enlarge(logits)
     assert full.shape == (1, 16, 32)
     columns = (np.arange(32) + 0.5) / 2 - 0.5
     np.testing.assert_allclose(full[0, 5, 1:-1], columns[1:-1], atol=1e-5)
@@ -340,10 +332,8 @@ def plain_answer(model: Any, image: np.ndarray, point: np.ndarray) -> tuple[torc
     with torch.no_grad():
         answer = model(pixel_values=torch.from_numpy(pixels), input_points=given)
     ious, low = answer.iou_scores[0, 0], answer.pred_masks[0, 0]
-    if isinstance(model, Sam2Model):
-        full = torch.nn.functional.interpolate(low[None], (height, width), mode="bilinear")[0]
-    else:
-        full = sam.upscale(low, SIDE, size, (height, width))
+    padding = None if isinstance(model, Sam2Model) else size
+    full = sam.EncodedImage(model, {}, SIDE, padding, (height, width), ordered=True).enlarge(low)
     if not isinstance(model, SamModel):
         order = sorted(range(3), key=lambda k: int((low[k] > 0).sum()))
         ious, full = ious[order], full[order]
@@ -488,21 +478,6 @@ def test_sources_are_chosen_and_absences_named(config: MaskConfig, tmp_path: Pat
     (tmp_path / "model.safetensors").write_bytes(b"")
     with pytest.raises(EncoderError, match="none of the segmenters"):
         load_mask_source(MaskConfig(sam=str(tmp_path)))
-
-
-@pytest.mark.parametrize("make", [tiny_sam, tiny_sam2])
-def test_half_the_digits_give_nearly_the_same_masks(make: Callable[[Path], Any], tmp_path: Path) -> None:
-    """As on a GPU, which alone is asked so: PyTorch rounds on a CPU to the same digits."""
-    make(tmp_path)
-    config = replace(LOOSE, sam=str(tmp_path), predicted_iou=-9.0, stability=0.0, box_nms=1.0, nms_iou=1.0)
-    segmenter = load_segmenter(str(tmp_path), "cpu")
-    whole, half = (SamMasks(segmenter, config, half_on) for half_on in (None, "cpu"))
-    assert whole.key != half.key
-    for want, got in zip(whole(photograph(), silent).masks, half(photograph(), silent).masks, strict=True):
-        assert abs(len(want) - len(got)) <= 2
-        apart = np.array([min((mask ^ other).mean() for other in want) for mask in got])
-        assert np.median(apart) < 0.02
-        assert (apart > 0).any()  # so it was rounded
 
 
 def test_overflow_of_float16_is_computed_in_float32(config: MaskConfig) -> None:
