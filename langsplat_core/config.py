@@ -6,7 +6,6 @@ that it holds.
 """
 
 import dataclasses
-import types
 import typing
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -61,10 +60,10 @@ def check_settings(settings: object, option: str = "--") -> None:
 def numeric_settings(settings: object, option: str = "--") -> Iterator[Setting]:
     """Fields of a dataclass that hold numbers, and those of dataclasses in it, in their order."""
     for name, value, hint in named_values(settings, option):
-        kinds = set(_kinds(hint))
-        if kinds & {int, float}:
-            bound = next((part for part in annotations(hint) if isinstance(part, Range)), None)
-            yield Setting(name, value, bound, whole=float not in kinds)
+        parts = list(annotations(hint))
+        if int in parts or float in parts:
+            bound = next((part for part in parts if isinstance(part, Range)), None)
+            yield Setting(name, value, bound, whole=float not in parts)
 
 
 def named_values(settings: object, option: str = "--") -> Iterator[tuple[str, Any, Any]]:
@@ -82,25 +81,15 @@ def named_values(settings: object, option: str = "--") -> Iterator[tuple[str, An
 
 
 def annotations(hint: Any) -> Iterator[Any]:
-    """Yield the parts of `Annotated` beside the type, inside of unions, tuples and `Annotated` too."""
+    """Yield what `Annotated` says beside types, inside of unions and tuples too, and the plain types."""
     if get_origin(hint) is Annotated:
         yield from hint.__metadata__
-    if get_origin(hint) is not typing.Literal:
+        yield from annotations(hint.__origin__)
+    elif get_origin(hint) is not Literal:
         for part in get_args(hint):
             yield from annotations(part)
-
-
-def _kinds(hint: Any) -> Iterator[type]:
-    """Return the plain types in a type hint: int and float of ``tuple[int, ...] | float``."""
-    if get_origin(hint) is typing.Literal:
-        return
-    if get_origin(hint) is Annotated:
-        yield from _kinds(hint.__origin__)
-    elif get_args(hint):
-        for part in get_args(hint):
-            yield from _kinds(part)
-    elif isinstance(hint, type) and hint is not types.NoneType:
-        yield hint
+        if isinstance(hint, type) and not get_args(hint):
+            yield hint
 
 
 def _problem(setting: Setting) -> str | None:
@@ -110,13 +99,10 @@ def _problem(setting: Setting) -> str | None:
         return None
     if bound.some and not numbers:
         return "give at least one number"
-    for number in numbers:
-        kind: Any = Integral if setting.whole else Real
-        if isinstance(number, bool) or not isinstance(number, kind):
-            return f"must be {'a whole number' if setting.whole else 'a number'}, {bound}"
-        if not bound.holds(number):
-            return f"must be {bound}"
-    return None
+    kind: Any = Integral if setting.whole else Real
+    if any(isinstance(number, bool) or not isinstance(number, kind) for number in numbers):
+        return f"must be {'a whole number' if setting.whole else 'a number'}, {bound}"
+    return None if all(map(bound.holds, numbers)) else f"must be {bound}"
 
 
 def _flat(value: Any) -> Iterator[Any]:

@@ -1,4 +1,4 @@
-"""Progress of long work, and the milliseconds that the steps of a frame take.
+"""Progress of long work.
 
 Core functions take a `Progress`; the command line and the window supply one each.
 """
@@ -6,38 +6,8 @@ Core functions take a `Progress`; the command line and the window supply one eac
 import json
 import logging
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from time import perf_counter
-
-_laps: ContextVar[dict[str, float] | None] = ContextVar("laps", default=None)
-
-
-@contextmanager
-def watched() -> Iterator[dict[str, float]]:
-    """Measure the laps inside, on this thread: name -> milliseconds, summed."""
-    laps: dict[str, float] = {}
-    before = _laps.set(laps)
-    try:
-        yield laps
-    finally:
-        _laps.reset(before)
-
-
-@contextmanager
-def lap(name: str, finish: Callable[[], object] = lambda: None) -> Iterator[None]:
-    """Measure one step. `finish` waits for the device's share of it; called only inside `watched`."""
-    laps = _laps.get()
-    if laps is None:
-        yield
-        return
-    began = perf_counter()
-    yield
-    finish()
-    laps[name] = laps.get(name, 0.0) + 1e3 * (perf_counter() - began)
-
 
 log = logging.getLogger("langsplat")
 

@@ -1,8 +1,6 @@
 """What every layer shares: numbers, the one printable line of a message, and progress as a value, in lines
-and in words, with laps where somebody watches."""
+and in words."""
 
-import time
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
 import numpy as np
@@ -16,8 +14,6 @@ from langsplat_core.progress import (
     Progress,
     Report,
     TerminalProgress,
-    lap,
-    watched,
 )
 
 
@@ -62,46 +58,6 @@ def test_a_quotation_is_short_with_its_escapes() -> None:
 
 
 # Progress.
-
-
-def test_laps_of_one_name_are_summed():
-    with watched() as laps:
-        for _ in range(2):
-            with lap("a"):
-                time.sleep(0.01)
-        with lap("b"):
-            pass
-    assert laps["a"] >= 20
-    assert laps["b"] < laps["a"]
-    with lap("c"):
-        pass
-    assert set(laps) == {"a", "b"}
-
-
-def test_laps_wait_for_the_device_only_when_watched():
-    with lap("a", lambda: pytest.fail("waited")):
-        pass
-    with watched() as laps, lap("a", lambda: time.sleep(0.01)):
-        pass
-    assert laps["a"] >= 10
-
-
-def test_other_threads_are_not_watched():
-    def work() -> None:
-        with lap("elsewhere"):
-            pass
-
-    with watched() as laps, ThreadPoolExecutor(1) as pool:
-        pool.submit(work).result()
-    assert laps == {}
-
-
-def test_an_error_ends_the_watch():
-    with pytest.raises(ValueError, match="oh"), watched(), lap("a"):
-        raise ValueError("oh")
-    with watched() as laps:
-        pass
-    assert laps == {}
 
 
 def test_progress_as_lines_for_other_programs(capsys):

@@ -20,7 +20,6 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import INRIA, RasterSettings
-from langsplat_core.progress import lap
 from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer
 from langsplat_core.raster.protocol import Backend, LiftingRasterizer, LiftingView, V, View
 from langsplat_core.scene import Camera, Gaussians, Scene
@@ -86,10 +85,9 @@ def render(
 def splat_colours(view: View, gaussians: Gaussians, values: Array | None = None) -> Rendering:
     """Draw the image of a view of `gaussians` in one pass; values as in `render`."""
     rows = view.rows
-    with lap("colours"):
-        seen = colours_seen(gaussians, view.camera, rows)
-        if values is not None:
-            seen = np.concatenate([seen, np.asarray(values, np.float32)[rows]], 1)
+    seen = colours_seen(gaussians, view.camera, rows)
+    if values is not None:
+        seen = np.concatenate([seen, np.asarray(values, np.float32)[rows]], 1)
     image, alpha = view.splat_rows(seen)
     return Rendering(image[..., :3], alpha, image[..., 3:])
 
@@ -99,7 +97,7 @@ def colours_seen(gaussians: Gaussians, camera: Camera, rows: Array | None = None
 
     rows: (M,) int32, to have those of these alone.
     """
-    from langsplat_core.raster.cpu.projection import colours  # numba: a second that OpenGL need not wait for
+    from langsplat_core.raster.cpu.projection import colours  # numba takes a second to import
 
     if camera.orthographic:
         sights = np.broadcast_to(camera.rotation[2].astype(np.float32), gaussians.means.shape)

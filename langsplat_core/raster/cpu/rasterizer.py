@@ -17,7 +17,6 @@ from scipy import sparse
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.compiled import Workers, plain, shared_workers
 from langsplat_core.config import INRIA, RasterSettings
-from langsplat_core.progress import lap
 from langsplat_core.raster.cpu import backward, blend, projection
 from langsplat_core.raster.cpu.backward import GaussianGradients
 from langsplat_core.raster.cpu.tiles import Kept, bin_tiles, depth_order, padded
@@ -77,16 +76,13 @@ class CpuView(LiftingView):
         found = projection.Projection(
             memory.empty((n, projection.COLUMNS), np.float64), np.empty(n), np.empty(n, np.uint8)
         )
-        with lap("projection"):
-            workers.run(projection.project, n, self._rows, self._kernel_camera, found)
-        with lap("sort"):
-            drawn = np.flatnonzero(found.status == projection.DRAWN).astype(np.int32)
-            depths = found.depths[drawn]
-            order = depth_order(depths)
-            self.order, self._depths = drawn[order], depths[order]  # (M,) int32 rows, (M,) float64
-        with lap("tiles"):
-            size = camera.width, camera.height
-            self.tiles = bin_tiles(found.geometry, self.order, size, settings, workers, memory.empty)
+        workers.run(projection.project, n, self._rows, self._kernel_camera, found)
+        drawn = np.flatnonzero(found.status == projection.DRAWN).astype(np.int32)
+        depths = found.depths[drawn]
+        order = depth_order(depths)
+        self.order, self._depths = drawn[order], depths[order]  # (M,) int32 rows, (M,) float64
+        size = camera.width, camera.height
+        self.tiles = bin_tiles(found.geometry, self.order, size, settings, workers, memory.empty)
         self.dropped = int(np.count_nonzero(found.status == projection.INVALID))
 
     @property
@@ -114,8 +110,7 @@ class CpuView(LiftingView):
         for start in range(0, max(values.shape[1], 1), _CHANNELS_AT_ONCE):
             part = plain(values[:, start : start + _CHANNELS_AT_ONCE])
             parts.append(np.empty((*size, part.shape[1]), np.float32))
-            with lap("blend"):
-                self._over_tiles(blend.splat, kept, part, parts[-1], alpha)
+            self._over_tiles(blend.splat, kept, part, parts[-1], alpha)
         return parts[0] if len(parts) == 1 else np.concatenate(parts, -1), alpha[..., 0]
 
     def gather(self, image: Array) -> Array:

@@ -1,9 +1,9 @@
 """Gaussians through the graphics pipeline: OpenGL 4.1 core, so that it also runs on macOS.
 
-A view is projected once, in a fragment pass with one fragment per Gaussian; a splat then draws one quad
-per Gaussian, sorted on the device from OpenGL 4.3 on and else on the CPU, and the fixed-function blender
-composes back to front. The image formation is that of `raster/reference.py` but for one thing: blending back
-to front cannot stop at T <= 1e-4, so a pixel may differ by up to 1e-4 of the largest value behind.
+A view is projected once, in a fragment pass with one fragment per Gaussian, and sorted on the CPU; a splat
+then draws one quad per Gaussian, and the fixed-function blender composes back to front. The image formation
+is that of `raster/reference.py` but for one thing: blending back to front cannot stop at T <= 1e-4, so a
+pixel may differ by up to 1e-4 of the largest value behind.
 """
 
 from collections.abc import Sequence
@@ -15,14 +15,11 @@ import numpy as np
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.errors import BackendError
-from langsplat_core.progress import lap
 from langsplat_core.raster.opengl import shader, splat_shaders
 from langsplat_core.raster.opengl.scene_textures import (
     HALF_MAX,
     SceneTextures,
-    Sort,
     Targets,
-    chosen_sorter,
     drawing,
     set_uniforms,
 )
@@ -43,17 +40,13 @@ class GlRasterizer:
     suits measurements: but for the cut-offs within 2e-5 in images of 400 pixels a side, 1e-4 in those of
     1920 and for needles across the image, as pixel positions are float32.
 
-    `sort`: who finds the draw order, the same either way; see `chosen_sorter`.
-
     Blending goes back to front and cannot stop: behind layers that would end a pixel more is drawn, with the
     weight that was left, at most 1e-2 and mostly below 1e-3.
     """
 
     name = "opengl"
 
-    def __init__(
-        self, ctx: moderngl.Context, precision: Literal["half", "single"] = "half", sort: Sort = "auto"
-    ) -> None:
+    def __init__(self, ctx: moderngl.Context, precision: Literal["half", "single"] = "half") -> None:
         if ctx.version_code < 410:
             raise BackendError(
                 f"rasterizer 'opengl' needs OpenGL 4.1, this driver offers {ctx.version_code / 100:.1f}; "
@@ -61,7 +54,6 @@ class GlRasterizer:
             )
         self.ctx = ctx
         self.precision = precision
-        self._sorter = chosen_sorter(ctx, sort)
         self._project = ctx.program(
             vertex_shader=shader("fullscreen.vert"), fragment_shader=shader("project.frag")
         )
@@ -91,7 +83,7 @@ class GlRasterizer:
                 self._scene.release()
             self._scene = self._current = self._sorted = None  # stays so if the upload fails
             try:
-                self._scene = SceneTextures(self.ctx, gaussians, self.precision == "half", self._sorter)
+                self._scene = SceneTextures(self.ctx, gaussians, self.precision == "half")
             except moderngl.Error as error:
                 raise BackendError(
                     f"rasterizer 'opengl': {error}; the scene is too large for the device "
@@ -131,7 +123,7 @@ class GlRasterizer:
         for unit, texture in enumerate((scene.placement, scene.shape, *textures)):
             texture.use(unit)
         vao = self.ctx.vertex_array(program, [(scene.order, "1i/i", "gaussian")])
-        with lap("blend", self.ctx.finish), drawing(self.ctx, targets.framebuffer, moderngl.BLEND):
+        with drawing(self.ctx, targets.framebuffer, moderngl.BLEND):
             targets.framebuffer.clear()
             self.ctx.blend_equation = moderngl.FUNC_ADD, moderngl.FUNC_ADD
             self.ctx.blend_func = moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA
@@ -170,12 +162,11 @@ class GlRasterizer:
         )
         scene.geometry.use(0)
         scene.sh.use(1)
-        with lap("projection", self.ctx.finish), drawing(self.ctx, scene.projected, moderngl.NOTHING):
+        with drawing(self.ctx, scene.projected, moderngl.NOTHING):
             self._project_vao.render(moderngl.TRIANGLES, vertices=3)
         wanted = (settings.near, farthest(settings), *camera.world_to_camera[2])
         if self._sorted != wanted:  # it is kept when only the image plane changed
-            with lap("sort", self.ctx.finish):
-                scene.sort(camera, settings)
+            scene.sort(camera, settings)
         self._current, self._sorted = view, wanted
 
     def _splat_program(self, values: int, depth: bool) -> moderngl.Program:
@@ -204,8 +195,6 @@ class GlRasterizer:
         for program in self._splats.values():
             program.release()
         self._splats.clear()
-        if self._sorter is not None:
-            self._sorter.release()
         self._project_vao.release()
         self._project.release()
 
