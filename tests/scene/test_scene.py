@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from langsplat_core import render
-from langsplat_core.arrays import logit, psnr, rotation_matrices, sigmoid, unit
+from langsplat_core.arrays import logit, psnr, sigmoid, unit
 from langsplat_core.errors import InputError
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import NO_NODE, Camera, Gaussians, PlattScaling, Scene, Tree
@@ -20,7 +20,6 @@ from langsplat_core.scene.transform import (
     Similarity,
     moving,
     rotating,
-    rotation_quaternion,
     scaling,
     sh_basis,
     sh_rotations,
@@ -368,15 +367,6 @@ def test_transforms_compose_and_lead_back():
     half = rotating(AXES["z"], 90).then(rotating(AXES["z"], 90))
     assert half.then(half).is_identity
     assert rotating(AXES["x"], -360).is_identity
-
-
-def test_every_rotation_has_its_quaternion():
-    quats = unit(np.random.default_rng(5).normal(size=(300, 4)))
-    for quat, matrix in zip(quats, rotation_matrices(quats), strict=True):
-        np.testing.assert_allclose(rotation_quaternion(matrix), quat * np.sign(quat[0]), atol=1e-12)
-    for turn in TURNS:
-        matrix = rotation_matrices(rotation_quaternion(turn.rotation)[None])[0]
-        np.testing.assert_allclose(matrix, turn.rotation, atol=1e-12)
 
 
 @pytest.mark.parametrize("onto", [*AXES.values(), np.array([1.0, 1.0, 1e-9])])
