@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -119,18 +119,6 @@ class OutlineView:
     sizes: Array = field(default_factory=lambda: np.zeros(0, np.int64))  # (K,) Gaussians of every node
     problem: str = ""  # why there is none, or none yet
     colours: dict[tuple[str, int, int], Point] = field(default_factory=dict)  # by display, level and node
-
-    @cached_property
-    def _rows(self) -> dict[int, Outline]:
-        found, waiting = {}, list(self.roots)
-        while waiting:
-            row = waiting.pop()
-            found[row.node] = row
-            waiting += row.parts
-        return found
-
-    def row(self, node: int) -> Outline | None:
-        return self._rows.get(node)
 
 
 @dataclass(frozen=True)

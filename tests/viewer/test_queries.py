@@ -358,7 +358,6 @@ def test_outline_row_is_named_and_selects_its_thing(outlined):
         row = row_of(outlined, word)
         assert word in outline.name_of(outlined, row)
         assert (outlined.engine.tree.members(row.node) == blob(word)).all()
-        assert outlined.state.outline.row(row.node) is row
         act(outline.visit, outlined, row.node)
         assert marked(outlined)[0] == word
         assert outlined.state.glide.end.distance < before.distance

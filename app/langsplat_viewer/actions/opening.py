@@ -240,7 +240,6 @@ def step_scene(viewer: Viewer, by: int) -> None:
 # The file browser, typed paths, files dropped onto the window, and recent scenes.
 
 COMPANIONS = (cameras.SUFFIX, sidecar.SUFFIX)  # files beside a scene, read with it
-NAMED = 3  # files that a message names
 
 
 def ask_for(viewer: Viewer, choice: FileChoice) -> None:
@@ -322,8 +321,8 @@ def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
     known = [path for path in scenes if format_of(path)] or scenes[:1]
     others = [path.name for path in scenes if path not in known]
     if others:
-        more = f" and {len(others) - NAMED} more" if len(others) > NAMED else ""
-        viewer.say_error(f"not opened: {', '.join(others[:NAMED])}{more}")
+        more = f" and {len(others) - 1} more" if len(others) > 1 else ""
+        viewer.say_error(f"not opened: {others[0]}{more}")
     add_scenes(viewer, known)
     if len(known) > 1:
         viewer.state.say(f"{len(known)} scenes: the panel Scene lists them")

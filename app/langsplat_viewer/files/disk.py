@@ -67,8 +67,6 @@ def _entry(path: Path) -> FolderEntry | None:
 # A scene's files that change while it is shown. A thread of its own looks about once a second, so that the
 # window can sleep until there is something to say.
 
-EVERY = 1.0  # seconds between looks
-
 Stamp = tuple[int, int] | None  # time of change (ns) and bytes of a file; None where there is none
 Stamps = tuple[tuple[Path, Stamp], ...]
 
@@ -108,7 +106,7 @@ class Watch:
         threading.Thread(target=self._run, name="langsplat-watch", daemon=True).start()
 
     def _run(self) -> None:
-        while not self._closed.wait(EVERY):
+        while not self._closed.wait(1.0):
             self.look()
 
     def look(self) -> None:

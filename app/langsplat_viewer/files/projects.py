@@ -197,7 +197,7 @@ class Shelf:
 
     def read(self, scene: Path) -> tuple[Bookmark, ...]:
         """Read the bookmarks of a scene. InputError where the file makes no sense."""
-        return self._bookmarks(lambda top: _bookmarks(top.get(str(scene.absolute()), [])), ())
+        return self._read(scene)[1]
 
     def write(self, scene: Path, bookmarks: tuple[Bookmark, ...]) -> None:
         """Keep the bookmarks of a scene beside those of others.
@@ -207,33 +207,31 @@ class Shelf:
         """
         if self.folder is None:
             return
-        none: dict[str, Any] = {}
-        scenes = self._bookmarks(lambda top: top, none)
+        scenes, _ = self._read(scene)
         scenes.pop(str(scene.absolute()), None)
         if bookmarks:
             scenes[str(scene.absolute())] = [_flat(_plain(bookmark)) for bookmark in bookmarks]
         _write(self.folder / BOOKMARKS, {"version": 1, "scenes": dict(list(scenes.items())[-MOST_SCENES:])})
 
-    def _bookmarks(self, decode: Callable[[dict[str, Any]], T], otherwise: T) -> T:
+    def _read(self, scene: Path) -> tuple[dict[str, list[Any]], tuple[Bookmark, ...]]:
+        """Return the entries of all scenes, and the bookmarks of one."""
         path = None if self.folder is None else self.folder / BOOKMARKS
         if path is None or not path.exists():
-            return otherwise
+            return {}, ()
 
-        def scenes(top: Any) -> T:
+        def decode(top: Any) -> tuple[dict[str, list[Any]], tuple[Bookmark, ...]]:
             if top["version"] != 1:
                 raise ValueError("of another version")
-            return decode(_converted(top["scenes"], dict[str, list[Any]]))
+            scenes = _converted(top["scenes"], dict[str, list[Any]])
+            own = [_nested(entry) for entry in scenes.get(str(scene.absolute()), [])[:MOST_BOOKMARKS]]
+            bookmarks: tuple[Bookmark, ...] = _converted(own, tuple[Bookmark, ...])
+            for bookmark in bookmarks:
+                _check_pose(bookmark.pose)
+            return scenes, tuple(
+                replace(bookmark, name=printable_line(bookmark.name)) for bookmark in bookmarks
+            )
 
-        return _read(path, "bookmarks of this version, mend or delete the file", scenes)
-
-
-def _bookmarks(entries: list[Any]) -> tuple[Bookmark, ...]:
-    found: tuple[Bookmark, ...] = _converted(
-        [_nested(e) for e in entries[:MOST_BOOKMARKS]], tuple[Bookmark, ...]
-    )
-    for bookmark in found:
-        _check_pose(bookmark.pose)
-    return tuple(replace(bookmark, name=printable_line(bookmark.name)) for bookmark in found)
+        return _read(path, "bookmarks of this version, mend or delete the file", decode)
 
 
 # Query sets, which people write by hand as well: phrases, cuts, and whether each is shown in a colour.
