@@ -145,9 +145,8 @@ def _checked(target: Path) -> int:
         raise InputError(f"{shown(target)}: {shown(folder)} is a file, not a folder; choose another name")
     # Where files are none: what is written there is read by the system or by nobody, and is gone afterwards.
     real = Path(os.path.realpath(target))
-    if any(real.is_relative_to(place) for place in ("/proc", "/sys", "/dev")) and not real.is_relative_to(
-        "/dev/shm"
-    ):
+    system = any(real.is_relative_to(place) for place in ("/proc", "/sys", "/dev"))
+    if system and not real.is_relative_to("/dev/shm"):
         raise InputError(f"{shown(target)}: lies in a folder of the system's own; choose another")
     try:
         with tempfile.TemporaryFile(dir=target if stat.S_ISDIR(mode) else folder):

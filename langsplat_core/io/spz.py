@@ -120,9 +120,8 @@ def _read_streams(
     stored = [whole for whole in wholes if whole]  # blocks without a byte have no stream
     if [whole for _, whole in entries if whole] != stored:
         raise malformed(path, f"the sizes in its table are not those of {header.count} Gaussians")
-    if sum(stored) > BYTES_PER_BYTE * size + SLACK or at + sum(zipped for zipped, _ in entries) > len(
-        content
-    ):
+    end = at + sum(zipped for zipped, _ in entries)
+    if sum(stored) > BYTES_PER_BYTE * size + SLACK or end > len(content):
         raise malformed(path, f"truncated: its streams do not fit into {size} bytes")
     streams = []
     for zipped, whole in entries:
