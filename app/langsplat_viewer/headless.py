@@ -1,10 +1,7 @@
 """`--headless`: an image or a film without a window. Imports neither glfw nor imgui."""
 
 import logging
-from collections.abc import Sequence
 from pathlib import Path
-
-import numpy as np
 
 from langsplat_core.display.displays import MAX_QUERIES
 from langsplat_core.errors import InputError
@@ -19,9 +16,7 @@ from langsplat_core.scene.language import split_phrases
 from langsplat_viewer.camera.controls import (
     default_view,
     extent_of,
-    focus,
     from_camera,
-    holding_distance,
     spanning,
 )
 from langsplat_viewer.camera.flight import Motion, turntable
@@ -95,8 +90,12 @@ def draw(options: ViewerOptions, path: Path, services: Services, progress: Progr
     if options.backend in ("auto", "cpu"):
         say_compiling(progress)
     if options.is_film:
-        motion = flight or _turn(scene, camera, results, options)
-        cameras = cameras_of(motion, extent_of(scene), options.fps, request.size)
+        extent = extent_of(scene)
+        motion: Motion | None = flight
+        if options.turntable is not None:
+            motion = turntable(from_camera(camera, extent), options.turntable)
+        assert motion is not None
+        cameras = cameras_of(motion, extent, options.fps, request.size)
         lines = make_film(Shot(request, cameras, options.fps, options.backend), out, progress)
     else:
         progress("drawing", 0.8)
@@ -133,27 +132,6 @@ def _answers(
     for phrase in phrases:  # before anything slow is done
         check_phrase(engine, phrase, camera, progress)
     return tuple(run_phrase(engine, phrase, options.level, camera, progress).answer for phrase in phrases)
-
-
-def _turn(scene: Scene, camera: Camera, results: Sequence[QueryResult], options: ViewerOptions) -> Motion:
-    """Return the turn around what the camera sees in its middle, or around the place of the last answer.
-
-    The answer fills half of the image then. InputError where nothing was found.
-    """
-    extent = extent_of(scene)
-    view = from_camera(camera, extent)
-    if options.around == "answer":
-        found = [r for r in results if r.verdict != "not here" and r.place is not None]
-        if not found:
-            raise InputError("--around answer: nothing was found; add --query with a thing of this scene")
-        place, box = found[-1].place, found[-1].box
-        assert place is not None
-        if box is None:
-            box = np.stack([place, place + 0.1 * extent.radius])
-        nearer = min(holding_distance(view, box), float(np.linalg.norm(place - view.eye)))
-        view = focus(view, place, None if view.orthographic else nearer)  # whose scale was chosen
-    assert options.turntable is not None
-    return turntable(view, options.turntable)
 
 
 def answer_line(result: QueryResult) -> str:

@@ -79,8 +79,6 @@ class ViewerOptions:
     """A camera path: with --headless the film along it, else it is opened in the panel "Record"."""
     turntable: Seconds | None = None
     """With --headless: a film of so many seconds, once around what the camera sees in its middle."""
-    around: Literal["view", "answer"] = "view"
-    """What --turntable goes around; answer: the last query found, from near."""
     beside: Annotated[Path | None, tyro.conf.arg(metavar="SCENE")] = None
     """In the window: a second scene right of a line, by another encoder or method, seen and asked alike."""
     fps: PicturesPerSecond = 30.0

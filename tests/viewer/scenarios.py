@@ -583,14 +583,6 @@ def arrange_panels(s: Any) -> None:
     for title in ("Scene", "Display", "Camera", "Messages"):
         if not s.ctx.item_exists(f"//{title}"):
             s.menu("Window", title)
-    s.key("Ctrl+O")
-    assert s.state.browser.folder == s.folder.absolute()
-    s.ctx.item_click("//**/plain.ply")
-    s.shows("plain.ply")
-    assert s.state.browser is None
-    s.key("Ctrl+O", frames=4)
-    s.key("escape", frames=3)
-    assert s.state.browser is None
 
 
 def leave_settings(s: Any) -> None:

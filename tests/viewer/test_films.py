@@ -283,18 +283,6 @@ def test_animations(program, folder, suffix):
     assert sorted(path.suffix for path in folder.iterdir() if "film" in path.name) == [suffix]
 
 
-@pytest.mark.parametrize("flat", [[], ["--orthographic", "3"]])
-def test_a_turntable_around_the_answer_has_it_in_the_middle(program, folder, flat):
-    arguments = ["--query", "plant", "--turntable", "1", "--fps", "4", "--size", "64x48", "--display", "rgb"]
-    assert program("blobs.ply", *arguments, *flat, "--around", "answer", "--out", "film")[0] == 0
-    for name in FRAMES[:4]:
-        middle = picture(folder / "film" / name)[20:28, 28:36]
-        assert middle.mean((0, 1)).argmax() == 2  # the plant is blue
-    code, _, err = program("blobs.ply", "--turntable", "1", "--around", "answer", "--out", "film")
-    assert code == 2
-    assert "nothing was found" in err[0]
-
-
 def test_without_pyav_a_video_becomes_a_folder(program, folder, caplog, monkeypatch):
     monkeypatch.setattr(output, "has_video", lambda: False)
     code, out, _ = program("blobs.ply", "--turntable", "1", "--fps", "2", "--size", "32x24", "--out", "a.mp4")
