@@ -24,7 +24,7 @@ from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.raster.render import pixel_weights
-from langsplat_core.scene import LEVELS, Camera, Codec, LanguageField
+from langsplat_core.scene import LEVELS, Camera, CodebookCodec, Codec, LanguageField
 from langsplat_core.scene.surface import surface_areas
 from langsplat_core.semantics.vocabulary import Bundled, bundled_vocabulary
 
@@ -38,7 +38,7 @@ SAMPLES = 512
 NARROWEST = 1e-6  # spread; words that are all the same have none
 LIKELY = 0.5  # probability from which a word is said
 OR = " or "  # between words for one thing
-CELLS = 8_000_000  # numbers of a block of features times words: 32 MB
+CELLS = 8_000_000  # numbers, at most, of features times words that are held at once: 32 MB
 
 
 @dataclass(frozen=True)
@@ -62,6 +62,7 @@ def likely_name(words: Sequence[Word]) -> Word | None:
 class WordScores:
     """A vocabulary as numbers: everything about it that does not depend on the place that is asked for."""
 
+    codec: Codec  # of the scene's features
     phrases: tuple[str, ...]  # V
     vectors: Array  # (V + C, D) float32 unit; the last C stand for "none of these"
     hubs: Array  # (V + C,) float32, taken half
@@ -73,25 +74,36 @@ class WordScores:
         phrases = tuple(phrase for phrase, kept in zip(self.phrases, chosen, strict=True) if kept)
         return replace(self, phrases=phrases, vectors=self.vectors[rows], hubs=self.hubs[rows])
 
-    def probabilities(self, codec: Codec, latents: Array) -> Array:
+    @cached_property
+    def _of_codewords(self) -> Array | None:
+        """(K, V + C) float32 probabilities of all codewords; None where there are none, or too many."""
+        if not isinstance(self.codec, CodebookCodec) or self.codec.size * len(self.vectors) > CELLS:
+            return None
+        return self._softmax(np.arange(self.codec.size)[:, None])
+
+    def probabilities(self, latents: Array) -> Array:
         """Return (M, V + C) float32 probabilities for (M, d) latents, each row adding up to 1."""
-        logits = np.float32(self.scale) * (codec.cosines(latents, self.vectors) - self.hubs / 2)
+        known = self._of_codewords
+        return self._softmax(latents) if known is None else known[latents[:, 0]]
+
+    def _softmax(self, latents: Array) -> Array:
+        logits = np.float32(self.scale) * (self.codec.cosines(latents, self.vectors) - self.hubs / 2)
         shares = np.exp(logits - logits.max(1, keepdims=True))
         return shares / shares.sum(1, keepdims=True)
 
-    def mixture(self, codec: Codec, latents: Array, weights: Array) -> Array:
+    def mixture(self, latents: Array, weights: Array) -> Array:
         """Return the (V + C,) float64 mean of the probabilities for (M, d) latents, weighted by (M,).
 
         Weights are >= 0, not all zero. Answers are blended, never features: between two things lies a third.
         """
-        latents, of = codec.unique(latents)
+        latents, of = self.codec.unique(latents)
         weights = np.bincount(of, weights, minlength=len(latents))
         total = np.zeros(len(self.vectors))
         for part in self._blocks(len(latents)):
-            total += weights[part] @ self.probabilities(codec, latents[part])
+            total += weights[part] @ self.probabilities(latents[part])
         return total / total.sum()
 
-    def best(self, codec: Codec, latents: Array, count: int) -> tuple[Array, Array]:
+    def best(self, latents: Array, count: int) -> tuple[Array, Array]:
         """Return (M, count) numbers of the most probable phrases of (M, d) latents, best first, and these.
 
         Probabilities are float32; there are fewer columns where the vocabulary has fewer phrases.
@@ -100,7 +112,7 @@ class WordScores:
         words = np.empty((len(latents), count), np.int32)
         shares = np.empty((len(latents), count), np.float32)
         for part in self._blocks(len(latents) if count else 0):
-            found = self.probabilities(codec, latents[part])[:, : len(self.phrases)]
+            found = self.probabilities(latents[part])[:, : len(self.phrases)]
             some = np.argpartition(-found, count - 1, axis=1)[:, :count]
             order = np.argsort(-np.take_along_axis(found, some, 1), axis=1, kind="stable")
             words[part] = np.take_along_axis(some, order, 1)
@@ -116,13 +128,16 @@ def build_words(field: LanguageField, phrases: tuple[str, ...], vectors: Array) 
     """Return scores of names of things, from V phrases and their (V, D) unit vectors."""
     every = np.concatenate([vectors, field.canonical]).astype(np.float32)
     bank = field_features(field)
-    return WordScores(phrases, every, hubs(every, bank), WORD_SCALE / _spread(field, vectors, bank))
+    return WordScores(
+        field.codec, phrases, every, hubs(every, bank), WORD_SCALE / _spread(field, vectors, bank)
+    )
 
 
 def build_attributes(field: LanguageField, phrases: tuple[str, ...], vectors: Array) -> WordScores:
     """Return scores of words of which a thing has one, such as colours: few and alike, they are no hubs."""
     scale = ATTRIBUTE_SCALE / _spread(field, vectors, field_features(field))
-    return WordScores(phrases, vectors.astype(np.float32), np.zeros(len(vectors), np.float32), scale)
+    no_hubs = np.zeros(len(vectors), np.float32)
+    return WordScores(field.codec, phrases, vectors.astype(np.float32), no_hubs, scale)
 
 
 def _spread(field: LanguageField, vectors: Array, bank: Array) -> float:
@@ -225,7 +240,7 @@ class Describer:
             return LevelWords(level, (), 0.0, 0.0)
         latents, weights = field.latents[level, rows[known]], weights[known]
         names = self.words[level]
-        shares = names.mixture(field.codec, latents, weights)
+        shares = names.mixture(latents, weights)
         best = np.argsort(-shares[: len(names.phrases)], kind="stable")[: max(top, 0)]
         words = tuple(Word(names.phrases[i], float(shares[i])) for i in best)
         other = float(shares[len(names.phrases) :].sum())
@@ -239,7 +254,7 @@ class Describer:
     def _certain(self, words: WordScores | None, latents: Array, weights: Array) -> Word | None:
         if words is None:
             return None
-        shares = words.mixture(self.engine.field.codec, latents, weights)
+        shares = words.mixture(latents, weights)
         best = int(shares.argmax())
         return Word(words.phrases[best], float(shares[best])) if shares[best] >= CERTAIN else None
 

@@ -96,7 +96,7 @@ def _claims(describer: Describer, latents: Array, of: Array, level: int) -> Iter
     latents: (M, d) the distinct ones of the field; of: (N,) int64 number of each Gaussian's, -1 for none.
     """
     words, areas = describer.words[level], describer.areas
-    best, shares = words.best(describer.engine.field.codec, latents, RUNNERS_UP)
+    best, shares = words.best(latents, RUNNERS_UP)
     if best.size == 0:  # no words, or no features
         return
     has = of >= 0

@@ -331,7 +331,7 @@ def _names(describer: Describer, level: int, regions: Mapping[int, Array], truth
         if not right.any() or len(members) == 0:
             continue
         areas = np.maximum(describer.areas[members], 1e-300)
-        shares = words.mixture(field.codec, field.latents[level, members], areas)[: len(right)]
+        shares = words.mixture(field.latents[level, members], areas)[: len(right)]
         best = np.argsort(-shares, kind="stable")[:TOP]
         rows.append((right[best[0]], right[best].any(), shares[best[0]], shares[right].sum()))
     mean = np.mean(rows, axis=0) if rows else np.zeros(4)

@@ -84,7 +84,7 @@ def test_pixel_words_follow_the_rows_of_w(codebook, backend):
     engine, names = asked.engine, asked.words[2]
     results = [engine.run(word) for word in WORDS]
     relevancy = np.stack([result.relevancy[result.level] for result in results], 1)
-    own = names.probabilities(engine.field.codec, engine.field.latents[2]).astype(np.float64)
+    own = names.probabilities(engine.field.latents[2]).astype(np.float64)
     view = load_lifting_rasterizer("reference").view(scene.gaussians, camera)
     depths = camera.project(scene.gaussians.means.astype(np.float64))[1]
     for thing, centre in enumerate([*CENTRES, (CENTRES[0] + CENTRES[1]) / 2 + (-0.15, 0, 0)]):
@@ -217,11 +217,11 @@ def test_probabilities_and_mixtures_are_those_of_the_formula(kind):
     words = build_words(made, names, vectors)
     latents = made.latents[made.known][:60]
     want = plain_probabilities(made, vectors, latents, field_features(made))
-    np.testing.assert_allclose(words.probabilities(made.codec, latents), want, atol=2e-5)
+    np.testing.assert_allclose(words.probabilities(latents), want, atol=2e-5)
     weights = np.random.default_rng(6).uniform(size=len(latents))
-    mixture = words.mixture(made.codec, latents, weights)
+    mixture = words.mixture(latents, weights)
     np.testing.assert_allclose(mixture, weights @ want / weights.sum(), atol=2e-5)
-    best, shares = words.best(made.codec, latents, 3)
+    best, shares = words.best(latents, 3)
     order = np.argsort(-want[:, :V], axis=1)[:, :3]
     assert (best == order).mean() > 0.99  # equal but for rounding
     np.testing.assert_allclose(shares, np.take_along_axis(want, order, 1), atol=2e-5)
@@ -240,7 +240,7 @@ def test_hub_word_does_not_answer_everywhere():
     vectors = np.concatenate([names, centre[None].astype(np.float32)])
     labels = (*(f"thing {number}" for number in range(40)), "hub")
     plain, right = (
-        (build(made, labels, vectors).best(codec, codes[0], 1)[0][:, 0] == np.arange(40)).mean()
+        (build(made, labels, vectors).best(codes[0], 1)[0][:, 0] == np.arange(40)).mean()
         for build in (build_attributes, build_words)
     )
     assert plain < 0.2 < 0.8 < right
