@@ -257,8 +257,8 @@ class _Stages:
         order = np.random.default_rng(self.config.codec.seed).permutation(len(self.gaussians))
         robust, samples = self.lift.mode == "median", []
         for rows in (order[:FITTED], order[FITTED : FITTED + JUDGED]):
-            lifted = lift_sample(*self.mask_weights, np.sort(rows), robust, self.progress)
-            samples.append(lifted.vectors[lifted.confidence > 0])
+            vectors, confidence = lift_sample(*self.mask_weights, np.sort(rows), robust, self.progress)
+            samples.append(vectors[confidence > 0])
         return samples[0], samples[1]
 
     def latents(self, codec: Codec) -> Latents:
@@ -296,11 +296,12 @@ class _Stages:
 
         def lift(number: int) -> Arrays:
             weights = mask_weights.block(number, groups)
-            lifted = lift_weights(weights, groups.vectors, robust=self.lift.mode == "median")
-            levels, count, dim = lifted.vectors.shape
-            latents = codec.encode(lifted.vectors.reshape(-1, dim)).reshape(levels, count, -1)
-            latents = np.where(lifted.confidence[..., None] > 0, latents, 0).astype(latents.dtype)
-            return {"latents": latents, "confidence": lifted.confidence}
+            robust = self.lift.mode == "median"
+            vectors, confidence = lift_weights(weights, groups.vectors, robust)
+            latents = codec.encode(vectors.reshape(-1, vectors.shape[2]))
+            latents = latents.reshape(*vectors.shape[:2], -1)
+            latents = np.where(confidence[..., None] > 0, latents, 0).astype(latents.dtype)
+            return {"latents": latents, "confidence": confidence}
 
         for number in self.processes.share(range(len(mask_weights.blocks))):
             kept(folder / f"{number:05d}.npz", partial(lift, number))

@@ -6,7 +6,6 @@ between two latents.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -22,18 +21,10 @@ from langsplat_core.semantics.features import ImageFeatures
 from langsplat_core.training.language.mask_weights import MaskGroups, MaskWeights
 
 
-@dataclass(frozen=True, eq=False)
-class Lifted:
-    """Vectors of n Gaussians at the three levels."""
-
-    vectors: Array  # (3, n, D) float32 unit vectors; zero where unobserved
-    confidence: Array  # (3, n) float32 total blending weight, in pixels
-
-
 def lift_sample(
     mask_weights: MaskWeights, groups: MaskGroups, rows: Array, robust: bool, progress: Progress = silent
-) -> Lifted:
-    """Lift onto the Gaussians at `rows`, which ascend."""
+) -> tuple[Array, Array]:
+    """Lift onto the Gaussians at `rows`, which ascend; see `lift_weights`."""
     parts = [sparse.csr_matrix((0, len(LEVELS) * len(groups.vectors)), dtype=np.float32)]
     for number, (first, last) in enumerate(mask_weights.blocks):
         inside = rows[(rows >= first) & (rows < last)] - first
@@ -43,16 +34,16 @@ def lift_sample(
     return lift_weights(sparse.vstack(parts, "csr"), groups.vectors, robust)
 
 
-def lift_weights(weights: sparse.csr_matrix, vectors: Array, robust: bool) -> Lifted:
-    """Lift by the (n, 3 G) weights of n Gaussians in G groups of masks, level after level.
+def lift_weights(weights: sparse.csr_matrix, vectors: Array, robust: bool) -> tuple[Array, Array]:
+    """Return (3, n, D) float32 unit vectors, zero where unobserved, and (3, n) float32 confidence.
 
-    vectors: (G, D) float32 unit vectors of the groups; `robust` takes the geometric median, else the mean.
+    Confidence is the total blending weight, in pixels. weights: (n, 3 G) of n Gaussians in G groups of masks,
+    level after level; vectors: (G, D) float32 unit vectors of the groups. `robust` takes the geometric
+    median, else the mean.
     """
-    lifted = Lifted(
-        np.zeros((len(LEVELS), weights.shape[0], vectors.shape[1]), np.float32),
-        np.zeros((len(LEVELS), weights.shape[0]), np.float32),
-    )
-    for level, (centre, confidence) in enumerate(zip(lifted.vectors, lifted.confidence, strict=True)):
+    lifted = np.zeros((len(LEVELS), weights.shape[0], vectors.shape[1]), np.float32)
+    confidences = np.zeros((len(LEVELS), weights.shape[0]), np.float32)
+    for level, (centre, confidence) in enumerate(zip(lifted, confidences, strict=True)):
         at_level = weights[:, level * len(vectors) : (level + 1) * len(vectors)].tocsr()
         confidence[:] = np.asarray(at_level.sum(1)).ravel()
         centre[:] = unit(at_level @ vectors)
@@ -63,7 +54,7 @@ def lift_weights(weights: sparse.csr_matrix, vectors: Array, robust: bool) -> Li
             parts = (at_level.indptr, at_level.indices, at_level.data, vectors, centre)
             shared_workers().run(_weiszfeld, len(centre), *parts)
         centre[confidence == 0] = 0
-    return lifted
+    return lifted, confidences
 
 
 @partial(helper, fastmath={"reassoc", "contract", "nsz"})

@@ -306,10 +306,10 @@ def lifting(gaussians):
 
 
 def test_mean_lift_weights_vectors_by_blending_weights(gaussians, lifting):
-    lifted = lift_sample(*lifting, np.arange(25), robust=False)
-    assert lifted.vectors.shape == (3, 25, LIFTED_DIM)
-    assert (lifted.vectors[0] == 0).all()
-    assert (lifted.confidence[0] == 0).all()
+    vectors, confidence = lift_sample(*lifting, np.arange(25), robust=False)
+    assert vectors.shape == (3, 25, LIFTED_DIM)
+    assert (vectors[0] == 0).all()
+    assert (confidence[0] == 0).all()
     total, weight = np.zeros((25, LIFTED_DIM)), np.zeros(25)
     for camera, features in make_views():
         dense = dense_weights(gaussians, camera)
@@ -317,20 +317,20 @@ def test_mean_lift_weights_vectors_by_blending_weights(gaussians, lifting):
             inside = dense[features.labels[2] == row].sum(0)
             total += inside[:, None] * features.vectors[row]
             weight += inside
-    np.testing.assert_allclose(lifted.confidence[2], weight, rtol=1e-4, atol=0.02)
+    np.testing.assert_allclose(confidence[2], weight, rtol=1e-4, atol=0.02)
     seen = weight > 1
-    np.testing.assert_allclose(lifted.vectors[2][seen], unit(total[seen]), atol=2e-3)
+    np.testing.assert_allclose(vectors[2][seen], unit(total[seen]), atol=2e-3)
 
 
 def test_lifting_a_sample_equals_its_rows_of_the_whole(lifting):
     mask_weights, groups = lifting
-    whole = lift_weights(mask_weights.block(0, groups), groups.vectors, robust=True)
+    whole, weight = lift_weights(mask_weights.block(0, groups), groups.vectors, robust=True)
     rows = np.array([0, 3, 7, 8, 22])
     again = replace(mask_weights, block_size=8)
-    some = lift_sample(again, groups, rows, robust=True)
-    np.testing.assert_allclose(some.vectors, whole.vectors[:, rows], atol=1e-6)
-    np.testing.assert_allclose(some.confidence, whole.confidence[:, rows], rtol=1e-6)
-    assert lift_sample(again, groups, rows[:0], robust=True).vectors.shape == (3, 0, LIFTED_DIM)
+    some, confidence = lift_sample(again, groups, rows, robust=True)
+    np.testing.assert_allclose(some, whole[:, rows], atol=1e-6)
+    np.testing.assert_allclose(confidence, weight[:, rows], rtol=1e-6)
+    assert lift_sample(again, groups, rows[:0], robust=True)[0].shape == (3, 0, LIFTED_DIM)
 
 
 def reference_median(weights: np.ndarray, vectors: np.ndarray) -> np.ndarray:
@@ -349,8 +349,8 @@ def test_median_outvotes_a_wrong_mask_that_the_mean_follows():
     vectors = unit(np.concatenate([np.tile(good, (7, 1)), np.tile(bad, (3, 1))]) + noise).astype(np.float32)
     # Of one Gaussian, at level "whole".
     weights = csr_matrix(np.repeat([[0, 0, 1]], 10, 1).astype(np.float32))
-    mean = lift_weights(weights, vectors, robust=False).vectors[2, 0]
-    median = lift_weights(weights, vectors, robust=True).vectors[2, 0]
+    mean = lift_weights(weights, vectors, robust=False)[0][2, 0]
+    median = lift_weights(weights, vectors, robust=True)[0][2, 0]
     assert median @ good > 0.98
     assert median @ good > mean @ good + 0.02
     # eight steps come within one degree of the converged median
@@ -360,10 +360,10 @@ def test_median_outvotes_a_wrong_mask_that_the_mean_follows():
 def test_views_without_masks_lift_nothing(gaussians):
     empty = ImageFeatures(np.full((3, 6, 8), -1, np.int32), np.zeros((0, LIFTED_DIM), np.float32))
     mask_weights = find_mask_weights(ReferenceRasterizer(), gaussians, [(random_camera(0, 8, 6), empty)])
-    lifted = lift_sample(mask_weights, group_masks([empty.vectors]), np.arange(25), robust=True)
-    assert lifted.vectors.shape == (3, 25, LIFTED_DIM)
-    assert not lifted.vectors.any()
-    assert not lifted.confidence.any()
+    vectors, confidence = lift_sample(mask_weights, group_masks([empty.vectors]), np.arange(25), robust=True)
+    assert vectors.shape == (3, 25, LIFTED_DIM)
+    assert not vectors.any()
+    assert not confidence.any()
 
 
 # The paper's one-pass lifting against dense weights.
