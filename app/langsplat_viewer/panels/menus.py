@@ -43,8 +43,7 @@ def _recent(viewer: Viewer) -> None:
             name = Path(path)
             if imgui.menu_item(f"{name.parent.name}/{name.name}##{number}", "", False)[0]:
                 opening.open_file(viewer, name)
-            if imgui.is_item_hovered():
-                imgui.set_tooltip(path)
+            ui.tip(path)
         imgui.end_menu()
 
 
@@ -152,7 +151,7 @@ def _clicked(found: list[Command], typing: bool) -> Command | None:
             if imgui.selectable(command.does, place == 0 and typing)[0]:
                 chosen = command
             keys = ", ".join(command.keys)
-            imgui.same_line(right - imgui.calc_text_size(keys).x)
+            imgui.same_line(right - ui.width_of(keys))
             imgui.text_colored(ui.muted(), keys)
     imgui.end_child()
     return chosen

@@ -71,7 +71,7 @@ def _titles(viewer: Viewer, area: ui.Area) -> None:
         names = tuple("" if path is None else path.name for path in (viewer.state.path, there))
     if split.mode in ("wipe", "scenes"):
         x = area.left + split.at * area.width
-        text_on_shade(names[0], x - gap - imgui.calc_text_size(names[0]).x, top, area)
+        text_on_shade(names[0], x - gap - ui.width_of(names[0]), top, area)
         text_on_shade(names[1], x + gap, top, area)
     elif split.mode == "levels":
         for column, name in zip(area.columns(len(names)), names, strict=True):
@@ -419,7 +419,7 @@ def _bar(phrase: str, colours: Array, ends: tuple[float, float]) -> None:
     for place, value in ((0.0, low), (0.5, (low + high) / 2), (1.0, high)):
         text = f"{value:.2f}"
         if place:
-            imgui.same_line(x + place * (width - imgui.calc_text_size(text).x))
+            imgui.same_line(x + place * (width - ui.width_of(text)))
         imgui.text_unformatted(text)
 
 

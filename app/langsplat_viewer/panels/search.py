@@ -69,9 +69,7 @@ def hint(viewer: Viewer) -> str:
 def _offer_buttons(viewer: Viewer, title: str, phrases: tuple[str, ...]) -> None:
     imgui.text_colored(ui.muted(), title)
     for number, phrase in enumerate(phrases):
-        imgui.same_line()
-        if imgui.get_content_region_avail().x < ui.button_width(phrase):
-            imgui.new_line()
+        ui.beside(phrase)
         shown = ui.elided(phrase, imgui.get_content_region_avail().x - ui.button_width(""))
         if imgui.small_button(f"{shown}###offer {number}"):
             viewer.state.drafts.pop("##phrase", None)
@@ -91,8 +89,7 @@ def _cut(viewer: Viewer, query: Query, result: QueryResult) -> None:
     height = hello_imgui.em_size(HISTOGRAM_EM)
     imgui.plot_histogram("##relevancies", counts, graph_size=ImVec2(-1, height))
     corner, size = imgui.get_item_rect_min(), imgui.get_item_rect_size()
-    if imgui.is_item_hovered():
-        imgui.set_tooltip("Gaussians by relevancy, on a logarithmic scale; the line is where the answer ends")
+    ui.tip("Gaussians by relevancy, on a logarithmic scale; the line is where the answer ends")
     x = corner.x + size.x * (min(max(result.cut, low), high) - low) / (high - low)
     colour = imgui.get_color_u32(imgui.Col_.text)
     imgui.get_window_draw_list().add_line(ImVec2(x, corner.y), ImVec2(x, corner.y + size.y), colour, 2.0)
@@ -156,7 +153,7 @@ def rows_shown(count: int, room: float) -> float:
 def _line(viewer: Viewer, query: Query) -> None:
     """Colour, phrase, verdict and a button to take it off; the phrase gets what the others leave."""
     spacing, side = imgui.get_style().item_spacing.x, imgui.get_frame_height()
-    verdict_width = imgui.calc_text_size("weak match").x
+    verdict_width = ui.width_of("weak match")
     left, right = imgui.get_cursor_pos_x(), imgui.get_content_region_avail().x
     room = right - 2 * side - verdict_width - 3 * spacing
     _swatch(viewer, query, side)
@@ -165,16 +162,14 @@ def _line(viewer: Viewer, query: Query) -> None:
     name = ui.elided(query.phrase, room)
     if imgui.selectable(f"{name}##phrase of list", chosen, size=ImVec2(room, 0))[0]:
         viewer.put(chosen=query.phrase)
-    if name != query.phrase and imgui.is_item_hovered():
-        imgui.set_tooltip(query.phrase)
+    ui.tip(query.phrase if name != query.phrase else "")
     imgui.same_line(left + right - side - spacing - verdict_width)
     imgui.align_text_to_frame_padding()
     _verdict(viewer, query)
     imgui.same_line(left + right - side)
     if imgui.button("x", ImVec2(side, 0)):
         queries.remove(viewer, query.phrase)
-    if imgui.is_item_hovered():
-        imgui.set_tooltip("Take it off the list")
+    ui.tip("Take it off the list")
 
 
 def _swatch(viewer: Viewer, query: Query, side: float) -> None:
@@ -182,10 +177,7 @@ def _swatch(viewer: Viewer, query: Query, side: float) -> None:
     red, green, blue = HIDDEN if query.slot is None else QUERY_COLOURS[query.slot]
     flags = imgui.ColorEditFlags_.no_tooltip
     if imgui.color_button("##shown", ImVec4(red, green, blue, 1.0), flags, ImVec2(side, side)):
-        if shown:
-            queries.hide(viewer, query.phrase)
-        else:
-            queries.show(viewer, query.phrase)
+        (queries.hide if shown else queries.show)(viewer, query.phrase)
     ui.tip("Click to hide" if shown else "Click to show")
     state, result = viewer.state, viewer.state.result(query)
     alone = state.session.picture.display == "relevancy" and len(painted(state.shown_results())) == 1
@@ -202,9 +194,8 @@ def _verdict(viewer: Viewer, query: Query) -> None:
         imgui.text_colored(ui.bad(), "unknown")
     elif result is not None:
         imgui.text_colored(ui.good() if result.found else ui.muted(), result.verdict)
-        probability = result.probability
-        if imgui.is_item_hovered() and probability is not None:
-            imgui.set_tooltip(f"{100 * probability:.0f} % likely to be there")
+        if result.probability is not None:
+            ui.tip(f"{100 * result.probability:.0f} % likely to be there")
 
 
 def _details(viewer: Viewer, query: Query) -> None:
@@ -231,11 +222,8 @@ def _details(viewer: Viewer, query: Query) -> None:
         for index, (name, score) in enumerate(zip(LEVELS, result.scores, strict=True)):
             if index:
                 imgui.same_line()
-            text = f"{name} {score:.2f}"
-            if index == result.level:
-                imgui.text(text)
-            else:
-                imgui.text_colored(ui.muted(), text)
+            plain = imgui.get_style_color_vec4(imgui.Col_.text)
+            imgui.text_colored(plain if index == result.level else ui.muted(), f"{name} {score:.2f}")
             ui.tip(f"The best relevancy at the level '{name}'; the brighter one answers")
         _cut(viewer, query, result)
 
