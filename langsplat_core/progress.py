@@ -32,14 +32,10 @@ class Report:
             raise ValueError("no line of progress") from None
 
     @property
-    def details(self) -> str:
-        """Note and metrics in words: "9 Gaussians, loss 0.0312"."""
-        return ", ".join(filter(None, [self.note, *(_metric(*item) for item in self.metrics.items())]))
-
-    @property
     def text(self) -> str:
         """Stage, note and metrics in words: "training: 9 Gaussians, loss 0.0312"."""
-        return ": ".join(filter(None, [self.stage, self.details]))
+        details = ", ".join(filter(None, [self.note, *(_metric(*item) for item in self.metrics.items())]))
+        return ": ".join(filter(None, [self.stage, details]))
 
 
 @dataclass(frozen=True)

@@ -35,14 +35,10 @@ class Extension:
     formats: References = field(default_factory=dict)  # ".xyz" -> io.scenes.SceneFormat
     importers: References = field(default_factory=dict)  # method -> io.scenes.Importer
     exporters: References = field(default_factory=dict)  # word of `convert --to` -> io.scenes.Exporter
-    encoders: References = field(
-        default_factory=dict
-    )  # `model_type` of config.json -> semantics.encoders.Family
+    encoders: References = field(default_factory=dict)  # `model_type` of config.json -> encoders.Family
     segmenters: References = field(default_factory=dict)  # `model_type` -> function of Weights to a Segmenter
     layouts: References = field(default_factory=dict)  # name -> semantics.weights.Layout
-    mask_sources: References = field(
-        default_factory=dict
-    )  # word of `--masks.source` -> function to a MaskSource
+    mask_sources: References = field(default_factory=dict)  # `--masks.source` -> function to a MaskSource
     panels: References = field(default_factory=dict)  # title -> langsplat_viewer.panels.layout.Panel
 
 

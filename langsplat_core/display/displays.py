@@ -93,30 +93,22 @@ def painted(answers: Answers) -> list[int]:
 
 
 def relevancies(subject: Subject) -> Array | None:
-    """(N, Q) float32 raw relevancy per Gaussian and slot, 0 where a slot paints nothing."""
-
-    def of_level(answer: Answer) -> Array:
-        values: Array = answer.relevancy[answer.level if subject.level is None else subject.level]
-        return values
-
-    return _by_slot(subject, of_level)
+    """(N, Q) float32 raw relevancy per Gaussian and slot; None where no slot paints anything."""
+    return _by_slot(subject, lambda one: one.relevancy[one.level if subject.level is None else subject.level])
 
 
 def members(subject: Subject) -> Array | None:
-    """(N, Q) float32, 1 for the Gaussians of each slot's answer."""
-    return _by_slot(subject, lambda answer: answer.members)
+    """(N, Q) float32, 1 for the Gaussians of each slot's answer; None where no slot paints anything."""
+    return _by_slot(subject, lambda one: one.members)
 
 
 def _by_slot(subject: Subject, values_of: Callable[[Answer], Array]) -> Array | None:
-    """(N, Q) float32 values of each slot's answer; None where no slot paints anything."""
-    slots = painted(subject.answers)
-    if not slots:
+    if not painted(subject.answers):
         return None
     values = np.zeros((subject.count, len(subject.answers)), np.float32)
-    for slot in slots:
-        answer = subject.answers[slot]
-        assert answer is not None
-        values[:, slot] = values_of(answer)
+    for slot, answer in enumerate(subject.answers):
+        if answer is not None and STRENGTH[answer.verdict]:
+            values[:, slot] = values_of(answer)
     return values
 
 
@@ -125,21 +117,17 @@ def heat_ranges(answers: Answers, scale: tuple[float, float] | None = None) -> R
 
     A weak match gets no hotter than a half.
     """
-    return _weakened(answers, lambda answer: scale or answer.heat_range)
+    ranges = []
+    for answer in answers:
+        strength = 0.0 if answer is None else STRENGTH[answer.verdict]
+        low, high = (scale or answer.heat_range) if answer is not None and strength else NO_HEAT
+        ranges.append((low, low + (high - low) / (strength or 1.0)))
+    return tuple(ranges)
 
 
 def member_ranges(answers: Answers, scale: tuple[float, float] | None = None) -> Ranges:
     """Range of members for each slot, which are 0 or 1; a weak match is half as opaque."""
-    return _weakened(answers, lambda answer: (0.0, 1.0))
-
-
-def _weakened(answers: Answers, range_of: Callable[[Answer], tuple[float, float]]) -> Ranges:
-    ranges = []
-    for answer in answers:
-        strength = 0.0 if answer is None else STRENGTH[answer.verdict]
-        low, high = range_of(answer) if answer is not None and strength else NO_HEAT
-        ranges.append((low, low + (high - low) / (strength or 1.0)))
-    return tuple(ranges)
+    return heat_ranges(answers, (0.0, 1.0))
 
 
 _LATENT: WeakKeyDictionary[LanguageField, Array] = WeakKeyDictionary()
@@ -162,13 +150,10 @@ def latent_colours(field: LanguageField) -> Array:
     principal axes over all levels together (one basis for the scene, so that colours agree between views
     and levels); each axis is stretched between its 2 % and 98 % quantiles.
     """
-    made = _LATENT.get(field)
-    if made is not None:
-        return made
-    seen = field.known
-    flat = field.latents.reshape(-1, field.latents.shape[2])
-    colours = field.codec.colours(flat, seen.reshape(-1).astype(np.float64)).reshape(*seen.shape, 3)
-    _LATENT[field] = np.where(seen[..., None], colours, np.float32(0.5)).astype(np.float32)
+    if field not in _LATENT:
+        seen, flat = field.known, field.latents.reshape(-1, field.latents.shape[2])
+        colours = field.codec.colours(flat, seen.reshape(-1).astype(np.float64)).reshape(*seen.shape, 3)
+        _LATENT[field] = np.where(seen[..., None], colours, np.float32(0.5)).astype(np.float32)
     return _LATENT[field]
 
 

@@ -91,10 +91,6 @@ class GlRasterizer:
                 ) from error
         return self._scene
 
-    def forget(self) -> None:
-        """Have the next view projected and sorted anew."""
-        self._current = self._sorted = None
-
     def draw(
         self, view: "GlView", sources: Sequence[Source], with_depth: bool = False
     ) -> tuple[moderngl.Texture, ...]:
