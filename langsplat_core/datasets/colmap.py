@@ -9,7 +9,7 @@ frames (COLMAP >= 3.12) add nothing here, because images.bin still carries every
 import logging
 import os
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -26,19 +26,19 @@ from langsplat_core.io.files import shown
 from langsplat_core.progress import Progress
 from langsplat_core.scene import FARTHEST
 
-# Lenses by their numbers: name, formula, and parameters in file order; f stands for both fx and fy.
-LENSES = MappingProxyType({
-    0: ("SIMPLE_PINHOLE", BrownDistortion, "f cx cy"),
-    1: ("PINHOLE", BrownDistortion, "fx fy cx cy"),
-    2: ("SIMPLE_RADIAL", BrownDistortion, "f cx cy k1"),
-    3: ("RADIAL", BrownDistortion, "f cx cy k1 k2"),
-    4: ("OPENCV", BrownDistortion, "fx fy cx cy k1 k2 p1 p2"),
-    5: ("OPENCV_FISHEYE", FisheyeDistortion, "fx fy cx cy k1 k2 k3 k4"),
-    6: ("FULL_OPENCV", BrownDistortion, "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
-    8: ("SIMPLE_RADIAL_FISHEYE", FisheyeDistortion, "f cx cy k1"),
-    9: ("RADIAL_FISHEYE", FisheyeDistortion, "f cx cy k1 k2"),
-    14: ("SIMPLE_FISHEYE", FisheyeDistortion, "f cx cy"),
-    15: ("FISHEYE", FisheyeDistortion, "fx fy cx cy"),
+# Lenses: number in binary files, formula, and parameters in file order; f stands for both fx and fy.
+LENSES: Mapping[str, tuple[int, Any, str]] = MappingProxyType({
+    "SIMPLE_PINHOLE": (0, BrownDistortion, "f cx cy"),
+    "PINHOLE": (1, BrownDistortion, "fx fy cx cy"),
+    "SIMPLE_RADIAL": (2, BrownDistortion, "f cx cy k1"),
+    "RADIAL": (3, BrownDistortion, "f cx cy k1 k2"),
+    "OPENCV": (4, BrownDistortion, "fx fy cx cy k1 k2 p1 p2"),
+    "OPENCV_FISHEYE": (5, FisheyeDistortion, "fx fy cx cy k1 k2 k3 k4"),
+    "FULL_OPENCV": (6, BrownDistortion, "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
+    "SIMPLE_RADIAL_FISHEYE": (8, FisheyeDistortion, "f cx cy k1"),
+    "RADIAL_FISHEYE": (9, FisheyeDistortion, "f cx cy k1 k2"),
+    "SIMPLE_FISHEYE": (14, FisheyeDistortion, "f cx cy"),
+    "FISHEYE": (15, FisheyeDistortion, "fx fy cx cy"),
 })  # fmt: skip
 
 # Records of the binary files, each of which begins with their number. An image goes on with its name, a zero
@@ -111,13 +111,12 @@ def _content(path: Path) -> Any:
 
 def lens_of(name: str, width: int, height: int, parameters: Array) -> PhotoIntrinsics:
     """Return the lens of a camera of a model; ValueError where none has such numbers, or it is not read."""
-    found = next((row for row in LENSES.values() if row[0] == name), None)
-    if found is None:
+    if name not in LENSES:
         raise ValueError(
             f"{printable_line(name, 40)} is no camera that is read here; undistort the photographs with "
             "`colmap image_undistorter`"
         )
-    _, formula, keys = found
+    _, formula, keys = LENSES[name]
     values = dict(zip(keys.split(), map(float, parameters), strict=True))
     if not np.isfinite(parameters).all():
         raise ValueError(f"a {name} camera with {values}")
@@ -153,15 +152,13 @@ def _records(data: bytes, kind: Any, rest: Callable[[Any, int], int]) -> Iterato
 
 
 def _binary_cameras(data: bytes) -> dict[int, PhotoIntrinsics]:
-    def row(camera: Any) -> tuple[str, Any, str]:
-        return LENSES.get(int(camera["lens"]), (f"number {camera['lens']}", None, ""))
-
-    return {
-        int(camera["id"]): lens_of(
-            row(camera)[0], int(camera["width"]), int(camera["height"]), np.frombuffer(parameters)
-        )
-        for camera, parameters in _records(data, CAMERA, lambda camera, _: 8 * len(row(camera)[2].split()))
-    }
+    rows = {number: (name, 8 * len(keys.split())) for name, (number, _, keys) in LENSES.items()}
+    lenses = {}
+    for camera, parameters in _records(data, CAMERA, lambda camera, _: rows.get(camera["lens"], ("", 0))[1]):
+        name, _ = rows.get(camera["lens"], (f"number {camera['lens']}", 0))
+        size = int(camera["width"]), int(camera["height"])
+        lenses[int(camera["id"])] = lens_of(name, *size, np.frombuffer(parameters))
+    return lenses
 
 
 def _binary_images(data: bytes) -> list[ModelImage]:

@@ -188,11 +188,8 @@ def load_config(kind: Any, weights: Weights, name: str) -> Any:
 
 
 # Settings whose parts are built one by one, for hours before anybody compares, and the side of images in px.
-LARGEST = {
-    **dict.fromkeys(("num_hidden_layers", "blocks_per_stage", "iou_head_depth"), 512),
-    **dict.fromkeys(("num_multimask_outputs", "num_point_embeddings"), 512),
-    "image_size": 1 << 14,
-}
+_PARTS = ("num_hidden_layers", "blocks_per_stage", "iou_head_depth", "num_multimask_outputs")
+LARGEST = {**dict.fromkeys((*_PARTS, "num_point_embeddings"), 512), "image_size": 1 << 14}
 
 
 def _check_counts(id: str, settings: Any) -> None:

@@ -27,7 +27,7 @@ WIDTH, HEIGHT = 320, 240
 FOCAL = {"f": 260.0, "fx": 260.0, "fy": 255.0, "cx": 166.0, "cy": 117.0}
 COEFFICIENTS = {"k1": -0.12, "k2": 0.03, "k3": -0.01, "k4": 0.004, "k5": 0.002, "k6": -0.001}
 COEFFICIENTS |= {"p1": 0.001, "p2": -0.0015}
-KEYS = {name: keys.split() for name, _, keys in LENSES.values()}
+KEYS = {name: keys.split() for name, (_, _, keys) in LENSES.items()}
 
 
 def parameters_of(model: str) -> Array:
@@ -48,7 +48,7 @@ def test_pixels_agree_with_colmap(model: str) -> None:
     xy = np.random.default_rng(0).uniform(-0.6, 0.6, (200, 2))
     xy[0] = 0  # the axis, where the fisheye formula divides zero by zero
     theirs = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=parameters)
-    assert LENSES[int(theirs.model.value)][0] == model
+    assert LENSES[model][0] == int(theirs.model.value)
     want = theirs.img_from_cam(np.concatenate([xy, np.ones((200, 1))], 1))
     found = lens_of(model, WIDTH, HEIGHT, parameters).pixels(xy)
     np.testing.assert_allclose(found, want, rtol=0, atol=1e-9)
