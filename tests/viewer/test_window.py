@@ -163,36 +163,3 @@ def test_window_memory_stays_small():
         timeout=120,
     )
     assert done.stdout.strip() == "[]", done.stderr
-
-
-HEAPS = """
-import ctypes, sys, threading
-from langsplat_viewer.jobs import share_one_heap
-if sys.argv[1] == "one":
-    share_one_heap()
-library = ctypes.CDLL(None)
-library.malloc.restype = ctypes.c_void_p
-together = threading.Barrier(4)
-def take():
-    together.wait(30)
-    library.malloc(1000)
-    together.wait(30)
-threads = [threading.Thread(target=take) for _ in range(4)]
-for thread in threads:
-    thread.start()
-for thread in threads:
-    thread.join()
-library.malloc_info(0, ctypes.c_void_p.in_dll(library, "stdout"))
-library.fflush(None)
-"""
-
-
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="of glibc")
-def test_threads_share_one_heap():
-    def heaps(how: str) -> int:
-        said = subprocess.run([sys.executable, "-c", HEAPS, how], capture_output=True, text=True, check=True)
-        return said.stdout.count("<heap nr=")
-
-    if heaps("many") == 1:
-        pytest.skip("this C library does not tell")
-    assert heaps("one") == 1

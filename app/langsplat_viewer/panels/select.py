@@ -186,12 +186,12 @@ def draw_stroke(viewer: Viewer, area: ui.Area) -> None:
         if tools.tool == "brush":
             _stripe(paint, points, radius)
         else:
-            paint.add_polyline(points, _colour(DARK), 3.0, 0)
-            paint.add_polyline(points, _colour(LIGHT), 1.5, 0)
+            paint.add_polyline(points, imgui.get_color_u32(DARK), 3.0, 0)
+            paint.add_polyline(points, imgui.get_color_u32(LIGHT), 1.5, 0)
     io = imgui.get_io()
     if tools.tool == "brush" and (drawn is not None or not io.want_capture_mouse):
-        paint.add_circle(io.mouse_pos, radius, _colour(DARK), 0, 3.0)
-        paint.add_circle(io.mouse_pos, radius, _colour(LIGHT), 0, 1.0)
+        paint.add_circle(io.mouse_pos, radius, imgui.get_color_u32(DARK), 0, 3.0)
+        paint.add_circle(io.mouse_pos, radius, imgui.get_color_u32(LIGHT), 0, 1.0)
     paint.pop_clip_rect()
 
 
@@ -203,9 +203,9 @@ def _on_screen(line: Array, area: ui.Area) -> list[Any]:
 def _stripe(paint: Any, points: list[Any], radius: float) -> None:
     """Draw the way of the brush, as wide as it is; of a click a disk."""
     if len(points) == 1:
-        paint.add_circle_filled(points[0], radius, _colour(PAINT))
+        paint.add_circle_filled(points[0], radius, imgui.get_color_u32(PAINT))
     else:
-        paint.add_polyline(points, _colour(PAINT), 2 * radius, 0)
+        paint.add_polyline(points, imgui.get_color_u32(PAINT), 2 * radius, 0)
 
 
 def draw_hint(viewer: Viewer, area: ui.Area) -> None:
@@ -222,10 +222,6 @@ def draw_hint(viewer: Viewer, area: ui.Area) -> None:
     say(text, area, "tool", hello_imgui.em_size(0.7))
 
 
-def _colour(colour: tuple[float, float, float, float]) -> Any:
-    return imgui.get_color_u32(colour)
-
-
 # The panel "Transform": gizmo, numbers, crop box; and the gizmo over the scene.
 
 gizmo = imguizmo.im_guizmo
@@ -237,6 +233,10 @@ OPERATIONS = {
 GIZMOS: dict[Gizmo, str] = {
     kind: f"{'No gizmo' if kind == 'off' else kind.capitalize()}##gizmo" for kind in get_args(Gizmo)
 }
+OF_BOX: tuple[ui.Verb, ...] = (
+    ("Fit", editing.fill_box, "The box around the selection, or around everything"),
+    ("Crop", editing.crop, "Delete what lies outside the box; the file stays as it is"),
+)
 NEAR, FAR = 1e-3, 1e3  # depths that the gizmo's camera sees, of the distance to what it turns around
 
 
@@ -252,11 +252,11 @@ def draw_transform(viewer: Viewer) -> None:
     if ui.button("Apply", "Scale and rotate about the middle of what is transformed, then move"):
         editing.apply_form(viewer)
     imgui.separator()
-    _crop_box(viewer)
-    if ui.button("Fit", "The box around the selection, or around everything"):
-        editing.fill_box(viewer)
-    if ui.next_button("Crop", "Delete what lies outside the box; the file stays as it is"):
-        editing.crop(viewer)
+    low = _three("From", form.low, "A corner of the box, world units")
+    high = _three("To", form.high, "The opposite corner")
+    if (low, high) != (form.low, form.high):
+        editing.set_box(viewer, low, high)
+    ui.verbs(viewer, OF_BOX)
     imgui.end_disabled()
 
 
@@ -266,14 +266,6 @@ def _numbers(form: EditForm) -> EditForm:
     ui.leave_room("Scale", 12)
     _, scale = imgui.input_float("Scale", form.scale, 0, 0, "%.5g")
     return replace(form, move=move, rotate=rotate, scale=scale)
-
-
-def _crop_box(viewer: Viewer) -> None:
-    form = viewer.state.edit_form
-    low = _three("From", form.low, "A corner of the box, world units")
-    high = _three("To", form.high, "The opposite corner")
-    if (low, high) != (form.low, form.high):
-        editing.set_box(viewer, low, high)
 
 
 def _three(label: str, values: Point, what: str) -> Point:
