@@ -113,7 +113,7 @@ def draw(options: ViewerOptions, path: Path, services: Services, progress: Progr
 def _first_camera(scene: Scene, options: ViewerOptions) -> Camera:
     """Return the camera that is chosen, else the first training camera, else one that frames the scene."""
     size = options.wanted_size
-    camera = chosen_camera(scene, options.camera) or (scene.cameras[0] if scene.cameras else None)
+    camera = chosen_camera(options.camera, scene) or (scene.cameras[0] if scene.cameras else None)
     if camera is None:
         camera = default_view(scene, extent_of(scene), size or DEFAULT_SIZE).camera(*(size or DEFAULT_SIZE))
     elif size is not None and size != (camera.width, camera.height):

@@ -34,6 +34,7 @@ from langsplat_viewer.rendering.request import Clip
 from langsplat_viewer.viewer import Services
 
 DisplayChoice = Literal["auto", Display]
+INDEX = re.compile(r"-?[0-9]+")
 WARMING = 64  # Gaussians of the image that has the kernels compiled
 MAX_SIDE = 16_384  # pixels; beyond it drivers refuse textures
 Seconds = Annotated[float, Range(0.1, 36_000.0)]
@@ -153,34 +154,24 @@ def scene_path(scene: Path | None) -> Path:
     return scene
 
 
-def camera_file(choice: str) -> Camera | None:
-    """Return the camera of a `--camera FILE`; None where `choice` is empty or an index.
-
-    Raises InputError.
-    """
-    if not choice or re.fullmatch(r"-?[0-9]+", choice):
-        return None
-    cameras = read_cameras(Path(choice))
-    if not cameras:
-        raise InputError(f"--camera {choice}: the file holds no camera")
-    return cameras[0]
-
-
-def chosen_camera(scene: Scene, choice: str) -> Camera | None:
+def chosen_camera(choice: str, scene: Scene | None = None) -> Camera | None:
     """Return the camera that `--camera` names, of a file or by its index; None for no choice.
 
-    Raises InputError.
+    Without a scene only files are read. Raises InputError.
     """
-    if not choice:
+    if not choice or (scene is None and INDEX.fullmatch(choice)):
         return None
-    of_file = camera_file(choice)
-    if of_file is not None:
-        return of_file
-    if not scene.cameras:
+    if not INDEX.fullmatch(choice):
+        cameras = read_cameras(Path(choice))
+        if not cameras:
+            raise InputError(f"--camera {choice}: the file holds no camera")
+        return cameras[0]
+    cameras = () if scene is None else scene.cameras
+    if not cameras:
         raise InputError(f"--camera {choice}: the scene has no training cameras; name a camera file instead")
-    if not 0 <= int(choice) < len(scene.cameras):
-        raise InputError(f"--camera {choice}: the scene has cameras 0 to {len(scene.cameras) - 1}")
-    return scene.cameras[int(choice)]
+    if not 0 <= int(choice) < len(cameras):
+        raise InputError(f"--camera {choice}: the scene has cameras 0 to {len(cameras) - 1}")
+    return cameras[int(choice)]
 
 
 def check_display(scene: Scene, display: Display, queries: tuple[str, ...]) -> None:

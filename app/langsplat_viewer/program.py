@@ -10,7 +10,7 @@ from langsplat_core.cli.run import main, parsed
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, TerminalProgress, silent
 from langsplat_viewer.files.projects import PROJECTS
-from langsplat_viewer.options import ViewerOptions, camera_file, scene_path, services
+from langsplat_viewer.options import ViewerOptions, chosen_camera, scene_path, services
 
 WITHOUT_WINDOW = ("out", "turntable", "colour_map", "transparent", "near_cut", "far_cut")
 
@@ -22,7 +22,7 @@ class ViewerCommand(ViewerOptions):
     def run(self) -> None:
         self.wanted_size, self.picture  # noqa: B018  what cannot be read is said before anything slow is done
         path = scene_path(self.scene)
-        camera_file(self.camera)
+        chosen_camera(self.camera)
         if self.headless and self.beside is not None:
             raise InputError("--beside is for the window; draw the two scenes one after the other")
         if self.headless and path.name.endswith(PROJECTS):

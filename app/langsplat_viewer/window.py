@@ -281,7 +281,7 @@ class Window:
         state, options = viewer.state, self._options
         assert state.scene is not None
         try:
-            camera = chosen_camera(state.scene, options.camera)
+            camera = chosen_camera(options.camera, state.scene)
             if camera is not None:
                 viewpoint.open_at(viewer, camera)
         except InputError as error:
