@@ -50,10 +50,6 @@ def test_a_long_line_keeps_its_ends() -> None:
     assert line.endswith("xxx end")
     assert len(str(InputError("y" * 10_000))) == errors.LINE_LIMIT
     assert printable_line("z" * 100, 100) == "z" * 100
-
-
-def test_a_quotation_is_short_with_its_escapes() -> None:
-    assert quoted("red mug", 60) == "'red mug'"
     assert len(quoted("\x00" * 60, 60)) == 60
 
 
@@ -68,13 +64,10 @@ def test_progress_as_lines_for_other_programs(capsys):
     reports = [Report.from_json(line) for line in capsys.readouterr().err.splitlines()]
     assert reports == [Report("a\n", 0.25, "one", {"loss": 0.25}), Report("b", 1.0)]
     assert reports[0].text == "a\n: one, loss 0.2500"
+    assert Report("a", 0.5, "b", {"psnr": 20.06}).text == "a: b, PSNR 20.1 dB"
     for line in ("words", '{"stage": 3}', '"text"', "[1]", '{"stage": "a", "fraction": 0, "metrics": 1}'):
         with pytest.raises(ValueError):
             Report.from_json(line)
-
-
-def test_a_report_in_words_names_its_metrics():
-    assert Report("a", 0.5, "b", {"psnr": 20.06}).text == "a: b, PSNR 20.1 dB"
 
 
 @pytest.mark.parametrize("stopped", [False, True])

@@ -44,14 +44,6 @@ class Style(NamedTuple):
     table: Array  # (NODES, 3) the colour map
 
 
-class Planes(NamedTuple):
-    """The channels of an image as a kernel takes them, float32."""
-
-    rgb: Array  # (H, W, 3)
-    alpha: Array  # (H, W)
-    extra: Array  # (H, W, C)
-
-
 def compose(channels: Channels, picture: PictureConfig, ranges: Ranges = ()) -> Array:
     """(H, W, 3) uint8 image; with `picture.transparent` (H, W, 4), its colours not premultiplied.
 
@@ -67,7 +59,7 @@ def compose_upwards(channels: Channels, picture: PictureConfig, ranges: Ranges =
     Opaque unless the picture is transparent.
     """
     extra = channels.alpha[..., None] if channels.extra is None else channels.extra
-    planes = Planes(*(np.asarray(plane, np.float32) for plane in (channels.rgb, channels.alpha, extra)))
+    planes = tuple(np.asarray(plane, np.float32) for plane in (channels.rgb, channels.alpha, extra))
     style = Style(
         drawing=int(drawing_of(picture.display, channels.extra is not None)),
         transparent=picture.transparent,
@@ -143,24 +135,25 @@ def _depth(shown: Array, depth: Any, is_open: bool, style: Style) -> None:
 
 
 @kernel
-def _rows(first: int, last: int, image: Array, planes: Planes, style: Style) -> None:
-    """Compose rows [first, last) of the planes, row 0 on top, into `image`."""
-    height, width = planes.alpha.shape
+def _rows(first: int, last: int, image: Array, planes: tuple[Array, Array, Array], style: Style) -> None:
+    """Compose rows [first, last) of (H, W, 3) colours, (H, W) alpha and (H, W, C) values into `image`."""
+    rgb, alphas, extra = planes
+    height, width = alphas.shape
     shown, base = np.empty(3, np.float32), np.empty(3, np.float32)
-    values = np.empty(planes.extra.shape[2], np.float32)
+    values = np.empty(extra.shape[2], np.float32)
     for y in range(first, last):
         for x in range(width):
-            alpha = planes.alpha[y, x]
+            alpha = alphas[y, x]
             is_open = alpha > style.gate
             scale = 1 / alpha if is_open else np.float32(0)
             share = 1 / max(alpha, np.float32(LEAST_ALPHA)) if style.transparent else np.float32(1)
             for k in range(3):
-                own = planes.extra[y, x, k] if style.drawing == Drawing.SUMS else planes.rgb[y, x, k]
+                own = extra[y, x, k] if style.drawing == Drawing.SUMS else rgb[y, x, k]
                 mixed = _clip(own * share + (1 - alpha) * style.backdrop[k])
                 base[k] = alpha if style.drawing == Drawing.ALPHA else mixed
                 shown[k] = base[k]
             for k in range(len(values)):
-                values[k] = planes.extra[y, x, k] * scale
+                values[k] = extra[y, x, k] * scale
             opacity = np.float32(1) if style.drawing == Drawing.ALPHA or not style.transparent else alpha
             if style.drawing == Drawing.HEAT:
                 _heat(shown, base, values, style)

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -146,19 +147,22 @@ def test_images_and_depths_equal_the_reference(fast_backend: Backend, slow: bool
     assert flipped <= 1e-3 * pixels
 
 
+def check_gradients(view: Any, values: Array, without: Array) -> None:
+    """Finite everywhere, and exactly zero for the rows `without`."""
+    rng, size = np.random.default_rng(2), (view.camera.height, view.camera.width)
+    by_image, by_alpha = rng.normal(size=(*size, values.shape[1])), rng.normal(size=size)
+    for name, gradient in view.backward(values, by_image, by_alpha)._asdict().items():
+        assert len(gradient) == len(values)
+        assert np.isfinite(gradient).all(), name
+        assert not gradient[without].any(), name
+
+
 def test_gradients_are_finite(slow: bool) -> None:
     """Of the CPU backend; those that are not drawn have none."""
 
     def law(case: Drawn) -> None:
-        gaussians, camera, raster_settings = case
-        view = CpuRasterizer().view(gaussians, camera, raster_settings)
-        rng = np.random.default_rng(1)
-        by_image = rng.normal(size=(camera.height, camera.width, 2))
-        gradients = view.backward(random_values(len(gaussians), 2), by_image, by_image[..., 0])
-        undrawn = view.radii == 0
-        for name, gradient in gradients._asdict().items():
-            assert np.isfinite(gradient).all(), name
-            assert not gradient[undrawn].any(), name
+        view = CpuRasterizer().view(*case)
+        check_gradients(view, random_values(len(case[0]), 2), view.radii == 0)
 
     over_random_cases(law, slow)
 
@@ -219,7 +223,7 @@ def run_case(case: Case, drawing: Drawing, backend: Backend, measured: Measure) 
         check_adjoint(seen)
         check_frozen(seen)
     if hasattr(seen.view, "backward"):
-        check_gradients(seen)
+        check_gradients(seen.view, seen.drawing.features(), ~seen.drawing.gaussians.valid())
     return seen
 
 
@@ -261,19 +265,6 @@ def check_frozen(seen: Seen) -> None:
     assert np.abs(image - seen.image).max(initial=0) <= count * 0.5 / 65535 + 1e-6
     assert frozen.dropped == seen.view.dropped
     check_adjoint(replace(seen, view=frozen, image=image))
-
-
-def check_gradients(seen: Seen) -> None:
-    """Finite everywhere, exactly zero for dropped rows."""
-    rng = np.random.default_rng(2)
-    by_image, by_alpha = rng.normal(size=seen.image.shape), rng.normal(size=seen.alpha.shape)
-    gradients = seen.view.backward(seen.drawing.features(), by_image, by_alpha)
-    dropped = ~seen.drawing.gaussians.valid()
-    assert gradients.values.shape == seen.drawing.features().shape
-    for name, gradient in gradients._asdict().items():
-        assert len(gradient) == len(dropped)
-        assert np.isfinite(gradient).all(), name
-        assert not gradient[dropped].any(), name
 
 
 @pytest.mark.parametrize("case", NAMED)

@@ -24,7 +24,7 @@ from langsplat_core.raster.protocol import LiftingView, check_size, mean_depth
 from langsplat_core.scene import Camera, Gaussians
 
 _CHANNELS_AT_ONCE = 32  # a tile's state stays in the first level cache
-_SPARE_BLOCKS = 16  # a view takes five
+_SPARE_BLOCKS = 16  # a view takes five, its gradients seven
 
 
 class _Loan:
@@ -69,12 +69,12 @@ class CpuView(LiftingView):
         memory: Memory,
     ) -> None:
         n = self.count = len(gaussians)
-        self.camera, self.workers = camera, workers
+        self.camera, self.workers, self._empty = camera, workers, memory.empty
         self._kernel_camera = projection.kernel_camera(camera, settings)
         self._rows = projection.rows_of(gaussians)
         self._kept: tuple[Kept, Array] | None = None  # weights and alpha, of a frozen view
         found = projection.Projection(
-            memory.empty((n, projection.COLUMNS), np.float64), np.empty(n), np.empty(n, np.uint8)
+            self._empty((n, projection.COLUMNS), np.float64), np.empty(n), np.empty(n, np.uint8)
         )
         workers.run(projection.project, n, self._rows, self._kernel_camera, found)
         drawn = np.flatnonzero(found.status == projection.DRAWN).astype(np.int32)
@@ -82,7 +82,7 @@ class CpuView(LiftingView):
         order = depth_order(depths)
         self.order, self._depths = drawn[order], depths[order]  # (M,) int32 rows, (M,) float64
         size = camera.width, camera.height
-        self.tiles = bin_tiles(found.geometry, self.order, size, settings, workers, memory.empty)
+        self.tiles = bin_tiles(found.geometry, self.order, size, settings, workers, self._empty)
         self.dropped = int(np.count_nonzero(found.status == projection.INVALID))
 
     @property
@@ -162,10 +162,10 @@ class CpuView(LiftingView):
         check_array("alpha_grad", alpha_grad, (height, width))
         grads = (plain(image_grad), plain(alpha_grad)[..., None])
         met, columns = len(self.tiles.ranks), backward.MOMENTS + padded(channels)
-        partial, reached = np.empty((met, columns), np.float32), np.empty(met, bool)
+        partial, reached = self._empty((met, columns), np.float32), np.empty(met, bool)
         self._over_tiles(backward.backward, plain(values[self.order]), grads, partial, reached)
         shapes = (3,), (3,), (4,), (), (channels,), (2,)
-        out = GaussianGradients(*(np.empty((n, *shape), np.float32) for shape in shapes))
+        out = GaussianGradients(*(self._empty((n, *shape), np.float32) for shape in shapes))
         rank_of = np.full(n, -1, np.int32)
         rank_of[self.order] = np.arange(len(self.order), dtype=np.int32)
         sums = backward.Sums(rank_of, partial, reached)
