@@ -195,9 +195,6 @@ class Session:
     queries: Annotated[tuple[Query, ...], Meta(max_length=200)] = ()  # in the order of asking
     chosen: str = ""  # the phrase whose details are shown
     level: LevelChoice = "auto"
-    canonical: Annotated[
-        tuple[Phrase, ...], Meta(max_length=200)
-    ] = ()  # all is compared with; none: the scene's
 
     # what was selected, edited, named and noted
     marks: Marked = field(default_factory=Marked)
@@ -245,7 +242,7 @@ class Session:
     def undone(self, now: "Session") -> "Session":
         """Return this earlier session with what is never undone as it is `now`."""
         ruler = now.ruler if now.moves == self.moves else replace(now.ruler, points=())
-        return replace(self, canonical=now.canonical, bookmarks=now.bookmarks, ruler=ruler)
+        return replace(self, bookmarks=now.bookmarks, ruler=ruler)
 
     def of_next_scene(self, bookmarks: tuple[Bookmark, ...]) -> "Session":
         """Return the session that another scene begins with: settings of the window stay."""

@@ -154,23 +154,19 @@ def _plain(value: Any, sure: bool) -> Any:
     return made
 
 
-def _looks(described: dict[str, Any]) -> str:
-    return " ".join(described[key]["phrase"] for key in ("colour", "material") if described[key] is not None)
-
-
 def _percent(described: dict[str, Any]) -> str:
     return "" if described["probability"] is None else f" {100 * described['probability']:.0f} %"
 
 
 def _print_inventory(entries: list[dict[str, Any]]) -> None:
-    table = Table("what", "also", "level", "p %", "surface %", "looks", "centre", box=None)
+    table = Table("what", "also", "level", "p %", "surface %", "centre", box=None)
     for entry in entries:
         sure = _percent(entry).strip(" %") or "-"
         names = (entry["phrase"], ", ".join(entry["also"]), entry["level"], sure)
         for number, spot in enumerate(entry["spots"]):
             centre = " ".join(f"{value:.2f}" for value in spot["centre"])
             start = names if number == 0 else ("", "", "", "")
-            table.add_row(*start, f"{100 * spot['share']:.2f}", _looks(spot), centre)
+            table.add_row(*start, f"{100 * spot['share']:.2f}", centre)
     console = OutputConsole()
     OutputConsole(width=max(WIDTH, console.width)).print(table)
     if not entries:
@@ -219,8 +215,7 @@ def _print_words(levels: list[dict[str, Any]]) -> None:
             print(f"{level['level']:<8} nothing is known here")
             continue
         said = ", ".join(word["phrase"] + _percent(word) for word in level["words"])
-        looks = _looks(level)
-        print(f"{level['level']:<8} {said}" + (f"; looks {looks}" if looks else ""))
+        print(f"{level['level']:<8} {said}")
 
 
 @dataclass(frozen=True)

@@ -26,12 +26,11 @@ from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.raster.render import pixel_weights
 from langsplat_core.scene import LEVELS, Camera, CodebookCodec, Codec, LanguageField
 from langsplat_core.scene.surface import surface_areas
-from langsplat_core.semantics.vocabulary import Bundled, bundled_vocabulary
+from langsplat_core.semantics.vocabulary import bundled_vocabulary
 
 # Logits per spread of phrases' cosines with a feature: a probability is then right about so often, with the
 # bundled encoder and with the geometry of CLIP (rooms 201 to 203, docs/searching.md).
 WORD_SCALE = 6.0
-ATTRIBUTE_SCALE = 3.4
 NEAREST = 10  # features that make a word's hub, as in the paper
 BANK = 4096  # features that are looked at for it, of codebooks; of other codecs fewer, since none is distinct
 SAMPLES = 512
@@ -128,23 +127,11 @@ def build_words(field: LanguageField, phrases: tuple[str, ...], vectors: Array) 
     """Return scores of names of things, from V phrases and their (V, D) unit vectors."""
     every = np.concatenate([vectors, field.canonical]).astype(np.float32)
     bank = field_features(field)
-    return WordScores(
-        field.codec, phrases, every, hubs(every, bank), WORD_SCALE / _spread(field, vectors, bank)
-    )
-
-
-def build_attributes(field: LanguageField, phrases: tuple[str, ...], vectors: Array) -> WordScores:
-    """Return scores of words of which a thing has one, such as colours: few and alike, they are no hubs."""
-    scale = ATTRIBUTE_SCALE / _spread(field, vectors, field_features(field))
-    no_hubs = np.zeros(len(vectors), np.float32)
-    return WordScores(field.codec, phrases, vectors.astype(np.float32), no_hubs, scale)
-
-
-def _spread(field: LanguageField, vectors: Array, bank: Array) -> float:
-    """Return the median, over features, of the spread of everyday phrases' cosines, else of the words'."""
+    # The scale is in the median, over features, of the spread of everyday phrases' cosines, else the words'.
     texts = vectors if field.everyday is None else field.everyday
     spreads = (bank @ texts.T).std(1) if len(bank) and len(texts) > 1 else np.ones(1)
-    return max(float(np.median(spreads)), NARROWEST)
+    scale = WORD_SCALE / max(float(np.median(spreads)), NARROWEST)
+    return WordScores(field.codec, phrases, every, hubs(every, bank), scale)
 
 
 def field_features(field: LanguageField) -> Array:
@@ -166,9 +153,6 @@ def hubs(vectors: Array, bank: Array) -> Array:
 
 # Places in words.
 
-CERTAIN = 0.5  # probability from which a colour or material is said
-ATTRIBUTES: tuple[Bundled, ...] = ("colours", "materials")
-
 
 @dataclass(frozen=True)
 class LevelWords:
@@ -178,8 +162,6 @@ class LevelWords:
     words: tuple[Word, ...]  # the most probable first; none where nothing is known
     other: float  # probability that no word of the vocabulary fits
     known: float  # share of the place that has a feature at this level, in [0, 1]
-    colour: Word | None = None  # where one is `CERTAIN` enough
-    material: Word | None = None
 
 
 Levels = tuple[LevelWords, ...]  # of subpart, part and whole
@@ -212,8 +194,6 @@ class Describer:
         every = build_words(field, known, vectors)
         self.words: tuple[WordScores, WordScores, WordScores]
         self.words = every, every, every.take(np.isin(known, things))
-        taught = [engine.known_vectors(bundled_vocabulary(name), progress) for name in ATTRIBUTES]
-        self._attributes = [build_attributes(field, *pair) if pair[0] else None for pair in taught]
 
     @cached_property
     def areas(self) -> Array:
@@ -244,19 +224,7 @@ class Describer:
         best = np.argsort(-shares[: len(names.phrases)], kind="stable")[: max(top, 0)]
         words = tuple(Word(names.phrases[i], float(shares[i])) for i in best)
         other = float(shares[len(names.phrases) :].sum())
-        return LevelWords(level, words, other, seen / total, *self.appearance(latents, weights))
-
-    def appearance(self, latents: Array, weights: Array) -> tuple[Word | None, Word | None]:
-        """Return colour and material of (M, d) latents, weighted by (M,), where one is certain."""
-        colour, material = (self._certain(words, latents, weights) for words in self._attributes)
-        return colour, material
-
-    def _certain(self, words: WordScores | None, latents: Array, weights: Array) -> Word | None:
-        if words is None:
-            return None
-        shares = words.mixture(latents, weights)
-        best = int(shares.argmax())
-        return Word(words.phrases[best], float(shares[best])) if shares[best] >= CERTAIN else None
+        return LevelWords(level, words, other, seen / total)
 
 
 @dataclass(frozen=True, eq=False)

@@ -83,8 +83,7 @@ class QueryEngine:
     """Queries against one scene.
 
     What depends on the scene alone is computed at the first query, and the text encoder is loaded when a
-    phrase first needs it. Several threads may ask at once, and take turns at the encoder; none may call
-    `compare_with` meanwhile.
+    phrase first needs it. Several threads may ask at once, and take turns at the encoder.
     """
 
     def __init__(
@@ -114,8 +113,6 @@ class QueryEngine:
         self._turn = RLock()  # at the encoder, whose tokenizer is not made for two at once
         # Of phrases that can be asked without encoding, 2 KB each at D = 512.
         self._vectors: dict[str, Array] = {} if scene.language is None else dict(scene.language.phrasebook)
-        self._canonical: Array | None = None  # (C, D) in place of the scene's own
-        self.canonical_phrases: tuple[str, ...] = CANONICAL_PHRASES
         taught = () if scene.language is None else scene.language.taught
         if words is not None:
             check_words(self.field, words)
@@ -166,11 +163,11 @@ class QueryEngine:
 
     @property
     def field(self) -> LanguageField:
-        """The scene's language field, see `compare_with`; InputError where it has none."""
+        """The scene's language field; InputError where it has none."""
         field = self.scene.language
         if field is None:
             raise InputError(no_field(self.scene))
-        return field if self._canonical is None else replace(field, canonical=self._canonical)
+        return field
 
     @property
     def rule(self) -> AnswerRule:
@@ -185,9 +182,8 @@ class QueryEngine:
 
     @property
     def calibration(self) -> Calibration | None:
-        """The calibration of probabilities; None with other canonical phrases than it was fitted with."""
-        usual = self._canonical is None and self.rule == "regions"
-        return self.field.calibration if usual else None
+        """The calibration of probabilities, by regions alone."""
+        return self.field.calibration if self.rule == "regions" else None
 
     @cached_property
     def compared(self) -> LanguageField:
@@ -237,17 +233,6 @@ class QueryEngine:
         ]
         return bars_of(self.regions.table, self.chance, np.concatenate(chosen))
 
-    def compare_with(self, phrases: Sequence[str] = (), progress: Progress = silent) -> None:
-        """Take other canonical phrases (LERF, section 3.3) from now on; without any, the scene's own again.
-
-        With others no probability is said. Raises as `text_vectors` does, and leaves everything as it was.
-        """
-        canonical = self.text_vectors(phrases, progress) if phrases else None
-        self._canonical = canonical
-        self.canonical_phrases = tuple(map(phrase_key, phrases)) or CANONICAL_PHRASES
-        for made in ("compared", "_lookup", "chance", "bars"):
-            self.__dict__.pop(made, None)
-
     @property
     def basis(self) -> Basis:
         """The basis of answers, by what is known so far: nothing is loaded for it."""
@@ -261,11 +246,11 @@ class QueryEngine:
         elif everyday is None:
             short = f"{name}, as published: no everyday phrases to compare with"
             long = f"{short}. Found is a relevancy of {field.found:g} or more, without percentages"
-        elif field.calibration is None or self._canonical is not None:
+        elif field.calibration is None:
             short = f"{name}, no calibration here: found is more than by chance"
             long = (
                 f"{short}. Of phrases that name nothing in the scene, 19 in 20 are not found. Percentages "
-                "need a calibration in such scenes, and the canonical phrases that it was made with"
+                "need a calibration in such scenes"
             )
         else:
             short, calibration = f"{name}, calibrated in drawn rooms", "drawn rooms"

@@ -41,8 +41,6 @@ class Spot:
     box: Array  # (2, 3) lower and upper corner, world units, between 2 % and 98 % of its Gaussians
     rows: Array  # (M,) int64 numbers of its Gaussians
     share: float  # of the scene's surface, in [0, 1]
-    colour: Word | None
-    material: Word | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +148,7 @@ def _verified(describer: Describer, claim: _Claim) -> InventoryEntry | None:
         agreed = claim.rows[result.relevancy[level, claim.rows] > FLOOR]
         if not result.found or 2 * areas[agreed].sum() < areas[claim.rows].sum():
             continue
-        spots = _spots(describer, level, agreed)
+        spots = _spots(describer, agreed)
         if spots:
             others = tuple(other for other in claim.phrases if other != phrase)
             share = float(sum(spot.share for spot in spots))
@@ -158,7 +156,7 @@ def _verified(describer: Describer, claim: _Claim) -> InventoryEntry | None:
     return None
 
 
-def _spots(describer: Describer, level: int, rows: Array) -> tuple[Spot, ...]:
+def _spots(describer: Describer, rows: Array) -> tuple[Spot, ...]:
     """Return the connected parts of Gaussians `rows` (M,), the largest first, without splinters."""
     engine, areas, found = describer.engine, describer.areas, []
     on_surface = engine.surface.rows
@@ -172,8 +170,7 @@ def _spots(describer: Describer, level: int, rows: Array) -> tuple[Spot, ...]:
             engine.scene.gaussians.means[own].astype(np.float64),
         )
         centre, share = weights @ positions / weights.sum(), float(weights.sum()) / float(areas.sum())
-        seen = describer.appearance(engine.field.latents[level, own], weights)
-        found.append(Spot(centre, axis_aligned_box(positions), own, share, *seen))
+        found.append(Spot(centre, axis_aligned_box(positions), own, share))
     return tuple(found)
 
 

@@ -11,7 +11,7 @@ from itertools import chain, pairwise, product
 import numpy as np
 
 from assets.making.dataset import MIN_PIXELS, Region, Truth, photographed_room
-from assets.making.world import CATEGORIES, World, colour_words, object_words
+from assets.making.world import CATEGORIES, World, object_words
 from langsplat_core.arrays import Array
 from langsplat_core.extensions.benchmarks.report import intersection_over_union, markdown
 from langsplat_core.query.answers import QueryResult
@@ -299,7 +299,6 @@ class RoomWords:
 
     seed: int
     names: tuple[LevelNames, ...]
-    colour: float  # share of whole things of one colour whose most certain colour is right
     inventory: InventoryScore
 
 
@@ -312,8 +311,7 @@ def name_regions(room: Room) -> RoomWords:
     entries = scene_inventory(describer)
     seconds = time.perf_counter() - start
     score = score_inventory(entries, labels, truth, describer.areas, describer.words[2].phrases)
-    colour = _colours(describer, _regions(labels[2]), truth)
-    return RoomWords(room.seed, tuple(names), colour, replace(score, seconds=seconds))
+    return RoomWords(room.seed, tuple(names), replace(score, seconds=seconds))
 
 
 def _regions(labels: Array) -> dict[int, Array]:
@@ -336,13 +334,6 @@ def _names(describer: Describer, level: int, regions: Mapping[int, Array], truth
         rows.append((right[best[0]], right[best].any(), shares[best[0]], shares[right].sum()))
     mean = np.mean(rows, axis=0) if rows else np.zeros(4)
     return LevelNames(LEVELS[level], len(rows), *(float(value) for value in mean))
-
-
-def _colours(describer: Describer, regions: Mapping[int, Array], truth: Regions) -> float:
-    coloured = {key: members for key, members in regions.items() if truth[key].colour}
-    said = {key: describer.at_gaussians(members)[2].colour for key, members in coloured.items()}
-    hits = [one is not None and one.phrase in colour_words(truth[key].colour) for key, one in said.items()]
-    return float(np.mean(hits)) if hits else 0.0
 
 
 def score_inventory(
@@ -379,8 +370,8 @@ def word_table(rooms: Sequence[RoomWords]) -> str:
     )
     inventories = (
         (room.seed, room.inventory.entries, f"{100 * room.inventory.true:.0f}", room.inventory.things)
-        + (f"{100 * room.inventory.named:.0f}", f"{100 * room.colour:.0f}", f"{room.inventory.seconds:.1f}")
+        + (f"{100 * room.inventory.named:.0f}", f"{room.inventory.seconds:.1f}")
         for room in rooms
     )
-    listed = ("room", "listed", "true %", "things", "named %", "colour right %", "seconds")
+    listed = ("room", "listed", "true %", "things", "named %", "seconds")
     return f"{markdown(head, names)}\n{markdown(listed, inventories)}"

@@ -324,7 +324,7 @@ LABELS = np.stack([np.repeat([-1, -1, -1, -1], 30), np.repeat([-1] * 4, 30), np.
 
 
 def entry(phrase: str, rows: range, level: int = 2) -> InventoryEntry:
-    spot = Spot(np.zeros(3), np.zeros((2, 3)), np.array(rows), 0.1, None, None)
+    spot = Spot(np.zeros(3), np.zeros((2, 3)), np.array(rows), 0.1)
     return InventoryEntry(phrase, (), level, 0.9, 0.9, 0.1, (spot,))
 
 

@@ -9,7 +9,6 @@ from langsplat_core.arrays import Array, unit
 from langsplat_core.query import describe
 from langsplat_core.query.describe import (
     Describer,
-    build_attributes,
     build_words,
     field_features,
     look_at_pixel,
@@ -33,13 +32,6 @@ from tests.support.fakes import (
     named_scene,
 )
 from tests.support.scenes import unturned_gaussians
-
-
-@pytest.fixture(autouse=True)
-def few_attributes(monkeypatch):
-    """The bundled lists are real words, of which the fake encoder knows three."""
-    lists = {"things": ("mug", "book"), "parts": ("plant", "handle"), "colours": WORDS, "materials": ("red",)}
-    monkeypatch.setattr(describe, "bundled_vocabulary", lists.__getitem__)
 
 
 def describer(scene: Scene, vocabulary=NAMES) -> Describer:
@@ -69,9 +61,6 @@ def test_boolean_rows_and_weights_are_accepted():
     assert two == asked.at_gaussians(np.array([0, PER_BLOB]), np.array([3.0, 1.0]), top=2)[2]
     assert [word.phrase for word in two.words] == ["mug", "book"]
     np.testing.assert_allclose([word.probability for word in two.words], [0.75, 0.25], atol=0.01)
-    assert two.colour.phrase == "mug"  # of which one is certain; of three alike none is
-    assert asked.at_gaussians(np.arange(3) * PER_BLOB)[2].colour is None
-    assert two.material is None
 
 
 @pytest.mark.parametrize("codebook", [True, False])
@@ -142,7 +131,9 @@ def test_synonyms_share_an_entry_and_places_are_spots():
     assert scene_inventory(describer(named_scene(), ("wall",))) == []
 
 
-def test_bundled_parts_are_not_offered_for_wholes():
+def test_bundled_parts_are_not_offered_for_wholes(monkeypatch):
+    lists = {"things": ("mug", "book"), "parts": ("plant", "handle")}
+    monkeypatch.setattr(describe, "bundled_vocabulary", lists.__getitem__)
     asked = describer(named_scene(), None)
     assert asked.words[2].phrases == ("mug", "book")
     assert asked.words[0].phrases == asked.words[1].phrases == ("mug", "book", "plant")
@@ -239,9 +230,10 @@ def test_hub_word_does_not_answer_everywhere():
     made = LanguageField(codes, np.ones((3, 40), np.float32), codec, far, "none")
     vectors = np.concatenate([names, centre[None].astype(np.float32)])
     labels = (*(f"thing {number}" for number in range(40)), "hub")
+    words = build_words(made, labels, vectors)
     plain, right = (
-        (build(made, labels, vectors).best(codes[0], 1)[0][:, 0] == np.arange(40)).mean()
-        for build in (build_attributes, build_words)
+        (scores.best(codes[0], 1)[0][:, 0] == np.arange(40)).mean()
+        for scores in (replace(words, hubs=np.zeros_like(words.hubs)), words)
     )
     assert plain < 0.2 < 0.8 < right
 

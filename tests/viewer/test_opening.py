@@ -119,7 +119,6 @@ def test_scene_returns_with_its_camera_and_queries(three):
     assert (three.state.scene, three.state.scenes) == (SCENES["blobs.ply"], (BLOBS, PLAIN, BARE))
     assert settings.take(three.state, "wanted_panel") == "Scene"
     ask(three, "mug", "book")
-    act(queries.set_canonical, three, ("plant",))
     queries.hide(three, "mug")
     queries.set_cut(three, "book", 0.7)
     go(viewpoint.go_to_camera, three, 2)
@@ -128,7 +127,7 @@ def test_scene_returns_with_its_camera_and_queries(three):
     view = three.state.view
     act(opening.switch_scene, three, BARE)
     assert three.state.scene is SCENES["bare.ply"]
-    assert (three.state.session.queries, three.state.session.canonical) == ((), ())
+    assert three.state.session.queries == ()
     assert three.state.session.clip == UNCLIPPED
     ask(three, "plant")
     viewpoint.zoom_by(three, 2.0)
@@ -142,7 +141,6 @@ def test_scene_returns_with_its_camera_and_queries(three):
         ("book", 1, 0.7),
     ]
     assert result(three, 1).own_cut == 0.7
-    assert state.session.canonical == three.engine.canonical_phrases == ("plant",)
     assert (state.camera_index, len(state.session.keyframes)) == (2, 1)
     assert state.session.clip == Clip(1.0, 9.0)
     act(opening.switch_scene, three, BARE)
@@ -150,7 +148,6 @@ def test_scene_returns_with_its_camera_and_queries(three):
     assert errors(three) == []
     assert [query.phrase for query in three.state.session.queries] == ["plant"]
     assert three.state.shown_results()[0].found
-    assert three.engine.canonical_phrases != ("plant",)
 
 
 # The file browser, without a window.
@@ -388,7 +385,6 @@ def test_second_scene_follows_view_and_queries(two):
     for phrase in ("book", "nothing like this"):
         queries.ask(two, phrase)
     queries.set_level(two, "whole")
-    queries.set_canonical(two, ("book", "plant"))
     settings.set_display(two, "segmentation")
     settings.resize(two, 77, 55)
     act(viewpoint.move, two, lambda view: orbit(view, 0.2, 0.1))
@@ -399,21 +395,11 @@ def test_second_scene_follows_view_and_queries(two):
         "segmentation",
         (77, 55),
     )
-    assert other.session.canonical == ("book", "plant")
     assert other.view is two.state.view
     queries.hide(two, "mug")
     queries.remove(two, "book")
     meet(two)
     assert [(query.phrase, query.slot) for query in other.session.queries] == [("mug", None)]
-
-
-def test_second_scene_encodes_canonical_phrases_once(two):
-    labels, submit = [], two.beside.worker.submit
-    two.beside.worker.submit = lambda label, *rest: labels.append(label) or submit(label, *rest)
-    act(queries.set_canonical, two, ("book",))
-    for _ in range(5):
-        opening.follow_beside(two)
-    assert labels.count("encoding canonical phrases") == 1
 
 
 def test_second_scene_without_field_shows_colours_or_says_why(two):

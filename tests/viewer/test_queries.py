@@ -10,7 +10,6 @@ from numpy.testing import assert_allclose
 
 from langsplat_core.display.displays import NO_HEAT, Subject, relevancies
 from langsplat_core.errors import EncoderError, InputError
-from langsplat_core.scene import CANONICAL_PHRASES
 from langsplat_core.semantics.features import ImageFeatures
 from langsplat_viewer.actions import editing, opening, outline, queries, saving, settings
 from langsplat_viewer.actions.editing import take
@@ -201,37 +200,19 @@ def test_threshold_is_one_step_and_outlives_the_level(asked):
     assert result(asked).own_cut == 0.62
 
 
-def test_canonical_phrases_are_replaced_and_restored(asked):
-    before = result(asked)
-    act(queries.set_canonical, asked, ("book", "plant"))
-    assert asked.state.session.canonical == ("book", "plant")
-    assert asked.engine.canonical_phrases == ("book", "plant")
-    assert np.abs(result(asked).relevancy - before.relevancy).max() > 0.01
-    assert result(asked).probability is None
-    act(queries.set_canonical, asked, ("sofa",))  # never taught: all stays as it was
-    assert "sofa" in errors(asked)[-1]
-    assert asked.state.session.canonical == ("book", "plant")
-    act(queries.set_canonical, asked, ())
-    assert asked.state.session.canonical == ()
-    assert asked.engine.canonical_phrases == CANONICAL_PHRASES
-    np.testing.assert_array_equal(result(asked).relevancy, before.relevancy)
-
-
 @pytest.mark.parametrize("dropped", [lambda path: [path], lambda path: [path, Path("blobs.ply")]])
 def test_query_set_is_asked_alone_or_with_its_scene(asked, tmp_path, dropped):
     queries.set_cut(asked, "mug", 0.7)
     ask(asked, "plant")
     queries.hide(asked, "plant")
     queries.set_level(asked, "whole")
-    act(queries.set_canonical, asked, ("book",))
     path = queries.save_queries(asked, tmp_path)
     assert path.name == "blobs-001.queries.json"
     open_scene(asked, "blobs.ply")
-    assert (asked.state.session.queries, asked.state.session.canonical) == ((), ())
+    assert asked.state.session.queries == ()
     act(opening.open_dropped, asked, dropped(path))
     found = [(query.phrase, query.cut, query.slot is None) for query in asked.state.session.queries]
     assert found == [("mug", 0.7, False), ("plant", None, True)]
-    assert asked.state.session.canonical == ("book",)
     assert asked.state.session.level == "whole"
     assert result(asked, 0).own_cut == 0.7
 
@@ -244,8 +225,6 @@ def test_query_set_without_queries_or_field_says_why(viewer, opened, tmp_path):
     write_queries(tmp_path / "a.queries.json", Session(queries=(Query("mug"),)))
     queries.load_queries(opened, tmp_path / "a.queries.json")
     assert "searched" in errors(opened)[-1]
-    queries.set_canonical(opened, ("book",))
-    assert "language field" in errors(opened)[-1]
     assert opened.state.session.queries == ()
 
 
@@ -268,8 +247,6 @@ GOOD = {"format": "langsplat-queries", "queries": [{"phrase": "mug"}]}
         {"queries": [{"phrase": "mug"}] * 201},
         {"level": "floor"},
         {"level": []},
-        {"canonical": "book"},
-        {"canonical": [""]},
     ],
 )
 def test_damaged_query_set_is_refused_in_one_line(tmp_path, change):

@@ -19,7 +19,15 @@ from langsplat_core.scene.transform import moving
 from langsplat_viewer.actions import editing, opening, queries, saving, settings, viewpoint
 from langsplat_viewer.actions.editing import mark
 from langsplat_viewer.camera.controls import orbit
-from langsplat_viewer.files.projects import Shelf, load_preferences, read_flight, read_project, read_queries
+from langsplat_viewer.files.projects import (
+    NO_GROUPS,
+    NOT_COMPARED,
+    Shelf,
+    load_preferences,
+    read_flight,
+    read_project,
+    read_queries,
+)
 from langsplat_viewer.marks import Marks, hiding, unmarked
 from langsplat_viewer.rendering.request import Clip, Splats
 from langsplat_viewer.session import Note, Preferences, Query, Ruler, Things
@@ -319,7 +327,7 @@ def test_project_of_version_1_opens_and_means_the_same(viewer, tmp_path, monkeyp
     path.write_bytes((SAVED / path.name).read_bytes())
     settings.toggle_overlay(viewer, "grid")
     act(opening.open_file, viewer, path)
-    assert errors(viewer) == ["groups and locks of the outline are left out: this version has none"]
+    assert errors(viewer) == [NO_GROUPS, NOT_COMPARED]
     state, session = viewer.state, viewer.state.session
     assert session.queries == (
         Query("mug"),
@@ -327,7 +335,7 @@ def test_project_of_version_1_opens_and_means_the_same(viewer, tmp_path, monkeyp
         Query("plant", shown_since=2),
         Query("mug or book", slot=1, shown_since=3),
     )
-    assert (session.chosen, session.level, session.canonical) == ("mug or book", "whole", ("plant",))
+    assert (session.chosen, session.level) == ("mug or book", "whole")
     assert result(viewer).found
     assert session.picture == PictureConfig("relevancy", dim=0.7, heat_scale=(0.4, 0.9), colour_map="magma")
     assert (session.clip, session.overlays) == (Clip(0.5, 40.0), ("grid",))  # it says nothing of overlays
@@ -342,7 +350,7 @@ def test_project_of_version_1_opens_and_means_the_same(viewer, tmp_path, monkeyp
     assert state.shows_panels == ("Search", "Notes")
 
 
-def test_other_files_of_version_1_open_and_mean_the_same(viewer):
+def test_other_files_of_version_1_open_and_mean_the_same(opened):
     project = read_project(SAVED / "version1.langsplat")
     assert project.session.things == Things({3: "the atlas"})
     asked = read_queries(SAVED / "version1.queries.json")
@@ -350,7 +358,9 @@ def test_other_files_of_version_1_open_and_mean_the_same(viewer):
         ("book", 0.6, True),
         ("plant", None, False),
     ]
-    assert (asked.level, asked.canonical) == ("whole", ("plant",))
+    assert asked.level == "whole"
+    act(queries.load_queries, opened, SAVED / "version1.queries.json")
+    assert errors(opened) == [NOT_COMPARED]
     (bookmark,) = Shelf(SAVED).read(Path("/scenes/blobs.ply"))
     first, second = read_flight(SAVED / "version1.path.json").keyframes
     for pose in (bookmark.pose, first.pose, project.view.pose):

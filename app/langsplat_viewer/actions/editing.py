@@ -20,7 +20,7 @@ from langsplat_core.query.selection import at_point, grow, in_box, of_rows, shri
 from langsplat_core.scene import LEVELS
 from langsplat_core.scene.transform import AXES, Similarity, moving, rotating, scaling
 from langsplat_viewer import marks
-from langsplat_viewer.actions.queries import ask_listed, forget_unlisted, set_canonical, teach
+from langsplat_viewer.actions.queries import ask_listed, forget_unlisted, teach
 from langsplat_viewer.camera.controls import extent_of
 from langsplat_viewer.marks import Drawn, Marks, Mode, Stroke, Tool
 from langsplat_viewer.rendering.request import UNCLIPPED
@@ -331,10 +331,7 @@ def place(viewer: Viewer) -> None:
     scene = replace(scene, language=viewer.language)
     state.opened, state.scene, state.extent, state.moving = opened, scene, extent_of(scene), None
     viewer.engine, viewer.describer = viewer.services.engine(scene), None
-    if state.session.canonical:
-        set_canonical(viewer, state.session.canonical)  # which asks again
-    else:
-        ask_listed(viewer)
+    ask_listed(viewer)
 
 
 def apply_form(viewer: Viewer) -> None:
@@ -420,14 +417,9 @@ def adopt(viewer: Viewer, session: Session) -> None:
     set_tools(viewer, stroke=None)
     state.record.chosen = None
     state.marks = session.marks.masks(before.marks, state.marks)
-    state.session = replace(session, canonical=before.canonical)  # until the engine compares with others
+    state.session = session
     forget_unlisted(viewer)
     if session.moves != before.moves:
-        viewer.put(canonical=session.canonical)
         place(viewer)
-    elif session.canonical != before.canonical:
-        set_canonical(viewer, session.canonical)  # which asks again
-    elif session.level != before.level:
-        ask_listed(viewer)
     else:
-        ask_listed(viewer, anew=False)
+        ask_listed(viewer, anew=session.level != before.level)

@@ -133,7 +133,7 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
 def _without_field(session: Session) -> Session:
     """Return the session of a scene that cannot be searched."""
     display = "rgb" if DISPLAYS[session.picture.display].needs_field else session.picture.display
-    return replace(session, queries=(), canonical=(), picture=replace(session.picture, display=display))
+    return replace(session, queries=(), picture=replace(session.picture, display=display))
 
 
 def _say_opened(viewer: Viewer, path: Path, opened: _Opened) -> None:
@@ -360,8 +360,8 @@ def _restore(viewer: Viewer, project: Project, path: Path) -> None:
     session = replace(session, bookmarks=session.bookmarks or now.bookmarks)
     if project.version == 1:  # which had no other settings
         session = replace(session, split=now.split, splats=now.splats, overlays=now.overlays)
-    if project.has_groups:
-        viewer.say_error("groups and locks of the outline are left out: this version has none")
+    for reason in project.left_out:
+        viewer.say_error(reason)
     if state.count != project.gaussians:
         unedited = replace(session, marks=Marked(), moves=(), things=Things())
         if unedited != session:
@@ -506,11 +506,9 @@ def follow_beside(viewer: Viewer) -> None:
     if other.scene is None or state.view is None:
         return
     other.view = state.view
-    session, before = _mirrored(state, other), beside.mirrored
-    if session != before:
+    session = _mirrored(state, other)
+    if session != beside.mirrored:
         beside.mirrored = session
-        if before is not None and before.canonical == session.canonical:  # the same are not encoded again
-            session = replace(session, canonical=other.session.canonical)
         take_session(beside, session)
 
 
@@ -530,6 +528,5 @@ def _mirrored(state: ViewerState, other: ViewerState) -> Session:
         first.of_next_scene(other.session.bookmarks),
         split=Split(),
         clip=first.clip,
-        canonical=first.canonical,
         queries=tuple(replace(query, slot=None) if hidden(query) else query for query in answered),
     )

@@ -19,7 +19,7 @@ from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import TaughtWord
 from langsplat_core.scene.language import phrase_key, split_phrases
 from langsplat_viewer.actions.settings import open_panel
-from langsplat_viewer.files.projects import QUERIES, read_queries, write_queries
+from langsplat_viewer.files.projects import NOT_COMPARED, QUERIES, read_queries, write_queries
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.output import free_name
 from langsplat_viewer.session import Query
@@ -195,29 +195,6 @@ def set_cut(viewer: Viewer, phrase: str, cut: float | None, *, is_new: bool = Tr
     state.session = state.session.with_query(phrase, cut=cut)
 
 
-def set_canonical(viewer: Viewer, phrases: tuple[str, ...]) -> None:
-    """Compare everything with other canonical phrases; none: with the scene's own again."""
-    engine, state, before = viewer.searchable(), viewer.state, viewer.state.session.canonical
-    if engine is None:
-        return
-
-    def work(progress: Progress) -> tuple[str, ...]:
-        engine.compare_with(phrases, progress)
-        return engine.canonical_phrases
-
-    def done(canonical: tuple[str, ...]) -> None:
-        viewer.put(canonical=phrases)
-        state.say(f"compared with {', '.join(canonical)}")
-        ask_listed(viewer)
-
-    def failed(reason: str) -> None:
-        viewer.say_error(reason)
-        viewer.put(canonical=before if before != phrases else ())
-        ask_listed(viewer, anew=False)
-
-    viewer.run("encoding canonical phrases", work, done, failed)
-
-
 # What an answer stands on.
 
 
@@ -267,8 +244,8 @@ def load_queries(viewer: Viewer, path: Path) -> None:
         return
     if viewer.searchable() is None:
         return
-    if wanted.canonical != viewer.state.session.canonical:
-        set_canonical(viewer, wanted.canonical)
+    if wanted.canonical:
+        viewer.say_error(NOT_COMPARED)
     set_level(viewer, wanted.level)
     for query in wanted.queries:
         ask_one(viewer, query.phrase, cut=query.cut, then_show=query.shown)

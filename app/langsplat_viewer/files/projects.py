@@ -237,6 +237,7 @@ class Shelf:
 # Query sets, which people write by hand as well: phrases, cuts, and whether each is shown in a colour.
 
 QUERIES = ".queries.json"
+NOT_COMPARED = "canonical phrases of one's own are left out: this version has none"
 
 
 class SavedQuery(msgspec.Struct):
@@ -254,13 +255,13 @@ class QuerySet(msgspec.Struct):
     queries: Annotated[tuple[SavedQuery, ...], Meta(max_length=200)]
     version: int = 1
     level: LevelChoice = "auto"
-    canonical: Annotated[tuple[Phrase, ...], Meta(max_length=200)] = ()
+    canonical: tuple[str, ...] | msgspec.UnsetType = msgspec.UNSET  # of earlier versions
 
 
 def write_queries(path: Path, session: Session) -> None:
     """Write the queries of a session and how they were asked, whole or not at all."""
     saved = tuple(SavedQuery(query.phrase, query.cut, query.slot is not None) for query in session.queries)
-    asked = QuerySet("langsplat-queries", saved, level=session.level, canonical=session.canonical)
+    asked = QuerySet("langsplat-queries", saved, level=session.level)
     _write(path, msgspec.to_builtins(asked))
 
 
@@ -281,6 +282,7 @@ def read_queries(path: Path) -> QuerySet:
 
 PROJECTS = ".langsplat"  # suffix of project files
 FORMAT, VERSION = "langsplat-project", 2
+NO_GROUPS = "groups and locks of the outline are left out: this version has none"
 
 
 class Project(msgspec.Struct, omit_defaults=True):
@@ -293,7 +295,7 @@ class Project(msgspec.Struct, omit_defaults=True):
     intrinsics: Intrinsics | None = None  # of the view, where the field of view does not say all
     panels: Annotated[tuple[str, ...], Meta(max_length=100)] = ()
     version: int = VERSION
-    has_groups: bool = False  # things in groups, or locked, which earlier versions had
+    left_out: tuple[str, ...] = ()  # of a project of an earlier version, a line each
 
 
 def write_project(path: Path, project: Project, answers: list[dict[str, Any]]) -> None:
@@ -320,7 +322,9 @@ def read_project(path: Path) -> Project:
             _check_pose(replace(project.view.pose, fov_degrees=project.intrinsics.fov_degrees))
         project.session = _checked(project.session)
         things = top["session"].get("things", {})
-        project.has_groups = bool(things.get("groups") or things.get("locked"))
+        groups = things.get("groups") or things.get("locked")
+        found = {NO_GROUPS: groups, NOT_COMPARED: top["session"].get("canonical")}
+        project.left_out = tuple(reason for reason, there in found.items() if there)
         project.scene = os.path.abspath(path.parent / project.scene)
         return project
 

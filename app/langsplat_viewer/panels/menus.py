@@ -169,8 +169,8 @@ FIRST_STEPS = (
      "thing names it, hides it, or finds more like it."),
     ("Found, weak match, not here", "What the scene says of a phrase. Only what may be there is painted, "
      "and a weak match no hotter than half."),
-    ("Relevancy", "From 0 to 1: how much nearer a place is to the phrase than to the everyday words under "
-     "'Compared with'; 0.5 is neither. Its 'threshold' is a relevancy: what has less is no part of it. The "
+    ("Relevancy", "From 0 to 1: how much nearer a place is to the phrase than to everyday words; "
+     "0.5 is neither. Its 'threshold' is a relevancy: what has less is no part of it. The "
      "slider moves that end, Auto gives the answer's own back."),
     ("Subpart, part, whole", "How finely things are divided: the handle, the cup, the cup with its saucer. "
      "'auto' takes the level that answers best."),

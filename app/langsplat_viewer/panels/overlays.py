@@ -460,8 +460,7 @@ def said(words: LevelWords, sure: bool) -> str:
     """
     likely = [word for word in words.words if word.probability > UNSURE]
     named = [word.phrase + (f" {100 * word.probability:.0f} %" if sure else "") for word in likely]
-    of_colour = "" if words.colour is None else f"{words.colour.phrase}: "
-    return of_colour + ", ".join(named) if named else "nothing known"
+    return ", ".join(named) if named else "nothing known"
 
 
 def pointed_figures(hover: Hover) -> list[str]:

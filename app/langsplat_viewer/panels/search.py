@@ -12,8 +12,7 @@ from langsplat_core.config import LevelChoice
 from langsplat_core.display.displays import QUERY_COLOURS, STRENGTH, painted
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import no_field
-from langsplat_core.scene import CANONICAL_PHRASES, LEVELS
-from langsplat_core.scene.language import split_phrases
+from langsplat_core.scene import LEVELS
 from langsplat_viewer.actions import queries, settings, viewpoint
 from langsplat_viewer.panels import ui
 from langsplat_viewer.panels.overlays import bar_colours, draw_bar
@@ -251,22 +250,6 @@ def draw(viewer: Viewer) -> None:
         ui.small_wrapped(basis.short, ui.bad() if basis.guesses else ui.muted())
         ui.tip(basis.long)
     _answers(viewer)
-    _canonical(viewer)
-
-
-def _canonical(viewer: Viewer) -> None:
-    opened = imgui.collapsing_header("Compared with")
-    ui.tip("Everyday phrases: relevancy is how much nearer a place is to yours than to these")
-    if not opened:
-        return
-    state = viewer.state
-    ui.small_wrapped("a place is relevant where it is nearer to the phrase than to all of these", ui.muted())
-    hint = ", ".join(CANONICAL_PHRASES)
-    typed = ui.kept_box(viewer, "##canonical", hint, text=", ".join(state.session.canonical))
-    if typed is not None:
-        queries.set_canonical(viewer, tuple(split_phrases(typed)))
-    if state.session.canonical and imgui.button("The scene's own"):
-        queries.set_canonical(viewer, ())
 
 
 def _level(viewer: Viewer) -> None:

@@ -209,19 +209,17 @@ def box(label: str, hint: str, text: str, width: float = -1.0) -> tuple[bool, st
     return bool(entered), str(typed)
 
 
-def kept_box(viewer: Viewer, label: str, hint: str, button: str = "", text: str = "") -> str | None:
-    """Draw a box that keeps what is half typed, with a button that does what Enter does where one is named.
+def kept_box(viewer: Viewer, label: str, hint: str, button: str) -> str | None:
+    """Draw a box that keeps what is half typed, and a button that does what Enter does.
 
-    Return the text once it is entered, and empty the box: it shows `text` until something is typed.
+    Return the text once it is entered, and empty the box.
     """
     drafts = viewer.state.drafts
-    width = beside_button(button) if button else -1.0
-    entered, drafts[label] = box(label, hint, drafts.get(label, text), width)
-    if button:
-        imgui.same_line()
-        entered |= bool(imgui.button(button))
+    entered, drafts[label] = box(label, hint, drafts.get(label, ""), beside_button(button))
+    imgui.same_line()
+    entered |= bool(imgui.button(button))
     typed = drafts[label]
-    if entered or typed == text:
+    if entered or not typed:
         del drafts[label]
     return typed if entered else None
 
