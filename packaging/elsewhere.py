@@ -21,8 +21,8 @@ ROOT = Path(__file__).resolve().parents[1]
 TABLE = ROOT / "docs" / "benchmarks" / "elsewhere.md"
 OUT = ROOT / "elsewhere_out"
 COMPUTING = (
-    "raster scene query training semantics display compaction evaluation datasets making benchmarks io "
-    "pipeline/test_train.py pipeline/test_importing.py test_lowest_layers.py test_compiled.py test_bench.py"
+    "raster scene query training semantics display extensions datasets making benchmarks io "
+    "pipeline/test_train.py test_lowest_layers.py test_compiled.py"
 )
 WRITING = "cli datasets io pipeline scene semantics test_writing.py"
 HEAD = """# The tests on other machines
