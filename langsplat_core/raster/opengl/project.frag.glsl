@@ -34,7 +34,7 @@ vec3 coefficient(ivec2 texel, int k) {
     return value;
 }
 
-// Real spherical harmonics as in raster/reference.py.
+// Real spherical harmonics as in scene/transform.py.
 vec3 radiance(ivec2 texel, vec3 d) {
     float x = d.x, y = d.y, z = d.z;
     vec3 rgb = 0.5 + 0.28209479177387814 * coefficient(texel, 0);
