@@ -11,7 +11,6 @@ from typing import Annotated, Literal
 import numpy as np
 import tyro
 
-from langsplat_core.arrays import Array
 from langsplat_core.cli.arguments import AnyScene, WrittenScene
 from langsplat_core.config import Positive, Range
 from langsplat_core.errors import InputError
@@ -23,7 +22,7 @@ from langsplat_core.io.scenes import (
     load_without_language,
     save_scene,
 )
-from langsplat_core.query.selection import above_plane, in_box, in_sphere
+from langsplat_core.query.selection import in_box
 from langsplat_core.scene import Scene
 from langsplat_core.scene.transform import (
     AXES,
@@ -86,49 +85,22 @@ class Transform:
 
 @dataclass(frozen=True)
 class Crop:
-    """Keep the Gaussians whose centres lie in all of the given boxes, spheres and half-spaces.
-
-    What belongs to them goes along; with --outside everything else is kept. World units.
-    """
+    """Keep the Gaussians whose centres lie in a box; what belongs to them goes along."""
 
     scene: AnyScene
     out: WrittenScene
-    box: Annotated[tyro.conf.UseAppendAction[tuple[Box, ...]], tyro.conf.arg(metavar="X Y Z X Y Z")] = ()
-    """Two opposite corners; may be given several times, as the others."""
-    sphere: Annotated[tyro.conf.UseAppendAction[tuple[Four, ...]], tyro.conf.arg(metavar="X Y Z R")] = ()
-    """Centre and radius."""
-    plane: Annotated[tyro.conf.UseAppendAction[tuple[Four, ...]], tyro.conf.arg(metavar="NX NY NZ D")] = ()
-    """Normal and offset: keeps what has NX x + NY y + NZ z >= D."""
-    outside: bool = False
-    """Keep what lies outside of them together instead."""
+    box: Annotated[Box, tyro.conf.arg(metavar="X Y Z X Y Z")]
+    """Two opposite corners, world units."""
 
     def run(self) -> None:
         check_writable(self.out)
         check_keeps(self.out, self.scene)
-        if not (self.box or self.sphere or self.plane):
-            raise InputError("nothing to crop to: give --box, --sphere or --plane")
-        scene = load_scene(self.scene)
-        keep = self.inside(scene.gaussians.means) != self.outside
+        scene, corners = load_scene(self.scene), np.array(self.box).reshape(2, 3)
+        keep = in_box(scene.gaussians.means, corners.min(0), corners.max(0))
         if not keep.any():
             raise InputError(f"the crop holds none of the {len(keep)} Gaussians; {_extent(scene)}")
         save_scene(self.out, replace(scene.take(keep), path=self.out))
         print(f"{self.out}: {keep.sum()} of {len(keep)} Gaussians")
-
-    def inside(self, means: Array) -> Array:
-        """(N, 3) positions -> (N,) bool, whether each is in all of the shapes."""
-        inside = np.ones(len(means), bool)
-        for numbers in self.box:
-            corners = np.array(numbers).reshape(2, 3)
-            inside &= in_box(means, corners.min(0), corners.max(0))
-        for *centre, radius in self.sphere:
-            if not radius > 0:
-                raise InputError(f"--sphere: a radius of {radius:g} holds nothing; it must be above 0")
-            inside &= in_sphere(means, np.array(centre), radius)
-        for *normal, offset in self.plane:
-            if not any(normal):
-                raise InputError("--plane: the normal is 0 0 0; give a direction")
-            inside &= above_plane(means, np.array(normal), offset)
-        return inside
 
 
 def _extent(scene: Scene) -> str:

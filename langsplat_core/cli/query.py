@@ -35,11 +35,6 @@ from langsplat_core.config import Count, CountOrZero, LevelChoice, NotNegative, 
 from langsplat_core.errors import EncoderError, InputError, LangSplatError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.scenes import check_keeps, check_writable, save_scene
-from langsplat_core.io.shapes import (
-    POINT_SUFFIXES,
-    check_suffix,
-    write_points,
-)
 from langsplat_core.io.sidecar import read_words
 from langsplat_core.pipeline.evidence import draw_evidence, find_evidence, kept_features, kept_photographs
 from langsplat_core.progress import TerminalProgress
@@ -304,12 +299,9 @@ def _lines(answer: dict[str, Any], unit: Unit) -> list[str]:
     return [said] if reading is None else [said, f"  read as: {reading}"]
 
 
-Shape = Literal["scene", "points"]
-
-
 @dataclass(frozen=True)
 class Select:
-    """Write what a phrase names as a scene, points or a mesh of its own; with --remove, all the rest.
+    """Write what a phrase names as a scene of its own; with --remove, all the rest.
 
     Prints the things that were found, best first.
     """
@@ -318,7 +310,7 @@ class Select:
     texts: tyro.conf.Positional[tuple[str, ...]]
     """Phrases, each in quotes if it has several words; what any of them names is taken."""
     out: OutFile
-    """File to write: .ply, .spz or .splat for a scene, .ply for points."""
+    """Scene to write: .ply, .spz or .splat."""
     remove: bool = False
     """Write everything else instead."""
     level: LevelChoice = "auto"
@@ -329,8 +321,6 @@ class Select:
     """Take also what is so near along the surface: metres if the scene has a scale, else world units."""
     shrink: NotNegative = 0.0
     """Leave out what is so near to the rest along the surface, in the same unit; after growing."""
-    shape: Annotated[Shape, tyro.conf.arg(name="as")] = "scene"
-    """scene: Gaussians. points: their centres, with colour and relevancy."""
     scale: ScaleOption = None
     encoder: EncoderOption = ""
     taught: WordsOption = None
@@ -347,8 +337,9 @@ class Select:
         found = engine.instances(answer)
         rows = np.concatenate([instance.members for instance in chosen_instances(found, self.instance)])
         selected = self._reshaped(engine, of_rows(rows, len(answer.members)), unit)
-        written = self._write(engine, replace(answer, members=selected))
-        self._print(found, unit, int(selected.sum()), written)
+        rows = np.flatnonzero(~selected if self.remove else selected)
+        save_scene(self.out, replace(scene.take(rows), path=self.out))
+        self._print(found, unit, int(selected.sum()), len(rows))
 
     def _check(self) -> None:
         """InputError for what needs no scene to be known: it should not cost the loading of one."""
@@ -356,10 +347,7 @@ class Select:
             raise InputError(
                 "no phrase given; for example: langsplat select scene.ply 'red cup' --out cup.ply"
             )
-        if self.shape == "scene":
-            check_writable(self.out)
-        else:
-            check_suffix(self.out, POINT_SUFFIXES)
+        check_writable(self.out)
         check_keeps(self.out, self.scene)
         folder = self.out.parent
         if not folder.is_dir():
@@ -376,15 +364,6 @@ class Select:
             raise InputError("the selection is the whole scene: nothing would be left after --remove")
         return selected
 
-    def _write(self, engine: QueryEngine, answer: QueryResult) -> int:
-        """Write the file; return the number of Gaussians or points in it."""
-        scene, rows = engine.scene, np.flatnonzero(~answer.members if self.remove else answer.members)
-        if self.shape == "points":
-            relevancy = answer.relevancy[answer.level][rows]
-            return write_points(self.out, scene.gaussians.take(rows), {"relevancy": relevancy})
-        save_scene(self.out, replace(scene.take(rows), path=self.out))
-        return len(rows)
-
     def _print(self, found: Sequence[Instance], unit: Unit, selected: int, written: int) -> None:
         if self.json:
             content = {
@@ -393,7 +372,6 @@ class Select:
                 **listed(found),
                 "taken": list(self.instance) or list(range(1, len(found) + 1)),
                 "selected": selected,
-                "as": self.shape,
                 "removed": self.remove,
                 "written": written,
                 "out": str(self.out),
@@ -401,6 +379,5 @@ class Select:
             print_json(content)
             return
         print("\n".join(instance_lines(found, unit)))
-        what = {"scene": "Gaussians", "points": "points"}[self.shape]
         of = f"all but the {selected} selected" if self.remove else f"of {selected} selected Gaussians"
-        print(f"{self.out}: {written} {what}, {of}")
+        print(f"{self.out}: {written} Gaussians, {of}")

@@ -1,6 +1,6 @@
 """Coloured points and meshes, which other programs open without knowing Gaussians."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -42,17 +42,14 @@ def base_colours(gaussians: Gaussians) -> Array:
     return np.clip(np.nan_to_num(colours), 0, 1)
 
 
-def write_points(path: Path | str, gaussians: Gaussians, extras: Mapping[str, Array] | None = None) -> int:
+def write_points(path: Path | str, gaussians: Gaussians) -> int:
     """Write the means of the Gaussians that can be drawn as a PLY point cloud, atomically.
 
-    Red, green and blue are bytes, each of `extras`, name -> (N,), a float. Return the number of points.
-    InputError for another suffix.
+    Red, green and blue are bytes. Return the number of points. InputError for another suffix.
     """
     path = check_suffix(path, POINT_SUFFIXES)
     valid = gaussians.valid()
-    columns = _coloured(gaussians.means[valid], base_colours(gaussians)[valid])
-    columns |= {name: values[valid].astype(np.float32) for name, values in (extras or {}).items()}
-    write_table(path, columns)
+    write_table(path, _coloured(gaussians.means[valid], base_colours(gaussians)[valid]))
     return int(valid.sum())
 
 

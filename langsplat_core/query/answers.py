@@ -86,7 +86,6 @@ def recut(result: QueryResult, cut: float) -> QueryResult:
 
 # Regions: the sets of Gaussians that a scene's tree makes at each level.
 
-PIECES = 4  # that a level is summed in, so that more than three cores have work
 CHUNK = 16_384  # distinct features read at a time
 MIDDLE = 16  # Gaussians around the middle of a region
 
@@ -107,10 +106,10 @@ class Regions:
 
         Summed in the order of the Gaussians and not of the surface: memory is read from front to back.
         """
-        longest = max(len(total) for total in self.totals)
-        sums = np.zeros((len(LEVELS) * PIECES, longest))
+        pieces, longest = 4, max(map(len, self.totals))  # of a level, so that more than three cores have work
+        sums = np.zeros((len(LEVELS) * pieces, longest))
         shared_workers().run(_sum_pieces, len(sums), plain(values), self.everywhere, self.weights, sums)
-        levels = sums.reshape(len(LEVELS), PIECES, longest).sum(1)
+        levels = sums.reshape(len(LEVELS), pieces, longest).sum(1)
         return tuple(row[: len(total)] / total for row, total in zip(levels, self.totals, strict=True))
 
     def spread(self, level: int, values: Array, others: Array) -> Array:
@@ -260,7 +259,6 @@ def even_relevancy(regions: Regions, scale: Scale, relevancy: Array) -> Array:
 
 
 SPAN = 0.02  # the least distance between the floor and the peak that is divided
-PLATEAU = 1e-3  # of relevancy: what is this close to the peak is as high
 
 
 def by_peak(
@@ -303,7 +301,7 @@ def locate(surface: Surface, smoothed: Array, threshold: float) -> tuple[Array, 
     inside = smoothed > threshold
     inside[peak] = True
     members = surface.connected(inside, peak)
-    highest = members[smoothed[members] >= smoothed[peak] - PLATEAU]
+    highest = members[smoothed[members] >= smoothed[peak] - 1e-3]
     centre = surface.positions[highest].mean(0)
     middle = highest[((surface.positions[highest] - centre) ** 2).sum(1).argmin()]
     near = surface.neighbours[middle]

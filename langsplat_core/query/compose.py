@@ -40,11 +40,11 @@ from langsplat_core.semantics.relevancy import FLOOR
 
 SHARE = 0.6  # of the way from what is typical of a thing's least fitting surface to the part's peak on it
 LEAST = 0.05  # quantile of a part's relevancy on its thing that stands for "not this part"
-HALF = 0.5  # of the peak: what is less is no longer the place
-SAME = 0.5  # of a thing's Gaussians: what shares so many with another is the same, and not related to it
-# Of the way that an answer reaches below its best region: what fits an unwanted name so well is what was
-# meant, and the answers that the range of a count is taken from.
-SURE, STRICT, WIDE = 0.5, 0.25, 2.0
+# Of the peak: what is less is no longer the place. Of a thing's Gaussians: what shares so many with another
+# is the same, and not related to it. Of the way that an answer reaches below its best region: what fits an
+# unwanted name so well is what was meant.
+HALF = 0.5
+STRICT, WIDE = 0.25, 2.0  # of that way: the answers that the range of a count is taken from
 SAID_BY_VIEWER = ("left of", "right of", "behind", "in front of", "leftmost", "rightmost")
 
 
@@ -141,7 +141,7 @@ class _Asking:
                 if isinstance(unwanted, Atom):
                     # A green mug may be in the answer to "red mug", for want of a better one; it is not what
                     # "not red mug" means.
-                    members = members & within_reach(self.engine, excluded, SURE)
+                    members = members & within_reach(self.engine, excluded, HALF)
                 return restricted(wanted, ~members, wanted) if excluded.found else wanted
             case Inside(part, whole):
                 return self._inside(part, whole, level)
@@ -192,7 +192,7 @@ class _Asking:
                 if any(
                     stands(tree.kind, thing, other, self._viewpoint)
                     for theirs, other in anchors
-                    if np.isin(mine, theirs).mean() < SAME
+                    if np.isin(mine, theirs).mean() < HALF
                 )
             }
         keep = np.zeros(len(what.members), bool)

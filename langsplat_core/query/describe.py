@@ -32,8 +32,7 @@ from langsplat_core.semantics.vocabulary import bundled_vocabulary
 # bundled encoder and with the geometry of CLIP (rooms 201 to 203, docs/searching.md).
 WORD_SCALE = 6.0
 NEAREST = 10  # features that make a word's hub, as in the paper
-BANK = 4096  # features that are looked at for it, of codebooks; of other codecs fewer, since none is distinct
-SAMPLES = 512
+BANK = 4096  # features, at most, that are looked at for it
 NARROWEST = 1e-6  # spread; words that are all the same have none
 LIKELY = 0.5  # probability from which a word is said
 OR = " or "  # between words for one thing
@@ -137,8 +136,7 @@ def build_words(field: LanguageField, phrases: tuple[str, ...], vectors: Array) 
 def field_features(field: LanguageField) -> Array:
     """Return (B, D) float32 unit vectors of the scene's Gaussians, evenly chosen where there are many."""
     latents, _ = field.codec.unique(field.latents[field.known])
-    most = SAMPLES if field.codec.blends else BANK  # latents that are no numbers are all distinct features
-    chosen = np.unique(np.linspace(0, len(latents) - 1, min(most, len(latents))).astype(np.int64))
+    chosen = np.unique(np.linspace(0, len(latents) - 1, min(BANK, len(latents))).astype(np.int64))
     return field.codec.decode(latents[chosen])
 
 

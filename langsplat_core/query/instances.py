@@ -13,7 +13,6 @@ from langsplat_core.scene.surface import Surface
 
 INNER = (0.02, 0.98)  # a box holds the points between these quantiles of each coordinate: strays do not count
 TURNED = 256  # points, at most, that the box is turned by
-ROUNDS = 2  # of turns about each axis
 COARSE = np.radians(np.arange(0.0, 90.0, 10.0))  # beginning with 0: of equal areas the principal axes stay
 FINE = np.radians([0.0, -2.0, 2.0, -4.0, 4.0])
 
@@ -70,7 +69,7 @@ def oriented_box(points: Array) -> OrientedBox:
 def _turned(columns: Array, axes: Array) -> Array:
     """`axes` turned about each of them in turn, the shortest side's first; columns: (3, M) points."""
     axes = axes.copy()
-    for one, other in ((1, 2), (0, 2), (0, 1)) * ROUNDS:
+    for one, other in ((1, 2), (0, 2), (0, 1)) * 2:  # a second round: of a cube one is not enough
         pair = axes[:, [one, other]]
         for angles in (COARSE, FINE):
             along, across = pair.T @ columns

@@ -38,13 +38,6 @@ def in_box(means: Array, low: Array, high: Array) -> Array:
     return np.all((means >= np.asarray(low)) & (means <= np.asarray(high)), axis=1)
 
 
-def above_plane(means: Array, normal: Array, offset: float) -> Array:
-    """(N, 3) -> (N,) bool: finite, and `normal` (3,) @ mean >= offset."""
-    with np.errstate(invalid="ignore"):
-        above: Array = np.asarray(means, np.float64) @ np.asarray(normal, np.float64) >= offset
-        return above & np.isfinite(means).all(1)
-
-
 def at_point(surface: Surface, regions: Regions, level: int, point: Array) -> Array:
     """Return the (N,) bool region, at a level (index into LEVELS), of the surface nearest to `point` (3,)."""
     if len(surface.rows) == 0:

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from plyfile import PlyData
 
 from langsplat_core.cli import describe, query
 from langsplat_core.cli.edit import SetScale
@@ -260,16 +259,6 @@ def test_select_grows_and_shrinks_in_metres(folder):
     assert len(load_scene("u.ply").gaussians) == sizes["g"]
 
 
-def test_select_writes_points(folder):
-    assert run("select", "a.ply", "mug", "--out", "p.ply", "--as", "points") == 0
-    vertex = PlyData.read("p.ply")["vertex"]
-    assert 0.9 * PER_BLOB < len(vertex["x"]) <= PER_BLOB
-    assert vertex["relevancy"].min() > 0.5
-    assert vertex["red"].mean() > 190 > 60 > vertex["green"].mean() > 40
-    assert run("select", "a.ply", "mug", "--out", "rest.ply", "--as", "points", "--remove") == 0
-    assert len(PlyData.read("rest.ply")["vertex"]["x"]) >= 2 * PER_BLOB
-
-
 def test_known_length_gives_the_scale(folder, capsys):
     assert run("scale", "a.ply", "--metres", "0.3", "--between", "-1", "0", "0", "0.2", "0", "0") == 0
     assert load_scene("a.ply").metres_per_unit == pytest.approx(0.25)
@@ -365,7 +354,6 @@ def test_describe_names_a_pixel(described, capsys):
         ("select a.ply mug --grow -1", "--grow -1: must be 0 to 1e+09"),
         ("select a.ply pair --shrink 9", "nothing is left; shrink by less"),
         ("select a.ply mug book plant --grow 99 --remove", "the whole scene"),
-        ("select a.ply mug --as points --out b.spz", "written as .ply"),
         ("select a.ply mug --out b.obj.gz", "scenes are written as"),
         ("select a.ply mug --out a.ply", "would replace the original"),
         ("select a.ply mug --out there/b.ply", "there: no such folder for b.ply"),

@@ -556,19 +556,17 @@ SHADES = np.array([[1.0, 0, 0], [0, 0.5, 0], [0, 0, 0], [0, 1, 0]])
 MESH = SimpleNamespace(name="red mug", vertices=TETRAHEDRON, triangles=FACES, colour=SHADES)
 
 
-def test_points_have_colours_and_extras(tmp_path):
+def test_points_have_places_and_colours(tmp_path):
     gaussians = random_gaussians(40, sh_degree=1)
     gaussians.means[7] = np.nan
     gaussians.sh[8, 0] = 9, -9, 0
-    relevancy = np.linspace(0, 1, 40)
-    assert write_points(tmp_path / "a.ply", gaussians, {"relevancy": relevancy}) == 39
+    assert write_points(tmp_path / "a.ply", gaussians) == 39
     vertex = PlyData.read(tmp_path / "a.ply")["vertex"]
     kept = np.delete(np.arange(40), 7)
     np.testing.assert_array_equal(np.stack([vertex[k] for k in "xyz"], 1), gaussians.means[kept])
     colours = np.stack([vertex[name] for name in ("red", "green", "blue")], 1)
     want = np.clip(0.5 + 0.28209479177 * gaussians.sh[kept, 0].astype(np.float64), 0, 1)
     assert np.abs(colours / 255 - want).max() <= 0.5 / 255 + 1e-9
-    np.testing.assert_allclose(vertex["relevancy"], relevancy[kept], atol=1e-7)
 
 
 def test_a_ply_holds_a_mesh(tmp_path):
