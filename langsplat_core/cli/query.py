@@ -68,10 +68,9 @@ class QueryScene:
     taught: WordsOption = None
     level: LevelChoice = "auto"
     """Semantic level; auto takes the one that answers best, for a thing rather the whole."""
-    whole: bool = False
-    """Ask every phrase whole, without looking for structure such as "handle of the red mug"."""
     mode: Literal["splat", "paper"] = "splat"
-    """splat: relevancy per Gaussian, then blended. paper: latents blended, every pixel decoded."""
+    """splat: relevancy per Gaussian, then blended. paper: latents blended, every pixel decoded, and phrases
+    asked whole, without looking for structure such as "handle of the red mug"."""
     camera: Annotated[CountOrZero, tyro.conf.arg(metavar="INDEX")] = 0
     """Training view in which the pixel is reported."""
     encoder: EncoderOption = ""
@@ -139,10 +138,10 @@ class QueryScene:
         reasons: dict[str, list[str]] = {}  # why not -> these phrases
         for phrase in dict.fromkeys(phrases):
             try:
-                if self.mode == "paper" and engine.is_taught(phrase):
-                    raise InputError(NOT_DECODED)
-                if self._plainly and not engine.is_taught(phrase):
-                    engine.text_vectors([phrase])[0]
+                if self.mode == "paper":
+                    if engine.is_taught(phrase):
+                        raise InputError(NOT_DECODED)
+                    engine.text_vectors([phrase])
                 else:
                     check_phrase(engine, phrase, camera)
             except LangSplatError as error:
@@ -154,15 +153,11 @@ class QueryScene:
             print(f"langsplat: not asked: {', '.join(map(repr, same))}: {reason}", file=sys.stderr)
         return [phrase for phrase in phrases if phrase not in unasked]
 
-    @property
-    def _plainly(self) -> bool:
-        return self.whole or self.mode == "paper"
-
     def _ask(
         self, engine: QueryEngine, text: str, camera: Camera | None
     ) -> tuple[QueryResult, Phrase | None, tuple[str, ...]]:
         """Return the answer, the phrase's tree where it has structure, and the words of what is asked for."""
-        if self._plainly:
+        if self.mode == "paper":
             return engine.run(text, self.level), None, (text,)
         composed = run_phrase(engine, text, self.level, camera)
         simple = isinstance(composed.tree, Atom)

@@ -220,7 +220,7 @@ def language_tables(
         "guess": engine.basis.short if engine.basis.guesses else "",
         "bars": bars,
         "calibration": None if engine.calibration is None else asdict(engine.calibration),
-        "rule": RULE.as_json() | {"least_likeness": [-taught.HEAT, -1 / taught.UNIT]},
+        "rule": RULE.as_json() | {"least_likeness": taught.LEAST},
         "grammar": {name.lower(): sorted(getattr(grammar, name)) for name in WORD_LISTS},
         "examples": suggested.examples,
         "phrases": suggested.phrases,

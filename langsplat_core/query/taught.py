@@ -26,10 +26,11 @@ OTHERS = 0.9  # share of pairs of wholes
 # rival. Of what was shown in one of rooms 201 to 203 and is absent in another, 95 % stays below, with the
 # bundled encoder and with CLIP's geometry.
 FOUND = ((0.0, 2.8), (0.0, 2.8), (0.1, 1.9))
-LEAST = 0.08  # rival: a few regions say little about it
 HIGHEST = 0.95  # similarity from which anything is what was shown
-UNIT = 0.3  # of the similarity from which it is found: half of it below, 80 % of what is absent is less
-HEAT = 4.0  # fit of what is exactly as shown: a relevancy of 0.98
+# Of the similarity from which it is found: half of it below, 80 % of what is absent is less. What is exactly
+# as shown has a fit of 1 / UNIT, a relevancy of 0.97.
+UNIT = 0.3
+LEAST = -1 / UNIT  # fit, and margin, of what is like nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,14 +101,14 @@ def compared(word: TaughtWord, space: WordSpace, vectors: Array, level: int) -> 
 
 def _examples(word: TaughtWord, space: WordSpace) -> tuple[Array, Array]:
     """(T, W) unit examples, and (3, T) similarity from which something is as each of them, at each level."""
-    rivals = np.maximum((word.rivals + space.rival) / 2, LEAST)
+    rivals = np.maximum((word.rivals + space.rival) / 2, 0.08)  # of a few regions it says little
     base, times = np.array(FOUND).T
     bars = np.minimum(base[:, None] + np.outer(times, rivals), HIGHEST)
     return unit(word.vectors @ space.basis.T), bars
 
 
 def _fits(alike: Array, bar: Array) -> Array:
-    return np.asarray((HEAT * (alike - bar) / (1 - bar)).max(1, initial=-HEAT))
+    return np.asarray(((alike - bar) / (1 - bar) / UNIT).max(1, initial=LEAST))
 
 
 def likeness(word: TaughtWord, space: WordSpace) -> tuple[list[Array], list[Array]]:
@@ -117,7 +118,7 @@ def likeness(word: TaughtWord, space: WordSpace) -> tuple[list[Array], list[Arra
     for row, bar in zip(space.regions, bars, strict=True):
         alike = row @ examples.T  # (R, T)
         fits.append(_fits(alike, bar))
-        above.append(((alike / bar - 1) / UNIT).max(1, initial=-1 / UNIT))
+        above.append(((alike / bar - 1) / UNIT).max(1, initial=LEAST))
     return fits, above
 
 
@@ -131,7 +132,7 @@ def by_showing(
     solid = [sizes >= min(SMALLEST, sizes.max(initial=0)) for sizes in regions.sizes]
     peaks = triple(np.array([row[some].max(initial=0) for row, some in zip(every, solid, strict=True)]))
     best = np.where(solid[chosen], fits[chosen], -np.inf)
-    excess = float(np.where(solid[chosen], above[chosen], -np.inf).max(initial=-1 / UNIT))
+    excess = float(np.where(solid[chosen], above[chosen], -np.inf).max(initial=LEAST))
     inside = solid[chosen] & (best >= min(0.0, best.max(initial=-np.inf)))
     nothing = np.zeros(regions.everywhere.shape[1], np.float32)
     relevancy = np.stack(
@@ -145,7 +146,7 @@ def by_showing(
         relevancy=relevancy,
         even=relevancy[chosen],
         peak=peaks[chosen],
-        fits=triple(np.array([row[some].max(initial=-HEAT) for row, some in zip(fits, solid, strict=True)])),
+        fits=triple(np.array([row[some].max(initial=LEAST) for row, some in zip(fits, solid, strict=True)])),
         judgement=Verdict(excess >= 0, "example", excess),
         members=regions.spread(chosen, inside, nothing > 0),
         place=place,

@@ -85,7 +85,6 @@ class Language {
   answerByExamples(word, level) {
     const { rule } = this.meta;
     const { sizes } = this.regions;
-    const [leastFit, leastMargin] = rule.least_likeness;
     const row = (tensor) => tensor.subarray(word.row * sizes.length, (word.row + 1) * sizes.length);
     const every = row(this.tensors.taught_fits);
     const margins = row(this.tensors.taught_above);
@@ -98,12 +97,12 @@ class Language {
     const chosen = level < 0 ? word.level : level;
     const regions = solid[chosen];
     const least = Math.min(0, Math.max(...regions.map((region) => every[region])));
-    const margin = Math.max(leastMargin, ...regions.map((region) => margins[region]));
+    const margin = Math.max(rule.least_likeness, ...regions.map((region) => margins[region]));
     const better = (best, region) => (best < 0 || every[region] > every[best] ? region : best);
     const decision = {
       level: chosen,
       scores: solid.map((some) => Math.max(0, ...some.map((region) => sigmoid(every[region])))),
-      fits: solid.map((some) => Math.max(leastFit, ...some.map((region) => every[region]))),
+      fits: solid.map((some) => Math.max(rule.least_likeness, ...some.map((region) => every[region]))),
       regionFits: every,
       inside: regions.filter((region) => every[region] >= least),
       best: regions.reduce(better, -1),

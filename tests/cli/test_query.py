@@ -190,17 +190,15 @@ def test_query_prints_no_probability_without_calibration(folder, capsys):
     assert not any(OPEN_MODEL in line for line in said)
 
 
-def test_whole_option_ignores_structure(folder, capsys):
-    save_fake(phrasebook={"mug": axis(0), "plant": axis(2), "mug near the plant": axis(1)})
+def test_query_prints_the_reading_of_structure(folder, capsys):
+    save_fake(phrasebook={"mug": axis(0), "plant": axis(2)})
     (answer,) = answers(capsys, "query", "b.ply", "mug or plant")
     said = lines(capsys, "query", "b.ply", "mug or plant")
     assert said[0].startswith("mug or plant: found")
     assert said[1] == f"  read as: {answer['reading']}" == "  read as: mug  or  plant"
     assert len(answer["instances"]) == 2
-    (whole,) = answers(capsys, "query", "b.ply", "mug near the plant", "--whole")
     (plain,) = answers(capsys, "query", "b.ply", "plant")
-    assert (whole["reading"], plain["reading"]) == (None, None)
-    assert whole["place"][0] == pytest.approx(0, abs=0.2)  # what the phrasebook says of the whole phrase
+    assert plain["reading"] is None
 
 
 # `langsplat select`.
