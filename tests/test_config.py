@@ -40,6 +40,8 @@ COMMANDS = (
     "convert s.ply t.ply",
     "convert s.npz t.ply --codec.kind=autoencoder",
     "compact s.ply",
+    "bench raster",
+    "bench query s.ply",
 )
 
 

@@ -503,23 +503,15 @@ def splats(content: dict) -> dict:
 
 MALFORMED_GLTF = {
     "a path": lambda c: c["buffers"][0].update(uri="../../etc/passwd"),
-    "beyond its buffer": lambda c: c["bufferViews"][0].update(byteOffset=2**30),
     "many rows": lambda c: [one.update(count=2**31) for one in c["accessors"]],
-    "one count alone": lambda c: c["accessors"][2].update(count=9),
     "a sparse column": lambda c: c["accessors"][0].update(sparse={"count": 1}),
-    "no buffer": lambda c: c["accessors"][0].pop("bufferView"),
     "a circle": lambda c: c["nodes"][0].update(children=[0]),
     "many instances": lambda c: c.update(nodes=[{"mesh": 0}] * 999, scenes=[{"nodes": list(range(999))}]),
     "a mirror": lambda c: c["nodes"][0].update(scale=[-1, 1, 1]),
     "an axis of its own": lambda c: c["nodes"][0].update(scale=[1, 2, 1]),
-    "no numbers": lambda c: c["nodes"][0].update(translation=["a", 1, 1]),
-    "huge numbers": lambda c: c["nodes"][0].update(translation=[10**400, 1, 1]),
     "meshopt": lambda c: c.update(extensionsRequired=["EXT_meshopt_compression"]),
     "triangles": lambda c: splats(c).update(mode=4),
     "linear colours": lambda c: splats(c)["extensions"][EXTENSION].update(colorSpace="lin_rec709_display"),
-    "half a degree": lambda c: splats(c)["attributes"].pop(f"{EXTENSION}:SH_DEGREE_1_COEF_1"),
-    "negative index": lambda c: c["nodes"][0].update(mesh=-1),
-    "another version": lambda c: c.update(asset={"version": "1.0"}),
     "no Gaussians": lambda c: c.update(nodes=[], scenes=[], extensionsUsed=[]),
 }
 
@@ -587,11 +579,3 @@ def test_a_glb_mesh_has_linear_colours_and_y_up(tmp_path):
     np.testing.assert_allclose(colours[:, :3].sum(1), [1, 0.2140, 0, 1], atol=1e-4)
     matrix = np.array(content["nodes"][0]["matrix"]).reshape(4, 4).T
     np.testing.assert_allclose(matrix @ [*scene.up(), 1], [0, 2, 0, 1], atol=1e-6)  # up, metres
-
-
-def test_another_suffix_is_refused(tmp_path):
-    with pytest.raises(InputError):
-        write_points(tmp_path / "a.obj", random_gaussians(3))
-    with pytest.raises(InputError):
-        write_mesh(tmp_path / "a.stl", MESH, np.eye(4))
-    assert list(tmp_path.iterdir()) == []

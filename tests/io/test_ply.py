@@ -248,32 +248,18 @@ REST = b"".join(b"property float f_rest_%d\n" % index for index in range(1, 10))
 CHARS = b"".join(b"property char a%d\n" % index for index in range(900))
 MALFORMED = {  # a good file, and what of it is replaced by what
     "empty": (PLAIN, PLAIN, b""),
-    "another format": (PLAIN, b"ply\n", b"solid cube\n"),
-    "no format": (PLAIN, b"format binary_little_endian 1.0\n", b""),
-    "no vertices": (PLAIN, b"element vertex", b"element corner"),
     "a point cloud": (PLAIN, PLAIN[PLAIN.index(b"f_dc_0") : PLAIN.index(b"rot_3")], b"red\nproperty float "),
-    "no opacity": (PLAIN, b"float opacity", b"float opaque"),
-    "a list for a number": (PLAIN, b"float opacity", b"list uchar float opacity"),
-    "a gap among coefficients": (LONG, OPACITY, REST + OPACITY),
     "ten coefficients": (LONG, OPACITY, b"property float f_rest_0\n" + REST + OPACITY),
-    "a property twice": (PLAIN, b"float y", b"float x"),
     "a truncated body": (PLAIN, PLAIN, PLAIN[:-1]),
     "10^12 vertices": (PLAIN, b"vertex 2", b"vertex 1000000000000"),
     "10^12 lines": (ASCII, b"vertex 2", b"vertex 1000000000000"),
-    "a negative count": (PLAIN, b"vertex 2", b"vertex -2"),
-    "an endless header": (PLAIN, b"end_header", b"comment x\n" * 10_000),
     "a name that clears the screen": (PLAIN, b"element", b"element \x1b[2J 0\nelement"),
     "properties that eat the vertices": (PLAIN, b"property float x", CHARS + b"property float x"),
     "lists that eat the vertices": (
         PLAIN, b"element vertex", b"element face 1\nproperty list uint float i\nelement vertex"),
-    "words in ascii": (ASCII, b"4 0 1 2 3\n", b"4 0 1 2 3\none two"),
     "a row less in ascii": (ASCII, b"vertex 2", b"vertex 3"),
-    "a value more in ascii": (ASCII, b"property float rot_3\n", b""),
     "too few chunks": (PACKED, b"chunk 3\n", b"chunk 2\n"),
-    "a bound missing": (PACKED, b"max_y\n", b"ceiling\n"),
-    "coefficients of fewer": (PACKED, b"sh 600\n", b"sh 599\n"),
     "coefficients of chars": (PACKED, b"uchar f_rest_3", b"char f_rest_3"),
-    "packed numbers of floats": (PACKED, b"uint packed_color", b"float packed_color"),
 }  # fmt: skip
 
 
@@ -282,12 +268,6 @@ def test_malformed_files_are_refused_in_a_line(put, bounded, case):
     good, old, new = MALFORMED[case]
     assert old in good
     assert_refused(read_ply, put(good.replace(old, new, 1)))
-
-
-@pytest.mark.parametrize("path", ["nowhere.ply", "/", "nul\0.ply", "/dev/null"])
-def test_paths_that_are_no_file_are_refused(path):
-    with pytest.raises(InputError):
-        read_ply(path)
 
 
 ENCODINGS: dict[str, Callable[[Gaussians], bytes]] = {
@@ -325,9 +305,3 @@ def test_bounds_that_are_no_numbers_drop_their_chunk(put):
         valid = read_ply(put(header + b"end_header\n" + bound + body[4:])).valid()
         assert not valid[:256].any()
         assert valid[256:].all()
-
-
-def test_coefficients_without_a_property_are_none(put):
-    content = compressed_ply(random_gaussians(3, sh_degree=1))
-    bare = content.replace(b"".join(b"property uchar f_rest_%d\n" % i for i in range(9)), b"")
-    assert read_ply(put(bare)).sh_degree == 0

@@ -2,7 +2,6 @@
 scene. No test looks at a time."""
 
 import json
-import logging
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +10,6 @@ import pytest
 from PIL import Image
 
 from langsplat_core.cli.app import parse
-from langsplat_core.config import numeric_settings
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.benchmarks.query_speed import (
     BenchQuery,
@@ -22,12 +20,8 @@ from langsplat_core.extensions.benchmarks.query_speed import (
 )
 from langsplat_core.extensions.benchmarks.raster_speed import (
     BenchRaster,
-    peak_memory,
     reference_windows,
-    resident_memory,
-    restart_peak,
     run_plan,
-    sweep,
 )
 from langsplat_core.extensions.benchmarks.report import write_report
 from langsplat_core.raster.reference import ReferenceRasterizer
@@ -69,11 +63,6 @@ class TestReferenceWindows:
         assert exact.splat_error(bad, x).off_cuts == pytest.approx(0.125)
 
 
-def test_sweep_has_every_pair_once_and_small_ones_first():
-    pairs = sweep((10, 1000, 100), ((8, 8), (4, 4), (16, 16)), 100)
-    assert pairs == [(10, (8, 8)), (100, (4, 4)), (100, (8, 8)), (100, (16, 16)), (1000, (8, 8))]
-
-
 @pytest.mark.long
 def test_a_tiny_run_writes_three_sane_files(tmp_path):
     sizes = ["--counts", "60", "120", "200", "--sizes", "40", "30", "--pivot", "120", "--channels", "1", "3"]
@@ -106,18 +95,6 @@ def test_operations_beyond_the_limit_are_named():
     left_out = [r for r in report.rows if r.gaussians == 4000]
     assert {r.milliseconds is None and "expected" in r.note for r in left_out} == {True}
     assert "not run" in report.text
-
-
-@pytest.mark.long
-def test_a_peak_begins_anew():
-    if restart_peak() is None:
-        pytest.skip("this system does not tell")
-    block = bytearray(200_000_000)
-    block[::4096] = b"x" * len(block[::4096])
-    del block
-    assert peak_memory() > resident_memory() + 100_000_000
-    restart_peak()
-    assert peak_memory() < resident_memory() + 100_000_000
 
 
 # The query benchmark.
@@ -186,23 +163,6 @@ def test_the_command_writes_what_it_measured(tmp_path, capsys):
     assert report["costs"][2]["lookup"]["p99"] < 1e-6
     assert (tmp_path / "query.md").read_text() in capsys.readouterr().out
     assert run(*words, "--repeats", 0) == 2
-
-
-def test_members_of_a_group_are_named_and_take_verbosity_anywhere() -> None:
-    with pytest.raises(InputError, match="no command 'bench quary'; did you mean 'query'"):
-        parse(["bench", "quary"])
-    log = logging.getLogger("langsplat")
-    for words in (["bench", "-q", "raster"], ["bench", "raster", "-q"]):
-        log.setLevel(logging.INFO)
-        parse(words)
-        assert log.level == logging.ERROR
-    log.setLevel(logging.INFO)
-
-
-@pytest.mark.parametrize("words", [["bench", "raster"], ["bench", "query", "s.ply"]])
-def test_every_number_of_a_command_has_a_range(words: list[str]) -> None:
-    command = parse(words)
-    assert [setting.option for setting in numeric_settings(command) if setting.range is None] == []
 
 
 @pytest.mark.parametrize(

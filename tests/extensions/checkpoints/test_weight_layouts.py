@@ -301,12 +301,8 @@ def replaced(name: str, by: torch.Tensor) -> Callable[[Tensors], object]:
 
 BROKEN_CLIP = {
     "no projection": without("visual.proj"),
-    "a hole": lambda t: {k.replace("resblocks.0", "resblocks.7"): v for k, v in t.items()},
     "a short norm": replaced("ln_final.bias", torch.zeros(5)),
-    "a scalar": replaced("transformer.resblocks.0.attn.in_proj_weight", torch.tensor(1.0)),
     "a tensor too many": replaced("visual.conv1.bias", torch.zeros(128)),
-    "nothing": lambda t: {},
-    "a number for its state": lambda t: {"state_dict": 5},
     "more than the file": lambda t: t | {"positional_embedding": torch.zeros(1).expand(1 << 40, 128)},
 }
 BROKEN_SAM = {
@@ -383,12 +379,9 @@ def stating(part: str, **settings: object) -> Callable[[Any], Any]:
 
 
 OTHER_CONFIGS = {
-    "other width": stating("vision_cfg", width=64),
     "timm": stating("vision_cfg", timm_model_name="vit_base"),
-    "heads that do not divide": stating("text_cfg", heads=7),
     "no text": lambda config: {"model_cfg": {"vision_cfg": {}}},
     "a captioner": lambda config: {"model_cfg": config["model_cfg"] | {"multimodal_cfg": {"width": 8}}},
-    "two colours": lambda config: config | {"preprocess_cfg": {"mean": [0, 0]}},
 }
 
 

@@ -14,7 +14,6 @@ from langsplat_core.extensions.compaction.clean import CleanConfig, CleanReport,
 from langsplat_core.extensions.compaction.commands import Compact
 from langsplat_core.extensions.compaction.compact import (
     ALONE,
-    HOLD_OUT,
     BudgetConfig,
     MeasuringView,
     Views,
@@ -108,15 +107,6 @@ def test_gaussians_that_any_view_needs_are_kept(scene):
     assert score[~keep].max() <= score[keep].min()
 
 
-def test_measuring_views_do_not_rank(scene):
-    chosen = choose_views(scene, None, CONFIG, silent)
-    assert len(chosen.measuring) == len(scene.cameras) // HOLD_OUT
-    assert len(chosen.ranking) + len(chosen.measuring) == len(scene.cameras)
-    assert not set(map(id, chosen.ranking)) & set(map(id, chosen.measuring))
-    thinned = choose_views(scene, None, replace(CONFIG, views=4), silent)
-    assert (len(thinned.ranking), len(thinned.measuring)) == (2, 2)
-
-
 def test_compact_file_keeps_budget_order_and_companions(scene, source, tmp_path):
     out = tmp_path / "out.ply"
     report = compact_scene(source, out, CONFIG)
@@ -153,10 +143,6 @@ def test_a_scene_without_cameras_is_seen_from_a_ring(scene, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "out", "words"),
     [
-        ({"max_psnr_loss": -1.0}, "out.ply", "max-psnr-loss"),
-        ({"max_psnr_loss": float("nan")}, "out.ply", "max-psnr-loss"),
-        ({"assumed_psnr": 0.0}, "out.ply", "assumed-psnr"),
-        ({"views": 1}, "out.ply", "--views 1: must be 2 to"),
         ({}, "scene.ply", "choose another name"),
         ({}, "out.xyz", "choose such a name"),
         ({"max_psnr_loss": 1e-6}, "out.splat", "format alone"),  # eight bits per colour and opacity
