@@ -22,7 +22,7 @@ TABLE = ROOT / "docs" / "benchmarks" / "elsewhere.md"
 OUT = ROOT / "elsewhere_out"
 COMPUTING = (
     "raster scene query training semantics display extensions datasets making benchmarks io "
-    "pipeline/test_train.py test_lowest_layers.py test_compiled.py"
+    "pipeline/test_train.py test_lowest_layers.py"
 )
 WRITING = "cli datasets io pipeline scene semantics test_writing.py"
 HEAD = """# The tests on other machines

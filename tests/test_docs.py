@@ -20,7 +20,6 @@ from assets.making.__main__ import parse as parse_making
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.arguments import Runnable
 from langsplat_core.cli.run import main
-from langsplat_core.io.scenes import load_scene
 from langsplat_viewer.program import parse as parse_viewer
 from tests.benchmarks.__main__ import parse as parse_benchmarks
 from tests.support.file_samples import compressed_ply
@@ -118,22 +117,12 @@ def run(start: list[str], more: tuple[str, ...] = ()) -> None:
     assert main(words[0], lambda: PARSERS[words[0]]([*words[1:], *more])) == 0
 
 
-def test_readme_inspect_runs(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run(["langsplat", "inspect"])
-    assert "81,288" in capsys.readouterr().out
-
-
 @pytest.mark.long
 def test_readme_query_runs(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run(["langsplat", "query"])
     answers = json.loads(capsys.readouterr().out)
     assert [answer["phrase"] for answer in answers] == ["handle of the red mug"]
     assert all(len(answer["pixel"]) == 2 for answer in answers)
-
-
-def test_readme_convert_runs(folder: Path) -> None:
-    run(["langsplat", "convert"])
-    assert len(load_scene(folder / "guitar.spz").gaussians) == 300
 
 
 @pytest.mark.long

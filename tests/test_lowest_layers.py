@@ -1,20 +1,33 @@
-"""What every layer shares: numbers, the one printable line of a message, and progress as a value, in lines
-and in words."""
+"""What every layer shares: numbers, lines of messages, progress, compiled kernels, extensions."""
 
+import os
+import shutil
+import subprocess
+import sys
 from contextlib import suppress
+from itertools import product
+from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 
-from langsplat_core import errors
+from langsplat_core import compiled, errors, registry
 from langsplat_core.arrays import psnr
+from langsplat_core.cli.app import command_names, parse
+from langsplat_core.compiled import Workers, digest_of_sources, is_compiled
 from langsplat_core.errors import EncoderError, InputError, printable_line, quoted
+from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.progress import (
     LineProgress,
     Progress,
     Report,
     TerminalProgress,
 )
+from langsplat_core.raster.cpu import backward, blend, tiles
+from langsplat_core.scene import Scene
+from tests.support.processes import bound_by_permissions, files_of_at_most
+from tests.support.scenes import random_gaussians
 
 
 def test_psnr() -> None:
@@ -88,3 +101,218 @@ def test_progress_of_a_part_stays_within_its_share():
     whole.part(1, 4)("inner", 0.5, "b", loss=1.0)
     whole.part(3, 4, "outer", "c")("inner", 1.0)
     assert reports == [Report("inner", 0.375, "b", {"loss": 1.0}), Report("outer", 1.0, "c")]
+
+
+# Machine code that is kept on disk never outlives the sources it was made from.
+
+PACKAGE = Path(compiled.__file__).parent
+KERNEL = """
+from langsplat_core.arrays import Array
+from langsplat_core.compiled import kernel
+from langsplat_core.adding import added
+@kernel
+def run(first: int, last: int, out: Array) -> None:
+    for i in range(first, last):
+        out[i] = added(i)
+"""
+HELPER = (
+    "from langsplat_core.compiled import helper\nSTEP = {step}\n@helper\ndef added(i):\n    return i + STEP\n"
+)
+CALL = "import numpy as np; from langsplat_core.running import run; x = np.zeros(3); run(0, 3, x); print(x)"
+
+
+def small_package(folder: Path) -> Path:
+    """A package with one kernel, whose helper in `adding.py` is still to be written."""
+    package = folder / "langsplat_core"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    for name in ("arrays.py", "compiled.py", "errors.py"):
+        shutil.copy(PACKAGE / name, package / name)
+    (package / "running.py").write_text(KERNEL)
+    return package
+
+
+@pytest.mark.long
+def test_kernels_are_kept_until_a_helper_changes(tmp_path: Path) -> None:
+    package = small_package(tmp_path)
+    environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    environment["PYTHONPATH"] = str(tmp_path)
+    code = f"{CALL}; print(sum(run.stats.cache_misses.values()))"
+    for step, said in ((1, "[1. 2. 3.]"), (5, "[5. 6. 7.]")):
+        (package / "adding.py").write_text(HELPER.format(step=step))
+        for misses in ("1", "0"):
+            command = [sys.executable, "-c", code]
+            text = subprocess.check_output(command, env=environment, cwd=tmp_path, text=True)
+            assert text.splitlines() == [said, misses]
+    assert len(list(package.rglob("*.nbc"))) == 1  # the code of the older sources is gone
+
+
+def test_digest_follows_the_imports_of_a_kernel(tmp_path: Path) -> None:
+    lonely = tmp_path / "lonely.py"
+    lonely.write_text("import numpy\n")
+    before = digest_of_sources(lonely)
+    digest_of_sources.cache_clear()
+    lonely.write_text("import numpy  # changed\n")
+    assert digest_of_sources(lonely) != before
+    sources = [Path(module.__file__ or "") for module in (blend, tiles, backward)]
+    assert len({digest_of_sources(source) for source in sources}) == 3
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("home", ["/proc", "closed"])
+def test_kernels_compile_without_a_writable_folder(home: str, tmp_path: Path) -> None:
+    """With neither the package's folder nor a home to write to."""
+    package, closed = small_package(tmp_path), tmp_path / "closed"
+    closed.mkdir()
+    (package / "adding.py").write_text(HELPER.format(step=2))
+    for folder in (package, closed):
+        folder.chmod(0o555)
+    environment = {"PATH": os.environ["PATH"], "PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", CALL],
+        env=environment | {"HOME": str(tmp_path / home)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        preexec_fn=bound_by_permissions(),
+    )
+    for folder in (package, closed):
+        folder.chmod(0o755)
+    assert done.stdout.strip() == "[2. 3. 4.]", done.stderr
+    (line,) = done.stderr.splitlines()
+    assert "kernels are compiled for this run only" in line
+
+
+def test_pieces_cover_a_range_once() -> None:
+    def mark(first: int, last: int, out: np.ndarray) -> None:
+        out[first:last] += 1
+
+    for count, threads in product((0, 1, 7, 100), (1, 3)):
+        out = np.zeros(count, int)
+        Workers(threads).run(mark, count, out)
+        assert (out == 1).all()
+
+
+def test_kernels_run_on_a_full_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+
+    def doubled(value: float) -> float:
+        return value + value
+
+    for size in (0, 500):
+        double = compiled.kernel(doubled)
+        with files_of_at_most(size), caplog.at_level("WARNING", "langsplat"):
+            assert double(2.5) == 5
+    assert [record.getMessage().partition(":")[0] for record in caplog.records] == [
+        "kernels are compiled for this run only, which takes some seconds"
+    ]
+    assert not list(tmp_path.rglob("*.nbc"))
+    again = compiled.kernel(doubled)
+    assert not is_compiled(again)
+    assert again(2.5) == 5
+    assert list(tmp_path.rglob("*.nbc"))
+    assert is_compiled(compiled.kernel(doubled))
+
+
+# Extensions: a stranger's package adds a format and a command, a broken one costs a warning.
+
+EXAMPLE = Path(__file__).parents[1] / "docs" / "examples" / "05_write_an_extension"
+OWN = sorted(registry.extensions())
+
+
+def langsplat(site: Path, *words: object) -> subprocess.CompletedProcess[str]:
+    """Run `langsplat` with the packages in the folder `site` beside those that are installed."""
+    paths = os.pathsep.join([str(site), *sys.path])
+    return subprocess.run(
+        [sys.executable, "-m", "langsplat_core", *map(str, words)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": paths},
+    )
+
+
+@pytest.fixture(scope="module")
+def example(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder that the example is installed into, as a user would."""
+    folder = tmp_path_factory.mktemp("example")
+    shutil.copytree(EXAMPLE, folder / "source")
+    install = ["install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
+    target = ["--target", str(folder / "site"), str(folder / "source")]
+    subprocess.run([sys.executable, "-m", "pip", *install, *target], check=True, capture_output=True)
+    return folder / "site"
+
+
+@pytest.mark.long
+def test_installed_package_adds_a_format_and_a_command(example: Path, tmp_path: Path) -> None:
+    points = np.random.default_rng(0).uniform(0, 255, (200, 6)).round(2)
+    np.savetxt(tmp_path / "a.xyz", points)
+    converted = langsplat(example, "convert", tmp_path / "a.xyz", tmp_path / "a.ply")
+    assert (converted.returncode, converted.stderr) == (0, "")
+    np.testing.assert_allclose(load_scene(tmp_path / "a.ply").gaussians.means, points[:, :3], rtol=1e-6)
+    extent = langsplat(example, "extent", tmp_path / "a.ply")
+    lengths = [float(word) for word in extent.stdout.split()[1:]]
+    np.testing.assert_allclose(lengths, np.ptp(points[:, :3], axis=0), atol=1e-3)
+    (tmp_path / "bad.xyz").write_text("one two three\n")
+    refused = langsplat(example, "extent", tmp_path / "bad.xyz")
+    assert refused.returncode == 2
+    assert len(refused.stderr.splitlines()) == 1
+
+
+def write_extension(site: Path, name: str, code: str) -> None:
+    """Write a module with an entry point of the group, as an installed package has them."""
+    (site / f"{name}.py").write_text(code)
+    about = site / f"{name}-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(f"[{registry.GROUP}]\n{name} = {name}:EXTENSION\n")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "code",
+    [
+        "raise RuntimeError('of\\nthe stranger')",
+        "EXTENSION = 3",
+        "from langsplat_core.registry import Extension\nEXTENSION = Extension(formats={'.x': 'none_such:F'})",
+    ],
+    ids=["raises", "is none", "names nothing"],
+)
+def test_broken_extension_costs_one_warning(code: str, tmp_path: Path) -> None:
+    write_extension(tmp_path, "broken", code)
+    save_scene(tmp_path / "a.ply", Scene(random_gaussians(20)))
+    done = langsplat(tmp_path, "convert", tmp_path / "a.ply", tmp_path / "b.splat")
+    assert done.returncode == 0
+    assert (tmp_path / "b.splat").exists()
+    (warning,) = done.stderr.splitlines()
+    assert "left out" in warning
+
+
+def test_broken_part_is_refused_when_it_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    broken = registry.Extension(exporters={"broken": "none_such:EXPORTER"})
+    monkeypatch.setattr(registry, "extensions", lambda: {"a": broken})
+    assert registry.parts("exporters") == {}
+    with pytest.raises(registry.InputError, match="broken"):
+        registry.part("exporters", "broken")
+
+
+@pytest.mark.parametrize("hidden", OWN)
+def test_help_shows_the_rest_with_an_extension_hidden(
+    hidden: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    every = set(command_names())
+    own = set(registry.extensions()[hidden].commands)
+    monkeypatch.setenv(registry.HIDDEN, hidden)
+    registry.extensions.cache_clear()
+    try:
+        assert set(command_names()) == every - own
+        with pytest.raises(SystemExit):
+            parse(["--help"])
+        listed = capsys.readouterr().out
+        for name in every:
+            assert (f"• {name} " in listed) == (name not in own and " " not in name)
+    finally:
+        registry.extensions.cache_clear()

@@ -6,13 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from PIL import Image
 from transformers import AutoTokenizer, CLIPTokenizerFast
 
 from assets.making import dataset
 from assets.making import encoder as demo_encoder
-from assets.making.crops import CropSet, EncoderConfig, plain_crops, room_crops
+from assets.making.crops import EncoderConfig, plain_crops, room_crops
 from assets.making.dataset import (
     LIGHT,
     SEED,
@@ -24,8 +22,6 @@ from assets.making.dataset import (
     write_dataset,
 )
 from assets.making.encoder import (
-    CANONICAL_COSINE,
-    loss_of,
     phrase_book,
     report,
     report_table,
@@ -34,7 +30,7 @@ from assets.making.encoder import (
     word_merges,
     write_tokenizer,
 )
-from assets.making.kit import COLOURS, Kit, colour_word, from_lch, random_colour, to_lch
+from assets.making.kit import COLOURS, Kit
 from assets.making.objects import EVERYTHING, TABLE_TOP
 from assets.making.render import Light, Renderer
 from assets.making.world import (
@@ -49,7 +45,7 @@ from assets.making.world import (
     label_region,
 )
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
-from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.errors import EncoderError
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import Progress, Report, WorkCancelledError, silent
 from langsplat_core.query.engine import QueryEngine
@@ -79,15 +75,6 @@ def world():
 @pytest.fixture(scope="module")
 def renderer(world):
     return Renderer(world, Light(np.array([-0.9, -1.0, 1.7])), samples=4)
-
-
-def test_colour_words_cover_what_they_draw():
-    rng = np.random.default_rng(0)
-    for word in COLOURS:
-        assert {colour_word(random_colour(word, rng)) for _ in range(20)} == {word}
-    assert colour_word(np.array([0.9, 0.6, 0.15])) in ("orange", None)
-    display = rng.uniform(0, 1, (50, 3))
-    np.testing.assert_allclose(from_lch(to_lch(display)), display, atol=1e-6)
 
 
 def test_truth_is_nested_and_follows_the_seed(world):
@@ -139,19 +126,6 @@ def test_written_dataset_is_read_back(tmp_path, coarse_light):
     point = camera.unproject((32.5, 24.5), float(depth[24, 32]))
     nearest = np.linalg.norm(capture.points - point, axis=1).min()
     assert nearest < 0.1  # the cloud covers what the camera sees: conventions of both agree
-
-
-def test_interrupted_dataset_renders_missing_views_only(tmp_path, coarse_light):
-    write_dataset(tmp_path, 1, 4, (32, 24), silent)
-    before = {path: path.stat().st_mtime_ns for path in tmp_path.glob("images/*")}
-    image = np.asarray(Image.open(tmp_path / "images" / "view_002.png"))
-    (tmp_path / "truth" / "view_002.npz").unlink()
-    with pytest.raises(InputError, match="at least 4 views"):
-        write_dataset(tmp_path, 1, 2, (32, 24), silent)
-    write_dataset(tmp_path, 1, 4, (32, 24), silent)
-    changed = {path.stem for path, when in before.items() if path.stat().st_mtime_ns != when}
-    assert changed == {"view_002"}
-    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "images" / "view_002.png")), image)
 
 
 def small_things(placed):
@@ -315,35 +289,6 @@ def test_tokenizer_has_one_token_for_every_word(book, tmp_path):
     files = (folder / "tokenizer.json" for folder in (tmp_path, tmp_path / "again"))
     assert len({file.read_bytes() for file in files}) == 1
     assert word_merges(["aba", "ab"]) == [("a", "b"), ("a", "b</w>"), ("ab", "a</w>")]
-
-
-def test_loss_ranks_right_canonical_and_wrong_phrases():
-    fits = torch.tensor([[0, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 1]], dtype=torch.int8)
-    nameable = torch.tensor([True, True])
-    good = torch.tensor([[CANONICAL_COSINE] * 4 + [0.9, -0.2], [CANONICAL_COSINE] * 4 + [-0.2, 0.9]])
-    swapped = good[:, [0, 1, 2, 3, 5, 4]]
-    loud = good.clone()
-    loud[:, :4] = 0.8
-    best = loss_of(good, fits, nameable)
-    assert best < 0.05
-    assert loss_of(swapped, fits, nameable) > 5
-    assert loss_of(loud, fits, nameable) > best + 1
-    other = good.clone()
-    other[0, 5] = 0.9
-    fits[0, 5] = -1  # neither right nor wrong
-    assert loss_of(other, fits, nameable) == loss_of(good, fits, nameable)
-
-
-def test_room_crops_survive_saving_and_loading(unseen_room, tmp_path):
-    levels = [label.level for label in unseen_room.labels]
-    assert {-1, 0, 1, 2} == set(levels)
-    assert len(levels) > 60
-    assert unseen_room.images.shape == (len(levels), 64, 64, 3)
-    assert (unseen_room.images.reshape(len(levels), -1).max(1) > 20).mean() > 0.95
-    unseen_room.save(tmp_path / "room.npz")
-    again = CropSet.load(tmp_path / "room.npz")
-    np.testing.assert_array_equal(again.images, unseen_room.images)
-    assert again.labels == unseen_room.labels
 
 
 @pytest.fixture

@@ -19,7 +19,6 @@ from langsplat_core.extensions.agents.commands import MOST_SIDE, Door, scene_fil
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.scene import Scene
 from tests.support.fakes import PER_BLOB, named_scene
-from tests.support.processes import refusal
 
 SCENE = named_scene()
 
@@ -95,7 +94,3 @@ def test_a_client_asks_over_standard_input_and_output(folder):
     assert refused.is_error
     assert "names nothing to look for" in refused.content[0].text
     assert before == {path: path.read_bytes() for path in folder.rglob("*.*") if path.is_file()}
-
-
-def test_serve_names_its_protocol_option(folder, capsys):
-    assert "--mcp" in refusal(capsys, "serve", folder / "a.ply")

@@ -7,10 +7,9 @@ import pytest
 import torch
 
 from langsplat_core.arrays import Array, unit
-from langsplat_core.config import CODEC_CONFIGS, AutoencoderConfig, CodebookConfig, LinearConfig
+from langsplat_core.config import AutoencoderConfig, CodebookConfig, LinearConfig
 from langsplat_core.scene import (
     NO_NODE,
-    AutoencoderCodec,
     Codec,
     Gaussians,
     LanguageField,
@@ -65,11 +64,6 @@ def codec(request: pytest.FixtureRequest) -> Codec:
 # What every codec answers.
 
 
-def test_every_kind_of_codec_has_settings() -> None:
-    assert set(KINDS) == set(CODEC_CONFIGS)
-    assert all(CODEC_CONFIGS[kind]().kind == KINDS[kind].kind == kind for kind in KINDS)
-
-
 def test_codecs_survive_storage(codec: Codec) -> None:
     vectors, _ = clusters(12, 10)
     latents = codec.encode(vectors)
@@ -116,18 +110,6 @@ def test_latents_have_distances_and_colours(codec: Codec) -> None:
     colours = codec.colours(latents, np.ones(120))
     assert (colours.dtype, colours.shape) == (np.float32, (120, 3))
     assert 0 <= colours.min() <= colours.max() <= 1
-
-
-def test_broken_tensors_are_named() -> None:
-    told = {"linear": "basis", "autoencoder": "encoder", "codebook": "vectors"}
-    for kind, missing in (*told.items(), ("vq", "unknown codec kind")):
-        with pytest.raises(ValueError, match=missing):
-            codec_from_tensors(kind, {})
-    w, b = np.zeros((3, 8), np.float32), np.zeros(3, np.float32)
-    with pytest.raises(ValueError, match="mirror"):
-        AutoencoderCodec(((w, b),), ((np.zeros((9, 3), np.float32), np.zeros(9, np.float32)),))
-    with pytest.raises(ValueError, match="codec encoder"):
-        AutoencoderCodec(((w, np.zeros(4, np.float32)),), ((w.T.copy(), np.zeros(8, np.float32)),))
 
 
 # Fitting.

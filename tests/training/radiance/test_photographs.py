@@ -1,6 +1,8 @@
-"""Losses against scikit-image and automatic differentiation; exposures; what moves, against plain loops."""
+"""What photographs say: losses, exposures, what moves, and depths, against references and plain loops."""
 
 import math
+from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -8,8 +10,20 @@ import torch
 from skimage.metrics import structural_similarity
 
 from langsplat_core.arrays import Array
+from langsplat_core.datasets.capture import Capture
 from langsplat_core.scene import Camera, look_at
+from langsplat_core.training.radiance import stereo
 from langsplat_core.training.radiance.losses import fit_exposure, radiance_loss, ssim_map, with_exposure
+from langsplat_core.training.radiance.stereo import (
+    PLANES,
+    RADIUS,
+    find_depths,
+    in_free_space,
+    inverse_depths,
+    neighbouring_views,
+    sweep,
+    warp,
+)
 from langsplat_core.training.radiance.transients import (
     GRID,
     MOST,
@@ -194,3 +208,131 @@ def test_patches_map_to_their_pixels() -> None:
     transients.moving[0] = moving
     still = transients.still_pixels(0, (64, 96), torch.device("cpu")).numpy()
     np.testing.assert_array_equal(still, ~moving.repeat(2, 0).repeat(3, 1))
+
+
+# Depths by plane sweeping, against a plain reference and surfaces that are known.
+
+UP = np.array([0.0, 1.0, 0.0])
+SIDES = (72, 54)
+TILT = 0.3  # of the surface z = TILT x
+
+
+def row_of_cameras() -> list[Camera]:
+    """In a row before the surface, some degrees apart; the last looks away."""
+    eyes = [np.array([x, 0.2, -4.0]) for x in (-0.9, -0.3, 0.3, 0.9)]
+    seeing = [look_at(eye, np.zeros(3), UP, SIDES, 40.0) for eye in eyes]
+    return [*seeing, look_at(np.array([0, 0, -4.0]), np.array([0, 0, -9.0]), UP, SIDES, 40.0)]
+
+
+def true_depth(camera: Camera) -> Array:
+    """(H, W) depth of the surface."""
+    ray = camera.unproject(camera.pixel_centres(), np.ones((camera.height, camera.width))) - camera.position
+    return (TILT * camera.position[0] - camera.position[2]) / (ray[..., 2] - TILT * ray[..., 0])
+
+
+def picture(camera: Camera) -> Array:
+    """The surface with a texture of waves that repeats nowhere."""
+    at = camera.unproject(camera.pixel_centres(), true_depth(camera))
+    rng = np.random.default_rng(2)
+    waves = rng.normal(size=(40, 2)) * 14
+    phases, colours = rng.uniform(0, 6, 40), rng.normal(size=(40, 3)) * 0.09
+    return (255 * (0.5 + np.sin(at[..., :2] @ waves.T + phases) @ colours).clip(0, 1)).astype(np.uint8)
+
+
+@cache
+def capture() -> Capture:
+    rng = np.random.default_rng(0)
+    across = rng.uniform(-1, 1, (200, 2))
+    points = np.stack([across[:, 0], across[:, 1], TILT * across[:, 0]], -1)
+    images = [picture(camera) for camera in row_of_cameras()]
+    return Capture(tuple(row_of_cameras()), tuple(images), points, np.zeros((200, 3), np.uint8))
+
+
+def correlation(a: Array, b: Array) -> float:
+    """Zero-mean normalised cross-correlation of two windows."""
+    a, b = a - a.mean(), b - b.mean()
+    return float((a * b).mean() / np.sqrt(((a * a).mean() + 1e-5) * ((b * b).mean() + 1e-5)))
+
+
+def looked_up(other: Array, camera: Camera, to: Camera, depth: float, column: int, row: int) -> float:
+    """The other image where a pixel lies at a depth, bilinear; NaN outside."""
+    (place,), _ = to.project(camera.unproject((column + 0.5, row + 0.5), depth)[None])
+    u, v = place - 0.5
+    if not (0 <= u < other.shape[1] - 1 and 0 <= v < other.shape[0] - 1):
+        return float("nan")
+    i, j = int(u), int(v)
+    a, b = u - i, v - j
+    above, below = (other[k, i] * (1 - a) + other[k, i + 1] * a for k in (j, j + 1))
+    return float(above * (1 - b) + below * b)
+
+
+def test_sweep_scores_equal_the_reference() -> None:
+    one, two = row_of_cameras()[1:3]
+    greys = [picture(camera).mean(2, dtype=np.float32) / 255 for camera in (one, two)]
+    planes = inverse_depths(one, [one, two], capture().points)
+    best = np.full((stereo.BEST, PLANES, *greys[0].shape), -1, np.float32)
+    stereo.score_planes(0, PLANES, *greys, *warp(one, two), planes, best)
+    judged = 0
+    for row, column, plane in ((20, 30, 40), (27, 36, 60), (33, 41, 5), (15, 52, 77)):
+        rows, columns = range(row - RADIUS, row + RADIUS + 1), range(column - RADIUS, column + RADIUS + 1)
+        depth = 1 / planes[plane]
+        seen = np.array(
+            [[looked_up(greys[1].astype(float), one, two, depth, x, y) for x in columns] for y in rows]
+        )
+        if np.isfinite(seen).all():
+            judged += 1
+            window = greys[0][rows.start : rows.stop, columns.start : columns.stop].astype(float)
+            assert best[0, plane, row, column] == pytest.approx(correlation(window, seen), abs=2e-4)
+    assert judged >= 3
+    assert (best[1] == -1).all()  # one neighbour has one score
+
+
+def test_depths_lie_on_the_true_surface() -> None:
+    maps = find_depths(capture(), range(5))
+    assert len(maps) == 4  # the view that looks away has none
+    for one, camera in zip(maps, row_of_cameras(), strict=False):
+        known = np.isfinite(one.depth)
+        assert known.mean() > 0.5
+        error = np.abs(one.depth / true_depth(camera) - 1)[known]
+        assert np.quantile(error, 0.95) < 0.01
+        points, colours = one.points()
+        assert len(points) == len(colours) == known.sum()
+        assert np.quantile(np.abs(points[:, 2] - TILT * points[:, 0]), 0.95) < 0.04
+
+
+def test_space_before_a_surface_is_free() -> None:
+    maps = find_depths(capture(), range(4))
+    rng = np.random.default_rng(1)
+    across = rng.uniform(-0.5, 0.5, (100, 2))
+    surface = np.stack([across[:, 0], across[:, 1], TILT * across[:, 0]], -1)
+    assert in_free_space(surface - (0, 0, 1.0), maps).mean() > 0.9
+    assert in_free_space(surface, maps).mean() < 0.02
+    assert not in_free_space(surface + (0, 0, 1.0), maps).any()  # nobody looks there
+    assert not in_free_space(surface - (0, 0, 20.0), maps).any()
+    assert not in_free_space(surface, []).any()
+
+
+def test_masked_pixels_have_no_depth() -> None:
+    mask = np.ones(SIDES[::-1], bool)
+    mask[:, :30] = False
+    masked = replace(capture(), masks=(mask, None, None, None, None))
+    first = find_depths(masked, range(4))[0]
+    assert not np.isfinite(first.depth[:, :30]).any()
+    assert np.isfinite(first.depth[:, 30:]).any()
+
+
+def test_single_or_flat_views_have_no_depths() -> None:
+    assert find_depths(capture(), [0]) == []
+    flat = replace(capture(), images=tuple(np.full((*SIDES[::-1], 3), 120, np.uint8) for _ in range(5)))
+    assert not any(np.isfinite(one.depth).any() for one in find_depths(flat, range(4)))
+
+
+def test_neighbouring_views_see_the_same_from_aside() -> None:
+    near = neighbouring_views(row_of_cameras(), capture().points)
+    assert near[4] == []
+    assert all(4 not in others and len(others) == 3 for others in near[:4])
+    at_one_place = row_of_cameras()[:2] * 2
+    assert neighbouring_views(at_one_place, np.zeros((0, 3)))[0] == [1, 3]
+    depth, score = sweep(0, [1], row_of_cameras(), [np.zeros(SIDES[::-1], np.float32)] * 5, np.zeros((0, 3)))
+    assert np.isfinite(depth).all()
+    assert score.max() == 0
