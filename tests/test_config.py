@@ -4,7 +4,7 @@
 import dataclasses
 import math
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -88,7 +88,6 @@ def test_every_number_of_every_command_has_a_range(line: str) -> None:
     ("line", "named"),
     [
         ("--radiance.sh-degree 4", "--radiance.sh-degree 4: must be 0 to 3"),
-        ("--radiance.position-lr-init 0", "--radiance.position-lr-init 0: must be above 0 and at most 10"),
         ("--codec.kind linear --codec.latent-dim 0", "--codec.latent-dim 0: must be 1 to 4096"),
         ("--profile paper --codec.lr nan", "--codec.lr nan"),
         ("--codec.kind vq", "--codec.kind vq: choose one of codebook, autoencoder, linear"),
@@ -108,28 +107,6 @@ def test_python_callers_are_refused_alike(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^--codec\.batch "):
         train_scene(tmp_path / "absent", tmp_path / "s.ply", TrainConfig(codec=AutoencoderConfig(batch=1)))
     assert list(tmp_path.iterdir()) == []
-
-
-@dataclasses.dataclass(frozen=True)
-class Sample:
-    plain: int = 3
-    length: Annotated[float, config.Range(0.0, 1.0, above=True)] | None = None
-    pair: tuple[Annotated[int, config.Range(1, 9)], Annotated[int, config.Range(1, 9)]] = (1, 9)
-    text: str = "no number"
-    switch: bool = False
-
-
-def test_values_inside_their_range_pass() -> None:
-    found = {setting.option: setting.range for setting in numeric_settings(Sample())}
-    assert found["--plain"] is None
-    assert list(found) == ["--plain", "--length", "--pair"]
-    check_settings(Sample(length=None, pair=(1, 9)))
-    check_settings(Sample(length=np.float32(1), pair=(np.int64(1), 9)))  # type: ignore[arg-type]
-    check_settings(Sample(length=1))
-    with pytest.raises(InputError, match="above 0 and at most 1"):
-        check_settings(Sample(length=0.0))
-    with pytest.raises(InputError, match="whole number"):
-        check_settings(Sample(pair=(True, 1)))
 
 
 # How the options of `langsplat train` come together.
@@ -183,9 +160,7 @@ def test_options_beside_a_file_win(tmp_path: Path) -> None:
     [
         ("[radiance]\nstepz = 7", "--radiance.stepz"),
         ("radiance = 5", "--radiance"),
-        ("help = true", "--help"),
         ("[radiance]\nsteps = 'many'", "--radiance.steps: invalid literal"),
-        ("[radiance]\nsteps = true", "--radiance.steps"),
         ("[radiance]\nsteps = 0", "--radiance.steps 0: must be 1 to"),
         ("phrases = ['--out', 'x']", "phrases"),
         ("config = 'other.toml'", "config"),

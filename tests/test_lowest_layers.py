@@ -15,7 +15,7 @@ import pytest
 from langsplat_core import compiled, errors, registry
 from langsplat_core.arrays import psnr
 from langsplat_core.cli.app import command_names, parse
-from langsplat_core.compiled import Workers, digest_of_sources, is_compiled
+from langsplat_core.compiled import Workers, is_compiled
 from langsplat_core.errors import EncoderError, InputError, printable_line, quoted
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.progress import (
@@ -24,7 +24,6 @@ from langsplat_core.progress import (
     Report,
     TerminalProgress,
 )
-from langsplat_core.raster.cpu import backward, blend, tiles
 from langsplat_core.scene import Scene
 from tests.support.processes import bound_by_permissions, files_of_at_most
 from tests.support.scenes import random_gaussians
@@ -145,17 +144,6 @@ def test_kernels_are_kept_until_a_helper_changes(tmp_path: Path) -> None:
             text = subprocess.check_output(command, env=environment, cwd=tmp_path, text=True)
             assert text.splitlines() == [said, misses]
     assert len(list(package.rglob("*.nbc"))) == 1  # the code of the older sources is gone
-
-
-def test_digest_follows_the_imports_of_a_kernel(tmp_path: Path) -> None:
-    lonely = tmp_path / "lonely.py"
-    lonely.write_text("import numpy\n")
-    before = digest_of_sources(lonely)
-    digest_of_sources.cache_clear()
-    lonely.write_text("import numpy  # changed\n")
-    assert digest_of_sources(lonely) != before
-    sources = [Path(module.__file__ or "") for module in (blend, tiles, backward)]
-    assert len({digest_of_sources(source) for source in sources}) == 3
 
 
 @pytest.mark.long

@@ -125,12 +125,6 @@ def test_the_longest_names_are_written(name: str, tmp_path: Path) -> None:
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "whole")]
 
 
-def test_paths_are_shown_short_and_printable() -> None:
-    assert files.shown("a/b.ply") == "a/b.ply"
-    assert files.shown("\udcff") == "\\udcff"
-    assert len(files.shown("x" * 500)) == 100
-
-
 # A disk that is full, for every kind of file that is written: one line, and what was there stays.
 
 GAUSSIANS = random_gaussians(40, 1, sh_degree=1)

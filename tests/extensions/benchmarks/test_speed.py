@@ -15,11 +15,8 @@ from langsplat_core.extensions.benchmarks.query_speed import (
     BenchQuery,
     measure_queries,
     query_table,
-    repeated,
-    with_codec,
 )
 from langsplat_core.extensions.benchmarks.raster_speed import (
-    BenchRaster,
     reference_windows,
     run_plan,
 )
@@ -27,7 +24,6 @@ from langsplat_core.extensions.benchmarks.report import write_report
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import CodebookCodec, LanguageField, Scene
 from tests.support.fakes import DIM, PER_BLOB, FakeEncoder, axis, blob_scene
-from tests.support.file_samples import random_codec
 from tests.support.processes import Captured, check_full_disk, refusal, run
 from tests.support.scenes import random_camera, random_gaussians, random_values
 
@@ -87,16 +83,6 @@ def test_a_tiny_run_writes_three_sane_files(tmp_path):
     assert Image.open(tmp_path / "raster.png").size[0] > 1000
 
 
-@pytest.mark.long
-def test_operations_beyond_the_limit_are_named():
-    plan = BenchRaster(False, (60, 4000), ((40, 30),), 60, (1,), limit=1e-9)
-    report = run_plan(plan)
-    assert {r.milliseconds is None for r in report.rows if r.gaussians == 60} == {False}
-    left_out = [r for r in report.rows if r.gaussians == 4000]
-    assert {r.milliseconds is None and "expected" in r.note for r in left_out} == {True}
-    assert "not run" in report.text
-
-
 # The query benchmark.
 
 SMALL = BenchQuery(Path(), size=(40, 30), phrases=2, together=3, repeats=1, codec_steps=40)
@@ -130,27 +116,6 @@ def test_every_order_is_measured_against_what_it_should_find():
 def test_a_scene_without_a_codebook_is_refused():
     with pytest.raises(InputError, match="codebook"):
         measure_queries(blob_scene(), FakeEncoder(), SMALL)
-
-
-def test_repeated_gaussians_lie_beside_their_own_with_their_meaning():
-    scene = codebook_scene()
-    larger = repeated(scene, 1000)
-    assert len(larger.gaussians) == 1000
-    rows = np.arange(1000) % (3 * PER_BLOB)
-    np.testing.assert_array_equal(larger.language.latents, scene.language.latents[:, rows])
-    steps = (larger.gaussians.means - scene.gaussians.means[rows]) / np.exp(scene.gaussians.log_scales[rows])
-    assert 0.9 < steps.std() < 1.1
-
-
-def test_another_codec_encodes_the_codewords():
-    field = codebook_scene().language
-    wide = CodebookCodec(np.eye(3, 16, dtype=np.float32), np.zeros((3, 3), np.float32))
-    field = replace(field, codec=wide, canonical=np.eye(16, dtype=np.float32)[[3] * 4])
-    codec = random_codec("autoencoder")
-    encoded = with_codec(field, codec)
-    want = codec.encode(np.eye(3, 16, dtype=np.float32))[field.latents[2, :, 0]]
-    np.testing.assert_array_equal(encoded.latents[2], want)
-    assert (encoded.latents[0, :50] == 0).all()
 
 
 @pytest.mark.long

@@ -149,16 +149,6 @@ def test_folding_batch_normalisation_changes_nothing() -> None:
     np.testing.assert_allclose(np.maximum(data.numpy() @ w1.T + b1, 0) @ w2.T + b2, want, atol=2e-5)
 
 
-def test_further_vectors_help_kinds_that_interpolate_only() -> None:
-    vectors, further = clusters(5, 20)[0], clusters(30, 20, seed=1)[0]
-    linear = LinearConfig(latent_dim=30)
-    alone, helped = (fit_codec(vectors, linear, WORDS, further=more) for more in (None, further))
-    assert codec_report(helped, further, WORDS).cosine > codec_report(alone, further, WORDS).cosine
-    same, book = (fit_codec(vectors, CodebookConfig(size=5), WORDS, further=more) for more in (None, further))
-    np.testing.assert_array_equal(same.decode(np.zeros((1, 1), int)), book.decode(np.zeros((1, 1), int)))
-    assert fit_codec(vectors[:0], CodebookConfig(size=5), WORDS, further=further).size == 5
-
-
 def test_codebook_is_the_smallest_within_its_error_budget() -> None:
     vectors, _ = clusters(100, 20, noise=0.01)
     sizes = []
