@@ -3,7 +3,7 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice, PictureConfig
@@ -34,21 +34,9 @@ class Unit:
         return between.join(f"{self.length * value:.3f}" for value in values)
 
 
-class HasUnit(Protocol):
-    """A scene, or what stands for one, that may say how long its unit is."""
-
-    @property
-    def metres_per_unit(self) -> float | None:
-        """Metres per world unit; None where nobody said."""
-
-
-def unit_of(scene: HasUnit, metres_per_unit: float | None = None) -> Unit:
-    """Return the unit of lengths in a scene: metres where a scale is known, else world units.
-
-    metres_per_unit: in place of the scene's own scale.
-    """
-    metres = metres_per_unit or scene.metres_per_unit
-    return Unit("units", 1.0) if metres is None else Unit("m", metres)
+def unit_of(metres_per_unit: float | None) -> Unit:
+    """Return the unit of lengths in a scene: metres where a scale is known, else world units."""
+    return Unit("units", 1.0) if metres_per_unit is None else Unit("m", metres_per_unit)
 
 
 def instance_lines(instances: Sequence[Instance], unit: Unit) -> list[str]:

@@ -75,7 +75,7 @@ class Describe:
             print_json(answer | basis_fields(engine))
             return
         if self.outline:
-            print(*outline_lines(answer["outline"], unit_of(scene)), sep="\n")
+            print(*outline_lines(answer["outline"], unit_of(scene.metres_per_unit)), sep="\n")
         elif self.pixel is None:
             _print_inventory(answer["inventory"])
         else:

@@ -137,21 +137,13 @@ class SetScale:
             raise InputError("give either --metres with --between, or --metres-per-unit")
         factor = self.metres_per_unit
         if self.metres is not None and self.between is not None:
-            factor = metres_per_unit(self.metres, self.between)
+            units = math.dist(self.between[:3], self.between[3:])
+            if not 0 < units < math.inf:
+                raise InputError(
+                    f"--between: points {units:g} units apart; their distance must be above 0 and finite"
+                )
+            factor = self.metres / units
         if factor is not None:
             write_metres(self.scene, factor)
         stored = load_without_language(self.scene).metres_per_unit
         print(f"{self.scene}: {'no scale' if stored is None else f'{stored:.6g} m per unit'}")
-
-
-def metres_per_unit(metres: float, between: Box) -> float:
-    """Return the metres per unit of a length in metres between two points.
-
-    Raises InputError unless both lengths are positive.
-    """
-    units = math.dist(between[:3], between[3:])
-    if not (0 < metres < math.inf and 0 < units < math.inf):
-        raise InputError(
-            f"{metres:g} m between points {units:g} units apart: both must be above 0 and finite"
-        )
-    return metres / units

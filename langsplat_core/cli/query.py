@@ -93,7 +93,7 @@ class QueryScene:
         explain = _Explainer(self, scene) if self.why is not None else None
         camera = camera_of(scene, self.camera) if scene.cameras else None
         engine = _engine(scene, once(load_text_encoder), self.encoder, self.taught)
-        unit = unit_of(scene, self.scale)
+        unit = unit_of(self.scale or scene.metres_per_unit)
         found = [self._ask(engine, text, camera) for text in self._askable(engine, camera)]
         if self.like:
             level = "whole" if self.level == "auto" else self.level
@@ -325,7 +325,7 @@ class Select:
         """Select, write the file, and print what is in it."""
         self._check()
         scene = searchable(self.scene)
-        unit = unit_of(scene, self.scale)
+        unit = unit_of(self.scale or scene.metres_per_unit)
         engine = _engine(scene, load_text_encoder, self.encoder, self.taught)
         answers = [found_answer(engine, text, self.level) for text in self.texts]
         answer = answers[0] if len(answers) == 1 else joined(answers, all_needed=True)

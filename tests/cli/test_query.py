@@ -273,7 +273,7 @@ def test_known_length_gives_the_scale(folder, capsys):
     ("given", "message"),
     [
         ({"metres": 1.0}, "belong together"),
-        ({"metres": 1.0, "between": (0, 0, 0, 0, 0, 0)}, "both must be above 0"),
+        ({"metres": 1.0, "between": (0, 0, 0, 0, 0, 0)}, "must be above 0"),
         ({"metres": 1.0, "between": (0, 0, 0, 1, 0, 0), "metres_per_unit": 1.0}, "give either"),
         ({"metres_per_unit": 0.0}, "must be above 0"),
     ],

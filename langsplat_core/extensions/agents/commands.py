@@ -93,7 +93,7 @@ class Door:
         """
         engine = self._engine(scene)
         composed = run_phrase(engine, phrase, viewpoint=_first(engine.scene))
-        answer, unit = composed.answer, unit_of(engine.scene)
+        answer, unit = composed.answer, unit_of(engine.scene.metres_per_unit)
         there = answer.found or answer.verdict == "weak match"
         return {
             "verdict": answer.verdict,
@@ -117,7 +117,7 @@ class Door:
     def distance(self, first: str, second: str, scene: str = "") -> dict[str, Any]:
         """How far apart the nearest points of two things are, each named by a phrase."""
         engine = self._engine(scene)
-        frame, unit = upright(engine.scene.up()), unit_of(engine.scene)
+        frame, unit = upright(engine.scene.up()), unit_of(engine.scene.metres_per_unit)
         bodies = []
         for phrase in (first, second):
             answer = self._found(engine, phrase)
@@ -131,7 +131,9 @@ class Door:
     def describe(self, scene: str = "") -> str:
         """Return what is in a scene: an outline of its things with their parts, sizes and counts."""
         engine = self._engine(scene)
-        lines = outline_lines(outline_of(Describer(engine, None, silent)), unit_of(engine.scene))
+        lines = outline_lines(
+            outline_of(Describer(engine, None, silent)), unit_of(engine.scene.metres_per_unit)
+        )
         return "\n".join([*lines, f"answers: {engine.basis.long}"])
 
     def look(self, phrase: str = "", camera: int = 0, scene: str = "") -> Array:

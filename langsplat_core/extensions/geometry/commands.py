@@ -72,7 +72,7 @@ class WriteMesh:
         check_suffix(self.out, MESH_SUFFIXES)
         check_keeps(self.out, self.scene)
         scene = searchable(self.scene) if self.phrase else load_scene(self.scene)
-        unit = unit_of(scene)
+        unit = unit_of(scene.metres_per_unit)
         if self.phrase:
             engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
             scene = scene.take(found_answer(engine, self.phrase, self.level).members)

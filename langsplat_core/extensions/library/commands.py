@@ -86,7 +86,7 @@ def _said(hit: Hit) -> str:
     sure = "" if hit.probability is None else f" ({100 * hit.probability:.0f} %)"
     place = "place not looked for" if hit.answer is None else "place -"
     if hit.answer is not None and hit.answer.place is not None:
-        unit = unit_of(hit)
+        unit = unit_of(hit.metres_per_unit)
         place = f"place {unit.format(hit.answer.place)} {unit.name}"
     return f"{hit.verdict}{sure}, {place}"
 
@@ -174,7 +174,7 @@ class Changes:
             raise InputError("--register finds what --transform gives; leave one of them out")
         placed = None if self.transform is None else read_transform(self.transform).matrix
         scenes = searchable(self.before), searchable(self.after)
-        unit = unit_of(scenes[0], self.scale)
+        unit = unit_of(self.scale or scenes[0].metres_per_unit)
         unsure = None in [scene.metres_per_unit for scene in scenes]
         first, second = (QueryEngine(scene, load_text_encoder, encoder_id=self.encoder) for scene in scenes)
         with TerminalProgress() as progress:
