@@ -47,13 +47,6 @@ from tests.support.photographs import (
 from tests.support.processes import files_of_at_most, stop_at
 
 
-def test_images_in_files_are_the_same(tmp_path, monkeypatch):
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    picture = np.random.default_rng(0).integers(256, size=(6, 8, 3)).astype(np.uint8)
-    np.testing.assert_array_equal(in_file(picture), picture)
-    assert list(tmp_path.iterdir()) == []  # the files have no name: nothing is left behind
-
-
 def test_image_files_need_room_on_the_disk(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     picture = np.zeros((60, 80, 3), np.uint8)
@@ -102,8 +95,6 @@ def bomb(path: Path) -> None:
     [
         lambda path: path.write_bytes(b""),
         lambda path: path.write_bytes(path.read_bytes()[:200]),
-        lambda path: path.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(100)),
-        lambda path: path.write_bytes(b"GIF89a" + bytes(20)),
         bomb,
     ],
 )
@@ -243,9 +234,6 @@ def test_focal_length_follows_from_pixels_per_inch(
     "tags",
     [
         {},
-        {FOCAL_TAG: 18.0},
-        {FOCAL_TAG: 18.0, PLANE_X: 0.0},
-        {FOCAL_TAG: 0.0, PLANE_X: 4500.0},
         {FOCAL_TAG: 18.0, PLANE_X: 4500.0, PLANE_UNIT: 77},
         {FOCAL_TAG: 1e6, PLANE_X: 1e9},
     ],

@@ -167,12 +167,6 @@ def test_page_shows_held_out_views_first_and_needs_no_other_file(tmp_path: Path)
     assert len(page.of("polygon")) == 8  # cameras from above
 
 
-@pytest.mark.parametrize("count", [1, 2])
-def test_few_cameras_and_no_gaussians(count: int, tmp_path: Path) -> None:
-    write_reports(tmp_path, report([]), capture([str(k) for k in range(count)]), gaussians(0))
-    assert len(Read(tmp_path / PAGE).of("img")) == 2 * count
-
-
 def test_a_refusal_shows_its_groups(tmp_path: Path) -> None:
     names = (f"a{HOSTILE}", "b", "c", "d")
     matches = Matches(names, (900, 900, 900, 0), ((0, 1, 80), (1, 2, 4)), frozenset())

@@ -161,9 +161,7 @@ def with_header(path: Path, old: bytes, new: bytes) -> None:
     ("old", "new"),
     [
         (b"'shape'", b"'shap'+"),  # tokenizer errors from NumPy's own reader
-        (b"'<f2'", b"'|S2'"),  # bytes, which have no astype to floats
         (b"(7, 512)", b"(7777777777777777, 512)"),  # MemoryError
-        (b"'<U1'", b"'<U9'"),
         (b"labels", b"label\x1b"),
     ],
 )

@@ -252,14 +252,6 @@ def test_crops_are_those_of_the_public_code() -> None:
         assert boxes.max(axis=0).tolist() == [*boxes[:, :2].max(axis=0), shape[1], shape[0]]
 
 
-def test_masks_cut_by_their_crop_are_dropped() -> None:
-    crop, shape = np.array([0, 0, 904, 724]), (1080, 1440)
-    assert not sam.cut_by_crop(np.array([30, 30, 500, 500]), crop, shape)
-    assert not sam.cut_by_crop(np.array([0, 0, 500, 500]), crop, shape)  # the picture itself ends there
-    assert sam.cut_by_crop(np.array([30, 30, 890, 500]), crop, shape)
-    assert not sam.cut_by_crop(np.array([0, 0, 1440, 1080]), np.array([0, 0, 1440, 1080]), shape)
-
-
 # SAM masks: the real loading path, with a tiny model made here, against one point at a time.
 
 

@@ -144,15 +144,6 @@ def test_classes_must_be_listed(tmp_path, content):
         read_3d_ovs(tmp_path)
 
 
-def test_the_other_layout_is_recognised(lerf, tmp_path_factory):
-    other = tmp_path_factory.mktemp("other")
-    ovs_view(other, "00", {"cup": block(1, 1, 2, 2)})
-    with pytest.raises(InputError, match="use `langsplat eval 3d-ovs`"):
-        read_lerf_ovs(other)
-    with pytest.raises(InputError, match="use `langsplat eval lerf-ovs`"):
-        read_3d_ovs(lerf)
-
-
 @pytest.mark.parametrize("read", [read_lerf_ovs, read_3d_ovs])
 def test_no_layout_at_all(read, tmp_path):
     with pytest.raises(InputError, match="no such folder"):
