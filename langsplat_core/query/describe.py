@@ -33,7 +33,6 @@ from langsplat_core.semantics.vocabulary import bundled_vocabulary
 WORD_SCALE = 6.0
 NEAREST = 10  # features that make a word's hub, as in the paper
 BANK = 4096  # features, at most, that are looked at for it
-NARROWEST = 1e-6  # spread; words that are all the same have none
 LIKELY = 0.5  # probability from which a word is said
 OR = " or "  # between words for one thing
 CELLS = 8_000_000  # numbers, at most, of features times words that are held at once: 32 MB
@@ -129,7 +128,7 @@ def build_words(field: LanguageField, phrases: tuple[str, ...], vectors: Array) 
     # The scale is in the median, over features, of the spread of everyday phrases' cosines, else the words'.
     texts = vectors if field.everyday is None else field.everyday
     spreads = (bank @ texts.T).std(1) if len(bank) and len(texts) > 1 else np.ones(1)
-    scale = WORD_SCALE / max(float(np.median(spreads)), NARROWEST)
+    scale = WORD_SCALE / max(float(np.median(spreads)), 1e-6)  # words that are all the same have none
     return WordScores(field.codec, phrases, every, hubs(every, bank), scale)
 
 

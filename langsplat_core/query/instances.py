@@ -12,7 +12,6 @@ from langsplat_core.scene.language import NO_NODE
 from langsplat_core.scene.surface import Surface
 
 INNER = (0.02, 0.98)  # a box holds the points between these quantiles of each coordinate: strays do not count
-TURNED = 256  # points, at most, that the box is turned by
 COARSE = np.radians(np.arange(0.0, 90.0, 10.0))  # beginning with 0: of equal areas the principal axes stay
 FINE = np.radians([0.0, -2.0, 2.0, -4.0, 4.0])
 
@@ -55,7 +54,7 @@ def oriented_box(points: Array) -> OrientedBox:
     middle = core.mean(1, keepdims=True)
     spread = core - middle
     axes = np.linalg.eigh(spread @ spread.T)[1]
-    axes = _turned(spread[:, :: -(-spread.shape[1] // TURNED)], axes)
+    axes = _turned(spread[:, :: -(-spread.shape[1] // 256)], axes)  # by 256 points at most
     low, high = np.quantile(axes.T @ (columns - middle), INNER, axis=1)
     order = np.argsort(low - high, kind="stable")
     axes, low, high = axes[:, order], low[order], high[order]
