@@ -1,4 +1,4 @@
-"""The front door: one call from a scene and a camera to a picture."""
+"""The reference against closed forms and gsplat's plain functions; the front door against the reference."""
 
 import doctest
 import subprocess
@@ -6,20 +6,254 @@ import sys
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from safetensors.numpy import load_file
 
 import langsplat_core
 from langsplat_core import Scene, render
+from langsplat_core.arrays import Array, unit
 from langsplat_core.config import GSPLAT, INRIA
 from langsplat_core.errors import BackendError, InputError
 from langsplat_core.io.cameras import read_cameras, write_cameras
 from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer, protocol, reference
 from langsplat_core.raster import render as front_door
-from langsplat_core.raster.render import pixel_weights, splat_colours, view_of
-from langsplat_core.scene import look_at
-from tests.support.scenes import random_camera, random_gaussians, random_values, without_perspective
+from langsplat_core.raster.cpu import projection
+from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
+from langsplat_core.raster.reference import ReferenceRasterizer, colours, project
+from langsplat_core.raster.render import colours_seen, pixel_weights, splat_colours, view_of
+from langsplat_core.scene import Camera, Gaussians, look_at
+from tests.support.comparing import BAND
+from tests.support.hard_cases import AXIS, balls
+from tests.support.scenes import (
+    covariances,
+    random_camera,
+    random_gaussians,
+    random_values,
+    without_perspective,
+)
+
+RASTER = ReferenceRasterizer()
+
+
+def test_one_ball_on_the_axis_is_a_gaussian_of_known_width():
+    """And ends where its alpha reaches the smallest that counts."""
+    view = RASTER.view(balls([3.0], [0.8]), AXIS)
+    image, alpha = view.splat(np.full((1, 1), 2.5))
+    variance = (30.0 * 0.2 / 3.0) ** 2 + 0.3
+    reach = np.sqrt(variance * 2 * np.log(255 * 0.8))
+    np.testing.assert_allclose(view.footprints.extents_px[0], reach, rtol=1e-6)
+    offset = np.arange(21) + 0.5 - 10.5
+    want = 0.8 * np.exp(-0.5 * (offset[:, None] ** 2 + offset**2) / variance)
+    want[want < 1 / 255] = 0
+    np.testing.assert_allclose(alpha, want, atol=1e-7)  # the opacity is a float32 logit
+    np.testing.assert_allclose(image[..., 0], 2.5 * want, atol=3e-7)
+
+
+def test_the_nearer_of_two_hides_the_farther():
+    view = RASTER.view(balls([4.0, 3.0], [0.5, 0.6]), AXIS)
+    image, alpha = view.splat(np.eye(2))
+    np.testing.assert_allclose(image[10, 10], [0.5 * 0.4, 0.6], atol=1e-7)
+    np.testing.assert_allclose(alpha[10, 10], 1 - 0.5 * 0.4, atol=1e-7)
+    assert view.median_depth()[10, 10] == 3.0
+    np.testing.assert_allclose(view.depth()[10, 10], (0.2 * 4 + 0.6 * 3) / 0.8, atol=1e-6)
+
+
+def test_a_tilted_ellipsoid_projects_to_the_textbook_covariance():
+    """Off the axis and rotated: J R S S^T R^T J^T + 0.3 I, built here without the kernel's shortcuts."""
+    g = random_gaussians(1, seed=3, scale_range=(0.05, 0.3))
+    camera = random_camera(4)
+    f = RASTER.view(g, camera).footprints
+    w, x, y, z = g.quats_wxyz[0].astype(float) / np.linalg.norm(g.quats_wxyz[0].astype(float))
+    axis_angle = np.array([x, y, z])
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    turn = (
+        np.eye(3) * (w * w - axis_angle @ axis_angle) + 2 * np.outer(axis_angle, axis_angle) + 2 * w * cross
+    )
+    sigma = turn @ np.diag(np.exp(2 * g.log_scales[0].astype(float))) @ turn.T
+
+    def to_pixel(point):
+        return camera.project(point[None])[0][0]
+
+    centre, step = g.means[0].astype(float), 1e-5
+    jacobian = np.stack(
+        [(to_pixel(centre + step * e) - to_pixel(centre - step * e)) / (2 * step) for e in np.eye(3)], -1
+    )
+    covariance = jacobian @ sigma @ jacobian.T + 0.3 * np.eye(2)
+    xx, xy, yy = f.conics[0]
+    np.testing.assert_allclose(np.linalg.inv(covariance), [[xx, xy], [xy, yy]], rtol=1e-6)
+    np.testing.assert_allclose(f.means_px[0], to_pixel(centre), atol=1e-9)
+
+
+def test_without_perspective_the_map_is_linear():
+    """Pixels are fx x + cx, and the covariance is J R S S^T R^T J^T + 0.3 I with J = diag(fx, fy)."""
+    g, camera = random_gaussians(20, seed=3, sh_degree=3), without_perspective(random_camera(4))
+    f = RASTER.view(g, camera).footprints
+    in_camera = g.means.astype(float) @ camera.rotation.T + camera.world_to_camera[:3, 3]
+    assert (in_camera[:, 2] > 1).all()
+    pixels = in_camera[:, :2] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    np.testing.assert_allclose(f.means_px, pixels, atol=1e-9)
+    np.testing.assert_allclose(f.depths, in_camera[:, 2], atol=1e-12)
+    across = np.diag([camera.fx, camera.fy]) @ camera.rotation[:2]
+    for conic, covariance in zip(f.conics, covariances(g), strict=True):
+        want = np.linalg.inv(across @ covariance @ across.T + 0.3 * np.eye(2))
+        np.testing.assert_allclose(conic, want[[0, 0, 1], [0, 1, 1]], rtol=1e-6, atol=1e-9)
+    found, _ = camera.project(g.means.astype(float))
+    np.testing.assert_allclose(found, pixels, atol=1e-12)
+    seen = colours_seen(g, camera)
+    np.testing.assert_allclose(seen, colours(g.sh, camera.rotation[2] + 0 * g.means, np.zeros(3)), atol=1e-6)
+
+
+def test_every_pixel_is_covered_or_seen_through():
+    """Weights and what is left of the light add up to 1, here in closed form: flat layers over the frame."""
+    opacities = np.array([0.3, 0.5, 0.2, 0.6])
+    view = RASTER.view(balls([3.0, 4.0, 5.0, 6.0], opacities, scale=1e4), AXIS)
+    weights, alpha = view.splat(np.eye(4))
+    left = np.cumprod(1 - opacities)
+    want = opacities * np.concatenate([[1], left[:-1]])
+    np.testing.assert_allclose(weights, np.broadcast_to(want, weights.shape), atol=1e-6)
+    np.testing.assert_allclose(alpha + left[-1], 1, atol=1e-6)
+
+
+def test_a_rigid_motion_of_world_and_camera_changes_nothing():
+    """Also the way back: a full orbit in seven steps ends with the picture it began with."""
+    g, camera = random_gaussians(30, seed=8), random_camera(8, 30, 20)
+    x = random_values(30, 3)
+    image = RASTER.view(g, camera).splat(x)[0]
+    angle = 2 * np.pi / 7
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    c, s = np.cos(angle / 2), np.sin(angle / 2)
+    q = g.quats_wxyz.astype(np.float64).T
+    quats = np.stack([c * q[0] - s * q[3], c * q[1] - s * q[2], c * q[2] + s * q[1], c * q[3] + s * q[0]], -1)
+    turned = replace(g, means=g.means @ turn.T, quats_wxyz=quats)
+    back = np.eye(4)
+    back[:3, :3] = turn.T
+    moved = replace(camera, world_to_camera=camera.world_to_camera @ back)
+    np.testing.assert_allclose(RASTER.view(turned, moved).splat(x)[0], image, atol=2e-6)  # float32 means
+    for _ in range(7):
+        camera = replace(camera, world_to_camera=camera.world_to_camera @ back)
+    np.testing.assert_allclose(RASTER.view(g, camera).splat(x)[0], image, atol=1e-12)
+
+
+def test_antialiasing_fades_small_footprints_only():
+    small, large = (
+        RASTER.view(balls([3.0], [0.8], scale), AXIS, replace(INRIA, antialiased=True)).footprints
+        for scale in (0.005, 2.0)
+    )
+    variance = (30.0 * 0.005 / 3.0) ** 2
+    np.testing.assert_allclose(small.opacities, 0.8 * variance / (variance + 0.3), rtol=1e-6)
+    np.testing.assert_allclose(large.opacities, 0.8, rtol=1e-3)
+
+
+def load_golden(path: Path) -> tuple[Gaussians, Camera, Array]:
+    """Gaussians, camera and (H, W, 4) image on black; the camera is the one the image was made with."""
+    data = load_file(path)
+    gaussians = Gaussians(data["means"], data["scales"], data["quats"], data["opacities"], data["coeffs"])
+    height, width, _ = data["out_img"].shape
+    matrix = np.eye(4)
+    matrix[:3, 3] = (-0.123, -0.456, 8.0)
+    camera = Camera(width, height, width / 2, width / 2, width / 2, height / 2, matrix)
+    return gaussians, camera, data["out_img"]
+
+
+@pytest.mark.parametrize("case", ["tiny_case", "basic_case"])
+@pytest.mark.parametrize("rasterizer", [RASTER, CpuRasterizer()], ids=["reference", "cpu"])
+def test_golden_images_of_gsplat(real_data, case, rasterizer):
+    gaussians, camera, want = load_golden(real_data / "golden" / f"{case}.safetensors")
+    image, alpha = rasterizer.view(gaussians, camera, GSPLAT).splat(
+        colours(gaussians.sh, gaussians.means, camera.position)
+    )
+    np.testing.assert_allclose(np.dstack([image, alpha]), want, atol=1e-5, rtol=0.01)
+
+
+def test_the_band_finds_a_pixel_on_the_contour():
+    variance = (30.0 * 0.2 / 3.0) ** 2 + 0.3
+    on_contour = np.exp(0.5 * 16 / variance) / 255  # alpha is 1/255 four pixels from the centre
+    band = RASTER.view(balls([3.0], [on_contour]), AXIS).cut_off_band(BAND)
+    assert band[10, 14]
+    assert band[6, 10]
+    assert band.sum() == 4
+
+
+# A second opinion on projection, covariance and colours: gsplat's plain PyTorch functions, written by others
+# from the same papers. gsplat's own rasterizer needs CUDA; these do not. All of their names are private.
+
+
+@pytest.fixture(scope="module")
+def oracle() -> Any:
+    return pytest.importorskip("gsplat.cuda._torch_impl")
+
+
+def double(array: Array) -> Any:
+    import torch
+
+    return torch.tensor(np.asarray(array, np.float64))
+
+
+def gsplat_covariances(oracle: Any, gaussians: Gaussians) -> Any:
+    """(N, 3, 3) covariances and their inverses, float64 tensors."""
+    quats = unit(gaussians.quats_wxyz.astype(np.float64))
+    return oracle._quat_scale_to_covar_preci(double(quats), double(gaussians.log_scales).exp())  # noqa: SLF001
+
+
+def gsplat_projection(oracle: Any, gaussians: Gaussians, camera: Camera) -> tuple[Array, ...]:
+    """gsplat's radii, means2d, depths, conics and compensations, in float64."""
+    intrinsics = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    found = oracle._fully_fused_projection(  # noqa: SLF001
+        double(gaussians.means), gsplat_covariances(oracle, gaussians)[0],
+        double(camera.world_to_camera)[None], double(intrinsics)[None], camera.width, camera.height,
+        eps2d=GSPLAT.dilation, near_plane=GSPLAT.near, calc_compensations=True,
+    )  # fmt: skip
+    return tuple(part[0].numpy() for part in found)
+
+
+@pytest.mark.parametrize(("seed", "distance"), [*enumerate((3.0, 3.0, 1.2, 0.5, 8.0))])
+def test_projection_is_that_of_gsplat(oracle: Any, seed: int, distance: float) -> None:
+    """Before the camera and around it; gsplat bounds a footprint by 3.33 standard deviations, opacity 1 at
+    alpha 1/255, the CPU's kernels exactly."""
+    gaussians = random_gaussians(300, seed, scale_range=(0.002, 0.3))
+    camera = random_camera(seed, distance=distance)
+    radii, means_px, depths, conics, compensations = gsplat_projection(oracle, gaussians, camera)
+    ours = project(gaussians, camera, GSPLAT)
+    drawn = depths > GSPLAT.near
+    assert drawn.sum() > 100
+    np.testing.assert_array_equal(ours.opacities[~drawn], 0)
+    np.testing.assert_allclose(ours.depths[drawn], depths[drawn], rtol=1e-12)
+    np.testing.assert_allclose(ours.means_px[drawn], means_px[drawn], rtol=1e-10, atol=1e-9)
+    # gsplat forms the 3D covariance first and so loses digits where a footprint is long and thin.
+    np.testing.assert_allclose(ours.conics[drawn], conics[drawn], rtol=1e-6, atol=1e-9)
+    sharp = project(gaussians, camera, replace(GSPLAT, antialiased=True))
+    both = drawn & (sharp.opacities > 0)
+    floored = np.maximum(compensations, 0.005)  # as INRIA's code floors it; gsplat 1.5.3 does not
+    np.testing.assert_allclose(sharp.opacities[both] / ours.opacities[both], floored[both], rtol=1e-5)
+    exact = CpuRasterizer().view(gaussians, camera, GSPLAT).radii
+    assert (exact > 0).sum() > 10
+    assert (exact <= radii.max(1) + 1e-3).all()
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_spherical_harmonics_are_those_of_gsplat(oracle: Any, degree: int) -> None:
+    """float64 to 1e-6 (gsplat types its constants to 7 to 16 digits), the compiled float32 twin to 2e-6."""
+    gaussians, eye = random_gaussians(300, 7, degree), np.array([0.4, -2.5, 0.7])
+    sh, directions = 2.5 * gaussians.sh, double(gaussians.means.astype(np.float64) - eye)
+    want = oracle._spherical_harmonics(degree, directions, double(sh)).numpy() + 0.5  # noqa: SLF001
+    want = np.maximum(want, 0)
+    assert (want == 0).any()
+    np.testing.assert_allclose(colours(sh, gaussians.means, eye), want, atol=1e-6)
+    np.testing.assert_allclose(projection.colours(sh, gaussians.means, eye), want, atol=2e-6)
+
+
+def test_covariances_are_those_of_gsplat(oracle: Any) -> None:
+    gaussians = random_gaussians(200, 8, scale_range=(1e-4, 1.0))
+    want, precision = (part.numpy() for part in gsplat_covariances(oracle, gaussians))
+    ours = covariances(gaussians)
+    np.testing.assert_allclose(ours, want, rtol=1e-9, atol=1e-14)
+    np.testing.assert_allclose(ours @ precision, np.broadcast_to(np.eye(3), ours.shape), atol=1e-5)
+
+
+# The front door: one call from a scene and a camera to a picture.
 
 G, CAMERA = random_gaussians(80, 4, sh_degree=2), random_camera(2)
 either = pytest.mark.parametrize("backend", ["cpu", "reference"])
