@@ -215,7 +215,10 @@ class Canvas:
 
     def capture(self, request: RenderRequest) -> Array:
         """Return the image of a request, see `ShownImage.capture`."""
-        return self._renderer.read(request)
+        image = self._renderer.read(request)
+        if self._drawn is None or request.projection != self._drawn.projection:
+            self._renderer.forget()  # layers of another size, which may be gigabytes
+        return image
 
     @property
     def waits(self) -> bool:

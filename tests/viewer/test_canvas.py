@@ -129,6 +129,9 @@ def test_canvas_draws_several_panes_and_no_line(gl, opened):
     rest(canvas, state, 3.0)
     assert [texture.size for texture in canvas.textures] == [(20, 40)] * 3
     assert canvas.capture(state.request()).shape == (40, 60, 3)
+    assert renderer.ahead(state.request()) is None  # the layers on screen are kept
+    assert canvas.capture(state.request((90, 60))).shape == (60, 90, 3)
+    assert renderer.ahead(state.request((90, 60))) is not None  # those of another size are not
     renderer.release()
 
 

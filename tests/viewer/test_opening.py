@@ -105,6 +105,13 @@ def three(viewer):
     return viewer
 
 
+def test_what_leaves_the_list_is_not_found_again_as_it_was(three):
+    act(opening.switch_scene, three, PLAIN)
+    opening.unlist_scene(three, BLOBS)
+    assert three.state.scenes == (PLAIN, BARE)
+    assert three.visits == {}
+
+
 def test_display_returns_with_its_scene_and_visits_keep_no_arrays(three):
     ask(three, "mug")
     act(opening.switch_scene, three, PLAIN)

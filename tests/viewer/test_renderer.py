@@ -1,5 +1,6 @@
 """Renderers: rasterizing and compositing, what is kept between requests, picking, missing drivers."""
 
+import gc
 import os
 import subprocess
 import sys
@@ -201,6 +202,15 @@ def test_channels_are_kept_while_only_view_settings_change(renderer, passes):
     assert largest_difference(renderer.read(replace(heat, answers=inverse)), first) > 20
     renderer.read(plain_request(Scene(random_gaussians(20, 3)), CAMERA, heat.picture))
     assert len(passes) == 4
+
+
+def test_reading_images_leaves_nothing_on_the_device(gl, renderer, monkeypatch):
+    gc.collect()  # of other tests
+    monkeypatch.setattr(gl, "gc_mode", "context_gc")  # which keeps what is dropped
+    for _ in range(2):
+        renderer.read(request_for())
+    gc.collect()
+    assert {type(dropped).__name__ for dropped in gl.objects} <= {"InvalidObject"}  # released before
 
 
 def test_panes_of_one_camera_share_one_pass(renderer, passes):

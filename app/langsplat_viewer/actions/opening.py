@@ -237,6 +237,12 @@ def step_scene(viewer: Viewer, by: int) -> None:
     switch_scene(viewer, scenes[(here + by) % len(scenes)])
 
 
+def unlist_scene(viewer: Viewer, path: Path) -> None:
+    """Take a scene off the list, and forget its visit; the scene that is shown stays."""
+    viewer.state.scenes = tuple(other for other in viewer.state.scenes if other != path)
+    viewer.visits.pop(path, None)
+
+
 # The file browser, typed paths, files dropped onto the window, and recent scenes.
 
 COMPANIONS = (cameras.SUFFIX, sidecar.SUFFIX)  # files beside a scene, read with it

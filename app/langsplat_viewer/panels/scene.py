@@ -51,7 +51,7 @@ def _list(viewer: Viewer) -> None:
     if clicked is not None:
         opening.switch_scene(viewer, state.scenes[clicked])
     if gone is not None:
-        settings.put(state, scenes=(*state.scenes[:gone], *state.scenes[gone + 1 :]))
+        opening.unlist_scene(viewer, state.scenes[gone])
 
 
 # Training.

@@ -151,6 +151,10 @@ class Renderer(ABC, Generic[L]):
         """Take over what another thread rasterized, as if it had been rasterized here."""
         self._layers = made
 
+    def forget(self) -> None:
+        """Let go of what was rasterized for the last request."""
+        self._layers = None
+
     def shows_nothing(self) -> bool:
         """Return whether the last image, if there was one, holds nothing of the scene."""
         if self._layers is None or not self._layers.images:
@@ -290,7 +294,7 @@ class GlRenderer(Renderer[moderngl.Texture]):
     def read(self, request: RenderRequest) -> Array:
         camera, components = request.camera, 4 if request.picture.transparent else 3
         (layers, channels), images = self._rasterized(request), []
-        target = self._ctx.simple_framebuffer((camera.width, camera.height), 4)
+        target = self._ctx.framebuffer([self._ctx.renderbuffer((camera.width, camera.height), 4)])
         try:
             for pane, channel in zip(request.panes, channels, strict=True):
                 self._compose(request, pane, layers, channel, target)
