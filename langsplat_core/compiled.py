@@ -15,6 +15,7 @@ import hashlib
 import logging
 import os
 import re
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -53,6 +54,17 @@ def kernel(function: Callable[..., Any], **options: Any) -> Any:
     return made
 
 
+class _KernelFiles(IndexDataCacheFile):
+    """Names files by signature: numba numbers them, and processes at once would take each other's numbers."""
+
+    def save(self, key: Any, data: Any) -> None:
+        overloads = self._load_index()
+        if key not in overloads:
+            overloads[key] = self._data_name(zlib.crc32(repr(key[:2]).encode()))
+            self._save_index(overloads)
+        self._save_data(overloads[key], data)
+
+
 class _KernelCache(FunctionCache):
     """The machine code of one kernel, one set of files whatever becomes of its sources."""
 
@@ -60,7 +72,7 @@ class _KernelCache(FunctionCache):
         super().__init__(function)
         source = Path(function.__code__.co_filename)
         digest = digest_of_sources(source)
-        self._cache_file = IndexDataCacheFile(self.cache_path, f"{source.stem}.{function.__name__}", digest)
+        self._cache_file = _KernelFiles(self.cache_path, f"{source.stem}.{function.__name__}", digest)
         # Looked at before the index, whose types may be gone, is unpickled.
         self._cache_file._version = f"{numba.__version__} {digest}"  # noqa: SLF001
 

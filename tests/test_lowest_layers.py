@@ -205,6 +205,18 @@ def test_kernels_run_on_a_full_disk(
     assert is_compiled(compiled.kernel(doubled))
 
 
+def test_kernels_of_other_signatures_are_other_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that processes that begin at once cannot take one for the other."""
+
+    def tripled(value: float) -> float:
+        return 3 * value
+
+    for value in (2.5, 2):
+        monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / str(value)))
+        assert compiled.kernel(tripled)(value) == 3 * value
+    assert len({path.name for path in tmp_path.rglob("*.nbc")}) == 2
+
+
 # Extensions: a stranger's package adds a format and a command, a broken one costs a warning.
 
 EXAMPLE = Path(__file__).parents[1] / "docs" / "examples" / "05_write_an_extension"

@@ -1,5 +1,6 @@
 """The CPU rasterizer against the float64 reference, and laws that need none."""
 
+import tracemalloc
 from dataclasses import fields, replace
 
 import numpy as np
@@ -63,6 +64,8 @@ def test_a_frozen_view_differs_by_its_rounding_only(channels, size):
     x = random_values(300, channels)
     (image, alpha), (want, want_alpha) = frozen.splat(x), view.splat(x)
     np.testing.assert_array_equal(alpha, want_alpha)
+    alpha[:] = 2  # one's own
+    np.testing.assert_array_equal(frozen.splat(x)[1], want_alpha)
     deepest = 0.5 / 65535 * 300  # every Gaussian rounded the wrong way
     assert np.abs(image - want).max(initial=0) < min(deepest, 2e-4)
     y = np.random.default_rng(3).uniform(-1, 1, image.shape).astype(np.float32)
@@ -124,6 +127,17 @@ def test_memory_is_used_again_once_nothing_lies_in_it():
     assert not np.shares_memory(second, part)
     del part
     assert memory.empty((40_000, 4), np.float64).ctypes.data == place
+
+
+def test_memory_that_nobody_asks_for_is_given_back():
+    memory = Memory()
+    tracemalloc.start()
+    memory.empty((1_000_000,), np.float64)
+    for _ in range(100):
+        memory.empty((50,), np.float64)
+    held, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert held < 1e6
 
 
 def test_depth_order_is_a_stable_sort():

@@ -242,15 +242,16 @@ _SIZES: WeakKeyDictionary[Gaussians, Array] = WeakKeyDictionary()  # Gaussians a
 
 def rows_of(gaussians: Gaussians) -> Rows:
     """Return the Gaussians as kernels take them; their sizes are measured once."""
+    sizes = _SIZES.get(gaussians)  # asked once: another thread may be measuring them
     rows = Rows(
         plain(gaussians.means),
         plain(gaussians.log_scales),
         plain(gaussians.quats_wxyz),
         plain(gaussians.opacity_logits),
         plain(gaussians.sh).reshape(len(gaussians), gaussians.sh.shape[1] * 3).view(np.uint32),
-        _SIZES.get(gaussians, np.empty(len(gaussians), np.float32)),
+        np.empty(len(gaussians), np.float32) if sizes is None else sizes,
     )
-    if gaussians not in _SIZES:
+    if sizes is None:
         shared_workers().run(_measure, len(gaussians), rows)
         _SIZES[gaussians] = rows.sizes
     return rows

@@ -25,6 +25,7 @@ from langsplat_core.scene import Camera, Gaussians
 
 _CHANNELS_AT_ONCE = 32  # a tile's state stays in the first level cache
 _SPARE_BLOCKS = 16  # a view takes five, its gradients seven
+_IDLE = 60  # requests after which a block that nobody asked for is given back
 
 
 class _Loan:
@@ -42,18 +43,22 @@ class Memory:
 
     def __init__(self) -> None:
         self._lock = Lock()
-        self._spare: list[Array] = []
+        self._requests = 0
+        self._spare: list[tuple[int, Array]] = []  # when last asked for
 
     def empty(self, shape: tuple[int, ...], dtype: Any) -> Array:
         """Return an array like `numpy.empty` does, in a block that no other array lies in any more."""
         size = math.prod(shape) * np.dtype(dtype).itemsize
         with self._lock:
-            fits = (i for i, spare in enumerate(self._spare) if size <= len(spare) <= 2 * size)
-            place = next(fits, None)
-            block = np.empty(size + size // 4, np.uint8) if place is None else self._spare.pop(place)
-            del self._spare[:-_SPARE_BLOCKS]
+            self._requests += 1
+            now, spare = self._requests, list(self._spare)
+            del self._spare[: len(spare)]  # loans that end meanwhile come behind them
+            recent = [one for one in spare[-_SPARE_BLOCKS:] if now - one[0] < _IDLE]
+            place = next((i for i, (_, one) in enumerate(recent) if size <= len(one) <= 2 * size), None)
+            block = np.empty(size + size // 4, np.uint8) if place is None else recent.pop(place)[1]
+            self._spare[:0] = recent
         loan = _Loan(block)
-        finalize(loan, self._spare.append, block)
+        finalize(loan, self._spare.append, (now, block))
         return np.asarray(loan)[:size].view(dtype).reshape(shape)
 
 
@@ -106,6 +111,7 @@ class CpuView(LiftingView):
         check_array("values", values, (len(self.order), "C"))
         size = self.camera.height, self.camera.width
         kept, alpha = self._kept or (None, np.empty((*size, 1), np.float32))
+        alpha = alpha if kept is None else alpha.copy()  # the caller's own, to be changed
         parts = []
         for start in range(0, max(values.shape[1], 1), _CHANNELS_AT_ONCE):
             part = plain(values[:, start : start + _CHANNELS_AT_ONCE])
