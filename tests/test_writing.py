@@ -84,6 +84,7 @@ def test_folders_and_files_are_told_apart(tmp_path: Path) -> None:
     for check in CHECKS:
         assert "is a file" in refusal(check, tmp_path / "file" / "under" / "x.ply")
     refusal(check_output_file, tmp_path / "pipe")
+    assert "is a folder" in refusal(check_output_file, Path("/"))  # which nothing lies above
 
 
 def test_checking_a_place_leaves_nothing_there(tmp_path: Path) -> None:

@@ -129,8 +129,9 @@ def _checked(target: Path) -> int:
         os.fsencode(target)
         str(target).encode()
         mode = _mode(target)
-        folder = next(above for above in Path(os.path.abspath(target)).parents if os.path.lexists(above))
-        for part in Path(os.path.abspath(target)).relative_to(folder).parts:
+        whole = Path(os.path.abspath(target))
+        folder = next((above for above in whole.parents if os.path.lexists(above)), Path(whole.anchor))
+        for part in whole.relative_to(folder).parts:
             _mode(folder / part)  # whether the file system takes the name
     except UnicodeEncodeError:
         raise InputError(

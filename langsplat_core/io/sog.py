@@ -223,7 +223,7 @@ def write_sog(path: Path | str, gaussians: Gaussians, antialiased: bool = False)
     scales, scale_book = _coded(known(gaussians.log_scales).clip(-30), valid)  # a flat axis is e^-30 thick
     colours = known(gaussians.sh)
     base, base_book = _coded(colours[:, 0], valid)
-    opacities = np.where(valid, to_bytes(255 * sigmoid(gaussians.opacity_logits.astype(np.float64))), 0)
+    opacities = to_bytes(255 * sigmoid(known(gaussians.opacity_logits, -np.inf)))
     meta: dict[str, Any] = {
         "version": 2,
         "asset": {"generator": "langsplat-viewer"},

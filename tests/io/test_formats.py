@@ -4,6 +4,7 @@ KHR_gaussian_splatting, and points and meshes for other programs."""
 import gzip
 import json
 import struct
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -330,7 +331,10 @@ def test_rows_that_cannot_be_drawn_are_transparent(tmp_path, suffix):
     scene.opacity_logits[4:6] = np.inf, -np.inf  # legal, as is a flat axis
     scene.log_scales[6, 0] = -np.inf
     scene.quats_wxyz[7] *= -7
-    save_scene(path, Scene(scene))
+    scene.opacity_logits[3] = np.nan
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        save_scene(path, Scene(scene))
     got = load_gaussians(path)
     assert got.valid().all()
     assert got.opacity_logits[:6].tolist() == [*[-np.inf] * 4, np.inf, -np.inf]

@@ -194,8 +194,8 @@ def _clusters(arrays: dict[str, Array], path: Path) -> Clusters:
     if counts.shape != (len(vectors),):
         raise FormatError(f"{path}: occu_count has the shape {counts.shape}, leaf_feat {vectors.shape}")
     known = np.where(counts[:, None] > 0, vectors, 0).astype(np.float32)
-    named = np.where((index >= 0) & (index < len(vectors)), index, -1)
-    return Clusters(path, named.astype(np.int64), known)
+    index = index.astype(np.int64)
+    return Clusters(path, np.where((index >= 0) & (index < len(vectors)), index, -1), known)
 
 
 def _from_torch(content: Any, path: Path) -> Part:

@@ -180,7 +180,7 @@ def read_transform(path: Path) -> Similarity:
     entry = read_json_file(path, TRANSFORM_LIMIT)
     try:
         return similarity(entry["matrix"])
-    except (InputError, LookupError, TypeError, ValueError) as error:
+    except (InputError, LookupError, OverflowError, TypeError, ValueError) as error:
         raise malformed(path, f"no transform ({printable_line(error, 100)})") from None
 
 

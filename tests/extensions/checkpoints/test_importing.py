@@ -207,6 +207,8 @@ def test_open_gaussian(tmp_path, as_ply):
     both = [path, tmp_path / "cluster_lang.npz"]
     got = read_foreign(both)
     assert got.method == "OpenGaussian"
+    leaves(both[1], index.clip(0).astype(np.uint8))  # which cannot say -1
+    assert_rows(read_foreign(both), 2, np.append(vectors, np.zeros((1, D)), axis=0)[index.clip(0)])
     assert_rows(got, 2, np.where(((index >= 0) & (index < 6))[:, None], vectors[index.clip(0, 5)], 0))
     assert got.levels[:2] == (None, None)
     leaves(tmp_path / "cluster_lang.npz", index[1:])
