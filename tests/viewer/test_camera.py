@@ -529,6 +529,8 @@ def test_keyframes_keep_projection_and_scale():
         assert (found.orthographic, found.fx) == (view.orthographic, pytest.approx(wanted.fx))
     assert pose_at(flight_of(*flat), 0.5).span == pytest.approx(2.0)
     assert pose_at(flight, 1.5).span == pytest.approx(4.0)  # till the next keyframe
+    there_and_back = flight_of(flat[0], VIEW, flat[1])
+    assert pose_at(there_and_back, 0.5).span == pytest.approx(1.0)  # whatever comes later
     assert pose_at(flight_of(VIEW, VIEW, flat[0]), 0.5).span is None
 
 

@@ -198,8 +198,9 @@ class _Curve:
         self._focal = PchipInterpolator(self._times, focal)
         spans = np.array([key.pose.span or np.nan for key in keyframes], np.float64)
         self._parallel = flat = np.isfinite(spans)
-        logs = np.interp(self._times, self._times[flat], np.log(spans[flat])) if flat.any() else 0 * spans
-        self._span = PchipInterpolator(self._times, np.nan_to_num(logs))
+        if flat.any():  # a gap has the last one before it, at the start the next one
+            spans = spans[np.flatnonzero(flat)[np.maximum(np.cumsum(flat) - 1, 0)]]
+        self._span = PchipInterpolator(self._times, np.log(np.nan_to_num(spans, nan=1.0)))
 
     def poses(self, seconds: Array) -> tuple[Pose, ...]:
         times = np.clip(seconds, self._times[0], self._times[-1])
