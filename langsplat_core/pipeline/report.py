@@ -188,7 +188,11 @@ def write_refusal(work: Path, error: NotLocatedError) -> Path:
         for group in matches.groups
     }
     parts = [f"<div class='card warning'>{_text(error, 1000)}</div>", _section("Groups", _table(groups))]
-    _write(work / PAGE, "Too few photographs could be located", [*parts, f"<p>{_located(matches)}</p>"])
+    _write(
+        work / PAGE,
+        "Too few photographs could be located",
+        [*parts, f"<p>{_text(_located(matches), 600)}</p>"],
+    )
     return work / PAGE
 
 

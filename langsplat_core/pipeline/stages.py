@@ -19,7 +19,6 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.hostile import read_npz
 from langsplat_core.scene import Gaussians
 from langsplat_core.semantics.features import ImageFeatures
 
@@ -74,9 +73,11 @@ def open_array(path: Path) -> Array:
 def read_arrays(path: Path) -> Arrays:
     """Return the arrays of an .npz file; FormatError for a damaged one."""
     try:
-        return {name: array.copy() for name, array in read_npz(path).items()}  # kernels want them writable
-    except InputError as error:
-        raise FormatError(f"{error}; delete it and run again") from None
+        # Not by `read_npz`, which takes no array of more than 2 GB, and thrice its memory.
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except Exception as error:  # noqa: BLE001  zipfile and NumPy may raise any
+        raise FormatError(f"{path}: damaged ({error}); delete it and run again") from None
 
 
 def digest_of(data: Gaussians | ImageFeatures) -> str:

@@ -168,11 +168,11 @@ def test_page_shows_held_out_views_first_and_needs_no_other_file(tmp_path: Path)
 
 
 def test_a_refusal_shows_its_groups(tmp_path: Path) -> None:
-    names = (f"a{HOSTILE}", "b", "c", "d")
+    names = (f"a{HOSTILE}", f"b{HOSTILE}", "c", "d")  # b and c are named in the advice
     matches = Matches(names, (900, 900, 900, 0), ((0, 1, 80), (1, 2, 4)), frozenset())
     page = Read(write_refusal(tmp_path, NotLocatedError("too few", matches)))
     assert not page.of("script")
-    for words in ("too few", "a<script>", matches.why(3), "0 of 4 photographs"):
+    for words in ("too few", "a<script>", matches.why(3), "0 of 4 photographs", "between b<script>"):
         assert words in page.text
 
 
