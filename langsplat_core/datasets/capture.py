@@ -152,7 +152,8 @@ def warn_of_lost_points(good: Array, source: str) -> None:
     """Warn where most of the points of `source` had to be left out; good: (M,) bool, those that were not."""
     lost = len(good) - good.sum()
     if 2 * lost > len(good):
-        log.warning("%d of %d points of %s are damaged or badly located: left out", lost, len(good), source)
+        share = f"{lost} of {len(good)} points of {source}"
+        log.warning("%s are damaged or badly located: left out; was it written whole?", share)
 
 
 # Views that are held out from training, to measure it on.

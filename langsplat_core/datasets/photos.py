@@ -136,7 +136,8 @@ def place(path: Path) -> tuple[float, float]:
             # What stands behind a PNG's pixels is read by decoding them all.
             tags = image.getexif().get_ifd(GPS_IFD) if image.format != "PNG" or "exif" in image.info else {}
             latitude, longitude = (
-                sum(float(part) / 60**power for power, part in enumerate(tags[tag])) * signs[tags[tag - 1]]
+                sum(float(part) / by for by, part in zip((1, 60, 3600), tags[tag], strict=True))
+                * signs[tags[tag - 1]]
                 for tag, signs in ((2, {"N": 1, "S": -1}), (4, {"E": 1, "W": -1}))
             )
     # Absent, or not what the standard says.

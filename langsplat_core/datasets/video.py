@@ -58,7 +58,7 @@ def extract_frames(video: Path, out: Path, count: int, progress: Progress = sile
         plain = isinstance(error, OSError) and not isinstance(error, av.FFmpegError)
         if plain and getattr(error, "errno", 0) != errno.EINVAL:
             raise  # of the disk
-        reason = printable_line(error, 80)
+        reason = printable_line(getattr(error, "strerror", None) or error, 80)
         raise FormatError(f"{shown(video)}: not a readable video ({reason}); copy it again") from None
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)

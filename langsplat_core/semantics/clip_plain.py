@@ -93,11 +93,13 @@ def plain_text_tower(weights: Weights) -> PlainClipText | None:
         settings = {"projection_dim": stated["projection_dim"]}
         config = msgspec.convert({**stated["text_config"], **settings}, TextConfig)
         tokenizer = read_tokenizer(weights.folder / TOKENIZER)
-        tower = PlainClipText(weights.id, config, _tensors(weights.folder, config), tokenizer)
-        plain = all(re.fullmatch("[a-z]+", word) for word in words) and tokenizer.end == config.eos_token_id
-        return (
-            tower if plain and tower.encode(words[:1]).shape == (1, tower.dim) else None
-        )  # all fits together
+        tensors = _tensors(weights.folder, config)
+        tower = PlainClipText(weights.id, config, tensors, tokenizer)
+        rows = len(tensors[TOKENS]), len(tensors[POSITIONS])
+        # What a later phrase would meet, and what the first word shows.
+        fits = set(tokenizer.numbers.values()) <= set(range(rows[0])) and tokenizer.end == config.eos_token_id
+        plain = rows[1] == config.max_position_embeddings and all(re.fullmatch("[a-z]+", w) for w in words)
+        return tower if fits and plain and tower.encode(words[:1]).shape == (1, tower.dim) else None
     except (OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError):
         return None
     except LangSplatError:

@@ -227,7 +227,12 @@ def test_the_place_of_a_photograph(photo: Path) -> None:
 
 @pytest.mark.parametrize(
     ("latitude", "north"),
-    [((91.0, 0.0, 0.0), "N"), ((IFDRational(1, 0), 0.0, 0.0), "N"), ((47.0, 22.0, 1.0), "X")],
+    [
+        ((91.0, 0.0, 0.0), "N"),
+        ((IFDRational(1, 0), 0.0, 0.0), "N"),
+        ((47.0, 22.0), "N"),
+        ((47.0, 22.0, 1.0), "X"),
+    ],
 )
 def test_implausible_exif_places_are_unknown(photo: Path, latitude: object, north: str) -> None:
     assert all(map(math.isnan, place(photo)))

@@ -342,6 +342,8 @@ def test_random_weights_agree_with_float64(tmp_path: Path, activation: str, half
 
 NOT_PLAIN: dict[str, Callable[[Path], object]] = {
     "no tokenizer": lambda folder: (folder / "tokenizer.json").unlink(),
+    "tokens that have no vector": tokenizer_of(lambda stated: stated["model"]["vocab"].update(rare=10**6)),
+    "longer phrases than positions": text_setting(max_position_embeddings=10**6),
     "another activation": text_setting(hidden_act="relu"),
     "fewer layers": text_setting(num_hidden_layers=1),
     "open words": lambda folder: (folder / "vocabulary.txt").unlink(),
