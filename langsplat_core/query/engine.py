@@ -133,7 +133,8 @@ class QueryEngine:
     ) -> list[QueryResult]:
         """Return the answers of `run` to phrases, which are encoded and compared together."""
         texts = [phrase for phrase in phrases if not self.is_taught(phrase)]
-        relevancies = self._lookup.relevancies(self.text_vectors(texts, progress))
+        vectors = self.text_vectors(texts, progress)  # first: what it refuses leaves nothing cached
+        relevancies = self._lookup.relevancies(vectors) if texts else iter(())
         answers = []
         for phrase in phrases:
             progress(f"searching '{tidy(phrase)}'", 0.5)

@@ -29,6 +29,7 @@ from langsplat_core.scene.codec import CodebookCodec
 from langsplat_core.scene.language import LONGEST_NAME, MOST_SHOWN, tree_of_wholes
 from langsplat_core.scene.surface import SMALLEST, Surface, build_surface
 from langsplat_core.semantics.relevancy import FLOOR, Scale
+from langsplat_core.semantics.vocabulary import TextEncoder
 from tests.support.fakes import CENTRES, PER_BLOB, FakeEncoder, blob_scene, blobs, language
 from tests.support.file_samples import random_field
 from tests.support.scenes import chain_of_levels, random_gaussians, regions_of, unturned_gaussians
@@ -491,3 +492,18 @@ def test_taught_names_are_unique_in_a_field():
     short = replace(taught(3), vectors=np.eye(1, 8, dtype=np.float32))
     with pytest.raises(ValueError, match="taught"):
         replace(SHOWN.language, taught=(short,))
+
+
+def test_taught_words_and_refusals_leave_the_encoder_alone():
+    def offline(_: str) -> TextEncoder:
+        loads.append(1)
+        raise EncoderError("offline")
+
+    loads: list[int] = []
+    field = replace(SHOWN.language, everyday=None, taught=(taught(3),))
+    engine = QueryEngine(Scene(SHOWN.gaussians, field), offline)
+    engine.run("grandma's vase")
+    assert loads == []
+    with pytest.raises(EncoderError, match="offline"):
+        engine.run("zebra")
+    assert loads == [1]
