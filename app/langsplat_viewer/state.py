@@ -264,6 +264,7 @@ class ViewerState(SceneState):
     recalled: int = 0  # index into `asked` of the phrase last recalled; its length: none
     focus_input: bool = False  # the query box takes the keyboard at the next frame
     awaits_keyboard: bool = False  # keys wait until a box has it
+    letters_muted: bool = False  # letters are no keys: they were meant for a box that is not there
 
     training_form: TrainingForm = field(default_factory=TrainingForm)
     edit_form: EditForm = field(default_factory=EditForm)

@@ -102,9 +102,12 @@ class _Scene(Struct):
     nodes: list[Index] = []
 
 
-class _Content(Struct, rename="camel"):
+class _About(Struct, rename="camel"):
     asset: dict[str, Any]
     extensions_required: list[str] = []
+
+
+class _Content(Struct, rename="camel"):
     accessors: list[_Accessor] = []
     buffer_views: list[_View] = []
     buffers: list[dict[str, Any]] = []
@@ -224,13 +227,14 @@ class _File:
             size = int.from_bytes(text[end : end + 4], "little")
             self._binary = text[end + 8 :][: size if text[end + 4 : end + 8] == BINARY_CHUNK else 0]
             text = text[20:end]
-        self.content = decode_json(bytes(text), _Content, path)
-        version = self.content.asset.get("version")
+        about = decode_json(bytes(text), _About, path)  # first: other versions have other content
+        version = about.asset.get("version")
         if str(version)[:2] != "2.":
             raise malformed(path, f"glTF version {quoted(version)}; only 2 is read", "export it as glTF 2.0")
-        for name in self.content.extensions_required:
+        for name in about.extensions_required:
             if name not in KNOWN:
                 raise malformed(path, f"needs {quoted(name)}, which is not read", "export it without")
+        self.content = decode_json(bytes(text), _Content, path)
 
     def accessor(self, index: int, width: int, count: int, name: str) -> Array:
         """Return the (count, width) float32 values of an accessor."""

@@ -124,6 +124,13 @@ def test_fourth_query_takes_the_colour_of_the_oldest(opened):
     assert phrases(opened) == ["book", "plant", "mug or book"]
 
 
+def test_letters_for_a_box_that_is_not_there_are_no_keys(viewer):
+    queries.focus_search(viewer)
+    assert viewer.state.letters_muted
+    settings.escape(viewer)
+    assert not viewer.state.letters_muted
+
+
 def test_search_box_takes_the_keyboard_once(opened):
     opened.state.show_panel = False
     queries.focus_search(opened)

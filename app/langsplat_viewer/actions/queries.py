@@ -119,10 +119,15 @@ def forget_unlisted(viewer: Viewer) -> None:
 
 
 def focus_search(viewer: Viewer) -> None:
-    """Have the search box take the keyboard; say so where there is nothing to search."""
+    """Have the search box take the keyboard; say so where there is nothing to search.
+
+    The letters that follow are no commands then, until a click or Esc.
+    """
     open_panel(viewer, "Search")
     if viewer.searchable() is not None:
         viewer.state.focus_input = viewer.state.awaits_keyboard = True
+    else:
+        viewer.state.letters_muted = True
 
 
 # Names that are taught.

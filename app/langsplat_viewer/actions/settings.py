@@ -236,7 +236,7 @@ def escape(viewer: Viewer) -> None:
     """Close what lies over the scene; where nothing does leave the stroke, else the tool."""
     state, tools = viewer.state, viewer.state.tools
     lay_over = state.show_help or state.show_palette or state.browser or state.leaving
-    state.show_help = state.show_palette = state.pins_notes = False
+    state.show_help = state.show_palette = state.pins_notes = state.letters_muted = False
     state.browser = state.leaving = None
     if state.session.ruler.measures:
         toggle_measuring(viewer)

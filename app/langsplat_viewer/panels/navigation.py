@@ -11,7 +11,7 @@ from functools import cache
 
 from imgui_bundle import imgui
 
-from langsplat_viewer.actions import viewpoint
+from langsplat_viewer.actions import settings, viewpoint
 from langsplat_viewer.camera import controls
 from langsplat_viewer.commands import COMMANDS, Command
 from langsplat_viewer.panels import select, ui
@@ -186,15 +186,17 @@ def chord(text: str) -> Chord:
 def handle_keys(viewer: Viewer) -> None:
     """Run the commands whose keys were pressed in this frame."""
     typing = imgui.get_io().want_text_input
+    if imgui.is_mouse_clicked(imgui.MouseButton_.left):
+        settings.put(viewer.state, letters_muted=False)
     for command in COMMANDS:
-        if any(_pressed(chord(text), command, typing) for text in command.keys):
+        if any(_pressed(chord(text), command, typing, viewer.state.letters_muted) for text in command.keys):
             command.act(viewer)
             return
 
 
-def _pressed(wanted: Chord, command: Command, typing: bool) -> bool:
+def _pressed(wanted: Chord, command: Command, typing: bool, muted: bool) -> bool:
     io = imgui.get_io()
-    if typing and (wanted.is_plain or command.is_edit):
+    if (typing and (wanted.is_plain or command.is_edit)) or (muted and wanted.is_plain):
         return False
     if wanted.key is None:
         return not io.key_ctrl and wanted.character in map(chr, io.input_queue_characters)
@@ -221,7 +223,8 @@ def handle(viewer: Viewer, area: ui.Area) -> None:
         _mouse(viewer, area)
     viewpoint.hover(viewer, _pixel(area))
     handle_keys(viewer)
-    if viewer.state.view is not None and not (io.want_text_input or io.key_ctrl):
+    letters = not (io.want_text_input or io.key_ctrl or viewer.state.letters_muted)
+    if viewer.state.view is not None and letters:
         _fly(viewer)
 
 
