@@ -297,7 +297,7 @@ EACH = 40  # Gaussians of a thing
 RNG = np.random.default_rng(5)
 WALL = KINDS - 1  # of which every scene has several pieces, as rooms have
 PIECES = 8
-MEANINGS = unit(RNG.normal(size=(KINDS, SPAN)) @ np.linalg.qr(RNG.normal(size=(DIM, SPAN)))[0].T)
+FEATURES = unit(RNG.normal(size=(KINDS, SPAN)) @ np.linalg.qr(RNG.normal(size=(DIM, SPAN)))[0].T)
 GAP = unit(RNG.normal(size=DIM))
 
 
@@ -307,7 +307,7 @@ def row_of(things: list[int], seed: int) -> Scene:
     no matter of words."""
     rng = np.random.default_rng(seed)
     things = things + PIECES * [WALL]
-    looks = MEANINGS[things] + 0.2 * unit(rng.normal(size=(len(things), DIM)))
+    looks = FEATURES[things] + 0.2 * unit(rng.normal(size=(len(things), DIM)))
     vectors = unit(1.6 * GAP + 0.7 * looks + 0.9 * unit(rng.normal(size=(len(things), DIM))))
     codec = CodebookCodec(vectors.astype(np.float32), np.zeros((len(things), 3), np.float32))
     of = np.repeat(np.arange(len(things)), EACH)
@@ -316,9 +316,9 @@ def row_of(things: list[int], seed: int) -> Scene:
         latents=np.tile(of.astype(np.uint16)[:, None], (3, 1, 1)),
         confidence=np.ones((3, len(of)), np.float32),
         codec=codec,
-        canonical=np.tile(unit(GAP + MEANINGS[0]).astype(np.float32), (4, 1)),
+        canonical=np.tile(unit(GAP + FEATURES[0]).astype(np.float32), (4, 1)),
         encoder_id="images",
-        everyday=unit(0.8 * unit(MEANINGS.mean(0)) + MEANINGS).astype(np.float32),
+        everyday=unit(0.8 * unit(FEATURES.mean(0)) + FEATURES).astype(np.float32),
         tree=tree_of_wholes(np.where(of < len(things) - PIECES, of, NO_NODE)),
     )
     return Scene(unturned_gaussians(places, np.log(0.08), 2.0), field)
