@@ -3,6 +3,7 @@
 import gc
 import os
 import random
+import signal
 import tracemalloc
 import warnings
 from pathlib import Path
@@ -54,6 +55,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # in the background of a shell, and children too
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     gc.disable()  # what is imported stays: looking through its millions of objects is time lost
     # Chance and the clock decide nothing but in the slow tier, which looks for new cases.
     chance = config.getoption("--slow")
