@@ -152,11 +152,12 @@ def _write_folder(film: Film, draw: Draw) -> None:
     _check_own(film.out)
     with atomic_path(film.out / SETTINGS) as temporary:
         temporary.write_text(json.dumps({"pictures": film.count, "fps": film.fps}), encoding="utf-8")
-    for path in film.out.iterdir():  # of another film
-        if FRAME.fullmatch(path.name):
-            path.unlink()
     for number in range(film.count):
-        save_png(film.out / frame_name(number), draw(number))
+        image = draw(number)
+        if number == 0:  # only now there is something in the place of an earlier film
+            for path in filter(lambda path: FRAME.fullmatch(path.name), list(film.out.iterdir())):
+                path.unlink()
+        save_png(film.out / frame_name(number), image)
 
 
 def _write_animation(film: Film, draw: Draw, path: Path) -> None:

@@ -226,7 +226,7 @@ def _lean(stands: Array, apart: Array, training: Array, index: int) -> float:
 # tells.
 
 FEWEST_PLACES = 5  # photographs that name one
-EARTH = 6_371_009.0  # metres, its mean radius; off by 0.6 % where it is flattest
+EQUATOR, FLATTENED = 6_378_137.0, 6.694_379_990_14e-3  # of WGS 84: radius in metres, squared eccentricity
 
 
 def metres_of(capture: Capture) -> float | None:
@@ -256,7 +256,9 @@ def metres_per_unit(eyes: Array, places: Array) -> float | None:
     far = apart >= apart.max() / 2
     latitude, longitude = np.radians(places).T
     east = (longitude - longitude[0] + math.pi) % (2 * math.pi) - math.pi  # also over the date line
-    ground = EARTH * np.stack([math.cos(latitude[0]) * east, latitude], 1)
+    bend = 1 - FLATTENED * math.sin(latitude[0]) ** 2
+    along = EQUATOR / math.sqrt(bend) * math.cos(latitude[0]) * east
+    ground = np.stack([along, EQUATOR * (1 - FLATTENED) / bend**1.5 * (latitude - latitude[0])], 1)
     low, middle, high = np.quantile(pdist(ground)[far] / apart[far], [0.25, 0.5, 0.75])
     return float(middle) if middle > 0 and high - low <= middle / 5 else None
 

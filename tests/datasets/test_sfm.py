@@ -134,6 +134,18 @@ def _never(**_: object) -> None:
     raise AssertionError("computed again")
 
 
+def test_repeated_reconstruction_computes_nothing(
+    photos: Path,
+    located: tuple[Capture, Path, list[str], list[str]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    in_this_process(monkeypatch)
+    for name in ("extract_features", "incremental_mapping"):
+        monkeypatch.setattr(pycolmap, name, _never)
+    again = load_capture(photos, CONFIG, located[1])
+    np.testing.assert_array_equal(again.points, located[0].points)
+
+
 def aligned(points: Array, source: Array, target: Array) -> Array:
     """`points` moved by the similarity that best takes `source` (N, 3) to `target` (Umeyama 1991)."""
     a, b = source - source.mean(0), target - target.mean(0)

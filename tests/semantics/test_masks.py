@@ -447,6 +447,14 @@ def test_sam_2_masks_are_ordered_by_size_at_each_point() -> None:
     assert ordered[:, :, 0, 0].tolist() == [[2, 3, 1], [3, 1, 2]]
 
 
+def test_batches_do_not_change_the_masks(config: MaskConfig) -> None:
+    one, many = (load_mask_source(replace(config, points_per_batch=count), "cpu") for count in (1, 64))
+    assert one.key == many.key
+    for a, b in zip(one(photograph(), silent).masks, many(photograph(), silent).masks, strict=True):
+        assert a.shape == b.shape
+        assert (a ^ b).sum() <= 2 * len(a)
+
+
 def test_no_mask_at_all_is_an_answer(config: MaskConfig) -> None:
     levels = load_mask_source(replace(config, predicted_iou=99.0), "cpu")(photograph(), silent)
     assert [masks.shape for masks in levels.masks] == [(0, 48, 80)] * 3

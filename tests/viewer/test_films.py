@@ -351,3 +351,16 @@ def test_impossible_options_are_one_line(program, folder, arguments, reason):
     assert (code, out, len(err)) == (2, [], 1)
     assert reason in err[0]
     assert sorted(folder.rglob("*")) == before
+
+
+def test_failed_film_leaves_the_earlier_one_in_its_folder(tmp_path):
+    write_film(Film(tmp_path, 2, (4, 3), 2.0), lambda number: np.zeros((3, 4, 3), np.uint8))
+
+    def fails(number: int) -> np.ndarray:
+        raise InputError("nothing to draw")
+
+    with pytest.raises(InputError):
+        write_film(Film(tmp_path, 1, (4, 3), 2.0), fails)
+    assert len(list(tmp_path.glob("frame-*.png"))) == 2
+    write_film(Film(tmp_path, 1, (4, 3), 2.0), lambda number: np.zeros((3, 4, 3), np.uint8))
+    assert len(list(tmp_path.glob("frame-*.png"))) == 1

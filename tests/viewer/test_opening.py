@@ -105,7 +105,7 @@ def three(viewer):
     return viewer
 
 
-def test_what_leaves_the_list_is_not_found_again_as_it_was(three):
+def test_unlisted_scene_opens_afresh(three):
     act(opening.switch_scene, three, PLAIN)
     opening.unlist_scene(three, BLOBS)
     assert three.state.scenes == (PLAIN, BARE)

@@ -100,7 +100,9 @@ def test_screen_file_film_and_reference_agree(gl, opened, tmp_path, mode, backen
     screen = state.session.split.joined(on_screen(canvas), state.size[0]).astype(int)
     images = {"screen": screen, "saved": image(saving.save_picture(opened, tmp_path))}
     settings.put(opened.state.record, size=state.size)
-    images["sized"] = image(saving.save_sized_picture(opened, tmp_path))
+    saving.save_sized_picture(opened, tmp_path)
+    recorded(opened)
+    images["sized"] = image(next(tmp_path.glob("*-160x120*.png")))
     viewpoint.set_turning(opened, True)
     viewpoint.set_path_seconds(opened, 1.0)
     opened.state.record.fps = 2.0

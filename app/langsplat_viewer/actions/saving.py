@@ -29,12 +29,14 @@ from langsplat_viewer.output import (
     Shot,
     cameras_of,
     check_film,
+    draw_something,
     free_name,
     has_video,
     in_one_line,
     make_film,
     save_png,
 )
+from langsplat_viewer.rendering.renderer import open_renderer
 from langsplat_viewer.session import Bookmark, Note, Query
 from langsplat_viewer.state import Leaving, ViewerState, flight_of
 from langsplat_viewer.viewer import Viewer
@@ -49,21 +51,18 @@ def _new_file(viewer: Viewer, folder: Path, suffix: str, more: str = "") -> Path
 # Pictures, views and paths.
 
 
-def save_picture(viewer: Viewer, folder: Path = Path(), size: tuple[int, int] | None = None) -> Path | None:
-    """Save the scene as shown to a new PNG in `folder`, of `size` pixels in place of the window's.
-
-    Returns its path, None if that failed.
-    """
+def save_picture(viewer: Viewer, folder: Path = Path()) -> Path | None:
+    """Save the scene as shown to a new PNG in `folder`; return its path, None if that failed."""
     state = viewer.state
     if viewer.surface is None or state.scene is None or state.view is None:
         viewer.say_error("open a scene first, then save a picture of it")
         return None
-    path = _new_file(viewer, folder, ".png", "" if size is None else f"-{size[0]}x{size[1]}")
+    path = _new_file(viewer, folder, ".png")
     beside, transparent = viewer.beside, state.session.picture.transparent
     shown = [viewer] if beside is None or beside.state.scene is None else [viewer, beside]
 
     def write() -> None:
-        requests = [(one.surface, one.state.request(size, transparent)) for one in shown]
+        requests = [(one.surface, one.state.request(None, transparent)) for one in shown]
         with in_one_line(path, "this size"):
             images = [surface.capture(request) for surface, request in requests if surface is not None]
         save_png(path, state.session.split.joined(images, images[0].shape[1]))
@@ -71,9 +70,22 @@ def save_picture(viewer: Viewer, folder: Path = Path(), size: tuple[int, int] | 
     return viewer.save(path, write)
 
 
-def save_sized_picture(viewer: Viewer, folder: Path = Path()) -> Path | None:
-    """Save the scene as shown in the size of a film."""
-    return save_picture(viewer, folder, viewer.state.record.size)
+def save_sized_picture(viewer: Viewer, folder: Path = Path()) -> None:
+    """Have the scene as shown drawn by the CPU in the size of a film, and saved to a new file."""
+    state, (width, height) = viewer.state, viewer.state.record.size
+    if state.view is None:
+        viewer.say_error("open a scene first, then save a picture of it")
+        return
+    request = state.request((width, height), state.session.picture.transparent)
+
+    def work(progress: Progress) -> str:
+        path = _new_file(viewer, folder, ".png", f"-{width}x{height}")
+        progress("drawing", 0.0, path.name)
+        with in_one_line(path, f"{width}x{height}"), open_renderer("cpu") as renderer:
+            save_png(path, draw_something(request, renderer))
+        return f"saved {path}"
+
+    viewer.recorder.submit(f"picture of {width} x {height}", work, state.say, viewer.say_error)
 
 
 def save_view(viewer: Viewer, folder: Path = Path()) -> Path | None:

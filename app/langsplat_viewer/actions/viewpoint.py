@@ -131,13 +131,13 @@ def frame_scene(viewer: Viewer) -> None:
 
 
 def look_from(viewer: Viewer, side: Side) -> None:
-    """Look at what the view turns around along one of the world's axes, from as far as now."""
+    """Turn the view to look along one of the world's axes, at the same place from as far."""
     if viewer.state.view is not None:
         glide_to(viewer, from_side(viewer.state.view, side))
 
 
 def toggle_orthographic(viewer: Viewer) -> None:
-    """Look without perspective, or with it again; a glide under way goes on."""
+    """Switch between perspective and none; a glide under way goes on."""
     state = viewer.state
     if state.view is not None:
         orthographic, glide = not state.view.orthographic, state.glide
@@ -394,9 +394,9 @@ def toggle_pointing(viewer: Viewer) -> None:
 
 
 def hover(viewer: Viewer, pixel: tuple[int, int] | None) -> None:
-    """Once per frame: the mouse is over this pixel (column, row) of the scene's area.
+    """Note the pixel (column, row) that the mouse is over in this frame; None: elsewhere, or it drags.
 
-    None: elsewhere, or it drags. What lies there is asked once the mouse and the camera rest.
+    What lies there is asked once the mouse and the camera rest.
     """
     state, before, (width, height) = viewer.state, viewer.state.hover, viewer.state.size
     inside = pixel is not None and 0 <= pixel[0] < width and 0 <= pixel[1] < height

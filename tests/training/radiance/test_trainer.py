@@ -286,7 +286,7 @@ def test_larger_budgets_are_tried_until_one_loses(scores: list[list[float]], bes
     assert supported(scores, [*range(5)]) == best  # type: ignore[arg-type, comparison-overlap]
 
 
-def test_nothing_is_rehearsed_without_spare_views() -> None:
+def test_few_views_train_without_rehearsals() -> None:
     assert rehearse(noise(), RadianceConfig(), [QUICK, GOOD], [0, 4, 7]) == []
     assert rehearse(noise(), RadianceConfig(), [QUICK], range(8)) == []
 
