@@ -26,9 +26,9 @@ from langsplat_core.pipeline.stages import kept
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.features import FeatureStore, ImageFeatures
 from langsplat_core.training.radiance.state import save_checkpoint
-from langsplat_viewer.files.projects import Bookmark, Shelf, save_preferences, write_flight, write_queries
+from langsplat_viewer.files.projects import Bookmark, Shelf, save_preferences, write_flight
 from langsplat_viewer.output import Film, save_png, write_film
-from langsplat_viewer.session import Preferences, Query, Session
+from langsplat_viewer.session import Preferences
 from tests.support.file_samples import random_field
 from tests.support.processes import (
     Captured,
@@ -194,7 +194,6 @@ WRITERS: dict[str, Write] = {
     "camera path": flight,
     "bookmarks": bookmarks,
     "preferences": lambda folder: save_preferences(folder, Preferences()),
-    "queries": lambda folder: write_queries(folder / "q.json", Session(queries=(Query("cup"),))),
 }
 
 

@@ -160,7 +160,6 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
         Command("save a picture", saving.save_picture, ("Ctrl+S", "P"), icon="CAMERA", apart=True),
         Command("save the view", saving.save_view),
         Command("save the project", saving.save_project, ("Ctrl+Shift+S",)),
-        Command("save the queries", queries.save_queries),
         Command("save a picture of the size of the film", saving.save_sized_picture),
         Command("save a film of the path", saving.save_film),
         Command("save the camera path", saving.save_path),

@@ -268,7 +268,7 @@ def test_a_signal_ends_a_command_in_a_line(number: int, said: str, tmp_path: Pat
         "@dataclass\nclass Waits:\n    def run(self):\n"
         "        import langsplat_core.datasets.reconstruction\n"
         "        print('ready', flush=True)\n"
-        "        while True:\n            time.sleep(0.05)\n"  # one long sleep begins after a signal just before
+        "        while True:\n            time.sleep(0.05)\n"  # a long sleep could begin after the signal
         "sys.exit(main('langsplat', Waits))\n"
     )
     assert signalled(code, number) == (128 + number, [CONTINUES.format(said)])

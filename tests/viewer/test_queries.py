@@ -9,14 +9,13 @@ import pytest
 from numpy.testing import assert_allclose
 
 from langsplat_core.display.displays import NO_HEAT, Subject, relevancies
-from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.errors import EncoderError
 from langsplat_core.semantics.features import ImageFeatures
 from langsplat_viewer.actions import editing, opening, outline, queries, saving, settings
 from langsplat_viewer.actions.editing import take
-from langsplat_viewer.files.projects import read_queries, write_queries
 from langsplat_viewer.headless import answer_line
 from langsplat_viewer.panels.search import BINS, hint, histogram
-from langsplat_viewer.session import Query, Session, Things
+from langsplat_viewer.session import Query, Things
 from langsplat_viewer.viewer import Services
 from tests.support.fakes import CENTRES, FakeEncoder, as_trained, axis, blob_scene, calibrated_for, language
 from tests.support.scenes import with_tree
@@ -171,7 +170,7 @@ def test_answer_is_explained_by_kept_photographs(opened, tmp_path, monkeypatch):
     assert opened.state.evidence is None
 
 
-# Own cuts, canonical phrases and sets of queries, without a window.
+# Own cuts, without a window.
 
 
 def test_threshold_is_set_and_reset(asked):
@@ -205,65 +204,6 @@ def test_threshold_is_one_step_and_outlives_the_level(asked):
     np.testing.assert_array_equal(result(asked).members, automatic.members)
     editing.redo(asked)
     assert result(asked).own_cut == 0.62
-
-
-@pytest.mark.parametrize("dropped", [lambda path: [path], lambda path: [path, Path("blobs.ply")]])
-def test_query_set_is_asked_alone_or_with_its_scene(asked, tmp_path, dropped):
-    queries.set_cut(asked, "mug", 0.7)
-    ask(asked, "plant")
-    queries.hide(asked, "plant")
-    queries.set_level(asked, "whole")
-    path = queries.save_queries(asked, tmp_path)
-    assert path.name == "blobs-001.queries.json"
-    open_scene(asked, "blobs.ply")
-    assert asked.state.session.queries == ()
-    act(opening.open_dropped, asked, dropped(path))
-    found = [(query.phrase, query.cut, query.slot is None) for query in asked.state.session.queries]
-    assert found == [("mug", 0.7, False), ("plant", None, True)]
-    assert asked.state.session.level == "whole"
-    assert result(asked, 0).own_cut == 0.7
-
-
-def test_query_set_without_queries_or_field_says_why(viewer, opened, tmp_path):
-    assert queries.save_queries(opened, tmp_path) is None
-    queries.load_queries(opened, tmp_path / "gone.queries.json")
-    assert "gone.queries.json" in errors(opened)[-1]
-    open_scene(opened, "plain.ply")
-    write_queries(tmp_path / "a.queries.json", Session(queries=(Query("mug"),)))
-    queries.load_queries(opened, tmp_path / "a.queries.json")
-    assert "searched" in errors(opened)[-1]
-    assert opened.state.session.queries == ()
-
-
-GOOD = {"format": "langsplat-queries", "queries": [{"phrase": "mug"}]}
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"format": "other"},
-        {"queries": "mug"},
-        {"queries": ["mug"]},
-        {"queries": [{"phrase": ""}]},
-        {"queries": [{"phrase": 3}]},
-        {"queries": [{"phrase": "x" * 2000}]},
-        {"queries": [{"phrase": "mug", "cut": 2}]},
-        {"queries": [{"phrase": "mug", "cut": True}]},
-        {"queries": [{"phrase": "mug", "cut": float("nan")}]},
-        {"queries": [{"phrase": "mug", "shown": 1}]},
-        {"queries": [{"phrase": "mug"}] * 201},
-        {"level": "floor"},
-        {"level": []},
-    ],
-)
-def test_damaged_query_set_is_refused_in_one_line(tmp_path, change):
-    path = tmp_path / "a.queries.json"
-    path.write_text(json.dumps(GOOD))
-    assert [query.phrase for query in read_queries(path).queries] == ["mug"]
-    path.write_text(json.dumps(GOOD | change))
-    with pytest.raises(InputError, match="no set of queries") as caught:
-        read_queries(path)
-    assert str(caught.value).isprintable()
 
 
 def test_relevancy_histogram_counts_every_gaussian(asked):

@@ -26,7 +26,6 @@ from langsplat_viewer.files.projects import (
     load_preferences,
     read_flight,
     read_project,
-    read_queries,
 )
 from langsplat_viewer.marks import Marks, hiding, unmarked
 from langsplat_viewer.rendering.request import Clip, Splats
@@ -353,14 +352,6 @@ def test_project_of_version_1_opens_and_means_the_same(viewer, tmp_path, monkeyp
 def test_other_files_of_version_1_open_and_mean_the_same(opened):
     project = read_project(SAVED / "version1.langsplat")
     assert project.session.things == Things({3: "the atlas"})
-    asked = read_queries(SAVED / "version1.queries.json")
-    assert [(q.phrase, q.cut, q.shown) for q in asked.queries][1:3] == [
-        ("book", 0.6, True),
-        ("plant", None, False),
-    ]
-    assert asked.level == "whole"
-    act(queries.load_queries, opened, SAVED / "version1.queries.json")
-    assert errors(opened) == [NOT_COMPARED]
     (bookmark,) = Shelf(SAVED).read(Path("/scenes/blobs.ply"))
     first, second = read_flight(SAVED / "version1.path.json").keyframes
     for pose in (bookmark.pose, first.pose, project.view.pose):

@@ -17,13 +17,12 @@ from langsplat_core.query.engine import no_field
 from langsplat_core.scene import Scene, surface
 from langsplat_viewer.actions import viewpoint
 from langsplat_viewer.actions.editing import adopt
-from langsplat_viewer.actions.queries import load_queries
 from langsplat_viewer.actions.saving import leave
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.camera.controls import Extent, extent_of
 from langsplat_viewer.files import disk
 from langsplat_viewer.files.disk import Stamps, stamps
-from langsplat_viewer.files.projects import PATHS, PROJECTS, QUERIES, Project, read_project
+from langsplat_viewer.files.projects import PATHS, PROJECTS, Project, read_project
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.marks import unmarked
 from langsplat_viewer.rendering.request import Split, why_undrawable
@@ -293,12 +292,10 @@ def _is_plain_folder(path: Path) -> bool:
 
 
 def open_file(viewer: Viewer, path: Path) -> None:
-    """Open a scene or a project, ask a set of queries, or take a camera path."""
+    """Open a scene or a project, or take a camera path."""
     viewer.state.browser = None
     if path.name.endswith(PROJECTS):
         open_project(viewer, path)
-    elif path.name.endswith(QUERIES):
-        load_queries(viewer, path)
     elif path.name.endswith(PATHS):
         viewpoint.load_path(viewer, path)
     else:
@@ -308,15 +305,14 @@ def open_file(viewer: Viewer, path: Path) -> None:
 def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
     """Open what was dropped onto the window.
 
-    Of scenes the first is opened and all are listed; then sets of queries are asked and paths taken. What
-    belongs to a scene lies beside it. A folder of photographs is offered for training. What is none of these
-    is said.
+    Of scenes the first is opened and all are listed; then paths are taken. What belongs to a scene lies
+    beside it. A folder of photographs is offered for training. What is none of these is said.
     """
     if len(paths) == 1 and _is_plain_folder(paths[0]) and count_photographs(paths[0]):
         choose_photographs(viewer, paths[0])
         open_panel(viewer, "Train")
         return
-    sets = [path for path in paths if path.name.endswith((QUERIES, PATHS, PROJECTS))]
+    sets = [path for path in paths if path.name.endswith((PATHS, PROJECTS))]
     files = [path for path in paths if path not in sets]
 
     def open_sets(viewer: Viewer) -> None:

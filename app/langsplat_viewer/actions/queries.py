@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
@@ -19,9 +18,6 @@ from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import TaughtWord
 from langsplat_core.scene.language import phrase_key, split_phrases
 from langsplat_viewer.actions.settings import open_panel
-from langsplat_viewer.files.projects import NOT_COMPARED, QUERIES, read_queries, write_queries
-from langsplat_viewer.jobs import one_line
-from langsplat_viewer.output import free_name
 from langsplat_viewer.session import Query
 from langsplat_viewer.state import QueryAnswer
 from langsplat_viewer.viewer import Viewer
@@ -38,11 +34,8 @@ def ask(viewer: Viewer, text: str) -> None:
         viewer.say_error(f"'{text.strip()[:40]}' has no word to look for")
 
 
-def ask_one(viewer: Viewer, phrase: str, *, cut: float | None = None, then_show: bool = True) -> None:
-    """Search the scene for one phrase.
-
-    cut: a threshold in place of the answer's own; then_show: give it a colour if it may be there.
-    """
+def ask_one(viewer: Viewer, phrase: str) -> None:
+    """Search the scene for one phrase, and give it a colour if it may be there."""
     state, key = viewer.state, phrase_key(phrase)
     if viewer.searchable() is None:
         return
@@ -50,10 +43,10 @@ def ask_one(viewer: Viewer, phrase: str, *, cut: float | None = None, then_show:
     queries = state.session.queries
     query = next((query for query in queries if phrase_key(query.phrase) == key), Query(phrase))
     others = (other for other in queries if other is not query)
-    viewer.put(queries=(*others, replace(query, cut=cut)), chosen=query.phrase)  # in the order of asking
+    viewer.put(queries=(*others, replace(query, cut=None)), chosen=query.phrase)  # in the order of asking
     state.asked = [*(earlier for earlier in state.asked if phrase_key(earlier) != key), phrase]
     state.recalled = len(state.asked)
-    answer(viewer, query.phrase, then_show)
+    answer(viewer, query.phrase, then_show=True)
 
 
 def answer(viewer: Viewer, phrase: str, then_show: bool = False) -> None:
@@ -224,36 +217,6 @@ def explain(viewer: Viewer, query: Query) -> None:
             state.evidence = query.phrase, image
 
     viewer.run(f"looking for the evidence of '{query.phrase}'", work, done)
-
-
-# Sets of queries in files.
-
-
-def save_queries(viewer: Viewer, folder: Path = Path()) -> Path | None:
-    """Save the list to a new file in `folder`; returns its path, None if there is none or that failed."""
-    state = viewer.state
-    if not state.session.queries:
-        viewer.say_error("search for something first, then save the queries")
-        return None
-    path = free_name(folder, state.path.stem if state.path else "scene", QUERIES)
-    more = "; open it, or drop it onto the window, to ask them again"
-    return viewer.save(path, lambda: write_queries(path, state.session), more)
-
-
-def load_queries(viewer: Viewer, path: Path) -> None:
-    """Ask all queries of a file, after those that are listed already."""
-    try:
-        wanted = read_queries(path)
-    except InputError as error:
-        viewer.say_error(one_line(error))
-        return
-    if viewer.searchable() is None:
-        return
-    if wanted.canonical:
-        viewer.say_error(NOT_COMPARED)
-    set_level(viewer, wanted.level)
-    for query in wanted.queries:
-        ask_one(viewer, query.phrase, cut=query.cut, then_show=query.shown)
 
 
 # What is offered to a searcher: examples of the scene, completions, corrections, earlier phrases.

@@ -14,7 +14,7 @@ from langsplat_core.io.ply import write_ply
 from langsplat_core.io.scenes import format_of
 from langsplat_core.pipeline.report import work_folder
 from langsplat_core.scene import Gaussians
-from langsplat_viewer.files.projects import PATHS, PROJECTS, QUERIES
+from langsplat_viewer.files.projects import PATHS, PROJECTS
 
 # Folders of the file browser.
 
@@ -57,7 +57,7 @@ def _entry(path: Path) -> FolderEntry | None:
     try:
         if path.is_dir():
             return FolderEntry(path, is_file=format_of(path) is not None)
-        if format_of(path) is not None or path.name.endswith((QUERIES, PATHS, PROJECTS)):
+        if format_of(path) is not None or path.name.endswith((PATHS, PROJECTS)):
             return FolderEntry(path, True, path.stat().st_size)
     except OSError:  # it may not be looked at
         pass

@@ -1,4 +1,4 @@
-"""Files of a user, as JSON: camera paths, bookmarks, query sets, projects and preferences.
+"""Files of a user, as JSON: camera paths, bookmarks, projects and preferences.
 
 What they hold are parts of a `Session`, which msgspec turns into JSON and back; what its types do not say is
 checked here. Nothing in a file becomes a path, an array or a call that was not checked before.
@@ -13,14 +13,14 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 import numpy as np
 import platformdirs
 from msgspec import Meta
 
-from langsplat_core.config import LevelChoice, check_settings
+from langsplat_core.config import check_settings
 from langsplat_core.errors import FormatError, InputError, printable_line, quoted
 from langsplat_core.io.cameras import is_rotation
 from langsplat_core.io.files import atomic_path
@@ -35,7 +35,6 @@ from langsplat_viewer.session import (
     SLOTS,
     Bits,
     Bookmark,
-    Phrase,
     Preferences,
     Session,
 )
@@ -88,12 +87,12 @@ def _bits(text: Any, count: int) -> Bits:
     return Bits(count, content)
 
 
-def _read(path: Path, what: str, decode: Callable[[Any], T], limit: int = SIZE_LIMIT) -> T:
+def _read(path: Path, what: str, decode: Callable[[Any], T]) -> T:
     """Return what `decode` makes of the JSON in a file.
 
     InputError and FormatError, in one line, where it is no `what`.
     """
-    top = read_json_file(path, limit)
+    top = read_json_file(path, SIZE_LIMIT)
     try:
         return decode(top)
     except (InputError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
@@ -234,42 +233,6 @@ class Shelf:
         return _read(path, "bookmarks of this version, mend or delete the file", decode)
 
 
-# Query sets, which people write by hand as well: phrases, cuts, and whether each is shown in a colour.
-
-QUERIES = ".queries.json"
-NOT_COMPARED = "canonical phrases of one's own are left out: this version has none"
-
-
-class SavedQuery(msgspec.Struct):
-    """A query of a set."""
-
-    phrase: Phrase
-    cut: Annotated[float, Meta(ge=0, le=1)] | None = None
-    shown: bool = True
-
-
-class QuerySet(msgspec.Struct):
-    """The content of a query set."""
-
-    format: Literal["langsplat-queries"]
-    queries: Annotated[tuple[SavedQuery, ...], Meta(max_length=200)]
-    version: int = 1
-    level: LevelChoice = "auto"
-    canonical: tuple[str, ...] | msgspec.UnsetType = msgspec.UNSET  # of earlier versions
-
-
-def write_queries(path: Path, session: Session) -> None:
-    """Write the queries of a session and how they were asked, whole or not at all."""
-    saved = tuple(SavedQuery(query.phrase, query.cut, query.slot is not None) for query in session.queries)
-    asked = QuerySet("langsplat-queries", saved, level=session.level)
-    _write(path, msgspec.to_builtins(asked))
-
-
-def read_queries(path: Path) -> QuerySet:
-    """Read a set. InputError where the file cannot be read or is none."""
-    return _read(path, "set of queries", lambda top: _converted(top, QuerySet), 1_000_000)
-
-
 # Projects: a scene and its session.
 #
 # {"format": "langsplat-project", "version": 2,
@@ -282,6 +245,7 @@ def read_queries(path: Path) -> QuerySet:
 
 PROJECTS = ".langsplat"  # suffix of project files
 FORMAT, VERSION = "langsplat-project", 2
+NOT_COMPARED = "canonical phrases of one's own are left out: this version has none"
 NO_GROUPS = "groups and locks of the outline are left out: this version has none"
 
 
@@ -361,25 +325,25 @@ def _line(text: str) -> str:
 
 def _from_version_1(top: dict[str, Any]) -> dict[str, Any]:
     """Return a project of version 1 in the layout of version 2."""
-    asked: QuerySet = _converted(top["queries"], QuerySet)
-    free = iter([*range(SLOTS), *[None] * len(asked.queries)])
+    asked = top["queries"]["queries"]
+    free = iter([*range(SLOTS), *[None] * len(asked)])
     queries = [
         {
-            "phrase": query.phrase,
-            "cut": query.cut,
-            "slot": next(free) if query.shown else None,
+            "phrase": query["phrase"],
+            "cut": query.get("cut"),
+            "slot": next(free) if query.get("shown", True) else None,
             "shown_since": number,
         }
-        for number, query in enumerate(asked.queries)
+        for number, query in enumerate(asked)
     ]
     session = {
         "picture": top["look"],
         "latent_level": top["level"],
         "clip": {name: depth for name, depth in top["cuts"].items() if depth is not None},
         "queries": queries,
-        "level": asked.level,
-        "canonical": asked.canonical,
-        "chosen": asked.queries[-1].phrase if asked.queries else "",
+        "level": top["queries"].get("level", "auto"),
+        "canonical": top["queries"].get("canonical"),
+        "chosen": asked[-1]["phrase"] if asked else "",
         "keyframes": [_nested(key) for key in top["keyframes"]],
         "bookmarks": [_nested(bookmark) for bookmark in top["bookmarks"]],
         "notes": top["notes"],

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from langsplat_core.cli.arguments import EncoderOption, OutFile, OutFolder
+from langsplat_core.cli.arguments import EncoderOption, OutFile
 from langsplat_core.errors import InputError
 from langsplat_core.extensions.benchmarks.profiles import (
     LERF_PROFILES,
@@ -33,8 +33,6 @@ class _Eval:
     """Names of the benchmark's scenes to score; all of them if empty."""
     json: OutFile | None = None
     """Also write all figures to this file."""
-    pictures: OutFolder | None = None
-    """Also write one image per query into this folder."""
     paper_order: bool = False
     """Blend latents and decode every pixel, as the paper does, not the relevancies; no codebook can."""
     encoder: EncoderOption = ""
@@ -60,9 +58,7 @@ class _Eval:
         subject = Evaluated(scene, self.maps, self.encoder, self.paper_order)
         benchmark = read(self.paths[-1])
         with TerminalProgress() as progress:
-            report = run_benchmark(
-                benchmark, profile, subject, load_text_encoder, self.only, self.pictures, progress
-            )
+            report = run_benchmark(benchmark, profile, subject, load_text_encoder, self.only, progress)
         print(table(report))
         published = beside_published(report)
         if published:

@@ -68,7 +68,6 @@ class Frame:
     name: str  # of its photograph, without extension; dots inside belong to it
     size: Size  # of the label's grid
     labels: tuple[LabelledPhrase, ...]
-    photograph: Path | None = None  # to draw on
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +129,6 @@ def photograph_of(folder: Path, name: str) -> Path | None:
 #
 # lerf_ovs/label/<scene>/<frame>.json  info {name, width, height}, objects [{category,
 #                                      bbox [x1, y1, x2, y2], segmentation [[x, y]...]}]
-# lerf_ovs/label/<scene>/<frame>.jpg   the photograph again (not needed)
 # lerf_ovs/<scene>/                    photographs and cameras
 #
 # An object has one polygon; a category that occurs several times in a frame is one query with all its
@@ -184,7 +182,7 @@ def read_lerf_ovs(folder: Path) -> Benchmark:
 def _read_scene(name: str, labels: Path, dataset: Path) -> LabelledScene:
     frames, left_out = [], []
     for path in sorted(labels.glob("*.json")):
-        frame, without = _read_frame(path, dataset)
+        frame, without = _read_frame(path)
         frames.append(frame)
         left_out += [f"{frame.name}: {phrase} (no outline)" for phrase in without]
     if not any(frame.labels for frame in frames):
@@ -192,7 +190,7 @@ def _read_scene(name: str, labels: Path, dataset: Path) -> LabelledScene:
     return LabelledScene(name, tuple(frames), dataset, tuple(left_out))
 
 
-def _read_frame(path: Path, dataset: Path) -> tuple[Frame, list[str]]:
+def _read_frame(path: Path) -> tuple[Frame, list[str]]:
     """Return the frame, and the categories of it that have no polygon with an inside."""
     try:
         content = msgspec.convert(read_json_file(path, LIMIT), _LabelFile)
@@ -214,9 +212,8 @@ def _read_frame(path: Path, dataset: Path) -> tuple[Frame, list[str]]:
         for phrase, outlines in polygons.items()
         if outlines
     )
-    photograph = photograph_of(path.parent, path.stem) or photograph_of(dataset / "images", path.stem)
     without = [phrase for phrase, outlines in polygons.items() if not outlines]
-    return Frame(path.stem, size, labels, photograph), without
+    return Frame(path.stem, size, labels), without
 
 
 def _box(stored: Any, polygon: Array) -> Array:
@@ -267,7 +264,7 @@ def _read_ovs3d_scene(folder: Path) -> LabelledScene:
         if labels:
             photograph = photograph_of(folder / "images", view.name)
             grid = picture_size(photograph or files[labels[0].phrase])
-            frames.append(Frame(view.name, grid, labels, photograph))
+            frames.append(Frame(view.name, grid, labels))
     if not frames:
         raise FormatError(f"{folder / 'segmentations'}: no <view>/<class>.png for any line of classes.txt")
     return LabelledScene(folder.resolve().name, tuple(frames), folder, tuple(stray))

@@ -1,4 +1,4 @@
-"""Every labelled query against its answer: scores, their means, tables, JSON and images."""
+"""Every labelled query against its answer: scores, their means, tables and JSON."""
 
 import json
 import logging
@@ -8,18 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageDraw
-from scipy.ndimage import binary_erosion
 
 from langsplat_core.arrays import Array
 from langsplat_core.datasets.colmap import find_model, load_colmap
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
-from langsplat_core.datasets.photos import read_photo
 from langsplat_core.errors import InputError, shortened
 from langsplat_core.extensions.benchmarks.labels import (
     Benchmark,
-    Frame,
-    LabelledPhrase,
     LabelledScene,
     Size,
     check_same_image,
@@ -29,12 +24,10 @@ from langsplat_core.extensions.benchmarks.profiles import (
     MapRule,
     MapSource,
     OwnRule,
-    Prediction,
     Profile,
     SceneSource,
     SilhouetteRule,
     Source,
-    file_name,
 )
 from langsplat_core.io.files import atomic_path, write_json
 from langsplat_core.progress import Progress, silent
@@ -68,31 +61,6 @@ def intersection_over_union(found: Array, truth: Array) -> float:
     return float(np.logical_and(found, truth).sum() / union) if union else 1.0
 
 
-# The image: photograph, mask that was found, the label's outline and boxes, the place.
-
-TRUTH = (60, 220, 90)  # the label's outline and boxes
-
-
-def write_image(folder: Path, frame: Frame, label: LabelledPhrase, answer: Prediction, truth: Array) -> None:
-    """`folder`/<frame>/<phrase>.png on the scored grid; over black where the photograph is not there."""
-    rows, columns = answer.mask.shape
-    photo = np.zeros((rows, columns, 3))
-    if frame.photograph is not None:
-        photo = np.asarray(read_photo(frame.photograph, upright=False).resize((columns, rows)), np.float64)
-    photo = np.where(answer.mask[..., None], 0.45 * photo + 0.55 * np.array([250, 115, 25]), photo)
-    photo[truth & ~binary_erosion(truth)] = TRUTH
-    canvas = Image.fromarray(photo.astype(np.uint8))
-    brush = ImageDraw.Draw(canvas)
-    scale = np.array([columns / frame.size[0], rows / frame.size[1]] * 2)
-    for box in [] if label.boxes is None else label.boxes * scale:
-        corners = np.concatenate([np.minimum(box[:2], box[2:]), np.maximum(box[:2], box[2:])])
-        brush.rectangle([float(value) for value in corners], outline=TRUTH)
-    for column, row in answer.peaks[:100]:  # of a flat map every pixel is a peak
-        brush.ellipse([column - 4, row - 4, column + 4, row + 4], outline=(40, 130, 255), width=2)
-    with atomic_path(folder / frame.name / f"{file_name(label.phrase)}.png") as path:
-        canvas.save(path, "PNG")
-
-
 # Every labelled query against its answer.
 
 
@@ -115,13 +83,12 @@ def score_scene(
     labelled: LabelledScene,
     source: Source,
     profile: Profile,
-    pictures: Path | None = None,
     progress: Progress = silent,
 ) -> tuple[list[QueryScore], list[str]]:
     """Return the scores of every query of a scene, and the labels that cannot be asked, with the reason.
 
-    pictures: a folder for one image per answer. A frame's answers are complete, cut and all, before any mask
-    of it is drawn. Raises InputError where a map has another shape than the labelled image.
+    A frame's answers are complete, cut and all, before any mask of it is drawn. Raises InputError where a map
+    has another shape than the labelled image.
     """
     scores: list[QueryScore] = []
     left_out = list(labelled.left_out)
@@ -153,8 +120,6 @@ def score_scene(
                     hit=inside_any_box(answer.peaks, label.boxes, frame.size, size) if placed else None,
                     level="" if answer.level is None else LEVELS[answer.level],
                 )
-                if pictures is not None:
-                    write_image(pictures / labelled.name, frame, label, answer, truth)
             scores.append(score)
         progress("asking phrases", (done + 1) / len(labelled.frames), labelled.name)
     return scores, left_out
@@ -360,7 +325,6 @@ def run_benchmark(
     subject: Evaluated,
     load_encoder: LoadEncoder,
     only: Sequence[str] = (),
-    pictures: Path | None = None,
     progress: Progress = silent,
 ) -> BenchmarkReport:
     """Score `subject` on the scenes of `benchmark`, or those named by `only`.
@@ -381,7 +345,7 @@ def run_benchmark(
             if subject.maps is not None
             else _scene_source(labelled, profile, subject, load_encoder, progress)
         )
-        scores, without = score_scene(labelled, source, profile, pictures, progress)
+        scores, without = score_scene(labelled, source, profile, progress)
         queries += scores
         left_out += without
     order = ", latents blended and every pixel decoded (the paper's order)" if subject.paper_order else ""

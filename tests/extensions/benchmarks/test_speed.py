@@ -133,7 +133,7 @@ def test_the_command_writes_what_it_measured(tmp_path, capsys):
 @pytest.mark.parametrize(
     "words",
     [
-        *("eval lerf-ovs s.ply d --json /proc/x.json", "eval 3d-ovs s.ply d --pictures /proc/x"),
+        *("eval lerf-ovs s.ply d --json /proc/x.json", "eval 3d-ovs s.ply d --json /proc/x"),
         *("bench raster --out /proc/x", "bench query s.ply --out /proc/x"),
     ],
 )
