@@ -17,6 +17,7 @@ from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, no_field
 from langsplat_core.scene import LanguageField, Scene
 from langsplat_core.semantics.encoders import DEMO
+from langsplat_core.semantics.weights import local_path
 from langsplat_viewer.files.disk import Stamps, Watch
 from langsplat_viewer.files.projects import Shelf
 from langsplat_viewer.jobs import Job, Worker, one_line
@@ -262,7 +263,7 @@ class Viewer:
     def has_encoder_here(self) -> bool:
         """True where the text encoder lies on this machine: a hub id may mean a download."""
         encoder = self.encoder_id
-        return encoder == DEMO or (encoder != "" and Path(encoder).expanduser().is_dir())
+        return encoder == DEMO or (encoder != "" and os.path.isdir(local_path(encoder)))
 
     def save(self, path: Path, write: Callable[[], object], more: str = "") -> Path | None:
         """Have `write` write the file `path`, and say so, or why it is not saved and return None."""

@@ -115,6 +115,10 @@ def open_for_reading(path: Path) -> tuple[BinaryIO, int]:
         raise InputError(f"{path}: cannot be opened ({error}); check its name and permissions") from None
 
 
+class FromFile(str):
+    """A text that a file states: it may name what is here, and starts no request and expands no `~`."""
+
+
 def is_plain_name(name: object) -> bool:
     """Return whether a name in a file is one of a file beside it: a path could lead out of its folder."""
     return isinstance(name, str) and name not in ("", ".", "..") and not set(name) & set("/\\:\0")

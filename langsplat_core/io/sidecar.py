@@ -74,7 +74,7 @@ from safetensors.numpy import save_file
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.errors import malformed, printable_line, quoted
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.hostile import decode_json, open_for_reading
+from langsplat_core.io.hostile import FromFile, decode_json, open_for_reading
 from langsplat_core.scene import (
     CANONICAL_PHRASES,
     LEVELS,
@@ -225,7 +225,7 @@ def _field(tensors: dict[str, Array], about: dict[str, Any]) -> LanguageField:
         tensors["confidence"],
         codec,
         tensors["canonical"],
-        about["encoder"],
+        FromFile(about["encoder"]),
         dict(zip(phrases, vectors, strict=True)),
         **known,
         calibration=odds and Calibration(*(PlattScaling(*numbers) for numbers in odds)),

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import pickle
 import re
 import warnings
@@ -16,6 +17,8 @@ from typing import Any, Literal, TypeVar, cast
 
 from langsplat_core import registry
 from langsplat_core.errors import EncoderError
+from langsplat_core.io.files import shown
+from langsplat_core.io.hostile import FromFile
 
 T = TypeVar("T")
 CONFIG = "config.json"
@@ -73,26 +76,36 @@ def weights_path(model: str, option: str) -> Path:
     """Return the folder or file that holds `model`, downloaded when it is a hub id that is not cached yet.
 
     model: an existing folder or file, or a hub id "owner/name"; option: the setting to name in messages, such
-    as "--clip.model". What exists is never looked up on the hub, and with HF_HUB_OFFLINE set nothing is.
-    Raises EncoderError saying what to pass or to run.
+    as "--clip.model". What exists is never looked up on the hub, and with HF_HUB_OFFLINE set, or where
+    nobody but a file names the model, nothing is. Raises EncoderError saying what to pass or to run.
     """
-    path = Path(model).expanduser()
-    if path.is_file():
+    path, said = local_path(model), shown(model)
+    if os.path.isfile(path):
         plain = any(path.match(pattern) for pattern in SAFE + PICKLED)
         return path.parent if plain and _is_hugging_face(path.parent) else path
-    if path.is_dir():
+    if os.path.isdir(path):
         if not _is_complete(path):
             raise EncoderError(
-                f"{model}: no {CONFIG} with model.safetensors in this folder; {option} wants a model folder "
+                f"{said}: no {CONFIG} with model.safetensors in this folder; {option} wants a model folder "
                 f"in Hugging Face layout, or that of open_clip with {OPEN_CLIP_CONFIG} and {OPEN_CLIP[0]}"
             )
         return path
     if not re.fullmatch(r"[^./~][^/]*/[^/]+(?<!\.safetensors)(?<!\.bin)(?<!\.pt)(?<!\.pth)", model):
         raise EncoderError(
-            f"{model}: no such file, no such folder; pass `{option} FOLDER`, a file or a hub id such as "
+            f"{said}: no such file, no such folder; pass `{option} FOLDER`, a file or a hub id such as "
             "owner/name"
         )
     return _from_hub(model, option)
+
+
+def local_path(model: str) -> Path:
+    """Return where `model` lies if it is a file or folder here.
+
+    `~` and a folder on another machine, which is asked for it, are the user's own to write.
+    """
+    if not isinstance(model, FromFile):
+        return Path(os.path.expanduser(model))
+    return Path(os.devnull if model[:2].replace("\\", "/") == "//" else model)
 
 
 def _is_hugging_face(folder: Path) -> bool:
@@ -108,7 +121,9 @@ def _is_complete(folder: Path) -> bool:
 def _from_hub(model: str, option: str) -> Path:
     from huggingface_hub import constants, errors, snapshot_download
 
-    reason, here_or_there = "HF_HUB_OFFLINE is set", (True,) if constants.HF_HUB_OFFLINE else (True, False)
+    offline, unasked = constants.HF_HUB_OFFLINE, isinstance(model, FromFile)
+    reason = "HF_HUB_OFFLINE is set" if offline else "a scene's word fetches nothing"
+    here_or_there = (True,) if offline or unasked else (True, False)
     for local_only, kind in product(here_or_there, (SAFE, PICKLED, OPEN_CLIP[:1], OPEN_CLIP[1:])):
         try:
             patterns = ["*.json", "*.txt", *kind]
@@ -118,9 +133,10 @@ def _from_hub(model: str, option: str) -> Path:
             reason = reason if local_only else "it has no weights for transformers"
         except (OSError, ValueError, errors.HTTPError) as error:  # of whichever client the hub uses
             reason = reason if local_only else type(error).__name__
+    supply, give = ("was not asked", shown(model)) if unasked else ("cannot supply it", "FOLDER")
     raise EncoderError(
-        f"{model}: neither a folder nor in the local cache, and the hub cannot supply it ({reason}); "
-        f"run `hf download {model}` where there is a network, or pass `{option} FOLDER`"
+        f"{shown(model)}: neither a folder nor in the local cache, and the hub {supply} ({reason}); "
+        f"run `hf download {shown(model)}` where there is a network, or pass `{option} {give}`"
     )
 
 

@@ -20,6 +20,7 @@ from transformers import CLIPModel, CLIPTokenizerFast, PreTrainedTokenizerFast, 
 
 from langsplat_core.arrays import unit
 from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.io.hostile import FromFile
 from langsplat_core.scene import Calibration, PlattScaling
 from langsplat_core.semantics.clip_plain import PlainClipText, plain_text_tower, read_tokenizer
 from langsplat_core.semantics.encoders import (
@@ -114,6 +115,21 @@ def test_absent_weights_say_what_to_pass(tmp_path: Path, monkeypatch: pytest.Mon
         load_encoder(str(tmp_path))
     with pytest.raises(EncoderError, match=r"HF_HUB_OFFLINE is set.*`hf download nobody/nothing-here`"):
         load_encoder("nobody/nothing-here")
+
+
+STRANGERS = ["~nosuchuser/x", "nobody/nothing-here", "//host/share", "/dev/zero", "a\0b"]
+
+
+@pytest.mark.parametrize("name", [*STRANGERS, "x" * 5000, "a/" + "b" * 5000])
+def test_names_in_files_neither_fetch_nor_end_the_program(name: str, monkeypatch) -> None:
+    asked: list[object] = []
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
+    monkeypatch.setattr("socket.getaddrinfo", lambda *host, **_: asked.append(host) or [])
+    with pytest.raises(EncoderError) as caught:
+        load_text_encoder(FromFile(name))
+    assert len(str(caught.value)) < 500
+    assert "--encoder" in str(caught.value)
+    assert asked == []
 
 
 def test_weights_of_another_model_are_refused(tmp_path: Path) -> None:

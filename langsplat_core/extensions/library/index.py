@@ -33,7 +33,7 @@ from langsplat_core.display.composing import compose
 from langsplat_core.display.displays import Channels
 from langsplat_core.errors import EncoderError, FormatError, InputError, LangSplatError, printable_line
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.hostile import exists, open_for_reading
+from langsplat_core.io.hostile import FromFile, exists, open_for_reading
 from langsplat_core.io.scenes import companion_path, format_of, load_scene, scene_files
 from langsplat_core.io.sidecar import SUFFIX, read_stored
 from langsplat_core.progress import Progress, silent
@@ -343,7 +343,7 @@ def write_library(index: Path, digests: Sequence[Digest]) -> None:
         tuple(each.listed for each in digests if each.canonical is None),
     )
     with atomic_path(index) as temporary:
-        save_file(tensors, temporary, {SCENES: msgspec.json.encode(stated).decode()})
+        save_file(tensors, temporary, {SCENES: msgspec.json.encode(stated, enc_hook=str).decode()})
 
 
 def read_library(index: Path, folder: Path) -> Library:
@@ -371,9 +371,8 @@ def read_library(index: Path, folder: Path) -> Library:
 def _group(file: Any, number: int, encoder: str, scenes: tuple[Listed, ...]) -> tuple[EncoderGroup, Array]:
     """Return a group and its (S, H, W, 3) thumbnails; ValueError for arrays that do not fit its scenes."""
     canonical, shown = file.get_tensor(f"{number}.canonical"), file.get_tensor(f"{number}.thumbnails")
-    group = EncoderGroup(
-        encoder, canonical, scenes, Columns(*(file.get_tensor(f"{number}.{c}") for c in KINDS._fields))
-    )
+    columns = Columns(*(file.get_tensor(f"{number}.{name}") for name in KINDS._fields))
+    group = EncoderGroup(FromFile(encoder), canonical, scenes, columns)
     if canonical.dtype != np.float32 or canonical.ndim != 2:
         raise ValueError("a group without an encoder")
     if shown.dtype != np.uint8 or shown.shape != (len(scenes), THUMBNAIL[1], THUMBNAIL[0], 3):

@@ -67,6 +67,11 @@ def load(name: str) -> FakeEncoder:
     return FakeEncoder()
 
 
+def own(name: str) -> FakeEncoder:
+    """The fake for "demo", else what is here."""
+    return FakeEncoder() if name == "demo" else load_text_encoder(name)
+
+
 def test_scenes_with_a_field_are_found_in_all_folders(folder):
     (folder / ".hidden").mkdir()
     save_scene(folder / ".hidden" / "scene.ply", named_scene())
@@ -161,6 +166,16 @@ def test_a_scene_that_cannot_be_read_is_named(folder):
     assert unread.path == "all.ply"
     assert "all.ply" in unread.unread
     assert len(library.scenes) == 2
+
+
+@pytest.mark.parametrize("name", ["~nosuchuser/x", "x" * 5000, "nobody/nothing-here"])
+def test_an_encoder_that_is_not_here_costs_its_own_scenes_alone(tmp_path, name):
+    scene = named_scene()
+    for file, encoder in (("good", "demo"), ("bad", name)):
+        field = replace(scene.language, encoder_id=encoder, phrasebook={})
+        save_scene(tmp_path / f"{file}.ply", replace(scene, language=field))
+    groups = find(update_library(tmp_path, load_encoder=own), "mug", own)
+    assert {each.encoder_id: bool(each.problem) for each in groups} == {"demo": False, name: True}
 
 
 # Damaged and hostile index files.
