@@ -42,7 +42,7 @@ LAYERS = [
     ["langsplat_core.config", "langsplat_core.compiled"],
     ["langsplat_core.arrays", "langsplat_core.progress"],
     ["langsplat_core.registry"],
-    ["langsplat_core.errors", "langsplat_core.interrupts", "langsplat_core.web"],
+    ["langsplat_core.errors", "langsplat_core.interrupts"],
 ]
 EXTENSIONS = (
     "langsplat_core.extensions"  # beside the layers: they see public names of the core, which sees none

@@ -21,7 +21,7 @@ FLAGS = ("-q", "--quiet", "-v", "--verbose")  # may precede a command
 CORE: Mapping[str, str] = MappingProxyType({
     "train": "train.Train", "frames": "train.Frames", "query": "query.QueryScene",
     "describe": "describe.Describe", "select": "query.Select", "teach": "describe.Teach",
-    "scale": "edit.SetScale", "transform": "edit.Transform", "crop": "edit.Crop",
+    "scale": "export.SetScale", "transform": "export.Transform", "crop": "export.Crop",
     "export": "export.Export", "convert": "export.Convert",
     "inspect": "scenes.Inspect", "doctor": "scenes.Doctor", "demo": "scenes.Demo",
 })  # fmt: skip

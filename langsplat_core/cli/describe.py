@@ -13,19 +13,18 @@ import numpy as np
 import tyro
 from rich.table import Table
 
-from langsplat_core.cli.answers import Unit, basis_fields, pixel_in, pointed, unit_of
 from langsplat_core.cli.arguments import EncoderOption, Level, TrainedScene
+from langsplat_core.cli.query import Unit, basis_fields, pixel_in, pointed, unit_of
 from langsplat_core.cli.run import OutputConsole, print_json
 from langsplat_core.config import Count, CountOrZero
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io import sidecar as files
 from langsplat_core.io.files import check_output_file
 from langsplat_core.io.scenes import check_writable, companion_path
-from langsplat_core.pipeline.labels import export_labels
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.describe import Describer, LevelWords, look_at_pixel
 from langsplat_core.query.engine import QueryEngine, check_words, searchable
-from langsplat_core.query.inventory import InventoryEntry, scene_inventory, scene_outline
+from langsplat_core.query.inventory import InventoryEntry, export_labels, scene_inventory, scene_outline
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import LEVELS, LanguageField, Scene, TaughtWord
 from langsplat_core.scene.language import phrase_key

@@ -197,7 +197,7 @@ def write_refusal(work: Path, error: NotLocatedError) -> Path:
 
 
 def _write(path: Path, title: str, parts: Iterable[str]) -> None:
-    head = files("langsplat_core.web").joinpath("report.html").read_text(encoding="utf-8")
+    head = files("langsplat_core").joinpath("web", "report.html").read_text(encoding="utf-8")
     with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.writelines(f"{part}\n" for part in (head.replace("{{TITLE}}", _text(title)), *parts))
 

@@ -303,7 +303,7 @@ def page_text(title: str, data: bytes) -> str:
 
     Its policy lets nothing run but its own script, and nothing be fetched.
     """
-    folder = files("langsplat_core.web")
+    folder = files("langsplat_core") / "web"
     modules = [folder.joinpath(f"{name}.js").read_text(encoding="utf-8") for name in MODULES]
     script = "\n".join(module.split(BEGIN)[1].split(END)[0] for module in modules)
     style = folder.joinpath("page.css").read_text(encoding="utf-8")

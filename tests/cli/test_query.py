@@ -1,4 +1,4 @@
-"""`langsplat query`, `select`, `describe`, and `scale`."""
+"""`langsplat query`, `select`, `describe`, `teach` and `scale`."""
 
 import json
 import os
@@ -11,12 +11,14 @@ import numpy as np
 import pytest
 
 from langsplat_core.cli import describe, query
-from langsplat_core.cli.edit import SetScale
+from langsplat_core.cli.export import SetScale
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.scenes import load_scene, save_scene
+from langsplat_core.io.sidecar import read_words
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.encoders import OPEN_MODEL
+from tests.support.comparing import assert_same_field
 from tests.support.fakes import (
     CENTRES,
     NAMES,
@@ -31,6 +33,8 @@ from tests.support.fakes import (
     named_scene,
 )
 from tests.support.processes import refusal, run
+
+SCENE = named_scene()
 
 
 @pytest.fixture
@@ -289,11 +293,14 @@ def test_invalid_scale_is_refused(folder, given, message):
 
 @pytest.fixture
 def described(folder: Path) -> Path:
-    """Scenes with everything, without field and without cameras, and lists of phrases."""
-    scene = named_scene()
-    save_scene("named.ply", scene)
-    save_scene("plain.ply", Scene(scene.gaussians))
-    save_scene("blind.ply", replace(scene, cameras=()))
+    """Scenes with everything, without field, without cameras and of another encoder; lists; a taught word."""
+    save_scene("named.ply", SCENE)
+    save_scene("plain.ply", Scene(SCENE.gaussians))
+    save_scene("blind.ply", replace(SCENE, cameras=()))
+    other = replace(SCENE.language, encoder_id="other", canonical=np.tile(axis(5), (4, 1)))
+    save_scene("other.ply", replace(SCENE, language=other))
+    Path("junk.safetensors").write_bytes(b"junk")
+    assert run("teach", "named.ply", "--name", "vase", "--at", MUG, "--into", "own.safetensors") == 0
     lists = {"empty": "# nothing", "bad": "mug\n???", "sofas": "sofa", "list": "\n".join([*NAMES, "sofa"])}
     for name, text in lists.items():
         Path(f"{name}.txt").write_text(text)
@@ -331,13 +338,85 @@ def test_inventory_is_printed_as_table_and_json(described, capsys):
 
 def test_describe_names_a_pixel(described, capsys):
     words = ("describe", "named.ply", "--vocabulary", "list.txt")
-    column, row = named_scene().cameras[1].project(named_scene().gaussians.means[:1])[0].astype(int)[0]
+    column, row = SCENE.cameras[1].project(SCENE.gaussians.means[:1])[0].astype(int)[0]
     said = lines(capsys, *words, "--camera", "1", "--pixel", str(column), str(row), "--top", "2")
     assert any(line.startswith("whole    mug") for line in said)
     assert "subpart  nothing is known here" in said
     assert not any("%" in line for line in said)
     said = lines(capsys, *words, "--pixel", "0", "0")
     assert sum("nothing is known here" in line for line in said) == 3
+
+
+# `langsplat teach`, and `query` for what was taught and for more like this.
+
+
+def pixel_of(blob: int) -> str:
+    """The pixel of the first camera in the middle of a blob, as the options have it."""
+    means = SCENE.gaussians.means[blob * PER_BLOB : (blob + 1) * PER_BLOB].astype(np.float64)
+    column, row = SCENE.cameras[0].project(means.mean(0)[None])[0][0].astype(int)
+    return f"{column},{row}"
+
+
+NO_PIXELS = ("80", "a,b", "-1,2", "1,2,3", "1.5,2", "9" * 5000 + ",1", "٣,٣")
+MUG, BOOK = pixel_of(0), pixel_of(1)
+
+
+def test_scene_keeps_and_forgets_taught_words(described, capsys):
+    before = load_scene("named.ply").language
+    teach = ("teach", "named.ply", "--name", "grandma's vase")
+    assert run(*teach, "--at", MUG) == 0
+    said = capsys.readouterr().out
+    assert f"{PER_BLOB} Gaussians, shown once" in said
+    assert "named.langsplat.safetensors: taught words: 1" in said
+    (answer,) = answers(capsys, "query", "named.ply", "Grandma's vase")
+    assert (answer["verdict"], answer["probability"], answer["level"]) == ("found", None, "whole")
+    assert [one["gaussians"] for one in answer["instances"]] == [PER_BLOB]
+    assert answer["pixel"] == pytest.approx([int(number) for number in MUG.split(",")], abs=12)
+    assert run(*teach, "--at", BOOK) == 0
+    assert "shown 2 times" in capsys.readouterr().out
+    (both,) = answers(capsys, "query", "named.ply", "grandma's vase")
+    assert sum(one["gaussians"] for one in both["instances"]) == 2 * PER_BLOB
+    assert run("select", "named.ply", "grandma's vase", "--out", "c.ply") == 0
+    assert len(load_scene("c.ply").gaussians) == 2 * PER_BLOB
+    assert run(*teach, "--remove") == 0
+    assert_same_field(load_scene("named.ply").language, before)
+
+
+def test_users_words_work_in_other_scenes(described, capsys):
+    teach = ("--into", "words.safetensors", "--camera", "0")
+    save_scene("b.ply", SCENE)
+    untouched = Path("named.langsplat.safetensors").read_bytes()
+    assert run("teach", "named.ply", "--name", "book", "--at", MUG, *teach) == 0
+    assert run("teach", "named.ply", "--name", "wall", "--at", BOOK, "--level", "whole", *teach) == 0
+    assert Path("named.langsplat.safetensors").read_bytes() == untouched
+    assert [word.name for word in read_words("words.safetensors").words] == ["book", "wall"]
+    book, mug = answers(capsys, "query", "b.ply", "book", "mug", "--taught", "words.safetensors")
+    assert book["place"] == pytest.approx(mug["place"], abs=0.1)  # what was shown, in place of the text
+    (plain,) = answers(capsys, "query", "b.ply", "book")
+    assert plain["place"] != pytest.approx(book["place"], abs=0.1)
+    assert run("teach", "named.ply", "--name", "Book", "--remove", *teach) == 0
+    assert [word.name for word in read_words("words.safetensors").words] == ["wall"]
+    assert run("select", "b.ply", "wall", "--out", "c.ply", "--taught", "words.safetensors") == 0
+    assert len(load_scene("c.ply").gaussians) == PER_BLOB
+
+
+def test_like_option_stands_beside_phrases_or_alone(described, capsys):
+    (alone,) = answers(capsys, "query", "named.ply", "--like", BOOK)
+    assert (alone["phrase"], alone["found"]) == (f"like {BOOK}", True)
+    assert alone["instances"][0]["gaussians"] == PER_BLOB
+    assert [one["phrase"] for one in answers(capsys, "query", "named.ply", "mug", "--like", BOOK)] == [
+        "mug",
+        f"like {BOOK}",
+    ]
+
+
+def test_taught_word_may_be_a_part(described, capsys):
+    field = language()
+    field.latents[1] = field.latents[2]
+    save_scene("parts.ply", Scene(SCENE.gaussians, field, SCENE.cameras))
+    assert run("teach", "parts.ply", "--name", "knob", "--at", MUG, "--level", "part") == 0
+    (answer,) = answers(capsys, "query", "parts.ply", "knob")
+    assert (answer["level"], answer["found"]) == ("part", True)
 
 
 @pytest.mark.parametrize(
@@ -366,10 +445,34 @@ def test_describe_names_a_pixel(described, capsys):
         ("describe named.ply --vocabulary sofas.txt", "knows none of the vocabulary's 1 phrases"),
         ("describe named.ply --vocabulary none.txt", "none.txt: the vocabulary cannot be read"),
         ("describe blind.ply --pixel 1 1", "has no cameras"),
+        (f"teach named.ply --name the --at {MUG}", "'the' cannot be a name"),
+        (f"teach named.ply --name ?! --at {MUG}", "'' cannot be a name"),
+        (f"teach named.ply --name a;b --at {MUG}", "without commas and semicolons"),
+        ("teach named.ply --name vase", "give either --at X,Y, a pixel to teach, or --remove"),
+        (f"teach named.ply --name vase --at {MUG} --remove", "either --at"),
+        ("teach named.ply --name vase --at 0,0", "--at 0,0: nothing is there in camera 0"),
+        ("teach named.ply --name vase --at 160,0", "--at 160,0: camera 0 has columns 0 to 159"),
+        ("teach named.ply --name vase --at 80,60 --camera 7", "--camera 7: the scene has cameras 0 to 2"),
+        *((f"teach named.ply --name vase --at={at}", "give column and row") for at in NO_PIXELS),
+        (f"teach named.ply --name vase --at {MUG} --level subpart", "point at something else"),
+        ("teach named.ply --name vase --remove", "'vase' was not taught here; taught words: none"),
+        (f"teach blind.ply --name vase --at {MUG}", "no cameras"),
+        (f"teach plain.ply --name vase --at {MUG}", "no language field"),
+        (f"teach named.ply --name vase --at {MUG} --into words.json", "written as .safetensors"),
+        (f"teach named.ply --name vase --at {MUG} --into junk.safetensors", "not a whole safetensors file"),
+        (f"teach named.ply --name vase --at {MUG} --into named.langsplat.safetensors", "not of taught words"),
+        (f"teach other.ply --name vase --at {MUG} --into own.safetensors", "own.safetensors: these words"),
+        ("query other.ply mug --taught own.safetensors", "with fake, the scene was made with other"),
+        ("query named.ply mug --taught none.safetensors", "no such file"),
+        ("query named.ply vase --mode paper --taught own.safetensors", "--mode paper"),
+        (f"query named.ply mug --mode paper --like {MUG}", "--mode paper"),
+        ("query named.ply --like 0,0", "--like 0,0: nothing is there"),
+        ("query named.ply --like here", "give column and row"),
+        ("query blind.ply --like 1,1", "no cameras"),
     ],
-)
+)  # fmt: skip
 def test_bad_input_is_one_line_and_nothing_is_written(described, capsys, words, message):
-    before = sorted(path.name for path in described.iterdir())
+    before = {path.name: path.read_bytes() for path in described.iterdir()}
     out = ("--out", "b.ply") if words.startswith("select") and "--out" not in words else ()
     assert message in refusal(capsys, *words.split(), *out)
-    assert sorted(path.name for path in described.iterdir()) == before
+    assert {path.name: path.read_bytes() for path in described.iterdir()} == before

@@ -17,11 +17,11 @@ from langsplat_core.pipeline.evidence import (
     kept_features,
     kept_photographs,
 )
-from langsplat_core.pipeline.labels import export_labels
 from langsplat_core.pipeline.train import train_scene
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.inventory import export_labels
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import NO_NODE, Scene
 from langsplat_core.scene.language import Tree

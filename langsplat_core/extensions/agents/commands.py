@@ -13,9 +13,9 @@ import tyro
 from PIL import Image
 
 from langsplat_core.arrays import Array
-from langsplat_core.cli.answers import camera_of, unit_of
 from langsplat_core.cli.arguments import EncoderOption
 from langsplat_core.cli.describe import outline_lines, outline_of
+from langsplat_core.cli.query import camera_of, unit_of
 from langsplat_core.errors import InputError, LangSplatError
 from langsplat_core.extensions.library.index import scenes_in
 from langsplat_core.progress import silent

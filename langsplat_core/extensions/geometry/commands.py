@@ -9,8 +9,8 @@ import tyro
 from PIL import Image
 
 from langsplat_core.arrays import Array
-from langsplat_core.cli.answers import found_answer, unit_of
 from langsplat_core.cli.arguments import AnyScene, EncoderOption, OutFile, OutFolder
+from langsplat_core.cli.query import found_answer, unit_of
 from langsplat_core.config import Count, LevelChoice, Positive
 from langsplat_core.errors import EncoderError, InputError, malformed, optional_imports, printable_line
 from langsplat_core.extensions.geometry.occupancy import (

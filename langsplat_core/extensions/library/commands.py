@@ -12,9 +12,8 @@ from typing import Annotated, Any
 import tyro
 from PIL import Image
 
-from langsplat_core.cli.answers import Unit, unit_of
 from langsplat_core.cli.arguments import EncoderOption, JsonOption, OutFile, TrainedScene
-from langsplat_core.cli.query import once
+from langsplat_core.cli.query import Unit, once, unit_of
 from langsplat_core.cli.run import print_json
 from langsplat_core.config import CountOrZero, Positive
 from langsplat_core.errors import EncoderError, InputError

@@ -424,7 +424,7 @@ def test_a_transform_that_is_none_is_refused(scans, capsys, text):
 # The rule for answers in its three places: the engine, the index over scans, and the exported page.
 
 DEMO = Path(str(files("langsplat_assets"))) / "demo" / "scene.ply"
-WEB = Path(str(files("langsplat_core.web")))
+WEB = Path(str(files("langsplat_core") / "web"))
 EVERY = 8  # every so-manyth Gaussian of the bundled scene
 LIKE = 0.1  # spreads and logits within which 8 bits of a codeword may tip a verdict
 # Answers of the page's modules outside a browser: each phrase of a JSON list on stdin, on its own.

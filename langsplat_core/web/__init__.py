@@ -1,1 +1,0 @@
-"""Browser code of an exported scene: plain JavaScript modules, inlined by `pipeline.webpage`."""
