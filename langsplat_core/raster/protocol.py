@@ -100,18 +100,6 @@ class LiftingView(View):
         if maps.max(initial=-1) >= count or maps.min(initial=-1) < -1:
             raise ValueError(f"maps: labels {maps.min()} to {maps.max()}, expected -1 to {count - 1}")
 
-    def frozen(self) -> "LiftingView":
-        """Return the same view with W kept, in fewer digits, or the view itself where nothing is gained.
-
-        `splat` and `gather` get cheaper, from some calls on.
-        """
-        return self
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of what `frozen` keeps."""
-        return 0
-
 
 V = TypeVar("V", bound=View, covariant=True)
 

@@ -54,26 +54,6 @@ def test_images_equal_the_reference(channels, distance, settings):
     assert image.max() > 0.1
 
 
-@pytest.mark.parametrize("channels", [1, 3, 12, 40])
-@pytest.mark.parametrize("size", [(70, 45), (1, 1), (33, 5)])
-def test_a_frozen_view_differs_by_its_rounding_only(channels, size):
-    """What holds for every view, as that `gather` is the adjoint, is checked over the hard cases."""
-    gaussians, camera = random_gaussians(300, 21), random_camera(21, *size)
-    view = CPU.view(gaussians, camera)
-    frozen = view.frozen()
-    x = random_values(300, channels)
-    (image, alpha), (want, want_alpha) = frozen.splat(x), view.splat(x)
-    np.testing.assert_array_equal(alpha, want_alpha)
-    alpha[:] = 2  # one's own
-    np.testing.assert_array_equal(frozen.splat(x)[1], want_alpha)
-    deepest = 0.5 / 65535 * 300  # every Gaussian rounded the wrong way
-    assert np.abs(image - want).max(initial=0) < min(deepest, 2e-4)
-    y = np.random.default_rng(3).uniform(-1, 1, image.shape).astype(np.float32)
-    assert np.abs(frozen.gather(y) - view.gather(y)).max() < 0.5 / 65535 * size[0] * size[1]
-    np.testing.assert_array_equal(frozen.depth(), view.depth())
-    assert view.nbytes == 0 < frozen.nbytes < 40 * len(view.tiles.ranks) * 16 + 16 * size[0] * size[1] + 64
-
-
 def test_radii_are_positive_exactly_where_something_is_drawn():
     gaussians, camera = random_gaussians(300, 18, radius=2.0), random_camera(18)
     view = CPU.view(gaussians, camera)

@@ -352,17 +352,14 @@ def _operations(backend: Rasterizer, case: Case, channels: int) -> Iterator[_Ope
         yield "project", lambda: backend.view(case.gaussians, camera), None
     yield "frame", frame, None
     view: Any = backend.view(case.gaussians, camera)
-    yield from _linear(view, values, image, "")
+    yield from _linear(view, values, image)
     if hasattr(view, "backward"):
         yield "backward", lambda: view.backward(values, image), by_values
     if isinstance(view, LiftingView):
         yield _labels(view, camera)
-        if view.frozen() is not view:
-            yield "freeze", view.frozen, None
-            yield from _linear(view.frozen(), values, image, "frozen ")
 
 
-def _linear(view: Any, values: Array, image: Array, prefix: str) -> Iterator[_Operation]:
+def _linear(view: Any, values: Array, image: Array) -> Iterator[_Operation]:
     """Yield the operation `splat` and, where the view has it, `gather`."""
 
     def gathered(exact: "ReferenceWindows") -> Error:
@@ -370,12 +367,12 @@ def _linear(view: Any, values: Array, image: Array, prefix: str) -> Iterator[_Op
         return exact.gather_error(view.gather(masked), masked)
 
     yield (
-        f"{prefix}splat",
+        "splat",
         lambda: view.splat(values),
         lambda exact: exact.splat_error(view.splat(values)[0], values),
     )
     if hasattr(view, "gather"):
-        yield f"{prefix}gather", lambda: view.gather(image), gathered
+        yield "gather", lambda: view.gather(image), gathered
 
 
 def _labels(view: LiftingView, camera: Camera) -> _Operation:

@@ -1,6 +1,6 @@
 """Blending on the CPU: the kernels of ``W x``, ``W^T y`` and the depth of half transmittance (see `walk`).
 
-Below: ``W^T onehot(labels)`` in one walk, and the blending weights kept for views that are used many times.
+Below: ``W^T onehot(labels)`` in one walk.
 """
 
 from typing import Any, NamedTuple
@@ -11,14 +11,11 @@ from scipy import sparse
 from langsplat_core.arrays import Array
 from langsplat_core.compiled import Workers, helper, kernel
 from langsplat_core.raster.cpu.lanes import (
-    UNIT,
     Lanes,
     lanes,
-    largest,
     load,
     prefetch,
     store,
-    store_units,
     where_at_least,
     where_greater,
 )
@@ -26,29 +23,17 @@ from langsplat_core.raster.cpu.tiles import (
     AHEAD,
     PIXELS,
     TILE,
-    Kept,
     Tiles,
     add_weighted,
     correlate,
     load_tile,
     nothing_to_close,
     nothing_to_open,
-    pack_span,
     padded_inside,
     tile_at,
-    unpack_span,
     walk,
-    walk_kept,
     write_tile,
 )
-
-
-@helper
-def write_alpha(transmittance: Array, alpha: Array, tile: int, tiles: Tiles) -> None:
-    """Write 1 - |T| to the tile of (H, W, 1) alpha; changes `transmittance`."""
-    for n in range(PIXELS):
-        transmittance[n] = np.float32(1) - abs(transmittance[n])
-    write_tile(transmittance, alpha, tile, tiles)
 
 
 @helper
@@ -67,23 +52,17 @@ def _add_values(work: Any, x: Array, s: int, row: int, low: int, weight: Lanes, 
 
 
 @kernel
-def splat(
-    first: int, last: int, tiles: Tiles, kept: Kept | None, values: Array, image: Array, alpha: Array
-) -> None:
-    """(M, C) values in depth order -> fills (H, W, C) image and (H, W, 1) alpha, all float32.
-
-    With weights that are kept, alpha is left as it is.
-    """
+def splat(first: int, last: int, tiles: Tiles, values: Array, image: Array, alpha: Array) -> None:
+    """(M, C) values in depth order -> fills (H, W, C) image and (H, W, 1) alpha, all float32."""
     sums = np.empty(PIXELS * padded_inside(image.shape[2]), np.float32)
     for i in range(first, last):
         tile = tile_at(i, tiles)
         sums[:] = 0
         work = (tiles.ranks, values, sums)
-        if kept is None:
-            transmittance, _ = walk(tile, tiles, work, _fetch_values, _add_values, nothing_to_close)
-            write_alpha(transmittance, alpha, tile, tiles)
-        else:
-            walk_kept(tile, tiles, kept, work, _fetch_values, _add_values, nothing_to_close)
+        transmittance, _ = walk(tile, tiles, work, _fetch_values, _add_values, nothing_to_close)
+        for n in range(PIXELS):
+            transmittance[n] = np.float32(1) - abs(transmittance[n])
+        write_tile(transmittance, alpha, tile, tiles)
         write_tile(sums, image, tile, tiles)
 
 
@@ -99,18 +78,14 @@ def _correlate(work: Any, mine: Any, s: int, low: int, high: int) -> None:
 
 
 @kernel
-def gather(first: int, last: int, tiles: Tiles, kept: Kept | None, image: Array, partial: Array) -> None:
+def gather(first: int, last: int, tiles: Tiles, image: Array, partial: Array) -> None:
     """(H, W, C) float32 image -> fills (I, padded(C)) partial sums of ``W^T y``, a row per intersection."""
     planes, weights = np.empty(PIXELS * partial.shape[1], np.float32), np.empty(PIXELS, np.float32)
     for i in range(first, last):
         tile = tile_at(i, tiles)
         load_tile(planes, image, tile, tiles)
-        work = (weights, planes, partial, 0)
-        if kept is None:
-            _, end = walk(tile, tiles, work, nothing_to_open, _store_weight, _correlate)
-            partial[end : tiles.starts[tile + 1]] = 0
-        else:
-            walk_kept(tile, tiles, kept, work, nothing_to_open, _store_weight, _correlate)
+        _, end = walk(tile, tiles, (weights, planes, partial, 0), nothing_to_open, _store_weight, _correlate)
+        partial[end : tiles.starts[tile + 1]] = 0
 
 
 @kernel
@@ -254,71 +229,3 @@ def gather_labels(
     weights.eliminate_zeros()
     weights.sort_indices()
     return weights.astype(np.float32)
-
-
-# Blending weights that are kept, so that splatting and gathering need no exponential again.
-
-VISIBLE = 0.5 / UNIT  # weights below round to 0
-
-
-@helper
-def _forget_rows(work: Any, s: int, later: int) -> int:
-    seen = work[1]
-    seen[0], seen[1] = TILE, 0
-    return 0
-
-
-@helper
-def _look_at_row(work: Any, mine: Any, s: int, row: int, low: int, weight: Lanes, before: Lanes) -> None:
-    """Note the first and the last row in which one of the weights counts."""
-    seen = work[1]
-    if largest(weight) >= VISIBLE:
-        seen[0], seen[1] = min(seen[0], row), row + 1
-
-
-@helper
-def _keep_span(work: Any, mine: Any, s: int, low: int, high: int) -> None:
-    rows, seen = work
-    if seen[1] > 0:
-        rows[s] = pack_span(seen[0], seen[1])
-
-
-@kernel
-def _find_rows(first: int, last: int, tiles: Tiles, rows: Array, alpha: Array) -> None:
-    """Fill the rows of `Kept`, 0 at first, and (H, W, 1) alpha."""
-    seen = np.empty(2, np.int64)
-    for i in range(first, last):
-        tile = tile_at(i, tiles)
-        transmittance, _ = walk(tile, tiles, (rows, seen), _forget_rows, _look_at_row, _keep_span)
-        write_alpha(transmittance, alpha, tile, tiles)
-
-
-@helper
-def _rows_kept(kept: Kept, s: int, later: int) -> tuple[int, int, int]:
-    """Return the rows of intersection s that are kept, and where row 0 of them would lie."""
-    start, end = unpack_span(kept.rows[s])
-    return start, end, kept.firsts[s] - start
-
-
-@helper
-def _keep_row(kept: Kept, mine: Any, s: int, row: int, low: int, weight: Lanes, before: Lanes) -> None:
-    start, end, at = mine
-    if start <= row < end:
-        store_units(kept.weights, (at + row) * TILE, weight)
-
-
-@kernel
-def _fill_kept(first: int, last: int, tiles: Tiles, kept: Kept) -> None:
-    for i in range(first, last):
-        walk(tile_at(i, tiles), tiles, kept, _rows_kept, _keep_row, nothing_to_close)
-
-
-def keep_weights(tiles: Tiles, workers: Workers) -> tuple[Kept, Array]:
-    """Return the weights of a view, and its (H, W, 1) alpha."""
-    number = len(tiles.starts) - 1
-    rows, alpha = np.zeros(len(tiles.ranks), np.uint16), np.empty((tiles.height, tiles.width, 1), np.float32)
-    workers.run(_find_rows, number, tiles, rows, alpha)
-    firsts = np.concatenate([[0], np.cumsum((rows >> 8).astype(np.int64) - (rows & 255))])
-    kept = Kept(rows, firsts, np.empty((int(firsts[-1]), TILE), np.uint16))
-    workers.run(_fill_kept, number, tiles, kept)
-    return kept, alpha

@@ -19,8 +19,8 @@ from numba.extending import intrinsic, lower_builtin, models, register_model
 
 LANES = 16
 Lanes = Any  # how a value of sixteen lanes is annotated in kernels
-FLOAT, INT, SHORT = ir.FloatType(), ir.IntType(32), ir.IntType(16)
-FLOATS, INTS, SHORTS = (ir.VectorType(kind, LANES) for kind in (FLOAT, INT, SHORT))
+FLOAT, INT = ir.FloatType(), ir.IntType(32)
+FLOATS, INTS = (ir.VectorType(kind, LANES) for kind in (FLOAT, INT))
 _FUSE = ("contract",)  # a * b + c may round once; nothing is reordered
 
 # 2^x on [-0.5, 0.5], minimax in relative error (7.5e-8, found by iteratively reweighted least squares).
@@ -246,31 +246,3 @@ def prefetch(typing: Any, array: Any, index: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(array, types.intp), lower
-
-
-UNIT = 65535  # what stands for 1 in sixteen bits
-
-
-@intrinsic
-def load_units(typing: Any, array: Any, index: Any) -> Any:
-    """array.flat[index : index + 16] / UNIT of uint16, as lanes."""
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        value = builder.load(_pointer(context, builder, sig, arguments, SHORTS))
-        value.align = 2
-        return builder.fmul(builder.sitofp(builder.zext(value, INTS), FLOATS), _constant(1 / UNIT))
-
-    return lanes16(array, types.intp), lower
-
-
-@intrinsic
-def store_units(typing: Any, array: Any, index: Any, value: Any) -> Any:
-    """array.flat[index : index + 16] = lanes in [0, 1] times UNIT, rounded, as uint16."""
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        scaled = builder.fadd(builder.fmul(arguments[2], _constant(UNIT)), _constant(0.5))
-        shorts = builder.trunc(builder.fptosi(scaled, INTS), SHORTS)
-        builder.store(shorts, _pointer(context, builder, sig, arguments, SHORTS)).align = 2
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, value), lower

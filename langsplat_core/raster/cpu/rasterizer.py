@@ -6,7 +6,6 @@ per Gaussian in a fixed order.
 
 import math
 from collections.abc import Callable
-from copy import copy
 from threading import Lock
 from typing import Any
 from weakref import finalize
@@ -19,7 +18,7 @@ from langsplat_core.compiled import Workers, plain, shared_workers
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.raster.cpu import backward, blend, projection
 from langsplat_core.raster.cpu.backward import GaussianGradients
-from langsplat_core.raster.cpu.tiles import Kept, bin_tiles, depth_order, padded
+from langsplat_core.raster.cpu.tiles import bin_tiles, depth_order, padded
 from langsplat_core.raster.protocol import LiftingView, check_size, mean_depth
 from langsplat_core.scene import Camera, Gaussians
 
@@ -77,7 +76,6 @@ class CpuView(LiftingView):
         self.camera, self.workers, self._empty = camera, workers, memory.empty
         self._kernel_camera = projection.kernel_camera(camera, settings)
         self._rows = projection.rows_of(gaussians)
-        self._kept: tuple[Kept, Array] | None = None  # weights and alpha, of a frozen view
         found = projection.Projection(
             self._empty((n, projection.COLUMNS), np.float64), np.empty(n), np.empty(n, np.uint8)
         )
@@ -110,26 +108,23 @@ class CpuView(LiftingView):
     def splat_rows(self, values: Array) -> tuple[Array, Array]:
         check_array("values", values, (len(self.order), "C"))
         size = self.camera.height, self.camera.width
-        kept, alpha = self._kept or (None, np.empty((*size, 1), np.float32))
-        alpha = alpha if kept is None else alpha.copy()  # the caller's own, to be changed
-        parts = []
+        alpha, parts = np.empty((*size, 1), np.float32), []
         for start in range(0, max(values.shape[1], 1), _CHANNELS_AT_ONCE):
             part = plain(values[:, start : start + _CHANNELS_AT_ONCE])
             parts.append(np.empty((*size, part.shape[1]), np.float32))
-            self._over_tiles(blend.splat, kept, part, parts[-1], alpha)
+            self._over_tiles(blend.splat, part, parts[-1], alpha)
         return parts[0] if len(parts) == 1 else np.concatenate(parts, -1), alpha[..., 0]
 
     def gather(self, image: Array) -> Array:
         """Return W^T image, (N, C) float32, summed in float64 over tiles."""
         check_array("image", image, (self.camera.height, self.camera.width, "C"))
-        kept, _ = self._kept or (None, None)
         channels = image.shape[2]
         values = np.zeros((self.count, channels), np.float32)
         for start in range(0, channels, _CHANNELS_AT_ONCE):
             part = plain(image[..., start : start + _CHANNELS_AT_ONCE])
             partial = np.empty((len(self.tiles.ranks), padded(part.shape[2])), np.float32)
             out = np.zeros((self.count, part.shape[2]), np.float32)
-            self._over_tiles(blend.gather, kept, part, partial)
+            self._over_tiles(blend.gather, part, partial)
             self.workers.run(blend.sum_partials, len(self.order), self.tiles, self.order, partial, out)
             values[:, start : start + _CHANNELS_AT_ONCE] = out
         return values
@@ -138,20 +133,6 @@ class CpuView(LiftingView):
         self.check_labels(maps, count)
         labels = np.require(maps, np.int32, ["C", "W"])
         return blend.gather_labels(self.tiles, self.order, self.workers, labels, (self.count, count), least)
-
-    def frozen(self) -> "CpuView":
-        """Return this view with W kept, to 1 / 131070 in every entry; `gather` is still the exact adjoint.
-
-        `splat` and `gather` get cheaper the more often they are called.
-        """
-        frozen = copy(self)
-        frozen._kept = blend.keep_weights(self.tiles, self.workers)  # noqa: SLF001
-        return frozen
-
-    @property
-    def nbytes(self) -> int:
-        kept, alpha = self._kept or ((), np.empty(0))
-        return sum(array.nbytes for array in (*kept, alpha))
 
     def backward(
         self, values: Array, image_grad: Array, alpha_grad: Array | None = None
@@ -202,7 +183,7 @@ class CpuView(LiftingView):
         # Ones are blended along: alpha itself is 1 - T, which has no digits left where it is small.
         both = plain(np.stack([self._depths, np.ones_like(self._depths)], -1))
         image = np.empty((self.camera.height, self.camera.width, 2), np.float32)
-        self._over_tiles(blend.splat, None, both, image, np.empty_like(image[..., :1]))
+        self._over_tiles(blend.splat, both, image, np.empty_like(image[..., :1]))
         return mean_depth(image[..., 0], image[..., 1])
 
 

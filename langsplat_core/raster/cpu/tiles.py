@@ -22,7 +22,6 @@ from langsplat_core.raster.cpu.lanes import (
     lanes,
     largest,
     load,
-    load_units,
     prefetch,
     ramp,
     smaller,
@@ -399,14 +398,6 @@ AHEAD = 8  # intersections between asking for a footprint and using it
 CHECK_EVERY = 16  # Gaussians between two looks at whether a tile still has running pixels
 
 
-class Kept(NamedTuple):
-    """The blending weights of a view, sixteen bits of fixed point each."""
-
-    rows: Array  # (I,) uint16 spans of rows that have a weight, packed as those of `Tiles`
-    firsts: Array  # (I + 1,) int64: intersection s has weights[firsts[s] : firsts[s + 1]]
-    weights: Array  # (R, 16) uint16, a row of a tile each
-
-
 @helper
 def tile_at(i: int, tiles: Tiles) -> int:
     """Return the i-th tile that is blended."""
@@ -513,28 +504,6 @@ def walk(
             row_(work, mine, s, row, low, added * before, before)
         close_(work, mine, s, low, high)
     return transmittance, last
-
-
-@helper
-def walk_kept(
-    tile: int,
-    tiles: Tiles,
-    kept: Kept,
-    work: Any,
-    open_: Callable[..., Any],
-    row_: Callable[..., None],
-    close_: Callable[..., None],
-) -> None:
-    """Do what `walk` does, with weights that are kept; there is no transmittance."""
-    last = tiles.starts[tile + 1]
-    for s in range(tiles.starts[tile], last):
-        low, high = unpack_span(kept.rows[s])
-        mine = open_(work, s, min(s + AHEAD, last - 1))
-        at = kept.firsts[s] * TILE
-        for row in range(low, high):
-            row_(work, mine, s, row, low, load_units(kept.weights, at), None)
-            at += TILE
-        close_(work, mine, s, low, high)
 
 
 @helper

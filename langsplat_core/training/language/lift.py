@@ -142,8 +142,6 @@ def lift_latents(
 # the first gradients about 1e9 times too large, which Adam's second moment must forget before anything
 # moves; from the one-pass mean the same loss is reached much sooner.
 
-KEPT_BYTES = 4e9  # weights of views that are kept; further views are projected again at every step
-
 
 def lift_by_gradient(
     rasterizer: LiftingRasterizer,
@@ -170,7 +168,9 @@ def lift_by_gradient(
         (camera, np.asarray(seen.labels, np.int32), plain(codec.encode(seen.vectors)))
         for camera, seen in views
     ]
-    kept: dict[int, LiftingView] = {}
+    # The geometry is frozen: views are kept as far as memory allows, 100 bytes a Gaussian in each.
+    most = int(4e9 / (100 * max(len(gaussians), 1)))
+    kept = [rasterizer.view(gaussians, camera) for camera, _ in views[:most]]
     generator = np.random.default_rng(config.seed)
     order = generator.permutation(len(views))
     for step in range(config.steps):
@@ -178,13 +178,7 @@ def lift_by_gradient(
             order = generator.permutation(len(views))
         index = int(order[step % len(views)])
         camera, labels, latents = targets[index]
-        view = kept.get(index)
-        if view is None:  # the geometry is frozen: weights are kept as far as memory allows
-            view = rasterizer.view(gaussians, camera)
-            if sum(one.nbytes for one in kept.values()) <= KEPT_BYTES:
-                frozen = view.frozen()
-                if frozen is not view:
-                    view = kept[index] = frozen
+        view = kept[index] if index < len(kept) else rasterizer.view(gaussians, camera)
         loss, gradient = _loss_and_gradient(view, labels, latents, blended(x) if published else x)
         features.grad = torch.from_numpy(plain(by_features(x, gradient) if published else gradient))
         adam.step()

@@ -330,7 +330,7 @@ def draw_patches(view: LiftingView, gaussians: Gaussians, patches: Array) -> Arr
         return np.full((view.camera.height, view.camera.width), -1, np.int32)
     shown = np.bincount(patches[inside], view.contributions()[inside]) >= 1  # pixel
     channel_of, owners = _share_channels(_boxes(view.camera, gaussians, patches, len(shown)), shown)
-    channels, view = np.where(inside, channel_of[patches], -1), view.frozen()
+    channels = np.where(inside, channel_of[patches], -1)
     most = np.zeros((view.camera.height, view.camera.width), np.float32)
     drawn = np.full(most.shape, -1, np.int32)
     rows, columns = np.indices(most.shape) // CELL

@@ -434,7 +434,7 @@ def test_descent_from_the_mean_lowers_the_loss():
 
 
 @pytest.mark.long
-def test_frozen_weights_lead_to_the_same_latents():
+def test_backends_descend_to_the_same_latents():
     pairs = views()
     fast = lift_by_gradient(load_lifting_rasterizer("cpu"), GAUSSIANS, pairs, CODEC, SHORT)[0]
     slow = lift_by_gradient(load_lifting_rasterizer("reference"), GAUSSIANS, pairs, CODEC, SHORT)[0]
