@@ -1,4 +1,4 @@
-"""Image-text encoders: what callers ask of them, the families CLIP and SigLIP, and their loading.
+"""Image-text encoders: what callers ask of them, the family CLIP, and their loading.
 
 CLIP is that of Radford et al. 2021, with OpenCLIP and the bundled demo encoder. A family brings two towers,
 each a few lines; checks of phrases and images, batches and unit vectors are the same for all.
@@ -6,9 +6,7 @@ each a few lines; checks of phrases and images, batches and unit vectors are the
 
 import html
 import json
-import math
 import re
-import string
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -34,7 +32,6 @@ from langsplat_core.semantics.weights import (
     load_config,
     load_model,
     open_weights,
-    read_scalar,
     weights_path,
 )
 
@@ -47,7 +44,7 @@ class TextTower(Protocol):
     """The half of a model that reads phrases."""
 
     dim: int  # length D of the vectors
-    temperature: float  # factor of a difference of cosines before the sigmoid, see `SHARE_OF_SCALE`
+    temperature: float  # factor of a difference of cosines before the sigmoid, 10 for CLIP
 
     def encode(self, texts: list[str]) -> Array:
         """(B, D) float32 vectors, of any length, of B > 0 phrases.
@@ -256,19 +253,19 @@ class TorchText:
         self._device, self._output = weights.device, output
         self._length = int(config.max_position_embeddings)
         self._model: Any = load_model(kind, weights, config)
-        self._clean = text_cleaner()
-        self._tokenizer = _tokenizer(weights, int(config.vocab_size))
-        self._end = _special_token(weights, self._tokenizer, "eos_token", ("<|endoftext|>", "</s>", "<eos>"))
-        self._begin = [_special_token(weights, self._tokenizer, "bos_token", (begin,))] if begin else []
+        self.clean = text_cleaner()
+        self.tokenizer = _tokenizer(weights, int(config.vocab_size))
+        self._end = _special_token(weights, self.tokenizer, "eos_token", ("<|endoftext|>", "</s>", "<eos>"))
+        self._begin = [_special_token(weights, self.tokenizer, "bos_token", (begin,))] if begin else []
         self._pad = (
-            _special_token(weights, self._tokenizer, "pad_token", ("<pad>", "</s>")) if not begin else 0
+            _special_token(weights, self.tokenizer, "pad_token", ("<pad>", "</s>")) if not begin else 0
         )
 
     def encode(self, texts: list[str]) -> Array:
         import torch
 
-        plain = [self._clean(text) for text in texts]
-        found = self._tokenizer.encode_batch(plain, add_special_tokens=False)
+        plain = [self.clean(text) for text in texts]
+        found = self.tokenizer.encode_batch(plain, add_special_tokens=False)
         rows = [[*self._begin, *row.ids, self._end] for row in found]
         room = self._length - len(self._begin) - 1
         for text, row in zip(plain, found, strict=True):
@@ -354,59 +351,7 @@ def _clip_config(weights: Weights, tower: str) -> Any:
     return tower_config
 
 
-# SigLIP (Zhai et al. 2023) and SigLIP 2 (Tschannen et al. 2025): pairs judged one by one by a sigmoid.
-#
-# SigLIP 2's fixed-resolution checkpoints are SigLIP models with another vocabulary, and say so in their
-# `model_type`. A text's vector is that of its last token, padding or not, and no token is masked: a phrase
-# is always padded to the length of training.
-#
-# Their logits are scale * cosine + bias, with a learned scale of 110 to 120 and a bias of -12 to -17. The
-# bias makes a pair improbable unless it is right, since of n^2 pairs in a batch only n are; in relevancy,
-# which is made of differences of cosines, it cancels.
-
-# Share of a model's logit scale that is the temperature of relevancy. LERF and LangSplat take 10 for CLIP,
-# whose training caps the scale at 100: a tenth. The larger the scale, the smaller the gaps between cosines of
-# right and wrong pairs that training had to make, so a tenth of it gives the margins of two families like
-# relevancies. It is a rule of proportion, not a calibration: verdicts need thresholds of their own.
-SHARE_OF_SCALE = 0.1
-
-
-class SiglipText(TorchText):
-    """The text tower of a SigLIP, by torch."""
-
-    def __init__(self, weights: Weights) -> None:
-        from transformers import SiglipTextModel as Model
-
-        super().__init__(Model, weights, _siglip_config(weights).text_config, "pooler_output", None)
-        scale = read_scalar(weights, "logit_scale")
-        if not math.isfinite(scale):
-            raise EncoderError(f"{weights.id}: not SigLIP weights: logit_scale is not in them")
-        self.temperature = SHARE_OF_SCALE * math.exp(scale)
-        # SentencePiece's unigram kind is the first generation's, whose captions had no punctuation.
-        gone = string.punctuation if type(self._tokenizer.model).__name__ == "Unigram" else ""
-        self._without = str.maketrans("", "", gone)
-
-    def encode(self, texts: list[str]) -> Array:
-        """Encode texts like the captions of its training: clean, in lower case."""
-        lower = (self._clean(text).lower().translate(self._without) for text in texts)
-        return super().encode([" ".join(text.split()) for text in lower])
-
-
-def siglip_images(weights: Weights) -> ImageTower:
-    """Return the image tower of a SigLIP, by torch."""
-    from transformers import SiglipVisionModel as Model
-
-    usual = np.full((2, 3), 0.5)
-    return Images(Model, weights, _siglip_config(weights).vision_config, "pooler_output", usual)
-
-
-def _siglip_config(weights: Weights) -> Any:
-    from transformers import SiglipConfig
-
-    return load_config(SiglipConfig, weights, "SigLIP")
-
-
-# Loading by hub id, folder or file: a new family is two towers above and one row here.
+# Loading by hub id, folder or file: a new family is two towers, and a row here or in an extension.
 
 DEMO = "demo"
 DEMO_ELSEWHERE = (
@@ -415,7 +360,7 @@ DEMO_ELSEWHERE = (
     f"langsplat train DATASET --out scene.ply --clip.model {OPEN_MODEL}"
 )
 FAMILIES: Mapping[str, Family] = MappingProxyType(  # by `model_type` of config.json
-    {"clip": Family(clip_text, clip_images), "siglip": Family(SiglipText, siglip_images)}
+    {"clip": Family(clip_text, clip_images)}
 )
 
 

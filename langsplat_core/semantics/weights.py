@@ -1,7 +1,6 @@
 """Finding and reading the weights of a model: a folder, a file, or a model of the Hugging Face hub."""
 
 import json
-import math
 import os
 import pickle
 import re
@@ -110,7 +109,7 @@ def local_path(model: str) -> Path:
 
 def _is_hugging_face(folder: Path) -> bool:
     """Return True where a folder holds weights and their configuration as transformers saves them."""
-    return bool(_weight_files(folder)) and (folder / CONFIG).is_file()
+    return bool(weight_files(folder)) and (folder / CONFIG).is_file()
 
 
 def _is_complete(folder: Path) -> bool:
@@ -140,7 +139,7 @@ def _from_hub(model: str, option: str) -> Path:
     )
 
 
-def _weight_files(folder: Path) -> list[Path]:
+def weight_files(folder: Path) -> list[Path]:
     """Return the files with a folder's weights: of both kinds the first, which transformers prefers, too."""
     kinds = (sorted(path for pattern in kind for path in folder.glob(pattern)) for kind in (SAFE, PICKLED))
     return next(filter(None, kinds), [])
@@ -152,24 +151,6 @@ def unpickled(path: Path) -> dict[str, Any]:
 
     mapped = zipfile.is_zipfile(path)  # files of PyTorch before 1.6 are none, and are read whole
     return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
-
-
-def read_scalar(weights: Weights, name: str) -> float:
-    """Return a number that is among the weights, without loading the rest of them; NaN where it is not there.
-
-    Half a model (a text tower) has no place for what belongs to the pair, such as a logit scale.
-    """
-    from safetensors import safe_open
-
-    with loading_errors(weights.id, "readable"):
-        for path in _weight_files(weights.folder):
-            if path.suffix != ".safetensors" and name in (found := unpickled(path)):
-                return float(found[name])
-            if path.suffix == ".safetensors":
-                with safe_open(path, framework="pt") as file:
-                    if name in file.keys():  # noqa: SIM118  not a mapping
-                        return float(file.get_tensor(name))
-    return math.nan
 
 
 # Building a model: transformers fills with random numbers what its configuration has and its weights lack.
@@ -227,7 +208,7 @@ def _check_size(kind: Any, weights: Weights, config: Any) -> None:
 
     with torch.device("meta"):
         asked = sum(parameter.numel() for parameter in kind(config).parameters())
-    held = sum(path.stat().st_size for path in _weight_files(weights.folder))
+    held = sum(path.stat().st_size for path in weight_files(weights.folder))
     if asked > held:
         raise EncoderError(
             f"{weights.id}: {CONFIG} states a model of {asked} numbers, its weights have {held} bytes; take "

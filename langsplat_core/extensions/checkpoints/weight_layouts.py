@@ -1,4 +1,6 @@
-"""Weights in the layouts of open_clip, OpenAI, segment_anything and sam2, renamed to those of transformers.
+"""Weights in the layouts of open_clip, OpenAI, segment_anything and sam2; and the encoders of SigLIP.
+
+Tensors of other layouts are renamed to those of transformers.
 
 What a model is made of follows from the shapes of its tensors; an open_clip_config.json beside them says
 what shapes do not: the heads, and which GELU. Without one, CLIP's heads are 64 wide, those for images at
@@ -8,7 +10,9 @@ Of SAM 2, whose windows and heads no shape tells, the published sizes are known.
 """
 
 import json
+import math
 import re
+import string
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,12 +20,19 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+
+from langsplat_core.arrays import Array
 from langsplat_core.errors import EncoderError
+from langsplat_core.semantics.encoders import Family, Images, ImageTower, TorchText
 from langsplat_core.semantics.weights import (
     OPEN_CLIP_CONFIG,
     Converted,
+    Weights,
+    load_config,
     loading_errors,
     unpickled,
+    weight_files,
 )
 
 Tensors = Mapping[str, Any]  # name -> torch.Tensor
@@ -406,3 +417,76 @@ def _shape(tensors: Tensors, name: str, axes: int) -> tuple[int, ...]:
 def _count(tensors: Tensors, pattern: str) -> int:
     """Count the numbers in names that begin with `pattern`."""
     return len({found[1] for found in map(re.compile(pattern).match, tensors) if found})
+
+
+# SigLIP (Zhai et al. 2023) and SigLIP 2 (Tschannen et al. 2025): pairs judged one by one by a sigmoid.
+#
+# SigLIP 2's fixed-resolution checkpoints are SigLIP models with another vocabulary, and say so in their
+# `model_type`. A text's vector is that of its last token, padding or not, and no token is masked: a phrase
+# is always padded to the length of training.
+#
+# Their logits are scale * cosine + bias, with a learned scale of 110 to 120 and a bias of -12 to -17. The
+# bias makes a pair improbable unless it is right, since of n^2 pairs in a batch only n are; in relevancy,
+# which is made of differences of cosines, it cancels.
+
+# Share of a model's logit scale that is the temperature of relevancy. LERF and LangSplat take 10 for CLIP,
+# whose training caps the scale at 100: a tenth. The larger the scale, the smaller the gaps between cosines of
+# right and wrong pairs that training had to make, so a tenth of it gives the margins of two families like
+# relevancies. It is a rule of proportion, not a calibration: verdicts need thresholds of their own.
+SHARE_OF_SCALE = 0.1
+
+
+class SiglipText(TorchText):
+    """The text tower of a SigLIP, by torch."""
+
+    def __init__(self, weights: Weights) -> None:
+        from transformers import SiglipTextModel as Model
+
+        super().__init__(Model, weights, _siglip_config(weights).text_config, "pooler_output", None)
+        scale = _read_scalar(weights, "logit_scale")
+        if not math.isfinite(scale):
+            raise EncoderError(f"{weights.id}: not SigLIP weights: logit_scale is not in them")
+        self.temperature = SHARE_OF_SCALE * math.exp(scale)
+        # SentencePiece's unigram kind is the first generation's, whose captions had no punctuation.
+        gone = string.punctuation if type(self.tokenizer.model).__name__ == "Unigram" else ""
+        self._without = str.maketrans("", "", gone)
+
+    def encode(self, texts: list[str]) -> Array:
+        """Encode texts like the captions of its training: clean, in lower case."""
+        lower = (self.clean(text).lower().translate(self._without) for text in texts)
+        return super().encode([" ".join(text.split()) for text in lower])
+
+
+def siglip_images(weights: Weights) -> ImageTower:
+    """Return the image tower of a SigLIP, by torch."""
+    from transformers import SiglipVisionModel as Model
+
+    usual = np.full((2, 3), 0.5)
+    return Images(Model, weights, _siglip_config(weights).vision_config, "pooler_output", usual)
+
+
+def _siglip_config(weights: Weights) -> Any:
+    from transformers import SiglipConfig
+
+    return load_config(SiglipConfig, weights, "SigLIP")
+
+
+def _read_scalar(weights: Weights, name: str) -> float:
+    """Return a number that is among the weights, without loading the rest of them; NaN where it is not there.
+
+    Half a model (a text tower) has no place for what belongs to the pair, such as a logit scale.
+    """
+    from safetensors import safe_open
+
+    with loading_errors(weights.id, "readable"):
+        for path in weight_files(weights.folder):
+            if path.suffix != ".safetensors" and name in (found := unpickled(path)):
+                return float(found[name])
+            if path.suffix == ".safetensors":
+                with safe_open(path, framework="pt") as file:
+                    if name in file.keys():  # noqa: SIM118  not a mapping
+                        return float(file.get_tensor(name))
+    return math.nan
+
+
+SIGLIP = Family(SiglipText, siglip_images)

@@ -1,4 +1,4 @@
-"""Weights in the layouts of open_clip, segment_anything and sam2.
+"""Weights in the layouts of open_clip, segment_anything and sam2, and the encoders of SigLIP.
 
 Written from the papers and the names in published checkpoints, apart from the product's own tables.
 """
@@ -14,16 +14,25 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 from torch import Tensor
-from transformers import CLIPConfig, CLIPModel, CLIPTokenizer
+from transformers import CLIPConfig, CLIPModel, CLIPTokenizer, PreTrainedTokenizerFast, Siglip2Tokenizer
 
+from langsplat_core.arrays import unit
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.extensions.checkpoints.weight_layouts import Hiera, converted
 from langsplat_core.semantics.encoders import load_encoder, load_text_encoder
 from langsplat_core.semantics.sam import FAMILIES, Segmenter, load_segmenter
 from langsplat_core.semantics.weights import Weights
-from tests.support.tiny_models import SAM_SIDE, MakesFolder, tiny_sam, tiny_sam2
+from tests.support.tiny_models import (
+    LENGTH,
+    SAM_SIDE,
+    SCALE,
+    MakesFolder,
+    tiny_sam,
+    tiny_sam2,
+    tiny_siglip,
+)
 
 pytestmark = pytest.mark.long
 
@@ -421,3 +430,68 @@ def test_a_file_of_a_segmenter_answers_as_the_folder_does(name: str, tmp_path: P
     torch.testing.assert_close(masks, folder_masks, rtol=1e-5, atol=1e-5)
     assert masks.std() > 0.01
     assert (masks[0] - masks[1]).abs().max() > 0.01
+
+
+# SigLIP and SigLIP 2.
+
+
+def padded_ids(tokenizer: Any, phrases: list[str]) -> torch.Tensor:
+    """As the model's own pages say: padding="max_length", and no attention mask."""
+    found = tokenizer(phrases, padding="max_length", max_length=LENGTH, truncation=True, return_tensors="pt")
+    return found.input_ids
+
+
+def test_texts_agree_with_the_whole_siglip(tmp_path: Path) -> None:
+    model = tiny_siglip(tmp_path)
+    phrases = ["red mug", "red", "a red mug with a very long handle"]
+    written = str(tmp_path / "tokenizer.json")
+    tokenizer = PreTrainedTokenizerFast(tokenizer_file=written, pad_token="</s>", eos_token="</s>")
+    ids = padded_ids(tokenizer, phrases)
+    assert ids.shape == (3, LENGTH)
+    assert ids[0].tolist() == [4, 5] + [1] * (LENGTH - 2)  # end and padding are one token
+    want = unit(model.get_text_features(input_ids=ids).pooler_output.detach().numpy())
+    got = load_text_encoder(str(tmp_path)).encode_texts(phrases)
+    assert got.dtype == np.float32
+    np.testing.assert_allclose(got, want, atol=2e-6)
+    one_by_one = np.concatenate([load_text_encoder(str(tmp_path)).encode_texts([p]) for p in phrases])
+    np.testing.assert_allclose(got, one_by_one, atol=2e-6)  # a phrase does not depend on its neighbours
+
+
+def test_texts_agree_with_the_whole_siglip_2(tmp_path: Path) -> None:
+    model = tiny_siglip(tmp_path, second=True)
+    phrases = ["Red mug", "red", "a red mug, with a very long handle"]
+    ids = padded_ids(Siglip2Tokenizer.from_pretrained(tmp_path), phrases)
+    assert ids[1].tolist()[1:] == [1] + [0] * (LENGTH - 2)  # an end, then padding to the right
+    want = unit(model.get_text_features(input_ids=ids).pooler_output.detach().numpy())
+    got = load_text_encoder(str(tmp_path)).encode_texts(phrases)
+    np.testing.assert_allclose(got, want, atol=2e-6)
+
+
+@pytest.mark.parametrize("second", [False, True])
+def test_siglip_reads_no_case_and_only_its_second_punctuation(second: bool, tmp_path: Path) -> None:
+    tiny_siglip(tmp_path, second=second)
+    encoder = load_text_encoder(str(tmp_path))
+    small, large, dotted = encoder.encode_texts(["red mug", "RED Mug", "red mug!"])
+    np.testing.assert_allclose(small, large, atol=1e-6)
+    assert np.allclose(small, dotted, atol=1e-6) != second
+    for read in (encoder, load_encoder(str(tmp_path), "cpu")):
+        assert read.temperature == pytest.approx(SCALE / 10)  # a tenth of the learned scale
+
+
+def test_images_agree_with_the_whole_siglip(tmp_path: Path) -> None:
+    model = tiny_siglip(tmp_path)
+    pictures = np.random.default_rng(0).integers(0, 256, (5, SIDE, SIDE, 3)).astype(np.uint8)
+    encoder = load_encoder(str(tmp_path), "cpu", batch=2)
+    assert (encoder.dim, encoder.image_size, encoder.id) == (32, SIDE, str(tmp_path))
+    pixels = torch.from_numpy((pictures / 127.5 - 1).transpose(0, 3, 1, 2).astype(np.float32))
+    want = unit(model.get_image_features(pixel_values=pixels).pooler_output.detach().numpy())
+    np.testing.assert_allclose(encoder.encode_images(pictures), want, atol=2e-6)
+
+
+def test_siglip_without_its_scale_is_refused(tmp_path: Path) -> None:
+    tiny_siglip(tmp_path)
+    state = load_file(tmp_path / "model.safetensors")
+    del state["logit_scale"]
+    save_file(state, tmp_path / "model.safetensors", {"format": "pt"})
+    with pytest.raises(EncoderError, match="logit_scale is not in them"):
+        load_text_encoder(str(tmp_path))
