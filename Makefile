@@ -138,7 +138,7 @@ desktop: $(STAMP)  ## show the viewer among this user's programs, and open scene
 	sed 's|^\(Try\)\?Exec=|&$(CURDIR)/$(BIN)/|' packaging/desktop/langsplat-viewer.desktop \
 	  > $(DATA)/applications/langsplat-viewer.desktop
 	install -m 644 packaging/desktop/langsplat-viewer.png $(DATA)/icons/hicolor/256x256/apps/
-	$(BIN)/python packaging/desktop/mime_types.py > $(DATA)/mime/packages/langsplat-viewer.xml
+	$(BIN)/python packaging/desktop/desktop_files.py > $(DATA)/mime/packages/langsplat-viewer.xml
 	-update-mime-database $(DATA)/mime
 	-update-desktop-database $(DATA)/applications
 

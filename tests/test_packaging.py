@@ -49,7 +49,7 @@ def desktop_entry() -> dict[str, str]:
 
 
 def mime_globs() -> dict[str, list[str]]:
-    made = subprocess.run([sys.executable, DESKTOP / "mime_types.py"], capture_output=True, check=True)
+    made = subprocess.run([sys.executable, DESKTOP / "desktop_files.py"], capture_output=True, check=True)
     root = ElementTree.fromstring(made.stdout)
     types = root.findall(f"{NAMESPACE}mime-type")
     return {
