@@ -59,7 +59,7 @@ from langsplat_core.semantics.sam import grid_points, load_segmenter
 from langsplat_core.training.language.mask_weights import find_mask_weights
 from langsplat_core.training.radiance.differentiable import evaluate_views
 from langsplat_core.training.radiance.trainer import train_radiance
-from tests.support.comparing import reference_gradients
+from tests.support.backends import reference_gradients
 
 
 class MissingError(Exception):

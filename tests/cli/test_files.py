@@ -18,8 +18,7 @@ from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Gaussians, Scene, TaughtWord
 from langsplat_core.scene.language import tree_of_wholes
 from tests.support.backends import Measure
-from tests.support.comparing import assert_same_extras
-from tests.support.file_samples import random_field, sog_files, write_folder
+from tests.support.file_samples import assert_same_extras, random_field, sog_files, write_folder
 from tests.support.processes import refusal, run
 from tests.support.scenes import random_camera, random_extras, random_gaussians
 

@@ -25,9 +25,10 @@ from langsplat_core.io.spz import read_spz_scene, write_spz
 from langsplat_core.raster.reference import colours
 from langsplat_core.scene import Gaussians, Scene
 from langsplat_core.scene.transform import moving, rotating, scaling, transform_gaussians
-from tests.support.comparing import assert_refused, assert_same
 from tests.support.file_samples import (
     C0,
+    assert_refused,
+    assert_same,
     sog_files,
     splat_bytes,
     spz_bytes,

@@ -18,11 +18,13 @@ from langsplat_core.io.ply import (
 )
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.scene import Gaussians, Scene
-from tests.support.comparing import assert_refused, assert_same, assert_same_extras
 from tests.support.fakes import blob_scene
 from tests.support.file_samples import (
     C0,
     ascii_ply,
+    assert_refused,
+    assert_same,
+    assert_same_extras,
     columns,
     compressed_ply,
     inria_names,

@@ -29,9 +29,16 @@ from langsplat_core.io.summary import summarise
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import NO_NODE, Calibration, PlattScaling, Scene
 from langsplat_core.scene.language import tree_of_wholes
-from tests.support.comparing import assert_refused, assert_same_extras, assert_same_field
 from tests.support.fakes import blob_scene
-from tests.support.file_samples import compressed_ply, random_field, sog_files, write_folder
+from tests.support.file_samples import (
+    assert_refused,
+    assert_same_extras,
+    assert_same_field,
+    compressed_ply,
+    random_field,
+    sog_files,
+    write_folder,
+)
 from tests.support.scenes import random_camera, random_extras, random_gaussians
 
 N = 60

@@ -33,8 +33,7 @@ from langsplat_core.scene import (
     TaughtWord,
     Tree,
 )
-from tests.support.comparing import assert_refused, assert_same_field
-from tests.support.file_samples import random_field
+from tests.support.file_samples import assert_refused, assert_same_field, random_field
 from tests.support.scenes import random_gaussians
 
 N = 60

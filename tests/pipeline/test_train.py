@@ -31,8 +31,8 @@ from langsplat_core.pipeline.train import train_scene
 from langsplat_core.progress import Progress, Report, WorkCancelledError
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.semantics.masks import LevelMasks, MaskSource
-from tests.support.comparing import assert_same_tree
 from tests.support.fakes import blob_scene
+from tests.support.file_samples import assert_same_tree
 from tests.support.processes import bound_by_permissions, run, stop_at
 from tests.support.tiny_models import tiny_room, tiny_settings
 

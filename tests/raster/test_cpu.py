@@ -16,7 +16,7 @@ from langsplat_core.raster.cpu.tiles import depth_order
 from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera
-from tests.support.comparing import (
+from tests.support.backends import (
     BAND,
     assert_adjoint,
     assert_close_off_cuts,

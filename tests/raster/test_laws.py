@@ -28,8 +28,7 @@ from langsplat_core.raster.reference import ReferenceRasterizer, ReferenceView
 from langsplat_core.raster.reference import colours as true_colours
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Camera, Gaussians, Scene
-from tests.support.backends import Backend, Measure
-from tests.support.comparing import assert_adjoint
+from tests.support.backends import Backend, Measure, assert_adjoint
 from tests.support.hard_cases import CASES, HUGE_IMAGE, ROW, Case, Drawing, Seen, altered, balls, crowd, draw
 from tests.support.scenes import random_camera, random_gaussians, random_values, without_perspective
 

@@ -25,7 +25,7 @@ from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer, colours, project
 from langsplat_core.raster.render import colours_seen, pixel_weights, splat_colours, view_of
 from langsplat_core.scene import Camera, Gaussians, look_at
-from tests.support.comparing import BAND
+from tests.support.backends import BAND
 from tests.support.hard_cases import AXIS, balls
 from tests.support.scenes import (
     covariances,

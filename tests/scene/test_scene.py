@@ -28,8 +28,7 @@ from langsplat_core.scene.transform import (
     transform_scene,
     turning,
 )
-from tests.support.comparing import assert_same
-from tests.support.file_samples import random_field
+from tests.support.file_samples import assert_same, random_field
 from tests.support.hard_cases import balls
 from tests.support.scenes import covariances, random_camera, random_gaussians, without_perspective
 

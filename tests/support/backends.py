@@ -1,5 +1,9 @@
-"""Fixtures that `conftest.py` offers to all: rasterizers that load here and how far each may be from the
-reference, OpenGL contexts, figures that accuracy tests measured."""
+"""Rasterizers that load here, how far each may be from the reference, and comparisons with it; OpenGL
+contexts; figures that accuracy tests measured. The fixtures are offered to all by `conftest.py`.
+
+Image formation has steps: an alpha of just 1/255 counts or does not, a transmittance of just 1e-4 stops a
+pixel or does not. Pixels where rounding may decide are the *band*: a counted allowance of them may differ.
+"""
 
 import ctypes
 from collections.abc import Callable, Iterator
@@ -17,7 +21,8 @@ from langsplat_core.errors import BackendError
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.gsplat import drawn_settings
 from langsplat_core.raster.opengl.scene_textures import create_egl_context
-from langsplat_core.scene import Gaussians
+from langsplat_core.raster.reference import Footprints, ReferenceView, project
+from langsplat_core.scene import Camera, Gaussians
 from tests.support.gsplat_twin import gsplat_on_cpu
 
 # "cuda-twin": the CUDA backend over gsplat's kernels in plain PyTorch, see `gsplat_twin`.
@@ -192,3 +197,110 @@ def print_measured(reporter: pytest.TerminalReporter) -> None:
     reporter.write_line(f"{'':<58} {'count':>6} {'largest':>10} {'sum':>10}")
     for label, values in sorted(rows.items()):
         reporter.write_line(f"{label:<58} {len(values):>6} {max(values):>10.3g} {sum(values):>10.4g}")
+
+
+# Comparisons with the reference.
+
+BAND = 1e-4  # relative distance to a cut-off; float32 kernels are within about 1e-6 of it
+
+
+def assert_close_off_cuts(got: Array, want: Array, band: Array, atol: float = 2e-5) -> None:
+    """`got` equals `want` within `atol` outside the band; in the band at most half the pixels are off.
+
+    The band must be small (under 2 % of the pixels), or the comparison would say little.
+    """
+    assert got.shape == want.shape
+    assert np.isfinite(got).all()
+    error = np.abs(got - want).reshape(*band.shape, -1).max(-1)
+    assert band.mean() < 0.02, f"{band.sum()} of {band.size} pixels lie at a cut-off: change the scene"
+    worst = float(error[~band].max(initial=0))
+    assert worst <= atol, f"off by {worst:.2e} in {(error[~band] > atol).sum()} pixels away from cut-offs"
+    flipped = error[band] > atol
+    assert flipped.sum() <= max(0.5 * band.sum(), 1), f"{flipped.sum()} of {band.sum()} band pixels flipped"
+
+
+def assert_adjoint(
+    splat: Callable[[Array], Array], gather: Callable[[Array], Array], x: Array, y: Array, rtol: float = 1e-5
+) -> None:
+    """<W x, y> = <x, W^T y>, relative to |W x| |y|."""
+    image = splat(x).astype(np.float64)
+    left, right = np.vdot(image, y), np.vdot(x.astype(np.float64), gather(y))
+    scale = np.linalg.norm(image) * np.linalg.norm(y)
+    assert abs(left - right) <= rtol * scale, f"{left} against {right}, scale {scale}"
+
+
+def assert_gradient(
+    name: str, got: Array, want: Array, rtol: float = 1e-3, largest: float | None = None
+) -> None:
+    """Equal within `rtol` of each entry, plus 1e-5 of the largest one for float32 sums."""
+    allowed = rtol * np.abs(want) + 1e-5 * (np.abs(want).max() if largest is None else largest)
+    off = np.abs(got - want) > allowed
+    assert not off.any(), f"{name}: {off.sum()} of {off.size} off, worst {np.abs(got - want).max():.2e}"
+
+
+# Gradients of the float64 reference by central differences: what backward passes are compared with.
+
+
+PARAMETERS = ("means", "log_scales", "quats_wxyz", "opacity_logits")
+STEP = 1e-6  # in every parameter's own unit
+
+
+@dataclass(frozen=True, eq=False)
+class Exact:
+    """Gaussians in float64, as the reference reads them; all rows valid."""
+
+    means: Array
+    log_scales: Array
+    quats_wxyz: Array
+    opacity_logits: Array
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def valid(self) -> Array:
+        return np.ones(len(self), bool)
+
+
+def reference_gradients(
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    values: Array,
+    image_grad: Array,
+    alpha_grad: Array,
+    rows: Array | None = None,
+) -> dict[str, Array]:
+    """Gradients of <image, image_grad> + <alpha, alpha_grad> by the parameters, values and pixel means of the
+    Gaussians at `rows`, by default of all.
+
+    Pixels at a cut-off must carry no loss: there the image jumps.
+    """
+    rows = np.arange(len(gaussians)) if rows is None else rows
+    exact = Exact(*(getattr(gaussians, name).astype(np.float64) for name in PARAMETERS))
+
+    def loss(footprints: Footprints) -> float:
+        image, alpha = ReferenceView(footprints, camera, settings, 0).splat(values)
+        return float((image * image_grad).sum() + (alpha * alpha_grad).sum())
+
+    def moved(array: Array, place: tuple[int, ...], step: float) -> Array:
+        array = array.copy()
+        array[place] += step
+        return array
+
+    footprints, found = project(exact, camera, settings), {}  # type: ignore[arg-type]
+    for name in PARAMETERS:
+        whole = getattr(exact, name)
+        grad = found[name] = np.empty((len(rows), *whole.shape[1:]))
+        for place in np.ndindex(grad.shape):
+            at = (int(rows[place[0]]), *place[1:])
+            ends = [replace(exact, **{name: moved(whole, at, step)}) for step in (STEP, -STEP)]
+            high, low = (loss(project(end, camera, settings)) for end in ends)  # type: ignore[arg-type]
+            grad[place] = (high - low) / (2 * STEP)
+    grad = found["means_px"] = np.empty((len(rows), 2))
+    for place in np.ndindex(grad.shape):
+        at = (int(rows[place[0]]), place[1])
+        ends_px = [moved(footprints.means_px, at, step) for step in (STEP, -STEP)]
+        high, low = (loss(replace(footprints, means_px=end)) for end in ends_px)
+        grad[place] = (high - low) / (2 * STEP)
+    found["values"] = ReferenceView(footprints, camera, settings, 0).gather(image_grad)[rows]  # linear
+    return found

@@ -1,9 +1,20 @@
-"""Every kind of input file that is damaged in tests: good samples, how to damage them, and how they are
-read."""
+"""Every kind of input file that is damaged in tests: good samples, seeded mutations of binary and of text
+formats, how the files are read, and what a reader may do with a damaged one."""
 
+import gzip
 import io
-from collections.abc import Callable
-from dataclasses import replace
+import logging
+import re
+import struct
+import time
+import traceback
+import warnings
+import zipfile
+import zlib
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -16,6 +27,8 @@ from langsplat_core.datasets.colmap import load_colmap
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.datasets.photos import read_photo
 from langsplat_core.display.displays import latent_colours
+from langsplat_core.errors import InputError, printable_line
+from langsplat_core.extensions.benchmarks.raster_speed import peak_memory, restart_peak
 from langsplat_core.io.cameras import read_cameras, write_cameras
 from langsplat_core.io.gltf import write_gltf
 from langsplat_core.io.hostile import picture_size
@@ -37,9 +50,344 @@ from tests.support.file_samples import (
     spz_bytes,
     zipped,
 )
-from tests.support.mutation import FileKind, Mutation, in_gzip, in_ply_header, in_png, in_zip, mutant
 from tests.support.photographs import write_colmap, write_nerfstudio
 from tests.support.scenes import random_camera, random_gaussians
+
+HEADER = 600  # bytes at the beginning in which half of the mutations fall
+INTEGERS = (0, 1, -1, *(2**k + d for k in (7, 8, 15, 16, 24, 31, 32, 53, 63) for d in (-1, 0)))
+FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-45, 1e-38, 1e9, 1e20, 3.4e38, float("inf"), float("-inf"), float("nan"))
+TOKENS = (
+    *b"0 -1 1 256 65536 4294967296 18446744073709551616 0x10 1_0".split(),
+    *b"1e308 1e999 -1e999 1e-320 nan NaN inf -Infinity".split(),
+    *b'null true [] {} "" "a" [[[[ \\ud800 ../../x /dev/zero %s%n #'.split(),
+    *(b"9" * 30, b"1" + b"0" * 400, b"9" * 5000, b"a" * 5000, b"\x00", b"\x1b[2J", b"\xff\xfe", b"\n", b"\r"),
+    *("٣".encode(), "\u2028".encode()),
+)
+_WORD = re.compile(rb"[^\s,:\[\]{}\"]+")
+_NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][+-]?\d+)?")
+
+
+def mutant(sample: bytes, others: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    """`sample` with one to four mutations; `others` are files of the same kind to splice with."""
+    data = sample
+    for _ in range(int(rng.choice([1, 1, 1, 2, 2, 3, 4]))):
+        data = MUTATIONS[int(rng.integers(len(MUTATIONS)))](data, others, rng)
+    return data
+
+
+Mutation = Callable[[bytes, Sequence[bytes], np.random.Generator], bytes]
+
+
+def _place(data: bytes, rng: np.random.Generator) -> int:
+    inside = min(len(data), HEADER) if rng.random() < 0.5 else len(data)
+    return int(rng.integers(0, max(inside, 1)))
+
+
+def _flip_bits(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    out = bytearray(data)
+    for _ in range(int(rng.integers(1, 9)) if data else 0):
+        out[_place(data, rng)] ^= 1 << int(rng.integers(8))
+    return bytes(out)
+
+
+def _truncate(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    return data[: _place(data, rng)]
+
+
+def _cut_out(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    place = _place(data, rng)
+    return data[:place] + data[place + int(2 ** rng.uniform(0, 8)) :]
+
+
+def _insert(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    place, length = _place(data, rng), int(2 ** rng.uniform(0, 8))
+    new = rng.bytes(length) if rng.random() < 0.5 else data[place : place + length]
+    return data[:place] + new + data[place:]
+
+
+def _fill(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    """A run of one byte."""
+    place, length = _place(data, rng), int(2 ** rng.uniform(0, 8))
+    value = bytes([int(rng.choice([0, 255, 127, 128, 32, 9]))])
+    return data[:place] + value * min(length, len(data) - place) + data[place + length :]
+
+
+def _extreme_number(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    """A binary number of any width, either byte order, at any place or an aligned one."""
+    order = "<>"[int(rng.integers(2))]
+    if rng.random() < 0.6:
+        width = int(rng.choice([1, 2, 4, 8]))
+        value = int(rng.choice(np.array(INTEGERS, object))) + int(rng.integers(-1, 2))
+        new = (value % 256**width).to_bytes(width, "little" if order == "<" else "big")
+    else:
+        new = struct.pack(f"{order}{rng.choice(['f', 'd'])}", float(rng.choice(FLOATS)))
+    place = _place(data, rng)
+    place -= place % len(new) if rng.random() < 0.5 else 0
+    return data[:place] + new + data[place + len(new) :]
+
+
+def _other(what: re.Pattern[bytes]) -> Mutation:
+    """Of text, a number or a word becomes another."""
+
+    def replaced(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> bytes:
+        start = _place(data, rng)
+        match = what.search(data, start) or what.search(data)
+        if match is None:
+            return data
+        return data[: match.start()] + TOKENS[int(rng.integers(len(TOKENS)))] + data[match.end() :]
+
+    return replaced
+
+
+_inflate, _other_word = _other(_NUMBER), _other(_WORD)
+
+
+def _swap_lines(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    """Two lines, or blocks of 16 bytes where there are none, in each other's place; or one of them twice."""
+    lines = data[:20_000].splitlines(keepends=True)
+    if len(lines) < 4:
+        lines = [data[i : i + 16] for i in range(0, len(data[:20_000]), 16)]
+    if len(lines) < 2:
+        return data
+    a, b = (int(i) for i in rng.integers(0, len(lines), 2))
+    if rng.random() < 0.5:
+        lines[a], lines[b] = lines[b], lines[a]
+    else:
+        lines[a] = lines[b]
+    return b"".join(lines) + data[20_000:]
+
+
+def _splice(data: bytes, others: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    """The beginning of one file and the end of another."""
+    other = others[int(rng.integers(len(others)))] if others else data
+    place = _place(data, rng)
+    shift = int(rng.choice([0, 0, -1, 1, 4, -8]))
+    return data[:place] + other[max(place + shift, 0) :]
+
+
+MUTATIONS: tuple[Mutation, ...] = (
+    *(_flip_bits, _flip_bits, _truncate, _cut_out, _insert, _fill),
+    *(_extreme_number, _extreme_number, _inflate, _inflate, _other_word, _swap_lines, _splice),
+)
+
+
+# Damage below a wrapping that would notice it: members of archives, gzip streams, chunks of PNG.
+
+CHUNKS = (*(b"IHDR", b"PLTE", b"tRNS", b"iCCP", b"tEXt"), *(b"zTXt", b"iTXt", b"eXIf", b"acTL", b"fcTL"))
+
+
+def _half(inner: Mutation) -> Mutation:
+    return lambda data, others, rng: (inner if rng.random() < 0.6 else mutant)(data, others, rng)
+
+
+@_half
+def in_zip(data: bytes, others: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    """One member is damaged, missing, or packed by another method; the checksums are right."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    name = str(rng.choice(list(members)))
+    same = [member for member in members.values() if len(member) > 100]
+    methods = [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA]
+    method = methods[int(rng.choice([0, 0, 1, 1, 1, 1, 1, 2, 3]))]
+    members[name] = (in_png if members[name][:4] == b"\x89PNG" else mutant)(members[name], same, rng)
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", method) as archive:
+        for other, content in members.items():
+            archive.writestr(other, content)
+    packed = buffer.getvalue()
+    return mutant(packed, others, rng) if rng.random() < 0.2 else packed
+
+
+@_half
+def in_gzip(data: bytes, others: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    if data[:2] != b"\x1f\x8b":
+        return mutant(data, others, rng)
+    plain = [gzip.decompress(other) for other in others if other[:2] == b"\x1f\x8b"]
+    return gzip.compress(mutant(gzip.decompress(data), plain, rng), 1)
+
+
+def _unfolded(content: bytes) -> bytes:
+    try:
+        return zlib.decompress(content)
+    except zlib.error:  # damaged already
+        return content
+
+
+@_half
+def in_png(data: bytes, others: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    """Chunks whose content, order or number is damaged, with right lengths and checksums."""
+    chunks, place = [], 8
+    while place + 8 <= len(data):
+        (length,) = struct.unpack(">I", data[place : place + 4])
+        chunks.append((data[place + 4 : place + 8], data[place + 8 : place + 8 + length]))
+        place += 12 + length
+    for _ in range(int(rng.integers(1, 3))):
+        index = int(rng.integers(len(chunks)))
+        name, content = chunks[index]
+        match int(rng.integers(6)):
+            case 0:
+                chunks.insert(int(rng.integers(len(chunks) + 1)), chunks[index])
+            case 1 if len(chunks) > 1:
+                del chunks[index]
+            case 2:
+                chunks[index] = (CHUNKS[int(rng.integers(len(CHUNKS)))], content)
+            case 3 if name == b"IDAT":
+                chunks[index] = (name, zlib.compress(mutant(_unfolded(content), [], rng)))
+            case _:
+                chunks[index] = (name, mutant(content, [], rng))
+    body = b"".join(
+        struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
+        for name, content in chunks
+    )
+    return data[:8] + body
+
+
+# Lines of the header of a PLY, from which a mutation takes others.
+PLY_LINES = (
+    *b"ply;property;element;element face 3;element a 999999999999;element vertex 3".split(b";"),
+    *b"property list uchar int v;property list char int v;property list uint double w".split(b";"),
+    *b"property list float int v;property double q;property uchar q;property float x".split(b";"),
+    *b"property float f_rest_0;property float f_rest_45;property float packed_color".split(b";"),
+    *b"comment SplatRenderMode: mip;format ascii 1.0;format binary_big_endian 1.0;end_header".split(b";"),
+    *(b"property char \xff\xfe", b"obj_info \x00", b"", b"\x00"),
+)
+PLY_WORDS = (
+    *b"char uchar short ushort int uint float double int8 float64".split(),
+    *b"ascii binary_little_endian binary_big_endian chunk sh vertex".split(),
+    *b"x opacity rot_3 f_dc_0 min_x packed_position f_rest_9 f_rest_-1".split(),
+    *(str(n).encode() for n in (-1, 0, 1, 2, 19, 21, 255, 256, 257, 2**31, 2**32, 2**63, 2**64, 10**12)),
+)
+
+
+@_half
+def in_ply_header(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    """One to three lines removed, doubled, swapped, added, or saying something else."""
+    header, _, body = data.partition(b"end_header\n")
+    lines = header.splitlines()
+    for _ in range(int(rng.integers(1, 4))):
+        place, other = (int(i) for i in rng.integers(1, len(lines), size=2))
+        match int(rng.integers(0, 6)):
+            case 0 if len(lines) > 3:
+                del lines[place]
+            case 1:
+                lines.insert(other, lines[place])
+            case 2:
+                lines[place], lines[other] = lines[other], lines[place]
+            case 3:
+                lines.insert(place, PLY_LINES[int(rng.integers(len(PLY_LINES)))])
+            case _:
+                words = lines[place].split(b" ")
+                words[int(rng.integers(len(words)))] = PLY_WORDS[int(rng.integers(len(PLY_WORDS)))]
+                lines[place] = b" ".join(words)
+    newline = b"\r\n" if rng.random() < 0.1 else b"\n"
+    return newline.join([*lines, b"end_header"]) + newline + body
+
+
+# What a reader may do with a damaged file: load it, or refuse it in one short printable line. Everything
+# else is a fault, and so are memory, time and Python warnings.
+
+MEMORY_FACTOR, MEMORY_SLACK = 4, 300_000_000  # bytes: beyond the file's size times the factor
+LINE = 300  # characters of a message, with the short path of a test
+SECONDS = 20.0  # of the processor: what the worst mutants need is hundredths
+
+
+@dataclass
+class Outcome:
+    """What became of many mutants of one kind."""
+
+    tried: int = 0
+    loaded: int = 0
+    warned: int = 0  # of those, with a warning of ours
+    faults: Counter[str] = field(default_factory=Counter)  # description -> mutants
+
+    @property
+    def refused(self) -> int:
+        return self.tried - self.loaded - self.faults.total()
+
+
+@dataclass(frozen=True)
+class FileKind:
+    """A format whose damaged files are tried."""
+
+    file: str  # where the mutants are written, below the folder of the test
+    samples: Callable[[Path], list[bytes]]  # also writes what has to lie beside them into the folder
+    read: Callable[[Path], float]  # the share of sound content, in [0, 1]; below a half a warning is due
+    damage: Mutation = mutant
+
+
+def fuzz(kind: FileKind, folder: Path, count: int, seed: int) -> Outcome:
+    """What became of `count` mutants, after the good samples were read without a word."""
+    samples, rng = kind.samples(folder), np.random.default_rng(seed)
+    good = tried(kind, folder, samples)
+    assert (good.loaded, good.warned) == (len(samples), 0), good
+    mutants = (kind.damage(samples[number % len(samples)], samples, rng) for number in range(count))
+    outcome = tried(kind, folder, mutants)
+    assert outcome.refused + outcome.loaded == outcome.tried
+    assert outcome.refused + outcome.warned > outcome.tried / 50  # the mutations do hurt
+    return outcome
+
+
+def tried(kind: FileKind, folder: Path, contents: Iterable[bytes]) -> Outcome:
+    """What became of each, as the contents of a file of the kind; no fault among them."""
+    outcome, path = Outcome(), folder / kind.file
+    with _listening() as said:
+        for content in contents:
+            said.clear()
+            outcome.tried += 1
+            path.write_bytes(content)
+            before, began = restart_peak() or 0, time.process_time()
+            what = _verdict(kind, path, said, outcome)
+            took, seconds = (peak_memory() or 0) - before, time.process_time() - began
+            if what is None and took > MEMORY_FACTOR * len(content) + MEMORY_SLACK:
+                what = f"memory: {took / 1e6:.0f} MB for {len(content)} bytes"
+            if what is None and seconds > SECONDS:
+                what = f"time: {seconds:.0f} s for {len(content)} bytes"
+            if what is not None:
+                outcome.faults[what] += 1
+    assert not outcome.faults, outcome
+    return outcome
+
+
+def _verdict(kind: FileKind, path: Path, said: list[str], outcome: Outcome) -> str | None:
+    """The fault, if any; counts what loaded."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            sound = kind.read(path)
+    except InputError as error:
+        return _bad_line(str(error))
+    except Exception as error:  # noqa: BLE001  which is what is looked for
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        return f"{type(error).__name__} ({str(error)[:80]}) at {Path(last.filename).name}:{last.lineno}"
+    bad = next((line for line in map(_bad_line, said) if line), None)
+    if bad is None and sound < 0.5 and not said:
+        bad = "mostly unsound, unsaid"
+    outcome.loaded += bad is None
+    outcome.warned += bad is None and bool(said)
+    return bad
+
+
+def _bad_line(text: str) -> str | None:
+    if not text or len(text) >= LINE or not text.isprintable():
+        return f"message: {len(text)} characters, {text[:60]!r} ... {text[-60:]!r}"
+    return None
+
+
+@contextmanager
+def _listening() -> Iterator[list[str]]:
+    """What the logger "langsplat" says, as the command line shows it."""
+    said: list[str] = []
+    handler = logging.Handler()
+    handler.emit = lambda record: said.append(printable_line(record.getMessage()))  # type: ignore[method-assign]
+    logger = logging.getLogger("langsplat")
+    logger.addHandler(handler)
+    try:
+        yield said
+    finally:
+        logger.removeHandler(handler)
+
+
+# Good samples of every kind, and how they are read.
 
 SCENE = random_gaussians(20, sh_degree=1)
 PLAIN = random_gaussians(300, seed=1)
@@ -65,9 +413,6 @@ def scene_share(path: Path) -> float:
 
 def drawable_share(gaussians: Gaussians) -> float:
     return float(gaussians.valid().mean()) if len(gaussians) else 1.0
-
-
-# -- samples -------------------------------------------------------------------------------------------------
 
 
 def sidecars(folder: Path) -> list[bytes]:

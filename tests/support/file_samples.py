@@ -1,4 +1,5 @@
-"""Encoders of the formats that the project only reads, and small files of every kind, for tests.
+"""Encoders of the formats that the project only reads, small files of every kind, and comparisons of what was
+read with what was written.
 
 They are written from the published layouts, apart from the readers, so that both would have to be wrong
 in the same way for a test to miss it.
@@ -10,17 +11,21 @@ import json
 import math
 import struct
 import zipfile
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 import zstandard
 from PIL import Image
 from torch import nn
 
 from langsplat_core.arrays import Array, sigmoid, unit
+from langsplat_core.errors import FormatError
 from langsplat_core.scene import (
     CANONICAL_PHRASES,
     AutoencoderCodec,
@@ -29,6 +34,7 @@ from langsplat_core.scene import (
     Gaussians,
     LanguageField,
     LinearCodec,
+    Tree,
 )
 from langsplat_core.scene.transform import sh_basis
 
@@ -446,3 +452,62 @@ def autoencoder(
     for _ in range(20):
         network.encoder(torch.randn(64, dim))
     return network.eval()
+
+
+# Comparisons, bit for bit; and refusals.
+
+TREE = ("leaves", "parents", "levels", "votes")
+FIELDS = ("means", "log_scales", "quats_wxyz", "opacity_logits", "sh")
+
+
+def assert_same(got: Gaussians, want: Gaussians) -> None:
+    """Bit for bit, NaN included."""
+    for field in FIELDS:
+        a, b = getattr(got, field), getattr(want, field)
+        assert a.dtype == np.float32
+        np.testing.assert_array_equal(a.view(np.uint32), b.view(np.uint32), field)
+
+
+def assert_same_extras(got: Mapping[str, Array], want: Mapping[str, Array]) -> None:
+    """Named arrays, in this order."""
+    assert list(got) == list(want)
+    for name, values in want.items():
+        assert got[name].dtype == values.dtype
+        np.testing.assert_array_equal(got[name], values, name)
+
+
+def assert_same_tree(got: Tree, want: Tree) -> None:
+    """Node by node."""
+    assert_same_extras(_arrays(got, TREE), _arrays(want, TREE))
+
+
+def assert_same_field(got: LanguageField, want: LanguageField) -> None:
+    """Bit for bit: a saved scene must answer exactly like the one in memory."""
+    for name in ("encoder_id", "temperature", "found", "calibration", "codec.kind"):
+        assert attrgetter(name)(got) == attrgetter(name)(want)
+    for part in (_parts, lambda field: field.codec.tensors(), lambda field: field.phrasebook):
+        assert_same_extras(part(got), part(want))
+
+
+def _parts(field: LanguageField) -> dict[str, Array]:
+    found = _arrays(field, ("latents", "confidence", "canonical"))
+    found |= {} if field.tree is None else _arrays(field.tree, TREE)
+    found |= {} if field.everyday is None else {"everyday": field.everyday}
+    for word in field.taught:
+        found |= _arrays(word, ("vectors", "rivals"), f"{word.name} {word.level} ")
+    return found
+
+
+def _arrays(owner: object, names: Sequence[str], prefix: str = "") -> dict[str, Array]:
+    return {prefix + name: getattr(owner, name) for name in names}
+
+
+def assert_refused(read: Callable[[Path], object], path: Path) -> None:
+    """A FormatError of one short printable line that begins with the path and ends with a remedy."""
+    with pytest.raises(FormatError) as caught:
+        read(path)
+    said = str(caught.value)
+    assert said.startswith(str(path))
+    assert said.isprintable()
+    assert "; " in said
+    assert len(said) < len(str(path)) + 200  # whatever a library adds

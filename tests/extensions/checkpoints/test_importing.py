@@ -23,8 +23,8 @@ from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.scene import CANONICAL_PHRASES, AutoencoderCodec, Gaussians, LanguageField, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.training.language.codec_fit import everyday_vocabulary
-from tests.support.comparing import assert_same
 from tests.support.file_samples import (
+    assert_same,
     autoencoder,
     geometry,
     random_codec,

@@ -12,9 +12,8 @@ import pytest
 import torch
 
 from langsplat_core.extensions.checkpoints.importing import read_foreign
-from tests.support.file_kinds import drawable_share
+from tests.support.file_kinds import FileKind, drawable_share, fuzz, mutant
 from tests.support.file_samples import autoencoder, geometry, save_model, tensor, training_state
-from tests.support.mutation import FileKind, fuzz, mutant
 from tests.support.processes import Ended, convert_each
 from tests.support.scenes import random_gaussians
 

@@ -40,8 +40,8 @@ from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Gaussians, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.semantics.vocabulary import bundled_vocabulary
-from tests.support.comparing import FIELDS
 from tests.support.fakes import CENTRES, NAMES, PER_BLOB, WORDS, FakeEncoder, axis, named_scene
+from tests.support.file_samples import FIELDS
 from tests.support.processes import refusal, run
 from tests.support.scenes import unturned_gaussians
 
