@@ -1,7 +1,7 @@
 """`python -m assets.making dataset|encoder|build`: make photographs, the demo encoder, the demo scene.
 
-It runs from a checkout; no part of it is installed. The work is imported when it is done: torch and open3d take
-seconds that --help need not pay.
+It runs from a checkout; no part of it is installed. The work is imported when it is done: torch and open3d
+take seconds that --help need not pay.
 """
 
 import sys
