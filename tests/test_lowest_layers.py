@@ -18,12 +18,7 @@ from langsplat_core.cli.app import command_names, parse
 from langsplat_core.compiled import Workers, is_compiled
 from langsplat_core.errors import EncoderError, InputError, printable_line, quoted
 from langsplat_core.io.scenes import load_scene, save_scene
-from langsplat_core.progress import (
-    LineProgress,
-    Progress,
-    Report,
-    TerminalProgress,
-)
+from langsplat_core.progress import LineProgress, Progress, Report, TerminalProgress
 from langsplat_core.scene import Scene
 from tests.support.processes import bound_by_permissions, files_of_at_most
 from tests.support.scenes import random_gaussians

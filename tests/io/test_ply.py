@@ -10,12 +10,7 @@ import pytest
 
 from langsplat_core.arrays import rotation_matrices, sigmoid
 from langsplat_core.errors import InputError
-from langsplat_core.io.ply import (
-    read_ply,
-    read_ply_scene,
-    write_metres,
-    write_ply,
-)
+from langsplat_core.io.ply import read_ply, read_ply_scene, write_metres, write_ply
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.scene import Gaussians, Scene
 from tests.support.fakes import blob_scene

@@ -15,12 +15,7 @@ from assets.making.dataset import MIN_PIXELS, outlines, read_truth, write_labell
 from langsplat_core.cli.app import parse
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.extensions.benchmarks import profiles
-from langsplat_core.extensions.benchmarks.labels import (
-    Outlines,
-    read_3d_ovs,
-    read_lerf_ovs,
-    without_suffix,
-)
+from langsplat_core.extensions.benchmarks.labels import Outlines, read_3d_ovs, read_lerf_ovs, without_suffix
 from langsplat_core.extensions.benchmarks.profiles import (
     LERF_PROFILES,
     OVS_PROFILES,

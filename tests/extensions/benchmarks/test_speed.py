@@ -11,15 +11,8 @@ from PIL import Image
 
 from langsplat_core.cli.app import parse
 from langsplat_core.errors import InputError
-from langsplat_core.extensions.benchmarks.query_speed import (
-    BenchQuery,
-    measure_queries,
-    query_table,
-)
-from langsplat_core.extensions.benchmarks.raster_speed import (
-    reference_windows,
-    run_plan,
-)
+from langsplat_core.extensions.benchmarks.query_speed import BenchQuery, measure_queries, query_table
+from langsplat_core.extensions.benchmarks.raster_speed import reference_windows, run_plan
 from langsplat_core.extensions.benchmarks.report import write_report
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import CodebookCodec, LanguageField, Scene
