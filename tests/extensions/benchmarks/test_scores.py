@@ -1,8 +1,10 @@
-"""Both benchmarks: labels by hand and of drawn rooms, the rules against plain loops, scores."""
+"""Scores on both benchmarks, of labels by hand and of drawn rooms, and their rules against plain loops; what
+is measured of rasterizers and of queries."""
 
 import json
 import logging
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,6 +25,8 @@ from langsplat_core.extensions.benchmarks.profiles import (
     read_maps,
     voted,
 )
+from langsplat_core.extensions.benchmarks.query_speed import BenchQuery, measure_queries
+from langsplat_core.extensions.benchmarks.raster_speed import reference_windows, run_plan
 from langsplat_core.extensions.benchmarks.report import (
     Evaluated,
     inside_any_box,
@@ -34,11 +38,12 @@ from langsplat_core.extensions.benchmarks.report import (
 )
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.progress import silent
+from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.raster.render import render
-from langsplat_core.scene import Scene
 from tests.support.fakes import PER_BLOB, WORDS, FakeEncoder, blob_scene, cameras
 from tests.support.photographs import SIZE, block, lerf_frame, mask_map, ovs_view, rectangle, silhouette
 from tests.support.processes import refusal, run
+from tests.support.scenes import random_camera, random_gaussians, random_values
 
 
 @pytest.fixture
@@ -67,13 +72,6 @@ def test_polygons_of_one_category_are_joined(lerf):
     assert mug.boxes.tolist() == [[1, 2, 5, 6], [20, 10, 29, 19]]
     np.testing.assert_array_equal(mug.truth.draw((80, 60)), np.kron(mask, np.ones((2, 2), bool)))
     assert without_suffix("frame.00041") == without_suffix("frame.00041.JPG") == "frame.00041"
-
-
-def test_every_folder_of_the_benchmark_will_do(lerf):
-    (lerf / "kitchen" / "images").mkdir(parents=True)
-    found = [only_scene(read_lerf_ovs(lerf / part)) for part in ("", "label/kitchen", "kitchen")]
-    assert {scene.dataset.resolve() for scene in found} == {(lerf / "kitchen").resolve()}
-    assert {len(scene.frames) for scene in found} == {2}
 
 
 def test_a_polygon_of_fractions_and_one_that_leaves_the_picture(tmp_path):
@@ -128,23 +126,6 @@ def test_masks_of_another_size_of_zeros_and_ones_unlisted_and_broken(tmp_path):
     np.testing.assert_array_equal(jar.truth.draw(SIZE), block(5, 5, 6, 6))
     with pytest.raises(FormatError, match=r"pot\.png"):
         pot.truth.draw(SIZE)
-
-
-@pytest.mark.parametrize("content", [b"", b"\n  \n", b"\xff\xfe\x00"])
-def test_classes_must_be_listed(tmp_path, content):
-    ovs_view(tmp_path, "00", {"cup": block(1, 1, 2, 2)})
-    (tmp_path / "segmentations" / "classes.txt").write_bytes(content)
-    with pytest.raises(FormatError, match=r"classes\.txt"):
-        read_3d_ovs(tmp_path)
-
-
-@pytest.mark.parametrize("read", [read_lerf_ovs, read_3d_ovs])
-def test_no_layout_at_all(read, tmp_path):
-    with pytest.raises(InputError, match="no such folder"):
-        read(tmp_path / "absent")
-    (tmp_path / "transforms.json").write_text("{}")
-    with pytest.raises(InputError, match="not in the layout"):
-        read(tmp_path)
 
 
 # Rooms drawn in both layouts, read and scored as the benchmarks are.
@@ -247,12 +228,6 @@ def looped_vote(mask: np.ndarray, clipped: bool) -> np.ndarray:
     return out
 
 
-@pytest.mark.parametrize("vote", ["clipped", "inside"])
-def test_vote(vote):
-    mask = np.random.default_rng(0).uniform(size=(14, 12)) > 0.5
-    np.testing.assert_array_equal(voted(mask, vote, 7), looped_vote(mask, vote == "clipped"))
-
-
 def test_ties_and_flat_maps():
     mask = np.zeros((8, 8), bool)
     mask[:, :4] = True
@@ -336,15 +311,6 @@ def test_macro_and_micro_means_and_all_figures_as_json(two_scenes, tmp_path):
     assert [query["iou"] for query in content["queries"]] == pytest.approx([1, 0.5, 0.3, 0])
 
 
-def test_one_scene_alone(two_scenes):
-    data, maps = two_scenes
-    assert of_maps(data, maps, only=("b",)).scenes == ["b"]
-    alone = of_maps(data / "label" / "a", maps / "a")  # its own folders, without the name
-    assert alone.scenes == ["a"]
-    with pytest.raises(InputError, match=r"--only c: .*a, b"):
-        of_maps(data, maps, only=("c",))
-
-
 def test_a_missing_map_counts_as_wrong_and_is_named(two_scenes):
     data, maps = two_scenes
     (maps / "a" / "one.1" / "mug.png").unlink()
@@ -393,12 +359,8 @@ def test_kinds_of_maps(tmp_path, kind):
 
 def test_maps_that_do_not_fit(two_scenes, tmp_path):
     data, maps = two_scenes
-    with pytest.raises(InputError, match=r"no folder is named after a labelled frame \(one.1, two\)"):
-        of_maps(data / "label" / "a", tmp_path)
-    with pytest.raises(InputError, match="a scene's own answer"):
-        of_maps(data, maps, profile=LERF_PROFILES["ours"])
     broken = {"not finite": np.full((30, 40), np.nan), "at most 3 levels": np.zeros((4, 30, 40))}
-    for message, array in {**broken, "expected": np.zeros(5)}.items():
+    for message, array in broken.items():
         np.save(maps / "b" / "one.1" / "mug.npy", array)
         with pytest.raises(InputError, match=message):
             of_maps(data, maps, CODE, only=("b",))
@@ -491,27 +453,20 @@ def test_a_view_that_is_missing_and_words_that_are_unknown(blobs_on_disk, caplog
 
 def test_scenes_and_labels_that_do_not_fit(blobs_on_disk):
     tmp_path, _ = blobs_on_disk
-    ours, one = OVS_PROFILES["ours"], Evaluated(scene=tmp_path / "blobs.ply")
 
-    def refused(match: str, data, subject=one) -> None:
+    def refused(match: str, data) -> None:
+        one = Evaluated(scene=tmp_path / "blobs.ply")
         with pytest.raises(InputError, match=match):
-            run_benchmark(read_3d_ovs(data), ours, subject, lambda _: FakeEncoder())
+            run_benchmark(read_3d_ovs(data), OVS_PROFILES["ours"], one, lambda _: FakeEncoder())
 
     ovs_view(tmp_path / "other", "00", {"mug": block(0, 0, 9, 9)})
-    refused(
-        r"none of the scene's views \(photo.0.x, photo.1.x\) is a labelled frame \(00\)", tmp_path / "other"
-    )
+    refused("none of the scene's views", tmp_path / "other")
     refused("could be any labelled scene of data, other", tmp_path)
-    refused(r"data\.ply: no such scene", tmp_path, Evaluated(scene=tmp_path))
-    save_scene(tmp_path / "data.ply", Scene(blob_scene().gaussians, blob_scene().language))
-    refused("it has none", tmp_path / "data", Evaluated(scene=tmp_path))
     ovs_view(tmp_path / "data", "photo.0.x", {"mug": block(0, 0, 9, 9, (160, 160))}, (160, 160))
     refused("the view is 160x120, the labels are 160x160", tmp_path / "data")
-    (tmp_path / "blobs.langsplat.safetensors").unlink()
-    refused("no language field", tmp_path / "data")
 
 
-# `langsplat eval lerf-ovs` and `3d-ovs`: arguments, and one line for what is wrong with them.
+# `langsplat eval lerf-ovs`, and what its arguments lack.
 
 
 @pytest.fixture
@@ -529,17 +484,96 @@ def test_maps_of_another_system(data, capsys, protocol):
     (query,) = json.loads(out.read_text())["queries"]
     assert (query["hit"], query["level"], query["grid"]) == (True, "subpart", [40, 30])
     assert f"protocol {protocol}:" in capsys.readouterr().out
+    assert "give a scene and the benchmark's folder" in refusal(capsys, "eval", "lerf-ovs", data / "data")
+
+
+# The rasterizer benchmark, its reference windows and files; the query benchmark. No test looks at a time.
+
+
+class TestReferenceWindows:
+    g, camera = random_gaussians(400, 7), random_camera(8, 150, 110)
+
+    def test_windows_are_the_whole_reference(self):
+        """Pixels off the windows are not looked at; those in them are equal up to the order of sums."""
+        exact, x = reference_windows(self.g, self.camera), random_values(400, 3)
+        whole = ReferenceRasterizer().view(self.g, self.camera)
+        image = whole.splat(x)[0]
+        band = whole.cut_off_band(1e-3)  # as wide as the benchmark's
+        assert band.any()
+        for window, got in zip(exact.windows, exact.splat(x), strict=True):
+            assert np.abs(got - image[window.at]).max() < 1e-12
+            assert np.array_equal(window.band, band[window.at])
+        assert exact.splat_error(image, x).largest < 1e-12
+        masked = exact.masked(np.random.default_rng(0).normal(size=image.shape).astype(np.float32))
+        assert exact.gather_error(whole.gather(masked), masked).off_cuts < 1e-11  # sums of thousands
+
+    def test_an_error_is_seen_and_a_flip_is_told_apart(self):
+        exact, x = reference_windows(self.g, self.camera), random_values(400, 3)
+        image = ReferenceRasterizer().view(self.g, self.camera).splat(x)[0]
+        window = next(w for w in exact.windows if w.band.any() and not w.band.all())
+        bad = image.copy()
+        bad[window.at][window.band] += 0.25
+        error = exact.splat_error(bad, x)
+        assert error.largest == pytest.approx(0.25)
+        assert error.off_cuts < 1e-12
+        assert error.flips >= window.band.sum()
+        bad[window.at][~window.band] += 0.125
+        assert exact.splat_error(bad, x).off_cuts == pytest.approx(0.125)
+
+
+@pytest.mark.long
+def test_a_tiny_run_writes_three_sane_files(tmp_path):
+    sizes = ["--counts", "60", "120", "200", "--sizes", "40", "30", "--pivot", "120", "--channels", "1", "3"]
+    command, unfinished = parse(["bench", "raster", *sizes, "--out", str(tmp_path)]), []
+    run_plan(command, keep=unfinished.append)
+    command.run()
+    assert [part.machine["unfinished"][0] for part in unfinished] == ["1", "2", "3"]
+    assert {row.gaussians for row in unfinished[0].rows} == {60}
+    record = json.loads((tmp_path / "raster.json").read_text())
+    rows = record["measurements"]
+    cpu = {r["operation"] for r in rows if r["backend"] == "cpu"}
+    assert {"project", "frame", "splat", "gather", "backward"} <= cpu
+    assert all(r["milliseconds"] > 0 for r in rows)
+    exact = [r for r in rows if r["backend"] == "cpu" and not r["operation"].startswith("frozen")]
+    # float32 blending of values in [0, 1].
+    assert all(r["error_off_cuts"] < 2e-5 for r in exact if r["error_off_cuts"] is not None)
+    assert all(r["error_off_cuts"] is not None for r in exact if r["operation"] == "backward")
+    frozen = [r for r in rows if r["operation"].startswith("frozen")]
+    assert all(r["error_off_cuts"] < 2e-3 for r in frozen)  # weights in 16 bits
+    text = (tmp_path / "raster.md").read_text()
+    assert "# Rasterizers" in text
+    assert Image.open(tmp_path / "raster.png").size[0] > 1000
+
+
+# The query benchmark.
+
+SMALL = BenchQuery(Path(), size=(40, 30), phrases=2, together=3, repeats=1, codec_steps=40)
+
+
+def test_a_scene_without_a_codebook_is_refused():
+    with pytest.raises(InputError, match="codebook"):
+        measure_queries(blob_scene(), FakeEncoder(), SMALL)
+
+
+@pytest.mark.long
+def test_the_command_writes_what_it_measured(tmp_path, capsys):
+    small = "--size 64 48 --phrases 2 --together 2 --repeats 1 --codec-steps 30"
+    words = ["bench", "query", "assets/demo/scene.ply", *small.split(), "--out", tmp_path]
+    assert run(*words) == 0
+    report = json.loads((tmp_path / "query.json").read_text())["report"]
+    assert report["size"] == [64, 48]
+    assert [cost["way"] for cost in report["costs"]] == ["paper's order", "cells", "codebook"]
+    assert report["costs"][2]["lookup"]["p99"] < 1e-6  # its latents stand for the codewords themselves
+    assert (tmp_path / "query.md").read_text() in capsys.readouterr().out
+    assert run(*words, "--repeats", 0) == 2
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    "words",
     [
-        (("lerf-ovs", "data"), "give a scene and the benchmark's folder"),
-        (("lerf-ovs", "scene.ply", "data", "--maps", "maps"), "alone with --maps"),
-        (("lerf-ovs", "data", "--maps", "maps", "--paper-order"), "leave it out"),
-        (("3d-ovs", "data", "--maps", "maps", "--protocol", "langsplat-code"), "invalid choice"),
+        *("eval lerf-ovs s.ply d --json /proc/x.json", "eval 3d-ovs s.ply d --pictures /proc/x"),
+        *("bench raster --out /proc/x", "bench query s.ply --out /proc/x"),
     ],
 )
-def test_bad_arguments_are_one_line(data, monkeypatch, capsys, words, message):
-    monkeypatch.chdir(data)
-    assert message in refusal(capsys, "eval", *words)
+def test_commands_try_the_place_to_write_first(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "system's own" in refusal(capsys, *words.split())
