@@ -18,7 +18,6 @@ from langsplat_core.io.sidecar import read_words
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.encoders import OPEN_MODEL
-from tests.support.comparing import assert_same_field
 from tests.support.fakes import (
     CENTRES,
     NAMES,
@@ -32,6 +31,7 @@ from tests.support.fakes import (
     language,
     named_scene,
 )
+from tests.support.file_samples import assert_same_field
 from tests.support.processes import refusal, run
 
 SCENE = named_scene()

@@ -534,12 +534,10 @@ def test_a_tiny_run_writes_three_sane_files(tmp_path):
     cpu = {r["operation"] for r in rows if r["backend"] == "cpu"}
     assert {"project", "frame", "splat", "gather", "backward"} <= cpu
     assert all(r["milliseconds"] > 0 for r in rows)
-    exact = [r for r in rows if r["backend"] == "cpu" and not r["operation"].startswith("frozen")]
+    exact = [r for r in rows if r["backend"] == "cpu"]
     # float32 blending of values in [0, 1].
     assert all(r["error_off_cuts"] < 2e-5 for r in exact if r["error_off_cuts"] is not None)
     assert all(r["error_off_cuts"] is not None for r in exact if r["operation"] == "backward")
-    frozen = [r for r in rows if r["operation"].startswith("frozen")]
-    assert all(r["error_off_cuts"] < 2e-3 for r in frozen)  # weights in 16 bits
     text = (tmp_path / "raster.md").read_text()
     assert "# Rasterizers" in text
     assert Image.open(tmp_path / "raster.png").size[0] > 1000
@@ -571,7 +569,7 @@ def test_the_command_writes_what_it_measured(tmp_path, capsys):
 @pytest.mark.parametrize(
     "words",
     [
-        *("eval lerf-ovs s.ply d --json /proc/x.json", "eval 3d-ovs s.ply d --pictures /proc/x"),
+        *("eval lerf-ovs s.ply d --json /proc/x.json", "eval 3d-ovs s.ply d --json /proc/x"),
         *("bench raster --out /proc/x", "bench query s.ply --out /proc/x"),
     ],
 )
