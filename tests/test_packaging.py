@@ -21,7 +21,7 @@ from PIL import Image
 from langsplat_core import load_scene
 from langsplat_core.errors import EXTRAS
 from langsplat_core.io.scenes import formats
-from langsplat_core.raster.opengl.scene_textures import create_egl_context
+from langsplat_core.raster.opengl.rasterizer import create_egl_context
 from langsplat_viewer.state import TrainingForm
 from langsplat_viewer.viewer import command
 

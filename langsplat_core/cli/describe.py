@@ -29,7 +29,7 @@ from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import LEVELS, LanguageField, Scene, TaughtWord
 from langsplat_core.scene.language import phrase_key
 from langsplat_core.semantics.encoders import load_text_encoder
-from langsplat_core.semantics.vocabulary import read_vocabulary
+from langsplat_core.semantics.relevancy import read_vocabulary
 
 WIDTH = 118  # characters of a table that is not written to a terminal
 

@@ -108,7 +108,7 @@ class Doctor:
 
 def _opengl() -> str:
     """Name of the OpenGL that draws without a window, or why there is none and what to do."""
-    from langsplat_core.raster.opengl.scene_textures import create_egl_context
+    from langsplat_core.raster.opengl.rasterizer import create_egl_context
 
     try:
         context = create_egl_context()

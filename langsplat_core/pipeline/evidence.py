@@ -28,7 +28,7 @@ from langsplat_core.raster.render import view_of
 from langsplat_core.scene import LEVELS, NO_NODE, Scene
 from langsplat_core.scene.surface import SMALLEST
 from langsplat_core.semantics.features import FeatureStore, ImageFeatures, StoredFeatures
-from langsplat_core.training.language.mask_weights import SHOWN, VOTE
+from langsplat_core.training.language.lift import SHOWN, VOTE
 from langsplat_core.training.language.merge_tree import SOLID
 
 

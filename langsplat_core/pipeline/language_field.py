@@ -52,7 +52,7 @@ from langsplat_core.semantics.features import (
     fingerprint,
     within,
 )
-from langsplat_core.semantics.vocabulary import everyday_vectors
+from langsplat_core.semantics.relevancy import everyday_vectors
 from langsplat_core.training.language.codec_fit import (
     CodecReport,
     codec_report,
@@ -62,17 +62,15 @@ from langsplat_core.training.language.codec_fit import (
     rounded,
 )
 from langsplat_core.training.language.lift import (
-    lift_by_gradient,
-    lift_latents,
-    lift_sample,
-    lift_weights,
-)
-from langsplat_core.training.language.mask_weights import (
     MaskGroups,
     MaskWeights,
     count_votes,
     find_instances,
     group_masks,
+    lift_by_gradient,
+    lift_latents,
+    lift_sample,
+    lift_weights,
     view_pairs,
 )
 from langsplat_core.training.language.merge_tree import MergeTree, draw_patches, find_tree, nested_maps

@@ -40,7 +40,7 @@ from langsplat_core.scene import LEVELS, Camera, Gaussians, Scene
 from langsplat_core.scene.gaussians import along_curve
 from langsplat_core.semantics.clip_plain import PlainClipText
 from langsplat_core.semantics.encoders import PhraseEncoder
-from langsplat_core.semantics.vocabulary import BUNDLED, bundled_vocabulary
+from langsplat_core.semantics.relevancy import BUNDLED, bundled_vocabulary
 
 # In an order in which each imports only those before it, so that their code can stand in one script.
 MODULES = ("words", "rule", "encoder", "language", "data", "camera", "draw", "page")

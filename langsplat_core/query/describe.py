@@ -26,7 +26,7 @@ from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.raster.render import pixel_weights
 from langsplat_core.scene import LEVELS, Camera, CodebookCodec, Codec, LanguageField
 from langsplat_core.scene.surface import surface_areas
-from langsplat_core.semantics.vocabulary import bundled_vocabulary
+from langsplat_core.semantics.relevancy import bundled_vocabulary
 
 # Logits per spread of phrases' cosines with a feature: a probability is then right about so often, with the
 # bundled encoder and with the geometry of CLIP (rooms 201 to 203, docs/searching.md).

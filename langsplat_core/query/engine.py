@@ -44,8 +44,7 @@ from langsplat_core.scene import (
 from langsplat_core.scene.language import LONGEST_NAME, MOST_SHOWN, phrase_key, split_phrases, tidy
 from langsplat_core.scene.surface import Surface, build_surface, build_tree, surface_weights
 from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE
-from langsplat_core.semantics.relevancy import Scale, relevancy_of
-from langsplat_core.semantics.vocabulary import FEWEST, TextEncoder, everyday_vectors
+from langsplat_core.semantics.relevancy import FEWEST, Scale, TextEncoder, everyday_vectors, relevancy_of
 
 BATCH = 256  # phrases that are encoded at a time
 SAME_ENCODER = 0.99  # least cosine of canonical vectors of one encoder, whatever rounds them

@@ -12,14 +12,22 @@ are not there: at every language feature its cosine is compared with theirs, in 
 where the spread is the standard deviation of the everyday phrases' cosines there, and zero is what the best
 of them have by chance (the mean of the largest `TOP`), mixed with the nearest of the canonical phrases, which
 are LERF's own null, of four. A feature that lies near all phrases ("hub") thereby loses its advantage.
+
+Below: vocabularies, which are plain lists of phrases, and the everyday phrases among them.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
 from langsplat_core.arrays import Array, sigmoid
+from langsplat_core.errors import InputError, quoted
 from langsplat_core.scene import Codec, LanguageField
+from langsplat_core.scene.language import phrase_key
 
 FLOOR = 0.5  # no closer to the phrase than to the closest of "object", "things", "stuff", "texture"
 MIN_HEAT_SPAN = 0.1  # a peak closer than this to the floor is not stretched to full heat
@@ -100,3 +108,84 @@ class Scale:
     def fit(self, relevancy: Array | float) -> Array:
         """Relevancy in [0, 1] -> the fit it stands for, in spreads; as published, the margin of cosines."""
         return fit_of(relevancy, 1.0 if self.everyday is not None else self.temperature)
+
+
+# Vocabularies: plain lists of phrases that a scene can be described with.
+
+BUNDLED = "things", "parts", "colours", "materials"  # of which a page knows the phrases
+LONGEST = 80  # characters of a phrase: CLIP reads 77 tokens, and a whole paragraph is no word
+
+
+def bundled_vocabulary(name: str) -> tuple[str, ...]:
+    """Return the phrases of a bundled list: one of `BUNDLED`, "nouns" or "adjectives"."""
+    return read_vocabulary(Path(str(files("langsplat_assets") / "vocabulary" / f"{name}.txt")))
+
+
+def read_vocabulary(path: Path) -> tuple[str, ...]:
+    """Return the phrases of a UTF-8 text file, one a line, in lower case, each once, in the file's order.
+
+    Empty lines and lines that begin with # do not count. Raises InputError for a file that cannot be read,
+    that has no phrase, or with a line that is none (no letter or digit, too long, no text), which is named.
+    """
+    try:
+        lines = path.read_bytes().removeprefix(b"\xef\xbb\xbf").splitlines()
+    except OSError as error:
+        raise InputError(f"{path}: the vocabulary cannot be read ({error.strerror or error})") from None
+    phrases: dict[str, None] = {}
+    for number, line in enumerate(lines, 1):
+        text = " ".join(line.decode(errors="replace").split())
+        if not text or text.startswith("#"):
+            continue
+        phrase = phrase_key(text)
+        plain = text.isprintable() and "\ufffd" not in text  # which stands for bytes that are not UTF-8
+        if not (plain and any(map(str.isalnum, phrase)) and len(phrase) <= LONGEST):
+            raise InputError(
+                f"{path}, line {number}: {quoted(text, 30)} is no phrase; write plain text in UTF-8, one "
+                f"phrase of at most {LONGEST} letters a line, or begin with # what is none"
+            )
+        phrases[phrase] = None
+    if not phrases:
+        raise InputError(f"{path}: the vocabulary is empty; write one phrase per line, such as 'cup'")
+    return tuple(phrases)
+
+
+# Everyday phrases: what a codec's errors are judged on, beside a scene's own vectors, and what answers are
+# compared with.
+
+
+MIXED = 96  # phrases of two words
+FEWEST = 48  # phrases from which they tell what fits by chance
+
+
+class TextEncoder(Protocol):
+    """The text half of a CLIP model."""
+
+    def encode_texts(self, texts: list[str]) -> Array:
+        """(M, D) float32 unit vectors."""
+
+    def unknown_words(self, text: str) -> tuple[str, ...]:
+        """Words of `text` that the encoder was never taught; empty if it cannot tell."""
+
+    def near_words(self, word: str) -> tuple[str, ...]:
+        """Words it was taught that are written like an unknown one, the nearest first."""
+
+
+def everyday_phrases(unknown_words: Callable[[str], Sequence[str]]) -> list[str]:
+    """Nouns and `MIXED` random pairs of adjective and noun, always the same, without unknown words."""
+    nouns, adjectives = (
+        [word for word in bundled_vocabulary(name) if not unknown_words(word)]
+        for name in ("nouns", "adjectives")
+    )
+    if not nouns or not adjectives:
+        return nouns
+    generator = np.random.default_rng(0)
+    pairs = zip(generator.choice(adjectives, MIXED), generator.choice(nouns, MIXED), strict=True)
+    return [*nouns, *sorted({f"{adjective} {noun}" for adjective, noun in pairs})]
+
+
+def everyday_vectors(encoder: TextEncoder) -> Array | None:
+    """(V, D) float32 unit vectors of the everyday phrases, of float16 precision; None if it knows too few."""
+    phrases = everyday_phrases(encoder.unknown_words)
+    if len(phrases) < FEWEST:
+        return None
+    return encoder.encode_texts(phrases).astype(np.float16).astype(np.float32)

@@ -50,13 +50,13 @@ from langsplat_core.extensions.benchmarks.raster_speed import table as speed_tab
 from langsplat_core.io.files import atomic_path
 from langsplat_core.raster import gsplat, load_lifting_rasterizer, load_rasterizer
 from langsplat_core.raster.gsplat import require_device
-from langsplat_core.raster.opengl.scene_textures import create_egl_context, is_software
+from langsplat_core.raster.opengl.rasterizer import create_egl_context, is_software
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera, Scene
 from langsplat_core.semantics.encoders import load_encoder
 from langsplat_core.semantics.features import ImageFeatures
 from langsplat_core.semantics.sam import grid_points, load_segmenter
-from langsplat_core.training.language.mask_weights import find_mask_weights
+from langsplat_core.training.language.lift import find_mask_weights
 from langsplat_core.training.radiance.differentiable import evaluate_views
 from langsplat_core.training.radiance.trainer import train_radiance
 from tests.support.backends import reference_gradients

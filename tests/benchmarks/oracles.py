@@ -34,7 +34,7 @@ from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.scene import LEVELS, Calibration, Camera, Gaussians, LanguageField
 from langsplat_core.scene.language import phrase_key
 from langsplat_core.semantics.features import ImageFeatures
-from langsplat_core.training.language.mask_weights import MaskGroups, find_mask_weights
+from langsplat_core.training.language.lift import MaskGroups, find_mask_weights
 
 WRONG = 0.15  # share of masks with another region's vector
 

@@ -44,7 +44,7 @@ from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_core.scene.gaussians import merged
 from langsplat_core.scene.transform import C0
 from langsplat_core.semantics.encoders import load_text_encoder
-from langsplat_core.semantics.vocabulary import ADJECTIVES, NOUNS
+from langsplat_core.semantics.relevancy import bundled_vocabulary
 from tests.benchmarks.fresh import in_fresh_interpreter
 from tests.benchmarks.room import publish
 
@@ -265,7 +265,10 @@ def measure_endurance(command: Scale, progress: Progress = silent) -> list[Stret
 
 def _two_words(encoder: TextEncoder, count: int) -> list[str]:
     """Different phrases of an adjective and a noun that the encoder was taught, at most `count`."""
-    adjectives, nouns = ([w for w in words if not encoder.unknown_words(w)] for words in (ADJECTIVES, NOUNS))
+    adjectives, nouns = (
+        [word for word in bundled_vocabulary(name) if not encoder.unknown_words(word)]
+        for name in ("adjectives", "nouns")
+    )
     return [f"{adjective} {noun}" for noun in nouns for adjective in adjectives][:count]
 
 

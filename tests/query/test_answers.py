@@ -28,8 +28,7 @@ from langsplat_core.scene import (
 from langsplat_core.scene.codec import CodebookCodec
 from langsplat_core.scene.language import LONGEST_NAME, MOST_SHOWN, tree_of_wholes
 from langsplat_core.scene.surface import SMALLEST, Surface, build_surface
-from langsplat_core.semantics.relevancy import FLOOR, Scale
-from langsplat_core.semantics.vocabulary import TextEncoder
+from langsplat_core.semantics.relevancy import FLOOR, Scale, TextEncoder
 from tests.support.fakes import CENTRES, PER_BLOB, FakeEncoder, blob_scene, blobs, language
 from tests.support.file_samples import random_field
 from tests.support.scenes import chain_of_levels, random_gaussians, regions_of, unturned_gaussians

@@ -39,8 +39,7 @@ from langsplat_core.scene import (
 )
 from langsplat_core.semantics import relevancy as relevancies
 from langsplat_core.semantics.encoders import DEMO, OPEN_MODEL
-from langsplat_core.semantics.relevancy import Scale, latent_relevancy, relevancy, relevancy_of
-from langsplat_core.semantics.vocabulary import FEWEST
+from langsplat_core.semantics.relevancy import FEWEST, Scale, latent_relevancy, relevancy, relevancy_of
 from tests.support.fakes import DIM, PER_BLOB, WORDS, FakeEncoder, axis, blob_scene, named_scene
 from tests.support.file_samples import random_field
 from tests.support.scenes import random_camera, random_gaussians

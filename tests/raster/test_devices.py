@@ -19,11 +19,10 @@ from langsplat_core.config import GSPLAT, INRIA, RadianceConfig, RasterSettings
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import BackendError
 from langsplat_core.raster import gsplat, load_lifting_rasterizer, load_rasterizer
-from langsplat_core.raster.opengl.rasterizer import GlRasterizer
-from langsplat_core.raster.opengl.scene_textures import create_egl_context
+from langsplat_core.raster.opengl.rasterizer import GlRasterizer, create_egl_context
 from langsplat_core.raster.reference import ReferenceRasterizer, colours
 from langsplat_core.scene import Camera, Gaussians
-from langsplat_core.training.language.mask_weights import find_mask_weights
+from langsplat_core.training.language.lift import find_mask_weights
 from langsplat_core.training.radiance.differentiable import (
     CpuRenderer,
     CudaRenderer,
@@ -189,7 +188,7 @@ MAC = """
 import numpy as np, moderngl
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
-from langsplat_core.raster.opengl.scene_textures import create_egl_context
+from langsplat_core.raster.opengl.rasterizer import create_egl_context
 from tests.support.scenes import random_camera, random_gaussians, random_values
 ctx = create_egl_context()
 assert ctx.version_code == 410, ctx.version_code

@@ -29,8 +29,8 @@ from langsplat_core.semantics.encoders import (
     load_text_encoder,
     torch_clip_text,
 )
+from langsplat_core.semantics.relevancy import BUNDLED, LONGEST, bundled_vocabulary, read_vocabulary
 from langsplat_core.semantics.sam import load_segmenter
-from langsplat_core.semantics.vocabulary import BUNDLED, LONGEST, bundled_vocabulary, read_vocabulary
 from langsplat_core.semantics.weights import Weights
 from tests.support.tiny_models import (
     SAM_SIDE,

@@ -20,7 +20,7 @@ from langsplat_core.config import RasterSettings
 from langsplat_core.errors import BackendError
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.gsplat import drawn_settings
-from langsplat_core.raster.opengl.scene_textures import create_egl_context
+from langsplat_core.raster.opengl.rasterizer import create_egl_context
 from langsplat_core.raster.reference import Footprints, ReferenceView, project
 from langsplat_core.scene import Camera, Gaussians
 from tests.support.gsplat_twin import gsplat_on_cpu

@@ -31,8 +31,15 @@ from langsplat_core.errors import BackendError
 from langsplat_core.progress import Progress
 from langsplat_core.raster import Rasterizer, View, load_rasterizer
 from langsplat_core.raster.opengl import shader
-from langsplat_core.raster.opengl.rasterizer import GlRasterizer, GlView, Source
-from langsplat_core.raster.opengl.scene_textures import create_egl_context, drawing, is_software, set_uniforms
+from langsplat_core.raster.opengl.rasterizer import (
+    GlRasterizer,
+    GlView,
+    Source,
+    create_egl_context,
+    drawing,
+    is_software,
+    set_uniforms,
+)
 from langsplat_core.raster.render import splat_colours, view_of
 from langsplat_core.scene import Scene
 from langsplat_viewer.rendering.request import (

@@ -31,8 +31,7 @@ from langsplat_core.raster.protocol import View
 from langsplat_core.raster.render import view_of
 from langsplat_core.scene import LEVELS, Camera, Codec, LanguageField, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
-from langsplat_core.semantics.relevancy import Scale, relevancy_of
-from langsplat_core.semantics.vocabulary import everyday_phrases
+from langsplat_core.semantics.relevancy import Scale, everyday_phrases, relevancy_of
 
 GATE = PictureConfig().alpha_gate
 

@@ -31,7 +31,7 @@ from langsplat_core.extensions.benchmarks.report import markdown, write_report
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import Progress, TerminalProgress, silent
 from langsplat_core.raster import load_rasterizer
-from langsplat_core.raster.opengl.scene_textures import create_egl_context
+from langsplat_core.raster.opengl.rasterizer import create_egl_context
 from langsplat_core.raster.protocol import LiftingView, Rasterizer
 from langsplat_core.raster.reference import Footprints, ReferenceView, project, rim
 from langsplat_core.scene import Camera, Gaussians, look_at

@@ -25,8 +25,7 @@ from langsplat_core.scene import (
 from langsplat_core.scene.codec import KINDS, principal_colours
 from langsplat_core.scene.surface import Surface
 from langsplat_core.semantics.encoders import PhraseEncoder
-from langsplat_core.semantics.relevancy import Scale, relevancy_of
-from langsplat_core.semantics.vocabulary import everyday_phrases, everyday_vectors
+from langsplat_core.semantics.relevancy import Scale, everyday_phrases, everyday_vectors, relevancy_of
 from langsplat_core.training import one_torch_thread
 
 log = logging.getLogger("langsplat")

@@ -33,7 +33,7 @@ from langsplat_core.raster.protocol import LiftingView
 from langsplat_core.raster.reference import project
 from langsplat_core.scene import LEVELS, Camera, Gaussians
 from langsplat_core.scene.surface import Surface, divide, surface_areas
-from langsplat_core.training.language.mask_weights import MaskWeights
+from langsplat_core.training.language.lift import MaskWeights
 
 SEEN, BENT, COLOUR = 0.5, 0.3, 1.0  # weights of the cost's terms
 UNSEEN = 0.5  # disagreement of what no view shows together

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from langsplat_core.arrays import ViewScore, psnr
+from langsplat_core.arrays import Array, ViewScore, psnr
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.datasets.capture import Capture, shrunk_view
 from langsplat_core.errors import BackendError
@@ -20,7 +20,8 @@ from langsplat_core.raster import gsplat
 from langsplat_core.raster.cpu.projection import colours, colours_backward
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer, CpuView
 from langsplat_core.scene import Camera, Gaussians
-from langsplat_core.training.radiance.losses import fit_exposure, ssim_map, with_exposure
+from langsplat_core.scene.transform import C0
+from langsplat_core.training.radiance.losses import fit_exposure, patch_means, ssim_map, with_exposure
 
 PARAMETERS = ("means", "log_scales", "quats_wxyz", "opacity_logits", "sh_dc", "sh_rest")
 
@@ -135,6 +136,17 @@ class CudaRenderer:
         values = _coefficients(parameters, sh_degree)
         drawn = gsplat.draw(gaussians, values, camera, self._settings, sh_degree)
         return Rendered(drawn.image, drawn.alpha, drawn.visible, drawn.means_px)
+
+
+def rendered_depths(renderer: DifferentiableRenderer, values: dict[str, Tensor], camera: Camera) -> Array:
+    """Return the (GRID, GRID) mean depths of what a camera sees of the `values`, NaN where little is."""
+    small = camera.resized(64, max(1, round(64 * camera.height / camera.width)))
+    z = camera.project(values["means"].detach().cpu().numpy())[1].clip(0).astype(np.float32)
+    grey = torch.from_numpy(np.repeat((z[:, None, None] - 0.5) / C0, 3, axis=2)).to(values["means"].device)
+    with torch.no_grad():
+        rendered = renderer.render({**values, "sh_dc": grey}, small, 0)
+    depth, alpha = patch_means(rendered.image)[..., 0], patch_means(rendered.alpha[..., None])[..., 0]
+    return np.where(alpha > 0.5, depth / np.maximum(alpha, 1e-6), np.nan)
 
 
 Backend = Literal["auto", "cpu", "cuda"]

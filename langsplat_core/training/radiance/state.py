@@ -22,8 +22,7 @@ from langsplat_core.io.files import atomic_path
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians
 from langsplat_core.scene.transform import C0
 from langsplat_core.training.radiance.differentiable import PARAMETERS, parameters_of
-from langsplat_core.training.radiance.losses import no_exposures
-from langsplat_core.training.radiance.transients import Transients, no_transients
+from langsplat_core.training.radiance.losses import Transients, no_exposures, no_transients
 
 # Fewer points are topped up to this number: features are found where there is detail, and what lies between
 # is covered from random ones better than by splitting what is elsewhere (docs/photographs.md) ...

@@ -24,10 +24,16 @@ from langsplat_core.interrupts import Terminated, handled
 from langsplat_core.progress import Progress, WorkCancelledError, silent
 from langsplat_core.scene import Camera, Gaussians
 from langsplat_core.training import one_torch_thread
-from langsplat_core.training.radiance.differentiable import DifferentiableRenderer, renderer_for
+from langsplat_core.training.radiance.differentiable import (
+    DifferentiableRenderer,
+    rendered_depths,
+    renderer_for,
+)
 from langsplat_core.training.radiance.losses import (
     fit_exposures,
     no_exposures,
+    no_transients,
+    patch_means,
     radiance_loss,
     with_exposure,
 )
@@ -47,7 +53,6 @@ from langsplat_core.training.radiance.state import (
     start,
 )
 from langsplat_core.training.radiance.stereo import DepthMap, find_depths, in_free_space
-from langsplat_core.training.radiance.transients import no_transients, patch_means, rendered_depths
 
 log = logging.getLogger("langsplat")
 

@@ -39,7 +39,7 @@ from langsplat_core.query.rule import judge, triple
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Gaussians, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
-from langsplat_core.semantics.vocabulary import bundled_vocabulary
+from langsplat_core.semantics.relevancy import bundled_vocabulary
 from tests.support.fakes import CENTRES, NAMES, PER_BLOB, WORDS, FakeEncoder, axis, named_scene
 from tests.support.file_samples import FIELDS
 from tests.support.processes import refusal, run

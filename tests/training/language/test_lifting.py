@@ -18,21 +18,19 @@ from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import LEVELS, NO_NODE, Camera, LinearCodec, Tree
 from langsplat_core.semantics.features import ImageFeatures
 from langsplat_core.training.language.lift import (
-    blended,
-    by_features,
-    lift_by_gradient,
-    lift_latents,
-    lift_sample,
-    lift_weights,
-)
-from langsplat_core.training.language.mask_weights import (
     PAIR,
     SAME,
     MaskWeights,
+    blended,
+    by_features,
     count_votes,
     find_instances,
     find_mask_weights,
     group_masks,
+    lift_by_gradient,
+    lift_latents,
+    lift_sample,
+    lift_weights,
     view_pairs,
 )
 from tests.support.processes import stop_at

@@ -12,7 +12,7 @@ from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene.surface import build_surface
 from langsplat_core.semantics.features import ImageFeatures
 from langsplat_core.training.language import merge_tree as module
-from langsplat_core.training.language.mask_weights import PAIR, MaskWeights, find_mask_weights
+from langsplat_core.training.language.lift import PAIR, MaskWeights, find_mask_weights
 from langsplat_core.training.language.merge_tree import (
     SOLID,
     MergeTree,

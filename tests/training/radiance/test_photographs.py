@@ -13,7 +13,20 @@ from langsplat_core.arrays import Array
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.scene import Camera, look_at
 from langsplat_core.training.radiance import stereo
-from langsplat_core.training.radiance.losses import fit_exposure, radiance_loss, ssim_map, with_exposure
+from langsplat_core.training.radiance.losses import (
+    GRID,
+    MOST,
+    SAME_SURFACE,
+    colour_difference,
+    connected_patches,
+    count_agreeing,
+    fit_exposure,
+    no_transients,
+    patch_means,
+    radiance_loss,
+    ssim_map,
+    with_exposure,
+)
 from langsplat_core.training.radiance.stereo import (
     PLANES,
     RADIUS,
@@ -23,16 +36,6 @@ from langsplat_core.training.radiance.stereo import (
     neighbouring_views,
     sweep,
     warp,
-)
-from langsplat_core.training.radiance.transients import (
-    GRID,
-    MOST,
-    SAME_SURFACE,
-    colour_difference,
-    connected_patches,
-    count_agreeing,
-    no_transients,
-    patch_means,
 )
 
 
