@@ -1,5 +1,5 @@
 """Settings: every number has a range, and what lies outside is refused by name, before any work; options of
-`langsplat train` come together from a file, profiles, presets and short names."""
+`langsplat train` come together from profiles, presets and short names."""
 
 import dataclasses
 import math
@@ -112,14 +112,9 @@ def test_python_callers_are_refused_alike(tmp_path: Path) -> None:
 # How the options of `langsplat train` come together.
 
 WORDS = ("train", "photographs", "--out", "s.ply")
-PAGE = Path(__file__).parents[1] / "docs" / "photographs.md"
 
 
-def trained(*words: str, file: Path | None = None, text: str = "") -> Train:
-    """What is asked for, with a file that holds `text`."""
-    if file is not None:
-        file.write_text(text)
-        words = (*words, "--config", str(file))
+def trained(*words: str) -> Train:
     found = parse([*WORDS, *words])
     assert isinstance(found, Train)
     assert str(found.dataset) == "photographs"
@@ -133,53 +128,8 @@ def test_every_spelling_of_an_option_takes_its_value_both_ways(name: str) -> Non
         assert trained(spelling, "0.002").config.codec.max_relevancy_error == 0.002
 
 
-def test_the_example_of_the_docs_is_read(tmp_path: Path) -> None:
-    (example,) = PAGE.read_text().split("```toml\n")[1:]
-    found = trained(file=tmp_path / "train.toml", text=example.partition("```")[0])
-    config = found.config
-    assert (found.preset, config.radiance.max_gaussians) == ("good", 60_000)  # the preset's
-    assert (config.dataset.max_side, config.radiance.steps, config.clip.model) == (640, 3000, "demo")
-    assert (config.codec.max_relevancy_error, config.phrases) == (0.002, ("red mug", "keyboard"))
-
-
-def test_options_beside_a_file_win(tmp_path: Path) -> None:
-    file, text = tmp_path / "f.toml", 'preset = "quick"\nradiance.steps = 7\nphrases = ["a", "b"]'
-    assert trained(file=file, text=text).config.radiance.steps == 7
-    other = trained("--radiance.steps=8", "--preset", "good", "--phrases", "c", file=file, text=text)
-    assert (other.preset, other.config.radiance.steps, other.config.phrases) == ("good", 8, ("c",))
-    assert other.config.dataset.max_side == 480  # of the preset that was asked for
-    assert trained(f"--config={file}").config.dataset.max_side == 320
-    flags = "[dataset]\nallow_few_cameras = true"
-    assert trained(file=file, text=flags).config.dataset.allow_few_cameras
-    other = trained("--dataset.no-allow-few-cameras", file=file, text=flags)
-    assert not other.config.dataset.allow_few_cameras
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("[radiance]\nstepz = 7", "--radiance.stepz"),
-        ("radiance = 5", "--radiance"),
-        ("[radiance]\nsteps = 'many'", "--radiance.steps: invalid literal"),
-        ("[radiance]\nsteps = 0", "--radiance.steps 0: must be 1 to"),
-        ("phrases = ['--out', 'x']", "phrases"),
-        ("config = 'other.toml'", "config"),
-        ("steps = ", "Invalid value"),
-        ("\udcff", "utf-8"),
-    ],
-)
-def test_a_file_that_cannot_be_used_is_named_with_its_key(
-    text: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = tmp_path / "train.toml"
-    file.write_text(text, errors="surrogateescape")
-    line = refusal(capsys, *WORDS, "--config", file)
-    assert line.startswith(f"langsplat: {file}: ")
-    assert said in line
-
-
-@pytest.mark.parametrize("name", ["absent.toml", "."])
-def test_unreadable_config_files_are_refused(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert str(tmp_path / name) in refusal(capsys, *WORDS, "--config", tmp_path / name)
+def test_options_beside_a_preset_win() -> None:
+    found = trained("--radiance.steps=8", "--preset", "good", "--phrases", "red mug", "keyboard")
+    assert (found.preset, found.config.radiance.steps) == ("good", 8)
+    assert (found.config.dataset.max_side, found.config.radiance.max_gaussians) == (480, 60_000)
+    assert found.config.phrases == ("red mug", "keyboard")

@@ -30,16 +30,14 @@ CORE: Mapping[str, str] = MappingProxyType({
 def parse(args: list[str]) -> Runnable:
     """Return the command that the words of a command line name.
 
-    Raises SystemExit as tyro does, with its message on stderr; InputError for a command that does not exist,
-    and for an unusable `--config`.
+    Raises SystemExit as tyro does, with its message on stderr; InputError for a command that does not exist.
     """
     before = list(takewhile(FLAGS.__contains__, args))
     args = args[len(before) :]
     check_commands(args)
     if args[:1] == ["train"]:
-        from langsplat_core.cli.train import train_command, with_file
+        from langsplat_core.cli.train import train_command
 
-        args = with_file(args)
         commands = [_subcommand("train", train_command(args))]
     elif args[:1] and args[0] in command_names():
         commands = [_subcommand(args[0], with_codec(load_command(args[0]), args))]
