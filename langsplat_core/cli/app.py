@@ -19,7 +19,7 @@ from langsplat_core.errors import InputError
 FLAGS = ("-q", "--quiet", "-v", "--verbose")  # may precede a command
 # Name -> class, imported when the command line needs it; those of extensions follow.
 CORE: Mapping[str, str] = MappingProxyType({
-    "train": "train.Train", "frames": "train.Frames", "query": "query.QueryScene",
+    "train": "train.Train", "query": "query.QueryScene",
     "describe": "describe.Describe", "select": "query.Select", "teach": "describe.Teach",
     "scale": "export.SetScale", "transform": "export.Transform", "crop": "export.Crop",
     "export": "export.Export", "convert": "export.Convert",
@@ -35,17 +35,20 @@ def parse(args: list[str]) -> Runnable:
     before = list(takewhile(FLAGS.__contains__, args))
     args = args[len(before) :]
     check_commands(args)
-    if args[:1] == ["train"]:
+    commands: dict[str, Any]
+    groups, name = registry.references("groups"), args[0] if args else ""
+    if name == "train":
         from langsplat_core.cli.train import train_command
 
-        commands = [_subcommand("train", train_command(args))]
-    elif args[:1] and args[0] in command_names():
-        commands = [_subcommand(args[0], with_codec(load_command(args[0]), args))]
-    else:
-        groups = registry.references("groups")
-        named = args[:1] if args[:1] and args[0] in groups else [*CORE, *_extras(), *groups]
-        commands = [_group(name, args[1:2]) if name in groups else _listed(name) for name in named]
-        commands = [command for command in commands if command is not None]
+        commands = {name: train_command(args)}
+    elif name in command_names():
+        commands = {name: with_codec(load_command(name), args)}
+    elif name in groups:
+        commands = {name: _group(name, args[1:2])}
+    else:  # all of them, but for those of extensions that are broken
+        commands = {one: load_command(one) for one in CORE}
+        commands |= {one: kind for one, kind in registry.parts("commands").items() if " " not in one}
+        commands |= {one: _group(one) for one in groups}
     about = "Train, query, convert and measure 3D Gaussian scenes with a language field."
     found = parsed("langsplat", _union(commands), [*before, *args], about)
     return getattr(found, "command", found)  # of a group
@@ -64,49 +67,32 @@ def load_command(name: str) -> type[Runnable]:
     return getattr(import_module(f"langsplat_core.cli.{module}"), kind)
 
 
-def _extras() -> list[str]:
-    """Return the commands of extensions that stand in no group."""
-    return [name for name in registry.references("commands") if " " not in name]
-
-
-def _listed(name: str) -> Any:
-    """Return a subcommand for the list of all; None for one of an extension that is broken."""
-    if name in CORE:
-        return _subcommand(name, load_command(name))
-    command = registry.parts("commands").get(name)
-    return None if command is None else _subcommand(name, command)
-
-
-def _subcommand(name: str, command: type[Runnable]) -> Any:
-    return Annotated[command, tyro.conf.subcommand(name=name)]
-
-
-def _group(name: str, words: Sequence[str]) -> Any:
+def _group(name: str, words: Sequence[str] = ()) -> Any:
     """Return a group's commands, or only the one that `words` begins with."""
     members = _members(name)
     named = [word for word in words if word in members] or members
-    made = _union([_subcommand(member, load_command(f"{name} {member}")) for member in named])
+    made = _union({member: load_command(f"{name} {member}") for member in named})
     group = make_dataclass("Group", [("command", Annotated[made, tyro.conf.arg(name="")])])
-    about = registry.references("groups")[name]
-    return Annotated[group, tyro.conf.subcommand(name=name, description=about)]
+    group.__doc__ = registry.references("groups")[name]
+    return group
 
 
 def _members(group: str) -> list[str]:
     """Return the names of a group's commands, without the group's own."""
-    return [
-        name.partition(" ")[2] for name in registry.references("commands") if name.startswith(f"{group} ")
-    ]
+    every = registry.references("commands")
+    return [name.partition(" ")[2] for name in every if name.startswith(f"{group} ")]
 
 
-def _union(commands: Sequence[Any]) -> Any:
-    """Return the union of commands; tyro asks for two subcommands at least."""
-    return Union[(*commands, Annotated[None, tyro.conf.Suppress])]
+def _union(commands: Mapping[str, Any]) -> Any:
+    """Return the union of commands as subcommands of these names; tyro asks for two at least."""
+    named = [Annotated[kind, tyro.conf.subcommand(name=name)] for name, kind in commands.items()]
+    return Union[(*named, Annotated[None, tyro.conf.Suppress])]
 
 
 def check_commands(args: Sequence[str]) -> None:
     """Raise InputError for a command that does not exist, naming those that are written like it."""
     groups = registry.references("groups")
-    known: Iterable[str] = (*CORE, *_extras(), *groups)
+    known: Iterable[str] = (*(name for name in command_names() if " " not in name), *groups)
     for place, word in enumerate(args[:2]):
         if word.startswith("-"):
             return

@@ -21,7 +21,7 @@ from langsplat_core.cli.arguments import (
     WordsOption,
 )
 from langsplat_core.cli.run import print_json
-from langsplat_core.config import Count, CountOrZero, LevelChoice, NotNegative, PictureConfig
+from langsplat_core.config import Count, CountOrZero, LevelChoice, PictureConfig
 from langsplat_core.errors import EncoderError, InputError, LangSplatError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.scenes import check_keeps, check_writable, save_scene
@@ -34,7 +34,7 @@ from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder, s
 from langsplat_core.query.grammar import Atom, Counted, Phrase, heads, unparse
 from langsplat_core.query.instances import Instance
 from langsplat_core.query.lookup import decoded_relevancy, peak_pixel, splatted_relevancy
-from langsplat_core.query.selection import grow, in_pixel, of_rows, shrink
+from langsplat_core.query.selection import in_pixel, of_rows
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.render import pixel_weights, view_of
 from langsplat_core.scene import LEVELS, Camera, Scene
@@ -90,22 +90,14 @@ def instance_lines(instances: Sequence[Instance], unit: Unit) -> list[str]:
 
 def listed(instances: Sequence[Instance]) -> dict[str, Any]:
     """Return instances, numbered from 1, ready for JSON, lengths in world units."""
-    return {"instances": [_instance_fields(instance, number) for number, instance in enumerate(instances, 1)]}
-
-
-def _instance_fields(instance: Instance, number: int) -> dict[str, Any]:
-    box = instance.oriented
-    return {
-        "number": number,
-        "score": instance.score,
-        "mean": instance.mean,
-        "share": instance.share,
-        "gaussians": instance.count,
-        "centre": instance.centre,
-        "size": instance.size,
-        "box": instance.box,
-        "oriented_box": {"centre": box.centre, "rotation": box.axes, "half_extents": box.half_extents},
-    }
+    fields = []
+    for number, one in enumerate(instances, 1):
+        box = one.oriented
+        shape = {"centre": box.centre, "rotation": box.axes, "half_extents": box.half_extents}
+        scores = {"number": number, "score": one.score, "mean": one.mean, "share": one.share}
+        place = {"centre": one.centre, "size": one.size, "box": one.box, "oriented_box": shape}
+        fields.append(scores | {"gaussians": one.count} | place)
+    return {"instances": fields}
 
 
 def found_answer(engine: QueryEngine, text: str, level: LevelChoice) -> QueryResult:
@@ -438,10 +430,6 @@ class Select:
     """Semantic level; auto takes for each phrase the one with the highest score."""
     instance: tuple[Count, ...] = ()
     """Numbers of the things to take, as printed, the best is 1; all if none is given."""
-    grow: NotNegative = 0.0
-    """Take also what is so near along the surface: metres if the scene has a scale, else world units."""
-    shrink: NotNegative = 0.0
-    """Leave out what is so near to the rest along the surface, in the same unit; after growing."""
     scale: ScaleOption = None
     encoder: EncoderOption = ""
     taught: WordsOption = None
@@ -457,7 +445,9 @@ class Select:
         answer = answers[0] if len(answers) == 1 else joined(answers, all_needed=True)
         found = engine.instances(answer)
         rows = np.concatenate([instance.members for instance in chosen_instances(found, self.instance)])
-        selected = self._reshaped(engine, of_rows(rows, len(answer.members)), unit)
+        selected = of_rows(rows, len(answer.members))
+        if self.remove and selected.all():
+            raise InputError("the selection is the whole scene: nothing would be left after --remove")
         rows = np.flatnonzero(~selected if self.remove else selected)
         save_scene(self.out, replace(scene.take(rows), path=self.out))
         self._print(found, unit, int(selected.sum()), len(rows))
@@ -473,17 +463,6 @@ class Select:
         folder = self.out.parent
         if not folder.is_dir():
             raise InputError(f"{folder}: no such folder for {self.out.name}; make it first")
-
-    def _reshaped(self, engine: QueryEngine, selected: Array, unit: Unit) -> Array:
-        if self.grow:
-            selected = grow(engine.surface, selected, self.grow / unit.length)
-        if self.shrink:
-            selected = shrink(engine.surface, selected, self.shrink / unit.length)
-        if not selected.any():
-            raise InputError(f"--shrink {self.shrink:g}: nothing is left; shrink by less")
-        if self.remove and selected.all():
-            raise InputError("the selection is the whole scene: nothing would be left after --remove")
-        return selected
 
     def _print(self, found: Sequence[Instance], unit: Unit, selected: int, written: int) -> None:
         if self.json:

@@ -148,11 +148,13 @@ def _ended(program: str, error: BaseException) -> int:
         number = signal.SIGTERM if isinstance(error, Terminated) else signal.SIGINT
         print(f"{program}: {SAID[number]}{_CONTINUES}", file=sys.stderr)
         return 128 + number
+    message = str(error)
     if isinstance(error, OSError):
-        return _fail(program, _system_complaint(error))
-    if isinstance(error, MemoryError):
-        return _fail(program, "too little memory on this machine; ask for less, or for smaller pictures")
-    return _fail(program, str(error))
+        message = _system_complaint(error)
+    elif isinstance(error, MemoryError):
+        message = "too little memory on this machine; ask for less, or for smaller pictures"
+    print(f"{program}: {message}", file=sys.stderr)
+    return 2
 
 
 class _StandardError(io.FileIO):
@@ -201,11 +203,6 @@ def _system_complaint(error: OSError) -> str:
         _drop_standard_output()  # perhaps the culprit, which would complain again at exit
         return f"a file or standard output cannot be written ({reason}); {_ROOM}"
     return reason
-
-
-def _fail(program: str, message: str) -> int:
-    print(f"{program}: {message}", file=sys.stderr)
-    return 2
 
 
 def print_json(content: Any) -> None:

@@ -1,6 +1,5 @@
 """`langsplat train`: photographs -> scene.ply with a language field."""
 
-import logging
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
@@ -12,16 +11,12 @@ import tyro
 from langsplat_core.cli.arguments import OutFile, OutFolder, codec_settings, named
 from langsplat_core.config import (
     PAPER,
-    DatasetConfig,
-    FrameCount,
     TrainConfig,
     TrainPreset,
     TrainProfile,
     with_preset,
 )
 from langsplat_core.progress import LineProgress, TerminalProgress, silent
-
-log = logging.getLogger("langsplat")
 
 
 @dataclass(frozen=True)
@@ -90,29 +85,6 @@ class Train:
             print(f"warning: {warning}")
         page = (self.work or work_folder(self.out)) / PAGE
         print(f"photographs beside what the scene shows: {page}")
-
-
-@dataclass(frozen=True)
-class Frames:
-    """Take photographs out of a video: the sharpest image of each of COUNT equal parts.
-
-    `langsplat train` does so for a video; with this command one looks at them first, and sorts out.
-    """
-
-    video: tyro.conf.Positional[Path]
-    """The video: mp4, mov, m4v, mkv, webm or avi."""
-    out: OutFolder
-    """Folder for frame_0001.jpg ...; a new one."""
-    count: FrameCount = DatasetConfig.frames
-    """At most, of the whole video: two or three a second of a slow walk around something."""
-
-    def run(self) -> None:
-        """Write the photographs."""
-        from langsplat_core.datasets.video import extract_frames
-
-        with TerminalProgress() as progress:
-            written = extract_frames(self.video, self.out, self.count, progress)
-        print(f"{self.out}: {len(written)} photographs; next: langsplat train {self.out} --out scene.ply")
 
 
 def train_command(args: Sequence[str]) -> type[Train]:

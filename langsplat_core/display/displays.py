@@ -239,11 +239,14 @@ class DisplayRow:
     # of the answers, by `PictureConfig.heat_scale`
     ranges: Callable[[Answers, tuple[float, float] | None], Ranges] = lambda answers, scale: ()
     is_colour: bool = False  # its channel is colours, tinted where Gaussians are selected
-    legend: bool = False  # a colour bar of the answers lies over the image
     uses_map: bool = False  # it shows numbers by the colour map
     by_level: bool = False  # it has a button for each semantic level
-    needs_field: bool = False  # shows the language field
     needs_query: bool = False  # shows answers
+
+    @property
+    def needs_field(self) -> bool:
+        """True where it shows the language field."""
+        return self.needs_query or self.by_level
 
 
 _ROWS = (
@@ -251,27 +254,11 @@ _ROWS = (
     DisplayRow("depth", "Depth", Drawing.DEPTH, "depth", uses_map=True),
     DisplayRow("alpha", "Alpha", Drawing.ALPHA),
     DisplayRow(
-        "relevancy",
-        "Relevancy",
-        Drawing.HEAT,
-        relevancies,
-        heat_ranges,
-        legend=True,
-        uses_map=True,
-        needs_field=True,
-        needs_query=True,
+        "relevancy", "Relevancy", Drawing.HEAT, relevancies, heat_ranges, uses_map=True, needs_query=True
     ),
-    DisplayRow(
-        "segmentation",
-        "Segmentation",
-        Drawing.SEGMENTS,
-        members,
-        member_ranges,
-        needs_field=True,
-        needs_query=True,
-    ),
-    DisplayRow("latent", "Latent", Drawing.SUMS, latents, is_colour=True, by_level=True, needs_field=True),
-    DisplayRow("tree", "Tree", Drawing.SUMS, nodes, is_colour=True, by_level=True, needs_field=True),
+    DisplayRow("segmentation", "Segmentation", Drawing.SEGMENTS, members, member_ranges, needs_query=True),
+    DisplayRow("latent", "Latent", Drawing.SUMS, latents, is_colour=True, by_level=True),
+    DisplayRow("tree", "Tree", Drawing.SUMS, nodes, is_colour=True, by_level=True),
 )
 DISPLAYS: Mapping[Display, DisplayRow] = MappingProxyType({row.name: row for row in _ROWS})
 

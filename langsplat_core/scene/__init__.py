@@ -16,25 +16,7 @@ from langsplat_core.scene.language import (
 from langsplat_core.scene.scene import FARTHEST, Camera, Intrinsics, Scene, look_at
 
 __all__ = [
-    "CANONICAL_PHRASES",
-    "FARTHEST",
-    "LEVELS",
-    "NO_NODE",
-    "SH_COUNTS",
-    "AutoencoderCodec",
-    "Calibration",
-    "Camera",
-    "CodebookCodec",
-    "Codec",
-    "Fits",
-    "Gaussians",
-    "Intrinsics",
-    "LanguageField",
-    "LinearCodec",
-    "PlattScaling",
-    "Scene",
-    "TaughtWord",
-    "Tree",
-    "codec_from_tensors",
-    "look_at",
-]
+    "CANONICAL_PHRASES", "FARTHEST", "LEVELS", "NO_NODE", "SH_COUNTS", "AutoencoderCodec", "Calibration",
+    "Camera", "CodebookCodec", "Codec", "Fits", "Gaussians", "Intrinsics", "LanguageField", "LinearCodec",
+    "PlattScaling", "Scene", "TaughtWord", "Tree", "codec_from_tensors", "look_at",
+]  # fmt: skip

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from math import isqrt
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +16,10 @@ from langsplat_core.progress import Progress, silent
 
 SH_COUNTS = {0: 1, 1: 4, 2: 9, 3: 16}  # degree -> coefficients per colour channel
 LARGEST_COEFFICIENT = 1e20  # of the spherical harmonics: sums of sixteen and their gradients fit a float32
+FAULTS = (  # for which a row is not drawn
+    *("position not finite", "scale not a number or above e^80", "rotation zero or not finite"),
+    *("opacity not a number", "colour not finite or above 1e20"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,41 +58,30 @@ class Gaussians:
 
     def valid(self) -> Array:
         """(N,) True where a row can be drawn, see `invalid_rows` for why it cannot."""
-        return self._usable.copy()
-
-    @cached_property
-    def _usable(self) -> Array:
-        usable = np.ones(len(self), bool)
-        for _, sound in self._requirements():
-            usable &= sound
-        return usable
+        return self._faults == 0
 
     def invalid_rows(self) -> dict[str, int]:
         """Return why rows are not valid: reason -> count. A row counts once, under its first reason."""
-        counts: dict[str, int] = {}
-        if self._usable.all():
-            return counts
-        unexplained = np.ones(len(self), bool)
-        for reason, sound in self._requirements():
-            faulty = unexplained & ~sound
-            unexplained &= sound
-            if faulty.any():
-                counts[reason] = int(faulty.sum())
-        return counts
+        counts = np.bincount(self._faults, minlength=len(FAULTS) + 1)[1:].tolist()
+        return {reason: count for reason, count in zip(FAULTS, counts, strict=True) if count}
 
-    def _requirements(self) -> tuple[tuple[str, Any], ...]:
-        """Return what a drawn row needs: name of the fault, (N,) True where there is none."""
+    @cached_property
+    def _faults(self) -> Array:
+        """(N,) uint8 number, from 1, of the first of `FAULTS` that a row has; 0: none."""
         with np.errstate(over="ignore", invalid="ignore"):
             length_squared = (self.quats_wxyz.astype(np.float64) ** 2).sum(1)
             sound_colour = (np.abs(self.sh) <= LARGEST_COEFFICIENT).all((1, 2))
-        return (
-            ("position not finite", np.isfinite(self.means).all(1)),
-            # exp(88.7) overflows float32; NaN compares False
-            ("scale not a number or above e^80", (self.log_scales <= 80).all(1)),
-            ("rotation zero or not finite", np.isfinite(length_squared) & (length_squared > 1e-24)),
-            ("opacity not a number", ~np.isnan(self.opacity_logits)),
-            ("colour not finite or above 1e20", sound_colour),
+        sound = (
+            np.isfinite(self.means).all(1),
+            (self.log_scales <= 80).all(1),  # exp(88.7) overflows float32; NaN compares False
+            np.isfinite(length_squared) & (length_squared > 1e-24),
+            ~np.isnan(self.opacity_logits),
+            sound_colour,
         )
+        faults = np.zeros(len(self), np.uint8)
+        for number in range(len(FAULTS), 0, -1):
+            faults[~sound[number - 1]] = number
+        return faults
 
 
 def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:

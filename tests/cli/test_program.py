@@ -44,7 +44,7 @@ def test_every_option_is_described(name):
     ("words", "said"),
     [
         (["qurey", "a.ply"], "no command 'qurey'; did you mean 'query'?"),
-        (["xyz"], "no command 'xyz'; there are train, frames, query"),
+        (["xyz"], "no command 'xyz'; there are train, query"),
         (["--tyro-print-completion", "ksh"], "--tyro-print-completion ksh: there is bash, zsh"),
     ],
 )

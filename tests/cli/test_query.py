@@ -251,16 +251,6 @@ def test_select_takes_one_instance(folder, capsys):
     np.testing.assert_allclose(centre, answer["instances"][1]["centre"], atol=0.05)
 
 
-def test_select_grows_and_shrinks_in_metres(folder):
-    sizes = {}
-    for name, words in {"0": (), "g": ("--grow", "0.2"), "s": ("--shrink", "0.01")}.items():
-        assert run("select", "a.ply", "book", "--out", f"{name}.ply", *words) == 0
-        sizes[name] = len(load_scene(f"{name}.ply").gaussians)
-    assert sizes["s"] <= sizes["0"] < sizes["g"]
-    assert run("select", "a.ply", "book", "--out", "u.ply", "--grow", "0.4", "--scale", "1") == 0
-    assert len(load_scene("u.ply").gaussians) == sizes["g"]
-
-
 def test_known_length_gives_the_scale(folder, capsys):
     assert run("scale", "a.ply", "--metres", "0.3", "--between", "-1", "0", "0", "0.2", "0", "0") == 0
     assert load_scene("a.ply").metres_per_unit == pytest.approx(0.25)
@@ -428,9 +418,7 @@ def test_taught_word_may_be_a_part(described, capsys):
         ("select a.ply spoon", "does not know 'spoon'"),
         ("select a.ply", "no phrase given"),
         ("select a.ply mug --instance 2", "--instance 2: there are 1, numbered from 1"),
-        ("select a.ply mug --grow -1", "--grow -1: must be 0 to 1e+09"),
-        ("select a.ply pair --shrink 9", "nothing is left; shrink by less"),
-        ("select a.ply mug book plant --grow 99 --remove", "the whole scene"),
+        ("select a.ply mug book plant --remove", "the whole scene"),
         ("select a.ply mug --out b.obj.gz", "scenes are written as"),
         ("select a.ply mug --out a.ply", "would replace the original"),
         ("select a.ply mug --out there/b.ply", "there: no such folder for b.ply"),

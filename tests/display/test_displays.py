@@ -49,7 +49,6 @@ def test_displays_are_those_of_the_settings():
     assert set(DISPLAYS) == set(get_args(Display))
     assert all(name == row.name for name, row in DISPLAYS.items())
     assert len({row.label for row in DISPLAYS.values()}) == len(DISPLAYS)
-    assert all(row.needs_field for row in DISPLAYS.values() if row.needs_query)
 
 
 @pytest.mark.parametrize(("channel", "ranges"), [(relevancies, heat_ranges), (members, member_ranges)])

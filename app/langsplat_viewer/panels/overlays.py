@@ -10,7 +10,7 @@ from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import ColourMap
-from langsplat_core.display.displays import QUERY_COLOURS, STRENGTH, mapped, painted
+from langsplat_core.display.displays import QUERY_COLOURS, STRENGTH, Drawing, mapped, painted
 from langsplat_core.query.describe import LevelWords
 from langsplat_core.scene import LEVELS, Camera
 from langsplat_viewer.actions import saving, settings, viewpoint
@@ -361,7 +361,8 @@ def draw_legend(viewer: Viewer, area: ui.Area, name: str = "relevancy") -> None:
     state = viewer.state
     shown = state.shown_results()
     slots = painted(shown)
-    if state.scene is None or not slots or not any(pane.row.legend for pane in state.panes()):
+    is_hot = any(pane.row.drawing is Drawing.HEAT for pane in state.panes())
+    if state.scene is None or not slots or not is_hot:
         return
     begin_legend(name, area)
     for slot in slots:
