@@ -151,7 +151,6 @@ def _tree(ctx: Any, window: Window) -> None:
 
 def _overlays(ctx: Any, window: Window) -> None:
     viewer = window.viewer
-    settings.open_panel(viewer, "Overlays")
     for overlay in ("cameras", "cube", "grid"):
         settings.toggle_overlay(viewer, overlay)
     settings.set_display(viewer, "rgb")

@@ -129,7 +129,7 @@ SIDE_KEYS: tuple[tuple[Side, str], ...] = (
 )
 PANEL_TITLES = (
     *("Search", "Display", "Camera", "Scene", "Outline", "Select", "Transform"),
-    *("Train", "Record", "Bookmarks", "Messages", "Overlays", "Notes"),
+    *("Train", "Record", "Bookmarks", "Messages", "Notes"),
     *registry.references("panels"),
 )
 TOOL_ICONS: dict[Tool, str] = {
@@ -244,7 +244,6 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
             is_on=lambda viewer: viewer.state.pins_notes,
             icon="NOTE_STICKY",
         ),
-        Command("pin a note to the selection", settings.pin_to_selection),
     ),
     "Camera": (
         Command("return to the opening view", viewpoint.reset_view, ("R", "Home"), icon="HOUSE"),

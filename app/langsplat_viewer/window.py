@@ -222,7 +222,6 @@ class Window:
         params.callbacks.setup_imgui_style = self._workspace.style
         params.callbacks.show_menus = lambda: menus.draw_menus(self.viewer)
         params.callbacks.post_init = self._start
-        params.callbacks.pre_new_frame = self.keyboard.feed
         params.callbacks.show_gui = self._gui
         params.callbacks.before_imgui_render = self._draw
         params.callbacks.confirm_exit = self._may_close
@@ -246,7 +245,6 @@ class Window:
         imgui.get_io().config_input_text_cursor_blink = False  # a blinking cursor would be drawn for ever
         imgui.get_io().config_flags |= imgui.ConfigFlags_.nav_enable_keyboard
         glfw.set_drop_callback(glfw_window_hello_imgui(), self._dropped)  # type: ignore[arg-type]
-        self.keyboard.listen(glfw_window_hello_imgui())
         settings.open_panel(self.viewer, "Search")  # before what was left over it the last time
         if self._path.name.endswith(PROJECTS):  # which says itself how it is looked at
             opening.open_project(self.viewer, self._path, self._ask)
@@ -314,6 +312,7 @@ class Window:
             self._obey()
         if viewer.state.may_close:
             hello_imgui.get_runner_params().app_shall_exit = True
+        self.keyboard.keep()
         viewer.take_results()
         viewpoint.tick(viewer, imgui.get_time())
         opening.follow_beside(viewer)
@@ -340,7 +339,7 @@ class Window:
         idling = hello_imgui.get_runner_params().fps_idling
         news = (viewer.worker.delivered, viewer.recorder.delivered)
         seen = (state.view, state.nothing, state.hover, state.leaving, state.may_close)
-        now = (news, seen, self.unfinished, viewer.watch.changed, self.keyboard.given)
+        now = (news, seen, self.unfinished, viewer.watch.changed)
         self._frames = AWAKE_FRAMES if now != self._last else max(self._frames - 1, 0)
         self._last = now
         awaits = any(canvas is not None and canvas.waits for canvas in self._canvases)  # and is woken

@@ -13,7 +13,7 @@ from langsplat_core.semantics.features import ImageFeatures
 from langsplat_viewer.actions import editing, opening, settings, viewpoint
 from langsplat_viewer.camera.controls import from_side
 from langsplat_viewer.commands import COMMANDS
-from langsplat_viewer.panels import overlays, select
+from langsplat_viewer.panels import select
 from langsplat_viewer.panels.layout import all_panels
 from langsplat_viewer.panels.menus import button_label
 from langsplat_viewer.panels.ui import scene_area
@@ -57,15 +57,14 @@ def split_the_view(s: Any) -> None:
 
 
 def draw_over_the_scene(s: Any) -> None:
-    """The end of an axis turns the view, a click on a camera stands there, two clicks measure."""
+    """Axes and cameras are drawn, a click on a camera stands there, two clicks measure."""
+    plain, area = s.shot("plain"), scene_area()
     s.menu("View", "Show or hide the axes")
+    right = int(area.left + area.width)
+    assert (s.shot("axes") != plain)[int(area.top) : int(area.top) + 75, right - 75 : right].any()
     s.menu("View", "Show or hide the training cameras")
-    area, before = scene_area(), s.state.view
-    corner = s.ctx.item_info("//axes/sides").rect_full
-    assert corner.max.x <= area.left + area.width + 1
-    forward = from_side(before, "top").rotation[2]
-    end = -before.rotation[:2] @ forward * overlays.REACH_OF_ENDS * (corner.max.x - corner.min.x)
-    s.click_at(((corner.min.x + corner.max.x) / 2 + end[0], (corner.min.y + corner.max.y) / 2 + end[1]))
+    forward = from_side(s.state.view, "top").rotation[2]
+    s.key("keypad7")
     np.testing.assert_allclose(s.state.view.rotation[2], forward, atol=1e-6)
 
     turn_the_wheel(s, 8)  # until all cameras are in the picture

@@ -170,7 +170,7 @@ def test_answer_is_explained_by_kept_photographs(opened, tmp_path, monkeypatch):
     assert opened.state.evidence is None
 
 
-# Own cuts, without a window.
+# Thresholds of one's own.
 
 
 def test_threshold_is_set_and_reset(asked):

@@ -31,7 +31,7 @@ from langsplat_viewer.marks import Marks, hiding, unmarked
 from langsplat_viewer.rendering.request import Clip, Splats
 from langsplat_viewer.session import Note, Preferences, Query, Ruler, Things
 from langsplat_viewer.viewer import GESTURE, MOST_STEPS, Services, Viewer
-from tests.support.fakes import CENTRES, FakeEncoder
+from tests.support.fakes import FakeEncoder
 from tests.support.windowless import (
     SCENES,
     FakeSurface,
@@ -292,21 +292,6 @@ def test_project_without_scene_or_window_is_refused(saved, opened, run_viewer):
     assert opened.state.scene is not None
 
 
-def test_project_states_the_answers_for_other_programs(opened, saved):
-    answers = {answer["phrase"]: answer for answer in json.loads(saved.read_text())["answers"]}
-    assert answers["mug"]["verdict"] == "found"
-    np.testing.assert_allclose(answers["mug"]["place"], CENTRES[0], atol=0.25)
-    assert answers["mug"]["gaussians"] == 120
-    nearest = (
-        ((opened.state.scene.gaussians.means - np.array(opened.state.session.notes[0].at)) ** 2)
-        .sum(1)
-        .argmin()
-    )
-    for query in opened.state.session.queries:
-        inside = bool(opened.state.result(query).members[nearest])
-        assert bool(answers[query.phrase]["notes"]) == inside
-
-
 def test_project_of_a_changed_scene_restores_only_queries(saved, viewer, monkeypatch):
     smaller = SCENES["blobs.ply"].take(np.arange(240))
     monkeypatch.setitem(SCENES, "blobs.ply", smaller)
@@ -349,7 +334,7 @@ def test_project_of_version_1_opens_and_means_the_same(viewer, tmp_path, monkeyp
     assert state.shows_panels == ("Search", "Notes")
 
 
-def test_other_files_of_version_1_open_and_mean_the_same(opened):
+def test_other_files_of_version_1_open_and_mean_the_same():
     project = read_project(SAVED / "version1.langsplat")
     assert project.session.things == Things({3: "the atlas"})
     (bookmark,) = Shelf(SAVED).read(Path("/scenes/blobs.ply"))
@@ -377,7 +362,7 @@ def test_damaged_project_is_refused_in_one_line(saved, version):
     refused: list[str] = []
     tried = 0
     for way in list(places(top)):
-        if way[0] in ("answers", "format"):
+        if way[0] == "format":
             continue
         for odd in (None, "x", -1, True, [], {}, 1e308, [[["x"]]], "\0"):
             broken = copy.deepcopy(top)
@@ -475,13 +460,3 @@ def test_notes_return_with_their_scene(opened):
     act(opening.reload, opened)
     assert opened.state.session.notes == notes
     assert opened.state.has_unsaved_notes
-
-
-def test_note_is_pinned_to_the_selection(opened):
-    settings.pin_to_selection(opened)
-    assert "select something" in errors(opened)[-1]
-    editing.take(opened, blob("book"))
-    settings.pin_to_selection(opened)
-    np.testing.assert_allclose(opened.state.session.notes[0].at, CENTRES[1], atol=0.1)
-    assert settings.take(opened.state, "wanted_panel") == "Notes"
-    assert opened.state.fresh_note is opened.state.session.notes[0]

@@ -305,8 +305,8 @@ def open_file(viewer: Viewer, path: Path) -> None:
 def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
     """Open what was dropped onto the window.
 
-    Of scenes the first is opened and all are listed; then paths are taken. What belongs to a scene lies
-    beside it. A folder of photographs is offered for training. What is none of these is said.
+    Of scenes the first is opened and all are listed; then paths are taken. Companions belong to their scene.
+    A folder of photographs is offered for training. What is none of these is said.
     """
     if len(paths) == 1 and _is_plain_folder(paths[0]) and count_photographs(paths[0]):
         choose_photographs(viewer, paths[0])

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from concurrent.futures import wait
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -37,8 +37,8 @@ from langsplat_viewer.output import (
     save_png,
 )
 from langsplat_viewer.rendering.renderer import open_renderer
-from langsplat_viewer.session import Bookmark, Note, Query
-from langsplat_viewer.state import Leaving, ViewerState, flight_of
+from langsplat_viewer.session import Bookmark
+from langsplat_viewer.state import Leaving, flight_of
 from langsplat_viewer.viewer import Viewer
 
 
@@ -223,36 +223,11 @@ def save_project(viewer: Viewer, folder: Path = Path()) -> Path | None:
         intrinsics=state.view.intrinsics,
         panels=state.preferences.panels or (),
     )
-    answers = [_answer(state, query) for query in state.session.queries]
-    if viewer.save(path, lambda: write_project(path, project, answers)) is None:
+    if viewer.save(path, lambda: write_project(path, project)) is None:
         return None
     state.project, state.saved = path, state.session
     state.preferences = state.preferences.with_recent(path)
     return path
-
-
-def _answer(state: ViewerState, query: Query) -> dict[str, Any]:
-    """Return the answer to a query as a project keeps it, for other programs."""
-    answer, result, scene = state.answer(query), state.result(query), state.scene
-    if result is None or scene is None:
-        return {"phrase": query.phrase, "problem": answer.problem}
-    inside = [note.text for note in state.session.notes if result.members[_nearest(scene, note)]]
-    return {
-        "phrase": query.phrase,
-        "verdict": result.verdict,
-        "probability": result.probability,
-        "place": None if result.place is None else [float(part) for part in result.place],
-        "gaussians": int(result.members.sum()),
-        "boxes": [thing.box.tolist() for thing in answer.things],
-        "notes": inside,
-    }
-
-
-def _nearest(scene: Scene, note: Note) -> int:
-    """Return the Gaussian whose centre is nearest to a note."""
-    with np.errstate(all="ignore"):
-        away = ((scene.gaussians.means.astype(np.float64) - np.array(note.at)) ** 2).sum(1)
-    return int(np.nanargmin(np.where(np.isfinite(away), away, np.inf)))
 
 
 # Another scene, or none: what was deleted and not saved is asked about first.

@@ -4,13 +4,11 @@ from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import Any
 
-import numpy as np
-
 from langsplat_core.config import Display, PictureConfig
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.query.engine import no_field
 from langsplat_viewer.rendering.request import AT_RANGE, Clip, SplitMode
-from langsplat_viewer.session import LONGEST_NOTE, MOST_NOTES, OVERLAYS, SCALES, Note, Overlay, Point, Ruler
+from langsplat_viewer.session import LONGEST_NOTE, MOST_NOTES, OVERLAYS, SCALES, Note, Overlay, Ruler
 from langsplat_viewer.state import Recording, ViewerState
 from langsplat_viewer.viewer import Viewer
 
@@ -130,24 +128,10 @@ def toggle_pinning(viewer: Viewer) -> None:
 
 def pin_at(viewer: Viewer, u: float, v: float) -> None:
     """Pin a note to the surface; (u, v) are fractions of the scene's area."""
-    point = viewer.point_at(u, v, "pin a note to")
-    if point is not None:
-        _pin(viewer, point)
-
-
-def pin_to_selection(viewer: Viewer) -> None:
-    """Pin a note to the middle of what is selected."""
-    state, chosen = viewer.state, viewer.state.marks.selected
-    if state.scene is None or not chosen.any():
-        viewer.say_error("select something first, then pin a note to it")
-        return
-    means = state.scene.gaussians.means[chosen].astype(np.float64)
-    x, y, z = means[np.argmin(((means - np.median(means, axis=0)) ** 2).sum(1))].tolist()
-    _pin(viewer, (x, y, z))
-
-
-def _pin(viewer: Viewer, point: Point) -> None:
     state, notes = viewer.state, viewer.state.session.notes
+    point = viewer.point_at(u, v, "pin a note to")
+    if point is None:
+        return
     if len(notes) >= MOST_NOTES:
         viewer.say_error("no room for more notes")
         return

@@ -240,8 +240,7 @@ class Shelf:
 #  "gaussians": 81288,      that it has; of another number marks, moves and names are not taken
 #  "view": {...},           as a bookmark, and "intrinsics"
 #  "panels": ["Search"],    that are open
-#  "session": {...},        the fields of `Session`. Masks are a bit for each Gaussian, zlib, base64
-#  "answers": [...]}        of the queries, for other programs; it is not read
+#  "session": {...}}        the fields of `Session`. Masks are a bit for each Gaussian, zlib, base64
 
 PROJECTS = ".langsplat"  # suffix of project files
 FORMAT, VERSION = "langsplat-project", 2
@@ -262,12 +261,11 @@ class Project(msgspec.Struct, omit_defaults=True):
     left_out: tuple[str, ...] = ()  # of a project of an earlier version, a line each
 
 
-def write_project(path: Path, project: Project, answers: list[dict[str, Any]]) -> None:
+def write_project(path: Path, project: Project) -> None:
     """Write a project, whole or not at all."""
     folder, scene = path.absolute().parent, Path(project.scene)
     named = scene.relative_to(folder).as_posix() if scene.is_relative_to(folder) else str(scene)
-    content = {"format": FORMAT, "version": VERSION, **_plain(project), "scene": named, "answers": answers}
-    _write(path, content)
+    _write(path, {"format": FORMAT, "version": VERSION, **_plain(project), "scene": named})
 
 
 def read_project(path: Path) -> Project:

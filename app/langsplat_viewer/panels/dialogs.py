@@ -1,7 +1,7 @@
 """What asks over the scene: the file browser, a file that has changed, and what is not saved.
 
 The browser is the project's own beside ImFileDialog, since it fits small windows and large text, says why a
-folder cannot be read, lists recent scenes and opens folders that are scenes. Native dialogs need helpers that
+folder cannot be read and opens folders that are scenes. Native dialogs need helpers that
 may be missing.
 """
 
@@ -20,7 +20,7 @@ BROWSER_EM = 40.0, 30.0
 
 
 def draw_browser(viewer: Viewer) -> None:
-    """Draw the browser: a box for a path, the folders above, what is in this one, and recent scenes."""
+    """Draw the browser: a box for a path, the folders above, and what is in this one."""
     listing, choice = viewer.state.browser, viewer.state.choice
     title = choice.title or "Open"
     ui.ask_for_popup(title, listing is not None)
@@ -62,9 +62,7 @@ def _above(viewer: Viewer, folder: Path) -> None:
 
 def _entries(viewer: Viewer, listing: Listing) -> None:
     picks = viewer.state.choice.is_folder
-    recent = () if picks else viewer.state.preferences.recent
-    below = (min(len(recent), 4) + 2 * bool(recent)) * imgui.get_text_line_height_with_spacing()
-    below += imgui.get_frame_height_with_spacing() * picks
+    below = imgui.get_frame_height_with_spacing() * picks
     if imgui.begin_child("entries", ImVec2(0, -below), imgui.ChildFlags_.borders):
         if listing.problem:
             ui.small_wrapped(listing.problem, ui.bad())
@@ -75,13 +73,6 @@ def _entries(viewer: Viewer, listing: Listing) -> None:
         if listing.left_out:
             ui.small_wrapped(f"{listing.left_out:,} more: type a path", ui.muted())
     imgui.end_child()
-    if recent:
-        imgui.text_colored(ui.muted(), "Recent")
-        if imgui.begin_child("recent"):
-            for path in recent:
-                if imgui.selectable(f"{path}##recent", False)[0]:
-                    opening.open_file(viewer, Path(path))
-        imgui.end_child()
 
 
 def _entry(viewer: Viewer, entry: FolderEntry) -> None:

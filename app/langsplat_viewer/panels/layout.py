@@ -48,7 +48,6 @@ CORE_PANELS: tuple[Panel, ...] = (
     Panel("Record", MIDDLE, viewpoint.draw_record, is_open=False),
     Panel("Bookmarks", MIDDLE, viewpoint.draw_bookmarks, is_open=False),
     Panel("Messages", FOOT, scene.draw_messages),
-    Panel("Overlays", MIDDLE, overlays.draw_overlays, is_open=False),
     Panel("Notes", MIDDLE, overlays.draw_notes, is_open=False),
 )
 
@@ -147,7 +146,6 @@ def draw_over(viewer: Viewer) -> None:
         select.draw_hint(viewer, area)
         select.draw_gizmo(viewer, area)
     overlays.draw_grip(viewer, area)
-    overlays.draw_axes(viewer, area)
     menus.draw_toolbar(viewer, area)
     dialogs.draw_changed(viewer, area)
     dialogs.draw_unsaved(viewer)

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, get_args
+from typing import Any
 
 import moderngl
 import numpy as np
@@ -15,9 +15,9 @@ from langsplat_core.query.describe import LevelWords
 from langsplat_core.scene import LEVELS, Camera
 from langsplat_viewer.actions import saving, settings, viewpoint
 from langsplat_viewer.camera import overlays
-from langsplat_viewer.camera.controls import Side, from_side
+from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.camera.overlays import PlacedText, placed
-from langsplat_viewer.commands import OVERLAY_TITLES, with_key
+from langsplat_viewer.commands import with_key
 from langsplat_viewer.panels import ui
 from langsplat_viewer.session import Note, Point, Ruler
 from langsplat_viewer.state import Hover
@@ -148,6 +148,8 @@ Colour = tuple[float, float, float, float]
 REACH = 7.0  # window units from a line at which a click means it
 STILL = 4.0  # a click that moves farther is a drag
 CAMERA, CHOSEN, HOVERED = (0.75, 0.82, 0.95, 0.3), (0.98, 0.62, 0.15, 1.0), (1.0, 1.0, 1.0, 1.0)
+AXES_EM = 5.0  # of the corner that the axes take
+AXES = (("x", (0.93, 0.33, 0.31)), ("y", (0.45, 0.78, 0.30)), ("z", (0.36, 0.60, 0.98)))  # the world's
 NOTE, GRID, RULER = (0.55, 0.85, 1.0, 1.0), (0.85, 0.85, 0.85, 0.4), (1.0, 0.9, 0.2, 1.0)
 
 
@@ -204,6 +206,8 @@ def draw_lines(viewer: Viewer, area: ui.Area) -> None:
         _ruler(state.session.ruler, pen, metres)
         _notes(state.session.notes, pen)
         paint.pop_clip_rect()
+    if "cube" in shown:  # as files call them
+        _axes(state.view, area)
     foot = [] if grid is None else [f"grid {overlays.length_text(grid.spacing, metres)}"]
     if state.view.orthographic:
         span = overlays.length_text(state.view.span_in(*state.size), metres)
@@ -315,6 +319,16 @@ def _grid(grid: overlays.Grid, pen: Pen) -> None:
         place = pen.place(point)
         if place is not None:
             paint.add_text(ImVec2(*(place + (3, 0))), packed, text)
+
+
+def _axes(view: OrbitCamera, area: ui.Area) -> None:
+    """Draw the world's axes in the upper right corner. ImGuizmo's cube takes y as up and names no side."""
+    side = min(hello_imgui.em_size(AXES_EM), area.width, area.height)
+    paint, middle = imgui.get_background_draw_list(), (area.corners[1].x - side / 2, area.top + side / 2)
+    for (letter, colour), axis in zip(AXES, view.rotation.T, strict=True):
+        end = ImVec2(*(np.array(middle) + 0.35 * side * axis[:2]))
+        paint.add_line(ImVec2(*middle), end, _faded(colour, 1.0), 2.0)
+        paint.add_text(end, _faded(colour, 1.0), letter)
 
 
 def _ruler(ruler: Ruler, pen: Pen, metres: float | None) -> None:
@@ -474,78 +488,12 @@ def pointed_figures(hover: Hover) -> list[str]:
     return [*lines, f"at {x:.2f}  {y:.2f}  {z:.2f}, {hover.found.depth:.2f} away"]
 
 
-# Axes over the image's corner; a click on the end of one turns the view there. ImGuizmo's cube takes y as up
-# and names no side; its documentation warns of a patent.
-
-SIDE_EM = 7.0  # of the corner that they take
-REACH_OF_ENDS, REACH_OF_AXES = 0.40, 0.26  # of that side, from the middle
-AXES = (("x", (0.93, 0.33, 0.31)), ("y", (0.45, 0.78, 0.30)), ("z", (0.36, 0.60, 0.98)))  # the world's
-GREY, LIT = (0.75, 0.75, 0.75), (0.98, 0.78, 0.35)
-
-
-def draw_axes(viewer: Viewer, area: ui.Area) -> None:
-    """Draw the world's axes, and the sides that a scene can be looked at from."""
-    view = viewer.state.view
-    if view is None or "cube" not in viewer.state.session.overlays:  # as files call them
-        return
-    side = min(hello_imgui.em_size(SIDE_EM), area.width, area.height)
-    corner = np.array([area.left + area.width - side, area.top])
-    imgui.push_style_var(imgui.StyleVar_.window_padding, ImVec2(0, 0))
-    imgui.set_next_window_pos(ImVec2(*corner))
-    imgui.set_next_window_size(ImVec2(side, side))
-    imgui.begin("axes", None, UNMOVED)
-    pressed = imgui.invisible_button("sides", ImVec2(side, side))
-    paint, middle = imgui.get_window_draw_list(), corner + side / 2
-    for (letter, paint_of), axis in zip(AXES, view.rotation.T, strict=True):
-        end = middle + REACH_OF_AXES * side * axis[:2]
-        paint.add_line(ImVec2(*middle), ImVec2(*end), _faded(paint_of, 1.0), 2.0)
-        paint.add_text(ImVec2(*end), _faded(paint_of, 1.0), letter)
-    radius, mouse = 0.3 * imgui.get_text_line_height(), imgui.get_io().mouse_pos
-    ends = {name: view.rotation @ -from_side(view, name).rotation[2] for name in get_args(Side)}
-    under: Side | None = None
-    for name, end in sorted(ends.items(), key=lambda item: -item[1][2]):  # the nearest one last
-        x, y = middle + REACH_OF_ENDS * side * end[:2]
-        hovered = imgui.is_item_hovered() and np.hypot(mouse.x - x, mouse.y - y) < 2 * radius
-        under = name if hovered else under
-        colour = _faded(LIT if hovered else GREY, 0.95 if end[2] < 0.1 else 0.4)
-        paint.add_circle_filled(ImVec2(x, y), radius, colour)
-        if end[2] < 0.1:
-            paint.add_text(ImVec2(x - ui.width_of(name) / 2, y + radius), colour, name)
-    imgui.end()
-    imgui.pop_style_var()
-    if pressed and under is not None:
-        viewpoint.look_from(viewer, under)
-
-
 def _faded(colour: Iterable[float], alpha: float) -> int:
     red, green, blue = map(float, colour)
     return int(imgui.get_color_u32((red, green, blue, alpha)))
 
 
-# The panels "Overlays" and "Notes".
-
-
-def draw_overlays(viewer: Viewer) -> None:
-    """Draw the panel "Overlays": what is drawn over the image, and the ruler."""
-    state = viewer.state
-    for name, title in OVERLAY_TITLES.items():
-        if imgui.checkbox(title.capitalize(), name in state.session.overlays)[0]:
-            settings.toggle_overlay(viewer, name)
-    ruler, scene = state.session.ruler, state.scene
-    measure = with_key("Measure", settings.toggle_measuring)
-    imgui.begin_disabled(scene is None)
-    if imgui.checkbox(f"{measure}###measure", ruler.measures)[0]:
-        settings.toggle_measuring(viewer)
-    ui.tip("Click two points on the surface; Esc ends it")
-    imgui.end_disabled()
-    if ruler.measures:
-        metres = None if scene is None else scene.metres_per_unit
-        text = "click a second point" if ruler.points else "click a first point"
-        if ruler.length is not None:
-            text = overlays.length_text(ruler.length, metres)
-        ui.small_wrapped(text, ui.muted())
-        if scene is not None and metres is None:
-            ui.small_wrapped("the scene has no scale in metres; langsplat scale gives it one", ui.muted())
+# The panel "Notes".
 
 
 def draw_notes(viewer: Viewer) -> None:
@@ -555,11 +503,7 @@ def draw_notes(viewer: Viewer) -> None:
     pin = with_key("Pin one to what is clicked", settings.toggle_pinning)
     if imgui.checkbox(pin, state.pins_notes)[0]:
         settings.toggle_pinning(viewer)
-    if ui.button("Pin one to the selection", enabled=bool(state.marks.selected.any())):
-        settings.pin_to_selection(viewer)
-    if ui.next_button(
-        "Save project", "Notes, queries, selection, edits, views: one file, to be opened again"
-    ):
+    if ui.button("Save project", "Notes, queries, selection, edits, views: one file, to be opened again"):
         saving.save_project(viewer)
     imgui.end_disabled()
     if not state.session.notes:
