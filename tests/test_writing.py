@@ -26,8 +26,8 @@ from langsplat_core.pipeline.stages import kept
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.features import FeatureStore, ImageFeatures
 from langsplat_core.training.radiance.state import save_checkpoint
-from langsplat_viewer.files.projects import Bookmark, Shelf, save_preferences, write_flight
 from langsplat_viewer.output import Film, save_png, write_film
+from langsplat_viewer.projects import Bookmark, Shelf, save_preferences, write_flight
 from langsplat_viewer.session import Preferences
 from tests.support.file_samples import random_field
 from tests.support.processes import (

@@ -5,6 +5,7 @@ The menus, the keys, the list of keys and the list of commands are made from it.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain
 from pathlib import Path
 
@@ -52,6 +53,7 @@ class Command:
     does: str
     act: Callable[[Viewer], object]
     keys: tuple[str, ...] = ()
+    button: str = ""  # its label in a panel
     repeats: bool = False  # while held
     is_edit: bool = False  # belongs to the box while one types, as it does everywhere
     is_on: Callable[[Viewer], bool] | None = None  # for a check mark in the menu
@@ -104,8 +106,9 @@ def _tool(tool: Tool) -> Command:
     )
 
 
-def _export(does: str, part: Part, as_points: bool = False) -> Command:
-    return Command(does, lambda viewer: saving.export(viewer, Path.cwd(), part, as_points=as_points))
+def _export(button: str, does: str, part: Part, as_points: bool = False) -> Command:
+    act = partial(saving.export, folder=Path(), part=part, as_points=as_points)
+    return Command(does, act, (), button)
 
 
 def _side(side: Side, key: str) -> Command:
@@ -152,17 +155,19 @@ MENUS = ("File", "Edit", "Select", "View", "Camera", "Window", "Help")
 
 BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list of commands alone
     "File": (
-        Command("open a scene", opening.ask_for_file, ("Ctrl+O",)),
+        Command("open a scene", opening.ask_for_file, ("Ctrl+O",), "Open ..."),
         Command("reload the scene", opening.reload, ("F5",), apart=True),
         Command("next scene of the list", lambda v: opening.step_scene(v, 1), ("Ctrl+PageDown",)),
         Command("previous scene of the list", lambda v: opening.step_scene(v, -1), ("Ctrl+PageUp",)),
         Command("train a scene", lambda viewer: settings.open_panel(viewer, "Train"), apart=True),
-        Command("save a picture", saving.save_picture, ("Ctrl+S", "P"), icon="CAMERA", apart=True),
-        Command("save the view", saving.save_view),
+        Command(
+            "save a picture", saving.save_picture, ("Ctrl+S", "P"), "Save picture", icon="CAMERA", apart=True
+        ),
+        Command("save the view", saving.save_view, (), "Save view"),
         Command("save the project", saving.save_project, ("Ctrl+Shift+S",)),
-        Command("save a picture of the size of the film", saving.save_sized_picture),
-        Command("save a film of the path", saving.save_film),
-        Command("save the camera path", saving.save_path),
+        Command("save a picture of the film's size", saving.save_sized_picture, (), "Picture of this size"),
+        Command("save a film of the path", saving.save_film, (), "Save film"),
+        Command("save the camera path", saving.save_path, (), "Save path"),
         Command("quit", saving.quit_viewer, ("Ctrl+Q",), apart=True),
     ),
     "Edit": (
@@ -180,13 +185,13 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
         ),
     ),
     "Select": (
-        Command("select everything", editing.select_all, ("Ctrl+A",), is_edit=True),
-        Command("select nothing", editing.select_none, ("Ctrl+D", "Ctrl+Shift+A"), is_edit=True),
-        Command("invert the selection", editing.invert_selection, ("Ctrl+I",), is_edit=True),
+        Command("select everything", editing.select_all, ("Ctrl+A",), "All", is_edit=True),
+        Command("select nothing", editing.select_none, ("Ctrl+D", "Ctrl+Shift+A"), "None", is_edit=True),
+        Command("invert the selection", editing.invert_selection, ("Ctrl+I",), "Invert", is_edit=True),
         Command("select what the search found", editing.select_query, apart=True),
-        Command("select everything like the selection", editing.select_alike),
-        Command("grow the selection", editing.grow_selection),
-        Command("shrink the selection", editing.shrink_selection),
+        Command("select everything like the selection", editing.select_alike, (), "More like it"),
+        Command("grow the selection", editing.grow_selection, (), "Grow"),
+        Command("shrink the selection", editing.shrink_selection, (), "Shrink"),
         Command(
             "select with no tool: the left button turns the view",
             lambda viewer: editing.use_tool(viewer, None),
@@ -195,14 +200,14 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
             apart=True,
         ),
         *(_tool(tool) for tool in TOOLS),
-        Command("hide the selection", editing.hide_selected, ("H",), apart=True),
-        Command("isolate the selection", editing.isolate_selected, ("Shift+H",)),
-        Command("show all that is hidden", editing.show_hidden, ("U", "Alt+H")),
-        Command("delete the selection", editing.delete_selected, ("Delete",)),
-        _export("save the selection", "selection"),
-        _export("save the selection as points", "selection", as_points=True),
-        _export("save the rest", "rest"),
-        _export("save the scene without what was deleted", "edited"),
+        Command("hide the selection", editing.hide_selected, ("H",), "Hide", apart=True),
+        Command("isolate the selection", editing.isolate_selected, ("Shift+H",), "Isolate"),
+        Command("show all that is hidden", editing.show_hidden, ("U", "Alt+H"), "Show all"),
+        Command("delete the selection", editing.delete_selected, ("Delete",), "Delete"),
+        _export("Selection", "save the selection", "selection"),
+        _export("Points", "save the selection as points", "selection", as_points=True),
+        _export("Rest", "save the rest", "rest"),
+        _export("Scene", "save the scene without what was deleted", "edited"),
     ),
     "View": (
         *(_display(button, number) for number, button in enumerate(BUTTONS, 1)),
@@ -246,17 +251,21 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
         ),
     ),
     "Camera": (
-        Command("return to the opening view", viewpoint.reset_view, ("R", "Home"), icon="HOUSE"),
-        Command("frame everything", viewpoint.frame_scene, ("Shift+F",), icon="EXPAND"),
-        Command("focus on the latest result found", viewpoint.focus_result, ("F",), icon="CROSSHAIRS"),
-        Command("previous training camera", lambda v: viewpoint.step_camera(v, -1), (",",), True, apart=True),
-        Command("next training camera", lambda v: viewpoint.step_camera(v, 1), (".",), True),
-        Command("level the horizon", lambda viewer: viewpoint.move(viewer, level), apart=True),
-        Command("align the up axis with the picture", lambda viewer: viewpoint.move(viewer, adopt_up)),
+        Command("return to the opening view", viewpoint.reset_view, ("R", "Home"), "Reset", icon="HOUSE"),
+        Command("frame everything", viewpoint.frame_scene, ("Shift+F",), "Frame all", icon="EXPAND"),
+        Command(
+            "focus on the latest result found", viewpoint.focus_result, ("F",), "Focus", icon="CROSSHAIRS"
+        ),
+        Command(
+            "previous training camera", lambda v: viewpoint.step_camera(v, -1), (",",), "", True, apart=True
+        ),
+        Command("next training camera", lambda v: viewpoint.step_camera(v, 1), (".",), "", True),
+        Command("level the horizon", lambda v: viewpoint.move(v, level), (), "Horizon", apart=True),
+        Command("align the up axis with the picture", lambda v: viewpoint.move(v, adopt_up), (), "Align up"),
         *(_side(side, key) for side, key in SIDE_KEYS),
         Command("orthographic view, and back", viewpoint.toggle_orthographic, ("O", "Keypad5"), apart=True),
         Command("bookmark this view", viewpoint.add_bookmark, ("Ctrl+B",), apart=True),
-        Command("add a keyframe here", viewpoint.add_keyframe, ("K",)),
+        Command("add a keyframe here", viewpoint.add_keyframe, ("K",), "Add keyframe"),
         Command("play the camera path, or stop", viewpoint.toggle_playing, ("Shift+K",)),
     ),
     "Window": (
@@ -273,13 +282,15 @@ BY_MENU: dict[str, tuple[Command, ...]] = {  # those of "" are found in the list
     "": tuple(_panel(title) for title in PANEL_TITLES),
     "Help": (
         Command("find a command", settings.toggle_palette, ("Ctrl+Shift+P",)),
-        Command("first steps, and list of keys", settings.toggle_help, ("F1", "?")),
+        Command("first steps, and list of keys", settings.toggle_help, ("F1", "?"), "Help"),
     ),
 }
 COMMANDS: tuple[Command, ...] = (
     *chain(*BY_MENU.values()),
     Command("close what lies over the scene", settings.escape, ("Esc",)),
 )
+
+BY_BUTTON = {command.button: command for command in COMMANDS if command.button}
 
 # What the mouse does and what keys do for as long as they are held (`panels.navigation`), for people to read.
 HELD: tuple[tuple[str, str], ...] = (

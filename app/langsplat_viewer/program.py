@@ -1,5 +1,9 @@
-"""`langsplat-viewer`: arguments -> window, or an image or film without a window."""
+"""`langsplat-viewer`: arguments -> window, or an image or film without a window.
 
+Without one neither glfw nor imgui is imported.
+"""
+
+import logging
 import sys
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -7,12 +11,36 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from langsplat_core.cli.run import main, parsed
+from langsplat_core.display.displays import MAX_QUERIES
 from langsplat_core.errors import InputError
+from langsplat_core.io.files import check_output_file
+from langsplat_core.io.sidecar import SUFFIX
 from langsplat_core.progress import Progress, TerminalProgress, silent
-from langsplat_viewer.files.projects import PROJECTS
-from langsplat_viewer.options import ViewerOptions, chosen_camera, scene_path, services
+from langsplat_core.query.answers import QueryResult
+from langsplat_core.query.compose import check_phrase, run_phrase
+from langsplat_core.query.engine import QueryEngine
+from langsplat_core.scene import LEVELS, Camera, Scene
+from langsplat_core.scene.language import split_phrases
+from langsplat_viewer import output
+from langsplat_viewer.camera.controls import default_view, extent_of, from_camera, spanning
+from langsplat_viewer.camera.flight import Motion, turntable
+from langsplat_viewer.options import (
+    ViewerOptions,
+    check_display,
+    chosen_camera,
+    latent_level,
+    say_compiling,
+    scene_path,
+    services,
+)
+from langsplat_viewer.projects import PROJECTS, read_flight
+from langsplat_viewer.rendering.renderer import open_renderer
+from langsplat_viewer.rendering.request import plain_request, why_undrawable
+from langsplat_viewer.viewer import Services
 
+DEFAULT_SIZE = (1280, 720)
 WITHOUT_WINDOW = ("out", "turntable", "colour_map", "transparent", "near_cut", "far_cut")
+log = logging.getLogger("langsplat")
 
 
 @dataclass(frozen=True)
@@ -35,8 +63,6 @@ class ViewerCommand(ViewerOptions):
             self._window(path)
 
     def _without_window(self, path: Path) -> None:
-        from langsplat_viewer.headless import check_options, draw
-
         check_options(self)
         bars: AbstractContextManager[Progress] = nullcontext(silent)
         if sys.stderr.isatty():
@@ -57,6 +83,117 @@ class ViewerCommand(ViewerOptions):
         from langsplat_viewer.window import open_window
 
         open_window(path, self, services(self.encoder))
+
+
+# Images and films without a window.
+
+
+def check_options(options: ViewerOptions) -> Path:
+    """Return where the image or film goes. InputError where that cannot work, before anything slow."""
+    if options.path is not None and options.turntable is not None:
+        raise InputError("--path and --turntable are two films; choose one")
+    if options.path is not None and options.orthographic is not None:
+        raise InputError("--orthographic is for one view; the keyframes of a --path say it themselves")
+    if options.is_film and options.transparent:
+        raise InputError("--transparent is for pictures; films have a background")
+    if options.is_film:
+        return output.check_film(options.out, options.wanted_size)
+    if options.out is None:
+        raise InputError("--headless needs somewhere to draw to; add --out picture.png")
+    if options.out.suffix.lower() != ".png":
+        raise InputError(f"--out {options.out}: only PNG is written; end the name in .png")
+    check_output_file(options.out)
+    return options.out
+
+
+def draw(options: ViewerOptions, path: Path, services: Services, progress: Progress = silent) -> list[str]:
+    """Draw the image or film that is asked for; return lines for people and scripts.
+
+    The first is of the file, then follow one of each query, and what the answers stand on. Raises InputError
+    and what the services do.
+    """
+    out = check_options(options)
+    flight = None if options.path is None else read_flight(options.path)  # before anything slow is done
+    if out != options.out:
+        log.warning("PyAV is not installed: pictures are written into the folder %s instead", out)
+    progress("opening the scene", 0.1)
+    scene = services.load_scene(path)
+    reason = why_undrawable(scene.gaussians)
+    if reason:  # before a text encoder is loaded for nothing
+        raise InputError(f"{path}: {reason}; export it again, or open another scene")
+    check_display(scene, options.shown_display, options.query)
+    camera, engine = _first_camera(scene, options), services.engine(scene)
+    results = _answers(engine, options, camera, progress)
+    if out.suffix.lower() == output.VIDEO:  # whose sides are even, those of a training camera need not be
+        width, height = (max(side - side % 2, 2) for side in (camera.width, camera.height))
+        camera = camera.with_intrinsics(camera.intrinsics.fitted(width, height))
+    request = plain_request(
+        scene,
+        camera,
+        options.picture,
+        level=latent_level(options.level),
+        answers=results[-MAX_QUERIES:],  # as in the window, where a fourth takes the oldest one's colour
+        clip=options.clip,
+    )
+    if options.backend in ("auto", "cpu"):
+        say_compiling(progress)
+    if options.is_film:
+        extent = extent_of(scene)
+        motion: Motion | None = flight
+        if options.turntable is not None:
+            motion = turntable(from_camera(camera, extent), options.turntable)
+        assert motion is not None
+        cameras = output.cameras_of(motion, extent, options.fps, request.size)
+        lines = output.make_film(output.Shot(request, cameras, options.fps, options.backend), out, progress)
+    else:
+        progress("drawing", 0.8)
+        size = f"{camera.width}x{camera.height}"
+        with output.in_one_line(out, size), open_renderer(options.backend) as renderer:
+            output.save_png(out, output.draw_something(request, renderer))
+        lines = [f"{out}: {size}, {options.shown_display}"]
+    for reason in scene.unread:
+        if SUFFIX in reason:  # of the cameras it was said when they were read
+            log.warning("opened without its language field: %s", reason)
+    basis = [f"answers: {engine.basis.long}"] if results else []
+    return [*lines, *map(answer_line, results), *basis]
+
+
+def _first_camera(scene: Scene, options: ViewerOptions) -> Camera:
+    """Return the camera that is chosen, else the first training camera, else one that frames the scene."""
+    size = options.wanted_size
+    camera = chosen_camera(options.camera, scene) or (scene.cameras[0] if scene.cameras else None)
+    if camera is None:
+        camera = default_view(scene, extent_of(scene), size or DEFAULT_SIZE).camera(*(size or DEFAULT_SIZE))
+    elif size is not None and size != (camera.width, camera.height):
+        camera = camera.with_intrinsics(camera.intrinsics.fitted(*size))
+    if options.orthographic is not None:  # at the same eye
+        view = spanning(from_camera(camera, extent_of(scene)), options.orthographic)
+        camera = view.camera(camera.width, camera.height)
+    return camera
+
+
+def _answers(
+    engine: QueryEngine, options: ViewerOptions, camera: Camera, progress: Progress
+) -> tuple[QueryResult, ...]:
+    """Return the answers to the queries, in their order."""
+    phrases = [phrase for text in options.query for phrase in split_phrases(text) or [text]]
+    for phrase in phrases:  # before anything slow is done
+        check_phrase(engine, phrase, camera, progress)
+    return tuple(run_phrase(engine, phrase, options.level, camera, progress).answer for phrase in phrases)
+
+
+def answer_line(result: QueryResult) -> str:
+    """Return the answer as a line for people and for scripts."""
+    shown = None if result.verdict == "not here" else result.place
+    place = "none" if shown is None else "({})".format(", ".join(f"{v:.3f}" for v in shown))
+    verdict: str = result.verdict
+    if result.probability is not None:
+        verdict += f" ({100 * result.probability:.0f} %)"
+    level = LEVELS[result.level]
+    return f"'{result.phrase}': {verdict}, score {result.peak:.3f}, level {level}, place {place}"
+
+
+# The command line.
 
 
 def parse(args: Sequence[str]) -> ViewerCommand:

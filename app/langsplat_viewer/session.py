@@ -22,7 +22,7 @@ from langsplat_core.scene import FARTHEST, LEVELS, Scene
 from langsplat_core.scene.transform import Similarity, transform_scene
 from langsplat_viewer.camera.flight import Keyframe, Pose
 from langsplat_viewer.marks import Marks
-from langsplat_viewer.rendering.request import Clip, Splats, Split
+from langsplat_viewer.rendering.request import Clip, Splats, Split, widget
 
 SLOTS = MAX_QUERIES  # queries shown at a time: one colour each
 LONGEST_NAME, LONGEST_NOTE = 80, 500  # characters
@@ -37,7 +37,6 @@ Node = Annotated[int, Meta(ge=0, lt=2**31)]  # of the scene's tree
 Level = Annotated[int, Meta(ge=0, lt=len(LEVELS))]  # index into LEVELS
 Overlay = Literal["things", "cameras", "cube", "grid"]
 OVERLAYS: tuple[Overlay, ...] = get_args(Overlay)
-IN_CAMERA = {"panel": "Camera"}  # where a setting has its widget
 
 
 # Marks and transforms. Of masks a session keeps bits, an eighth of their size: histories hold a hundred.
@@ -127,9 +126,7 @@ class Query:
     """One line of the query list."""
 
     phrase: Phrase
-    cut: Annotated[float, Meta(ge=0, le=1)] | None = (
-        None  # relevancy from which on it answers, if set by hand
-    )
+    cut: Annotated[float, Meta(ge=0, le=1)] | None = None  # relevancy from which on it answers, by hand
     slot: Annotated[int, Meta(ge=0, lt=SLOTS)] | None = None  # index of its colour while shown, None: hidden
     shown_since: int = 0  # larger for a query shown later
 
@@ -279,17 +276,9 @@ class Preferences:
     panels: tuple[str, ...] | None = None  # titles of those that are open; None: those that are at first
     colour_map: ColourMap = "turbo"  # that a session begins with
     overlays: tuple[str, ...] = ()  # that a session begins with
-    fly_speed: Annotated[
-        float,
-        Meta(ge=0.05, le=4, title="Fly speed", description="Scene radii per second", extra=IN_CAMERA),
-    ] = 0.5
+    fly_speed: Annotated[float, widget("Camera", "Fly speed", "Scene radii per second", 0.05, 4)] = 0.5
     coarse_while_moving: Annotated[
-        bool,
-        Meta(
-            title="Coarse while moving",
-            description="Where drawing is slow: fewer pixels and merged Gaussians while the camera moves",
-            extra=IN_CAMERA,
-        ),
+        bool, widget("Camera", "Coarse while moving", "Where drawing is slow: fewer pixels, merged Gaussians")
     ] = True
 
     def with_recent(self, path: Path) -> "Preferences":

@@ -19,7 +19,7 @@ from langsplat_core.scene import Camera, Scene
 from langsplat_core.scene.language import Tree
 from langsplat_viewer.camera.controls import Extent, OrbitCamera
 from langsplat_viewer.camera.flight import Flight, Keyframe
-from langsplat_viewer.files.disk import Listing
+from langsplat_viewer.disk import Listing
 from langsplat_viewer.marks import Marks, Mode, Stroke, Tool, unmarked
 from langsplat_viewer.rendering.request import EditedScene, Pane, RenderRequest, edited_scene, panes
 from langsplat_viewer.session import Move, Note, Point, Preferences, Query, Session

@@ -18,10 +18,10 @@ from langsplat_core.query.engine import LoadEncoder, QueryEngine, no_field
 from langsplat_core.scene import LanguageField, Scene
 from langsplat_core.semantics.encoders import DEMO
 from langsplat_core.semantics.weights import local_path
-from langsplat_viewer.files.disk import Stamps, Watch
-from langsplat_viewer.files.projects import Shelf
+from langsplat_viewer.disk import Stamps, Watch
 from langsplat_viewer.jobs import Job, Worker, one_line
 from langsplat_viewer.marks import Marks
+from langsplat_viewer.projects import Shelf
 from langsplat_viewer.rendering.request import RenderRequest
 from langsplat_viewer.session import Point, Session
 from langsplat_viewer.state import OutlineView, SceneState, TrainingForm, ViewerState
@@ -221,6 +221,23 @@ class Viewer:
         `take_results` then calls `done` with its result, or `failed` with the reason, by default `say_error`.
         """
         return self.worker.submit(label, work, done, failed or self.say_error)
+
+    def ask_engine(
+        self,
+        label: str,
+        work: Callable[[QueryEngine, Progress], T],
+        done: Callable[[T], None],
+        failed: Callable[[str], None] | None = None,
+    ) -> None:
+        """Have the worker do `work` with the scene's engine; what it finds is dropped with the scene."""
+        engine, scene = self.engine, self.state.scene
+
+        def here(then: Callable[[Any], None]) -> Callable[[Any], None]:
+            return lambda found: then(found) if self.state.scene is scene else None
+
+        if engine is not None:
+            report = here(failed or self.say_error)
+            self.run(label, lambda progress: work(engine, progress), here(done), report)
 
     def searchable(self) -> QueryEngine | None:
         """Return the engine of a scene that can be searched; where there is none say why."""

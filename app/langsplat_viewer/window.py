@@ -18,7 +18,11 @@ from langsplat_core.errors import BackendError, InputError, LangSplatError
 from langsplat_viewer.actions import opening, queries, saving, settings, viewpoint
 from langsplat_viewer.camera.controls import spanning
 from langsplat_viewer.canvas import MOVING_BUDGET, Canvas
-from langsplat_viewer.files.projects import (
+from langsplat_viewer.jobs import give_memory_back, on_signals, one_line, share_one_heap
+from langsplat_viewer.options import ViewerOptions, chosen_camera, latent_level
+from langsplat_viewer.panels import layout, menus, navigation, outline, overlays, ui
+from langsplat_viewer.panels.navigation import Keyboard
+from langsplat_viewer.projects import (
     FILE_NAME,
     LAYOUT_NAME,
     PROJECTS,
@@ -28,10 +32,6 @@ from langsplat_viewer.files.projects import (
     preferences_folder,
     save_preferences,
 )
-from langsplat_viewer.jobs import give_memory_back, on_signals, one_line, share_one_heap
-from langsplat_viewer.options import ViewerOptions, chosen_camera, latent_level
-from langsplat_viewer.panels import layout, menus, navigation, outline, overlays, ui
-from langsplat_viewer.panels.navigation import Keyboard
 from langsplat_viewer.rendering.renderer import Backend, Renderer, renderer_for
 from langsplat_viewer.session import Preferences
 from langsplat_viewer.viewer import Services, Viewer

@@ -16,7 +16,7 @@ from langsplat_viewer.actions import settings, viewpoint
 from langsplat_viewer.camera import controls
 from langsplat_viewer.camera.controls import OrbitCamera, from_side, spanning
 from langsplat_viewer.camera.flight import Flight, Keyframe, camera_of, pose_at, pose_of
-from langsplat_viewer.files.projects import BOOKMARKS, Shelf
+from langsplat_viewer.projects import BOOKMARKS, Shelf
 from langsplat_viewer.rendering.renderer import renderer_for
 from langsplat_viewer.rendering.request import Clip, depth_range, image_formation, plain_request, why_nothing
 from langsplat_viewer.state import GLIDE_SECONDS, QueryAnswer

@@ -18,8 +18,8 @@ from langsplat_viewer import output
 from langsplat_viewer.actions import editing, opening, queries, saving, settings, viewpoint
 from langsplat_viewer.camera.controls import extent_of, orbit, zoom
 from langsplat_viewer.camera.flight import Flight, Keyframe
-from langsplat_viewer.files.projects import read_flight, write_flight
 from langsplat_viewer.output import Film, Shot, cameras_of, make_film, write_film
+from langsplat_viewer.projects import read_flight, write_flight
 from langsplat_viewer.rendering.renderer import render_image
 from langsplat_viewer.rendering.request import RenderRequest, plain_request
 from langsplat_viewer.viewer import Viewer

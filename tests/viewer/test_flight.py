@@ -14,7 +14,7 @@ from langsplat_core.errors import InputError
 from langsplat_viewer.camera import flight
 from langsplat_viewer.camera.controls import extent_of, from_camera, orbit
 from langsplat_viewer.camera.flight import Flight, Keyframe, Pose, pose_at, tangents
-from langsplat_viewer.files.projects import MOST_KEYFRAMES, read_flight, write_flight
+from langsplat_viewer.projects import MOST_KEYFRAMES, read_flight, write_flight
 from tests.support.fakes import blob_scene
 
 STEP = 1e-6  # seconds, of numerical velocities

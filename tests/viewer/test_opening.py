@@ -12,7 +12,7 @@ from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions import editing, opening, queries, settings, viewpoint
 from langsplat_viewer.camera.controls import orbit
-from langsplat_viewer.files.disk import MOST_LISTED, list_folder
+from langsplat_viewer.disk import MOST_LISTED, list_folder
 from langsplat_viewer.rendering.request import UNCLIPPED, Clip
 from tests.support.fakes import blob_scene
 from tests.support.windowless import SCENES, act, ask, errors, go, open_scene, result, settle

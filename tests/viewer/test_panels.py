@@ -24,13 +24,13 @@ from langsplat_viewer.camera import overlays
 from langsplat_viewer.camera.controls import extent_of, frame_of
 from langsplat_viewer.camera.overlays import PlacedText, placed
 from langsplat_viewer.commands import COMMANDS, PANEL_TITLES, matching
-from langsplat_viewer.files.projects import FILE_NAME, load_preferences, save_preferences
 from langsplat_viewer.panels import ui
 from langsplat_viewer.panels.layout import all_panels
 from langsplat_viewer.panels.navigation import chord
 from langsplat_viewer.panels.overlays import pointed_figures, said
 from langsplat_viewer.panels.select import box_of, dragged, gl_matrices
 from langsplat_viewer.panels.ui import elided
+from langsplat_viewer.projects import FILE_NAME, load_preferences, save_preferences
 from langsplat_viewer.session import MOST_RECENT, Preferences
 from langsplat_viewer.state import MAX_MESSAGES
 from tests.support.fakes import CENTRES, FakeEncoder, blob_scene, cameras

@@ -13,8 +13,8 @@ from langsplat_core.errors import EncoderError
 from langsplat_core.semantics.features import ImageFeatures
 from langsplat_viewer.actions import editing, opening, outline, queries, saving, settings
 from langsplat_viewer.actions.editing import take
-from langsplat_viewer.headless import answer_line
 from langsplat_viewer.panels.search import BINS, hint, histogram
+from langsplat_viewer.program import answer_line
 from langsplat_viewer.session import Query, Things
 from langsplat_viewer.viewer import Services
 from tests.support.fakes import CENTRES, FakeEncoder, as_trained, axis, blob_scene, calibrated_for, language

@@ -16,9 +16,9 @@ from langsplat_viewer.actions import editing, queries, saving, settings, viewpoi
 from langsplat_viewer.actions.editing import mark
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.commands import BUTTONS, COMMANDS, OVERLAY_TITLES, matching
-from langsplat_viewer.files.projects import load_preferences, save_preferences
 from langsplat_viewer.marks import Marks
-from langsplat_viewer.panels.display import compared_name
+from langsplat_viewer.panels.scene import compared_name
+from langsplat_viewer.projects import load_preferences, save_preferences
 from langsplat_viewer.rendering.renderer import ArrayRenderer, Inputs, renderer_for
 from langsplat_viewer.rendering.request import (
     AT_RANGE,

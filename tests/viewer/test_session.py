@@ -19,7 +19,8 @@ from langsplat_core.scene.transform import moving
 from langsplat_viewer.actions import editing, opening, queries, saving, settings, viewpoint
 from langsplat_viewer.actions.editing import mark
 from langsplat_viewer.camera.controls import orbit
-from langsplat_viewer.files.projects import (
+from langsplat_viewer.marks import Marks, hiding, unmarked
+from langsplat_viewer.projects import (
     NO_GROUPS,
     NOT_COMPARED,
     Shelf,
@@ -27,7 +28,6 @@ from langsplat_viewer.files.projects import (
     read_flight,
     read_project,
 )
-from langsplat_viewer.marks import Marks, hiding, unmarked
 from langsplat_viewer.rendering.request import Clip, Splats
 from langsplat_viewer.session import Note, Preferences, Query, Ruler, Things
 from langsplat_viewer.viewer import GESTURE, MOST_STEPS, Services, Viewer

@@ -18,7 +18,7 @@ from langsplat_core.pipeline.report import REPORT
 from langsplat_core.scene import Scene
 from langsplat_viewer import viewer as training_process
 from langsplat_viewer.actions import opening, settings, viewpoint
-from langsplat_viewer.files.disk import IN_TRAINING, PREVIEW, write_preview
+from langsplat_viewer.disk import IN_TRAINING, PREVIEW, write_preview
 from langsplat_viewer.state import TrainingForm
 from langsplat_viewer.viewer import PREVIEW_EVERY, TrainingProgress, command
 from tests.support.fakes import blob_scene

@@ -98,15 +98,9 @@ delete_selected = _verb(lambda marks: Marks(_nothing(marks), marks.hidden, marks
 
 def find(viewer: Viewer, label: str, work: Callable[[QueryEngine], Array], mode: Mode | None) -> None:
     """Have the worker find (N,) bool with the scene's engine, and take it."""
-    engine, scene = viewer.engine, viewer.state.scene
-    if engine is None:
-        return
-
-    def done(found: Array) -> None:
-        if viewer.state.scene is scene:
-            take(viewer, found, mode)
-
-    viewer.run(f"{label} the selection", lambda progress: work(engine), done)
+    viewer.ask_engine(
+        f"{label} the selection", lambda engine, _: work(engine), lambda found: take(viewer, found, mode)
+    )
 
 
 def reach(viewer: Viewer) -> float:
@@ -143,21 +137,20 @@ def of_thing(act: Callable[[Viewer, Array], None]) -> Callable[[Viewer, Target],
     """Return the action that has the worker find (N,) bool of a thing, and then does `act` with it."""
 
     def begin(viewer: Viewer, target: Target) -> None:
-        engine, scene, level = viewer.searchable(), viewer.state.scene, viewer.state.session.level
-        if engine is None:
-            return
+        level = viewer.state.session.level
 
-        def work(progress: Progress) -> Array:
+        def work(engine: QueryEngine, progress: Progress) -> Array:
             if isinstance(target, int):
                 return engine.tree.members(target)
             index = LEVELS.index("whole" if level == "auto" else level)
             return at_point(engine.surface, engine.regions, index, target)
 
         def done(members: Array) -> None:
-            if viewer.state.scene is scene and members.any():
+            if members.any():
                 act(viewer, members)
 
-        viewer.run("finding the thing", work, done)
+        if viewer.searchable() is not None:
+            viewer.ask_engine("finding the thing", work, done)
 
     return begin
 

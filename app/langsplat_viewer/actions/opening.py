@@ -15,16 +15,16 @@ from langsplat_core.pipeline.report import stated_warnings, work_folder
 from langsplat_core.progress import Progress
 from langsplat_core.query.engine import no_field
 from langsplat_core.scene import Scene, surface
+from langsplat_viewer import disk
 from langsplat_viewer.actions import viewpoint
 from langsplat_viewer.actions.editing import adopt
 from langsplat_viewer.actions.saving import leave
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.camera.controls import Extent, extent_of
-from langsplat_viewer.files import disk
-from langsplat_viewer.files.disk import Stamps, stamps
-from langsplat_viewer.files.projects import PATHS, PROJECTS, Project, read_project
+from langsplat_viewer.disk import Stamps, stamps
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.marks import unmarked
+from langsplat_viewer.projects import PATHS, PROJECTS, Project, read_project
 from langsplat_viewer.rendering.request import Split, why_undrawable
 from langsplat_viewer.session import Marked, Query, Session, Things
 from langsplat_viewer.state import FileChoice, Recording, SceneState, ViewerState

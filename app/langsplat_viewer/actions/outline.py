@@ -9,6 +9,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.display.displays import Subject, latent_colours, nodes
 from langsplat_core.progress import Progress
 from langsplat_core.query.describe import Describer
+from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.instances import axis_aligned_box
 from langsplat_core.query.inventory import Outline, scene_outline
 from langsplat_core.scene import NO_NODE
@@ -38,10 +39,7 @@ def wanted(viewer: Viewer) -> OutlineView | None:
 
 
 def _find(viewer: Viewer) -> None:
-    engine, scene = viewer.engine, viewer.state.scene
-    assert engine is not None
-
-    def work(progress: Progress) -> tuple[Describer, OutlineView]:
+    def work(engine: QueryEngine, progress: Progress) -> tuple[Describer, OutlineView]:
         describer = viewer.describing(engine, progress)
         progress("looking for what is here", 0.5)
         roots = scene_outline(describer)
@@ -50,14 +48,12 @@ def _find(viewer: Viewer) -> None:
         return describer, OutlineView(roots, tree, sizes)
 
     def done(found: tuple[Describer, OutlineView]) -> None:
-        if viewer.state.scene is scene:
-            viewer.describer, viewer.state.outline = found
+        viewer.describer, viewer.state.outline = found
 
     def failed(reason: str) -> None:
-        if viewer.state.scene is scene:
-            viewer.state.outline = OutlineView(problem=reason)
+        viewer.state.outline = OutlineView(problem=reason)
 
-    viewer.run("looking for what is here", work, done, failed)
+    viewer.ask_engine("looking for what is here", work, done, failed)
 
 
 def _totals(own: Array, parents: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
@@ -131,17 +132,13 @@ def teach(viewer: Viewer, name: str, members: Array, done: Callable[[str], None]
 
     What is saved from now on keeps it. `done` gets the name, if the scene is still there.
     """
-    engine, scene = viewer.engine, viewer.state.scene
-    if engine is None:
-        return
 
     def taught(word: TaughtWord) -> None:
-        if viewer.state.scene is scene:
-            done(word.name)
-            viewer.state.say(f"taught '{word.name}'; to keep it, save the scene")
-            ask_one(viewer, word.name)
+        done(word.name)
+        viewer.state.say(f"taught '{word.name}'; to keep it, save the scene")
+        ask_one(viewer, word.name)
 
-    viewer.run(f"teaching '{name}'", lambda progress: engine.teach(name, members), taught)
+    viewer.ask_engine(f"teaching '{name}'", lambda engine, _: engine.teach(name, members), taught)
 
 
 # The list of queries.
@@ -224,22 +221,19 @@ def explain(viewer: Viewer, query: Query) -> None:
 
 def prepare_suggestions(viewer: Viewer) -> None:
     """Have the worker find examples, once per scene, when it has nothing else to do."""
-    state, engine = viewer.state, viewer.engine
+    state = viewer.state
     if state.scene is state.suggestions_of or viewer.worker.current is not None:
         return
     scene = state.scene
     state.suggestions, state.suggestions_of = Suggestions(), scene
-    if engine is None or scene is None or not state.has_field:
+    if scene is None or not state.has_field:
         return
-    asked = engine if viewer.has_encoder_here else QueryEngine(scene)  # the phrasebook alone
+    here = viewer.has_encoder_here
 
-    def done(found: Suggestions) -> None:
-        if state.scene is scene:
-            state.suggestions = found
+    def work(engine: QueryEngine, progress: Progress) -> Suggestions:
+        return suggest(engine if here else QueryEngine(scene), progress=progress)  # else by the phrasebook
 
-    viewer.run(
-        "finding examples", lambda progress: suggest(asked, progress=progress), done, lambda reason: None
-    )
+    viewer.ask_engine("finding examples", work, partial(setattr, state, "suggestions"), lambda reason: None)
 
 
 def offers(viewer: Viewer, typed: str) -> tuple[str, tuple[str, ...]]:

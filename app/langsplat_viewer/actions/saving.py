@@ -22,7 +22,6 @@ from langsplat_core.scene import Scene
 from langsplat_viewer.actions.editing import has_scene, has_selection
 from langsplat_viewer.actions.viewpoint import path_motion
 from langsplat_viewer.camera.flight import pose_of
-from langsplat_viewer.files.projects import PATHS, PROJECTS, Project, write_flight, write_project
 from langsplat_viewer.options import say_compiling
 from langsplat_viewer.output import (
     VIDEO,
@@ -36,6 +35,7 @@ from langsplat_viewer.output import (
     make_film,
     save_png,
 )
+from langsplat_viewer.projects import PATHS, PROJECTS, Project, write_flight, write_project
 from langsplat_viewer.rendering.renderer import open_renderer
 from langsplat_viewer.session import Bookmark
 from langsplat_viewer.state import Leaving, flight_of

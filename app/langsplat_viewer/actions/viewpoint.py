@@ -11,7 +11,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError, LangSplatError, printable_line
 from langsplat_core.progress import Progress
 from langsplat_core.query.describe import Describer, Pointed, look_at_pixel
-from langsplat_core.query.engine import no_field
+from langsplat_core.query.engine import QueryEngine, no_field
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Camera
 from langsplat_viewer.actions.settings import open_panel
@@ -41,8 +41,8 @@ from langsplat_viewer.camera.flight import (
     view_of,
     with_keyframe,
 )
-from langsplat_viewer.files.projects import MOST_KEYFRAMES, read_flight
 from langsplat_viewer.jobs import one_line
+from langsplat_viewer.projects import MOST_KEYFRAMES, read_flight
 from langsplat_viewer.rendering.request import image_formation
 from langsplat_viewer.session import LONGEST_NAME, MOST_BOOKMARKS, Bookmark, Query
 from langsplat_viewer.state import GLIDE_SECONDS, SPACING, Glide, Hover, flight_of
@@ -410,15 +410,12 @@ def hover(viewer: Viewer, pixel: tuple[int, int] | None) -> None:
 
 
 def _ask(viewer: Viewer, place: Hover) -> None:
-    engine = viewer.engine
-    if engine is None:
-        return
-    camera = place.view.camera(*viewer.state.size)
+    camera, clip = place.view.camera(*viewer.state.size), viewer.state.session.clip
     phrases = tuple(query.phrase for query in viewer.state.shown() if query is not None)
-    settings = image_formation(engine.scene, camera, viewer.state.session.clip)
     results = [result for result in viewer.state.shown_results() if result is not None]
 
-    def work(progress: Progress) -> tuple[Describer, Pointed | None]:
+    def work(engine: QueryEngine, progress: Progress) -> tuple[Describer, Pointed | None]:
+        settings = image_formation(engine.scene, camera, clip)
         describer, cpu = viewer.describing(engine, progress), load_lifting_rasterizer("cpu")
         return describer, look_at_pixel(cpu, describer, camera, place.pixel, results, settings=settings)
 
@@ -426,7 +423,7 @@ def _ask(viewer: Viewer, place: Hover) -> None:
         viewer.describer, place.found = found
         place.phrases = phrases
 
-    viewer.run("looking under the cursor", work, done)
+    viewer.ask_engine("looking under the cursor", work, done)
 
 
 # Bookmarks.

@@ -10,7 +10,7 @@ from pathlib import Path
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_viewer.actions import opening, saving, settings
-from langsplat_viewer.files.disk import FolderEntry, Listing
+from langsplat_viewer.disk import FolderEntry, Listing
 from langsplat_viewer.panels import ui
 from langsplat_viewer.viewer import Viewer
 

@@ -9,7 +9,6 @@ from langsplat_core import registry
 from langsplat_viewer.actions import settings
 from langsplat_viewer.panels import (
     dialogs,
-    display,
     menus,
     outline,
     overlays,
@@ -38,9 +37,9 @@ class Panel:
 
 CORE_PANELS: tuple[Panel, ...] = (
     Panel("Search", LEFT, search.draw),
-    Panel("Display", MIDDLE, display.draw),
+    Panel("Display", MIDDLE, scene.draw_display),
     Panel("Camera", MIDDLE, viewpoint.draw_camera),
-    Panel("Scene", MIDDLE, scene.draw),
+    Panel("Scene", MIDDLE, scene.draw_scene),
     Panel("Outline", MIDDLE, outline.draw, is_open=False),
     Panel("Select", MIDDLE, select.draw, is_open=False),
     Panel("Transform", MIDDLE, select.draw_transform, is_open=False),

@@ -2,7 +2,6 @@
 
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
@@ -13,7 +12,7 @@ from langsplat_core.errors import LangSplatError
 from langsplat_core.scene import Camera
 from langsplat_core.scene.transform import Similarity, moving, scaling, similarity
 from langsplat_viewer import marks
-from langsplat_viewer.actions import editing, saving, settings
+from langsplat_viewer.actions import editing, settings
 from langsplat_viewer.marks import BRUSHES, MODES, REACHES, TOOLS, Marks, Mode, Tool
 from langsplat_viewer.panels import ui
 from langsplat_viewer.panels.overlays import say
@@ -22,38 +21,17 @@ from langsplat_viewer.session import Point
 from langsplat_viewer.state import EditForm, Gizmo
 from langsplat_viewer.viewer import Viewer
 
-CHANGES: tuple[ui.Verb, ...] = (
-    ("All", editing.select_all, "Everything that is shown"),
-    ("None", editing.select_none, "Nothing"),
-    ("Invert", editing.invert_selection, "What was not selected"),
-    ("Grow", editing.grow_selection, "And what is within reach along the surface"),
-    ("Shrink", editing.shrink_selection, "Without what is within reach of the rest"),
-    ("More like it", editing.select_alike, "Everything that is like what is selected, and that too"),
-)
-FATES: tuple[ui.Verb, ...] = (
-    ("Hide", editing.hide_selected, "Out of the picture"),
-    ("Isolate", editing.isolate_selected, "Everything else out of the picture"),
-    ("Show all", editing.show_hidden, "Everything that was hidden"),
-    ("Delete", editing.delete_selected, "Out of the scene; its file stays as it is"),
-)
-OF_SELECTED = {
-    *("None", "Grow", "Shrink", "More like it"),
-    *("Hide", "Isolate", "Delete"),
-    *("Selection", "Rest", "Points"),
-}
-FILES: tuple[ui.Verb, ...] = (
-    ("Selection", lambda viewer: saving.export(viewer, Path.cwd(), "selection"), "A PLY with its field"),
-    ("Rest", lambda viewer: saving.export(viewer, Path.cwd(), "rest"), "Everything else as a PLY"),
-    (
-        "Points",
-        lambda viewer: saving.export(viewer, Path.cwd(), "selection", as_points=True),
-        "The selection as a point cloud",
-    ),
-    (
-        "Scene",
-        lambda viewer: saving.export(viewer, Path.cwd(), "edited"),
-        "The scene without what was deleted, as a new PLY",
-    ),
+OF_SELECTED = (
+    "None",
+    "Grow",
+    "Shrink",
+    "More like it",
+    "Hide",
+    "Isolate",
+    "Delete",
+    "Selection",
+    "Rest",
+    "Points",
 )
 
 
@@ -65,19 +43,19 @@ def draw(viewer: Viewer) -> None:
     _tools(viewer)
     _found(viewer)
     imgui.separator()
-    ui.verbs(viewer, CHANGES, disabled)
+    ui.verbs(viewer, "All", "None", "Invert", "Grow", "Shrink", "More like it", disabled=disabled)
     reach = ui.slider(
         "Reach", viewer.state.tools.reach, REACHES, "%.3f of the scene", logarithmic=True, ems=12
     )
     editing.set_tools(viewer, reach=reach)
     _name(viewer)
     imgui.separator()
-    ui.verbs(viewer, FATES, disabled)
+    ui.verbs(viewer, "Hide", "Isolate", "Show all", "Delete", disabled=disabled)
     imgui.separator()
     imgui.align_text_to_frame_padding()
     imgui.text("Save")
     imgui.same_line()
-    ui.verbs(viewer, FILES, disabled)
+    ui.verbs(viewer, "Selection", "Rest", "Points", "Scene", disabled=disabled)
     imgui.end_disabled()
 
 
@@ -233,10 +211,6 @@ OPERATIONS = {
 GIZMOS: dict[Gizmo, str] = {
     kind: f"{'No gizmo' if kind == 'off' else kind.capitalize()}##gizmo" for kind in get_args(Gizmo)
 }
-OF_BOX: tuple[ui.Verb, ...] = (
-    ("Fit", editing.fill_box, "The box around the selection, or around everything"),
-    ("Crop", editing.crop, "Delete what lies outside the box; the file stays as it is"),
-)
 NEAR, FAR = 1e-3, 1e3  # depths that the gizmo's camera sees, of the distance to what it turns around
 
 
@@ -256,7 +230,10 @@ def draw_transform(viewer: Viewer) -> None:
     high = _three("To", form.high, "The opposite corner")
     if (low, high) != (form.low, form.high):
         editing.set_box(viewer, low, high)
-    ui.verbs(viewer, OF_BOX)
+    if ui.button("Fit", "The box around the selection, or around everything"):
+        editing.fill_box(viewer)
+    if ui.next_button("Crop", "Delete what lies outside the box; the file stays as it is"):
+        editing.crop(viewer)
     imgui.end_disabled()
 
 

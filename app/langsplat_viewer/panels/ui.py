@@ -14,7 +14,7 @@ from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
 from msgspec import Meta
 
 from langsplat_core.arrays import Array
-from langsplat_viewer.commands import with_key
+from langsplat_viewer.commands import BY_BUTTON, with_key
 from langsplat_viewer.session import Preferences
 from langsplat_viewer.viewer import Viewer
 
@@ -186,16 +186,14 @@ def next_button(label: str, about: str = "", *, enabled: bool = True) -> bool:
     return button(label, about, enabled=enabled)
 
 
-Verb = tuple[str, Callable[[Viewer], object], str]  # of a button: its label, what it does, its tip
-
-
-def verbs(viewer: Viewer, buttons: Sequence[Verb], disabled: Container[str] = ()) -> None:
-    """Draw buttons beside each other, each with the key of its command in its tip; do what is clicked."""
-    for place, (label, act, about) in enumerate(buttons):
+def verbs(viewer: Viewer, *buttons: str, disabled: Container[str] = ()) -> None:
+    """Draw the buttons of commands beside each other, each with its words and key as a tip."""
+    for place, label in enumerate(buttons):
         if place:
             beside(label)
-        if button(label, with_key(about, act).strip(), enabled=label not in disabled):
-            act(viewer)
+        command = BY_BUTTON[label]
+        if button(label, with_key(command.does.capitalize(), command.act), enabled=label not in disabled):
+            command.act(viewer)
 
 
 def box(label: str, hint: str, text: str, width: float = -1.0) -> tuple[bool, str]:

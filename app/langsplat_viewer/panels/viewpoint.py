@@ -7,7 +7,7 @@ from imgui_bundle import hello_imgui, imgui
 
 from langsplat_core.scene import Camera
 from langsplat_viewer.actions import saving, settings, viewpoint
-from langsplat_viewer.camera.controls import FOV_RANGE, OrbitCamera, adopt_up, level, with_fov
+from langsplat_viewer.camera.controls import FOV_RANGE, OrbitCamera, with_fov
 from langsplat_viewer.camera.flight import Keyframe
 from langsplat_viewer.commands import with_key
 from langsplat_viewer.options import MAX_SIDE
@@ -18,22 +18,13 @@ from langsplat_viewer.viewer import Viewer
 CUT_RANGE = (0.01, 20.0)  # of the scene's radius, the least and most that a cut can be chosen
 
 
-VIEWS: tuple[ui.Verb, ...] = (
-    ("Reset", viewpoint.reset_view, "Return to the opening view"),
-    ("Focus", viewpoint.focus_result, "Go to the latest answer"),
-    ("Frame all", viewpoint.frame_scene, "Show the whole scene from this side"),
-    ("Horizon", lambda viewer: viewpoint.move(viewer, level), "Turn the picture until the horizon is level"),
-    ("Align up", lambda viewer: viewpoint.move(viewer, adopt_up), "Take the picture's up as the world's up"),
-)
-
-
 def draw_camera(viewer: Viewer) -> None:
     """Draw the panel "Camera"."""
     state = viewer.state
     imgui.begin_disabled(state.view is None)
     if state.scene is not None and state.scene.cameras:
         _training_cameras(viewer, state.scene.cameras)
-    ui.verbs(viewer, VIEWS)
+    ui.verbs(viewer, "Reset", "Focus", "Frame all", "Horizon", "Align up")
     if state.view is not None:
         _projection(viewer, state.view)
     if state.extent is not None:
@@ -89,10 +80,6 @@ def _training_cameras(viewer: Viewer, cameras: Sequence[Camera]) -> None:
 
 ROWS = 3.5  # of the list: the half one says that there are more
 NUMBER_EM, FPS_EM = 7.5, 4.5
-FILMS: tuple[ui.Verb, ...] = (
-    ("Save film", saving.save_film, ""),
-    ("Save picture##sized", saving.save_sized_picture, "What is shown now, in this size"),
-)
 
 
 def draw_record(viewer: Viewer) -> None:
@@ -116,7 +103,8 @@ def _play(viewer: Viewer) -> None:
     record, seconds = viewer.state.record, viewpoint.path_seconds(viewer)
     imgui.begin_disabled(seconds <= 0)
     label = "Stop##path" if record.began is not None else "Play##path"
-    ui.verbs(viewer, [(label, viewpoint.toggle_playing, "Play")])
+    if ui.button(label, with_key("Play", viewpoint.toggle_playing)):
+        viewpoint.toggle_playing(viewer)
     imgui.same_line()
     loop = ui.width_of("Loop") + imgui.get_frame_height() + 2 * imgui.get_style().item_spacing.x
     imgui.set_next_item_width(-loop)
@@ -147,8 +135,9 @@ def _number(label: str, value: float, step: float) -> float | None:
 
 def _keyframes(viewer: Viewer) -> None:
     record, keyframes = viewer.state.record, viewer.state.session.keyframes
-    edits = ("Add keyframe", viewpoint.add_keyframe, "The current view"), ("Clear", viewpoint.clear_path, "")
-    ui.verbs(viewer, edits, () if keyframes else ("Clear",))
+    ui.verbs(viewer, "Add keyframe")
+    if ui.next_button("Clear", enabled=bool(keyframes)):
+        viewpoint.clear_path(viewer)
     ui.beside("Duration", hello_imgui.em_size(NUMBER_EM))
     _duration(viewer)
     rows = [
@@ -162,7 +151,7 @@ def _keyframes(viewer: Viewer) -> None:
     if gone is not None:
         viewpoint.delete_keyframe(viewer, keyframes[gone])
     _chosen(viewer, record.chosen)
-    ui.verbs(viewer, [("Save path", saving.save_path, "A new file; dropped onto the window, it comes back")])
+    ui.verbs(viewer, "Save path")
 
 
 def _chosen(viewer: Viewer, key: Keyframe | None) -> None:
@@ -200,7 +189,7 @@ def _films(viewer: Viewer) -> None:
         if ui.stoppable(*work, tag="film"):
             saving.cancel_film(viewer)
         return
-    ui.verbs(viewer, FILMS)
+    ui.verbs(viewer, "Save film", "Picture of this size")
 
 
 # The panel "Bookmarks".

@@ -22,6 +22,13 @@ from langsplat_viewer.marks import Marks
 
 # View settings that a request has.
 
+SH_DEGREE = len(SH_COUNTS) - 1
+
+
+def widget(panel: str, title: str, about: str, low: float | None = None, high: float | None = None) -> Meta:
+    """Return the annotation of a setting that has a widget in a panel; its bounds hold for files, too."""
+    return Meta(ge=low, le=high, title=title, description=about, extra={"panel": panel})
+
 
 @dataclass(frozen=True)
 class Clip:
@@ -46,26 +53,10 @@ UNCLIPPED = Clip()
 class Splats:
     """Sizes and colours of the Gaussians as drawn; answers and files have them as they are."""
 
-    size: Annotated[
-        float,
-        Meta(
-            ge=0.1,
-            le=1,
-            title="Splat size",
-            description="Smaller, every Gaussian can be seen; answers and files do not change",
-            extra={"panel": "Display"},
-        ),
-    ] = 1.0  # factor of every axis
+    size: Annotated[float, widget("Display", "Splat size", "Draw every Gaussian smaller", 0.1, 1)] = 1.0
     sh_degree: Annotated[
-        int,
-        Meta(
-            ge=0,
-            le=len(SH_COUNTS) - 1,
-            title="SH degree",
-            description="Up to which degree colours change with the direction that they are seen from",
-            extra={"panel": "Display"},
-        ),
-    ] = len(SH_COUNTS) - 1  # at most
+        int, widget("Display", "SH degree", "How much colours change with the direction", 0, SH_DEGREE)
+    ] = SH_DEGREE  # at most
 
 
 SplitMode = Literal["off", "wipe", "levels", "scenes"]

@@ -14,7 +14,7 @@ from langsplat_core.io.ply import write_ply
 from langsplat_core.io.scenes import format_of
 from langsplat_core.pipeline.report import work_folder
 from langsplat_core.scene import Gaussians
-from langsplat_viewer.files.projects import PATHS, PROJECTS
+from langsplat_viewer.projects import PATHS, PROJECTS
 
 # Folders of the file browser.
 

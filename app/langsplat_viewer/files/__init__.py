@@ -1,1 +1,0 @@
-"""Files that the window reads and writes beside scenes."""
