@@ -24,7 +24,7 @@ from msgspec import Meta, Struct
 from langsplat_core.arrays import Array, logit, rotation_matrices, sigmoid, unit
 from langsplat_core.errors import InputError, malformed, quoted
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.hostile import decode_json, is_plain_name, read_file
+from langsplat_core.io.hostile import FREE, SMALL_RATIO, Room, decode_json, is_plain_name, read_file
 from langsplat_core.io.quantised import mirrored, to_bytes
 from langsplat_core.io.spz import decode_spz
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
@@ -42,7 +42,6 @@ COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 512
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 MAGIC, JSON_CHUNK, BINARY_CHUNK = b"glTF", b"JSON", b"BIN\0"
 JSON_LIMIT = 16 << 20  # bytes; ours has 10 kB
-LEAST_ROW = 12  # bytes of a Gaussian: its position
 MOST_NODES = 1 << 16
 SIGNS = np.array([-1, -1, 1], np.float32)  # left up front to right down front, and back
 SRGB = "srgb_rec709_display"
@@ -138,7 +137,6 @@ def read_gltf_scene(path: Path | str) -> Scene:
 
 def _parts(file: "_File") -> Iterator[Gaussians]:
     """Yield the Gaussians of every primitive that has some, placed by their nodes, along glTF's axes."""
-    left = file.size  # bytes that are not shown yet: an honest file has no need to show one again and again
     for matrix, primitive in _placed(file):
         splatting = primitive.extensions[EXTENSION]
         if primitive.mode != POINTS:
@@ -148,15 +146,12 @@ def _parts(file: "_File") -> Iterator[Gaussians]:
         packed = next(
             (found.buffer_view for name, found in splatting.extensions.items() if name in PACKED), None
         )
-        data = b"" if packed is None else file.view(packed)[0]
-        count = 0 if packed is not None else file.content.accessors[primitive.attributes["POSITION"]].count
-        left -= len(data) + LEAST_ROW * count
-        if left < 0:
-            raise malformed(file.path, f"shows more Gaussians than {file.size} bytes can hold")
         if packed is not None:
-            gaussians = mirrored(decode_spz(bytes(data), file.path).gaussians, SIGNS)
+            data = bytes(file.view(packed)[0])
+            file.room.take(1 << 16)  # the time of small ones counts too
+            gaussians = mirrored(decode_spz(data, file.path, file.room).gaussians, SIGNS)
         else:
-            gaussians = _gaussians(file, primitive.attributes, count)
+            gaussians = _gaussians(file, primitive.attributes)
         try:
             place = similarity(matrix)
             yield gaussians if place.is_identity else transform_gaussians(gaussians, place)
@@ -193,8 +188,9 @@ def _matrix(node: _Node) -> Array:
     return matrix
 
 
-def _gaussians(file: "_File", attributes: dict[str, int], count: int) -> Gaussians:
-    """`count` Gaussians along glTF's axes."""
+def _gaussians(file: "_File", attributes: dict[str, int]) -> Gaussians:
+    """Gaussians along glTF's axes."""
+    count = file.content.accessors[attributes["POSITION"]].count
 
     def column(name: str, width: int) -> Array:
         return file.accessor(attributes[name], width, count, name)
@@ -218,7 +214,10 @@ class _File:
     def __init__(self, path: Path) -> None:
         self.path = path
         text = memoryview(read_file(path, 2**32))
-        self.size, self._binary = len(text), text[:0]
+        self._binary = text[:0]
+        # Numbers as they are stored, which an honest file shows once or a few times; Gaussians packed in it
+        self._shown = Room(path, len(text), 1, FREE // 4)
+        self.room = Room(path, len(text), SMALL_RATIO)
         self._buffers: dict[int, bytes | memoryview] = {}
         if text[:4] == MAGIC:  # then version, length; size and kind of a chunk; JSON; the same of the buffer
             end = 20 + int.from_bytes(text[12:16], "little")
@@ -248,6 +247,7 @@ class _File:
         stride = stride or row
         if not row <= stride <= max(row, 252) or offset + stride * (count - 1) + row > len(data):
             raise malformed(self.path, f"truncated: {name} of {count} Gaussians does not fit its buffer")
+        self._shown.take(max(count * row, 512))  # the time of small ones counts too
         shape, strides = (count, width), (stride, dtype.itemsize)
         values: Array = np.ndarray(shape, dtype, data, offset, strides).astype(np.float32)
         if about.normalized and dtype.kind in "iu":
@@ -274,8 +274,9 @@ class _File:
                 except ValueError:
                     raise malformed(self.path, f"buffer {index} is not base64") from None
             elif is_plain_name(name := unquote(str(uri))):
-                self._buffers[index] = read_file(self.path.parent / name, 2**40)
-                self.size += len(self._buffers[index])
+                self._buffers[index] = read_file(self.path.parent / name, 2**32)
+                self._shown.left += len(self._buffers[index])
+                self.room.left += SMALL_RATIO * len(self._buffers[index])
             else:
                 raise malformed(self.path, f"buffer {quoted(uri)} is no plain file name")
         return self._buffers[index]

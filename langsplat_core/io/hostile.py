@@ -9,6 +9,7 @@ import json
 import logging
 import math
 import stat
+import struct
 import warnings
 import zipfile
 from collections.abc import Iterator
@@ -31,8 +32,36 @@ from langsplat_core.errors import (
     remedy,
 )
 from langsplat_core.io.files import atomic_path
+from langsplat_core.scene import SH_COUNTS
 
 T = TypeVar("T")
+
+# ---- memory: what a file decodes to is counted against the bytes that it has, before it is held ----
+
+FREE = 48 << 20  # bytes that any file may decode to
+# Bytes in memory for each of the file: arrays as they are, or of 8 bits widened to 32; and rows of Gaussians
+# whose formats are made to be small. Honest files of these have 8 to 20; a deflated hole has 1000.
+PLAIN_RATIO, SMALL_RATIO = 4, 32
+
+
+class Room:
+    """What may still be decoded of one file; it becomes less as its parts are read."""
+
+    def __init__(self, path: object, size: int, ratio: int = PLAIN_RATIO, free: int = FREE) -> None:
+        """path: for messages; size: of the file, bytes as they lie on the disk."""
+        self._path, self._size, self.left = path, size, free + ratio * size  # left: bytes
+
+    def take(self, size: int) -> None:
+        """Count `size` bytes before they are held; FormatError where the file is too small for them."""
+        self.left -= size
+        if self.left < 0:
+            what = f"its {self._size} bytes unfold to far more than files of this kind do"
+            raise malformed(self._path, f"truncated, or made to exhaust memory: {what}")
+
+    def take_gaussians(self, count: int, sh_degree: int) -> None:
+        """Count whole rows of Gaussians, as they are once decoded."""
+        self.take(4 * count * (11 + 3 * SH_COUNTS[sh_degree]))
+
 
 # ---- .npy and .npz: plain numbers or texts, read without pickles and without belief in their headers ----
 
@@ -66,12 +95,15 @@ def read_npz(path: Path) -> dict[str, Array]:
         for member in archive.names:
             data = archive.read(member, 2**31)
             name = member.removesuffix(".npy")
-            arrays[name] = _parse(io.BytesIO(data), len(data), f"{path}: {quoted(name, 60)}")
+            arrays[name] = _parse(io.BytesIO(data), len(data), f"{path}: {quoted(name, 60)}", data)
     return arrays
 
 
-def _parse(file: BinaryIO, size: int, name: str) -> Array:
-    """`numpy.load` that believes the header only as far as `size` bytes of `file` go; `name` for messages."""
+def _parse(file: BinaryIO, size: int, name: str, whole: bytes | None = None) -> Array:
+    """`numpy.load` that believes the header only as far as `size` bytes of `file` go.
+
+    name: for messages; whole: the content, where it is in memory already and need not be copied.
+    """
     form = np.lib.format
     try:
         if form.read_magic(file) != (1, 0):  # as NumPy writes all but records of thousands of columns
@@ -85,7 +117,7 @@ def _parse(file: BinaryIO, size: int, name: str) -> Array:
     left = size - file.tell()
     if math.prod(shape) * dtype.itemsize != left:
         raise malformed(name, f"truncated or damaged: shape {quoted(shape)} does not fit its {left} bytes")
-    data = np.frombuffer(file.read(), dtype)
+    data = np.frombuffer(file.read() if whole is None else memoryview(whole)[file.tell() :], dtype)
     if dtype.kind == "U" and data.size:
         codes = data.view(data.dtype.byteorder.replace("|", "=") + "u4")
         if ((codes >= 0xD800) & (codes <= 0xDFFF) | (codes > 0x10FFFF)).any():  # NumPy raises SystemError
@@ -143,14 +175,22 @@ def read_file(path: Path, limit: int) -> bytes:
 
 def read_json_file(path: Path, limit: int) -> Any:
     """Return the value in a JSON file of at most `limit` bytes. Raises InputError and FormatError."""
+    text = read_file(path, limit)
     with _as_json(path):
-        return json.loads(read_file(path, limit))
+        _check_values(text, path)
+        return json.loads(text)
 
 
 def decode_json(text: bytes, kind: type[T], path: Path) -> T:
     """Return the value of a JSON text, which has to fit the msgspec structure `kind`; FormatError."""
     with _as_json(path):
+        _check_values(text, path)
         return msgspec.json.decode(text.decode(json.detect_encoding(text)), type=kind)
+
+
+def _check_values(text: bytes, path: Path) -> None:
+    """Count the values of a JSON text: a dictionary of three letters takes 240 bytes, a list 64."""
+    Room(path, len(text)).take(40 * text.count(b",") + 240 * text.count(b"{") + 64 * text.count(b"["))
 
 
 @contextmanager
@@ -158,6 +198,8 @@ def _as_json(path: Path) -> Iterator[None]:
     """Turn what bad syntax, endless nesting and digits, and unfitting values raise into FormatError."""
     try:
         yield
+    except LangSplatError:
+        raise
     except (RecursionError, ValueError) as error:
         raise malformed(path, f"not readable as JSON ({printable_line(error, 100)})") from None
 
@@ -169,18 +211,22 @@ def _as_json(path: Path) -> Iterator[None]:
 # archive. Only stored and deflated members are unpacked: no format that is read here uses other methods.
 
 
+MOST_DIRECTORY = 4 << 20  # bytes, in 40 000 names; zipfile makes objects of ten times the size
+
+
 class Archive:
     """The members of an open archive."""
 
     def __init__(self, archive: zipfile.ZipFile, path: Path, size: int) -> None:
         self._archive, self.path, self.size = archive, path, size  # size of the file, bytes
         self.names = archive.namelist()
+        self._room = Room(path, size)
 
     def read(self, name: str, limit: int) -> bytes:
         """Return the content of a member.
 
-        FormatError where there is none, or where it unfolds to more than `limit` bytes, which is noticed
-        before more are held.
+        FormatError where there is none, or where it unfolds to more than `limit` bytes or all that are read
+        together to more than the archive has room for, which is noticed before more are held.
         """
         try:
             info = self._archive.getinfo(name)
@@ -190,7 +236,8 @@ class Archive:
             what = f"{quoted(name, 60)} inside is packed by method {info.compress_type}"
             raise malformed(self.path, what, "pack the archive again with deflate")
         with self._archive.open(info) as member:
-            content = member.read(limit + 1)
+            content = member.read(min(limit, self._room.left) + 1)
+        self._room.take(len(content))
         if len(content) > limit:
             raise malformed(self.path, f"{quoted(name, 60)} inside has more than {limit} bytes")
         return content
@@ -206,6 +253,7 @@ def opened_archive(path: Path, kind: str) -> Iterator[Archive]:
     file, size = open_for_reading(path)
     with file:
         try:
+            _check_directory(file, size)
             with zipfile.ZipFile(file) as archive:
                 yield Archive(archive, path, size)
         except LangSplatError:
@@ -213,6 +261,20 @@ def opened_archive(path: Path, kind: str) -> Iterator[Archive]:
         except Exception as error:  # noqa: BLE001  any at all, see the top of this file
             what = str(error)[:80] or type(error).__name__
             raise malformed(path, f"not a readable {kind} ({what})") from None
+
+
+def _check_directory(file: BinaryIO, size: int) -> None:
+    """Raise ValueError for a directory of so many members that their objects would fill the memory."""
+    file.seek(max(0, size - (1 << 16) - 98))
+    tail = file.read()
+    for signature, form, at in ((b"PK\5\6", "<I", 12), (b"PK\6\6", "<Q", 40)):
+        place = tail.rfind(signature) + at
+        if (
+            place >= at
+            and len(tail) >= place + 8
+            and struct.unpack_from(form, tail, place)[0] > MOST_DIRECTORY
+        ):
+            raise ValueError(f"a directory of more than {MOST_DIRECTORY} bytes")
 
 
 # ---- images: the one place of the project that hands a file to Pillow ----

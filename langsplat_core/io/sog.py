@@ -31,7 +31,15 @@ from PIL import Image
 from langsplat_core.arrays import Array, logit, sigmoid
 from langsplat_core.errors import malformed, quoted
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.hostile import decode_json, is_plain_name, opened, opened_archive, read_file
+from langsplat_core.io.hostile import (
+    SMALL_RATIO,
+    Room,
+    decode_json,
+    is_plain_name,
+    opened,
+    opened_archive,
+    read_file,
+)
 from langsplat_core.io.quantised import smallest_three, to_bytes, without_largest
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
 
@@ -39,9 +47,6 @@ META_NAME = "meta.json"
 META_LIMIT = 1024 * 1024  # bytes; a real one has three codebooks, 15 kB
 PALETTE_ROW, PALETTE_ROWS = 64, 1024  # entries a row, most rows
 IMAGE_LIMIT = 1 << 30  # bytes of one image file
-# The low bytes of positions are close to noise: lossless compression gains 3 to 1 at best. An image that
-# claims to have gained 64 to 1 is made to exhaust memory.
-PIXELS_PER_BYTE = 64
 SLACK_PIXELS = 65536
 
 Fetch = Callable[[str, int], bytes]  # (file name, most bytes) -> content
@@ -102,27 +107,32 @@ def read_sog_scene(path: Path | str) -> Scene:
     if path.is_dir():
         path = path / META_NAME
     if path.suffix.lower() == ".json":
-        return _decode(lambda name, limit: read_file(path.parent / name, limit), path)
+        size = sum(file.stat().st_size for file in path.parent.glob("*") if file.is_file())
+        return _decode(lambda name, limit: read_file(path.parent / name, limit), path, size)
     with opened_archive(path, "SOG archive") as archive:
         # The images are compressed already, so a member far larger than its archive is a trap.
         most = 16 * archive.size + META_LIMIT
-        return _decode(lambda name, limit: archive.read(name, min(limit, most)), path / META_NAME)
+        return _decode(
+            lambda name, limit: archive.read(name, min(limit, most)), path / META_NAME, archive.size
+        )
 
 
-def _decode(fetch: Fetch, meta_path: Path) -> Scene:
-    """Decode the scene whose meta file `fetch` finds by the last part of `meta_path`."""
+def _decode(fetch: Fetch, meta_path: Path, size: int) -> Scene:
+    """Decode the scene, of `size` bytes, whose meta file `fetch` finds by the last part of `meta_path`."""
     text = fetch(meta_path.name, META_LIMIT)
     version = decode_json(text, _Versioned, meta_path).version
     if version != 2:
         what = f"SOG version {quoted(version)}; only 2 is read"
         raise malformed(meta_path, what, "export the scene again")
     meta = decode_json(text, _Meta, meta_path)
+    degree = meta.higher.bands if meta.higher is not None else 0
+    Room(meta_path, size, SMALL_RATIO).take_gaussians(meta.count, degree)
     antialiased = meta.model == "antialiased" or meta.antialias is True
     return Scene(_gaussians(_Planes(fetch, meta_path, meta.count), meta), antialiased=antialiased)
 
 
 def _gaussians(planes: "_Planes", meta: _Meta) -> Gaussians:
-    low, high = (planes.of_gaussians(name, True) for name in meta.means.files[:2])
+    low, high = (planes.of_gaussians(name) for name in meta.means.files[:2])
     fractions = (low[:, :3] + high[:, :3].astype(np.uint32) * 256) / 65535
     mins, maxs = np.array(meta.means.mins), np.array(meta.means.maxs)
     logs = mins + (maxs - mins) * fractions
@@ -130,20 +140,22 @@ def _gaussians(planes: "_Planes", meta: _Meta) -> Gaussians:
     if meta.count and quats[:, 3].min() < 252:
         raise malformed(planes.path, "'quats' holds an alpha below 252", "was the image saved lossily?")
     sh0 = planes.of_gaussians(meta.sh0.files[0])
-    base = np.array(meta.sh0.codebook)[sh0[:, :3]]
-    rest = np.zeros((meta.count, 0, 3))
+    base = np.array(meta.sh0.codebook, np.float32)[sh0[:, :3]]
+    rest = np.zeros((meta.count, 0, 3), np.float32)
     if meta.higher is not None:
         palette = planes.palette(meta.higher.files[0], SH_COUNTS[meta.higher.bands] - 1, meta.higher.count)
         labels = planes.of_gaussians(meta.higher.files[1])
         entry = labels[:, 0] + labels[:, 1].astype(np.uint32) * 256
         if entry.max(initial=0) >= len(palette):
             raise malformed(planes.path, f"a label of 'shN' is beyond the {len(palette)} of its palette")
-        rest = np.array(meta.higher.codebook)[palette[entry]]
+        rest = np.array(meta.higher.codebook, np.float32)[palette[entry]]
     with np.errstate(over="ignore"):  # overflow to infinity makes rows that are dropped later
         means = np.sign(logs) * np.expm1(np.abs(logs))
     return Gaussians(
         means=means,
-        log_scales=np.array(meta.scales.codebook)[planes.of_gaussians(meta.scales.files[0])[:, :3]],
+        log_scales=np.array(meta.scales.codebook, np.float32)[
+            planes.of_gaussians(meta.scales.files[0])[:, :3]
+        ],
         quats_wxyz=smallest_three((quats[:, :3] / 255 - 0.5) * np.sqrt(2), quats[:, 3] - 252),
         opacity_logits=logit(sh0[:, 3] / 255),
         sh=np.concatenate([base[:, None], rest], axis=1),
@@ -156,10 +168,10 @@ class _Planes:
     def __init__(self, fetch: Fetch, path: Path, count: int) -> None:
         self.path, self.count, self._fetch = path, count, fetch
 
-    def of_gaussians(self, name: str, is_noise: bool = False) -> Array:
-        """Return the (N, 4) uint8 rgba of an image; `is_noise`: which no compression gains much on."""
+    def of_gaussians(self, name: str) -> Array:
+        """Return the (N, 4) uint8 rgba of an image."""
         most = 2 * self.count + SLACK_PIXELS
-        pixels = self._image(name, lambda w, h: self.count <= w * h <= most, is_noise)
+        pixels = self._image(name, lambda w, h: self.count <= w * h <= most)
         return pixels.reshape(-1, 4)[: self.count]
 
     def palette(self, name: str, coefficients: int, entries: int) -> Array:
@@ -168,14 +180,12 @@ class _Planes:
         pixels = self._image(name, lambda w, h: w == width and rows <= h <= PALETTE_ROWS)
         return pixels[:rows].reshape(rows * PALETTE_ROW, coefficients, 4)[:entries, :, :3]
 
-    def _image(self, name: str, suits: Callable[[int, int], bool], is_noise: bool = False) -> Array:
+    def _image(self, name: str, suits: Callable[[int, int], bool]) -> Array:
         """(H, W, 4) uint8; `suits` judges (width, height) before anything is decoded."""
         if not is_plain_name(name):
             raise malformed(self.path, f"{quoted(name)} is no plain file name")
         what = f"{self.path}: image {quoted(name)}"
         data = self._fetch(name, IMAGE_LIMIT)
-        if is_noise and self.count > PIXELS_PER_BYTE * len(data) + SLACK_PIXELS:
-            raise malformed(what, f"{len(data)} bytes are too few for {self.count} Gaussians")
         with opened(data, what, ("WEBP", "PNG")) as image:
             if not suits(*image.size):
                 size = f"{image.width}x{image.height}"

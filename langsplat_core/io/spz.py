@@ -24,7 +24,7 @@ import numpy as np
 from langsplat_core.arrays import Array, logit, sigmoid
 from langsplat_core.errors import InputError, malformed
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.hostile import open_for_reading
+from langsplat_core.io.hostile import SMALL_RATIO, Room, open_for_reading
 from langsplat_core.io.quantised import mirrored, smallest_three, to_bytes, without_largest
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
 
@@ -32,10 +32,7 @@ MAGIC, GZIP_MAGIC = b"NGSP", b"\x1f\x8b"
 ANTIALIASED, EXTENDED = 0x1, 0x2  # flags
 AXES_RECORD, AXES_RUB = 0xADBE0003, 4
 SPZ_SH_COUNTS = (1, 4, 9, 16, 25)  # of degree 0 to 4, the base colour included
-# Quantised Gaussians compress 3 to 1 at best. A file that claims to have gained 64 to 1 is made to
-# exhaust memory.
-BYTES_PER_BYTE = 64
-SLACK = 1024 * 1024  # bytes, for small files of equal Gaussians, and for records behind them
+SLACK = 1024 * 1024  # bytes of records behind the Gaussians
 _HEADER = struct.Struct("<4sIIBBBB")
 
 
@@ -73,11 +70,10 @@ class _Packed:
     blocks: dict[str, Array]  # attribute -> (N, bytes of one Gaussian) uint8
 
 
-def _read_packed(file: BinaryIO, size: int, path: Path) -> _Packed:
+def _read_packed(file: BinaryIO, size: int, path: Path, room: Room) -> _Packed:
     """Read a file of `size` bytes; what it can honestly hold is known before anything is unpacked."""
     zipped = file.read(2) == GZIP_MAGIC
     file.seek(0)
-    limit = BYTES_PER_BYTE * size + SLACK if zipped else size
     stream: Any = gzip.GzipFile(fileobj=file) if zipped else file
     try:
         start = stream.read(_HEADER.size)
@@ -89,11 +85,11 @@ def _read_packed(file: BinaryIO, size: int, path: Path) -> _Packed:
             what = f".spz version {header.version}, SH degree {header.sh_degree}"
             raise malformed(path, what, "only versions 1 to 4 of degree 0 to 4 are read: export it again")
         sizes = [header.count * width for width in header.widths.values()]
+        room.take_gaussians(header.count, min(header.sh_degree, 3))
         if header.version == 4:
             blocks, records = _read_streams(file, size, header, sizes, path)
-        elif sum(sizes) > limit:
-            what = f"{header.count} Gaussians need {sum(sizes)} bytes, the file can hold {limit}"
-            raise malformed(path, f"truncated: {what}")
+        elif not zipped and sum(sizes) > size:
+            raise malformed(path, f"truncated: {header.count} Gaussians need {sum(sizes)} bytes of {size}")
         else:
             blocks = [stream.read(size) for size in sizes]
             records = stream.read(SLACK + 1)  # to the end, where gzip checks its sum
@@ -121,7 +117,7 @@ def _read_streams(
     if [whole for _, whole in entries if whole] != stored:
         raise malformed(path, f"the sizes in its table are not those of {header.count} Gaussians")
     end = at + sum(zipped for zipped, _ in entries)
-    if sum(stored) > BYTES_PER_BYTE * size + SLACK or end > len(content):
+    if end > len(content):
         raise malformed(path, f"truncated: its streams do not fit into {size} bytes")
     streams = []
     for zipped, whole in entries:
@@ -191,15 +187,15 @@ def read_spz_scene(path: Path | str) -> Scene:
     path = Path(path)
     file, size = open_for_reading(path)
     with file:
-        return _scene(_read_packed(file, size, path))
+        return _scene(_read_packed(file, size, path, Room(path, size, SMALL_RATIO)))
 
 
-def decode_spz(data: bytes, path: Path) -> Scene:
+def decode_spz(data: bytes, path: Path, room: Room) -> Scene:
     """Return the scene of an .spz file in memory, along the axes of the PLY.
 
-    path: for messages. Raises FormatError.
+    path: for messages; room: of the file that it is a part of. Raises FormatError.
     """
-    return _scene(_read_packed(io.BytesIO(data), len(data), path))
+    return _scene(_read_packed(io.BytesIO(data), len(data), path, room))
 
 
 def _scene(packed: _Packed) -> Scene:

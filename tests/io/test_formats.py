@@ -15,7 +15,7 @@ import pytest
 from plyfile import PlyData
 
 from langsplat_core.arrays import rotation_matrices, sigmoid, unit
-from langsplat_core.errors import FormatError, InputError
+from langsplat_core.errors import InputError
 from langsplat_core.io.gltf import EXTENSION, PACKED, write_gltf
 from langsplat_core.io.quantised import read_splat, write_splat
 from langsplat_core.io.scenes import load_gaussians, load_scene, save_scene
@@ -29,6 +29,7 @@ from tests.support.file_samples import (
     C0,
     assert_refused,
     assert_same,
+    glb,
     sog_files,
     splat_bytes,
     spz_bytes,
@@ -358,14 +359,6 @@ def parts(data: bytes) -> tuple[dict, bytes]:
     return json.loads(data[20 : 20 + size]), data[28 + size :]
 
 
-def glb(content: dict, binary: bytes) -> bytes:
-    text = json.dumps(content).encode()
-    text += b" " * (-len(text) % 4)
-    binary += bytes(-len(binary) % 4)
-    header = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text) + len(binary), len(text), b"JSON")
-    return header + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
-
-
 def changed(path: Path, scene: Gaussians, change: Callable[[dict], object] = lambda content: None) -> Path:
     """`scene` as a .glb whose JSON is changed in place."""
     write_gltf(path, scene)
@@ -460,10 +453,6 @@ def test_an_spz_inside_is_read(tmp_path, name):
     }
     (tmp_path / "a.glb").write_bytes(glb(content, data))
     assert_alike(load_gaussians(tmp_path / "a.glb"), load_gaussians(tmp_path / "a.spz"))
-    content["nodes"] = [{"mesh": 0}] * 3
-    (tmp_path / "a.glb").write_bytes(glb(content, data))
-    with pytest.raises(FormatError, match="more Gaussians than"):
-        load_gaussians(tmp_path / "a.glb")
 
 
 def test_quantised_and_interleaved_columns_are_read(tmp_path):
@@ -500,7 +489,7 @@ MALFORMED_GLTF = {
     "many rows": lambda c: [one.update(count=2**31) for one in c["accessors"]],
     "a sparse column": lambda c: c["accessors"][0].update(sparse={"count": 1}),
     "a circle": lambda c: c["nodes"][0].update(children=[0]),
-    "many instances": lambda c: c.update(nodes=[{"mesh": 0}] * 999, scenes=[{"nodes": list(range(999))}]),
+    "many instances": lambda c: c.update(nodes=[{"mesh": 0}] * 9999, scenes=[{"nodes": list(range(9999))}]),
     "a mirror": lambda c: c["nodes"][0].update(scale=[-1, 1, 1]),
     "an axis of its own": lambda c: c["nodes"][0].update(scale=[1, 2, 1]),
     "meshopt": lambda c: c.update(extensionsRequired=["EXT_meshopt_compression"]),

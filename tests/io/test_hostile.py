@@ -2,6 +2,7 @@
 
 import gzip
 import io
+import json
 import re
 import struct
 import zipfile
@@ -14,8 +15,10 @@ import pytest
 import zstandard
 from PIL import Image
 
+from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.datasets.photos import read_photo
 from langsplat_core.io.cameras import read_cameras
+from langsplat_core.io.gltf import COEFFICIENTS, EXTENSION
 from langsplat_core.io.hostile import (
     MOST_PIXELS,
     PictureError,
@@ -28,8 +31,9 @@ from langsplat_core.io.hostile import (
 from langsplat_core.io.ply import GREY, read_cloud
 from langsplat_core.io.scenes import formats, load_gaussians
 from langsplat_core.io.spz import read_spz_scene
-from tests.support.file_kinds import KINDS, STRICT, fuzz, tried
-from tests.support.file_samples import assert_refused, sog_files, spz_bytes, write_folder
+from langsplat_core.progress import silent
+from tests.support.file_kinds import KINDS, STRICT, FileKind, fuzz, tried
+from tests.support.file_samples import assert_refused, glb, sog_files, spz_bytes, write_folder, zipped
 from tests.support.scenes import random_gaussians
 
 
@@ -287,6 +291,94 @@ def test_zstandard_frames_that_unfold_to_gigabytes_are_refused(tmp_path, bounded
     size = struct.pack("<Q", len(frame))
     path.write_bytes(content[:32] + size + content[40:start] + frame + content[start + old :])
     assert_refused(read_spz_scene, path)
+
+
+# Of every container one whose rows are just few enough to be read, and one that claims far more: each takes
+# what is promised of memory, or less.
+
+
+def flat_sog(count: int, side: int, degree: int = 0) -> bytes:
+    """`count` equal Gaussians in images of side x side equal pixels, in two kilobytes."""
+    files = sog_files(random_gaussians(20, sh_degree=degree))
+    buffer = io.BytesIO()
+    Image.new("RGBA", (side, side), (0, 0, 0, 255)).save(buffer, "WEBP", lossless=True)
+    palette = {"shN_centroids.webp": files.get("shN_centroids.webp", b"")}
+    meta = json.loads(files["meta.json"]) | {"count": count}
+    return zipped(
+        {name: buffer.getvalue() for name in files} | palette | {"meta.json": json.dumps(meta).encode()}
+    )
+
+
+def flat_spz(count: int) -> bytes:
+    return gzip.compress(b"NGSP" + struct.pack("<IIBBBB", 3, count, 0, 12, 0, 0) + bytes(20 * count), 1)
+
+
+def flat_npz(size: int, members: int) -> bytes:
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **{f"a{k}": np.zeros(size, np.uint8) for k in range(members)})
+    return buffer.getvalue()
+
+
+def glb_of_one_row(count: int) -> bytes:
+    """All columns of a primitive, and of others, are the same numbers."""
+    names = [f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY")] + COEFFICIENTS
+    shapes = ["VEC3", "VEC4", "VEC3", "SCALAR"] + ["VEC3"] * len(COEFFICIENTS)
+    primitive = {
+        "attributes": {name: k for k, name in enumerate(["POSITION", *names])},
+        "mode": 0,
+        "extensions": {EXTENSION: {}},
+    }
+    about = {"bufferView": 0, "count": count, "componentType": 5126}
+    content = {
+        "asset": {"version": "2.0"},
+        "accessors": [about | {"type": shape} for shape in shapes],
+        "bufferViews": [{"buffer": 0, "byteLength": 16 * count, "byteStride": 16}],
+        "buffers": [{"byteLength": 16 * count}],
+        "meshes": [{"primitives": [primitive] * 3}],
+        "nodes": [{"mesh": 0}],
+    }
+    return glb(content, np.ones(4 * count, "<f4").tobytes())
+
+
+def many_members(count: int) -> bytes:
+    return zipped({f"{number:06d}": b"" for number in range(count)})
+
+
+BOMBS: dict[str, tuple[str, Callable[[], bytes]]] = {
+    "sog": ("a.sog", lambda: flat_sog(870_000, 950)),
+    "sog of degree 3": ("a.sog", lambda: flat_sog(200_000, 450, 3)),
+    "sog of too many": ("a.sog", lambda: flat_sog(16_000_000, 4000)),
+    "spz": ("a.spz", lambda: flat_spz(850_000)),
+    "spz of too many": ("a.spz", lambda: flat_spz(6_000_000)),
+    "npz": ("a.npz", lambda: flat_npz(25_000_000, 2)),
+    "npz of too much": ("a.npz", lambda: flat_npz(20_000_000, 40)),
+    "npz of many": ("a.npz", lambda: many_members(120_000)),
+    "glb": ("a.glb", lambda: glb_of_one_row(800_000)),
+    "gltf of objects": (
+        "a.gltf",
+        lambda: b'{"asset":{"version":"2.0"},"scenes":[{}' + b",{}" * 4_000_000 + b"]}",
+    ),
+    "json of objects": ("transforms.json", lambda: b'{"frames":[{}' + b',{"a":1}' * 2_000_000 + b"]}"),
+}
+
+
+def read_any(path: Path) -> float:
+    match path.suffix:
+        case ".npz":
+            read_npz(path)
+        case ".json":
+            load_nerfstudio(path, 64, silent)
+        case _:
+            load_gaussians(path)
+    return 1.0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", BOMBS)
+def test_bombs_take_no_more_memory_than_promised(tmp_path: Path, name: str) -> None:
+    file, made = BOMBS[name]
+    outcome = tried(FileKind(file, lambda _: [], read_any), tmp_path, [made()])
+    assert outcome.loaded == (name in ("sog", "sog of degree 3", "spz", "npz"))
 
 
 def test_a_file_of_a_terabyte_of_zeros_is_refused(tmp_path, bounded):

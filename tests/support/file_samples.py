@@ -241,6 +241,14 @@ def zipped(files: dict[str, bytes]) -> bytes:
     return buffer.getvalue()
 
 
+def glb(content: dict, binary: bytes) -> bytes:
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    binary += bytes(-len(binary) % 4)
+    header = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text) + len(binary), len(text), b"JSON")
+    return header + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+
+
 def write_folder(folder: Path, files: dict[str, bytes]) -> Path:
     folder.mkdir(exist_ok=True)
     for name, content in files.items():
