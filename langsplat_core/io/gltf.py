@@ -24,7 +24,7 @@ from msgspec import Meta, Struct
 from langsplat_core.arrays import Array, logit, rotation_matrices, sigmoid, unit
 from langsplat_core.errors import InputError, malformed, quoted
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.hostile import FREE, SMALL_RATIO, Room, decode_json, is_plain_name, read_file
+from langsplat_core.io.hostile import FREE, SMALL_RATIO, Allowance, decode_json, is_plain_name, read_file
 from langsplat_core.io.quantised import mirrored, to_bytes
 from langsplat_core.io.spz import decode_spz
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
@@ -216,8 +216,8 @@ class _File:
         text = memoryview(read_file(path, 2**32))
         self._binary = text[:0]
         # Numbers as they are stored, which an honest file shows once or a few times; Gaussians packed in it
-        self._shown = Room(path, len(text), 1, FREE // 4)
-        self.room = Room(path, len(text), SMALL_RATIO)
+        self._shown = Allowance(path, len(text), 1, FREE // 4)
+        self.room = Allowance(path, len(text), SMALL_RATIO)
         self._buffers: dict[int, bytes | memoryview] = {}
         if text[:4] == MAGIC:  # then version, length; size and kind of a chunk; JSON; the same of the buffer
             end = 20 + int.from_bytes(text[12:16], "little")

@@ -44,7 +44,7 @@ FREE = 48 << 20  # bytes that any file may decode to
 PLAIN_RATIO, SMALL_RATIO = 4, 32
 
 
-class Room:
+class Allowance:
     """What may still be decoded of one file; it becomes less as its parts are read."""
 
     def __init__(self, path: object, size: int, ratio: int = PLAIN_RATIO, free: int = FREE) -> None:
@@ -190,7 +190,7 @@ def decode_json(text: bytes, kind: type[T], path: Path) -> T:
 
 def _check_values(text: bytes, path: Path) -> None:
     """Count the values of a JSON text: a dictionary of three letters takes 240 bytes, a list 64."""
-    Room(path, len(text)).take(40 * text.count(b",") + 240 * text.count(b"{") + 64 * text.count(b"["))
+    Allowance(path, len(text)).take(40 * text.count(b",") + 240 * text.count(b"{") + 64 * text.count(b"["))
 
 
 @contextmanager
@@ -220,7 +220,7 @@ class Archive:
     def __init__(self, archive: zipfile.ZipFile, path: Path, size: int) -> None:
         self._archive, self.path, self.size = archive, path, size  # size of the file, bytes
         self.names = archive.namelist()
-        self._room = Room(path, size)
+        self._room = Allowance(path, size)
 
     def read(self, name: str, limit: int) -> bytes:
         """Return the content of a member.

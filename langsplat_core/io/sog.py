@@ -33,7 +33,7 @@ from langsplat_core.errors import malformed, quoted
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import (
     SMALL_RATIO,
-    Room,
+    Allowance,
     decode_json,
     is_plain_name,
     opened,
@@ -126,7 +126,7 @@ def _decode(fetch: Fetch, meta_path: Path, size: int) -> Scene:
         raise malformed(meta_path, what, "export the scene again")
     meta = decode_json(text, _Meta, meta_path)
     degree = meta.higher.bands if meta.higher is not None else 0
-    Room(meta_path, size, SMALL_RATIO).take_gaussians(meta.count, degree)
+    Allowance(meta_path, size, SMALL_RATIO).take_gaussians(meta.count, degree)
     antialiased = meta.model == "antialiased" or meta.antialias is True
     return Scene(_gaussians(_Planes(fetch, meta_path, meta.count), meta), antialiased=antialiased)
 

@@ -24,7 +24,7 @@ import numpy as np
 from langsplat_core.arrays import Array, logit, sigmoid
 from langsplat_core.errors import InputError, malformed
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.hostile import SMALL_RATIO, Room, open_for_reading
+from langsplat_core.io.hostile import SMALL_RATIO, Allowance, open_for_reading
 from langsplat_core.io.quantised import mirrored, smallest_three, to_bytes, without_largest
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
 
@@ -70,7 +70,7 @@ class _Packed:
     blocks: dict[str, Array]  # attribute -> (N, bytes of one Gaussian) uint8
 
 
-def _read_packed(file: BinaryIO, size: int, path: Path, room: Room) -> _Packed:
+def _read_packed(file: BinaryIO, size: int, path: Path, room: Allowance) -> _Packed:
     """Read a file of `size` bytes; what it can honestly hold is known before anything is unpacked."""
     zipped = file.read(2) == GZIP_MAGIC
     file.seek(0)
@@ -187,10 +187,10 @@ def read_spz_scene(path: Path | str) -> Scene:
     path = Path(path)
     file, size = open_for_reading(path)
     with file:
-        return _scene(_read_packed(file, size, path, Room(path, size, SMALL_RATIO)))
+        return _scene(_read_packed(file, size, path, Allowance(path, size, SMALL_RATIO)))
 
 
-def decode_spz(data: bytes, path: Path, room: Room) -> Scene:
+def decode_spz(data: bytes, path: Path, room: Allowance) -> Scene:
     """Return the scene of an .spz file in memory, along the axes of the PLY.
 
     path: for messages; room: of the file that it is a part of. Raises FormatError.

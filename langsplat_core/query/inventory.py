@@ -34,6 +34,7 @@ LEAST_COUNT = 12  # Gaussians of a spot or node
 SAME = 0.5  # overlap of claims from which two words name the same thing
 RUNNERS_UP = 5  # words per feature that may be names for it
 MOST = 200  # candidates per level, the largest first
+DEEPEST = 64  # nodes in one another, which the trees of scenes come nowhere near
 NAMES = 3  # words, at most, that a node is called by
 
 
@@ -200,31 +201,40 @@ def scene_outline(describer: Describer) -> tuple[Outline, ...]:
     """Return the scene's tree, wholes with the largest surface first.
 
     Left out are small nodes, and parts that say nothing new: without a word, or with that of what they are
-    in; their own parts take their place.
+    in; their own parts take their place. A file may hold any tree: what lies in more than DEEPEST others is
+    not listed, nor named once each Gaussian was looked at DEEPEST times.
     """
     tree, members, areas = describer.engine.tree, describer.engine.tree.gaussians(), describer.areas
     every = max(float(areas.sum()), 1e-300)
-    totals = np.array([areas[rows].sum() for rows in members]) / every
-    large = [n for n, rows in enumerate(members) if totals[n] >= LEAST_SHARE and len(rows) >= LEAST_COUNT]
+    totals = members.sums(areas) / every
+    large = np.flatnonzero((totals >= LEAST_SHARE) & (members.sizes >= LEAST_COUNT))
     parts: dict[int, list[int]] = {}
-    for node in sorted(large, key=lambda node: -totals[node]):
+    for node in sorted(large.tolist(), key=lambda node: -totals[node]):
         parts.setdefault(int(tree.parents[node]), []).append(node)
+    left = DEEPEST * len(areas)  # Gaussians to look at
 
     def name_of(node: int) -> Word | None:
+        nonlocal left
+        left -= int(members.sizes[node])
+        if left < 0:
+            return None
         rows, level = members[node], int(tree.levels[node])
         weights = np.maximum(areas[rows], 1e-300)
         return likely_name(describer.at_level(level, rows, weights, NAMES).words)
 
-    def below(node: int, word: Word | None) -> Iterator[Outline]:
-        for part in parts.get(node, []):
+    def below(node: int, word: Word | None) -> Iterator[tuple[int, Word]]:
+        waiting = parts.get(node, [])[::-1]
+        while waiting:
+            part = waiting.pop()
             own = name_of(part)
             if own is None or (word is not None and own.phrase.split(OR)[0] in word.phrase.split(OR)):
-                yield from below(part, word)
+                waiting += parts.get(part, [])[::-1]
             else:
-                yield shown(part, own)
+                yield part, own
 
-    def shown(node: int, word: Word | None) -> Outline:
+    def shown(node: int, word: Word | None, depth: int = 0) -> Outline:
         rows = members[node]
+        inside = [] if depth == DEEPEST else [shown(*part, depth + 1) for part in below(node, word)]
         weights = np.maximum(areas[rows], 1e-300)
         positions = describer.engine.scene.gaussians.means[rows].astype(np.float64)
         return Outline(
@@ -236,7 +246,7 @@ def scene_outline(describer: Describer) -> tuple[Outline, ...]:
             centre=weights @ positions / weights.sum(),
             size=2 * oriented_box(positions).half_extents,
             votes=(int(tree.votes[node, 0]), int(tree.votes[node, 1])),
-            parts=tuple(sorted(below(node, word), key=lambda part: -part.share)),
+            parts=tuple(sorted(inside, key=lambda part: -part.share)),
         )
 
     return tuple(shown(node, name_of(node)) for node in parts.get(NO_NODE, []))

@@ -8,7 +8,6 @@ import re
 import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -108,13 +107,12 @@ class Tree:
 
     def at(self, level: int) -> Array:
         """(N,) int32 largest node of at most `level` of each Gaussian, else its smallest; or NO_NODE."""
-        owners = np.arange(self.count + 1, dtype=np.int32)
-        owners[-1] = NO_NODE
-        for node in range(self.count - 1, -1, -1):
-            parent = self.parents[node]
-            if parent != NO_NODE and self.levels[parent] <= level:
+        owners = [*range(self.count), NO_NODE]
+        low = [*(self.levels <= level).tolist(), False]  # the last: of what is part of none
+        for node, parent in zip(range(self.count - 1, -1, -1), self.parents[::-1].tolist(), strict=True):
+            if low[parent]:
                 owners[node] = owners[parent]
-        return owners[self.leaves]
+        return np.array(owners, np.int32)[self.leaves]
 
     def voted(self, level: int) -> Array:
         """`at` a level, NO_NODE where no mask voted for that node."""
@@ -124,21 +122,37 @@ class Tree:
 
     def members(self, node: int) -> Array:
         """(N,) bool: the Gaussians of a node, those of its descendants included."""
-        inside = np.zeros(self.count + 1, bool)  # the last: in no node
+        inside = [False] * (self.count + 1)  # the last: in no node
         inside[node] = True
-        for other in range(node - 1, -1, -1):
-            inside[other] = self.parents[other] != NO_NODE and inside[self.parents[other]]
-        return np.asarray(inside[self.leaves])
+        for other, parent in zip(range(node - 1, -1, -1), self.parents[:node][::-1].tolist(), strict=True):
+            inside[other] = inside[parent]
+        return np.array(inside)[self.leaves]
 
-    def gaussians(self) -> list[Array]:
-        """Return the Gaussians of each node, ascending."""
-        order = np.argsort(self.leaves, kind="stable")
-        firsts = np.searchsorted(self.leaves[order], np.arange(self.count + 1))
-        found = [order[a:b] for a, b in pairwise(firsts)]
-        for node, parent in enumerate(self.parents):
+    def totals(self, own: Array) -> Array:
+        """Return the (K,) int64 numbers of nodes with those of their descendants, of the (K,) they have."""
+        totals = own.tolist()
+        for node, parent in enumerate(self.parents.tolist()):
             if parent != NO_NODE:
-                found[parent] = np.union1d(found[parent], found[node])
-        return found
+                totals[parent] += totals[node]
+        return np.array(totals, np.int64)
+
+    def gaussians(self) -> "NodeGaussians":
+        """Return the Gaussians of every node: those of each follow each other in one order of all."""
+        inside = self.leaves != NO_NODE
+        own = np.bincount(self.leaves[inside], minlength=self.count)
+        sizes = self.totals(own)
+        firsts, next_child, roots = sizes.tolist(), sizes.tolist(), 0
+        for node, parent in zip(range(self.count - 1, -1, -1), self.parents[::-1].tolist(), strict=True):
+            first = roots if parent == NO_NODE else next_child[parent]
+            if parent == NO_NODE:
+                roots += firsts[node]
+            else:
+                next_child[parent] += firsts[node]
+            firsts[node] = next_child[node] = first
+        starts = np.array(firsts, np.int64)
+        behind = starts + sizes - own  # a node's own Gaussians are behind those of its parts
+        rows = np.flatnonzero(inside)
+        return NodeGaussians(rows[np.argsort(behind[self.leaves[rows]], kind="stable")], starts, sizes)
 
     def things(self) -> Array:
         """(3, N) int32 nodes of each level that masks voted for, see `build_tree`."""
@@ -158,6 +172,26 @@ class Tree:
             shares = np.bincount(at[inside], row[inside] != NO_NODE, self.count)
             votes[2 * shares > np.bincount(at[inside], minlength=self.count), 0] = 1
         return replace(self, votes=votes)
+
+
+@dataclass(frozen=True, eq=False)
+class NodeGaussians:
+    """The Gaussians of the K nodes of a tree, without a copy for each node."""
+
+    order: Array  # (M,) numbers of Gaussians
+    starts: Array  # (K,) place in it of a node's first
+    sizes: Array  # (K,) how many there are from there on
+
+    def __getitem__(self, node: int) -> Array:
+        """Return the Gaussians of a node, ascending."""
+        start = self.starts[node]
+        return np.sort(self.order[start : start + self.sizes[node]])
+
+    def sums(self, values: Array) -> Array:
+        """Return the (K, ...) float64 sums of (N, ...) values over each node."""
+        running = np.cumsum(values[self.order], axis=0, dtype=np.float64)
+        running = np.concatenate([np.zeros_like(running[:1], shape=(1, *values.shape[1:])), running])
+        return np.asarray(running[self.starts + self.sizes] - running[self.starts])
 
 
 def tree_of_wholes(things: Array) -> Tree:

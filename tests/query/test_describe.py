@@ -1,5 +1,6 @@
 """Words for Gaussians, for a pixel, for a scene."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -14,9 +15,17 @@ from langsplat_core.query.describe import (
     look_at_pixel,
 )
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.inventory import completions, corrected, same_things, scene_inventory, suggest
+from langsplat_core.query.inventory import (
+    DEEPEST,
+    completions,
+    corrected,
+    same_things,
+    scene_inventory,
+    scene_outline,
+    suggest,
+)
 from langsplat_core.raster import load_lifting_rasterizer
-from langsplat_core.scene import LanguageField, LinearCodec, Scene
+from langsplat_core.scene import NO_NODE, LanguageField, LinearCodec, Scene, Tree
 from langsplat_core.scene.codec import CodebookCodec
 from langsplat_core.scene.surface import surface_areas
 from tests.support.fakes import (
@@ -114,6 +123,28 @@ def test_inventory_lists_every_thing_at_its_place(codebook):
         np.testing.assert_allclose(spot.centre, centre, atol=0.1)
         assert ((spot.box[0] < spot.centre) & (spot.centre < spot.box[1])).all()
         assert len(spot.rows) > 0.95 * PER_BLOB
+
+
+@pytest.mark.parametrize(
+    ("nodes", "step"), [(3000, 1), pytest.param(2_000_000, 5000, marks=pytest.mark.long)]
+)
+@pytest.mark.parametrize("wide", [False, True])
+def test_trees_of_any_depth_have_an_outline(nodes, step, wide):
+    scene = named_scene()
+    parents = np.full(nodes, nodes - 1, np.int32) if wide else np.arange(1, nodes + 1, dtype=np.int32)
+    parents[-1] = NO_NODE
+    leaves = (np.arange(len(scene.gaussians)) * step % nodes).astype(np.int32)
+    tree = Tree(leaves, parents, np.full(nodes, 2, np.uint8), np.ones((nodes, 2), np.uint16))
+    made = describer(replace(scene, language=replace(scene.language, tree=tree)))
+    began = time.process_time()
+    (outline,) = scene_outline(made)
+    assert made.engine.run("mug").found
+    assert time.process_time() - began < 30
+    assert outline.count == len(scene.gaussians)
+    depth, row = 0, outline
+    while row.parts:
+        depth, row = depth + 1, row.parts[0]
+    assert depth <= DEEPEST
 
 
 def test_synonyms_share_an_entry_and_places_are_spots():

@@ -44,7 +44,7 @@ def _find(viewer: Viewer) -> None:
         progress("looking for what is here", 0.5)
         roots = scene_outline(describer)
         tree = engine.tree
-        sizes = _totals(np.bincount(tree.leaves[tree.leaves != NO_NODE], minlength=tree.count), tree.parents)
+        sizes = tree.totals(np.bincount(tree.leaves[tree.leaves != NO_NODE], minlength=tree.count))
         return describer, OutlineView(roots, tree, sizes)
 
     def done(found: tuple[Describer, OutlineView]) -> None:
@@ -54,15 +54,6 @@ def _find(viewer: Viewer) -> None:
         viewer.state.outline = OutlineView(problem=reason)
 
     viewer.ask_engine("looking for what is here", work, done, failed)
-
-
-def _totals(own: Array, parents: Array) -> Array:
-    """(K,) numbers of nodes -> with those of their descendants. Children come before their parents."""
-    totals = own.astype(np.int64)
-    for node, parent in enumerate(parents):
-        if parent != NO_NODE:
-            totals[parent] += totals[node]
-    return totals
 
 
 def name_of(viewer: Viewer, row: Outline) -> str:
@@ -90,7 +81,7 @@ def hidden_nodes(viewer: Viewer) -> Array:
         return np.zeros(0, bool)
     if viewer.out_of_sight is None or viewer.out_of_sight[:2] != (view, marks):
         gone = view.tree.leaves[~marks.shown & (view.tree.leaves != NO_NODE)]
-        counts = _totals(np.bincount(gone, minlength=view.tree.count), view.tree.parents)
+        counts = view.tree.totals(np.bincount(gone, minlength=view.tree.count))
         viewer.out_of_sight = view, marks, counts >= np.maximum(view.sizes, 1)
     return viewer.out_of_sight[2]
 

@@ -219,10 +219,15 @@ def _pieces(engine: QueryEngine, evidence: Array, into: Array) -> list[_Piece]:
     inside = np.zeros(tree.count, bool)
     features = _codewords_seen(engine)
     made: list[_Piece] = []
+    sums, images, leaves = members.sums(evidence[:, :3]), np.zeros(tree.count), tree.leaves >= 0
+    np.maximum.at(images, tree.leaves[leaves], evidence[leaves, 3])
+    for node in range(tree.count):
+        if tree.parents[node] >= 0:
+            images[tree.parents[node]] = max(images[tree.parents[node]], images[node])
     for node in range(tree.count - 1, -1, -1):  # parents first
         parent = tree.parents[node]
         within = parent >= 0 and bool(inside[parent])
-        inside[node] = within or _has_changed(evidence[members[node]])
+        inside[node] = within or _has_changed(members.sizes[node], sums[node], images[node])
         if inside[node] and not within:
             made.append(_piece(engine, evidence, into, members[node], features))
     kept: list[_Piece] = []
@@ -238,10 +243,9 @@ def _pieces(engine: QueryEngine, evidence: Array, into: Array) -> list[_Piece]:
     return kept
 
 
-def _has_changed(evidence: Array) -> bool:
-    gone, kept, coloured = evidence[:, :3].sum(0)
-    images = evidence[:, 3].max(initial=0)
-    enough = len(evidence) >= LEAST and gone + kept >= LEAST_PIXELS * max(images, 1)
+def _has_changed(size: int, sums: Array, images: float) -> bool:
+    gone, kept, coloured = sums
+    enough = size >= LEAST and gone + kept >= LEAST_PIXELS * max(images, 1)
     least = MOST_GONE if gone >= ABSENT * (gone + kept) else MOST_COLOURED
     return bool(enough and gone + coloured >= least * (gone + kept))
 
