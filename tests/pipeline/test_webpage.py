@@ -397,6 +397,12 @@ def test_mouse_and_touch_move_the_camera(browser: Any, thin: Path) -> None:
         assert orbited["rotation"] != states[0]["rotation"]
         assert panned["rotation"] == orbited["rotation"] == zoomed["rotation"] == pinched["rotation"]
         assert len({tuple(state["position"]) for state in states}) == 5
+        axes = np.reshape(orbited["rotation"], (3, 3))  # right, down, ahead
+        places = [np.array(state["position"]) for state in states[1:]]
+        dragged, by_fingers = axes @ (places[1] - places[0]), axes @ (places[3] - places[2])
+        assert dragged[0] < 0  # the camera moves left: the scene follows the pointer
+        np.testing.assert_allclose(dragged, [dragged[0], dragged[0] / 4, 0], atol=1e-6)
+        assert by_fingers[0] < 0
         assert tab.run("() => document.documentElement.scrollWidth") <= 390
         assert tab.faults == []
 

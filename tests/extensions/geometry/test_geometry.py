@@ -3,6 +3,7 @@ along rays, the map of the floor, poses in front of things."""
 
 import json
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +52,7 @@ from tests.support.scenes import FLOOR, WALL, box_room, random_camera, random_ga
 pytest.importorskip("open3d")
 
 
+@cache
 def ball(radius: float = 1.0, count: int = 3000) -> Scene:
     """Flat opaque Gaussians on a sphere around the origin, without cameras."""
     index = np.arange(count) + 0.5
@@ -109,7 +111,7 @@ def test_the_surface_of_a_room_is_found():
 
 
 def test_a_ball_is_closed_and_coloured_without_cameras():
-    mesh, side = fuse(ball(2.0))
+    mesh, side = fuse(ball(2.0), resolution=0.05)
     assert np.median(np.abs(np.linalg.norm(mesh.vertices, axis=1) - 2)) < 0.01
     outside = np.cross(
         *(mesh.vertices[mesh.triangles[:, k]] - mesh.vertices[mesh.triangles[:, 0]] for k in (1, 2))
