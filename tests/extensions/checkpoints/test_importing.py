@@ -17,23 +17,22 @@ from langsplat_core.config import CodebookConfig, LinearConfig
 from langsplat_core.errors import EncoderError, FormatError, InputError
 from langsplat_core.extensions.checkpoints.convert import export_langsplat, export_occam
 from langsplat_core.extensions.checkpoints.importing import ForeignScene, import_scene, read_foreign
-from langsplat_core.extensions.checkpoints.langsplat_files import write_autoencoder, write_checkpoint
+from langsplat_core.extensions.checkpoints.langsplat_files import write_checkpoint
 from langsplat_core.io.ply import write_ply
 from langsplat_core.io.scenes import load_scene, save_scene
-from langsplat_core.scene import CANONICAL_PHRASES, AutoencoderCodec, Gaussians, LanguageField, Scene
+from langsplat_core.scene import CANONICAL_PHRASES, Gaussians, LanguageField, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.training.language.codec_fit import everyday_vocabulary
 from tests.support.file_samples import (
     assert_same,
     autoencoder,
     geometry,
-    random_codec,
     random_field,
     save_model,
     tensor,
     training_state,
 )
-from tests.support.processes import Captured, Write, check_full_disk, refusal, run
+from tests.support.processes import Captured, check_full_disk, refusal, run
 from tests.support.scenes import random_gaussians
 from tests.support.tiny_models import tiny_clip
 
@@ -294,7 +293,6 @@ def wrong(index: int, value: object) -> tuple[object, ...]:
 @pytest.mark.parametrize(
     ("index", "value", "message"),
     [
-        (1, torch.zeros(N, 2), "element 1: positions"),
         (5, torch.zeros(N + 1, 4), "element 5: rotations"),
         (7, torch.zeros(N + 1, D), r"features \(21, 24\) for 20 Gaussians"),
         (7, torch.zeros(1).expand(10**9, 24), "more numbers than the file has"),
@@ -327,28 +325,6 @@ def test_files_that_do_not_go_together(tmp_path):
     refused([*levels, levels[0], ae], "a fourth checkpoint")
     d4 = save_model(tmp_path / "d4.pth", G, tensor(VECTORS[0][:, :4]))
     refused([d4, ae], "4 numbers per Gaussian, but .* makes 3")
-
-
-def test_damaged_autoencoders(tmp_path):
-    good, checkpoint = autoencoder(D).state_dict(), langsplat(tmp_path, (1,))[0]
-    missing = {name: value for name, value in good.items() if name != "encoder.3.bias"}
-    infinite = good | {"decoder.4.bias": good["decoder.4.bias"] * torch.nan}
-    for state, message in (
-        (missing, "not an autoencoder of LangSplat's kind"),
-        (infinite, "weights are not finite"),
-        ({"layer.weight": torch.zeros(3, 3)}, "not a checkpoint or autoencoder of a known method"),
-    ):
-        torch.save(state, tmp_path / "ae.pth")
-        refused([tmp_path / "ae.pth", checkpoint], message)
-
-
-def test_files_of_no_method_are_refused(tmp_path):
-    path, checkpoint = tmp_path / "x", save_model(tmp_path / "c.pth", G, tensor(VECTORS[0]))
-    for content in (b"something else", b""):
-        path.write_bytes(content)
-        refused([path, checkpoint], "neither a PLY nor a file of torch")
-    np.savez(tmp_path / "x.npz", a=np.zeros((3, 4)))
-    refused([tmp_path / "x.npz", checkpoint], r"holds arrays \(3, 4\)")
 
 
 # What becomes of them: scenes with a language field, and the way back, against a tiny CLIP.
@@ -568,37 +544,8 @@ def test_checkpoints_become_a_scene_and_back(tmp_path, checkpoints, capsys):
 
 
 @pytest.mark.long
-def test_a_checkpoint_of_gaussians_is_converted(tmp_path, capsys):
-    g = random_gaussians(20, sh_degree=3)
-    path = save_model(tmp_path / "chkpnt30000.pth", g)
-    assert run("convert", path, tmp_path / "a.spz") == 0
-    assert "20 Gaussians, without a language field" in capsys.readouterr().out
-    assert np.abs(load_scene(tmp_path / "a.spz").gaussians.means - g.means).max() < 1e-3
-    words = ("convert", tmp_path / "a.spz", tmp_path / "out", "--to", "langsplat")
-    assert "has no language field" in refusal(capsys, *words)
+def test_a_full_disk_is_one_line(tmp_path: Path, capsys: Captured) -> None:
+    def write(folder: Path) -> None:
+        write_checkpoint(folder / "c.pth", GAUSSIANS, np.ones((COUNT, 3), np.float32))
 
-
-# A full disk: one line, and what was there stays.
-
-
-def checkpoint(count: int) -> Write:
-    gaussians = random_gaussians(count, 1, sh_degree=1)
-    return lambda folder: write_checkpoint(folder / "c.pth", gaussians, np.ones((count, 3), np.float32))
-
-
-def best_checkpoint(folder: Path) -> object:
-    codec = random_codec("autoencoder")
-    assert isinstance(codec, AutoencoderCodec)
-    return write_autoencoder(folder / "a.pth", codec.encoder, codec.decoder)
-
-
-WRITERS: dict[str, Write] = {
-    "checkpoint": checkpoint(40),
-    "autoencoder": best_checkpoint,
-}
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", WRITERS)
-def test_a_full_disk_is_one_line(name: str, tmp_path: Path, capsys: Captured) -> None:
-    check_full_disk(WRITERS[name], tmp_path, capsys, b"what was there before")
+    check_full_disk(write, tmp_path, capsys, b"what was there before")
