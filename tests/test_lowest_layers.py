@@ -1,5 +1,5 @@
-"""What every layer shares: numbers, lines of messages, progress, compiled kernels, extensions; settings and how
-the options of `langsplat train` come together."""
+"""What every layer shares: numbers, lines of messages, progress, compiled kernels, extensions, settings; and
+how the options of `langsplat train` come together."""
 
 import dataclasses
 import math
