@@ -23,6 +23,7 @@ from langsplat_core.datasets.intrinsics import BrownDistortion, FisheyeDistortio
 from langsplat_core.datasets.photos import Photo, develop, find_photos, mask_beside
 from langsplat_core.errors import FormatError, InputError, printable_line, shortened
 from langsplat_core.io.files import shown
+from langsplat_core.io.ply import read_cloud
 from langsplat_core.progress import Progress
 from langsplat_core.scene import FARTHEST
 
@@ -40,6 +41,8 @@ LENSES: Mapping[str, tuple[int, Any, str]] = MappingProxyType({
     "SIMPLE_FISHEYE": (14, FisheyeDistortion, "f cx cy"),
     "FISHEYE": (15, FisheyeDistortion, "fx fy cx cy"),
 })  # fmt: skip
+
+CLOUDS = ("points3D.ply", "points3d.ply", "points.ply")  # of tools that write no points of COLMAP's
 
 # Records of the binary files, each of which begins with their number. An image goes on with its name, a zero
 # byte, and the number of its observations of 24 bytes; a point with `track` observations of 8 bytes.
@@ -95,8 +98,21 @@ def read_model(folder: Path) -> SparseModel:
                 f"{folder / f'images{suffix}'}: {printable_line(image.name, 80)} was taken with camera "
                 f"{printable_line(image.camera_id, 40)}, which the model lacks; export the model again"
             )
-    points = folder / f"points3D{suffix}"
-    return SparseModel(lenses, images, _content(points) if points.is_file() else np.zeros(0, POINT))
+    return SparseModel(lenses, images, _points(folder, suffix))
+
+
+def _points(folder: Path, suffix: str) -> Array:
+    """Return the points beside cameras and images: the model's own, else a PLY, as MASt3R and VGGT write."""
+    for name in (f"points3D{suffix}", "points3D.bin", "points3D.txt"):
+        if (folder / name).is_file() and len(points := _content(folder / name)):
+            return np.asarray(points)
+    for name in CLOUDS:
+        if (folder / name).is_file():
+            positions, colours = read_cloud(folder / name)
+            points = np.zeros(len(positions), POINT)
+            points["position"], points["colour"], points["error"] = positions, colours, -1
+            return points
+    return np.zeros(0, POINT)
 
 
 def _content(path: Path) -> Any:

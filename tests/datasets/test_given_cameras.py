@@ -175,6 +175,20 @@ def test_plainly_wrong_points_are_dropped(tmp_path: Path) -> None:
     np.testing.assert_array_equal(colours, [[9, 8, 7], [9, 8, 7]])
 
 
+@pytest.mark.parametrize(("name", "left"), [("points3D.ply", None), ("points.ply", "")])
+def test_points_of_a_ply_beside_the_model_are_used(tmp_path: Path, name: str, left: str | None) -> None:
+    model = write_colmap(tmp_path, "txt")
+    want = load_capture(tmp_path, CONFIG, tmp_path / "work")
+    (model / "points3D.txt").unlink()
+    if left is not None:
+        (model / "points3D.txt").write_text(left)
+    columns = [*want.points.T, *want.colours.T]
+    write_ply(model / name, dict(zip(("x", "y", "z", "red", "green", "blue"), columns, strict=True)))
+    got = load_capture(tmp_path, CONFIG, tmp_path / "work")
+    np.testing.assert_array_equal(got.points, want.points)
+    np.testing.assert_array_equal(got.colours, want.colours)
+
+
 # transforms.json: poses, intrinsics in all their spellings, points, and what may be missing.
 
 FOX = Path(__file__).parents[3] / "shared" / "data" / "fox"
