@@ -1,8 +1,9 @@
 """Errors a user can cause, each with a message of one line: what is wrong, and how to mend it."""
 
+import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from types import MappingProxyType
+from types import MappingProxyType, SimpleNamespace
 
 LINE_LIMIT = 1000  # characters of a message: room for two long paths, not for a file's content
 
@@ -57,6 +58,18 @@ class FormatError(InputError):
 def malformed(path: object, what: str, remedy: str = "copy it again, or export it anew") -> FormatError:
     """Return the error of a file that breaks a rule: its name, what is wrong, and how to mend it."""
     return FormatError(f"{path}: {what}; {remedy}")
+
+
+# What a reader skips, pads, rounds or guesses is counted by it and said in one line.
+
+LOSSES = SimpleNamespace(strict=False)  # True: of --strict, under which a loss is an error
+
+
+def report_loss(message: str, *values: object) -> None:
+    """Say in one line what a reader could not take as it was given; InputError under --strict."""
+    if LOSSES.strict:
+        raise InputError(f"{message % values} (refused by --strict)")
+    logging.getLogger("langsplat").warning(message, *values)
 
 
 class BackendError(LangSplatError):

@@ -20,9 +20,10 @@ import numpy as np
 from langsplat_core.arrays import Array, rotation_matrices
 from langsplat_core.datasets.capture import Capture, warn_of_lost_points
 from langsplat_core.datasets.intrinsics import BrownDistortion, FisheyeDistortion, PhotoIntrinsics
-from langsplat_core.datasets.photos import Photo, develop, find_photos, mask_beside
+from langsplat_core.datasets.photos import Photo, develop, find_photos, finder, mask_beside
 from langsplat_core.errors import FormatError, InputError, printable_line, shortened
 from langsplat_core.io.files import shown
+from langsplat_core.io.hostile import decimal_comma, decode_name, decode_text
 from langsplat_core.io.ply import read_cloud
 from langsplat_core.progress import Progress
 from langsplat_core.scene import FARTHEST
@@ -118,11 +119,11 @@ def _points(folder: Path, suffix: str) -> Array:
 def _content(path: Path) -> Any:
     """Return what the reader of a file's name makes of it."""
     try:
-        return _READERS[path.name](path.read_bytes())
+        data = path.read_bytes()
+        return _READERS[path.name](decode_text(data, path) if path.suffix == ".txt" else data)
     except (struct.error, ValueError, IndexError, OverflowError) as error:
-        raise FormatError(
-            f"{path} is no readable COLMAP file ({printable_line(error, 160)}); export the model again"
-        ) from None
+        reason = f"{printable_line(error, 160)}{decimal_comma(error)}"
+        raise FormatError(f"{path} is no readable COLMAP file ({reason}); export the model again") from None
 
 
 def lens_of(name: str, width: int, height: int, parameters: Array) -> PhotoIntrinsics:
@@ -183,7 +184,7 @@ def _binary_images(data: bytes) -> list[ModelImage]:
         return int(end + 8 + 24 * struct.unpack_from("<Q", data, end)[0] - begin)
 
     return [
-        _image(behind.partition(b"\0")[0].decode(), int(image["camera"]), image["pose"])
+        _image(decode_name(behind.partition(b"\0")[0]), int(image["camera"]), image["pose"])
         for image, behind in _records(data, IMAGE, rest)
     ]
 
@@ -196,28 +197,28 @@ def _binary_points(data: bytes) -> Array:
 # Text files: a line for each row, after comments.
 
 
-def _lines(data: bytes) -> list[str]:
-    return [line.strip() for line in data.decode().splitlines() if not line.startswith("#")]
+def _lines(text: str) -> list[str]:
+    return [line.strip() for line in text.split("\n") if not line.startswith("#")]
 
 
-def _text_cameras(data: bytes) -> dict[int, PhotoIntrinsics]:
+def _text_cameras(text: str) -> dict[int, PhotoIntrinsics]:
     lenses = {}
-    for line in filter(None, _lines(data)):
+    for line in filter(None, _lines(text)):
         camera_id, name, width, height, *parameters = line.split()
         lenses[int(camera_id)] = lens_of(name, int(width), int(height), np.array(parameters, np.float64))
     return lenses
 
 
-def _text_images(data: bytes) -> list[ModelImage]:
+def _text_images(text: str) -> list[ModelImage]:
     images = []
-    for line in "\n".join(_lines(data)).rstrip().split("\n")[::2]:  # every second one lists 2D points
+    for line in "\n".join(_lines(text)).rstrip().split("\n")[::2]:  # every second one lists 2D points
         _, *pose, camera_id, name = line.split(maxsplit=9)
         images.append(_image(name, int(camera_id), np.array(pose, np.float64)))
     return images
 
 
-def _text_points(data: bytes) -> Array:
-    rows = [line.split() for line in _lines(data) if line]
+def _text_points(text: str) -> Array:
+    rows = [line.split() for line in _lines(text) if line]
     return np.array(
         [
             (0, list(map(float, row[1:4])), list(map(int, row[4:7])), float(row[7]), len(row[8:]) // 2)
@@ -227,7 +228,7 @@ def _text_points(data: bytes) -> Array:
     )
 
 
-_READERS: dict[str, Callable[[bytes], Any]] = {
+_READERS: dict[str, Callable[[Any], Any]] = {
     "cameras.bin": _binary_cameras,
     "cameras.txt": _text_cameras,
     "images.bin": _binary_images,
@@ -292,10 +293,11 @@ def load_colmap(folder: Path, model_folder: Path, max_side: int, progress: Progr
 
 def located_photos(model: SparseModel, folder: Path) -> list[Photo]:
     """Return the model's images as photographs in `folder`, each name once."""
+    find = finder(folder)
     return [
         Photo(path, name, model.lenses[image.camera_id], image.world_to_camera, mask=mask_beside(path))
         for name, image in {image.name: image for image in model.images}.items()
-        for path in (folder / name,)
+        for path in (find(name),)
     ]
 
 

@@ -9,6 +9,7 @@ import logging
 import math
 import os
 import reprlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.datasets.capture import Capture, warn_of_lost_points
 from langsplat_core.datasets.intrinsics import BrownDistortion, Distortion, FisheyeDistortion, PhotoIntrinsics
-from langsplat_core.datasets.photos import Photo, develop, mask_beside
+from langsplat_core.datasets.photos import Photo, develop, finder, mask_beside
 from langsplat_core.errors import FormatError, InputError, printable_line, quoted, shortened
 from langsplat_core.io.hostile import PHOTO_SUFFIXES, PictureError, picture_size, read_json_file
 from langsplat_core.io.ply import read_cloud
@@ -40,19 +41,20 @@ def load_nerfstudio(file: Path, max_side: int, progress: Progress) -> Capture:
         raise FormatError(f'{file} has no list of "frames"; it is not a nerfstudio dataset')
     photos: dict[str, Photo] = {}
     missing = []
+    find = finder(file.parent)
     for number, frame in enumerate(frames):
         where = f"{file}: frame {number}"
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise FormatError(f'{where} has no "file_path"; it is not a nerfstudio dataset')
-        label = frame["file_path"].replace("\\", "/")
+        label = frame["file_path"]
         try:
-            path = _photo_file(file.parent, label)
+            path = _photo_file(find, label)
             size = picture_size(path)
         except (FileNotFoundError, PictureError):
             missing.append(label)
             continue
         try:
-            mask = _mask_file(file.parent, frame) or mask_beside(path)
+            mask = _mask_file(find, frame) or mask_beside(path)
             photos[label] = Photo(path, label, _lens({**top, **frame}, size), _pose(frame), mask=mask)
         except ValueError as error:
             raise FormatError(f"{where} ({printable_line(label, 60)}): {error}") from None
@@ -73,23 +75,23 @@ def load_nerfstudio(file: Path, max_side: int, progress: Progress) -> Capture:
     return Capture(cameras, images, points, colours, metres, files, drawn, masks)
 
 
-def _photo_file(folder: Path, label: str) -> Path:
+def _photo_file(find: Callable[[str], Path], label: str) -> Path:
     """Return the photograph called `label`; some datasets leave its suffix away. FileNotFoundError."""
     for suffix in ("", *PHOTO_SUFFIXES):
         # Unlike Path.is_file, also no for names that no file system could hold.
-        if os.path.isfile(candidate := f"{folder / label}{suffix}"):
-            return Path(candidate)
+        if os.path.isfile(candidate := find(f"{label}{suffix}")):
+            return candidate
     raise FileNotFoundError(label)
 
 
-def _mask_file(folder: Path, frame: Json) -> Path | None:
+def _mask_file(find: Callable[[str], Path], frame: Json) -> Path | None:
     """Return the file of a frame's "mask_path"; ValueError where there is none."""
     label = frame.get("mask_path")
     if label is None:
         return None
-    if not isinstance(label, str) or not os.path.isfile(folder / label):
+    if not isinstance(label, str) or not os.path.isfile(find(label)):
         raise ValueError(f'"mask_path" names no file: {reprlib.repr(label)}')
-    return folder / label
+    return find(label)
 
 
 def _number(values: Json, key: str, default: float | None = None) -> float:

@@ -7,9 +7,10 @@ import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any
+from unicodedata import normalize
 
 import numpy as np
 from PIL import Image, ImageOps
@@ -18,7 +19,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics, pinhole_for, resample, source_positions
 from langsplat_core.errors import InputError, shortened
-from langsplat_core.io.hostile import PHOTO_SUFFIXES, PictureError, is_video, opened
+from langsplat_core.io.hostile import PHOTO_SUFFIXES, PictureError, decode_name, is_video, opened
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera
 
@@ -66,6 +67,31 @@ def count_photographs(dataset: Path) -> int:
         return len(find_photos(folder / "images") or find_photos(photo_folder(folder) or folder))
     except OSError:
         return 0
+
+
+def finder(folder: Path) -> Callable[[str], Path]:
+    r"""Return the function from the name of a file, as another file in `folder` has it, to its path.
+
+    Folders stand before "/" or "\\"; accents may be composed or not (NFC, NFD), in the name and on disk.
+    """
+
+    @cache
+    def listed(inside: Path) -> dict[str, str]:
+        try:
+            return {normalize("NFC", decode_name(os.fsencode(name))): name for name in os.listdir(inside)}
+        except (OSError, ValueError):
+            return {}
+
+    def find(label: str) -> Path:
+        path = folder / label
+        if not os.path.lexists(path):
+            path = folder
+            for part in PurePosixPath(label.replace("\\", "/")).parts:
+                there = os.path.lexists(path / part)
+                path /= part if there else listed(path).get(normalize("NFC", part), part)
+        return path
+
+    return find
 
 
 def mask_beside(photo: Path) -> Path | None:

@@ -8,6 +8,7 @@ import io
 import json
 import logging
 import math
+import re
 import stat
 import struct
 import warnings
@@ -30,11 +31,14 @@ from langsplat_core.errors import (
     printable_line,
     quoted,
     remedy,
+    report_loss,
 )
 from langsplat_core.io.files import atomic_path
 from langsplat_core.scene import SH_COUNTS
 
 T = TypeVar("T")
+CONTROL = re.compile(r"[\0-\x08\x0e-\x1a\x1c-\x1f]")  # characters that no text has
+COMMA = re.compile(r"(?<![\w.,])[-+]?\d+,\d+(?![\w,])")
 
 # ---- memory: what a file decodes to is counted against the bytes that it has, before it is held ----
 
@@ -173,12 +177,48 @@ def read_file(path: Path, limit: int) -> bytes:
         return file.read(size)
 
 
+def read_text(path: Path, limit: int = 64 * 1024 * 1024) -> str:
+    """Return the text in a file of at most `limit` bytes. Raises InputError, and as `decode_text` does."""
+    return decode_text(read_file(path, limit), path)
+
+
+def decode_text(data: bytes, path: Path) -> str:
+    r"""Return the text of a file of any maker, with "\n" at the ends of its lines.
+
+    It is UTF-8, UTF-16 or UTF-32, with a byte order mark or without. What is none of these is read in the
+    code page of Western Windows, which is a guess and reported as one; FormatError for what is no text.
+    """
+    try:
+        text = data.decode(json.detect_encoding(data))
+    except UnicodeDecodeError as error:
+        text = decode_name(data)
+        if CONTROL.search(text):
+            raise malformed(path, "is no text", "save it as text in UTF-8") from None
+        line = data.count(b"\n", 0, error.start) + 1
+        guess = "%s, line %d: is not UTF-8 and is read as Windows-1252; save the file as UTF-8"
+        report_loss(guess, path, line)
+    return text.removeprefix("\ufeff").replace("\r\n", "\n").replace("\r", "\n")
+
+
+def decode_name(data: bytes) -> str:
+    """Return a text in UTF-8, or else in the code page of Western Windows."""
+    try:
+        return data.decode()
+    except UnicodeDecodeError:
+        return data.decode("cp1252", "replace")
+
+
+def decimal_comma(text: object) -> str:
+    """Return what to say behind a complaint about a number that is written with a comma; "" for others."""
+    return "; numbers need a decimal point, not a comma" if COMMA.search(str(text)) else ""
+
+
 def read_json_file(path: Path, limit: int) -> Any:
     """Return the value in a JSON file of at most `limit` bytes. Raises InputError and FormatError."""
-    text = read_file(path, limit)
+    data = read_file(path, limit)
     with _as_json(path):
-        _check_values(text, path)
-        return json.loads(text)
+        _check_values(data, path)
+        return json.loads(decode_text(data, path))
 
 
 def decode_json(text: bytes, kind: type[T], path: Path) -> T:

@@ -20,7 +20,7 @@ _APOSTROPHES = str.maketrans(dict.fromkeys("’‘ʼ′＇´`", "'"))
 
 def split_phrases(text: str) -> list[str]:
     """Return the phrases in a line, tidy, separated by ";" or ","; "mug, not red" is one, and "" is none."""
-    return [part for part in (tidy(part) for part in _SEPARATE.split(text)) if part]
+    return [part for part in (tidy(part) for part in _SEPARATE.split(_composed(text))) if part]
 
 
 def tidy(text: str) -> str:
@@ -35,9 +35,7 @@ def phrase_key(text: str) -> str:
 
 def tokens(text: str) -> list[str]:
     """Words without quotes and punctuation around them, and commas, none at the end."""
-    text = "".join(
-        " " if unicodedata.category(mark) in ("Cc", "Cs") else mark for mark in text.translate(_APOSTROPHES)
-    )
+    text = "".join(" " if unicodedata.category(mark) in ("Cc", "Cs") else mark for mark in _composed(text))
     text = re.sub(r"(?<=\w)\s+'s\b", "'s", text)
     found = []
     for piece in re.findall(r",|[^\s,;]+", text):
@@ -47,6 +45,11 @@ def tokens(text: str) -> list[str]:
     while found and found[-1] == ",":
         found.pop()
     return found
+
+
+def _composed(text: str) -> str:
+    """`text` with plain apostrophes, and letters of full width or with separate accents as usual (NFKC)."""
+    return unicodedata.normalize("NFKC", text.translate(_APOSTROPHES))
 
 
 def _bare(word: str) -> str:

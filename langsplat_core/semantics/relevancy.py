@@ -26,6 +26,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.errors import InputError, quoted
+from langsplat_core.io.hostile import read_text
 from langsplat_core.scene import Codec, LanguageField
 from langsplat_core.scene.language import phrase_key
 
@@ -122,25 +123,20 @@ def bundled_vocabulary(name: str) -> tuple[str, ...]:
 
 
 def read_vocabulary(path: Path) -> tuple[str, ...]:
-    """Return the phrases of a UTF-8 text file, one a line, in lower case, each once, in the file's order.
+    """Return the phrases of a text file, one a line, in lower case, each once, in the file's order.
 
     Empty lines and lines that begin with # do not count. Raises InputError for a file that cannot be read,
     that has no phrase, or with a line that is none (no letter or digit, too long, no text), which is named.
     """
-    try:
-        lines = path.read_bytes().removeprefix(b"\xef\xbb\xbf").splitlines()
-    except OSError as error:
-        raise InputError(f"{path}: the vocabulary cannot be read ({error.strerror or error})") from None
     phrases: dict[str, None] = {}
-    for number, line in enumerate(lines, 1):
-        text = " ".join(line.decode(errors="replace").split())
+    for number, line in enumerate(read_text(path).split("\n"), 1):
+        text = " ".join(line.split())
         if not text or text.startswith("#"):
             continue
         phrase = phrase_key(text)
-        plain = text.isprintable() and "\ufffd" not in text  # which stands for bytes that are not UTF-8
-        if not (plain and any(map(str.isalnum, phrase)) and len(phrase) <= LONGEST):
+        if not (text.isprintable() and any(map(str.isalnum, phrase)) and len(phrase) <= LONGEST):
             raise InputError(
-                f"{path}, line {number}: {quoted(text, 30)} is no phrase; write plain text in UTF-8, one "
+                f"{path}, line {number}: {quoted(text, 30)} is no phrase; write plain text, one "
                 f"phrase of at most {LONGEST} letters a line, or begin with # what is none"
             )
         phrases[phrase] = None

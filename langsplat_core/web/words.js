@@ -10,6 +10,7 @@ const EMPTY = /[\p{Cf}\p{Po}\p{Mn}]/u; // letters that are no word alone
 function tokens(text) {
   const plain = text
     .replace(APOSTROPHES, "'")
+    .normalize("NFKC")
     .replace(CONTROL, " ")
     .replace(/([\p{L}\p{N}_])\s+'s\b/gu, "$1's");
   const found = (plain.match(/,|[^\s,;]+/gu) || [])

@@ -431,7 +431,7 @@ def test_taught_word_may_be_a_part(described, capsys):
         ("describe named.ply --vocabulary empty.txt", "empty.txt: the vocabulary is empty"),
         ("describe named.ply --vocabulary bad.txt", "bad.txt, line 2"),
         ("describe named.ply --vocabulary sofas.txt", "knows none of the vocabulary's 1 phrases"),
-        ("describe named.ply --vocabulary none.txt", "none.txt: the vocabulary cannot be read"),
+        ("describe named.ply --vocabulary none.txt", "none.txt: no such file"),
         ("describe blind.ply --pixel 1 1", "has no cameras"),
         (f"teach named.ply --name the --at {MUG}", "'the' cannot be a name"),
         (f"teach named.ply --name ?! --at {MUG}", "'' cannot be a name"),

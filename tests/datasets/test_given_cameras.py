@@ -15,7 +15,7 @@ from plyfile import PlyData, PlyElement
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
-from langsplat_core.datasets import load_capture
+from langsplat_core.datasets import load_capture, load_photographs
 from langsplat_core.datasets.colmap import LENSES, find_model, good_points, lens_of, read_model
 from langsplat_core.datasets.intrinsics import (
     BrownDistortion,
@@ -427,6 +427,56 @@ def test_odd_names_in_a_model(tmp_path: Path, name: str, found: list[str]) -> No
     (tmp_path / "images/a.png").rename(tmp_path / "images/mon été 1.png")
     capture = load_capture(tmp_path, CONFIG, tmp_path / "work")
     assert [camera.name for camera in capture.cameras] == found
+
+
+@pytest.mark.parametrize(
+    ("encoding", "name", "on_disk", "said"),
+    [
+        ("utf-8-sig", "é.png", "é.png", 0),
+        ("utf-16", "é.png", "é.png", 0),
+        ("utf-16-le", "é.png", "e\u0301.png", 0),
+        ("cp1252", "é.png", "é.png", 1),
+        ("utf-8", "left\\e\u0301.png", "left/é.png", 0),
+        ("utf-8", ".\\left\\é.png", "left/\udce9.png", 0),  # unpacked from an archive of cp1252
+    ],
+)
+@pytest.mark.parametrize("reader", ["COLMAP", "nerfstudio"])
+def test_text_of_every_maker_is_read(
+    tmp_path: Path,
+    reader: str,
+    encoding: str,
+    name: str,
+    on_disk: str,
+    said: int,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    if reader == "COLMAP":
+        files, photos = sorted(write_colmap(tmp_path, "txt").iterdir()), tmp_path / "images"
+    else:
+        write_nerfstudio(tmp_path)
+        files, photos = [tmp_path / "transforms.json"], tmp_path
+    want = load_photographs(tmp_path, CONFIG, tmp_path / "work")
+    (photos / "left").mkdir()
+    (photos / "a.png").rename(photos / on_disk)
+    for file in files:
+        text = file.read_text("utf-8-sig")
+        text = text.replace(
+            "a.png", name if reader == "COLMAP" else json.dumps(name, ensure_ascii=False)[1:-1]
+        )
+        file.write_bytes(text.replace("\n", "\r\n").encode(encoding))
+    caplog.clear()
+    got = load_photographs(tmp_path, CONFIG, tmp_path / "work")
+    assert len(caplog.messages) == said
+    assert len(got) == len(want)
+    assert got.points.tolist() == want.points.tolist()
+
+
+def test_decimal_commas_are_refused_by_name(tmp_path: Path) -> None:
+    file = write_colmap(tmp_path, "txt") / "cameras.txt"
+    file.write_text("1 PINHOLE 40 30 50,5 50 20 15\n")
+    message = refuse(tmp_path, tmp_path / "work")
+    assert "'50,5'" in message
+    assert "decimal point" in message
 
 
 @pytest.mark.parametrize(

@@ -202,9 +202,10 @@ def test_merged_extremes_are_drawable():
 
 KEYS = {
     "red mug": ("red mug", '"red mug"', "'Red  Mug'", "“red mug”", "«red mug»", "(red) mug.", "red mug!?",
-                " - red mug … ", "red mug\u200b", "red, mug,", "*red* _mug_"),
+                " - red mug … ", "red mug\u200b", "red, mug,", "*red* _mug_", "ｒｅｄ　ｍｕｇ"),
     "the dogs' t-shirt & the child's cup": ("The dogs' T-shirt & the child’s cup",),
     "杯子": ("杯子。",),
+    "café": ("cafe\u0301", "CAFÉ"),
     "☕": ("☕",),
     "": ("", " \n\t", "'?!'", "...", "\x00", ",;,", "\u200b"),
 }  # fmt: skip
@@ -223,6 +224,7 @@ def test_quotes_and_punctuation_are_no_part_of_a_phrase(key, text):
         ("mug , not 'red mug'!", ["mug, not red mug"]),
         (" , mug ,", ["mug"]),
         ("duck, penguin", ["duck", "penguin"]),
+        ("杯子，书", ["杯子", "书"]),
         ('"mug", red book; plate, not red plate,, the cup, but not my cup',
          ["mug", "red book", "plate, not red plate", "the cup, but not my cup"]),
     ],

@@ -462,10 +462,18 @@ def test_vocabulary_files_are_read_leniently(tmp_path):
     assert min(len(bundled_vocabulary(name)) for name in BUNDLED) > 10
 
 
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-be", "cp1252"])
+def test_vocabularies_of_other_encodings_are_read(tmp_path, encoding, caplog):
+    path = tmp_path / "mine.txt"
+    path.write_bytes("cup\r\ncafé table\r\n".encode(encoding))
+    assert read_vocabulary(path) == ("cup", "café table")
+    assert ["line 2: is not UTF-8" in text for text in caplog.messages] == [True] * (encoding == "cp1252")
+
+
 @pytest.mark.parametrize(
     ("content", "problem"),
     [
-        (b"cup\nmug\n\xff\xfe\n", "line 3: "),
+        (b"cup\nmug\n\xff\x01\n", "is no text"),
         (b"cup\n" + b"x" * (LONGEST + 1), "line 2: "),
         (b"# nothing\n\n", "is empty"),
     ],
@@ -475,5 +483,5 @@ def test_broken_vocabularies_are_named_by_file_and_line(tmp_path, content, probl
     path.write_bytes(content)
     with pytest.raises(InputError, match=re.escape(str(path)) + ".*" + re.escape(problem)):
         read_vocabulary(path)
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="is a folder"):
         read_vocabulary(tmp_path)

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
+from unicodedata import normalize
 
 import msgspec
 import numpy as np
@@ -11,7 +12,7 @@ from PIL import Image, ImageDraw
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.io.hostile import PHOTO_SUFFIXES, opened, picture_size, read_json_file
+from langsplat_core.io.hostile import PHOTO_SUFFIXES, opened, picture_size, read_json_file, read_text
 
 Size = tuple[int, int]  # width and height, pixels
 SAME_SHAPE = 0.02  # relative difference of aspect up to which two sizes may be of one image
@@ -258,7 +259,7 @@ def _read_ovs3d_scene(folder: Path) -> LabelledScene:
     classes = _classes(folder / "segmentations" / "classes.txt")
     stray, frames = [], []
     for view in sorted(path for path in (folder / "segmentations").iterdir() if path.is_dir()):
-        files = {path.stem: path for path in sorted(view.glob("*.png"))}
+        files = {normalize("NFC", path.stem): path for path in sorted(view.glob("*.png"))}
         stray += [f"{view.name}: {name} (not in classes.txt)" for name in files if name not in classes]
         labels = tuple(LabelledPhrase(name, MaskFile(files[name]), None) for name in classes if name in files)
         if labels:
@@ -272,10 +273,7 @@ def _read_ovs3d_scene(folder: Path) -> LabelledScene:
 
 def _classes(path: Path) -> tuple[str, ...]:
     """One class a line, each once."""
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError:
-        raise FormatError(f"{path}: not a text file; expected one class a line") from None
+    lines = normalize("NFC", read_text(path)).split("\n")
     classes = tuple(dict.fromkeys(line.strip() for line in lines if line.strip()))
     if not classes:
         raise FormatError(f"{path}: is empty; expected one class a line")
