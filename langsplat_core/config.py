@@ -148,7 +148,9 @@ class RasterSettings:
     Sources: graphdeco-inria/diff-gaussian-rasterization and gsplat.
     """
 
-    near: Positive = 0.2  # Gaussians with camera z <= near are not drawn, world units
+    # Gaussians with camera z <= near are not drawn, world units; but for published code it follows from the
+    # scene, see `scene.near_plane`
+    near: Positive = 0.2
     far: Positive | None = None  # nor those with camera z > far; None: none is too far
     fov_clamp: Positive = 1.3  # Jacobian taken at most at this multiple of the half field of view
     dilation: NotNegative = 0.3  # added to both diagonal entries of the 2D covariance, px^2
@@ -240,7 +242,13 @@ class RadianceConfig:
     # what moves in a photograph, such as people, does not count; auto: where it explains enough of the error
     transients: Literal["auto", "on", "off"] = "auto"
     checkpoint_every: Count = 2_000  # steps of this run
+    # camera z up to which nothing is drawn, world units; None: it follows from the cameras and what they see
+    near: Positive | None = None
     seed: Seed = 0  # of random numbers
+
+    def formation(self, near: float) -> RasterSettings:
+        """Return the constants of image formation; `near`: the plane that follows from what is seen."""
+        return replace(INRIA, near=self.near or near)
 
     def spending(self, budget: RadianceBudget) -> "RadianceConfig":
         """Return these settings with the budget's steps, Gaussians and degree."""
@@ -358,7 +366,12 @@ class TrainConfig:
 PAPER = TrainConfig(
     dataset=DatasetConfig(hold_out="every"),
     radiance=RadianceConfig(
-        coarse_fraction=0.0, few_views=0, rehearsed_views=0, exposure="off", transients="off"
+        coarse_fraction=0.0,
+        few_views=0,
+        rehearsed_views=0,
+        exposure="off",
+        transients="off",
+        near=INRIA.near,
     ),
     masks=MaskConfig(source="sam", sam="facebook/sam-vit-huge", crop_layers=1),
     codec=AutoencoderConfig(steps=10_000, batch=64, lr=7e-4),

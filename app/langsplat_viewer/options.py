@@ -196,12 +196,11 @@ def warm_up(scene: Scene, backend: str, progress: Progress = silent) -> None:
     """Have the CPU rasterizer compiled before the window first draws with it, and say so."""
     if backend == "cpu":
         say_compiling(progress)
-        from langsplat_core.raster import load_rasterizer
-        from langsplat_core.raster.render import splat_colours
+        from langsplat_core.raster.render import splat_colours, view_of
 
         few = Scene(scene.gaussians.take(np.arange(min(len(scene.gaussians), WARMING))))
         camera = few.framing_camera((16, 16))
-        view = load_rasterizer("cpu").view(few.gaussians, camera)
+        view = view_of(few, camera)
         splat_colours(view, few.gaussians)
         view.depth_at(8, 8)
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import LiftConfig, TrainConfig
+from langsplat_core.config import LiftConfig, RadianceConfig, RasterSettings, TrainConfig
 from langsplat_core.errors import InputError
 from langsplat_core.io.hostile import write_npy
 from langsplat_core.pipeline.stages import (
@@ -38,9 +38,11 @@ from langsplat_core.scene import (
     LanguageField,
     Tree,
     codec_from_tensors,
+    near_plane,
 )
 from langsplat_core.scene.codec import KINDS, CodebookCodec
 from langsplat_core.scene.language import phrase_key
+from langsplat_core.scene.scene import NEAR_CAMERAS
 from langsplat_core.scene.surface import build_surface, build_tree
 from langsplat_core.semantics.encoders import Encoder, PhraseEncoder
 from langsplat_core.semantics.features import (
@@ -194,7 +196,7 @@ class _Stages:
         for _, features in self.views:
             vectors.append(features.vectors)
             digests.append(digest_of(features))
-        return vectors, (digest_of(self.gaussians), digests)
+        return vectors, (digest_of(self.gaussians), digests, self.config.radiance.near)
 
     def path(self, name: str, version: int, *settings: Any) -> Path:
         """Return the file of a stage."""
@@ -212,7 +214,7 @@ class _Stages:
         vectors, inputs = self.inputs
         # Named as in older work folders.
         folder = self.work / stage_key("memberships", 2, *inputs)  # codespell:ignore memberships
-        shared = self.rasterizer(), self.processes, self.progress
+        shared = self.rasterizer(), self.processes, self.progress, self.formation
         mask_weights = kept_mask_weights(self.gaussians, self.views, folder, *shared)
 
         def make() -> Arrays:
@@ -222,6 +224,10 @@ class _Stages:
         made = self.processes.once(lambda: kept(folder / "groups.npz", make))
         edges = np.cumsum([len(view) for view in vectors])[:-1]
         return mask_weights, MaskGroups(tuple(np.split(made["of_mask"], edges)), made["vectors"])
+
+    @cached_property
+    def formation(self) -> RasterSettings:
+        return _formation(self.gaussians, self.views, self.config.radiance)
 
     def rasterizer(self) -> LiftingRasterizer:
         return load_lifting_rasterizer(self.config.lift.backend)
@@ -267,7 +273,7 @@ class _Stages:
             self.lift_blocks(codec, blocks)
 
         def make() -> Arrays:
-            scene = self.gaussians, self.views, codec
+            scene, shared = (self.gaussians, self.views, codec), (self.formation, self.progress)
             if self.by_weights:
                 shape = len(LEVELS), len(self.gaussians)
                 latents = np.zeros((*shape, codec.latent_dim), codec.dtype)
@@ -276,11 +282,9 @@ class _Stages:
                     part = read_arrays(blocks / f"{number:05d}.npz")
                     latents[:, first:last], confidence[:, first:last] = part["latents"], part["confidence"]
             elif self.lift.mode == "one-pass":
-                latents, confidence = lift_latents(self.rasterizer(), *scene, progress=self.progress)
+                latents, confidence = lift_latents(self.rasterizer(), *scene, *shared)
             else:
-                latents, confidence = lift_by_gradient(
-                    self.rasterizer(), *scene, config=self.config.lift, progress=self.progress
-                )
+                latents, confidence = lift_by_gradient(self.rasterizer(), *scene, self.config.lift, *shared)
             return {"latents": latents, "confidence": confidence}
 
         made = self.processes.once(lambda: kept(done, make))
@@ -325,6 +329,13 @@ class _Stages:
         return Tree(**self.kept(self.path("nodes", 4, self.lift, self.config.codec), make))
 
 
+def _formation(gaussians: Gaussians, views: Views, config: RadianceConfig) -> RasterSettings:
+    """Return the image formation of the views; few are read, as their masks come with them."""
+    step = max(-(-len(views) // NEAR_CAMERAS), 1)
+    cameras = [views[index][0] for index in range(0, len(views), step)]
+    return config.formation(near_plane(gaussians, cameras))
+
+
 def kept_mask_weights(
     gaussians: Gaussians,
     views: Views,
@@ -332,12 +343,13 @@ def kept_mask_weights(
     rasterizer: LiftingRasterizer,
     processes: ProcessGroup,
     progress: Progress,
+    settings: RasterSettings,
 ) -> MaskWeights:
     """Return the mask weights of all views, a file in `folder` each, which is read where it is needed."""
     files = [folder / f"{index:05d}.npy" for index in range(len(views))]
     for index in processes.share(range(len(views))):
         if not files[index].exists():
-            write_npy(files[index], view_pairs(rasterizer, gaussians, *views[index]))
+            write_npy(files[index], view_pairs(rasterizer, gaussians, *views[index], settings))
         progress("lifting masks onto the Gaussians", (index + 1) / len(views))
     processes.barrier()
     return MaskWeights([open_array(path) for path in files], len(gaussians))
@@ -352,7 +364,7 @@ def kept_mask_weights(
 CUTS = (0.15, 0.4, 0.8)  # costs up to which subparts, parts and wholes grow; chosen in rooms 201 and 203
 LEAST = 2.5e-4  # of the image: smaller regions show the encoder nothing
 AGREED = "describing what masks agree on"  # stage
-VERSION = 1
+VERSION = 2
 
 
 def agreed_features(
@@ -373,7 +385,8 @@ def agreed_features(
     processes = processes or ProcessGroup()
     inputs = digest_of(gaussians), [digest_of(features) for _, features in views]
     folder = work / stage_key("rough-memberships", VERSION, *inputs)
-    mask_weights = kept_mask_weights(gaussians, views, folder, rasterizer, processes, progress)
+    formed = _formation(gaussians, views, RadianceConfig())
+    mask_weights = kept_mask_weights(gaussians, views, folder, rasterizer, processes, progress, formed)
     counts = [len(features.vectors) for _, features in views]
     eyes = np.stack([camera.position for camera, _ in views])
 
@@ -388,7 +401,7 @@ def agreed_features(
     for index in processes.share(range(len(views))):
         camera, _ = views[index]
         if not store.has(camera.name, made_by):
-            drawn = draw_patches(rasterizer.view(gaussians, camera), gaussians, tree.patches)
+            drawn = draw_patches(rasterizer.view(gaussians, camera, formed), gaussians, tree.patches)
             image, mask = photographs[index]
             maps = within(nested_maps(drawn, cuts, LEAST), mask)
             store.save(camera.name, ImageFeatures(maps, embed_regions(image, maps, encoder)), made_by)

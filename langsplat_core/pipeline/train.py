@@ -154,7 +154,8 @@ def _train(run: _Run, masks_of: Callable[[Capture], MaskSource] | None, given: S
             metres = config.dataset.metres_per_unit or said or capture.metres_per_unit
             save_scene(run.out, Scene(gaussians, language, views.cameras, metres_per_unit=metres))
             small = capture.read_at(held_out, QUICK.longer_side) if held_out else None
-            scores = evaluate_views(gaussians, capture, held_out, small=small) if held_out else []
+            near = config.radiance.near
+            scores = evaluate_views(gaussians, capture, held_out, small=small, near=near) if held_out else []
         report = TrainReport(
             views=len(views),
             held_out=len(scores),

@@ -19,7 +19,7 @@ from typing import overload
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import INRIA, RasterSettings
+from langsplat_core.config import RasterSettings
 from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer
 from langsplat_core.raster.protocol import (
     Backend,
@@ -76,13 +76,14 @@ def render(
     camera: Camera,
     values: Array | None = None,
     backend: str = "cpu",
-    profile: RasterSettings = INRIA,
+    profile: RasterSettings | None = None,
 ) -> Rendering:
     """Draw `scene` as `camera` sees it.
 
     values: (N, C) further numbers per Gaussian, finite, to be blended along with the colours. backend: one
     of `raster.BACKENDS` that needs no device handed to it ("cpu", "cuda", "reference"). profile: constants
-    of image formation; the scene's own antialiasing applies. Raises InputError for an unknown backend,
+    of image formation, such as `config.INRIA`; None: the published ones with the scene's own near plane. Its
+    antialiasing applies to both. Raises InputError for an unknown backend,
     BackendError for one that cannot load here.
     """
     rasterizer = _cpu() if backend == "cpu" else load_rasterizer(backend)

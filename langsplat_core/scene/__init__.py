@@ -13,10 +13,11 @@ from langsplat_core.scene.language import (
     TaughtWord,
     Tree,
 )
-from langsplat_core.scene.scene import FARTHEST, Camera, Intrinsics, Scene, look_at
+from langsplat_core.scene.scene import FARTHEST, Camera, Intrinsics, Scene, look_at, near_plane
 
 __all__ = [
     "CANONICAL_PHRASES", "FARTHEST", "LEVELS", "NO_NODE", "SH_COUNTS", "AutoencoderCodec", "Calibration",
     "Camera", "CodebookCodec", "Codec", "Fits", "Gaussians", "Intrinsics", "LanguageField", "LinearCodec",
     "PlattScaling", "Scene", "TaughtWord", "Tree", "codec_from_tensors", "look_at",
+    "near_plane",
 ]  # fmt: skip

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from langsplat_core.arrays import Array, across, check_array, unit
+from langsplat_core.arrays import Array, across, check_array, logit, unit
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.scene.gaussians import Gaussians
 from langsplat_core.scene.language import LanguageField
@@ -159,6 +159,47 @@ def look_at(
     return Camera(width, height, focal, focal, width / 2, height / 2, matrix)
 
 
+NEAR = 0.05  # of the depth of the middle of what is seen, or of the radius of what no camera sees
+LEAST_NEAR = 0.01  # the same where things are nearer: what is nearer yet is fog before the eye
+NEAREST, NEAR_OF_NEAREST = 0.01, 0.25  # of what is seen, that passes for the nearest, and of its depth
+NEAR_CAMERAS, NEAR_SAMPLES = 16, 10_000  # that are enough to tell
+
+
+def near_plane(gaussians: Gaussians, cameras: Sequence[Camera], most: float | None = None) -> float:
+    """Return the camera z up to which nothing is drawn, world units, > 0: a share of what cameras see.
+
+    most: it is no farther; None: it is `NEAR` of the middle's. Published code has 0.2 in every unit
+    (`config.INRIA`). Orthographic cameras do not tell.
+    """
+    rows = slice(None, None, len(gaussians) // NEAR_SAMPLES + 1)
+    seen = gaussians.valid()[rows] & (gaussians.opacity_logits[rows] >= logit(np.array(INRIA.alpha_min)))
+    points = gaussians.means[rows][seen].astype(np.float64)
+    telling = [camera for camera in cameras if not camera.orthographic]
+    depths = [np.zeros(0)]
+    for camera in telling[:: max(-(-len(telling) // NEAR_CAMERAS), 1)]:
+        pixels, z = camera.project(points)
+        depths.append(z[camera.in_image(pixels, z)])
+    every = np.concatenate(depths)
+    if len(every) == 0:
+        return most or NEAR * bounds_of(gaussians)[1]
+    nearest, middle = np.quantile(every, (NEAREST, 0.5))
+    return float(min(most or NEAR * middle, max(NEAR_OF_NEAREST * nearest, LEAST_NEAR * middle)))
+
+
+def bounds_of(gaussians: Gaussians) -> tuple[Array, float]:
+    """Robust centre (3,) and radius in world units, > 0: medians, so that floaters do not count."""
+    valid = gaussians.valid()
+    means = gaussians.means[valid].astype(np.float64)
+    if len(means) == 0:
+        return np.zeros(3), 1.0
+    centre = np.median(means, axis=0)
+    radius = float(np.quantile(np.linalg.norm(means - centre, axis=1), 0.7))
+    # One Gaussian alone has a radius too; and far from the origin float32 positions are coarse, and a camera
+    # needs a distance that it can tell.
+    size = float(np.exp(np.median(gaussians.log_scales[valid].astype(np.float64))))
+    return centre, max(radius, size, 1e-6 * float(np.abs(centre).max()))
+
+
 # The opening view of a scene without cameras is from where it covers the most of a grid; lengths in radii.
 SAMPLES, TURNS, REACH, CELL = 20_000, 12, 3.0, 0.06
 WIDEST = 0.2  # of an image's width: shorter focal lengths, 136 degrees, are of no lens
@@ -199,9 +240,18 @@ class Scene:
             path=None,
         )
 
-    def raster_settings(self, profile: RasterSettings = INRIA) -> RasterSettings:
-        """`profile` with the antialiasing and the focal length that this scene was trained with."""
-        return replace(profile, antialiased=self.antialiased, focal=self._focal)
+    def raster_settings(self, profile: RasterSettings | None = None) -> RasterSettings:
+        """`profile` with the antialiasing and the focal length that this scene was trained with.
+
+        Without one, the published constants with the scene's own near plane.
+        """
+        formed = replace(INRIA, near=self.near) if profile is None else profile
+        return replace(formed, antialiased=self.antialiased, focal=self._focal)
+
+    @cached_property
+    def near(self) -> float:
+        """Camera z up to which nothing is drawn, world units, > 0: see `near_plane`."""
+        return near_plane(self.gaussians, self.cameras)
 
     @cached_property
     def _focal(self) -> float | None:
@@ -220,14 +270,8 @@ class Scene:
         return np.array([0.0, -1.0, 0.0])
 
     def bounds(self) -> tuple[Array, float]:
-        """Robust centre (3,) and radius in world units: medians, so that floaters do not count."""
-        means = self.gaussians.means[self.gaussians.valid()].astype(np.float64)
-        if len(means) == 0:
-            return np.zeros(3), 1.0
-        centre = np.median(means, axis=0)
-        radius = float(np.quantile(np.linalg.norm(means - centre, axis=1), 0.7))
-        # far from the origin float32 positions are coarse, and a camera needs a distance that it can tell
-        return centre, max(radius, 1e-3, 1e-6 * float(np.abs(centre).max()))
+        """Robust centre (3,) and radius in world units, > 0: see `bounds_of`."""
+        return bounds_of(self.gaussians)
 
     def _across(self, centre: Array, radius: float, up: Array) -> Array:
         """(3,) the level direction along which the scene covers the most of an image."""

@@ -328,7 +328,8 @@ def test_a_view_is_formed_as_the_scene_was_trained(backend):
     fitted = Scene(G, cameras=(CAMERA,), antialiased=True)
     camera, x = CAMERA.resized(3 * CAMERA.width, 3 * CAMERA.height), random_values(len(G), 2)
     rasterizer = load_lifting_rasterizer(backend)
-    own = replace(INRIA, antialiased=True, focal=float(np.sqrt(CAMERA.fx * CAMERA.fy)))
+    focal = float(np.sqrt(CAMERA.fx * CAMERA.fy))
+    own = replace(INRIA, near=fitted.near, antialiased=True, focal=focal)
     for got, settings in (
         (view_of(fitted, camera, rasterizer), own),
         (view_of(fitted, camera, rasterizer, INRIA), INRIA),
@@ -382,7 +383,8 @@ def test_pixel_weights_are_a_row_of_w(backend, distance, orthographic):
     gaussians = random_gaussians(400, 3, scale_range=(0.005, 0.5))
     camera, rasterizer = view_from(distance), load_lifting_rasterizer(backend)
     camera = without_perspective(camera) if orthographic else camera
-    truth = load_lifting_rasterizer("reference").view(gaussians, camera)
+    formed = Scene(gaussians).raster_settings()
+    truth = load_lifting_rasterizer("reference").view(gaussians, camera, formed)
     for column, row in [(0, 0), (63, 47), (32, 24), (20, 40), (50, 5)]:
         image = np.zeros((48, 64, 1))
         image[row, column] = 1

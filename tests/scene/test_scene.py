@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 
 from langsplat_core import render
 from langsplat_core.arrays import logit, psnr, sigmoid, unit
+from langsplat_core.config import INRIA
 from langsplat_core.errors import InputError
 from langsplat_core.raster.reference import ReferenceRasterizer
-from langsplat_core.scene import NO_NODE, Camera, Gaussians, PlattScaling, Scene, Tree
+from langsplat_core.scene import NO_NODE, Camera, Gaussians, PlattScaling, Scene, Tree, near_plane
 from langsplat_core.scene.gaussians import GROUP, merged
 from langsplat_core.scene.language import phrase_key, split_phrases, tidy, tokens
 from langsplat_core.scene.transform import (
@@ -453,3 +454,15 @@ def test_selected_gaussians_are_transformed_alone(chosen) -> None:
     moved = transform_scene(Scene(gaussians), TO, selected).gaussians
     assert_same(moved.take(~selected), gaussians.take(~selected))
     assert_same(moved.take(selected), whole.take(selected))
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e4])
+def test_the_near_plane_scales_with_the_scene(scale):
+    scene = Scene(random_gaussians(300, 1), cameras=tuple(random_camera(seed) for seed in range(3)))
+    for one in (scene, replace(scene, cameras=())):
+        scaled = transform_scene(one, scaling(scale))
+        assert scaled.near == pytest.approx(scale * one.near, rel=1e-4)
+        assert scaled.raster_settings().near == scaled.near
+    assert scene.raster_settings(INRIA).near == INRIA.near
+    near = replace(scene.cameras[0], fx=1e4, fy=1e4)  # sees little
+    assert near_plane(scene.gaussians, [near], scene.near) <= scene.near

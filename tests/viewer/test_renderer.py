@@ -30,7 +30,6 @@ from langsplat_viewer.rendering.request import (
     Split,
     depth_range,
     image_formation,
-    near_plane,
     plain_request,
     why_nothing,
     why_undrawable,
@@ -347,13 +346,13 @@ def test_the_image_does_not_depend_on_the_unit(factor):
 
 def test_the_near_plane_comes_nearer_with_the_camera():
     scene = blob_scene()
-    assert [near_plane(scene.gaussians, camera) for camera in scene.cameras] == [INRIA.near] * 3
+    assert [image_formation(scene, camera).near for camera in scene.cameras] == [scene.near] * 3
     ahead, seen = scene.cameras[0], []
     for left in (1.0, 0.15, 0.1):  # of the way to the middle
         matrix = ahead.world_to_camera.copy()
         matrix[:3, 3] *= left
-        seen.append(near_plane(scene.gaussians, replace(ahead, world_to_camera=matrix)))
-    assert INRIA.near == seen[0] > seen[1] > seen[2] > 0
+        seen.append(image_formation(scene, replace(ahead, world_to_camera=matrix)).near)
+    assert scene.near == seen[0] > seen[1] > seen[2] > 0
 
 
 def looking_away() -> Camera:

@@ -13,9 +13,9 @@ import numpy as np
 from msgspec import Meta
 
 from langsplat_core.arrays import Array, logit
-from langsplat_core.config import INRIA, Display, PictureConfig, RasterSettings
+from langsplat_core.config import Display, PictureConfig, RasterSettings
 from langsplat_core.display.displays import DISPLAYS, Answers, DisplayRow, Ranges, painted
-from langsplat_core.scene import LEVELS, SH_COUNTS, Camera, Gaussians, Scene
+from langsplat_core.scene import LEVELS, SH_COUNTS, Camera, Gaussians, Scene, near_plane
 from langsplat_core.scene.gaussians import Merged
 from langsplat_core.scene.transform import C0
 from langsplat_viewer.marks import Marks
@@ -278,9 +278,6 @@ def plain_request(scene: Scene, camera: Camera, picture: PictureConfig, **more: 
 
 # Image formation for looking round: what training would clip is shown, an image of nothing explained.
 
-NEAR_SHARE = 0.25  # of the depth of what is nearest in the image
-NEAREST_SHARE = 0.01  # of the Gaussians in the image that count as the nearest
-LEAST_NEAR = 1e-3  # of the depth of the middle one: nearer, a Gaussian would be a fog over everything
 VISIBLE_ALPHA = 1 / 255
 
 
@@ -295,27 +292,14 @@ def _in_image(gaussians: Gaussians, camera: Camera) -> tuple[slice, Array, Array
         return rows, depths, camera.in_image(pixels, depths)
 
 
-def near_plane(gaussians: Gaussians, camera: Camera, most: float = INRIA.near) -> float:
-    """Return the near plane's distance, world units: a share of the depth of what is nearest in the image.
+def image_formation(scene: Scene, camera: Camera, clip: Clip = UNCLIPPED) -> RasterSettings:
+    """Return the scene's own image formation, within `clip`.
 
-    At most `most`, the constant of training: the view of a photograph is the one that was trained. An
+    Its near plane comes nearer where the camera stands closer to what it sees than the scene's cameras do. An
     orthographic camera has it at the eye.
     """
-    if camera.orthographic:
-        return 0.0
-    rows, depths, inside = _in_image(gaussians, camera)
-    with np.errstate(invalid="ignore"):
-        inside &= gaussians.opacity_logits[rows] > logit(np.array(VISIBLE_ALPHA))
-    if not inside.any():
-        return most
-    nearest, middle = np.quantile(depths[inside], [NEAREST_SHARE, 0.5])
-    return float(min(most, max(NEAR_SHARE * nearest, LEAST_NEAR * middle)))
-
-
-def image_formation(scene: Scene, camera: Camera, clip: Clip = UNCLIPPED) -> RasterSettings:
-    """Return the scene's own image formation, with the near plane of `near_plane`, and within `clip`."""
     settings = scene.raster_settings()
-    near = near_plane(scene.gaussians, camera, settings.near)
+    near = 0.0 if camera.orthographic else near_plane(scene.gaussians, [camera], scene.near)
     return replace(settings, near=max(near, clip.near), far=None if math.isinf(clip.far) else clip.far)
 
 
@@ -365,6 +349,6 @@ def why_nothing(gaussians: Gaussians, camera: Camera) -> str:
     _, depths = camera.project(gaussians.means[gaussians.valid()].astype(np.float64))
     if (depths <= 0).all():
         return "the whole scene lies behind the camera"
-    if (depths <= near_plane(gaussians, camera)).all():
+    if (depths <= near_plane(gaussians, [camera])).all():
         return "the whole scene lies nearer than the camera can see"
     return "nothing of the scene lies in this picture"

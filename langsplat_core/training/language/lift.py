@@ -353,6 +353,7 @@ def lift_latents(
     gaussians: Gaussians,
     views: Sequence[tuple[Camera, ImageFeatures]],
     codec: Codec,
+    settings: RasterSettings = INRIA,
     progress: Progress = silent,
 ) -> tuple[Array, Array]:
     """Return (3, N, d) latents ``W^T H / W^T 1`` and (3, N) confidence.
@@ -368,7 +369,7 @@ def lift_latents(
         images = latents[features.labels]  # label -1 indexes the last row: zeros
         height, width = features.labels.shape[1:]
         stacked = np.moveaxis(images, 0, 2).reshape(height, width, -1)
-        view = rasterizer.view(gaussians, camera)
+        view = rasterizer.view(gaussians, camera, settings)
         total += view.gather(np.ascontiguousarray(stacked)).reshape(count, len(LEVELS), d + 1)
         progress("lifting latents onto the Gaussians", (done + 1) / len(views))
     confidence = total[..., d]
@@ -396,6 +397,7 @@ def lift_by_gradient(
     views: Sequence[tuple[Camera, ImageFeatures]],
     codec: Codec,
     config: LiftConfig,
+    settings: RasterSettings = INRIA,
     progress: Progress = silent,
 ) -> tuple[Array, Array]:
     """Return (3, N, d) float32 unit latents and (3, N) confidence, both as of `lift_latents`.
@@ -403,7 +405,7 @@ def lift_by_gradient(
     Latents are zero where unobserved. `config` says for how many steps, how fast, from where. Deterministic
     for a given seed on the CPU.
     """
-    start, confidence = lift_latents(rasterizer, gaussians, views, codec, progress)
+    start, confidence = lift_latents(rasterizer, gaussians, views, codec, settings, progress)
     import torch  # seconds that other modes need not pay
 
     check_settings(config, "--lift.")
@@ -425,7 +427,7 @@ def lift_by_gradient(
             order = generator.permutation(len(views))
         index = int(order[step % len(views)])
         camera, labels, latents = targets[index]
-        view = kept[index] if index < len(kept) else rasterizer.view(gaussians, camera)
+        view = kept[index] if index < len(kept) else rasterizer.view(gaussians, camera, settings)
         loss, gradient = _loss_and_gradient(view, labels, latents, blended(x) if published else x)
         features.grad = torch.from_numpy(plain(by_features(x, gradient) if published else gradient))
         adam.step()

@@ -5,7 +5,7 @@
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -19,7 +19,7 @@ from langsplat_core.errors import BackendError
 from langsplat_core.raster import gsplat
 from langsplat_core.raster.cpu.projection import colours, colours_backward
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer, CpuView
-from langsplat_core.scene import Camera, Gaussians
+from langsplat_core.scene import Camera, Gaussians, near_plane
 from langsplat_core.scene.transform import C0
 from langsplat_core.training.radiance.losses import fit_exposure, patch_means, ssim_map, with_exposure
 
@@ -152,19 +152,19 @@ def rendered_depths(renderer: DifferentiableRenderer, values: dict[str, Tensor],
 Backend = Literal["auto", "cpu", "cuda"]
 
 
-def renderer_for(backend: Backend) -> DifferentiableRenderer:
+def renderer_for(backend: Backend, settings: RasterSettings = INRIA) -> DifferentiableRenderer:
     """Return the renderer a user asked for; `auto` takes CUDA where gsplat really draws there, else the CPU.
 
     Raises BackendError when `cuda` is asked for and cannot work.
     """
     if backend == "cpu" or (backend == "auto" and not torch.cuda.is_available()):
-        return CpuRenderer()
+        return CpuRenderer(settings)
     try:
-        return CudaRenderer()
+        return CudaRenderer(settings)
     except BackendError:
         if backend == "cuda":
             raise
-        return CpuRenderer()
+        return CpuRenderer(settings)
 
 
 # Scores of trained Gaussians: images of views against their photographs.
@@ -176,13 +176,15 @@ def evaluate_views(
     indices: Sequence[int],
     backend: Backend = "auto",
     small: Capture | None = None,
+    near: float | None = None,
 ) -> list[ViewScore]:
     """Draw the views at `indices` and score them against the photographs; colours are clamped to [0, 1].
 
     small: the same views read at 320 px, which images are compared with too, shrunk. A photograph that is
-    shrunk twice differs from one that was read at that size, by as much as good images do.
+    shrunk twice differs from one that was read at that size, by as much as good images do. near: the near
+    plane, world units; None: that of what the cameras see.
     """
-    renderer = renderer_for(backend)
+    renderer = renderer_for(backend, replace(INRIA, near=near or near_plane(gaussians, capture.cameras)))
     parameters = parameters_of(gaussians, renderer.device)
     scores = []
     for number, index in enumerate(indices):

@@ -78,7 +78,7 @@ def rehearse(
         small = capture.read_at(train_indices, budget.longer_side)
         train = [row for row in range(len(small)) if row not in without]
         gaussians = train_radiance(small, config.spending(budget), train, at, _steps_alone(part))
-        scores = evaluate_views(gaussians, small, without, config.backend)
+        scores = evaluate_views(gaussians, small, without, config.backend, near=config.near)
         done.append(float(np.mean([score.psnr_exposed or score.psnr for score in scores])))
         log.debug("%s without %s: %.2f dB", budget_text(budget), without, done[-1])
         return done[-1]

@@ -22,7 +22,7 @@ from langsplat_core.datasets.capture import Capture, shrunk_view
 from langsplat_core.errors import InputError
 from langsplat_core.interrupts import Terminated, handled
 from langsplat_core.progress import Progress, WorkCancelledError, silent
-from langsplat_core.scene import Camera, Gaussians
+from langsplat_core.scene import Camera, Gaussians, near_plane
 from langsplat_core.training import one_torch_thread
 from langsplat_core.training.radiance.differentiable import (
     DifferentiableRenderer,
@@ -162,7 +162,6 @@ def train_radiance(
     check_settings(config, "--radiance.")
     if not train_indices:
         raise InputError("no photographs to train on; give a capture with at least one training view")
-    renderer = renderer_for(config.backend)
     made_from = fingerprint(capture, config, train_indices) if checkpoint else ""
     depths: list[DepthMap] = []
     if len(train_indices) <= config.few_views:
@@ -173,6 +172,7 @@ def train_radiance(
         capture = _with_points(capture, depths, config)
     first = initial_gaussians(capture, train_indices, config.sh_degree, config.max_gaussians, config.seed)
     extent = _extent(capture, first)
+    renderer = renderer_for(config.backend, config.formation(near_plane(first, capture.cameras)))
     views = _Views(capture, train_indices, renderer.device)
     run = _Run(config, schedule_for(config, extent), views, renderer, extent, depths)
     if checkpoint and checkpoint.exists():
