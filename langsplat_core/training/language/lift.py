@@ -419,7 +419,7 @@ def lift_by_gradient(
     ]
     # The geometry is frozen: views are kept as far as memory allows, 100 bytes a Gaussian in each.
     most = int(4e9 / (100 * max(len(gaussians), 1)))
-    kept = [rasterizer.view(gaussians, camera) for camera, _ in views[:most]]
+    kept = [rasterizer.view(gaussians, camera, settings) for camera, _ in views[:most]]
     generator = np.random.default_rng(config.seed)
     order = generator.permutation(len(views))
     for step in range(config.steps):
