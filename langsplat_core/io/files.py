@@ -40,6 +40,9 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         yield temporary
         temporary.chmod(0o666 & ~_UMASK)  # mkstemp makes private files; ours are ordinary ones
         temporary.replace(target)
+    except LangSplatError as error:  # which may name what is written: by the name that the user knows
+        error.args = tuple(str(part).replace(str(temporary), str(target)) for part in error.args)
+        raise
     except Exception as error:
         cause = _no_room(error, temporary)
         if cause is None:
@@ -78,8 +81,6 @@ def _no_room(error: Exception, temporary: Path) -> OSError | None:
 
     Libraries say so in their own words and classes, or give no cause at all: then the system is asked again.
     """
-    if isinstance(error, LangSplatError):
-        return None
     if isinstance(error, OSError) and error.errno is not None:
         return error if error.errno in NO_ROOM else None
     said = re.search(r"\(os error (\d+)\)", str(error))  # a library in Rust, such as safetensors

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from langsplat_core.arrays import Array, logit, sigmoid, unit
-from langsplat_core.errors import malformed
+from langsplat_core.errors import InputError, malformed
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import open_for_reading
 from langsplat_core.scene import Gaussians
@@ -33,6 +33,21 @@ _ODD = ["", "y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", 
 def to_bytes(values: Array) -> Array:
     """Round numbers and clip them to uint8."""
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+
+
+def check_steps(path: Path, gaussians: Gaussians, steps: Array) -> None:
+    """Raise InputError where (N,) `steps` of positions, world units, are larger than most Gaussians."""
+    if len(gaussians) == 0:
+        return
+    sizes = gaussians.log_scales.max(axis=1).astype(np.float64)  # logarithm of the longest axis
+    with np.errstate(divide="ignore"):
+        coarse = np.log(steps) > sizes
+    if 2 * np.count_nonzero(coarse) > len(sizes):
+        reach, size = float(np.abs(gaussians.means).max()), float(np.exp(np.median(sizes)))
+        raise InputError(
+            f"{path}: positions up to {reach:.3g} of Gaussians as small as {size:.3g} are beyond what "
+            f"{path.suffix} tells apart; write .ply, or crop what lies far off"
+        )
 
 
 def smallest_three(three: Array, largest: Array) -> Array:
@@ -114,6 +129,9 @@ def write_splat(path: Path | str, gaussians: Gaussians) -> None:
     """
     valid = gaussians.valid()
     drawn = gaussians.take(valid)
+    largest = np.maximum(np.abs(drawn.means).max(1), np.exp(drawn.log_scales.max(1)))
+    if (largest >= _HUGE).any():
+        raise InputError(f"{path}: a reader takes numbers from {_HUGE:g} on for damage; write .ply")
     rows = np.zeros(len(gaussians), _RECORD)
     rows["position"][valid] = drawn.means
     rows["scale"][valid] = np.exp(drawn.log_scales)

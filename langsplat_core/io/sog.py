@@ -40,7 +40,7 @@ from langsplat_core.io.hostile import (
     opened_archive,
     read_file,
 )
-from langsplat_core.io.quantised import smallest_three, to_bytes, without_largest
+from langsplat_core.io.quantised import check_steps, smallest_three, to_bytes, without_largest
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
 
 META_NAME = "meta.json"
@@ -207,7 +207,8 @@ def write_sog(path: Path | str, gaussians: Gaussians, antialiased: bool = False)
     Positions are rounded to 1/65535 of the scene's extent in sign(x) log(1 + |x|), quaternions and opacities
     to 1/255; scales, colours and higher coefficients to the nearest of 256 values each, chosen for the
     scene; with more than 65536 Gaussians the higher coefficients of several are one entry of a palette. A row
-    that cannot be drawn is written with opacity 0.
+    that cannot be drawn is written with opacity 0. Raises InputError where the steps of positions are larger
+    than most Gaussians.
     """
     valid, count = gaussians.valid(), len(gaussians)
     images: dict[str, Array] = {}
@@ -228,6 +229,8 @@ def write_sog(path: Path | str, gaussians: Gaussians, antialiased: bool = False)
     means = known(gaussians.means)
     logs = np.sign(means) * np.log1p(np.abs(means))
     low, high = (reduced(logs[valid], axis=0) if valid.any() else np.zeros(3) for reduced in (np.min, np.max))
+    spacing = (np.abs(means[valid]).max(1, initial=0) + 1) * (high - low).max() / 65535
+    check_steps(Path(path), gaussians.take(valid), spacing)
     whole = np.rint(((logs - low) / np.where(high > low, high - low, 1)).clip(0, 1) * 65535).astype(np.uint32)
     three, largest = without_largest(known(gaussians.quats_wxyz, [1, 0, 0, 0]))
     scales, scale_book = _coded(known(gaussians.log_scales).clip(-30), valid)  # a flat axis is e^-30 thick

@@ -13,6 +13,7 @@ Source of the layout: README, extensions and loader of nianticlabs/spz; the code
 
 import gzip
 import io
+import logging
 import struct
 import zlib
 from dataclasses import astuple, dataclass
@@ -25,8 +26,16 @@ from langsplat_core.arrays import Array, logit, sigmoid
 from langsplat_core.errors import InputError, malformed
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import SMALL_RATIO, Allowance, open_for_reading
-from langsplat_core.io.quantised import mirrored, smallest_three, to_bytes, without_largest
+from langsplat_core.io.quantised import (
+    check_steps,
+    mirrored,
+    smallest_three,
+    to_bytes,
+    without_largest,
+)
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
+
+log = logging.getLogger("langsplat")
 
 MAGIC, GZIP_MAGIC = b"NGSP", b"\x1f\x8b"
 ANTIALIASED, EXTENDED = 0x1, 0x2  # flags
@@ -176,6 +185,7 @@ def _axes(records: bytes, path: Path) -> int:
 # differs in the container alone. Source: nianticlabs/spz; the code here is our own.
 
 COLOUR_SCALE = 0.15
+SMALLEST, LARGEST = -10, 255 / 16 - 10  # logarithms of sizes
 FRACTIONAL_BITS = 12  # what other writers use: steps of 1/4096, up to 2048
 
 
@@ -220,19 +230,26 @@ def write_spz(path: Path | str, gaussians: Gaussians, antialiased: bool = False)
     Positions are rounded to 1/4096 world unit, or finer where the Gaussians are smaller than that; scales
     to 1/16 in the logarithm, within e^-10 to e^5.9; coefficients to 1/128, within -1 to 1 (other
     writers round them to 1/16 and 1/8, for still smaller files); colours and opacities to 1/255. A row that
-    cannot be drawn is written with opacity 0. Raises InputError for a scene so large that 24 bits cannot tell
-    its positions apart.
+    cannot be drawn is written with opacity 0, and sizes that are cut are warned of. Raises InputError for a
+    scene so large that 24 bits cannot tell its positions apart, or whose sizes it cannot say.
     """
     valid = gaussians.valid()
     drawn = mirrored(gaussians.take(valid), _signs_to_rdf(AXES_RUB))  # half a turn, its own inverse
     bits = _fractional_bits(drawn, Path(path))
+    sizes = drawn.log_scales.max(axis=1, initial=-np.inf)
+    cut = (sizes > LARGEST + 0.1) | (sizes < SMALLEST - 0.1)  # tenths are rounding
+    if 2 * np.count_nonzero(cut) > len(sizes):
+        what = f"sizes around {np.exp(np.median(sizes)):.2g} are beyond .spz, 4.5e-5 to 380"
+        raise InputError(f"{path}: {what} world units; write .ply or .sog")
+    if cut.any():
+        log.warning(".spz: the sizes of %d Gaussians of %d are beyond it and were cut", cut.sum(), len(sizes))
     codes = np.rint(drawn.means.astype(np.float64) * 2.0**bits).astype("<i4")
     rest = drawn.sh[:, 1:]
     coded = {
         "positions": codes[..., None].view(np.uint8)[..., :3].reshape(-1, 9),
         "alphas": to_bytes(sigmoid(drawn.opacity_logits) * 255)[:, None],
         "colours": to_bytes((drawn.sh[:, 0] * COLOUR_SCALE + 0.5) * 255),
-        "scales": to_bytes((drawn.log_scales + 10) * 16),
+        "scales": to_bytes((drawn.log_scales.clip(SMALLEST, LARGEST) + 10) * 16),
         "rotations": _rotation_codes(drawn.quats_wxyz),
         "sh": to_bytes(rest.reshape(len(rest), 3 * rest.shape[1]) * 128 + 128),
     }
@@ -255,11 +272,10 @@ def _fractional_bits(drawn: Gaussians, path: Path) -> int:
     most = int(np.floor(np.log2((2**23 - 1) / reach)))
     size = float(np.median(drawn.log_scales.max(axis=1)))  # logarithm of a typical Gaussian's longest axis
     least = int(np.ceil(-size / np.log(2))) if np.isfinite(size) else 0  # a step of its size
-    if most < min(least, FRACTIONAL_BITS):
-        raise InputError(
-            f"{path}: positions up to {reach:.3g} of Gaussians as small as {np.exp(size):.3g} are beyond the "
-            "24 bits of .spz; write .ply, or crop what lies far off"
-        )
+    if most < FRACTIONAL_BITS:
+        check_steps(path, drawn, np.full(len(drawn), 2.0**-most))
+    if most < 0:  # however large the Gaussians are: there are no steps of more than a unit
+        raise InputError(f"{path}: positions up to {reach:.3g} are beyond the 24 bits of .spz; write .ply")
     # The median Gaussian keeps its place to a sixteenth of its size. 24 bits hold the scene, and beyond
     # 30 bits behind the point other readers overflow.
     return max(0, min(most, max(FRACTIONAL_BITS, least + 4), 30))

@@ -28,6 +28,7 @@ from langsplat_core.config import PictureConfig
 from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, QUERY_COLOURS, STRENGTH, shader_defines
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.files import atomic_path
+from langsplat_core.io.quantised import to_bytes
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query import grammar, taught
 from langsplat_core.query.answers import place_of
@@ -117,6 +118,8 @@ def unsearchable(engine: QueryEngine) -> str:
             f"its language field is {engine.field.codec.kind!r}, not a codebook: train it with "
             "--codec.kind codebook to search it in a page"
         )
+    if engine.field.codec.size > np.iinfo(np.uint16).max:
+        return "its codebook has more than 65535 entries, which is beyond the numbers of a page"
     if engine.rule != "regions":
         return "a page answers by everyday phrases, and neither the scene nor an encoder here has them"
     return ""
@@ -207,7 +210,7 @@ def language_tables(
         "rate": rate,
         "codes": codes.astype(np.uint16),
         "regions": regions.everywhere[:, rows],
-        "palette": np.rint(255 * palette).astype(np.uint8),
+        "palette": to_bytes(255 * palette),
         **_region_tables(engine),
     }
     bars = [asdict(bar) for bar in engine.bars or ()]

