@@ -1,7 +1,7 @@
 """`langsplat describe` and `langsplat teach`.
 
-Words for what is in a scene, everywhere, at a place, or as a tree; and a name for something that is pointed
-at, by which it is then found.
+Words for what is in a scene, as a list or as a tree; and a name for something that is pointed at, by which
+it is then found.
 """
 
 from collections.abc import Iterator, Sequence
@@ -9,23 +9,21 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import tyro
 from rich.table import Table
 
 from langsplat_core.cli.arguments import EncoderOption, Level, TrainedScene
-from langsplat_core.cli.query import Unit, basis_fields, pixel_in, pointed, unit_of
+from langsplat_core.cli.query import Unit, basis_fields, pointed, unit_of
 from langsplat_core.cli.run import OutputConsole, print_json
-from langsplat_core.config import Count, CountOrZero
+from langsplat_core.config import CountOrZero
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io import sidecar as files
 from langsplat_core.io.files import check_output_file
 from langsplat_core.io.scenes import check_writable, companion_path
-from langsplat_core.progress import Progress, TerminalProgress
-from langsplat_core.query.describe import Describer, LevelWords, look_at_pixel
+from langsplat_core.progress import TerminalProgress
+from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import QueryEngine, check_words, searchable
-from langsplat_core.query.inventory import InventoryEntry, export_labels, scene_inventory, scene_outline
-from langsplat_core.raster import load_lifting_rasterizer
+from langsplat_core.query.inventory import export_labels, scene_inventory, scene_outline
 from langsplat_core.scene import LEVELS, LanguageField, Scene, TaughtWord
 from langsplat_core.scene.language import phrase_key
 from langsplat_core.semantics.encoders import load_text_encoder
@@ -36,22 +34,14 @@ WIDTH = 118  # characters of a table that is not written to a terminal
 
 @dataclass(frozen=True)
 class Describe:
-    """Name what is in a pixel, or in the whole scene."""
+    """Name what is in the scene, and where."""
 
     scene: TrainedScene
-    camera: Annotated[CountOrZero, tyro.conf.arg(metavar="INDEX")] = 0
-    """Training view in which --pixel is meant."""
-    pixel: Annotated[tuple[CountOrZero, CountOrZero] | None, tyro.conf.arg(metavar="X Y")] = None
-    """Column and row, counted from the top left pixel, 0 0."""
-    level: Level | None = None
-    """This semantic level alone."""
     outline: bool = False
     """The scene as a tree: wholes, with their parts under them."""
     labels: Annotated[Path | None, tyro.conf.arg(metavar="OUT.ply")] = None
     """Write the scene with instance, part and class of each Gaussian as properties, and OUT.labels.json with
     the tree's nodes: words, boxes, counts."""
-    top: Count = 5
-    """Words per level."""
     vocabulary: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Your own list, one phrase per line, in place of the bundled everyday things and parts."""
     encoder: EncoderOption = ""
@@ -60,74 +50,42 @@ class Describe:
 
     def run(self) -> None:
         """Describe, and print the words."""
+        if self.labels is not None:
+            if self.outline or self.json:
+                raise InputError("--labels writes files of the whole scene; leave out what else is asked for")
+            if self.labels.suffix.lower() != ".ply":
+                raise InputError(f"{self.labels}: labels are properties of a .ply; choose such a name")
+            check_writable(self.labels)
         phrases = None if self.vocabulary is None else read_vocabulary(self.vocabulary)
         scene = searchable(self.scene)
-        self._check(scene)
         with TerminalProgress() as progress:
             engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
             describer = Describer(engine, phrases, progress)
             if self.labels is not None:
                 print(f"{self.labels} and {export_labels(describer, self.labels)}")
                 return
-            answer = self._described(describer, progress)
+            sure = engine.basis.calibration is not None
+            found = (
+                outline_of(describer)
+                if self.outline
+                else [_plain(entry, sure) for entry in scene_inventory(describer, progress)]
+            )
+        asked, left_out = len(describer.words[0].phrases), describer.left_out
         if self.json:
-            print_json(answer | basis_fields(engine))
+            counts = {"asked": asked, "left_out": len(left_out)}
+            print_json(counts | {"outline" if self.outline else "inventory": found} | basis_fields(engine))
             return
         if self.outline:
-            print(*outline_lines(answer["outline"], unit_of(scene.metres_per_unit)), sep="\n")
-        elif self.pixel is None:
-            _print_inventory(answer["inventory"])
+            print(*outline_lines(found, unit_of(scene.metres_per_unit)), sep="\n")
         else:
-            _print_words(answer["levels"])
+            _print_inventory(found)
         print(f"answers: {engine.basis.long}")
-        if describer.left_out:
-            names = ", ".join(describer.left_out[:3]) + (" ..." if len(describer.left_out) > 3 else "")
+        if left_out:
+            names = ", ".join(left_out[:3]) + (" ..." if len(left_out) > 3 else "")
             print(
-                f"{answer['asked']} phrases were compared; {len(describer.left_out)} were left out, because "
-                f"the encoder was never taught their words ({names})"
+                f"{asked} phrases were compared; {len(left_out)} were left out, because the encoder was "
+                f"never taught their words ({names})"
             )
-
-    def _check(self, scene: Scene) -> None:
-        """InputError for arguments that do not go with the scene or each other, before anything is loaded."""
-        narrowed = self.pixel is not None or self.level is not None
-        if self.outline and narrowed:
-            raise InputError(
-                "--outline is of the whole scene, at all levels; leave out what else is asked for"
-            )
-        if self.labels is not None:
-            if self.outline or self.json or narrowed:
-                raise InputError("--labels writes files of the whole scene; leave out what else is asked for")
-            if self.labels.suffix.lower() != ".ply":
-                raise InputError(f"{self.labels}: labels are properties of a .ply; choose such a name")
-            check_writable(self.labels)
-        if self.pixel is None:
-            if self.camera != 0:
-                raise InputError(f"--camera {self.camera} needs a --pixel X Y in it")
-            return
-        if not scene.cameras:
-            raise InputError(f"{self.scene}: has no cameras, so --pixel means nothing")
-        pixel_in(scene, self.camera, self.pixel, "--pixel {} {}".format(*self.pixel))
-
-    def _described(self, describer: Describer, progress: Progress) -> dict[str, Any]:
-        """Return the outline, the inventory, or the words of a pixel, ready for JSON."""
-        engine = describer.engine
-        sure = engine.basis.calibration is not None
-        asked: dict[str, Any] = {
-            "asked": len(describer.words[0].phrases),
-            "left_out": len(describer.left_out),
-        }
-        if self.outline:
-            return asked | {"outline": outline_of(describer)}
-        found: Sequence[LevelWords | InventoryEntry]
-        if self.pixel is None:
-            found = scene_inventory(describer, progress)
-        else:
-            camera = engine.scene.cameras[self.camera]
-            at = look_at_pixel(load_lifting_rasterizer("cpu"), describer, camera, self.pixel, top=self.top)
-            found = describer.at_gaussians(np.zeros(0, np.int64)) if at is None else at.words
-            asked |= {"camera": self.camera, "view": camera.name, "pixel": list(self.pixel)}
-        wanted = [_plain(one, sure) for one in found if self.level in (None, LEVELS[one.level])]
-        return asked | {"inventory" if self.pixel is None else "levels": wanted}
 
 
 def _plain(value: Any, sure: bool) -> Any:
@@ -206,15 +164,6 @@ def _outline_lines(nodes: list[dict[str, Any]], unit: Unit, depth: int) -> Itera
         times = f"{len(group)} x " if len(group) > 1 else ""
         yield f"{'  ' * depth}{times}{word}: {'the largest ' if times else ''}{', '.join(what)}"
         yield from _outline_lines(node["parts"], unit, depth + 1)
-
-
-def _print_words(levels: list[dict[str, Any]]) -> None:
-    for level in reversed(levels):
-        if not level["words"]:
-            print(f"{level['level']:<8} nothing is known here")
-            continue
-        said = ", ".join(word["phrase"] + _percent(word) for word in level["words"])
-        print(f"{level['level']:<8} {said}")
 
 
 @dataclass(frozen=True)

@@ -141,23 +141,15 @@ def pointed(engine: QueryEngine, camera: int, at: str, option: str, level: Level
         raise InputError(
             f"{option} {at}: give column and row, counted from the top left pixel, as in 412,230"
         )
-    pixel = int(place[1]), int(place[2])
-    view = pixel_in(scene, camera, pixel, f"{option} {at}")
-    rows, weights = pixel_weights(scene, view, pixel)
+    column, row, view = int(place[1]), int(place[2]), camera_of(scene, camera)
+    if column >= view.width or row >= view.height:
+        edge = f"columns 0 to {view.width - 1} and rows 0 to {view.height - 1}"
+        raise InputError(f"{option} {at}: camera {camera} has {edge}")
+    rows, weights = pixel_weights(scene, view, (column, row))
     members = in_pixel(engine.regions, LEVELS.index(level), rows, weights)
     if weights.sum() <= PictureConfig().alpha_gate or not members.any():
         raise InputError(f"{option} {at}: nothing is there in camera {camera}; point at a thing")
     return members
-
-
-def pixel_in(scene: Scene, index: int, pixel: tuple[int, int], given: str) -> Camera:
-    """Return the camera of a number; InputError where there is none, or `pixel` is outside its image."""
-    camera, (column, row) = camera_of(scene, index), pixel
-    if not (0 <= column < camera.width and 0 <= row < camera.height):
-        raise InputError(
-            f"{given}: camera {index} has columns 0 to {camera.width - 1} and rows 0 to {camera.height - 1}"
-        )
-    return camera
 
 
 def camera_of(scene: Scene, index: int) -> Camera:

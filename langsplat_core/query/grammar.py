@@ -3,7 +3,7 @@
 import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Literal
 
 from langsplat_core.errors import InputError
 from langsplat_core.scene.language import tokens as tokens_of
@@ -119,9 +119,7 @@ def check_names(words: Sequence[str]) -> None:
 
 
 Side = Literal["on", "in", "near", "left of", "right of", "above", "below", "behind", "in front of"]
-SIDES: tuple[Side, ...] = get_args(Side)
 Extreme = Literal["biggest", "smallest", "nearest", "farthest", "highest", "lowest", "leftmost", "rightmost"]
-EXTREMES: tuple[Extreme, ...] = get_args(Extreme)
 
 
 @dataclass(frozen=True)

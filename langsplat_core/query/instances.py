@@ -30,10 +30,6 @@ class OrientedBox:
         signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
         return self.centre + (signs * self.half_extents) @ self.axes.T
 
-    def contains(self, points: Array) -> Array:
-        """(N, 3) points -> (N,) bool, True inside the box or on a face."""
-        return (np.abs((points - self.centre) @ self.axes) <= self.half_extents * (1 + 1e-9)).all(1)
-
 
 def axis_aligned_box(points: Array) -> Array:
     """(M, 3), M >= 1 -> (2, 3) float64 lower and upper corner between the `INNER` quantiles."""

@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, pairwise, product
+from typing import get_args
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from langsplat_core.extensions.benchmarks.report import intersection_over_union,
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.describe import Describer
-from langsplat_core.query.grammar import EXTREMES, SIDES, atoms, parse
+from langsplat_core.query.grammar import Extreme, Side, atoms, parse
 from langsplat_core.query.inventory import InventoryEntry, scene_inventory
 from langsplat_core.query.relations import Body, body, most, stands, upright, viewpoint
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
@@ -34,7 +35,7 @@ VIEWER_SAYS = ("left of", "right of", "behind", "in front of", "nearest", "farth
 FEWEST = 3  # things that a superlative chooses from
 CONSTRUCTIONS = (
     *("part of thing", "subpart of thing", "thing part", "thing subpart", "A and B", "thing without part"),
-    *("kind, not thing", *SIDES, *EXTREMES),
+    *("kind, not thing", *get_args(Side), *get_args(Extreme)),
 )
 
 
@@ -142,7 +143,7 @@ def _kinds(things: Things) -> list[str]:
 def _relations(things: Things, seen_by: Array) -> Iterator[Case]:
     """Of a kind of which some stand so and others do not; and of single things, of which none does."""
     objects = sorted(set(things.words.values()) - set(SHELL))
-    for side, anchor in product(SIDES, objects):
+    for side, anchor in product(get_args(Side), objects):
         anchors = things.called(anchor)
         for word in [*_kinds(things), *objects]:
             candidates = [number for number in things.called(word) if number not in anchors]
@@ -158,7 +159,7 @@ def _relations(things: Things, seen_by: Array) -> Iterator[Case]:
 
 
 def _extremes(things: Things, seen_by: Array) -> Iterator[Case]:
-    for kind, word in product(EXTREMES, _kinds(things)):
+    for kind, word in product(get_args(Extreme), _kinds(things)):
         numbers = things.called(word)
         if len(numbers) >= FEWEST:
             one = numbers[most(kind, [things.extents[number] for number in numbers], [], seen_by)]

@@ -323,18 +323,6 @@ def test_inventory_is_printed_as_table_and_json(described, capsys):
         assert (entry["level"], entry["probability"]) == ("whole", None)
         assert 0 < entry["softmax"] <= 1
         assert all(len(spot["centre"]) == 3 for spot in entry["spots"])
-    assert answers(capsys, *words, "--level", "subpart")["inventory"] == []
-
-
-def test_describe_names_a_pixel(described, capsys):
-    words = ("describe", "named.ply", "--vocabulary", "list.txt")
-    column, row = SCENE.cameras[1].project(SCENE.gaussians.means[:1])[0].astype(int)[0]
-    said = lines(capsys, *words, "--camera", "1", "--pixel", str(column), str(row), "--top", "2")
-    assert any(line.startswith("whole    mug") for line in said)
-    assert "subpart  nothing is known here" in said
-    assert not any("%" in line for line in said)
-    said = lines(capsys, *words, "--pixel", "0", "0")
-    assert sum("nothing is known here" in line for line in said) == 3
 
 
 # `langsplat teach`, and `query` for what was taught and for more like this.
@@ -424,15 +412,10 @@ def test_taught_word_may_be_a_part(described, capsys):
         ("select a.ply mug --out there/b.ply", "there: no such folder for b.ply"),
         ("select a.ply mug --scale 0", "--scale 0"),
         ("select plain.ply mug", "no language field"),
-        ("describe named.ply --camera 3 --pixel 1 1", "--camera 3: the scene has cameras 0 to 2"),
-        ("describe named.ply --pixel 160 1", "--pixel 160 1: camera 0 has columns 0 to 159"),
-        ("describe named.ply --camera 1", "needs a --pixel X Y"),
-        ("describe named.ply --outline --level part", "--outline is of the whole scene"),
         ("describe named.ply --vocabulary empty.txt", "empty.txt: the vocabulary is empty"),
         ("describe named.ply --vocabulary bad.txt", "bad.txt, line 2"),
         ("describe named.ply --vocabulary sofas.txt", "knows none of the vocabulary's 1 phrases"),
         ("describe named.ply --vocabulary none.txt", "none.txt: no such file"),
-        ("describe blind.ply --pixel 1 1", "has no cameras"),
         (f"teach named.ply --name the --at {MUG}", "'the' cannot be a name"),
         (f"teach named.ply --name ?! --at {MUG}", "'' cannot be a name"),
         (f"teach named.ply --name a;b --at {MUG}", "without commas and semicolons"),
