@@ -235,7 +235,7 @@ class RadianceConfig:
     # opacities decay and are not reset; 0 (as published): never
     few_views: CountOrZero = 50
     # up to so many training views, short trainings on some of them decide whether fewer `steps` are trained,
-    # with fewer Gaussians and smaller photographs, see `training.radiance.rehearsal`; 0: never
+    # with fewer Gaussians and smaller photographs, see `training.radiance.trainer`; 0: never
     rehearsed_views: CountOrZero = 24
     # each photograph has an exposure and white balance of its own; auto: where that explains enough
     exposure: Literal["auto", "on", "off"] = "auto"

@@ -208,9 +208,9 @@ def warm_up(scene: Scene, backend: str, progress: Progress = silent) -> None:
 def say_compiling(progress: Progress) -> None:
     """Report that the CPU rasterizer's kernels are compiled next, unless an earlier run has done so."""
     from langsplat_core.compiled import is_compiled
-    from langsplat_core.raster.cpu import blend
+    from langsplat_core.raster.cpu.rasterizer import splat_tiles
 
-    if not is_compiled(blend.splat):
+    if not is_compiled(splat_tiles):
         progress("compiling the drawing kernels, once per installation (half a minute)", 0.7)
 
 

@@ -47,7 +47,7 @@ from langsplat_core.semantics.features import FeatureStore, StoredFeatures, desc
 from langsplat_core.semantics.masks import MaskSource
 from langsplat_core.semantics.sam import load_mask_source
 from langsplat_core.training.radiance.differentiable import evaluate_views
-from langsplat_core.training.radiance.rehearsal import (
+from langsplat_core.training.radiance.trainer import (
     budget_text,
     budgets_for,
     checkpoints_of,

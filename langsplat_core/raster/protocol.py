@@ -14,10 +14,8 @@ from scipy import sparse
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import INRIA, RasterSettings
-from langsplat_core.errors import InputError
 from langsplat_core.scene import Camera, Gaussians
 
-MOST_PIXELS = 2**28  # 16384 x 16384, which takes 11 GB while it is drawn
 # Of the dilation, for images 16 times as large as the photographs: with more of it, wrong cameras beside a
 # scene would spread every Gaussian over the whole image.
 MOST_GROWTH = 256.0
@@ -153,11 +151,3 @@ def dilation(camera: Camera, settings: RasterSettings) -> float:
     if growth < 1 + 1e-6:  # at the photographs' own size it is rounding that differs
         return settings.dilation
     return settings.dilation * min(growth, MOST_GROWTH)
-
-
-def check_size(camera: Camera) -> None:
-    """InputError where an image of the camera's size is larger than any that is drawn."""
-    if camera.width * camera.height > MOST_PIXELS:
-        raise InputError(
-            f"an image of {camera.width}x{camera.height} pixels is too large; choose a smaller size"
-        )

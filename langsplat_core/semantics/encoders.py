@@ -181,21 +181,18 @@ def inferred(forward: Callable[[], Any]) -> Array:
 # What families share.
 
 
-def text_cleaner() -> Callable[[str], str]:
-    """Return the cleaning that open_clip does before its tokenizer reads a text.
+def clean_text(text: str) -> str:
+    """Return a text cleaned as open_clip does before its tokenizer reads it.
 
     Broken Unicode is mended, curly quotes and ligatures are made plain, names of HTML replaced, spaces made
-    single. The function raises InputError where no letter and no digit is left.
+    single. Raises InputError where no letter and no digit is left.
     """
     import ftfy
 
-    def clean(text: str) -> str:
-        plain = " ".join(html.unescape(html.unescape(ftfy.fix_text(text))).split())
-        if not any(map(str.isalnum, plain)):
-            raise InputError(f"empty phrase {text!r}: type a word or a few, such as 'red mug'")
-        return plain
-
-    return clean
+    plain = " ".join(html.unescape(html.unescape(ftfy.fix_text(text))).split())
+    if not any(map(str.isalnum, plain)):
+        raise InputError(f"empty phrase {text!r}: type a word or a few, such as 'red mug'")
+    return plain
 
 
 class Images:
@@ -253,7 +250,6 @@ class TorchText:
         self._device, self._output = weights.device, output
         self._length = int(config.max_position_embeddings)
         self._model: Any = load_model(kind, weights, config)
-        self.clean = text_cleaner()
         self.tokenizer = _tokenizer(weights, int(config.vocab_size))
         self._end = _special_token(weights, self.tokenizer, "eos_token", ("<|endoftext|>", "</s>", "<eos>"))
         self._begin = [_special_token(weights, self.tokenizer, "bos_token", (begin,))] if begin else []
@@ -264,7 +260,7 @@ class TorchText:
     def encode(self, texts: list[str]) -> Array:
         import torch
 
-        plain = [self.clean(text) for text in texts]
+        plain = [clean_text(text) for text in texts]
         found = self.tokenizer.encode_batch(plain, add_special_tokens=False)
         rows = [[*self._begin, *row.ids, self._end] for row in found]
         room = self._length - len(self._begin) - 1

@@ -23,7 +23,7 @@ from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import exists, read_npz
 from langsplat_core.progress import Progress, silent
-from langsplat_core.semantics.masks import LevelMasks, MaskSource, label_maps
+from langsplat_core.semantics.masks import LevelMasks, MaskSource, label_maps, within
 
 VERSION = 1  # of what is stored of a photograph
 STAGE = "masks and vectors"
@@ -174,15 +174,6 @@ def embed_regions(image: Array, label_maps: Array, encoder: ImageEncoder) -> Arr
             if box is not None:  # a row of another level
                 crops[row] = masked_crop(image[box], labels[box] == row, encoder.image_size)
     return encoder.encode_images(crops)
-
-
-def within(labels: Array, mask: Array | None) -> Array:
-    """Return (L, H, W) label maps without what lies outside of the (H, W) mask; numbers stay without gaps."""
-    if mask is None:
-        return labels
-    kept = np.where(mask, labels, -1)
-    numbers = np.unique(kept[kept >= 0])
-    return np.where(kept >= 0, np.searchsorted(numbers, kept), -1).astype(labels.dtype)
 
 
 def fingerprint(encoder: ImageEncoder) -> str:

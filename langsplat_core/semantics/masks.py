@@ -65,15 +65,20 @@ def label_maps(levels: LevelMasks) -> Array:
     """
     maps = np.full((len(levels.masks), *levels.masks[0].shape[1:]), -1, np.int32)
     first = 0
-    for level, masks in enumerate(levels.masks):
-        for row, mask in enumerate(masks):
-            maps[level][mask] = row
-        visible = np.unique(maps[level][maps[level] >= 0])
-        compact = np.full(len(masks) + 1, -1, np.int32)  # the last entry is what -1 indexes
-        compact[visible] = np.arange(first, first + len(visible))
-        maps[level] = compact[maps[level]]
-        first += len(visible)
-    return maps
+    for labels, masks in zip(maps, levels.masks, strict=True):
+        for row, mask in enumerate(masks, first):
+            labels[mask] = row
+        first += len(masks)
+    return within(maps, None)
+
+
+def within(labels: Array, mask: Array | None) -> Array:
+    """Return (L, H, W) label maps without what lies outside of the (H, W) mask, and numbers without gaps."""
+    kept = labels if mask is None else np.where(mask, labels, -1)
+    numbers = np.unique(kept[kept >= 0])
+    rows = np.full(int(kept.max(initial=-1)) + 2, -1, labels.dtype)  # the last entry is what -1 indexes
+    rows[numbers] = np.arange(len(numbers))
+    return rows[kept]
 
 
 # Which of many proposed masks are kept: suppression by box and by pixels, and the removal of crumbs.

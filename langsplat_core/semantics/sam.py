@@ -83,7 +83,9 @@ class EncodedImage:
 class Segmenter(Protocol):
     """A model that finds masks at points."""
 
-    name: str  # for messages, such as "SAM 2"
+    @property
+    def name(self) -> str:
+        """Name for messages, such as "SAM 2"."""
 
     def encode(self, image: Array) -> EncodedImage:
         """Show the model an image (H, W, 3) uint8 once."""
@@ -112,59 +114,49 @@ def normalised(image: Array, side: int, padded: bool) -> tuple[Array, tuple[int,
     return np.ascontiguousarray(pixels.transpose(2, 0, 1)[None]), size
 
 
+@dataclass(frozen=True)
 class Sam:
-    """Segment Anything (Kirillov et al. 2023): its three masks of a point are subpart, part and whole."""
+    """Segment Anything (Kirillov et al. 2023), and SAM 2 and 2.1 (Ravi et al. 2024) on single images."""
 
-    name = "SAM"
-
-    def __init__(self, weights: Weights) -> None:
-        from transformers import SamConfig, SamModel
-
-        settings = load_config(SamConfig, weights, self.name)
-        # Of the norms between attentions in segment_anything, PyTorch's; transformers has 1e-6 there.
-        settings.mask_decoder_config.layer_norm_eps = 1e-5
-        self._model: Any = load_model(SamModel, weights, settings)
+    name: str
+    model: Any  # a transformers model
+    side: int  # of the images it takes, px
+    ordered: bool  # SAM: images are padded, and its three masks of a point are subpart, part and whole
 
     @asking_errors("the segmenter")
     def encode(self, image: Array) -> EncodedImage:
         import torch
 
-        side = int(self._model.config.vision_config.image_size)
-        pixels, size = normalised(image, side, padded=True)
-        given = torch.from_numpy(pixels).to(self._model.device)
-        seen = {"image_embeddings": self._model.get_image_embeddings(given)}
-        return EncodedImage(self._model, seen, side, size, image.shape[:2], ordered=True)
+        pixels, size = normalised(image, self.side, padded=self.ordered)
+        given = torch.from_numpy(pixels).to(self.model.device)
+        seen = {"image_embeddings": self.model.get_image_embeddings(given)}
+        inside = size if self.ordered else None
+        return EncodedImage(self.model, seen, self.side, inside, image.shape[:2], self.ordered)
 
 
-class Sam2:
-    """SAM 2 and 2.1 (Ravi et al. 2024) on single images, by the image half of their video model.
+def load_sam(weights: Weights) -> Sam:
+    """Load a SAM."""
+    from transformers import SamConfig, SamModel
 
-    The order of its three masks of a point means nothing, so their size tells the level.
-    """
-
-    name = "SAM 2"
-
-    def __init__(self, weights: Weights) -> None:
-        from transformers import Sam2Config, Sam2Model
-
-        # The hub's files state the video model's configuration.
-        self._model: Any = load_model(Sam2Model, weights, load_config(Sam2Config, weights, self.name))
-
-    @asking_errors("the segmenter")
-    def encode(self, image: Array) -> EncodedImage:
-        import torch
-
-        side = int(self._model.config.prompt_encoder_config.image_size)
-        pixels, _ = normalised(image, side, padded=False)
-        given = torch.from_numpy(pixels).to(self._model.device)
-        seen = {"image_embeddings": self._model.get_image_embeddings(given)}
-        return EncodedImage(self._model, seen, side, None, image.shape[:2], ordered=False)
+    settings = load_config(SamConfig, weights, "SAM")
+    # Of the norms between attentions in segment_anything, PyTorch's; transformers has 1e-6 there.
+    settings.mask_decoder_config.layer_norm_eps = 1e-5
+    model = load_model(SamModel, weights, settings)
+    return Sam("SAM", model, int(model.config.vision_config.image_size), ordered=True)
 
 
-# Loading by hub id, folder or file: a new family is a class above and one row here.
+def load_sam2(weights: Weights) -> Sam:
+    """Load the image half of a SAM 2: the hub's files state the video model's configuration."""
+    from transformers import Sam2Config, Sam2Model
+
+    model = load_model(Sam2Model, weights, load_config(Sam2Config, weights, "SAM 2"))
+    return Sam("SAM 2", model, int(model.config.prompt_encoder_config.image_size), ordered=False)
+
+
+# Loading by hub id, folder or file: a new family is a function above and one row here.
 
 FAMILIES: Mapping[str, Callable[[Weights], Segmenter]] = MappingProxyType(  # by `model_type` of config.json
-    {"sam": Sam, "sam2": Sam2, "sam2_video": Sam2}
+    {"sam": load_sam, "sam2": load_sam2, "sam2_video": load_sam2}
 )
 HALF_ON = "cuda"  # where products are float16's: bfloat16's error is seven times as large
 

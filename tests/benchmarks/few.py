@@ -36,7 +36,7 @@ from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Scene, look_at
 from langsplat_core.training.radiance.differentiable import evaluate_views
-from langsplat_core.training.radiance.rehearsal import (
+from langsplat_core.training.radiance.trainer import (
     budget_text,
     budgets_for,
     rehearse,

@@ -59,7 +59,7 @@ from langsplat_core.semantics.features import FeatureStore, ImageFeatures, descr
 from langsplat_core.semantics.masks import MaskSource
 from langsplat_core.semantics.sam import load_mask_source
 from langsplat_core.training.language.codec_fit import CodecReport
-from langsplat_core.training.radiance.rehearsal import budgets_for
+from langsplat_core.training.radiance.trainer import budgets_for
 from tests.benchmarks.oracles import (
     ClipGeometry,
     moved_to_images,

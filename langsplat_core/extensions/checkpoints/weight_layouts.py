@@ -24,7 +24,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import EncoderError
-from langsplat_core.semantics.encoders import Family, Images, ImageTower, TorchText
+from langsplat_core.semantics.encoders import Family, Images, ImageTower, TorchText, clean_text
 from langsplat_core.semantics.weights import (
     OPEN_CLIP_CONFIG,
     Converted,
@@ -453,7 +453,7 @@ class SiglipText(TorchText):
 
     def encode(self, texts: list[str]) -> Array:
         """Encode texts like the captions of its training: clean, in lower case."""
-        lower = (self.clean(text).lower().translate(self._without) for text in texts)
+        lower = (clean_text(text).lower().translate(self._without) for text in texts)
         return super().encode([" ".join(text.split()) for text in lower])
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from langsplat_core.arrays import Array, unit
-from langsplat_core.config import AutoencoderConfig, CodebookConfig, CodecConfig, LinearConfig, check_settings
+from langsplat_core.config import AutoencoderConfig, CodebookConfig, CodecConfig, check_settings
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import (
     CANONICAL_PHRASES,
@@ -101,12 +101,8 @@ def fit_codec(
         return fit_codebook(vectors, config, vocabulary, progress)
     if isinstance(config, AutoencoderConfig):
         return train_autoencoder(vectors, config, progress)
-    return fit_linear(vectors, config)
-
-
-def fit_linear(vectors: Array, config: LinearConfig) -> LinearCodec:
-    """Fit the leading `config.latent_dim` right singular vectors, the best basis by least squares."""
-    # Through the D x D Gram matrix: D is 512, M may be a million. float64 keeps its squared condition usable.
+    # The leading right singular vectors, the best basis by least squares; through the D x D Gram matrix: D is
+    # 512, M may be a million. float64 keeps its squared condition usable.
     wide = np.asarray(vectors, np.float64)
     _, axes = np.linalg.eigh(wide.T @ wide)
     return LinearCodec(np.ascontiguousarray(axes[:, ::-1][:, : config.latent_dim].T, np.float32))

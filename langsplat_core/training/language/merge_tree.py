@@ -33,6 +33,7 @@ from langsplat_core.raster.protocol import LiftingView
 from langsplat_core.raster.reference import project
 from langsplat_core.scene import LEVELS, Camera, Gaussians
 from langsplat_core.scene.surface import Surface, divide, surface_areas
+from langsplat_core.semantics.masks import within
 from langsplat_core.training.language.lift import MaskWeights
 
 SEEN, BENT, COLOUR = 0.5, 0.3, 1.0  # weights of the cost's terms
@@ -386,9 +387,7 @@ def nested_maps(drawn: Array, cuts: Sequence[Array], least: float) -> Array:
     first, there = 0, drawn >= 0
     for level, nodes in zip(maps, cuts, strict=True):
         found = nodes[drawn[there]]
-        kept = np.flatnonzero(np.bincount(found) >= max(least * drawn.size, 1))
-        rows = np.full(int(nodes.max(initial=-1)) + 1, -1, np.int32)
-        rows[kept] = np.arange(first, first + len(kept))
-        level[there] = rows[found]
-        first += len(kept)
-    return maps
+        large = np.bincount(found) >= max(least * drawn.size, 1)
+        level[there] = np.where(large[found], first + found, -1)
+        first += len(large)
+    return within(maps, None)

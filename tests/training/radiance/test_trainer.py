@@ -27,20 +27,21 @@ from langsplat_core.errors import BackendError, InputError
 from langsplat_core.progress import Progress, Report, WorkCancelledError
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Gaussians, Scene, look_at
-from langsplat_core.training.radiance import rehearsal
 from langsplat_core.training.radiance.differentiable import CpuRenderer, evaluate_views, renderer_for
-from langsplat_core.training.radiance.rehearsal import (
+from langsplat_core.training.radiance.state import PARAMETERS, initial_gaussians, start
+from langsplat_core.training.radiance.stereo import STAGE
+from langsplat_core.training.radiance.trainer import (
+    REHEARSING,
     budgets_for,
     checkpoints_of,
     climb,
     rehearse,
+    schedule_for,
     supported,
+    train_radiance,
     train_within,
     widened,
 )
-from langsplat_core.training.radiance.state import PARAMETERS, initial_gaussians, start
-from langsplat_core.training.radiance.stereo import STAGE
-from langsplat_core.training.radiance.trainer import schedule_for, train_radiance
 from tests.support.scenes import SHORT, SIZE, capture, picture, truth
 
 
@@ -354,7 +355,7 @@ def test_an_interrupted_rehearsal_ends_as_an_uninterrupted_one(tmp_path: Path) -
     with pytest.raises(WorkCancelledError):
         rehearse(*job, path, Progress(stop))
     assert len(checkpoints_of(path)) > 1
-    assert {report.stage for report in reports} == {rehearsal.STAGE}
+    assert {report.stage for report in reports} == {REHEARSING}
     assert reports[0].fraction < 0.1
     again: list[Report] = []
     assert rehearse(*job, path, Progress(again.append)) == straight
