@@ -73,15 +73,14 @@ Stamps = tuple[tuple[Path, Stamp], ...]
 
 def stamps(files: tuple[Path, ...]) -> Stamps:
     """Return the times of change and sizes of files."""
-    return tuple((file, _stamp(file)) for file in files)
-
-
-def _stamp(file: Path) -> Stamp:
-    try:
-        found = file.stat()
-    except OSError:
-        return None
-    return found.st_mtime_ns, found.st_size
+    found: list[tuple[Path, Stamp]] = []
+    for file in files:
+        try:
+            stat = file.stat()
+            found.append((file, (stat.st_mtime_ns, stat.st_size)))
+        except OSError:
+            found.append((file, None))
+    return tuple(found)
 
 
 class Watch:

@@ -1,23 +1,17 @@
 """Marks: which Gaussians are selected, hidden and deleted, and the tools that mark them."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import combinations
+from itertools import product
 from typing import Literal, get_args
 
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.query.selection import (
-    in_box,
-    in_polygon,
-    in_rectangle,
-    in_sphere,
-    in_stroke,
-    on_surface,
-    project,
-)
+from langsplat_core.query import selection
 from langsplat_core.scene import Camera
+from langsplat_viewer.camera.overlays import box_edges
 
 # The scene itself is never changed: deleting marks, and what is marked is left out of images and of what is
 # saved. So everything can be undone, and an answer's numbers per Gaussian keep their places.
@@ -134,27 +128,23 @@ def caught(drawn: Drawn, means: Array, depths: Array | None = None) -> Array:
     depths: (H, W) of the surface, as `Surface.depths` has them, to leave out what a rectangle, lasso or brush
     meets behind it; None: all the way through.
     """
-    if drawn.tool not in ON_SCREEN:
-        return _in_body(drawn, means)
-    camera, pixels = drawn.camera, drawn.pixels
-    seen, size = project(means, camera), (camera.width, camera.height)
-    if drawn.tool == "rectangle":
-        inside = in_rectangle(seen, pixels[0], pixels[-1])
-    elif drawn.tool == "lasso":
-        inside = in_polygon(seen, pixels, size)
-    else:
-        inside = in_stroke(seen, pixels, drawn.brush * camera.height, size)
-    if depths is None:
-        return inside
-    return inside & on_surface(seen, depths, size)
-
-
-def _in_body(drawn: Drawn, means: Array) -> Array:
-    if drawn.stroke.centre is None:
+    if drawn.tool not in ON_SCREEN and drawn.stroke.centre is None:
         return np.zeros(len(means), bool)
     if drawn.tool == "sphere":
-        return in_sphere(means, drawn.centre, drawn.radius)
-    return in_box(means, drawn.centre - drawn.radius, drawn.centre + drawn.radius)
+        return selection.in_sphere(means, drawn.centre, drawn.radius)
+    if drawn.tool not in ON_SCREEN:
+        return selection.in_box(means, drawn.centre - drawn.radius, drawn.centre + drawn.radius)
+    camera, pixels = drawn.camera, drawn.pixels
+    seen, size = selection.project(means, camera), (camera.width, camera.height)
+    if drawn.tool == "rectangle":
+        inside = selection.in_rectangle(seen, pixels[0], pixels[-1])
+    elif drawn.tool == "lasso":
+        inside = selection.in_polygon(seen, pixels, size)
+    else:
+        inside = selection.in_stroke(seen, pixels, drawn.brush * camera.height, size)
+    if depths is None:
+        return inside
+    return inside & selection.on_surface(seen, depths, size)
 
 
 def outlines(drawn: Drawn) -> list[Array]:
@@ -168,29 +158,19 @@ def outlines(drawn: Drawn) -> list[Array]:
             return [np.array([*drawn.stroke.path, first])]
         case "brush":
             return [np.array(drawn.stroke.path)]
-        case "sphere" | "box" if drawn.stroke.centre is not None:
-            return _of_sphere(drawn) if drawn.tool == "sphere" else _of_box(drawn)
+        case "sphere" if drawn.stroke.centre is not None:
+            turns, (right, down, _) = np.linspace(0, 2 * math.pi, ROUND + 1), drawn.camera.rotation
+            return _projected(drawn, [np.cos(turns)[:, None] * right + np.sin(turns)[:, None] * down])
+        case "box" if drawn.stroke.centre is not None:
+            return _projected(drawn, box_edges(np.array(list(product((-1.0, 1.0), repeat=3)))))
     return []
 
 
-def _of_sphere(drawn: Drawn) -> list[Array]:
-    turns = np.linspace(0, 2 * math.pi, ROUND + 1)
-    right, down, _ = drawn.camera.rotation
-    around = np.cos(turns)[:, None] * right + np.sin(turns)[:, None] * down
-    return _projected(drawn, [drawn.centre + drawn.radius * around])
-
-
-def _of_box(drawn: Drawn) -> list[Array]:
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
-    edges = [np.stack(ends) for ends in combinations(corners, 2) if np.abs(ends[0] - ends[1]).sum() == 2]
-    return _projected(drawn, [drawn.centre + drawn.radius * edge for edge in edges])
-
-
-def _projected(drawn: Drawn, lines: list[Array]) -> list[Array]:
-    """Lines of world points in the image; none that reaches behind the camera."""
+def _projected(drawn: Drawn, lines: Sequence[Array] | Array) -> list[Array]:
+    """Lines around a body of radius 1, as they are in the image; none that reaches behind the camera."""
     camera, found = drawn.camera, []
     for line in lines:
-        pixels, depths = camera.project(line)
+        pixels, depths = camera.project(drawn.centre + drawn.radius * line)
         if (depths > 1e-6 * drawn.radius).all():
             found.append(pixels / (camera.width, camera.height))
     return found

@@ -15,6 +15,7 @@ import glfw  # isort: skip
 import moderngl
 
 from langsplat_core.errors import BackendError, InputError, LangSplatError
+from langsplat_viewer import projects
 from langsplat_viewer.actions import opening, queries, saving, settings, viewpoint
 from langsplat_viewer.camera.controls import spanning
 from langsplat_viewer.canvas import MOVING_BUDGET, Canvas
@@ -22,16 +23,6 @@ from langsplat_viewer.jobs import give_memory_back, on_signals, one_line, share_
 from langsplat_viewer.options import ViewerOptions, chosen_camera, latent_level
 from langsplat_viewer.panels import layout, menus, navigation, outline, overlays, ui
 from langsplat_viewer.panels.navigation import Keyboard
-from langsplat_viewer.projects import (
-    FILE_NAME,
-    LAYOUT_NAME,
-    PROJECTS,
-    Shelf,
-    fitting_scale,
-    load_preferences,
-    preferences_folder,
-    save_preferences,
-)
 from langsplat_viewer.rendering.renderer import Backend, Renderer, renderer_for
 from langsplat_viewer.session import Preferences
 from langsplat_viewer.viewer import Services, Viewer
@@ -98,21 +89,23 @@ class Workspace:
         """
         params.ini_disable = True
         params.app_window_params.restore_previous_geometry = False
-        self._state.preferences = replace(self._state.preferences, ui_scale=fitting_scale(_screen_height()))
+        self._state.preferences = replace(
+            self._state.preferences, ui_scale=projects.fitting_scale(_screen_height())
+        )
         if self._folder is None:
             return
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            self._state.preferences = load_preferences(self._folder, self._state.preferences)
+            self._state.preferences = projects.load_preferences(self._folder, self._state.preferences)
         except (OSError, InputError) as error:
             self._state.say(f"settings are not remembered: {one_line(error)}", is_error=True)
             return
-        self._state.show_help = not (self._folder / FILE_NAME).exists()  # at the first start
+        self._state.show_help = not (self._folder / projects.FILE_NAME).exists()  # at the first start
         self._kept = self._state.preferences
         settings.take_preferences(self._viewer)
         params.ini_disable = False
         params.ini_folder_type = hello_imgui.IniFolderType.absolute_path
-        params.ini_filename = str(self._folder / LAYOUT_NAME)
+        params.ini_filename = str(self._folder / projects.LAYOUT_NAME)
         params.app_window_params.restore_previous_geometry = restore_size
 
     def style(self) -> None:
@@ -130,7 +123,7 @@ class Workspace:
             return
         self._kept = preferences
         try:
-            save_preferences(self._folder, preferences)
+            projects.save_preferences(self._folder, preferences)
         except OSError as error:
             self._state.say(f"settings not written: {one_line(error)}", is_error=True)
 
@@ -147,7 +140,7 @@ RECORDER_PATIENCE = 5.0  # seconds for a film that is being drawn to leave nothi
 def open_window(path: Path, options: ViewerOptions, services: Services) -> None:
     """Run until the window is closed. Raises BackendError where there is no display or no OpenGL."""
     share_one_heap()
-    window = Window(path, options, services, folder=None if options.fresh else preferences_folder())
+    window = Window(path, options, services, folder=None if options.fresh else projects.preferences_folder())
     with on_signals(glfw.post_empty_event) as window.signals:
         immapp.run(window.params())
     if window.failure is not None:
@@ -171,7 +164,7 @@ class Window:
         budget: float = MOVING_BUDGET,
     ) -> None:
         """Keep what is remembered in `folder`, nothing for None; `budget` is that of `Canvas`."""
-        self.viewer = Viewer(services, shelf=Shelf(folder))
+        self.viewer = Viewer(services, shelf=projects.Shelf(folder))
         self.failure: LangSplatError | None = None  # why the window could not work
         self._path, self._options, self._size = path, options, options.wanted_size
         self._make_renderer, self._budget = make_renderer, budget
@@ -246,7 +239,7 @@ class Window:
         imgui.get_io().config_flags |= imgui.ConfigFlags_.nav_enable_keyboard
         glfw.set_drop_callback(glfw_window_hello_imgui(), self._dropped)  # type: ignore[arg-type]
         settings.open_panel(self.viewer, "Search")  # before what was left over it the last time
-        if self._path.name.endswith(PROJECTS):  # which says itself how it is looked at
+        if self._path.name.endswith(projects.PROJECTS):  # which says itself how it is looked at
             opening.open_project(self.viewer, self._path, self._ask)
         else:
             opening.open_scene(self.viewer, self._path, self._first_view)

@@ -14,6 +14,7 @@ from langsplat_viewer.camera.controls import extent_of, from_camera, orbit
 from langsplat_viewer.camera.flight import Flight, Keyframe, pose_of
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.marks import Marks, unmarked
+from langsplat_viewer.rendering.renderer import Backend, open_renderer
 from langsplat_viewer.rendering.request import Clip, RenderRequest, Splats
 from langsplat_viewer.state import GLIDE_SECONDS, ViewerState
 from langsplat_viewer.viewer import Viewer
@@ -69,6 +70,12 @@ class FakeRenderer:
     def depth_at(self, request: RenderRequest, x_px: float, y_px: float) -> float | None:
         """Only in the right half of the image there is a surface; merged Gaussians are farther away."""
         return None if x_px <= request.camera.width / 2 else 2.0 if request.merged is None else 3.0
+
+
+def render_image(request: RenderRequest, backend: Backend = "auto") -> np.ndarray:
+    """Return the (H, W, 3) uint8 image, row 0 on top, (H, W, 4) of a transparent one."""
+    with open_renderer(backend) as renderer:
+        return renderer.read(request)
 
 
 def load(path: Path) -> Scene:

@@ -20,11 +20,10 @@ from langsplat_viewer.camera.controls import extent_of, orbit, zoom
 from langsplat_viewer.camera.flight import Flight, Keyframe
 from langsplat_viewer.output import Film, Shot, cameras_of, make_film, write_film
 from langsplat_viewer.projects import read_flight, write_flight
-from langsplat_viewer.rendering.renderer import render_image
 from langsplat_viewer.rendering.request import RenderRequest, plain_request
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
-from tests.support.windowless import errors, flight, open_scene, recorded
+from tests.support.windowless import errors, flight, open_scene, recorded, render_image
 
 
 def turn(viewer: Viewer, yaw: float) -> None:
@@ -49,7 +48,6 @@ def times(viewer: Viewer) -> list[float]:
 def frames(monkeypatch: pytest.MonkeyPatch) -> None:
     """Films are folders of images."""
     monkeypatch.setattr(output, "has_video", lambda: False)
-    monkeypatch.setattr(saving, "has_video", lambda: False)
 
 
 def test_a_played_path_goes_through_its_keyframes(opened):

@@ -23,7 +23,7 @@ from langsplat_core.scene import Camera, Gaussians, Scene, look_at
 from langsplat_viewer.actions import editing, settings, viewpoint
 from langsplat_viewer.camera.controls import default_view, extent_of, from_camera
 from langsplat_viewer.rendering import renderer as renderers
-from langsplat_viewer.rendering.renderer import ArrayRenderer, GlRenderer, render_image, renderer_for
+from langsplat_viewer.rendering.renderer import ArrayRenderer, GlRenderer, renderer_for
 from langsplat_viewer.rendering.request import (
     Clip,
     RenderRequest,
@@ -37,7 +37,7 @@ from langsplat_viewer.rendering.request import (
 from tests.support.backends import gl_state
 from tests.support.fakes import blob_scene
 from tests.support.scenes import random_answer, random_camera, random_gaussians, random_scene, with_tree
-from tests.support.windowless import marked
+from tests.support.windowless import marked, render_image
 
 COUNT = 150
 SCENE = with_tree(random_scene(COUNT))
@@ -466,7 +466,7 @@ import moderngl, sys
 from langsplat_core.config import PictureConfig
 from langsplat_core.errors import BackendError
 from langsplat_core.scene import Scene
-from langsplat_viewer.rendering.renderer import renderer_for, render_image
+from langsplat_viewer.rendering.renderer import open_renderer, renderer_for
 from langsplat_viewer.rendering.request import plain_request
 from tests.support.scenes import random_camera, random_gaussians
 request = plain_request(Scene(random_gaussians(20)), random_camera(), PictureConfig())
@@ -483,9 +483,11 @@ except BackendError as error:
 """
 NO_DRIVER = """
 for backend in ("auto", "cpu"):
-    assert render_image(request, backend).any()
+    with open_renderer(backend) as renderer:
+        assert renderer.read(request).any()
 try:
-    render_image(request, "opengl")
+    with open_renderer("opengl"):
+        pass
 except BackendError as error:
     assert "libegl1" in str(error) and "--backend cpu" in str(error) and "\\n" not in str(error)
     print("refused")

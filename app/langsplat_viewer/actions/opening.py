@@ -9,7 +9,6 @@ from langsplat_core.compiled import is_compiled
 from langsplat_core.datasets.photos import count_photographs
 from langsplat_core.display.displays import DISPLAYS, latent_colours
 from langsplat_core.errors import InputError, LangSplatError
-from langsplat_core.io import cameras, sidecar
 from langsplat_core.io.scenes import format_of, scene_files
 from langsplat_core.pipeline.report import stated_warnings, work_folder
 from langsplat_core.progress import Progress
@@ -18,7 +17,7 @@ from langsplat_core.scene import Scene, surface
 from langsplat_viewer import disk
 from langsplat_viewer.actions import viewpoint
 from langsplat_viewer.actions.editing import adopt
-from langsplat_viewer.actions.saving import leave
+from langsplat_viewer.actions.saving import COMPANIONS, leave
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.camera.controls import Extent, extent_of
 from langsplat_viewer.disk import Stamps, stamps
@@ -243,8 +242,6 @@ def unlist_scene(viewer: Viewer, path: Path) -> None:
 
 
 # The file browser, typed paths, files dropped onto the window, and recent scenes.
-
-COMPANIONS = (cameras.SUFFIX, sidecar.SUFFIX)  # files beside a scene, read with it
 
 
 def ask_for(viewer: Viewer, choice: FileChoice) -> None:

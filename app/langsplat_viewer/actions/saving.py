@@ -19,22 +19,11 @@ from langsplat_core.io.scenes import save_scene
 from langsplat_core.io.shapes import write_points
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Scene
+from langsplat_viewer import output
 from langsplat_viewer.actions.editing import has_scene, has_selection
 from langsplat_viewer.actions.viewpoint import path_motion
 from langsplat_viewer.camera.flight import pose_of
 from langsplat_viewer.options import say_compiling
-from langsplat_viewer.output import (
-    VIDEO,
-    Shot,
-    cameras_of,
-    check_film,
-    draw_something,
-    free_name,
-    has_video,
-    in_one_line,
-    make_film,
-    save_png,
-)
 from langsplat_viewer.projects import PATHS, PROJECTS, Project, write_flight, write_project
 from langsplat_viewer.rendering.renderer import open_renderer
 from langsplat_viewer.session import Bookmark
@@ -45,7 +34,7 @@ from langsplat_viewer.viewer import Viewer
 def _new_file(viewer: Viewer, folder: Path, suffix: str, more: str = "") -> Path:
     """Return a free name in `folder`, after the scene's."""
     path = viewer.state.path
-    return free_name(folder, f"{'scene' if path is None else path.stem}{more}", suffix)
+    return output.free_name(folder, f"{'scene' if path is None else path.stem}{more}", suffix)
 
 
 # Pictures, views and paths.
@@ -63,9 +52,9 @@ def save_picture(viewer: Viewer, folder: Path = Path()) -> Path | None:
 
     def write() -> None:
         requests = [(one.surface, one.state.request(None, transparent)) for one in shown]
-        with in_one_line(path, "this size"):
+        with output.in_one_line(path, "this size"):
             images = [surface.capture(request) for surface, request in requests if surface is not None]
-        save_png(path, state.session.split.joined(images, images[0].shape[1]))
+        output.save_png(path, state.session.split.joined(images, images[0].shape[1]))
 
     return viewer.save(path, write)
 
@@ -81,8 +70,8 @@ def save_sized_picture(viewer: Viewer, folder: Path = Path()) -> None:
     def work(progress: Progress) -> str:
         path = _new_file(viewer, folder, ".png", f"-{width}x{height}")
         progress("drawing", 0.0, path.name)
-        with in_one_line(path, f"{width}x{height}"), open_renderer("cpu") as renderer:
-            save_png(path, draw_something(request, renderer))
+        with output.in_one_line(path, f"{width}x{height}"), open_renderer("cpu") as renderer:
+            output.save_png(path, output.draw_something(request, renderer))
         return f"saved {path}"
 
     viewer.recorder.submit(f"picture of {width} x {height}", work, state.say, viewer.say_error)
@@ -125,16 +114,18 @@ def save_film(viewer: Viewer, folder: Path = Path()) -> None:
     try:
         new = folder.absolute() / typed
         if not typed:
-            new = _new_file(viewer, folder, VIDEO if has_video() else "", "-film")
-        out = check_film(new, record.size)
-        shot = Shot(request, cameras_of(motion, state.extent, record.fps, record.size), record.fps, "cpu")
+            new = _new_file(viewer, folder, output.VIDEO if output.has_video() else "", "-film")
+        out = output.check_film(new, record.size)
+        shot = output.Shot(
+            request, output.cameras_of(motion, state.extent, record.fps, record.size), record.fps, "cpu"
+        )
     except (InputError, OSError) as error:
         viewer.say_error(f"no film: {error}")
         return
 
     def work(progress: Progress) -> str:
         say_compiling(progress)
-        return "; ".join(make_film(shot, out, progress))
+        return "; ".join(output.make_film(shot, out, progress))
 
     viewer.recorder.submit(f"film {out.name}", work, state.say, viewer.say_error)
 
@@ -192,7 +183,7 @@ def export(
 
 
 def _write(scene: Scene, rows: Array, folder: Path, stem: str, as_points: bool) -> tuple[Path, int]:
-    path = free_name(folder, stem, ".ply", () if as_points else COMPANIONS)
+    path = output.free_name(folder, stem, ".ply", () if as_points else COMPANIONS)
     if as_points:
         return path, write_points(path, scene.gaussians.take(rows))
     save_scene(path, replace(scene.take(rows), path=path))

@@ -15,32 +15,9 @@ from langsplat_core.query.engine import QueryEngine, no_field
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Camera
 from langsplat_viewer.actions.settings import open_panel
-from langsplat_viewer.camera.controls import (
-    Extent,
-    OrbitCamera,
-    Side,
-    between,
-    default_view,
-    focus,
-    frame_all,
-    from_camera,
-    from_side,
-    holding_distance,
-    orbit,
-    zoom,
-)
-from langsplat_viewer.camera.flight import (
-    LONGEST,
-    SAME_TIME,
-    Keyframe,
-    Motion,
-    pose_at,
-    pose_of,
-    stretched,
-    turntable,
-    view_of,
-    with_keyframe,
-)
+from langsplat_viewer.camera import controls, flight
+from langsplat_viewer.camera.controls import Extent, OrbitCamera, Side
+from langsplat_viewer.camera.flight import Keyframe, Motion
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.projects import MOST_KEYFRAMES, read_flight
 from langsplat_viewer.rendering.request import image_formation
@@ -59,7 +36,7 @@ def tick(viewer: Viewer, now: float) -> None:
     glide = viewer.state.glide
     if glide is not None:
         t = (now - glide.began) / GLIDE_SECONDS
-        viewer.state.view = between(glide.start, glide.end, t)
+        viewer.state.view = controls.between(glide.start, glide.end, t)
         if t >= 1:
             viewer.state.glide = None
     _play(viewer)
@@ -86,7 +63,7 @@ def open_at(viewer: Viewer, camera: Camera) -> None:
         same = [np.array_equal(own.world_to_camera, camera.world_to_camera) for own in scene.cameras]
         viewer.state.camera_index = same.index(True) if any(same) else None
         viewer.state.opening_camera = camera
-        move(viewer, lambda view: from_camera(camera, extent))
+        move(viewer, lambda view: controls.from_camera(camera, extent))
 
 
 def zoom_by(viewer: Viewer, factor: float) -> None:
@@ -94,7 +71,7 @@ def zoom_by(viewer: Viewer, factor: float) -> None:
     extent = viewer.state.extent
     if extent is not None:
         nearest, farthest = NEAREST * extent.radius, extent.farthest
-        move(viewer, lambda view: zoom(view, factor, nearest, farthest))
+        move(viewer, lambda view: controls.zoom(view, factor, nearest, farthest))
 
 
 def opening_view(viewer: Viewer) -> OrbitCamera | None:
@@ -107,8 +84,8 @@ def opening_view(viewer: Viewer) -> OrbitCamera | None:
     if state.scene is None or state.extent is None:
         return None
     if state.opening_camera is not None:
-        return from_camera(state.opening_camera, state.extent)
-    return default_view(state.scene, state.extent, state.size)
+        return controls.from_camera(state.opening_camera, state.extent)
+    return controls.default_view(state.scene, state.extent, state.size)
 
 
 def reset_view(viewer: Viewer) -> None:
@@ -119,7 +96,7 @@ def reset_view(viewer: Viewer) -> None:
     if state.view is not None and state.view.orthographic:
         view = replace(view, orthographic=True)
         if state.opening_camera is None and not state.scene.cameras:
-            view = frame_all(view, state.extent, state.size)
+            view = controls.frame_all(view, state.extent, state.size)
     glide_to(viewer, view)
 
 
@@ -127,13 +104,13 @@ def frame_scene(viewer: Viewer) -> None:
     """Show the whole scene, from the side that it is seen from now."""
     state = viewer.state
     if state.view is not None and state.extent is not None:
-        glide_to(viewer, frame_all(state.view, state.extent, state.size))
+        glide_to(viewer, controls.frame_all(state.view, state.extent, state.size))
 
 
 def look_from(viewer: Viewer, side: Side) -> None:
     """Turn the view to look along one of the world's axes, at the same place from as far."""
     if viewer.state.view is not None:
-        glide_to(viewer, from_side(viewer.state.view, side))
+        glide_to(viewer, controls.from_side(viewer.state.view, side))
 
 
 def toggle_orthographic(viewer: Viewer) -> None:
@@ -155,7 +132,7 @@ def go_to_camera(viewer: Viewer, index: int) -> None:
         viewer.say_error("this scene has no training cameras (no .cameras.json beside it)")
         return
     viewer.state.camera_index = index % len(scene.cameras)
-    glide_to(viewer, from_camera(scene.cameras[viewer.state.camera_index], extent))
+    glide_to(viewer, controls.from_camera(scene.cameras[viewer.state.camera_index], extent))
 
 
 def step_camera(viewer: Viewer, by: int) -> None:
@@ -189,8 +166,8 @@ def focus_on(viewer: Viewer, place: Array, box: Array | None) -> None:
     if box is None:
         box = np.stack([place, place + 0.1 * extent.radius])
     most = max(float(np.linalg.norm(place - view.eye)), home.distance)
-    distance = min(max(holding_distance(view, box), NEAREST * extent.radius), most)
-    glide_to(viewer, focus(view, place, distance))
+    distance = min(max(controls.holding_distance(view, box), NEAREST * extent.radius), most)
+    glide_to(viewer, controls.focus(view, place, distance))
 
 
 def focus_pixel(viewer: Viewer, u: float, v: float) -> None:
@@ -200,7 +177,7 @@ def focus_pixel(viewer: Viewer, u: float, v: float) -> None:
     if view is not None and point is not None:
         # The eye stays, but without perspective the size of things does.
         depth = None if view.orthographic else float((np.array(point) - view.eye) @ view.rotation[2])
-        glide_to(viewer, focus(view, np.array(point), depth))
+        glide_to(viewer, controls.focus(view, np.array(point), depth))
 
 
 # The camera path as it is played.
@@ -220,7 +197,7 @@ def path_motion(viewer: Viewer) -> Motion | None:
     if state.view is None or path_seconds(viewer) <= 0:
         return None
     if record.turns:
-        return turntable(record.turn_from or state.view, record.turn_seconds)
+        return flight.turntable(record.turn_from or state.view, record.turn_seconds)
     return flight_of(state.session.keyframes)
 
 
@@ -279,9 +256,9 @@ def _show(viewer: Viewer, seconds: float) -> None:
     state, record = viewer.state, viewer.state.record
     record.at = seconds
     if record.turns and record.turn_from is not None:
-        state.view = orbit(record.turn_from, 2 * math.pi * seconds / record.turn_seconds, 0)
+        state.view = controls.orbit(record.turn_from, 2 * math.pi * seconds / record.turn_seconds, 0)
     elif state.extent is not None and state.session.keyframes:
-        state.view = view_of(pose_at(flight_of(state.session.keyframes), seconds), state.extent)
+        state.view = flight.view_of(flight.pose_at(flight_of(state.session.keyframes), seconds), state.extent)
 
 
 # Keyframes of the path.
@@ -295,10 +272,10 @@ def add_keyframe(viewer: Viewer) -> None:
         return
     keyframes = state.session.keyframes
     last = keyframes[-1].seconds + SPACING if keyframes else 0.0
-    if last > LONGEST or len(keyframes) >= MOST_KEYFRAMES:
-        viewer.say_error(f"a path has at most {MOST_KEYFRAMES} keyframes and {LONGEST:.0f} seconds")
+    if last > flight.LONGEST or len(keyframes) >= MOST_KEYFRAMES:
+        viewer.say_error(f"a path has at most {MOST_KEYFRAMES} keyframes and {flight.LONGEST:.0f} seconds")
         return
-    added = Keyframe(last, pose_of(state.view))
+    added = Keyframe(last, flight.pose_of(state.view))
     record.turns = False
     _set_path(viewer, (*keyframes, added), added)
     state.say(f"keyframe {len(keyframes) + 1} at {added.seconds:.1f} s")
@@ -308,7 +285,7 @@ def choose_keyframe(viewer: Viewer, key: Keyframe) -> None:
     """Go to a keyframe."""
     state, record = viewer.state, viewer.state.record
     if state.extent is not None:
-        glide_to(viewer, view_of(key.pose, state.extent))
+        glide_to(viewer, flight.view_of(key.pose, state.extent))
         record.chosen, record.at = key, key.seconds
 
 
@@ -320,29 +297,29 @@ def delete_keyframe(viewer: Viewer, key: Keyframe) -> None:
 def move_keyframe(viewer: Viewer, key: Keyframe, seconds: float) -> None:
     """Move a keyframe to another time, or beside a keyframe that has that time."""
     others = tuple(other for other in viewer.state.session.keyframes if other is not key)
-    seconds = min(max(seconds, 0.0), LONGEST)
-    while any(abs(other.seconds - seconds) < SAME_TIME for other in others):
+    seconds = min(max(seconds, 0.0), flight.LONGEST)
+    while any(abs(other.seconds - seconds) < flight.SAME_TIME for other in others):
         seconds += 0.01
     moved = replace(key, seconds=seconds)
-    _set_path(viewer, with_keyframe(others, moved), moved)
+    _set_path(viewer, flight.with_keyframe(others, moved), moved)
 
 
 def replace_keyframe(viewer: Viewer, key: Keyframe) -> None:
     """Put the current view in the place of a keyframe."""
     if viewer.state.view is not None:
-        new = replace(key, pose=pose_of(viewer.state.view))
-        _set_path(viewer, with_keyframe(viewer.state.session.keyframes, new), new)
+        new = replace(key, pose=flight.pose_of(viewer.state.view))
+        _set_path(viewer, flight.with_keyframe(viewer.state.session.keyframes, new), new)
 
 
 def set_path_seconds(viewer: Viewer, seconds: float) -> None:
     """Set how long the path, or the turn, takes."""
     record, keyframes = viewer.state.record, viewer.state.session.keyframes
-    seconds = min(max(seconds, 0.1), LONGEST)
+    seconds = min(max(seconds, 0.1), flight.LONGEST)
     if record.turns:
         record.at *= seconds / record.turn_seconds
         record.turn_seconds = seconds
     elif path_seconds(viewer) > 0:
-        _set_path(viewer, stretched(keyframes, max(seconds, len(keyframes) * SAME_TIME)), None)
+        _set_path(viewer, flight.stretched(keyframes, max(seconds, len(keyframes) * flight.SAME_TIME)), None)
 
 
 def clear_path(viewer: Viewer) -> None:
@@ -368,15 +345,15 @@ def set_turning(viewer: Viewer, turns: bool) -> None:
 def load_path(viewer: Viewer, path: Path) -> None:
     """Take the path of a file in place of the one that is there."""
     try:
-        flight = read_flight(path)
+        found = read_flight(path)
     except LangSplatError as error:
         viewer.say_error(str(error))
         return
     viewer.state.record.turns = False
-    _set_path(viewer, flight.keyframes, None)
+    _set_path(viewer, found.keyframes, None)
     viewer.state.record.at = 0.0
     open_panel(viewer, "Record")
-    viewer.state.say(f"{path.name}: {len(flight.keyframes)} keyframes, {flight.seconds:.1f} s")
+    viewer.state.say(f"{path.name}: {len(found.keyframes)} keyframes, {found.seconds:.1f} s")
 
 
 # The cursor: what lies under it while it rests.
@@ -438,7 +415,7 @@ def add_bookmark(viewer: Viewer, name: str = "") -> None:
     if not name.strip():
         taken, number = {bookmark.name for bookmark in kept}, len(kept) + 1
         name = next(f"view {n}" for n in range(number, 2 * number) if f"view {n}" not in taken)
-    added = Bookmark(printable_line(name, LONGEST_NAME), pose_of(state.view), state.view.distance)
+    added = Bookmark(printable_line(name, LONGEST_NAME), flight.pose_of(state.view), state.view.distance)
     others = tuple(bookmark for bookmark in kept if bookmark.name != added.name)
     if len(others) >= MOST_BOOKMARKS:
         viewer.say_error(f"a scene has at most {MOST_BOOKMARKS} bookmarks: delete one")
@@ -455,7 +432,7 @@ def go_to_bookmark(viewer: Viewer, bookmark: Bookmark) -> None:
 
 def bookmarked_view(bookmark: Bookmark, extent: Extent) -> OrbitCamera:
     """Return the view of a bookmark."""
-    view = view_of(bookmark.pose, extent)
+    view = flight.view_of(bookmark.pose, extent)
     target = view.eye + bookmark.distance * view.rotation[2]
     return replace(view, target=target, distance=bookmark.distance)
 

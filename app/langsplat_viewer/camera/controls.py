@@ -194,13 +194,8 @@ def orbit(view: OrbitCamera, yaw: float, pitch: float) -> OrbitCamera:
     limit = max(MAX_ELEVATION, abs(view.elevation))
     pitch = float(np.clip(pitch, view.elevation - limit, view.elevation + limit))
     rotation = _about(np.array([1.0, 0, 0]), pitch) @ view.rotation @ _about(view.up, yaw)
-    return replace(view, rotation=_orthonormal(rotation))
-
-
-def _orthonormal(rotation: Array) -> Array:
-    """Return the nearest rotation: thousands of small drags must not let the axes drift apart."""
-    u, _, vt = np.linalg.svd(rotation)
-    return u @ vt
+    u, _, vt = np.linalg.svd(rotation)  # thousands of small drags must not let the axes drift apart
+    return replace(view, rotation=u @ vt)
 
 
 def look(view: OrbitCamera, yaw: float, pitch: float) -> OrbitCamera:

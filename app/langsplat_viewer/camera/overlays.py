@@ -157,7 +157,8 @@ def ground_grid(extent: Extent, up: Array, metres_per_unit: float | None) -> Gri
     if len(extent.sample.points):
         height = weighted_quantile(extent.sample.points @ up, extent.sample.weights, GROUND_SHARE)
     reach = GRID_REACH * extent.radius
-    across, ahead = (_multiples(middle - reach, middle + reach, spacing) for middle in (right, front))
+    ends = (((middle - reach) / spacing, (middle + reach) / spacing) for middle in (right, front))
+    across, ahead = (spacing * np.arange(math.floor(low), math.ceil(high) + 1) for low, high in ends)
 
     def point(x: float, z: float) -> Array:
         return np.array([x, height, z]) @ frame
@@ -167,7 +168,3 @@ def ground_grid(extent: Extent, up: Array, metres_per_unit: float | None) -> Gri
     marks = [(f"{x * scale:.4g}", point(x, ahead[0])) for x in across[1:]]
     marks += [(f"{z * scale:.4g}", point(across[0], z)) for z in ahead[1:]]
     return Grid(np.array(lines), spacing, tuple(marks))
-
-
-def _multiples(low: float, high: float, spacing: float) -> Array:
-    return spacing * np.arange(math.floor(low / spacing), math.ceil(high / spacing) + 1)

@@ -79,7 +79,13 @@ def draw_display(viewer: Viewer) -> None:
         changed, chosen = imgui.combo("Colour map", names.index(picture.colour_map), list(names))
         if changed:
             picture = replace(picture, colour_map=names[chosen])
-    picture = replace(picture, background=_backdrop(picture.background))
+    picture = replace(picture, background=ui.radio(BACKDROPS, picture.background))
+    ui.beside_boxed("Backdrop")
+    flags = imgui.ColorEditFlags_.no_inputs | imgui.ColorEditFlags_.uint8
+    changed, colour = imgui.color_edit3("Backdrop", list(picture.background), flags)
+    if changed:
+        red, green, blue = (min(max(float(part), 0.0), 1.0) for part in colour)
+        picture = replace(picture, background=(red, green, blue))
     ui.tip("What shows where the scene is not")
     picture = replace(picture, transparent=imgui.checkbox("Save without backdrop", picture.transparent)[1])
     ui.tip("Pictures are saved transparent where the scene is not")
@@ -104,15 +110,6 @@ def _heat_scale(viewer: Viewer) -> tuple[float, float] | None:
     flags = imgui.SliderFlags_.always_clamp
     changed, low, high = imgui.drag_float_range2("From, to", *scale, 0.002, 0.0, 1.0, "%.3f", "%.3f", flags)
     return (low, high) if changed and high - low > LEAST_SPAN else scale
-
-
-def _backdrop(background: tuple[float, float, float]) -> tuple[float, float, float]:
-    background = ui.radio(BACKDROPS, background)
-    ui.beside_boxed("Backdrop")
-    flags = imgui.ColorEditFlags_.no_inputs | imgui.ColorEditFlags_.uint8
-    changed, colour = imgui.color_edit3("Backdrop", list(background), flags)
-    red, green, blue = (min(max(float(part), 0.0), 1.0) for part in colour)
-    return (red, green, blue) if changed else background
 
 
 def _display_line(viewer: Viewer, rows: tuple[DisplayRow, ...]) -> None:

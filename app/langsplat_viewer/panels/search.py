@@ -130,7 +130,8 @@ def _answers(viewer: Viewer) -> None:
     """
     row = imgui.get_frame_height_with_spacing()
     listed = viewer.state.session.queries
-    rows = rows_shown(len(listed), imgui.get_content_region_avail().y / row)
+    room = imgui.get_content_region_avail().y / row - BELOW
+    rows = min(len(listed) or 1, max(ROWS, math.floor(room) + 0.5))
     if imgui.begin_child("queries", ImVec2(0, rows * row), imgui.ChildFlags_.nav_flattened):
         if not listed:
             imgui.text_colored(ui.muted(), "what you search is listed here")
@@ -142,11 +143,6 @@ def _answers(viewer: Viewer) -> None:
     chosen = viewer.state.session.query(viewer.state.session.chosen)
     if chosen is not None:
         _details(viewer, chosen)
-
-
-def rows_shown(count: int, room: float) -> float:
-    """Return how many of `count` queries a panel with `room` rows shows: all where the details fit below."""
-    return min(count or 1, max(ROWS, math.floor(room - BELOW) + 0.5))
 
 
 def _line(viewer: Viewer, query: Query) -> None:

@@ -18,7 +18,7 @@ from langsplat_viewer.panels import ui
 from langsplat_viewer.panels.overlays import say
 from langsplat_viewer.rendering.request import TINT
 from langsplat_viewer.session import Point
-from langsplat_viewer.state import EditForm, Gizmo
+from langsplat_viewer.state import Gizmo
 from langsplat_viewer.viewer import Viewer
 
 OF_SELECTED = (
@@ -160,9 +160,12 @@ def draw_stroke(viewer: Viewer, area: ui.Area) -> None:
     paint.push_clip_rect(*area.corners)
     drawn, radius = editing.drawn_stroke(viewer), tools.brush * area.height
     for line in marks.outlines(drawn) if drawn is not None else []:
-        points = _on_screen(line, area)
-        if tools.tool == "brush":
-            _stripe(paint, points, radius)
+        places = (area.left, area.top) + line * (area.width, area.height)
+        points: list[Any] = [ImVec2(*place) for place in places.tolist()]
+        if tools.tool == "brush" and len(points) == 1:
+            paint.add_circle_filled(points[0], radius, imgui.get_color_u32(PAINT))
+        elif tools.tool == "brush":
+            paint.add_polyline(points, imgui.get_color_u32(PAINT), 2 * radius, 0)
         else:
             paint.add_polyline(points, imgui.get_color_u32(DARK), 3.0, 0)
             paint.add_polyline(points, imgui.get_color_u32(LIGHT), 1.5, 0)
@@ -171,19 +174,6 @@ def draw_stroke(viewer: Viewer, area: ui.Area) -> None:
         paint.add_circle(io.mouse_pos, radius, imgui.get_color_u32(DARK), 0, 3.0)
         paint.add_circle(io.mouse_pos, radius, imgui.get_color_u32(LIGHT), 0, 1.0)
     paint.pop_clip_rect()
-
-
-def _on_screen(line: Array, area: ui.Area) -> list[Any]:
-    """(K, 2) fractions of the area -> window units."""
-    return [ImVec2(area.left + u * area.width, area.top + v * area.height) for u, v in line.tolist()]
-
-
-def _stripe(paint: Any, points: list[Any], radius: float) -> None:
-    """Draw the way of the brush, as wide as it is; of a click a disk."""
-    if len(points) == 1:
-        paint.add_circle_filled(points[0], radius, imgui.get_color_u32(PAINT))
-    else:
-        paint.add_polyline(points, imgui.get_color_u32(PAINT), 2 * radius, 0)
 
 
 def draw_hint(viewer: Viewer, area: ui.Area) -> None:
@@ -222,7 +212,11 @@ def draw_transform(viewer: Viewer) -> None:
     what = f"{chosen:,} selected Gaussians" if chosen else "The whole scene, with its cameras"
     ui.small_wrapped(what, ui.muted())
     form = replace(state.edit_form, gizmo=ui.radio(GIZMOS, state.edit_form.gizmo))
-    settings.put(state, edit_form=_numbers(form))
+    move = _three("Move", form.move, "World units along x, y and z")
+    rotate = _three("Rotate", form.rotate, "Degrees about x, then y, then z, right-handed")
+    ui.leave_room("Scale", 12)
+    _, scale = imgui.input_float("Scale", form.scale, 0, 0, "%.5g")
+    settings.put(state, edit_form=replace(form, move=move, rotate=rotate, scale=scale))
     if ui.button("Apply", "Scale and rotate about the middle of what is transformed, then move"):
         editing.apply_form(viewer)
     imgui.separator()
@@ -235,14 +229,6 @@ def draw_transform(viewer: Viewer) -> None:
     if ui.next_button("Crop", "Delete what lies outside the box; the file stays as it is"):
         editing.crop(viewer)
     imgui.end_disabled()
-
-
-def _numbers(form: EditForm) -> EditForm:
-    move = _three("Move", form.move, "World units along x, y and z")
-    rotate = _three("Rotate", form.rotate, "Degrees about x, then y, then z, right-handed")
-    ui.leave_room("Scale", 12)
-    _, scale = imgui.input_float("Scale", form.scale, 0, 0, "%.5g")
-    return replace(form, move=move, rotate=rotate, scale=scale)
 
 
 def _three(label: str, values: Point, what: str) -> Point:

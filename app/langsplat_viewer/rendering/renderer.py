@@ -410,9 +410,3 @@ def open_renderer(backend: Backend = "auto") -> Iterator[Renderer[Any]]:
     finally:
         if ctx is not None:
             ctx.release()
-
-
-def render_image(request: RenderRequest, backend: Backend = "auto") -> Array:
-    """Return the (H, W, 3) uint8 image, row 0 on top, (H, W, 4) of a transparent one; see `open_renderer`."""
-    with open_renderer(backend) as renderer:
-        return renderer.read(request)
