@@ -41,6 +41,7 @@ from langsplat_viewer.session import (
 
 T = TypeVar("T")
 SIZE_LIMIT = 64 * 1024 * 1024  # bytes of any of these files
+NONSENSE = InputError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError
 
 
 def _plain(value: object) -> Any:
@@ -95,7 +96,7 @@ def _read(path: Path, what: str, decode: Callable[[Any], T]) -> T:
     top = read_json_file(path, SIZE_LIMIT)
     try:
         return decode(top)
-    except (InputError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+    except NONSENSE as error:
         reason = printable_line(error if isinstance(error, InputError | ValueError) else f"{error!r}", 120)
         raise FormatError(f"{path}: no {what} ({reason}); save it anew") from None
 

@@ -216,10 +216,7 @@ class Viewer:
         done: Callable[[T], None] = lambda result: None,
         failed: Callable[[str], None] | None = None,
     ) -> Job:
-        """Have the worker do `work`.
-
-        `take_results` then calls `done` with its result, or `failed` with the reason, by default `say_error`.
-        """
+        """Have the worker do `work`, then `done` with its result or `failed`, by default `say_error`."""
         return self.worker.submit(label, work, done, failed or self.say_error)
 
     def ask_engine(

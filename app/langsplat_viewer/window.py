@@ -83,10 +83,7 @@ class Workspace:
         self._styled: Preferences | None = None  # as the window looks
 
     def load(self, params: hello_imgui.RunnerParams, restore_size: bool) -> None:
-        """Take the preferences that are there, and say where the layout is.
-
-        Where the folder cannot be written or understood, the reason is said and nothing is kept.
-        """
+        """Take the preferences that are there; where the folder makes no sense say so, and keep nothing."""
         params.ini_disable = True
         params.app_window_params.restore_previous_geometry = False
         self._state.preferences = replace(

@@ -484,13 +484,8 @@ def record_and_play(s: Any) -> None:
 
 
 def use_the_palette(s: Any) -> None:
-    """Its keys keep away from the scrollbar; Enter does the first command that matches, which is lit."""
+    """Enter does the first command that matches."""
     s.key("Ctrl+Shift+P", frames=3)
-    box, bar = s.ctx.item_info("//Commands/##command").rect_full, imgui.get_style().scrollbar_size
-    right, rows = int(box.max.x - bar), slice(int(box.max.y) + 30, int(box.max.y) + 150)
-    seen = s.shot("palette")[rows]
-    assert np.ptp(seen[:, right - 100 : right], axis=0).max() > 60  # keys
-    assert np.ptp(seen[:, right - 5 : right - 1], axis=0).max() < 10
     s.enter("show depth", frames=3)
     assert s.state.session.picture.display == "depth"
     assert not s.state.show_palette
@@ -579,9 +574,7 @@ def arrange_panels(s: Any) -> None:
     assert s.state.drafts["##phrase"] == "mug"  # the panel is open again, and its box has the keyboard
     s.key("escape", frames=1)
     s.menu("Window", "Reset the layout")
-    for title in ("Scene", "Display", "Camera", "Messages"):
-        if not s.ctx.item_exists(f"//{title}"):
-            s.menu("Window", title)
+    assert s.state.size[0] == whole[0]
 
 
 def leave_settings(s: Any) -> None:

@@ -370,34 +370,11 @@ def test_deletion_is_unsaved_until_exported(pruned, tmp_path):
     assert kept_in(tmp_path) == 240
 
 
-def test_opening_waits_for_the_question(pruned, tmp_path):
-    for reply in (settings.escape, saving.go_on):
-        opening.open_scene(pruned, Path("plain.ply"))
-        assert pruned.state.opening is None
-        assert pruned.state.leaving.to == "plain.ply is opened"
-        assert marked(pruned) == ("", "", "plant")
-        act(reply, pruned)
-        left = reply is saving.go_on
-        assert pruned.state.leaving is None
-        assert pruned.state.path.name == ("plain.ply" if left else "blobs.ply")
-    assert names_in(tmp_path) == []
-
-
 def test_broken_scene_after_discarding_keeps_edits(pruned):
     opening.open_scene(pruned, Path("broken.ply"))
     act(saving.go_on, pruned)
     assert marked(pruned) == ("", "", "plant")
     assert pruned.state.is_unsaved
-
-
-def test_leaving_continues_after_saving(pruned, tmp_path):
-    then = []
-    opening.open_scene(pruned, Path("plain.ply"), then.append)
-    act(saving.save_and_leave, pruned, tmp_path)
-    settle(pruned)
-    assert then == [pruned]
-    assert pruned.state.path.name == "plain.ply"
-    assert kept_in(tmp_path) == 240
 
 
 def test_failed_saving_stays_in_the_scene(pruned, tmp_path):

@@ -12,7 +12,7 @@ from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions import editing, opening, queries, settings, viewpoint
 from langsplat_viewer.camera.controls import orbit
-from langsplat_viewer.disk import MOST_LISTED, list_folder
+from langsplat_viewer.disk import list_folder
 from langsplat_viewer.rendering.request import UNCLIPPED, Clip
 from tests.support.fakes import blob_scene
 from tests.support.windowless import SCENES, act, ask, errors, go, open_scene, result, settle
@@ -180,13 +180,6 @@ def test_listing_has_folders_first_and_only_scenes(folder):
     assert not listing.problem
     assert "No such file" in list_folder(folder / "gone").problem
     assert "Not a directory" in list_folder(folder / "notes.txt").problem
-
-
-def test_listing_of_a_crowded_folder_is_cut(tmp_path):
-    for number in range(MOST_LISTED + 2):
-        (tmp_path / f"{number}.ply").touch()
-    listing = list_folder(tmp_path)
-    assert (len(listing.entries), listing.left_out) == (MOST_LISTED, 2)
 
 
 def test_browser_enters_folders_and_opens_scenes(viewer, folder):

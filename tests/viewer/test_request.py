@@ -132,7 +132,6 @@ UNSEEN = {
     "line": lambda v: settings.move_line(v, 0.3),  # the window draws it
     "ruler": settings.toggle_measuring,
     "tool": lambda v: editing.use_tool(v, "brush"),
-    "word": lambda v: setattr(v.state, "typed", "plant"),
     "chosen query": lambda v: v.put(chosen=""),
     "saved without background": lambda v: settings.set_picture(
         v, replace(v.state.session.picture, transparent=True)

@@ -354,31 +354,46 @@ def test_other_files_of_version_1_open_and_mean_the_same():
     )
 
 
-@pytest.mark.parametrize("version", [1, 2])
-def test_damaged_project_is_refused_in_one_line(saved, version):
-    if version == 1:
-        saved.write_bytes((SAVED / "version1.langsplat").read_bytes())
-    top = json.loads(saved.read_text())
+READERS = {
+    ".langsplat": read_project,
+    ".path.json": read_flight,
+    "bookmarks.json": lambda path: Shelf(path.parent).read(Path("/scenes/blobs.ply")),
+    "preferences.json": lambda path: load_preferences(path.parent),
+}
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["blobs-001.langsplat", "version1.langsplat", "version1.path.json", "bookmarks.json", "preferences.json"],
+)
+def test_damaged_file_is_refused_in_one_line(saved, name):
+    path = saved.with_name(name)
+    top = json.loads((path if path == saved else SAVED / name).read_text())
+    (read,) = (reader for ending, reader in READERS.items() if name.endswith(ending))
     refused: list[str] = []
     tried = 0
     for way in list(places(top)):
-        if way[0] == "format":
-            continue
-        for odd in (None, "x", -1, True, [], {}, 1e308, [[["x"]]], "\0"):
+        for odd in (None, "x", -1, True, [], {}, 1e308, 10**400, [[["x"]]], "\0"):
             broken = copy.deepcopy(top)
             inner = broken
             for step in way[:-1]:
                 inner = inner[step]
             inner[way[-1]] = odd
-            saved.write_text(json.dumps(broken))
+            path.write_text(json.dumps(broken))
             tried += 1
             try:
-                read_project(saved)  # some of it is a project still
+                read(path)  # some of it makes sense still
             except LangSplatError as error:
                 refused.append(str(error))
-    assert tried > len(refused) > 400
-    assert all(text.startswith(f"{saved}: no project (") for text in refused)
-    assert not [text for text in refused if "\n" in text or not text.endswith("; save it anew")]
+    for text in ("", "[]", "{", "[" * 100_000, "\xff\xfe"):
+        path.write_bytes(text.encode("latin-1"))
+        with pytest.raises(LangSplatError) as raised:
+            read(path)
+        refused.append(str(raised.value))
+    assert tried > len(refused) > tried / 3
+    assert all(text.startswith(f"{path}: ") and text.isprintable() for text in refused)
+    remedies = ("; save it anew", "; mend or delete it", "export it anew")
+    assert [text for text in refused if not text.endswith(remedies)] == []
 
 
 def test_project_with_impossible_values_is_refused(saved):

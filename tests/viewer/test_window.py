@@ -1,4 +1,4 @@
-"""The window on a virtual display: scenarios, idling, closing, orbiting, memory, a long day of 100 scenes."""
+"""The program: pictures without a window, refusals as one line, and the window on a virtual display."""
 
 import json
 import os
@@ -13,11 +13,245 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from langsplat_core.io.scenes import save_scene
-from langsplat_core.scene import Scene
-from tests.support.fakes import blob_scene
+from langsplat_core.io.cameras import write_cameras
+from langsplat_core.io.scenes import companion_path, save_scene
+from langsplat_core.io.sidecar import SUFFIX as SIDECAR
+from langsplat_core.scene import Camera, Scene
+from langsplat_viewer import options
+from langsplat_viewer.options import load_text_encoder, parse_size
+from tests.support.fakes import CENTRES, blob_scene
 from tests.support.processes import Cast, play, surroundings
+from tests.support.scenes import with_tree
+
+MUG, BOOK, PLANT = CENTRES
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working folder, with scenes in it."""
+    save_scene(tmp_path / "blobs.ply", with_tree(blob_scene(phrasebook=True)))
+    save_scene(tmp_path / "old.ply", blob_scene())
+    save_scene(tmp_path / "plain.ply", blob_scene(field=False, with_cameras=False))
+    whole = (tmp_path / "plain.ply").read_bytes()
+    (tmp_path / "truncated.ply").write_bytes(whole[: len(whole) // 2])
+    moved = blob_scene()
+    gaussians = replace(moved.gaussians, means=moved.gaussians.means + 1)
+    save_scene(tmp_path / "edited.ply", Scene(gaussians))
+    sidecar = companion_path(tmp_path / "blobs.ply", SIDECAR)
+    companion_path(tmp_path / "edited.ply", SIDECAR).write_bytes(sidecar.read_bytes())
+    save_scene(tmp_path / "nothing.ply", Scene(gaussians.take(np.zeros(len(gaussians), bool))))
+    (tmp_path / "broken.json").write_text('[{"width": 12')
+    (tmp_path / "empty.json").write_text("[]")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def picture(path: Path) -> np.ndarray:
+    return np.asarray(Image.open(path)).astype(int)
+
+
+def draw(run_viewer, out: str, *arguments: str) -> list[str]:
+    """What is said of a picture of the blobs that is drawn without a window."""
+    code, said, errors = run_viewer("blobs.ply", "--headless", "--out", out, *arguments)
+    assert (code, errors) == (0, [])
+    return said
+
+
+def colour_at(image: np.ndarray, camera: Camera, point: np.ndarray) -> np.ndarray:
+    pixels, _ = camera.project(point[None])
+    column, row = pixels[0].astype(int)
+    return image[row - 2 : row + 3, column - 2 : column + 3].reshape(-1, 3).mean(0)
+
+
+def test_headless_image_uses_the_first_camera(run_viewer, folder):
+    assert draw(run_viewer, "a.png") == ["a.png: 160x120, rgb"]
+    image, camera = picture(folder / "a.png"), blob_scene().cameras[0]
+    assert image.shape == (120, 160, 3)
+    assert [colour_at(image, camera, p).argmax() for p in (MUG, BOOK, PLANT)] == [0, 1, 2]
+    draw(run_viewer, "b.png", "--size", "400x120")  # holds the whole photograph
+    wide = picture(folder / "b.png")
+    assert wide.shape == (120, 400, 3)
+    np.testing.assert_allclose(wide[:, 120:280], image, atol=1)
+    write_cameras(folder / "view.json", (blob_scene().cameras[2],))
+    draw(run_viewer, "c.png", "--camera", "2")
+    draw(run_viewer, "d.png", "--camera", "view.json")
+    np.testing.assert_array_equal(picture(folder / "c.png"), picture(folder / "d.png"))
+
+
+def test_headless_query_prints_and_paints_answers(run_viewer, folder):
+    draw(run_viewer, "rgb.png", "--camera", "1")
+    out = draw(run_viewer, "a.png", "--query", "plant", "--query", "Book", "--camera", "1")
+    assert out[0] == "a.png: 160x120, relevancy"
+    assert out[1].startswith("'plant': found, score ")
+    assert "level whole" in out[1]
+    place = np.array([float(v) for v in out[1].partition("place (")[2].rstrip(")").split(",")])
+    np.testing.assert_allclose(place, PLANT, atol=0.2)
+    assert out[2].startswith("'Book': found")
+    camera = blob_scene().cameras[1]
+    before, heat = picture(folder / "rgb.png"), picture(folder / "a.png")
+    assert colour_at(heat, camera, PLANT)[2] < 60 < colour_at(before, camera, PLANT)[2]
+    dimmed = 0.45 * colour_at(before, camera, MUG)  # what is not asked for
+    np.testing.assert_allclose(colour_at(heat, camera, MUG), dimmed, atol=4)
+    out = draw(run_viewer, "a.png", "--query", "mug", "--level", "part")
+    assert "not here" in out[1]
+    assert "level part" in out[1]
+
+
+def test_transparent_image_in_another_colour_map(run_viewer, folder):
+    draw(run_viewer, "a.png", "--display", "depth")
+    draw(run_viewer, "b.png", "--display", "depth", "--colour-map", "cividis", "--transparent")
+    plain, clear = picture(folder / "a.png"), picture(folder / "b.png")
+    assert (plain.shape[2], clear.shape[2]) == (3, 4)
+    inside = clear[..., 3] == 255
+    assert 0.01 < inside.mean() < 0.9
+    assert (clear[~inside] == 0).all()
+    assert np.abs(clear[..., :3][inside] - plain[inside]).max() > 60
+
+
+def test_orthographic_image_has_the_asked_scale(run_viewer, folder):
+    """Three units across 120 pixels; each blob is as large as the others, however far away."""
+    assert draw(run_viewer, "a.png", "--orthographic", "3") == ["a.png: 160x120, rgb"]
+    image, camera = picture(folder / "a.png"), blob_scene().cameras[0]
+    sizes, middles = [], []
+    for colour in range(3):
+        columns = np.nonzero(image[..., colour] - np.delete(image, colour, -1).max(-1) > 40)[1]
+        sizes.append(len(columns))
+        middles.append(columns.mean())
+    assert max(sizes) < 1.3 * min(sizes)
+    along = float((PLANT - MUG) @ camera.rotation[0])
+    assert abs(middles[2] - middles[0] - along * 120 / 3) < 4
+
+
+def test_scene_without_cameras_is_framed(run_viewer, folder):
+    code, out, _ = run_viewer("plain.ply", "--headless", "--out", "new/folder/a.png", "--size", "96x64")
+    assert (code, out) == (0, ["new/folder/a.png: 96x64, rgb"])
+    covered = (picture(folder / "new/folder/a.png").max(-1) > 40).mean()
+    assert 0.02 < covered < 0.9
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["nope.ply"], "nope.ply: no such file"),
+        (["."], "is a folder"),
+        (["x" * 5000 + ".ply"], "cannot be opened"),
+        (["truncated.ply"], "truncated.ply: truncated"),
+        (["nothing.ply"], "the scene holds no Gaussians"),
+        (["edited.ply", "--query", "mug"], "edited.langsplat.safetensors"),
+        (["blobs.ply", "--query", "sofa"], "'sofa'"),
+        (["blobs.ply", "--query", " "], "empty"),
+        (["blobs.ply", "--camera", "3"], "cameras 0 to 2"),
+        (["blobs.ply", "--camera", "nope.json"], "nope.json: no such file"),
+        (["blobs.ply", "--camera", "broken.json"], "broken.json"),
+        (["blobs.ply", "--camera", "empty.json"], "holds no camera"),
+        (["plain.ply", "--camera", "0"], "no training cameras"),
+        (["plain.ply", "--query", "mug"], "langsplat train"),
+        (["plain.ply", "--display", "latent"], "langsplat train"),
+        (["old.ply", "--display", "tree"], "keeps no tree"),
+        (["blobs.ply", "--display", "segmentation"], "add --query"),
+        (["blobs.ply", "--display", "pretty"], "pretty"),
+        (["blobs.ply", "--size", "99999x10"], "1280x720"),
+        (["blobs.ply", "--headles"], "--headles"),
+        (["blobs.ply", "plain.ply"], "plain.ply"),
+        (["blobs.ply", "--near-cut", "-1"], "--near-cut -1: must be 0"),
+        (["blobs.ply", "--far-cut", "0"], "--far-cut 0: must be above 0"),
+        (["blobs.ply", "--near-cut", "30"], "nothing of the scene"),
+        (["blobs.ply", "--orthographic", "0"], "--orthographic 0: must be 1e-09 to 1e+09"),
+        (["blobs.ply", "--orthographic", "4", "--near-cut", "30"], "nothing of the scene"),
+    ],
+)
+def test_impossible_options_are_one_line(run_viewer, folder, arguments, reason):
+    code, out, err = run_viewer(*arguments, "--headless", "--out", "a.png")
+    assert (code, out, len(err)) == (2, [], 1)
+    assert reason in err[0]
+    assert err[0].startswith("langsplat-viewer: ")
+    assert not (folder / "a.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["--headless"], "add --out"),
+        (["--headless", "--out", "a.jpg"], "end the name in .png"),
+        (["--headless", "--out", "folder.png"], "is a folder"),
+        (["--headless", "--out", "blobs.ply/a.png"], "is a file, not a folder"),
+        (["--headless", "--out", "x" * 5000 + ".png"], "choose another"),
+        (["--out", "a.png"], "add --headless"),
+        (["--transparent"], "add --headless"),
+        (["--far-cut", "1"], "add --headless"),
+    ],
+)
+def test_missing_options_are_named_in_one_line(run_viewer, folder, arguments, reason):
+    (folder / "folder.png").mkdir()
+    code, out, err = run_viewer("blobs.ply", *arguments)
+    assert (code, out, len(err)) == (2, [], 1)
+    assert reason in err[0]
+
+
+def test_absent_encoder_is_one_line(run_viewer, monkeypatch, folder):
+    monkeypatch.setattr(options, "load_text_encoder", load_text_encoder)
+    code, _, errors = run_viewer("blobs.ply", "--headless", "--out", "a.png", "--query", "mug")
+    assert (code, len(errors)) == (2, 1)
+    assert "fake" in errors[0]
+    assert not (folder / "a.png").exists()
+
+
+def test_failed_image_leaves_the_old_one(run_viewer, folder):
+    (folder / "a.png").write_bytes(b"old")
+    run_viewer("truncated.ply", "--headless", "--out", "a.png")
+    assert (folder / "a.png").read_bytes() == b"old"
+    run_viewer("plain.ply", "--headless", "--out", "a.png", "--size", "32x32")
+    assert picture(folder / "a.png").shape == (32, 32, 3)
+    assert not [path for path in folder.iterdir() if path.name.startswith(".a")]
+
+
+def run_python(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Of a process without a display, but for one that is given."""
+    inherited = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    return subprocess.run(
+        [sys.executable, *arguments], env=inherited | environment, capture_output=True, text=True, timeout=120
+    )
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the message is about X11")
+@pytest.mark.parametrize("display", [{}, {"DISPLAY": ":987"}])
+def test_missing_display_suggests_headless(folder, display):
+    run = run_python("-m", "langsplat_viewer", "blobs.ply", **display)
+    assert (run.returncode, len(run.stderr.splitlines())) == (2, 1), run.stderr
+    assert "--headless" in run.stderr
+
+
+WINDOWLESS = """
+import sys
+from langsplat_viewer.program import entry
+sys.argv = "langsplat-viewer blobs.ply --query book --headless --out a.png".split()
+try:
+    entry()
+except SystemExit as stop:
+    assert not stop.code, stop.code
+print([name for name in ("glfw", "imgui_bundle", "torch", "transformers", "open3d") if name in sys.modules])
+"""
+
+
+@pytest.mark.long
+def test_headless_loads_no_windowing_library(folder):
+    run = run_python("-c", WINDOWLESS)
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.splitlines()[-1] == "[]"
+    assert (folder / "a.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "size"), [("", None), ("1280x720", (1280, 720)), ("1X16384", (1, 16384)), (" 3×4 ", (3, 4))]
+)
+def test_sizes(text, size):
+    assert parse_size(text) == size
+
+
+# The window: scenarios, idling, closing, orbiting, memory.
 
 SCENARIOS = [
     "look_and_search", "without_field", "from_the_command_line", "broken_renderer", "use_shortcuts",
@@ -38,7 +272,7 @@ def cast(display: str) -> Iterator[Cast]:
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def scenes(tmp_path: Path) -> Path:
     """Scenes with and without a language field, one cut short, and one of which nothing can be drawn."""
     for name, field in (("blobs", True), ("plain", False)):
         save_scene(tmp_path / f"{name}.ply", replace(blob_scene(field=field), path=None))
@@ -51,19 +285,19 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.mark.long
 @pytest.mark.parametrize("scenario", SCENARIOS)
-def test_window(scenario: str, cast: Cast, folder: Path):
-    drive(scenario, cast, folder)
+def test_window(scenario: str, cast: Cast, scenes: Path):
+    drive(scenario, cast, scenes)
 
 
 @pytest.mark.long
-def test_layout_is_remembered(cast: Cast, folder: Path):
-    drive("leave_settings", cast, folder)
-    drive("find_settings", cast, folder)
+def test_layout_is_remembered(cast: Cast, scenes: Path):
+    drive("leave_settings", cast, scenes)
+    drive("find_settings", cast, scenes)
 
 
-def drive(scenario: str, cast: Cast, folder: Path) -> None:
+def drive(scenario: str, cast: Cast, scenes: Path) -> None:
     """Play one scenario of `window_driver`."""
-    said = cast.play([scenario, str(folder)], folder, timeout=300)
+    said = cast.play([scenario, str(scenes)], scenes, timeout=300)
     assert said.rstrip().endswith("PASSED"), said[-4000:]
 
 

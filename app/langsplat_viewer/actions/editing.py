@@ -311,10 +311,7 @@ def transform(viewer: Viewer, to: Similarity) -> None:
 
 
 def place(viewer: Viewer) -> None:
-    """Make the scene that is shown from the one that was opened, by the session's transforms.
-
-    What was asked is asked anew. Raises InputError where one leads too far, and then changes nothing.
-    """
+    """Make the scene that is shown anew by the session's transforms, or raise InputError, and ask anew."""
     state = viewer.state
     if state.scene is None:
         return

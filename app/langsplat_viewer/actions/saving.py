@@ -150,11 +150,7 @@ def export(
     as_points: bool = False,
     then: Callable[[Viewer], None] = lambda viewer: None,
 ) -> None:
-    """Have the worker write a part of the scene to a new file in `folder`.
-
-    It is a PLY with its language field and cameras, or a point cloud. `then` runs once it is written; if that
-    fails the reason is said.
-    """
+    """Have the worker write a part of the scene to a new file in `folder`; `then` runs once it is there."""
     if not (has_scene(viewer) if part == "edited" else has_selection(viewer)):
         return
     state, marks, session = viewer.state, viewer.state.marks, viewer.state.session

@@ -14,10 +14,7 @@ from langsplat_viewer.viewer import Viewer
 
 
 def put(part: ViewerState | Recording, **values: object) -> None:
-    """Take what was typed or switched, where nothing follows from it.
-
-    `values` are fields of the state or a part of it, by name. Panels write nothing themselves.
-    """
+    """Set fields of the state, or of a part of it, by name: panels write nothing themselves."""
     for name, value in values.items():
         getattr(part, name)  # AttributeError where it has none
         setattr(part, name, value)

@@ -340,10 +340,7 @@ def from_camera(camera: Camera, extent: Extent) -> OrbitCamera:
 
 
 def spanning(view: OrbitCamera, span: float) -> OrbitCamera:
-    """Return the orthographic view from the same eye whose shorter side spans `span` world units.
-
-    That is the side of the uncropped image.
-    """
+    """Return the orthographic view from the same eye, `span` world units across the uncropped image."""
     distance = view.distance * span / view.span
     return replace(focus(view, view.eye + distance * view.rotation[2], distance), orthographic=True)
 

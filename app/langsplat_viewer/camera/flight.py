@@ -35,10 +35,7 @@ class Pose:
     span: float | None = None  # world units across that side without perspective, > 0; None: in perspective
 
     def camera(self, width: int, height: int) -> Camera:
-        """Return the pinhole camera of an image of `width` x `height` pixels, its principal point centred.
-
-        `camera_of` minds `span`.
-        """
+        """Return the pinhole camera of an image, its principal point centred; `camera_of` minds `span`."""
         matrix = np.eye(4)
         matrix[:3, :3] = self.rotation
         matrix[:3, 3] = -self.rotation @ self.position
@@ -116,10 +113,7 @@ def turntable(view: OrbitCamera, seconds: float) -> Turntable:
 
 
 def pose_of(view: OrbitCamera) -> Pose:
-    """Return the eye of a view.
-
-    A principal point that is off the centre moves there.
-    """
+    """Return the eye of a view; a principal point that is off the centre moves there."""
     span = view.span if view.orthographic else None
     return Pose(view.eye, view.rotation, view.intrinsics.fov_degrees, span)
 
@@ -163,10 +157,7 @@ def with_keyframe(keyframes: tuple[Keyframe, ...], added: Keyframe) -> tuple[Key
 
 
 def stretched(keyframes: tuple[Keyframe, ...], seconds: float) -> tuple[Keyframe, ...]:
-    """Return the same path in another time: all of it, `seconds` > 0, in proportion.
-
-    Paths of no duration stay.
-    """
+    """Return the path in another time, `seconds` > 0, in proportion; one of no duration stays."""
     if not keyframes or keyframes[-1].seconds <= 0:
         return keyframes
     factor = seconds / keyframes[-1].seconds

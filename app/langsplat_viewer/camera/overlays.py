@@ -108,10 +108,7 @@ def box_edges(corners: Array) -> Array:
 
 
 def nearest_segment(segments: Array, point: tuple[float, float]) -> tuple[int, float]:
-    """Return the row of (K, 2, 2) segments nearest to a point, and its distance in pixels.
-
-    (-1, inf) for none.
-    """
+    """Return the row of (K, 2, 2) segments nearest to a point, and its distance; (-1, inf) for none."""
     if not len(segments):
         return -1, math.inf
     start, step = segments[:, 0], segments[:, 1] - segments[:, 0]

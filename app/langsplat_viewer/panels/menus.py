@@ -165,19 +165,12 @@ FIRST_STEPS = (
      "turn around. R leads back."),
     ("Search", "Type into the box and press Enter: 'red mug', 'handle of the mug', 'book on the table', "
      "'three books', 'toy, not teddy bear'. Tab completes, arrow up recalls."),
-    ("What is here", "The panel Outline, in the menu Window, lists what the scene holds; a right click on a "
-     "thing names it, hides it, or finds more like it."),
     ("Found, weak match, not here", "What the scene says of a phrase. Only what may be there is painted, "
      "and a weak match no hotter than half."),
     ("Relevancy", "From 0 to 1: how much nearer a place is to the phrase than to everyday words; "
-     "0.5 is neither. Its 'threshold' is a relevancy: what has less is no part of it. The "
-     "slider moves that end, Auto gives the answer's own back."),
-    ("Subpart, part, whole", "How finely things are divided: the handle, the cup, the cup with its saucer. "
-     "'auto' takes the level that answers best."),
-    ("Displays", "The strip at the left edge: colours, depth, heat map, segmentation, the latent language "
-     "field as colours, the tree of parts; two side by side."),
-    ("Select", "Click a thing with the pointing hand, draw around it, or take what the search found; then "
-     "hide, name, measure, move or save it."),
+     "0.5 is neither. What has less than the threshold is no part of the answer."),
+    ("Subpart, part, whole", "How finely things are divided: the handle, the cup, the cup with its saucer."),
+    ("Displays, tools", "The strip at the left edge. The panel Outline lists what the scene holds."),
     ("Everything else", "Ctrl + Shift + P finds every command by its words. Without a mouse: Ctrl + Tab goes "
      "to the next panel, Tab and arrows travel in it."),
 )  # fmt: skip

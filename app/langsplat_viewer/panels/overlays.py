@@ -469,10 +469,7 @@ def draw_pointing(viewer: Viewer) -> None:
 
 
 def said(words: LevelWords, sure: bool) -> str:
-    """Return the most probable words of a place at one level, such as "teddy bear 64 %, toy 12 %".
-
-    Percentages are left out where none are `sure`.
-    """
+    """Return the most probable words of a place at one level; their percentages only where `sure`."""
     likely = [word for word in words.words if word.probability > UNSURE]
     named = [word.phrase + (f" {100 * word.probability:.0f} %" if sure else "") for word in likely]
     return ", ".join(named) if named else "nothing known"

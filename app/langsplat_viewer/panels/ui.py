@@ -134,10 +134,7 @@ def tip(text: str) -> None:
 
 
 def stoppable(label: str, fraction: float, tag: str = "") -> bool:
-    """Draw a bar in the accent's colour, with a button beside it; return whether that was clicked.
-
-    `tag` tells the button from others of its name.
-    """
+    """Draw a bar with a button beside it; return whether that was clicked. `tag`: for an id of its own."""
     width = beside_button("Cancel")
     if width_of(label) > imgui.get_content_region_avail().x + width:  # no room for it in the bar
         imgui.text_wrapped(label)
@@ -197,10 +194,7 @@ def verbs(viewer: Viewer, *buttons: str, disabled: Container[str] = ()) -> None:
 
 
 def box(label: str, hint: str, text: str, width: float = -1.0) -> tuple[bool, str]:
-    """Draw a text box; return whether Enter was pressed, and the text.
-
-    It is as wide as the row unless a `width` is given.
-    """
+    """Draw a text box, as wide as the row by default; return whether Enter was pressed, and the text."""
     imgui.set_next_item_width(width)
     flags = imgui.InputTextFlags_.enter_returns_true
     entered, typed = imgui.input_text_with_hint(label, hint, text, flags)
@@ -208,10 +202,7 @@ def box(label: str, hint: str, text: str, width: float = -1.0) -> tuple[bool, st
 
 
 def kept_box(viewer: Viewer, label: str, hint: str, button: str) -> str | None:
-    """Draw a box that keeps what is half typed, and a button that does what Enter does.
-
-    Return the text once it is entered, and empty the box.
-    """
+    """Draw a box and a button that does what Enter does; return the text once it is entered."""
     drafts = viewer.state.drafts
     entered, drafts[label] = box(label, hint, drafts.get(label, ""), beside_button(button))
     imgui.same_line()

@@ -32,10 +32,7 @@ def widget(panel: str, title: str, about: str, low: float | None = None, high: f
 
 @dataclass(frozen=True)
 class Clip:
-    """Range of depths in which Gaussians are drawn, by their centres; world units from the eye.
-
-    Answers and files have all of them.
-    """
+    """Depths between which Gaussians are drawn, by their centres; world units from the eye."""
 
     near: Annotated[float, Meta(ge=0)] = 0.0
     far: Annotated[float, Meta(ge=0)] = math.inf
