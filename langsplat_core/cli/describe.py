@@ -4,6 +4,7 @@ Words for what is in a scene, as a list or as a tree; and a name for something t
 it is then found.
 """
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
@@ -12,10 +13,11 @@ from typing import Annotated, Any
 import tyro
 from rich.table import Table
 
+from langsplat_core.arrays import Array
 from langsplat_core.cli.arguments import EncoderOption, Level, TrainedScene
-from langsplat_core.cli.query import Unit, basis_fields, pointed, unit_of
+from langsplat_core.cli.query import Unit, basis_fields, camera_of, unit_of
 from langsplat_core.cli.run import OutputConsole, print_json
-from langsplat_core.config import CountOrZero
+from langsplat_core.config import CountOrZero, PictureConfig
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io import sidecar as files
 from langsplat_core.io.files import check_output_file
@@ -24,6 +26,8 @@ from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import QueryEngine, check_words, searchable
 from langsplat_core.query.inventory import export_labels, scene_inventory, scene_outline
+from langsplat_core.query.selection import in_pixel
+from langsplat_core.raster.render import pixel_weights
 from langsplat_core.scene import LEVELS, LanguageField, Scene, TaughtWord
 from langsplat_core.scene.language import phrase_key
 from langsplat_core.semantics.encoders import load_text_encoder
@@ -208,7 +212,7 @@ class Teach:
         else:
             engine = QueryEngine(scene)
             engine.taught = known
-            members = pointed(engine, self.camera, self.at, "--at", self.level)
+            members = _pointed(engine, self.camera, self.at, self.level)
             word = engine.teach(self.name, members, self.level)
             here = len(engine.instances(engine.run(word.name)))
             times = "once" if len(word.vectors) == 1 else f"{len(word.vectors)} times"
@@ -234,3 +238,24 @@ class Teach:
         else:
             path = companion_path(self.scene, files.SUFFIX)
             files.write_language(path, replace(field, taught=tuple(taught)), scene.gaussians.means)
+
+
+def _pointed(engine: QueryEngine, camera: int, at: str, level: Level) -> Array:
+    """(N,) bool: the region in a pixel, "X,Y" as --at gives it.
+
+    Raises InputError for what is no pixel of the camera, and for one without a region.
+    """
+    scene, place = engine.scene, re.fullmatch(r"([0-9]{1,9}), ?([0-9]{1,9})", at)
+    if not scene.cameras:
+        raise InputError("the scene has no cameras, so --at means nothing")
+    if place is None:
+        raise InputError(f"--at {at}: give column and row, counted from the top left pixel, as in 412,230")
+    column, row, view = int(place[1]), int(place[2]), camera_of(scene, camera)
+    if column >= view.width or row >= view.height:
+        edge = f"columns 0 to {view.width - 1} and rows 0 to {view.height - 1}"
+        raise InputError(f"--at {at}: camera {camera} has {edge}")
+    rows, weights = pixel_weights(scene, view, (column, row))
+    members = in_pixel(engine.regions, LEVELS.index(level), rows, weights)
+    if weights.sum() <= PictureConfig().alpha_gate or not members.any():
+        raise InputError(f"--at {at}: nothing is there in camera {camera}; point at a thing")
+    return members

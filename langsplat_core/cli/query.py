@@ -1,6 +1,5 @@
 """`langsplat query` and `select`: where in a scene a phrase is true, and that alone as a scene of its own."""
 
-import re
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -34,9 +33,9 @@ from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder, s
 from langsplat_core.query.grammar import Atom, Counted, Phrase, heads, unparse
 from langsplat_core.query.instances import Instance
 from langsplat_core.query.lookup import decoded_relevancy, peak_pixel, splatted_relevancy
-from langsplat_core.query.selection import in_pixel, of_rows
+from langsplat_core.query.selection import of_rows
 from langsplat_core.raster import load_rasterizer
-from langsplat_core.raster.render import pixel_weights, view_of
+from langsplat_core.raster.render import view_of
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.scene.language import split_phrases
 from langsplat_core.semantics.encoders import load_text_encoder
@@ -129,29 +128,6 @@ def basis_fields(engine: QueryEngine) -> dict[str, Any]:
     return {"encoder": engine.basis.encoder, "calibration": engine.basis.calibration}
 
 
-def pointed(engine: QueryEngine, camera: int, at: str, option: str, level: LevelChoice) -> Array:
-    """(N,) bool: the region in a pixel, "X,Y" as the user gave it with an option.
-
-    Raises InputError for what is no pixel of the camera, and for one without a region.
-    """
-    scene, place = engine.scene, re.fullmatch(r"([0-9]{1,9}), ?([0-9]{1,9})", at)
-    if not scene.cameras:
-        raise InputError(f"the scene has no cameras, so {option} means nothing")
-    if place is None:
-        raise InputError(
-            f"{option} {at}: give column and row, counted from the top left pixel, as in 412,230"
-        )
-    column, row, view = int(place[1]), int(place[2]), camera_of(scene, camera)
-    if column >= view.width or row >= view.height:
-        edge = f"columns 0 to {view.width - 1} and rows 0 to {view.height - 1}"
-        raise InputError(f"{option} {at}: camera {camera} has {edge}")
-    rows, weights = pixel_weights(scene, view, (column, row))
-    members = in_pixel(engine.regions, LEVELS.index(level), rows, weights)
-    if weights.sum() <= PictureConfig().alpha_gate or not members.any():
-        raise InputError(f"{option} {at}: nothing is there in camera {camera}; point at a thing")
-    return members
-
-
 def camera_of(scene: Scene, index: int) -> Camera:
     """Return the camera of a number; InputError where there is none."""
     if not 0 <= index < len(scene.cameras):
@@ -173,8 +149,6 @@ class QueryScene:
     texts: tyro.conf.Positional[tuple[str, ...]] = ()
     """Phrases, each in quotes if it has several words; "," and ";" separate them too. What cannot be asked
     is named on stderr, and the rest is answered; with nothing left the exit code is 2."""
-    like: Annotated[str, tyro.conf.arg(metavar="X,Y")] = ""
-    """Find more like what is in this pixel of the --camera, at --level; auto: like the whole thing."""
     taught: WordsOption = None
     level: LevelChoice = "auto"
     """Semantic level; auto takes the one that answers best, for a thing rather the whole."""
@@ -199,16 +173,13 @@ class QueryScene:
     def run(self) -> None:
         """Ask, and print the answers."""
         scene = searchable(self.scene)
-        self._check()
+        if not self.texts:
+            raise InputError("no phrase given; for example: langsplat query scene.ply 'red cup'")
         explain = _Explainer(self, scene) if self.why is not None else None
         camera = camera_of(scene, self.camera) if scene.cameras else None
         engine = _engine(scene, once(load_text_encoder), self.encoder, self.taught)
         unit = unit_of(self.scale or scene.metres_per_unit)
         found = [self._ask(engine, text, camera) for text in self._askable(engine, camera)]
-        if self.like:
-            level = "whole" if self.level == "auto" else self.level
-            alike = engine.like(pointed(engine, self.camera, self.like, "--like", level), level)
-            found.append((replace(alike, phrase=f"like {self.like}"), None, ()))
         answers, tables = [], []
         for result, tree, of in found:
             understood = None if tree is None else unparse(tree)
@@ -229,14 +200,6 @@ class QueryScene:
         for answer, table in zip(answers, tables, strict=True):
             print(*_lines(answer, unit), *table, sep="\n")
         print(f"answers: {engine.basis.long}")
-
-    def _check(self) -> None:
-        if not self.texts and not self.like:
-            raise InputError("no phrase given; for example: langsplat query scene.ply 'red cup'")
-        if self.like and self.mode == "paper":
-            raise InputError(NOT_DECODED)
-        if self.like and self.why is not None:
-            raise InputError("--why is of phrases; give what --like finds a name with `langsplat teach`")
 
     def _askable(self, engine: QueryEngine, camera: Camera | None) -> list[str]:
         """Return the phrases that can be asked.

@@ -225,18 +225,6 @@ def test_the_original_is_never_replaced(command, source, capsys):
     assert source.read_bytes() == content
 
 
-def test_far_scenes_without_companions_are_edited(tmp_path):
-    gaussians = random_gaussians(N)
-    far = replace(gaussians, means=gaussians.means + np.float32(1e6))
-    save_scene(tmp_path / "far.ply", Scene(far))
-    near = tmp_path / "near.ply"
-    assert run("transform", tmp_path / "far.ply", near, "--move", -1e6, -1e6, -1e6) == 0
-    made = load_scene(near)
-    assert made.language is None
-    assert np.abs(made.gaussians.means - gaussians.means).max() < 0.1  # float32's steps at a million
-    assert run("crop", near, tmp_path / "half.ply", "--box", 0, -9, -9, 9, 9, 9) == 0
-
-
 def test_clean_reports_what_it_removes(scene, source, tmp_path, capsys):
     out = tmp_path / "out.ply"
     assert run("clean", source, out, "--region", 3, "--max-psnr-loss", 3, "--json") == 0

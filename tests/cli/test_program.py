@@ -2,7 +2,6 @@
 whatever happens to a command, it ends with one line."""
 
 import dataclasses
-import json
 import logging
 import os
 import signal
@@ -23,7 +22,7 @@ from langsplat_core.errors import InputError
 from langsplat_viewer.program import ViewerCommand
 from langsplat_viewer.program import entry as viewer_entry
 from langsplat_viewer.program import parse as viewer_parse
-from tests.support.processes import bound_by_permissions, refusal, run
+from tests.support.processes import refusal, run
 
 EVERY = {
     "viewer": ViewerCommand,
@@ -304,47 +303,3 @@ def test_a_signal_during_an_import_ends_the_command(number: int, said: str, tmp_
     words = [sys.executable, "-c", code]
     done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=60)
     assert (done.returncode, done.stderr) == (128 + number, CONTINUES.format(said) + "\n")
-
-
-CLOSED = (".", "images", "sparse/0/cameras.bin", "transforms.json")
-TRAIN_ALL = """
-import json, sys
-from langsplat_core.cli.app import parse
-from langsplat_core.cli.run import main
-for words in json.load(sys.stdin):
-    print(main("langsplat", lambda: parse(words)), flush=True)
-"""
-
-
-@pytest.mark.long
-def test_datasets_without_permission_are_refused(tmp_path: Path) -> None:
-    """One process tries them all: to be bound by permissions it has to be one of its own."""
-    lines, paths = [], []
-    for number, closed in enumerate(CLOSED):
-        data = tmp_path / str(number)
-        data.mkdir()
-        if closed == "transforms.json":
-            (data / closed).write_text("{}")
-        else:
-            (data / "images").mkdir()
-            (data / "sparse" / "0").mkdir(parents=True)
-            for name in ("cameras.bin", "images.bin", "points3D.bin"):
-                (data / "sparse" / "0" / name).write_bytes(bytes(8))
-        paths.append(data / closed)
-        lines.append(["train", str(data), "--out", str(tmp_path / f"{number}.ply"), "--clip.model", "demo"])
-    for path in paths:
-        path.chmod(0)
-    done = subprocess.run(
-        [sys.executable, "-c", TRAIN_ALL],
-        input=json.dumps(lines),
-        capture_output=True,
-        text=True,
-        check=False,
-        preexec_fn=bound_by_permissions(),
-    )
-    for path in paths:
-        path.chmod(0o755)
-    assert done.stdout.split() == ["2"] * len(CLOSED), done.stderr
-    said = done.stderr.splitlines()
-    assert len(said) == len(CLOSED), said
-    assert all(line.startswith("langsplat: ") for line in said)
