@@ -27,7 +27,7 @@ from langsplat_core.scene import Scene
 from langsplat_core.semantics.features import FeatureStore, ImageFeatures
 from langsplat_core.training.radiance.state import save_checkpoint
 from langsplat_viewer.output import Film, save_png, write_film
-from langsplat_viewer.projects import Bookmark, Shelf, save_preferences, write_flight
+from langsplat_viewer.projects import Bookmark, Shelf, load_preferences, save_preferences, write_flight
 from langsplat_viewer.session import Preferences
 from tests.support.file_samples import random_field
 from tests.support.processes import (
@@ -235,6 +235,20 @@ def test_two_writers_of_one_scene_take_turns(tmp_path: Path) -> None:
             assert last.language is not None
             assert [f"extra_{phrase}" for phrase in last.language.phrasebook] == list(last.extras)
     assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_two_windows_keep_what_each_changed(tmp_path: Path) -> None:
+    save_preferences(tmp_path, Preferences("light", 1.5), Preferences(ui_scale=1.5))
+    save_preferences(tmp_path, Preferences("dark", 2.0), Preferences("dark", 1.5))
+    assert load_preferences(tmp_path) == Preferences("light", 2.0)
+
+
+def test_bookmarks_kept_at_once_are_all_there(tmp_path: Path) -> None:
+    pose = some_flight().keyframes[0].pose
+    names = [Path(f"{number}.ply") for number in range(40)]
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda name: Shelf(tmp_path).write(name, (Bookmark("door", pose, 1.0),)), names))
+    assert all(Shelf(tmp_path).read(name) for name in names)
 
 
 def test_other_errors_of_a_writer_are_raised(tmp_path: Path) -> None:

@@ -11,7 +11,8 @@ import math
 import os
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -23,7 +24,7 @@ from msgspec import Meta
 from langsplat_core.config import check_settings
 from langsplat_core.errors import FormatError, InputError, printable_line, quoted
 from langsplat_core.io.cameras import is_rotation
-from langsplat_core.io.files import atomic_path
+from langsplat_core.io.files import atomic_path, locked
 from langsplat_core.io.hostile import read_json_file
 from langsplat_core.scene import FARTHEST, Intrinsics
 from langsplat_core.scene.transform import similarity
@@ -207,11 +208,14 @@ class Shelf:
         """
         if self.folder is None:
             return
-        scenes, _ = self._read(scene)
-        scenes.pop(str(scene.absolute()), None)
-        if bookmarks:
-            scenes[str(scene.absolute())] = [_flat(_plain(bookmark)) for bookmark in bookmarks]
-        _write(self.folder / BOOKMARKS, {"version": 1, "scenes": dict(list(scenes.items())[-MOST_SCENES:])})
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with locked(self.folder):
+            scenes, _ = self._read(scene)
+            scenes.pop(str(scene.absolute()), None)
+            if bookmarks:
+                scenes[str(scene.absolute())] = [_flat(_plain(bookmark)) for bookmark in bookmarks]
+            last = dict(list(scenes.items())[-MOST_SCENES:])
+            _write(self.folder / BOOKMARKS, {"version": 1, "scenes": last})
 
     def _read(self, scene: Path) -> tuple[dict[str, list[Any]], tuple[Bookmark, ...]]:
         """Return the entries of all scenes, and the bookmarks of one."""
@@ -385,8 +389,17 @@ def load_preferences(folder: Path, at_first: Preferences | None = None) -> Prefe
         raise InputError(f"{path}: {reason}; the defaults are used; mend or delete it") from None
 
 
-def save_preferences(folder: Path, preferences: Preferences) -> None:
-    """Write the preferences, whole or not at all. OSError where the folder cannot be written."""
+def save_preferences(folder: Path, preferences: Preferences, before: Preferences | None = None) -> None:
+    """Write the preferences, whole or not at all. OSError where the folder cannot be written.
+
+    before: as they were read; what is the same since then stays as another window has written it.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    with atomic_path(folder / FILE_NAME) as temporary:
-        temporary.write_bytes(msgspec.json.format(msgspec.json.encode(preferences), indent=1))
+    with locked(folder):
+        if before is not None:
+            pairs = ((entry.name, getattr(preferences, entry.name)) for entry in fields(preferences))
+            changed = {name: value for name, value in pairs if value != getattr(before, name)}
+            with suppress(InputError):  # a file that makes no sense is written anew
+                preferences = replace(load_preferences(folder, preferences), **changed)
+        with atomic_path(folder / FILE_NAME) as temporary:
+            temporary.write_bytes(msgspec.json.format(msgspec.json.encode(preferences), indent=1))

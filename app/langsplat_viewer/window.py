@@ -118,9 +118,9 @@ class Workspace:
             self.style()
         if self._folder is None or self._kept is None or preferences == self._kept:
             return
-        self._kept = preferences
+        before, self._kept = self._kept, preferences
         try:
-            projects.save_preferences(self._folder, preferences)
+            projects.save_preferences(self._folder, preferences, before)
         except OSError as error:
             self._state.say(f"settings not written: {one_line(error)}", is_error=True)
 

@@ -20,7 +20,7 @@ from langsplat_core.cli.run import OutputConsole, print_json
 from langsplat_core.config import CountOrZero, PictureConfig
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io import sidecar as files
-from langsplat_core.io.files import check_output_file
+from langsplat_core.io.files import check_output_file, locked
 from langsplat_core.io.scenes import check_writable, companion_path
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.describe import Describer
@@ -195,14 +195,22 @@ class Teach:
 
     def run(self) -> None:
         """Learn the word, or forget it, and write the file."""
-        scene = searchable(self.scene)
-        field, target = scene.language, self.into or companion_path(self.scene, files.SUFFIX)
-        assert field is not None
+        target = self.into or companion_path(self.scene, files.SUFFIX)
         if self.remove == bool(self.at):
             raise InputError("give either --at X,Y, a pixel to teach, or --remove")
         if self.into is not None and self.into.suffix != ".safetensors":
             raise InputError(f"{self.into}: taught words are written as .safetensors; choose such a name")
         check_output_file(target)
+        scene = None
+        if self.into is not None:
+            scene = searchable(self.scene)
+            self.into.parent.mkdir(parents=True, exist_ok=True)
+        with locked(target.parent):  # from reading to writing: what another teaches meanwhile is kept
+            self._change(scene or searchable(self.scene), target)
+
+    def _change(self, scene: Scene, target: Path) -> None:
+        field = scene.language
+        assert field is not None
         known = {word.key: word for word in self._known(field)}
         if self.remove:
             if known.pop(phrase_key(self.name), None) is None:

@@ -227,8 +227,7 @@ def save_scene(path: Path | str, scene: Scene) -> None:
     assert row.write is not None
     sidecar, cameras = _companions(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    # Locked, else the files of two who write one scene at once could end up side by side.
-    with locked(path.parent), ExitStack() as renames:  # made in the reverse order of these lines
+    with ExitStack() as lock, ExitStack() as renames:  # made in the reverse order of these lines
         if scene.cameras:
             camera_files.write_cameras(renames.enter_context(atomic_path(cameras)), scene.cameras)
         new_sidecar = None if scene.language is None else renames.enter_context(atomic_path(sidecar))
@@ -239,6 +238,8 @@ def save_scene(path: Path | str, scene: Scene) -> None:
             rounded = "precision" in row.loses
             means = load_gaussians(new_file).means if rounded else scene.gaussians.means
             language_files.write_language(new_sidecar, scene.language, means)
+        # Locked, else the files of two who write one scene at once could end up side by side.
+        lock.enter_context(locked(path.parent))
         for companion in (sidecar, cameras):
             companion.unlink(missing_ok=True)
 

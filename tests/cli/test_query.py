@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -365,6 +366,15 @@ def test_users_words_work_in_other_scenes(described, capsys):
     assert [word.name for word in read_words("words.safetensors").words] == ["wall"]
     assert run("select", "b.ply", "wall", "--out", "c.ply", "--taught", "words.safetensors") == 0
     assert len(load_scene("c.ply").gaussians) == PER_BLOB
+
+
+@pytest.mark.parametrize("into", [None, Path("words.safetensors")])
+def test_words_taught_at_once_are_all_kept(described, into):
+    names = ("vase", "urn", "jar", "pot")
+    with ThreadPoolExecutor(len(names)) as pool:
+        list(pool.map(lambda name: describe.Teach(Path("named.ply"), name, MUG, into=into).run(), names))
+    kept = load_scene("named.ply").language.taught if into is None else read_words(into).words
+    assert {word.name for word in kept} == set(names)
 
 
 def test_taught_word_may_be_a_part(described, capsys):

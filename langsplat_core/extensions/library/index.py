@@ -32,7 +32,7 @@ from langsplat_core.config import PictureConfig
 from langsplat_core.display.composing import compose
 from langsplat_core.display.displays import Channels
 from langsplat_core.errors import EncoderError, FormatError, InputError, LangSplatError, printable_line
-from langsplat_core.io.files import atomic_path
+from langsplat_core.io.files import atomic_path, locked
 from langsplat_core.io.hostile import FromFile, exists, open_for_reading
 from langsplat_core.io.scenes import companion_path, format_of, load_scene, scene_files
 from langsplat_core.io.sidecar import SUFFIX, read_stored
@@ -273,16 +273,8 @@ def update_library(
     paths = {path.relative_to(folder).as_posix(): path for path in scenes_in(folder)}
     if not paths:
         raise InputError(f"{folder}: no scene with a language field in it; `langsplat train` makes them")
-    old = Library(folder, ())
-    try:
-        old = read_library(index, folder) if exists(index) else old
-    except FormatError as error:
-        log.warning("%s", error)
     stamps = {name: stamp_of(path) for name, path in paths.items()}
-    kept = {
-        each.listed.path: each for each in _digests(old) if stamps.get(each.listed.path) == each.listed.stamp
-    }
-    listed = len(old.scenes) + len(old.unread)
+    kept, listed = _kept(index, folder, stamps)
     fresh = [name for name in paths if name not in kept]
     try:
         for done, name in enumerate(fresh):
@@ -290,9 +282,25 @@ def update_library(
             kept[name] = digest(paths[name], name, load_encoder)
     finally:
         if fresh or len(kept) != listed:
-            write_library(index, [kept[name] for name in paths if name in kept])
+            with locked(index.parent):  # what another search has read meanwhile is kept, too
+                kept = _kept(index, folder, stamps, logging.DEBUG)[0] | kept
+                write_library(index, [kept[name] for name in paths if name in kept])
     progress("reading scenes", 1.0)
     return read_library(index, folder)
+
+
+def _kept(
+    index: Path, folder: Path, stamps: Mapping[str, tuple[int, ...]], level: int = logging.WARNING
+) -> tuple[dict[str, Digest], int]:
+    """Return the entries of an index whose scenes are as they were, and how many there are in all."""
+    try:
+        old = read_library(index, folder) if exists(index) else Library(folder, ())
+    except FormatError as error:
+        log.log(level, "%s", error)
+        return {}, 0
+    found = {each.listed.path: each for each in _digests(old)}
+    same = {path: each for path, each in found.items() if stamps.get(path) == each.listed.stamp}
+    return same, len(old.scenes) + len(old.unread)
 
 
 def _digests(library: Library) -> Iterator[Digest]:
