@@ -156,13 +156,6 @@ def test_bad_arguments_are_one_line_and_nothing_is_written(source, tmp_path, cap
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_a_scene_that_no_view_sees_is_refused(scene, source, tmp_path):
-    away = tuple(look_at(np.array([9.0, 0, z]), np.array([20.0, 0, 0]), [0, -1, 0], (32, 24)) for z in (0, 1))
-    save_scene(source, replace(scene, cameras=away))
-    with pytest.raises(InputError, match="visible"):
-        compact_scene(source, tmp_path / "out.ply", CONFIG)
-
-
 def test_interruption_leaves_the_old_file(source, tmp_path, monkeypatch):
     out = tmp_path / "out.ply"
     compact_scene(source, out, CONFIG)
@@ -287,8 +280,3 @@ def test_cleaning_keeps_a_single_small_region(count):
     keep, report = cleaned(Scene(random_gaussians(count, scale_range=(0.5, 0.8))))
     assert keep.any()
     assert report.loss <= CLEAN.max_psnr_loss
-
-
-def test_empty_scenes_cannot_be_cleaned():
-    with pytest.raises(InputError, match="nothing"):
-        clean(Scene(random_gaussians(0)), Views((), (), (), ""), CLEAN)
