@@ -58,14 +58,9 @@ def _unwritten(*shape: int) -> Tensor:
     return torch.full(shape, torch.nan)
 
 
-def _rotations(quats: Tensor) -> Tensor:
-    w, x, y, z = (quats * quats.square().sum(1, keepdim=True).rsqrt()).unbind(1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, 1).reshape(-1, 3, 3)
+def _plain(name: str) -> Any:
+    """One of gsplat's own plain functions, which are under no other name."""
+    return getattr(import_module("gsplat.cuda._torch_impl"), f"_{name}")
 
 
 def _project(
@@ -79,28 +74,12 @@ def _project(
     camera_model: int,
 ) -> tuple[Tensor, ...]:
     """Centres in camera space, pixels, blurred 2D covariances (N, 2, 2), det before / after the blur."""
-    turn, shift = viewmats[0, :3, :3], viewmats[0, :3, 3]
-    focal, centre = torch.stack([Ks[0, 0, 0], Ks[0, 1, 1]]), Ks[0, :2, 2]
-    points = means @ turn.T + shift
-    spread = _rotations(quats) * scales[:, None, :]
-    covariances = turn @ (spread @ spread.transpose(1, 2)) @ turn.T
-    extent = torch.tensor(size, dtype=torch.float32)
-    margin = 0.3 * (0.5 * extent / focal)
-    over_z = 1 / points[:, 2] if camera_model == PINHOLE else torch.ones_like(points[:, 2])
-    slopes = points[:, :2] * over_z[:, None]
-    kept = slopes.clamp(-(centre / focal + margin), (extent - centre) / focal + margin) * points[:, 2:]
-    if camera_model == ORTHO:
-        kept = torch.zeros_like(kept)  # its Jacobian has no third column
-    zero = torch.zeros_like(over_z)
-    jacobian = torch.stack(
-        [
-            focal[0] * over_z, zero, -focal[0] * kept[:, 0] * over_z**2,
-            zero, focal[1] * over_z, -focal[1] * kept[:, 1] * over_z**2,
-        ], 1,
-    ).reshape(-1, 2, 3)  # fmt: skip
-    sharp = jacobian @ covariances @ jacobian.transpose(1, 2)
+    covariances, _ = _plain("quat_scale_to_covar_preci")(quats, scales, compute_preci=False)
+    points, turned = _plain("world_to_cam")(means, covariances, viewmats)
+    project = _plain("persp_proj" if camera_model == PINHOLE else "ortho_proj")
+    pixels, sharp = (part[0] for part in project(points, turned, Ks, *size))
     blurred = sharp + eps2d * torch.eye(2)
-    return points, focal * slopes + centre, blurred, _det(sharp) / _det(blurred)
+    return points[0], pixels, blurred, _det(sharp) / _det(blurred)
 
 
 def _det(m: Tensor) -> Tensor:
@@ -300,7 +279,7 @@ def spherical_harmonics_fwd(
     _check(dirs, coeffs)
     assert masks is not None
     colours = _unwritten(*dirs.shape)
-    colours[masks] = _harmonics()(degrees_to_use, dirs[masks], coeffs[masks])
+    colours[masks] = _plain("spherical_harmonics")(degrees_to_use, dirs[masks], coeffs[masks])
     return colours
 
 
@@ -313,15 +292,10 @@ def spherical_harmonics_bwd(  # gsplat's signature
     assert coeffs.shape[-2] == K
     leaves = [dirs[masks].requires_grad_(), coeffs[masks].requires_grad_()]
     with torch.enable_grad():
-        colours = _harmonics()(degrees_to_use, *leaves)
+        colours = _plain("spherical_harmonics")(degrees_to_use, *leaves)
         found = torch.autograd.grad(
             colours, leaves, v_colors[masks], allow_unused=True, materialize_grads=True
         )
     by_dirs, by_coeffs = torch.zeros_like(dirs), torch.zeros_like(coeffs)
     by_dirs[masks], by_coeffs[masks] = found
     return by_coeffs, by_dirs if compute_v_dirs else None
-
-
-def _harmonics() -> Any:
-    """gsplat's own plain function."""
-    return import_module("gsplat.cuda._torch_impl")._spherical_harmonics  # noqa: SLF001  under no other name
