@@ -76,12 +76,6 @@ def test_every_kind_of_picture_becomes_rgb(tmp_path: Path) -> None:
         assert np.abs(got.astype(int) - grey[..., None]).max() <= 1, name
 
 
-def test_broken_exif_data_count_as_none(tmp_path: Path) -> None:
-    write_picture(tmp_path / "a.png")
-    Image.open(tmp_path / "a.png").save(tmp_path / "b.jpg", exif=b"Exif\x00\x00MM\x00*\xff\xff\xff\xff junk")
-    assert read_photo(tmp_path / "b.jpg", upright=True).size == (40, 30)
-
-
 def bomb(path: Path) -> None:
     """A PNG of a hundred bytes whose header claims 60 000 x 60 000 pixels."""
     write_picture(path)
@@ -282,11 +276,6 @@ def test_the_sharpest_image_of_every_part_is_taken(clip: Path, tmp_path: Path) -
         errors = [abs(image - scene(k, 0.0 if k % 5 == 2 else 2.0)).mean() for k in range(40)]
         assert errors[step] < 8
         assert errors[step] < min(error for k, error in enumerate(errors) if k % 5 != 2)
-
-
-def test_fewer_images_than_parts_are_all_taken(tmp_path: Path) -> None:
-    video = write_video(tmp_path / "short.mov", [scene(3 * k) for k in range(5)])
-    assert len(extract_frames(video, tmp_path / "out", 100)) == 5
 
 
 def test_work_folder_keeps_whole_sets_of_frames_alone(clip: Path, tmp_path: Path) -> None:
