@@ -25,7 +25,7 @@ from langsplat_core.io.scenes import (
     load_without_language,
     save_scene,
 )
-from langsplat_core.io.sidecar import read_words, rematch_language
+from langsplat_core.io.sidecar import rematch_language
 from langsplat_core.pipeline.webpage import write_page
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.engine import QueryEngine
@@ -54,21 +54,18 @@ class Export:
     """Page to write, *.html."""
     title: str = ""
     """Heading of the page, by default the scene's name."""
-    words: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Your own taught words, *.safetensors, beside those of the scene."""
     encoder: EncoderOption = ""
 
     def run(self) -> None:
         if self.out.suffix.lower() not in (".html", ".htm"):
             raise InputError(f"{self.out}: pages are written as .html; choose such a name")
         check_output_file(self.out)
-        words = None if self.words is None else read_words(self.words)
         with TerminalProgress() as progress:
             progress("reading the scene", 0.0)
             scene = load_scene(self.scene)
             engine = None
             if scene.language is not None:
-                engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder, words=words)
+                engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
             title = self.title or self.out.stem
             report = write_page(self.out, scene, engine, title, progress)
         if report.why_not:

@@ -29,7 +29,6 @@ from langsplat_core.datasets.workspace import (
     MASKS,
     CameraGroup,
     Matches,
-    NotLocatedError,
     Pair,
     open_workspace,
     read_matches,
@@ -76,10 +75,9 @@ def load_photos(
     found = len(matches.located)
     if model is None or (found < max(MIN_PHOTOS, FEWEST * len(files)) and not allow_few_cameras):
         anyway = "" if model is None else ", or go on without these with --dataset.allow-few-cameras"
-        raise NotLocatedError(
+        raise InputError(
             f"only {found} of {len(files)} photographs could be located together "
-            f"({_listed(lost, 10)}); {matches.joined()}{matches.advice()}{anyway}",
-            matches,
+            f"({_listed(lost, 10)}); {matches.joined()}{matches.advice()}{anyway}"
         )
     if lost:
         share = f"{len(files) - found} of {len(files)} photographs"

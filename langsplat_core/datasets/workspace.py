@@ -20,7 +20,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from langsplat_core.errors import InputError, printable_line, shortened
+from langsplat_core.errors import printable_line, shortened
 from langsplat_core.io import apart
 from langsplat_core.progress import Progress
 
@@ -167,14 +167,6 @@ class Matches:
 
     def _name(self, row: int) -> str:
         return printable_line(self.names[row], 30)
-
-
-class NotLocatedError(InputError):
-    """Too few photographs could be located; `matches` says why."""
-
-    def __init__(self, message: str, matches: Matches) -> None:
-        self.matches = matches
-        super().__init__(message)
 
 
 def read_matches(folder: Path, files: dict[str, Path], located: Collection[str]) -> Matches:

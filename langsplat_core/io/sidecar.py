@@ -221,7 +221,7 @@ def _field(tensors: dict[str, Array], about: dict[str, Any]) -> LanguageField:
         leaves, parents = _signed(tensors["tree.leaves"]), _signed(tensors["tree.parents"])
         tree = Tree(leaves, parents, tensors["tree.levels"], tensors["tree.votes"])
     return LanguageField(
-        codec.from_file(tensors),
+        tensors["latents"] if codec.blends else tensors["codes"][..., None],
         tensors["confidence"],
         codec,
         tensors["canonical"],
@@ -308,7 +308,7 @@ def write_language(path: Path | str, field: LanguageField, means: Array) -> None
     floats = {
         "confidence": field.confidence,
         "canonical": field.canonical,
-        **field.codec.to_file(field.latents),
+        **({"latents": field.latents} if field.codec.blends else {"codes": field.latents[..., 0]}),
         **({} if field.everyday is None else {"everyday": field.everyday}),
         **({"phrasebook": np.stack(list(field.phrasebook.values()))} if field.phrasebook else {}),
         **{CODEC + name: tensor for name, tensor in field.codec.tensors().items()},

@@ -19,7 +19,7 @@ from PIL import Image
 
 from langsplat_core.arrays import Array, ViewScore, sigmoid
 from langsplat_core.datasets.capture import Capture
-from langsplat_core.datasets.workspace import Matches, NotLocatedError
+from langsplat_core.datasets.workspace import Matches
 from langsplat_core.errors import FormatError, InputError, printable_line
 from langsplat_core.io.files import atomic_path, write_json
 from langsplat_core.io.hostile import read_json_file
@@ -168,38 +168,18 @@ def write_reports(work: Path, report: TrainReport, capture: Capture, gaussians: 
     scene = Scene(gaussians, cameras=capture.cameras)
     views = (_view(capture, scene, rows[score.name], score, score.name in held_out) for score in scores)
     more = len(capture) - len(scores)
-    _write(work / PAGE, Path(report.dataset).name or "Training", [
+    head = files("langsplat_core").joinpath("web", "report.html").read_text(encoding="utf-8")
+    parts = [
+        head.replace("{{TITLE}}", _text(Path(report.dataset).name or "Training")),
         _tiles(report), *_warnings(report.warnings), "<div class=halves>",
         _section("Cameras from above", _from_above(scene, held_out)), _figures(report, capture.matches),
         "</div><h2>Photographs, and what the scene shows there</h2>",
         "<p class=soft>Left the photograph, right the scene. Held-out photographs, which were not trained "
         f"on, come first{f'; {more} more are not shown' if more else ''}.</p>",
         "<div class=views>", *views, "</div>",
-    ])  # fmt: skip
-
-
-def write_refusal(work: Path, error: NotLocatedError) -> Path:
-    """Write the page of a training that ended without cameras, and return its path."""
-    matches = error.matches
-    groups = {
-        ", ".join(matches.names[row] for row in group): "located"
-        if group[0] in matches.located
-        else matches.why(group[0])
-        for group in matches.groups
-    }
-    parts = [f"<div class='card warning'>{_text(error, 1000)}</div>", _section("Groups", _table(groups))]
-    _write(
-        work / PAGE,
-        "Too few photographs could be located",
-        [*parts, f"<p>{_text(_located(matches), 600)}</p>"],
-    )
-    return work / PAGE
-
-
-def _write(path: Path, title: str, parts: Iterable[str]) -> None:
-    head = files("langsplat_core").joinpath("web", "report.html").read_text(encoding="utf-8")
-    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as file:
-        file.writelines(f"{part}\n" for part in (head.replace("{{TITLE}}", _text(title)), *parts))
+    ]  # fmt: skip
+    with atomic_path(work / PAGE) as temporary:
+        temporary.write_text("\n".join(parts), encoding="utf-8")
 
 
 def _text(text: object, limit: int = 120) -> str:

@@ -17,7 +17,6 @@ import numpy as np
 from langsplat_core.config import QUICK, RadianceBudget, RadianceConfig, TrainConfig, check_settings
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture, split_views
-from langsplat_core.datasets.workspace import NotLocatedError
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import check_output_folder, shown, write_json
 from langsplat_core.io.ply import read_ply, write_ply
@@ -35,7 +34,6 @@ from langsplat_core.pipeline.report import (
     read_report,
     rehearsals_in_words,
     work_folder,
-    write_refusal,
     write_reports,
 )
 from langsplat_core.pipeline.stages import ProcessGroup, sole_use, stage_key
@@ -190,11 +188,7 @@ def _mean(scores: Iterable[float | None]) -> float | None:
 
 def _photographs(run: _Run) -> Capture:
     """Return the photographs that have cameras, enough for a scene."""
-    try:
-        capture = load_capture(run.dataset, run.config.dataset, run.work, run.progress)
-    except NotLocatedError as error:
-        page = write_refusal(run.work, error)
-        raise InputError(f"{error}; see {shown(page)}") from None
+    capture = load_capture(run.dataset, run.config.dataset, run.work, run.progress)
     if len(capture) < FEWEST_VIEWS and not run.config.dataset.allow_few_cameras:
         raise InputError(
             f"{shown(run.dataset)}: only {len(capture)} photographs have cameras, and a scene needs "

@@ -70,15 +70,6 @@ class Codec(ABC):
     def from_tensors(cls, tensors: dict[str, Array]) -> Self:
         """Return the inverse of `tensors`; KeyError or ValueError where they do not belong together."""
 
-    def to_file(self, latents: Array) -> dict[str, Array]:
-        """(3, N, d) latents as the named tensor of the scene file."""
-        return {"latents": latents}
-
-    @classmethod
-    def from_file(cls, tensors: Mapping[str, Array]) -> Array:
-        """Return the inverse of `to_file`; KeyError for a tensor that is missing."""
-        return tensors["latents"]
-
     def check(self, latents: Array) -> None:  # noqa: B027  any numbers will do
         """ValueError for (M, d) latents that no vector has."""
 
@@ -277,13 +268,6 @@ class CodebookCodec(Codec):
             return few.astype(np.float32)
         every: Array = (self.vectors @ vectors.T).astype(np.float32)
         return every[latents[:, 0]]
-
-    def to_file(self, latents: Array) -> dict[str, Array]:
-        return {"codes": latents[..., 0]}
-
-    @classmethod
-    def from_file(cls, tensors: Mapping[str, Array]) -> Array:
-        return tensors["codes"][..., None]
 
     def check(self, latents: Array) -> None:
         if latents.max(initial=0) >= len(self.vectors):

@@ -8,13 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from langsplat_core.arrays import Array, ViewScore
-from langsplat_core.config import ClipConfig, TrainConfig
 from langsplat_core.datasets.capture import Capture
-from langsplat_core.datasets.workspace import Matches, NotLocatedError
-from langsplat_core.errors import InputError
+from langsplat_core.datasets.workspace import Matches
 from langsplat_core.pipeline.report import (
     APART,
     PAGE,
@@ -25,10 +22,8 @@ from langsplat_core.pipeline.report import (
     read_report,
     stated_warnings,
     work_folder,
-    write_refusal,
     write_reports,
 )
-from langsplat_core.pipeline.train import train_scene
 from langsplat_core.scene import Camera, Gaussians, look_at
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -165,24 +160,3 @@ def test_page_shows_held_out_views_first_and_needs_no_other_file(tmp_path: Path)
     for words in ("it is dim: add <light>", "21.4 dB, SSIM 0.712", "7 of 8 photographs are located"):
         assert words in page.text
     assert len(page.of("polygon")) == 8  # cameras from above
-
-
-def test_a_refusal_shows_its_groups(tmp_path: Path) -> None:
-    names = (f"a{HOSTILE}", f"b{HOSTILE}", "c", "d")  # b and c are named in the advice
-    matches = Matches(names, (900, 900, 900, 0), ((0, 1, 80), (1, 2, 4)), frozenset())
-    page = Read(write_refusal(tmp_path, NotLocatedError("too few", matches)))
-    assert not page.of("script")
-    for words in ("too few", "a<script>", matches.why(3), "0 of 4 photographs", "between b<script>"):
-        assert words in page.text
-
-
-def test_refusal_of_unmatched_photographs_names_the_page(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    for index in range(3):
-        noise = rng.integers(0, 256, (120, 160, 3), dtype=np.uint8)
-        Image.fromarray(noise).save(tmp_path / f"{index}.png")
-    demo = TrainConfig(clip=ClipConfig(model="demo"))
-    with pytest.raises(InputError, match=r"see .*work/report\.html") as caught:
-        train_scene(tmp_path, tmp_path / "a.ply", demo, tmp_path / "work")
-    assert "between 0.png and 1.png" in str(caught.value)
-    assert "2.png" in Read(tmp_path / "work" / PAGE).text

@@ -72,8 +72,6 @@ def test_codecs_survive_storage(codec: Codec) -> None:
     assert type(again) is type(codec)
     np.testing.assert_array_equal(again.encode(vectors), latents)
     np.testing.assert_array_equal(again.decode(latents), codec.decode(latents))
-    field = np.stack([latents] * 3)
-    np.testing.assert_array_equal(codec.from_file(codec.to_file(field)), field)
     assert codec.known(latents).all()
     codec.check(latents)
 
