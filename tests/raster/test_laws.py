@@ -526,14 +526,3 @@ def test_far_corner_of_a_large_image(fast_backend: Backend, measured: Measure, s
     measured(f"{fast_backend.name}, corner of {size[0]} px", "error away from cut-offs", error[~band].max())
     positions = 5e-8 * size[0] if fast_backend.name == "opengl-single" else 0.0
     assert error[~band].max() <= max(fast_backend.tolerance, positions)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("name", REAL)
-def test_whole_view_of_a_real_scene(
-    real_data: Path, fast_backend: Backend, measured: Measure, name: str, antialiased: bool
-) -> None:
-    scene, camera = scene_and_camera(real_data / "gaussians" / name, (160, 120))
-    settings = replace(INRIA, antialiased=antialiased)
-    check_scene(fast_backend, scene, camera, settings, f"{name} whole", measured)

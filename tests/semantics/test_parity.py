@@ -7,9 +7,8 @@ import fails. What these packages need of that part is the suppression of boxes,
 
 import importlib
 import json
-import re
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from importlib.util import find_spec
@@ -42,26 +41,6 @@ PARTS = ("segment_anything.automatic_mask_generator", "sam2.build_sam", "sam2.sa
 NAMES = ("torchvision", "open_clip", "segment_anything", "sam2", "cv2")
 ENDS = {"<start_of_text>": "<|startoftext|>", "<end_of_text>": "<|endoftext|>"}  # as the hub names them
 SCALES = {"pos": 0.3, "rel_": 0.3, "token": 0.3, "no_mem": 0.3, "latent": 0.3, "class_embedding": 0.3}
-SIGLIP = (  # patterns of open_clip's names -> of transformers'
-    (r"^visual\.trunk\.blocks\.", "vision_model.encoder.layers."),
-    (r"^visual\.trunk\.norm\.", "vision_model.post_layernorm."),
-    (r"^visual\.trunk\.patch_embed\.proj\.", "vision_model.embeddings.patch_embedding."),
-    (r"^visual\.trunk\.pos_embed$", "vision_model.embeddings.position_embedding.weight"),
-    (r"^visual\.trunk\.attn_pool\.latent$", "vision_model.head.probe"),
-    (r"^visual\.trunk\.attn_pool\.proj\.", "vision_model.head.attention.out_proj."),
-    (r"^visual\.trunk\.attn_pool\.norm\.", "vision_model.head.layernorm."),
-    (r"^visual\.trunk\.attn_pool\.", "vision_model.head."),
-    (r"^text\.positional_embedding$", "text_model.embeddings.position_embedding.weight"),
-    (r"^text\.token_embedding\.", "text_model.embeddings.token_embedding."),
-    (r"^text\.transformer\.resblocks\.", "text_model.encoder.layers."),
-    (r"^text\.ln_final\.", "text_model.final_layer_norm."),
-    (r"^text\.text_projection\.", "text_model.head."),
-    (r"(layers\.\d+)\.(?:norm|ln_)(\d)\.", r"\1.layer_norm\2."),
-    (r"\.mlp\.c_fc\.", ".mlp.fc1."),
-    (r"\.mlp\.c_proj\.", ".mlp.fc2."),
-    (r"\.attn\.(?:out_)?proj\.", ".self_attn.out_proj."),
-    (r"\.attn\.(?:qkv\.|in_proj_)", ".self_attn.{}_proj."),
-)
 
 
 @cache
@@ -123,20 +102,6 @@ def save_clip(name: str, model: Any, folder: Path) -> None:
     CLIPTokenizer(vocab=numbers, merges=list(words.bpe_ranks)).save_pretrained(folder)
 
 
-def siglip_tensors(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """The weights of a SigLIP as open_clip names them, as transformers does."""
-    found: dict[str, torch.Tensor] = {}
-    for name, tensor in tensors.items():
-        for pattern, by in SIGLIP:
-            name = re.sub(pattern, by, name)
-        thirds = zip("qkv", tensor.chunk(3), strict=True) if "{}" in name else [("", tensor)]
-        found |= {name.format(role): part.squeeze(0) if "position" in name else part for role, part in thirds}
-    for part in ("weight", "bias"):
-        query, rest = (found.pop(f"vision_model.head.{name}.{part}") for name in ("q", "kv"))
-        found[f"vision_model.head.attention.in_proj_{part}"] = torch.cat([query, rest])
-    return found
-
-
 # Vectors and masks against those of open_clip, segment_anything and sam2 themselves, at full size with the
 # same random weights. `make parity` installs them and runs this; else it is skipped.
 
@@ -183,35 +148,6 @@ def test_a_clip_of_open_clip(name: str, field: SimpleNamespace, tmp_path: Path, 
         seen = normalize(model.encode_image(torch.stack([see(Image.fromarray(some)) for some in pictures])))
     close(f"{name}, text", encoder.encode_texts(phrases), texts, 1e-5, measured)
     close(f"{name}, pictures", encoder.encode_images(pictures), seen, 1e-5, measured)
-
-
-def test_siglip_2_of_open_clip(field: SimpleNamespace, tmp_path: Path, measured: Measure) -> None:
-    """transformers has the tanh form of GELU in both halves; in open_clip pictures go through the exact one,
-    which is replaced here to compare all else."""
-    from safetensors.torch import save_file
-    from transformers import SiglipConfig
-
-    from tests.support.tiny_models import gemma_tokenizer
-
-    model = scrambled(field.open_clip.create_model, "ViT-B-16-SigLIP2")
-    tensors = {name: tensor.contiguous() for name, tensor in siglip_tensors(model.state_dict()).items()}
-    save_file(tensors, tmp_path / "model.safetensors")
-    text = {"vocab_size": gemma_tokenizer(tmp_path, words=256_000), "projection_size": 768}
-    SiglipConfig(text_config=text, vision_config={"patch_size": 16}).save_pretrained(tmp_path)
-    encoder = load_encoder(str(tmp_path), "cpu")
-    words = field.open_clip.tokenizer.HFTokenizer(str(tmp_path), context_length=64, clean="canonicalize")
-    pictures = squares(encoder.image_size)
-    pixels = torch.from_numpy(pictures.transpose(0, 3, 1, 2).astype(np.float32) / 127.5 - 1)
-    with torch.inference_mode():
-        texts = normalize(model.encode_text(words(PLAIN)))
-        exact = normalize(model.encode_image(pixels))
-        for module in model.visual.modules():
-            if isinstance(module, torch.nn.GELU):
-                module.approximate = "tanh"
-        seen = normalize(model.encode_image(pixels))
-    close("SigLIP 2, text", encoder.encode_texts(PLAIN), texts, 1e-5, measured)
-    close("SigLIP 2, pictures", encoder.encode_images(pictures), seen, 1e-5, measured)
-    measured("SigLIP 2, pictures", "as open_clip leaves them", (exact - seen).abs().max().item())
 
 
 PASSING = {"nms_iou": 2.0, "nms_score": -1.0, "nms_inner": 2.0}

@@ -92,12 +92,10 @@ def tiny_clip(folder: Path, half: bool = False) -> CLIPModel:
     return _saved(CLIPModel, config, folder, 0, lambda model: model.half() if half else None).float()
 
 
-def unigram_tokenizer(folder: Path, words: int = 0) -> int:
-    """SigLIP's: SentencePiece unigram with end and padding in one token; returns the size of its vocabulary,
-    which `words` made-up words enlarge."""
+def unigram_tokenizer(folder: Path) -> int:
+    """SigLIP's: SentencePiece unigram with end and padding in one token; returns the size of its vocabulary."""
     pieces = [("<pad>", 0.0), ("</s>", 0.0), ("<unk>", -9.0), ("▁", -2.0), ("▁red", -1.0), ("▁mug", -1.0)]
     pieces += [(letter, -3.0) for letter in ascii_lowercase]
-    pieces += [(f"▁word{i}", -5.0) for i in range(words - len(pieces))]
     tokenizer = Tokenizer(models.Unigram(pieces, unk_id=2, byte_fallback=False))
     tokenizer.normalizer = normalizers.Lowercase()
     tokenizer.pre_tokenizer = pre_tokenizers.Metaspace()
@@ -110,11 +108,10 @@ def unigram_tokenizer(folder: Path, words: int = 0) -> int:
     return len(pieces)
 
 
-def gemma_tokenizer(folder: Path, words: int = 0) -> int:
+def gemma_tokenizer(folder: Path) -> int:
     """SigLIP 2's: byte pairs, an end token and another one for padding; else as `unigram_tokenizer`."""
     special = ["<pad>", "<eos>", "<bos>", "<unk>", "<mask>"]
     pieces = [*special, "▁", *ascii_lowercase, "re", "red", "mu", "mug"]
-    pieces += [f"word{i}" for i in range(words - len(pieces))]
     Siglip2Tokenizer(
         vocab={piece: i for i, piece in enumerate(pieces)},
         merges=[("r", "e"), ("re", "d"), ("m", "u"), ("mu", "g")],  # type: ignore[arg-type]
