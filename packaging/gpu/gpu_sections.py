@@ -56,10 +56,10 @@ from langsplat_core.scene import Camera, Scene
 from langsplat_core.semantics.encoders import load_encoder
 from langsplat_core.semantics.features import ImageFeatures
 from langsplat_core.semantics.sam import grid_points, load_segmenter
-from langsplat_core.training.language.lift import find_mask_weights
 from langsplat_core.training.radiance.differentiable import evaluate_views
 from langsplat_core.training.radiance.trainer import train_radiance
 from tests.support.backends import reference_gradients
+from tests.support.scenes import find_mask_weights
 
 
 class MissingError(Exception):

@@ -34,7 +34,8 @@ from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.scene import LEVELS, Calibration, Camera, Gaussians, LanguageField
 from langsplat_core.scene.language import phrase_key
 from langsplat_core.semantics.features import ImageFeatures
-from langsplat_core.training.language.lift import MaskGroups, find_mask_weights
+from langsplat_core.training.language.lift import MaskGroups
+from tests.support.scenes import find_mask_weights
 
 WRONG = 0.15  # share of masks with another region's vector
 
@@ -119,7 +120,7 @@ def true_labels(
         rows, numbers = _as_rows(ids)
         described.append((camera, ImageFeatures(rows, np.zeros((len(numbers), 1), np.float32))))
         columns.append(numbers)
-    members = find_mask_weights(rasterizer, gaussians, described, progress=progress)
+    members = find_mask_weights(rasterizer, gaussians, described)
     known, group = np.unique(np.concatenate(columns), return_inverse=True)
     edges = np.cumsum([len(numbers) for numbers in columns])[:-1]
     groups = MaskGroups(tuple(np.split(group.astype(np.int32), edges)), np.zeros((len(known), 1), np.float32))

@@ -22,7 +22,6 @@ from langsplat_core.raster import gsplat, load_lifting_rasterizer, load_rasteriz
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer, create_egl_context
 from langsplat_core.raster.reference import ReferenceRasterizer, colours
 from langsplat_core.scene import Camera, Gaussians
-from langsplat_core.training.language.lift import find_mask_weights
 from langsplat_core.training.radiance.differentiable import (
     CpuRenderer,
     CudaRenderer,
@@ -34,6 +33,7 @@ from langsplat_core.training.radiance.trainer import train_radiance
 from tests.support import gsplat_twin as twin
 from tests.support.backends import gl_state
 from tests.support.scenes import (
+    find_mask_weights,
     make_views,
     random_camera,
     random_gaussians,

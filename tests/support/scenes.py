@@ -13,12 +13,14 @@ from langsplat_core.arrays import Array, logit, rotation_matrices, unit
 from langsplat_core.config import INRIA, RadianceConfig, RasterSettings
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.query.answers import Regions, build_regions
+from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer, colours
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians, LanguageField, LinearCodec, Scene, look_at
 from langsplat_core.scene.language import Tree
 from langsplat_core.scene.surface import Surface, build_surface, build_tree, surface_weights
 from langsplat_core.scene.transform import C0
 from langsplat_core.semantics.features import ImageFeatures
+from langsplat_core.training.language.lift import MaskWeights, view_pairs
 
 
 def random_gaussians(
@@ -308,3 +310,14 @@ def capture() -> Capture:
     points = np.repeat(truth().means.astype(np.float64), 8, axis=0)
     points += 0.08 * rng.normal(size=points.shape)
     return Capture(tuple(cameras), tuple(images), points, np.full(points.shape, 128, np.uint8))
+
+
+def find_mask_weights(
+    rasterizer: LiftingRasterizer,
+    gaussians: Gaussians,
+    views: Sequence[tuple[Camera, ImageFeatures]],
+    settings: RasterSettings = INRIA,
+) -> MaskWeights:
+    """The mask weights of all views, in memory."""
+    pairs = [view_pairs(rasterizer, gaussians, *view, settings) for view in views]
+    return MaskWeights(pairs, len(gaussians))

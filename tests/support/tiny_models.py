@@ -93,7 +93,7 @@ def tiny_clip(folder: Path, half: bool = False) -> CLIPModel:
 
 
 def unigram_tokenizer(folder: Path) -> int:
-    """SigLIP's: SentencePiece unigram with end and padding in one token; returns the size of its vocabulary."""
+    """SigLIP's: SentencePiece unigram, end and padding in one token; returns the size of its vocabulary."""
     pieces = [("<pad>", 0.0), ("</s>", 0.0), ("<unk>", -9.0), ("▁", -2.0), ("▁red", -1.0), ("▁mug", -1.0)]
     pieces += [(letter, -3.0) for letter in ascii_lowercase]
     tokenizer = Tokenizer(models.Unigram(pieces, unk_id=2, byte_fallback=False))

@@ -113,21 +113,6 @@ class MaskWeights:
         return sums, np.concatenate(labelling)
 
 
-def find_mask_weights(
-    rasterizer: LiftingRasterizer,
-    gaussians: Gaussians,
-    views: Sequence[tuple[Camera, ImageFeatures]],
-    settings: RasterSettings = INRIA,
-    progress: Progress = silent,
-) -> MaskWeights:
-    """Gather the mask weights of all views, in memory."""
-    pairs = []
-    for camera, features in views:
-        pairs.append(view_pairs(rasterizer, gaussians, camera, features, settings))
-        progress("lifting masks onto the Gaussians", len(pairs) / len(views))
-    return MaskWeights(pairs, len(gaussians))
-
-
 def view_pairs(
     rasterizer: LiftingRasterizer,
     gaussians: Gaussians,

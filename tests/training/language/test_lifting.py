@@ -25,7 +25,6 @@ from langsplat_core.training.language.lift import (
     by_features,
     count_votes,
     find_instances,
-    find_mask_weights,
     group_masks,
     lift_by_gradient,
     lift_latents,
@@ -34,7 +33,14 @@ from langsplat_core.training.language.lift import (
     view_pairs,
 )
 from tests.support.processes import stop_at
-from tests.support.scenes import LIFTED_DIM, dense_weights, make_views, random_camera, random_gaussians
+from tests.support.scenes import (
+    LIFTED_DIM,
+    dense_weights,
+    find_mask_weights,
+    make_views,
+    random_camera,
+    random_gaussians,
+)
 
 
 @pytest.fixture(scope="module")

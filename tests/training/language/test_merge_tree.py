@@ -12,7 +12,7 @@ from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene.surface import build_surface
 from langsplat_core.semantics.features import ImageFeatures
 from langsplat_core.training.language import merge_tree as module
-from langsplat_core.training.language.lift import PAIR, MaskWeights, find_mask_weights
+from langsplat_core.training.language.lift import PAIR, MaskWeights
 from langsplat_core.training.language.merge_tree import (
     SOLID,
     MergeTree,
@@ -23,7 +23,7 @@ from langsplat_core.training.language.merge_tree import (
     nested_maps,
 )
 from tests.support.fakes import PER_BLOB, blob_scene, cameras
-from tests.support.scenes import make_views, random_camera, random_gaussians
+from tests.support.scenes import find_mask_weights, make_views, random_camera, random_gaussians
 
 
 def random_patches(seed: int, count: int = 24, views: int = 4) -> Patches:
