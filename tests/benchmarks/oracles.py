@@ -28,7 +28,6 @@ from assets.making.dataset import Region, Truth
 from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import InputError
 from langsplat_core.io.hostile import read_npy
-from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import TextEncoder
 from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.scene import LEVELS, Calibration, Camera, Gaussians, LanguageField
@@ -108,7 +107,6 @@ def true_labels(
     rasterizer: LiftingRasterizer,
     gaussians: Gaussians,
     views: Sequence[tuple[Camera, Array]],
-    progress: Progress = silent,
 ) -> Array:
     """(3, N) int64: the truth id that each Gaussian shows most of, ``argmax W^T onehot(ids)`` over all views.
 

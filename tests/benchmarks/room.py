@@ -221,7 +221,7 @@ class Room:
         if not path.exists():
             views = [(camera, self.truth.labels(camera.name)) for camera in self.capture.cameras]
             with self._timed("labels of the Gaussians"):
-                write_npy(path, true_labels(CpuRasterizer(), self.gaussians, views, self.progress))
+                write_npy(path, true_labels(CpuRasterizer(), self.gaussians, views))
         stored: Array = np.load(path, allow_pickle=False)
         return stored
 
