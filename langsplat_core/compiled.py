@@ -27,7 +27,7 @@ import numba
 import numpy as np
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, check_array
 
 log = logging.getLogger("langsplat")
 
@@ -41,17 +41,34 @@ def helper(function: Callable[..., Any], **options: Any) -> Any:
     return numba.njit(forceinline=True, error_model="numpy", **options)(function)
 
 
-def kernel(function: Callable[..., Any], **options: Any) -> Any:
+def kernel(function: Callable[..., Any], shapes: str = "", **options: Any) -> Any:
     """Compile `function` at its first call, or take the machine code of an earlier process.
 
-    options: further ones of `numba.njit`, such as `fastmath`.
+    shapes: of arguments whose arrays may come from files, "values M D, table.steps M": a kernel reads beyond
+    an array that is too short, so `Workers` compares them before it runs one. options: further ones of
+    `numba.njit`, such as `fastmath`.
     """
     made = numba.njit(nogil=True, error_model="numpy", **options)(function)
+    if shapes:
+        _SHAPES[made] = [tuple(entry.split()) for entry in shapes.split(",")]
     try:
         made._cache = _KernelCache(function)  # noqa: SLF001  numba has no other way to it
     except RuntimeError:
         _say_once("no folder for them can be written to; set NUMBA_CACHE_DIR to one that can")
     return made
+
+
+_SHAPES: dict[Any, list[tuple[str, ...]]] = {}  # of kernels: name of an argument, and letters of its axes
+
+
+def _check_shapes(compiled: Any, arguments: Sequence[Any]) -> None:
+    """Raise ValueError where arguments behind the first two are not of the shapes that a kernel states."""
+    names = compiled.py_func.__code__.co_varnames[2:]
+    given, dims = dict(zip(names, arguments, strict=False)), dict[str, int]()
+    for name, *axes in _SHAPES[compiled]:
+        argument, _, part = name.partition(".")
+        array = getattr(given[argument], part) if part else given[argument]
+        dims = check_array(name, array, tuple(axes), dims)
 
 
 class _KernelFiles(IndexDataCacheFile):
@@ -146,6 +163,8 @@ class Workers:
 
         Returns what they return, in order.
         """
+        if compiled in _SHAPES:
+            _check_shapes(compiled, arguments)
         pieces = min(count, self.threads * _PIECES_PER_THREAD if self.threads > 1 else 1)
         edges = [count * i // max(pieces, 1) for i in range(max(pieces, 1) + 1)]
         return self.each(compiled, [(*edge, *arguments) for edge in pairwise(edges)])

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -157,7 +158,7 @@ def build_regions(tree: Tree, weights: Array) -> Regions:
     return Regions(tuple(nodes), np.stack(everywhere), weights, tuple(sizes), tuple(totals), table)
 
 
-@kernel
+@partial(kernel, shapes="values L N, everywhere L N, weights N")
 def _sum_pieces(first: int, last: int, values: Array, everywhere: Array, weights: Array, sums: Array) -> None:
     """Rows [first, last) of `sums` (3 P, R): of a level's P pieces the weighted sums over its regions."""
     count, pieces = len(weights), len(sums) // len(values)
@@ -168,7 +169,7 @@ def _sum_pieces(first: int, last: int, values: Array, everywhere: Array, weights
                 sums[row, everywhere[level, i]] += np.float64(weights[i]) * values[level, i]
 
 
-@kernel
+@partial(kernel, shapes="of N, values R, others N, spread N")
 def _spread(first: int, last: int, of: Array, values: Array, others: Array, spread: Array) -> None:
     """Fill rows [first, last) of `spread` (N,)."""
     for i in range(first, last):

@@ -7,6 +7,7 @@ decoded once. Of other codecs every latent is a feature of its own.
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -57,7 +58,7 @@ class Lookup:
                 yield found
 
 
-@kernel
+@partial(kernel, shapes="values K, codes N, found N")
 def _fetch(first: int, last: int, values: Array, codes: Array, found: Array) -> None:
     """Fill rows [first, last) of `found` (3 N,)."""
     for i in range(first, last):

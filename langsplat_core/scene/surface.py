@@ -5,7 +5,7 @@ cutting their graph out for `scipy.sparse.csgraph` takes ten times as long.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -124,7 +124,7 @@ def _links(neighbours: Array, near: Array) -> csr_matrix:
     return (one_way + one_way.T).tocsr()
 
 
-@kernel
+@partial(kernel, shapes="chosen K, neighbours M k, rows M, weights M, values N, smoothed K")
 def _smooth(
     first: int,
     last: int,

@@ -63,6 +63,7 @@ log = logging.getLogger("langsplat")
 INDEX = ".langsplat-library"  # its name in the folder
 SCENES = "scenes"  # key of the metadata
 THUMBNAIL = (96, 72)  # width and height, pixels, of the picture that the index keeps of a scene
+REMADE = "remove it, and it is made again"
 PICTURE = (320, 240)  # and of the picture of an answer
 Whole = Annotated[int, msgspec.Meta(ge=0, lt=2**62)]
 
@@ -389,6 +390,8 @@ def _group(file: Any, number: int, encoder: str, scenes: tuple[Listed, ...]) -> 
         wanted = (group.starts[-1, of], *(canonical.shape[1:] if name == "codewords" else ()))
         if values.dtype != np.dtype(kind) or values.shape != wanted:
             raise ValueError(f"{name} of another length than the scenes have")
+        if not np.isfinite(values).all():
+            raise ValueError(f"{name} that are not finite")
     return group, shown
 
 
@@ -403,9 +406,14 @@ def fits_in(group: EncoderGroup, vector: Array) -> Array:
     """
     arrays, phrase = group.columns, np.require(vector, np.float32, "C")
     means, sound = np.zeros(len(arrays.parents)), np.ones(len(group.scenes), bool)
-    shared_workers().run(_region_means, len(sound), phrase, arrays, group.starts, means, sound)
+    try:
+        if group.starts[-1].tolist() != [len(arrays.steps), len(arrays.shares), len(means)]:
+            raise ValueError("arrays of other lengths than its scenes have")
+        shared_workers().run(_region_means, len(sound), phrase, arrays, group.starts, means, sound)
+    except ValueError as error:  # arrays of other sizes than a phrase, or each other
+        raise FormatError(f"the index of scenes does not fit ({error}); {REMADE}") from None
     if not sound.all():
-        raise FormatError("the index of scenes is damaged; remove it, and it is made again")
+        raise FormatError(f"the index of scenes is damaged; {REMADE}")
     fits = region_fits(group.table, fit_of(means))
     best = fit_of(best_relevancies(group.table, region_relevancies(fits)))
     indexed = np.array([scene.is_indexed for scene in group.scenes], bool)
@@ -420,7 +428,11 @@ def _dot(row: Array, vector: Array) -> np.float32:
     return total
 
 
-@kernel
+@partial(
+    kernel,
+    shapes="vector D, columns.codewords K D, columns.steps K, columns.zeros K, columns.rates K, "
+    "columns.shares M, columns.words M, columns.regions M, columns.parents R, means R, sound S",
+)
 def _region_means(
     first: int, last: int, vector: Array, columns: Columns, starts: Array, means: Array, sound: Array
 ) -> None:

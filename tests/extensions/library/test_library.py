@@ -226,6 +226,29 @@ def test_damaged_index_is_made_again_with_a_warning(folder, caplog):
         assert caplog.text.count(INDEX) == 1
 
 
+@pytest.mark.parametrize("column", ["codewords", "steps", "words", "shares", "regions", "parents"])
+def test_kernels_refuse_arrays_of_other_sizes(folder, column):
+    """What an index holds need not be what a phrase has: nothing is read beyond an array."""
+    group = update_library(folder, load_encoder=load).groups[0]
+    short = getattr(group.columns, column)[..., :-1]
+    changed = replace(group, columns=group.columns._replace(**{column: np.ascontiguousarray(short)}))
+    with pytest.raises(FormatError, match=r"does not fit|damaged"):
+        fits_in(changed, axis(0))
+    with pytest.raises(FormatError, match="does not fit"):
+        fits_in(group, np.ones(600, np.float32))
+
+
+def test_an_index_of_infinities_is_refused(folder):
+    update_library(folder, load_encoder=load)
+    tensors, index = load_file(folder / INDEX), folder / INDEX
+    for name in ("shares", "rates"):
+        values = tensors[f"0.{name}"].copy()
+        values[0] = np.inf
+        save_file(tensors | {f"0.{name}": values}, index, {SCENES: json.dumps(stated(index))})
+        with pytest.raises(FormatError, match="not finite"):
+            read_library(index, folder)
+
+
 @pytest.mark.parametrize("column", ["words", "regions", "parents"])
 def test_indices_out_of_range_are_refused(folder, column):
     group = update_library(folder, load_encoder=load).groups[0]
